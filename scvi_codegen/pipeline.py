@@ -62,6 +62,7 @@ from scvi_codegen.rendering.program_source import (
     render_double_double,
     render_embedded,
     render_ensemble,
+    render_points,
     render_thread,
     workspace_size,
 )
@@ -222,6 +223,10 @@ def describe_arrays(
         layout=layout,
         lengths=tuple(length for near in system.neighbours for length in near.lengths),
     )
+
+
+OF_ONE_WORD = ("ensemble", "observing", "thread", "points", "fallback")
+"""Variants that double-double arithmetic lacks."""
 
 
 class Sources:
@@ -465,10 +470,11 @@ class Sources:
             "second_derivatives": lambda: self.tangent(second=True),
             "changes": lambda: self.changes(int(count)),
             "observing": lambda: self.observing(count),
+            "points": lambda: render_points(self.program()),
             "thread": lambda: render_thread(self.program(), control_of(self.program(), self.controller, self.system)),
         }
         if self.precision == DOUBLE_DOUBLE:  # derivatives are those of the step in double
-            return None if kind in ("ensemble", "observing", "thread", "fallback") else self._in_double.variant(name)
+            return None if kind in OF_ONE_WORD else self._in_double.variant(name)
         return None if self.of_arrays else variants[kind]()
 
 

@@ -10,6 +10,7 @@ The support headers contain all of it: ``flow.h`` the function, ``xla_flow.h`` a
 frameworks.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, chain
@@ -28,12 +29,13 @@ from scvi_codegen.rendering.kernels.simd import (
     POINTS,
     TRAJECTORIES,
     Fallback,
+    IterationSource,
     iteration_source,
     lane_table,
     predictor_text,
     splitting_source,
 )
-from scvi_codegen.rendering.source import ExampleInput, Interface, Source
+from scvi_codegen.rendering.source import POINT_THREADS, ExampleInput, Interface, Source
 from scvi_codegen.rendering.text import INPUT_PRECISION, LARGEST_VIOLATION, MAX_ITERATIONS, ROUNDING_UNITS, included
 
 Embedded: TypeAlias = Literal["double", "single"]
@@ -294,6 +296,27 @@ def render_ensemble(program: Program, observed: Kernel | None = None, *, tangent
         "fixed_point": source,
     }
     return _render(prefix, context, "ensemble")
+
+
+def render_points(program: Program) -> Source | None:
+    """Return source of fixed steps whose points are threads of a GPU; ``None`` unless there are 8, and forces alone."""
+    fixed_point = program.fixed_point
+    if not fixed_point or fixed_point.name != "separable" or fixed_point.lanes != POINT_THREADS:
+        return None
+    if program.quantities.integrals:
+        return None
+    program = replace(program, prefix=f"{program.prefix}_points")
+    context = _context(program, DOUBLE, None, "none")
+    text = cast(IterationSource, context["fixed_point"])
+    tables = tuple(map(_at_own_point, text.tables))
+    return _render(program.prefix, {**context, "fixed_point": replace(text, tables=tables), "on_device": "points"})
+
+
+def _at_own_point(table: str) -> str:
+    """Return a table of vectors over points as one of numbers, which begins at the point of the thread."""
+    size = "[POINTS * POINTS]" if "[POINTS * GROUPS]" in table else "[POINTS]"
+    head, name, rest = re.split(r"lanes (\w+)\[[^]]*\]", table, maxsplit=1)
+    return f"{head}double {name}_OF_POINTS{size}{rest}\n#define {name} ({name}_OF_POINTS + OWN_POINT)"
 
 
 def render_thread(program: Program, control: Control | None) -> Source | None:

@@ -132,6 +132,8 @@ class Source:
 DOUBLE_DOUBLE = "double-double"
 """Precision of states of two words, 31 digits."""
 PRECISIONS = ("double", DOUBLE_DOUBLE)
+POINT_THREADS = 8
+"""Threads of a GPU that share a trajectory with many coordinates, one for each point of a step."""
 COMPONENTS = {"rotation": 4, "direction": 3, "spin": 2}
 """Number of homogeneous coordinates by kind."""
 NUMBER = re.compile(r"\d+(\.\d*)?", re.ASCII)

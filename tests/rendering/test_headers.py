@@ -33,6 +33,7 @@ ELSEWHERE = {
     "support/run/observation.h": "tests/runtime/test_device.py",
     "support/run/tangent_growth.h": "tests/runtime/test_device.py",
     "support/run/thread_advance_to.h": "tests/runtime/test_device.py",
+    "support/run/thread_points.h": "tests/runtime/test_device.py",
     "support/run/thread_run.h": "tests/runtime/test_device.py",
 }
 """Headers that require libraries, a model, another header or a compiler for GPUs, and the tests that compile them."""

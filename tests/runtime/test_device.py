@@ -23,6 +23,7 @@ from scvi_codegen.cli import main
 from scvi_codegen.methods import Method
 from scvi_codegen.native import cuda
 from scvi_codegen.native.building import PORTABLE_FLAGS
+from scvi_codegen.runtime.ensemble import ensemble
 from scvi_codegen.runtime.ensemble.device import DeviceEnsemble
 from scvi_codegen.runtime.ensemble.ensemble import Ensemble
 
@@ -177,7 +178,7 @@ ENDS = np.array([9.0, 4.0, 6.0, 0.0, 7.5])
 @pytest.mark.filterwarnings("ignore::scvi_codegen.errors.AccuracyWarning")
 @pytest.mark.parametrize(
     "system",
-    [pytest.param("kepler", marks=pytest.mark.second), pytest.param("double-pendulum", marks=pytest.mark.second)],
+    [pytest.param("kepler", marks=pytest.mark.second), pytest.param("double-pendulum", marks=pytest.mark.full)],
 )
 def test_adaptive_steps_have_the_bits_of_the_processor(gpu: EmulatedGpu, system: str) -> None:
     stepper, (q, p) = compiled(system, sc.SVI(4)), states(system)
@@ -217,7 +218,25 @@ def test_adaptive_trajectories_that_fail_are_repeated_by_the_processor(gpu: Emul
 
 
 @pytest.mark.second
-@pytest.mark.parametrize("count", [1, 3])
+@pytest.mark.filterwarnings("ignore::scvi_codegen.errors.AccuracyWarning")
+def test_threads_that_share_a_trajectory_have_the_bits_of_integrate(gpu: EmulatedGpu, monkeypatch) -> None:
+    monkeypatch.setattr(ensemble, "FEWEST_COORDINATES", 2)
+    e = np.array([0.1, 0.99, 0.5])
+    q, p = np.stack([1 - e, 0 * e], axis=1), np.stack([0 * e, np.sqrt((1 + e) / (1 - e))], axis=1)
+    stepper, plan = compiled("kepler", sc.SVI(5)), {"h": 0.1, "steps": 80, "save_every": 20}
+    host = stepper.integrate_ensemble(q, p, **plan, device="cuda").to_host()
+    assert gpu.launches[1] == ("points", 64)
+    for j in (0, 2):
+        alone = stepper.integrate(q[j], p[j], **plan)
+        assert np.array_equal(host.q[:, j], alone.q)
+        assert np.array_equal(host.p[:, j], alone.p)
+    on_processor = stepper.integrate_ensemble(q, p, **plan)  # the second trajectory fails, or requires Newton's method
+    assert host.status.tolist() == on_processor.status.tolist()
+    assert np.array_equal(np.isnan(host.q), np.isnan(on_processor.q))
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("count", [1, pytest.param(3, marks=pytest.mark.full)])
 def test_chaos_indicators_agree_with_those_of_the_processor(gpu: EmulatedGpu, count: int) -> None:
     stepper, (q, p) = compiled("henon-heiles", sc.SVI(4)), states("henon-heiles")
     q[1:3] *= 30.0  # escapes, within and after the first block of steps
@@ -337,6 +356,18 @@ def test_without_a_gpu_the_error_names_the_remedy(monkeypatch: pytest.MonkeyPatc
         compiled("kepler", sc.SVI(4)).integrate_ensemble([1.0, 0.0], [0.0, 1.0], h=0.1, steps=5, device="cuda")
 
 
+@pytest.mark.full
+def test_nvrtc_spills_less_if_threads_share_a_trajectory() -> None:
+    pytest.importorskip("cuda.core")
+    pytest.importorskip("cuda.bindings.nvrtc")
+    stepper, spilled = sc.compile_stepper(sc.problem("outer-solar-system").system, "svi:8"), {}
+    for name in ("points", "ensemble"):
+        log = io.StringIO()
+        cuda.build(cuda.kernel_text(stepper._variants[name]), "sm_90", log=log, ptxas_options=["-v"])
+        spilled[name] = sum(map(int, re.findall(r"(\d+) bytes spill", log.getvalue())))
+    assert spilled["points"] < spilled["ensemble"] / 3
+
+
 LIMITS = {("kepler", 4): (220, 0), ("henon-heiles", 4): (206, 0), ("kepler", 8): (255, 352)}
 """Registers and bytes of spilled loads that are accepted; those on sm_90 by NVRTC 13.5, and 3 % more."""
 
@@ -355,7 +386,7 @@ def test_nvrtc_compiles_kernels_within_registers(system: str, degree: int) -> No
         assert (max(used), max(spilled)) <= LIMITS[system, degree]
 
 
-@pytest.mark.second
+@pytest.mark.full
 def test_ptx_of_nvrtc_computes_the_same_growth_as_c(gpu: EmulatedGpu) -> None:
     pytest.importorskip("cuda.core")
     pytest.importorskip("cuda.bindings.nvrtc")
@@ -374,13 +405,17 @@ def test_ptx_of_nvrtc_computes_the_same_growth_as_c(gpu: EmulatedGpu) -> None:
         ("kepler", sc.SVI(4), PLAN | {"observe": "energy"}),
         ("henon-heiles", sc.Gauss(2), PLAN),
         pytest.param("henon-heiles", sc.SVI(2), {"t_end": ENDS, "tolerance": 1e-4}, marks=pytest.mark.full),
+        pytest.param("henon-heiles", sc.SVI(5), PLAN, marks=pytest.mark.full),
     ],
-    ids=["observed", "fixed", "adaptive"],
+    ids=["observed", "fixed", "adaptive", "points"],
 )
-def test_ptx_of_nvrtc_computes_the_same_bits_as_c(gpu: EmulatedGpu, system: str, method: Method, plan: dict) -> None:
+def test_ptx_of_nvrtc_computes_the_same_bits_as_c(
+    gpu: EmulatedGpu, monkeypatch, system: str, method: Method, plan: dict
+) -> None:
     pytest.importorskip("cuda.core")
     pytest.importorskip("cuda.bindings.nvrtc")
     stepper, start = compiled(system, method), states(system)
+    monkeypatch.setattr(ensemble, "FEWEST_COORDINATES", 2)
     gpu.estimates = True
     by_c = stepper.integrate_ensemble(*start, **plan, device="cuda").to_host()
     gpu.by_nvrtc = True

@@ -22,8 +22,8 @@ SIGNS |= {"rem": "%", "div": "/"}
 COMPARED = {"eq": "==", "lt": "<", "le": "<=", "gt": ">", "ge": ">=", "lo": "<", "ls": "<=", "hi": ">", "hs": ">="}
 INVERTED = {"ltu": ">=", "leu": ">", "gtu": "<=", "geu": "<", "neu": "=="}
 """Comparisons that are true for NaN, by their negation."""
-SPECIAL = {"%tid.x": "0", "%ctaid.x": "trajectory", "%ntid.x": "1", "%SP": "SP", "%SPL": "SPL"}
-"""Registers of the thread: here every block has one."""
+SPECIAL = {"%tid.x": "(trajectory % 8)", "%ctaid.x": "(trajectory / 8)", "%ntid.x": "8", "%SP": "SP", "%SPL": "SPL"}
+"""Registers of the thread: here every block has eight."""
 FUNCTIONS = {"neg": "-{0}", "abs": "fabs({0})", "rcp": "1.0 / {0}", "sqrt": "sqrt({0})", "cvta": "{0}"}
 FUNCTIONS |= {"rsqrt": "device_inverse_root({0})", "fma": "fma({0}, {1}, {2})", "min": "({0} < {1} ? {0} : {1})"}
 FUNCTIONS |= {
@@ -31,16 +31,37 @@ FUNCTIONS |= {
     "selp": "({2} ? {0} : {1})",
     "not": "~{0}",
     "prmt": "permuted({0}, {1}, {2})",
+    "bfi": "inserted({0}, {1}, {2}, {3})",
     "copysign": "copysign({1}, {0})",
     "clz": "__builtin_clz({0})",
 }
 
+EXCHANGE = """#include <pthread.h>
+_Thread_local long long trajectory; /* number of the thread */
+static _Thread_local int turn;
+static pthread_barrier_t all_points;
+static uint64_t exchanged[2][8];
+__attribute__((constructor)) static void initialise(void) { pthread_barrier_init(&all_points, NULL, 8); }
+static uint64_t of_thread(uint64_t bits, int j)
+{
+  uint64_t *values = exchanged[turn];
+  turn = 1 - turn;
+  values[trajectory % 8] = bits;
+  pthread_barrier_wait(&all_points);
+  return values[j % 8];
+}
+"""
+"""Values of the other threads of eight that share a trajectory, which run at the same time."""
 HEAD = """#include <math.h>
 #include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
-long long trajectory;
 static inline double of_bits(uint64_t bits) { double x; memcpy(&x, &bits, 8); return x; }
+static inline uint64_t inserted(uint64_t bits, uint64_t into, uint32_t first, uint32_t count)
+{
+  const uint64_t mask = (count < 64 ? (1ULL << count) - 1 : ~0ULL) << first;
+  return (into & ~mask) | (bits << first & mask);
+}
 static inline uint32_t permuted(uint32_t low, uint32_t high, uint32_t selected)
 {
   uint32_t bytes = 0;
@@ -86,7 +107,7 @@ def ptx_of(text: str, architecture: str) -> str:
 def translated(ptx: str) -> str:
     """Return C with a function for each kernel; its thread is the number ``trajectory``."""
     ptx = re.sub(r"//.*", "", ptx)
-    parts = [HEAD, ESTIMATE, LIBRARY]
+    parts = [HEAD, EXCHANGE, ESTIMATE, LIBRARY]
     for bits, name, size, values in re.findall(r"\.align \d+ \.b(\d+) (\w+)\[(\d+)\] = \{([^}]*)\}", ptx):
         parts.append(f"static const uint{bits}_t {name}[{size}] __attribute__((aligned(16))) = {{{values}}};")
     own = r"\.func[^{]*?\b__internal_\w+\s*\([^()]*\)\s*\{.*?\n\}"
@@ -167,6 +188,8 @@ def _assignment(name: str, kinds: list[str], arguments: list[str]) -> str:
         pairs = zip(elements, cells, strict=True) if name == "ld" else zip(cells, elements, strict=True)
         return " ".join(f"{one} = {other};" for one, other in pairs)
     target, *values = arguments
+    if name == "shfl":
+        return f"{_value(target.split('|')[0])} = of_thread({_value(values[0])}, {_value(values[1])});"
     half = 32 if last == "b64" else 16
     if name == "mov" and target.startswith("{"):
         low, high = (_value(each) for each in target.strip("{}").split(", "))

@@ -8,7 +8,7 @@ repeats it from the start.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Protocol, cast
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.native.cuda import DEVICES, Device, constant, has_device_memory
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.rendering.source import Source
+from scvi_codegen.rendering.source import POINT_THREADS, Source
 from scvi_codegen.representation import one_line
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array
@@ -35,6 +35,8 @@ from scvi_codegen.validation import LARGEST_COUNT
 
 FIRST_STEPS, GROWTH = 64, 8.0
 """Steps of the first launch, and the largest ratio of those of successive ones."""
+FEWEST_COORDINATES = 7
+"""Number of coordinates from which on :data:`POINT_THREADS` threads share a trajectory, if its steps allow it."""
 HEAD = 4
 """Numbers in front of the memory of a trajectory: time, its low word, steps for the predictor, 1 while active."""
 
@@ -96,11 +98,13 @@ class DeviceRuns:
         observation: EnsembleObservation | None = None,
         *,
         record: ThreadRecord | None = None,
+        source: Source | None = None,
     ) -> None:
         self.stepper, self.options, self.start, self.steps = stepper, options or SolverOptions(), start, steps
         self.values_at, self.observation, self.device = values_at, observation, Device()
         record = self.record = record or observation
-        source = cast(Source, stepper.ensemble) if record is None else record.source
+        self.values = parameters
+        source = source or cast(Source, stepper.ensemble if record is None else record.source)
         self.launch = self.device.kernels(source)
         count, self.m = map(int, start[0].shape)
         self.count, device = count, self.device
@@ -109,10 +113,8 @@ class DeviceRuns:
         for initial, states in zip(saved, (self.q, self.p), strict=True):
             device.copy_in(initial, states)
         self.parameters = device.copied(parameters if parameters.size else np.zeros((count, 1)))
-        self.points = constant(source, "S")
-        self.needs_velocities = bool(constant(source, f"{source.prefix.upper()}_NEEDS_VELOCITIES"))
         self.h = steps.segments[0].h
-        self.memory = device.copied(self._first_memory(parameters))
+        self._begin(source)
         self.counts = device.copied(np.zeros(count, np.int64))
         self.status, self.done = np.full(count, OK, dtype="<U32"), np.zeros(count, dtype=np.int64)
 
@@ -123,6 +125,12 @@ class DeviceRuns:
     def size(self) -> int:
         """Numbers in the memory of a trajectory, without observed values."""
         return HEAD + (4 + 2 * self.points) * self.m
+
+    def _begin(self, source: Source) -> None:
+        """Prepare the memory of the threads."""
+        self.points = constant(source, "S")
+        self.needs_velocities = bool(constant(source, f"{source.prefix.upper()}_NEEDS_VELOCITIES"))
+        self.memory = self.device.copied(self._first_memory(self.values))
 
     def states(self) -> tuple[Array, Array]:
         """Return copies of the (n, k, m) saved positions and momenta on the processor."""
@@ -188,10 +196,13 @@ class DeviceRuns:
             self._reset_predictor(memory, parameters)
             device.copy_in(memory, self.memory)
 
+    def _rows(self, begin: int) -> Iterator[np.uint64]:
+        """Yield the places of the positions and of the momenta that are saved first after a step."""
+        size = self.steps.row(begin) * self.count * self.q.shape[2] * self.q.dtype.itemsize
+        yield from (np.uint64(each.ptr + size) for each in (self.q, self.p))
+
     def _advance(self, begin: int, size: int, save_every: int) -> None:
-        rows = self.steps.row(begin) * self.count * self.q.shape[2] * self.q.dtype.itemsize
-        options = self.options
-        states = (np.uint64(each.ptr + rows) for each in (self.q, self.p))
+        options, states = self.options, self._rows(begin)
         numbers = options_of(options)
         memory = self.memory, self.parameters, *states, self.counts
         self.launch("thread_advance", self.count, self.count, begin, size, save_every, float(self.h), *numbers, *memory)
@@ -224,6 +235,36 @@ class DeviceRuns:
         for target, values in ((self.q, work.q), (self.p, work.p)):
             arguments = self.count, rows, len(failed), which, self.device.copied(values), target
             self.launch("thread_replace", rows * len(failed), *arguments)
+
+
+class PointRuns(DeviceRuns):
+    """Trajectories with equal steps on a GPU, each by :data:`POINT_THREADS` threads with one point of a step each."""
+
+    def _begin(self, source: Source) -> None:
+        device, size = self.device, self.device.copied(np.zeros(1, np.int64))
+        self.launch("thread_size", 1, size)
+        self.memory = device.empty((int(device.copy_out(size)[0]) * POINT_THREADS * self.count,), np.uint8)
+        self.initial = [device.copied(each) for each in self.start]
+
+    def _advance(self, begin: int, size: int, save_every: int) -> None:
+        plan = self.count, begin, size, save_every, float(self.steps.t0), float(self.h), *options_of(self.options)
+        arrays = self.memory, *self.initial, self.parameters, *self._rows(begin), self.counts
+        self.launch("thread_points", POINT_THREADS * self.count, *plan, *arrays)
+
+    def _continue(self, failed: NDArray[np.intp], threads: int | None) -> None:
+        """Repeat trajectories on the processor, and store their states on the device."""
+        if not failed.size:
+            return
+        start, values = (self.start[0][failed], self.start[1][failed]), self.values[failed]
+        work = CommonRuns(self.stepper, self.options, start, values, lambda _, part: values[part], self.steps)
+        run_jobs(
+            len(failed), lambda j, _: SingleBlock(work, j).advance(self.steps.steps), progress=None, threads=threads
+        )
+        self.status[failed], self.done[failed] = work.status, work.done
+        for target, saved in ((self.q, work.q), (self.p, work.p)):
+            states = self.device.copy_out(target)
+            states[:, failed] = saved
+            self.device.copy_in(states, target)
 
 
 class AdaptiveDeviceRuns:

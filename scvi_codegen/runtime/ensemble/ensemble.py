@@ -21,12 +21,15 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen.errors import EventError, StateError, StepFailedError
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.native.options import SolverOptions, checked_options
+from scvi_codegen.rendering.source import Source
 from scvi_codegen.runtime.core.features import check_together, require
 from scvi_codegen.runtime.core.validation import Array, States, check_left_to_inputs, columns_of_inputs, parameter_index
 from scvi_codegen.runtime.ensemble.device import (
+    FEWEST_COORDINATES,
     AdaptiveDeviceRuns,
     DeviceEnsemble,
     DeviceRuns,
+    PointRuns,
     check_device,
     on_processor,
 )
@@ -154,7 +157,9 @@ class Ensemble:
         if fixed is not None and not stepper.changes_states:
             kind = CommonRuns if device is None else DeviceRuns
             observation = None if observe is None else EnsembleObservation(stepper, observe, len(self))
-            self.common = kind(stepper, self.options, self.start, self.parameters, self.values_at, fixed, observation)
+            arguments = stepper, self.options, self.start, self.parameters, self.values_at, fixed, observation
+            points = None if device is None or observation is not None else self._source_of_points(fixed)
+            self.common = kind(*arguments) if points is None else PointRuns(*arguments, source=points)
         elif observe is not None:
             raise StateError(
                 f"observe={observe!r} requires a fixed step size and events that do not change the state: give h and "
@@ -163,6 +168,12 @@ class Ensemble:
         self.states: list[Rows] = []
         self.adaptive = None if device is None or self.common is not None else self._on_device()
         self.successive = self._successive()
+
+    def _source_of_points(self, fixed: CommonSteps) -> Source | None:
+        """Return the source whose points are threads of a GPU, for many coordinates and equal steps, or ``None``."""
+        if len(fixed.segments) > 1 or self.inputs or self.stepper.dimension < FEWEST_COORDINATES:
+            return None
+        return cast("Source | None", self.stepper._variants["points"])
 
     def _successive(self) -> SuccessiveRuns | None:
         """Return the trajectories that C integrates one after the other, ``None`` for other ensembles."""
