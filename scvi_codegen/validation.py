@@ -7,19 +7,54 @@ they are converted (:func:`checked_count`, :mod:`scvi_codegen.native.options`).
 from __future__ import annotations
 
 import functools
+import math
 import numbers
 import operator
 import os
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from decimal import Context, Decimal
 from inspect import Parameter, signature
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, Self, TypeVar, cast
 
 import numpy as np
 
 from scvi_codegen.errors import ArgumentError, ScviCodegenError, StateError, closest
+
+NUMERAL = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?\s*(/\s*\d+\s*)?", re.ASCII | re.IGNORECASE)
+"""Text of a decimal number, or of a fraction with a whole denominator."""
+SIXTY_DIGITS = Context(prec=60)
+
+
+class ExactNumber(float):
+    """Nearest double to a number in text, ``"0.1"`` or ``"1/3"``; ``low`` is the nearest double to the rest."""
+
+    low: float = 0.0
+    decimal: Decimal | None = None
+
+    def __new__(cls, text: str) -> Self:
+        """Return the number in a text; raise ``ValueError`` for other text."""
+        numerator, bar, denominator = text.partition("/")
+        if not math.isfinite(high := float(numerator)):
+            return super().__new__(cls, high)
+        exact = Decimal(numerator.strip())
+        if bar:
+            if not NUMERAL.fullmatch(text) or not float(denominator):
+                raise ValueError(f"'{text}' is not a fraction of numbers, as in 1/3")
+            exact = SIXTY_DIGITS.divide(exact, Decimal(denominator.strip()))
+            high = float(exact)
+        number = super().__new__(cls, high)
+        number.low = float(SIXTY_DIGITS.subtract(exact, Decimal(high))) if high else 0.0
+        number.decimal = SIXTY_DIGITS.plus(exact)
+        return number
+
+    def __str__(self) -> str:
+        return repr(self) if self.decimal is None else str(self.decimal)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (str(self),)
 
 
 @functools.cache

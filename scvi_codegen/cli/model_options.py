@@ -33,6 +33,7 @@ from scvi_codegen.models.options import (
     excluded,
 )
 from scvi_codegen.models.problems import PROBLEMS, problem
+from scvi_codegen.validation import ExactNumber
 
 MOST_COORDINATES = 2000
 """Largest number of coordinates of an array model that is compiled with its sizes: its equations are unrolled."""
@@ -63,7 +64,7 @@ def _numbers(context: click.Context, parameter: click.Parameter, value: str | No
     if value is None:
         return None
     try:
-        return tuple(float(word) for word in re.split(r"[,\s]+", value.strip()))
+        return tuple(ExactNumber(word) for word in re.split(r"[,\s]+", value.strip()))
     except ValueError as error:
         raise click.BadParameter(f"{error}; give numbers separated by commas, as in 0.5,-1.2e-3") from error
 
@@ -83,7 +84,7 @@ def _assignments(
     for text in values:
         name, equals, number = (part.strip() for part in text.partition("="))
         try:
-            value = float(number)
+            value: float = ExactNumber(number)
         except ValueError:
             value = math.nan
         if not name or not equals or not math.isfinite(value):

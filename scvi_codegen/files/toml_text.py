@@ -5,6 +5,7 @@ Tables that belong to this package are TOML files beside its modules.
 
 import re
 import tomllib
+from collections.abc import Callable
 from typing import Any
 
 from scvi_codegen.errors import ModelFileError
@@ -17,8 +18,8 @@ LONG_KEY = re.compile(r"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\
 """Keys with many dots; the time of the parser grows with the square of their number."""
 
 
-def read_toml(text: str) -> dict[str, Any]:
-    """Return the document in a text.
+def read_toml(text: str, parse_float: Callable[[str], float] = float) -> dict[str, Any]:
+    """Return the document in a text, with numbers with a point or an exponent by ``parse_float``.
 
     Raises:
         ModelFileError: for text that is not TOML, or longer or deeper than any file of this program.
@@ -28,7 +29,7 @@ def read_toml(text: str) -> dict[str, Any]:
     if LONG_KEY.search(text):
         raise ModelFileError("this is not a file of this program: a key has more than 32 words between dots")
     try:
-        document = tomllib.loads(text)
+        document = tomllib.loads(text, parse_float=parse_float)
     except tomllib.TOMLDecodeError as error:
         raise ModelFileError(f"this is not TOML: {error}") from error
     except RecursionError:

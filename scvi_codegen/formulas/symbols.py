@@ -25,6 +25,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.validation import ExactNumber
 
 if TYPE_CHECKING:
     from sympy import Basic, Expr, Symbol
@@ -50,7 +51,9 @@ def symbol(name: str) -> Symbol:
 
 
 def number(name: str, value: Any) -> float:
-    """Convert a default value to float; text, complex and non-finite numbers are rejected."""
+    """Convert a default value to float, also an exact one; text, complex and non-finite numbers are rejected."""
+    if isinstance(value, ExactNumber) and math.isfinite(value):
+        return value
     try:
         converted = math.nan if isinstance(value, (str, bytes, complex)) else float(value)
     except (TypeError, ValueError, OverflowError):

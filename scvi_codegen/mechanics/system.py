@@ -34,7 +34,7 @@ from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.files.cache import key_of, store_text, stored_text
 from scvi_codegen.formulas.symbols import DOT, number, symbol
 from scvi_codegen.indices import Array
-from scvi_codegen.validation import of
+from scvi_codegen.validation import ExactNumber, of
 
 if TYPE_CHECKING:
     from sympy import Expr, Symbol
@@ -103,6 +103,8 @@ def _text_of(cls: type, arguments: Mapping[str, Any]) -> str | None:
         arguments["coordinates"], arguments["parameters"] or (), arguments["tables"]
     ):
         return None
+    if any(isinstance(value, ExactNumber) for value in (arguments["parameters"] or {}).values()):
+        return None  # JSON has one word
     plain = {name: dict(value) if isinstance(value, Mapping) else value for name, value in arguments.items()}
     try:
         return json.dumps([f"{cls.__module__}.{cls.__qualname__}", plain])

@@ -19,7 +19,15 @@ from scvi_codegen.mechanics.first_order import FirstOrderSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import Method, as_method
 from scvi_codegen.methods.galerkin import SVI
-from scvi_codegen.models.options import RUN_FIELDS, STATE, VELOCITY, check_alternatives, checked_path_value, real
+from scvi_codegen.models.options import (
+    RUN_FIELDS,
+    STATE,
+    VELOCITY,
+    check_alternatives,
+    checked_path_value,
+    real,
+    with_exact_numbers,
+)
 from scvi_codegen.models.problems import Problem
 from scvi_codegen.models.time_span import TimeSpan, check_length
 from scvi_codegen.representation import summary
@@ -429,6 +437,8 @@ class Model(TimeSpan):
             raise ModelFileError(f"{name} must be {len(names)} numbers, not {values!r}")
         values = tuple(values)
         check_length(values, names, name)
+        if self.in_double_double:
+            values = tuple(with_exact_numbers(values))
         return tuple(real(value, f"{name}[{i}] ({names[i]})") for i, value in enumerate(values))
 
 

@@ -8,6 +8,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
+from fractions import Fraction
 from itertools import combinations
 from numbers import Real
 from typing import Any, NamedTuple
@@ -17,7 +18,7 @@ from scvi_codegen.errors import ModelFileError
 from scvi_codegen.native.cuda import DEVICES
 from scvi_codegen.rendering.source import DOUBLE_DOUBLE, PRECISIONS
 from scvi_codegen.runtime.ensemble.observation import OBSERVED
-from scvi_codegen.validation import TOLERANCE_RANGE, checked_count
+from scvi_codegen.validation import NUMERAL, TOLERANCE_RANGE, ExactNumber, checked_count
 
 NUMBER, COUNT, TEXT, CHOICE, SWITCH, METHOD = "number", "count", "text", "choice", "switch", "method"
 NUMBERS, NUMBERS_OR_NAME = "numbers", "numbers or name"
@@ -97,7 +98,7 @@ class Option:
             if not isinstance(value, bool):
                 raise ModelFileError(f"{where} must be true or false, not {value!r}")
             return value
-        return real(value, where)
+        return float(real(value, where))
 
     def checked(self, value: Any) -> Any:
         """Return a value of a field, or raise :class:`ModelFileError` with the message of the option."""
@@ -346,13 +347,28 @@ def check_available(values: Any, situation: str) -> None:
 
 
 def real(value: Any, where: str) -> float:
-    """Return a finite number, or raise an error that begins with ``where``."""
+    """Return a finite number, also an exact one, or raise an error that begins with ``where``."""
     if isinstance(value, bool) or not isinstance(value, Real):
         raise ModelFileError(f"{where} must be a number, not {value!r}")
     try:
-        number = float(value)
+        number = value if isinstance(value, ExactNumber) else float(value)
     except OverflowError:
         number = math.inf
     if not math.isfinite(number):
         raise ModelFileError(f"{where} is {number}: it must be a finite number")
     return number
+
+
+def with_exact_numbers(value: Any, *, exact: bool = True) -> Any:
+    """Return a number, or a list or table of numbers, with text and fractions as exact numbers, or all as doubles."""
+    if isinstance(value, dict):
+        return {key: with_exact_numbers(each, exact=exact) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [with_exact_numbers(each, exact=exact) for each in value]
+    if not exact:
+        return float(value) if isinstance(value, ExactNumber) else value
+    numeral = isinstance(value, str) and NUMERAL.fullmatch(value)
+    try:
+        return ExactNumber(str(value)) if numeral or isinstance(value, Fraction) else value
+    except ValueError as error:
+        raise ModelFileError(str(error)) from error

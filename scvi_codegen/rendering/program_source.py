@@ -207,6 +207,7 @@ def render_double_double(program: Program, derivatives: PointDerivatives, contro
     context = _context(program, DOUBLE, control)
     context |= {
         **_lane_context(program, lanes, changes=False),
+        "cut": context["cut"] or is_divided(lanes),
         "two_words": {
             "derivatives": derivatives.count,
             "of_numbers": numbers,

@@ -83,6 +83,37 @@ def test_other_options_and_commands_are_refused(spring: Path, words: list[str], 
     assert sorted(path.name for path in spring.parent.iterdir()) == ["spring.toml"]
 
 
+EXACT = {"q": "[0.1]", "q_dot": '["1/3"]', "w": "0.3"}
+
+
+@pytest.mark.parametrize("words", [[], ["--q", "1/10", "--velocity", "1/3", "--parameter", "w=3/10"]])
+def test_decimals_and_fractions_are_exact(spring: Path, words: list[str]) -> None:
+    """Numbers of a file and of flags are exact decimals and fractions; in double they are the nearest doubles."""
+    text = TEXT.replace("- q**2/2", "- w*q**2/2").replace("[0.5]", EXACT["q"] if not words else "[7.0]")
+    text = text.replace("[0.25]", EXACT["q_dot"] if not words else "[7.0]")
+    spring.write_text(text.replace("[initial]", f"[parameters]\nw = {EXACT['w'] if not words else 7.0}\n[initial]"))
+    shown = CliRunner().invoke(main, ["run", str(spring), *words, "-o", "states.npz"])
+    assert shown.exit_code == 0
+    with mp.workdps(40), np.load("states.npz") as saved:
+        rate = mp.sqrt(mp.mpf(3) / 10)
+        exact = mp.cos(2 * rate) / 10 + mp.sin(2 * rate) / rate / 3
+        assert abs(mp.mpf(saved["q"][-1, 0]) + saved["q_low"][-1, 0] - exact) < 1e-31
+    if not words:
+        model = sc.load_model(spring)
+        sc.save_model(model, "again.toml")
+        again = sc.load_model("again.toml")
+        numbers = [(*each.q, *each.velocity, *each.parameters.values()) for each in (model, again)]
+        lows = [[x.low for x in each] for each in numbers]
+        assert lows[0] == lows[1]
+        assert all(lows[0])
+    else:
+        double = CliRunner().invoke(main, ["run", str(spring), *words, "--precision", "double", "--json"])
+        assert abs(json.loads(double.stdout)["final"]["q"]["q"] - float(exact)) < 1e-14
+        for wrong in ("1/0", "1/x", "1/2/3"):
+            refused = CliRunner().invoke(main, ["run", str(spring), "--q", wrong])
+            assert "give numbers separated by commas" in " ".join(refused.output.split())
+
+
 def test_precision_is_read_and_replaced(spring: Path) -> None:
     """The flag replaces the value of the file; unknown values are refused."""
     assert not sc.load_model(spring, {"run": {"precision": "double"}}).in_double_double

@@ -52,9 +52,10 @@ from scvi_codegen.models.model_files.sections import (
     words_of,
 )
 from scvi_codegen.models.model_files.values import read_values
-from scvi_codegen.models.options import STATE, STEP_KEYS, options_of
+from scvi_codegen.models.options import STATE, STEP_KEYS, options_of, with_exact_numbers
 from scvi_codegen.models.problems import Problem
-from scvi_codegen.validation import checks_arguments, of
+from scvi_codegen.rendering.source import DOUBLE_DOUBLE
+from scvi_codegen.validation import ExactNumber, checks_arguments, of
 
 SYSTEM_KEYS = (
     *("name", "coordinates", *TURNING, "momenta", *FORMULAS, "inputs", "neighbours", "catalogue"),
@@ -121,6 +122,8 @@ def parse_model(text: str, changes: Document | None = None, *, folder: str | os.
         folder: base of relative paths.
     """
     document = read_toml(text)
+    if DOUBLE_DOUBLE in (_precision(document), _precision(changes or {})):
+        document = read_toml(text, ExactNumber)
     check_keys(document, SECTIONS, "section")
     for name, content in document.items():
         if not isinstance(content, dict) and name != "events":
@@ -128,6 +131,11 @@ def parse_model(text: str, changes: Document | None = None, *, folder: str | os.
     for name, known in KEYS.items():
         check_keys(document.get(name, {}), known, "key", f"[{name}]")
     return _read_model(document, changes or {}, folder)
+
+
+def _precision(document: Document) -> Any:
+    run = document.get("run")
+    return run.get("precision") if isinstance(run, dict) else None
 
 
 def dump_model(model: Model) -> str:
@@ -172,6 +180,8 @@ def _read_model(document: Document, changes: Document, folder: str | os.PathLike
         changes = _without_inherited_step(changes)
     document = _without_inherited_step(document)
     document, specification, solver = _merged(document, changes, entry)
+    numbers = {name: document[name] for name in ("parameters", "initial") if name in document}
+    document = {**document, **with_exact_numbers(numbers, exact=_precision(document) == DOUBLE_DOUBLE)}
     with warnings.catch_warnings():  # other formulas than that of the system may use its parameters
         warnings.simplefilter("ignore", SystemDefinitionWarning)
         if "field" in document:

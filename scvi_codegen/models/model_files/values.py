@@ -69,7 +69,7 @@ def read_values(
     """
     section, any_system = document["initial"], cast(Any, system)
     check_one(section, "initial", "p", "q_dot")
-    time = {"t": real(section.get("t", 0.0), "[initial] t")}
+    time = {"t": float(real(section.get("t", 0.0), "[initial] t"))}
     entries = _parameter_entries(document.get("parameters", {}), system)
     if isinstance(any_system, ArraySystem):
         if any_system.rotations:

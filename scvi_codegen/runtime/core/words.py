@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError
+from scvi_codegen.validation import ExactNumber
 
 Array = NDArray[np.float64]
 Shapes = Sequence[tuple[str, tuple[int, ...]]]
@@ -190,6 +191,8 @@ def two_words(value: Any, name: str) -> tuple[float, float]:
     """
     if type(value) is float and np.isfinite(value):
         return value, 0.0
+    if isinstance(value, ExactNumber) and np.isfinite(value):
+        return float(value), value.low
     from mpmath import mp
 
     try:
