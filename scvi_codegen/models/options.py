@@ -349,7 +349,7 @@ def check_available(values: Any, situation: str) -> None:
 def real(value: Any, where: str) -> float:
     """Return a finite number, also an exact one, or raise an error that begins with ``where``."""
     if isinstance(value, bool) or not isinstance(value, Real):
-        raise ModelFileError(f"{where} must be a number, not {value!r}")
+        raise ModelFileError(f"{where} must be a number, not {value!r:.60}")
     try:
         number = value if isinstance(value, ExactNumber) else float(value)
     except OverflowError:

@@ -9,6 +9,7 @@ same program, so that no text is evaluated as code.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
@@ -29,6 +30,9 @@ from scvi_codegen.indices import Array, Size
 
 Values = NDArray[np.float64]
 
+FAMILY = re.compile(r"(\w+)\[([A-Za-z]\w*) in (\d+)\]")
+"""Name of a family of points: name, index and number."""
+MAX_FAMILY = 1000
 MARKS = ("walls", "rods", "springs", "bodies", "trails")
 """Keys of a picture besides ``points``, in the order in which they are drawn."""
 OPERATIONS: Mapping[str, Callable[..., Any]] = {
@@ -203,9 +207,10 @@ def shape_of_picture(drawn: DrawnSystem, picture: Mapping[str, Any], where: str 
     Args:
         drawn: system with the names that the formulas may use.
         picture: ``points``, two or three formulas or numbers by name, in coordinates, momenta, entries of rotations,
-            parameters and t; ``rods``, ``springs`` and ``walls``, lists of names of points; ``bodies`` and ``trails``,
-            names of points, by default those that move and are not ends of walls, and the bodies.
-            Of a field on a mesh instead ``fields``, the names of fields or momenta that are drawn.
+            parameters and t, by ``p[k in 12]`` of ``p[0]`` to ``p[11]``, all of which ``p`` names; ``rods``,
+            ``springs`` and ``walls``, lists of names of points; ``bodies`` and ``trails``, names of points, by default
+            those that move and are not ends of walls, and the bodies. Of a field on a mesh instead ``fields``, the
+            names of fields or momenta that are drawn.
         where: of it, for messages.
 
     Raises:
@@ -224,8 +229,9 @@ def shape_of_picture(drawn: DrawnSystem, picture: Mapping[str, Any], where: str 
     for key in picture:
         if key not in ("points", *MARKS):
             raise ModelFileError(f"{where}: unknown key {key!r}{closest(key, MARKS)} Known: points, {', '.join(MARKS)}")
-    names, reader, program = [*picture["points"]], _reader(drawn), PointProgram(drawn.names)
-    formulas = [_components(reader, each, f"{where} points {name}") for name, each in picture["points"].items()]
+    reader, program, points = _reader(drawn), PointProgram(drawn.names), _single_points(picture["points"], where)
+    names = [*points]
+    formulas = [_components(reader, each, f"{where} points {name}") for name, each in points.items()]
     if len({*map(len, formulas)}) > 1:
         raise ModelFileError(f"{where} points must all have two components, in the plane, or all three, in space")
     state = {symbol(each) for each in drawn.names[: len(drawn.names) - len(drawn.interface.parameters)]}
@@ -247,6 +253,24 @@ def shape_of_picture(drawn: DrawnSystem, picture: Mapping[str, Any], where: str 
         dimension=len(formulas[0]), points=[program.point(each) for each in formulas], program=program.entries,
         marks=marks, trails=trails, movable=[k for k in shown if names[k] in moving],
     )  # fmt: skip
+
+
+def _single_points(points: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Return points by name, with families as ``p[k in 12]`` expanded."""
+    result: dict[str, Any] = {}
+    for name, formulas in points.items():
+        if not (family := FAMILY.fullmatch(name)):
+            result[name] = formulas
+            continue
+        begin, letter, count = family[1], family[2], int(family[3])
+        if not 0 < count <= MAX_FAMILY or not isinstance(formulas, list | tuple):
+            raise ModelFileError(
+                f"{where} points {name} must be formulas of 1 to {MAX_FAMILY} points, not {formulas!r:.60}"
+            )
+        index = re.compile(rf"\b{letter}\b")
+        for k in range(count):
+            result[f"{begin}[{k}]"] = [index.sub(str(k), x) if isinstance(x, str) else x for x in formulas]
+    return result
 
 
 def _chosen_fields(drawn: DrawnSystem, names: Sequence[Any], where: str) -> MovingShape:
@@ -305,7 +329,12 @@ def _numbers(names: Any, known: Sequence[str], where: str) -> list[int]:
     """Return the numbers of points by name."""
     if not isinstance(names, list | tuple):
         raise ModelFileError(f"{where} must be lists of points, [[{', '.join(map(repr, known[:2]))}]], not {names!r}")
+    numbers: dict[Any, list[int]] = {}
+    for k, name in enumerate(known):
+        numbers.setdefault(name, []).append(k)
+        if name.endswith("]"):
+            numbers.setdefault(name.partition("[")[0], []).append(k)
     for name in names:
-        if name not in known:
+        if not isinstance(name, str) or name not in numbers:
             raise ModelFileError(f"{where}: there is no {name!r}{closest(str(name), known)} Known: {', '.join(known)}")
-    return [known.index(name) for name in names]
+    return [k for name in names for k in numbers[name]]

@@ -75,6 +75,7 @@ def test_a_picture_is_drawn_in_films_and_written_to_files(tmp_path):
         ('cart = ["x", 0]', 'cart = "x"', r"points cart must be two or three formulas or numbers"),
         ('cart = ["x", 0]', 'cart = ["x", 0, 0]', "must all have two components, in the plane, or all three"),
         ('cart = ["x", 0]', 'cart = ["x", true]', "points cart: True must be a formula or a number"),
+        ('cart = ["x", 0]', '"cart[k in 0]" = ["x", "k"]', "must be formulas of 1 to 1000 points"),
         ("springs", "strings", r"unknown key 'strings' in \[picture\]; did you mean 'springs'"),
         ('["end", "cart"]', '["end", "card"]', "springs: there is no 'card'; did you mean 'cart'"),
         ('["end", "cart"]', '["end"]', r"springs: \['end'\] must be two points"),
@@ -85,6 +86,20 @@ def test_a_picture_is_drawn_in_films_and_written_to_files(tmp_path):
 def test_mistakes_in_a_picture_are_errors(old, new, message):
     with pytest.raises(sc.ModelFileError, match=message):
         parse_model(CART.replace(old, new))
+
+
+def test_a_family_of_points_is_listed_by_its_name():
+    text = CART.replace('points.cart = ["x", 0]', 'points."cart[k in 3]" = ["x + k*pi", "k"]')
+    model = parse_model(
+        text.replace('rods = [["cart", "bob"]]', 'rods = [["cart", "bob"]]\ntrails = ["cart[2]"]').replace(
+            '["end", "cart"]', '["end", "cart[0]"]'
+        )
+    )
+    shape = shape_of_picture(drawn_system_of_model(model), model.picture)
+    assert [mark["points"] for mark in shape.marks if mark["kind"] in ("rod", "spring")] == [[3, 4, 5, 6], [2, 3]]
+    assert shape.trails == [5]
+    state = shape.positions(0.0, np.array([[0.1, 0.5]]), np.zeros((1, 2)), [9.81, 2.0, 1.5])[0]
+    assert np.allclose(state[3:6], [[0.1, 0], [0.1 + np.pi, 1], [0.1 + 2 * np.pi, 2]])
 
 
 def test_pictures_of_arrays_and_rotations_use_entries():
