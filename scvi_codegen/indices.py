@@ -90,7 +90,7 @@ class Array:
 
     @property
     def is_lattice(self) -> bool:
-        """Whether there are axes with names, all before those of integer size."""
+        """True if there are axes with names, all before those of integer size."""
         named = [bool(axis.name) for axis in self.axes]
         return bool(named) and named[0] and named == sorted(named, reverse=True)
 

@@ -41,5 +41,5 @@ class Controller:
 
     @property
     def in_tau(self) -> bool:
-        """Whether steps are of equal size in tau, which requires a time-rescaling function."""
+        """True if steps are of equal size in tau, which requires a time-rescaling function."""
         return self.values is not None

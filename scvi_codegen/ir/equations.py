@@ -427,7 +427,7 @@ class ErrorGrowth:
 
     @property
     def kernels(self) -> tuple[Kernel, ...]:
-        """Its kernels, all on lanes."""
+        """Kernels of the growth, all on lanes."""
         return (self.partials, self.product, *((self.energy,) if self.energy else ()))
 
 

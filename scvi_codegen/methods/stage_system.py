@@ -71,7 +71,7 @@ class EntryName:
 
     @property
     def transposed(self) -> EntryName:
-        """The same number where points are columns and columns are points."""
+        """Name of the same number in the transposed table, where points are columns."""
         one_index = self.point is None or self.column is None
         return replace(self, point=self.column, column=self.point, column_first=not (one_index or self.column_first))
 

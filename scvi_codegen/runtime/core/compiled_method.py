@@ -413,5 +413,5 @@ class CompiledMethod(ChosenBySizes):
 
     @property
     def _has_error_estimate(self) -> bool:
-        """Whether the method has adaptive steps for this system; true if that follows from sizes at run time."""
+        """True if the method has adaptive steps for this system; also if that follows from sizes at run time."""
         return self.binding.has("advance_to")

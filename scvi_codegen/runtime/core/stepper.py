@@ -732,7 +732,7 @@ class StepperOfRunTimeSizes(Stepper):
 
     @property
     def _has_error_estimate(self) -> bool:
-        """Whether the method has adaptive steps; true if that follows from the sizes."""
+        """True if the method has adaptive steps; also if that follows from the sizes."""
         return bool(self._reason) or "_advance_to(" in self.source.header
 
 
