@@ -19,7 +19,7 @@ from typing import Any
 import pytest
 from browsing import UNREADABLE, VIEWS, looked_at
 from docutils.utils.math.latex2mathml import tex2mathml
-from pages import BLOCK, ROOT, agree, run_command, run_page, runnable
+from pages import BLOCK, ROOT, Part, agree, run_command, run_page, runnable
 
 import scvi_codegen
 
@@ -159,6 +159,9 @@ def test_a_page_runs_from_top_to_bottom(name, tmp_path, monkeypatch):
     if missing:
         pytest.skip(f"{missing[0]} is not installed")
     parts = [part for part in runnable(PAGES[name]) if not part.text.startswith(MINUTES)]
+    if "{write-your-own}" in PAGES[name]:  # the form of the page writes the example
+        form = (ROOT / "docs" / "_extensions" / "motions.py").read_text(encoding="utf-8")
+        parts.insert(0, Part("file", re.findall(r'"Model file">(.*?)</pre>', form, re.DOTALL)[0], "model.toml"))
     run_page(name, parts, tmp_path, monkeypatch)
     assert [picture for picture in PICTURE.findall(PAGES[name]) if not (tmp_path / picture).is_file()] == []
 
