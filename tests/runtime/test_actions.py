@@ -188,7 +188,7 @@ def test_shadow_energy_is_constant_and_shows_a_drift(method, h):
 
 def test_shadow_energy_and_actions_are_refused_with_the_reason(stepper):
     run = stepper.integrate(START[:2], START[2:], h=0.2, steps=40)
-    with pytest.raises(MethodError, match="steps as long as those of this method"):
+    with pytest.raises(MethodError, match="with the long steps of this method"):
         run.shadow_energy()
     low = sc.compile_stepper(HENON_HEILES, "svi:1")
     with pytest.raises(StateError, match="all states of a run of fixed step size"):

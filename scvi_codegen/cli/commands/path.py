@@ -88,12 +88,8 @@ def _paths(model: Model) -> list[Path]:
         return different_paths(stepper, *ends, span, starts=wanted.get("starts", 0), **arguments)
     near = model.integrate()
     start = near.at(np.linspace(near.t[0], near.t[-1], steps + 1))[0]
-    return [stepper.path(T=span, start=np.asarray(start), closed=_symmetry(closed), **arguments)]
-
-
-def _symmetry(closed: Any) -> Any:
-    names = [each.strip() for each in closed.split(",")] if isinstance(closed, str) else closed
-    return True if names == ["true"] else names
+    symmetry = True if closed in ("true", ["true"]) else closed
+    return [stepper.path(T=span, start=np.asarray(start), closed=symmetry, **arguments)]
 
 
 def _described(found: Path) -> str:

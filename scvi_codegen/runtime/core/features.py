@@ -47,6 +47,8 @@ OPERATIONS = {
 }
 """Names of :meth:`~scvi_codegen.Stepper.supports`, and what messages call them."""
 
+SHORT_STEPS = ("svi-1-", "svi-2-", "stoermer-verlet", "composition")
+"""Beginnings of the names of methods whose steps are short enough for the interpolation of the shadow energy."""
 PROPERTIES: dict[str, Callable[[Any], bool]] = {
     "with a time transformation": lambda stepper: bool(stepper.interface.time_transformation),
     "in transformed time": lambda stepper: bool(stepper.interface.energy_parameter),
@@ -61,6 +63,8 @@ PROPERTIES: dict[str, Callable[[Any], bool]] = {
         stepper.interface.layout.constraints and stepper.interface.method.startswith("composition")
     ),
     "without constraints": lambda stepper: not (stepper.interface.constraints or stepper.interface.layout.constraints),
+    "with the long steps of this method": lambda stepper: not stepper.interface.method.startswith(SHORT_STEPS),
+    "where the energy changes": lambda stepper: bool(stepper.interface.changes_energy),
     "without a mesh": lambda stepper: stepper.interface.layout.mesh is None,
     "with sizes known when compiled": lambda stepper: not stepper.run_time_sizes,
     "with sizes known at run time": lambda stepper: stepper.run_time_sizes,
@@ -111,6 +115,14 @@ FEATURES = {
         ("in transformed time", "device chaos chaos_ensemble periodic_orbit fit flow", _ORIGINAL),
         ("in transformed time", _ACTIONS, _ORIGINAL),
         ("with a time transformation", "shadow_energy path", "compile the stepper without time_transformation"),
+        (
+            "with the long steps of this method",
+            "shadow_energy",
+            "differences of the states are less accurate than the energy; use energy(), or SVI of degree 1 or 2, "
+            "StoermerVerlet or a Composition",
+        ),
+        ("where the energy changes", "shadow_energy", "it is not conserved; use energy()"),
+        ("with constraints", "shadow_energy", "use energy()"),
         ("for a first-order system", _ACTIONS, "use a system whose velocities determine its momenta"),
         ("without a sum of L along steps", _ACTIONS, f"it requires {_CURVE}"),
         ("in transformed time", "hessian", f"use first derivatives, or {_ORIGINAL}"),

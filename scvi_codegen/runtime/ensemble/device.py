@@ -60,7 +60,7 @@ def options_of(options: SolverOptions) -> tuple[float, int, int]:
 
 
 class ThreadRecord(Protocol):
-    """What the threads of an ensemble record besides states, or instead of them.
+    """Records of the threads of an ensemble besides states, or instead of them.
 
     Attributes:
         source: of the ensemble.

@@ -372,6 +372,8 @@ def _symmetry(interface: Any, closed: Any) -> Array:
     names, m = interface.coordinates, interface.dimension
     if closed is True:
         return np.eye(m)
+    if isinstance(closed, str):
+        closed = [each.strip() for each in closed.split(",")]
     entries: Sequence[Any] = list(closed) if isinstance(closed, list | tuple) else []
     if entries and all(isinstance(each, str) for each in entries):
         M = np.zeros((m, m))

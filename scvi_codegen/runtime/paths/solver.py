@@ -171,7 +171,13 @@ class AtEnergy:
         """Return the path near the nodes q, and the duration of the intervals."""
         M, intervals = self.M, self.intervals
         x = np.append(q if M is None else q[: self.rows], float(intervals.h.sum()))
-        x, at, _, more = newton(self.evaluate, self.factorise, self.move, x, MOST_ITERATIONS)
+        try:
+            x, at, _, more = newton(self.evaluate, self.factorise, self.move, x, MOST_ITERATIONS)
+        except UNSOLVED as error:
+            raise PathError(
+                f"no path of energy {self.energy:g} was found ({error}): give another T to start from, or another "
+                "energy, which must be that of a motion"
+            ) from error
         intervals = intervals.lasting(float(x[-1]))
         own = factors_of(at, intervals) if M is None else Closed(at, self.intervals.basis_map(M), symmetric=True)
         return Solution(self.nodes(x), intervals, at, own, iterations + more)
