@@ -442,7 +442,8 @@ class Sources:
             ]
             if not values or any(value.free_symbols & {*system.velocities} for value in values):
                 values = self._at_momenta(values)
-        return render_ensemble(program, system_kernel(system, "observed_lanes", values, u=states))
+        counts = functions not in ("extremes", "energy")
+        return render_ensemble(program, system_kernel(system, "observed_lanes", values, u=states), counts=counts)
 
     def _at_momenta(self, values: Sequence[Expr]) -> Sequence[Expr]:
         """Return functions of velocities as functions of momenta; the energy if there are none."""

@@ -264,7 +264,9 @@ def _control_context(program: Program, control: Control | None) -> dict[str, obj
     return {"control": control, "own_headers": {name: text}, "growth_tables": growth_tables}
 
 
-def render_ensemble(program: Program, observed: Kernel | None = None, *, tangents: int = 0) -> Source | None:
+def render_ensemble(
+    program: Program, observed: Kernel | None = None, *, counts: bool = False, tangents: int = 0
+) -> Source | None:
     """Return source that integrates many trajectories at once, one per lane, by fixed-point iteration or explicitly.
 
     ``None`` for other steps, for rigid bodies turned in closed form, and with integrals: with a time transformation,
@@ -272,7 +274,8 @@ def render_ensemble(program: Program, observed: Kernel | None = None, *, tangent
 
     Args:
         program: the program.
-        observed: functions whose extremes and changes of sign are recorded.
+        observed: functions whose extremes are recorded.
+        counts: whether changes of their signs are counted instead.
         tangents: number of tangent vectors among the coordinates.
     """
     fixed_point, split = program.fixed_point, program.splitting
@@ -290,6 +293,7 @@ def render_ensemble(program: Program, observed: Kernel | None = None, *, tangent
         "program": program,
         "points": points,
         "observed": observed.values if observed else 0,
+        "counts": counts,
         "tangents": tangents,
         "cut": is_divided((*kernels, *((observed,) if observed else ()))),
         "needs_velocities": fixed_point is not None and fixed_point.kept is StoredValues.VELOCITIES,

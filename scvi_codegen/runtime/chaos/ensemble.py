@@ -106,9 +106,13 @@ class ChaosIndicatorsEnsemble:
         return ChaosIndicators.of(self.t[:: self.save_every], self.values, self.status)
 
     def _warn_of_long_steps(self) -> None:
-        """Warn of too large steps: rerun every ``CHECKED_STRIDE``-th trajectory, as SIMD steps estimate no error."""
+        """Warn of too large steps: rerun every ``CHECKED_STRIDE``-th trajectory, as SIMD steps estimate no error.
+
+        Of trajectories on a GPU at most about ``CHECKED_STRIDE`` are run.
+        """
         steps, runs = len(self.t) - 1, {}
-        for j in range(0, len(self.q), CHECKED_STRIDE):
+        stride = CHECKED_STRIDE if self.device is None else max(CHECKED_STRIDE, len(self.q) // CHECKED_STRIDE)
+        for j in range(0, len(self.q), stride):
             start = self.q[j], self.p[j]
             arguments: dict[str, Any] = {"t": self.t[0], "parameters": self.parameters[j], "options": self.options}
             memory = Memory.started(self.stepper, *start, plan=StepPlan(h=self.h), **arguments)

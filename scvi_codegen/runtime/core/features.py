@@ -20,6 +20,7 @@ OPERATIONS = {
     "with_sizes": "with_sizes",
     "ensembles": "integrate_ensemble",
     "device": "device=",
+    "observe_ensemble": "integrate_ensemble(observe=)",
     "checkpoint": "checkpoint",
     "recording": "record_run",
     "dense_output": "dense output",
@@ -101,7 +102,7 @@ FEATURES = {
     for property_, operations, remedy in (
         (
             "with a time transformation",
-            "ensembles device chaos_ensemble periodic_orbit fit flow",
+            "ensembles device observe_ensemble chaos_ensemble periodic_orbit fit flow",
             "this requires fixed steps h; compile the stepper without time_transformation",
         ),
         ("with precision='double-double'", _IN_DOUBLE, "omit it, or use precision='double'"),
@@ -112,7 +113,7 @@ FEATURES = {
         ("in transformed time", "advice", "use --tolerance (local error)"),
         ("in transformed time", "adaptive", "give h (fixed step in tau)"),
         ("in transformed time", "inputs", "compile the original system"),
-        ("in transformed time", "device chaos chaos_ensemble periodic_orbit fit flow", _ORIGINAL),
+        ("in transformed time", "device observe_ensemble chaos chaos_ensemble periodic_orbit fit flow", _ORIGINAL),
         ("in transformed time", _ACTIONS, _ORIGINAL),
         ("with a time transformation", "shadow_energy path", "compile the stepper without time_transformation"),
         (
@@ -130,7 +131,7 @@ FEATURES = {
         ("for a first-order system", "hessian", "use first derivatives and differences of them"),
         (
             "with events that change the state",
-            "error device check_growth hessian chaos_ensemble flow advice",
+            "error device observe_ensemble check_growth hessian chaos_ensemble flow advice",
             "make them terminal and restart",
         ),
         (
@@ -159,12 +160,16 @@ FEATURES = {
             "it requires forces at two or more stages, or velocities that vary along a step; give h and steps (fixed "
             "step size)",
         ),
-        ("with sizes known at run time", "flow device", f"pass stepper.with_sizes(..); {SIZES_REQUIRED}"),
+        (
+            "with sizes known at run time",
+            "flow device observe_ensemble",
+            f"pass stepper.with_sizes(..); {SIZES_REQUIRED}",
+        ),
         (
             "without trajectories in SIMD lanes",
-            "device",
+            "device observe_ensemble",
             "it requires explicit steps or a fixed-point iteration, as of SVI and Gauss methods without constraints; "
-            "omit device",
+            "omit it",
         ),
         ("without derivatives", f"{_DERIVATIVES} {_ACTIONS}", "it was loaded without their source; compile the system"),
         (

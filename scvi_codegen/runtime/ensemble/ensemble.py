@@ -115,7 +115,7 @@ class Ensemble:
     ) -> None:
         interface = stepper.interface
         _check_device(device, h, inputs, save_every, error=error, t_eval=t_eval)
-        check_together(inputs=inputs, observe=observe, error=error, t_eval=t_eval)
+        _check_observe(stepper, observe, inputs=inputs, error=error, t_eval=t_eval)
         steps, t_end = _steps_or_end(t, h, steps, t_end, inputs, tolerance, t_eval)
         require(stepper, "ensembles")
         if device is not None:
@@ -162,8 +162,8 @@ class Ensemble:
             self.common = kind(*arguments) if points is None else PointRuns(*arguments, source=points)
         elif observe is not None:
             raise StateError(
-                f"observe={observe!r} requires a fixed step size and events that do not change the state: give h and "
-                "steps, or observe each trajectory by integrate"
+                f"observe={observe!r} requires a fixed step size: give h and steps, or observe each trajectory by "
+                "integrate"
             )
         self.states: list[Rows] = []
         self.adaptive = None if device is None or self.common is not None else self._on_device()
@@ -533,6 +533,13 @@ def _check_device(device: str | None, h: float | None, inputs: object, save_ever
             "device='cuda' with adaptive steps saves the initial and the final states, and has no inputs: omit "
             "save_every and inputs, give h and steps, or omit device"
         )
+
+
+def _check_observe(stepper: Any, observe: str | None, **others: Any) -> None:
+    """Raise an error for a stepper, and for arguments, with which ensembles do not observe all steps."""
+    if observe is not None:
+        check_together(observe=observe, **others)
+        require(stepper, "observe_ensemble")
 
 
 def _steps_or_end(

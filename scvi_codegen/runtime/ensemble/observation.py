@@ -38,7 +38,7 @@ class EnsembleObservation:
     Raises:
         StateError: for another name.
         EventError: without events, and for events that end runs or have conditions.
-        MethodError: without trajectories in SIMD lanes, and for velocities and energies without a formula.
+        MethodError: of a stepper that was loaded, and for velocities and energies without a formula.
 
     Attributes:
         source: of the ensemble.
@@ -57,9 +57,8 @@ class EnsembleObservation:
         source = stepper._variants[f"observing {self._functions()}"]
         if source is None:
             raise MethodError(
-                f"observe={name!r} is not available in ensembles of '{stepper.title}': it requires trajectories in "
-                "SIMD lanes, as of SVI, Gauss methods and compositions without constraints, of a stepper that was "
-                "compiled in this process; omit observe and save states"
+                f"observe={name!r} is not available in ensembles of '{stepper.title}', which was loaded without their "
+                "source: compile the system, or omit observe and save states"
             )
         self.source = source
         self.values = np.full((5, constant(source, f"{source.prefix.upper()}_OBSERVED"), count), np.nan)
