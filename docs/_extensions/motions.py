@@ -31,7 +31,11 @@ HERE = Path(__file__).parent
 MADE_OF = b"".join(
     path.read_bytes()
     for path in sorted((HERE.parents[1] / "templates/page").iterdir())
-    + sorted((HERE.parents[1] / "scvi_codegen/pages").glob("*.py"))
+    + [
+        path
+        for name in ("pages", "pictures")
+        for path in sorted((HERE.parents[1] / "scvi_codegen" / name).glob("*.py"))
+    ]
 )
 """Sources of a page besides its model: a page is written again when they change."""
 LOGGER = logging.getLogger(__name__)
