@@ -113,6 +113,28 @@ def test_order_symplecticity_and_symmetry_of_tableaux_are_those_proved_in_ration
     assert tableau.is_symmetric == proved.symmetric
 
 
+@pytest.mark.parametrize("s", range(2, 9))
+def test_work_of_scvi_has_order_s_plus_1_on_chebyshev_lobatto_nodes_and_more_on_gauss_abscissae(s: int) -> None:
+    """The leading error of the work of a step is h^(s + 2) times the integral of (x - 1/2) M; see docs/conserved.md."""
+    nodes = NODES["chebyshev-lobatto"](s + 1)
+    M, rest = divmod(nodes, X)  # the first node carries no equation
+    assert not rest
+    assert [float(x) for x in sc.SCVI(s).tableau.c] == pytest.approx(
+        sorted(float(r.real) for r, _ in M.complex_roots())
+    )
+    assert integral((X - fmpq(1, 2)) * M) != 0
+    assert integral((X - fmpq(1, 2)) * NODES["gauss"](s)) == 0
+
+
+@pytest.mark.second
+def test_leading_error_of_the_work_of_scvi_is_that_of_the_integral() -> None:
+    """For q'' = -q - q', force -q', it is -h^4 v'' v'/24: the integral of (x - 1/2)^2 (x - 1) is -1/24."""
+    damped = sc.LagrangianSystem.from_text("damped", ["q"], "q_dot**2/2 - q**2/2", forces={"q": "-q_dot"})
+    run = sc.compile_stepper(damped, sc.SCVI(2)).integrate([1.0], velocity=[0.5], h=0.01, steps=1)
+    fine = sc.compile_stepper(damped, "svi:4").integrate([1.0], velocity=[0.5], h=0.01, steps=1)
+    assert (run.work()[-1] - fine.work()[-1]) / 0.01**4 == pytest.approx(1.0 * -1.5 / -24, rel=0.02)
+
+
 def rational(x: Any) -> Any:
     numerator, denominator = x.as_integer_ratio() if isinstance(x, float) else (None, None)
     if numerator is not None:
