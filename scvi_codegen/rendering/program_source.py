@@ -314,7 +314,11 @@ def render_points(program: Program) -> Source | None:
     context = _context(program, DOUBLE, None, "none")
     text = cast(IterationSource, context["fixed_point"])
     tables = tuple(map(_at_own_point, text.tables))
-    return _render(program.prefix, {**context, "fixed_point": replace(text, tables=tables), "on_device": "points"})
+    own = program.memory // POINT_THREADS
+    sizes = {"memory": own, "workspace": workspace_size(program) - program.memory + own}
+    return _render(
+        program.prefix, {**context, **sizes, "fixed_point": replace(text, tables=tables), "on_device": "points"}
+    )
 
 
 def _at_own_point(table: str) -> str:
@@ -407,6 +411,7 @@ def _context(
         "kernels": kernels,
         "cut": is_divided((*scalars, *(program.fixed_point.kernels if program.fixed_point else ()), *lanes)),
         "inverse_roots": inverse_roots(scalars),
+        "memory": program.memory,
         "workspace": workspace_size(program) + (fallback == "external"),
         "scratch": scratch_size(program) + (fallback == "external"),
         "jacobian": jacobian_size(program),
