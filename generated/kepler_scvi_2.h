@@ -45,6 +45,7 @@ typedef struct {
   long long iterations; /* of the solver, over all steps */
   double change; /* the last update, measured as above */
   double t; /* start of the last step tried */
+  long long fallback_steps; /* solved by the fallback of the iteration */
   double duration; /* of the last step: h */
   long long stored; /* states stored, with adaptive steps */
 } kepler_scvi_2_report;
@@ -58,6 +59,7 @@ typedef struct {
   double carry_q[2], carry_p[2];
   double memory[14];
   long long guess; /* what memory contains of the previous steps; 0: nothing */
+  long long fallback_steps; /* steps that the iteration did not solve, but its fallback */
   long long iterations; /* since the last stored state */
   double error, error_t; /* largest error estimate of a step so far, and the time of that step */
   double largest_q, largest_p; /* largest numbers of the states examined so far */

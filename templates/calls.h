@@ -47,6 +47,9 @@ int NAME(call_integrate)(NAME(call) *c, long long steps, long long every)
 #ifdef HAS_REJECTED
   c->rejected = c->run->rejected;
 #endif
+#ifdef HAS_FALLBACK_STEPS
+  c->fallback_steps = c->run->fallback_steps;
+#endif
   if (c->h == 0.0 && c->sizes)
     for (long long k = 0; k < c->stored; k++)
       c->sizes[k] = c->t[k + 1] - c->t[k];
@@ -100,6 +103,9 @@ static int NAME(call_one)(NAME(each) *c, const double *parameters, long long ste
   *taken += c->run->step - begun;
   c->stored[j] += c->rows - row;
   c->done[j] = c->run->step;
+#ifdef HAS_FALLBACK_STEPS
+  c->fallback_steps[j] = c->run->fallback_steps;
+#endif
   if (c->energies && arrived && !status && c->rows > row) {
     const long long last = (c->rows - 1) * m;
     double *energy = c->energies + 2 * j;

@@ -12,7 +12,7 @@ typedef struct {
   double h, t_end, tolerance; /* h = 0: adaptive steps */
   long long words, coordinates, measures_growth, has_energies;
   double error, error_t, energies[2];
-  long long stored, steps, rejected;
+  long long stored, steps, rejected, fallback_steps;
 } NAME(call);
 int NAME(call_advance)(const NAME(call) *call, long long steps, long long every);
 int NAME(call_integrate)(NAME(call) *call, long long steps, long long every);
@@ -28,7 +28,7 @@ typedef struct {
   int *iterations;
   double *actions; /* memory for the actions up to the states, unless NULL */
   int *status; /* of all trajectories, -1 before their end */
-  long long *stored, *done; /* numbers of states and of steps of all trajectories */
+  long long *stored, *done, *fallback_steps; /* numbers of states and of steps of all trajectories */
   double *energies; /* of all trajectories at both ends, unless NULL */
   NAME(report) * report;
   double *workspace, t, tolerance;

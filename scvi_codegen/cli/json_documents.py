@@ -32,6 +32,7 @@ def run_numbers(
         **(arrays if model.array_system else {}),
         "steps": trajectory.steps,
         "rejected_steps": run.rejected_steps,
+        "fallback_steps": run.fallback_steps,
         "h": model.h or run.h if run.plan.fixed else run.plan.tau or None,
         "states": len(trajectory),
         "seconds": outcome.seconds,

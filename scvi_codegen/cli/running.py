@@ -180,7 +180,11 @@ def _speed(outcome: RunOutcome, model: Model) -> str:
         text += f", {duration(each / model.dimension)} a step and coordinate"
     saved = trajectory.t[-1] == outcome.end[0]  # else iterations are known up to the last saved state
     watched = outcome.run.steps if saved else (len(trajectory) - 1) * model.save_every
-    return f"{text}, {int(np.sum(trajectory.iterations)) / watched:.2f} iterations a step" if watched else text
+    text += f", {int(np.sum(trajectory.iterations)) / watched:.2f} iterations a step" if watched else ""
+    if not (fallbacks := trajectory.fallback_steps):
+        return text
+    remedy = "; a smaller step or --solver newton is faster" if fallbacks > outcome.run.steps // 10 else ""
+    return f"{text}, {counted(fallbacks, 'step')} by Newton's method{remedy}"
 
 
 def conserved(trajectory: Trajectory, account: EnergyAccount | None = None) -> Iterator[str]:

@@ -13,9 +13,9 @@ from struct import Struct
 from scvi_codegen.files.cache import template_folder
 from scvi_codegen.rendering.source import Source
 
-RESULTS, FIRST_RESULT = Struct("=4d3q"), "error"
+RESULTS, FIRST_RESULT = Struct("=4d4q"), "error"
 """Format of the last fields of the struct (``calls_declarations.h``), and the first of them."""
-OPTIONAL = ("actions", "advance_to", "measures_growth", "step_error", "rejected", "set_fallback")
+OPTIONAL = ("actions", "advance_to", "measures_growth", "step_error", "rejected", "set_fallback", "fallback_steps")
 """Names that not all sources declare, HAS_.. in ``calls.h``."""
 
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = ["integrate_ensemble"]
 
-ARRAYS = ("t", "times", "q", "p", "status", "steps")
+ARRAYS = ("t", "times", "q", "p", "status", "steps", "fallback_steps")
 """Attributes of a result that workers send back."""
 
 LANES = 8

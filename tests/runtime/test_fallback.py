@@ -2,6 +2,7 @@
 
 import pickle
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -163,3 +164,53 @@ def test_prepare_compiles_everything_later_calls_need(tmp_path, monkeypatch):
     chain.integrate([1.0, 0.5], [0.0, 0.0], h=0.1, steps=3)
     chain.integrate([1.0, 0.5], [0.0, 0.0], t_end=0.3, tolerance=1e-6)
     assert built == []
+
+
+STIFF = {"lagrangian": "q_dot**2/2 - k*(1 - cos(q))", "coordinates": ["q"], "parameters": {"k": 1.0}}
+ROD = {"lagrangian": "(x_dot**2 + y_dot**2)/2 - g*y", "coordinates": ["x", "y"], "parameters": {"g": 9.81}}
+
+
+@pytest.mark.filterwarnings("ignore::scvi_codegen.AccuracyWarning")
+@pytest.mark.parametrize(
+    ("text", "q", "h", "values"),
+    [
+        (STIFF, [0.3], 0.7, {"k": np.array([10.0, 30.0, 40.0])}),
+        (ROD | {"constraints": ["x**2 + y**2 - 1"]}, [1.0, 0.0], 0.4, {"g": np.array([2.0, 9.81, 12.0])}),
+    ],
+    ids=["spring", "rod"],
+)
+def test_steps_by_newtons_method_are_counted(text, q, h, values):
+    """A run has as many as an ensemble's trajectory and its own parts; adaptive steps are shortened instead."""
+    system = sc.LagrangianSystem.from_text(name="stiff", **text)
+    stepper = sc.compile_stepper(system, "svi:4", flags=PORTABLE_FLAGS)
+    q, p, counts = np.array(q), np.zeros(len(q)), []
+    ((name, each),) = values.items()
+    for value in each.tolist():
+        settings = {"h": h, "parameters": {name: value}}
+        whole = stepper.integrate(q, p, **settings, steps=60)
+        part = stepper.start(q, p, **settings)
+        part.advance(23)
+        part = stepper.from_checkpoint(part.checkpoint())
+        part.advance(37)
+        assert part.fallback_steps == whole.fallback_steps
+        counts.append(whole.fallback_steps)
+        assert stepper.integrate(q, p, parameters={name: value}, t_end=5.0).fallback_steps == 0
+    assert counts[0] == 0 < min(counts[1:]) and max(counts) <= 60
+    start = np.tile([q, p], (3, 1, 1)).swapaxes(0, 1)
+    assert stepper.integrate_ensemble(*start, h=h, steps=60, parameters=values).fallback_steps.tolist() == counts
+
+
+def test_steps_are_counted_that_fail_without_newtons_method():
+    system = sc.LagrangianSystem.from_text(name="stiff", **STIFF)
+    source, interface = sc.generate_source(system, "svi:4")
+    without = replace(source, code=f"#define NO_FALLBACK\n{source.code}")
+    run, alone = (
+        sc.Stepper(each, interface, flags=PORTABLE_FLAGS).start([0.3], [0.0], h=0.7, parameters={"k": 30.0})
+        for each in (source, without)
+    )
+    with pytest.raises(sc.StepFailedError, match="not converge"):
+        alone.advance(60)
+    run.advance(alone.steps)
+    assert run.fallback_steps == 0
+    run.advance(1)
+    assert run.fallback_steps == 1

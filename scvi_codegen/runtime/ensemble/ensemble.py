@@ -69,13 +69,14 @@ FEW_STEPS = 10_000
 
 
 class SavedLane(NamedTuple):
-    """Saved states of one trajectory, its status and its number of steps."""
+    """Saved states of one trajectory, its status, its number of steps and of those solved by Newton's method."""
 
     t: Array
     q: Array
     p: Array
     status: str
     steps: int
+    fallback_steps: int = 0
 
 
 class Ensemble:
@@ -267,12 +268,14 @@ class Ensemble:
     def keep(self, part: slice, trajectories: EnsembleTrajectory) -> None:
         """Store the results of a slice that was integrated elsewhere."""
         if self.common is None:
-            for j, each in zip(range(part.start, part.stop), trajectories.each(), strict=True):
-                self.saved[j] = SavedLane(*each)
+            fallbacks = cast(Array, trajectories.fallback_steps).tolist()
+            for j, each, count in zip(range(part.start, part.stop), trajectories.each(), fallbacks, strict=True):
+                self.saved[j] = SavedLane(*each, count)
             return
         common = cast(CommonRuns, self.common)
         common.q[:, part], common.p[:, part] = trajectories.q, trajectories.p
         common.status[part], common.done[part] = trajectories.status, trajectories.steps
+        common.fallback_steps[part] = cast(Array, trajectories.fallback_steps)
         if common.times is not None:
             common.times[:, part] = trajectories.times
 
@@ -376,7 +379,7 @@ class Ensemble:
                 with suppress(StateError, StepFailedError):
                     states = integrate(q, p, error=self.error, **arguments)
                     self.confirmations[j], self.plans[j] = states.confirmation, states.plan
-                    return SavedLane(states.t, states.q, states.p, OK, states.steps)
+                    return SavedLane(states.t, states.q, states.p, OK, states.steps, states.fallback_steps)
             try:
                 states = integrate(q, p, h=plan.h or None, tolerance=plan.tolerance or None, **arguments)
             except StepFailedError as failure:
@@ -392,7 +395,8 @@ class Ensemble:
             times = states.forward * states.t
             wanted = states.forward * self.t_eval + WHOLE * abs(plan.h)
             rows = np.searchsorted(times, wanted[wanted < times[-1] + 2 * WHOLE * abs(plan.h)], side="right") - 1
-        return SavedLane(states.t[rows], states.q[rows], states.p[rows], status, states.steps)
+        about = status, states.steps, states.fallback_steps
+        return SavedLane(states.t[rows], states.q[rows], states.p[rows], *about)
 
     def result(self) -> EnsembleTrajectory:
         """Return the trajectories; those neither completed nor failed have the status ``"interrupted"``."""
@@ -401,6 +405,7 @@ class Ensemble:
         common, fixed = self.common, self.common.steps
         if self.successive is not None:
             common.done, ended = self.successive.done, self.successive.status >= 0
+            common.fallback_steps = self.successive.fallback_steps
             common.status = np.where(ended, self.successive.names, OK)
         q, p = common.states()
         spans: tuple[Span, ...] = ()
@@ -410,6 +415,7 @@ class Ensemble:
             t=fixed.times(tau=common.times is not None),
             times=common.times,
             actions=common.actions,
+            fallback_steps=common.fallback_steps,
             observed=None if common.observation is None else common.observation.result(),
             q=q,
             p=p,
@@ -468,7 +474,8 @@ class Ensemble:
                 times[row, j] = each.t
         status = np.array([each.status for each in lanes], dtype="<U32")
         steps = np.array([each.steps for each in lanes], dtype=np.int64)
-        return self._trajectories(t, times, q, p, status, steps)
+        fallbacks = np.array([each.fallback_steps for each in lanes], dtype=np.int64)
+        return self._trajectories(t, times, q, p, status, steps, fallbacks)
 
     def _successive_result(self, work: SuccessiveRuns) -> EnsembleTrajectory:
         states, shape = self.states, (1 + int(work.stored.max()), *self.start[0].shape)
@@ -478,15 +485,22 @@ class Ensemble:
             times[rows, j], q[rows, j], p[rows, j], actions[rows, j] = values
         if self.t_eval is None:
             numbers = np.arange(shape[0], dtype=float)
-            whole = self._trajectories(numbers, times, q, p, work.names, work.done)
+            whole = self._trajectories(numbers, times, q, p, work.names, work.done, work.fallback_steps)
             return replace(whole, actions=actions) if self.stepper.sums_action else whole
         at = np.where(self.t_eval == self.t0, 0, 1)
         missing = np.full_like(q[:1], np.nan)
         q, p = (np.concatenate([each, missing])[at] for each in (q, p))  # if no trajectory reached the end
-        return self._trajectories(self.t_eval, None, q, p, work.names, work.done)
+        return self._trajectories(self.t_eval, None, q, p, work.names, work.done, work.fallback_steps)
 
     def _trajectories(
-        self, t: Array, times: Array | None, q: Array, p: Array, status: NDArray[np.str_], steps: NDArray[np.int64]
+        self,
+        t: Array,
+        times: Array | None,
+        q: Array,
+        p: Array,
+        status: NDArray[np.str_],
+        steps: NDArray[np.int64],
+        fallback_steps: NDArray[np.int64],
     ) -> EnsembleTrajectory:
         return EnsembleTrajectory(
             t=t,
@@ -495,6 +509,7 @@ class Ensemble:
             p=p,
             status=status,
             steps=steps,
+            fallback_steps=fallback_steps,
             h=self.plans[0].h,
             plans=() if self.plans[0].fixed else tuple(self.plans),
             confirmations=tuple(self.confirmations),

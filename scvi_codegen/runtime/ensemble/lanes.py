@@ -46,6 +46,7 @@ class CommonRuns:
         times: (n, k) times in transformed time, else ``None``.
         actions: (n, k) actions up to each state if runs sum them, NaN where unknown, else ``None``.
         status, done: reason of the end and number of completed steps of each trajectory.
+        fallback_steps: numbers of steps that the iteration did not solve, but its fallback.
     """
 
     stepper: Integrator
@@ -68,6 +69,7 @@ class CommonRuns:
         if self.times is not None:
             self.times[0] = self.steps.t0
         self.status, self.done = np.full(len(self), OK, dtype="<U32"), np.zeros(len(self), dtype=np.int64)
+        self.fallback_steps = np.zeros_like(self.done)
 
     def __len__(self) -> int:
         return len(self.start[0])
@@ -322,7 +324,7 @@ class SingleRun:
             trajectory = record(run, step - first, save_every=stride)
         except StepFailedError as failure:
             work.status[j], trajectory, self.run = failure.status, Trajectory.before(failure), None
-        work.done[j] = run.steps
+        work.done[j], work.fallback_steps[j] = run.steps, run.fallback_steps
         saved = np.arange(1, len(trajectory))
         if work.observation is not None:
             work.observation.include(j, trajectory.t, trajectory.q, trajectory.p, run.parameters)

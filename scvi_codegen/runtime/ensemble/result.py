@@ -89,6 +89,7 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble):
     Attributes:
         q, p: (n, k, m) positions and momenta; NaN after a failure, and after the end of a shorter trajectory.
         actions: (n, k) actions up to each state if the runs summed them (``action=True``), else ``None``.
+        fallback_steps: (k,) numbers of steps that Newton's method solved because the iteration failed; ``None`` of a GPU.
         spans: with inputs, rows of states of a slice of trajectories and their parameters.
         confirmations: with ``error=``, of each trajectory as of :class:`Trajectory`, ``None`` for one that fails; else
             empty.
@@ -97,6 +98,7 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble):
     q: Array
     p: Array
     actions: Array | None = field(default=None, repr=False)
+    fallback_steps: NDArray[np.int64] | None = field(default=None, repr=False)
     spans: tuple[Span, ...] = field(default=(), repr=False)
     confirmations: tuple[GlobalError | None, ...] = field(default=(), repr=False)
 

@@ -71,6 +71,7 @@ class SuccessiveRuns:
     Attributes:
         status: (k,) status of C, -1 before the end of a trajectory.
         stored, done: (k,) numbers of saved states without the initial one, and of completed steps.
+        fallback_steps: (k,) numbers of steps that the iteration did not solve, but its fallback.
         energies: (k, 2) energies at both ends of trajectories with adaptive steps, NaN where not computed.
     """
 
@@ -91,7 +92,7 @@ class SuccessiveRuns:
         self.q, self.p, self.parameters = (np.ascontiguousarray(each) for each in (*start, parameters))
         self.tolerance, self.save_every, self.store, count = tolerance, save_every, store, len(self.q)
         self.status = np.full(count, -1, np.int32)
-        self.stored, self.done = np.zeros(count, np.int64), np.zeros(count, np.int64)
+        self.stored, self.done, self.fallback_steps = np.zeros((3, count), np.int64)
         self.energies = np.full((count, 2), np.nan)
 
     @property
@@ -169,7 +170,8 @@ class _Call:
             if work.stepper.interface.conserves_energy:
                 call.energies = binding.pointer(work.energies)
         call.status = binding.integers(work.status)
-        call.stored, call.done = map(binding.whole_numbers, (work.stored, work.done))
+        numbers = work.stored, work.done, work.fallback_steps
+        call.stored, call.done, call.fallback_steps = map(binding.whole_numbers, numbers)
         call.t, call.coordinates, call.parameters_each, call.every = work.t, m, each, work.save_every
         call.next, call.end, call.segment, call.capacity = first, end, -1, self.capacity
         self.iterations = np.empty(self.capacity, np.int32)

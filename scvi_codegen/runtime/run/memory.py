@@ -41,7 +41,7 @@ LARGEST_STEP, MOST_GRID_LEVEL = 2**53, 2**16
 """Largest number of steps that a double represents; a bound of step-size levels beyond all exponents of a double."""
 RANGES = {
     **dict.fromkeys(
-        ("step", "iterations", "rejected", "steps_from_rest", "steps_to_compare", "many", "suspended"),
+        ("step", "iterations", "rejected", "fallback_steps", "steps_from_rest", "steps_to_compare", "many", "suspended"),
         (0, LARGEST_STEP),
     ),
     **dict.fromkeys(("guess", "turn"), (0, 2)),
@@ -491,6 +491,14 @@ class Memory:
     def rejected_steps(self) -> int:
         """Number of rejected steps."""
         return int(self._memory.rejected) if self._plan.adaptive else 0
+
+    @property
+    def fallback_steps(self) -> int:
+        """Number of steps that the iteration did not solve, but its fallback, Newton's method.
+
+        Where they are many, a smaller step or ``solver="newton"`` is faster. Arrays of run-time sizes have no fallback.
+        """
+        return int(getattr(self._memory, "fallback_steps", 0))
 
     @property
     def step_error(self) -> float:

@@ -178,13 +178,13 @@ def integrate_short(
     short.begin(t, q, p)
     short.call.measures_growth = growth
     status = short.integrate(size, save_every)
-    error, error_t, first, last, stored, done, rejected = short.results()
+    error, error_t, first, last, stored, done, rejected, fallbacks = short.results()
     if status or (steps is None and done == size):
         return record(run, steps, save_every=save_every, filled=1 + stored, status=status)
     if not h:
         run._ends = first, last
     states, sizes = short.recorded(1 + stored, h, save_every)
-    return _trajectory(run, states, sizes, done, error, error_t, rejected)
+    return _trajectory(run, states, sizes, done, error, error_t, rejected, fallbacks)
 
 
 class _StateRecorder:
@@ -271,13 +271,21 @@ def trajectory_of(
     """Return a trajectory of these states with the data of the run."""
     run, error = memory._memory, math.nan if memory._step_error is None else memory._step_error()
     done, rejected = run.step if steps is None else steps, run.rejected if memory._plan.adaptive else 0
-    trajectory = _trajectory(memory, states, step_sizes, done, error, run.error_t if error >= 0.0 else 0.0, rejected)
+    error_t, fallbacks = run.error_t if error >= 0.0 else 0.0, memory.fallback_steps
+    trajectory = _trajectory(memory, states, step_sizes, done, error, error_t, rejected, fallbacks)
     trajectory.events, trajectory.tau = events, tau
     return trajectory
 
 
 def _trajectory(
-    memory: Memory, states: States, step_sizes: Array, steps: int, error: float, error_t: float, rejected: int
+    memory: Memory,
+    states: States,
+    step_sizes: Array,
+    steps: int,
+    error: float,
+    error_t: float,
+    rejected: int,
+    fallbacks: int,
 ) -> Trajectory:
     """Return a trajectory without events.
 
@@ -292,7 +300,7 @@ def _trajectory(
     trajectory.t, trajectory.q, trajectory.p, trajectory.step_sizes = t, q, p, step_sizes
     trajectory.h = plan.h or first_step_size(plan, t)
     trajectory.plan, trajectory.stepper, trajectory.options = plan, stepper, memory._options
-    trajectory.steps, trajectory.rejected_steps = steps, rejected
+    trajectory.steps, trajectory.rejected_steps, trajectory.fallback_steps = steps, rejected, fallbacks
     if error >= 0.0:
         trajectory.step_error, trajectory.worst_step_time = error, error_t
     else:

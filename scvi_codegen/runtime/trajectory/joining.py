@@ -22,7 +22,7 @@ def joined(pieces: Sequence[Result]) -> Result:
         name: concatenated([getattr(piece, name) for piece in pieces]) for name in ("t", "q", "p", "iterations")
     }
     states |= {name: first.stepper.named(states[name]) for name in "qp"}
-    same = ("plan", "steps", "rejected_steps", "step_error", "worst_step_time")
+    same = ("plan", "steps", "rejected_steps", "fallback_steps", "step_error", "worst_step_time")
     whole: Result = replace(
         first,
         **states,

@@ -71,6 +71,7 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
         events: zero crossings found, parallel to ``stepper.events``.
         plan: step sizes and target time of the run.
         steps, rejected_steps: numbers of completed and of rejected steps since the start of the run.
+        fallback_steps: number of completed steps that the iteration did not solve, but its fallback, Newton's method.
         step_error, worst_step_time: estimated relative error of the worst step of the run, and its start time. The
             error is relative to the state, or to the largest state of the run near rest at the origin; NaN for methods
             without an error estimate.
@@ -87,6 +88,7 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
     iterations: NDArray[np.int32]
     events: tuple[Crossings, ...] = ()
     rejected_steps: int = 0
+    fallback_steps: int = 0
     confirmation: GlobalError | None = field(default=None, repr=False)
     observed: Array | None = field(default=None, repr=False)
     conserved: Array | None = field(default=None, repr=False)

@@ -61,7 +61,7 @@ static int solve(const step_data *step, const solver_data *way, real *memory, lo
     const solver_options *options, solver_report *report, real *workspace)
 {
   newton_data *data = newton_in(workspace);
-  int status = NOT_CONVERGED, keep = 0;
+  int status = NOT_CONVERGED, keep = 0, falls_back = 0;
 #ifdef FIRST_ORDER_SYSTEM
   real theta[M];
   step_data with_momenta = *step;
@@ -75,7 +75,8 @@ static int solve(const step_data *step, const solver_data *way, real *memory, lo
 #ifdef RATTLE
   status = rattle(step, *guess ? memory : NULL, data, dp, options, report);
   keep = 0;
-  if (status != OK && way->rattle_alone)
+  falls_back = status != OK;
+  if (falls_back && way->rattle_alone)
     return status;
 #else
   (void)way;
@@ -96,6 +97,7 @@ static int solve(const step_data *step, const solver_data *way, real *memory, lo
 #endif
   if (!reaches(step, dq, dp))
     return NOT_FINITE;
+  report->fallback_steps += falls_back;
   memcpy(memory, data->z, sizeof(real) * N);
   memcpy(memory + N, data->point, sizeof(real) * POINT);
   *guess = POINT > 0 && keep ? 2 : 1;

@@ -34,6 +34,7 @@ typedef struct {
   solver_data data;
   real t_end, tau, density, part, growth; /* growth: change of the density in half of a whole step */
   real dq[2 * M], dp[2 * M]; /* increments, then their low words */
+  long long fallbacks; /* 1 if the fallback solved the step */
   int last; /* 1 if the step ends at t_end */
   int turned; /* 1 if the run reverses its direction */
 } trial;
@@ -78,8 +79,11 @@ static int find_step(run_memory *run, trial *now, const solver_options *options,
   }
   prepare(&now->step, &now->data);
   run->guess = 0; /* the predictor belongs to another step size */
-  return solve(&now->step, &now->data, run->memory, &run->guess, now->dq, now->dp, options, report,
+  now->fallbacks = report->fallback_steps;
+  status = solve(&now->step, &now->data, run->memory, &run->guess, now->dq, now->dp, options, report,
       now->step.scratch + SCRATCH);
+  now->fallbacks = report->fallback_steps - now->fallbacks;
+  return status;
 }
 
 static int confirm_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
@@ -99,6 +103,7 @@ static void accept_trial(run_memory *run, trial *now)
   } else {
     add_compensated(&now->at.t, &now->at.t_low, now->step.h, 0);
   }
+  run->fallback_steps += now->fallbacks;
   run->density = now->density;
   run->part = now->part;
   now->turned = 0;

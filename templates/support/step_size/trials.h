@@ -112,6 +112,9 @@ typedef struct {
   long long guess, grid_level; /* level of the step size */
   long long change; /* of the level, from the previous step to this */
   long long iterations; /* of the last trial */
+#ifdef RATTLE
+  long long fallbacks; /* 1 if Newton's method solved it */
+#endif
   real length; /* step size; 0 before the first trial */
   int last; /* 1 if the step ends at t_end */
   int inside; /* levels above this one of a rejected step, whose curve is stored; 0: none */
@@ -142,10 +145,14 @@ HOT void try_step(run_memory *run, trial *now, real least, const solver_options 
   }
 #ifdef RATTLE
   now->data.rattle_alone = run->avoiding >= 0;
+  now->fallbacks = report->fallback_steps;
 #endif
   now->error = attempt(run, &now->step, &now->data, now->last, now->last ? 0 : now->inside, &now->guess, now->dq,
       now->dp, now->limits.decay, least, options, report);
   now->iterations = report->iterations - now->iterations;
+#ifdef RATTLE
+  now->fallbacks = report->fallback_steps - now->fallbacks;
+#endif
 }
 
 /* Returns 1 if the momenta change by a small part of the largest one, as they do where nonsmooth forces shorten a
@@ -400,6 +407,9 @@ static inline void accept_trial(run_memory *run, trial *now)
   add_action(run, &now->step, &now->data, now->guess);
   add_increments(now->at.q, now->at.carry_q, now->dq);
   add_increments(now->at.p, now->at.carry_p, now->dp);
+#endif
+#ifdef RATTLE
+  run->fallback_steps += now->fallbacks;
 #endif
   if (larger(now->error, now->apart) > run->error) {
     run->error = larger(now->error, now->apart);
