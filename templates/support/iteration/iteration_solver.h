@@ -52,7 +52,9 @@ static __attribute__((noinline)) int solve_afresh(const step_data *step, const s
     status = fall_back(status, step, dq, dp, options, report, workspace);
     if (status == OK && !reaches(step, dq, dp))
       status = NOT_FINITE;
+#ifndef NO_FALLBACK
     report->fallback_steps += status == OK;
+#endif
     steps = 0;
   }
   if (status == OK)
