@@ -195,7 +195,8 @@ def test_steps_by_newtons_method_are_counted(text, q, h, values):
         assert part.fallback_steps == whole.fallback_steps
         counts.append(whole.fallback_steps)
         assert stepper.integrate(q, p, parameters={name: value}, t_end=5.0).fallback_steps == 0
-    assert counts[0] == 0 < min(counts[1:]) and max(counts) <= 60
+    assert counts[0] == 0 < min(counts[1:])
+    assert max(counts) <= 60
     start = np.tile([q, p], (3, 1, 1)).swapaxes(0, 1)
     assert stepper.integrate_ensemble(*start, h=h, steps=60, parameters=values).fallback_steps.tolist() == counts
 

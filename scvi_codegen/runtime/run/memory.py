@@ -41,7 +41,16 @@ LARGEST_STEP, MOST_GRID_LEVEL = 2**53, 2**16
 """Largest number of steps that a double represents; a bound of step-size levels beyond all exponents of a double."""
 RANGES = {
     **dict.fromkeys(
-        ("step", "iterations", "rejected", "fallback_steps", "steps_from_rest", "steps_to_compare", "many", "suspended"),
+        (
+            "step",
+            "iterations",
+            "rejected",
+            "fallback_steps",
+            "steps_from_rest",
+            "steps_to_compare",
+            "many",
+            "suspended",
+        ),
         (0, LARGEST_STEP),
     ),
     **dict.fromkeys(("guess", "turn"), (0, 2)),
