@@ -82,7 +82,7 @@ class DeviceRuns:
     Attributes:
         q, p: (n, k, m) saved states, on the device; with a record that is saved instead, (n, k, numbers) and nothing.
         times, actions: ``None``: all trajectories have the same times, and no action is summed.
-        status, done: as of :class:`CommonRuns`.
+        status, done, fallback_steps: as of :class:`CommonRuns`.
     """
 
     times = actions = None
@@ -117,6 +117,7 @@ class DeviceRuns:
         self._begin(source)
         self.counts = device.copied(np.zeros(count, np.int64))
         self.status, self.done = np.full(count, OK, dtype="<U32"), np.zeros(count, dtype=np.int64)
+        self.fallback_steps = np.zeros_like(self.done)
 
     def __len__(self) -> int:
         return self.count
@@ -229,6 +230,7 @@ class DeviceRuns:
 
         run_jobs(len(failed), advance, progress=None, threads=threads)
         self.status[failed], self.done[failed] = work.status, work.done
+        self.fallback_steps[failed] = work.fallback_steps
         if observation is not None and self.observation is not None:
             self.observation.values[:, :, failed] = observation.values
         which, rows = self.device.copied(failed.astype(np.int64)), len(work.q)

@@ -89,7 +89,7 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble):
     Attributes:
         q, p: (n, k, m) positions and momenta; NaN after a failure, and after the end of a shorter trajectory.
         actions: (n, k) actions up to each state if the runs summed them (``action=True``), else ``None``.
-        fallback_steps: (k,) numbers of steps solved by Newton's method, as the iteration failed; ``None`` of a GPU.
+        fallback_steps: (k,) numbers of steps solved by Newton's method, as the iteration failed.
         spans: with inputs, rows of states of a slice of trajectories and their parameters.
         confirmations: with ``error=``, of each trajectory as of :class:`Trajectory`, ``None`` for one that fails; else
             empty.
