@@ -190,6 +190,23 @@ def test_conserved_quantities() -> None:
 
 
 @pytest.mark.second
+@pytest.mark.parametrize(("stages", "steps", "least"), [(4, 1024, 1e-27), (8, 16, 1e-28), (12, 4, 1e-29)])
+def test_order(stages: int, steps: int, least: float) -> None:
+    """Errors of Kepler's problem fall with the order 2 s down to ``least``."""
+    stepper = sc.compile_stepper(system("kepler"), f"svi:{stages}", precision="double-double")
+    errors = []
+    with mp.workdps(50):
+        angle = mp.findroot(lambda x: x - mp.sin(x) / 5 - 2, 2)
+        exact = [mp.cos(angle) - mp.mpf(1) / 5, mp.sqrt(mp.mpf(24) / 25) * mp.sin(angle)]
+        start = {"q": ["0.8", 0], "velocity": [0, mp.sqrt(mp.mpf(3) / 2)]}
+        for n in (steps, 2 * steps):
+            run = stepper.integrate(**start, h=2.0 / n, steps=n, save_every=n)
+            errors.append(max(abs(x - y) for x, y in zip(run.mp("q")[-1], exact, strict=True)))
+        assert abs(mp.log(errors[0] / errors[1], 2) - 2 * stages) < 0.04 * stages
+    assert errors[1] < least
+
+
+@pytest.mark.second
 def test_divided_kernels() -> None:
     """Derivatives of the forces of many coordinates, in parts, compile, and a step is accurate to 30 digits."""
     entry = sc.problem("outer-solar-system")
