@@ -265,7 +265,7 @@ def test_refusals() -> None:
         sc.compile_stepper(friction, "svi:4", precision="double-double")
     stepper = sc.compile_stepper(kepler, "svi:4", precision="double-double")
     assert stepper.supports("adaptive")
-    assert not stepper.supports("ensembles")
+    assert not stepper.supports("observe_ensemble")
     start = {"velocity": [0.0, 1.0], "h": 0.1}
     with pytest.raises(StateError, match=r"q must have shape \(2,\)"):
         stepper.integrate([1.0], **start, steps=3)
@@ -274,7 +274,7 @@ def test_refusals() -> None:
     for call, word in (
         (lambda: stepper.integrate([1.0, 0.0], **start, steps=3, events="x"), "events="),
         (lambda: stepper.integrate([1.0, 0.0], velocity=[0.0, 1.0], t_end=1.0, error=1e-9), "error="),
-        (lambda: stepper.integrate_ensemble([[1.0, 0.0]], [[0.0, 1.0]], h=0.1, steps=3), "integrate_ensemble"),
+        (lambda: stepper.integrate_ensemble([[1.0, 0.0]], [[0.0, 1.0]], h=0.1, steps=3, device="cuda"), "device="),
         (lambda: stepper.integrate([1.0, 0.0], **start, steps=3).action(), "action"),
         (lambda: stepper.discrete_lagrangian([1.0, 0.0], [1.0, 0.1], 0.1), "discrete_lagrangian"),
     ):
@@ -331,6 +331,45 @@ def test_runs() -> None:
             [0.5, 0.0], velocity=[0.0, 3.0**0.5], h=0.07, steps=85
         )
         assert np.abs(fixed[:86].sensitivity().state - double.sensitivity().state).max() < 1e-9
+
+
+def test_ensembles(tmp_path: Path) -> None:
+    """Trajectories of ensembles equal single runs bit for bit, in both words, and the exact orbit; also in files."""
+    stepper = sc.compile_stepper(system("kepler"), "svi:12", precision="double-double")
+    with mp.workdps(50):
+        root, third = mp.sqrt(3), mp.mpf(1) / 3
+        q, v = [["0.5", "0"], [third, "0"]], [["0", root], ["0", mp.sqrt(third + 3)]]
+        parameters = {"mu": [1, "1/10"], "m": "1/7"}
+        single = [{"mu": mu, "m": "1/7"} for mu in (1, "1/10")]
+        for steps in (
+            {"h": 0.07, "t_end": 6.01, "save_every": 5},
+            {"t_end": 2.0},
+            {"t_end": 2.0, "t_eval": [0.3, 1.1]},
+        ):
+            runs = stepper.integrate_ensemble(q, velocity=v, parameters=parameters, **steps)
+            for j, values in enumerate(single):
+                run = stepper.integrate(q[j], velocity=v[j], parameters=values, **steps)
+                for name in ("t", "q", "p", "parameters", "energy", "momentum_maps"):
+                    assert (runs[j].mp(name) == run.mp(name)).all(), (name, steps)
+                energies, maps = runs.energy()[: len(run), j], runs.momentum_maps()[: len(run), j]
+                assert (as_mpmath(energies) == run.mp("energy")).all()
+                assert (as_mpmath(maps) == run.mp("momentum_maps")).all()
+        ends = stepper.integrate_ensemble(q, velocity=v, h=0.07, t_end=6.01)
+        assert max(abs(x - y) for x, y in zip(ends[0].mp("q")[-1], exact_orbit(6.01), strict=True)) < 1e-29
+        again = stepper.integrate_ensemble([run.q[-1] for run in (ends[0], ends[1])], ends.p[-1], h=-0.07, steps=3)
+        assert (again[1].mp("q")[0] == ends[1].mp("q")[-1]).all()
+    ends.save(tmp_path / "ends.npz")
+    with np.load(tmp_path / "ends.npz") as saved:
+        for name in ("t", "q", "p", "parameters"):
+            assert np.array_equal(saved[f"{name}_low"], getattr(ends, name).low)
+    with pytest.raises(StateError, match=r"NAME\.npz"):
+        ends.save(tmp_path / "ends.csv")
+    failing = stepper.integrate_ensemble([[0.5, 0], [1e-9, 0]], velocity=[[0, 1], [0, 1]], h=0.07, steps=9)
+    assert failing.status.tolist() == ["ok", "not converged"]
+    assert np.isnan(failing.q[-1, 1]).all()
+    assert failing.q[-1, 0].low.all()
+    with pytest.raises(StateError, match=r"velocity\[1, 0\] must be a real number"):
+        stepper.integrate_ensemble(q, velocity=[[0, 1], ["a", 1]], h=0.07, steps=9)
 
 
 def test_associative_math_is_an_error(tmp_path: Path) -> None:

@@ -117,6 +117,8 @@ class Words(NamedState):
         result = super().__array_function__(function, types, arguments, keywords)
         if function is np.concatenate:
             return with_low(np.asarray(result), np.concatenate([*map(low_words, arguments[0])], **keywords))
+        if function is np.broadcast_to:
+            return with_low(result, np.broadcast_to(self.low, *arguments[1:], **keywords))
         return result
 
     def copy(self, order: Any = "C") -> Self:
@@ -149,6 +151,18 @@ def with_low(high: Any, low: Array, shapes: Any = None) -> Any:
 def low_words(values: Any) -> Array:
     """Return the low words of numbers, 0 of doubles."""
     return values.low if isinstance(values, Words) else np.zeros(np.shape(values))
+
+
+def stacked(rows: Sequence[Any]) -> Array:
+    """Return numbers or vectors as one array, with both words if they have two."""
+    high: Array = np.array(rows)
+    return with_low(high, np.array([*map(low_words, rows)])) if isinstance(rows[0], Words) else high
+
+
+def missing(shape: tuple[int, ...], words: int) -> Array:
+    """Return an array of NaN for numbers of one or two words."""
+    high = np.full(shape, np.nan)
+    return high if words == 1 else with_low(high, np.zeros(shape))
 
 
 def from_block(block: Array) -> Words:
@@ -226,6 +240,9 @@ def split(values: Any, name: str) -> tuple[Any, Any]:
         return {key: part[0] for key, part in parts.items()}, {key: part[1] for key, part in parts.items()}
     if values is None or isinstance(values, Words):
         return (None, None) if values is None else (np.asarray(values), values.low)
+    if isinstance(values, list | tuple) and any(isinstance(each, Words) for each in values):
+        rows = [split(each, f"{name}[{k}]") for k, each in enumerate(values)]
+        return np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
     array = np.asarray(values) if isinstance(values, np.ndarray) else np.array(values, dtype=object)
     if array.dtype == np.float64:
         return array, np.zeros(array.shape)

@@ -2,9 +2,9 @@
 
 With common fixed steps trajectories are SIMD lanes (:mod:`scvi_codegen.runtime.ensemble.lanes`). Others are computed by
 the single integrator, many in one call of C (:mod:`scvi_codegen.runtime.ensemble.successive`), so they are bitwise
-equal to those of :meth:`Stepper.integrate`, which computes trajectories with inputs, output times, changes by events
-or a bound of the global error. C runs without the GIL, so threads share the work; results are bitwise equal for any
-number of threads.
+equal to those of :meth:`Stepper.integrate`, which computes trajectories with inputs, output times, changes by events,
+states of two words or a bound of the global error. C runs without the GIL, so threads share the work; results are
+bitwise equal for any number of threads.
 """
 
 import time
@@ -24,6 +24,7 @@ from scvi_codegen.native.options import SolverOptions, checked_options
 from scvi_codegen.rendering.source import Source
 from scvi_codegen.runtime.core.features import check_together, require
 from scvi_codegen.runtime.core.validation import Array, States, check_left_to_inputs, columns_of_inputs, parameter_index
+from scvi_codegen.runtime.core.words import missing
 from scvi_codegen.runtime.ensemble.device import (
     FEWEST_COORDINATES,
     AdaptiveDeviceRuns,
@@ -149,13 +150,15 @@ class Ensemble:
         self.saved: dict[int, SavedLane] = {}
         self.error, self.confirmations = error, list[GlobalError | None]()
         self.t_eval: Array | None = None
-        if fixed is None or stepper.changes_states:  # events change the states of each within steps
+        self.singly = stepper.changes_states or interface.words > 1  # events change the states of each within steps
+        self.fixed = fixed if interface.words > 1 else None
+        if fixed is None or self.singly:
             self.plans = self._plans(fixed, cast(ArrayLike, t_end), tolerance)
             self.confirmations = [None] * (0 if error is None else len(self))
-            self.t_eval = self._output_times(t_eval) if fixed is None else fixed.times(tau=False)
+            self.t_eval = self._output_times(fixed, t_eval)
         if self.inputs:
             self.parameters[:, columns_of_inputs(interface)] = 0.0
-        if fixed is not None and not stepper.changes_states:
+        if fixed is not None and not self.singly:
             kind = CommonRuns if device is None else DeviceRuns
             observation = None if observe is None else EnsembleObservation(stepper, observe, len(self))
             arguments = stepper, self.options, self.start, self.parameters, self.values_at, fixed, observation
@@ -181,7 +184,7 @@ class Ensemble:
         stepper, common = self.stepper, self.common
         if isinstance(common, DeviceRuns) or self.adaptive is not None:
             return None
-        if self.inputs or stepper.changes_states or stepper.in_tau or not stepper.binding.reusable:
+        if self.inputs or self.singly or stepper.in_tau or not stepper.binding.reusable:
             return None
         if common is not None:
             return common.successive() if common.steps.steps and stepper.ensemble is None else None
@@ -228,8 +231,10 @@ class Ensemble:
             return [plan] * len(self)
         return [StepPlan(t_end=end, tolerance=plan.tolerance) for end in ends.tolist()]
 
-    def _output_times(self, t_eval: ArrayLike | None) -> Array | None:
+    def _output_times(self, fixed: CommonSteps | None, t_eval: ArrayLike | None) -> Array | None:
         """Return the validated output times; raise ``StateError`` if inputs do not cover a run."""
+        if fixed is not None:  # ends of steps of two words are saved as they are
+            return fixed.times(tau=False) if self.fixed is None else None
         for plan in self.plans if self.inputs else ():
             breakpoints_until(self.t0, plan.t_end, self.inputs)
         if t_eval is None:
@@ -259,11 +264,16 @@ class Ensemble:
         }
         if self.common is None:
             ends = [plan.t_end for plan in self.plans[part]]
+            if self.fixed is not None:
+                return arguments | self._fixed_steps()
             if h := self.plans[0].h:
                 return arguments | {"h": h, "t_end": ends[0]}
             return arguments | {"t_end": ends, "tolerance": self.plans[0].tolerance or None, "t_eval": self.t_eval}
-        fixed = self.common.steps
-        return arguments | {"h": fixed.h} | ({"steps": fixed.steps} if fixed.t_end is None else {"t_end": fixed.t_end})
+        return arguments | self._fixed_steps()
+
+    def _fixed_steps(self) -> dict[str, Any]:
+        fixed = self.fixed or cast(CommonRuns, self.common).steps
+        return {"h": fixed.h} | ({"steps": fixed.steps} if fixed.t_end is None else {"t_end": fixed.t_end})
 
     def keep(self, part: slice, trajectories: EnsembleTrajectory) -> None:
         """Store the results of a slice that was integrated elsewhere."""
@@ -365,11 +375,15 @@ class Ensemble:
             "inputs": inputs_of_slice(self.inputs, j) or None,
         } | {
             "t": self.t0,
-            "t_end": plan.t_end,
             "save_every": self.save_every if self.t_eval is None else 1,
             "options": self.options,
             "progress": check_stop,
         }
+        if self.stepper.interface.words > 1:
+            arguments["parameters"] = self.parameters[j]
+        steps: dict[str, Any] = {"h": plan.h or None, "tolerance": plan.tolerance or None, "t_end": plan.t_end}
+        if self.fixed is not None:
+            steps = self._fixed_steps()
         if self.t_eval is not None and not (plan.h and self.inputs):
             arguments["t_eval"] = self.t_eval[np.abs(self.t_eval - self.t0) <= abs(plan.t_end - self.t0)]
         stepper = self.stepper if self.stepper.changes_states else self.stepper.with_events(())
@@ -377,11 +391,11 @@ class Ensemble:
         with without_accuracy_warnings():
             if self.error is not None:
                 with suppress(StateError, StepFailedError):
-                    states = integrate(q, p, error=self.error, **arguments)
+                    states = integrate(q, p, error=self.error, t_end=plan.t_end, **arguments)
                     self.confirmations[j], self.plans[j] = states.confirmation, states.plan
                     return SavedLane(states.t, states.q, states.p, OK, states.steps, states.fallback_steps)
             try:
-                states = integrate(q, p, h=plan.h or None, tolerance=plan.tolerance or None, **arguments)
+                states = integrate(q, p, **steps, **arguments)
             except StepFailedError as failure:
                 states, status = Trajectory.before(failure), failure.status
             except EventError as failure:
@@ -465,13 +479,16 @@ class Ensemble:
         lanes = [self.saved.get(j) or self._unfinished(j) for j in range(len(self))]
         count = max(len(each.t) for each in lanes) if self.t_eval is None else len(self.t_eval)
         t = np.arange(count, dtype=float) if self.t_eval is None else self.t_eval
-        times = np.full((count, len(lanes)), np.nan) if self.t_eval is None else None
-        q, p = np.full((2, count, len(self), self.stepper.dimension), np.nan)
+        words, shape = self.stepper.interface.words, (count, len(self), self.stepper.dimension)
+        times = missing((count, len(lanes)), words) if self.t_eval is None else None
+        q, p = missing(shape, words), missing(shape, words)
         for j, each in enumerate(lanes):
             row = slice(0, len(each.t))
             q[row, j], p[row, j] = each.q, each.p
             if times is not None:
                 times[row, j] = each.t
+        if self.fixed is not None:
+            t, times = max((each.t for each in lanes), key=len), None
         status = np.array([each.status for each in lanes], dtype="<U32")
         steps = np.array([each.steps for each in lanes], dtype=np.int64)
         fallbacks = np.array([each.fallback_steps for each in lanes], dtype=np.int64)

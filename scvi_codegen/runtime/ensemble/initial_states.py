@@ -18,6 +18,7 @@ from scvi_codegen.runtime.core.validation import (
     flat_state,
     parameter_columns,
 )
+from scvi_codegen.runtime.core.words import split, stacked, with_low
 
 EnsembleParameters = Mapping[str, ArrayLike] | Sequence[Any] | Array | None
 
@@ -44,7 +45,7 @@ def momenta_of_each(
         raise StateError(f"q and velocity must have equal shapes, not {positions.shape} and {velocities.shape}")
     values = parameters_of_each(stepper, parameters, len(positions))
     states = zip(positions, velocities, values, strict=True)
-    return np.array([stepper.initial_momentum(position, v, time, value) for position, v, value in states])
+    return stacked([stepper.initial_momentum(position, v, time, value) for position, v, value in states])
 
 
 def start_of_ensemble(
@@ -64,6 +65,7 @@ def start_of_ensemble(
 
 def _states(stepper: Integrator, value: States, name: str) -> Array:
     """Return a validated (k, m) array of finite numbers."""
+    value, low = split(value, name) if stepper.interface.precision else (value, None)
     array = real_array(flat_state(stepper.interface, value, name), name)
     if array.ndim == 1:
         array = array[np.newaxis]
@@ -72,13 +74,31 @@ def _states(stepper: Integrator, value: States, name: str) -> Array:
     if not np.isfinite(array).all():
         j, i = (int(index[0]) for index in np.nonzero(~np.isfinite(array)))
         raise StateError(f"{name}[{j}, {i}] ({stepper.coordinates[i]}) is {array[j, i]}: it must be finite")
-    return array
+    if low is None:
+        return array
+    words: Array = with_low(
+        array, np.asarray(flat_state(stepper.interface, low, name), dtype=float).reshape(array.shape)
+    )
+    return words
 
 
 def parameters_of_each(stepper: Integrator, argument: EnsembleParameters, count: int) -> Array:
     """Return (k, number of parameters) values: defaults overridden by name (one or k numbers each) or by an array."""
+    defaults = np.asarray(stepper.defaults, dtype=float)
+    if stepper.interface.precision:
+        parts = zip(split(argument, "parameters"), (defaults, np.zeros_like(defaults)), strict=True)
+        high, low = (_parameters_of_each(stepper, part, count, default) for part, default in parts)
+        values: Array = with_low(high, low)
+    else:
+        values = _parameters_of_each(stepper, argument, count, defaults)
+    for j, each in enumerate(values if stepper.interface.lengths else ()):
+        check_lengths(stepper.interface, each, f" of trajectory {j}")
+    return values
+
+
+def _parameters_of_each(stepper: Integrator, argument: EnsembleParameters, count: int, defaults: Array) -> Array:
     names = stepper.parameters
-    values = np.tile(stepper.defaults, (count, 1))
+    values = np.tile(defaults, (count, 1))
     if isinstance(argument, Mapping):
         for name, where, value in parameter_columns(stepper.interface, argument):
             column = real_array(value, f"the parameter {name}")
@@ -96,6 +116,4 @@ def parameters_of_each(stepper: Integrator, argument: EnsembleParameters, count:
     if not np.isfinite(values).all():
         j, i = (int(index[0]) for index in np.nonzero(~np.isfinite(values)))
         raise StateError(f"the parameter {names[i]} of trajectory {j} is {values[j, i]}: it must be finite")
-    for j, each in enumerate(values if stepper.interface.lengths else ()):
-        check_lengths(stepper.interface, each, f" of trajectory {j}")
     return values

@@ -19,6 +19,7 @@ from scvi_codegen.files.labelled_arrays import AXES, Labelled, checked_units, to
 from scvi_codegen.representation import one_line
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array
+from scvi_codegen.runtime.core.words import Words, missing
 from scvi_codegen.runtime.rotations.attitude_history import AttitudeHistory
 from scvi_codegen.runtime.rotations.quantities import named_quantities
 from scvi_codegen.runtime.run.descriptions import short_title
@@ -118,7 +119,7 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble):
         pieces = []
         for number, (good, parameters) in enumerate(parts):
             rows = np.insert(good, 0, good[0] - 1) if number else good  # the state at a breakpoint belongs to both
-            q, p = (self.stepper.named(np.ascontiguousarray(each[rows, j])) for each in (self.q, self.p))
+            q, p = (self.stepper.named(each[rows, j].copy()) for each in (self.q, self.p))
             pieces.append(
                 trajectory(
                     t=times[rows],
@@ -190,7 +191,7 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble):
 
     def energy(self) -> Array:
         """Return (n, k) energies p.v - L; NaN after a failure, and for trajectories that leave the domain of L."""
-        energies = np.full(self.q.shape[:2], np.nan)
+        energies = missing(self.q.shape[:2], self.stepper.interface.words)
         for j, good, parameters in self._with_parameters():
             with suppress(StateError):
                 energies[good, j] = self.stepper.energy(
@@ -217,7 +218,8 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble):
         return relative_changes(*self._momentum_maps())
 
     def _momentum_maps(self) -> tuple[Array, Array]:
-        values, sizes = np.full((2, *self.q.shape[:2], len(self.stepper.momentum_map_names)), np.nan)
+        shape = (*self.q.shape[:2], len(self.stepper.momentum_map_names))
+        values, sizes = missing(shape, self.stepper.interface.words), np.full(shape, np.nan)
         for j, good, parameters in self._with_parameters():
             with suppress(StateError):
                 values[good, j], sizes[good, j] = self.stepper._momentum_maps_and_sizes(
@@ -247,6 +249,8 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble):
         """
         suffix, known = Path(path).suffix.lower(), checked_units(units)
         self._check_common_times()
+        if isinstance(self.q, Words) and suffix != ".npz":
+            raise StateError(f"{path} would lose the low words of double-double arithmetic: give a file NAME.npz")
         if suffix in LABELLED:
             check_format(path)
             write_whole(path, lambda new: LABELLED[suffix].write(self._labelled(known), new))
@@ -328,6 +332,9 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble):
     def _write_npz(self, file: IO[bytes]) -> None:
         others = {"times": self.times, "observed": self.observed}
         optional: dict[str, Any] = {name: values for name, values in others.items() if values is not None}
+        for name in ("t", "times", "q", "p", "parameters"):
+            if isinstance(values := getattr(self, name), Words):
+                optional[f"{name}_low"] = values.low
         np.savez(
             file,
             t=self.t,
