@@ -93,15 +93,32 @@ def compile_stepper(
             or have a fixed-point iteration over stage positions (SVI, SC, Runge-Kutta); others, and systems without
             such loops, are compiled with the sizes of each call, once.
         tables: with ``sizes``, index tables of shape (rows, columns) by name.
-        precision: ``"double"``, or ``"double-double"`` for states and results of 31 digits, of separable systems
+        precision: ``"double"``; or ``"double-double"`` for states and results of 31 digits, of separable systems
             (constant diagonal masses, forces of positions and time) by SVI, spectral collocation, SCVI and
-            Runge-Kutta methods (docs/digits.md).
+            Runge-Kutta methods (docs/digits.md); or ``"auto"``: double, and double-double for runs with ``error=``
+            that double does not confirm, as ``run.confirmation.precision`` reports.
 
     Raises:
         BuildError: if there is no C compiler.
         MethodError: if the method, the solver or another argument is not available for the system.
     """
     check_precision(precision, flags)
+    if precision == AUTO:
+        if sizes is None and hasattr(system, "REQUIRES_SIZES"):
+            raise MethodError(f"precision='auto' is not available with arrays of run-time sizes: {SIZES_REQUIRED}")
+        common: dict[str, Any] = {
+            "solver": solver,
+            "flags": flags,
+            "prefix": prefix,
+            "symmetries": symmetries,
+            "sizes": sizes,
+            "time_transformation": time_transformation,
+            "controller": controller,
+            "tables": tables,
+        }
+        stepper = compile_stepper(system, method, events=events, **common)
+        stepper._precise = partial(compile_stepper, system, method, precision=DOUBLE_DOUBLE, **common)
+        return stepper
     if symmetries != ():
         from scvi_codegen.mechanics.symmetry.symmetry import SYMMETRIES
 
@@ -145,10 +162,14 @@ def compile_stepper(
     return Stepper(source, interface, variants=variants, flags=flags, events=as_events(events))
 
 
+AUTO = "auto"
+"""Precision of runs with ``error=``: double where it suffices."""
+
+
 def check_precision(precision: str, flags: Sequence[str]) -> None:
     """Raise :class:`MethodError` for an unknown precision, and for flags that would destroy it."""
-    if precision not in PRECISIONS:
-        raise MethodError(f"unknown precision {precision!r}: use {' or '.join(map(repr, PRECISIONS))}")
+    if precision not in (*PRECISIONS, AUTO):
+        raise MethodError(f"unknown precision {precision!r}: use {', '.join(map(repr, PRECISIONS))} or {AUTO!r}")
     if precision == DOUBLE_DOUBLE and (worst := [flag for flag in flags if flag in REORDERING_FLAGS]):
         raise MethodError(
             f"the compiler flag {worst[0]!r} reorders sums, which destroys precision='double-double': omit it "

@@ -207,6 +207,29 @@ def test_order(stages: int, steps: int, least: float) -> None:
 
 
 @pytest.mark.second
+def test_automatic_precision() -> None:
+    """With precision="auto" a chaotic run has the error asked for in double-double, a short one in double."""
+    bodies = [(f"x{n}", f"y{n}") for n in range(3)]
+    pairs = [(bodies[i], bodies[j]) for i, j in ((0, 1), (0, 2), (1, 2))]
+    kinetic = " + ".join(f"{name}_dot**2/2" for body in bodies for name in body)
+    potential = " + ".join(f"1/sqrt(({a} - {c})**2 + ({b} - {d})**2)" for (a, b), (c, d) in pairs)
+    three = sc.LagrangianSystem.from_text(
+        name="three bodies", coordinates=[x for body in bodies for x in body], lagrangian=f"{kinetic} + {potential}"
+    )
+    stepper = sc.compile_stepper(three, "svi:12", precision="auto")
+    start = {"q": [-0.5, 0.0, 0.5, 0.0, 0.2, 0.4], "velocity": np.zeros(6), "error": 1e-6}
+    short, long = (stepper.integrate(**start, t_end=end) for end in (2.0, 15.0))
+    assert [each.confirmation.precision for each in (short, long)] == ["double", "double-double"]
+    assert short.confirmation.confirmed
+    assert long.confirmation.confirmed
+    del start["error"]
+    other = sc.compile_stepper(three, "svi:16", precision="double-double").integrate(**start, t_end=15.0)
+    assert np.abs(other.q[-1] - long.q[-1]).max() < 1e-6
+    double = stepper.integrate(**start, t_end=15.0, check_growth=False)
+    assert np.abs(np.asarray(double.q[-1]) - np.asarray(long.q[-1])).max() > 1e-5
+
+
+@pytest.mark.second
 def test_divided_kernels() -> None:
     """Derivatives of the forces of many coordinates, in parts, compile, and a step is accurate to 30 digits."""
     entry = sc.problem("outer-solar-system")
@@ -273,8 +296,8 @@ def test_refusals() -> None:
         stepper.integrate([1.0, 0.0], **start, steps=3, parameters={"mass": 1.0})
     for call, word in (
         (lambda: stepper.integrate([1.0, 0.0], **start, steps=3, events="x"), "events="),
-        (lambda: stepper.integrate([1.0, 0.0], velocity=[0.0, 1.0], t_end=1.0, error=1e-9), "error="),
         (lambda: stepper.integrate_ensemble([[1.0, 0.0]], [[0.0, 1.0]], h=0.1, steps=3, device="cuda"), "device="),
+        (lambda: stepper.integrate_ensemble([[1.0, 0.0]], [[0.0, 1.0]], t_end=1.0, error=0.1), "error= of ensembles"),
         (lambda: stepper.integrate([1.0, 0.0], **start, steps=3).action(), "action"),
         (lambda: stepper.discrete_lagrangian([1.0, 0.0], [1.0, 0.1], 0.1), "discrete_lagrangian"),
     ):

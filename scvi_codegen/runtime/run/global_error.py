@@ -40,6 +40,8 @@ FINER = 0.1
 """Ratio of the tolerances of a run whose error rounding may dominate, of its three comparisons, and of the next run."""
 LAST = (0.0, 1e-18, 1e-19, 1e-20)
 """Tolerances of the last runs (0: the default, round-off level), which are compared with each other."""
+LEAST_OF_TWO_WORDS, LAST_OF_TWO_WORDS = 1e-30, (0.0, 1e-30, 1e-29, 1e-28)
+"""The same with states of two words, whose high words are compared; runs of smaller tolerances are equal."""
 COARSER = 1e4
 """Factor of the tolerance of a comparison that fails, for a second attempt."""
 SAFETY, SAFETY_OF_TWO, SAFETY_OF_ROUNDING = 3.0, 12.0, 4.0
@@ -80,6 +82,7 @@ class GlobalError:
             0.1, where runs are uncorrelated.
         confirmed_until: last of the times up to which the factor times each difference is at most the requested error.
         runs: number of runs.
+        precision: ``"double"`` or ``"double-double"``.
     """
 
     requested: float
@@ -91,6 +94,7 @@ class GlobalError:
     estimate: float
     confirmed_until: float
     runs: int
+    precision: str = "double"
 
     @property
     def confirmed(self) -> bool:
@@ -185,6 +189,8 @@ def confirmed_run(
     again: Callable[..., Result] | None,
     start: float,
     step_of_tau: Callable[[float], float] | None,
+    *,
+    words: int = 1,
 ) -> Result:
     """Return the run whose global error is at most ``wanted``, or the most accurate one with a warning.
 
@@ -194,12 +200,13 @@ def confirmed_run(
         again: that of the runs for comparison, which ends at ``t_end``; ``None`` if ``integrate`` saves all steps.
         start: initial time.
         step_of_tau: function that returns the largest step of tau for a tolerance, or ``None`` without it.
+        words: number of words of states.
 
     Raises:
         StepFailedError: if the most accurate run fails.
     """
     with without_accuracy_warnings():
-        trajectory, result = _Runs(wanted, integrate, again, start, step_of_tau).judged()
+        trajectory, result = _Runs(wanted, integrate, again, start, step_of_tau, words).judged()
     if not result.confirmed and warnings_wanted():
         warn(
             f"the global error {wanted:g} is confirmed until t = {result.confirmed_until:.6g} only: beyond it, runs "
@@ -234,13 +241,17 @@ class _Runs:
         again: Callable[..., Any] | None,
         start: float,
         step_of_tau: Callable[[float], float] | None,
+        words: int,
     ) -> None:
         self.wanted, self.integrate, self.again, self.start = wanted, integrate, again, start
         self.first, self.h, self.count = min(wanted * FIRST, 0.1), 0.0, 0
+        self.least, self.rounded, self.last = LEAST, ROUNDED, LAST
+        if words > 1:
+            self.least, self.rounded, self.last = LEAST_OF_TWO_WORDS, 0.0, LAST_OF_TWO_WORDS
         if step_of_tau is not None:
-            self.first = max(self.first, LEAST)
+            self.rounded, self.first = ROUNDED_OF_TAU, max(self.first, LEAST)
             self.h = step_of_tau(self.first)
-        elif self.first < ROUNDED:  # the factor of the estimate is larger there
+        elif self.first < self.rounded:  # the factor of the estimate is larger there
             self.first *= FINER
         self.made: dict[float, Any] = {}
 
@@ -269,8 +280,8 @@ class _Runs:
 
     def judged(self) -> tuple[Any, GlobalError]:
         """Return the first run that is confirmed, and its estimate; otherwise the better of the last."""
-        tolerance, rounded = self.first, ROUNDED_OF_TAU if self.h else ROUNDED
-        while tolerance > 2.0 * LEAST:
+        tolerance, rounded = self.first, self.rounded
+        while tolerance > 2.0 * self.least:
             try:
                 trajectory = self.run(tolerance)
             except StepFailedError:
@@ -288,14 +299,14 @@ class _Runs:
                 powers = math.ceil(math.log(result.estimate / self.wanted, GAIN) * math.log(RATIO, ratio))
             tolerance = list(accumulate(repeat(ratio, max(1, powers)), mul, initial=tolerance))[-1]
         found: list[tuple[Any, GlobalError]] = []
-        for tolerance in LAST:
+        for tolerance in self.last:
             try:
                 trajectory = self.run(tolerance)
             except StepFailedError:
                 if not found:
                     raise
                 continue
-            others = [each for each in LAST if each != tolerance]
+            others = [each for each in self.last if each != tolerance]
             found.append((trajectory, self.estimated(trajectory, tolerance, others, last=True)))
             if found[-1][1].confirmed or found[-1][1].estimate > GAIN * self.wanted:
                 break
@@ -312,7 +323,7 @@ class _Runs:
                 break
             further = compared.differences(self.other(each, compared.end))
             if last and not np.isfinite(further).all():
-                further = compared.differences(self.other((each or LEAST) * COARSER, compared.end))
+                further = compared.differences(self.other((each or self.least) * COARSER, compared.end))
             differences = np.maximum(differences, further)
             largest = float(differences.max())
             if not last and safety * largest > self.wanted:
@@ -329,6 +340,7 @@ class _Runs:
             estimate=math.inf if math.isnan(largest) else max(safety * largest, SMALLEST, tolerance),
             confirmed_until=float(compared.t[reached - 1]) if reached else self.start,
             runs=self.count,
+            precision="double-double" if self.last is LAST_OF_TWO_WORDS else "double",
         )
 
 
