@@ -118,9 +118,9 @@ def _conserved(result: Trajectory | EnsembleTrajectory) -> dict[str, Any]:
     values_by_name: dict[str, Any] = {"energy_change": None, "energy": None, "momentum_errors": None}
     try:
         with np.errstate(all="ignore"):
-            energy = np.asarray(result.energy())
+            energy = result.energy()  # a row, unlike a number, has both words
             values_by_name["energy"] = energy[0]
-            values_by_name["energy_change"] = _largest(energy - energy[0])
+            values_by_name["energy_change"] = _largest(energy - energy[:1])
             errors = np.asarray(result.momentum_errors())
             names = result.stepper.interface.map_names
             values_by_name["momentum_errors"] = {name: _largest(errors[..., k]) for k, name in enumerate(names)}

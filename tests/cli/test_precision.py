@@ -1,6 +1,7 @@
 """Option --precision of ``run`` and key of model files: digits of the final state, both words, refusals."""
 
 import json
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -55,6 +56,7 @@ def test_final_state_is_exact_to_thirty_digits(spring: Path) -> None:
         momentum = mp.mpf(saved["p"][-1, 0]) + saved["p_low"][-1, 0]
         assert abs(momentum - (mp.cos(2) / 4 - mp.sin(2) / 2)) < 1e-30
     assert document["run"]["precision"] == "double-double"
+    assert 0.0 < document["energy_change"] < 1e-31
     model = sc.load_model(spring)
     sc.save_model(model, "again.toml")
     assert sc.load_model("again.toml") == model
@@ -64,7 +66,7 @@ def test_final_state_is_exact_to_thirty_digits(spring: Path) -> None:
     ("words", "message"),
     [
         (["run", "--error", "1e-9", "--span", "2"], "--error 1e-09 is not available"),
-        (["run", "--ensemble", "a.toml"], "--ensemble a.toml is not available"),
+        (["run", "--ensemble", "a.toml", "-o", "a.csv"], "-o a.csv (write a file NAME.npz) is not available"),
         (["run", "-o", "a.run"], "-o a.run (write a file NAME.npz) is not available"),
         (["run", "--event", "q"], "events= is not available with precision='double-double'"),
         (["generate", "-o", "spring_svi"], "a generated program or FMU is not available"),
@@ -112,6 +114,31 @@ def test_decimals_and_fractions_are_exact(spring: Path, words: list[str]) -> Non
         for wrong in ("1/0", "1/x", "1/2/3"):
             refused = CliRunner().invoke(main, ["run", str(spring), "--q", wrong])
             assert "give numbers separated by commas" in " ".join(refused.output.split())
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "starts"),
+    [
+        ("grid.toml", '[grid]\nq = ["1/3", 0.1]\nw = {from = 0.1, to = 0.4, count = 4}\n', "1/3 0.1"),
+        ("table.csv", "q,p_q,w\n0.1,0.2,0.3\n0.7,0.2,0.1\n", "0.1 0.7"),
+    ],
+)
+def test_ensembles_are_exact(spring: Path, file: str, text: str, starts: str) -> None:
+    """Numbers of grids and tables are exact decimals and fractions, and all final states have 30 digits."""
+    spring.write_text(TEXT.replace("- q**2/2", "- w*q**2/2").replace("[initial]", "[parameters]\nw = 0.3\n[initial]"))
+    Path(file).write_text(text)
+    done = CliRunner().invoke(main, ["run", str(spring), "--ensemble", file, "-o", "ends.npz"])
+    assert done.exit_code == 0, done.output
+    with mp.workdps(40), np.load("ends.npz") as saved:
+        tenths = [1, 2, 3, 4] if file == "grid.toml" else [3, 1]
+        q0 = [mp.mpf(Fraction(each).numerator) / Fraction(each).denominator for each in starts.split()]
+        states = [(q, w) for q in q0 for w in tenths] if file == "grid.toml" else list(zip(q0, tenths, strict=True))
+        v = mp.mpf(1) / (4 if file == "grid.toml" else 5)
+        assert len(states) == len(saved["status"])
+        for j, (q, w) in enumerate(states):
+            rate = mp.sqrt(mp.mpf(w) / 10)
+            exact = q * mp.cos(2 * rate) + v * mp.sin(2 * rate) / rate
+            assert abs(mp.mpf(saved["q"][-1, j, 0]) + saved["q_low"][-1, j, 0] - exact) < 1e-30
 
 
 def test_precision_is_read_and_replaced(spring: Path) -> None:

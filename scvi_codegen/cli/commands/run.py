@@ -133,9 +133,7 @@ def run(
     _check_combination(choices, plot=plot, ensemble=ensemble, wanted=wanted, folder=output if recorded else None)
     model = read_model(model_name, choices)
     if model.in_double_double:
-        model = _in_double_double(
-            model, {"--ensemble": ensemble, "-o": output, **{f"--{k}": wanted[k] for k in wanted}}
-        )
+        model = _in_double_double(model, {"-o": output, **{f"--{k}": wanted[k] for k in wanted}})
     if ensemble is not None:
         check_available(model, IN_ENSEMBLE)
     else:

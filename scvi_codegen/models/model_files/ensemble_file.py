@@ -11,6 +11,7 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,9 +23,10 @@ from scvi_codegen.files.toml_text import read_toml
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.input_tables import parse_table
 from scvi_codegen.models.model_files.sections import text_in
-from scvi_codegen.models.options import real
+from scvi_codegen.models.options import real, with_exact_numbers
 from scvi_codegen.runtime.core.validation import Array
-from scvi_codegen.validation import checked_count
+from scvi_codegen.runtime.core.words import split, stacked, with_low
+from scvi_codegen.validation import ExactNumber, checked_count
 
 if TYPE_CHECKING:
     from scvi_codegen.runtime.core.stepper import Stepper
@@ -40,7 +42,7 @@ class EnsembleStates:
     """Initial values of k trajectories from a file.
 
     Attributes:
-        columns: (k,) values by name.
+        columns: (k,) values by name; exact numbers where states have two words.
         model: provides all other values.
     """
 
@@ -75,18 +77,27 @@ class EnsembleStates:
         default = model.velocity
         if default is None:
             start = model.parameters_at_start(stepper)
-            default = tuple(stepper.velocity(model.q, model.momenta(stepper), model.t, start))
+            default = stepper.velocity(model.q, model.momenta(stepper), model.t, start)
         parameters = self.parameters
         if model.inputs:  # with their initial coefficients
             parameters = self._table(list(stepper.parameters), model.parameters_at_start(stepper))
         states = zip(self.q, self._table(velocities, default), parameters, strict=True)
-        return np.array([stepper.momentum(q, v, model.t, values) for q, v, values in states])
+        return stacked([stepper.momentum(q, v, model.t, values) for q, v, values in states])
 
     def _table(self, names: list[str], defaults: Any) -> Array:
+        columns = {name: values for name, values in self.columns.items() if name in names}
+        if not self.model.in_double_double:
+            return self._filled(names, defaults, columns)
+        words = zip(split(defaults, "a value"), split(columns, "the ensemble"), strict=True)
+        high, low = (self._filled(names, *word) for word in words)
+        table: Array = with_low(high, low)
+        return table
+
+    def _filled(self, names: list[str], defaults: Any, columns: Mapping[str, Array]) -> Array:
         table = np.tile(np.asarray(defaults, dtype=float), (len(self), 1))
         for i, name in enumerate(names):
-            if name in self.columns:
-                table[:, i] = self.columns[name]
+            if name in columns:
+                table[:, i] = columns[name]
         return table
 
 
@@ -102,8 +113,12 @@ def load_ensemble(path: str | os.PathLike[str], model: Model) -> EnsembleStates:
     Raises:
         ModelFileError: beginning with the path and naming the name or line at fault.
     """
+    number = ExactNumber if model.in_double_double else float
     readers: dict[str, Callable[[str, Check], dict[str, Array]]]
-    readers = {".toml": _read_grid, ".csv": lambda text, check: parse_table(text, check).columns}
+    readers = {
+        ".toml": partial(_read_grid, number=number),
+        ".csv": lambda text, check: parse_table(text, check, number).columns,
+    }
     suffix = Path(path).suffix.lower()
     if suffix not in readers:
         raise ModelFileError(f"{path}: an ensemble must be a grid in a .toml file or a table in a .csv file")
@@ -115,13 +130,14 @@ def load_ensemble(path: str | os.PathLike[str], model: Model) -> EnsembleStates:
     return EnsembleStates(columns=columns, model=model)
 
 
-def _read_grid(text: str, check: Check) -> dict[str, Array]:
-    document = read_toml(text)
+def _read_grid(text: str, check: Check, *, number: Callable[[str], float]) -> dict[str, Array]:
+    document = read_toml(text, number)
     grid = document.get("grid")
     if set(document) != {"grid"} or not isinstance(grid, dict) or not grid:
         raise ModelFileError("the file must have one section, [grid], with a line for each quantity that varies")
     check(list(grid))
-    axes = [_axis(value, f"[grid] {name}") for name, value in grid.items()]
+    read = _axis if number is float else _exact_axis
+    axes = [read(value, f"[grid] {name}") for name, value in grid.items()]
     count = math.prod(map(len, axes))
     if count > MOST:
         raise ModelFileError(f"the grid has {count} combinations, more than the {MOST} that are supported")
@@ -140,6 +156,17 @@ def _axis(value: Any, where: str) -> Array:
     if not values:
         raise ModelFileError(f"{where} is an empty list")
     return np.array([real(item, where) for item in values])
+
+
+def _exact_axis(value: Any, where: str) -> Array:
+    """Return the values of one quantity as exact numbers and fractions."""
+    value = with_exact_numbers(value)
+    doubles = _axis(value, where)
+    if not isinstance(value, dict):
+        return np.array(value if isinstance(value, list) else [value], dtype=object)
+    first, last = (Fraction(getattr(value[key], "decimal", None) or value[key]) for key in ("from", "to"))
+    parts = max(1, len(doubles) - 1)
+    return np.array([first + (last - first) * Fraction(k, parts) for k in range(len(doubles))], dtype=object)
 
 
 def _check_names(model: Model, names: Sequence[str]) -> None:

@@ -49,8 +49,10 @@ class CsvTable:
         return f"line {self.lines[k]}" if self.lines else f"row {k}"
 
 
-def parse_table(text: str, check: Callable[[list[str]], None] | None = None) -> CsvTable:
-    """Parse a table; ``check`` is called with its names before its numbers are parsed.
+def parse_table(
+    text: str, check: Callable[[list[str]], None] | None = None, number: Callable[[str], float] = float
+) -> CsvTable:
+    """Parse a table; ``check`` is called with its names before its numbers are parsed, by ``number``.
 
     Raises:
         ModelFileError: naming the column or line at fault.
@@ -70,20 +72,22 @@ def parse_table(text: str, check: Callable[[list[str]], None] | None = None) -> 
         raise ModelFileError(f"column {names.index('') + 1} has no name in the first line")
     if check is not None:
         check(names)
-    rows = [_row(cells, names, number) for number, cells in lines[1:]]
-    return CsvTable(dict(zip(names, np.array(rows).T, strict=True)), tuple(number for number, _ in lines[1:]))
+    rows = np.array(
+        [_row(cells, names, line, number) for line, cells in lines[1:]], float if number is float else object
+    )
+    return CsvTable(dict(zip(names, rows.T, strict=True)), tuple(line for line, _ in lines[1:]))
 
 
-def _row(cells: list[str], names: list[str], number: int) -> list[float]:
+def _row(cells: list[str], names: list[str], line: int, number: Callable[[str], float]) -> list[float]:
     if len(cells) != len(names):
-        raise ModelFileError(f"line {number} must have a number for each of {len(names)} names, and has {len(cells)}")
+        raise ModelFileError(f"line {line} must have a number for each of {len(names)} names, and has {len(cells)}")
     values = []
     for name, cell in zip(names, cells, strict=True):
         if not NUMBER.fullmatch(cell):
-            raise ModelFileError(f"line {number}, {name}: '{cell[:MAX_SHOWN_LENGTH]}' is not a number")
-        values.append(float(cell))
+            raise ModelFileError(f"line {line}, {name}: '{cell[:MAX_SHOWN_LENGTH]}' is not a number")
+        values.append(number(cell))
         if not math.isfinite(values[-1]):
-            raise ModelFileError(f"line {number}, {name}: {cell[:MAX_SHOWN_LENGTH]} is not a finite number")
+            raise ModelFileError(f"line {line}, {name}: {cell[:MAX_SHOWN_LENGTH]} is not a finite number")
     return values
 
 
