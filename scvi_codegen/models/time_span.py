@@ -94,7 +94,7 @@ class TimeSpan(RunOptions):
 
     def _check_alone(self) -> None:
         """Raise an error for a single run with an option of ensembles."""
-        for name in ("device", "observe"):
+        for name in ("device", "observe", "reproducible"):
             if (value := getattr(self, name)) is not None:
                 raise ModelFileError(
                     f"{name} = {value!r} ([run] {name}, run --{name}) is for ensembles only: give --ensemble FILE, "

@@ -223,9 +223,12 @@ class Binding:
         """Return the C struct, NULL for the defaults."""
         if options is None or checked_options(options) is None:
             return self.null
-        return self._ffi.new(
-            f"{self._prefix}_options *", [options.tolerance, options.max_iterations, int(options.absolute)]
-        )
+        chosen = self._ffi.new(f"{self._prefix}_options *")
+        chosen.tolerance, chosen.max_iterations = options.tolerance, options.max_iterations
+        chosen.absolute = options.absolute
+        if hasattr(chosen, "shared"):  # of ensembles
+            chosen.shared = not options.reproducible
+        return chosen
 
 
 def _format(kind: Any) -> tuple[Any, tuple[int, ...]]:

@@ -440,6 +440,18 @@ def test_bits_of_trajectories_do_not_depend_on_others(
         assert one.steps.tolist() == runs.steps[members].tolist()
 
 
+def test_trajectories_that_share_the_end_of_iterations_differ_by_rounding_errors() -> None:
+    stepper, (q, p) = stepper_for("kepler", sc.SVI(5)), states("kepler", 40)
+    alone, shared = (
+        stepper.integrate_ensemble(q, p, h=0.3, steps=40, options=sc.SolverOptions(reproducible=reproducible))
+        for reproducible in (True, False)
+    )
+    assert alone.q.tobytes() == stepper.integrate_ensemble(q, p, h=0.3, steps=40).q.tobytes() != shared.q.tobytes()
+    assert np.abs(shared.q - alone.q).max() < 1e-12
+    with pytest.raises(sc.StateError, match="reproducible must be True or False"):
+        sc.SolverOptions(reproducible=1)  # type: ignore[arg-type]
+
+
 class TestThreadsAndInterruption:
     def test_results_do_not_depend_on_the_number_of_threads(self, kepler: sc.Stepper):
         q, p = states("kepler", 64)

@@ -149,7 +149,7 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
         for (int i = 0; i < M; i++)
           z[n][i] += amplification(&now) * r[n][i];
 #ifndef POINTS
-    if (converge_early(&now))
+    if (converge_early(&now, report))
       keep_early(step, data, value, z, r, &now, stored);
 #endif
   }

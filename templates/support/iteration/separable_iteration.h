@@ -418,7 +418,7 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
       measure_by_largest(stagnant(&now), inverse_size);
 #endif
 #ifndef POINTS
-    if (converge_early(&now)) {
+    if (converge_early(&now, report)) {
       store_early(&now, F[0], stored[0]);
       mark_stored(&now);
     }
