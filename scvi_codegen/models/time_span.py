@@ -104,9 +104,11 @@ class TimeSpan(RunOptions):
     def _run_section(self) -> dict[str, Any]:
         """Return the section ``[run]`` of the model file."""
         section = {option.key: getattr(self, option.field) for option in options_of("run")}
+        if not self.action:  # the default
+            del section["action"]
         if self.time_transformation is not None and self.controller is None:
             section["controller"] = default_controller(in_tau=True)
-        return {key: value for key, value in section.items() if value is not None and value is not False}
+        return {key: value for key, value in section.items() if value is not None}
 
     def _with_step_size(self, *, steps: int | None = None, **chosen: Any) -> Self:
         """Return the model whose step size another option determines, over the same time span or ``steps`` steps."""

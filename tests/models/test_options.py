@@ -28,6 +28,7 @@ RUNS = {
     "save_every": 2,
     "solver_tolerance": 1e-12,
     "max_iterations": 30,
+    "reproducible": False,
     "threads": 2,
     "action": True,
     "q": [0.5],
@@ -63,7 +64,7 @@ def test_key_of_an_option_sets_its_field_and_is_written(option):
     sections = {"initial": [], "run": []}
     for each in FIELDS:
         if each.name in values:
-            sections[each.section].append(f"{each.key} = {values[each.name]!r}".replace("True", "true"))
+            sections[each.section].append(f"{each.key} = {str(values[each.name]).lower()}")
     model = parse_model(model_file(sections, arrays=option.name == "threads"))
     found = getattr(model, option.field)
     assert (list(found) if isinstance(found, tuple) else found) == RUNS[option.name]
@@ -112,8 +113,10 @@ OCCURRENCES = {
     "save_every": {"cli/recording.py", "cli/running.py", "models/packages/example.py"},
     "solver_tolerance": set(),
     "max_iterations": set(),
+    "reproducible": {"models/time_span.py"},
     "threads": {"models/model.py"},
     "action": {
+        "models/time_span.py",
         "cli/commands/cache.py",
         "cli/commands/path.py",
         "cli/running.py",

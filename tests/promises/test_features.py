@@ -95,6 +95,8 @@ SITUATIONS = {
     "with sizes known at run time": lambda: stepper_of(**ARRAY),
     "with precision='double-double'": lambda: stepper_of(precision="double-double"),
     "with forces": lambda: stepper_of(forces={"q": "-q_dot"}),
+    "with the long steps of this method": lambda: stepper_of("svi:4"),
+    "where the energy changes": lambda: stepper_of(lagrangian="q_dot**2/2 - cos(t)*q**2/2"),
     "": stepper_of,
 }
 """Steppers with the properties of the table; one without any lacks constraints, work, a mesh and run-time sizes."""
@@ -149,6 +151,7 @@ OPERATIONS = {
     "sensitivity": lambda s: run_of(s).sensitivity(),
     "hessian": lambda s: (run := run_of(s)).hessian_product(rows_of(run), np.ones(2 * run.stepper.dimension)),
     "chaos": lambda s: run_of(s).chaos_indicators(),
+    "shadow_energy": lambda s: run_of(s).shadow_energy(),
     "chaos_ensemble": lambda s: s.chaos_indicators_ensemble(*map(stacked, state_of(s)), h=0.1, steps=3),
     "periodic_orbit": lambda s: sc.periodic_orbit(s, *state_of(s), period=6.3, steps=60),
     "energy": lambda s: sc.periodic_orbit(s, *state_of(s), period=6.3, steps=60, energy=0.1),
