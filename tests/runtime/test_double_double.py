@@ -381,6 +381,7 @@ def test_ensembles(tmp_path: Path) -> None:
         assert max(abs(x - y) for x, y in zip(ends[0].mp("q")[-1], exact_orbit(6.01), strict=True)) < 1e-29
         again = stepper.integrate_ensemble([run.q[-1] for run in (ends[0], ends[1])], ends.p[-1], h=-0.07, steps=3)
         assert (again[1].mp("q")[0] == ends[1].mp("q")[-1]).all()
+    assert np.array_equal(ends.p_low[-1, 1], ends[1].p_low[-1])
     ends.save(tmp_path / "ends.npz")
     with np.load(tmp_path / "ends.npz") as saved:
         for name in ("t", "q", "p", "parameters"):
@@ -393,6 +394,15 @@ def test_ensembles(tmp_path: Path) -> None:
     assert failing.q[-1, 0].low.all()
     with pytest.raises(StateError, match=r"velocity\[1, 0\] must be a real number"):
         stepper.integrate_ensemble(q, velocity=[[0, 1], ["a", 1]], h=0.07, steps=9)
+
+
+def test_velocities_of_files() -> None:
+    """Files and datasets of a run whose last step is shorter have its velocities."""
+    stepper = sc.compile_stepper(system("kepler"), "svi:12", precision="double-double")
+    run = stepper.integrate(["0.5", 0], velocity=[0, "1.7"], h=0.0625, t_end=1.01)
+    derived = run.states().quantities
+    assert derived is not None
+    assert np.array_equal(derived(run.t, run.q, run.p)["velocity"], run.p)
 
 
 def test_associative_math_is_an_error(tmp_path: Path) -> None:

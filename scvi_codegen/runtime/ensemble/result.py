@@ -19,7 +19,7 @@ from scvi_codegen.files.labelled_arrays import AXES, Labelled, checked_units, to
 from scvi_codegen.representation import one_line
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array
-from scvi_codegen.runtime.core.words import Words, missing
+from scvi_codegen.runtime.core.words import Words, low_words, missing
 from scvi_codegen.runtime.rotations.attitude_history import AttitudeHistory
 from scvi_codegen.runtime.rotations.quantities import named_quantities
 from scvi_codegen.runtime.run.descriptions import short_title
@@ -165,6 +165,16 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble):
             picture=picture,
             progress=progress,
         )
+
+    @property
+    def q_low(self) -> Array:
+        """(n, k, m) low words of the positions; 0 in double precision."""
+        return low_words(self.q)
+
+    @property
+    def p_low(self) -> Array:
+        """(n, k, m) low words of the momenta; 0 in double precision."""
+        return low_words(self.p)
 
     def __repr__(self) -> str:
         states = f"{len(self.t)} states of each of {len(self)} trajectories, {np.count_nonzero(self.ok)} of them ok"

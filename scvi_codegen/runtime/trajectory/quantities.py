@@ -18,10 +18,10 @@ def quantities(stepper: Integrator, parameters: Array, t: Array, q: Array, p: Ar
     rows_of_states = np.flatnonzero(np.isfinite(q).all(axis=1) & np.isfinite(p).all(axis=1))
     per_time = np.full(len(t), np.nan)
     _fill(per_time, rows_of_states, lambda rows: stepper.rates(q[rows], p[rows], parameters))
-    result = {
-        "velocity": _velocities(stepper, parameters, t, q, p) / per_time[:, np.newaxis],
-        "energy": np.full(len(t), np.nan),
-    }
+    velocity = _velocities(stepper, parameters, t, q, p)
+    if stepper.interface.words > 1:
+        _fill(velocity, rows_of_states, lambda rows: stepper.velocity(q[rows], p[rows], t[rows], parameters))
+    result = {"velocity": velocity / per_time[:, np.newaxis], "energy": np.full(len(t), np.nan)}
     _fill(result["energy"], rows_of_states, lambda rows: stepper.energy(q[rows], p[rows], t[rows], parameters))
     if names := stepper.momentum_map_names:
         result["momentum_map"] = np.full((len(t), len(names)), np.nan)
@@ -43,6 +43,8 @@ def _velocities(stepper: Integrator, parameters: Array, t: Array, q: Array, p: A
     """Return (n, m) velocities by unchecked C calls, for exports with many millions of states."""
     binding, (n, m) = stepper.binding, q.shape
     result = np.full((n, m), np.nan)
+    if stepper.interface.words > 1:
+        return result
     positions, momenta = np.ascontiguousarray(q), np.ascontiguousarray(p)
     velocity, workspace, values = binding.function("velocity"), binding.workspace(), binding.pointer(parameters)
     q0, p0, v0 = (binding.pointer(array) for array in (positions, momenta, result))
