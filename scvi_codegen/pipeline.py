@@ -140,7 +140,7 @@ def describe(
         parameters=program.layout.parameters,
         defaults=program.layout.defaults,
         unknowns=program.equations.unknowns,
-        workspace=workspace_size(program) + (uses_fallback_library or program.splitting is not None),  # also of actions
+        workspace=workspace_size(program) + uses_fallback_library,
         has_action=program.action or (uses_fallback_library and program.equations.acts),
         sums_action=program.quantities.integrates,
         map_names=tuple(each.name for each in program.quantities.momentum_maps),

@@ -60,6 +60,12 @@ class Source:
         files = {f"{self.prefix}.h": self.header, f"{self.prefix}.c": self.code, **dict(self.support)}
         return files | (self.beside.files if self.beside else {})
 
+    @property
+    def workspace(self) -> int:
+        """Doubles of workspace per call, 0 for arrays of run-time sizes."""
+        found = re.search(r"_WORKSPACE (\d+)$", self.header, re.MULTILINE)
+        return int(found[1]) if found else 0
+
     def write(self, folder: Path) -> None:
         """Write all files into a folder."""
         for name, text in self.files.items():

@@ -328,7 +328,7 @@ typedef union {{ lanes all; double lane[LANES]; }} lane_view;
 typedef lanes number, coordinates[1];
 typedef int step_data;
 typedef struct {{ double tolerance; long long max_iterations; int absolute; }} solver_options;
-typedef struct {{ double change, *active; long long iterations; }} solver_report;
+typedef struct {{ double change, *active; int shared; long long iterations; }} solver_report;
 enum {{ M = 1, S = 1, FINAL_ITERATIONS = 0, OK = 0, NOT_CONVERGED = 1, NOT_FINITE = 2, LAST_ALONE, LAST, BEFORE }};
 #define SELDOM
 #define SUPPORT_NUMBERS_H
@@ -356,7 +356,7 @@ typedef struct {{ lanes (*last)[M], (*before)[M]; }} history;
 int decide(const double *changes, int count, double *active, double *rows)
 {{
   const solver_options options = {{0x1p-53, 40, 0}};
-  solver_report report = {{0.0, active, 0}};
+  solver_report report = {{.active = active}};
   progress now = before_iterations();
   for (int k = 0; k < count && needs_iteration(&now); k++, changes += LANES, rows += 3 * LANES) {{
     lane_view change, status, large = {{lanes_of(0.0)}}, factor = large;

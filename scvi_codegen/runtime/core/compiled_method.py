@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, Self, cast
 
@@ -158,9 +159,10 @@ class CompiledMethod(ChosenBySizes):
         return stepper._with_action
 
     def _copy(self, events: tuple[Event, ...], source: Source | None = None) -> Self:
+        workspace = source.workspace if source else None
         return type(self)(
             source or self._plain,
-            self.interface,
+            replace(self.interface, workspace=workspace) if workspace else self.interface,
             variants=self._variants,
             flags=self.flags,
             events=events,
