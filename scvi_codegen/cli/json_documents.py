@@ -65,6 +65,7 @@ def failure_text(outcome: RunOutcome | RecordedOutcome) -> str | None:
 def recorded_numbers(recorded: RecordedRun) -> dict[str, Any]:
     """Return the numbers of a run in a folder."""
     interface = recorded.manifest.interface
+    words = (("q", recorded.q), ("p", recorded.p)) if interface.words > 1 else ()
     return {
         "system": interface.system,
         "method": interface.method,
@@ -75,6 +76,7 @@ def recorded_numbers(recorded: RecordedRun) -> dict[str, Any]:
             "t": float(recorded.t[-1]),
             "q": _by_name(interface.coordinates, recorded.q[-1]),
             "p": _by_name(interface.coordinates, recorded.p[-1]),
+            **{f"{name}_low": _by_name(interface.coordinates, each[-1].low) for name, each in words},
         },
         "finished": recorded.finished,
     }

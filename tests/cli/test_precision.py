@@ -67,7 +67,6 @@ def test_final_state_is_exact_to_thirty_digits(spring: Path) -> None:
     [
         (["run", "--error", "1e-9", "--span", "2"], "--error 1e-09 is not available"),
         (["run", "--ensemble", "a.toml", "-o", "a.csv"], "-o a.csv (write a file NAME.npz) is not available"),
-        (["run", "-o", "a.run"], "-o a.run (write a file NAME.npz) is not available"),
         (["run", "--event", "q"], "events= is not available with precision='double-double'"),
         (["generate", "-o", "spring_svi"], "a generated program or FMU is not available"),
         (["generate", "--fmu", "-o", "spring.fmu"], "a generated program or FMU is not available"),
@@ -139,6 +138,17 @@ def test_ensembles_are_exact(spring: Path, file: str, text: str, starts: str) ->
             rate = mp.sqrt(mp.mpf(w) / 10)
             exact = q * mp.cos(2 * rate) + v * mp.sin(2 * rate) / rate
             assert abs(mp.mpf(saved["q"][-1, j, 0]) + saved["q_low"][-1, j, 0] - exact) < 1e-30
+
+
+def test_recorded_runs_have_both_words(spring: Path) -> None:
+    """A folder that is extended ends at the state of a run in memory, also in the document and in its file."""
+    arguments = [["run", str(spring), *words, "--json"] for words in (["-o", "a.run"], ["--steps", "24"])]
+    ends = [json.loads(CliRunner().invoke(main, words).stdout)["final"] for words in arguments]
+    resumed = CliRunner().invoke(main, ["run", "--resume", "a.run", "--steps", "24", "--json"])
+    assert json.loads(resumed.stdout)["final"] == ends[1] != ends[0]
+    assert CliRunner().invoke(main, ["export", "a.run", "-o", "a.npz"]).exit_code == 0
+    with np.load("a.npz") as saved:
+        assert saved["q_low"][[16, 24], 0].tolist() == [end["q_low"]["q"] for end in ends]
 
 
 def test_precision_is_read_and_replaced(spring: Path) -> None:

@@ -396,6 +396,34 @@ def test_ensembles(tmp_path: Path) -> None:
         stepper.integrate_ensemble(q, velocity=[[0, 1], ["a", 1]], h=0.07, steps=9)
 
 
+@pytest.mark.parametrize("steps", [{"h": 0.07}, {"t_end": 2.0}])
+def test_recordings(steps: dict[str, float], tmp_path: Path) -> None:
+    """A recording that is interrupted and resumed has all bits of a run in memory; also checkpoints and files."""
+    stepper = sc.compile_stepper(system("kepler"), "svi:12", precision="double-double")
+    start = {"q": ["0.7", 0], "velocity": ["0", "1.3"], "t": 0.1, "parameters": {"m": "1.1", "mu": Fraction(6, 5)}}
+    count = {"steps": 40} if "h" in steps else {}
+    run = stepper.start(**start, **steps)
+    restored = stepper.from_checkpoint(run.checkpoint(), t_end=steps.get("t_end"))
+    assert (as_mpmath(restored.parameters) == as_mpmath(run.parameters)).all()
+    every = {"rows": 7, "checkpoint_steps": 5}
+    part = sc.record_run(run, tmp_path / "a.run", **every, **count, save_every=2, stop=lambda: run.steps >= 10)
+    assert not part.finished
+    assert part.steps == 10
+    whole, memory = sc.resume_run(tmp_path / "a.run"), stepper.integrate(**start, **steps, **count, save_every=2)
+    assert whole.finished
+    for name in ("t", "q", "p", "parameters", "energy", "momentum_maps"):
+        assert (whole[:].mp(name) == memory.mp(name)).all(), name
+    assert np.array_equal(whole.q[-1].low, memory.q_low[-1])
+    assert np.array_equal(whole.p[::3].low, memory.p_low[::3])
+    whole.save(tmp_path / "a.npz")
+    with np.load(tmp_path / "a.npz") as saved:
+        for name in ("t", "q", "p", "parameters"):
+            assert saved[f"{name}_low"].any() or name == "t"
+            assert np.array_equal(saved[f"{name}_low"], getattr(memory, name).low)
+    with pytest.raises(StateError, match=r"NAME\.npz"):
+        whole.save(tmp_path / "a.h5")
+
+
 def test_velocities_of_files() -> None:
     """Files and datasets of a run whose last step is shorter have its velocities."""
     stepper = sc.compile_stepper(system("kepler"), "svi:12", precision="double-double")

@@ -162,7 +162,8 @@ def run(
 def _in_double_double(model: Model, options: dict[str, Any]) -> Model:
     """Return the model at known sizes; reject options that states of two words do not have."""
     for flag, value in options.items():
-        if value is not None and flag != "--tolerance" and not (flag == "-o" and Path(value).suffix.lower() == ".npz"):
+        kept = flag == "-o" and value is not None and (is_run_folder(value) or Path(value).suffix.lower() == ".npz")
+        if value is not None and flag != "--tolerance" and not kept:
             model._check_double(f"{flag} {value}{' (write a file NAME.npz)' * (flag == '-o')}")
     return model.with_known_sizes()
 

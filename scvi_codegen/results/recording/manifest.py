@@ -24,6 +24,7 @@ from scvi_codegen.rendering.source import Interface, Source, check_interface
 from scvi_codegen.runtime.core.compiled_method import Variants
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.core.words import Words, missing, with_low
 from scvi_codegen.runtime.events.event import Event
 from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.runtime.run.step_plan import StepPlan
@@ -56,10 +57,10 @@ class Chunk:
         return len(self.piece[0])
 
 
-def no_states(dimension: int) -> Piece:
-    """Return an empty piece of states of m coordinates."""
-    vectors = np.empty((0, dimension))
-    return np.empty(0), vectors, vectors, np.empty(0, dtype=np.int32)
+def no_states(interface: Interface) -> Piece:
+    """Return an empty piece of states, with low words in double-double arithmetic."""
+    t, vectors = missing((0,), interface.words), missing((0, interface.dimension), interface.words)
+    return t, vectors, vectors, np.empty(0, dtype=np.int32)
 
 
 def chunk_path(folder: Path, number: int) -> Path:
@@ -91,6 +92,8 @@ def write_chunk(folder: Path, number: int, chunk: Chunk) -> None:
     t, q, p, iterations = chunk.piece
     memory = np.frombuffer(chunk.memory, dtype=np.uint8)
     further: dict[str, Any] = {"step": np.int64(chunk.step), "memory": memory, "crossings": chunk.crossings}
+    named = zip(COLUMNS, chunk.piece, strict=True)
+    further |= {f"{name}_low": column.low for name, column in named if isinstance(column, Words)}
     np.savez(buffer, t=t, q=q, p=p, iterations=iterations, **further)
     write_atomically(chunk_path(folder, number), lambda file: file.write(_sealed(buffer.getvalue())))
     sync_folder(folder)
@@ -120,8 +123,8 @@ END_OF_ARCHIVE, NO_COMMENT = b"PK\x05\x06", b"\0\0"
 """Signature of the last 22 bytes of an archive without comment, and the last of them, the length of the comment."""
 
 
-def read_chunk(path: Path, dimension: int | None = None, rows: int | None = None) -> Chunk:
-    """Return the contents of a file of states after checking checksums and, optionally, dimension and number of rows.
+def read_chunk(path: Path, interface: Interface, rows: int) -> Chunk:
+    """Return the contents of a file of states after checking checksums, shapes and number of rows.
 
     Raises:
         RecordingError: if the file cannot be read or is damaged.
@@ -129,25 +132,28 @@ def read_chunk(path: Path, dimension: int | None = None, rows: int | None = None
     try:
         with loaded(_unsealed(regular(path).read_bytes())) as arrays:
             t, q, p, iterations = (arrays[name] for name in COLUMNS)
+            if interface.words > 1:
+                t, q, p = (with_low(arrays[name], arrays[f"{name}_low"]) for name in ("t", "q", "p"))
             crossings = arrays["crossings"] if "crossings" in arrays else np.empty((0, 2 + 2 * q.shape[-1]))
             chunk = Chunk((t, q, p, iterations), int(arrays["step"]), arrays["memory"].tobytes(), crossings)
-            _check_shapes(chunk, q.shape[-1] if dimension is None else dimension, rows)
+            _check_shapes(chunk, interface, rows)
             return chunk
     except (OSError, ValueError) as error:
         raise RecordingError(f"'{path}' cannot be read: {error}") from error
 
 
-def _check_shapes(chunk: Chunk, dimension: int, rows: int | None) -> None:
+def _check_shapes(chunk: Chunk, interface: Interface, rows: int) -> None:
     """Raise :class:`ValueError` if columns have other types or inconsistent lengths."""
     columns: tuple[NDArray[Any], ...] = chunk.piece
-    likes: tuple[NDArray[Any], ...] = no_states(dimension)
+    likes: tuple[NDArray[Any], ...] = no_states(interface)
     for name, column, like in zip(COLUMNS, columns, likes, strict=True):
-        if column.shape != (len(chunk), *like.shape[1:]) or column.dtype != like.dtype:
-            raise ValueError(f"{name} has the shape {column.shape} and the type {column.dtype}")
+        for words in (column, column.low) if isinstance(column, Words) else (column,):
+            if words.shape != (len(chunk), *like.shape[1:]) or words.dtype != like.dtype:
+                raise ValueError(f"{name} has the shape {words.shape} and the type {words.dtype}")
     crossings = chunk.crossings
-    if crossings.ndim != 2 or crossings.shape[1] != 2 + 2 * dimension or crossings.dtype != np.float64:
+    if crossings.ndim != 2 or crossings.shape[1] != 2 + 2 * interface.dimension or crossings.dtype != np.float64:
         raise ValueError(f"crossings has the shape {crossings.shape} and the type {crossings.dtype}")
-    if chunk.step < 0 or (rows is not None and len(chunk) > rows):
+    if chunk.step < 0 or len(chunk) > rows:
         raise ValueError(f"it has {len(chunk)} states up to step {chunk.step}")
 
 
@@ -191,7 +197,8 @@ class Manifest:
         source, interface, flags: those of its stepper.
         fallback: source of the fallback library with Newton's iteration, ``None`` if the source contains it.
         options: convergence criterion of the solver; ``None`` for the defaults.
-        parameters: values in the order of ``interface.parameters``.
+        parameters, parameters_low: values in the order of ``interface.parameters``; low words in double-double
+            arithmetic.
         h: step size, 0 for adaptive steps.
         t: initial time.
         save_every: steps between saved states.
@@ -222,6 +229,13 @@ class Manifest:
     fallback: Source | None = None
     events: tuple[Event, ...] = ()
     mesh: Mapping[str, Any] | None = None
+    parameters_low: tuple[float, ...] = ()
+
+    @property
+    def values(self) -> NDArray[np.float64]:
+        """(k,) parameters, of one word or of two."""
+        high, low = np.array(self.parameters), self.parameters_low
+        return high if self.interface.words == 1 else with_low(high, np.array(low, dtype=float))
 
     def mesh_of_fields(self, folder: Path) -> Any:
         """Return the mesh of the fields of a density, or ``None``."""
@@ -280,8 +294,11 @@ class Manifest:
             checked_number(getattr(self, name), name)
         if len(self.parameters) != len(self.interface.parameters):
             raise ValueError(f"{len(self.parameters)} parameters where {len(self.interface.parameters)} are wanted")
-        for name, value in zip(self.interface.parameters, self.parameters, strict=True):
-            checked_number(value, name)
+        if len(self.parameters_low) != (self.interface.words - 1) * len(self.parameters):
+            raise ValueError(f"{len(self.parameters_low)} low words of parameters")
+        for values in (self.parameters, self.parameters_low) if self.parameters_low else (self.parameters,):
+            for name, value in zip(self.interface.parameters, values, strict=True):
+                checked_number(value, name)
         if (self.plan is None) == (self.steps is None) or (self.plan is None) == (self.h == 0.0):
             raise ValueError("give h (fixed steps) or a target time")
         if self.plan and not (np.isfinite([self.plan.t_end, self.plan.tau]).all() and 0 <= self.plan.tolerance < 1):
@@ -300,6 +317,7 @@ class Manifest:
             **({"fallback": self.fallback.to_record()} if self.fallback else {}),
             **({"events": [event.table for event in self.events]} if self.events else {}),
             **({"mesh": self.mesh} if self.mesh else {}),
+            **({"parameters_low": self.parameters_low} if self.parameters_low else {}),
         }
         text = json.dumps(document, indent=1) + "\n"
         return SEAL % hashlib.sha256(text.encode()).hexdigest() + text[1:]
@@ -330,6 +348,7 @@ class Manifest:
             fallback=Source.from_record(document["fallback"]) if "fallback" in document else None,
             events=tuple(Event(**table) for table in document.get("events", ())),
             mesh=document.get("mesh"),
+            parameters_low=tuple(document.get("parameters_low", ())),
         )
         manifest.check()
         return manifest

@@ -18,6 +18,7 @@ from scvi_codegen.files.labelled_arrays import checked_units
 from scvi_codegen.representation import LONGEST, clipped
 from scvi_codegen.results.recording.manifest import Chunk, chunk_paths, no_states, read_chunk, read_manifest
 from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.core.words import check_keeps_words, low_words
 from scvi_codegen.runtime.events.event import Crossings
 from scvi_codegen.runtime.rotations.attitude_history import AttitudeHistory
 from scvi_codegen.runtime.rotations.quantities import named_quantities
@@ -160,7 +161,7 @@ class RecordedRun(AttitudeHistory):
             t_end=plan.t_end if plan else None,
             tolerance=(plan.tolerance or None) if plan else None,
             h=(plan.tau or None) if plan else None,
-            parameters=manifest.parameters,
+            parameters=manifest.values,
             options=manifest.options,
         )
 
@@ -183,7 +184,7 @@ class RecordedRun(AttitudeHistory):
             yield self._last.piece
 
     def _read(self, path: Path) -> Chunk:
-        return read_chunk(path, self.manifest.interface.dimension, self.manifest.rows)
+        return read_chunk(path, self.manifest.interface, self.manifest.rows)
 
     def _read_full(self, path: Path) -> Piece:
         """Read a file that is followed by others."""
@@ -219,8 +220,9 @@ class RecordedRun(AttitudeHistory):
 
     def gather(self, rows: NDArray[np.int64], columns: Sequence[int]) -> list[NDArray[Any]]:
         """Return selected rows of some columns; each file is read once."""
-        kinds = [no_states(self.manifest.interface.dimension)[column] for column in columns]
+        kinds = [no_states(self.manifest.interface)[column] for column in columns]
         results = [np.empty((len(rows), *kind.shape[1:]), dtype=kind.dtype) for kind in kinds]
+        results = [array.view(type(kind)) for array, kind in zip(results, kinds, strict=True)]  # or of two words
         order = np.argsort(rows, kind="stable")
         files = rows[order] // self.manifest.rows
         for some in np.split(order, np.flatnonzero(np.diff(files)) + 1) if len(rows) else ():
@@ -249,6 +251,7 @@ class RecordedRun(AttitudeHistory):
     def states(self, units: Mapping[str, str] | None = None) -> States:
         """Return the states for :mod:`scvi_codegen.files.export`, read file by file."""
         manifest = self.manifest
+        numbers = (("t", self.t), ("q", self.q), ("p", self.p), ("parameters", manifest.values))
         return States(
             count=len(self),
             pieces=self._pieces,
@@ -259,8 +262,9 @@ class RecordedRun(AttitudeHistory):
             about=manifest.about(),
             maps=manifest.interface.map_names,
             attitudes=named_quantities(manifest.interface),
-            quantities=lambda t, q, p: quantities(self.stepper, np.array(manifest.parameters), t, q, p),
+            quantities=lambda t, q, p: quantities(self.stepper, manifest.values, t, q, p),
             units=checked_units(units),
+            low={f"{name}_low": low_words(each[:]) for name, each in numbers} if manifest.interface.words > 1 else {},
         )
 
     @checks_arguments()
@@ -270,6 +274,7 @@ class RecordedRun(AttitudeHistory):
         A CSV file has no velocities and no energy, which would require compiling the C source of the recording.
         ``run[:].save(path)`` and HDF5 files have them.
         """
+        check_keeps_words(self.manifest.interface.words, path)
         states, plain = self.states(units), Path(path).suffix.lower() == ".csv"
         write_states(replace(states, quantities=None) if plain else states, path)
 
@@ -303,7 +308,7 @@ class LazyArray:
 
     def __init__(self, run: RecordedRun, column: int) -> None:
         self._run, self._column = run, column
-        self._like = no_states(run.manifest.interface.dimension)[column]
+        self._like = no_states(run.manifest.interface)[column]
 
     @property
     def shape(self) -> tuple[int, ...]:

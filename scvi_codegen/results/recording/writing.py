@@ -36,6 +36,7 @@ from scvi_codegen.results.recording.manifest import (
 )
 from scvi_codegen.results.recording.reading import RecordedRun, load_run
 from scvi_codegen.runtime.core.features import require
+from scvi_codegen.runtime.core.words import low_words
 from scvi_codegen.runtime.run.accuracy import warn_of_energy_error, warn_of_large_steps, warn_of_unresolved_fields
 from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.observation import Observation
@@ -108,6 +109,7 @@ def record_run(
         flags=run.stepper.flags,
         options=run.options,
         parameters=tuple(map(float, run.parameters)),
+        parameters_low=tuple(low_words(run.parameters).tolist()) if run.stepper.interface.words > 1 else (),
         h=run.h,
         t=run.t,
         save_every=checked_count(save_every, "save_every", least=1),
@@ -220,7 +222,7 @@ class _Recorder:
 
     def load_last_file(self, folder: Path) -> None:
         paths = chunk_paths(folder)
-        chunk = read_chunk(paths[-1])
+        chunk = read_chunk(paths[-1], self.manifest.interface, self.manifest.rows)
         full = len(chunk) == self.manifest.rows
         self.number = len(paths) - 1 + full
         pieces, crossings = ([], self.crossings) if full else ([chunk.piece], chunk.crossings)
@@ -310,7 +312,7 @@ class _Recorder:
         pieces, crossings, step, reached, memory = self.pending
         if (step, reached) == (self.written, self.written_t):
             return
-        t, q, p, iterations = map(np.concatenate, zip(no_states(self.run.stepper.dimension), *pieces, strict=True))
+        t, q, p, iterations = map(np.concatenate, zip(no_states(self.manifest.interface), *pieces, strict=True))
         piece = (t, q, p, iterations)
         write_chunk(self.folder, self.number, Chunk(piece, step, memory, crossings))
         self.written, self.written_t = step, reached

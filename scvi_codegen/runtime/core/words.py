@@ -7,6 +7,7 @@ is its high words, followed by its low words.
 import math
 from collections.abc import Hashable, Iterable, KeysView, Mapping, Sequence
 from numbers import Rational
+from pathlib import Path
 from typing import Any, Self, TypeVar
 
 import numpy as np
@@ -177,6 +178,12 @@ def block_of(values: Any) -> Array:
     if not isinstance(values, Words):
         return np.asarray(values)
     return np.concatenate([np.asarray(values), values.low], axis=-1)
+
+
+def check_keeps_words(words: int, path: Any) -> None:
+    """Raise :class:`StateError` for a file of a format that has no low words."""
+    if words > 1 and Path(path).suffix.lower() != ".npz":
+        raise StateError(f"{path} would lose the low words of double-double arithmetic: give a file NAME.npz")
 
 
 def as_mpmath(values: Any) -> Any:

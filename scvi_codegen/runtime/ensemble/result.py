@@ -19,7 +19,7 @@ from scvi_codegen.files.labelled_arrays import AXES, Labelled, checked_units, to
 from scvi_codegen.representation import one_line
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array
-from scvi_codegen.runtime.core.words import Words, low_words, missing
+from scvi_codegen.runtime.core.words import Words, check_keeps_words, low_words, missing
 from scvi_codegen.runtime.rotations.attitude_history import AttitudeHistory
 from scvi_codegen.runtime.rotations.quantities import named_quantities
 from scvi_codegen.runtime.run.descriptions import short_title
@@ -259,8 +259,7 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble):
         """
         suffix, known = Path(path).suffix.lower(), checked_units(units)
         self._check_common_times()
-        if isinstance(self.q, Words) and suffix != ".npz":
-            raise StateError(f"{path} would lose the low words of double-double arithmetic: give a file NAME.npz")
+        check_keeps_words(self.stepper.interface.words, path)
         if suffix in LABELLED:
             check_format(path)
             write_whole(path, lambda new: LABELLED[suffix].write(self._labelled(known), new))

@@ -12,6 +12,7 @@ from scvi_codegen.indices import MOST_THREADS
 from scvi_codegen.representation import clipped
 from scvi_codegen.runtime.arrays.interface import RunSizes, check_accesses, read_tables
 from scvi_codegen.runtime.core.integrator import Integrator
+from scvi_codegen.runtime.core.words import block_of, from_block
 from scvi_codegen.validation import checked_count
 
 MAGIC = b"scvi run 4\n"
@@ -47,7 +48,7 @@ def checkpoint(run: Any) -> bytes:
         "unset inputs": run._unset_inputs,
         "adaptive": not run.plan.fixed,
     }
-    arrays = [*places.values(), run.parameters]
+    arrays: list[Any] = [*places.values(), block_of(run.parameters)]
     return sealed(b"".join([json.dumps(header).encode(), b"\n", *(array.tobytes() for array in arrays), run.snapshot]))
 
 
@@ -99,8 +100,12 @@ def _read(
         problem = RunSizes(sizes=sizes, places=places, threads=count)
         binding: Any = stepper  # of run-time sizes
         stepper = binding._bound_to(problem).with_events(stepper.events)
-    values = np.frombuffer(rest, count=len(stepper.defaults), offset=first)
-    known = stepper.parameters_by_name(values)
+    values = np.frombuffer(rest, count=stepper.interface.words * len(stepper.defaults), offset=first)
+    if stepper.interface.words == 1:
+        known = stepper.parameters_by_name(values)
+    else:
+        numbers = from_block(values)
+        known = {name: numbers[k : k + 1].reshape(()) for k, name in enumerate(stepper.parameters)}
     for name in header["unset inputs"]:
         del known[f"{name}_0"]
     return stepper, rest[first + values.nbytes :], known

@@ -9,7 +9,6 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self, cast, overload
 
 import numpy as np
@@ -23,7 +22,7 @@ from scvi_codegen.files.labelled_arrays import checked_units, to_dataset
 from scvi_codegen.runtime.constraints.projection import constraint_values, multipliers
 from scvi_codegen.runtime.core.features import refusal, require
 from scvi_codegen.runtime.core.validation import columns_of_inputs
-from scvi_codegen.runtime.core.words import Words, as_mpmath, low_words
+from scvi_codegen.runtime.core.words import Words, as_mpmath, check_keeps_words, low_words
 from scvi_codegen.runtime.events.detection import crossings_of
 from scvi_codegen.runtime.events.event import Crossings, Event, EventLike, as_events
 from scvi_codegen.runtime.paths.actions import actions_until, compensated_sums, shadow_energy
@@ -511,8 +510,7 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
             StateError: if the suffix is unknown, or the format has no units.
             MissingLibraryError: if h5netcdf or zarr is not installed (extra ``data``).
         """
-        if isinstance(self.q, Words) and Path(path).suffix.lower() != ".npz":
-            raise StateError(f"{path} would lose the low words of double-double arithmetic: give a file NAME.npz")
+        check_keeps_words(self.stepper.interface.words, path)
         write_states(self.states(units), path)
 
     def to_xarray(self, *, units: Mapping[str, str] | None = None) -> xarray.Dataset:
