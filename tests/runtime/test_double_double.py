@@ -239,6 +239,25 @@ def test_divided_kernels() -> None:
     assert max(abs(whole.mp("q")[-1] - halves.mp("q")[-1])) < 1e-29
 
 
+@pytest.mark.second
+def test_states_by_name() -> None:
+    """States by the names of coordinates or arrays keep both words."""
+    third = Fraction(1, 3)
+    named = {"x": "0.7", "y": third}, {"x": 0, "y": "1.3"}
+    chain = sc.LagrangianSystem.from_text(
+        name="springs", coordinates=["x[2]"], lagrangian="sum(i in 2, x_dot[i]**2/2 - x[i]**2/2)"
+    )
+    arrays = {"x": ["0.7", third]}, {"x": [0, "1.3"]}
+    for each, (q, v) in ((system("kepler"), named), (chain, arrays)):
+        stepper = sc.compile_stepper(each, "svi:4", precision="double-double")
+        run, plain = (
+            stepper.integrate(*start[:1], velocity=start[1], h=0.1, steps=2)
+            for start in ((q, v), (["0.7", third], [0, "1.3"]))
+        )
+        assert (run.mp("q") == plain.mp("q")).all()
+        assert run.q_low[0].all()
+
+
 def test_large_steps() -> None:
     """Corrections whose last changes are rounding errors are accepted, near pericentre with 16 steps a period."""
     stepper = sc.compile_stepper(system("kepler"), "svi:24", precision="double-double")

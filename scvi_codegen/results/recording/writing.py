@@ -115,7 +115,9 @@ def record_run(
         save_every=checked_count(save_every, "save_every", least=1),
         steps=_checked_steps(run, steps),
         plan=None if run.plan.fixed else run.plan,
-        rows=chunk_rows(run.stepper.dimension) if rows is None else checked_count(rows, "rows", least=1),
+        rows=chunk_rows(run.stepper.dimension * run.stepper.interface.words)
+        if rows is None
+        else checked_count(rows, "rows", least=1),
         model=model,
         certificate=_certificate(certificate),
         builds=(Build.of(run.stepper, 0),),

@@ -91,7 +91,7 @@ def flat_states(interface: Interface, q: States, other: States | None, name: str
 
 def checked_pair(interface: Interface, q: States, other: States, name: str = "p") -> tuple[Array, Array]:
     """Return finite, contiguous (m,) copies of positions and momenta (or what ``name`` names), also by name."""
-    if isinstance(q, Mapping) or isinstance(other, Mapping):
+    if not interface.precision and (isinstance(q, Mapping) or isinstance(other, Mapping)):
         q, other = flat_states(interface, q, other, name)
     return checked_vector(interface, q, "q"), checked_vector(interface, other, name)
 
