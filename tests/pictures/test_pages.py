@@ -343,6 +343,8 @@ def computed(text, steps):
     ],
 )
 def test_the_webassembly_computes_the_bits_of_python_within_200_kilobytes(tmp_path, text, steps, statuses):
+    needs("node")
+    pytest.importorskip("ziglang", reason="pages are compiled by the extra compiler")
     path = written(tmp_path, text)
     page = sc.page(path)
     assert len(page.html) < 200_000

@@ -151,7 +151,7 @@ OPERATIONS = {
     "sensitivity": lambda s: run_of(s).sensitivity(),
     "hessian": lambda s: (run := run_of(s)).hessian_product(rows_of(run), np.ones(2 * run.stepper.dimension)),
     "chaos": lambda s: run_of(s).chaos_indicators(),
-    "shadow_energy": lambda s: run_of(s).shadow_energy(),
+    "shadow_energy": lambda s: run_of(s, t_end=2.0, steps=None).shadow_energy(),
     "chaos_ensemble": lambda s: s.chaos_indicators_ensemble(*map(stacked, state_of(s)), h=0.1, steps=3),
     "periodic_orbit": lambda s: sc.periodic_orbit(s, *state_of(s), period=6.3, steps=60),
     "energy": lambda s: sc.periodic_orbit(s, *state_of(s), period=6.3, steps=60, energy=0.1),

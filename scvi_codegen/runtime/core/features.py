@@ -131,7 +131,7 @@ FEATURES = {
         ("for a first-order system", "hessian", "use first derivatives and differences of them"),
         (
             "with events that change the state",
-            "error device observe_ensemble check_growth hessian chaos_ensemble flow advice",
+            "error device observe_ensemble check_growth hessian chaos_ensemble flow advice shadow_energy",
             "make them terminal and restart",
         ),
         (
@@ -142,7 +142,7 @@ FEATURES = {
         ("with constraints of arrays", "threads", "omit threads; the step uses one"),
         (
             "with constraints of arrays by a composition",
-            f"{_FIRST} chaos chaos_ensemble hessian work discrete_lagrangian with_sizes",
+            f"{_FIRST} chaos chaos_ensemble hessian work discrete_lagrangian with_sizes recording",
             "it compiles known sizes, whose constraints require an SVI; use SVI(1, 'gauss-lobatto:2'), which is RATTLE",
         ),
         (

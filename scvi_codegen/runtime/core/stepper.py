@@ -678,6 +678,10 @@ class StepperOfRunTimeSizes(Stepper):
         **named: Any,
     ) -> Any:
         """Call a method of the stepper that is bound to the arrays of the call."""
+        if method == Stepper.integrate_ensemble:
+            for argument, operation in (("device", "device"), ("observe", "observe_ensemble")):
+                if named.get(argument) is not None:
+                    require(self, operation)
         threads = named.pop("threads", None) if method in PER_STEP else None
         stepper = self if named.get("events") is None else self.with_events(named.pop("events"))
         bound, state = stepper.bind(q, parameters, tables, threads)
