@@ -22,7 +22,7 @@ FOLDER = template_folder() / "support"
 HEADERS = {str(path.relative_to(FOLDER)) for path in FOLDER.glob("**/*.h")}
 OTHERS = {
     **{header: "compared with 60 digits in test_double_double.py" for header in HEADERS if "double_double/" in header},
-    **dict.fromkeys(("run/thread_advance_to.h", "run/thread_points.h", "run/tangent_growth.h"), "run in test_device.py"),
+    **{f"run/{name}.h": "in test_device.py" for name in ("thread_advance_to", "thread_points", "tangent_growth")},
     "run/observation.h": "compared with the states of runs in test_observers.py",
     "frameworks/casadi_flow.h": "interface of CasADi to a compiled step",
     "frameworks/flow.h": "interface of JAX and PyTorch to a compiled step",
