@@ -52,8 +52,9 @@ def test_the_overview_shows_body_axes_in_the_unit_circle(run, tmp_path):
 
 def test_an_animation_moves_and_turns_with_the_body(run):
     film = run.animate(seconds=0.2)
-    centre, *axes, tip = np.moveaxis(positions_of(film.shapes[0], film.shown[0]), 1, 0)
+    centre, *axes, base, tip = np.moveaxis(positions_of(film.shapes[0], film.shown[0]), 1, 0)
     np.testing.assert_array_equal(centre, run.q[:, :3])
+    np.testing.assert_array_equal(base, centre)
     turned = np.stack(axes, axis=2) - centre[:, :, np.newaxis]
     np.testing.assert_allclose(turned, run.rotation(), rtol=0, atol=1e-15)
     np.testing.assert_allclose(tip, centre + run.direction(), rtol=0, atol=1e-15)
