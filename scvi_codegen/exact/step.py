@@ -195,8 +195,19 @@ class DerivedStep:
                 assert scalar is not None  # checked above
                 (value,) = scalar(self._point(group, n, arguments[n], known))
                 grown = self._damping_factor(group.abscissae[n], known)
-                total += scale * weight * grown * known.h ** (1 + group.scalar_power) * value
+                total += self._row_scale(f, n) * scale * weight * grown * known.h ** (1 + group.scalar_power) * value
         return total
+
+    def _row_scale(self, f: int, n: int) -> Number:
+        """Return the factor of the action at a point that a row of its own has been divided by, 1 without such a row.
+
+        The rows of a splitting are divided by the coefficients with which their unknowns enter the end position, so
+        that kinetic energies have the weight 1 in them instead of the part of their step.
+        """
+        rows = {r for table in self.scatters[f] for r in np.flatnonzero(table[n])}
+        if len(rows) != 1 or (row := rows.pop()) == len(self.stages.rows):
+            return mp.one
+        return numbers(self.stages.end_position.entries[0])[row + 1] / self.momenta[row]
 
     def _straight(self, known: _Known) -> Numbers:
         """Return the (unknowns,) initial guess: straight line with the initial velocity, 0 for other block sizes."""

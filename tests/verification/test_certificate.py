@@ -75,8 +75,10 @@ def test_planted_fault_leaves_no_trace_in_the_process() -> None:
     assert certified(mutation.case).passed
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(each, marks=getattr(pytest.mark, "second" if "composition" in each else "full")) for each in CASES],
+)
 def test_unmodified_systems_pass(name: str) -> None:
     certificate = certified(CASES[name])
     assert certificate.passed, certificate.to_text()
