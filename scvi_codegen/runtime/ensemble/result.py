@@ -134,6 +134,7 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble):
                     stepper=self.stepper,
                     plan=plan,
                     steps=int(self.steps[j]),
+                    fallback_steps=0 if self.fallback_steps is None else int(self.fallback_steps[j]),
                 )
             )
         return joined(pieces) if len(pieces) > 1 else pieces[0]
