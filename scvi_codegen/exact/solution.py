@@ -308,7 +308,7 @@ class FirstOrderMotion(ExactMotion):
 
     @cached_property
     def _theta(self) -> Tape:
-        """theta, and its derivatives by q and by y, row by row; then by t."""
+        """Return theta, and its derivatives by q and by y, row by row; then by t."""
         theta, q, y = self.system.one_form, self.system.coordinates, self.system.momenta
         derivatives = [each.diff(x) for x in (*q, *y) for each in theta]
         return Tape([*theta, *derivatives, *(each.diff(self.system.time) for each in theta)], self.symbols)

@@ -65,24 +65,20 @@ DAMPING = (
 RATTLES = tuple(
     text(f"{what}, rods/rattle", case("rods/rattle"), *edit)
     for what, *edit in (
-        ("a hidden constraint without g_t", r"value \+ M, 1, lambda\)", "value + M + CONSTRAINTS, 1, lambda)"),
-        ("half of the force at the end", r"now->force\[i \* B \+ DEGREE\];", "now->force[i * B + DEGREE] / 2;"),
-        ("constraints of the start of a step", r"step->t \+ RATTLE_ABSCISSA\[n\] \* step->h;", "step->t;"),
-        ("masses that are not inverted", r"now->inverse_mass\[i\] = 1 / now", "now->inverse_mass[i] = now"),
+        ("a hidden constraint without g_t", r"-value\[M \+ k\]", "-value[M + CONSTRAINTS + k]"),
+        ("half of the force at the end", r"now->force\[i\]\[DEGREE - 1\];", "now->force[i][DEGREE - 1] / 2;"),
+        ("constraints of the start of a step", r"step->t \+ RATTLE_ABSCISSA\[n \+ 1\] \* step->h;", "step->t;"),
+        ("masses that are not inverted", r"now->inverse_mass\[i\] = 1 / mass", "now->inverse_mass[i] = mass"),
     )
 ) + tuple(
     text(f"{what}, rods/lobatto-svi", case("rods/lobatto-svi"), *edit)
     for what, *edit in (
         (
             "derivatives of the next point",
-            r"derivative = now->derivative \+ e \* B, \*own",
-            "derivative = now->derivative + e * B + 1, *own",
+            r"FORMER\(load\(now->derivative\[e\]\), lanes_of\(now->first_derivative\[e\]\)\)",
+            "load(now->derivative[e])",
         ),
-        (
-            "positions off by 1e-12 of a step",
-            r"RATTLE_POSITION\[b\]\[r\] \* z",
-            "RATTLE_POSITION[b][r] * (1 + 1e-12) * z",
-        ),
+        ("positions off by 1e-12 of a step", r"moved = step->h \* v;", "moved = step->h * (1 + 1e-12) * v;"),
     )
 )
 
@@ -248,8 +244,8 @@ C_TEXT = (
         "sweeps of changes that end early",
         "kepler/svi-3",
         "vectors_status",
-        r"<= LEFT_TO_COME \* before",
-        "<= 1e-14 * before",
+        r"MOVED_BY_ROUNDING : LEFT_TO_COME",
+        "MOVED_BY_ROUNDING : 1e-6",
     ),
     ("a matrix not transposed", "double/svi", "solve_back", r"pivot, 1, at->x", "pivot, 0, at->x"),
     (
@@ -293,8 +289,8 @@ SECOND = (
     text(
         "second derivatives at the start of the step",
         case("driven/svi"),
-        r"f->curvature\(given, time_of\(f, step, n\),",
-        "f->curvature(given, step->t,",
+        r"f->curvature\(u, time_of\(f, step, n\),",
+        "f->curvature(u, step->t,",
     ),
     text(
         "arguments that h moves bend once too often",

@@ -63,7 +63,7 @@ ROUNDOFF = (
     (
         "carry left out of positions",
         "kepler/composition",
-        "solve",
+        "leap",
         r"\(step->carry_q\[i\] \+",
         "(0 * step->carry_q[i] +",
     ),
