@@ -93,6 +93,8 @@ class Binding:
     def each(self, call: Any) -> Callable[[int], int]:
         """Return the function ``<prefix>_call_each`` of the largest number of steps; it returns the steps taken."""
         function: Callable[[int], int] = partial(getattr(self._lib, f"{self._prefix}_call_each"), call)
+        if self._fallback is None:
+            return function
 
         def advance(steps: int) -> int:
             taken = function(steps)

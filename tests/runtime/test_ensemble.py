@@ -419,7 +419,7 @@ def test_bits_of_trajectories_do_not_depend_on_others(
     name: str, method: Method, plan: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In another order, in parts, in threads and calls: with different iterations, accelerated and failed steps."""
-    monkeypatch.setattr("scvi_codegen.runtime.ensemble.ensemble.CHUNK_SECONDS", 1e3)  # two blocks in a call
+    monkeypatch.setattr("scvi_codegen.runtime.ensemble.batches.FIRST_CHUNK_STEPS", 7)  # calls end within blocks
     generator = np.random.default_rng(4)
     if name == "chain":  # slow iterations
         stepper, count = sc.compile_stepper(chain(4).system, method), 136
@@ -486,10 +486,10 @@ class TestThreadsAndInterruption:
         assert 0 < result.steps.max() < 10**9
 
     def test_error_in_a_block_is_raised(self, kepler: sc.Stepper, monkeypatch: pytest.MonkeyPatch):
-        def fail(*arguments: object) -> None:
+        def fail(*arguments: object, **others: object) -> None:
             raise RuntimeError("out of order")
 
-        monkeypatch.setattr("scvi_codegen.runtime.ensemble.lanes.LaneBlock.advance", fail)
+        monkeypatch.setattr("scvi_codegen.runtime.ensemble.batches.Call.advance", fail)
         with pytest.raises(RuntimeError, match="out of order"):
             kepler.integrate_ensemble(*states("kepler", 20), h=0.05, steps=10)
 

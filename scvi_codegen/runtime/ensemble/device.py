@@ -23,11 +23,11 @@ from scvi_codegen.rendering.source import POINT_THREADS, Source
 from scvi_codegen.representation import one_line
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array
+from scvi_codegen.runtime.ensemble.batches import CHUNK_SECONDS, Rows, SuccessiveRuns
 from scvi_codegen.runtime.ensemble.lanes import CommonRuns, SingleBlock
 from scvi_codegen.runtime.ensemble.observation import EnsembleObservation
 from scvi_codegen.runtime.ensemble.result import INTERRUPTED, OK, EnsembleRuns, EnsembleTrajectory
 from scvi_codegen.runtime.ensemble.schedule import CommonSteps
-from scvi_codegen.runtime.ensemble.successive import CHUNK_SECONDS, Rows, SuccessiveRuns
 from scvi_codegen.runtime.ensemble.thread_pool import StopCheck, run_jobs
 from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.descriptions import short_title
@@ -366,7 +366,7 @@ class AdaptiveDeviceRuns:
                 self.t_end[failed],
                 tolerance=self.tolerance,
                 save_every=LARGEST_COUNT,
-                store=store,
+                receive=store,
             )
             again.run(progress=None, threads=threads)
             self.status[failed], self.done[failed] = again.names, again.done

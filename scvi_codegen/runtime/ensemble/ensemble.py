@@ -1,13 +1,12 @@
 """Ensembles: many trajectories with common fixed steps, or each with adaptive steps of its own.
 
 With common fixed steps trajectories are SIMD lanes (:mod:`scvi_codegen.runtime.ensemble.lanes`). Others are computed by
-the single integrator, many in one call of C (:mod:`scvi_codegen.runtime.ensemble.successive`), so they are bitwise
-equal to those of :meth:`Stepper.integrate`, which computes trajectories with inputs, output times, changes by events,
-states of two words or a bound of the global error. C runs without the GIL, so threads share the work; results are
-bitwise equal for any number of threads.
+the single integrator, so they are bitwise equal to those of :meth:`Stepper.integrate`, which computes trajectories with
+inputs, output times, changes by events, states of two words or a bound of the global error. C integrates many
+trajectories in one call (:mod:`scvi_codegen.runtime.ensemble.batches`), without the GIL, so threads share the work;
+results are bitwise equal for any number of threads.
 """
 
-import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
@@ -25,6 +24,7 @@ from scvi_codegen.rendering.source import Source
 from scvi_codegen.runtime.core.features import check_together, require
 from scvi_codegen.runtime.core.validation import Array, States, check_left_to_inputs, columns_of_inputs, parameter_index
 from scvi_codegen.runtime.core.words import missing
+from scvi_codegen.runtime.ensemble.batches import Rows, SuccessiveRuns
 from scvi_codegen.runtime.ensemble.device import (
     FEWEST_COORDINATES,
     AdaptiveDeviceRuns,
@@ -45,7 +45,6 @@ from scvi_codegen.runtime.ensemble.lanes import CommonRuns
 from scvi_codegen.runtime.ensemble.observation import EnsembleObservation
 from scvi_codegen.runtime.ensemble.result import EVENT_FAILED, INTERRUPTED, OK, EnsembleTrajectory, Span
 from scvi_codegen.runtime.ensemble.schedule import CommonSteps
-from scvi_codegen.runtime.ensemble.successive import CHUNK_SECONDS, FIRST_CHUNK_STEPS, GROWTH, Rows, SuccessiveRuns
 from scvi_codegen.runtime.ensemble.thread_pool import StopCheck, run_jobs
 from scvi_codegen.runtime.inputs.segments import (
     Input,
@@ -57,16 +56,12 @@ from scvi_codegen.runtime.inputs.segments import (
     parameters_at,
 )
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
-from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.global_error import GlobalError
 from scvi_codegen.runtime.run.step_plan import StepPlan, checked_plan, planned_steps
 from scvi_codegen.runtime.run.times import WHOLE
 from scvi_codegen.runtime.trajectory.dense_output import times_of_run
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation import LARGEST_COUNT, checked_count
-
-FEW_STEPS = 10_000
-"""Largest number of steps of trajectories of which many are integrated in one call of C."""
 
 
 class SavedLane(NamedTuple):
@@ -181,13 +176,11 @@ class Ensemble:
 
     def _successive(self) -> SuccessiveRuns | None:
         """Return the trajectories that C integrates one after the other, ``None`` for other ensembles."""
-        stepper, common = self.stepper, self.common
-        if isinstance(common, DeviceRuns) or self.adaptive is not None:
+        stepper = self.stepper
+        if self.common is not None or self.adaptive is not None:
             return None
         if self.inputs or self.singly or stepper.in_tau or not stepper.binding.reusable:
             return None
-        if common is not None:
-            return common.successive() if common.steps.steps and stepper.ensemble is None else None
         ends = self._ends()
         if self.error is not None or not (self.t_eval is None or self._saves_ends(ends)):
             return None
@@ -200,7 +193,7 @@ class Ensemble:
             ends,
             tolerance=self.plans[0].tolerance,
             save_every=self.save_every if self.t_eval is None else LARGEST_COUNT,
-            store=lambda states: self.states.append(states.copies()),
+            receive=lambda states: self.states.append(states.copies()),
         )
 
     def _ends(self) -> Array:
@@ -299,68 +292,17 @@ class Ensemble:
             threads: number of threads, by default one per core.
         """
         if self.successive is not None:
-            unit = self.length / len(self)
-            report = None if progress is None else lambda done: progress(int(done * unit))
+            report = None if progress is None else lambda done: progress(int(done))
             self.successive.run(progress=report, threads=threads)
             return
-        if isinstance(self.common, DeviceRuns):
-            self.common.run(progress=progress, threads=threads)
-            return
-        if self.adaptive is not None:
-            self.adaptive.run(progress=progress, threads=threads)
-            return
-        if self.common is not None:
-            self._run_blocks(self.common, progress, threads)
+        if (runs := self.adaptive or self.common) is not None:
+            runs.run(progress=progress, threads=threads)
             return
 
         def advance(j: int, check_stop: StopCheck) -> None:
             self.saved[j] = self._trajectory(j, check_stop)
 
         run_jobs(len(self), advance, progress=progress, threads=threads)
-
-    def _run_blocks(self, common: CommonRuns, progress: Callable[[int], None] | None, threads: int | None) -> None:
-        make, width = common.blocks()
-        firsts = range(0, len(self), width)
-        reached = np.zeros(len(firsts))
-
-        def advance(number: int, check_stop: StopCheck) -> None:
-            block = make(firsts[number])
-
-            def advance_chunk(size: int) -> int:
-                check_stop(size)
-                block.advance(size)
-                reached[number] += size
-                return size
-
-            drive(
-                advance_chunk,
-                common.steps.steps,
-                first=FIRST_CHUNK_STEPS,
-                growth=GROWTH,
-                seconds=CHUNK_SECONDS,
-                ended=lambda: False,
-            )
-
-        together, begun, blocks = None if self.inputs else common.lanes_in_one_call(), 0, 1
-        if together is not None and len(firsts) > 1 and common.steps.steps <= FEW_STEPS:
-            began = time.perf_counter()
-            advance(0, lambda _: None)
-            blocks = int(min(CHUNK_SECONDS / (time.perf_counter() - began), -(-len(firsts) // 16)))
-            begun, blocks = 1, max(1, blocks)
-        jobs = range(begun, len(firsts), blocks)  # of so many blocks each
-
-        def advance_many(number: int, check_stop: StopCheck) -> None:
-            first, last = jobs[number], min(jobs[number] + blocks, len(firsts))
-            failed = [firsts[first]]
-            if together is not None and blocks > 1:
-                failed = together(firsts[first], min(firsts[last - 1] + width, len(self)))
-                reached[first:last] = common.steps.steps
-            for each in failed:
-                reached[each // width] = 0
-                advance(each // width, check_stop)
-
-        report = None if progress is None else lambda _: progress(int(reached.mean()))
-        run_jobs(len(jobs), advance_many, progress=report, threads=threads)
 
     def _trajectory(self, j: int, check_stop: StopCheck) -> SavedLane:
         """Return trajectory j as :meth:`Stepper.integrate` does; with ``error`` its confirmed local tolerance is kept.
@@ -417,10 +359,6 @@ class Ensemble:
         if self.common is None:
             return self._adaptive_result()
         common, fixed = self.common, self.common.steps
-        if self.successive is not None:
-            common.done, ended = self.successive.done, self.successive.status >= 0
-            common.fallback_steps = self.successive.fallback_steps
-            common.status = np.where(ended, self.successive.names, OK)
         q, p = common.states()
         spans: tuple[Span, ...] = ()
         if fixed.t_end is not None:

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.native.arguments import empty_array
@@ -21,10 +20,20 @@ from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array
+from scvi_codegen.runtime.ensemble.batches import (
+    CHUNK_SECONDS,
+    FIRST_CHUNK_STEPS,
+    GROWTH,
+    Batch,
+    Call,
+    Rows,
+    SuccessiveRuns,
+)
 from scvi_codegen.runtime.ensemble.observation import EnsembleObservation
 from scvi_codegen.runtime.ensemble.result import OK
 from scvi_codegen.runtime.ensemble.schedule import CommonSteps
-from scvi_codegen.runtime.ensemble.successive import FixedSegments, Rows, SuccessiveRuns
+from scvi_codegen.runtime.ensemble.thread_pool import StopCheck, run_jobs
+from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.run_loop import record
 from scvi_codegen.runtime.run.step_plan import StepPlan
@@ -78,70 +87,65 @@ class CommonRuns:
         """Return the (n, k, m) saved positions and momenta."""
         return self.q, self.p
 
-    def successive(self) -> SuccessiveRuns:
-        """Return the trajectories as successive runs, which store their states here."""
-        fixed, _ = self.fixed_segments()
-        start = self.start, self.parameters, self.steps.t0
-        return SuccessiveRuns(self.stepper, self.options, *start, fixed, store=self._store)
+    def run(self, *, progress: Callable[[int], None] | None, threads: int | None) -> None:
+        """Integrate all trajectories; ``progress`` is called with the number of completed steps and may raise."""
+        batch, unit = self._batch(), self.steps.steps / len(self)
+        if batch is None:
+            self._run_blocks(progress, threads)
+            return
+        try:
+            batch.run(progress=None if progress is None else lambda done: progress(int(done * unit)), threads=threads)
+        finally:
+            if isinstance(batch, SuccessiveRuns):
+                self.status = np.where(batch.status >= 0, batch.names, OK)
+                self.done, self.fallback_steps = batch.done, batch.fallback_steps
+
+    def _batch(self) -> Batch | None:
+        """Return the trajectories as C integrates many in one call, ``None`` if it does not."""
+        stepper, binding = self.stepper, self._binding
+        start = self.options, self.start, self.parameters, self.steps.t0
+        if self.steps.has_inputs or stepper.in_tau or not self.steps.steps:
+            return None
+        if stepper.ensemble is None:
+            fixed = self.steps.fixed_segments()
+            return SuccessiveRuns(stepper, *start, fixed, receive=self._store) if stepper.binding.reusable else None
+        if binding is None or self.observation is not None or binding.constant("NEEDS_VELOCITIES"):
+            return None
+        return LaneRuns(self, binding, *start, self.steps.fixed_segments())
 
     def _store(self, states: Rows) -> None:
         self.q[states.rows, states.trajectories], self.p[states.rows, states.trajectories] = states.q, states.p
         if self.actions is not None:
             self.actions[states.rows, states.trajectories] = states.actions
 
-    def fixed_segments(self) -> tuple[FixedSegments, NDArray[np.int64]]:
-        """Return the steps in segments, and the row of the first state that is saved in each."""
-        steps, h, segments, begin = self.steps, self.steps.segments[0].h, [], 0
-        for chunk in steps.chunks(0, steps.steps):
-            h = h if chunk.entered is None else chunk.entered.h
-            segments.append((chunk.steps, chunk.save_every, h, steps.row(begin)))
-            begin += chunk.steps
-        numbers, save_every, sizes, rows = zip(*segments, strict=True)
-        fixed = FixedSegments(np.array(numbers, np.int64), np.array(save_every, np.int64), np.array(sizes, float))
-        return fixed, np.array(rows, np.int64)
+    def _run_blocks(self, progress: Callable[[int], None] | None, threads: int | None) -> None:
+        _, width = self.blocks()
+        reached = np.zeros(-(-len(self) // width))
+
+        def advance(number: int, check_stop: StopCheck) -> None:
+            def took(size: int) -> None:
+                reached[number] = size
+
+            self.advance_block(number * width, check_stop, took)
+
+        report = None if progress is None else lambda _: progress(int(reached.mean()))
+        run_jobs(len(reached), advance, progress=report, threads=threads)
+
+    def advance_block(self, first: int, check_stop: StopCheck, progress: Callable[[int], None] | None = None) -> None:
+        """Integrate a block to its end; ``progress`` is called with its number of completed steps."""
+        block = self.blocks()[0](first)
+
+        def advance(size: int) -> int:
+            check_stop(size)
+            block.advance(size)
+            return size
+
+        chunks: dict[str, Any] = {"first": FIRST_CHUNK_STEPS, "growth": GROWTH, "seconds": CHUNK_SECONDS}
+        drive(advance, self.steps.steps, **chunks, ended=lambda: False, progress=progress)
 
     @property
     def _binding(self) -> Binding | None:
         return self.stepper._ensemble_binding if self.observation is None else self.observation.binding
-
-    def lanes_in_one_call(self) -> Callable[[int, int], list[int]] | None:
-        """Return a function that integrates a range of trajectories in one call of C; ``None`` without such lanes.
-
-        It returns the first trajectories of the blocks in which one failed, which have to be integrated singly.
-        """
-        binding = self._binding
-        if self.observation is not None or self.actions is not None or not self.steps.steps:
-            return None
-        if binding is None or binding.constant("NEEDS_VELOCITIES"):
-            return None
-        (steps, save_every, h), rows = self.fixed_segments()
-        width = len(binding.new("block *").active)
-        start = [np.ascontiguousarray(x) for x in (*self.start, self.parameters)]
-        if not start[-1].size:
-            start[-1] = np.zeros((1, 1))
-        active = np.zeros(len(self))
-
-        def advance(first: int, end: int) -> list[int]:
-            binding.function("advance_each")(
-                binding.new("block *"),
-                first,
-                end,
-                self.steps.t0,
-                *map(binding.pointer, start),
-                len(h),
-                *map(binding.whole_numbers, (steps, save_every, rows)),
-                binding.pointer(h),
-                binding.options(self.options),
-                binding.pointer(self.q),
-                binding.pointer(self.p),
-                self.start[0].size,
-                binding.pointer(active),
-            )
-            failed = np.flatnonzero(active[first:end] == 0.0) // width * width + first
-            self.done[first:end] = self.steps.steps
-            return sorted({*failed.tolist()})
-
-        return advance
 
     def blocks(self) -> tuple[Callable[[int], LaneBlock | SingleBlock], int]:
         """Return a function that makes the block beginning at a trajectory, and the trajectories per block."""
@@ -149,6 +153,51 @@ class CommonRuns:
         if binding is None:
             return lambda first: SingleBlock(self, first), 1
         return lambda first: LaneBlock(self, first, binding), len(binding.new("block *").active)
+
+
+class LaneRuns(Batch):
+    """Trajectories in SIMD lanes, of which C integrates many blocks in one call; arguments as of :class:`Batch`.
+
+    Args:
+        common: the trajectories, whose arrays C fills.
+    """
+
+    def __init__(self, common: CommonRuns, binding: Binding, *arguments: Any) -> None:
+        super().__init__(binding, *arguments)
+        self.common, self.width = common, len(binding.new("block *").active)
+        common.done = self.done
+
+    def call(self, first: int, end: int) -> Call:
+        """Return the calls for a range of trajectories."""
+        return _LaneCall(self, first, end)
+
+
+class _LaneCall(Call):
+    """Calls with the memory of a block; blocks with failed steps are repeated with single runs."""
+
+    def __init__(self, work: LaneRuns, first: int, end: int) -> None:
+        super().__init__(work, first, end)
+        self.work, common, struct = work, work.common, self.struct
+        self.block = struct.block = work.binding.new("block *")
+        struct.positions, struct.momenta = map(work.binding.pointer, (common.q, common.p))
+        if common.actions is not None:
+            struct.actions = work.binding.pointer(common.actions)
+        struct.trajectories = len(common)
+
+    def advance(self, *, check_stop: StopCheck | None = None, until: Callable[[], bool] = lambda: False) -> None:
+        """Advance as all calls; states after failed steps are NaN, until the block ends and is repeated."""
+        work, common, end = self.work, self.work.common, int(self.struct.end)
+        try:
+            super().advance(check_stop=check_stop, until=until)
+        finally:
+            failed = np.flatnonzero(work.status[self.first : end] > 0) + self.first
+            for j in failed.tolist():
+                rows = slice(common.steps.row(int(work.done[j])), None)
+                common.q[rows, j] = common.p[rows, j] = np.nan
+        ended = failed[failed < self.struct.next] // work.width * work.width
+        for first in np.unique(ended).tolist():
+            common.advance_block(first, check_stop or (lambda _: None))
+        self.first = int(self.struct.next)
 
 
 class LaneBlock:

@@ -6,6 +6,7 @@ from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scvi_codegen.native.arguments import checked_step, empty_array
 from scvi_codegen.runtime.core.validation import Array
@@ -27,6 +28,14 @@ class StepChunk(NamedTuple):
     entered: Segment | None = None
 
 
+class FixedSegments(NamedTuple):
+    """Fixed steps in segments: their numbers of steps, strides of saved states and step sizes."""
+
+    steps: NDArray[np.int64]
+    save_every: NDArray[np.int64]
+    h: Array
+
+
 class CommonSteps:
     """Fixed steps that all trajectories share, and the states that are saved.
 
@@ -40,6 +49,7 @@ class CommonSteps:
         segments: segments of equal steps.
         ends: number of steps up to the end of each segment.
         numbers: step numbers of the saved states.
+        has_inputs: whether parameters change along the runs.
     """
 
     def __init__(
@@ -53,6 +63,7 @@ class CommonSteps:
         save_every: int,
     ) -> None:
         self.t0, self.h, self.t_end, self.save_every = t0, checked_step(h), t_end, save_every
+        self.has_inputs = bool(inputs)
         count = 0 if t_end is not None else checked_count(steps, "steps", least=0)
         self.segments = [Segment(count, self.h, (t0, 0.0), t0)]
         if t_end is not None:
@@ -78,6 +89,15 @@ class CommonSteps:
             save_every = last if odd and until == last else self.save_every
             yield StepChunk(until - step, save_every, self.segments[k] if entering else None)
             step = until
+
+    def fixed_segments(self) -> FixedSegments:
+        """Return the chunks of all steps, as C takes them."""
+        h, chunks, sizes = self.segments[0].h, list(self.chunks(0, self.steps)), []
+        for chunk in chunks:
+            h = h if chunk.entered is None else chunk.entered.h
+            sizes.append(h)
+        steps, save_every = (np.array(each, np.int64) for each in zip(*(chunk[:2] for chunk in chunks), strict=True))
+        return FixedSegments(steps, save_every, np.array(sizes, float))
 
     def at(self, step: int) -> tuple[Segment, tuple[float, float]]:
         """Return the segment and the double-double time after ``step`` steps."""

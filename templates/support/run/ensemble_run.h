@@ -55,20 +55,6 @@ void NAME(start)(block_memory *block, double t, double h)
 #endif
 }
 
-void NAME(set)(block_memory *block, int lane, const double *q, const double *p, const double *v,
-    const double *parameters)
-{
-  for (int i = 0; i < M; i++) {
-    block->q[i][lane] = q[i];
-    block->p[i][lane] = p[i];
-    for (int n = 0; STATUS(NEEDS_VELOCITIES) && n < S; n++)
-      block->memory[0][n][i][lane] = block->memory[1][n][i][lane] = v[i];
-  }
-  for (int i = 0; i < P; i++)
-    block->parameters[i][lane] = parameters[i];
-  block->active[lane] = 1.0;
-}
-
 static void load_state(const block_memory *block, state *now)
 {
   memcpy(now->q, block->q, sizeof now->q);
@@ -256,27 +242,58 @@ void NAME(observe)(block_memory *block, int lane, long long count, const double 
 }
 #endif
 
-void NAME(advance_each)(block_memory *block, long long first, long long end, double t, const double *q0,
-    const double *p0, const double *parameters, int segments, const long long *steps, const long long *every,
-    const long long *row, const double *h, const solver_options *options, double *q, double *p, long long row_length,
-    double *active)
+/* Puts the next trajectories into the lanes; surplus lanes repeat the last one and are inactive. */
+static void begin_block(NAME(each) *c, int count)
 {
-  for (; first < end; first += LANES) {
-    const int count = (int)(end - first < LANES ? end - first : LANES);
-    NAME(start)(block, t, h[0]);
-    for (int j = 0; j < LANES; j++) {
-      const long long from = first + (j < count ? j : count - 1);
-      NAME(set)(block, j, q0 + from * M, p0 + from * M, q0 + from * M, parameters + from * P);
-      block->active[j] = j < count;
+  block_memory *block = c->block;
+  NAME(start)(block, c->t, c->segment_h[0]);
+  for (int j = 0; j < LANES; j++) {
+    const long long from = c->next + (j < count ? j : count - 1);
+    for (int i = 0; i < M; i++) {
+      block->q[i][j] = c->q[from * M + i];
+      block->p[i][j] = c->p[from * M + i];
     }
-    for (int s = 0; s < segments; s++) {
-      block->guess = h[s] == block->h ? block->guess : 0;
-      block->h = h[s];
-      NAME(advance)(block, count, steps[s], every[s], options, q + row[s] * row_length + first * M,
-          p + row[s] * row_length + first * M, row_length);
-    }
-    for (int j = 0; j < count; j++)
-      active[first + j] = block->active[j];
+    for (int i = 0; i < P; i++)
+      block->parameters[i][j] = c->parameters[from * P + i];
+    block->active[j] = j < count;
   }
+  c->rows = 1;
+  c->segment = 0;
+  c->left = c->segment_steps[0];
+}
+
+long long NAME(call_each)(NAME(each) *c, long long steps)
+{
+  block_memory *block = c->block;
+  long long taken = 0;
+  while (c->next < c->end && taken < steps) {
+    const int count = (int)(c->end - c->next < LANES ? c->end - c->next : LANES);
+    if (c->segment < 0)
+      begin_block(c, count);
+    const long long every = c->segment_every[c->segment], begun = block->step;
+    const long long size = steps - taken < c->left ? steps - taken : c->left, place = c->rows * c->trajectories + c->next;
+#ifdef RUN_ACTION
+    block->actions = c->actions + place;
+#endif
+    NAME(advance)(block, count, size, every, c->options, c->positions + place * M, c->momenta + place * M,
+        c->trajectories * M);
+    c->rows += block->step / every - begun / every;
+    taken += size;
+    c->left -= size;
+    while (c->left == 0 && ++c->segment < c->segments) {
+      c->left = c->segment_steps[c->segment];
+      block->guess = c->segment_h[c->segment] == block->h ? block->guess : 0;
+      block->h = c->segment_h[c->segment];
+    }
+    for (int j = 0; j < count; j++) {
+      c->done[c->next + j] = block->last_step[j];
+      c->status[c->next + j] = block->active[j] == 0.0 ? STATUS(FAILED) : c->segment == c->segments ? STATUS(OK) : -1;
+    }
+    if (c->segment == c->segments) {
+      c->next += count;
+      c->segment = -1;
+    }
+  }
+  return taken;
 }
 #endif

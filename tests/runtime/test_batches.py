@@ -11,7 +11,7 @@ from counting import TooMuchWorkError, at_most
 from scipy.spatial.transform import Rotation
 
 import scvi_codegen as sc
-from scvi_codegen.runtime.ensemble import ensemble, successive
+from scvi_codegen.runtime.ensemble import batches
 from scvi_codegen.runtime.ensemble.ensemble import Ensemble
 
 COUNT = 7
@@ -74,10 +74,10 @@ CASES = [
 
 
 @pytest.mark.parametrize(("name", "plan"), CASES)
-@pytest.mark.parametrize("capacity", [successive.MOST_NUMBERS, 1])
+@pytest.mark.parametrize("capacity", [batches.MOST_NUMBERS, 1])
 def test_trajectories_equal_single_runs(name: str, plan: str, capacity: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also if the memory for states is full after a few of them."""
-    monkeypatch.setattr(successive, "MOST_NUMBERS", capacity)
+    monkeypatch.setattr(batches, "MOST_NUMBERS", capacity)
     one, (q, p), arguments = stepper(name), states(name), PLANS[plan]
     masses = {"parameters": {"mu": MU}} if name == "kepler" else {}
     start = {"q": q} if name == "chain" else q
@@ -142,8 +142,8 @@ def test_a_step_that_requests_newtons_method_is_repeated_with_it() -> None:
 def test_threads_and_calls_do_not_change_results(name: str, plan: str, monkeypatch: pytest.MonkeyPatch) -> None:
     one, (q, p), arguments = stepper(name), states(name), PLANS[plan]
     alone = one.integrate_ensemble(q, p, **arguments, threads=1)
-    monkeypatch.setattr(successive, "CHUNK_SECONDS", 0.0)  # threads begin after the first call of one step
-    monkeypatch.setattr(successive, "FIRST_CHUNK_STEPS", 1)
+    monkeypatch.setattr(batches, "CHUNK_SECONDS", 0.0)  # threads begin after the first call of one step
+    monkeypatch.setattr(batches, "FIRST_CHUNK_STEPS", 1)
     reported: list[int] = []
     shared = one.integrate_ensemble(q, p, **arguments, threads=3, progress=reported.append)
     assert shared.q.tobytes() == alone.q.tobytes()
@@ -157,8 +157,7 @@ def test_threads_and_calls_do_not_change_results(name: str, plan: str, monkeypat
 def test_python_costs_less_than_one_function_call_for_each_trajectory(
     arguments: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (ensemble, successive):
-        monkeypatch.setattr(module, "CHUNK_SECONDS", 1e3)  # independent of the clock
+    monkeypatch.setattr(batches, "CHUNK_SECONDS", 1e3)  # independent of the clock
     one, (q, p) = stepper("kepler"), (np.repeat(x, 200, axis=0) for x in states("kepler"))
     one.integrate_ensemble(q, p, **arguments)
     with at_most(len(q) // 2):

@@ -1,0 +1,255 @@
+"""Trajectories of an ensemble that C integrates, many in one call: one after the other, or in blocks of SIMD lanes.
+
+A call takes a limited number of steps, so that Python regains control about every 20 ms; C keeps the present trajectory
+or block for the next call. The first call decides whether threads are worth starting. Trajectories that C integrates
+one after the other are bitwise equal to single runs: C starts and advances the same memory of a run.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.native.binding import Binding
+from scvi_codegen.native.options import OUTCOMES, SolverOptions
+from scvi_codegen.runtime.core.integrator import Integrator
+from scvi_codegen.runtime.core.validation import Array
+from scvi_codegen.runtime.ensemble.result import INTERRUPTED, OK
+from scvi_codegen.runtime.ensemble.schedule import FixedSegments
+from scvi_codegen.runtime.ensemble.thread_pool import StopCheck, run_jobs
+from scvi_codegen.runtime.run.chunks import drive
+from scvi_codegen.validation import checked_count
+
+FIRST_CHUNK_STEPS = 64
+"""Steps of the first call, before the speed of the steps is known."""
+CHUNK_SECONDS = 0.02
+"""Target duration of a call in seconds; bounds the delay of an interruption."""
+GROWTH = 8.0
+"""Largest ratio of successive numbers of steps of calls."""
+MOST_NUMBERS, FEWEST_ROWS = 2**16, 8
+"""Numbers in the memory for states of a call, and the fewest states."""
+NAMES = np.array([OK, *OUTCOMES, INTERRUPTED], dtype="<U32")
+"""Reasons of the end by the status of C; the last one of -1."""
+
+
+class Rows(NamedTuple):
+    """Saved states: row and trajectory of each, times, positions, momenta and actions (NaN unless runs sum them)."""
+
+    rows: NDArray[np.intp]
+    trajectories: NDArray[np.intp]
+    t: Array
+    q: Array
+    p: Array
+    actions: Array
+
+    def copies(self) -> Rows:
+        """Return copies, in memory of their own."""
+        return Rows(*self[:2], *(each.copy() for each in self[2:]))
+
+
+class Batch:
+    """Trajectories from given states, with the same fixed steps or with adaptive steps to individual times.
+
+    Args:
+        binding, options: the compiled integrator and its solver options.
+        start: (k, m) initial positions and momenta at the time ``t``.
+        parameters: (k, number of parameters) values.
+        steps: segments of fixed steps, or (k,) final times of adaptive steps.
+
+    Attributes:
+        width: number of trajectories that C integrates at the same time.
+        status: (k,) status of C, -1 before the end of a trajectory.
+        done: (k,) numbers of completed steps.
+    """
+
+    width = 1
+
+    def __init__(
+        self,
+        binding: Binding,
+        options: SolverOptions | None,
+        start: tuple[Array, Array],
+        parameters: Array,
+        t: float,
+        steps: FixedSegments | Array,
+    ) -> None:
+        self.binding, self.options, self.t, self.steps = binding, options, t, steps
+        self.q, self.p, self.parameters = (np.ascontiguousarray(each) for each in (*start, parameters))
+        self.status = np.full(len(self.q), -1, np.int32)
+        self.done = np.zeros(len(self.q), np.int64)
+
+    def call(self, first: int, end: int) -> Call:
+        """Return the calls for a range of trajectories."""
+        raise NotImplementedError
+
+    def completed(self) -> float:
+        """Return the number of completed trajectories, of fixed steps with the parts of the others."""
+        ended = self.status >= 0
+        if not isinstance(self.steps, FixedSegments):
+            return float(ended.sum())
+        return float(np.where(ended, 1.0, self.done / self.steps.steps.sum()).sum())
+
+    def run(self, *, progress: Callable[[float], None] | None, threads: int | None) -> None:
+        """Integrate all trajectories; ``progress`` is called with the number of completed ones and may raise.
+
+        The calling thread begins. If that takes longer than one chunk, it divides the rest among threads, in jobs of
+        about that duration.
+        """
+        if threads is not None:
+            checked_count(threads, "threads", least=1)
+        count, began = len(self.q), time.perf_counter()
+        first = self.call(0, count)
+        first.advance(until=lambda: time.perf_counter() - began > CHUNK_SECONDS)
+        if first.struct.next < count:
+            self._share(first, progress, threads)
+        elif progress is not None:
+            progress(self.completed())
+
+    def _share(self, first: Call, progress: Callable[[float], None] | None, threads: int | None) -> None:
+        """Finish the trajectories begun and the following ones in threads."""
+        count, width = len(self.q), self.width
+        begun = first.struct.end = min(int(first.struct.next) + width, count)
+        size = max(1, min(begun // width - 1, -(-(count - begun) // (16 * width))))  # like the first chunk, or 16 jobs
+        ends = [*range(begun, count, size * width), count]
+
+        def advance(job: int, check_stop: StopCheck) -> None:
+            call = self.call(ends[job - 1], ends[job]) if job else first
+            call.advance(check_stop=check_stop)
+
+        report = None if progress is None else lambda _: progress(self.completed())
+        run_jobs(len(ends), advance, progress=report, threads=threads)
+
+
+class Call:
+    """Arguments of C calls for a range of trajectories.
+
+    Args:
+        work: the trajectories.
+        first, end: the range.
+    """
+
+    def __init__(self, work: Batch, first: int, end: int) -> None:
+        binding, self.first = work.binding, first
+        struct = self.struct = binding.new("each *")
+        self.options = struct.options = binding.options(work.options)
+        struct.q, struct.p, struct.parameters = map(binding.pointer, (work.q, work.p, work.parameters))
+        if isinstance(work.steps, FixedSegments):
+            steps, save_every, h = work.steps
+            struct.segment_steps, struct.segment_every = map(binding.whole_numbers, (steps, save_every))
+            struct.segment_h, struct.segments = binding.pointer(h), len(h)
+        struct.status, struct.done = binding.integers(work.status), binding.whole_numbers(work.done)
+        struct.t, struct.next, struct.end, struct.segment = work.t, first, end, -1
+        self.take = binding.each(struct)
+
+    def advance(self, *, check_stop: StopCheck | None = None, until: Callable[[], bool] = lambda: False) -> None:
+        """Advance the trajectories to their ends, or until ``until`` returns true; states are stored in any case."""
+
+        def take(size: int) -> int:
+            if check_stop is not None:
+                check_stop(size)
+            taken = self.take(size)
+            self.store()
+            return taken
+
+        try:
+            drive(
+                take,
+                math.inf,
+                first=FIRST_CHUNK_STEPS,
+                growth=GROWTH,
+                seconds=CHUNK_SECONDS,
+                ended=lambda: self.struct.next == self.struct.end or until(),
+            )
+        finally:
+            self.store(last=True)
+
+    def store(self, *, last: bool = False) -> None:
+        """Pass on the states in memory, if it is nearly full or after the last call."""
+
+
+class SuccessiveRuns(Batch):
+    """Trajectories that C integrates one after the other; arguments as of :class:`Batch`.
+
+    Args:
+        stepper: the integrator.
+        tolerance, save_every: of adaptive steps.
+        receive: receives saved states after the initial ones, row 0, possibly from several threads; they are views.
+
+    Attributes:
+        stored: (k,) numbers of saved states without the initial one.
+        fallback_steps: (k,) numbers of steps that the iteration did not solve, but its fallback.
+        energies: (k, 2) energies at both ends of trajectories with adaptive steps, NaN where not computed.
+    """
+
+    def __init__(
+        self,
+        stepper: Integrator,
+        *arguments: Any,
+        tolerance: float = 0.0,
+        save_every: int = 1,
+        receive: Callable[[Rows], None],
+    ) -> None:
+        super().__init__(stepper.binding, *arguments)
+        self.conserves_energy = stepper.interface.conserves_energy
+        self.tolerance, self.save_every, self.receive, count = tolerance, save_every, receive, len(self.q)
+        self.stored, self.fallback_steps = np.zeros((2, count), np.int64)
+        self.energies = np.full((count, 2), np.nan)
+
+    def call(self, first: int, end: int) -> Call:
+        """Return the calls for a range of trajectories."""
+        return _SuccessiveCall(self, first, end)
+
+    @property
+    def names(self) -> NDArray[np.str_]:
+        """(k,) reasons of the end."""
+        return NAMES[self.status]
+
+
+class _SuccessiveCall(Call):
+    """Calls with the memory of a run, and memory for states."""
+
+    def __init__(self, work: SuccessiveRuns, first: int, end: int) -> None:
+        super().__init__(work, first, end)
+        self.work, self.flushed, binding, struct = work, first, work.binding, self.struct
+        m = work.q.shape[1]
+        self.capacity = max(FEWEST_ROWS, MOST_NUMBERS // (2 * m + 1))
+        self.before = 0  # states of the first trajectory that were stored earlier
+        self.runs = binding.new("run *"), binding.new("report *")
+        struct.run, struct.report = self.runs
+        self.workspace = struct.workspace = binding.workspace(self.runs[0])
+        if binding.count is None:
+            self.copy = struct.before = binding.new("run *")
+        if not isinstance(work.steps, FixedSegments):
+            struct.t_end, struct.tolerance = binding.pointer(work.steps), work.tolerance
+            if work.conserves_energy:
+                struct.energies = binding.pointer(work.energies)
+        struct.stored, struct.fallback_steps = map(binding.whole_numbers, (work.stored, work.fallback_steps))
+        struct.coordinates, struct.parameters_each, struct.every = m, work.parameters.shape[1], work.save_every
+        struct.capacity = self.capacity
+        self.iterations = np.empty(self.capacity, np.int32)
+        struct.iterations = binding.integers(self.iterations)
+        self.actions = np.full(self.capacity, np.nan)
+        (struct.actions,) = binding.pointers(self.actions)
+        self.states = np.empty(self.capacity), np.empty((self.capacity, m)), np.empty((self.capacity, m))
+        struct.times, struct.positions, struct.momenta = binding.pointers(*self.states)
+
+    def store(self, *, last: bool = False) -> None:
+        """Pass on the states in memory, with their trajectories and rows."""
+        call, work, count = self.struct, self.work, int(self.struct.rows)
+        if not count or (not last and count + FEWEST_ROWS <= self.capacity):
+            return
+        each = np.arange(self.flushed, min(call.next + 1, call.end))
+        first = np.ones(len(each), np.int64)
+        first[0] += self.before
+        numbers = work.stored[each] + 1 - first
+        rows = np.arange(count) + np.repeat(first + numbers - np.cumsum(numbers), numbers)
+        t, q, p = (states[:count] for states in self.states)
+        work.receive(Rows(rows, np.repeat(each, numbers), t, q, p, self.actions[:count]))
+        self.flushed = int(call.next)
+        self.before = int(work.stored[self.flushed]) if self.flushed < call.end and call.segment >= 0 else 0
+        call.rows = 0
