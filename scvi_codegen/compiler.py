@@ -15,8 +15,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from typing import TYPE_CHECKING, Any, cast
 
 from numpy.typing import ArrayLike
@@ -29,7 +30,7 @@ from scvi_codegen.methods import SVI, StoermerVerlet, as_method
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.building import TUNED_FLAGS
 from scvi_codegen.native.compilers import REORDERING_FLAGS
-from scvi_codegen.rendering.source import DOUBLE_DOUBLE, PRECISIONS, Interface, Source
+from scvi_codegen.rendering.source import AUTO, DOUBLE_DOUBLE, PRECISIONS, Interface, Source
 from scvi_codegen.runtime.core.compiled_method import Variants
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.events.event import EventLike, as_events
@@ -117,7 +118,14 @@ def compile_stepper(
             "tables": tables,
         }
         stepper = compile_stepper(system, method, events=events, **common)
-        stepper._precise = partial(compile_stepper, system, method, precision=DOUBLE_DOUBLE, **common)
+
+        @cache
+        def in_double_double() -> Stepper | None:
+            with suppress(MethodError):  # of this system or method
+                return compile_stepper(system, method, precision=DOUBLE_DOUBLE, **common)
+            return None
+
+        stepper._precise = in_double_double
         return stepper
     if symmetries != ():
         from scvi_codegen.mechanics.symmetry.symmetry import SYMMETRIES
@@ -162,14 +170,10 @@ def compile_stepper(
     return Stepper(source, interface, variants=variants, flags=flags, events=as_events(events))
 
 
-AUTO = "auto"
-"""Precision of runs with ``error=``: double where it suffices."""
-
-
 def check_precision(precision: str, flags: Sequence[str]) -> None:
     """Raise :class:`MethodError` for an unknown precision, and for flags that would destroy it."""
-    if precision not in (*PRECISIONS, AUTO):
-        raise MethodError(f"unknown precision {precision!r}: use {', '.join(map(repr, PRECISIONS))} or {AUTO!r}")
+    if precision not in PRECISIONS:
+        raise MethodError(f"unknown precision {precision!r}: use {', '.join(map(repr, PRECISIONS[:-1]))} or {AUTO!r}")
     if precision == DOUBLE_DOUBLE and (worst := [flag for flag in flags if flag in REORDERING_FLAGS]):
         raise MethodError(
             f"the compiler flag {worst[0]!r} reorders sums, which destroys precision='double-double': omit it "

@@ -340,8 +340,6 @@ class Sources:
             reason = "time is transformed: use fixed steps h in physical time"
         elif self.system.constraints:
             reason = "it has constraints: use independent coordinates (rods in a plane: eliminate_constraints)"
-        elif self.system.inputs:
-            reason = "it has tabulated inputs: write them as functions of t"
         elif self.solver not in ("auto", "fixed-point"):
             reason = f"solver={self.solver!r} is not available: omit it"
         elif fixed_point is None or fixed_point.name != "separable":

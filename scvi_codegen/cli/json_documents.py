@@ -52,7 +52,9 @@ def run_numbers(
 
 def _low_words(model: Model, q: Any, p: Any) -> dict[str, Any]:
     """Return the low words of a state in double-double arithmetic."""
-    return {"q_low": _named(model, low_words(q)), "p_low": _named(model, low_words(p))} if model.precision else {}
+    return (
+        {"q_low": _named(model, low_words(q)), "p_low": _named(model, low_words(p))} if model.in_double_double else {}
+    )
 
 
 def failure_text(outcome: RunOutcome | RecordedOutcome) -> str | None:

@@ -11,6 +11,7 @@ from scvi_codegen.cli.command_group import tell
 from scvi_codegen.cli.reports import duration
 from scvi_codegen.errors import AccuracyWarning, StateError
 from scvi_codegen.models.model import Model
+from scvi_codegen.rendering.source import DOUBLE_DOUBLE
 from scvi_codegen.runtime.core.features import refusal, require
 from scvi_codegen.runtime.run.global_error import GlobalError
 from scvi_codegen.validation import check_tolerance
@@ -42,6 +43,7 @@ def model_with_global_error(model: Model, error: float) -> tuple[Model, GlobalEr
         result = wanted.confirmed(wanted.stepper())
     local = f"local tolerance of {result.tolerance:.1e}" if result.tolerance else "local tolerance of round-off"
     local = f"step of tau of {result.h:.6g}" if result.h else local
+    in_words = result.precision == DOUBLE_DOUBLE
     numbers = {
         "requested": error,
         "estimate": result.estimate,
@@ -51,16 +53,18 @@ def model_with_global_error(model: Model, error: float) -> tuple[Model, GlobalEr
         "tolerance": result.tolerance,
         "h": result.h,
         "runs": result.runs,
+        "precision": result.precision,
     }
     tell(
         f"global error: estimated at {result.estimate:.1e} (relative) from {result.runs} runs; the bound {error:g} "
-        f"is confirmed until t = {result.confirmed_until:g}, with a {local}",
+        f"is confirmed until t = {result.confirmed_until:g}, with a {local}{f' in {DOUBLE_DOUBLE}' * in_words}",
         global_error=numbers,
     )
     if result.h:
         signed = math.copysign(result.h, wanted.covered)
         return replace(wanted, h=signed, span=abs(wanted.covered), error=None), result
-    return replace(wanted, tolerance=result.steps["tolerance"], error=None), result
+    precision = DOUBLE_DOUBLE if in_words else wanted.precision
+    return replace(wanted, tolerance=result.steps["tolerance"], error=None, precision=precision), result
 
 
 def model_with_advised_step(model: Model, tolerance: float) -> Model:

@@ -363,8 +363,10 @@ class Model(TimeSpan):
         state, h, common = self.initial_state(stepper), self.h, self._common(options, threads)
         tolerance = self.tolerance
         if self.error is not None:
-            steps = self.confirmed(stepper, options=options, threads=threads).steps
-            h, tolerance = steps.get("h"), steps.get("tolerance")
+            result = self.confirmed(stepper, options=options, threads=threads)
+            h, tolerance = result.steps.get("h"), result.steps.get("tolerance")
+            if result.precision != "double":
+                stepper = stepper.in_double_double or stepper
         elif h is None and self.has_time_transformation:
             from scvi_codegen.runtime.run.largest_step import largest_step  # imported here: not needed for reading
 

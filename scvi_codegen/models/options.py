@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from scvi_codegen.controllers import CONTROLLERS, SYMPLECTIC
 from scvi_codegen.errors import ModelFileError
 from scvi_codegen.native.cuda import DEVICES
-from scvi_codegen.rendering.source import DOUBLE_DOUBLE, PRECISIONS
+from scvi_codegen.rendering.source import AUTO, DOUBLE_DOUBLE, PRECISIONS
 from scvi_codegen.runtime.ensemble.observation import OBSERVED
 from scvi_codegen.validation import NUMERAL, TOLERANCE_RANGE, ExactNumber, checked_count
 
@@ -159,7 +159,9 @@ class RunOptions:
         choices=(SYMPLECTIC, *CONTROLLERS),
     )
     precision: str | None = run_option(
-        *("run", CHOICE, "", f"Arithmetic [double]; {DOUBLE_DOUBLE}: 31 digits."), choices=PRECISIONS, common=False
+        *("run", CHOICE, "", f"Arithmetic [double]; {DOUBLE_DOUBLE}: 31 digits; {AUTO}: this if --error requires it."),
+        choices=PRECISIONS,
+        common=False,
     )
     device: str | None = run_option(
         *("run", CHOICE, "", "With --ensemble: run on an NVIDIA GPU (extra 'cuda'; experimental)."),

@@ -42,7 +42,8 @@ class TimeSpan(RunOptions):
             :func:`~scvi_codegen.compile_stepper`; requires a span. A system in transformed time has its own.
         controller: name of the step-size controller, ``None`` for the default; without ``time_transformation`` it
             requires adaptive steps.
-        precision: ``"double-double"`` for runs with states of two words; ``None`` means ``"double"``.
+        precision: ``"double-double"`` for runs with states of two words; ``"auto"``: double, and double-double for
+            ``error`` that double does not confirm; ``None`` means ``"double"``.
         device: ``"cuda"`` for ensembles on a GPU; single runs are not available with it.
         observe: ``"extremes"`` or ``"energy"`` of ensembles, as of :meth:`Stepper.integrate_ensemble`.
         solver_tolerance, max_iterations: of the iteration on the stage equations, as of

@@ -137,7 +137,9 @@ class Source:
 
 DOUBLE_DOUBLE = "double-double"
 """Precision of states of two words, 31 digits."""
-PRECISIONS = ("double", DOUBLE_DOUBLE)
+AUTO = "auto"
+"""Precision of runs with ``error=``: double where it suffices, else double-double."""
+PRECISIONS = ("double", DOUBLE_DOUBLE, AUTO)
 POINT_THREADS = 8
 """Threads of a GPU that share a trajectory with many coordinates, one for each point of a step."""
 COMPONENTS = {"rotation": 4, "direction": 3, "spin": 2}

@@ -65,7 +65,7 @@ def test_final_state_is_exact_to_thirty_digits(spring: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["run", "--error", "1e-9", "--span", "2"], "--error 1e-09 is not available"),
+        (["run", "--advise", "1e-9", "--span", "2"], "--advise 1e-09 is not available"),
         (["run", "--ensemble", "a.toml", "-o", "a.csv"], "-o a.csv (write a file NAME.npz) is not available"),
         (["run", "--event", "q"], "events= is not available with precision='double-double'"),
         (["generate", "-o", "spring_svi"], "a generated program or FMU is not available"),
@@ -82,6 +82,30 @@ def test_other_options_and_commands_are_refused(spring: Path, words: list[str], 
     assert done.exit_code
     assert message in " ".join(done.output.split())
     assert sorted(path.name for path in spring.parent.iterdir()) == ["spring.toml"]
+
+
+def test_precision_of_error(spring: Path) -> None:
+    """With "auto" a bound that double does not confirm is that of a run in two words; others are in double."""
+    text = TEXT.replace("step = 0.125\nsteps = 16\n", "error = 3e-15\nspan = 200.0\n")
+    for precision, error, expected in (("double-double", "3e-15", 2), ("auto", "3e-15", 2), ("auto", "1e-9", 1)):
+        spring.write_text(text.replace("double-double", precision).replace("3e-15", error))
+        done = CliRunner().invoke(main, ["run", str(spring), "--json", "-o", "states.npz"])
+        assert done.exit_code == 0, done.output
+        document = json.loads(done.stdout)
+        assert document["global_error"]["precision"] == ("double", "double-double")[expected - 1]
+        assert ("q_low" in document["final"]) == (expected == 2)
+        with np.load("states.npz") as saved:
+            assert saved["q"][-1, 0] == document["final"]["q"]["q"]
+            assert ("q_low" in saved) == (expected == 2)
+        model = sc.load_model(spring)
+        run, started = model.integrate(), model.start()
+        assert (run.confirmation.precision == "double-double") == (expected == 2)
+        started._run_to_target()
+        assert started.q == run.q[-1]
+        assert run.q[-1, 0] == document["final"]["q"]["q"]
+    spring.write_text(text.replace("double-double", "auto"))
+    refused = CliRunner().invoke(main, ["run", str(spring), "-o", "states.csv"])
+    assert "-o states.csv (write a file NAME.npz) is not available" in " ".join(refused.output.split())
 
 
 EXACT = {"q": "[0.1]", "q_dot": '["1/3"]', "w": "0.3"}

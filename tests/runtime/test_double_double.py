@@ -316,7 +316,6 @@ def test_refusals() -> None:
     for call, word in (
         (lambda: stepper.integrate([1.0, 0.0], **start, steps=3, events="x"), "events="),
         (lambda: stepper.integrate_ensemble([[1.0, 0.0]], [[0.0, 1.0]], h=0.1, steps=3, device="cuda"), "device="),
-        (lambda: stepper.integrate_ensemble([[1.0, 0.0]], [[0.0, 1.0]], t_end=1.0, error=0.1), "error= of ensembles"),
         (lambda: stepper.integrate([1.0, 0.0], **start, steps=3).action(), "action"),
         (lambda: stepper.discrete_lagrangian([1.0, 0.0], [1.0, 0.1], 0.1), "discrete_lagrangian"),
     ):
@@ -413,6 +412,69 @@ def test_ensembles(tmp_path: Path) -> None:
     assert failing.q[-1, 0].low.all()
     with pytest.raises(StateError, match=r"velocity\[1, 0\] must be a real number"):
         stepper.integrate_ensemble(q, velocity=[[0, 1], ["a", 1]], h=0.07, steps=9)
+
+
+def driven_spring(t: list[float], u: list[Fraction], end: float, kind: str) -> list:
+    """Return q and its velocity at an end for q'' + q = u with values u at t, constant or linear between."""
+    q, v = mp.mpf("0.3"), mp.mpf("0.2")
+    for start, stop, *ends in zip(t, t[1:], u, u[1:], strict=False):
+        if start < end:
+            slope = (ends[1] - ends[0]) / (Fraction(stop) - Fraction(start)) * (kind == "linear")
+            at, rate = (mp.mpf(each.numerator) / each.denominator for each in (ends[0], Fraction(slope)))
+            h = mp.mpf(min(stop, end)) - start
+            c, s, x, y = mp.cos(h), mp.sin(h), q - at, v - rate
+            q, v = x * c + y * s + at + rate * h, y * c - x * s + rate
+    return [q, v]
+
+
+def test_inputs() -> None:
+    """Inputs of two words, constant or linear between samples, or set by a controller, agree with the solution."""
+    spring = sc.LagrangianSystem.from_text(
+        name="driven spring", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2 + u*q", inputs=["u"]
+    )
+    stepper = sc.compile_stepper(spring, "svi:10", precision="double-double")
+    t, u = [0.0, 1.0, 2.0, 4.0], ["0.1", "1/3", "-0.7", Fraction(1, 4)]
+    start = {"q": ["0.3"], "velocity": ["0.2"]}
+    with mp.workdps(50):
+        for kind, steps in (("linear", {"h": 0.07}), ("constant", {}), ("linear", {"tolerance": 1e-30})):
+            run = stepper.integrate(**start, **steps, t_end=3.7, inputs={"u": (t, u, kind)})
+            exact = driven_spring(t, [*map(Fraction, u)], 3.7, kind)
+            assert max(abs(run.mp(x)[-1, 0] - y) for x, y in zip("qp", exact, strict=True)) < 1e-30
+            inside = driven_spring(t, [*map(Fraction, u)], 1.3, kind)[0]
+            assert abs(as_mpmath(run.at(1.3)[0])[0] - inside) < 1e-30
+            many = stepper.integrate_ensemble(
+                [["0.3"]] * 2, velocity=[["0.2"]] * 2, **steps, t_end=3.7, inputs={"u": (t, [[0, 1, 2, 3], u], kind)}
+            )
+            assert (many[1].mp("q") == run.mp("q")).all()
+            assert (as_mpmath(many.energy()[: len(run), 1]) == run.mp("energy")).all()
+        held = stepper.start(**start, h=0.125)
+        for value in u[:3]:
+            held.set_inputs(u=value)
+            held.advance(8)
+        whole = stepper.integrate(**start, h=0.125, t_end=3.0, inputs={"u": ([0.0, 1.0, 2.0, 3.0], u, "constant")})
+        assert (as_mpmath(held.q) == whole.mp("q")[-1]).all()
+        constant = stepper.integrate(**start, h=0.125, steps=8, inputs={"u": "1/3"})
+        assert (
+            abs(constant.mp("q")[-1, 0] - driven_spring([0.0, 1.0], [Fraction(1, 3)] * 2, 1.0, "constant")[0]) < 1e-31
+        )
+    for wrong, message in (("u.csv", "not text; read a file first"), (([0, 1], ["a", 1]), "must be a real number")):
+        with pytest.raises(StateError, match=message):
+            stepper.integrate(**start, h=0.1, steps=3, inputs={"u": wrong})
+
+
+def test_global_errors_of_ensembles() -> None:
+    """The bound error= holds for each trajectory, with a local tolerance of its own."""
+    stepper = sc.compile_stepper(system("kepler"), "svi:12", precision="double-double")
+    with mp.workdps(50):
+        v = [["0", mp.sqrt(3)], ["0", "1.7"]]
+        runs = stepper.integrate_ensemble([["0.5", "0"]] * 2, velocity=v, t_end=2.0, error=1e-13)
+        assert runs.global_error.max() <= 1e-13
+        assert [each.precision for each in runs.confirmations] == ["double-double"] * 2
+        exact = exact_orbit(2.0)
+        error = max(abs(x - y) for x, y in zip(as_mpmath(runs.ends[1][0]), exact, strict=True))
+        assert 1e-28 < error < 1e-13
+    one = stepper.integrate(["0.5", "0"], velocity=v[0], t_end=2.0, error=1e-13)
+    assert (one.q_low[-1] == runs[0].q_low[-1]).all()
 
 
 @pytest.mark.parametrize("steps", [{"h": 0.07}, {"t_end": 2.0}])

@@ -28,6 +28,7 @@ from scvi_codegen.models.model_files.ensemble_file import load_ensemble
 from scvi_codegen.models.options import IN_ENSEMBLE, OPTIONS, STEP_SIZE, WITH_INPUTS, check_available
 from scvi_codegen.pictures.animation import FILMS
 from scvi_codegen.pictures.canvas import PICTURES, check_plot_path
+from scvi_codegen.rendering.source import AUTO, DOUBLE_DOUBLE
 from scvi_codegen.runtime.run.global_error import GlobalError
 
 ABOUT = """\
@@ -132,8 +133,9 @@ def run(
     wanted = {name: choices.pop(name) for name in ERRORS}
     _check_combination(choices, plot=plot, ensemble=ensemble, wanted=wanted, folder=output if recorded else None)
     model = read_model(model_name, choices)
-    if model.in_double_double:
-        model = _in_double_double(model, {"-o": output, **{f"--{k}": wanted[k] for k in wanted}})
+    _check_words(model, {"-o": output, "--advise": wanted["advise"]})
+    if model.precision in (DOUBLE_DOUBLE, AUTO):
+        model = model.with_known_sizes()
     if ensemble is not None:
         check_available(model, IN_ENSEMBLE)
     else:
@@ -149,6 +151,7 @@ def run(
     if model.system.inputs and recorded:
         raise click.UsageError("a run with inputs cannot be recorded in a folder: write it to a file (-o NAME.npz)")
     model, confirmation = _with_steps(model, wanted)
+    _check_words(model, {"-o": output})  # with precision = "auto"
     if ensemble is not None:
         _run_ensemble(model, ensemble, (output, plot))
         return
@@ -159,13 +162,12 @@ def run(
     _check_confirmed(confirmation)
 
 
-def _in_double_double(model: Model, options: dict[str, Any]) -> Model:
-    """Return the model at known sizes; reject options that states of two words do not have."""
-    for flag, value in options.items():
+def _check_words(model: Model, options: dict[str, Any]) -> None:
+    """Reject options that states of two words do not have, if those of the model have two."""
+    for flag, value in options.items() if model.in_double_double else ():
         kept = flag == "-o" and value is not None and (is_run_folder(value) or Path(value).suffix.lower() == ".npz")
-        if value is not None and flag != "--tolerance" and not kept:
+        if value is not None and not kept:
             model._check_double(f"{flag} {value}{' (write a file NAME.npz)' * (flag == '-o')}")
-    return model.with_known_sizes()
 
 
 def _check_confirmed(confirmation: GlobalError | None) -> None:

@@ -45,9 +45,13 @@ from scvi_codegen.runtime.run.accuracy import (
     warn_of_error_growth,
     warn_of_inaccuracy,
     warn_of_unresolved_members,
-    without_accuracy_warnings,
 )
-from scvi_codegen.runtime.run.global_error import checked_error, confirmed_run, warn_of_unconfirmed
+from scvi_codegen.runtime.run.global_error import (
+    checked_error,
+    confirmed_run,
+    warn_of_unconfirmed,
+    warn_of_unconfirmed_run,
+)
 from scvi_codegen.runtime.run.largest_step import largest_step
 from scvi_codegen.runtime.run.observers import Observe
 from scvi_codegen.runtime.run.run import Run
@@ -65,8 +69,8 @@ class Stepper(Integrator):
     """Compiled integrator of one system: :class:`Integrator` with integrations, runs, ensembles and projections."""
 
     _trajectory_type = Trajectory
-    _precise: Callable[[], Stepper] | None = None
-    """Function that returns the stepper in double-double, for ``error=`` with precision="auto"."""
+    _precise: Callable[[], Stepper | None] | None = None
+    """Function that returns the stepper in double-double if there is one, for ``error=`` with precision="auto"."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         if self.origin is not None:
@@ -234,18 +238,20 @@ class Stepper(Integrator):
             self.in_tau or self.interface.time_transformation,
         )
         arguments = error, run, again, checked_number(t, "the time t"), step_of_tau if has_tau else None
-        if self._precise is None or has_tau:
-            return confirmed_run(*arguments, words=self.interface.words)
-        with without_accuracy_warnings():
-            trajectory = confirmed_run(*arguments)
+        trajectory = confirmed_run(*arguments, words=self.interface.words)
         assert trajectory.confirmation is not None  # by confirmed_run
-        if trajectory.confirmation.confirmed:
-            return trajectory
-        try:
-            precise = self._precise()
-        except MethodError:  # of this system or method
-            return confirmed_run(*arguments)
-        return precise._confirmed(error, q, p, start, saved)
+        if not (trajectory.confirmation.confirmed or has_tau) and (precise := self.in_double_double) is not None:
+            return precise._confirmed(error, q, p, start, saved)
+        warn_of_unconfirmed_run(trajectory)
+        return trajectory
+
+    @property
+    def in_double_double(self) -> Stepper | None:
+        """The stepper in double-double of one with precision="auto"; ``None`` if there is none with its events."""
+        precise = None if self._precise is None else self._precise()
+        if precise is None or not self.events or precise.supports("events"):
+            return precise and precise.with_events(self.events)
+        return None
 
     @property
     def _has_tau(self) -> bool:
@@ -412,9 +418,6 @@ class Stepper(Integrator):
         q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
         if error is not None:
             require(self, "error")
-            if self.interface.words > 1:
-                what = "error= of ensembles is not available with precision='double-double'"
-                raise MethodError(f"{what}: give a tolerance, or integrate one by one")
             error = checked_error(error, {"h": h, "steps": steps, "tolerance": tolerance})
         work = Ensemble(
             self._for_run(None, action=action),

@@ -470,14 +470,13 @@ class Ensemble:
             confirmations=tuple(self.confirmations),
             parameters=self.parameters,
             stepper=self.stepper,
-            spans=tuple(span for j in range(len(self)) for span in self._spans(j, times)) if self.inputs else (),
+            spans=tuple(span for j in range(len(self)) for span in self._spans(j, t if times is None else times[:, j])),
         )
 
-    def _spans(self, j: int, times: Array | None) -> Iterator[Span]:
-        """Yield the rows of trajectory j in each piece of the inputs and their parameters."""
-        if times is None or not self.inputs:
+    def _spans(self, j: int, t: Array) -> Iterator[Span]:
+        """Yield the rows of trajectory j, of states at t, in each piece of the inputs and their parameters."""
+        if not self.inputs:
             return
-        t = times[:, j]
         plan = self.plans[j].t_end
         forward = -1.0 if plan < self.t0 else 1.0
         ends = breakpoints_until(self.t0, plan, self.inputs) or [plan]

@@ -17,9 +17,10 @@ from scvi_codegen.native.arguments import checked_number, checked_step, real_arr
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.core.features import refusal
 from scvi_codegen.runtime.core.validation import Array, check_left_to_inputs, no_input
+from scvi_codegen.runtime.core.words import split, with_low
 from scvi_codegen.runtime.run.accuracy import warn_of_large_steps, warn_of_unresolved_fields
 from scvi_codegen.runtime.run.memory import Memory
-from scvi_codegen.runtime.run.times import times_after
+from scvi_codegen.runtime.run.times import exact_product, times_after
 from scvi_codegen.runtime.trajectory.dense_output import checked_times
 from scvi_codegen.runtime.trajectory.joining import joined
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
     from scvi_codegen.runtime.run.run import Run
 
 POWERS = 4
+NO_TIME = np.array([1.0] * POWERS + [0.0])
+"""Factors of the C parameters of a piece that omit its breakpoint, which is a double."""
 ALL = slice(None)
 KINDS_OF_INPUTS = "a number, (t, values) or (t, values, 'cubic')"
 NEGLIGIBLE_STEP = 1e-9
@@ -76,7 +79,8 @@ def checked_inputs(
         raise StateError(
             f"the input '{missing[0]}' is not set: pass inputs={{'{missing[0]}': (t, values)}}, or a number"
         )
-    return {name: input_of(name, value, trajectories) for name, value in argument.items()}
+    read = input_of if interface.words == 1 else _in_two_words
+    return {name: read(name, value, trajectories) for name, value in argument.items()}
 
 
 def input_of(name: str, argument: Any, trajectories: int | None = None) -> Input:
@@ -114,6 +118,48 @@ def input_of(name: str, argument: Any, trajectories: int | None = None) -> Input
         )
     _check_ascending(name, t)
     return _from_pieces(name, t, KINDS[kind](t, values), trajectories)
+
+
+def _in_two_words(name: str, argument: Any, trajectories: int | None) -> Input:
+    """Return a constant, or values that are constant or linear between times, with coefficients of two words.
+
+    Splines have coefficients of one word.
+    """
+    if isinstance(argument, Input) or callable(argument):
+        return input_of(name, argument, trajectories)
+    if not isinstance(argument, tuple):
+        try:
+            high, low = split(argument, f"the input {name}")
+        except StateError:
+            return input_of(name, argument, trajectories)  # raises an error with a remedy
+        t = np.array([-np.inf, np.inf])
+        data, rest = input_of(name, high, trajectories), low[np.newaxis, ..., np.newaxis]
+    elif len(argument) in (2, 3):
+        high, low = split(argument[1], f"values of the input {name}")
+        data = input_of(name, (argument[0], high, *argument[2:]), trajectories)
+        t, kind = data.breakpoints, argument[2] if len(argument) == 3 else "linear"
+        if kind == "cubic":
+            return data
+        rest = _constant(t, low) if kind == "constant" else np.array([low[..., :-1], _slopes(t, high, low)[1]])
+    else:
+        return input_of(name, argument, trajectories)
+    return replace(data, pieces=with_low(data.pieces, _from_pieces(name, t, rest, trajectories).pieces * NO_TIME))
+
+
+def _slopes(t: Array, high: Array, low: Array) -> tuple[Array, Array]:
+    """Return the slopes of lines between values of two words, in two words."""
+    (rise, rest), (run, run_low) = (_differences(np.asarray(each)) for each in (high, t))
+    slopes = rise / run
+    product, cut = exact_product(slopes, run)
+    return slopes, ((rise - product) - cut + (rest + np.diff(low)) - slopes * run_low) / run
+
+
+def _differences(x: Array) -> tuple[Array, Array]:
+    """Return the differences of successive numbers without rounding error, as double-double numbers (TwoSum)."""
+    first, second = x[..., :-1], x[..., 1:]
+    difference = second - first
+    part = difference - second
+    return difference, (second - (difference - part)) - (first + part)
 
 
 def _powers(name: str, argument: Any) -> tuple[Array, Array]:

@@ -192,7 +192,7 @@ def confirmed_run(
     *,
     words: int = 1,
 ) -> Result:
-    """Return the run whose global error is at most ``wanted``, or the most accurate one with a warning.
+    """Return the run whose global error is at most ``wanted``, or the most accurate one.
 
     Args:
         wanted: bound of the relative global error.
@@ -207,15 +207,20 @@ def confirmed_run(
     """
     with without_accuracy_warnings():
         trajectory, result = _Runs(wanted, integrate, again, start, step_of_tau, words).judged()
-    if not result.confirmed and warnings_wanted():
-        warn(
-            f"the global error {wanted:g} is confirmed until t = {result.confirmed_until:.6g} only: beyond it, runs "
-            f"with other steps differ by up to about {result.estimate:.1e}. End the run there, or give a larger error"
-            f"{_alternative(trajectory, result)}",
-            AccuracyWarning,
-        )
     trajectory.confirmation = result
     return cast(Result, trajectory)
+
+
+def warn_of_unconfirmed_run(trajectory: Any) -> None:
+    """Issue a warning for a run whose requested global error is not confirmed."""
+    result: GlobalError = trajectory.confirmation
+    if not result.confirmed and warnings_wanted():
+        warn(
+            f"the global error {result.requested:g} is confirmed until t = {result.confirmed_until:.6g} only: beyond "
+            f"it, runs with other steps differ by up to about {result.estimate:.1e}. End the run there, or give a "
+            f"larger error{_alternative(trajectory, result)}",
+            AccuracyWarning,
+        )
 
 
 def _alternative(trajectory: Any, result: GlobalError) -> str:

@@ -28,7 +28,7 @@ from scvi_codegen.runtime.core.validation import (
     no_input,
     parameter_index,
 )
-from scvi_codegen.runtime.core.words import block_of, with_low
+from scvi_codegen.runtime.core.words import block_of, low_words, two_words, with_low
 from scvi_codegen.runtime.rotations.states import checked_pair
 from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.saving import checkpoint
@@ -307,8 +307,8 @@ class Memory:
             self.plan = plan
 
     @alone
-    def set_inputs(self, **inputs: float) -> None:
-        """Set inputs to constant values for the following steps (zero-order hold).
+    def set_inputs(self, **inputs: Any) -> None:
+        """Set inputs to constant numbers for the following steps (zero-order hold).
 
         >>> run.set_inputs(u=-1.5); run.advance(10)  # doctest: +SKIP
         """
@@ -316,7 +316,12 @@ class Memory:
         for name, value in inputs.items():
             if name not in self._inputs:
                 raise no_input(name, self._inputs)
-            values[self._inputs[name]] = checked_number(value, f"the input {name}"), 0.0, 0.0, 0.0, 0.0
+            if self.stepper.interface.words > 1:
+                high, low = two_words(value, f"the input {name}")
+                low_words(values)[self._inputs[name]] = low, 0.0, 0.0, 0.0, 0.0
+            else:
+                high = checked_number(value, f"the input {name}")
+            np.asarray(values)[self._inputs[name]] = high, 0.0, 0.0, 0.0, 0.0
         self._set_parameters(values)
         if self._unset_inputs:
             self._unset_inputs = tuple(name for name in self._unset_inputs if name not in inputs)

@@ -22,7 +22,7 @@ def times_after(t: float, h: float, steps: ArrayLike) -> tuple[Array, Array]:
     mantissa, exponent = math.frexp(h)
     numbers = np.asarray(steps, dtype=np.float64)
     with np.errstate(over="ignore", invalid="ignore"):
-        high, low = (np.ldexp(piece, exponent) for piece in _product(numbers, mantissa))
+        high, low = (np.ldexp(piece, exponent) for piece in exact_product(numbers, mantissa))
         total = t + high
         part = total - t
         rest = ((t - (total - part)) + (high - part)) + low
@@ -53,7 +53,7 @@ def steps_to(t: float, t_end: float, h: float) -> int | None:
     return round(span) if abs(span - round(span)) <= WHOLE else None
 
 
-def _product(x: Array, y: float) -> tuple[Array, Array]:
+def exact_product(x: Array, y: Array | float) -> tuple[Array, Array]:
     """Return x y without rounding error as a double-double number (Dekker's product)."""
     product = x * y
     x_high, y_high = SPLITTER * x - (SPLITTER * x - x), SPLITTER * y - (SPLITTER * y - y)

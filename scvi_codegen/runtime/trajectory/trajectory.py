@@ -22,7 +22,7 @@ from scvi_codegen.files.labelled_arrays import checked_units, to_dataset
 from scvi_codegen.runtime.constraints.projection import constraint_values, multipliers
 from scvi_codegen.runtime.core.features import refusal, require
 from scvi_codegen.runtime.core.validation import columns_of_inputs
-from scvi_codegen.runtime.core.words import Words, as_mpmath, check_keeps_words, low_words
+from scvi_codegen.runtime.core.words import Words, as_mpmath, check_keeps_words, low_words, missing
 from scvi_codegen.runtime.events.detection import crossings_of
 from scvi_codegen.runtime.events.event import Crossings, Event, EventLike, as_events
 from scvi_codegen.runtime.paths.actions import actions_until, compensated_sums, shadow_energy
@@ -423,7 +423,7 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
         if not self.pieces:
             return states_at(self, times)
         flat = within(times, self.t[0], self.t[-1])
-        q, p = np.empty((2, len(flat), self.stepper.dimension))
+        q, p = (missing((len(flat), self.stepper.dimension), self.stepper.interface.words) for _ in range(2))
         forward = self.pieces[0].forward
         ends = forward * np.array([piece.t[-1] for piece in self.pieces])
         number = np.minimum(np.searchsorted(ends, forward * flat), len(ends) - 1)
