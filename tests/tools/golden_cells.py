@@ -15,6 +15,7 @@ from pathlib import Path
 
 import samples
 from golden_drivers import arrays_driver, ensemble_driver, run_driver, tangent_driver
+from notation import hamilton, lagrange
 
 from scvi_codegen import HamiltonianSystem, LagrangianSystem, as_method, problem, reparametrise
 from scvi_codegen.mechanics.arrays.system import ArraySystem
@@ -147,11 +148,8 @@ def transformed() -> MechanicalSystem:
 
 
 def vibration() -> HamiltonianSystem:
-    return HamiltonianSystem.from_text(
-        name="vibration",
-        coordinates=["x", "y"],
-        momenta=["u", "v"],
-        hamiltonian="(1 + x**2)*u**2/2 + v**2*(1 + u**2)/2 + x**2/2 + y**4/4 + x*y/3",
+    return hamilton(
+        "vibration", "x y", "(1 + x**2)*u**2/2 + v**2*(1 + u**2)/2 + x**2/2 + y**4/4 + x*y/3", momenta="u v"
     )
 
 
@@ -166,12 +164,11 @@ def rubbed() -> LagrangianSystem:
 
 
 def ring() -> ArraySystem:
-    return LagrangianSystem.from_text(
-        name="ring",
-        coordinates=["q[N]"],
-        parameters={"beta": 0.25},
-        lagrangian="sum(i in N, q_dot[i]**2/2) - sum(i in N periodic, (q[i+1] - q[i])**2/2"
-        " + beta*(q[i+1] - q[i])**4/4)",
+    return lagrange(
+        "ring",
+        "q[N]",
+        "sum(i in N, q_dot[i]**2/2) - sum(i in N periodic, (q[i+1] - q[i])**2/2 + beta*(q[i+1] - q[i])**4/4)",
+        beta=0.25,
     )
 
 
@@ -199,12 +196,11 @@ def rubbed_ring() -> ArraySystem:
 
 
 def rotors() -> ArraySystem:
-    return HamiltonianSystem.from_text(
-        name="rotors",
-        coordinates=["q[N]"],
+    return hamilton(
+        "rotors",
+        "q[N]",
+        "sum(i in N, p_q[i]**2/2*(1 + q[i]**2/9) + m[i]*q[i]**2/2) + sum(i in N periodic, (q[i+1] - q[i])**4/4)",
         parameters={"m[N]": 1},
-        hamiltonian="sum(i in N, p_q[i]**2/2*(1 + q[i]**2/9) + m[i]*q[i]**2/2)"
-        " + sum(i in N periodic, (q[i+1] - q[i])**4/4)",
     )
 
 

@@ -13,6 +13,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from notation import lagrange
 from numpy.typing import NDArray
 
 import scvi_codegen as sc
@@ -92,11 +93,7 @@ def _slow(random: np.random.Generator) -> tuple[Array, Array, float]:
 
 def _families() -> Mapping[str, Family]:
     text, known = sc.LagrangianSystem.from_text, lambda name: sc.problem(name).system
-    chain = sc.LagrangianSystem.from_text(
-        name="chain",
-        coordinates=["x[N]"],
-        lagrangian="sum(a in N, x_dot[a]**2/2 - x[a]**2/2) - sum(a in N-1, (x[a+1] - x[a])**4/4)",
-    )
+    chain = lagrange("chain", "x[N]", "sum(a in N, x_dot[a]**2/2 - x[a]**2/2) - sum(a in N-1, (x[a+1] - x[a])**4/4)")
     five = [f"x{k}" for k in range(5)]
     out = " + ".join(f"{x}_dot**2/2 - {x}**2/2" for x in five)
     out += "".join(f" - ({b} - {a})**4/4" for a, b in pairwise(five))
