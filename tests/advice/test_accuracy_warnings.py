@@ -9,19 +9,14 @@ import warnings
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+from notation import lagrange
 
 import scvi_codegen as sc
 from scvi_codegen.advice.tolerance_check import known_digits, missed_tolerance
 from scvi_codegen.cli import main
 from scvi_codegen.cli.reports import in_known_digits
 
-PUSHED = sc.LagrangianSystem.from_text(
-    name="pushed",
-    coordinates=["x"],
-    lagrangian="x_dot**2/2 - x**2/2",
-    forces={"x": "a*cos(t) + b*sin(3*t)"},
-    parameters={"a": 1.0, "b": 0.0},
-)
+PUSHED = lagrange("pushed", "x", "x_dot**2/2 - x**2/2", forces={"x": "a*cos(t) + b*sin(3*t)"}, a=1.0, b=0.0)
 FORCED = {"a": 1.0, "b": 0.0}
 NEARLY_RADIAL = [1.999, 0.0], [0.0, 0.022366272]
 
@@ -86,9 +81,7 @@ class TestLongSteps:
 
     @pytest.mark.filterwarnings("error")
     def test_late_or_stepwise_push_does_not_warn(self):
-        constrained = sc.LagrangianSystem.from_text(
-            name="held", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2 + u*x", inputs=["u"]
-        )
+        constrained = lagrange("held", "x", "x_dot**2/2 - x**2/2 + u*x", inputs="u")
         stepper = sc.compile_stepper(constrained, "svi:1")
         stepper.integrate([0.0], [0.0], inputs={"u": ([0.0, 1.0, 1.1, 30.0], [0.0, 0.0, 1.0, 1.0])}, h=0.1, t_end=30.0)
         going = stepper.start([0.0], [0.0], h=0.1)
@@ -101,9 +94,7 @@ class TestLongSteps:
     @pytest.mark.parametrize("method", ["svi:1", "svi:2", "svi:3", "svi:4"])
     def test_impulse_misjudged_by_the_first_step_warns(self, method):
         """A flight goes on from it, whose way grows: the momentum is as wrong as ever."""
-        blow = sc.LagrangianSystem.from_text(
-            name="blow", coordinates=["x"], lagrangian="x_dot**2/2 + x*exp(-(t/0.03)**2)"
-        )
+        blow = lagrange("blow", "x", "x_dot**2/2 + x*exp(-(t/0.03)**2)")
         with pytest.warns(sc.AccuracyWarning, match="h = 0.1 is too large: .* from t = 0 is"):
             run = sc.compile_stepper(blow, method).integrate([0.0], [0.0], h=0.1, steps=200)
         assert abs(run.p[-1, 0] / (0.03 * math.sqrt(math.pi) / 2) - 1.0) > 1e-3
@@ -186,9 +177,7 @@ class TestLostEnergy:
     @pytest.mark.filterwarnings("error")
     def test_no_report_if_energy_is_conserved_or_need_not_be(self, kepler):
         kepler.integrate([1.0, 0.0], [0.0, 1e-3], t_end=3.0)
-        driven = sc.LagrangianSystem.from_text(
-            name="driven", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2 + 5*q*sin(t)"
-        )
+        driven = lagrange("driven", "q", "q_dot**2/2 - q**2/2 + 5*q*sin(t)")
         run = sc.compile_stepper(driven, "svi:4").integrate([0.1], [0.0], t_end=20.0, tolerance=1e-8)
         energy = run.energy()
         assert abs(energy[-1] - energy[0]) > 1.0

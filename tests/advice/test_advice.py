@@ -11,6 +11,7 @@ import pytest
 from click.testing import CliRunner, Result
 from mpmath import mp
 from nbody_reference import integrate
+from notation import lagrange
 from outer_planets import GRAVITY, MASSES, POSITIONS, VELOCITIES
 
 from scvi_codegen import Advice, LagrangianSystem, MethodError, StateError, advise, compile_stepper, problem
@@ -248,9 +249,7 @@ class TestHonesty:
     @pytest.mark.parametrize(("k", "direction"), [(1.0, 1), (4.0, -1)])
     def test_growth_times_are_those_of_a_saddle(self, k: float, direction: int):
         """Errors of a motion that decays at a saddle grow tenfold in log(10)/sqrt(k)."""
-        saddle = LagrangianSystem.from_text(
-            name="saddle", coordinates=["q"], lagrangian="q_dot**2/2 + k*q**2/2", parameters={"k": k}
-        )
+        saddle = lagrange("saddle", "q", "q_dot**2/2 + k*q**2/2", k=k)
         rate, span = math.sqrt(k), direction * 30.0 / math.sqrt(k)
         advice = advise(saddle, SVI(6), [1.0], [-direction * rate], span, 1e-6)
         words = " ".join(advice.warnings)
@@ -346,8 +345,6 @@ class TestCommandLine:
 
 def test_symplecticity_is_not_claimed_under_forces():
     saved = advise(problem("duffing").system, SVI(4), [0.5], [0.0], 5.0, 1e-6)
-    damped = LagrangianSystem.from_text(
-        name="damped", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2", dissipation="q_dot**2/10"
-    )
+    damped = lagrange("damped", "q", "q_dot**2/2 - q**2/2", dissipation="q_dot**2/10")
     assert "symplectic" in saved.message
     assert "symplectic" not in advise(damped, SVI(4), [0.5], [0.0], 5.0, 1e-6).message

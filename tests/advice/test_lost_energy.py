@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+from notation import lagrange
 
 import scvi_codegen as sc
 from scvi_codegen.advice.tolerance_check import _lost_energy, _tenfold
@@ -14,12 +15,7 @@ from scvi_codegen.advice.tolerance_check import _lost_energy, _tenfold
 @pytest.mark.parametrize(("mass", "offset"), [(1.0, 0.0), (1e3, 0.0), (1e-3, 0.0), (1e3, 7e4)])
 def test_energy_error_is_relative_to_energy_and_twice_the_kinetic_energy(mass, offset):
     """A coarse run of an anharmonic oscillator; the size does not vanish where the energy does."""
-    system = sc.LagrangianSystem.from_text(
-        name="oscillator",
-        coordinates=["x"],
-        lagrangian="m*x_dot**2/2 - m*(x**2/2 + x**4/4) - offset",
-        parameters={"m": mass, "offset": offset},
-    )
+    system = lagrange("oscillator", "x", "m*x_dot**2/2 - m*(x**2/2 + x**4/4) - offset", m=mass, offset=offset)
     run = sc.compile_stepper(system, "svi:1").integrate([1.0], velocity=[0.3], h=0.2, steps=50, t=0.4)
     x, p = run.q[:, 0], run.p[:, 0]
     energy = p**2 / (2 * mass) + mass * (x**2 / 2 + x**4 / 4) + offset

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from notation import lagrange
 
 import scvi_codegen as sc
 from scvi_codegen.advice import tolerance_check
@@ -17,12 +18,7 @@ STIFFER = {"k": 9.0, "a": 0.75}
 @pytest.fixture(scope="module")
 def driven():
     """Stiffer by far than its defaults, and driven by the clock."""
-    return sc.LagrangianSystem.from_text(
-        name="driven",
-        coordinates=["x"],
-        lagrangian="x_dot**2/2 - k*x**2/2 + a*x*cos(t)",
-        parameters={"k": 1.0, "a": 0.0},
-    )
+    return lagrange("driven", "x", "x_dot**2/2 - k*x**2/2 + a*x*cos(t)", k=1.0, a=0.0)
 
 
 def exact(t, q, p):
