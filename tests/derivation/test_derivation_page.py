@@ -19,6 +19,7 @@ from browsing import (
 )
 from click.testing import CliRunner
 from html_page import Page
+from notation import hamilton, lagrange
 from samples import driven_duffing
 from summed_equations import Evaluation
 
@@ -59,9 +60,7 @@ METHODS = [
 
 def tilted() -> sc.LagrangianSystem:
     """Everything a Lagrangian of one coordinate can have: a mass that varies, a magnetic term, time, a quartic term."""
-    return sc.LagrangianSystem.from_text(
-        name="tilted", coordinates=["q"], lagrangian=TILTED, parameters={"m": 1.3, "a": 0.4, "k": 0.7}
-    )
+    return lagrange("tilted", "q", TILTED, m=1.3, a=0.4, k=0.7)
 
 
 def compared(system: Any, method: Any) -> list[tuple[sympy.Expr, sympy.Expr]]:
@@ -102,9 +101,7 @@ class TestEquations:
         "method", [sc.SVI(2), sc.SVI(2, "gauss-legendre:3"), sc.SCVI(2), sc.Gauss(2)], ids=lambda m: m.name
     )
     def test_rolled_sums_of_a_hamiltonian_equal_unrolled_terms(self, method):
-        system = sc.HamiltonianSystem.from_text(
-            name="twisted", coordinates=["q"], momenta=["p"], hamiltonian="p**2*(1 + q**2)/2 + q**4*cos(t) + p*q/3"
-        )
+        system = hamilton("twisted", "q", "p**2*(1 + q**2)/2 + q**4*cos(t) + p*q/3", momenta="p")
         assert all(abs(one - other) < 1e-18 for one, other in compared(system, method))
 
     @pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
@@ -210,9 +207,7 @@ class TestPage:
 
     def test_every_kind_of_iteration_is_explained(self):
         assert set(ITERATIONS) == set(get_args(IterationName))
-        singular = sc.HamiltonianSystem.from_text(
-            name="hyperbolic", coordinates=["q"], momenta=["p"], hamiltonian="q*p + q**2*p**2"
-        )
+        singular = hamilton("hyperbolic", "q", "q*p + q**2*p**2", momenta="p")
         page = derivation_html(singular, sc.Gauss(2))
         assert "in turn to convergence" in page
 
