@@ -5,6 +5,7 @@ from fractions import Fraction
 import numpy as np
 import oracle
 import pytest
+from notation import lagrange
 from samples import driven_duffing, linkage, pumped_cart_pole, pushed_pendulum
 
 from scvi_codegen.compiler import compile_stepper
@@ -50,9 +51,7 @@ def test_free_particle_is_exact():
 
 
 def test_uniform_field_is_exact():
-    field = LagrangianSystem.from_text(
-        name="field", coordinates=["x"], lagrangian="x_dot**2/2 - g*x", parameters={"g": 9.81}
-    )
+    field = lagrange("field", "x", "x_dot**2/2 - g*x", g=9.81)
     g, h, q0, q1 = mp.mpf("9.81"), mp.mpf("0.7"), mp.mpf("0.2"), mp.mpf("1.1")
     found = exact_discrete_lagrangian(field, ["0.2"], ["1.1"], "0.7", parameters=["9.81"])
     expected = (q1 - q0) ** 2 / (2 * h) - g * h * (q0 + q1) / 2 - g**2 * h**3 / 24
@@ -90,13 +89,7 @@ def test_forced_oscillator_with_nonzero_initial_time():
 
 def test_generalised_forces_act_on_the_exact_flow():
     """q'' = -q - c q' + f: a damped rotation about f."""
-    system = LagrangianSystem.from_text(
-        name="damped",
-        coordinates=["x"],
-        parameters={"c": 0.5, "f": 0.25},
-        lagrangian="(x_dot**2 - x**2)/2",
-        forces={"x": "f - c*x_dot"},
-    )
+    system = lagrange("damped", "x", "(x_dot**2 - x**2)/2", c=0.5, f=0.25, forces={"x": "f - c*x_dot"})
     c, f, h, x, v = mp.mpf("0.5"), mp.mpf("0.25"), mp.mpf("0.9"), mp.mpf("0.625"), mp.mpf("-0.375")
     w, decay = mp.sqrt(1 - c**2 / 4), mp.exp(-c * h / 2)
     a, b = x - f, (v + c * (x - f) / 2) / w
