@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from notation import lagrange
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
@@ -146,9 +147,7 @@ def test_convolutions_are_unrolled_and_verified():
     assert float(at) == pytest.approx(expected, rel=1e-14)
     for summand in ("c[j-i]*q[j]**2", "q[j]", "c[j-i]*q[i]", "c[i-j]*q[j]", "c[j-i]*c[j-i]*q[j]"):
         with pytest.raises(sc.ExpressionError, match=r"difference of a pair|convolution"):
-            sc.LagrangianSystem.from_text(
-                "ring", ["q[N]"], f"sum(i in N, q_dot[i]**2 - sum(j in N, {summand}))", parameters={"c[N]": 1.0}
-            )
+            lagrange("ring", "q[N]", f"sum(i in N, q_dot[i]**2 - sum(j in N, {summand}))", parameters={"c[N]": 1.0})
 
 
 DENSITIES = {
@@ -176,9 +175,7 @@ def test_differences_of_indices_are_those_of_pairs():
     assert {str(each) for each in unrolled.parameters} == {"k", "c_0", "c_1", "c_2"}
     for sums in ("sum(i in N, j in N, c[j-i]*q[i]*q[j])", "sum(i < j in N, c[i-j]*q[i]*q[j])"):
         with pytest.raises(sc.ExpressionError, match="must be the difference of a pair"):
-            sc.LagrangianSystem.from_text(
-                "ring", ["q[N]"], f"sum(i in N, q_dot[i]**2) - {sums}", parameters={"c[N]": 1.0}
-            )
+            lagrange("ring", "q[N]", f"sum(i in N, q_dot[i]**2) - {sums}", parameters={"c[N]": 1.0})
 
 
 def test_derivatives_by_transforms_or_matrices_are_chosen_by_size():
