@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from notation import lagrange
 
 import scvi_codegen as sc
 from scvi_codegen.files.export import States, loaded
@@ -16,21 +17,14 @@ Result = tuple[Any, dict[str, Any]]
 
 
 def pushed() -> sc.LagrangianSystem:
-    return sc.LagrangianSystem.from_text(
-        name="pushed",
-        coordinates=["x", "y"],
-        lagrangian="m*(x_dot**2 + 2*y_dot**2)/2 - k*(x**2 + x*y**3)/2 + u*x",
-        parameters=PARAMETERS,
-        inputs=["u"],
+    return lagrange(
+        "pushed", "x y", "m*(x_dot**2 + 2*y_dot**2)/2 - k*(x**2 + x*y**3)/2 + u*x", parameters=PARAMETERS, inputs="u"
     )
 
 
 def free() -> sc.LagrangianSystem:
-    return sc.LagrangianSystem.from_text(
-        name="free",
-        coordinates=["x", "y"],
-        lagrangian="m*(x_dot**2 + 2*y_dot**2)/2 - k*(x**2 + x*y**3)/2 + x*cos(t)",
-        parameters=PARAMETERS,
+    return lagrange(
+        "free", "x y", "m*(x_dot**2 + 2*y_dot**2)/2 - k*(x**2 + x*y**3)/2 + x*cos(t)", parameters=PARAMETERS
     )
 
 
