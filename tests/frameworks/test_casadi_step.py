@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from notation import lagrange
 from numpy.testing import assert_allclose
 from samples import QUICK_FLAGS
 
@@ -13,14 +14,7 @@ ca = pytest.importorskip("casadi", reason="needs the extra 'casadi'")
 KEPLER = sc.problem("kepler").system
 Q, P, H = [0.5, 0.1], [0.2, 1.6], 0.1
 NO_INPUTS = ca.DM(0, 1)
-TOWED = sc.LagrangianSystem.from_text(
-    name="towed",
-    coordinates=["x"],
-    lagrangian="m*x_dot**2/2 - x**4/4 + w*cos(t)*x",
-    parameters={"m": 2.0},
-    forces={"x": "u - x_dot*w"},
-    inputs=["u", "w"],
-)
+TOWED = lagrange("towed", "x", "m*x_dot**2/2 - x**4/4 + w*cos(t)*x", m=2.0, forces={"x": "u - x_dot*w"}, inputs="u w")
 
 
 @pytest.mark.parametrize(
@@ -35,9 +29,7 @@ def test_a_solved_step_is_that_of_the_equations_in_60_digits(system, method):
 
 
 def test_constraints_are_among_the_equations():
-    rod = sc.LagrangianSystem.from_text(
-        name="rod", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 = 1"]
-    )
+    rod = lagrange("rod", "x y", "(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 = 1"])
     method = sc.SVI(2, "gauss-lobatto:3")
     found = sc.casadi_step(rod, method, solved=True)(q=[0.6, -0.8], p=[0.4, 0.3], inputs=NO_INPUTS, t=0.0, h=0.1)
     exact = compiled_equations(rod, method)([0.6, -0.8], [0.4, 0.3], 0.1)
@@ -67,9 +59,7 @@ def test_inputs_in_bernsteins_form_are_the_cubics_of_compiled_steps():
 
 
 def test_names_of_constants_are_unrestricted():
-    system = sc.LagrangianSystem.from_text(
-        name="e", coordinates=["x"], lagrangian="x_dot**2/2 - exp(1)*e*x**2/pi", parameters={"e": 0.25}
-    )
+    system = lagrange("e", "x", "x_dot**2/2 - exp(1)*e*x**2/pi", e=0.25)
     found = sc.casadi_step(system, sc.SVI(2), solved=True)(
         q=0.4, p=0.3, inputs=NO_INPUTS, parameters=0.25, t=0.0, h=0.1
     )

@@ -9,6 +9,7 @@ from functools import cache, partial
 import numpy as np
 import pumped_leapfrog as pumped
 import pytest
+from notation import lagrange
 from numpy.testing import assert_allclose, assert_array_equal
 from samples import QUICK_FLAGS
 
@@ -31,9 +32,7 @@ def binary64():
 
 @cache
 def driven(method):
-    system = sc.LagrangianSystem.from_text(
-        name="driven", coordinates=["x"], lagrangian="m*x_dot**2/2 - k*x**4/4 + a*x*cos(w*t)", parameters=SPECIAL
-    )
+    system = lagrange("driven", "x", "m*x_dot**2/2 - k*x**4/4 + a*x*cos(w*t)", parameters=SPECIAL)
     return sc.compile_stepper(system, method, flags=QUICK_FLAGS)
 
 
@@ -91,9 +90,7 @@ def test_derivatives_by_all_arguments_are_those_of_leapfrog(derivative, save_eve
 
 
 def test_derivatives_of_a_harmonic_oscillator_are_closed_form():
-    system = sc.LagrangianSystem.from_text(
-        name="oscillator", coordinates=["x"], lagrangian="x_dot**2/2 - w**2*x**2/2", parameters={"w": 1.3}
-    )
+    system = lagrange("oscillator", "x", "x_dot**2/2 - w**2*x**2/2", w=1.3)
     flow = sc.jax_flow(sc.compile_stepper(system, sc.SVI(6), flags=QUICK_FLAGS), steps=70)
     end = jax.value_and_grad(lambda w, h: flow(jnp.ones(1), jnp.zeros(1), parameters={"w": w}, h=h)[0][0], (0, 1))
     value, partials = end(1.3, H)
@@ -181,9 +178,7 @@ def test_result_is_equal_in_another_process(tmp_path):
 
 
 def test_inputs_with_zero_order_hold_are_parameters():
-    system = sc.LagrangianSystem.from_text(
-        name="pushed", coordinates=["x"], lagrangian="x_dot**2/2", forces={"x": "u"}, inputs=["u"]
-    )
+    system = lagrange("pushed", "x", "x_dot**2/2", forces={"x": "u"}, inputs="u")
     flow = sc.jax_flow(sc.compile_stepper(system, sc.SVI(1), flags=QUICK_FLAGS), steps=10)
     start = {"q": jnp.zeros(1), "p": jnp.zeros(1)}
     derivative = jax.grad(lambda u: flow(**start, parameters={"u_0": u}, h=0.2)[0][0])(3.0)
@@ -193,13 +188,7 @@ def test_inputs_with_zero_order_hold_are_parameters():
 
 
 def test_constrained_trajectories_have_the_derivatives_of_their_runs():
-    system = sc.LagrangianSystem.from_text(
-        name="rod",
-        coordinates=["x", "y"],
-        lagrangian="(x_dot**2 + y_dot**2)/2 - g*y",
-        parameters={"g": 9.0},
-        constraints=["x**2 + y**2 = 1"],
-    )
+    system = lagrange("rod", "x y", "(x_dot**2 + y_dot**2)/2 - g*y", g=9.0, constraints=["x**2 + y**2 = 1"])
     stepper = sc.compile_stepper(system, sc.SVI(2, "gauss-lobatto:3"), flags=QUICK_FLAGS)
     flow, run = sc.jax_flow(stepper, steps=20), stepper.integrate([1.0, 0.0], [0.0, 0.5], h=0.02, steps=20)
     found = jax.jacrev(lambda q, p: flow(q, p, h=0.02)[0], (0, 1))(jnp.array([1.0, 0.0]), jnp.array([0.0, 0.5]))

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from notation import lagrange
 from numpy.testing import assert_allclose
 from samples import QUICK_FLAGS
 from scipy.integrate import quad_vec
@@ -10,23 +11,10 @@ import scvi_codegen as sc
 
 pytest.importorskip("casadi", reason="needs the extra 'casadi'")
 
-POINT = sc.LagrangianSystem.from_text(
-    name="point", coordinates=["x"], lagrangian="x_dot**2/2", forces={"x": "u"}, inputs=["u"]
-)
-SWING = sc.LagrangianSystem.from_text(
-    name="swing",
-    coordinates=["q"],
-    lagrangian="(1 + a)*q_dot**2/2 + cos(q)",
-    parameters={"a": 0.5},
-    forces={"q": "u"},
-    inputs=["u"],
-)
-ROTORS = sc.LagrangianSystem.from_text(
-    name="rotors",
-    coordinates=["theta", "a"],
-    lagrangian="theta_dot**2 + (theta_dot + a_dot)**2*(2 + cos(a))/2",
-    forces={"a": "u"},
-    inputs=["u"],
+POINT = lagrange("point", "x", "x_dot**2/2", forces={"x": "u"}, inputs="u")
+SWING = lagrange("swing", "q", "(1 + a)*q_dot**2/2 + cos(q)", a=0.5, forces={"q": "u"}, inputs="u")
+ROTORS = lagrange(
+    "rotors", "theta a", "theta_dot**2 + (theta_dot + a_dot)**2*(2 + cos(a))/2", forces={"a": "u"}, inputs="u"
 )
 REST = {"start": {"x": 0.0, "x_dot": 0.0}, "end": {"x": 1.0, "x_dot": 0.0}}
 UP = {
@@ -51,9 +39,7 @@ def test_minimum_effort_rest_to_rest_has_the_exact_costates():
 @pytest.mark.parametrize("s", [2, 3])
 def test_cost_and_costates_have_the_order_of_the_method(s):
     """Beside the Gramian of a spring that is pushed: inputs of degree s - 1 by Gauss's s points."""
-    spring = sc.LagrangianSystem.from_text(
-        name="spring", coordinates=["x"], lagrangian="(x_dot**2 - x**2)/2", forces={"x": "u"}, inputs=["u"]
-    )
+    spring = lagrange("spring", "x", "(x_dot**2 - x**2)/2", forces={"x": "u"}, inputs="u")
     turned = np.array([[np.sin(1.0)], [np.cos(1.0)]])  # where a unit impulse leads, a unit of time later
     gramian = quad_vec(lambda t: np.outer(v := [np.sin(t), np.cos(t)], v), 0.0, 3.0)[0]
     costate = np.linalg.solve(gramian, [1.0, 0.0])
@@ -153,17 +139,10 @@ def test_invalid_problems_are_reported(changed, error, message):
         sc.optimal_control(**asked)
 
 
-BOB = sc.LagrangianSystem.from_text(
-    name="bob",
-    coordinates=["x", "y"],
-    lagrangian="(x_dot**2 + y_dot**2)/2 - y",
-    constraints=["x**2 + y**2 = 1"],
-    forces={"x": "u"},
-    inputs=["u"],
+BOB = lagrange(
+    "bob", "x y", "(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 = 1"], forces={"x": "u"}, inputs="u"
 )
-ANGLE = sc.LagrangianSystem.from_text(
-    name="angle", coordinates=["a"], lagrangian="a_dot**2/2 + cos(a)", forces={"a": "u*cos(a)"}, inputs=["u"]
-)
+ANGLE = lagrange("angle", "a", "a_dot**2/2 + cos(a)", forces={"a": "u*cos(a)"}, inputs="u")
 
 
 def test_constraints_hold_and_the_optimum_is_that_in_the_angle():
@@ -216,13 +195,6 @@ def test_skate_moves_along_its_blade():
 
 
 def test_constraint_that_depends_on_an_input_is_rejected():
-    led = sc.LagrangianSystem.from_text(
-        name="led",
-        coordinates=["x", "y"],
-        lagrangian="(x_dot**2 + y_dot**2)/2 - y",
-        constraints=["x = u"],
-        forces={"y": "w"},
-        inputs=["u", "w"],
-    )
+    led = lagrange("led", "x y", "(x_dot**2 + y_dot**2)/2 - y", constraints=["x = u"], forces={"y": "w"}, inputs="u w")
     with pytest.raises(sc.MethodError, match="a constraint depends on an input and would jump"):
         sc.optimal_control(led, sc.SVI(1, "gauss-lobatto:2"), steps=3, duration=1.0, start={}, end={})
