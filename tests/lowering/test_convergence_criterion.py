@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from either_system import either_system
+from notation import hamilton, lagrange
 from programs import needs
 from samples import QUICK_FLAGS
 
@@ -50,9 +51,7 @@ def test_long_steps_of_an_oscillator_equal_those_in_an_ensemble(method):
 
 def test_slow_convergence_is_not_mistaken_for_rounding():
     """Near its limit the iteration of a coupled system stops shrinking a while, at 1e-10 of the state, and fails."""
-    heavy = LagrangianSystem.from_text(
-        name="heavy", coordinates=["x"], lagrangian="x_dot**2*(1 + x**2/100)/2 - x**2/2", parameters={}
-    )
+    heavy = lagrange("heavy", "x", "x_dot**2*(1 + x**2/100)/2 - x**2/2")
     method = SVI(4)
     iterations, newton = (
         compile_stepper(heavy, method, solver=solver, flags=QUICK_FLAGS) for solver in ("fixed-point", "newton")
@@ -66,11 +65,7 @@ def test_slow_convergence_is_not_mistaken_for_rounding():
 @pytest.mark.parametrize("deviation", [1e-9, 1e-11])
 def test_rotating_iteration_that_stagnates_has_not_converged(deviation):
     """A rotation about a moving point contracts by h**2 in two iterations, the first of which enlarges the change."""
-    rotation = HamiltonianSystem.from_text(
-        name="rotation",
-        coordinates=["x", "y"],
-        hamiltonian="p_x + p_y + 2*(x - t - 1)*(p_y - 1) - (y - t - 1)*(p_x - 1)/2",
-    )
+    rotation = hamilton("rotation", "x y", "p_x + p_y + 2*(x - t - 1)*(p_y - 1) - (y - t - 1)*(p_x - 1)/2")
     method, state = SpectralCollocation(1, form="phase-space"), 1 + deviation * np.array([1, 0.3, -0.6, 0.8])
     iterations, newton = (
         compile_stepper(rotation, method, solver=solver, flags=QUICK_FLAGS) for solver in ("fixed-point", "newton")
@@ -293,11 +288,7 @@ def test_standing_waves_of_an_ensemble_converge_at_known_sizes():
 
 def test_bodies_of_known_number_are_measured_one_by_one():
     """Bodies that do not move do not make the criterion of others looser: only fields are measured as a whole."""
-    system = LagrangianSystem.from_text(
-        name="pairs",
-        coordinates=["x[4]"],
-        lagrangian="sum(i in 4, x_dot[i]**2/2) + sum(i < j in 4, 1/sqrt((x[i] - x[j])**2 + 1))",
-    )
+    system = lagrange("pairs", "x[4]", "sum(i in 4, x_dot[i]**2/2) + sum(i < j in 4, 1/sqrt((x[i] - x[j])**2 + 1))")
     assert not any(array.is_field for array in system.arrays)
 
 

@@ -4,6 +4,7 @@ from itertools import combinations, pairwise
 
 import numpy as np
 import pytest
+from notation import lagrange
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
@@ -40,9 +41,7 @@ def coupled(name: str, count: int) -> sc.LagrangianSystem:
     q = [f"q{i}" for i in range(count)]
     kinetic = [f"{a}_dot**2" for a in q] + [f"cos({a})*{a}_dot*{b}_dot/4" for a, b in pairwise(q)]
     springs = [f"-({b} - {a} - {k}/10)**2/2 - k*sin(t)*({b} - {a})**4" for k, (a, b) in enumerate(pairwise(q))]
-    return sc.LagrangianSystem.from_text(
-        name=name, coordinates=q, lagrangian=" + ".join(kinetic) + " ".join(springs), parameters={"k": 0.3}
-    )
+    return lagrange(name, q, " + ".join(kinetic) + " ".join(springs), k=0.3)
 
 
 def hamiltonian(name: str, count: int) -> sc.HamiltonianSystem:
@@ -123,11 +122,6 @@ def test_few_terms_and_constraints_remain_unrolled():
 def test_parameters_may_have_the_names_of_reads():
     names = ["a", "b", "c", "d"]
     springs = " ".join(f"- slot_0*given_0*({b} - {a})**{2}*{k + 2}" for k, (a, b) in enumerate(pairwise(names)))
-    system = sc.LagrangianSystem.from_text(
-        name="clash",
-        coordinates=names,
-        lagrangian=" + ".join(f"{q}_dot**2" for q in names) + springs,
-        parameters={"slot_0": 2, "given_0": 3},
-    )
+    system = lagrange("clash", names, " + ".join(f"{q}_dot**2" for q in names) + springs, slot_0=2, given_0=3)
     (group,) = module.roll_terms(system).term_groups
     assert {each.name for each in group.formula.free_symbols} >= {"slot_0", "given_0", "slot__0"}
