@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import sympy
+from notation import hamilton, lagrange
 
 from scvi_codegen import HamiltonianSystem, LagrangianSystem, SystemDefinitionError, unroll_sums
 from scvi_codegen.mechanics.arrays.reading import arrays_from_text
@@ -107,9 +108,7 @@ def test_systems_that_cannot_be_unrolled_are_rejected(
     sizes: dict[str, int], extra: dict[str, object], message: str
 ) -> None:
     """Sizes, tables and parameters are those of the system."""
-    chain = LagrangianSystem.from_text(
-        name="chain", coordinates=["q[N]"], parameters={"m[N]": 1}, lagrangian="sum(i in N, m[i]*q_dot[i]**2) - q[1]**2"
-    )
+    chain = lagrange("chain", "q[N]", "sum(i in N, m[i]*q_dot[i]**2) - q[1]**2", parameters={"m[N]": 1})
     with pytest.raises(SystemDefinitionError, match=message):
         unroll_sums(chain, sizes, **extra)
 
@@ -208,9 +207,7 @@ def test_momentum_maps_of_a_hamiltonian() -> None:
         f"- sum(i < j in N, 1/{DISTANCE.replace('3', '2', 1)})",
     )
     assert [each.name for each in momentum_maps(bodies)] == ["angular momentum of r[.., 0], r[.., 1]"]
-    oscillators = HamiltonianSystem.from_text(
-        name="oscillators", coordinates=["q[N]"], hamiltonian="sum(i in N, (q[i]**2 + p_q[i]**2)**2)"
-    )
+    oscillators = hamilton("oscillators", "q[N]", "sum(i in N, (q[i]**2 + p_q[i]**2)**2)")
     assert [each.name for each in momentum_maps(oscillators)] == ["norm of q"]
 
 

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import sympy
+from notation import lagrange
 from scipy.integrate import solve_ivp
 
 import scvi_codegen as sc
@@ -132,9 +133,7 @@ def test_vortices_on_a_curved_surface_agree_with_the_published_reference() -> No
     places = [f"(1 + x{i}**2 + y{i}**2)" for i in (1, 2)]
     theta = " + ".join(f"g*S/2*(x{i}*y{i}_dot - y{i}*x{i}_dot)".replace("S", s) for i, s in enumerate(places, 1))
     energy = f"g**2*{places[0]}*{places[1]}*log((x1 - x2)**2 + (y1 - y2)**2)/(2*pi)"
-    vortices = sc.LagrangianSystem.from_text(
-        "vortices", ["x1", "y1", "x2", "y2"], f"{theta} - {energy}", parameters={"g": 0.5}
-    )
+    vortices = lagrange("vortices", "x1 y1 x2 y2", f"{theta} - {energy}", g=0.5)
     run = sc.compile_stepper(vortices, "svi:8").integrate([0.5, 0.1, 0.5, -0.1], h=0.1, steps=100)
     published = [0.18722529318641928, 0.38967432450068706, 0.38125332930294187, 0.4258020604293123]
     assert np.abs(run.variables[-1] - published).max() < 1e-11
@@ -209,9 +208,7 @@ def test_translations_of_vortices_conserve_their_centre() -> None:
     energy = " + ".join(
         f"{strengths[i] * strengths[j]}*log((x{i} - x{j})**2 + (y{i} - y{j})**2)/(4*pi)" for i, j in pairs
     )
-    three = sc.LagrangianSystem.from_text(
-        "vortices", [f"{c}{i}" for i in strengths for c in "xy"], f"{theta} + {energy}"
-    )
+    three = lagrange("vortices", [f"{c}{i}" for i in strengths for c in "xy"], f"{theta} + {energy}")
     stepper = sc.compile_stepper(three, "svi:3")
     assert stepper.momentum_map_names == ("momentum of y1, y2, y3",)
     assert stepper.interface.map_exact == (True,)
@@ -364,12 +361,7 @@ def differences(function, size: int, width: float = 1e-3) -> np.ndarray:
 @pytest.mark.parametrize("method", ["svi:2", "stoermer-verlet", "radau-iia:2"])
 def test_derivatives_of_steps_against_differences(method: str) -> None:
     """The one-form and H depend on parameters and time, so that every derivative of theta occurs."""
-    driven = sc.LagrangianSystem.from_text(
-        "driven",
-        ["x", "y", "a", "b"],
-        COUPLED.replace("(b + b**3/5)", "(1 + t/3)*(b + c*b**3 + c*a*y)"),
-        parameters={"c": 0.2},
-    )
+    driven = lagrange("driven", "x y a b", COUPLED.replace("(b + b**3/5)", "(1 + t/3)*(b + c*b**3 + c*a*y)"), c=0.2)
     stepper = sc.compile_stepper(driven, method)
     z, h, t = np.concatenate(driven.halves(CASES["coupled"][3])), 0.1, 0.7
 
@@ -417,9 +409,7 @@ def test_periodic_orbits() -> None:
 
 
 def test_inputs(tmp_path) -> None:
-    driven = sc.LagrangianSystem.from_text(
-        "driven", ["x", "y"], "(x + x**3)*y_dot - x**2/2 - y**2/2 - f*x - f**2*y", inputs=["f"]
-    )
+    driven = lagrange("driven", "x y", "(x + x**3)*y_dot - x**2/2 - y**2/2 - f*x - f**2*y", inputs="f")
     times = np.linspace(0.0, 2.0, 3)
     run = sc.compile_stepper(driven, "svi:4").integrate(
         [0.3, 0.2], h=0.05, steps=40, inputs={"f": (times, [0.0, 1.0, 0.0])}

@@ -2,6 +2,7 @@
 
 import pytest
 import sympy
+from notation import hamilton, lagrange
 from sympy.physics.mechanics import LagrangesMethod, Point, ReferenceFrame, dynamicsymbols
 
 import scvi_codegen as sc
@@ -62,17 +63,13 @@ def test_legendre_transform_and_its_inverse():
     other = sc.hamiltonian_of(system)
     assert str(other.forces[0]) == "-c*p_x/m"
     assert sc.lagrangian_of(other).forces == system.forces
-    text = sc.HamiltonianSystem.from_text(
-        name="h", coordinates=["x"], hamiltonian="p_x**2/2", parameters={"c": 1}, forces={"x": "-c*p_x"}
-    )
+    text = hamilton("h", "x", "p_x**2/2", c=1, forces={"x": "-c*p_x"})
     assert [str(f) for f in text.forces] == ["-c*p_x"]
 
 
 def test_work_is_the_same_in_other_coordinates():
     """A constant force along x, in polar coordinates."""
-    plane = sc.LagrangianSystem.from_text(
-        name="plane", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2", forces={"x": "1"}
-    )
+    plane = lagrange("plane", "x y", "(x_dot**2 + y_dot**2)/2", forces={"x": "1"})
     polar = sc.change_coordinates(plane, {"x": "r*cos(a)", "y": "r*sin(a)"}, coordinates=["r", "a"])
     assert [str(f) for f in polar.forces] == ["cos(a)", "-r*sin(a)"]
 
@@ -91,23 +88,15 @@ def test_forces_of_sympys_mechanics_act_through_velocities():
     method = LagrangesMethod(length**2 * theta.diff(t) ** 2 / 2, [theta], forcelist=acting, frame=ground)
     method.form_lagranges_equations()
     system = sc.LagrangianSystem.from_lagranges_method(method, name="pulled", parameters={"l": 2})
-    expected = sc.LagrangianSystem.from_text(
-        name="pulled",
-        coordinates=["theta"],
-        lagrangian="l**2*theta_dot**2/2",
-        parameters={"l": 2},
-        forces={"theta": "-3*l*sin(theta) - l**2*theta_dot + 5"},
+    expected = lagrange(
+        "pulled", "theta", "l**2*theta_dot**2/2", l=2, forces={"theta": "-3*l*sin(theta) - l**2*theta_dot + 5"}
     )
     assert sympy.simplify(system.forces[0] - expected.forces[0]) == 0
 
 
 def test_symmetries_are_those_of_the_forced_motion():
-    still = sc.LagrangianSystem.from_text(
-        name="free", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - y**4"
-    )
-    dragged = sc.LagrangianSystem.from_text(
-        name="free", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - y**4", forces={"x": "-x_dot/2"}
-    )
+    still = lagrange("free", "x y", "(x_dot**2 + y_dot**2)/2 - y**4")
+    dragged = lagrange("free", "x y", "(x_dot**2 + y_dot**2)/2 - y**4", forces={"x": "-x_dot/2"})
     assert "p_x" in {str(each.momentum_map) for each in sc.symmetries(still)}
     assert [str(each.momentum_map) for each in sc.symmetries(dragged)] == ["p_x + x/2"]
 

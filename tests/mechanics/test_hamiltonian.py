@@ -7,6 +7,7 @@ one is checked against closed solutions and against a Runge-Kutta step written o
 import numpy as np
 import pytest
 import sympy
+from notation import hamilton, lagrange
 
 import scvi_codegen as sc
 from scvi_codegen.mechanics.legendre import equivalent_lagrangian, hamiltonian_of, lagrangian_of, positive_parameters
@@ -43,13 +44,7 @@ def hyperbolic() -> sc.HamiltonianSystem:
 
 
 def test_text_and_sympy_define_equal_systems() -> None:
-    text = sc.HamiltonianSystem.from_text(
-        name="pendulum",
-        coordinates=["q"],
-        momenta=["p"],
-        hamiltonian="p**2/(2*m) - cos(q) + 0.1*t",
-        parameters={"m": 2},
-    )
+    text = hamilton("pendulum", "q", "p**2/(2*m) - cos(q) + 0.1*t", momenta="p", m=2)
     q, p, m, t = sympy.symbols("q p m t")
     own = sc.HamiltonianSystem.from_sympy(
         name="pendulum",
@@ -140,9 +135,7 @@ def test_missing_legendre_transform_is_named() -> None:
     with pytest.raises(sc.SystemDefinitionError, match="velocities do not determine momenta"):
         lagrangian_of(hyperbolic())
     assert equivalent_lagrangian(hyperbolic()) is None
-    quintic = sc.LagrangianSystem.from_text(
-        name="quintic", coordinates=["q"], lagrangian="q_dot**2/2 + q_dot**6/6 - q**2"
-    )
+    quintic = lagrange("quintic", "q", "q_dot**2/2 + q_dot**6/6 - q**2")
     with pytest.raises(sc.SystemDefinitionError, match="define the other function yourself"):
         hamiltonian_of(quintic)
 
@@ -274,12 +267,7 @@ def test_both_solvers_give_the_same_step_without_a_lagrangian(method, h) -> None
 
 def test_parameters_are_assumed_positive_if_their_values_are():
     """Roots of squares of other parameters have signs; a value of 0 does not determine the sign of others."""
-    system = sc.LagrangianSystem.from_text(
-        name="signs",
-        coordinates=["q"],
-        lagrangian="a*q_dot**2/2 - b*q - c*q**2",
-        parameters={"a": 1.0, "b": 0.0, "c": -1.0},
-    )
+    system = lagrange("signs", "q", "a*q_dot**2/2 - b*q - c*q**2", a=1.0, b=0.0, c=-1.0)
     assert [given.name for given in positive_parameters(system)] == ["a"]
 
 

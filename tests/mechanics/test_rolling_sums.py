@@ -4,6 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from notation import lagrange
 
 import scvi_codegen as sc
 from scvi_codegen.errors import SystemDefinitionError
@@ -38,13 +39,7 @@ def damped(count):
     kinetic = " + ".join(f"{a}_dot**2/2" for a in q)
     springs = "".join(f" - ({b} - {a})**2/2 - ({b} - {a})**4" for a, b in pairwise(q))
     friction = {a: f"-c*{k + 1}*{a}_dot**3 + sin({b} - {a})" for k, (a, b) in enumerate(pairwise(q))}
-    return sc.LagrangianSystem.from_text(
-        name="damped",
-        coordinates=q,
-        lagrangian=f"{kinetic}{springs} - q0**2/2",
-        parameters={"c": 0.1},
-        forces={**friction, q[-1]: "c*cos(t)"},
-    )
+    return lagrange("damped", q, f"{kinetic}{springs} - q0**2/2", c=0.1, forces={**friction, q[-1]: "c*cos(t)"})
 
 
 def canonical(count):
@@ -103,15 +98,7 @@ def test_common_parameters_remain_scalar():
             sc.LagrangianSystem.from_text(name="damped", coordinates=["x"], lagrangian="x_dot**2/2", damping="1"),
             "'damped' has damping",
         ),
-        (
-            sc.LagrangianSystem.from_text(
-                name="rod",
-                coordinates=["x", "y"],
-                lagrangian="x_dot**2/2 + y_dot**2/2",
-                constraints=["x**2 + y**2 = 1"],
-            ),
-            "'rod' has constraints",
-        ),
+        (lagrange("rod", "x y", "x_dot**2/2 + y_dot**2/2", constraints=["x**2 + y**2 = 1"]), "'rod' has constraints"),
     ],
 )
 def test_unsupported_systems_are_rejected(system, message):
@@ -132,10 +119,7 @@ def test_inputs_retain_their_names():
     found = sc.roll_sums(system)
     assert found.system.inputs == ("u",)
     assert (
-        found.system.parameters
-        == sc.LagrangianSystem.from_text(
-            name="u", coordinates=["q[N]"], lagrangian="sum(i in N, q_dot[i]**2/2 + u*q[i])", inputs=["u"]
-        ).parameters
+        found.system.parameters == lagrange("u", "q[N]", "sum(i in N, q_dot[i]**2/2 + u*q[i])", inputs="u").parameters
     )
     data = {"u": (np.linspace(0, 1, 11), np.sin(np.linspace(0, 1, 11)))}
     run = sc.compile_stepper(found.system, "svi:3").integrate(

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import sympy
 from counting import at_most
+from notation import hamilton, lagrange
 from sympy import Symbol
 
 import scvi_codegen as sc
@@ -25,12 +26,7 @@ ROUNDOFF = 3e-14
 def particle(potential: str = "0", axes: str = "xy", **parameters: float) -> sc.LagrangianSystem:
     """One mass m, kinetic energy less a potential."""
     kinetic = " + ".join(f"{axis}_dot**2" for axis in axes)
-    return sc.LagrangianSystem.from_text(
-        name="particle",
-        coordinates=list(axes),
-        lagrangian=f"m*({kinetic})/2 - ({potential})",
-        parameters={"m": 1.3} | parameters,
-    )
+    return lagrange("particle", list(axes), f"m*({kinetic})/2 - ({potential})", parameters={"m": 1.3} | parameters)
 
 
 def bodies(axes: str = "xy", *, gravity: bool = False, names: str = "abc") -> sc.LagrangianSystem:
@@ -55,12 +51,7 @@ MAGNETIC = "m*(x_dot**2 + y_dot**2 + z_dot**2)/2 + e*B*x*y_dot + e*E*x"
 
 def magnetic(e_field: float = 0.3) -> sc.LagrangianSystem:
     """A charge in crossed constant fields."""
-    return sc.LagrangianSystem.from_text(
-        name="crossed fields",
-        coordinates=["x", "y", "z"],
-        lagrangian=MAGNETIC,
-        parameters={"m": 1.3, "e": 0.7, "B": 1.1, "E": e_field},
-    )
+    return lagrange("crossed fields", "x y z", MAGNETIC, m=1.3, e=0.7, B=1.1, E=e_field)
 
 
 def formulas(system: MechanicalSystem) -> dict[str, str]:
@@ -120,21 +111,13 @@ def test_uniform_field_has_the_symmetries_of_a_free_particle():
 
 
 def test_symmetries_with_anisotropic_masses():
-    system = sc.LagrangianSystem.from_text(
-        name="anisotropic",
-        coordinates=["u", "w"],
-        lagrangian="m*u_dot**2/2 + M*w_dot**2/2",
-        parameters={"m": 1.0, "M": 4.0},
-    )
+    system = lagrange("anisotropic", "u w", "m*u_dot**2/2 + M*w_dot**2/2", m=1.0, M=4.0)
     assert formulas(system)["angular momentum of u, w"] == "m*u*p_w - M*w*p_u"
 
 
 def test_symmetries_with_sums_of_parameters_in_coefficients():
-    system = sc.LagrangianSystem.from_text(
-        name="trolley",
-        coordinates=["x", "y"],
-        lagrangian="M*x_dot**2/2 + m*(x_dot + y_dot)**2/2 - k*(y - a - b)**4",
-        parameters={"m": 1.0, "M": 4.0, "k": 1.0, "a": 0.1, "b": 0.2},
+    system = lagrange(
+        "trolley", "x y", "M*x_dot**2/2 + m*(x_dot + y_dot)**2/2 - k*(y - a - b)**4", m=1.0, M=4.0, k=1.0, a=0.1, b=0.2
     )
     assert formulas(system)["boost of x"] == "(M + m)*x + m*y - p_x*t"
     shifted = particle("((x - a - b)**2 + y**2)**2", a=0.3, b=0.4)
@@ -149,10 +132,8 @@ def test_long_decimal_numbers_are_exact():
 
 def test_symmetries_in_other_linear_coordinates():
     """Kepler's problem in x = 2 u + w, y = u - 3 w: the rotation has no simple form there."""
-    system = sc.LagrangianSystem.from_text(
-        name="skew",
-        coordinates=["u", "w"],
-        lagrangian="((2*u_dot + w_dot)**2 + (u_dot - 3*w_dot)**2)/2 + 1/sqrt((2*u + w)**2 + (u - 3*w)**2)",
+    system = lagrange(
+        "skew", "u w", "((2*u_dot + w_dot)**2 + (u_dot - 3*w_dot)**2)/2 + 1/sqrt((2*u + w)**2 + (u - 3*w)**2)"
     )
     assert formulas(system) == {"linear symmetry of u, w": "u*p_u + 5*u*p_w - 10*w*p_u - w*p_w"}
 
@@ -184,20 +165,10 @@ def test_three_bodies_have_the_full_galilean_group(axes, gravity):
 def test_more_than_twelve_coordinates_are_searched_together():
     chain = " ".join(f"+ cos(q{k} - q{(k + 1) % 14})" for k in range(14))
     kinetic = " + ".join(f"M*q{k}_dot**2/2" for k in range(14))
-    closed = sc.LagrangianSystem.from_text(
-        name="closed chain",
-        coordinates=[f"q{k}" for k in range(14)],
-        lagrangian=f"{kinetic} {chain}",
-        parameters={"M": 2.0},
-    )
+    closed = lagrange("closed chain", [f"q{k}" for k in range(14)], f"{kinetic} {chain}", M=2.0)
     assert list(formulas(closed)) == ["momentum of all coordinates", "boost of all coordinates"]
     assert formulas(closed)["boost of all coordinates"].startswith("M*q0 + M*q1 + M*q2 ")
-    loose = sc.LagrangianSystem.from_text(
-        name="cyclic ones",
-        coordinates=[f"q{k}" for k in range(14)],
-        lagrangian=f"{kinetic} + cos(q1) + q2**2 * q3_dot**2",
-        parameters={"M": 2.0},
-    )
+    loose = lagrange("cyclic ones", [f"q{k}" for k in range(14)], f"{kinetic} + cos(q1) + q2**2 * q3_dot**2", M=2.0)
     assert "momentum of q3" in formulas(loose)
     assert "momentum of q1" not in formulas(loose)
 
@@ -219,9 +190,7 @@ def test_systems_without_symmetries(text):
 @pytest.mark.parametrize("sum_", ["1e300 - m", "atanh(m) + m", "(m - 9)**1.5 + 1"])
 def test_sum_of_parameters_without_a_value_does_not_hide_a_symmetry(sum_):
     """The sum might stand in a coefficient, so it is tried as a factor of one."""
-    system = sc.LagrangianSystem.from_text(
-        name="sums", coordinates=["q", "x"], lagrangian=f"(q_dot**2 + x_dot**2)/2 + {sum_}", parameters={"m": 0.5}
-    )
+    system = lagrange("sums", "q x", f"(q_dot**2 + x_dot**2)/2 + {sum_}", m=0.5)
     assert "p_q" in formulas(system).values()
 
 
@@ -236,13 +205,7 @@ def test_a_hamiltonian_has_the_symmetries_of_its_lagrangian():
 
 
 def phase_space(hamiltonian: str, coordinates: str, momenta: str, **parameters: float) -> sc.HamiltonianSystem:
-    return sc.HamiltonianSystem.from_text(
-        name="phase space",
-        coordinates=coordinates.split(),
-        momenta=momenta.split(),
-        hamiltonian=hamiltonian,
-        parameters=parameters,
-    )
+    return hamilton("phase space", coordinates.split(), hamiltonian, momenta=momenta.split(), parameters=parameters)
 
 
 ROTATOR = phase_space("(x**2 + p**2)**2/4", "x", "p")
@@ -379,9 +342,7 @@ GAUGED = {
 @pytest.mark.parametrize("name", GAUGED)
 def test_a_gauge_that_is_not_quadratic_is_found(name):
     lagrangian, direction, expected = GAUGED[name]
-    system = sc.LagrangianSystem.from_text(
-        name=name, coordinates=["x"], lagrangian=lagrangian, parameters={"k": 2.0} if "k*" in lagrangian else {}
-    )
+    system = lagrange(name, "x", lagrangian, parameters={"k": 2.0} if "k*" in lagrangian else {})
     found = sc.check_symmetry(system, direction)
     assert str(found.momentum_map) == expected
     assert sc.check_symmetry(system, direction, gauge=found.gauge).momentum_map == found.momentum_map
@@ -389,9 +350,7 @@ def test_a_gauge_that_is_not_quadratic_is_found(name):
 
 def test_undecided_symmetries_are_not_denied():
     drift = "exp(x**2)*sin(x)"
-    system = sc.LagrangianSystem.from_text(
-        name="drift", coordinates=["x"], lagrangian=f"x_dot**2/2 + {drift}*x_dot", parameters={}
-    )
+    system = lagrange("drift", "x", f"x_dot**2/2 + {drift}*x_dot")
     with pytest.raises(sc.SystemDefinitionError, match=r"a symmetry of 'drift': .* Give f as gauge"):
         sc.check_symmetry(system, ["1"])
     assert sc.check_symmetry(system, ["1"], gauge=drift).gauge != 0
@@ -582,9 +541,7 @@ def test_no_claims_for_one_forms_with_velocity_dependent_forces():
 
 def test_the_lagrangian_changes_by_the_rate_of_the_gauge():
     """Noether's condition xi . L_q + xi' . L_v = df/dt, and J = p . xi - f, from the definition."""
-    system = sc.LagrangianSystem.from_text(
-        "falling pair", ["x", "y"], "(3*x_dot**2 + 2*y_dot**2)/2 - (x - y)**2/2 - g*(3*x + 2*y)", parameters={"g": 2.0}
-    )
+    system = lagrange("falling pair", "x y", "(3*x_dot**2 + 2*y_dot**2)/2 - (x - y)**2/2 - g*(3*x + 2*y)", g=2.0)
     q, v, t = system.coordinates, system.velocities, system.time
     found = symmetries(system)
     assert any(each.gauge != 0 for each in found)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import sympy
+from notation import lagrange
 from sympy import Rational, Symbol, cos, sin
 from sympy.physics.mechanics import LagrangesMethod, Particle, Point, ReferenceFrame, dynamicsymbols
 
@@ -24,9 +25,7 @@ X, V = sympy.symbols("x x_dot")
 
 
 def from_text(coordinates: str, lagrangian: str, **parameters: float) -> LagrangianSystem:
-    return LagrangianSystem.from_text(
-        name="system", coordinates=coordinates.split(), lagrangian=lagrangian, parameters=parameters
-    )
+    return lagrange("system", coordinates.split(), lagrangian, parameters=parameters)
 
 
 def from_sympy(lagrangian: Any, *coordinates: Any, **options: Any) -> LagrangianSystem:
@@ -349,11 +348,7 @@ def test_large_coupled_mass_matrix_is_accepted() -> None:
 
 def test_rates_along_a_curve_are_those_of_its_taylor_series():
     """dL/dt and d2L/dt2 of a system with velocities in every term, compared with L along a prescribed curve of time."""
-    system = LagrangianSystem.from_text(
-        name="twisted",
-        coordinates=["x", "y"],
-        lagrangian="x_dot**2*y/2 + y_dot**2*exp(x)/2 + t*x*y_dot - x**2*y + sin(t)*x",
-    )
+    system = lagrange("twisted", "x y", "x_dot**2*y/2 + y_dot**2*exp(x)/2 + t*x*y_dot - x**2*y + sin(t)*x")
     t = system.time
     curve = dict(zip(system.coordinates, (sympy.sin(t), t**3 + 2 * t), strict=True))
     names = [*system.coordinates, *system.velocities, *(s for group in curve_rates(system, 2) for s in group)]

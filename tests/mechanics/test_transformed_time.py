@@ -4,6 +4,7 @@ from functools import cache
 
 import pytest
 import sympy
+from notation import lagrange
 
 import scvi_codegen as sc
 from scvi_codegen.errors import SystemDefinitionError
@@ -13,16 +14,9 @@ from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.mechanics.derived_expressions import sample_points
 from scvi_codegen.tables.precision import mp
 
-KEPLER = sc.LagrangianSystem.from_text(
-    name="Kepler",
-    coordinates=["x", "y"],
-    lagrangian="m*(x_dot**2 + y_dot**2)/2 + m*mu/sqrt(x**2 + y**2)",
-    parameters={"m": 0.75, "mu": 1.25},
-)
-CHARGED = sc.LagrangianSystem.from_text(
-    name="charged particle",
-    coordinates=["x", "y"],
-    lagrangian="(2*x_dot**2 + x_dot*y_dot + 3*y_dot**2)/2 + x*y_dot - y**2*x_dot - x**4 - cos(y)",
+KEPLER = lagrange("Kepler", "x y", "m*(x_dot**2 + y_dot**2)/2 + m*mu/sqrt(x**2 + y**2)", m=0.75, mu=1.25)
+CHARGED = lagrange(
+    "charged particle", "x y", "(2*x_dot**2 + x_dot*y_dot + 3*y_dot**2)/2 + x*y_dot - y**2*x_dot - x**4 - cos(y)"
 )
 THREE_BODIES = sc.LagrangianSystem.from_text(
     name="three softened bodies on a line",
@@ -126,9 +120,7 @@ def test_levi_civita_s_coordinates_make_an_oscillator() -> None:
 
 
 def test_energy_parameter_has_an_unused_name() -> None:
-    system = sc.LagrangianSystem.from_text(
-        name="beam", coordinates=["q"], lagrangian="q_dot**2/2 - E*q**4", parameters={"E": 1.0}
-    )
+    system = lagrange("beam", "q", "q_dot**2/2 - E*q**4", E=1.0)
     assert sc.reparametrise(system, "1/(1 + q**2)").clock.energy.name == "E_0"
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from notation import lagrange
 from scipy.integrate import solve_ivp
 
 import scvi_codegen as sc
@@ -66,13 +67,7 @@ def test_constraints_of_arrays_accept_any_units(metre, second, factor):
 @pytest.mark.parametrize("method", ["stoermer-verlet", "composition:8"])
 def test_velocity_dependent_forces_are_not_treated_as_kicks(method):
     """Explicit solvers refuse them, and where a step is made it is that of the motion."""
-    system = sc.LagrangianSystem.from_text(
-        name="rubbed",
-        coordinates=["x"],
-        lagrangian="m*x_dot**2/2 - k*x**2/2",
-        parameters={"m": 1.75, "k": 0.625},
-        forces={"x": "-x_dot/2"},
-    )
+    system = lagrange("rubbed", "x", "m*x_dot**2/2 - k*x**2/2", m=1.75, k=0.625, forces={"x": "-x_dot/2"})
     with pytest.raises(MethodError):
         sc.compile_stepper(system, method, solver="explicit")
     try:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import sympy
+from notation import lagrange
 from numpy.testing import assert_allclose
 from samples import QUICK_FLAGS
 
@@ -13,12 +14,8 @@ from scvi_codegen.mechanics.derived_systems import with_tangent_vectors
 
 def test_tangent_vectors_satisfy_the_variational_equations():
     """x'' = -sin x - k x y^2 + cos t, and so on: forces of changes are the Hessian times these, masses the same."""
-    system = sc.LagrangianSystem.from_text(
-        name="two",
-        coordinates=["x", "y"],
-        lagrangian="(m*x_dot**2 + y_dot**2)/2 + cos(x) - k*x**2*y**2/2",
-        parameters={"m": 2.0, "k": 0.5},
-        forces={"x": "cos(t)*y"},
+    system = lagrange(
+        "two", "x y", "(m*x_dot**2 + y_dot**2)/2 + cos(x) - k*x**2*y**2/2", m=2.0, k=0.5, forces={"x": "cos(t)*y"}
     )
     varied = with_tangent_vectors(system, 2)
     assert [q.name for q in varied.coordinates] == [
@@ -38,17 +35,13 @@ def test_tangent_vectors_satisfy_the_variational_equations():
 
 
 def test_reserved_names_are_avoided():
-    system = sc.LagrangianSystem.from_text(
-        name="taken", coordinates=["x", "x_change_1"], lagrangian="(x_dot**2 + x_change_1_dot**2)/2 - x**2*x_change_1"
-    )
+    system = lagrange("taken", "x x_change_1", "(x_dot**2 + x_change_1_dot**2)/2 - x**2*x_change_1")
     assert len({q.name for q in with_tangent_vectors(system, 2).coordinates}) == 6
 
 
 def test_variable_masses_have_no_variational_equations():
     assert with_tangent_vectors(sc.problem("double-pendulum").system, 1) is None
-    magnetic = sc.LagrangianSystem.from_text(
-        name="magnetic", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 + x*y_dot - y**2"
-    )
+    magnetic = lagrange("magnetic", "x y", "(x_dot**2 + y_dot**2)/2 + x*y_dot - y**2")
     assert with_tangent_vectors(magnetic, 1) is None
 
 
