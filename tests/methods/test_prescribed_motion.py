@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import sympy
+from notation import lagrange
 from numpy.testing import assert_allclose
 from sympy.physics.mechanics import dynamicsymbols
 
@@ -17,9 +18,7 @@ NEAR = [1.0, 0.0, 1.94, 1.5]
 
 
 def linkage(constraints: list[str] = CONSTRAINTS) -> sc.LagrangianSystem:
-    return sc.LagrangianSystem.from_text(
-        "driven linkage", ["x1", "y1", "x2", "y2"], LAGRANGIAN, parameters=NUMBERS, constraints=constraints
-    )
+    return lagrange("driven linkage", "x1 y1 x2 y2", LAGRANGIAN, parameters=NUMBERS, constraints=constraints)
 
 
 def inverse_dynamics(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -75,9 +74,7 @@ def test_the_same_system_from_sympy_and_from_files(tmp_path):
     symbolic = sc.LagrangianSystem.from_sympy(
         name="crank", lagrangian=lagrangian, coordinates=[x, y], constraints=[x - sympy.cos(t), y - sympy.sin(t)]
     )
-    text = sc.LagrangianSystem.from_text(
-        "crank", ["x", "y"], "(x_dot**2 + y_dot**2)/2", constraints=["x = cos(t)", "y = sin(t)"]
-    )
+    text = lagrange("crank", "x y", "(x_dot**2 + y_dot**2)/2", constraints=["x = cos(t)", "y = sin(t)"])
     assert symbolic == text
     model = sc.Model(system=text, method="svi:2", q=[1.0, 0.0], velocity=[0.0, 1.0], h=0.1, span=1.0)
     sc.save_model(model, tmp_path / "crank.toml")
@@ -87,9 +84,7 @@ def test_the_same_system_from_sympy_and_from_files(tmp_path):
 
 def test_prescribed_velocities():
     lagrangian = "J*a_dot**2/2 + m*x_dot**2/2"
-    cart = sc.LagrangianSystem.from_text(
-        "cart", ["a", "x"], lagrangian, parameters={"J": 1, "m": 2}, constraints=["x_dot = t", "a = x"]
-    )
+    cart = lagrange("cart", "a x", lagrangian, J=1, m=2, constraints=["x_dot = t", "a = x"])
     run = sc.compile_stepper(cart, "svi:2").integrate([0, 0], velocity=[0, 0], h=0.1, steps=10)
     assert_allclose(run.q[-1], [0.5, 0.5], rtol=0, atol=1e-14)
     assert_allclose(run.multipliers(), [[3.0, 1.0]] * 11, rtol=0, atol=1e-12)
@@ -97,9 +92,7 @@ def test_prescribed_velocities():
 
 @pytest.mark.sampled(1)
 def test_certificate_and_tangents():
-    system = sc.LagrangianSystem.from_text(
-        "crank", ["x", "y"], "(x_dot**2 + y_dot**2)/2", constraints=["x = cos(t)", "y = sin(t)"]
-    )
+    system = lagrange("crank", "x y", "(x_dot**2 + y_dot**2)/2", constraints=["x = cos(t)", "y = sin(t)"])
     certificate = sc.verify(system, "svi:2", [1.0, 0.0], [0.0, 1.0], h=0.1)
     assert certificate.passed, str(certificate)
     assert "symplecticity" not in {check.name for check in certificate.checks}

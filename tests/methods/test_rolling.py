@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import sympy
+from notation import lagrange
 from numpy.testing import assert_allclose
 from samples import sleigh
 from scipy.integrate import solve_ivp
@@ -138,12 +139,7 @@ def test_holonomic_and_moving_nonholonomic_constraints_combine():
 
 def test_a_blade_of_prescribed_direction_does_no_work():
     """Constraint forces do work only if the rates of constraints at rest are not 0, also where they contain time."""
-    system = sc.LagrangianSystem.from_text(
-        name="blade",
-        coordinates=["x", "y"],
-        lagrangian="(x_dot**2 + y_dot**2)/2 - y",
-        constraints=["x_dot*sin(t) = y_dot*cos(t)"],
-    )
+    system = lagrange("blade", "x y", "(x_dot**2 + y_dot**2)/2 - y", constraints=["x_dot*sin(t) = y_dot*cos(t)"])
     assert not system.changes_energy
     run = sc.compile_stepper(system, lobatto(4)).integrate([0.0, 0.0], velocity=[1.0, 0.0], h=0.05, steps=60)
     assert np.abs(run.energy() - 0.5).max() < 1e-12 < 0.1 < np.ptp(run.velocity[:, 0])
@@ -169,12 +165,7 @@ def test_invalid_nonholonomic_constraints_are_rejected():
     with pytest.raises(sc.SystemDefinitionError, match="not linear in the velocity x_dot"):
         sc.LagrangianSystem.from_text(**skate, constraints=["x_dot**2 = y"])
     with pytest.raises(sc.SystemDefinitionError, match="is redundant"):
-        sc.LagrangianSystem.from_text(
-            name="s",
-            coordinates=["x", "y", "z"],
-            lagrangian="x_dot**2 + y_dot**2 + z_dot**2",
-            constraints=["x_dot = y*z_dot", "2*x_dot = 2*y*z_dot"],
-        )
+        lagrange("s", "x y z", "x_dot**2 + y_dot**2 + z_dot**2", constraints=["x_dot = y*z_dot", "2*x_dot = 2*y*z_dot"])
     with pytest.raises(sc.MethodError, match="does not support the constraints"):
         sc.compile_stepper(sleigh(), sc.SVI(3))
     with pytest.raises(sc.MethodError, match="not polynomials"):

@@ -2,21 +2,17 @@
 
 import numpy as np
 import pytest
+from notation import hamilton, lagrange
 from samples import QUICK_FLAGS
 
-from scvi_codegen import HamiltonianSystem, LagrangianSystem, MethodError, StepFailedError, compile_stepper, problem
+from scvi_codegen import HamiltonianSystem, MethodError, StepFailedError, compile_stepper, problem
 from scvi_codegen.methods import SVI, Composition, StoermerVerlet, method_from_specification
 
 DRIFTS_FIRST = "drift-kick-drift"
-RELATIVISTIC = HamiltonianSystem.from_text(
-    name="relativistic oscillator",
-    coordinates=["x", "y"],
-    hamiltonian="sqrt(1 + p_x**2 + p_y**2) + k*(x**2 + 2*y**2)/2 + x*y**2/3 - x*cos(t)/5",
-    parameters={"k": 1.5},
+RELATIVISTIC = hamilton(
+    "relativistic oscillator", "x y", "sqrt(1 + p_x**2 + p_y**2) + k*(x**2 + 2*y**2)/2 + x*y**2/3 - x*cos(t)/5", k=1.5
 )
-DUFFING = LagrangianSystem.from_text(
-    name="driven", coordinates=["x"], lagrangian="m*x_dot**2/2 - x**4/4 + x*cos(t)", parameters={"m": 2.0}
-)
+DUFFING = lagrange("driven", "x", "m*x_dot**2/2 - x**4/4 + x*cos(t)", m=2.0)
 
 
 def compiled(system, method, solver="auto"):
@@ -91,12 +87,7 @@ def test_the_map_is_symplectic_and_symmetric():
 
 def test_logarithmic_hamiltonian_preserves_the_ellipse():
     """Mikkola & Tanikawa, Preto & Tremaine: second order in time, while the orbit is exact."""
-    system = HamiltonianSystem.from_text(
-        name="logarithmic",
-        coordinates=["x", "y", "s"],
-        momenta=["u", "v", "b"],
-        hamiltonian="log((u**2 + v**2)/2 + b) + log(x**2 + y**2)/2",
-    )
+    system = hamilton("logarithmic", "x y s", "log((u**2 + v**2)/2 + b) + log(x**2 + y**2)/2", momenta="u v b")
     e = 0.999
     q, p = np.array([1 + e, 0.0, 0.0]), np.array([0.0, np.sqrt((1 - e) / (1 + e)), 0.5])
     run = compiled(system, StoermerVerlet(DRIFTS_FIRST)).integrate(q, p, h=0.1, steps=2000)
