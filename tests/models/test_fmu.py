@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from fmu import DISCARD, ERROR, OK, Fmu, Slave
+from notation import lagrange
 from numpy.testing import assert_allclose
 from style import check_style
 
@@ -47,9 +48,7 @@ def pushed(**given):
 
 def rod():
     """A mass on a rod, in Cartesian coordinates."""
-    system = sc.LagrangianSystem.from_text(
-        name="rod", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 = 1"]
-    )
+    system = lagrange("rod", "x y", "(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 = 1"])
     return sc.Model(
         system=system, method=sc.SVI(2, "gauss-lobatto:3"), q=(1.0, 0.0), velocity=(0.0, 0.2), h=H, steps=10
     )
@@ -135,9 +134,7 @@ def check_event_mode(fmu, model, run):
 
 def test_impacts_within_communication_steps(tmp_path):
     """States equal those of the stepper, also from a saved state; the crossing of x = -2 ends the simulation."""
-    system = sc.LagrangianSystem.from_text(
-        name="ball", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - g*y - y**4/40", parameters={"g": 1.0}
-    )
+    system = lagrange("ball", "x y", "(x_dot**2 + y_dot**2)/2 - g*y - y**4/40", g=1.0)
     walls = (sc.impact("y", 0.8), sc.Event("x - 3", then={"p_x": "-p_x"}), sc.Event("x + 2", -1, terminal=1))
     model = sc.Model(system=system, method=sc.SVI(2), q=(0.0, 1.0), velocity=(1.0, 0.0), h=H, steps=60, events=walls)
     one = Slave(Fmu(sc.generate_fmu(model, tmp_path / "ball.fmu"), tmp_path / "unpacked"))
@@ -396,12 +393,7 @@ def test_model_with_initial_momenta_starts_with_them(tmp_path):
 
 
 def test_names_are_made_unique(tmp_path):
-    system = sc.LagrangianSystem.from_text(
-        name="names",
-        coordinates=["q"],
-        lagrangian="energy*q_dot**2/2 - p_q*q**2/2",
-        parameters={"energy": 1.0, "p_q": 2.0, "energy_": 0.0},
-    )
+    system = lagrange("names", "q", "energy*q_dot**2/2 - p_q*q**2/2", energy=1.0, p_q=2.0, energy_=0.0)
     model = sc.Model(system=system, method="svi:2", q=(1.0,), velocity=(0.0,), h=0.1, steps=1)
     names = list(Fmu(sc.generate_fmu(model, tmp_path / "names.fmu"), tmp_path / "unpacked").variables)
     assert len(set(names)) == len(names) == 8

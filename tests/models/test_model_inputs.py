@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from notation import lagrange
 from numpy.testing import assert_allclose
 
 from scvi_codegen import LagrangianSystem, Model, ModelFileError, compile_stepper, load_model, save_model
@@ -53,9 +54,7 @@ def _write(path, header):
 
 
 def test_momenta_use_the_inputs_at_the_start():
-    system = LagrangianSystem.from_text(
-        name="growing", coordinates=["q"], lagrangian="(1 + u)*q_dot**2/2", inputs=["u"]
-    )
+    system = lagrange("growing", "q", "(1 + u)*q_dot**2/2", inputs="u")
     model = Model(
         system=system, method="svi:2", q=(0.0,), velocity=(3.0,), h=0.1, span=0.5, t=1.0, inputs={"u": ([0, 2], [0, 2])}
     )
@@ -74,9 +73,7 @@ def test_momenta_use_the_inputs_at_the_start():
     ],
 )
 def test_formulas_use_the_names_of_inputs(lagrangian, tmp_path):
-    system = LagrangianSystem.from_text(
-        name="pushed", coordinates=["q"], lagrangian=lagrangian, inputs=["u", "w"], forces={"q": "-2*u"}
-    )
+    system = lagrange("pushed", "q", lagrangian, inputs="u w", forces={"q": "-2*u"})
     assert not re.search("[uw]_[0123t]", system.to_text())
     model = Model(system=system, method="svi:4", q=(0.1,), p=(0.0,), h=0.1, span=1.0, inputs={"u": (T, U, "constant")})
     save_model(model, tmp_path / "model.toml")

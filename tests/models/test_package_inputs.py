@@ -6,10 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from notation import lagrange
 from numpy.testing import assert_allclose
 from style import check_style
 
-from scvi_codegen import SVI, LagrangianSystem, Model, StoermerVerlet, compile_stepper, load_package
+from scvi_codegen import SVI, Model, StoermerVerlet, compile_stepper, load_package
 from scvi_codegen.models.packages.package import generate_package
 from scvi_codegen.runtime.events.event import Event, impact
 from scvi_codegen.runtime.inputs.segments import checked_inputs, parameters_of, prepared_segments
@@ -21,13 +22,8 @@ STRICT = "-O1 -std=c99 -Wall -Wextra -Wpedantic -Wshadow -Wconversion -Werror -f
 @pytest.fixture(scope="module")
 def model():
     """A pushed pendulum whose hook is shaken."""
-    system = LagrangianSystem.from_text(
-        name="pushed pendulum",
-        coordinates=["q"],
-        lagrangian="(1 + w)*q_dot**2/2 + cos(q)",
-        parameters={"c": 0.2},
-        forces={"q": "u - c*q_dot"},
-        inputs=["w", "u"],
+    system = lagrange(
+        "pushed pendulum", "q", "(1 + w)*q_dot**2/2 + cos(q)", c=0.2, forces={"q": "u - c*q_dot"}, inputs="w u"
     )
     inputs = {"u": (KNOTS, VALUES, "cubic"), "w": ((-1.0, 0.5, 1.41, 3.0), (0.0, 0.3, 0.1, 0.2))}
     return Model(system=system, method=SVI(4), q=(0.3,), velocity=(0.5,), h=0.03, span=2.3, inputs=inputs)
