@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from notation import lagrange
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
@@ -68,9 +69,7 @@ def refused(act: Callable[[], Any]) -> sc.ScviCodegenError | None:
 
 @cache
 def system() -> sc.LagrangianSystem:
-    return sc.LagrangianSystem.from_text(
-        name="swing", coordinates=["q"], lagrangian="q_dot**2/2 - w*q**2/2 + u*q", parameters={"w": 1.0}, inputs=["u"]
-    )
+    return lagrange("swing", "q", "q_dot**2/2 - w*q**2/2 + u*q", w=1.0, inputs="u")
 
 
 @cache
@@ -130,9 +129,7 @@ CALLS: dict[str, Callable[[Any], Any]] = {
     "array restore": lambda x: arrays().from_checkpoint(x),
     "coordinates": lambda x: sc.LagrangianSystem.from_text(name="a", coordinates=x, lagrangian="q_dot**2"),
     "lagrangian": lambda x: sc.LagrangianSystem.from_text(name="a", coordinates=["q"], lagrangian=x),
-    "defaults": lambda x: sc.LagrangianSystem.from_text(
-        name="a", coordinates=["q"], lagrangian="q_dot**2", parameters=x
-    ),
+    "defaults": lambda x: lagrange("a", "q", "q_dot**2", parameters=x),
     "forces": lambda x: sc.LagrangianSystem.from_text(name="a", coordinates=["q"], lagrangian="q_dot**2", forces=x),
     "method": lambda x: sc.compile_stepper(system(), x, flags=QUICK_FLAGS),
     "load_run": sc.load_run,

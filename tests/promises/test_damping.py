@@ -9,6 +9,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 import sympy
+from notation import hamilton, lagrange
 from samples import QUICK_FLAGS
 from scipy.integrate import solve_ivp
 
@@ -48,9 +49,7 @@ def damped(lagrangian=L, **extra):
 )
 def test_a_step_is_that_of_the_scaled_lagrangian(method, solver):
     """At any time: exp(gamma t) of the start is a unit of action."""
-    scaled = sc.LagrangianSystem.from_text(
-        name="scaled", coordinates=["x", "y"], lagrangian=f"exp(c*m*t)*({L})", parameters={"c": 0.4, "m": 0.9}
-    )
+    scaled = lagrange("scaled", "x y", f"exp(c*m*t)*({L})", c=0.4, m=0.9)
     own = sc.compile_stepper(damped(), method, solver=solver, flags=QUICK_FLAGS)
     other = sc.compile_stepper(scaled, method, solver=solver, flags=QUICK_FLAGS)
     for t, h in ((0.0, 0.1), (7.0, -0.07)):
@@ -65,13 +64,7 @@ def test_a_step_is_that_of_the_scaled_lagrangian(method, solver):
     "method", [sc.SVI(1), sc.SVI(3), sc.Gauss(2), sc.StoermerVerlet()], ids=lambda method: method.name
 )
 def test_linear_steps_contract_area_exactly(method):
-    system = sc.LagrangianSystem.from_text(
-        name="damped oscillator",
-        coordinates=["q"],
-        lagrangian="q_dot**2/2 - k*q**2/2",
-        parameters={"c": 0.3, "k": 2.0},
-        damping="c",
-    )
+    system = lagrange("damped oscillator", "q", "q_dot**2/2 - k*q**2/2", c=0.3, k=2.0, damping="c")
     stepper = sc.compile_stepper(system, method)
     for t in (0.0, 1e6):
         columns = [np.concatenate(stepper.step([q], [p], 0.2, t)) for q, p in ((1.0, 0.0), (0.0, 1.0))]
@@ -125,12 +118,8 @@ def test_order_is_that_without_damping(method, order, counts):
 
 def test_momentum_maps_decay_exactly_and_work_is_reported():
     """The angular momentum of a body about a centre; damping takes energy to the order of the method."""
-    system = sc.LagrangianSystem.from_text(
-        name="slowed body",
-        coordinates=["x", "y"],
-        lagrangian="m*(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2)",
-        parameters={"m": 2.0, "c": 0.2},
-        damping="c",
+    system = lagrange(
+        "slowed body", "x y", "m*(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2)", m=2.0, c=0.2, damping="c"
     )
     assert system.changes_energy
     stepper = sc.compile_stepper(system, sc.SVI(3))
@@ -149,14 +138,8 @@ def test_momentum_maps_decay_exactly_and_work_is_reported():
 
 def test_damping_with_adaptive_steps_ensembles_and_hamiltonians():
     """Lanes with different rates; H, its Lagrangian, additional forces; constrained systems."""
-    hamiltonian = sc.HamiltonianSystem.from_text(
-        name="damped from H",
-        coordinates=["x"],
-        momenta=["p"],
-        hamiltonian="p**2/(2*m) - cos(x)",
-        parameters={"m": 1.5, "c": 0.3},
-        forces={"x": "cos(t)/2"},
-        damping="c",
+    hamiltonian = hamilton(
+        "damped from H", "x", "p**2/(2*m) - cos(x)", momenta="p", m=1.5, c=0.3, forces={"x": "cos(t)/2"}, damping="c"
     )
 
     def pendulum(t, z, rate):
@@ -177,17 +160,10 @@ def test_damping_with_adaptive_steps_ensembles_and_hamiltonians():
 
 
 def test_constrained_motion_is_that_of_the_angle():
-    rod = sc.LagrangianSystem.from_text(
-        name="damped rod",
-        coordinates=["x", "y"],
-        lagrangian="(x_dot**2 + y_dot**2)/2 - y",
-        parameters={"c": 0.5},
-        damping="c",
-        constraints=["x**2 + y**2 = 1"],
+    rod = lagrange(
+        "damped rod", "x y", "(x_dot**2 + y_dot**2)/2 - y", c=0.5, damping="c", constraints=["x**2 + y**2 = 1"]
     )
-    angle = sc.LagrangianSystem.from_text(
-        name="damped angle", coordinates=["a"], lagrangian="a_dot**2/2 + cos(a)", parameters={"c": 0.5}, damping="c"
-    )
+    angle = lagrange("damped angle", "a", "a_dot**2/2 + cos(a)", c=0.5, damping="c")
     exact = sc.compile_stepper(angle, "svi:8").integrate([1.0], [0.0], h=0.1, steps=20).q[-1, 0]
     stepper, errors = sc.compile_stepper(rod, sc.SVI(2, "gauss-lobatto:3"), flags=QUICK_FLAGS), []
     for steps in (20, 40):
@@ -257,6 +233,4 @@ def test_unsupported_systems_reject_damping():
             )
     for rate, symbol in (("c*x", "x"), ("c*t", "t"), ("c + y_dot", "y_dot")):
         with pytest.raises(sc.SystemDefinitionError, match=rf"depends on '{symbol}'.*as forces"):
-            sc.LagrangianSystem.from_text(
-                name="varied", coordinates=["x", "y"], lagrangian=L, parameters={"c": 1.0}, damping=rate
-            )
+            lagrange("varied", "x y", L, c=1.0, damping=rate)

@@ -8,9 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from notation import lagrange
 
 import scvi_codegen
-from scvi_codegen import SVI, LagrangianSystem, MethodError
+from scvi_codegen import SVI, MethodError
 from scvi_codegen.lowering.stage_groups import layout_of
 from scvi_codegen.methods.discretise import discretise
 
@@ -290,12 +291,7 @@ for observe in ("variance", Variance()):
 
 def test_two_block_sizes_need_blocks_and_rows_of_each() -> None:
     """Multipliers are blocks of as many components as there are constraints."""
-    rod = LagrangianSystem.from_text(
-        name="mass on a rod",
-        coordinates=["x", "y"],
-        lagrangian="(x_dot**2 + y_dot**2)/2 - y",
-        constraints=["x**2 + y**2 = 1"],
-    )
+    rod = lagrange("mass on a rod", "x y", "(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 = 1"])
     stages = discretise(rod, SVI(2, "gauss-lobatto:3"))
     assert layout_of(stages, 2) is not None
     with pytest.raises(MethodError, match="3 blocks and 2 rows of 1"):

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from notation import lagrange
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
@@ -136,12 +137,7 @@ def test_target_time_of_a_run_may_be_changed_and_is_pickled() -> None:
 
 @cache
 def driven() -> Stepper:
-    system = sc.LagrangianSystem.from_text(
-        name="cart with two forces",
-        coordinates=["x"],
-        lagrangian="x_dot**2/2 - x**2/2 + u*x + w*x**2",
-        inputs=["u", "w"],
-    )
+    system = lagrange("cart with two forces", "x", "x_dot**2/2 - x**2/2 + u*x + w*x**2", inputs="u w")
     return compile_stepper(system, "svi:2", flags=QUICK_FLAGS)
 
 

@@ -1,12 +1,11 @@
 """Warnings name the line of the user's that they are about."""
 
 import pytest
+from notation import lagrange
 
 import scvi_codegen as sc
 
-ROD = sc.LagrangianSystem.from_text(
-    name="rod", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 - 1"]
-)
+ROD = lagrange("rod", "x y", "(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 - 1"])
 
 
 def too_long():
@@ -48,11 +47,8 @@ def test_start_off_its_constraints_warns_with_the_violation(q, velocity, reporte
 
 
 def test_velocity_constraint_violation_is_a_rate():
-    blade = sc.LagrangianSystem.from_text(
-        name="blade",
-        coordinates=["x", "y", "a"],
-        lagrangian="(x_dot**2 + y_dot**2 + a_dot**2)/2",
-        constraints=["x_dot*sin(a) - y_dot*cos(a)"],
+    blade = lagrange(
+        "blade", "x y a", "(x_dot**2 + y_dot**2 + a_dot**2)/2", constraints=["x_dot*sin(a) - y_dot*cos(a)"]
     )
     with pytest.raises(sc.StateError, match=r"x_dot\*sin\(a\) - y_dot\*cos\(a\) is -1, not 0"):
         sc.compile_stepper(blade, "svi:2").start([0.0, 0.0, 0.0], velocity=[0.0, 1.0, 0.0], h=0.1)
