@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from notation import hamilton, lagrange
 from programs import needs
 from samples import QUICK_FLAGS, sample_named
 from style import check_style
@@ -59,18 +60,11 @@ TUNED = (sc.SVI(3), sc.Gauss(5), sc.SpectralCollocation(4), sc.SCVI(5, variation
 
 
 def bare_oscillator() -> sc.LagrangianSystem:
-    return sc.LagrangianSystem.from_text(
-        name="bare oscillator", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2", parameters={}
-    )
+    return lagrange("bare oscillator", "q", "q_dot**2/2 - q**2/2")
 
 
 def driven_hamiltonian() -> sc.HamiltonianSystem:
-    return sc.HamiltonianSystem.from_text(
-        name="driven Hamiltonian",
-        coordinates=["x", "y"],
-        hamiltonian="sqrt(1 + p_x**2 + k*p_x*p_y + p_y**2) + x*sin(t) + x**2*p_y",
-        parameters={"k": 0.3},
-    )
+    return hamilton("driven Hamiltonian", "x y", "sqrt(1 + p_x**2 + k*p_x*p_y + p_y**2) + x*sin(t) + x**2*p_y", k=0.3)
 
 
 def hyperbolic() -> sc.HamiltonianSystem:

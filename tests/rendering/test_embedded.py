@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from notation import lagrange
 from programs import needs
 from samples import sample_named, stepper_for
 
@@ -211,9 +212,7 @@ def test_models_with_numbers_beyond_single_precision_are_rejected(number):
     text = "q_dot**2/2 - {}*q**2/2"
     for system in (
         sc.LagrangianSystem.from_text(name="s", coordinates=["q"], lagrangian=text.format(number)),
-        sc.LagrangianSystem.from_text(
-            name="s", coordinates=["q"], lagrangian=text.format("k"), parameters={"k": float(number)}
-        ),
+        lagrange("s", "q", text.format("k"), k=float(number)),
     ):
         sc.generate_source(system, sc.SVI(1), embedded="double")
         with pytest.raises(sc.MethodError, match="other units"):
@@ -312,9 +311,7 @@ int main(void)
 def test_impacts_without_allocation(tmp_path):
     """The bounces of a ball by C alone, which allocates no memory, equal those of Python."""
     needs("gcc")
-    ball = sc.LagrangianSystem.from_text(
-        name="ball", coordinates=["y"], lagrangian="y_dot**2/2 - g*y", parameters={"g": 1.0}
-    )
+    ball = lagrange("ball", "y", "y_dot**2/2 - g*y", g=1.0)
     source, _ = sc.generate_source(ball, sc.SVI(2), prefix="hit", events=sc.impact("y", 0.8), embedded="double")
     assert set(source.files) == {"hit.h", "hit.c", "hit_events.h", "hit_events.c"}
     source.write(tmp_path)
