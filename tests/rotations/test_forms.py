@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import sympy
+from notation import hamilton
 from samples import QUICK_FLAGS
 from sympy.physics.mechanics import Point, ReferenceFrame, RigidBody, dynamicsymbols, inertia
 
@@ -61,12 +62,8 @@ def test_spins_and_rotations_of_a_hamiltonian_are_read_from_sympy():
         spins=["s"],
         hamiltonian=p**2 / 2 + Pi[0] ** 2 / 2 + Pi[1] ** 2 + 3 * Pi[2] ** 2 + x * R_33 + s[0] * s[2],
     )
-    by_text = sc.HamiltonianSystem.from_text(
-        "all",
-        ["x"],
-        rotations={"R": "Pi"},
-        spins=["s"],
-        hamiltonian="p_x**2/2 + Pi_1**2/2 + Pi_2**2 + 3*Pi_3**2 + x*R_33 + s_1*s_3",
+    by_text = hamilton(
+        "all", "x", "p_x**2/2 + Pi_1**2/2 + Pi_2**2 + 3*Pi_3**2 + x*R_33 + s_1*s_3", rotations={"R": "Pi"}, spins=["s"]
     )
     assert by_sympy == by_text
 
