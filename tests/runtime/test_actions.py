@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from notation import lagrange
 
 import scvi_codegen as sc
 from scvi_codegen.errors import MethodError, StateError
@@ -97,13 +98,9 @@ def test_action_summed_by_the_run_is_that_of_its_steps(arguments, method, steps)
 
 
 def test_action_is_summed_for_hamiltonians_rotations_and_arrays():
-    top = sc.LagrangianSystem.from_text(
-        "top", [], "(omega_1**2 + 2*omega_2**2 + 3*omega_3**2)/2 - R_33", rotations={"R": "omega"}
-    )
+    top = lagrange("top", [], "(omega_1**2 + 2*omega_2**2 + 3*omega_3**2)/2 - R_33", rotations={"R": "omega"})
     oscillator = sc.HamiltonianSystem.from_text("oscillator", ["x"], "p_x**2/2 + p_x**4/8 + x**2/2 + x*p_x/5")
-    chain = sc.LagrangianSystem.from_text(
-        "chain", ["u[N]"], "sum(i in N, u_dot[i]**2/2 - u[i]**4/4) - sum(i in 0..N-2, (u[i+1] - u[i])**2/2)"
-    )
+    chain = lagrange("chain", "u[N]", "sum(i in N, u_dot[i]**2/2 - u[i]**4/4) - sum(i in 0..N-2, (u[i+1] - u[i])**2/2)")
     for system, q, start in (
         (top, {"R": [1, 0, 0, 0]}, {"velocity": {"omega": [0.1, 0.2, 2]}}),
         (oscillator, [1.0], {"p": [0.2]}),
@@ -117,18 +114,14 @@ def test_action_is_summed_for_hamiltonians_rotations_and_arrays():
 
 @pytest.mark.second
 def test_actions_of_constraints_forces_damping_and_ensembles(stepper):
-    rod = sc.LagrangianSystem.from_text(
-        "rod", ["x", "y"], "(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 - 1"]
-    )
+    rod = lagrange("rod", "x y", "(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 - 1"])
     angle = sc.LagrangianSystem.from_text("angle", ["a"], "a_dot**2/2 - sin(a)")
     both = [
         sc.compile_stepper(system, "svi:4").integrate(q, np.zeros(len(q)), h=0.05, steps=40).action()
         for system, q in ((rod, [1.0, 0.0]), (angle, [0.0]))
     ]
     assert abs(both[0] - both[1]) < 1e-11
-    drag = sc.LagrangianSystem.from_text(
-        "drag", ["x"], "x_dot**2/2 - x**2/2", forces={"x": "-c*x_dot"}, parameters={"c": 0.1}
-    )
+    drag = lagrange("drag", "x", "x_dot**2/2 - x**2/2", forces={"x": "-c*x_dot"}, c=0.1)
     damped = sc.LagrangianSystem.from_text("damped", ["x"], "x_dot**2/2 - x**2/2", damping="1/10")
     t, w = 2.0, np.sqrt(1 - 0.05**2)
     s = np.linspace(0, t, 20001)  # x = exp(-t/20) (cos w t + sin w t / (20 w)), without work of the drag

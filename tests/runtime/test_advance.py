@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from notation import lagrange
 
 import scvi_codegen as sc
 from scvi_codegen.runtime.run import memory
@@ -9,14 +10,7 @@ from scvi_codegen.runtime.run.step_plan import StepPlan
 
 pytestmark = pytest.mark.usefixtures("as_users_compile")
 
-PUSHED = sc.LagrangianSystem.from_text(
-    name="pushed pendulum",
-    coordinates=["q"],
-    lagrangian="q_dot**2/2 + k*cos(q)",
-    parameters={"k": 1.0},
-    forces={"q": "u"},
-    inputs=["u"],
-)
+PUSHED = lagrange("pushed pendulum", "q", "q_dot**2/2 + k*cos(q)", k=1.0, forces={"q": "u"}, inputs="u")
 
 
 @pytest.fixture(scope="module")

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from notation import hamilton, lagrange
 
 import scvi_codegen as sc
 
@@ -15,9 +16,7 @@ def random(*shape: int) -> Any:
     return np.random.default_rng(7).normal(size=shape)
 
 
-RING = sc.LagrangianSystem.from_text(
-    "case", ["q[N]"], f"{KINETIC} - sum(i in N periodic, (q[i+1] - q[i])**4/4 + q[i-1]*q[i+2])"
-)
+RING = lagrange("case", "q[N]", f"{KINETIC} - sum(i in N periodic, (q[i+1] - q[i])**4/4 + q[i-1]*q[i+2])")
 BODIES = sc.LagrangianSystem.from_text(
     "case",
     ["r[N, 2]"],
@@ -37,10 +36,7 @@ FIELD = sc.LagrangianSystem.from_text(
 def test_one_library_is_used_for_every_size(count: int) -> None:
     """A ring of coupled oscillators against its normal modes; momentum to round-off."""
     stepper = sc.compile_stepper(
-        sc.LagrangianSystem.from_text(
-            name="ring", coordinates=["q[N]"], lagrangian=f"{KINETIC} - sum(i in N periodic, (q[i+1] - q[i])**2/2)"
-        ),
-        "svi:6",
+        lagrange("ring", "q[N]", f"{KINETIC} - sum(i in N periodic, (q[i+1] - q[i])**2/2)"), "svi:6"
     )
     q, velocity = random(count), random(2, count)[1]
     run = stepper.integrate(q, velocity=velocity, h=0.25, steps=40, save_every=40)
@@ -54,11 +50,7 @@ def test_one_library_is_used_for_every_size(count: int) -> None:
 
 def test_energy_does_not_drift() -> None:
     """Over 20 000 steps of a variational method; an explicit one of its order oscillates."""
-    ring = sc.LagrangianSystem.from_text(
-        name="ring",
-        coordinates=["q[N]"],
-        lagrangian=f"{KINETIC} - sum(i in N periodic, (q[i+1] - q[i])**2/2 + (q[i+1] - q[i])**4/4)",
-    )
+    ring = lagrange("ring", "q[N]", f"{KINETIC} - sum(i in N periodic, (q[i+1] - q[i])**2/2 + (q[i+1] - q[i])**4/4)")
     run = sc.compile_stepper(ring, "svi:6").integrate(random(5), h=0.05, steps=20_000, save_every=200)
     changes = run.energy() - run.energy()[0]
     assert run.energy_error() < 1e-13
@@ -110,12 +102,7 @@ def test_velocities_depend_on_masses() -> None:
 
 def test_table_with_one_column_may_be_a_list() -> None:
     """For example, fixed positions."""
-    constrained = sc.LagrangianSystem.from_text(
-        name="held",
-        coordinates=["q[N]"],
-        tables=["pins[P, 1]"],
-        lagrangian=f"{KINETIC} - sum(p in P, q[pins[p, 0]]**2/2)",
-    )
+    constrained = lagrange("held", "q[N]", f"{KINETIC} - sum(p in P, q[pins[p, 0]]**2/2)", tables=["pins[P, 1]"])
     stepper = sc.compile_stepper(constrained, "svi:4")
     runs = [stepper.integrate(random(4), h=0.1, steps=5, tables={"pins": pins}) for pins in ([1, 3], [[1], [3]])]
     assert np.array_equal(runs[0].q["q"], runs[1].q["q"])
@@ -180,9 +167,7 @@ def test_failures_of_array_runs() -> None:
     with pytest.raises(sc.StepFailedError, match="Use a smaller h") as caught:
         sc.compile_stepper(RING, "svi:4").integrate(random(5), h=1.5, steps=3)
     assert len(caught.value.trajectory.t) == 1
-    bare = sc.LagrangianSystem.from_text(
-        name="bare", coordinates=["q[N]"], lagrangian="sum(i in 0..N-2, q_dot[i]**2/2) - sum(i in N, q[i]**2)"
-    )
+    bare = lagrange("bare", "q[N]", "sum(i in 0..N-2, q_dot[i]**2/2) - sum(i in N, q[i]**2)")
     with pytest.raises(sc.StateError, match="coordinate 2 of 3 has no positive mass"):
         sc.compile_stepper(bare, "svi:2").start(np.ones(3), h=0.1)
     with pytest.raises(sc.MethodError, match=r"3000 coordinates are too many .* scvi-4.* is not supported for array"):
@@ -193,12 +178,7 @@ def test_failures_of_array_runs() -> None:
 
 def test_index_out_of_range_of_a_table_is_rejected() -> None:
     """A loop over another size than the table's rows, found before a row is read."""
-    system = sc.LagrangianSystem.from_text(
-        name="x",
-        coordinates=["q[N]"],
-        tables=["bonds[B, 2]"],
-        lagrangian="sum(i in N, q_dot[i]**2/2 - q[bonds[i, 0]]**2)",
-    )
+    system = lagrange("x", "q[N]", "sum(i in N, q_dot[i]**2/2 - q[bonds[i, 0]]**2)", tables=["bonds[B, 2]"])
     message = r"bonds\[i, 0\] runs from 0 to 4, but bonds\[B, 2\] has B = 1 entries"
     with pytest.raises(sc.StateError, match=message):
         sc.compile_stepper(system, "svi:2").start(np.ones(5), h=0.1, tables={"bonds": [[0, 1]]})
@@ -226,16 +206,12 @@ def test_fixed_point_converges_up_to_the_documented_step_size(form: str, method:
 
 def test_uniform_damping_has_the_exact_rate() -> None:
     """Damped oscillators of mass 2, in closed form; for a Hamiltonian it requires known sizes."""
-    system = sc.LagrangianSystem.from_text(
-        name="damped", coordinates=["q[N]"], lagrangian="sum(i in N, q_dot[i]**2 - q[i]**2)", damping=0.4
-    )
+    system = lagrange("damped", "q[N]", "sum(i in N, q_dot[i]**2 - q[i]**2)", damping=0.4)
     stepper = sc.compile_stepper(system, "svi:5")
     assert "not symplectic" in stepper.source.header
     with pytest.raises(sc.MethodError, match="does not support velocity-dependent forces"):
         sc.compile_stepper(system, "stoermer-verlet")
-    other = sc.HamiltonianSystem.from_text(
-        name="damped", coordinates=["q[N]"], hamiltonian="sum(i in N, p_q[i]**2 + q[i]**2)", damping=0.4
-    )
+    other = hamilton("damped", "q[N]", "sum(i in N, p_q[i]**2 + q[i]**2)", damping=0.4)
     start = np.array([1.0, 2.0, 3.0])
     run = sc.compile_stepper(other, "svi:5").integrate(start, h=0.2, steps=50)  # compiled with these sizes
     w = np.sqrt(4 - 0.2**2)
@@ -246,9 +222,7 @@ def test_uniform_damping_has_the_exact_rate() -> None:
 def test_error_estimate_of_a_step_from_rest_at_the_origin() -> None:
     """Where nothing but a drive moves anything, it is a part of where that leads; it is held against the coefficient
     below the highest, which is far too much for so short a step."""
-    driven = sc.LagrangianSystem.from_text(
-        name="driven", coordinates=["q[N]"], lagrangian=f"{KINETIC} - sum(i in N, q[i]**2/2)", forces={"q[0]": "cos(t)"}
-    )
+    driven = lagrange("driven", "q[N]", f"{KINETIC} - sum(i in N, q[i]**2/2)", forces={"q[0]": "cos(t)"})
     run = sc.compile_stepper(driven, "svi:4").start(np.zeros(3), h=0.2)
     run.advance(1)
     error = abs(run.q["q"][0] - 0.1 * np.sin(0.2)) / 0.02

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from notation import lagrange
 
 import scvi_codegen as sc
 
@@ -161,12 +162,7 @@ class TestInputs:
 
 def test_parameters_affect_the_first_kick_of_an_explicit_method():
     """Whose force is kept from the step before, which had another value of one of the parameters."""
-    spring = sc.LagrangianSystem.from_text(
-        name="spring",
-        coordinates=["q[N]"],
-        parameters={"k": 1, "c": 1},
-        lagrangian="sum(i in N, q_dot[i]**2/2 - k*q[i]**2/2 - c*q[i]**4/4)",
-    )
+    spring = lagrange("spring", "q[N]", "sum(i in N, q_dot[i]**2/2 - k*q[i]**2/2 - c*q[i]**4/4)", k=1, c=1)
     stepper = sc.compile_stepper(spring, "stoermer-verlet")
     for name in ("k", "c"):
         run = stepper.start([1.0, 0.5], h=0.1)
@@ -180,9 +176,7 @@ def test_parameters_affect_the_first_kick_of_an_explicit_method():
 
 def test_error_estimate_survives_a_zero_of_one_coefficient() -> None:
     """One quartic oscillator, whose highest coefficient vanishes now and then: no step changes the energy by more."""
-    system = sc.LagrangianSystem.from_text(
-        name="quartic", coordinates=["x[N]"], lagrangian="sum(i in N, x_dot[i]**2/2 - x[i]**4/4)"
-    )
+    system = lagrange("quartic", "x[N]", "sum(i in N, x_dot[i]**2/2 - x[i]**4/4)")
     stepper, worst = sc.compile_stepper(system, "svi:4"), 0.0
     for phase in np.linspace(0.0, 6.0, 12):
         run = stepper.integrate([np.cos(phase)], velocity=[np.sin(phase)], t_end=30.0, tolerance=1e-4)

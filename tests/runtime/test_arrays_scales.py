@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 from either_system import either_system
+from notation import hamilton, lagrange
 
 import scvi_codegen as sc
 
@@ -28,12 +29,8 @@ def springs(form):
     energy = "sum(i in N periodic, (q[i+1] - q[i])**2)/2 + sum(i in N, q[i]**2)/2"
     if form == "hamiltonian":
         momenta = "sum(i in N, p[i]**2)/2 + sum(i in N, q[i]*p[i])/8"
-        return sc.HamiltonianSystem.from_text(
-            name="springs", coordinates=["q[N]"], momenta=["p[N]"], hamiltonian=f"{momenta} + {energy}"
-        )
-    return sc.LagrangianSystem.from_text(
-        name="springs", coordinates=["q[N]"], lagrangian=f"sum(i in N, q_dot[i]**2)/2 - ({energy})"
-    )
+        return hamilton("springs", "q[N]", f"{momenta} + {energy}", momenta="p[N]")
+    return lagrange("springs", "q[N]", f"sum(i in N, q_dot[i]**2)/2 - ({energy})")
 
 
 @cache
@@ -82,9 +79,7 @@ def test_forces_from_rest_at_the_origin_are_scale_invariant(method, solver, forc
 
 def test_nan_momentum_fails_the_step():
     """The last kick of a leapfrog step is at a wall, which the positions just reach."""
-    wall = sc.LagrangianSystem.from_text(
-        name="wall", coordinates=["q[N]"], lagrangian="sum(i in N, q_dot[i]**2)/2 - sum(i in N, 1/(q[i] - 1))"
-    )
+    wall = lagrange("wall", "q[N]", "sum(i in N, q_dot[i]**2)/2 - sum(i in N, 1/(q[i] - 1))")
     run = sc.compile_stepper(wall, "stoermer-verlet").start([0.0], [0.5], h=1.0)
     with pytest.raises(sc.StepFailedError, match="finite"):
         run.advance(1)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from counting import TooMuchWorkError, at_most
+from notation import lagrange
 from scipy.spatial.transform import Rotation
 
 import scvi_codegen as sc
@@ -26,12 +27,8 @@ TOP = sc.LagrangianSystem.from_text(
 def stepper(name: str) -> sc.Stepper:
     """Return an integrator of each kind of run: iterated, constrained, of arrays, of rotations."""
     if name == "rod":
-        system = sc.LagrangianSystem.from_text(
-            name="rod",
-            coordinates=["x", "y"],
-            lagrangian="m*(x_dot**2 + y_dot**2)/2 - g*y",
-            parameters={"m": 1.0, "g": 9.81},
-            constraints=["x**2 + y**2 = 1"],
+        system = lagrange(
+            "rod", "x y", "m*(x_dot**2 + y_dot**2)/2 - g*y", m=1.0, g=9.81, constraints=["x**2 + y**2 = 1"]
         )
         return sc.compile_stepper(system, "svi:4")
     if name == "chain":
@@ -125,9 +122,7 @@ def test_failures_leave_the_states_before_them() -> None:
 
 
 def test_a_step_that_requests_newtons_method_is_repeated_with_it() -> None:
-    system = sc.LagrangianSystem.from_text(
-        name="stiff", coordinates=["x"], lagrangian="x_dot**2/2 - k*x**2/2", parameters={"k": 1.0}
-    )
+    system = lagrange("stiff", "x", "x_dot**2/2 - k*x**2/2", k=1.0)
     one, k = sc.compile_stepper(system, sc.SVI(3)), np.array([1.0, 1e5, 2.0])
     end = 0.2
     work = Ensemble(one, np.ones((3, 1)), np.zeros((3, 1)), t_end=end, tolerance=1e-3, parameters={"k": k})

@@ -5,6 +5,7 @@ import warnings
 
 import numpy as np
 import pytest
+from notation import hamilton, lagrange
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import solve_ivp
 
@@ -43,9 +44,7 @@ def test_an_exponent_of_henon_and_heiles_is_the_published_one(galaxy):
 
 def test_a_saddle_has_the_exponents_of_its_linear_motion():
     """Exponents of x'' = a^2 x with y'' = -b^2 y are a, 0, 0, -a; by a method of high order."""
-    saddle = sc.LagrangianSystem.from_text(
-        name="saddle", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2 + 0.09*x**2 - 4*y**2)/2"
-    )
+    saddle = lagrange("saddle", "x y", "(x_dot**2 + y_dot**2 + 0.09*x**2 - 4*y**2)/2")
     run = sc.compile_stepper(saddle, sc.Gauss(4)).integrate([0.0, 0.1], [0.0, 0.0], h=0.1, steps=4000)
     assert_allclose(run.lyapunov_exponents(), [0.3, 0.0, 0.0, -0.3], rtol=0, atol=1e-2)
     deviations = run.chaos_indicators()
@@ -141,9 +140,7 @@ def test_friction_moves_the_middle_of_the_spectrum():
 
 def test_constraints_reduce_the_number_of_tangent_vectors():
     """A pendulum of rods: two changes, those of the angle."""
-    rod = sc.LagrangianSystem.from_text(
-        name="rod", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 = 1"]
-    )
+    rod = lagrange("rod", "x y", "(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 = 1"])
     run = sc.compile_stepper(rod, sc.SVI(4, "gauss-lobatto:5")).integrate([1.0, 0.0], [0.0, 0.0], h=0.1, steps=4000)
     exponents = run.lyapunov_exponents()
     assert exponents.shape == (2,)
@@ -158,9 +155,7 @@ def test_constraints_reduce_the_number_of_tangent_vectors():
 
 def test_ensembles_with_constraints_are_the_same_as_runs():
     """Trajectories that no lanes are compiled for."""
-    rod = sc.LagrangianSystem.from_text(
-        name="rod", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 = 1"]
-    )
+    rod = lagrange("rod", "x y", "(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 = 1"])
     stepper = sc.compile_stepper(rod, sc.SVI(1, "gauss-lobatto:2"))
     q, p = np.array([[1.0, 0.0], [0.0, -1.0]]), np.array([[0.0, 0.5], [0.3, 0.0]])
     found = stepper.chaos_indicators_ensemble(q, p, h=0.01, steps=40, save_every=1, count=1)
@@ -215,9 +210,7 @@ FORCED = sc.LagrangianSystem.from_text(
     forces={"x": "sin(w*t)*y", "y": "u*cos(x)"},
     inputs=["u"],
 )
-OPEN = sc.HamiltonianSystem.from_text(
-    name="open", coordinates=["x", "y"], momenta=["a", "b"], hamiltonian="a**2/2 + b**2/3 + x**2*y + x**4 + y**2"
-)
+OPEN = hamilton("open", "x y", "a**2/2 + b**2/3 + x**2*y + x**4 + y**2", momenta="a b")
 
 
 @pytest.mark.sampled(1)
@@ -296,9 +289,7 @@ def test_more_trajectories_than_one_batch_are_distinguished(galaxy):
 
 
 def test_ensembles_have_the_time_and_the_parameters_of_their_trajectories():
-    pumped = sc.LagrangianSystem.from_text(
-        "pumped", ["x"], "x_dot**2/2 - k*(1 + cos(t)/2)*x**2/2 - x**4/8", parameters={"k": 1.0}
-    )
+    pumped = lagrange("pumped", "x", "x_dot**2/2 - k*(1 + cos(t)/2)*x**2/2 - x**4/8", k=1.0)
     stepper, k, common = sc.compile_stepper(pumped, "svi:2"), [0.5, 2.0], {"h": 0.1, "steps": 20, "t": 0.7}
     q, p = np.array([[1.0], [0.5]]), np.array([[0.0], [0.3]])
     found = stepper.chaos_indicators_ensemble(q, p, count=1, save_every=1, parameters={"k": k}, **common)
@@ -352,12 +343,7 @@ def test_regular_and_chaotic_planets_agree_with_rebound():
     pairs = ("01", "02", "12")
     energy = " + ".join(f"m{i}*(x{i}_dot**2 + y{i}_dot**2)/2" for i in "012")
     pull = " + ".join(f"m{i}*m{j}/sqrt((x{i} - x{j})**2 + (y{i} - y{j})**2)" for i, j in pairs)
-    planets = sc.LagrangianSystem.from_text(
-        name="two planets",
-        coordinates=["x0", "y0", "x1", "y1", "x2", "y2"],
-        lagrangian=f"{energy} + {pull}",
-        parameters={"m0": 1.0, "m1": 1e-3, "m2": 1e-3},
-    )
+    planets = lagrange("two planets", "x0 y0 x1 y1 x2 y2", f"{energy} + {pull}", m0=1.0, m1=1e-3, m2=1e-3)
     stepper, span = sc.compile_stepper(planets, sc.SVI(3)), 600 * np.pi
     for distance, regular in ((1.3, False), (1.35, True)):
         known = rebound.Simulation()

@@ -6,6 +6,7 @@ import pickle
 import numpy as np
 import pytest
 from mpmath import mp
+from notation import hamilton, lagrange
 from scipy.special import ellipj
 
 import scvi_codegen as sc
@@ -114,9 +115,7 @@ def test_every_iterative_method_has_adaptive_steps(method, pendulums):
 
 
 def test_hamiltonian_has_adaptive_steps():
-    system = sc.HamiltonianSystem.from_text(
-        name="relativistic", coordinates=["x"], momenta=["p"], hamiltonian="sqrt(1 + p**2) + x**2/2"
-    )
+    system = hamilton("relativistic", "x", "sqrt(1 + p**2) + x**2/2", momenta="p")
     run = sc.compile_stepper(system, sc.SVI(8)).integrate([1.0], [0.5], t_end=30.0)
     assert np.ptp(run.energy()) < 1e-13
 
@@ -257,12 +256,7 @@ def test_newton_iteration_has_adaptive_steps(method):
 
 
 def test_newton_solves_stiff_systems_with_steps_of_the_slow_time_scale():
-    system = sc.LagrangianSystem.from_text(
-        name="penalty pendulum",
-        coordinates=["x", "y"],
-        lagrangian="(x_dot**2 + y_dot**2)/2 - y - k*(x**2 + y**2 - 1)**2/8",
-        parameters={"k": 1e10},
-    )
+    system = lagrange("penalty pendulum", "x y", "(x_dot**2 + y_dot**2)/2 - y - k*(x**2 + y**2 - 1)**2/8", k=1e10)
     start, rest = [math.sin(1.0), -math.cos(1.0)], [0.0, 0.0]
     stiff = sc.compile_stepper(system, sc.SVI(6), solver="newton")
     run = stiff.integrate(start, rest, t_end=2.0, tolerance=1e-9)
@@ -327,9 +321,7 @@ def test_forces_beyond_the_degree_at_the_start_are_reported():
 
 def test_a_singular_time_inside_a_run_is_resolved_or_its_error_reported():
     """The force -log((t - 1)^2): q(2) = q(0) + 4 from rest. The step across t = 1 has the error of the whole run."""
-    singular = sc.LagrangianSystem.from_text(
-        name="singular", coordinates=["q"], lagrangian="q_dot**2/2 - q*log((t - 1)**2)"
-    )
+    singular = lagrange("singular", "q", "q_dot**2/2 - q*log((t - 1)**2)")
     stepper = sc.compile_stepper(singular, sc.SVI(8))
     for tolerance in (1e-8, 1e-10, None):
         run = stepper.integrate([1.0], [0.0], t_end=2.0, tolerance=tolerance, check_growth=False)
@@ -365,9 +357,7 @@ def far_away():
     text = {"name": "oscillator", "coordinates": ["q"], "lagrangian": "q_dot**2/2 - q**2/2"}
     system = sc.LagrangianSystem.from_text(**text)
     pushed = sc.LagrangianSystem.from_text(**text, forces={"q": "u"}, inputs=["u"])
-    summed = sc.LagrangianSystem.from_text(
-        name="oscillators", coordinates=["q[N]"], lagrangian="sum(i in N, q_dot[i]**2/2 - q[i]**2/2)"
-    )
+    summed = lagrange("oscillators", "q[N]", "sum(i in N, q_dot[i]**2/2 - q[i]**2/2)")
     adaptive, reversible, clocked, driven, indexed = (
         sc.compile_stepper(system, "gauss:4"),
         sc.compile_stepper(system, "svi:3", time_transformation="1/(1 + q**2)"),
@@ -413,9 +403,7 @@ def test_runs_end_at_t_end_including_the_low_word_of_time(far_away, way, span):
 def oscillators():
     """A stepper and an indexed one, with the names that their event functions use."""
     system = sc.LagrangianSystem.from_text(name="o", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2")
-    summed = sc.LagrangianSystem.from_text(
-        name="o", coordinates=["q[N]"], lagrangian="sum(i in N, q_dot[i]**2/2 - q[i]**2/2)"
-    )
+    summed = lagrange("o", "q[N]", "sum(i in N, q_dot[i]**2/2 - q[i]**2/2)")
     return {"q": sc.compile_stepper(system, "svi:4"), "q[0]": sc.compile_stepper(summed, "svi:4")}
 
 
@@ -480,11 +468,7 @@ def test_invalid_steps_and_ends_are_rejected(oscillators, name, given, message):
 
 def test_many_iterations_limit_the_step_size():
     """At 1e-3 the error of a charge in a field that depends on z allows sizes at which the iteration diverges."""
-    system = sc.LagrangianSystem.from_text(
-        name="charge",
-        coordinates=["x", "y", "z"],
-        lagrangian="(x_dot**2 + y_dot**2 + z_dot**2)/2 + (5 + 5*z**2/2)*(x*y_dot - y*x_dot)",
-    )
+    system = lagrange("charge", "x y z", "(x_dot**2 + y_dot**2 + z_dot**2)/2 + (5 + 5*z**2/2)*(x*y_dot - y*x_dot)")
     stepper = sc.compile_stepper(system, sc.SCVI(5))
     start = {"q": [0.3, 0.0, 0.2], "velocity": [0.0, 1.0, 0.3], "t_end": 50.0}
     exact = stepper.integrate(**start)
@@ -500,9 +484,7 @@ def test_many_iterations_limit_the_step_size():
 
 def test_step_sizes_do_not_depend_on_the_origin_of_time():
     """Also of steps that are compared with two of half their size."""
-    pumped = sc.LagrangianSystem.from_text(
-        "pumped", ["x"], "x_dot**2/2 - (1 + cos(3*(t - s))/2)*x**4/4", parameters={"s": 0.0}
-    )
+    pumped = lagrange("pumped", "x", "x_dot**2/2 - (1 + cos(3*(t - s))/2)*x**4/4", s=0.0)
     stepper = sc.compile_stepper(pumped, "svi:4")
     first, shifted = (
         stepper.integrate([1.0], [0.0], t=s, t_end=s + 9.0, tolerance=1e-8, parameters={"s": s}) for s in (0.0, 64.0)

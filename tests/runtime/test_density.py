@@ -4,6 +4,7 @@ import pickle
 
 import numpy as np
 import pytest
+from notation import hamilton, lagrange
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
@@ -15,12 +16,7 @@ START = np.array([1.0 - E, 0.0]), np.array([0.0, np.sqrt((1.0 + E) / (1.0 - E))]
 PERIOD = 2.0 * np.pi
 RADIUS = "(q1**2 + q2**2)**(3/4)"
 
-DRIVEN = sc.LagrangianSystem.from_text(
-    name="driven and damped",
-    coordinates=["x"],
-    lagrangian="x_dot**2/2 - x**4/4 + x*cos(2*t)/2",
-    forces={"x": "-x_dot/10"},
-)
+DRIVEN = lagrange("driven and damped", "x", "x_dot**2/2 - x**4/4 + x*cos(2*t)/2", forces={"x": "-x_dot/10"})
 
 
 def kepler(method, time_transformation="frequency", **more):
@@ -109,13 +105,7 @@ def off_the_time_transformation(run):
 
 def test_steps_that_end_at_a_time_advance_the_density_partially():
     """At breakpoints of inputs and where a run goes to and fro; by whole ones it would go on ahead of the motion."""
-    pushed = sc.LagrangianSystem.from_text(
-        name="pushed",
-        coordinates=["x", "y"],
-        lagrangian="(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2)",
-        forces={"x": "u"},
-        inputs=["u"],
-    )
+    pushed = lagrange("pushed", "x y", "(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2)", forces={"x": "u"}, inputs="u")
     stepper = sc.compile_stepper(pushed, sc.SVI(6), time_transformation="x**2 + y**2", flags=QUICK_FLAGS)
     start = {"q": [0.4, 0.0], "velocity": [0.0, 2.0], "h": 0.1}
     for breakpoints in (2, 101, 401):
@@ -218,9 +208,7 @@ def test_too_long_steps_for_the_time_transformation_are_rejected():
 
 
 def test_momenta_not_determined_by_velocities_are_supported():
-    vortices = sc.HamiltonianSystem.from_text(
-        name="q p", coordinates=["x"], momenta=["y"], hamiltonian="x**2*y**2/2 + x**2/2 + y**2/2"
-    )
+    vortices = hamilton("q p", "x", "x**2*y**2/2 + x**2/2 + y**2/2", momenta="y")
     run = sc.compile_stepper(
         vortices, sc.SVI(3), time_transformation="1/(1 + x**2 + y**2)", flags=QUICK_FLAGS
     ).integrate([1.0], [1.0], h=0.1, t_end=10.0)

@@ -4,6 +4,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from notation import hamilton, lagrange
 from numpy.testing import assert_allclose
 from samples import QUICK_FLAGS
 
@@ -216,13 +217,7 @@ def test_derivatives_at_an_end_time_agree_with_fixed_steps_of_time():
 
 def test_derivatives_of_a_rod_in_transformed_time():
     """With a constraint, compare with the transpose and with differences of steps."""
-    rod = sc.LagrangianSystem.from_text(
-        name="rod",
-        coordinates=["x", "y"],
-        lagrangian="(x_dot**2 + y_dot**2)/2 - g*y",
-        parameters={"g": 1.0},
-        constraints=["x**2 + y**2 - 1"],
-    )
+    rod = lagrange("rod", "x y", "(x_dot**2 + y_dot**2)/2 - g*y", g=1.0, constraints=["x**2 + y**2 - 1"])
     made = sc.compile_stepper(sc.reparametrise(rod, "1/(3 + y)"), sc.SVI(2, "gauss-lobatto:3"), flags=QUICK_FLAGS)
     q, p = made.project([0.6, -0.8], [0.8, 0.6])
     starts, size = Starts.chain(q, p, np.array([0.0]), np.array([0.3])), made._input_size
@@ -249,9 +244,7 @@ def test_unsupported_derivatives_in_transformed_time():
 
 
 def test_hamiltonian_linear_in_momenta_has_an_energy_surface():
-    vortex = sc.HamiltonianSystem.from_text(
-        name="turn", coordinates=["q"], momenta=["p"], hamiltonian="w*(q**2 + p**2)/2", parameters={"w": 1.5}
-    )
+    vortex = hamilton("turn", "q", "w*(q**2 + p**2)/2", momenta="p", w=1.5)
     made = sc.compile_stepper(sc.reparametrise(vortex, "1/(1 + q**2)"), sc.Gauss(2), flags=QUICK_FLAGS)
     assert_allclose(
         made._energy_gradient(np.array([0.6]), np.array([0.3]), made.defaults), [0.9, 0.45, 0.225, 0.0, 0.0, 0.0]

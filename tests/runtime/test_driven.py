@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import sympy
 from counting import at_most
+from notation import hamilton, lagrange
 from numpy.testing import assert_allclose
 from samples import pushed_pendulum
 from scipy.integrate import solve_ivp
@@ -160,9 +161,7 @@ def test_files_contain_energies_with_the_inputs_of_their_times(pendulum, tmp_pat
 
 def test_momentum_maps_with_inputs():
     """A push inside of a pair leaves its momentum alone."""
-    pair = sc.LagrangianSystem.from_text(
-        name="pair", coordinates=["x", "y"], lagrangian="x_dot**2/2 + y_dot**2 - (x - y - u)**2/2", inputs=["u"]
-    )
+    pair = lagrange("pair", "x y", "x_dot**2/2 + y_dot**2 - (x - y - u)**2/2", inputs="u")
     run = sc.compile_stepper(pair, sc.SVI(3)).integrate(
         [0.0, 1.0], velocity=[0.5, 0.1], inputs={"u": (KNOTS, VALUES)}, h=0.1, t_end=2.3
     )
@@ -198,9 +197,7 @@ def test_invalid_inputs_are_rejected(pendulum, inputs, message):
 
 def test_velocities_at_a_breakpoint_use_the_following_segment():
     """Also on the way back, in the first state of runs of all kinds."""
-    system = sc.LagrangianSystem.from_text(
-        name="drawn", coordinates=["q"], lagrangian="q_dot**2/2 + u*q_dot - q**2/2", inputs=["u"]
-    )
+    system = lagrange("drawn", "q", "q_dot**2/2 + u*q_dot - q**2/2", inputs="u")
     stepper, inputs = sc.compile_stepper(system, sc.SVI(3)), {"u": ([0.0, 1.0, 2.0], [5.0, 7.0, 7.0], "constant")}
     for t_end, u in ((0.0, 5.0), (2.0, 7.0)):
         for h in (t_end - 1.0, None):
@@ -339,14 +336,8 @@ def test_inputs_of_a_hamiltonian(pendulum):
     """Text and SymPy input, in H and in forces, equal the Lagrangian formulation."""
     data = {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], [0.0, 0.3])}
     expected = sc.compile_stepper(pendulum, sc.SVI(6)).integrate([0.3], [0.1], inputs=data, h=0.05, t_end=2.3)
-    reported = sc.HamiltonianSystem.from_text(
-        name="pushed pendulum",
-        coordinates=["q"],
-        momenta=["p"],
-        hamiltonian="p**2/2 - (1 + w)*cos(q)",
-        parameters={"c": 0.2},
-        forces={"q": "u - c*p"},
-        inputs=["u", "w"],
+    reported = hamilton(
+        "pushed pendulum", "q", "p**2/2 - (1 + w)*cos(q)", momenta="p", c=0.2, forces={"q": "u - c*p"}, inputs="u w"
     )
     q, p, c, u, w = sympy.symbols("q p c u w")
     taken = sc.HamiltonianSystem.from_sympy(

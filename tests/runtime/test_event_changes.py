@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import sympy
 from click.testing import CliRunner
+from notation import hamilton, lagrange
 
 import scvi_codegen as sc
 from scvi_codegen.cli import main
@@ -24,9 +25,7 @@ from scvi_codegen.verification.impacts import impact_checks
 from scvi_codegen.verification.system_under_test import State, SystemUnderTest
 
 FLAGS = ("-O1",)
-BALL = sc.LagrangianSystem.from_text(
-    name="ball", coordinates=["y"], lagrangian="y_dot**2/2 - g*y", parameters={"g": 1.0}
-)
+BALL = lagrange("ball", "y", "y_dot**2/2 - g*y", g=1.0)
 POINT = sc.LagrangianSystem.from_text(name="point", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2")
 FREE = sc.LagrangianSystem.from_text(name="free", coordinates=["y"], lagrangian="y_dot**2/2")
 BOUNCES = {
@@ -166,11 +165,7 @@ def test_moving_wall_accelerates_a_point():
 
 def test_energy_of_a_double_pendulum_at_a_wall():
     """The mass matrix depends on the state; impulses conserve energy to round-off, trajectories have order 16."""
-    system = sc.LagrangianSystem.from_text(
-        name="double pendulum",
-        coordinates=["a", "b"],
-        lagrangian="a_dot**2 + b_dot**2/2 + a_dot*b_dot*cos(a - b) + 2*cos(a) + cos(b)",
-    )
+    system = lagrange("double pendulum", "a b", "a_dot**2 + b_dot**2/2 + a_dot*b_dot*cos(a - b) + 2*cos(a) + cos(b)")
     stepper = sc.compile_stepper(system, "svi:8")
     wall = sc.impact("3/10 - sin(a) - sin(b)", terminal=60)
     run = stepper.integrate([-1.0, -0.5], [0.0, 0.0], h=0.2, t_end=1e4, events=wall)
@@ -184,13 +179,7 @@ def test_energy_of_a_double_pendulum_at_a_wall():
 @pytest.mark.parametrize("speed", [0.0, 0.2])
 def test_impulse_of_a_relativistic_particle_conserves_energy(speed):
     """Reversing the velocity would change the energy by 3 per cent; the frame of a moving wall exchanges lambda g_t."""
-    system = sc.HamiltonianSystem.from_text(
-        name="relativistic",
-        coordinates=["x", "y"],
-        momenta=["p", "r"],
-        hamiltonian="sqrt(1 + p**2 + 4*r**2) + p*r/(5 + 5*p**2) + y/2",
-        parameters={"b": 0.0},
-    )
+    system = hamilton("relativistic", "x y", "sqrt(1 + p**2 + 4*r**2) + p*r/(5 + 5*p**2) + y/2", momenta="p r", b=0.0)
     stepper = sc.compile_stepper(system, "svi:8", flags=FLAGS)
     wall = sc.impact("y + x/3 + x**2/5 - b*t")
     run = stepper.integrate([0.3, 1.0], [0.3, -0.2], h=0.1, t_end=12.0, events=wall, parameters={"b": speed})
@@ -307,12 +296,7 @@ def test_slow_departures_from_zeros_located_at_high_speed(ball, y0, e, h):
         assert abs(run.q[-1, 0] - (fall * e * e) ** 2 / 2) < 1e-13
 
 
-DROP = sc.LagrangianSystem.from_text(
-    name="drop",
-    coordinates=["x", "y"],
-    lagrangian="(1 + x**2/9)*(x_dot**2 + y_dot**2)/2 - g*y - x**2*y/5",
-    parameters={"g": 0.7},
-)
+DROP = lagrange("drop", "x y", "(1 + x**2/9)*(x_dot**2 + y_dot**2)/2 - g*y - x**2*y/5", g=0.7)
 FAULTS = {
     "impacts": ("lambda *= 0.5 * (1.0 + restitution);", "lambda *= 0.5000001 * (1.0 + restitution);"),
     "event surfaces": ("crossing->t = at.t;", "crossing->t = at.t; crossing->q[0] += 1e-9; at.q[0] += 1e-9;"),
@@ -470,19 +454,8 @@ def test_wall_of_a_long_chain():
     assert np.abs(ends[0][1] - ends[1][1]).max() < 1e-13
 
 
-ROD = sc.LagrangianSystem.from_text(
-    name="rod",
-    coordinates=["x", "y"],
-    lagrangian="(x_dot**2 + y_dot**2)/2 - y",
-    constraints=["(x - b*sin(t))**2 + y**2 - 1"],
-    parameters={"b": 0.0, "e": 1.0},
-)
-ANGLE = sc.LagrangianSystem.from_text(
-    name="angle",
-    coordinates=["a"],
-    lagrangian="a_dot**2/2 + b*a_dot*cos(a)*cos(t) + cos(a)",
-    parameters={"b": 0.0, "e": 1.0},
-)
+ROD = lagrange("rod", "x y", "(x_dot**2 + y_dot**2)/2 - y", constraints=["(x - b*sin(t))**2 + y**2 - 1"], b=0.0, e=1.0)
+ANGLE = lagrange("angle", "a", "a_dot**2/2 + b*a_dot*cos(a)*cos(t) + cos(a)", b=0.0, e=1.0)
 
 
 def chart(x, t):
@@ -536,9 +509,7 @@ def test_impacts_of_relativistic_pendulums_contain_the_work_of_a_moving_constrai
     options = {"coordinates": ["x", "y"], "parameters": {"b": 0.3}, "constraints": ["(x - b*sin(t))**2 + y**2 - 1"]}
     rod = sc.LagrangianSystem.from_text(name="fast", lagrangian="-sqrt(1 - x_dot**2 - y_dot**2) - y/4", **options)
     speed = "a_dot**2 + 2*b*a_dot*cos(a)*cos(t) + b**2*cos(t)**2"
-    angle = sc.LagrangianSystem.from_text(
-        name="fast_angle", coordinates=["a"], lagrangian=f"-sqrt(1 - ({speed})) + cos(a)/4", parameters={"b": 0.3}
-    )
+    angle = lagrange("fast_angle", "a", f"-sqrt(1 - ({speed})) + cos(a)/4", b=0.3)
     plan, a, w = {"h": 0.05, "t_end": 16.0}, -0.4, 0.3
     walls = sc.impact("3/10 + sin(2*t)/20 - x", 0.9), sc.impact("3/10 + sin(2*t)/20 - b*sin(t) - sin(a)", 0.9)
     start = [np.sin(a), -np.cos(a)], [0.3 + w * np.cos(a), w * np.sin(a)]
@@ -606,12 +577,7 @@ def test_impacts_of_constrained_arrays():
 
 def test_impacts_with_a_time_transformation():
     """Reversible steps through close encounters, against adaptive ones."""
-    kepler = sc.LagrangianSystem.from_text(
-        name="kepler",
-        coordinates=["x", "y"],
-        lagrangian="(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2) + 0*e",
-        parameters={"e": 0.97},
-    )
+    kepler = lagrange("kepler", "x y", "(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2) + 0*e", e=0.97)
     arguments = {"velocity": [0.0, 0.5], "t_end": 6.0, "events": sc.impact("1/10 + x - y/5", "e")}
     plain = sc.compile_stepper(kepler, "svi:6").integrate([1.0, 0.0], **arguments)
     stepper = sc.compile_stepper(kepler, "svi:6", time_transformation="sqrt(x**2 + y**2)**(3/2)")

@@ -9,6 +9,7 @@ import pytest
 import sympy
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from notation import hamilton, lagrange
 from programs import needs
 from scipy.special import ellipk
 from sympy.physics.mechanics import dynamicsymbols
@@ -108,9 +109,7 @@ def polynomials() -> sc.Stepper:
     """Functions of time whose roots are parameters, of degree 1 to 4, 8, and one with two roots near each other."""
     names = "abcdefgh"
     factors = [f"(t - {name})" for name in names]
-    system = sc.LagrangianSystem.from_text(
-        name="free particle", coordinates=["q"], lagrangian="q_dot**2/2", parameters=dict.fromkeys([*names, "s"], 1.0)
-    )
+    system = lagrange("free particle", "q", "q_dot**2/2", parameters=dict.fromkeys([*names, "s"], 1.0))
     functions = ["s*" + "*".join(factors[:degree]) for degree in (1, 2, 3, 4, 8)]
     near = "s*((t - a)**2 - b**2)*(2 + t)*(3 - t)"
     return sc.compile_stepper(system, sc.StoermerVerlet(), flags=FLAGS, events=[*functions, near])
@@ -167,9 +166,7 @@ def test_crossings_of_other_functions_are_found(function):
 
 def test_tangency_gives_two_crossings_or_none():
     """The angle just below and just above its amplitude, which lies within a step."""
-    system = sc.LagrangianSystem.from_text(
-        name="pendulum", coordinates=["q"], lagrangian="q_dot**2/2 + cos(q)", parameters={"level": 0.0}
-    )
+    system = lagrange("pendulum", "q", "q_dot**2/2 + cos(q)", level=0.0)
     stepper = sc.compile_stepper(system, sc.SVI(8), flags=FLAGS, events=["p_q", "q - level"])
     start = {"q": [0.0], "p": [1.0], "h": 0.37, "steps": 5}
     (turn, _) = stepper.integrate(**start).events
@@ -287,9 +284,7 @@ def test_events_with_explicit_time_and_parameters(compiled):
 
 
 def test_momenta_of_hamiltonians_have_user_defined_names():
-    system = sc.HamiltonianSystem.from_text(
-        name="pendulum", coordinates=["q"], momenta=["J"], hamiltonian="J**2/2 - cos(q)"
-    )
+    system = hamilton("pendulum", "q", "J**2/2 - cos(q)", momenta="J")
     run = compiled_plainly(system, sc.SVI(4)).integrate([1.0], [0.0], h=0.1, steps=100, events=["J", "q_dot", "q"])
     twin = compiled_plainly(sc.problem("planar-pendulum").system, sc.SVI(4)).with_events(["p_q", "q"])
     expected = twin.integrate([1.0], [0.0], h=0.1, steps=100).events
@@ -389,12 +384,8 @@ def test_a_stepper_may_be_compiled_with_events():
 # Runs that go on from a crossing with another velocity.
 
 
-BALL = sc.LagrangianSystem.from_text(
-    name="ball", coordinates=["y"], lagrangian="y_dot**2/2 - g*y", parameters={"g": 9.81}
-)
-BALLS = sc.LagrangianSystem.from_text(
-    name="balls", coordinates=["y[N]"], lagrangian="sum(i in N, y_dot[i]**2/2 - g*y[i])", parameters={"g": 9.81}
-)
+BALL = lagrange("ball", "y", "y_dot**2/2 - g*y", g=9.81)
+BALLS = lagrange("balls", "y[N]", "sum(i in N, y_dot[i]**2/2 - g*y[i])", g=9.81)
 DISC = sc.LagrangianSystem.from_text(name="puck", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2")
 DISCS = sc.LagrangianSystem.from_text(name="pucks", coordinates=["r[N]"], lagrangian="sum(i in N, r_dot[i]**2/2)")
 CORNERS = [(0.5, (0.5, 0.5), (1, 1)), (5.0, (0.5, 0.5), (1, 1)), (0.5, (0.25, 0.5), (0.7, 1.4))]

@@ -2,18 +2,14 @@
 
 import numpy as np
 import pytest
+from notation import lagrange
 
 import scvi_codegen as sc
 from scvi_codegen.runtime.events import detection
 from scvi_codegen.verification.certificate import Outcome
 
 FLAGS = ("-O1",)
-GAS = sc.LagrangianSystem.from_text(
-    name="gas",
-    coordinates=["r[N, 2]"],
-    lagrangian="sum(i in N, (r_dot[i, 0]**2 + r_dot[i, 1]**2)/2 + 0*d)",
-    parameters={"d": 0.25},
-)
+GAS = lagrange("gas", ["r[N, 2]"], "sum(i in N, (r_dot[i, 0]**2 + r_dot[i, 1]**2)/2 + 0*d)", d=0.25)
 CHAIN = sc.LagrangianSystem.from_text(
     name="chain",
     coordinates=["q[N]"],

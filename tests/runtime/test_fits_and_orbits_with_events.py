@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from notation import lagrange
 
 import scvi_codegen as sc
 
@@ -13,9 +14,7 @@ E = 0.8
 @pytest.fixture(scope="module")
 def table() -> sc.Stepper:
     """Ball on the table A sin t: y is the distance from it."""
-    system = sc.LagrangianSystem.from_text(
-        name="table", coordinates=["y"], lagrangian="y_dot**2/2 - (1 - A*sin(t))*y", parameters={"A": 0.8}
-    )
+    system = lagrange("table", "y", "y_dot**2/2 - (1 - A*sin(t))*y", A=0.8)
     return sc.compile_stepper(system, "svi:6", flags=FLAGS, events=sc.impact("y", E))
 
 
@@ -81,9 +80,7 @@ def test_orbits_of_billiards_have_the_multipliers_of_mirrors():
 def test_fit_of_restitution_and_wall_from_bounces():
     """Exact parameters from exact heights, and parameters within their errors from noisy ones."""
     with pytest.warns(sc.SystemDefinitionWarning, match="'e' does not occur"):
-        ball = sc.LagrangianSystem.from_text(
-            name="ball", coordinates=["y"], lagrangian="y_dot**2/2 - g*y", parameters={"g": 1.0, "e": 0.8, "w": 0.1}
-        )
+        ball = lagrange("ball", "y", "y_dot**2/2 - g*y", g=1.0, e=0.8, w=0.1)
     stepper = sc.compile_stepper(ball, "svi:2", flags=FLAGS, events=sc.impact("y - w", "e"))
     exact, t = {"g": 1.05, "e": 0.77, "w": 0.12}, np.linspace(0.05, 6.3, 40)
     heights = stepper.integrate([1.0], [0.0], h=0.1, t_end=6.4, parameters=exact, t_eval=t).q[:, 0]
@@ -101,9 +98,7 @@ def test_fit_of_restitution_and_wall_from_bounces():
 @pytest.fixture(scope="module")
 def billiard() -> sc.Stepper:
     """Point without forces in a plane."""
-    system = sc.LagrangianSystem.from_text(
-        name="billiard", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 + 0*w", parameters={"w": 0.5}
-    )
+    system = lagrange("billiard", "x y", "(x_dot**2 + y_dot**2)/2 + 0*w", w=0.5)
     return sc.compile_stepper(system, "svi:1", flags=FLAGS)
 
 

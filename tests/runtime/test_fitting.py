@@ -7,6 +7,7 @@ from itertools import product
 import numpy as np
 import pytest
 import scipy.optimize
+from notation import lagrange
 from numpy.testing import assert_allclose
 from samples import QUICK_FLAGS, linkage
 from scipy.integrate import solve_ivp
@@ -108,14 +109,7 @@ def test_several_quantities_with_gaps_and_individual_noise():
 @pytest.fixture(scope="module")
 def pushed():
     """Return the stepper of a pushed oscillator, its input, a run, and times of measurements."""
-    system = sc.LagrangianSystem.from_text(
-        name="pushed",
-        coordinates=["x"],
-        lagrangian="m*x_dot**2/2 - k*x**2/2",
-        parameters={"m": 1.5, "k": 2.0},
-        forces={"x": "u"},
-        inputs=["u"],
-    )
+    system = lagrange("pushed", "x", "m*x_dot**2/2 - k*x**2/2", m=1.5, k=2.0, forces={"x": "u"}, inputs="u")
     stepper = sc.compile_stepper(system, sc.SVI(4), flags=QUICK_FLAGS)
     push = {"u": (np.linspace(0.0, 8.0, 9), np.random.default_rng(4).normal(size=9))}
     run = stepper.integrate([0.5], [0.0], inputs=push, h=0.05, t_end=8.0)
@@ -188,9 +182,7 @@ def test_invalid_arguments_are_named(options, message):
 
 def test_biased_parameters_warn_of_too_long_steps():
     """With large second-order steps, estimates are off by twelve standard errors, which is reported."""
-    soft = sc.LagrangianSystem.from_text(
-        name="hard", coordinates=["x"], lagrangian="x_dot**2/2 - a*x**2/2 - b*x**4/4", parameters={"a": 1.0, "b": 1.0}
-    )
+    soft = lagrange("hard", "x", "x_dot**2/2 - a*x**2/2 - b*x**4/4", a=1.0, b=1.0)
     times = np.linspace(0.0, 20.0, 101)
     exact = sc.compile_stepper(soft, sc.SVI(8), flags=QUICK_FLAGS).integrate(
         [1.0], [0.0], h=0.1, steps=200, save_every=2
@@ -205,9 +197,7 @@ def test_biased_parameters_warn_of_too_long_steps():
 
 def test_initial_guess_with_failing_runs_is_accepted():
     """A soft spring: on the way to the truth a trial leaves its well and goes to infinity."""
-    soft = sc.LagrangianSystem.from_text(
-        name="soft", coordinates=["x"], lagrangian="x_dot**2/2 - a*x**2/2 + x**4/4", parameters={"a": 1.0}
-    )
+    soft = lagrange("soft", "x", "x_dot**2/2 - a*x**2/2 + x**4/4", a=1.0)
     stepper = sc.compile_stepper(soft, sc.SVI(4), flags=QUICK_FLAGS)
     run = stepper.integrate([0.9], [0.0], h=0.1, steps=100)
     found = sc.fit(stepper, run.t, run.q[:, 0], q=[0.8], p=[0.0], h=0.1, parameters={"a": 1.2})

@@ -12,6 +12,7 @@ import pytest
 from click.testing import CliRunner
 from extrapolation import Real, integrated
 from motions import MOTIONS, recorded
+from notation import lagrange
 
 import scvi_codegen as sc
 from scvi_codegen.cli import main
@@ -409,10 +410,7 @@ class TestEnsembles:
         assert runs.confirmed_digits[1] == 0
 
     def test_inputs_of_each_trajectory(self):
-        system = sc.LagrangianSystem.from_text(
-            name="pushed", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2", inputs=["u"], parameters={"c": 0.2},
-            forces={"x": "u - c*x_dot"},
-        )  # fmt: skip
+        system = lagrange("pushed", "x", "x_dot**2/2 - x**2/2", inputs="u", c=0.2, forces={"x": "u - c*x_dot"})
         stepper, t = sc.compile_stepper(system, "svi:4"), np.array([0.0, 1.0, 2.5, 6.0])
         values = np.array([[0.0, 1.0, -1.0, 0.0], [1.0, 0.0, 0.5, 2.0]])
         common = {"t_end": 6.0, "error": 1e-8}
@@ -472,12 +470,7 @@ class TestOtherRuns:
         """x'' = -x + u with u = 1 - t/2 until t = 2, then 0, from t = 0.5: exact."""
         table = (np.array([0.5, 2.0, 6.0]), np.array([0.75, 0.0, 0.0]))
         if indexed:
-            system = sc.LagrangianSystem.from_text(
-                name="i",
-                coordinates=["q[N]"],
-                lagrangian="sum(i in N, q_dot[i]**2/2 - q[i]**2/2 + u*q[i])",
-                inputs=["u"],
-            )
+            system = lagrange("i", "q[N]", "sum(i in N, q_dot[i]**2/2 - q[i]**2/2 + u*q[i])", inputs="u")
             stepper = sc.compile_stepper(system, "svi:6")
         else:
             stepper = sc.compile_stepper(made("i", ["q"], "q_dot**2/2 - q**2/2 + u*q", inputs=["u"]), "svi:6")
@@ -514,10 +507,8 @@ class TestOtherRuns:
             stepper.integrate(start, t_end=12.0, observe=lambda run: run.energy, error=1e-9)
 
     def test_chaotic_arrays_warn(self):
-        system = sc.LagrangianSystem.from_text(
-            name="pendulums",
-            coordinates=["q[N]"],
-            lagrangian="sum(i in N, q_dot[i]**2/2 + cos(q[i])) + sum(i in N - 1, cos(q[i] - q[i + 1]))",
+        system = lagrange(
+            "pendulums", "q[N]", "sum(i in N, q_dot[i]**2/2 + cos(q[i])) + sum(i in N - 1, cos(q[i] - q[i + 1]))"
         )
         stepper = sc.compile_stepper(system, "svi:8")
         for more in ({}, {"save_every": 5}):

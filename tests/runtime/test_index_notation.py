@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from golden_cells import catalogue
+from notation import hamilton, lagrange
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
@@ -48,9 +49,7 @@ def test_time_transformation_by_an_index_table():
 
 
 def test_time_transformation_by_momenta_of_a_hamiltonian():
-    system = sc.HamiltonianSystem.from_text(
-        name="H", coordinates=["q[3]"], momenta=["p[3]"], hamiltonian="sum(i in 3, p[i]**2/2 + q[i]**4/4)"
-    )
+    system = hamilton("H", "q[3]", "sum(i in 3, p[i]**2/2 + q[i]**4/4)", momenta="p[3]")
     found = sc.reparametrise(system, "1/(1 + sum(i in 3, p[i]**2))").clock.rate
     assert str(found) == "1/(p_0**2 + p_1**2 + p_2**2 + 1)"
 
@@ -123,9 +122,4 @@ def test_rotated_vectors_of_arrays(size, inverse, entries):
 )
 def test_invalid_rotated_vectors_are_named(formula, message):
     with pytest.raises(sc.ExpressionError, match=message):
-        sc.LagrangianSystem.from_text(
-            name="tops",
-            coordinates=["x"],
-            rotations={"R[N]": "omega"},
-            lagrangian=f"x_dot**2/2 + sum(i in N, omega_1[i]**2 + {formula})",
-        )
+        lagrange("tops", "x", f"x_dot**2/2 + sum(i in N, omega_1[i]**2 + {formula})", rotations={"R[N]": "omega"})

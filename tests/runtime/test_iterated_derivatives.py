@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from notation import lagrange
 from numpy.testing import assert_allclose
 from samples import fixed_point, tangle
 
@@ -74,12 +75,7 @@ def test_iterated_derivatives_equal_those_by_factorisation(name):
 
 def test_unconverged_steps_are_differentiated_by_factorisation():
     """The spring is occasionally too stiff for the fixed-point iteration."""
-    spring = sc.LagrangianSystem.from_text(
-        name="spring that stiffens",
-        coordinates=["x"],
-        lagrangian="x_dot**2/2 - (1 + k*sin(t/4)**8)*x**2/2",
-        parameters={"k": 900.0},
-    )
+    spring = lagrange("spring that stiffens", "x", "x_dot**2/2 - (1 + k*sin(t/4)**8)*x**2/2", k=900.0)
     steppers = {
         solver: sc.compile_stepper(spring, sc.SVI(2), solver=solver) for solver in ("auto", "newton", "fixed-point")
     }
@@ -95,9 +91,7 @@ def test_unconverged_steps_are_differentiated_by_factorisation():
 
 def test_steps_beyond_the_limit_of_iterations_are_differentiated_by_factorisation():
     """Six iterations are too few for the fixed-point iteration and enough for Newton's."""
-    quartic = sc.LagrangianSystem.from_text(
-        name="quartic", coordinates=["x"], lagrangian="x_dot**2/2 - k*x**4/4", parameters={"k": 0.9}
-    )
+    quartic = lagrange("quartic", "x", "x_dot**2/2 - k*x**4/4", k=0.9)
     few, found = sc.SolverOptions(max_iterations=6), []
     for solver in ("auto", "newton"):
         run = sc.compile_stepper(quartic, sc.SVI(2), solver=solver).integrate(
@@ -127,9 +121,7 @@ def test_convergence_does_not_depend_on_units_of_coordinates():
     text = "x_dot**2/2 + {a}**2*y_dot**2/2 - (x**2 + 36*{a}**2*y**2)/2 - x**2*({a}*y) + ({a}*y)**3/3"
     derivatives = []
     for unit in ("1", "1000000", "1/1000000"):
-        system = sc.LagrangianSystem.from_text(
-            name="two units", coordinates=["x", "y"], lagrangian=text.format(a=f"({unit})")
-        )
+        system = lagrange("two units", "x y", text.format(a=f"({unit})"))
         a = {"1": 1.0, "1000000": 1e6, "1/1000000": 1e-6}[unit]
         scale = np.array([1.0, a, 1.0, 1.0 / a])
         stepper = sc.compile_stepper(system, sc.SVI(4))

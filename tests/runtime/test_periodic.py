@@ -4,6 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
+from notation import lagrange
 from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
@@ -32,12 +33,11 @@ def restricted():
 
 @pytest.fixture(scope="module")
 def planar():
-    system = sc.LagrangianSystem.from_text(
-        name="planar restricted three-body problem",
-        coordinates=["x", "y"],
-        lagrangian="((x_dot - y)**2 + (y_dot + x)**2)/2 + (1 - mu)/sqrt((x + mu)**2 + y**2)"
-        " + mu/sqrt((x - 1 + mu)**2 + y**2)",
-        parameters={"mu": 0.01215},
+    system = lagrange(
+        "planar restricted three-body problem",
+        "x y",
+        "((x_dot - y)**2 + (y_dot + x)**2)/2 + (1 - mu)/sqrt((x + mu)**2 + y**2) + mu/sqrt((x - 1 + mu)**2 + y**2)",
+        mu=0.01215,
     )
     return sc.compile_stepper(system, sc.SVI(8))
 
@@ -234,13 +234,8 @@ def test_invalid_orbits_are_rejected(galaxy):
 
 def test_nonautonomous_orbits_have_a_period_of_the_system():
     """A forced oscillator closes after any time from some state, and goes elsewhere the next time round."""
-    system = sc.LagrangianSystem.from_text(
-        name="forced",
-        coordinates=["x"],
-        lagrangian="x_dot**2/2 - x**2/2",
-        parameters={"w": 1.3},
-        forces={"x": "cos(w*t)/10"},
-        dissipation="x_dot**2/20",
+    system = lagrange(
+        "forced", "x", "x_dot**2/2 - x**2/2", w=1.3, forces={"x": "cos(w*t)/10"}, dissipation="x_dot**2/20"
     )
     stepper, period = sc.compile_stepper(system, sc.SVI(3)), 2 * np.pi / 1.3
     with pytest.raises(sc.MethodError, match=r"give the period of .*, with fixed_period=True"):
@@ -262,9 +257,7 @@ def test_orbit_has_the_requested_energy():
 
 
 def test_missing_inputs_are_not_zero_and_time_transformations_not_fixed_steps():
-    pushed = sc.LagrangianSystem.from_text(
-        name="pushed", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2", forces={"x": "u"}, inputs=["u"]
-    )
+    pushed = lagrange("pushed", "x", "x_dot**2/2 - x**2/2", forces={"x": "u"}, inputs="u")
     with pytest.raises(sc.StateError, match="the input 'u' is not set"):
         sc.periodic_orbit(sc.compile_stepper(pushed, sc.SVI(2)), [1.0], [0.0], period=6.28, steps=20)
     watched = sc.compile_stepper(sc.problem("kepler").system, sc.SVI(2), time_transformation="frequency")
@@ -276,9 +269,7 @@ def test_missing_inputs_are_not_zero_and_time_transformations_not_fixed_steps():
 
 def test_names_of_a_state_are_unique():
     """A coordinate called p_x in addition to x: the momentum of x has another name."""
-    plane = sc.LagrangianSystem.from_text(
-        name="plane", coordinates=["x", "p_x"], lagrangian="(x_dot**2 + p_x_dot**2)/2 - x**2/2 - p_x**2"
-    )
+    plane = lagrange("plane", "x p_x", "(x_dot**2 + p_x_dot**2)/2 - x**2/2 - p_x**2")
     stepper = sc.compile_stepper(plane, sc.SVI(3))
     assert stepper.interface.momenta == ("_p_x", "p_p_x")
     given = [0.9, 0.0], [0.3, 0.0]

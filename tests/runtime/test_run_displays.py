@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
+from notation import lagrange
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 
-PUSHED = sc.LagrangianSystem.from_text(
-    name="pushed", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2", forces={"q": "u"}, inputs=["u"]
-)
+PUSHED = lagrange("pushed", "q", "q_dot**2/2 - q**2/2", forces={"q": "u"}, inputs="u")
 FREE = sc.LagrangianSystem.from_text(name="free", coordinates=["q"], lagrangian="q_dot**2/2 - q**4/4")
 OF_FREE = "of free, svi-2-gauss-legendre-2"
 
@@ -36,9 +35,7 @@ def test_display_of_adaptive_steps(stepper):
 
 
 def test_display_of_steps_in_tau():
-    moon = sc.LagrangianSystem.from_text(
-        name="Kepler", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2)"
-    )
+    moon = lagrange("Kepler", "x y", "(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2)")
     slow = sc.compile_stepper(sc.reparametrise(moon, "distance"), "svi:2", flags=QUICK_FLAGS)
     assert "3 steps of 0.1 in tau" in repr(slow.integrate([1.0, 0.0], [0.0, 1.1], h=0.1, steps=3))
     assert "0 steps of 0.1 in tau, solver" in repr(slow.start([1.0, 0.0], [0.0, 1.1], h=0.1))
@@ -64,13 +61,7 @@ def test_display_names_missing_inputs():
 
 
 def test_display_of_array_runs():
-    chain = sc.LagrangianSystem.from_text(
-        name="chain",
-        coordinates=["q[N]"],
-        lagrangian="sum(i in N, q_dot[i]**2/2 - q[i]**2/2)",
-        forces={"q[0]": "u"},
-        inputs=["u"],
-    )
+    chain = lagrange("chain", "q[N]", "sum(i in N, q_dot[i]**2/2 - q[i]**2/2)", forces={"q[0]": "u"}, inputs="u")
     run = sc.compile_stepper(chain, "svi:2").start(np.zeros(5), h=0.1)
     assert repr(run).startswith("<Run of chain, svi-2")
     assert "; t = 0 after 0 steps of 0.1, solver" in repr(run)

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import oracle
 import pytest
+from notation import hamilton, lagrange
 
 import scvi_codegen as sc
 from scvi_codegen.runtime.core.validation import checked_parameters
@@ -376,9 +377,7 @@ def test_momentum_velocity_and_energy_agree_with_the_oracle(sample, compiled, na
 
 def test_velocity_is_found_where_momenta_cancel(quickly_compiled):
     """p = v + 5 sin(q) in which the terms cancel, as of charges in magnetic fields."""
-    system = sc.LagrangianSystem.from_text(
-        name="driven pivot", coordinates=["q"], lagrangian="q_dot**2/2 + 5.345*sin(q)*q_dot"
-    )
+    system = lagrange("driven pivot", "q", "q_dot**2/2 + 5.345*sin(q)*q_dot")
     stepper = quickly_compiled(system, sc.SVI(2))
     q = np.linspace(0.05, 3.0, 500)[:, None]
     for p in (np.zeros_like(q), -0.0024 * q):
@@ -471,9 +470,7 @@ def test_two_point_form_gives_the_same_positions(sample, compiled, method):
     "system",
     [
         sc.LagrangianSystem.from_text(name="L", coordinates=["x"], lagrangian="x_dot**2 - x**4/4 + x*cos(t)"),
-        sc.HamiltonianSystem.from_text(
-            name="H", coordinates=["x"], momenta=["y"], hamiltonian="y**2/4 + x**4/4 - x*cos(t)"
-        ),
+        hamilton("H", "x", "y**2/4 + x**4/4 - x*cos(t)", momenta="y"),
     ],
     ids=["lagrangian", "hamiltonian"],
 )

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from notation import lagrange
 
 import scvi_codegen as sc
 from scvi_codegen.exact.solution import ExactMotion
@@ -13,12 +14,7 @@ from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.runtime.trajectory.time_transformation import part_of_step
 from scvi_codegen.tables.precision import mp
 
-KEPLER = sc.LagrangianSystem.from_text(
-    name="Kepler",
-    coordinates=["x", "y"],
-    lagrangian="(x_dot**2 + y_dot**2)/2 + mu/sqrt(x**2 + y**2)",
-    parameters={"mu": 1.0},
-)
+KEPLER = lagrange("Kepler", "x y", "(x_dot**2 + y_dot**2)/2 + mu/sqrt(x**2 + y**2)", mu=1.0)
 ECCENTRICITY = 0.9
 START: Any = [1.0 - ECCENTRICITY, 0.0], [0.0, float(np.sqrt((1 + ECCENTRICITY) / (1 - ECCENTRICITY)))]
 METHODS = {

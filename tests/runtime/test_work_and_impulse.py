@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from notation import lagrange
 
 import scvi_codegen as sc
 
@@ -11,13 +12,7 @@ DRAG = {"x": "-c*x_dot*sqrt(x_dot**2 + y_dot**2) + w*cos(3*t)", "y": "-c*y_dot*s
 @pytest.fixture(scope="module")
 def thrown():
     """A body in the plane about a centre, with drag by the square of its speed and a push that is periodic."""
-    return sc.LagrangianSystem.from_text(
-        name="thrown",
-        lagrangian="(x_dot**2 + y_dot**2)/2 + k/sqrt(x**2 + y**2)",
-        coordinates=["x", "y"],
-        parameters={"k": 1.0, "c": 0.05, "w": 0.1},
-        forces=DRAG,
-    )
+    return lagrange("thrown", "x y", "(x_dot**2 + y_dot**2)/2 + k/sqrt(x**2 + y**2)", k=1.0, c=0.05, w=0.1, forces=DRAG)
 
 
 def balance(stepper, h, span=2.0, **options):
