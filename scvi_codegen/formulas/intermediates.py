@@ -12,7 +12,7 @@ symbols and replacements of an intermediate quantity are therefore computed once
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Container, Sequence
 from itertools import count
 from typing import Any
 from weakref import WeakValueDictionary
@@ -83,10 +83,10 @@ class Intermediate(Expr):  # type: ignore[misc]  # SymPy is untyped
         if _LAST[0] != rule:
             _LAST[:] = dict(rule), {}
         replaced: dict[Intermediate, tuple[Expr, bool]] = _LAST[1]
-        for each in intermediates(self):
+        for each in intermediates(self, known=replaced):
             if each in rule:
                 replaced[each] = (rule[each], True)
-            elif each not in replaced:
+            else:
                 value, changed = each.definition._xreplace(rule)
                 replaced[each] = (intermediate(value), True) if changed else (each, False)
         return replaced[self]
@@ -196,13 +196,16 @@ def inner_of(expression: Expr) -> tuple[Intermediate, ...]:
     return tuple(quantities)
 
 
-def intermediates(*expressions: Expr) -> list[Intermediate]:
-    """Return all quantities in expressions and in their definitions, each after those that it depends on."""
+def intermediates(*expressions: Expr, known: Container[Intermediate] = ()) -> list[Intermediate]:
+    """Return all quantities in expressions and in their definitions, each after those that it depends on.
+
+    Known ones are left out, and so are those that occur in their definitions alone.
+    """
     seen: set[Intermediate] = set()
     pending = [node for each in expressions for node in inner_of(each)]
     while pending:
         node = pending.pop()
-        if node not in seen:
+        if node not in seen and node not in known:
             seen.add(node)
             pending += node.inner
     return sorted(seen, key=lambda each: each.number)
