@@ -1,7 +1,5 @@
 """Interface of step-size controllers: their C, their memory in a run, and the formulas that they evaluate."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -8,8 +8,6 @@ where b runs over the points that the cell uses. Discretisations are subclasses 
 :mod:`~scvi_codegen.fields.elements`, :mod:`~scvi_codegen.fields.differences`, :mod:`~scvi_codegen.fields.fourier`.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field

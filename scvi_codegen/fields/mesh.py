@@ -1,7 +1,5 @@
 """Mesh of a density: points, quadrature, derivatives, frequencies, resolution; and its semi-discrete system."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast

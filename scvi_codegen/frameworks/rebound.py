@@ -1,7 +1,5 @@
 """Conversion of gravitating bodies from and to REBOUND."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import combinations
 from typing import Any, NamedTuple

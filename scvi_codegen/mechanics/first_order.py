@@ -16,8 +16,6 @@ a step, have their full order, and preserve the two-form omega.
 values at random points in 60 digits.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property

@@ -5,8 +5,6 @@ the binary is cached by source, options, version of NVRTC and architecture. All 
 the package cuda-core, which requires neither nvcc nor headers (extra ``cuda``).
 """
 
-from __future__ import annotations
-
 import base64
 import re
 from collections.abc import Callable

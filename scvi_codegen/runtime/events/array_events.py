@@ -1,7 +1,5 @@
 """Events in index notation over arrays of run-time sizes: the compiled search evaluates their functions in loops."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial

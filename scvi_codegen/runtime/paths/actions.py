@@ -4,8 +4,6 @@ The discrete action S_n = sum_k L_d(q_k, q_k+1) is a sum over the quadrature poi
 from the saved states. Sums of many steps are compensated (Neumaier, ZAMM 54 (1974) 39).
 """
 
-from __future__ import annotations
-
 from math import factorial
 
 import numpy as np

@@ -5,8 +5,6 @@ below it. The negative pivots of its block LDL^T factorisation up to node k coun
 on [t_0, t_(k+1)]: the Morse index, which increases at conjugate points (Milnor, Morse Theory, sec. 15).
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

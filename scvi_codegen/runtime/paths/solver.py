@@ -4,8 +4,6 @@ A step is damped until the simplified Newton correction decreases, |H^-1 r(q + s
 Newton Methods for Nonlinear Problems, sec. 3.3), which does not depend on units of the residual.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """Public class of a run in progress."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any, Self

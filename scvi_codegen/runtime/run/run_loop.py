@@ -1,7 +1,5 @@
 """Run loop: advance in chunks of bounded duration, and save every k-th state of a run."""
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Step plan of a run: fixed step size, adaptive steps to a time, or constant steps in transformed time to a time."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """Tangent vectors along consecutive steps of prescribed sizes, through events that change the state."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

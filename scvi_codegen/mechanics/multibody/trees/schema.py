@@ -5,8 +5,6 @@ are read are those of the motion, and those of parts that are reported as missin
 actuators). Attributes that are ignored do not change the motion.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 
