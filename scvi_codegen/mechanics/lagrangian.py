@@ -382,7 +382,7 @@ class LagrangianSystem(MechanicalSystem):
     def _of_tree(
         cls, name: str, links: Any, gravity: Any, actuated: Sequence[str] | bool, constraints: Sequence[Expr] = ()
     ) -> LagrangianSystem:
-        from scvi_codegen.mechanics.multibody.trees.articulated import system_of_tree
+        from scvi_codegen.mechanics.multibody.trees.energies import system_of_tree
 
         system: LagrangianSystem = system_of_tree(cls, name, links, gravity, actuated, constraints)
         return system

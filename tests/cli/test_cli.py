@@ -525,7 +525,7 @@ def test_unwritable_package_is_a_failure(tmp_path, monkeypatch):
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr("scvi_codegen.models.packages.folders.write_text", full)
+    monkeypatch.setattr("scvi_codegen.models.packages.package.write_text", full)
     result = CliRunner().invoke(main, ["generate", "kepler", "-o", str(tmp_path / "kepler_svi")])
     assert result.exit_code == 1
     assert "cannot be written: No space left" in result.output

@@ -14,7 +14,7 @@ from scvi_codegen.formulas.expressions import Tape, gradient
 from scvi_codegen.formulas.intermediates import intermediate, intermediates, separated, written_out
 from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.mechanics.derived_expressions import forms_of
-from scvi_codegen.mechanics.multibody.trees import articulated
+from scvi_codegen.mechanics.multibody.trees import energies
 from scvi_codegen.tables.precision import mp
 
 ROBOTS = Path(__file__).parent / "robots"
@@ -25,7 +25,7 @@ FOLLOWING = '<mimic joint="shoulder" multiplier="-0.5" offset="0.2"/>'
 @pytest.fixture
 def always(monkeypatch):
     """Recursion for trees of any size."""
-    monkeypatch.setattr(articulated, "SMALLEST", 1)
+    monkeypatch.setattr(energies, "SMALLEST", 1)
 
 
 def chain(folder: Path, n: int) -> sc.LagrangianSystem:
@@ -85,9 +85,9 @@ def test_dual_energy_is_unknown_where_joints_follow_others_and_not_used_for_anot
 
 
 def test_small_trees_factorise_their_mass_matrices(tmp_path):
-    assert chain(tmp_path, articulated.SMALLEST - 2).dual_energy == 0
-    large = chain(tmp_path, articulated.SMALLEST - 1)  # and the branch
-    assert large.dimension == articulated.SMALLEST
+    assert chain(tmp_path, energies.SMALLEST - 2).dual_energy == 0
+    large = chain(tmp_path, energies.SMALLEST - 1)  # and the branch
+    assert large.dimension == energies.SMALLEST
     assert forms_of(large).inverse_mass is not None
 
 

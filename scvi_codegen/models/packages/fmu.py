@@ -28,8 +28,7 @@ from scvi_codegen.formulas.symbols import DOT, PARTS, TIME
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.model_file import model_texts
 from scvi_codegen.models.packages.example import example_of
-from scvi_codegen.models.packages.folders import prefix_of
-from scvi_codegen.models.packages.package import MODEL
+from scvi_codegen.models.packages.package import MODEL, prefix_of
 from scvi_codegen.native.building import PORTABLE_FLAGS, TARGETS, library_for, load
 from scvi_codegen.pipeline import generate_source
 from scvi_codegen.rendering.program_source import ExampleRun, with_fmu

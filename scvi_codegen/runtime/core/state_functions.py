@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import REASONS
-from scvi_codegen.runtime.arrays.any_size import constraint_shapes
+from scvi_codegen.runtime.arrays.interface import constraint_shapes
 from scvi_codegen.runtime.core.compiled_method import CompiledMethod
 from scvi_codegen.runtime.core.validation import (
     Array,

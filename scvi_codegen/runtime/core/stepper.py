@@ -22,8 +22,7 @@ from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.calls import with_calls
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Source
-from scvi_codegen.runtime.arrays.any_size import interface_of_sizes, shapes_of_call, sizes_of_run
-from scvi_codegen.runtime.arrays.interface import RunSizes
+from scvi_codegen.runtime.arrays.interface import RunSizes, interface_of_sizes, shapes_of_call, sizes_of_run
 from scvi_codegen.runtime.chaos.ensemble import ChaosIndicatorsEnsemble
 from scvi_codegen.runtime.chaos.indicators import ChaosIndicators
 from scvi_codegen.runtime.constraints.projection import consistent, constraint_values, multipliers, projected
