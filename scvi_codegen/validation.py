@@ -4,6 +4,8 @@ Types of arguments are checked when the function is called; numbers and arrays, 
 they are converted (:func:`checked_count`, :mod:`scvi_codegen.native.options`).
 """
 
+from __future__ import annotations
+
 import functools
 import math
 import numbers

@@ -7,6 +7,8 @@ discrete Legendre transforms and the exact flow. The solution is computed by :mo
 successively finer grids, until two in a row agree to the requested digits.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -1,5 +1,7 @@
 """Conversion of gravitating bodies from and to REBOUND."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from itertools import combinations
 from typing import Any, NamedTuple

@@ -8,6 +8,8 @@ m x'' = F_q x: Newton's equations with the same masses, coordinates x and forces
 differentiation, so the computed x and m x' are the derivatives of the computed q and p.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 

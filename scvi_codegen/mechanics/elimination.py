@@ -8,6 +8,8 @@ it of l_j l_k cos(a_j - a_k) a_j' a_k', in which terms are collected by pairs of
 E. M. Lifshitz, *Mechanics*, section 5, problem 1).
 """
 
+from __future__ import annotations
+
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -3,6 +3,8 @@
 Quadratic forms are transformed by matrix inverses, other functions variable by variable.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache

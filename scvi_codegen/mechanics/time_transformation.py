@@ -24,6 +24,8 @@ G. Wanner, *Geometric Numerical Integration*, VIII.2-3; V. Duruisseaux, J. Schmi
 (2021), where the singular p_t direction of K = g (H + p_t) rules a Lagrangian out; with p_t = -E constant it does not.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from types import MappingProxyType

@@ -1,5 +1,7 @@
 """Catalogue of example problems: a system, an initial state, a step size and a time span, by command-line name."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -5,6 +5,8 @@ polynomials (Davis & Rabinowitz, *Methods of Numerical Integration*, 2nd ed. 198
 method on the three-term recurrence with twenty guard digits: no eigenvalue problem, no monomials.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache, lru_cache, partial

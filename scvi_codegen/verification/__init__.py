@@ -9,6 +9,8 @@ comparison; an error in the derivation, which both sides share, in the second.
 States and parameters are perturbed slightly, so that no symmetry and no mass of 1 hides an error.
 """
 
+from __future__ import annotations
+
 import time
 from collections.abc import Mapping, Sequence
 from typing import Any

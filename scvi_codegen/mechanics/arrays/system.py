@@ -20,6 +20,8 @@ with a multiplier lambda for every element. Rods between nodes ``bonds[b, 0]`` a
 so G M^-1 G^T is sparse; its pattern is that of the net and is known when a run begins.
 """
 
+from __future__ import annotations
+
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace

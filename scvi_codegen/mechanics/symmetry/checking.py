@@ -6,6 +6,8 @@ expression is zero (Olver, *Applications of Lie Groups to Differential Equations
 then its integral along straight lines from q = 0.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Sequence
 
 import sympy

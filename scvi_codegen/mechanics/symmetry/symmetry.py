@@ -31,6 +31,8 @@ exp(-gamma h) per step), and the integral is accurate to the order of the method
 points of the action: both balances hold to the order of the curve, s + 1.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import EventError, FitError, StepFailedError
 from scvi_codegen.runtime.core.validation import Array
-from scvi_codegen.runtime.estimation.fitting import Measurements
+from scvi_codegen.runtime.estimation.measurements import Measurements
 from scvi_codegen.runtime.inputs.segments import parameters_at
 from scvi_codegen.runtime.rotations.reduction import Reduction
 

@@ -32,7 +32,7 @@ from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.core.features import require
 from scvi_codegen.runtime.core.stepper import STEPPER, Stepper
 from scvi_codegen.runtime.core.validation import Array, Parameters, check_inputs_given, checked_vector
-from scvi_codegen.runtime.estimation.fitting import state_names
+from scvi_codegen.runtime.estimation.measurements import state_names
 from scvi_codegen.runtime.orbits.periodic_orbit import PeriodicOrbit
 from scvi_codegen.runtime.rotations.reduction import Reduction
 from scvi_codegen.runtime.rotations.states import checked_pair, homogeneous_state
