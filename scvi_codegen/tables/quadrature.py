@@ -5,6 +5,8 @@ Numerical Integration*, 2nd ed. 1984; Golub & Welsch, Math. Comp. 23 (1969) 221;
 Trefethen, SIAM Review 50 (2008) 67.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal, TypeVar

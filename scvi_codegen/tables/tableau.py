@@ -8,6 +8,8 @@ II*, 2nd ed. 1996, here HW).
 A-stability is tested by Routh's criterion and Sturm's theorem; coefficients below 1e-30 of their scale count as zero.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
