@@ -102,13 +102,16 @@ class Rattle:
     """Tables of constrained steps on s + 1 Lobatto points for constant diagonal masses; RATTLE for s = 1.
 
     Attributes:
-        force: L_q at u = q.
+        force: L_q + f at u = q, or at u = (q, v) if forces f depend on velocities.
         mass: M (no arguments).
         abscissae: (s + 1,) of the points; weights: (s + 1,), of p1 = p0 + h sum_n w_n F_n.
         start: (s,), 0 except for rounding, and momentum: (s, s), from forces at the points but the last to velocities,
             M V_b = (1 + start[b]) p0 + h sum_n momentum[n][b] F_n.
         drift: (s,), the positions without forces, u_i = q0 + h drift[i] p0 / M: the abscissae but for rounding.
         response: (s, s), from them to the points but the first, h^2 sum_n response[n][i] F_n / M; inverse: its inverse.
+        velocity_start: (s,) and velocity: (s, s), from forces at the points but the last to velocities at them, M v_n =
+            (1 + velocity_start[n]) p0 + h sum_m velocity[m][n] F_m; last_velocity: (s,), from the velocities V_b to
+            that at the last point; all empty if forces do not depend on velocities.
         next_positions: (s + 1, s), of the next step, u_i = q0 + h sum_b next_positions[b][i] V_b, extrapolated from the
             velocities of a step; next_multipliers: (s + 1, s), of the next step, extrapolated.
     """
@@ -122,6 +125,9 @@ class Rattle:
     drift: tuple[Number, ...]
     response: NumberTable
     inverse: NumberTable
+    velocity_start: tuple[Number, ...]
+    velocity: NumberTable
+    last_velocity: tuple[Number, ...]
     next_positions: NumberTable
     next_multipliers: NumberTable
 

@@ -1,14 +1,15 @@
 """RATTLE and its generalisation to s + 1 Lobatto points, for constant masses: only multipliers are solved for.
 
-If masses are constant and diagonal and forces depend on positions and time, positions at the s + 1 Lobatto points are
-explicit in forces and multipliers (Lobatto IIIA and IIIB), which leaves s equations per constraint,
+If masses are constant and diagonal, positions at the s + 1 Lobatto points are explicit in forces and multipliers
+(Lobatto IIIA and IIIB), which leaves s equations per constraint,
 
     g(u_i) = 0,   u_i = q0 + h c_i M^-1 p0 + h^2 sum_n a_in M^-1 (F_n + G_n^T lambda_n),   i = 1 .. s, n = 0 .. s - 1,
 
 then one for the momentum at the end, G_s M^-1 (.. + h w_s G_s^T lambda_s) + g_t = 0. The first are solved iteratively:
 with P_n = G_n M^-1 G_n^T, a band matrix if the constraints form a chain, and R = (a_in), the correction of lambda is
 -P_n^-1 (R^-1 (g + G du))_n / h^2. Changes of forces and derivatives within the step are neglected, an error of order h
-that the iteration removes. SVI(1) is RATTLE.
+that the iteration removes. SVI(1) is RATTLE. Forces that depend on velocities are evaluated at those of the curve, also
+explicit in forces and multipliers, M v_n = p0 + h sum_m b_nm (F_m + G_m^T lambda_m), in each iteration.
 
 Constraints of systems of arrays are solved by RATTLE and its symmetric compositions. A step of h is, with G0 and G1 the
 derivatives of the constraints at its ends,
@@ -65,14 +66,17 @@ def rattle_of(system: MechanicalSystem, stages: StageSystem, predictor: NumberTa
         predictor: (2 (s + 1), s + 1) tables to the unknowns of the next step, of velocities and of multipliers.
     """
     forms, tables = forms_of(system), velocity_tables(stages.shape)
-    if any(velocity_conditions(system)) or not forms.separable or tables is None:
+    if any(velocity_conditions(system)) or not forms.has_constant_masses or tables is None:
         return None
     position, momentum = tables.position[1:], tuple(line[:-1] for line in tables.momentum)
     start = tuple(line[0] / tables.end_momentum[0] for line in momentum)
     response = transpose(matrix_product(position, momentum))
     velocities = tuple(row[:-1] for row in predictor[: len(position) + 1])
+    at_points = tables.velocity if forms.forces_depend_on_velocities else ()
+    others, u = at_points[:-1], (*system.coordinates, *(system.velocities if at_points else ()))
+    purpose = "L_q + f at u = (q, v)." if at_points else "L_q at u = q."
     return Rattle(
-        force=system_kernel(system, "constrained_force", forms.force, u=system.coordinates, purpose="L_q at u = q."),
+        force=system_kernel(system, "constrained_force", forms.force, u=u, purpose=purpose),
         mass=system_kernel(system, "constrained_mass", forms.mass.values(), u=(), purpose="The constant masses."),
         abscissae=lower_vector(tables.abscissae),
         weights=lower_vector(tables.end_momentum),
@@ -81,6 +85,9 @@ def rattle_of(system: MechanicalSystem, stages: StageSystem, predictor: NumberTa
         drift=lower_vector(tuple(mp.fdot(line, start) for line in position)),
         response=lower_matrix(response),
         inverse=lower_matrix(rounded((mp.matrix(response) ** -1).tolist())),
+        velocity_start=lower_vector(tuple(mp.fdot(line, start) - 1 for line in others)),
+        velocity=lower_matrix(transpose(matrix_product(others, momentum)) if others else ()),
+        last_velocity=lower_vector(at_points[-1] if at_points else ()),
         next_positions=lower_matrix(matrix_product(velocities, transpose(position))),
         next_multipliers=tuple(row[:-1] for row in predictor[len(position) + 1 :]),
     )

@@ -242,6 +242,16 @@ class Forms:
 
     @cached_property
     def separable(self) -> bool:
+        """True if L = sum m_i v_i^2 / 2 - V(q, t) with constant masses, without forces that depend on velocities."""
+        return self.has_constant_masses and not self.forces_depend_on_velocities
+
+    @cached_property
+    def forces_depend_on_velocities(self) -> bool:
+        """True if :attr:`force` depends on velocities, judged by the structure of its derivatives."""
+        return bool(jacobian(self.force, self.system.velocities))
+
+    @cached_property
+    def has_constant_masses(self) -> bool:
         """True if L = sum m_i v_i^2 / 2 - V(q, t) with constant masses, judged by the structure of its derivatives.
 
         False with damping: velocities at the points are then not the sums of forces in the tables of a method.
@@ -252,8 +262,7 @@ class Forms:
         if any(i != j or not entry.free_symbols <= constant for (i, j), entry in self.mass.items()):
             return False
         at_rest = dict.fromkeys(self.system.velocities, sympy.S.Zero)
-        still = all(p.xreplace(at_rest) == 0 for p in self.momentum)
-        return still and not jacobian(self.force, self.system.velocities)
+        return all(p.xreplace(at_rest) == 0 for p in self.momentum)
 
     def rates(self, count: int) -> tuple[Expr, ...]:
         """Return dL/dt, .., d^count L/dt^count along a curve, in (q, v, t) and :func:`curve_rates`."""

@@ -22,6 +22,14 @@ PENDULUM = sc.LagrangianSystem.from_text(
     constraints=["x1**2 + y1**2 = 1", "(x2 - x1)**2 + (y2 - y1)**2 = 1"],
 )
 """For multipliers alone; RATTLE with degree 1."""
+DAMPED = sc.LagrangianSystem.from_text(
+    name="damped rod",
+    coordinates=["x", "y"],
+    lagrangian="(x_dot**2 + y_dot**2)/2 - 9.81*y",
+    constraints=["x**2 + y**2 = 1"],
+    forces={"x": "-x_dot", "y": "-y_dot"},
+)
+"""With forces at the velocities of the points."""
 NEAR = [0.0, 1.0, 1.94, 1.5]
 
 
@@ -31,7 +39,13 @@ def lobatto(s):
 
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 def test_constrained_code_compiles_without_warnings(compiler, tmp_path):
-    for system, s, controlled in ((LINKAGE, 3, False), (LINKAGE, 3, True), (PENDULUM, 1, True), (PENDULUM, 4, False)):
+    for system, s, controlled in (
+        (LINKAGE, 3, False),
+        (LINKAGE, 3, True),
+        (PENDULUM, 1, True),
+        (PENDULUM, 4, False),
+        (DAMPED, 2, True),
+    ):
         source = sc.generate_source(system, lobatto(s), controlled=controlled)[0]
         (tmp_path / f"{source.prefix}.h").write_text(source.header)
         (tmp_path / "all.c").write_text(source.single_file().code)

@@ -10,23 +10,38 @@
  * c = RATTLE_DRIFT, R = RATTLE_RESPONSE. The correction of lambda at each point solves P dlambda = -G M^-1 df -
  * R^-1 g / h^2, where df is the change of the forces since those of u, and P = G M^-1 G^T at this point is a band
  * matrix factorised as L D L^T (Golub & Van Loan, Matrix Computations, sec. 4.3.6). It neglects that G varies
- * between the points, an error of order h, and that F varies with u. SIMD lanes are points.
+ * between the points, an error of order h, and that F varies with u. SIMD lanes are points. With VELOCITY_FORCES F
+ * includes forces that depend on the velocities of the curve at the points,
+ *
+ *   v = (1 + s) M^-1 p0 + h V M^-1 f,
+ *
+ * s = RATTLE_VELOCITY_START, 0 except for rounding, V = RATTLE_VELOCITY with its low words.
  *
  * Requires: newton.h, constraints.h, the kernels constrained_force and constrained_mass; the tables
  * RATTLE_ABSCISSA, RATTLE_WEIGHT, RATTLE_START, RATTLE_MOMENTUM, RATTLE_RESPONSE and RATTLE_DRIFT with their low
  * words, RATTLE_INVERSE of R, and from the unknowns of the previous step RATTLE_POSITIONS, in units of h, and
  * RATTLE_MULTIPLIERS, padded with zeros; PRODUCT, {e, f, row, distance}: the product of derivatives e and f is part
  * of the entry of P in this row at this distance below the diagonal; CONSTRAINT_POSITION of constraints,
- * CONSTRAINT_REACH of P; POINT_LANES; FORMER_POINTS, the indices that shift lanes by one point. */
+ * CONSTRAINT_REACH of P; POINT_LANES; FORMER_POINTS, the indices that shift lanes by one point; with VELOCITY_FORCES
+ * also RATTLE_LAST_VELOCITY, from the velocities z of the step to that at the last point. */
 #define RATTLE
 #pragma GCC diagnostic ignored "-Wpsabi" /* all functions with vector arguments are static */
 
 #define PREDICTED REAL(4.0) /* multiple of the next update, from the convergence rate, that is below the tolerance */
-#define FASTEST_MULTIPLIERS REAL(1e-3) /* credible convergence rate; a lower one is accidental */
 #define SLOWEST_MULTIPLIERS REAL(0.5) /* convergence rate of the multipliers beyond which Newton's method is faster */
 #define TRANSIENT_ITERATIONS 2 /* that need not contract */
 #define REUSED_FACTORS REAL(1e-2) /* relative update below which the factors of P are reused in the next iteration */
-#define MULTIPLIER_ROUNDOFF (64 * REAL_EPSILON) /* updates below it that decrease slowly are rounding errors */
+#ifdef VELOCITY_FORCES
+#define MULTIPLIER_ROUNDOFF (16 * REAL_EPSILON) /* updates below it that decrease slowly are rounding errors */
+#define ROUNDED_SHRINKING 1
+#define FASTEST_MULTIPLIERS REAL(2e-2) /* credible convergence rate; a lower one is accidental */
+#define STAGNANT_ROUNDOFF MULTIPLIER_ROUNDOFF /* complex convergence rates: updates that grow may shrink later */
+#else
+#define FASTEST_MULTIPLIERS REAL(1e-3)
+#define MULTIPLIER_ROUNDOFF (64 * REAL_EPSILON)
+#define ROUNDED_SHRINKING STOPPED_SHRINKING
+#define STAGNANT_ROUNDOFF ROUNDOFF_LEVEL
+#endif
 
 enum {
   DEGREE = B - 1, /* of B points; lane n is point n + 1 of positions, point n of forces and multipliers */
@@ -48,13 +63,19 @@ typedef long long lane_numbers __attribute__((vector_size(LANE_BYTES)));
 #define FORMER(x, first) __builtin_shuffle(x, first, (lane_numbers){FORMER_POINTS})
 #endif
 
-/* Positions u, forces L_q, derivatives G and g at all points but the first, where the second and third are first_force
- * and first_derivative; multipliers and the forces f of u at all but the last. `base` is u without forces. */
+/* Positions u, forces F, derivatives G and g at all points but the first, where the second and third are first_force
+ * and first_derivative; multipliers and the forces f of u at all but the last. `base` is u without forces. With
+ * VELOCITY_FORCES force, positions `at` and velocities v are at all points but the last, and base_v is v without
+ * forces. */
 typedef struct {
   real u[M][POINT_LANES], f[M][POINT_LANES], force[M][POINT_LANES], g[CONSTRAINTS][POINT_LANES];
   real derivative[CONSTRAINT_ENTRIES][POINT_LANES], first_force[M], first_derivative[CONSTRAINT_ENTRIES];
   real inverse_mass[M];
   lanes base[M], lambda[CONSTRAINTS];
+#ifdef VELOCITY_FORCES
+  real at[M][POINT_LANES], v[M][POINT_LANES];
+  lanes base_v[M];
+#endif
 } rattle_step;
 
 typedef lanes factors[CONSTRAINTS][CONSTRAINT_REACH + 1]; /* L below its diagonal, D^-1 at distance 0 */
@@ -89,16 +110,58 @@ LANE_FUNCTION lanes times(const real (*table)[POINT_LANES], int count, const rea
   return sum + other;
 }
 
-/* Evaluates forces, constraints and their derivatives at all points but the first. */
+#ifdef VELOCITY_FORCES
+/* Forces at the point of a lane. */
+LANE_FUNCTION void force_of_lane(const step_data *step, const rattle_step *now, int n, real *force)
+{
+  real u[2 * M];
+#pragma GCC unroll 64
+  for (int i = 0; i < M; i++)
+    u[i] = now->at[i][n];
+#pragma GCC unroll 64
+  for (int i = 0; i < M; i++)
+    u[M + i] = now->v[i][n];
+  constrained_force(u, step->t + RATTLE_ABSCISSA[n] * step->h, step->parameters, force);
+}
+
+/* Positions and velocities at all points but the last, of u and f. */
+static inline void move_points(const step_data *step, rattle_step *now)
+{
+  for (int i = 0; i < M; i++) {
+    const lanes at = FORMER(load(now->u[i]), lanes_of(step->q0[i]));
+    const lanes v = now->base_v[i] +
+        step->h * now->inverse_mass[i] * times(RATTLE_VELOCITY, DEGREE, now->f[i]);
+    memcpy(now->at[i], &at, sizeof at);
+    memcpy(now->v[i], &v, sizeof v);
+  }
+}
+#else
+LANE_FUNCTION void force_of_lane(const step_data *step, const rattle_step *now, int n, real *force)
+{
+  real u[M];
+#pragma GCC unroll 64
+  for (int i = 0; i < M; i++)
+    u[i] = now->u[i][n];
+  constrained_force(u, step->t + RATTLE_ABSCISSA[n + 1] * step->h, step->parameters, force);
+}
+
+static inline void move_points(const step_data *step, rattle_step *now)
+{
+  (void)step, (void)now;
+}
+#endif
+
+/* Evaluates forces, constraints and their derivatives. */
 static __attribute__((flatten)) void evaluate_points(const step_data *step, rattle_step *restrict now)
 {
+  move_points(step, now);
   for (int n = 0; n < POINT_LANES; n++) {
     real u[M], force[M], g[CONSTRAINTS], derivative[CONSTRAINT_ENTRIES];
     const real t = step->t + RATTLE_ABSCISSA[n + 1] * step->h;
 #pragma GCC unroll 64
     for (int i = 0; i < M; i++)
       u[i] = now->u[i][n];
-    constrained_force(u, t, step->parameters, force);
+    force_of_lane(step, now, n, force);
     constraints(u, t, step->parameters, g, derivative);
 #pragma GCC unroll 64
     for (int i = 0; i < M; i++)
@@ -155,11 +218,19 @@ static inline void former_derivatives(const rattle_step *now, lanes *derivative)
     derivative[e] = FORMER(load(now->derivative[e]), lanes_of(now->first_derivative[e]));
 }
 
-/* f = L_q + G^T lambda at all points but the last. */
+#ifdef VELOCITY_FORCES
+#define FORCES_BEFORE_LAST(now, i) load((now)->force[i])
+#define FIRST_FORCE(now, i) (now)->force[i][0]
+#else
+#define FORCES_BEFORE_LAST(now, i) FORMER(load((now)->force[i]), lanes_of((now)->first_force[i]))
+#define FIRST_FORCE(now, i) (now)->first_force[i]
+#endif
+
+/* f = F + G^T lambda at all points but the last. */
 static inline void all_forces(const rattle_step *now, const lanes *derivative, lanes *f)
 {
   for (int i = 0; i < M; i++)
-    f[i] = FORMER(load(now->force[i]), lanes_of(now->first_force[i]));
+    f[i] = FORCES_BEFORE_LAST(now, i);
 #pragma GCC unroll 64
   for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
     f[CONSTRAINT_ENTRY[e][1]] += derivative[e] * now->lambda[CONSTRAINT_ENTRY[e][0]];
@@ -171,7 +242,7 @@ static real invert_term_sizes(const step_data *step, const rattle_step *now, rea
 {
   real largest = 0;
   for (int i = 0; i < M; i++)
-    size[i] = MATH(fabs)(now->first_force[i]);
+    size[i] = MATH(fabs)(FIRST_FORCE(now, i));
   for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
     size[CONSTRAINT_ENTRY[e][1]] += MATH(fabs)(now->first_derivative[e] * now->lambda[CONSTRAINT_ENTRY[e][0]][0]);
   for (int i = 0; i < M; i++) {
@@ -199,11 +270,11 @@ static inline int accepts(const movement *moved, const movement *last, const sol
     return 1;
   if (k > 0 && next <= tolerance * before && PREDICTED * now * before <= tolerance * earlier)
     return 1;
-  if (!absolute && moved->overall <= MULTIPLIER_ROUNDOFF && now >= STOPPED_SHRINKING * before)
+  if (!absolute && moved->overall <= MULTIPLIER_ROUNDOFF && now >= ROUNDED_SHRINKING * before)
     return 1;
-  if (!absolute && stagnant && moved->overall <= ROUNDOFF_LEVEL && moved->overall >= last[0].overall)
+  if (!absolute && stagnant && moved->overall <= STAGNANT_ROUNDOFF && moved->overall >= last[0].overall)
     return 1;
-  return k > TRANSIENT_ITERATIONS && stagnant && moved->overall > ROUNDOFF_LEVEL ? -1 : 0;
+  return k > TRANSIENT_ITERATIONS && stagnant && moved->overall > STAGNANT_ROUNDOFF ? -1 : 0;
 }
 
 /* One iteration: updates lambda, f and u, the last by `change`. */
@@ -316,7 +387,9 @@ static void begin(const step_data *step, const real *memory, rattle_step *now)
   const lanes drift = load(RATTLE_DRIFT), drift_low = load(RATTLE_DRIFT_LOW);
   real g[CONSTRAINTS], mass[M];
   constrained_mass(NULL, step->t, step->parameters, mass);
+#ifndef VELOCITY_FORCES
   constrained_force(step->q0, step->t, step->parameters, now->first_force);
+#endif
   constraints(step->q0, step->t, step->parameters, g, now->first_derivative);
   for (int i = 0; i < M; i++) {
     const real v = step->p0[i] / mass[i], moved = step->h * v;
@@ -332,6 +405,11 @@ static void begin(const step_data *step, const real *memory, rattle_step *now)
     }
     memcpy(now->f[i], &f, sizeof f);
     IN_MEMORY(now->f[i]);
+#ifdef VELOCITY_FORCES
+    const lanes bent = load(RATTLE_VELOCITY_START) * v +
+        step->h * now->inverse_mass[i] * times(RATTLE_VELOCITY_LOW, DEGREE, now->f[i]);
+    now->base_v[i] = v + bent;
+#endif
     low += step->h * step->h * now->inverse_mass[i] * times(RATTLE_RESPONSE_LOW, DEGREE, now->f[i]);
     x = step->q0[i] + (step->carry_q[i] + x);
     now->base[i] = step->q0[i] + (step->carry_q[i] + (low + now->base[i]));
@@ -341,6 +419,24 @@ static void begin(const step_data *step, const real *memory, rattle_step *now)
     now->lambda[k] = memory ? times(RATTLE_MULTIPLIERS, B, memory + (M + k) * B) : lanes_of(0);
 }
 
+/* Force at the last point, where the velocity is that of the curve with velocities z. */
+static inline void last_force(const step_data *step, const rattle_step *now, const real *z, real *force)
+{
+#ifdef VELOCITY_FORCES
+  real u[2 * M] = {0};
+  for (int i = 0; i < M; i++) {
+    u[i] = now->u[i][DEGREE - 1];
+    for (int b = 0; b < DEGREE; b++)
+      u[M + i] += RATTLE_LAST_VELOCITY[b] * z[i * B + b];
+  }
+  constrained_force(u, step->t + RATTLE_ABSCISSA[DEGREE] * step->h, step->parameters, force);
+#else
+  (void)step, (void)z;
+  for (int i = 0; i < M; i++)
+    force[i] = now->force[i][DEGREE - 1];
+#endif
+}
+
 /* Computes p1 - p0 on the tangent space, and the unknowns z of the step. */
 static int finish_step(const step_data *step, rattle_step *now, newton_data *data, real *dp)
 {
@@ -348,13 +444,20 @@ static int finish_step(const step_data *step, rattle_step *now, newton_data *dat
   const lanes start = load(RATTLE_START);
   factors l;
   lanes derivative[CONSTRAINT_ENTRIES], f[M], x[CONSTRAINTS];
-  real u[2 * M], value[M + 2 * CONSTRAINTS];
+  real u[2 * M], value[M + 2 * CONSTRAINTS], force[M];
   former_derivatives(now, derivative);
   all_forces(now, derivative, f);
   memcpy(now->f, f, sizeof f);
   IN_MEMORY(now->f);
   for (int i = 0; i < M; i++) {
-    real sum = RATTLE_WEIGHT[DEGREE] * now->force[i][DEGREE - 1];
+    const lanes push = times(RATTLE_MOMENTUM, DEGREE, now->f[i]) +
+        times(RATTLE_MOMENTUM_LOW, DEGREE, now->f[i]);
+    const lanes z = (step->p0[i] + (start * step->p0[i] + step->h * push)) * now->inverse_mass[i];
+    memcpy(data->z + i * B, &z, sizeof(real) * DEGREE);
+  }
+  last_force(step, now, data->z, force);
+  for (int i = 0; i < M; i++) {
+    real sum = RATTLE_WEIGHT[DEGREE] * force[i];
     for (int n = 0; n < DEGREE; n++)
       sum += RATTLE_WEIGHT[n] * now->f[i][n];
     dp[i] = step->h * sum;
@@ -371,13 +474,8 @@ static int finish_step(const step_data *step, rattle_step *now, newton_data *dat
   for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
     dp[CONSTRAINT_ENTRY[e][1]] += weight * now->derivative[e][DEGREE - 1] *
         x[CONSTRAINT_POSITION[CONSTRAINT_ENTRY[e][0]]][DEGREE - 1];
-  for (int i = 0; i < M; i++) {
-    const lanes push = times(RATTLE_MOMENTUM, DEGREE, now->f[i]) +
-        times(RATTLE_MOMENTUM_LOW, DEGREE, now->f[i]);
-    const lanes z = (step->p0[i] + (start * step->p0[i] + step->h * push)) * now->inverse_mass[i];
-    memcpy(data->z + i * B, &z, sizeof(real) * DEGREE);
+  for (int i = 0; i < M; i++)
     data->z[i * B + DEGREE] = (step->p0[i] + dp[i]) * now->inverse_mass[i];
-  }
   for (int k = 0; k < CONSTRAINTS; k++) {
     memcpy(data->z + (M + k) * B, now->lambda + k, sizeof(real) * DEGREE);
     data->z[(M + k) * B + DEGREE] = x[CONSTRAINT_POSITION[k]][DEGREE - 1];
