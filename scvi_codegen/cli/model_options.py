@@ -14,6 +14,7 @@ from scvi_codegen.cli.command_group import Command
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.methods import ARGUMENTS, METHODS, size_of, specification_of
 from scvi_codegen.models.model import Model
+from scvi_codegen.models.model_files.entries import ROBOT_FILES
 from scvi_codegen.models.model_files.model_file import catalogue_model, load_model
 from scvi_codegen.models.model_files.sections import event_entry
 from scvi_codegen.models.options import (
@@ -206,7 +207,7 @@ def read_model(name: str, choices: Choices) -> Model:
     check_exclusive(choices)
     _check_method(choices)
     path = Path(name)
-    if path.suffix.lower() == ".toml" or os.sep in name or path.is_file():
+    if path.suffix.lower() in (".toml", *ROBOT_FILES) or os.sep in name or path.is_file():
         return load_model(path, sections_of(choices))
     if name.partition(":")[0] not in PROBLEMS:
         try:

@@ -12,7 +12,6 @@ import math
 import os
 import re
 import tempfile
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -25,14 +24,14 @@ import sympy
 
 from scvi_codegen.display.mathml import mathml_terms
 from scvi_codegen.errors import ArgumentError, ExpressionError, MethodError, StateError, closest
-from scvi_codegen.files.atomic import regular, write_text
+from scvi_codegen.files.atomic import write_text
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.rotations import Rotation, RotationNames, Spin
 from scvi_codegen.formulas.symbols import input_parameters, symbol
 from scvi_codegen.mechanics.arrays.system import SYSTEM_OR_ARRAYS
 from scvi_codegen.models.model import DEFAULT_METHOD, Model
 from scvi_codegen.models.model_files.document import document_of
-from scvi_codegen.models.model_files.model_file import load_model
+from scvi_codegen.models.model_files.model_file import document_in, load_model
 from scvi_codegen.models.model_files.page_section import (
     check_page,
     check_picture,
@@ -132,7 +131,7 @@ def page(
         raise ArgumentError(f"page() takes {', '.join(motion)} for a system alone: change them in the model")
     if isinstance(model, Model):
         return page_of(model, document_of(model), settings)
-    return page_of(load_model(model), tomllib.loads(regular(model).read_text(encoding="utf-8")), settings)
+    return page_of(load_model(model), document_in(model), settings)
 
 
 def _model_of(system: Any, motion: Mapping[str, Any]) -> Model:

@@ -1,6 +1,5 @@
 """Command ``scvi-codegen page``: a page that computes the motion in the browser."""
 
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -8,8 +7,8 @@ import click
 
 from scvi_codegen.cli.command_group import check_writable, reporting, tell
 from scvi_codegen.cli.model_options import model_arguments, read_model, sections_of
-from scvi_codegen.files.atomic import read_text
 from scvi_codegen.models.model_files.document import document_of
+from scvi_codegen.models.model_files.model_file import document_in
 from scvi_codegen.pages.page import page_of
 
 
@@ -34,11 +33,12 @@ def page(model_name: str, output: str, ranges: tuple[tuple[str, float, float], .
     \b
     Examples:
       scvi-codegen page pendulum.toml -o pendulum.html
+      scvi-codegen page arm.xml -o arm.html
       scvi-codegen page kinks.toml --range v 0.05 0.95 -o kinks.html
     """
     check_writable(Path(output), "'-o'")
     model = read_model(model_name, choices)
     own = Path(model_name).is_file() and not {"initial", "system", "field"} & sections_of(choices).keys()
-    document = tomllib.loads(read_text(model_name, "utf-8")) if own else document_of(model)
+    document = document_in(model_name) if own else document_of(model)
     page_of(model, document, {"ranges": {name: (low, high) for name, low, high in ranges}}).save(output)
     tell(f"wrote {output}", system=model.system.name, method=model.method.name, written=[output])

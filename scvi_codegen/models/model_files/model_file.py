@@ -27,7 +27,8 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.mechanics.time_transformation import time_rescaling_function
 from scvi_codegen.methods import fitted
 from scvi_codegen.models.model import DEFAULT_METHOD, Model
-from scvi_codegen.models.model_files.document import document_of, motion_of, with_files
+from scvi_codegen.models.model_files.document import document_of, with_files
+from scvi_codegen.models.model_files.entries import ROBOT_KEYS, URDF_KEYS, Entry, is_robot, read_entry
 from scvi_codegen.models.model_files.input_tables import InputTable
 from scvi_codegen.models.model_files.page_section import PAGE_KEYS, PICTURE_KEYS, check_page, check_picture
 from scvi_codegen.models.model_files.sections import (
@@ -43,7 +44,6 @@ from scvi_codegen.models.model_files.sections import (
     has_arrays,
     in_section,
     merged_sections,
-    read_catalogue,
     read_events,
     read_method,
     read_run,
@@ -53,13 +53,12 @@ from scvi_codegen.models.model_files.sections import (
 )
 from scvi_codegen.models.model_files.values import read_values
 from scvi_codegen.models.options import STATE, STEP_KEYS, options_of, with_exact_numbers
-from scvi_codegen.models.problems import Problem
 from scvi_codegen.rendering.source import DOUBLE_DOUBLE
 from scvi_codegen.validation import ExactNumber, checks_arguments, of
 
 SYSTEM_KEYS = (
-    *("name", "coordinates", *TURNING, "momenta", *FORMULAS, "inputs", "neighbours", "catalogue"),
-    *("time_transformation", "point_forces", "eliminate_constraints"),
+    *("name", "coordinates", *TURNING, "momenta", *FORMULAS, "inputs", "neighbours", "point_forces"),
+    *("catalogue", *ROBOT_KEYS, *URDF_KEYS),
 )
 FIELD_KEYS = (
     *("name", "fields", "momenta", "space", "boundary", "density", "hamiltonian", "dissipation"),
@@ -83,13 +82,20 @@ def load_model(path: str | os.PathLike[str], changes: Document | None = None) ->
     Raises:
         ModelFileError: beginning with the path and naming the key at fault.
     """
-    text = text_in(path, "utf-8")
+    text, folder = "" if is_robot(path) else text_in(path, "utf-8"), Path(path).parent
     try:
-        return parse_model(text, changes, folder=Path(path).parent)
+        if is_robot(path):
+            return _read_model(document_in(path), changes or {}, folder)
+        return parse_model(text, changes, folder=folder)
     except ModelFileError as error:
         raise ModelFileError(f"{path}: {error}") from error
     except MemoryError as error:
         raise ModelFileError(f"{path}: its arrays do not fit in memory: reduce the sizes") from error
+
+
+def document_in(path: str | os.PathLike[str]) -> Document:
+    """Return the sections of a model file or a robot's file."""
+    return {"system": {"robot": Path(path).name}} if is_robot(path) else read_toml(text_in(path, "utf-8"))
 
 
 @checks_arguments(model=of("a Model", Model))
@@ -156,7 +162,7 @@ def _written(model: Model, stem: str | None) -> dict[str, str]:
 
     part = "system"
     for as_arrays in (True, False) if model.array_system is None else (True,):  # a derived system has another form
-        document = document_of(model, as_arrays=as_arrays)
+        document = in_section("[system]", partial(document_of, model, as_arrays=as_arrays))
         shortened, files = (document, {}) if stem is None else with_files(document, stem)
         text = tomli_w.dumps(shortened, multiline_strings=True)
         with warnings.catch_warnings():  # formulas of initial values, which used parameters, are numbers now
@@ -165,6 +171,10 @@ def _written(model: Model, stem: str | None) -> dict[str, str]:
         if again == model:
             return {f"{stem}.toml": text, **files}
         part = "method" if again.method != model.method else "system" if again.system != model.system else "state"
+    if part == "system" and hasattr(model.system, "links") and model.system.links:
+        raise ModelFileError(
+            f"the formulas of the robot {model.system.name} cannot be written to a file: write [system] robot = FILE"
+        )
     raise ModelFileError(
         f"the {part} of this model cannot be represented in a file: quadratures, nodes and "
         "tableaux must be built-in ones with a name, and abscissae binary64 numbers"
@@ -172,7 +182,7 @@ def _written(model: Model, stem: str | None) -> dict[str, str]:
 
 
 def _read_model(document: Document, changes: Document, folder: str | os.PathLike[str] = ".") -> Model:
-    entry = read_catalogue(document.get("system", {}))
+    entry = read_entry(document.get("system", {}), folder)
     for name in ARRAY_SECTIONS:
         if (name in document or name in changes) and not has_arrays(document):
             raise ModelFileError(f'[{name}] belongs to coordinates that are arrays, coordinates = ["q[N]"]')
@@ -189,7 +199,7 @@ def _read_model(document: Document, changes: Document, folder: str | os.PathLike
 
             system = read_field(document)
         else:
-            system = read_system(document, entry)
+            system = read_system(document, entry and entry.system)
         system, values = _read_state(document, system, folder)
     arrays = Model.arrays_of(system)
     method = read_method(fitted(specification, one_coordinate(arrays) if arrays else system))
@@ -239,19 +249,20 @@ def _in_angles(system: LagrangianSystem, values: dict[str, Any]) -> dict[str, An
     return {"t": values["t"], **{name: tuple(vector.tolist()) for name, vector in state.items()}}
 
 
-def _merged(document: Document, changes: Document, entry: Problem | None) -> tuple[Document, Section, str]:
+def _merged(document: Document, changes: Document, entry: Entry | None) -> tuple[Document, Section, str]:
     """Return all sections with the changes merged over them, the specification of the method, and the solver."""
     solver: str = {"solver": "auto", **document.get("method", {}), **changes.get("method", {})}["solver"]
     document, changes = _without_solver(document), _without_solver(changes)
     if entry is not None:
-        names = [coordinate.name for coordinate in entry.system.coordinates]
-        document = merged_sections(motion_of(Model.from_problem(entry), names), document)
+        document = merged_sections(entry.motion, document)
     declared = {key.partition("[")[0]: key for key in document.get("parameters", {})}
     parameters = {declared.get(name, name): value for name, value in changes.get("parameters", {}).items()}
     merged = merged_sections(document, {**changes, "parameters": parameters} if parameters else changes)
     if entry is None:
         check_complete(merged)
         check_used(merged, changes.get("parameters", {}))
+    else:
+        merged["initial"] = entry.completed(merged["initial"])
     return merged, chosen_method(document, changes), solver
 
 

@@ -16,7 +16,6 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import ARGUMENTS, Method, method_from_specification, sized, specification_of
 from scvi_codegen.models.model import DEFAULT_METHOD
 from scvi_codegen.models.options import ALTERNATIVE_KEYS, FIELDS, KEYED, STEP_KEYS, alternatives, options_of, real
-from scvi_codegen.models.problems import Problem, problem
 from scvi_codegen.runtime.events.event import Event
 from scvi_codegen.validation import FORMULA, checked_count, likely_names, synonym_hint
 
@@ -235,7 +234,7 @@ def check_complete(document: Document) -> None:
             choice = next((choice for choice in ALTERNATIVES if key in choice), {key})
             if choice.isdisjoint(document.get(name, {})) and not _is_optional(document, key):
                 missing.append(f"{' or '.join(sorted(choice))} in [{name}]")
-    if missing == ["p or q_dot in [initial]"] and isinstance(read_system(document, None), FirstOrderSystem):
+    if missing == ["p or q_dot in [initial]"] and isinstance(read_system(document), FirstOrderSystem):
         return
     if missing:
         at_rest = "p or q_dot in [initial]" in missing
@@ -305,26 +304,15 @@ def event_entry(text: str) -> dict[str, Any]:
     return entry
 
 
-def read_catalogue(section: Section) -> Problem | None:
-    """Return the entry of the catalogue that a section ``[system]`` names, if any."""
-    if "catalogue" not in section:
-        return None
-    check_keys(
-        section, ("catalogue", "time_transformation", "eliminate_constraints"), "key", "[system] beside catalogue"
-    )
-    name = text_of(section, "catalogue", "[system]")
-    return in_section("[system]", lambda: problem(name))
-
-
-def read_system(document: Document, entry: Problem | None) -> MechanicalSystem:
-    """Return the system of a file, with the values of its scalar parameters."""
+def read_system(document: Document, named: MechanicalSystem | None = None) -> MechanicalSystem:
+    """Return the system of a file, ``named`` if it names one, with the values of its scalar parameters."""
     forces, values = document.get("forces", {}), _scalars(document)
-    if entry is not None:
+    if named is not None:
         if forces:
             raise ModelFileError(
-                "[forces] are not supported for a system of the catalogue: write the system out in [system]"
+                "[forces] are not supported for a system of the catalogue or of a robot: write it out in [system]"
             )
-        return in_section("[parameters]", lambda: entry.system.with_parameters(**values))
+        return in_section("[parameters]", lambda: named.with_parameters(**values))
     section = document["system"]
     check_one(section, "system", "lagrangian", "hamiltonian")
     arguments: dict[str, Any] = {
