@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import sympy
+from certified_cases import CASES, CONTROLLED, case
 from sabotage import Case, Make, Sabotage, changed_result
 
 from scvi_codegen.ir.kernel import Operation
@@ -12,6 +13,8 @@ from scvi_codegen.methods import SVI, RungeKutta, acceleration_stages
 from scvi_codegen.methods.stage_system import Table
 from scvi_codegen.tables.nodes import chebyshev_lobatto
 from scvi_codegen.tables.precision import mp
+
+TO_NINE_DIGITS = replace(CONTROLLED, tolerance=1e-9)
 
 
 @dataclass(frozen=True)
@@ -24,12 +27,12 @@ class Mutation:
     edits_text: bool = False
 
 
-def function(name: str, where: Case, home: Any, attribute: str, make: Make) -> Mutation:
-    return Mutation(name, where, lambda sabotage: sabotage.replace(home, attribute, make))
+def function(name: str, where: str, home: Any, attribute: str, make: Make) -> Mutation:
+    return Mutation(name, case(where), lambda sabotage: sabotage.replace(home, attribute, make))
 
 
-def here(name: str, where: Case, home: Any, attribute: str, make: Make) -> Mutation:
-    return Mutation(name, where, lambda sabotage: sabotage.replace_here(home, attribute, make))
+def here(name: str, where: str, home: Any, attribute: str, make: Make) -> Mutation:
+    return Mutation(name, case(where), lambda sabotage: sabotage.replace_here(home, attribute, make))
 
 
 def inside(function: str, pattern: str) -> str:
@@ -37,27 +40,32 @@ def inside(function: str, pattern: str) -> str:
     return rf"(\b{function}\([^;{{]*\)\n\{{\n(?:.*\n)*?.*?){pattern}"
 
 
-def text(name: str, where: Case, pattern: str, replacement: str, *, within: str = "") -> Mutation:
-    """An edit of the C text, the first place after the head of the function ``within``."""
+def text(name: str, where: str, within: str, pattern: str, replacement: str) -> Mutation:
+    """An edit of the C text, the first place after the head of the function ``within`` if one is named."""
     if within:
         pattern, replacement = inside(within, pattern), rf"\g<1>{replacement}"
-    return Mutation(name, where, lambda sabotage: sabotage.edit(pattern, replacement), edits_text=True)
+    return Mutation(
+        f"{name} {where}" if name.endswith(",") else name,
+        TO_NINE_DIGITS if where == "to nine digits" else CASES.get(where) or case(where),
+        lambda sabotage: sabotage.edit(pattern, replacement),
+        edits_text=True,
+    )
 
 
-def wrong_tableau(name: str, where: Case, **changes: Make) -> Mutation:
+def wrong_tableau(name: str, where: str, **changes: Make) -> Mutation:
     """A tableau that is wrong from the beginning: both sides use it."""
-    made = where.method()
+    made = case(where).method()
     assert isinstance(made, RungeKutta)
     other = replace(made.tableau, **{key: change(getattr(made.tableau, key)) for key, change in changes.items()})
-    return Mutation(name, replace(where, method=lambda: RungeKutta(other, made.form)), lambda sabotage: None)
+    return Mutation(name, replace(case(where), method=lambda: RungeKutta(other, made.form)), lambda sabotage: None)
 
 
-def wrong_rule(name: str, where: Case, change: Make) -> Mutation:
+def wrong_rule(name: str, where: str, change: Make) -> Mutation:
     """A quadrature that is wrong from the beginning."""
-    made = where.method()
+    made = case(where).method()
     assert isinstance(made, SVI)
     other = change(made.quadrature)
-    return Mutation(name, replace(where, method=lambda: SVI(made.degree, other)), lambda sabotage: None)
+    return Mutation(name, replace(case(where), method=lambda: SVI(made.degree, other)), lambda sabotage: None)
 
 
 def eight_digits(x: Any) -> Any:

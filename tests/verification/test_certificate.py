@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from beside import C_TEXT
+from c_edits import TEMPLATE_EDITS
 from certified_cases import CASES
 from checkout import ROOT
 from click.testing import CliRunner
@@ -60,8 +60,11 @@ def test_every_planted_fault_is_detected(mutation: Mutation, record_property) ->
 
 def test_planted_faults_find_their_source_lines() -> None:
     """Rewritten source would otherwise disable its planted faults, noticed only by the full tier."""
-    texts = [path.read_text("utf-8") for path in ROOT.glob("templates/support/*/*.h")]
-    places = {what: inside(within, pattern) for what, _, within, pattern, _ in C_TEXT}
+    texts = [path.read_text("utf-8") for path in ROOT.glob("templates/**/*.[hj]*")]
+    places = {
+        f"{what}{where}": inside(within, pattern) if within else pattern
+        for what, where, within, pattern, _ in TEMPLATE_EDITS
+    }
     assert [what for what, place in places.items() if not any(re.search(place, text) for text in texts)] == []
     for mutation in MUTATIONS:
         with sabotaged(mutation.apply):  # raises an error for a function that no longer exists

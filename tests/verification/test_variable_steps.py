@@ -1,4 +1,4 @@
-"""Certificates of runs in transformed time and with adaptive steps. Planted faults: ``faults/paces.py``."""
+"""Certificates of runs in transformed time and with adaptive steps. Planted faults: ``faults/c_edits.py``."""
 
 from collections.abc import Iterator
 
