@@ -352,7 +352,7 @@ RACES = """
 #include "shared.h"
 enum {{ N = {count} }};
 static const int bonds[] = {{{bonds}}};
-static double memory[128 * N + 4096] __attribute__((aligned(64))), start[2 * N];
+static double memory[192 * N + 4096] __attribute__((aligned(64))), start[2 * N];
 static double t[{steps}], q[{steps} * N], p[{steps} * N];
 static int iterations[{steps}];
 int main(void)

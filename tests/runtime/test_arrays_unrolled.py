@@ -319,7 +319,7 @@ def test_array_system_equals_the_unrolled_system(name, method, solver, situation
     if stepper.momentum_map_names and method.startswith(("svi", "gauss")):
         assert np.ptp(own.momentum_maps(), axis=0).max() < 1e-13
     if name in ("ring", "chain", "waves"):
-        assert own.step_error == pytest.approx(expected.step_error, rel=2.0)
+        assert own.step_error == pytest.approx(expected.step_error, rel=2.0, nan_ok=True)  # compositions have none
     between = np.array([[0.3, 0.6], [0.9, 0.1]]) * (own.t[-1] - own.t[0]) + own.t[0]
     if method.startswith(("svi:2", "svi:4", "svi:6", "gauss")):
         for found, wanted in zip(own.at(between), expected.at(between), strict=True):
