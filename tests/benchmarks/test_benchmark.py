@@ -317,16 +317,8 @@ class TestReport:
         (found,) = data["cases"]
         assert set(found) == {"name", "span", "dimension", "reference_accuracy", "skipped", "measurements", "rows"}
         fields = {
-            "method",
-            "setting",
-            "options",
-            "compile_seconds",
-            "seconds",
-            "fastest",
-            "error",
-            "repeats",
-            "failure",
-        }
+            "method", "setting", "options", "compile_seconds", "seconds", "fastest", "error", "repeats", "failure",
+        }  # fmt: skip
         assert all(set(entry) == fields for entry in found["measurements"])
         assert found["measurements"][4]["seconds"] is None
         assert data["tables"][0]["rows"] == [{"a": None}, {"a": 1.0, "b": "x"}]
