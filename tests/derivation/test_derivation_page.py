@@ -40,22 +40,11 @@ from scvi_codegen.rendering.program_source import render
 
 TILTED = """m*(1 + q**2/3)*q_dot**2/2 + a*q*q_dot*sin(t) - k*q**4/4 + q_dot**4/40"""
 METHODS = [
-    sc.SVI(3),
-    sc.SVI(2, "gauss-lobatto:3"),
-    sc.SVI(2, "hermite:2"),
-    sc.SVI(2, space="splines:2"),
-    sc.SCVI(3),
-    sc.SCVI(1),
-    sc.SCVI(2, variational=False),
-    sc.SCVI(2, abscissae="gauss"),
-    sc.SpectralCollocation(3),
-    sc.SpectralCollocation(2, form="phase-space"),
-    sc.Gauss(3),
-    sc.LobattoIIIA(3),
-    sc.RadauIIA(2, form="position"),
-    sc.ExplicitEuler(),
-    sc.StoermerVerlet(),
-]
+    sc.SVI(3), sc.SVI(2, "gauss-lobatto:3"), sc.SVI(2, "hermite:2"), sc.SVI(2, space="splines:2"), sc.SCVI(3),
+    sc.SCVI(1), sc.SCVI(2, variational=False), sc.SCVI(2, abscissae="gauss"), sc.SpectralCollocation(3),
+    sc.SpectralCollocation(2, form="phase-space"), sc.Gauss(3), sc.LobattoIIIA(3), sc.RadauIIA(2, form="position"),
+    sc.ExplicitEuler(), sc.StoermerVerlet(),
+]  # fmt: skip
 
 
 def tilted() -> sc.LagrangianSystem:

@@ -36,22 +36,11 @@ def test_two_point_pendulum_equals_equations_36_and_37():
 
 SYSTEMS = [PENDULUM, KEPLER, DOUBLE_PENDULUM, DUFFING.with_parameters(gamma=0.3, omega=1.3)]
 METHODS = [
-    sc.SVI(1),
-    sc.SVI(2, "gauss-lobatto:3", "legendre-lobatto"),
-    sc.SVI(3, "gauss-legendre:4", "equispaced"),
-    sc.SCVI(1, "gauss-legendre:2"),
-    sc.SCVI(2),
-    sc.SCVI(3, "gauss-legendre:4"),
-    sc.SCVI(2, variational=False),
-    sc.SpectralCollocation(2),
-    sc.SpectralCollocation(3, form="phase-space"),
-    sc.Gauss(2),
-    sc.RadauIIA(2),
-    sc.RadauIA(2, form="position"),
-    sc.LobattoIIIA(3),
-    sc.StoermerVerlet(),
-    sc.ExplicitEuler(),
-]
+    sc.SVI(1), sc.SVI(2, "gauss-lobatto:3", "legendre-lobatto"), sc.SVI(3, "gauss-legendre:4", "equispaced"),
+    sc.SCVI(1, "gauss-legendre:2"), sc.SCVI(2), sc.SCVI(3, "gauss-legendre:4"), sc.SCVI(2, variational=False),
+    sc.SpectralCollocation(2), sc.SpectralCollocation(3, form="phase-space"), sc.Gauss(2), sc.RadauIIA(2),
+    sc.RadauIA(2, form="position"), sc.LobattoIIIA(3), sc.StoermerVerlet(), sc.ExplicitEuler(),
+]  # fmt: skip
 STATES = {1: ([0.7], [0.4], 0.2), 2: ([0.7, -0.3], [0.3, 0.9], 0.15)}
 
 

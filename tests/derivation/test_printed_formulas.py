@@ -152,17 +152,9 @@ CASES = {
     "one coordinate scvi": (ONE, sc.SCVI(1)),
 }
 ALIKE = (
-    "forced scvi on gauss",
-    "forced sc in phase space",
-    "plain svi splines",
-    "forced radau",
-    "forced lobatto",
-    "damped gauss",
-    "rattle",
-    "hamiltonian gauss",
-    "composition",
-    "one coordinate scvi",
-)
+    "forced scvi on gauss", "forced sc in phase space", "plain svi splines", "forced radau", "forced lobatto",
+    "damped gauss", "rattle", "hamiltonian gauss", "composition", "one coordinate scvi",
+)  # fmt: skip
 """Cases whose formulas are printed by the code that others of the default tier reach; left to the full tier."""
 WITHOUT_STAGES = ("stoermer-verlet", "composition")
 """Explicit methods, which have no compiled form of stage equations."""
