@@ -155,32 +155,12 @@ def test_special_values_are_rejected_or_handled(name: str, tmp_path: Path, monke
 
 
 CSV = [
-    "",
-    "u",
-    "t,u",
-    "t,u\n",
-    "t,u\n0,1",
-    "t,u\n0,1\n0,2",
-    "t,u\n0,1\n1",
-    "t,u\n0,x\n1,2",
-    "t,t\n0,1\n1,2",
-    ",u\n0,1\n1,2",
-    "t,u\n0,1_0\n1,2",
-    "t,u\n0,\u0661\n1,2",
-    "t,u\n0,nan\n1,2",
-    "t,u\n0,1e999\n1,2",
-    't,u\n0,"1\n1,2',
-    "\ufefft,u\n0,1\n9,2",
-    "t,u\n0," + "1" * 200_000 + "\n1,2",
-    "t;u\n0;1\n1;2",
-    "t,u\n0,1\n1,2\0",
-    "t,v\n0,1\n9,2",
-    "t,u,v\n0,1,2\n9,1,2",
-    "\x00\x01",
-    "q1,q2\n1_0,2",
-    "q1,q2\n\u0661,2",
+    "", "u", "t,u", "t,u\n", "t,u\n0,1", "t,u\n0,1\n0,2", "t,u\n0,1\n1", "t,u\n0,x\n1,2", "t,t\n0,1\n1,2",
+    ",u\n0,1\n1,2", "t,u\n0,1_0\n1,2", "t,u\n0,\u0661\n1,2", "t,u\n0,nan\n1,2", "t,u\n0,1e999\n1,2",
+    't,u\n0,"1\n1,2', "\ufefft,u\n0,1\n9,2", "t,u\n0," + "1" * 200_000 + "\n1,2", "t;u\n0;1\n1;2",
+    "t,u\n0,1\n1,2\0", "t,v\n0,1\n9,2", "t,u,v\n0,1,2\n9,1,2", "\x00\x01", "q1,q2\n1_0,2", "q1,q2\n\u0661,2",
     "q1\n" + "1" * 200_000,
-]
+]  # fmt: skip
 
 
 def test_undamaged_model_is_accepted(tmp_path: Path) -> None:
@@ -295,21 +275,9 @@ step = 0.01
 steps = 3
 """
 WORDS = [
-    "",
-    " ",
-    "q[",
-    "q[-1]",
-    "q[9]",
-    "N = [[",
-    "N = " + "[" * 9000,
-    "near",
-    "0.1.2",
-    "((",
-    "zz",
-    "1/0",
-    "spin s",
+    "", " ", "q[", "q[-1]", "q[9]", "N = [[", "N = " + "[" * 9000, "near", "0.1.2", "((", "zz", "1/0", "spin s",
     "\0",
-]
+]  # fmt: skip
 
 
 @pytest.mark.sampled(1)

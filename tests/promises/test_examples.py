@@ -26,28 +26,12 @@ pytestmark = pytest.mark.long
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 SCRIPTS = (
-    "balanced_cart_pole",
-    "ceres_orbit",
-    "collisions_in_space",
-    "curves_and_quadratures",
-    "duffing_fit",
-    "eccentric_comet",
-    "elements_on_processes",
-    "field_on_two_processes",
-    "halo_orbits",
-    "hanging_chain",
-    "henon_heiles_map",
-    "custom_sympy_system",
-    "import_generated_stepper",
-    "inspect_derivation",
-    "joints",
-    "kepler_conservation",
-    "lennard_jones_liquid",
-    "logarithmic_hamiltonian",
-    "mechanism_from_joints",
-    "poincare_section",
-    "which_step",
-)
+    "balanced_cart_pole", "ceres_orbit", "collisions_in_space", "curves_and_quadratures", "duffing_fit",
+    "eccentric_comet", "elements_on_processes", "field_on_two_processes", "halo_orbits", "hanging_chain",
+    "henon_heiles_map", "custom_sympy_system", "import_generated_stepper", "inspect_derivation", "joints",
+    "kepler_conservation", "lennard_jones_liquid", "logarithmic_hamiltonian", "mechanism_from_joints",
+    "poincare_section", "which_step",
+)  # fmt: skip
 ENERGY_ERRORS = {
     "outer_solar_system": 1e-13,
     "pendulum": 1e-8,

@@ -221,24 +221,9 @@ def test_damaged_bytes_of_a_run_are_rejected_or_bounded(method):
 # Magnitudes.
 
 SIZES = [
-    0.0,
-    5e-324,
-    1e-310,
-    2.3e-308,
-    1e-200,
-    1e-16,
-    1e-3,
-    0.7,
-    1.0,
-    3.0,
-    40.0,
-    1e8,
-    1e100,
-    1e154,
-    1e155,
-    1e300,
+    0.0, 5e-324, 1e-310, 2.3e-308, 1e-200, 1e-16, 1e-3, 0.7, 1.0, 3.0, 40.0, 1e8, 1e100, 1e154, 1e155, 1e300,
     1.7e308,
-]
+]  # fmt: skip
 
 
 def oscillator(kind: str) -> sc.LagrangianSystem | sc.HamiltonianSystem:

@@ -26,18 +26,9 @@ VELOCITY_TERMS = (
 )
 """Each at most once: together they take less than a half from the masses below, which are at least 1 (|a|, |b| < 1)."""
 POTENTIAL_TERMS = (
-    "{x}*{y}",
-    "a*{x}**4/4",
-    "cos({x} + b*{y})",
-    "exp(-{x}**2 - {y}**2)",
-    "{x}*cos(2*t)",
-    "t**2*{y}**3/10",
-    "log(2 + {x}**2)",
-    "1/(1 + ({x} - {y})**2)",
-    "atan({x}*{y})",
-    "sqrt(3 + {x}**2 + t**2)",
-    "tanh(b*{y} - t)",
-)
+    "{x}*{y}", "a*{x}**4/4", "cos({x} + b*{y})", "exp(-{x}**2 - {y}**2)", "{x}*cos(2*t)", "t**2*{y}**3/10",
+    "log(2 + {x}**2)", "1/(1 + ({x} - {y})**2)", "atan({x}*{y})", "sqrt(3 + {x}**2 + t**2)", "tanh(b*{y} - t)",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
