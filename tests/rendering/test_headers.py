@@ -38,21 +38,9 @@ ELSEWHERE = {
 }
 """Headers that require libraries, a model, another header or a compiler for GPUs, and the tests that compile them."""
 CELLS = (
-    "kepler_monitor",
-    "double_adaptive",
-    "kepler_many",
-    "double_tangent",
-    "kepler_shooting",
-    "kepler_composition",
-    "vibration",
-    "damped",
-    "rods",
-    "ring_adaptive",
-    "ring_newton",
-    "ring_composition",
-    "rotors",
-    "swings",
-)
+    "kepler_monitor", "double_adaptive", "kepler_many", "double_tangent", "kepler_shooting", "kepler_composition",
+    "vibration", "damped", "rods", "ring_adaptive", "ring_newton", "ring_composition", "rotors", "swings",
+)  # fmt: skip
 GENERATED = (
     r"core/|newton/stages|newton/band|arrays/(?:arrays|lattice_transform|circulant|convolutions)|derivatives/linear"
     r"|mechanics/damping|double_double/(?!mixed_step|pair_)"
