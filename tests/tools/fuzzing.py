@@ -143,19 +143,8 @@ NUMBERS = """
 VALUE = re.compile(r'(?<![\w.])-?[0-9][\w.]*|"[^"\n]*"')
 """Numbers and quoted texts of a file."""
 EXTREME = (
-    "2000000000",
-    "99999999",
-    "-1",
-    "1e-300",
-    "-1e300",
-    "inf",
-    "nan",
-    "[]",
-    "{}",
-    "true",
-    "../x.csv",
-    "/dev/zero",
-)
+    "2000000000", "99999999", "-1", "1e-300", "-1e300", "inf", "nan", "[]", "{}", "true", "../x.csv", "/dev/zero",
+)  # fmt: skip
 NAMES = "x y z x x y t pi q q_dot p m sin exp e E I oo nan inf zoo S N Q".split()  # noqa: SIM905
 FUNCTIONS = """
     sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh exp log sqrt sqrt sin cos abs Abs eval __import__
