@@ -4,6 +4,7 @@ import mpmath
 import numpy as np
 import pytest
 import sympy
+from notation import lagrange
 from sympy import sin, sqrt
 
 import scvi_codegen as sc
@@ -107,9 +108,7 @@ def test_closed_form_and_compiled_step_agree(system, method):
 
 
 def test_derivation_names_avoid_names_of_the_system():
-    system = sc.LagrangianSystem.from_text(
-        name="clash", coordinates=["q"], lagrangian="h*q_dot**2/2 - w_1*q**2", parameters={"h": 1.0, "w_1": 2.0}
-    )
+    system = lagrange("clash", "q", "h*q_dot**2/2 - w_1*q**2", h=1.0, w_1=2.0)
     derived = sc.derive(system, sc.SVI(1, "gauss-legendre:2"))
     assert derived.step.name == "_h"
     stepper = sc.compile_stepper(system, sc.SVI(1, "gauss-legendre:2"))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from browsing import UNREADABLE, VIEWS, assert_it_asks_for_nothing, opened
 from html_page import Page
+from notation import lagrange
 from samples import compile_quickly
 
 import scvi_codegen as sc
@@ -25,9 +26,7 @@ METHODS = [
 
 @cache
 def falling() -> sc.LagrangianSystem:
-    return sc.LagrangianSystem.from_text(
-        name="falling", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - g*y", parameters={"g": 9.81}
-    )
+    return lagrange("falling", "x y", "(x_dot**2 + y_dot**2)/2 - g*y", g=9.81)
 
 
 @cache

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from notation import hamilton
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
@@ -226,9 +227,7 @@ def test_damped_steps_equal_those_of_fixed_point_iteration():
 
 
 def test_hamiltonians_with_too_many_couplings_are_refused():
-    all_pairs = sc.HamiltonianSystem.from_text(
-        "all pairs", coordinates=["q[N]"], hamiltonian="sum(i in N, p_q[i]**2/2) + sum(i < j in N, (q[i] - q[j])**4)"
-    )
+    all_pairs = hamilton("all pairs", "q[N]", "sum(i in N, p_q[i]**2/2) + sum(i < j in N, (q[i] - q[j])**4)")
     stepper = sc.compile_stepper(all_pairs, "svi:1", solver="newton", flags=QUICK_FLAGS)
     with pytest.raises(sc.StateError, match=r"at most 400 entries per row.*use solver='fixed-point'"):
         stepper.integrate({"q": np.arange(450.0)}, h=0.01, steps=1)

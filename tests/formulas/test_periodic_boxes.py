@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from notation import lagrange
 from scipy.spatial import cKDTree
 
 import scvi_codegen as sc
@@ -46,11 +47,8 @@ def test_derivatives_are_those_of_the_pieces() -> None:
 
 
 def pair(power: int) -> sc.LagrangianSystem:
-    return sc.LagrangianSystem.from_text(
-        "pair",
-        ["x", "y"],
-        f"(x_dot**2 + y_dot**2)/2 - positive_part(1 - (wrap(x - y, L)/1.2)**2)**{power}",
-        parameters={"L": 3.0},
+    return lagrange(
+        "pair", "x y", f"(x_dot**2 + y_dot**2)/2 - positive_part(1 - (wrap(x - y, L)/1.2)**2)**{power}", L=3.0
     )
 
 

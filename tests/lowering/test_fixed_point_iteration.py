@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 import pytest
 import sympy
+from notation import lagrange
 from samples import QUICK_FLAGS, pumped_cart_pole, tangle
 
 from scvi_codegen import SVI, LagrangianSystem, SolverOptions, Stepper, compile_stepper, hamiltonian_of, problem
@@ -51,9 +52,7 @@ def leaning() -> LagrangianSystem:
 
 def relativistic() -> LagrangianSystem:
     """Masses that depend on velocities alone."""
-    return LagrangianSystem.from_text(
-        name="relativistic", coordinates=["x", "y"], lagrangian="-sqrt(1 - x_dot**2/2 - y_dot**2/3) - x**2*y"
-    )
+    return lagrange("relativistic", "x y", "-sqrt(1 - x_dot**2/2 - y_dot**2/3) - x**2*y")
 
 
 def as_numbers(arguments, expression):

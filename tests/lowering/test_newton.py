@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from notation import lagrange
 from samples import lowered, pumped_chain
 
 import scvi_codegen as sc
@@ -24,9 +25,7 @@ def ring(seed: int | None = None) -> sc.Stepper:
     order = list(range(SIZE)) if seed is None else random.Random(seed).sample(range(SIZE), SIZE)
     kinetic = " + ".join(f"x{i}_dot**2/2" for i in range(SIZE))
     springs = "".join(f" - cosh(x{i} - x{(i + 1) % SIZE}) + x{i}*x{(i + 5) % SIZE}_dot/50" for i in range(SIZE))
-    system = sc.LagrangianSystem.from_text(
-        name="ring", coordinates=[f"x{i}" for i in order], lagrangian=kinetic + springs
-    )
+    system = lagrange("ring", [f"x{i}" for i in order], kinetic + springs)
     return sc.compile_stepper(system, sc.SVI(3), solver="newton")
 
 

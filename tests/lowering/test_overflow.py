@@ -2,15 +2,14 @@
 
 import numpy as np
 import pytest
+from notation import lagrange
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 from scvi_codegen.errors import StepFailedError
 
 OSCILLATOR = sc.LagrangianSystem.from_text(name="osc", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2")
-COUPLED = sc.LagrangianSystem.from_text(
-    name="pair", coordinates=["q", "r"], lagrangian="(q_dot**2 + r_dot**2 + q_dot*r_dot/2)/2 - q**2/2 - r**2/2 - q*r/3"
-)
+COUPLED = lagrange("pair", "q r", "(q_dot**2 + r_dot**2 + q_dot*r_dot/2)/2 - q**2/2 - r**2/2 - q*r/3")
 HAMILTONIAN = sc.HamiltonianSystem.from_text(name="mixed", coordinates=["q"], hamiltonian="p_q**2/2 + q**2/2 + p_q*q/3")
 ITERATED = [
     *((OSCILLATOR, method) for method in ("svi:2", "scvi:3", "sc:3")),

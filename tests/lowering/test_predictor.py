@@ -1,6 +1,7 @@
 """Predictor of fixed-point iterations: exact where the motion is a polynomial of the degree of the method's curves."""
 
 import pytest
+from notation import lagrange
 from numpy.polynomial import Polynomial
 
 import scvi_codegen as sc
@@ -77,9 +78,7 @@ def test_curves_of_rejected_steps_are_interpolated(kind):
 
 
 def test_rejected_steps_cost_few_iterations():
-    system = sc.LagrangianSystem.from_text(
-        name="kepler", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2)"
-    )
+    system = lagrange("kepler", "x y", "(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2)")
     run = sc.compile_stepper(system, "svi:8").integrate([1.5, 0.0], [0.0, 3**-0.5], t_end=2000.0, tolerance=1e-5)
     assert run.rejected_steps > run.steps / 10
     assert run.iterations.sum() / run.steps < 4.6  # 4.9 from the straight line

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from notation import lagrange
 from numpy.polynomial import Legendre
 from numpy.polynomial.legendre import leggauss
 
@@ -9,9 +10,7 @@ import scvi_codegen as sc
 from scvi_codegen.pipeline import program_of
 
 FREE = sc.LagrangianSystem.from_text(name="quartic", coordinates=["x"], lagrangian="x_dot**2/2 - x**4")
-HELD = sc.LagrangianSystem.from_text(
-    name="rod", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 = 1"]
-)
+HELD = lagrange("rod", "x y", "(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 = 1"])
 CASES = {
     **{f"velocities, {s}": (FREE, sc.SVI(s), s - 1) for s in (2, 5)},
     "velocities, Gauss": (FREE, sc.Gauss(4), 3),

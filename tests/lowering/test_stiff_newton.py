@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from notation import lagrange
 from samples import QUICK_FLAGS
 
-from scvi_codegen import SVI, LagrangianSystem, RadauIIA, SolverOptions, StepFailedError, compile_stepper
+from scvi_codegen import SVI, RadauIIA, SolverOptions, StepFailedError, compile_stepper
 from scvi_codegen.exact.step import derived_step
 
 STIFFNESS = 1e8
@@ -12,11 +13,8 @@ EPSILON = 2.0**-52
 
 
 def spring_pendulum():
-    return LagrangianSystem.from_text(
-        name="spring pendulum",
-        coordinates=["x", "y"],
-        lagrangian="(x_dot**2 + y_dot**2)/2 - 9.81*y - k/2*(sqrt(x**2 + y**2) - 1)**2",
-        parameters={"k": STIFFNESS},
+    return lagrange(
+        "spring pendulum", "x y", "(x_dot**2 + y_dot**2)/2 - 9.81*y - k/2*(sqrt(x**2 + y**2) - 1)**2", k=STIFFNESS
     )
 
 

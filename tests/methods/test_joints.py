@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from notation import lagrange
 from numpy.testing import assert_allclose
 
-from scvi_codegen import SVI, LagrangianSystem, compile_stepper
+from scvi_codegen import SVI, compile_stepper
 
 JOINTS: Any = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[2] / "examples" / "joints.py")))
 G = JOINTS.GRAVITY
@@ -25,9 +26,7 @@ def ran(mechanism: Any, steps: int = 200) -> Any:
 def reduced(lagrangian: str, start: list[float], velocity: list[float], t: np.ndarray, **parameters: float) -> Any:
     """(n, m) positions of the same motion in coordinates that need no constraint, by adaptive steps."""
     names = [f"u{k}" for k in range(len(start))]
-    system = LagrangianSystem.from_text(
-        name="reduced", coordinates=names, lagrangian=lagrangian, parameters={"g": G, **parameters}
-    )
+    system = lagrange("reduced", names, lagrangian, parameters={"g": G, **parameters})
     run = compile_stepper(system, SVI(8)).integrate(start, velocity=velocity, t_end=float(t[-1]))
     return run.at(t)[0]
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from notation import lagrange
 
 import scvi_codegen as sc
 from scvi_codegen import ModelFileError, StateError, SystemDefinitionError, generate_package, load_package
@@ -127,9 +128,7 @@ def test_integrate_uses_the_controller(shaken: Path) -> None:
 
 
 def test_steps_end_at_breakpoints_of_inputs() -> None:
-    system = sc.LagrangianSystem.from_text(
-        name="pushed", coordinates=["x"], lagrangian="x_dot**2/2 - x**4/4 + x*u", inputs=["u"]
-    )
+    system = lagrange("pushed", "x", "x_dot**2/2 - x**4/4 + x*u", inputs="u")
     pushes = {"u": ((0.0, 1.0, 2.5, 6.0), (0.3, -1.0, 0.5, 0.5), "constant")}
     exact = sc.compile_stepper(system, sc.SVI(8)).integrate([1.0], [0.0], inputs=pushes, t_end=6.0).q[-1]
     common: dict[str, Any] = {

@@ -1,9 +1,10 @@
 """Leapfrog of two coupled oscillators whose coupling depends on time, with exact first derivatives by all numbers."""
 
 import numpy as np
+from notation import lagrange
 from samples import QUICK_FLAGS
 
-from scvi_codegen import LagrangianSystem, StoermerVerlet, compile_stepper
+from scvi_codegen import StoermerVerlet, compile_stepper
 
 STEP_INPUTS = ("x", "y", "p_x", "p_y", "m", "k", "a", "w", "t", "h")
 DEFAULTS = {"m": 1.0, "k": 1.0, "a": 0.0, "w": 1.0}
@@ -16,11 +17,8 @@ STEPS, EVERY = 150, 50
 
 def stepper():
     """Compiled; a flow that took default parameters, t = 0 or the time of another piece is off by more than 1e-3."""
-    system = LagrangianSystem.from_text(
-        name="pumped",
-        coordinates=["x", "y"],
-        lagrangian="m*(x_dot**2 + y_dot**2)/2 - k*x**2/2 - y**2/2 - a*cos(w*t)*x*y",
-        parameters=DEFAULTS,
+    system = lagrange(
+        "pumped", "x y", "m*(x_dot**2 + y_dot**2)/2 - k*x**2/2 - y**2/2 - a*cos(w*t)*x*y", parameters=DEFAULTS
     )
     return compile_stepper(system, StoermerVerlet(), flags=QUICK_FLAGS)
 

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from notation import lagrange
 from samples import compile_quickly
 
 import scvi_codegen as sc
@@ -37,9 +38,7 @@ def is_pendulum(run):
 
 
 def run_with(lagrangian: str, coordinates: list[str], **parameters: float) -> sc.Trajectory:
-    system = sc.LagrangianSystem.from_text(
-        name="mine", coordinates=coordinates, parameters=parameters, lagrangian=lagrangian
-    )
+    system = lagrange("mine", coordinates, lagrangian, parameters=parameters)
     m = len(coordinates)
     return compile_quickly(system, sc.SVI(2)).integrate([0.1] * m, [0.2] * m, h=0.01, steps=5)
 

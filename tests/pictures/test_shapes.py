@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from notation import lagrange
 from programs import needs
 
 import scvi_codegen as sc
@@ -103,9 +104,7 @@ def test_a_family_of_points_is_listed_by_its_name():
 
 
 def test_pictures_of_arrays_and_rotations_use_entries():
-    chain = sc.LagrangianSystem.from_text(
-        "chain", coordinates=["q[N]"], lagrangian="sum(i in N, q_dot[i]**2/2)-sum(i in 0..N-2, (q[i+1]-q[i])**2)"
-    )
+    chain = lagrange("chain", "q[N]", "sum(i in N, q_dot[i]**2/2)-sum(i in 0..N-2, (q[i+1]-q[i])**2)")
     model = sc.Model(system=chain, method="svi:2", q={"q": np.arange(4.0)}, h=0.1, steps=1)
     shape = shape_of_picture(drawn_system_of_model(model), {"points": {"mean": ["sum(i in 4, q[i])/4", "q[2]"]}})
     assert np.allclose(shape.positions(0.0, np.arange(4.0)[np.newaxis], np.zeros((1, 4)), ()), [[[1.5, 2.0]]])

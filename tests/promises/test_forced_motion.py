@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 import sympy
+from notation import lagrange
 from scipy.integrate import solve_ivp
 
 import scvi_codegen as sc
@@ -134,9 +135,7 @@ def test_hamiltonian_with_forces_has_the_same_step(quickly_compiled, method):
 
 def test_compositions_accept_forces_of_position_and_time(quickly_compiled):
     """x'' = -x + sin(2 t): the solution from rest is (2 sin t - sin 2t) / 3."""
-    system = sc.LagrangianSystem.from_text(
-        name="pushed", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2", forces={"x": "sin(2*t)"}
-    )
+    system = lagrange("pushed", "x", "x_dot**2/2 - x**2/2", forces={"x": "sin(2*t)"})
     errors = []
     for count in (4, 8):
         run = quickly_compiled(system, sc.Composition(8)).integrate([0.0], [0.0], h=SPAN / count, steps=count)

@@ -8,9 +8,9 @@ from itertools import combinations
 import numpy as np
 import oracle
 import pytest
+from notation import lagrange
 
 from scvi_codegen.errors import MethodError
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import (
     SCVI,
     SVI,
@@ -195,9 +195,7 @@ def with_gauge(name, order):
     """Duffing's oscillator with d/dt (q^order (1 + t)) added to L, and the gradient of that function."""
     lagrangian = "q_dot**2/2 + alpha*q**2/2 - q**4/4 + q*cos(t)/3"
     gauge = f" + {order}*q**{order - 1}*q_dot*(1 + t) + q**{order}"
-    return LagrangianSystem.from_text(
-        name=name, coordinates=["q"], parameters={"alpha": 1.2}, lagrangian=lagrangian + (gauge if order else "")
-    )
+    return lagrange(name, "q", lagrangian + (gauge if order else ""), alpha=1.2)
 
 
 @pytest.mark.sampled(3)

@@ -8,6 +8,7 @@ import oracle
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from notation import lagrange
 
 import scvi_codegen as sc
 from scvi_codegen.methods.method import Method
@@ -63,9 +64,7 @@ def systems(draw):
     choices = st.tuples(st.sampled_from((*VELOCITY_TERMS, *POTENTIAL_TERMS)), pairs)
     chosen = st.lists(choices, min_size=1, max_size=5, unique_by=lambda choice: choice[0])
     terms = [term.format(x=x, y=y) for term, (x, y) in draw(chosen)]
-    return sc.LagrangianSystem.from_text(
-        name="random", coordinates=names, lagrangian=lagrangian(names, mass, terms), parameters={"a": 0.7, "b": -0.4}
-    )
+    return lagrange("random", names, lagrangian(names, mass, terms), a=0.7, b=-0.4)
 
 
 def quadratures(least):

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import sympy
+from notation import lagrange
 
 import scvi_codegen as sc
 from scvi_codegen import as_method, compiler, pipeline, problem
@@ -38,9 +39,7 @@ def made(tmp_path, monkeypatch) -> list[str]:
 
 
 def spring(stiffness: float = 1.0) -> sc.LagrangianSystem:
-    return sc.LagrangianSystem.from_text(
-        name="spring", coordinates=["q"], lagrangian="q_dot**2/2 - k*q**2/2", parameters={"k": stiffness}
-    )
+    return lagrange("spring", "q", "q_dot**2/2 - k*q**2/2", k=stiffness)
 
 
 def test_cached_derivations_are_not_repeated(made):

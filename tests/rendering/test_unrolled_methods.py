@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from notation import hamilton
 from tiers import first_of_each
 
 from scvi_codegen import SCVI, SVI, Gauss, StoermerVerlet, compile_stepper, generate_source, problem
-from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.native.building import PORTABLE_FLAGS
 from scvi_codegen.rendering.kernels import functions
 from scvi_codegen.runtime.core.stepper import Stepper
@@ -20,9 +20,7 @@ pytestmark = pytest.mark.usefixtures("as_users_compile")
 
 GENERATED = Path(__file__).parents[2] / "generated" / "two_point_pendulum.c"
 TWO_POINTS = SCVI(1, "gauss-legendre:2")
-HAMILTONIAN = HamiltonianSystem.from_text(
-    name="pendulum", coordinates=["x"], momenta=["y"], hamiltonian="y**2*(1 + x**2/5)/2 - cos(x)"
-)
+HAMILTONIAN = hamilton("pendulum", "x", "y**2*(1 + x**2/5)/2 - cos(x)", momenta="y")
 CASES = {
     "pendulum, two points": (PENDULUM, TWO_POINTS),
     "pendulum, trapezium": (PENDULUM, StoermerVerlet()),

@@ -6,6 +6,7 @@ import subprocess
 
 import numpy as np
 import pytest
+from notation import lagrange
 from programs import needs
 
 import scvi_codegen as sc
@@ -64,9 +65,7 @@ def test_sums_of_eight_vectors_have_the_bits_of_single_ones(tmp_path):
 @pytest.mark.parametrize("k", [1, 3, 5, 7])
 def test_inverse_roots_are_right_to_two_units(tmp_path, k, flags):
     compiler = needs("cc")
-    system = sc.LagrangianSystem.from_text(
-        name="power", coordinates=["q"], lagrangian=f"q_dot**2/2 - q**({2 - k}/2)", parameters={}
-    )
+    system = lagrange("power", "q", f"q_dot**2/2 - q**({2 - k}/2)")
     source, _ = sc.generate_source(system, sc.SVI(8), prefix="power")
     source.write(tmp_path)
     (tmp_path / "check.c").write_text(CHECK % (k, k))

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import sympy
+from notation import lagrange
 
 import scvi_codegen as sc
 from scvi_codegen.models.model_files.model_file import dump_model, parse_model
@@ -89,9 +90,7 @@ def test_point_given_in_space_between_two_bodies_and_a_direction_is_a_potential_
 
 def test_points_of_systems_without_rotations():
     force = {"point": ["l*sin(a)", "0", "-l*cos(a)"], "force": ["c", "0", "-g"]}
-    system = sc.LagrangianSystem.from_text(
-        "pendulum", ["a"], "l**2*a_dot**2/2", parameters={"l": 0.7, "g": 9.8, "c": 1.0}, point_forces=[force]
-    )
+    system = lagrange("pendulum", "a", "l**2*a_dot**2/2", l=0.7, g=9.8, c=1.0, point_forces=[force])
     by_hand = sympy.sympify("c*l*cos(a) - g*l*sin(a)")
     assert sympy.simplify(sympy.sympify(str(system.forces[0])) - by_hand) == 0
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from notation import lagrange
 from samples import QUICK_FLAGS
 from scipy.integrate import solve_ivp
 
@@ -67,9 +68,7 @@ def test_motion_solves_newtons_equations(known):
 
 
 def test_the_only_array_needs_no_name():
-    atoms = sc.LagrangianSystem.from_text(
-        name="atoms", coordinates=["r[2, 3]"], lagrangian="sum(i in 2, k in 3, r_dot[i, k]**2/2 - r[i, k]**2/2)"
-    )
+    atoms = lagrange("atoms", ["r[2, 3]"], "sum(i in 2, k in 3, r_dot[i, k]**2/2 - r[i, k]**2/2)")
     stepper = sc.compile_stepper(atoms, "svi:4")
     start = np.arange(6.0).reshape(2, 3)
     run = stepper.integrate(start, 0 * start, h=0.1, steps=3)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from notation import lagrange
 
 import scvi_codegen as sc
 from scvi_codegen.models.systems import point_vortices
@@ -54,9 +55,7 @@ def test_adaptive_steps_do_not_drift(angle):
     assert abs(energy / energy[0] - 1).max() < 6e-13
 
 
-ROD = sc.LagrangianSystem.from_text(
-    name="rod", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 = 1"]
-)
+ROD = lagrange("rod", "x y", "(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 = 1"])
 RODS = sc.LagrangianSystem.from_text(
     name="two rods",
     coordinates=["x1", "y1", "x2", "y2"],

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from notation import lagrange
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
@@ -50,9 +51,7 @@ def test_velocity_in_the_kernel_of_the_mass_matrix_is_rejected(coordinates, lagr
 
 def test_velocity_with_zero_momentum_is_accepted():
     """In a magnetic field p = v - y may be 0."""
-    system = sc.LagrangianSystem.from_text(
-        name="drifting", coordinates=["x", "y"], lagrangian="x_dot**2/2 + y_dot**2/2 - y*x_dot"
-    )
+    system = lagrange("drifting", "x y", "x_dot**2/2 + y_dot**2/2 - y*x_dot")
     run = sc.compile_stepper(system, "svi:2", flags=QUICK_FLAGS).start([0.0, 1.0], velocity=[1.0, 0.0], h=0.1)
     assert run.p.tolist() == [0.0, 0.0]
 

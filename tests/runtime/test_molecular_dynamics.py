@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from notation import lagrange
 
 import scvi_codegen as sc
 
@@ -102,9 +103,7 @@ def test_observers_are_the_functions_of_trajectories() -> None:
 
 
 def test_free_particles_are_an_ideal_gas() -> None:
-    line = sc.LagrangianSystem.from_text(
-        name="line", coordinates=["q[N]"], parameters={"L": 2.0}, lagrangian="sum(i in N, q_dot[i]**2/2) + L/L"
-    )
+    line = lagrange("line", "q[N]", "sum(i in N, q_dot[i]**2/2) + L/L", L=2.0)
     generator = np.random.default_rng(8)
     start = {"q": generator.uniform(size=400) * 2}
     run = sc.compile_stepper(line, "svi:2").integrate(

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from notation import lagrange
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
@@ -24,9 +25,7 @@ def stepper() -> sc.Stepper:
 
 @pytest.fixture(scope="module")
 def arrays() -> sc.Stepper:
-    system = sc.LagrangianSystem.from_text(
-        name="pendulums", coordinates=["q[N]"], lagrangian="sum(i in N, q_dot[i]**2/2 + cos(q[i]))"
-    )
+    system = lagrange("pendulums", "q[N]", "sum(i in N, q_dot[i]**2/2 + cos(q[i]))")
     return sc.compile_stepper(system, "svi:2", flags=QUICK_FLAGS)
 
 

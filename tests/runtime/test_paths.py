@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from notation import lagrange
 from scipy.special import ellipk
 
 import scvi_codegen as sc
@@ -212,9 +213,7 @@ def test_constrained_index_is_that_of_the_angle():
 
 
 def test_paths_of_arrays_of_run_time_sizes():
-    chain = sc.LagrangianSystem.from_text(
-        "chain", ["u[N]"], "sum(i in N, u_dot[i]**2/2 - u[i]**4/4) - sum(i in 0..N-2, (u[i+1] - u[i])**2/2)"
-    )
+    chain = lagrange("chain", "u[N]", "sum(i in N, u_dot[i]**2/2 - u[i]**4/4) - sum(i in 0..N-2, (u[i+1] - u[i])**2/2)")
     stepper = sc.compile_stepper(chain, "svi:3")
     ends = np.array([0.1, -0.2, 0.3]), np.array([0.4, 0.1, 0.2])
     path = stepper.path(*ends, 2.0, steps=12)

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from notation import lagrange
 
-from scvi_codegen import LagrangianSystem, MethodError, MethodWarning, compile_stepper, problem
+from scvi_codegen import MethodError, MethodWarning, compile_stepper, problem
 from scvi_codegen.methods import SVI, method_from_specification
 from scvi_codegen.tables.basis import cardinal_values
 from scvi_codegen.tables.precision import mp
@@ -251,9 +252,7 @@ def test_trigonometric_curves_are_more_accurate_on_a_perturbed_oscillator() -> N
 @pytest.mark.full
 def test_splines_are_more_accurate_where_a_force_has_a_kink() -> None:
     """A triangular wave drives a pendulum; its kinks lie in the middle of the steps, where the splines have theirs."""
-    system = LagrangianSystem.from_text(
-        name="kinked drive", coordinates=["q"], lagrangian="q_dot**2/2 + cos(q) + q*asin(sin(t))/5"
-    )
+    system = lagrange("kinked drive", "q", "q_dot**2/2 + cos(q) + q*asin(sin(t))/5")
     start, h = ([0.5], [0.0]), np.pi
     fine = stepper(system, SVI(8)).integrate(*start, h=h / 16, steps=16 * 8)
     errors = [

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from notation import lagrange
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "runtime"))
 
@@ -36,9 +37,7 @@ RUNS: dict[str, Callable[[], tuple[Any, Any, Any, float]]] = {
 
 
 def _rod() -> sc.Stepper:
-    system = sc.LagrangianSystem.from_text(
-        name="rod", coordinates=("x", "y"), lagrangian="(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 - 1"]
-    )
+    system = lagrange("rod", "x y", "(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 - 1"])
     return sc.compile_stepper(system, "svi:8")
 
 

@@ -12,6 +12,7 @@ import heyoka as hy
 import mpmath
 import numpy as np
 import sympy as sp
+from notation import lagrange
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "oracles"))
 from motions import MOTIONS, RECORDS, Motion
@@ -91,9 +92,7 @@ def main() -> None:
     mpmath.mp.dps = 45
     records = {}
     for name, motion in MOTIONS.items():
-        system = sc.LagrangianSystem.from_text(
-            name="motion", coordinates=motion.coordinates.split(), lagrangian=motion.lagrangian, forces=motion.forces
-        )
+        system = lagrange("motion", motion.coordinates.split(), motion.lagrangian, forces=motion.forces)
         first, last = motion.span
         stepper = sc.compile_stepper(system, motion.method)
         run = stepper.integrate(motion.q, motion.p, t=first, t_end=last, tolerance=1e-12, check_growth=False)
