@@ -306,10 +306,6 @@ def test_arguments_of_derivatives_are_checked(name, call, error, message):
 def test_runs_without_derivatives_are_rejected():
     with pytest.raises(sc.StateError, match="whole steps"):
         MOTIONS["driven"].run(steps=9, t=0.0, t_eval=[0.03, 0.1]).sensitivity()
-    kepler = sc.problem("kepler")
-    clocked = sc.compile_stepper(sc.reparametrise(kepler.system, "frequency"), sc.SVI(4), flags=QUICK_FLAGS)
-    with pytest.raises(sc.MethodError, match="hessian_product is not available"):
-        clocked.integrate(kepler.q, [0.0, 1.0], h=0.1, steps=3).hessian_product(np.ones((4, 4)), np.ones(4))
     hill = sc.LagrangianSystem.from_text(name="hill", coordinates=["q"], lagrangian="q_dot**2/2 + q**2/2")
     with pytest.raises(sc.StateError, match="derivatives exceed the largest double"):
         sc.compile_stepper(hill, sc.SVI(2)).integrate([0.0], [0.0], h=0.5, steps=1600).tangent()
