@@ -51,6 +51,7 @@ from scvi_codegen.mechanics.term_groups import roll_terms
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.discretise import discretise, discretised_form
 from scvi_codegen.methods.method import Method
+from scvi_codegen.methods.stage_system import tables_in_two_words
 from scvi_codegen.native.announcements import announced
 from scvi_codegen.rendering.events import EventFormulas, with_events
 from scvi_codegen.rendering.kernels.simd import Fallback
@@ -290,7 +291,11 @@ class Sources:
         """Return the lowered program; with ``fallback`` it also contains Newton's iteration as a fallback."""
         if fallback not in self._programs:
             with announced(f"deriving the equations of {self.system.name} by {self.method.name}"):
-                self._programs[fallback] = self._derived(solver=self.solver, fallback=fallback)
+                program = self._derived(solver=self.solver, fallback=fallback)
+                if self.precision == DOUBLE_DOUBLE and not self._corrected(program):
+                    with tables_in_two_words():
+                        program = self._derived(solver="newton" if self.solver == "auto" else self.solver)
+                self._programs[fallback] = program
         return self._programs[fallback]
 
     @property
@@ -317,7 +322,8 @@ class Sources:
         """
         program = self.program()
         if self.precision == DOUBLE_DOUBLE:
-            derivatives = self._point_derivatives()
+            self._check_double_double()
+            derivatives = self._corrected(program)
             control = control_of(program, self.controller, self.system) if controlled else None
             return render_double_double(program, derivatives, control), self.interface
         control = control_of(program, self.controller, self.system, self.g)
@@ -326,34 +332,37 @@ class Sources:
         fallback: Fallback | None = "external" if self.uses_fallback_library else None
         return render(program, control if controlled else None, fallback=fallback), self.interface
 
-    def _point_derivatives(self) -> PointDerivatives:
-        """Return the derivatives of forces for the correction to two words.
+    def _corrected(self, program: Program) -> PointDerivatives | None:
+        """Return the derivatives of forces for the correction of a fixed-point iteration to two words, if it has one.
 
-        Raises:
-            MethodError: if the system or the method has no steps in double-double arithmetic.
+        It has for constant masses and forces of position and time that have not too many derivatives.
         """
-        fixed_point = self.program().fixed_point
+        fixed_point = program.fixed_point
+        if fixed_point is None or fixed_point.name != "separable":
+            return None
+        return point_derivatives_of(self.system, fixed_point)
+
+    def _check_double_double(self) -> None:
+        """Raise :class:`MethodError` if the system or the method has no steps in double-double arithmetic."""
         reason = ""
         if self.of_arrays:
             reason = "arrays have sizes known at run time: pass sizes={..}"
         elif self.g is not None or self.system.clock:
             reason = "time is transformed: use fixed steps h in physical time"
-        elif self.system.constraints:
-            reason = "it has constraints: use independent coordinates (rods in a plane: eliminate_constraints)"
-        elif self.solver not in ("auto", "fixed-point"):
-            reason = f"solver={self.solver!r} is not available: omit it"
-        elif fixed_point is None or fixed_point.name != "separable":
+        elif self.system.damping != 0:
+            reason = 'it has a damping: write it as forces, "-gamma*p"'
+        elif forms_of(self.system).one_form:
+            reason = "its velocities do not determine its momenta: use precision='double'"
+        elif self.solver == "fixed-point" and not self._corrected(self.program()):
             reason = (
-                "it requires constant diagonal masses, forces of positions and time, and SVI, spectral collocation, "
-                "SCVI or a Runge-Kutta method with at most 32 points"
+                f"solver={self.solver!r} requires constant diagonal masses and forces of position and time: omit it"
             )
-        derivatives = None if reason or fixed_point is None else point_derivatives_of(self.system, fixed_point)
-        if derivatives is None:
-            reason = reason or "its forces have too many derivatives: use precision='double'"
+        elif self.solver == "explicit":
+            reason = "solver='explicit' is not available: omit it"
+        if reason:
             raise MethodError(
                 f"precision='double-double' is not available for '{self.system.name}' by {self.method.name}: {reason}"
             )
-        return derivatives
 
     def fallback(self) -> Source | None:
         """Return the source with Newton's iteration if the integrator itself contains none."""

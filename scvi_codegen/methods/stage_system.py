@@ -27,7 +27,9 @@ method, in 60 digits, independent of the system. Stage equations without a shape
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from itertools import count
@@ -41,6 +43,7 @@ from scvi_codegen.tables.quadrature import Quadrature
 from scvi_codegen.tables.tableau import Tableau
 
 DYADIC_BITS = 52
+_WORDS: ContextVar[int] = ContextVar("words of the entries of tables", default=1)
 ROUNDING = mp.mpf("1e-50")
 """Bound below which entries are set to 0: round-off of sums that are 0."""
 
@@ -329,9 +332,19 @@ class ScalarStageGroup(StagePoints):
         )
 
 
+@contextmanager
+def tables_in_two_words() -> Iterator[None]:
+    """Let :func:`dyadic` round to twice as many bits: entries of size up to 1 are then exact as double-double numbers."""
+    token = _WORDS.set(2)
+    try:
+        yield
+    finally:
+        _WORDS.reset(token)
+
+
 def dyadic(entries: Sequence[Sequence[Number]]) -> Matrix:
     """Round to multiples of 2^-52, so that entries of size up to 1 and their differences are exact in binary64."""
-    unit = mp.ldexp(1, DYADIC_BITS)
+    unit = mp.ldexp(1, DYADIC_BITS * _WORDS.get())
     return tuple(tuple(mp.nint(x * unit) / unit for x in line) for line in entries)
 
 

@@ -185,18 +185,22 @@ def render_derivatives(derivatives: Derivatives) -> Source:
     return _render(program.prefix, context | {"derivatives": derivatives, "unrolled_equations": None})
 
 
-def render_double_double(program: Program, derivatives: PointDerivatives, control: Control | None = None) -> Source:
-    """Return the source of a separable program in double-double arithmetic; control as of :func:`render`.
+def render_double_double(
+    program: Program, derivatives: PointDerivatives | None, control: Control | None = None
+) -> Source:
+    """Return the source of a program in double-double arithmetic; control as of :func:`render`.
 
     Args:
-        program: with a fixed-point iteration of separable systems, and without Newton's method.
-        derivatives: of the forces at the points.
+        program: with a fixed-point iteration of separable systems, or with Newton's method, not with both.
+        derivatives: of the forces at the points of a fixed-point iteration.
 
     Raises:
         MethodError: for a function that has no double-double form.
     """
     fixed_point = program.fixed_point
-    assert fixed_point is not None  # by the caller
+    if fixed_point is None:
+        return _render_mixed_newton(program, control)
+    assert derivatives is not None  # by the caller
     mass = fixed_point.constant_mass
     assert mass is not None  # of separable systems
     tables = [replace(each, in_two_parts=not each.is_matrix or each.in_two_parts) for each in fixed_point.own_tables]
@@ -214,6 +218,28 @@ def render_double_double(program: Program, derivatives: PointDerivatives, contro
             "of_vectors": vectors,
             "functions": uses_functions((*numbers, *vectors)),
         },
+        "own_headers": {**arithmetic_headers(), **cast("Mapping[str, str]", context["own_headers"])},
+    }
+    return _render(program.prefix, context)
+
+
+def _render_mixed_newton(program: Program, control: Control | None) -> Source:
+    """Return the source of a program with Newton's method, whose solution is corrected in pairs."""
+    quantities, constraints = program.quantities, program.constraints
+    of_states = (
+        *(group.value for group in program.equations.stage_groups),
+        *(quantities.energy, quantities.inverse_legendre, quantities.momentum_kernel),
+        constraints and constraints.motion,
+    )
+    with_partials = quantities.legendre, constraints and constraints.kernel
+    kernels = (
+        *(kernel for kernel in of_states if kernel),
+        *(replace(kernel, values=len(kernel.results)) for kernel in with_partials if kernel),
+    )
+    context = _context(program, DOUBLE, control)
+    context |= {
+        "unrolled_equations": None,
+        "two_words": {"of_numbers": kernels, "functions": uses_functions(kernels)},
         "own_headers": {**arithmetic_headers(), **cast("Mapping[str, str]", context["own_headers"])},
     }
     return _render(program.prefix, context)

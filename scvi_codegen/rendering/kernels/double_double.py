@@ -11,7 +11,7 @@ from functools import cache
 from scvi_codegen.errors import MethodError
 from scvi_codegen.files.cache import template_folder
 from scvi_codegen.ir.kernel import Constant, Expression, Kernel, Load, Number
-from scvi_codegen.rendering.kernels.printer import DOUBLE, INVERSE_ROOT, print_number, scalar_functions
+from scvi_codegen.rendering.kernels.printer import INVERSE_ROOT, scalar_functions
 from scvi_codegen.rendering.kernels.simd import Lanes
 from scvi_codegen.rendering.text import table, wrapped, wrapped_comment, wrapped_prototype
 from scvi_codegen.tables.precision import mp
@@ -65,8 +65,8 @@ class _PairPrinter:
     def printed(self, expression: Expression) -> _Printed:
         """Return the source of an expression."""
         if isinstance(expression, Constant):
-            text, rest = print_number(expression.value), DOUBLE.rest(expression.value)
-            return _Printed(f"dd_of({text}, {print_number(rest)})", "dd") if rest else _Printed(text, "word")
+            high, low = _words(mp.convert(expression.value), 2)  # of small constants as well, unlike Target.rest
+            return _Printed(f"dd_of({high}, {low})", "dd") if float(low) else _Printed(high, "word")
         if isinstance(expression, Load):
             return self._load(expression)
         operands = [self.printed(each) for each in expression.operands]

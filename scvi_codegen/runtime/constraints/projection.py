@@ -20,6 +20,7 @@ from scvi_codegen.rendering.text import INPUT_PRECISION, LARGEST_VIOLATION, ROUN
 from scvi_codegen.runtime.core.features import require
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array, Parameters, States, inputs_not_given, missing_input
+from scvi_codegen.runtime.core.words import block_of
 from scvi_codegen.runtime.rotations.states import checked_pair, checked_states
 
 MOST_SHOWN, MOST_DENSE = 4, 64
@@ -37,8 +38,9 @@ def constraint_values(stepper: Integrator, q: States, p: States, t: ArrayLike, p
 def multipliers(stepper: Integrator, q: States, p: States, t: ArrayLike, parameters: Parameters) -> Array:
     """Return (n, c) lambda of d/dt L_v = L_q + f + g_q^T lambda at states, in physical time t."""
     times, positions, momenta = _of_constrained(stepper, q, p, t)
-    values = np.empty((len(times), len(stepper.constraints)))
+    values = np.empty((len(times), len(stepper.constraints) * stepper.interface.words))
     _call(stepper, "multipliers", times, positions, momenta, parameters, values)
+    values = stepper._numbers(values)
     if stepper.interface.energy_parameter:
         values /= stepper.rates(positions, momenta, parameters)[:, np.newaxis]
     return values
@@ -56,20 +58,20 @@ def projected(
     """
     q0, p0 = checked_pair(stepper.interface, q, p)
     _of_constrained(stepper, q0, p0, t)
-    binding, q1, p1 = stepper.binding, np.empty_like(q0), np.empty_like(p0)
-    values = stepper._parameters(parameters)
+    binding, (q1, p1) = stepper.binding, np.empty((2, len(q0) * stepper.interface.words))
+    before, values = (block_of(q0), block_of(p0)), block_of(stepper._parameters(parameters))
     status = binding.function("project")(
-        checked_number(t, "the time t"), *map(binding.pointer, (q0, p0, values, q1, p1)), binding.workspace()
+        checked_number(t, "the time t"), *map(binding.pointer, (*before, values, q1, p1)), binding.workspace()
     )
     if status:
         if wrong := _dependent(stepper, q0, t, parameters, nearest=True):
             raise StateError(f"projection onto the constraints failed near q = {_shown(q0)}: {wrong}")
         _refuse(stepper, status, q0)
     apart = np.empty(2)
-    status = binding.function("apart")(t, *map(binding.pointer, (q0, p0, q1, p1, values, apart)), binding.workspace())
+    status = binding.function("apart")(t, *map(binding.pointer, (*before, q1, p1, values, apart)), binding.workspace())
     if status:
         _refuse(stepper, status, q0)
-    return q1, p1, apart
+    return stepper._numbers(q1), stepper._numbers(p1), apart
 
 
 def consistent(
@@ -89,7 +91,7 @@ def consistent(
     if check_rank and (wrong := _dependent(stepper, q1, t, parameters)):
         raise StateError(f"{wrong} (q = {_shown(q1)})")
     moved = float(apart.max())
-    if moved <= ROUNDING_UNITS * np.finfo(float).eps:
+    if moved <= ROUNDING_UNITS * np.finfo(float).eps ** stepper.interface.words:
         return q0, p0
     if moved <= INPUT_PRECISION:
         return q1, p1
@@ -145,10 +147,10 @@ def _of_constrained(stepper: Integrator, q: States, p: States, t: ArrayLike) -> 
 def _call(
     stepper: Integrator, name: str, times: Array, q: Array, p: Array, parameters: Parameters, *results: Array
 ) -> None:
-    pointer = stepper.binding.pointer
-    values = stepper._parameters(parameters)
+    times = times if stepper.interface.words == 1 else times[:, None]
+    arguments = *map(block_of, (times, q, p, stepper._parameters(parameters))), *results
     status = stepper.binding.function(name)(
-        len(times), *map(pointer, (times, q, p, values, *results)), stepper.binding.workspace()
+        len(times), *map(stepper.binding.pointer, arguments), stepper.binding.workspace()
     )
     if status:
         _refuse(stepper, status, q)

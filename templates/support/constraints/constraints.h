@@ -72,12 +72,13 @@ static real largest_of(const real *x)
   return largest;
 }
 
+#ifndef DOUBLE_DOUBLE /* pair_constraints.h */
 /* Computes g, its rate G v + g_t, and the velocity u + M of a state. */
 static int constrained(real t, const real *q, const real *p, const real *parameters, real *u, real *g, real *rate,
     real *workspace)
 {
   real value[M + 2 * CONSTRAINTS], derivative[CONSTRAINT_ENTRIES];
-  const int status = NAME(velocity)(t, q, p, parameters, u + M, workspace);
+  const int status = find_velocity(t, q, p, parameters, u + M, workspace);
   if (status != OK)
     return status;
   memcpy(u, q, sizeof(real) * M);
@@ -99,6 +100,7 @@ int NAME(constraint_values)(long long count, const real *t, const real *q, const
   }
   return OK;
 }
+#endif
 
 /* Sum of squares of g; infinite if g is not finite. */
 static real misfit(real t, const real *q, const real *parameters, real *g)
@@ -165,6 +167,15 @@ static int project_position(real t, real *u, const real *parameters, saddle *at)
   return NOT_CONVERGED;
 }
 
+/* y = L_vv x. */
+static void times_mass(const real *mass, const real *x, real *y)
+{
+  memset(y, 0, sizeof(real) * M);
+  for (int e = 0; e < MASS_ENTRIES; e++)
+    y[MASS_ENTRY[e][0]] += mass[e] * x[MASS_ENTRY[e][1]];
+}
+
+#ifndef DOUBLE_DOUBLE
 /* Projects p onto the cotangent space of the constraints. */
 static int project_momentum(real t, const real *q, real *p, const real *parameters, saddle *at, real *workspace)
 {
@@ -192,7 +203,7 @@ int NAME(project)(real t, const real *q0, const real *p0, const real *parameters
 {
   saddle *at = saddle_in(workspace);
   real u[2 * M], p[M];
-  int status = NAME(velocity)(t, q0, p0, parameters, u + M, workspace);
+  int status = find_velocity(t, q0, p0, parameters, u + M, workspace);
   memcpy(u, q0, sizeof(real) * M);
   memcpy(p, p0, sizeof p);
   if (status == OK)
@@ -204,14 +215,6 @@ int NAME(project)(real t, const real *q0, const real *p0, const real *parameters
   memcpy(q1, u, sizeof(real) * M);
   memcpy(p1, p, sizeof p);
   return OK;
-}
-
-/* y = L_vv x. */
-static void times_mass(const real *mass, const real *x, real *y)
-{
-  memset(y, 0, sizeof(real) * M);
-  for (int e = 0; e < MASS_ENTRIES; e++)
-    y[MASS_ENTRY[e][0]] += mass[e] * x[MASS_ENTRY[e][1]];
 }
 
 /* Distance of x[0] and x[1] relative to the larger norm, in the metric for which y is the dual vector of x. */
@@ -233,14 +236,14 @@ int NAME(apart)(real t, const real *q0, const real *p0, const real *q1, const re
 {
   const real still[M] = {0};
   real u[2 * M], velocity[M], x[2][M], y[2][M], p[M], mass[MASS_ENTRIES];
-  int status = NAME(velocity)(t, q1, p0, parameters, y[0], workspace);
+  int status = find_velocity(t, q1, p0, parameters, y[0], workspace);
   if (status == OK)
-    status = NAME(velocity)(t, q1, p1, parameters, y[1], workspace);
+    status = find_velocity(t, q1, p1, parameters, y[1], workspace);
   memcpy(u, q1, sizeof(real) * M);
   memcpy(velocity, y[0], sizeof velocity);
   memcpy(u + M, y[1], sizeof y[1]);
   if (status == OK)
-    status = NAME(velocity)(t, q1, still, parameters, p, workspace);
+    status = find_velocity(t, q1, still, parameters, p, workspace);
   if (status != OK)
     return status;
   for (int i = 0; i < M; i++) {
@@ -275,7 +278,7 @@ int NAME(multipliers)(long long count, const real *t, const real *q, const real 
   saddle *at = saddle_in(workspace);
   for (long long k = 0; k < count; k++) {
     real u[2 * M], value[M + 2 * CONSTRAINTS], g[CONSTRAINTS], a[M], *y = multiplier + k * CONSTRAINTS;
-    int status = NAME(velocity)(t[k], q + k * M, p + k * M, parameters, u + M, workspace);
+    int status = find_velocity(t[k], q + k * M, p + k * M, parameters, u + M, workspace);
     memcpy(u, q + k * M, sizeof(real) * M);
     if (status == OK)
       status = factorise_saddle(t[k], u, parameters, at, g);
@@ -292,3 +295,4 @@ int NAME(multipliers)(long long count, const real *t, const real *q, const real 
   }
   return OK;
 }
+#endif

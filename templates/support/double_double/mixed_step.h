@@ -160,10 +160,12 @@ static inline int find_correction(pair_step *w)
 }
 
 /* Replaces the increments of a step, solved in double, by those in two words. On failure they are undefined. */
-HOT int refine_increments(const step_data *step, double t_low, double h_low, double *dq, double *dp)
+HOT int refine_increments(const step_data *step, double *memory, double t_low, double h_low, double *dq, double *dp,
+    double *workspace)
 {
   pair_step w;
   int status;
+  (void)memory, (void)workspace;
   begin_pairs(&w, step, t_low, h_low);
   forces_of_pairs(&w);
   find_residual(&w);

@@ -1,62 +1,44 @@
-#include "../core/status_codes.h"
+#include "pair_states.h"
 
-/* Momenta p = m v, energies and momentum maps in pairs. */
-
-static inline void load_pairs(const double *words, dd *x)
-{
-  for (int i = 0; i < M; i++)
-    x[i] = dd_of(words[i], words[M + i]);
-}
-
-static int store_pairs(const dd *x, double *words)
-{
-  for (int i = 0; i < M; i++)
-    words[i] = x[i].high, words[M + i] = x[i].low;
-  return all_finite(words, 2 * M) ? OK : NOT_FINITE;
-}
+/* Momenta p = L_v, velocities, energies and momentum maps in pairs. */
 
 int NAME(momentum)(double t, const double *q, const double *v, const double *parameters, double *p, double *workspace)
 {
-  dd masses[M], velocity[M];
-  (void)q, (void)workspace;
-  mass_pairs(NULL, dd_of(t, 0.0), parameters, masses);
+  dd positions[M], velocity[M], result[M];
+  load_pairs(q, positions);
   load_pairs(v, velocity);
-  for (int i = 0; i < M; i++)
-    velocity[i] = dd_multiply(masses[i], velocity[i]);
-  return store_pairs(velocity, p);
-}
-
-static void velocities_of(dd t, const double *p, const double *parameters, dd *velocity)
-{
-  dd masses[M];
-  mass_pairs(NULL, t, parameters, masses);
-  load_pairs(p, velocity);
-  for (int i = 0; i < M; i++)
-    velocity[i] = dd_divide(velocity[i], masses[i]);
+  const int status = momenta_of(dd_of(t, 0.0), positions, velocity, parameters, result, workspace);
+  return status == OK ? store_pairs(result, p) : status;
 }
 
 int NAME(velocity)(double t, const double *q, const double *p, const double *parameters, double *v, double *workspace)
 {
-  dd velocity[M];
-  (void)q, (void)workspace;
-  velocities_of(dd_of(t, 0.0), p, parameters, velocity);
-  return store_pairs(velocity, v);
+  dd positions[M], momentum[M], result[M];
+  load_pairs(q, positions);
+  load_pairs(p, momentum);
+  const int status = velocities_of(dd_of(t, 0.0), positions, momentum, parameters, result, workspace);
+  return status == OK ? store_pairs(result, v) : status;
 }
 
-static int energy_of(dd t, const double *q, const double *p, const double *parameters, double *energy)
+static int energy_of(dd t, const double *q, const double *p, const double *parameters, double *energy,
+    double *workspace)
 {
   dd u[2 * M], sum;
   load_pairs(q, u);
 #ifdef HAMILTONIAN_SYSTEM
+  (void)workspace;
   load_pairs(p, u + M);
   hamiltonian_pairs(u, t, parameters, &sum);
 #else
-  dd value;
-  velocities_of(t, p, parameters, u + M);
+  dd momentum[M], value;
+  load_pairs(p, momentum);
+  const int status = velocities_of(t, u, momentum, parameters, u + M, workspace);
+  if (status != OK)
+    return status;
   lagrangian_pairs(u, t, parameters, &value);
   sum = dd_negative(value);
   for (int i = 0; i < M; i++)
-    sum = dd_add(sum, dd_multiply(dd_of(p[i], p[M + i]), u[M + i]));
+    sum = dd_add(sum, dd_multiply(momentum[i], u[M + i]));
 #endif
   energy[0] = sum.high;
   energy[1] = sum.low;
@@ -66,17 +48,15 @@ static int energy_of(dd t, const double *q, const double *p, const double *param
 int NAME(energy)(double t, const double *q, const double *p, const double *parameters, double *energy,
     double *workspace)
 {
-  (void)workspace;
-  return energy_of(dd_of(t, 0.0), q, p, parameters, energy);
+  return energy_of(dd_of(t, 0.0), q, p, parameters, energy, workspace);
 }
 
 int NAME(energies)(long long count, const double *t, const double *q, const double *p, const double *parameters,
     double *energy, double *workspace)
 {
-  (void)workspace;
   for (long long k = 0; k < count; k++) {
-    const int status =
-        energy_of(dd_of(t[2 * k], t[2 * k + 1]), q + k * 2 * M, p + k * 2 * M, parameters, energy + 2 * k);
+    const int status = energy_of(dd_of(t[2 * k], t[2 * k + 1]), q + k * 2 * M, p + k * 2 * M, parameters,
+        energy + 2 * k, workspace);
     if (status != OK)
       return status;
   }

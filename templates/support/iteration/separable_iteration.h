@@ -441,7 +441,7 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
 #ifndef ARRAYS
   remember_curve(F, past);
 #endif
-#if defined(ERROR_GROWTH) || defined(DOUBLE_DOUBLE)
+#if defined(ERROR_GROWTH) || defined(MIXED_POINTS)
   if (step->points)
     memcpy(step->points, X, sizeof X);
 #endif

@@ -34,7 +34,7 @@ int NAME(advance_to)(run_memory *run, real t_end, real tolerance, long long step
   memset(report, 0, sizeof *report);
   now.step = step_from(run->t, 0, now.at.q, now.at.p, now.at.carry_q, now.at.carry_p, parameters, workspace);
   load_state(run, &now.at);
-#ifdef DOUBLE_DOUBLE
+#ifdef MIXED_POINTS
   now.step.points = (double *)now.points;
 #elif defined(ERROR_GROWTH)
   now.step.points = run->measures_growth ? (double *)now.points : NULL;
@@ -45,7 +45,8 @@ int NAME(advance_to)(run_memory *run, real t_end, real tolerance, long long step
     if (status == OK)
       status = confirm_step(run, &now, options, report);
     if (status == OK)
-      status = refine_increments(&now.step, now.at.t_low, rest_of_last(&now), now.dq, now.dp);
+      status = refine_increments(&now.step, run->memory, now.at.t_low, rest_of_last(&now), now.dq, now.dp,
+          SOLVER_WORKSPACE(&now.step));
     if (status != OK) {
       run->guess = 0;
       save_state(&now.at, run);

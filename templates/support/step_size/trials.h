@@ -121,7 +121,7 @@ typedef struct {
 #ifdef RATTLE
   int failures; /* trials of the step that failed */
 #endif
-#if defined(ERROR_GROWTH) || defined(DOUBLE_DOUBLE)
+#if defined(ERROR_GROWTH) || defined(MIXED_POINTS)
   coordinates points[GROUPS]; /* of the last trial */
 #endif
 } trial;

@@ -1,0 +1,79 @@
+#include "../newton/newton.h"
+#include "stage_pairs.h"
+
+/* Step in double-double arithmetic by mixed precision (iterative refinement; Higham, Accuracy and Stability of
+ * Numerical Algorithms, ch. 12). Newton's method solves the stage equations in double, to 1e-16; their residual in
+ * pairs has 16 digits as one word, and is solved in double with the factors of the Jacobian at the solution. Each
+ * correction gains up to 16 digits, so that two evaluations in pairs suffice; the second shows that they do. Requires:
+ * newton.h, evaluate_pairs, the rows in pairs. */
+
+#define REFINED 4e-32 /* change by a correction, relative to the state, after which there is no further one */
+#define REFINED_ROUNDING 1e-27 /* changes that may be rounding errors, if they stop decreasing */
+#define MOST_REFINEMENTS 8
+
+/* Solves for a correction of the unknowns and adds it; returns its size relative to the state. */
+static inline double correct_pairs(pair_equations *at, newton_data *data, const band *shape, const double *inverse_size)
+{
+  double change = 0.0;
+  for (int i = 0; i < SITES; i++)
+    for (int b = 0; b < B; b++)
+      data->update[POSITION_IN_MATRIX[i] * B + b] = at->rows[i * (B + 1) + b].high;
+  back_substitute(data->factors, shape, data->pivot, data->update);
+  for (int i = 0; i < SITES; i++)
+    for (int b = 0; b < B; b++) {
+      const double update = data->update[POSITION_IN_MATRIX[i] * B + b];
+      at->z[i * B + b] = dd_add(at->z[i * B + b], dd_word(-update));
+      if (!is_finite(update))
+        return update;
+      if (i < M && MOVES[b])
+        change = larger(change, fabs(at->h.high * update) * inverse_size[i]);
+    }
+  return change;
+}
+
+/* Replaces the increments of a step, solved in double, by those in two words; `memory` has its unknowns. The workspace
+ * then has the factors of the Jacobian at these. On failure they are undefined. */
+static int refine_increments(const step_data *step, double *memory, double t_low, double h_low, double *dq, double *dp,
+    double *workspace)
+{
+  newton_data *data = newton_in(workspace);
+  const band shape = band_of(SITES, B);
+  pair_equations at = {.t = dd_of(step->t, t_low), .h = dd_of(step->h, h_low), .parameters = step->parameters};
+  double size_p[SITES], size_q[M], last = INFINITY, largest = 0.0;
+  memcpy(data->z, memory, sizeof(double) * N);
+  evaluate(step, data->z, data->rows, size_p, size_q, data->factors, &shape);
+  if (!all_finite(data->rows, N + SITES) || !all_finite(size_q, M))
+    return NOT_FINITE;
+  if (!linearise(step, data, &shape))
+    return SINGULAR;
+  memcpy(memory + N, data->point, sizeof(double) * POINT);
+  for (int i = 0; i < M; i++)
+    largest = larger(largest, size_q[i]);
+  for (int i = 0; i < M; i++) {
+    at.q0[i] = dd_of(step->q0[i], step->carry_q[i]);
+    at.p0[i] = dd_of(step->p0[i], step->carry_p[i]);
+    size_q[i] = 1.0 / (size_q[i] + 1e-3 * largest + DBL_MIN);
+  }
+  for (int k = 0; k < N; k++)
+    at.z[k] = dd_word(data->z[k]);
+  for (int k = 0;; k++) {
+    evaluate_pairs(&at);
+    const double change = correct_pairs(&at, data, &shape, size_q);
+    if (!is_finite(change))
+      return NOT_FINITE;
+    if (change <= REFINED || (change <= REFINED_ROUNDING && !(change < last / 4)))
+      break;
+    if (k + 1 >= MOST_REFINEMENTS)
+      return NOT_CONVERGED;
+    last = change;
+  }
+  for (int i = 0; i < M; i++) {
+    dd q = dd_of(0.0, 0.0);
+    for (int b = 0; b < B; b++)
+      q = dd_add(q, times_entry(END_POSITION[b], END_POSITION_LOW[b], at.z[i * B + b]));
+    q = dd_multiply(at.h, q);
+    const dd p = at.rows[i * (B + 1) + B];
+    dq[i] = q.high, dq[M + i] = q.low, dp[i] = p.high, dp[M + i] = p.low;
+  }
+  return all_finite(dq, 2 * M) && all_finite(dp, 2 * M) ? OK : NOT_FINITE;
+}

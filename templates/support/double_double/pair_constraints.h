@@ -1,0 +1,212 @@
+#include "../constraints/constraints.h"
+#include "pair_states.h"
+
+/* Projection onto constraints, and Lagrange multipliers, in pairs: solutions in double, corrected with the factors of
+ * the same matrices by residuals in pairs. Requires: constraints.h, pair_states.h, the kernels constraints_pairs (g,
+ * then the derivatives), constrained_motion_pairs and legendre_pairs (with the mass matrix). */
+
+enum { PAIR_CORRECTIONS = 4, MOST_PAIR_CORRECTIONS = 16 };
+#define SETTLED_PAIRS 1e-31 /* relative to the state: update after which there is no further one */
+
+static double largest_high(const dd *x)
+{
+  double largest = 0.0;
+  for (int i = 0; i < M; i++)
+    largest = larger(largest, fabs(x[i].high));
+  return largest;
+}
+
+static inline void high_words(const dd *x, int n, double *high)
+{
+  for (int i = 0; i < n; i++)
+    high[i] = x[i].high;
+}
+
+/* Computes g, its rate G v + g_t and the velocity u + M of a state. */
+static int constrained_pairs(dd t, const dd *q, const dd *p, const double *parameters, dd *u, dd *g, dd *rate,
+    double *workspace)
+{
+  dd value[M + 2 * CONSTRAINTS];
+  const int status = velocities_of(t, q, p, parameters, u + M, workspace);
+  if (status != OK)
+    return status;
+  memcpy(u, q, sizeof(dd) * M);
+  constraints_pairs(u, t, parameters, g);
+  constrained_motion_pairs(u, t, parameters, value);
+  memcpy(rate, value + M, sizeof(dd) * CONSTRAINTS);
+  return OK;
+}
+
+int NAME(constraint_values)(long long count, const double *t, const double *q, const double *p,
+    const double *parameters, double *g, double *rate, double *workspace)
+{
+  for (long long k = 0; k < count; k++) {
+    dd positions[M], momenta[M], u[2 * M], values[CONSTRAINTS + CONSTRAINT_ENTRIES], rates[CONSTRAINTS];
+    load_pairs(q + k * 2 * M, positions);
+    load_pairs(p + k * 2 * M, momenta);
+    const int status = constrained_pairs(dd_of(t[2 * k], t[2 * k + 1]), positions, momenta, parameters, u, values,
+        rates, workspace);
+    if (status != OK)
+      return status;
+    high_words(values, CONSTRAINTS, g + k * CONSTRAINTS);
+    high_words(rates, CONSTRAINTS, rate + k * CONSTRAINTS);
+    if (!all_finite(g + k * CONSTRAINTS, CONSTRAINTS) || !all_finite(rate + k * CONSTRAINTS, CONSTRAINTS))
+      return NOT_FINITE;
+  }
+  return OK;
+}
+
+/* Nearest state that satisfies the constraints: positions in double, then corrected; momenta p - G^T y. */
+int NAME(project)(double t, const double *q0, const double *p0, const double *parameters, double *q1, double *p1,
+    double *workspace)
+{
+  saddle *at = saddle_in(workspace);
+  const dd now = dd_of(t, 0.0);
+  double high[2 * M], g[CONSTRAINTS], right[CONSTRAINTS], y[CONSTRAINTS], update[M], size = INFINITY;
+  dd q[M], p[M], u[2 * M], values[CONSTRAINTS + CONSTRAINT_ENTRIES], rate[CONSTRAINTS], sum[CONSTRAINTS];
+  int status = find_velocity(t, q0, p0, parameters, high + M, workspace);
+  load_pairs(q0, q);
+  memcpy(high, q0, sizeof(double) * M);
+  if (status == OK)
+    status = project_position(t, high, parameters, at);
+  for (int i = 0; i < M; i++)
+    q[i] = dd_add(q[i], dd_two_sum(high[i], -q0[i]));
+  for (int k = 0; status == OK && k < MOST_PAIR_CORRECTIONS && size > SETTLED_PAIRS * largest_high(q); k++) {
+    high_words(q, M, high);
+    status = factorise_saddle(t, high, parameters, at, g);
+    constraints_pairs(q, now, parameters, values);
+    for (int j = 0; j < CONSTRAINTS; j++)
+      right[j] = -values[j].high;
+    if (status == OK)
+      solve_saddle(at, NULL, right, update, y);
+    for (int i = 0; status == OK && i < M; i++)
+      q[i] = dd_add(q[i], dd_word(update[i]));
+    size = largest_of(update);
+  }
+  memset(sum, 0, sizeof sum);
+  size = INFINITY;
+  for (int k = 0; status == OK && k < MOST_PAIR_CORRECTIONS && (k < 2 || size > SETTLED_PAIRS * largest_of(high + M));
+       k++) {
+    load_pairs(p0, p);
+    constraints_pairs(q, now, parameters, values);
+    for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
+      p[CONSTRAINT_ENTRY[e][1]] = dd_subtract(p[CONSTRAINT_ENTRY[e][1]],
+          dd_multiply(values[CONSTRAINTS + e], sum[CONSTRAINT_ENTRY[e][0]]));
+    status = constrained_pairs(now, q, p, parameters, u, values, rate, workspace);
+    high_words(u, 2 * M, high);
+    if (status == OK)
+      status = factorise_saddle(t, high, parameters, at, g);
+    for (int j = 0; j < CONSTRAINTS; j++)
+      right[j] = -rate[j].high;
+    if (status == OK)
+      solve_saddle(at, NULL, right, update, y);
+    for (int j = 0; status == OK && j < CONSTRAINTS; j++)
+      sum[j] = dd_add(sum[j], dd_word(y[j]));
+    size = largest_of(update);
+  }
+  if (status != OK)
+    return status;
+  status = store_pairs(q, q1);
+  return status == OK ? store_pairs(p, p1) : status;
+}
+
+/* Relative size of a difference d with the dual e, of vectors whose larger squared norm is `size`. */
+static double relative_size(const double *d, const double *e, double size)
+{
+  double sum = 0.0;
+  for (int i = 0; i < M; i++)
+    sum += d[i] * e[i];
+  return size > 0.0 ? sqrt(fabs(sum) / size) : 0.0;
+}
+
+static double product_of_vectors(const double *x, const double *y)
+{
+  double sum = 0.0;
+  for (int i = 0; i < M; i++)
+    sum += x[i] * y[i];
+  return fabs(sum);
+}
+
+/* Relative distances of two states: positions in the metric of the mass matrix, momenta in that of its inverse. */
+int NAME(apart)(double t, const double *q0, const double *p0, const double *q1, const double *p1,
+    const double *parameters, double *apart, double *workspace)
+{
+  const double still[M] = {0};
+  double u[2 * M], p[M], v[M], other[M], d[M], e[M], mass[MASS_ENTRIES];
+  dd q[M], x[2][M], velocity[2][M];
+  int status = OK;
+  load_pairs(q1, q);
+  for (int k = 0; status == OK && k < 2; k++) {
+    load_pairs(k ? p1 : p0, x[k]);
+    status = velocities_of(dd_of(t, 0.0), q, x[k], parameters, velocity[k], workspace);
+  }
+  if (status == OK)
+    status = find_velocity(t, q1, still, parameters, p, workspace);
+  if (status != OK)
+    return status;
+  for (int i = 0; i < M; i++) {
+    d[i] = dd_subtract(x[1][i], x[0][i]).high;
+    e[i] = dd_subtract(velocity[1][i], velocity[0][i]).high;
+    v[i] = velocity[0][i].high - p[i];
+    other[i] = velocity[1][i].high - p[i];
+    u[i] = q1[i], u[M + i] = velocity[1][i].high;
+  }
+  apart[1] = relative_size(d, e, larger(product_of_vectors(p0, v), product_of_vectors(p1, other)));
+  legendre(u, t, parameters, p, mass);
+  for (int i = 0; i < M; i++)
+    d[i] = dd_subtract(dd_of(q1[i], q1[M + i]), dd_of(q0[i], q0[M + i])).high;
+  times_mass(mass, d, e);
+  times_mass(mass, q0, v);
+  times_mass(mass, q1, other);
+  apart[0] = relative_size(d, e, larger(product_of_vectors(q0, v), product_of_vectors(q1, other)));
+  return all_finite(apart, 2) ? OK : NOT_FINITE;
+}
+
+/* Lagrange multipliers as in constraints.h, high words, then low words, of each state. */
+int NAME(multipliers)(long long count, const double *t, const double *q, const double *p, const double *parameters,
+    double *multiplier, double *workspace)
+{
+  saddle *at = saddle_in(workspace);
+  for (long long k = 0; k < count; k++) {
+    const dd then = dd_of(t[2 * k], t[2 * k + 1]);
+    dd positions[M], momenta[M], u[2 * M], g[CONSTRAINTS + CONSTRAINT_ENTRIES], rate[CONSTRAINTS];
+    dd value[M + 2 * CONSTRAINTS], mass[M + MASS_ENTRIES], a[M], y[CONSTRAINTS];
+    double high[2 * M], none[CONSTRAINTS], *to = multiplier + k * 2 * CONSTRAINTS;
+    load_pairs(q + k * 2 * M, positions);
+    load_pairs(p + k * 2 * M, momenta);
+    int status = constrained_pairs(then, positions, momenta, parameters, u, g, rate, workspace);
+    high_words(u, 2 * M, high);
+    if (status == OK)
+      status = factorise_saddle(t[2 * k], high, parameters, at, none);
+    if (status != OK)
+      return status;
+    memset(a, 0, sizeof a);
+    memset(y, 0, sizeof y);
+    legendre_pairs(u, then, parameters, mass);
+    for (int n = 0; n < PAIR_CORRECTIONS; n++) {
+      double forces[M], rates[CONSTRAINTS], change[M], change_of_y[CONSTRAINTS];
+      constrained_motion_pairs(u, then, parameters, value); /* residuals: F - L_vv a - G^T y, -(rest) - G a */
+      for (int e = 0; e < MASS_ENTRIES; e++)
+        value[MASS_ENTRY[e][0]] =
+            dd_subtract(value[MASS_ENTRY[e][0]], dd_multiply(mass[M + e], a[MASS_ENTRY[e][1]]));
+      for (int e = 0; e < CONSTRAINT_ENTRIES; e++) {
+        const int row = CONSTRAINT_ENTRY[e][0], i = CONSTRAINT_ENTRY[e][1], j = M + CONSTRAINTS + row;
+        value[i] = dd_subtract(value[i], dd_multiply(g[CONSTRAINTS + e], y[row]));
+        value[j] = dd_add(value[j], dd_multiply(g[CONSTRAINTS + e], a[i]));
+      }
+      high_words(value, M, forces);
+      for (int j = 0; j < CONSTRAINTS; j++)
+        rates[j] = -value[M + CONSTRAINTS + j].high;
+      solve_saddle(at, forces, rates, change, change_of_y);
+      for (int i = 0; i < M; i++)
+        a[i] = dd_add(a[i], dd_word(change[i]));
+      for (int j = 0; j < CONSTRAINTS; j++)
+        y[j] = dd_add(y[j], dd_word(change_of_y[j]));
+    }
+    for (int j = 0; j < CONSTRAINTS; j++)
+      to[j] = -y[j].high, to[CONSTRAINTS + j] = -y[j].low;
+    if (!all_finite(to, 2 * CONSTRAINTS))
+      return NOT_FINITE;
+  }
+  return OK;
+}
