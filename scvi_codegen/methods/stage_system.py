@@ -334,7 +334,7 @@ class ScalarStageGroup(StagePoints):
 
 @contextmanager
 def tables_in_two_words() -> Iterator[None]:
-    """Let :func:`dyadic` round to twice as many bits: entries of size up to 1 are then exact as double-double numbers."""
+    """Let :func:`dyadic` round to twice as many bits, so that entries of size up to 1 are exact in two words."""
     token = _WORDS.set(2)
     try:
         yield

@@ -43,7 +43,7 @@ CELLS = (
 )  # fmt: skip
 GENERATED = (
     r"core/|newton/stages|newton/band|arrays/(?:arrays|lattice_transform|circulant|convolutions)|derivatives/linear"
-    r"|mechanics/damping|double_double/(?!mixed_step|pair_)"
+    r"|mechanics/damping|double_double/(?!mixed_|pair_)"
 )
 """Headers with types that the generated part uses."""
 CHOSEN = (
@@ -84,6 +84,8 @@ def sources() -> tuple[Source, ...]:
     made.append(with_flow_of_rows(kepler.variant("derivatives")))
     pendulum = problem("planar-pendulum").system
     made.append(Sources(pendulum, SVI(2), precision="double-double").integrator()[0])
+    rod = LagrangianSystem.from_text("rod", ["x", "y"], "x_dot**2 + y_dot**2", constraints=["x**2 + y**2 - 1"])
+    made.append(Sources(rod, SVI(1, "gauss-lobatto:2"), precision="double-double").integrator()[0])
     return (*made, *oscillator.sources)
 
 

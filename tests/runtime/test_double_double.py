@@ -294,17 +294,15 @@ def test_refusals() -> None:
             sc.compile_stepper(kepler, "svi:4", precision="double-double", flags=("-O2", flag))
     with pytest.raises(MethodError, match="unknown precision 'quad'"):
         sc.compile_stepper(kepler, "svi:4", precision="quad")
-    refused = {"solver": "newton", "time_transformation": "distance", "events": "x"}
+    refused = {"time_transformation": "distance", "events": "x"}
     for name, value in refused.items():
         with pytest.raises(MethodError, match="precision='double-double' is not available"):
             sc.compile_stepper(kepler, "svi:4", precision="double-double", **{name: value})
-    with pytest.raises(MethodError, match="constant diagonal masses"):
-        sc.compile_stepper(kepler, "stoermer-verlet", precision="double-double")
-    friction = sc.LagrangianSystem.from_text(
-        name="friction", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2", forces={"q": "-q_dot"}
+    damped = sc.LagrangianSystem.from_text(
+        name="damped", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2", damping="0.1"
     )
-    with pytest.raises(MethodError, match="constant diagonal masses"):
-        sc.compile_stepper(friction, "svi:4", precision="double-double")
+    with pytest.raises(MethodError, match="write it as forces"):
+        sc.compile_stepper(damped, "svi:4", precision="double-double")
     stepper = sc.compile_stepper(kepler, "svi:4", precision="double-double")
     assert stepper.supports("adaptive")
     assert not stepper.supports("observe_ensemble")

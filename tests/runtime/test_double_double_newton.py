@@ -1,0 +1,165 @@
+"""Double-double steps whose stage equations Newton's method solves, against 60 digits and other coordinates."""
+
+import numpy as np
+import pytest
+from mpmath import mp
+
+import scvi_codegen as sc
+from scvi_codegen.exact.step import derived_step
+from scvi_codegen.methods import as_method
+from scvi_codegen.methods.discretise import discretised_form
+from scvi_codegen.runtime.rotations.attitudes import momenta_of_body
+
+LINKS = "(x_dot**2 + y_dot**2)/2 + 0.75*(u_dot**2 + w_dot**2)/2 - y - 0.75*w"
+MUTUAL = "a_dot**2 + b_dot**2/2 + a_dot*b_dot*cos(a - b) + 2*cos(a) + cos(b)"
+ROD, SECOND = "x**2 + y**2 - 1", "(u - x)**2 + (w - y)**2 - "
+PLANE, FOUR = ["x", "y"], ["x", "y", "u", "w"]
+STATES = {
+    "rod": ([0.6, -0.8], [0.8, 0.6]),
+    "rods": ([0.6, -0.8, 1.6, -0.8], [0.8, 0.6, 0.8, 0.3]),
+    "four-bar": ([0.0, 1.0, 3**0.5, 2.0], [0.0, 0.0, 0.0, 0.0]),
+    "masses": ([0.7, -0.4], [0.3, 0.5]),
+    "friction": ([0.7], [0.3]),
+    "charge": ([0.7, 0.2], [0.1, 0.4]),
+    "kepler": ([0.8, 0.0], [0.0, 1.2]),
+    "sleigh": ([0.1, 0.2, 0.0], [0.5, 0.0, 0.2]),
+}
+
+
+def system(name: str) -> sc.LagrangianSystem:
+    texts = {
+        "rod": (PLANE, "m*(x_dot**2 + y_dot**2)/2 - m*y", {"parameters": {"m": 1.25}, "constraints": [ROD]}),
+        "rods": (FOUR, LINKS, {"constraints": [ROD, f"{SECOND}1"]}),
+        "four-bar": (FOUR, LINKS, {"constraints": [ROD, f"{SECOND}4", "(u - 2)**2 + w**2 - 2.25"]}),
+        "masses": (["a", "b"], MUTUAL, {}),
+        "friction": (["q"], "q_dot**2/2 - q**2/2", {"forces": {"q": "-q_dot/10"}}),
+        "charge": (PLANE, "(x_dot**2 + y_dot**2)/2 + (x*y_dot - y*x_dot)/2 - (x**2 + y**2)**2/4", {}),
+        "kepler": (PLANE, "(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2)", {}),
+        "sleigh": (
+            [*PLANE, "phi"],
+            "(x_dot**2 + y_dot**2 + phi_dot**2)/2 - x/3",
+            {"constraints": ["x_dot*sin(phi) - y_dot*cos(phi)"]},
+        ),
+    }
+    coordinates, text, further = texts[name]
+    return sc.LagrangianSystem.from_text(name=name, coordinates=coordinates, lagrangian=text, **further)
+
+
+def compiled(name: str, method: str) -> sc.Stepper:
+    return sc.compile_stepper(system(name), method, precision="double-double")
+
+
+def consistent(stepper: sc.Stepper, name: str) -> tuple:
+    """Return the initial state on the constraints to 32 digits."""
+    q, v = STATES[name]
+    p = stepper.momentum(q, v)
+    return stepper.project(q, p) if stepper.constraints else (q, p)
+
+
+def largest(values) -> object:
+    return max(map(abs, values))
+
+
+def check_step(stepper: sc.Stepper, form, method: str, q, p, t: float = 0.0) -> None:
+    """Compare the first step and a later one with the solution of the paper's equations in 60 digits."""
+    h = 0.125
+    run, derived = stepper.integrate(q, p, h=h, steps=3, t=t), derived_step(form, as_method(method, form))
+    with mp.workdps(60):
+        for k in (0, 2):
+            exact = derived(*(list(run.mp(part)[k]) for part in "qp"), h, t + k * h)
+            for part in "qp":
+                values = getattr(exact, part)
+                assert largest(a - b for a, b in zip(run.mp(part)[k + 1], values, strict=True)) < 3e-31 * largest(
+                    values
+                )
+
+
+@pytest.mark.second
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [
+        *((name, "svi:3") for name in ("rod", "rods", "four-bar", "masses", "charge", "sleigh")),
+        ("rod", "svi:1"),
+        ("friction", "stoermer-verlet"),
+        ("masses", "sc:3"),
+        ("masses", "scvi:3"),
+        ("kepler", "composition:4"),
+    ],
+)
+def test_steps(name: str, method: str) -> None:
+    """Steps are accurate to 3e-31: constraints, variable masses, velocities in forces, explicit methods."""
+    stepper = compiled(name, method)
+    check_step(stepper, system(name), method, *consistent(stepper, name), t=0.5)
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("top", [False, True])
+def test_rotations(top: bool) -> None:
+    """The same for a free body and, in the moving frame, a heavy top, whose quaternions keep their length."""
+    text = "w_1**2 + w_2**2 + w_3**2/2 - R_33" if top else "w_1**2/2 + w_2**2 + 3*w_3**2/2"
+    body = sc.LagrangianSystem.from_text("body", rotations={"R": "w"}, lagrangian=text)
+    q = np.full(4, 0.5)
+    p = momenta_of_body(q, np.array([0.3, 0.4, 1.5]))
+    stepper = sc.compile_stepper(body, "svi:2", precision="double-double")
+    check_step(stepper, discretised_form(body, as_method("svi:2", body)), "svi:2", q, p)
+    run = stepper.integrate(q, p, h=0.125, steps=200)
+    with mp.workdps(40):
+        assert largest(sum(x * x for x in row) - 1 for row in run.mp("q")) < 1e-30
+        maps = run.mp("momentum_maps")
+        assert largest(maps[-1] - maps[0]) < 1e-30
+
+
+@pytest.mark.second
+def test_constraints_hold() -> None:
+    """Constraints of a four-bar and their rates hold to 1e-30, and so does the energy but for the order."""
+    stepper = compiled("four-bar", "svi:8")
+    run = stepper.integrate(*consistent(stepper, "four-bar"), h=0.0625, steps=1000, save_every=10)
+    assert all(np.abs(values).max() < 1e-30 for values in run.constraint_values())
+    assert run.energy_error() < 1e-19
+
+
+@pytest.mark.full
+def test_constraints_hold_for_many_steps() -> None:
+    """The same for 10,000 steps of every mechanism."""
+    for name in ("rod", "rods", "four-bar"):
+        stepper = compiled(name, "svi:8")
+        run = stepper.integrate(*consistent(stepper, name), h=0.125, steps=10_000, save_every=10)
+        assert all(np.abs(values).max() < 1e-30 for values in run.constraint_values())
+
+
+@pytest.mark.second
+def test_rod_and_angle() -> None:
+    """A pendulum as a rod, with adaptive and with fixed steps, agrees with that of an angle."""
+    angle = sc.LagrangianSystem.from_text(name="angle", coordinates=["a"], lagrangian="a_dot**2/2 + cos(a)")
+    exact = sc.compile_stepper(angle, "svi:16", precision="double-double").integrate(
+        ["0.75"], ["0.5"], h=0.0625, steps=32, save_every=32
+    )
+    stepper = sc.compile_stepper(system("rod"), "svi:4", precision="double-double")
+    with mp.workdps(40):
+        a, rate = mp.mpf("0.75"), mp.mpf("0.5")
+        q, v = [mp.sin(a), -mp.cos(a)], [rate * mp.cos(a), rate * mp.sin(a)]
+        end = exact.mp("q")[-1, 0]
+
+        def error(run) -> float:
+            return float(largest([run.mp("q")[-1, 0] - mp.sin(end), run.mp("q")[-1, 1] + mp.cos(end)]))
+
+        errors = [error(stepper.integrate(q, velocity=v, h=2.0 / n, steps=n, save_every=n)) for n in (1024, 2048)]
+        assert abs(np.log2(errors[0] / errors[1]) - 8.0) < 0.1
+        assert errors[1] < 1e-27
+        dense = sc.compile_stepper(system("rod"), "svi:12", precision="double-double")
+        assert error(dense.integrate(q, velocity=v, t_end=2.0, tolerance=1e-30)) < 1e-28
+        m = mp.mpf(1.25)
+        force = dense.multipliers(q, p=[m * x for x in v])  # of m v^2 = force on a circle
+        assert abs(force.mp()[0] + m * (rate**2 + mp.cos(a)) / 2) < 1e-30
+
+
+def test_initial_states() -> None:
+    """A state that violates the constraints is projected to 32 digits, and one that satisfies them is not moved."""
+    stepper = compiled("rod", "svi:1")
+    q, p = stepper.project([0.6, -0.8001], [0.8, 0.6])
+    g, rate = stepper.constraint_values(q, p)
+    assert max(abs(g).max(), abs(rate).max()) < 1e-31
+    again = stepper.integrate(q, p, h=0.1, steps=1)
+    assert (again.mp("q")[0] == q.mp()).all()
+    assert (again.mp("p")[0] == p.mp()).all()
+    assert np.abs(again.constraint_values()).max() < 1e-30
