@@ -94,8 +94,9 @@ def compile_stepper(
             or have a fixed-point iteration over stage positions (SVI, SC, Runge-Kutta); others, and systems without
             such loops, are compiled with the sizes of each call, once.
         tables: with ``sizes``, index tables of shape (rows, columns) by name.
-        precision: ``"double"``; or ``"double-double"`` for states and results of 31 digits (docs/digits.md); or ``"auto"``: double, and double-double for runs with ``error=``
-            that double does not confirm, as ``run.confirmation.precision`` reports.
+        precision: ``"double"``; or ``"double-double"`` for states and results of 31 digits (docs/digits.md); or
+            ``"auto"``: double, and double-double for runs with ``error=`` that double does not confirm, as
+            ``run.confirmation.precision`` reports.
 
     Raises:
         BuildError: if there is no C compiler.
