@@ -220,6 +220,44 @@ class PredictorTables:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ShiftTables:
+    """Decomposition A = V diag(mu) V^-1 of the matrix of a step, with one eigenvalue of each complex pair.
+
+    Attributes:
+        count: number of eigenvalues, padded to a power of two with zeros.
+        mu: (2 count,) real parts, then imaginary parts.
+        into: V^-1 by points, each with count real parts, then imaginary parts.
+        back: (2 count, lanes) such that x = sum_k Re z_k back_k + Im z_k back_(count + k) for z = V^-1 x.
+        is_accurate: whether V is well conditioned and no eigenvalue is negative or nearly so.
+    """
+
+    count: int
+    mu: tuple[Number, ...]
+    into: tuple[Number, ...]
+    back: tuple[tuple[Number, ...], ...]
+    is_accurate: bool = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinearPart:
+    """Constant derivatives of forces at q = 0, a symmetric band matrix.
+
+    Attributes:
+        kernel: its entries as functions of the parameters.
+        entries: (i, j), i >= j, their positions in a bandwidth-reducing ordering.
+        coordinates: the coordinate at each position.
+        bandwidth: largest i - j.
+        shifts: eigenvectors of the matrix of a step.
+    """
+
+    kernel: Kernel
+    entries: tuple[tuple[int, int], ...]
+    coordinates: tuple[int, ...]
+    bandwidth: int
+    shifts: ShiftTables
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FixedPointIteration:
     """Fixed-point iteration whose kernels are evaluated at points on SIMD lanes: data, from which C is rendered.
 
@@ -245,6 +283,7 @@ class FixedPointIteration:
         serves_many: whether lanes may be trajectories.
         final_iterations: number of iterations after the one that converges.
         in_groups: whether its C supports several vectors for the points of a step, besides one.
+        linear_part: constant linear part of the forces, for which steps are solved implicitly; ``None`` without one.
     """
 
     name: IterationName
@@ -267,6 +306,7 @@ class FixedPointIteration:
     serves_many: bool = False
     final_iterations: int = 0
     in_groups: bool = True
+    linear_part: LinearPart | None = None
 
     @property
     def tables(self) -> Iterator[IterationTable]:

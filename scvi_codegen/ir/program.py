@@ -16,6 +16,7 @@ from scvi_codegen.ir.equations import (
     FixedPointIteration,
     LoweredStageGroup,
     Rattle,
+    ShiftTables,
     Splitting,
 )
 from scvi_codegen.ir.kernel import Kernel, Number, NumberTable, RolledKernel
@@ -172,23 +173,6 @@ class Quantities:
     first_order_rates: Kernel | None = None
     work_and_impulses: tuple[str, ...] = ()
     integrates: bool = False
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ShiftTables:
-    """Decomposition A = V diag(mu) V^-1 of the matrix of a step, with one eigenvalue of each complex pair.
-
-    Attributes:
-        count: number of eigenvalues, padded to a power of two with zeros.
-        mu: (2 count,) real parts, then imaginary parts.
-        into: V^-1 by points, each with count real parts, then imaginary parts.
-        back: (2 count, lanes) such that x = sum_k Re z_k back_k + Im z_k back_(count + k) for z = V^-1 x.
-    """
-
-    count: int
-    mu: tuple[Number, ...]
-    into: tuple[Number, ...]
-    back: tuple[tuple[Number, ...], ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

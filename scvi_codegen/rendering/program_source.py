@@ -204,7 +204,7 @@ def render_double_double(
     mass = fixed_point.constant_mass
     assert mass is not None  # of separable systems
     tables = [replace(each, in_two_parts=not each.is_matrix or each.in_two_parts) for each in fixed_point.own_tables]
-    program = replace(program, fixed_point=replace(fixed_point, own_tables=tuple(tables)))
+    program = replace(program, fixed_point=replace(fixed_point, own_tables=tuple(tables), linear_part=None))
     quantities, lanes = program.quantities, (derivatives.partials, derivatives.products[0])
     states = (quantities.energy, *((quantities.momentum_kernel,) if quantities.momentum_kernel else ()))
     numbers, vectors = (mass, *states), fixed_point.kernels
@@ -336,7 +336,7 @@ def render_points(program: Program) -> Source | None:
         return None
     if program.quantities.integrals:
         return None
-    program = replace(program, prefix=f"{program.prefix}_points")
+    program = replace(program, prefix=f"{program.prefix}_points", fixed_point=replace(fixed_point, linear_part=None))
     context = _context(program, DOUBLE, None, "none")
     text = cast(IterationSource, context["fixed_point"])
     tables = tuple(map(_at_own_point, text.tables))
@@ -359,7 +359,7 @@ def render_thread(program: Program, control: Control | None) -> Source | None:
     fixed_point = program.fixed_point
     if not (control and control.predictor and fixed_point and fixed_point.in_groups) or program.quantities.integrals:
         return None
-    program = replace(program, prefix=f"{program.prefix}_thread")
+    program = replace(program, prefix=f"{program.prefix}_thread", fixed_point=replace(fixed_point, linear_part=None))
     context = _context(program, DOUBLE, replace(control, growth=None), "none")
     return _render(program.prefix, {**context, "on_device": True})
 

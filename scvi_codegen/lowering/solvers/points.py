@@ -37,18 +37,20 @@ once and used in stages and updates alike, and A_nj / w_j = 1 - mu_jn, exact sin
 rounded map still has a generating function: its energy error does not drift.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import chain
 from typing import Any
 
+import numpy as np
 import sympy
 from sympy import Add, Expr, Symbol
 
 from scvi_codegen.formulas.expressions import gradient_tuple, jacobian
 from scvi_codegen.formulas.intermediates import inner_of
-from scvi_codegen.ir.equations import FixedPointIteration, IterationName, IterationTable, StoredValues
+from scvi_codegen.formulas.symbols import symbol
+from scvi_codegen.ir.equations import FixedPointIteration, IterationName, IterationTable, LinearPart, StoredValues
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.lowering.solvers.tables import (
     MOST_LANES,
@@ -59,10 +61,17 @@ from scvi_codegen.lowering.solvers.tables import (
     pad_vector,
     predictor_tables_of,
     resolved_degree,
+    shift_tables,
     tableau_tables,
     velocity_tables,
 )
-from scvi_codegen.lowering.stage_groups import damping_kernel, integrand_kernel, system_kernel
+from scvi_codegen.lowering.stage_groups import (
+    bandwidth,
+    bandwidth_ordering,
+    damping_kernel,
+    integrand_kernel,
+    system_kernel,
+)
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.rotations.axial import Turn, axial_turns, frame_potential
@@ -70,6 +79,12 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import Accelerations, Shape, Velocities
 from scvi_codegen.tables.basis import matrix_product, transpose
 from scvi_codegen.tables.precision import Matrix, Vector, mp
+
+LEAST_LINEAR_PART, WIDEST_LINEAR_PART = 8, 4
+"""Fewest coordinates and largest bandwidth with which steps are solved implicitly for the linear part of the forces."""
+ROUNDING = 1e-12
+INPUT_PARAMETERS = 5
+"""Number of parameters of a tabulated input."""
 
 
 def separable_iteration(problem: StepProblem, *, velocities: bool = False) -> FixedPointIteration | None:
@@ -128,7 +143,56 @@ def _separable(system: LagrangianSystem, tables: VelocityTables, *, velocities: 
         derivatives_part="" if velocities else "separable_derivatives",
         serves_many=True,
         final_iterations=1,  # the final one, with double-double coefficients
+        linear_part=None if velocities or points < 2 else _linear_part(system, product, lanes),
     )
+
+
+def _linear_part(system: LagrangianSystem, product: Matrix, lanes: int) -> LinearPart | None:
+    """Return the derivatives of the forces at q = 0 if steps are to be solved for them, else ``None``.
+
+    They must be finite, constant, symmetric with a narrow band and, with the default parameters, a stable equilibrium,
+    so that the systems for all eigenvalues are regular at any step size.
+    """
+    force, rest = forms_of(system).force, dict.fromkeys(system.coordinates, sympy.S.Zero)
+    places = {q: i for i, q in enumerate(system.coordinates)}
+    depends = [sorted({i, *(places[q] for q in F.free_symbols & places.keys())}) for i, F in enumerate(force)]
+    few = all(len(each) <= 2 * WIDEST_LINEAR_PART + 1 for each in depends)
+    if len(force) < LEAST_LINEAR_PART or not few or not all(_is_finite(F.xreplace(rest)) for F in force):
+        return None
+    entries = {(i, j): F.diff(system.coordinates[j]).xreplace(rest) for i, F in enumerate(force) for j in depends[i]}
+    entries = {place: entry for place, entry in entries.items() if entry != 0 or place[0] == place[1]}
+    symmetric = all(entries.get((j, i), 0) == entry for (i, j), entry in entries.items())
+    if not symmetric or not all(_is_finite(entry) for entry in entries.values()) or not _is_stable(system, entries):
+        return None
+    order, shifts = bandwidth_ordering(entries, len(force)), shift_tables(product, lanes)
+    if bandwidth(entries, order) > WIDEST_LINEAR_PART or not shifts.is_accurate:
+        return None
+    lower = {(order[i], order[j]): entry for (i, j), entry in entries.items() if order[i] >= order[j]}
+    purpose = "Derivatives of the forces L_q at q = 0."
+    return LinearPart(
+        kernel=system_kernel(system, "linear_forces", lower.values(), u=(), purpose=purpose),
+        entries=tuple(lower),
+        coordinates=tuple(sorted(range(len(force)), key=order.__getitem__)),
+        bandwidth=bandwidth(entries, order),
+        shifts=shifts,
+    )
+
+
+def _is_stable(system: LagrangianSystem, entries: Mapping[tuple[int, int], Expr]) -> bool:
+    """Return whether derivatives of forces depend on constant parameters alone and are negative semidefinite."""
+    inputs = {symbol(f"{name}_{k}") for name in system.inputs for k in range(INPUT_PARAMETERS)}
+    values = dict(zip(system.parameters, system.defaults, strict=True))
+    if any(entry.free_symbols - (values.keys() - inputs) for entry in entries.values()):
+        return False
+    matrix = np.zeros((system.dimension, system.dimension))
+    for place, entry in entries.items():
+        matrix[place] = float(entry.xreplace(values))
+    rates = np.linalg.eigvalsh(matrix)
+    return bool(rates[0] < 0 and rates[-1] <= ROUNDING * -rates[0])
+
+
+def _is_finite(value: Expr) -> bool:
+    return not value.has(sympy.nan, sympy.zoo, sympy.oo, -sympy.oo)
 
 
 def _point_iteration(

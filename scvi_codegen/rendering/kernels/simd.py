@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
-from scvi_codegen.ir.equations import AdaptivePredictor, FixedPointIteration, Splitting, StoredValues
+from scvi_codegen.ir.equations import AdaptivePredictor, FixedPointIteration, LinearPart, Splitting, StoredValues
 from scvi_codegen.ir.kernel import Kernel, Number, NumberTable
 from scvi_codegen.rendering.kernels.printer import DOUBLE, INVERSE_ROOT, TIMES, Sources, lane_functions, print_number
 from scvi_codegen.rendering.kernels.roots import with_factors_in_roots
@@ -73,6 +73,7 @@ class IterationSource:
         mass: the constant masses, if any.
         damping: the rate of a damping that differs between lanes.
         support: headers from the tables on.
+        linear_part: of the forces, for which steps are solved implicitly.
         error_defines, highest, next: macros and values, and the tables, of the error estimate.
     """
 
@@ -89,6 +90,7 @@ class IterationSource:
     error_defines: Mapping[str, str] = field(default_factory=dict)
     highest: str = ""
     next: str = ""
+    linear_part: LinearPart | None = None
 
     @property
     def inverse_roots(self) -> bool:
@@ -138,6 +140,7 @@ def iteration_source(
         error_defines=_kept(fixed_point),
         highest=lane_table("HIGHEST", fixed_point.guess.highest),
         next=lane_table("NEXT", fixed_point.guess.next),
+        linear_part=fixed_point.linear_part if meaning.are_points else None,
     )
 
 

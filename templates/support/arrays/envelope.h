@@ -1,3 +1,4 @@
+#include "../core/shifts.h"
 #include "array_newton.h"
 
 /* Linear part of a step of coordinates that are coupled to near ones (meshes, beams, chains): the inverse of 1 - A F'
@@ -9,11 +10,6 @@
  * imaginary parts. */
 
 enum { PROBES = X_VECTORS / UNKNOWNS }; /* parts of the state by which the forces of an unknown are differentiated */
-
-typedef double shifts __attribute__((vector_size(8 * SHIFTS)));
-typedef struct {
-  shifts re, im;
-} complex_shifts;
 
 /* Rows i of L and columns i of U in a certain order of the unknowns, positions and momenta: entries first[i] to i, at
  * start[i]. Column j of F' has entries in `row`, from column[j] on. Columns of equal `colour` have no common row, the
@@ -62,21 +58,6 @@ static inline complex_shifts *row_of(const envelope *all, int side, long long i)
   return all->factor + (side * all->entries + all->start[i] - all->first[i]);
 }
 
-static inline shifts shifts_at(const double *table)
-{
-  shifts x;
-  memcpy(&x, table, sizeof x);
-  return x;
-}
-
-/* a - x y. */
-static inline complex_shifts minus_product(complex_shifts a, complex_shifts x, complex_shifts y)
-{
-  a.re -= x.re * y.re - x.im * y.im;
-  a.im -= x.re * y.im + x.im * y.re;
-  return a;
-}
-
 /* a - sum of x_k y_k, in two independent sums. */
 static inline complex_shifts minus_products(complex_shifts a, const complex_shifts *x, const complex_shifts *y,
     long long count)
@@ -89,12 +70,6 @@ static inline complex_shifts minus_products(complex_shifts a, const complex_shif
   a = count > 0 ? minus_product(a, *x, *y) : a;
   a.re += b.re, a.im += b.im;
   return a;
-}
-
-static inline complex_shifts product_of(complex_shifts x, complex_shifts y)
-{
-  const complex_shifts product = {x.re * y.re - x.im * y.im, x.re * y.im + x.im * y.re};
-  return product;
 }
 
 /* Sets x to a value at the columns of a colour. */
@@ -194,23 +169,13 @@ static inline int has_factors(const linear_system *of)
 /* Residual of a coordinate in eigenvectors of A, times its mass. */
 static inline complex_shifts to_shifts(const envelope *all, const lanes *x, double mass)
 {
-  complex_shifts sum = {{0.0}, {0.0}};
-  for (int j = 0; j < KEPT; j++) {
-    const double value = mass * at_point(x, all->stride, j);
-    sum.re += value * shifts_at(TO_SHIFTS + 2 * SHIFTS * j);
-    sum.im += value * shifts_at(TO_SHIFTS + 2 * SHIFTS * j + SHIFTS);
-  }
-  return sum;
+  return into_shifts(x, all->stride, mass);
 }
 
 static inline void from_shifts(const envelope *all, complex_shifts z, lanes *y)
 {
-  for (int g = 0; g < GROUPS; g++) {
-    lanes sum = lanes_of(0.0);
-    for (int k = 0; k < SHIFTS; k++)
-      sum += z.re[k] * FROM_SHIFTS[k * GROUPS + g] + z.im[k] * FROM_SHIFTS[(SHIFTS + k) * GROUPS + g];
-    y[g * all->stride] = sum;
-  }
+  for (int g = 0; g < GROUPS; g++)
+    y[g * all->stride] = from_shifts_at(z, g);
 }
 
 #ifdef FORCES_OF_VELOCITIES
