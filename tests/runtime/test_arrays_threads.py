@@ -20,6 +20,7 @@ from scvi_codegen.lowering.program import lower
 from scvi_codegen.native.compilers import find_compiler
 from scvi_codegen.pipeline import Sources
 from scvi_codegen.rendering.kernels.loop_nests import Sharing, sharing_of
+from scvi_codegen.runtime.arrays.envelope import envelope_of
 
 RNG = np.random.default_rng(5)
 THREADS = (1, 2, 3, 5)
@@ -349,20 +350,20 @@ def test_pair_blocks_form_a_round_robin_schedule(windows: dict[tuple[str, int], 
 
 
 RACES = """
+#include <stdlib.h>
 #include "shared.h"
 enum {{ N = {count} }};
-static const int bonds[] = {{{bonds}}};
-static double memory[192 * N + 4096] __attribute__((aligned(64))), start[2 * N];
+static const int bonds[] = {{{bonds}}}, pattern[] = {{{pattern}}};
+static double start[2 * N];
 static double t[{steps}], q[{steps} * N], p[{steps} * N];
 static int iterations[{steps}];
 int main(void)
 {{
   const long long sizes[] = {{{sizes}}};
-  const int *const tables[] = {{bonds, 0}};
+  const int *const tables[] = {{{tables}0}};
   const double parameters[] = {{N}};
-  shared_run *run = shared_bind(sizes, tables, memory);
-  if (shared_memory(sizes, tables) * 8 > (long long)sizeof memory)
-    return 9;
+  char *const memory = calloc((size_t)shared_memory(sizes, tables) + 8, sizeof(double));
+  shared_run *run = shared_bind(sizes, tables, (double *)(void *)(memory + 63 - ((size_t)memory + 63) % 64));
   for (int i = 0; i < N; i++)
     start[i] = 0.3 * (i * 37 % 101) / 101.0;
   shared_start(run, 0.0, 0.01, start, start + N);
@@ -389,11 +390,15 @@ def program(name: str, method: str, solver: str, folder: Path, **numbers: int) -
     for path, text in source.files.items():
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
         (folder / path).write_text(text)
-    sizes = {"N": CASES[name].shape[0], "B": len(BONDS)}
+    sizes, layout, envelope = {"N": CASES[name].shape[0], "B": len(BONDS)}, interface.layout, None
+    if solver == "newton":
+        envelope = envelope_of(layout, stepper_of(name, method, solver).start(start_of(name), h=0.01).stepper.problem)
     texts = {
         "count": sizes["N"],
         "bonds": ", ".join(map(str, BONDS.reshape(-1))),
-        "sizes": ", ".join(str(sizes[size]) for size in interface.layout.sizes),
+        "pattern": "0" if envelope is None else ", ".join(map(str, envelope.pattern)),
+        "tables": "bonds, " * bool(layout.tables) + "pattern, " * (envelope is not None),
+        "sizes": ", ".join(str(sizes[size]) for size in layout.sizes),
     }
     (folder / "main.c").write_text(RACES.format(**texts, **numbers))
 
