@@ -4,9 +4,27 @@ A density T(u, u_x, x) is integrated cell by cell with the quadrature of the cel
 
     int T dx = sum_e J_e sum_a w_a T(sum_b I_ab u_b, (1/J_e) sum_b D_ab u_b, x_ea),
 
-where b runs over the points that the cell uses. Discretisations are subclasses of :class:`Axis`:
-:mod:`~scvi_codegen.fields.elements`, :mod:`~scvi_codegen.fields.differences`, :mod:`~scvi_codegen.fields.fourier`.
+where b runs over the points that the cell uses. Discretisations are subclasses of :class:`Axis`.
+
+**Spectral elements** of degree p have the Gauss-Lobatto-Legendre points as points and quadrature, so that I is the
+identity and the mass matrix is diagonal (C. Canuto et al., Spectral Methods: Fundamentals in Single Domains, Springer
+2006, section 5.4).
+
+**Staggered finite differences** of order 2 m, which are squared in the density, evaluate u, u_x and u_xx between two
+points from 2 m points (u_xx: 2 m + 2) (B. Fornberg, Math. Comp. 51 (1988), 699-706). At an end
+the rows Q = W D of u_x, the quadrature weights W between points and M at points satisfy
+
+    sum_i Q_ci x_i^k = W_c k x_c^(k-1),    sum_c Q_ci x_c^k = -M_i k x_i^(k-1) - [i = 0] 0^k,    k = 0 .. m,
+
+that is, D is exact for polynomials of degree m, and summation by parts holds for them (O. O'Reilly et al., J. Sci.
+Comput. 2017, staggered operators). Of all solutions the one nearest to the interior coefficients is taken.
+
+**Fourier modes**: on a periodic axis of equidistant points, with the derivatives of the trigonometric interpolant,
+int u_x^2 dx = sum_k L k^2 |c_k|^2 over the discrete Fourier coefficients c_k is the quadratic form u . K u with a
+circulant K whose rows have the sum 0, so that it is -sum_(i<j) K_ij (u_i - u_j)^2; likewise u_xx with k^4.
 """
+
+from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -18,8 +36,13 @@ from numpy.typing import NDArray
 from sympy import Expr, Rational
 
 from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.fields.density import Density
+from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.indices import Loop, Place, Size
+from scvi_codegen.tables.basis import differentiation_matrix, identity_matrix, matrix_product
+from scvi_codegen.tables.nodes import point_count
 from scvi_codegen.tables.precision import Matrix, Number, Vector, mp
+from scvi_codegen.tables.quadrature import Quadrature, gauss_lobatto
 from scvi_codegen.validation import checked_count
 
 Array = NDArray[np.float64]
@@ -232,3 +255,391 @@ def same(values: Sequence[float] | Array) -> float | None:
 def rational(value: Number) -> Expr:
     """Return a number rounded to 25 digits."""
     return Rational(mp.nstr(mp.mpf(value), 25))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SpectralElements(Axis):
+    """Elements between ascending ends.
+
+    Attributes:
+        reference: the points on [-1, 1].
+    """
+
+    reference: Vector
+
+    @staticmethod
+    def rule(count: int) -> Quadrature:
+        """Return the points of an element, with both ends, and the quadrature."""
+        return gauss_lobatto(count)
+
+    @classmethod
+    def of(cls, system: Density, name: str, *, degree: int, elements: Any) -> SpectralElements:
+        """Return the axis of a density.
+
+        Args:
+            system, name: the density, and the axis.
+            degree: p.
+            elements: number of equal elements, which are divided at places of point Lagrangians, or their ends.
+        """
+        places = [place[name] for place, _ in system.point_lagrangians]
+        return cls.between_ends(system, name, _breaks(name, *system.space[name], elements, places), degree)
+
+    @classmethod
+    def one(cls, system: Density, name: str, *, degree: int) -> SpectralElements:
+        """Return the axis of a density as one element of this degree."""
+        return cls.between_ends(system, name, np.array(system.space[name]), degree)
+
+    @classmethod
+    def between_ends(cls, system: Density, name: str, breaks: Array, degree: int) -> SpectralElements:
+        """Return the axis of a density with (E + 1,) ascending ends of the elements."""
+        fixed = held_ends(system.boundary[name])
+        clamped = clamped_ends(system.boundary[name], f"{system.fields[0]}_{name}")
+        p = point_count(degree, "the degree of the elements", least=1)
+        rule = cls.rule(p + 1)
+        derivative = differentiation_matrix(rule.points)
+        half = np.diff(breaks) / 2
+        elements = len(half)
+        offsets = np.array([float(1 + each) for each in rule.points])
+        local = breaks[:-1, None] + half[:, None] * offsets
+        places = np.arange(elements)[:, None] * p + np.arange(p + 1)
+        count = elements * p + (fixed is not None)
+        places %= count
+        points, masses = np.zeros(count), np.zeros(count)
+        points[places[:, ::-1]] = local[:, ::-1]
+        points[places[0, 0]] = breaks[0]  # not the end of a periodic axis
+        np.add.at(masses, places.ravel(), np.outer(half, np.array([float(each) for each in rule.weights])).ravel())
+        left, right = fixed or (False, False)
+        if count <= left + right:
+            raise SystemDefinitionError(f"'{name}' has no points between its prescribed ends: use more elements")
+        inside = slice(int(left), count - int(right))
+        size, index, nodes = f"E{name}", f"e{name}", f"nodes_{name}"
+        kinds = []
+        if elements > left + right:
+            every = tuple(Place(index=index, table=nodes, column=b) for b in range(p + 1))
+            kinds.append(Cells(span(index, size, int(left), int(right)), Place(index=index), every, nodes))
+        if elements == 1 and left and right:
+            kinds = [Cells(None, fixed_place(0), (0, *(fixed_place(b) for b in range(p - 1)), 1))]
+        else:
+            if left:
+                kinds.append(Cells(None, fixed_place(0), (0, *(fixed_place(b) for b in range(p)))))
+            if right:
+                last = tuple(fixed_place(b - p, f"N{name}") for b in range(p))
+                kinds.append(Cells(None, fixed_place(-1, size), (*last, 1)))
+        table = np.clip(places - int(left), 0, count - int(left) - int(right) - 1)
+        matrix = np.array([[float(x) for x in row] for row in derivative])
+        roots = np.sqrt(np.array([float(each) for each in rule.weights]))
+        largest = float(np.linalg.norm(roots[:, None] * matrix / roots, 2)) ** 2 / float(half.min()) ** 2
+        return cls(
+            name=name,
+            points=points[inside],
+            weights=masses[inside],
+            length=float(breaks[-1] - breaks[0]),
+            periodic=fixed is None,
+            quadrature=rule.weights,
+            operators=(identity_matrix(p + 1), derivative, matrix_product(derivative, derivative)),
+            stiffness=(largest, largest**2),
+            edges=_edges(name, places, local, (rule.weights, derivative), fixed, clamped),
+            cells=tuple(kinds),
+            jacobians=half,
+            cell_points=local,
+            table=table,
+            closed=ClosedPoints(
+                points=local.ravel(),
+                weights=np.outer(half, [float(each) for each in rule.weights]).ravel(),
+                positions=table.ravel(),
+                inside=((places >= int(left)) & (places < count - int(right))).ravel(),
+                neighbours=np.arange(places.size).reshape(places.shape).repeat(p + 1, axis=0),
+                rates=np.vstack([matrix / length for length in half]),
+            ),
+            reference=rule.points,
+        )
+
+    def between(self, place: float, distance: Array) -> dict[int, float]:
+        """See :meth:`Axis.between`: none within elements, which end at the places of point Lagrangians."""
+        raise SystemDefinitionError(
+            f"the point Lagrangian at {self.name} = {place:g} is not at an unknown value of the mesh, but inside of "
+            'an element or at an end with a prescribed value: use "spectral-elements", and a place off that end'
+        )
+
+    def modes(self, values: Array) -> Array:
+        """See :meth:`Axis.modes`: Legendre polynomials on each element."""
+        assert self.table is not None
+        points = np.array([float(x) for x in self.reference])
+        to_modes = np.linalg.inv(np.polynomial.legendre.legvander(points, len(points) - 1))
+        local = self.in_elements(values, -1).reshape(*values.shape[:-1], *self.table.shape)
+        modes = np.einsum("ab,...eb->...ea", to_modes, local)[..., 1:] ** 2
+        return np.asarray(modes / (np.arange(1, len(points)) + 0.5))
+
+
+def _breaks(axis: str, start: float, end: float, elements: Any, places: Sequence[float]) -> Any:
+    """Return the ends of the elements, including the places, at which equal elements are divided."""
+    if np.ndim(elements) == 0:
+        argument = f"elements= of '{axis}' (a number of elements or their ends)"
+        count = checked_count(elements, argument, least=1, error=SystemDefinitionError)
+        ends = np.unique([start, *places, end])
+        numbers = np.ceil(np.diff(ends) / (end - start) * count - 1e-9).astype(int)
+        parts = [np.linspace(a, b, n + 1) for a, b, n in zip(ends[:-1], ends[1:], numbers, strict=True)]
+        return np.unique(np.concatenate(parts))
+    breaks = np.asarray(elements, float)
+    if (
+        breaks.ndim != 1
+        or len(breaks) < 2
+        or not (np.diff(breaks) > 0).all()
+        or breaks[0] != start
+        or breaks[-1] != end
+    ):
+        raise SystemDefinitionError(f"the ends of the elements of '{axis}' must ascend from {start:g} to {end:g}")
+    return np.union1d(breaks, places)
+
+
+def _edges(
+    name: str,
+    places: NDArray[np.int64],
+    local: Array,
+    rule: tuple[Vector, Matrix],
+    fixed: tuple[bool, bool] | None,
+    clamped: tuple[bool, bool],
+) -> Edges:
+    """Return the ends of elements; ``places`` and ``local``, (E, p + 1), are positions and coordinates of points."""
+    weights = np.array([float(each) for each in rule[0]])
+    derivative = np.array([[float(x) for x in row] for row in rule[1]])
+    elements, size, half = len(places), places.shape[1], np.ptp(local, axis=1) / 2
+    last, (left, right) = int(places.max()), fixed or (False, False)
+    ends = np.arange(1 - clamped[0], elements + (fixed is None or clamped[1]))
+    sides = np.stack([ends - 1, ends], axis=1)
+    present = (sides >= 0) & ((sides < elements) | (fixed is None))
+    sides = np.where(present, sides % elements, (sides % elements)[:, ::-1])
+    table = places[sides]
+    table[~present[:, 0], 0] = table[~present[:, 0], 0, ::-1]  # so that entry p is the edge in all rows
+    table = table.reshape(-1, 2 * size)
+    shares = np.where(present, half[sides] * weights[0], 0.0)
+    whole = shares.sum(1, keepdims=True)
+    by_end = ((table == 0) & left, (table == last) & right)
+    prescribed, (lower, upper) = by_end[0] | by_end[1], (int(each.any(1).sum()) for each in by_end)
+    index = f"f{name}"
+    slots = tuple(Place(index=index, table=f"edges_{name}", column=b) for b in range(2 * size))
+    loop = span(index, f"F{name}", lower, upper)
+    kinds = [] if prescribed.any(1).all() else [Cells(loop, Place(index=index), slots, edge=True)]
+    for f in np.flatnonzero(prescribed.any(1)):
+        single = zip(table[f].tolist(), prescribed[f].tolist(), strict=True)
+        points = tuple(int(n > 0) if end else fixed_place(n - left) for n, end in single)
+        kinds.append(Cells(None, fixed_place(int(f)), points, edge=True))
+    stiffness = derivative.T @ (weights[:, None] * derivative)
+    return Edges(
+        cells=tuple(kinds),
+        table=np.clip(table - left, 0, last - left - right),
+        weights=whole[:, 0],
+        points=np.where(present[:, 1], local[sides[:, 1], 0], local[sides[:, 0], -1]),
+        rows={order: matrix[[-1, 0]] for order, matrix in ((1, derivative), (2, stiffness))},
+        scales={1: shares / half[sides] / whole, 2: np.where(present, -1, 0) / half[sides] / whole},
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FiniteDifferences(Axis):
+    """Equidistant points.
+
+    Attributes:
+        stencil: number of points for the interpolation of values between points.
+    """
+
+    stencil: int
+
+    @classmethod
+    def of(cls, system: Density, name: str, *, order: int, points: int) -> FiniteDifferences:
+        """Return the axis of a density; for u_xx in its density two points more are used.
+
+        Args:
+            system, name: the density, and the axis.
+            order: 2 m.
+            points: their number, ends included.
+        """
+        second = any(
+            orders.get(name) == 2 and symbol(each) in system.density.free_symbols
+            for each, (_, orders) in system.derivatives.items()
+        )
+        bounds, fixed = system.space[name], held_ends(system.boundary[name])
+        if isinstance(order, bool) or order not in (2, 4, 6, 8):
+            raise SystemDefinitionError(f"order= of finite differences is 2, 4, 6 or 8, not {order!r}")
+        if second and fixed is not None:
+            raise SystemDefinitionError(
+                f"'finite-differences' of second derivatives need a periodic axis, and '{name}' has ends: use "
+                '"spectral-elements"'
+            )
+        count, index = point_count_of(name, points, least=(2 if fixed is None else 3) * order), f"e{name}"
+        cell_count = count - (fixed is not None)
+        m, h = order // 2 + second, (bounds[1] - bounds[0]) / cell_count
+        nodes: Array = bounds[0] + h * np.arange(count, dtype=np.float64)
+        rows = _coefficients([mp.mpf(2 * k + 1) / 2 for k in range(-m, m)], 2 + second)
+        stiffness = [float(sum(map(abs, row))) ** 2 / h ** (2 * k) for k, row in enumerate(rows)]
+        places = tuple(Place(index=index, base=Size("", k)) for k in range(1 - m, m + 1))
+        cells = [Cells(span(index, f"N{name}", periodic=True), Place(index=index), places)]
+        masses, inner, closed = np.full(count, h), slice(None), None
+        if fixed is not None:
+            end_rows, midpoints, ends, largest = _end_rows(np.array([float(x) for x in rows[1]]))
+            masses[: len(ends)], masses[-len(ends) :] = h * ends, h * ends[::-1]
+            left, right = map(int, fixed)
+            within = span(index, f"N{name}", order - left, order + 1 - right)  # the unknown to the left of each cell
+            inner_cells = Cells(within, Place(index=index, base=Size("", left)), places)
+            cells = [inner_cells, *_end_cells(name, end_rows, midpoints, fixed)]
+            inner = slice(left, count - right)
+            closed = _closed(nodes, masses, order, inner)
+            stiffness[1] = max(stiffness[1], largest / h**2)
+        return cls(
+            name=name,
+            points=nodes[inner],
+            weights=masses[inner],
+            length=bounds[1] - bounds[0],
+            stencil=order,
+            periodic=fixed is None,
+            quadrature=(mp.mpf(1),),
+            operators=tuple((row,) for row in rows),
+            cells=tuple(cells),
+            jacobians=np.full(cell_count, h),
+            cell_points=(nodes[:cell_count] + h / 2)[:, None],
+            closed=closed,
+            stiffness=tuple(stiffness[1:]),
+        )
+
+    def between(self, place: float, distance: Array) -> dict[int, float]:
+        """See :meth:`Axis.between`: the polynomial through the nearest points."""
+        near = np.sort(np.abs(distance).argsort(kind="stable")[: self.stencil]).tolist()
+        return dict(zip(near, lagrange(distance[near]).tolist(), strict=True))
+
+    def modes(self, values: Array) -> Array:
+        """See :meth:`Axis.modes`."""
+        if not self.periodic:  # sine series of what a straight line through the ends leaves
+            steps = np.linspace(0, 1, values.shape[-1])
+            values = values - values[..., :1] - steps * (values[..., -1:] - values[..., :1])
+            values = np.concatenate([values, -values[..., -2:0:-1]], -1)
+        return Axis.modes(self, values)
+
+
+def _coefficients(offsets: Sequence[Number], count: int) -> list[Vector]:
+    """Return the coefficients of derivatives of order 0, 1, .. at 0 of the interpolant of values at offsets."""
+    powers = mp.matrix([[x**r for x in offsets] for r in range(len(offsets))])
+    moments = ([mp.factorial(k) * (r == k) for r in range(len(offsets))] for k in range(count))
+    return [tuple(mp.lu_solve(powers, mp.matrix(each))) for each in moments]
+
+
+def _end_rows(row: Array) -> tuple[Array, Array, Array, float]:
+    """Return, for h = 1, D of the first 2 m midpoints, the weights W and M, and a bound of D^T W D by M (one end)."""
+    m = len(row) // 2
+    size, width = 2 * m, 3 * m
+    interior = np.zeros((4 * width, 4 * width + m))
+    for c in range(m - 1, 4 * width):
+        interior[c, c - m + 1 : c + m + 1] = row
+    unknown, blocks, right = size * width, [], []
+    x, y = np.arange(width + 0.0), np.arange(4 * width) + 0.5
+    for k in range(m + 1):
+        rates = k * x ** max(k - 1, 0), k * y[:size] ** max(k - 1, 0)
+        blocks.append([np.kron(np.eye(size), x**k), -np.diag(rates[1]), np.zeros((size, width))])
+        blocks.append([np.kron(y[:size] ** k, np.eye(width)), np.zeros((width, size)), np.diag(rates[0])])
+        right += [np.zeros(size), -(k == 0) * (x == 0) - y[size:] ** k @ interior[size:, :width]]
+    matrix, target = np.block(blocks), np.concatenate(right)
+    solution = np.concatenate([interior[:size, :width].ravel(), np.ones(size), 1 - (x == 0) / 2])
+    for _ in range(3):  # the first is the nearest solution, the others remove rounding
+        solution += np.linalg.lstsq(matrix, target - matrix @ solution, rcond=1e-11)[0]
+    weights, masses = solution[unknown : unknown + size], solution[unknown + size :]
+    rows = solution[:unknown].reshape(size, width) / weights[:, None]
+    interior[:size] = 0
+    interior[:size, :width] = np.sqrt(weights)[:, None] * rows
+    interior[:, :width] /= np.sqrt(masses)
+    return rows, weights, masses, 1.01 * float(np.linalg.norm(interior, 2)) ** 2
+
+
+def _end_cells(name: str, rows: Array, weights: Array, fixed: tuple[bool, bool]) -> list[Cells]:
+    """Return the cells at both ends; those of the right are mirror images of the left."""
+    result = []
+    for c, row in enumerate(rows):
+        distance = c + 0.5 - np.arange(rows.shape[1], dtype=np.float64)
+        near = np.argsort(np.abs(distance), kind="stable")[: len(weights)]
+        value = np.zeros(rows.shape[1])
+        value[near] = lagrange(distance[near])
+        for end, prescribed in enumerate(fixed):
+            places = [
+                end
+                if prescribed and i == 0
+                else fixed_place(i - prescribed)
+                if end == 0
+                else fixed_place(prescribed - i - 1, f"N{name}")
+                for i in range(rows.shape[1])
+            ]
+            operators = tuple((tuple(map(mp.mpf, each)),) for each in (value, -row if end else row))
+            index = fixed_place(c) if end == 0 else fixed_place(-c - 1, f"E{name}")
+            result.append(Cells(None, index, tuple(places), operators=operators, weight=float(weights[c])))
+    return result
+
+
+def _closed(points: Array, masses: Array, order: int, inner: slice) -> ClosedPoints:
+    count = len(points)
+    first = np.clip(np.arange(count) - order // 2, 0, count - order - 1)
+    neighbours: NDArray[np.int64] = first[:, None] + np.arange(order + 1)
+    rates = [
+        np.array(_coefficients([mp.mpf(k - place) for k in range(order + 1)], 2)[1], float) / (points[1] - points[0])
+        for place in range(order + 1)
+    ]
+    return ClosedPoints(
+        points=points,
+        weights=masses,
+        positions=np.clip(np.arange(count) - inner.start, 0, inner.stop - inner.start - 1),
+        inside=np.isin(np.arange(count), np.arange(count)[inner]),
+        neighbours=neighbours,
+        rates=np.array([rates[offset] for offset in np.arange(count) - first]),
+    )
+
+
+LEAST_TRANSFORMED = 32
+"""Smallest even number of Fourier points that are transformed, half of the smallest odd one (measured)."""
+
+
+class Fourier(Axis):
+    """Periodic axis of equidistant points."""
+
+    __slots__ = ()
+
+    @classmethod
+    def of(cls, system: Density, name: str, *, points: int, derivative: str | None = None) -> Fourier:
+        """Return the axis of a density.
+
+        Args:
+            system, name: the density, and the axis.
+            points: their number.
+            derivative: ``"fft"``, ``"dense"``, or ``None`` for fast Fourier transforms of many points.
+        """
+        if system.boundary[name] != PERIODIC:
+            raise SystemDefinitionError(
+                f"'fourier' needs a periodic axis, and '{name}' has ends: use \"spectral-elements\" or "
+                '"finite-differences"'
+            )
+        start, end = system.space[name]
+        if derivative not in (None, "fft", "dense"):
+            raise SystemDefinitionError(f'derivative= of \'{name}\' is "fft" or "dense", not {derivative!r}')
+        count = point_count_of(name, points, least=3, most=4096 if derivative == "dense" else 16384)
+        transformed = count >= LEAST_TRANSFORMED * (1 + count % 2) if derivative is None else derivative == "fft"
+        h = (end - start) / count
+        k = 2 * np.pi * np.fft.fftfreq(count, h)
+        distance = np.abs(np.arange(1 if transformed else count)[:, None] - np.arange(count))
+        angle = np.pi * np.arange(1, (count + 1) // 2) / count
+        signs = np.where(np.arange(1, (count + 1) // 2) % 2, np.pi, -np.pi) / (end - start)
+        half = signs / (
+            np.sin(angle) if count % 2 else np.tan(angle)
+        )  # Trefethen, Spectral Methods in MATLAB, chapter 3
+        spectra = (np.fft.ifft(k.astype(np.longdouble) ** (2 * power)).real * h for power in (1, 2))
+        rows = [each.astype(np.float64) for each in spectra]
+        matrices = (-row[np.minimum(distance, count - distance)] for row in rows)
+        return cls(
+            name=name,
+            points=start + h * np.arange(count, dtype=np.float64),
+            weights=np.full(count, h),
+            length=end - start,
+            pairs=tuple(each[0] if transformed else each for each in matrices),
+            rates=np.concatenate([[0.0], half, np.zeros(1 - count % 2), -half[::-1]]),
+            stiffness=tuple(float(np.abs(k).max()) ** (2 * power) for power in (1, 2)),
+        )
+
+    def between(self, place: float, distance: Array) -> dict[int, float]:
+        """See :meth:`Axis.between`: trigonometric interpolation."""
+        angle, n = np.pi * distance / self.length, len(self.points)
+        values = np.sin(n * angle) / (n * (np.sin(angle) if n % 2 else np.tan(angle)))
+        return dict(enumerate(values.tolist()))

@@ -14,11 +14,8 @@ from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.fields.assembly import Assembly
-from scvi_codegen.fields.axes import NATURAL, PERIODIC, Axis
+from scvi_codegen.fields.axes import NATURAL, PERIODIC, Axis, FiniteDifferences, Fourier, SpectralElements
 from scvi_codegen.fields.density import Density, derivatives_of
-from scvi_codegen.fields.differences import FiniteDifferences
-from scvi_codegen.fields.elements import SpectralElements
-from scvi_codegen.fields.fourier import Fourier
 from scvi_codegen.fields.laws import FieldDerivation, derivation_of
 from scvi_codegen.fields.mesh import MeshSystem
 from scvi_codegen.formulas.array_statements import array_text

@@ -11,8 +11,7 @@ from scipy.integrate import solve_ivp
 
 import scvi_codegen as sc
 from scvi_codegen.runtime.chaos.ensemble import TRAJECTORIES_TOGETHER
-from scvi_codegen.runtime.chaos.growth import SERIES
-from scvi_codegen.runtime.chaos.tangent_propagation import InitialTangents
+from scvi_codegen.runtime.chaos.indicators import SERIES, InitialTangents
 
 REGULAR, CHAOTIC = ((0.0, 0.0), (0.5, 0.0)), ((0.0, -0.25), (0.42, 0.0))
 """Of Henon and Heiles near the energy 1/8: Skokos, Bountis & Antonopoulos, Physica D 231 (2007) 30, section 3."""

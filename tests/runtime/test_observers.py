@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import scvi_codegen as sc
-from scvi_codegen.runtime.run.observer import Observer
+from scvi_codegen.runtime.run.observation import Observer
 
 STATE = {"q": [1.0, 0.0], "p": [0.0, 1.1], "h": 0.1}
 SITUATIONS = {

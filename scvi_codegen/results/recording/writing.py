@@ -39,8 +39,7 @@ from scvi_codegen.runtime.core.features import require
 from scvi_codegen.runtime.core.words import low_words
 from scvi_codegen.runtime.run.accuracy import warn_of_energy_error, warn_of_large_steps, warn_of_unresolved_fields
 from scvi_codegen.runtime.run.chunks import drive
-from scvi_codegen.runtime.run.observation import Observation
-from scvi_codegen.runtime.run.observers import Saver
+from scvi_codegen.runtime.run.observation import Observation, Saver
 from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.runtime.run.run_loop import record
 from scvi_codegen.runtime.run.step_plan import StepPlan

@@ -20,10 +20,17 @@ from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.cuda import constant
 from scvi_codegen.native.options import SolverOptions, checked_options
 from scvi_codegen.rendering.source import Source
-from scvi_codegen.runtime.chaos.growth import SERIES, Growth, ill_conditioned, r_factors
-from scvi_codegen.runtime.chaos.indicators import ChaosIndicators
-from scvi_codegen.runtime.chaos.tangent_propagation import MOST as LARGEST_CHUNK
-from scvi_codegen.runtime.chaos.tangent_propagation import InitialTangents, StepSegment, TangentPropagation
+from scvi_codegen.runtime.chaos.indicators import MOST as LARGEST_CHUNK
+from scvi_codegen.runtime.chaos.indicators import (
+    SERIES,
+    ChaosIndicators,
+    Growth,
+    InitialTangents,
+    StepSegment,
+    TangentPropagation,
+    ill_conditioned,
+    r_factors,
+)
 from scvi_codegen.runtime.core.features import require
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array, States

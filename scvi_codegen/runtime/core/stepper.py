@@ -52,7 +52,7 @@ from scvi_codegen.runtime.run.global_error import (
     warn_of_unconfirmed_run,
 )
 from scvi_codegen.runtime.run.largest_step import largest_step
-from scvi_codegen.runtime.run.observers import Observe
+from scvi_codegen.runtime.run.observation import Observe
 from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.runtime.run.saving import read_checkpoint
 from scvi_codegen.runtime.run.step_plan import StepPlan, checked_plan, planned_steps
@@ -128,7 +128,7 @@ class Stepper(Integrator):
                 :meth:`Trajectory.at`. Not with inputs.
             observe: function of the run that returns the data to save instead of the states, a number or an array of
                 constant shape, in ``observed`` of the trajectory; or an observer of all states
-                (:class:`~scvi_codegen.runtime.run.observer.Observer`) or its name, whose result is saved there:
+                (:class:`~scvi_codegen.runtime.run.observation.Observer`) or its name, whose result is saved there:
                 ``"extremes"``, the smallest and largest positions and momenta. Not with inputs.
             events: zero crossings to record in ``events`` of the trajectory; a terminal one ends the run, others may
                 change the state (:func:`~scvi_codegen.impact`), which is saved as a further state. One or several

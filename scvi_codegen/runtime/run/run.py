@@ -14,8 +14,7 @@ from scvi_codegen.runtime.rotations.attitude_history import AttitudeHistory
 from scvi_codegen.runtime.run.accuracy import warn_of_inaccuracy
 from scvi_codegen.runtime.run.descriptions import describe_run
 from scvi_codegen.runtime.run.memory import Memory, alone
-from scvi_codegen.runtime.run.observation import Observation
-from scvi_codegen.runtime.run.observers import Observe, Saver, saver_of
+from scvi_codegen.runtime.run.observation import Observation, Observe, Saver, saver_of
 from scvi_codegen.runtime.run.run_loop import FIRST_STEPS, ShortRuns, integrate_short, record
 from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.runtime.chaos.indicators import ChaosIndicators
-from scvi_codegen.runtime.chaos.tangent_propagation import InitialTangents, along
+from scvi_codegen.runtime.chaos.indicators import ChaosIndicators, InitialTangents, along
 from scvi_codegen.runtime.core.features import require
 from scvi_codegen.runtime.core.validation import columns_of_inputs
 from scvi_codegen.runtime.sensitivity.gradients import (

@@ -1,5 +1,5 @@
 /* Growth of tangent vectors, which are coordinates after those of their trajectory, along a thread of a GPU (the series
- * are those of scvi_codegen/runtime/chaos/growth.py). Requires: thread_memory, TANGENTS, the number of vectors. */
+ * are those of scvi_codegen/runtime/chaos/indicators.py). Requires: thread_memory, TANGENTS, the number of vectors. */
 enum { OWN = M / (TANGENTS + 1) }; /* coordinates of the trajectory */
 
 /* Adds a multiple of one tangent vector to another, in the state and in the stored values, which are linear in it. */
