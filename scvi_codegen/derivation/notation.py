@@ -123,8 +123,8 @@ def latex(
     equations: Sequence[Equation], end: End, entries: Sequence[TableEntry], symmetries: Sequence[Symmetry]
 ) -> str:
     """Return an ``align*`` environment with numbers as tags, one for the tables, one for the momentum maps."""
-    residuals = [equation.residual for equation in (*equations, *end.values())]
-    symbols = set(end).union(*(r.free_symbols for r in residuals), (entry.symbol for entry in entries))
+    shown = [*(equation.residual for equation in (*equations, *end.values())), *(s.momentum_map for s in symmetries)]
+    symbols = set(end).union(*(expression.free_symbols for expression in shown), (entry.symbol for entry in entries))
     names = {symbol: latex_name(symbol.name) for symbol in symbols}
 
     def written(expression: sympy.Expr) -> str:
@@ -138,10 +138,7 @@ def latex(
         new = latex_name(f"{start.name}+1")
         lines.append(rf"{new} &= {written(equation.residual)} \tag{{{_tag(equation.number)}}}")
     tables = [rf"{names[entry.symbol]} &= {exact(entry)}{mp.nstr(entry.value, 17)}" for entry in entries]
-    maps = [
-        rf"J &= {sympy.latex(s.momentum_map, symbol_names=_names_of_maps(s))} \tag{{{_tag(s.name)}}}"
-        for s in symmetries
-    ]
+    maps = [rf"J &= {written(s.momentum_map)} \tag{{{_tag(s.name)}}}" for s in symmetries]
     blocks = [block for block in (lines, tables, maps) if block]
     return "\n".join("\\begin{align*}\n" + " \\\\\n".join(block) + "\n\\end{align*}" for block in blocks)
 
@@ -152,10 +149,6 @@ def html(equation: Equation) -> Html:
     if size > LARGEST_SHOWN:
         return Html(f"<div>{plain(f'({equation.number}) {size} operations')}</div>")
     return Html(f"<div>{plain(f'({equation.number})')} {' '.join(mathml_terms(equation.residual, sympy.S.Zero))}</div>")
-
-
-def _names_of_maps(symmetry: Symmetry) -> dict[sympy.Symbol, str]:
-    return {symbol: latex_name(symbol.name) for symbol in symmetry.momentum_map.free_symbols}
 
 
 def _tag(number: str) -> str:

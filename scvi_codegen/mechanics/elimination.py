@@ -460,14 +460,10 @@ class _RodSearch:
         if len(own) < 2:
             return f"contains {len(own)} coordinate" + "s" * (len(own) != 1)
         squared = sympy.expand(_without_root(g, self.order))
-        squares = [q for q in own if _is_constant(squared.diff(q, 2), self.order) and squared.diff(q, 2) != 0]
+        squares = [q for q in own if (second := squared.diff(q, 2)) != 0 and not _coordinates([second], self.order)]
         if len(squares) in (3, 6):
             return f"contains the squares of {len(squares)} coordinates: a rod in space, not in a plane"
         return "is not of the form (x1 - x2)**2 + (y1 - y2)**2 = l**2 with a length that depends on no coordinate"
-
-
-def _is_constant(expression: Expr, coordinates: Mapping[Symbol, int]) -> bool:
-    return not _coordinates([expression], coordinates)
 
 
 def _coordinates(expressions: Sequence[Expr], coordinates: Mapping[Symbol, int]) -> set[Symbol]:

@@ -25,7 +25,9 @@ def with_calls(source: Source) -> Source:
     names = {*re.findall(r"\w+", re.sub(r"/\*.*?\*/", "", source.declarations, flags=re.DOTALL))}
     if f"{prefix}_advance" not in names:
         return source
-    declarations, functions = (_named(_text(name), prefix) for name in ("calls_declarations", "calls"))
+    declarations, functions = (
+        re.sub(r"NAME\((\w+)\)", rf"{prefix}_\1", _text(name)) for name in ("calls_declarations", "calls")
+    )
     present = [name for name in OPTIONAL if {name, f"{prefix}_{name}"} & names]
     switches = "".join(f"#define HAS_{name.upper()}\n" for name in present)
     return replace(
@@ -38,7 +40,3 @@ def with_calls(source: Source) -> Source:
 @cache
 def _text(name: str) -> str:
     return (template_folder() / f"{name}.h").read_text(encoding="utf-8")
-
-
-def _named(text: str, prefix: str) -> str:
-    return re.sub(r"NAME\((\w+)\)", rf"{prefix}_\1", text)

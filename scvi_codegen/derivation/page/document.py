@@ -9,7 +9,7 @@ from sympy import Function as Applied
 from sympy import Symbol
 
 from scvi_codegen.derivation.equations import StepEquations, derive
-from scvi_codegen.derivation.notation import Equation, events_text, table_entries
+from scvi_codegen.derivation.notation import events_text, table_entries
 from scvi_codegen.derivation.page.drawings import curve_section, jacobian_section, tables_section
 from scvi_codegen.derivation.page.sums import end_formulas, gather_formulas, meaning, row_formulas
 from scvi_codegen.display.page import (
@@ -191,7 +191,9 @@ def component_equations_section(derived: StepEquations | None) -> Section:
         Paragraph("The same equations by components, with positions and velocities substituted, not simplified:")
     ]
     for _, group in groupby(derived.equations, key=lambda equation: equation.kind):
-        contents += formulas([_formula(equation) for equation in group], "equation", together=MOST_OPERATIONS)
+        contents += formulas(
+            [Formula(each.residual, sympy.S.Zero, each.number) for each in group], "equation", together=MOST_OPERATIONS
+        )
     q, p = derived.state
     ends = zip((*q, *p), (*derived.end_position, *derived.end_momentum), strict=True)
     contents += formulas(
@@ -224,10 +226,6 @@ def _place(group: StageGroup) -> str:
     first = group.name.partition("_")[0]
     named = FAMILIES.get(first, f"At the points of '{group.name}'")
     return named if len(group.abscissae) == 1 else f"{named}, {len(group.abscissae)} of them"
-
-
-def _formula(equation: Equation) -> Formula:
-    return Formula(equation.residual, sympy.S.Zero, equation.number)
 
 
 def derivation_html(system: MechanicalSystem, method: Method, *, events: Sequence[Event] = ()) -> str:

@@ -206,7 +206,7 @@ def gathered(table: Table, blocks: Sequence[Block]) -> sympy.Expr:
 
 def _group_terms(letter: str, group: Sequence[tuple[Column, Block]]) -> Iterator[sympy.Expr]:
     """Yield unknowns of one kind times their coefficients."""
-    columns, numbers = [column for column, _ in group], [_number(block) for _, block in group]
+    columns, numbers = [column for column, _ in group], [int(block.name.rpartition("_")[2]) for _, block in group]
     factor, span = h ** group[0][1].power, (j, numbers[0], numbers[-1])
     kinds = {column.kind for column in columns}
     named = [(column, number) for column, number in zip(columns, numbers, strict=True) if column.kind == "named"]
@@ -363,10 +363,6 @@ def _small(value: Number) -> sympy.Expr:
 
 def _letter(block: Block) -> str:
     return block.name.rpartition("_")[0]
-
-
-def _number(block: Block) -> int:
-    return int(block.name.rpartition("_")[2])
 
 
 def _unknown(letter: str, index: object) -> Symbol:

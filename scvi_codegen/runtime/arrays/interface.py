@@ -129,7 +129,9 @@ def field_values(
         _check_finite(values, array.name)
         shape = array.shape(sizes)
         if values.shape not in ((), shape):
-            raise StateError(f"'{array.name}' must have the shape {_text(shape)} of {array}, not {values.shape}")
+            raise StateError(
+                f"'{array.name}' must have the shape {' x '.join(map(str, shape))} of {array}, not {values.shape}"
+            )
         fields[array.name] = _read_only(np.ascontiguousarray(np.broadcast_to(values, shape)))
     return fields
 
@@ -255,10 +257,6 @@ def _check_finite(values: Numbers, label: str) -> None:
     if not np.all(np.isfinite(values)):
         index = np.argwhere(~np.isfinite(np.atleast_1d(values)))[0]
         raise StateError(f"{label} must be finite, but is not at the index {[int(k) for k in index]}")
-
-
-def _text(shape: Sequence[int]) -> str:
-    return " x ".join(map(str, shape))
 
 
 MOST_COORDINATES, MOST_OF_MESH = 2000, 64
