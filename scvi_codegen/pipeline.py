@@ -178,7 +178,6 @@ def _arrays_of(system: MechanicalSystem) -> tuple[str, ...]:
 
 
 def _solver_of(program: Program) -> str:
-    """Return the name of the solver that is tried first."""
     if program.splitting:
         return "explicit"
     return "rattle" if program.rattle else "fixed-point" if program.fixed_point else "newton"
@@ -284,7 +283,6 @@ class Sources:
 
     @cached_property
     def _in_double(self) -> Sources:
-        """The sources in double precision."""
         return Sources(*self._arguments)
 
     def program(self, *, fallback: bool = False) -> Program:

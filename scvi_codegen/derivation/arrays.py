@@ -78,7 +78,6 @@ def _text(system: ArraySystem) -> Iterator[str]:
 
 
 def _latex(system: ArraySystem) -> Iterator[str]:
-    """Yield one line each, in display mode."""
     yield rf"\[ {system.latex} \]"
     for term in system.potentials:
         entries = {slot: latex_entry(access) for slot, access in term.slots}

@@ -116,7 +116,6 @@ class StepEquations:
 
     @property
     def _end(self) -> dict[sympy.Symbol, Equation]:
-        """The new values by the symbols of the old."""
         return dict(zip((*self.state[0], *self.state[1]), (*self.end_position, *self.end_momentum), strict=True))
 
     def _heading(self) -> Iterator[str]:
@@ -239,7 +238,6 @@ class _Writer:
         return sympy.Symbol(name, real=True)
 
     def equations(self) -> tuple[Equation, ...]:
-        """Return the rows of the stage system, component by component."""
         rows = self._rows()
         return tuple(
             Equation(row.number, row.kind, sympy.Add(*rows[r][i]))
@@ -248,7 +246,6 @@ class _Writer:
         )
 
     def end_state(self) -> tuple[tuple[Equation, ...], tuple[Equation, ...]]:
-        """Return q_{k+1} and p_{k+1}."""
         number_q, number_p = self.stages.end_numbers
         position = self._gathered(self.stages.end_position, 0, power=0, scale=sympy.S.One)
         shrunk = sympy.exp(-self.stages.damping * self.step)

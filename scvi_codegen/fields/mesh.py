@@ -251,7 +251,6 @@ class MeshSystem(Mesh):
 
 
 def _plain(value: Any) -> Any:
-    """Return options with arrays as lists."""
     return {key: _plain(x) for key, x in value.items()} if isinstance(value, Mapping) else np.asarray(value).tolist()
 
 

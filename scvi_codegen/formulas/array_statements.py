@@ -404,7 +404,6 @@ def entry_names(array: Array, sizes: Mapping[str, int]) -> NDArray[np.str_]:
 
 
 def _elements(loops: Sequence[Loop], sizes: Mapping[str, int]) -> Iterator[Elements]:
-    """Yield the values of all indices."""
     if not loops:
         yield {}
         return

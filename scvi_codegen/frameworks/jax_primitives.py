@@ -67,7 +67,6 @@ def _linear_batched(primitive: Callable[[], Primitive]) -> Callable[..., tuple[A
 
 
 def _repeated(array: Any, count: int, axis_index: int) -> Any:
-    """Return the array repeated along a new axis of length ``count``."""
     return jnp.broadcast_to(
         jnp.expand_dims(array, axis_index), (*array.shape[:axis_index], count, *array.shape[axis_index:])
     )

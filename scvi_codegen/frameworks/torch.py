@@ -30,13 +30,11 @@ class TorchFlow(FlowOfRows, ArrayFlow):
     """States of a trajectory as a function that PyTorch differentiates."""
 
     def _along(self, x: Any) -> Any:
-        """Return the saved states; see :meth:`ArrayFlow._along`."""
         from scvi_codegen.frameworks.torch_functions import StatesAlong
 
         return StatesAlong.apply(x, self)
 
     def _binary64(self, value: Any, name: str) -> Any:
-        """Return a tensor in double precision; see :meth:`ArrayFlow._binary64`."""
         import torch
 
         tensor = torch.as_tensor(value, dtype=None if isinstance(value, torch.Tensor) else torch.float64)
@@ -47,7 +45,6 @@ class TorchFlow(FlowOfRows, ArrayFlow):
         return tensor.to(torch.float64)
 
     def _joined(self, parts: Sequence[Any], batch: tuple[int, ...]) -> Any:
-        """Return tensors concatenated along the last axis; see :meth:`ArrayFlow._joined`."""
         import torch
 
         return torch.cat([part.expand((*batch, part.shape[-1])) for part in parts], dim=-1)

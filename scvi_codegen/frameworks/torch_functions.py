@@ -23,7 +23,6 @@ NO_MEMORY = 6
 def _call(
     binding: Any, name: str, flow: FlowOfRows, counts: Sequence[int], x: Any, arguments: Sequence[Any], shape: Any
 ) -> Any:
-    """Return the results of a C function for all rows of x."""
     result = torch.empty(shape, dtype=torch.float64)
     arrays = [each.detach().contiguous() for each in (x, *arguments)]
     report, rows = binding.new("report *"), x[..., 0].numel()

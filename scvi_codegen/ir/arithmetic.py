@@ -60,7 +60,6 @@ class _Graph:
         return content[1] if isinstance(content, tuple) else ()
 
     def read(self, expression: sympy.Expr) -> int:
-        """Return the id of a SymPy expression."""
         if expression not in self._read:
             self._read[expression] = self._build(expression)
         return self._read[expression]

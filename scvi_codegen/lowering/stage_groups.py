@@ -310,7 +310,6 @@ def argument_name(system: MechanicalSystem, gather: Gather) -> str:
 def _derivative_blocks(
     group: StageGroup, sites: UnknownLayout
 ) -> tuple[tuple[sympy.Expr, ...], tuple[DerivativeBlock, ...]]:
-    """Return the nonzero derivatives, grouped by scatter and gather."""
     entries = _partials(group)
     partials: list[sympy.Expr] = []
     blocks = []

@@ -110,7 +110,6 @@ def _acts(split: KineticSplitting) -> bool:
 
 
 def _potential_part(system: MechanicalSystem) -> Expr:
-    """Return L without its kinetic energy."""
     return system.lagrangian.xreplace(dict.fromkeys(system.velocities, S.Zero))
 
 

@@ -103,7 +103,6 @@ class TimeSpan(RunOptions):
                 )
 
     def _run_section(self) -> dict[str, Any]:
-        """Return the section ``[run]`` of the model file."""
         section = {option.key: getattr(self, option.field) for option in options_of("run")}
         if not self.action:  # the default
             del section["action"]

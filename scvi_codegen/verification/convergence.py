@@ -92,7 +92,6 @@ def convergence_checks(tested: SystemUnderTest) -> Iterator[Check]:
 
 
 def _known_properties(method: Method) -> Finding | None:
-    """Compare the properties that the method computes from its coefficients with the known ones."""
     expected, actual = _expected(method), (method.order, method.symplectic, method.symmetric)
     if expected is None:
         return None

@@ -90,7 +90,6 @@ def _starts(state: State) -> Starts:
 
 
 def _map_of(tested: SystemUnderTest, stepper: Stepper) -> _Map:
-    """Return the step of a stepper from the first state."""
     state, m = tested.states[0], tested.system.dimension
 
     def end(arguments: list[Number]) -> Array:
@@ -128,7 +127,6 @@ def derivative_checks(tested: SystemUnderTest) -> Iterator[Check]:
 
 
 def _largest(tested: SystemUnderTest, error: Callable[[_Map], float]) -> Finding | None:
-    """Return the largest error of the stepper under test and the one with Newton's method alone."""
     if not _differentiable(tested):
         return None
     errors = [error(_map_of(tested, stepper)) for stepper in tested.steppers]
@@ -144,7 +142,6 @@ def _differentiable(tested: SystemUnderTest) -> bool:
 
 
 def _second(tested: SystemUnderTest) -> Finding | None:
-    """Compare the second derivative along two directions with differences of the exact step."""
     if not _has_second_derivatives(tested):
         return None
     step = _map_of(tested, tested.stepper)

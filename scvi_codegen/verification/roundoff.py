@@ -238,7 +238,6 @@ class _Walk:
 
 
 def _walks(tested: SystemUnderTest, run: Callable[[Array, Array, int], tuple[Array, Array]]) -> Iterator[_Walk]:
-    """Yield the statistics of each invariant."""
     invariants = _invariants(tested)
     if not invariants:
         return

@@ -144,7 +144,6 @@ def _fallback(tested: SystemUnderTest) -> Finding | None:
 
 
 def _counted(tested: SystemUnderTest, state: State, options: SolverOptions | None = None) -> tuple[int, Array]:
-    """Return the number of iterations of a step, and its end state."""
     run = tested.stepper.integrate(
         state.q, state.p, h=state.h, steps=1, t=state.t, parameters=tested.parameters, options=options
     )
@@ -161,7 +160,6 @@ def _convergence_rate(tested: SystemUnderTest) -> Finding:
 
 
 def _run(tested: SystemUnderTest) -> Finding:
-    """Compare the steps of a run, with predictor and compensation, with single steps from the same states."""
     worst = max(_run_of(tested, stepper) for stepper in tested.steppers)
     return Finding(worst, ROUNDINGS, f"in units of rounding, {RUN_STEPS} steps, also with Newton's method alone")
 
@@ -211,7 +209,6 @@ def _relative(result: Array, expected: Numbers) -> float:
 
 
 def _discrete(tested: SystemUnderTest) -> Finding | None:
-    """Compare the compiled discrete Legendre transforms with central differences of the discrete Lagrangian."""
     stepper, state = tested.stepper, tested.states[0]
     if not stepper.interface.has_action:
         return None

@@ -97,7 +97,6 @@ def _reduced_symplecticity(tested: SystemUnderTest) -> Finding:
 
 
 def _gauge_invariance(tested: SystemUnderTest) -> Finding:
-    """Return the difference of steps from states of other gauge."""
     reduction, worst = Reduction(tested.stepper.interface), 0.0
     for each in tested.states:
         state = State(*reduction.normalised(each.q, each.p), each.t, each.h)
@@ -151,7 +150,6 @@ def _by_time(tested: SystemUnderTest, state: State) -> Array:
 
 
 def _multipliers(tested: SystemUnderTest) -> Finding:
-    """Compare the compiled Lagrange multipliers with those of the exact motion."""
     state, motion = tested.states[0], tested.motion
     q, p, t = numbers(state.q), numbers(state.p), mp.mpf(state.t)
     v = motion.velocity(q, p, t)
@@ -173,7 +171,6 @@ def _reversal(tested: SystemUnderTest) -> Finding:
 
 
 def _momentum(tested: SystemUnderTest, k: int) -> Finding:
-    """Measure the change of the k-th momentum map along a run."""
     initial, stepper = tested.initial, tested.stepper
     try:
         run = stepper.integrate(

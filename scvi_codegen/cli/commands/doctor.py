@@ -155,7 +155,6 @@ def _compilation() -> Iterator[CheckResult]:
 
 
 def _trial(folder: Path) -> CheckResult:
-    """Derive, compile and run a pendulum in a folder."""
     began = time.perf_counter()
     with running([sys.executable, "-c", TRIAL], folder) as process:
         try:
@@ -193,7 +192,6 @@ def _vectors(folder: Path) -> CheckResult:
 
 
 def _cache() -> CheckResult:
-    """Check the folder of the cache of compiled integrators."""
     folder = cache_folder()
     nearest = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     try:

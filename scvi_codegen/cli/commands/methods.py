@@ -105,7 +105,6 @@ def tableau_text(name: str) -> str:
 
 
 def _entries(A: Sequence[Expressions], b: Expressions, c: Expressions) -> Iterator[str]:
-    """Yield a line for each entry of a tableau."""
     yield from (f"c_{i} = {x}" for i, x in enumerate(c, 1))
     yield from (f"a_{i},{j} = {x}" for i, line in enumerate(A, 1) for j, x in enumerate(line, 1))
     yield from (f"b_{j} = {x}" for j, x in enumerate(b, 1))

@@ -165,7 +165,6 @@ def _chosen(names: Sequence[str], experiments: Mapping[str, Experiment]) -> list
 
 
 def _add(done: Reproduction, outcome: Result | Failure, folder: Path) -> str:
-    """Store and write a result; return the line to print."""
     if isinstance(outcome, Failure):
         done.failures.append(outcome)
         return f"failed: {outcome.message}"

@@ -468,7 +468,6 @@ class ArraySystem:
 
     @property
     def _velocities(self) -> dict[str, Array]:
-        """Arrays of coordinates by the names of their velocities."""
         return {} if self.momenta else {array.name + DOT: array for array in self.coordinates}
 
     def warn_of_mistakes(self, others: Iterable[Symbol] = ()) -> None:

@@ -63,7 +63,6 @@ def forces_at_points(
 def _vectors(
     entry: Mapping[str, Any], rotations: Mapping[str, Rotation], where: str, read: Callable[[Any], Expr]
 ) -> tuple[Matrix, Matrix]:
-    """Return the point and the force in space."""
     unknown = sorted(set(entry) - set(KEYS))
     if unknown or not {"point", "force"} <= set(entry):
         named = f"the unknown key '{unknown[0]}'" if unknown else "no point or no force"

@@ -211,7 +211,6 @@ def all_symmetries(system: MechanicalSystem, additional: Sequence[Symmetry]) -> 
 
 
 def _found(system: MechanicalSystem) -> list[Terms]:
-    """Return the momentum maps as polynomials."""
     if system.rotations:
         return _of_rotations(system)
     if system.dimension > MAX_SEARCHED_COORDINATES:

@@ -102,7 +102,6 @@ class EnsembleStates:
 
 
 def _names_of(model: Model) -> tuple[list[str], list[str], list[str]]:
-    """Return the names of coordinates, velocities and momenta."""
     names = [coordinate.name for coordinate in model.system.coordinates]
     return names, [f"{name}_dot" for name in names], [f"p_{name}" for name in names]
 

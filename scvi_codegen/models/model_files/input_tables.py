@@ -191,7 +191,6 @@ def _numbers(value: Any, where: str) -> tuple[float, ...]:
 
 
 def _read(name: str, path: Path) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return times and values of an input in a file."""
     readers = {".csv": _read_csv, ".npz": _read_npz}
     if path.suffix.lower() not in readers:
         raise ModelFileError(f"inputs must be in {' or '.join(readers)} files")

@@ -275,7 +275,6 @@ def _stepper_of_arrays(folder: Path) -> Stepper:
 
 
 def _texts(model: Model, prefix: str, embedded: Embedded | None, *, single_file: bool) -> dict[str, str]:
-    """Return texts by file name, ``interface.json`` last."""
     from scvi_codegen.models.model_files.model_file import model_texts
     from scvi_codegen.models.packages.example import example_of, package_template, readme_text
     from scvi_codegen.pipeline import generate_source
@@ -312,7 +311,6 @@ def _texts(model: Model, prefix: str, embedded: Embedded | None, *, single_file:
 
 
 def _texts_of_arrays(model: Model, prefix: str, embedded: Embedded | None, *, single_file: bool) -> dict[str, str]:
-    """Return the texts of a model whose array sizes are known at run time."""
     from scvi_codegen.models.model_files.model_file import model_texts
     from scvi_codegen.models.packages.example import array_example_of, package_template
     from scvi_codegen.pipeline import Sources

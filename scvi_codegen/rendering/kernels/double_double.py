@@ -63,7 +63,6 @@ class _PairPrinter:
         return "ddl" if source in self.sources else "dd"
 
     def printed(self, expression: Expression) -> _Printed:
-        """Return the source of an expression."""
         if isinstance(expression, Constant):
             high, low = _words(mp.convert(expression.value), 2)  # of small constants as well, unlike Target.rest
             return _Printed(f"dd_of({high}, {low})", "dd") if float(low) else _Printed(high, "word")

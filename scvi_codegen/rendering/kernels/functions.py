@@ -130,7 +130,6 @@ class _Statements:
 
     @property
     def _momenta(self) -> str:
-        """Name of the momenta of the initial state."""
         return "step->theta0" if self.program.quantities.first_order_rates else "step->p0"
 
     def _row(self, site: int, row: int) -> list[Term]:

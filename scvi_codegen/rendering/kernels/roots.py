@@ -50,7 +50,6 @@ class _Rewriting:
         self.products: dict[int, _Product] = {}
 
     def kernel(self) -> Kernel:
-        """Return the kernel."""
         for k, expression in enumerate(self.given.temporaries):
             product = self.product(expression)
             if product is None:
@@ -89,7 +88,6 @@ class _Rewriting:
         return one._replace(factor=Operation("*", (one.factor, others[0])) if one.factor else others[0])
 
     def rewritten(self, expression: Expression) -> Expression:
-        """Return an expression of the new temporaries."""
         product = self.product(expression)
         if product is not None:
             root, argument, factor = product

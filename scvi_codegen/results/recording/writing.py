@@ -400,7 +400,6 @@ def _certificate(argument: Any) -> Any:
 
 
 def _prepare(folder: Path) -> None:
-    """Create the folder, or check that it may be used."""
     folder.mkdir(exist_ok=True)
     if (folder / MANIFEST).exists():
         raise RecordingError(

@@ -132,7 +132,6 @@ class CompiledMethod(ChosenBySizes):
         self._load()
 
     def _load(self) -> None:
-        """Load the library with the events."""
         interface, events = self.interface if self.origin is None else self.origin.interface, self.events
         if events and (known := self._variants._made.get(events)) is not None:
             self.source = known
@@ -199,7 +198,6 @@ class CompiledMethod(ChosenBySizes):
 
     @property
     def _known_with_events(self) -> Self:
-        """:attr:`known` with the events."""
         return self.known.with_events(self.events)
 
     def _events_of_entries(self, event: Event) -> tuple[Event, ...]:

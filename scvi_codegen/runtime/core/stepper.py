@@ -291,7 +291,6 @@ class Stepper(Integrator):
         parameters: Parameters,
         options: SolverOptions | None,
     ) -> Run:
-        """Return a run with these arguments of :meth:`start`."""
         q, p = self._consistent_state(q, p, velocity, t, parameters)
         return Run.started(self, q, p, plan=plan, t=t, parameters=parameters, options=options)
 
@@ -304,11 +303,9 @@ class Stepper(Integrator):
         return consistent(self, q, p, t, parameters) if self.interface.constraints else (q, p)
 
     def _run(self, q: Array, p: Array, **arguments: Any) -> Run:
-        """Return a run from a state that satisfies the constraints."""
         return Run.started(self, q, p, **arguments)
 
     def _plan(self, h: float | None, t_end: float | None, tolerance: float | None) -> StepPlan:
-        """Return the step plan of these arguments of :meth:`start`."""
         return checked_plan(h, t_end, tolerance, self.interface.time_transformation, self.in_tau)
 
     def _output_times(self, t_eval: ArrayLike, t: float, plan: StepPlan, steps: int | None) -> Array:

@@ -198,7 +198,6 @@ def _node_states_from_guess(parts: Sequence[Measurements], known: Array) -> Arra
 
 
 def _parabola(whole: Measurements, column: int, t: float) -> tuple[float, float]:
-    """Return value and derivative at a time."""
     rows = np.flatnonzero(np.isfinite(whole.measured[:, column]))
     near = rows[np.argsort(np.abs(whole.t[rows] - t), kind="stable")[: 2 * PARABOLA_NEIGHBOURS + 1]]
     coefficients = np.polynomial.polynomial.polyfit(

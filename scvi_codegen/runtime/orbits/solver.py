@@ -493,6 +493,5 @@ class _ClosingEquations:
 
     @property
     def motion(self) -> _Segment:
-        """Return the only segment, of a whole period."""
         (motion,) = self.segments
         return motion

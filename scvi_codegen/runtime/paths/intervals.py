@@ -188,7 +188,6 @@ class ReducedIntervals(Intervals):
         return np.ascontiguousarray(self.parameters[k] if self.parameters.ndim == 2 else self.parameters)
 
     def _normals(self, q: Array, t: float, parameters: Array) -> Array:
-        """Return rows normal to the manifold at q."""
         stepper, m = self.stepper, self.stepper.dimension
         rows = []
         if stepper.interface.constraints:

@@ -151,7 +151,6 @@ class AttitudeHistory:
         raise StateError(f"there is no quantity '{name}' of the states{closest(name, known)} Known: {', '.join(known)}")
 
     def _states(self, t: ArrayLike | None) -> tuple[Array, Array]:
-        """Return the saved states, or those at times t."""
         if t is None:
             return np.asarray(self.q), np.asarray(self.p)  # of recordings, which are read on access
         if not hasattr(self, "at"):

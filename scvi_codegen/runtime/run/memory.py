@@ -447,7 +447,6 @@ class Memory:
         return step_failure(status, self._report, step=self.steps, h=self.h, remark=remark, failures=failures)
 
     def _taken(self, steps: int) -> int:
-        """Take steps in one C call and return their number."""
         if self._unset_inputs and steps:
             self.check_inputs()
         if status := self._take(steps, NO_OUTPUT):

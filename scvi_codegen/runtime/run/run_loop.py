@@ -243,7 +243,6 @@ class _StateRecorder:
         return rows.states if count == capacity and rows.words == 1 else rows.first(count)
 
     def trajectory(self) -> Trajectory:
-        """Return the states saved so far."""
         memory, states = self.memory, self._states()
         if self.earlier:
             states = tuple(map(np.concatenate, zip(*self.earlier, states, strict=True)))

@@ -107,8 +107,6 @@ def _rates(start: WholeStart) -> Finding:
 
 
 def _perturbed(start: WholeStart) -> WholeStart:
-    """Return the start with every number of the state perturbed."""
-
     def moved(state: Mapping[str, Numbers]) -> dict[str, Numbers]:
         return {
             name: x * (1 + PERTURBATION * np.cos(1.0 + np.arange(x.size)).reshape(x.shape)) for name, x in state.items()
@@ -189,7 +187,6 @@ def _reversal(start: WholeStart) -> Finding:
 
 
 def _long_run(start: WholeStart, sizes: str) -> Iterator[Check]:
-    """Yield the checks of energy and momentum maps along a run."""
     run = start.run()
     count = sum(values.size for values in start.p.values())
     steps = int(max(20, min(MOST_STEPS, WORK // count)))

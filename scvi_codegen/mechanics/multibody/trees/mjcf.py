@@ -88,7 +88,6 @@ class _MujocoModel:
             self.read_limits(tendon, "tendons", tendon.name)
 
     def read(self, world: Element) -> None:
-        """Read the bodies, frames and sites of the world."""
         pending = [(world, -1, Pose())]
         while pending:
             element, link, at = pending.pop()
@@ -185,7 +184,6 @@ class _MujocoModel:
                 self.links[place] = replace(self.links[place], joint=joint)
 
     def read_limits(self, element: Element, part: str, name: str) -> None:
-        """Store that a joint or tendon has limits or dry friction."""
         limited = element.choice("limited", "auto", "true", "false")
         low, high = element.vector("range", (0, 0), (2,))
         if limited == "auto" and low < high and self.settings.choice("autolimits", "true", "false") == "true":
