@@ -232,10 +232,7 @@ class Stepper(Integrator):
             span = checked_number(saved["t_end"], "the time t_end") - t
             return largest_step(self, q, momenta, span, tolerance, t=t, parameters=parameters, options=start["options"])
 
-        run, has_tau = (
-            partial(self.integrate, q, p, **start, **saved),
-            self.in_tau or self.interface.time_transformation,
-        )
+        run, has_tau = partial(self.integrate, q, p, **start, **saved), self._has_tau
         arguments = error, run, again, checked_number(t, "the time t"), step_of_tau if has_tau else None
         trajectory = confirmed_run(*arguments, words=self.interface.words)
         assert trajectory.confirmation is not None  # by confirmed_run
