@@ -120,6 +120,7 @@ static int NAME(call_one)(NAME(each) *c, const double *parameters, long long ste
       c->run->h = c->segment_h[c->segment];
       c->run->guess = 0;
     }
+    c->entered = c->pauses;
   }
   arrived |= status || (!c->t_end && c->segment == c->segments);
   c->status[j] = arrived ? status : -1;
@@ -131,8 +132,8 @@ static int NAME(call_one)(NAME(each) *c, const double *parameters, long long ste
 long long NAME(call_each)(NAME(each) *c, long long steps)
 {
   long long taken = 0;
-  c->requested = 0;
-  while (c->next < c->end && taken < steps && !c->requested) {
+  c->requested = c->entered = 0;
+  while (c->next < c->end && taken < steps && !c->requested && !c->entered) {
     const long long j = c->next, m = c->coordinates, room = c->capacity - c->rows - 2;
     long long size = steps - taken;
     if (room < 1)
@@ -141,6 +142,8 @@ long long NAME(call_each)(NAME(each) *c, long long steps)
       NAME(start)(c->run, c->t, c->t_end ? 0.0 : c->segment_h[0], c->q + j * m, c->p + j * m);
       c->segment = 0;
       c->left = c->t_end ? 0 : c->segment_steps[0];
+      if ((c->entered = c->pauses))
+        break;
     }
     const long long every = c->t_end ? c->every : c->segment_every[c->segment];
     size = size / every > room - 1 ? room * every - every : size;

@@ -34,5 +34,6 @@ typedef struct {
   double *workspace, t, tolerance;
   long long coordinates, parameters_each, segments, every, capacity;
   long long rows, next, end, segment, left, requested; /* states in memory; present trajectory, its segment */
+  long long pauses, entered; /* with `pauses`, calls end where a segment begins: parameters may change */
 } NAME(each);
 long long NAME(call_each)(NAME(each) *call, long long steps);

@@ -83,7 +83,7 @@ def _work(model: Model, stepper: Stepper, states: EnsembleStates) -> Ensemble:
     }
     work = Ensemble(*start, parameters=states.parameters, **arguments)
     if isinstance(work.common, CommonRuns):
-        work.common.blocks()
+        work.common.batch()
     return work
 
 

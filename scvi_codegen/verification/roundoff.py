@@ -25,7 +25,7 @@ from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.ensemble.ensemble import Ensemble
-from scvi_codegen.runtime.ensemble.lanes import CommonRuns, LaneBlock
+from scvi_codegen.runtime.ensemble.lanes import CommonRuns, LaneRuns
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.verification.certificate import Check, Finding, ViolationError, checked
 from scvi_codegen.verification.system_under_test import EPSILON, State, SystemUnderTest
@@ -168,16 +168,17 @@ def _lanes(tested: SystemUnderTest, starts: list[State], steps: int, carry: Arra
     ensemble = Ensemble(tested.stepper, q, p, h=first.h, steps=steps, t=first.t, parameters=tested.parameters)
     work = ensemble.common
     assert isinstance(work, CommonRuns)
-    make, width = work.blocks()
-    block = make(0)
-    assert isinstance(block, LaneBlock)
+    batch = work.batch()
+    assert isinstance(batch, LaneRuns)
+    block = batch.call(0, min(batch.width, len(starts)))
+    block.begin()
     block.lanes("carry_q")[:] = carry[:m, None]
     block.lanes("carry_p")[:] = carry[m:, None]
-    block.advance(steps)
-    if block.left:
+    block.advance()
+    if (batch.status > 0).any():
         raise ViolationError("single runs succeed, SIMD lanes fail")
     low = np.concatenate([block.lanes(name) for name in ("carry_q", "carry_p")])
-    for lane in range(min(width, len(starts))):
+    for lane in range(min(batch.width, len(starts))):
         yield np.concatenate([work.q[-1, lane], work.p[-1, lane]]), low[:, lane]
 
 

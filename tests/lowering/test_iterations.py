@@ -15,7 +15,7 @@ from samples import QUICK_FLAGS
 
 from scvi_codegen import SolverOptions, Stepper, compile_stepper, problem
 from scvi_codegen.runtime.ensemble.ensemble import Ensemble
-from scvi_codegen.runtime.ensemble.lanes import LaneBlock
+from scvi_codegen.runtime.ensemble.lanes import LaneRuns
 
 STEPS = 100
 ROUNDING = 0.02
@@ -59,10 +59,10 @@ def test_lanes_use_as_many_iterations_as_single_runs(name):
     for part in (1, 8, 64):
         h = given.h / part
         work = Ensemble(own, [given.q] * 8, [given.p] * 8, h=h, steps=STEPS)
-        make, _ = work.common.blocks()
-        block = make(0)
-        assert isinstance(block, LaneBlock)
-        block.advance(STEPS)
+        batch = work.common.batch()
+        assert isinstance(batch, LaneRuns)
+        block = batch.call(0, batch.width)
+        block.advance()
         run = own.integrate(given.q, given.p, h=h, steps=STEPS)
         assert block.memory.iterations == pytest.approx(int(run.iterations.sum()), rel=ROUNDING, abs=2)
 

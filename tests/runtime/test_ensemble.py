@@ -28,7 +28,7 @@ from scvi_codegen.cli import main
 from scvi_codegen.methods import Method
 from scvi_codegen.models.model_files.ensemble_file import load_ensemble
 from scvi_codegen.runtime.ensemble.ensemble import Ensemble
-from scvi_codegen.runtime.ensemble.lanes import LaneBlock
+from scvi_codegen.runtime.ensemble.lanes import LaneRuns
 
 KINDS = {
     "separable": "kepler",
@@ -392,11 +392,14 @@ class TestFailures:
             q, p = np.tile([1.0, 0.0], (2, 1)), np.tile([0.0, 1.0], (2, 1))
             runs = Ensemble(kepler, q, p, h=0.1, steps=20).common
             assert runs is not None
-            block = runs.blocks()[0](0)
-            assert isinstance(block, LaneBlock)
+            batch = runs.batch()
+            assert isinstance(batch, LaneRuns)
+            block = batch.call(0, 2)
+            block.begin()
             block.lanes("q")[0, 1:] = radius
             block.active[1:] = 0.0
-            block.advance(20)
+            block.struct.end = 1  # others are not continued
+            block.advance()
             states = runs.q[:, 0].tobytes(), runs.p[:, 0].tobytes()
             ends.append((*states, block.memory.iterations, block.memory.guess))
         assert len(set(ends)) == 1
@@ -959,12 +962,10 @@ def test_lanes_converge_as_single_runs(h: float) -> None:
     p = np.array([stepper.momentum(*each) for each in zip(q, v, strict=True)])
     runs = Ensemble(stepper, q, p, h=h, steps=steps).common
     assert runs is not None
-    make, width = runs.blocks()
-    for first in range(0, count, width):
-        block = make(first)
-        block.advance(steps)
-        assert isinstance(block, LaneBlock)
-        assert not block.left
+    batch = runs.batch()
+    assert isinstance(batch, LaneRuns)
+    batch.run(progress=None, threads=1)
+    assert (batch.status == 0).all()
     for j in range(0, count, 5):
         single = stepper.integrate(q[j], p[j], h=h, steps=steps)
         np.testing.assert_allclose(runs.q[-1, j], single.q[-1], rtol=0, atol=1e-12)

@@ -60,6 +60,7 @@ class Batch:
         start: (k, m) initial positions and momenta at the time ``t``.
         parameters: (k, number of parameters) values.
         steps: segments of fixed steps, or (k,) final times of adaptive steps.
+        values_at: function that returns the parameters at a time of a slice of trajectories, if they change.
 
     Attributes:
         width: number of trajectories that C integrates at the same time.
@@ -77,9 +78,12 @@ class Batch:
         parameters: Array,
         t: float,
         steps: FixedSegments | Array,
+        values_at: Callable[[float, slice], Array] | None = None,
     ) -> None:
-        self.binding, self.options, self.t, self.steps = binding, options, t, steps
+        self.binding, self.options, self.t, self.steps, self.values_at = binding, options, t, steps, values_at
         self.q, self.p, self.parameters = (np.ascontiguousarray(each) for each in (*start, parameters))
+        if values_at is not None:
+            self.parameters = self.parameters.copy()
         self.status = np.full(len(self.q), -1, np.int32)
         self.done = np.zeros(len(self.q), np.int64)
 
@@ -134,16 +138,17 @@ class Call:
     """
 
     def __init__(self, work: Batch, first: int, end: int) -> None:
-        binding, self.first = work.binding, first
+        self.work, binding = work, work.binding
         struct = self.struct = binding.new("each *")
         self.options = struct.options = binding.options(work.options)
         struct.q, struct.p, struct.parameters = map(binding.pointer, (work.q, work.p, work.parameters))
         if isinstance(work.steps, FixedSegments):
-            steps, save_every, h = work.steps
+            steps, save_every, h, _ = work.steps
             struct.segment_steps, struct.segment_every = map(binding.whole_numbers, (steps, save_every))
             struct.segment_h, struct.segments = binding.pointer(h), len(h)
         struct.status, struct.done = binding.integers(work.status), binding.whole_numbers(work.done)
         struct.t, struct.next, struct.end, struct.segment = work.t, first, end, -1
+        struct.pauses = work.values_at is not None
         self.take = binding.each(struct)
 
     def advance(self, *, check_stop: StopCheck | None = None, until: Callable[[], bool] = lambda: False) -> None:
@@ -153,6 +158,8 @@ class Call:
             if check_stop is not None:
                 check_stop(size)
             taken = self.take(size)
+            if self.struct.entered:
+                self.enter(self.struct.segment)
             self.store()
             return taken
 
@@ -167,6 +174,13 @@ class Call:
             )
         finally:
             self.store(last=True)
+
+    def enter(self, segment: int) -> None:
+        """Set the parameters of the present trajectories in a segment."""
+        work, first = self.work, int(self.struct.next)
+        if work.values_at is not None and isinstance(work.steps, FixedSegments):
+            part = slice(first, min(first + work.width, len(work.q)))
+            work.parameters[part] = work.values_at(float(work.steps.middle[segment]), part)
 
     def store(self, *, last: bool = False) -> None:
         """Pass on the states in memory, if it is nearly full or after the last call."""
@@ -213,9 +227,11 @@ class SuccessiveRuns(Batch):
 class _SuccessiveCall(Call):
     """Calls with the memory of a run, and memory for states."""
 
+    work: SuccessiveRuns
+
     def __init__(self, work: SuccessiveRuns, first: int, end: int) -> None:
         super().__init__(work, first, end)
-        self.work, self.flushed, binding, struct = work, first, work.binding, self.struct
+        self.flushed, binding, struct = first, work.binding, self.struct
         m = work.q.shape[1]
         self.capacity = max(FEWEST_ROWS, MOST_NUMBERS // (2 * m + 1))
         self.before = 0  # states of the first trajectory that were stored earlier

@@ -24,7 +24,7 @@ from scvi_codegen.representation import one_line
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.ensemble.batches import CHUNK_SECONDS, Rows, SuccessiveRuns
-from scvi_codegen.runtime.ensemble.lanes import CommonRuns, SingleBlock
+from scvi_codegen.runtime.ensemble.lanes import CommonRuns, SingleRun
 from scvi_codegen.runtime.ensemble.observation import EnsembleObservation
 from scvi_codegen.runtime.ensemble.result import INTERRUPTED, OK, EnsembleRuns, EnsembleTrajectory
 from scvi_codegen.runtime.ensemble.schedule import CommonSteps
@@ -225,8 +225,7 @@ class DeviceRuns:
 
         def advance(j: int, check_stop: StopCheck) -> None:
             step = int(self.done[failed[j]])
-            block = SingleBlock(work, j, q[j], p[j], step=step, carries=(carries[0][j], carries[1][j]))
-            block.advance(self.steps.steps - step)
+            SingleRun(work, j, q[j], p[j], step, (carries[0][j], carries[1][j])).follow(check_stop)
 
         run_jobs(len(failed), advance, progress=None, threads=threads)
         self.status[failed], self.done[failed] = work.status, work.done
@@ -259,9 +258,7 @@ class PointRuns(DeviceRuns):
             return
         start, values = (self.start[0][failed], self.start[1][failed]), self.values[failed]
         work = CommonRuns(self.stepper, self.options, start, values, lambda _, part: values[part], self.steps)
-        run_jobs(
-            len(failed), lambda j, _: SingleBlock(work, j).advance(self.steps.steps), progress=None, threads=threads
-        )
+        work.run(progress=None, threads=threads)
         self.status[failed], self.done[failed] = work.status, work.done
         for target, saved in ((self.q, work.q), (self.p, work.p)):
             states = self.device.copy_out(target)

@@ -1,16 +1,15 @@
-"""Blocks of an ensemble with common fixed steps: trajectories in the SIMD lanes of C, or alone.
+"""Ensembles with common fixed steps: trajectories in the SIMD lanes of blocks of C, or one after the other.
 
-A lane whose step fails keeps its last good state and is continued by the single integrator (which falls back on
-Newton's iteration); if that fails too, its later states are NaN and its status gives the reason. Other lanes are
-unaffected.
+A lane whose step fails keeps its last good state. When its block has ended, the single integrator (which falls back on
+Newton's iteration) continues it; if that fails too, its later states are NaN and its status gives the reason. Other
+lanes are unaffected.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -31,7 +30,7 @@ from scvi_codegen.runtime.ensemble.batches import (
 )
 from scvi_codegen.runtime.ensemble.observation import EnsembleObservation
 from scvi_codegen.runtime.ensemble.result import OK
-from scvi_codegen.runtime.ensemble.schedule import CommonSteps
+from scvi_codegen.runtime.ensemble.schedule import CommonSteps, FixedSegments
 from scvi_codegen.runtime.ensemble.thread_pool import StopCheck, run_jobs
 from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.memory import Memory
@@ -89,10 +88,16 @@ class CommonRuns:
 
     def run(self, *, progress: Callable[[int], None] | None, threads: int | None) -> None:
         """Integrate all trajectories; ``progress`` is called with the number of completed steps and may raise."""
-        batch, unit = self._batch(), self.steps.steps / len(self)
+        batch, steps = self.batch(), self.steps.steps
         if batch is None:
-            self._run_blocks(progress, threads)
+            run_jobs(
+                len(self),
+                lambda j, check_stop: SingleRun(self, j, self.q[0, j], self.p[0, j]).follow(check_stop),
+                progress=None if progress is None else lambda done: progress(done * steps // len(self)),
+                threads=threads,
+            )
             return
+        unit = steps / len(self)
         try:
             batch.run(progress=None if progress is None else lambda done: progress(int(done * unit)), threads=threads)
         finally:
@@ -100,63 +105,26 @@ class CommonRuns:
                 self.status = np.where(batch.status >= 0, batch.names, OK)
                 self.done, self.fallback_steps = batch.done, batch.fallback_steps
 
-    def _batch(self) -> Batch | None:
-        """Return the trajectories as C integrates many in one call, ``None`` if it does not."""
-        stepper, binding = self.stepper, self._binding
+    def batch(self) -> LaneRuns | SuccessiveRuns | None:
+        """Return the trajectories as C integrates many in one call, ``None`` if memory of runs is not reusable."""
+        binding = self.stepper._ensemble_binding if self.observation is None else self.observation.binding
         start = self.options, self.start, self.parameters, self.steps.t0
-        if self.steps.has_inputs or stepper.in_tau or not self.steps.steps:
+        steps, values_at = self.steps.fixed_segments(), self.values_at if self.steps.has_inputs else None
+        if binding is not None:
+            return LaneRuns(self, binding, *start, steps, values_at)
+        if not self.stepper.binding.reusable:
             return None
-        if stepper.ensemble is None:
-            fixed = self.steps.fixed_segments()
-            return SuccessiveRuns(stepper, *start, fixed, receive=self._store) if stepper.binding.reusable else None
-        if binding is None or self.observation is not None or binding.constant("NEEDS_VELOCITIES"):
-            return None
-        return LaneRuns(self, binding, *start, self.steps.fixed_segments())
+        return SuccessiveRuns(self.stepper, *start, steps, values_at, receive=self._store)
 
     def _store(self, states: Rows) -> None:
         self.q[states.rows, states.trajectories], self.p[states.rows, states.trajectories] = states.q, states.p
-        if self.actions is not None:
-            self.actions[states.rows, states.trajectories] = states.actions
-
-    def _run_blocks(self, progress: Callable[[int], None] | None, threads: int | None) -> None:
-        _, width = self.blocks()
-        reached = np.zeros(-(-len(self) // width))
-
-        def advance(number: int, check_stop: StopCheck) -> None:
-            def took(size: int) -> None:
-                reached[number] = size
-
-            self.advance_block(number * width, check_stop, took)
-
-        report = None if progress is None else lambda _: progress(int(reached.mean()))
-        run_jobs(len(reached), advance, progress=report, threads=threads)
-
-    def advance_block(self, first: int, check_stop: StopCheck, progress: Callable[[int], None] | None = None) -> None:
-        """Integrate a block to its end; ``progress`` is called with its number of completed steps."""
-        block = self.blocks()[0](first)
-
-        def advance(size: int) -> int:
-            check_stop(size)
-            block.advance(size)
-            return size
-
-        chunks: dict[str, Any] = {"first": FIRST_CHUNK_STEPS, "growth": GROWTH, "seconds": CHUNK_SECONDS}
-        drive(advance, self.steps.steps, **chunks, ended=lambda: False, progress=progress)
-
-    @property
-    def _binding(self) -> Binding | None:
-        return self.stepper._ensemble_binding if self.observation is None else self.observation.binding
-
-    def blocks(self) -> tuple[Callable[[int], LaneBlock | SingleBlock], int]:
-        """Return a function that makes the block beginning at a trajectory, and the trajectories per block."""
-        binding = self._binding
-        if binding is None:
-            return lambda first: SingleBlock(self, first), 1
-        return lambda first: LaneBlock(self, first, binding), len(binding.new("block *").active)
+        for own, values in ((self.times, states.t), (self.actions, states.actions)):
+            if own is not None:
+                own[states.rows, states.trajectories] = values
 
 
 class LaneRuns(Batch):
-    """Trajectories in SIMD lanes, of which C integrates many blocks in one call; arguments as of :class:`Batch`.
+    """Trajectories in SIMD lanes, many blocks in a call; further arguments as of :class:`Batch`.
 
     Args:
         common: the trajectories, whose arrays C fills.
@@ -167,173 +135,79 @@ class LaneRuns(Batch):
         self.common, self.width = common, len(binding.new("block *").active)
         common.done = self.done
 
-    def call(self, first: int, end: int) -> Call:
+    def call(self, first: int, end: int) -> LaneCall:
         """Return the calls for a range of trajectories."""
-        return _LaneCall(self, first, end)
+        return LaneCall(self, first, end)
 
 
-class _LaneCall(Call):
-    """Calls with the memory of a block; blocks with failed steps are repeated with single runs."""
+class LaneCall(Call):
+    """Calls with the memory of a block.
+
+    Attributes:
+        memory, active: the block, and a view of the flags of its active lanes.
+        left: single runs that continue the failed lanes of blocks that have ended.
+    """
 
     def __init__(self, work: LaneRuns, first: int, end: int) -> None:
         super().__init__(work, first, end)
-        self.work, common, struct = work, work.common, self.struct
-        self.block = struct.block = work.binding.new("block *")
-        struct.positions, struct.momenta = map(work.binding.pointer, (common.q, common.p))
-        if common.actions is not None:
-            struct.actions = work.binding.pointer(common.actions)
-        struct.trajectories = len(common)
-
-    def advance(self, *, check_stop: StopCheck | None = None, until: Callable[[], bool] = lambda: False) -> None:
-        """Advance as all calls; states after failed steps are NaN, until the block ends and is repeated."""
-        work, common, end = self.work, self.work.common, int(self.struct.end)
-        try:
-            super().advance(check_stop=check_stop, until=until)
-        finally:
-            failed = np.flatnonzero(work.status[self.first : end] > 0) + self.first
-            for j in failed.tolist():
-                rows = slice(common.steps.row(int(work.done[j])), None)
-                common.q[rows, j] = common.p[rows, j] = np.nan
-        ended = failed[failed < self.struct.next] // work.width * work.width
-        for first in np.unique(ended).tolist():
-            common.advance_block(first, check_stop or (lambda _: None))
-        self.first = int(self.struct.next)
-
-
-class LaneBlock:
-    """Trajectories in the SIMD lanes of one C block, and those that left it after a failed step."""
-
-    def __init__(self, work: CommonRuns, first: int, binding: Binding) -> None:
-        self.work, self.first, self.binding = work, first, binding
-        self.memory = binding.new("block *")
-        binding.function("start")(self.memory, work.steps.t0, work.steps.h)
+        self.common, self.left, binding, struct = work.common, list[SingleRun](), work.binding, self.struct
+        self.needs_velocities = bool(binding.constant("NEEDS_VELOCITIES"))
+        self.memory = struct.block = binding.new("block *")
         self.active = np.frombuffer(binding.buffer(self.memory.active), dtype=np.float64)
-        lanes = np.frombuffer(binding.buffer(self.memory.parameters), dtype=np.float64).reshape(-1, len(self.active))
-        self.parameters = lanes[: work.parameters.shape[1]]
-        self.count, self.step = min(len(self.active), len(work) - first), 0
-        self.left: dict[int, SingleRun] = {}
-        self._fill()
-        if work.observation is not None:
-            self._advance(0, 1)  # includes the initial states
-
-    def _fill(self) -> None:
-        """Put a trajectory into each lane; surplus lanes repeat the last one and are inactive."""
-        work, v, lanes = self.work, self._velocities(), np.arange(len(self.active))
-        each = np.minimum(lanes, self.count - 1)
-        self.lanes("q")[:], self.lanes("p")[:] = (x[0, self.first + each].T for x in (work.q, work.p))
-        self.parameters[:] = work.parameters[self.first + each].T
-        self.active[:] = lanes < self.count
-        if v is not None:
-            self._at_points()[:] = v[each].T
-            self.active *= np.isfinite(v[each]).all(axis=1)
-
-    def _velocities(self) -> Array | None:
-        """Return (count, m) initial velocities if the predictor needs them, NaN where undefined; else ``None``."""
-        if not self.binding.constant("NEEDS_VELOCITIES"):
-            return None
-        work, v = self.work, np.full((self.count, self.work.stepper.dimension), np.nan)
-        for k in range(self.count):
-            j = self.first + k
-            with suppress(StateError):
-                v[k] = work.stepper.velocity(work.q[0, j], work.p[0, j], work.steps.t0, work.parameters[j])
-        return v
+        self.active[:] = 1.0
+        struct.positions, struct.momenta = map(binding.pointer, self.common.states())
+        if self.common.actions is not None:
+            struct.actions = binding.pointer(self.common.actions)
+        if self.common.observation is not None:
+            struct.observed = binding.pointer(self.common.observation.values)
+        struct.trajectories, struct.pauses = len(self.common), struct.pauses or self.needs_velocities
 
     def lanes(self, name: str) -> Array:
-        """Return a (m, lanes) view of a field of the block: ``q``, ``p``, ``carry_q`` or ``carry_p``."""
-        field = np.frombuffer(self.binding.buffer(getattr(self.memory, name)), dtype=np.float64)
-        return field.reshape(self.work.stepper.dimension, -1)
+        """Return a (m, lanes) view of a field of the block, (2 S, m, lanes) of ``memory``."""
+        field = np.frombuffer(self.work.binding.buffer(getattr(self.memory, name)), dtype=np.float64)
+        values = field.reshape(-1, self.common.stepper.dimension, len(self.active))
+        return values if len(values) > 1 else values[0]
 
-    def _at_points(self) -> Array:
-        """Return a (points, m, lanes) view of the values that the predictor extrapolates, of two steps."""
-        values = np.frombuffer(self.binding.buffer(self.memory.memory), dtype=np.float64)
-        return values.reshape(-1, self.work.stepper.dimension, len(self.active))
+    def begin(self) -> None:
+        """Put the first trajectories into the block, so that its memory can be changed before the first step."""
+        self.struct.pauses = 1
+        self.take(1)
+        self.enter(0)
 
-    def advance(self, size: int) -> None:
-        """Advance by ``size`` steps."""
-        for chunk in self.work.steps.chunks(self.step, size):
-            if chunk.entered is not None:
-                part = slice(self.first, self.first + self.count)
-                self._change(chunk.entered.h, self.work.values_at(chunk.entered.middle, part))
-            self._advance(chunk.steps, chunk.save_every)
+    def advance(self, *, check_stop: StopCheck | None = None, until: Callable[[], bool] = lambda: False) -> None:
+        """Advance as all calls, then the single runs."""
+        super().advance(check_stop=check_stop, until=until)
+        while self.left:
+            self.left.pop().follow(check_stop or (lambda _: None))
 
-    def _change(self, h: float, parameters: Array) -> None:
-        """Set step size and parameters; a new step size invalidates the predictor."""
-        for lane, alone in self.left.items():
-            alone.update(h, parameters[lane])
-        self.parameters[:, : self.count] = parameters.T
-        self.parameters[:, self.count :] = parameters[-1:].T
-        if h == self.memory.h:
+    def enter(self, segment: int) -> None:
+        """Set the parameters of a segment; for a new step size, start the predictor from the present velocities.
+
+        Lanes without velocities are deactivated.
+        """
+        super().enter(segment)
+        h = cast(FixedSegments, self.work.steps).h
+        if not self.needs_velocities or (segment and h[segment] == h[segment - 1]):
             return
-        self.memory.h, self.memory.guess = h, 0
-        if self.binding.constant("NEEDS_VELOCITIES"):
-            self._reset_predictor(parameters)
-
-    def _reset_predictor(self, parameters: Array) -> None:
-        """Reset the predictor to the current velocities, as initially; deactivate lanes without velocities."""
-        at_points = self._at_points()
-        q, p, t = self.lanes("q").T, self.lanes("p").T, float(self.memory.t)
-        for lane in np.flatnonzero(self.active[: self.count] > 0.0):
+        at_points, q, p, t = (*map(self.lanes, ("memory", "q", "p")), float(self.memory.t))
+        for lane in np.flatnonzero(self.active > 0.0).tolist():
             try:
-                at_points[:, :, lane] = self.work.stepper.velocity(q[lane], p[lane], t, parameters[lane])
+                values = self.work.parameters[self.struct.next + lane]
+                at_points[:, :, lane] = self.common.stepper.velocity(q[:, lane], p[:, lane], t, values)
             except StateError:
                 self.active[lane] = 0.0
 
-    def _advance(self, size: int, save_every: int) -> None:
-        work, begin, self.step = self.work, self.step, self.step + size
-        if len(self.left) < self.count:
-            row = work.steps.row(begin)
-            stride = len(work) * work.stepper.dimension
-            offset = row * stride + self.first * work.stepper.dimension if row < len(work.q) else 0
-            if work.actions is not None and hasattr(self.memory, "actions"):
-                self.memory.actions = self.binding.pointer(work.actions) + offset // work.stepper.dimension
-            self.binding.function("advance")(
-                self.memory,
-                self.count,
-                size,
-                save_every,
-                self.binding.options(work.options),
-                self.binding.pointer(work.q) + offset,
-                self.binding.pointer(work.p) + offset,
-                stride,
-            )
-        running = self.active[: self.count] > 0.0
-        work.done[self.first : self.first + self.count][running] = self.step
-        if work.observation is not None:
-            seen = np.frombuffer(self.binding.buffer(self.memory.observed), dtype=np.float64)
-            here = work.observation.values[:, :, self.first : self.first + self.count]
-            lanes = [lane for lane in range(self.count) if lane not in self.left]
-            here[:, :, lanes] = seen.reshape(*here.shape[:2], -1)[:, :, lanes]
-        for lane in np.flatnonzero(~running):
-            self._continue_singly(int(lane), begin, save_every)
-
-    def _continue_singly(self, lane: int, begin: int, save_every: int) -> None:
-        """Replace the states that a call from step ``begin`` stored for an inactive lane by those of a single run."""
-        work, j = self.work, self.first + lane
-        if lane not in self.left:
-            step = int(self.memory.last_step[lane])
-            q, p, *carries = (self.lanes(name)[:, lane].copy() for name in ("q", "p", "carry_q", "carry_p"))
-            self.left[lane] = SingleRun(work, j, q, p, step, (carries[0], carries[1]))
-            begin = step
-        rows = slice(work.steps.row(begin), work.steps.row(self.step))
-        work.q[rows, j] = work.p[rows, j] = np.nan
-        self.left[lane].advance_to(self.step, save_every)
-
-
-class SingleBlock:
-    """Block of one trajectory, for methods without SIMD lanes; other arguments as of :class:`SingleRun`."""
-
-    def __init__(self, work: CommonRuns, first: int, *state: Array, step: int = 0, carries: Any = None) -> None:
-        q, p = state or (work.q[0, first], work.p[0, first])
-        self.step, self.run = step, SingleRun(work, first, q, p, step, carries)
-
-    def advance(self, size: int) -> None:
-        """Advance by ``size`` steps."""
-        run = self.run
-        for chunk in run.work.steps.chunks(self.step, size):
-            self.step += chunk.steps
-            if chunk.entered is not None:
-                run.update(chunk.entered.h, run.work.values_at(chunk.entered.middle, slice(run.j, run.j + 1))[0])
-            run.advance_to(self.step, chunk.save_every)
+    def store(self, *, last: bool = False) -> None:
+        """Remove the states after the failed steps of a block, and continue its failed lanes if it has ended."""
+        common, ended, width = self.common, self.struct.segment < 0, len(self.active)
+        first = (int(self.struct.next) - ended) // width * width
+        for lane in np.flatnonzero(self.active[: self.struct.end - first] == 0.0).tolist():
+            j, step = first + lane, int(self.memory.last_step[lane])
+            common.q[common.steps.row(step) :, j] = common.p[common.steps.row(step) :, j] = np.nan
+            if ended:
+                q, p, *carries = (self.lanes(name)[..., lane].copy() for name in ("q", "p", "carry_q", "carry_p"))
+                self.left.append(SingleRun(common, j, q, p, step, (carries[0], carries[1])))
+        self.active[:] = 1.0 if ended else self.active
 
 
 class SingleRun:
@@ -342,7 +216,7 @@ class SingleRun:
     def __init__(
         self, work: CommonRuns, j: int, q: Array, p: Array, step: int = 0, carries: tuple[Array, Array] | None = None
     ) -> None:
-        self.work, self.j, self.left = work, j, carries is not None
+        self.work, self.j, self.step, self.left = work, j, step, carries is not None
         self.run: Memory | None = None
         work.done[j] = step
         segment, time = work.steps.at(step)
@@ -357,10 +231,21 @@ class SingleRun:
                 run._resume_at(step, time, carries)
             self.run = run
 
-    def update(self, h: float, parameters: Array) -> None:
-        """Set step size and parameters."""
-        if self.run is not None:
-            self.run.update(h=h, parameters=parameters)
+    def follow(self, check_stop: StopCheck) -> None:
+        """Advance to the end, unless the trajectory fails."""
+
+        def advance(size: int) -> int:
+            check_stop(size)
+            for chunk in self.work.steps.chunks(self.step, size):
+                if chunk.entered is not None and self.run is not None:
+                    values = self.work.values_at(chunk.entered.middle, slice(self.j, self.j + 1))[0]
+                    self.run.update(h=chunk.entered.h, parameters=values)
+                self.step += chunk.steps
+                self.advance_to(self.step, chunk.save_every)
+            return size
+
+        chunks: dict[str, Any] = {"first": FIRST_CHUNK_STEPS, "growth": GROWTH, "seconds": CHUNK_SECONDS}
+        drive(advance, self.work.steps.steps - self.step, **chunks, ended=lambda: self.run is None)
 
     def advance_to(self, step: int, save_every: int) -> None:
         """Advance to step number ``step``, unless the trajectory has failed."""

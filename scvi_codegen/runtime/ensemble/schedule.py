@@ -29,11 +29,12 @@ class StepChunk(NamedTuple):
 
 
 class FixedSegments(NamedTuple):
-    """Fixed steps in segments: their numbers of steps, strides of saved states and step sizes."""
+    """Fixed steps in segments: their numbers of steps, strides of saved states, step sizes, and middle times."""
 
     steps: NDArray[np.int64]
     save_every: NDArray[np.int64]
     h: Array
+    middle: Array
 
 
 class CommonSteps:
@@ -92,12 +93,12 @@ class CommonSteps:
 
     def fixed_segments(self) -> FixedSegments:
         """Return the chunks of all steps, as C takes them."""
-        h, chunks, sizes = self.segments[0].h, list(self.chunks(0, self.steps)), []
-        for chunk in chunks:
-            h = h if chunk.entered is None else chunk.entered.h
-            sizes.append(h)
-        steps, save_every = (np.array(each, np.int64) for each in zip(*(chunk[:2] for chunk in chunks), strict=True))
-        return FixedSegments(steps, save_every, np.array(sizes, float))
+        segment, rows = self.segments[0], []
+        for chunk in self.chunks(0, self.steps):
+            segment = chunk.entered or segment
+            rows.append((chunk.steps, chunk.save_every, segment.h, segment.middle))
+        steps, save_every, h, middle = zip(*rows or [(0, 1, self.h, self.t0)], strict=True)
+        return FixedSegments(np.array(steps), np.array(save_every), np.array(h), np.array(middle))
 
     def at(self, step: int) -> tuple[Segment, tuple[float, float]]:
         """Return the segment and the double-double time after ``step`` steps."""

@@ -253,27 +253,32 @@ static void begin_block(NAME(each) *c, int count)
       block->q[i][j] = c->q[from * M + i];
       block->p[i][j] = c->p[from * M + i];
     }
-    for (int i = 0; i < P; i++)
-      block->parameters[i][j] = c->parameters[from * P + i];
     block->active[j] = j < count;
   }
   c->rows = 1;
   c->segment = 0;
   c->left = c->segment_steps[0];
+  c->entered = c->pauses;
 }
 
 long long NAME(call_each)(NAME(each) *c, long long steps)
 {
   block_memory *block = c->block;
-  long long taken = 0;
-  while (c->next < c->end && taken < steps) {
+  long long taken = 0, failed = 0;
+  c->entered = 0;
+  while (c->next < c->end && taken < steps && !c->entered && !failed) {
     const int count = (int)(c->end - c->next < LANES ? c->end - c->next : LANES);
     if (c->segment < 0)
       begin_block(c, count);
+    if (c->entered)
+      break;
+    for (int i = 0; i < P; i++)
+      for (int j = 0; j < LANES; j++)
+        block->parameters[i][j] = c->parameters[(c->next + (j < count ? j : count - 1)) * P + i];
     const long long every = c->segment_every[c->segment], begun = block->step;
     const long long size = steps - taken < c->left ? steps - taken : c->left, place = c->rows * c->trajectories + c->next;
 #ifdef RUN_ACTION
-    block->actions = c->actions + place;
+    block->actions = c->actions ? c->actions + place : NULL;
 #endif
     NAME(advance)(block, count, size, every, c->options, c->positions + place * M, c->momenta + place * M,
         c->trajectories * M);
@@ -284,12 +289,20 @@ long long NAME(call_each)(NAME(each) *c, long long steps)
       c->left = c->segment_steps[c->segment];
       block->guess = c->segment_h[c->segment] == block->h ? block->guess : 0;
       block->h = c->segment_h[c->segment];
+      c->entered = c->pauses;
     }
+#ifdef OBSERVED
+    for (int i = 0; i < 5 * OBSERVED; i++)
+      memcpy(c->observed + i * c->trajectories + c->next, block->observed[i / OBSERVED][i % OBSERVED],
+          sizeof(double) * (size_t)count);
+#endif
     for (int j = 0; j < count; j++) {
       c->done[c->next + j] = block->last_step[j];
       c->status[c->next + j] = block->active[j] == 0.0 ? STATUS(FAILED) : c->segment == c->segments ? STATUS(OK) : -1;
     }
     if (c->segment == c->segments) {
+      for (int j = 0; j < count; j++)
+        failed |= block->active[j] == 0.0;
       c->next += count;
       c->segment = -1;
     }
