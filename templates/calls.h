@@ -156,3 +156,27 @@ long long NAME(call_each)(NAME(each) *c, long long steps)
   }
   return taken;
 }
+
+#ifdef HAS_MOMENTUM
+/* Momenta of states with velocities v and parameters of their own; returns the number of states before a failure. */
+long long NAME(call_momenta)(long long count, double t, long long m, long long parameters_each, const double *q,
+    const double *v, const double *parameters, double *p, double *workspace)
+{
+  long long k = 0;
+  while (k < count && !NAME(momentum)(t, q + k * m, v + k * m, parameters + k * parameters_each, p + k * m, workspace))
+    k++;
+  return k;
+}
+#endif
+
+#ifdef HAS_PROJECT
+/* Projections (q1, p1) of states with parameters of their own, and their distances, NaN after a failure. */
+void NAME(call_project)(long long count, double t, long long m, long long parameters_each, const double *q,
+    const double *p, const double *parameters, double *q1, double *p1, double *apart, double *workspace)
+{
+  for (long long k = 0; k < count; k++, q += m, p += m, q1 += m, p1 += m, parameters += parameters_each, apart += 2)
+    if (NAME(project)(t, q, p, parameters, q1, p1, workspace) ||
+        NAME(apart)(t, q, p, q1, p1, parameters, apart, workspace))
+      apart[0] = apart[1] = NAN;
+}
+#endif

@@ -37,3 +37,7 @@ typedef struct {
   long long pauses, entered; /* with `pauses`, calls end where a segment begins: parameters may change */
 } NAME(each);
 long long NAME(call_each)(NAME(each) *call, long long steps);
+long long NAME(call_momenta)(long long count, double t, long long m, long long parameters_each, const double *q,
+    const double *v, const double *parameters, double *p, double *workspace);
+void NAME(call_project)(long long count, double t, long long m, long long parameters_each, const double *q,
+    const double *p, const double *parameters, double *q1, double *p1, double *apart, double *workspace);

@@ -18,8 +18,8 @@ from scvi_codegen.native.calls import FIRST_RESULT, RESULTS
 from scvi_codegen.native.options import FAILURES, FALLBACK_REQUIRED, SolverOptions, checked_options
 
 DOUBLE_SIZE = np.dtype(np.float64).itemsize
-WITHOUT_STEPS = frozenset(("start", "step_error", "energies"))
-"""Frequent functions that never request the fallback."""
+WITHOUT_STEPS = frozenset(("start", "step_error", "energies", "call_momenta", "call_project"))
+"""Functions that never request the fallback, frequent or of many states."""
 
 
 class Binding:
@@ -105,6 +105,13 @@ class Binding:
             return taken
 
         return advance
+
+    def of_each(self, name: str, t: float, parameters: NDArray[np.float64], *states: NDArray[np.float64]) -> Any:
+        """Call ``<prefix>_call_<name>`` with (k, m) states, each with its own parameters; arrays are contiguous."""
+        inputs, results = states[:2], states[2:]
+        sizes = *inputs[0].shape, parameters.shape[1]
+        pointers = map(self.pointer, (*inputs, parameters, *results))
+        return self.function(f"call_{name}")(sizes[0], t, *sizes[1:], *pointers, self.workspace())
 
     def with_function(self, name: str) -> Self:
         """Return this binding, or that of the fallback if only it has the function; MethodError if neither has it."""

@@ -15,7 +15,10 @@ from scvi_codegen.rendering.source import Source
 
 RESULTS, FIRST_RESULT = Struct("=4d4q"), "error"
 """Format of the last fields of the struct (``calls_declarations.h``), and the first of them."""
-OPTIONAL = ("actions", "advance_to", "measures_growth", "step_error", "rejected", "set_fallback", "fallback_steps")
+OPTIONAL = (
+    *("actions", "advance_to", "measures_growth", "step_error", "rejected", "set_fallback", "fallback_steps"),
+    *("momentum", "project"),
+)
 """Names that not all sources declare, HAS_.. in ``calls.h``."""
 
 

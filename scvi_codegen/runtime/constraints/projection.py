@@ -103,6 +103,18 @@ def consistent(
     return q1, p1
 
 
+def make_consistent(stepper: Integrator, q: Array, p: Array, t: float, parameters: Array) -> None:
+    """Replace (k, m) states by those of :func:`consistent`, each with its own parameters."""
+    q[0], p[0] = consistent(stepper, q[0], p[0], t, parameters[0])
+    q1, p1, apart = np.empty_like(q), np.empty_like(p), np.empty((len(q), 2))
+    stepper.binding.of_each("project", t, parameters, q, p, q1, p1, apart)
+    moved = apart.max(axis=1)
+    by_typing = (moved > ROUNDING_UNITS * np.finfo(float).eps) & (moved <= INPUT_PRECISION)
+    q[by_typing], p[by_typing] = q1[by_typing], p1[by_typing]
+    for k in np.flatnonzero(~(moved <= INPUT_PRECISION)).tolist():
+        q[k], p[k] = consistent(stepper, q[k], p[k], t, parameters[k], check_rank=False)
+
+
 def _worst(stepper: Integrator, q: Array, p: Array, t: float, parameters: Parameters) -> str:
     """Describe the largest residual of the constraints and of their rates, omitting one that is 0 up to rounding."""
     values = constraint_values(stepper, q, p, t, parameters)[:, 0]

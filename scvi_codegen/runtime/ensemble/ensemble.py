@@ -145,6 +145,7 @@ class Ensemble:
         self.saved: dict[int, SavedLane] = {}
         self.error, self.confirmations = error, list[GlobalError | None]()
         self.t_eval: Array | None = None
+        self.ends = np.empty(0)
         self.singly = stepper.changes_states or interface.words > 1  # events change the states of each within steps
         self.fixed = fixed if interface.words > 1 else None
         if fixed is None or self.singly:
@@ -181,7 +182,7 @@ class Ensemble:
             return None
         if self.inputs or self.singly or stepper.in_tau or not stepper.binding.reusable:
             return None
-        ends = self._ends()
+        ends = self.ends
         if self.error is not None or not (self.t_eval is None or self._saves_ends(ends)):
             return None
         return SuccessiveRuns(
@@ -196,24 +197,22 @@ class Ensemble:
             receive=lambda states: self.states.append(states.copies()),
         )
 
-    def _ends(self) -> Array:
-        return np.array([plan.t_end for plan in self.plans])
-
     def _on_device(self) -> AdaptiveDeviceRuns:
         """Return the trajectories with adaptive steps that a GPU integrates."""
-        arguments = self.stepper, self.options, self.start, self.parameters, self.t0, self._ends()
+        arguments = self.stepper, self.options, self.start, self.parameters, self.t0, self.ends
         return AdaptiveDeviceRuns(*arguments, tolerance=self.plans[0].tolerance)
 
     def _saves_ends(self, ends: Array) -> bool:
         """Return whether the output times are the common end of all trajectories, with or without their start."""
         times = set() if self.t_eval is None else {*self.t_eval.tolist()} - {self.t0}
-        return times == {*ends.tolist()}
+        return times == {*np.unique(ends).tolist()}
 
     def _plans(self, fixed: CommonSteps | None, t_end: ArrayLike, tolerance: float | None) -> list[StepPlan]:
         """Return the step plan of each trajectory; all must run forward or all backward."""
         if fixed is not None:
             return [StepPlan(h=fixed.h, t_end=float(fixed.times(tau=False)[-1]))] * len(self)
         ends = real_array(t_end, "t_end")
+        self.ends = np.full(len(self), ends) if not ends.ndim else ends
         if ends.shape not in ((), (len(self),)):
             raise StateError(f"t_end must be one time or {len(self)} times, not of shape {ends.shape}")
         worst = int(np.argmin(np.isfinite(ends)))  # the first one that is not finite
@@ -233,8 +232,7 @@ class Ensemble:
         if t_eval is None:
             return None
         check_together(t_eval=t_eval, save_every=None if self.save_every == 1 else self.save_every)
-        farthest = max((plan.t_end for plan in self.plans), key=lambda end: abs(end - self.t0))
-        return times_of_run(t_eval, self.t0, farthest)
+        return times_of_run(t_eval, self.t0, float(self.ends[np.abs(self.ends - self.t0).argmax()]))
 
     def __len__(self) -> int:
         return len(self.start[0])

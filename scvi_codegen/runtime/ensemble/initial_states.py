@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, real_array
-from scvi_codegen.runtime.constraints.projection import consistent
+from scvi_codegen.runtime.constraints.projection import make_consistent
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import (
     Array,
@@ -44,8 +44,16 @@ def momenta_of_each(
     if positions.shape != velocities.shape:
         raise StateError(f"q and velocity must have equal shapes, not {positions.shape} and {velocities.shape}")
     values = parameters_of_each(stepper, parameters, len(positions))
-    states = zip(positions, velocities, values, strict=True)
-    return stacked([stepper.initial_momentum(position, v, time, value) for position, v, value in states])
+    interface = stepper.interface
+    if interface.words > 1 or interface.energy_parameter or interface.layout.momenta:
+        states = zip(positions, velocities, values, strict=True)
+        return stacked([stepper.initial_momentum(position, v, time, value) for position, v, value in states])
+    momenta = np.empty_like(positions)
+    done = stepper.binding.of_each("momenta", time, values, positions, velocities, momenta)
+    dropped = ((momenta[:done] == 0.0) & (velocities[:done] != 0.0)).any(axis=1)
+    for j in (*np.flatnonzero(dropped).tolist(), *range(done, len(momenta))):
+        momenta[j] = stepper.initial_momentum(positions[j], velocities[j], time, values[j])  # may raise
+    return momenta
 
 
 def start_of_ensemble(
@@ -56,10 +64,8 @@ def start_of_ensemble(
     positions, momenta = checked_ensemble(stepper, q, p)
     values = parameters_of_each(stepper, parameters, len(positions))
     if stepper.interface.constraints:
-        for k, parameters_of_lane in enumerate(values):
-            positions[k], momenta[k] = consistent(
-                stepper, positions[k], momenta[k], t, parameters_of_lane, check_rank=k == 0
-            )
+        positions, momenta = (np.ascontiguousarray(each) for each in (positions, momenta))
+        make_consistent(stepper, positions, momenta, t, values)
     return positions, momenta, values
 
 
@@ -98,7 +104,8 @@ def parameters_of_each(stepper: Integrator, argument: EnsembleParameters, count:
 
 def _parameters_of_each(stepper: Integrator, argument: EnsembleParameters, count: int, defaults: Array) -> Array:
     names = stepper.parameters
-    values = np.tile(defaults, (count, 1))
+    values = np.empty((count, len(defaults)))
+    values[:] = defaults
     if isinstance(argument, Mapping):
         for name, where, value in parameter_columns(stepper.interface, argument):
             column = real_array(value, f"the parameter {name}")

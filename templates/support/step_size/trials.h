@@ -10,6 +10,8 @@
 #define SPURIOUS REAL(1e-8) /* relative to the state: spurious solutions of the equations differ by more */
 #define MANY_ITERATIONS 10 /* of a step, after which the next one is not larger */
 #define TOO_MANY_ITERATIONS 13 /* the next one is smaller: about ten iterations take the least time per unit of time */
+#define SHORT_PART REAL(0.015625) /* of the time in which a state changes by its size, or of the span: early trial */
+#define FACTOR_UP REAL(16.0) /* of the step size by MOST_UP levels */
 #define SUSPENDED 8 /* steps without this rule after one that needed as many iterations as a larger one */
 #define FAILURES_BEFORE_NEWTON 3 /* trials of a step in which the iteration of the multipliers fails */
 #define STEPS_COMPARED_AFTER_DOUBT 16 /* steps that are compared after one that was shortened by a comparison */
@@ -155,23 +157,30 @@ HOT void try_step(run_memory *run, trial *now, real least, const solver_options 
 #endif
 }
 
+/* Largest increment of x, and the largest number of x. */
+static SELDOM real largest_change(const step_data *step, const real *x, const real *dx, real *size)
+{
+  sums all;
+  begin_blocks(&all, step);
+  EACH_BLOCK (all) {
+    real change = 0, of_x = 0;
+    for (long long i = all.here.first; i < all.here.end; i++) {
+      change = larger(change, MATH(fabs)(dx[i]));
+      of_x = larger(of_x, MATH(fabs)(x[i]));
+    }
+    add_block(&all, change, of_x);
+  }
+  meet(step);
+  *size = largest_over(&all, 1);
+  return largest_over(&all, 0);
+}
+
 /* Returns 1 if the momenta change by a small part of the largest one, as they do where nonsmooth forces shorten a
  * step. */
 static SELDOM int changes_little(const trial *now)
 {
-  const step_data *step = &now->step;
-  sums all;
-  begin_blocks(&all, step);
-  EACH_BLOCK (all) {
-    real change = 0, size = 0;
-    for (long long i = all.here.first; i < all.here.end; i++) {
-      change = larger(change, MATH(fabs)(now->dp[i]));
-      size = larger(size, MATH(fabs)(now->at.p[i]));
-    }
-    add_block(&all, change, size);
-  }
-  meet(step);
-  return largest_over(&all, 0) < SMALL_PART * largest_over(&all, 1);
+  real size;
+  return largest_change(&now->step, now->at.p, now->dp, &size) < SMALL_PART * size;
 }
 
 /* Compares a trial with two half steps, in momenta too if requested. */
@@ -191,6 +200,28 @@ static int levels_up(const trial *now)
   return up;
 }
 
+/* Levels by which the first trial, of size h, may be increased at once: to a part of the time in which positions or
+ * momenta change by their size. Changes from rest or from the origin are of second order in time. */
+static SELDOM int levels_of_first(const trial *now, real h, real span)
+{
+  real q, p, rate = 0, factor;
+  int up = 0;
+  const real dq = largest_change(&now->step, now->at.q, now->dq, &q);
+  const real dp = largest_change(&now->step, now->at.p, now->dp, &p);
+  if (q > 0)
+    rate = larger(rate, dq / q);
+  if (p > 0)
+    rate = larger(rate, dp / p);
+  if (!(q > 0 && p > 0))
+    rate = MATH(sqrt)(rate);
+  if (!(rate > 0 && rate < INFINITY && now->error < INFINITY))
+    return 0;
+  factor = SHORT_PART * (1 / rate < span / h ? 1 / rate : span / h);
+  for (; factor >= FACTOR_UP; factor /= FACTOR_UP)
+    up += MOST_UP;
+  return up;
+}
+
 /* Determines the first step size by increasing one that is certainly too small. The smallest trials may fail, with
  * fixed-point iteration larger ones, too: if some velocities are zero, rounding dominates them. Or their error estimate
  * is only rounding, of any size; the estimate of a curve grows as expected. */
@@ -198,9 +229,21 @@ static SELDOM void try_first_step(run_memory *run, trial *now, const solver_opti
 {
   const real span = MATH(fabs)(now->t_end - now->at.t);
   real shorter = run->h != 0 ? REAL_MIN : (real)INFINITY;
-  int found = 0, up = 1;
+  int found = 0, up = 1, early = 0;
   run->grid_level = level_below(run->h != 0 ? MATH(fabs)(run->h) : span * FIRST_STEP);
   try_step(run, now, 0, options, report);
+  if (run->h == 0)
+    early = levels_of_first(now, now->length, span);
+  while (early > 0) {
+    run->grid_level += early;
+    try_step(run, now, 0, options, report);
+    if (levels_up(now) == MOST_UP)
+      break;
+    run->grid_level -= early;
+    early = early / (2 * MOST_UP) * MOST_UP;
+    if (early == 0)
+      try_step(run, now, 0, options, report);
+  }
   while (!now->last && up > 0) {
     const int failed = !(now->error < INFINITY), small = now->error <= now->limits.most;
     const int as_expected = now->error > error_at(shorter, up / 2) && now->error < error_at(shorter, up + 1);
