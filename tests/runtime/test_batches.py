@@ -161,6 +161,42 @@ def test_python_costs_less_than_one_function_call_for_each_trajectory(
         one.integrate_ensemble(q, p, **arguments)
 
 
+@pytest.mark.parametrize("kind", ["p", "velocity"])
+@pytest.mark.parametrize("name", ["kepler", "rod"])
+def test_initial_states_cost_less_than_one_function_call_each(
+    name: str, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(batches, "CHUNK_SECONDS", 1e3)
+    one, (q, p) = stepper(name), (np.repeat(x, 200, axis=0) for x in states(name))
+    one.integrate_ensemble(q, **{kind: p}, h=0.05, steps=2, threads=1)
+    with at_most(len(q)):
+        one.integrate_ensemble(q, **{kind: p}, h=0.05, steps=2, threads=1)
+
+
+def test_initial_states_of_two_kinds_equal_those_of_single_runs() -> None:
+    """Of velocities with different masses, and projected where they are typed with few digits."""
+    one, (q, v), m = stepper("rod"), states("rod"), np.linspace(0.5, 2.0, COUNT)
+    q[1::2], v[1::2] = np.round(q[1::2], 7), np.round(v[1::2], 7)
+    with pytest.warns(sc.AccuracyWarning, match="the initial state violates"):
+        q[3] *= 1.01
+        runs = one.integrate_ensemble(q, velocity=v, h=0.05, steps=1, parameters={"m": m})
+        for j in range(COUNT):
+            run = one.integrate(q[j], velocity=v[j], h=0.05, steps=1, parameters={"m": m[j]})
+            assert runs.q[:, j].tobytes() == run.q.tobytes()
+            assert runs.p[:, j].tobytes() == run.p.tobytes()
+    with pytest.raises(sc.StateError, match="violates the constraints"):
+        one.integrate_ensemble(np.vstack([q, [[3.0, 4.0]]]), np.zeros((COUNT + 1, 2)), h=0.05, steps=1)
+
+
+def test_a_velocity_without_momentum_is_refused() -> None:
+    polar = sc.LagrangianSystem.from_text(
+        name="polar", coordinates=["r", "phi"], lagrangian="r_dot**2/2 + r**2*phi_dot**2/2 - r**2/2"
+    )
+    one = sc.compile_stepper(polar, "svi:4")
+    with pytest.raises(sc.StateError, match="phi_dot = 1 at q = .* has no momentum"):
+        one.integrate_ensemble([[1.0, 0.0], [0.0, 0.0]], velocity=[[0.0, 1.0], [0.0, 1.0]], h=0.05, steps=1)
+
+
 def test_energies_that_change_are_reported_for_the_worst_trajectory() -> None:
     one, (q, p) = stepper("kepler"), states("kepler")
     q[3], p[3] = (1e-3, 0.0), (0.0, 44.5)  # eccentricity .98: a loose tolerance loses the energy
