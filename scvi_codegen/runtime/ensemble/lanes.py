@@ -106,13 +106,16 @@ class CommonRuns:
                 self.done, self.fallback_steps = batch.done, batch.fallback_steps
 
     def batch(self) -> LaneRuns | SuccessiveRuns | None:
-        """Return the trajectories as C integrates many in one call, ``None`` if memory of runs is not reusable."""
+        """Return the trajectories as C integrates many in one call.
+
+        ``None`` if memory of runs is not reusable, and of constraints with inputs, which single runs check for jumps.
+        """
         binding = self.stepper._ensemble_binding if self.observation is None else self.observation.binding
         start = self.options, self.start, self.parameters, self.steps.t0
         steps, values_at = self.steps.fixed_segments(), self.values_at if self.steps.has_inputs else None
         if binding is not None:
             return LaneRuns(self, binding, *start, steps, values_at)
-        if not self.stepper.binding.reusable:
+        if not self.stepper.binding.reusable or (values_at is not None and self.stepper.interface.constraints):
             return None
         return SuccessiveRuns(self.stepper, *start, steps, values_at, receive=self._store)
 
