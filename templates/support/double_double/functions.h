@@ -38,8 +38,8 @@ static inline void OF(sine_and_cosine)(PAIR x, PAIR *sine, PAIR *cosine)
   const PAIR s = OF(plus)(rest, OF(multiply)(OF(multiply)(rest, square), OF(polynomial)(square, SINE, 3, 4)));
   const PAIR c = OF(multiply)(square, OF(polynomial)(square, COSINE, 3, 4)); /* cos - 1 */
   const PAIR S = {PICK(k, CIRCLE, 0), PICK(k, CIRCLE, 1)}, C = {PICK(k, CIRCLE, 2), PICK(k, CIRCLE, 3)};
-  *sine = OF(add)(S, OF(add)(OF(multiply)(C, s), OF(multiply)(S, c)));
-  *cosine = OF(add)(C, OF(subtract)(OF(multiply)(C, c), OF(multiply)(S, s)));
+  *sine = OF(plus)(S, OF(plus)(OF(multiply)(C, s), OF(multiply)(S, c))); /* S and C are 0 or 0.049 at least, s 0.025 */
+  *cosine = OF(plus)(C, OF(plus)(OF(multiply)(C, c), OF(negative)(OF(multiply)(S, s))));
 }
 
 static inline PAIR OF(sin)(PAIR x)

@@ -21,8 +21,9 @@ typedef struct {
 
 static inline double lane_of(const lanes *x, int j)
 {
-  const lane_view view = {*x}; /* a cast of the pointer would alias */
-  return view.lane[j];
+  double value; /* a cast of the pointer would alias */
+  memcpy(&value, (const char *)x + (size_t)j * sizeof value, sizeof value);
+  return value;
 }
 
 /* sum_j table_gj x_j of a coordinate: Dot2 (Ogita, Rump & Oishi 2005) with the low words of both factors. */
@@ -38,7 +39,16 @@ static inline ddl sum_of_pairs(const lanes *table, const lanes *low, int g, cons
     sum[j % 2].high = next.high;
     sum[j % 2].low += multiply_add(a, rest, multiply_add(b, high, product.low + next.low));
   }
-  return ddl_add(ddl_fast_two_sum(sum[0].high, sum[0].low), ddl_fast_two_sum(sum[1].high, sum[1].low));
+  const ddl both = ddl_two_sum(sum[0].high, sum[1].high);
+  return ddl_fast_two_sum(both.high, both.low + (sum[0].low + sum[1].low));
+}
+
+/* x + y with an unnormalised low word: the sum of the low words and the rounding error. */
+static inline ddl add_loosely(ddl x, ddl y)
+{
+  ddl sum = ddl_two_sum(x.high, y.high);
+  sum.low += x.low + y.low;
+  return sum;
 }
 
 /* Sum over all points, in an order that does not depend on the vector length. */
@@ -46,10 +56,10 @@ static inline dd total_of_pairs(ddl *x)
 {
   enum { WHOLE = (POINTS & -POINTS) / LANES };
   for (int n = WHOLE; n < GROUPS; n++)
-    x[n % WHOLE] = ddl_add(x[n % WHOLE], x[n]);
+    x[n % WHOLE] = add_loosely(x[n % WHOLE], x[n]);
   for (int half = WHOLE / 2; half > 0; half /= 2)
     for (int n = 0; n < half; n++)
-      x[n] = ddl_add(x[n], x[n + half]);
+      x[n] = add_loosely(x[n], x[n + half]);
   ddl sum = x[0];
   for (int half = LANES / 2; half > 0; half /= 2) {
     lane_view high = {sum.high}, low = {sum.low};
@@ -58,17 +68,17 @@ static inline dd total_of_pairs(ddl *x)
       low.lane[j] = low.lane[j + half];
     }
     const ddl other = {high.all, low.all};
-    sum = ddl_add(sum, other);
+    sum = add_loosely(sum, other);
   }
-  return dd_of(lane_of(&sum.high, 0), lane_of(&sum.low, 0));
+  return dd_fast_two_sum(lane_of(&sum.high, 0), lane_of(&sum.low, 0));
 }
 
 static inline dd weighted_total(const lanes *weights, const lanes *low, const ddl (*x)[M], int i)
 {
   ddl part[GROUPS];
   for (int n = 0; n < GROUPS; n++) {
-    const ddl weight = {weights[n], low[n]};
-    part[n] = ddl_multiply(weight, x[n][i]);
+    part[n] = ddl_two_product(weights[n], x[n][i].high);
+    part[n].low += multiply_add(weights[n], x[n][i].low, low[n] * x[n][i].high);
   }
   return total_of_pairs(part);
 }
@@ -95,7 +105,7 @@ static void begin_pairs(pair_step *w, const step_data *step, double t_low, doubl
   for (int i = 0; i < M; i++) {
     const dd q = dd_of(step->q0[i], step->carry_q[i]), p = dd_of(step->p0[i], step->carry_p[i]);
     w->inverse_mass[i] = dd_divide(dd_of(1.0, 0.0), masses[i]);
-    w->drift[i] = dd_multiply(dd_divide(p, masses[i]), h);
+    w->drift[i] = dd_multiply(dd_multiply(p, w->inverse_mass[i]), h);
     w->scale[i] = w->square.high * w->inverse_mass[i].high;
     w->inverse_size[i] = fabs(q.high) + fabs(w->drift[i].high);
     for (int n = 0; n < GROUPS; n++) {
@@ -109,15 +119,15 @@ static void begin_pairs(pair_step *w, const step_data *step, double t_low, doubl
     w->inverse_size[i] = 1.0 / (w->inverse_size[i] + 1e-3 * largest + DBL_MIN);
 }
 
-/* Residual of the stage equations, as one word. */
+/* Residual of the stage equations, as one word; X has one, so that its difference from the high word is exact. */
 static inline void find_residual(pair_step *w)
 {
   for (int i = 0; i < M; i++)
     for (int n = 0; n < GROUPS; n++) {
       const dd unit = dd_multiply(w->square, w->inverse_mass[i]);
       const ddl sum = sum_of_pairs(PRODUCT, PRODUCT_LOW, n, w->F, i);
-      const ddl point = ddl_add(w->base[n][i], ddl_multiply(sum, ddl_of(unit)));
-      w->rest[n][i] = ddl_subtract(point, w->X[n][i]).high;
+      const ddl moved = ddl_multiply(sum, ddl_of(unit)), point = ddl_two_sum(w->base[n][i].high, moved.high);
+      w->rest[n][i] = (point.high - w->X[n][i].high) + (point.low + (w->base[n][i].low + moved.low));
     }
 }
 
