@@ -193,6 +193,7 @@ def test_steps_by_newtons_method_are_counted(text, q, h, values):
         part = stepper.from_checkpoint(part.checkpoint())
         part.advance(37)
         assert part.fallback_steps == whole.fallback_steps
+        assert np.array_equal(part.q, whole.q[-1])
         counts.append(whole.fallback_steps)
         assert stepper.integrate(q, p, parameters={name: value}, t_end=5.0).fallback_steps == 0
     assert counts[0] == 0 < min(counts[1:])
@@ -200,6 +201,29 @@ def test_steps_by_newtons_method_are_counted(text, q, h, values):
     start = np.tile([q, p], (3, 1, 1)).swapaxes(0, 1)
     runs = stepper.integrate_ensemble(*start, h=h, steps=60, parameters=values)
     assert runs.fallback_steps.tolist() == [runs[j].fallback_steps for j in range(3)] == counts
+
+
+def test_iteration_that_fails_is_tried_again_after_growing_numbers_of_steps():
+    """A try takes 10 iterations or more; the iteration takes over again where the equations are no longer stiff."""
+    system = sc.LagrangianSystem.from_text(name="stiff", **STIFF)
+    ours, newton = (
+        sc.compile_stepper(system, "svi:4", solver=each, flags=PORTABLE_FLAGS) for each in ("auto", "newton")
+    )
+    stiff = {"h": 0.7, "parameters": {"k": 40.0}}
+    run, other = (each.integrate([0.3], [0.0], **stiff, steps=200) for each in (ours, newton))
+    assert run.fallback_steps == 200
+    assert np.flatnonzero(run.iterations[1:] >= 15).tolist() == [0, 1, 3, 7, 15, 31, 63, 127, 191]
+    assert np.abs(run.q - other.q).max() < 1e-12
+    after = ours.start([0.3], [0.0], **stiff)
+    after.advance(20)
+    after.update(parameters={"k": 10.0})
+    after.advance(11)
+    assert after.fallback_steps == 31
+    after.advance(30)
+    assert after.fallback_steps == 31
+    after.update(parameters={"k": 40.0})
+    after.advance(4)
+    assert after.fallback_steps == 35
 
 
 def test_steps_are_counted_that_fail_without_newtons_method():

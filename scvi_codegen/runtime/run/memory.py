@@ -37,8 +37,9 @@ from scvi_codegen.validation import LARGEST_COUNT, checked_count
 
 STEPS_PER_CALL, MOST_UNTIMED = 10**5, 2**10
 """Largest number of steps per call into C, between checks for Ctrl-C, and of coordinates of which it is not timed."""
-LARGEST_STEP, MOST_GRID_LEVEL = 2**53, 2**16
-"""Largest number of steps that a double represents; a bound of step-size levels beyond all exponents of a double."""
+LARGEST_STEP, MOST_GRID_LEVEL, MOST_SUSPENDED = 2**53, 2**16, 64
+"""Largest number of steps that a double represents; a bound of step-size levels beyond all exponents of a double; that
+of ``suspension.h``."""
 RANGES = {
     **dict.fromkeys(
         (
@@ -53,7 +54,8 @@ RANGES = {
         ),
         (0, LARGEST_STEP),
     ),
-    **dict.fromkeys(("guess", "turn"), (0, 2)),
+    "guess": (1 - 2 * MOST_SUSPENDED, 2),
+    "turn": (0, 2),
     **dict.fromkeys(
         ("grid_level", "change", "change_before", "direction", "failed"), (-MOST_GRID_LEVEL, MOST_GRID_LEVEL)
     ),

@@ -1,4 +1,5 @@
 #include "../core/status_codes.h"
+#include "../newton/suspension.h"
 #include "one_trajectory.h"
 
 /* Step by fixed-point iteration. If it fails, the step is solved by Newton's method, by that of another library
@@ -42,12 +43,14 @@ static void prepare(const step_data *step, solver_data *data)
   prepare_iteration(step, data);
 }
 
-/* Computes the increments by fixed-point iteration from the straight line, else by fall_back. */
+/* Computes the increments by fixed-point iteration from the straight line unless it is suspended, else by fall_back. */
 static __attribute__((noinline)) int solve_afresh(const step_data *step, const solver_data *data, history memory,
     long long *guess, double *dq, double *dp, const solver_options *options, solver_report *report, double *workspace)
 {
   long long steps = 0;
-  int status = fixed_point(step, data, memory, &steps, dq, dp, options, report);
+  int status = NOT_CONVERGED;
+  if (!is_suspended(*guess))
+    status = fixed_point(step, data, memory, &steps, dq, dp, options, report);
   if (status != OK) {
     status = fall_back(status, step, dq, dp, options, report, workspace);
     if (status == OK && !reaches(step, dq, dp))
@@ -55,7 +58,7 @@ static __attribute__((noinline)) int solve_afresh(const step_data *step, const s
 #ifndef NO_FALLBACK
     report->fallback_steps += status == OK;
 #endif
-    steps = 0;
+    steps = after_fallback(*guess);
   }
   if (status == OK)
     *guess = steps;
@@ -63,8 +66,8 @@ static __attribute__((noinline)) int solve_afresh(const step_data *step, const s
 }
 
 /* Computes the increments by fixed-point iteration from the curve extrapolated from *guess former steps, or from the
- * straight line if there are none or it fails. On success *guess is the number of steps for the next predictor. On
- * failure the increments are undefined. */
+ * straight line if there are none or it fails. On success *guess is the number of steps for the next predictor, or
+ * negative after Newton's method (suspension.h). On failure the increments are undefined. */
 HOT int solve(const step_data *step, const solver_data *data, history memory, long long *guess, double *dq, double *dp,
     const solver_options *options, solver_report *report, double *workspace)
 {

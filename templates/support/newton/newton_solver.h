@@ -1,5 +1,6 @@
 #include "newton_from_line.h"
 #include "stages.h"
+#include "suspension.h"
 
 /* Step by Newton's method. Requires: newton.h, the table EXTRAPOLATION: the predictor is sum_c EXTRAPOLATION[c][b] z_c
  * of the previous step; for multipliers the rows from B on. */
@@ -55,8 +56,9 @@ static int variables_of_momenta(const step_data *step, const real *z, const real
 
 /* Computes the increments by RATTLE if applicable, else by Newton's method from the extrapolated stages of the previous
  * step, and from the straight line if there are none or the iteration fails. memory contains the stages and, if factors
- * are reused, the point of the factors; guess is 1 if the stages are valid, 2 if both are. On failure the increments
- * are undefined and memory and guess are unchanged. */
+ * are reused, the point of the factors; guess is 1 if the stages are valid, 2 if both are, and negative if they are
+ * after a step that RATTLE did not solve (suspension.h). On failure the increments are undefined and memory and guess
+ * are unchanged. */
 static int solve(const step_data *step, const solver_data *way, real *memory, long long *guess, real *dq, real *dp,
     const solver_options *options, solver_report *report, real *workspace)
 {
@@ -73,7 +75,8 @@ static int solve(const step_data *step, const solver_data *way, real *memory, lo
   if (POINT > 0 && *guess == 2)
     keep = step->first ? remake_factors(step, memory + N, data) : 1;
 #ifdef RATTLE
-  status = rattle(step, *guess ? memory : NULL, data, dp, options, report);
+  if (!is_suspended(*guess))
+    status = rattle(step, *guess ? memory : NULL, data, dp, options, report);
   keep = 0;
   falls_back = status != OK;
   if (falls_back && way->rattle_alone)
@@ -100,6 +103,6 @@ static int solve(const step_data *step, const solver_data *way, real *memory, lo
   report->fallback_steps += falls_back;
   memcpy(memory, data->z, sizeof(real) * N);
   memcpy(memory + N, data->point, sizeof(real) * POINT);
-  *guess = POINT > 0 && keep ? 2 : 1;
+  *guess = falls_back ? after_fallback(*guess) : POINT > 0 && keep ? 2 : 1;
   return status;
 }

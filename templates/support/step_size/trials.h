@@ -77,7 +77,7 @@ static __attribute__((noinline)) double attempt(run_memory *run, step_data *step
     tables.alone = PREDICTOR_INSIDE[inside - 1];
     *guess = 1;
   } else
-    *guess = afresh || !choose_tables(run, &tables) ? 0 : run->guess;
+    *guess = afresh || run->guess < 0 || !choose_tables(run, &tables) ? 0 : run->guess;
 #ifdef NEWTON_KRYLOV
   status = solve(step, data, STORED(run, step), guess, dq, dp, options, report, NULL);
 #else
