@@ -145,9 +145,9 @@ def energy_balance(result: EnsembleTrajectory) -> float | None:
 
 def _energy_report(result: EnsembleTrajectory, balance: float | None) -> str:
     """Return one line: the largest error or change of the energy among all trajectories."""
-    energies = result.energy()
+    energies, where = result.energy(), ""
     if result.observed is not None and result.observed.ndim == 2:
-        energies = np.concatenate([energies, result.observed])
+        energies, where = np.concatenate([energies, result.observed]), " over all steps"
     sizes = np.abs(energies[0])
     reason = energy_reason(result.stepper)
     relative = bool((sizes > 0.0).all()) and not reason
@@ -156,7 +156,7 @@ def _energy_report(result: EnsembleTrajectory, balance: float | None) -> str:
         return "energy: not finite in any state"
     state, worst = (int(index) for index in np.unravel_index(np.nanargmax(changes), changes.shape))
     if reason:
-        changed = f"energy: {reason}, it changed by {changes[state, worst]:.3g} at most"
+        changed = f"energy: {reason}, it changed by {changes[state, worst]:.3g} at most{where}"
         return changed if balance is None else f"{changed}; energy balance |E - E0 - W| {balance:.1e} at most"
     title = "relative energy error" if relative else "energy error"
-    return f"{title}: {changes[state, worst]:.2e} at most, of trajectory {worst}"
+    return f"{title}: {changes[state, worst]:.2e} at most{where}, of trajectory {worst}"

@@ -97,8 +97,10 @@ class TimeSpan(RunOptions):
         """Raise an error for a single run with an option of ensembles."""
         for name in ("device", "observe", "reproducible"):
             if (value := getattr(self, name)) is not None:
+                flag = next(option.flag for option in options_of("run") if option.field == name)
+                shown = str(value).lower() if isinstance(value, bool) else repr(value)
                 raise ModelFileError(
-                    f"{name} = {value!r} ([run] {name}, run --{name}) is for ensembles only: give --ensemble FILE, "
+                    f"{name} = {shown} ([run] {name}, run {flag}) is for ensembles only: give --ensemble FILE, "
                     f"or omit {name}"
                 )
 
