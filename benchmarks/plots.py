@@ -51,14 +51,14 @@ def draw_curves(results: Sequence[CaseResult]) -> Figure:
         for method in result.methods():
             handles[method] = _draw_method(panel, result, method, looks[method])
         panel.set(xscale="log", yscale="log", xlabel="time of a trajectory, ms", ylabel="error", title=result.name)
-        _label_times(panel)
+        label_times(panel)
     for panel in panels[len(results) :]:
         panel.set_visible(False)
     figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=abreast)
     return figure
 
 
-def _label_times(axes: Axes) -> None:
+def label_times(axes: Axes) -> None:
     """Label times as 0.1, 0.2, 0.5, 1, .. ms, as many as fit."""
     from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 

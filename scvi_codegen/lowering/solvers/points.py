@@ -154,13 +154,13 @@ def _linear_part(system: LagrangianSystem, product: Matrix, lanes: int) -> Linea
     so that the systems for all eigenvalues are regular at any step size.
     """
     force, rest = forms_of(system).force, dict.fromkeys(system.coordinates, sympy.S.Zero)
-    places = {q: i for i, q in enumerate(system.coordinates)}
-    depends = [sorted({i, *(places[q] for q in F.free_symbols & places.keys())}) for i, F in enumerate(force)]
-    few = all(len(each) <= 2 * WIDEST_LINEAR_PART + 1 for each in depends)
+    diagonal = {(i, i) for i in range(len(force))}
+    few = all(len(F.free_symbols & rest.keys()) <= 2 * WIDEST_LINEAR_PART + 1 for F in force)
     if len(force) < LEAST_LINEAR_PART or not few or not all(_is_finite(F.xreplace(rest)) for F in force):
         return None
-    entries = {(i, j): F.diff(system.coordinates[j]).xreplace(rest) for i, F in enumerate(force) for j in depends[i]}
-    entries = {place: entry for place, entry in entries.items() if entry != 0 or place[0] == place[1]}
+    derivatives = jacobian(force, system.coordinates)
+    entries = {place: derivatives.get(place, sympy.S.Zero).xreplace(rest) for place in diagonal | derivatives.keys()}
+    entries = {place: entry for place, entry in sorted(entries.items()) if entry != 0 or place in diagonal}
     symmetric = all(entries.get((j, i), 0) == entry for (i, j), entry in entries.items())
     if not symmetric or not all(_is_finite(entry) for entry in entries.values()) or not _is_stable(system, entries):
         return None
