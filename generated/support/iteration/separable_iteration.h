@@ -26,6 +26,10 @@
 
 enum { OF_EACH = 1 + VELOCITIES }; /* values per coordinate in X: positions, then velocities */
 
+#ifdef LINEAR_FORCES
+#include "linear_part.h"
+#endif
+
 #define FEW 8 /* coordinates, whose squared changes are added, which is faster */
 
 /* Constants of a step size: h^2 = square + square_low, h w = kick + kick_low. */
@@ -37,6 +41,9 @@ typedef struct {
   number inverse_mass[M];
 #endif
   double square, square_low;
+#ifdef LINEAR_FORCES
+  linear_part linear;
+#endif
 } iteration_data;
 
 /* h v of a coordinate. */
@@ -345,6 +352,9 @@ static void prepare_iteration(const step_data *step, iteration_data *data)
   mass(NULL, step->t, step->parameters, data->inverse_mass);
   for (int i = 0; i < M; i++)
     data->inverse_mass[i] = 1.0 / data->inverse_mass[i];
+#ifdef LINEAR_FORCES
+  factorise_linear_part(step->parameters, data->square, data->inverse_mass, &data->linear);
+#endif
 }
 
 PASS void forces(const step_points *w)
@@ -387,12 +397,57 @@ PASS number improve(const step_points *w)
 }
 #endif
 
+#ifdef LINEAR_FORCES
+#define solves_linear_part(data) ((data)->linear.is_used)
+
+/* Corrects the points by solving for the linear part of the forces; returns the largest squared relative change. */
+static number correct_points(const step_points *w)
+{
+  coordinates d[GROUPS];
+  lanes change = lanes_of(0.0);
+  for (int i = 0; i < M; i++)
+    for (int g = 0; g < GROUPS; g++) {
+      const lanes curved = unit_of(w, i) * SUM_OF_FORCES(PRODUCT, w, g, i);
+      d[g][i] = (w->base[g * M + i] - w->X[g * M + i]) + WITH_LOW_WORDS(w, g, i, curved);
+    }
+  solve_linear_part(&w->data->linear, d[0]);
+  for (int i = 0; i < M; i++)
+    for (int g = 0; g < GROUPS; g++) {
+      change = with_change(change, d[g][i] * w->inverse_size[i]);
+      w->X[g * M + i] += d[g][i];
+    }
+  return total_change(change);
+}
+
+/* Corrects the points and, by their linear part, the forces, with double-double coefficients. */
+static void refine_forces(const step_points *w)
+{
+  const iteration_data *data = w->data;
+  coordinates d[GROUPS];
+  for (int i = 0; i < M; i++)
+    for (int g = 0; g < GROUPS; g++) {
+      const lanes sum = SUM_OF_FORCES(PRODUCT, w, g, i);
+      d[g][i] = (w->step->q0[i] - w->X[g * M + i]) +
+          (DRIFT[g] * w->drifts[i].high + data->inverse_mass[i] * (data->square * sum)) +
+          (w->rests[g * M + i] + data->inverse_mass[i] * (data->square_low * sum));
+    }
+  solve_linear_part(&data->linear, d[0]);
+  for (int k = 0; k < GROUPS * M; k++)
+    w->X[k] += d[0][k];
+  correct_forces(&data->linear, d[0], w->F);
+}
+#else
+#define solves_linear_part(data) 0
+#define correct_points(w) number_of(0.0)
+#define refine_forces(w) (void)0
+#endif
+
 #ifndef NEWTON_KRYLOV
 /* Computes the increments of one step and their low words. The points X are iterated until they converge, then once
- * more with double-double coefficients; the forces are stored for the predictor. On failure the increments are
- * undefined. */
-HOT int fixed_point(const step_data *step, const iteration_data *data, history past, long long *steps, number *dq,
-    number *dp, const solver_options *options, solver_report *report)
+ * more with double-double coefficients; the forces are stored for the predictor. implicit: 1 if equations are solved
+ * for the linear part of the forces. On failure the increments are undefined. */
+HOT int iterate(const step_data *step, const iteration_data *data, history past, long long *steps, number *dq,
+    number *dp, const solver_options *options, solver_report *report, int implicit)
 {
 #ifdef ARRAYS
   const section own = own_part(step);
@@ -413,7 +468,7 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
   forces(&w);
   measure_points(&w, options);
   for (int k = 0; needs_iteration(&now); k++) {
-    const number change = improve(&w);
+    const number change = implicit ? correct_points(&w) : improve(&w);
     forces(&w);
     take_change(&now, change, options, k, report);
 #ifndef ARRAYS
@@ -433,23 +488,36 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
   status = outcome(&now, report);
   if (status != OK)
     return status;
-  refine_points(&w, own);
+  if (implicit)
+    refine_forces(&w);
+  else {
+    refine_points(&w, own);
 #ifdef ARRAYS
-  improve_velocities(&w, own);
+    improve_velocities(&w, own);
 #endif
-  forces(&w);
+    forces(&w);
+  }
   find_increments(&w, own, dq, dp);
   if (!accept(step, dq, dp, report))
     return NOT_FINITE;
 #ifndef ARRAYS
   remember_curve(F, past);
 #endif
-#if defined(ERROR_GROWTH) || defined(DOUBLE_DOUBLE)
+#if defined(ERROR_GROWTH) || defined(MIXED_POINTS)
   if (step->points)
     memcpy(step->points, X, sizeof X);
 #endif
   *steps = next_guess(*steps, &now, report);
   return OK;
+}
+
+/* The same with the linear part of the forces or, if that does not converge, without it. */
+HOT int fixed_point(const step_data *step, const iteration_data *data, history past, long long *steps, number *dq,
+    number *dp, const solver_options *options, solver_report *report)
+{
+  if (solves_linear_part(data) && iterate(step, data, past, steps, dq, dp, options, report, 1) == OK)
+    return OK;
+  return iterate(step, data, past, steps, dq, dp, options, report, 0);
 }
 #endif
 

@@ -9,7 +9,7 @@
 static int line_from(const step_data *step, newton_data *data)
 {
   real v[M];
-  const int status = NAME(velocity)(step->t, step->q0, step->p0, step->parameters, v, step->scratch);
+  const int status = find_velocity(step->t, step->q0, step->p0, step->parameters, v, step->scratch);
   if (status == OK)
     start_on_line(v, step->p0, data->z);
   return status;
