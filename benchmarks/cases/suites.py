@@ -3,11 +3,13 @@
     sciml:henon-heiles, :quadrupole-boson, :pendulum     SciMLBenchmarks.jl, DynamicalODE
     sciml:pleiades, :three-body                          SciMLBenchmarks.jl, NonStiffODE
     heyoka:restricted, :three-bodies                     heyoka, benchmark/pcr3bp.cpp and ss_3bp.cpp
+    heyoka:mascons                                       the equations of heyoka, benchmark/mascon_models.hpp
 
 The formulas are written here anew. Each has one initial state. The span of SciML's Henon-Heiles
 (100 to 50,000) is the shortest; those of its quadrupole boson and of heyoka's restricted problem (100 to 20,000; 2000)
 are shortened, because their motions are chaotic.
-The end of heyoka's three bodies is its published state of quadruple precision.
+The end of heyoka's three bodies is its published state of quadruple precision. The shape of the mascons is synthetic,
+two spheres in contact, where heyoka has tables of measured asteroids; their number, rotation and orbit are chosen here.
 """
 
 import math
@@ -107,14 +109,52 @@ def _pleiades() -> Case:
     return _case(planar_gravitation, {"system": system, "span": data["span"], **states}, bodies=bodies)
 
 
-def _rotating(q: Array, momenta: Any) -> Any:
-    """Return velocities from momenta in a rotating frame: p = v + (-y, x)."""
-    return momenta - np.stack([-q[:, 1], q[:, 0]], axis=1).astype(np.longdouble)
+def _rotating(q: Array, momenta: Any, rate: float = 1.0) -> Any:
+    """Return velocities from momenta in a frame that rotates about z: p = v + rate (-y, x, 0)."""
+    across = [-q[:, 1], q[:, 0], *(0 * z for z in q.T[2:])]
+    return momenta - np.longdouble(rate) * np.stack(across, axis=1).astype(np.longdouble)
 
 
 def _restricted(name: str) -> Case:
     made = _case(restricted, {**SUITES[name], "system": SUITES["restricted"]["system"] | SUITES[name]["values"]})
     return replace(made, velocity_of=partial(_rotating, made.q))
+
+
+def mascon_points() -> Array:
+    """Return equal point masses on golden spirals of two spheres in contact, about their centre of mass."""
+    lobes = []
+    for sphere in SUITES["mascons"]["lobes"]:
+        k = np.arange(sphere["points"])
+        z, angle = 1.0 - (2.0 * k + 1.0) / len(k), math.pi * (3.0 - math.sqrt(5.0)) * k
+        across = np.sqrt(1.0 - z * z)
+        directions = np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)
+        lobes.append([sphere["x"], 0.0, 0.0] + sphere["radius"] * directions)
+    points = np.concatenate(lobes)
+    return points - points.mean(axis=0)
+
+
+def mascons(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:
+    """Return the accelerations about the point masses, in the frame that rotates with them about z."""
+    result: list[Any] = [of["w"] ** 2 * q[0] + 2 * of["w"] * v[1], of["w"] ** 2 * q[1] - 2 * of["w"] * v[0], 0.0]
+    for point in mascon_points().tolist():
+        d = [x - a for x, a in zip(q, point, strict=True)]
+        pull = of["mu"] * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]) ** -1.5
+        result = [a - pull * x for a, x in zip(result, d, strict=True)]
+    return result
+
+
+def _mascons() -> Case:
+    """Return a satellite of an irregular body, whose field is that of point masses."""
+    data, points = SUITES["mascons"], mascon_points().tolist()
+    potential = [f"mu/sqrt((x - ({a!r}))**2 + (y - ({b!r}))**2 + (z - ({c!r}))**2)" for a, b, c in points]
+    system = {
+        "name": "mascons",
+        "coordinates": ["x", "y", "z"],
+        "lagrangian": "((x_dot - w*y)**2 + (y_dot + w*x)**2 + z_dot**2)/2 + " + " + ".join(potential),
+        "parameters": {"mu": 1.0 / len(points), "w": data["rate"]},
+    }
+    made = _case(mascons, {**data, "system": system})
+    return replace(made, velocity_of=partial(_rotating, made.q, rate=data["rate"]))
 
 
 def _three_bodies() -> Case:
@@ -141,6 +181,7 @@ SUITE_CASES: Mapping[str, Callable[[], Case]] = {
     "sciml:three-body": partial(_restricted, "three-body"),
     "heyoka:restricted": partial(_restricted, "pcr3bp"),
     "heyoka:three-bodies": _three_bodies,
+    "heyoka:mascons": _mascons,
 }
 """Functions that build a case, by the name of its section."""
 SUITE_ENDS = {"heyoka:three-bodies": _three_bodies_end}

@@ -317,7 +317,10 @@ def _robot(drawn: DrawnSystem) -> MovingShape:
             tips.append(len(points))
             points.append(program.point(origin + 2 * turn * Matrix(link.center)))
         marks += [{"kind": "link", "points": [i, end], "color": i} for end in children or tips[-1:]]
-    return MovingShape(dimension=3, points=points, program=program.entries, marks=marks, trails=tips, movable=tips)
+    base = 0 if links[0].kind == "free" and all(each.parent >= 0 for each in links[1:]) else None
+    return MovingShape(
+        dimension=3, points=points, program=program.entries, marks=marks, trails=tips, movable=tips, followed=base
+    )
 
 
 def _placed(link: Any, joints: Mapping[str, Any], members: Mapping[str, Any]) -> tuple[Matrix, Matrix]:

@@ -57,6 +57,7 @@ class MovingShape:
         marks: kind and points of each mark, and where it has them name, mass (a number or parameter) and color.
         trails: points whose paths are drawn.
         movable: points that can be dragged.
+        followed: point that the view of a page follows, of what moves freely in space.
         labels: of the axes, if the points are no positions in space.
         equal: use one scale for all axes.
         angles: coordinates of period 2 pi.
@@ -72,6 +73,7 @@ class MovingShape:
     marks: Sequence[Mapping[str, Any]] = ()
     trails: Sequence[int] = ()
     movable: Sequence[int] = ()
+    followed: int | None = None
     labels: Sequence[str] = ()
     equal: bool = True
     angles: Sequence[int] = ()

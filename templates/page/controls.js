@@ -52,7 +52,7 @@ function addSlider(title, label, name, { low, high, log = false, hard = true, ge
     if (document.activeElement !== range) range.value = at;
     range.style.setProperty("--at", `${100 * at}%`);
     range.setAttribute("aria-valuetext", short(x));
-    if (document.activeElement !== number) number.value = Math.abs(x) < 1e-15 * Math.max(Math.abs(low), Math.abs(high)) ? 0 : [4, 3].map((digits) => +x.toPrecision(digits)).find((shown, k) => k || String(shown).length < 8);
+    if (document.activeElement !== number) number.value = Math.abs(x) < 1e-15 * Math.max(Math.abs(low), Math.abs(high)) ? 0 : [4, 3].map((digits) => compact(x, digits)).find((shown, k) => k || shown.length < 8);
   };
   const changed = (x) => { put(x); showSliders(); writeAddress(); };
   range.addEventListener("input", () => { const s = +range.value; changed(clamped(+(log ? low * (high / low) ** s : low + (high - low) * s).toPrecision(4), low, high)); });
@@ -100,7 +100,7 @@ function addRotation({ name, columns, rates }) {
     if (Math.abs(w * a + x * b + y * c + z * d) < 1 - 1e-12) chosen = [Math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)), Math.asin(clamped(2 * (w * y - z * x), -1, 1)), Math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))];
     return chosen;
   };
-  const title = turned.length > 1 ? `Rotation ${name}` : "Initial values";
+  const title = turned.length > 1 ? `Rotation ${spelled(name)}` : "Initial values";
   ["x", "y", "z"].forEach((letter, axis) => addSlider(title, `angle ${letter}`, `Angle of ${name} about ${letter}`, {
     low: axis === 1 ? -Math.PI / 2 : -Math.PI, high: axis === 1 ? Math.PI / 2 : Math.PI, get: () => angles()[axis],
     set: (x) => {

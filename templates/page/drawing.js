@@ -41,15 +41,16 @@ const constant = (k) => shape.points[k].every((each) => each >= START && !shape.
 // ---- views
 /** Returns a view of the plane, or of space from a camera that orbits: to(point) gives pixels and the depth. */
 const view = {
-  turn: 0.7, tilt: 0.32, zoom: 1, centre: [0, 0, 0], reach: 1, fresh: true,
-  /** Moves towards the box of what is drawn, at once when a motion begins. */
-  follow([low, high], width, height) {
+  turn: 0.7, tilt: 0.32, zoom: 1, centre: [0, 0, 0], middle: [0, 0, 0], reach: 1, fresh: true,
+  /** Moves towards the box of what is drawn about an origin, at once when a motion begins. */
+  follow([low, high], width, height, origin = [0, 0, 0]) {
     const margin = flat ? 0.86 : 0.8, middle = low.map((x, k) => (x + high[k]) / 2), half = high.map((x, k) => (x - low[k]) / 2);
     this.fitting = [width, height].map((size, k) => (0.43 * size) / (half[k] || 1));
     const wanted = flat ? Math.max(half[0] * Math.min(1, height / width), half[1] * Math.min(1, width / height)) : Math.hypot(...half) * 0.85;
     const target = (wanted || 1) / margin, share = this.fresh ? 1 : 0.12;
     this.reach += (target - this.reach) * share;
-    this.centre = middle.map((x, k) => (this.centre[k] ?? 0) + (x - (this.centre[k] ?? 0)) * (shape.equal ? share : 1));
+    this.middle = middle.map((x, k) => (this.middle[k] ?? 0) + (x - (this.middle[k] ?? 0)) * (shape.equal ? share : 1));
+    this.centre = this.middle.map((x, k) => x + origin[k]);
     this.fresh = false;
     this.width = width; this.height = height;
     this.scale = (Math.min(width, height) / 2 / this.reach) * this.zoom;
@@ -159,9 +160,12 @@ function lighting([a, b, c, d]) {
 
 // ---- the drawing of points, lines and bodies
 const marked = () => {
-  let low, high, first; // the box of all points seen
+  let low, high, first; // the box of all points seen, from the one that the view follows
+  const origin = (points) => (shape.followed === undefined ? [0, 0, 0] : points[shape.followed]);
   const grown = (points) => {
-    for (const point of points) point.forEach((x, k) => {
+    const from = origin(points);
+    for (const point of points) point.forEach((there, k) => {
+      const x = there - from[k];
       if (!Number.isFinite(x)) return;
       const limit = first ? 3 * (first[1][k] - first[0][k] || 1) : Infinity; // an escaping body leaves the drawing
       low[k] = Math.min(low[k], Math.max(x, first ? first[0][k] - limit : x)); high[k] = Math.max(high[k], Math.min(x, first ? first[1][k] + limit : x));
@@ -188,9 +192,9 @@ const marked = () => {
     draw(pen, q, p, t, width, height) {
       const points = pointsOf(q, p, t);
       grown(points);
-      view.follow([low, high], width, height);
+      view.follow([low, high], width, height, origin(points));
       const at = points.map((point) => view.to(point)), parts = [], add = (depth, paint) => parts.push([depth, paint]);
-      if (!flat) this.ground(pen);
+      if (!flat) this.ground(pen, ...[low, high].map((corner) => corner.map((x, k) => x + origin(points)[k])));
       if (shape.labels.length) this.axes(pen, width, height);
       const sign = backward() ? -1 : 1;
       shape.trails.forEach((which, k) => {
@@ -243,7 +247,7 @@ const marked = () => {
       text(spelled(shape.labels[0]), width - 12, height - 6, "right", "bottom"); text(spelled(shape.labels[1]), 12, 32, "left", "top");
     },
     /** Draws what shows the directions of space: a sphere about one solid, or else a floor. */
-    ground(pen) {
+    ground(pen, low, high) {
       if (shape.box.length === 3) {
         const corner = (k) => view.to(shape.box.map((register, axis) => ((k >> axis) & 1) * registers[register]));
         for (let k = 0; k < 8; k++) for (let axis = 0; axis < 3; axis++) if (!((k >> axis) & 1)) line(pen, [corner(k), corner(k | (1 << axis))], colors.edge, 1);
@@ -398,8 +402,10 @@ function ticks(low, high, wanted) {
   for (let k = Math.ceil(low / step); k * step <= high && result.length < 20; k++) result.push(k * step);
   return result;
 }
-/** Returns a number as text of few characters. */
-function short(x, digits = 3) {
-  if (x === 0 || !Number.isFinite(x)) return String(x);
-  return String(+x.toPrecision(digits)).replace("-", "\u2212").replace("e-", "e\u2212").replace("e+", "e");
+/** Returns a number as text of few characters, which can be read again. */
+function compact(x, digits = 3) {
+  const rounded = +x.toPrecision(digits);
+  return Math.abs(x) < 1e-3 && x ? rounded.toExponential() : String(rounded);
 }
+/** Returns a number as text of few characters, to be read by people. */
+const short = (x, digits = 3) => compact(x, digits).replace("-", "\u2212").replace("e-", "e\u2212").replace("e+", "e");

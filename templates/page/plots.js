@@ -74,9 +74,10 @@ if (about.energy) addPanel(about.energy.conserved ? "Relative energy error" : ab
   plot(canvas, rows.map((row) => row[0]), ys, colors.c2, { symmetric: about.energy.conserved });
   output.textContent = short(ys.at(-1), 2);
 });
-about.quantities.forEach((name, k) => addPanel(`${name[0].toUpperCase()}${name.slice(1)}, change`, ({ canvas, output }) => {
-  plot(canvas, rows.map((row) => row[0]), rows.map((row) => row[2 + k] - quantities0[k]), colors.c3, { symmetric: true });
-  output.textContent = short(rows.at(-1)[2 + k], 4);
+about.quantities.forEach((name, k) => addPanel(`Change of ${name.replace(/\w+_\w+/g, spelled)}`, ({ canvas, output }) => {
+  const ys = rows.map((row) => row[2 + k] - quantities0[k]);
+  plot(canvas, rows.map((row) => row[0]), ys, colors.c3, { symmetric: true });
+  output.textContent = short(ys.at(-1), 2);
 }));
 
 /** Returns the context of a canvas, cleared, in CSS pixels. */

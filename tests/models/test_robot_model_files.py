@@ -7,7 +7,10 @@ import pytest
 
 import scvi_codegen as sc
 from scvi_codegen.errors import ModelFileError
+from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.models.model_files.model_file import document_in, dump_model, load_model, model_texts, parse_model
+from scvi_codegen.models.model_files.page_section import drawn_system_of_model
+from scvi_codegen.pictures.recognition import shape_of
 
 ROBOTS = Path(__file__).parents[1] / "mechanics" / "robots"
 BALL = '[system]\nrobot = "ball.xml"\n'
@@ -19,16 +22,18 @@ def test_a_robot_file_is_a_model_at_rest_in_its_reference_configuration():
     assert model.system.links
     assert model.q == (0.0, 1.0, 0.0, 0.0, 0.0)
     assert not any(model.velocity)
-    assert (model.span, model.tolerance, model.h) == (10.0, 1e-9, None)
-    assert load_model(ROBOTS / "ball.xml", {"run": {"step": 0.01}}).tolerance is None
+    assert (model.method, model.span, model.h) == (SVI(3), 10.0, 0.005)
+    assert load_model(ROBOTS / "ball.xml", {"run": {"tolerance": 1e-9}}).h is None
 
 
 def test_a_free_body_starts_in_the_pose_of_the_file(tmp_path):
     body = '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/><freejoint name="f"/>'
     text = f'<mujoco><worldbody><body pos="1 2 3" euler="0 0 90">{body}</body></worldbody></mujoco>'
     (tmp_path / "free.xml").write_text(text, encoding="utf-8")
-    q = load_model(tmp_path / "free.xml").q
-    assert q == pytest.approx([1, 2, 3, np.sqrt(0.5), 0, 0, np.sqrt(0.5)])
+    model = load_model(tmp_path / "free.xml")
+    assert model.q == pytest.approx([1, 2, 3, np.sqrt(0.5), 0, 0, np.sqrt(0.5)])
+    seen = {each: shape_of(drawn_system_of_model(each)).followed for each in (model, load_model(ROBOTS / "ball.xml"))}
+    assert list(seen.values()) == [0, None]  # the view of a page follows a free base
 
 
 def test_a_table_by_name_changes_a_part_of_the_state_and_a_list_all_of_it():

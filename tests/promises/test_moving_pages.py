@@ -222,6 +222,12 @@ def test_a_number_out_of_range_is_replaced_and_explained(view, pages):
     assert view.evaluate("page.state().settings.parameters.v") == 0.95
 
 
+def test_small_numbers_fit_their_fields(view, pages):
+    opened(view, pages["figure_eight"], "#.step=0.0000437&.n=0")
+    assert view.input_value("input[aria-label='Step size, value']") == "4.37e-5"
+    assert view.evaluate("[...document.querySelectorAll('input')].every((x) => x.scrollWidth <= x.clientWidth)")
+
+
 def matrix_of(quaternion: np.ndarray) -> np.ndarray:
     """Return the rotation of a quaternion of any length."""
     w, v = quaternion[0], quaternion[1:]

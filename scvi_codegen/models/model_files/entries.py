@@ -11,7 +11,8 @@ import numpy as np
 from scvi_codegen.errors import ModelFileError
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.models.model import DEFAULT_METHOD, Model
+from scvi_codegen.methods.galerkin import SVI
+from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.document import motion_of
 from scvi_codegen.models.model_files.sections import Document, Section, check_keys, in_section, text_of
 from scvi_codegen.models.options import STATE
@@ -24,8 +25,8 @@ URDF_KEYS = ("floating", "gravity")
 URDF = ".urdf"
 ROBOT_FILES = (URDF, ".xml", ".mjcf")
 """Suffixes of robots' files, which are models by themselves."""
-SPAN, TOLERANCE = 10.0, 1e-9
-"""Span and tolerance of adaptive steps of a robot without ``[run]``."""
+METHOD, STEP, SPAN = SVI(3), 0.005, 10.0
+"""Method, step size and span of a robot without ``[method]`` and ``[run]``."""
 
 
 class Entry(NamedTuple):
@@ -82,7 +83,6 @@ def _robot(section: Section, folder: Path) -> Entry:
         text_of(section, "name", "[system]")
     read: Any = LagrangianSystem.from_urdf if urdf else LagrangianSystem.from_mjcf
     system = in_section("[system] robot", lambda: read(path, **arguments))
-    method = DEFAULT_METHOD if not system.constraints else type(DEFAULT_METHOD)(6)
     q: dict[str, Any] = {}
     rates: dict[str, Any] = {}
     for link in system.links:
@@ -99,7 +99,7 @@ def _robot(section: Section, folder: Path) -> Entry:
             q[link.name], rates[link.name] = link.zero, 0.0
     motion = {
         "initial": {"q": q, "q_dot": rates},
-        "method": method.specification(),
-        "run": {"span": SPAN, "tolerance": TOLERANCE},
+        "method": METHOD.specification(),
+        "run": {"span": SPAN, "step": STEP},
     }
     return Entry(system, motion)
