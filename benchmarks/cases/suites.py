@@ -129,8 +129,9 @@ def mascon_points() -> Array:
         across = np.sqrt(1.0 - z * z)
         directions = np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)
         lobes.append([sphere["x"], 0.0, 0.0] + sphere["radius"] * directions)
-    points = np.concatenate(lobes)
-    return points - points.mean(axis=0)
+    points: Array = np.concatenate(lobes)
+    points -= points.mean(axis=0)
+    return points
 
 
 def mascons(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:

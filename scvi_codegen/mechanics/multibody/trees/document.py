@@ -196,5 +196,8 @@ def root_of(path: Path, *tags: str) -> Element:
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise SystemDefinitionError(f"{path} is not XML: {error}") from error
     if node.tag not in tags:
-        raise SystemDefinitionError(f"{path} begins with <{node.tag}>, not with <{tags[0]}>")
+        other = {"robot": ": it is a URDF file, NAME.urdf", "mujoco": ": it is an MJCF file, NAME.xml"}.get(
+            node.tag, ""
+        )
+        raise SystemDefinitionError(f"{path} begins with <{node.tag}>, not with <{tags[0]}>{other}")
     return Element(str(path), node)
