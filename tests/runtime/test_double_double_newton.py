@@ -163,3 +163,8 @@ def test_initial_states() -> None:
     assert (again.mp("q")[0] == q.mp()).all()
     assert (again.mp("p")[0] == p.mp()).all()
     assert np.abs(again.constraint_values()).max() < 1e-30
+    many = stepper.integrate_ensemble([q, [0.6, -0.8]], velocity=[stepper.velocity(q, p), [0.8, 0.6]], h=0.1, steps=1)
+    assert np.abs(many[1].constraint_values()).max() < 1e-30
+    many = stepper.integrate_ensemble([q, q], [p, p], h=0.1, steps=1)
+    assert (many.q[-1] == again.q[-1]).all()
+    assert (many.q.low[-1] == again.q.low[-1]).all()

@@ -105,7 +105,11 @@ def consistent(
 
 def make_consistent(stepper: Integrator, q: Array, p: Array, t: float, parameters: Array) -> None:
     """Replace (k, m) states by those of :func:`consistent`, each with its own parameters."""
-    q[0], p[0] = consistent(stepper, q[0], p[0], t, parameters[0])
+    of_two_words = stepper.interface.words > 1  # one by one
+    for k in range(len(q) if of_two_words else 1):
+        q[k], p[k] = consistent(stepper, q[k], p[k], t, parameters[k], check_rank=k == 0)
+    if of_two_words:
+        return
     q1, p1, apart = np.empty_like(q), np.empty_like(p), np.empty((len(q), 2))
     stepper.binding.of_each("project", t, parameters, q, p, q1, p1, apart)
     moved = apart.max(axis=1)

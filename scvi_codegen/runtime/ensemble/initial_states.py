@@ -64,7 +64,8 @@ def start_of_ensemble(
     positions, momenta = checked_ensemble(stepper, q, p)
     values = parameters_of_each(stepper, parameters, len(positions))
     if stepper.interface.constraints:
-        positions, momenta = (np.ascontiguousarray(each) for each in (positions, momenta))
+        if stepper.interface.words == 1:
+            positions, momenta = (np.ascontiguousarray(each) for each in (positions, momenta))
         make_consistent(stepper, positions, momenta, t, values)
     return positions, momenta, values
 
