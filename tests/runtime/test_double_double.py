@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mpmath import mp
+from oracle import stepper_of
+from samples import GENERIC, sample_named
 
 import scvi_codegen as sc
 from scvi_codegen.errors import MethodError, StateError
@@ -166,6 +168,59 @@ def test_step(name: str, stages: int, h: float) -> None:
             for part, values in zip("qp", exact, strict=True):
                 worst = max(abs(x - y) for x, y in zip(run.mp(part)[k + 1], values, strict=True))
                 assert worst <= 2e-30 * max(map(abs, values))
+
+
+METHODS = (
+    sc.SVI(4),
+    sc.SVI(3, "gauss-lobatto:4"),
+    sc.SCVI(3),
+    sc.SpectralCollocation(2),
+    sc.Gauss(3),
+    sc.RadauIIA(2),
+    sc.LobattoIIIA(4),
+)
+CASES = [*((name, METHODS[0]) for name in GENERIC), *(("henon-heiles", method) for method in METHODS[1:])]
+
+
+@pytest.mark.second
+@pytest.mark.parametrize(("name", "method"), CASES)
+def test_step_of_samples(name: str, method: sc.methods.Method) -> None:
+    """One step of each sample system that is accepted agrees with the oracle in 60 digits to 2e-30."""
+    sample = sample_named(name)
+    try:
+        stepper = sc.compile_stepper(sample.system, method, precision="double-double")
+    except MethodError:
+        assert name not in ("harmonic-oscillator", "planar-pendulum", "driven-duffing", "kepler", "three-bodies")
+        return
+    small = Fraction(1, 3 * 10**17)
+    q, v = ([Fraction(x) + small * (k + 1) for k, x in enumerate(each)] for each in GENERIC[name])
+    run = stepper.integrate(q, velocity=v, h=0.0625, steps=1, t=0.5)
+    with mp.workdps(60):
+        step, arguments = stepper_of(method.specification())
+        exact = step(sample.mechanics, mp.mpf(0.5), run.mp("q")[0], run.mp("p")[0], mp.mpf(0.0625), **arguments)
+        for part, values in zip("qp", exact, strict=True):
+            assert max(abs(run.mp(part)[1] - values)) <= 2e-30 * max(map(abs, values)), part
+
+
+@pytest.mark.second
+def test_near_zeros(tmp_path: Path) -> None:
+    """Near zeros sin, cos and tan of x have the relative error 1e-31 + 1e-47 |x / f(x)|."""
+    flint = pytest.importorskip("flint")
+    flint.ctx.prec, arb = 400, flint.arb
+    library, half = compiled_functions(tmp_path), arb.pi() / 2
+    multiples = np.unique(np.exp(np.random.default_rng(3).uniform(0.0, np.log(6e8), 100)).astype(int))
+    for least in (0.0, 1.0):  # x is near a zero to one and to two words
+        high = np.array([float(half * int(k)) for k in multiples])
+        low = np.array([float(half * int(k) - arb(x)) * least for k, x in zip(multiples, high, strict=True)])
+        x, found = np.concatenate([high, low]), np.empty(2 * len(high))
+        for f in ("sin", "cos", "tan"):
+            getattr(library, f"number_{f}")(
+                len(high), *(each.ctypes.data_as(ctypes.c_void_p) for each in (x, x, found))
+            )
+            for a, b, c, d in zip(high, low, *found.reshape(2, -1), strict=True):
+                exact, value = getattr(arb(a) + b, f)(), arb(c) + d
+                if abs(exact) < 1e3:
+                    assert abs(value - exact) <= 1e-31 * abs(exact) + 1e-47 * a
 
 
 def test_conserved_quantities() -> None:

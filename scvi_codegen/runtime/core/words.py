@@ -78,11 +78,34 @@ def by_name(values: Array, shapes: Iterable[tuple[Key, tuple[int, ...]]]) -> dic
     return arrays
 
 
+class Word(np.float64):
+    """High word of a double-double number; ``low`` is the low word. Differences are computed with both."""
+
+    low: float = 0.0
+
+    def mp(self) -> Any:
+        """Return the number as an mpmath number of 40 digits."""
+        return as_mpmath(self)
+
+    def __sub__(self, other: Any) -> Any:
+        return NotImplemented if isinstance(other, np.ndarray) else float(self) - other + (self.low - low_words(other))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return word, (float(self), self.low)
+
+
+def word(high: float, low: float) -> Word:
+    """Return a double-double number."""
+    result = Word(high)
+    result.low = float(low)
+    return result
+
+
 class Words(NamedState):
     """High words of double-double numbers; ``low`` has the low words.
 
-    Rows, slices, copies and concatenations keep both words, and differences are computed with both; other arithmetic
-    uses the high words alone and returns ordinary arrays.
+    Entries (``Word``), rows, slices, copies and concatenations keep both words, and differences are computed with both;
+    other arithmetic uses the high words alone and returns ordinary arrays.
     """
 
     _low: Array | None = None
@@ -103,8 +126,8 @@ class Words(NamedState):
         return as_mpmath(self)
 
     def __getitem__(self, key: Any) -> Any:
-        high = super().__getitem__(key)
-        return with_low(high, NamedState.__getitem__(_named_as(self.low, self), key)) if np.ndim(high) else high
+        high, low = super().__getitem__(key), NamedState.__getitem__(_named_as(self.low, self), key)
+        return with_low(high, low) if isinstance(high, np.ndarray) else word(high, low)
 
     def __setitem__(self, key: Any, value: Any) -> None:
         low = self.low
@@ -151,7 +174,9 @@ def with_low(high: Any, low: Array, shapes: Any = None) -> Any:
 
 def low_words(values: Any) -> Array:
     """Return the low words of numbers, 0 of doubles."""
-    return values.low if isinstance(values, Words) else np.zeros(np.shape(values))
+    if isinstance(values, list | tuple):
+        return np.array([*map(low_words, values)])
+    return np.asarray(values.low) if isinstance(values, Words | Word) else np.zeros(np.shape(values))
 
 
 def stacked(rows: Sequence[Any]) -> Array:
@@ -192,7 +217,7 @@ def as_mpmath(values: Any) -> Any:
 
     with mp.workdps(DIGITS):
         return np.frompyfunc(lambda a, b: mp.mpf(float(a)) + mp.mpf(float(b)), 2, 1)(
-            np.asarray(values), low_words(values)
+            np.asarray(values, dtype=float), low_words(values)
         )
 
 
@@ -212,7 +237,7 @@ def two_words(value: Any, name: str) -> tuple[float, float]:
     """
     if type(value) is float and np.isfinite(value):
         return value, 0.0
-    if isinstance(value, ExactNumber) and np.isfinite(value):
+    if isinstance(value, ExactNumber | Word) and np.isfinite(value):
         return float(value), value.low
     from mpmath import mp
 

@@ -3,10 +3,13 @@
 /* Step in double-double arithmetic by mixed precision. separable_iteration.h solves the stage equations in double, to
  * 1e-16; their residual in pairs, r = q0 + h c v0 + h^2 A F(X) / m - X, has 16 digits as one word, so that the
  * correction D = r + h^2 A F_q(X) D / m, solved in double by fixed-point iteration, makes X accurate to 32 digits. Two
- * evaluations of the forces in pairs are enough: those of the residual and those at X + D. Requires: the kernels
+ * evaluations of the forces in pairs are enough: those of the residual and those at X + D. What the linear equation
+ * omits, e = F(X + D) - F(X) - F_q D, is quadratic in D: a bias of 1e-32, from which the energy would drift. It changes
+ * the points by D' = h^2 A (e + F_q D') / m, in double, and the forces by F_q D'. Requires: the kernels
  * force_lanes_pairs, mass_pairs, point_derivatives and derivative_product. */
 
 #define CORRECTED 1e-34 /* last change of D, relative to the state */
+#define CORRECTED_BIAS 0.05 /* last change of D', relative to itself */
 #define CORRECTED_ROUNDING 1e-14 /* changes relative to the residual that may be rounding errors */
 #define MOST_CORRECTIONS 200
 
@@ -16,6 +19,7 @@ typedef struct {
   double scale[M], inverse_size[M]; /* scale: h^2 / m */
   const double *parameters;
   ddl X[GROUPS][M], F[GROUPS][M], base[GROUPS][M]; /* base: points without forces */
+  ddl first[GROUPS][M]; /* forces at X */
   lanes rest[GROUPS][M], vector[GROUPS][M + POINT_DERIVATIVES]; /* vector: D, then the derivatives */
 } pair_step;
 
@@ -131,22 +135,29 @@ static inline void find_residual(pair_step *w)
     }
 }
 
-/* Solves for the correction D, which starts as the residual. */
-static inline int find_correction(pair_step *w)
+static inline void find_derivatives(pair_step *w)
 {
-  double last = INFINITY, size = 0.0; /* size of the residual */
   for (int n = 0; n < GROUPS; n++) {
     lanes X[M];
-    for (int i = 0; i < M; i++) {
+    for (int i = 0; i < M; i++)
       X[i] = w->X[n][i].high;
+    point_derivatives(X, w->t.high + w->h.high * ABSCISSA[n], w->parameters, w->vector[n] + M);
+  }
+}
+
+/* Solves for the correction D, which starts as the residual, to a part of it or to CORRECTED; f: F_q D. */
+static inline int find_correction(pair_step *w, double part, lanes (*f)[M])
+{
+  double last = INFINITY, size = 0.0; /* size of the residual */
+  for (int n = 0; n < GROUPS; n++)
+    for (int i = 0; i < M; i++) {
       w->vector[n][i] = w->rest[n][i];
       for (int j = 0; j < LANES; j++)
         size = larger(size, fabs(lane_of(&w->rest[n][i], j)) * w->inverse_size[i]);
     }
-    point_derivatives(X, w->t.high + w->h.high * ABSCISSA[n], w->parameters, w->vector[n] + M);
-  }
+  const double least = larger(part * size, CORRECTED);
   for (int k = 0; k < MOST_CORRECTIONS; k++) {
-    lanes f[GROUPS][M], moved[GROUPS] = {{0.0}};
+    lanes moved[GROUPS] = {{0.0}};
     for (int n = 0; n < GROUPS; n++)
       derivative_product(w->vector[n], lanes_of(w->t.high), w->parameters, f[n]);
     for (int i = 0; i < M; i++)
@@ -159,7 +170,7 @@ static inline int find_correction(pair_step *w)
     const double change = sqrt(points_total(moved)) / 1e15, rate = change / last;
     if (!is_finite(change))
       return NOT_FINITE;
-    if (change <= CORRECTED || (k > 0 && rate < 0.5 && change * rate <= CORRECTED))
+    if (change <= least || (k > 0 && rate < 0.5 && change * rate <= least))
       return OK;
     /* rounding errors of D, which stop the decrease; they matter in the 32nd digit of the state at most */
     if (rate > 0.25 && change <= larger(CORRECTED_ROUNDING * size, CORRECTED))
@@ -169,23 +180,43 @@ static inline int find_correction(pair_step *w)
   return NOT_CONVERGED;
 }
 
+/* Moves the points by D, of the products f, and finds the forces there and the effect of what is quadratic in D. */
+static inline int correct_points(pair_step *w, lanes (*f)[M])
+{
+  memcpy(w->first, w->F, sizeof w->F);
+  for (int n = 0; n < GROUPS; n++)
+    for (int i = 0; i < M; i++)
+      w->X[n][i] = ddl_two_sum(w->X[n][i].high, w->vector[n][i]);
+  forces_of_pairs(w);
+  for (int n = 0; n < GROUPS; n++)
+    for (int i = 0; i < M; i++)
+      f[n][i] = ddl_subtract(w->F[n][i], w->first[n][i]).high - f[n][i];
+  for (int n = 0; n < GROUPS; n++)
+    for (int i = 0; i < M; i++)
+      w->rest[n][i] = w->scale[i] * apply(PRODUCT, n, f, i);
+  const int status = find_correction(w, CORRECTED_BIAS, f);
+  for (int n = 0; n < GROUPS; n++)
+    for (int i = 0; i < M; i++)
+      w->F[n][i] = ddl_add(w->F[n][i], ddl_word(f[n][i]));
+  return status;
+}
+
 /* Replaces the increments of a step, solved in double, by those in two words. On failure they are undefined. */
 HOT int refine_increments(const step_data *step, double *memory, double t_low, double h_low, double *dq, double *dp,
     double *workspace)
 {
   pair_step w;
+  lanes f[GROUPS][M];
   int status;
   (void)memory, (void)workspace;
   begin_pairs(&w, step, t_low, h_low);
   forces_of_pairs(&w);
   find_residual(&w);
-  status = find_correction(&w);
+  find_derivatives(&w);
+  status = find_correction(&w, 0.0, f);
+  status = status == OK ? correct_points(&w, f) : status;
   if (status != OK)
     return status;
-  for (int n = 0; n < GROUPS; n++)
-    for (int i = 0; i < M; i++)
-      w.X[n][i] = ddl_two_sum(w.X[n][i].high, w.vector[n][i]);
-  forces_of_pairs(&w);
   for (int i = 0; i < M; i++) {
     const dd unit = dd_multiply(w.square, w.inverse_mass[i]);
     const dd end = dd_multiply(weighted_total(POINT_END_POSITION, POINT_END_POSITION_LOW, w.F, i), unit);
