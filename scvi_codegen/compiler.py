@@ -14,7 +14,7 @@ key of a system defined by text (:mod:`scvi_codegen.mechanics.system`), neither 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache, cached_property, partial
@@ -103,29 +103,21 @@ def compile_stepper(
         MethodError: if the method, the solver or another argument is not available for the system.
     """
     check_precision(precision, flags)
+    common: dict[str, Any] = {
+        "solver": solver,
+        "flags": flags,
+        "prefix": prefix,
+        "symmetries": symmetries,
+        "sizes": sizes,
+        "time_transformation": time_transformation,
+        "controller": controller,
+        "tables": tables,
+    }
+    compiled = partial(compile_stepper, system, method, **common)
     if precision == AUTO:
         if sizes is None and hasattr(system, "REQUIRES_SIZES"):
             raise MethodError(f"precision='auto' is not available with arrays of run-time sizes: {SIZES_REQUIRED}")
-        common: dict[str, Any] = {
-            "solver": solver,
-            "flags": flags,
-            "prefix": prefix,
-            "symmetries": symmetries,
-            "sizes": sizes,
-            "time_transformation": time_transformation,
-            "controller": controller,
-            "tables": tables,
-        }
-        stepper = compile_stepper(system, method, events=events, **common)
-
-        @cache
-        def in_double_double() -> Stepper | None:
-            with suppress(MethodError):  # of this system or method
-                return compile_stepper(system, method, precision=DOUBLE_DOUBLE, **common)
-            return None
-
-        stepper._precise = in_double_double
-        return stepper
+        return _in_both_precisions(compiled, events)
     if symmetries != ():
         from scvi_codegen.mechanics.symmetry.symmetry import SYMMETRIES
 
@@ -142,10 +134,8 @@ def compile_stepper(
         if symmetries:
             raise MethodError(f"symmetries= is unavailable for '{system.name}': {SIZES_REQUIRED}")
         chosen, method = method, as_method(method)
-    if precision == DOUBLE_DOUBLE and (events is not None or not known_sizes):
-        of_arrays = "arrays of run-time sizes: pass sizes={..}"
-        what = of_arrays if events is None else "events=: find them in the results"
-        raise MethodError(f"precision='double-double' is not available with {what}")
+    if precision == DOUBLE_DOUBLE and not known_sizes:
+        raise MethodError("precision='double-double' is not available with arrays of run-time sizes: pass sizes={..}")
     sources = CachedSources(system, method, solver, prefix, symmetries, time_transformation, controller, precision)
     variants = Variants(make=sources.variant, lacking=lambda name: name == "second_derivatives" and system.damping != 0)
     if not known_sizes:
@@ -166,7 +156,25 @@ def compile_stepper(
     source, interface = sources.integrator()
     interface = replace(interface, layout=replace(interface.layout, **drawn))
     cast(MechanicalSystem, system).store_key()
+    if precision == DOUBLE_DOUBLE:
+        stepper = Stepper(source, interface, variants=variants, flags=flags)
+        stepper._doubles = cache(compiled)
+        return stepper.with_events(as_events(events))
     return Stepper(source, interface, variants=variants, flags=flags, events=as_events(events))
+
+
+def _in_both_precisions(compiled: Callable[..., Stepper], events: EventLike | Sequence[EventLike] | None) -> Stepper:
+    """Return the stepper in double of precision="auto", with that in double-double if there is one."""
+
+    @cache
+    def in_double_double() -> Stepper | None:
+        with suppress(MethodError):  # of this system or method
+            return compiled(precision=DOUBLE_DOUBLE)
+        return None
+
+    stepper = compiled(events=events)
+    stepper._precise = in_double_double
+    return stepper
 
 
 def check_precision(precision: str, flags: Sequence[str]) -> None:

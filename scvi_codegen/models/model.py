@@ -366,7 +366,7 @@ class Model(TimeSpan):
             result = self.confirmed(stepper, options=options, threads=threads)
             h, tolerance = result.steps.get("h"), result.steps.get("tolerance")
             if result.precision != "double":
-                stepper = stepper.in_double_double or stepper
+                stepper = stepper._in_double_double or stepper
         elif h is None and self.has_time_transformation:
             from scvi_codegen.runtime.run.largest_step import largest_step  # imported here: not needed for reading
 

@@ -67,7 +67,6 @@ def test_final_state_is_exact_to_thirty_digits(spring: Path) -> None:
     [
         (["run", "--advise", "1e-9", "--span", "2"], "--advise 1e-09 is not available"),
         (["run", "--ensemble", "a.toml", "-o", "a.csv"], "-o a.csv (write a file NAME.npz) is not available"),
-        (["run", "--event", "q"], "events= is not available with precision='double-double'"),
         (["generate", "-o", "spring_svi"], "a generated program or FMU is not available"),
         (["generate", "--fmu", "-o", "spring.fmu"], "a generated program or FMU is not available"),
         (["verify"], "a certificate is not available"),

@@ -1,6 +1,8 @@
 """Double-double arithmetic: elementary functions, one step and conserved quantities against mpmath, refusals."""
 
 import ctypes
+import json
+import pickle
 import subprocess
 from fractions import Fraction
 from pathlib import Path
@@ -16,7 +18,7 @@ from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.native.building import TUNED_FLAGS
 from scvi_codegen.native.compilers import REORDERING_FLAGS
 from scvi_codegen.rendering.kernels.double_double import FUNCTIONS, arithmetic_headers
-from scvi_codegen.runtime.core.words import as_mpmath, two_words
+from scvi_codegen.runtime.core.words import as_mpmath, split, two_words, with_low
 
 KEPLER = "m*(x_dot**2 + y_dot**2)/2 + mu/sqrt(x**2 + y**2)"
 ROOTS = ("sqrt", "inverse_root_1", "inverse_root_3", "inverse_root_5", "inverse_root_7")
@@ -349,7 +351,7 @@ def test_refusals() -> None:
             sc.compile_stepper(kepler, "svi:4", precision="double-double", flags=("-O2", flag))
     with pytest.raises(MethodError, match="unknown precision 'quad'"):
         sc.compile_stepper(kepler, "svi:4", precision="quad")
-    refused = {"time_transformation": "distance", "events": "x"}
+    refused = {"time_transformation": "distance"}
     for name, value in refused.items():
         with pytest.raises(MethodError, match="precision='double-double' is not available"):
             sc.compile_stepper(kepler, "svi:4", precision="double-double", **{name: value})
@@ -367,7 +369,7 @@ def test_refusals() -> None:
     with pytest.raises(StateError, match="no parameter 'mass'"):
         stepper.integrate([1.0, 0.0], **start, steps=3, parameters={"mass": 1.0})
     for call, word in (
-        (lambda: stepper.integrate([1.0, 0.0], **start, steps=3, events="x"), "events="),
+        (lambda: stepper.integrate([1.0, 0.0], **start, steps=3, check_growth=True), "check_growth=True"),
         (lambda: stepper.integrate_ensemble([[1.0, 0.0]], [[0.0, 1.0]], h=0.1, steps=3, device="cuda"), "device="),
         (lambda: stepper.integrate([1.0, 0.0], **start, steps=3).action(), "action"),
         (lambda: stepper.discrete_lagrangian([1.0, 0.0], [1.0, 0.1], 0.1), "discrete_lagrangian"),
@@ -425,6 +427,50 @@ def test_runs() -> None:
             [0.5, 0.0], velocity=[0.0, 3.0**0.5], h=0.07, steps=85
         )
         assert np.abs(fixed[:86].sensitivity().state - double.sensitivity().state).max() < 1e-9
+
+
+def test_events() -> None:
+    """Times and states of crossings have two words: y = 0 at multiples of pi, x = 0 at a known anomaly."""
+    stepper = sc.compile_stepper(system("kepler"), "svi:12", precision="double-double")
+    with mp.workdps(50):
+        start = {"q": ["0.5", "0"], "velocity": ["0", mp.sqrt(3)]}
+        quarter = mp.pi / 3 - mp.sin(mp.pi / 3) / 2
+        for steps in ({"h": 0.0625, "steps": 110}, {"t_end": 7.0}, {"h": 0.0625, "t_end": 6.9, "save_every": 7}):
+            run = stepper.integrate(**start, **steps, events=["y", "x_dot*x - x*x_dot + x"])
+            times = run.events[0].t.mp()
+            assert max(abs(t - (k + 1) * mp.pi) for k, t in enumerate(times)) < 1e-29
+            assert len(times) == 2
+            assert abs(run.events[1].t[0].mp() - quarter) < 1e-30
+            assert abs(run.events[1].q[0, 0].mp()) < 1e-30
+        ended = stepper.integrate(**start, h=0.0625, steps=200, events=sc.Event("y", direction=-1, terminal=True))
+        assert abs(ended.t[-1].mp() - mp.pi) < 1e-30
+        assert abs(ended.q[-1, 0].mp() + 1.5) < 1e-30
+        assert abs(ended.crossings("x")[0].t[0].mp() - quarter) < 1e-30
+        with_event = stepper.with_events("x")
+        halves = with_event.start(**start, h=0.0625)
+        first = halves.record(5)
+        again = with_event.from_checkpoint(halves.checkpoint()).record(10)
+        assert len(first.events[0]) == 0
+        assert abs(again.events[0].t[0].mp() - quarter) < 1e-30
+    with pytest.raises(MethodError, match="events that change the state"):
+        stepper.integrate(**start, h=0.0625, steps=3, events=sc.impact("x"))
+
+
+def test_entries() -> None:
+    """Entries of arrays keep low words, in differences, as initial values and in pickles."""
+    x = with_low(np.array([1.0, 1.0, 2.0]), np.array([1e-20, 3e-20, 5e-20]))
+    assert (x - x[0])[:2].tolist() == [0.0, 3e-20 - 1e-20]
+    assert x[1] - x[0] == 3e-20 - 1e-20
+    assert x[1] - 1.0 == 3e-20
+    assert [each.low for each in x] == [1e-20, 3e-20, 5e-20]
+    assert two_words(x[2], "q") == (2.0, 5e-20)
+    assert (split([x[0], x[2]], "q")[1] == [1e-20, 5e-20]).all()
+    assert pickle.loads(pickle.dumps(x[1])).low == 3e-20
+    assert f"{x[1]:g} {json.dumps(x[1])}" == "1 1.0"
+    assert isinstance(x[1] + 1.0, float)
+    assert not hasattr(x[1] + 1.0, "low")
+    with mp.workdps(40):
+        assert x[1].mp() == mp.mpf(1) + mp.mpf(3e-20)
 
 
 def test_ensembles(tmp_path: Path) -> None:

@@ -133,6 +133,8 @@ class CompiledMethod(ChosenBySizes):
 
     def _load(self) -> None:
         interface, events = self.interface if self.origin is None else self.origin.interface, self.events
+        if interface.words > 1:
+            events = ()  # located by the integrator in double
         if events and (known := self._variants._made.get(events)) is not None:
             self.source = known
         elif events:
@@ -395,8 +397,11 @@ class CompiledMethod(ChosenBySizes):
         wanted = as_events(events)
         if wanted == self.events:
             return self
-        if wanted and self.interface.words > 1:
-            require(self, "events")
+        if self.interface.words > 1 and any(event.changes_state for event in wanted):
+            raise MethodError(
+                "events that change the state (then=, restitution=) are not available with precision='double-double': "
+                "make them terminal and restart, or use precision='double'"
+            )
         if wanted not in self._event_variants:
             while len(self._event_variants) >= MOST_EVENT_SETS:
                 self._event_variants.pop(next(iter(self._event_variants)), None)

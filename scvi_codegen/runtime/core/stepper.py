@@ -35,6 +35,7 @@ from scvi_codegen.runtime.ensemble.ensemble import Ensemble
 from scvi_codegen.runtime.ensemble.initial_states import EnsembleParameters, momenta_of_each
 from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
 from scvi_codegen.runtime.events.event import Event, EventLike
+from scvi_codegen.runtime.events.refinement import WithEventsInDouble
 from scvi_codegen.runtime.inputs.segments import InputSegments, checked_inputs, final_time
 from scvi_codegen.runtime.paths.path import ArrayOrFunction, Path, find_path
 from scvi_codegen.runtime.rotations.states import homogeneous_state, is_one_state
@@ -64,12 +65,17 @@ from scvi_codegen.validation import checked_count, checks_arguments, of
 Called = TypeVar("Called", bound=Callable[..., Any])
 
 
-class Stepper(Integrator):
+class Stepper(WithEventsInDouble, Integrator):
     """Compiled integrator of one system: :class:`Integrator` with integrations, runs, ensembles and projections."""
 
     _trajectory_type = Trajectory
     _precise: Callable[[], Stepper | None] | None = None
     """Function that returns the stepper in double-double if there is one, for ``error=`` with precision="auto"."""
+
+    def _copy(self, events: tuple[Event, ...], source: Source | None = None) -> Self:
+        copy = super()._copy(events, source)
+        copy._precise, copy._doubles = self._precise, self._doubles
+        return copy
 
     def __reduce__(self) -> tuple[Any, ...]:
         if self.origin is not None:
@@ -236,18 +242,16 @@ class Stepper(Integrator):
         arguments = error, run, again, checked_number(t, "the time t"), step_of_tau if has_tau else None
         trajectory = confirmed_run(*arguments, words=self.interface.words)
         assert trajectory.confirmation is not None  # by confirmed_run
-        if not (trajectory.confirmation.confirmed or has_tau) and (precise := self.in_double_double) is not None:
+        if not (trajectory.confirmation.confirmed or has_tau) and (precise := self._in_double_double) is not None:
             return precise._confirmed(error, q, p, start, saved)
         warn_of_unconfirmed_run(trajectory)
         return trajectory
 
     @property
-    def in_double_double(self) -> Stepper | None:
+    def _in_double_double(self) -> Stepper | None:
         """The stepper in double-double of one with precision="auto"; ``None`` if there is none with its events."""
-        precise = None if self._precise is None else self._precise()
-        if precise is None or not self.events or precise.supports("events"):
-            return precise and precise.with_events(self.events)
-        return None
+        precise = None if self._precise is None or self.changes_states else self._precise()
+        return precise and precise.with_events(self.events)
 
     @property
     def _has_tau(self) -> bool:

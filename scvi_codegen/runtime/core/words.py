@@ -182,7 +182,7 @@ def low_words(values: Any) -> Array:
 def stacked(rows: Sequence[Any]) -> Array:
     """Return numbers or vectors as one array, with both words if they have two."""
     high: Array = np.array(rows)
-    return with_low(high, np.array([*map(low_words, rows)])) if isinstance(rows[0], Words) else high
+    return with_low(high, low_words([*rows])) if isinstance(rows[0], Words | Word) else high
 
 
 def missing(shape: tuple[int, ...], words: int) -> Array:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.errors import EventError, EventWarning, StateError, warn
+from scvi_codegen.errors import EventError, EventWarning, warn
 from scvi_codegen.native.options import step_failure
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.events.event import (
@@ -179,22 +178,3 @@ class CrossingSearch:
             values.setdefault("element", np.zeros(len(unknown), np.int64))
             crossings.append(Crossings(event=event, **values))
         return tuple(crossings)
-
-
-def crossings_of(stepper: Integrator, states: SavedStates) -> tuple[Crossings, ...]:
-    """Return the crossings of the stepper's events along a trajectory with all states saved; no event is terminal.
-
-    Raises:
-        StateError: if intermediate states were not saved.
-        EventError, StepFailedError: as :meth:`CrossingSearch.search`.
-    """
-    lengths, spans, tolerance = states.step_sizes.copy(), np.diff(states.stepped), states.grid_tolerance[:-1]
-    short = np.abs(spans) < np.abs(lengths[:-1]) - tolerance
-    if short[:-1].any() or not (np.abs(spans) <= np.abs(lengths[:-1]) + tolerance).all():
-        raise StateError(
-            "events require all states, but this trajectory has save_every > 1 or t_eval: integrate with save_every=1"
-        )
-    lengths[:-1][short] = spans[short]  # an event ended the last step
-    search = CrossingSearch(stepper, terminal=False)
-    search.search(replace(states, step_sizes=lengths))
-    return search.crossings()

@@ -275,7 +275,7 @@ class Memory:
         high = np.array([self.t])
         return high if self.stepper.interface.words == 1 else with_low(high, np.array([self._memory.t_low]))
 
-    def _step_to(self, end: float) -> None:
+    def _step_to(self, end: float | Fraction) -> None:
         """Let the next step, in double-double arithmetic, end at a time: its size has two words as well."""
         exact = Fraction(end) - Fraction(self.t) - Fraction(self._memory.t_low)
         self._memory.h = float(exact)
@@ -396,9 +396,11 @@ class Memory:
     @alone
     def rollback(self, saved: bytes) -> None:
         """Restore the state of :attr:`snapshot`; raise ``StateError`` for bytes of another length."""
-        binding = self.stepper.binding
+        binding, stepper = self.stepper.binding, cast(Any, self.stepper)
         buffer = binding.buffer(self._memory)
-        watch = binding.new("watch *") if self.stepper.events and len(saved) > len(buffer) else None
+        watch = None
+        if stepper.events and len(saved) > len(buffer):
+            watch = (binding if stepper.interface.words == 1 else stepper._in_double.binding).new("watch *")
         size = len(buffer) + (0 if watch is None else len(binding.buffer(watch)))
         if len(saved) != size:
             raise StateError(f"invalid saved run: it has {len(saved)} bytes, those of this stepper have {size}")

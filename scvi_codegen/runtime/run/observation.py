@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen.errors import EventError, StateError, StepFailedError, closest
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.runtime.core.validation import Array
-from scvi_codegen.runtime.core.words import Words
-from scvi_codegen.runtime.events.detection import CrossingSearch
+from scvi_codegen.runtime.core.words import Words, stacked
+from scvi_codegen.runtime.events.refinement import search_of
 from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.run_loop import record, trajectory_of
@@ -271,7 +271,7 @@ class Observation:
 
     def __init__(self, run: Memory, saver: Saver) -> None:
         self.run, self.saver = run, saver
-        self.search = CrossingSearch(run.stepper, None if run.ended else run._watch) if run.stepper.events else None
+        self.search = search_of(run.stepper, None if run.ended else run._watch) if run.stepper.events else None
         run._watch = self.search and self.search.watch
         plan = run.plan
         self.end = plan.t_end if plan.fixed and math.isfinite(plan.t_end) else None
@@ -407,7 +407,7 @@ class Observation:
     ) -> Trajectory:
         """Return a chunk with one more state within a step appended."""
         made = self._made(
-            np.append(part.t, t),
+            np.concatenate([part.t, stacked([t])]),
             np.concatenate([part.q, q[None]]),
             np.concatenate([part.p, p[None]]),
             np.append(part.iterations, np.int32(0)),

@@ -13,6 +13,7 @@ One state takes 0.65 microseconds there, four times as long as a step of the run
 """
 
 from dataclasses import replace
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -115,10 +116,14 @@ def _take_partial_steps(states: SavedStates, t: Array, h: Array, q: Array, p: Ar
     return iterations
 
 
-def stepped_to(states: SavedStates | Memory, q: Array, p: Array, t: Array, end: float) -> tuple[Array, Array]:
+def stepped_to(
+    states: SavedStates | Memory, q: Array, p: Array, t: Array, end: float | Fraction
+) -> tuple[Array, Array]:
     """Return the state after one step from (1,) time t of two words to ``end``, whose size has two words as well."""
     settings: dict[str, Any] = {"parameters": states.parameters, "options": states.options}
-    run = Memory.started(states.stepper, q, p, plan=StepPlan(h=end - t[0]), t=float(t[0]), **settings)
+    run = Memory.started(
+        states.stepper, q, p, plan=StepPlan(h=float(end - Fraction(float(t[0])))), t=float(t[0]), **settings
+    )
     run._memory.t_low = low_words(t)[0]
     run._step_to(end)
     run.advance(1)

@@ -23,8 +23,8 @@ from scvi_codegen.runtime.constraints.projection import constraint_values, multi
 from scvi_codegen.runtime.core.features import refusal, require
 from scvi_codegen.runtime.core.validation import columns_of_inputs
 from scvi_codegen.runtime.core.words import Words, as_mpmath, check_keeps_words, low_words, missing
-from scvi_codegen.runtime.events.detection import crossings_of
 from scvi_codegen.runtime.events.event import Crossings, Event, EventLike, as_events
+from scvi_codegen.runtime.events.refinement import crossings_of
 from scvi_codegen.runtime.paths.actions import actions_until, compensated_sums, shadow_energy
 from scvi_codegen.runtime.rotations.attitude_history import AttitudeHistory
 from scvi_codegen.runtime.rotations.quantities import named_quantities

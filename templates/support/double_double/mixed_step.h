@@ -10,7 +10,7 @@
 
 #define CORRECTED 1e-34 /* last change of D, relative to the state */
 #define CORRECTED_BIAS 0.05 /* last change of D', relative to itself */
-#define CORRECTED_ROUNDING 1e-14 /* changes relative to the residual that may be rounding errors */
+#define CORRECTED_ROUNDING 1e-15 /* changes relative to the residual that may be rounding errors; ten times these are */
 #define MOST_CORRECTIONS 200
 
 /* Arguments of a step, and its points. */
@@ -173,7 +173,7 @@ static inline int find_correction(pair_step *w, double part, lanes (*f)[M])
     if (change <= least || (k > 0 && rate < 0.5 && change * rate <= least))
       return OK;
     /* rounding errors of D, which stop the decrease; they matter in the 32nd digit of the state at most */
-    if (rate > 0.25 && change <= larger(CORRECTED_ROUNDING * size, CORRECTED))
+    if (rate > 0.5 && change <= larger(CORRECTED_ROUNDING * size * (rate > 0.9 ? 10.0 : 1.0), least))
       return OK;
     last = change;
   }
@@ -181,7 +181,7 @@ static inline int find_correction(pair_step *w, double part, lanes (*f)[M])
 }
 
 /* Moves the points by D, of the products f, and finds the forces there and the effect of what is quadratic in D. */
-static inline int correct_points(pair_step *w, lanes (*f)[M])
+static inline int correct_forces(pair_step *w, lanes (*f)[M])
 {
   memcpy(w->first, w->F, sizeof w->F);
   for (int n = 0; n < GROUPS; n++)
@@ -214,7 +214,7 @@ HOT int refine_increments(const step_data *step, double *memory, double t_low, d
   find_residual(&w);
   find_derivatives(&w);
   status = find_correction(&w, 0.0, f);
-  status = status == OK ? correct_points(&w, f) : status;
+  status = status == OK ? correct_forces(&w, f) : status;
   if (status != OK)
     return status;
   for (int i = 0; i < M; i++) {
