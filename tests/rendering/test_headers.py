@@ -76,6 +76,7 @@ def sources() -> tuple[Source, ...]:
         (LagrangianSystem.from_text("sums", ["q[N]"], sums, parameters={"c[N]": 1.0}), SVI(1)),
         (LagrangianSystem.from_text("pair", ["q[N]"], pair, neighbours=near), SVI(1)),
         (LagrangianSystem.from_mjcf(robot), SVI(2)),
+        (problem("fput-chain:8").system, SVI(8)),
     ]
     made += [kepler.integrator()[0], *(Sources(system, method).integrator()[0] for system, method in pairs)]
     drift = LagrangianSystem.from_text("drift", ["x", "y"], "x**3*y_dot - x**2 - y**2")

@@ -140,18 +140,18 @@ def _in_two_words(name: str, argument: Any, trajectories: int | None) -> Input:
         t, kind = data.breakpoints, argument[2] if len(argument) == 3 else "linear"
         if kind == "cubic":
             return data
-        rest = _constant(t, low) if kind == "constant" else np.array([low[..., :-1], _slopes(t, high, low)[1]])
+        rest = _constant(t, low) if kind == "constant" else np.array([low[..., :-1], _rates_of_lines(t, high, low)[1]])
     else:
         return input_of(name, argument, trajectories)
     return replace(data, pieces=with_low(data.pieces, _from_pieces(name, t, rest, trajectories).pieces * NO_TIME))
 
 
-def _slopes(t: Array, high: Array, low: Array) -> tuple[Array, Array]:
-    """Return the slopes of lines between values of two words, in two words."""
+def _rates_of_lines(t: Array, high: Array, low: Array) -> tuple[Array, Array]:
+    """Return the rates of lines between values of two words, in two words."""
     (rise, rest), (run, run_low) = (_differences(np.asarray(each)) for each in (high, t))
-    slopes = rise / run
-    product, cut = exact_product(slopes, run)
-    return slopes, ((rise - product) - cut + (rest + np.diff(low)) - slopes * run_low) / run
+    rates = rise / run
+    product, cut = exact_product(rates, run)
+    return rates, ((rise - product) - cut + (rest + np.diff(low)) - rates * run_low) / run
 
 
 def _differences(x: Array) -> tuple[Array, Array]:

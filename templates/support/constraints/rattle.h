@@ -406,9 +406,9 @@ static void begin(const step_data *step, const real *memory, rattle_step *now)
     memcpy(now->f[i], &f, sizeof f);
     IN_MEMORY(now->f[i]);
 #ifdef VELOCITY_FORCES
-    const lanes bent = load(RATTLE_VELOCITY_START) * v +
+    const lanes change = load(RATTLE_VELOCITY_START) * v +
         step->h * now->inverse_mass[i] * times(RATTLE_VELOCITY_LOW, DEGREE, now->f[i]);
-    now->base_v[i] = v + bent;
+    now->base_v[i] = v + change;
 #endif
     low += step->h * step->h * now->inverse_mass[i] * times(RATTLE_RESPONSE_LOW, DEGREE, now->f[i]);
     x = step->q0[i] + (step->carry_q[i] + x);

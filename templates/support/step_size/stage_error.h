@@ -4,15 +4,15 @@
 /* Error estimate of a step by Newton's method from the leading coefficient of its curve, as in curve_error.h. Requires:
  * stages.h, the tables STAGE_HIGHEST, STAGE_NEXT, STAGE_CURVATURE and STAGE_OTHER_CURVATURE; STAGE_POWER. */
 
-#define CURVE_NOISE (SITES > M ? 16 * REAL_EPSILON : 0) /* constraints are satisfied to rounding, however short the
-                                                         * step */
-
 /* Returns the estimate from the unknowns z of the stages, or `least` if that is larger. */
 static real stage_error(const step_data *step, const real *z, const real *dq, real share, real decay, real least)
 {
-  real largest = 0;
-  for (int i = 0; i < M; i++)
+  real largest = 0, fastest = 0;
+  for (int i = 0; i < M; i++) {
     largest = larger(largest, MATH(fabs)(step->q0[i]) + MATH(fabs)(dq[i]));
+    fastest = larger(fastest, MATH(fabs)(dq[i]));
+  }
+  const real rounded = SITES > M ? largest : fastest; /* constraints are satisfied to rounding, however short the step */
   for (int i = 0; i < M; i++) {
     const real unit = step->h / (MATH(fabs)(step->q0[i]) + MATH(fabs)(dq[i]) + share * largest + REAL_MIN);
     real top = 0, next = 0, curvature = 0, other = 0, noise = 0;
@@ -23,8 +23,10 @@ static real stage_error(const step_data *step, const real *z, const real *dq, re
       curvature += STAGE_CURVATURE[b] * z[i * B + b];
       other += STAGE_OTHER_CURVATURE[b] * z[i * B + b];
     }
-    top = larger(MATH(fabs)(top), decay * MATH(fabs)(next));
-    top = larger(top - noise * largest / MATH(fabs)(step->h), 0) * unit;
+    top = MATH(fabs)(top);
+    top = top > VANISHING * MATH(fabs)(next) ? larger(top, decay * MATH(fabs)(next)) : top;
+    noise *= rounded / MATH(fabs)(step->h);
+    top = top < noise ? 0 : SITES > M ? (top - noise) * unit : top * unit;
     curvature = MATH(fabs)(unit) * (MATH(fabs)(curvature) + MATH(fabs)(other)) + NEGLIGIBLE;
     if (top * top > least * curvature)
       least = top * top / curvature;
