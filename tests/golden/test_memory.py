@@ -42,6 +42,11 @@ EXACT = """
 """Arrays of a run in allocations of their own, so that each access outside of one is detected."""
 
 
+def sanitizers_exist(folder: Path) -> bool:
+    (folder / "empty.c").write_text("int main(void)\n{\n  return 0;\n}\n")
+    return not subprocess.run([*SANITIZED, "empty.c", "-o", "empty"], cwd=folder, capture_output=True).returncode
+
+
 @pytest.mark.sampled(5)
 @pytest.mark.parametrize(
     "name", [*FEW_UNKNOWNS, *(name if name in QUICK else pytest.param(name, marks=pytest.mark.full) for name in CELLS)]
@@ -53,8 +58,9 @@ def test_runs_read_and_write_only_their_own_memory(name: str, tmp_path: Path) ->
         (tmp_path / path).write_text(text)
     command = [*SANITIZED, "-fno-sanitize-recover=all", f"{made.prefix}.c", "main.c", "-lm", "-o", "main"]
     built = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    if built.returncode:
+    if built.returncode and not sanitizers_exist(tmp_path):
         pytest.skip(f"no sanitizers: {built.stderr[-200:]}")
+    assert built.returncode == 0, built.stderr[-1000:]
     options = os.environ | {"ASAN_OPTIONS": "detect_leaks=0"}
     done = subprocess.run([str(tmp_path / "main")], capture_output=True, text=True, check=False, env=options)
     assert done.returncode == 0, done.stderr[:1000]

@@ -107,8 +107,10 @@ def ensemble_driver(
     for (int k = 0; k < WIDTH; k++) {{
       double q0[] = {{{numbers(q)}}}, p0[] = {{{numbers(p)}}};
       for (int i = 0; i < {m}; i++)
-        q0[i] *= 1 + 0.001 * k, p0[i] *= 1 - 0.002 * k;
-      CALL(set)(&block, k, q0, p0, p0, parameters);
+        block.q[i][k] = q0[i] * (1 + 0.001 * k), block.p[i][k] = p0[i] * (1 - 0.002 * k);
+      for (int i = 0; i < {len(parameters)}; i++)
+        block.parameters[i][k] = parameters[i];
+      block.active[k] = 1.0;
     }}
     CALL(advance)(&block, WIDTH, {steps}, {max(1, steps // 3)}, NULL, q, p, {4 * m});"""
     return (
