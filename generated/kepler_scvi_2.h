@@ -58,7 +58,7 @@ typedef struct {
   double q[2], p[2];
   double carry_q[2], carry_p[2];
   double memory[14];
-  long long guess; /* what memory contains of the previous steps; 0: nothing; < 0: the iteration failed (suspension.h) */
+  long long guess; /* what memory contains of the previous steps; 0: nothing; < 0: the iteration failed */
   long long fallback_steps; /* steps that the iteration did not solve, but its fallback */
   long long iterations; /* since the last stored state */
   double error, error_t; /* largest error estimate of a step so far, and the time of that step */

@@ -59,7 +59,7 @@ typedef struct {
   double q[1], p[1];
   double carry_q[1], carry_p[1];
   double memory[1];
-  long long guess; /* what memory contains of the previous steps; 0: nothing; < 0: the iteration failed (suspension.h) */
+  long long guess; /* what memory contains of the previous steps; 0: nothing; < 0: the iteration failed */
   long long fallback_steps; /* steps that the iteration did not solve, but its fallback */
   long long iterations; /* since the last stored state */
   double error, error_t; /* largest error estimate of a step so far, and the time of that step */

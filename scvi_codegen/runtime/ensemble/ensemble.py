@@ -468,19 +468,18 @@ class Ensemble:
             confirmations=tuple(self.confirmations),
             parameters=self.parameters,
             stepper=self.stepper,
-            spans=tuple(span for j in range(len(self)) for span in self._spans(j, t if times is None else times[:, j])),
+            spans=tuple(self._spans(t, times)) if self.inputs else (),
         )
 
-    def _spans(self, j: int, t: Array) -> Iterator[Span]:
-        """Yield the rows of trajectory j, of states at t, in each piece of the inputs and their parameters."""
-        if not self.inputs:
-            return
-        plan = self.plans[j].t_end
-        forward = -1.0 if plan < self.t0 else 1.0
-        ends = breakpoints_until(self.t0, plan, self.inputs) or [plan]
-        last = np.searchsorted(forward * t[np.isfinite(t)], forward * np.array(ends), side="right").tolist()
-        for (start, end), (first, until) in zip(pairwise([self.t0, *ends]), pairwise([0, *last]), strict=True):
-            yield slice(first, until), slice(j, j + 1), partial(self.values_at, (start + end) / 2)
+    def _spans(self, t: Array, times: Array | None) -> Iterator[Span]:
+        """Yield the rows of each trajectory, of states at t or its own times, in each piece of its inputs."""
+        for j, plan in enumerate(self.plans):
+            at, end_of_run = t if times is None else times[:, j], plan.t_end
+            forward = -1.0 if end_of_run < self.t0 else 1.0
+            ends = breakpoints_until(self.t0, end_of_run, self.inputs) or [end_of_run]
+            last = np.searchsorted(forward * at[np.isfinite(at)], forward * np.array(ends), side="right").tolist()
+            for (start, end), (first, until) in zip(pairwise([self.t0, *ends]), pairwise([0, *last]), strict=True):
+                yield slice(first, until), slice(j, j + 1), partial(self.values_at, (start + end) / 2)
 
     def _unfinished(self, j: int) -> SavedLane:
         first = slice(0, 1 if self.t_eval is None else 0)

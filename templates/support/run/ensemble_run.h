@@ -276,7 +276,8 @@ long long NAME(call_each)(NAME(each) *c, long long steps)
       for (int j = 0; j < LANES; j++)
         block->parameters[i][j] = c->parameters[(c->next + (j < count ? j : count - 1)) * P + i];
     const long long every = c->segment_every[c->segment], begun = block->step;
-    const long long size = steps - taken < c->left ? steps - taken : c->left, place = c->rows * c->trajectories + c->next;
+    const long long size = steps - taken < c->left ? steps - taken : c->left;
+    const long long place = c->rows * c->trajectories + c->next;
 #ifdef RUN_ACTION
     block->actions = c->actions ? c->actions + place : NULL;
 #endif

@@ -12,7 +12,7 @@ static real stage_error(const step_data *step, const real *z, const real *dq, re
     largest = larger(largest, MATH(fabs)(step->q0[i]) + MATH(fabs)(dq[i]));
     fastest = larger(fastest, MATH(fabs)(dq[i]));
   }
-  const real rounded = SITES > M ? largest : fastest; /* constraints are satisfied to rounding, however short the step */
+  const real rounded = SITES > M ? largest : fastest; /* constraints hold to rounding, however short the step */
   for (int i = 0; i < M; i++) {
     const real unit = step->h / (MATH(fabs)(step->q0[i]) + MATH(fabs)(dq[i]) + share * largest + REAL_MIN);
     real top = 0, next = 0, curvature = 0, other = 0, noise = 0;
