@@ -46,7 +46,7 @@ int NAME(advance_to)(run_memory *run, real t_end, real tolerance, long long step
       status = confirm_step(run, &now, options, report);
     if (status == OK)
       status = refine_increments(&now.step, run->memory, now.at.t_low, rest_of_last(&now), now.dq, now.dp,
-          SOLVER_WORKSPACE(&now.step));
+          now.step.scratch + SCRATCH);
     if (status != OK) {
       run->guess = 0;
       save_state(&now.at, run);
