@@ -285,13 +285,14 @@ def scvi_abscissae(system: Mechanics, t: Any, q0: Any, p0: Any, h: Any, *, stage
 
 
 def generated_map(discrete_lagrangian: Callable[[Any, Any], Any], q0: Any, p0: Any, guess: Any) -> State:
-    """(5): q1 from p0 = -D1 L_d(q0, q1), then p1 = D2 L_d(q0, q1)."""
+    """(5): q1 from p0 = -D1 L_d(q0, q1), then p1 = D2 L_d(q0, q1), to two thirds of the digits of mpmath."""
+    width = mp.nstr(mp.mpf(10) ** -(mp.dps // 3))
 
     def mismatch(end: np.ndarray) -> np.ndarray:
-        return p0 + central(lambda start: discrete_lagrangian(start, end), q0, "1e-12")
+        return p0 + central(lambda start: discrete_lagrangian(start, end), q0, width)
 
-    q1 = newton(mismatch, guess, digits=20, width="1e-9")
-    return q1, central(lambda end: discrete_lagrangian(q0, end), q1, "1e-12")
+    q1 = newton(mismatch, guess, digits=max(20, mp.dps // 2), width="1e-9")
+    return q1, central(lambda end: discrete_lagrangian(q0, end), q1, width)
 
 
 def scvi_printed(system: Mechanics, t: Any, q0: Any, p0: Any, h: Any, *, nodes: Any, c: Any, w: Any) -> State:
