@@ -292,6 +292,13 @@ long long NAME(call_each)(NAME(each) *c, long long steps)
       block->h = c->segment_h[c->segment];
       c->entered = c->pauses;
     }
+    int going = 0;
+    for (int j = 0; j < count; j++)
+      going |= block->active[j] != 0.0;
+    if (!going) { /* all failed: nothing is left to do */
+      c->segment = c->segments;
+      c->entered = 0;
+    }
 #ifdef OBSERVED
     for (int i = 0; i < 5 * OBSERVED; i++)
       memcpy(c->observed + i * c->trajectories + c->next, block->observed[i / OBSERVED][i % OBSERVED],
