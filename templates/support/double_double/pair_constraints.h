@@ -5,7 +5,8 @@
  * the same matrices by residuals in pairs. Requires: constraints.h, pair_states.h, the kernels constraints_pairs (g,
  * then the derivatives), constrained_motion_pairs and legendre_pairs (with the mass matrix). */
 
-enum { PAIR_CORRECTIONS = 4, MOST_PAIR_CORRECTIONS = 16 };
+enum { PAIR_CORRECTIONS = 4,
+  MOST_PAIR_CORRECTIONS = 16 };
 #define SETTLED_PAIRS 1e-31 /* relative to the state: update after which there is no further one */
 
 static double largest_high(const dd *x)
@@ -86,7 +87,7 @@ int NAME(project)(double t, const double *q0, const double *p0, const double *pa
   memset(sum, 0, sizeof sum);
   size = INFINITY;
   for (int k = 0; status == OK && k < MOST_PAIR_CORRECTIONS && (k < 2 || size > SETTLED_PAIRS * largest_of(high + M));
-       k++) {
+      k++) {
     load_pairs(p0, p);
     constraints_pairs(q, now, parameters, values);
     for (int e = 0; e < CONSTRAINT_ENTRIES; e++)

@@ -103,6 +103,7 @@ static int solve(const step_data *step, const solver_data *way, real *memory, lo
   report->fallback_steps += falls_back;
   memcpy(memory, data->z, sizeof(real) * N);
   memcpy(memory + N, data->point, sizeof(real) * POINT);
-  *guess = falls_back ? after_fallback(*guess) : POINT > 0 && keep ? 2 : 1;
+  *guess = falls_back ? after_fallback(*guess) : POINT > 0 && keep ? 2
+                                                                   : 1;
   return status;
 }

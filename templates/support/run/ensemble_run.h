@@ -243,7 +243,7 @@ void NAME(observe)(block_memory *block, int lane, long long count, const double 
 #endif
 
 /* Puts the next trajectories into the lanes; surplus lanes repeat the last one and are inactive. */
-static void begin_block(NAME(each) *c, int count)
+static void begin_block(NAME(each) * c, int count)
 {
   block_memory *block = c->block;
   NAME(start)(block, c->t, c->segment_h[0]);
@@ -261,7 +261,7 @@ static void begin_block(NAME(each) *c, int count)
   c->entered = c->pauses;
 }
 
-long long NAME(call_each)(NAME(each) *c, long long steps)
+long long NAME(call_each)(NAME(each) * c, long long steps)
 {
   block_memory *block = c->block;
   long long taken = 0, failed = 0;
@@ -306,7 +306,8 @@ long long NAME(call_each)(NAME(each) *c, long long steps)
 #endif
     for (int j = 0; j < count; j++) {
       c->done[c->next + j] = block->last_step[j];
-      c->status[c->next + j] = block->active[j] == 0.0 ? STATUS(FAILED) : c->segment == c->segments ? STATUS(OK) : -1;
+      c->status[c->next + j] = block->active[j] == 0.0 ? STATUS(FAILED) : c->segment == c->segments ? STATUS(OK)
+                                                                                                    : -1;
     }
     if (c->segment == c->segments) {
       for (int j = 0; j < count; j++)

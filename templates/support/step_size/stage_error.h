@@ -26,7 +26,8 @@ static real stage_error(const step_data *step, const real *z, const real *dq, re
     top = MATH(fabs)(top);
     top = top > VANISHING * MATH(fabs)(next) ? larger(top, decay * MATH(fabs)(next)) : top;
     noise *= rounded / MATH(fabs)(step->h);
-    top = top < noise ? 0 : SITES > M ? (top - noise) * unit : top * unit;
+    top = top < noise ? 0 : SITES > M ? (top - noise) * unit
+                                      : top * unit;
     curvature = MATH(fabs)(unit) * (MATH(fabs)(curvature) + MATH(fabs)(other)) + NEGLIGIBLE;
     if (top * top > least * curvature)
       least = top * top / curvature;
