@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from scvi_codegen.runtime.trajectory.saved_states import Array, SavedStates
 
 DIFFERENCE, LARGEST_CHANGE = 2.0**-20, 2.0**-27
-"""Difference of times for the first slope, and largest change of the time of a crossing, relative to the step."""
+"""Difference of times for the first derivative, and largest change of the time of a crossing, relative to the step."""
 
 
 class RefinedCrossing(NamedTuple):

@@ -147,7 +147,7 @@ def _in_two_words(name: str, argument: Any, trajectories: int | None) -> Input:
 
 
 def _rates_of_lines(t: Array, high: Array, low: Array) -> tuple[Array, Array]:
-    """Return the rates of lines between values of two words, in two words."""
+    """Return the time derivatives of linear pieces between values of two words, in two words."""
     (rise, rest), (run, run_low) = (_differences(np.asarray(each)) for each in (high, t))
     rates = rise / run
     product, cut = exact_product(rates, run)
