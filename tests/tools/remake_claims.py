@@ -1,6 +1,6 @@
 """Write the page on claims, ``docs/claims.md``, from recorded measurements.
 
-python -m benchmarks planar-pendulum .. fput-chain:256 --peers heyoka -o report.json    (the sections of TITLES)
+python -m benchmarks planar-pendulum .. fput-chain:64 --peers heyoka -o report.json    (the sections of TITLES)
 python tests/tools/remake_claims.py report.json
 
 The record is what ``-o`` writes, with the key ``date``, without the single settings of each method. It is replaced as a
@@ -30,7 +30,6 @@ TITLES = {
     "relativistic-particle": "relativistic particle, T = 1000",
     "fput-chain:8": "FPUT chain of 8, T = 1000",
     "fput-chain:64": "FPUT chain of 64, T = 1000",
-    "fput-chain:256": "FPUT chain of 256, T = 1000",
 }
 """Rows of the table of ``docs/performance.md`` by section of the benchmark."""
 
@@ -97,7 +96,7 @@ and `python tests/tools/remake_claims.py report.json`.
     ]
     table = "\n".join(lines)
     versions, load = machine["versions"], float(machine["load"].split(",")[0])
-    busy = " (other programs ran)" if load > int(machine["cores"]) / 2 else ""
+    busy = " (other programs ran)" if load > 1 + int(machine["cores"]) / 4 else ""  # the benchmark itself loads one
     return f"""# What would change our mind: claims and how to check them
 
 <!-- index: falsifiable, reproducibility, evidence, check the numbers -->
