@@ -23,7 +23,17 @@ from typing import TYPE_CHECKING, overload
 
 import sympy
 
-from scvi_codegen.derivation.notation import LARGEST_SHOWN, Equation, TableEntry, entries, html, latex, text_lines
+from scvi_codegen.derivation.notation import (
+    LARGEST_DENOMINATOR,
+    LARGEST_SHOWN,
+    Equation,
+    TableEntry,
+    entries,
+    formula_text,
+    html,
+    latex,
+    text_lines,
+)
 from scvi_codegen.display.cards import card, listed, plain
 from scvi_codegen.formulas.expressions import jacobian
 from scvi_codegen.formulas.intermediates import inner_of, written_out
@@ -124,9 +134,9 @@ class StepEquations:
         yield from (each.description for each in (*self.system.rotations, *axial_turns(self.system)[1]))
         if in_moving_frame(self.system, self.method):
             yield from (MOVING_FRAME, FREE_ROTATION)
-        yield f"{'H' if self.system.auxiliaries else 'L'} = {format_expression(self.system.formula)}"
+        yield f"{'H' if self.system.auxiliaries else 'L'} = {formula_text(self.system.formula)}"
         for g in self.system.constraints:
-            yield f"0 = {format_expression(g)}"
+            yield f"0 = {formula_text(g)}"
         if isinstance(self.system, FirstOrderSystem):
             yield f"subtracted from L: d/dt of {format_expression(self.system.integrated)}"
             for momentum, theta in zip(p, self.system.one_form, strict=True):
@@ -353,7 +363,7 @@ class _Writer:
 def _rational(value: Number) -> sympy.Expr:
     """Return a coefficient of p_k or of the straight line: small dyadic numbers and node positions."""
     exact = sympy.nsimplify(sympy.Float(str(value), 30), rational=True, tolerance=sympy.Float("1e-25"))
-    return exact if exact.q < 10**6 else sympy.Float(str(value), 17)
+    return exact if exact.q <= LARGEST_DENOMINATOR else sympy.Float(str(value), 17)
 
 
 def _with_radicals(derived: StepEquations) -> StepEquations:

@@ -13,6 +13,7 @@ from scvi_codegen.display.mathml import latex_name, mathml_terms
 from scvi_codegen.errors import ExpressionError
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.symbols import TIME, symbol
+from scvi_codegen.formulas.translation import format_expression
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method
@@ -66,6 +67,22 @@ def square_free(root: sympy.Expr) -> sympy.Expr:
     return rest if coefficient.is_Rational else root
 
 
+LARGEST_DENOMINATOR = 10**6
+"""Largest denominator that is shown; other rational numbers, as those of robots, are shown in 17 digits."""
+
+
+def readable(expression: sympy.Expr) -> sympy.Expr:
+    """Return an expression for display, with decimals instead of rational numbers of large denominators."""
+    numbers = [number for number in expression.atoms(sympy.Rational) if number.q > LARGEST_DENOMINATOR]
+    return expression.xreplace({number: sympy.Float(number, 17) for number in numbers})
+
+
+def formula_text(expression: sympy.Expr) -> str:
+    """Return a formula in the grammar of model files, unless decimals replace numbers in it."""
+    shown = readable(expression)
+    return format_expression(expression) if shown == expression else str(shown)
+
+
 LARGEST_SHOWN = 400
 """Largest number of operations of an equation that a notebook shows."""
 
@@ -101,7 +118,7 @@ class Equation:
     residual: sympy.Expr
 
     def __str__(self) -> str:
-        return f"({self.number}) 0 = {self.residual}"
+        return f"({self.number}) 0 = {readable(self.residual)}"
 
 
 def text_lines(
@@ -111,7 +128,7 @@ def text_lines(
     yield "\nequations"
     yield from (f"  {equation}" for equation in equations)
     yield "\nend of the step"
-    yield from (f"  ({e.number}) {symbol.name[:-2]}_(k+1) = {e.residual}" for symbol, e in end.items())
+    yield from (f"  ({e.number}) {symbol.name[:-2]}_(k+1) = {readable(e.residual)}" for symbol, e in end.items())
     yield "\nfirst guess (q_dot_k: the velocity that belongs to p_k)"
     yield from (f"  {symbol} = {value}" for symbol, value in guess.items())
     if entries:
@@ -128,7 +145,7 @@ def latex(
     names = {symbol: latex_name(symbol.name) for symbol in symbols}
 
     def written(expression: sympy.Expr) -> str:
-        return str(sympy.latex(expression, symbol_names=names))
+        return str(sympy.latex(readable(expression), symbol_names=names))
 
     def exact(entry: TableEntry) -> str:
         return written(entry.exact) + " = " if entry.exact is not None else ""
@@ -148,7 +165,9 @@ def html(equation: Equation) -> Html:
     size = sympy.count_ops(equation.residual)
     if size > LARGEST_SHOWN:
         return Html(f"<div>{plain(f'({equation.number}) {size} operations')}</div>")
-    return Html(f"<div>{plain(f'({equation.number})')} {' '.join(mathml_terms(equation.residual, sympy.S.Zero))}</div>")
+    return Html(
+        f"<div>{plain(f'({equation.number})')} {' '.join(mathml_terms(readable(equation.residual), sympy.S.Zero))}</div>"
+    )
 
 
 def _tag(number: str) -> str:

@@ -127,6 +127,14 @@ def test_equations_have_displays():
     assert derived.jacobian.shape == (10, 10)
 
 
+def test_numbers_of_many_digits_are_shown_as_decimals():
+    mass = sympy.Rational(1234567, 10**7)
+    derived = sc.derive(lagrange("numbers", "q", f"{mass}*q_dot**2/2 - q**4/3"), sc.SVI(1, "gauss-legendre:2"))
+    assert "L = -q**4/3 + 0.06172835*q_dot**2" in derived.to_text()
+    shown = (derived.to_text(), derived.to_latex(), derived.equations[0].residual)
+    assert ["1234567" in str(each).replace("0.1234567", "") for each in shown] == [False, False, True]
+
+
 def test_singular_hamiltonians_have_no_printed_equations_where_velocities_are_needed():
     """H = x y determines no velocities: a method in position form has no step to print."""
     shear = sc.HamiltonianSystem.from_text(name="shear", coordinates=["x"], momenta=["y"], hamiltonian="x*y")
