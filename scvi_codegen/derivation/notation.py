@@ -165,9 +165,8 @@ def html(equation: Equation) -> Html:
     size = sympy.count_ops(equation.residual)
     if size > LARGEST_SHOWN:
         return Html(f"<div>{plain(f'({equation.number}) {size} operations')}</div>")
-    return Html(
-        f"<div>{plain(f'({equation.number})')} {' '.join(mathml_terms(readable(equation.residual), sympy.S.Zero))}</div>"
-    )
+    terms = " ".join(mathml_terms(readable(equation.residual), sympy.S.Zero))
+    return Html(f"<div>{plain(f'({equation.number})')} {terms}</div>")
 
 
 def _tag(number: str) -> str:
