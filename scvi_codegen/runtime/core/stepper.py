@@ -37,7 +37,7 @@ from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
 from scvi_codegen.runtime.events.event import Event, EventLike
 from scvi_codegen.runtime.events.refinement import WithEventsInDouble
 from scvi_codegen.runtime.inputs.segments import InputSegments, checked_inputs, final_time
-from scvi_codegen.runtime.paths.path import ArrayOrFunction, Path, find_path
+from scvi_codegen.runtime.paths.path import Path, WithPaths
 from scvi_codegen.runtime.rotations.states import homogeneous_state, is_one_state
 from scvi_codegen.runtime.run.accuracy import (
     measured_growth,
@@ -65,7 +65,7 @@ from scvi_codegen.validation import checked_count, checks_arguments, of
 Called = TypeVar("Called", bound=Callable[..., Any])
 
 
-class Stepper(WithEventsInDouble, Integrator):
+class Stepper(WithEventsInDouble, WithPaths, Integrator):
     """Compiled integrator of one system: :class:`Integrator` with integrations, runs, ensembles and projections."""
 
     _trajectory_type = Trajectory
@@ -506,67 +506,6 @@ class Stepper(WithEventsInDouble, Integrator):
             device=device,
         )
         return work.run(progress=progress, threads=threads)
-
-    @checks_arguments(StateError)
-    def path(
-        self,
-        q0: States | None = None,
-        q1: States | None = None,
-        T: float | None = None,
-        *,
-        steps: int = 32,
-        start: ArrayOrFunction = None,
-        homotopy: bool = True,
-        energy: float | None = None,
-        closed: Any = None,
-        t: float = 0.0,
-        parameters: Parameters = None,
-        inputs: Mapping[str, Any] | None = None,
-        options: SolverOptions | None = None,
-    ) -> Path:
-        """Return a motion from q0 to q1 in the time T (boundary-value problem): a stationary point of the action.
-
-        Newton's method on the positions of all steps, with the exact Hessian of the action. Boundary-value problems may
-        have several solutions: each start leads to one. With forces, damping and inputs the equations are those of
-        Lagrange and d'Alembert.
-
-        Args:
-            q0, q1: (m,) positions at t and t + T.
-            T: duration, negative for a path backward in time.
-            steps: number of steps. A method of degree 4 to 8 needs about one to four in the shortest period over 2 pi.
-            start: positions to start from: (steps + 1, m), or a function of time; by default the straight line.
-            homotopy: if the straight line leads to no path, continue the path of duration T/16 to T. This finds the
-                direct one, without revolutions.
-            energy: at the start, of closed paths the mean of all nodes; the duration is then unknown, T an estimate.
-            closed: a closed path q(t + T) = M q(t) near ``start``, without q0 and q1: ``True`` (M = 1); the coordinates
-                that follow after T, in the order of all, as a permutation with signs, ``["x2", "-y2", ..]``; or an
-                orthogonal (m, m) matrix. Without forces and energy= a minimum of the action is sought first.
-            t, parameters, options: as in :meth:`step`.
-            inputs: as in :meth:`integrate`; their breakpoints should be ends of steps.
-
-        Returns:
-            A :class:`~scvi_codegen.runtime.paths.path.Path`; its ``run()`` integrates from the first state.
-
-        Raises:
-            PathError: if no path is found.
-            MethodError: for methods without a sum of L, first-order systems and nonholonomic constraints.
-            StateError: if a shape, name or number is invalid.
-        """
-        return find_path(
-            self,
-            q0,
-            q1,
-            T,
-            steps=steps,
-            start=start,
-            homotopy=homotopy,
-            energy=energy,
-            closed=closed,
-            t=t,
-            parameters=parameters,
-            inputs=inputs,
-            options=options,
-        )
 
     def project(
         self,

@@ -16,12 +16,12 @@ from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.representation import summary
 from scvi_codegen.runtime.core.features import require
-from scvi_codegen.runtime.core.validation import Array, Parameters, columns_of_inputs, flat_state
+from scvi_codegen.runtime.core.validation import Array, Parameters, States, columns_of_inputs, flat_state
 from scvi_codegen.runtime.paths import solver
 from scvi_codegen.runtime.paths.equations import Band, condensed_hessian, negative_directions
 from scvi_codegen.runtime.paths.intervals import Intervals, ManyCoordinates, ReducedIntervals
 from scvi_codegen.runtime.rotations.states import flat_states
-from scvi_codegen.validation import checked_count
+from scvi_codegen.validation import checked_count, checks_arguments
 
 if TYPE_CHECKING:
     from scvi_codegen.runtime.trajectory.trajectory import Trajectory
@@ -120,67 +120,100 @@ class Path:
         return condensed_hessian(self.solution.at, factors)
 
 
-def find_path(
-    stepper: Any,
-    q0: Any,
-    q1: Any,
-    T: float | None,
-    *,
-    steps: int,
-    start: Any,
-    homotopy: bool,
-    energy: float | None,
-    closed: Any,
-    t: float,
-    parameters: Parameters,
-    inputs: Mapping[str, Any] | None,
-    options: SolverOptions | None,
-) -> Path:
-    """Return a path; arguments and errors as of :meth:`~scvi_codegen.Stepper.path`."""
-    stepper = stepper.known
-    require(stepper, "path")
-    count = checked_count(steps, "steps", least=2)
-    if T is None:
-        raise StateError("path: give T, the duration of the path (with energy= an estimate of it)")
-    duration, begin = checked_number(T, "the duration T"), checked_number(t, "the time t")
-    if duration == 0:
-        raise StateError("path: T must not be 0")
-    kind = _kind_of_intervals(stepper, closed=closed is not None, energy=energy is not None)
-    h = np.full(count, duration / count)
-    times = begin + np.arange(count) * h
-    intervals = kind(stepper, times, h, _parameters_of_steps(stepper, parameters, inputs, times + h / 2.0), options)
-    arguments = {"parameters": parameters, "options": options, **({"inputs": inputs} if inputs is not None else {})}
-    nodes = _given_nodes(stepper.interface, start, begin, duration, count)
-    values, wanted = intervals.parameters, None if energy is None else checked_number(energy, "energy")
+class WithPaths:
+    """Mixin of integrators with paths."""
 
-    def states(q: Array, p: Array) -> tuple[Array, Array]:
-        at = np.full(len(q), begin)
-        return np.asarray(stepper.energy(q, p, at, values)), np.asarray(stepper.velocity(q, p, at, values))
+    @checks_arguments(StateError)
+    def path(
+        self: Any,
+        q0: States | None = None,
+        q1: States | None = None,
+        T: float | None = None,
+        *,
+        steps: int = 32,
+        start: ArrayOrFunction = None,
+        homotopy: bool = True,
+        energy: float | None = None,
+        closed: Any = None,
+        t: float = 0.0,
+        parameters: Parameters = None,
+        inputs: Mapping[str, Any] | None = None,
+        options: SolverOptions | None = None,
+    ) -> Path:
+        """Return a motion from q0 to q1 in the time T (boundary-value problem): a stationary point of the action.
 
-    if closed is not None:
-        if nodes is None:
-            raise StateError("closed paths require start=: an array (steps + 1, m), or a function of time")
-        M, forced = _symmetry(stepper.interface, closed), bool(stepper.interface.exchange_names)
-        minimised = not (forced or isinstance(intervals, ReducedIntervals))
-        found = solver.closed(
-            intervals, nodes[:count], M, minimise=minimised, symmetric=not forced, energy=wanted, states=states
-        )
-        closed_path = _described(stepper, found, begin, arguments, M)
-        if closed_path.at_rest:
-            warn(
-                "path: the closed path is at rest in path.q[0], an equilibrium, which is closed for any T. For a "
-                f"motion give energy=, a start of larger amplitude, or a period of motions as T, not {duration:g}; for "
-                "small amplitudes it is near 2 pi over a frequency of the equilibrium",
-                AccuracyWarning,
+        Newton's method on the positions of all steps, with the exact Hessian of the action. Boundary-value problems may
+        have several solutions: each start leads to one. With forces, damping and inputs the equations are those of
+        Lagrange and d'Alembert.
+
+        Args:
+            q0, q1: (m,) positions at t and t + T.
+            T: duration, negative for a path backward in time.
+            steps: number of steps. A method of degree 4 to 8 needs about one to four in the shortest period over 2 pi.
+            start: positions to start from: (steps + 1, m), or a function of time; by default the straight line.
+            homotopy: if the straight line leads to no path, continue the path of duration T/16 to T. This finds the
+                direct one, without revolutions.
+            energy: at the start, of closed paths the mean of all nodes; the duration is then unknown, T an estimate.
+            closed: a closed path q(t + T) = M q(t) near ``start``, without q0 and q1: ``True`` (M = 1); the coordinates
+                that follow after T, in the order of all, as a permutation with signs, ``["x2", "-y2", ..]``; or an
+                orthogonal (m, m) matrix. Without forces and energy= a minimum of the action is sought first.
+            t, parameters, options: as in :meth:`step`.
+            inputs: as in :meth:`integrate`; their breakpoints should be ends of steps.
+
+        Returns:
+            A :class:`~scvi_codegen.runtime.paths.path.Path`; its ``run()`` integrates from the first state.
+
+        Raises:
+            PathError: if no path is found.
+            MethodError: for methods without a sum of L, first-order systems and nonholonomic constraints.
+            StateError: if a shape, name or number is invalid.
+        """
+        stepper = self.known
+        require(stepper, "path")
+        count = checked_count(steps, "steps", least=2)
+        if T is None:
+            raise StateError("path: give T, the duration of the path (with energy= an estimate of it)")
+        duration, begin = checked_number(T, "the duration T"), checked_number(t, "the time t")
+        if duration == 0:
+            raise StateError("path: T must not be 0")
+        kind = _kind_of_intervals(stepper, closed=closed is not None, energy=energy is not None)
+        h = np.full(count, duration / count)
+        times = begin + np.arange(count) * h
+        intervals = kind(stepper, times, h, _parameters_of_steps(stepper, parameters, inputs, times + h / 2.0), options)
+        arguments = {"parameters": parameters, "options": options, **({"inputs": inputs} if inputs is not None else {})}
+        nodes = _given_nodes(stepper.interface, start, begin, duration, count)
+        values, wanted = intervals.parameters, None if energy is None else checked_number(energy, "energy")
+
+        def states(q: Array, p: Array) -> tuple[Array, Array]:
+            at = np.full(len(q), begin)
+            return np.asarray(stepper.energy(q, p, at, values)), np.asarray(stepper.velocity(q, p, at, values))
+
+        if closed is not None:
+            if nodes is None:
+                raise StateError("closed paths require start=: an array (steps + 1, m), or a function of time")
+            M, forced = _symmetry(stepper.interface, closed), bool(stepper.interface.exchange_names)
+            minimised = not (forced or isinstance(intervals, ReducedIntervals))
+            found = solver.closed(
+                intervals, nodes[:count], M, minimise=minimised, symmetric=not forced, energy=wanted, states=states
             )
-        return closed_path
-    if q0 is None or q1 is None:
-        raise StateError("path: give both positions q0 and q1, or closed= and start=")
-    ends = [stepper._vector(_positions(stepper.interface, each, name), name) for each, name in ((q0, "q0"), (q1, "q1"))]
-    found = _open_path(intervals, ends, nodes, duration, homotopy=homotopy and start is None)
-    if wanted is not None:
-        found = solver.AtEnergy(found.intervals, wanted, states).solved(found.q, found.iterations)
-    return _described(stepper, found, begin, arguments)
+            closed_path = _described(stepper, found, begin, arguments, M)
+            if closed_path.at_rest:
+                warn(
+                    "path: the closed path is at rest in path.q[0], an equilibrium, which is closed for any T. For a "
+                    "motion give energy=, a start of larger amplitude, or a period of motions as T, not "
+                    f"{duration:g}; for small amplitudes it is near 2 pi over a frequency of the equilibrium",
+                    AccuracyWarning,
+                )
+            return closed_path
+        if q0 is None or q1 is None:
+            raise StateError("path: give both positions q0 and q1, or closed= and start=")
+        ends = [
+            stepper._vector(_positions(stepper.interface, each, name), name) for each, name in ((q0, "q0"), (q1, "q1"))
+        ]
+        found = _open_path(intervals, ends, nodes, duration, homotopy=homotopy and start is None)
+        if wanted is not None:
+            found = solver.AtEnergy(found.intervals, wanted, states).solved(found.q, found.iterations)
+        return _described(stepper, found, begin, arguments)
 
 
 def different_paths(stepper: Any, q0: Any, q1: Any, T: float, *, starts: int = 0, **arguments: Any) -> list[Path]:
