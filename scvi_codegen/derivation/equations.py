@@ -46,7 +46,7 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.discretise import discretised_form, in_moving_frame, paper_equations
 from scvi_codegen.methods.method import Method
-from scvi_codegen.methods.stage_system import Block, Row, StageGroup, StageSystem, Table
+from scvi_codegen.methods.stage_system import Block, EntryName, Row, StageGroup, StageSystem, Table
 from scvi_codegen.representation import LONGEST, clipped
 from scvi_codegen.tables.precision import Number
 from scvi_codegen.validation import checks_arguments
@@ -239,7 +239,7 @@ class _Writer:
             for block in stages.blocks
             for parts in [names if block.size is None else range(1, block.size + 1)]
         ]
-        self.values: dict[sympy.Symbol, Number] = {}
+        self.values: dict[sympy.Symbol, tuple[EntryName, Number]] = {}
 
     def _symbol(self, name: str) -> sympy.Symbol:
         """Return a symbol of the derivation, with underscores before its name if the system has one of that name."""
@@ -293,7 +293,7 @@ class _Writer:
         table = self.stages.end_position
         name = table.names[0][column] if column < len(table.names[0]) else None
         if name and name.of == "beta" and row.momentum == table.entries[0][column]:
-            return self._named(name.number, row.momentum)
+            return self._named(name, row.momentum)
         return _rational(row.momentum)
 
     def _scatter(self, group: StageGroup, n: int, powers: Sequence[int], rows: list[list[list[sympy.Expr]]]) -> None:
@@ -319,7 +319,7 @@ class _Writer:
     def _abscissa(self, group: StageGroup, n: int) -> sympy.Expr:
         """Return the abscissa of point n on the step, by its name."""
         prefix, abscissa = "d" if group.name == "quadrature" else "c", group.abscissae[n]
-        return self._named("" if abscissa in (0, 1) else f"{prefix}_{n + 1}", abscissa)
+        return self._named(None if abscissa in (0, 1) else EntryName(prefix, n + 1), abscissa)
 
     def _arguments(self, group: StageGroup, n: int) -> dict[sympy.Symbol, sympy.Expr]:
         replaced = {}
@@ -347,16 +347,16 @@ class _Writer:
     def _entry(self, table: Table, n: int, b: int) -> sympy.Expr:
         name, value = table.names[n][b], table.entries[n][b]
         if name is None:
-            return self._named("", value)
+            return self._named(None, value)
         factor = sympy.Rational(name.factor.numerator, name.factor.denominator)
-        return factor * self._named(name.number, value / name.factor.numerator * name.factor.denominator)
+        return factor * self._named(name, value / name.factor.numerator * name.factor.denominator)
 
-    def _named(self, name: str, value: Number) -> sympy.Expr:
+    def _named(self, name: EntryName | None, value: Number) -> sympy.Expr:
         """Return the symbol of a number and record its value; without a name, the number."""
-        if not name:
+        if name is None:
             return sympy.Integer(int(value))
-        symbol = self._symbol(name)
-        self.values[symbol] = value
+        symbol = self._symbol(name.number)
+        self.values[symbol] = name, value
         return symbol
 
 

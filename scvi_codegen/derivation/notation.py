@@ -17,7 +17,7 @@ from scvi_codegen.formulas.translation import format_expression
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method
-from scvi_codegen.methods.stage_system import StageSystem
+from scvi_codegen.methods.stage_system import EntryName, StageSystem
 from scvi_codegen.runtime.events.event import Event
 from scvi_codegen.tables.closed_forms import exact_points, exact_rule, exact_tableau
 from scvi_codegen.tables.precision import DIGITS, Number, Vector, mp
@@ -92,9 +92,10 @@ End = Mapping[sympy.Symbol, "Equation"]
 
 @dataclass(frozen=True, slots=True)
 class TableEntry:
-    """A number of a table: its symbol, its value in 60 digits, and a short exact form or ``None``."""
+    """A number of a table: its symbol and name, its value in 60 digits, and a short exact form or ``None``."""
 
     symbol: sympy.Symbol
+    name: EntryName
     value: Number
     exact: sympy.Expr | None
 
@@ -175,35 +176,26 @@ def _tag(number: str) -> str:
     return "$" + number.replace("dG", r"\partial G").replace("/d", r"/\partial ") + "$"
 
 
-def entries(values: Mapping[sympy.Symbol, Number], method: Method) -> tuple[TableEntry, ...]:
+def entries(values: Mapping[sympy.Symbol, tuple[EntryName, Number]], method: Method) -> tuple[TableEntry, ...]:
     """Return numbers of a method's tables by symbol, sorted by name and index, with their radicals."""
     basis = _basis(method)
-    return tuple(
-        TableEntry(symbol, value, recognised(value, basis)) for symbol, value in sorted(values.items(), key=_by_name)
-    )
+    result = [TableEntry(symbol, name, value, recognised(value, basis)) for symbol, (name, value) in values.items()]
+    return tuple(sorted(result, key=lambda entry: (entry.name.of, entry.name.indices)))
 
 
 def table_entries(stages: StageSystem, method: Method) -> tuple[TableEntry, ...]:
     """Return the named numbers of all tables of a method's equations, also those that do not occur in the equations."""
     tables = [stages.end_position]
-    values: dict[sympy.Symbol, Number] = {}
+    values: dict[EntryName, Number] = {}
     for group in stages.stage_groups:
         tables += [gather.table for gather in group.gathers] + [scatter.table for scatter in group.scatters]
-        named = zip(group.weight_names, group.weights, strict=True)
-        values |= {sympy.Symbol(name, real=True): weight for name, weight in named if name}
+        values |= {name: weight for name, weight in zip(group.weight_names, group.weights, strict=True) if name}
     for table in tables:
         for names, numbers in zip(table.names, table.entries, strict=True):
             for name, value in zip(names, numbers, strict=True):
                 if name:
-                    values[sympy.Symbol(name.number, real=True)] = (
-                        value / name.factor.numerator * name.factor.denominator
-                    )
-    return entries(values, method)
-
-
-def _by_name(item: tuple[sympy.Symbol, Number]) -> tuple[object, ...]:
-    prefix, *indices = item[0].name.lstrip("_").split("_")
-    return (prefix, *(int(index) for index in indices))
+                    values[name] = value / name.factor.numerator * name.factor.denominator
+    return entries({sympy.Symbol(name.number, real=True): (name, value) for name, value in values.items()}, method)
 
 
 @lru_cache(maxsize=64)

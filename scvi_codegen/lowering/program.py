@@ -313,7 +313,7 @@ def _stage_curve(stages: StageSystem) -> StageCurve | None:
     last one that it has, and also available for one velocity.
     """
     shape, count = stages.shape, len([block for block in stages.blocks if block.size is None])
-    has_end_velocity = any(block.name == END_VELOCITY for block in stages.blocks)
+    has_end_velocity = any((block.letter, block.index) == END_VELOCITY for block in stages.blocks)
     if isinstance(shape, Velocities) and _moves(stages, shape):
         tables, last = velocity_tables(shape), len(shape.blocks) - 1 + has_end_velocity
         degree = last if has_end_velocity or tables is None else resolved_degree(tables)

@@ -47,7 +47,7 @@ from scvi_codegen.tables.quadrature import Quadrature
 from scvi_codegen.tables.spaces import Polynomials
 from scvi_codegen.tables.tableau import Tableau
 
-VELOCITY_BLOCK = Block(name="v_0", power=1, straight=(mp.zero, mp.one))
+VELOCITY_BLOCK = Block(letter="v", index=0, straight=(mp.zero, mp.one))
 
 
 def position_system(system: MechanicalSystem, tableau: Tableau) -> StageSystem:
@@ -99,7 +99,7 @@ def residual_group(
 
 def acceleration_unknowns(size: int) -> tuple[Block, ...]:
     """Return the blocks v0, z_1 .. z_s of a curve with initial velocity v0 and scaled accelerations z_i."""
-    return (VELOCITY_BLOCK, *(Block(name=f"z_{i}", power=1, straight=(mp.zero, mp.zero)) for i in range(1, size + 1)))
+    return (VELOCITY_BLOCK, *(Block(letter="z", index=i) for i in range(1, size + 1)))
 
 
 def acceleration_gathers(
@@ -221,10 +221,7 @@ def shooting_increments(
     weights = rule.unit_weights
     if rounded:
         position, weights, beta = dyadic(position), unit_sum(weights), dyadic([beta])[0]
-    blocks = (
-        *acceleration_unknowns(size),
-        *(Block(name=f"m_{i}", power=1, straight=(mp.zero, mp.zero)) for i in range(1, size + 1)),
-    )
+    blocks = (*acceleration_unknowns(size), *(Block(letter="m", index=i) for i in range(1, size + 1)))
     action = action_groups(
         system,
         rule.abscissae,
@@ -300,7 +297,7 @@ def printed_increments(system: MechanicalSystem, tableau: Tableau, rule: Quadrat
         name="quadrature",
         abscissae=rule.abscissae,
         weights=rule.unit_weights,
-        weight_names=tuple(f"w_{n}" for n in range(1, points + 1)),
+        weight_names=tuple(EntryName("w", n) for n in range(1, points + 1)),
         gathers=curve_gathers(system, position_rows, velocities, names=("r", "u"), first=0),
         scatters=lagrangian_scatters(system, first_and_sum("s1", values), first_and_sum("s2", derivative_values)),
     )
@@ -338,10 +335,7 @@ def shooting_nodal(system: MechanicalSystem, nodes: Nodes, rule: Quadrature) -> 
     )
     return stationary_nodal(
         stage_groups=(nodal_quadrature_group(system, nodes, rule, other_blocks=1 + size), node),
-        blocks=(
-            *nodal_blocks(nodes),
-            *(Block(name=f"lambda_{i}", power=0, straight=(mp.zero, mp.zero)) for i in range(1, size + 1)),
-        ),
+        blocks=(*nodal_blocks(nodes), *(Block(letter="lambda", index=i, power=0) for i in range(1, size + 1))),
         end_block=size - 1,
         rows=(
             Row(number="34d", kind="IDEL", momentum=mp.one),

@@ -45,7 +45,7 @@ from scvi_codegen.tables.basis import cardinal_values
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 from scvi_codegen.tables.quadrature import gauss_legendre
 
-END_VELOCITY = "v_1"
+END_VELOCITY = "v", 1
 """Name of the unknown velocity that corresponds to the momentum at the end."""
 
 SAME = mp.mpf(10) ** -40
@@ -60,11 +60,9 @@ def with_constraints(system: MechanicalSystem, stages: StageSystem, name: str) -
     """
     _check_points(system, stages, name)
     group, count = stages.stage_groups[0], len(system.constraints)
-    nothing, points = (mp.zero, mp.zero), len(group.abscissae)
-    multipliers = tuple(
-        Block(name=f"lambda_{n}", power=1, straight=nothing, moves=False, size=count) for n in range(points)
-    )
-    velocity = Block(name=END_VELOCITY, power=1, straight=(mp.zero, mp.one), moves=False)
+    points = len(group.abscissae)
+    multipliers = tuple(Block(letter="lambda", index=n, moves=False, size=count) for n in range(points))
+    velocity = Block(letter=END_VELOCITY[0], index=END_VELOCITY[1], straight=(mp.zero, mp.one), moves=False)
     conditions = [("g", "stage")] * (points - 1) + [("hidden", "stage")]
     return replace(
         stages,

@@ -12,7 +12,6 @@ the method equals that of the Lagrangian, step for step: (35f) is the Legendre t
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import sympy
 from sympy import Add, Expr, Symbol
@@ -200,11 +199,11 @@ def _rotated(
         ),
         computes="Changes of q and u = h p by rotations of bodies, less v, and u",
     )
-    still = Block(name=f"V_{name}", power=1, straight=(mp.zero, mp.zero))
+    still = Block(letter="V", index=name)
     last = Row(number=f"P_{name}", kind="IDEL", momentum=momentum)
     return replace(
         stages,
-        blocks=(*stages.blocks, still, replace(still, name=f"P_{name}", momentum=1, moves=False)),
+        blocks=(*stages.blocks, still, replace(still, letter="P", momentum=1, moves=False)),
         rows=(*stages.rows, Row(number=f"V_{name}", kind="stage", momentum=mp.zero), last),
         stage_groups=(*groups, group),
         end_position=end if first else Table.joined(stages.end_position, one, none),
@@ -258,8 +257,7 @@ def with_auxiliaries(system: MechanicalSystem, stages: StageSystem) -> StageSyst
         return stages
     added = [(g, n) for g, group in enumerate(groups) for n in range(len(group.guess))]
     rows = (*stages.rows, *(Row(number="35f", kind="stage", momentum=mp.zero) for _ in added))
-    auxiliary = partial(Block, power=1, straight=(mp.zero, mp.zero), moves=False)
-    blocks = [auxiliary(name=f"{groups[g].name}_{n + 1}", momentum=int(groups[g].momenta)) for g, n in added]
+    blocks = [Block(letter=groups[g].name, index=n + 1, momentum=int(groups[g].momenta), moves=False) for g, n in added]
     number_q, number_p = stages.end_numbers
     return replace(
         stages,

@@ -82,7 +82,7 @@ def galerkin_system(
     gathers = curve_gathers(system, position, (velocity, *derivatives))
     return stationary_increments(
         stage_groups=action_groups(system, abscissae, (weights, *derivative_weights), gathers),
-        blocks=tuple(Block(name=f"V_{b}", power=1, straight=(mp.zero, mp.one)) for b in range(1, size + 1)),
+        blocks=tuple(Block(letter="V", index=b, straight=(mp.zero, mp.one)) for b in range(1, size + 1)),
         end_position=end_position,
         rows=tuple(Row(number=f"V_{b}", kind="IDEL", momentum=end_position[b - 1]) for b in range(1, size + 1)),
         extrapolation=extrapolation,
@@ -120,7 +120,7 @@ def action_groups(
             name=f"derivative_{k}" if k else "quadrature",
             abscissae=abscissae,
             weights=group_weights,
-            weight_names=tuple(f"{'d' * k}w_{n}" for n in range(1, len(abscissae) + 1)),
+            weight_names=tuple(EntryName(f"{'d' * k}w", n) for n in range(1, len(abscissae) + 1)),
             gathers=gathers[: k + 2],
             scalar=scalar,
             power=k,
@@ -182,7 +182,7 @@ def nodal_quadrature_group(
         name="quadrature",
         abscissae=rule.abscissae,
         weights=rule.weights,
-        weight_names=tuple(f"w_{n}" for n in range(1, len(rule) + 1)),
+        weight_names=tuple(EntryName("w", n) for n in range(1, len(rule) + 1)),
         gathers=(
             Gather(arguments=system.coordinates, table=Table.joined(values, padding), power=0),
             Gather(
@@ -197,7 +197,7 @@ def nodal_quadrature_group(
 
 def position_block(v: int, nodes: Nodes) -> Block:
     """Return the block of the unknown Q^v, whose initial guess is on the straight line."""
-    return Block(name=f"Q_{v}", power=0, straight=(mp.one, nodes.abscissae[v]))
+    return Block(letter="Q", index=v, power=0, straight=(mp.one, nodes.abscissae[v]))
 
 
 def phase_space_system(system: MechanicalSystem, tableau: Tableau) -> StageSystem:
@@ -206,7 +206,7 @@ def phase_space_system(system: MechanicalSystem, tableau: Tableau) -> StageSyste
     gathers = curve_gathers(system, tableau.A, (identity_matrix(size),))
     b_column = Table(entries=tuple((x,) for x in tableau.b), names=tuple((EntryName("b", n + 1),) for n in range(size)))
     return StageSystem(
-        blocks=tuple(Block(name=f"V_{i}", power=1, straight=(mp.zero, mp.one)) for i in range(1, size + 1)),
+        blocks=tuple(Block(letter="V", index=i, straight=(mp.zero, mp.one)) for i in range(1, size + 1)),
         rows=tuple(Row(number="22", kind="stage", momentum=mp.one) for _ in range(size)),
         stage_groups=(
             StageGroup(

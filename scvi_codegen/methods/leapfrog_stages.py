@@ -10,7 +10,7 @@ from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.splitting import KineticSplitting, kinetic_splitting
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method
-from scvi_codegen.methods.stage_system import Block, Gather, Row, Scatter, StageGroup, StageSystem, Table
+from scvi_codegen.methods.stage_system import Block, EntryName, Gather, Row, Scatter, StageGroup, StageSystem, Table
 from scvi_codegen.tables.basis import identity_matrix
 from scvi_codegen.tables.precision import Vector, mp
 
@@ -37,8 +37,8 @@ def leapfrog_system(system: MechanicalSystem, method: Method) -> StageSystem:
     numbers, more = range(1, len(moving) + 1), len(moving) if split.bodies else 0
     return StageSystem(
         blocks=(
-            *(Block(name=f"V_{k}", power=1, straight=(mp.zero, mp.one)) for k in numbers),
-            *(Block(name=f"P_{k}", power=1, straight=(mp.zero,) * 2, momentum=1, moves=False) for k in numbers[:more]),
+            *(Block(letter="V", index=k, straight=(mp.zero, mp.one)) for k in numbers),
+            *(Block(letter="P", index=k, momentum=1, moves=False) for k in numbers[:more]),
         ),
         rows=(
             *(Row(number=f"V_{k}", kind="stage", momentum=mp.zero) for k in numbers[:more]),
@@ -96,7 +96,7 @@ def _kick_group(split: KineticSplitting, kicks: Vector, drifts: Vector) -> Stage
         name="kick",
         abscissae=tuple(mp.fsum(line) for line in drifted),
         weights=tuple(kicks[n] for n in points),
-        weight_names=tuple(f"w_{n}" for n in points),
+        weight_names=tuple(EntryName("w", n) for n in points),
         gathers=(Gather(arguments=split.system.coordinates, table=places, power=0),),
         scatters=(Scatter(results=split.force, table=later, power=1),),
         scalar=_potential_part(split.system) if _acts(split) else None,

@@ -67,10 +67,15 @@ class EntryName:
     factor: Fraction = Fraction(1)
 
     @property
+    def indices(self) -> tuple[int, ...]:
+        """Indices in their order."""
+        both = (self.column, self.point) if self.column_first else (self.point, self.column)
+        return tuple(index for index in both if index is not None)
+
+    @property
     def number(self) -> str:
         """The named number without its factor."""
-        indices = (self.column, self.point) if self.column_first else (self.point, self.column)
-        return "_".join([self.of, *(str(index) for index in indices if index is not None)])
+        return "_".join([self.of, *map(str, self.indices)])
 
     @property
     def transposed(self) -> EntryName:
@@ -138,7 +143,7 @@ class Block:
     """Unknowns of one kind: ``Q_1`` (position, power 0), ``V_3`` (velocity, power 1), ``lambda_2``, ``v_0``.
 
     Attributes:
-        name: its symbol in displayed equations.
+        letter, index: of its symbol in displayed equations.
         power: the power of h that makes it a position.
         straight: (a, b) of the straight-line guess z = a q0 + b h^(1 - power) v0.
         momentum: coefficient of p0 in that guess.
@@ -147,12 +152,18 @@ class Block:
             on them.
     """
 
-    name: str
-    power: int
-    straight: tuple[Number, Number]
+    letter: str
+    index: int | str
+    power: int = 1
+    straight: tuple[Number, Number] = (mp.zero, mp.zero)
     momentum: int = 0
     moves: bool = True
     size: int | None = None
+
+    @property
+    def name(self) -> str:
+        """Symbol in displayed equations."""
+        return f"{self.letter}_{self.index}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -202,13 +213,13 @@ class StagePoints:
     name: str
     abscissae: Vector
     weights: Vector = ()
-    weight_names: tuple[str, ...] = ()
+    weight_names: tuple[EntryName | None, ...] = ()
     gathers: tuple[Gather, ...]
 
     def __post_init__(self) -> None:
         points = len(self.abscissae)
         object.__setattr__(self, "weights", self.weights or (mp.one,) * points)
-        object.__setattr__(self, "weight_names", self.weight_names or ("",) * points)
+        object.__setattr__(self, "weight_names", self.weight_names or (None,) * points)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -212,7 +212,7 @@ def table_values(stages: Any) -> dict[str, Any]:
     for group in stages.stage_groups:
         for name, weight in zip(group.weight_names, group.weights, strict=True):
             if name:
-                found[printed(name)] = of_package(weight)
+                found[printed(name.number)] = of_package(weight)
     return found
 
 
@@ -257,7 +257,7 @@ class PrintedStep:
         known["Q^0"] = known["q_k"]
         gamma = self.case.parsed(self.case.damping).subs(PARAMETERS)
         for group in self.stages.stage_groups:
-            first = int(group.weight_names[0].rpartition("_")[2] or 1)
+            first = group.weight_names[0].point if group.weight_names[0] else 1
             for n, abscissa in enumerate(group.abscissae):
                 time = mp.mpf(t) + of_package(abscissa) * mp.mpf(h)
                 place = {"start": "k", "end": "k+1"}.get(group.name, str(n + first))
@@ -667,7 +667,7 @@ def iteration_numbers(name: str) -> tuple[int, dict[str, Any]]:
     curve = fixed_point is not None and fixed_point.name in ("collocation", "shooting")
     places = stage_groups[-1] if curve and len(stage_groups) > 1 else stage_groups[0]
     places = next((f for f in stage_groups if f.name == "node"), places) if curve else places
-    first = int(places.weight_names[0].rpartition("_")[2] or 1)
+    first = places.weight_names[0].point if places.weight_names[0] else 1
     for n in range(1, len(places.abscissae) + 1):
         given = step.arguments(places, n, str(n - 1 + first), known)
         time = mp.mpf(t) + of_package(places.abscissae[n - 1]) * mp.mpf(h)

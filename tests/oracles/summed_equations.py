@@ -43,7 +43,7 @@ class Evaluation:
 
     def _evaluate_kernel(self, group) -> None:
         formulas = {formula.left: formula.right for formula in gather_formulas(self.system, self.stages, group)}
-        first = int(group.weight_names[0].rpartition("_")[2] or 1)
+        first = group.weight_names[0].point if group.weight_names[0] else 1
         for place, (abscissa, weight, name) in enumerate(
             zip(group.abscissae, group.weights, group.weight_names, strict=True)
         ):
@@ -54,7 +54,7 @@ class Evaluation:
                 right = renamed(formulas.get(left, left), "n", row)
                 arguments[gather.arguments[0]] = self.value(right)
             if name:
-                self.values[name] = sympy.Float(str(weight), DIGITS)
+                self.values[name.number] = sympy.Float(str(weight), DIGITS)
             for scatter in group.scatters:
                 symbol = result_symbol(self.system, group, scatter, point_index(group, number))
                 result = scatter.results[0].xreplace(arguments).xreplace(self.parameters)

@@ -211,10 +211,10 @@ def _rows(system: MechanicalSystem, stages: StageSystem, kinds: set[str]) -> Ite
 
 
 def _unknowns(system: MechanicalSystem, stages: StageSystem) -> str:
-    groups = groupby(stages.blocks, key=lambda block: block.name.rpartition("_")[0])
+    groups = groupby(stages.blocks, key=lambda block: block.letter)
     names = []
     for _, blocks in groups:
-        members = [block.name.replace("_", "^") if block.name[0] in "QVP" else block.name for block in blocks]
+        members = [f"{block.letter}^{block.index}" if block.letter in "QVP" else block.name for block in blocks]
         names.append(", ".join(members if len(members) < 4 else (members[0], "..", members[-1])))
     sizes = [system.dimension if block.size is None else block.size for block in stages.blocks]
     size = sum(sizes)

@@ -117,9 +117,9 @@ def tables_section(method: Method, entries: tuple[TableEntry, ...]) -> Section:
     """Return the section on nodes, weights, tableaux, and all entries that the equations name."""
     contents: list[Content] = [number_table(part) for part in method.parts]
     skipped = {*SHOWN_WITH_PARTS, *("ac" if any(isinstance(part, Tableau) for part in method.parts) else "")}
-    for prefix in dict.fromkeys(_indices(entry)[0] for entry in entries):
+    for prefix in dict.fromkeys(entry.name.of for entry in entries):
         if prefix not in skipped:
-            contents += _entry_table(prefix, [entry for entry in entries if _indices(entry)[0] == prefix])
+            contents += _entry_table(prefix, [entry for entry in entries if entry.name.of == prefix])
     contents.append(
         Paragraph(
             "Numbers are computed in 60 digits and shown in 17, or as radicals where these are short. Entries that are "
@@ -131,7 +131,7 @@ def tables_section(method: Method, entries: tuple[TableEntry, ...]) -> Section:
 
 def _entry_table(prefix: str, entries: list[TableEntry]) -> Iterator[Content]:
     """Yield entries of one name: a matrix, or a column if they have one index."""
-    cells: dict[tuple[int, ...], Cell] = {_indices(entry)[1]: _shown(entry) for entry in entries}
+    cells: dict[tuple[int, ...], Cell] = {entry.name.indices: _shown(entry) for entry in entries}
     caption = CAPTIONS.get(prefix, f"{prefix}_{{n,j}}: coefficients of the equations")
     if any(len(index) < 2 for index in cells):
         column = tuple((str(index[-1]), cell) for index, cell in sorted(cells.items()))
@@ -143,11 +143,6 @@ def _entry_table(prefix: str, entries: list[TableEntry]) -> Iterator[Content]:
         return
     rows = tuple((str(n), *(cells.get((n, column)) for column in sorted(columns))) for n in sorted(lines))
     yield TableBlock(columns=("n", *(f"j = {column}" for column in sorted(columns))), rows=rows, name=caption)
-
-
-def _indices(entry: TableEntry) -> tuple[str, tuple[int, ...]]:
-    prefix, *indices = entry.symbol.name.lstrip("_").split("_")
-    return prefix, tuple(map(int, indices))
 
 
 def _shown(entry: TableEntry) -> Cell:

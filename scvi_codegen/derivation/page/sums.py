@@ -195,18 +195,18 @@ def gathered(table: Table, blocks: Sequence[Block]) -> sympy.Expr:
     columns = [column_of(table, c) for c in range(len(blocks) + 1)]
     first = columns[0]
     if first.kind == "single" and [column.index for column in columns] == list(range(1, len(columns) + 1)):
-        return _unknown(_letter(blocks[0]), "n-1")  # the points are the nodes, and number 0 is q_k
+        return _unknown(blocks[0].letter, "n-1")  # the points are the nodes, and number 0 is q_k
     entry = Symbol("G_n_0") if first.kind in ("single", "other") and first.points > 1 else first.entry(0)
     terms = [entry * Symbol("q_k")] if first.kind != "zero" else []
     numbered = list(zip(columns[1:], blocks, strict=True))
-    for letter, group in groupby(numbered, key=lambda pair: _letter(pair[1])):
+    for letter, group in groupby(numbered, key=lambda pair: pair[1].letter):
         terms += _group_terms(letter, list(group))
     return sympy.Add(*terms)
 
 
 def _group_terms(letter: str, group: Sequence[tuple[Column, Block]]) -> Iterator[sympy.Expr]:
     """Yield unknowns of one kind times their coefficients."""
-    columns, numbers = [column for column, _ in group], [int(block.name.rpartition("_")[2]) for _, block in group]
+    columns, numbers = [column for column, _ in group], [int(block.index) for _, block in group]
     factor, span = h ** group[0][1].power, (j, numbers[0], numbers[-1])
     kinds = {column.kind for column in columns}
     named = [(column, number) for column, number in zip(columns, numbers, strict=True) if column.kind == "named"]
@@ -245,7 +245,8 @@ class _Part:
     @property
     def first(self) -> int:
         """Number of the first point, as in the names of the weights."""
-        return int(self.group.weight_names[0].rpartition("_")[2] or 1)
+        name = self.group.weight_names[0]
+        return 1 if name is None else name.indices[0]
 
     @property
     def index(self) -> int | None:
@@ -261,7 +262,7 @@ class _Part:
 
     def weight(self, index: object) -> sympy.Expr:
         name = self.group.weight_names[0]
-        return Symbol(f"{name.rpartition('_')[0]}_{index}") if name else sympy.S.One
+        return Symbol(f"{name.of}_{index}") if name else sympy.S.One
 
 
 @dataclass(frozen=True, slots=True)
@@ -359,10 +360,6 @@ def _small(value: Number) -> sympy.Expr:
     """Return halves exactly, other numbers in 17 digits."""
     doubled = 2 * value
     return sympy.Rational(int(doubled), 2) if doubled == int(doubled) else sympy.Float(str(value), 17)
-
-
-def _letter(block: Block) -> str:
-    return block.name.rpartition("_")[0]
 
 
 def _unknown(letter: str, index: object) -> Symbol:
