@@ -114,7 +114,13 @@ MUTATIONS = (
         "matrix_product",
         lambda original: lambda a, b: original(transposed(a), b) if len(a) > 1 else original(a, b),
     ),
-    function("the mass of the sweeps doubled", "double/svi", mechanics.Forms, "lower_mass", changed_property(doubled)),
+    function(
+        "the mass of the fixed-point iteration doubled",
+        "double/svi",
+        mechanics.Forms,
+        "lower_mass",
+        changed_property(doubled),
+    ),
     function(
         "the mass at the nodes doubled",
         "double/gauss-position",

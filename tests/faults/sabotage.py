@@ -27,8 +27,8 @@ from scvi_codegen.verification import Certificate, verify
 Make = Callable[[Any], Any]
 
 _numbers = count(1)
-"""Of faults, for libraries of their own: sweeps that a fault leaves as they are would keep the iteration of Newton that
-they borrowed, with the fault, for what is certified later in the process."""
+"""Numbers of faults, one library each: a fixed-point iteration that a fault leaves unchanged would keep the fallback
+library of the faulty Newton iteration for what is certified later in the process."""
 
 
 @dataclass(frozen=True)

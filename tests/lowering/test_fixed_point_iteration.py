@@ -1,6 +1,6 @@
 """One fixed-point iteration agrees to round-off with its formulas, with SymPy's derivatives, for one point.
 
-What a sweep does wrong, the next ones mend as long as they contract: the solution does not show it.
+The next iterations correct errors of one as long as they converge, so that the solution does not show them.
 """
 
 import itertools

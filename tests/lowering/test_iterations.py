@@ -1,6 +1,6 @@
 """Iteration counts of runs compared with recorded counts: an increase indicates an error.
 
-Steps are the same whatever leads to them: kept factors that never serve, guesses from the wrong steps, sweeps that
+Steps are the same whatever leads to them: kept factors that never serve, guesses from the wrong steps, iterations that
 stop a little later than they may. The numbers are the same with and without optimisation; a few more or less are
 rounding. Where a change makes them smaller, the new ones belong here.
 """

@@ -241,7 +241,7 @@ def test_three_lobatto_points_estimate_errors_by_the_momentum_derivative(solver)
 @pytest.mark.parametrize("method", [sc.SVI(8), sc.SVI(6, "gauss-legendre:9")])
 def test_newton_iteration_has_adaptive_steps(method):
     stepper = sc.compile_stepper(sc.problem("kepler").system, method, solver="newton")
-    assert "sweep(" not in stepper.source.code
+    assert "_iteration.h" not in stepper.source.code
     for e in (0.2, 0.9):
         q, p = orbit(e)
         run = stepper.integrate(q, p, t_end=20.0)

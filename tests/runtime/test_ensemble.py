@@ -340,7 +340,7 @@ class TestFailures:
     @pytest.mark.parametrize("place", [3, 6])
     def test_lane_that_fails_at_the_start_does_not_affect_others(self, place: int):
         """Between others, and as the last, whose place is filled up with copies: to roundings, as lanes that step
-        together take as many sweeps as the slowest of them needs."""
+        together take as many iterations as the slowest of them needs."""
         stepper = stepper_for("relativistic-particle", sc.SVI(5))
         q, p = states("relativistic-particle", 7)
         values, others = np.tile(stepper.defaults, (7, 1)), np.arange(7) != place

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 from matrix_systems import LOW, STOP, Motion, Problem, truth_of
-from samples import QUICK_FLAGS
+from samples import UNOPTIMISED_FLAGS
 from scipy.optimize import brentq
 
 import scvi_codegen as sc
@@ -42,9 +42,9 @@ def _stepper(problem: Problem, method: int) -> Any:
     name, solver, _ = problem.methods[method]
     made = sc.methods.method_from_specification(name) if isinstance(name, dict) else name
     if problem.kind == "array":
-        return sc.compile_stepper(problem.system(), made, solver=solver, flags=QUICK_FLAGS)
+        return sc.compile_stepper(problem.system(), made, solver=solver, flags=UNOPTIMISED_FLAGS)
     time_transformation = {"time_transformation": problem.time_transformation} if problem.kind == "reversible" else {}
-    return sc.compile_stepper(problem.system(), made, solver=solver, flags=QUICK_FLAGS, **time_transformation)
+    return sc.compile_stepper(problem.system(), made, solver=solver, flags=UNOPTIMISED_FLAGS, **time_transformation)
 
 
 @dataclass(frozen=True)
