@@ -379,12 +379,17 @@ PASS void first_points(const step_points *w, history past, long long steps)
       w->X[g * M + i] += unit_of(w, i) * w->F[g * M + i];
 }
 
-/* Sizes of the coordinates, and low words of their iteration, with the first forces. */
+/* Sizes of the coordinates. */
 PASS void measure_points(const step_points *w, const solver_options *options)
 {
   for (int i = 0; i < M; i++)
     w->inverse_size[i] = size_of(w, w->drifts[i], i);
   invert_sizes(options, 1.0, w->inverse_size);
+}
+
+/* Low words of the iteration, with the first forces. */
+PASS void find_rests(const step_points *w)
+{
   for (int i = 0; i < M; i++)
     for (int g = 0; g < GROUPS; g++)
       w->rests[g * M + i] = coefficient_rests(w, g, w->drifts[i], i);
@@ -407,8 +412,7 @@ static number correct_points(const step_points *w)
   lanes change = lanes_of(0.0);
   for (int i = 0; i < M; i++)
     for (int g = 0; g < GROUPS; g++) {
-      const lanes curved = unit_of(w, i) * SUM_OF_FORCES(PRODUCT, w, g, i);
-      d[g][i] = (w->base[g * M + i] - w->X[g * M + i]) + WITH_LOW_WORDS(w, g, i, curved);
+      d[g][i] = (w->base[g * M + i] - w->X[g * M + i]) + unit_of(w, i) * SUM_OF_FORCES(PRODUCT, w, g, i);
     }
   solve_linear_part(&w->data->linear, d[0]);
   for (int i = 0; i < M; i++)
@@ -419,7 +423,8 @@ static number correct_points(const step_points *w)
   return total_change(change);
 }
 
-/* Corrects the points and, by their linear part, the forces, with double-double coefficients. */
+/* Corrects the points and, by their linear part, the forces, with double-double coefficients. Their low words are those
+ * of the present forces: where vibrations are fast, the first ones may be wrong by orders of magnitude. */
 static void refine_forces(const step_points *w)
 {
   const iteration_data *data = w->data;
@@ -429,7 +434,7 @@ static void refine_forces(const step_points *w)
       const lanes sum = SUM_OF_FORCES(PRODUCT, w, g, i);
       d[g][i] = (w->step->q0[i] - w->X[g * M + i]) +
           (DRIFT[g] * w->drifts[i].high + data->inverse_mass[i] * (data->square * sum)) +
-          (w->rests[g * M + i] + data->inverse_mass[i] * (data->square_low * sum));
+          (coefficient_rests(w, g, w->drifts[i], i) + data->inverse_mass[i] * (data->square_low * sum));
     }
   solve_linear_part(&data->linear, d[0]);
   for (int k = 0; k < GROUPS * M; k++)
@@ -467,6 +472,10 @@ HOT int iterate(const step_data *step, const iteration_data *data, history past,
   first_points(&w, past, *steps);
   forces(&w);
   measure_points(&w, options);
+#ifndef ARRAYS
+  if (!implicit)
+    find_rests(&w);
+#endif
   for (int k = 0; needs_iteration(&now); k++) {
     const number change = implicit ? correct_points(&w) : improve(&w);
     forces(&w);
