@@ -1,5 +1,5 @@
 /* Runs whose arguments and results are one struct. Requires: NAME, STATUS, calls_declarations.h; HAS_ADVANCE_TO,
- * HAS_ACTIONS, HAS_MEASURES_GROWTH, HAS_STEP_ERROR, HAS_REJECTED and HAS_SET_FALLBACK where the source has these. Functions
+ * HAS_ACTIONS, HAS_MEASURES_GROWTH, HAS_STEP_ERROR, HAS_REJECTED, HAS_H_LOW and HAS_SET_FALLBACK where the source has these. Functions
  * are called by volatile pointers: not inlined, so that the bits of steps do not depend on these callers. */
 
 static int NAME(call_store)(const NAME(call) *c, long long row, long long steps, long long every)
@@ -62,11 +62,25 @@ int NAME(call_integrate)(NAME(call) *c, long long steps, long long every)
   return 0;
 }
 
+#ifdef HAS_H_LOW
+/* Lets the next step end at a time, unless that is NaN: its size has two words. */
+static void NAME(call_step_to)(NAME(run) * run, double end)
+{
+  const double left = end - run->t, part = left - end, rest = (end - (left - part)) - (run->t + part);
+  const double h = left - run->t_low, moved = h - left, low = ((left - (h - moved)) - (run->t_low + moved)) + rest;
+  if (end == end) {
+    run->h = h + low;
+    run->h_low = low - (run->h - h);
+  } else
+    run->h_low = 0.0;
+}
+#endif
+
 /* Advances the present trajectory by at most `steps` steps; returns 1 at its end. */
 static int NAME(call_one)(NAME(each) *c, const double *parameters, long long steps, long long *taken)
 {
   const long long j = c->next, m = c->coordinates, begun = c->run->step, row = c->rows;
-  double *t = c->times + row, *q = c->positions + row * m, *p = c->momenta + row * m;
+  double *t = c->times + row * c->words, *q = c->positions + row * m, *p = c->momenta + row * m;
   __typeof__(NAME(advance)) *volatile fixed = NAME(advance);
   int status = 0, arrived = 0;
 #ifdef HAS_ACTIONS
@@ -120,6 +134,9 @@ static int NAME(call_one)(NAME(each) *c, const double *parameters, long long ste
       c->run->h = c->segment_h[c->segment];
       c->run->guess = 0;
     }
+#ifdef HAS_H_LOW
+    NAME(call_step_to)(c->run, c->segment_end[c->segment]);
+#endif
     c->entered = c->pauses;
   }
   arrived |= status || (!c->t_end && c->segment == c->segments);
@@ -142,6 +159,10 @@ long long NAME(call_each)(NAME(each) *c, long long steps)
       NAME(start)(c->run, c->t, c->t_end ? 0.0 : c->segment_h[0], c->q + j * m, c->p + j * m);
       c->segment = 0;
       c->left = c->t_end ? 0 : c->segment_steps[0];
+#ifdef HAS_H_LOW
+      if (!c->t_end)
+        NAME(call_step_to)(c->run, c->segment_end[0]);
+#endif
       if ((c->entered = c->pauses))
         break;
     }

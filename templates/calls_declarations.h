@@ -23,7 +23,7 @@ typedef struct {
   const NAME(options) *options;
   const double *q, *p, *parameters, *t_end; /* of all trajectories; t_end NULL: fixed steps, in segments */
   const long long *segment_steps, *segment_every;
-  const double *segment_h; /* step size from there on */
+  const double *segment_h, *segment_end; /* step size from there on; of two words: end of a single step, or NaN */
   double *times, *positions, *momenta; /* memory for states */
   int *iterations;
   double *actions; /* memory for the actions up to the states, unless NULL */
@@ -32,7 +32,7 @@ typedef struct {
   double *energies; /* of all trajectories at both ends, unless NULL */
   NAME(report) * report;
   double *workspace, t, tolerance;
-  long long coordinates, parameters_each, segments, every, capacity;
+  long long words, coordinates, parameters_each, segments, every, capacity; /* words: of a time */
   long long rows, next, end, segment, left, requested; /* states in memory; present trajectory, its segment */
   long long pauses, entered; /* with `pauses`, calls end where a segment begins: parameters may change */
 } NAME(each);

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -29,6 +29,7 @@ from scvi_codegen.methods import ARGUMENTS, SVI, Method, as_method, method_from_
 from scvi_codegen.methods.discretise import is_symplectic
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.rendering.source import DOUBLE_DOUBLE, PRECISIONS
 from scvi_codegen.representation import summary
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.core.validation import States
@@ -36,8 +37,8 @@ from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.validation import checks_arguments
 
-DEGREES = (2, 4, 6, 8, 10, 12)
-"""Degrees, or numbers of stages, among which ``advise`` chooses."""
+DEGREES = {1: (2, 4, 6, 8, 10, 12), 2: (8, 12, 16, 20, 24, 32)}
+"""Degrees, or numbers of stages, among which ``advise`` chooses, by the number of words of the states."""
 SAFETY = 2.0
 """Ratio of the tolerance to the error aimed at."""
 BISECTION_RATIO = 1.5
@@ -46,8 +47,10 @@ ORDER_MARGIN = 0.3
 """Largest relative deviation of the measured from the claimed order for extrapolating to untried steps."""
 LANES = 8
 """Numbers in a vector register, for the cost of an evaluation."""
-OVERHEAD = 3.0
-"""Cost of a step in addition to its iterations, in iterations."""
+OVERHEAD = {1: 3.0, 2: 25.0}
+"""Cost of a step in addition to its iterations, in iterations, by the number of words of the states."""
+SHORT_MANTISSA = 2.0**20
+"""Steps of two words have so short a mantissa that their sums are exact; a shorter last one ends at the span."""
 WORK_RATIO = 0.9
 """Ratio of work at which a smaller step is preferred to the largest admissible one."""
 MOST_RODS, STEPS, TRIALS = 16, 100, 3
@@ -129,6 +132,7 @@ def advise(
     degree: bool = False,
     solver: str = "auto",
     options: SolverOptions | None = None,
+    precision: str = "double",
 ) -> Advice:
     """Recommend the largest fixed step size with which positions at the end of a run meet a tolerance.
 
@@ -148,8 +152,10 @@ def advise(
         parameters: values by name (others keep their defaults), or all in order.
         t: initial time.
         degree: also choose the degree (or number of stages) among 2, 4, ..., 12: the one with the fewest evaluations in
-            vector registers of 8 points.
+            vector registers of 8 points; with states of two words among 8, 12, 16, 20, 24 and 32.
         solver, options: solver of the stage equations, as of ``compile_stepper``, and options of the run.
+        precision: ``"double-double"`` for tolerances below 1e-12, as of ``compile_stepper``; the last step of a run
+            to ``t + span`` is then shorter.
 
     Returns:
         The recommendation, reproducible. It has warnings if the tolerance cannot be met (round-off, chaos), or if that
@@ -171,8 +177,11 @@ def advise(
     state = {"p": p, "velocity": velocity, "t": t, "parameters": parameters, "options": options}
     result: list[tuple[float, Advice]] = []
     failures: list[StateError] = []
-    for candidate in _candidates(method) if degree else [method]:
-        for stepper in _steppers(known, candidate, solver):
+    if precision not in PRECISIONS[:2]:
+        raise MethodError(f"advise requires precision='double' or 'double-double', not {precision!r}")
+    compiled = partial(compile_stepper, precision=precision)
+    for candidate in _candidates(method, 1 + (precision == DOUBLE_DOUBLE)) if degree else [method]:
+        for stepper in _steppers(compiled, known, candidate, solver):
             try:
                 result.append(_advised(stepper, candidate, is_symplectic(candidate, known), q, state, length, target))
             except StateError as failure:
@@ -184,22 +193,24 @@ def advise(
         raise failures[-1]
     met = [pair for pair in result if pair[1].expected_error <= target]
     best = min(met, key=lambda pair: pair[0]) if met else min(result, key=lambda pair: pair[1].expected_error)
-    return _with_elimination(best[1], known, q, state)
+    return _with_elimination(compiled, best[1], known, q, state)
 
 
-def _with_elimination(advice: Advice, system: MechanicalSystem, q: States, state: Mapping[str, Any]) -> Advice:
+def _with_elimination(
+    compiled: Callable[..., Stepper], advice: Advice, system: MechanicalSystem, q: States, state: Mapping[str, Any]
+) -> Advice:
     """Return the advice with the time of a step in the angles of rods, if the system has some and they save time."""
     count = eliminable_rods(system)
     if not 0 < count <= MOST_RODS:
         return advice
     try:
-        stepper, reduced = compile_stepper(system, advice.method), eliminate_constraints(system)
+        stepper, reduced = compiled(system, advice.method), eliminate_constraints(system)
         values = {"t": state["t"], "parameters": state["parameters"]}
         run = stepper.start(q, **{**state, "options": None}, h=advice.h)
         constants = stepper.parameters_by_name(stepper._parameters(state["parameters"]))
         angles = reduced.elimination.from_original(run.q, run.p, t=state["t"], parameters=constants)
         degree = f"svi:{advice.degree}" if isinstance(advice.method, SVI) else advice.method
-        other = compile_stepper(reduced, degree).start(**angles, **values, h=advice.h)
+        other = compiled(reduced, degree).start(**angles, **values, h=advice.h)
         seconds = [min(_seconds(each) for _ in range(TRIALS)) for each in (run, other)]
     except (MethodError, StateError, StepFailedError):
         return advice
@@ -253,29 +264,32 @@ def _advised(
         symplectic=symplectic,
         target_error=tolerance / SAFETY,
         most=most,
+        words=stepper.interface.words,
     )
-    choice = _choose(pilot, tolerance)
+    choice = _choose(pilot, tolerance, overhead := OVERHEAD[stepper.interface.words])
     nearest = min(pilot.good, key=lambda k: abs(math.log(k / choice.n)))
-    evaluations = (pilot.runs[nearest].iterations + OVERHEAD) * math.ceil(points / LANES) * LANES  # in full registers
-    return evaluations / pilot.step(choice.n), _advice(pilot, choice, method)
+    evaluations = (pilot.runs[nearest].iterations + overhead) * math.ceil(points / LANES) * LANES  # in full registers
+    return evaluations / pilot.step(choice.n), _advice(pilot, choice, method, stepper.interface.words)
 
 
-def _steppers(system: MechanicalSystem, method: Method, solver: str) -> Iterator[Stepper]:
+def _steppers(
+    compiled: Callable[..., Stepper], system: MechanicalSystem, method: Method, solver: str
+) -> Iterator[Stepper]:
     """Yield steppers for a solver; for ``"auto"`` the fixed-point solver first, whose limit on h is best respected."""
     if solver == "auto":
         with suppress(MethodError):
-            yield compile_stepper(system, method, solver="fixed-point")
-    yield compile_stepper(system, method, solver=solver)
+            yield compiled(system, method, solver="fixed-point")
+    yield compiled(system, method, solver=solver)
 
 
-def _candidates(method: Method) -> list[Method]:
+def _candidates(method: Method, words: int) -> list[Method]:
     specification = dict(method.specification())
     sized = [name for name in ("degree", "stages") if name in ARGUMENTS[str(specification["method"])]]
     if not sized:
         raise MethodError(f"{method.name} has no degree or number of stages to choose: pass degree=False")
     if specification.get("quadrature") == f"gauss-legendre:{specification.get('degree')}":
         del specification["quadrature"]  # the default of its degree: each degree has its own
-    return [method_from_specification(specification | {sized[0]: number}) for number in DEGREES]
+    return [method_from_specification(specification | {sized[0]: number}) for number in DEGREES[words]]
 
 
 def _points(method: Method) -> int:
@@ -293,11 +307,11 @@ class _Choice(NamedTuple):
     tried: bool = True
 
 
-def _choose(pilot: Pilot, tolerance: float) -> _Choice:
+def _choose(pilot: Pilot, tolerance: float, overhead: float) -> _Choice:
     """Return the largest step that meets the tolerance, or whose error is dominated by round-off."""
     floor, (coarse, fine) = pilot.floor_at_end, pilot.compared[-2:]
     target_error = max(tolerance / SAFETY, 2.0 * floor)
-    n = _cheapest(pilot, _bisected(pilot, target_error))
+    n = _cheapest(pilot, _bisected(pilot, target_error), overhead)
     if n is not None or (pilot.rate and floor > tolerance):
         n = n or fine
         return _Choice(n, min(1.0, pilot.error(n)), tuple(_warnings(pilot, tolerance, n)))
@@ -346,11 +360,11 @@ def _bisected(pilot: Pilot, target_error: float) -> int | None:
     return best
 
 
-def _cheapest(pilot: Pilot, n: int | None) -> int | None:
+def _cheapest(pilot: Pilot, n: int | None, overhead: float) -> int | None:
     """Return n, or a larger number of steps with much less work: iterations increase near the convergence limit."""
     if n is None:
         return None
-    work = {k: k * (pilot.runs[k].iterations + OVERHEAD) for k in pilot.compared if k >= n}
+    work = {k: k * (pilot.runs[k].iterations + overhead) for k in pilot.compared if k >= n}
     best = min(work, key=work.__getitem__)
     return best if work[best] < WORK_RATIO * work[n] else n
 
@@ -361,15 +375,20 @@ def _sampled(n: float) -> int:
     return math.ceil(n / unit) * unit
 
 
-def _advice(pilot: Pilot, choice: _Choice, method: Method) -> Advice:
+def _advice(pilot: Pilot, choice: _Choice, method: Method, words: int) -> Advice:
     """Return the recommendation in numbers and words."""
     steps = max(1, math.ceil(choice.n * (pilot.span / pilot.length) * (1.0 - 1e-12)))
+    h = pilot.span / steps
+    if words > 1:
+        mantissa, exponent = math.frexp(h)
+        h = math.ldexp(math.trunc(mantissa * SHORT_MANTISSA) / SHORT_MANTISSA, exponent)
+        steps = math.ceil(pilot.span / h)
     specification = method.specification()
     degree = specification.get("degree", specification.get("stages"))
     shown = sorted(n for n, leg in pilot.runs.items() if n in pilot.compared or leg.failure)
     runs = [(n, pilot.runs[n]) for n in shown]
     return Advice(
-        h=pilot.span / steps,
+        h=h,
         steps=steps,
         degree=degree if isinstance(degree, int) else None,
         method=method,
@@ -378,13 +397,13 @@ def _advice(pilot: Pilot, choice: _Choice, method: Method) -> Advice:
             Evidence(pilot.length / n, pilot.error(n), leg.iterations, leg.seconds / abs(pilot.length))
             for n, leg in runs
         ),
-        message=" ".join(_sentences(pilot, choice, method, steps)),
+        message=" ".join(_sentences(pilot, choice, method, steps, h)),
         warnings=choice.warnings,
     )
 
 
-def _sentences(pilot: Pilot, choice: _Choice, method: Method, steps: int) -> Iterator[str]:
-    yield f"{steps} steps of {pilot.span / steps:.6g} by {method.name}, for an expected error of {choice.error:.1g}."
+def _sentences(pilot: Pilot, choice: _Choice, method: Method, steps: int, h: float) -> Iterator[str]:
+    yield f"{steps} steps of {h:.6g} by {method.name}, for an expected error of {choice.error:.1g}."
     if pilot.whole:
         yield "The pilot runs covered the whole span."
     else:

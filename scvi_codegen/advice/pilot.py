@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from fractions import Fraction
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -22,14 +23,17 @@ import numpy as np
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.methods import Method
 from scvi_codegen.runtime.core.validation import Array
+from scvi_codegen.runtime.core.words import low_words, with_low
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 Integrate = Callable[..., Trajectory]
 
+EPSILON = 2.0**-52
+"""Rounding error of doubles; that of numbers of two words is its square."""
 SAMPLES = 64
 """Number of states of each run that are compared."""
 RESOLVED, ROUNDOFF_LEVEL = 0.01, 1e-9
-"""Bounds of the asymptotic regime: larger errors do not follow a power of h yet, smaller ones are round-off."""
+"""Bounds of the asymptotic regime: larger errors do not follow a power of h yet, smaller ones round-off (of doubles)."""
 SHORTENING, MAX_SHORTENINGS = 4, 20
 """Factor by which pilot runs are shortened, and the largest number of times."""
 SEARCH = 16
@@ -54,7 +58,15 @@ class PilotRun(NamedTuple):
 
 
 def run_pilot(
-    integrate: Integrate, method: Method, q: Array, span: float, *, symplectic: bool, target_error: float, most: int
+    integrate: Integrate,
+    method: Method,
+    q: Array,
+    span: float,
+    *,
+    symplectic: bool,
+    target_error: float,
+    most: int,
+    words: int = 1,
 ) -> Pilot:
     """Return pilot runs over the longest part of the span that can be resolved, with steps down to the error bound.
 
@@ -66,13 +78,14 @@ def run_pilot(
         symplectic: True if steps preserve the symplectic form.
         target_error: error bound at the end of the span.
         most: largest number of steps of a run.
+        words: number of doubles of each number of a state.
 
     Raises:
         StateError: if the solution seems to end in a singularity, or no step size resolves it from the start.
     """
     pilot, first = None, 1
     for cuts in range(MAX_SHORTENINGS, -1, -1):
-        longer = Pilot(integrate, method, q, span, span / SHORTENING**cuts, symplectic)
+        longer = Pilot(integrate, method, q, span, span / SHORTENING**cuts, symplectic, words)
         longer.resolve(first, most // SEARCH)
         if not longer.resolved:
             break
@@ -97,10 +110,17 @@ class Pilot:
     """
 
     def __init__(
-        self, integrate: Integrate, method: Method, q: Array, span: float, length: float, symplectic: bool
+        self,
+        integrate: Integrate,
+        method: Method,
+        q: Array,
+        span: float,
+        length: float,
+        symplectic: bool,
+        words: int = 1,
     ) -> None:
         self.integrate, self.q, self.span, self.length, self.rate = integrate, q, span, length, 0.0
-        self.order, self.symplectic = method.order or 1, symplectic
+        self.order, self.symplectic, self.epsilon = method.order or 1, symplectic, EPSILON**words
         self.runs: dict[int, PilotRun] = {}
 
     @property
@@ -129,7 +149,11 @@ class Pilot:
         if len(self.compared) < 2:
             return False
         coarse, fine = map(self.final_quarter_error, self.compared[-2:])
-        return coarse < RESOLVED and fine <= max(coarse, ROUNDOFF_LEVEL)
+        return coarse < RESOLVED and fine <= max(coarse, self._roundoff_level)
+
+    @property
+    def _roundoff_level(self) -> float:
+        return ROUNDOFF_LEVEL * (self.epsilon / EPSILON)
 
     @property
     def floor(self) -> float:
@@ -137,7 +161,7 @@ class Pilot:
         errors = [self.final_quarter_error(n) for n in self._halved()][-3:]
         falls = max(0.5, 2.0 ** (-0.3 * self.order))
         levelled = [fine > coarse * falls for coarse, fine in pairwise(errors)]
-        shown = levelled == [True, True] or (levelled[-1:] == [True] and errors[-1] < ROUNDOFF_LEVEL)
+        shown = levelled == [True, True] or (levelled[-1:] == [True] and errors[-1] < self._roundoff_level)
         return errors[-1] if shown else 0.0
 
     @property
@@ -149,7 +173,7 @@ class Pilot:
     def floor_at_end(self) -> float:
         """Round-off level of the error at the end of the span, 0 if the runs do not reach it."""
         if self.rate:
-            return self._exploded(max(self.floor, 2.0**-52))
+            return self._exploded(max(self.floor, self.epsilon))
         return self.floor * float((self.span / self.length) ** ROUNDING)
 
     def step(self, n: float) -> float:
@@ -165,7 +189,9 @@ class Pilot:
             self.runs[n] = PilotRun(np.empty((0, 0)), 0.0, time.perf_counter() - began, failure.status)
         else:
             iterations = float(trajectory.iterations.sum()) / n
-            self.runs[n] = PilotRun(trajectory.q[1:], iterations, time.perf_counter() - began)
+            seconds = time.perf_counter() - began
+            q = trajectory.q if self.epsilon == EPSILON else _at_equal_times(trajectory, self.length)
+            self.runs[n] = PilotRun(q[1:], iterations, seconds)
 
     def resolve(self, n: int, most: int) -> None:
         """Halve the step size, starting with n steps, until errors are small."""
@@ -235,6 +261,20 @@ class Pilot:
 
     def _exploded(self, size: float) -> float:
         return size * math.exp(min(self.rate * abs(self.span - self.length), 600.0))
+
+
+def _at_equal_times(trajectory: Trajectory, length: float) -> Array:
+    """Return positions of two words at multiples of ``length / n``, from which times differ, as h is a double.
+
+    The differences are roundings of doubles, so that their square is below two words.
+    """
+    t, n = trajectory.t, len(trajectory) - 1
+    words = zip(np.asarray(t).tolist(), low_words(t).tolist(), strict=True)
+    exact = (Fraction(high) + Fraction(low) - Fraction(float(t[0])) for high, low in words)
+    late = np.array([float(each - k * Fraction(length) / n) for k, each in enumerate(exact)])
+    moved = late[:, np.newaxis] * np.asarray(trajectory.velocity)
+    result: Array = with_low(np.asarray(trajectory.q), low_words(trajectory.q) - moved)
+    return result
 
 
 def _windows(errors: Array) -> tuple[float, float]:

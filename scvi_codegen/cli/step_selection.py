@@ -11,7 +11,7 @@ from scvi_codegen.cli.command_group import tell
 from scvi_codegen.cli.reports import duration
 from scvi_codegen.errors import AccuracyWarning, StateError
 from scvi_codegen.models.model import Model
-from scvi_codegen.rendering.source import DOUBLE_DOUBLE
+from scvi_codegen.rendering.source import DOUBLE_DOUBLE, PRECISIONS
 from scvi_codegen.runtime.core.features import refusal, require
 from scvi_codegen.runtime.run.global_error import GlobalError
 from scvi_codegen.validation import check_tolerance
@@ -86,6 +86,7 @@ def model_with_advised_step(model: Model, tolerance: float) -> Model:
         t=model.t,
         solver=model.solver,
         options=model.solver_options,
+        precision=DOUBLE_DOUBLE if model.in_double_double else PRECISIONS[0],
     )
     numbers = {"h": advice.h, "steps": advice.steps, "message": advice.message, "warnings": list(advice.warnings)}
     tell(_text(advice), advice=numbers)
@@ -96,7 +97,7 @@ def model_with_advised_step(model: Model, tolerance: float) -> Model:
             f"the recommended run has {advice.steps} steps, more than {MAX_STEPS:g}: use a method of higher order, a "
             f"larger --advise or a shorter --span, or pass --step {advice.h:.6g} to run it"
         )
-    return model._with_step_size(h=advice.h, steps=advice.steps)
+    return model._with_step_size(h=advice.h, steps=None if model.in_double_double else advice.steps)
 
 
 def _text(advice: Advice) -> str:

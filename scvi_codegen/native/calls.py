@@ -17,7 +17,7 @@ RESULTS, FIRST_RESULT = Struct("=4d4q"), "error"
 """Format of the last fields of the struct (``calls_declarations.h``), and the first of them."""
 OPTIONAL = (
     *("actions", "advance_to", "measures_growth", "step_error", "rejected", "set_fallback", "fallback_steps"),
-    *("momentum", "project"),
+    *("momentum", "project", "h_low"),
 )
 """Names that not all sources declare, HAS_.. in ``calls.h``."""
 

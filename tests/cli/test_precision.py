@@ -65,7 +65,6 @@ def test_final_state_is_exact_to_thirty_digits(spring: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["run", "--advise", "1e-9", "--span", "2"], "--advise 1e-09 is not available"),
         (["run", "--ensemble", "a.toml", "-o", "a.csv"], "-o a.csv (write a file NAME.npz) is not available"),
         (["generate", "-o", "spring_svi"], "a generated program or FMU is not available"),
         (["generate", "--fmu", "-o", "spring.fmu"], "a generated program or FMU is not available"),
@@ -75,12 +74,22 @@ def test_final_state_is_exact_to_thirty_digits(spring: Path) -> None:
 )
 def test_other_options_and_commands_are_refused(spring: Path, words: list[str], message: str) -> None:
     """Nothing is computed in double without a word."""
-    if "--span" in words:
-        spring.write_text(TEXT.replace("steps = 16\n", ""))
     done = CliRunner().invoke(main, [words[0], str(spring), *words[1:]])
     assert done.exit_code
     assert message in " ".join(done.output.split())
     assert sorted(path.name for path in spring.parent.iterdir()) == ["spring.toml"]
+
+
+def test_advice(spring: Path) -> None:
+    """The step that --advise recommends has the error asked for at the end of the span, to which the last one leads."""
+    spring.write_text(TEXT.replace("step = 0.125\nsteps = 16\n", "span = 1.3\n"))
+    done = CliRunner().invoke(main, ["run", str(spring), "--advise", "1e-24", "--json"])
+    assert done.exit_code == 0, done.output
+    document = json.loads(done.stdout)
+    with mp.workdps(40):
+        end = mp.mpf(document["final"]["q"]["q"]) + document["final"]["q_low"]["q"]
+        assert 1e-30 < abs(end / (mp.cos(1.3) / 2 + mp.sin(1.3) / 4) - 1) < 1e-24
+    assert document["advice"]["steps"] < 16
 
 
 def test_precision_of_error(spring: Path) -> None:

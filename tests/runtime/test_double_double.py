@@ -24,6 +24,7 @@ from scvi_codegen.native.building import TUNED_FLAGS
 from scvi_codegen.native.compilers import REORDERING_FLAGS
 from scvi_codegen.rendering.kernels.double_double import FUNCTIONS, arithmetic_headers
 from scvi_codegen.runtime.core.words import as_mpmath, split, two_words, with_low
+from scvi_codegen.runtime.ensemble.ensemble import Ensemble
 
 KEPLER = "m*(x_dot**2 + y_dot**2)/2 + mu/sqrt(x**2 + y**2)"
 ROOTS = ("sqrt", "inverse_root_1", "inverse_root_3", "inverse_root_5", "inverse_root_7")
@@ -490,6 +491,33 @@ def test_entries() -> None:
         assert x[1].mp() == mp.mpf(1) + mp.mpf(3e-20)
 
 
+@pytest.mark.second
+def test_advice() -> None:
+    """Recommended steps have the error asked for at the end, compared with the exact orbit."""
+    with mp.workdps(50):
+        start = {"q": ["0.5", "0"], "velocity": ["0", mp.sqrt(3)]}
+        for method, tolerance, degree in (("svi:12", 1e-18, False), ("svi:12", 1e-26, False), ("svi:8", 1e-24, True)):
+            advice = sc.advise(
+                system("kepler"),
+                method,
+                **start,
+                span=9.3,
+                tolerance=tolerance,
+                degree=degree,
+                precision="double-double",
+            )
+            stepper = sc.compile_stepper(system("kepler"), advice.method, precision="double-double")
+            run = stepper.integrate(**start, h=advice.h, t_end=9.3)
+            exact = exact_orbit(9.3)
+            error = mp.norm([x - y for x, y in zip(run.mp("q")[-1], exact, strict=True)]) / mp.norm(exact)
+            assert tolerance / 1000 < error < tolerance
+            assert not advice.warnings
+            assert len(run) == advice.steps + 1
+            assert degree == (advice.degree > 12)
+    with pytest.raises(MethodError, match="'double' or 'double-double', not 'auto'"):
+        sc.advise(system("kepler"), "svi:4", [1.0, 0.0], [0.0, 1.0], 1.0, 1e-9, precision="auto")
+
+
 def test_ensembles(tmp_path: Path) -> None:
     """Trajectories of ensembles equal single runs bit for bit, in both words, and the exact orbit; also in files."""
     stepper = sc.compile_stepper(system("kepler"), "svi:12", precision="double-double")
@@ -504,6 +532,8 @@ def test_ensembles(tmp_path: Path) -> None:
             {"t_end": 2.0, "t_eval": [0.3, 1.1]},
         ):
             runs = stepper.integrate_ensemble(q, velocity=v, parameters=parameters, **steps)
+            together = Ensemble(stepper, q, None, velocity=v, parameters=parameters, **steps).successive
+            assert (together is None) == ("t_eval" in steps)  # integrated by one call of C
             for j, values in enumerate(single):
                 run = stepper.integrate(q[j], velocity=v[j], parameters=values, **steps)
                 for name in ("t", "q", "p", "parameters", "energy", "momentum_maps"):

@@ -133,7 +133,7 @@ def run(
     wanted = {name: choices.pop(name) for name in ERRORS}
     _check_combination(choices, plot=plot, ensemble=ensemble, wanted=wanted, folder=output if recorded else None)
     model = read_model(model_name, choices)
-    _check_words(model, {"-o": output, "--advise": wanted["advise"]})
+    _check_words(model, {"-o": output})
     if model.precision in (DOUBLE_DOUBLE, AUTO):
         model = model.with_known_sizes()
     if ensemble is not None:

@@ -94,7 +94,7 @@ _CURVE = "SVI, SCVI or a Gauss method"
 _ACTIONS = "action shadow_energy path"
 _IN_DOUBLE = (
     "check_growth device observe_ensemble work discrete_lagrangian "
-    f"chaos_ensemble periodic_orbit energy fit flow advice {_ACTIONS}"
+    f"chaos_ensemble periodic_orbit energy fit flow {_ACTIONS}"
 )
 _ORIGINAL = "compile the original system, with fixed steps h, or with time_transformation=... or t_end=..."
 FEATURES = {

@@ -19,6 +19,7 @@ from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import OUTCOMES, SolverOptions
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array
+from scvi_codegen.runtime.core.words import block_of, from_block
 from scvi_codegen.runtime.ensemble.result import INTERRUPTED, OK
 from scvi_codegen.runtime.ensemble.schedule import FixedSegments
 from scvi_codegen.runtime.ensemble.thread_pool import StopCheck, run_jobs
@@ -81,7 +82,7 @@ class Batch:
         values_at: Callable[[float, slice], Array] | None = None,
     ) -> None:
         self.binding, self.options, self.t, self.steps, self.values_at = binding, options, t, steps, values_at
-        self.q, self.p, self.parameters = (np.ascontiguousarray(each) for each in (*start, parameters))
+        self.q, self.p, self.parameters = (np.ascontiguousarray(block_of(each)) for each in (*start, parameters))
         if values_at is not None:
             self.parameters = self.parameters.copy()
         self.status = np.full(len(self.q), -1, np.int32)
@@ -143,7 +144,7 @@ class Call:
         self.options = struct.options = binding.options(work.options)
         struct.q, struct.p, struct.parameters = map(binding.pointer, (work.q, work.p, work.parameters))
         if isinstance(work.steps, FixedSegments):
-            steps, save_every, h, _ = work.steps
+            steps, save_every, h, *_ = work.steps
             struct.segment_steps, struct.segment_every = map(binding.whole_numbers, (steps, save_every))
             struct.segment_h, struct.segments = binding.pointer(h), len(h)
         struct.status, struct.done = binding.integers(work.status), binding.whole_numbers(work.done)
@@ -209,7 +210,8 @@ class SuccessiveRuns(Batch):
         receive: Callable[[Rows], None],
     ) -> None:
         super().__init__(stepper.binding, *arguments)
-        self.conserves_energy = stepper.interface.conserves_energy
+        self.words = stepper.interface.words
+        self.conserves_energy = stepper.interface.conserves_energy and self.words == 1
         self.tolerance, self.save_every, self.receive, count = tolerance, save_every, receive, len(self.q)
         self.stored, self.fallback_steps = np.zeros((2, count), np.int64)
         self.energies = np.full((count, 2), np.nan)
@@ -240,18 +242,20 @@ class _SuccessiveCall(Call):
         self.workspace = struct.workspace = binding.workspace(self.runs[0])
         if binding.count is None:
             self.copy = struct.before = binding.new("run *")
-        if not isinstance(work.steps, FixedSegments):
+        if isinstance(work.steps, FixedSegments):
+            struct.segment_end = binding.pointer(work.steps.end)
+        else:
             struct.t_end, struct.tolerance = binding.pointer(work.steps), work.tolerance
             if work.conserves_energy:
                 struct.energies = binding.pointer(work.energies)
         struct.stored, struct.fallback_steps = map(binding.whole_numbers, (work.stored, work.fallback_steps))
         struct.coordinates, struct.parameters_each, struct.every = m, work.parameters.shape[1], work.save_every
-        struct.capacity = self.capacity
+        struct.words, struct.capacity = work.words, self.capacity
         self.iterations = np.empty(self.capacity, np.int32)
         struct.iterations = binding.integers(self.iterations)
         self.actions = np.full(self.capacity, np.nan)
         (struct.actions,) = binding.pointers(self.actions)
-        self.states = np.empty(self.capacity), np.empty((self.capacity, m)), np.empty((self.capacity, m))
+        self.states = tuple(np.empty((self.capacity, numbers)) for numbers in (work.words, m, m))
         struct.times, struct.positions, struct.momenta = binding.pointers(*self.states)
 
     def store(self, *, last: bool = False) -> None:
@@ -264,8 +268,9 @@ class _SuccessiveCall(Call):
         first[0] += self.before
         numbers = work.stored[each] + 1 - first
         rows = np.arange(count) + np.repeat(first + numbers - np.cumsum(numbers), numbers)
-        t, q, p = (states[:count] for states in self.states)
-        work.receive(Rows(rows, np.repeat(each, numbers), t, q, p, self.actions[:count]))
+        states = (each[:count] if work.words == 1 else from_block(each[:count]) for each in self.states)
+        t, q, p = states
+        work.receive(Rows(rows, np.repeat(each, numbers), t[:, 0], q, p, self.actions[:count]))
         self.flushed = int(call.next)
         self.before = int(work.stored[self.flushed]) if self.flushed < call.end and call.segment >= 0 else 0
         call.rows = 0

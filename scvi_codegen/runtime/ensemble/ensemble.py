@@ -180,7 +180,7 @@ class Ensemble:
         stepper = self.stepper
         if self.common is not None or self.adaptive is not None:
             return None
-        if self.inputs or self.singly or stepper.in_tau or not stepper.binding.reusable:
+        if self.inputs or stepper.changes_states or stepper.in_tau or not stepper.binding.reusable:
             return None
         ends = self.ends
         if self.error is not None or not (self.t_eval is None or self._saves_ends(ends)):
@@ -191,7 +191,7 @@ class Ensemble:
             self.start,
             self.parameters,
             self.t0,
-            ends,
+            ends if self.fixed is None else self.fixed.fixed_segments(),
             tolerance=self.plans[0].tolerance,
             save_every=self.save_every if self.t_eval is None else LARGEST_COUNT,
             receive=lambda states: self.states.append(states.copies()),
@@ -432,17 +432,20 @@ class Ensemble:
 
     def _successive_result(self, work: SuccessiveRuns) -> EnsembleTrajectory:
         states, shape = self.states, (1 + int(work.stored.max()), *self.start[0].shape)
-        q, p, times, actions = *np.full((2, *shape), np.nan), *np.full((2, *shape[:2]), np.nan)
+        words, actions = self.stepper.interface.words, np.full(shape[:2], np.nan)
+        q, p, times = missing(shape, words), missing(shape, words), missing(shape[:2], words)
         q[0], p[0], times[0], actions[0] = *self.start, self.t0, 0.0
         for rows, j, *values in states:
             times[rows, j], q[rows, j], p[rows, j], actions[rows, j] = values
         if self.t_eval is None:
             numbers = np.arange(shape[0], dtype=float)
+            if self.fixed is not None:
+                numbers, times = times[:, work.stored.argmax()], None
             whole = self._trajectories(numbers, times, q, p, work.names, work.done, work.fallback_steps)
             return replace(whole, actions=actions) if self.stepper.sums_action else whole
         at = np.where(self.t_eval == self.t0, 0, 1)
-        missing = np.full_like(q[:1], np.nan)
-        q, p = (np.concatenate([each, missing])[at] for each in (q, p))  # if no trajectory reached the end
+        none = missing((1, *shape[1:]), words)  # if no trajectory reached the end
+        q, p = (np.concatenate([each, none])[at] for each in (q, p))
         return self._trajectories(self.t_eval, None, q, p, work.names, work.done, work.fallback_steps)
 
     def _trajectories(

@@ -29,12 +29,13 @@ class StepChunk(NamedTuple):
 
 
 class FixedSegments(NamedTuple):
-    """Fixed steps in segments: their numbers of steps, strides of saved states, step sizes, and middle times."""
+    """Fixed steps in segments: numbers of steps, strides of saved states, step sizes, middle times, ends (or NaN)."""
 
     steps: NDArray[np.int64]
     save_every: NDArray[np.int64]
     h: Array
     middle: Array
+    end: Array
 
 
 class CommonSteps:
@@ -96,9 +97,10 @@ class CommonSteps:
         segment, rows = self.segments[0], []
         for chunk in self.chunks(0, self.steps):
             segment = chunk.entered or segment
-            rows.append((chunk.steps, chunk.save_every, segment.h, segment.middle))
-        steps, save_every, h, middle = zip(*rows or [(0, 1, self.h, self.t0)], strict=True)
-        return FixedSegments(np.array(steps), np.array(save_every), np.array(h), np.array(middle))
+            end = np.nan if segment.end is None else segment.end
+            rows.append((chunk.steps, chunk.save_every, segment.h, segment.middle, end))
+        columns = zip(*rows or [(0, 1, self.h, self.t0, np.nan)], strict=True)
+        return FixedSegments(*map(np.array, columns))
 
     def at(self, step: int) -> tuple[Segment, tuple[float, float]]:
         """Return the segment and the double-double time after ``step`` steps."""
