@@ -291,8 +291,9 @@ class Sources:
             with announced(f"deriving the equations of {self.system.name} by {self.method.name}"):
                 program = self._derived(solver=self.solver, fallback=fallback)
                 if self.precision == DOUBLE_DOUBLE and not self._corrected(program):
-                    with tables_in_two_words():
-                        program = self._derived(solver="newton" if self.solver == "auto" else self.solver)
+                    with tables_in_two_words():  # RATTLE is an iteration for the solution of Newton's equations
+                        by_newton = self.solver == "auto" and not program.rattle
+                        program = self._derived(solver="newton" if by_newton else self.solver)
                 self._programs[fallback] = program
         return self._programs[fallback]
 
@@ -336,7 +337,7 @@ class Sources:
         It has for constant masses and forces of position and time that have not too many derivatives.
         """
         fixed_point = program.fixed_point
-        if fixed_point is None or fixed_point.name != "separable":
+        if fixed_point is None or fixed_point.name != "separable" or program.damping:
             return None
         return point_derivatives_of(self.system, fixed_point)
 
@@ -347,10 +348,6 @@ class Sources:
             reason = "arrays have sizes known at run time: pass sizes={..}"
         elif self.g is not None or self.system.clock:
             reason = "time is transformed: use fixed steps h in physical time"
-        elif self.system.damping != 0:
-            reason = 'it has a damping: write it as forces, "-gamma*p"'
-        elif forms_of(self.system).one_form:
-            reason = "its velocities do not determine its momenta: use precision='double'"
         elif self.solver == "fixed-point" and not self._corrected(self.program()):
             reason = (
                 f"solver={self.solver!r} requires constant diagonal masses and forces of position and time: omit it"

@@ -80,7 +80,7 @@ class Advice:
     """Recommended step size, and the pilot runs that support it.
 
     Attributes:
-        h: step size, ``span / steps``; negative for a span backward.
+        h: step size, ``span / steps``, of states of two words slightly less; negative for a span backward.
         steps: number of steps.
         degree: degree or number of stages of ``method``, ``None`` if it has none.
         method: recommended method: the one passed, or the one of the best degree.

@@ -33,7 +33,7 @@ EPSILON = 2.0**-52
 SAMPLES = 64
 """Number of states of each run that are compared."""
 RESOLVED, ROUNDOFF_LEVEL = 0.01, 1e-9
-"""Bounds of the asymptotic regime: larger errors do not follow a power of h, smaller ones are round-off (of doubles)."""
+"""Bounds of the asymptotic regime: larger errors follow no power of h, smaller ones are round-off (of doubles)."""
 SHORTENING, MAX_SHORTENINGS = 4, 20
 """Factor by which pilot runs are shortened, and the largest number of times."""
 SEARCH = 16

@@ -229,6 +229,7 @@ def _render_mixed_newton(program: Program, control: Control | None) -> Source:
     of_states = (
         *(group.value for group in program.equations.stage_groups),
         *(quantities.energy, quantities.inverse_legendre, quantities.momentum_kernel),
+        *(quantities.first_order_rates, program.damping),
         constraints and constraints.motion,
     )
     with_partials = quantities.legendre, constraints and constraints.kernel
@@ -239,7 +240,7 @@ def _render_mixed_newton(program: Program, control: Control | None) -> Source:
     context = _context(program, DOUBLE, control)
     context |= {
         "unrolled_equations": None,
-        "two_words": {"of_numbers": kernels, "functions": uses_functions(kernels)},
+        "two_words": {"of_numbers": kernels, "functions": bool(program.damping) or uses_functions(kernels)},
         "own_headers": {**arithmetic_headers(), **cast("Mapping[str, str]", context["own_headers"])},
     }
     return _render(program.prefix, context)

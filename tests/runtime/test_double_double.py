@@ -373,11 +373,6 @@ def test_refusals() -> None:
     for name, value in refused.items():
         with pytest.raises(MethodError, match="precision='double-double' is not available"):
             sc.compile_stepper(kepler, "svi:4", precision="double-double", **{name: value})
-    damped = sc.LagrangianSystem.from_text(
-        name="damped", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2", damping="0.1"
-    )
-    with pytest.raises(MethodError, match="write it as forces"):
-        sc.compile_stepper(damped, "svi:4", precision="double-double")
     stepper = sc.compile_stepper(kepler, "svi:4", precision="double-double")
     assert stepper.supports("adaptive")
     assert not stepper.supports("observe_ensemble")

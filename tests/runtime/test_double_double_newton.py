@@ -23,6 +23,7 @@ STATES = {
     "charge": ([0.7, 0.2], [0.1, 0.4]),
     "kepler": ([0.8, 0.0], [0.0, 1.2]),
     "sleigh": ([0.1, 0.2, 0.0], [0.5, 0.0, 0.2]),
+    "damped": ([0.7, 0.2], [0.1, 0.4]),
 }
 
 
@@ -34,6 +35,11 @@ def system(name: str) -> sc.LagrangianSystem:
         "masses": (["a", "b"], MUTUAL, {}),
         "friction": (["q"], "q_dot**2/2 - q**2/2", {"forces": {"q": "-q_dot/10"}}),
         "charge": (PLANE, "(x_dot**2 + y_dot**2)/2 + (x*y_dot - y*x_dot)/2 - (x**2 + y**2)**2/4", {}),
+        "damped": (
+            PLANE,
+            "(x_dot**2 + y_dot**2)/2 - x**2/2 - x**2*y**2",
+            {"damping": "g", "parameters": {"g": 0.3}},
+        ),
         "kepler": (PLANE, "(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2)", {}),
         "sleigh": (
             [*PLANE, "phi"],
@@ -78,7 +84,7 @@ def check_step(stepper: sc.Stepper, form, method: str, q, p, t: float = 0.0) -> 
 @pytest.mark.parametrize(
     ("name", "method"),
     [
-        *((name, "svi:3") for name in ("rod", "rods", "four-bar", "masses", "charge", "sleigh")),
+        *((name, "svi:3") for name in ("rod", "rods", "four-bar", "masses", "charge", "sleigh", "damped")),
         ("rod", "svi:1"),
         ("friction", "stoermer-verlet"),
         ("masses", "sc:3"),
@@ -107,6 +113,22 @@ def test_rotations(top: bool) -> None:
         assert largest(sum(x * x for x in row) - 1 for row in run.mp("q")) < 1e-30
         maps = run.mp("momentum_maps")
         assert largest(maps[-1] - maps[0]) < 1e-30
+
+
+@pytest.mark.second
+def test_first_order() -> None:
+    """Steps of a guiding centre are accurate to 3e-31, and it stays where H has its value."""
+    text = "(1 + x**2 + y**2)*(x*y_dot - y*x_dot)/2 - cos(x) - sin(y)"
+    particle = sc.LagrangianSystem.from_text(name="particle", coordinates=PLANE, lagrangian=text)
+    stepper = sc.compile_stepper(particle, "svi:4", precision="double-double")
+    form = discretised_form(particle, as_method("svi:4", particle))
+    check_step(stepper, form, "svi:4", {"x": 1.0, "y": 0.75}, None, t=0.5)
+    run = stepper.integrate({"x": 1.0, "y": 0.75}, h=1 / 1024, steps=100)
+    assert run.energy_error() < 1e-30
+    v = stepper.velocity(run.q[-1], run.p[-1])
+    with mp.workdps(40):
+        x, y = run.mp("q")[-1][0], run.mp("p")[-1][0]  # x' = -H_y / b, b = 1 + 2 (x^2 + y^2)
+        assert abs(v.mp()[0] - mp.cos(y) / (1 + 2 * (x * x + y * y))) < 1e-31
 
 
 @pytest.mark.second

@@ -1,4 +1,5 @@
 #include "../newton/newton.h"
+#include "pair_states.h"
 #include "stage_pairs.h"
 
 /* Step in double-double arithmetic by mixed precision (iterative refinement; Higham, Accuracy and Stability of
@@ -31,6 +32,25 @@ static inline double correct_pairs(pair_equations *at, newton_data *data, const 
   return change;
 }
 
+#ifdef FIRST_ORDER_SYSTEM
+/* Increments of y, whose high words dp has, from those of the momenta theta(q, y) in the rows. */
+static inline int variable_pairs(const step_data *step, const pair_equations *at, const double *dq, double *dp)
+{
+  dd u[2 * M], theta[M];
+  for (int i = 0; i < M; i++) {
+    u[i] = dd_add(at->q0[i], dd_of(dq[i], dq[M + i]));
+    u[M + i] = dd_word(step->p0[i] + (step->carry_p[i] + dp[i]));
+    theta[i] = dd_add(at->p0[i], at->rows[i * (B + 1) + B]);
+  }
+  const int status = correct_transform(dd_add(at->t, at->h), u, theta, at->parameters, step->scratch);
+  for (int i = 0; i < M; i++) {
+    const dd change = dd_subtract(u[M + i], dd_of(step->p0[i], step->carry_p[i]));
+    dp[i] = change.high, dp[M + i] = change.low;
+  }
+  return status;
+}
+#endif
+
 /* Replaces the increments of a step, solved in double, by those in two words; `memory` has its unknowns. The workspace
  * then has the factors of the Jacobian at these. On failure they are undefined. */
 static int refine_increments(const step_data *step, double *memory, double t_low, double h_low, double *dq, double *dp,
@@ -40,6 +60,22 @@ static int refine_increments(const step_data *step, double *memory, double t_low
   const band shape = band_of(SITES, B);
   pair_equations at = {.t = dd_of(step->t, t_low), .h = dd_of(step->h, h_low), .parameters = step->parameters};
   double size_p[SITES], size_q[M], last = INFINITY, largest = 0.0;
+  for (int i = 0; i < M; i++) {
+    at.q0[i] = dd_of(step->q0[i], step->carry_q[i]);
+    at.p0[i] = dd_of(step->p0[i], step->carry_p[i]);
+  }
+#ifdef FIRST_ORDER_SYSTEM
+  double theta[M];
+  dd u[2 * M];
+  step_data with_momenta = *step;
+  memcpy(u, at.q0, sizeof at.q0);
+  memcpy(u + M, at.p0, sizeof at.p0);
+  transform_of_pairs(at.t, u, at.parameters, at.p0, NULL);
+  for (int i = 0; i < M; i++)
+    theta[i] = at.p0[i].high;
+  with_momenta.theta0 = theta;
+  step = &with_momenta;
+#endif
   memcpy(data->z, memory, sizeof(double) * N);
   evaluate(step, data->z, data->rows, size_p, size_q, data->factors, &shape);
   if (!all_finite(data->rows, N + SITES) || !all_finite(size_q, M))
@@ -50,8 +86,6 @@ static int refine_increments(const step_data *step, double *memory, double t_low
   for (int i = 0; i < M; i++)
     largest = larger(largest, size_q[i]);
   for (int i = 0; i < M; i++) {
-    at.q0[i] = dd_of(step->q0[i], step->carry_q[i]);
-    at.p0[i] = dd_of(step->p0[i], step->carry_p[i]);
     size_q[i] = 1.0 / (size_q[i] + 1e-3 * largest + DBL_MIN);
   }
   for (int k = 0; k < N; k++)
@@ -67,13 +101,24 @@ static int refine_increments(const step_data *step, double *memory, double t_low
       return NOT_CONVERGED;
     last = change;
   }
+#ifdef DAMPED
+  shrink_pairs(&at);
+#endif
   for (int i = 0; i < M; i++) {
     dd q = dd_of(0.0, 0.0);
     for (int b = 0; b < B; b++)
       q = dd_add(q, times_entry(END_POSITION[b], END_POSITION_LOW[b], at.z[i * B + b]));
     q = dd_multiply(at.h, q);
+    dq[i] = q.high, dq[M + i] = q.low;
+#ifndef FIRST_ORDER_SYSTEM
     const dd p = at.rows[i * (B + 1) + B];
-    dq[i] = q.high, dq[M + i] = q.low, dp[i] = p.high, dp[M + i] = p.low;
+    dp[i] = p.high, dp[M + i] = p.low;
+#endif
   }
+#ifdef FIRST_ORDER_SYSTEM
+  const int status = variable_pairs(step, &at, dq, dp);
+  if (status != OK)
+    return status;
+#endif
   return all_finite(dq, 2 * M) && all_finite(dp, 2 * M) ? OK : NOT_FINITE;
 }

@@ -27,27 +27,15 @@ static inline int transform_of_pairs(dd t, dd *u, const double *parameters, dd *
   return OK;
 }
 
-/* Replaces x in u = (q, x) by that with the given y. */
-static inline int invert_pairs(dd t, dd *u, const dd *y, const double *parameters, double *workspace)
+#ifndef INVERSE_LEGENDRE
+/* Corrects the x in u = (q, x), which is accurate to one word, to that with the given y. */
+static inline int correct_transform(dd t, dd *u, const dd *y, const double *parameters, double *workspace)
 {
-#ifdef INVERSE_LEGENDRE
-  dd x[M];
-  memcpy(u + M, y, sizeof(dd) * M);
-  inverse_legendre_pairs(u, t, parameters, x);
-  memcpy(u + M, x, sizeof x);
-  (void)workspace;
-#else
   enum { CORRECTIONS = 3 };
   const band shape = band_of(M, 1);
-  double q[M], high[2 * M], value[M], pivot[M];
-  int status;
-  for (int i = 0; i < M; i++)
-    q[i] = u[i].high, high[i] = y[i].high;
-  status = inverse_transform(t.high, q, high, parameters, value, workspace);
-  if (status != OK)
-    return status;
-  for (int i = 0; i < M; i++)
-    high[i] = q[i], high[M + i] = value[i], u[M + i] = dd_word(value[i]);
+  double high[2 * M], value[M], pivot[M];
+  for (int i = 0; i < 2 * M; i++)
+    high[i] = u[i].high;
   transform_and_derivatives(t.high, high, parameters, value, workspace);
   if (!factorise(workspace, &shape, pivot))
     return SINGULAR;
@@ -60,8 +48,31 @@ static inline int invert_pairs(dd t, dd *u, const dd *y, const double *parameter
     for (int i = 0; i < M; i++)
       u[M + i] = dd_add(u[M + i], dd_word(value[MASS_POSITION[i]]));
   }
-#endif
   return OK;
+}
+#endif
+
+/* Replaces x in u = (q, x) by that with the given y. */
+static inline int invert_pairs(dd t, dd *u, const dd *y, const double *parameters, double *workspace)
+{
+#ifdef INVERSE_LEGENDRE
+  dd x[M];
+  memcpy(u + M, y, sizeof(dd) * M);
+  inverse_legendre_pairs(u, t, parameters, x);
+  memcpy(u + M, x, sizeof x);
+  (void)workspace;
+  return OK;
+#else
+  double q[M], high[M], value[M];
+  for (int i = 0; i < M; i++)
+    q[i] = u[i].high, high[i] = y[i].high;
+  const int status = inverse_transform(t.high, q, high, parameters, value, workspace);
+  if (status != OK)
+    return status;
+  for (int i = 0; i < M; i++)
+    u[M + i] = dd_word(value[i]);
+  return correct_transform(t, u, y, parameters, workspace);
+#endif
 }
 
 #ifdef HAMILTONIAN_SYSTEM
@@ -87,12 +98,50 @@ static inline int state_transform(int inverse, dd t, const dd *q, const dd *x, c
 
 static inline int momenta_of(dd t, const dd *q, const dd *v, const double *parameters, dd *p, double *workspace)
 {
+#ifdef FIRST_ORDER_SYSTEM
+  (void)t, (void)q, (void)v, (void)parameters, (void)p, (void)workspace;
+  return SINGULAR;
+#else
   return state_transform(MOMENTA_INVERTED, t, q, v, parameters, p, workspace);
+#endif
 }
 
 static inline int velocities_of(dd t, const dd *q, const dd *p, const double *parameters, dd *v, double *workspace)
 {
+#ifdef FIRST_ORDER_SYSTEM
+  enum { SOLUTIONS = 4 }; /* of theta_y^T v = H_y: the first one, and corrections */
+  const band shape = band_of(M, 1);
+  double right[M], pivot[M];
+  dd u[2 * M], theta[M + MASS_ENTRIES], rates[M];
+  memcpy(u, q, sizeof(dd) * M);
+  memcpy(u + M, p, sizeof(dd) * M);
+  legendre_pairs(u, t, parameters, theta);
+  first_order_rates_pairs(u, t, parameters, rates);
+  memset(workspace, 0, sizeof(double) * band_size(&shape));
+  for (int e = 0; e < MASS_ENTRIES; e++)
+    workspace[shape.first + MASS_POSITION[MASS_ENTRY[e][0]] * shape.stride + MASS_POSITION[MASS_ENTRY[e][1]]] =
+        theta[M + e].high;
+  if (!all_finite(workspace, (int)band_size(&shape)))
+    return NOT_FINITE;
+  if (!factorise(workspace, &shape, pivot))
+    return SINGULAR;
+  memset(v, 0, sizeof(dd) * M);
+  for (int k = 0; k < SOLUTIONS; k++) {
+    dd rest[M];
+    memcpy(rest, rates, sizeof rest);
+    for (int e = 0; e < MASS_ENTRIES; e++)
+      rest[MASS_ENTRY[e][1]] =
+          dd_subtract(rest[MASS_ENTRY[e][1]], dd_multiply(theta[M + e], v[MASS_ENTRY[e][0]]));
+    for (int i = 0; i < M; i++)
+      right[MASS_POSITION[i]] = rest[i].high;
+    back_substitute(workspace, &shape, pivot, right);
+    for (int i = 0; i < M; i++)
+      v[i] = dd_add(v[i], dd_word(right[MASS_POSITION[i]]));
+  }
+  return OK;
+#else
   return state_transform(!MOMENTA_INVERTED, t, q, p, parameters, v, workspace);
+#endif
 }
 #else
 static inline int momenta_of(dd t, const dd *q, const dd *v, const double *parameters, dd *p, double *workspace)
