@@ -266,10 +266,10 @@ def _advised(
         most=most,
         words=stepper.interface.words,
     )
-    choice = _choose(pilot, tolerance, overhead := OVERHEAD[stepper.interface.words])
+    choice, overhead = _choose(pilot, tolerance), OVERHEAD[pilot.words]
     nearest = min(pilot.good, key=lambda k: abs(math.log(k / choice.n)))
     evaluations = (pilot.runs[nearest].iterations + overhead) * math.ceil(points / LANES) * LANES  # in full registers
-    return evaluations / pilot.step(choice.n), _advice(pilot, choice, method, stepper.interface.words)
+    return evaluations / pilot.step(choice.n), _advice(pilot, choice, method)
 
 
 def _steppers(
@@ -307,11 +307,11 @@ class _Choice(NamedTuple):
     tried: bool = True
 
 
-def _choose(pilot: Pilot, tolerance: float, overhead: float) -> _Choice:
+def _choose(pilot: Pilot, tolerance: float) -> _Choice:
     """Return the largest step that meets the tolerance, or whose error is dominated by round-off."""
     floor, (coarse, fine) = pilot.floor_at_end, pilot.compared[-2:]
     target_error = max(tolerance / SAFETY, 2.0 * floor)
-    n = _cheapest(pilot, _bisected(pilot, target_error), overhead)
+    n = _cheapest(pilot, _bisected(pilot, target_error))
     if n is not None or (pilot.rate and floor > tolerance):
         n = n or fine
         return _Choice(n, min(1.0, pilot.error(n)), tuple(_warnings(pilot, tolerance, n)))
@@ -360,11 +360,11 @@ def _bisected(pilot: Pilot, target_error: float) -> int | None:
     return best
 
 
-def _cheapest(pilot: Pilot, n: int | None, overhead: float) -> int | None:
+def _cheapest(pilot: Pilot, n: int | None) -> int | None:
     """Return n, or a larger number of steps with much less work: iterations increase near the convergence limit."""
     if n is None:
         return None
-    work = {k: k * (pilot.runs[k].iterations + overhead) for k in pilot.compared if k >= n}
+    work = {k: k * (pilot.runs[k].iterations + OVERHEAD[pilot.words]) for k in pilot.compared if k >= n}
     best = min(work, key=work.__getitem__)
     return best if work[best] < WORK_RATIO * work[n] else n
 
@@ -375,11 +375,11 @@ def _sampled(n: float) -> int:
     return math.ceil(n / unit) * unit
 
 
-def _advice(pilot: Pilot, choice: _Choice, method: Method, words: int) -> Advice:
+def _advice(pilot: Pilot, choice: _Choice, method: Method) -> Advice:
     """Return the recommendation in numbers and words."""
     steps = max(1, math.ceil(choice.n * (pilot.span / pilot.length) * (1.0 - 1e-12)))
     h = pilot.span / steps
-    if words > 1:
+    if pilot.words > 1:
         mantissa, exponent = math.frexp(h)
         h = math.ldexp(math.trunc(mantissa * SHORT_MANTISSA) / SHORT_MANTISSA, exponent)
         steps = math.ceil(pilot.span / h)

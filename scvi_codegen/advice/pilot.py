@@ -120,7 +120,8 @@ class Pilot:
         words: int = 1,
     ) -> None:
         self.integrate, self.q, self.span, self.length, self.rate = integrate, q, span, length, 0.0
-        self.order, self.symplectic, self.epsilon = method.order or 1, symplectic, EPSILON**words
+        self.order, self.symplectic, self.words = method.order or 1, symplectic, words
+        self.epsilon = EPSILON**words
         self.runs: dict[int, PilotRun] = {}
 
     @property
@@ -190,7 +191,7 @@ class Pilot:
         else:
             iterations = float(trajectory.iterations.sum()) / n
             seconds = time.perf_counter() - began
-            q = trajectory.q if self.epsilon == EPSILON else _at_equal_times(trajectory, self.length)
+            q = trajectory.q if self.words == 1 else _at_equal_times(trajectory, self.length)
             self.runs[n] = PilotRun(q[1:], iterations, seconds)
 
     def resolve(self, n: int, most: int) -> None:

@@ -9,7 +9,7 @@ Verification, on the whole run, of the error for which a step size was recommend
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -17,7 +17,9 @@ from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import ScviCodegenError, StateError
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import default_method
+from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.core.validation import Array
+from scvi_codegen.runtime.core.words import Words
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
@@ -140,7 +142,7 @@ def missed_tolerance(
         tolerance: error |q - q_exact| / |q| for which the step size was recommended.
         known: error estimate from a second run.
     """
-    if trajectory.stepper.interface.words > 1:
+    if isinstance(trajectory.q, Words):
         return _missed_in_two_words(trajectory, tolerance)
     doubt = _worst_step(trajectory, tolerance) or _lost_energy(system, trajectory, tolerance)
     if known is None and doubt:
@@ -159,7 +161,7 @@ def _missed_in_two_words(trajectory: Trajectory, tolerance: float) -> str:
     settings: dict[str, Any] = {"t": float(trajectory.t[0]), "parameters": trajectory.parameters}
     h, end = SECOND_STEP * trajectory.h, float(trajectory.t[-1])
     try:
-        second = trajectory.stepper.integrate(
+        second = cast(Stepper, trajectory.stepper).integrate(
             trajectory.q[0], trajectory.p[0], h=h, t_end=end, save_every=trajectory.steps, **settings
         )
     except ScviCodegenError:

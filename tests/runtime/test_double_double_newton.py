@@ -127,8 +127,8 @@ def test_first_order() -> None:
     assert run.energy_error() < 1e-30
     v = stepper.velocity(run.q[-1], run.p[-1])
     with mp.workdps(40):
-        x, y = run.mp("q")[-1][0], run.mp("p")[-1][0]  # x' = -H_y / b, b = 1 + 2 (x^2 + y^2)
-        assert abs(v.mp()[0] - mp.cos(y) / (1 + 2 * (x * x + y * y))) < 1e-31
+        y, x = run.mp("q")[-1][0], run.mp("p")[-1][0]  # b y' = H_x, b = 1 + 2 (x^2 + y^2)
+        assert abs(v.mp()[0] + mp.sin(x) / (1 + 2 * (x * x + y * y))) < 1e-31
 
 
 @pytest.mark.second

@@ -434,14 +434,15 @@ class Ensemble:
         states, shape = self.states, (1 + int(work.stored.max()), *self.start[0].shape)
         words, actions = self.stepper.interface.words, np.full(shape[:2], np.nan)
         q, p, times = missing(shape, words), missing(shape, words), missing(shape[:2], words)
+        own: Array | None = times
         q[0], p[0], times[0], actions[0] = *self.start, self.t0, 0.0
         for rows, j, *values in states:
             times[rows, j], q[rows, j], p[rows, j], actions[rows, j] = values
         if self.t_eval is None:
             numbers = np.arange(shape[0], dtype=float)
             if self.fixed is not None:
-                numbers, times = times[:, work.stored.argmax()], None
-            whole = self._trajectories(numbers, times, q, p, work.names, work.done, work.fallback_steps)
+                numbers, own = times[:, work.stored.argmax()], None
+            whole = self._trajectories(numbers, own, q, p, work.names, work.done, work.fallback_steps)
             return replace(whole, actions=actions) if self.stepper.sums_action else whole
         at = np.where(self.t_eval == self.t0, 0, 1)
         none = missing((1, *shape[1:]), words)  # if no trajectory reached the end
