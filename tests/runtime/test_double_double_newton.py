@@ -35,11 +35,7 @@ def system(name: str) -> sc.LagrangianSystem:
         "masses": (["a", "b"], MUTUAL, {}),
         "friction": (["q"], "q_dot**2/2 - q**2/2", {"forces": {"q": "-q_dot/10"}}),
         "charge": (PLANE, "(x_dot**2 + y_dot**2)/2 + (x*y_dot - y*x_dot)/2 - (x**2 + y**2)**2/4", {}),
-        "damped": (
-            PLANE,
-            "(x_dot**2 + y_dot**2)/2 - x**2/2 - x**2*y**2",
-            {"damping": "g", "parameters": {"g": 0.3}},
-        ),
+        "damped": (PLANE, "(x_dot**2 + y_dot**2)/2 - x**2/2 - x**2*y**2", {"damping": "g", "parameters": {"g": 0.3}}),
         "kepler": (PLANE, "(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2)", {}),
         "sleigh": (
             [*PLANE, "phi"],
