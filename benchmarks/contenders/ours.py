@@ -137,15 +137,13 @@ def advised_counts(case: Case, method: Method, states: Array, *, quick: bool) ->
     """Return numbers of steps that fill the span -> the tolerance for which each suffices, from each of the states."""
     counts: dict[int, float] = {}
     solver = "auto" if case.dimension <= LARGEST_NEWTON or case.system.constraints else "fixed-point"
+    q, p = (part[0] if len(states) == 1 else part for part in np.split(states, 2, axis=1))
     for tolerance in QUICK_TOLERANCES if quick else TOLERANCES:
         try:
-            steps = [
-                advise(case.system, method, q, p, case.span, tolerance, solver=solver).steps
-                for q, p in states.reshape(len(states), 2, -1)
-            ]
+            steps = advise(case.system, method, q, p, case.span, tolerance, solver=solver).steps
         except StateError:  # no step size is known to be small enough
             continue
-        counts.setdefault(max(steps), tolerance)
+        counts.setdefault(steps, tolerance)
     return counts
 
 

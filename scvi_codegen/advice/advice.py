@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import takewhile
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from scvi_codegen.advice.pilot import EXPONENTIAL_POWER, Pilot, run_pilot
 from scvi_codegen.compiler import compile_stepper
@@ -32,7 +34,8 @@ from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import DOUBLE_DOUBLE, PRECISIONS
 from scvi_codegen.representation import summary
 from scvi_codegen.runtime.core.stepper import Stepper
-from scvi_codegen.runtime.core.validation import States
+from scvi_codegen.runtime.core.validation import Array, States, flat_state
+from scvi_codegen.runtime.ensemble.initial_states import EnsembleParameters, momenta_of_each, start_of_ensemble
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.validation import checks_arguments
@@ -57,6 +60,10 @@ MOST_RODS, STEPS, TRIALS = 16, 100, 3
 """Largest number of rods whose angles are tried, and numbers of steps and repetitions of their timing."""
 NUMBERS, FEWEST, MOST = 2**21, 2**13, 2**18
 """Number of stage positions computed in one pilot run, and bounds of its number of steps."""
+TOGETHER, FEWEST_TOGETHER = 16, 2**10
+"""Factor of that number for many trajectories, and the fewest steps of their longest pilot run."""
+COUNTED = 256
+"""Steps of the worst trajectory whose iterations are counted, as those of an ensemble are not reported one by one."""
 
 
 class Evidence(NamedTuple):
@@ -85,6 +92,7 @@ class Advice:
         degree: degree or number of stages of ``method``, ``None`` if it has none.
         method: recommended method: the one passed, or the one of the best degree.
         expected_error: error of the positions at the end, relative to their size.
+        member: index of the trajectory that determines the step of an ensemble, ``None`` for a single state.
         evidence: pilot runs of ``method``, largest step size first.
         message: recommendation in a few sentences.
         warnings: reasons why the tolerance may be missed; empty if there are none.
@@ -98,6 +106,7 @@ class Advice:
     evidence: tuple[Evidence, ...]
     message: str
     warnings: tuple[str, ...]
+    member: int | None = None
 
     __repr__ = summary("h", "steps", "method", "expected_error")
 
@@ -127,12 +136,13 @@ def advise(
     tolerance: float | None = None,
     *,
     velocity: States | None = None,
-    parameters: Mapping[str, float] | Sequence[float] | None = None,
+    parameters: EnsembleParameters = None,
     t: float = 0.0,
     degree: bool = False,
     solver: str = "auto",
     options: SolverOptions | None = None,
     precision: str = "double",
+    quantile: float = 1.0,
 ) -> Advice:
     """Recommend the largest fixed step size with which positions at the end of a run meet a tolerance.
 
@@ -143,19 +153,24 @@ def advise(
     symplectic, and its energy drifts. Close encounters therefore determine the step size of the whole run; a pilot run
     that ends before an encounter does not resolve it.
 
+    Of many initial states all trajectories are integrated with each step size that is tried, in one call, and the step
+    size is that of the trajectory with the largest error.
+
     Args:
         system: mechanical system; arrays of run-time sizes have the sizes of q.
         method: method, or its name, as ``"svi:8"``.
-        q, p, velocity: (m,) initial positions with one of momenta and velocities, or arrays by name.
+        q, p, velocity: (m,) initial positions with one of momenta and velocities, or arrays by name; of an ensemble
+            (k, m) each.
         span: duration of the run, negative to integrate backward; required.
         tolerance: required: wanted error ``|q - q_exact| / |q|`` at the end; the step size aims at half of it.
-        parameters: values by name (others keep their defaults), or all in order.
+        parameters: values by name (others keep their defaults), or all in order; of an ensemble also (k,) values.
         t: initial time.
         degree: also choose the degree (or number of stages) among 2, 4, ..., 12: the one with the fewest evaluations in
             vector registers of 8 points; with states of two words among 8, 12, 16, 20, 24 and 32.
         solver, options: solver of the stage equations, as of ``compile_stepper``, and options of the run.
         precision: ``"double-double"`` for tolerances below 1e-12, as of ``compile_stepper``; the last step of a run
             to ``t + span`` is then shorter.
+        quantile: part of the trajectories of an ensemble whose errors must meet the tolerance; 1: all of them.
 
     Returns:
         The recommendation, reproducible. It has warnings if the tolerance cannot be met (round-off, chaos), or if that
@@ -174,8 +189,10 @@ def advise(
             f"'{known.name}' is in transformed time: no step size is recommended; use largest_step or try h"
         )
     length, target = _checked_request(span, tolerance)
+    if not 0.0 < checked_number(quantile, "quantile") <= 1.0:
+        raise StateError(f"quantile must be above 0 and at most 1, not {quantile!r}")
     state = {"p": p, "velocity": velocity, "t": t, "parameters": parameters, "options": options}
-    result: list[tuple[float, Advice]] = []
+    result: list[tuple[float, Advice, _Trials]] = []
     failures: list[StateError] = []
     if precision not in PRECISIONS[:2]:
         raise MethodError(f"advise requires precision='double' or 'double-double', not {precision!r}")
@@ -183,7 +200,8 @@ def advise(
     for candidate in _candidates(method, 1 + (precision == DOUBLE_DOUBLE)) if degree else [method]:
         for stepper in _steppers(compiled, known, candidate, solver):
             try:
-                result.append(_advised(stepper, candidate, is_symplectic(candidate, known), q, state, length, target))
+                trials = _Trials(stepper, q, state, quantile)
+                result.append(_advised(trials, candidate, is_symplectic(candidate, known), length, target))
             except StateError as failure:
                 failures.append(failure)
                 continue
@@ -191,9 +209,10 @@ def advise(
                 break
     if not result:
         raise failures[-1]
-    met = [pair for pair in result if pair[1].expected_error <= target]
-    best = min(met, key=lambda pair: pair[0]) if met else min(result, key=lambda pair: pair[1].expected_error)
-    return _with_elimination(compiled, best[1], known, q, state)
+    met = [each for each in result if each[1].expected_error <= target]
+    best = min(met, key=lambda each: each[0]) if met else min(result, key=lambda each: each[1].expected_error)
+    _, advice, trials = best
+    return _with_elimination(compiled, advice, known, *trials.one(advice.member or 0))
 
 
 def _with_elimination(
@@ -243,33 +262,85 @@ def _checked_request(span: float | None, tolerance: float | None) -> tuple[float
 
 
 def _advised(
-    stepper: Stepper,
-    method: Method,
-    symplectic: bool,
-    q: States,
-    state: Mapping[str, Any],
-    span: float,
-    tolerance: float,
-) -> tuple[float, Advice]:
+    trials: _Trials, method: Method, symplectic: bool, span: float, tolerance: float
+) -> tuple[float, Advice, _Trials]:
     """Return the cost of a unit of time with the recommendation for one stepper, and the recommendation."""
-    initial = {name: state[name] for name in ("p", "velocity", "t", "parameters")}
-    start = stepper.start(q, **initial, h=1.0)  # checks the arguments
     points = _points(method)
-    most = min(max(FEWEST, NUMBERS // (points * stepper.dimension)), MOST)
+    fewest, share = (FEWEST_TOGETHER, TOGETHER) if trials.together else (FEWEST, 1)
+    most = min(max(fewest, share * NUMBERS // (points * trials.q.size)), MOST)
     pilot = run_pilot(
-        partial(stepper.integrate, **{**state, "p": start.p, "velocity": None}),
+        trials.integrate,
         method,
-        start.q,
+        trials.q,
         span,
         symplectic=symplectic,
         target_error=tolerance / SAFETY,
         most=most,
-        words=stepper.interface.words,
+        words=trials.stepper.interface.words,
+        quantile=trials.quantile,
     )
     choice, overhead = _choose(pilot, tolerance), OVERHEAD[pilot.words]
     nearest = min(pilot.good, key=lambda k: abs(math.log(k / choice.n)))
     evaluations = (pilot.runs[nearest].iterations + overhead) * math.ceil(points / LANES) * LANES  # in full registers
-    return evaluations / pilot.step(choice.n), _advice(pilot, choice, method)
+    return evaluations / pilot.step(choice.n), _advice(pilot, choice, method), trials
+
+
+class _Trials:
+    """Pilot runs of a single state, or of all states of an ensemble together.
+
+    Attributes:
+        q, p: (m,) positions and momenta, or (k, m) of an ensemble.
+        together: whether they are those of an ensemble.
+        quantile: part of its trajectories that must succeed.
+    """
+
+    def __init__(self, stepper: Stepper, q: States, state: Mapping[str, Any], quantile: float) -> None:
+        self.stepper, self.quantile, self.state = stepper, quantile, {**state, "velocity": None}
+        flat = q if stepper.interface.rotations else flat_state(stepper.interface, q, "q")
+        self.together = not isinstance(flat, Mapping) and np.ndim(flat) == 2
+        p, velocity, t, parameters = (state[name] for name in ("p", "velocity", "t", "parameters"))
+        if self.together and stepper.interface.words > 1:
+            raise MethodError("advise with precision='double-double' requires a single state: give the hardest one")
+        if self.together:
+            momenta = momenta_of_each(stepper, q, p, velocity, t, parameters)
+            self.q, self.p, self.state["parameters"] = start_of_ensemble(stepper, q, momenta, t, parameters)
+        else:
+            start = stepper.start(q, p, velocity=velocity, t=t, parameters=parameters, h=1.0)  # checks the arguments
+            self.q, self.p = start.q, start.p
+        self.state["p"] = self.p
+
+    def one(self, j: int) -> tuple[Array, dict[str, Any]]:
+        """Return the positions of trajectory j, and the other arguments of its run."""
+        if not self.together:
+            return self.q, self.state
+        parameters = self.stepper.parameters_by_name(self.state["parameters"][j])
+        return self.q[j], {**self.state, "p": self.p[j], "parameters": parameters}
+
+    def integrate(self, q: Array, *, h: float, steps: int, save_every: int) -> Any:
+        """Integrate as :meth:`Stepper.integrate`, an ensemble in one call; iterations are those of one trajectory.
+
+        Raises:
+            StepFailedError: if more trajectories fail than the quantile allows.
+        """
+        plan: dict[str, Any] = {"h": h, "steps": steps, "save_every": save_every}
+        if not self.together:
+            return self.stepper.integrate(q, **self.state, **plan)
+        runs = self.stepper.integrate_ensemble(q, **self.state, **plan)
+        failed, counted = np.flatnonzero(~runs.ok), min(steps, COUNTED)
+        if len(failed) > len(q) - math.ceil(self.quantile * len(q)):
+            status, step = str(runs.status[failed[0]]), int(runs.steps[failed[0]])
+            message = f"trajectory {failed[0]} failed: {status}"
+            raise StepFailedError(message, status=status, step=step, t=float(runs.ends[0][failed[0]]), residual=0.0)
+        q_of_one, state = self.one(int(np.argmax(runs.ok)))
+        alone = self.stepper.integrate(q_of_one, **state, h=h, steps=counted, save_every=counted)
+        return _Together(runs.q, alone.iterations.sum() * (steps / counted))
+
+
+class _Together(NamedTuple):
+    """Saved (n, k, m) positions of an ensemble, and the number of iterations of one trajectory."""
+
+    q: Array
+    iterations: Array
 
 
 def _steppers(
@@ -399,6 +470,7 @@ def _advice(pilot: Pilot, choice: _Choice, method: Method) -> Advice:
         ),
         message=" ".join(_sentences(pilot, choice, method, steps, h)),
         warnings=choice.warnings,
+        member=pilot.member if pilot.q.ndim == 2 else None,
     )
 
 
@@ -409,6 +481,10 @@ def _sentences(pilot: Pilot, choice: _Choice, method: Method, steps: int, h: flo
     else:
         growth = "exponentially" if pilot.rate else f"like t^{pilot.growth:.1f}"
         yield f"The pilot runs covered {pilot.length:.4g} of {pilot.span:.4g}, where errors grew {growth}."
+    if pilot.q.ndim == 2:
+        part = f"the error that {pilot.quantile:g} of them do not exceed"
+        which = "the largest error" if pilot.quantile == 1.0 else part
+        yield f"Of {pilot.count} trajectories, number {pilot.member} (from 0) has {which}."
     if not choice.tried:
         yield f"So small a step was not tried: the error is extrapolated by order {pilot.order}."
     failing = [n for n, leg in pilot.runs.items() if leg.failure]

@@ -6,7 +6,8 @@ trusted. Errors at the end of the span are extrapolated from the end of the pilo
 quadratic in time, or exponential if two runs from neighbouring states diverge exponentially (chaos).
 
 Error means |q - q_exact| / |q| with Euclidean norms over all coordinates; |q| is the root mean square over the later
-half of the pilot run.
+half of the pilot run. Several initial states are integrated together, as an ensemble: each has its own error, growth
+and size, and the largest error counts, or the one that a stated part of the trajectories does not exceed.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import time
 from collections.abc import Callable
 from fractions import Fraction
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -32,6 +33,8 @@ EPSILON = 2.0**-52
 """Rounding error of doubles; that of numbers of two words is its square."""
 SAMPLES = 64
 """Number of states of each run that are compared."""
+MOST_NUMBERS, FEWEST_SAMPLES = 2**21, 8
+"""Largest number of positions that are stored of a run of many trajectories, and the fewest states of each."""
 RESOLVED, ROUNDOFF_LEVEL = 0.01, 1e-9
 """Bounds of the asymptotic regime: larger errors follow no power of h, smaller ones are round-off (of doubles)."""
 SHORTENING, MAX_SHORTENINGS = 4, 20
@@ -49,7 +52,7 @@ quarter and over the second half."""
 
 
 class PilotRun(NamedTuple):
-    """Result of a run: (samples, m) positions at equal intervals, iterations per step, seconds, reason of failure."""
+    """Result of a run: (samples, k, m) positions at equal times, iterations per step, seconds, reason of failure."""
 
     q: Array
     iterations: float
@@ -67,25 +70,28 @@ def run_pilot(
     target_error: float,
     most: int,
     words: int = 1,
+    quantile: float = 1.0,
 ) -> Pilot:
     """Return pilot runs over the longest part of the span that can be resolved, with steps down to the error bound.
 
     Args:
-        integrate: ``Stepper.integrate``, called with q, h, steps and every.
+        integrate: ``Stepper.integrate``, or a function that does the same for many states, called with q, h, steps and
+            save_every.
         method: method of the stepper.
-        q: (m,) initial positions.
+        q: (m,) initial positions, or (k, m) of many trajectories.
         span: duration, not 0; negative to integrate backward.
         symplectic: True if steps preserve the symplectic form.
         target_error: error bound at the end of the span.
         most: largest number of steps of a run.
         words: number of doubles of each number of a state.
+        quantile: part of the trajectories whose errors must be within the bound.
 
     Raises:
         StateError: if the solution seems to end in a singularity, or no step size resolves it from the start.
     """
     pilot, first = None, 1
     for cuts in range(MAX_SHORTENINGS, -1, -1):
-        longer = Pilot(integrate, method, q, span, span / SHORTENING**cuts, symplectic, words)
+        longer = Pilot(integrate, method, q, span, span / SHORTENING**cuts, symplectic, words, quantile)
         longer.resolve(first, most // SEARCH)
         if not longer.resolved:
             break
@@ -98,7 +104,7 @@ def run_pilot(
             "span"
         )
     if not pilot.whole:
-        pilot.rate = pilot.divergence_rate(most // SEARCH)
+        pilot.rates = pilot.divergence_rates(most // SEARCH)
     pilot.complete(target_error, most)
     return pilot
 
@@ -106,7 +112,7 @@ def run_pilot(
 class Pilot:
     """Runs over ``length``, the beginning of ``span``, each identified by its number n of steps.
 
-    Errors are extrapolated exponentially with ``rate`` if it is not 0.
+    Errors of a trajectory are extrapolated exponentially with its rate of ``rates`` if that is not 0.
     """
 
     def __init__(
@@ -118,8 +124,14 @@ class Pilot:
         length: float,
         symplectic: bool,
         words: int = 1,
+        quantile: float = 1.0,
     ) -> None:
-        self.integrate, self.q, self.span, self.length, self.rate = integrate, q, span, length, 0.0
+        self.integrate, self.q, self.span, self.length = integrate, q, span, length
+        self.count = len(q) if q.ndim == 2 else 1
+        self.rates, self.quantile = np.zeros(self.count), quantile
+        self.samples, self._errors_of = SAMPLES, dict[tuple[int, int], Array]()
+        while self.samples > FEWEST_SAMPLES and self.samples * q.size > MOST_NUMBERS:
+            self.samples //= 2
         self.order, self.symplectic, self.words = method.order or 1, symplectic, words
         self.epsilon = EPSILON**words
         self.runs: dict[int, PilotRun] = {}
@@ -167,14 +179,31 @@ class Pilot:
 
     @property
     def growth(self) -> float:
-        """Exponent of the growth of errors in time, from the coarsest resolved runs, where truncation dominates."""
-        return float(np.median([_power(self._errors(n)) for n in self._halved()[:3]]))
+        """Exponent of the growth of errors in time, of the trajectory that determines the error."""
+        return float(self._growths[self.member])
+
+    @property
+    def _growths(self) -> Array:
+        """(k,) exponents of the growth, from the coarsest resolved runs, where truncation dominates."""
+        resolved = [_power(self._errors(n)) for n in self._halved()[:3]]
+        return np.asarray(np.median(resolved, axis=0) if resolved else np.full(self.count, math.nan))
+
+    @property
+    def rate(self) -> float:
+        """Exponential growth rate of errors, 0 if they do not grow exponentially."""
+        return self._worst(self.rates)
+
+    @property
+    def member(self) -> int:
+        """Index of the trajectory that determines the error of the finest run that is compared."""
+        errors = self._errors_at_end(self.compared[-1])
+        return int(np.argsort(errors, kind="stable")[self._rank(len(errors))])
 
     @property
     def floor_at_end(self) -> float:
         """Round-off level of the error at the end of the span, 0 if the runs do not reach it."""
         if self.rate:
-            return self._exploded(max(self.floor, self.epsilon))
+            return float(_exploded(max(self.floor, self.epsilon), self.rate, self.span - self.length))
         return self.floor * float((self.span / self.length) ** ROUNDING)
 
     def step(self, n: float) -> float:
@@ -185,14 +214,14 @@ class Pilot:
         """Perform one more run, sampled as often as its number of steps allows."""
         began = time.perf_counter()
         try:
-            trajectory = self.integrate(self.q, h=self.length / n, steps=n, save_every=n // math.gcd(n, SAMPLES))
+            trajectory = self.integrate(self.q, h=self.length / n, steps=n, save_every=n // math.gcd(n, self.samples))
         except StepFailedError as failure:
-            self.runs[n] = PilotRun(np.empty((0, 0)), 0.0, time.perf_counter() - began, failure.status)
+            self.runs[n] = PilotRun(np.empty((0, 0, 0)), 0.0, time.perf_counter() - began, failure.status)
         else:
             iterations = float(trajectory.iterations.sum()) / n
             seconds = time.perf_counter() - began
             q = trajectory.q if self.words == 1 else _at_equal_times(trajectory, self.length)
-            self.runs[n] = PilotRun(q[1:], iterations, seconds)
+            self.runs[n] = PilotRun(q[1:].reshape(-1, self.count, q.shape[-1]), iterations, seconds)
 
     def resolve(self, n: int, most: int) -> None:
         """Halve the step size, starting with n steps, until errors are small."""
@@ -207,61 +236,89 @@ class Pilot:
         while min(self.runs) > 1 and self.error(min(self.runs)) < 1.0:
             self.run(min(self.runs) // 2)
 
-    def divergence_rate(self, most: int) -> float:
-        """Return the exponential growth rate of a perturbation of the initial positions, 0 if not exponential."""
+    def divergence_rates(self, most: int) -> Array:
+        """Return (k,) exponential growth rates of a perturbation of the initial positions, 0 if not exponential."""
         h = math.copysign(self.step(self.finest), self.span)
         steps = min(most, int(self.span / h))
-        nudged = self.q + PERTURBATION * np.cos(np.arange(len(self.q))) * (_rms(self.q) or 1.0)
+        sizes = np.asarray(_rms(self.q.T))
+        nudges = PERTURBATION * np.cos(np.arange(self.q.shape[-1]))
+        nudged = self.q + nudges * np.where(sizes > 0.0, sizes, 1.0)[..., np.newaxis]
         try:
-            one, other = (self.integrate(q, h=h, steps=steps, save_every=1).q[1:] for q in (self.q, nudged))
+            one, other = (
+                self.integrate(q, h=h, steps=steps, save_every=1).q[1:].reshape(steps, self.count, -1)
+                for q in (self.q, nudged)
+            )
         except StepFailedError:
-            return 0.0
-        difference = np.linalg.norm(other - one, axis=1) / (_rms(np.linalg.norm(one, axis=1)) or 1.0)
-        near = difference[: int(np.argmax(difference > RESOLVED)) or steps]
-        # Exponential growth exp(r t): the mean of the second half over the second quarter gives r.
-        power = _power(near)
-        return power * math.log(2.0) / abs(0.5 * h * len(near)) if power > EXPONENTIAL_POWER else 0.0
+            return np.zeros(self.count)
+        norms = _rms(np.linalg.norm(one, axis=-1))
+        differences = np.linalg.norm(other - one, axis=-1) / np.where(norms > 0.0, norms, 1.0)
+        rates = np.zeros(self.count)
+        for j, difference in enumerate(differences.T):
+            near = difference[: int(np.argmax(difference > RESOLVED)) or steps]
+            # Exponential growth exp(r t): the mean of the second half over the second quarter gives r.
+            power = float(_power(near))
+            rates[j] = power * math.log(2.0) / abs(0.5 * h * len(near)) if power > EXPONENTIAL_POWER else 0.0
+        return rates
 
     def error(self, n: int) -> float:
         """Return the expected error at the end of the span of the run with n steps; infinite if it failed."""
-        if n not in self.compared:
-            return math.inf
-        if self.whole:
-            return max(
-                float(self._errors(n)[-1]), self.final_quarter_error(n) / 3.0
-            )  # the error may cross zero at the end
-        if self.rate:
-            return self._exploded(self.final_quarter_error(n))
-        # Fit error(t) = a t + b t^2 to the mean errors of two windows; symplectic methods: b = 0.
-        early, late = _windows(self._errors(n))
-        ratio = self.span / self.length
-        if self.symplectic and self.growth < NEARLY_LINEAR:
-            return late * ratio / LATE
-        quadratic = max(0.0, (late / LATE - early / EARLY) / (LATE - EARLY))
-        return max(0.0, late / LATE - quadratic * LATE) * ratio + quadratic * ratio**2
+        return self._worst(self._errors_at_end(n)) if n in self.compared else math.inf
 
     def final_quarter_error(self, n: int) -> float:
         """Return the root-mean-square error of the run with n steps in the last quarter of the pilot run."""
+        return self._worst(self._final_quarter(n))
+
+    def _final_quarter(self, n: int) -> Array:
+        """Return the (k,) root-mean-square errors in the last quarter of the pilot run."""
         errors = self._errors(n)
         return _rms(errors[-max(1, len(errors) // 4) :])
+
+    def _errors_at_end(self, n: int) -> Array:
+        """Return the (k,) expected errors at the end of the span of the run with n steps."""
+        errors = self._errors(n)
+        if self.whole:
+            return np.asarray(np.maximum(errors[-1], self._final_quarter(n) / 3.0))  # it may cross zero at the end
+        # Fit error(t) = a t + b t^2 to the mean errors of two windows; symplectic methods: b = 0.
+        early, late = _windows(errors)
+        ratio = self.span / self.length
+        with np.errstate(invalid="ignore"):  # infinite errors of trajectories that failed
+            quadratic = np.maximum(0.0, (late / LATE - early / EARLY) / (LATE - EARLY))
+            regular = np.maximum(0.0, late / LATE - quadratic * LATE) * ratio + quadratic * ratio**2
+        if self.symplectic:
+            regular = np.where(self._growths < NEARLY_LINEAR, late * ratio / LATE, regular)
+        exploded = _exploded(self._final_quarter(n), self.rates, self.span - self.length)
+        return np.asarray(np.where(self.rates > 0.0, exploded, regular))
+
+    def _rank(self, count: int) -> int:
+        """Return the rank of the error, among those of the trajectories, that decides."""
+        return math.ceil(self.quantile * count) - 1
+
+    def _worst(self, values: Array) -> float:
+        """Return the value that decides: the largest, or the quantile of the values of all trajectories."""
+        rank = self._rank(len(values))
+        return float(np.partition(np.where(np.isnan(values), math.inf, values), rank)[rank])
 
     def _halved(self) -> list[int]:
         """Return the runs obtained by halving whose errors are small."""
         return [n for n in self.compared if n.bit_count() == 1 and self.final_quarter_error(n) < RESOLVED]
 
     def _errors(self, n: int) -> Array:
-        """Return the errors of a run at its samples relative to the finest run, by Richardson extrapolation."""
+        """Return (samples, k) errors of a run relative to the finest run, by Richardson extrapolation.
+
+        Those of trajectories that failed are infinite.
+        """
         finest = self.good[-1]
+        if (known := self._errors_of.get((n, finest))) is not None:
+            return known
         reference, positions = self.runs[finest].q, self.runs[n].q
-        size = _rms(np.linalg.norm(reference[len(reference) // 2 :], axis=1)) or 1.0
+        size = _rms(np.linalg.norm(reference[len(reference) // 2 :], axis=-1))
         count = math.gcd(len(reference), len(positions))
         both = [q[len(q) // count - 1 :: len(q) // count] for q in (reference, positions)]
-        errors: Array = np.linalg.norm(both[1] - both[0], axis=1) / size
+        errors: Array = np.linalg.norm(both[1] - both[0], axis=-1) / np.where(size == 0.0, 1.0, size)
         # The reference has the error e_ref = (n/finest)^order e_n, so that |q_n - q_ref| = (1 - (n/finest)^order) e_n.
-        return errors / (1.0 - (n / finest) ** self.order)
-
-    def _exploded(self, size: float) -> float:
-        return size * math.exp(min(self.rate * abs(self.span - self.length), 600.0))
+        errors = errors / (1.0 - (n / finest) ** self.order)
+        self._errors_of[n, finest] = errors = np.where(np.isfinite(errors), errors, math.inf)
+        return errors
 
 
 def _at_equal_times(trajectory: Trajectory, length: float) -> Array:
@@ -278,17 +335,23 @@ def _at_equal_times(trajectory: Trajectory, length: float) -> Array:
     return result
 
 
-def _windows(errors: Array) -> tuple[float, float]:
+def _exploded(size: Any, rate: Any, time: float) -> Any:
+    return size * np.exp(np.minimum(rate * abs(time), 600.0))
+
+
+def _windows(errors: Array) -> tuple[Array, Array]:
     """Return root mean squares over the second quarter and over the second half."""
     half, quarter = len(errors) // 2, len(errors) // 4
     return _rms(errors[quarter:half]), _rms(errors[half:])
 
 
-def _power(errors: Array) -> float:
-    """Return the exponent of the growth in time of errors at equal intervals."""
+def _power(errors: Array) -> Array:
+    """Return the exponents of the growth in time of errors at equal intervals."""
     early, late = _windows(errors)
-    return math.log2(late / early) if 0.0 < early <= late else 0.0
+    grows = (early > 0.0) & (early <= late) & (late < math.inf)
+    return np.asarray(np.log2(np.where(grows, late, 1.0) / np.where(grows, early, 1.0)))
 
 
-def _rms(values: Array) -> float:
-    return math.sqrt(float(np.mean(np.square(values)))) if len(values) else 0.0
+def _rms(values: Array) -> Array:
+    """Return root mean squares along the first axis, 0 of none."""
+    return np.asarray(np.sqrt(np.mean(np.square(values), axis=0)) if len(values) else np.zeros(values.shape[1:]))

@@ -8,7 +8,7 @@ from itertools import chain
 
 import numpy as np
 
-from scvi_codegen.cli.reports import duration, momentum_report
+from scvi_codegen.cli.reports import LARGE_ERROR, duration, momentum_report
 from scvi_codegen.cli.supervision import check_memory, interruptions, progress_bar
 from scvi_codegen.files.energy import MOST_BALANCED_STEPS, energy_account, energy_reason
 from scvi_codegen.models.model import Model
@@ -155,6 +155,9 @@ def _energy_report(result: EnsembleTrajectory, balance: float | None) -> str:
     if not np.isfinite(changes).any():
         return "energy: not finite in any state"
     state, worst = (int(index) for index in np.unravel_index(np.nanargmax(changes), changes.shape))
+    if relative and changes[state, worst] > LARGE_ERROR and not energy_account(result[worst], limited=True).initial:
+        relative, changes = False, np.abs(energies - energies[0])  # an energy that is a rounding error of its terms
+        state, worst = (int(index) for index in np.unravel_index(np.nanargmax(changes), changes.shape))
     if reason:
         changed = f"energy: {reason}, it changed by {changes[state, worst]:.3g} at most{where}"
         return changed if balance is None else f"{changed}; energy balance |E - E0 - W| {balance:.1e} at most"

@@ -11,6 +11,7 @@ from scvi_codegen.cli.command_group import tell
 from scvi_codegen.cli.reports import duration
 from scvi_codegen.errors import AccuracyWarning, StateError
 from scvi_codegen.models.model import Model
+from scvi_codegen.models.model_files.ensemble_file import EnsembleStates
 from scvi_codegen.rendering.source import DOUBLE_DOUBLE, PRECISIONS
 from scvi_codegen.runtime.core.features import refusal, require
 from scvi_codegen.runtime.run.global_error import GlobalError
@@ -67,10 +68,13 @@ def model_with_global_error(model: Model, error: float) -> tuple[Model, GlobalEr
     return replace(wanted, tolerance=result.steps["tolerance"], error=None, precision=precision), result
 
 
-def model_with_advised_step(model: Model, tolerance: float) -> Model:
-    """Return the model with the fixed step size that pilot runs recommend for an error at the end of the span.
+def model_with_advised_step(
+    model: Model, tolerance: float, states: EnsembleStates | None = None
+) -> tuple[Model, Advice]:
+    """Return the model with the fixed step size that pilot runs recommend for an error at the end, and the advice.
 
-    Prints the recommendation and its pilot runs to stdout, warnings to stderr.
+    Of an ensemble it is the one for all of its initial states. Prints the recommendation and its pilot runs to stdout,
+    warnings to stderr.
     """
     if model.has_time_transformation:
         raise refusal("advice", "with a time transformation")
@@ -79,10 +83,11 @@ def model_with_advised_step(model: Model, tolerance: float) -> Model:
     advice = advise(
         model.system,
         model.method,
-        model.q,
-        model.momenta(stepper),
+        model.q if states is None else states.q,
+        model.momenta(stepper) if states is None else states.momenta(stepper),
         model.covered,
         tolerance,
+        parameters=None if states is None else states.parameters,
         t=model.t,
         solver=model.solver,
         options=model.solver_options,
@@ -97,7 +102,8 @@ def model_with_advised_step(model: Model, tolerance: float) -> Model:
             f"the recommended run has {advice.steps} steps, more than {MAX_STEPS:g}: use a method of higher order, a "
             f"larger --advise or a shorter --span, or pass --step {advice.h:.6g} to run it"
         )
-    return model._with_step_size(h=advice.h, steps=None if model.in_double_double else advice.steps)
+    steps = None if model.in_double_double else advice.steps
+    return model._with_step_size(h=advice.h, steps=steps), advice
 
 
 def _text(advice: Advice) -> str:

@@ -257,9 +257,9 @@ _TABLE: dict[str, Option] = {
     **{each.name: each.metadata["option"] for each in fields(RunOptions)},
     "advise": Option(
         *("", NUMBER, "X"),
-        "Choose a fixed step size for this relative error of the positions at the end.",
+        "Choose a fixed step size for this relative error of the positions at the end (of all trajectories).",
         determines=STEP_SIZE,
-        unavailable={IN_ENSEMBLE: "give --step or --tolerance", WITH_INPUTS: "use --tolerance"},
+        unavailable={WITH_INPUTS: "use --tolerance"},
         common=False,
     ),
     "solver": Option(

@@ -265,7 +265,7 @@ class TestChoices:
                 "a recorded run in transformed time needs a number of steps",
             ),
             ("kepler -o orbit.run --plot orbit.png", "--plot is not available for a run recorded in a folder"),
-            ("kepler --ensemble states.csv --advise 1e-6", "--advise is not available with --ensemble"),
+            ("kepler --ensemble states.csv --error 1e-6", "--error is not available with --ensemble"),
             (
                 "kepler --ensemble states.csv --time-transformation distance --step 0.1",
                 "each trajectory has its own times",
@@ -326,6 +326,18 @@ class TestRun:
         assert "lanes" not in Path("kepler_newton/kepler_newton.c").read_text()
         assert "'newton', 'explicit'" in error_of("run", "kepler", "--solver", "guess")
         assert "not explicit for this system" in error_of("run", "kepler", "--solver", "explicit")
+
+    def test_step_of_an_ensemble_is_advised_for_all_of_its_states(self):
+        Path("g.toml").write_text("[grid]\nq1 = [0.9, 0.5]\n")
+        words = ("run", "kepler", "--q", "1,0", "--velocity", "0,1", "--span", "20", "--method", "svi:6")
+        text = output_of(*words, "--advise", "1e-6", "--ensemble", "g.toml", "-o", "a.npz")
+        assert "Of 2 trajectories, number 1 (from 0) has the largest error." in text
+        with np.load("a.npz") as saved:
+            ends = saved["q"][-1]
+        stepper = compile_stepper(problem("kepler").system, SVI(8))
+        for start, end in zip((0.9, 0.5), ends, strict=True):
+            exact = stepper.integrate([start, 0.0], velocity=[0.0, 1.0], t_end=20.0).q[-1]
+            assert np.linalg.norm(end - exact) < 1e-6 * np.linalg.norm(exact)
 
     def test_energy_drift_is_detected(self):
         text = output_of("run", "kepler", "--method", "explicit-euler", "--step", "0.001", "--span", "10")

@@ -455,6 +455,21 @@ def test_trajectories_that_share_the_end_of_iterations_differ_by_rounding_errors
         sc.SolverOptions(reproducible=1)  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize(
+    ("method", "plan", "reason"),
+    [
+        ("svi:4", {"t_end": 1.0}, "one after the other .adaptive steps"),
+        ("stoermer-verlet", {"h": 0.1, "steps": 3}, "explicit steps have no iterations"),
+        ("scvi:2", {"h": 0.1, "steps": 3}, "those of this method are integrated one after the other"),
+    ],
+)
+def test_shared_iterations_are_refused_where_there_are_none(method: str, plan: dict[str, Any], reason: str) -> None:
+    q, p = states("kepler", 3)
+    stepper = sc.compile_stepper(sc.problem("kepler").system, method)
+    with pytest.raises(sc.StateError, match=rf"reproducible=False \(--shared.*{reason}.*: omit it"):
+        stepper.integrate_ensemble(q, p, **plan, options=sc.SolverOptions(reproducible=False))
+
+
 class TestThreadsAndInterruption:
     def test_results_do_not_depend_on_the_number_of_threads(self, kepler: sc.Stepper):
         q, p = states("kepler", 64)

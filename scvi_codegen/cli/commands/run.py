@@ -1,5 +1,6 @@
 """Command ``scvi-codegen run``: integrate a model or an ensemble, in memory or into a folder, and print a summary."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from scvi_codegen.cli.running import RunOutcome, integrate_model, known_at_end, 
 from scvi_codegen.cli.step_selection import model_with_adaptive_steps, model_with_advised_step, model_with_global_error
 from scvi_codegen.files.export import FORMATS
 from scvi_codegen.models.model import Model
-from scvi_codegen.models.model_files.ensemble_file import load_ensemble
+from scvi_codegen.models.model_files.ensemble_file import EnsembleStates, load_ensemble
 from scvi_codegen.models.options import IN_ENSEMBLE, OPTIONS, STEP_SIZE, WITH_INPUTS, check_available
 from scvi_codegen.pictures.animation import FILMS
 from scvi_codegen.pictures.canvas import PICTURES, check_plot_path
@@ -150,10 +151,11 @@ def run(
         check_flag(ERRORS["advise"], WITH_INPUTS)
     if model.system.inputs and recorded:
         raise click.UsageError("a run with inputs cannot be recorded in a folder: write it to a file (-o NAME.npz)")
-    model, confirmation = _with_steps(model, wanted)
+    states = None if ensemble is None else load_ensemble(ensemble, model)
+    model, confirmation, member = _with_steps(model, wanted, states)
     _check_words(model, {"-o": output})  # with precision = "auto"
-    if ensemble is not None:
-        _run_ensemble(model, ensemble, (output, plot))
+    if states is not None:
+        _run_ensemble(replace(states, model=model), (output, plot), advised=wanted["advise"], member=member)
         return
     if output is not None and recorded:
         _finish_recording(recording.record(model, output))
@@ -179,16 +181,22 @@ def _check_confirmed(confirmation: GlobalError | None) -> None:
         raise CommandFailure(unconfirmed, FAILURE)
 
 
-def _with_steps(model: Model, wanted: dict[str, float | None]) -> tuple[Model, GlobalError | None]:
-    """Return the model with the steps that one of the requested errors determines, and the estimated global error."""
+def _with_steps(
+    model: Model, wanted: dict[str, float | None], states: EnsembleStates | None
+) -> tuple[Model, GlobalError | None, int]:
+    """Return the model with the steps that one of the requested errors determines, and the estimated global error.
+
+    The third value is the index of the trajectory that determines the step of an ensemble.
+    """
     tolerance, error, advise = wanted["tolerance"], wanted["error"], wanted["advise"]
     if tolerance is not None:
-        return model_with_adaptive_steps(model, tolerance), None
+        return model_with_adaptive_steps(model, tolerance), None, 0
     if advise is not None:
-        return model_with_advised_step(model, advise), None
+        model, advice = model_with_advised_step(model, advise, states)
+        return model, None, advice.member or 0
     if (wanted_error := model.error if error is None else error) is not None:
-        return model_with_global_error(model, wanted_error)
-    return model, None
+        return *model_with_global_error(model, wanted_error), 0
+    return model, None, 0
 
 
 def _check_outputs(output: str | None, plot: str | None, ensemble: str | None) -> None:
@@ -257,12 +265,15 @@ def _finish_recording(outcome: RecordedOutcome) -> None:
     tell(f"wrote {outcome.recorded.folder}", written=[outcome.recorded.folder])
 
 
-def _run_ensemble(model: Model, path: str, outputs: tuple[str | None, str | None]) -> None:
+def _run_ensemble(
+    states: EnsembleStates, outputs: tuple[str | None, str | None], *, advised: float | None, member: int
+) -> None:
+    model = states.model
     if model.has_time_transformation:
         raise click.UsageError(
             "--ensemble is not available with a time transformation: each trajectory has its own times"
         )
-    outcome = integrate_states(load_ensemble(path, model))
+    outcome = integrate_states(states)
     balance = energy_balance(outcome.result)
     tell(ensemble_summary(model, outcome, balance), **ensemble_numbers(model, outcome, balance))
     written = _write_outputs(model, outcome.result, *outputs, draw=outcome.result.plot)
@@ -277,6 +288,11 @@ def _run_ensemble(model: Model, path: str, outputs: tuple[str | None, str | None
         raise CommandFailure(f"every trajectory failed\n{continuation}", FAILURE)
     for path in written:
         tell(f"wrote {path}", written=written)
+    if advised is not None:
+        missed = missed_tolerance(model.system, outcome.result[member], advised) if outcome.result.ok[member] else ""
+        tell(missed=missed or None)
+        if missed:
+            raise CommandFailure(f"trajectory {member}: {missed}", FAILURE)
 
 
 def _write_outputs(model: Model, result: Any, output: str | None, plot: str | None, *, draw: Any) -> list[str]:

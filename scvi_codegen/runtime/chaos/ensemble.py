@@ -1,14 +1,16 @@
 """Chaos indicators of many initial states: tangent vectors propagated along each trajectory, in parallel threads.
 
-In SIMD lanes the variations are additional coordinates (:mod:`scvi_codegen.mechanics.derived_systems`) of an ensemble.
-After each block of steps the tangent frame of every lane is replaced by Q of its QR factorisation; a block is repeated
-with half as many steps if its R shows that the tangent vectors became nearly parallel. Systems without variational
+In SIMD lanes, and in the threads of a GPU, the variations are additional coordinates
+(:mod:`scvi_codegen.mechanics.derived_systems`) of an ensemble. After each step C replaces the tangent vectors by Q of
+their QR factorisation and sums their growth (``templates/support/run/tangent_growth.h``). Systems without variational
 equations in lanes, and lanes whose step fails, are computed trajectory by trajectory. Only the indicators are stored.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,16 +26,14 @@ from scvi_codegen.runtime.chaos.indicators import MOST as LARGEST_CHUNK
 from scvi_codegen.runtime.chaos.indicators import (
     SERIES,
     ChaosIndicators,
-    Growth,
     InitialTangents,
     StepSegment,
     TangentPropagation,
-    ill_conditioned,
-    r_factors,
 )
 from scvi_codegen.runtime.core.features import require
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array, States
+from scvi_codegen.runtime.ensemble.batches import Batch, Call
 from scvi_codegen.runtime.ensemble.device import DeviceRuns
 from scvi_codegen.runtime.ensemble.initial_states import EnsembleParameters, start_of_ensemble
 from scvi_codegen.runtime.ensemble.result import OK
@@ -47,10 +47,6 @@ from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.runtime.sensitivity.step_derivatives import Starts
 from scvi_codegen.validation import checked_count
 
-TRAJECTORIES_TOGETHER = 256
-"""Number of trajectories integrated together, so that the output of a block of steps fits into the cache."""
-FIRST, MOST = 8, 32
-"""Number of steps of the first and of the largest block."""
 CHECKED_STRIDE: Final = 64
 """Stride of the trajectories whose step error is estimated."""
 
@@ -98,8 +94,8 @@ class ChaosIndicatorsEnsemble:
         report, left = progress or (lambda _: None), np.arange(len(self.q))
         if self.device is not None:
             left = self._on_device(report, threads)
-        elif (binding := self._lanes()) is not None:
-            left = self._all_in_lanes(binding, report, threads)
+        elif (source := self._source()) is not None:
+            left = self._in_lanes(source, report, threads)
         if len(left):
             self.stepper.tangent  # noqa: B018  (compiled once, before threads ask for it)
             before = len(self.q) - len(left)
@@ -143,36 +139,39 @@ class ChaosIndicatorsEnsemble:
                 f"chaos indicators on a GPU are not available for '{self.stepper.title}': they require constant "
                 "diagonal masses, forces of positions and time, and SVI or collocation; omit device"
             )
-        count, steps, first = len(self.q), len(self.t) - 1, self._first(0)
-        growth = _ThreadGrowth(source, first, count)
-        plan = CommonSteps(self.t[0], self.h, steps=steps, t_end=None, inputs={}, save_every=self.save_every)
-        start = [np.hstack([x, np.tile(growth.frame(part), (count, 1))]) for part, x in enumerate((self.q, self.p))]
-        arguments = self.stepper, self.options, (start[0], start[1]), self.parameters
+        growth, plan, count = self._growth(source), self._plan(), len(self.q)
+        arguments = self.stepper, self.options, self._start(growth), self.parameters
         runs = DeviceRuns(*arguments, lambda _, part: self.parameters[part], plan, record=growth)
-        runs.run(progress=lambda done: report(done * count // steps), threads=threads)
-        ended = runs.done == steps
-        values = runs.device.copy_out(runs.q).reshape(len(plan.numbers), count, len(SERIES), -1)
+        runs.run(progress=lambda done: report(done * count // plan.steps), threads=threads)
+        return self._take(runs.device.copy_out(runs.q), runs.done == plan.steps)
+
+    def _in_lanes(self, source: Source, report: Callable[[int], None], threads: int | None) -> NDArray[np.intp]:
+        """Process all trajectories in SIMD lanes; return those that failed."""
+        growth, plan = self._growth(source), self._plan()
+        binding = Binding(building.load(source, flags=self.stepper.flags), source.prefix)
+        arguments = binding, self.options, self._start(growth), self.parameters, plan.t0, plan.fixed_segments()
+        runs = _GrowthRuns(growth, len(plan.numbers), *arguments)
+        runs.run(progress=lambda _: report(int(np.count_nonzero(runs.status == 0))), threads=threads)
+        return self._take(runs.saved, runs.status == 0)
+
+    def _growth(self, source: Source) -> _Growth:
+        return _Growth(source, self._first(0), len(self.q))
+
+    def _plan(self) -> CommonSteps:
+        steps = len(self.t) - 1
+        return CommonSteps(self.t[0], self.h, steps=steps, t_end=None, inputs={}, save_every=self.save_every)
+
+    def _start(self, growth: _Growth) -> tuple[Array, Array]:
+        """Return initial positions and momenta with those of the tangent vectors."""
+        count = len(self.q)
+        q, p = (np.hstack([x, np.tile(growth.frame(part), (count, 1))]) for part, x in enumerate((self.q, self.p)))
+        return q, p
+
+    def _take(self, saved: Array, ended: NDArray[np.bool_]) -> NDArray[np.intp]:
+        """Store (n, K, 5 k) values of the trajectories that have ended; return the others."""
+        values = saved.reshape(len(saved), len(self.q), len(SERIES), -1)
         self.values[:, :, ended] = values.transpose(2, 0, 1, 3)[:, :, ended]
         return np.flatnonzero(~ended)
-
-    def _lanes(self) -> Binding | None:
-        """Return the compiled ensemble library with tangent vectors, or ``None``."""
-        source = self._source()
-        return None if source is None else Binding(building.load(source, flags=self.stepper.flags), source.prefix)
-
-    def _all_in_lanes(self, binding: Binding, report: Callable[[int], None], threads: int | None) -> NDArray[np.intp]:
-        """Process all trajectories in SIMD lanes, ``TRAJECTORIES_TOGETHER`` at a time; return those that failed."""
-        count, changes = len(self.q), self._first(0)
-        done = np.zeros(count, dtype=bool)
-
-        def follow(k: int, check_stop: StopCheck) -> None:
-            part = slice(k * TRAJECTORIES_TOGETHER, min((k + 1) * TRAJECTORIES_TOGETHER, count))
-            self.values[:, :, part], done[part] = self._in_lanes(binding, changes, part, check_stop)
-
-        run_jobs(
-            -(-count // TRAJECTORIES_TOGETHER), follow, progress=lambda _: report(int(done.sum())), threads=threads
-        )
-        return np.flatnonzero(~done)
 
     def _width(self) -> int:
         """Return the number of tangent vectors of the first trajectory that can be started (constraints reduce it)."""
@@ -185,41 +184,6 @@ class ChaosIndicatorsEnsemble:
         """Return the (2m, k) initial tangent vectors of trajectory j."""
         start = self.q[j], self.p[j], self.h, float(self.t[0])
         return self.changes.at(*start, self.parameters[j], self.options)
-
-    def _in_lanes(
-        self, binding: Binding, tangents: Array, part: slice, check_stop: StopCheck
-    ) -> tuple[Array, NDArray[np.bool_]]:
-        """Return the (5, n, K, k) series of K trajectories from (2m, k) tangents, and (K,) flags of complete ones."""
-        t, lanes = self.t, _TangentLanes(self, binding, part, tangents.shape[1])
-        frame, triangle = (np.broadcast_to(factor, (lanes.size, *factor.shape)) for factor in np.linalg.qr(tangents))
-        with np.errstate(divide="ignore"):  # linearly dependent directions span zero volume: log 0 = -inf
-            growth = Growth(t[:: self.save_every], np.log(np.abs(np.diagonal(triangle, axis1=1, axis2=2))))
-        done, steps, size, most = 0, len(t) - 1, FIRST, MOST
-        lanes.take(frame)
-        memory = binding.buffer(lanes.memory)
-        while done < steps:
-            check_stop(done)
-            size = min(size, most, self.save_every - done % self.save_every, steps - done)
-            before = bytes(memory)
-            images = lanes.advance(size)
-            running = lanes.running
-            frame, last = _factors(np.where(running[:, np.newaxis, np.newaxis], images[-1], frame))
-            if size > 1 and ill_conditioned(last).any():
-                memory[:] = before
-                most = size // 2
-                continue
-            done += size
-            sizes = _lengths(images, triangle)
-            numbers = np.full(size, -1)
-            numbers[-1] = done // self.save_every if done % self.save_every == 0 else -1
-            with np.errstate(divide="ignore"):
-                diagonals = np.log(np.abs(np.diagonal(last, axis1=1, axis2=2)))
-                stretched = np.broadcast_to(diagonals, (size, *diagonals.shape))
-                growth.add(t[done - size : done + 1], numbers, np.log(sizes), stretched)
-            triangle = last @ triangle / sizes[-1][:, np.newaxis]
-            lanes.take(frame)
-            size *= 2
-        return growth.values, lanes.running
 
     def _follow(self, j: int, check_stop: StopCheck) -> None:
         """Integrate trajectory j with tangent vectors, by derivatives of single steps; NaN after a failed step."""
@@ -247,83 +211,47 @@ class ChaosIndicatorsEnsemble:
         self.values[:, :, j] = np.nan if propagation is None else propagation.growth.values
 
 
-def _lengths(images: Array, triangle: Array) -> Array:
-    """Return (steps, K, k) norms of the tangent vectors, whose images in the frame are (steps, K, 2m, k)."""
-    whole = images if images.shape[-1] == 1 else images @ triangle
-    return np.asarray(np.sqrt(np.einsum("skij,skij->skj", whole, whole)))
-
-
-def _factors(images: Array) -> tuple[Array, Array]:
-    """Return the QR factors, (K, 2m, k) and (K, k, k)."""
-    if images.shape[-1] > 1:
-        orthonormal, upper = np.linalg.qr(images)
-        return np.asarray(orthonormal), np.asarray(upper)
-    lengths = r_factors(images)
-    return images / lengths, lengths
-
-
-class _ThreadGrowth:
-    """Growth of the same initial tangent vectors (2m, k) of K trajectories, in the memory of threads of a GPU."""
+class _Growth:
+    """Growth of the same initial tangent vectors (2m, k) of K trajectories, in SIMD lanes or threads of a GPU."""
 
     def __init__(self, source: Source, tangents: Array, count: int) -> None:
         self.source, (self.orthonormal, triangle) = source, np.linalg.qr(tangents)
         k = tangents.shape[1]
         with np.errstate(divide="ignore"):  # linearly dependent directions span zero volume
             diagonal = np.log(np.abs(np.diagonal(triangle)))
-        numbers = np.concatenate([np.zeros(2 * k), diagonal, np.zeros(3 * k), triangle.ravel()])
-        self.rows = np.tile(numbers[:, np.newaxis], count)
-        self.saved: Array | None = np.tile(numbers[: len(SERIES) * k], (count, 1))
+        self.numbers = np.concatenate([np.zeros(2 * k), diagonal, np.zeros(3 * k), triangle.ravel()])
+        self.rows = np.tile(self.numbers[:, np.newaxis], count)
+        self.saved: Array | None = np.tile(self.numbers[: len(SERIES) * k], (count, 1))
 
     def frame(self, part: int) -> Array:
         """Return the (m k,) positions or momenta of the orthonormal tangent vectors, one after the other."""
         return np.split(self.orthonormal, 2)[part].T.ravel()
 
 
-class _TangentLanes:
-    """SIMD blocks of K trajectories with k tangent vectors each; surplus lanes hold inactive copies of the last one."""
+class _GrowthRuns(Batch):
+    """Trajectories in SIMD lanes whose growth of tangent vectors is saved; further arguments as of :class:`Batch`.
 
-    def __init__(self, work: ChaosIndicatorsEnsemble, binding: Binding, part: slice, count: int) -> None:
-        q, p, parameters = work.q[part], work.p[part], work.parameters[part]
-        (self.size, self.dimension), self.count = q.shape, count
-        self.width = len(binding.new("block *").active)
-        blocks = -(-self.size // self.width)
-        self.binding, self.options = binding, binding.options(work.options)
-        self.memory = binding.new(f"block[{blocks}]")
-        for k in range(blocks):
-            binding.function("start")(self.memory + k, float(work.t[0]), work.h)
-        self.lanes = binding.records(self.memory)
-        lane_numbers = np.arange(blocks * self.width)
-        self.lane_indices = np.minimum(lane_numbers, self.size - 1)
-        self.lanes["q"][:, : self.dimension], self.lanes["p"][:, : self.dimension] = map(self._across, (q, p))
-        self.lanes["parameters"][:, : parameters.shape[1]] = self._across(parameters)
-        self.lanes["active"] = (lane_numbers < self.size).reshape(blocks, self.width)
+    Attributes:
+        saved: (rows, K, 5 k) values, NaN where not reached.
+    """
 
-    def _across(self, rows: Array) -> Array:
-        """Transpose (K, n) rows to (blocks, n, lanes)."""
-        lanes = rows[self.lane_indices].reshape(len(self.lanes), self.width, rows.shape[1])
-        return np.asarray(lanes.transpose(0, 2, 1))
+    def __init__(self, growth: _Growth, rows: int, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self.growth, self.width = growth, len(self.binding.new("block *").active)
+        first = cast(Array, growth.saved)
+        self.saved = np.full((rows, *first.shape), np.nan)
+        self.saved[0] = first
 
-    @property
-    def running(self) -> NDArray[np.bool_]:
-        """(K,) flags of the trajectories without a failed step."""
-        return np.asarray(self.lanes["active"].ravel()[: self.size] > 0.0)
+    def call(self, first: int, end: int) -> _GrowthCall:
+        """Return the calls for a range of trajectories."""
+        return _GrowthCall(self, first, end)
 
-    def take(self, frame: Array) -> None:
-        """Set (K, 2m, k) tangent vectors, clear their compensation terms and discard the predictor."""
-        m = self.dimension
-        for name, part in (("q", frame[:, :m]), ("p", frame[:, m:])):
-            self.lanes[name][:, m:] = self._across(part.transpose(0, 2, 1).reshape(self.size, -1))
-            self.lanes[f"carry_{name}"][:, m:] = 0.0
-        self.lanes["guess"] = 0
 
-    def advance(self, steps: int) -> Array:
-        """Advance all trajectories and return the (steps, K, 2m, k) tangent vectors after each step."""
-        advance, size = self.binding.function("advance"), self.dimension * (self.count + 1)
-        q, p = np.empty((2, steps, len(self.lane_indices), size))
-        row, (at_q, at_p) = len(self.lane_indices) * size, map(self.binding.pointer, (q, p))
-        for k in range(len(self.lanes)):
-            offset = k * self.width * size
-            advance(self.memory + k, self.width, steps, 1, self.options, at_q + offset, at_p + offset, row)
-        shape = steps, self.size, self.count, self.dimension
-        parts = [x[:, : self.size, self.dimension :].reshape(shape).transpose(0, 1, 3, 2) for x in (q, p)]
-        return np.concatenate(parts, axis=2)
+class _GrowthCall(Call):
+    """Calls with the memory of a block."""
+
+    def __init__(self, work: _GrowthRuns, first: int, end: int) -> None:
+        super().__init__(work, first, end)
+        self.memory = self.struct.block = work.binding.new("block *")
+        self.struct.positions, self.struct.growth = work.binding.pointers(work.saved, work.growth.numbers)
+        self.struct.trajectories = len(work.q)

@@ -26,6 +26,8 @@ from scvi_codegen.runtime.core.validation import (
 from scvi_codegen.runtime.core.words import block_of, by_name, from_block
 from scvi_codegen.runtime.rotations.states import checked_pair, checked_states, is_one_state
 
+PROBES = 8
+"""Number of random momenta that estimate the size of the direction of a symmetry."""
 REPORTED = 1e-3
 """Largest relative difference between a velocity and the velocity recomputed from its momentum."""
 
@@ -185,6 +187,20 @@ class StateFunctions(CompiledMethod):
         if status:
             raise StateError(f"the momentum maps of a state cannot be computed: {REASONS[status]}")
         return self._numbers(values), sizes
+
+    def _momentum_bounds(self, q: Array, p: Array, t: Array, parameters: Parameters) -> Array:
+        """Return (k,) bounds |p| |xi| of the momentum maps p . xi at the state with the largest momenta.
+
+        |xi| is estimated by random momenta.
+        """
+        q, p, t = (np.asarray(each, dtype=float) for each in (q, p, t))
+        sizes = np.linalg.norm(p, axis=1)
+        at = int(np.argmax(sizes))
+        probes = np.random.default_rng(PROBES).normal(size=(1 + PROBES, p.shape[1]))
+        probes[0] = 0.0
+        values = self._momentum_maps_and_sizes(np.tile(q[at], (len(probes), 1)), probes, t[at], parameters)[0]
+        values = np.asarray(values, dtype=float)
+        return np.asarray(sizes[at] * np.sqrt(np.mean((values[1:] - values[0]) ** 2, axis=0)))
 
     def _transform(
         self, name: str, q: States, other: States, t: ArrayLike, parameters: Parameters, label: str

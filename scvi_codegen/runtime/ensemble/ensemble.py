@@ -168,6 +168,26 @@ class Ensemble:
         self.states: list[Rows] = []
         self.adaptive = None if device is None or self.common is not None else self._on_device()
         self.successive = self._successive()
+        self._check_shared()
+
+    def _check_shared(self) -> None:
+        """Raise ``StateError`` for ``reproducible=False`` unless trajectories are SIMD lanes that iterate."""
+        if self.options is None or self.options.reproducible:
+            return
+        if isinstance(self.common, DeviceRuns):
+            reason = "those of a GPU are threads"
+        elif self.common is None:
+            reason = "these are integrated one after the other (adaptive steps, or changes by events)"
+        elif self.stepper.ensemble is None:
+            reason = "those of this method are integrated one after the other"
+        elif "#define EXPLICIT_STEPS" in self.stepper.ensemble.code:
+            reason = "explicit steps have no iterations"
+        else:
+            return
+        raise StateError(
+            "reproducible=False (--shared, [run] reproducible = false) lets the iterations of trajectories in SIMD "
+            f"lanes end together, but {reason}: omit it"
+        )
 
     def _source_of_points(self, fixed: CommonSteps) -> Source | None:
         """Return the source whose points are threads of a GPU, for many coordinates and equal steps, or ``None``."""
@@ -431,21 +451,29 @@ class Ensemble:
         return self._trajectories(t, times, q, p, status, steps, fallbacks)
 
     def _successive_result(self, work: SuccessiveRuns) -> EnsembleTrajectory:
-        states, shape = self.states, (1 + int(work.stored.max()), *self.start[0].shape)
-        words, actions = self.stepper.interface.words, np.full(shape[:2], np.nan)
-        q, p, times = missing(shape, words), missing(shape, words), missing(shape[:2], words)
-        own: Array | None = times
-        q[0], p[0], times[0], actions[0] = *self.start, self.t0, 0.0
-        for rows, j, *values in states:
-            times[rows, j], q[rows, j], p[rows, j], actions[rows, j] = values
+        count, rows, words = len(self), 1 + int(work.stored.max()), self.stepper.interface.words
+        places = [np.arange(count), *(each.rows * count + each.trajectories for each in self.states)]
+        index = np.full((rows, count), -1)  # of the states in the order in which C stored them; the last row is NaN
+        index.reshape(-1)[np.concatenate(places)] = np.arange(sum(map(len, places)))
+
+        def ordered(name: str, first: Array) -> Array:
+            """Return the rows of all trajectories, NaN after their ends."""
+            last = missing((1, *first.shape[1:]), words if name != "actions" else 1)
+            return cast(Array, np.concatenate([first, *(getattr(each, name) for each in self.states), last])[index])
+
+        q, p = ordered("q", self.start[0]), ordered("p", self.start[1])
         if self.t_eval is None:
-            numbers = np.arange(shape[0], dtype=float)
+            start = missing((count,), words)
+            start[:] = self.t0
+            numbers, times = np.arange(rows, dtype=float), ordered("t", start)
+            own: Array | None = times
             if self.fixed is not None:
                 numbers, own = times[:, work.stored.argmax()], None
             whole = self._trajectories(numbers, own, q, p, work.names, work.done, work.fallback_steps)
-            return replace(whole, actions=actions) if self.stepper.sums_action else whole
+            sums = self.stepper.sums_action
+            return replace(whole, actions=ordered("actions", np.zeros(count))) if sums else whole
         at = np.where(self.t_eval == self.t0, 0, 1)
-        none = missing((1, *shape[1:]), words)  # if no trajectory reached the end
+        none = missing((1, *q.shape[1:]), words)  # if no trajectory reached the end
         q, p = (np.concatenate([each, none])[at] for each in (q, p))
         return self._trajectories(self.t_eval, None, q, p, work.names, work.done, work.fallback_steps)
 

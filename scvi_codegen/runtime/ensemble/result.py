@@ -226,7 +226,16 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble):
 
     def momentum_errors(self) -> Array:
         """Return (n, k, c) changes of the momentum maps since the first state, relative to their largest term."""
-        return relative_changes(*self._momentum_maps())
+
+        def bounds(wanted: NDArray[np.bool_]) -> Array:
+            found = np.zeros(wanted.shape)
+            for j, good, parameters in self._with_parameters():
+                if wanted[j].any():
+                    states = self.q[good, j], self.p[good, j], self._times()[good, j]
+                    found[j] = np.maximum(found[j], self.stepper._momentum_bounds(*states, parameters))
+            return found
+
+        return relative_changes(*self._momentum_maps(), bounds)
 
     def _momentum_maps(self) -> tuple[Array, Array]:
         shape = (*self.q.shape[:2], len(self.stepper.momentum_map_names))

@@ -1,6 +1,6 @@
 """Joining of the trajectories of consecutive segments of a run."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -48,9 +48,28 @@ def joined_crossings(crossings: Sequence[Crossings]) -> Crossings:
     return Crossings(event=crossings[0].event, **joined)
 
 
-def relative_changes(values: Array, sizes: Array) -> Array:
-    """Return changes since the first value along axis 0, relative to the largest size; NaN if sizes overflow."""
+SUSPICIOUS, ROUNDING = 1e-6, 1e-10
+"""Relative change of a quantity from which on its terms may be rounding errors; the largest such change relative to its
+bound."""
+
+
+def relative_changes(values: Array, sizes: Array, bounds: Callable[[NDArray[np.bool_]], Array]) -> Array:
+    """Return changes since the first value along axis 0, relative to the largest size; NaN if sizes overflow.
+
+    If the terms of a quantity are rounding errors, as of the angular momentum of a fall along an axis, changes are
+    relative to a bound of its values.
+
+    Args:
+        values, sizes: (n, ..) values and sizes of their terms.
+        bounds: function that returns (..) bounds where a mask (..) is true.
+    """
     with np.errstate(invalid="ignore", over="ignore"):
         scales = np.fmax.reduce(sizes, axis=0)
-        changes: Array = (values - values[0]) / np.where(scales > 0.0, scales, 1.0)
+        changes: Array = values - values[0]
+        scales = np.where(scales > 0.0, scales, 1.0)
+        largest = np.fmax.reduce(np.abs(changes), axis=0).astype(float)
+        if (suspicious := largest > SUSPICIOUS * scales).any():
+            wider = np.where(suspicious, bounds(suspicious), 0.0)
+            scales = np.where(largest <= ROUNDING * wider, wider, scales)
+        changes = changes / scales
     return np.where(np.isinf(scales), np.nan, changes)

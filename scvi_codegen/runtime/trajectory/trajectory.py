@@ -261,7 +261,8 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
             for each in self.pieces or (self,)
         ]
         values, sizes = (concatenated(part) for part in zip(*maps, strict=True))
-        return relative_changes(values, sizes)
+        states = self.q, self.p, self.t, self.parameters
+        return relative_changes(values, sizes, lambda _: self.stepper._momentum_bounds(*states))
 
     @overload
     def action(self, *, cumulative: Literal[False] = False) -> float: ...

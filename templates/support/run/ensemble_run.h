@@ -39,6 +39,13 @@ static void drop_infinite(const state *now, const lanes *dq, const lanes *dp, do
 #ifdef OBSERVED
 #include "observation.h"
 #endif
+#ifdef TANGENTS
+#include "tangent_growth.h"
+
+enum { SAVED = 5 * TANGENTS }; /* numbers that are saved of a trajectory after a step */
+#else
+enum { SAVED = M };
+#endif
 #ifdef SCVI_DEVICE
 #include "thread_run.h"
 #else
@@ -177,6 +184,11 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
   memcpy(&seen, block->observed, sizeof seen);
   observe(&seen, &now, block->t, parameters, block->active);
 #endif
+#ifdef TANGENTS
+  tangent_growth growth;
+  (void)p;
+  memcpy(&growth, block->growth, sizeof growth);
+#endif
   for (long long k = 0, stored = 0; k < steps; k++) {
     const long long parity = block->step % 2;
     const history past = {memory[1 - parity], memory[parity]};
@@ -205,10 +217,18 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
 #ifdef OBSERVED
     observe(&seen, &now, block->t, parameters, block->active);
 #endif
+#ifdef TANGENTS
+    const double passed = (double)block->step * fabs(block->h);
+    add_growth(&growth, &now, past, passed, fabs(block->h));
+#endif
     if (block->step % every == 0) {
+#ifdef TANGENTS
+      store_growth(&growth, passed, count, q + stored * row_length);
+#else
       store_states(&now, count, q + stored * row_length, p + stored * row_length);
+#endif
 #ifdef RUN_ACTION
-      store_actions(block, count, stored * (row_length / M));
+      store_actions(block, count, stored * (row_length / SAVED));
 #endif
       stored++;
     }
@@ -218,6 +238,9 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
   memcpy(block->memory, memory, sizeof memory);
 #ifdef OBSERVED
   memcpy(block->observed, &seen, sizeof seen);
+#endif
+#ifdef TANGENTS
+  memcpy(block->growth, &growth, sizeof growth);
 #endif
 }
 
@@ -255,6 +278,11 @@ static void begin_block(NAME(each) * c, int count)
     }
     block->active[j] = j < count;
   }
+#ifdef TANGENTS
+  for (int i = 0; i < (6 + TANGENTS) * TANGENTS; i++)
+    for (int j = 0; j < LANES; j++)
+      block->growth[i][j] = c->growth[i];
+#endif
   c->rows = 1;
   c->segment = 0;
   c->left = c->segment_steps[0];
@@ -281,8 +309,8 @@ long long NAME(call_each)(NAME(each) * c, long long steps)
 #ifdef RUN_ACTION
     block->actions = c->actions ? c->actions + place : NULL;
 #endif
-    NAME(advance)(block, count, size, every, c->options, c->positions + place * M, c->momenta + place * M,
-        c->trajectories * M);
+    NAME(advance)(block, count, size, every, c->options, c->positions + place * SAVED,
+        c->momenta ? c->momenta + place * SAVED : NULL, c->trajectories * SAVED);
     c->rows += block->step / every - begun / every;
     taken += size;
     c->left -= size;

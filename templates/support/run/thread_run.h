@@ -4,14 +4,6 @@
  * stops before it, and the processor continues it. Stored values change places by copies, so that all arrays may stay
  * in registers. Requires: ensemble_run.h, KERNEL, and TRAJECTORY, the number of the thread. */
 
-#ifdef TANGENTS
-/* Logarithms of norms, their maxima, and of the diagonal of R; integrals of MEGNO; R with columns of length 1. */
-typedef struct {
-  double norm[TANGENTS], largest[TANGENTS], diagonal[TANGENTS], moment[TANGENTS], rate[TANGENTS], area[TANGENTS];
-  double triangle[TANGENTS][TANGENTS];
-} tangent_growth;
-#endif
-
 /* Memory of a thread between calls. head: the time, its low word, the steps for the predictor, and 1 while active. */
 typedef struct {
   lanes head[4];
@@ -24,10 +16,6 @@ typedef struct {
   tangent_growth growth;
 #endif
 } thread_memory;
-
-#ifdef TANGENTS
-#include "tangent_growth.h"
-#endif
 
 /* Reads or writes numbers of a trajectory, which are `count` numbers apart in global memory. */
 static inline double *transfer(int writes, lanes *x, int size, double *memory, long long count)
@@ -134,9 +122,9 @@ KERNEL NAME(thread_advance)(long long count, long long begin, long long steps, l
     observe(&own.seen, &own.now, step.t, values, &active);
 #endif
 #ifdef TANGENTS
-    add_growth(&own, (double)(n + 1) * fabs(h), fabs(h));
+    add_growth(&own.growth, &own.now, past, (double)(n + 1) * fabs(h), fabs(h));
     if ((n + 1) % every == 0) {
-      store_growth(&own.growth, (double)(n + 1) * fabs(h), q);
+      store_growth(&own.growth, (double)(n + 1) * fabs(h), 1, q);
       q += count * 5 * TANGENTS;
     }
 #else
