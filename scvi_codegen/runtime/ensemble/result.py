@@ -27,14 +27,12 @@ from scvi_codegen.runtime.run.global_error import ConfirmedEnsemble, GlobalError
 from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.trajectory.joining import joined, relative_changes
 from scvi_codegen.runtime.trajectory.quantities import quantities
-from scvi_codegen.runtime.trajectory.saved_states import checked_row
+from scvi_codegen.runtime.trajectory.saved_states import Pictured, checked_row
 from scvi_codegen.validation import checks_arguments
 
 if TYPE_CHECKING:
     import xarray
 
-    from scvi_codegen.pictures.animation import Film
-    from scvi_codegen.pictures.overview import Plots
     from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 OK, INTERRUPTED, EVENT_FAILED = "ok", "interrupted", "event failed"
@@ -84,7 +82,7 @@ class EnsembleRuns:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble):
+class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictured):
     """States of k trajectories, the initial state first; further attributes as of :class:`EnsembleRuns`.
 
     Attributes:
@@ -140,32 +138,8 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble):
         return joined(pieces) if len(pieces) > 1 else pieces[0]
 
     @property
-    def plot(self) -> Plots:
-        """Plots of the first trajectories (at most 64), as of :attr:`Trajectory.plot`."""
-        from scvi_codegen.pictures.overview import Plots
-
-        return Plots([self[j] for j in range(min(len(self), MOST_DRAWN))])
-
-    def animate(
-        self,
-        path: str | os.PathLike[str] | None = None,
-        *,
-        seconds: float = 8.0,
-        positions: Callable[[Array], Array] | None = None,
-        picture: Mapping[str, Any] | None = None,
-        progress: Callable[[int, int], None] | None = None,
-    ) -> Film:
-        """Return an animation of the first trajectories (at most 64) together, as :meth:`Trajectory.animate`."""
-        from scvi_codegen.pictures.animation import animate
-
-        return animate(
-            [self[j] for j in range(min(len(self), MOST_DRAWN))],
-            path,
-            seconds=seconds,
-            positions=positions,
-            picture=picture,
-            progress=progress,
-        )
+    def _pictured(self) -> list[Trajectory]:
+        return [self[j] for j in range(min(len(self), MOST_DRAWN))]
 
     @property
     def q_low(self) -> Array:

@@ -1,9 +1,13 @@
 """Saved states of a run with the data needed for dense output, events and derivatives."""
 
+from __future__ import annotations
+
 import math
 import operator
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from os import PathLike
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +17,10 @@ from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.words import Words
 from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.step_plan import StepPlan
+
+if TYPE_CHECKING:
+    from scvi_codegen.pictures.animation import Film
+    from scvi_codegen.pictures.overview import Plots
 
 Array = NDArray[np.float64]
 ROUNDINGS, STEP_END_TOLERANCE = 4.0, 1e-6
@@ -82,3 +90,41 @@ class SavedStates:
         if isinstance(self.t, Words):
             run._memory.t_low = self.t.low[k]
         return run
+
+
+class Pictured:
+    """Mixin of trajectories and ensembles with pictures."""
+
+    __slots__ = ()
+
+    @property
+    def _pictured(self) -> Any:
+        return self
+
+    @property
+    def plot(self) -> Plots:
+        """Plots: ``run.plot()`` gives an overview, ``run.plot.energy("energy.png")`` a single plot in a file.
+
+        There are ``motion``, ``phase``, ``energy``, ``momentum_maps`` and ``section``, and of fields on a mesh
+        ``field`` and ``spectrum``; each returns Matplotlib axes. Of an ensemble the first 64 trajectories are drawn.
+        """
+        from scvi_codegen.pictures.overview import Plots
+
+        return Plots(self._pictured)
+
+    def animate(
+        self,
+        path: str | PathLike[str] | None = None,
+        *,
+        seconds: float = 8.0,
+        positions: Callable[[Array], Array] | None = None,
+        picture: Mapping[str, Any] | None = None,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> Film:
+        """Return an animation for a notebook, or write .gif, .html or .mp4; see :func:`scvi_codegen.animate`.
+
+        Of an ensemble the first 64 trajectories are drawn together.
+        """
+        from scvi_codegen.pictures.animation import animate
+
+        return animate(self._pictured, path, seconds=seconds, positions=positions, picture=picture, progress=progress)

@@ -36,22 +36,20 @@ from scvi_codegen.runtime.trajectory.dense_output import checked_times, states_a
 from scvi_codegen.runtime.trajectory.joining import Number, concatenated, joined, joined_crossings, relative_changes
 from scvi_codegen.runtime.trajectory.quantities import quantities
 from scvi_codegen.runtime.trajectory.recomputation import exchanged_energy, work_and_impulses_until
-from scvi_codegen.runtime.trajectory.saved_states import Array, checked_row
+from scvi_codegen.runtime.trajectory.saved_states import Array, Pictured, checked_row
 from scvi_codegen.validation import checks_arguments
 
 if TYPE_CHECKING:
     import pandas
     import xarray
 
-    from scvi_codegen.pictures.animation import Film
-    from scvi_codegen.pictures.overview import Plots
 
 MOST_DRAWN, MOST_CURVES = 400, 6
 """Largest numbers of states and of coordinates in the plot of a notebook."""
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
-class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
+class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed, Pictured):
     """States along a run, the initial state first.
 
     Attributes:
@@ -472,31 +470,6 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed):
             return "unknown: the method has no error estimate here"
         message = f"about {self.step_error:.1e} relative in the step from t = {self.worst_step_time:g}, the worst"
         return f"{message}; h is too large" if self.step_error > TOLERABLE_ERROR else message
-
-    @property
-    def plot(self) -> Plots:
-        """Plots: ``run.plot()`` gives an overview, ``run.plot.energy("energy.png")`` a single plot in a file.
-
-        There are ``motion``, ``phase``, ``energy``, ``momentum_maps`` and ``section``, and of fields on a mesh
-        ``field`` and ``spectrum``; each returns Matplotlib axes.
-        """
-        from scvi_codegen.pictures.overview import Plots
-
-        return Plots(self)
-
-    def animate(
-        self,
-        path: str | os.PathLike[str] | None = None,
-        *,
-        seconds: float = 8.0,
-        positions: Callable[[Array], Array] | None = None,
-        picture: Mapping[str, Any] | None = None,
-        progress: Callable[[int, int], None] | None = None,
-    ) -> Film:
-        """Return an animation for a notebook, or write .gif, .html or .mp4; see :func:`scvi_codegen.animate`."""
-        from scvi_codegen.pictures.animation import animate
-
-        return animate(self, path, seconds=seconds, positions=positions, picture=picture, progress=progress)
 
     @checks_arguments()
     def save(self, path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> None:
