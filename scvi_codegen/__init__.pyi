@@ -122,7 +122,7 @@ from scvi_codegen.runtime.estimation.fitting import fit as fit
 from scvi_codegen.runtime.events.event import Crossings as Crossings
 from scvi_codegen.runtime.events.event import Event as Event
 from scvi_codegen.runtime.events.event import impact as impact
-from scvi_codegen.runtime.orbits.periodic_orbit import PeriodicOrbit as PeriodicOrbit
+from scvi_codegen.runtime.orbits.solver import PeriodicOrbit as PeriodicOrbit
 from scvi_codegen.runtime.orbits.solver import periodic_orbit as periodic_orbit
 from scvi_codegen.runtime.paths.path import Path as Path
 from scvi_codegen.runtime.run.run import Run as Run

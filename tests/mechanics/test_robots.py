@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 import scvi_codegen as sc
 from scvi_codegen.errors import SystemDefinitionError, SystemDefinitionWarning
 from scvi_codegen.formulas.expressions import evaluate
-from scvi_codegen.mechanics.multibody.trees.shapes import SHAPES
+from scvi_codegen.mechanics.multibody.trees.mjcf import SHAPES
 
 ROBOTS = Path(__file__).parent / "robots"
 DELAY = 2e-4

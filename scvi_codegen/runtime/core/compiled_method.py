@@ -17,12 +17,11 @@ from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.calls import with_calls
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.representation import LONGEST, clipped
-from scvi_codegen.runtime.arrays.binding import ArrayBinding
+from scvi_codegen.runtime.arrays.binding import ArrayBinding, EventBinding
 from scvi_codegen.runtime.arrays.interface import RunSizes, check_few_coordinates
 from scvi_codegen.runtime.core.features import Support, check_features, require
 from scvi_codegen.runtime.core.validation import Array, shapes_of
 from scvi_codegen.runtime.core.words import named
-from scvi_codegen.runtime.events.array_events import EventBinding
 from scvi_codegen.runtime.events.event import Event, EventLike, as_events
 
 MOST_EVENT_SETS = 16
