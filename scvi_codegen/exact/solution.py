@@ -368,8 +368,9 @@ def _saddle(mass: Numbers, derivatives: Numbers) -> Numbers:
 
 def solved(matrix: Numbers, right: Numbers) -> Numbers:
     """Return the solution of a linear system."""
-    if len(right) == 1:
-        return np.array([right[0] / matrix[0, 0]], dtype=object)
+    diagonal = matrix.diagonal()
+    if np.count_nonzero(matrix) == np.count_nonzero(diagonal) == len(right):
+        return np.asarray(right / diagonal)
     return np.array(list(mp.lu_solve(mp.matrix(matrix.tolist()), mp.matrix(right.tolist()))), dtype=object)
 
 

@@ -9,7 +9,7 @@ differences.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -33,6 +33,8 @@ DIGITS = 45
 WIDTH = mp.mpf(10) ** -30
 """Relative width of the finite differences, which are correct to 30 digits."""
 REFINEMENTS = 4
+EVALUATIONS = 20
+"""Number of evaluations of the equations that take as long as their solution."""
 STEADY = 0.1
 """Convergence factor above which the Jacobian is recomputed; it is expensive (differences in 60 digits)."""
 
@@ -102,10 +104,10 @@ class DerivedStep:
         return int(self.blocks[-1].stop)
 
     def seconds(self, q: Any, p: Any, h: Any, t: Any = 0) -> float:
-        """Estimate the time of solving a step: that of evaluating its equations as many times as it has unknowns."""
+        """Estimate the time of solving a step from that of evaluating its equations."""
         known, began = self._known(q, p, h, t), time.perf_counter()
         self._rows(self._straight(known), known)
-        return self.unknowns * (time.perf_counter() - began)
+        return EVALUATIONS * (time.perf_counter() - began)
 
     def __call__(self, q: Any, p: Any, h: Any, t: Any = 0) -> SolvedStep:
         """Compute the step from (q, p) at t to t + h; numbers are converted exactly, so 0.1 is the double.
@@ -116,7 +118,7 @@ class DerivedStep:
         known = self._known(q, p, h, t)
 
         def linearised(z: Numbers) -> Solve:
-            inverse = self._inverse(self._exact_matrix(z, known), known)
+            inverse = self._inverse(self._matrix(z, known, float), known)
             return lambda rows: inverse @ rows
 
         try:
@@ -135,7 +137,7 @@ class DerivedStep:
         """Return the result of one Newton update from the straight line, with the matrix from finite differences."""
         known = self._known(q, p, h, t)
         z = self._straight(known)
-        matrix, rows = self._exact_matrix(z, known), self._rows(z, known)[: self.unknowns]
+        matrix, rows = self._matrix(z, known, mp.mpf), self._rows(z, known)[: self.unknowns]
         inverse = self._inverse(matrix, known)
         update = inverse @ rows
         for _ in range(REFINEMENTS):
@@ -264,14 +266,18 @@ class DerivedStep:
                         rows[self.rows[r]] += values[results] * (self._factor(group, s, n, r, known) * table[n, r])
         return rows
 
-    def _exact_matrix(self, z: Numbers, known: _Known) -> Numbers:
-        """Return the derivatives of the rows with respect to the unknowns; those of the kernels by differences."""
-        matrix = numbers(np.zeros((self.unknowns, self.unknowns)))
+    def _matrix(self, z: Numbers, known: _Known, number: Callable[[Number], Any]) -> Numbers:
+        """Return the derivatives of the rows with respect to the unknowns; those of the kernels by differences.
+
+        ``number``: ``float``, which suffices for Newton's iteration, or ``mp.mpf``.
+        """
+        kind: Any = float if number is float else object
+        matrix: Numbers = np.zeros((self.unknowns, self.unknowns), dtype=kind)
         powers = [known.h**block.power for block in self.stages.blocks]
         for f, group in enumerate(self.stages.stage_groups):
             arguments = self._arguments(f, z, known)
             for n in range(len(group.abscissae)):
-                derivatives = self._kernel_jacobian(f, n, arguments[n], known)
+                derivatives: Numbers = self._kernel_jacobian(f, n, arguments[n], known).astype(kind)
                 for s, rows in enumerate(self.scatters[f]):
                     for g, gather in enumerate(group.gathers):
                         derivative = derivatives[self.results[f][s], self.arguments[f][g]]
@@ -280,7 +286,7 @@ class DerivedStep:
                             factor = self._factor(group, s, n, r, known) * rows[n, r] * moved
                             for b in np.flatnonzero(self.gathers[f][g][n, 1:]):
                                 entry = factor * self.gathers[f][g][n, b + 1] * powers[b]
-                                matrix[self.rows[r], self.blocks[b]] += derivative * entry
+                                matrix[self.rows[r], self.blocks[b]] += derivative * number(entry)
         return matrix
 
     def _kernel_jacobian(self, f: int, n: int, arguments: Numbers, known: _Known) -> Numbers:

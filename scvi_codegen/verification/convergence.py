@@ -47,7 +47,7 @@ from scvi_codegen.verification.system_under_test import State, SystemUnderTest
 
 TARGET_ERROR = mp.mpf(10) ** -17
 """Error at which the order is measured: below the round-off of doubles, so that errors of that size show."""
-FLOOR = mp.mpf(10) ** -38
+FLOOR = mp.mpf(10) ** -42
 """Error below which a step counts as exact."""
 SMALLEST = 1e-9
 """Smallest step size tried, relative to h: an error that is not small there is of order 0."""

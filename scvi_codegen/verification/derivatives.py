@@ -93,9 +93,12 @@ def _map_of(tested: SystemUnderTest, stepper: Stepper) -> _Map:
     state, m = tested.states[0], tested.system.dimension
 
     def end(arguments: list[Number]) -> Array:
-        step = tested.derived().with_parameters(arguments[2 * m : -2])
-        result = step(arguments[:m], arguments[m : 2 * m], arguments[-1], arguments[-2])
-        return np.array([*result.q, *result.p], dtype=object)
+        ends, key = tested.ends_in_digits, tuple(arguments)
+        if key not in ends:
+            step = tested.derived().with_parameters(arguments[2 * m : -2])
+            result = step(arguments[:m], arguments[m : 2 * m], arguments[-1], arguments[-2])
+            ends[key] = np.array([*result.q, *result.p], dtype=object)
+        return ends[key]
 
     values = np.array(list(tested.parameters.values()))
     return _Map(stepper, state, values, tested.scales(state), np.arange(2 * m), end)

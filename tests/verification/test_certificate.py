@@ -301,3 +301,11 @@ def test_certificate_reports_slow_checks_and_their_duration(quickly_compiled, mo
 )
 def test_properties_in_the_literature_are_those_of_the_method(method):
     assert _expected(method) in (None, (method.order, method.symplectic, method.symmetric))
+
+
+@pytest.mark.second
+def test_order_of_small_errors() -> None:
+    """The order 16 is measured, with errors of 1e-37 at a step of a tenth of the state."""
+    certificate = sc.verify(sc.problem("kepler").system, "svi:8")
+    order = next(check for check in certificate.checks if check.name == "order")
+    assert 15.8 < order.measured < 16.1
