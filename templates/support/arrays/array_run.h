@@ -75,12 +75,6 @@ static int run_workers(run_memory *run, const job *way, solver_report *report)
 /* Runs of array systems. Requires: array_memory.h, bind_work_arrays, perform_step of a solver, ERROR_POWER; with
  * CONSTRAINTS_OF_ARRAYS project_run. */
 
-solver_options NAME(default_options)(void)
-{
-  const solver_options options = {.tolerance = TOLERANCE, .max_iterations = MAX_ITERATIONS};
-  return options;
-}
-
 /* Stores the state after a step if its number is a multiple of `every`, and at the end of an adaptive run; each thread
  * its own coordinates. */
 static void store_state(run_memory *run, const job *way, solver_report *report, long long n, int arrived)
