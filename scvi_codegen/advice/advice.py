@@ -60,8 +60,8 @@ MOST_RODS, STEPS, TRIALS = 16, 100, 3
 """Largest number of rods whose angles are tried, and numbers of steps and repetitions of their timing."""
 NUMBERS, FEWEST, MOST = 2**21, 2**13, 2**18
 """Number of stage positions computed in one pilot run, and bounds of its number of steps."""
-TOGETHER, FEWEST_TOGETHER = 16, 2**10
-"""Factor of that number for many trajectories, and the fewest steps of their longest pilot run."""
+FEWEST_TOGETHER = 2**10
+"""Fewest steps of the longest pilot run of an ensemble, whose number falls with the root of that of trajectories."""
 COUNTED = 256
 """Steps of the worst trajectory whose iterations are counted, as those of an ensemble are not reported one by one."""
 
@@ -266,8 +266,8 @@ def _advised(
 ) -> tuple[float, Advice, _Trials]:
     """Return the cost of a unit of time with the recommendation for one stepper, and the recommendation."""
     points = _points(method)
-    fewest, share = (FEWEST_TOGETHER, TOGETHER) if trials.together else (FEWEST, 1)
-    most = min(max(fewest, share * NUMBERS // (points * trials.q.size)), MOST)
+    most = min(max(FEWEST, NUMBERS // (points * trials.stepper.dimension)), MOST)
+    most = max(min(most, FEWEST_TOGETHER), round(most / math.sqrt(trials.count)))
     pilot = run_pilot(
         trials.integrate,
         method,
@@ -292,6 +292,7 @@ class _Trials:
         q, p: (m,) positions and momenta, or (k, m) of an ensemble.
         together: whether they are those of an ensemble.
         quantile: part of its trajectories that must succeed.
+        count: number of trajectories.
     """
 
     def __init__(self, stepper: Stepper, q: States, state: Mapping[str, Any], quantile: float) -> None:
@@ -307,7 +308,7 @@ class _Trials:
         else:
             start = stepper.start(q, p, velocity=velocity, t=t, parameters=parameters, h=1.0)  # checks the arguments
             self.q, self.p = start.q, start.p
-        self.state["p"] = self.p
+        self.state["p"], self.count = self.p, len(self.q) if self.together else 1
 
     def one(self, j: int) -> tuple[Array, dict[str, Any]]:
         """Return the positions of trajectory j, and the other arguments of its run."""
@@ -458,6 +459,8 @@ def _advice(pilot: Pilot, choice: _Choice, method: Method) -> Advice:
     degree = specification.get("degree", specification.get("stages"))
     shown = sorted(n for n, leg in pilot.runs.items() if n in pilot.compared or leg.failure)
     runs = [(n, pilot.runs[n]) for n in shown]
+    nearest = min(pilot.compared, key=lambda n: abs(math.log(n / choice.n)))
+    member = pilot.member(nearest) if pilot.q.ndim == 2 else None
     return Advice(
         h=h,
         steps=steps,
@@ -468,23 +471,25 @@ def _advice(pilot: Pilot, choice: _Choice, method: Method) -> Advice:
             Evidence(pilot.length / n, pilot.error(n), leg.iterations, leg.seconds / abs(pilot.length))
             for n, leg in runs
         ),
-        message=" ".join(_sentences(pilot, choice, method, steps, h)),
+        message=" ".join(_sentences(pilot, choice, method, steps, h, member)),
         warnings=choice.warnings,
-        member=pilot.member if pilot.q.ndim == 2 else None,
+        member=member,
     )
 
 
-def _sentences(pilot: Pilot, choice: _Choice, method: Method, steps: int, h: float) -> Iterator[str]:
+def _sentences(
+    pilot: Pilot, choice: _Choice, method: Method, steps: int, h: float, member: int | None
+) -> Iterator[str]:
     yield f"{steps} steps of {h:.6g} by {method.name}, for an expected error of {choice.error:.1g}."
     if pilot.whole:
         yield "The pilot runs covered the whole span."
     else:
         growth = "exponentially" if pilot.rate else f"like t^{pilot.growth:.1f}"
         yield f"The pilot runs covered {pilot.length:.4g} of {pilot.span:.4g}, where errors grew {growth}."
-    if pilot.q.ndim == 2:
+    if member is not None:
         part = f"the error that {pilot.quantile:g} of them do not exceed"
         which = "the largest error" if pilot.quantile == 1.0 else part
-        yield f"Of {pilot.count} trajectories, number {pilot.member} (from 0) has {which}."
+        yield f"Of {pilot.count} trajectories, number {member} (from 0) has {which}."
     if not choice.tried:
         yield f"So small a step was not tried: the error is extrapolated by order {pilot.order}."
     failing = [n for n, leg in pilot.runs.items() if leg.failure]

@@ -179,24 +179,20 @@ class Pilot:
 
     @property
     def growth(self) -> float:
-        """Exponent of the growth of errors in time, of the trajectory that determines the error."""
-        return float(self._growths[self.member])
+        """Exponent of the growth of errors in time, from the coarsest resolved runs, where truncation dominates.
 
-    @property
-    def _growths(self) -> Array:
-        """(k,) exponents of the growth, from the coarsest resolved runs, where truncation dominates."""
-        resolved = [_power(self._errors(n)) for n in self._halved()[:3]]
-        return np.asarray(np.median(resolved, axis=0) if resolved else np.full(self.count, math.nan))
+        The median over all trajectories: over a short pilot run that of a single one depends on its phase.
+        """
+        return float(np.median([_power(self._errors(n)) for n in self._halved()[:3]]))
 
     @property
     def rate(self) -> float:
         """Exponential growth rate of errors, 0 if they do not grow exponentially."""
         return self._worst(self.rates)
 
-    @property
-    def member(self) -> int:
-        """Index of the trajectory that determines the error of the finest run that is compared."""
-        errors = self._errors_at_end(self.compared[-1])
+    def member(self, n: int) -> int:
+        """Return the index of the trajectory that determines the error of the run with n steps."""
+        errors = self._errors_at_end(n)
         return int(np.argsort(errors, kind="stable")[self._rank(len(errors))])
 
     @property
@@ -284,8 +280,8 @@ class Pilot:
         with np.errstate(invalid="ignore"):  # infinite errors of trajectories that failed
             quadratic = np.maximum(0.0, (late / LATE - early / EARLY) / (LATE - EARLY))
             regular = np.maximum(0.0, late / LATE - quadratic * LATE) * ratio + quadratic * ratio**2
-        if self.symplectic:
-            regular = np.where(self._growths < NEARLY_LINEAR, late * ratio / LATE, regular)
+        if self.symplectic and self.growth < NEARLY_LINEAR:
+            regular = late * ratio / LATE
         exploded = _exploded(self._final_quarter(n), self.rates, self.span - self.length)
         return np.asarray(np.where(self.rates > 0.0, exploded, regular))
 

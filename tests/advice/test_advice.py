@@ -331,6 +331,17 @@ class TestEnsembles:
         for e in self.ECCENTRICITIES:
             assert achieved(system, advice, *kepler_start(e), kepler_end(e, 100.0), 1.0) < 1e-8
 
+    def test_short_pilot_of_many_trajectories_is_extrapolated_as_one_of_the_worst(self):
+        """Of 200 orbits, one has an error that seems to grow quadratically over a few revolutions."""
+        q, p = map(np.array, zip(*map(kepler_start, np.linspace(0.05, 0.5, 200)), strict=True))
+        system = problem("kepler").system
+        advice = advise(system, SVI(8), q, p, 5000.0, 1e-8)
+        assert not advice.warnings
+        assert advice.member is not None
+        assert advice.member > 190
+        alone = advise(system, SVI(8), q[advice.member], p[advice.member], 5000.0, 1e-8)
+        assert advice.steps == pytest.approx(alone.steps, rel=0.25)
+
     def test_quantile_leaves_out_the_worst_trajectories(self):
         advice = self.advised(0.7)
         assert advice.member == 2
