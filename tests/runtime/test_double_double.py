@@ -533,9 +533,8 @@ def test_ensembles(tmp_path: Path) -> None:
                 run = stepper.integrate(q[j], velocity=v[j], parameters=values, **steps)
                 for name in ("t", "q", "p", "parameters", "energy", "momentum_maps"):
                     assert (runs[j].mp(name) == run.mp(name)).all(), (name, steps)
-                energies, maps = runs.energy()[: len(run), j], runs.momentum_maps()[: len(run), j]
-                assert (as_mpmath(energies) == run.mp("energy")).all()
-                assert (as_mpmath(maps) == run.mp("momentum_maps")).all()
+                for name in ("q", "p", "energy", "momentum_maps"):
+                    assert (runs.mp(name)[: len(run), j] == run.mp(name)).all()
         ends = stepper.integrate_ensemble(q, velocity=v, h=0.07, t_end=6.01)
         assert max(abs(x - y) for x, y in zip(ends[0].mp("q")[-1], exact_orbit(6.01), strict=True)) < 1e-29
         again = stepper.integrate_ensemble([run.q[-1] for run in (ends[0], ends[1])], ends.p[-1], h=-0.07, steps=3)

@@ -215,7 +215,7 @@ def as_mpmath(values: Any) -> Any:
     """Return numbers as mpmath numbers in an object array, or one number."""
     from mpmath import mp
 
-    with mp.workdps(DIGITS):
+    with mp.workdps(DIGITS), np.errstate(invalid="ignore"):  # NaN: states that were not reached
         return np.frompyfunc(lambda a, b: mp.mpf(float(a)) + mp.mpf(float(b)), 2, 1)(
             np.asarray(values, dtype=float), low_words(values)
         )
@@ -281,3 +281,34 @@ def split(values: Any, name: str) -> tuple[Any, Any]:
     words = [two_words(each, f"{name}{list(k) if k else ''}") for k, each in np.ndenumerate(array)]
     high, low = np.array(words, dtype=float).reshape(array.size, 2).T.reshape(2, *array.shape)
     return high, low
+
+
+class TwoWords:
+    """Mixin of trajectories and ensembles: low words, and quantities as mpmath numbers."""
+
+    __slots__ = ()
+    q: Array
+    p: Array
+
+    @property
+    def q_low(self) -> Array:
+        """Low words of the positions, of the shape of ``q``; 0 in double precision."""
+        return low_words(self.q)
+
+    @property
+    def p_low(self) -> Array:
+        """Low words of the momenta, of the shape of ``p``; 0 in double precision."""
+        return low_words(self.p)
+
+    def mp(self, name: str) -> Any:
+        """Return a quantity as mpmath numbers of 40 digits in an object array of its shape.
+
+        Args:
+            name: ``"t"``, ``"q"``, ``"p"``, ``"parameters"``, ``"energy"``, ``"momentum_maps"``, or a coordinate.
+
+        Raises:
+            StateError: for an unknown name.
+        """
+        if name in ("energy", "momentum_maps"):
+            return as_mpmath(getattr(self, name)())
+        return as_mpmath(getattr(self, name) if name in ("t", "q", "p", "parameters") else self[name])  # type: ignore[index]

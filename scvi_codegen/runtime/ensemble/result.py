@@ -19,7 +19,7 @@ from scvi_codegen.files.labelled_arrays import AXES, Labelled, checked_units, to
 from scvi_codegen.representation import one_line
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array
-from scvi_codegen.runtime.core.words import Words, check_keeps_words, low_words, missing
+from scvi_codegen.runtime.core.words import TwoWords, Words, check_keeps_words, missing
 from scvi_codegen.runtime.rotations.attitude_history import AttitudeHistory
 from scvi_codegen.runtime.rotations.quantities import named_quantities
 from scvi_codegen.runtime.run.descriptions import short_title
@@ -82,7 +82,7 @@ class EnsembleRuns:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictured):
+class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictured, TwoWords):
     """States of k trajectories, the initial state first; further attributes as of :class:`EnsembleRuns`.
 
     Attributes:
@@ -140,16 +140,6 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
     @property
     def _pictured(self) -> list[Trajectory]:
         return [self[j] for j in range(min(len(self), MOST_DRAWN))]
-
-    @property
-    def q_low(self) -> Array:
-        """(n, k, m) low words of the positions; 0 in double precision."""
-        return low_words(self.q)
-
-    @property
-    def p_low(self) -> Array:
-        """(n, k, m) low words of the momenta; 0 in double precision."""
-        return low_words(self.p)
 
     def __repr__(self) -> str:
         states = f"{len(self.t)} states of each of {len(self)} trajectories, {np.count_nonzero(self.ok)} of them ok"

@@ -22,7 +22,7 @@ from scvi_codegen.files.labelled_arrays import checked_units, to_dataset
 from scvi_codegen.runtime.constraints.projection import constraint_values, multipliers
 from scvi_codegen.runtime.core.features import refusal, require
 from scvi_codegen.runtime.core.validation import columns_of_inputs
-from scvi_codegen.runtime.core.words import Words, as_mpmath, check_keeps_words, low_words, missing
+from scvi_codegen.runtime.core.words import TwoWords, Words, check_keeps_words, low_words, missing
 from scvi_codegen.runtime.events.event import Crossings, Event, EventLike, as_events
 from scvi_codegen.runtime.events.refinement import crossings_of
 from scvi_codegen.runtime.paths.actions import actions_until, compensated_sums, shadow_energy
@@ -49,7 +49,7 @@ MOST_DRAWN, MOST_CURVES = 400, 6
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
-class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed, Pictured):
+class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed, Pictured, TwoWords):
     """States along a run, the initial state first.
 
     Attributes:
@@ -222,29 +222,6 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed, Pictured):
     def t_low(self) -> Array:
         """(n,) low words of the times; 0 in double precision."""
         return low_words(self.t)
-
-    @property
-    def q_low(self) -> Array:
-        """(n, m) low words of the positions."""
-        return low_words(self.q)
-
-    @property
-    def p_low(self) -> Array:
-        """(n, m) low words of the momenta."""
-        return low_words(self.p)
-
-    def mp(self, name: str) -> Any:
-        """Return a quantity as mpmath numbers of 40 digits in an object array.
-
-        Args:
-            name: ``"t"``, ``"q"``, ``"p"``, ``"parameters"``, ``"energy"``, ``"momentum_maps"``, or a coordinate.
-
-        Raises:
-            StateError: for an unknown name.
-        """
-        if name in ("energy", "momentum_maps"):
-            return as_mpmath(getattr(self, name)())
-        return as_mpmath(getattr(self, name) if name in ("t", "q", "p", "parameters") else self[name])
 
     def momentum_maps(self) -> Array:
         """Return (n, k) conserved quantities, in the order of ``stepper.momentum_map_names``."""
