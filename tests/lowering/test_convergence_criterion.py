@@ -22,6 +22,7 @@ from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import SCVI, SVI, SpectralCollocation
 from scvi_codegen.models.problems import problem
+from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.environment import support_text
 from scvi_codegen.runtime.ensemble.ensemble import Ensemble
 
@@ -412,3 +413,24 @@ def test_lanes_decide_as_single_trajectories(tmp_path):
         assert not active[~running].any()
         assert iterations == max(ends, default=iterations)
     assert seen == {("s", -1.0), ("s", 0.0), ("s", 1.0), ("l", 0.0), ("l", 1.0), ("a", 0.0), ("a", 1e3)}
+
+
+@pytest.mark.parametrize("name", ["kepler", "heavy top"])
+def test_tolerance_of_adaptive_steps_ends_the_iteration_early(name):
+    """Half of the iterations, and momentum maps to their error, or to round-off with a criterion of one's own."""
+    if name == "kepler":
+        system, state = problem("kepler").system, {"q": [0.5, 0.0], "p": [0.0, 3**0.5]}
+    else:
+        system = LagrangianSystem.from_text(
+            name="top", lagrangian="(omega_1**2 + omega_2**2 + omega_3**2/2)/2 - R_33", rotations={"R": "omega"}
+        )
+        turned = np.array([np.cos(0.2), np.sin(0.2), 0.0, 0.0])
+        state = {"q": {"R": turned}, "velocity": {"omega": [0.1, 0.2, 3.0]}}
+    stepper = compile_stepper(system, "svi:6")
+    loose, tight = (
+        stepper.integrate(**state, t_end=20.0, tolerance=1e-5, options=options, check_growth=False)
+        for options in (None, SolverOptions())
+    )
+    assert loose.iterations.sum() < 0.6 * tight.iterations.sum()
+    assert 1e-13 < np.abs(loose.momentum_errors()).max() < 1e-7
+    assert np.abs(tight.momentum_errors()).max() < 1e-14
