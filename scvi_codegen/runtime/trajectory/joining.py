@@ -69,7 +69,7 @@ def relative_changes(values: Array, sizes: Array, bounds: Callable[[NDArray[np.b
         scales = np.where(scales > 0.0, scales, 1.0)
         largest = np.fmax.reduce(np.abs(changes), axis=0).astype(float)
         if (suspicious := largest > SUSPICIOUS * scales).any():
-            wider = np.where(suspicious, bounds(suspicious), 0.0)
-            scales = np.where(largest <= ROUNDING * wider, wider, scales)
+            wider = bounds(suspicious)
+            scales = np.where(suspicious & (largest <= ROUNDING * wider), wider, scales)
         changes = changes / scales
     return np.where(np.isinf(scales), np.nan, changes)
