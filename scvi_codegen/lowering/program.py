@@ -30,7 +30,7 @@ from scvi_codegen.ir.program import (
 from scvi_codegen.lowering.arrays import check_solver_of_arrays, one_coordinate
 from scvi_codegen.lowering.constraints import constrained_steps, lowered_constraints, rattle_of
 from scvi_codegen.lowering.loops import rolled_terms
-from scvi_codegen.lowering.solvers.curves import position_iteration, printed_iteration, shooting_iteration
+from scvi_codegen.lowering.solvers.curves import curve_iteration
 from scvi_codegen.lowering.solvers.points import coupled_iteration, hamiltonian_iteration, separable_iteration
 from scvi_codegen.lowering.solvers.tables import Solver, StepProblem, resolved_degree, shift_tables, velocity_tables
 from scvi_codegen.lowering.stage_groups import (
@@ -59,14 +59,7 @@ from scvi_codegen.methods.stage_system import Accelerations, PrintedCurve, ShotC
 from scvi_codegen.tables.basis import cardinal_values, legendre_functional
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 
-FIXED_POINTS: tuple[Solver, ...] = (
-    separable_iteration,
-    hamiltonian_iteration,
-    coupled_iteration,
-    position_iteration,
-    printed_iteration,
-    shooting_iteration,
-)
+FIXED_POINTS: tuple[Solver, ...] = (separable_iteration, hamiltonian_iteration, coupled_iteration, curve_iteration)
 """Fixed-point solvers, the fastest first; the first that is applicable is used."""
 
 

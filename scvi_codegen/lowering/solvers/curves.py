@@ -23,11 +23,12 @@ multipliers) makes it converge twice as fast as a simultaneous update. The equat
 """
 
 import operator
+from collections.abc import Iterator
 
 from sympy import S
 
 from scvi_codegen.formulas.expressions import gradient_tuple
-from scvi_codegen.ir.equations import FixedPointIteration, IterationName, IterationTable, StoredValues
+from scvi_codegen.ir.equations import FixedPointIteration, IterationTable, StoredValues
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.lowering.solvers.tables import (
     MOST_LANES,
@@ -39,7 +40,6 @@ from scvi_codegen.lowering.solvers.tables import (
 )
 from scvi_codegen.lowering.stage_groups import system_kernel
 from scvi_codegen.mechanics.derived_expressions import accelerations, forms_of, multipliers
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import Accelerations, PrintedCurve, ShotCurve
 from scvi_codegen.tables.basis import (
@@ -57,64 +57,19 @@ LARGEST_DIMENSION = 8
 """Largest number of coordinates of shooting; beyond, the kernels take longer to compile than they save."""
 
 
-def position_iteration(problem: StepProblem) -> FixedPointIteration | None:
-    """Return the fixed-point iteration of a tableau in position form; ``None`` with too many stages."""
+def curve_iteration(problem: StepProblem) -> FixedPointIteration | None:
+    """Return the fixed-point iteration on a curve through the stages of a tableau; ``None`` if it would be too large.
+
+    Without a rule it is that of a tableau in position form, else of an SCVI of degree 2 or more: shooting, or printed.
+    """
     system, shape = problem.lagrangian, problem.shape
-    if system is None or not isinstance(shape, Accelerations):
+    if system is None or not isinstance(shape, Accelerations | PrintedCurve | ShotCurve):
         return None
-    lanes = lane_count(len(shape.tableau.b), in_groups=False)
-    if lanes > MOST_LANES:
+    tableau, rule = shape.tableau, None if isinstance(shape, Accelerations) else shape.rule
+    size, shooting = len(tableau.b), isinstance(shape, ShotCurve)
+    lanes = lane_count(max(size, len(rule) if rule else 0), in_groups=False)
+    if lanes > MOST_LANES or (shooting and system.dimension > LARGEST_DIMENSION):
         return None
-    macros = (("HAMILTONIAN", int(bool(problem.system.auxiliaries))),)
-    return _curve_iteration("collocation", system, shape.tableau, None, lanes, macros=macros)
-
-
-def printed_iteration(problem: StepProblem) -> FixedPointIteration | None:
-    """Return the fixed-point iteration of an SCVI as printed, of degree 2 or more; ``None`` with too many points."""
-    system, shape = problem.lagrangian, problem.shape
-    if system is None or not isinstance(shape, PrintedCurve):
-        return None
-    lanes = lane_count(max(len(shape.tableau.b), len(shape.rule)), in_groups=False)
-    if lanes > MOST_LANES:
-        return None
-    ends = _printed_ends(shape.tableau, shape.rule, lanes)
-    return _curve_iteration("collocation", system, shape.tableau, shape.rule, lanes, further=ends)
-
-
-def shooting_iteration(problem: StepProblem) -> FixedPointIteration | None:
-    """Return the fixed-point iteration of a variational SCVI of degree 2 or more; ``None`` if it would be too large."""
-    system, shape = problem.lagrangian, problem.shape
-    if system is None or not isinstance(shape, ShotCurve):
-        return None
-    tableau, rule = shape.tableau, shape.rule
-    lanes = lane_count(max(len(tableau.b), len(rule)), in_groups=False)
-    if lanes > MOST_LANES or system.dimension > LARGEST_DIMENSION:
-        return None
-    position = cardinal_integrals(tableau.c, rule.abscissae, 0)
-    velocity = cardinal_values(tableau.c, rule.abscissae)
-    consistency = matrix_product((rule.unit_weights,), velocity)[0]
-    further = (
-        IterationTable("COLLOCATION_T", pad_matrix(transpose(tableau.A), lanes)),
-        IterationTable("POINT_POSITION_T", pad_matrix(transpose(position), lanes)),
-        IterationTable("POINT_VELOCITY_T", pad_matrix(transpose(velocity), lanes)),
-        IterationTable("POINT_WEIGHT", pad_vector(rule.unit_weights, lanes)),
-        IterationTable("NODE_CONSISTENCY", pad_vector(consistency, lanes, repeat=True)),
-    )
-    return _curve_iteration("shooting", system, tableau, rule, lanes, further=further)
-
-
-def _curve_iteration(
-    name: IterationName,
-    system: LagrangianSystem,
-    tableau: Tableau,
-    rule: Quadrature | None,
-    lanes: int,
-    *,
-    further: tuple[IterationTable, ...] = (),
-    macros: tuple[tuple[str, int], ...] = (),
-) -> FixedPointIteration:
-    """Return the iteration on a curve through the stages of a tableau, with the points of a rule, if there is one."""
-    size, shooting = len(tableau.b), name == "shooting"
     nodes = (
         IterationTable("NODE_TIME", pad_vector(tableau.c, lanes, repeat=True)),
         IterationTable("COLLOCATION", pad_matrix(tableau.A, lanes)),
@@ -123,28 +78,36 @@ def _curve_iteration(
     )
     kernel = _residual_kernel(system) if shooting else _node_kernel(system)
     return FixedPointIteration(
-        name=name,
+        name="shooting" if shooting else "collocation",
         points=size,
         lanes=lanes,
-        own_tables=(*nodes, *(_point_tables(tableau, rule, lanes) if rule else ()), *further),
+        own_tables=(*nodes, *(_point_tables(tableau, rule, lanes, shooting=shooting) if rule else ())),
         guess=predictor_tables_of(tableau.c, lanes),
         kernels=(kernel, _action_kernel(system)) if rule else (kernel,),
         kept=StoredValues.ACCELERATIONS,
         stored=(3 if shooting else 2) * lanes + 1,
-        parts=("mass_matrix", "curve", f"{name}_iteration"),
-        macros=macros or (("NODES", size),),
+        parts=("mass_matrix", "curve", f"{'shooting' if shooting else 'collocation'}_iteration"),
+        macros=(("NODES", size) if rule else ("HAMILTONIAN", int(bool(problem.system.auxiliaries))),),
         mass_entries=tuple(forms_of(system).lower_mass),
         in_groups=False,
     )
 
 
-def _point_tables(tableau: Tableau, rule: Quadrature, lanes: int) -> tuple[IterationTable, ...]:
-    """Return the points of a quadrature along a curve whose velocity is a polynomial through the nodes."""
-    return (
-        IterationTable("POINT_TIME", pad_vector(rule.abscissae, lanes, repeat=True)),
-        IterationTable("POINT_POSITION", pad_matrix(cardinal_integrals(tableau.c, rule.abscissae, 0), lanes)),
-        IterationTable("POINT_VELOCITY", pad_matrix(cardinal_values(tableau.c, rule.abscissae), lanes)),
-    )
+def _point_tables(tableau: Tableau, rule: Quadrature, lanes: int, *, shooting: bool) -> Iterator[IterationTable]:
+    """Yield the points of a quadrature along a curve whose velocity is a polynomial through the nodes."""
+    position, velocity = cardinal_integrals(tableau.c, rule.abscissae, 0), cardinal_values(tableau.c, rule.abscissae)
+    yield IterationTable("POINT_TIME", pad_vector(rule.abscissae, lanes, repeat=True))
+    yield IterationTable("POINT_POSITION", pad_matrix(position, lanes))
+    yield IterationTable("POINT_VELOCITY", pad_matrix(velocity, lanes))
+    if not shooting:
+        yield from _printed_ends(tableau, rule, lanes)
+        return
+    consistency = matrix_product((rule.unit_weights,), velocity)[0]
+    yield IterationTable("COLLOCATION_T", pad_matrix(transpose(tableau.A), lanes))
+    yield IterationTable("POINT_POSITION_T", pad_matrix(transpose(position), lanes))
+    yield IterationTable("POINT_VELOCITY_T", pad_matrix(transpose(velocity), lanes))
+    yield IterationTable("POINT_WEIGHT", pad_vector(rule.unit_weights, lanes))
+    yield IterationTable("NODE_CONSISTENCY", pad_vector(consistency, lanes, repeat=True))
 
 
 def _printed_ends(tableau: Tableau, rule: Quadrature, lanes: int) -> tuple[IterationTable, ...]:
