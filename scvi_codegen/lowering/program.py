@@ -59,7 +59,12 @@ from scvi_codegen.methods.stage_system import Accelerations, PrintedCurve, ShotC
 from scvi_codegen.tables.basis import cardinal_values, legendre_functional
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 
-FIXED_POINTS: tuple[Solver, ...] = (separable_iteration, hamiltonian_iteration, coupled_iteration, curve_iteration)
+FIXED_POINTS: tuple[Solver, ...] = (
+    separable_iteration,  # constant masses
+    hamiltonian_iteration,
+    coupled_iteration,  # velocities of any Lagrangian
+    curve_iteration,  # accelerations
+)
 """Fixed-point solvers, the fastest first; the first that is applicable is used."""
 
 
