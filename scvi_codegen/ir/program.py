@@ -291,7 +291,7 @@ class Program:
             ),
             *(quantities.first_order_rates, quantities.inverse_legendre),
             *(integrals.kernel if integrals else None, constraints and constraints.kernel),
-            *(constraints and constraints.motion, self.damping, rattle and rattle.force, rattle and rattle.mass),
+            *(constraints and constraints.motion, self.damping, rattle and rattle.force, rattle and rattle.momenta),
         )
         return tuple({kernel.name: kernel for kernel in kernels if kernel}.values())
 
@@ -302,18 +302,20 @@ class Program:
         return tuple(sorted(extra).index(place) for place in extra)
 
     @property
-    def constraint_products(self) -> tuple[tuple[int, int, int, int], ...]:
-        """Products of derivatives e, f of constraints with respect to the same coordinate, e, f, row, distance.
+    def constraint_products(self) -> tuple[tuple[int, int, int, int, int], ...]:
+        """Products of derivatives e, f of constraints and an entry of M^-1: e, f, row, distance, entry.
 
         They are terms of the entries of G M^-1 G^T at this distance below the diagonal, in the order of the positions.
         """
         entries = self.constraints.entries if self.constraints else ()
+        inverse = self.rattle.inverse_masses if self.rattle else ()
+        indices = {pair: n for n, (i, j) in enumerate(inverse) for pair in ((i, j), (j, i))}
         places = [(self.constraint_positions[k], i) for k, i in entries]
         return tuple(
-            (e, f, row, row - column)
+            (e, f, row, row - column, indices[i, j])
             for e, (row, i) in enumerate(places)
             for f, (column, j) in enumerate(places)
-            if i == j and row >= column
+            if (i, j) in indices and row >= column
         )
 
     @property

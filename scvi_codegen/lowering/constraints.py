@@ -1,7 +1,7 @@
 """RATTLE and its generalisation to s + 1 Lobatto points, for constant masses: only multipliers are solved for.
 
-If masses are constant and diagonal, positions at the s + 1 Lobatto points are explicit in forces and multipliers
-(Lobatto IIIA and IIIB), which leaves s equations per constraint,
+If the mass matrix M is constant, positions at the s + 1 Lobatto points are explicit in forces and multipliers (Lobatto
+IIIA and IIIB), which leaves s equations per constraint,
 
     g(u_i) = 0,   u_i = q0 + h c_i M^-1 p0 + h^2 sum_n a_in M^-1 (F_n + G_n^T lambda_n),   i = 1 .. s, n = 0 .. s - 1,
 
@@ -9,7 +9,8 @@ then one for the momentum at the end, G_s M^-1 (.. + h w_s G_s^T lambda_s) + g_t
 with P_n = G_n M^-1 G_n^T, a band matrix if the constraints form a chain, and R = (a_in), the correction of lambda is
 -P_n^-1 (R^-1 (g + G du))_n / h^2. Changes of forces and derivatives within the step are neglected, an error of order h
 that the iteration removes. SVI(1) is RATTLE. Forces that depend on velocities are evaluated at those of the curve, also
-explicit in forces and multipliers, M v_n = p0 + h sum_m b_nm (F_m + G_m^T lambda_m), in each iteration.
+explicit in forces and multipliers, M v_n = p0 + h sum_m b_nm (F_m + G_m^T lambda_m), in each iteration. Terms A of
+momenta M v + A(q, t) act likewise: l^T w l M V = .. - l^T w A, l the velocities of the curve at the points of weight w.
 
 Constraints of systems of arrays are solved by RATTLE and its symmetric compositions. A step of h is, with G0 and G1 the
 derivatives of the constraints at its ends,
@@ -27,10 +28,11 @@ S. Reich, SIAM J. Numer. Anal. 33 (1996), on compositions; E. Barth, K. Kuczera,
 Chem. 16 (1995), on the iteration.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import partial
 
 from sympy import Symbol
+from sympy.utilities.iterables import connected_components
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.ir.equations import ConstrainedSteps, Constraints, Rattle
@@ -58,6 +60,9 @@ from scvi_codegen.methods.stage_system import StageSystem, Velocities
 from scvi_codegen.tables.basis import matrix_product, rounded, transpose
 from scvi_codegen.tables.precision import Vector, mp
 
+MOST_COUPLED_MASSES = 32
+"""Coordinates that masses couple; with more, Newton's method solves for all unknowns."""
+
 
 def rattle_of(system: MechanicalSystem, stages: StageSystem, predictor: NumberTable) -> Rattle | None:
     """Return the tables of such steps; ``None`` if they are not applicable.
@@ -66,7 +71,10 @@ def rattle_of(system: MechanicalSystem, stages: StageSystem, predictor: NumberTa
         predictor: (2 (s + 1), s + 1) tables to the unknowns of the next step, of velocities and of multipliers.
     """
     forms, tables = forms_of(system), velocity_tables(stages.shape)
-    if any(velocity_conditions(system)) or not forms.has_constant_masses or tables is None:
+    if any(velocity_conditions(system)) or not forms.has_constant_mass_matrix or tables is None:
+        return None
+    groups = coupled_coordinates(forms.lower_mass, system.dimension)
+    if max(map(len, groups)) > MOST_COUPLED_MASSES:
         return None
     position, momentum = tables.position[1:], tuple(line[:-1] for line in tables.momentum)
     start = tuple(line[0] / tables.end_momentum[0] for line in momentum)
@@ -74,23 +82,45 @@ def rattle_of(system: MechanicalSystem, stages: StageSystem, predictor: NumberTa
     velocities = tuple(row[:-1] for row in predictor[: len(position) + 1])
     at_points = tables.velocity if forms.forces_depend_on_velocities else ()
     others, u = at_points[:-1], (*system.coordinates, *(system.velocities if at_points else ()))
+    further = any(forms.momentum_at_rest)
+    projection = tuple(row[1:] for row in tables.projection) if further else ()
+    shift = transpose(matrix_product(position, projection)) if further else ()
+    inverse = (mp.matrix(response) ** -1).tolist()
     purpose = "L_q + f at u = (q, v)." if at_points else "L_q at u = q."
     return Rattle(
         force=system_kernel(system, "constrained_force", forms.force, u=u, purpose=purpose),
-        mass=system_kernel(system, "constrained_mass", forms.mass.values(), u=(), purpose="The constant masses."),
+        momenta=system_kernel(
+            system, "constrained_momentum", forms.momentum_at_rest, u=system.coordinates, purpose="L_v at u = q, v = 0."
+        )
+        if further
+        else None,
+        inverse_masses=(
+            *((i, i) for i in range(system.dimension)),
+            *((i, j) for group in groups for i in group for j in group if i > j),
+        ),
+        mass_columns=tuple(next(g.index(i) for g in groups if i in g) for i in range(system.dimension)),
         abscissae=lower_vector(tables.abscissae),
         weights=lower_vector(tables.end_momentum),
         start=lower_vector(tuple(x - 1 for x in start)),
         momentum=lower_matrix(transpose(momentum)),
         drift=lower_vector(tuple(mp.fdot(line, start) for line in position)),
         response=lower_matrix(response),
-        inverse=lower_matrix(rounded((mp.matrix(response) ** -1).tolist())),
+        inverse=lower_matrix(rounded(inverse)),
         velocity_start=lower_vector(tuple(mp.fdot(line, start) - 1 for line in others)),
         velocity=lower_matrix(transpose(matrix_product(others, momentum)) if others else ()),
         last_velocity=lower_vector(at_points[-1] if at_points else ()),
+        projection=lower_matrix(transpose(projection)),
+        shift=lower_matrix(shift),
+        shift_response=lower_matrix(rounded(matrix_product(shift, inverse)) if further else ()),
+        velocity_shift=lower_matrix(transpose(matrix_product(others, projection)) if others and further else ()),
         next_positions=lower_matrix(matrix_product(velocities, transpose(position))),
         next_multipliers=tuple(row[:-1] for row in predictor[len(position) + 1 :]),
     )
+
+
+def coupled_coordinates(entries: Iterable[tuple[int, int]], count: int) -> list[tuple[int, ...]]:
+    """Return the groups of coordinates that entries (i, j) of a matrix couple."""
+    return [tuple(sorted(group)) for group in connected_components((range(count), list(entries)))]
 
 
 def constrained_steps(system: ArraySystem, stages: StageSystem, method: Method) -> ConstrainedSteps | None:

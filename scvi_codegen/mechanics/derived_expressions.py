@@ -252,17 +252,25 @@ class Forms:
 
     @cached_property
     def has_constant_masses(self) -> bool:
-        """True if L = sum m_i v_i^2 / 2 - V(q, t) with constant masses, judged by the structure of its derivatives.
+        """True if L = sum m_i v_i^2 / 2 - V(q, t) with constant masses, judged by the structure of its derivatives."""
+        return self.has_constant_mass_matrix and all(i == j for i, j in self.mass) and not any(self.momentum_at_rest)
+
+    @cached_property
+    def has_constant_mass_matrix(self) -> bool:
+        """True if L = v^T M v / 2 + A(q, t) v - V(q, t) with constant M, judged by the structure of its derivatives.
 
         False with damping: velocities at the points are then not the sums of forces in the tables of a method.
         """
         if self.system.auxiliaries or self.system.damping != 0 or self.inverse_mass:
             return False
         constant = set(self.system.parameters)
-        if any(i != j or not entry.free_symbols <= constant for (i, j), entry in self.mass.items()):
-            return False
+        return all(entry.free_symbols <= constant for entry in self.mass.values())
+
+    @cached_property
+    def momentum_at_rest(self) -> tuple[Expr, ...]:
+        """L_v at v = 0, m expressions: the A(q, t) of terms A v of L."""
         at_rest = dict.fromkeys(self.system.velocities, sympy.S.Zero)
-        return all(p.xreplace(at_rest) == 0 for p in self.momentum)
+        return tuple(p.xreplace(at_rest) for p in self.momentum)
 
     def rates(self, count: int) -> tuple[Expr, ...]:
         """Return dL/dt, .., d^count L/dt^count along a curve, in (q, v, t) and :func:`curve_rates`."""

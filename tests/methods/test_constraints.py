@@ -24,7 +24,7 @@ def rod(**more):
     return sc.LagrangianSystem.from_text(
         name="rod",
         coordinates=["x", "y"],
-        lagrangian="m*(x_dot**2 + y_dot**2)/2 - m*g*y",
+        lagrangian="m*(x_dot**2 + y_dot**2)/2 - m*g*y" + more.pop("terms", ""),
         parameters={"m": 2.0, "g": G, "l": 1.5, **more.pop("parameters", {})},
         constraints=["x**2 + y**2 = l**2"],
         **more,
@@ -149,8 +149,85 @@ def test_forces_that_depend_on_velocities_need_no_newton_iteration(kind, s):
     assert np.abs(stiff[0].q - stiff[1].q).max() < 1e-11
 
 
+MASSES = {
+    "bars": "",
+    "magnetic": " + c*(1 + x1**2/3)*(x1*y1_dot - y1*x1_dot)",
+    "driven": " + c*cos(3*t)*x1_dot + sin(t)*y2_dot",
+}
+
+
 @pytest.mark.parametrize(
-    "more", [{}, {"forces": {"x": "c*y_dot", "y": "-c*x_dot"}}], ids=["potential", "gyroscopic force"]
+    ("kind", "s"),
+    [("magnetic", 1), *(pytest.param(*each, marks=pytest.mark.second) for each in (("bars", 8), ("driven", 4)))],
+)
+def test_coupled_masses_and_momentum_terms_need_no_newton_iteration(kind, s):
+    """Compare uniform bars by their ends, whose masses are coupled, with the states of Newton's iteration."""
+    bars = sc.LagrangianSystem.from_text(
+        name=f"{kind} bars",
+        coordinates=["x1", "y1", "x2", "y2"],
+        lagrangian="m*(2*x1_dot**2 + 2*y1_dot**2 + x1_dot*x2_dot + y1_dot*y2_dot + x2_dot**2 + y2_dot**2)/6"
+        f" - 9.81*m*(y1 + y2/2){MASSES[kind]}",
+        parameters={"m": 2.0, "c": 1.5} if MASSES[kind] else {"m": 2.0},
+        constraints=["x1**2 + y1**2 = 1", "(x2 - x1)**2 + (y2 - y1)**2 = 1"],
+    )
+    ours, newton = (sc.compile_stepper(bars, lobatto(s), solver=solver) for solver in ("auto", "newton"))
+    assert "constrained_force(" in ours.source.amalgamated().code
+    start = newton.project([0.6, -0.8, 1.5, -0.4], newton.momentum([0.6, -0.8, 1.5, -0.4], [0.1] * 4, 0.0))
+    for way in ({"h": -0.01, "steps": 60}, {"h": 0.02, "steps": 30}, {"t_end": 0.5}):
+        one, other = (stepper.integrate(*start, **way) for stepper in (ours, newton))
+        assert one.fallback_steps == 0
+        bound = 1e-14 if "h" in way else 1e-8
+        assert np.abs(one.q[-1] - other.q[-1]).max() < bound
+        assert np.abs(one.p[-1] - other.p[-1]).max() < 5 * bound
+        assert np.abs(one.constraint_values()).max() < 2e-14
+
+
+def test_many_coupled_masses_take_newton_iteration(monkeypatch):
+    monkeypatch.setattr("scvi_codegen.lowering.constraints.MOST_COUPLED_MASSES", 2)
+    lagrangian = "x_dot**2 + y_dot**2 + z_dot**2 + x_dot*y_dot{} - z"
+    for further, expected in (("", True), (" + y_dot*z_dot", False)):
+        system = sc.LagrangianSystem.from_text(
+            name=f"coupled{further}",
+            coordinates=["x", "y", "z"],
+            lagrangian=lagrangian.format(further),
+            constraints=["x**2 + y**2 + z**2 = 1"],
+        )
+        assert ("constrained_force(" in sc.generate_source(system, lobatto(1))[0].amalgamated().code) is expected
+
+
+def test_rod_in_a_rotating_frame(swung):
+    """Compare with the motion in an inertial frame."""
+    frame = sc.LagrangianSystem.from_text(
+        name="turning",
+        coordinates=["x", "y"],
+        lagrangian="((x_dot - w*y)**2 + (y_dot + w*x)**2)/2 - g*(x*sin(w*t) + y*cos(w*t))",
+        parameters={"g": G, "w": 0.7},
+        constraints=["x**2 + y**2 = 1.5**2"],
+    )
+    x, y = on_circle(1.3)
+    run = sc.compile_stepper(frame, lobatto(6)).integrate([x, y], [0.0, 0.0], h=0.02, steps=60)
+    at = on_circle(swung[0])
+    turn = 0.7 * 1.2
+    expected = [np.cos(turn) * at[0] + np.sin(turn) * at[1], np.cos(turn) * at[1] - np.sin(turn) * at[0]]
+    assert_allclose(run.q[-1], expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.second
+def test_bits_do_not_depend_on_the_width_of_a_vector_register(monkeypatch):
+    states = []
+    for width in (16, 32, 64):
+        monkeypatch.setenv("SCVI_CODEGEN_CFLAGS", f"-ffp-contract=off -DVECTOR_BYTES={width}")
+        stepper = sc.compile_stepper(rod(terms=" + c*(x*y_dot - y*x_dot)", parameters={"c": 1.0}), lobatto(5))
+        run = stepper.integrate(on_circle(1.0), np.zeros(2), h=0.1, steps=50)
+        states.append(np.array([run.q[-1], run.p[-1]]))
+    assert np.array_equal(states[0], states[1])
+    assert np.array_equal(states[0], states[2])
+
+
+@pytest.mark.parametrize(
+    "more",
+    [{}, {"forces": {"x": "c*y_dot", "y": "-c*x_dot"}}, {"terms": " + c*(x*y_dot - y*x_dot)*x"}],
+    ids=["potential", "gyroscopic force", "magnetic field"],
 )
 def test_energy_of_long_runs_does_not_drift(more):
     """With tables rounded to doubles it drifted by 4e-18 a step; their low words prevent it."""

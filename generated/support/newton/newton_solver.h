@@ -9,12 +9,19 @@
  * of the previous step; for multipliers the rows from B on. */
 typedef struct {
   int rattle_alone; /* 1 if a step whose iteration of the multipliers fails is not solved by Newton's method */
+#ifdef RATTLE
+  real inverse_mass[INVERSE_MASSES];
+#endif
 } solver_data;
 
 static void prepare(const step_data *step, solver_data *data)
 {
-  (void)step;
   data->rattle_alone = 0;
+#ifdef RATTLE
+  invert_masses(step, data->inverse_mass);
+#else
+  (void)step;
+#endif
 }
 
 /* Recomputes the factors at a stored point, bit for bit; returns 0 if that fails. */
@@ -79,7 +86,7 @@ static int solve(const step_data *step, const solver_data *way, real *memory, lo
     keep = step->first ? remake_factors(step, memory + N, data) : 1;
 #ifdef RATTLE
   if (!is_suspended(*guess))
-    status = rattle(step, *guess ? memory : NULL, data, dp, options, report);
+    status = rattle(step, way->inverse_mass, *guess ? memory : NULL, data, dp, options, report);
   keep = 0;
   falls_back = status != OK;
   if (falls_back && way->rattle_alone)
