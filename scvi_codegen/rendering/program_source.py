@@ -17,8 +17,8 @@ from itertools import accumulate, chain
 from typing import Any, Literal, TypeAlias, cast, get_args
 
 from scvi_codegen.ir.derivatives import Derivatives, PointDerivatives
-from scvi_codegen.ir.equations import Control, StoredValues
-from scvi_codegen.ir.kernel import Kernel, is_divided
+from scvi_codegen.ir.equations import Control, IterationTable, StoredValues
+from scvi_codegen.ir.kernel import Kernel, Number, is_divided
 from scvi_codegen.ir.program import Program
 from scvi_codegen.rendering.environment import support_text, template_environment
 from scvi_codegen.rendering.kernels.double_double import arithmetic_headers, uses_functions
@@ -53,6 +53,8 @@ DECLARATIONS = {
 """Inner part of a header by the name of its template."""
 
 
+OF_THREE_WORDS = ("DRIFT", "PRODUCT", "POINT_END_POSITION", "POINT_END_MOMENTUM")
+"""Tables of a separable iteration in double-double arithmetic, by their names in C."""
 LARGEST_INLINED = 150
 """Largest number of operations of the kernels of an iteration that is inlined into the loop over steps.
 
@@ -204,6 +206,7 @@ def render_double_double(
     mass = fixed_point.constant_mass
     assert mass is not None  # of separable systems
     tables = [replace(each, in_two_parts=not each.is_matrix or each.in_two_parts) for each in fixed_point.own_tables]
+    tables += [_lowest_words(each) for each in tables if each.name in OF_THREE_WORDS]
     program = replace(program, fixed_point=replace(fixed_point, own_tables=tuple(tables), linear_part=None))
     quantities, lanes = program.quantities, (derivatives.partials, derivatives.products[0])
     states = (quantities.energy, *((quantities.momentum_kernel,) if quantities.momentum_kernel else ()))
@@ -221,6 +224,16 @@ def render_double_double(
         "own_headers": {**arithmetic_headers(), **cast("Mapping[str, str]", context["own_headers"])},
     }
     return _render(program.prefix, context)
+
+
+def _lowest_words(table: IterationTable) -> IterationTable:
+    """Return the table of what two words of each number leave."""
+
+    def lowest(x: Number) -> Number:
+        return DOUBLE.rest(DOUBLE.rest(x))
+
+    numbers: Any = tuple(tuple(map(lowest, x)) if isinstance(x, tuple) else lowest(x) for x in table.numbers)
+    return replace(table, name=f"{table.name}_LOWEST", numbers=numbers, in_two_parts=False)
 
 
 def _render_mixed_newton(program: Program, control: Control | None) -> Source:

@@ -340,6 +340,20 @@ def test_large_steps() -> None:
     assert run.energy_error() < 3e-29
 
 
+@pytest.mark.second
+def test_energy_does_not_drift() -> None:
+    """The mean change of the energy is a random walk: tables of two words would be those of a dissipative method."""
+    springs = sc.LagrangianSystem.from_text(
+        name="springs", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - x**2/2 - y**2/3"
+    )
+    stepper, steps, changes = sc.compile_stepper(springs, "svi:16", precision="double-double"), 100_000, []
+    for x, y, u, w in np.random.default_rng(1).uniform(-0.25, 0.25, (4, 4)):
+        run = stepper.integrate([x, y], velocity=[u, w], h=0.5, steps=steps, save_every=steps)
+        energy = run.energy()
+        changes.append(float(energy[-1] - energy[0]) / abs(float(energy[0])) / steps)
+    assert abs(np.mean(changes)) < 4e-35
+
+
 def test_numbers() -> None:
     """Floats, text, fractions, mpmath numbers and long doubles become two words; other values are refused by name."""
     with mp.workdps(50):
