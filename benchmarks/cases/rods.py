@@ -70,9 +70,9 @@ def tensions(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> lis
 
 
 def with_constraints(case: Case, n: int, *, quick: bool) -> list[Contender]:
-    """Return contenders with constraints and adaptive step size, by SVI(6); their angles are computed afterwards."""
+    """Return contenders with constraints and adaptive step size, by SVI(8); their angles are computed afterwards."""
     system = points(n)
-    stepper, seconds = compiled(system, SVI(6, "gauss-lobatto:7"))
+    stepper, seconds = compiled(system, SVI(8, "gauss-lobatto:9"))
     maps = case.system.elimination  # type: ignore[attr-defined]
 
     def prepare(tolerance: float | None, index: int) -> Callable[[], Any]:
