@@ -110,7 +110,7 @@ def solve_ivp(
         y0: (2 m,) initial positions, then momenta; (m,) positions alone, also arrays by name, if ``velocity`` is
             passed. They determine the sizes of arrays that are known at run time only.
         velocity: (m,) initial velocities, instead of momenta, or arrays by name.
-        method: method, or its name, as ``"svi:6"``; by default ``SVI(8)``, with constraints SVI(6) with Lobatto points.
+        method: method, or its name, as ``"svi:6"``; by default ``SVI(8)``, with constraints at Gauss-Lobatto points.
         h: upper bound of a fixed step size, reduced so that whole steps fill the span.
         tolerance: instead of ``h``: error ``|q - q_exact| / |q|`` at the end, for which :func:`advise` chooses ``h``.
             ``success`` is False if the run misses it.

@@ -104,8 +104,8 @@ def as_method(method: Method | str, system: MechanicalSystem | None = None) -> M
 
 
 def default_method(system: MechanicalSystem) -> Method:
-    """Return SVI(8); for a system with constraints, SVI(6) with Gauss-Lobatto points, at which they are imposed."""
-    return as_method("svi:6", system) if system.constrained else SVI(8)
+    """Return SVI(8); for a system with constraints with Gauss-Lobatto points, at which they are imposed."""
+    return as_method("svi:8", system)
 
 
 def fitted(specification: Specification, system: MechanicalSystem | None) -> Specification:
