@@ -321,7 +321,7 @@ class Program:
     @property
     def constraint_reach(self) -> int:
         """Largest distance of coupled constraints in this order."""
-        return max((distance for *_, distance in self.constraint_products), default=0)
+        return max((distance for _, _, _, distance, _ in self.constraint_products), default=0)
 
     @property
     def action(self) -> bool:

@@ -182,6 +182,18 @@ def test_coupled_masses_and_momentum_terms_need_no_newton_iteration(kind, s):
         assert np.abs(one.constraint_values()).max() < 2e-14
 
 
+@pytest.mark.parametrize(("terms", "reach"), [("", 1), (" + (x1_dot + x2_dot + x3_dot + x4_dot)**2", 3)])
+def test_the_matrix_of_multipliers_of_a_chain_is_a_band(terms, reach):
+    """A point mass couples the two constraints of its rods, a mass matrix without zeros couples all four."""
+    chain = sc.LagrangianSystem.from_text(
+        name="chain",
+        coordinates=[f"{axis}{k}" for k in range(1, 5) for axis in "xy"],
+        lagrangian=" + ".join(f"(x{k}_dot**2 + y{k}_dot**2)/2 - y{k}" for k in range(1, 5)) + terms,
+        constraints=["x1**2 + y1**2 = 1", *(f"(x{k} - x{k - 1})**2 + (y{k} - y{k - 1})**2 = 1" for k in (2, 3, 4))],
+    )
+    assert f"CONSTRAINT_REACH = {reach}\n" in sc.generate_source(chain, lobatto(1))[0].amalgamated().code
+
+
 def test_many_coupled_masses_take_newton_iteration(monkeypatch):
     monkeypatch.setattr("scvi_codegen.lowering.constraints.MOST_COUPLED_MASSES", 2)
     lagrangian = "x_dot**2 + y_dot**2 + z_dot**2 + x_dot*y_dot{} - z"
