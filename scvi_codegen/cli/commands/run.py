@@ -138,6 +138,10 @@ def run(
     if model.precision in (DOUBLE_DOUBLE, AUTO):
         model = model.with_known_sizes()
     if ensemble is not None:
+        if model.has_time_transformation:
+            raise click.UsageError(
+                "--ensemble is not available with a time transformation: each trajectory has its own times"
+            )
         check_available(model, IN_ENSEMBLE)
     else:
         model._check_alone()
@@ -269,10 +273,6 @@ def _run_ensemble(
     states: EnsembleStates, outputs: tuple[str | None, str | None], *, advised: float | None, member: int
 ) -> None:
     model = states.model
-    if model.has_time_transformation:
-        raise click.UsageError(
-            "--ensemble is not available with a time transformation: each trajectory has its own times"
-        )
     outcome = integrate_states(states)
     balance = energy_balance(outcome.result)
     tell(ensemble_summary(model, outcome, balance), **ensemble_numbers(model, outcome, balance))
