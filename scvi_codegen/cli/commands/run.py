@@ -138,11 +138,7 @@ def run(
     if model.precision in (DOUBLE_DOUBLE, AUTO):
         model = model.with_known_sizes()
     if ensemble is not None:
-        if model.has_time_transformation:
-            raise click.UsageError(
-                "--ensemble is not available with a time transformation: each trajectory has its own times"
-            )
-        check_available(model, IN_ENSEMBLE)
+        _check_ensemble(model)
     else:
         model._check_alone()
     for option, needed in (
@@ -166,6 +162,15 @@ def run(
     else:
         _run_one(model, output, plot, advised=wanted["advise"])
     _check_confirmed(confirmation)
+
+
+def _check_ensemble(model: Model) -> None:
+    """Reject models and options that ensembles do not have."""
+    if model.has_time_transformation:
+        raise click.UsageError(
+            "--ensemble is not available with a time transformation: each trajectory has its own times"
+        )
+    check_available(model, IN_ENSEMBLE)
 
 
 def _check_words(model: Model, options: dict[str, Any]) -> None:
