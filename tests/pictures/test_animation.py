@@ -40,7 +40,7 @@ def is_pendulum(run):
 def run_with(lagrangian: str, coordinates: list[str], **parameters: float) -> sc.Trajectory:
     system = lagrange("mine", coordinates, lagrangian, parameters=parameters)
     m = len(coordinates)
-    return compile_quickly(system, sc.SVI(2)).integrate([0.1] * m, [0.2] * m, h=0.01, steps=5)
+    return compile_quickly(system, sc.SVI(2)).integrate([0.5] * m, [0.2] * m, h=0.01, steps=5)
 
 
 ROBOTS = Path(__file__).parent.parent / "mechanics" / "robots"
