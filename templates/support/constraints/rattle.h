@@ -181,7 +181,6 @@ LANE_FUNCTION void find_accelerations(const real *inverse_mass, const lanes *f, 
 /* v = M^-1 p. */
 static inline void find_velocities(const real *inverse_mass, const real *p, real *v)
 {
-#pragma GCC unroll 64
   for (int i = 0; i < M; i++)
     v[i] = inverse_mass[i] * p[i];
   for (int e = M; e < INVERSE_MASSES; e++) {
@@ -606,7 +605,6 @@ static inline void last_force(const step_data *step, const rattle_step *now, con
 static inline void end_velocity(const rattle_step *now, const real *dp, real *v)
 {
   find_velocities(now->inverse_mass, dp, v);
-#pragma GCC unroll 64
   for (int i = 0; i < M; i++) {
     v[i] += now->v0[i];
 #ifdef MOMENTUM_TERMS
@@ -615,8 +613,8 @@ static inline void end_velocity(const rattle_step *now, const real *dp, real *v)
   }
 }
 
-/* Computes p1 - p0 on the tangent space, and the unknowns z of the step. Unrolled loops keep dp in
- * registers: a vector that is loaded soon after its parts were stored waits for them. */
+/* Computes p1 - p0 on the tangent space, and the unknowns z of the step. An unrolled loop keeps dp
+ * in registers: a vector that is loaded soon after its parts were stored waits for them. */
 static int finish_step(const step_data *step, rattle_step *now, newton_data *data, real *dp)
 {
   const real weight = step->h * RATTLE_WEIGHT[DEGREE];
@@ -643,7 +641,6 @@ static int finish_step(const step_data *step, rattle_step *now, newton_data *dat
     memcpy(data->z + i * B, z, sizeof(real) * DEGREE);
   }
   last_force(step, now, data->z, force);
-#pragma GCC unroll 64
   for (int i = 0; i < M; i++) {
     real sum = RATTLE_WEIGHT[DEGREE] * force[i];
     for (int n = 0; n < DEGREE; n++)
