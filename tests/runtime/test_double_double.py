@@ -54,7 +54,11 @@ def compiled_functions(folder: Path) -> ctypes.CDLL:
     def text(name: str) -> str:
         return headers.get(f"support/{name}") or (support / name).read_text()
 
-    names = ["core/vectors.h", *(f"double_double/{name}.h" for name in ("words", "number_pairs", "vector_words"))]
+    names = [
+        "core/vector_width.h",
+        "core/vectors.h",
+        *(f"double_double/{name}.h" for name in ("words", "number_pairs", "vector_words")),
+    ]
     names += [f"double_double/{name}.h" for name in ("vector_pairs", "conversions", "tables_of_functions")]
     names += ["double_double/number_functions.h", "double_double/vector_functions.h"]
     code = "#include <float.h>\n#include <math.h>\n#include <string.h>\n#define POINTS 8\n#define PARAMETERS 1\n"
