@@ -90,7 +90,7 @@ Record all claims together, on an idle machine, by
 and `python tests/tools/remake_claims.py report.json`.
 """ * bool(missing)
     lines = [
-        f"| {TITLES[name]} | {row['at_error']:.0e} | {documented[TITLES[name]][1]} | {1e3 * row['seconds']:.2g} ms "
+        f"| {TITLES[name]} | {row['at_error']:.0e} | {_with_unit(documented[TITLES[name]])[1]} | {1e3 * row['seconds']:.2g} ms "
         f"| {documented[TITLES[name]][2]} | {row['default']:.2g} | {documented[TITLES[name]][3]} | {row['best']:.2g} |"
         for name, row in rows_of(recorded).items()
     ]
