@@ -180,7 +180,7 @@ class Ensemble:
             reason = "these are integrated one after the other (adaptive steps, or changes by events)"
         elif self.stepper.ensemble is None:
             reason = "those of this method are integrated one after the other"
-        elif "#define EXPLICIT_STEPS" in self.stepper.ensemble.code:
+        elif self.stepper.interface.solver == "explicit":
             reason = "explicit steps have no iterations"
         else:
             return
