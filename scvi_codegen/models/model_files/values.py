@@ -51,7 +51,7 @@ INDICES = ("i", "j", "k")
 FILE_KEYS = ("file", "array")
 
 
-class Entry(NamedTuple):
+class ArrayValue(NamedTuple):
     """Value of an array in a file, and its location for messages."""
 
     array: Array
@@ -88,7 +88,7 @@ def read_values(
         where = f"[initial] {key}, "
         for each in known if isinstance(value, dict) else ():
             if each.name in value:
-                entries[key, each.name] = Entry(each, value[each.name], where + each.name)
+                entries[key, each.name] = ArrayValue(each, value[each.name], where + each.name)
     read = _read_arrays(entries, {}, folder, {each.name: x for each, x in system.constants.items()})
     elements = {
         key: dict(zip(entries[key].array.elements, values.reshape(-1).tolist(), strict=True))
@@ -125,12 +125,12 @@ def _by_coordinate(section: Section, system: MechanicalSystem) -> Section:
 
 
 def _values_of_arrays(
-    document: Document, system: ArraySystem, entries: dict[Key, Entry], folder: str | os.PathLike[str]
+    document: Document, system: ArraySystem, entries: dict[Key, ArrayValue], folder: str | os.PathLike[str]
 ) -> dict[str, Any]:
     """Return the fields of a model with arrays whose sizes are names; ``entries`` are those of parameters."""
     for key, value in document.get("tables", {}).items():
         table = in_section("[tables]", partial(parse_array, key))
-        entries["tables", table.name] = Entry(table, value, f"[tables] {table.name}")
+        entries["tables", table.name] = ArrayValue(table, value, f"[tables] {table.name}")
     entries |= _state_entries(document["initial"], system)
     sizes = document.get("sizes", {})
     check_keys(sizes, system.sizes, "size", "[sizes]")
@@ -144,16 +144,17 @@ def _values_of_arrays(
     return dict(groups)
 
 
-def _parameter_entries(section: Section, system: MechanicalSystem) -> dict[Key, Entry]:
+def _parameter_entries(section: Section, system: MechanicalSystem) -> dict[Key, ArrayValue]:
     """Return the values of arrays of parameters that are not one number."""
     declared = {array.name: array for array in system.arrays}
     names = {key: key.partition("[")[0] for key, value in section.items() if "[" in key and not is_number(value)}
     return {
-        ("fields", name): Entry(declared[name], section[key], f"[parameters] {name}") for key, name in names.items()
+        ("fields", name): ArrayValue(declared[name], section[key], f"[parameters] {name}")
+        for key, name in names.items()
     }
 
 
-def _state_entries(section: Section, system: ArraySystem) -> dict[Key, Entry]:
+def _state_entries(section: Section, system: ArraySystem) -> dict[Key, ArrayValue]:
     """Return the values of each array of coordinates, and of its velocities or momenta."""
     required(section, "q", "[initial]")
     names = [array.name for array in system.coordinates]
@@ -170,12 +171,15 @@ def _state_entries(section: Section, system: ArraySystem) -> dict[Key, Entry]:
             value = {names[0]: value}
         check_keys(value, names, "array", where)
         for array in system.coordinates:
-            entries[field, array.name] = Entry(array, required(value, array.name, where), f"{where}, {array.name}")
+            entries[field, array.name] = ArrayValue(array, required(value, array.name, where), f"{where}, {array.name}")
     return entries
 
 
 def _read_arrays(
-    entries: Mapping[Key, Entry], sizes: Mapping[str, int], folder: str | os.PathLike[str], numbers: Mapping[str, float]
+    entries: Mapping[Key, ArrayValue],
+    sizes: Mapping[str, int],
+    folder: str | os.PathLike[str],
+    numbers: Mapping[str, float],
 ) -> dict[Key, Numbers]:
     """Read all arrays: lists and files first, since they determine sizes, then numbers and formulas."""
     sizes, arrays = dict(sizes), {}
