@@ -11,6 +11,7 @@
     report       time at equal error, by interpolation; tables and JSON of results; plots: their pictures
     digits       double-double arithmetic, and heyoka in long double and quadruple precision
     tables       energy drift, time from text to the first step
+    steps        time of a step: by size and threads, with derivatives, by compiler and processor
     machine      description of the machine
     settings     settings of a benchmark; processor times of functions
 
@@ -34,6 +35,7 @@ from benchmarks.machine import machine
 from benchmarks.report import LEGEND, PRECISION, CaseResult, ResultTable, degree_table, header_lines
 from benchmarks.sections import BUILDERS
 from benchmarks.settings import Plan, ReportActivity
+from benchmarks.steps import run_builds, run_derivatives, run_scaling, run_threads
 from benchmarks.tables import run_drift, run_first_steps
 from scvi_codegen.errors import ScviCodegenError, StateError, closest
 from scvi_codegen.files.atomic import write_text
@@ -48,6 +50,10 @@ SECTIONS: Mapping[str, Callable[[Plan, ReportActivity], CaseResult | ResultTable
     "digits": run_digits,
     "drift": run_drift,
     "first-step": run_first_steps,
+    "scaling": run_scaling,
+    "threads": run_threads,
+    "derivatives": run_derivatives,
+    "builds": run_builds,
 }
 """Sections of the benchmark: name on the command line -> function that measures it."""
 
