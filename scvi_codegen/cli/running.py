@@ -206,7 +206,8 @@ def worst_step(trajectory: Trajectory) -> Iterator[str]:
         yield "largest local error: unknown, this method has no error estimate here"
     else:
         too_long = error > TOLERABLE_ERROR
-        yield f"largest local error: {error:.1e} (relative, estimated), step {begun}{': too large' * too_long}"
+        size = f"{error:.1e} (relative, estimated), step {begun}" if error else "below rounding (estimated)"
+        yield f"largest local error: {size}{': too large' * too_long}"
         if too_long:
             warn(
                 f"the step {begun} is too large: its estimated relative error is {error:.1e}; use a smaller --step or "

@@ -254,6 +254,7 @@ class Model(TimeSpan):
         """Return h, or the size of the first adaptive step; with a time transformation, the step size in tau."""
         if self.h is not None and self.time_transformation is None:
             return self.h
+        self.all_inputs()
         run = self.start(stepper)
         if self.in_transformed_time:
             return run.h

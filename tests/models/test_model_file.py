@@ -165,6 +165,7 @@ def test_a_catalogue_reference_may_be_changed():
         ),
         ("[method]", "[zzz]", "Known: system, field, forces, torques, torques_space, inputs, sizes, "),
         ("lagrangian", "lagrangain", "unknown key 'lagrangain' in [system]; did you mean 'lagrangian'?"),
+        ("lagrangian", "forces", "unknown key 'forces' in [system]; there is a section [forces]. Known: name, coord"),
         ("degree", "degre", "unknown key 'degre' in [method] for svi; did you mean 'degree'?"),
         ('method = "', 'name = "', "unknown key 'name' in [method]; did you mean 'method'?"),
         ("save_every", "save_evry", "unknown key 'save_evry' in [run]; did you mean 'save_every'?"),

@@ -43,7 +43,7 @@ def key_hint(key: str, names: Iterable[str]) -> str:
     known = list(names)
     if here := synonym_hint(key, known):
         return here
-    if (hint := closest(key, known)) != ".":
+    if key not in LOCATIONS and (hint := closest(key, known)) != ".":
         return hint
     locations = [LOCATIONS[name] for name in ([key] if key in LOCATIONS else likely_names(key)) if name in LOCATIONS]
     return f"; {locations[0]}." if locations else "."
@@ -177,7 +177,7 @@ def check_keys(section: Section, known: Iterable[str], kind: str, where: str = "
     hint = key_hint if kind in ("key", "section") else closest
     for key in section:
         if key not in names:
-            raise ModelFileError(f"unknown {kind} '{key}' in {where}{hint(key, names)} Known: {', '.join(names)}")
+            raise ModelFileError(f"unknown {kind} '{key}' in {where}{hint(key, names)} Known: {', '.join(dict.fromkeys(names))}")
 
 
 def in_section(where: str, build: Callable[[], Built]) -> Built:
