@@ -169,6 +169,9 @@ def test_names_that_are_not_inputs_are_rejected():
     given = {"system": system, "method": "svi:2", "q": (0.0,), "p": (0.0,), "h": 0.1, "span": 1.0}
     with pytest.raises(ModelFileError, match="the input 'u' is a Python function"):
         Model(**given, inputs={"u": np.sin})
-    model = Model(**given)
-    with pytest.raises(ModelFileError, match=r"the input u is not set: .*--input u=FILE"):
-        next(model.segments(model.start(compile_stepper(system, "svi:2"))))
+    model, message = Model(**given), r"the input u is not set: .*--input u=FILE"
+    stepper = compile_stepper(system, "svi:2")
+    with pytest.raises(ModelFileError, match=message):
+        next(model.segments(model.start(stepper)))
+    with pytest.raises(ModelFileError, match=message):
+        Model(**given | {"h": None}).first_step(stepper)

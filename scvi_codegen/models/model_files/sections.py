@@ -177,7 +177,9 @@ def check_keys(section: Section, known: Iterable[str], kind: str, where: str = "
     hint = key_hint if kind in ("key", "section") else closest
     for key in section:
         if key not in names:
-            raise ModelFileError(f"unknown {kind} '{key}' in {where}{hint(key, names)} Known: {', '.join(dict.fromkeys(names))}")
+            raise ModelFileError(
+                f"unknown {kind} '{key}' in {where}{hint(key, names)} Known: {', '.join(dict.fromkeys(names))}"
+            )
 
 
 def in_section(where: str, build: Callable[[], Built]) -> Built:
