@@ -323,7 +323,7 @@ class Sources:
         if self.precision == DOUBLE_DOUBLE:
             self._check_double_double()
             derivatives = self._corrected(program)
-            control = control_of(program, self.controller, self.system) if controlled else None
+            control = control_of(program, self.controller, self.system, self.g) if controlled else None
             return render_double_double(program, derivatives, control), self.interface
         control = control_of(program, self.controller, self.system, self.g)
         if control and controlled and not (self.of_arrays or control.density):
@@ -337,7 +337,7 @@ class Sources:
         It has for constant masses and forces of position and time that have not too many derivatives.
         """
         fixed_point = program.fixed_point
-        if fixed_point is None or fixed_point.name != "separable" or program.damping:
+        if fixed_point is None or fixed_point.name != "separable" or program.damping or program.quantities.integrals:
             return None
         return point_derivatives_of(self.system, fixed_point)
 
@@ -346,8 +346,6 @@ class Sources:
         reason = ""
         if self.of_arrays:
             reason = "arrays have sizes known at run time: pass sizes={..}"
-        elif self.g is not None or self.system.clock:
-            reason = "time is transformed: use fixed steps h in physical time"
         elif self.solver == "fixed-point" and not self._corrected(self.program()):
             reason = (
                 f"solver={self.solver!r} requires constant diagonal masses and forces of position and time: omit it"

@@ -243,6 +243,7 @@ def _render_mixed_newton(program: Program, control: Control | None) -> Source:
         *(group.value for group in program.equations.stage_groups),
         *(quantities.energy, quantities.inverse_legendre, quantities.momentum_kernel),
         *(quantities.first_order_rates, program.damping),
+        quantities.integrals and quantities.integrals.kernel,
         constraints and constraints.motion,
     )
     with_partials = quantities.legendre, constraints and constraints.kernel

@@ -19,6 +19,7 @@ from scvi_codegen.native.options import REASONS, STATUS
 from scvi_codegen.rendering.text import INPUT_PRECISION, LARGEST_VIOLATION, ROUNDING_UNITS
 from scvi_codegen.runtime.core.features import require
 from scvi_codegen.runtime.core.integrator import Integrator
+from scvi_codegen.runtime.core.pairs import quotient_of
 from scvi_codegen.runtime.core.validation import Array, Parameters, States, inputs_not_given, missing_input
 from scvi_codegen.runtime.core.words import block_of
 from scvi_codegen.runtime.rotations.states import checked_pair, checked_states
@@ -42,7 +43,7 @@ def multipliers(stepper: Integrator, q: States, p: States, t: ArrayLike, paramet
     _call(stepper, "multipliers", times, positions, momenta, parameters, values)
     values = stepper._numbers(values)
     if stepper.interface.energy_parameter:
-        values /= stepper.rates(positions, momenta, parameters)[:, np.newaxis]
+        values = quotient_of(values, stepper.rates(positions, momenta, parameters)[:, np.newaxis])
     return values
 
 

@@ -396,11 +396,6 @@ class CompiledMethod(ChosenBySizes):
         wanted = as_events(events)
         if wanted == self.events:
             return self
-        if self.interface.words > 1 and any(event.changes_state for event in wanted):
-            raise MethodError(
-                "events that change the state (then=, restitution=) are not available with precision='double-double': "
-                "make them terminal and restart, or use precision='double'"
-            )
         if wanted not in self._event_variants:
             while len(self._event_variants) >= MOST_EVENT_SETS:
                 self._event_variants.pop(next(iter(self._event_variants)), None)

@@ -14,6 +14,7 @@ from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import REASONS
 from scvi_codegen.runtime.arrays.interface import constraint_shapes
 from scvi_codegen.runtime.core.compiled_method import CompiledMethod
+from scvi_codegen.runtime.core.pairs import product_of, quotient_of, sum_of
 from scvi_codegen.runtime.core.validation import (
     Array,
     Parameters,
@@ -51,14 +52,13 @@ class StateFunctions(CompiledMethod):
     def rates(self, q: States, p: States, parameters: Parameters = None) -> Array:
         """Return (n,) rates dt/dtau at (n, m) states; 1 if time is not transformed."""
         _, positions, momenta = checked_states(self.interface, q, p, 0.0)
-        rates = np.ones(positions.size // self.dimension)
+        rates = np.ones((positions.size // self.dimension, self.interface.words))
         if not self.interface.energy_parameter:
-            return rates
-        values = self.binding.pointer(self._parameters(parameters))
-        pointers = map(self.binding.pointer, (positions, momenta))
-        if self.binding.function("rates")(len(rates), *pointers, values, self.binding.pointer(rates)):
+            return rates[:, 0]
+        arrays = *map(block_of, (positions, momenta, self._parameters(parameters))), rates
+        if self.binding.function("rates")(len(rates), *map(self.binding.pointer, arrays)):
             raise StateError("the rate dt/dtau of the time transformation must be positive at every state")
-        return rates
+        return self._numbers(rates)[:, 0]
 
     def momentum(self, q: States, v: States, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
         """Return momenta p = dL/dv at (q, v, t), the Legendre transform: (m,), or (n, m) for (n, m) states."""
@@ -156,7 +156,8 @@ class StateFunctions(CompiledMethod):
         if self.interface.words > 1:
             result = from_block(result.reshape(-1, 2))[:, 0]
         if name := self.interface.energy_parameter:
-            result = parameters[parameter_index(self.interface, name)] + result / self.rates(q, p, parameters)
+            energy = parameters[parameter_index(self.interface, name)]
+            result = sum_of(energy, quotient_of(result, self.rates(q, p, parameters)))
         return result
 
     def momentum_maps(self, q: States, p: States, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
@@ -220,9 +221,9 @@ class StateFunctions(CompiledMethod):
             return self._called(name, t, q, other, values)
         if name == "velocity":
             values[parameter_index(self.interface, self.interface.energy_parameter)] = self.energy(q, other, t, values)
-            return self._called(name, t, q, other, values) / self.rates(q, other, values)
+            return quotient_of(self._called(name, t, q, other, values), self.rates(q, other, values))
         rate = self.rates(q, np.zeros_like(q), values)
-        p = self._called(name, t, q, other * rate, values)
+        p = self._called(name, t, q, product_of(other, rate), values)
         if self.rates(q, p, values) != rate:
             raise StateError("dt/dtau depends on the momenta, so velocity does not determine them: give p")
         return p

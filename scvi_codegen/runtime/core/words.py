@@ -6,6 +6,7 @@ is its high words, followed by its low words.
 
 import math
 from collections.abc import Hashable, Iterable, KeysView, Mapping, Sequence
+from fractions import Fraction
 from numbers import Rational
 from pathlib import Path
 from typing import Any, Self, TypeVar
@@ -219,6 +220,11 @@ def as_mpmath(values: Any) -> Any:
         return np.frompyfunc(lambda a, b: mp.mpf(float(a)) + mp.mpf(float(b)), 2, 1)(
             np.asarray(values, dtype=float), low_words(values)
         )
+
+
+def fraction_of(value: Any) -> Fraction:
+    """Return a number of one or two words exactly."""
+    return value if isinstance(value, Fraction) else Fraction(float(value)) + Fraction(float(low_words(value)))
 
 
 def as_text(values: Any) -> list[str]:

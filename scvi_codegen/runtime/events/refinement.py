@@ -2,22 +2,31 @@
 
 Between two states of a run the integrator in double finds the time of a crossing to 16 digits. From there the secant
 method solves g = 0 with states of two words, which partial steps give, and g in 40 digits: two iterations suffice.
+
+Events that change the state are located step by step: the integrator in double repeats each step from the high words
+with its changes. The step in double-double then goes to the refined time of each change, from the changed state to the
+next one, and to its end.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
 from functools import cached_property
+from itertools import groupby
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
-from scvi_codegen.errors import MethodError, StateError
-from scvi_codegen.runtime.core.words import DIGITS, Word, as_mpmath, missing, stacked, word
+from scvi_codegen.errors import EventError, MethodError, StateError, StepFailedError
+from scvi_codegen.runtime.core.words import Word, fraction_of, missing, stacked, with_low, word
 from scvi_codegen.runtime.events.detection import CrossingSearch
 from scvi_codegen.runtime.events.event import Crossings, Event
+from scvi_codegen.runtime.events.functions import EventFunctions
+from scvi_codegen.runtime.run.memory import Memory
+from scvi_codegen.runtime.run.step_plan import StepPlan
+from scvi_codegen.runtime.run.times import WHOLE
 from scvi_codegen.runtime.trajectory.dense_output import stepped_to
 
 if TYPE_CHECKING:
@@ -38,35 +47,21 @@ class RefinedCrossing(NamedTuple):
     element: int
 
 
-class EventFunctions:
-    """Functions of events that are evaluated in 40 digits.
+class Place(NamedTuple):
+    """Time and state of two words from which a partial step starts."""
 
-    Args:
-        stepper: integrator in double-double.
-        events: the events.
-    """
+    t: Fraction
+    q: Array
+    p: Array
 
-    def __init__(self, stepper: Integrator, events: Sequence[Event]) -> None:
-        from scvi_codegen.formulas.expressions import Tape  # here, because it imports SymPy
-        from scvi_codegen.formulas.symbols import TIME, symbol
-        from scvi_codegen.rendering.events import EventFormulas
 
-        formulas = EventFormulas(stepper.interface, events)
-        symbols = [*formulas.arguments, symbol(TIME), *formulas.parameters]
-        self.firsts = np.cumsum([0, *formulas.elements]).tolist()
-        self.tapes = [Tape([function], symbols) for function in formulas.functions]
-        self.velocities = [not function.free_symbols.isdisjoint(formulas.v) for function in formulas.functions]
-        self.stepper = stepper
+class Row(NamedTuple):
+    """State at the end of a step or after a change within one, and the size of the part of the step before it."""
 
-    def value(self, number: int, q: Array, p: Array, t: Fraction, parameters: Array) -> Any:
-        """Return the value of a function at a state; raise ``ArithmeticError`` outside its domain."""
-        from scvi_codegen.tables.precision import mp
-
-        v = self.stepper.velocity(q, p, float(t), parameters) if self.velocities[number] else q
-        with mp.workdps(DIGITS):
-            words = [mp.mpf(x) for each in (q, p, v, parameters) for x in as_mpmath(each)]
-            words.insert(3 * len(q), mp.mpf(t.numerator) / t.denominator)
-            return self.tapes[number](words)[0]
+    at: Place
+    size: float = 0.0
+    number: int = -1
+    iterations: int = 0
 
 
 class RefinedSearch(CrossingSearch):
@@ -89,44 +84,127 @@ class RefinedSearch(CrossingSearch):
         return reached
 
     def _refined(self, part: SavedStates, record: Any) -> RefinedCrossing:
-        number = int(record["function"])
-        element = int(record["element"]) if "element" in record.dtype.names else 0
         t, forward = float(record["t"]), part.forward
         k = max(0, int(np.searchsorted(forward * np.asarray(part.t), forward * t, side="right")) - 1)
-        function = self.precise._event_functions.firsts[number] + element
-        end, q, p = self._root(part, k, function, Fraction(t), Fraction(float(part.step_sizes[k])))
-        high = float(end)
-        return RefinedCrossing(number, word(high, float(end - Fraction(high))), q, p, element)
+        start, h = Place(fraction_of(part.t[k]), part.q[k], part.p[k]), float(part.step_sizes[k])
+        if self.precise.in_tau:
+            h *= float(self.precise.rates(start.q, start.p, part.parameters)[0])
+        return self._crossing(record, self._root(part, start, self._function(record), Fraction(t), Fraction(h)))
 
-    def _root(
-        self, part: SavedStates, k: int, function: int, start: Fraction, h: Fraction
-    ) -> tuple[Fraction, Array, Array]:
-        """Return the time of a simple zero near ``start`` in the step from state k, else ``start``, and the state."""
-        q, p = self._state(part, k, start)
+    def _function(self, record: Any) -> int:
+        number: int = self.precise._event_functions.firsts[int(record["function"])] + _element(record)
+        return number
 
-        def value(t: Fraction, q: Array, p: Array) -> Fraction:
-            numerator, exponent = self.precise._event_functions.value(function, q, p, t, part.parameters).man_exp
-            return Fraction(int(numerator)) * Fraction(2**exponent if exponent >= 0 else Fraction(1, 2**-exponent))
+    def _crossing(self, record: Any, at: Place) -> RefinedCrossing:
+        return RefinedCrossing(int(record["function"]), _word(at.t), at.q, at.p, _element(record))
+
+    def _root(self, states: SavedStates | Memory, start: Place, function: int, guess: Fraction, h: Fraction) -> Place:
+        """Return the time of a simple zero near ``guess`` in the step from ``start``, else ``guess``, and the state."""
+        here = _moved(states, start, guess)
+
+        def value(at: Place) -> Fraction:
+            number = self.precise._event_functions.value(function, at.q, at.p, at.t, states.parameters)
+            numerator, exponent = number.man_exp  # of the absolute value
+            size = Fraction(int(numerator)) * Fraction(2) ** exponent
+            return size if number > 0 else -size
 
         try:
-            near = start + h * Fraction(DIFFERENCE)
-            first, second = value(start, q, p), value(near, *self._state(part, k, near))
+            near = guess + h * Fraction(DIFFERENCE)
+            first, second = value(here), value(_moved(states, start, near))
             if not first or first == second:
-                return start, q, p
-            t = start - first * (near - start) / (second - first)
-            if abs(t - start) > abs(h) * Fraction(LARGEST_CHANGE):
-                return start, q, p
-            last = value(t, *self._state(part, k, t))
+                return here
+            t = guess - first * (near - guess) / (second - first)
+            if abs(t - guess) > abs(h) * Fraction(LARGEST_CHANGE):
+                return here
+            last = value(_moved(states, start, t))
             if last != first:
-                t -= last * (t - start) / (last - first)
+                t -= last * (t - guess) / (last - first)
         except ArithmeticError:  # undefined beside the zero
-            return start, q, p
-        return t, *self._state(part, k, t)
+            return here
+        return _moved(states, start, t)
 
-    def _state(self, part: SavedStates, k: int, end: Fraction) -> tuple[Array, Array]:
-        if float(end) == float(part.t[k]) and not float(end - Fraction(float(part.t[k]))):
-            return part.q[k], part.p[k]
-        return stepped_to(part, part.q[k], part.p[k], part.t[k : k + 1], end)
+    def advance(self, run: Memory, size: int) -> Any:
+        """Advance a run by at most ``size`` steps with events that change its state; see the base class."""
+        plan, rows, failure = run._plan, [Row(_place(run), number=run.steps)], None
+        memory, watch = run.stepper.binding.buffer(run._memory), self.binding.buffer(self.watch)
+        for _ in range(size):
+            if self.ended or run.left_to(plan.t_end) == 0.0:
+                break
+            before = bytes(memory), bytes(watch)
+            try:
+                rows += self._step(run)
+            except (EventError, StepFailedError) as error:
+                memory[:], watch[:] = before
+                failure = error
+                break
+        t, q, p = (stacked([row.at[k] if k else _word(row.at.t) for row in rows]) for k in range(3))
+        sizes = np.array([*(row.size for row in rows[1:]), plan.h or np.nan])
+        iterations, numbers = (np.array([row[k] for row in rows]) for k in (3, 2))
+        return (t, q, p, iterations.astype(np.int32)), sizes, numbers, failure
+
+    def _step(self, run: Memory) -> list[Row]:
+        """Take one step with the changes in it; return the states after these and, unless it ended, at its end."""
+        start, number, stop = _place(run), run.steps, None
+        self._take(run)
+        iterations, run.iterations, end = run.iterations, 0, _place(run)
+        at, h, rows = start, end.t - start.t, list[Row]()
+        for crossings in self._located(run, start, h, number):
+            roots = [self._root(run, at, self._function(each), Fraction(float(each["t"])), h) for each in crossings]
+            acting = [k for k, each in enumerate(crossings) if self.watch.acts[int(each["function"])]]
+            stop = None if acting else roots[-1]
+            if acting:  # crossings that coincide have one state
+                before = roots[acting[0]]
+                roots = [before] * len(crossings)
+                functions = [self._function(crossings[k]) for k in acting]
+                after = self.precise._event_functions.changed(functions, *before[1:], before.t, run.parameters, h > 0)
+                rows.append(Row(Place(before.t, *after), float(before.t - at.t)))
+                at = rows[-1].at
+            self.refined += map(self._crossing, crossings, roots)
+            self.last = self.refined[-1][1:4]
+        if self.ended:
+            if stop is not None:
+                rows.append(Row(stop, float(stop.t - at.t)))
+                at = stop
+            run._memory.step = number
+            _set(run, at)
+            return rows
+        if rows:
+            end = _moved(run, at, end.t)
+            _set(run, end)
+        return [*rows, Row(end, float(end.t - at.t), run.steps, iterations)]
+
+    def _take(self, run: Memory) -> None:
+        """Take one step, shorter if it would pass the target time of fixed steps."""
+        memory, plan = run._memory, run._plan
+        shorter = bool(plan.h) and abs(run.left_to(plan.t_end)) < (1.0 - WHOLE) * abs(plan.h)
+        if shorter:
+            run._step_to(plan.t_end)
+        run._taken(1)
+        if shorter:
+            memory.t, memory.t_low = plan.t_end, 0.0
+            memory.h, memory.h_low = plan.h, 0.0
+
+    def _located(self, run: Memory, start: Place, h: Fraction, number: int) -> list[list[Any]]:
+        """Return the crossings in a step, which the integrator in double repeats, grouped by time."""
+        twin = self._twin
+        twin._parameters[:] = run._parameters
+        if run._options is not twin._options:
+            twin._set_options(run._options)
+        while True:
+            twin.plan = StepPlan(h=float(h))
+            twin._begin(np.asarray(start.q), np.asarray(start.p), float(start.t))
+            twin._memory.step = number
+            failure = super().advance(twin, 1)[-1]
+            records = self.recorded.pop()
+            if failure is not None:
+                raise failure
+            if self.ended or twin._report.steps:
+                together = groupby(records, lambda each: (each["t"], each["fraction"]))
+                return [[*group] for _, group in together]
+
+    @cached_property
+    def _twin(self) -> Memory:
+        return Memory(self.stepper)
 
     def crossings(self) -> tuple[Crossings, ...]:
         """Return the crossings by event, with times and states of two words."""
@@ -138,6 +216,37 @@ class RefinedSearch(CrossingSearch):
             elements = np.array([each.element for each in mine], dtype=np.int64)
             found.append(Crossings(event=event, t=t, q=named(q), p=named(p), element=elements))
         return tuple(found)
+
+
+def _element(record: Any) -> int:
+    return int(record["element"]) if "element" in record.dtype.names else 0
+
+
+def _word(t: Fraction) -> Word:
+    high = float(t)
+    return word(high, float(t - Fraction(high)))
+
+
+def _place(run: Memory) -> Place:
+    return Place(run._exact_time, run.q, run.p)
+
+
+def _set(run: Memory, at: Place) -> None:
+    """Set the time and the state of a run; its step density begins anew."""
+    memory, t = run._memory, _word(at.t)
+    memory.t, memory.t_low, memory.guess = float(t), t.low, 0
+    run._q[:], run._p[:] = at.q, at.p
+    if hasattr(memory, "density"):
+        memory.density = 0.0
+
+
+def _moved(states: SavedStates | Memory, start: Place, end: Fraction) -> Place:
+    """Return the state after a partial step to a time."""
+    if end == start.t:
+        return start
+    t = _word(start.t)
+    begin = with_low(np.array([float(t)]), np.array([t.low]))
+    return Place(end, *stepped_to(states, start.q, start.p, begin, end))
 
 
 class WithEventsInDouble:

@@ -16,11 +16,12 @@ from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.native.arguments import checked_number, checked_step, real_array
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.core.features import refusal
+from scvi_codegen.runtime.core.pairs import exact_product
 from scvi_codegen.runtime.core.validation import Array, check_left_to_inputs, no_input
 from scvi_codegen.runtime.core.words import split, with_low
 from scvi_codegen.runtime.run.accuracy import warn_of_large_steps, warn_of_unresolved_fields
 from scvi_codegen.runtime.run.memory import Memory
-from scvi_codegen.runtime.run.times import exact_product, times_after
+from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.runtime.trajectory.dense_output import checked_times
 from scvi_codegen.runtime.trajectory.joining import joined
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory

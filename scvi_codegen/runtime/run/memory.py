@@ -275,11 +275,18 @@ class Memory:
         high = np.array([self.t])
         return high if self.stepper.interface.words == 1 else with_low(high, np.array([self._memory.t_low]))
 
+    @property
+    def _exact_time(self) -> Fraction:
+        return Fraction(self.t) + Fraction(float(getattr(self._memory, "t_low", 0.0)))
+
     def _step_to(self, end: float | Fraction) -> None:
         """Let the next step, in double-double arithmetic, end at a time: its size has two words as well."""
-        exact = Fraction(end) - Fraction(self.t) - Fraction(self._memory.t_low)
-        self._memory.h = float(exact)
-        self._memory.h_low = float(exact - Fraction(self._memory.h))
+        self._set_step(Fraction(end) - self._exact_time)
+
+    def _set_step(self, size: Fraction) -> None:
+        """Set the size of the next step, in double-double arithmetic."""
+        self._memory.h = float(size)
+        self._memory.h_low = float(size - Fraction(self._memory.h))
 
     def left_to(self, end: float) -> float:
         """Return the time left to ``end``, computed with the low word of the run's time."""
@@ -458,13 +465,15 @@ class Memory:
         taken: int = self._report.steps
         return taken
 
-    def _fill(self, steps: int, q: Array, p: Array) -> Array:
-        """Take steps in one C call, copy the states after each to the rows of q and p, and return their times."""
-        t, pointer = np.empty(steps), self.stepper.binding.pointer  # of doubles
-        arrays = (pointer(t), pointer(q), pointer(p), pointer(np.empty(steps, dtype=np.int32)))
-        if status := self._advance(steps, 1, arrays):
+    def _fill(self, steps: int) -> tuple[Array, Array, Array]:
+        """Take steps in one C call; return the times and the states after each."""
+        binding, words = self.stepper.binding, self.stepper.interface.words
+        t, q, p = (np.empty((steps, words * count)) for count in (1, len(self._q), len(self._p)))
+        iterations = binding.pointer(np.empty(steps, dtype=np.int32))
+        if status := self._advance(steps, 1, (*map(binding.pointer, (t, q, p)), iterations)):
             raise self._failure(status)
-        return t
+        numbers = self.stepper._numbers
+        return numbers(t)[:, 0], numbers(q), numbers(p)
 
     def _run_to_target(self) -> None:
         """Advance to the target time without saving intermediate states."""

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen.errors import EventError, StateError, StepFailedError, closest
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.runtime.core.validation import Array
-from scvi_codegen.runtime.core.words import Words, stacked
+from scvi_codegen.runtime.core.words import Words, fraction_of, stacked
 from scvi_codegen.runtime.events.refinement import search_of
 from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.memory import Memory
@@ -358,10 +358,11 @@ class Observation:
 
         Systems in transformed time are autonomous, so t is counted from the last state.
         """
-        if part.tau is None or (left := self.run.left_to(t)) == 0.0:
-            return part.q[-1], part.p[-1], None if part.tau is None else float(part.tau[-1])
         run = self.run
-        q, p, x = part_of_step(run.stepper, 0.0, run.h, left, part.q[-1], part.p[-1], run.parameters, run.options)
+        if part.tau is None or (left := run.left_to(t)) == 0.0:
+            return part.q[-1], part.p[-1], None if part.tau is None else float(part.tau[-1])
+        span = left if run.stepper.interface.words == 1 else fraction_of(t) - run._exact_time
+        q, p, x = part_of_step(run.stepper, 0.0, run.h, span, part.q[-1], part.p[-1], run.parameters, run.options)
         return q, p, float(part.tau[-1]) + x * run.h
 
     def _with_state(

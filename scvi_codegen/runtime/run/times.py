@@ -7,10 +7,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, checked_step
+from scvi_codegen.runtime.core.pairs import exact_product, exact_sum
 from scvi_codegen.runtime.core.validation import Array
 
-SPLITTER = 2.0**27 + 1.0
-"""Factor that splits a double into two halves of 26 bits (Dekker 1971)."""
 WHOLE = 1e-9
 """Fraction of a step that rounding may leave of a span."""
 MOST_STEPS = 10**9
@@ -23,9 +22,8 @@ def times_after(t: float, h: float, steps: ArrayLike) -> tuple[Array, Array]:
     numbers = np.asarray(steps, dtype=np.float64)
     with np.errstate(over="ignore", invalid="ignore"):
         high, low = (np.ldexp(piece, exponent) for piece in exact_product(numbers, mantissa))
-        total = t + high
-        part = total - t
-        rest = ((t - (total - part)) + (high - part)) + low
+        total, cut = exact_sum(t, high)
+        rest = cut + low
         time = total + rest
         return time, rest - (time - total)
 
@@ -51,11 +49,3 @@ def steps_to(t: float, t_end: float, h: float) -> int | None:
     if not span <= MOST_STEPS:
         raise StateError(f"h = {h:g} requires {span:.0e} steps from t = {t:g} to t_end = {t_end:g}: give a larger h")
     return round(span) if abs(span - round(span)) <= WHOLE else None
-
-
-def exact_product(x: Array, y: Array | float) -> tuple[Array, Array]:
-    """Return x y without rounding error as a double-double number (Dekker's product)."""
-    product = x * y
-    x_high, y_high = SPLITTER * x - (SPLITTER * x - x), SPLITTER * y - (SPLITTER * y - y)
-    x_low, y_low = x - x_high, y - y_high
-    return product, ((x_high * y_high - product) + x_high * y_low + x_low * y_high) + x_low * y_low

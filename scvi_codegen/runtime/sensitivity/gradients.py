@@ -199,7 +199,7 @@ def starts_of(states: SavedStates, first: int, last: int) -> tuple[Starts, NDArr
         return starts, np.arange(first, last + 1)
     t, h = states.t[first] + length * np.arange(count), np.full(count, length)
     starts = Starts.chain(states.q[first], states.p[first], t, h)
-    times = states._restarted(first, length)._fill(count, starts.q[1:], starts.p[1:])
+    times, starts.q[1:], starts.p[1:] = states._restarted(first, length)._fill(count)
     if states.tau is not None:
         starts.t[1:] = times[:-1]
     numbers = np.full(count + 1, -1)

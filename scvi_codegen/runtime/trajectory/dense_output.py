@@ -26,7 +26,7 @@ from scvi_codegen.runtime.core.words import Words, low_words
 from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.trajectory.saved_states import ROUNDINGS, SavedStates
-from scvi_codegen.runtime.trajectory.time_transformation import states_in_transformed_time
+from scvi_codegen.runtime.trajectory.time_transformation import part_of_step, states_in_transformed_time
 
 Array = NDArray[np.float64]
 
@@ -120,6 +120,8 @@ def stepped_to(
     states: SavedStates | Memory, q: Array, p: Array, t: Array, end: float | Fraction
 ) -> tuple[Array, Array]:
     """Return the state after one step from (1,) time t of two words to ``end``, whose size has two words as well."""
+    if states.stepper.in_tau:
+        return part_of_step(states.stepper, t[0], states.h, end, q, p, states.parameters, states.options)[:2]
     settings: dict[str, Any] = {"parameters": states.parameters, "options": states.options}
     run = Memory.started(
         states.stepper, q, p, plan=StepPlan(h=float(end - Fraction(float(t[0])))), t=float(t[0]), **settings

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import ScviCodegenError, StateError
+from scvi_codegen.runtime.core.words import missing
 from scvi_codegen.runtime.events.event import Crossings
 from scvi_codegen.runtime.trajectory.dense_output import whole_steps
 from scvi_codegen.runtime.trajectory.saved_states import ROUNDINGS, STEP_END_TOLERANCE, Array, SavedStates
@@ -121,13 +122,13 @@ def exchanged_energy(states: Any, energy: Array) -> Array | None:
     stepper = states.stepper
     if stepper.interface.changes_energy and not stepper.interface.balances_energy:
         return None
-    before = np.full(len(energy), np.inf)  # energies before the first of the events at one time
+    before = missing((len(energy),), stepper.interface.words)  # before the first event at a time
     try:
         for crossings, rows in changes_by_events(states):
             for row, value in zip(
                 rows, stepper.energy(crossings.q, crossings.p, crossings.t, states.parameters), strict=True
             ):
-                if abs(value - energy[row - 1]) < abs(before[row] - energy[row - 1]):
+                if not abs(value - energy[row - 1]) >= abs(before[row] - energy[row - 1]):  # NaN: none
                     before[row] = value
         exchanged = np.where(np.isfinite(before), energy - before, 0.0)
         total: Array = np.cumsum(exchanged)

@@ -54,7 +54,7 @@ static inline int variable_pairs(const step_data *step, const pair_equations *at
 /* Replaces the increments of a step, solved in double, by those in two words; `memory` has its unknowns. The workspace
  * then has the factors of the Jacobian at these. On failure they are undefined. */
 static int refine_increments(const step_data *step, double *memory, double t_low, double h_low, double *dq, double *dp,
-    double *workspace)
+    double *passed, double *workspace)
 {
   newton_data *data = newton_in(workspace);
   const band shape = band_of(SITES, B);
@@ -101,6 +101,12 @@ static int refine_increments(const step_data *step, double *memory, double t_low
       return NOT_CONVERGED;
     last = change;
   }
+#ifdef TIME_TRANSFORMATION
+  const dd duration = duration_of_pairs(&at);
+  passed[0] = duration.high, passed[1] = duration.low;
+#else
+  (void)passed;
+#endif
 #ifdef DAMPED
   shrink_pairs(&at);
 #endif

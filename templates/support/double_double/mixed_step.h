@@ -212,12 +212,12 @@ static inline int correct_forces(pair_step *w, lanes (*f)[M])
 
 /* Replaces the increments of a step, solved in double, by those in two words. On failure they are undefined. */
 HOT int refine_increments(const step_data *step, double *memory, double t_low, double h_low, double *dq, double *dp,
-    double *workspace)
+    double *passed, double *workspace)
 {
   pair_step w;
   lanes f[GROUPS][M];
   int status;
-  (void)memory, (void)workspace;
+  (void)memory, (void)passed, (void)workspace;
   begin_pairs(&w, step, t_low, h_low);
   forces_of_pairs(&w);
   find_residual(&w);

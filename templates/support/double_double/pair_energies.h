@@ -85,3 +85,22 @@ int NAME(momentum_maps)(long long count, const double *t, const double *q, const
   return OK;
 }
 #endif
+
+#ifdef TIME_TRANSFORMATION
+/* Rates dt/dtau of an array of states. Requires: the kernel integrands_pairs at u = (q, velocities (unused), p). */
+int NAME(rates)(long long count, const double *q, const double *p, const double *parameters, double *rate)
+{
+  for (long long k = 0; k < count; k++) {
+    dd u[3 * M], value[INTEGRALS];
+    memset(u, 0, sizeof u);
+    load_pairs(q + k * 2 * M, u);
+    load_pairs(p + k * 2 * M, u + 2 * M);
+    integrands_pairs(u, dd_of(0.0, 0.0), parameters, value);
+    rate[2 * k] = value[0].high;
+    rate[2 * k + 1] = value[0].low;
+    if (!all_finite(rate + 2 * k, 2) || value[0].high <= 0.0)
+      return NOT_FINITE;
+  }
+  return OK;
+}
+#endif

@@ -41,11 +41,12 @@ int NAME(advance_to)(run_memory *run, real t_end, real tolerance, long long step
 #endif
   while (report->steps < steps && !has_arrived(now.at.t, now.at.t_low, t_end)) {
     const long long before = report->iterations;
+    real passed[2]; /* which only steps in transformed time need */
     int status = find_step(run, &now, options, report);
     if (status == OK)
       status = confirm_step(run, &now, options, report);
     if (status == OK)
-      status = refine_increments(&now.step, run->memory, now.at.t_low, rest_of_last(&now), now.dq, now.dp,
+      status = refine_increments(&now.step, run->memory, now.at.t_low, rest_of_last(&now), now.dq, now.dp, passed,
           now.step.scratch + SCRATCH);
     if (status != OK) {
       run->guess = 0;

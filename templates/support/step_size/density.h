@@ -2,7 +2,27 @@
 
 /* Reversible step-size control by an integrated step density; HAMILTONIAN_SYSTEM: the density depends on momenta,
  * not on velocities. */
-#ifdef HAMILTONIAN_SYSTEM
+#ifdef DOUBLE_DOUBLE
+/* Arguments of the step density, one word of each: positions, momenta or velocities. Requires: pair_states.h. */
+static int density_arguments(const step_data *step, double *u)
+{
+  dd q[M], p[M];
+  for (int i = 0; i < M; i++) {
+    q[i] = dd_word(step->q0[i]);
+    p[i] = dd_word(step->p0[i]);
+  }
+#ifndef HAMILTONIAN_SYSTEM
+  dd v[M];
+  const int status = velocities_of(dd_word(step->t), q, p, step->parameters, v, step->scratch);
+  if (status != OK)
+    return status;
+  memcpy(p, v, sizeof p);
+#endif
+  for (int i = 0; i < M; i++)
+    u[i] = q[i].high, u[M + i] = p[i].high;
+  return OK;
+}
+#elif defined(HAMILTONIAN_SYSTEM)
 /* Arguments of the step density: positions and momenta. Requires: step.h. */
 static int density_arguments(const step_data *step, real *u)
 {
@@ -37,6 +57,9 @@ typedef struct {
   long long fallbacks; /* 1 if the fallback solved the step */
   int last; /* 1 if the step ends at t_end */
   int turned; /* 1 if the run reverses its direction */
+#ifdef MIXED_POINTS
+  coordinates points[GROUPS]; /* of the step in double */
+#endif
 } trial;
 
 static void begin_trials(run_memory *run, trial *now, real tau, solver_options *standard)
