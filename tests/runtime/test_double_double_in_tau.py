@@ -10,6 +10,8 @@ from mpmath import mp
 
 import scvi_codegen as sc
 from scvi_codegen.errors import MethodError
+from scvi_codegen.exact.step import derived_step
+from scvi_codegen.methods import as_method
 from scvi_codegen.runtime.core.pairs import product_of, quotient_of, sum_of
 from scvi_codegen.runtime.core.words import as_mpmath, with_low
 
@@ -18,6 +20,9 @@ KEPLER = sc.LagrangianSystem.from_text(
     coordinates=["x", "y"],
     lagrangian="(x_dot**2 + y_dot**2)/2 + mu/sqrt(x**2 + y**2)",
     parameters={"mu": 1.0},
+)
+ROD = sc.LagrangianSystem.from_text(
+    name="rod", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 - 1"]
 )
 RADIUS = "sqrt(x**2 + y**2)"
 
@@ -81,6 +86,32 @@ def test_step(hamiltonian: bool) -> None:
             exact = [z[i] + h * mp.fdot(b, [g[i] for g in f]) for i in range(5)]
             found = [*run.mp("q")[k + 1], *run.mp("p")[k + 1], run.mp("t")[k + 1]]
             assert largest(a - c for a, c in zip(found, exact, strict=True)) < 2e-30 * largest(exact)
+
+
+@pytest.mark.second
+@pytest.mark.parametrize(
+    ("form", "method"), [("L", "svi:4"), ("K", "radau-iia:3"), ("K", "stoermer-verlet"), ("rod", "svi:3")]
+)
+def test_steps(form: str, method: str) -> None:
+    """Steps agree with the solution of the paper's equations in 60 digits, at an energy off the surface K = 0, too."""
+    plain, g, q, p = {
+        "L": (KEPLER, "frequency", [0.125, 0.0], [0.0, 4.0]),
+        "K": (sc.hamiltonian_of(KEPLER), "arclength", [0.125, 0.0], [0.0, 4.0]),
+        "rod": (ROD, "2 + y", [0.6, -0.8], [0.8, 0.6]),
+    }[form]
+    system = sc.reparametrise(plain, g)
+    each = sc.compile_stepper(system, method, precision="double-double")
+    q, p = each.project(q, p) if form == "rod" else (q, p)
+    run = each.integrate(q, p, h=0.125, steps=3, parameters={"E": -0.25})
+    known = system.with_parameters(E=-0.25)
+    derived = derived_step(known, as_method(method, known))
+    with mp.workdps(60):
+        for k in (0, 2):
+            exact = derived(*(list(run.mp(part)[k]) for part in "qp"), 0.125)
+            for part in "qp":
+                values = getattr(exact, part)
+                found = run.mp(part)[k + 1]
+                assert largest(a - b for a, b in zip(found, values, strict=True)) < 3e-31 * largest(values)
 
 
 @pytest.mark.second
@@ -151,13 +182,7 @@ def test_order_of_the_reversible_controller() -> None:
         run = reversible("svi:16").integrate(**start("0.9"), h=0.0625, t_end=6.5)
         assert anomaly_error(run, "0.9", -1) < 1e-27
         assert run.energy_error() < 1e-28
-        rod = sc.LagrangianSystem.from_text(
-            name="rod",
-            coordinates=["x", "y"],
-            lagrangian="(x_dot**2 + y_dot**2)/2 - y",
-            constraints=["x**2 + y**2 - 1"],
-        )
-        swing = sc.compile_stepper(rod, "svi:4", time_transformation="2 + y", precision="double-double")
+        swing = sc.compile_stepper(ROD, "svi:4", time_transformation="2 + y", precision="double-double")
         held = swing.integrate(["0.6", "-0.8"], velocity=["0.8", "0.6"], h=0.125, t_end=3.0)
         assert max(np.abs(each).max() for each in held.constraint_values()) < 1e-30
 
@@ -172,10 +197,7 @@ def test_energy_of_many_steps() -> None:
 
 def test_other_systems() -> None:
     """Constraints and arrays of known sizes in transformed time; what it excludes stays an error with its remedy."""
-    rod = sc.LagrangianSystem.from_text(
-        name="rod", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 - 1"]
-    )
-    swing = sc.compile_stepper(sc.reparametrise(rod, "2 + y"), "svi:4", precision="double-double")
+    swing = sc.compile_stepper(sc.reparametrise(ROD, "2 + y"), "svi:4", precision="double-double")
     q, p = swing.project([0.6, -0.8], [0.8, 0.6])
     run = swing.integrate(q, p, h=0.0625, steps=20)
     assert max(np.abs(each).max() for each in run.constraint_values()) < 1e-30

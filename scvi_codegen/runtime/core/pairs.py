@@ -16,7 +16,7 @@ def exact_product(x: Array, y: Array | float) -> tuple[Array, Array]:
     return product, ((x_high * y_high - product) + x_high * y_low + x_low * y_high) + x_low * y_low
 
 
-def exact_sum(x: Array, y: Array) -> tuple[Array, Array]:
+def exact_sum(x: Array | float, y: Array) -> tuple[Array, Array]:
     """Return x + y without rounding error as a double-double number (Knuth's sum)."""
     total = x + y
     part = total - x
@@ -52,5 +52,5 @@ def quotient_of(x: Array, y: Array) -> Array:
 
 
 def _normalised(high: Array, rest: Array) -> Array:
-    total, low = exact_sum(np.asarray(high), np.asarray(rest))
-    return with_low(total, low) if isinstance(total, np.ndarray) else with_low(np.array(total), np.array(low))
+    result: Array = with_low(*map(np.asarray, exact_sum(high, rest)))
+    return result

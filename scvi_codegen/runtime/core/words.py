@@ -141,7 +141,9 @@ class Words(NamedState):
     def __array_function__(self, function: Any, types: Any, arguments: Any, keywords: Any) -> Any:
         result = super().__array_function__(function, types, arguments, keywords)
         if function is np.concatenate:
-            return with_low(np.asarray(result), np.concatenate([*map(low_words, arguments[0])], **keywords))
+            return with_low(
+                np.asarray(result), np.concatenate([*map(low_words, arguments[0])], *arguments[1:], **keywords)
+            )
         if function is np.broadcast_to:
             return with_low(result, np.broadcast_to(self.low, *arguments[1:], **keywords))
         return result

@@ -105,7 +105,8 @@ class EventFunctions:
             state[index // m][index % m] = word(*two_words(value, "a value of then="))
         if by_velocity:
             state[1] = stepper.momentum(state[0], state[2], float(t), parameters)
-        return projected(stepper, *state[:2], float(t), parameters)[:2] if stepper.constraints else (state[0], state[1])
+        q, p, _ = state
+        return projected(stepper, q, p, float(t), parameters)[:2] if stepper.constraints else (q, p)
 
     def _impact(
         self,

@@ -105,7 +105,7 @@ class RefinedSearch(CrossingSearch):
         def value(at: Place) -> Fraction:
             number = self.precise._event_functions.value(function, at.q, at.p, at.t, states.parameters)
             numerator, exponent = number.man_exp  # of the absolute value
-            size = Fraction(int(numerator)) * Fraction(2) ** exponent
+            size = int(numerator) * Fraction(2**exponent if exponent >= 0 else Fraction(1, 2**-exponent))
             return size if number > 0 else -size
 
         try:
