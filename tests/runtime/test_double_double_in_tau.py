@@ -141,6 +141,7 @@ def test_output_times_and_events() -> None:
             for states in (run, thinned):
                 q = as_mpmath(states.at([t])[0][0])
                 assert largest(q - times.mp("q")[k]) < 1e-29
+        assert np.abs(thinned.sensitivity().state[-1] - run[:57].sensitivity().state[-1]).max() < 1e-10
         crossings = [t.mp() for t in run.events[0].t]
         assert len(crossings) == 2
         assert largest(t - (k + 1) * mp.pi for k, t in enumerate(crossings)) < 1e-28

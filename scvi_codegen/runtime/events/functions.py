@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from scvi_codegen.runtime.constraints.projection import projected
-from scvi_codegen.runtime.core.words import DIGITS, as_mpmath, two_words, with_low, word
+from scvi_codegen.runtime.core.words import DIGITS, low_words, two_words, with_low, word
 from scvi_codegen.runtime.events.event import Event
 
 if TYPE_CHECKING:
@@ -63,12 +63,16 @@ class EventFunctions:
     def _values(self, tape: Any, number: int, q: Array, p: Array, t: Fraction, parameters: Array) -> list[Any]:
         from scvi_codegen.tables.precision import mp
 
-        v = self.stepper.velocity(q, p, float(t), parameters) if self.velocities[number] else q
+        v = self._velocity(q, p, t, parameters) if self.velocities[number] else q
         with mp.workdps(DIGITS):
             words = [x for each in (q, p, v, parameters) for x in _numbers(each)]
             words.insert(3 * len(q), mp.mpf(t.numerator) / t.denominator)
             values: list[Any] = tape(words)
         return values
+
+    def _velocity(self, q: Array, p: Array, t: Fraction, parameters: Array) -> Array:
+        velocity: Array = self.stepper._transformed("velocity", float(t), q, p, parameters.copy())
+        return velocity
 
     def changed(
         self, numbers: Sequence[int], q: Array, p: Array, t: Fraction, parameters: Array, forward: bool
@@ -100,7 +104,7 @@ class EventFunctions:
         if self.is_impact[number]:
             return q, self._impact(q, p, t, parameters, values[:m], values[m], values[m + 1], forward)
         by_velocity = any(index >= 2 * m for index in self.indices[number])
-        state = [q.copy(), p.copy(), stepper.velocity(q, p, float(t), parameters) if by_velocity else p]
+        state = [q.copy(), p.copy(), self._velocity(q, p, t, parameters) if by_velocity else p]
         for index, value in zip(self.indices[number], values, strict=True):
             state[index // m][index % m] = word(*two_words(value, "a value of then="))
         if by_velocity:
@@ -122,15 +126,16 @@ class EventFunctions:
         """Return the momenta after an impact; the same array if the wall is not approached."""
         from scvi_codegen.tables.precision import mp
 
-        stepper = self.stepper
+        stepper, momenta_before = self.stepper, _numbers(p)
 
         def momenta(impulse: Any) -> Array:
-            moved = [two_words(x + impulse * n, "a momentum") for x, n in zip(_numbers(p), normal, strict=True)]
-            words: Array = with_low(*np.array(moved).T.copy())
+            moved = [x + impulse * n for x, n in zip(momenta_before, normal, strict=True)]
+            high = [float(x) for x in moved]
+            words: Array = with_low(np.array(high), np.array([float(x - y) for x, y in zip(moved, high, strict=True)]))
             return projected(stepper, q, words, float(t), parameters)[1] if stepper.constraints else words
 
         def terms(impulse: Any) -> list[Any]:
-            v = _numbers(stepper.velocity(q, momenta(impulse) if impulse else p, float(t), parameters))
+            v = _numbers(self._velocity(q, momenta(impulse) if impulse else p, t, parameters))
             return [by_time, *(n * x for n, x in zip(normal, v, strict=True))]
 
         def rate(impulse: Any) -> Any:
@@ -155,7 +160,8 @@ def _numbers(values: Array) -> list[Any]:
     """Return numbers of two words in the context of the tables."""
     from scvi_codegen.tables.precision import mp
 
-    return [mp.mpf(x) for x in as_mpmath(values)]
+    words = zip(np.asarray(values).tolist(), low_words(values).tolist(), strict=True)
+    return [mp.mpf(high) + low if low else mp.mpf(high) for high, low in words]
 
 
 def _mean(function: Callable[[Any], Any], end: Any, tolerance: Any) -> Any:

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 import numpy as np
 
 from scvi_codegen.errors import EventError, MethodError, StateError, StepFailedError
-from scvi_codegen.runtime.core.words import Word, fraction_of, missing, stacked, with_low, word
+from scvi_codegen.runtime.core.words import Word, block_of, fraction_of, missing, stacked, with_low, word
 from scvi_codegen.runtime.events.detection import CrossingSearch
 from scvi_codegen.runtime.events.event import Crossings, Event
 from scvi_codegen.runtime.events.functions import EventFunctions
@@ -70,6 +70,7 @@ class RefinedSearch(CrossingSearch):
     def __init__(self, stepper: Any, watch: Any = None, *, terminal: bool = True) -> None:
         super().__init__(stepper._in_double, watch, terminal=terminal)
         self.precise, self.refined = stepper, list[RefinedCrossing]()
+        self._partial: Memory | None = None  # run of partial steps
 
     def search(self, part: SavedStates, first: int = 0) -> int:
         """Search between consecutive states; see the base class."""
@@ -100,7 +101,7 @@ class RefinedSearch(CrossingSearch):
 
     def _root(self, states: SavedStates | Memory, start: Place, function: int, guess: Fraction, h: Fraction) -> Place:
         """Return the time of a simple zero near ``guess`` in the step from ``start``, else ``guess``, and the state."""
-        here = _moved(states, start, guess)
+        here = self._moved(states, start, guess)
 
         def value(at: Place) -> Fraction:
             number = self.precise._event_functions.value(function, at.q, at.p, at.t, states.parameters)
@@ -110,18 +111,38 @@ class RefinedSearch(CrossingSearch):
 
         try:
             near = guess + h * Fraction(DIFFERENCE)
-            first, second = value(here), value(_moved(states, start, near))
+            first, second = value(here), value(self._moved(states, start, near))
             if not first or first == second:
                 return here
             t = guess - first * (near - guess) / (second - first)
             if abs(t - guess) > abs(h) * Fraction(LARGEST_CHANGE):
                 return here
-            last = value(_moved(states, start, t))
+            last = value(self._moved(states, start, t))
             if last != first:
                 t -= last * (t - guess) / (last - first)
         except ArithmeticError:  # undefined beside the zero
             return here
-        return _moved(states, start, t)
+        return self._moved(states, start, t)
+
+    def _moved(self, states: SavedStates | Memory, start: Place, end: Fraction) -> Place:
+        """Return the state after a partial step to a time."""
+        if end == start.t:
+            return start
+        t, stepper = _word(start.t), self.precise
+        if stepper.in_tau:
+            begin = with_low(np.array([float(t)]), np.array([t.low]))
+            return Place(end, *stepped_to(states, start.q, start.p, begin, end))
+        if self._partial is None:
+            plan = StepPlan(h=float(end - start.t))
+            settings: dict[str, Any] = {"parameters": states.parameters, "options": states.options}
+            self._partial = Memory.started(stepper, start.q, start.p, plan=plan, **settings)
+        run, block = self._partial, map(block_of, (start.q, start.p))
+        run._parameters[:] = states.parameters
+        run._start_function(float(t), 0.0, *stepper.binding.pointers(*block))
+        run._memory.t_low = t.low
+        run._step_to(end)
+        run.advance(1)
+        return Place(end, run.q, run.p)
 
     def advance(self, run: Memory, size: int) -> Any:
         """Advance a run by at most ``size`` steps with events that change its state; see the base class."""
@@ -169,7 +190,7 @@ class RefinedSearch(CrossingSearch):
             _set(run, at)
             return rows
         if rows:
-            end = _moved(run, at, end.t)
+            end = self._moved(run, at, end.t)
             _set(run, end)
         return [*rows, Row(end, float(end.t - at.t), run.steps, iterations)]
 
@@ -238,15 +259,6 @@ def _set(run: Memory, at: Place) -> None:
     run._q[:], run._p[:] = at.q, at.p
     if hasattr(memory, "density"):
         memory.density = 0.0
-
-
-def _moved(states: SavedStates | Memory, start: Place, end: Fraction) -> Place:
-    """Return the state after a partial step to a time."""
-    if end == start.t:
-        return start
-    t = _word(start.t)
-    begin = with_low(np.array([float(t)]), np.array([t.low]))
-    return Place(end, *stepped_to(states, start.q, start.p, begin, end))
 
 
 class WithEventsInDouble:
