@@ -53,9 +53,10 @@ __all__ = [
 ]
 
 CALLED: Final = {
-    "stoermer-verlet": "verlet leapfrog velocity-verlet stormer-verlet",
+    "stoermer-verlet": "verlet leapfrog velocity-verlet stormer-verlet rattle shake",
     "gauss": "gauss-legendre",
     "gauss:1": "implicit-midpoint midpoint",
+    "lobatto-iiia:2": "trapezoidal trapezoid",
     "explicit-euler": "euler",
     "radau-iia": "radau",
     "composition": "yoshida",

@@ -95,7 +95,14 @@ SYSTEMS = [
     ({"lagrangian": "q_dot²/2"}, "unexpected character '²': powers are written x**2"),
     ({"L": "x"}, "takes no 'L'; did you mean 'lagrangian'?"),
 ]
-METHODS = {"verlet": "stoermer-verlet", "leapfrog": "stoermer-verlet", "midpoint": "gauss:1", "svl:4": "svi"}
+METHODS = {
+    "verlet": "stoermer-verlet",
+    "rattle": "stoermer-verlet",
+    "trapezoidal": "lobatto-iiia:2",
+    "leapfrog": "stoermer-verlet",
+    "midpoint": "gauss:1",
+    "svl:4": "svi",
+}
 CALLS = [
     *((lambda given=given: run(**given), message) for given, message in RUNS),
     *((lambda given=given: system(**given), message) for given, message in SYSTEMS),
