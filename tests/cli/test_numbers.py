@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from notation import lagrange
 
 import scvi_codegen as sc
 from scvi_codegen.cli import main
@@ -588,10 +589,7 @@ def test_every_number_of_advice_is_correct(springs):
         steps = round(5.25 / h)
         if message is None or steps > 2000:
             continue
-        model = sc.LagrangianSystem.from_text(
-            name="springs", coordinates=["x", "y"], parameters={"m": M, "k": K, "c": C},
-            lagrangian="m*(x_dot**2 + y_dot**2)/2 - k*(x**2 + y**2)/2 - c*(x**2 + y**2)**2/4",
-        )  # fmt: skip
+        model = lagrange("springs", "x y", "m*(x_dot**2 + y_dot**2)/2 - k*(x**2 + y**2)/2 - c*(x**2 + y**2)**2/4", m=M, k=K, c=C)  # fmt: skip
         again = sc.compile_stepper(model, "svi:2").integrate(q[0], p[0], h=5.25 / steps, steps=steps, t=T)
         off = np.linalg.norm(again.q[-1] - end[0]) / math.sqrt(np.mean(np.sum(q**2, axis=1)))
         assert 0.2 * off < float(message) < 20 * off

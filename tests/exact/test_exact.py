@@ -12,7 +12,6 @@ from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError
 from scvi_codegen.exact.discrete_lagrangian import exact_discrete_lagrangian, exact_map
 from scvi_codegen.formulas.expressions import evaluate
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import SCVI, SVI
 from scvi_codegen.models.problems import problem
 from scvi_codegen.tables.precision import mp
@@ -44,7 +43,7 @@ def test_harmonic_oscillator_has_the_requested_digits(digits, h):
 
 
 def test_free_particle_is_exact():
-    free = LagrangianSystem.from_text(name="free", coordinates=["x"], lagrangian="m*x_dot**2/2", parameters={"m": 3.0})
+    free = lagrange("free", "x", "m*x_dot**2/2", m=3.0)
     found = exact_discrete_lagrangian(free, [Fraction(1, 3)], [2], "0.1")
     assert abs(found.action - mp.mpf(3) * mp.mpf(25) / 9 / (2 * mp.mpf("0.1"))) < mp.mpf("1e-45")
     assert largest_difference(found.p0, found.p1) < mp.mpf("1e-45")

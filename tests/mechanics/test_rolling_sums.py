@@ -94,10 +94,7 @@ def test_common_parameters_remain_scalar():
             lagrangian(["x"], "x_dot**2/2 + " + " + ".join(f"x**{k} + sin(x)*x**{k}" for k in range(3, 50))),
             "more than 64 different structures",
         ),
-        (
-            sc.LagrangianSystem.from_text(name="damped", coordinates=["x"], lagrangian="x_dot**2/2", damping="1"),
-            "'damped' has damping",
-        ),
+        (lagrange("damped", "x", "x_dot**2/2", damping="1"), "'damped' has damping"),
         (lagrange("rod", "x y", "x_dot**2/2 + y_dot**2/2", constraints=["x**2 + y**2 = 1"]), "'rod' has constraints"),
     ],
 )

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from notation import lagrange
 
-from scvi_codegen import Composition, LagrangianSystem, MethodError, StoermerVerlet, compile_stepper, problem
+from scvi_codegen import Composition, MethodError, StoermerVerlet, compile_stepper, problem
 
 DOUBLE_PENDULUM, DUFFING, KEPLER = (problem(name).system for name in ("double-pendulum", "duffing", "kepler"))
 
@@ -31,10 +32,7 @@ def test_energy_does_not_drift():
 
 def test_momenta_at_rest_are_not_velocities():
     """L + 3 v has the same motion, and momenta that are larger by 3; leapfrog steps of p / m would be others."""
-    plain, shifted = (
-        LagrangianSystem.from_text(name="o", coordinates=["q"], lagrangian=f"q_dot**2/2 - q**4/4{more}")
-        for more in ("", " + 3*q_dot")
-    )
+    plain, shifted = (lagrange("o", "q", f"q_dot**2/2 - q**4/4{more}") for more in ("", " + 3*q_dot"))
     q, p = compile_stepper(plain, StoermerVerlet()).step([0.7], [0.4], 0.1)
     np.testing.assert_allclose(
         compile_stepper(shifted, StoermerVerlet()).step([0.7], [3.4], 0.1), [q, p + 3], rtol=1e-14

@@ -210,10 +210,7 @@ def test_residual_zeros_in_tables_become_zero_and_model_numbers_are_rejected():
 def test_models_with_numbers_beyond_single_precision_are_rejected(number):
     """Numbers are constants of the Lagrangian or values of parameters."""
     text = "q_dot**2/2 - {}*q**2/2"
-    for system in (
-        sc.LagrangianSystem.from_text(name="s", coordinates=["q"], lagrangian=text.format(number)),
-        lagrange("s", "q", text.format("k"), k=float(number)),
-    ):
+    for system in (lagrange("s", "q", text.format(number)), lagrange("s", "q", text.format("k"), k=float(number))):
         sc.generate_source(system, sc.SVI(1), embedded="double")
         with pytest.raises(sc.MethodError, match="other units"):
             sc.generate_source(system, sc.SVI(1), embedded="single")

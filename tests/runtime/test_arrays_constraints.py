@@ -4,6 +4,7 @@ import subprocess
 
 import numpy as np
 import pytest
+from notation import lagrange
 from scipy.optimize import minimize
 
 import scvi_codegen as sc
@@ -160,9 +161,7 @@ def test_time_dependent_constraints_are_satisfied():
     )
     stepper = sc.compile_stepper(shaken, "composition:8")
     run = stepper.integrate([[0.0, -1.0]], velocity=[[0.3, 0.0]], h=0.02, steps=100, save_every=100)
-    angle = sc.LagrangianSystem.from_text(
-        name="angle", coordinates=["a"], lagrangian="((a_dot*cos(a) + 3*cos(3*t)/10)**2 + (a_dot*sin(a))**2)/2 + cos(a)"
-    )
+    angle = lagrange("angle", "a", "((a_dot*cos(a) + 3*cos(3*t)/10)**2 + (a_dot*sin(a))**2)/2 + cos(a)")
     exact = sc.compile_stepper(angle, "svi:8").integrate([0.0], velocity=[0.0], h=0.05, steps=40)
     place = [np.sin(6.0) / 10 + np.sin(exact.q[-1, 0]), -np.cos(exact.q[-1, 0])]
     assert np.abs(run.q["r"][-1, 0] - place).max() < 1e-9
@@ -236,13 +235,7 @@ def test_discontinuous_constraint_parameters_are_rejected(stepper):
 )
 def test_invalid_constraints_are_rejected(text, message):
     def compiled():
-        system = sc.LagrangianSystem.from_text(
-            name="x",
-            coordinates=["r[N, 2]"],
-            parameters={"g": 1},
-            lagrangian="sum(i in N, sum(a in 2, r_dot[i, a]**2)/2)",
-            constraints=[text],
-        )
+        system = lagrange("x", ["r[N, 2]"], "sum(i in N, sum(a in 2, r_dot[i, a]**2)/2)", g=1, constraints=[text])
         return sc.compile_stepper(system, "stoermer-verlet")
 
     with pytest.raises(sc.SystemDefinitionError, match=message):

@@ -189,9 +189,7 @@ def test_initial_states_of_two_kinds_equal_those_of_single_runs() -> None:
 
 
 def test_a_velocity_without_momentum_is_refused() -> None:
-    polar = sc.LagrangianSystem.from_text(
-        name="polar", coordinates=["r", "phi"], lagrangian="r_dot**2/2 + r**2*phi_dot**2/2 - r**2/2"
-    )
+    polar = lagrange("polar", "r phi", "r_dot**2/2 + r**2*phi_dot**2/2 - r**2/2")
     one = sc.compile_stepper(polar, "svi:4")
     with pytest.raises(sc.StateError, match=r"phi_dot = 1 at q = .* has no momentum"):
         one.integrate_ensemble([[1.0, 0.0], [0.0, 0.0]], velocity=[[0.0, 1.0], [0.0, 1.0]], h=0.05, steps=1)

@@ -169,9 +169,7 @@ def test_collision_is_rejected_where_it_occurs(kepler):
 
 
 def test_equilibria_and_free_particles_need_few_steps():
-    free = sc.compile_stepper(
-        sc.LagrangianSystem.from_text(name="free", coordinates=["x"], lagrangian="x_dot**2/2"), sc.SVI(8)
-    )
+    free = sc.compile_stepper(lagrange("free", "x", "x_dot**2/2"), sc.SVI(8))
     run = free.integrate([0.0], [2.0], t_end=1000.0)
     assert run.q[-1] == [2000.0]
     assert run.steps < 40

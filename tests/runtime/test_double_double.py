@@ -15,6 +15,7 @@ import mpmath
 import numpy as np
 import pytest
 from mpmath import mp
+from notation import lagrange
 from oracle import stepper_of
 from samples import GENERIC, sample_named
 
@@ -292,9 +293,7 @@ def test_automatic_precision() -> None:
     pairs = [(bodies[i], bodies[j]) for i, j in ((0, 1), (0, 2), (1, 2))]
     kinetic = " + ".join(f"{name}_dot**2/2" for body in bodies for name in body)
     potential = " + ".join(f"1/sqrt(({a} - {c})**2 + ({b} - {d})**2)" for (a, b), (c, d) in pairs)
-    three = sc.LagrangianSystem.from_text(
-        name="three bodies", coordinates=[x for body in bodies for x in body], lagrangian=f"{kinetic} + {potential}"
-    )
+    three = lagrange("three bodies", [x for body in bodies for x in body], f"{kinetic} + {potential}")
     stepper = sc.compile_stepper(three, "svi:12", precision="auto")
     start = {"q": [-0.5, 0.0, 0.5, 0.0, 0.2, 0.4], "velocity": np.zeros(6), "error": 1e-6}
     short, long = (stepper.integrate(**start, t_end=end) for end in (2.0, 15.0))
@@ -323,9 +322,7 @@ def test_states_by_name() -> None:
     """States by the names of coordinates or arrays keep both words."""
     third = Fraction(1, 3)
     named = {"x": "0.7", "y": third}, {"x": 0, "y": "1.3"}
-    chain = sc.LagrangianSystem.from_text(
-        name="springs", coordinates=["x[2]"], lagrangian="sum(i in 2, x_dot[i]**2/2 - x[i]**2/2)"
-    )
+    chain = lagrange("springs", "x[2]", "sum(i in 2, x_dot[i]**2/2 - x[i]**2/2)")
     arrays = {"x": ["0.7", third]}, {"x": [0, "1.3"]}
     for each, (q, v) in ((system("kepler"), named), (chain, arrays)):
         stepper = sc.compile_stepper(each, "svi:4", precision="double-double")
@@ -347,9 +344,7 @@ def test_large_steps() -> None:
 @pytest.mark.second
 def test_energy_does_not_drift() -> None:
     """The mean change of the energy is a random walk: tables of two words would be those of a dissipative method."""
-    springs = sc.LagrangianSystem.from_text(
-        name="springs", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - x**2/2 - y**2/3"
-    )
+    springs = lagrange("springs", "x y", "(x_dot**2 + y_dot**2)/2 - x**2/2 - y**2/3")
     stepper, steps, changes = sc.compile_stepper(springs, "svi:16", precision="double-double"), 100_000, []
     for x, y, u, w in np.random.default_rng(1).uniform(-0.25, 0.25, (4, 4)):
         run = stepper.integrate([x, y], velocity=[u, w], h=0.5, steps=steps, save_every=steps)
@@ -581,9 +576,7 @@ def driven_spring(t: list[float], u: list[Fraction], end: float, kind: str) -> l
 
 def test_inputs() -> None:
     """Inputs of two words, constant or linear between samples, or set by a controller, agree with the solution."""
-    spring = sc.LagrangianSystem.from_text(
-        name="driven spring", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2 + u*q", inputs=["u"]
-    )
+    spring = lagrange("driven spring", "q", "q_dot**2/2 - q**2/2 + u*q", inputs="u")
     stepper = sc.compile_stepper(spring, "svi:10", precision="double-double")
     t, u = [0.0, 1.0, 2.0, 4.0], ["0.1", "1/3", "-0.7", Fraction(1, 4)]
     start = {"q": ["0.3"], "velocity": ["0.2"]}

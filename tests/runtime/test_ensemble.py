@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+from notation import hamilton, lagrange
 from numpy.testing import assert_allclose
 from samples import pushed_pendulum, sample_named, stepper_for
 from scipy.interpolate import CubicSpline
@@ -62,9 +63,7 @@ def coupled_with_inputs() -> sc.LagrangianSystem:
     )
 
 
-RELATIVISTIC = sc.HamiltonianSystem.from_text(
-    "relativistic", ["q"], "sqrt(1 + p_q**2) + k*q**2/2 + cos(t)*q", parameters={"k": 1.0}
-)
+RELATIVISTIC = hamilton("relativistic", "q", "sqrt(1 + p_q**2) + k*q**2/2 + cos(t)*q", k=1.0)
 WITH_INPUTS = {"pushed pendulum": pushed_pendulum, "coupled with inputs": coupled_with_inputs}
 
 
@@ -829,9 +828,7 @@ def test_absolute_tolerance_equals_that_of_single_trajectories(name):
 
 
 def test_diverging_trajectory_retains_its_previous_states():
-    singular = sc.LagrangianSystem.from_text(
-        name="falling", coordinates=["x"], lagrangian="x_dot**2/2 + 1/x", forces={"x": "u"}, inputs=["u"]
-    )
+    singular = lagrange("falling", "x", "x_dot**2/2 + 1/x", forces={"x": "u"}, inputs="u")
     inputs = {"u": ([0.0, 0.5, 3.0], [0.0, 0.1, 0.1])}
     stepper = sc.compile_stepper(singular, sc.SVI(4))
     runs = stepper.integrate_ensemble([[1.0], [9.0]], [[0.0], [0.0]], inputs=inputs, t_end=2.5)
@@ -865,9 +862,7 @@ def test_splines_of_scipy_are_accepted():
 
 def test_failed_trajectory_does_not_affect_others():
     """The third pendulum's push has no square root in the fourth piece."""
-    system = sc.LagrangianSystem.from_text(
-        name="root", coordinates=["q"], lagrangian="q_dot**2/2 + cos(q)", forces={"q": "sqrt(u)"}, inputs=["u"]
-    )
+    system = lagrange("root", "q", "q_dot**2/2 + cos(q)", forces={"q": "sqrt(u)"}, inputs="u")
     stepper, u = sc.compile_stepper(system, sc.SVI(3)), np.abs(OWN_VALUES) + 0.1
     fine = stepper.integrate_ensemble(*states("pushed pendulum", COUNT), inputs={"u": (KNOTS, u)}, h=0.1, t_end=2.3)
     u[2, 4] = -3.0
@@ -883,9 +878,7 @@ def test_failed_trajectory_does_not_affect_others():
 @pytest.mark.filterwarnings("ignore::scvi_codegen.errors.AccuracyWarning")
 def test_lane_with_failed_iteration_continues_as_scalar_across_breakpoints():
     """Stiff from the second piece on, where Newton's iteration alone leads on."""
-    system = sc.LagrangianSystem.from_text(
-        name="stiffening", coordinates=["q"], lagrangian="q_dot**2/2 - (1 + u)*q**2/2 - q**4/4", inputs=["u"]
-    )
+    system = lagrange("stiffening", "q", "q_dot**2/2 - (1 + u)*q**2/2 - q**4/4", inputs="u")
     stepper, u = sc.compile_stepper(system, sc.SVI(2)), np.tile(VALUES**2, (COUNT, 1))
     u[4, 2:] = 4000.0
     q, p = states("pushed pendulum", COUNT)

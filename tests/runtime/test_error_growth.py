@@ -5,6 +5,7 @@ import warnings
 
 import numpy as np
 import pytest
+from notation import lagrange
 
 import scvi_codegen as sc
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
@@ -42,9 +43,7 @@ STEPPERS = {}
 def stepper_of(system, method="svi:8"):
     if (system, method) not in STEPPERS:
         names, text = system
-        STEPPERS[system, method] = sc.compile_stepper(
-            sc.LagrangianSystem.from_text(name="motion", coordinates=names, lagrangian=text), method
-        )
+        STEPPERS[system, method] = sc.compile_stepper(lagrange("motion", names, text), method)
     return STEPPERS[system, method]
 
 

@@ -114,11 +114,7 @@ def test_accumulation_of_a_relativistic_ball():
 
     The crossings within the last step are more than one call of C returns.
     """
-    stepper = sc.compile_stepper(
-        sc.LagrangianSystem.from_text(name="relativistic", coordinates=["y"], lagrangian="-sqrt(1 - y_dot**2) - y/10"),
-        "svi:8",
-        flags=FLAGS,
-    )
+    stepper = sc.compile_stepper(lagrange("relativistic", "y", "-sqrt(1 - y_dot**2) - y/10"), "svi:8", flags=FLAGS)
     e, fall = 0.99, 10.0 * math.sqrt(1.1**2 - 1.0)
     with pytest.warns(sc.EventWarning, match="accumulate"):
         run = stepper.integrate([1.0], [0.0], h=0.1, t_end=2000.0, events=sc.impact("y", e))

@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from notation import lagrange
 
 import scvi_codegen as sc
 from scvi_codegen.native import building
@@ -145,9 +146,7 @@ def test_prepare_compiles_everything_later_calls_need(tmp_path, monkeypatch):
     monkeypatch.setenv("SCVI_CODEGEN_CACHE", str(tmp_path))
     swing, flags = sc.problem("planar-pendulum").system, ("-O0",)
     stepper, state = sc.compile_stepper(swing, "svi:2", flags=flags), ([1.0], [0.0])
-    lattice = sc.LagrangianSystem.from_text(
-        name="chain", coordinates=["q[N]"], lagrangian="sum(a in N, q_dot[a]**2/2 - q[a]**2/2)"
-    )
+    lattice = lagrange("chain", "q[N]", "sum(a in N, q_dot[a]**2/2 - q[a]**2/2)")
     chain = sc.compile_stepper(lattice, "svi:2", flags=flags)
     stepper.prepare(tangent=True, second=True, ensemble=True, events=["q", "q_dot"])
     chain.prepare()

@@ -59,11 +59,7 @@ def test_ball_on_a_vibrating_table_has_orbits_of_period_one_and_two(table):
 
 def test_orbits_of_billiards_have_the_multipliers_of_mirrors():
     """Two mirrors of radius R at distance L: half the trace of the round trip is 2 g^2 - 1, g = 1 - L/R."""
-    point = sc.compile_stepper(
-        sc.LagrangianSystem.from_text(name="point", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2"),
-        "svi:1",
-        flags=FLAGS,
-    )
+    point = sc.compile_stepper(lagrange("point", "x y", "(x_dot**2 + y_dot**2)/2"), "svi:1", flags=FLAGS)
     ellipse = point.with_events(sc.impact("1 - (x/1.5)**2 - y**2"))
     discs = point.with_events([sc.impact("(x - 3/2)**2 + y**2 - 1"), sc.impact("(x + 3/2)**2 + y**2 - 1")])
     for stepper, velocity, ratio, period in ((ellipse, [0.01, 1.0], 2 / 2.25, 4.0), (discs, [1.0, 0.01], -1.0, 2.0)):

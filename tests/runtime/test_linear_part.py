@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from mpmath import factorial, mp
+from notation import lagrange
 
 import scvi_codegen as sc
 from scvi_codegen.lowering.program import lower
@@ -17,11 +18,8 @@ def ring(cubic: float = 0.0, *, count: int = COUNT, further: str = "", name: str
     pairs = [(f"q{order[k]}", f"q{order[(k + 1) % count]}") for k in range(count)]
     springs = [f"-k*({b} - {a})**2/2 - c*({b} - {a})**4/4" for a, b in pairs]
     kinetic = [f"m*q{k}_dot**2/{2 + k % 2}" for k in range(count)]
-    return sc.LagrangianSystem.from_text(
-        name=name,
-        coordinates=[f"q{k}" for k in range(count)],
-        lagrangian="+".join(kinetic) + "".join(springs) + further,
-        parameters={"m": 1.5, "k": 2.0, "c": cubic},
+    return lagrange(
+        name, [f"q{k}" for k in range(count)], "+".join(kinetic) + "".join(springs) + further, m=1.5, k=2.0, c=cubic
     )
 
 

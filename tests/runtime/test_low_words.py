@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from notation import hamilton, lagrange
 from oracle import collocation_tableau, points
 from samples import QUICK_FLAGS
 
@@ -39,17 +40,13 @@ def coupled() -> sc.LagrangianSystem:
 
 def hamiltonian() -> sc.HamiltonianSystem:
     text = "p**2/4 + r**2/2 + s**2 + (x - y)**2 + (y - z)**4/4 - cos(z - x + t)/3"
-    return sc.HamiltonianSystem.from_text(
-        name="bodies", coordinates=COORDINATES, momenta=["p", "r", "s"], hamiltonian=text
-    )
+    return hamilton("bodies", COORDINATES, text, momenta="p r s")
 
 
 def coupled_hamiltonian() -> sc.HamiltonianSystem:
     """Velocities depend on several momenta; their coupling does not move the centre of mass."""
     text = "p**2/4 + r**2/2 + s**2 + (p/2 - r)**4/6 + (x - y)**2 + (y - z)**4/4 - cos(z - x + t)/3"
-    return sc.HamiltonianSystem.from_text(
-        name="coupled momenta", coordinates=COORDINATES, momenta=["p", "r", "s"], hamiltonian=text
-    )
+    return hamilton("coupled momenta", COORDINATES, text, momenta="p r s")
 
 
 def rod() -> sc.LagrangianSystem:
@@ -259,9 +256,7 @@ def test_coefficients_and_their_low_words_are_exact(text: str) -> None:
 
 def test_work_is_the_sum_over_steps() -> None:
     """Comparison with the exact sum, over steps recomputed between saved states."""
-    system = sc.LagrangianSystem.from_text(
-        name="rubbed", coordinates=["x"], lagrangian="x_dot**2 - x**2", forces={"x": "sin(3*t) - x_dot/5"}
-    )
+    system = lagrange("rubbed", "x", "x_dot**2 - x**2", forces={"x": "sin(3*t) - x_dot/5"})
     stepper = sc.compile_stepper(system, "svi:3", flags=QUICK_FLAGS)
     run = stepper.integrate([0.3], [0.4], h=0.01, t=0.7, steps=300)
     states = zip(run.q[:-1], run.p[:-1], run.t[:-1].tolist(), strict=True)

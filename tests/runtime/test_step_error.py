@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from notation import lagrange
 
 import scvi_codegen as sc
 
@@ -12,10 +13,7 @@ OSCILLATORS = {
     "of two wells": "x_dot**2/2 + x**2/2 - x**4/4",
     "quick": "sqrt(1 + x_dot**2) - x**2/2",
 }
-SYSTEMS = CATALOGUE | {
-    name: sc.LagrangianSystem.from_text(name=name, coordinates=["x"], lagrangian=lagrangian)
-    for name, lagrangian in OSCILLATORS.items()
-}
+SYSTEMS = CATALOGUE | {name: lagrange(name, "x", lagrangian) for name, lagrangian in OSCILLATORS.items()}
 PHASES = 60
 
 

@@ -468,10 +468,7 @@ def test_two_point_form_gives_the_same_positions(sample, compiled, method):
 
 @pytest.mark.parametrize(
     "system",
-    [
-        sc.LagrangianSystem.from_text(name="L", coordinates=["x"], lagrangian="x_dot**2 - x**4/4 + x*cos(t)"),
-        hamilton("H", "x", "y**2/4 + x**4/4 - x*cos(t)", momenta="y"),
-    ],
+    [lagrange("L", "x", "x_dot**2 - x**4/4 + x*cos(t)"), hamilton("H", "x", "y**2/4 + x**4/4 - x*cos(t)", momenta="y")],
     ids=["lagrangian", "hamiltonian"],
 )
 def test_the_discrete_lagrangian_of_an_explicit_step_is_the_trapezoidal_sum(system):
