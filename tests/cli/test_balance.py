@@ -5,10 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import output_of
 
 from scvi_codegen import SVI, Event, LagrangianSystem, Model, StateError, compile_stepper, generate_package, save_model
-from scvi_codegen.cli import main
 from scvi_codegen.files.energy import MOST_BALANCED_COORDINATES, MOST_BALANCED_STEPS, energy_account
 
 MODEL = """
@@ -39,20 +38,18 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
-def output_of(model, *words):
+def printed(model, *words):
     Path("model.toml").write_text(model)
-    result = CliRunner().invoke(main, ["run", "model.toml", *words])
-    assert result.exit_code == 0, result.output
-    return result.stdout
+    return output_of("run", "model.toml", *words)
 
 
 def test_damping_and_inputs_have_a_work_balance():
     damped = MODEL.replace("lagrangian", "damping = 0.1\nlagrangian").replace('[forces]\nx = "-x_dot/10"\n', "")
-    assert "energy: damping takes it" in (text := output_of(damped))
+    assert "energy: damping takes it" in (text := printed(damped))
     assert "energy balance |E - E0 - W|" in text
     driven = MODEL.replace("-x_dot/10", "u").replace("coordinates", 'inputs = ["u"]\ncoordinates')
     inputs = "[inputs]\nu = { t = [0.0, 3.0, 7.0], values = [0.0, 1.0, 0.0] }\n"
-    assert "energy balance |E - E0 - W|" in output_of(driven + inputs)
+    assert "energy balance |E - E0 - W|" in printed(driven + inputs)
 
 
 @pytest.mark.sampled(2)
@@ -71,8 +68,8 @@ def test_conservative_systems_have_no_balance(changed):
     for old, new in changed.items():
         assert old in model
         model = model.replace(old, new)
-    assert "E - E0 - W" not in output_of(model)
-    found = json.loads(output_of(model, "--json"))
+    assert "E - E0 - W" not in printed(model)
+    found = json.loads(printed(model, "--json"))
     assert found["work"] is None
     assert found["energy_balance"] is None
 
@@ -138,18 +135,18 @@ def reports_of(model):
     save_model(model, "model.toml")
     Path("grid.toml").write_text("[grid]\nq = [0.5, 1.0]\n")
     for words in ((), ("-o", "states.run"), ("--ensemble", "grid.toml")):
-        result = CliRunner().invoke(main, ["run", "model.toml", *words])
-        assert result.exit_code == 0, result.output
-        yield result.stdout.replace("energy: forces act, it changed", "energy change").replace(
-            "energy: L depends on time, it changed", "energy change"
+        yield (
+            output_of("run", "model.toml", *words)
+            .replace("energy: forces act, it changed", "energy change")
+            .replace("energy: L depends on time, it changed", "energy change")
         )
 
 
 def test_balance_of_an_ensemble_is_the_largest_of_its_trajectories():
     Path("grid.toml").write_text("[grid]\nx = [0.5, 1.0, 1.5]\n")
-    found = json.loads(output_of(MODEL, "--ensemble", "grid.toml", "--json"))["energy_balance"]
-    single = [json.loads(output_of(MODEL.replace("1.0, 0.0", f"{x}, 0.0"), "--json")) for x in (0.5, 1.0, 1.5)]
+    found = json.loads(printed(MODEL, "--ensemble", "grid.toml", "--json"))["energy_balance"]
+    single = [json.loads(printed(MODEL.replace("1.0, 0.0", f"{x}, 0.0"), "--json")) for x in (0.5, 1.0, 1.5)]
     assert found == pytest.approx(max(each["energy_balance"] for each in single), rel=1e-3)
-    changed = output_of(MODEL.replace("(x - y)**4/4", "(2 + cos(t))*(x - y)**4/12"), "--ensemble", "grid.toml")
+    changed = printed(MODEL.replace("(x - y)**4/4", "(2 + cos(t))*(x - y)**4/12"), "--ensemble", "grid.toml")
     assert "it changed by" in changed
     assert "E - E0 - W" not in changed

@@ -19,7 +19,7 @@ import click
 import numpy as np
 import pytest
 from click.shell_completion import ShellComplete
-from click.testing import CliRunner, Result
+from commands import error_of, invoke, output_of
 
 from scvi_codegen import Model, compile_stepper, problem
 from scvi_codegen.cli import ABOUT, main
@@ -37,25 +37,6 @@ COMMAND = shutil.which("scvi-codegen", path=str(Path(sys.executable).parent))
 def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.chdir(tmp_path)
     return
-
-
-def invoke(*words: str) -> Result:
-    return CliRunner().invoke(main, list(words), prog_name="scvi-codegen")
-
-
-def output_of(*words: str) -> str:
-    result = invoke(*words)
-    assert result.exit_code == 0, result.output
-    return result.stdout
-
-
-def error_of(*words: str, status: int = 2) -> str:
-    """The message on stderr of a command that fails without a traceback."""
-    result = invoke(*words)
-    assert result.exit_code == status, result.output
-    assert isinstance(result.exception, SystemExit)
-    assert "Traceback" not in result.output
-    return result.stderr
 
 
 def arrays(path: str) -> dict[str, np.ndarray]:
@@ -199,7 +180,7 @@ class TestChoices:
 
     def test_options_select_a_problem(self):
         words = "--q -1,0 --velocity 0,-1.1 --parameter mu=1.5 --step 0.1 --steps 10 --method gauss --stages 2"
-        text = output_of("run", "kepler", *words.split())
+        text = output_of(f"run kepler {words}")
         assert "10 steps of 0.1 from t = 0 to t = 1; 11 states saved" in text
         assert "gauss:2" in text
 
@@ -273,7 +254,7 @@ class TestChoices:
         ],
     )
     def test_mistakes_are_usage_errors(self, words, message):
-        assert message in error_of("run", *words.split())
+        assert message in error_of(f"run {words}")
 
     def test_warnings_are_one_line_each(self):
         result = invoke("run", "harmonic-oscillator", "--degree", "3", "--quadrature", "gauss-legendre:2")
@@ -311,12 +292,11 @@ class TestRun:
     def test_equal_steps_of_recorded_runs_and_programs_end_elsewhere_with_a_warning(self):
         for words in (("run", "kepler", "-o", "a.run"), ("generate", "kepler", "-o", "program")):
             found = invoke(*words, "--step", "0.3", "--span", "1")
-            assert found.exit_code == 0
             assert "Warning: span 1 is not a whole number of steps of 0.3" in found.stderr
             assert "3 steps end at t = 0.9, not 1" in found.stderr
         assert "steps end at t = 2.1, not 2;" in invoke("run", "--resume", "a.run", "--span", "2", "--json").stderr
         for words in ("--step 0.25 --span 1", "--step 0.3 --steps 3", "--tolerance 1e-9 --span 1"):
-            assert "whole number" not in invoke("run", "kepler", *words.split(), "-o", "b.run").output
+            assert "whole number" not in output_of(f"run kepler {words}", "-o", "b.run")
             shutil.rmtree("b.run")
 
     def test_solver_can_be_selected(self):
@@ -354,7 +334,6 @@ class TestRun:
         """One point and a step of a quarter of the period: the energy of so few states is constant, by chance."""
         words = ("run", "harmonic-oscillator", "--degree", "2", "--quadrature", "gauss-legendre:1", "--steps", "40")
         result = invoke(*words, "--step", "1.5", option)
-        assert result.exit_code == 0
         assert re.search(r"Warning: the step from t = \S+ is too large: .* use a smaller --step", result.stderr)
         assert "too long" not in invoke("run", "harmonic-oscillator", option).stderr
 
@@ -399,8 +378,7 @@ class TestRun:
             yield lambda count: signal.raise_signal(number) if done.append(count) or len(done) == 3 else None
 
         monkeypatch.setattr("scvi_codegen.cli.running.progress_bar", third_chunk)
-        result = invoke("run", "kepler", "--steps", "1000000", "-o", "orbit.npz")
-        assert result.exit_code == 130
+        result = invoke("run", "kepler", "--steps", "1000000", "-o", "orbit.npz", status=130)
         assert "Error: interrupted at t = " in result.stderr
         t = arrays("orbit.npz")["t"]
         assert f"the {len(t)} states computed before were written: orbit.npz" in result.stderr
@@ -411,8 +389,7 @@ class TestRun:
     def test_failing_step_saves_computed_states(self):
         # Falls into the centre of attraction along a line that a step of Newton's method cannot pass.
         words = "--method gauss --stages 1 --velocity 0,0 --step 0.01 --max-iterations 3 -o fall.npz"
-        result = invoke("run", "kepler", *words.split())
-        assert result.exit_code == 1
+        result = invoke(f"run kepler {words}", status=1)
         step = int(
             re.search(r"Error: step (\d+) at t = \S+ with h = 0.01 failed: .* did not converge", result.stderr)[1]
         )
@@ -424,8 +401,7 @@ class TestRun:
         assert np.isfinite(written["q"]).all()
 
     def test_failure_of_the_first_step_is_one_short_message(self):
-        result = invoke("run", "double-pendulum", "--step", "5")
-        assert result.exit_code == 1
+        result = invoke("run", "double-pendulum", "--step", "5", status=1)
         assert "Error: step 0 at t = 0 with h = 5 failed" in result.stderr
         assert "the initial state was not written to a file (-o, --plot)" in result.stderr
         assert "energy" not in result.stdout
@@ -538,6 +514,4 @@ def test_unwritable_package_is_a_failure(tmp_path, monkeypatch):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr("scvi_codegen.models.packages.package.write_text", full)
-    result = CliRunner().invoke(main, ["generate", "kepler", "-o", str(tmp_path / "kepler_svi")])
-    assert result.exit_code == 1
-    assert "cannot be written: No space left" in result.output
+    assert "cannot be written: No space left" in error_of("generate", "kepler", "-o", tmp_path / "kepler_svi", status=1)

@@ -2,7 +2,6 @@
 
 import importlib.metadata
 import importlib.util
-import json
 import platform
 import re
 import tomllib
@@ -10,23 +9,20 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from click.testing import CliRunner
+from commands import invoke, json_of
 
-from scvi_codegen.cli import main
 from scvi_codegen.cli.commands import doctor as diagnostics
 
 PROJECT = Path(__file__).parents[2] / "pyproject.toml"
 
 
 def doctor(*words: str) -> tuple[int, str]:
-    result = CliRunner().invoke(main, ["doctor", *words], prog_name="scvi-codegen")
+    result = invoke("doctor", *words, status=None)
     return result.exit_code, result.output
 
 
 def findings(status: int = 0) -> dict[str, dict[str, Any]]:
-    result = CliRunner().invoke(main, ["doctor", "--json"], prog_name="scvi-codegen")
-    assert result.exit_code == status, result.output
-    report = json.loads(result.stdout)
+    report = json_of("doctor", status=status)
     assert report["ok"] == (status == 0)
     return {found["name"]: found for found in report["findings"]}
 

@@ -6,11 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import error_of, invoke, output_of
 from numpy.testing import assert_allclose
 
 from scvi_codegen import Run, compile_stepper, load_model
-from scvi_codegen.cli import main
 from scvi_codegen.cli.running import integrate_model
 
 MODEL = """
@@ -42,22 +41,14 @@ def model(tmp_path, monkeypatch):
     return load_model("pushed.toml")
 
 
-def invoke(*words):
-    return CliRunner().invoke(main, ["run", "pushed.toml", *words], prog_name="scvi-codegen")
-
-
-def output_of(*words):
-    result = invoke(*words)
-    assert result.exit_code == 0, result.output
-    return result.stdout
+RUN = ("run", "pushed.toml")
 
 
 def test_inputs_of_the_command_line_replace_those_of_the_file(model):
     (Path("elsewhere")).mkdir()
     Path("pushed.toml").rename("elsewhere/pushed.toml")
     words = ["run", "elsewhere/pushed.toml", "--input", "u=u.csv:cubic", "--tolerance", "1e-13", "-o", "run.csv"]
-    result = CliRunner().invoke(main, words)
-    assert result.exit_code == 0, result.output
+    invoke(*words)
     table = ([0.0, 1.0, 2.0, 3.0], [1.0, 0.0, 0.5, -1.0], "cubic")
     expected = compile_stepper(model.system, "svi:8").integrate(model.q, model.p, inputs={"u": table}, t_end=2.3)
     found = np.loadtxt("run.csv", delimiter=",", skiprows=1)
@@ -65,7 +56,7 @@ def test_inputs_of_the_command_line_replace_those_of_the_file(model):
 
 
 def test_constant_of_the_command_line(model):
-    output_of("--input", "u=-2.5e-1", "-o", "run.npz")
+    output_of(*RUN, "--input", "u=-2.5e-1", "-o", "run.npz")
     expected = compile_stepper(model.system, model.method).integrate(
         model.q, model.p, parameters={"u_0": -0.25}, h=0.1, steps=23
     )
@@ -87,15 +78,13 @@ def test_constant_of_the_command_line(model):
     ],
 )
 def test_unsupported_options_are_rejected(words, message):
-    result = invoke(*words)
-    assert result.exit_code == 2, result.output
-    assert message in result.stderr
+    assert message in error_of(*RUN, *words)
 
 
 def test_ensemble_of_runs_with_inputs(model):
     Path("many.csv").write_text("q,q_dot\n0.1,0\n0.2,1\n0.3,-1\n")
     Path("pushed.toml").write_text(MODEL.replace("cos(q)", "(1 + u)*cos(q)").replace('[forces]\nq = "u"\n', ""))
-    text = output_of("--ensemble", "many.csv", "-o", "many.npz")
+    text = output_of(*RUN, "--ensemble", "many.csv", "-o", "many.npz")
     model = load_model("pushed.toml")
     stepper = compile_stepper(model.system, model.method)
     given = {"inputs": dict(model.inputs), "h": 0.1, "t_end": 2.3}
@@ -109,23 +98,21 @@ def test_ensemble_of_runs_with_inputs(model):
 
 
 def test_runs_without_steps_and_columns_of_inputs():
-    assert "0 steps of 0.1 from t = 0 to t = 0; 1 state saved" in output_of("--steps", "0")
+    assert "0 steps of 0.1 from t = 0 to t = 0; 1 state saved" in output_of(*RUN, "--steps", "0")
     Path("many.csv").write_text("q,u_0\n0.1,5\n")
-    assert "'u_0' is not a coordinate" in invoke("--ensemble", "many.csv").stderr
+    assert "'u_0' is not a coordinate" in error_of(*RUN, "--ensemble", "many.csv")
 
 
 def test_missing_input_is_reported():
     Path("pushed.toml").write_text(MODEL.replace("[inputs]\nu = {", "[parameters]\n# {"))
-    assert "the input u is not set" in invoke().stderr
-    assert "final state" in output_of("--input", "u=u.csv")
+    assert "the input u is not set" in error_of(*RUN)
+    assert "final state" in output_of(*RUN, "--input", "u=u.csv")
 
 
 def test_failing_step_saves_the_preceding_segments(model):
     """Towards the end the push has no numbers left."""
     Path("pushed.toml").write_text(MODEL.replace('q = "u"', 'q = "sqrt(u + 0.5)"'))
-    result = invoke("-o", "run.csv")
-    assert result.exit_code == 1
-    assert "states computed before were written: run.csv" in result.stderr
+    assert "states computed before were written: run.csv" in error_of(*RUN, "-o", "run.csv", status=1)
     found = np.loadtxt("run.csv", delimiter=",", skiprows=1)
     assert 1.0 < found[-1, 0] < 1.5
     assert 1.0 in found[:, 0]
@@ -152,7 +139,7 @@ def test_signal_stops_a_run_between_chunks(model, monkeypatch):
 def test_terminal_event_is_the_last_saved_state(model, inputs):
     """With several segments: of inputs, or of a last step that is shorter."""
     words = [] if inputs else ["--input", "u=1", "--span", "2.25"]
-    output_of(*words, "--event", "q - 0.5; terminal=1", "--save-every", "7", "-o", "run.npz")
+    output_of(*RUN, *words, "--event", "q - 0.5; terminal=1", "--save-every", "7", "-o", "run.npz")
     with np.load("run.npz") as file:
         assert (np.diff(file["t"]) > 0.0).all()
         assert abs(file["q"][-1] - 0.5) < 1e-13
@@ -162,7 +149,7 @@ def test_ensemble_of_adaptive_runs_with_inputs(model):
     text = Path("pushed.toml").read_text()
     Path("pushed.toml").write_text(text.replace("step = 0.1", "tolerance = 1e-10"))
     Path("grid.csv").write_text("q,p_q\n0.1,0.0\n0.2,1.0\n")
-    output_of("--ensemble", "grid.csv", "-o", "many.npz")
+    output_of(*RUN, "--ensemble", "grid.csv", "-o", "many.npz")
     stepper = compile_stepper(model.system, model.method)
     with np.load("many.npz") as file:
         for j, (q, p) in enumerate([(0.1, 0.0), (0.2, 1.0)]):

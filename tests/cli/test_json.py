@@ -4,12 +4,11 @@ import json
 import math
 import re
 from pathlib import Path
-from typing import Any
 
 import click
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from commands import invoke, json_of
 from scipy.special import ellipk
 
 import scvi_codegen as sc
@@ -44,21 +43,6 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
 
 
-def invoke(*words: str, status: int = 0) -> Result:
-    result = CliRunner().invoke(main, list(words), prog_name="scvi-codegen")
-    assert result.exit_code == status, result.output
-    return result
-
-
-def document(*words: str, status: int = 0) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads(invoke(*words, "--json", status=status).stdout, parse_constant=refuse)
-    return found
-
-
-def refuse(constant: str) -> float:
-    raise AssertionError(f"{constant} is no JSON")
-
-
 def test_every_command_is_tested():
     assert {words[0] for words in QUIET_COMMANDS} == set(main.list_commands(click.Context(main)))
 
@@ -71,11 +55,11 @@ def test_quiet_prints_nothing_and_json_prints_one_document(words):
     assert invoke(*words).stdout
     quiet = invoke(*words, "--quiet")
     assert (quiet.stdout, quiet.stderr) == ("", "")
-    assert document(*words)
+    assert json_of(*words)
 
 
 def test_failed_run_reports_how_far_it_got():
-    found = document("run", "kepler", "--q", "1,0", "--velocity", "0,0", "--tolerance", "1e-9", "--span", "3", status=1)
+    found = json_of("run", "kepler", "--q", "1,0", "--velocity", "0,0", "--tolerance", "1e-9", "--span", "3", status=1)
     assert "step" in found["failure"]
     assert 1.0 < found["final"]["t"] < math.pi / 8**0.5
     far = (
@@ -89,7 +73,7 @@ def test_failed_run_reports_how_far_it_got():
         "1e-3*(1 + (q1**2 + q2**2)/1000)",
     )
     assert (
-        "use another time transformation" in document("run", "kepler", *far, "--tolerance", "1e-10", status=1)["missed"]
+        "use another time transformation" in json_of("run", "kepler", *far, "--tolerance", "1e-10", status=1)["missed"]
     )
     assert invoke("run", "keplr", "--json", status=2).stdout == ""
 
@@ -102,7 +86,7 @@ def test_json_of_several_momentum_maps():
         '[method]\nmethod = "explicit-euler"\n[run]\nstep = 0.1\nsteps = 20\n'
         "[initial]\nq = [0.1, 1.0, 0.0]\nq_dot = [0.3, 0.0, 0.7]\n"
     )
-    found = document("run", "spiral.toml")["momentum_errors"]
+    found = json_of("run", "spiral.toml")["momentum_errors"]
     assert found["momentum of z"] < 1e-15 > found["boost of z"]
     assert found["angular momentum z"] > 0.1
     run = sc.load_model("spiral.toml").integrate()
@@ -114,7 +98,7 @@ def test_json_of_ensembles_with_unequal_steps():
     """Bodies that fall to the centre in pi/sqrt(8) r**1.5."""
     Path("grid.toml").write_text("[grid]\nq1 = [2.0, 1.0, 3.0]\n")
     falling = ("kepler", "--velocity", "0,0", "--step", "0.05", "--steps", "80", "--method", "svi:4")
-    found = document("run", *falling, "--ensemble", "grid.toml")
+    found = json_of("run", *falling, "--ensemble", "grid.toml")
     stepper = sc.compile_stepper(sc.problem("kepler").system, "svi:4")
     with pytest.raises(sc.StepFailedError) as failed:
         stepper.integrate([1.0, 0.0], velocity=[0.0, 0.0], h=0.05, steps=80)
@@ -125,13 +109,13 @@ def test_json_of_ensembles_with_unequal_steps():
 
 
 def test_json_of_lists_and_model_files():
-    listed = document("systems")["systems"]
+    listed = json_of("systems")["systems"]
     assert [entry["name"] for entry in listed] == list(sc.PROBLEMS)
     assert listed[0]["parameters"]["m"] == 1.0
-    sections = document("systems", "kepler")
+    sections = json_of("systems", "kepler")
     again = parse_model(invoke("systems", "kepler").stdout)
     assert sections["initial"]["q"] == list(again.q)
-    by_name = {" ".join([entry["example"], *entry["options"]]): entry for entry in document("methods")["methods"]}
+    by_name = {" ".join([entry["example"], *entry["options"]]): entry for entry in json_of("methods")["methods"]}
     for example, entry in by_name.items():
         specification_of(entry["example"])  # as --method reads it
         if not entry["options"]:
@@ -139,21 +123,21 @@ def test_json_of_lists_and_model_files():
             assert example.startswith(entry["name"])
             assert all(entry[name] == getattr(method, name) for name in ("order", "symplectic", "symmetric"))
         if " " in example:
-            assert document("derive", "kepler", "--method", *example.split())["equations"]
+            assert json_of("derive", "kepler", "--method", *example.split())["equations"]
     assert by_name["svi:4"]["order"] == 8
-    tableau = document("methods", "--tableau", "gauss:2")
+    tableau = json_of("methods", "--tableau", "gauss:2")
     assert tableau["b"] == [0.5, 0.5]
     assert np.sum(tableau["A"], axis=1) == pytest.approx(tableau["c"], abs=1e-16)
 
 
 def test_json_of_paths_is_that_of_the_model_file_and_of_the_interface():
     words = ("--from", "0,0", "--to", "0.1,0.3", "--span", "3", "--step", "0.25", "--starts", "2", "--method", "svi:4")
-    found = document("path", "henon-heiles", *words, "-o", "path.npz")
+    found = json_of("path", "henon-heiles", *words, "-o", "path.npz")
     text = invoke("systems", "henon-heiles").stdout
     text = re.sub("(span|step) = .*", lambda line: f"{line[1]} = {3.0 if line[1] == 'span' else 0.25}", text)
     text += "\n[path]\nfrom = [0.0, 0.0]\nto = [0.1, 0.3]\nstarts = 2\n"
     Path("own.toml").write_text(text)
-    assert document("path", "own.toml", "--method", "svi:4")["paths"] == found["paths"]
+    assert json_of("path", "own.toml", "--method", "svi:4")["paths"] == found["paths"]
     assert parse_model(dump_model(parse_model(text))) == parse_model(text)
     stepper = sc.compile_stepper(sc.problem("henon-heiles").system, "svi:4")
     direct = stepper.path([0.0, 0.0], [0.1, 0.3], 3.0, steps=12)
@@ -163,7 +147,7 @@ def test_json_of_paths_is_that_of_the_model_file_and_of_the_interface():
         assert np.abs(file["q"][[0, -1]] - [[0, 0], [0.1, 0.3]]).max() < 1e-12
         assert file["p"][0].tolist() == list(found["paths"][0]["momenta"].values())
     closed = ("--closed=-q", "--q", "0", "--velocity", "1.5", "--span", "4", "--step", "0.2")
-    (swing,) = document("path", "planar-pendulum", *closed)["paths"]
+    (swing,) = json_of("path", "planar-pendulum", *closed)["paths"]
     assert swing["period"] == 8.0
     assert 4 * ellipk((1 + swing["energy"]) / 2) == pytest.approx(8.0, abs=1e-9)
     for wrong, status, message in (
@@ -176,7 +160,7 @@ def test_json_of_paths_is_that_of_the_model_file_and_of_the_interface():
 
 
 def test_certificate_equals_the_saved_one():
-    found = document("verify", "planar-pendulum", "--method", "svi:1", "-o", "certificate.json")
+    found = json_of("verify", "planar-pendulum", "--method", "svi:1", "-o", "certificate.json")
     assert found == json.loads(Path("certificate.json").read_text())
     assert any(check["name"].startswith("identity") for check in found["checks"])
 

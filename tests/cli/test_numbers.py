@@ -4,7 +4,6 @@ Energies, momentum maps and motions are written out here in NumPy; a classical R
 many steps says what is exact. A field or a line without a check fails.
 """
 
-import json
 import math
 import re
 from collections.abc import Callable, Mapping
@@ -14,11 +13,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import json_of, output_of
 from notation import lagrange
 
 import scvi_codegen as sc
-from scvi_codegen.cli import main
 
 Array = Any
 M, K, C, G = 1.75, 0.625, 0.375, 1.25
@@ -284,13 +282,12 @@ def done(request: Any, tmp_path_factory: Any) -> Done:
     run = "[run]\nstep = 1.0\nspan = 1.0\n"
     model.write_text(f'{kind.system}{PARAMETERS}{kind.start}[method]\nmethod = "{kind.method[0]}"\n{kind.extra}{run}')
     words = ["run", str(model), *kind.words, *CHANGED]
-    first = CliRunner().invoke(main, [*words, "--json", "-o", str(folder / "states.npz")])
-    second = CliRunner().invoke(main, words)
-    assert (first.exit_code, second.exit_code) == (0, 0), first.output + second.output
+    first = json_of(*words, "-o", folder / "states.npz")
+    second = output_of(*words)
     with np.load(folder / "states.npz") as saved:
         states = dict(saved)
     return Done(
-        kind, json.loads(first.stdout), second.stdout.splitlines(), states["t"], states["q"], states["p"],
+        kind, first, second.splitlines(), states["t"], states["q"], states["p"],
         states["iterations"], 60.0, model,
     )  # fmt: skip
 
@@ -482,12 +479,6 @@ def test_every_line_of_the_text_is_correct(done):
     assert rest == []
 
 
-def document(*words: str) -> dict[str, Any]:
-    found = CliRunner().invoke(main, [*words, "--json"])
-    assert found.exit_code == 0, found.output
-    return dict(json.loads(found.stdout))
-
-
 @pytest.fixture
 def springs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Kind:
     monkeypatch.chdir(tmp_path)
@@ -499,7 +490,7 @@ def springs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Kind:
 def test_every_field_and_line_of_an_ensemble_is_correct(springs):
     Path("grid.toml").write_text("[grid]\nx = [0.5, 1.0, 1.5]\nk = [0.5, 2.0]\n")
     words = ("run", "model.toml", *springs.words, "--parameter", f"m={M}", "--parameter", f"c={C}", "--ensemble")
-    numbers = document(*words, "grid.toml", "-o", "many.npz")
+    numbers = json_of(*words, "grid.toml", "-o", "many.npz")
     with np.load("many.npz") as saved:
         t, q, p = saved["t"], saved["q"], saved["p"]
     stiff, radii = np.array([0.5, 2.0] * 3), np.sum(q**2, axis=2)
@@ -531,7 +522,7 @@ def test_every_field_and_line_of_an_ensemble_is_correct(springs):
     }
     assert numbers.keys() <= checks.keys()
     assert {name: numbers[name] for name in numbers if not checks[name](numbers[name])} == {}
-    lines = CliRunner().invoke(main, [*words, "grid.toml"]).stdout.splitlines()
+    lines = output_of(*words, "grid.toml").splitlines()
     assert lines[2] == f"6 trajectories of 90 steps of 0.125 from t = {T:g}; 31 states saved of each"
     assert lines[4] == "6 ok"
     relative = np.abs(energy / energy[0] - 1.0)
@@ -543,7 +534,7 @@ def test_every_field_and_line_of_an_ensemble_is_correct(springs):
 
 def test_every_field_and_line_of_a_recorded_run_is_correct(springs):
     words = ("run", "model.toml", *springs.words, *CHANGED)
-    numbers, memory = document(*words, "-o", "long.run"), document(*words)
+    numbers, memory = json_of(*words, "-o", "long.run"), json_of(*words)
     checks: dict[str, Callable[[Any], bool]] = {
         "system": lambda x: x == "springs",
         "method": lambda x: x == springs.method[1],
@@ -558,8 +549,8 @@ def test_every_field_and_line_of_a_recorded_run_is_correct(springs):
     }
     assert numbers.keys() <= checks.keys()
     assert {name: numbers[name] for name in numbers if not checks[name](numbers[name])} == {}
-    text = CliRunner().invoke(main, [*words, "-o", "again.run"]).stdout.splitlines()
-    in_memory = CliRunner().invoke(main, list(words)).stdout.splitlines()
+    text = output_of(*words, "-o", "again.run").splitlines()
+    in_memory = output_of(*words).splitlines()
     assert text[1] == f"90 steps (all) of 0.125 from t = {T:g} to t = {T + 11.25:g}; 31 states saved in 'again.run'"
     assert text[3:5] == in_memory[4:6]
     finals = [float(x) for line in text for x in re.findall(r"= +(-?[\d.]{9,})", line)]
@@ -569,7 +560,7 @@ def test_every_field_and_line_of_a_recorded_run_is_correct(springs):
 
 def test_every_number_of_advice_is_correct(springs):
     words = ("run", "model.toml", "--span", "5.25", *CHANGED, "--advise", "1e-6")
-    numbers = document(*words, "-o", "advised.npz")
+    numbers = json_of(*words, "-o", "advised.npz")
     advice = numbers["advice"]
     assert advice.keys() == {"h", "steps", "message", "warnings"}
     assert (advice["h"], advice["steps"], advice["warnings"]) == (numbers["h"], numbers["steps"], [])
@@ -581,7 +572,7 @@ def test_every_number_of_advice_is_correct(springs):
     error = np.linalg.norm(end[0] - q[-1]) / math.sqrt(np.mean(np.sum(q**2, axis=1)))
     assert 1e-8 < error < 1e-6
     assert float(re.search(r"expected error of (\S+)\.", advice["message"])[1]) > 0.3 * error
-    lines = CliRunner().invoke(main, list(words)).stdout.splitlines()
+    lines = output_of(*words).splitlines()
     pilots = [re.fullmatch(r"  h = (\S+) +(?:error (\S+)|no correct digit|fails) .*", line) for line in lines[1:]]
     rows = [(float(row[1]), row[2]) for row in pilots if row]
     assert len(rows) >= 3
@@ -589,7 +580,8 @@ def test_every_number_of_advice_is_correct(springs):
         steps = round(5.25 / h)
         if message is None or steps > 2000:
             continue
-        model = lagrange("springs", "x y", "m*(x_dot**2 + y_dot**2)/2 - k*(x**2 + y**2)/2 - c*(x**2 + y**2)**2/4", m=M, k=K, c=C)  # fmt: skip
+        formula = "m*(x_dot**2 + y_dot**2)/2 - k*(x**2 + y**2)/2 - c*(x**2 + y**2)**2/4"
+        model = lagrange("springs", "x y", formula, m=M, k=K, c=C)
         again = sc.compile_stepper(model, "svi:2").integrate(q[0], p[0], h=5.25 / steps, steps=steps, t=T)
         off = np.linalg.norm(again.q[-1] - end[0]) / math.sqrt(np.mean(np.sum(q**2, axis=1)))
         assert 0.2 * off < float(message) < 20 * off
@@ -617,7 +609,7 @@ def test_every_field_and_line_of_an_array_system_is_correct(tmp_path, monkeypatc
     monkeypatch.chdir(tmp_path)
     Path("ring.toml").write_text(RING)
     words = ("run", "ring.toml", "--step", "0.25", "--steps", "60", "--save-every", "4", "--parameter", "k=0.75")
-    numbers = document(*words, "-o", "ring.npz")
+    numbers = json_of(*words, "-o", "ring.npz")
     with np.load("ring.npz") as saved:
         t, q, p = saved["t"], saved["q"], saved["p"]
     mass, apart = 1.0 + np.arange(6) / 4, np.roll(q, -1, axis=1) - q
@@ -654,7 +646,7 @@ def test_every_field_and_line_of_an_array_system_is_correct(tmp_path, monkeypatc
     }
     assert numbers.keys() == checks.keys()
     assert {name: numbers[name] for name in numbers if not checks[name](numbers[name])} == {}
-    lines = CliRunner().invoke(main, list(words)).stdout.splitlines()
+    lines = output_of(*words).splitlines()
     assert lines[0] == "ring: 6 coordinates, N = 6"
     assert lines[2] == "60 steps of 0.25 from t = 0 to t = 15; 16 states saved"
     speed = re.fullmatch(r"(\S+) s, .* a step and coordinate, (\S+) iterations a step; prepared in \S+ s", lines[3])

@@ -1,26 +1,18 @@
 """Numbers in the JSON of ``derive``, ``methods``, ``systems`` and ``verify``, recomputed by other code."""
 
-import json
 import re
 from typing import Any
 
 import numpy as np
 import pytest
 import sympy
-from click.testing import CliRunner
+from commands import json_of
 from scipy.optimize import fsolve
 
 import scvi_codegen as sc
 from scvi_codegen.advice.tolerance_check import Known
-from scvi_codegen.cli import main
 from scvi_codegen.cli.running import final_state
 from scvi_codegen.rendering.source import Interface
-
-
-def document(*words: str) -> dict[str, Any]:
-    found = CliRunner().invoke(main, [*words, "--json"])
-    assert found.exit_code == 0, found.output
-    return dict(json.loads(found.stdout))
 
 
 @pytest.mark.parametrize(
@@ -33,7 +25,7 @@ def document(*words: str) -> dict[str, Any]:
 )
 def test_printed_equations_have_the_compiled_step_as_solution(model, method, q, p, h):
     """SciPy solves the residuals of the JSON from its first guess; its end is that of the compiled step."""
-    system, numbers = sc.problem(model).system, document("derive", model, "--method", method)
+    system, numbers = sc.problem(model).system, json_of("derive", model, "--method", method)
     velocity = sc.compile_stepper(system, method).velocity(q, p)
     known = {"h": h, "t_k": 0.0, **numbers["entries"]}
     known |= dict(zip(map(str, system.parameters), system.defaults, strict=True))
@@ -61,7 +53,7 @@ def test_printed_equations_have_the_compiled_step_as_solution(model, method, q, 
 
 
 def test_systems_have_their_coordinates_and_parameters():
-    entries = document("systems")["systems"]
+    entries = json_of("systems")["systems"]
     assert len(entries) > 10
     for entry in entries:
         system = sc.problem(entry["name"]).system
@@ -72,7 +64,7 @@ def test_systems_have_their_coordinates_and_parameters():
 
 
 def test_checks_of_verify_compare_what_they_measured_with_their_bounds():
-    numbers = document("verify", "planar-pendulum", "--method", "svi:2")
+    numbers = json_of("verify", "planar-pendulum", "--method", "svi:2")
     checks = {check["name"]: check for check in numbers["checks"] if check["bound"] is not None}
     assert numbers["passed"] is True
     assert len(checks) > 20

@@ -1,16 +1,14 @@
 """Option --precision of ``run`` and key of model files: digits of the final state, both words, refusals."""
 
-import json
 from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import error_of, invoke, json_of, output_of
 from mpmath import mp
 
 import scvi_codegen as sc
-from scvi_codegen.cli import main
 
 TEXT = """
 [system]
@@ -40,14 +38,14 @@ def spring(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_final_state_is_exact_to_thirty_digits(spring: Path) -> None:
     """The text, the document and the file agree with the solution q = cos(t)/2 + sin(t)/4."""
-    shown = CliRunner().invoke(main, ["run", str(spring), "-o", "states.npz"])
-    document = json.loads(CliRunner().invoke(main, ["run", str(spring), "--json"]).stdout)
+    shown = output_of("run", spring, "-o", "states.npz")
+    document = json_of("run", spring)
     spring.write_text(TEXT.replace("steps = 16\n", "span = 1.3\n"))
-    shorter = json.loads(CliRunner().invoke(main, ["run", str(spring), "--json"]).stdout)["final"]
+    shorter = json_of("run", spring)["final"]
     spring.write_text(TEXT)
     with mp.workdps(40), np.load("states.npz") as saved:
         exact = mp.cos(2) / 2 + mp.sin(2) / 4
-        last = next(line for line in shown.stdout.splitlines() if line.startswith("  q = "))
+        last = next(line for line in shown.splitlines() if line.startswith("  q = "))
         words = [document["final"][name]["q"] for name in ("q", "q_low")]
         numbers = mp.mpf(last.split()[2]), sum(map(mp.mpf, words)), mp.mpf(saved["q"][-1, 0]) + saved["q_low"][-1, 0]
         assert max(abs(number - exact) for number in numbers) < 1e-30
@@ -74,18 +72,14 @@ def test_final_state_is_exact_to_thirty_digits(spring: Path) -> None:
 )
 def test_other_options_and_commands_are_refused(spring: Path, words: list[str], message: str) -> None:
     """Nothing is computed in double without a word."""
-    done = CliRunner().invoke(main, [words[0], str(spring), *words[1:]])
-    assert done.exit_code
-    assert message in " ".join(done.output.split())
+    assert message in " ".join(error_of(words[0], spring, *words[1:]).split())
     assert sorted(path.name for path in spring.parent.iterdir()) == ["spring.toml"]
 
 
 def test_advice(spring: Path) -> None:
     """The step that --advise recommends has the error asked for at the end of the span, to which the last one leads."""
     spring.write_text(TEXT.replace("step = 0.125\nsteps = 16\n", "span = 1.3\n"))
-    done = CliRunner().invoke(main, ["run", str(spring), "--advise", "1e-24", "--json"])
-    assert done.exit_code == 0, done.output
-    document = json.loads(done.stdout)
+    document = json_of("run", spring, "--advise", "1e-24")
     with mp.workdps(40):
         end = mp.mpf(document["final"]["q"]["q"]) + document["final"]["q_low"]["q"]
         assert 1e-30 < abs(end / (mp.cos(1.3) / 2 + mp.sin(1.3) / 4) - 1) < 1e-24
@@ -97,9 +91,7 @@ def test_precision_of_error(spring: Path) -> None:
     text = TEXT.replace("step = 0.125\nsteps = 16\n", "error = 3e-15\nspan = 200.0\n")
     for precision, error, expected in (("double-double", "3e-15", 2), ("auto", "3e-15", 2), ("auto", "1e-9", 1)):
         spring.write_text(text.replace("double-double", precision).replace("3e-15", error))
-        done = CliRunner().invoke(main, ["run", str(spring), "--json", "-o", "states.npz"])
-        assert done.exit_code == 0, done.output
-        document = json.loads(done.stdout)
+        document = json_of("run", spring, "-o", "states.npz")
         assert document["global_error"]["precision"] == ("double", "double-double")[expected - 1]
         assert ("q_low" in document["final"]) == (expected == 2)
         with np.load("states.npz") as saved:
@@ -112,8 +104,8 @@ def test_precision_of_error(spring: Path) -> None:
         assert started.q == run.q[-1]
         assert run.q[-1, 0] == document["final"]["q"]["q"]
     spring.write_text(text.replace("double-double", "auto"))
-    refused = CliRunner().invoke(main, ["run", str(spring), "-o", "states.csv"])
-    assert "-o states.csv (write a file NAME.npz) is not available" in " ".join(refused.output.split())
+    refused = " ".join(error_of("run", spring, "-o", "states.csv").split())
+    assert "-o states.csv (write a file NAME.npz) is not available" in refused
 
 
 EXACT = {"q": "[0.1]", "q_dot": '["1/3"]', "w": "0.3"}
@@ -125,8 +117,7 @@ def test_decimals_and_fractions_are_exact(spring: Path, words: list[str]) -> Non
     text = TEXT.replace("- q**2/2", "- w*q**2/2").replace("[0.5]", EXACT["q"] if not words else "[7.0]")
     text = text.replace("[0.25]", EXACT["q_dot"] if not words else "[7.0]")
     spring.write_text(text.replace("[initial]", f"[parameters]\nw = {EXACT['w'] if not words else 7.0}\n[initial]"))
-    shown = CliRunner().invoke(main, ["run", str(spring), *words, "-o", "states.npz"])
-    assert shown.exit_code == 0
+    invoke("run", spring, *words, "-o", "states.npz")
     with mp.workdps(40), np.load("states.npz") as saved:
         rate = mp.sqrt(mp.mpf(3) / 10)
         exact = mp.cos(2 * rate) / 10 + mp.sin(2 * rate) / rate / 3
@@ -140,11 +131,10 @@ def test_decimals_and_fractions_are_exact(spring: Path, words: list[str]) -> Non
         assert lows[0] == lows[1]
         assert all(lows[0])
     else:
-        double = CliRunner().invoke(main, ["run", str(spring), *words, "--precision", "double", "--json"])
-        assert abs(json.loads(double.stdout)["final"]["q"]["q"] - float(exact)) < 1e-14
+        double = json_of("run", spring, *words, "--precision", "double")
+        assert abs(double["final"]["q"]["q"] - float(exact)) < 1e-14
         for wrong in ("1/0", "1/x", "1/2/3"):
-            refused = CliRunner().invoke(main, ["run", str(spring), "--q", wrong])
-            assert "give numbers separated by commas" in " ".join(refused.output.split())
+            assert "give numbers separated by commas" in " ".join(error_of("run", spring, "--q", wrong).split())
 
 
 @pytest.mark.parametrize(
@@ -158,8 +148,7 @@ def test_ensembles_are_exact(spring: Path, file: str, text: str, starts: str) ->
     """Numbers of grids and tables are exact decimals and fractions, and all final states have 30 digits."""
     spring.write_text(TEXT.replace("- q**2/2", "- w*q**2/2").replace("[initial]", "[parameters]\nw = 0.3\n[initial]"))
     Path(file).write_text(text)
-    done = CliRunner().invoke(main, ["run", str(spring), "--ensemble", file, "-o", "ends.npz"])
-    assert done.exit_code == 0, done.output
+    invoke("run", spring, "--ensemble", file, "-o", "ends.npz")
     with mp.workdps(40), np.load("ends.npz") as saved:
         tenths = [1, 2, 3, 4] if file == "grid.toml" else [3, 1]
         q0 = [mp.mpf(Fraction(each).numerator) / Fraction(each).denominator for each in starts.split()]
@@ -174,11 +163,9 @@ def test_ensembles_are_exact(spring: Path, file: str, text: str, starts: str) ->
 
 def test_recorded_runs_have_both_words(spring: Path) -> None:
     """A folder that is extended ends at the state of a run in memory, also in the document and in its file."""
-    arguments = [["run", str(spring), *words, "--json"] for words in (["-o", "a.run"], ["--steps", "24"])]
-    ends = [json.loads(CliRunner().invoke(main, words).stdout)["final"] for words in arguments]
-    resumed = CliRunner().invoke(main, ["run", "--resume", "a.run", "--steps", "24", "--json"])
-    assert json.loads(resumed.stdout)["final"] == ends[1] != ends[0]
-    assert CliRunner().invoke(main, ["export", "a.run", "-o", "a.npz"]).exit_code == 0
+    ends = [json_of("run", spring, *words)["final"] for words in (["-o", "a.run"], ["--steps", "24"])]
+    assert json_of("run", "--resume", "a.run", "--steps", "24")["final"] == ends[1] != ends[0]
+    invoke("export", "a.run", "-o", "a.npz")
     with np.load("a.npz") as saved:
         assert saved["q_low"][[16, 24], 0].tolist() == [end["q_low"]["q"] for end in ends]
 

@@ -368,8 +368,7 @@ def _running(number: str) -> Iterator[dict[str, int]]:
 @cache
 def made(name: str) -> tuple[Case, Any, PrintedPage]:
     case, method = CASES[name]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         return case, method, read_page(derivation_html(case.system, method))
 
 
@@ -386,8 +385,7 @@ def start_of(case: Case) -> tuple[Any, Any, float, float]:
 @cache
 def solution(name: str, section: str) -> tuple[PrintedStep, Any]:
     case, method, page = made(name)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         stages = paper_equations(case.system, method) if section == "stages" else discretise(case.system, method)
     own = [
         e for e in page.entries if (e.pair == "evaluate" if section == "evaluate" else e.section in ("stages", "idel"))
@@ -400,8 +398,7 @@ def solution(name: str, section: str) -> tuple[PrintedStep, Any]:
 def compiled_step(name: str) -> tuple[Any, Any]:
     case, method, _ = made(name)
     q, p, h, t = start_of(case)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         stepper = sc.compile_stepper(case.system, method)
         return stepper.step([float(x) for x in q], [float(x) for x in p], h, t, PARAMETERS)
 
@@ -651,8 +648,7 @@ def iteration_numbers(name: str) -> tuple[int, dict[str, Any]]:
     """Return the values of symbols of a fixed-point iteration on the solved step; tables are those of the package."""
     case, method, _ = made(name)
     q, p, h, t = start_of(case)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         fixed_point = program_of(case.system, method, prefix="printed").fixed_point
     step, x = (
         solution(name, "evaluate")
@@ -837,8 +833,7 @@ SHORT = [name for name in NAMES if name.values[0] not in ("composition", "forced
 @cache
 def derived(name: str) -> Any:
     case, method = CASES[name]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         return derive(case.system, method)
 
 

@@ -8,11 +8,10 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
+from commands import output_of
 
 import scvi_codegen as sc
 from scvi_codegen import BuildError, CacheWarning, pipeline
-from scvi_codegen.cli import main
 from scvi_codegen.files import cache
 from scvi_codegen.native import building
 from scvi_codegen.rendering.source import Source
@@ -261,9 +260,7 @@ class TestClearing:
         answer(1)
 
         def message(*words: str) -> str:
-            result = CliRunner().invoke(main, ["cache", *words])
-            assert result.exit_code == 0, result.output
-            return result.output
+            return output_of("cache", *words)
 
         assert message("path") == f"{folder}\n"
         assert message() == message("info")

@@ -104,8 +104,7 @@ def try_system(number: int) -> bool:
         )
 
     try:
-        with guarded(may_compile=True), warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with guarded(may_compile=True), warnings.catch_warnings(action="ignore"):
             compiled()
     except sc.ScviCodegenError:
         return False
@@ -142,8 +141,7 @@ def try_model(number: int) -> bool:
     known = seeds("models")
     text = random.choice(known)
     text = with_a_value_changed(random, text) if number % 2 else mutated(random, text, known)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         model = quietly(parse_model, text, expected=sc.ModelFileError)
         if model is None:
             return False
@@ -217,8 +215,7 @@ def try_name(number: int) -> bool:
     random = Random(number)
     known = seeds("names.txt")
     name = mutated(random, random.choice(known), known) if number % 4 else random.choice(known)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         if number % 2:
             read = random.choice((quadrature_by_name, space_by_name, tableau_by_name))
             found = quietly(read, name, expected=sc.MethodError)

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 import sympy
-from click.testing import CliRunner
+from commands import error_of, invoke
 
 import scvi_codegen as sc
-from scvi_codegen.cli import main
 from scvi_codegen.models.model_files.model_file import dump_model, parse_model
 from scvi_codegen.verification.certificate import Outcome
 from scvi_codegen.verification.elimination import elimination_checks
@@ -228,13 +227,10 @@ def test_model_files_events_and_derived_quantities(tmp_path) -> None:
     assert np.abs(forces - with_constraints.multipliers()[-1]).max() < 1e-11
     path = tmp_path / "chain.toml"
     path.write_text(MODEL.replace("eliminate_constraints = true", ""))
-    result = CliRunner().invoke(main, ["run", str(path), "--eliminate-constraints", "-o", str(tmp_path / "run.csv")])
-    assert result.exit_code == 0, result.output
+    invoke("run", path, "--eliminate-constraints", "-o", tmp_path / "run.csv")
     assert "r_1_1_dot" in (tmp_path / "run.csv").read_text().splitlines()[0]
     path.write_text(MODEL.replace("[2.0, 0.0]", "[2.0, 1.0]"))
-    wrong = CliRunner().invoke(main, ["run", str(path)])
-    assert wrong.exit_code == 2
-    assert "violate the constraint" in wrong.output
+    assert "violate the constraint" in error_of("run", path)
 
 
 @pytest.mark.second

@@ -28,8 +28,7 @@ def arrays(formula, **given):
 
 
 def messages(define, *given, **named):
-    with warnings.catch_warnings(record=True) as heard:
-        warnings.simplefilter("always")
+    with warnings.catch_warnings(record=True, action="always") as heard:
         define(*given, **named)
     assert all(each.category is sc.SystemDefinitionWarning and each.filename == __file__ for each in heard)
     return [str(each.message) for each in heard]

@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import invoke
 
 import scvi_codegen as sc
-from scvi_codegen.cli import main
 from scvi_codegen.formulas.arrays import parse_array
 from scvi_codegen.models.model_files.model_file import load_model
 from scvi_codegen.models.model_files.values import read_array
@@ -281,8 +280,7 @@ def test_generated_example_frees_memory_and_rejects_indices_out_of_range(
 ) -> None:
     """Tables are files next to the program: invalid edits give a message, and no access outside an array."""
     monkeypatch.chdir(net.parent)
-    invoked = CliRunner().invoke(main, ["generate", str(net), "-o", "net_svi"])
-    assert invoked.exit_code == 0, invoked.output
+    invoke("generate", net, "-o", "net_svi")
     command = [*find_compiler(), "-O0", "-std=c99", "main.c", "net_svi.c", "-lm", "-o", "main"]
     checked = subprocess.run(
         [*command, "-fsanitize=address,undefined"], cwd="net_svi", capture_output=True, check=False

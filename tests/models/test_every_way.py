@@ -11,12 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import output_of
 from numpy.testing import assert_allclose
 from programs import needs
 
 import scvi_codegen as sc
-from scvi_codegen.cli import main
 from scvi_codegen.models.model_files.model_file import dump_model, parse_model
 from scvi_codegen.native.building import PORTABLE_FLAGS
 
@@ -183,12 +182,6 @@ def assert_equal(found, run):
         assert np.array_equal(one, rows(getattr(run, name)))
 
 
-def invoke(*words):
-    done = CliRunner().invoke(main, [*words], prog_name="scvi-codegen")
-    assert done.exit_code == 0, done.output
-    return done.stdout
-
-
 def compiled(case, model, **options):
     """A stepper and its run, without the model."""
     stepper = sc.compile_stepper(model.system, model.method, time_transformation=case.g, **options)
@@ -208,7 +201,7 @@ def test_every_way_gives_the_states_of_integrate(name):
             started.record(steps)
         assert started.t == run.t[-1]
         assert all(np.array_equal(rows(x), rows(y)[-1]) for x, y in ((started.q, run.q), (started.p, run.p)))
-    printed = invoke("run", "models/model.toml", "-o", "run.npz")
+    printed = output_of("run", "models/model.toml", "-o", "run.npz")
     assert case.printed in printed
     with np.load("run.npz") as file:
         assert_equal({"t": file["t"], "q": file["q"], "p": file["p"]}, run)

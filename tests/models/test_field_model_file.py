@@ -1,14 +1,12 @@
 """Model files with a density: reading, writing with equal bits, the commands, and errors by name."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import error_of, invoke, json_of, output_of
 
 import scvi_codegen as sc
-from scvi_codegen.cli import main
 from scvi_codegen.models.model_files.model_file import dump_model, parse_model
 
 STRING = """
@@ -167,16 +165,12 @@ def test_commands_accept_a_density(tmp_path, monkeypatch):
     """Equations first; the folder runs and keeps the density."""
     monkeypatch.chdir(tmp_path)
     Path("nls.toml").write_text(SCHROEDINGER)
-    call = CliRunner()
-    derived = call.invoke(main, ["derive", "nls.toml"], prog_name="scvi-codegen")
-    assert derived.exit_code == 0, derived.output
-    assert derived.stdout.index("a_t = -a**2*b*k - b**3*k - b_xx/2") < derived.stdout.index("q' = q + h*")
-    ran = call.invoke(main, ["run", "nls.toml", "--json", "--parameter", "k=0.5"], prog_name="scvi-codegen")
+    derived = output_of("derive", "nls.toml")
+    assert derived.index("a_t = -a**2*b*k - b**3*k - b_xx/2") < derived.index("q' = q + h*")
     expected = parse_model(SCHROEDINGER.replace("k = 1.0", "k = 0.5")).integrate().q["a"][-1]
-    assert json.loads(ran.stdout)["final"]["q"]["a"] == expected.tolist()
-    wrong = call.invoke(main, ["run", "nls.toml", "--parameter", "z=0.5"], prog_name="scvi-codegen")
-    assert "the system has no parameter 'z'" in wrong.output
-    assert call.invoke(main, ["generate", "nls.toml", "-o", "nls_svi"], prog_name="scvi-codegen").exit_code == 0
+    assert json_of("run", "nls.toml", "--parameter", "k=0.5")["final"]["q"]["a"] == expected.tolist()
+    assert "the system has no parameter 'z'" in error_of("run", "nls.toml", "--parameter", "z=0.5")
+    invoke("generate", "nls.toml", "-o", "nls_svi")
     assert sc.load_model("nls_svi/model.toml") == parse_model(SCHROEDINGER)
 
 
@@ -184,6 +178,4 @@ def test_commands_accept_a_density(tmp_path, monkeypatch):
 def test_verify_measures_the_integrator_of_a_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("nls.toml").write_text(SCHROEDINGER)
-    verified = CliRunner().invoke(main, ["verify", "nls.toml"], prog_name="scvi-codegen")
-    assert verified.exit_code == 0, verified.output
-    assert "reversal at full size" in verified.output
+    assert "reversal at full size" in output_of("verify", "nls.toml")

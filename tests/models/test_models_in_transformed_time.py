@@ -4,10 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import error_of, output_of
 
 import scvi_codegen as sc
-from scvi_codegen.cli import main
 from scvi_codegen.errors import ModelFileError
 from scvi_codegen.models.model_files.model_file import catalogue_model, dump_model, parse_model
 
@@ -17,12 +16,6 @@ BY_CLOCK = {"system": {"time_transformation": "frequency"}, "run": {"step": 0.2,
 @pytest.fixture(scope="module")
 def model() -> sc.Model:
     return catalogue_model("kepler", BY_CLOCK)
-
-
-def invoke(*words: str, status: int = 0) -> str:
-    result = CliRunner().invoke(main, list(words), prog_name="scvi-codegen")
-    assert result.exit_code == status, result.output
-    return result.output
 
 
 @pytest.mark.parametrize("time_transformation", ["frequency", "(q1**2 + q2**2)**(3/4)"])
@@ -61,7 +54,7 @@ def test_step_size_of_another_time_is_not_reused(model: sc.Model) -> None:
 
 
 def test_command_line_finds_a_step_and_reports_unsuitable_steps() -> None:
-    printed = invoke("run", "kepler", "--time-transformation", "frequency", "--span", "50", "--tolerance", "1e-8")
+    printed = output_of("run", "kepler", "--time-transformation", "frequency", "--span", "50", "--tolerance", "1e-8")
     error = float(printed.partition("largest local error: ")[2].partition(" ")[0])
     assert 1e-12 < error < 1e-7
     far = (
@@ -74,7 +67,7 @@ def test_command_line_finds_a_step_and_reports_unsuitable_steps() -> None:
         "--time-transformation",
         "1e-3*(1 + (q1**2 + q2**2)/1000)",
     )
-    assert "Error" in invoke("run", "kepler", *far, "--tolerance", "1e-10", status=1)
+    assert "Error" in error_of("run", "kepler", *far, "--tolerance", "1e-10", status=1)
 
 
 @pytest.mark.parametrize("run", [{"tolerance": 1e-8}, {"tolerance": 1e-8, "span": -5.0}, {"step": 0.1}])
@@ -96,7 +89,7 @@ def test_single_step_functions_use_the_first_step_of_the_run(run: dict[str, floa
 
 def test_folders_contain_a_number_of_steps(tmp_path: Path) -> None:
     folder, by_clock = str(tmp_path / "orbit.run"), ("run", "kepler", "--time-transformation", "frequency")
-    assert "give --step and --steps" in invoke(*by_clock, "--step", "0.2", "--span", "9", "-o", folder, status=2)
-    assert "50 steps in tau (all)" in invoke(*by_clock, "--step", "0.2", "--steps", "50", "-o", folder)
-    assert "not --span" in invoke("run", "--resume", folder, "--span", "9", status=2)
-    assert "60 steps in tau (all)" in invoke("run", "--resume", folder, "--steps", "60")
+    assert "give --step and --steps" in error_of(*by_clock, "--step", "0.2", "--span", "9", "-o", folder)
+    assert "50 steps in tau (all)" in output_of(*by_clock, "--step", "0.2", "--steps", "50", "-o", folder)
+    assert "not --span" in error_of("run", "--resume", folder, "--span", "9")
+    assert "60 steps in tau (all)" in output_of("run", "--resume", folder, "--steps", "60")

@@ -8,12 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import error_of, output_of
 from notation import lagrange
 
 import scvi_codegen as sc
 from scvi_codegen import ModelFileError, StateError, SystemDefinitionError, generate_package, load_package
-from scvi_codegen.cli import main
 from scvi_codegen.models.model_files.model_file import catalogue_model, dump_model, parse_model
 from scvi_codegen.runtime.run.largest_step import REFINEMENTS, largest_step
 
@@ -48,12 +47,6 @@ def shaken(tmp_path: Path) -> Path:
     return path
 
 
-def invoke(*words: str, status: int = 0) -> str:
-    result = CliRunner().invoke(main, list(words), prog_name="scvi-codegen")
-    assert result.exit_code == status, result.output
-    return result.output
-
-
 def plain(model: sc.Model) -> sc.Stepper:
     return sc.compile_stepper(model.system, model.method)
 
@@ -70,7 +63,7 @@ def test_controller_of_a_time_transformation_can_be_replaced() -> None:
 
 
 def test_command_line_finds_the_step_in_tau(shaken: Path) -> None:
-    printed = invoke("run", str(shaken), "--tolerance", "1e-8")
+    printed = output_of("run", str(shaken), "--tolerance", "1e-8")
     error = float(printed.partition("largest local error: ")[2].partition(" ")[0])
     assert 1e-12 < error < 1e-7
     words = (
@@ -82,13 +75,13 @@ def test_command_line_finds_the_step_in_tau(shaken: Path) -> None:
         "1e-10",
     )
     far = ("--q", "1.97,0", "--velocity", "0,0.1234", "--span", "6")
-    assert "use another time transformation" in invoke("run", "kepler", *far, *words, status=1)
+    assert "use another time transformation" in error_of("run", "kepler", *far, *words, status=1)
 
 
 def test_run_continues_from_a_folder(shaken: Path, tmp_path: Path) -> None:
     folder = str(tmp_path / "shaken.run")
-    assert "of 0.1 in tau from t = 0 to t = 12;" in invoke("run", str(shaken), "-o", folder)
-    assert "to t = 20;" in invoke("run", "--resume", folder, "--span", "20")
+    assert "of 0.1 in tau from t = 0 to t = 12;" in output_of("run", str(shaken), "-o", folder)
+    assert "to t = 20;" in output_of("run", "--resume", folder, "--span", "20")
     model = sc.load_model(shaken)
     exact = plain(model).integrate(model.q, model.p, t_end=20.0)
     assert np.abs(sc.load_run(folder)[-1:].q - exact.q[-1]).max() < 1e-9
@@ -166,7 +159,7 @@ def test_steps_end_at_breakpoints_of_inputs() -> None:
     ],
 )
 def test_unsupported_combinations_with_a_controller_are_reported(shaken: Path, words: str, printed: str) -> None:
-    assert printed in " ".join(invoke(*words.replace("FILE", str(shaken)).split(), status=2).split())
+    assert printed in " ".join(error_of(*words.replace("FILE", str(shaken)).split()).split())
 
 
 def test_python_and_the_command_line_choose_the_same_step_of_tau() -> None:

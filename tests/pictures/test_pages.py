@@ -225,8 +225,9 @@ def test_a_system_with_its_motion_has_a_page(tmp_path):
 
 def boxed():
     """Return the model of two particles in a periodic box."""
-    gas = lagrange("gas", ["r[N, 2]"], "sum(i in N, sum(a in 2, r_dot[i, a]**2)/2)"
-        " - sum(i < j in near, (cut**2 - sum(a in 2, wrap(r[i, a] - r[j, a], box)**2))**2)", box=6.0, cut=2.5, neighbours={"near": {"of": "r", "cutoff": "cut", "box": "box"}})  # fmt: skip
+    pairs = "sum(i < j in near, (cut**2 - sum(a in 2, wrap(r[i, a] - r[j, a], box)**2))**2)"
+    near, kinetic = {"of": "r", "cutoff": "cut", "box": "box"}, "sum(i in N, sum(a in 2, r_dot[i, a]**2)/2)"
+    gas = lagrange("gas", ["r[N, 2]"], f"{kinetic} - {pairs}", box=6.0, cut=2.5, neighbours={"near": near})
     q, velocity = {"r": [[0.0, 1.0], [2.0, 7.0]]}, {"r": np.zeros((2, 2))}
     return sc.Model(system=gas, method="svi:2", q=q, velocity=velocity, h=0.1, steps=1)
 

@@ -15,12 +15,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import invoke
 from notation import lagrange
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
-from scvi_codegen.cli import main
 from scvi_codegen.models.packages.package import generate_package
 from scvi_codegen.native import building, compilers
 from scvi_codegen.rendering.source import Source
@@ -58,8 +57,7 @@ ODD: list[Any] = [
 
 def refused(act: Callable[[], Any]) -> sc.ScviCodegenError | None:
     """The error of the package, if there is one; every other exception is one of the test."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         try:
             act()
         except sc.ScviCodegenError as error:
@@ -179,7 +177,7 @@ def test_damaged_csv_tables_are_rejected(number: int, tmp_path: Path, monkeypatc
     Path("u.csv").write_text(CSV[number])
     Path("model.toml").write_text(MODEL.replace("{ t = [0.0, 10.0], values = [0.0, 1.0] }", '{ file = "u.csv" }'))
     refused(lambda: sc.load_model("model.toml").all_inputs())
-    result = CliRunner().invoke(main, ["run", "kepler", "--step", "0.1", "--steps", "2", "--ensemble", "u.csv"])
+    result = invoke("run", "kepler", "--step", "0.1", "--steps", "2", "--ensemble", "u.csv", status=None)
     assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
 
 

@@ -37,8 +37,7 @@ def test_table_lists_the_features_that_are_tested():
 def test_features_work_or_are_refused_with_a_reason(feature, kind, kinds, tmp_path):
     of = kinds[kind]
     of.used = of.stepper()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         if TABLE[feature][kind] == "no":
             with pytest.raises(ScviCodegenError, match=REASONS):
                 FEATURES[feature](of, tmp_path)
@@ -202,8 +201,7 @@ def test_operations_that_a_stepper_supports_work(situation, half, situations):
     """In the default tier half of the operations in each situation, each operation in half of the situations."""
     stepper, left_out = situations(situation), {"device", "observe_ensemble", "fit", "flow", "periodic_orbit", "energy"}
     of_sizes = {"work", "discrete_lagrangian", "chaos"} if stepper.run_time_sizes else set()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         for number, (operation, call) in enumerate(OPERATIONS.items(), [*SITUATIONS].index(situation)):
             if number % 2 == half and operation not in left_out | of_sizes and stepper.supports(operation):
                 call(stepper)

@@ -298,10 +298,9 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for name, data in kind.files.items():
             (path := root / chosen.replace(" ", "_") / name).parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(data)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            with suppress(BuildError, *[sc.ScviCodegenError] * chosen.startswith("corpus")):  # some of them are wrong
-                kind.read(root / chosen.replace(" ", "_"))
+        refused = suppress(BuildError, *[sc.ScviCodegenError] * chosen.startswith("corpus"))  # some of them are wrong
+        with warnings.catch_warnings(action="ignore"), refused:
+            kind.read(root / chosen.replace(" ", "_"))
     return root
 
 

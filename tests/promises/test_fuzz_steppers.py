@@ -254,8 +254,7 @@ def check_oscillator(stepper: sc.Stepper, random: Random) -> bool:
     if h == 0.0:
         return False
     steps = random.choice((1, 1, 5))
-    with guarded(), warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with guarded(), warnings.catch_warnings(action="error"):
         warnings.simplefilter("ignore", sc.AccuracyWarning)
         try:
             if steps == 1:
@@ -316,8 +315,7 @@ def check_nonlinear(name: str, method: Any, random: Random) -> bool:
     h = random.choice((-1, 1)) * random.choice(SIZES[1:])
     found = []
     for stepper in steppers:
-        with guarded(), warnings.catch_warnings():
-            warnings.simplefilter("error")
+        with guarded(), warnings.catch_warnings(action="error"):
             warnings.simplefilter("ignore", sc.AccuracyWarning)
             try:
                 found.append(np.hstack(stepper.step(q, p, h)))

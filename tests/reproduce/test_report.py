@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import importlib.util
-import json
 import multiprocessing
 import os
 import re
@@ -12,15 +11,14 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 import toy_experiments
-from click.testing import CliRunner
+from commands import error_of, invoke, json_of, output_of
 from html_page import Page
 from toy_experiments import EXPERIMENTS, GOOD
 
-from scvi_codegen.cli import main
 from scvi_codegen.cli.commands.reproduce import Reproduction, experiments_table, experiments_titles
 from scvi_codegen.display.page import cell, prose
 from scvi_codegen.errors import StateError
@@ -199,15 +197,13 @@ def toys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("scvi_codegen.reproduce.catalogue.EXPERIMENTS", EXPERIMENTS)
 
 
-def invoke(*words: str) -> Any:
-    return CliRunner().invoke(main, ["reproduce", "--jobs", "1", *words], prog_name="scvi-codegen")
+COMMAND = ("reproduce", "--jobs", "1")
 
 
 @pytest.mark.usefixtures("toys")
 class TestCommand:
     def test_command_writes_files_and_the_page(self):
-        done = invoke("section-3.1", "table-8", "-o", "made/here", "--html", "all.html")
-        assert done.exit_code == 0, done.output
+        text = output_of(*COMMAND, "section-3.1", "table-8", "-o", "made/here", "--html", "all.html")
         assert sorted(path.name for path in Path("made/here").iterdir()) == [
             "figure-4-series.csv",
             "figure-4.csv",
@@ -219,20 +215,19 @@ class TestCommand:
             "table-8.csv",
             "table-8.txt",
         ]
-        assert "3 results, 2 hold in part, 1 shown\nwrote 10 files to . and made/here" in done.stdout
-        assert "figure-4     holds in part  Energy errors of <SVI> & SC\n" in done.stdout
+        assert "3 results, 2 hold in part, 1 shown\nwrote 10 files to . and made/here" in text
+        assert "figure-4     holds in part  Energy errors of <SVI> & SC\n" in text
         text = Path("all.html").read_text(encoding="utf-8")
         assert text.index('<section id="section-3.1"') < text.index('<section id="figure-4"')
 
     @pytest.mark.full
     def test_violated_claim_is_not_a_failure(self):
-        assert invoke("figure-4").exit_code == 0
+        invoke(*COMMAND, "figure-4")
         assert Path("reproduced/figure-4.txt").is_file()
 
     def test_failed_experiment_is_named_at_the_end(self):
-        done = invoke("broken", "table-9")
-        assert done.exit_code == 1
-        assert "1 experiment failed to run\n  broken: ValueError: no such luck" in done.stderr
+        error = error_of(*COMMAND, "broken", "table-9", status=1)
+        assert "1 experiment failed to run\n  broken: ValueError: no such luck" in error
         assert Path("reproduced/table-9.txt").is_file()
 
     @pytest.mark.parametrize(
@@ -247,45 +242,37 @@ class TestCommand:
     )
     def test_invalid_arguments_are_reported_before_the_run(self, words, message):
         Path("file").write_text("")
-        done = invoke(*words)
-        assert done.exit_code == 2
-        assert message in done.stderr
+        assert message in error_of(*COMMAND, *words)
         assert not Path("reproduced").exists()
 
     def test_unwritable_file_exits_with_1(self):
         Path("made/table-9.txt").mkdir(parents=True)
-        done = invoke("table-9", "-o", "made")
-        assert done.exit_code == 1
-        assert "made" in done.stderr
+        assert "made" in error_of(*COMMAND, "table-9", "-o", "made", status=1)
 
     def test_missing_matplotlib_names_what_to_install(self, monkeypatch):
         monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-        done = invoke("table-9")
-        assert done.exit_code == 2
-        assert "pip install 'scvi-codegen[plot]'" in done.stderr
+        assert "pip install 'scvi-codegen[plot]'" in error_of(*COMMAND, "table-9")
 
     def test_command_lists_experiments(self):
-        assert "figure-4      Energy errors\n" in invoke("--list").stdout
-        assert invoke("--list", "table-8").stdout == "figure-4  Energy errors\ntable-8   Iterations\n"
-        assert experiments_table(experiments_titles(module=TOYS)) == invoke("--list").stdout.rstrip("\n")
+        listed = output_of(*COMMAND, "--list")
+        assert "figure-4      Energy errors\n" in listed
+        assert output_of(*COMMAND, "--list", "table-8") == "figure-4  Energy errors\ntable-8   Iterations\n"
+        assert experiments_table(experiments_titles(module=TOYS)) == listed.rstrip("\n")
 
     def test_json_and_quiet_output(self):
-        listed = json.loads(invoke("--list", "--json").stdout)
-        assert listed["experiments"]["figure-4"] == "Energy errors"
-        found = json.loads(invoke("broken", "table-8", "--json").stdout)
+        assert json_of(*COMMAND, "--list")["experiments"]["figure-4"] == "Energy errors"
+        found = json_of(*COMMAND, "broken", "table-8", status=1)
         assert {each["name"]: each["verdict"] for each in found["results"]}["figure-4"] == "holds in part"
         assert list(found["failures"]) == ["broken"]
         assert "reproduced/table-8.txt" in found["written"]
-        assert invoke("table-8", "--quiet").stdout == invoke("--list", "--quiet").stdout == ""
+        assert output_of(*COMMAND, "table-8", "--quiet") == output_of(*COMMAND, "--list", "--quiet") == ""
 
     def test_interrupt_exits_with_130(self, monkeypatch):
         interrupted = Reproduction(interrupted=True)
         monkeypatch.setattr(
             "scvi_codegen.cli.commands.reproduce.reproduce_experiments", lambda *words, **options: interrupted
         )
-        done = invoke("slow")
-        assert done.exit_code == 130
-        assert "interrupted" in done.stderr
+        assert "interrupted" in error_of(*COMMAND, "slow", status=130)
 
 
 INTERRUPTED = """

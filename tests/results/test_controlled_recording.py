@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import error_of, output_of
 from recorded_runs import STATE, StopsAfter, assert_same, digests, recorded
 
 import scvi_codegen as sc
-from scvi_codegen.cli import main, supervision
+from scvi_codegen.cli import supervision
 from scvi_codegen.models.model_files.model_file import dump_model, parse_model
 
 END, TOLERANCE = 60.0, 1e-10
@@ -101,35 +101,24 @@ def test_model_file_contains_a_tolerance():
     assert parse_model(dump_model(sc.Model.from_problem(sc.problem("kepler"))), {"run": {"tolerance": 0.5}}).h is None
 
 
-def invoke(words: str):
-    return CliRunner().invoke(main, ["run", *words.split()])
-
-
 def test_the_command_line_runs_records_and_resumes_it(kepler):
     Path("k.toml").write_text(MODEL)
-    plain, half, rest = (
-        invoke("k.toml -o k.npz"),
-        invoke("k.toml -o k.run --span 30"),
-        invoke("--resume k.run --span 60"),
-    )
-    assert [done.exit_code for done in (plain, half, rest)] == [0, 0, 0], plain.output + half.output + rest.output
-    assert "of adaptive size" in plain.output
-    assert "largest local error" in plain.output
-    assert f"to t = {END:g}" in rest.output
+    plain = output_of("run", "k.toml", "-o", "k.npz")
+    assert "of adaptive size" in plain
+    assert "largest local error" in plain
+    output_of("run", "k.toml", "-o", "k.run", "--span", "30")
+    assert f"to t = {END:g}" in output_of("run", "--resume", "k.run", "--span", "60")
     with np.load("k.npz") as file:
         run = kepler.integrate(file["q"][0], file["p"][0], t_end=END, tolerance=TOLERANCE)
         assert np.abs(file["q"][-1] - run.q[-1]).max() < 1e-9
         assert float(file["h"]) == file["t"][1]
     assert np.abs(sc.load_run("k.run").q[-1] - run.q[-1]).max() < 1e-7
-    refused = invoke("k.toml --steps 10")
-    assert refused.exit_code != 0
-    assert "give span, not steps" in refused.output
+    assert "give span, not steps" in error_of("run", "k.toml", "--steps", "10")
 
 
 def test_run_beyond_the_memory_ends_with_advice(monkeypatch):
     Path("k.toml").write_text(MODEL)
     monkeypatch.setattr(supervision, "usable_memory", lambda: 8000.0)
-    done = invoke("k.toml")
-    assert done.exit_code != 0
-    assert "save fewer (--save-every" in done.output
-    assert "-o NAME.run" in done.output
+    error = error_of("run", "k.toml")
+    assert "save fewer (--save-every" in error
+    assert "-o NAME.run" in error

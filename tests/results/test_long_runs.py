@@ -12,12 +12,11 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
+from commands import error_of, output_of
 from programs import needs
 from recorded_runs import STATE, H, assert_same, digests, recorded, start
 
 import scvi_codegen as sc
-from scvi_codegen.cli import main
 from scvi_codegen.results.recording import load_run
 
 CHILD = """
@@ -190,24 +189,18 @@ def test_failed_step_saves_the_preceding_states(compiled):
 
 
 class TestCommandLine:
-    @staticmethod
-    def invoke(words: str, status: int = 0) -> str:
-        result = CliRunner().invoke(main, words.split(), prog_name="scvi-codegen")
-        assert result.exit_code == status, result.output
-        return result.output
-
     def test_command_line_records_extends_and_exports_a_run(self):
-        text = self.invoke("run kepler --method stoermer-verlet --step 0.01 --steps 1000 --save-every 10 -o a.run")
+        text = output_of("run kepler --method stoermer-verlet --step 0.01 --steps 1000 --save-every 10 -o a.run")
         assert "1000 steps (all) of 0.01 from t = 0 to t = 10; 101 states saved in 'a.run'" in text
         assert "relative energy error" in text
         assert "wrote a.run" in text
-        assert "already contains a run" in self.invoke("run kepler --method stoermer-verlet -o a.run", 1)
-        text = self.invoke("run --resume a.run --span 20")
+        assert "already contains a run" in error_of("run kepler --method stoermer-verlet -o a.run", status=1)
+        text = output_of("run --resume a.run --span 20")
         assert "2000 steps (all)" in text
-        self.invoke("run kepler --method stoermer-verlet --step 0.01 --steps 2000 --save-every 10 -o whole/")
+        output_of("run kepler --method stoermer-verlet --step 0.01 --steps 2000 --save-every 10 -o whole/")
         assert digests("a.run") == digests("whole")
-        assert "201 states saved in 'a.run'" in self.invoke("export a.run")
-        assert "wrote a.csv" in self.invoke("export a.run -o a.csv")
+        assert "201 states saved in 'a.run'" in output_of("export a.run")
+        assert "wrote a.csv" in output_of("export a.run -o a.csv")
         assert len(Path("a.csv").read_text().splitlines()) == 202
 
     @pytest.mark.parametrize(
@@ -227,7 +220,7 @@ class TestCommandLine:
     )
     def test_command_line_reports_invalid_requests(self, words, message, status):
         words = words.replace("kepler -o", "kepler --method stoermer-verlet --steps 10 -o")
-        assert message in self.invoke(words, status)
+        assert message in error_of(words, status=status)
 
     def test_interrupt_prints_how_to_continue(self):
         words = "run kepler --method stoermer-verlet --step 0.01 --steps 1000000000000 --save-every 100000 -o a.run"

@@ -139,8 +139,7 @@ class TestRecording:
         monkeypatch.setattr(manifest, "fingerprint", lambda source, flags: "another")
         with pytest.warns(sc.RecordingWarning, match=f"from step {step} on another build is used"):
             sc.resume_run("a.run", steps=600)
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
+        with warnings.catch_warnings(action="error"):
             found = sc.resume_run("a.run", steps=700)
         assert [build.step for build in found.manifest.builds] == [0, step]
 

@@ -386,8 +386,7 @@ def test_invalid_arguments_are_rejected(galaxy):
 def test_too_long_steps_in_an_ensemble_are_reported():
     kepler = sc.compile_stepper(sc.problem("kepler").system, sc.SVI(4))
     starts = [[1.0, 0.0], [0.1, 0.0]], [[0.0, 1.0], [0.0, 19.0**0.5]]
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         kepler.chaos_indicators_ensemble(*starts, h=0.005, steps=200)
     with pytest.warns(sc.AccuracyWarning, match=r"too large.*\(trajectory 0 of 2\)"):
         kepler.chaos_indicators_ensemble(starts[0][::-1], starts[1][::-1], h=0.05, steps=200)

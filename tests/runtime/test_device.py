@@ -13,13 +13,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import invoke
 from emulated_gpu import ArrayOfLibrary, EmulatedGpu
 from pages import ROOT, runnable
 from samples import pushed_pendulum, sample_named
 
 import scvi_codegen as sc
-from scvi_codegen.cli import main
 from scvi_codegen.methods import Method
 from scvi_codegen.native import cuda
 from scvi_codegen.native.building import PORTABLE_FLAGS
@@ -315,8 +314,7 @@ def test_command_line_and_model_files_choose_the_device(gpu: EmulatedGpu, tmp_pa
     ensemble = ["--ensemble", str(tmp_path / "angles.csv"), "-o", str(tmp_path / "a.npz")]
 
     def run(*arguments: str) -> str:
-        result = CliRunner().invoke(main, [*arguments], prog_name="scvi-codegen")
-        return result.output
+        return invoke(*arguments, status=None).output
 
     assert " s on a GPU, " in run(*words, *ensemble, "--device", "cuda")
     assert len(gpu.launches) == 1

@@ -34,8 +34,7 @@ def states() -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def distributed() -> Any:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         return pytest.importorskip("distributed", reason="needs the extra 'distributed'")
 
 

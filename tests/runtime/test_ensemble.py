@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from commands import error_of, invoke, output_of
 from notation import hamilton, lagrange
 from numpy.testing import assert_allclose
 from samples import pushed_pendulum, sample_named, stepper_for
@@ -25,7 +25,6 @@ from scipy.interpolate import CubicSpline
 
 import scvi_codegen as sc
 from benchmarks.cases.robots import chain
-from scvi_codegen.cli import main
 from scvi_codegen.methods import Method
 from scvi_codegen.models.model_files.ensemble_file import load_ensemble
 from scvi_codegen.runtime.ensemble.ensemble import Ensemble
@@ -743,19 +742,14 @@ class TestCommandLine:
         monkeypatch.chdir(tmp_path)
         Path("grid.toml").write_text(GRID)
 
-    def invoke(self, words: str) -> Result:
-        return CliRunner().invoke(main, ["run", *words.split()])
-
     @pytest.mark.parametrize("suffix", ["npz", "csv"])
     def test_ensemble_command_prints_a_summary_and_writes_files(self, suffix: str):
-        result = self.invoke(
-            f"kepler --degree 4 --step 0.1 --steps 50 --save-every 10 --ensemble grid.toml -o runs.{suffix}"
-        )
-        assert result.exit_code == 0, result.output
-        assert "6 trajectories of 50 steps of 0.1 from t = 0; 6 states saved of each" in result.stdout
-        assert "\n6 ok\n" in result.stdout
-        assert float(re.search(r"relative energy error: (\S+) at most, of trajectory \d", result.stdout)[1]) < 1e-3  # type: ignore[index]
-        assert f"wrote runs.{suffix}" in result.stdout
+        words = f"run kepler --degree 4 --step 0.1 --steps 50 --save-every 10 --ensemble grid.toml -o runs.{suffix}"
+        text = output_of(words)
+        assert "6 trajectories of 50 steps of 0.1 from t = 0; 6 states saved of each" in text
+        assert "\n6 ok\n" in text
+        assert float(re.search(r"relative energy error: (\S+) at most, of trajectory \d", text)[1]) < 1e-3  # type: ignore[index]
+        assert f"wrote runs.{suffix}" in text
         if suffix == "npz":
             with np.load("runs.npz") as file:
                 assert file["q"].shape == (6, 6, 2)
@@ -764,19 +758,18 @@ class TestCommandLine:
 
     def test_failures_are_counted_and_others_saved(self):
         Path("table.csv").write_text("mu\n1\n1e9\n1.1\n")
-        result = self.invoke("kepler --degree 4 --step 0.05 --steps 50 --ensemble table.csv -o runs.npz")
-        assert result.exit_code == 0, result.output
-        assert re.search(r"^2 ok, 1 not \w+$", result.stdout, re.MULTILINE)
+        words = "run kepler --degree 4 --step 0.05 --steps 50 --ensemble table.csv -o runs.npz"
+        text = output_of(words)
+        assert re.search(r"^2 ok, 1 not \w+$", text, re.MULTILINE)
         assert re.search(
-            r"^  trajectory 1: step \d+ at t = \S+ failed: .*(did not converge|NaN).*$", result.stdout, re.MULTILINE
+            r"^  trajectory 1: step \d+ at t = \S+ failed: .*(did not converge|NaN).*$", text, re.MULTILINE
         )
         assert Path("runs.npz").exists()
 
     def test_failure_of_all_trajectories_is_a_failure(self):
         Path("table.csv").write_text("mu\n1e9\n")
-        result = self.invoke("kepler --degree 4 --step 0.05 --steps 50 --ensemble table.csv")
-        assert result.exit_code == 1
-        assert "every trajectory failed" in result.stderr
+        words = "run kepler --degree 4 --step 0.05 --steps 50 --ensemble table.csv"
+        assert "every trajectory failed" in error_of(words, status=1)
 
     @pytest.mark.parametrize(
         ("words", "message"),
@@ -792,9 +785,7 @@ class TestCommandLine:
         ],
     )
     def test_mistakes_are_usage_errors(self, words: str, message: str):
-        result = self.invoke(words)
-        assert result.exit_code == 2, result.output
-        assert message in result.stderr
+        assert message in error_of(f"run {words}")
 
     def test_interrupted_command_saves_completed_states(self, monkeypatch: pytest.MonkeyPatch):
         @contextmanager
@@ -802,10 +793,8 @@ class TestCommandLine:
             yield lambda count: signal.raise_signal(signal.SIGINT) if count else None
 
         monkeypatch.setattr("scvi_codegen.cli.ensembles.progress_bar", once_some_have_begun)
-        result = self.invoke(
-            "kepler --degree 4 --step 0.05 --steps 10000000000 --save-every 1000000000 --ensemble grid.toml -o runs.npz"
-        )
-        assert result.exit_code == 130
+        words = "run kepler --degree 4 --step 0.05 --steps 10000000000 --save-every 1000000000 --ensemble grid.toml"
+        result = invoke(words, "-o", "runs.npz", status=130)
         assert "0 ok, 6 interrupted" in result.stdout
         assert "the computed states were written: runs.npz" in result.stderr
         with np.load("runs.npz") as file:
@@ -947,8 +936,7 @@ def test_command_line_runs_a_grid(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         '[system]\ncatalogue = "kepler"\n[method]\nmethod = "svi"\ndegree = 4\n[run]\ntolerance = 1e-9\nspan = 9\n'
     )
     Path("grid.toml").write_text("[grid]\nq1 = [0.5, 0.7]\nmu = [1.0, 1.1]\n")
-    done = CliRunner().invoke(main, ["run", "k.toml", "--ensemble", "grid.toml", "-o", "grid.npz"])
-    assert done.exit_code == 0, done.output
+    done = invoke("run", "k.toml", "--ensemble", "grid.toml", "-o", "grid.npz")
     assert "adaptive steps from t = 0 to t = 9" in done.output
     assert "4 ok" in done.output
     with np.load("grid.npz") as file:

@@ -85,8 +85,7 @@ def henon_heiles_states(random, energy):
 
 def reports(stepper, q, p, t_end, **arguments):
     """Whether a run reports that errors grow."""
-    with warnings.catch_warnings(record=True) as heard:
-        warnings.simplefilter("always")
+    with warnings.catch_warnings(record=True, action="always") as heard:
         stepper.integrate(q, p, t_end=t_end, **arguments)
     return any(str(each.message).startswith("the motion amplifies errors") for each in heard)
 

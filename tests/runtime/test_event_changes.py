@@ -11,11 +11,10 @@ import mpmath as mp
 import numpy as np
 import pytest
 import sympy
-from click.testing import CliRunner
+from commands import error_of, invoke
 from notation import hamilton, lagrange
 
 import scvi_codegen as sc
-from scvi_codegen.cli import main
 from scvi_codegen.derivation.page.document import derivation_html
 from scvi_codegen.models.model_files.model_file import dump_model, parse_model
 from scvi_codegen.rendering.events import with_events
@@ -330,8 +329,7 @@ def test_impacts_on_moving_curved_walls_are_satisfied(wall, restitution, flags):
     ball = sc.LagrangianSystem.from_text("ball", ["x", "y"], "(x_dot**2 + y_dot**2)/2 - y - x**2/8")
     stepper = sc.compile_stepper(ball, "svi:4", flags=flags, events=sc.impact(wall, restitution=restitution))
     start = State(np.array([0.3, 1.2]), np.array([0.4, -0.2]), 0.0, 0.05)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", sc.EventWarning)
+    with warnings.catch_warnings(action="ignore", category=sc.EventWarning):
         checks = list(impact_checks(SystemUnderTest(ball, sc.SVI(4), stepper, None, start), stepper))
     assert {each.outcome for each in checks} == {Outcome.SATISFIED}, checks
     (impacts,) = (each for each in checks if each.name == "impacts")
@@ -843,8 +841,7 @@ def test_unsupported_combinations_are_refused(ball):
 
 
 def test_no_accuracy_warnings_of_energies_that_impacts_change(ball):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", sc.AccuracyWarning)
+    with warnings.catch_warnings(action="error", category=sc.AccuracyWarning):
         sc.compile_stepper(BALL, "svi:4", flags=FLAGS).integrate(
             [1.0], [0.0], t_end=5.0, events=sc.impact("y", 0.5, terminal=3)
         )
@@ -909,8 +906,7 @@ def test_generated_programs_print_events(tmp_path, steps):
 def test_events_of_the_command_line_add_to_those_of_the_file(tmp_path):
     path = tmp_path / "ball.toml"
     path.write_text(MODEL)
-    derived = CliRunner().invoke(main, ["derive", str(path), "--event", "y - x**2 + t; restitution=1/2"])
-    assert derived.exit_code == 0, derived.output
+    derived = invoke("derive", path, "--event", "y - x**2 + t; restitution=1/2")
     assert "g = y = 0\n    p := p + (1 + e)/2 lambda n, H(q, p + lambda n) - H(q, p)" in derived.output
     assert "n = (0, 1), g_t = 0\n    e = e" in derived.output
     assert "n = (-2*x, 1), g_t = 1\n    e = 1/2" in derived.output
@@ -918,12 +914,9 @@ def test_events_of_the_command_line_add_to_those_of_the_file(tmp_path):
     assert "dz := R_z (dz + X- dt) + R_t dt - X+ dt" in derived.output
     page = derivation_html(parse_model(MODEL).system, sc.SVI(1), events=parse_model(MODEL).events)
     assert "lambda g_t = 0\n    n = (0, 1), g_t = 0" in page
-    advised = CliRunner().invoke(main, ["run", str(path), "--advise", "1e-6"])
-    assert advised.exit_code == 2
-    assert "--advise is not available with events that change the state" in advised.output
+    assert "--advise is not available with events that change the state" in error_of("run", path, "--advise", "1e-6")
     command = ["run", str(path), "--event", "t - 6; terminal=1", "--event", "y - 1/2; direction=1; p_y=p_y/2"]
-    result = CliRunner().invoke(main, command)
-    assert result.exit_code == 0, result.output
+    result = invoke(*command)
     assert "event y: 3 crossings" in result.output
     assert "to t = 6;" in result.output
     assert "event y - 1/2:" in result.output

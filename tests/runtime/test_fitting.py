@@ -364,8 +364,7 @@ def test_diagnosis_does_not_depend_on_units(length, time, segments):
     motion = kepler().integrate(state[:3], state[3:], h=0.05 * time, steps=120, parameters=[mu, k])
     guess = {"q": state[:3], "p": state[3:], "h": 0.05 * time, "start": 0.0, "segments": segments}
     t, q = motion.t[2::2], motion.q[2::2]
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", sc.AccuracyWarning)
+    with warnings.catch_warnings(action="error", category=sc.AccuracyWarning):
         found = sc.fit(kepler(), t, q, parameters=[1.01 * mu, 0.99 * k], **guess)
     assert_allclose(found.values / units, true, rtol=0, atol=1e-8)
     with pytest.raises(sc.FitError, match=r"do not determine (k|z|p_z)"):

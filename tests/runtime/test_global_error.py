@@ -1,6 +1,5 @@
 """Global error of whole runs: the estimate bounds the true error, chaos ends what is confirmed, defaults warn."""
 
-import json
 import math
 import re
 import warnings
@@ -9,13 +8,12 @@ from types import SimpleNamespace
 import mpmath
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import error_of, json_of, output_of
 from extrapolation import Real, integrated
 from motions import MOTIONS, recorded
 from notation import lagrange
 
 import scvi_codegen as sc
-from scvi_codegen.cli import main
 from scvi_codegen.runtime.run.global_error import SAFETY, SAFETY_OF_ROUNDING, SAFETY_OF_TWO, _alternative
 from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.runtime.trajectory import dense_output
@@ -282,8 +280,7 @@ class TestChaos:
         for save_every in range(1, 13):
             q = np.array(PYTHAGOREAN[0]) * (1.0 + 1e-3 * random.standard_normal(6))
             arguments = {"t_end": 70.0, "save_every": save_every}
-            with warnings.catch_warnings(record=True) as heard:
-                warnings.simplefilter("always")
+            with warnings.catch_warnings(record=True, action="always") as heard:
                 burrau_stepper.integrate(q, PYTHAGOREAN[1], **arguments, check_growth=True)
                 count = len(heard)
                 burrau_stepper.integrate(q, PYTHAGOREAN[1], **arguments)
@@ -313,8 +310,7 @@ class TestChaos:
         wells = f"{late}*(x**2 - x**4/4 + x*cos(t)/2)"
         system = made("late", ["x"], f"x_dot**2/2 - x**2/2 + x*cos(7*t)/100 + {wells}")
         stepper = sc.compile_stepper(system, "svi:4")
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
+        with warnings.catch_warnings(action="error"):
             run = stepper.integrate([0.1], [0.3], t_end=1300.0)
         assert run.steps > 2048
         with pytest.warns(sc.AccuracyWarning, match="amplifies errors"):
@@ -456,8 +452,7 @@ class TestOtherRuns:
     def test_constraints_agree_with_an_angle(self):
         """A pendulum held by x^2 + y^2 = 1 and one that has no other coordinate than its angle."""
         constrained = made("h", ["x", "y"], "(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 = 1"])
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
+        with warnings.catch_warnings(action="error"):
             run = sc.compile_stepper(constrained, sc.SVI(6, "gauss-lobatto:7")).integrate(
                 [1.0, 0.0], [0.0, 0.4], t_end=10.0, error=1e-8
             )
@@ -514,8 +509,7 @@ class TestOtherRuns:
         for more in ({}, {"save_every": 5}):
             with pytest.warns(sc.AccuracyWarning, match="amplifies errors"):
                 stepper.integrate([2.5, -1.0, 1.0], [0.5, 1.5, -0.3], t_end=300.0, **more)
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
+        with warnings.catch_warnings(action="error"):
             stepper.integrate([2.5, -1.0, 1.0], [0.5, 1.5, -0.3], t_end=300.0, check_growth=False)
             stepper.integrate([0.2, 0.1, 0.0], [0.0, 0.0, 0.0], t_end=100.0)
 
@@ -540,24 +534,22 @@ def loaded(path):
 
 class TestCommandLine:
     def test_text_and_json_agree_with_the_states(self, tmp_path):
-        words = ["run", "kepler", "--span", "20", "--error", "1e-9", "-o", str(tmp_path / "orbit.npz")]
-        outcome = CliRunner().invoke(main, words)
-        document = json.loads(CliRunner().invoke(main, [*words, "--json"]).stdout)
+        words = ["run", "kepler", "--span", "20", "--error", "1e-9", "-o", tmp_path / "orbit.npz"]
+        printed = output_of(*words)
+        document = json_of(*words)
         found, saved = document["global_error"], loaded(tmp_path / "orbit.npz")
         exact = on_an_ellipse(saved["q"][0], saved["p"][0], saved["t"])
         size = np.linalg.norm(saved["q"], axis=1).max()
-        assert outcome.exit_code == 0
-        assert (
-            f"global error: estimated at {found['estimate']:.1e} (relative) from {found['runs']} runs" in outcome.output
-        )
+        assert f"global error: estimated at {found['estimate']:.1e} (relative) from {found['runs']} runs" in printed
         assert np.linalg.norm(exact[:, :2] - saved["q"], axis=1).max() / size <= found["estimate"] <= 1e-9
         assert found["digits"] == math.floor(-math.log10(found["estimate"])) >= 9
         assert (found["requested"], found["confirmed"], found["confirmed_until"]) == (1e-9, True, saved["t"][-1])
 
     def test_unconfirmed_result_exits_with_1(self):
-        result = CliRunner().invoke(main, ["run", "double-pendulum", "--span", "40", "--error", "1e-9"])
-        assert result.exit_code == 1
-        assert re.search(r"the bound 1e-09 on the global error is confirmed only until t = [\d.]+", result.output)
+        assert re.search(
+            r"the bound 1e-09 on the global error is confirmed only until t = [\d.]+",
+            error_of("run", "double-pendulum", "--span", "40", "--error", "1e-9", status=1),
+        )
 
     ARRAYS = (
         '[system]\nname = "pendulums"\ncoordinates = ["q[N]"]\n'
@@ -569,7 +561,7 @@ class TestCommandLine:
         path, output = tmp_path / "arrays.toml", tmp_path / "a.npz"
         path.write_text(self.ARRAYS.format(span=8.0, q=[0.2, 0.1, 0.0]))
         words = (["run", str(path), "-o", str(output), "--json"], ["run", str(path), "--error", "1e-8", "--json"])
-        found = [json.loads(CliRunner().invoke(main, each).stdout)["global_error"] for each in words]
+        found = [json_of(*each)["global_error"] for each in words]
         model = sc.load_model(path)
         run = model.integrate()
         assert found[0] == found[1]
@@ -578,9 +570,7 @@ class TestCommandLine:
         saved = loaded(output)
         assert any(np.array_equal(saved[name], run.q["q"]) for name in saved)
         path.write_text(self.ARRAYS.format(span=200.0, q=[2.5, -1.0, 1.0]))
-        result = CliRunner().invoke(main, ["run", str(path)])
-        assert result.exit_code == 1
-        assert "the bound 1e-08 on the global error is confirmed only until t = " in result.output
+        assert "the bound 1e-08 on the global error is confirmed only until t = " in error_of("run", path, status=1)
 
     @pytest.mark.parametrize(
         ("run", "words", "message"),
@@ -593,16 +583,14 @@ class TestCommandLine:
     def test_invalid_files_are_rejected(self, tmp_path, run, words, message):
         path = tmp_path / "kepler.toml"
         path.write_text(f'[system]\ncatalogue = "kepler"\n[run]\nspan = 20.0\n{run}\n')
-        result = CliRunner().invoke(main, ["run", str(path), *words])
-        assert result.exit_code == 2
-        assert message in result.output
+        assert message in error_of("run", path, *words)
 
     @pytest.mark.parametrize("controller", ["symplectic", "reversible"])
     def test_error_and_time_transformation_can_be_combined(self, tmp_path, controller):
         """In a file and by an option; the printed run is the confirmed one."""
         path = self._kepler(tmp_path)
         words = ["--time-transformation", "frequency", "--controller", controller, "-o", str(tmp_path / "k.npz")]
-        document = json.loads(CliRunner().invoke(main, ["run", str(path), *words, "--json"]).stdout)
+        document = json_of("run", path, *words)
         found, saved = document["global_error"], loaded(tmp_path / "k.npz")
         exact = on_an_ellipse(saved["q"][0], saved["p"][0], saved["t"])
         size = np.linalg.norm(saved["q"], axis=1).max()
@@ -633,9 +621,7 @@ class TestCommandLine:
 
     @pytest.mark.parametrize("other", ["--tolerance", "--advise"])
     def test_step_size_arguments_are_exclusive(self, other):
-        result = CliRunner().invoke(main, ["run", "kepler", "--error", "1e-9", other, "1e-9"])
-        assert result.exit_code == 2
-        assert "exclude each other" in result.output
+        assert "exclude each other" in error_of("run", "kepler", "--error", "1e-9", other, "1e-9")
 
 
 @pytest.mark.parametrize("power", [-660, 660])
@@ -654,6 +640,5 @@ def test_growth_check_of_linear_systems_is_scale_invariant(power):
     start = {"q": [2.0**power], "p": [-(2.0**power)], "t": 3.0, "t_end": 43.0}
     with pytest.warns(sc.AccuracyWarning, match="amplifies errors"):
         saddle.integrate(**start, check_growth=True)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         saddle.integrate(**start, parameters={"k": -1.0}, check_growth=True)

@@ -204,8 +204,7 @@ def test_another_orbit_is_reported(planar):
 def test_another_member_of_the_family_is_reported(planar):
     """A velocity 10 % too large leads to an orbit of 2.5 times the amplitude; one 10 % too small to a neighbour."""
     for speed, reported in ((1.1, True), (0.9, False)):
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
+        with warnings.catch_warnings(record=True, action="always") as caught:
             velocity = [0.0, 0.1625133 * speed]
             orbit = sc.periodic_orbit(planar, [0.82, 0.0], velocity=velocity, period=2.780187, steps=200)
         states = np.concatenate([orbit.run().q, orbit.run().p], axis=1)

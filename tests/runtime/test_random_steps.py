@@ -75,8 +75,7 @@ def adaptive_ratio(name, method, solver, q, p, t, tolerance):
     family, stepper = FAMILIES[name], compiled(name, method, solver)
     shape = [axis.number or 1 for axis in stepper.interface.layout.coordinates[0].axes]
     at = [np.reshape(x, [-1, *shape[1:]]) for x in (q, p)]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         try:
             run = stepper.integrate(*at, t=t, t_end=t + 3 * family.period, tolerance=tolerance)
         except sc.StepFailedError:
@@ -133,8 +132,7 @@ def test_spurious_solution_is_rejected_or_its_error_reported(name, flags):
     for method, q, p, h in SPURIOUS[name]:
         stepper = sc.compile_stepper(system, method, flags=flags)
         exact = sc.compile_stepper(system, sc.SVI(12)).integrate([q], [p], t_end=h).q[-1, 0]
-        with warnings.catch_warnings(record=True) as heard:
-            warnings.simplefilter("always")
+        with warnings.catch_warnings(record=True, action="always") as heard:
             try:
                 run = stepper.integrate([q], [p], h=h, steps=1)
             except sc.StepFailedError:

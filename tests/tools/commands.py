@@ -8,9 +8,9 @@ from click.testing import CliRunner, Result
 from scvi_codegen.cli import main
 
 
-def invoke(*words: object, status: int | None = 0) -> Result:
-    """Run a command, which ends with an exit status (``None``: any)."""
-    result = CliRunner().invoke(main, [str(word) for word in words], prog_name="scvi-codegen")
+def invoke(text: str, *words: object, status: int | None = 0) -> Result:
+    """Run a text of words separated by blanks and further words, which end with an exit status (``None``: any)."""
+    result = CliRunner().invoke(main, [*text.split(), *map(str, words)], prog_name="scvi-codegen")
     assert status is None or result.exit_code == status, result.output
     return result
 
@@ -20,7 +20,7 @@ def output_of(*words: object) -> str:
     return invoke(*words).stdout
 
 
-def error_of(*words: object, status: int = 2) -> str:
+def error_of(*words: object, status: int | None = 2) -> str:
     """Return the message on stderr of a command that fails without a traceback."""
     result = invoke(*words, status=status)
     assert isinstance(result.exception, SystemExit)
@@ -28,7 +28,7 @@ def error_of(*words: object, status: int = 2) -> str:
     return result.stderr
 
 
-def document(*words: object, status: int = 0) -> dict[str, Any]:
+def json_of(*words: object, status: int = 0) -> dict[str, Any]:
     """Return the JSON of a command, which has no undefined numbers."""
     return dict(json.loads(invoke(*words, "--json", status=status).stdout, parse_constant=_refuse))
 

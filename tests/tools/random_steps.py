@@ -201,8 +201,7 @@ def outcome(stepper: Any, of: list[Trial]) -> Outcome:
     """Return the results of the trials."""
     refused, estimates, errors = np.zeros(len(of), bool), np.full(len(of), np.nan), np.zeros(len(of))
     for k, trial in enumerate(of):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             try:
                 end, estimates[k] = taken(stepper, trial)
             except sc.StepFailedError:

@@ -9,13 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from commands import output_of
 from either_system import either_system
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 from scvi_codegen import compiler, pipeline
-from scvi_codegen.cli import main
 from scvi_codegen.ir.equations import Control
 from scvi_codegen.ir.program import Program
 from scvi_codegen.rendering.program_source import render
@@ -181,9 +180,7 @@ def test_model_file_is_verified(tmp_path: Path) -> None:
         steps = 10
         """
     )
-    result = CliRunner().invoke(main, ["verify", str(path)])
-    assert result.exit_code == 0, result.output
-    assert "all measured properties are satisfied" in result.output
+    assert "all measured properties are satisfied" in output_of("verify", path)
     assert json.loads((tmp_path / "oscillators.certificate.json").read_text())["passed"]
 
 

@@ -9,14 +9,13 @@ import pytest
 from c_edits import TEMPLATE_EDITS
 from certified_cases import CASES
 from checkout import ROOT
-from click.testing import CliRunner
+from commands import invoke
 from faults import Mutation, inside
 from mutations import MUTATIONS
 from sabotage import certified, sabotaged
 from samples import QUICK_FLAGS, pushed_pendulum
 
 import scvi_codegen as sc
-from scvi_codegen.cli import main
 from scvi_codegen.exact.solution import exact_motion
 from scvi_codegen.exact.step import derived_step
 from scvi_codegen.formulas.expressions import evaluate
@@ -245,7 +244,7 @@ def test_the_derived_step_is_that_of_the_closed_form() -> None:
 
 
 def command(*words: str) -> tuple[int, str]:
-    result = CliRunner().invoke(main, ["verify", *words])
+    result = invoke("verify", *words, status=None)
     return result.exit_code, result.output
 
 
