@@ -95,6 +95,7 @@ MOVED = {"terms": " - x1*sin(t)", "forces": {"x2": "cos(t)*y2"}}
 MOVING = {**MOVED, "first": "(1 + w*sin(3*t))**2", "w": 0.2}
 BARS = "m*(2*x1_dot**2 + 2*y1_dot**2 + x1_dot*x2_dot + y1_dot*y2_dot + x2_dot**2 + y2_dot**2)/6"
 WITHOUT_NEWTON = {
+    "magnetic": (1, {"kinetic": BARS, "terms": " + c*(1 + x1**2/3)*(x1*y1_dot - y1*x1_dot)", "c": 1.5}),
     "constant masses": (1, MOVED),
     "moving 1": (1, MOVING),
     "moving": (2, MOVING),
@@ -103,7 +104,6 @@ WITHOUT_NEWTON = {
     "linear force": (1, {"forces": {f"{a}{k}": f"-c*{a}{k}_dot" for k in (1, 2) for a in "xy"}, "c": 0.1}),
     "gyroscopic force": (4, {"forces": {"x2": "c*y2_dot*cos(t)", "y2": "-c*x2_dot*cos(t)"}, "c": 0.1}),
     "drag": (8, {"forces": {"x1": "-c*x1_dot*sqrt(x1_dot**2 + y2**2)", "y2": "x1 - c*y2_dot**3"}, "c": 0.1}),
-    "magnetic": (1, {"kinetic": BARS, "terms": " + c*(1 + x1**2/3)*(x1*y1_dot - y1*x1_dot)", "c": 1.5}),
     "bars": (8, {"kinetic": BARS}),
     "driven": (4, {"kinetic": BARS, "terms": " + c*cos(3*t)*x1_dot + sin(t)*y2_dot", "c": 1.5}),
 }
