@@ -58,11 +58,13 @@ from scvi_codegen.rendering.kernels.simd import Fallback
 from scvi_codegen.rendering.program_source import (
     EMBEDDED,
     Embedded,
+    in_pairs,
     render,
     render_derivatives,
     render_double_double,
     render_embedded,
     render_ensemble,
+    render_ensemble_in_pairs,
     render_points,
     render_thread,
     workspace_size,
@@ -290,7 +292,7 @@ class Sources:
         if fallback not in self._programs:
             with announced(f"deriving the equations of {self.system.name} by {self.method.name}"):
                 program = self._derived(solver=self.solver, fallback=fallback)
-                if self.precision == DOUBLE_DOUBLE and not self._corrected(program):
+                if self.precision == DOUBLE_DOUBLE and not (self._corrected(program) or self._in_pairs(program)):
                     with tables_in_two_words():  # RATTLE is an iteration for the solution of Newton's equations
                         by_newton = self.solver == "auto" and not program.rattle
                         program = self._derived(solver="newton" if by_newton else self.solver)
@@ -341,6 +343,10 @@ class Sources:
             return None
         return point_derivatives_of(self.system, fixed_point)
 
+    def _in_pairs(self, program: Program) -> bool:
+        """Return whether double-double steps are explicit."""
+        return in_pairs(program) and self.g is None and self.system.clock is None
+
     def _check_double_double(self) -> None:
         """Raise :class:`MethodError` if the system or the method has no steps in double-double arithmetic."""
         reason = ""
@@ -350,8 +356,8 @@ class Sources:
             reason = (
                 f"solver={self.solver!r} requires constant diagonal masses and forces of position and time: omit it"
             )
-        elif self.solver == "explicit":
-            reason = "solver='explicit' is not available: omit it"
+        elif self.solver == "explicit" and not self._in_pairs(self.program()):
+            reason = "solver='explicit' requires constant diagonal masses and fixed steps h in physical time: omit it"
         if reason:
             raise MethodError(
                 f"precision='double-double' is not available for '{self.system.name}' by {self.method.name}: {reason}"
@@ -475,6 +481,8 @@ class Sources:
             "thread": lambda: render_thread(self.program(), control_of(self.program(), self.controller, self.system)),
         }
         if self.precision == DOUBLE_DOUBLE:  # derivatives are those of the step in double
+            if kind == "ensemble" and self._in_pairs(self.program()):
+                return render_ensemble_in_pairs(self.program())
             return None if kind in OF_ONE_WORD else self._in_double.variant(name)
         return None if self.of_arrays else variants[kind]()
 

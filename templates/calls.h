@@ -62,20 +62,6 @@ int NAME(call_integrate)(NAME(call) *c, long long steps, long long every)
   return 0;
 }
 
-#ifdef HAS_H_LOW
-/* Lets the next step end at a time, unless that is NaN: its size has two words. */
-static void NAME(call_step_to)(NAME(run) * run, double end)
-{
-  const double left = end - run->t, part = left - end, rest = (end - (left - part)) - (run->t + part);
-  const double h = left - run->t_low, moved = h - left, low = ((left - (h - moved)) - (run->t_low + moved)) + rest;
-  if (end == end) {
-    run->h = h + low;
-    run->h_low = low - (run->h - h);
-  } else
-    run->h_low = 0.0;
-}
-#endif
-
 /* Advances the present trajectory by at most `steps` steps; returns 1 at its end. */
 static int NAME(call_one)(NAME(each) *c, const double *parameters, long long steps, long long *taken)
 {
@@ -135,7 +121,7 @@ static int NAME(call_one)(NAME(each) *c, const double *parameters, long long ste
       c->run->guess = 0;
     }
 #ifdef HAS_H_LOW
-    NAME(call_step_to)(c->run, c->segment_end[c->segment]);
+    set_step_to(c->segment_end[c->segment], c->run->t, c->run->t_low, &c->run->h, &c->run->h_low);
 #endif
     c->entered = c->pauses;
   }
@@ -161,7 +147,7 @@ long long NAME(call_each)(NAME(each) *c, long long steps)
       c->left = c->t_end ? 0 : c->segment_steps[0];
 #ifdef HAS_H_LOW
       if (!c->t_end)
-        NAME(call_step_to)(c->run, c->segment_end[0]);
+        set_step_to(c->segment_end[0], c->run->t, c->run->t_low, &c->run->h, &c->run->h_low);
 #endif
       if ((c->entered = c->pauses))
         break;

@@ -35,7 +35,10 @@ from scvi_codegen.rendering.source import DOUBLE_DOUBLE, PRECISIONS
 from scvi_codegen.representation import summary
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.core.validation import Array, States, flat_state
+from scvi_codegen.runtime.core.words import split
 from scvi_codegen.runtime.ensemble.initial_states import EnsembleParameters, momenta_of_each, start_of_ensemble
+from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
+from scvi_codegen.runtime.rotations.states import homogeneous_state
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.validation import checks_arguments
@@ -297,11 +300,9 @@ class _Trials:
 
     def __init__(self, stepper: Stepper, q: States, state: Mapping[str, Any], quantile: float) -> None:
         self.stepper, self.quantile, self.state = stepper, quantile, {**state, "velocity": None}
-        flat = q if stepper.interface.rotations else flat_state(stepper.interface, q, "q")
-        self.together = not isinstance(flat, Mapping) and np.ndim(flat) == 2
-        p, velocity, t, parameters = (state[name] for name in ("p", "velocity", "t", "parameters"))
-        if self.together and stepper.interface.words > 1:
-            raise MethodError("advise with precision='double-double' requires a single state: give the hardest one")
+        interface, t, parameters = stepper.interface, state["t"], state["parameters"]
+        q, p, velocity = homogeneous_state(interface, q, state["p"], state["velocity"])
+        self.together = np.ndim(flat_state(interface, split(q, "q")[0] if interface.precision else q, "q")) == 2
         if self.together:
             momenta = momenta_of_each(stepper, q, p, velocity, t, parameters)
             self.q, self.p, self.state["parameters"] = start_of_ensemble(stepper, q, momenta, t, parameters)
@@ -314,7 +315,8 @@ class _Trials:
         """Return the positions of trajectory j, and the other arguments of its run."""
         if not self.together:
             return self.q, self.state
-        parameters = self.stepper.parameters_by_name(self.state["parameters"][j])
+        values = self.state["parameters"][j]
+        parameters = values if self.stepper.interface.precision else self.stepper.parameters_by_name(values)
         return self.q[j], {**self.state, "p": self.p[j], "parameters": parameters}
 
     def integrate(self, q: Array, *, h: float, steps: int, save_every: int) -> Any:
@@ -334,14 +336,32 @@ class _Trials:
             raise StepFailedError(message, status=status, step=step, t=float(runs.ends[0][failed[0]]), residual=0.0)
         q_of_one, state = self.one(int(np.argmax(runs.ok)))
         alone = self.stepper.integrate(q_of_one, **state, h=h, steps=counted, save_every=counted)
-        return _Together(runs.q, alone.iterations.sum() * (steps / counted))
+        return _Together(runs, alone.iterations.sum() * (steps / counted))
 
 
 class _Together(NamedTuple):
-    """Saved (n, k, m) positions of an ensemble, and the number of iterations of one trajectory."""
+    """Saved states of an ensemble, and the number of iterations of one trajectory."""
 
-    q: Array
+    runs: EnsembleTrajectory
     iterations: Array
+
+    @property
+    def t(self) -> Array:
+        """(n,) times of the saved states."""
+        return self.runs.t
+
+    @property
+    def q(self) -> Array:
+        """(n, k, m) saved positions."""
+        return self.runs.q
+
+    @property
+    def velocity(self) -> Array:
+        """(n, k, m) velocities; NaN of trajectories that failed."""
+        velocity = np.full(self.q.shape, np.nan)
+        for j in np.flatnonzero(self.runs.ok).tolist():
+            velocity[:, j] = self.runs[j].velocity
+        return velocity
 
 
 def _steppers(

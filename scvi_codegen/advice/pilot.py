@@ -25,9 +25,8 @@ from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.methods import Method
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.core.words import low_words, with_low
-from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
-Integrate = Callable[..., Trajectory]
+Integrate = Callable[..., Any]
 
 EPSILON = 2.0**-52
 """Rounding error of doubles; that of numbers of two words is its square."""
@@ -317,16 +316,16 @@ class Pilot:
         return errors
 
 
-def _at_equal_times(trajectory: Trajectory, length: float) -> Array:
+def _at_equal_times(trajectory: Any, length: float) -> Array:
     """Return positions of two words at multiples of ``length / n``, from which times differ, as h is a double.
 
     The differences are roundings of doubles, so that their square is below two words.
     """
-    t, n = trajectory.t, len(trajectory) - 1
+    t, n, velocity = trajectory.t, len(trajectory.t) - 1, np.asarray(trajectory.velocity)
     words = zip(np.asarray(t).tolist(), low_words(t).tolist(), strict=True)
     exact = (Fraction(high) + Fraction(low) - Fraction(float(t[0])) for high, low in words)
     late = np.array([float(each - k * Fraction(length) / n) for k, each in enumerate(exact)])
-    moved = late[:, np.newaxis] * np.asarray(trajectory.velocity)
+    moved = late.reshape(-1, *[1] * (velocity.ndim - 1)) * velocity
     result: Array = with_low(np.asarray(trajectory.q), low_words(trajectory.q) - moved)
     return result
 

@@ -200,6 +200,8 @@ def render_double_double(
         MethodError: for a function that has no double-double form.
     """
     fixed_point = program.fixed_point
+    if in_pairs(program):
+        return _render_explicit(program)
     if fixed_point is None:
         return _render_mixed_newton(program, control)
     assert derivatives is not None  # by the caller
@@ -219,6 +221,7 @@ def render_double_double(
             "derivatives": derivatives.count,
             "of_numbers": numbers,
             "of_vectors": vectors,
+            "meaning": POINTS,
             "functions": uses_functions((*numbers, *vectors)),
         },
         "own_headers": {**arithmetic_headers(), **cast("Mapping[str, str]", context["own_headers"])},
@@ -234,6 +237,49 @@ def _lowest_words(table: IterationTable) -> IterationTable:
 
     numbers: Any = tuple(tuple(map(lowest, x)) if isinstance(x, tuple) else lowest(x) for x in table.numbers)
     return replace(table, name=f"{table.name}_LOWEST", numbers=numbers, in_two_parts=False)
+
+
+def in_pairs(program: Program) -> bool:
+    """Return whether double-double steps are explicit: kicks by forces of position and time, drifts by masses."""
+    return program.splitting is not None and program.splitting.by_masses
+
+
+def _render_explicit(program: Program) -> Source:
+    """Return the source of explicit steps in pairs."""
+    quantities, split = program.quantities, program.splitting
+    assert split is not None  # by the caller
+    states = quantities.energy, *((quantities.momentum_kernel,) if quantities.momentum_kernel else ())
+    kernels = split.drift, split.force, *states
+    context = _context(program, DOUBLE, None)
+    words = {"derivatives": 0, "of_numbers": kernels, "of_vectors": (), "functions": uses_functions(kernels)}
+    memory = 4 * program.dimension + 1  # inverse masses, last force
+    sizes = {"memory": memory, "workspace": workspace_size(program) + memory - program.memory}
+    return _render(program.prefix, context | sizes | {"two_words": words, "own_headers": arithmetic_headers()})
+
+
+def render_ensemble_in_pairs(program: Program) -> Source:
+    """Return the source of explicit steps in pairs of many trajectories, which are lanes."""
+    split = program.splitting
+    assert split is not None  # by the caller
+    kernels = split.drift, split.force
+    context = {
+        "program": program,
+        "points": 2,  # of the stored force: its words
+        "observed": 0,
+        "counts": False,
+        "tangents": 0,
+        "cut": is_divided(kernels),
+        "needs_velocities": False,
+        "fixed_point": None,
+        "two_words": {
+            "of_numbers": (),
+            "of_vectors": kernels,
+            "meaning": TRAJECTORIES,
+            "functions": uses_functions(kernels),
+        },
+        "own_headers": arithmetic_headers(),
+    }
+    return _render(f"{program.prefix}_ensemble", context, "ensemble")
 
 
 def _render_mixed_newton(program: Program, control: Control | None) -> Source:

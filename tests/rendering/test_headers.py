@@ -84,7 +84,8 @@ def sources() -> tuple[Source, ...]:
     made.append(with_casadi_flow(kepler.variant("second_derivatives"), 10, 5, second=True))
     made.append(with_flow_of_rows(kepler.variant("derivatives")))
     pendulum = problem("planar-pendulum").system
-    made.append(Sources(pendulum, SVI(2), precision="double-double").integrator()[0])
+    for method in (SVI(2), StoermerVerlet()):
+        made.append(Sources(pendulum, method, precision="double-double").integrator()[0])
     rod = LagrangianSystem.from_text("rod", ["x", "y"], "x_dot**2 + y_dot**2", constraints=["x**2 + y**2 - 1"])
     made.append(Sources(rod, SVI(1, "gauss-lobatto:2"), precision="double-double").integrator()[0])
     return (*made, *oscillator.sources)

@@ -131,7 +131,8 @@ class Ensemble:
             parameters = parameters_at(stepper.parameters, values, self.inputs, inside)
         p = momenta_of_each(stepper, q, p, velocity, t, parameters)
         self.t0, self.save_every = checked_number(t, "the time t"), checked_count(save_every, "save_every", least=1)
-        settings: dict[str, Any] = {"inputs": self.inputs, "save_every": self.save_every}
+        words = interface.words
+        settings: dict[str, Any] = {"inputs": self.inputs, "save_every": self.save_every, "words": words}
         fixed = None if h is None else CommonSteps(self.t0, h, steps=steps, t_end=cast(Any, t_end), **settings)
         *start, self.parameters = start_of_ensemble(stepper, q, p, self.t0, parameters)
         self.start = start[0], start[1]
@@ -146,8 +147,9 @@ class Ensemble:
         self.error, self.confirmations = error, list[GlobalError | None]()
         self.t_eval: Array | None = None
         self.ends = np.empty(0)
-        self.singly = stepper.changes_states or interface.words > 1  # events change the states of each within steps
-        self.fixed = fixed if interface.words > 1 else None
+        # of two words explicit steps alone are lanes; events change the states of each within steps
+        self.singly = stepper.changes_states or (words > 1 and (bool(self.inputs) or stepper.ensemble is None))
+        self.fixed = fixed if words > 1 else None
         if fixed is None or self.singly:
             self.plans = self._plans(fixed, cast(ArrayLike, t_end), tolerance)
             self.confirmations = [None] * (0 if error is None else len(self))
@@ -379,7 +381,7 @@ class Ensemble:
         common, fixed = self.common, self.common.steps
         q, p = common.states()
         spans: tuple[Span, ...] = ()
-        if fixed.t_end is not None:
+        if fixed.t_end is not None and self.fixed is None:
             spans = tuple((rows, slice(None), partial(self.values_at, each.middle)) for rows, each in fixed.spans())
         return EnsembleTrajectory(
             t=fixed.times(tau=common.times is not None),

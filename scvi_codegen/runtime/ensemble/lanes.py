@@ -19,6 +19,7 @@ from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array
+from scvi_codegen.runtime.core.words import from_block
 from scvi_codegen.runtime.ensemble.batches import (
     CHUNK_SECONDS,
     FIRST_CHUNK_STEPS,
@@ -51,6 +52,7 @@ class CommonRuns:
         steps: the steps.
         observation: functions of the state that are observed along the runs, or ``None``.
         q, p: (n, k, m) saved states; NaN where not reached.
+        blocks: their memory, which has both words of numbers of two.
         times: (n, k) times in transformed time, else ``None``.
         actions: (n, k) actions up to each state if runs sum them, NaN where unknown, else ``None``.
         status, done: reason of the end and number of completed steps of each trajectory.
@@ -66,8 +68,10 @@ class CommonRuns:
     observation: EnsembleObservation | None = None
 
     def __post_init__(self) -> None:
-        shape = (len(self.steps.numbers), *self.start[0].shape)
-        self.q, self.p = empty_array(shape), empty_array(shape)
+        shape, words = (len(self.steps.numbers), *self.start[0].shape), self.stepper.interface.words
+        self.blocks = [empty_array((*shape[:2], words * shape[2])) for _ in "qp"]
+        states: list[Array] = self.blocks if words == 1 else [*map(from_block, self.blocks)]
+        self.q, self.p = states
         self.q[:] = self.p[:] = np.nan
         self.q[0], self.p[0] = self.start
         self.actions = np.full(shape[:2], np.nan) if self.stepper.sums_action else None
@@ -158,7 +162,9 @@ class LaneCall(Call):
         self.memory = struct.block = binding.new("block *")
         self.active = np.frombuffer(binding.buffer(self.memory.active), dtype=np.float64)
         self.active[:] = 1.0
-        struct.positions, struct.momenta = map(binding.pointer, self.common.states())
+        struct.positions, struct.momenta = map(binding.pointer, self.common.blocks)
+        if self.common.stepper.interface.words > 1:
+            struct.segment_end = binding.pointer(cast(FixedSegments, work.steps).end)
         if self.common.actions is not None:
             struct.actions = binding.pointer(self.common.actions)
         if self.common.observation is not None:

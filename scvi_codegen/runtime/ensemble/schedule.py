@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.native.arguments import checked_step, empty_array
 from scvi_codegen.runtime.core.validation import Array
+from scvi_codegen.runtime.core.words import with_low
 from scvi_codegen.runtime.inputs.segments import Input, Segment, planned_segments, time_after_steps
 from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.validation import checked_count
@@ -46,6 +47,7 @@ class CommonSteps:
         steps, t_end: number of steps, or final time, with a shorter step before each breakpoint and at the end.
         inputs: validated inputs, with ``t_end``.
         save_every: steps between saved states.
+        words: of numbers of states; of two, the last step ends at ``t_end`` to both words.
 
     Attributes:
         segments: segments of equal steps.
@@ -63,6 +65,7 @@ class CommonSteps:
         t_end: float | None,
         inputs: Mapping[str, Input],
         save_every: int,
+        words: int = 1,
     ) -> None:
         self.t0, self.h, self.t_end, self.save_every = t0, checked_step(h), t_end, save_every
         self.has_inputs = bool(inputs)
@@ -70,11 +73,16 @@ class CommonSteps:
         self.segments = [Segment(count, self.h, (t0, 0.0), t0)]
         if t_end is not None:
             self.segments = planned_segments(t0, t_end, self.h, inputs) or self.segments
-        self.ends = list(accumulate(segment.steps for segment in self.segments))
-        self.steps = self.ends[-1]
+        saved = list(accumulate(segment.steps for segment in self.segments))
+        self.steps = saved[-1]
         empty_array((self.steps // save_every + 1,))  # rejects numbers of states beyond any memory
         multiples = np.arange(0, self.steps + 1, save_every)
-        self.numbers = multiples if t_end is None else np.union1d(multiples, self.ends)
+        self.numbers = multiples if t_end is None else np.union1d(multiples, saved)
+        last = self.segments[-1]
+        if words > 1 and t_end is not None and last.end is None and last.steps > 0:  # h is a double: ends at t_end
+            start = time_after_steps(last.start, last.h, last.steps - 1)
+            self.segments[-1:] = last._replace(steps=last.steps - 1), Segment(1, last.h, start, last.middle, t_end)
+        self.words, self.ends = words, list(accumulate(segment.steps for segment in self.segments))
 
     def row(self, step: int) -> int:
         """Return the index of the first saved state after ``step`` steps."""
@@ -86,7 +94,7 @@ class CommonSteps:
         while step < end:
             k = bisect_right(self.ends, step)
             last, entering = self.ends[k], self.t_end is not None and step == self._first(k)
-            odd = self.t_end is not None and last % self.save_every != 0
+            odd = last % self.save_every != 0 and self.numbers[self.row(last) - 1] == last
             until = min(end, last - 1 if odd and step < last - 1 else last)
             save_every = last if odd and until == last else self.save_every
             yield StepChunk(until - step, save_every, self.segments[k] if entering else None)
@@ -113,13 +121,16 @@ class CommonSteps:
         return self.ends[k] - self.segments[k].steps
 
     def times(self, *, tau: bool) -> Array:
-        """Return the (n,) times of the saved states; tau from 0 in transformed time."""
-        times = np.empty(len(self.numbers))
+        """Return the (n,) times of the saved states, of one or two words; tau from 0 in transformed time."""
+        times, lows = np.empty((2, len(self.numbers)))
         for k, (rows, segment) in enumerate(self.spans()):
             start, low = (0.0, 0.0) if tau else segment.start
             high, rest = times_after(start, segment.h, self.numbers[rows] - self._first(k))
             times[rows] = high + (rest + low)
-        return times
+            lows[rows] = (high - times[rows]) + (rest + low)
+            if self.words > 1 and segment.end is not None:
+                times[rows.stop - 1], lows[rows.stop - 1] = segment.end, 0.0
+        return times if self.words == 1 else with_low(times, lows)
 
     def spans(self) -> Iterator[tuple[slice, Segment]]:
         """Yield the saved states of each segment; a breakpoint belongs to the earlier one."""

@@ -159,6 +159,9 @@ typedef struct {
 /* Arguments of a step. */
 typedef struct {
   double t, h;
+#ifdef DOUBLE_DOUBLE
+  double t_low, h_low;
+#endif
   const lanes *q0, *p0, *carry_q, *carry_p, *parameters;
 } step_data;
 

@@ -6,6 +6,12 @@
 #error "compile for SSE2 (-mfpmath=sse -msse2): x87 registers round twice"
 #endif
 
+#if defined(__GNUC__) && !defined(__clang__) && !defined(LANES)
+/* A product that is vectorised and computed in numbers, too, may be rounded for its rounding error, and contracted to
+ * an FMA where it is added, which adds the error again (gcc 12 with -ffp-contract=fast). */
+#pragma GCC optimize("fp-contract=off")
+#endif
+
 #define TO_INTEGER 6755399441055744.0 /* 1.5 2^52: adding and subtracting it rounds to a whole number */
 
 static inline double dd_root(double x)

@@ -4,6 +4,14 @@
  * prepare_iteration and fixed_point of a solver, which compute the increments of a step; EXPLICIT_STEPS if it does not
  * iterate. */
 
+#ifdef DOUBLE_DOUBLE
+#define WORDS 2 /* of a number of a state, high words of a vector before low words */
+#define LOW_WORD(of, name) (of)->name##_low
+#else
+#define WORDS 1
+#define LOW_WORD(of, name) 0.0
+#endif
+
 /* The part of the state that a step changes, in local memory during a call. */
 typedef struct {
   lanes q[M], p[M], carry_q[M], carry_p[M];
@@ -44,7 +52,7 @@ static void drop_infinite(const state *now, const lanes *dq, const lanes *dp, do
 
 enum { SAVED = 5 * TANGENTS }; /* numbers that are saved of a trajectory after a step */
 #else
-enum { SAVED = M };
+enum { SAVED = WORDS * M };
 #endif
 #ifdef SCVI_DEVICE
 #include "thread_run.h"
@@ -84,9 +92,16 @@ static void store_states(const state *now, int count, double *q, double *p)
   for (int i = 0; i < M; i++) {
     const lane_view position = {now->q[i]}, momentum = {now->p[i]};
     for (int j = 0; j < count; j++) {
-      q[j * M + i] = position.lane[j];
-      p[j * M + i] = momentum.lane[j];
+      q[j * WORDS * M + i] = position.lane[j];
+      p[j * WORDS * M + i] = momentum.lane[j];
     }
+#ifdef DOUBLE_DOUBLE
+    const lane_view low_position = {now->carry_q[i]}, low_momentum = {now->carry_p[i]};
+    for (int j = 0; j < count; j++) {
+      q[(j * WORDS + 1) * M + i] = low_position.lane[j];
+      p[(j * WORDS + 1) * M + i] = low_momentum.lane[j];
+    }
+#endif
   }
 }
 
@@ -193,6 +208,9 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
     const long long parity = block->step % 2;
     const history past = {memory[1 - parity], memory[parity]};
     step.t = block->t;
+#ifdef DOUBLE_DOUBLE
+    step.t_low = block->t_low, step.h_low = block->h_low;
+#endif
 #ifdef EXPLICIT_STEPS
     fixed_point(&step, &data, past, &block->guess, dq, dp, options ? options : &standard, &report);
 #else
@@ -210,7 +228,7 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
     add_increments(now.q, now.carry_q, dq, block->active);
     add_increments(now.p, now.carry_p, dp, block->active);
     block->step++;
-    add_compensated(&block->t, &block->t_low, block->h, 0.0);
+    add_compensated(&block->t, &block->t_low, block->h, LOW_WORD(block, h));
     for (int j = 0; j < count; j++)
       if (block->active[j] > 0.0)
         block->last_step[j] = block->step;
@@ -270,11 +288,18 @@ static void begin_block(NAME(each) * c, int count)
 {
   block_memory *block = c->block;
   NAME(start)(block, c->t, c->segment_h[0]);
+#ifdef DOUBLE_DOUBLE
+  set_step_to(c->segment_end[0], block->t, block->t_low, &block->h, &block->h_low);
+#endif
   for (int j = 0; j < LANES; j++) {
     const long long from = c->next + (j < count ? j : count - 1);
     for (int i = 0; i < M; i++) {
-      block->q[i][j] = c->q[from * M + i];
-      block->p[i][j] = c->p[from * M + i];
+      block->q[i][j] = c->q[from * WORDS * M + i];
+      block->p[i][j] = c->p[from * WORDS * M + i];
+#ifdef DOUBLE_DOUBLE
+      block->carry_q[i][j] = c->q[(from * WORDS + 1) * M + i];
+      block->carry_p[i][j] = c->p[(from * WORDS + 1) * M + i];
+#endif
     }
     block->active[j] = j < count;
   }
@@ -318,6 +343,9 @@ long long NAME(call_each)(NAME(each) * c, long long steps)
       c->left = c->segment_steps[c->segment];
       block->guess = c->segment_h[c->segment] == block->h ? block->guess : 0;
       block->h = c->segment_h[c->segment];
+#ifdef DOUBLE_DOUBLE
+      set_step_to(c->segment_end[c->segment], block->t, block->t_low, &block->h, &block->h_low);
+#endif
       c->entered = c->pauses;
     }
     int going = 0;
