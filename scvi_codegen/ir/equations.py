@@ -97,55 +97,47 @@ class LoweredStageGroup:
         return self.points * (self.derivative.arguments + len(self.derivative.results))
 
 
+@dataclass(frozen=True, slots=True)
+class IterationTable:
+    """A table by its name in C: one number per point, or rows of them; double-double if necessary."""
+
+    name: str
+    numbers: tuple[Number, ...] | NumberTable
+    in_two_parts: bool = False
+
+    @property
+    def is_matrix(self) -> bool:
+        """True if it has rows."""
+        return isinstance(self.numbers[0], tuple)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rattle:
-    """Tables of constrained steps on s + 1 Lobatto points for a constant mass matrix; RATTLE for s = 1.
+    """Constrained steps on s + 1 Lobatto points, by an iteration for the multipliers alone; RATTLE for s = 1.
 
     Attributes:
-        force: L_q + f at u = q, or at u = (q, v) if forces f depend on velocities.
+        part: its header.
+        kernels: of forces and momenta.
+        macros: of the header.
         inverse_masses: (i, j) of the lower half of M^-1, the diagonal first; mass_columns: a number of each coordinate,
-            different for those that masses couple.
-        abscissae: (s + 1,) of the points; weights: (s + 1,), of p1 = p0 + h sum_n w_n F_n.
-        start: (s,), 0 except for rounding, and momentum: (s, s), from forces at the points but the last to velocities,
-            M V_b = (1 + start[b]) p0 + h sum_n momentum[n][b] F_n.
-        drift: (s,), the positions without forces, u_i = q0 + h drift[i] p0 / M: the abscissae but for rounding.
-        response: (s, s), from them to the points but the first, h^2 sum_n response[n][i] F_n / M; inverse: its inverse.
-        velocity_start: (s,) and velocity: (s, s), from forces at the points but the last to velocities at them, M v_n =
-            (1 + velocity_start[n]) p0 + h sum_m velocity[m][n] F_m; last_velocity: (s,), from the velocities V_b to
-            that at the last point; all empty if forces do not depend on velocities.
-        momenta: A at u = q of momenta M v + A(q, t), or ``None``; with it, w = M^-1 (A - A_0) at the points but the
-            first, projection: (s, s), V_b is less sum_n projection[n][b] w_n; shift: (s, s), u_i is less h sum_n
-            shift[n][i] w_n; shift_response: (s, s), of the forces with the same effect; velocity_shift: (s, s), v_m is
-            less sum_n velocity_shift[n][m] w_n.
-        next_positions: (s + 1, s), of the next step, u_i = q0 + h sum_b next_positions[b][i] V_b, extrapolated from the
-            velocities of a step; next_multipliers: (s + 1, s), of the next step, extrapolated.
+            different for those that masses couple; lower_masses: (i, j) of M, if it differs between points.
+        points: s.
+        tables: named and described in the header.
     """
 
-    force: Kernel
-    momenta: Kernel | None
+    part: str
+    kernels: tuple[Kernel, ...]
+    macros: tuple[str, ...]
     inverse_masses: tuple[tuple[int, int], ...]
     mass_columns: tuple[int, ...]
-    abscissae: tuple[Number, ...]
-    weights: tuple[Number, ...]
-    start: tuple[Number, ...]
-    momentum: NumberTable
-    drift: tuple[Number, ...]
-    response: NumberTable
-    inverse: NumberTable
-    velocity_start: tuple[Number, ...]
-    velocity: NumberTable
-    last_velocity: tuple[Number, ...]
-    projection: NumberTable
-    shift: NumberTable
-    shift_response: NumberTable
-    velocity_shift: NumberTable
-    next_positions: NumberTable
-    next_multipliers: NumberTable
+    lower_masses: tuple[tuple[int, int], ...] = ()
+    points: int
+    tables: tuple[IterationTable, ...]
 
     @property
     def lanes(self) -> int:
         """Number of SIMD lanes, s rounded up to a power of two."""
-        return 1 << (len(self.start) - 1).bit_length()
+        return 1 << (self.points - 1).bit_length()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -195,20 +187,6 @@ class StoredValues(Enum):
     FORCES = auto()
     VELOCITIES = auto()
     ACCELERATIONS = auto()
-
-
-@dataclass(frozen=True, slots=True)
-class IterationTable:
-    """A table by its name in C: one number per point, or rows of them; double-double if necessary."""
-
-    name: str
-    numbers: tuple[Number, ...] | NumberTable
-    in_two_parts: bool = False
-
-    @property
-    def is_matrix(self) -> bool:
-        """True if it has rows."""
-        return isinstance(self.numbers[0], tuple)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

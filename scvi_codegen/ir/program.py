@@ -232,7 +232,7 @@ class Program:
         polynomial_curves: whether the leading coefficient of a curve is an error estimate.
         equations, quantities: of named coordinates.
         constraints: their kernels, or ``None``.
-        rattle: tables of RATTLE, which is tried before Newton's method if applicable.
+        rattle: the iteration for the multipliers, which is tried before Newton's method if applicable.
         damping: the rate of a uniform damping, if there is one.
         summed: whether the action is summed also where it is no function of both ends of a step.
         acts_along: whether runs sum the action of their steps.
@@ -291,7 +291,7 @@ class Program:
             ),
             *(quantities.first_order_rates, quantities.inverse_legendre),
             *(integrals.kernel if integrals else None, constraints and constraints.kernel),
-            *(constraints and constraints.motion, self.damping, rattle and rattle.force, rattle and rattle.momenta),
+            *(constraints and constraints.motion, self.damping, *(rattle.kernels if rattle else ())),
         )
         return tuple({kernel.name: kernel for kernel in kernels if kernel}.values())
 
@@ -322,6 +322,12 @@ class Program:
     def constraint_reach(self) -> int:
         """Largest distance of coupled constraints in this order."""
         return max((distance for _, _, _, distance, _ in self.constraint_products), default=0)
+
+    @property
+    def mass_reach(self) -> int:
+        """Largest distance of coordinates that a mass matrix of points couples, in the order of their positions."""
+        order, entries = self.equations.mass_positions, self.rattle.lower_masses if self.rattle else ()
+        return max((abs(order[i] - order[j]) for i, j in entries), default=0)
 
     @property
     def action(self) -> bool:

@@ -28,16 +28,17 @@ S. Reich, SIAM J. Numer. Anal. 33 (1996), on compositions; E. Barth, K. Kuczera,
 Chem. 16 (1995), on the iteration.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator, Mapping
 from functools import partial
+from typing import TypeAlias
 
 from sympy import Symbol
 from sympy.utilities.iterables import connected_components
 
 from scvi_codegen.errors import MethodError
-from scvi_codegen.ir.equations import ConstrainedSteps, Constraints, Rattle
-from scvi_codegen.ir.kernel import NumberTable, RolledKernel, lower_matrix, lower_vector
-from scvi_codegen.lowering.solvers.tables import velocity_tables
+from scvi_codegen.ir.equations import ConstrainedSteps, Constraints, IterationTable, Rattle
+from scvi_codegen.ir.kernel import Kernel, NumberTable, RolledKernel, lower_matrix, lower_vector
+from scvi_codegen.lowering.solvers.tables import VelocityTables, velocity_tables
 from scvi_codegen.lowering.stage_groups import rolled_kernel, system_kernel
 from scvi_codegen.mechanics.arrays.system import (
     ArraySystem,
@@ -58,64 +59,143 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import StageSystem, Velocities
 from scvi_codegen.tables.basis import matrix_product, rounded, transpose
-from scvi_codegen.tables.precision import Vector, mp
+from scvi_codegen.tables.precision import Matrix, Vector, mp
 
 MOST_COUPLED_MASSES = 32
 """Coordinates that masses couple; with more, Newton's method solves for all unknowns."""
 
 
 def rattle_of(system: MechanicalSystem, stages: StageSystem, predictor: NumberTable) -> Rattle | None:
-    """Return the tables of such steps; ``None`` if they are not applicable.
+    """Return the iteration for the multipliers of such steps; ``None`` if it is not applicable.
 
     Args:
         predictor: (2 (s + 1), s + 1) tables to the unknowns of the next step, of velocities and of multipliers.
     """
     forms, tables = forms_of(system), velocity_tables(stages.shape)
-    if any(velocity_conditions(system)) or not forms.has_constant_mass_matrix or tables is None:
+    if any(velocity_conditions(system)) or tables is None or not forms.has_quadratic_energy:
         return None
     groups = coupled_coordinates(forms.lower_mass, system.dimension)
     if max(map(len, groups)) > MOST_COUPLED_MASSES:
         return None
-    position, momentum = tables.position[1:], tuple(line[:-1] for line in tables.momentum)
-    start = tuple(line[0] / tables.end_momentum[0] for line in momentum)
-    response = transpose(matrix_product(position, momentum))
-    velocities = tuple(row[:-1] for row in predictor[: len(position) + 1])
-    at_points = tables.velocity if forms.forces_depend_on_velocities else ()
-    others, u = at_points[:-1], (*system.coordinates, *(system.velocities if at_points else ()))
-    further = any(forms.momentum_at_rest)
-    projection = tuple(row[1:] for row in tables.projection) if further else ()
-    shift = transpose(matrix_product(position, projection)) if further else ()
-    inverse = (mp.matrix(response) ** -1).tolist()
-    purpose = "L_q + f at u = (q, v)." if at_points else "L_q at u = q."
+    points = len(tables.blocks)
+    velocities = tuple(row[:-1] for row in predictor[: points + 1])
+    added = _for_constant_masses if forms.has_constant_mass_matrix else _for_masses_of_points
+    part, kernels, macros, further = added(system, tables, velocities)
     return Rattle(
-        force=system_kernel(system, "constrained_force", forms.force, u=u, purpose=purpose),
-        momenta=system_kernel(
-            system, "constrained_momentum", forms.momentum_at_rest, u=system.coordinates, purpose="L_v at u = q, v = 0."
-        )
-        if further
-        else None,
+        part=part,
+        kernels=kernels,
+        macros=macros,
         inverse_masses=(
             *((i, i) for i in range(system.dimension)),
             *((i, j) for group in groups for i in group for j in group if i > j),
         ),
         mass_columns=tuple(next(g.index(i) for g in groups if i in g) for i in range(system.dimension)),
-        abscissae=lower_vector(tables.abscissae),
-        weights=lower_vector(tables.end_momentum),
-        start=lower_vector(tuple(x - 1 for x in start)),
-        momentum=lower_matrix(transpose(momentum)),
-        drift=lower_vector(tuple(mp.fdot(line, start) for line in position)),
-        response=lower_matrix(response),
-        inverse=lower_matrix(rounded(inverse)),
-        velocity_start=lower_vector(tuple(mp.fdot(line, start) - 1 for line in others)),
-        velocity=lower_matrix(transpose(matrix_product(others, momentum)) if others else ()),
-        last_velocity=lower_vector(at_points[-1] if at_points else ()),
-        projection=lower_matrix(transpose(projection)),
-        shift=lower_matrix(shift),
-        shift_response=lower_matrix(rounded(matrix_product(shift, inverse)) if further else ()),
-        velocity_shift=lower_matrix(transpose(matrix_product(others, projection)) if others and further else ()),
-        next_positions=lower_matrix(matrix_product(velocities, transpose(position))),
-        next_multipliers=tuple(row[:-1] for row in predictor[len(position) + 1 :]),
+        lower_masses=() if forms.has_constant_mass_matrix else tuple(forms.lower_mass),
+        points=points,
+        tables=(
+            IterationTable("RATTLE_ABSCISSA", lower_vector(tables.abscissae)),
+            IterationTable("RATTLE_WEIGHT", lower_vector(tables.end_momentum)),
+            IterationTable("RATTLE_INVERSE", lower_matrix(_inverse(_response(tables)))),
+            IterationTable("RATTLE_MULTIPLIERS", tuple(row[:-1] for row in predictor[points + 1 :])),
+            *further,
+        ),
     )
+
+
+def _response(tables: VelocityTables) -> Matrix:
+    """Return the transpose of R: positions at the points but the first from forces at all but the last, in h^2 / M."""
+    return transpose(matrix_product(tables.position[1:], _impulse(tables)))
+
+
+def _impulse(tables: VelocityTables) -> Matrix:
+    """Return the velocities from forces at all points but the last, whose coefficients are zero."""
+    return tuple(line[:-1] for line in tables.momentum)
+
+
+def _inverse(matrix: Matrix) -> Matrix:
+    return rounded((mp.matrix(matrix) ** -1).tolist())
+
+
+Part: TypeAlias = tuple[str, tuple[Kernel, ...], tuple[str, ...], tuple[IterationTable, ...]]
+"""Header of an iteration, its kernels, macros and tables."""
+
+
+def _for_constant_masses(system: MechanicalSystem, tables: VelocityTables, velocities: NumberTable) -> Part:
+    """Return the iteration on accelerations; ``velocities``: predictor of V."""
+    forms = forms_of(system)
+    position, momentum = tables.position[1:], _impulse(tables)
+    start = tuple(line[0] / tables.end_momentum[0] for line in momentum)
+    response = _response(tables)
+    at_points = tables.velocity if forms.forces_depend_on_velocities else ()
+    others, u = at_points[:-1], (*system.coordinates, *(system.velocities if at_points else ()))
+    purpose = "L_q + f at u = (q, v)." if at_points else "L_q at u = q."
+    kernels = [system_kernel(system, "constrained_force", forms.force, u=u, purpose=purpose)]
+    named: dict[str, Matrix] = {"MOMENTUM": transpose(momentum), "RESPONSE": response}
+    vectors = {"START": tuple(x - 1 for x in start), "DRIFT": tuple(mp.fdot(line, start) for line in position)}
+    if at_points:
+        vectors["VELOCITY_START"] = tuple(mp.fdot(line, start) - 1 for line in others)
+        vectors["LAST_VELOCITY"] = at_points[-1]
+        named["VELOCITY"] = transpose(matrix_product(others, momentum))
+    if any(forms.momentum_at_rest):
+        projection = tuple(row[1:] for row in tables.projection)
+        named["PROJECTION"] = transpose(projection)
+        named["SHIFT"] = transpose(matrix_product(position, projection))
+        named["SHIFT_RESPONSE"] = rounded(matrix_product(named["SHIFT"], _inverse(response)))
+        if at_points:
+            named["VELOCITY_SHIFT"] = transpose(matrix_product(others, projection))
+        kernels.append(
+            system_kernel(
+                system,
+                "constrained_momentum",
+                forms.momentum_at_rest,
+                u=system.coordinates,
+                purpose="L_v at u = q, v = 0.",
+            )
+        )
+    macros = (*(("MOMENTUM_TERMS",) if len(kernels) > 1 else ()), *(("VELOCITY_FORCES",) if at_points else ()))
+    two_words = ("MOMENTUM", "DRIFT", "RESPONSE", "SHIFT", "VELOCITY")
+    named["POSITIONS"] = matrix_product(velocities, transpose(position))
+    return "rattle", tuple(kernels), macros, tuple(_tables(vectors, named, two_words))
+
+
+def _for_masses_of_points(system: MechanicalSystem, tables: VelocityTables, velocities: NumberTable) -> Part:
+    """Return the iteration on velocities at the points but the last; ``velocities``: predictor of V."""
+    forms = forms_of(system)
+    position, others = tables.position[1:], tables.velocity[:-1]
+    unknowns = _inverse(others)
+    mean = transpose(matrix_product(others, tables.projection))
+    point = system_kernel(
+        system,
+        "constrained_point",
+        (*forms.force, *forms.momentum),
+        u=(*system.coordinates, *system.velocities),
+        partials=forms.lower_mass.values(),
+        purpose="L_q + f and L_v, and the lower half of L_vv, at u = (q, v).",
+    )
+    named = {
+        "DISPLACEMENT": transpose(matrix_product(position, unknowns)),
+        "IMPULSE": transpose(matrix_product(others, _impulse(tables))),
+        "MEAN": mean[:-1],
+        "UNKNOWNS": transpose(unknowns),
+        "VELOCITIES": matrix_product(velocities, transpose(others)),
+    }
+    vectors = {"MEAN_OF_LAST": mean[-1], "LAST_VELOCITY": matrix_product(tables.velocity[-1:], unknowns)[0]}
+    two_words = ("DISPLACEMENT", "IMPULSE", "MEAN", "MEAN_OF_LAST")
+    return (
+        "coupled_rattle",
+        (point,),
+        ("MASSES_OF_POINTS", "VELOCITY_FORCES"),
+        tuple(_tables(vectors, named, two_words)),
+    )
+
+
+def _tables(
+    vectors: Mapping[str, Vector], matrices: Mapping[str, Matrix], two_words: Container[str]
+) -> Iterator[IterationTable]:
+    for name, vector in vectors.items():
+        yield IterationTable(f"RATTLE_{name}", lower_vector(vector), name in two_words)
+    for name, matrix in matrices.items():
+        yield IterationTable(f"RATTLE_{name}", lower_matrix(matrix), name in two_words)
 
 
 def coupled_coordinates(entries: Iterable[tuple[int, int]], count: int) -> list[tuple[int, ...]]:

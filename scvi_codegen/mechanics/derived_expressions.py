@@ -267,6 +267,14 @@ class Forms:
         return all(entry.free_symbols <= constant for entry in self.mass.values())
 
     @cached_property
+    def has_quadratic_energy(self) -> bool:
+        """True if L = v^T M(q, t) v / 2 + A(q, t) v - V(q, t), judged by the structure of its derivatives."""
+        if self.system.auxiliaries or self.inverse_mass:
+            return False
+        velocities = set(self.system.velocities)
+        return not any(entry.free_symbols & velocities for entry in self.mass.values())
+
+    @cached_property
     def momentum_at_rest(self) -> tuple[Expr, ...]:
         """L_v at v = 0, m expressions: the A(q, t) of terms A v of L."""
         at_rest = dict.fromkeys(self.system.velocities, sympy.S.Zero)

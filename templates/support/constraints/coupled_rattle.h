@@ -1,0 +1,332 @@
+#include "point_lanes.h"
+
+/* Constrained steps on Lobatto points for mass matrices M(q, t) that depend on positions, and for uniform damping, whose
+ * factors e^(gamma c_n h) multiply the values at point n. Unknowns are the velocities v and multipliers lambda at all
+ * points but the last. With the momenta p = L_v at all points, positions and residuals are
+ *
+ *   u = q0 + h D v,    r = p0 + h I (F + G^T lambda) - m p,
+ *
+ * D = RATTLE_DISPLACEMENT, I = RATTLE_IMPULSE, m = RATTLE_MEAN, F = L_q + f. With y = M^-1 r and P = G M^-1 G^T, whose
+ * matrices M and G are those of each point, an iteration subtracts x from lambda,
+ *
+ *   P x = (D I)^-1 (g + h G D y) / h^2,    v += y - h M^-1 I G^T x,
+ *
+ * which neglects that M and G vary between the points and that F varies, errors of order h. Unconstrained systems have
+ * the same iteration without multipliers (coupled_iteration.h).
+ *
+ * Requires: point_lanes.h with what it requires, MASSES_OF_POINTS, the kernel constrained_point of L_q + f and L_v, with
+ * the lower half of M, LOWER_MASS_ENTRY; MASS_REACH of M in the order MASS_POSITION; if DAMPED, damping.h; the tables
+ * RATTLE_ABSCISSA, RATTLE_WEIGHT; RATTLE_DISPLACEMENT, RATTLE_IMPULSE, RATTLE_MEAN and, of the last point,
+ * RATTLE_MEAN_OF_LAST with their low words; RATTLE_INVERSE of D I; RATTLE_LAST_VELOCITY, from v to the velocity at the
+ * last point, RATTLE_UNKNOWNS, to the unknowns of the step, and from these RATTLE_VELOCITIES and RATTLE_MULTIPLIERS of
+ * the next one, padded with zeros. */
+
+/* Constants of a step size: the factors of the points, e^(-gamma h), and e^(-gamma h) - 1. */
+typedef struct {
+  real grown[POINT_LANES + 1], shrunk, loss;
+} rattle_data;
+
+static void prepare_rattle(const step_data *step, rattle_data *data)
+{
+#ifdef DAMPED
+  const real growth = growth_of(step);
+  for (int n = 0; n <= POINT_LANES; n++)
+    data->grown[n] = MATH(exp)(growth * RATTLE_ABSCISSA[n]);
+  data->shrunk = MATH(exp)(-growth);
+  data->loss = MATH(expm1)(-growth);
+#else
+  (void)step, (void)data;
+#endif
+}
+
+#ifdef DAMPED
+#define GROWN(now, g) load((now)->run->grown, g)
+#else
+#define GROWN(now, g) 1
+#endif
+
+/* Positions u, derivatives G and g at all points but the first, where G is first_derivative; positions `at`, velocities,
+ * forces, momenta, masses and multipliers at all but the last, where force and momentum are last_force and last_p. With
+ * f, y and c the right-hand sides of an iteration; base and base_p, q0 and p0 with the effect of low words. */
+typedef struct {
+  const rattle_data *run;
+  real u[M][GROUP_LANES], at[M][GROUP_LANES], v[M][GROUP_LANES], force[M][GROUP_LANES], p[M][GROUP_LANES];
+  real mass[LOWER_MASSES][GROUP_LANES], g[CONSTRAINTS][GROUP_LANES], derivative[CONSTRAINT_ENTRIES][GROUP_LANES];
+  real first_derivative[CONSTRAINT_ENTRIES], last_force[M], last_p[M];
+  real f[M][GROUP_LANES], y[M][GROUP_LANES], c[CONSTRAINTS][GROUP_LANES];
+  lanes base[M][GROUPS], base_p[M][GROUPS], lambda[CONSTRAINTS][GROUPS];
+  inverse_masses inverse_mass[GROUPS], end_mass;
+  real end_inverse[INVERSE_MASSES], end_rest[M]; /* M^-1 and L_v at v = 0 at the end */
+} rattle_step;
+
+/* Inverts the masses of a group of points; not finite if they are singular. Coordinates that no masses couple share a
+ * solution. */
+static inline void invert_masses(const lanes *mass, inverse_masses inverse)
+{
+  lanes l[M * (MASS_REACH + 1)] = {{0}}, x[M];
+  for (int e = 0; e < LOWER_MASSES; e++) {
+    const int i = MASS_POSITION[LOWER_MASS_ENTRY[e][0]], j = MASS_POSITION[LOWER_MASS_ENTRY[e][1]];
+    l[(i > j ? i : j) * (MASS_REACH + 1) + (i > j ? i - j : j - i)] = mass[e];
+  }
+  factorise_band(l, M, MASS_REACH);
+  for (int column = 0; column < MASS_COLUMNS; column++) {
+    for (int i = 0; i < M; i++)
+      x[MASS_POSITION[i]] = lanes_of(MASS_COLUMN[i] == column);
+    solve_band(l, M, MASS_REACH, x);
+    for (int e = 0; e < INVERSE_MASSES; e++)
+      if (MASS_COLUMN[INVERSE_MASS_ENTRY[e][1]] == column)
+        inverse[e] = x[MASS_POSITION[INVERSE_MASS_ENTRY[e][0]]];
+  }
+}
+
+/* Evaluates the last point. */
+static inline void evaluate_last(const step_data *step, rattle_step *now)
+{
+  real u[2 * M] = {0}, value[2 * M], mass[LOWER_MASSES];
+  for (int i = 0; i < M; i++) {
+    u[i] = now->u[i][DEGREE - 1];
+    for (int n = 0; n < DEGREE; n++)
+      u[M + i] += RATTLE_LAST_VELOCITY[n] * now->v[i][n];
+  }
+  constrained_point(u, step->t + RATTLE_ABSCISSA[DEGREE] * step->h, step->parameters, value, mass);
+  for (int i = 0; i < M; i++) {
+    now->last_force[i] = value[i];
+    now->last_p[i] = value[M + i];
+#ifdef DAMPED
+    now->last_force[i] *= now->run->grown[DEGREE];
+    now->last_p[i] *= now->run->grown[DEGREE];
+#endif
+  }
+}
+
+/* Evaluates forces, momenta, masses, constraints and their derivatives. */
+static __attribute__((flatten)) void evaluate_points(const step_data *step, rattle_step *restrict now)
+{
+  for (int i = 0; i < M; i++)
+    for (int g = 0; g < GROUPS; g++)
+      store(now->at[i], g, former(now->u[i], step->q0[i], g));
+  for (int n = 0; n < GROUP_LANES; n++) {
+    real u[2 * M], value[2 * M], mass[LOWER_MASSES];
+    for (int i = 0; i < M; i++) {
+      u[i] = now->at[i][n];
+      u[M + i] = now->v[i][n];
+    }
+    constrained_point(u, step->t + RATTLE_ABSCISSA[n] * step->h, step->parameters, value, mass);
+    for (int i = 0; i < M; i++) {
+      now->force[i][n] = value[i];
+      now->p[i][n] = value[M + i];
+    }
+    for (int e = 0; e < LOWER_MASSES; e++)
+      now->mass[e][n] = mass[e];
+  }
+  for (int n = 0; n < GROUP_LANES; n++) {
+    real u[M], g[CONSTRAINTS], derivative[CONSTRAINT_ENTRIES];
+    for (int i = 0; i < M; i++)
+      u[i] = now->u[i][n];
+    constraints(u, step->t + RATTLE_ABSCISSA[n + 1] * step->h, step->parameters, g, derivative);
+    for (int k = 0; k < CONSTRAINTS; k++)
+      now->g[k][n] = g[k];
+    for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
+      now->derivative[e][n] = derivative[e];
+  }
+  evaluate_last(step, now);
+#ifdef DAMPED
+  for (int i = 0; i < M; i++)
+    for (int g = 0; g < GROUPS; g++) {
+      store(now->force[i], g, load(now->force[i], g) * GROWN(now, g));
+      store(now->p[i], g, load(now->p[i], g) * GROWN(now, g));
+    }
+#endif
+}
+
+/* Derivatives at all points but the last. */
+static inline void former_derivatives(const rattle_step *now, int g, lanes *derivative)
+{
+  for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
+    derivative[e] = former(now->derivative[e], now->first_derivative[e], g);
+}
+
+/* Computes f = F + G^T lambda at all points but the last. */
+static inline void find_forces(rattle_step *now)
+{
+  for (int g = 0; g < GROUPS; g++) {
+    lanes derivative[CONSTRAINT_ENTRIES], f[M];
+    former_derivatives(now, g, derivative);
+    for (int i = 0; i < M; i++)
+      f[i] = load(now->force[i], g);
+    for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
+      f[CONSTRAINT_ENTRY[e][1]] += GROWN(now, g) * derivative[e] * now->lambda[CONSTRAINT_ENTRY[e][0]][g];
+    for (int i = 0; i < M; i++)
+      store(now->f[i], g, f[i]);
+  }
+  IN_MEMORY(now->f);
+  IN_MEMORY(now->p);
+}
+
+/* Computes y = M^-1 r, and factors of M and P. */
+static inline void find_corrections(const step_data *step, rattle_step *now, factors *l, int factorised)
+{
+  for (int g = 0; g < GROUPS; g++) {
+    lanes derivative[CONSTRAINT_ENTRIES], mass[LOWER_MASSES], r[M], y[M];
+    if (!factorised) {
+      for (int e = 0; e < LOWER_MASSES; e++)
+        mass[e] = load(now->mass[e], g);
+      invert_masses(mass, now->inverse_mass[g]);
+      former_derivatives(now, g, derivative);
+      factorise_points(derivative, now->inverse_mass[g], l[g]);
+    }
+    for (int i = 0; i < M; i++) {
+      const lanes mean = times(RATTLE_MEAN, DEGREE, now->p[i], g) + load(RATTLE_MEAN_OF_LAST, g) * now->last_p[i];
+      r[i] = (now->base_p[i][g] + (step->h * times(RATTLE_IMPULSE, DEGREE, now->f[i], g) - mean)) / GROWN(now, g);
+    }
+    find_accelerations(now->inverse_mass[g], r, y);
+    for (int i = 0; i < M; i++)
+      store(now->y[i], g, y[i]);
+  }
+  IN_MEMORY(now->y);
+}
+
+/* Computes c = g + h G D y. */
+static inline void find_misfits(const step_data *step, rattle_step *now)
+{
+  for (int g = 0; g < GROUPS; g++) {
+    lanes moved[M], c[CONSTRAINTS];
+    for (int i = 0; i < M; i++)
+      moved[i] = step->h * times(RATTLE_DISPLACEMENT, DEGREE, now->y[i], g);
+    for (int k = 0; k < CONSTRAINTS; k++)
+      c[k] = load(now->g[k], g);
+    for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
+      c[CONSTRAINT_ENTRY[e][0]] += load(now->derivative[e], g) * moved[CONSTRAINT_ENTRY[e][1]];
+    for (int k = 0; k < CONSTRAINTS; k++)
+      store(now->c[k], g, c[k]);
+  }
+  IN_MEMORY(now->c);
+}
+
+/* Updates lambda; f is the change of the constraint forces. */
+static inline void update_multipliers(const step_data *step, rattle_step *now, factors *l)
+{
+  const real scale = 1 / (step->h * step->h);
+  for (int g = 0; g < GROUPS; g++) {
+    lanes derivative[CONSTRAINT_ENTRIES], f[M] = {{0}}, x[CONSTRAINTS];
+    for (int k = 0; k < CONSTRAINTS; k++)
+      x[CONSTRAINT_POSITION[k]] = times(RATTLE_INVERSE, DEGREE, now->c[k], g) * scale;
+    solve_points(l[g], x);
+    for (int k = 0; k < CONSTRAINTS; k++)
+      now->lambda[k][g] -= x[CONSTRAINT_POSITION[k]];
+    former_derivatives(now, g, derivative);
+    for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
+      f[CONSTRAINT_ENTRY[e][1]] -= GROWN(now, g) * derivative[e] * x[CONSTRAINT_POSITION[CONSTRAINT_ENTRY[e][0]]];
+    for (int i = 0; i < M; i++)
+      store(now->f[i], g, f[i]);
+  }
+  IN_MEMORY(now->f);
+}
+
+/* One iteration: updates lambda, v and u, the last by `change`. */
+static inline void iterate(const step_data *step, rattle_step *now, factors *l, int factorised, lanes *change)
+{
+  find_forces(now);
+  find_corrections(step, now, l, factorised);
+  find_misfits(step, now);
+  update_multipliers(step, now, l);
+  for (int g = 0; g < GROUPS; g++) {
+    lanes r[M], v[M];
+    for (int i = 0; i < M; i++)
+      r[i] = step->h * times(RATTLE_IMPULSE, DEGREE, now->f[i], g) / GROWN(now, g);
+    find_accelerations(now->inverse_mass[g], r, v);
+    for (int i = 0; i < M; i++)
+      store(now->v[i], g, load(now->v[i], g) + (load(now->y[i], g) + v[i]));
+  }
+  IN_MEMORY(now->v);
+  for (int i = 0; i < M; i++)
+    for (int g = 0; g < GROUPS; g++) {
+      const lanes u = now->base[i][g] + step->h * times(RATTLE_DISPLACEMENT, DEGREE, now->v[i], g);
+      change[i * GROUPS + g] = u - load(now->u[i], g);
+      store(now->u[i], g, u);
+    }
+}
+
+/* Inverse sizes of the terms of the displacements, whose largest size is returned. */
+static inline real invert_term_sizes(const step_data *step, rattle_step *now, real *size)
+{
+  real force[M], inverse_mass[INVERSE_MASSES];
+  for (int i = 0; i < M; i++)
+    force[i] = now->force[i][0];
+  for (int e = 0; e < INVERSE_MASSES; e++)
+    inverse_mass[e] = now->inverse_mass[0][e][0];
+  return invert_sizes(step, force, now->first_derivative, now->lambda, inverse_mass, size);
+}
+
+/* Initial values: the first point, and a guess of the others from the unknowns of the previous step, or if they are
+ * NULL motion without forces. The low words of the tables act on the guess. */
+static int begin(const step_data *step, const rattle_data *run, const real *memory, rattle_step *now)
+{
+  real constraint[CONSTRAINTS], v0[M];
+  const int status = memory ? OK : find_velocity(step->t, step->q0, step->p0, step->parameters, v0, step->scratch);
+  if (status != OK)
+    return status;
+  now->run = run;
+  constraints(step->q0, step->t, step->parameters, constraint, now->first_derivative);
+  for (int i = 0; i < M; i++)
+    for (int g = 0; g < GROUPS; g++)
+      store(now->v[i], g, memory ? times(RATTLE_VELOCITIES, B, memory + i * B, g) : lanes_of(v0[i]));
+  IN_MEMORY(now->v);
+  for (int i = 0; i < M; i++)
+    for (int g = 0; g < GROUPS; g++) {
+      const lanes low = step->h * times(RATTLE_DISPLACEMENT_LOW, DEGREE, now->v[i], g);
+      now->base[i][g] = step->q0[i] + (step->carry_q[i] + low);
+      store(now->u[i], g, now->base[i][g] + step->h * times(RATTLE_DISPLACEMENT, DEGREE, now->v[i], g));
+    }
+  for (int k = 0; k < CONSTRAINTS; k++)
+    for (int g = 0; g < GROUPS; g++)
+      now->lambda[k][g] = memory ? times(RATTLE_MULTIPLIERS, B, memory + (M + k) * B, g) : lanes_of(0);
+  evaluate_points(step, now);
+  find_forces(now);
+  for (int i = 0; i < M; i++)
+    for (int g = 0; g < GROUPS; g++) {
+      const lanes mean = times(RATTLE_MEAN_LOW, DEGREE, now->p[i], g) +
+          load(RATTLE_MEAN_OF_LAST_LOW, g) * now->last_p[i];
+      now->base_p[i][g] = step->p0[i] + (step->h * times(RATTLE_IMPULSE_LOW, DEGREE, now->f[i], g) - mean);
+    }
+  return OK;
+}
+
+/* Velocities z of the curve, p1 - p0 before the projection, and the masses at the end. */
+static inline void finish_curve(const step_data *step, rattle_step *now, real *velocities, real *dp)
+{
+  real z[GROUP_LANES], u[2 * M] = {0}, value[2 * M], mass[LOWER_MASSES];
+  lanes end_mass[LOWER_MASSES];
+  find_forces(now);
+  for (int i = 0; i < M; i++) {
+    real sum = RATTLE_WEIGHT[DEGREE] * now->last_force[i];
+    for (int g = 0; g < GROUPS; g++)
+      store(z, g, times(RATTLE_UNKNOWNS, DEGREE, now->v[i], g));
+    memcpy(velocities + i * B, z, sizeof(real) * DEGREE);
+    for (int n = 0; n < DEGREE; n++)
+      sum += RATTLE_WEIGHT[n] * now->f[i][n];
+    dp[i] = step->h * sum;
+#ifdef DAMPED
+    dp[i] = now->run->shrunk * dp[i] + now->run->loss * (step->p0[i] + step->carry_p[i]);
+#endif
+    u[i] = now->u[i][DEGREE - 1];
+  }
+  constrained_point(u, step->t + step->h, step->parameters, value, mass);
+  memcpy(now->end_rest, value + M, sizeof now->end_rest);
+  for (int e = 0; e < LOWER_MASSES; e++)
+    end_mass[e] = lanes_of(mass[e]);
+  invert_masses(end_mass, now->end_mass);
+  for (int e = 0; e < INVERSE_MASSES; e++)
+    now->end_inverse[e] = now->end_mass[e][0];
+}
+
+#define END_MASSES(now) (now)->end_mass /* inverted, at the end */
+
+/* Velocities at the end, where the momenta are p0 + dp. */
+static inline void end_velocity(const step_data *step, const rattle_step *now, const real *dp, real *v)
+{
+  real p[M];
+  for (int i = 0; i < M; i++)
+    p[i] = (step->p0[i] - now->end_rest[i]) + dp[i];
+  find_velocities(now->end_inverse, p, v);
+}
