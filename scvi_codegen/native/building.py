@@ -91,6 +91,12 @@ Unrolled they become scalar code (leapfrog of 8 masses: 1.5 times the time). The
 UNROLLED_HEADERS = frozenset({"support/newton/newton_solver.h", "support/iteration/shooting_iteration.h"})
 """Headers of steps of one trajectory that are a tenth slower if their short loops are not unrolled."""
 
+POINTS_HEADER, SEPARATE_FLAGS = "support/constraints/point_lanes.h", ("-fno-builtin-sin", "-fno-builtin-cos")
+"""Header of sources with kernels in loops over points, and flags of gcc for them.
+
+Otherwise gcc replaces sine and cosine of an argument by one call, of which there is no vector version.
+"""
+
 THREADS_HEADER, THREADS = "support/arrays/arrays.h", ("-DSCVI_THREADS", "-pthread")
 """Header of sources whose steps threads may share, and the flags for them."""
 
@@ -304,7 +310,7 @@ def _passes(part: Source, flags: tuple[str, ...], cut: tuple[str, ...]) -> tuple
     if "-O3" not in flags:
         return ()
     rolled = NO_UNROLL_FLAGS if "support/run/run.h" in part.files and UNROLLED_HEADERS.isdisjoint(part.files) else ()
-    return (*cut, *rolled)
+    return (*cut, *rolled, *(SEPARATE_FLAGS if POINTS_HEADER in part.files else ()))
 
 
 def _mathematics(flags: tuple[str, ...]) -> list[tuple[list[str], list[str]]]:

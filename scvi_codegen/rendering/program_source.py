@@ -32,6 +32,7 @@ from scvi_codegen.rendering.kernels.simd import (
     IterationSource,
     iteration_source,
     lane_table,
+    loop_functions,
     predictor_text,
     splitting_source,
 )
@@ -506,10 +507,17 @@ def _context(
         "embedded": False,
         "derivatives": None,
         "unrolled_equations": unrolled_equations(program, target),
+        "vector_functions": loop_functions(_kernels_of_points(program)),
         "fallback": fallback,
         **_control_context(program, control),
         **_lane_context(program, lanes, changes=beside is not None and bool(lanes)),
     }
+
+
+def _kernels_of_points(program: Program) -> tuple[Kernel, ...]:
+    """Return the kernels that are evaluated in loops over the points of a constrained step."""
+    rattle, constraints = program.rattle, program.constraints
+    return (*rattle.kernels, constraints.kernel) if rattle and constraints and rattle.lanes > 1 else ()
 
 
 def _scalar_kernels(

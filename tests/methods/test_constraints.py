@@ -143,6 +143,72 @@ def test_multipliers_are_solved_without_newton_iteration(name):
             ours.integrate(*start, h=30.0, steps=1)
 
 
+VARYING = {
+    "angles": {
+        "coordinates": ["u", "v", "w"],
+        "lagrangian": "8*u_dot**2/3 + 2*v_dot**2/3 + 2*u_dot*v_dot*cos(u - v) + 0.5625*w_dot**2"
+        " - 9.81*(2.5*sin(u) + 2*sin(v) + 1.125*sin(w))",
+        "constraints": ["cos(u) + 2*cos(v) - 1.5*cos(w) = 2", "sin(u) + 2*sin(v) = 1.5*sin(w)"],
+        "start": [1.0, 0.5, 1.2],
+    },
+    "damped": {"lagrangian": "(x1_dot**2 + y1_dot**2 + x2_dot**2 + y2_dot**2)/2 - 9.81*(y1 + y2)", "damping": "c"},
+    "all": {
+        "lagrangian": "((2 + x1*cos(t))*x1_dot**2 + y1_dot**2 + x1_dot*x2_dot + (1 + y2**2)*x2_dot**2 + y2_dot**2)/2"
+        " - 9.81*(y1 + y2) + (1 + x1**2/3)*(x1*y1_dot - y1*x1_dot)",
+        "forces": {"x2": "-c*x2_dot**3", "y1": "t*y2_dot"},
+        "damping": "c/3",
+    },
+}
+
+
+@pytest.mark.parametrize(
+    ("kind", "s"),
+    [
+        ("angles", 4),
+        *(pytest.param(*each, marks=pytest.mark.second) for each in (("damped", 8), ("all", 2), ("all", 1))),
+    ],
+)
+def test_masses_of_positions_and_damping_need_no_newton_iteration(kind, s):
+    """Compare with the states of Newton's iteration, for weak and for strong damping, also with adaptive steps."""
+    case = dict(VARYING[kind])
+    near = case.pop("start", [0.6, -0.8, 1.5, -0.4])
+    rods = ["x1**2 + y1**2 = 1", "(x2 - x1)**2 + (y2 - y1)**2 = 1"]
+    given = {"coordinates": ["x1", "y1", "x2", "y2"], "constraints": rods, "parameters": {"c": 0.2}} | case
+    system = sc.LagrangianSystem.from_text(name=kind, **given)
+    ours, newton = (sc.compile_stepper(system, lobatto(s), solver=solver) for solver in ("auto", "newton"))
+    assert "constrained_point(" in ours.source.amalgamated().code
+    start = newton.project(near, newton.momentum(near, [0.1] * len(near), 0.0))
+    for way, c in (({"h": -0.01, "steps": 60}, 0.2), ({"h": 0.02, "steps": 30}, 6.0), ({"t_end": 0.5}, 0.2)):
+        one, other = (stepper.integrate(*start, **way, parameters={"c": c}) for stepper in (ours, newton))
+        assert one.fallback_steps == 0
+        bound = 3e-14 if "h" in way else 1e-8
+        assert np.abs(one.q[-1] - other.q[-1]).max() < bound
+        assert np.abs(one.p[-1] - other.p[-1]).max() < 10 * bound
+        assert np.abs(one.constraint_values()).max() < 2e-14
+
+
+def test_damping_of_constrained_momenta_and_energies_are_exact():
+    """The angular momentum decays by e^(-gamma h), and without damping the energy has no drift."""
+    system = sc.LagrangianSystem.from_text(
+        name="free rods",
+        coordinates=["x1", "y1", "x2", "y2"],
+        lagrangian="(x1_dot**2 + y1_dot**2 + (x2_dot**2 + y2_dot**2)*(1 + (x2**2 + y2**2)/4))/2",
+        parameters={"c": 0.1},
+        damping="c",
+        constraints=["x1**2 + y1**2 = 1", "(x2 - x1)**2 + (y2 - y1)**2 = 1"],
+    )
+    stepper = sc.compile_stepper(system, lobatto(4))
+    start = stepper.project([1, 0, 1, 1], [1, 2, 0.3, 0.2])
+    run = stepper.integrate(*start, h=0.02, steps=2000, save_every=100)
+    (x1, y1, x2, y2), (u1, v1, u2, v2) = run.q.T, run.p.T
+    momentum = (x1 * v1 - y1 * u1 + x2 * v2 - y2 * u2) * np.exp(0.1 * run.t)
+    assert np.abs(momentum / momentum[0] - 1).max() < 2e-14
+    free = stepper.integrate(*start, h=0.02, steps=20000, save_every=1000, parameters={"c": 0.0})
+    assert free.fallback_steps == 0
+    energy = free.energy()
+    assert np.abs(energy / energy[0] - 1).max() < 1e-12
+
+
 @pytest.mark.parametrize(("terms", "reach"), [("", 1), (" + (x1_dot + x2_dot + x3_dot + x4_dot)**2", 3)])
 def test_the_matrix_of_multipliers_of_a_chain_is_a_band(terms, reach):
     """A point mass couples the two constraints of its rods, a mass matrix without zeros couples all four."""

@@ -30,6 +30,14 @@ DAMPED = sc.LagrangianSystem.from_text(
     forces={"x": "-x_dot", "y": "-y_dot"},
 )
 """With forces at the velocities of the points."""
+BEAD = sc.LagrangianSystem.from_text(
+    name="damped bead",
+    coordinates=["r", "a"],
+    lagrangian="(r_dot**2 + r**2*a_dot**2)/2 - 9.81*r*sin(a)",
+    constraints=["r*(1 + 0.3*cos(a)) = 1"],
+    damping="0.1",
+)
+"""With masses that depend on positions."""
 NEAR = [0.0, 1.0, 1.94, 1.5]
 
 
@@ -45,6 +53,7 @@ def test_constrained_code_compiles_without_warnings(compiler, tmp_path):
         (PENDULUM, 1, True),
         (PENDULUM, 4, False),
         (DAMPED, 2, True),
+        (BEAD, 2, True),
     ):
         source = sc.generate_source(system, lobatto(s), controlled=controlled)[0]
         (tmp_path / f"{source.prefix}.h").write_text(source.header)

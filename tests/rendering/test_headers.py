@@ -48,7 +48,7 @@ GENERATED = (
 """Headers with types that the generated part uses."""
 CHOSEN = (
     r"iteration/\w*(?:_iteration|trajectory|trajectories|_solver|splitting)|newton/newton_solver"
-    r"|newton/library_fallback|arrays/array_hamiltonian_iteration|arrays/(?:newton_gmres|second_order_points)"
+    r"|newton/library_fallback|constraints/(?:coupled_)?rattle\.|arrays/array_hamiltonian_iteration|arrays/(?:newton_gmres|second_order_points)"
     r"|derivatives/(?:separable|coupled)_derivatives|step_size/(?:trials|density)"
 )
 """Headers of which a source chooses one of several with the same functions."""
@@ -88,6 +88,10 @@ def sources() -> tuple[Source, ...]:
         made.append(Sources(pendulum, method, precision="double-double").integrator()[0])
     rod = LagrangianSystem.from_text("rod", ["x", "y"], "x_dot**2 + y_dot**2", constraints=["x**2 + y**2 - 1"])
     made.append(Sources(rod, SVI(1, "gauss-lobatto:2"), precision="double-double").integrator()[0])
+    bead = LagrangianSystem.from_text(
+        "bead", ["x", "y"], "x_dot**2 + (1 + x**2)*y_dot**2", constraints=["x**2 + y**2 - 1"]
+    )
+    made.append(Sources(bead, SVI(2, "gauss-lobatto:3")).integrator()[0])
     return (*made, *oscillator.sources)
 
 

@@ -24,8 +24,8 @@ from scvi_codegen.rendering.kernels.loop_nests import (
     sizes_text,
     starts_text,
 )
-from scvi_codegen.rendering.kernels.printer import DOUBLE, inverse_roots, scalar_functions
-from scvi_codegen.rendering.kernels.simd import LIBRARY, POINTS, iteration_source
+from scvi_codegen.rendering.kernels.printer import DOUBLE, inverse_roots
+from scvi_codegen.rendering.kernels.simd import POINTS, iteration_source, loop_functions
 
 EXPLICIT_VECTORS, CONSTRAINED_VECTORS, ITERATION_VECTORS = 4, 7, 4
 """Number of vectors in ``work``.
@@ -175,8 +175,7 @@ def _step_work(program: Program) -> int:
 
 def _vector_functions(program: Program) -> list[str]:
     """Return the functions of the vector library that occur in the forces of an explicit method."""
-    kernels = [each.kernel for each in program.loops.forces] if program.fixed_point is None else []
-    return sorted(set(LIBRARY) & set().union(*map(scalar_functions, kernels)))
+    return loop_functions([each.kernel for each in program.loops.forces] if program.fixed_point is None else [])
 
 
 def _force_text(program: Program, rolled: RolledKernel) -> str:

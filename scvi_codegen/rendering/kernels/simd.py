@@ -10,13 +10,21 @@ uses a second library, compiled when the iteration first fails; an exported sour
 library is set once, for all steppers of a source: one generator makes one Newton solver for the same iteration.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
 from scvi_codegen.ir.equations import AdaptivePredictor, FixedPointIteration, LinearPart, Splitting, StoredValues
 from scvi_codegen.ir.kernel import Kernel, Number, NumberTable
-from scvi_codegen.rendering.kernels.printer import DOUBLE, INVERSE_ROOT, TIMES, Sources, lane_functions, print_number
+from scvi_codegen.rendering.kernels.printer import (
+    DOUBLE,
+    INVERSE_ROOT,
+    TIMES,
+    Sources,
+    lane_functions,
+    print_number,
+    scalar_functions,
+)
 from scvi_codegen.rendering.kernels.roots import with_factors_in_roots
 from scvi_codegen.rendering.text import table
 
@@ -162,6 +170,11 @@ def splitting_source(split: Splitting, observed: Kernel | None = None) -> Iterat
         damping=None,
         support=("iteration/splitting",),
     )
+
+
+def loop_functions(kernels: Iterable[Kernel]) -> list[str]:
+    """Return the functions of the vector library that occur in kernels, for loops that the compiler vectorises."""
+    return sorted(set(LIBRARY) & set().union(*map(scalar_functions, kernels)))
 
 
 def _kept(fixed_point: FixedPointIteration) -> dict[str, str]:

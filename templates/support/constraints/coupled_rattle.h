@@ -1,8 +1,8 @@
 #include "point_lanes.h"
 
-/* Constrained steps on Lobatto points for mass matrices M(q, t) that depend on positions, and for uniform damping, whose
- * factors e^(gamma c_n h) multiply the values at point n. Unknowns are the velocities v and multipliers lambda at all
- * points but the last. With the momenta p = L_v at all points, positions and residuals are
+/* Constrained steps on Lobatto points for mass matrices M(q, t) that depend on positions, and for uniform damping,
+ * whose factors e^(gamma c_n h) multiply the values at point n. Unknowns are the velocities v and multipliers lambda at
+ * all points but the last. With the momenta p = L_v at all points, positions and residuals are
  *
  *   u = q0 + h D v,    r = p0 + h I (F + G^T lambda) - m p,
  *
@@ -14,9 +14,9 @@
  * which neglects that M and G vary between the points and that F varies, errors of order h. Unconstrained systems have
  * the same iteration without multipliers (coupled_iteration.h).
  *
- * Requires: point_lanes.h with what it requires, MASSES_OF_POINTS, the kernel constrained_point of L_q + f and L_v, with
- * the lower half of M, LOWER_MASS_ENTRY; MASS_REACH of M in the order MASS_POSITION; if DAMPED, damping.h; the tables
- * RATTLE_ABSCISSA, RATTLE_WEIGHT; RATTLE_DISPLACEMENT, RATTLE_IMPULSE, RATTLE_MEAN and, of the last point,
+ * Requires: point_lanes.h with what it requires, MASSES_OF_POINTS, the kernel constrained_point of L_q + f and L_v,
+ * with the lower half of M, LOWER_MASS_ENTRY; MASS_REACH of M in the order MASS_POSITION; if DAMPED, damping.h; the
+ * tables RATTLE_ABSCISSA, RATTLE_WEIGHT; RATTLE_DISPLACEMENT, RATTLE_IMPULSE, RATTLE_MEAN and, of the last point,
  * RATTLE_MEAN_OF_LAST with their low words; RATTLE_INVERSE of D I; RATTLE_LAST_VELOCITY, from v to the velocity at the
  * last point, RATTLE_UNKNOWNS, to the unknowns of the step, and from these RATTLE_VELOCITIES and RATTLE_MULTIPLIERS of
  * the next one, padded with zeros. */
@@ -45,9 +45,10 @@ static void prepare_rattle(const step_data *step, rattle_data *data)
 #define GROWN(now, g) 1
 #endif
 
-/* Positions u, derivatives G and g at all points but the first, where G is first_derivative; positions `at`, velocities,
- * forces, momenta, masses and multipliers at all but the last, where force and momentum are last_force and last_p. With
- * f, y and c the right-hand sides of an iteration; base and base_p, q0 and p0 with the effect of low words. */
+/* Positions u, derivatives G and g at all points but the first, where G is first_derivative; positions `at`,
+ * velocities, forces, momenta, masses and multipliers at all but the last, where force and momentum are last_force and
+ * last_p. With f, y and c the right-hand sides of an iteration; base and base_p, q0 and p0 with the effect of low
+ * words; at the end M^-1, end_mass and end_inverse, and L_v at v = 0, end_rest. */
 typedef struct {
   const rattle_data *run;
   real u[M][GROUP_LANES], at[M][GROUP_LANES], v[M][GROUP_LANES], force[M][GROUP_LANES], p[M][GROUP_LANES];
@@ -56,7 +57,7 @@ typedef struct {
   real f[M][GROUP_LANES], y[M][GROUP_LANES], c[CONSTRAINTS][GROUP_LANES];
   lanes base[M][GROUPS], base_p[M][GROUPS], lambda[CONSTRAINTS][GROUPS];
   inverse_masses inverse_mass[GROUPS], end_mass;
-  real end_inverse[INVERSE_MASSES], end_rest[M]; /* M^-1 and L_v at v = 0 at the end */
+  real end_inverse[INVERSE_MASSES], end_rest[M];
 } rattle_step;
 
 /* Inverts the masses of a group of points; not finite if they are singular. Coordinates that no masses couple share a
@@ -64,6 +65,7 @@ typedef struct {
 static inline void invert_masses(const lanes *mass, inverse_masses inverse)
 {
   lanes l[M * (MASS_REACH + 1)] = {{0}}, x[M];
+#pragma GCC unroll 64
   for (int e = 0; e < LOWER_MASSES; e++) {
     const int i = MASS_POSITION[LOWER_MASS_ENTRY[e][0]], j = MASS_POSITION[LOWER_MASS_ENTRY[e][1]];
     l[(i > j ? i : j) * (MASS_REACH + 1) + (i > j ? i - j : j - i)] = mass[e];
@@ -73,6 +75,7 @@ static inline void invert_masses(const lanes *mass, inverse_masses inverse)
     for (int i = 0; i < M; i++)
       x[MASS_POSITION[i]] = lanes_of(MASS_COLUMN[i] == column);
     solve_band(l, M, MASS_REACH, x);
+#pragma GCC unroll 64
     for (int e = 0; e < INVERSE_MASSES; e++)
       if (MASS_COLUMN[INVERSE_MASS_ENTRY[e][1]] == column)
         inverse[e] = x[MASS_POSITION[INVERSE_MASS_ENTRY[e][0]]];
@@ -116,6 +119,7 @@ static __attribute__((flatten)) void evaluate_points(const step_data *step, ratt
       now->force[i][n] = value[i];
       now->p[i][n] = value[M + i];
     }
+#pragma GCC unroll 64
     for (int e = 0; e < LOWER_MASSES; e++)
       now->mass[e][n] = mass[e];
   }
@@ -126,6 +130,7 @@ static __attribute__((flatten)) void evaluate_points(const step_data *step, ratt
     constraints(u, step->t + RATTLE_ABSCISSA[n + 1] * step->h, step->parameters, g, derivative);
     for (int k = 0; k < CONSTRAINTS; k++)
       now->g[k][n] = g[k];
+#pragma GCC unroll 64
     for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
       now->derivative[e][n] = derivative[e];
   }
@@ -142,6 +147,7 @@ static __attribute__((flatten)) void evaluate_points(const step_data *step, ratt
 /* Derivatives at all points but the last. */
 static inline void former_derivatives(const rattle_step *now, int g, lanes *derivative)
 {
+#pragma GCC unroll 64
   for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
     derivative[e] = former(now->derivative[e], now->first_derivative[e], g);
 }
@@ -154,6 +160,7 @@ static inline void find_forces(rattle_step *now)
     former_derivatives(now, g, derivative);
     for (int i = 0; i < M; i++)
       f[i] = load(now->force[i], g);
+#pragma GCC unroll 64
     for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
       f[CONSTRAINT_ENTRY[e][1]] += GROWN(now, g) * derivative[e] * now->lambda[CONSTRAINT_ENTRY[e][0]][g];
     for (int i = 0; i < M; i++)
@@ -169,6 +176,7 @@ static inline void find_corrections(const step_data *step, rattle_step *now, fac
   for (int g = 0; g < GROUPS; g++) {
     lanes derivative[CONSTRAINT_ENTRIES], mass[LOWER_MASSES], r[M], y[M];
     if (!factorised) {
+#pragma GCC unroll 64
       for (int e = 0; e < LOWER_MASSES; e++)
         mass[e] = load(now->mass[e], g);
       invert_masses(mass, now->inverse_mass[g]);
@@ -195,6 +203,7 @@ static inline void find_misfits(const step_data *step, rattle_step *now)
       moved[i] = step->h * times(RATTLE_DISPLACEMENT, DEGREE, now->y[i], g);
     for (int k = 0; k < CONSTRAINTS; k++)
       c[k] = load(now->g[k], g);
+#pragma GCC unroll 64
     for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
       c[CONSTRAINT_ENTRY[e][0]] += load(now->derivative[e], g) * moved[CONSTRAINT_ENTRY[e][1]];
     for (int k = 0; k < CONSTRAINTS; k++)
@@ -215,6 +224,7 @@ static inline void update_multipliers(const step_data *step, rattle_step *now, f
     for (int k = 0; k < CONSTRAINTS; k++)
       now->lambda[k][g] -= x[CONSTRAINT_POSITION[k]];
     former_derivatives(now, g, derivative);
+#pragma GCC unroll 64
     for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
       f[CONSTRAINT_ENTRY[e][1]] -= GROWN(now, g) * derivative[e] * x[CONSTRAINT_POSITION[CONSTRAINT_ENTRY[e][0]]];
     for (int i = 0; i < M; i++)
@@ -253,6 +263,7 @@ static inline real invert_term_sizes(const step_data *step, rattle_step *now, re
   real force[M], inverse_mass[INVERSE_MASSES];
   for (int i = 0; i < M; i++)
     force[i] = now->force[i][0];
+#pragma GCC unroll 64
   for (int e = 0; e < INVERSE_MASSES; e++)
     inverse_mass[e] = now->inverse_mass[0][e][0];
   return invert_sizes(step, force, now->first_derivative, now->lambda, inverse_mass, size);
@@ -313,9 +324,11 @@ static inline void finish_curve(const step_data *step, rattle_step *now, real *v
   }
   constrained_point(u, step->t + step->h, step->parameters, value, mass);
   memcpy(now->end_rest, value + M, sizeof now->end_rest);
+#pragma GCC unroll 64
   for (int e = 0; e < LOWER_MASSES; e++)
     end_mass[e] = lanes_of(mass[e]);
   invert_masses(end_mass, now->end_mass);
+#pragma GCC unroll 64
   for (int e = 0; e < INVERSE_MASSES; e++)
     now->end_inverse[e] = now->end_mass[e][0];
 }

@@ -278,4 +278,3 @@ static inline movement measure_change(const lanes *change, const real *inverse_s
   moved.overall = moved.absolute > 0 ? moved.absolute / largest_size : 0;
   return moved;
 }
-

@@ -20,11 +20,11 @@
  * RATTLE_VELOCITY_SHIFT w, and da less R^-1 Q dw / h.
  *
  * Requires: point_lanes.h with what it requires, the kernels constrained_force and, with MOMENTUM_TERMS,
- * constrained_momentum, A; the tables RATTLE_ABSCISSA, RATTLE_WEIGHT, RATTLE_START, RATTLE_MOMENTUM, RATTLE_RESPONSE and
- * RATTLE_DRIFT with their low words, RATTLE_INVERSE of R, and from the unknowns of the previous step RATTLE_POSITIONS,
- * in units of h, and RATTLE_MULTIPLIERS, padded with zeros; with VELOCITY_FORCES also RATTLE_LAST_VELOCITY, from the
- * velocities z of the step to that at the last point; with MOMENTUM_TERMS RATTLE_SHIFT_RESPONSE, R^-1 Q, and
- * RATTLE_PROJECTION, by which w reduces z. */
+ * constrained_momentum, A; the tables RATTLE_ABSCISSA, RATTLE_WEIGHT, RATTLE_START, RATTLE_MOMENTUM, RATTLE_RESPONSE
+ * and RATTLE_DRIFT with their low words, RATTLE_INVERSE of R, and from the unknowns of the previous step
+ * RATTLE_POSITIONS, in units of h, and RATTLE_MULTIPLIERS, padded with zeros; with VELOCITY_FORCES also
+ * RATTLE_LAST_VELOCITY, from the velocities z of the step to that at the last point; with MOMENTUM_TERMS
+ * RATTLE_SHIFT_RESPONSE, R^-1 Q, and RATTLE_PROJECTION, by which w reduces z. */
 
 /* Positions u, forces F, derivatives G and g at all points but the first, where the second and third are first_force
  * and first_derivative; multipliers and the accelerations a of u at all but the last. `base` is u without forces. With
