@@ -90,6 +90,18 @@ SYSTEMS: dict[str, System] = {
         {"q": [1.0], "p": [0.1], "h": 0.05},
         {"events": [sc.impact("x - sin(t)/9", restitution=0.95)]},
     ),
+    "damped bead": (
+        lambda: sc.LagrangianSystem.from_text(
+            "bead",
+            ["r", "a"],
+            "(r_dot**2 + r**2*a_dot**2)/2 - r*sin(a)",
+            constraints=["r*(1 + 0.3*cos(a)) = 1"],
+            damping="0.1",
+        ),
+        "svi:3",
+        {"q": [1.0, np.pi / 2], "p": [0.15, 0.5], "h": 0.05},
+        {},
+    ),
     "lattice": (lambda: lattice("sum(i in N periodic, (q[i+1] - q[i])**4)"), "svi:2", ARRAYS, {}),
     "lattice, Newton": (golden_cells.ring, "svi:2", ARRAYS, {"solver": "newton"}),
     "lattice, explicit": (lambda: lattice("sum(i in N, q[i]**4)"), "composition:4", ARRAYS, {}),
