@@ -139,6 +139,7 @@ run_memory *NAME(bind)(const long long *sizes, const int *const *tables, double 
 #endif
 #ifdef CONSTRAINTS_OF_ARRAYS
   find_pairs(&run);
+  run_in(memory)->is_exact = is_without_fill(&run);
 #endif
   return run_in(memory);
 }

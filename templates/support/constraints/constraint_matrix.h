@@ -11,7 +11,7 @@ typedef struct {
   int *first, *place, *owner, *list, *at, *where, *row, *column;
 } pattern;
 
-static pattern pattern_of(const run_memory *run, long long n)
+static inline pattern pattern_of(const run_memory *run, long long n)
 {
   const long long count = run->constraints, entries = run->entries;
   pattern of = {.first = run->places, .column = run->columns};
@@ -95,13 +95,34 @@ static long long find_pairs(run_memory *run)
   return pairs;
 }
 
-/* Systems with the constraint matrix G M^-1 G^T by conjugate gradients, preconditioned by the incomplete factorisation
- * L D L^T without fill (J. A. Meijerink & H. A. van der Vorst, Math. Comp. 31, 1977). For a chain or a tree whose
- * constraints are ordered from an end the factors are exact. Redundant constraints make the matrix singular, which
- * is an error. */
+/* Returns 1 if the factorisation of the matrix has no fill-in: rows that share a column contain the first of them
+ * (perfect elimination; D. J. Rose, J. Math. Anal. Appl. 32, 1970). */
+static int is_without_fill(const run_memory *run)
+{
+  const pattern of = pattern_of(run, coordinates_of(&run->data));
+  int *first = of.where, missing = 0;
+  for (int k = 0; k < run->constraints; k++)
+    for (int m = of.row[k]; m < of.row[k + 1]; m++) {
+      const int column = of.column[m];
+      int found = first[column] < 0;
+      for (int j = m + 1; j < of.row[k + 1]; j++)
+        found |= of.column[j] == first[column];
+      missing |= !found;
+      if (first[column] < 0)
+        first[column] = k;
+    }
+  for (long long k = 0; k < run->constraints; k++)
+    first[k] = -1;
+  return !missing;
+}
+
+/* Systems with the constraint matrix G M^-1 G^T by its factors L D L^T if these are exact in its pattern, as for a
+ * chain or a tree whose constraints are ordered from an end; otherwise by conjugate gradients, preconditioned by the
+ * incomplete factorisation without fill (J. A. Meijerink & H. A. van der Vorst, Math. Comp. 31, 1977). Redundant
+ * constraints make the matrix singular, which is an error. */
 
 #define LEAST_PIVOT 1e-3 /* relative to the diagonal: a smaller pivot was lost by the incomplete factorisation */
-#define DEPENDENT 1e-13 /* of the matrix relative to L D L^T: curvature that counts as 0 */
+#define DEPENDENT 1e-13 /* of the matrix relative to L D L^T, or of an exact pivot to the diagonal: it counts as 0 */
 #define ROUNDING_MULTIPLE 4096.0 /* multiple of the rounding error that may remain at converged positions */
 #define SPARE_PRODUCTS 100 /* iterations beyond the number of constraints, to allow for rounding */
 
@@ -110,25 +131,36 @@ static long long find_pairs(run_memory *run)
  * state and at another one), and per pair (the matrix, L). */
 typedef struct {
   pattern of;
-  long long count, entries;
+  long long count, entries, is_exact;
   double *g, *rate, *lambda, *right, *change, *preconditioned, *direction, *image, *rounding, *diagonal, *pivot;
   double *derivative, *next;
   double *entry, *factor;
 } constraint_system;
 
-static constraint_system constraint_arrays(const run_memory *run, long long n)
+static inline constraint_system constraint_arrays(const run_memory *run, long long n)
 {
-  constraint_system found = {.of = pattern_of(run, n), .count = run->constraints, .entries = run->entries};
-  double **const each[] = {&found.g, &found.rate, &found.lambda, &found.right, &found.change, &found.preconditioned,
-      &found.direction,
-      &found.image, &found.rounding, &found.diagonal, &found.pivot};
-  double *numbers = run->held;
-  for (size_t k = 0; k < sizeof each / sizeof *each; k++, numbers += found.count)
-    *each[k] = numbers;
-  found.derivative = numbers;
-  found.next = found.derivative + found.entries;
-  found.entry = found.next + found.entries;
-  found.factor = found.entry + run->pairs;
+  const long long count = run->constraints, entries = run->entries;
+  double *const numbers = run->held, *const further = numbers + 11 * count;
+  const constraint_system found = {
+      .of = pattern_of(run, n),
+      .count = count,
+      .entries = entries,
+      .is_exact = run->is_exact,
+      .g = numbers,
+      .rate = numbers + count,
+      .lambda = numbers + 2 * count,
+      .right = numbers + 3 * count,
+      .change = numbers + 4 * count,
+      .preconditioned = numbers + 5 * count,
+      .direction = numbers + 6 * count,
+      .image = numbers + 7 * count,
+      .rounding = numbers + 8 * count,
+      .diagonal = numbers + 9 * count,
+      .pivot = numbers + 10 * count,
+      .derivative = further,
+      .next = further + entries,
+      .entry = further + 2 * entries,
+      .factor = further + 2 * entries + run->pairs};
   return found;
 }
 
@@ -156,7 +188,7 @@ static void find_products(const constraint_system *held, const double *inverse_m
   }
 }
 
-/* Computes a row of L from the rows above; returns 0 if the diagonal is not positive. */
+/* Computes a row of L from the rows above; returns 0 if the diagonal is not positive or the row depends on others. */
 static int factorise_row(const constraint_system *held, int k)
 {
   const pattern *of = &held->of;
@@ -176,7 +208,9 @@ static int factorise_row(const constraint_system *held, int k)
     held->factor[m] *= held->pivot[of->column[m]];
     of->where[of->column[m]] = -1;
   }
-  held->pivot[k] = 1.0 / (left > LEAST_PIVOT * held->diagonal[k] ? left : held->diagonal[k]);
+  held->pivot[k] = 1.0 / (held->is_exact || left > LEAST_PIVOT * held->diagonal[k] ? left : held->diagonal[k]);
+  if (held->is_exact && !(left > DEPENDENT * held->diagonal[k]))
+    return 0;
   return held->diagonal[k] > 0.0 && held->diagonal[k] < INFINITY;
 }
 
@@ -269,6 +303,10 @@ static double move_on(const constraint_system *held, double step)
 static int solve_constraint_system(const constraint_system *held, double tolerance, solver_report *report)
 {
   const long long n = held->count;
+  if (held->is_exact) {
+    precondition(held, held->right, held->change);
+    return OK;
+  }
   double size = product_of(held->right, held->right, n), derivative,
          length; /* squared length of the search direction in the
                                                                          * metric of L D L^T */
