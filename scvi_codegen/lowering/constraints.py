@@ -1,4 +1,4 @@
-"""RATTLE and its generalisation to s + 1 Lobatto points, for constant masses: only multipliers are solved for.
+"""RATTLE and its generalisation to s + 1 Lobatto points: only multipliers, or these and velocities, are solved for.
 
 If the mass matrix M is constant, positions at the s + 1 Lobatto points are explicit in forces and multipliers (Lobatto
 IIIA and IIIB), which leaves s equations per constraint,
@@ -11,6 +11,10 @@ with P_n = G_n M^-1 G_n^T, a band matrix if the constraints form a chain, and R 
 that the iteration removes. SVI(1) is RATTLE. Forces that depend on velocities are evaluated at those of the curve, also
 explicit in forces and multipliers, M v_n = p0 + h sum_m b_nm (F_m + G_m^T lambda_m), in each iteration. Terms A of
 momenta M v + A(q, t) act likewise: l^T w l M V = .. - l^T w A, l the velocities of the curve at the points of weight w.
+
+If M depends on positions, or with uniform damping, unknowns are multipliers and velocities at the points: their
+corrections follow from the residuals of the momenta and of g with M^-1 and G M^-1 G^T of each point
+(``coupled_rattle.h``).
 
 Constraints of systems of arrays are solved by RATTLE and its symmetric compositions. A step of h is, with G0 and G1 the
 derivatives of the constraints at its ends,
