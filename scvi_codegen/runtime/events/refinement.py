@@ -279,6 +279,12 @@ class WithEventsInDouble:
             )
         return self._doubles().with_events(self.events)
 
+    def _compile(self) -> None:
+        super()._compile()  # type: ignore[misc]
+        if self.interface.words > 1 and self.events and self._doubles is not None:
+            self._in_double._compile()
+            _ = self._event_functions
+
     @cached_property
     def _event_functions(self) -> EventFunctions:
         """The functions of the events in 40 digits."""

@@ -8,7 +8,7 @@
  * correction gains up to 16 digits, so that two evaluations in pairs suffice; the second shows that they do. Requires:
  * newton.h, evaluate_pairs, the rows in pairs. */
 
-#define REFINED 4e-32 /* change by a correction, relative to the state, after which there is no further one */
+#define REFINED 1e-34 /* change by the last correction, relative to the state: momenta are those before it */
 #define REFINED_ROUNDING 1e-27 /* changes that may be rounding errors, if they stop decreasing */
 #define MOST_REFINEMENTS 8
 
