@@ -10,7 +10,7 @@
 typedef struct {
   int rattle_alone; /* 1 if a step whose iteration of the multipliers fails is not solved by Newton's method */
 #ifdef RATTLE
-  real inverse_mass[INVERSE_MASSES];
+  rattle_data rattle;
 #endif
 } solver_data;
 
@@ -18,7 +18,7 @@ static void prepare(const step_data *step, solver_data *data)
 {
   data->rattle_alone = 0;
 #ifdef RATTLE
-  invert_masses(step, data->inverse_mass);
+  prepare_rattle(step, &data->rattle);
 #else
   (void)step;
 #endif
@@ -86,7 +86,7 @@ static int solve(const step_data *step, const solver_data *way, real *memory, lo
     keep = step->first ? remake_factors(step, memory + N, data) : 1;
 #ifdef RATTLE
   if (!is_suspended(*guess))
-    status = rattle(step, way->inverse_mass, *guess ? memory : NULL, data, dp, options, report);
+    status = rattle(step, &way->rattle, *guess ? memory : NULL, data, dp, options, report);
   keep = 0;
   falls_back = status != OK;
   if (falls_back && way->rattle_alone)
