@@ -674,3 +674,23 @@ def test_projected_momenta_have_admissible_velocities_for_any_kinetic_energy():
     for angle, momentum in ((0.2, [3.0, 1.0]), (1.4, [-1.0, 2.0]), (2.5, [0.5, -4.0])):
         q, p = stepper.project([0.3 * np.sin(1.0) + np.cos(angle), np.sin(angle)], momentum, t=1.0)
         assert np.abs(stepper.constraint_values(q, p, 1.0)).max() < 2e-15
+
+
+@pytest.mark.second
+def test_ball_joints_of_rotations_need_no_newton_iteration():
+    """Compare a body that is hung at a point by constraints with the states of Newton's iteration."""
+    body = sc.LagrangianSystem.from_text(
+        name="hung body",
+        coordinates=["x", "y", "z"],
+        rotations={"R": "omega"},
+        lagrangian="(x_dot**2 + y_dot**2 + z_dot**2)/2 - 9.81*z + (3*omega_1**2 + 2*omega_2**2 + omega_3**2)/20",
+        constraints=["x = R_13/2", "y = R_23/2", "z = R_33/2"],
+    )
+    ours, newton = (sc.compile_stepper(body, lobatto(2), solver=solver) for solver in ("auto", "newton"))
+    assert "constrained_point(" in ours.source.amalgamated().code
+    velocity = {"omega": [0.5, 0.3, 2], "x": 0.15, "y": -0.25, "z": 0}
+    q, p = newton.project({"R": [1, 0, 0, 0], "x": 0, "y": 0, "z": 0.5}, velocity=velocity)
+    one, other = (stepper.integrate(q, p=p, h=0.01, steps=50) for stepper in (ours, newton))
+    assert one.fallback_steps == 0
+    assert np.abs(one.q[-1] - other.q[-1]).max() < 1e-14
+    assert np.abs(one.p[-1] - other.p[-1]).max() < 1e-14
