@@ -154,7 +154,10 @@ TABLE = [
         (f"growing at {x:.0e}", x, x / 1e28, ROUNDED, 0, 6, GIVEN_UP, x / 1e56)
         for x in (1e56, 1e84, 1e112, 1e140, 1e154)
     ),
-    ("growing at once beyond all numbers whose squares are finite", 1e140, 1e10, ROUNDED, 0, 2, ON),
+    ("growing at once beyond all numbers whose squares are finite", 1e140, 1e10, ROUNDED, 0, 2, GIVEN_UP),
+    ("growing at once above a thousand states", 1.1e3, 1e3, ROUNDED, 0, 2, GIVEN_UP),
+    ("growing at once below a thousand states", 0.9e3, 0.5e3, ROUNDED, 0, 2, ON),
+    ("decreasing above a thousand states", 1.1e3, 1e4, ROUNDED, 0, 2, ON),
 ]
 
 

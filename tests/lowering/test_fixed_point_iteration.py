@@ -41,6 +41,11 @@ def partials(system: MechanicalSystem):
     return tuple(map(partial(as_numbers, [q, v, system.time]), matrices))
 
 
+def rotating() -> LagrangianSystem:
+    """A plane rotating frame: constant masses, momenta that depend on positions, forces that are no polynomials."""
+    return lagrange("rotating", "x y", "(x_dot**2 + y_dot**2)/2 + x*y_dot - y*x_dot + 1/sqrt(x**2 + y**2 + 2)")
+
+
 def leaning() -> LagrangianSystem:
     """Three coordinates whose constant masses all meet."""
     return LagrangianSystem.from_text(
@@ -69,7 +74,7 @@ def close(found, expected) -> bool:
     return bool(np.max(np.abs(np.concatenate(found) - np.concatenate(expected))) < ROUNDING)
 
 
-@pytest.mark.parametrize("system", [tangle(), pumped_cart_pole()], ids=lambda system: system.name)
+@pytest.mark.parametrize("system", [tangle(), pumped_cart_pole(), rotating()], ids=lambda system: system.name)
 def test_velocities_are_updated_by_the_full_mass_matrix_to_first_order(system):
     stepper, (force, momentum, mass) = iterated(system), functions(system)
     assert "#define FOLLOWED" in stepper.source.code

@@ -30,6 +30,23 @@ enum { OF_EACH = 1 + VELOCITIES }; /* values per coordinate in X: positions, the
 #include "linear_part.h"
 #endif
 
+#if defined(LINEAR_FORCES) && defined(POINTS)
+#define POOR_GUESS 4.0 /* predictions with errors above twice the state (squared) */
+#define STRAIGHT 24 /* steps that begin with a straight line after one */
+#define BEGINS_STRAIGHT(steps) ((steps) == 0 || (steps) > 2)
+
+/* Number of former steps for the next predictor, or 2 + the number of steps that begin with a straight line: fast
+ * vibrations turn by several radians in a step, so that their extrapolation may be worse. */
+static long long next_of_vibrations(long long steps, double first_change)
+{
+  if (steps > 2)
+    return steps > 3 ? steps - 1 : 1;
+  return steps > 0 && first_change > POOR_GUESS ? 2 + STRAIGHT : steps_to_continue(steps, first_change);
+}
+#else
+#define BEGINS_STRAIGHT(steps) ((steps) == 0)
+#endif
+
 #define FEW 8 /* coordinates, whose squared changes are added, which is faster */
 
 /* Constants of a step size: h^2 = square + square_low, h w = kick + kick_low. */
@@ -371,7 +388,7 @@ PASS void first_points(const step_points *w, history past, long long steps)
     for (int g = 0; g < GROUPS; g++)
       w->X[g * M + i] = w->base[g * M + i] = w->step->q0[i] + DRIFT[g] * w->drifts[i].high;
   }
-  if (steps == 0)
+  if (BEGINS_STRAIGHT(steps))
     return;
   continue_curve(w->step, past, steps, (coordinates *)w->F);
   for (int i = 0; i < M; i++)
@@ -515,6 +532,12 @@ HOT int iterate(const step_data *step, const iteration_data *data, history past,
 #if defined(ERROR_GROWTH) || defined(MIXED_POINTS)
   if (step->points)
     memcpy(step->points, X, sizeof X);
+#endif
+#ifdef POOR_GUESS
+  if (implicit) {
+    *steps = next_of_vibrations(*steps, now.first);
+    return OK;
+  }
 #endif
   *steps = next_guess(*steps, &now, report);
   return OK;

@@ -30,7 +30,8 @@ sum_b l_nb z_b and the equations are projected: a correction is interpolated by 
 and projected back. If masses depend on positions, a correction changes forces and momenta about as much as the residual
 it removes. So it is computed twice, the second time including its own first-order effect, by F_q, F_v and L_vq of the
 same kernel: one iteration then converges like two, and the final forces include the last correction. This saves a
-quarter of the time of a step of a swinging Atwood machine, 8 to 25 % for pendulums, carts and time-transformed systems.
+quarter of the time of a step of a swinging Atwood machine, 8 to 25 % for pendulums, carts and time-transformed systems,
+and a tenth in a plane rotating frame (momenta that depend on positions, and forces that are no polynomials).
 
 For a variational method the two tables are adjoint. With mu_nj = a_nj / beta_j, the scaled weights h beta_j rounded
 once and used in stages and updates alike, and A_nj / w_j = 1 - mu_jn, exact since mu is a multiple of 2^-51, the
@@ -321,8 +322,9 @@ def _nearly_equal(one: Matrix, other: Matrix) -> bool:
 EPSILON = 1e-14
 """Largest difference of tables that rounding explains."""
 FRACTION_BITS = 51
-MOST_LINEARISED = 8
-"""Largest number of coordinates with linearised forces; beyond, their derivatives cost more than they save."""
+MOST_LINEARISED, MOST_COUPLED = 8, 2
+"""Largest numbers of coordinates with linearised forces; beyond, their derivatives cost more than they save: if masses
+depend on positions, and if momenta do with masses that do not."""
 
 
 LARGEST_MASS_MATRICES = 2**17
@@ -402,17 +404,15 @@ def _solution_kernel(system: LagrangianSystem) -> Kernel | None:
 
 
 def _linearised_forces(system: LagrangianSystem) -> tuple[Expr, ...]:
-    """Return F_q, F_v and L_vq by rows, for few coordinates with position-dependent masses; else nothing."""
-    forms, m, zero = forms_of(system), system.dimension, sympy.Integer(0)
-    if m > MOST_LINEARISED or not any(
-        entry.free_symbols & {*system.coordinates} for entry in forms.lower_mass.values()
-    ):
+    """Return F_q, F_v and L_vq by rows, for few coordinates with position-dependent masses or momenta; else nothing."""
+    forms, m, zero, q = forms_of(system), system.dimension, sympy.Integer(0), system.coordinates
+    of_position = any(entry.free_symbols & {*q} for entry in forms.lower_mass.values())
+    if m > (MOST_LINEARISED if of_position else MOST_COUPLED):
         return ()
-    matrices = (
-        jacobian(forms.force, system.coordinates),
-        jacobian(forms.force, system.velocities),
-        jacobian(forms.momentum, system.coordinates),
-    )
+    momenta = jacobian(forms.momentum, q)
+    if not of_position and (not momenta or all(F.is_polynomial(*q) for F in forms.force)):
+        return ()  # polynomials cost less than the linearised equations
+    matrices = jacobian(forms.force, q), jacobian(forms.force, system.velocities), momenta
     return tuple(matrix.get((i, j), zero) for matrix in matrices for i in range(m) for j in range(m))
 
 

@@ -9,6 +9,7 @@
                                  * decreasing */
 #define SUDDEN_CONVERGENCE 1e-3 /* an iteration reduces the change at most 30 times more than the previous one; more is
                                  * accidental */
+#define DIVERGED 1e6 /* changes above a thousand times the state: iterations are abandoned among the first, too */
 #define LARGEST_CHANGE 1e75 /* the fourth power of a larger change may overflow */
 #define ROUNDING_LEVEL 1e-25 /* changes below 3e-13 of the state may be rounding errors */
 #define CERTAIN_ROUNDING 1e-28 /* changes below 1e-14 that do not decrease are rounding errors */
@@ -57,8 +58,9 @@ static inline int iteration_status(double change, double last, double before, co
   const int small = is_small_remainder(change, last, before, options, MARGIN);
   const int stagnated = (change < CERTAIN_ROUNDING) | ((change < ROUNDING_LEVEL) & (change >= STAGNATION * before));
   const int stopped = (change == 0.0) | ((k > 0) & (change >= last) & stagnated);
-  const int creeping = (change > 0.5 * last) & (change > STAGNATION * before) & (change > PROGRESS_LEVEL);
-  const int slow = (k >= options->max_iterations) | ((k > FIRST_ITERATIONS) & creeping);
+  const double least = k > FIRST_ITERATIONS ? PROGRESS_LEVEL : DIVERGED;
+  const int creeping = (change > 0.5 * last) & (change > STAGNATION * before) & (change > least);
+  const int slow = (k >= options->max_iterations) | creeping;
   return change < INFINITY ? (small | stopped ? 1 : -slow) : -1;
 }
 
