@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from typing import Any, Self
 
 from scvi_codegen.controllers import default_controller
@@ -166,7 +167,11 @@ class TimeSpan(RunOptions):
     @property
     def has_shorter_last_step(self) -> bool:
         """True if the span is not a whole number of fixed steps, so that the last step is shorter."""
-        return not (self.span is None or self.ends_at_time or is_whole(self.span, self.step))
+        if self.span is None or self.ends_at_time:
+            return False
+        if self.in_double_double:
+            return Fraction(self.span) % abs(Fraction(self.step)) != 0
+        return not is_whole(self.span, self.step)
 
     @property
     def covered(self) -> float:

@@ -736,3 +736,40 @@ def test_associative_math_is_an_error(tmp_path: Path) -> None:
         done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
         assert (done.returncode != 0) == bool(wanted)
         assert wanted in done.stderr
+
+
+@pytest.mark.parametrize(("h", "t_end"), [(0.1, 20.0), (0.3, 3.0), (0.7, 2.1), (-0.3, -3.0), (0.25, 2.0), (0.15, 2.0)])
+def test_fixed_steps_end_at_the_final_time(h: float, t_end: float) -> None:
+    """y = 1 - t^2/2, and between impacts y = T s - s^2/2 with T = sqrt(2), at t_end, not at the multiple of h."""
+    ball = lagrange("ball", "y", "y_dot**2/2 - y")
+    stepper = sc.compile_stepper(ball, "svi:2", precision="double-double")
+    observed, reflected = sc.Event("y", -1), sc.Event("y", -1, then={"y_dot": "-y_dot"})
+    with mp.workdps(50):
+        t, T = mp.mpf(t_end), mp.sqrt(2)
+        s = abs(t) - (2 * mp.floor((abs(t) + T) / (2 * T)) - 1) * T
+        expected = 1 - t**2 / 2, T * s - s**2 / 2 if t > T else 1 - t**2 / 2
+        for events, y in zip((observed, reflected), expected, strict=True):
+            if t < 0 and events is reflected:
+                continue
+            for save_every in (1, 3):
+                run = stepper.integrate(["1"], ["0"], h=h, t_end=t_end, events=events, save_every=save_every)
+                assert run.mp("t")[-1] == t
+                assert abs(run.mp("q")[-1][0] - y) < 1e-30 * (1 + abs(y))
+                assert run.steps == round(t_end / h + 0.17)
+        many = stepper.integrate_ensemble([["1"]], [["0"]], h=h, t_end=t_end)
+        assert abs(many.mp("q")[-1][0][0] - expected[0]) < 1e-30 * (1 + t**2)
+
+
+def test_times_have_two_words_or_are_refused() -> None:
+    """x = cos(a) - cos(t) - (t - a) sin(a) from rest at the origin at a = 1/10, where the size of the state is zero."""
+    system = lagrange("driven", "x", "x_dot**2/2 + x*cos(t)")
+    stepper = sc.compile_stepper(system, "svi:8", precision="double-double")
+    run = stepper.integrate([0.0], [0.0], t="0.1", h=0.125, steps=8)
+    again = stepper.integrate(run.q[3], run.p[3], t=run.t[3], h=0.125, steps=5)
+    with mp.workdps(50):
+        tenth = mp.mpf(1) / 10
+        assert abs(run.mp("q")[-1][0] - (mp.cos(tenth) - mp.cos(tenth + 1) - mp.sin(tenth))) < 1e-29
+    assert (again.mp("q")[-1] == run.mp("q")[-1]).all()
+    for times in ({"t_end": Fraction(1, 10)}, {"t_end": 1.0, "t_eval": [Fraction(3, 10)]}):
+        with pytest.raises(StateError, match="must be doubles"):
+            stepper.integrate([0.0], [0.0], **times)

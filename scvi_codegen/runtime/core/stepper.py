@@ -30,6 +30,7 @@ from scvi_codegen.runtime.core.compiled_method import OF_KNOWN_SIZES, Variants
 from scvi_codegen.runtime.core.features import check_together, require
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array, Parameters, States, flat_state
+from scvi_codegen.runtime.core.words import check_doubles, checked_time, hashed
 from scvi_codegen.runtime.ensemble.device import check_device, on_processor
 from scvi_codegen.runtime.ensemble.ensemble import Ensemble
 from scvi_codegen.runtime.ensemble.initial_states import EnsembleParameters, momenta_of_each
@@ -183,8 +184,10 @@ class Stepper(WithEventsInDouble, WithPaths, Integrator):
             start = {"velocity": velocity, "inputs": inputs, "t": t, "parameters": parameters, "options": options}
             saved = {"t_end": t_end, "save_every": save_every, "t_eval": t_eval}
             return stepper._confirmed(wanted, q, p, {**start, "progress": progress}, saved)
-        begin = 0.0 if h is None or t_end is None else t  # one plan for all initial times where they do not matter
-        schedule = h, steps, t_end, tolerance, save_every, begin, interface.time_transformation, stepper.in_tau
+        t = checked_time(t, interface.words)
+        begin = 0.0 if h is None or t_end is None else hashed(t)  # one plan for all times where they do not matter
+        how = interface.time_transformation, stepper.in_tau, interface.words
+        schedule = h, steps, t_end, tolerance, save_every, begin, *how
         try:
             plan, count = planned_steps(*schedule)
         except TypeError:  # of an argument that is not hashable, as an array
@@ -196,7 +199,6 @@ class Stepper(WithEventsInDouble, WithPaths, Integrator):
         if p is None or velocity is not None or interface.constraints:
             q, p = stepper._consistent_state(q, p, velocity, t, parameters)
         growth = 0 if plan.h and not check_growth else measured_growth(stepper, plan, check_growth)
-        t = checked_number(t, "the time t")
         times = None if t_eval is None else stepper._output_times(t_eval, t, plan, count)
         run = Run._reused(stepper)
         run._set_up(plan, parameters, options, q, p)
@@ -310,6 +312,8 @@ class Stepper(WithEventsInDouble, WithPaths, Integrator):
         return checked_plan(h, t_end, tolerance, self.interface.time_transformation, self.in_tau)
 
     def _output_times(self, t_eval: ArrayLike, t: float, plan: StepPlan, steps: int | None) -> Array:
+        if self.interface.words > 1:
+            check_doubles(t_eval=t_eval)
         if steps is None:
             return times_of_run(t_eval, t, plan.t_end)
         if self.in_tau:

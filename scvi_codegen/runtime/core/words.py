@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError
+from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.validation import ExactNumber
 
 Array = NDArray[np.float64]
@@ -267,6 +268,27 @@ def two_words(value: Any, name: str) -> tuple[float, float]:
     if not (np.isfinite(high) and np.isfinite(low)):
         raise StateError(f"{name} is {value}: it must be finite")
     return high, low
+
+
+def checked_time(t: Any, words: int) -> float:
+    """Return a finite time; of runs in two words both of them."""
+    if words == 1 or type(t) is float:
+        return checked_number(t, "the time t")
+    return word(*two_words(t, "the time t"))
+
+
+def hashed(t: float) -> float | Fraction:
+    """Return a time as a number whose hash depends on both words."""
+    return fraction_of(t) if isinstance(t, Word) else t
+
+
+def check_doubles(**times: Any) -> None:
+    """Raise ``StateError`` if a time is not a double, which rounding would change."""
+    for name, given in times.items():
+        if type(given) is not float and given is not None:
+            low = split(given, name)[1]
+            if np.any(low):
+                raise StateError(f"{name} must be doubles, such as 0.125 or float({name}): it has digits beyond those")
 
 
 def split(values: Any, name: str) -> tuple[Any, Any]:

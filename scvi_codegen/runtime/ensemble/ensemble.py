@@ -562,7 +562,7 @@ def _steps_or_end(
     if h is not None and t_end is not None and np.ndim(t_end):
         raise StateError("with h all trajectories have one t_end: give one number, or omit h (adaptive step size)")
     first = None if t_end is None else float(real_array(t_end, "t_end").flat[0])
-    planned_steps.__wrapped__(h, steps, first, tolerance, 1, checked_number(t, "the time t"), "", False)
+    planned_steps.__wrapped__(h, steps, first, tolerance, 1, checked_number(t, "the time t"), "", False, 1)
     if h is None or (inputs is None and first is None):
         return steps, t_end
     return None, final_time(t, h, steps, first)

@@ -72,7 +72,7 @@ class CommonSteps:
         count = 0 if t_end is not None else checked_count(steps, "steps", least=0)
         self.segments = [Segment(count, self.h, (t0, 0.0), t0)]
         if t_end is not None:
-            self.segments = planned_segments(t0, t_end, self.h, inputs) or self.segments
+            self.segments = planned_segments(t0, t_end, self.h, inputs, words=words) or self.segments
         saved = list(accumulate(segment.steps for segment in self.segments))
         self.steps = saved[-1]
         empty_array((self.steps // save_every + 1,))  # rejects numbers of states beyond any memory

@@ -195,13 +195,13 @@ class RefinedSearch(CrossingSearch):
         return [*rows, Row(end, float(end.t - at.t), run.steps, iterations)]
 
     def _take(self, run: Memory) -> None:
-        """Take one step, shorter if it would pass the target time of fixed steps."""
+        """Take one step, the last to the target time of fixed steps: shorter, or longer by the rounding of h."""
         memory, plan = run._memory, run._plan
-        shorter = bool(plan.h) and abs(run.left_to(plan.t_end)) < (1.0 - WHOLE) * abs(plan.h)
-        if shorter:
+        last = bool(plan.h) and abs(run.left_to(plan.t_end)) < (1.0 + WHOLE) * abs(plan.h)
+        if last:
             run._step_to(plan.t_end)
         run._taken(1)
-        if shorter:
+        if last:
             memory.t, memory.t_low = plan.t_end, 0.0
             memory.h, memory.h_low = plan.h, 0.0
 

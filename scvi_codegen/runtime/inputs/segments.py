@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
@@ -294,7 +295,7 @@ def prepared_segments(
         The number of steps of the segment; ``None`` for adaptive steps to the target time of the run.
     """
     if run.plan.fixed:
-        for segment in planned_segments(run.t, t_end, run.h, inputs):
+        for segment in planned_segments(run.t, t_end, run.h, inputs, words=run.stepper.interface.words):
             run.update(parameters=values(segment.middle), h=segment.h)
             if run.stepper.interface.words > 1 and segment.end is not None:
                 run._step_to(segment.end)
@@ -321,13 +322,19 @@ class Segment(NamedTuple):
     end: float | None = None
 
 
-def planned_segments(t: float, t_end: float, h: float, inputs: Mapping[str, Input]) -> list[Segment]:
-    """Return the segments from t to t_end: steps of h, and a shorter one before each breakpoint and the end."""
+def planned_segments(t: float, t_end: float, h: float, inputs: Mapping[str, Input], *, words: int = 1) -> list[Segment]:
+    """Return the segments from t to t_end: steps of h, and a shorter one before each breakpoint and the end.
+
+    In two words (``words``), a step that differs from h by its rounding error is not a multiple of h.
+    """
     forward, now, segments = np.sign(t_end - t), (t, 0.0), []
     negligible = NEGLIGIBLE_STEP * min(abs(h), abs(t_end - t))
     for end in breakpoints_until(t, t_end, inputs):
         middle = now[0] + 0.5 * (end - now[0])
-        if whole := int(np.floor(((end - now[0]) - now[1]) / h + NEGLIGIBLE_STEP)):
+        whole = int(np.floor(((end - now[0]) - now[1]) / h + NEGLIGIBLE_STEP))
+        if words > 1 and 0 < abs(Fraction(end) - sum(map(Fraction, now)) - whole * Fraction(h)) <= negligible:
+            whole -= 1
+        if whole > 0:
             segments.append(Segment(whole, h, now, middle))
             now = time_after_steps(now, h, whole)
         rest = (end - now[0]) - now[1]

@@ -28,7 +28,7 @@ from scvi_codegen.runtime.core.validation import (
     no_input,
     parameter_index,
 )
-from scvi_codegen.runtime.core.words import block_of, low_words, two_words, with_low
+from scvi_codegen.runtime.core.words import Word, block_of, checked_time, low_words, two_words, with_low
 from scvi_codegen.runtime.rotations.states import checked_pair
 from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.saving import checkpoint
@@ -169,12 +169,14 @@ class Memory:
     ) -> None:
         """Start at (q, p) and t; nothing of an earlier run remains."""
         self._set_up(plan, parameters, options, q, p)
-        self._begin(q, p, checked_number(t, "the time t"))
+        self._begin(q, p, checked_time(t, self.stepper.interface.words))
 
     def _begin(self, q: States, p: States, t: float, growth: int = 0) -> None:
         """Start at (q, p) and t after :meth:`_set_up`; ``growth``: value of ``measures_growth`` in C."""
         q, p = map(block_of, checked_pair(self.stepper.interface, q, p))
         self._start_function(t, self._plan.h, *self.stepper.binding.pointers(q, p))
+        if isinstance(t, Word):
+            self._memory.t_low = t.low
         if growth and self._can_measure_growth:
             self._memory.measures_growth = growth
 

@@ -339,6 +339,11 @@ class Observation:
             self.run.rollback(before)
             whole -= 1
             part = record(self.run, whole)
+        in_words = self.run.stepper.interface.words > 1 and not self.run.stepper.interface.time_transformation
+        if whole and in_words and 0.0 < abs(self.run.left_to(self.end)) <= WHOLE * abs(self.run.h):
+            self.run.rollback(before)  # the last step is longer than h by its rounding error
+            whole -= 1
+            part = record(self.run, whole)
         q, p, tau = self._state_within_step(part, self.end)
         lengths = part.step_sizes.copy()
         lengths[-1] = self.run.left_to(self.end) if tau is None else tau - part.stepped[-1]

@@ -2,11 +2,13 @@
 
 import math
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from functools import lru_cache
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.runtime.core.features import FEATURES, refusal
+from scvi_codegen.runtime.core.words import check_doubles
 from scvi_codegen.runtime.run.times import steps_to
 from scvi_codegen.validation import check_tolerance, checked_count
 
@@ -82,9 +84,10 @@ def planned_steps(
     t_end: float | None,
     tolerance: float | None,
     save_every: int,
-    t: float,
+    t: float | Fraction,
     controller: str,
     in_tau: bool,
+    words: int,
     /,
 ) -> tuple[StepPlan, int | None]:
     """Return the plan of :meth:`Stepper.integrate` and its number of steps, ``None`` to t_end.
@@ -92,12 +95,15 @@ def planned_steps(
     Args:
         h, steps, t_end, tolerance, save_every, t: arguments of :meth:`Stepper.integrate`; t matters with h and t_end.
         controller, in_tau: as of :func:`checked_plan`.
+        words: number of words of the states; runs in double-double end at t_end to 32 digits.
 
     Raises:
         StateError: if a number is invalid, or they do not determine the steps.
     """
     fixed = h is not None and not controller
     plan = checked_plan(h, None if fixed else t_end, tolerance, controller, in_tau)
+    if words > 1:
+        check_doubles(t_end=t_end)
     if not fixed:  # Adaptive, or equal steps of tau by the controller
         if steps is not None:
             raise StateError(f"adaptive steps end at t_end={plan.t_end:g}: omit steps={steps}, or give h and steps")
@@ -106,7 +112,7 @@ def planned_steps(
         if steps is None:
             raise StateError("h requires steps or t_end (fixed step size); give t_end without h for adaptive steps")
         return plan, checked_count(steps, "steps", least=0)
-    count = None if in_tau or steps is not None else steps_to(t, t_end, plan.h)
+    count = None if in_tau or steps is not None else steps_to(t, t_end, plan.h, exactly=words > 1)
     if count is not None and count % checked_count(save_every, "save_every", least=1) == 0:
         return plan, count
     end = checked_number(t_end, "the time t_end")

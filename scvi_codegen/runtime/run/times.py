@@ -1,6 +1,7 @@
 """Double-double times t + n h of runs; numbers of steps that make up a span."""
 
 import math
+from fractions import Fraction
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -37,8 +38,10 @@ def steps_within(spans: ArrayLike, h: float) -> NDArray[np.intp]:
     return counts.astype(np.intp)
 
 
-def steps_to(t: float, t_end: float, h: float) -> int | None:
+def steps_to(t: float | Fraction, t_end: float, h: float, *, exactly: bool = False) -> int | None:
     """Return the number of steps h from t to t_end, or ``None`` if the last has to be shorter.
+
+    ``exactly``: without an allowance for the rounding of h.
 
     Raises:
         StateError: if h has the wrong sign or is too small.
@@ -48,4 +51,7 @@ def steps_to(t: float, t_end: float, h: float) -> int | None:
         raise StateError(f"h = {h:g} has the wrong sign for a run from t = {t:g} to t_end = {t_end:g}: use h = {-h:g}")
     if not span <= MOST_STEPS:
         raise StateError(f"h = {h:g} requires {span:.0e} steps from t = {t:g} to t_end = {t_end:g}: give a larger h")
-    return round(span) if abs(span - round(span)) <= WHOLE else None
+    count = round(span)
+    if exactly:
+        return count if Fraction(t) + count * Fraction(h) == Fraction(t_end) else None
+    return count if abs(span - count) <= WHOLE else None

@@ -10,6 +10,7 @@
 
 #define CORRECTED 1e-34 /* last change of D, relative to the state */
 #define CORRECTED_BIAS 0.05 /* last change of D', relative to itself */
+#define SMALLEST_SIZE 1e-280 /* of a coordinate; 1e15 times its inverse is finite */
 #define CORRECTED_ROUNDING 1e-15 /* changes relative to the residual that may be rounding errors; ten times these are */
 #define MOST_CORRECTIONS 200
 
@@ -113,10 +114,11 @@ static void begin_pairs(pair_step *w, const step_data *step, double t_low, doubl
   mass_pairs(NULL, w->t, step->parameters, masses);
   for (int i = 0; i < M; i++) {
     const dd q = dd_of(step->q0[i], step->carry_q[i]), p = dd_of(step->p0[i], step->carry_p[i]);
+    double farthest = fabs(q.high);
     w->inverse_mass[i] = dd_divide(dd_of(1.0, 0.0), masses[i]);
     w->drift[i] = dd_multiply(dd_multiply(p, w->inverse_mass[i]), h);
     w->scale[i] = w->square.high * w->inverse_mass[i].high;
-    w->inverse_size[i] = fabs(q.high) + fabs(w->drift[i].high);
+    w->inverse_size[i] = fabs(w->drift[i].high);
     for (int n = 0; n < GROUPS; n++) {
       const ddl node = {DRIFT[n], DRIFT_LOW[n]};
       const ddl drift = ddl_of(w->drift[i]), product = ddl_two_product(node.high, drift.high);
@@ -124,11 +126,14 @@ static void begin_pairs(pair_step *w, const step_data *step, double t_low, doubl
       const ddl moved = ddl_fast_two_sum(product.high, product.low + multiply_add(node.high, drift.low, lower));
       w->base[n][i] = ddl_add(ddl_of(q), moved);
       w->X[n][i] = ddl_word(X[n][i]);
+      for (int j = 0; j < LANES; j++) /* at rest in the origin, q and p are 0 */
+        farthest = larger(farthest, fabs(lane_of(&X[n][i], j)));
     }
+    w->inverse_size[i] += farthest;
   }
   const double largest = largest_number(w->inverse_size);
   for (int i = 0; i < M; i++)
-    w->inverse_size[i] = 1.0 / (w->inverse_size[i] + 1e-3 * largest + DBL_MIN);
+    w->inverse_size[i] = 1.0 / (w->inverse_size[i] + 1e-3 * largest + SMALLEST_SIZE);
 }
 
 /* Residual of the stage equations, as one word; X has one, so that its difference from the high word is exact. */
