@@ -17,7 +17,7 @@ from itertools import accumulate, chain
 from typing import Any, Literal, TypeAlias, cast, get_args
 
 from scvi_codegen.ir.derivatives import Derivatives, PointDerivatives
-from scvi_codegen.ir.equations import Control, IterationTable, StoredValues
+from scvi_codegen.ir.equations import Control, IterationTable, Rattle, StoredValues
 from scvi_codegen.ir.kernel import Kernel, Number, is_divided
 from scvi_codegen.ir.program import Program
 from scvi_codegen.rendering.environment import support_text, template_environment
@@ -298,13 +298,30 @@ def _render_mixed_newton(program: Program, control: Control | None) -> Source:
         *(kernel for kernel in of_states if kernel),
         *(replace(kernel, values=len(kernel.results)) for kernel in with_partials if kernel),
     )
+    rattle, vectors = program.rattle, tuple[Kernel, ...]()
+    plain = not (program.damping or quantities.integrals)
+    if rattle and constraints and rattle.points > 1 and plain and _of_forces_alone(rattle):
+        kernels = *kernels, *rattle.kernels
+        of_points = *rattle.kernels, replace(constraints.kernel, values=len(constraints.kernel.results))
+        vectors = tuple(replace(each, name=f"{each.name}_of_points") for each in of_points)
     context = _context(program, DOUBLE, control)
     context |= {
         "unrolled_equations": None,
-        "two_words": {"of_numbers": kernels, "functions": bool(program.damping) or uses_functions(kernels)},
+        "rattle_in_pairs": vectors != (),
+        "two_words": {
+            "of_numbers": kernels,
+            "of_vectors": vectors,
+            "meaning": POINTS,
+            "functions": bool(program.damping) or uses_functions(kernels),
+        },
         "own_headers": {**arithmetic_headers(), **cast("Mapping[str, str]", context["own_headers"])},
     }
     return _render(program.prefix, context)
+
+
+def _of_forces_alone(rattle: Rattle) -> bool:
+    """Return whether masses are constant, and forces and momenta do not depend on velocities and positions."""
+    return rattle.part == "rattle" and not rattle.macros
 
 
 def render_embedded(program: Program, precision: Embedded, control: Control | None = None) -> Source:
@@ -329,7 +346,7 @@ def _render(prefix: str, context: Mapping[str, object], entry: str = "stepper") 
         "max_iterations": MAX_ITERATIONS,
         "on_device": False,
     }
-    environment, context = template_environment(), {**common, "two_words": None, **context}
+    environment, context = template_environment(), {**common, "two_words": None, "rattle_in_pairs": False, **context}
     header = entry if entry in DECLARATIONS else "stepper"
     code = environment.get_template(f"{entry}.c.jinja").render(context)
     headers = cast("Mapping[str, str]", context.get("own_headers", {}))

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from mpmath import mp
+from notation import lagrange
 
 import scvi_codegen as sc
 from scvi_codegen.exact.step import derived_step
@@ -186,3 +187,28 @@ def test_initial_states() -> None:
     many = stepper.integrate_ensemble([q, q], [p, p], h=0.1, steps=1)
     assert (many.q[-1] == again.q[-1]).all()
     assert (many.q.low[-1] == again.q.low[-1]).all()
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("degree", [2, 5, 9])
+def test_constraints_by_multipliers(degree: int) -> None:
+    """Steps by RATTLE that are continued in two words agree with those by the factors of all unknowns."""
+    bar = "(x_dot**2 + x_dot*u_dot + u_dot**2 + y_dot**2 + y_dot*w_dot + w_dot**2)/6 - (y + w)/2"
+    moved = "(x_dot**2 + m*y_dot**2)/2 - y - exp(-x*y)*sin(t)"
+    for constrained, start in (
+        (system("rods"), STATES["rods"]),
+        (lagrange("bar", FOUR, bar, constraints=[ROD, f"{SECOND}1"]), STATES["rods"]),
+        (lagrange("moved", PLANE, moved, m=1.1, constraints=["x**2 + (y - sin(t)/10)**2 - 1"]), STATES["rod"]),
+    ):
+        one, other = (
+            sc.compile_stepper(constrained, f"svi:{degree}", solver=solver, precision="double-double")
+            for solver in ("auto", "newton")
+        )
+        assert "RATTLE_IN_PAIRS" in one.source.code
+        assert "RATTLE_IN_PAIRS" not in other.source.code
+        q, p = one.project(start[0], velocity=start[1])
+        for plan in ({"h": 0.0625, "steps": 5}, {"h": -0.0625, "t_end": -0.2}):
+            runs = [stepper.integrate(q, p, **plan) for stepper in (one, other)]
+            for name in ("q", "p"):
+                assert abs(runs[0].mp(name) - runs[1].mp(name)).max() < 1e-30
+            assert max(abs(each).max() for each in runs[0].constraint_values()) < 5e-31

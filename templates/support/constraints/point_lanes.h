@@ -60,7 +60,11 @@ enum {
   LAST_GROUP = (DEGREE - 1) / LANES,
   LANE_BYTES = LANES * sizeof(real)
 };
+#ifdef RATTLE_IN_PAIRS
+#include "../core/vectors.h"
+#else
 typedef real lanes __attribute__((vector_size(LANE_BYTES)));
+#endif
 typedef lane_number lane_numbers __attribute__((vector_size(LANE_BYTES)));
 
 #if defined(__AVX512F__) && POINT_LANES >= 8 && !defined(__clang__)
@@ -96,11 +100,13 @@ LANE_FUNCTION void store(real *x, int g, lanes values)
   memcpy(x + g * LANES, &values, sizeof values);
 }
 
+#ifndef RATTLE_IN_PAIRS
 LANE_FUNCTION lanes lanes_of(real x)
 {
   const lanes zero = {0};
   return zero + x;
 }
+#endif
 
 /* Group g of x at the points before, first at the first point. */
 LANE_FUNCTION lanes former(const real *x, real first, int g)
@@ -246,12 +252,14 @@ static inline int accepts(const movement *moved, const movement *last, const sol
   return k > TRANSIENT_ITERATIONS && stagnant && moved->overall > STAGNANT_ROUNDOFF ? -1 : 0;
 }
 
+#ifndef RATTLE_IN_PAIRS
 /* The larger of x and y, x where y is NaN. */
 LANE_FUNCTION lanes larger_lanes(lanes x, lanes y)
 {
   const lane_numbers chosen = (lane_numbers)(y > x);
   return (lanes)(((lane_numbers)y & chosen) | ((lane_numbers)x & ~chosen));
 }
+#endif
 
 LANE_FUNCTION real largest_lane(const lanes *x)
 {

@@ -57,6 +57,17 @@ typedef struct {
   real inverse_mass[INVERSE_MASSES];
 } rattle_data;
 
+#ifdef RATTLE_IN_PAIRS
+/* Step that is continued in pairs, by_rattle: if RATTLE solved it, and M^-1 in pairs. */
+typedef struct {
+  int by_rattle;
+  dd inverse_mass[INVERSE_MASSES];
+  rattle_step now;
+} solved_step;
+
+#define POINTS_OF_STEP(name) solved_step name
+#endif
+
 /* Computes the lower half of M^-1; NaN if M is singular. Coordinates that no masses couple share a solution. */
 static void prepare_rattle(const step_data *step, rattle_data *data)
 {

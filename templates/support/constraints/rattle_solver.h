@@ -73,9 +73,19 @@ static int finish_step(const step_data *step, rattle_step *now, newton_data *dat
 static int rattle(const step_data *step, const rattle_data *run, const real *memory, newton_data *data, real *dp,
     const solver_options *options, solver_report *report)
 {
-  rattle_step now;
-  int status = begin(step, run, memory, &now);
+  rattle_step local, *now = &local;
+#ifdef RATTLE_IN_PAIRS
+  solved_step *solved = (solved_step *)step->points;
+  now = solved ? &solved->now : now;
+#endif
+  int status = begin(step, run, memory, now);
   if (status == OK)
-    status = solve_constraints(step, &now, options, report);
-  return status == OK ? finish_step(step, &now, data, dp) : status;
+    status = solve_constraints(step, now, options, report);
+  if (status == OK)
+    status = finish_step(step, now, data, dp);
+#ifdef RATTLE_IN_PAIRS
+  if (solved)
+    solved->by_rattle = status == OK;
+#endif
+  return status;
 }

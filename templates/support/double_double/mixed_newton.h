@@ -53,7 +53,7 @@ static inline int variable_pairs(const step_data *step, const pair_equations *at
 
 /* Replaces the increments of a step, solved in double, by those in two words; `memory` has its unknowns. The workspace
  * then has the factors of the Jacobian at these. On failure they are undefined. */
-static int refine_increments(const step_data *step, double *memory, double t_low, double h_low, double *dq, double *dp,
+static int refine_unknowns(const step_data *step, double *memory, double t_low, double h_low, double *dq, double *dp,
     double *passed, double *workspace)
 {
   newton_data *data = newton_in(workspace);

@@ -16,6 +16,10 @@ static void prepare(const step_data *step, solver_data *data)
   data->rattle_alone = 0;
 #ifdef RATTLE
   prepare_rattle(step, &data->rattle);
+#ifdef RATTLE_IN_PAIRS
+  if (step->points)
+    invert_mass_pairs(step, data->rattle.inverse_mass, ((solved_step *)step->points)->inverse_mass);
+#endif
 #else
   (void)step;
 #endif
@@ -82,6 +86,10 @@ static int solve(const step_data *step, const solver_data *way, real *memory, lo
   if (POINT > 0 && *guess == 2)
     keep = step->first ? remake_factors(step, memory + N, data) : 1;
 #ifdef RATTLE
+#ifdef RATTLE_IN_PAIRS
+  if (step->points)
+    ((solved_step *)step->points)->by_rattle = 0;
+#endif
   if (!is_suspended(*guess))
     status = rattle(step, &way->rattle, *guess ? memory : NULL, data, dp, options, report);
   keep = 0;

@@ -35,9 +35,9 @@ int NAME(advance_to)(run_memory *run, real t_end, real tolerance, long long step
   now.step = step_from(run->t, 0, now.at.q, now.at.p, now.at.carry_q, now.at.carry_p, parameters, workspace);
   load_state(run, &now.at);
 #ifdef MIXED_POINTS
-  now.step.points = (double *)now.points;
+  now.step.points = (double *)&now.points;
 #elif defined(ERROR_GROWTH)
-  now.step.points = run->measures_growth ? (double *)now.points : NULL;
+  now.step.points = run->measures_growth ? (double *)&now.points : NULL;
 #endif
   while (report->steps < steps && !has_arrived(now.at.t, now.at.t_low, t_end)) {
     const long long before = report->iterations;

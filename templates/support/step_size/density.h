@@ -58,7 +58,7 @@ typedef struct {
   int last; /* 1 if the step ends at t_end */
   int turned; /* 1 if the run reverses its direction */
 #ifdef MIXED_POINTS
-  coordinates points[GROUPS]; /* of the step in double */
+  POINTS_OF_STEP(points); /* of the step in double */
 #endif
 } trial;
 

@@ -126,7 +126,7 @@ typedef struct {
   int failures; /* trials of the step that failed */
 #endif
 #if defined(ERROR_GROWTH) || defined(MIXED_POINTS)
-  coordinates points[GROUPS]; /* of the last trial */
+  POINTS_OF_STEP(points); /* of the last trial */
 #endif
 } trial;
 

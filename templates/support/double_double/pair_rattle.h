@@ -1,0 +1,312 @@
+#include "../constraints/rattle_solver.h"
+#include "mixed_newton.h"
+
+/* Increments of a step in two words: RATTLE (rattle.h) is continued in pairs of vectors from its solution in
+ * double: positions u and multipliers have two words, their corrections have one. With the residuals
+ *   r = q0 + h c v0 + h^2 R a - u,    g(u),    a = M^-1 (F(u) + G^T lambda),
+ * in pairs, which are small, so that one word of each has 16 digits, the correction of lambda solves P dlambda =
+ * -R^-1 (g + G r) / h^2, and that of u is r + h^2 R M^-1 G^T dlambda. What it neglects shrinks as the updates of RATTLE
+ * do. Momenta are projected by multipliers of two words. Requires: rattle.h, rattle_solver.h, mixed_newton.h; the
+ * kernels constrained_force_of_points, constraints_of_points (of vectors) and constrained_motion; RATTLE_ABSCISSA_LOW,
+ * RATTLE_WEIGHT_LOW. */
+#define NEGLECTED 4.0 /* multiple of the next update, from the last two, that is below REFINED */
+
+/* Values of a step at its points, as in rattle.h. */
+typedef struct {
+  dd t, h, drift[M], q0[M], first_force[M], first_derivative[CONSTRAINT_ENTRIES];
+  ddl u[M][GROUPS], force[M][GROUPS], moved[M][GROUPS], lambda[CONSTRAINTS][GROUPS], f[M][GROUPS];
+  ddl g[CONSTRAINTS][GROUPS], derivative[CONSTRAINT_ENTRIES][GROUPS];
+} rattle_pairs;
+
+/* Corrects the lower half of M^-1 to two words: X + X (1 - M X). */
+static void invert_mass_pairs(const step_data *step, const double *inverse_mass, dd *result)
+{
+  dd u[2 * M], value[M + MASS_ENTRIES], rest[M];
+  double x[M][M] = {{0.0}}, left[M][M];
+  memset(u, 0, sizeof u);
+  legendre_pairs(u, dd_word(step->t), step->parameters, value);
+  for (int e = 0; e < INVERSE_MASSES; e++) {
+    const int i = INVERSE_MASS_ENTRY[e][0], j = INVERSE_MASS_ENTRY[e][1];
+    x[i][j] = x[j][i] = inverse_mass[e];
+  }
+  for (int j = 0; j < M; j++) {
+    for (int i = 0; i < M; i++)
+      rest[i] = dd_word(i == j);
+    for (int e = 0; e < MASS_ENTRIES; e++) {
+      const int i = MASS_ENTRY[e][0];
+      rest[i] = dd_subtract(rest[i], dd_scale(value[M + e], x[MASS_ENTRY[e][1]][j]));
+    }
+    for (int i = 0; i < M; i++)
+      left[i][j] = rest[i].high;
+  }
+  for (int e = 0; e < INVERSE_MASSES; e++) {
+    double sum = 0.0;
+    for (int k = 0; k < M; k++)
+      sum += x[INVERSE_MASS_ENTRY[e][0]][k] * left[k][INVERSE_MASS_ENTRY[e][1]];
+    result[e] = dd_two_sum(inverse_mass[e], sum);
+  }
+}
+
+LANE_FUNCTION ddl former_pairs(const ddl *x, dd first, int g)
+{
+  const lanes high = g > 0 ? x[g - 1].high : lanes_of(first.high), low = g > 0 ? x[g - 1].low : lanes_of(first.low);
+  return ddl_of_words(FORMER(x[g].high, high), FORMER(x[g].low, low));
+}
+
+LANE_FUNCTION dd pair_of_lane(const ddl *x, int n)
+{
+  double high[LANES], low[LANES];
+  memcpy(high, &x[n / LANES].high, sizeof high);
+  memcpy(low, &x[n / LANES].low, sizeof low);
+  return dd_of(high[n % LANES], low[n % LANES]);
+}
+
+/* Group g of sum_n table_n x_n: Dot2 (Ogita, Rump & Oishi 2005), in two sums. */
+LANE_FUNCTION ddl pair_times(const real (*table)[POINT_LANES], const real (*table_low)[POINT_LANES],
+    const real *x, const real *x_low, int g)
+{
+  ddl sum[2] = {{{0.0}, {0.0}}, {{0.0}, {0.0}}};
+#pragma GCC unroll 16
+  for (int n = 0; n < DEGREE; n++) {
+    const lanes high = lanes_of(x[n]), entry = load(table[n], g);
+    const ddl product = ddl_two_product(entry, high), next = ddl_two_sum(sum[n % 2].high, product.high);
+    sum[n % 2].high = next.high;
+    sum[n % 2].low += multiply_add(entry, lanes_of(x_low[n]), load(table_low[n], g) * high) + (product.low + next.low);
+  }
+  const ddl both = ddl_two_sum(sum[0].high, sum[1].high);
+  return ddl_fast_two_sum(both.high, both.low + (sum[0].low + sum[1].low));
+}
+
+/* x = M^-1 y in pairs of numbers. */
+static inline void pair_accelerations(const dd *inverse_mass, const dd *y, dd *x)
+{
+  for (int i = 0; i < M; i++)
+    x[i] = dd_multiply(inverse_mass[i], y[i]);
+  for (int e = M; e < INVERSE_MASSES; e++) {
+    const int i = INVERSE_MASS_ENTRY[e][0], j = INVERSE_MASS_ENTRY[e][1];
+    x[i] = dd_add(x[i], dd_multiply(inverse_mass[e], y[j]));
+    x[j] = dd_add(x[j], dd_multiply(inverse_mass[e], y[i]));
+  }
+}
+
+static inline __attribute__((flatten)) void evaluate_pairs_of_points(const double *parameters, rattle_pairs *at)
+{
+  for (int g = 0; g < GROUPS; g++) {
+    const ddl abscissa = {load(RATTLE_ABSCISSA + 1, g), load(RATTLE_ABSCISSA_LOW + 1, g)};
+    const ddl t = ddl_add(ddl_of(at->t), ddl_multiply(abscissa, ddl_of(at->h)));
+    ddl u[M], force[M], value[CONSTRAINTS + CONSTRAINT_ENTRIES];
+    for (int i = 0; i < M; i++)
+      u[i] = at->u[i][g];
+    constrained_force_of_points_pairs(u, t, parameters, force);
+    constraints_of_points_pairs(u, t, parameters, value);
+    for (int i = 0; i < M; i++)
+      at->force[i][g] = force[i];
+    for (int k = 0; k < CONSTRAINTS; k++)
+      at->g[k][g] = value[k];
+    for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
+      at->derivative[e][g] = value[CONSTRAINTS + e];
+  }
+}
+
+/* F + G^T lambda at all points but the last. */
+static inline void all_pair_forces(rattle_pairs *at)
+{
+  for (int g = 0; g < GROUPS; g++) {
+    for (int i = 0; i < M; i++)
+      at->f[i][g] = former_pairs(at->force[i], at->first_force[i], g);
+    for (int e = 0; e < CONSTRAINT_ENTRIES; e++) {
+      const ddl derivative = former_pairs(at->derivative[e], at->first_derivative[e], g);
+      ddl *f = &at->f[CONSTRAINT_ENTRY[e][1]][g];
+      *f = ddl_add(*f, ddl_multiply(derivative, at->lambda[CONSTRAINT_ENTRY[e][0]][g]));
+    }
+  }
+}
+
+/* Computes the residuals r of the positions, and h^2 R a + h c v0. */
+static inline void find_pair_residuals(const solved_step *solved, rattle_pairs *at, real (*r)[GROUP_LANES])
+{
+  const ddl square = ddl_of(dd_multiply(at->h, at->h));
+  ddl a[M][GROUPS];
+  for (int g = 0; g < GROUPS; g++) {
+    for (int i = 0; i < M; i++)
+      a[i][g] = ddl_multiply(ddl_of(solved->inverse_mass[i]), at->f[i][g]);
+    for (int e = M; e < INVERSE_MASSES; e++) {
+      const int i = INVERSE_MASS_ENTRY[e][0], j = INVERSE_MASS_ENTRY[e][1];
+      a[i][g] = ddl_add(a[i][g], ddl_multiply(ddl_of(solved->inverse_mass[e]), at->f[j][g]));
+      a[j][g] = ddl_add(a[j][g], ddl_multiply(ddl_of(solved->inverse_mass[e]), at->f[i][g]));
+    }
+  }
+  for (int i = 0; i < M; i++) {
+    real high[GROUP_LANES], low[GROUP_LANES];
+    for (int g = 0; g < GROUPS; g++) {
+      store(high, g, a[i][g].high);
+      store(low, g, a[i][g].low);
+    }
+    IN_MEMORY(high);
+    IN_MEMORY(low);
+    for (int g = 0; g < GROUPS; g++) {
+      const ddl node = {load(RATTLE_DRIFT, g), load(RATTLE_DRIFT_LOW, g)};
+      const ddl curved = ddl_multiply(square, pair_times(RATTLE_RESPONSE, RATTLE_RESPONSE_LOW, high, low, g));
+      at->moved[i][g] = ddl_add(ddl_multiply(node, ddl_of(at->drift[i])), curved);
+      store(r[i], g, ddl_subtract(ddl_add(ddl_of(at->q0[i]), at->moved[i][g]), at->u[i][g]).high);
+    }
+  }
+  IN_MEMORY(*r);
+}
+
+/* Corrects the multipliers, and replaces r by the correction of the positions. */
+static inline void correct_points(const rattle_step *now, rattle_pairs *at, factors *l, real (*r)[GROUP_LANES])
+{
+  const real hh = at->h.high * at->h.high, scale = 1 / hh;
+  real g_high[CONSTRAINTS][GROUP_LANES], change[M][GROUP_LANES];
+  for (int k = 0; k < CONSTRAINTS; k++)
+    for (int g = 0; g < GROUPS; g++)
+      store(g_high[k], g, at->g[k][g].high);
+  IN_MEMORY(g_high);
+  for (int g = 0; g < GROUPS; g++) {
+    lanes derivative[CONSTRAINT_ENTRIES], x[CONSTRAINTS], f[M], a[M];
+    former_derivatives(now, g, derivative);
+    for (int i = 0; i < M; i++) {
+      a[i] = scale * times(RATTLE_INVERSE, DEGREE, r[i], g);
+      f[i] = lanes_of(0);
+    }
+    for (int k = 0; k < CONSTRAINTS; k++)
+      x[CONSTRAINT_POSITION[k]] = scale * times(RATTLE_INVERSE, DEGREE, g_high[k], g);
+    for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
+      x[CONSTRAINT_POSITION[CONSTRAINT_ENTRY[e][0]]] += derivative[e] * a[CONSTRAINT_ENTRY[e][1]];
+    solve_points(l[g], x);
+    for (int k = 0; k < CONSTRAINTS; k++)
+      at->lambda[k][g] = ddl_add(at->lambda[k][g], ddl_word(-x[CONSTRAINT_POSITION[k]]));
+    for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
+      f[CONSTRAINT_ENTRY[e][1]] -= derivative[e] * x[CONSTRAINT_POSITION[CONSTRAINT_ENTRY[e][0]]];
+    find_accelerations(now->inverse_mass, f, a);
+    for (int i = 0; i < M; i++)
+      store(change[i], g, a[i]);
+  }
+  IN_MEMORY(change);
+  for (int i = 0; i < M; i++)
+    for (int g = 0; g < GROUPS; g++) {
+      const lanes curved = hh * times(RATTLE_RESPONSE, DEGREE, change[i], g), update = load(r[i], g) + curved;
+      at->moved[i][g] = ddl_add(at->moved[i][g], ddl_word(curved));
+      at->u[i][g] = ddl_add(at->u[i][g], ddl_word(update));
+      store(r[i], g, update);
+    }
+}
+
+/* Projects the momenta p0 + dp at the end of the step, where the multipliers are nearly x. */
+static void project_end(const solved_step *solved, const step_data *step, const rattle_pairs *at, const dd *q,
+    const double *x, dd *dp)
+{
+  enum { ROUNDS = 2 };
+  const dd weight = dd_multiply(at->h, dd_of(RATTLE_WEIGHT[DEGREE], RATTLE_WEIGHT_LOW[DEGREE]));
+  factors l;
+  lanes derivative[CONSTRAINT_ENTRIES], right[CONSTRAINTS];
+  dd u[2 * M], p[M], mu[CONSTRAINTS], last[CONSTRAINT_ENTRIES], value[M + 2 * CONSTRAINTS];
+  memcpy(u, q, sizeof(dd) * M);
+  for (int e = 0; e < CONSTRAINT_ENTRIES; e++) {
+    derivative[e] = at->derivative[e][LAST_GROUP].high;
+    last[e] = dd_multiply(weight, pair_of_lane(at->derivative[e], DEGREE - 1));
+  }
+  for (int k = 0; k < CONSTRAINTS; k++)
+    mu[k] = dd_word(x[k * B]);
+  factorise_points(derivative, solved->now.inverse_mass, l);
+  for (int n = 0; n <= ROUNDS; n++) {
+    for (int i = 0; i < M; i++)
+      p[i] = dp[i];
+    for (int e = 0; e < CONSTRAINT_ENTRIES; e++) {
+      const int i = CONSTRAINT_ENTRY[e][1];
+      p[i] = dd_add(p[i], dd_multiply(last[e], mu[CONSTRAINT_ENTRY[e][0]]));
+    }
+    if (n == ROUNDS)
+      break;
+    for (int i = 0; i < M; i++)
+      value[i] = dd_add(dd_of(step->p0[i], step->carry_p[i]), p[i]);
+    pair_accelerations(solved->inverse_mass, value, u + M);
+    constrained_motion_pairs(u, dd_add(at->t, at->h), step->parameters, value);
+    for (int k = 0; k < CONSTRAINTS; k++)
+      right[CONSTRAINT_POSITION[k]] = lanes_of(-value[M + k].high / weight.high);
+    solve_points(l, right);
+    for (int k = 0; k < CONSTRAINTS; k++)
+      mu[k] = dd_add(mu[k], dd_word(right[CONSTRAINT_POSITION[k]][(DEGREE - 1) % LANES]));
+  }
+  memcpy(dp, p, sizeof p);
+}
+
+/* Values at the first point, and the solution in double. */
+static inline void begin_rattle_pairs(const solved_step *solved, const step_data *step, double t_low, double h_low,
+    rattle_pairs *at)
+{
+  dd p0[M], value[CONSTRAINTS + CONSTRAINT_ENTRIES];
+  at->t = dd_of(step->t, t_low);
+  at->h = dd_of(step->h, h_low);
+  for (int i = 0; i < M; i++) {
+    at->q0[i] = dd_of(step->q0[i], step->carry_q[i]);
+    p0[i] = dd_of(step->p0[i], step->carry_p[i]);
+  }
+  pair_accelerations(solved->inverse_mass, p0, at->drift);
+  for (int i = 0; i < M; i++)
+    at->drift[i] = dd_multiply(at->h, at->drift[i]);
+  constrained_force_pairs(at->q0, at->t, step->parameters, at->first_force);
+  constraints_pairs(at->q0, at->t, step->parameters, value);
+  memcpy(at->first_derivative, value + CONSTRAINTS, sizeof at->first_derivative);
+  for (int g = 0; g < GROUPS; g++) {
+    for (int i = 0; i < M; i++)
+      at->u[i][g] = ddl_word(load(solved->now.u[i], g));
+    for (int k = 0; k < CONSTRAINTS; k++)
+      at->lambda[k][g] = ddl_word(solved->now.lambda[k][g]);
+  }
+}
+
+/* Replaces the increments of a step that RATTLE solved; x: its last multipliers. */
+static int refine_points(solved_step *solved, const step_data *step, const double *x, double t_low, double h_low,
+    double *dq, double *dp)
+{
+  rattle_pairs at;
+  factors l[GROUPS];
+  lanes derivative[CONSTRAINT_ENTRIES], change[M * GROUPS];
+  real inverse_size[M], r[M][GROUP_LANES], last = INFINITY;
+  dd end[M], q[M];
+  const real largest = invert_term_sizes(step, &solved->now, inverse_size);
+  for (int i = 0; i < M; i++)
+    inverse_size[i] = 1 / (1 / inverse_size[i] + 1e-3 * largest);
+  begin_rattle_pairs(solved, step, t_low, h_low, &at);
+  for (int g = 0; g < GROUPS; g++) {
+    former_derivatives(&solved->now, g, derivative);
+    factorise_points(derivative, solved->now.inverse_mass, l[g]);
+  }
+  for (int k = 0;; k++) {
+    evaluate_pairs_of_points(step->parameters, &at);
+    all_pair_forces(&at);
+    find_pair_residuals(solved, &at, r);
+    correct_points(&solved->now, &at, l, r);
+    for (int n = 0; n < M * GROUPS; n++)
+      change[n] = load(r[n / GROUPS], n % GROUPS);
+    const real moved = measure_change(change, inverse_size, largest).relative;
+    const real next = moved * larger(moved / last, FASTEST_MULTIPLIERS);
+    if (!is_finite(moved))
+      return NOT_FINITE;
+    if (moved <= REFINED || (k > 0 && NEGLECTED * next <= REFINED))
+      break;
+    if (moved <= REFINED_ROUNDING && !(moved < last / 4))
+      break;
+    if (k + 1 >= MOST_ITERATIONS || (k > TRANSIENT_ITERATIONS && moved > SLOWEST_MULTIPLIERS * last))
+      return NOT_CONVERGED;
+    last = moved;
+  }
+  all_pair_forces(&at);
+  for (int i = 0; i < M; i++) {
+    const dd moved = pair_of_lane(at.moved[i], DEGREE - 1);
+    dd sum = dd_of(0.0, 0.0);
+    for (int n = 0; n <= DEGREE; n++) {
+      const dd force = n < DEGREE ? pair_of_lane(at.f[i], n) : pair_of_lane(at.force[i], DEGREE - 1);
+      sum = dd_add(sum, dd_multiply(dd_of(RATTLE_WEIGHT[n], RATTLE_WEIGHT_LOW[n]), force));
+    }
+    end[i] = dd_multiply(at.h, sum);
+    q[i] = dd_add(at.q0[i], moved);
+    dq[i] = moved.high, dq[M + i] = moved.low;
+  }
+  project_end(solved, step, &at, q, x, end);
+  for (int i = 0; i < M; i++)
+    dp[i] = end[i].high, dp[M + i] = end[i].low;
+  return all_finite(dq, 2 * M) && all_finite(dp, 2 * M) ? OK : NOT_FINITE;
+}
