@@ -98,15 +98,14 @@ def test_closed_loops_in_mujoco_are_soft_unless_stiff():
     assert stiff < 0.1 * soft < 0.1
 
 
-def test_instability_of_mujoco_is_reported_and_leaves_no_file(monkeypatch, tmp_path):
+def test_instability_of_mujoco_is_reported_and_leaves_no_file(monkeypatch, here):
     """MuJoCo would write its warnings into the working folder."""
     pytest.importorskip("mujoco", reason="extra bench")
-    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(engines, "LARGEST_STEP", 2.0)
     robot = replace(chain(5), span=400.0)
     with pytest.raises(ArithmeticError, match="unstable"):
         end(next(engines.mujoco_contenders(robot, quick=True)))
-    assert not list(tmp_path.iterdir())
+    assert not list(here.iterdir())
 
 
 @pytest.mark.full

@@ -10,6 +10,7 @@ from commands import output_of
 from scvi_codegen import SVI, Event, LagrangianSystem, Model, StateError, compile_stepper, generate_package, save_model
 from scvi_codegen.files.energy import MOST_BALANCED_COORDINATES, MOST_BALANCED_STEPS, energy_account
 
+pytestmark = pytest.mark.usefixtures("here")
 MODEL = """
 [system]
 name = "damped pair"
@@ -31,11 +32,6 @@ step = 0.1
 steps = 70
 save_every = 7
 """
-
-
-@pytest.fixture(autouse=True)
-def folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
 
 
 def printed(model, *words):

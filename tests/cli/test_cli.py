@@ -28,15 +28,9 @@ from scvi_codegen.cli.reports import energy_report
 from scvi_codegen.methods import METHODS, SCVI, SVI, CollocationRK, Gauss, SpectralCollocation, StoermerVerlet
 from scvi_codegen.models.model_files.model_file import load_model, parse_model, save_model
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("here")]
 
 COMMAND = shutil.which("scvi-codegen", path=str(Path(sys.executable).parent))
-
-
-@pytest.fixture(autouse=True)
-def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.chdir(tmp_path)
-    return
 
 
 def arrays(path: str) -> dict[str, np.ndarray]:

@@ -34,8 +34,7 @@ span = 2.3
 
 
 @pytest.fixture(autouse=True)
-def model(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def model(here):
     Path("pushed.toml").write_text(MODEL)
     Path("u.csv").write_text("t,value\n0,1\n1,0\n2,0.5\n3,-1\n")
     return load_model("pushed.toml")

@@ -17,6 +17,7 @@ from scvi_codegen.cli import command_group, main
 from scvi_codegen.methods import specification_of
 from scvi_codegen.models.model_files.model_file import dump_model, parse_model
 
+pytestmark = pytest.mark.usefixtures("here")
 KEPLER = ("kepler", "--step", "0.1", "--steps", "50", "--method", "svi:4")
 QUIET_COMMANDS = (
     ("run", *KEPLER),
@@ -36,11 +37,6 @@ QUIET_COMMANDS = (
     ("path", "kepler", "--from", "1,0", "--to=-0.5,0.8", "--span", "2", "--step", "0.1"),
 )
 """Of every command one at least, after a run in the folder ``orbit.run``."""
-
-
-@pytest.fixture(autouse=True)
-def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
 
 
 def test_every_command_is_tested():

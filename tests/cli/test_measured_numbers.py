@@ -21,7 +21,7 @@ from benchmarks.__main__ import main as benchmarks
 from benchmarks.cases.unforced import case
 from scvi_codegen.cli import main
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("here")]
 
 Array = Any
 QUICK = 0.05
@@ -99,11 +99,6 @@ def seconds_at(points: list[tuple[float, float]], error: float) -> float:
     reached = next((n for n, p in enumerate(best) if p[1] < 1e-13), len(best) - 1)
     seconds, errors = np.array(best[: reached + 1]).T
     return float(np.exp(np.interp(-np.log(error), -np.log(errors), np.log(seconds))))
-
-
-@pytest.fixture(autouse=True)
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
 
 
 def test_rows_of_benchmarks_follow_from_their_measurements():

@@ -480,8 +480,7 @@ def test_every_line_of_the_text_is_correct(done):
 
 
 @pytest.fixture
-def springs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Kind:
-    monkeypatch.chdir(tmp_path)
+def springs(here: Path) -> Kind:
     kind = KINDS["scalar"]
     Path("model.toml").write_text(f'{kind.system}{PARAMETERS}{kind.start}[method]\nmethod = "svi:2"\n')
     return kind
@@ -605,8 +604,7 @@ method = "svi:2"
 """
 
 
-def test_every_field_and_line_of_an_array_system_is_correct(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_every_field_and_line_of_an_array_system_is_correct(here):
     Path("ring.toml").write_text(RING)
     words = ("run", "ring.toml", "--step", "0.25", "--steps", "60", "--save-every", "4", "--parameter", "k=0.75")
     numbers = json_of(*words, "-o", "ring.npz")

@@ -28,10 +28,9 @@ precision = "double-double"
 
 
 @pytest.fixture
-def spring(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def spring(here: Path) -> Path:
     """Return a model file in the working folder."""
-    monkeypatch.chdir(tmp_path)
-    path = tmp_path / "spring.toml"
+    path = here / "spring.toml"
     path.write_text(TEXT)
     return path
 

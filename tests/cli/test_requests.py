@@ -63,11 +63,10 @@ def tried(command: str, kind: str, status: int | None = None) -> Result:
 
 
 @each_cell
-def test_allowed_requests_are_compiled_and_others_rejected(command, kind, served, tmp_path, monkeypatch):
+def test_allowed_requests_are_compiled_and_others_rejected(command, kind, served, here, monkeypatch):
     def unbuilt(*_, **__):
         raise BuildError(BUILT)
 
-    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(building, "_load_or_build", unbuilt)
     for module in (webassembly, building):  # the first is imported above, or it would keep the replacement
         monkeypatch.setattr(module, "run_compiler", unbuilt)
@@ -77,11 +76,10 @@ def test_allowed_requests_are_compiled_and_others_rejected(command, kind, served
         assert result.exit_code == 0 or (result.exit_code == 1 and reached), result.output
     else:
         assert result.exit_code == 2, result.output
-        assert not [path for path in tmp_path.iterdir() if path.name.startswith("made")]
+        assert not [path for path in here.iterdir() if path.name.startswith("made")]
 
 
 @pytest.mark.full
 @each_cell
-def test_allowed_requests_are_executed(command, kind, served, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_allowed_requests_are_executed(command, kind, served, here):
     tried(command, kind, 0 if served else 2)

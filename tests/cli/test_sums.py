@@ -43,9 +43,8 @@ NEWTON = ("--solver", "newton")
 
 
 @pytest.fixture
-def ring(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+def ring(here: Path) -> str:
     """A model file in the present folder."""
-    monkeypatch.chdir(tmp_path)
     Path("ring.toml").write_text(RING)
     return "ring.toml"
 

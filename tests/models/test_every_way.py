@@ -151,9 +151,8 @@ CASES = {
 
 
 @pytest.fixture(autouse=True)
-def folder(tmp_path, monkeypatch):
+def folder(here):
     """The model's table in a folder of its own; paths are relative to the model file."""
-    monkeypatch.chdir(tmp_path)
     Path("models/tables").mkdir(parents=True)
     Path("models/tables/u.csv").write_text("t,u\n\n" + "".join(f"{t!r}, {u!r}\n" for t, u in zip(T, U, strict=True)))
 

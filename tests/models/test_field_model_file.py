@@ -161,9 +161,8 @@ def test_invalid_files_are_rejected_by_name(old, new, message):
         parse_model(STRING.replace(old, new, 1)).start()
 
 
-def test_commands_accept_a_density(tmp_path, monkeypatch):
+def test_commands_accept_a_density(here):
     """Equations first; the folder runs and keeps the density."""
-    monkeypatch.chdir(tmp_path)
     Path("nls.toml").write_text(SCHROEDINGER)
     derived = output_of("derive", "nls.toml")
     assert derived.index("a_t = -a**2*b*k - b**3*k - b_xx/2") < derived.index("q' = q + h*")
@@ -175,7 +174,6 @@ def test_commands_accept_a_density(tmp_path, monkeypatch):
 
 
 @pytest.mark.full
-def test_verify_measures_the_integrator_of_a_file(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_verify_measures_the_integrator_of_a_file(here):
     Path("nls.toml").write_text(SCHROEDINGER)
     assert "reversal at full size" in output_of("verify", "nls.toml")

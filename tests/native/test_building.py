@@ -310,8 +310,7 @@ def test_missing_writable_folder_is_reported(tmp_path, monkeypatch):
         answer()
 
 
-def test_a_relative_cache_folder_works(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_a_relative_cache_folder_works(here, monkeypatch):
     monkeypatch.setenv(building.CACHE_VARIABLE, "beside")
     assert answer() == 42.0
 

@@ -141,8 +141,7 @@ def _is_huge(x: Any) -> bool:
 
 
 @pytest.mark.parametrize("name", CALLS)
-def test_special_values_are_rejected_or_handled(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_special_values_are_rejected_or_handled(name: str, here: Path) -> None:
     failed = []
     for value in ODD:
         try:
@@ -171,9 +170,8 @@ def test_undamaged_model_is_accepted(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("number", range(len(CSV)))
-def test_damaged_csv_tables_are_rejected(number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_damaged_csv_tables_are_rejected(number: int, here: Path) -> None:
     """Tables are inputs, index tables and ensembles of the command line."""
-    monkeypatch.chdir(tmp_path)
     Path("u.csv").write_text(CSV[number])
     Path("model.toml").write_text(MODEL.replace("{ t = [0.0, 10.0], values = [0.0, 1.0] }", '{ file = "u.csv" }'))
     refused(lambda: sc.load_model("model.toml").all_inputs())

@@ -167,11 +167,10 @@ def test_a_page_runs_from_top_to_bottom(name, tmp_path, monkeypatch):
 
 
 @pytest.mark.full
-def test_the_reproduction_of_the_paper_runs(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_the_reproduction_of_the_paper_runs(here):
     [command] = [part.text for part in runnable(PAGES["paper.md"]) if part.text.startswith(MINUTES)]
     run_command(command)
-    assert (tmp_path / "paper.html").is_file()
+    assert (here / "paper.html").is_file()
 
 
 QUERIES: dict[str, set[str]] = {}

@@ -168,7 +168,6 @@ COMMANDS = [
 
 
 @pytest.mark.parametrize(("old", "new", "words", "message"), COMMANDS)
-def test_first_mistakes_with_files_and_commands(old, new, words, message, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_first_mistakes_with_files_and_commands(old, new, words, message, here):
     Path("swing.toml").write_text(MODEL.replace(old, new, 1))
     assert message in error_of(*[words] if words == "runn" else ["run", "swing.toml", *words.split()])

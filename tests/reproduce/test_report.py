@@ -192,8 +192,7 @@ class TestPage:
 
 
 @pytest.fixture
-def toys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def toys(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("scvi_codegen.reproduce.catalogue.EXPERIMENTS", EXPERIMENTS)
 
 

@@ -11,6 +11,8 @@ import scvi_codegen as sc
 from scvi_codegen.cli import supervision
 from scvi_codegen.models.model_files.model_file import dump_model, parse_model
 
+pytestmark = pytest.mark.usefixtures("here")
+
 END, TOLERANCE = 60.0, 1e-10
 MODEL = f"""
 [system]

@@ -8,6 +8,8 @@ from samples import compile_quickly
 
 import scvi_codegen as sc
 
+pytestmark = pytest.mark.usefixtures("here")
+
 
 @pytest.fixture(scope="module", autouse=True)
 def xarray() -> Any:

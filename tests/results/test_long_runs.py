@@ -19,6 +19,8 @@ from recorded_runs import STATE, H, assert_same, digests, recorded, start
 import scvi_codegen as sc
 from scvi_codegen.results.recording import load_run
 
+pytestmark = pytest.mark.usefixtures("here")
+
 CHILD = """
 import os, pickle, resource, sys
 from pathlib import Path

@@ -20,6 +20,8 @@ from scvi_codegen.models.model_files.model_file import dump_model
 from scvi_codegen.results.recording import manifest, writing
 from scvi_codegen.runtime.run.run_loop import record
 
+pytestmark = pytest.mark.usefixtures("here")
+
 
 class TestRecording:
     @pytest.mark.parametrize("save_every", [1, 7, 5000])

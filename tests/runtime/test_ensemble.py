@@ -738,8 +738,7 @@ class TestEnsembleFiles:
 
 class TestCommandLine:
     @pytest.fixture(autouse=True)
-    def elsewhere(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.chdir(tmp_path)
+    def elsewhere(self, here: Path) -> None:
         Path("grid.toml").write_text(GRID)
 
     @pytest.mark.parametrize("suffix", ["npz", "csv"])
@@ -930,8 +929,7 @@ def test_files_contain_individual_times(tmp_path: Path) -> None:
     assert np.array_equal(np.isfinite(dataset.energy), np.isfinite(runs.times))
 
 
-def test_command_line_runs_a_grid(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_command_line_runs_a_grid(here: Path) -> None:
     Path("k.toml").write_text(
         '[system]\ncatalogue = "kepler"\n[method]\nmethod = "svi"\ndegree = 4\n[run]\ntolerance = 1e-9\nspan = 9\n'
     )
