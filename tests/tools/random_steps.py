@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from notation import lagrange
 from numpy.typing import NDArray
+from samples import UNOPTIMISED_FLAGS
 
 import scvi_codegen as sc
 from scvi_codegen.mechanics.arrays.system import ArraySystem
@@ -149,9 +150,8 @@ FAMILIES = _families()
 def compiled(name: str, method: Any, solver: str = "auto") -> Any:
     """The stepper of a family."""
     system = FAMILIES[name].system
-    if isinstance(system, ArraySystem):
-        return sc.compile_stepper(system, method, solver=solver.replace("auto", "fixed-point"))
-    return sc.compile_stepper(system, method, solver=solver)
+    solver = solver.replace("auto", "fixed-point") if isinstance(system, ArraySystem) else solver
+    return sc.compile_stepper(system, method, solver=solver, flags=UNOPTIMISED_FLAGS)
 
 
 def displaced(q: Array, end: Array, other: Array) -> float:
