@@ -201,10 +201,12 @@ links has 1200): their derivatives would take more than half of the time of comp
 def error_growth_of(system: MechanicalSystem, program: Program) -> ErrorGrowth | None:
     """Return kernels and tables; ``None`` unless the system is autonomous, conservative and small enough."""
     fixed_point = program.fixed_point
-    if fixed_point is None or program.newton or program.damping or system.inputs or system.changes_energy:
+    if fixed_point is None or program.newton or program.damping or system.dimension > MOST_COORDINATES:
+        return None
+    if system.inputs or system.changes_energy:
         return None
     make = GROWTH_KERNELS.get(fixed_point.derivatives_part)
-    twin = equivalent_lagrangian(system) if make and system.dimension <= MOST_COORDINATES else None
+    twin = equivalent_lagrangian(system) if make else None
     points = fixed_point.guess.abscissae
     which = [_nodes(points, most) for most in MOST_NODES]
     if make is None or twin is None or len(set(points)) < len(points) or len(which[0]) < 2:

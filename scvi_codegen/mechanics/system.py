@@ -262,13 +262,15 @@ class MechanicalSystem(Deferred, ABC):
             return "forces act" if self.forces else "damping takes it"
         if self._constraints_work():
             return "constraints do work"
-        return f"{'H' if self.auxiliaries else 'L'} depends on time" if self.lagrangian.has(self.time) else ""
+        if self.time in self.lagrangian.free_symbols:
+            return f"{'H' if self.auxiliaries else 'L'} depends on time"
+        return ""
 
     @property
     def balances_energy(self) -> bool:
         """True if the energy changes by the work of forces or damping only."""
         acted = bool(self.forces) or self.damping != 0
-        return acted and not (self.formula.has(self.time) or self._constraints_work())
+        return acted and not (self.time in self.formula.free_symbols or self._constraints_work())
 
     def _constraints_work(self) -> bool:
         from scvi_codegen.mechanics.constraints import constraints_work
