@@ -48,8 +48,9 @@ def check_solver_of_arrays(
     if solver == "newton" and (system.neighbours or not (loops.shifts and iterated)):
         raise SizesRequiredError(
             "Newton's method for array systems requires forces that are not constant, no constraints, no lists of "
-            "neighbours, and an implicit method (for a Hamiltonian and for forces of velocities one with the same "
-            "table for positions and momenta, as SVI and Gauss): leave out solver='newton'"
+            "neighbours, and an implicit method whose matrix has a basis of eigenvectors (for a Hamiltonian and for "
+            "forces of velocities one with the same table for positions and momenta, as SVI and Gauss): leave out "
+            "solver='newton'"
         )
     if not (iterated or isinstance(chosen, Splitting | ConstrainedSteps)):
         explicit = "" if system.momenta else ", Stoermer-Verlet or a composition"

@@ -73,3 +73,13 @@ def test_newton_of_explicit_methods_is_compiled_with_the_sizes_of_the_call():
 def test_unknown_solvers_are_rejected():
     with pytest.raises(sc.MethodError, match="use 'fixed-point' or 'newton'"):
         sc.compile_stepper(field(1.0), "svi:4", solver="krylov")
+
+
+@pytest.mark.parametrize("solver", ["auto", "newton"])
+def test_methods_without_a_basis_of_eigenvectors_are_compiled_with_known_sizes(solver):
+    """The matrix of these steps has the double eigenvalue 0 with one eigenvector."""
+    q = RANDOM.normal(size=30)
+    arrays = sc.compile_stepper(field(1.0), sc.SVI(3, "gauss-lobatto:3"), solver=solver)
+    known = sc.compile_stepper(sc.unroll_sums(field(1.0), {"N": 30}), sc.SVI(3, "gauss-lobatto:3"))
+    run, expected = (each.integrate(q, velocity=0 * q, h=0.1, steps=5) for each in (arrays, known))
+    assert np.abs(run.q["q"] - expected.q).max() < 1e-12

@@ -166,7 +166,7 @@ def _linear_part(system: LagrangianSystem, product: Matrix, lanes: int) -> Linea
     if not symmetric or not all(_is_finite(entry) for entry in entries.values()) or not _is_stable(system, entries):
         return None
     order, shifts = bandwidth_ordering(entries, len(force)), shift_tables(product, lanes)
-    if bandwidth(entries, order) > WIDEST_LINEAR_PART or not shifts.is_accurate:
+    if bandwidth(entries, order) > WIDEST_LINEAR_PART or not (shifts and shifts.is_accurate):
         return None
     lower = {(order[i], order[j]): entry for (i, j), entry in entries.items() if order[i] >= order[j]}
     purpose = "Derivatives of the forces L_q at q = 0."

@@ -99,11 +99,17 @@ LARGEST_CONDITION, LEAST_ANGLE = mp.mpf("1e8"), mp.mpf("0.1")
 
 
 @lru_cache(maxsize=16)
-def shift_tables(matrix: NumberTable, lanes: int) -> ShiftTables:
-    """Return the eigenvectors of the matrix of a step, whose rows are padded by repeating the last one."""
+def shift_tables(matrix: NumberTable, lanes: int) -> ShiftTables | None:
+    """Return the eigenvectors of the matrix of a step, whose rows are padded by repeating the last one.
+
+    ``None`` if the matrix is defective, as that of SVI(3, "gauss-lobatto:3").
+    """
     points = len(matrix)
     values, vectors = eigenvectors(matrix)
-    inverse = mp.inverse(vectors)
+    try:
+        inverse = mp.inverse(vectors)
+    except ZeroDivisionError:
+        return None
     real = [abs(mp.im(value)) < REAL * abs(value) for value in values]
     kept = [k for k, value in enumerate(values) if real[k] or mp.im(value) > 0]
     count = 1 << (len(kept) - 1).bit_length()
