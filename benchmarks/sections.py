@@ -23,7 +23,10 @@ from benchmarks.contenders.arrays import step_counts
 from benchmarks.contenders.engines import mujoco_contenders
 from benchmarks.contenders.mechanisms import LINKS, links
 from benchmarks.contenders.ours import (
+    LOOSE_TOLERANCES,
     adaptive_contenders,
+    compiled,
+    controlled_contenders,
     degree_contenders,
     fixed_contenders,
     our_contenders,
@@ -155,6 +158,19 @@ def _halved(
     return Race(case=chosen, ours=partial(fixed_contenders, chosen, some), ends=lambda _, __: exact_end())
 
 
+def _robot(make: Callable[[], Case], plan: Plan) -> Race:
+    """Return a multibody system at halved fixed steps; trees also with adaptive steps."""
+    race = _halved(make, ROBOT_METHODS, ROBOTS_EXACT, plan)
+    if race.case.system.constraints or race.case.system.rotations:
+        return race
+
+    def ours() -> list[Contender]:
+        tolerances = LOOSE_TOLERANCES[:: 4 if plan.quick else 1]
+        return [*race.ours(), *controlled_contenders(race.case, *compiled(race.case.system, "svi:4"), tolerances)]
+
+    return replace(race, ours=ours)
+
+
 def _field(make: Callable[[], FieldCase], plan: Plan) -> Race:
     """Return a partial differential equation; every contender knows the exact solution on its own mesh."""
     chosen, exact = make(), Reference(positions=np.ones((1, 1)), accuracy=0.0)
@@ -196,7 +212,7 @@ BUILDERS: dict[str, Callable[[Plan], Race]] = {
     **{f"adaptive:{name}": partial(_adaptive, name) for name in ADAPTIVE_CASES},
     **{f"rotations:{name}": partial(_rotation, name) for name in ROTATIONS},
     "rotations:bodies": _tumbling,
-    **{f"robots:{name}": partial(_halved, make, ROBOT_METHODS, ROBOTS_EXACT) for name, make in ROBOTS.items()},
+    **{f"robots:{name}": partial(_robot, make) for name, make in ROBOTS.items()},
     **{f"fields:{name}": partial(_field, make) for name, make in FIELDS.items()},
     **{f"lattices:{name}": partial(_halved, make, EXPLICIT, EXACT) for name, make in LATTICES.items()},
     **{

@@ -221,6 +221,7 @@ def controlled_contenders(
             compile_seconds=seconds,
             prepare=partial(prepare, tolerance),
             momenta=momenta,
+            starts=len(case.q),
         )
         for tolerance in tolerances
     ]
