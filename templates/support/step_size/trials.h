@@ -36,7 +36,6 @@ typedef struct {
 #ifdef NEWTON_ALONE
 #define HOT static
 #define SHORT_STEPS_FAIL 0
-#define MAY_BE_SHORT(report) 0
 #define LEVELS_INSIDE 0 /* no predictor from a rejected step */
 
 static inline real smaller(real a, real b)
@@ -63,7 +62,6 @@ static real attempt(run_memory *run, step_data *step, const solver_data *data, i
 #define LEVELS_INSIDE INSIDE
 #endif
 #define SHORT_STEPS_FAIL 1 /* their changes are relative to velocities that may be little more than rounding */
-#define MAY_BE_SHORT(report) ((report)->change * (report)->change < DIVERGED) /* of a failed step */
 
 /* Computes the increments; returns the error estimate of the curve if it exceeds `least`, or infinity if the step
  * failed. afresh: without the predictor; inside: levels above this one of a rejected step, whose curve is stored, or 0.
@@ -249,7 +247,7 @@ static SELDOM void try_first_step(run_memory *run, trial *now, const solver_opti
   while (!now->last && up > 0) {
     const int failed = !(now->error < INFINITY), small = now->error <= now->limits.most;
     const int as_expected = now->error > error_at(shorter, up / 2) && now->error < error_at(shorter, up + up / 2 + 1);
-    const int rises = failed ? !MAY_BE_SHORT(report) : as_expected;
+    const int rises = failed ? !SHORT_STEPS_FAIL : as_expected;
     found = found || small;
     up = small ? levels_up(now) : 0;
     if (up == 0 && !(found && rises))
