@@ -83,7 +83,14 @@ def test_energy_of_long_runs_does_not_drift(as_users_compile):
 
 @pytest.mark.parametrize(
     ("further", "found"),
-    [("", True), ("+k*q0**2", False), ("-k/(2 + q0)", True), ("-k/q0", False), ("-t*q0**2", False)],
+    [
+        ("", True),
+        ("+k*q0**2", False),
+        ("-k/(2 + q0)", True),
+        ("-k/q0", False),
+        ("-t*q0**2", False),
+        ("-sqrt(q0**2 + k**2)", False),
+    ],
 )
 def test_systems_with_linear_part(further, found):
     program = lower(ring(further=further), SVI(2), prefix="x")

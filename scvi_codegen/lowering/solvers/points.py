@@ -193,7 +193,8 @@ def _is_stable(system: LagrangianSystem, entries: Mapping[tuple[int, int], Expr]
 
 
 def _is_finite(value: Expr) -> bool:
-    return not value.has(sympy.nan, sympy.zoo, sympy.oo, -sympy.oo)
+    """Return whether a value at q = 0 is a number that C computes; sqrt(e**2) becomes an absolute value."""
+    return not value.has(sympy.nan, sympy.zoo, sympy.oo, -sympy.oo, sympy.Abs, sympy.sign)
 
 
 def _point_iteration(
