@@ -41,7 +41,7 @@ DIFFERENTIATED: dict[str, tuple[str, float]] = {
 }
 """Cases and step sizes of which derivatives are computed."""
 DERIVED_STEPS = 2000
-BUILDS = {"cc": "gcc", "clang": "clang"}
+BUILDS = ("cc", "clang")
 TARGETS = ("native", "x86-64-v4", "x86-64-v3", "x86-64", "portable")
 BUILT = ("kepler:0.5", "outer-solar-system")
 
@@ -151,13 +151,13 @@ def _derived(chosen: Case, by: str, h: float, plan: Plan) -> dict[str, float]:
 def run_builds(plan: Plan, report_activity: ReportActivity) -> ResultTable:
     """Measure one source built by the installed compilers for several processors."""
     rows = []
-    for (command, title), target in itertools.product(BUILDS.items(), TARGETS[-1:] if plan.quick else TARGETS):
+    for command, target in itertools.product(BUILDS, TARGETS[-1:] if plan.quick else TARGETS):
         if shutil.which(command) is not None:
-            report_activity(f"builds: {title}, {target}")
+            report_activity(f"builds: {command}, {target}")
             arguments = [sys.executable, "-m", "benchmarks.steps", target, str(plan.rounds), str(int(plan.quick))]
             environment = os.environ | {"CC": command}
             output = subprocess.run(arguments, env=environment, capture_output=True, text=True, check=True).stdout
-            rows.append({"compiler": title, "target": target} | json.loads(output))
+            rows.append({"compiler": command, "target": target} | json.loads(output))
     names = [f"{name}_{by}" for name in BUILT for by in ("svi:4", "svi:8")]
     return ResultTable(
         name="builds",

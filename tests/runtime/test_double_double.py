@@ -773,3 +773,5 @@ def test_times_have_two_words_or_are_refused() -> None:
     for times in ({"t_end": Fraction(1, 10)}, {"t_end": 1.0, "t_eval": [Fraction(3, 10)]}):
         with pytest.raises(StateError, match="must be doubles"):
             stepper.integrate([0.0], [0.0], **times)
+        with pytest.raises(StateError, match="must be doubles"):
+            stepper.integrate_ensemble([[0.0]], [[0.0]], **times)

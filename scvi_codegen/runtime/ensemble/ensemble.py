@@ -23,7 +23,7 @@ from scvi_codegen.native.options import SolverOptions, checked_options
 from scvi_codegen.rendering.source import Source
 from scvi_codegen.runtime.core.features import check_together, require
 from scvi_codegen.runtime.core.validation import Array, States, check_left_to_inputs, columns_of_inputs, parameter_index
-from scvi_codegen.runtime.core.words import missing
+from scvi_codegen.runtime.core.words import check_doubles, missing
 from scvi_codegen.runtime.ensemble.batches import Rows, SuccessiveRuns
 from scvi_codegen.runtime.ensemble.device import (
     FEWEST_COORDINATES,
@@ -113,7 +113,7 @@ class Ensemble:
         interface = stepper.interface
         _check_device(device, h, inputs, save_every, error=error, t_eval=t_eval)
         _check_observe(stepper, observe, inputs=inputs, error=error, t_eval=t_eval)
-        steps, t_end = _steps_or_end(t, h, steps, t_end, inputs, tolerance, t_eval)
+        steps, t_end = _steps_or_end(t, h, steps, t_end, inputs, tolerance, t_eval, words=interface.words)
         require(stepper, "ensembles")
         if device is not None:
             require(stepper, "device")
@@ -550,6 +550,8 @@ def _steps_or_end(
     inputs: object,
     tolerance: float | None,
     t_eval: object,
+    *,
+    words: int,
 ) -> tuple[int | None, ArrayLike | None]:
     """Return the number of common steps or the final time; with adaptive steps the final time or times.
 
@@ -557,6 +559,8 @@ def _steps_or_end(
         StateError: for missing or contradictory arguments.
     """
     check_together(inputs=inputs, t_eval=t_eval)
+    if words > 1:
+        check_doubles(t=t, t_end=t_end, t_eval=t_eval)
     if h is not None and t_eval is not None:
         raise StateError("t_eval requires adaptive steps: give t_end without h and steps")
     if h is not None and t_end is not None and np.ndim(t_end):

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from scvi_codegen.errors import EventError
 from scvi_codegen.runtime.constraints.projection import projected
 from scvi_codegen.runtime.core.words import DIGITS, low_words, two_words, with_low, word
 from scvi_codegen.runtime.events.event import Event
@@ -26,6 +27,8 @@ POINTS = (1, 2, 4, 8, 16, 32)
 """Numbers of points of the quadratures of a mean, in the order of their use."""
 EQUAL = 2.0**-100
 """Difference of two quadratures, and rate of approach that is rounding, relative to the sum of |n_i v_i|."""
+SOLVED = 2.0**-90
+"""Last correction of an impulse, relative to it."""
 MOST_CORRECTIONS, MOST_ROUNDS = 30, 20
 """Largest number of corrections of an impulse, and of passes over the walls of a corner."""
 
@@ -153,6 +156,10 @@ class EventFunctions:
                 if not abs(change) < before:
                     break
                 impulse, before = impulse - change, abs(change)
+            if not before <= SOLVED * abs(impulse):
+                raise EventError(
+                    f"the impulse of the impact at t = {float(t):.17g} did not converge: use a smaller step"
+                )
             return momenta((1 + (restitution if forward else 1 / restitution)) * impulse / 2)
 
 
