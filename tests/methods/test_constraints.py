@@ -433,6 +433,22 @@ def test_initial_states_are_projected_or_rejected():
     assert np.abs(stepper.constraint_values(*moved.start)).max() < 1e-15
 
 
+def test_states_far_from_constraints_with_sines_are_projected():
+    """Far beyond a state, sines are small against terms that are linear, so that their constraints seem linear."""
+    links = lagrange(
+        "links",
+        "x1 y1 a1 x2 y2 a2",
+        "(x1_dot**2 + y1_dot**2 + x2_dot**2 + y2_dot**2)/2 + (a1_dot**2 + a2_dot**2)/24",
+        constraints=["x1 = cos(a1)/2", "y1 = sin(a1)/2", "x2 = 2*x1 + cos(a2)/2", "y2 = 2*y1 + sin(a2)/2"],
+    )
+    stepper = sc.compile_stepper(links, lobatto(1))
+    far = [0.162, 0.419, 0.028, 1.295, -0.547, -0.18]
+    q, p = stepper.project(far, np.ones(6))
+    assert np.abs(stepper.constraint_values(q, p)).max() < 2e-15
+    with pytest.raises(sc.StateError, match="the initial state violates the constraints"):
+        stepper.integrate(far, p, h=0.1, steps=1)
+
+
 def test_angles_at_zero_satisfy_constraints_up_to_rounding():
     """The second constraint of this linkage is 0.2 + 0.4 - 0.6 = 1.1e-16 at 0, where angles have no relative size."""
     linkage = sc.LagrangianSystem.from_text(

@@ -15,7 +15,8 @@
 /* relative to the state: accepted size of the last update where rounding prevents a smaller residual */
 #define ACCEPTED_UPDATE REAL(1e-6)
 #define ROUNDED_UPDATE (1024 * REAL_EPSILON) /* near q = 0 or at rest, where a relative distance is undefined */
-#define BEYOND REAL(1e6) /* times an update: where g is still linear, rounding limits |g| */
+#define BEYOND (1 / MATH(sqrt)(REAL_EPSILON)) /* times an update: where g is still linear, rounding limits |g| */
+#define NONLINEAR REAL(0.015625) /* relative difference from linear, which bounded terms such as sines exceed, too */
 #define SLOW REAL(0.01) /* reduction of |g|^2 by an update that indicates rounding */
 
 /* Factors of the saddle-point matrix [L_vv, G^T; G, 0] of a state, and a right-hand side. */
@@ -112,8 +113,8 @@ static real misfit(real t, const real *q, const real *parameters, real *g)
   return all_finite(g, CONSTRAINTS) ? sum : (real)INFINITY;
 }
 
-/* Whether rounding alone prevents that `update`, which solves G update = right, reduces |g|: g changes linearly far
- * beyond it. A state at 0, as of angles, has no size with which the update could be compared. */
+/* Returns 1 if rounding alone prevents that `update`, which solves G update = right, reduces |g|: g changes linearly
+ * far beyond it. A state at 0, as of angles, has no size with which the update could be compared. */
 static int is_rounding(real t, const real *u, const real *right, const real *update, const real *parameters)
 {
   real x[M], beyond[CONSTRAINTS], wrong = 0, size = 0;
@@ -125,7 +126,7 @@ static int is_rounding(real t, const real *u, const real *right, const real *upd
     wrong += from_linear * from_linear;
     size += right[k] * right[k];
   }
-  return wrong < BEYOND * BEYOND * size / 4;
+  return wrong < NONLINEAR * NONLINEAR * BEYOND * BEYOND * size;
 }
 
 /* Projects q onto g = 0 by Gauss-Newton steps in the metric of the mass matrix at u = (q, v). An update is halved while
