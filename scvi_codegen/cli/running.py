@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -56,7 +56,8 @@ class RunOutcome:
     def end(self) -> tuple[float, Array, Array]:
         """Time, positions and momenta at the end.
 
-        In transformed time the last saved state lies inside the last step, before the state of the run.
+        In transformed time the last saved state lies inside the last step, before the state of the run; after a shorter
+        last step the run is left before that.
         """
         run, saved = self.run, self.trajectory
         inside = saved.t[-1] != run.t and (saved.t[-1] - run.t) * run.h > 0.0
@@ -72,8 +73,6 @@ def integrate_model(model: Model) -> RunOutcome:
     preparation = time.perf_counter() - began
     by_time = model.ends_at_time or bool(model.system.inputs)  # the number of steps is not known in advance
     length = BAR_LENGTH if by_time else model.step_count
-    if model.in_transformed_time and model.ends_at_time:
-        run.plan = replace(run.plan, t_end=model.t + model.covered)
     began, stopped, failure = time.perf_counter(), False, None
     with interruptions() as caught, progress_bar(length) as show_progress:
 
@@ -90,7 +89,7 @@ def integrate_model(model: Model) -> RunOutcome:
         recorded = partial(run._recorded, save_every=model.save_every, progress=look, stop=stop)
         segments = model.segments(run)
         try:
-            if model.has_segments:
+            if model.system.inputs:
                 trajectory = record_segments(run, segments, recorded, lambda: stopped)
             else:
                 trajectory = recorded(next(segments))
@@ -157,7 +156,7 @@ def known_at_end(model: Model, outcome: RunOutcome) -> Known | None:
         or not run.steps
         or outcome.failure is not None
         or outcome.interrupted
-        or trajectory.t[-1] != run.t
+        or trajectory.t[-1] != outcome.end[0]
     ):
         return None
     return known_digits(model.system, trajectory, most=SECOND_RUN + 4 * run.steps, inputs=model.inputs)

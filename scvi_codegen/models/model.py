@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from dataclasses import fields as fields_of
@@ -305,7 +306,7 @@ class Model(TimeSpan):
         return self._inputs_and_parameters(stepper)[1](first_inner_time(self.t, self.end))
 
     def segments(self, run: Run) -> Iterator[int | None]:
-        """Prepare a run of this model for each segment of equal steps, between breakpoints of its inputs.
+        """Prepare a run of this model for its end, or for each segment between breakpoints of its inputs.
 
         Yields:
             Number of steps of the segment; ``None`` for steps up to the target time of the run.
@@ -313,18 +314,15 @@ class Model(TimeSpan):
         Raises:
             ModelFileError, StateError: for inputs that are missing, or do not cover the whole run.
         """
-        if not self.has_segments:
-            yield None if not run.plan.fixed or self.ends_at_time else self.step_count
+        if not self.system.inputs:
+            if self.has_shorter_last_step or (self.in_transformed_time and self.ends_at_time):
+                run.plan = replace(run.plan, t_end=self.t + self.covered)
+            yield None if math.isfinite(run.plan.t_end) else self.step_count
             return
         from scvi_codegen.runtime.inputs.segments import prepared_segments
 
         inputs, values = self._inputs_and_parameters(run)
         yield from prepared_segments(run, inputs, self.end, values)
-
-    @property
-    def has_segments(self) -> bool:
-        """True if a run consists of segments, at whose ends states are saved whatever the output stride."""
-        return bool(self.system.inputs) or self.has_shorter_last_step
 
     @property
     def end(self) -> float:

@@ -203,7 +203,7 @@ constraints = ["x**2 + y**2 = 1"]
         energy=lambda t, q, p: spring_energy(t, q, p) + K * (1 + np.cos(t)) * column(square(q)) / 2,
         drawn="L depends on time",
     ),
-    "shorter last step": Kind(words=("--step", "0.125", "--span", "11.1875", "--save-every", "3"), states=32),
+    "shorter last step": Kind(words=("--step", "0.125", "--span", "11.1875", "--save-every", "3"), states=31),
     "inputs": Kind(
         maps={},
         system=f"""

@@ -60,7 +60,7 @@ PLANS: dict[str, dict[str, Any]] = {
     "end only": {"t_end": 3.0, "tolerance": 1e-9, "t_eval": [3.0]},
     "both ends": {"t_end": 3.0, "tolerance": 1e-9, "t_eval": [0.0, 3.0]},
     "fixed": {"h": 0.05, "steps": 33, "save_every": 5},
-    "shorter last step": {"h": 0.04, "t_end": 0.99},
+    "shorter last step": {"h": 0.04, "t_end": 0.99, "save_every": 7},
 }
 FIXED = ("fixed", "shorter last step")
 CASES = [

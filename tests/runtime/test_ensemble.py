@@ -188,7 +188,7 @@ CASES = {
     ),
     **{
         f"h = {h}, {threads} threads": Case(
-            "eccentric", sc.SVI(4), 4, {"h": h, "t_end": t_end, "threads": threads}, 1e-15
+            "eccentric", sc.SVI(4), 4, {"h": h, "t_end": t_end, "threads": threads, "save_every": threads}, 1e-15
         )
         for h, t_end in ((0.03, 0.1), (-0.03, -0.1), (0.25, 0.1))
         for threads in (1, 2)
@@ -340,7 +340,8 @@ def test_ensembles_with_few_or_no_steps() -> None:
     assert result.steps.tolist() == [3] * 9
     assert len(stepper.integrate_ensemble([1.0, 0.0], [0.0, 1.0], h=0.1, steps=5)) == 1
     shorter_last = Case("eccentric", sc.SVI(4), 4, {"h": 0.03, "t_end": 0.1, "save_every": 2}).run()
-    assert shorter_last.t[[0, -1]].tolist() == [0.0, 0.1]
+    assert shorter_last.t.tolist() == [0.0, 0.06, 0.1]
+    assert shorter_last[0].at(0.08)[0] == pytest.approx(Case("eccentric", sc.SVI(4), 1, {"t_end": 0.08}).run().q[-1, 0])
     still = Case("pushed pendulum", sc.SVI(3), COUNT, {"inputs": INPUTS, "h": 0.1, "t": 0.4, "t_end": 0.4}).run()
     assert still.t.tolist() == [0.4]
     assert still.ok.all()

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.native.arguments import checked_step, empty_array
 from scvi_codegen.runtime.core.validation import Array
-from scvi_codegen.runtime.core.words import with_low
+from scvi_codegen.runtime.core.words import low_words, with_low
 from scvi_codegen.runtime.inputs.segments import Input, Segment, planned_segments, time_after_steps
 from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.validation import checked_count
@@ -52,7 +52,7 @@ class CommonSteps:
     Attributes:
         segments: segments of equal steps.
         ends: number of steps up to the end of each segment.
-        numbers: step numbers of the saved states.
+        numbers: step numbers of the saved states: every ``save_every``-th and the last, with inputs ends of segments.
         has_inputs: whether parameters change along the runs.
     """
 
@@ -70,14 +70,14 @@ class CommonSteps:
         self.t0, self.h, self.t_end, self.save_every = t0, checked_step(h), t_end, save_every
         self.has_inputs = bool(inputs)
         count = 0 if t_end is not None else checked_count(steps, "steps", least=0)
-        self.segments = [Segment(count, self.h, (t0, 0.0), t0)]
+        self.segments = [Segment(count, self.h, (float(t0), float(low_words(t0))), t0)]
         if t_end is not None:
             self.segments = planned_segments(t0, t_end, self.h, inputs, words=words) or self.segments
-        saved = list(accumulate(segment.steps for segment in self.segments))
-        self.steps = saved[-1]
+        ends = list(accumulate(segment.steps for segment in self.segments))
+        self.steps = ends[-1]
         empty_array((self.steps // save_every + 1,))  # rejects numbers of states beyond any memory
         multiples = np.arange(0, self.steps + 1, save_every)
-        self.numbers = multiples if t_end is None else np.union1d(multiples, saved)
+        self.numbers = multiples if t_end is None else np.union1d(multiples, ends if inputs else ends[-1:])
         last = self.segments[-1]
         if words > 1 and t_end is not None and last.end is None and last.steps > 0:  # h is a double: ends at t_end
             start = time_after_steps(last.start, last.h, last.steps - 1)
