@@ -146,6 +146,7 @@ long long NAME(call_each)(NAME(each) *c, long long steps)
       c->segment = 0;
       c->left = c->t_end ? 0 : c->segment_steps[0];
 #ifdef HAS_H_LOW
+      c->run->t_low = c->t_low;
       if (!c->t_end)
         set_step_to(c->segment_end[0], c->run->t, c->run->t_low, &c->run->h, &c->run->h_low);
 #endif

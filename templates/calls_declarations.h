@@ -31,7 +31,7 @@ typedef struct {
   long long *stored, *done, *fallback_steps; /* numbers of states and of steps of all trajectories */
   double *energies; /* of all trajectories at both ends, unless NULL */
   NAME(report) * report;
-  double *workspace, t, tolerance;
+  double *workspace, t, t_low, tolerance;
   long long words, coordinates, parameters_each, segments, every, capacity; /* words: of a time */
   long long rows, next, end, segment, left, requested; /* states in memory; present trajectory, its segment */
   long long pauses, entered; /* with `pauses`, calls end where a segment begins: parameters may change */

@@ -548,7 +548,7 @@ def test_ensembles(tmp_path: Path) -> None:
         parameters = {"mu": [1, "1/10"], "m": "1/7"}
         single = [{"mu": mu, "m": "1/7"} for mu in (1, "1/10")]
         for steps in (
-            {"h": 0.07, "t_end": 6.01, "save_every": 5},
+            {"h": 0.07, "t_end": 6.01, "save_every": 7},
             {"t_end": 2.0},
             {"t_end": 2.0, "t_eval": [0.3, 1.1]},
         ):
@@ -593,7 +593,7 @@ def test_explicit_ensembles() -> None:
     for method, plan in (
         ("stoermer-verlet", {"h": -0.07, "steps": 9, "save_every": 4}),
         ("composition:6", {"h": 0.07, "t_end": 0.7, "save_every": 3}),
-        ("composition:6", {"h": 0.07, "t_end": 0.68}),
+        ("composition:6", {"h": 0.07, "t_end": 0.68, "save_every": 4}),
     ):
         stepper = sc.compile_stepper(driven, method, precision="double-double")
         assert Ensemble(stepper, starts, starts, **plan).common is not None
@@ -770,6 +770,28 @@ def test_times_have_two_words_or_are_refused() -> None:
         tenth = mp.mpf(1) / 10
         assert abs(run.mp("q")[-1][0] - (mp.cos(tenth) - mp.cos(tenth + 1) - mp.sin(tenth))) < 1e-29
     assert (again.mp("q")[-1] == run.mp("q")[-1]).all()
+    of_input = lagrange("driven", "x", "x_dot**2/2 + x*(cos(t) + u)", inputs="u")
+    inputs: dict[str, Any] = {"inputs": {"u": ([0.0, 0.5, 2.0], ["0", "1/3", "0"])}}
+    for driven, method, more in (
+        (system, "svi:8", {"h": 0.125, "steps": 8}),
+        (system, "svi:8", {"h": 0.125, "t_end": 1.1, "save_every": 5}),
+        (system, "svi:8", {"t_end": 1.1}),
+        (system, "svi:8", {"t_end": 1.1, "t_eval": [0.5, 1.1]}),
+        (system, "composition:6", {"h": -0.125, "t_end": -1.1}),  # SIMD lanes
+        (of_input, "svi:8", {"h": 0.125, "t_end": 1.1, **inputs}),
+    ):
+        stepper = sc.compile_stepper(driven, method, precision="double-double")
+        with mp.workdps(50):
+            for t in (
+                "1/10",
+                Fraction(1, 10),
+                mp.mpf(1) / 10,
+                stepper.integrate([1], [0], t="0.1", h=1.0, steps=0).t[0],
+            ):
+                many = stepper.integrate_ensemble([[1], ["0.7"]], velocity=[[0], ["0.1"]], t=t, **more)
+                one = stepper.integrate(["0.7"], velocity=["0.1"], t="0.1", **more)
+                for name in ("t", "q", "p"):
+                    assert (many[1].mp(name) == one.mp(name)).all(), (t, more, name)
     for times in ({"t_end": Fraction(1, 10)}, {"t_end": 1.0, "t_eval": [Fraction(3, 10)]}):
         with pytest.raises(StateError, match="must be doubles"):
             stepper.integrate([0.0], [0.0], **times)

@@ -19,7 +19,7 @@ from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import OUTCOMES, SolverOptions
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array
-from scvi_codegen.runtime.core.words import block_of, from_block
+from scvi_codegen.runtime.core.words import Word, block_of, from_block
 from scvi_codegen.runtime.ensemble.result import INTERRUPTED, OK
 from scvi_codegen.runtime.ensemble.schedule import FixedSegments
 from scvi_codegen.runtime.ensemble.thread_pool import StopCheck, run_jobs
@@ -149,6 +149,8 @@ class Call:
             struct.segment_h, struct.segments = binding.pointer(h), len(h)
         struct.status, struct.done = binding.integers(work.status), binding.whole_numbers(work.done)
         struct.t, struct.next, struct.end, struct.segment = work.t, first, end, -1
+        if isinstance(work.t, Word):
+            struct.t_low = work.t.low
         struct.pauses = work.values_at is not None
         self.take = binding.each(struct)
 

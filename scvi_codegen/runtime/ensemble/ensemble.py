@@ -18,12 +18,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import EventError, StateError, StepFailedError
-from scvi_codegen.native.arguments import checked_number, real_array
+from scvi_codegen.native.arguments import real_array
 from scvi_codegen.native.options import SolverOptions, checked_options
 from scvi_codegen.rendering.source import Source
 from scvi_codegen.runtime.core.features import check_together, require
 from scvi_codegen.runtime.core.validation import Array, States, check_left_to_inputs, columns_of_inputs, parameter_index
-from scvi_codegen.runtime.core.words import check_doubles, missing
+from scvi_codegen.runtime.core.words import check_doubles, checked_time, hashed, missing, stacked
 from scvi_codegen.runtime.ensemble.batches import Rows, SuccessiveRuns
 from scvi_codegen.runtime.ensemble.device import (
     FEWEST_COORDINATES,
@@ -113,6 +113,7 @@ class Ensemble:
         interface = stepper.interface
         _check_device(device, h, inputs, save_every, error=error, t_eval=t_eval)
         _check_observe(stepper, observe, inputs=inputs, error=error, t_eval=t_eval)
+        t = self.t0 = checked_time(t, interface.words)
         steps, t_end = _steps_or_end(t, h, steps, t_end, inputs, tolerance, t_eval, words=interface.words)
         require(stepper, "ensembles")
         if device is not None:
@@ -130,7 +131,7 @@ class Ensemble:
             values = parameters_of_each(stepper, parameters, count)
             parameters = parameters_at(stepper.parameters, values, self.inputs, inside)
         p = momenta_of_each(stepper, q, p, velocity, t, parameters)
-        self.t0, self.save_every = checked_number(t, "the time t"), checked_count(save_every, "save_every", least=1)
+        self.save_every = checked_count(save_every, "save_every", least=1)
         words = interface.words
         settings: dict[str, Any] = {"inputs": self.inputs, "save_every": self.save_every, "words": words}
         fixed = None if h is None else CommonSteps(self.t0, h, steps=steps, t_end=cast(Any, t_end), **settings)
@@ -365,7 +366,7 @@ class Ensemble:
                     raise
                 states, status = cast(Trajectory, failure.trajectory), EVENT_FAILED
             except StateError:  # a sum of finite terms has overflowed
-                return SavedLane(np.array([self.t0]), q[np.newaxis], p[np.newaxis], "not finite", 0)
+                return SavedLane(stacked([self.t0]), q[np.newaxis], p[np.newaxis], "not finite", 0)
         rows = slice(None)
         if self.t_eval is not None and plan.h and self.inputs:  # ends of steps, after changes of the state
             times = states.forward * states.t
@@ -381,7 +382,7 @@ class Ensemble:
         common, fixed = self.common, self.common.steps
         q, p = common.states()
         spans: tuple[Span, ...] = ()
-        if fixed.t_end is not None and self.fixed is None:
+        if self.inputs:
             spans = tuple((rows, slice(None), partial(self.values_at, each.middle)) for rows, each in fixed.spans())
         return EnsembleTrajectory(
             t=fixed.times(tau=common.times is not None),
@@ -518,7 +519,7 @@ class Ensemble:
     def _unfinished(self, j: int) -> SavedLane:
         first = slice(0, 1 if self.t_eval is None else 0)
         return SavedLane(
-            np.array([self.t0])[first], self.start[0][[j]][first], self.start[1][[j]][first], INTERRUPTED, 0
+            stacked([self.t0])[first], self.start[0][[j]][first], self.start[1][[j]][first], INTERRUPTED, 0
         )
 
 
@@ -560,13 +561,13 @@ def _steps_or_end(
     """
     check_together(inputs=inputs, t_eval=t_eval)
     if words > 1:
-        check_doubles(t=t, t_end=t_end, t_eval=t_eval)
+        check_doubles(t_end=t_end, t_eval=t_eval)
     if h is not None and t_eval is not None:
         raise StateError("t_eval requires adaptive steps: give t_end without h and steps")
     if h is not None and t_end is not None and np.ndim(t_end):
         raise StateError("with h all trajectories have one t_end: give one number, or omit h (adaptive step size)")
     first = None if t_end is None else float(real_array(t_end, "t_end").flat[0])
-    planned_steps.__wrapped__(h, steps, first, tolerance, 1, checked_number(t, "the time t"), "", False, 1)
+    planned_steps.__wrapped__(h, steps, first, tolerance, 1, hashed(t), "", False, 1)
     if h is None or (inputs is None and first is None):
         return steps, t_end
     return None, final_time(t, h, steps, first)

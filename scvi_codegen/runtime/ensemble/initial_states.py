@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.native.arguments import checked_number, real_array
+from scvi_codegen.native.arguments import real_array
 from scvi_codegen.runtime.constraints.projection import make_consistent
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import (
@@ -18,7 +18,7 @@ from scvi_codegen.runtime.core.validation import (
     flat_state,
     parameter_columns,
 )
-from scvi_codegen.runtime.core.words import split, stacked, with_low
+from scvi_codegen.runtime.core.words import checked_time, split, stacked, with_low
 
 EnsembleParameters = Mapping[str, ArrayLike] | Sequence[Any] | Array | None
 
@@ -38,7 +38,7 @@ def momenta_of_each(
     name, argument = stepper.momentum_or_velocity(p, velocity)
     if name == "p":
         return argument
-    time = checked_number(t, "the time t")
+    t = checked_time(t, stepper.interface.words)
     positions = _states(stepper, q, "q")
     velocities = _states(stepper, argument, name)
     if positions.shape != velocities.shape:
@@ -47,12 +47,12 @@ def momenta_of_each(
     interface = stepper.interface
     if interface.words > 1 or interface.energy_parameter or interface.layout.momenta:
         states = zip(positions, velocities, values, strict=True)
-        return stacked([stepper.initial_momentum(position, v, time, value) for position, v, value in states])
+        return stacked([stepper.initial_momentum(position, v, t, value) for position, v, value in states])
     momenta = np.empty_like(positions)
-    done = stepper.binding.of_each("momenta", time, values, positions, velocities, momenta)
+    done = stepper.binding.of_each("momenta", t, values, positions, velocities, momenta)
     dropped = ((momenta[:done] == 0.0) & (velocities[:done] != 0.0)).any(axis=1)
     for j in (*np.flatnonzero(dropped).tolist(), *range(done, len(momenta))):
-        momenta[j] = stepper.initial_momentum(positions[j], velocities[j], time, values[j])  # may raise
+        momenta[j] = stepper.initial_momentum(positions[j], velocities[j], t, values[j])  # may raise
     return momenta
 
 

@@ -19,7 +19,7 @@ from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.core.features import refusal
 from scvi_codegen.runtime.core.pairs import exact_product
 from scvi_codegen.runtime.core.validation import Array, check_left_to_inputs, no_input
-from scvi_codegen.runtime.core.words import split, with_low
+from scvi_codegen.runtime.core.words import low_words, split, with_low
 from scvi_codegen.runtime.run.accuracy import warn_of_large_steps, warn_of_unresolved_fields
 from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.times import times_after
@@ -295,7 +295,7 @@ def prepared_segments(
         The number of steps of the segment; ``None`` for adaptive steps to the target time of the run.
     """
     if run.plan.fixed:
-        for segment in planned_segments(run.t, t_end, run.h, inputs, words=run.stepper.interface.words):
+        for segment in planned_segments(run._times[0], t_end, run.h, inputs, words=run.stepper.interface.words):
             run.update(parameters=values(segment.middle), h=segment.h)
             if run.stepper.interface.words > 1 and segment.end is not None:
                 run._step_to(segment.end)
@@ -327,7 +327,7 @@ def planned_segments(t: float, t_end: float, h: float, inputs: Mapping[str, Inpu
 
     In two words (``words``), a step that differs from h by its rounding error is not a multiple of h.
     """
-    forward, now, segments = np.sign(t_end - t), (t, 0.0), []
+    forward, now, segments = np.sign(t_end - t), (float(t), float(low_words(t))), []
     negligible = NEGLIGIBLE_STEP * min(abs(h), abs(t_end - t))
     for end in breakpoints_until(t, t_end, inputs):
         middle = now[0] + 0.5 * (end - now[0])

@@ -289,6 +289,7 @@ static void begin_block(NAME(each) * c, int count)
   block_memory *block = c->block;
   NAME(start)(block, c->t, c->segment_h[0]);
 #ifdef DOUBLE_DOUBLE
+  block->t_low = c->t_low;
   set_step_to(c->segment_end[0], block->t, block->t_low, &block->h, &block->h_low);
 #endif
   for (int j = 0; j < LANES; j++) {
