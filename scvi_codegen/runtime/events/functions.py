@@ -17,7 +17,7 @@ import numpy as np
 from scvi_codegen.errors import EventError
 from scvi_codegen.runtime.constraints.projection import projected
 from scvi_codegen.runtime.core.words import DIGITS, low_words, two_words, with_low, word
-from scvi_codegen.runtime.events.event import Event
+from scvi_codegen.runtime.events.event import JAMMED, Event
 
 if TYPE_CHECKING:
     from scvi_codegen.runtime.core.integrator import Integrator
@@ -29,8 +29,8 @@ EQUAL = 2.0**-100
 """Difference of two quadratures, and rate of approach that is rounding, relative to the sum of |n_i v_i|."""
 SOLVED = 2.0**-90
 """Last correction of an impulse, relative to it."""
-MOST_CORRECTIONS, MOST_ROUNDS = 30, 20
-"""Largest number of corrections of an impulse, and of passes over the walls of a corner."""
+MOST_CORRECTIONS, MOST_ROUNDS = 30, 40
+"""Largest number of corrections of an impulse, and of passes over the walls of a corner, twice those in double."""
 
 
 class EventFunctions:
@@ -52,7 +52,8 @@ class EventFunctions:
         self.tapes = [Tape([function], symbols) for function in formulas.functions]
         self.indices = [indices for indices, _ in formulas.changes]
         self.new_values = [Tape(values, symbols) for _, values in formulas.changes]
-        self.is_impact = [event.restitution is not None for event in formulas.events]
+        self.events = [event for event, count in zip(events, formulas.elements, strict=True) for _ in range(count)]
+        self.is_impact = [event.restitution is not None for event in self.events]
         moving = set(formulas.v)
         pairs = zip(formulas.functions, formulas.changes, strict=True)
         of_changes = [[function, *values] for function, (_, values) in pairs]
@@ -78,13 +79,17 @@ class EventFunctions:
         return velocity
 
     def changed(
-        self, numbers: Sequence[int], q: Array, p: Array, t: Fraction, parameters: Array, forward: bool
+        self, numbers: Sequence[int], q: Array, p: Array, t: Fraction, parameters: Array, forward: bool, begin: float
     ) -> tuple[Array, Array]:
         """Return the state after simultaneous crossings of functions, the impacts repeated while a wall is approached.
 
         Args:
             numbers: of the functions, in the order of their changes.
             forward: whether the run is forward in time; a run backward undoes impacts.
+            begin: start of the step, for the message.
+
+        Raises:
+            EventError: if the impacts do not end.
         """
         state = q, p
         for number in numbers:
@@ -95,7 +100,9 @@ class EventFunctions:
             for number in walls:
                 state = self._change(number, *state, t, parameters, forward)
             if state[1] is before[1]:
-                break
+                return state
+        if len(walls) > 1:
+            raise EventError(JAMMED.format(function=self.events[min(walls)].function, t=begin))
         return state
 
     def _change(
@@ -149,14 +156,15 @@ class EventFunctions:
             first = rate(0)
             if not (first if forward else -first) < -EQUAL * size:
                 return p
-            impulse, before = -2 * first / (rate(mp.one) - first), mp.inf
+            slope = rate(mp.one) - first
+            impulse, before = -2 * first / slope, mp.inf
             for _ in range(MOST_CORRECTIONS):
                 mean = _mean(rate, impulse, EQUAL * size)
                 change = mean * impulse / (rate(impulse) - mean)
                 if not abs(change) < before:
                     break
                 impulse, before = impulse - change, abs(change)
-            if not before <= SOLVED * abs(impulse):
+            if not before <= max(SOLVED * abs(impulse), EQUAL * size / abs(slope)):
                 raise EventError(
                     f"the impulse of the impact at t = {float(t):.17g} did not converge: use a smaller step"
                 )
