@@ -31,6 +31,7 @@ from scvi_codegen.errors import StateError as StateError
 from scvi_codegen.errors import StepFailedError as StepFailedError
 from scvi_codegen.errors import SystemDefinitionError as SystemDefinitionError
 from scvi_codegen.errors import SystemDefinitionWarning as SystemDefinitionWarning
+from scvi_codegen.errors import UnresolvedError as UnresolvedError
 from scvi_codegen.exact.discrete_lagrangian import ExactStep as ExactStep
 from scvi_codegen.exact.discrete_lagrangian import exact_discrete_lagrangian as exact_discrete_lagrangian
 from scvi_codegen.exact.discrete_lagrangian import exact_map as exact_map

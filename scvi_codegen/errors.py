@@ -157,6 +157,10 @@ class StateError(ScviCodegenError, ValueError):
     """A state, step size or parameter of the wrong shape, type or name."""
 
 
+class UnresolvedError(StateError, ArithmeticError):
+    """A motion that no fixed step size resolves: it ends in a singularity, or has a close encounter."""
+
+
 class BuildError(ScviCodegenError, RuntimeError):
     """A missing C compiler, or C source that the compiler rejected."""
 

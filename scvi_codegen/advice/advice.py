@@ -16,9 +16,7 @@ from functools import partial
 from itertools import takewhile
 from typing import Any, NamedTuple
 
-import numpy as np
-
-from scvi_codegen.advice.pilot import EXPONENTIAL_POWER, Pilot, run_pilot
+from scvi_codegen.advice.pilot import EXPONENTIAL_POWER, Pilot, Trials, run_pilot
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.display.cards import Html, card, grid, plain
 from scvi_codegen.errors import ArgumentError, MethodError, StateError, StepFailedError
@@ -34,11 +32,8 @@ from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import DOUBLE_DOUBLE, PRECISIONS
 from scvi_codegen.representation import summary
 from scvi_codegen.runtime.core.stepper import Stepper
-from scvi_codegen.runtime.core.validation import Array, States, flat_state
-from scvi_codegen.runtime.core.words import split
-from scvi_codegen.runtime.ensemble.initial_states import EnsembleParameters, momenta_of_each, start_of_ensemble
-from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
-from scvi_codegen.runtime.rotations.states import homogeneous_state
+from scvi_codegen.runtime.core.validation import States
+from scvi_codegen.runtime.ensemble.initial_states import EnsembleParameters
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.validation import checks_arguments
@@ -65,8 +60,6 @@ NUMBERS, FEWEST, MOST = 2**21, 2**13, 2**18
 """Number of stage positions computed in one pilot run, and bounds of its number of steps."""
 FEWEST_TOGETHER = 2**10
 """Fewest steps of the longest pilot run of an ensemble, whose number falls with the root of that of trajectories."""
-COUNTED = 256
-"""Steps of the worst trajectory whose iterations are counted, as those of an ensemble are not reported one by one."""
 
 
 class Evidence(NamedTuple):
@@ -180,7 +173,8 @@ def advise(
         is uncertain.
 
     Raises:
-        StateError: on wrong shapes, names or numbers, or if every pilot run fails.
+        StateError: on wrong shapes, names or numbers.
+        UnresolvedError: if no pilot run is accurate.
         MethodError: if the degree is to be chosen for a method that has none, or time is transformed.
         BuildError: without a C compiler.
     """
@@ -195,7 +189,7 @@ def advise(
     if not 0.0 < checked_number(quantile, "quantile") <= 1.0:
         raise StateError(f"quantile must be above 0 and at most 1, not {quantile!r}")
     state = {"p": p, "velocity": velocity, "t": t, "parameters": parameters, "options": options}
-    result: list[tuple[float, Advice, _Trials]] = []
+    result: list[tuple[float, Advice, Trials]] = []
     failures: list[StateError] = []
     if precision not in PRECISIONS[:2]:
         raise MethodError(f"advise requires precision='double' or 'double-double', not {precision!r}")
@@ -203,7 +197,7 @@ def advise(
     for candidate in _candidates(method, 1 + (precision == DOUBLE_DOUBLE)) if degree else [method]:
         for stepper in _steppers(compiled, known, candidate, solver):
             try:
-                trials = _Trials(stepper, q, state, quantile)
+                trials = Trials(stepper, q, state, quantile)
                 result.append(_advised(trials, candidate, is_symplectic(candidate, known), length, target))
             except StateError as failure:
                 failures.append(failure)
@@ -265,8 +259,8 @@ def _checked_request(span: float | None, tolerance: float | None) -> tuple[float
 
 
 def _advised(
-    trials: _Trials, method: Method, symplectic: bool, span: float, tolerance: float
-) -> tuple[float, Advice, _Trials]:
+    trials: Trials, method: Method, symplectic: bool, span: float, tolerance: float
+) -> tuple[float, Advice, Trials]:
     """Return the cost of a unit of time with the recommendation for one stepper, and the recommendation."""
     points = _points(method)
     most = min(max(FEWEST, NUMBERS // (points * trials.stepper.dimension)), MOST)
@@ -286,82 +280,6 @@ def _advised(
     nearest = min(pilot.good, key=lambda k: abs(math.log(k / choice.n)))
     evaluations = (pilot.runs[nearest].iterations + overhead) * math.ceil(points / LANES) * LANES  # in full registers
     return evaluations / pilot.step(choice.n), _advice(pilot, choice, method), trials
-
-
-class _Trials:
-    """Pilot runs of a single state, or of all states of an ensemble together.
-
-    Attributes:
-        q, p: (m,) positions and momenta, or (k, m) of an ensemble.
-        together: whether they are those of an ensemble.
-        quantile: part of its trajectories that must succeed.
-        count: number of trajectories.
-    """
-
-    def __init__(self, stepper: Stepper, q: States, state: Mapping[str, Any], quantile: float) -> None:
-        self.stepper, self.quantile, self.state = stepper, quantile, {**state, "velocity": None}
-        interface, t, parameters = stepper.interface, state["t"], state["parameters"]
-        q, p, velocity = homogeneous_state(interface, q, state["p"], state["velocity"])
-        self.together = np.ndim(flat_state(interface, split(q, "q")[0] if interface.precision else q, "q")) == 2
-        if self.together:
-            momenta = momenta_of_each(stepper, q, p, velocity, t, parameters)
-            self.q, self.p, self.state["parameters"] = start_of_ensemble(stepper, q, momenta, t, parameters)
-        else:
-            start = stepper.start(q, p, velocity=velocity, t=t, parameters=parameters, h=1.0)  # checks the arguments
-            self.q, self.p = start.q, start.p
-        self.state["p"], self.count = self.p, len(self.q) if self.together else 1
-
-    def one(self, j: int) -> tuple[Array, dict[str, Any]]:
-        """Return the positions of trajectory j, and the other arguments of its run."""
-        if not self.together:
-            return self.q, self.state
-        values = self.state["parameters"][j]
-        parameters = values if self.stepper.interface.precision else self.stepper.parameters_by_name(values)
-        return self.q[j], {**self.state, "p": self.p[j], "parameters": parameters}
-
-    def integrate(self, q: Array, *, h: float, steps: int, save_every: int) -> Any:
-        """Integrate as :meth:`Stepper.integrate`, an ensemble in one call; iterations are those of one trajectory.
-
-        Raises:
-            StepFailedError: if more trajectories fail than the quantile allows.
-        """
-        plan: dict[str, Any] = {"h": h, "steps": steps, "save_every": save_every}
-        if not self.together:
-            return self.stepper.integrate(q, **self.state, **plan)
-        runs = self.stepper.integrate_ensemble(q, **self.state, **plan)
-        failed, counted = np.flatnonzero(~runs.ok), min(steps, COUNTED)
-        if len(failed) > len(q) - math.ceil(self.quantile * len(q)):
-            status, step = str(runs.status[failed[0]]), int(runs.steps[failed[0]])
-            message = f"trajectory {failed[0]} failed: {status}"
-            raise StepFailedError(message, status=status, step=step, t=float(runs.ends[0][failed[0]]), residual=0.0)
-        q_of_one, state = self.one(int(np.argmax(runs.ok)))
-        alone = self.stepper.integrate(q_of_one, **state, h=h, steps=counted, save_every=counted)
-        return _Together(runs, alone.iterations.sum() * (steps / counted))
-
-
-class _Together(NamedTuple):
-    """Saved states of an ensemble, and the number of iterations of one trajectory."""
-
-    runs: EnsembleTrajectory
-    iterations: Array
-
-    @property
-    def t(self) -> Array:
-        """(n,) times of the saved states."""
-        return self.runs.t
-
-    @property
-    def q(self) -> Array:
-        """(n, k, m) saved positions."""
-        return self.runs.q
-
-    @property
-    def velocity(self) -> Array:
-        """(n, k, m) velocities; NaN of trajectories that failed."""
-        velocity = np.full(self.q.shape, np.nan)
-        for j in np.flatnonzero(self.runs.ok).tolist():
-            velocity[:, j] = self.runs[j].velocity
-        return velocity
 
 
 def _steppers(

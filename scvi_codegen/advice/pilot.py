@@ -14,17 +14,21 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from fractions import Fraction
 from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.errors import StepFailedError, UnresolvedError
 from scvi_codegen.methods import Method
-from scvi_codegen.runtime.core.validation import Array
-from scvi_codegen.runtime.core.words import low_words, with_low
+from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.core.validation import Array, States, flat_state
+from scvi_codegen.runtime.core.words import low_words, split, with_low
+from scvi_codegen.runtime.ensemble.initial_states import momenta_of_each, start_of_ensemble
+from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
+from scvi_codegen.runtime.rotations.states import homogeneous_state
 
 Integrate = Callable[..., Any]
 
@@ -32,6 +36,8 @@ EPSILON = 2.0**-52
 """Rounding error of doubles; that of numbers of two words is its square."""
 SAMPLES = 64
 """Number of states of each run that are compared."""
+COUNTED = 256
+"""Steps of the worst trajectory whose iterations are counted, as those of an ensemble are not reported one by one."""
 MOST_NUMBERS, FEWEST_SAMPLES = 2**21, 8
 """Largest number of positions that are stored of a run of many trajectories, and the fewest states of each."""
 RESOLVED, ROUNDOFF_LEVEL = 0.01, 1e-9
@@ -48,6 +54,82 @@ PERTURBATION = 1e-9
 EARLY, LATE = 0.38, 0.76
 """Times, relative to the pilot run, at which a linearly growing error has its root mean square over the second
 quarter and over the second half."""
+
+
+class Trials:
+    """Pilot runs of a single state, or of all states of an ensemble together.
+
+    Attributes:
+        q, p: (m,) positions and momenta, or (k, m) of an ensemble.
+        together: whether they are those of an ensemble.
+        quantile: part of its trajectories that must succeed.
+        count: number of trajectories.
+    """
+
+    def __init__(self, stepper: Stepper, q: States, state: Mapping[str, Any], quantile: float) -> None:
+        self.stepper, self.quantile, self.state = stepper, quantile, {**state, "velocity": None}
+        interface, t, parameters = stepper.interface, state["t"], state["parameters"]
+        q, p, velocity = homogeneous_state(interface, q, state["p"], state["velocity"])
+        self.together = np.ndim(flat_state(interface, split(q, "q")[0] if interface.precision else q, "q")) == 2
+        if self.together:
+            momenta = momenta_of_each(stepper, q, p, velocity, t, parameters)
+            self.q, self.p, self.state["parameters"] = start_of_ensemble(stepper, q, momenta, t, parameters)
+        else:
+            start = stepper.start(q, p, velocity=velocity, t=t, parameters=parameters, h=1.0)  # checks the arguments
+            self.q, self.p = start.q, start.p
+        self.state["p"], self.count = self.p, len(self.q) if self.together else 1
+
+    def one(self, j: int) -> tuple[Array, dict[str, Any]]:
+        """Return the positions of trajectory j, and the other arguments of its run."""
+        if not self.together:
+            return self.q, self.state
+        values = self.state["parameters"][j]
+        parameters = values if self.stepper.interface.precision else self.stepper.parameters_by_name(values)
+        return self.q[j], {**self.state, "p": self.p[j], "parameters": parameters}
+
+    def integrate(self, q: Array, *, h: float, steps: int, save_every: int) -> Any:
+        """Integrate as :meth:`Stepper.integrate`, an ensemble in one call; iterations are those of one trajectory.
+
+        Raises:
+            StepFailedError: if more trajectories fail than the quantile allows.
+        """
+        plan: dict[str, Any] = {"h": h, "steps": steps, "save_every": save_every}
+        if not self.together:
+            return self.stepper.integrate(q, **self.state, **plan)
+        runs = self.stepper.integrate_ensemble(q, **self.state, **plan)
+        failed, counted = np.flatnonzero(~runs.ok), min(steps, COUNTED)
+        if len(failed) > len(q) - math.ceil(self.quantile * len(q)):
+            status, step = str(runs.status[failed[0]]), int(runs.steps[failed[0]])
+            message = f"trajectory {failed[0]} failed: {status}"
+            raise StepFailedError(message, status=status, step=step, t=float(runs.ends[0][failed[0]]), residual=0.0)
+        q_of_one, state = self.one(int(np.argmax(runs.ok)))
+        alone = self.stepper.integrate(q_of_one, **state, h=h, steps=counted, save_every=counted)
+        return _Together(runs, alone.iterations.sum() * (steps / counted))
+
+
+class _Together(NamedTuple):
+    """Saved states of an ensemble, and the number of iterations of one trajectory."""
+
+    runs: EnsembleTrajectory
+    iterations: Array
+
+    @property
+    def t(self) -> Array:
+        """(n,) times of the saved states."""
+        return self.runs.t
+
+    @property
+    def q(self) -> Array:
+        """(n, k, m) saved positions."""
+        return self.runs.q
+
+    @property
+    def velocity(self) -> Array:
+        """(n, k, m) velocities; NaN of trajectories that failed."""
+        velocity = np.full(self.q.shape, np.nan)
+        for j in np.flatnonzero(self.runs.ok).tolist():
+            velocity[:, j] = self.runs[j].velocity
+        return velocity
 
 
 class PilotRun(NamedTuple):
@@ -86,7 +168,7 @@ def run_pilot(
         quantile: part of the trajectories whose errors must be within the bound.
 
     Raises:
-        StateError: if the solution seems to end in a singularity, or no step size resolves it from the start.
+        UnresolvedError: if the solution seems to end in a singularity, or no step size resolves it from the start.
     """
     pilot, first = None, 1
     for cuts in range(MAX_SHORTENINGS, -1, -1):
@@ -95,10 +177,10 @@ def run_pilot(
         if not longer.resolved:
             break
         pilot, first = longer, max(1, longer.finest // SHORTENING)
-    h, failure = longer.step(longer.finest), longer.runs[longer.finest].failure
-    if pilot is None or (failure and SHORTENING * h < pilot.step(pilot.finest)):
-        raise StateError(
-            f"no pilot run over t = {longer.length:.3g} succeeds, with step sizes down to {h:.3g}: the solution may "
+    if pilot is None or longer.fails_below(pilot.step(pilot.finest) / SHORTENING):
+        h = longer.step(longer.finest)
+        raise UnresolvedError(
+            f"no pilot run over t = {longer.length:.3g} is accurate, with step sizes down to {h:.3g}: the solution may "
             "end in a singularity or have a close encounter; use adaptive step size (t_end, --tolerance), or a shorter "
             "span"
         )
@@ -200,6 +282,10 @@ class Pilot:
         if self.rate:
             return float(_exploded(max(self.floor, self.epsilon), self.rate, self.span - self.length))
         return self.floor * float((self.span / self.length) ** ROUNDING)
+
+    def fails_below(self, h: float) -> bool:
+        """Return whether a run with a step size below h fails; one of several may succeed by chance."""
+        return any(leg.failure and self.step(n) < h for n, leg in self.runs.items())
 
     def step(self, n: float) -> float:
         """Return the step size |h| of n steps."""

@@ -28,6 +28,7 @@ from scvi_codegen.errors import (
     ScviCodegenError,
     StepFailedError,
     SystemDefinitionWarning,
+    UnresolvedError,
     closest,
 )
 from scvi_codegen.files.atomic import write_text
@@ -116,7 +117,7 @@ def errors_as_messages() -> Iterator[None]:
     try:
         with _warnings_as_lines():
             yield
-    except (StepFailedError, PathError, BuildError, RecordingError) as error:
+    except (StepFailedError, UnresolvedError, PathError, BuildError, RecordingError) as error:
         raise CommandFailure(str(error), FAILURE) from error
     except ScviCodegenError as error:
         cause = error.__cause__

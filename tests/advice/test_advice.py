@@ -18,6 +18,7 @@ from scvi_codegen import Advice, LagrangianSystem, MethodError, StateError, advi
 from scvi_codegen.advice.advice import _advice, _choose, _warnings
 from scvi_codegen.advice.pilot import run_pilot
 from scvi_codegen.cli.step_selection import _text
+from scvi_codegen.errors import StepFailedError, UnresolvedError
 from scvi_codegen.methods import SVI, ExplicitEuler, Gauss, Method, RadauIIA, StoermerVerlet
 
 pytestmark = pytest.mark.long
@@ -70,6 +71,19 @@ def turning(q: np.ndarray, h: float, steps: int, save_every: int) -> SimpleNames
     """Run on a circle at the angular velocity 1 + h^2/24, as of a method of order 2."""
     angles = (1.0 + h * h / 24.0) * h * np.arange(0, steps + 1, save_every)
     return SimpleNamespace(q=np.stack([np.cos(angles), np.sin(angles)], 1), iterations=np.full(steps, 5))
+
+
+def test_run_that_succeeds_by_chance_is_not_trusted() -> None:
+    """All runs beyond t = 2, where an encounter begins, fail but the last one."""
+
+    def encounter(q: np.ndarray, h: float, steps: int, save_every: int) -> SimpleNamespace:
+        if h * steps > 2.0 and steps != 1024:
+            raise StepFailedError("", status="not converged", step=0, t=2.0, residual=1.0)
+        return turning(q, h, steps, save_every)
+
+    bounds = {"symplectic": True, "target_error": 5e-3, "most": 2**14}
+    with pytest.raises(UnresolvedError, match=r"no pilot run over t = 4 is accurate, with step sizes down to 0.0039"):
+        run_pilot(encounter, StoermerVerlet(), np.array([1.0, 0.0]), 16.0, **bounds)
 
 
 @pytest.mark.parametrize("span", [100.0, -100.0, 4000.0])
@@ -280,7 +294,7 @@ class TestHonesty:
 
     def test_trajectory_that_ends_is_reported(self):
         system = LagrangianSystem.from_text(name="runaway", coordinates=["q"], lagrangian="q_dot**2/2 + q**3/3")
-        with pytest.raises(StateError, match="may end in a singularity"):
+        with pytest.raises(UnresolvedError, match="may end in a singularity"):
             advise(system, Gauss(2), [1.0], [1.0], 10.0, 1e-6)
 
     def test_low_order_method_is_advised_a_step_too_short_for_the_pilot(self):
