@@ -93,9 +93,6 @@ SITUATIONS = {
     "without trajectories in SIMD lanes": lambda: stepper_of("scvi:2"),
     "with sizes known at run time": lambda: stepper_of(**ARRAY),
     "with precision='double-double'": lambda: stepper_of(precision="double-double"),
-    "with events and precision='double-double'": lambda: stepper_of(
-        events=sc.Event("q - 0.25", then={"p_q": "-p_q"}), precision="double-double"
-    ),
     "with forces": lambda: stepper_of(forces={"q": "-q_dot"}),
     "with the long steps of this method": lambda: stepper_of("svi:4"),
     "where the energy changes": lambda: stepper_of(lagrangian="q_dot**2/2 - cos(t)*q**2/2"),

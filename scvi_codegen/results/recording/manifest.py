@@ -24,8 +24,9 @@ from scvi_codegen.rendering.source import Interface, Source, check_interface
 from scvi_codegen.runtime.core.compiled_method import Variants
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.stepper import Stepper
-from scvi_codegen.runtime.core.words import Words, missing, with_low
+from scvi_codegen.runtime.core.words import Words, low_words, missing, with_low
 from scvi_codegen.runtime.events.event import Event
+from scvi_codegen.runtime.events.refinement import constantly
 from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.validation import checked_count
@@ -45,7 +46,7 @@ class Chunk:
         step: number of steps at the checkpoint.
         memory: memory of the run, as returned by :meth:`Run.checkpoint`.
         crossings: (k, 2 + 2m) crossings of events in these steps: number of the event (plus the number of events
-            times that of the element of its loops), t, q, p.
+            times that of the element of its loops), t, q, p, with low words in double-double arithmetic.
     """
 
     piece: Piece
@@ -61,6 +62,12 @@ def no_states(interface: Interface) -> Piece:
     """Return an empty piece of states, with low words in double-double arithmetic."""
     t, vectors = missing((0,), interface.words), missing((0, interface.dimension), interface.words)
     return t, vectors, vectors, np.empty(0, dtype=np.int32)
+
+
+def no_crossings(interface: Interface) -> NDArray[np.float64]:
+    """Return an empty array of crossings."""
+    none: NDArray[np.float64] = missing((0, 2 + 2 * interface.dimension), interface.words)
+    return none
 
 
 def chunk_path(folder: Path, number: int) -> Path:
@@ -92,7 +99,7 @@ def write_chunk(folder: Path, number: int, chunk: Chunk) -> None:
     t, q, p, iterations = chunk.piece
     memory = np.frombuffer(chunk.memory, dtype=np.uint8)
     further: dict[str, Any] = {"step": np.int64(chunk.step), "memory": memory, "crossings": chunk.crossings}
-    named = zip(COLUMNS, chunk.piece, strict=True)
+    named = zip((*COLUMNS, "crossings"), (*chunk.piece, chunk.crossings), strict=True)
     further |= {f"{name}_low": column.low for name, column in named if isinstance(column, Words)}
     np.savez(buffer, t=t, q=q, p=p, iterations=iterations, **further)
     write_atomically(chunk_path(folder, number), lambda file: file.write(_sealed(buffer.getvalue())))
@@ -134,7 +141,9 @@ def read_chunk(path: Path, interface: Interface, rows: int) -> Chunk:
             t, q, p, iterations = (arrays[name] for name in COLUMNS)
             if interface.words > 1:
                 t, q, p = (with_low(arrays[name], arrays[f"{name}_low"]) for name in ("t", "q", "p"))
-            crossings = arrays["crossings"] if "crossings" in arrays else np.empty((0, 2 + 2 * q.shape[-1]))
+            crossings = arrays["crossings"] if "crossings" in arrays else no_crossings(interface)
+            if "crossings_low" in arrays:
+                crossings = with_low(crossings, arrays["crossings_low"])
             chunk = Chunk((t, q, p, iterations), int(arrays["step"]), arrays["memory"].tobytes(), crossings)
             _check_shapes(chunk, interface, rows)
             return chunk
@@ -150,9 +159,9 @@ def _check_shapes(chunk: Chunk, interface: Interface, rows: int) -> None:
         for words in (column, column.low) if isinstance(column, Words) else (column,):
             if words.shape != (len(chunk), *like.shape[1:]) or words.dtype != like.dtype:
                 raise ValueError(f"{name} has the shape {words.shape} and the type {words.dtype}")
-    crossings = chunk.crossings
-    if crossings.ndim != 2 or crossings.shape[1] != 2 + 2 * interface.dimension or crossings.dtype != np.float64:
-        raise ValueError(f"crossings has the shape {crossings.shape} and the type {crossings.dtype}")
+    for words in (chunk.crossings, low_words(chunk.crossings)):
+        if words.shape != (len(chunk.crossings), 2 + 2 * interface.dimension) or words.dtype != np.float64:
+            raise ValueError(f"crossings has the shape {words.shape} and the type {words.dtype}")
     if chunk.step < 0 or len(chunk) > rows:
         raise ValueError(f"it has {len(chunk)} states up to step {chunk.step}")
 
@@ -197,6 +206,7 @@ class Manifest:
         source, interface, flags: those of its stepper.
         fallback: source of the fallback library with Newton's iteration, ``None`` if the source contains it.
         options: convergence criterion of the solver; ``None`` for the defaults.
+        double: source, interface and fallback in double, which locate the events of double-double runs, else empty.
         parameters, parameters_low: values in the order of ``interface.parameters``; low words in double-double
             arithmetic.
         h: step size, 0 for adaptive steps.
@@ -230,6 +240,7 @@ class Manifest:
     events: tuple[Event, ...] = ()
     mesh: Mapping[str, Any] | None = None
     parameters_low: tuple[float, ...] = ()
+    double: tuple[Source, Interface, Source | None] | tuple[()] = ()
 
     @property
     def values(self) -> NDArray[np.float64]:
@@ -254,7 +265,12 @@ class Manifest:
         """Return the integrator, compiled or loaded from the cache; ``mesh``: of the fields of a density."""
         variants = Variants({"fallback": self.fallback})
         interface = replace(self.interface, layout=replace(self.interface.layout, mesh=mesh))
-        return Stepper(self.source, interface, variants=variants, flags=self.flags, events=self.events)
+        stepper = Stepper(self.source, interface, variants=variants, flags=self.flags, events=self.events)
+        if self.double:
+            source, interface, fallback = self.double
+            variants = Variants({"fallback": fallback})
+            stepper._doubles = constantly(Stepper(source, interface, variants=variants, flags=self.flags))
+        return stepper
 
     def reached(self, run: Run) -> bool:
         """Return whether a run has reached its end."""
@@ -277,7 +293,8 @@ class Manifest:
     def check(self) -> None:
         """Raise :class:`ValueError` for numbers that are impossible in a run, and for unsafe compiler flags."""
         check_flags(self.flags)
-        check_interface(self.source, self.interface)
+        for source, interface in ((self.source, self.interface), *([self.double[:2]] if self.double else ())):
+            check_interface(source, interface)
         if self.fallback and self.fallback.prefix != self.source.prefix:
             raise ValueError(f"the fallback is of '{self.fallback.prefix}', not of '{self.source.prefix}'")
         if not isinstance(self.model, str | None):
@@ -318,6 +335,7 @@ class Manifest:
             **({"events": [event.table for event in self.events]} if self.events else {}),
             **({"mesh": self.mesh} if self.mesh else {}),
             **({"parameters_low": self.parameters_low} if self.parameters_low else {}),
+            **({"double": [each and each.to_record() for each in self.double]} if self.double else {}),
         }
         text = json.dumps(document, indent=1) + "\n"
         return SEAL % hashlib.sha256(text.encode()).hexdigest() + text[1:]
@@ -349,6 +367,7 @@ class Manifest:
             events=tuple(Event(**table) for table in document.get("events", ())),
             mesh=document.get("mesh"),
             parameters_low=tuple(document.get("parameters_low", ())),
+            double=_double(*document.get("double", ())),
         )
         manifest.check()
         return manifest
@@ -358,6 +377,13 @@ FIRST_LINE, SEAL = '{\n "format": ', '{\n "sha256": "%s",'
 """First line of the text of a manifest, and the lines before it: the checksum of the text."""
 PLAN = ("t_end", "tolerance", "tau")
 PLAIN = ("flags", "parameters", "h", "t", "save_every", "steps", "rows", "model", "certificate")
+
+
+def _double(*records: Any) -> tuple[Source, Interface, Source | None] | tuple[()]:
+    if not records:
+        return ()
+    source, interface, fallback = records
+    return Source.from_record(source), Interface.from_record(interface), fallback and Source.from_record(fallback)
 
 
 def read_manifest(folder: Path) -> Manifest:

@@ -132,9 +132,9 @@ class RecordedRun(AttitudeHistory):
         """Crossings of the events of the run."""
         paths, events = self._paths[:-1], self.manifest.events
         rows = [*(self._read(path).crossings for path in paths if events), self._last.crossings]
-        e, t, *states = np.concatenate(rows).T
-        q, p = np.split(np.transpose(states), 2, axis=1)
-        elements, numbers = np.divmod(e.astype(np.int64), max(1, len(events)))
+        crossings, half = np.concatenate(rows), 2 + self.manifest.interface.dimension
+        t, q, p = crossings[:, 1], crossings[:, 2:half], crossings[:, half:]
+        elements, numbers = np.divmod(np.asarray(crossings[:, 0], dtype=np.int64), max(1, len(events)))
         return tuple(
             Crossings(event=event, t=t[mine], q=q[mine], p=p[mine], element=elements[mine])
             for event, mine in ((event, numbers == k) for k, event in enumerate(events))

@@ -27,6 +27,7 @@ from scvi_codegen.results.recording.manifest import (
     Chunk,
     Manifest,
     chunk_paths,
+    no_crossings,
     no_states,
     read_chunk,
     read_manifest,
@@ -109,6 +110,7 @@ def record_run(
         options=run.options,
         parameters=tuple(map(float, run.parameters)),
         parameters_low=tuple(low_words(run.parameters).tolist()) if run.stepper.interface.words > 1 else (),
+        double=_double(run.stepper),
         h=run.h,
         t=run.t,
         save_every=checked_count(save_every, "save_every", least=1),
@@ -200,6 +202,14 @@ def _mesh(run: Run) -> dict[str, Any] | None:
     return mesh and {"field": mesh.to_section(), "parameters": {name: values[name] for name in known}}
 
 
+def _double(stepper: Any) -> tuple[Any, ...]:
+    """Return the source, the interface and the fallback in double of events in double-double runs."""
+    if stepper.interface.words == 1 or not stepper.events:
+        return ()
+    double = stepper._in_double
+    return double._plain, double.interface, double.fallback
+
+
 def _checked(folder: Path, run: Run) -> RecordedRun:
     """Return the run in a folder, with the accuracy warnings of a run in memory."""
     recorded = load_run(folder)
@@ -217,7 +227,7 @@ class _Recorder:
         self.folder, self.manifest, self.run = folder, manifest, run
         self.seconds, self.steps = seconds, steps
         self.number, self.written, self.written_t = 0, -1, run.t
-        self.crossings = np.empty((0, 2 + 2 * run.stepper.dimension))
+        self.crossings = no_crossings(run.stepper.interface)
         self.pending: tuple[list[Piece], NDArray[np.float64], int, float, bytes]
         self.pending = [], self.crossings, run.steps, run.t, run.checkpoint()
 
@@ -295,8 +305,10 @@ class _Recorder:
         run, (pieces, crossings, *_) = self.run, self.pending
         piece = trajectory.t[first:], trajectory.q[first:], trajectory.p[first:], trajectory.iterations[first:]
         events = trajectory.events
-        columns = [(k + len(events) * each.element, each.t, each.q, each.p) for k, each in enumerate(events)]
-        crossings = np.concatenate([crossings, *map(np.column_stack, columns)])
+        for k, each in enumerate(events):
+            numbers = (k + len(events) * each.element)[:, np.newaxis]
+            found = np.concatenate([numbers, each.t[:, np.newaxis], each.q, each.p], axis=1)
+            crossings = np.concatenate([crossings, found])
         self.pending = ([*pieces, piece], crossings, run.steps, run.t, run.checkpoint())
 
     def checkpoint(self) -> None:

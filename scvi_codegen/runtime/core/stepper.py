@@ -36,7 +36,7 @@ from scvi_codegen.runtime.ensemble.ensemble import Ensemble
 from scvi_codegen.runtime.ensemble.initial_states import EnsembleParameters, momenta_of_each
 from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
 from scvi_codegen.runtime.events.event import Event, EventLike
-from scvi_codegen.runtime.events.refinement import WithEventsInDouble
+from scvi_codegen.runtime.events.refinement import WithEventsInDouble, constantly
 from scvi_codegen.runtime.inputs.segments import InputSegments, checked_inputs, final_time
 from scvi_codegen.runtime.paths.path import Path, WithPaths
 from scvi_codegen.runtime.rotations.states import homogeneous_state, is_one_state
@@ -82,8 +82,9 @@ class Stepper(WithEventsInDouble, WithPaths, Integrator):
         if self.origin is not None:
             return (_rebuild_bound, (self.origin, self.problem, self.events))
         variants = Variants() if self._reason else self._variants
-        further: dict[str, Any] = {"flags": self.flags, "events": self.events, "reason": self._reason}
-        return partial(Stepper, variants=variants, **further), (self._plain, self.interface)
+        made = partial(Stepper, variants=variants, flags=self.flags, events=self.events, reason=self._reason)
+        further = {} if self._doubles is None or not self.events else {"_doubles": constantly(self._doubles())}
+        return made, (self._plain, self.interface), further
 
     @checks_arguments(StateError)
     def integrate(

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import groupby
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
@@ -47,7 +47,7 @@ class RefinedCrossing(NamedTuple):
     element: int
 
 
-class Place(NamedTuple):
+class TimedState(NamedTuple):
     """Time and state of two words from which a partial step starts."""
 
     t: Fraction
@@ -55,10 +55,10 @@ class Place(NamedTuple):
     p: Array
 
 
-class Row(NamedTuple):
+class SavedRow(NamedTuple):
     """State at the end of a step or after a change within one, and the size of the part of the step before it."""
 
-    at: Place
+    at: TimedState
     size: float = 0.0
     number: int = -1
     iterations: int = 0
@@ -87,7 +87,7 @@ class RefinedSearch(CrossingSearch):
     def _refined(self, part: SavedStates, record: Any) -> RefinedCrossing:
         t, forward = float(record["t"]), part.forward
         k = max(0, int(np.searchsorted(forward * np.asarray(part.t), forward * t, side="right")) - 1)
-        start, h = Place(fraction_of(part.t[k]), part.q[k], part.p[k]), float(part.step_sizes[k])
+        start, h = TimedState(fraction_of(part.t[k]), part.q[k], part.p[k]), float(part.step_sizes[k])
         if self.precise.in_tau:
             h *= float(self.precise.rates(start.q, start.p, part.parameters)[0])
         return self._crossing(record, self._root(part, start, self._function(record), Fraction(t), Fraction(h)))
@@ -96,14 +96,16 @@ class RefinedSearch(CrossingSearch):
         number: int = self.precise._event_functions.firsts[int(record["function"])] + _element(record)
         return number
 
-    def _crossing(self, record: Any, at: Place) -> RefinedCrossing:
+    def _crossing(self, record: Any, at: TimedState) -> RefinedCrossing:
         return RefinedCrossing(int(record["function"]), _word(at.t), at.q, at.p, _element(record))
 
-    def _root(self, states: SavedStates | Memory, start: Place, function: int, guess: Fraction, h: Fraction) -> Place:
+    def _root(
+        self, states: SavedStates | Memory, start: TimedState, function: int, guess: Fraction, h: Fraction
+    ) -> TimedState:
         """Return the time of a simple zero near ``guess`` in the step from ``start``, else ``guess``, and the state."""
         here = self._moved(states, start, guess)
 
-        def value(at: Place) -> Fraction:
+        def value(at: TimedState) -> Fraction:
             number = self.precise._event_functions.value(function, at.q, at.p, at.t, states.parameters)
             numerator, exponent = number.man_exp  # of the absolute value
             size = int(numerator) * Fraction(2**exponent if exponent >= 0 else Fraction(1, 2**-exponent))
@@ -124,14 +126,14 @@ class RefinedSearch(CrossingSearch):
             return here
         return self._moved(states, start, t)
 
-    def _moved(self, states: SavedStates | Memory, start: Place, end: Fraction) -> Place:
+    def _moved(self, states: SavedStates | Memory, start: TimedState, end: Fraction) -> TimedState:
         """Return the state after a partial step to a time."""
         if end == start.t:
             return start
         t, stepper = _word(start.t), self.precise
         if stepper.in_tau:
             begin = with_low(np.array([float(t)]), np.array([t.low]))
-            return Place(end, *stepped_to(states, start.q, start.p, begin, end))
+            return TimedState(end, *stepped_to(states, start.q, start.p, begin, end))
         if self._partial is None:
             plan = StepPlan(h=float(end - start.t))
             settings: dict[str, Any] = {"parameters": states.parameters, "options": states.options}
@@ -142,11 +144,11 @@ class RefinedSearch(CrossingSearch):
         run._memory.t_low = t.low
         run._step_to(end)
         run.advance(1)
-        return Place(end, run.q, run.p)
+        return TimedState(end, run.q, run.p)
 
     def advance(self, run: Memory, size: int) -> Any:
         """Advance a run by at most ``size`` steps with events that change its state; see the base class."""
-        plan, rows, failure = run._plan, [Row(_place(run), number=run.steps)], None
+        plan, rows, failure = run._plan, [SavedRow(_place(run), number=run.steps)], None
         memory, watch = run.stepper.binding.buffer(run._memory), self.binding.buffer(self.watch)
         for _ in range(size):
             if self.ended or run.left_to(plan.t_end) == 0.0:
@@ -163,12 +165,12 @@ class RefinedSearch(CrossingSearch):
         iterations, numbers = (np.array([row[k] for row in rows]) for k in (3, 2))
         return (t, q, p, iterations.astype(np.int32)), sizes, numbers, failure
 
-    def _step(self, run: Memory) -> list[Row]:
+    def _step(self, run: Memory) -> list[SavedRow]:
         """Take one step with the changes in it; return the states after these and, unless it ended, at its end."""
         start, number, stop = _place(run), run.steps, None
         self._take(run)
         iterations, run.iterations, end = run.iterations, 0, _place(run)
-        at, h, rows = start, end.t - start.t, list[Row]()
+        at, h, rows = start, end.t - start.t, list[SavedRow]()
         for crossings in self._located(run, start, h, number):
             roots = [self._root(run, at, self._function(each), Fraction(float(each["t"])), h) for each in crossings]
             acting = [k for k, each in enumerate(crossings) if self.watch.acts[int(each["function"])]]
@@ -177,14 +179,15 @@ class RefinedSearch(CrossingSearch):
                 before = roots[acting[0]]
                 roots = [before] * len(crossings)
                 functions = [self._function(crossings[k]) for k in acting]
-                after = self.precise._event_functions.changed(functions, *before[1:], before.t, run.parameters, h > 0)
-                rows.append(Row(Place(before.t, *after), float(before.t - at.t)))
+                changed = self.precise._event_functions.changed
+                after = changed(functions, *before[1:], before.t, run.parameters, h > 0, float(start.t))
+                rows.append(SavedRow(TimedState(before.t, *after), float(before.t - at.t)))
                 at = rows[-1].at
             self.refined += map(self._crossing, crossings, roots)
             self.last = self.refined[-1][1:4]
         if self.ended:
             if stop is not None:
-                rows.append(Row(stop, float(stop.t - at.t)))
+                rows.append(SavedRow(stop, float(stop.t - at.t)))
                 at = stop
             run._memory.step = number
             _set(run, at)
@@ -192,7 +195,7 @@ class RefinedSearch(CrossingSearch):
         if rows:
             end = self._moved(run, at, end.t)
             _set(run, end)
-        return [*rows, Row(end, float(end.t - at.t), run.steps, iterations)]
+        return [*rows, SavedRow(end, float(end.t - at.t), run.steps, iterations)]
 
     def _take(self, run: Memory) -> None:
         """Take one step, the last to the target time of fixed steps: shorter, or longer by the rounding of h."""
@@ -205,7 +208,7 @@ class RefinedSearch(CrossingSearch):
             memory.t, memory.t_low = plan.t_end, 0.0
             memory.h, memory.h_low = plan.h, 0.0
 
-    def _located(self, run: Memory, start: Place, h: Fraction, number: int) -> list[list[Any]]:
+    def _located(self, run: Memory, start: TimedState, h: Fraction, number: int) -> list[list[Any]]:
         """Return the crossings in a step, which the integrator in double repeats, grouped by time."""
         twin = self._twin
         twin._parameters[:] = run._parameters
@@ -248,17 +251,26 @@ def _word(t: Fraction) -> Word:
     return word(high, float(t - Fraction(high)))
 
 
-def _place(run: Memory) -> Place:
-    return Place(run._exact_time, run.q, run.p)
+def _place(run: Memory) -> TimedState:
+    return TimedState(run._exact_time, run.q, run.p)
 
 
-def _set(run: Memory, at: Place) -> None:
+def _set(run: Memory, at: TimedState) -> None:
     """Set the time and the state of a run; its step density begins anew."""
     memory, t = run._memory, _word(at.t)
     memory.t, memory.t_low, memory.guess = float(t), t.low, 0
     run._q[:], run._p[:] = at.q, at.p
     if hasattr(memory, "density"):
         memory.density = 0.0
+
+
+def constantly(stepper: Any) -> Callable[[], Any]:
+    """Return a function that returns a stepper, and can be pickled."""
+    return partial(_itself, stepper)
+
+
+def _itself(stepper: Any) -> Any:
+    return stepper
 
 
 class WithEventsInDouble:
@@ -274,8 +286,8 @@ class WithEventsInDouble:
         """The integrator in double with the same events."""
         if self._doubles is None:
             raise MethodError(
-                "events= with precision='double-double' require the integrator in double, which a loaded or pickled "
-                "stepper lacks: compile the system"
+                "events= with precision='double-double' require the integrator in double, which a stepper that was "
+                "loaded or pickled without events lacks: compile the system"
             )
         return self._doubles().with_events(self.events)
 
