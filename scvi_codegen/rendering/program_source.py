@@ -210,6 +210,7 @@ def render_double_double(
     assert mass is not None  # of separable systems
     tables = [replace(each, in_two_parts=not each.is_matrix or each.in_two_parts) for each in fixed_point.own_tables]
     tables += [_lowest_words(each) for each in tables if each.name in OF_THREE_WORDS]
+    anchor = 3 * max(_largest_sum(each) for each in tables if each.name in OF_THREE_WORDS[1:])
     program = replace(program, fixed_point=replace(fixed_point, own_tables=tuple(tables), linear_part=None))
     quantities, lanes = program.quantities, (derivatives.partials, derivatives.products[0])
     states = (quantities.energy, *((quantities.momentum_kernel,) if quantities.momentum_kernel else ()))
@@ -220,6 +221,7 @@ def render_double_double(
         "cut": context["cut"] or is_divided(lanes),
         "two_words": {
             "derivatives": derivatives.count,
+            "anchor": anchor,
             "of_numbers": numbers,
             "of_vectors": vectors,
             "meaning": POINTS,
@@ -228,6 +230,12 @@ def render_double_double(
         "own_headers": {**arithmetic_headers(), **cast("Mapping[str, str]", context["own_headers"])},
     }
     return _render(program.prefix, context)
+
+
+def _largest_sum(table: IterationTable) -> float:
+    """Return the largest sum of the absolute values of a row."""
+    rows = table.numbers if table.is_matrix else (table.numbers,)
+    return max(float(sum(map(abs, row))) for row in rows)
 
 
 def _lowest_words(table: IterationTable) -> IterationTable:

@@ -5,18 +5,22 @@ A kernel becomes calls of functions of pairs, ``dd_multiply(w0, w1)``: pairs of 
 of numbers, all high words before all low words.
 """
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from functools import cache
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.files.cache import template_folder
-from scvi_codegen.ir.kernel import Constant, Expression, Kernel, Load, Number
+from scvi_codegen.ir.kernel import Constant, Expression, Kernel, Load, Number, Operation
 from scvi_codegen.rendering.kernels.printer import INVERSE_ROOT, scalar_functions
 from scvi_codegen.rendering.kernels.simd import Lanes
 from scvi_codegen.rendering.text import table, wrapped, wrapped_comment, wrapped_prototype
 from scvi_codegen.tables.precision import mp
 
-OPERATORS = {"+": "add", "-": "subtract", "*": "multiply", "/": "divide", "neg": "negative"}
+OPERATORS = {"+": "sum", "-": "difference", "/": "divide", "neg": "negative"}
+SUMS = ("+", "-", "neg")
+PRODUCTS, SETTLED_PRODUCTS = ("squared", "multiple", "product"), ("square", "scale", "multiply")
+"""Functions of ``templates/support/double_double/pairs.h``: square, product with one word, and of pairs."""
 ROOTS = frozenset(("sqrt", *(f"{INVERSE_ROOT}{k}" for k in (1, 3, 5, 7))))
 FUNCTIONS = frozenset(
     "sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh exp log pow".split()  # noqa: SIM905
@@ -39,16 +43,26 @@ def uses_functions(kernels: tuple[Kernel, ...]) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class _Printed:
-    """C source of a pair, or of one word: ``kind`` is ``"dd"``, ``"ddl"`` or ``"word"``."""
+    """C source of a pair, or of one word: ``kind`` is ``"dd"``, ``"ddl"`` or ``"word"``.
+
+    ``form`` is that of its low word: ``"settled"``; ``"product"`` if it is a few units of the high word; ``"sum"``
+    if it may be of any size relative to it, as after cancellation.
+    """
 
     text: str
     kind: str
+    form: str = "settled"
 
-    def as_pair(self, kind: str) -> str:
-        """Return the source of a pair of this kind."""
+    def as_pair(self, kind: str, *, summed: bool = False) -> str:
+        """Return the source of a pair of this kind; of a sum a settled one, unless it is summed further."""
         if self.kind == "word":
             return f"{kind}_word({self.text if kind == 'dd' else f'lanes_of({self.text})'})"
-        return self.text if self.kind == kind else f"ddl_of({self.text})"
+        text = self.text if self.kind == kind else f"ddl_of({self.text})"
+        return f"{kind}_settled({text})" if self.form == "sum" and not summed else text
+
+    def settled(self, kind: str) -> str:
+        """Return the source of a settled pair of this kind."""
+        return replace(self, form="settled" if self.form == "settled" else "sum").as_pair(kind)
 
 
 class _PairPrinter:
@@ -56,7 +70,7 @@ class _PairPrinter:
 
     def __init__(self, lanes: Lanes | None) -> None:
         self.sources = lanes.sources if lanes else ()
-        self.temporaries: dict[int, str] = {}
+        self.temporaries: dict[int, tuple[str, str]] = {}  # kind and form
 
     def kind_of(self, source: str) -> str:
         """Return the kind of pairs of an argument."""
@@ -69,20 +83,31 @@ class _PairPrinter:
         if isinstance(expression, Load):
             return self._load(expression)
         operands = [self.printed(each) for each in expression.operands]
-        kinds = {each.kind for each in operands}
-        result = "ddl" if "ddl" in kinds else "dd"
-        name = OPERATORS.get(expression.operator, expression.operator)
-        if name == "multiply" and len(set(expression.operands)) == 1:
-            return _Printed(f"{result}_square({operands[0].as_pair(result)})", result)
-        if name == "multiply" and "word" in kinds:
-            word, pair = sorted(operands, key=lambda each: each.kind != "word")
-            scale = word.text if result == "dd" else f"lanes_of({word.text})"
-            return _Printed(f"{result}_scale({pair.as_pair(result)}, {scale})", result)
-        return _Printed(f"{result}_{name}({', '.join(each.as_pair(result) for each in operands)})", result)
+        result = "ddl" if any(each.kind == "ddl" for each in operands) else "dd"
+        if expression.operator == "*":
+            return self._product(expression, operands, result)
+        name, added = OPERATORS.get(expression.operator, expression.operator), expression.operator in SUMS
+        form = "settled" if not added else operands[0].form if name == "negative" else "sum"
+        texts = (each.as_pair(result, summed=added) for each in operands)
+        return _Printed(f"{result}_{name}({', '.join(texts)})", result, form)
+
+    def _product(self, expression: Operation, operands: list[_Printed], kind: str) -> _Printed:
+        """Return a product, whose low word is settled if those of its factors are not."""
+        factors = {each.form for each in operands}
+        names, form = (SETTLED_PRODUCTS, "settled") if "product" in factors else (PRODUCTS, "product")
+        if len(set(expression.operands)) == 1:
+            return _Printed(f"{kind}_{names[0]}({operands[0].as_pair(kind)})", kind, form)
+        word, pair = sorted(operands, key=lambda each: each.kind != "word")
+        if word.kind != "word":
+            return _Printed(f"{kind}_{names[2]}({', '.join(each.as_pair(kind) for each in operands)})", kind, form)
+        exact = math.frexp(abs(float(word.text)))[0] == 0.5  # a power of two
+        name, form = ("times_power", pair.form) if exact else (names[1], form)
+        number = word.text if kind == "dd" else f"lanes_of({word.text})"
+        return _Printed(f"{kind}_{name}({pair.as_pair(kind, summed=exact)}, {number})", kind, form)
 
     def _load(self, load: Load) -> _Printed:
         if load.source == "w":
-            return _Printed(f"w{load.index}", self.temporaries[load.index])
+            return _Printed(f"w{load.index}", *self.temporaries[load.index])
         kind = self.kind_of(load.source)
         if load.source == "parameters":
             return _Printed(f"PARAMETER{'_OF_LANES' if kind == 'ddl' else ''}({load.index})", kind)
@@ -105,10 +130,11 @@ def pair_kernel_text(kernel: Kernel, lanes: Lanes | None = None) -> str:
     for array, k, expression in kernel.statements():
         value = printer.printed(expression)
         if array == "w":
-            own = printer.temporaries[k] = "dd" if value.kind == "word" else value.kind
+            own = "dd" if value.kind == "word" else value.kind
+            printer.temporaries[k] = own, value.form.replace("sum", "settled")
             statements.append(f"const {own} w{k} = {value.as_pair(own)};")
         elif array == "value":
-            statements.append(f"value[{k}] = {value.as_pair(kind)};")
+            statements.append(f"value[{k}] = {value.settled(kind)};")
     parameters = "lanes" if printer.kind_of("parameters") == "ddl" else "double"
     arguments = f"const {kind} *u, {printer.kind_of('t')} t, const {parameters} *parameters, {kind} *value"
     unused = ", ".join(f"(void){name}" for name in ("u", "t", "parameters") if not kernel.uses(name))

@@ -2,26 +2,28 @@
 
 /* Step in double-double arithmetic by mixed precision. separable_iteration.h solves the stage equations in double, to
  * 1e-16; their residual in pairs, r = q0 + h c v0 + h^2 A F(X) / m - X, has 16 digits as one word, so that the
- * correction D = r + h^2 A F_q(X) D / m, solved in double by fixed-point iteration, makes X accurate to 32 digits. Two
- * evaluations of the forces in pairs are enough: those of the residual and those at X + D. What the linear equation
- * omits, e = F(X + D) - F(X) - F_q D, is quadratic in D: a bias of 1e-32, from which the energy would drift. It changes
- * the points by D' = h^2 A (e + F_q D') / m, in double, and the forces by F_q D'. Requires: the kernels
- * force_lanes_pairs, mass_pairs, point_derivatives and derivative_product. */
+ * correction D = r + h^2 A (F(X + D) - F(X)) / m, solved in double by fixed-point iteration, makes X accurate to 32
+ * digits, and so the forces F(X) + (F(X + D) - F(X)). The difference is F_q D + e, with e = F_qq D D / 2. Without e,
+ * which is a bias of 1e-32, the energy would drift; it needs few digits, e = (F(X + D / d) - F(X) - F_q D / d) d^2 in
+ * double with larger D / d. So one evaluation of the forces in pairs is enough. Requires: the kernels force_lanes_pairs,
+ * mass_pairs, point_derivatives and derivative_product; ANCHOR. */
 
-#define CORRECTED 1e-34 /* last change of D, relative to the state */
-#define CORRECTED_BIAS 0.05 /* last change of D', relative to itself */
-#define SMALLEST_SIZE 1e-280 /* of a coordinate; 1e15 times its inverse is finite */
+#define CORRECTED 2e-33 /* last change of D, relative to the state */
 #define CORRECTED_ROUNDING 1e-15 /* changes relative to the residual that may be rounding errors; ten times these are */
+#define CURVED 1e-2 /* changes relative to the residual at which e is computed */
+#define FAR 1e-6 /* D / d relative to the state */
+#define SCALE 1e15 /* of changes, whose squares are normal numbers then */
+#define SMALLEST_SIZE 1e-280 /* of a coordinate; 1e15 times its inverse is finite */
 #define MOST_CORRECTIONS 200
 
 /* Arguments of a step, and its points. */
 typedef struct {
-  dd t, h, square, inverse_mass[M], drift[M]; /* h^2; h v */
-  double scale[M], inverse_size[M]; /* scale: h^2 / m */
+  dd t, h, drift[M], unit[M]; /* h v; h^2 / m */
+  double inverse_size[M], anchor[M];
   const double *parameters;
-  ddl X[GROUPS][M], F[GROUPS][M], base[GROUPS][M]; /* base: points without forces */
-  ddl first[GROUPS][M]; /* forces at X */
-  lanes rest[GROUPS][M], vector[GROUPS][M + POINT_DERIVATIVES]; /* vector: D, then the derivatives */
+  coordinates X[GROUPS], rest[GROUPS];
+  ddl F[GROUPS][M];
+  lanes vector[GROUPS][M + POINT_DERIVATIVES]; /* D, then the derivatives */
 } pair_step;
 
 static inline double lane_of(const lanes *x, int j)
@@ -31,188 +33,179 @@ static inline double lane_of(const lanes *x, int j)
   return value;
 }
 
-/* sum_j table_gj x_j of a coordinate: Dot2 (Ogita, Rump & Oishi 2005) with the low words of both factors. Tables have
+/* Largest absolute value at the points. */
+static inline double largest_at_points(const ddl (*x)[M], int i)
+{
+  lane_view largest = {larger_lanes(x[0][i].high, -x[0][i].high)};
+  for (int n = 1; n < GROUPS; n++)
+    largest.all = larger_lanes(largest.all, larger_lanes(x[n][i].high, -x[n][i].high));
+  for (int half = LANES / 2; half > 0; half /= 2)
+    for (int j = 0; j < half; j++)
+      largest.lane[j] = larger(largest.lane[j], largest.lane[j + half]);
+  return largest.lane[0];
+}
+
+/* sum_j table_gj x_j of a coordinate. The sum begins with a large number, the anchor, so that all partial sums have the
+ * same unit and are exact, and so is the sum of what they omit of the products (Rump, Ogita & Oishi 2008). Tables have
  * three words: those of two are of another method, which is not symplectic, so that the energy would drift by 3e-35 a
  * step, more in a million steps than the random walk of rounding errors. */
 static inline ddl sum_of_pairs(const lanes *table, const lanes *low, const lanes *lowest, int g, const ddl (*x)[M],
-    int i)
+    int i, double anchor)
 {
-  ddl sum[2] = {{{0.0}, {0.0}}, {{0.0}, {0.0}}};
-#pragma GCC unroll 16
-  for (int j = 0; j < POINTS; j++) {
-    const lanes a = table[j * GROUPS + g], b = low[j * GROUPS + g];
+  lanes sum = lanes_of(anchor), omitted = lanes_of(0.0), rests[4] = {omitted, omitted, omitted, omitted};
+#pragma GCC unroll 32
+  for (int j = 0; j < COLUMNS; j++) {
     const ddl *at = &x[j / LANES][i];
-    const lanes high = lanes_of(lane_of(&at->high, j % LANES)), rest = lanes_of(lane_of(&at->low, j % LANES));
-    const ddl product = ddl_two_product(a, high), next = ddl_two_sum(sum[j % 2].high, product.high);
-    sum[j % 2].high = next.high;
-    const lanes lower = multiply_add(a, rest, multiply_add(b, high, lowest[j * GROUPS + g] * high));
-    sum[j % 2].low += lower + (product.low + next.low);
+    const lanes a = table[j * GROUPS + g], high = lanes_of(lane_of(&at->high, j % LANES));
+    const ddl product = ddl_two_product(a, high);
+    const lanes next = sum + product.high;
+    omitted += product.high - (next - sum);
+    rests[0] += product.low;
+    rests[1] = multiply_add(a, lanes_of(lane_of(&at->low, j % LANES)), rests[1]);
+    rests[2] = multiply_add(low[j * GROUPS + g], high, rests[2]);
+    rests[3] = multiply_add(lowest[j * GROUPS + g], high, rests[3]);
+    sum = next;
   }
-  const ddl both = ddl_two_sum(sum[0].high, sum[1].high);
-  return ddl_fast_two_sum(both.high, both.low + (sum[0].low + sum[1].low));
+  const ddl exact = ddl_two_sum(sum - anchor, omitted);
+  return ddl_fast_two_sum(exact.high, exact.low + ((rests[0] + rests[1]) + (rests[2] + rests[3])));
 }
 
-/* x + y with an unnormalised low word: the sum of the low words and the rounding error. */
-static inline ddl add_loosely(ddl x, ddl y)
+/* sum_n weights_n (x_n + f_n) of a coordinate in the same way, in an order that does not depend on the vector length. */
+static inline dd weighted_total(const lanes *weights, const lanes *low, const lanes *lowest, const ddl (*x)[M],
+    lanes (*f)[M], int i, double anchor)
 {
-  ddl sum = ddl_two_sum(x.high, y.high);
-  sum.low += x.low + y.low;
-  return sum;
-}
-
-/* Sum over all points, in an order that does not depend on the vector length. */
-static inline dd total_of_pairs(ddl *x)
-{
-  enum { WHOLE = (POINTS & -POINTS) / LANES };
-  for (int n = WHOLE; n < GROUPS; n++)
-    x[n % WHOLE] = add_loosely(x[n % WHOLE], x[n]);
-  for (int half = WHOLE / 2; half > 0; half /= 2)
-    for (int n = 0; n < half; n++)
-      x[n] = add_loosely(x[n], x[n + half]);
-  ddl sum = x[0];
-  for (int half = LANES / 2; half > 0; half /= 2) {
-    lane_view high = {sum.high}, low = {sum.low};
-    for (int j = 0; j < half; j++) {
-      high.lane[j] = high.lane[j + half];
-      low.lane[j] = low.lane[j + half];
-    }
-    const ddl other = {high.all, low.all};
-    sum = add_loosely(sum, other);
-  }
-  return dd_fast_two_sum(lane_of(&sum.high, 0), lane_of(&sum.low, 0));
-}
-
-static inline dd weighted_total(const lanes *weights, const lanes *low, const lanes *lowest, const ddl (*x)[M], int i)
-{
-  ddl part[GROUPS];
+  lanes part[GROUPS], omitted[GROUPS], rest[GROUPS];
   for (int n = 0; n < GROUPS; n++) {
-    part[n] = ddl_two_product(weights[n], x[n][i].high);
-    const lanes lower = multiply_add(low[n], x[n][i].high, lowest[n] * x[n][i].high);
-    part[n].low += multiply_add(weights[n], x[n][i].low, lower);
+    const ddl product = ddl_two_product(weights[n], x[n][i].high);
+    part[n] = (anchor + product.high) - anchor;
+    omitted[n] = product.high - part[n];
+    rest[n] = multiply_add(low[n], x[n][i].high, multiply_add(lowest[n], x[n][i].high, product.low));
+    rest[n] = multiply_add(weights[n], x[n][i].low + f[n][i], rest[n]);
   }
-  return total_of_pairs(part);
+  const dd exact = dd_two_sum(points_total(part), points_total(omitted));
+  return dd_fast_two_sum(exact.high, exact.low + points_total(rest));
 }
 
-static inline void forces_of_pairs(pair_step *w)
+static inline void begin_pairs(pair_step *w, const step_data *step, double t_low, double h_low)
 {
-  for (int n = 0; n < GROUPS; n++) {
-    const ddl part = {ABSCISSA[n], ABSCISSA_LOW[n]};
-    force_lanes_pairs(w->X[n], ddl_add(ddl_of(w->t), ddl_multiply(part, ddl_of(w->h))), w->parameters, w->F[n]);
-  }
-}
-
-static void begin_pairs(pair_step *w, const step_data *step, double t_low, double h_low)
-{
-  const dd h = dd_of(step->h, h_low);
-  dd masses[M];
-  lanes X[GROUPS][M];
+  const dd h = dd_of(step->h, h_low), square = dd_square(h);
   w->t = dd_of(step->t, t_low);
   w->h = h;
-  w->square = dd_multiply(h, h);
   w->parameters = step->parameters;
-  memcpy(X, step->points, sizeof X);
-  mass_pairs(NULL, w->t, step->parameters, masses);
+  memcpy(w->X, step->points, sizeof w->X);
+  mass_pairs(NULL, w->t, step->parameters, w->unit);
   for (int i = 0; i < M; i++) {
-    const dd q = dd_of(step->q0[i], step->carry_q[i]), p = dd_of(step->p0[i], step->carry_p[i]);
-    double farthest = fabs(q.high);
-    w->inverse_mass[i] = dd_divide(dd_of(1.0, 0.0), masses[i]);
-    w->drift[i] = dd_multiply(dd_multiply(p, w->inverse_mass[i]), h);
-    w->scale[i] = w->square.high * w->inverse_mass[i].high;
-    w->inverse_size[i] = fabs(w->drift[i].high);
-    for (int n = 0; n < GROUPS; n++) {
-      const ddl node = {DRIFT[n], DRIFT_LOW[n]};
-      const ddl drift = ddl_of(w->drift[i]), product = ddl_two_product(node.high, drift.high);
-      const lanes lower = multiply_add(node.low, drift.high, DRIFT_LOWEST[n] * drift.high);
-      const ddl moved = ddl_fast_two_sum(product.high, product.low + multiply_add(node.high, drift.low, lower));
-      w->base[n][i] = ddl_add(ddl_of(q), moved);
-      w->X[n][i] = ddl_word(X[n][i]);
-      for (int j = 0; j < LANES; j++) /* at rest in the origin, q and p are 0 */
-        farthest = larger(farthest, fabs(lane_of(&X[n][i], j)));
-    }
-    w->inverse_size[i] += farthest;
+    const dd inverse_mass = dd_inverse(w->unit[i]), p = dd_of(step->p0[i], step->carry_p[i]);
+    w->drift[i] = dd_multiply(dd_multiply(p, inverse_mass), h);
+    w->unit[i] = dd_multiply(square, inverse_mass);
+  }
+}
+
+/* Forces in pairs, derivatives of the forces, and sizes |q| + |h v| + h^2 |F| / m of the coordinates in the step. */
+static inline void evaluate_pairs(pair_step *w, const double *q)
+{
+  for (int n = 0; n < GROUPS; n++) {
+    const ddl part = {ABSCISSA[n], ABSCISSA_LOW[n]}, t = ddl_add(ddl_of(w->t), ddl_multiply(part, ddl_of(w->h)));
+    ddl X[M];
+    for (int i = 0; i < M; i++)
+      X[i] = ddl_word(w->X[n][i]);
+    force_lanes_pairs(X, t, w->parameters, w->F[n]);
+    point_derivatives(w->X[n], t.high, w->parameters, w->vector[n] + M);
+  }
+  for (int i = 0; i < M; i++) {
+    const double largest = largest_at_points(w->F, i);
+    w->anchor[i] = ANCHOR * largest;
+    w->inverse_size[i] = fabs(q[i]) + fabs(w->drift[i].high) + fabs(w->unit[i].high) * largest;
   }
   const double largest = largest_number(w->inverse_size);
   for (int i = 0; i < M; i++)
     w->inverse_size[i] = 1.0 / (w->inverse_size[i] + 1e-3 * largest + SMALLEST_SIZE);
 }
 
-/* Residual of the stage equations, as one word; X has one, so that its difference from the high word is exact. */
-static inline void find_residual(pair_step *w)
+/* Residual of the stage equations, as one word: its difference from X is exact. */
+static inline void find_residual(pair_step *w, const double *q, const double *q_low)
 {
   for (int i = 0; i < M; i++)
     for (int n = 0; n < GROUPS; n++) {
-      const dd unit = dd_multiply(w->square, w->inverse_mass[i]);
-      const ddl sum = sum_of_pairs(PRODUCT, PRODUCT_LOW, PRODUCT_LOWEST, n, w->F, i);
-      const ddl moved = ddl_multiply(sum, ddl_of(unit)), point = ddl_two_sum(w->base[n][i].high, moved.high);
-      const lanes low = (point.low - w->X[n][i].low) + (w->base[n][i].low + moved.low);
-      w->rest[n][i] = (point.high - w->X[n][i].high) + low;
+      const ddl sum = sum_of_pairs(PRODUCT, PRODUCT_LOW, PRODUCT_LOWEST, n, w->F, i, w->anchor[i]);
+      const ddl moved = ddl_product(sum, ddl_of(w->unit[i])), node = {DRIFT[n], DRIFT_LOW[n]};
+      ddl line = ddl_product(node, ddl_of(w->drift[i]));
+      line.low = multiply_add(DRIFT_LOWEST[n], lanes_of(w->drift[i].high), line.low);
+      const ddl start = ddl_two_sum(lanes_of(q[i]), line.high), point = ddl_two_sum(start.high, moved.high);
+      w->rest[n][i] = (point.high - w->X[n][i]) + ((start.low + point.low) + (moved.low + (line.low + q_low[i])));
     }
 }
 
-static inline void find_derivatives(pair_step *w)
+/* f = F_q D + e */
+static inline void find_products(const pair_step *w, lanes (*e)[M], lanes (*f)[M])
 {
   for (int n = 0; n < GROUPS; n++) {
-    lanes X[M];
+    derivative_product(w->vector[n], lanes_of(w->t.high), w->parameters, f[n]);
     for (int i = 0; i < M; i++)
-      X[i] = w->X[n][i].high;
-    point_derivatives(X, w->t.high + w->h.high * ABSCISSA[n], w->parameters, w->vector[n] + M);
+      f[n][i] += e[n][i];
   }
 }
 
-/* Solves for the correction D, which starts as the residual, to a part of it or to CORRECTED; f: F_q D. */
-static inline int find_correction(pair_step *w, double part, lanes (*f)[M])
+/* Finds e of D, whose squared relative size is `size`, from f = F_q D, and adds it. */
+static inline void add_bias(const pair_step *w, double size, lanes (*e)[M], lanes (*f)[M])
 {
-  double last = INFINITY, size = 0.0; /* size of the residual */
+  const double inverse = FAR * SCALE / sqrt(size), d = 1.0 / inverse;
+  for (int n = 0; n < GROUPS; n++) {
+    lanes X[M], F[M];
+    for (int i = 0; i < M; i++)
+      X[i] = w->X[n][i] + inverse * w->vector[n][i];
+    force_lanes(X, w->t.high + w->h.high * ABSCISSA[n], w->parameters, F);
+    for (int i = 0; i < M; i++) {
+      e[n][i] = ((F[i] - w->F[n][i].high) - inverse * f[n][i]) * (d * d);
+      f[n][i] += e[n][i];
+    }
+  }
+}
+
+/* Solves for the correction D, which starts as the residual; f: F_q D + e. */
+static inline int find_correction(pair_step *w, lanes (*f)[M])
+{
+  const double least = (SCALE * CORRECTED) * (SCALE * CORRECTED);
+  double last = INFINITY, size; /* squares relative to the state: of the last change, of the residual */
+  int curved = 0; /* whether e is known */
+  coordinates e[GROUPS];
+  lanes moved[GROUPS] = {{0.0}};
+  memset(e, 0, sizeof e);
   for (int n = 0; n < GROUPS; n++)
     for (int i = 0; i < M; i++) {
+      const lanes relative = w->rest[n][i] * (SCALE * w->inverse_size[i]);
       w->vector[n][i] = w->rest[n][i];
-      for (int j = 0; j < LANES; j++)
-        size = larger(size, fabs(lane_of(&w->rest[n][i], j)) * w->inverse_size[i]);
+      moved[n] += relative * relative;
     }
-  const double least = larger(part * size, CORRECTED);
+  size = points_total(moved);
+  find_products(w, e, f);
   for (int k = 0; k < MOST_CORRECTIONS; k++) {
-    lanes moved[GROUPS] = {{0.0}};
-    for (int n = 0; n < GROUPS; n++)
-      derivative_product(w->vector[n], lanes_of(w->t.high), w->parameters, f[n]);
+    double change;
+    memset(moved, 0, sizeof moved);
     for (int i = 0; i < M; i++)
       for (int n = 0; n < GROUPS; n++) {
-        const lanes next = w->rest[n][i] + w->scale[i] * apply(PRODUCT, n, f, i);
-        const lanes change = (next - w->vector[n][i]) * (1e15 * w->inverse_size[i]); /* squares are normal */
-        moved[n] = moved[n] + change * change;
+        const lanes next = w->rest[n][i] + w->unit[i].high * apply(PRODUCT, n, f, i);
+        const lanes relative = (next - w->vector[n][i]) * (SCALE * w->inverse_size[i]);
+        moved[n] += relative * relative;
         w->vector[n][i] = next;
       }
-    const double change = sqrt(points_total(moved)) / 1e15, rate = change / last;
-    if (!is_finite(change))
+    find_products(w, e, f);
+    change = points_total(moved);
+    if (!(change < INFINITY))
       return NOT_FINITE;
-    if (change <= least || (k > 0 && rate < 0.5 && change * rate <= least))
+    if (change == 0.0 || (curved && (change <= least || (change < 0.25 * last && change * change <= least * last))))
       return OK;
     /* rounding errors of D, which stop the decrease; they matter in the 32nd digit of the state at most */
-    if (rate > 0.5 && change <= larger(CORRECTED_ROUNDING * size * (rate > 0.9 ? 10.0 : 1.0), least))
+    if (curved && change > 0.25 * last &&
+        change <= CORRECTED_ROUNDING * CORRECTED_ROUNDING * size * (change > 0.81 * last ? 100.0 : 1.0))
       return OK;
+    if (!curved && change <= CURVED * CURVED * size) {
+      add_bias(w, size, e, f);
+      curved = 1;
+    }
     last = change;
   }
   return NOT_CONVERGED;
-}
-
-/* Moves the points by D, of the products f, and finds the forces there and the effect of what is quadratic in D. */
-static inline int correct_forces(pair_step *w, lanes (*f)[M])
-{
-  memcpy(w->first, w->F, sizeof w->F);
-  for (int n = 0; n < GROUPS; n++)
-    for (int i = 0; i < M; i++)
-      w->X[n][i] = ddl_two_sum(w->X[n][i].high, w->vector[n][i]);
-  forces_of_pairs(w);
-  for (int n = 0; n < GROUPS; n++)
-    for (int i = 0; i < M; i++)
-      f[n][i] = ddl_subtract(w->F[n][i], w->first[n][i]).high - f[n][i];
-  for (int n = 0; n < GROUPS; n++)
-    for (int i = 0; i < M; i++)
-      w->rest[n][i] = w->scale[i] * apply(PRODUCT, n, f, i);
-  const int status = find_correction(w, CORRECTED_BIAS, f);
-  for (int n = 0; n < GROUPS; n++)
-    for (int i = 0; i < M; i++)
-      w->F[n][i] = ddl_add(w->F[n][i], ddl_word(f[n][i]));
-  return status;
 }
 
 /* Replaces the increments of a step, solved in double, by those in two words. On failure they are undefined. */
@@ -220,22 +213,21 @@ HOT int refine_increments(const step_data *step, double *memory, double t_low, d
     double *passed, double *workspace)
 {
   pair_step w;
-  lanes f[GROUPS][M];
+  coordinates f[GROUPS];
   int status;
   (void)memory, (void)passed, (void)workspace;
   begin_pairs(&w, step, t_low, h_low);
-  forces_of_pairs(&w);
-  find_residual(&w);
-  find_derivatives(&w);
-  status = find_correction(&w, 0.0, f);
-  status = status == OK ? correct_forces(&w, f) : status;
+  evaluate_pairs(&w, step->q0);
+  find_residual(&w, step->q0, step->carry_q);
+  status = find_correction(&w, f);
   if (status != OK)
     return status;
   for (int i = 0; i < M; i++) {
-    const dd unit = dd_multiply(w.square, w.inverse_mass[i]);
-    const dd bend = weighted_total(POINT_END_POSITION, POINT_END_POSITION_LOW, POINT_END_POSITION_LOWEST, w.F, i);
-    const dd push = weighted_total(POINT_END_MOMENTUM, POINT_END_MOMENTUM_LOW, POINT_END_MOMENTUM_LOWEST, w.F, i);
-    const dd q = dd_add(w.drift[i], dd_multiply(bend, unit)), p = dd_multiply(push, w.h);
+    const dd bend = weighted_total(
+        POINT_END_POSITION, POINT_END_POSITION_LOW, POINT_END_POSITION_LOWEST, w.F, f, i, w.anchor[i]);
+    const dd push = weighted_total(
+        POINT_END_MOMENTUM, POINT_END_MOMENTUM_LOW, POINT_END_MOMENTUM_LOWEST, w.F, f, i, w.anchor[i]);
+    const dd q = dd_add(w.drift[i], dd_multiply(bend, w.unit[i])), p = dd_multiply(push, w.h);
     dq[i] = q.high, dq[M + i] = q.low, dp[i] = p.high, dp[M + i] = p.low;
   }
   return all_finite(dq, 2 * M) && all_finite(dp, 2 * M) ? OK : NOT_FINITE;

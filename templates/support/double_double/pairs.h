@@ -41,11 +41,24 @@ static inline PAIR OF(add)(PAIR a, PAIR b)
   return OF(fast_two_sum)(sum.high, sum.low + low.low);
 }
 
-/* The same for a and b of equal sign, or |b| << |a|, with half the operations. */
+/* Pair arithmetic (Lange & Rump 2020): low words need not be below the rounding error of high words, as those of sums
+ * that cancel, which `settled` repairs. The error is 4 u^2 relative to |a| + |b|. */
+static inline PAIR OF(sum)(PAIR a, PAIR b)
+{
+  PAIR result = OF(two_sum)(a.high, b.high);
+  result.low += a.low + b.low;
+  return result;
+}
+
+static inline PAIR OF(settled)(PAIR a)
+{
+  return OF(fast_two_sum)(a.high, a.low);
+}
+
+/* a + b to an error of 4 u^2 relative to |a| + |b|, with half the operations of the sum above. */
 static inline PAIR OF(plus)(PAIR a, PAIR b)
 {
-  const PAIR sum = OF(two_sum)(a.high, b.high);
-  return OF(fast_two_sum)(sum.high, sum.low + (a.low + b.low));
+  return OF(settled)(OF(sum)(a, b));
 }
 
 static inline PAIR OF(negative)(PAIR a)
@@ -54,28 +67,59 @@ static inline PAIR OF(negative)(PAIR a)
   return result;
 }
 
+static inline PAIR OF(difference)(PAIR a, PAIR b)
+{
+  return OF(sum)(a, OF(negative)(b));
+}
+
 static inline PAIR OF(subtract)(PAIR a, PAIR b)
 {
   return OF(add)(a, OF(negative)(b));
 }
 
-static inline PAIR OF(multiply)(PAIR a, PAIR b)
+/* Products, whose low words are up to 3 u of the high ones if those of settled factors are. */
+static inline PAIR OF(product)(PAIR a, PAIR b)
 {
-  const PAIR product = OF(two_product)(a.high, b.high);
-  return OF(fast_two_sum)(product.high, product.low + FMA(a.high, b.low, a.low * b.high));
+  PAIR result = OF(two_product)(a.high, b.high);
+  result.low = FMA(a.high, b.low, FMA(a.low, b.high, result.low));
+  return result;
 }
 
-/* Product with one word. */
+/* With one word. */
+static inline PAIR OF(multiple)(PAIR a, NUMBER b)
+{
+  PAIR result = OF(two_product)(a.high, b);
+  result.low = FMA(a.low, b, result.low);
+  return result;
+}
+
+/* With a power of two, exactly. */
+static inline PAIR OF(times_power)(PAIR a, NUMBER b)
+{
+  const PAIR result = {a.high * b, a.low * b};
+  return result;
+}
+
+static inline PAIR OF(squared)(PAIR a)
+{
+  PAIR result = OF(two_product)(a.high, a.high);
+  result.low = FMA(a.high + a.high, a.low, result.low);
+  return result;
+}
+
+static inline PAIR OF(multiply)(PAIR a, PAIR b)
+{
+  return OF(settled)(OF(product)(a, b));
+}
+
 static inline PAIR OF(scale)(PAIR a, NUMBER b)
 {
-  const PAIR product = OF(two_product)(a.high, b);
-  return OF(fast_two_sum)(product.high, FMA(a.low, b, product.low));
+  return OF(settled)(OF(multiple)(a, b));
 }
 
 static inline PAIR OF(square)(PAIR a)
 {
-  const PAIR product = OF(two_product)(a.high, a.high);
-  return OF(fast_two_sum)(product.high, FMA(a.high + a.high, a.low, product.low));
+  return OF(settled)(OF(squared)(a));
 }
 
 /* The quotient of the high words, corrected twice, since one correction leaves its own rounding error, 2^-105. */
@@ -87,6 +131,13 @@ static inline PAIR OF(divide)(PAIR a, PAIR b)
   const NUMBER third = OF(subtract)(rest, OF(scale)(b, second)).high / b.high;
   const PAIR sum = OF(fast_two_sum)(first, second);
   return OF(fast_two_sum)(sum.high, sum.low + third);
+}
+
+/* 1 / x, corrected by a series. */
+static inline PAIR OF(inverse)(PAIR x)
+{
+  const NUMBER y = 1.0 / x.high, e = FMA(-x.high, y, BROADCAST(1.0)) - x.low * y;
+  return OF(fast_two_sum)(y, y * FMA(e, e, e));
 }
 
 /* The root of the high word, corrected; 0 for 0, where the correction would be 0/0. */
