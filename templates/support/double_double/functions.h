@@ -9,24 +9,25 @@ static inline PAIR OF(constant)(const double *words)
   return result;
 }
 
-/* x - k unit for a unit of three words. */
+/* x - k unit for a unit of three words; k is the nearest whole number to x / unit, so that the first difference is
+ * exact. */
 static inline PAIR OF(reduced)(PAIR x, NUMBER k, const double *unit)
 {
   const PAIR a = OF(two_product)(k, BROADCAST(unit[0])), b = OF(two_product)(k, BROADCAST(unit[1]));
-  PAIR rest = OF(add)(OF(two_sum)(x.high, -a.high), OF(two_sum)(x.low, -a.low));
-  rest = OF(subtract)(rest, b);
-  return OF(fast_two_sum)(rest.high, rest.low - k * unit[2]);
+  const PAIR low = OF(two_sum)(x.low, -a.low), high = OF(two_sum)(x.high - a.high, low.high);
+  const PAIR rest = OF(two_sum)(high.high, -b.high);
+  return OF(two_sum)(rest.high, (rest.low + high.low) + (low.low - FMA(k, BROADCAST(unit[2]), b.low)));
 }
 
-/* Polynomial in x: `pairs` coefficients of two words, then `singles` of one. */
+/* Polynomial in a small x: `pairs` coefficients of two words, then `singles` of one. */
 static inline PAIR OF(polynomial)(PAIR x, const double (*c)[2], int pairs, int singles)
 {
   NUMBER tail = BROADCAST(c[pairs + singles - 1][0]);
   for (int n = pairs + singles - 2; n >= pairs; n--)
     tail = FMA(tail, x.high, BROADCAST(c[n][0]));
-  PAIR sum = OF(plus)(OF(constant)(c[pairs - 1]), OF(two_product)(tail, x.high));
+  PAIR sum = OF(sum)(OF(constant)(c[pairs - 1]), OF(two_product)(tail, x.high));
   for (int n = pairs - 2; n >= 0; n--)
-    sum = OF(plus)(OF(constant)(c[n]), OF(multiply)(sum, x));
+    sum = OF(sum)(OF(constant)(c[n]), OF(product)(sum, x));
   return sum;
 }
 
@@ -34,12 +35,12 @@ static inline PAIR OF(polynomial)(PAIR x, const double (*c)[2], int pairs, int s
 static inline void OF(sine_and_cosine)(PAIR x, PAIR *sine, PAIR *cosine)
 {
   const NUMBER k = (OF(angle)(x.high) * PER_UNIT_OF_ANGLE + TO_INTEGER) - TO_INTEGER;
-  const PAIR rest = OF(reduced)(x, k, UNIT_OF_ANGLE), square = OF(square)(rest);
-  const PAIR s = OF(plus)(rest, OF(multiply)(OF(multiply)(rest, square), OF(polynomial)(square, SINE, 3, 4)));
-  const PAIR c = OF(multiply)(square, OF(polynomial)(square, COSINE, 3, 4)); /* cos - 1 */
+  const PAIR rest = OF(reduced)(x, k, UNIT_OF_ANGLE), square = OF(squared)(rest);
+  const PAIR s = OF(sum)(rest, OF(product)(OF(product)(rest, square), OF(polynomial)(square, SINE, 3, 4)));
+  const PAIR c = OF(product)(square, OF(polynomial)(square, COSINE, 3, 4)); /* cos - 1 */
   const PAIR S = {PICK(k, CIRCLE, 0), PICK(k, CIRCLE, 1)}, C = {PICK(k, CIRCLE, 2), PICK(k, CIRCLE, 3)};
-  *sine = OF(plus)(S, OF(plus)(OF(multiply)(C, s), OF(multiply)(S, c))); /* S and C are 0 or 0.049 at least, s 0.025 */
-  *cosine = OF(plus)(C, OF(plus)(OF(multiply)(C, c), OF(negative)(OF(multiply)(S, s))));
+  *sine = OF(plus)(S, OF(sum)(OF(product)(C, s), OF(product)(S, c))); /* S and C are 0 or 0.049 at least, s 0.025 */
+  *cosine = OF(plus)(C, OF(difference)(OF(product)(C, c), OF(product)(S, s)));
 }
 
 static inline PAIR OF(sin)(PAIR x)

@@ -2,16 +2,15 @@
 
 /* Step in double-double arithmetic by mixed precision. separable_iteration.h solves the stage equations in double, to
  * 1e-16; their residual in pairs, r = q0 + h c v0 + h^2 A F(X) / m - X, has 16 digits as one word, so that the
- * correction D = r + h^2 A (F(X + D) - F(X)) / m, solved in double by fixed-point iteration, makes X accurate to 32
- * digits, and so the forces F(X) + (F(X + D) - F(X)). The difference is F_q D + e, with e = F_qq D D / 2. Without e,
- * which is a bias of 1e-32, the energy would drift; it needs few digits, e = (F(X + D / d) - F(X) - F_q D / d) d^2 in
- * double with larger D / d. So one evaluation of the forces in pairs is enough. Requires: the kernels force_lanes_pairs,
- * mass_pairs, point_derivatives and derivative_product; ANCHOR. */
+ * correction D = r + h^2 A (F_q D + e) / m, solved in double by fixed-point iteration, makes X accurate to 32 digits,
+ * and so the forces F(X) + F_q D + e. As soon as D has two digits, a second evaluation of the forces in pairs gives e =
+ * F(X + D) - F(X) - F_q D, what is quadratic in D: a bias of 1e-32, from which the energy would drift. Rounded tables
+ * in double have a bias in D of 1e-16 of its own, so that the iteration in double has their low words, too. Requires:
+ * the kernels force_lanes_pairs, mass_pairs, point_derivatives and derivative_product; ANCHOR. */
 
 #define CORRECTED 2e-33 /* last change of D, relative to the state */
 #define CORRECTED_ROUNDING 1e-15 /* changes relative to the residual that may be rounding errors; ten times these are */
 #define CURVED 1e-2 /* changes relative to the residual at which e is computed */
-#define FAR 1e-6 /* D / d relative to the state */
 #define SCALE 1e15 /* of changes, whose squares are normal numbers then */
 #define SMALLEST_SIZE 1e-280 /* of a coordinate; 1e15 times its inverse is finite */
 #define MOST_CORRECTIONS 200
@@ -48,11 +47,12 @@ static inline double largest_at_points(const ddl (*x)[M], int i)
 /* sum_j table_gj x_j of a coordinate. The sum begins with a large number, the anchor, so that all partial sums have the
  * same unit and are exact, and so is the sum of what they omit of the products (Rump, Ogita & Oishi 2008). Tables have
  * three words: those of two are of another method, which is not symplectic, so that the energy would drift by 3e-35 a
- * step, more in a million steps than the random walk of rounding errors. */
+ * step, more in a million steps than the random walk of rounding errors. The third word is added to a product: in a sum
+ * it would be less than half a unit of the others. */
 static inline ddl sum_of_pairs(const lanes *table, const lanes *low, const lanes *lowest, int g, const ddl (*x)[M],
     int i, double anchor)
 {
-  lanes sum = lanes_of(anchor), omitted = lanes_of(0.0), rests[4] = {omitted, omitted, omitted, omitted};
+  lanes sum = lanes_of(anchor), omitted = lanes_of(0.0), low_sum = omitted, lower_sum = omitted;
 #pragma GCC unroll 32
   for (int j = 0; j < COLUMNS; j++) {
     const ddl *at = &x[j / LANES][i];
@@ -60,14 +60,13 @@ static inline ddl sum_of_pairs(const lanes *table, const lanes *low, const lanes
     const ddl product = ddl_two_product(a, high);
     const lanes next = sum + product.high;
     omitted += product.high - (next - sum);
-    rests[0] += product.low;
-    rests[1] = multiply_add(a, lanes_of(lane_of(&at->low, j % LANES)), rests[1]);
-    rests[2] = multiply_add(low[j * GROUPS + g], high, rests[2]);
-    rests[3] = multiply_add(lowest[j * GROUPS + g], high, rests[3]);
+    low_sum += product.low;
+    lower_sum += multiply_add(a, lanes_of(lane_of(&at->low, j % LANES)),
+        multiply_add(low[j * GROUPS + g], high, lowest[j * GROUPS + g] * high));
     sum = next;
   }
   const ddl exact = ddl_two_sum(sum - anchor, omitted);
-  return ddl_fast_two_sum(exact.high, exact.low + ((rests[0] + rests[1]) + (rests[2] + rests[3])));
+  return ddl_fast_two_sum(exact.high, exact.low + (low_sum + lower_sum));
 }
 
 /* sum_n weights_n (x_n + f_n) of a coordinate in the same way, in an order that does not depend on the vector length. */
@@ -79,7 +78,7 @@ static inline dd weighted_total(const lanes *weights, const lanes *low, const la
     const ddl product = ddl_two_product(weights[n], x[n][i].high);
     part[n] = (anchor + product.high) - anchor;
     omitted[n] = product.high - part[n];
-    rest[n] = multiply_add(low[n], x[n][i].high, multiply_add(lowest[n], x[n][i].high, product.low));
+    rest[n] = multiply_add(low[n], x[n][i].high, lowest[n] * x[n][i].high) + product.low;
     rest[n] = multiply_add(weights[n], x[n][i].low + f[n][i], rest[n]);
   }
   const dd exact = dd_two_sum(points_total(part), points_total(omitted));
@@ -101,11 +100,17 @@ static inline void begin_pairs(pair_step *w, const step_data *step, double t_low
   }
 }
 
+static inline ddl time_of_points(const pair_step *w, int n)
+{
+  const ddl part = {ABSCISSA[n], ABSCISSA_LOW[n]};
+  return ddl_add(ddl_of(w->t), ddl_multiply(part, ddl_of(w->h)));
+}
+
 /* Forces in pairs, derivatives of the forces, and sizes |q| + |h v| + h^2 |F| / m of the coordinates in the step. */
 static inline void evaluate_pairs(pair_step *w, const double *q)
 {
   for (int n = 0; n < GROUPS; n++) {
-    const ddl part = {ABSCISSA[n], ABSCISSA_LOW[n]}, t = ddl_add(ddl_of(w->t), ddl_multiply(part, ddl_of(w->h)));
+    const ddl t = time_of_points(w, n);
     ddl X[M];
     for (int i = 0; i < M; i++)
       X[i] = ddl_word(w->X[n][i]);
@@ -122,17 +127,18 @@ static inline void evaluate_pairs(pair_step *w, const double *q)
     w->inverse_size[i] = 1.0 / (w->inverse_size[i] + 1e-3 * largest + SMALLEST_SIZE);
 }
 
-/* Residual of the stage equations, as one word: its difference from X is exact. */
+/* Residual of the stage equations, as one word; the difference of X from the high word is exact. */
 static inline void find_residual(pair_step *w, const double *q, const double *q_low)
 {
   for (int i = 0; i < M; i++)
     for (int n = 0; n < GROUPS; n++) {
       const ddl sum = sum_of_pairs(PRODUCT, PRODUCT_LOW, PRODUCT_LOWEST, n, w->F, i, w->anchor[i]);
-      const ddl moved = ddl_product(sum, ddl_of(w->unit[i])), node = {DRIFT[n], DRIFT_LOW[n]};
-      ddl line = ddl_product(node, ddl_of(w->drift[i]));
-      line.low = multiply_add(DRIFT_LOWEST[n], lanes_of(w->drift[i].high), line.low);
-      const ddl start = ddl_two_sum(lanes_of(q[i]), line.high), point = ddl_two_sum(start.high, moved.high);
-      w->rest[n][i] = (point.high - w->X[n][i]) + ((start.low + point.low) + (moved.low + (line.low + q_low[i])));
+      const ddl moved = ddl_product(sum, ddl_of(w->unit[i])), drift = ddl_of(w->drift[i]);
+      const ddl line = ddl_two_product(DRIFT[n], drift.high), start = ddl_two_sum(lanes_of(q[i]), line.high);
+      const ddl point = ddl_two_sum(start.high, moved.high);
+      const lanes lower = multiply_add(DRIFT_LOW[n], drift.high, DRIFT_LOWEST[n] * drift.high);
+      const lanes low = line.low + multiply_add(DRIFT[n], drift.low, lower);
+      w->rest[n][i] = (point.high - w->X[n][i]) + ((start.low + point.low) + ((low + q_low[i]) + moved.low));
     }
 }
 
@@ -146,19 +152,16 @@ static inline void find_products(const pair_step *w, lanes (*e)[M], lanes (*f)[M
   }
 }
 
-/* Finds e of D, whose squared relative size is `size`, from f = F_q D, and adds it. */
-static inline void add_bias(const pair_step *w, double size, lanes (*e)[M], lanes (*f)[M])
+/* e = F(X + D) - F(X) - f of f = F_q D. */
+static inline void find_bias(const pair_step *w, lanes (*f)[M], lanes (*e)[M])
 {
-  const double inverse = FAR * SCALE / sqrt(size), d = 1.0 / inverse;
   for (int n = 0; n < GROUPS; n++) {
-    lanes X[M], F[M];
+    ddl X[M], F[M];
     for (int i = 0; i < M; i++)
-      X[i] = w->X[n][i] + inverse * w->vector[n][i];
-    force_lanes(X, w->t.high + w->h.high * ABSCISSA[n], w->parameters, F);
-    for (int i = 0; i < M; i++) {
-      e[n][i] = ((F[i] - w->F[n][i].high) - inverse * f[n][i]) * (d * d);
-      f[n][i] += e[n][i];
-    }
+      X[i] = ddl_two_sum(w->X[n][i], w->vector[n][i]);
+    force_lanes_pairs(X, time_of_points(w, n), w->parameters, F);
+    for (int i = 0; i < M; i++)
+      e[n][i] = ((F[i].high - w->F[n][i].high) - f[n][i]) + (F[i].low - w->F[n][i].low);
   }
 }
 
@@ -200,7 +203,7 @@ static inline int find_correction(pair_step *w, lanes (*f)[M])
         change <= CORRECTED_ROUNDING * CORRECTED_ROUNDING * size * (change > 0.81 * last ? 100.0 : 1.0))
       return OK;
     if (!curved && change <= CURVED * CURVED * size) {
-      add_bias(w, size, e, f);
+      find_bias(w, f, e);
       curved = 1;
     }
     last = change;

@@ -66,10 +66,13 @@ static inline double dd_angle(double x)
   return fabs(x) <= 1e9 ? x : (double)NAN;
 }
 
-/* Row of a table of a power of two of rows; 0 for NaN, whose conversion would be undefined. */
+/* Row of a table of a power of two of rows, k modulo that, from the last bits of k + 1.5 2^52; any row for NaN. */
 static inline int dd_row(double k, int rows)
 {
-  return k == k ? (int)((long long)k & (rows - 1)) : 0;
+  long long bits;
+  k += TO_INTEGER;
+  memcpy(&bits, &k, sizeof bits);
+  return (int)(bits & (rows - 1));
 }
 
 /* 2^n with n = k / 64, rounded down: 0 below the normal numbers, infinite above. */

@@ -111,11 +111,6 @@ PASS drift_words find_drift(const step_points *w, long long i)
 #else
 #define DRIFT_OF(w, i) ((w)->drifts[i])
 #define STRAIGHT_LINE(w, g, i, of) ((void)(of), (w)->base[(g) * M + (i)])
-#endif
-#ifdef MIXED_POINTS /* mixed_step.h corrects the points */
-#define WITH_LOW_WORDS(w, g, i, x) (x)
-#define RESTS(w, g, i, of) lanes_of(0.0)
-#elif !defined(ARRAYS)
 #define WITH_LOW_WORDS(w, g, i, x) ((x) + (w)->rests[(g) * M + (i)])
 #define RESTS(w, g, i, of) ((w)->rests[(g) * M + (i)])
 #endif
@@ -491,7 +486,7 @@ HOT int iterate(const step_data *step, const iteration_data *data, history past,
   first_points(&w, past, *steps);
   forces(&w);
   measure_points(&w, options);
-#if !defined(ARRAYS) && !defined(MIXED_POINTS)
+#ifndef ARRAYS
   if (!implicit)
     find_rests(&w);
 #endif
