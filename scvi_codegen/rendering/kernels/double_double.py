@@ -155,6 +155,7 @@ def arithmetic_headers() -> dict[str, str]:
         "OF(name)": "dd_##name",
         "FMA(a, b, c)": "fma(a, b, c)",
         "BROADCAST(x)": "(x)",
+        "INLINE": "static inline",
         "PICK(k, table, column)": "table[dd_row(k, (int)(sizeof table / sizeof table[0]))][column]",
     }
     of_vectors = {
@@ -163,6 +164,7 @@ def arithmetic_headers() -> dict[str, str]:
         "OF(name)": "ddl_##name",
         "FMA(a, b, c)": "multiply_add(a, b, c)",
         "BROADCAST(x)": "lanes_of(x)",
+        "INLINE": "static inline __attribute__((always_inline))",  # in long kernels as well
         "PICK(k, table, column)": "ddl_entries(k, &table[0][column], (int)(sizeof table / sizeof table[0]), "
         "(int)(sizeof table[0] / sizeof table[0][0]))",
     }

@@ -69,7 +69,7 @@ static inline ddl sum_of_pairs(const lanes *table, const lanes *low, const lanes
   return ddl_fast_two_sum(exact.high, exact.low + (low_sum + lower_sum));
 }
 
-/* sum_n weights_n (x_n + f_n) of a coordinate in the same way, in an order that does not depend on the vector length. */
+/* sum_n weights_n (x_n + f_n) of a coordinate in the same way; the order does not depend on the vector length. */
 static inline dd weighted_total(const lanes *weights, const lanes *low, const lanes *lowest, const ddl (*x)[M],
     lanes (*f)[M], int i, double anchor)
 {

@@ -5,13 +5,13 @@ typedef struct {
   NUMBER high, low;
 } PAIR;
 
-static inline PAIR OF(word)(NUMBER x)
+INLINE PAIR OF(word)(NUMBER x)
 {
   const PAIR result = {x, BROADCAST(0.0)};
   return result;
 }
 
-static inline PAIR OF(two_sum)(NUMBER a, NUMBER b)
+INLINE PAIR OF(two_sum)(NUMBER a, NUMBER b)
 {
   const NUMBER sum = a + b, part = sum - a;
   const PAIR result = {sum, (a - (sum - part)) + (b - part)};
@@ -19,14 +19,14 @@ static inline PAIR OF(two_sum)(NUMBER a, NUMBER b)
 }
 
 /* The same for |a| >= |b| or a = 0. */
-static inline PAIR OF(fast_two_sum)(NUMBER a, NUMBER b)
+INLINE PAIR OF(fast_two_sum)(NUMBER a, NUMBER b)
 {
   const NUMBER sum = a + b;
   const PAIR result = {sum, b - (sum - a)};
   return result;
 }
 
-static inline PAIR OF(two_product)(NUMBER a, NUMBER b)
+INLINE PAIR OF(two_product)(NUMBER a, NUMBER b)
 {
   const NUMBER product = a * b;
   const PAIR result = {product, FMA(a, b, -product)};
@@ -34,7 +34,7 @@ static inline PAIR OF(two_product)(NUMBER a, NUMBER b)
 }
 
 /* Relative error 3 u^2 (u = 2^-53), also if the high words cancel. */
-static inline PAIR OF(add)(PAIR a, PAIR b)
+INLINE PAIR OF(add)(PAIR a, PAIR b)
 {
   const PAIR high = OF(two_sum)(a.high, b.high), low = OF(two_sum)(a.low, b.low);
   const PAIR sum = OF(fast_two_sum)(high.high, high.low + low.high);
@@ -43,42 +43,42 @@ static inline PAIR OF(add)(PAIR a, PAIR b)
 
 /* Pair arithmetic (Lange & Rump 2020): low words need not be below the rounding error of high words, as those of sums
  * that cancel, which `settled` repairs. The error is 4 u^2 relative to |a| + |b|. */
-static inline PAIR OF(sum)(PAIR a, PAIR b)
+INLINE PAIR OF(sum)(PAIR a, PAIR b)
 {
   PAIR result = OF(two_sum)(a.high, b.high);
   result.low += a.low + b.low;
   return result;
 }
 
-static inline PAIR OF(settled)(PAIR a)
+INLINE PAIR OF(settled)(PAIR a)
 {
   return OF(fast_two_sum)(a.high, a.low);
 }
 
 /* a + b to an error of 4 u^2 relative to |a| + |b|, with half the operations of the sum above. */
-static inline PAIR OF(plus)(PAIR a, PAIR b)
+INLINE PAIR OF(plus)(PAIR a, PAIR b)
 {
   return OF(settled)(OF(sum)(a, b));
 }
 
-static inline PAIR OF(negative)(PAIR a)
+INLINE PAIR OF(negative)(PAIR a)
 {
   const PAIR result = {-a.high, -a.low};
   return result;
 }
 
-static inline PAIR OF(difference)(PAIR a, PAIR b)
+INLINE PAIR OF(difference)(PAIR a, PAIR b)
 {
   return OF(sum)(a, OF(negative)(b));
 }
 
-static inline PAIR OF(subtract)(PAIR a, PAIR b)
+INLINE PAIR OF(subtract)(PAIR a, PAIR b)
 {
   return OF(add)(a, OF(negative)(b));
 }
 
 /* Products, whose low words are up to 3 u of the high ones if those of settled factors are. */
-static inline PAIR OF(product)(PAIR a, PAIR b)
+INLINE PAIR OF(product)(PAIR a, PAIR b)
 {
   PAIR result = OF(two_product)(a.high, b.high);
   result.low = FMA(a.high, b.low, FMA(a.low, b.high, result.low));
@@ -86,7 +86,7 @@ static inline PAIR OF(product)(PAIR a, PAIR b)
 }
 
 /* With one word. */
-static inline PAIR OF(multiple)(PAIR a, NUMBER b)
+INLINE PAIR OF(multiple)(PAIR a, NUMBER b)
 {
   PAIR result = OF(two_product)(a.high, b);
   result.low = FMA(a.low, b, result.low);
@@ -94,36 +94,36 @@ static inline PAIR OF(multiple)(PAIR a, NUMBER b)
 }
 
 /* With a power of two, exactly. */
-static inline PAIR OF(times_power)(PAIR a, NUMBER b)
+INLINE PAIR OF(times_power)(PAIR a, NUMBER b)
 {
   const PAIR result = {a.high * b, a.low * b};
   return result;
 }
 
-static inline PAIR OF(squared)(PAIR a)
+INLINE PAIR OF(squared)(PAIR a)
 {
   PAIR result = OF(two_product)(a.high, a.high);
   result.low = FMA(a.high + a.high, a.low, result.low);
   return result;
 }
 
-static inline PAIR OF(multiply)(PAIR a, PAIR b)
+INLINE PAIR OF(multiply)(PAIR a, PAIR b)
 {
   return OF(settled)(OF(product)(a, b));
 }
 
-static inline PAIR OF(scale)(PAIR a, NUMBER b)
+INLINE PAIR OF(scale)(PAIR a, NUMBER b)
 {
   return OF(settled)(OF(multiple)(a, b));
 }
 
-static inline PAIR OF(square)(PAIR a)
+INLINE PAIR OF(square)(PAIR a)
 {
   return OF(settled)(OF(squared)(a));
 }
 
 /* The quotient of the high words, corrected twice, since one correction leaves its own rounding error, 2^-105. */
-static inline PAIR OF(divide)(PAIR a, PAIR b)
+INLINE PAIR OF(divide)(PAIR a, PAIR b)
 {
   const NUMBER first = a.high / b.high;
   const PAIR rest = OF(subtract)(a, OF(scale)(b, first));
@@ -134,21 +134,21 @@ static inline PAIR OF(divide)(PAIR a, PAIR b)
 }
 
 /* 1 / x, corrected by a series. */
-static inline PAIR OF(inverse)(PAIR x)
+INLINE PAIR OF(inverse)(PAIR x)
 {
   const NUMBER y = 1.0 / x.high, e = FMA(-x.high, y, BROADCAST(1.0)) - x.low * y;
   return OF(fast_two_sum)(y, y * FMA(e, e, e));
 }
 
 /* The root of the high word, corrected; 0 for 0, where the correction would be 0/0. */
-static inline PAIR OF(sqrt)(PAIR x)
+INLINE PAIR OF(sqrt)(PAIR x)
 {
   const NUMBER y = OF(root)(x.high);
   return OF(fast_two_sum)(y, (FMA(-y, y, x.high) + x.low) / (y + y + DBL_MIN));
 }
 
 /* x^(-1/2) from y = x.high^(-1/2): with e = 1 - x y^2 by the series of (1 - e)^(-1/2). */
-static inline PAIR OF(inverse_root_1)(PAIR x)
+INLINE PAIR OF(inverse_root_1)(PAIR x)
 {
   const NUMBER y = 1.0 / OF(root)(x.high);
   const PAIR square = OF(two_product)(y, y), product = OF(two_product)(x.high, square.high);
@@ -156,19 +156,19 @@ static inline PAIR OF(inverse_root_1)(PAIR x)
   return OF(fast_two_sum)(y, y * (e * (0.5 + 0.375 * e)));
 }
 
-static inline PAIR OF(inverse_root_3)(PAIR x)
+INLINE PAIR OF(inverse_root_3)(PAIR x)
 {
   const PAIR y = OF(inverse_root_1)(x);
   return OF(multiply)(y, OF(square)(y));
 }
 
-static inline PAIR OF(inverse_root_5)(PAIR x)
+INLINE PAIR OF(inverse_root_5)(PAIR x)
 {
   const PAIR y = OF(inverse_root_1)(x);
   return OF(multiply)(y, OF(square)(OF(square)(y)));
 }
 
-static inline PAIR OF(inverse_root_7)(PAIR x)
+INLINE PAIR OF(inverse_root_7)(PAIR x)
 {
   const PAIR y = OF(inverse_root_1)(x), square = OF(square)(y);
   return OF(multiply)(OF(multiply)(y, square), OF(square)(square));
