@@ -14,6 +14,8 @@
 #define FACTOR_UP REAL(16.0) /* of the step size by MOST_UP levels */
 #define SUSPENDED 8 /* steps without this rule after one that needed as many iterations as a larger one */
 #define FAILURES_BEFORE_NEWTON 3 /* trials of a step in which the iteration of the multipliers fails */
+#define SHORT_MOTION REAL(0.01) /* relative to the largest position: a change so small .. */
+#define SHORT_BY_TOLERANCE 1000 /* .. and less than so many times the tolerance does not show errors of the forces */
 #define STEPS_COMPARED_AFTER_DOUBT 16 /* steps that are compared after one that was shortened by a comparison */
 
 #ifdef ARRAYS
@@ -183,6 +185,16 @@ static SELDOM int changes_little(const trial *now)
   return largest_change(&now->step, now->at.p, now->dp, &size) < SMALL_PART * size;
 }
 
+/* Returns 1 if the positions change by little more than the tolerance, so that their errors meet it whatever the forces
+ * are, as near a pole in time. */
+static SELDOM int moves_little(const trial *now)
+{
+  const real tolerance = MATH(pow)(now->limits.most, ERROR_POWER);
+  real size;
+  const real moved = largest_change(&now->step, now->at.q, now->dq, &size);
+  return moved < SHORT_MOTION * size && moved < SHORT_BY_TOLERANCE * tolerance * size;
+}
+
 /* Compares a trial with two half steps, in momenta too if requested. */
 static inline int compare_trial(const trial *now, int momenta, const solver_options *options, real *apart)
 {
@@ -335,9 +347,12 @@ HOT int find_step(run_memory *run, trial *now, const solver_options *options, so
  * factor of two or more although the momenta change little. Near a singular time or a nonsmooth force the coefficients
  * of the curve do not decay and do not show its error; steps are then so short that the error is in the momenta. Not
  * for Newton's method, whose steps may leave vibrations of stiff systems unresolved. */
-static inline int needs_momenta(const run_memory *run, const trial *now)
+static inline int needs_momenta(run_memory *run, const trial *now)
 {
-  return DOUBTS && (run->steps_to_compare > 0 || (now->change <= -LEVELS_PER_BINADE && changes_little(now)));
+  const int shorter = DOUBTS && now->change <= -LEVELS_PER_BINADE;
+  if (shorter && moves_little(now))
+    run->steps_to_compare = STEPS_COMPARED_AFTER_DOUBT;
+  return DOUBTS && (run->steps_to_compare > 0 || (shorter && changes_little(now)));
 }
 
 /* Compares a step with its half steps and shortens it while the difference is far above its error estimate. */
