@@ -227,7 +227,7 @@ def describe_arrays(
     )
 
 
-OF_ONE_WORD = ("ensemble", "observing", "thread", "points", "fallback")
+OF_ONE_WORD = ("observing", "thread", "points", "fallback")
 """Variants that double-double arithmetic lacks."""
 
 
@@ -481,8 +481,8 @@ class Sources:
             "thread": lambda: render_thread(self.program(), control_of(self.program(), self.controller, self.system)),
         }
         if self.precision == DOUBLE_DOUBLE:  # derivatives are those of the step in double
-            if kind == "ensemble" and self._in_pairs(self.program()):
-                return render_ensemble_in_pairs(self.program())
+            if kind == "ensemble":
+                return render_ensemble_in_pairs(self.program(), self._corrected(self.program()))
             return None if kind in OF_ONE_WORD else self._in_double.variant(name)
         return None if self.of_arrays else variants[kind]()
 

@@ -17,7 +17,7 @@ from itertools import accumulate, chain
 from typing import Any, Literal, TypeAlias, cast, get_args
 
 from scvi_codegen.ir.derivatives import Derivatives, PointDerivatives
-from scvi_codegen.ir.equations import Control, IterationTable, Rattle, StoredValues
+from scvi_codegen.ir.equations import Control, FixedPointIteration, IterationTable, Rattle, StoredValues
 from scvi_codegen.ir.kernel import Kernel, Number, is_divided
 from scvi_codegen.ir.program import Program
 from scvi_codegen.rendering.environment import support_text, template_environment
@@ -60,6 +60,14 @@ LARGEST_INLINED = 150
 """Largest number of operations of the kernels of an iteration that is inlined into the loop over steps.
 
 Larger ones are slower inlined: six bodies by 3 per cent, a chain of 64 masses by 20.
+"""
+
+
+LARGEST_IN_LANES = 256
+"""Largest number of values at the points of a step in two words in which trajectories, not points, are SIMD lanes.
+
+With 216 (outer solar system, SVI(12)) a trajectory takes 0.7 of the time, with 288 or 512 (SVI(16); chain of 64 masses,
+SVI(8)) there is no gain: the vectors exceed the cache.
 """
 
 
@@ -208,10 +216,7 @@ def render_double_double(
     assert derivatives is not None  # by the caller
     mass = fixed_point.constant_mass
     assert mass is not None  # of separable systems
-    tables = [replace(each, in_two_parts=not each.is_matrix or each.in_two_parts) for each in fixed_point.own_tables]
-    tables += [_lowest_words(each) for each in tables if each.name in OF_THREE_WORDS]
-    anchor = 3 * max(_largest_sum(each) for each in tables if each.name in OF_THREE_WORDS[1:])
-    program = replace(program, fixed_point=replace(fixed_point, own_tables=tuple(tables), linear_part=None))
+    program = _in_three_words(program)
     quantities, lanes = program.quantities, (derivatives.partials, derivatives.products[0])
     states = (quantities.energy, *((quantities.momentum_kernel,) if quantities.momentum_kernel else ()))
     numbers, vectors = (mass, *states), fixed_point.kernels
@@ -221,7 +226,7 @@ def render_double_double(
         "cut": context["cut"] or is_divided(lanes),
         "two_words": {
             "derivatives": derivatives.count,
-            "anchor": anchor,
+            "anchor": _anchor(program),
             "of_numbers": numbers,
             "of_vectors": vectors,
             "meaning": POINTS,
@@ -232,10 +237,21 @@ def render_double_double(
     return _render(program.prefix, context)
 
 
-def _largest_sum(table: IterationTable) -> float:
-    """Return the largest sum of the absolute values of a row."""
-    rows = table.numbers if table.is_matrix else (table.numbers,)
-    return max(float(sum(map(abs, row))) for row in rows)
+def _in_three_words(program: Program) -> Program:
+    """Return a program of a separable iteration whose tables have the low words that steps in pairs use."""
+    fixed_point = program.fixed_point
+    assert fixed_point is not None  # by the caller
+    tables = [replace(each, in_two_parts=not each.is_matrix or each.in_two_parts) for each in fixed_point.own_tables]
+    tables += [_lowest_words(each) for each in tables if each.name in OF_THREE_WORDS]
+    return replace(program, fixed_point=replace(fixed_point, own_tables=tuple(tables), linear_part=None))
+
+
+def _anchor(program: Program) -> float:
+    """Return three times the largest sum of the absolute values of a row of the tables of the forces."""
+    fixed_point = program.fixed_point
+    assert fixed_point is not None  # by the caller
+    rows = (row for name in OF_THREE_WORDS[1:] for row in fixed_point.numbers(name))
+    return 3 * max(float(sum(map(abs, row))) for row in rows)
 
 
 def _lowest_words(table: IterationTable) -> IterationTable:
@@ -266,21 +282,39 @@ def _render_explicit(program: Program) -> Source:
     return _render(program.prefix, context | sizes | {"two_words": words, "own_headers": arithmetic_headers()})
 
 
-def render_ensemble_in_pairs(program: Program) -> Source:
-    """Return the source of explicit steps in pairs of many trajectories, which are lanes."""
-    split = program.splitting
-    assert split is not None  # by the caller
-    kernels = split.drift, split.force
-    context = {
+def render_ensemble_in_pairs(program: Program, derivatives: PointDerivatives | None) -> Source | None:
+    """Return the source of steps in pairs of many trajectories, which are lanes.
+
+    ``None`` for steps by Newton's method, and for many values at the points of a step.
+
+    Args:
+        program: with explicit steps, or with a fixed-point iteration of separable systems.
+        derivatives: as of :func:`render_double_double`.
+    """
+    split, fixed_point = program.splitting, program.fixed_point
+    own: dict[str, object]
+    if split is not None and in_pairs(program):
+        kernels, beside = (split.drift, split.force), ()
+        own = {"points": 2, "fixed_point": None}  # points: words of the stored force
+    elif fixed_point and derivatives and program.dimension * fixed_point.points <= LARGEST_IN_LANES:
+        program, mass = _in_three_words(program), fixed_point.constant_mass
+        assert mass is not None  # of separable systems
+        kernels, beside = (mass, *fixed_point.kernels), (derivatives.partials, derivatives.products[0])
+        iteration = cast(FixedPointIteration, program.fixed_point)
+        source = iteration_source(iteration, TRAJECTORIES, kernels=(*fixed_point.kernels, *beside))
+        own = {"points": fixed_point.points, "fixed_point": source}
+    else:
+        return None
+    context = own | {
         "program": program,
-        "points": 2,  # of the stored force: its words
         "observed": 0,
         "counts": False,
         "tangents": 0,
-        "cut": is_divided(kernels),
+        "cut": is_divided((*kernels, *beside)),
         "needs_velocities": False,
-        "fixed_point": None,
+        "hot": "static",
         "two_words": {
+            **({"derivatives": derivatives.count, "anchor": _anchor(program)} if derivatives else {}),
             "of_numbers": (),
             "of_vectors": kernels,
             "meaning": TRAJECTORIES,

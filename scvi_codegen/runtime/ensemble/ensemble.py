@@ -2,7 +2,7 @@
 
 With common fixed steps trajectories are SIMD lanes (:mod:`scvi_codegen.runtime.ensemble.lanes`). Others are computed by
 the single integrator, so they are bitwise equal to those of :meth:`Stepper.integrate`, which computes trajectories with
-inputs, output times, changes by events, states of two words or a bound of the global error. C integrates many
+inputs, output times, changes by events or a bound of the global error. C integrates many
 trajectories in one call (:mod:`scvi_codegen.runtime.ensemble.batches`), without the GIL, so threads share the work;
 results are bitwise equal for any number of threads.
 """
@@ -148,8 +148,9 @@ class Ensemble:
         self.error, self.confirmations = error, list[GlobalError | None]()
         self.t_eval: Array | None = None
         self.ends = np.empty(0)
-        # of two words explicit steps alone are lanes; events change the states of each within steps
-        self.singly = stepper.changes_states or (words > 1 and (bool(self.inputs) or stepper.ensemble is None))
+        # events change the states of each within steps, and inputs of two words its parameters
+        of_two_words = words > 1 and fixed is not None and (bool(self.inputs) or stepper.ensemble is None)
+        self.singly = stepper.changes_states or of_two_words
         self.fixed = fixed if words > 1 else None
         if fixed is None or self.singly:
             self.plans = self._plans(fixed, cast(ArrayLike, t_end), tolerance)

@@ -249,6 +249,8 @@ class SingleRun:
                 if chunk.entered is not None and self.run is not None:
                     values = self.work.values_at(chunk.entered.middle, slice(self.j, self.j + 1))[0]
                     self.run.update(h=chunk.entered.h, parameters=values)
+                    if self.work.steps.words > 1 and chunk.entered.end is not None:
+                        self.run._step_to(chunk.entered.end)
                 self.step += chunk.steps
                 self.advance_to(self.step, chunk.save_every)
             return size

@@ -162,6 +162,9 @@ typedef struct {
 #ifdef DOUBLE_DOUBLE
   double t_low, h_low;
 #endif
+#ifdef MIXED_POINTS
+  double *points; /* for the points of the solved step */
+#endif
   const lanes *q0, *p0, *carry_q, *carry_p, *parameters;
 } step_data;
 

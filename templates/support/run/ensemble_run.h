@@ -204,6 +204,10 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
   (void)p;
   memcpy(&growth, block->growth, sizeof growth);
 #endif
+#ifdef MIXED_POINTS
+  coordinates points[GROUPS];
+  step.points = (double *)points;
+#endif
   for (long long k = 0, stored = 0; k < steps; k++) {
     const long long parity = block->step % 2;
     const history past = {memory[1 - parity], memory[parity]};
@@ -216,9 +220,12 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
 #else
     memcpy(stored_results.active, block->active, sizeof stored_results.active);
     stored_results.repeated = 0;
-    do
+    do {
       fixed_point(&step, &data, past, &block->guess, dq, dp, options ? options : &standard, &report);
-    while (memcmp(stored_results.active, block->active, sizeof stored_results.active) != 0 && block->step > 0 &&
+#ifdef MIXED_POINTS
+      refine_increments(&step, block->active, dq, dp);
+#endif
+    } while (memcmp(stored_results.active, block->active, sizeof stored_results.active) != 0 && block->step > 0 &&
         repeats_failed(&stored_results, past, &block->guess, dq, dp, block->active));
 #endif
     drop_infinite(&now, dq, dp, block->active);
