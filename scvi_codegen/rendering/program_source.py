@@ -292,9 +292,9 @@ def render_ensemble_in_pairs(program: Program, derivatives: PointDerivatives | N
         derivatives: as of :func:`render_double_double`.
     """
     split, fixed_point = program.splitting, program.fixed_point
-    own: dict[str, object]
+    kernels, beside, own = tuple[Kernel, ...](), tuple[Kernel, ...](), dict[str, object]()
     if split is not None and in_pairs(program):
-        kernels, beside = (split.drift, split.force), ()
+        kernels = split.drift, split.force
         own = {"points": 2, "fixed_point": None}  # points: words of the stored force
     elif fixed_point and derivatives and program.dimension * fixed_point.points <= LARGEST_IN_LANES:
         program, mass = _in_three_words(program), fixed_point.constant_mass

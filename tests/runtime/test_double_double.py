@@ -23,6 +23,7 @@ import scvi_codegen as sc
 from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.native.building import TUNED_FLAGS
 from scvi_codegen.native.compilers import REORDERING_FLAGS
+from scvi_codegen.pipeline import Sources
 from scvi_codegen.rendering.kernels.double_double import FUNCTIONS, arithmetic_headers
 from scvi_codegen.runtime.core.words import as_mpmath, split, two_words, with_low
 from scvi_codegen.runtime.ensemble.ensemble import Ensemble
@@ -709,6 +710,16 @@ def test_step_in_lanes() -> None:
             for part, values in zip("qp", exact, strict=True):
                 worst = max(abs(x - y) for x, y in zip(runs.mp(part)[k + 1, j], values, strict=True))
                 assert worst <= 2e-31 * max(map(abs, values))
+
+
+@pytest.mark.parametrize(("count", "has_lanes"), [(16, True), (17, False)])
+def test_largest_systems_in_lanes(count: int, has_lanes: bool) -> None:
+    """Trajectories are SIMD lanes for up to 256 values at the points of a step."""
+    names = [f"x{j}" for j in range(count)]
+    lagrangian = "+".join(f"{x}_dot**2/2 - {x}**4" for x in names)
+    free = sc.LagrangianSystem.from_text(name="free", coordinates=names, lagrangian=lagrangian)
+    source = Sources(free, sc.SVI(16), precision="double-double").variant("ensemble")
+    assert (source is not None) == has_lanes
 
 
 def test_trajectory_that_leaves_its_lane() -> None:
