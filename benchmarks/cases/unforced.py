@@ -256,17 +256,31 @@ def _small_case(name: str, accelerations: Callable[..., list[Any]], *others: For
     """Return a problem of the catalogue with its own state (or another one), spread by 5 %."""
     entry = problem(name)
     fields = {field: changes.pop(field) for field in ("span", "fine", "loops") if field in changes}
+    system = changes.pop("system", entry.system)
     q, velocity = changes.pop("q", entry.q), changes.pop("velocity", entry.velocity)
     step = changes.pop("step", entry.step)
     return Case(
         name=name,
-        system=entry.system.with_parameters(**changes),
+        system=system.with_parameters(**changes),
         formulations=(*hand_solved(accelerations), *others),
         q=scaled(q, 0.05),
         velocity=scaled(velocity, 0.05),
         step=step,
         **fields,
     )
+
+
+def duffing_case() -> Case:
+    """Return the Duffing oscillator of the catalogue without its driving force 0, which no peer integrates."""
+    defaults = problem("duffing").system
+    values = dict(zip(map(str, defaults.parameters), defaults.defaults, strict=True))
+    undriven = LagrangianSystem.from_text(
+        name="Duffing oscillator",
+        coordinates=["q"],
+        lagrangian="q_dot**2/2 - alpha*q**2/2 - beta*q**4/4",
+        parameters={name: values[name] for name in ("alpha", "beta")},
+    )
+    return _small_case("duffing", duffing, span=2000.0, fine=0.25, system=undriven)
 
 
 def hand_solved(accelerations: Callable[..., list[Any]]) -> tuple[Formulation, ...]:
@@ -340,7 +354,7 @@ MOMENTA = Formulation(name="Hamilton's equations", rates=relativistic_in_momenta
 
 CASES: Mapping[str, Callable[[], Case]] = {
     "planar-pendulum": partial(_small_case, "planar-pendulum", pendulum, span=1000.0, fine=0.5, q=(0.5,), step=0.8),
-    "duffing": partial(_small_case, "duffing", duffing, span=2000.0, fine=0.25),
+    "duffing": duffing_case,
     "kepler:0.2": partial(kepler_case, 0.2, step=0.5, fine=0.375),
     "kepler:0.5": partial(kepler_case, 0.5, step=0.25, fine=0.1875),
     "henon-heiles": partial(  # at energy 0.055, where motion is regular

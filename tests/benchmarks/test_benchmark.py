@@ -140,18 +140,20 @@ class TestCases:
 class TestDigits:
     def test_times_are_compared_at_twice_the_larger_error_below_those_of_doubles(self):
         ours, peer = points((1.0, 1e-20), (2.0, 1e-30)), points((10.0, 1e-15), (400.0, 5e-27))
-        row = digits.compared(ours, peer)
+        middle, row = digits.compared(ours, peer, (1e-12, 1e-20, 1e-28))  # those at which both curves have points
+        assert middle["at_error"] == 1e-20
+        assert middle["our_ms"] == pytest.approx(1e3)
         assert row["at_error"] == pytest.approx(1e-26)
         assert row["our_ms"] == pytest.approx(1e3 * 2**0.6)
         assert 300 < row["peer_ms"] / 1e3 < 400
-        assert digits.compared(ours, []) == {"our_smallest": 1e-30, "smallest": None}
+        assert [*digits.compared(ours, [], ())] == [{"our_smallest": 1e-30, "smallest": None}]
 
     @pytest.mark.second
     def test_section_compares_with_a_reference_of_200_bits(self, monkeypatch):
         pytest.importorskip("heyoka")
         monkeypatch.setattr(digits, "SPANS", {"planar-pendulum": (256.0, 1024)})
         monkeypatch.setattr(digits, "METHODS", ("svi:12",))
-        monkeypatch.setattr(digits, "KINDS", {"heyoka long double": ("longdouble", (0.0,))})
+        monkeypatch.setattr(digits, "KINDS", {"heyoka long double": ("longdouble", (0.0,), ())})
         (row,) = digits.run_digits(bench.Plan(quick=True, peers=("heyoka",)), lambda text: None).rows
         assert row["reference"] < 1e-40
         assert row["our_smallest"] < 1e-27
