@@ -70,7 +70,7 @@ static int NAME(call_one)(NAME(each) *c, const double *parameters, long long ste
   __typeof__(NAME(advance)) *volatile fixed = NAME(advance);
   int status = 0, arrived = 0;
 #ifdef HAS_ACTIONS
-  c->run->actions = c->actions + row;
+  c->run->actions = c->actions ? c->actions + row : NULL;
 #endif
 #ifdef HAS_SET_FALLBACK
   const long long left = c->left;

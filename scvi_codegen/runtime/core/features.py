@@ -200,6 +200,9 @@ FEATURES = {
 """Remedies of the operations that a property of the stepper, or another argument of the run, excludes."""
 
 
+_EXCLUDING = {each: [property_ for operation, property_ in FEATURES if operation == each] for each, _ in FEATURES}
+
+
 @dataclass(frozen=True, slots=True)
 class Support:
     """Answer of :meth:`~scvi_codegen.Stepper.supports`: true if the operation is available, else with the reason."""
@@ -236,9 +239,7 @@ def check_together(**arguments: Any) -> None:
 
 def require(stepper: Any, operation: str, *together: str) -> None:
     """Raise the refusal of an operation of a stepper, or of one together with others, if the table has one."""
-    for each, property_ in FEATURES:
-        if each != operation:
-            continue
+    for property_ in _EXCLUDING.get(operation, ()):
         if property_ in PROPERTIES_OF_SIZES:
             applies = not stepper.run_time_sizes and PROPERTIES_OF_SIZES[property_](stepper.known)
         else:

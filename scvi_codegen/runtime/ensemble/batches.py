@@ -39,10 +39,16 @@ NAMES = np.array([OK, *OUTCOMES, INTERRUPTED], dtype="<U32")
 
 
 class Rows(NamedTuple):
-    """Saved states: row and trajectory of each, times, positions, momenta and actions (NaN unless runs sum them)."""
+    """Saved states of successive trajectories.
 
-    rows: NDArray[np.intp]
+    Attributes:
+        trajectories, first, numbers: (k,) trajectories, their first rows and their numbers of rows.
+        t, q, p, actions: one row per state; actions are empty unless runs sum them.
+    """
+
     trajectories: NDArray[np.intp]
+    first: NDArray[np.int64]
+    numbers: NDArray[np.int64]
     t: Array
     q: Array
     p: Array
@@ -50,7 +56,23 @@ class Rows(NamedTuple):
 
     def copies(self) -> Rows:
         """Return copies, in memory of their own."""
-        return Rows(*self[:2], *(each.copy() for each in self[2:]))
+        return Rows(*self[:3], *(each.copy() for each in self[3:]))
+
+    def indices(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return the row and the trajectory of each state."""
+        rows = np.arange(len(self.t)) + np.repeat(self.first + self.numbers - np.cumsum(self.numbers), self.numbers)
+        return rows, np.repeat(self.trajectories, self.numbers)
+
+    def put(self, *pairs: tuple[Array | None, Array]) -> None:
+        """Store values of the states in (n, k, ..) arrays of all trajectories; ``None`` is not stored."""
+        k, row, count = (int(each[0]) for each in self[:3])
+        where: Any = slice(row, row + count), slice(k, k + len(self.first))
+        alike = (self.first == row).all() and (self.numbers == count).all()
+        where = where if alike else self.indices()
+        for whole, values in pairs:
+            if whole is not None:
+                shape = (-1, count, *values.shape[1:])
+                whole[where] = values.reshape(shape).swapaxes(0, 1) if alike else values
 
 
 class Batch:
@@ -212,7 +234,7 @@ class SuccessiveRuns(Batch):
         receive: Callable[[Rows], None],
     ) -> None:
         super().__init__(stepper.binding, *arguments)
-        self.words = stepper.interface.words
+        self.words, self.sums_action = stepper.interface.words, stepper.sums_action
         self.conserves_energy = stepper.interface.conserves_energy and self.words == 1
         self.tolerance, self.save_every, self.receive, count = tolerance, save_every, receive, len(self.q)
         self.stored, self.fallback_steps = np.zeros((2, count), np.int64)
@@ -255,8 +277,8 @@ class _SuccessiveCall(Call):
         struct.words, struct.capacity = work.words, self.capacity
         self.iterations = np.empty(self.capacity, np.int32)
         struct.iterations = binding.integers(self.iterations)
-        self.actions = np.full(self.capacity, np.nan)
-        (struct.actions,) = binding.pointers(self.actions)
+        self.actions = np.full(self.capacity if work.sums_action else 0, np.nan)
+        struct.actions = binding.pointer(self.actions)
         self.states = tuple(np.empty((self.capacity, numbers)) for numbers in (work.words, m, m))
         struct.times, struct.positions, struct.momenta = binding.pointers(*self.states)
 
@@ -269,10 +291,9 @@ class _SuccessiveCall(Call):
         first = np.ones(len(each), np.int64)
         first[0] += self.before
         numbers = work.stored[each] + 1 - first
-        rows = np.arange(count) + np.repeat(first + numbers - np.cumsum(numbers), numbers)
         states = (each[:count] if work.words == 1 else from_block(each[:count]) for each in self.states)
         t, q, p = states
-        work.receive(Rows(rows, np.repeat(each, numbers), t[:, 0], q, p, self.actions[:count]))
+        work.receive(Rows(each, first, numbers, t[:, 0], q, p, self.actions[:count]))
         self.flushed = int(call.next)
         self.before = int(work.stored[self.flushed]) if self.flushed < call.end and call.segment >= 0 else 0
         call.rows = 0

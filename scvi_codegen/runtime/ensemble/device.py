@@ -349,9 +349,10 @@ class AdaptiveDeviceRuns:
             each[1, status != 0] = np.nan
 
         def store(states: Rows) -> None:
+            trajectories = states.indices()[1]
             for each, values in zip(finals, (states.q, states.p), strict=True):
-                each[1, failed[states.trajectories]] = values
-            self.t[failed[states.trajectories]] = states.t
+                each[1, failed[trajectories]] = values
+            self.t[failed[trajectories]] = states.t
 
         if failed.size:
             again = SuccessiveRuns(

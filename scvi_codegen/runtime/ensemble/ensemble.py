@@ -420,8 +420,10 @@ class Ensemble:
         )
 
     def _status(self, common: CommonRuns | DeviceRuns) -> NDArray[np.str_]:
-        unfinished = (common.status == OK) & (common.done < common.steps.steps)
-        return np.where(unfinished, INTERRUPTED, common.status)
+        unfinished = common.done < common.steps.steps
+        if not unfinished.any():
+            return common.status
+        return np.where(unfinished & (common.status == OK), INTERRUPTED, common.status)
 
     def _adaptive_fields(self) -> dict[str, Any]:
         """Return the fields of results of a GPU with adaptive steps, but its states."""
@@ -456,7 +458,8 @@ class Ensemble:
 
     def _successive_result(self, work: SuccessiveRuns) -> EnsembleTrajectory:
         count, rows, words = len(self), 1 + int(work.stored.max()), self.stepper.interface.words
-        places = [np.arange(count), *(each.rows * count + each.trajectories for each in self.states)]
+        indices = [each.indices() for each in self.states]
+        places = [np.arange(count), *(row * count + trajectory for row, trajectory in indices)]
         index = np.full((rows, count), -1)  # of the states in the order in which C stored them; the last row is NaN
         index.reshape(-1)[np.concatenate(places)] = np.arange(sum(map(len, places)))
 

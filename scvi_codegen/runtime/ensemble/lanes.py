@@ -106,7 +106,7 @@ class CommonRuns:
             batch.run(progress=None if progress is None else lambda done: progress(int(done * unit)), threads=threads)
         finally:
             if isinstance(batch, SuccessiveRuns):
-                self.status = np.where(batch.status >= 0, batch.names, OK)
+                self.status = batch.names
                 self.done, self.fallback_steps = batch.done, batch.fallback_steps
 
     def batch(self) -> LaneRuns | SuccessiveRuns | None:
@@ -124,10 +124,7 @@ class CommonRuns:
         return SuccessiveRuns(self.stepper, *start, steps, values_at, receive=self._store)
 
     def _store(self, states: Rows) -> None:
-        self.q[states.rows, states.trajectories], self.p[states.rows, states.trajectories] = states.q, states.p
-        for own, values in ((self.times, states.t), (self.actions, states.actions)):
-            if own is not None:
-                own[states.rows, states.trajectories] = values
+        states.put((self.q, states.q), (self.p, states.p), (self.times, states.t), (self.actions, states.actions))
 
 
 class LaneRuns(Batch):
