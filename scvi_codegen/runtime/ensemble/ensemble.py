@@ -7,7 +7,7 @@ trajectories in one call (:mod:`scvi_codegen.runtime.ensemble.batches`), without
 results are bitwise equal for any number of threads.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -57,7 +57,7 @@ from scvi_codegen.runtime.inputs.segments import (
 )
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 from scvi_codegen.runtime.run.global_error import GlobalError
-from scvi_codegen.runtime.run.step_plan import StepPlan, checked_plan, planned_steps
+from scvi_codegen.runtime.run.step_plan import AdaptivePlans, StepPlan, checked_plan, planned_steps
 from scvi_codegen.runtime.run.times import WHOLE
 from scvi_codegen.runtime.trajectory.dense_output import times_of_run
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
@@ -143,7 +143,7 @@ class Ensemble:
                 values[energy] = stepper.energy(at, momenta, 0.0, values)
         self.values_at = partial(parameters_at, stepper.parameters, self.parameters, self.inputs)
         self.common: CommonRuns | DeviceRuns | None = None
-        self.plans: list[StepPlan] = []
+        self.plans: Sequence[StepPlan] = ()
         self.saved: dict[int, SavedLane] = {}
         self.error, self.confirmations = error, list[GlobalError | None]()
         self.t_eval: Array | None = None
@@ -154,6 +154,7 @@ class Ensemble:
         self.fixed = fixed if words > 1 else None
         if fixed is None or self.singly:
             self.plans = self._plans(fixed, cast(ArrayLike, t_end), tolerance)
+            self.plans = self.plans if error is None else list(self.plans)
             self.confirmations = [None] * (0 if error is None else len(self))
             self.t_eval = self._output_times(fixed, t_eval)
         if self.inputs:
@@ -231,10 +232,10 @@ class Ensemble:
         times = set() if self.t_eval is None else {*self.t_eval.tolist()} - {self.t0}
         return times == {*np.unique(ends).tolist()}
 
-    def _plans(self, fixed: CommonSteps | None, t_end: ArrayLike, tolerance: float | None) -> list[StepPlan]:
+    def _plans(self, fixed: CommonSteps | None, t_end: ArrayLike, tolerance: float | None) -> Sequence[StepPlan]:
         """Return the step plan of each trajectory; all must run forward or all backward."""
         if fixed is not None:
-            return [StepPlan(h=fixed.h, t_end=float(fixed.times(tau=False)[-1]))] * len(self)
+            return (StepPlan(h=fixed.h, t_end=float(fixed.times(tau=False)[-1])),) * len(self)
         ends = real_array(t_end, "t_end")
         self.ends = np.full(len(self), ends) if not ends.ndim else ends
         if ends.shape not in ((), (len(self),)):
@@ -244,8 +245,8 @@ class Ensemble:
         if (ends > self.t0).any() and (ends < self.t0).any():
             raise StateError(f"t_end lies on both sides of t = {self.t0:g}: split the ensemble into two")
         if not ends.ndim:
-            return [plan] * len(self)
-        return [StepPlan(t_end=end, tolerance=plan.tolerance) for end in ends.tolist()]
+            return (plan,) * len(self)
+        return AdaptivePlans(ends, plan.tolerance)
 
     def _output_times(self, fixed: CommonSteps | None, t_eval: ArrayLike | None) -> Array | None:
         """Return the validated output times; raise ``StateError`` if inputs do not cover a run."""
@@ -356,7 +357,7 @@ class Ensemble:
             if self.error is not None:
                 with suppress(StateError, StepFailedError):
                     states = integrate(q, p, error=self.error, t_end=plan.t_end, **arguments)
-                    self.confirmations[j], self.plans[j] = states.confirmation, states.plan
+                    self.confirmations[j], cast(list[StepPlan], self.plans)[j] = states.confirmation, states.plan
                     return SavedLane(states.t, states.q, states.p, OK, states.steps, states.fallback_steps)
             try:
                 states = integrate(q, p, **steps, **arguments)
@@ -429,7 +430,7 @@ class Ensemble:
         """Return the fields of results of a GPU with adaptive steps, but its states."""
         runs = cast(AdaptiveDeviceRuns, self.adaptive)
         times = np.array([np.full(len(self), self.t0), np.where(runs.status == OK, runs.t, np.nan)])
-        about = {"status": runs.status, "steps": runs.done, "h": 0.0, "plans": tuple(self.plans)}
+        about = {"status": runs.status, "steps": runs.done, "h": 0.0, "plans": self.plans}
         return {"t": np.arange(2.0), "times": times, "parameters": self.parameters, "stepper": self.stepper, **about}
 
     def _adaptive_result(self) -> EnsembleTrajectory:
@@ -466,7 +467,8 @@ class Ensemble:
         def ordered(name: str, first: Array) -> Array:
             """Return the rows of all trajectories, NaN after their ends."""
             last = missing((1, *first.shape[1:]), words if name != "actions" else 1)
-            return cast(Array, np.concatenate([first, *(getattr(each, name) for each in self.states), last])[index])
+            whole = np.concatenate([first, *(getattr(each, name) for each in self.states), last])
+            return cast(Array, whole[index] if words > 1 else whole.take(index, axis=0))
 
         q, p = ordered("q", self.start[0]), ordered("p", self.start[1])
         if self.t_eval is None:
@@ -503,7 +505,7 @@ class Ensemble:
             steps=steps,
             fallback_steps=fallback_steps,
             h=self.plans[0].h,
-            plans=() if self.plans[0].fixed else tuple(self.plans),
+            plans=() if self.plans[0].fixed else self.plans,
             confirmations=tuple(self.confirmations),
             parameters=self.parameters,
             stepper=self.stepper,

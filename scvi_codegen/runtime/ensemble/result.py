@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -69,7 +69,7 @@ class EnsembleRuns:
     parameters: Array
     stepper: Integrator = field(repr=False)
     times: Array | None = None
-    plans: tuple[StepPlan, ...] = ()
+    plans: Sequence[StepPlan] = ()
     observed: Array | None = field(default=None, repr=False)
 
     def __len__(self) -> int:

@@ -1,9 +1,14 @@
 """Step plan of a run: fixed step size, adaptive steps to a time, or constant steps in transformed time to a time."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, checked_step
@@ -38,6 +43,26 @@ class StepPlan:
     def adaptive(self) -> bool:
         """Return whether step sizes follow from the tolerance."""
         return not (self.h or self.tau)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AdaptivePlans(Sequence[StepPlan]):
+    """Step plans of trajectories with adaptive steps of one tolerance, made when they are read.
+
+    Attributes:
+        ends: (k,) target times.
+    """
+
+    ends: NDArray[np.float64]
+    tolerance: float
+
+    def __len__(self) -> int:
+        return len(self.ends)
+
+    def __getitem__(self, j: Any) -> Any:
+        if isinstance(j, slice):
+            return AdaptivePlans(self.ends[j], self.tolerance)
+        return StepPlan(t_end=float(self.ends[j]), tolerance=self.tolerance)
 
 
 def checked_plan(
