@@ -292,3 +292,18 @@ def test_low_words_enter_everywhere_the_state_does(name: str) -> None:
         ends.append(np.concatenate([q + low_q, p + low_p]))
     last = 2e-6 if name == "array" else 1e-14  # iterations over arrays take the low word in from the second on
     assert np.abs(ends[1] - ends[0]).max() < last
+
+
+def test_adaptive_steps_of_loose_tolerance_omit_low_words() -> None:
+    """Their iteration takes as many steps of the same sizes, whose states differ by rounding errors."""
+    kepler = sc.compile_stepper(sc.problem("kepler").system, "svi:8", flags=QUICK_FLAGS)
+    exact, rough = (
+        kepler.integrate(
+            [0.4, 0.0], [0.0, 2.0], t_end=20.0, tolerance=1e-9, options=sc.SolverOptions(tolerance=tolerance)
+        )
+        for tolerance in (0.99e-12, 1.01e-12)
+    )
+    assert (exact.t == rough.t).all()
+    apart = np.abs(rough.q - exact.q).max()
+    assert 0.0 < apart < 1e-12
+    assert np.ptp(rough.energy()) < 1.5 * np.ptp(exact.energy())

@@ -47,6 +47,10 @@ static long long next_of_vibrations(long long steps, double first_change)
 #define BEGINS_STRAIGHT(steps) ((steps) == 0)
 #endif
 
+#if defined(ADAPTIVE_STEPS) && !defined(MIXED_POINTS) && !defined(SCVI_DEVICE)
+#define ROUGH 1e-12 /* tolerance of the iteration above which low words have no effect on an adaptive step */
+#endif
+
 #define FEW 8 /* coordinates, whose squared changes are added, which is faster */
 
 /* Constants of a step size: h^2 = square + square_low, h w = kick + kick_low. */
@@ -219,6 +223,21 @@ PASS void refine_points(const step_points *w, section here)
     for (int g = 0; g < GROUPS; g++)
       w->X[g * OF_EACH * EXTENT(w->n) + i] = accurate_point(w, g, DRIFT_OF(w, i), i);
 }
+
+#ifdef ROUGH
+/* Increments without low words of the weights. */
+PASS void find_rough_increments(const step_points *w, number *dq, number *dp)
+{
+  for (int i = 0; i < M; i++) {
+    const drift_words of = DRIFT_OF(w, i);
+    const number kick = unit_of(w, i) * weigh_apart(POINT_END_POSITION, &w->F[i], M);
+    dq[i] = of.high + kick, dq[M + i] = (of.high - dq[i]) + kick;
+    dp[i] = weigh_apart(w->data->kick, &w->F[i], M);
+  }
+}
+#else
+#define find_rough_increments(w, dq, dp) (void)0
+#endif
 
 #if defined(SUMS_OF_EIGHT) && defined(EIGHT_COORDINATES)
 /* increments_of eight coordinates, which are lanes; dq_low: low words. */
@@ -467,9 +486,9 @@ static void refine_forces(const step_points *w)
 #ifndef NEWTON_KRYLOV
 /* Computes the increments of one step and their low words. The points X are iterated until they converge, then once
  * more with double-double coefficients; the forces are stored for the predictor. implicit: 1 if equations are solved
- * for the linear part of the forces. On failure the increments are undefined. */
+ * for the linear part of the forces; rough: 1 without low words. On failure the increments are undefined. */
 HOT int iterate(const step_data *step, const iteration_data *data, history past, long long *steps, number *dq,
-    number *dp, const solver_options *options, solver_report *report, int implicit)
+    number *dp, const solver_options *options, solver_report *report, int implicit, int rough)
 {
 #ifdef ARRAYS
   const section own = own_part(step);
@@ -490,7 +509,9 @@ HOT int iterate(const step_data *step, const iteration_data *data, history past,
   forces(&w);
   measure_points(&w, options);
 #ifndef ARRAYS
-  if (!implicit)
+  if (rough)
+    memset(rests, 0, sizeof rests);
+  else if (!implicit)
     find_rests(&w);
 #endif
   for (int k = 0; needs_iteration(&now); k++) {
@@ -517,13 +538,19 @@ HOT int iterate(const step_data *step, const iteration_data *data, history past,
   if (implicit)
     refine_forces(&w);
   else {
-    refine_points(&w, own);
+    if (rough)
+      improve(&w);
+    else
+      refine_points(&w, own);
 #ifdef ARRAYS
     improve_velocities(&w, own);
 #endif
     forces(&w);
   }
-  find_increments(&w, own, dq, dp);
+  if (rough)
+    find_rough_increments(&w, dq, dp);
+  else
+    find_increments(&w, own, dq, dp);
   if (!accept(step, dq, dp, report))
     return NOT_FINITE;
 #ifndef ARRAYS
@@ -547,10 +574,21 @@ HOT int iterate(const step_data *step, const iteration_data *data, history past,
 HOT int fixed_point(const step_data *step, const iteration_data *data, history past, long long *steps, number *dq,
     number *dp, const solver_options *options, solver_report *report)
 {
-  if (solves_linear_part(data) && iterate(step, data, past, steps, dq, dp, options, report, 1) == OK)
+  if (solves_linear_part(data) && iterate(step, data, past, steps, dq, dp, options, report, 1, 0) == OK)
     return OK;
-  return iterate(step, data, past, steps, dq, dp, options, report, 0);
+  return iterate(step, data, past, steps, dq, dp, options, report, 0, 0);
 }
+
+#ifdef ROUGH
+/* The same without low words, if `rough`. */
+HOT int adaptive_point(const step_data *step, const iteration_data *data, history past, long long *steps, number *dq,
+    number *dp, const solver_options *options, solver_report *report, int rough)
+{
+  if (rough && !solves_linear_part(data))
+    return iterate(step, data, past, steps, dq, dp, options, report, 0, 1);
+  return fixed_point(step, data, past, steps, dq, dp, options, report);
+}
+#endif
 #endif
 
 #ifdef RUN_ACTION

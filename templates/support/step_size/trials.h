@@ -66,11 +66,11 @@ static real attempt(run_memory *run, step_data *step, const solver_data *data, i
 #define SHORT_STEPS_FAIL 1 /* their changes are relative to velocities that may be little more than rounding */
 
 /* Computes the increments; returns the error estimate of the curve if it exceeds `least`, or infinity if the step
- * failed. afresh: without the predictor; inside: levels above this one of a rejected step, whose curve is stored, or 0.
- * Out of line, one copy compiles faster than two. */
-static __attribute__((noinline)) double attempt(run_memory *run, step_data *step, const solver_data *data, int afresh,
-    int inside, long long *guess, double *dq, double *dp, double decay, double least, const solver_options *options,
-    solver_report *report)
+ * failed. afresh: without the predictor; inside: levels above this one of a rejected step, whose curve is stored, or 0;
+ * rough: 1 without low words. */
+static inline __attribute__((always_inline)) double attempt_at(run_memory *run, step_data *step,
+    const solver_data *data, int afresh, int inside, long long *guess, double *dq, double *dp, double decay,
+    double least, const solver_options *options, solver_report *report, int rough)
 {
   struct predictor_tables_of tables = {NULL, NULL, NULL};
   int status;
@@ -82,9 +82,12 @@ static __attribute__((noinline)) double attempt(run_memory *run, step_data *step
     *guess = afresh || run->guess < 0 || !choose_tables(run, &tables) ? 0 : run->guess;
 #ifdef NEWTON_KRYLOV
   status = solve(step, data, STORED(run, step), guess, dq, dp, options, report, NULL);
+#elif defined(ROUGH)
+  status = adaptive_point(step, data, STORED(run, step), guess, dq, dp, options, report, rough);
 #else
   status = fixed_point(step, data, STORED(run, step), guess, dq, dp, options, report);
 #endif
+  (void)rough;
   step->tables = NULL;
   if (inside > 0) /* the step before is no longer stored */
     *guess = 1;
@@ -92,6 +95,30 @@ static __attribute__((noinline)) double attempt(run_memory *run, step_data *step
     return INFINITY;
   return curve_error(step, data, STORED(run, step), dq, SHARE_OF_TRIAL, decay, least);
 }
+
+/* Out of line, one copy compiles faster than two. Steps without low words have one of their own, so that others take no
+ * longer. */
+static __attribute__((noinline)) double attempt(run_memory *run, step_data *step, const solver_data *data, int afresh,
+    int inside, long long *guess, double *dq, double *dp, double decay, double least, const solver_options *options,
+    solver_report *report)
+{
+  return attempt_at(run, step, data, afresh, inside, guess, dq, dp, decay, least, options, report, 0);
+}
+
+#ifdef ROUGH
+static __attribute__((noinline)) double rough_attempt(run_memory *run, step_data *step, const solver_data *data,
+    int afresh, int inside, long long *guess, double *dq, double *dp, double decay, double least,
+    const solver_options *options, solver_report *report)
+{
+  return attempt_at(run, step, data, afresh, inside, guess, dq, dp, decay, least, options, report, 1);
+}
+#endif
+#endif
+
+#ifdef ROUGH
+#define ATTEMPT(options) ((options)->tolerance > ROUGH ? rough_attempt : attempt)
+#else
+#define ATTEMPT(options) attempt
 #endif
 
 #ifdef NEWTON_KRYLOV
@@ -151,8 +178,8 @@ HOT void try_step(run_memory *run, trial *now, real least, const solver_options 
   now->data.rattle_alone = run->avoiding >= 0;
   now->fallbacks = report->fallback_steps;
 #endif
-  now->error = attempt(run, &now->step, &now->data, now->last, now->last ? 0 : now->inside, &now->guess, now->dq,
-      now->dp, now->limits.decay, least, options, report);
+  now->error = ATTEMPT(options)(run, &now->step, &now->data, now->last, now->last ? 0 : now->inside, &now->guess,
+      now->dq, now->dp, now->limits.decay, least, options, report);
   now->iterations = report->iterations - now->iterations;
 #ifdef RATTLE
   now->fallbacks = report->fallback_steps - now->fallbacks;
