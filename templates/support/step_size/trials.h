@@ -10,8 +10,7 @@
 #define SPURIOUS REAL(1e-8) /* relative to the state: spurious solutions of the equations differ by more */
 #define MANY_ITERATIONS 10 /* of a step, after which the next one is not larger */
 #define TOO_MANY_ITERATIONS 13 /* the next one is smaller: about ten iterations take the least time per unit of time */
-#define SHORT_PART REAL(0.015625) /* of the time in which a state changes by its size, or of the span: early trial */
-#define FACTOR_UP REAL(16.0) /* of the step size by MOST_UP levels */
+#define SHORT_PART REAL(0.125) /* of the time in which a state changes by its size, or of the span: early trial */
 #define SUSPENDED 8 /* steps without this rule after one that needed as many iterations as a larger one */
 #define FAILURES_BEFORE_NEWTON 3 /* trials of a step in which the iteration of the multipliers fails */
 #define SHORT_MOTION REAL(0.01) /* relative to the largest position: a change so small .. */
@@ -244,7 +243,7 @@ static int levels_up(const trial *now)
 static SELDOM int levels_of_first(const trial *now, real h, real span)
 {
   real q, p, rate = 0, factor;
-  int up = 0;
+  int binades;
   const real dq = largest_change(&now->step, now->at.q, now->dq, &q);
   const real dp = largest_change(&now->step, now->at.p, now->dp, &p);
   if (q > 0)
@@ -256,9 +255,8 @@ static SELDOM int levels_of_first(const trial *now, real h, real span)
   if (!(rate > 0 && rate < INFINITY && now->error < INFINITY))
     return 0;
   factor = SHORT_PART * (1 / rate < span / h ? 1 / rate : span / h);
-  for (; factor >= FACTOR_UP; factor /= FACTOR_UP)
-    up += MOST_UP;
-  return up;
+  MATH(frexp)(factor, &binades);
+  return binades > 1 ? (binades - 1) * LEVELS_PER_BINADE : 0;
 }
 
 /* Determines the first step size by increasing one that is certainly too small. The smallest trials may fail, with
@@ -276,10 +274,10 @@ static SELDOM void try_first_step(run_memory *run, trial *now, const solver_opti
   while (early > 0) {
     run->grid_level += early;
     try_step(run, now, 0, options, report);
-    if (levels_up(now) == MOST_UP)
+    if (levels_up(now) >= LEVELS_PER_BINADE)
       break;
     run->grid_level -= early;
-    early = early / (2 * MOST_UP) * MOST_UP;
+    early = early < 2 * MOST_UP ? 0 : early - MOST_UP;
     if (early == 0)
       try_step(run, now, 0, options, report);
   }
