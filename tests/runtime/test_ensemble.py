@@ -196,6 +196,7 @@ CASES = {
     "adaptive": Case("eccentric", sc.SVI(4), 4, ADAPTIVE),
     "adaptive in threads": Case("eccentric", sc.SVI(4), 4, ADAPTIVE | {"save_every": 7, "threads": 3}),
     "at times": Case("eccentric", sc.SVI(4), 4, ADAPTIVE | {"t_eval": np.linspace(0.0, 20.0, 9)}),
+    "at their ends": Case("eccentric", sc.SVI(4), 4, ADAPTIVE | {"t_eval": sorted(ENDS)}),
     "adaptive backward": Case(
         "eccentric", sc.SVI(4), 2, {"t_end": -3.0, "tolerance": 1e-10, "parameters": {"mu": [1.0, 1.2]}}
     ),

@@ -230,7 +230,7 @@ class Ensemble:
     def _saves_ends(self, ends: Array) -> bool:
         """Return whether the output times are the common end of all trajectories, with or without their start."""
         times = set() if self.t_eval is None else {*self.t_eval.tolist()} - {self.t0}
-        return times == {*np.unique(ends).tolist()}
+        return len(times) == 1 and bool((ends == times.pop()).all())
 
     def _plans(self, fixed: CommonSteps | None, t_end: ArrayLike, tolerance: float | None) -> Sequence[StepPlan]:
         """Return the step plan of each trajectory; all must run forward or all backward."""
