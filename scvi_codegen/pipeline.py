@@ -34,7 +34,7 @@ from scvi_codegen.ir.derivatives import PointDerivatives
 from scvi_codegen.ir.program import Program
 from scvi_codegen.lowering.arrays import check_solver as check_solver_of_arrays
 from scvi_codegen.lowering.control import control_of, error_growth_of
-from scvi_codegen.lowering.derivatives import derivatives_of, point_derivatives_of
+from scvi_codegen.lowering.derivatives import correction_of, derivatives_of
 from scvi_codegen.lowering.loops import transforms, with_sums
 from scvi_codegen.lowering.program import lower, summing_splitting
 from scvi_codegen.lowering.solvers.points import summing_action
@@ -294,7 +294,7 @@ class Sources:
                 program = self._derived(solver=self.solver, fallback=fallback)
                 if self.precision == DOUBLE_DOUBLE and not (self._corrected(program) or self._in_pairs(program)):
                     with tables_in_two_words():  # RATTLE is an iteration for the solution of Newton's equations
-                        by_newton = self.solver == "auto" and not program.rattle
+                        by_newton = self.solver == "auto" and not (program.rattle or self._correction(program))
                         program = self._derived(solver="newton" if by_newton else self.solver)
                 self._programs[fallback] = program
         return self._programs[fallback]
@@ -324,24 +324,23 @@ class Sources:
         program = self.program()
         if self.precision == DOUBLE_DOUBLE:
             self._check_double_double()
-            derivatives = self._corrected(program)
+            correction = self._correction(program)
             control = control_of(program, self.controller, self.system, self.g) if controlled else None
-            return render_double_double(program, derivatives, control), self.interface
+            return render_double_double(program, correction, control), self.interface
         control = control_of(program, self.controller, self.system, self.g)
         if control and controlled and not (self.of_arrays or control.density):
             control = replace(control, growth=error_growth_of(self.system, program))
         fallback: Fallback | None = "external" if self.uses_fallback_library else None
         return render(program, control if controlled else None, fallback=fallback), self.interface
 
-    def _corrected(self, program: Program) -> PointDerivatives | None:
-        """Return the derivatives of forces for the correction of a fixed-point iteration to two words, if it has one.
+    def _correction(self, program: Program) -> PointDerivatives | None:
+        """Return the kernels for the correction of a fixed-point iteration to two words, if it has one."""
+        return correction_of(self.system, program.fixed_point) if program.fixed_point else None
 
-        It has for constant masses and forces of position and time that have not too many derivatives.
-        """
-        fixed_point = program.fixed_point
-        if fixed_point is None or fixed_point.name != "separable" or program.damping or program.quantities.integrals:
-            return None
-        return point_derivatives_of(self.system, fixed_point)
+    def _corrected(self, program: Program) -> PointDerivatives | None:
+        """Return the same for constant masses, and forces of position and time, without Newton's method."""
+        separable = program.fixed_point and program.fixed_point.name == "separable"
+        return self._correction(program) if separable else None
 
     def _in_pairs(self, program: Program) -> bool:
         """Return whether double-double steps are explicit."""

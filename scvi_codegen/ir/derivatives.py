@@ -49,6 +49,7 @@ class PointDerivatives:
         steps: number of steps that are solved before vectors are propagated over them.
         unknowns: (B, points) table from the displacements at the points, divided by h, or from the velocities there, to
             the unknowns; empty if they do not determine these.
+        in_pairs: kernels on lanes that a correction to two words evaluates: forces, or forces and momenta; integrands.
     """
 
     partials: Kernel
@@ -58,6 +59,7 @@ class PointDerivatives:
     masses: InputDerivatives | None = None
     steps: int = 32
     unknowns: NumberTable = ()
+    in_pairs: tuple[Kernel, ...] = ()
 
     @property
     def count(self) -> int:

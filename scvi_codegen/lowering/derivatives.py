@@ -141,6 +141,27 @@ def point_derivatives_of(system: MechanicalSystem, fixed_point: FixedPointIterat
     return iteration if iteration and iteration.count + len(iteration.given.entries) <= MOST_DERIVATIVES else None
 
 
+def correction_of(system: MechanicalSystem, fixed_point: FixedPointIteration) -> PointDerivatives | None:
+    """Return the kernels that correct a step in double to two words; ``None`` if unsupported or too large.
+
+    Supported are constant masses with forces of position and time, and any Lagrangian whose unknowns are the velocities
+    at the points.
+    """
+    twin, kernels = equivalent_lagrangian(system), fixed_point.kernels
+    if system.damping != 0 or twin is None:
+        return None
+    if fixed_point.name == "coupled" and not dict(fixed_point.macros).get("PROJECTED"):
+        fixed_point = replace(fixed_point, derivatives_part="coupled_derivatives")
+        forms, arguments = forms_of(twin), (*twin.coordinates, *twin.velocities)
+        values, purpose = (*forms.force, *forms.momentum), "L_q, L_v at all points."
+        integrands = (kernel for kernel in kernels if kernel.name == "integrand_lanes")
+        kernels = system_kernel(twin, "value_lanes", values, u=arguments, purpose=purpose), *integrands
+    elif fixed_point.name != "separable":
+        return None
+    found = point_derivatives_of(system, fixed_point)
+    return replace(found, in_pairs=kernels) if found else None
+
+
 def _iterated(
     system: MechanicalSystem, stages: StageSystem, fixed_point: FixedPointIteration
 ) -> PointDerivatives | None:

@@ -353,9 +353,14 @@ def tables_in_two_words() -> Iterator[None]:
         _WORDS.reset(token)
 
 
+def words_of_tables() -> int:
+    """Return the number of words in which tables of variational methods are exact."""
+    return _WORDS.get()
+
+
 def dyadic(entries: Sequence[Sequence[Number]]) -> Matrix:
     """Round to multiples of 2^-52, so that entries of size up to 1 and their differences are exact in binary64."""
-    unit = mp.ldexp(1, DYADIC_BITS * _WORDS.get())
+    unit = mp.ldexp(1, DYADIC_BITS * words_of_tables())
     return tuple(tuple(mp.nint(x * unit) / unit for x in line) for line in entries)
 
 

@@ -202,8 +202,9 @@ def render_double_double(
     """Return the source of a program in double-double arithmetic; control as of :func:`render`.
 
     Args:
-        program: with a fixed-point iteration of separable systems, or with Newton's method, not with both.
-        derivatives: of the forces at the points of a fixed-point iteration.
+        program: with a fixed-point iteration of separable systems, or with Newton's method, also as the fallback of
+            another iteration.
+        derivatives: at the points of a fixed-point iteration, which correct it to two words.
 
     Raises:
         MethodError: for a function that has no double-double form.
@@ -211,15 +212,16 @@ def render_double_double(
     fixed_point = program.fixed_point
     if in_pairs(program):
         return _render_explicit(program)
-    if fixed_point is None:
-        return _render_mixed_newton(program, control)
-    assert derivatives is not None  # by the caller
+    if program.newton:
+        return _render_mixed_newton(program, derivatives, control)
+    assert fixed_point is not None  # by the caller
+    assert derivatives is not None
     mass = fixed_point.constant_mass
     assert mass is not None  # of separable systems
     program = _in_three_words(program)
     quantities, lanes = program.quantities, (derivatives.partials, derivatives.products[0])
     states = (quantities.energy, *((quantities.momentum_kernel,) if quantities.momentum_kernel else ()))
-    numbers, vectors = (mass, *states), fixed_point.kernels
+    numbers, vectors = (mass, *states), derivatives.in_pairs
     context = _context(program, DOUBLE, control)
     context |= {
         **_lane_context(program, lanes, changes=False),
@@ -325,8 +327,11 @@ def render_ensemble_in_pairs(program: Program, derivatives: PointDerivatives | N
     return _render(f"{program.prefix}_ensemble", context, "ensemble")
 
 
-def _render_mixed_newton(program: Program, control: Control | None) -> Source:
-    """Return the source of a program with Newton's method, whose solution is corrected in pairs."""
+def _render_mixed_newton(program: Program, correction: PointDerivatives | None, control: Control | None) -> Source:
+    """Return the source of a program with Newton's method, whose solution is corrected in pairs.
+
+    With a correction, of the fixed-point iteration that Newton's method is the fallback of.
+    """
     quantities, constraints = program.quantities, program.constraints
     of_states = (
         *(group.value for group in program.equations.stage_groups),
@@ -346,15 +351,23 @@ def _render_mixed_newton(program: Program, control: Control | None) -> Source:
         kernels = *kernels, *rattle.kernels
         of_points = *rattle.kernels, replace(constraints.kernel, values=len(constraints.kernel.results))
         vectors = tuple(replace(each, name=f"{each.name}_of_points") for each in of_points)
+    in_pairs, lanes = vectors != (), tuple[Kernel, ...]()
+    if correction and program.fixed_point:
+        own = tuple(replace(each, in_two_parts=True) for each in program.fixed_point.own_tables)
+        program = replace(program, fixed_point=replace(program.fixed_point, own_tables=own))
+        vectors, lanes = correction.in_pairs, (correction.partials, correction.products[0])
     context = _context(program, DOUBLE, control)
     context |= {
+        **_lane_context(program, lanes, changes=False),
+        "cut": context["cut"] or is_divided(lanes),
         "unrolled_equations": None,
-        "rattle_in_pairs": vectors != (),
+        "rattle_in_pairs": in_pairs,
         "two_words": {
+            "derivatives": correction.count if correction else 0,
             "of_numbers": kernels,
             "of_vectors": vectors,
             "meaning": POINTS,
-            "functions": bool(program.damping) or uses_functions(kernels),
+            "functions": bool(program.damping) or uses_functions((*kernels, *vectors)),
         },
         "own_headers": {**arithmetic_headers(), **cast("Mapping[str, str]", context["own_headers"])},
     }

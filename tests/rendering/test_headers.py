@@ -86,6 +86,7 @@ def sources() -> tuple[Source, ...]:
     pendulum = problem("planar-pendulum").system
     for method in (SVI(2), StoermerVerlet()):
         made.append(Sources(pendulum, method, precision="double-double").integrator()[0])
+    made.append(Sources(problem("double-pendulum").system, SVI(2), precision="double-double").integrator()[0])
     rod = LagrangianSystem.from_text("rod", ["x", "y"], "x_dot**2 + y_dot**2", constraints=["x**2 + y**2 - 1"])
     made.append(Sources(rod, SVI(2, "gauss-lobatto:3"), precision="double-double").integrator()[0])
     bead = LagrangianSystem.from_text(

@@ -33,7 +33,7 @@ KEPLER = "m*(x_dot**2 + y_dot**2)/2 + mu/sqrt(x**2 + y**2)"
 ROOTS = ("sqrt", "inverse_root_1", "inverse_root_3", "inverse_root_5", "inverse_root_7")
 RANGES = {
     **dict.fromkeys(ROOTS, (1e-5, 1e5)),
-    **dict.fromkeys(("asinh", "atan", "divide"), (1e-9, 1e9)),
+    **dict.fromkeys(("asinh", "atan", "divide", "multiply", "square"), (1e-9, 1e9)),
     **dict.fromkeys(("asin", "acos", "atanh"), (1e-9, 0.999)),
     **dict.fromkeys(("sin", "cos", "tan"), (1e-9, 1e4)),
     **dict.fromkeys(("sinh", "cosh", "exp"), (1e-9, 600.0)),
@@ -45,6 +45,7 @@ RANGES = {
 }
 """Magnitudes of random arguments; of both signs where the function is defined there."""
 POSITIVE = (*ROOTS, "acosh", "pow", "log")
+OF_TWO = {"divide": operator.truediv, "multiply": operator.mul}
 MANY = 1_000_000 if find_spec("flint") else 10_000  # mpmath takes a hundred times as long
 
 
@@ -68,7 +69,7 @@ def compiled_functions(folder: Path) -> ctypes.CDLL:
     code += "\n".join(line for name in names for line in text(name).split("\n") if '#include "' not in line)
     for f in RANGES:
         for kind, pair, step in (("number", "dd", "1"), ("vector", "ddl", "LANES")):
-            second = ", b" if f in ("pow", "atan2", "divide") else ""
+            second = ", b" if f in ("pow", "atan2", "divide", "multiply") else ""
             loads = "".join(
                 f"memcpy(&{x}.high, {x}s + i, sizeof {x}.high); memcpy(&{x}.low, {x}s + n + i, sizeof {x}.low);"
                 for x in "ab"
@@ -90,12 +91,12 @@ def reference(f: str) -> Callable[[float, float, float, float], Any]:
     except ImportError:
         context = mpmath.MPContext()
         context.prec, exact = 200, context.mpf
-        two = {"pow": context.power, "atan2": context.atan2, "divide": operator.truediv}.get(f)
-        one = (lambda x: 1 / context.sqrt(x) ** int(f[-1])) if f in ROOTS[1:] else getattr(context, f, None)
+        two = {"pow": context.power, "atan2": context.atan2, **OF_TWO}.get(f)
+        one = (lambda x: 1 / context.sqrt(x) ** int(f[-1])) if f in ROOTS[1:] else getattr(context, f, lambda x: x * x)
     else:
         flint.ctx.prec, exact = 200, flint.arb
-        two = {"pow": exact.__pow__, "atan2": exact.atan2, "divide": exact.__truediv__}.get(f)
-        one = (lambda x: x.rsqrt() ** int(f[-1])) if f in ROOTS[1:] else getattr(exact, f, None)
+        two = {"pow": exact.__pow__, "atan2": exact.atan2, **OF_TWO}.get(f)
+        one = (lambda x: x.rsqrt() ** int(f[-1])) if f in ROOTS[1:] else getattr(exact, f, lambda x: x * x)
     if two:
         return lambda a, a_low, b, b_low: two(exact(a) + a_low, exact(b) + b_low)
     return lambda a, a_low, b, b_low: one(exact(a) + a_low)
@@ -104,7 +105,7 @@ def reference(f: str) -> Callable[[float, float, float, float], Any]:
 def largest_errors(folder: Path, count: int) -> dict[str, float]:
     """Return the largest relative error of each function, of numbers or lanes, for random arguments."""
     library, rng, worst = compiled_functions(folder), np.random.default_rng(7), {}
-    assert {*RANGES} == {*FUNCTIONS, *ROOTS, "divide"}
+    assert {*RANGES} == {*FUNCTIONS, *ROOTS, *OF_TWO, "square"}
 
     def pairs(low: float, high: float) -> np.ndarray:
         values = np.exp(rng.uniform(np.log(low), np.log(high), count))
@@ -134,6 +135,22 @@ def test_functions(count: int, tmp_path: Path) -> None:
     """Every function is accurate to 1e-30 for random arguments of all magnitudes, numbers and lanes."""
     worst = largest_errors(tmp_path, count)
     assert max(worst.values()) <= 1e-30, worst
+
+
+def test_rounding_errors_have_no_bias(tmp_path: Path) -> None:
+    """Mean errors of products and roots vanish, as those of one sign would let the energies of orbits drift."""
+    library, rng, count = compiled_functions(tmp_path), np.random.default_rng(3), 10_000
+    for f in ("square", "multiply", "divide", "sqrt", "inverse_root_1"):
+        exact = reference(f)
+        for least in (1.0, 2.0):
+            x, y = (np.array([rng.uniform(least, 2 * least, count), rng.uniform(-1, 1, count)]) for _ in range(2))
+            for each in (x, y):
+                each[1] *= least * 2.0**-53
+            found = np.empty((2, count))
+            getattr(library, f"number_{f}")(count, *(each.ctypes.data_as(ctypes.c_void_p) for each in (x, y, found)))
+            rows = zip(*(words.tolist() for words in (*x, *y, *found)), strict=True)
+            errors = np.array([float(exact(*arguments) - value - rest) for *arguments, value, rest in rows]) / found[0]
+            assert abs(errors.mean()) < 4 * errors.std() / np.sqrt(count), f
 
 
 def system(name: str) -> sc.LagrangianSystem:

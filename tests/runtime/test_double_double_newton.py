@@ -13,6 +13,7 @@ from scvi_codegen.runtime.rotations.attitudes import momenta_of_body
 
 LINKS = "(x_dot**2 + y_dot**2)/2 + 0.75*(u_dot**2 + w_dot**2)/2 - y - 0.75*w"
 MUTUAL = "a_dot**2 + b_dot**2/2 + a_dot*b_dot*cos(a - b) + 2*cos(a) + cos(b)"
+RELATIVISTIC = "-sqrt(1 - x_dot**2 - y_dot**2) + 1/sqrt(x**2 + y**2) + sin(t)*x/8"
 ROD, SECOND = "x**2 + y**2 - 1", "(u - x)**2 + (w - y)**2 - "
 PLANE, FOUR = ["x", "y"], ["x", "y", "u", "w"]
 STATES = {
@@ -25,6 +26,7 @@ STATES = {
     "kepler": ([0.8, 0.0], [0.0, 1.2]),
     "sleigh": ([0.1, 0.2, 0.0], [0.5, 0.0, 0.2]),
     "damped": ([0.7, 0.2], [0.1, 0.4]),
+    "relativistic": ([2.0, 0.125], [0.125, 0.5]),
 }
 
 
@@ -37,6 +39,7 @@ def system(name: str) -> sc.LagrangianSystem:
         "friction": (["q"], "q_dot**2/2 - q**2/2", {"forces": {"q": "-q_dot/10"}}),
         "charge": (PLANE, "(x_dot**2 + y_dot**2)/2 + (x*y_dot - y*x_dot)/2 - (x**2 + y**2)**2/4", {}),
         "damped": (PLANE, "(x_dot**2 + y_dot**2)/2 - x**2/2 - x**2*y**2", {"damping": "g", "parameters": {"g": 0.3}}),
+        "relativistic": (PLANE, RELATIVISTIC, {}),
         "kepler": (PLANE, "(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2)", {}),
         "sleigh": (
             [*PLANE, "phi"],
@@ -83,6 +86,7 @@ def check_step(stepper: sc.Stepper, form, method: str, q, p, t: float = 0.0) -> 
     [
         *((name, "svi:3") for name in ("rod", "rods", "four-bar", "masses", "charge", "sleigh", "damped")),
         ("rod", "svi:1"),
+        ("relativistic", "svi:4"),
         ("friction", "stoermer-verlet"),
         ("masses", "sc:3"),
         ("masses", "scvi:3"),
@@ -212,3 +216,40 @@ def test_constraints_by_multipliers(degree: int) -> None:
             for name in ("q", "p"):
                 assert abs(runs[0].mp(name) - runs[1].mp(name)).max() < 1e-30
             assert max(abs(each).max() for each in runs[0].constraint_values()) < 5e-31
+
+
+STIFF = "(1 + b**2)*a_dot**2/2 + b_dot**2/2 - 5000*a**2 - b**2"
+
+
+@pytest.mark.parametrize("degree", [3, *(pytest.param(s, marks=pytest.mark.second) for s in (9, 18))])
+def test_velocities_by_iteration(degree: int) -> None:
+    """Steps of variable masses by fixed-point iteration agree with those by the factors of all unknowns."""
+    transformed = sc.reparametrise(system("kepler"), "frequency")
+    for moving, q, v in (
+        (system("masses"), *STATES["masses"]),
+        (system("relativistic"), *STATES["relativistic"]),
+        (transformed, *STATES["kepler"]),
+    ):
+        one, other = (
+            sc.compile_stepper(moving, f"svi:{degree}", solver=solver, precision="double-double")
+            for solver in ("auto", "newton")
+        )
+        assert "MIXED_VELOCITIES" in one.source.code
+        assert "MIXED_VELOCITIES" not in other.source.code
+        for plan in ({"h": 0.0625, "steps": 5}, {"h": -0.0625, "t_end": -0.2}):
+            runs = [stepper.integrate(q, velocity=v, **plan) for stepper in (one, other)]
+            assert runs[0].fallback_steps == 0
+            for name in ("q", "p", "t"):
+                assert abs(runs[0].mp(name) - runs[1].mp(name)).max() < 1e-30
+
+
+def test_newton_after_the_iteration() -> None:
+    """Steps whose iteration fails are those of Newton's method, in two words."""
+    stiff = sc.LagrangianSystem.from_text(name="stiff", coordinates=["a", "b"], lagrangian=STIFF)
+    one, other = (
+        sc.compile_stepper(stiff, "svi:3", solver=solver, precision="double-double") for solver in ("auto", "newton")
+    )
+    runs = [stepper.integrate([0.001, 0.5], velocity=[0.01, 0.25], h=0.125, steps=4) for stepper in (one, other)]
+    assert runs[0].fallback_steps == 4
+    for name in ("q", "p"):
+        assert abs(runs[0].mp(name) - runs[1].mp(name)).max() < 1e-30

@@ -77,7 +77,7 @@ from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.rotations.axial import Turn, axial_turns, frame_potential
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.stage_system import Accelerations, Shape, Velocities
+from scvi_codegen.methods.stage_system import Accelerations, Shape, Velocities, words_of_tables
 from scvi_codegen.tables.basis import matrix_product, transpose
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 
@@ -423,7 +423,7 @@ def weighted_tables(tables: VelocityTables) -> tuple[Matrix, Vector, Matrix, Vec
     if not tables.variational:
         ones = (mp.one,) * len(beta)
         return tables.position, ones, tables.momentum, ones
-    unit = mp.ldexp(1, FRACTION_BITS)
+    unit = mp.ldexp(1, FRACTION_BITS * words_of_tables())
     mu = tuple(tuple(mp.nint(x * unit) / unit for x in over(line, beta)) for line in tables.position)
     if tables.projection:
         return mu, beta, tuple(over(line, weights) for line in tables.momentum), weights

@@ -114,7 +114,7 @@ class Memory:
         self._q, self._p = map(binding.vector, (memory.q, memory.p))
         values = self._parameters = stepper.defaults
         if stepper.interface.words > 1:
-            carries = map(binding.vector, (memory.carry_q, memory.carry_p))
+            carries = (binding.vector(each)[: stepper.dimension] for each in (memory.carry_q, memory.carry_p))
             self._q, self._p = (with_low(high, low) for high, low in zip((self._q, self._p), carries, strict=True))
             values = np.concatenate([values, np.zeros(len(values))])
             self._parameters = stepper._numbers(values)
@@ -383,7 +383,7 @@ class Memory:
         """Continue a run made elsewhere: set its step number, double-double time and compensation terms of q and p."""
         self._memory.step = steps
         self._memory.t, self._memory.t_low = time
-        for i, (cut_q, cut_p) in enumerate(zip(*carries, strict=True)):
+        for i, (cut_q, cut_p) in enumerate(zip(*map(np.ravel, carries), strict=True)):
             self._memory.carry_q[i], self._memory.carry_p[i] = cut_q, cut_p
 
     @property

@@ -1,9 +1,13 @@
 #include "mixed_newton.h"
 #ifdef RATTLE_IN_PAIRS
 #include "pair_rattle.h"
+#elif defined(MIXED_VELOCITIES)
+#include "../newton/newton_from_line.h"
+#include "mixed_velocities.h"
 #endif
 
-/* Increments of a step in two words, by RATTLE if that solved it in double, else by Newton's method. */
+/* Increments of a step in two words: by RATTLE or by the fixed-point iteration if that solved it in double, else by
+ * Newton's method. */
 
 /* Replaces the increments of a step, solved in double, by those in two words. On failure they are undefined. */
 static int refine_increments(const step_data *step, double *memory, double t_low, double h_low, double *dq, double *dp,
@@ -16,6 +20,18 @@ static int refine_increments(const step_data *step, double *memory, double t_low
     if (status == OK)
       return status;
   }
+#elif defined(MIXED_VELOCITIES)
+  const solver_options options = NAME(default_options)();
+  solver_report report = {0};
+  double unknowns[N + POINT]; /* memory has the velocities of the iteration */
+  int status, keep;
+  if (((solved_step *)step->points)->by_iteration && refine_velocities(step, t_low, h_low, dq, dp, passed) == OK)
+    return OK;
+  status = newton_from_line(step, newton_in(workspace), dp, &keep, &options, &report);
+  if (status != OK)
+    return status;
+  memory = unknowns;
+  memcpy(memory, newton_in(workspace)->z, sizeof(double) * N);
 #endif
   return refine_unknowns(step, memory, t_low, h_low, dq, dp, passed, workspace);
 }

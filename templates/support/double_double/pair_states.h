@@ -16,7 +16,7 @@ static inline int store_pairs(const dd *x, double *words)
   return all_finite(words, 2 * M) ? OK : NOT_FINITE;
 }
 
-#ifdef NEWTON_ALONE
+#ifdef NEWTON_IN_PAIRS
 /* y at u = (q, x). */
 static inline int transform_of_pairs(dd t, dd *u, const double *parameters, dd *y, double *workspace)
 {

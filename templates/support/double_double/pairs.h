@@ -100,10 +100,12 @@ INLINE PAIR OF(times_power)(PAIR a, NUMBER b)
   return result;
 }
 
+/* With the square of the low word, of one sign, added to the product of both words before rounding: a bias of 1e-33 lets
+ * the energies of some orbits drift. Below, terms of one sign are added in the same way. */
 INLINE PAIR OF(squared)(PAIR a)
 {
   PAIR result = OF(two_product)(a.high, a.high);
-  result.low = FMA(a.high + a.high, a.low, result.low);
+  result.low += FMA(a.high + a.high, a.low, a.low * a.low);
   return result;
 }
 
@@ -137,14 +139,15 @@ INLINE PAIR OF(divide)(PAIR a, PAIR b)
 INLINE PAIR OF(inverse)(PAIR x)
 {
   const NUMBER y = 1.0 / x.high, e = FMA(-x.high, y, BROADCAST(1.0)) - x.low * y;
-  return OF(fast_two_sum)(y, y * FMA(e, e, e));
+  return OF(fast_two_sum)(y, FMA(y, e, y * e * e));
 }
 
 /* The root of the high word, corrected; 0 for 0, where the correction would be 0/0. */
 INLINE PAIR OF(sqrt)(PAIR x)
 {
   const NUMBER y = OF(root)(x.high);
-  return OF(fast_two_sum)(y, (FMA(-y, y, x.high) + x.low) / (y + y + DBL_MIN));
+  const NUMBER half = 0.5 / (y + DBL_MIN), rest = FMA(-y, y, x.high) + x.low, low = rest * half;
+  return OF(fast_two_sum)(y, FMA(rest, half, -half * low * low));
 }
 
 /* x^(-1/2) from y = x.high^(-1/2): with e = 1 - x y^2 by the series of (1 - e)^(-1/2). */
@@ -153,7 +156,7 @@ INLINE PAIR OF(inverse_root_1)(PAIR x)
   const NUMBER y = 1.0 / OF(root)(x.high);
   const PAIR square = OF(two_product)(y, y), product = OF(two_product)(x.high, square.high);
   const NUMBER e = (1.0 - product.high) - (product.low + FMA(x.high, square.low, x.low * square.high));
-  return OF(fast_two_sum)(y, y * (e * (0.5 + 0.375 * e)));
+  return OF(fast_two_sum)(y, FMA(0.5 * y, e, 0.375 * y * e * e));
 }
 
 INLINE PAIR OF(inverse_root_3)(PAIR x)

@@ -14,6 +14,16 @@ enum { MASS_AGE = 16 };
 #include "secants.h"
 #endif
 
+#ifdef MIXED_VELOCITIES
+/* Step in double, which mixed_velocities.h corrects. */
+typedef struct {
+  int by_iteration; /* 0 if Newton's method solved it */
+  coordinates z[GROUPS];
+} solved_step;
+#undef POINTS_OF_STEP
+#define POINTS_OF_STEP(name) solved_step name
+#endif
+
 #ifndef POINTS
 /* Stores the velocities and forces of the trajectories that converge before others. */
 static __attribute__((noinline)) void keep_early(const step_data *step, const iteration_data *data,
@@ -175,6 +185,13 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
   if (!accept(step, dq, dp, report))
     return NOT_FINITE;
   remember_curve(z, past);
+#ifdef MIXED_VELOCITIES
+  if (step->points) {
+    solved_step *solved = (solved_step *)step->points;
+    solved->by_iteration = 1;
+    memcpy(solved->z, z, sizeof solved->z);
+  }
+#endif
   *steps = next_guess(*steps, &now, report);
   return OK;
 }

@@ -26,6 +26,10 @@ static SELDOM int fall_back(int status, const step_data *step, double *dq, doubl
   newton_data *newtons = newton_in(workspace);
   const long long before = report->iterations;
   int keep;
+#ifdef MIXED_VELOCITIES
+  if (step->points)
+    ((solved_step *)step->points)->by_iteration = 0;
+#endif
   status = newton_from_line(step, newtons, dp, &keep, options, report);
   gather(END_POSITION, 1, step->h, newtons->z, M, dq, 0, 1);
   memset(dq + M, 0, sizeof(double) * M);

@@ -12,11 +12,38 @@
 #define LOW_WORD(of, name) 0.0
 #endif
 
+#if defined(DOUBLE_DOUBLE) && !defined(EXPLICIT_STEPS)
+#define THREE_WORDS /* of the sums of increments */
+#define CARRIES (2 * M) /* low words, then third words */
+#else
+#define CARRIES M
+#endif
+
 /* The part of the state that a step changes, in local memory during a call. */
 typedef struct {
-  lanes q[M], p[M], carry_q[M], carry_p[M];
+  lanes q[M], p[M], carry_q[CARRIES], carry_p[CARRIES];
 } state;
 
+#ifdef THREE_WORDS
+/* x + carry += increment, each with its further words, in active lanes. */
+static void add_increments(lanes *x, lanes *carry, const lanes *increment, const double *active)
+{
+  for (int i = 0; i < M; i++) {
+    lane_view sum = {x[i]}, low = {carry[i]}, lowest = {carry[M + i]};
+    const lane_view high = {increment[i]}, rest = {increment[M + i]};
+    for (int j = 0; j < LANES; j++) {
+      double words[] = {sum.lane[j], low.lane[j], lowest.lane[j]};
+      add_to_three_words(&words[0], &words[1], &words[2], high.lane[j], rest.lane[j]);
+      sum.lane[j] = active[j] > 0.0 ? words[0] : sum.lane[j];
+      low.lane[j] = active[j] > 0.0 ? words[1] : low.lane[j];
+      lowest.lane[j] = active[j] > 0.0 ? words[2] : lowest.lane[j];
+    }
+    x[i] = sum.all;
+    carry[i] = low.all;
+    carry[M + i] = lowest.all;
+  }
+}
+#else
 /* x + carry += increment with its low word, in double-double arithmetic, in active lanes. */
 static void add_increments(lanes *x, lanes *carry, const lanes *increment, const double *active)
 {
@@ -33,6 +60,7 @@ static void add_increments(lanes *x, lanes *carry, const lanes *increment, const
     carry[i] = new_carry.all;
   }
 }
+#endif
 
 /* Deactivates lanes whose next state is not finite. */
 static void drop_infinite(const state *now, const lanes *dq, const lanes *dp, double *active)
