@@ -122,6 +122,11 @@ static int NAME(call_one)(NAME(each) *c, const double *parameters, long long ste
     }
 #ifdef HAS_H_LOW
     set_step_to(c->segment_end[c->segment], c->run->t, c->run->t_low, &c->run->h, &c->run->h_low);
+    if (c->segment_end[c->segment] == c->segment_end[c->segment]) { /* from the state alone, without third words */
+      const size_t low = (size_t)(m / c->words);
+      memset(c->run->carry_q + low, 0, sizeof c->run->carry_q - low * sizeof(double));
+      memset(c->run->carry_p + low, 0, sizeof c->run->carry_p - low * sizeof(double));
+    }
 #endif
     c->entered = c->pauses;
   }

@@ -100,8 +100,8 @@ INLINE PAIR OF(times_power)(PAIR a, NUMBER b)
   return result;
 }
 
-/* With the square of the low word, of one sign, added to the product of both words before rounding: a bias of 1e-33 lets
- * the energies of some orbits drift. Below, terms of one sign are added in the same way. */
+/* With the square of the low word: terms of one sign must be added to a product before that is rounded, here and below,
+ * since a mean rounding error of 1e-33 lets the energies of some orbits drift. */
 INLINE PAIR OF(squared)(PAIR a)
 {
   PAIR result = OF(two_product)(a.high, a.high);
