@@ -35,7 +35,7 @@ from benchmarks.machine import machine
 from benchmarks.report import LEGEND, PRECISION, CaseResult, ResultTable, degree_table, header_lines
 from benchmarks.sections import BUILDERS
 from benchmarks.settings import Plan, ReportActivity
-from benchmarks.steps import run_builds, run_derivatives, run_scaling, run_threads
+from benchmarks.steps import run_builds, run_derivatives, run_newton, run_scaling, run_threads, run_transforms
 from benchmarks.tables import run_drift, run_first_steps
 from scvi_codegen.errors import ScviCodegenError, StateError, closest
 from scvi_codegen.files.atomic import write_text
@@ -52,6 +52,8 @@ SECTIONS: Mapping[str, Callable[[Plan, ReportActivity], CaseResult | ResultTable
     "first-step": run_first_steps,
     "scaling": run_scaling,
     "threads": run_threads,
+    "transforms": run_transforms,
+    "newton": run_newton,
     "derivatives": run_derivatives,
     "builds": run_builds,
 }

@@ -1,4 +1,4 @@
-"""Tables of the time of one step: by number of coordinates and threads, with derivatives, by compiler and processor."""
+"""Tables of the time of one step: by size, threads, compiler; with derivatives, transforms and Newton's method."""
 
 import functools
 import itertools
@@ -9,18 +9,23 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
+import scipy.fft
 
 from benchmarks.cases.large import atoms, bodies, field, ring
 from benchmarks.cases.unforced import Array, Case, case
 from benchmarks.contenders.ours import momenta_of
 from benchmarks.report import ResultTable
-from benchmarks.settings import Plan, ReportActivity
+from benchmarks.settings import Plan, ReportActivity, timed
 from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.errors import StepFailedError
+from scvi_codegen.fields.system import FieldSystem
 from scvi_codegen.native.building import PORTABLE_FLAGS, TUNED_FLAGS
 
+Start = tuple[Array, Array]
+"""Initial positions and velocities."""
 STEP_SECONDS = 0.1
 """Shortest time of a timed interval."""
 RINGS, QUICK_RINGS = (1_000, 10_000, 100_000, 1_000_000), (1_000,)
@@ -41,6 +46,12 @@ DIFFERENTIATED: dict[str, tuple[str, float]] = {
 }
 """Cases and step sizes of which derivatives are computed."""
 DERIVED_STEPS = 2000
+DENSITIES = {"sine-Gordon": "u_t**2/2 - u_x**2/2 + cos(u)", "sqrt(1 + u_x^2)": "u_t**2/2 - sqrt(1 + u_x**2)"}
+"""Densities on Fourier meshes of a circle: derivatives of one convolution, and of two with a product between them."""
+TRANSFORMED = (256, 1024, 4096, 16384)
+"""Numbers of points of Fourier meshes."""
+LARGE = (1, 10, 30, 100)
+"""Step sizes times the highest frequency of the linear part."""
 BUILDS = ("cc", "clang")
 TARGETS = ("native", "x86-64-v4", "x86-64-v3", "x86-64", "portable")
 BUILT = ("kepler:0.5", "outer-solar-system")
@@ -99,6 +110,120 @@ def run_threads(plan: Plan, report_activity: ReportActivity) -> ResultTable:
         title="time of a step in one thread, and the speed-up of two threads; wall time",
         columns=columns,
         rows=tuple(rows),
+    )
+
+
+def _lattice(chosen: Case) -> tuple[Any, Start]:
+    """Return a lattice with its initial positions and velocities."""
+    shape = chosen.arrays.shape if chosen.arrays is not None else (-1,)
+    q, velocity = (part[0].reshape(shape) for part in chosen.states)
+    return chosen.system, (q, velocity)
+
+
+def _long_wave(count: int) -> tuple[Any, Start]:
+    """Return a ring at rest with one wave, whose springs are strained by up to 0.3."""
+    q = count / 20 * np.sin(2 * np.pi * np.arange(count) / count)
+    return ring(count, 1.0).system, (q, np.zeros(count))
+
+
+def _mesh(density: str, count: int) -> tuple[Any, Start]:
+    """Return a density on a Fourier mesh of a circle of circumference 2 pi, at rest at u = sin(x)/2."""
+    space: Any = {"name": "wave", "fields": ["u"], "space": {"x": ("0", "2*pi")}, "boundary": {"x": "periodic"}}
+    mesh = FieldSystem.from_text(**space, density=DENSITIES[density]).discretise("fourier", points=count)
+    start = np.sin(mesh.points["x"]) / 2
+    return mesh.system, (start, np.zeros(count))
+
+
+def run_transforms(plan: Plan, report_activity: ReportActivity) -> ResultTable:
+    """Measure leapfrog on Fourier meshes, beside leapfrog by hand with SciPy's transforms."""
+    rows = []
+    for name, count in itertools.product(DENSITIES, TRANSFORMED[: 1 if plan.quick else None]):
+        report_activity(f"transforms: {name}, {count} points")
+        system, (q, velocity) = _mesh(name, count)
+        h, steps = 1.0 / count, 200 if plan.quick else 500_000 // count
+        run = compile_stepper(system, "stoermer-verlet").start(q, velocity=velocity, h=h)
+        ours = shortest(functools.partial(run.advance, steps), plan)
+        run = compile_stepper(system, "stoermer-verlet").start(q, velocity=velocity, h=h)
+        run.advance(steps)
+        by_hand = functools.partial(_spectral_leapfrog, name, q, h, steps)
+        other = shortest(by_hand, plan)
+        both = {"here_us": 1e6 * ours / steps, "scipy_us": 1e6 * other / steps, "ratio": other / ours}
+        rows.append({"density": name, "points": count} | both | {"difference": float(np.abs(run.q - by_hand()).max())})
+    return ResultTable(
+        name="transforms",
+        title="microseconds a step of leapfrog on Fourier meshes, here and by hand with SciPy's rfft and irfft",
+        columns={"density": "", "points": "d"}
+        | dict.fromkeys(("here_us", "scipy_us", "ratio"), ".3g")
+        | {"difference": ".0e"},
+        rows=tuple(rows),
+    )
+
+
+def _spectral_leapfrog(name: str, q: Array, h: float, steps: int) -> Array:
+    """Return the positions after leapfrog steps from rest, with derivatives by SciPy's transforms."""
+    k = 1j * np.fft.rfftfreq(len(q), 1.0 / len(q))
+    k[-1] = 0.0  # the derivative of the highest mode vanishes at the points
+    squared = k**2
+
+    def force(u: Array) -> Array:
+        if name == "sine-Gordon":
+            return cast("Array", scipy.fft.irfft(squared * scipy.fft.rfft(u), len(u)) - np.sin(u))
+        slope = scipy.fft.irfft(k * scipy.fft.rfft(u), len(u))
+        return cast("Array", scipy.fft.irfft(k * scipy.fft.rfft(slope / np.sqrt(1.0 + slope**2)), len(u)))
+
+    u, v = q.copy(), h / 2 * force(q)
+    for _ in range(steps):
+        u += h * v
+        v += h * force(u)
+    return u
+
+
+STIFF: dict[str, tuple[Callable[[], tuple[Any, Start]], float]] = {
+    "ring of 1000": (lambda: _long_wave(1000), 2.0),
+    "sine-Gordon field, 256 x 256": (lambda: _lattice(field(256, 1.0)), 20.0 * 2.0**0.5),
+    **{
+        f"{name}, Fourier, {count}": (functools.partial(_mesh, name, count), count / 2)
+        for name, count in itertools.product(DENSITIES, TRANSFORMED[:3])
+    },
+}
+"""Systems with their initial states, and the highest frequencies of their linear parts."""
+
+
+def run_newton(plan: Plan, report_activity: ReportActivity) -> ResultTable:
+    """Measure the fixed-point iteration and Newton's method at large step sizes."""
+    rows = []
+    for name, (make, frequency) in itertools.islice(STIFF.items(), 1 if plan.quick else None):
+        report_activity(f"newton: {name}")
+        system, (q, velocity) = make()
+        solvers = {by: compile_stepper(system, "svi:4", solver=by) for by in ("fixed-point", "newton")}
+        exact: Array = np.empty(0)
+        for large in LARGE:
+            count, row = max(2, (20 if plan.quick else 300) // large), dict[str, Any](system=name, h_omega=large)
+            for by, stepper in solvers.items():
+                how: dict[str, Any] = {"h": large / frequency, "steps": count, "save_every": count}
+                work = functools.partial(stepper.integrate, q, velocity=velocity, check_growth=False, **how)
+                try:
+                    seconds, run = timed(work)
+                except StepFailedError:
+                    continue
+                row |= {
+                    f"{by}_iterations": float(np.sum(run.iterations)) / count,
+                    f"{by}_ns": 1e9 * seconds / count / q.size,
+                }
+                end = run.q[-1].ravel()
+                exact = end if not exact.size else exact
+                row["difference"] = float(np.abs(end - exact).max() / np.abs(exact).max())
+            rows.append(row)
+    timing = {f"{by}_{each}": form for by in solvers for each, form in (("iterations", ".1f"), ("ns", ".3g"))}
+    return ResultTable(
+        name="newton",
+        title="nanoseconds per coordinate and step of SVI(4) by the fixed-point iteration and by Newton's method",
+        columns={"system": "", "h_omega": "g"} | timing | {"difference": ".0e"},
+        rows=tuple(rows),
+        remarks=(
+            "h omega: step size times the highest frequency of the linear part. iterations: per step. difference: of",
+            "the final positions, to the smallest step. -: failed.",
+        ),
     )
 
 

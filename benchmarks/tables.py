@@ -7,12 +7,16 @@ import statistics
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
+from functools import partial
+from itertools import islice
 from typing import Any
 
 import numpy as np
 
+from benchmarks.cases.large import bodies
 from benchmarks.cases.robots import chain
-from benchmarks.cases.unforced import Array, Case, case
+from benchmarks.cases.unforced import Array, Case, case, chain_case, gravitating
 from benchmarks.contenders.engines import mujoco_states
 from benchmarks.contenders.ours import momenta_of
 from benchmarks.contenders.taylor import heyoka_states
@@ -111,7 +115,18 @@ def fitted_rate(error: Array) -> tuple[float, float]:
     return derivative, float(np.sqrt(1.2 * BLOCKS * np.var(gains, ddof=1)))
 
 
-FIRST_STEPS = ("kepler:0.2", "double-pendulum", "outer-solar-system", "fput-chain:64", "fput-chain:256")
+def named_bodies(count: int) -> Case:
+    """Return the first bodies of a cluster as named coordinates; all attract each other."""
+    cluster = bodies(count, 1.0)
+    state = [1.0 / count] * count, cluster.q[0], cluster.velocity[0]
+    return gravitating(*state, name=f"bodies:{count}", gravity=1.0, span=1.0, fine=0.1)
+
+
+FIRST_STEPS: dict[str, Callable[[], Case]] = {
+    **{name: partial(case, name) for name in ("kepler:0.2", "double-pendulum", "outer-solar-system", "fput-chain:64")},
+    **{f"fput-chain:{n}": partial(chain_case, n, step=2.0, fine=2.0) for n in (256, 1000)},
+    **{f"bodies:{n}": partial(named_bodies, n) for n in (12, 40)},
+}
 """Cases whose time from text to the first step is measured."""
 LONGEST = 1800
 FIRST_STEP = """
@@ -133,13 +148,14 @@ MEASURED = {"lines_of_C": "d", "first_step_s": ".3f", "python_cpu_s": ".2f", "co
 def run_first_steps(plan: Plan, report_activity: ReportActivity) -> ResultTable:
     """Measure fresh processes, with an empty cache and again with the cache filled, in turn; medians of the rounds."""
     rows = []
-    for name in FIRST_STEPS[: 1 if plan.quick else None]:
+    for name, make in islice(FIRST_STEPS.items(), 1 if plan.quick else None):
         rounds: dict[str, list[dict[str, Any]]] = {"empty": [], "filled": []}
+        chosen = make()
         for number in range(plan.rounds):
             report_activity(f"first step: {name}, round {number + 1}")
             with tempfile.TemporaryDirectory(prefix="scvi-codegen-bench-") as folder:
                 for kind, measured in rounds.items():
-                    measured.append({"system": name, "cache": kind} | _first_step(case(name), folder))
+                    measured.append({"system": name, "cache": kind} | _first_step(chosen, folder))
         rows += [_medians(measured) for measured in rounds.values()]
     return ResultTable(
         name="first-step",

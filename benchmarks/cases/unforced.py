@@ -345,7 +345,8 @@ def _outer_solar_system() -> Case:
     return gravitating(*state, name="outer-solar-system", gravity=gravity, span=span, step=500.0, fine=256.0)
 
 
-def _chain_case(n: int, *, step: float, fine: float) -> Case:
+def chain_case(n: int, *, step: float, fine: float) -> Case:
+    """Return an FPUT chain of n masses."""
     loops = CHAIN_LOOPS.format(n=n, beta=1.0)
     return _small_case(f"fput-chain:{n}", chain, span=1000.0, fine=fine, step=step, loops=loops)
 
@@ -367,9 +368,9 @@ CASES: Mapping[str, Callable[[], Case]] = {
     "relativistic-particle": partial(
         _small_case, "relativistic-particle", relativistic, MOMENTA, span=1000.0, fine=0.25
     ),
-    "fput-chain:8": partial(_chain_case, 8, step=1.0, fine=1.0),
-    "fput-chain:64": partial(_chain_case, 64, step=2.0, fine=3.0),
-    "fput-chain:256": partial(_chain_case, 256, step=2.0, fine=2.0),
+    "fput-chain:8": partial(chain_case, 8, step=1.0, fine=1.0),
+    "fput-chain:64": partial(chain_case, 64, step=2.0, fine=3.0),
+    "fput-chain:256": partial(chain_case, 256, step=2.0, fine=2.0),
 }
 """Cases of the table: name on the command line -> function that builds one."""
 

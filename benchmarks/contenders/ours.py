@@ -33,6 +33,8 @@ ADAPTIVE_TOLERANCES = (None, 1e-15, 1e-14, 1e-13, 1e-12, 1e-10, 1e-8)
 LOOSE_TOLERANCES = (*ADAPTIVE_TOLERANCES, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
 DEGREES = (2, 3, 4, 5, 6, 7, 8, 9, 10, 12)
 """Degrees whose work-precision curves are compared."""
+END_ALONE = 2**30
+"""``save_every`` of runs that return their initial and final states alone."""
 FIXED = tuple(2.0 ** (k / 2) for k in range(-2, 9))
 """Fixed steps, as multiples of the number of adaptive steps."""
 LARGEST_NEWTON = 18
@@ -181,9 +183,11 @@ def adaptive_contenders(case: Case, *, quick: bool) -> list[Contender]:
     momenta = momenta_of(stepper, case)
     adaptive = stepper.integrate(case.q[0], momenta[0], t_end=case.span, check_growth=False).steps
     counts = [max(1, round(adaptive * factor)) for factor in FIXED[: 1 if quick else None]]
-    controlled = controlled_contenders(case, stepper, seconds, ADAPTIVE_TOLERANCES[: 2 if quick else None])
+    tolerances = ADAPTIVE_TOLERANCES[: 2 if quick else None]
+    controlled = controlled_contenders(case, stepper, seconds, tolerances)
+    checked = controlled_contenders(case, stepper, seconds, tolerances, check_growth=True)
     fixed = (replace(each, method=f"{OURS} fixed") for each in fixed_contenders(case, {SVI(8): counts}))
-    return [*controlled, *fixed]
+    return [*checked, *controlled, *fixed]
 
 
 def degree_contenders(case: Case, *, quick: bool) -> list[Contender]:
@@ -197,16 +201,23 @@ def degree_contenders(case: Case, *, quick: bool) -> list[Contender]:
 
 
 def controlled_contenders(
-    case: Case, stepper: Stepper, seconds: float, tolerances: Iterable[float | None]
+    case: Case, stepper: Stepper, seconds: float, tolerances: Iterable[float | None], *, check_growth: bool = False
 ) -> list[Contender]:
-    """Return contenders with adaptive step size at several tolerances."""
+    """Return contenders with adaptive step size at several tolerances, which return the final state alone.
+
+    With ``check_growth`` they are calls of ``integrate`` with its default check, otherwise runs started beforehand, as
+    heyoka's ``propagate_until``.
+    """
     momenta = momenta_of(stepper, case)
+
+    def prepare_checked(tolerance: float | None, index: int) -> Callable[[], Array]:
+        how: dict[str, Any] = {"t_end": case.span, "tolerance": tolerance, "save_every": END_ALONE}
+        return lambda: stepper.integrate(case.q[index], momenta[index], **how).q[-1]
 
     def prepare(tolerance: float | None, index: int) -> Callable[[], Array]:
         run = stepper.start(case.q[index], momenta[index], t_end=case.span, tolerance=tolerance)
 
         def integrate() -> Array:
-            """Integrate and return the final state alone, as heyoka's propagate_until."""
             run._run_to_target()
             end: Array = run.q
             return end
@@ -215,11 +226,11 @@ def controlled_contenders(
 
     return [
         Contender(
-            method=f"{OURS} adaptive",
+            method=f"{OURS} adaptive, checked" if check_growth else f"{OURS} adaptive",
             setting=f"tol={tolerance:.0e}" if tolerance else "tol=default",
             options=f"{stepper.title}, {' '.join(stepper.flags)}",
             compile_seconds=seconds,
-            prepare=partial(prepare, tolerance),
+            prepare=partial(prepare_checked if check_growth else prepare, tolerance),
             momenta=momenta,
             starts=len(case.q),
         )
