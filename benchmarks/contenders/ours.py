@@ -7,6 +7,7 @@ import itertools
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Mapping
+from contextvars import Context
 from dataclasses import replace
 from functools import partial
 from typing import Any, cast
@@ -212,7 +213,8 @@ def controlled_contenders(
 
     def prepare_checked(tolerance: float | None, index: int) -> Callable[[], Array]:
         how: dict[str, Any] = {"t_end": case.span, "tolerance": tolerance, "save_every": END_ALONE}
-        return lambda: stepper.integrate(case.q[index], momenta[index], **how).q[-1]
+        run = partial(stepper.integrate, case.q[index], momenta[index], **how)
+        return lambda: Context().run(run).q[-1]  # outside without_accuracy_warnings, which disables the check
 
     def prepare(tolerance: float | None, index: int) -> Callable[[], Array]:
         run = stepper.start(case.q[index], momenta[index], t_end=case.span, tolerance=tolerance)
