@@ -447,15 +447,17 @@ class ErrorGrowth:
     Attributes:
         partials: distinct derivatives at the points, on lanes: F_q, or -E_q and -E_v with the terms of the mass matrix.
         product: at u = (x, these) their product with x = dq, or (dq, dq'), on lanes.
-        energy: gradient of the energy at (q, v), on lanes; ``None`` of separable systems.
+        energy: gradient of the energy at (q, v), on lanes; ``None`` of separable systems, and if it is not conserved.
+        conserves_energy: false if forces act or the system depends on time.
         schemes: for tolerances at round-off level, and for larger ones.
         at_end: (lanes,) extrapolation from all points to the end.
-        tables: those of corrections at the points, unless they are the iteration's own.
+        tables: those of corrections at the points, if accelerations depend on velocities; else the iteration's own.
     """
 
     partials: Kernel
     product: Kernel
     energy: Kernel | None
+    conserves_energy: bool
     schemes: tuple[TangentScheme, TangentScheme]
     at_end: tuple[Number, ...]
     tables: tuple[IterationTable, ...] = ()

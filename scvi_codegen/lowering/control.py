@@ -199,11 +199,11 @@ links has 1200): their derivatives would take more than half of the time of comp
 
 
 def error_growth_of(system: MechanicalSystem, program: Program) -> ErrorGrowth | None:
-    """Return kernels and tables; ``None`` unless the system is autonomous, conservative and small enough."""
+    """Return kernels and tables; ``None`` for damping, inputs or constraints, and for systems that are too large."""
     fixed_point = program.fixed_point
     if fixed_point is None or program.newton or program.damping or system.dimension > MOST_COORDINATES:
         return None
-    if system.inputs or system.changes_energy:
+    if system.inputs:
         return None
     make = GROWTH_KERNELS.get(fixed_point.derivatives_part)
     twin = equivalent_lagrangian(system) if make else None
@@ -226,9 +226,10 @@ def error_growth_of(system: MechanicalSystem, program: Program) -> ErrorGrowth |
         partials=_with_common_roots(partials),
         product=product,
         energy=energy,
+        conserves_energy=not system.changes_energy,
         schemes=(of_roundoff, of_tolerance),
         at_end=pad_vector(cardinal_values(points, (mp.one,))[0], lanes),
-        tables=tables if energy else (),
+        tables=() if make is _separable_growth else tables,
     )
 
 
@@ -252,7 +253,7 @@ def _separable_growth(system: LagrangianSystem) -> tuple[Kernel, Kernel, None]:
     return partials, products[0], None
 
 
-def _coupled_growth(system: LagrangianSystem) -> tuple[Kernel, Kernel, Kernel] | None:
+def _coupled_growth(system: LagrangianSystem) -> tuple[Kernel, Kernel, Kernel | None] | None:
     """Return kernels of L_vv dq'' = -E_q dq - E_v dq', E(q, v, a) the Euler-Lagrange residual, unless too large."""
     forms, of = forms_of(system), (*system.coordinates, *system.velocities)
     residual = [-each for each in forms.euler_lagrange]
@@ -276,6 +277,8 @@ def _coupled_growth(system: LagrangianSystem) -> tuple[Kernel, Kernel, Kernel] |
         shape=(system.dimension, len(of)),
         purpose="The matrix of derivatives times x, u = (x, its entries).",
     )
+    if system.changes_energy:
+        return partials, product, None
     energy = system_kernel(
         system, "energy_gradient", gradient_tuple(forms.energy, of), u=of, purpose="E_q and E_v of the energy E."
     )

@@ -37,14 +37,17 @@ TOP = (
 )
 SPHERICAL = ("u", "w"), "(u_dot**2 + sin(u)**2*w_dot**2)/2 + cos(u)"
 POLAR = ("r", "f"), "(r_dot**2 + r**2*f_dot**2)/2 + 1/r"
+DUFFING = ("x",), "x_dot**2/2 + x**2/2 - x**4/4"
+PLANET = PLANE, KEPLER[1] + " + 0.001/sqrt((x - 5.2*cos(t/11.86))**2 + (y - 5.2*sin(t/11.86))**2)"
 STEPPERS = {}
 
 
-def stepper_of(system, method="svi:8"):
-    if (system, method) not in STEPPERS:
+def stepper_of(system, method="svi:8", **forces):
+    key = system, method, *forces.items()
+    if key not in STEPPERS:
         names, text = system
-        STEPPERS[system, method] = sc.compile_stepper(lagrange("motion", names, text), method)
-    return STEPPERS[system, method]
+        STEPPERS[key] = sc.compile_stepper(lagrange("motion", names, text, forces=forces), method)
+    return STEPPERS[key]
 
 
 def ellipse(e):
@@ -115,6 +118,28 @@ CHAOTIC = {
 def test_chaotic_motions_are_reported_and_regular_ones_are_not(name, tolerance):
     system, q, p, t_end = (REGULAR | CHAOTIC)[name]
     assert reports(stepper_of(system), q, p, t_end, tolerance=tolerance) == (name in CHAOTIC)
+
+
+DRIVEN = {
+    "oscillator from rest": (OSCILLATORS, {"x": "cos(1.2*t)"}, [0.0, 0.0], [0.0, 0.0], False),
+    "Kepler with drag": (KEPLER, {"x": "-0.001*x_dot", "y": "-0.001*y_dot"}, *ellipse(0.2), False),
+    "Kepler with a planet": (PLANET, {}, *ellipse(0.2), False),
+    "damped pendulums": (PENDULUM, {"a": "-0.3*a_dot", "b": "-0.3*b_dot"}, [0.5, -0.2], [0.0, 0.0], False),
+    "Duffing, periodic": (DUFFING, {"x": "-0.5*x_dot + 0.1*cos(1.2*t)"}, [0.5], [0.1], False),
+    "Duffing, undamped": (DUFFING, {"x": "0.3*cos(1.2*t)"}, [0.5], [0.1], True),
+    "Duffing from rest": (DUFFING, {"x": "-0.15*x_dot + 0.3*cos(t)"}, [0.0], [0.0], True),
+    "driven pendulums": (PENDULUM, {"a": "2*cos(t) - 0.05*a_dot"}, [2.0, 1.7], [0.0, 0.0], True),
+}
+
+
+@pytest.mark.covering(2)
+@pytest.mark.parametrize("tolerance", TOLERANCES)
+@pytest.mark.parametrize("name", DRIVEN)
+def test_chaos_under_forces_is_reported_by_a_tangent_vector(name, tolerance):
+    system, forces, q, p, chaotic = DRIVEN[name]
+    stepper, t_end = stepper_of(system, **forces), 300.0
+    assert stepper.start(q, p, t_end=t_end)._memory.measures_growth == 0  # only integrate measures it
+    assert reports(stepper, q, p, t_end, tolerance=tolerance) == chaotic
 
 
 @pytest.mark.parametrize("method", ["svi:3", "svi:12", "svi:16"])

@@ -22,17 +22,31 @@
 #define MOST_CORRECTIONS 40
 #define LOG_2 0.6931471805599453
 
+#ifdef ENERGY_CONSERVED
+enum { LESS_ERROR = 0 };
+#define KNOWN(growth) ((growth) >= LARGEST_GROWTH)
+#define START(x, change) (x)
+#else
+enum { LESS_ERROR = 1 }; /* no projection reduces that of the scheme */
+#define KNOWN(growth) (fabs(growth) >= LARGEST_GROWTH) /* damping reduces errors */
+#define START(x, change) ((x) + (change)) /* motions often start at rest at the origin */
+#endif
+
 #ifdef VARIABLE_ACCELERATIONS
 enum { TANGENT = 2 * M }; /* numbers of a tangent vector on which accelerations depend */
 #define VECTOR_SQUARE(x, v) ((x) * (x) + (v) * (v))
 /* Squared change of h^2 dq'' by a correction, relative to the vector, after which another one is necessary. */
-#define UNSETTLED(change) ((change) > (MANY_POINTS ? 0.01 : 1.0))
-#define SMALL_REST (MANY_POINTS ? 0.01 : 0.1) /* squared residual of the last stage relative to the vector */
+#define UNSETTLED(change) ((change) > (LESS_ERROR ? 1e-4 : MANY_POINTS ? 0.01 \
+                                                                       : 1.0))
+/* Squared residual of the last stage relative to the vector. */
+#define SMALL_REST (LESS_ERROR ? 1e-4 : MANY_POINTS ? 0.01 \
+                                                    : 0.1)
 #else
 enum { TANGENT = M };
 #define VECTOR_SQUARE(x, v) ((x) * (x))
-#define UNSETTLED(change) 0 /* corrections converge like those of a sine */
-#define SMALL_REST (MANY_POINTS ? 0.01 : 1.0)
+#define UNSETTLED(change) (LESS_ERROR && (change) > 1e-4) /* otherwise corrections converge like those of a sine */
+#define SMALL_REST (LESS_ERROR ? 1e-4 : MANY_POINTS ? 0.01 \
+                                                    : 1.0)
 #endif
 
 /* Explicit scheme: nodes among the points, and weights of the stages (NODES at most). */
@@ -296,10 +310,12 @@ static inline void end_gradient(const run_memory *run, const step_data *step, co
   memcpy(end, AT_END, sizeof end);
   lanes_load(run->memory, F);
 #ifdef VARIABLE_ACCELERATIONS
-  lanes u[2 * M], value[2 * M];
   (void)data, (void)dp;
-  for (int i = 0; i < M; i++) {
+  for (int i = 0; i < M; i++)
     v[i] = weigh(end, F, i);
+#ifdef ENERGY_CONSERVED
+  lanes u[2 * M], value[2 * M];
+  for (int i = 0; i < M; i++) {
     u[i] = lanes_of(q[i]);
     u[M + i] = lanes_of(v[i]);
   }
@@ -308,6 +324,9 @@ static inline void end_gradient(const run_memory *run, const step_data *step, co
     by_q[i] = value[i][0];
     by_v[i] = value[M + i][0];
   }
+#else
+  (void)q, (void)step, (void)by_q, (void)by_v;
+#endif
 #else
   (void)q;
   for (int i = 0; i < M; i++) {
@@ -322,23 +341,31 @@ static inline void end_gradient(const run_memory *run, const step_data *step, co
 static inline void sample_growth(run_memory *run, const step_data *step, const iteration_data *data, const double *dq,
     const double *dp)
 {
-  double q[M], v[M], by_q[M], by_v[M], q2 = 0.0, v2 = 0.0, along = 0.0, size = 0.0, dq2 = 0.0, dv2 = 0.0, growth;
+  double q[M], v[M], by_q[M], by_v[M], q2 = 0.0, v2 = 0.0, dq2 = 0.0, dv2 = 0.0, growth;
+#ifdef ENERGY_CONSERVED
+  double along = 0.0, size = 0.0;
+#endif
   for (int i = 0; i < M; i++)
     q[i] = step->q0[i] + dq[i];
   end_gradient(run, step, data, q, dp, v, by_q, by_v);
   for (int i = 0; i < M; i++) {
     q2 += q[i] * q[i];
     v2 += v[i] * v[i];
-    along += by_v[i] * run->tangent_v[i] + by_q[i] * run->tangent_q[i];
   }
-  for (int i = 0; i < M; i++)
-    size += by_q[i] * by_q[i] * q2 + by_v[i] * by_v[i] * v2;
   run->largest_q2 = larger(run->largest_q2, q2);
   run->largest_v2 = larger(run->largest_v2, v2);
+#ifdef ENERGY_CONSERVED
+  for (int i = 0; i < M; i++) {
+    along += by_v[i] * run->tangent_v[i] + by_q[i] * run->tangent_q[i];
+    size += by_q[i] * by_q[i] * q2 + by_v[i] * by_v[i] * v2;
+  }
   along /= size;
   for (int i = 0; i < M; i++) {
     run->tangent_q[i] -= along * q2 * by_q[i];
     run->tangent_v[i] -= along * v2 * by_v[i];
+  }
+#endif
+  for (int i = 0; i < M; i++) {
     dq2 += run->tangent_q[i] * run->tangent_q[i];
     dv2 += run->tangent_v[i] * run->tangent_v[i];
   }
@@ -351,7 +378,7 @@ static inline void sample_growth(run_memory *run, const step_data *step, const i
     run->growth_excess = larger(run->growth_excess, growth - run->growth_sum / (double)run->growth_samples);
   if (!(fabs(growth) < LARGEST_GROWTH && larger(run->largest_q2, run->largest_v2) < LARGEST_SQUARE)) {
     run->measures_growth = 0;
-    run->growth_samples = growth >= LARGEST_GROWTH ? run->growth_samples : 0;
+    run->growth_samples = KNOWN(growth) ? run->growth_samples : 0;
   }
 }
 
@@ -367,11 +394,11 @@ static __attribute__((noinline)) void measure_growth(run_memory *run, const step
     lanes_load(run->memory, V);
 #endif
     for (int i = 0; i < M; i++) {
-      run->tangent_q[i] = step->q0[i] * cos(i);
+      run->tangent_q[i] = START(step->q0[i], dq[i]) * cos(i);
 #ifdef VARIABLE_ACCELERATIONS
-      run->tangent_v[i] = at_start(V, i) * cos(i + 1);
+      run->tangent_v[i] = START(at_start(V, i), dq[i] / step->h) * cos(i + 1);
 #else
-      run->tangent_v[i] = data->inverse_mass[i] * step->p0[i] * cos(i + 1);
+      run->tangent_v[i] = START(data->inverse_mass[i] * step->p0[i], dq[i] / step->h) * cos(i + 1);
 #endif
     }
   }
