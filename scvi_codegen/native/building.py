@@ -22,8 +22,9 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
 from functools import cache
 from importlib.machinery import SourceFileLoader
 from pathlib import Path
@@ -214,8 +215,8 @@ def _publish(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], 
         built = Path(folder) / entry.name
         built.mkdir(mode=0o755)
         with announced(_work(source, compiler, flags)):
-            _compile(source, compiler, flags, built)
-        (built / "manifest.json").write_text(json.dumps({"sha256": _checksum(built), "prefix": source.prefix}))
+            manifest = _compile(source, compiler, flags, built)
+        (built / "manifest.json").write_text(json.dumps(manifest))
         for file in built.rglob("*"):
             file.chmod(file.stat().st_mode & ~0o022)
         try:
@@ -235,20 +236,23 @@ def _work(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...]) -> 
     return f"compiling {source.code.count(chr(10)):,} lines of C with {command}{first}"
 
 
-def _compile(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], folder: Path) -> None:
-    """Compile the parts concurrently, one process each; then link them, and write the binding."""
+def _compile(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], folder: Path) -> dict[str, Any]:
+    """Compile the parts concurrently, one process each; link them, write the binding and return the manifest."""
     source.write(folder)
     is_divided = any("#define DIVIDED_KERNELS" in each.code for each in source.sources)
     cut = DIVIDED_FLAGS if is_divided and _takes_flags(compiler, DIVIDED_FLAGS) else ()
     threads = THREADS if any(THREADS_HEADER in each.files for each in source.sources) else ()
     wanted = [*threads, *words_of(FLAGS_VARIABLE)]
     parts = {each.prefix: _passes(each, flags, cut) for each in source.sources}
+    commands: dict[str, list[str]] = {}
     objects = ["-shared", *wanted, *(f"{name}.o" for name in parts)]
     for define, libraries in _mathematics(flags):
         with ExitStack() as ended:
             for name, passes in parts.items():
-                command = [*compiler, "-fPIC", "-std=c99", f"-I{folder}", *flags, *passes, *define, *wanted]
-                ended.enter_context(_finished([*command, "-c", f"{name}.c"], folder))
+                command = [*compiler, "-fPIC", "-std=c99", *flags, *passes, *define, *wanted, "-c", f"{name}.c"]
+                if name != source.prefix or not source.beside or not _copy_object(source, command, flags, folder):
+                    ended.enter_context(_finished([*command, f"-I{folder}"], folder))
+                    commands[name] = command
             _write_binding(_declarations(source, [*compiler, *flags, *wanted], folder), folder)
         try:
             run_compiler([*compiler, *objects, *libraries, "-o", _library(folder).name], folder)
@@ -262,7 +266,36 @@ def _compile(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], 
             "environment variable CC to one, as in CC=gcc"
         )
     for name in parts:
-        (folder / f"{name}.o").unlink(missing_ok=True)
+        if source.beside:
+            (folder / f"{name}.o").unlink(missing_ok=True)
+    return {"sha256": _checksum(folder), "prefix": source.prefix} | _object_record(source, commands, folder)
+
+
+def _object_record(source: Source, commands: Mapping[str, list[str]], folder: Path) -> dict[str, Any]:
+    """Return how the object file of a source alone was made, which sources with further parts are linked with."""
+    if source.beside:
+        return {}
+    file = folder / f"{source.prefix}.o"
+    return {"object": hashlib.sha256(file.read_bytes()).hexdigest(), "command": commands[source.prefix]}
+
+
+def _copy_object(source: Source, command: list[str], flags: tuple[str, ...], folder: Path) -> bool:
+    """Copy the object file of the first part of a source from the library of that part alone, if there is one.
+
+    Events are linked with the stepper that they call, whose compilation takes most of the time.
+    """
+    entry = folder.parent.parent / f"_scvi_{fingerprint(replace(source, beside=None), flags=flags)}"
+    file = entry / f"{source.prefix}.o"
+    try:
+        if not _is_intact(entry) or exposed(file):
+            return False
+        recorded, content = json.loads((entry / "manifest.json").read_text()), file.read_bytes()
+        if (recorded.get("object"), recorded.get("command")) != (hashlib.sha256(content).hexdigest(), command):
+            return False
+        (folder / file.name).write_bytes(content)
+    except (OSError, ValueError):
+        return False
+    return True
 
 
 def _declarations(source: Source, command: list[str], folder: Path) -> str:

@@ -59,7 +59,7 @@ class TestSize:
         for number in range(3):
             answer(number)
             os.utime(entry(folder, number), (number, number))
-        monkeypatch.setenv(cache.SIZE_VARIABLE, str(int(3 * cache._size(entry(folder, 0)) / cache.FILLED) + 500))
+        monkeypatch.setenv(cache.SIZE_VARIABLE, str(int(3 * cache._size(entry(folder, 1)) / cache.FILLED) + 500))
         answer(0)  # used again, from the cache
         answer(3)
         assert entries_in(folder) == {0, 2, 3}

@@ -73,6 +73,7 @@ def test_empty_cache_receives_one_entry_with_source_and_checksum(cache):
     assert {path.name for path in entry.iterdir()} == {
         "tiny.c",
         "tiny.h",
+        "tiny.o",
         f"{entry.name}.so",
         "binding.py",
         "manifest.json",
@@ -86,6 +87,34 @@ def test_cache_hit_runs_no_compiler(cache, monkeypatch):
     commands = compiler_runs(monkeypatch)
     assert answer() == 42.0
     assert commands == []
+
+
+def twice() -> float:
+    """The answer of a second part, which calls the first."""
+    declaration = "double twice_answer(void);\n"
+    code = '#include "tiny.h"\n#include "twice.h"\ndouble twice_answer(void)\n{\n  return 2.0 * tiny_answer();\n}\n'
+    part = Source(prefix="twice", header=declaration, code=code, declarations=declaration)
+    return building.load(replace(source(), beside=part), flags=FAST).lib.twice_answer()
+
+
+@pytest.mark.parametrize("change", ["none", "corrupt object", "no object", "another command", "no library"])
+def test_a_part_that_is_compiled_already_is_linked(change, cache, monkeypatch):
+    answer()
+    (entry,) = entries(cache)
+    manifest = entry / "manifest.json"
+    {
+        "none": lambda: None,
+        "corrupt object": lambda: flip(entry / "tiny.o"),
+        "no object": lambda: (entry / "tiny.o").unlink(),
+        "another command": lambda: manifest.write_text(manifest.read_text().replace("-fPIC", "-fpic")),
+        "no library": lambda: building._library(entry).unlink(),
+    }[change]()
+    commands = compiler_runs(monkeypatch)
+    assert twice() == 84.0
+    compiled = [name for command in commands for name in command if name.endswith(".c")]
+    assert sorted(compiled) == (["twice.c"] if change == "none" else ["tiny.c", "twice.c"])
+    (linked,) = {*entries(cache)} - {entry}
+    assert not [*linked.glob("*.o")]
 
 
 def test_second_load_in_one_process_does_no_io(cache):
