@@ -70,10 +70,12 @@ def test_observers_and_functions_save_the_same_times(stepper):
 
 def test_energy_errors_of_observed_runs_are_those_of_saved_ones(stepper):
     arguments = {"q": [1.0, 0.0], "p": [0.0, 0.6], "t_end": 60.0, "tolerance": 0.3, "check_growth": False}
+    with pytest.warns(sc.AccuracyWarning):
+        energy = stepper.integrate(**arguments).energy()
     for observe in (None, "energy"):
-        with pytest.warns(sc.AccuracyWarning, match="energy changed from -0.82 to -0.551"):
+        with pytest.warns(sc.AccuracyWarning, match=f"energy changed from -0.82 to {energy[-1]:.3g} although"):
             run = stepper.integrate(**arguments, observe=observe)
-        assert run.energy_error() == pytest.approx(0.4448143, abs=1e-6)
+        assert run.energy_error() == np.abs(energy / energy[0] - 1.0).max() > 0.3
     ends = stepper.velocity(run.q, run.p, run.t[[0, -1]])
     assert np.array_equal(run.velocity, ends)
 
