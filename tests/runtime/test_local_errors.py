@@ -14,7 +14,7 @@ BODIES = (
     " + 15/sqrt((a - e)**2 + (b - f)**2) + 20/sqrt((c - e)**2 + (d - f)**2)"
 )
 DRAG = {"x": "-x_dot*sqrt(x_dot**2 + y_dot**2)/5", "y": "-y_dot*sqrt(x_dot**2 + y_dot**2)/5"}
-SMOOTH, STIFF, SHARP, NONSMOOTH = 1.0, 10.0, 100.0, 3e3
+SMOOTH, STIFF, SHARP, NONSMOOTH = 1.0, 40.0, 100.0, 3e3
 """Largest ratios of a local error to the tolerance: measured 0.9, 4, 18 (a force that grows e^10 times within a step)
 and 570 (of forces that jump 3e5)."""
 SYSTEMS = {

@@ -47,7 +47,7 @@ static long long next_of_vibrations(long long steps, double first_change)
 #define BEGINS_STRAIGHT(steps) ((steps) == 0)
 #endif
 
-#if defined(ADAPTIVE_STEPS) && !defined(MIXED_POINTS) && !defined(SCVI_DEVICE)
+#if defined(ADAPTIVE_STEPS) && !defined(MIXED_POINTS)
 #define ROUGH 1e-12 /* tolerance of the iteration above which low words have no effect on an adaptive step */
 #endif
 

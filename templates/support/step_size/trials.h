@@ -115,9 +115,10 @@ static __attribute__((noinline)) double rough_attempt(run_memory *run, step_data
 #endif
 
 #ifdef ROUGH
-#define ATTEMPT(options) ((options)->tolerance > ROUGH ? rough_attempt : attempt)
+#define ATTEMPT(options, ...) \
+  ((options)->tolerance > ROUGH ? rough_attempt(__VA_ARGS__) : attempt(__VA_ARGS__))
 #else
-#define ATTEMPT(options) attempt
+#define ATTEMPT(options, ...) attempt(__VA_ARGS__)
 #endif
 
 #ifdef NEWTON_KRYLOV
@@ -177,7 +178,7 @@ HOT void try_step(run_memory *run, trial *now, real least, const solver_options 
   now->data.rattle_alone = run->avoiding >= 0;
   now->fallbacks = report->fallback_steps;
 #endif
-  now->error = ATTEMPT(options)(run, &now->step, &now->data, now->last, now->last ? 0 : now->inside, &now->guess,
+  now->error = ATTEMPT(options, run, &now->step, &now->data, now->last, now->last ? 0 : now->inside, &now->guess,
       now->dq, now->dp, now->limits.decay, least, options, report);
   now->iterations = report->iterations - now->iterations;
 #ifdef RATTLE
