@@ -168,8 +168,8 @@ def _spectral_leapfrog(name: str, q: Array, h: float, steps: int) -> Array:
     def force(u: Array) -> Array:
         if name == "sine-Gordon":
             return cast("Array", scipy.fft.irfft(squared * scipy.fft.rfft(u), len(u)) - np.sin(u))
-        slope = scipy.fft.irfft(k * scipy.fft.rfft(u), len(u))
-        return cast("Array", scipy.fft.irfft(k * scipy.fft.rfft(slope / np.sqrt(1.0 + slope**2)), len(u)))
+        gradient = scipy.fft.irfft(k * scipy.fft.rfft(u), len(u))
+        return cast("Array", scipy.fft.irfft(k * scipy.fft.rfft(gradient / np.sqrt(1.0 + gradient**2)), len(u)))
 
     u, v = q.copy(), h / 2 * force(q)
     for _ in range(steps):

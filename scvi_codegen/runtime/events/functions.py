@@ -156,15 +156,15 @@ class EventFunctions:
             first = rate(0)
             if not (first if forward else -first) < -EQUAL * size:
                 return p
-            slope = rate(mp.one) - first
-            impulse, before = -2 * first / slope, mp.inf
+            derivative = rate(mp.one) - first
+            impulse, before = -2 * first / derivative, mp.inf
             for _ in range(MOST_CORRECTIONS):
                 mean = _mean(rate, impulse, EQUAL * size)
                 change = mean * impulse / (rate(impulse) - mean)
                 if not abs(change) < before:
                     break
                 impulse, before = impulse - change, abs(change)
-            if not before <= max(SOLVED * abs(impulse), EQUAL * size / abs(slope)):
+            if not before <= max(SOLVED * abs(impulse), EQUAL * size / abs(derivative)):
                 raise EventError(
                     f"the impulse of the impact at t = {float(t):.17g} did not converge: use a smaller step"
                 )

@@ -77,7 +77,7 @@ static void find_velocity_residual(velocity_pairs *at)
   for (int n = 0; n < GROUPS; n++) {
     ddl u[2 * M], value[2 * M];
     for (int i = 0; i < M; i++) {
-      u[i] = at->q[n][i] = ddl_add(ddl_of(at->q0[i]), sum_of_pairs(POSITION, POSITION_LOW, NULL, n, scaled, i));
+      u[i] = at->q[n][i] = ddl_add(ddl_of(at->q0[i]), sum_of_pairs(POSITION, POSITION_LOW, n, scaled, i));
       u[M + i] = at->z[n][i];
     }
     value_lanes_pairs(u, time_of_points(at, n), at->parameters, value);
@@ -87,7 +87,7 @@ static void find_velocity_residual(velocity_pairs *at)
   weigh_pairs(at->momentum_weight, at->F, scaled);
   for (int n = 0; n < GROUPS; n++)
     for (int i = 0; i < M; i++) {
-      const ddl P = ddl_add(ddl_of(at->p0[i]), sum_of_pairs(MOMENTUM, MOMENTUM_LOW, NULL, n, scaled, i));
+      const ddl P = ddl_add(ddl_of(at->p0[i]), sum_of_pairs(MOMENTUM, MOMENTUM_LOW, n, scaled, i));
       at->rest[n][i] = ddl_subtract(P, momentum[n][i]).high;
     }
 }
@@ -169,7 +169,7 @@ static dd duration_of_velocity_pairs(const velocity_pairs *at)
     integrand_lanes_pairs(u, ddl_of(at->t), at->parameters, value);
     part[n][0] = ddl_multiply(at->momentum_weight[n], value[0]);
   }
-  return weighted_total(POINT_END_MOMENTUM, POINT_END_MOMENTUM_LOW, NULL, part, 0);
+  return weighted_total(POINT_END_MOMENTUM, POINT_END_MOMENTUM_LOW, part, 0);
 }
 #endif
 
@@ -209,12 +209,12 @@ static int refine_velocities(const step_data *step, double t_low, double h_low, 
 #endif
   weigh_pairs(at.position_weight, at.z, scaled);
   for (int i = 0; i < M; i++) {
-    const dd q = weighted_total(POINT_END_POSITION, POINT_END_POSITION_LOW, NULL, scaled, i);
+    const dd q = weighted_total(POINT_END_POSITION, POINT_END_POSITION_LOW, scaled, i);
     dq[i] = q.high, dq[M + i] = q.low;
   }
   weigh_pairs(at.momentum_weight, at.F, scaled);
   for (int i = 0; i < M; i++) {
-    const dd p = weighted_total(POINT_END_MOMENTUM, POINT_END_MOMENTUM_LOW, NULL, scaled, i);
+    const dd p = weighted_total(POINT_END_MOMENTUM, POINT_END_MOMENTUM_LOW, scaled, i);
     dp[i] = p.high, dp[M + i] = p.low;
   }
   return all_finite(dq, 2 * M) && all_finite(dp, 2 * M) ? OK : NOT_FINITE;

@@ -9,12 +9,8 @@ static inline double lane_of(const lanes *x, int j)
   return value;
 }
 
-/* sum_j table_gj x_j of a coordinate: Dot2 (Ogita, Rump & Oishi 2005) with the low words of both factors. Tables have
- * two words or, with `lowest`, three: those of a separable iteration with two would be of another method, which is not
- * symplectic, so that the energy would drift by 3e-35 a step, more in a million steps than the random walk of rounding
- * errors. */
-static inline ddl sum_of_pairs(const lanes *table, const lanes *low, const lanes *lowest, int g, const ddl (*x)[M],
-    int i)
+/* sum_j table_gj x_j of a coordinate: Dot2 (Ogita, Rump & Oishi 2005) with the low words of both factors. */
+static inline ddl sum_of_pairs(const lanes *table, const lanes *low, int g, const ddl (*x)[M], int i)
 {
   ddl sum[2] = {{{0.0}, {0.0}}, {{0.0}, {0.0}}};
 #pragma GCC unroll 16
@@ -24,8 +20,7 @@ static inline ddl sum_of_pairs(const lanes *table, const lanes *low, const lanes
     const lanes high = lanes_of(lane_of(&at->high, j % LANES)), rest = lanes_of(lane_of(&at->low, j % LANES));
     const ddl product = ddl_two_product(a, high), next = ddl_two_sum(sum[j % 2].high, product.high);
     sum[j % 2].high = next.high;
-    const lanes lower = multiply_add(a, rest, lowest ? multiply_add(b, high, lowest[j * GROUPS + g] * high) : b * high);
-    sum[j % 2].low += lower + (product.low + next.low);
+    sum[j % 2].low += multiply_add(a, rest, b * high) + (product.low + next.low);
   }
   const ddl both = ddl_two_sum(sum[0].high, sum[1].high);
   return ddl_fast_two_sum(both.high, both.low + (sum[0].low + sum[1].low));
@@ -61,11 +56,11 @@ static inline dd total_of_pairs(ddl *x)
   return dd_fast_two_sum(lane_of(&sum.high, 0), lane_of(&sum.low, 0));
 }
 
-static inline dd weighted_total(const lanes *weights, const lanes *low, const lanes *lowest, const ddl (*x)[M], int i)
+static inline dd weighted_total(const lanes *weights, const lanes *low, const ddl (*x)[M], int i)
 {
   ddl part[GROUPS];
   for (int n = 0; n < GROUPS; n++) {
-    const lanes high = x[n][i].high, lower = lowest ? multiply_add(low[n], high, lowest[n] * high) : low[n] * high;
+    const lanes high = x[n][i].high, lower = low[n] * high;
     part[n] = ddl_two_product(weights[n], high);
     part[n].low += multiply_add(weights[n], x[n][i].low, lower);
   }
