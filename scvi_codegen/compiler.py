@@ -26,7 +26,7 @@ from scvi_codegen.errors import MethodError, SizesRequiredError
 from scvi_codegen.files.cache import cached_source, key_of
 from scvi_codegen.indices import SIZES_REQUIRED
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods import SVI, StoermerVerlet, as_method
+from scvi_codegen.methods import SVI, StoermerVerlet, as_method, default_method
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.building import TUNED_FLAGS
 from scvi_codegen.native.compilers import REORDERING_FLAGS
@@ -161,6 +161,11 @@ def compile_stepper(
         stepper._doubles = cache(compiled)
         return stepper.with_events(as_events(events))
     return Stepper(source, interface, variants=variants, flags=flags, events=as_events(events))
+
+
+def second_stepper(system: MechanicalSystem) -> Callable[[], Stepper]:
+    """Return a function that compiles the stepper of second runs, by the default method, which has adaptive steps."""
+    return lambda: compile_stepper(system, default_method(system))
 
 
 def _in_both_precisions(compiled: Callable[..., Stepper], events: EventLike | Sequence[EventLike] | None) -> Stepper:

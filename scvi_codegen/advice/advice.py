@@ -1,7 +1,7 @@
 """Choice of a fixed step size (and degree) for a wanted error: the largest one that short pilot runs confirm.
 
-Steps are halved until the error at the end, as predicted by the pilot runs (:mod:`scvi_codegen.advice.pilot`), is small
-enough; bisection between the two step sizes that enclose it follows, so that the recommended step was tried and not
+Steps are halved until the error at the end, as predicted by pilot runs (:mod:`scvi_codegen.runtime.accuracy.pilot`), is
+small enough; bisection between the two step sizes that enclose it follows, so that the recommended step was tried, not
 only fitted. Methods of low order may need steps too small to try: their number follows from the order.
 """
 
@@ -16,7 +16,6 @@ from functools import partial
 from itertools import takewhile
 from typing import Any, NamedTuple
 
-from scvi_codegen.advice.pilot import EXPONENTIAL_POWER, Pilot, Trials, run_pilot
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.display.cards import Html, card, grid, plain
 from scvi_codegen.errors import ArgumentError, MethodError, StateError, StepFailedError
@@ -31,10 +30,11 @@ from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import DOUBLE_DOUBLE, PRECISIONS
 from scvi_codegen.representation import summary
+from scvi_codegen.runtime.accuracy.pilot import EXPONENTIAL_POWER, Pilot, Trials, run_pilot
+from scvi_codegen.runtime.accuracy.warning_switch import without_accuracy_warnings
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.core.validation import States
 from scvi_codegen.runtime.ensemble.initial_states import EnsembleParameters
-from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.validation import checks_arguments
 

@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike
 from sympy import Expr
 
 from scvi_codegen.advice.advice import advise
-from scvi_codegen.advice.tolerance_check import missed_tolerance
-from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.compiler import compile_stepper, second_stepper
 from scvi_codegen.controllers import SYMPLECTIC, with_time_transformation
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.mechanics.arrays.rolling import unrolled_at
@@ -23,12 +22,13 @@ from scvi_codegen.methods import Method, as_method, default_method
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.representation import summary
+from scvi_codegen.runtime.accuracy.global_error import checked_error
+from scvi_codegen.runtime.accuracy.largest_step import accuracy_message, largest_step
+from scvi_codegen.runtime.accuracy.tolerance_check import missed_tolerance
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.core.validation import Array, States
 from scvi_codegen.runtime.events.event import EventLike
 from scvi_codegen.runtime.rotations.states import homogeneous_state
-from scvi_codegen.runtime.run.global_error import checked_error
-from scvi_codegen.runtime.run.largest_step import accuracy_message, largest_step
 from scvi_codegen.runtime.trajectory.dense_output import times_of_run
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation import checks_arguments, of
@@ -236,7 +236,7 @@ def _plan(
             return {"t_end": end}, met
         system, method = uncompiled
         h = advise(system, method, q, p, end - start, advised, **along).h
-        missed = lambda run: missed_tolerance(system, run, advised)  # noqa: E731
+        missed = lambda run: missed_tolerance(second_stepper(system), run, advised)  # noqa: E731
     steps = max(1, math.ceil(abs((end - start) / checked_step(h)) * (1.0 - 1e-12)))
     return {"h": (end - start) / steps, "steps": steps}, missed
 

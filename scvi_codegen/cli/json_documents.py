@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.advice.tolerance_check import Known
 from scvi_codegen.cli.ensembles import EnsembleOutcome
 from scvi_codegen.cli.recording import RecordedOutcome
 from scvi_codegen.cli.running import RunOutcome
@@ -14,6 +13,7 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.files.energy import EnergyAccount
 from scvi_codegen.models.model import Model
 from scvi_codegen.results.recording import RecordedRun
+from scvi_codegen.runtime.accuracy.tolerance_check import Known
 from scvi_codegen.runtime.core.words import low_words
 from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory

@@ -8,21 +8,23 @@ from functools import partial
 
 import numpy as np
 
-from scvi_codegen.advice.tolerance_check import SECOND_RUN, Known, known_digits
 from scvi_codegen.cli.reports import duration, energy_report, in_known_digits, momentum_report
 from scvi_codegen.cli.supervision import BAR_LENGTH, check_memory, interruptions, progress_bar
+from scvi_codegen.compiler import second_stepper
 from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, warn
 from scvi_codegen.files.energy import EnergyAccount
 from scvi_codegen.methods.discretise import is_symplectic
 from scvi_codegen.models.model import Model
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.representation import counted
+from scvi_codegen.runtime.accuracy.largest_step import accuracy_message
+from scvi_codegen.runtime.accuracy.local_error import TOLERABLE_ERROR
+from scvi_codegen.runtime.accuracy.tolerance_check import SECOND_RUN, Known, known_digits
+from scvi_codegen.runtime.accuracy.warning_switch import without_accuracy_warnings
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.core.words import Words, as_text
 from scvi_codegen.runtime.events.event import Crossings
 from scvi_codegen.runtime.inputs.segments import record_segments
-from scvi_codegen.runtime.run.accuracy import TOLERABLE_ERROR, without_accuracy_warnings
-from scvi_codegen.runtime.run.largest_step import accuracy_message
 from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
@@ -159,7 +161,7 @@ def known_at_end(model: Model, outcome: RunOutcome) -> Known | None:
         or trajectory.t[-1] != outcome.end[0]
     ):
         return None
-    return known_digits(model.system, trajectory, most=SECOND_RUN + 4 * run.steps, inputs=model.inputs)
+    return known_digits(second_stepper(model.system), trajectory, most=SECOND_RUN + 4 * run.steps, inputs=model.inputs)
 
 
 def describe_step_size(model: Model, run: Run) -> str:

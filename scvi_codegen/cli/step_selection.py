@@ -13,8 +13,8 @@ from scvi_codegen.errors import AccuracyWarning, StateError
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.ensemble_file import EnsembleStates
 from scvi_codegen.rendering.source import DOUBLE_DOUBLE, PRECISIONS
+from scvi_codegen.runtime.accuracy.global_error import GlobalError
 from scvi_codegen.runtime.core.features import refusal, require
-from scvi_codegen.runtime.run.global_error import GlobalError
 from scvi_codegen.validation import check_tolerance
 
 ROUND_OFF = 2.0**-52

@@ -37,11 +37,11 @@ from scvi_codegen.validation import check_kind
 if TYPE_CHECKING:
     from scvi_codegen.models.model_files.input_tables import InputTable
     from scvi_codegen.native.options import SolverOptions
+    from scvi_codegen.runtime.accuracy.global_error import GlobalError
     from scvi_codegen.runtime.core.stepper import Stepper
     from scvi_codegen.runtime.core.validation import Array
     from scvi_codegen.runtime.events.event import Event
     from scvi_codegen.runtime.inputs.segments import Input
-    from scvi_codegen.runtime.run.global_error import GlobalError
     from scvi_codegen.runtime.run.run import Run
     from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
@@ -367,7 +367,7 @@ class Model(TimeSpan):
             if result.precision != "double":
                 stepper = stepper._in_double_double or stepper
         elif h is None and self.has_time_transformation:
-            from scvi_codegen.runtime.run.largest_step import largest_step  # imported here: not needed for reading
+            from scvi_codegen.runtime.accuracy.largest_step import largest_step  # imported here: not needed for reading
 
             if self.system.inputs:
                 raise ModelFileError(

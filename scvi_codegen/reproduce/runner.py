@@ -21,7 +21,7 @@ from typing import Any, TypeAlias
 
 from scvi_codegen.errors import MethodWarning, StateError, closest
 from scvi_codegen.reproduce.experiment import Experiment, Result
-from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
+from scvi_codegen.runtime.accuracy.warning_switch import without_accuracy_warnings
 
 CATALOGUE = "scvi_codegen.reproduce.catalogue"
 PATIENCE = 10.0

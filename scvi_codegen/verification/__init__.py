@@ -27,10 +27,10 @@ from scvi_codegen.methods.discretise import discretised_form
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.building import TUNED_FLAGS
+from scvi_codegen.runtime.accuracy.warning_switch import without_accuracy_warnings
 from scvi_codegen.runtime.core.stepper import STEPPER, Stepper
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.rotations.states import checked_pair
-from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 from scvi_codegen.validation import TEXTS, checks_arguments
 from scvi_codegen.verification.certificate import Certificate, Check, Outcome, issued
 from scvi_codegen.verification.convergence import convergence_checks, identity_checks

@@ -12,8 +12,9 @@ from commands import error_of, invoke, output_of
 from notation import lagrange
 
 import scvi_codegen as sc
-from scvi_codegen.advice.tolerance_check import known_digits, missed_tolerance
 from scvi_codegen.cli.reports import in_known_digits
+from scvi_codegen.compiler import second_stepper
+from scvi_codegen.runtime.accuracy.tolerance_check import known_digits, missed_tolerance
 
 PUSHED = lagrange("pushed", "x", "x_dot**2/2 - x**2/2", forces={"x": "a*cos(t) + b*sin(3*t)"}, a=1.0, b=0.0)
 FORCED = {"a": 1.0, "b": 0.0}
@@ -231,8 +232,10 @@ class TestTolerances:
     def test_step_error_above_the_tolerance_is_a_violation(self, kepler):
         trajectory = kepler.integrate([0.4, 0.0], [0.0, 2.0], h=0.2, steps=100)
         system = sc.problem("kepler").system
-        assert "alone has a relative error" in missed_tolerance(system, trajectory, trajectory.step_error / 20.0)
-        assert missed_tolerance(system, trajectory, 1e-3) == ""
+        assert "alone has a relative error" in missed_tolerance(
+            second_stepper(system), trajectory, trajectory.step_error / 20.0
+        )
+        assert missed_tolerance(second_stepper(system), trajectory, 1e-3) == ""
 
     @pytest.mark.parametrize(
         ("name", "method"), [("planar-pendulum", "svi:2"), ("cart-pole", "svi:3"), ("harmonic-oscillator", "svi:3")]
@@ -245,25 +248,29 @@ class TestTolerances:
         advice = sc.advise(problem.system, method, problem.q, p, 20.0, tolerance)
         found = stepper.integrate(problem.q, p, h=advice.h, steps=advice.steps)
         assert found.step_error > 100 * tolerance
-        assert missed_tolerance(problem.system, found, tolerance) == ""
+        assert missed_tolerance(second_stepper(problem.system), found, tolerance) == ""
         best = sc.compile_stepper(problem.system, "svi:8").integrate(problem.q, p, t_end=20.0)
         error = np.linalg.norm(found.q[-1] - best.q[-1]) / np.linalg.norm(best.q[-1])
         assert error < tolerance
-        assert "a second run with other steps differs by" in missed_tolerance(problem.system, found, error / 5)
+        assert "a second run with other steps differs by" in missed_tolerance(
+            second_stepper(problem.system), found, error / 5
+        )
 
     def test_underestimated_errors_are_detected(self):
         """The second run detects the growth of errors, which the local error estimate does not contain."""
         system = sc.problem("kepler").system
         trajectory = sc.compile_stepper(system, "svi:4").integrate([1.0, 0.0], [0.0, 1.2], h=0.2, steps=2000)
-        known = known_digits(system, trajectory, most=20_000)
+        known = known_digits(second_stepper(system), trajectory, most=20_000)
         tolerance = trajectory.step_error
-        assert missed_tolerance(system, trajectory, tolerance) == ""
-        assert "a second run with other steps differs by" in missed_tolerance(system, trajectory, tolerance, known)
+        assert missed_tolerance(second_stepper(system), trajectory, tolerance) == ""
+        assert "a second run with other steps differs by" in missed_tolerance(
+            second_stepper(system), trajectory, tolerance, known
+        )
 
     def test_energy_drift_is_a_violation(self):
         euler = sc.compile_stepper(sc.problem("kepler").system, sc.ExplicitEuler())
         trajectory = euler.integrate([1.0, 0.0], [0.0, 1.0], h=0.01, steps=500)
-        assert "energy" in missed_tolerance(sc.problem("kepler").system, trajectory, 1e-4)
+        assert "energy" in missed_tolerance(second_stepper(sc.problem("kepler").system), trajectory, 1e-4)
 
     @pytest.mark.parametrize(
         "given", [{"forces": {"q": "-q_dot/2"}}, {"damping": "1/2"}], ids=lambda each: next(iter(each))
@@ -273,8 +280,8 @@ class TestTolerances:
         damped = sc.LagrangianSystem.from_text(**text, **given)
         trajectory = sc.compile_stepper(damped, "svi:8").integrate([1.0], [0.0], h=0.1, steps=100)
         assert abs(np.ptp(trajectory.energy())) > 0.1
-        assert missed_tolerance(damped, trajectory, 1e-9) == ""
-        assert "energy" in missed_tolerance(sc.LagrangianSystem.from_text(**text), trajectory, 1e-9)
+        assert missed_tolerance(second_stepper(damped), trajectory, 1e-9) == ""
+        assert "energy" in missed_tolerance(second_stepper(sc.LagrangianSystem.from_text(**text)), trajectory, 1e-9)
 
     def test_withdrawn_tolerance_is_reported(self, monkeypatch):
         for module in ("cli.commands.run", "advice.solve_ivp"):
@@ -292,7 +299,7 @@ class TestKnownDigits:
     def test_correct_digits_are_correct(self, kepler):
         """Against a circle, with a step that leaves an error of 1e-7 or so."""
         trajectory = kepler.integrate([1.0, 0.0], [0.0, 1.0], h=1.9, steps=60)
-        known = known_digits(sc.problem("kepler").system, trajectory, most=10_000)
+        known = known_digits(second_stepper(sc.problem("kepler").system), trajectory, most=10_000)
         t = trajectory.t[-1]
         error = np.abs(trajectory.q[-1] - [math.cos(t), math.sin(t)])
         assert np.all(error <= 1.01 * known.q + 1e-14)
@@ -303,13 +310,13 @@ class TestKnownDigits:
         problem = sc.problem("double-pendulum")
         stepper = sc.compile_stepper(problem.system, sc.SVI(8))
         trajectory = stepper.integrate(problem.q, velocity=problem.velocity, h=0.02, steps=2500)
-        known = known_digits(problem.system, trajectory, most=100_000)
+        known = known_digits(second_stepper(problem.system), trajectory, most=100_000)
         assert known.chaotic
         assert known.q.max() > 1e-4
 
     def test_slow_second_run_is_abandoned(self, kepler):
         trajectory = kepler.integrate([1.0, 0.0], [0.0, 1.0], h=0.5, steps=4000)
-        assert known_digits(sc.problem("kepler").system, trajectory, most=10) is None
+        assert known_digits(second_stepper(sc.problem("kepler").system), trajectory, most=10) is None
 
     @pytest.mark.parametrize(
         ("x", "error", "text"),

@@ -16,10 +16,10 @@ from outer_planets import GRAVITY, MASSES, POSITIONS, VELOCITIES
 
 from scvi_codegen import Advice, LagrangianSystem, MethodError, StateError, advise, compile_stepper, problem
 from scvi_codegen.advice.advice import _advice, _choose, _warnings
-from scvi_codegen.advice.pilot import run_pilot
 from scvi_codegen.cli.step_selection import _text
 from scvi_codegen.errors import StepFailedError, UnresolvedError
 from scvi_codegen.methods import SVI, ExplicitEuler, Gauss, Method, RadauIIA, StoermerVerlet
+from scvi_codegen.runtime.accuracy.pilot import run_pilot
 
 pytestmark = pytest.mark.long
 
@@ -202,14 +202,18 @@ class TestDegree:
     def test_degree_choice_does_not_depend_on_timings(self, monkeypatch: pytest.MonkeyPatch):
         system, (q, p) = problem("kepler").system, kepler_start(0.2)
         times = iter(np.random.default_rng(1).uniform(0.0, 1e9, 10_000).cumsum())
-        monkeypatch.setattr("scvi_codegen.advice.pilot.time", SimpleNamespace(perf_counter=lambda: next(times)))
+        monkeypatch.setattr(
+            "scvi_codegen.runtime.accuracy.pilot.time", SimpleNamespace(perf_counter=lambda: next(times))
+        )
         first, second = (advise(system, Gauss(4), q, p, 50.0, 1e-8, degree=True) for _ in range(2))
         assert (first.degree, first.h, first.message) == (second.degree, second.h, second.message)
 
     def test_time_of_evidence_is_per_unit_of_time(self, monkeypatch: pytest.MonkeyPatch):
         """Pilot runs over the whole span of one second each."""
         times = count()
-        monkeypatch.setattr("scvi_codegen.advice.pilot.time", SimpleNamespace(perf_counter=lambda: next(times)))
+        monkeypatch.setattr(
+            "scvi_codegen.runtime.accuracy.pilot.time", SimpleNamespace(perf_counter=lambda: next(times))
+        )
         advice = advise(pendulum(), SVI(6), [1.5], [0.0], -20.0, 1e-6)
         assert {row.seconds for row in advice.evidence} == {1 / 20}
         found = re.findall(r"h = (-\S+) .* (\S+ \w+) for the whole span\n", _text(advice))

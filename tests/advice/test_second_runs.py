@@ -8,8 +8,9 @@ import pytest
 from notation import lagrange
 
 import scvi_codegen as sc
-from scvi_codegen.advice import tolerance_check
-from scvi_codegen.advice.tolerance_check import Known, _final_error, known_digits, missed_tolerance
+from scvi_codegen.compiler import second_stepper
+from scvi_codegen.runtime.accuracy import tolerance_check
+from scvi_codegen.runtime.accuracy.tolerance_check import Known, _final_error, known_digits, missed_tolerance
 
 T, SPAN = 2.5, 7.5
 STIFFER = {"k": 9.0, "a": 0.75}
@@ -38,7 +39,7 @@ def run(system, h, q=0.75, p=-0.5):
 def test_the_second_run_has_the_time_and_parameters_of_the_first(driven, h):
     trajectory = run(driven, h)
     off = abs(trajectory.q[:, 0] - exact(trajectory.t, 0.75, -0.5))
-    known = known_digits(driven, trajectory, most=10_000)
+    known = known_digits(second_stepper(driven), trajectory, most=10_000)
     late = off[-max(1, len(off) // 16) :]
     assert known.q[0] == pytest.approx(max(off[-1], math.sqrt(np.mean(late**2))), rel=1e-3)
     assert not known.chaotic
@@ -58,7 +59,7 @@ def test_chaotic_trajectory_is_classified_as_chaotic():
     found = {}
     for angle in (0.05, 2.5):
         trajectory = stepper.integrate([angle, angle / 2], [0.0, 0.0], h=0.02, steps=1500)
-        found[angle] = known_digits(double.system, trajectory, most=50_000)
+        found[angle] = known_digits(second_stepper(double.system), trajectory, most=50_000)
     assert not found[0.05].chaotic
     assert found[2.5].chaotic
     assert 0.3 < found[2.5].tenfold < 10.0
@@ -67,7 +68,9 @@ def test_chaotic_trajectory_is_classified_as_chaotic():
 def claimed_run(**more):
     """A run whose worst step and energy are in doubt or not."""
     q = np.ones((64, 1))
+    stepper = SimpleNamespace(interface=SimpleNamespace(conserves_energy=True))
     stated = {"step_error": 1e-12, "worst_step_time": 3.25, "q": q, "p": q, "velocity": q, "steps": 63}
+    stated["stepper"] = stepper
     return SimpleNamespace(**(stated | {"energy": lambda: np.ones(64)} | more))
 
 
@@ -86,15 +89,15 @@ def claimed_run(**more):
 def test_claimed_tolerance_is_compared_with_the_final_error(known, more, words):
     system = sc.LagrangianSystem.from_text(name="free", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2")
     regular, chaotic = (Known(q=np.array([known]), p=np.array([9.0]), tenfold=tenfold) for tenfold in (math.inf, 2.0))
-    found = missed_tolerance(system, claimed_run(**more), 1e-6, regular)
+    found = missed_tolerance(second_stepper(system), claimed_run(**more), 1e-6, regular)
     assert (words in found) if words else found == ""
-    assert bool(missed_tolerance(system, claimed_run(**more), 1e-6, chaotic)) == bool(more)
+    assert bool(missed_tolerance(second_stepper(system), claimed_run(**more), 1e-6, chaotic)) == bool(more)
 
 
 def test_missing_second_run_is_made_if_the_estimate_is_doubtful(driven, monkeypatch):
     asked = []
-    monkeypatch.setattr(tolerance_check, "known_digits", lambda system, run, *, most: asked.append(most))
-    assert missed_tolerance(driven, claimed_run(), 1e-6) == ""
+    monkeypatch.setattr(tolerance_check, "known_digits", lambda second, run, *, most: asked.append(most))
+    assert missed_tolerance(second_stepper(driven), claimed_run(), 1e-6) == ""
     assert asked == []
-    assert "alone has a relative error" in missed_tolerance(driven, claimed_run(step_error=1e-4), 1e-6)
+    assert "alone has a relative error" in missed_tolerance(second_stepper(driven), claimed_run(step_error=1e-4), 1e-6)
     assert asked == [10_000 + 4 * 63]

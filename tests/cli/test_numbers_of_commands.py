@@ -10,9 +10,9 @@ from commands import json_of
 from scipy.optimize import fsolve
 
 import scvi_codegen as sc
-from scvi_codegen.advice.tolerance_check import Known
 from scvi_codegen.cli.running import final_state
 from scvi_codegen.rendering.source import Interface
+from scvi_codegen.runtime.accuracy.tolerance_check import Known
 
 
 @pytest.mark.parametrize(

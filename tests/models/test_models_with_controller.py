@@ -14,7 +14,7 @@ from notation import lagrange
 import scvi_codegen as sc
 from scvi_codegen import ModelFileError, StateError, SystemDefinitionError, generate_package, load_package
 from scvi_codegen.models.model_files.model_file import catalogue_model, dump_model, parse_model
-from scvi_codegen.runtime.run.largest_step import REFINEMENTS, largest_step
+from scvi_codegen.runtime.accuracy.largest_step import REFINEMENTS, largest_step
 
 SHAKEN = """
 [system]

@@ -8,7 +8,7 @@ import pytest
 from notation import lagrange
 
 import scvi_codegen as sc
-from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
+from scvi_codegen.runtime.accuracy.warning_switch import without_accuracy_warnings
 
 TOLERANCES = [None, 1e-12, 1e-9, 1e-6, 1e-3]
 PLANE, BODIES = ("x", "y"), ("x1", "y1", "x2", "y2", "x3", "y3")

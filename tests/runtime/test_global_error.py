@@ -14,7 +14,7 @@ from motions import MOTIONS, recorded
 from notation import lagrange
 
 import scvi_codegen as sc
-from scvi_codegen.runtime.run.global_error import SAFETY, SAFETY_OF_ROUNDING, SAFETY_OF_TWO, _alternative
+from scvi_codegen.runtime.accuracy.global_error import SAFETY, SAFETY_OF_ROUNDING, SAFETY_OF_TWO, _alternative
 from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.runtime.trajectory import dense_output
 

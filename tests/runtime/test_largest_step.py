@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import scvi_codegen as sc
-from scvi_codegen.runtime.run.largest_step import ALLOWED, REFINEMENTS, accuracy_message, largest_step
+from scvi_codegen.runtime.accuracy.largest_step import ALLOWED, REFINEMENTS, accuracy_message, largest_step
 
 KEPLER = sc.problem("kepler").system
 START: Any = [1.9, 0.0], [0.0, (0.1 / 1.9) ** 0.5]

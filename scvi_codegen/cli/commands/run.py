@@ -6,7 +6,6 @@ from typing import Any
 
 import click
 
-from scvi_codegen.advice.tolerance_check import missed_tolerance
 from scvi_codegen.cli.command_group import (
     FAILURE,
     INTERRUPTED,
@@ -23,6 +22,7 @@ from scvi_codegen.cli.recording import RecordedOutcome, Recording, check_format,
 from scvi_codegen.cli.reports import known_account
 from scvi_codegen.cli.running import RunOutcome, integrate_model, known_at_end, summary
 from scvi_codegen.cli.step_selection import model_with_adaptive_steps, model_with_advised_step, model_with_global_error
+from scvi_codegen.compiler import second_stepper
 from scvi_codegen.files.export import FORMATS
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.ensemble_file import EnsembleStates, load_ensemble
@@ -30,7 +30,8 @@ from scvi_codegen.models.options import IN_ENSEMBLE, OPTIONS, STEP_SIZE, WITH_IN
 from scvi_codegen.pictures.animation import FILMS
 from scvi_codegen.pictures.canvas import PICTURES, check_plot_path
 from scvi_codegen.rendering.source import AUTO, DOUBLE_DOUBLE
-from scvi_codegen.runtime.run.global_error import GlobalError
+from scvi_codegen.runtime.accuracy.global_error import GlobalError
+from scvi_codegen.runtime.accuracy.tolerance_check import missed_tolerance
 
 ABOUT = """\
 Integrate MODEL; report conserved quantities and the final state.
@@ -258,7 +259,9 @@ def _run_one(model: Model, output: str | None, plot: str | None, *, advised: flo
         raise CommandFailure(f"{outcome.missed}\n{_kept(outcome, written)}", FAILURE)
     for path in written:
         tell(f"wrote {path}")
-    missed = "" if advised is None else missed_tolerance(model.system, outcome.trajectory, advised, known)
+    missed = ""
+    if advised is not None:
+        missed = missed_tolerance(second_stepper(model.system), outcome.trajectory, advised, known)
     tell(missed=missed or None)
     if missed:
         raise CommandFailure(missed, FAILURE)
@@ -294,7 +297,8 @@ def _run_ensemble(
     for path in written:
         tell(f"wrote {path}", written=written)
     if advised is not None:
-        missed = missed_tolerance(model.system, outcome.result[member], advised) if outcome.result.ok[member] else ""
+        second, good = second_stepper(model.system), outcome.result.ok[member]
+        missed = missed_tolerance(second, outcome.result[member], advised) if good else ""
         tell(missed=missed or None)
         if missed:
             raise CommandFailure(f"trajectory {member}: {missed}", FAILURE)

@@ -36,9 +36,10 @@ from scvi_codegen.results.recording.manifest import (
     write_manifest,
 )
 from scvi_codegen.results.recording.reading import RecordedRun, load_run
+from scvi_codegen.runtime.accuracy.local_error import warn_of_energy_error, warn_of_large_steps
+from scvi_codegen.runtime.accuracy.resolution import warn_of_unresolved_fields
 from scvi_codegen.runtime.core.features import require
 from scvi_codegen.runtime.core.words import low_words
-from scvi_codegen.runtime.run.accuracy import warn_of_energy_error, warn_of_large_steps, warn_of_unresolved_fields
 from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.observation import Observation, Saver
 from scvi_codegen.runtime.run.run import Run

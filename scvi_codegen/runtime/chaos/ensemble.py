@@ -22,6 +22,7 @@ from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.cuda import constant
 from scvi_codegen.native.options import SolverOptions, checked_options
 from scvi_codegen.rendering.source import Source
+from scvi_codegen.runtime.accuracy.local_error import warn_of_large_steps
 from scvi_codegen.runtime.chaos.indicators import MOST as LARGEST_CHUNK
 from scvi_codegen.runtime.chaos.indicators import (
     SERIES,
@@ -39,7 +40,6 @@ from scvi_codegen.runtime.ensemble.initial_states import EnsembleParameters, sta
 from scvi_codegen.runtime.ensemble.result import OK
 from scvi_codegen.runtime.ensemble.schedule import CommonSteps
 from scvi_codegen.runtime.ensemble.thread_pool import StopCheck, run_jobs
-from scvi_codegen.runtime.run.accuracy import warn_of_large_steps
 from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.run_loop import record
 from scvi_codegen.runtime.run.step_plan import StepPlan

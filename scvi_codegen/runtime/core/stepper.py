@@ -22,6 +22,16 @@ from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.calls import with_calls
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Source
+from scvi_codegen.runtime.accuracy.global_error import (
+    checked_error,
+    confirmed_run,
+    warn_of_unconfirmed,
+    warn_of_unconfirmed_run,
+)
+from scvi_codegen.runtime.accuracy.growth import measured_growth, warn_of_error_growth
+from scvi_codegen.runtime.accuracy.largest_step import largest_step
+from scvi_codegen.runtime.accuracy.local_error import warn_of_energy_errors, warn_of_inaccuracy
+from scvi_codegen.runtime.accuracy.resolution import warn_of_unresolved_members
 from scvi_codegen.runtime.arrays.interface import RunSizes, interface_of_sizes, shapes_of_call, sizes_of_run
 from scvi_codegen.runtime.chaos.ensemble import ChaosIndicatorsEnsemble
 from scvi_codegen.runtime.chaos.indicators import ChaosIndicators
@@ -40,20 +50,6 @@ from scvi_codegen.runtime.events.refinement import WithEventsInDouble, constantl
 from scvi_codegen.runtime.inputs.segments import InputSegments, checked_inputs, final_time
 from scvi_codegen.runtime.paths.path import Path, WithPaths
 from scvi_codegen.runtime.rotations.states import homogeneous_state, is_one_state
-from scvi_codegen.runtime.run.accuracy import (
-    measured_growth,
-    warn_of_energy_errors,
-    warn_of_error_growth,
-    warn_of_inaccuracy,
-    warn_of_unresolved_members,
-)
-from scvi_codegen.runtime.run.global_error import (
-    checked_error,
-    confirmed_run,
-    warn_of_unconfirmed,
-    warn_of_unconfirmed_run,
-)
-from scvi_codegen.runtime.run.largest_step import largest_step
 from scvi_codegen.runtime.run.observation import Observe
 from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.runtime.run.saving import read_checkpoint

@@ -21,6 +21,8 @@ from scvi_codegen.errors import EventError, StateError, StepFailedError
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.native.options import SolverOptions, checked_options
 from scvi_codegen.rendering.source import Source
+from scvi_codegen.runtime.accuracy.global_error import GlobalError
+from scvi_codegen.runtime.accuracy.warning_switch import without_accuracy_warnings
 from scvi_codegen.runtime.core.features import check_together, require
 from scvi_codegen.runtime.core.validation import Array, States, check_left_to_inputs, columns_of_inputs, parameter_index
 from scvi_codegen.runtime.core.words import check_doubles, checked_time, hashed, missing, stacked
@@ -55,8 +57,6 @@ from scvi_codegen.runtime.inputs.segments import (
     inputs_of_slice,
     parameters_at,
 )
-from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
-from scvi_codegen.runtime.run.global_error import GlobalError
 from scvi_codegen.runtime.run.step_plan import AdaptivePlans, StepPlan, checked_plan, planned_steps
 from scvi_codegen.runtime.run.times import WHOLE
 from scvi_codegen.runtime.trajectory.dense_output import times_of_run

@@ -17,13 +17,13 @@ from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.files.export import FORMATS, LABELLED, check_format, write_whole
 from scvi_codegen.files.labelled_arrays import AXES, Labelled, checked_units, to_dataset
 from scvi_codegen.representation import one_line
+from scvi_codegen.runtime.accuracy.global_error import ConfirmedEnsemble, GlobalError
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.core.words import TwoWords, Words, check_keeps_words, missing
 from scvi_codegen.runtime.rotations.attitude_history import AttitudeHistory
 from scvi_codegen.runtime.rotations.quantities import named_quantities
 from scvi_codegen.runtime.run.descriptions import short_title
-from scvi_codegen.runtime.run.global_error import ConfirmedEnsemble, GlobalError
 from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.trajectory.joining import joined, relative_changes
 from scvi_codegen.runtime.trajectory.quantities import quantities

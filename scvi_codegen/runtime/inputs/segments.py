@@ -16,11 +16,12 @@ import numpy as np
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.native.arguments import checked_number, checked_step, real_array
 from scvi_codegen.rendering.source import Interface
+from scvi_codegen.runtime.accuracy.local_error import warn_of_large_steps
+from scvi_codegen.runtime.accuracy.resolution import warn_of_unresolved_fields
 from scvi_codegen.runtime.core.features import refusal
 from scvi_codegen.runtime.core.pairs import exact_product
 from scvi_codegen.runtime.core.validation import Array, check_left_to_inputs, no_input
 from scvi_codegen.runtime.core.words import low_words, split, with_low
-from scvi_codegen.runtime.run.accuracy import warn_of_large_steps, warn_of_unresolved_fields
 from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.runtime.trajectory.dense_output import checked_times

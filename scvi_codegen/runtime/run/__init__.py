@@ -1,1 +1,1 @@
-"""Runs: state, step plan, run loop, accuracy of runs."""
+"""Runs: state, step plan, run loop."""

@@ -7,11 +7,11 @@ from typing import Any, Self
 import numpy as np
 
 from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.runtime.accuracy.local_error import warn_of_inaccuracy
 from scvi_codegen.runtime.constraints.projection import constraint_values, multipliers
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array, Parameters, States
 from scvi_codegen.runtime.rotations.attitude_history import AttitudeHistory
-from scvi_codegen.runtime.run.accuracy import warn_of_inaccuracy
 from scvi_codegen.runtime.run.descriptions import describe_run
 from scvi_codegen.runtime.run.memory import Memory, alone
 from scvi_codegen.runtime.run.observation import Observation, Observe, Saver, saver_of

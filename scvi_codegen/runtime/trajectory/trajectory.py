@@ -19,6 +19,9 @@ from scvi_codegen.errors import EventError, StateError, StepFailedError
 from scvi_codegen.files.energy import energy_account
 from scvi_codegen.files.export import States, to_dataframe, write_states
 from scvi_codegen.files.labelled_arrays import checked_units, to_dataset
+from scvi_codegen.runtime.accuracy.global_error import Confirmed, GlobalError
+from scvi_codegen.runtime.accuracy.local_error import TOLERABLE_ERROR
+from scvi_codegen.runtime.accuracy.resolution import unresolved_parts
 from scvi_codegen.runtime.constraints.projection import constraint_values, multipliers
 from scvi_codegen.runtime.core.features import refusal, require
 from scvi_codegen.runtime.core.validation import columns_of_inputs
@@ -28,9 +31,7 @@ from scvi_codegen.runtime.events.refinement import crossings_of
 from scvi_codegen.runtime.paths.actions import actions_until, compensated_sums, shadow_energy
 from scvi_codegen.runtime.rotations.attitude_history import AttitudeHistory
 from scvi_codegen.runtime.rotations.quantities import named_quantities
-from scvi_codegen.runtime.run.accuracy import TOLERABLE_ERROR, unresolved_parts
 from scvi_codegen.runtime.run.descriptions import describe_states, describe_step_size
-from scvi_codegen.runtime.run.global_error import Confirmed, GlobalError
 from scvi_codegen.runtime.sensitivity.trajectory_derivatives import TrajectoryDerivatives
 from scvi_codegen.runtime.trajectory.dense_output import checked_times, states_at, within
 from scvi_codegen.runtime.trajectory.joining import Number, concatenated, joined, joined_crossings, relative_changes

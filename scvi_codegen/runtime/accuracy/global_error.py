@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, warn
 from scvi_codegen.native.arguments import checked_number
-from scvi_codegen.runtime.run.accuracy import warnings_wanted, without_accuracy_warnings
+from scvi_codegen.runtime.accuracy.warning_switch import warnings_wanted, without_accuracy_warnings
 
 Array = NDArray[np.float64]
 Result = TypeVar("Result")

@@ -12,8 +12,8 @@ from typing import Any
 from scvi_codegen.errors import MethodError, StateError, StepFailedError
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.runtime.accuracy.warning_switch import without_accuracy_warnings
 from scvi_codegen.runtime.core.validation import Parameters, States, check_inputs_given
-from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 from scvi_codegen.runtime.run.run import Run
 
 ROUND_OFF = 2.0**-53

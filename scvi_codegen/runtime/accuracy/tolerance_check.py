@@ -7,20 +7,17 @@ Verification, on the whole run, of the error for which a step size was recommend
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
 
-from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import ScviCodegenError, StateError
-from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods import default_method
+from scvi_codegen.runtime.accuracy.warning_switch import without_accuracy_warnings
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.core.words import Words
-from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 SECOND_RUN = 10_000
@@ -58,13 +55,13 @@ class _TooLongError(Exception):
 
 @without_accuracy_warnings()
 def known_digits(
-    system: MechanicalSystem, trajectory: Trajectory, *, most: int, inputs: Mapping[str, Any] | None = None
+    second: Callable[[], Stepper], trajectory: Trajectory, *, most: int, inputs: Mapping[str, Any] | None = None
 ) -> Known | None:
-    """Estimate the error of the last state of ``trajectory``, a trajectory of ``system`` with ``inputs``.
+    """Estimate the error of the last state of ``trajectory`` with ``inputs`` by a run of the stepper ``second()``.
 
     Returns ``None`` if a second run fails, would take more than about ``most`` steps, or time is transformed.
     """
-    if system.clock is not None or len(trajectory) < 2:
+    if trajectory.stepper.in_tau or len(trajectory) < 2:
         return None
 
     def count(steps: int) -> None:
@@ -77,8 +74,8 @@ def known_digits(
     span: dict[str, Any] = {"t": float(times[0]), "t_end": float(times[-1])}
     arguments = {**span, "parameters": trajectory.parameters, "progress": count}
     try:
-        stepper = compile_stepper(system, default_method(system))
-        if system.inputs:
+        stepper = second()
+        if stepper.interface.inputs:
             q, p = stepper.integrate(nudged, trajectory.p[0], inputs=inputs or {}, **arguments).at(times)
         else:
             second = stepper.integrate(nudged, trajectory.p[0], t_eval=times, **arguments)
@@ -128,7 +125,7 @@ REMEDY = "use adaptive step size (t_end, --tolerance)"
 
 
 def missed_tolerance(
-    system: MechanicalSystem, trajectory: Trajectory, tolerance: float, known: Known | None = None
+    second: Callable[[], Stepper], trajectory: Trajectory, tolerance: float, known: Known | None = None
 ) -> str:
     """Return why the error at the end of a run exceeds ``tolerance``; ``""`` if there is no evidence for it.
 
@@ -137,16 +134,16 @@ def missed_tolerance(
     is compared with a second run.
 
     Args:
-        system: mechanical system.
+        second: function that returns a stepper of the same system with adaptive steps, for a second run.
         trajectory: run whose states are all at the ends of steps.
         tolerance: error |q - q_exact| / |q| for which the step size was recommended.
         known: error estimate from a second run.
     """
     if isinstance(trajectory.q, Words):
         return _missed_in_two_words(trajectory, tolerance)
-    doubt = _worst_step(trajectory, tolerance) or _lost_energy(system, trajectory, tolerance)
+    doubt = _worst_step(trajectory, tolerance) or _lost_energy(trajectory, tolerance)
     if known is None and doubt:
-        known = known_digits(system, trajectory, most=SECOND_RUN + 4 * trajectory.steps)
+        known = known_digits(second, trajectory, most=SECOND_RUN + 4 * trajectory.steps)
     if known is None or known.chaotic:
         return f"{doubt}; {REMEDY}" if doubt else ""
     error = float(np.linalg.norm(known.q)) / (float(np.linalg.norm(_final_error(np.abs(trajectory.q)))) or 1.0)
@@ -182,8 +179,8 @@ def _worst_step(trajectory: Trajectory, tolerance: float) -> str:
     )
 
 
-def _lost_energy(system: MechanicalSystem, trajectory: Trajectory, tolerance: float) -> str:
-    if system.changes_energy:
+def _lost_energy(trajectory: Trajectory, tolerance: float) -> str:
+    if not trajectory.stepper.interface.conserves_energy:
         return ""
     try:
         energy = trajectory.energy()
