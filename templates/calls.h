@@ -8,8 +8,8 @@ static int NAME(call_store)(const NAME(call) *c, long long row, long long steps,
   __typeof__(NAME(advance)) *volatile fixed = NAME(advance);
 #ifdef HAS_ADVANCE_TO
   __typeof__(NAME(advance_to)) *volatile adaptive = NAME(advance_to);
-  if (c->h == 0.0)
-    return adaptive(c->run, c->t_end, c->tolerance, steps, every, c->parameters, c->options, t, q, p,
+  if (c->control)
+    return adaptive(c->run, c->t_end, c->control, steps, every, c->parameters, c->options, t, q, p,
         c->iterations + row, c->report, c->workspace);
 #endif
   return fixed(c->run, steps, every, c->parameters, c->options, t, q, p, c->iterations + row, c->report, c->workspace);
@@ -42,7 +42,7 @@ int NAME(call_integrate)(NAME(call) *c, long long steps, long long every)
   c->error_t = c->run->error_t;
 #endif
 #ifdef HAS_ADVANCE_TO
-  c->stored = c->h == 0.0 ? c->report->stored : c->stored;
+  c->stored = c->control ? c->report->stored : c->stored;
 #endif
 #ifdef HAS_REJECTED
   c->rejected = c->run->rejected;
@@ -50,10 +50,10 @@ int NAME(call_integrate)(NAME(call) *c, long long steps, long long every)
 #ifdef HAS_FALLBACK_STEPS
   c->fallback_steps = c->run->fallback_steps;
 #endif
-  if (c->h == 0.0 && c->sizes)
+  if (c->control && c->sizes)
     for (long long k = 0; k < c->stored; k++)
       c->sizes[k] = c->t[k + 1] - c->t[k];
-  if (status || c->h != 0.0 || !c->has_energies)
+  if (status || !c->control || !c->has_energies)
     return status;
   long long last = c->stored, row = last * c->coordinates;
   if (NAME(energies)(1 + (last == 1), c->t, c->q, c->p, c->parameters, c->energies, c->workspace) ||
@@ -76,7 +76,7 @@ static int NAME(call_one)(NAME(each) *c, const double *parameters, long long ste
   const long long left = c->left;
   *c->before = *c->run;
 #endif
-  if (!c->t_end) {
+  if (!c->control) {
     const long long every = c->segment_every[c->segment], size = steps < c->left ? steps : c->left;
     status = fixed(c->run, size, every, parameters, c->options, t, q, p, c->iterations + row, c->report, c->workspace);
     c->left -= size;
@@ -84,8 +84,8 @@ static int NAME(call_one)(NAME(each) *c, const double *parameters, long long ste
   }
 #ifdef HAS_ADVANCE_TO
   __typeof__(NAME(advance_to)) *volatile adaptive = NAME(advance_to);
-  if (c->t_end) {
-    status = adaptive(c->run, c->t_end[j], c->tolerance, steps, c->every, parameters, c->options, t, q, p,
+  if (c->control) {
+    status = adaptive(c->run, c->t_end[j], c->control, steps, c->every, parameters, c->options, t, q, p,
         c->iterations + row, c->report, c->workspace);
     c->rows += c->report->stored;
     arrived = c->run->t == c->t_end[j] && c->run->t_low == 0.0;
@@ -114,7 +114,7 @@ static int NAME(call_one)(NAME(each) *c, const double *parameters, long long ste
             c->workspace))
       energy[0] = energy[1] = 0.0; /* undefined */
   }
-  while (!status && !c->t_end && c->left == 0 && ++c->segment < c->segments) {
+  while (!status && !c->control && c->left == 0 && ++c->segment < c->segments) {
     c->left = c->segment_steps[c->segment];
     if (c->segment_h[c->segment] != c->run->h) {
       c->run->h = c->segment_h[c->segment];
@@ -130,7 +130,7 @@ static int NAME(call_one)(NAME(each) *c, const double *parameters, long long ste
 #endif
     c->entered = c->pauses;
   }
-  arrived |= status || (!c->t_end && c->segment == c->segments);
+  arrived |= status || (!c->control && c->segment == c->segments);
   c->status[j] = arrived ? status : -1;
   return arrived;
 }
@@ -147,18 +147,18 @@ long long NAME(call_each)(NAME(each) *c, long long steps)
     if (room < 1)
       break;
     if (c->segment < 0) {
-      NAME(start)(c->run, c->t, c->t_end ? 0.0 : c->segment_h[0], c->q + j * m, c->p + j * m);
+      NAME(start)(c->run, c->t, c->control ? 0.0 : c->segment_h[0], c->q + j * m, c->p + j * m);
       c->segment = 0;
-      c->left = c->t_end ? 0 : c->segment_steps[0];
+      c->left = c->control ? 0 : c->segment_steps[0];
 #ifdef HAS_H_LOW
       c->run->t_low = c->t_low;
-      if (!c->t_end)
+      if (!c->control)
         set_step_to(c->segment_end[0], c->run->t, c->run->t_low, &c->run->h, &c->run->h_low);
 #endif
       if ((c->entered = c->pauses))
         break;
     }
-    const long long every = c->t_end ? c->every : c->segment_every[c->segment];
+    const long long every = c->control ? c->every : c->segment_every[c->segment];
     size = size / every > room - 1 ? room * every - every : size;
     if (size < 1)
       break;

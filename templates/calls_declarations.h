@@ -1,3 +1,5 @@
+struct NAME(step_control); /* of adaptive steps */
+
 /* Arguments and results of a run as one struct, for callers by which each argument of a call costs time. */
 typedef struct {
   NAME(run) * run;
@@ -9,7 +11,8 @@ typedef struct {
   double *sizes; /* of the steps that follow the states, unless NULL */
   NAME(report) * report;
   double *workspace;
-  double h, t_end, tolerance; /* h = 0: adaptive steps */
+  const struct NAME(step_control) *control; /* adaptive steps to t_end; NULL: fixed steps of h */
+  double h, t_end;
   long long words, coordinates, measures_growth, has_energies;
   double error, error_t, energies[2];
   long long stored, steps, rejected, fallback_steps;
@@ -21,7 +24,8 @@ int NAME(call_integrate)(NAME(call) *call, long long steps, long long every);
 typedef struct {
   NAME(run) * run, *before; /* of the present trajectory; copy to which it returns if it requests Newton's method */
   const NAME(options) *options;
-  const double *q, *p, *parameters, *t_end; /* of all trajectories; t_end NULL: fixed steps, in segments */
+  const struct NAME(step_control) *control; /* adaptive steps; NULL: fixed steps, in segments */
+  const double *q, *p, *parameters, *t_end; /* of all trajectories; t_end: of adaptive steps */
   const long long *segment_steps, *segment_every;
   const double *segment_h, *segment_end; /* step size from there on; of two words: end of a single step, or NaN */
   double *times, *positions, *momenta; /* memory for states */
@@ -31,7 +35,7 @@ typedef struct {
   long long *stored, *done, *fallback_steps; /* numbers of states and of steps of all trajectories */
   double *energies; /* of all trajectories at both ends, unless NULL */
   NAME(report) * report;
-  double *workspace, t, t_low, tolerance;
+  double *workspace, t, t_low;
   long long words, coordinates, parameters_each, segments, every, capacity; /* words: of a time */
   long long rows, next, end, segment, left, requested; /* states in memory; present trajectory, its segment */
   long long pauses, entered; /* with `pauses`, calls end where a segment begins: parameters may change */

@@ -273,7 +273,8 @@ def _entry(folder: Path, model: Model, interface: Any, initial: Sequence[str], a
         .render(
             array=interface.array, m=size, capacity=256 if size < 64 else 16, maps=len(interface.map_names),
             values=numbers, sizes=list(interface.sizes.values()) if interface.array else (), tables=tables,
-            constraints=interface.constraints, adaptive=adaptive, initial=initial, events=model.events,
+            constraints=interface.constraints, adaptive=adaptive, initial=initial,
+            transformed=model.time_transformation is not None, events=model.events,
             acting=any(each.changes_state for each in model.events), velocities=not starts_from_momenta(model),
             level=interface.parameters.index(energy) if (energy := interface.energy_parameter) else None,
             axes={f"at_{name}": nodes for name, nodes in axes.items()},

@@ -291,7 +291,7 @@ int main(void)
   hit_run run;
   hit_start(&run, 0.0, 0.1, q0, p0);
   while (run.t < 8.0) {
-    if (hit_advance_with_changes(&run, &watch, 8.0, 0.0, 16, parameters, NULL, 64, t, q, p, length, iterations, number,
+    if (hit_advance_with_changes(&run, &watch, 8.0, NULL, 16, parameters, NULL, 64, t, q, p, length, iterations, number,
             32, found, &filled, &report, workspace))
       return 1;
     for (int k = 0; k < filled; k++)

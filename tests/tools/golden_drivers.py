@@ -53,6 +53,12 @@ def numbers(values: Sequence[float]) -> str:
     return ", ".join(float(value).hex() for value in values) or "0"
 
 
+def control_of(tolerance: float, h: float) -> str:
+    """A pointer to the control of adaptive steps, which begin at h above round-off."""
+    first = f"(const double[]){{{h!r}}}" if tolerance else "NULL"
+    return f"&(const CALL(step_control)){{{tolerance!r}, INFINITY, {first}, NULL}}"
+
+
 def run_driver(
     prefix: str,
     q: Sequence[float],
@@ -67,12 +73,12 @@ def run_driver(
     """One step, then a run of fixed steps; of adaptive steps to t_end where that is given."""
     m = len(q)
     run = (
-        f"CALL(advance_to)(&run, {t_end!r}, {tolerance!r}, {steps}, {steps}, parameters, NULL, t, q, p, counts,"
-        " &report, work)"
+        f"CALL(advance_to)(&run, {t_end!r}, {control_of(tolerance, h)}, {steps}, {steps}, parameters, NULL, t, q, p,"
+        " counts, &report, work)"
         if t_end
         else f"CALL(advance)(&run, {steps}, {max(1, steps // 3)}, parameters, NULL, t, q, p, counts, &report, work)"
     )
-    start = 0.0 if t_end and not tolerance else h
+    start = 0.0 if t_end else h
     return (
         HEAD.format(prefix=prefix)
         + f"""
@@ -199,7 +205,8 @@ def arrays_driver(
     rows = "".join(f"static const int table_{k}[] = {{{', '.join(map(str, row))}}};\n" for k, row in enumerate(tables))
     listed = ", ".join(f"table_{k}" for k in range(len(tables)))
     run = (
-        f"CALL(advance_to)(run, {t_end!r}, {tolerance!r}, {steps}, 0, all, NULL, NULL, NULL, NULL, NULL, &report, NULL)"
+        f"CALL(advance_to)(run, {t_end!r}, {control_of(tolerance, h)}, {steps}, 0, all, NULL, NULL, NULL, NULL, NULL,"
+        " &report, NULL)"
         if t_end
         else f"CALL(advance)(run, {steps}, 0, all, NULL, NULL, NULL, NULL, NULL, &report, NULL)"
     )
@@ -217,7 +224,7 @@ def arrays_driver(
     for (int k = 0; k < {fields}; k++)
       for (long long i = 0; i < n; i++)
         ((double *)run->data.field[k])[i] = 1.0 + 0.125 * (double)(i % 3);{held if constrained else ""}
-    CALL(start)(run, 0.25, {0.0 if t_end and not tolerance else h!r}, q, p);
+    CALL(start)(run, 0.25, {0.0 if t_end else h!r}, q, p);
     run->threads = {threads};
     from = now();
     status = {run};"""

@@ -269,7 +269,9 @@ class _SuccessiveCall(Call):
         if isinstance(work.steps, FixedSegments):
             struct.segment_end = binding.pointer(work.steps.end)
         else:
-            struct.t_end, struct.tolerance = binding.pointer(work.steps), work.tolerance
+            self.control = struct.control = binding.new("step_control *")
+            struct.t_end, self.control.tolerance = binding.pointer(work.steps), work.tolerance
+            self.control.max_step = math.inf
             if work.conserves_energy:
                 struct.energies = binding.pointer(work.energies)
         struct.stored, struct.fallback_steps = map(binding.whole_numbers, (work.stored, work.fallback_steps))

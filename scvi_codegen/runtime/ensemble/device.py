@@ -7,6 +7,7 @@ repeats it from the start.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
@@ -323,7 +324,7 @@ class AdaptiveDeviceRuns:
         try:
             while left.size:
                 began, which = time.perf_counter(), device.copied(left)
-                plan = len(left), which, first, steps, float(self.t0), t_end, float(self.tolerance), *numbers
+                plan = len(left), which, first, steps, float(self.t0), t_end, float(self.tolerance), math.inf, *numbers
                 self.launch("thread_advance_to", len(left), *plan, *arrays)
                 status, self.t, self.done = map(device.copy_out, (codes, arrays[2], reached))
                 if progress is not None:

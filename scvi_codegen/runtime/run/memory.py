@@ -119,6 +119,7 @@ class Memory:
             values = np.concatenate([values, np.zeros(len(values))])
             self._parameters = stepper._numbers(values)
         self._arguments = binding.pointer(values), binding.null
+        self._control = binding.null  # of adaptive steps in C
         self._options: SolverOptions | None = None
         self._has_defaults = False  # whether no parameter differs from its default
         self._watch: Any = None  # state of the search for events in C
@@ -248,8 +249,18 @@ class Memory:
         if not (plan.fixed or self.stepper._has_error_estimate):
             require(self.stepper, "adaptive")
         self._plan, self._has_tau = plan, bool(plan.tau) or self.stepper.in_tau
+        self._control = self.stepper.binding.null if plan.fixed else self._step_control(plan)
         for call in self._calls:
-            call.h, call.t_end, call.tolerance = plan.h, plan.t_end, plan.tau or plan.tolerance
+            call.h, call.t_end, call.control = plan.h, plan.t_end, self._control
+
+    def _step_control(self, plan: StepPlan) -> Any:
+        """Return the control of steps in C that are not fixed."""
+        control = self.stepper.binding.new("step_control *")
+        if plan.tau:
+            control.tau = plan.tau
+        else:
+            control.tolerance, control.max_step = plan.tolerance, plan.max_step
+        return control
 
     @property
     def h(self) -> float:

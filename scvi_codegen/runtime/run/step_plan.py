@@ -33,6 +33,7 @@ class StepPlan:
     tolerance: float = 0.0
     tau: float = 0.0
     h: float = 0.0
+    max_step: float = math.inf
 
     @property
     def fixed(self) -> bool:

@@ -13,8 +13,8 @@ typedef struct job {
   int (*go)(run_memory *run, const struct job *way, solver_report *report);
   const problem *given;
   const solver_options *options;
-  double t_end, tolerance;
-  int is_adaptive;
+  double t_end;
+  const step_control *control; /* of adaptive steps; NULL: fixed steps */
   long long steps, every; /* at most; between stored states, 0: none is stored */
   double *t, *q, *p;
   int *iterations;
@@ -127,7 +127,7 @@ static int perform(run_memory *run, job way, const double *parameters, const sol
   if (status != OK)
     return status;
   way.given = &run->data;
-  way.options = options || way.is_adaptive ? options : &standard;
+  way.options = options || way.control ? options : &standard;
 #ifdef CONSTRAINTS_OF_ARRAYS
   if (run->is_changed)
     project_run(run, report, 0);

@@ -411,7 +411,7 @@ static int advance(fmu *one, double end, run_report *report)
     watch->remaining[e] = watch->acts[e] ? 1 : remaining[e];
   one->now.pending = false;
   while (left > 0 && !watch->ended && !one->now.pending && fabs(target - run->t) > slack_at(target)) {
-    status = NAME(advance_with_changes)(run, watch, target, 0.0, left, one->now.values + FIRST_PARAMETER, NULL,
+    status = NAME(advance_with_changes)(run, watch, target, NULL, left, one->now.values + FIRST_PARAMETER, NULL,
         MOST_CHANGES, to->t, to->q, to->p, to->length, to->iterations, to->number, MOST_CHANGES, to->found, &to->filled,
         report, one->workspace);
     if (status != STATUS(OK) || report->steps == 0)

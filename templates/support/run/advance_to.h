@@ -20,14 +20,14 @@ static inline real rest_of_last(const trial *now)
   return now->last ? (span - now->step.h) + (rest - now->at.t_low) : 0;
 }
 
-int NAME(advance_to)(run_memory *run, real t_end, real tolerance, long long steps, long long every,
+int NAME(advance_to)(run_memory *run, real t_end, const step_control *control, long long steps, long long every,
     const real *parameters, const solver_options *options, real *t, real *q, real *p, int *iterations,
     solver_report *report, real *workspace)
 {
   solver_options standard = NAME(default_options)();
   solver_report unread;
   trial now = {.t_end = t_end};
-  begin_trials(run, &now, tolerance, &standard);
+  begin_trials(run, &now, control, &standard);
   run->direction = (t_end - run->t) - run->t_low < 0 ? -1 : 1;
   options = options ? options : &standard;
   report = report ? report : &unread;

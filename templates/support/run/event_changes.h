@@ -207,10 +207,9 @@ static void set_run(event_run *run, real t, const event_sample *at)
 }
 
 /* Searches a step of a run that was at `before`, changes the state at crossings and continues the step. */
-static int change_in_step(const event_run *before, event_run *run, event_step *step, real length, int iterations,
-    const stored_states *to)
+static int change_in_step(const event_run *before, event_run *run, event_step *step, int adaptive, real length,
+    int iterations, const stored_states *to)
 {
-  const int adaptive = before->h == 0.0;
   const long long within = adaptive ? before->step + 1 : -1;
   real *const states = step->memory + 9 * M;
   event_sample left = {.t = before->t, .q = states, .p = states + M};
@@ -299,33 +298,34 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
   return status;
 }
 
-/* One step of a run: adaptive, or of its h. */
-static int advance_run(event_run *run, real t_end, real tolerance, const event_step *step, int *iterations,
+/* One step of a run: adaptive, or without `control` of its h. */
+static int advance_run(event_run *run, real t_end, const step_control *control, const event_step *step, int *iterations,
     solver_report *own)
 {
   int status = NOT_CONVERGED;
   real t, *const q = step->memory, *const p = q + M;
-  if (run->h != 0.0)
+  if (!control)
     status = NAME(advance)(run, 1, 1, step->parameters, step->options, &t, q, p, iterations, own, step->workspace);
 #if EVENTS_CONTROLLED
   else
-    status = NAME(advance_to)(run, t_end, tolerance, 1, 1, step->parameters, step->options, &t, q, p, iterations, own,
+    status = NAME(advance_to)(run, t_end, control, 1, 1, step->parameters, step->options, &t, q, p, iterations, own,
         step->workspace);
 #endif
-  (void)t_end, (void)tolerance;
+  (void)t_end;
   return status;
 }
 
 /* One step of a run, shorter if it would pass t_end; returns its size in *length. */
-static int take_step(event_run *run, real t_end, real tolerance, const event_step *step, real *length, int *iterations)
+static int take_step(event_run *run, real t_end, const step_control *control, const event_step *step, real *length,
+    int *iterations)
 {
   const real start = run->t, left = (t_end - run->t) - run->t_low;
   event_sample end = {.q = step->memory, .p = step->memory + M};
   solver_report own;
   int status;
-  if (run->h == 0.0 || fabs(left) >= (1.0 - CHANGE_WHOLE) * fabs(run->h)) {
-    status = advance_run(run, t_end, tolerance, step, iterations, &own);
-    *length = run->h == 0.0 ? run->t - start : run->h;
+  if (control || fabs(left) >= (1.0 - CHANGE_WHOLE) * fabs(run->h)) {
+    status = advance_run(run, t_end, control, step, iterations, &own);
+    *length = control ? run->t - start : run->h;
   } else {
     *length = left;
     status = NAME(step)(run->t, left, run->q, run->p, step->parameters, step->options, end.q, end.p, &own,
@@ -342,7 +342,7 @@ static int take_step(event_run *run, real t_end, real tolerance, const event_ste
   return status;
 }
 
-int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, real tolerance, long long steps,
+int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, const step_control *control, long long steps,
     const real *parameters, const solver_options *options, long long states, real *t, real *q, real *p, real *length,
     int *iterations, long long *number, long long room, event_crossing *found, long long *filled, solver_report *report,
     real *workspace)
@@ -363,9 +363,9 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, r
     real size;
     int count = 0;
     keep_run(&before, run, step.values + (long long)EVENT_VALUES * EVENTS);
-    status = take_step(run, t_end, tolerance, &step, &size, &count);
+    status = take_step(run, t_end, control, &step, &size, &count);
     if (status == OK)
-      status = change_in_step(&before, run, &step, size, count, &to);
+      status = change_in_step(&before, run, &step, control != NULL, size, count, &to);
     if (status != OK) {
       copy_run(run, &before);
       report->stored = kept;

@@ -14,10 +14,11 @@ KERNEL NAME(thread_size)(long long *size)
  * the step that failed, 0 at t_end, else -1. done: numbers of completed steps. solver_tolerance: 0 for the one of
  * `tolerance`. */
 KERNEL NAME(thread_advance_to)(long long number, const long long *which, long long first, long long steps, double t0,
-    const double *t_end, double tolerance, double solver_tolerance, long long max_iterations, long long absolute,
+    const double *t_end, double tolerance, double max_step, double solver_tolerance, long long max_iterations, long long absolute,
     run_memory *runs, const double *parameters, double *t, double *q, double *p, long long *status, long long *done)
 {
   const long long k = TRAJECTORY, every = 0x7fffffffffffffffLL;
+  const step_control control = {.tolerance = tolerance, .max_step = max_step};
   const solver_options options = {solver_tolerance, (int)max_iterations, (int)absolute};
   run_memory run;
   solver_report report;
@@ -33,7 +34,7 @@ KERNEL NAME(thread_advance_to)(long long number, const long long *which, long lo
     NAME(start)(&run, t0, 0.0, q + j * M, p + j * M);
   else
     run = runs[j];
-  result = NAME(advance_to)(&run, t_end[j], tolerance, steps, every, own, solver_tolerance > 0.0 ? &options : NULL,
+  result = NAME(advance_to)(&run, t_end[j], &control, steps, every, own, solver_tolerance > 0.0 ? &options : NULL,
       &end, q + j * M, p + j * M, &iterations, &report, workspace);
   status[j] = result != OK ? result : has_arrived(run.t, run.t_low, t_end[j]) ? 0
                                                                               : -1;

@@ -62,10 +62,10 @@ typedef struct {
 #endif
 } trial;
 
-static void begin_trials(run_memory *run, trial *now, real tau, solver_options *standard)
+static void begin_trials(run_memory *run, trial *now, const step_control *control, solver_options *standard)
 {
   (void)standard;
-  now->tau = tau;
+  now->tau = control->tau;
   now->turned = (real)run->direction * ((now->t_end - run->t) - run->t_low) < 0;
 }
 

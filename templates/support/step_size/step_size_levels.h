@@ -1,4 +1,5 @@
 #include "../core/numbers.h"
+#include <limits.h>
 
 /* Step-size control. Step sizes of adaptive steps are roots of 2 to the power of a grid level, and the error estimate
  * of a step determines the level of the next. Requires: MANTISSA; GROWTH, the factor of the error estimate per level;
@@ -30,6 +31,7 @@ enum {
 #define LEAST_UNRESOLVED (REAL(65536.0) * REAL_EPSILON * REAL_EPSILON) /* of a curve: smaller values are rounding
                                                                         * errors */
 #endif
+#define NO_LARGEST_LEVEL (LLONG_MAX / 2)
 #ifndef ITERATION_PART
 #define ITERATION_PART REAL(0.00390625) /* tolerance of the stage equations relative to that of a step */
 #endif
@@ -70,6 +72,12 @@ static long long level_below(real h)
   for (grid_level = (long long)exponent * LEVELS_PER_BINADE; size_of_level(grid_level) > h; grid_level--)
     ;
   return grid_level;
+}
+
+/* Largest level of step sizes up to max_step, which may be infinite. */
+static long long largest_level(real max_step)
+{
+  return max_step < INFINITY ? level_below(max_step) : NO_LARGEST_LEVEL;
 }
 
 /* Error estimate if the step size were `levels` larger on the grid. */

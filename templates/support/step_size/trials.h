@@ -34,6 +34,13 @@ typedef struct {
 #endif
 #endif
 
+/* Step-size control by default: errors of round-off size. */
+step_control NAME(default_step_control)(void)
+{
+  const step_control control = {.max_step = INFINITY};
+  return control;
+}
+
 #ifdef NEWTON_ALONE
 #define HOT static
 #define SHORT_STEPS_FAIL 0
@@ -133,6 +140,8 @@ typedef struct {
   step_data step;
   solver_data data;
   error_limits limits;
+  const step_control *control;
+  long long largest_level; /* of the step sizes up to control->max_step */
   real t_end, error;
 #ifdef ARRAYS
   double *dq, *dp;
@@ -228,13 +237,21 @@ static inline int compare_trial(const trial *now, int momenta, const solver_opti
   return compare_with_halves(&now->step, now->dq, momenta ? now->dp : NULL, options, apart);
 }
 
-/* Number of levels by which the first step may be increased at once. */
-static int levels_up(const trial *now)
+/* Number of levels, at most `most`, by which the step size may be increased without exceeding the largest one. */
+static inline int levels_within(const run_memory *run, const trial *now, int most)
 {
+  const long long left = now->largest_level - run->grid_level;
+  return left < most ? (int)left : most;
+}
+
+/* Number of levels by which the first step may be increased at once. */
+static int levels_up(const run_memory *run, const trial *now)
+{
+  const int most = levels_within(run, now, MOST_UP);
   real error = now->error;
   int up = 0;
   if (error < now->limits.fewer)
-    for (; up < MOST_UP && error * GROWTH <= now->limits.most; up++)
+    for (; up < most && error * GROWTH <= now->limits.most; up++)
       error *= GROWTH;
   return up;
 }
@@ -266,16 +283,23 @@ static SELDOM int levels_of_first(const trial *now, real h, real span)
 static SELDOM void try_first_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
   const real span = MATH(fabs)(now->t_end - now->at.t);
-  real shorter = run->h != 0 ? REAL_MIN : (real)INFINITY;
-  int found = 0, up = 1, early = 0;
-  run->grid_level = level_below(run->h != 0 ? MATH(fabs)(run->h) : span * FIRST_STEP);
+  real shorter = INFINITY;
+  int found = 0, up = 1, early;
+  if (now->control->first_step) {
+    run->grid_level = level_below(*now->control->first_step);
+    run->grid_level += levels_within(run, now, 0);
+    try_step(run, now, 0, options, report);
+    if (now->error < INFINITY)
+      return;
+  }
+  run->grid_level = level_below(span * FIRST_STEP);
+  run->grid_level += levels_within(run, now, 0);
   try_step(run, now, 0, options, report);
-  if (run->h == 0)
-    early = levels_of_first(now, now->length, span);
+  early = levels_within(run, now, levels_of_first(now, now->length, span));
   while (early > 0) {
     run->grid_level += early;
     try_step(run, now, 0, options, report);
-    if (levels_up(now) >= LEVELS_PER_BINADE)
+    if (levels_up(run, now) >= LEVELS_PER_BINADE)
       break;
     run->grid_level -= early;
     early = early < 2 * MOST_UP ? 0 : early - MOST_UP;
@@ -287,9 +311,9 @@ static SELDOM void try_first_step(run_memory *run, trial *now, const solver_opti
     const int as_expected = now->error > error_at(shorter, up / 2) && now->error < error_at(shorter, up + up / 2 + 1);
     const int rises = failed ? !SHORT_STEPS_FAIL : as_expected;
     found = found || small;
-    up = small ? levels_up(now) : 0;
+    up = small ? levels_up(run, now) : 0;
     if (up == 0 && !(found && rises))
-      up = MOST_UP;
+      up = levels_within(run, now, MOST_UP);
     shorter = now->error;
     run->grid_level += up;
     if (up > 0)
@@ -448,6 +472,7 @@ static inline void choose_size(run_memory *run, const trial *now)
 #endif
   if (run->avoiding > 0 && run->avoiding-- && run->grid_level + change >= run->failed)
     change = (int)(run->failed - 1 - run->grid_level);
+  change = levels_within(run, now, change);
   run->guess = now->guess;
   run->change_before = run->change;
   run->change = change;
@@ -455,9 +480,24 @@ static inline void choose_size(run_memory *run, const trial *now)
   run->error_before = error_at(now->error, change);
 }
 
-/* Sets the admissible error of a step, and the tolerance of its equations accordingly. */
-static void begin_trials(run_memory *run, trial *now, real tolerance, solver_options *standard)
+/* Reduces the size of the next step of a continued run to the largest one. */
+static void limit_size(run_memory *run, const trial *now)
 {
+  const int change = levels_within(run, now, 0);
+  if (change < 0 && run->error_before > 0) {
+    run->grid_level += change;
+    run->change += change;
+    run->error_before = error_at(run->error_before, change);
+  }
+}
+
+/* Sets the admissible error of a step, and the tolerance of its equations accordingly. */
+static void begin_trials(run_memory *run, trial *now, const step_control *control, solver_options *standard)
+{
+  const real tolerance = control->tolerance;
+  now->control = control;
+  now->largest_level = largest_level(control->max_step);
+  limit_size(run, now);
   now->limits = limits_of(tolerance > 0 ? tolerance : ROUNDOFF_ERROR);
   standard->tolerance = larger(REAL_EPSILON, ITERATION_PART * tolerance);
   if ((real)run->direction * ((now->t_end - run->t) - run->t_low) < 0)
@@ -513,7 +553,7 @@ static int take_trials(run_memory *run, const job *way, solver_report *report)
   now.step = step_of(run, way->given, &work);
   now.step.h = 0.0;
   now.dq = work.dq, now.dp = work.dp;
-  begin_trials(run, &now, way->tolerance, &standard);
+  begin_trials(run, &now, way->control, &standard);
   run->direction = (way->t_end - run->t) - run->t_low < 0 ? -1 : 1;
   while (report->steps < way->steps && (run->t != way->t_end || run->t_low != 0.0)) {
     const long long before = report->iterations;
@@ -531,14 +571,13 @@ static int take_trials(run_memory *run, const job *way, solver_report *report)
   return OK;
 }
 
-int NAME(advance_to)(run_memory *run, double t_end, double tolerance, long long steps, long long every,
+int NAME(advance_to)(run_memory *run, double t_end, const step_control *control, long long steps, long long every,
     const double *parameters, const solver_options *options, double *t, double *q, double *p, int *iterations,
     solver_report *report, double *workspace)
 {
   const job way = {.go = take_trials,
       .t_end = t_end,
-      .tolerance = tolerance,
-      .is_adaptive = 1,
+      .control = control,
       .steps = steps,
       .every = every,
       .t = t,
