@@ -15,8 +15,10 @@ Nothing here changes a value: constants are exact and rounded when they are prin
 """
 
 import math
-from collections.abc import Mapping, Sequence
+import operator
+from collections.abc import Iterator, Mapping, Sequence
 from fractions import Fraction
+from functools import partial
 
 import sympy
 
@@ -28,6 +30,17 @@ from scvi_codegen.ir.kernel import Constant, Expression, Kernel, Load, Operation
 CIRCULAR = ("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh")
 FUNCTIONS = {getattr(sympy, name): name for name in (*CIRCULAR, "atan2", "exp", "log")} | {rint: "rint"}
 INVERSE_ROOTS = {k: f"inverse_root_{k}" for k in (1, 3, 5, 7)}
+OPERATIONS = {
+    **{name: function for function, name in FUNCTIONS.items() if name != "rint"},
+    **{name: partial(lambda x, k: x ** sympy.Rational(-k, 2), k=k) for k, name in INVERSE_ROOTS.items()},
+    "+": operator.add,
+    "-": operator.sub,
+    "*": operator.mul,
+    "/": operator.truediv,
+    "sqrt": sympy.sqrt,
+    "pow": operator.pow,
+}
+"""Differentiable operations of a kernel, as functions of SymPy."""
 
 
 LARGEST_UNROLLED_POWER = 64
@@ -151,7 +164,7 @@ class _Graph:
         for factor in ordered:
             node = self.read(factor)
             content = self.nodes[node]
-            if isinstance(content, tuple) and content[0] == "neg":
+            if isinstance(content, tuple) and content[0] == "neg":  # exact
                 negative, node = not negative, content[1][0]
             nodes.append(node)
         product = nodes[0]
@@ -188,6 +201,47 @@ class _Graph:
         square = self.node(("*", (half, half)))
         return self.node(("*", (square, x))) if n % 2 else square
 
+    def rounding_error(self, root: int) -> int:
+        """Return the node of a bound of the rounding error of a node, relative to half a unit in the last place.
+
+        Running error analysis (Higham, Accuracy and Stability of Numerical Algorithms, sec. 3.3): an operation of x
+        adds its own size to sum_j |d result / d x_j| error_j. Arguments and times are rounded; parameters are exact.
+        """
+        errors: dict[int, int | None] = {}
+        for k in _order(self, [root]):
+            content = self.nodes[k]
+            if isinstance(content, tuple) and content[0] == "neg":  # exact
+                errors[k] = errors[content[1][0]]
+            elif isinstance(content, tuple):
+                errors[k] = self._total([self._absolute(k), *self._inherited(*content, errors)])
+            else:
+                is_rounded = isinstance(content, Load) and content.source in ("u", "t")
+                errors[k] = self._absolute(k) if is_rounded else None
+        error = errors[root]
+        return self.node(Constant(Fraction(0))) if error is None else error
+
+    def _inherited(self, operation: str, operands: tuple[int, ...], errors: Mapping[int, int | None]) -> Iterator[int]:
+        """Yield the errors of operands times the absolute derivatives of an operation by them."""
+        slots = [sympy.Dummy(real=True) for _ in operands]
+        value = OPERATIONS[operation](*slots) if operation in OPERATIONS else sympy.Integer(0)
+        self._read.update(zip(slots, operands, strict=True))
+        for slot, operand in zip(slots, operands, strict=True):
+            error, rate = errors[operand], value.diff(slot)
+            if error is not None and rate != 0:
+                yield error if abs(rate) == 1 else self.node(("*", (self._absolute(self.read(rate)), error)))
+
+    def _absolute(self, k: int) -> int:
+        content = self.nodes[k]
+        if isinstance(content, tuple) and content[0] in ("neg", "fabs"):
+            return self._absolute(content[1][0])
+        return k if isinstance(content, Constant) and content.value >= 0 else self.node(("fabs", (k,)))
+
+    def _total(self, terms: Sequence[int]) -> int:
+        total = terms[0]
+        for term in terms[1:]:
+            total = self.node(("+", (total, term)))
+        return total
+
     def _rank(self, factor: sympy.Expr) -> tuple[int, int]:
         """Return the sort key of a factor: numbers, parameters, composites, coordinates; then the order of reading."""
         if self.is_constant(factor):
@@ -207,9 +261,11 @@ def lower_kernel(
     partials: Sequence[sympy.Expr] = (),
     constants: int = 0,
     paired: bool = False,
+    of_rounding: bool = False,
 ) -> Kernel:
     """Return the kernel of ``values`` and ``partials`` with common subexpressions shared.
 
+    With ``of_rounding`` its values are bounds of their rounding errors (:meth:`_Graph.rounding_error`) instead.
     The last ``constants`` arguments are constant. With ``paired`` the terms of sums are added in pairs, and their
     common rational factor is not separated if they have sums as factors: a few more operations, with less latency.
     """
@@ -220,6 +276,8 @@ def lower_kernel(
     for each in intermediates(*values, *partials):
         graph.read(each)
     roots = [graph.read(expression) for expression in (*values, *partials)]
+    if of_rounding:
+        roots = [graph.rounding_error(root) for root in roots]
     temporaries, results = _linearise(graph, roots)
     return Kernel(
         name=name,
@@ -228,7 +286,7 @@ def lower_kernel(
         results=results,
         values=len(values),
         symbols=tuple(arguments),
-        formulas=(*values, *partials),
+        formulas=() if of_rounding else (*values, *partials),
     )
 
 

@@ -148,6 +148,7 @@ class Constraints:
         formulas: as text.
         kernel: g at u = q, then the nonzero derivatives g_q.
         entries: (k, i) of these derivatives.
+        rounding: bounds of the rounding errors of g, in units of the round-off.
         motion: at u = (q, v): L_vv a without constraints, m numbers; then g_q v + g_t, and the terms of its time
             derivative without a.
     """
@@ -155,6 +156,7 @@ class Constraints:
     formulas: tuple[str, ...]
     kernel: Kernel
     entries: tuple[tuple[int, int], ...]
+    rounding: Kernel
     motion: Kernel
 
     @property

@@ -291,7 +291,12 @@ class Program:
             ),
             *(quantities.first_order_rates, quantities.inverse_legendre),
             *(integrals.kernel if integrals else None, constraints and constraints.kernel),
-            *(constraints and constraints.motion, self.damping, *(rattle.kernels if rattle else ())),
+            *(
+                constraints and constraints.rounding,
+                constraints and constraints.motion,
+                self.damping,
+                *(rattle.kernels if rattle else ()),
+            ),
         )
         return tuple({kernel.name: kernel for kernel in kernels if kernel}.values())
 

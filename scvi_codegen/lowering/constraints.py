@@ -262,6 +262,14 @@ def lowered_constraints(system: MechanicalSystem) -> Constraints:
             purpose="The constraints g of positions, and their nonzero derivatives G, at u = q.",
         ),
         entries=tuple(partials),
+        rounding=system_kernel(
+            system,
+            "constraint_rounding",
+            position_conditions(system),
+            u=system.coordinates,
+            purpose="Rounding errors of the constraints g of positions at u = q, in units of the round-off.",
+            of_rounding=True,
+        ),
         motion=system_kernel(
             system,
             "constrained_motion",

@@ -53,6 +53,7 @@ def system_kernel(
     partials: Iterable[Expr] = (),
     purpose: str = "",
     paired: bool = False,
+    of_rounding: bool = False,
 ) -> Kernel:
     """Return the kernel ``name`` as a function of the time and parameters of a system.
 
@@ -63,6 +64,7 @@ def system_kernel(
         partials: expressions of derivatives, stored after the values.
         purpose: one sentence on what it computes, for the comment above it.
         paired: whether its sums have short chains of operations instead of few operations.
+        of_rounding: whether it computes bounds of the rounding errors of the values instead.
     """
     kernel = lower_kernel(
         name,
@@ -72,6 +74,7 @@ def system_kernel(
         values=tuple(values),
         partials=tuple(partials),
         paired=paired,
+        of_rounding=of_rounding,
     )
     return replace(kernel, purpose=purpose)
 

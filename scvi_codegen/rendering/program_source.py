@@ -546,9 +546,14 @@ def jacobian_size(program: Program) -> int:
 
 
 def scratch_size(program: Program) -> int:
-    """Return the doubles for the kernels of one stage group, or for the mass matrix with its derivatives."""
-    mass = program.matrix_size(program.dimension, 1) + len(program.quantities.mass_entries)
-    return max(mass, *(group.scratch for group in program.equations.stage_groups)) if program.newton else mass
+    """Return the doubles for kernels: of one stage group, of the mass matrix, or of the constraints.
+
+    These are the mass matrix with its derivatives, and a saddle point matrix with its pivots and a right-hand side.
+    """
+    sites, matrix_size = program.equations.sites, program.matrix_size
+    mass = matrix_size(program.dimension, 1) + len(program.quantities.mass_entries)
+    saddle = matrix_size(sites, 1) + 2 * sites if program.constraints else 0
+    return max(mass, saddle, *(group.scratch for group in program.equations.stage_groups)) if program.newton else mass
 
 
 def _context(

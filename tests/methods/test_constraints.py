@@ -288,7 +288,7 @@ def test_adaptive_steps_are_rejected_where_the_iteration_of_multipliers_fails():
     assert np.array_equal(thinned.q[-1], run.q[-1])
 
 
-def test_newton_iteration_is_the_last_resort_of_adaptive_steps_at_a_dead_point():
+def test_adaptive_steps_pass_a_dead_point():
     """A parallelogram passes a point where G M^-1 G^T is singular, and goes on as the pendulum that it is."""
     rods = sc.LagrangianSystem.from_text(
         name="parallelogram",
@@ -297,16 +297,14 @@ def test_newton_iteration_is_the_last_resort_of_adaptive_steps_at_a_dead_point()
         constraints=["x1**2 + y1**2 = 1", "(x2 - 2)**2 + y2**2 = 1", "(x2 - x1)**2 + (y2 - y1)**2 = 4"],
     )
     angle = sc.LagrangianSystem.from_text(name="angle", coordinates=["a"], lagrangian="a_dot**2/2 - 9.81*sin(a)")
-    stepper, exact, fallbacks = sc.compile_stepper(rods, lobatto(3)), sc.compile_stepper(angle, "svi:6"), 0
+    stepper, exact = sc.compile_stepper(rods, lobatto(3)), sc.compile_stepper(angle, "svi:6")
     for a, tolerance in ((0.3, 1e-4), (0.4, 1e-4), (0.5, 1e-3)):
         start = [np.cos(a), np.sin(a), 2 + np.cos(a), np.sin(a)]
         run = stepper.integrate(start, [0.0] * 4, t_end=0.6, tolerance=tolerance, check_growth=False)
         end = exact.integrate([a], [0.0], h=0.02, steps=30).q[-1, 0]
         assert end < -0.5
         assert np.abs(run.q[-1] - [np.cos(end), np.sin(end), 2 + np.cos(end), np.sin(end)]).max() < 1e-5
-        assert run.rejected_steps >= 3 * run.fallback_steps
-        fallbacks += run.fallback_steps
-    assert fallbacks > 0
+        assert run.rejected_steps <= 5
 
 
 def test_steps_are_symplectic_on_the_tangent_bundle_of_the_circle():

@@ -117,7 +117,7 @@ def test_dead_points_are_named_with_the_rank(span):
     start = stepper.project([1.8, 0.6], t=0.4)
     with pytest.raises(sc.StepFailedError, match=r"nearly singular there.*rank 1 of 2.*dead point") as failure:
         stepper.integrate(*start, t=0.4, **span)
-    assert 2.28 < failure.value.t < 2.3
+    assert 2.28 < failure.value.t < 2.3 + 1e-12
     with pytest.raises(sc.StateError, match=r"linearly dependent there \(rank 1 of 2\)"):
         stepper.integrate([0.0, 2.5], velocity=[0.0, 1.0], t=2.3, h=0.01, steps=1)
 

@@ -1,32 +1,33 @@
 #include "../core/status_codes.h"
+#include "../core/step.h"
 #include "../newton/band.h"
 
 /* Projection onto holonomic constraints g(q, t) = 0 or linear velocity constraints A(q, t) v + b = 0, and Lagrange
  * multipliers. For the latter, g = 0 and A v + b is the constraint rate.
  *
  * Positions: Gauss-Newton iteration in the metric of the mass matrix; momenta: p -= G^T y with G H_pp G^T y = rate
- * (Hairer, Lubich & Wanner, Geometric Numerical Integration, sec. VII.1). Requires: legendre.h, newton.h, the kernels
- * constraints and constrained_motion, and CONSTRAINT_ENTRY, the indices of the entries of G = g_q or A. */
+ * (Hairer, Lubich & Wanner, Geometric Numerical Integration, sec. VII.1). Requires: legendre.h, band.h, the
+ * kernels constraints, constraint_rounding and constrained_motion, and CONSTRAINT_ENTRY, the indices of the entries of G = g_q or A. */
 
 #define MAX_PROJECTIONS 100 /* Gauss-Newton iterations; more indicate that no state is near */
+#define MOST_HALVINGS 60 /* of an update */
 #define MOMENTUM_PROJECTIONS 3 /* one suffices except for rounding and non-quadratic kinetic energies, for which the
                                 * iteration continues until an update of the velocity, relative to it, is settled */
 #define SETTLED_UPDATE REAL(1e-9)
 /* relative to the state: accepted size of the last update where rounding prevents a smaller residual */
 #define ACCEPTED_UPDATE REAL(1e-6)
 #define ROUNDED_UPDATE (1024 * REAL_EPSILON) /* near q = 0 or at rest, where a relative distance is undefined */
-#define BEYOND (1 / MATH(sqrt)(REAL_EPSILON)) /* times an update: where g is still linear, rounding limits |g| */
-#define NONLINEAR REAL(0.015625) /* relative difference from linear, which bounded terms such as sines exceed, too */
-#define SLOW REAL(0.01) /* reduction of |g|^2 by an update that indicates rounding */
+#define ROUNDED_RESIDUAL (4 * REAL_EPSILON) /* times the rounding size of g: residuals that an update does not reduce */
 
 /* Factors of the saddle-point matrix [L_vv, G^T; G, 0] of a state, and a right-hand side. */
 typedef struct {
   real matrix[SADDLE], pivot[SITES], x[SITES];
 } saddle;
 
+/* In the memory of the kernels, which are not evaluated while it is used. */
 static saddle *saddle_in(real *workspace)
 {
-  return (saddle *)(workspace + SCRATCH + MEMORY);
+  return (saddle *)workspace;
 }
 
 /* Factorises the matrix at u = (q, v) and computes g. */
@@ -103,6 +104,25 @@ int NAME(constraint_values)(long long count, const real *t, const real *q, const
 }
 #endif
 
+/* Adds to the sizes of positions the displacements for which constraints change by the sizes of their terms: rounding
+ * leaves g_k = O(u r_k), with the rounding size r of constraint_rounding, and positions q + X_k g_k, X = M^-1 G^T (G M^-1
+ * G^T)^-1, whatever |q| is. Nothing is added where the constraints are dependent. */
+static SELDOM void add_constraint_sizes(real t, const real *q, const real *parameters, saddle *at, real *size)
+{
+  real u[2 * M] = {0}, g[CONSTRAINTS], rounding[CONSTRAINTS], x[M], y[CONSTRAINTS];
+  memcpy(u, q, sizeof(real) * M);
+  if (factorise_saddle(t, u, parameters, at, g) != OK)
+    return;
+  constraint_rounding(u, t, parameters, rounding);
+  for (int k = 0; k < CONSTRAINTS; k++) {
+    memset(g, 0, sizeof g);
+    g[k] = rounding[k];
+    solve_saddle(at, NULL, g, x, y);
+    for (int i = 0; i < M && all_finite(x, M); i++)
+      size[i] += MATH(fabs)(x[i]);
+  }
+}
+
 /* Sum of squares of g; infinite if g is not finite. */
 static real misfit(real t, const real *q, const real *parameters, real *g)
 {
@@ -113,54 +133,46 @@ static real misfit(real t, const real *q, const real *parameters, real *g)
   return all_finite(g, CONSTRAINTS) ? sum : (real)INFINITY;
 }
 
-/* Returns 1 if rounding alone prevents that `update`, which solves G update = right, reduces |g|: g changes linearly
- * far beyond it. A state at 0, as of angles, has no size with which the update could be compared. */
-static int is_rounding(real t, const real *u, const real *right, const real *update, const real *parameters)
+/* Returns 1 if |g_k| <= limit size_k for all k. */
+static int is_below(const real *g, real limit, const real *size)
 {
-  real x[M], beyond[CONSTRAINTS], wrong = 0, size = 0;
-  for (int i = 0; i < M; i++)
-    x[i] = u[i] + BEYOND * update[i];
-  misfit(t, x, parameters, beyond);
-  for (int k = 0; k < CONSTRAINTS; k++) {
-    const real from_linear = beyond[k] - (BEYOND - 1) * right[k];
-    wrong += from_linear * from_linear;
-    size += right[k] * right[k];
-  }
-  return wrong < NONLINEAR * NONLINEAR * BEYOND * BEYOND * size;
+  int below = 1;
+  for (int k = 0; k < CONSTRAINTS; k++)
+    below &= MATH(fabs)(g[k]) <= limit * size[k];
+  return below;
 }
 
 /* Projects q onto g = 0 by Gauss-Newton steps in the metric of the mass matrix at u = (q, v). An update is halved while
- * it does not reduce |g|; the iteration ends when rounding prevents a reduction. */
+ * it does not reduce |g|; the iteration ends where g is a rounding error, whose size is that of its terms: positions may
+ * be 0. */
 static int project_position(real t, real *u, const real *parameters, saddle *at)
 {
-  real g[CONSTRAINTS], right[CONSTRAINTS], y[CONSTRAINTS], update[M], nearest[M];
+  real g[CONSTRAINTS], right[CONSTRAINTS], y[CONSTRAINTS], update[M], nearest[M], rounding[CONSTRAINTS];
   real left = misfit(t, u, parameters, g);
   memcpy(nearest, u, sizeof nearest);
   for (int k = 0; k < MAX_PROJECTIONS; k++) {
     const int status = factorise_saddle(t, u, parameters, at, g);
-    real scale = 1, size, now;
+    int halvings = 0, is_rounding;
+    real now;
     if (status != OK)
       return status;
+    constraint_rounding(u, t, parameters, rounding);
+    if (is_below(g, REAL_EPSILON / 2, rounding))
+      return OK;
+    is_rounding = is_below(g, ROUNDED_RESIDUAL, rounding);
     for (int j = 0; j < CONSTRAINTS; j++)
       right[j] = -g[j];
     solve_saddle(at, NULL, right, update, y);
-    size = largest_of(update);
-    if (!is_finite(size))
+    if (!all_finite(update, M))
       return SINGULAR;
     do {
       for (int i = 0; i < M; i++)
-        u[i] = nearest[i] + scale * update[i];
+        u[i] = nearest[i] + MATH(ldexp)(update[i], -halvings);
       now = misfit(t, u, parameters, g);
-      scale /= 2;
-    } while (!(now < left) && scale * size > REAL_EPSILON * largest_of(nearest));
-    if (size <= REAL_EPSILON * largest_of(nearest) && now < left)
-      return OK;
-    if (!(now < SLOW * left)) {
-      const int rounding = is_rounding(t, nearest, right, update, parameters);
-      if ((k == 0 && rounding) || !(now < left))
-        memcpy(u, nearest, sizeof nearest);
-      if (rounding || !(now < left))
-        return rounding || size <= ACCEPTED_UPDATE * largest_of(nearest) ? OK : NOT_CONVERGED;
+    } while (!(now < left) && !is_rounding && ++halvings < MOST_HALVINGS);
+    if (!(now < left)) {
+      memcpy(u, nearest, sizeof nearest);
+      return is_rounding ? OK : NOT_CONVERGED;
     }
     left = now;
     memcpy(nearest, u, sizeof nearest);

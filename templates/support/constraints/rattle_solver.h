@@ -3,6 +3,21 @@
 /* Constrained steps by an iteration for the multipliers at the points, then the multipliers that project p1 onto the
  * tangent space. Requires: rattle.h or coupled_rattle.h. */
 
+/* Adds the sizes that the constraints give to positions to inverse sizes; returns the largest size. Stagnation above the
+ * rounding of the positions may be that of g. */
+static SELDOM real widen_sizes(const step_data *step, real *inverse_size)
+{
+  real size[M], largest = 0;
+  for (int i = 0; i < M; i++)
+    size[i] = 1 / inverse_size[i];
+  add_constraint_sizes(step->t, step->q0, step->parameters, saddle_in(step->scratch), size);
+  for (int i = 0; i < M; i++) {
+    largest = larger(largest, size[i]);
+    inverse_size[i] = 1 / size[i];
+  }
+  return largest;
+}
+
 /* Solves g(u) = 0 for lambda and u; evaluates forces and constraints there. Returns NOT_CONVERGED on failure. */
 static int solve_constraints(const step_data *step, rattle_step *now, const solver_options *options,
     solver_report *report)
@@ -12,7 +27,7 @@ static int solve_constraints(const step_data *step, rattle_step *now, const solv
   real inverse_size[M], largest_size = 0;
   const movement unknown = {(real)INFINITY, (real)INFINITY, (real)INFINITY, 0};
   movement last[2] = {unknown, unknown};
-  int factorised = 0;
+  int factorised = 0, widened = 0;
   for (int k = 0; k < least(options->max_iterations, MOST_ITERATIONS); k++) {
     movement moved;
     int verdict;
@@ -24,6 +39,13 @@ static int solve_constraints(const step_data *step, rattle_step *now, const solv
     report->change = options->absolute ? moved.absolute : moved.relative;
     evaluate_points(step, now);
     verdict = accepts(&moved, last, options, k);
+    if (verdict < 0 && !options->absolute && !widened) {
+      widened = 1;
+      largest_size = widen_sizes(step, inverse_size);
+      moved = measure_change(change, inverse_size, largest_size);
+      last[0] = last[1] = unknown;
+      verdict = accepts(&moved, last, options, k);
+    }
     if (verdict > 0)
       return OK;
     if (verdict < 0)
