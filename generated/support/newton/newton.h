@@ -143,6 +143,16 @@ static int linearise(const step_data *step, newton_data *data, const band *shape
   return factorise(data->factors, shape, data->pivot);
 }
 
+/* Displacements that round as g does: positions and multipliers that stagnate above the rounding of the former. */
+static inline void add_sizes_of_constraints(const step_data *step, real *size)
+{
+#ifdef CONSTRAINED
+  add_constraint_sizes(step->t, step->q0, step->parameters, saddle_in(step->scratch), size);
+#else
+  (void)step, (void)size;
+#endif
+}
+
 /* Solves the stage equations from the initial guess in z; on success z and the increment p1 - p0 are consistent, on
  * failure they are undefined. The factors, of an earlier step if *keep, are reused as long as updates are small and
  * decrease fast. With an end position q1, p0 is unknown, too, and solved for in place. */
@@ -150,13 +160,14 @@ static int newton(const step_data *step, newton_data *data, const real *q1, real
     const solver_options *options, solver_report *report)
 {
   const band shape = band_of(SITES, q1 ? B + 1 : B);
-  real size_q[M], size_p[SITES], change[M], last = (real)INFINITY;
+  real size_q[M], size_p[SITES], change[M], added[M] = {0}, last = (real)INFINITY;
   movement moved = no_movement();
-  int trials = 0, stagnations = 0;
+  int trials = 0, stagnations = 0, slow = 0;
   memset(increment, 0, sizeof(real) * M);
   for (int k = 0;; k++) {
     evaluate(step, data->z, data->rows, size_p, size_q, *keep ? NULL : data->factors, &shape);
     for (int i = 0; i < M; i++) {
+      size_q[i] += added[i];
       change[i] = data->rows[i * (B + 1) + B] - increment[i];
       increment[i] = data->rows[i * (B + 1) + B];
     }
@@ -175,6 +186,9 @@ static int newton(const step_data *step, newton_data *data, const real *q1, real
 #endif
         return OK;
       }
+      slow += moved.relative >= STOPPED_SHRINKING * last;
+      if (slow == STAGNATIONS)
+        add_sizes_of_constraints(step, added);
       last = moved.relative;
     }
     if (k >= least(options->max_iterations, MOST_ITERATIONS))
