@@ -125,7 +125,8 @@ def _describe_steps(model: Model, result: EnsembleTrajectory) -> str:
 def _failures(result: EnsembleTrajectory) -> Iterator[str]:
     lost = np.flatnonzero(~result.ok & (result.status != "interrupted"))
     for j in lost[:SHOWN_FAILURES]:
-        t = result.ends[0][j] if result.plans or result.spans else result.t[0] + result.steps[j] * result.h
+        own = result.plans or result.spans or result.times is not None
+        t = result.ends[0][j] if own else result.t[0] + result.steps[j] * result.h
         status = str(result.status[j])
         why = FAILURES[status][0] if status in FAILURES else status
         yield f"  trajectory {j}: step {result.steps[j]} at t = {t:g} failed: {why}"

@@ -9,9 +9,13 @@ from __future__ import annotations
 import pickle
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from inspect import signature
+from typing import TYPE_CHECKING, Any, cast
 
+from scvi_codegen.errors import StateError, closest
+from scvi_codegen.runtime.core.stepper import checked_ensemble_result
 from scvi_codegen.runtime.ensemble.ensemble import Ensemble
 from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
 from scvi_codegen.validation import checked_count
@@ -22,9 +26,8 @@ if TYPE_CHECKING:
 
 __all__ = ["integrate_ensemble"]
 
-ARRAYS = ("t", "times", "q", "p", "status", "steps", "fallback_steps")
-"""Attributes of a result that workers send back."""
-
+OF_THIS_MACHINE = {"threads": "workers use one thread each", "device": "workers use their processors"}
+"""Arguments that ensembles on a cluster do not have, and why."""
 LANES = 8
 BLOCKS_A_THREAD = 4
 """Blocks per worker thread; several balance the load and limit the loss when a worker dies."""
@@ -50,7 +53,7 @@ def integrate_ensemble(
         progress: called with the number of completed trajectories.
         address: address of a scheduler, ``"tcp://10.0.0.1:8786"``; by default a cluster of threads in this process.
         blocks: number of blocks of trajectories, by default four for each thread of the cluster.
-        arguments: those of ``stepper.integrate_ensemble`` except ``threads`` and ``error``.
+        arguments: those of ``stepper.integrate_ensemble`` except ``threads`` and ``device``.
 
     Returns:
         An :class:`EnsembleTrajectory`, also if workers were lost during the computation.
@@ -60,12 +63,28 @@ def integrate_ensemble(
         StateError: if a shape, name or number is invalid; raised before anything is sent.
         BuildError: if a worker cannot compile the source.
     """
-    work = Ensemble(stepper, q, p, **arguments)
+    _check_arguments(stepper, arguments)
+    work = stepper._ensemble(q, p, **arguments)
     wanted = None if blocks is None else checked_count(blocks, "blocks", least=1)
     with _client(address) as client:
         count = wanted or BLOCKS_A_THREAD * sum(client.ncores().values())
         _gather(client, work, list(_slices(len(work), count)), progress)
-    return work.result()
+    return checked_ensemble_result(work)
+
+
+def _check_arguments(stepper: Stepper, arguments: dict[str, Any]) -> None:
+    """Raise ``StateError`` for arguments that ensembles, or those of a cluster, do not have."""
+    known = signature(type(stepper).integrate_ensemble).parameters
+    for name, value in arguments.items():
+        if name not in known:
+            raise StateError(f"integrate_ensemble has no argument '{name}'{closest(name, known)}")
+        if name in OF_THIS_MACHINE and value is not None:
+            raise StateError(f"{name}= is not available on a cluster, whose {OF_THIS_MACHINE[name]}: omit it")
+    if arguments.get("error") is not None and stepper._precise is not None:
+        raise StateError(
+            "error= of a stepper with precision='auto' is not available on a cluster: compile the system with "
+            "precision='double' or 'double-double'"
+        )
 
 
 @contextmanager
@@ -104,11 +123,9 @@ def _gather(client: Any, work: Ensemble, parts: list[slice], progress: Callable[
     futures = {client.submit(_integrate, pickled, work.part(part), pure=False): part for part in parts}
     done = 0
     try:
-        for future, values in as_completed(futures, with_results=True):
+        for future, trajectories in as_completed(futures, with_results=True):
             part = futures[future]
-            arrays = dict(zip(ARRAYS, values, strict=True))
-            parameters = work.parameters[part]
-            work.keep(part, EnsembleTrajectory(**arrays, h=0.0, parameters=parameters, stepper=work.stepper))
+            work.keep(part, trajectories)
             future.release()
             done += part.stop - part.start
             if progress is not None:
@@ -117,10 +134,11 @@ def _gather(client: Any, work: Ensemble, parts: list[slice], progress: Callable[
         client.cancel(list(futures))
 
 
-def _integrate(pickled: bytes, arguments: dict[str, Any]) -> tuple[Any, ...]:
-    """Integrate one slice on a single worker thread and return its arrays."""
-    result = _stepper(pickled).integrate_ensemble(threads=1, **arguments)
-    return tuple(getattr(result, name) for name in ARRAYS)
+def _integrate(pickled: bytes, arguments: dict[str, Any]) -> EnsembleTrajectory:
+    """Integrate one slice on a single worker thread; return its results without stepper and functions."""
+    work = _stepper(pickled)._ensemble(**arguments)
+    work.run(threads=1)
+    return replace(work.result(), stepper=cast(Any, None), spans=())
 
 
 @lru_cache(maxsize=16)

@@ -19,6 +19,7 @@ OPERATIONS = {
     "tables": "tables=",
     "with_sizes": "with_sizes",
     "ensembles": "integrate_ensemble",
+    "ensemble_events": "integrate_ensemble of a stepper with events",
     "device": "device=",
     "observe_ensemble": "integrate_ensemble(observe=)",
     "checkpoint": "checkpoint",
@@ -115,6 +116,7 @@ FEATURES = {
         ("in transformed time", "inputs", "compile the original system"),
         ("in transformed time", "device observe_ensemble chaos chaos_ensemble periodic_orbit fit flow", _ORIGINAL),
         ("in transformed time", _ACTIONS, _ORIGINAL),
+        ("in transformed time", "ensemble_events", "integrate each trajectory, or pass stepper.with_events(())"),
         ("with a time transformation", "shadow_energy path", "compile the stepper without time_transformation"),
         (
             "with the long steps of this method",
@@ -192,6 +194,7 @@ FEATURES = {
         ("with inputs", "sensitivity chaos", "use tangent or pullback, or run.pieces"),
         ("with t_eval", "device", "give h, steps and save_every"),
         ("with error", "device", "give h and steps (fixed step size)"),
+        ("with events", "device observe_ensemble", "count them by observe='events', or pass stepper.with_events(())"),
         ("with t_eval", "observe", "omit observe"),
         ("with observe", "error dense_output", "omit observe"),
     )

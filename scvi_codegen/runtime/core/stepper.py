@@ -413,12 +413,7 @@ class Stepper(WithEventsInDouble, WithPaths, Integrator):
             StateError: if a shape, name or number is invalid.
             BuildError: with ``device`` if there is no GPU, or too little memory on it.
         """
-        q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
-        if error is not None:
-            require(self, "error")
-            error = checked_error(error, {"h": h, "steps": steps, "tolerance": tolerance})
-        work = Ensemble(
-            self._for_run(None, action=action),
+        work = self._ensemble(
             q,
             p,
             inputs=inputs,
@@ -434,16 +429,30 @@ class Stepper(WithEventsInDouble, WithPaths, Integrator):
             options=options,
             error=error,
             device=device,
+            action=action,
             observe=observe,
         )
         work.run(progress=progress, threads=threads)
         if device is not None:
             return cast("EnsembleTrajectory", work.device_result())
-        trajectories = work.result()
-        warn_of_unconfirmed(trajectories.confirmations)
-        warn_of_energy_errors(trajectories, None if work.successive is None else work.successive.energies)
-        warn_of_unresolved_members(trajectories)
-        return trajectories
+        return checked_ensemble_result(work)
+
+    def _ensemble(
+        self,
+        q: States,
+        p: States | None = None,
+        *,
+        velocity: States | None = None,
+        action: bool = False,
+        **settings: Any,
+    ) -> Ensemble:
+        """Return the ensemble of :meth:`integrate_ensemble`, with the same arguments, before its first step."""
+        q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
+        if settings.get("error") is not None:
+            require(self, "error")
+            steps = {name: settings.get(name) for name in ("h", "steps", "tolerance")}
+            settings["error"] = checked_error(settings["error"], steps)
+        return Ensemble(self._for_run(None, action=action), q, p, velocity=velocity, **settings)
 
     @checks_arguments(StateError)
     def chaos_indicators_ensemble(
@@ -580,6 +589,7 @@ class StepperOfRunTimeSizes(Stepper):
     start = _bound(Stepper.start, at_rest=True)
     project = _bound(Stepper.project, at_rest=True)
     integrate_ensemble = _bound(Stepper.integrate_ensemble, at_rest=True)
+    _ensemble = _bound(Stepper._ensemble, at_rest=True)
     chaos_indicators_ensemble = _bound(Stepper.chaos_indicators_ensemble, at_rest=True)
     multipliers, constraint_values = _bound(Stepper.multipliers), _bound(Stepper.constraint_values)
     step, step_positions = _bound(Stepper.step), _bound(Stepper.step_positions)
@@ -618,7 +628,7 @@ class StepperOfRunTimeSizes(Stepper):
         **named: Any,
     ) -> Any:
         """Call a method of the stepper that is bound to the arrays of the call."""
-        if method == Stepper.integrate_ensemble:
+        if method in (Stepper.integrate_ensemble, Stepper._ensemble):
             for argument, operation in (("device", "device"), ("observe", "observe_ensemble")):
                 if named.get(argument) is not None:
                     require(self, operation)
@@ -699,6 +709,17 @@ class StepperOfRunTimeSizes(Stepper):
 
 
 Stepper._of_run_time_sizes = StepperOfRunTimeSizes
+
+
+def checked_ensemble_result(work: Ensemble) -> EnsembleTrajectory:
+    """Return the trajectories of an ensemble that was integrated; issue warnings of inaccurate ones."""
+    trajectories = work.result()
+    warn_of_unconfirmed(trajectories.confirmations)
+    warn_of_energy_errors(trajectories, None if work.successive is None else work.successive.energies)
+    warn_of_unresolved_members(trajectories)
+    return trajectories
+
+
 PER_STEP = (Stepper.integrate, Stepper.start)
 """Methods whose ``threads`` are those of each step."""
 

@@ -7,6 +7,8 @@ trajectories in one call (:mod:`scvi_codegen.runtime.ensemble.batches`), without
 results are bitwise equal for any number of threads.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -48,6 +50,7 @@ from scvi_codegen.runtime.ensemble.observation import EnsembleObservation
 from scvi_codegen.runtime.ensemble.result import EVENT_FAILED, INTERRUPTED, OK, EnsembleTrajectory, Span
 from scvi_codegen.runtime.ensemble.schedule import CommonSteps
 from scvi_codegen.runtime.ensemble.thread_pool import StopCheck, run_jobs
+from scvi_codegen.runtime.events.event import Crossings, Event
 from scvi_codegen.runtime.inputs.segments import (
     Input,
     breakpoints_until,
@@ -65,7 +68,10 @@ from scvi_codegen.validation import LARGEST_COUNT, checked_count
 
 
 class SavedLane(NamedTuple):
-    """Saved states of one trajectory, its status, its number of steps and of those solved by Newton's method."""
+    """Saved states of one trajectory, its status, numbers of steps and of those solved by Newton's method, and events.
+
+    ``actions`` are those up to each state of runs that sum the action.
+    """
 
     t: Array
     q: Array
@@ -73,6 +79,15 @@ class SavedLane(NamedTuple):
     status: str
     steps: int
     fallback_steps: int = 0
+    events: tuple[Crossings, ...] = ()
+    actions: Array | None = None
+
+    @classmethod
+    def of(cls, states: Trajectory, rows: Any = slice(None), status: str = OK) -> SavedLane:
+        """Return rows of the states of a single run."""
+        actions = None if states.actions is None else states.actions[rows]
+        about = status, states.steps, states.fallback_steps, states.events, actions
+        return cls(states.t[rows], states.q[rows], states.p[rows], *about)
 
 
 class Ensemble:
@@ -85,8 +100,8 @@ class Ensemble:
         inputs: validated inputs.
         start: (k, m) initial positions and momenta.
         common: the trajectories with common steps, ``None`` with adaptive steps.
-        plans: step plan of each trajectory with adaptive steps.
-        saved: completed trajectories with adaptive steps.
+        plans: step plan of each trajectory that is integrated by itself.
+        saved: completed trajectories of these.
     """
 
     def __init__(
@@ -113,6 +128,7 @@ class Ensemble:
         interface = stepper.interface
         _check_device(device, h, inputs, save_every, error=error, t_eval=t_eval)
         _check_observe(stepper, observe, inputs=inputs, error=error, t_eval=t_eval)
+        recorded = _recorded_events(stepper, device, observe)
         t = self.t0 = checked_time(t, interface.words)
         steps, t_end = _steps_or_end(t, h, steps, t_end, inputs, tolerance, t_eval, words=interface.words)
         require(stepper, "ensembles")
@@ -143,15 +159,16 @@ class Ensemble:
                 values[energy] = stepper.energy(at, momenta, 0.0, values)
         self.values_at = partial(parameters_at, stepper.parameters, self.parameters, self.inputs)
         self.common: CommonRuns | DeviceRuns | None = None
+        self.observe = observe
         self.plans: Sequence[StepPlan] = ()
         self.saved: dict[int, SavedLane] = {}
         self.error, self.confirmations = error, list[GlobalError | None]()
         self.t_eval: Array | None = None
         self.ends = np.empty(0)
-        # events change the states of each within steps, and inputs of two words its parameters
+        # events are recorded by single runs, which they change or end, and inputs of two words change parameters
         of_two_words = words > 1 and fixed is not None and (bool(self.inputs) or stepper.ensemble is None)
-        self.singly = stepper.changes_states or of_two_words
-        self.fixed = fixed if words > 1 else None
+        self.singly = bool(recorded) or of_two_words
+        self.fixed = fixed
         if fixed is None or self.singly:
             self.plans = self._plans(fixed, cast(ArrayLike, t_end), tolerance)
             self.plans = self.plans if error is None else list(self.plans)
@@ -205,7 +222,7 @@ class Ensemble:
         stepper = self.stepper
         if self.common is not None or self.adaptive is not None:
             return None
-        if self.inputs or stepper.changes_states or stepper.in_tau or not stepper.binding.reusable:
+        if self.inputs or stepper.events or stepper.in_tau or not stepper.binding.reusable:
             return None
         ends = self.ends
         if self.error is not None or not (self.t_eval is None or self._saves_ends(ends)):
@@ -250,8 +267,10 @@ class Ensemble:
 
     def _output_times(self, fixed: CommonSteps | None, t_eval: ArrayLike | None) -> Array | None:
         """Return the validated output times; raise ``StateError`` if inputs do not cover a run."""
-        if fixed is not None:  # ends of steps of two words are saved as they are
-            return fixed.times(tau=False) if self.fixed is None else None
+        if fixed is not None:  # terminal events end runs at times of their own; two words are saved as they are
+            events = self.stepper.events
+            own = any(event.terminal for event in events) or (fixed.words > 1 and not events)
+            return None if own else fixed.times(tau=False)
         for plan in self.plans if self.inputs else ():
             breakpoints_until(self.t0, plan.t_end, self.inputs)
         if t_eval is None:
@@ -277,13 +296,13 @@ class Ensemble:
             "t": self.t0,
             "parameters": self.parameters[part],
             "options": self.options,
+            "observe": self.observe,
+            "error": self.error,
         }
         if self.common is None:
             ends = [plan.t_end for plan in self.plans[part]]
             if self.fixed is not None:
                 return arguments | self._fixed_steps()
-            if h := self.plans[0].h:
-                return arguments | {"h": h, "t_end": ends[0]}
             return arguments | {"t_end": ends, "tolerance": self.plans[0].tolerance or None, "t_eval": self.t_eval}
         return arguments | self._fixed_steps()
 
@@ -294,9 +313,14 @@ class Ensemble:
     def keep(self, part: slice, trajectories: EnsembleTrajectory) -> None:
         """Store the results of a slice that was integrated elsewhere."""
         if self.common is None:
-            fallbacks = cast(Array, trajectories.fallback_steps).tolist()
-            for j, each, count in zip(range(part.start, part.stop), trajectories.each(), fallbacks, strict=True):
-                self.saved[j] = SavedLane(*each, count)
+            fallbacks, actions = cast(Array, trajectories.fallback_steps).tolist(), trajectories.actions
+            for k, each in enumerate(trajectories.each()):
+                events = trajectories.events[k] if trajectories.events else ()
+                sums = None if actions is None else actions[: len(each[0]), k]
+                self.saved[part.start + k] = SavedLane(*each, fallbacks[k], events, sums)
+            if self.error is not None:
+                self.confirmations[part] = trajectories.confirmations
+                cast(list[StepPlan], self.plans)[part] = trajectories.plans
             return
         common = cast(CommonRuns, self.common)
         common.q[:, part], common.p[:, part] = trajectories.q, trajectories.p
@@ -304,6 +328,10 @@ class Ensemble:
         common.fallback_steps[part] = cast(Array, trajectories.fallback_steps)
         if common.times is not None:
             common.times[:, part] = trajectories.times
+        if common.actions is not None:
+            common.actions[:, part] = trajectories.actions
+        if common.observation is not None:
+            common.observation.keep(part, cast(Array, trajectories.observed))
 
     def run(self, *, progress: Callable[[int], None] | None = None, threads: int | None = None) -> None:
         """Integrate all trajectories with ``threads`` threads; an exception raised by ``progress`` stops them promptly.
@@ -340,25 +368,24 @@ class Ensemble:
             "inputs": inputs_of_slice(self.inputs, j) or None,
         } | {
             "t": self.t0,
-            "save_every": self.save_every if self.t_eval is None else 1,
+            "save_every": 1 if self.inputs and self.t_eval is not None else self.save_every,
             "options": self.options,
             "progress": check_stop,
         }
         if self.stepper.interface.words > 1:
             arguments["parameters"] = self.parameters[j]
-        steps: dict[str, Any] = {"h": plan.h or None, "tolerance": plan.tolerance or None, "t_end": plan.t_end}
+        steps: dict[str, Any] = {"tolerance": plan.tolerance or None, "t_end": plan.t_end}
         if self.fixed is not None:
             steps = self._fixed_steps()
-        if self.t_eval is not None and not (plan.h and self.inputs):
+        elif self.t_eval is not None:
             arguments["t_eval"] = self.t_eval[np.abs(self.t_eval - self.t0) <= abs(plan.t_end - self.t0)]
-        stepper = self.stepper if self.stepper.changes_states else self.stepper.with_events(())
-        integrate: Callable[..., Trajectory] = stepper.integrate
+        integrate: Callable[..., Trajectory] = self.stepper.integrate
         with without_accuracy_warnings():
             if self.error is not None:
                 with suppress(StateError, StepFailedError):
                     states = integrate(q, p, error=self.error, t_end=plan.t_end, **arguments)
                     self.confirmations[j], cast(list[StepPlan], self.plans)[j] = states.confirmation, states.plan
-                    return SavedLane(states.t, states.q, states.p, OK, states.steps, states.fallback_steps)
+                    return SavedLane.of(states)
             try:
                 states = integrate(q, p, **steps, **arguments)
             except StepFailedError as failure:
@@ -369,13 +396,15 @@ class Ensemble:
                 states, status = cast(Trajectory, failure.trajectory), EVENT_FAILED
             except StateError:  # a sum of finite terms has overflowed
                 return SavedLane(stacked([self.t0]), q[np.newaxis], p[np.newaxis], "not finite", 0)
-        rows = slice(None)
-        if self.t_eval is not None and plan.h and self.inputs:  # ends of steps, after changes of the state
-            times = states.forward * states.t
-            wanted = states.forward * self.t_eval + WHOLE * abs(plan.h)
-            rows = np.searchsorted(times, wanted[wanted < times[-1] + 2 * WHOLE * abs(plan.h)], side="right") - 1
-        about = status, states.steps, states.fallback_steps
-        return SavedLane(states.t[rows], states.q[rows], states.p[rows], *about)
+        return SavedLane.of(states, self._common_rows(states), status)
+
+    def _common_rows(self, states: Trajectory) -> Any:
+        """Return the rows at the common times of fixed steps: the last states there, after changes by events."""
+        if self.fixed is None or self.t_eval is None:
+            return slice(None)
+        times, common = (states.forward * np.asarray(each) for each in (states.t, self.t_eval))
+        latest = common + WHOLE * abs(self.fixed.h)
+        return np.searchsorted(times, latest[latest < times[-1] + 2 * WHOLE * abs(self.fixed.h)], side="right") - 1
 
     def result(self) -> EnsembleTrajectory:
         """Return the trajectories; those neither completed nor failed have the status ``"interrupted"``."""
@@ -445,17 +474,21 @@ class Ensemble:
         words, shape = self.stepper.interface.words, (count, len(self), self.stepper.dimension)
         times = missing((count, len(lanes)), words) if self.t_eval is None else None
         q, p = missing(shape, words), missing(shape, words)
+        actions = np.full(shape[:2], np.nan) if self.stepper.sums_action else None
         for j, each in enumerate(lanes):
             row = slice(0, len(each.t))
             q[row, j], p[row, j] = each.q, each.p
+            if actions is not None and each.actions is not None:
+                actions[row, j] = each.actions
             if times is not None:
                 times[row, j] = each.t
-        if self.fixed is not None:
+        if self.fixed is not None and not any(event.terminal for event in self.stepper.events):
             t, times = max((each.t for each in lanes), key=len), None
         status = np.array([each.status for each in lanes], dtype="<U32")
         steps = np.array([each.steps for each in lanes], dtype=np.int64)
         fallbacks = np.array([each.fallback_steps for each in lanes], dtype=np.int64)
-        return self._trajectories(t, times, q, p, status, steps, fallbacks)
+        whole = self._trajectories(t, times, q, p, status, steps, fallbacks)
+        return replace(whole, actions=actions, events=tuple(each.events for each in lanes))
 
     def _successive_result(self, work: SuccessiveRuns) -> EnsembleTrajectory:
         count, rows, words = len(self), 1 + int(work.stored.max()), self.stepper.interface.words
@@ -540,6 +573,15 @@ def _check_device(device: str | None, h: float | None, inputs: object, save_ever
             "device='cuda' with adaptive steps saves the initial and the final states, and has no inputs: omit "
             "save_every and inputs, give h and steps, or omit device"
         )
+
+
+def _recorded_events(stepper: Any, device: str | None, observe: str | None) -> tuple[Event, ...]:
+    """Return the events that trajectories record, none if they are counted; raise an error where that is impossible."""
+    recorded: tuple[Event, ...] = stepper.events if observe != "events" else ()
+    if recorded:
+        check_together(events=recorded, device=device, observe_ensemble=observe)
+        require(stepper, "ensemble_events")
+    return recorded
 
 
 def _check_observe(stepper: Any, observe: str | None, **others: Any) -> None:

@@ -107,6 +107,15 @@ class EnsembleObservation:
         binding.function("observe")(block, 0, len(t), *map(binding.pointer, map(np.ascontiguousarray, (t, q, p))))
         self.values[:, :, j] = seen[:, :, 0]
 
+    def keep(self, part: slice, observed: Array) -> None:
+        """Store ``observed`` of the result of a slice of the trajectories that was integrated elsewhere."""
+        if self.name == "events":
+            falls = np.array([event.direction < 0 for event in self.stepper.events])
+            self.values[RISES, ~falls, part] = observed.T[~falls]
+            self.values[FALLS, falls, part] = observed.T[falls]
+        else:
+            self.values[LEAST : LARGEST + 1, :, part] = np.atleast_3d(observed).swapaxes(1, 2)
+
     def result(self) -> Array:
         """Return ``observed`` of the result."""
         extremes = self.values[LEAST : LARGEST + 1].swapaxes(1, 2)

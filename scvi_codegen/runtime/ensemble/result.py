@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, TypeAlias, cast, overload
 
@@ -33,6 +33,7 @@ from scvi_codegen.validation import checks_arguments
 if TYPE_CHECKING:
     import xarray
 
+    from scvi_codegen.runtime.events.event import Crossings
     from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 OK, INTERRUPTED, EVENT_FAILED = "ok", "interrupted", "event failed"
@@ -92,6 +93,7 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
         spans: with inputs, rows of states of a slice of trajectories and their parameters.
         confirmations: with ``error=``, of each trajectory as of :class:`Trajectory`, ``None`` for one that fails; else
             empty.
+        events: (k,) crossings of the events of each trajectory, parallel to ``stepper.events``; empty without events.
     """
 
     q: Array
@@ -100,6 +102,7 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
     fallback_steps: NDArray[np.int64] | None = field(default=None, repr=False)
     spans: tuple[Span, ...] = field(default=(), repr=False)
     confirmations: tuple[GlobalError | None, ...] = field(default=(), repr=False)
+    events: tuple[tuple[Crossings, ...], ...] = field(default=(), repr=False)
 
     @overload
     def __getitem__(self, j: int) -> Trajectory: ...
@@ -135,7 +138,8 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
                     fallback_steps=0 if self.fallback_steps is None else int(self.fallback_steps[j]),
                 )
             )
-        return joined(pieces) if len(pieces) > 1 else pieces[0]
+        whole = joined(pieces) if len(pieces) > 1 else pieces[0]
+        return replace(whole, events=self.events[j]) if self.events else whole
 
     @property
     def _pictured(self) -> list[Trajectory]:
