@@ -170,7 +170,7 @@ long long NAME(call_each)(NAME(each) *c, long long steps)
   return taken;
 }
 
-#ifdef HAS_MOMENTUM
+#if defined(HAS_MOMENTUM) && !defined(DOUBLE_DOUBLE)
 /* Momenta of states with velocities v and parameters of their own; returns the number of states before a failure. */
 long long NAME(call_momenta)(long long count, double t, long long m, long long parameters_each, const double *q,
     const double *v, const double *parameters, double *p, double *workspace)
@@ -182,7 +182,7 @@ long long NAME(call_momenta)(long long count, double t, long long m, long long p
 }
 #endif
 
-#ifdef HAS_PROJECT
+#if defined(HAS_PROJECT) && !defined(DOUBLE_DOUBLE)
 /* Projections (q1, p1) of states with parameters of their own, and their distances, NaN after a failure. */
 void NAME(call_project)(long long count, double t, long long m, long long parameters_each, const double *q,
     const double *p, const double *parameters, double *q1, double *p1, double *apart, double *workspace)

@@ -6,6 +6,7 @@ import operator
 import pickle
 import subprocess
 from collections.abc import Callable
+from decimal import Decimal
 from fractions import Fraction
 from importlib.util import find_spec
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Any
 import mpmath
 import numpy as np
 import pytest
+import sympy
 from mpmath import mp
 from notation import lagrange
 from oracle import stepper_of
@@ -382,6 +384,12 @@ def test_numbers() -> None:
             assert abs(mp.mpf(high) + mp.mpf(low) - third) < 1e-32
     assert two_words(0.1, "q") == (0.1, 0.0)
     assert two_words(10**17 + 1, "q") == (1e17, 1.0)
+    for value in (np.int8(3), np.uint32(3), np.array(3), np.float32(3), Decimal(3), sympy.Integer(3)):
+        assert two_words(value, "q") == (3.0, 0.0)
+    assert two_words(np.int64(10**17 + 1), "q") == (1e17, 1.0)
+    assert (split(np.array([1, 10**17 + 1]), "q")[1] == [0.0, 1.0]).all()
+    assert two_words(sympy.pi, "q") == (np.pi, 1.2246467991473532e-16)
+    assert two_words(np.array("1/3"), "q") == two_words("1/3", "q")
     long = np.longdouble(1) / 3
     high, low = two_words(long, "q")
     assert np.longdouble(high) + np.longdouble(low) == long
@@ -429,6 +437,82 @@ def exact_orbit(t: object, e: object = Fraction(1, 2)) -> list:
     e, mean = mp.mpf(e.numerator) / e.denominator, mp.fmod(t, 2 * mp.pi)
     angle = mp.findroot(lambda x: x - e * mp.sin(x) - mean, mean)
     return [mp.cos(angle) - e, mp.sqrt(1 - e**2) * mp.sin(angle)]
+
+
+def test_every_quantity_has_both_words(tmp_path: Path) -> None:
+    """Coordinates, momenta and velocities by name, of runs, in progress, of ensembles, recordings and events."""
+    stepper = sc.compile_stepper(system("kepler"), "svi:4", precision="double-double", events=sc.Event("y - 3/5"))
+    start: dict[str, Any] = {"q": ["1/3", "0.7"], "velocity": ["0.1", "-1/7"], "t": "1/3", "parameters": {"m": "1.1"}}
+    run = stepper.integrate(**start, h=1 / 16, steps=8)
+    runs = stepper.integrate_ensemble(**start | {"q": [start["q"]], "velocity": [start["velocity"]]}, h=1 / 16, steps=8)
+    recorded = sc.record_run(stepper.start(**start, h=1 / 16), tmp_path / "a.run", steps=8)
+    now = stepper.start(**start, h=1 / 16)
+    now.advance(8)
+    with mp.workdps(40):
+        columns = {"x": ("q", 0), "p_y": ("p", 1), "y_dot": ("velocity", 1)}
+        for name, (whole, column) in columns.items():
+            values = run.mp(whole)[:, column]
+            assert any(mp.mpf(float(value)) != value for value in values)
+            for other in (run.mp(name), run[1:].mp(name), runs[0].mp(name), recorded[:].mp(name), recorded[name].mp()):
+                assert abs(other - values[-len(other) :]).max() < 1e-31, name
+            assert abs(runs.mp(name)[:, 0] - values).max() < 1e-31
+        assert abs(run.mp("x_dot")[0] - mp.mpf("0.1")) < 1e-32
+        for states in (run, runs[0], recorded):
+            t, q, p = states[8]
+            assert t.mp() == run.mp("t")[8] == now.t.mp()
+            assert abs(q.mp() - run.mp("q")[8]).max() + abs(p.mp() - run.mp("p")[8]).max() < 1e-31
+        assert now.energy.mp() == run.mp("energy")[8]
+        assert (now.velocity.mp() == run.mp("velocity")[8]).all()
+        assert (now.momentum_maps.mp() == run.mp("momentum_maps")[8]).all()
+        (crossings,), (kept,) = run.events, recorded.events
+        assert len(crossings) == 1
+        assert abs(crossings.q.mp()[0, 1] - mp.mpf(3) / 5) < 1e-31
+        assert crossings.t.mp()[0] == kept.t.mp()[0]
+        q, p = run.at(0.4)
+        again = stepper.integrate(run.q[0], run.p[0], t=run.t[0], h=1 / 16, t_end=0.4, parameters={"m": "1.1"})
+        assert abs(q.mp() - again.mp("q")[-1]).max() < 1e-30
+
+
+def test_arrays_have_both_words() -> None:
+    """Arrays of coordinates by name, and their items."""
+    text = "q_dot[0]**2/2 + q_dot[1]**2/2 + z_dot**2/2 - (q[0] - q[1])**2/2 - z**2*q[0]**2"
+    chain = sc.LagrangianSystem.from_text(name="chain", coordinates=["q[2]", "z"], lagrangian=text)
+    stepper = sc.compile_stepper(chain, "svi:2", precision="double-double")
+    run = stepper.integrate({"q": ["0.1", "1/3"], "z": "0.7"}, p={"q": ["0", "0.1"], "z": 0}, h=0.125, steps=1)
+    with mp.workdps(40):
+        q, (z, third) = run.mp("q"), (mp.mpf(7) / 10, mp.mpf(1) / 3)
+        assert abs(q[0] - [mp.mpf(1) / 10, third, z]).max() < 1e-32
+        assert abs(run.mp("z")[0] - z) + abs(run.mp("p_q")[0][1] - mp.mpf(1) / 10) < 1e-32
+        for by_name in (dict(run.q.items()), stepper.arrays(run.q), {"q": run.q["q"], "z": run.q["z"]}):
+            assert abs(by_name["q"].mp()[0][1] - third) + abs(by_name["z"].mp()[0] - z) < 1e-32
+
+
+def test_velocities_at_times_of_two_words() -> None:
+    """Momenta, velocities, energies, steps and projections of systems that depend on t use both words of t."""
+    text = "(2 + sin(t))*(x_dot**2 + y_dot**2)/2 - x**2*cos(t)/2 + t*x_dot"
+    moving = sc.LagrangianSystem.from_text(name="moving", coordinates=["x", "y"], lagrangian=text)
+    stepper = sc.compile_stepper(moving, "svi:4", precision="double-double")
+    ring = sc.LagrangianSystem.from_text(
+        name="ring",
+        coordinates=["x", "y"],
+        lagrangian="(x_dot**2 + y_dot**2)/2",
+        constraints=["x**2 + y**2 = (1 + sin(t)/4)**2"],
+    )
+    with mp.workdps(40):
+        t = 3 + mp.mpf(3) / 10**17
+        run = stepper.integrate(["1", "0"], velocity=["0.3", "0.1"], t=t, h=1 / 64, steps=1)
+        p = (2 + mp.sin(t)) * mp.mpf("0.3") + t
+        assert abs(run.mp("p")[0][0] - p) < 1e-31
+        many = stepper.integrate_ensemble([["1", "0"]], velocity=[["0.3", "0.1"]], t=t, h=1 / 64, steps=1)
+        assert abs(many.mp("p")[0][0][0] - p) < 1e-31
+        assert abs(run.mp("x_dot")[0] - mp.mpf("0.3")) < 1e-31
+        q1, p1 = stepper.step(run.q[0], run.p[0], 1 / 64, t=t)
+        assert (q1.mp() == run.mp("q")[1]).all()
+        assert (p1.mp() == run.mp("p")[1]).all()
+        radius, rate, (c, s) = 1 + mp.sin(t) / 4, mp.cos(t) / 4, (mp.mpf(3) / 5, mp.mpf(4) / 5)
+        q, v = [radius * c, radius * s], [rate * c - s, rate * s + c]
+        moved = sc.compile_stepper(ring, "svi:4", precision="double-double").project(q, v, t=t)
+        assert abs(np.array([moved[0].mp() - q, moved[1].mp() - v])).max() < 1e-31
 
 
 def test_runs() -> None:

@@ -1,5 +1,7 @@
 """Double-double steps whose stage equations Newton's method solves, against 60 digits and other coordinates."""
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 from mpmath import mp
@@ -9,6 +11,7 @@ import scvi_codegen as sc
 from scvi_codegen.exact.step import derived_step
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.discretise import discretised_form
+from scvi_codegen.runtime.core.words import fraction_of, two_words, word
 from scvi_codegen.runtime.rotations.attitudes import momenta_of_body
 
 LINKS = "(x_dot**2 + y_dot**2)/2 + 0.75*(u_dot**2 + w_dot**2)/2 - y - 0.75*w"
@@ -16,6 +19,7 @@ MUTUAL = "a_dot**2 + b_dot**2/2 + a_dot*b_dot*cos(a - b) + 2*cos(a) + cos(b)"
 RELATIVISTIC = "-sqrt(1 - x_dot**2 - y_dot**2) + 1/sqrt(x**2 + y**2) + sin(t)*x/8"
 ROD, SECOND = "x**2 + y**2 - 1", "(u - x)**2 + (w - y)**2 - "
 PLANE, FOUR = ["x", "y"], ["x", "y", "u", "w"]
+PAIRS = [(3, 2), (5, 2), (7, 4), (9, 4)]
 STATES = {
     "rod": ([0.6, -0.8], [0.8, 0.6]),
     "rods": ([0.6, -0.8, 1.6, -0.8], [0.8, 0.6, 0.8, 0.3]),
@@ -132,6 +136,32 @@ def test_first_order() -> None:
         assert abs(v.mp()[0] + mp.sin(x) / (1 + 2 * (x * x + y * y))) < 1e-31
 
 
+def test_numbers_of_first_order_states() -> None:
+    """Values of variables in order or by name, and coordinates beside a rotation, have both words."""
+    text = "(1 + x**2 + y**2)*(x*y_dot - y*x_dot)/2 - cos(x) - sin(y)"
+    particle = sc.LagrangianSystem.from_text(name="particle", coordinates=PLANE, lagrangian=text)
+    stepper = sc.compile_stepper(particle, "svi:1", precision="double-double")
+    step = {"h": 1 / 1024, "steps": 1}
+    with mp.workdps(40):
+        expected = [mp.mpf(1) / 3, mp.mpf(1) / 10]
+        for state in ({"x": Fraction(1, 3), "y": "0.1"}, ["1/3", expected[1]]):
+            run = stepper.integrate(state, **step)
+            assert abs(run.variables.mp()[0] - expected).max() < 1e-32
+            assert (stepper.integrate(run.variables[1], **step).q_low[0] == run.q_low[1]).all()
+        many = stepper.integrate_ensemble({"x": ["1/3", np.int64(1)], "y": "0.1"}, **step)
+        assert abs(many.mp("x")[0] - [expected[0], 1]).max() < 1e-32
+        assert abs(many.mp("y")[0] - expected[1]).max() < 1e-32
+        turning = sc.LagrangianSystem.from_text(
+            name="turning",
+            coordinates=["x"],
+            rotations={"R": "w"},
+            lagrangian="x_dot**2/2 + (w_1**2 + 2*w_2**2 + 3*w_3**2)/2 - x**2/2 - R_11*x",
+        )
+        body = sc.compile_stepper(turning, "svi:1", precision="double-double")
+        run = body.integrate({"x": "1/3", "R": np.eye(3)}, velocity={"x": "0.1", "w": [1, 2, 3]}, **step)
+        assert abs(run.mp("x")[0] - expected[0]) + abs(run.mp("x_dot")[0] - expected[1]) < 1e-32
+
+
 @pytest.mark.second
 def test_constraints_hold() -> None:
     """Constraints of a four-bar and their rates hold to 1e-30, and so does the energy but for the order."""
@@ -188,6 +218,15 @@ def test_initial_states() -> None:
     assert np.abs(again.constraint_values()).max() < 1e-30
     many = stepper.integrate_ensemble([q, [0.6, -0.8]], velocity=[stepper.velocity(q, p), [0.8, 0.6]], h=0.1, steps=1)
     assert np.abs(many[1].constraint_values()).max() < 1e-30
+    circle = [(Fraction(a * a - b * b, a * a + b * b), Fraction(2 * a * b, a * a + b * b)) for a, b in PAIRS]
+    exact = [[x, y] for x, y in circle], [[-y / 3, x / 3] for x, y in circle]
+    many = stepper.integrate_ensemble(*exact, h=0.1, steps=1)
+    for k, (x, y) in enumerate(zip(*exact, strict=True)):
+        one = stepper.integrate(x, y, h=0.1, steps=1)
+        for states in (one.q[0], many.q[0, k]):
+            assert [fraction_of(each) for each in states] == [fraction_of(word(*two_words(each, ""))) for each in x]
+        for states in (one.p[0], many.p[0, k]):
+            assert [fraction_of(each) for each in states] == [fraction_of(word(*two_words(each, ""))) for each in y]
     many = stepper.integrate_ensemble([q, q], [p, p], h=0.1, steps=1)
     assert (many.q[-1] == again.q[-1]).all()
     assert (many.q.low[-1] == again.q.low[-1]).all()

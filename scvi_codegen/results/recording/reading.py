@@ -18,7 +18,7 @@ from scvi_codegen.files.labelled_arrays import checked_units
 from scvi_codegen.representation import LONGEST, clipped
 from scvi_codegen.results.recording.manifest import Chunk, chunk_paths, no_states, read_chunk, read_manifest
 from scvi_codegen.runtime.core.stepper import Stepper
-from scvi_codegen.runtime.core.words import check_keeps_words, low_words
+from scvi_codegen.runtime.core.words import check_keeps_words, low_words, scalar
 from scvi_codegen.runtime.events.event import Crossings
 from scvi_codegen.runtime.rotations.attitude_history import AttitudeHistory
 from scvi_codegen.runtime.rotations.quantities import named_quantities
@@ -96,7 +96,7 @@ class RecordedRun(AttitudeHistory):
             return self._quantity(rows)
         if not isinstance(rows, slice):
             k = checked_row(rows, len(self))
-            return float(self.t[k]), self.q[k], self.p[k]
+            return scalar(self.t[k]), self.q[k], self.p[k]
         wanted = self.rows(rows)
         return self._trajectory(tuple(self.gather(wanted, range(len(COLUMNS)))), wanted)
 

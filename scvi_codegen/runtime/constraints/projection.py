@@ -14,14 +14,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import AccuracyWarning, StateError, warn
-from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import REASONS, STATUS
 from scvi_codegen.rendering.text import INPUT_PRECISION, LARGEST_VIOLATION, ROUNDING_UNITS
 from scvi_codegen.runtime.core.features import require
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.pairs import quotient_of
 from scvi_codegen.runtime.core.validation import Array, Parameters, States, inputs_not_given, missing_input
-from scvi_codegen.runtime.core.words import block_of
+from scvi_codegen.runtime.core.words import block_of, checked_time
 from scvi_codegen.runtime.rotations.states import checked_pair, checked_states
 
 MOST_SHOWN, MOST_DENSE = 4, 64
@@ -61,15 +60,14 @@ def projected(
     _of_constrained(stepper, q0, p0, t)
     binding, (q1, p1) = stepper.binding, np.empty((2, len(q0) * stepper.interface.words))
     before, values = (block_of(q0), block_of(p0)), block_of(stepper._parameters(parameters))
-    status = binding.function("project")(
-        checked_number(t, "the time t"), *map(binding.pointer, (*before, values, q1, p1)), binding.workspace()
-    )
+    at = stepper._time_argument(checked_time(t, stepper.interface.words))
+    status = binding.function("project")(at, *map(binding.pointer, (*before, values, q1, p1)), binding.workspace())
     if status:
         if wrong := _dependent(stepper, q0, t, parameters, nearest=True):
             raise StateError(f"projection onto the constraints failed near q = {_shown(q0)}: {wrong}")
         _refuse(stepper, status, q0)
     apart = np.empty(2)
-    status = binding.function("apart")(t, *map(binding.pointer, (*before, q1, p1, values, apart)), binding.workspace())
+    status = binding.function("apart")(at, *map(binding.pointer, (*before, q1, p1, values, apart)), binding.workspace())
     if status:
         _refuse(stepper, status, q0)
     return stepper._numbers(q1), stepper._numbers(p1), apart

@@ -1,6 +1,7 @@
 """Compiled method for one system: single steps and the discrete Lagrangian as pure functions of their arguments."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,7 +11,7 @@ from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import SolverOptions, step_failure
 from scvi_codegen.runtime.core.features import require
 from scvi_codegen.runtime.core.validation import Array, Parameters, States, check_inputs_given
-from scvi_codegen.runtime.core.words import block_of
+from scvi_codegen.runtime.core.words import block_of, checked_time
 from scvi_codegen.runtime.rotations.states import checked_pair
 from scvi_codegen.runtime.sensitivity.step_derivatives import LinearisedMethod
 
@@ -49,14 +50,15 @@ class Integrator(LinearisedMethod):
         check_inputs_given(self.interface, parameters)
         arrays = [*map(block_of, (q0, p0, self._parameters_at(q0, p0, parameters)))]
         q1, p1 = np.empty_like(arrays[0]), np.empty_like(arrays[1])
-        self._solve(self.binding, "step", t, h, arrays, options, (q1, p1))
+        t = checked_time(t, self.interface.words)
+        self._solve(self.binding, "step", self._time_argument(t), h, arrays, options, (q1, p1))
         return self.named(self._numbers(q1)), self.named(self._numbers(p1))
 
     def _solve(
         self,
         binding: Binding,
         name: str,
-        t: float,
+        t: Any,
         h: float,
         inputs: Sequence[Array],
         options: SolverOptions | None,
@@ -65,7 +67,7 @@ class Integrator(LinearisedMethod):
         """Solve the equations of a step in C and fill the arrays ``results``; raise ``StepFailedError`` on failure."""
         report = binding.new("report *")
         status = binding.function(name)(
-            checked_number(t, "the time t"),
+            t,
             checked_step(h),
             *map(binding.pointer, inputs),
             binding.options(options),
@@ -148,6 +150,7 @@ class Integrator(LinearisedMethod):
         state = *checked_pair(self.interface, q, p), self._parameters(parameters)
         q1, p1, values = *np.empty((2, self.dimension)), np.empty(len(self.interface.exchange_names) + 1)
         name = "work_and_impulses"
+        t = checked_number(t, "the time t")
         self._solve(self.binding.with_function(name), name, t, h, state, options, (q1, p1, values))
         return q1, p1, values[:-1]
 
@@ -179,5 +182,6 @@ class Integrator(LinearisedMethod):
         ends = self._vector(q0, "q0"), self._vector(q1, "q1"), self._parameters(parameters)
         p0, p1, action = *np.empty((2, self.dimension)), np.empty(1)
         binding = self.binding.with_function("discrete_legendre")
+        t = checked_number(t, "the time t")
         self._solve(binding, "discrete_legendre", t, h, ends, options, (p0, p1, action))
         return p0, p1, float(action[0])

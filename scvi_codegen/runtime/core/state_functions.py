@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import REASONS
 from scvi_codegen.runtime.arrays.interface import constraint_shapes
 from scvi_codegen.runtime.core.compiled_method import CompiledMethod
@@ -24,7 +23,7 @@ from scvi_codegen.runtime.core.validation import (
     coordinate_shapes,
     parameter_index,
 )
-from scvi_codegen.runtime.core.words import block_of, by_name, from_block
+from scvi_codegen.runtime.core.words import block_of, by_name, checked_time, from_block, low_words, scalar, unnamed
 from scvi_codegen.runtime.rotations.states import checked_pair, checked_states, is_one_state
 
 PROBES = 8
@@ -127,7 +126,7 @@ class StateFunctions(CompiledMethod):
         result = self._energies_of(times, positions, momenta, self._parameters(parameters))
         if not is_one_state(self.interface, q):
             return result
-        return float(result[0]) if self.interface.words == 1 else result.reshape(())
+        return scalar(result[0])
 
     def _energy_parts(self, q: Array, p: Array, t: Array, parameters: Array) -> Array:
         """Return (n, 3) kinetic, potential and total energies of (n, m) states; parts of run-time sizes, else NaN."""
@@ -207,11 +206,11 @@ class StateFunctions(CompiledMethod):
         self, name: str, q: States, other: States, t: ArrayLike, parameters: Parameters, label: str
     ) -> Array:
         if is_one_state(self.interface, q):
-            at, values = checked_number(t, "the time t"), self._parameters(parameters)
+            at, values = checked_time(t, self.interface.words), self._parameters(parameters)
             return self._transformed(name, at, *checked_pair(self.interface, q, other, label), values)
         times, positions, others = checked_states(self.interface, q, other, t, second=label)
         values, result = self._parameters(parameters), others.copy()
-        for k, (at, position, row) in enumerate(zip(times.tolist(), positions, others, strict=True)):
+        for k, (at, position, row) in enumerate(zip(times, positions, others, strict=True)):
             result[k] = self._transformed(name, at, position, row, values)
         return result
 
@@ -234,11 +233,17 @@ class StateFunctions(CompiledMethod):
             raise StateError(f"velocities are unavailable for a system defined by a Hamiltonian: {other_form}")
         result = np.empty(len(other) * self.interface.words)
         pointers = map(self.binding.pointer, (*map(block_of, (q, other, values)), result))
-        status = self.binding.function(name)(t, *pointers, self.binding.workspace())
+        status = self.binding.function(name)(self._time_argument(t), *pointers, self.binding.workspace())
         if status:
             hint = "; if the Hamiltonian is singular in p, give p instead of velocity" if name == "momentum" else ""
             raise StateError(f"the {name} at q = {q} and {other} cannot be computed: {REASONS[status]}{hint}")
         return self._numbers(result)
+
+    def _time_argument(self, t: float) -> Any:
+        """Return a time as an argument of C: a number or, in double-double arithmetic, a pointer to both words."""
+        if self.interface.words == 1:
+            return float(t)
+        return self.binding.pointer(np.array([float(t), float(low_words(t))]))
 
     def _numbers(self, block: Array) -> Array:
         """Return the numbers of an array of C, whose low words follow the high words in double-double arithmetic."""
@@ -249,7 +254,7 @@ class StateFunctions(CompiledMethod):
 
         States are accepted in the same form, ``{"x": 0.0, "q": [..]}`` of ``coordinates=["x", "q[8]"]``.
         """
-        return by_name(np.asarray(values), coordinate_shapes(self.interface))
+        return by_name(unnamed(values), coordinate_shapes(self.interface))
 
     def _vector(self, value: States, name: str) -> Array:
         return checked_vector(self.interface, value, name)

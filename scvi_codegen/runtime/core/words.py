@@ -54,11 +54,11 @@ class NamedState(np.ndarray[Any, Any]):
 
     def values(self) -> list[Array]:
         """Return the arrays in order."""
-        return list(by_name(np.asarray(self), self.shapes or ()).values())
+        return list(by_name(unnamed(self), self.shapes or ()).values())
 
     def items(self) -> list[tuple[str, Array]]:
         """Return the names and the arrays in order."""
-        return list(by_name(np.asarray(self), self.shapes or ()).items())
+        return list(by_name(unnamed(self), self.shapes or ()).items())
 
     def __reduce__(self) -> tuple[Any, ...]:
         return named, (np.asarray(self), self.shapes)
@@ -101,6 +101,12 @@ def word(high: float, low: float) -> Word:
     result = Word(high)
     result.low = float(low)
     return result
+
+
+def word_of(value: Fraction) -> Word:
+    """Return the double-double number nearest to a fraction."""
+    high = float(value)
+    return word(high, float(value - Fraction(high)))
 
 
 class Words(NamedState):
@@ -174,6 +180,17 @@ def with_low(high: Any, low: Array, shapes: Any = None) -> Any:
     result.shapes = getattr(high, "shapes", None) if shapes is None else shapes
     result._low = np.asarray(low)
     return result
+
+
+def unnamed(values: Any) -> Array:
+    """Return numbers as an array without names, with both words if they have two; shares memory."""
+    high: Array = np.asarray(values)
+    return with_low(high, values.low) if isinstance(values, Words) else high
+
+
+def scalar(value: Any) -> float:
+    """Return an entry of an array as a number, with both words if it has two."""
+    return value if isinstance(value, Word) else float(value)
 
 
 def low_words(values: Any) -> Array:
@@ -254,8 +271,12 @@ def two_words(value: Any, name: str) -> tuple[float, float]:
         if isinstance(value, bool | np.bool_ | complex) or value is None:
             raise TypeError("not a real number")
         with mp.workdps(DIGITS + 20):
-            if isinstance(value, Rational):
-                exact: Any = mp.mpf(value.numerator) / mp.mpf(value.denominator)
+            if isinstance(value, np.ndarray) and value.ndim == 0:
+                value = value[()]
+            if hasattr(value, "evalf"):  # of SymPy
+                value = value.evalf(DIGITS + 20)
+            if isinstance(value, Rational):  # integers of NumPy, too
+                exact: Any = mp.mpf(int(value.numerator)) / mp.mpf(int(value.denominator))
             else:
                 exact = mp.mpf(value) if isinstance(value, str) else value
             high = float(exact)

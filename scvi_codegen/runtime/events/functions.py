@@ -16,7 +16,7 @@ import numpy as np
 
 from scvi_codegen.errors import EventError
 from scvi_codegen.runtime.constraints.projection import projected
-from scvi_codegen.runtime.core.words import DIGITS, low_words, two_words, with_low, word
+from scvi_codegen.runtime.core.words import DIGITS, low_words, two_words, with_low, word, word_of
 from scvi_codegen.runtime.events.event import JAMMED, Event
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ class EventFunctions:
         return values
 
     def _velocity(self, q: Array, p: Array, t: Fraction, parameters: Array) -> Array:
-        velocity: Array = self.stepper._transformed("velocity", float(t), q, p, parameters.copy())
+        velocity: Array = self.stepper._transformed("velocity", word_of(t), q, p, parameters.copy())
         return velocity
 
     def changed(
@@ -118,9 +118,9 @@ class EventFunctions:
         for index, value in zip(self.indices[number], values, strict=True):
             state[index // m][index % m] = word(*two_words(value, "a value of then="))
         if by_velocity:
-            state[1] = stepper.momentum(state[0], state[2], float(t), parameters)
+            state[1] = stepper.momentum(state[0], state[2], word_of(t), parameters)
         q, p, _ = state
-        return projected(stepper, q, p, float(t), parameters)[:2] if stepper.constraints else (q, p)
+        return projected(stepper, q, p, word_of(t), parameters)[:2] if stepper.constraints else (q, p)
 
     def _impact(
         self,
@@ -142,7 +142,7 @@ class EventFunctions:
             moved = [x + impulse * n for x, n in zip(momenta_before, normal, strict=True)]
             high = [float(x) for x in moved]
             words: Array = with_low(np.array(high), np.array([float(x - y) for x, y in zip(moved, high, strict=True)]))
-            return projected(stepper, q, words, float(t), parameters)[1] if stepper.constraints else words
+            return projected(stepper, q, words, word_of(t), parameters)[1] if stepper.constraints else words
 
         def terms(impulse: Any) -> list[Any]:
             v = _numbers(self._velocity(q, momenta(impulse) if impulse else p, t, parameters))

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 import numpy as np
 
 from scvi_codegen.errors import EventError, MethodError, StateError, StepFailedError
-from scvi_codegen.runtime.core.words import Word, block_of, fraction_of, missing, stacked, with_low, word
+from scvi_codegen.runtime.core.words import Word, block_of, fraction_of, missing, stacked, with_low, word_of
 from scvi_codegen.runtime.events.detection import CrossingSearch
 from scvi_codegen.runtime.events.event import Crossings, Event
 from scvi_codegen.runtime.events.functions import EventFunctions
@@ -97,7 +97,7 @@ class RefinedSearch(CrossingSearch):
         return number
 
     def _crossing(self, record: Any, at: TimedState) -> RefinedCrossing:
-        return RefinedCrossing(int(record["function"]), _word(at.t), at.q, at.p, _element(record))
+        return RefinedCrossing(int(record["function"]), word_of(at.t), at.q, at.p, _element(record))
 
     def _root(
         self, states: SavedStates | Memory, start: TimedState, function: int, guess: Fraction, h: Fraction
@@ -130,7 +130,7 @@ class RefinedSearch(CrossingSearch):
         """Return the state after a partial step to a time."""
         if end == start.t:
             return start
-        t, stepper = _word(start.t), self.precise
+        t, stepper = word_of(start.t), self.precise
         if stepper.in_tau:
             begin = with_low(np.array([float(t)]), np.array([t.low]))
             return TimedState(end, *stepped_to(states, start.q, start.p, begin, end))
@@ -160,7 +160,7 @@ class RefinedSearch(CrossingSearch):
                 memory[:], watch[:] = before
                 failure = error
                 break
-        t, q, p = (stacked([row.at[k] if k else _word(row.at.t) for row in rows]) for k in range(3))
+        t, q, p = (stacked([row.at[k] if k else word_of(row.at.t) for row in rows]) for k in range(3))
         sizes = np.array([*(row.size for row in rows[1:]), plan.h or np.nan])
         iterations, numbers = (np.array([row[k] for row in rows]) for k in (3, 2))
         return (t, q, p, iterations.astype(np.int32)), sizes, numbers, failure
@@ -246,18 +246,13 @@ def _element(record: Any) -> int:
     return int(record["element"]) if "element" in record.dtype.names else 0
 
 
-def _word(t: Fraction) -> Word:
-    high = float(t)
-    return word(high, float(t - Fraction(high)))
-
-
 def _place(run: Memory) -> TimedState:
     return TimedState(run._exact_time, run.q, run.p)
 
 
 def _set(run: Memory, at: TimedState) -> None:
     """Set the time and the state of a run; its step density begins anew."""
-    memory, t = run._memory, _word(at.t)
+    memory, t = run._memory, word_of(at.t)
     memory.t, memory.t_low, memory.guess = float(t), t.low, 0
     run._q[:], run._p[:] = at.q, at.p
     if hasattr(memory, "density"):

@@ -12,6 +12,7 @@ from scvi_codegen.errors import StateError, closest
 from scvi_codegen.formulas.symbols import DOT
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.core.validation import Array, coordinate_shapes, shapes_of
+from scvi_codegen.runtime.core.words import missing, unnamed
 from scvi_codegen.runtime.rotations.attitudes import (
     angular_velocity,
     body_momentum,
@@ -56,8 +57,8 @@ class AttitudeHistory:
         if not interface.variables:
             raise StateError(f"'{interface.system}' is not a first-order system: its states are q and p")
         names = (*interface.coordinates, *interface.momenta)
-        states = np.concatenate([self.q, self.p], axis=-1)
-        return np.asarray(states[..., [names.index(name) for name in interface.variables]])
+        states = np.concatenate([self.q[:], self.p[:]], axis=-1)
+        return unnamed(states[..., [names.index(name) for name in interface.variables]])
 
     def rotation(self, name: str | None = None, *, t: ArrayLike | None = None) -> Array:
         """Return (n, 3, 3) rotation matrices, from components in the body frame to components in space."""
@@ -114,15 +115,15 @@ class AttitudeHistory:
         """
         interface, (q, p) = self.stepper.interface, self._states(None)
         if name in ("t", "energy"):
-            return np.asarray(self.t if name == "t" else self.energy())
+            return unnamed(self.t if name == "t" else self.energy())
         if (values := _fields(interface.layout.mesh, q, p).get(name)) is not None:
             return values
         if (columns := _columns(interface, name)) is not None:
-            return np.asarray(q[..., columns])
+            return unnamed(q[..., columns])
         if (columns := _momentum_columns(interface, name)) is not None:
-            return np.asarray(p[..., columns])
+            return unnamed(p[..., columns])
         if name.endswith(DOT) and (columns := _columns(interface, name.removesuffix(DOT))) is not None:
-            return np.asarray(self._velocities(q, p, None)[..., columns])
+            return unnamed(self._velocities(q, p, None)[..., columns])
         if interface.rotations or interface.originals:
             times = getattr(self, "times", None)
             velocity = self._velocities(q, p, None)
@@ -152,7 +153,7 @@ class AttitudeHistory:
 
     def _states(self, t: ArrayLike | None) -> tuple[Array, Array]:
         if t is None:
-            return np.asarray(self.q), np.asarray(self.p)  # of recordings, which are read on access
+            return unnamed(self.q[:]), unnamed(self.p[:])  # of recordings, which are read on access
         if not hasattr(self, "at"):
             raise StateError("recordings, ensembles and runs in progress have no dense output: omit t")
         q, p = self.at(t)
@@ -161,12 +162,12 @@ class AttitudeHistory:
     def _velocities(self, q: Array, p: Array, t: ArrayLike | None) -> Array:
         """Return velocities of the shape of q; NaN after the end of a trajectory of an ensemble."""
         if self.q.ndim < 3 and t is None:
-            return np.asarray(self.velocity)
+            return unnamed(self.velocity)
         if t is not None:
             if self.pieces:
                 raise StateError("angular velocities between the states of a run with inputs are not available: omit t")
-            return np.asarray(self.stepper.velocity(q, p, t, self.parameters))
-        velocities = np.full_like(q, np.nan)
+            return unnamed(self.stepper.velocity(q, p, t, self.parameters))
+        velocities = missing(q.shape, self.stepper.interface.words)
         for k, (times, own, momenta, *_) in enumerate(self.each()):
             velocities[: len(times), k] = self.stepper.velocity(own, momenta, times, self.parameters[k])
         return velocities

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -14,7 +15,7 @@ from numpy.typing import ArrayLike
 from scvi_codegen.errors import StateError, closest
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.rendering.source import COMPONENTS, Interface
-from scvi_codegen.runtime.core.validation import Array, States, checked_vector, flat_state, shapes_of
+from scvi_codegen.runtime.core.validation import Array, States, checked_vector, coordinate_shapes, flat_state, shapes_of
 from scvi_codegen.runtime.core.words import Shapes, split, with_low
 from scvi_codegen.runtime.rotations.attitudes import (
     matrices,
@@ -68,7 +69,13 @@ def members_of(dimension: int, declarations: Sequence[str]) -> tuple[Member, ...
 
 
 def homogeneous_state(interface: Interface, q: Any, p: Any, velocity: Any) -> tuple[Any, Any, Any]:
-    """Return (q, p, velocity) with states by name as (.., m) numbers, and numbers as they are; see :func:`state_of`."""
+    """Return (q, p, velocity) with states by name as (.., m) numbers, and numbers as they are; see :func:`state_of`.
+
+    In double-double arithmetic ordinary coordinates and the variables of first-order systems have both words;
+    rotations, directions and spins by name are doubles.
+    """
+    if interface.words > 1:
+        return _homogeneous_state_of_two_words(interface, q, p, velocity)
     if interface.variables:
         return _first_order_state(interface, q, p, velocity)
     by_name = [each for each in (q, p, velocity) if isinstance(each, Mapping)]
@@ -79,6 +86,39 @@ def homogeneous_state(interface: Interface, q: Any, p: Any, velocity: Any) -> tu
     if not any(each.keys().isdisjoint(homogeneous) for each in by_name):
         return q, p, velocity
     return state_of(interface.coordinates, members, q, p, velocity, shapes_of(interface) or ())
+
+
+def _homogeneous_state_of_two_words(interface: Interface, q: Any, p: Any, velocity: Any) -> tuple[Any, Any, Any]:
+    doubles = replace(interface, precision="")
+    if interface.variables:
+        if p is not None or velocity is not None:
+            return homogeneous_state(doubles, q, p, velocity)
+        halves = (homogeneous_state(doubles, words, None, None)[:2] for words in split(q, "the state"))
+        q, p = map(with_low, *halves)
+        return q, p, None
+    if not (interface.rotations and any(isinstance(each, Mapping) for each in (q, p, velocity))):
+        return q, p, velocity
+    ordinary, first = dict[str, tuple[slice, tuple[int, ...]]](), 0
+    for name, shape in coordinate_shapes(interface):
+        if first < members_of(interface.dimension, interface.rotations)[0].columns.start:
+            ordinary[name] = slice(first, first + math.prod(shape)), shape
+        first += math.prod(shape)
+    high, low = list[Any](), list[dict[str, Array]]()
+    for label, values in (("q", q), ("p", p), ("velocity", velocity)):
+        by_name = values if isinstance(values, Mapping) else {}
+        words = {name: split(value, f"{label}: '{name}'") for name, value in by_name.items() if name in ordinary}
+        low.append({name: part for name, (_, part) in words.items()})
+        high.append({**by_name, **{name: part for name, (part, _) in words.items()}} if by_name else values)
+    results = []
+    for values, parts in zip(homogeneous_state(doubles, *high), low, strict=True):
+        if parts:
+            rest = np.zeros(values.shape)
+            for name, part in parts.items():
+                columns, shape = ordinary[name]
+                rest[..., columns] = part.reshape(*part.shape[: part.ndim - len(shape)], math.prod(shape))
+            values = with_low(np.array(values), rest)
+        results.append(values)
+    return results[0], results[1], results[2]
 
 
 def flat_states(interface: Interface, q: States, other: States | None, name: str) -> tuple[Any, Any]:

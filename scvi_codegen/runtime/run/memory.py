@@ -28,7 +28,7 @@ from scvi_codegen.runtime.core.validation import (
     no_input,
     parameter_index,
 )
-from scvi_codegen.runtime.core.words import Word, block_of, checked_time, low_words, two_words, with_low
+from scvi_codegen.runtime.core.words import Word, block_of, checked_time, low_words, stacked, two_words, with_low, word
 from scvi_codegen.runtime.rotations.states import checked_pair
 from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.saving import checkpoint
@@ -279,14 +279,14 @@ class Memory:
 
     @property
     def t(self) -> float:
-        """Time, the rounded compensated sum of all steps."""
-        return _time(self._memory)
+        """Time, the rounded compensated sum of all steps; both words in double-double arithmetic."""
+        t = _time(self._memory)
+        return t if self.stepper.interface.words == 1 else word(t, self._memory.t_low)
 
     @property
     def _times(self) -> Array:
         """(1,) time, with its low word in double-double arithmetic."""
-        high = np.array([self.t])
-        return high if self.stepper.interface.words == 1 else with_low(high, np.array([self._memory.t_low]))
+        return stacked([self.t])
 
     @property
     def _exact_time(self) -> Fraction:
@@ -303,7 +303,7 @@ class Memory:
 
     def left_to(self, end: float) -> float:
         """Return the time left to ``end``, computed with the low word of the run's time."""
-        return (end - self.t) - float(getattr(self._memory, "t_low", 0.0))
+        return (end - float(self.t)) - float(getattr(self._memory, "t_low", 0.0))
 
     @alone
     def update(self, *, parameters: Parameters = None, h: float | None = None, plan: StepPlan | None = None) -> None:

@@ -11,6 +11,7 @@ from scvi_codegen.runtime.accuracy.local_error import warn_of_inaccuracy
 from scvi_codegen.runtime.constraints.projection import constraint_values, multipliers
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array, Parameters, States
+from scvi_codegen.runtime.core.words import scalar
 from scvi_codegen.runtime.rotations.attitude_history import AttitudeHistory
 from scvi_codegen.runtime.run.descriptions import describe_run
 from scvi_codegen.runtime.run.memory import Memory, alone
@@ -128,24 +129,24 @@ class Run(Memory, AttitudeHistory):
     @property
     def velocity(self) -> Array:
         """(m,) velocities."""
-        return self.stepper.velocity(self.q, self.p, self.t, self._parameters)
+        return self.stepper.velocity(self.q, self.p, self._times[0], self._parameters)
 
     @property
     def energy(self) -> float:
         """Energy of the present state."""
-        return float(self.stepper.energy(self.q, self.p, self.t, self._parameters))
+        return scalar(self.stepper.energy(self.q, self.p, self._times[0], self._parameters))
 
     @property
     def energies(self) -> tuple[float, float, float]:
         """Kinetic, potential and total energy in double-double arithmetic; of run-time sizes only, else NaN, NaN, E."""
-        now = self._q[np.newaxis], self._p[np.newaxis], np.array([self.t])
+        now = self._q[np.newaxis], self._p[np.newaxis], self._times
         kinetic, potential, total = self.stepper._energy_parts(*now, self._parameters)[0].tolist()
         return kinetic, potential, total
 
     @property
     def momentum_maps(self) -> Array:
         """Conserved quantities of the present state, in the order of ``stepper.momentum_map_names``."""
-        return self.stepper.momentum_maps(self.q, self.p, self.t, self._parameters)
+        return self.stepper.momentum_maps(self.q, self.p, self._times[0], self._parameters)
 
     @property
     def multipliers(self) -> Any:
@@ -154,12 +155,13 @@ class Run(Memory, AttitudeHistory):
         Raises:
             MethodError: if the system has no constraints.
         """
-        return self.stepper.constraint_arrays(multipliers(self.stepper, self.q, self.p, self.t, self._parameters)[0])
+        values = multipliers(self.stepper, self.q, self.p, self._times, self._parameters)
+        return self.stepper.constraint_arrays(values[0])
 
     @property
     def constraint_values(self) -> tuple[Any, Any]:
         """Constraint residuals and their rates, in the form of :attr:`multipliers`; raises as these."""
-        values = constraint_values(self.stepper, self.q, self.p, self.t, self._parameters)[:, 0]
+        values = constraint_values(self.stepper, self.q, self.p, self._times, self._parameters)[:, 0]
         return self.stepper.constraint_arrays(values[0]), self.stepper.constraint_arrays(values[1])
 
 

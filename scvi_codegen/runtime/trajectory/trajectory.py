@@ -25,7 +25,7 @@ from scvi_codegen.runtime.accuracy.resolution import unresolved_parts
 from scvi_codegen.runtime.constraints.projection import constraint_values, multipliers
 from scvi_codegen.runtime.core.features import refusal, require
 from scvi_codegen.runtime.core.validation import columns_of_inputs
-from scvi_codegen.runtime.core.words import TwoWords, Words, check_keeps_words, low_words, missing
+from scvi_codegen.runtime.core.words import TwoWords, Words, check_keeps_words, low_words, missing, scalar
 from scvi_codegen.runtime.events.event import Crossings, Event, EventLike, as_events
 from scvi_codegen.runtime.events.refinement import crossings_of
 from scvi_codegen.runtime.paths.actions import actions_until, compensated_sums, shadow_energy
@@ -123,7 +123,7 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed, Pictured, Tw
             return self._quantity(rows)
         if not isinstance(rows, slice):
             k = checked_row(rows, len(self))
-            return float(self.t[k]), self.q[k].copy(), self.p[k].copy()
+            return scalar(self.t[k]), self.q[k].copy(), self.p[k].copy()
         first, last, stride = rows.indices(len(self))
         if stride < 0 or first >= last:
             raise IndexError(f"a slice of {len(self)} states must be ascending and not empty, unlike {rows}")

@@ -57,21 +57,37 @@ int NAME(constraint_values)(long long count, const double *t, const double *q, c
   return OK;
 }
 
-/* Nearest state that satisfies the constraints: positions in double, then corrected; momenta p - G^T y. */
-int NAME(project)(double t, const double *q0, const double *p0, const double *parameters, double *q1, double *p1,
-    double *workspace)
+/* Sum of squares of g at positions in pairs; infinite if g is not finite. */
+static double misfit_of_pairs(dd t, const dd *q, const double *parameters)
+{
+  double high[CONSTRAINTS], sum = 0.0;
+  dd values[CONSTRAINTS + CONSTRAINT_ENTRIES];
+  constraints_pairs(q, t, parameters, values);
+  high_words(values, CONSTRAINTS, high);
+  for (int j = 0; j < CONSTRAINTS; j++)
+    sum += high[j] * high[j];
+  return all_finite(high, CONSTRAINTS) ? sum : INFINITY;
+}
+
+/* Nearest state that satisfies the constraints: positions in double, then corrected; momenta p - G^T y. Positions that
+ * satisfy the constraints better than those in double, of which rounding errors are 1e-16, are corrected themselves. */
+int NAME(project)(const double *time, const double *q0, const double *p0, const double *parameters, double *q1,
+    double *p1, double *workspace)
 {
   saddle *at = saddle_in(workspace);
-  const dd now = dd_of(t, 0.0);
+  const dd now = dd_of(time[0], time[1]);
+  const double t = now.high;
   double high[2 * M], g[CONSTRAINTS], right[CONSTRAINTS], y[CONSTRAINTS], update[M], size = INFINITY;
-  dd q[M], p[M], u[2 * M], values[CONSTRAINTS + CONSTRAINT_ENTRIES], rate[CONSTRAINTS], sum[CONSTRAINTS];
+  dd q[M], p[M], moved[M], u[2 * M], values[CONSTRAINTS + CONSTRAINT_ENTRIES], rate[CONSTRAINTS], sum[CONSTRAINTS];
   int status = find_velocity(t, q0, p0, parameters, high + M, workspace);
   load_pairs(q0, q);
   memcpy(high, q0, sizeof(double) * M);
   if (status == OK)
     status = project_position(t, high, parameters, at);
   for (int i = 0; i < M; i++)
-    q[i] = dd_add(q[i], dd_two_sum(high[i], -q0[i]));
+    moved[i] = dd_add(q[i], dd_two_sum(high[i], -q0[i]));
+  if (status == OK && misfit_of_pairs(now, moved, parameters) < misfit_of_pairs(now, q, parameters))
+    memcpy(q, moved, sizeof q);
   for (int k = 0; status == OK && k < MOST_PAIR_CORRECTIONS && size > SETTLED_PAIRS * largest_high(q); k++) {
     high_words(q, M, high);
     status = factorise_saddle(t, high, parameters, at, g);
@@ -129,9 +145,11 @@ static double product_of_vectors(const double *x, const double *y)
 }
 
 /* Relative distances of two states: positions in the metric of the mass matrix, momenta in that of its inverse. */
-int NAME(apart)(double t, const double *q0, const double *p0, const double *q1, const double *p1,
+int NAME(apart)(const double *time, const double *q0, const double *p0, const double *q1, const double *p1,
     const double *parameters, double *apart, double *workspace)
 {
+  const dd now = dd_of(time[0], time[1]);
+  const double t = now.high;
   const double still[M] = {0};
   double u[2 * M], p[M], v[M], other[M], d[M], e[M], mass[MASS_ENTRIES];
   dd q[M], x[2][M], velocity[2][M];
@@ -139,7 +157,7 @@ int NAME(apart)(double t, const double *q0, const double *p0, const double *q1, 
   load_pairs(q1, q);
   for (int k = 0; status == OK && k < 2; k++) {
     load_pairs(k ? p1 : p0, x[k]);
-    status = velocities_of(dd_of(t, 0.0), q, x[k], parameters, velocity[k], workspace);
+    status = velocities_of(now, q, x[k], parameters, velocity[k], workspace);
   }
   if (status == OK)
     status = find_velocity(t, q1, still, parameters, p, workspace);

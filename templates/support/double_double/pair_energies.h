@@ -1,22 +1,24 @@
 #include "pair_states.h"
 
-/* Momenta p = L_v, velocities, energies and momentum maps in pairs. */
+/* Momenta p = L_v, velocities, energies and momentum maps in pairs; times have two words. */
 
-int NAME(momentum)(double t, const double *q, const double *v, const double *parameters, double *p, double *workspace)
+int NAME(momentum)(const double *t, const double *q, const double *v, const double *parameters, double *p,
+    double *workspace)
 {
   dd positions[M], velocity[M], result[M];
   load_pairs(q, positions);
   load_pairs(v, velocity);
-  const int status = momenta_of(dd_of(t, 0.0), positions, velocity, parameters, result, workspace);
+  const int status = momenta_of(dd_of(t[0], t[1]), positions, velocity, parameters, result, workspace);
   return status == OK ? store_pairs(result, p) : status;
 }
 
-int NAME(velocity)(double t, const double *q, const double *p, const double *parameters, double *v, double *workspace)
+int NAME(velocity)(const double *t, const double *q, const double *p, const double *parameters, double *v,
+    double *workspace)
 {
   dd positions[M], momentum[M], result[M];
   load_pairs(q, positions);
   load_pairs(p, momentum);
-  const int status = velocities_of(dd_of(t, 0.0), positions, momentum, parameters, result, workspace);
+  const int status = velocities_of(dd_of(t[0], t[1]), positions, momentum, parameters, result, workspace);
   return status == OK ? store_pairs(result, v) : status;
 }
 

@@ -77,7 +77,7 @@ static void momentum_increment(const step_data *step, const iteration_data *data
     u[i] = step->q0[i] + (step->carry_q[i] + dq[i]);
     u[M + i] = end_velocity(curve, i);
   }
-  if (NAME(momentum)(step->t + step->h, u, u + M, step->parameters, dp, step->scratch) != OK)
+  if (find_momentum(step->t + step->h, u, u + M, step->parameters, dp, step->scratch) != OK)
     for (int i = 0; i < M; i++)
       dp[i] = NAN;
   for (int i = 0; i < M; i++)
