@@ -17,7 +17,7 @@ static int nearby_velocity(const step_data *step, double *v0)
   double u[2 * M];
   int status;
   if (HAMILTONIAN)
-    return NAME(velocity)(step->t, step->q0, step->p0, step->parameters, v0, step->scratch);
+    return find_velocity(step->t, step->q0, step->p0, step->parameters, v0, step->scratch);
   memcpy(u, step->q0, sizeof(double) * M);
   memcpy(u + M, v0, sizeof(double) * M);
   status = invert_from(step->t, u, step->p0, step->parameters, step->scratch);
@@ -71,7 +71,7 @@ static int first_curve(const step_data *step, const double *past, long long step
   }
   for (int i = 0; i < M; i++)
     curve->z[0][i] = lanes_of(0.0);
-  return NAME(velocity)(step->t, step->q0, step->p0, step->parameters, curve->v0, step->scratch);
+  return find_velocity(step->t, step->q0, step->p0, step->parameters, curve->v0, step->scratch);
 }
 
 /* 1 / (|v0| + |v1|), which makes changes of velocities relative. */

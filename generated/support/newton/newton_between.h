@@ -14,7 +14,7 @@ static int newton_between(const step_data *step, newton_data *data, const real *
   int keep = 0, status;
   for (int i = 0; i < M; i++)
     v[i] = (q1[i] - step->q0[i]) / step->h;
-  status = NAME(momentum)(step->t, step->q0, v, step->parameters, p0, step->scratch);
+  status = find_momentum(step->t, step->q0, v, step->parameters, p0, step->scratch);
   if (status != OK)
     return status;
   start_on_line(v, p0, data->z);
