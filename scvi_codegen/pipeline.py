@@ -167,6 +167,7 @@ def describe(
         lengths=system.lengths,
         originals=tuple((x.name, system.text_of(f)) for x, f in system.replaced.items()),
         original_arrays=tuple(map(str, system.eliminated.original.arrays)) if system.replaced else (),  # type: ignore[attr-defined]
+        kinks=system.kinks,
     )
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import operator
 import random
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import lru_cache
 from itertools import islice
@@ -62,6 +62,13 @@ class unit_step(Function):  # type: ignore[misc]  # noqa: N801
     def fdiff(self, argindex: int = 1) -> Expr:
         """Return 0."""
         return S.Zero
+
+
+def kinks_of(expressions: Iterable[Expr]) -> set[Expr]:
+    """Return functions at whose zeros expressions may jump or have a kink: x of unit_step(x), cos(pi x) of rint(x)."""
+    found = {f for e in expressions for f in (e, *(each.definition for each in intermediates(e)))}
+    jumps = {each for formula in found for each in formula.atoms(unit_step, rint)}
+    return {each.args[0] if isinstance(each, unit_step) else sympy.cos(sympy.pi * each.args[0]) for each in jumps}
 
 
 def wrap(x: Expr, length: Expr) -> Expr:

@@ -267,6 +267,13 @@ class MechanicalSystem(Deferred, ABC):
         return ""
 
     @property
+    def kinks(self) -> tuple[str, ...]:
+        """Functions as text at whose zeros the function, forces or constraints are not smooth, by unit_step or rint."""
+        from scvi_codegen.formulas.expressions import kinks_of
+
+        return tuple(sorted(map(self.text_of, kinks_of((self.lagrangian, *self.forces, *self.constraints)))))
+
+    @property
     def balances_energy(self) -> bool:
         """True if the energy changes by the work of forces or damping only."""
         acted = bool(self.forces) or self.damping != 0

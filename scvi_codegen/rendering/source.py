@@ -305,6 +305,7 @@ class Interface:
         originals: of a system in angles of rods, the names of the coordinates and velocities that they replace, with
             their formulas, ``("x", "l*sin(angle)")``.
         original_arrays: declarations of the arrays of the original system.
+        kinks: functions at whose zeros the equations are not smooth; not of arrays of run-time sizes.
     """
 
     prefix: str
@@ -342,6 +343,7 @@ class Interface:
     precision: str = ""
     originals: tuple[tuple[str, ...], ...] = ()
     original_arrays: tuple[str, ...] = ()
+    kinks: tuple[str, ...] = ()
 
     @property
     def words(self) -> int:

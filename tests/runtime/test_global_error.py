@@ -15,6 +15,7 @@ from notation import lagrange
 
 import scvi_codegen as sc
 from scvi_codegen.runtime.accuracy.global_error import SAFETY, SAFETY_OF_ROUNDING, SAFETY_OF_TWO, _alternative
+from scvi_codegen.runtime.inputs import segments
 from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.runtime.trajectory import dense_output
 
@@ -89,9 +90,15 @@ class Work:
     def __init__(self, monkeypatch):
         self.iterations = 0
         integrate, partial_steps = Run._integrated, dense_output._take_partial_steps
+        with_stops = segments.record_with_stops
 
         def counted_run(run, *arguments):
             trajectory = integrate(run, *arguments)
+            self.iterations += int(trajectory.iterations.sum())
+            return trajectory
+
+        def counted_with_stops(*arguments, **named):
+            trajectory = with_stops(*arguments, **named)
             self.iterations += int(trajectory.iterations.sum())
             return trajectory
 
@@ -101,6 +108,7 @@ class Work:
             return iterations
 
         monkeypatch.setattr(Run, "_integrated", counted_run)
+        monkeypatch.setattr(segments, "record_with_stops", counted_with_stops)
         monkeypatch.setattr(dense_output, "_take_partial_steps", counted_partial_steps)
 
     def of(self, run):

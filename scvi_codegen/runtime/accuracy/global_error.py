@@ -15,17 +15,18 @@ from contextlib import suppress
 from dataclasses import dataclass
 from itertools import accumulate, repeat
 from operator import mul
-from typing import Any, TypeVar, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, warn
 from scvi_codegen.native.arguments import checked_number
+from scvi_codegen.rendering.source import Interface
+from scvi_codegen.runtime.accuracy.size import Motion, first_of_groups, relative, roundoff
 from scvi_codegen.runtime.accuracy.warning_switch import warnings_wanted, without_accuracy_warnings
 
 Array = NDArray[np.float64]
-Result = TypeVar("Result")
 
 FIRST, RATIO = 1e-3, 1e-3
 """First local tolerance relative to the wanted error; next tolerance, and that of a comparison, relative to a run's."""
@@ -40,8 +41,8 @@ FINER = 0.1
 """Ratio of the tolerances of a run whose error rounding may dominate, of its three comparisons, and of the next run."""
 LAST = (0.0, 1e-18, 1e-19, 1e-20)
 """Tolerances of the last runs (0: the default, round-off level), which are compared with each other."""
-LEAST_OF_TWO_WORDS, LAST_OF_TWO_WORDS = 1e-30, (0.0, 1e-30, 1e-29, 1e-28)
-"""The same with states of two words, whose high words are compared; runs of smaller tolerances are equal."""
+ROUNDED_OF_TWO_WORDS, LEAST_OF_TWO_WORDS, LAST_OF_TWO_WORDS = 1e-26, 1e-30, (1e-30, 1e-29, 1e-28)
+"""The same with states of two words."""
 COARSER = 1e4
 """Factor of the tolerance of a comparison that fails, for a second attempt."""
 SAFETY, SAFETY_OF_TWO, SAFETY_OF_ROUNDING = 3.0, 12.0, 4.0
@@ -50,20 +51,23 @@ SAFETY, SAFETY_OF_TWO, SAFETY_OF_ROUNDING = 3.0, 12.0, 4.0
 If the errors are independent normal numbers, those of two further runs are both within e / 12 of the error e of the run
 in 8 of 10,000 cases, and those of three within e / 4 in as many.
 """
-SMALLEST = 5.0 * float(np.finfo(float).eps)
-"""Smallest estimate."""
+LEAST_STOPS, LONG, STRIDE, MOST_STOPS = 8, 64, 16, 512
+"""Of a run for comparison, numbers of times at which steps end: least; see :func:`irregular_stops`; most of others."""
+GOLDEN, MARGIN, IRREGULAR = 0.6180339887498949, 0.05, 0.8191725134
+"""Golden ratio; part of a step at its ends that is not cut; ratio of steps of tau of runs for comparison."""
+FURTHER, MANY = 1000, 100_000
+"""A run for comparison is given up after so many times the steps of the run, and so many more."""
 LEAST_SAMPLES, STEPS_PER_SAMPLE, MOST_SAMPLES, MOST_NUMBERS = 16, 16, 512, 2**22
 """Numbers of states that are compared: least, per steps, most, and most times the number of coordinates."""
-EARLY = 1.0 / 16.0
-"""Part of the run whose largest state sets the least size that errors are relative to."""
 ORDER = 10.0
 """Power of a step of tau that a local tolerance stands for: ``RATIO`` halves the steps of a time transformation."""
 UNEVEN = 30.0
 """Ratio of the longest to the shortest step from which on a time transformation is recommended."""
-SMALLEST_SQUARE, TINY = 1e-280, math.ulp(0.0)
-"""Sums of squares below this, or above its inverse, are computed from scaled numbers; smallest positive number."""
+TINY = math.ulp(0.0)
+"""Smallest positive number."""
 LOST = 0.1
 """Estimate from which on runs are uncorrelated."""
+NAMES_OF_PRECISIONS = {1: "double", 2: "double-double"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -169,8 +173,8 @@ def warn_of_unconfirmed(confirmations: Sequence[GlobalError | None]) -> None:
         )
 
 
-def checked_error(error: Any, others: Mapping[str, Any]) -> float:
-    """Return the requested global error as a number; raise StateError if combined with another step-size option."""
+def checked_error(error: Any, others: Mapping[str, Any], stepper: Any = None) -> float:
+    """Return the requested global error; raise StateError if it is unattainable or another option sets step sizes."""
     wanted = checked_number(error, "the global error")
     if not 0.0 < wanted < 1.0:
         raise StateError(f"error={wanted:g} must be between 0 and 1: it bounds the relative global error")
@@ -180,35 +184,20 @@ def checked_error(error: Any, others: Mapping[str, Any]) -> float:
                 f"error={wanted:g} and {name}={value!r} both determine the step size: error= requires adaptive steps; "
                 f"omit {name} and give t_end"
             )
+    if stepper is not None:
+        words = max(stepper.interface.words, 1 + (stepper._precise is not None))
+        if wanted < (least := smallest_estimate(words)):
+            remedy = ", or precision='double-double'" if words == 1 else ""
+            raise StateError(
+                f"error={wanted:g} is below {least:.1e}, the least error that {NAMES_OF_PRECISIONS[words]} arithmetic "
+                f"confirms: give a larger error{remedy}"
+            )
     return wanted
 
 
-def confirmed_run(
-    wanted: float,
-    integrate: Callable[..., Result],
-    again: Callable[..., Result] | None,
-    start: float,
-    step_of_tau: Callable[[float], float] | None,
-    *,
-    words: int = 1,
-) -> Result:
-    """Return the run whose global error is at most ``wanted``, or the most accurate one.
-
-    Args:
-        wanted: bound of the relative global error.
-        integrate: function of ``tolerance`` or ``h`` that makes the returned run.
-        again: that of the runs for comparison, which ends at ``t_end``; ``None`` if ``integrate`` saves all steps.
-        start: initial time.
-        step_of_tau: function that returns the largest step of tau for a tolerance, or ``None`` without it.
-        words: number of words of states.
-
-    Raises:
-        StepFailedError: if the most accurate run fails.
-    """
-    with without_accuracy_warnings():
-        trajectory, result = _Runs(wanted, integrate, again, start, step_of_tau, words).judged()
-    trajectory.confirmation = result
-    return cast(Result, trajectory)
+def smallest_estimate(words: int) -> float:
+    """Return the smallest estimate of an error of states of one or two words."""
+    return 10.0 * roundoff(words)
 
 
 def warn_of_unconfirmed_run(trajectory: Any) -> None:
@@ -236,23 +225,39 @@ def _alternative(trajectory: Any, result: GlobalError) -> str:
     )
 
 
-class _Runs:
-    """Runs of one motion by tolerance; arguments as of :func:`confirmed_run`."""
+class Runs:
+    """Runs of one motion by tolerance, one of which is returned and confirmed by others.
+
+    Args:
+        wanted: bound of the relative global error.
+        integrate: function of ``tolerance`` or ``h`` that makes the returned run.
+        confirming: function of the times at which steps end, of ``progress`` and of ``tolerance`` or ``h`` that makes a
+            run for comparison.
+        start: initial time.
+        step_of_tau: function that returns the largest step of tau for a tolerance, or ``None`` without it.
+        interface: of the stepper.
+        smooth: whether the equations are smooth along each step of ``confirming``.
+    """
 
     def __init__(
         self,
+        *,
         wanted: float,
         integrate: Callable[..., Any],
-        again: Callable[..., Any] | None,
+        confirming: Callable[..., Any],
         start: float,
         step_of_tau: Callable[[float], float] | None,
-        words: int,
+        interface: Interface,
+        smooth: bool = True,
     ) -> None:
-        self.wanted, self.integrate, self.again, self.start = wanted, integrate, again, start
-        self.first, self.h, self.count = min(wanted * FIRST, 0.1), 0.0, 0
+        self.wanted, self.integrate, self.confirming, self.start = wanted, integrate, confirming, start
+        self.words, self.interface = interface.words, interface
+        self.first, self.h, self.count, self.most = min(wanted * FIRST, 0.1), 0.0, 0, math.inf
         self.least, self.rounded, self.last = LEAST, ROUNDED, LAST
-        if words > 1:
-            self.least, self.rounded, self.last = LEAST_OF_TWO_WORDS, 0.0, LAST_OF_TWO_WORDS
+        if self.words > 1:
+            self.least, self.rounded, self.last = LEAST_OF_TWO_WORDS, ROUNDED_OF_TWO_WORDS, LAST_OF_TWO_WORDS
+        if not smooth:  # errors are as random as those of rounding
+            self.rounded = 1.0
         if step_of_tau is not None:
             self.rounded, self.first = ROUNDED_OF_TAU, max(self.first, LEAST)
             self.h = step_of_tau(self.first)
@@ -260,93 +265,134 @@ class _Runs:
             self.first *= FINER
         self.made: dict[float, Any] = {}
 
-    def steps(self, tolerance: float) -> dict[str, float | None]:
+    @without_accuracy_warnings()
+    def confirmed_run(self) -> Any:
+        """Return the run whose global error is at most ``wanted``, or the most accurate one.
+
+        Raises:
+            StepFailedError: if the most accurate run fails.
+        """
+        trajectory, trajectory.confirmation = self._judged()
+        return trajectory
+
+    def _steps(self, tolerance: float, factor: float = 1.0) -> dict[str, float | None]:
         if self.h:
-            return {"h": self.h * ((tolerance or LEAST) / self.first) ** (1.0 / ORDER)}
+            return {"h": factor * self.h * ((tolerance or LEAST) / self.first) ** (1.0 / ORDER)}
         return {"tolerance": tolerance or None}
 
-    def run(self, tolerance: float) -> Any:
+    def _run(self, tolerance: float) -> Any:
         if tolerance not in self.made:
             self.count += 1
-            self.made[tolerance] = self.integrate(**self.steps(tolerance))
+            self.made[tolerance] = made = self.integrate(**self._steps(tolerance))
+            self.most = min(self.most, FURTHER * made.steps + MANY)
         return self.made[tolerance]
 
-    def other(self, tolerance: float, end: float) -> Any:
-        """Return a run for comparison, to its last state if it fails."""
+    def _other(self, tolerance: float, compared: "_Samples", number: int) -> Any:
+        """Return a run for comparison, to its last state if it fails or takes too many steps."""
+        self.count += 1
+        stops = irregular_stops(compared.steps_of_run, number)
         try:
-            if self.again is None:
-                return self.run(tolerance)
-            self.count += 1
-            return self.again(**self.steps(tolerance), t_end=end)
+            return self.confirming(stops, self._check_count, **self._steps(tolerance, IRREGULAR))
         except StepFailedError as failure:
             if failure.trajectory is None:
                 raise
             return failure.trajectory
 
-    def judged(self) -> tuple[Any, GlobalError]:
+    def _check_count(self, steps: int) -> None:
+        if steps > self.most:
+            raise _TooManyStepsError
+
+    def _judged(self) -> tuple[Any, GlobalError]:
         """Return the first run that is confirmed, and its estimate; otherwise the better of the last."""
-        tolerance, rounded = self.first, self.rounded
+        tolerance, rounded, best = self.first, self.rounded, list[tuple[Any, GlobalError]]()
         while tolerance > 2.0 * self.least:
             try:
-                trajectory = self.run(tolerance)
+                trajectory = self._run(tolerance)
             except StepFailedError:
                 tolerance *= RATIO
                 continue
             ratio, count = (FINER, 3) if tolerance < rounded else (RATIO, 1)
             smaller = list(accumulate(repeat(ratio, count), mul, initial=tolerance))
-            result = self.estimated(trajectory, tolerance, smaller[1:])
+            result = self._estimated(trajectory, tolerance, smaller[1:])
             if result.confirmed:
                 return trajectory, result
+            best.append((trajectory, result))
             if not result.estimate < 1.0:
                 break
-            powers = 1
-            if self.again is not None or tolerance < rounded:  # else the next run was made for this comparison
-                powers = math.ceil(math.log(result.estimate / self.wanted, GAIN) * math.log(RATIO, ratio))
+            powers = math.ceil(math.log(result.estimate / self.wanted, GAIN) * math.log(RATIO, ratio))
             tolerance = list(accumulate(repeat(ratio, max(1, powers)), mul, initial=tolerance))[-1]
-        found: list[tuple[Any, GlobalError]] = []
+        failed: StepFailedError | None = None
         for tolerance in self.last:
             try:
-                trajectory = self.run(tolerance)
-            except StepFailedError:
-                if not found:
-                    raise
+                trajectory = self._run(tolerance)
+            except StepFailedError as failure:
+                failed = failure
                 continue
             others = [each for each in self.last if each != tolerance]
-            found.append((trajectory, self.estimated(trajectory, tolerance, others, last=True)))
-            if found[-1][1].confirmed or found[-1][1].estimate > GAIN * self.wanted:
+            best.append((trajectory, self._estimated(trajectory, tolerance, others, last=True)))
+            if best[-1][1].confirmed or best[-1][1].estimate > GAIN * self.wanted:
                 break
-        return min(found, key=lambda each: each[1].estimate)
+        if not best and failed is not None:
+            raise failed
+        return min(best, key=lambda each: each[1].estimate)
 
-    def estimated(self, trajectory: Any, tolerance: float, others: list[float], *, last: bool = False) -> GlobalError:
+    def _estimated(self, trajectory: Any, tolerance: float, others: list[float], *, last: bool = False) -> GlobalError:
         """Return the estimate of the error of a run by others; the last runs are compared with all of them."""
-        compared = _Samples(trajectory, self.start)
+        compared = _Samples(trajectory, self.start, self.interface)
         safety = SAFETY if len(others) == 1 else SAFETY_OF_ROUNDING
-        differences, largest = np.zeros(len(compared.t)), 0.0
+        floor = max(smallest_estimate(self.words), tolerance)
         for number, each in enumerate(others if compared.end != self.start else ()):
-            if number == 2 and SAFETY_OF_TWO * largest <= self.wanted:
+            if number == 2 and SAFETY_OF_TWO * compared.largest() <= self.wanted:
                 safety = SAFETY_OF_TWO
                 break
-            further = compared.differences(self.other(each, compared.end))
-            if last and not np.isfinite(further).all():
-                further = compared.differences(self.other((each or self.least) * COARSER, compared.end))
-            differences = np.maximum(differences, further)
-            largest = float(differences.max())
-            if not last and safety * largest > self.wanted:
+            try:
+                complete = compared.compare(self._other(each, compared, number))
+                if last and not complete:
+                    compared.compare(self._other((each or self.least) * COARSER, compared, number))
+            except _TooManyStepsError:
+                compared.lose()
+            if not last and safety * compared.largest() > self.wanted:
                 break
-        within = safety * differences <= self.wanted
-        reached = len(within) if within.all() else int(np.argmin(within))
+        differences, reached = compared.relative(lambda relative: np.maximum(safety * relative, floor) <= self.wanted)
+        largest = float(differences.max(initial=0.0))
         return GlobalError(
             requested=self.wanted,
             tolerance=tolerance,
-            h=float(self.steps(tolerance).get("h") or 0.0),
+            h=float(self._steps(tolerance).get("h") or 0.0),
             t=compared.t,
             differences=differences,
             safety=safety,
-            estimate=math.inf if math.isnan(largest) else max(safety * largest, SMALLEST, tolerance),
+            estimate=math.inf if math.isnan(largest) else max(safety * largest, floor),
             confirmed_until=float(compared.t[reached - 1]) if reached else self.start,
             runs=self.count,
-            precision="double-double" if self.last is LAST_OF_TWO_WORDS else "double",
+            precision=NAMES_OF_PRECISIONS[self.words],
         )
+
+
+class _TooManyStepsError(Exception):
+    """Raised if a run for comparison takes many more steps than the run that it is compared with."""
+
+
+def irregular_stops(t: Array, number: int) -> list[float]:
+    """Return times within the steps of a run at which another ends steps, so that it does not share their sequence.
+
+    Steps that follow from the motion alone, as in free flight, are the same for all tolerances. At least
+    ``LEAST_STOPS`` steps are cut, all that are longer than a ``LONG``-th of the run, and of others every
+    ``STRIDE``-th, at fractions that are multiples of the golden ratio modulo 1.
+
+    Args:
+        t: (n,) ends of steps, or other times of the run, with the first and the last time of the run.
+        number: of the comparison; each has other times.
+    """
+    sizes = np.diff(t)
+    pieces = max(1, -(-LEAST_STOPS // max(1, len(sizes))))
+    chosen = abs(sizes) * LONG > abs(t[-1] - t[0])
+    chosen[number :: max(STRIDE, -(-len(sizes) // MOST_STOPS))] = True
+    k = np.repeat(np.flatnonzero(chosen), pieces)
+    parts = (np.arange(1, len(k) + 1) * GOLDEN + number / 3.0) % 1.0
+    stops = np.unique(t[k] + (MARGIN + (1.0 - 2.0 * MARGIN) * parts) * sizes[k])
+    inner = stops[(stops != t[0]) & (stops != t[-1])]
+    return [*(inner if t[-1] > t[0] else inner[::-1]).tolist(), float(t[-1])]
 
 
 class _Samples:
@@ -356,51 +402,73 @@ class _Samples:
         t, states: (k,) times, and (2, k, m) positions and momenta: the last state, and from each of equal numbers of
             states the one where positions or momenta change fastest relative to their sizes, as an error in time has
             the largest effect there.
-        sizes: (2, k) sizes that differences are relative to.
+        errors: (2, k, m) largest differences from other runs, at least the rounding errors of the states.
+        steps_of_run: (n,) initial time, and times of all saved states.
         end: last time.
     """
 
-    def __init__(self, trajectory: Any, start: float) -> None:
-        t, states = trajectory.t, np.array([trajectory.q, trajectory.p])
-        self.end, steps = t.item(-1), len(t) - 1
+    def __init__(self, trajectory: Any, start: float, interface: Interface) -> None:
+        t, states = np.asarray(trajectory.t), [trajectory.q, trajectory.p]
+        self.start, self.end, steps = start, t.item(-1), len(t) - 1
         self.forward = math.copysign(1.0, self.end - start)
-        norms = _norms(states)
-        early = np.count_nonzero(abs(t - start) <= EARLY * abs(self.end - start))
-        least = norms[:, :early].max(axis=1, initial=TINY)
-        sizes = np.maximum.accumulate(np.maximum(norms, least[:, None]), axis=1)
-        count = max(LEAST_SAMPLES, min(len(t) // STEPS_PER_SAMPLE, MOST_SAMPLES, MOST_NUMBERS // states.shape[2]))
+        self.steps_of_run = t if t[0] == start else np.insert(t, 0, start)
+        m = trajectory.q.shape[1]
+        count = max(LEAST_SAMPLES, min(len(t) // STEPS_PER_SAMPLE, MOST_SAMPLES, MOST_NUMBERS // m))
         chosen: Any = slice(None)
         if count < steps:
+            speed = np.zeros(steps)
             with np.errstate(all="ignore"):
-                speeds = _norms(states[:, 1:] - states[:, :-1]) / sizes[:, 1:]
-                speed = np.fmax(*speeds) / np.maximum(abs(t[1:] - t[:-1]), TINY)
+                for each in map(np.asarray, states):
+                    unit = np.abs(each).max() or 1.0
+                    speed = np.fmax(speed, np.abs(np.diff(each / unit, axis=0)).max(axis=1))
+                speed /= np.maximum(abs(np.diff(t)), TINY)
             size = -(-steps // count)
             parts = np.full((-(-steps // size), size), -1.0)
             parts.ravel()[:steps] = speed
             fastest = np.arange(1, steps + 1, size) + parts.argmax(axis=1)
             chosen = [0, *fastest.tolist()]
             chosen += [steps] if chosen[-1] < steps else []
-        self.t, self.states, self.sizes = t[chosen], states[:, chosen], sizes[:, chosen]
+        self.t, self.states = t[chosen], [each[chosen] for each in states]
+        self.epsilon, self.firsts = roundoff(interface.words), first_of_groups(interface, m)
+        self.errors = self.epsilon * np.abs(np.array([np.asarray(each) for each in self.states]))
+        self.motion: Motion | None = None
 
-    def differences(self, other: Any) -> Array:
-        """Return the relative differences to another run, infinite after its end."""
-        ahead = self.forward * (self.t - other.t[-1])
-        differences, some = np.full(len(self.t), np.inf), slice(None) if ahead[-1] <= 0.0 else ahead <= 0.0
+    def compare(self, other: Any) -> bool:
+        """Compare with another run, whose differences are infinite after its end; return whether it is complete."""
+        ahead = self.forward * (self.t - np.asarray(other.t)[-1])
+        some = ahead <= 0.0
+        differences = np.full(self.errors.shape, np.inf)
         with suppress(StepFailedError), np.errstate(all="ignore"):  # a partial step
-            if ahead[0] <= 0.0:
-                states = np.array(other._states_at(self.t[some]))
-                differences[some] = (_norms(states - self.states[:, some]) / self.sizes[:, some]).max(axis=0)
-        return differences
+            if some.any():
+                states = other._states_at(self.t[some])
+                differences[:, some] = [abs(x - y[some]) for x, y in zip(states, self.states, strict=True)]
+        np.maximum(self.errors, differences, out=self.errors)
+        self.motion = Motion(np.asarray(other.t), other.q, other.p, self.firsts, self.epsilon)
+        return bool(np.isfinite(differences).all())
 
+    def lose(self) -> None:
+        """Record that a run for comparison has not ended."""
+        self.errors[:, self.t != self.start] = np.inf
 
-def _norms(rows: Array) -> Array:
-    """Return the norm of each row; rows whose squares may overflow or underflow are scaled."""
-    squares = np.einsum("...j,...j->...", rows, rows)
-    norms = np.sqrt(squares)
-    extreme = (squares < SMALLEST_SQUARE) | (squares > 1.0 / SMALLEST_SQUARE)
-    if extreme.any() and (some := rows[extreme]).any():
-        units = abs(some).max(axis=1)
-        with np.errstate(invalid="ignore"):
-            scaled = some / np.where(units == 0.0, 1.0, units)[:, None]
-            norms[extreme] = units * np.linalg.norm(scaled, axis=1)
-    return np.asarray(norms)
+    def largest(self) -> float:
+        """Return the largest error relative to the size of the whole motion."""
+        return float(self.relative()[0].max(initial=0.0))
+
+    def relative(self, within: Callable[[Array], NDArray[np.bool_]] | None = None) -> tuple[Array, int]:
+        """Return (k,) errors relative to the size of the motion, and up to which of them ``within`` is true.
+
+        The size of an unconfirmed run is that up to the last confirmed time, as what follows is not known.
+        """
+        if self.motion is None:
+            return np.zeros(len(self.t)), len(self.t)
+        whole, reached = np.empty(0), len(self.t)
+        while reached:
+            errors = self.errors[:, :reached]
+            sizes = self.motion.sizes(float(self.t[reached - 1]), errors.max(axis=1))
+            differences = relative(errors, sizes[:, None]).max(axis=(0, 2))
+            whole = whole if whole.size else differences
+            met = np.ones(reached, bool) if within is None else within(differences)
+            if met.all():
+                break
+            reached = int(np.argmin(met))
+        return whole, reached

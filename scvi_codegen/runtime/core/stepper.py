@@ -9,25 +9,21 @@ Neither SymPy nor Jinja is imported.
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
+from contextlib import suppress
 from functools import partial, wraps
 from typing import Any, Self, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scvi_codegen.errors import MethodError, StateError
+from scvi_codegen.errors import MethodError, ScviCodegenError, StateError
 from scvi_codegen.indices import SIZES_REQUIRED
 from scvi_codegen.native import building
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.calls import with_calls
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Source
-from scvi_codegen.runtime.accuracy.global_error import (
-    checked_error,
-    confirmed_run,
-    warn_of_unconfirmed,
-    warn_of_unconfirmed_run,
-)
+from scvi_codegen.runtime.accuracy.global_error import Runs, checked_error, warn_of_unconfirmed, warn_of_unconfirmed_run
 from scvi_codegen.runtime.accuracy.growth import measured_growth, warn_of_error_growth
 from scvi_codegen.runtime.accuracy.largest_step import largest_step
 from scvi_codegen.runtime.accuracy.local_error import warn_of_energy_errors, warn_of_inaccuracy
@@ -177,7 +173,7 @@ class Stepper(WithEventsInDouble, WithPaths, Integrator):
         if interface.rotations or interface.variables:
             q, p, velocity = homogeneous_state(interface, q, p, velocity)
         if error is not None:
-            wanted = checked_error(error, {"h": h, "steps": steps, "tolerance": tolerance})
+            wanted = checked_error(error, {"h": h, "steps": steps, "tolerance": tolerance}, self)
             start = {"velocity": velocity, "inputs": inputs, "t": t, "parameters": parameters, "options": options}
             saved = {"t_end": t_end, "save_every": save_every, "t_eval": t_eval}
             return stepper._confirmed(wanted, q, p, {**start, "progress": progress}, saved)
@@ -228,23 +224,58 @@ class Stepper(WithEventsInDouble, WithPaths, Integrator):
         """
         require(self, "error")
         t, velocity, parameters = start["t"], start["velocity"], start["parameters"]
-        again: Callable[..., Trajectory] | None = None
-        if self.events or saved["save_every"] != 1 or saved["t_eval"] is not None:
-            again = partial(self.with_events(()).integrate, q, p, **start)
+        by_pieces = self._ending_at_kinks()
+        bare = by_pieces or self.with_events(())
 
         def step_of_tau(tolerance: float) -> float:
             momenta = self._initial_momenta(q, p, velocity, t, parameters) if p is None or velocity is not None else p
             span = checked_number(saved["t_end"], "the time t_end") - t
             return largest_step(self, q, momenta, span, tolerance, t=t, parameters=parameters, options=start["options"])
 
-        run, has_tau = partial(self.integrate, q, p, **start, **saved), self._has_tau
-        arguments = error, run, again, checked_number(t, "the time t"), step_of_tau if has_tau else None
-        trajectory = confirmed_run(*arguments, words=self.interface.words)
+        def confirming(stops: Sequence[float], progress: Callable[[int], None], **steps: float | None) -> Trajectory:
+            arguments = {**start, "progress": progress}
+            if self._has_tau:
+                return bare.integrate(q, p, **arguments, **steps, t_end=stops[-1])
+            return bare._recorded_with_stops(q, p, arguments, stops, steps["tolerance"])
+
+        runs = Runs(
+            wanted=error,
+            integrate=partial(self.integrate, q, p, **start, **saved),
+            confirming=confirming,
+            start=checked_number(t, "the time t"),
+            step_of_tau=step_of_tau if self._has_tau else None,
+            interface=self.interface,
+            smooth=by_pieces is not None or not self.interface.kinks,
+        )
+        trajectory = runs.confirmed_run()
         assert trajectory.confirmation is not None  # by confirmed_run
-        if not (trajectory.confirmation.confirmed or has_tau) and (precise := self._in_double_double) is not None:
+        if not (trajectory.confirmation.confirmed or self._has_tau) and (precise := self._in_double_double) is not None:
             return precise._confirmed(error, q, p, start, saved)
         warn_of_unconfirmed_run(trajectory)
         return trajectory
+
+    def _ending_at_kinks(self) -> Stepper | None:
+        """Return a stepper whose steps end where the equations are not smooth; ``None`` without such places."""
+        interface = self.interface
+        if not interface.kinks or self._has_tau or interface.words > 1:
+            return None
+        name = interface.coordinates[0]
+        with suppress(ScviCodegenError):
+            stepper = self.with_events([Event(kink, then={name: name}) for kink in interface.kinks])
+            _ = stepper.binding
+            return stepper
+        return None
+
+    def _recorded_with_stops(
+        self, q: States, p: States | None, start: dict[str, Any], stops: Sequence[float], tolerance: float | None
+    ) -> Trajectory:
+        """Return a run with adaptive steps that end at each of the times ``stops``, in order, with all states."""
+        arguments = dict(start)
+        inputs, progress = arguments.pop("inputs"), arguments.pop("progress")
+        segments = InputSegments(self, inputs or {}, start["parameters"], start["t"], stops[-1])
+        arguments["parameters"] = segments.first
+        run = self.start(q, p, **arguments, t_end=stops[-1], tolerance=tolerance)
+        return segments.record_with_stops(run, stops, progress)
 
     @property
     def _in_double_double(self) -> Stepper | None:
@@ -451,7 +482,7 @@ class Stepper(WithEventsInDouble, WithPaths, Integrator):
         if settings.get("error") is not None:
             require(self, "error")
             steps = {name: settings.get(name) for name in ("h", "steps", "tolerance")}
-            settings["error"] = checked_error(settings["error"], steps)
+            settings["error"] = checked_error(settings["error"], steps, self)
         return Ensemble(self._for_run(None, action=action), q, p, velocity=velocity, **settings)
 
     @checks_arguments(StateError)

@@ -23,6 +23,7 @@ from scvi_codegen.runtime.core.pairs import exact_product
 from scvi_codegen.runtime.core.validation import Array, check_left_to_inputs, no_input
 from scvi_codegen.runtime.core.words import low_words, split, with_low
 from scvi_codegen.runtime.run.memory import Memory
+from scvi_codegen.runtime.run.run_loop import record_with_stops
 from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.runtime.trajectory.dense_output import checked_times
 from scvi_codegen.runtime.trajectory.joining import joined
@@ -280,6 +281,23 @@ class InputSegments:
             warn_of_large_steps(trajectory)
         warn_of_unresolved_fields(trajectory)
         return trajectory
+
+    def record_with_stops(self, run: Run, stops: Sequence[float], progress: Callable[[int], None] | None) -> Trajectory:
+        """Integrate with adaptive steps that end at the breakpoints and at ``stops``, in order; save all states."""
+
+        def recorded(steps: int | None) -> Trajectory:
+            start, end = run.t, run.plan.t_end
+            ends = [*(t for t in stops if min(start, end) < t < max(start, end)), end]
+            if not run.stepper.events:
+                return record_with_stops(run, ends, progress=progress)
+            return record_segments(run, prepared_ends(ends), partial(run._recorded, progress=progress))
+
+        def prepared_ends(ends: Sequence[float]) -> Iterator[None]:
+            for end in ends:
+                run.plan = replace(run.plan, t_end=end)
+                yield None
+
+        return record_segments(run, prepared_segments(run, self.inputs, self.t_end, self.values), recorded)
 
     def advance(self, run: Memory, t_end: float) -> None:
         """Advance a run with adaptive steps to a time without saving intermediate states."""

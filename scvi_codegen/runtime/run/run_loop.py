@@ -2,7 +2,8 @@
 
 import math
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from functools import lru_cache, partial
 from math import isfinite
 from typing import Any, cast
@@ -75,6 +76,26 @@ def record(
         memory.longest = float(np.abs(np.diff(trajectory.t)).max(initial=memory.longest))
         check_energy_surface(trajectory, memory.longest)
     return trajectory
+
+
+def record_with_stops(
+    memory: Memory, stops: Iterable[float], *, progress: Callable[[int], None] | None = None
+) -> Trajectory:
+    """Advance with adaptive steps that end at each of the times ``stops``, and save all states.
+
+    Raises:
+        StepFailedError: if a step fails; ``trajectory`` has the saved states, the run is left before that step.
+    """
+    recorder, first = _StateRecorder(memory, 1, None, 0), memory.steps
+    counted = None if progress is None else lambda _: progress(memory.steps - first)
+    try:
+        for t_end in stops:
+            memory.plan = replace(memory.plan, t_end=t_end)
+            drive(recorder.advance, math.inf, first=FIRST_STEPS, ended=lambda: memory.arrived, progress=counted)
+    except StepFailedError as failure:
+        failure.trajectory = recorder.trajectory()
+        raise
+    return recorder.trajectory()
 
 
 class StateRows:

@@ -1,0 +1,83 @@
+"""Size of a motion: the range of each coordinate over a run, which errors are relative to.
+
+A size that is the coordinate itself would depend on the origin. Coordinates that share a unit share their range: the
+entries of an array, the components of a rotation.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.rendering.source import Interface
+from scvi_codegen.runtime.core.validation import Array, coordinate_shapes
+from scvi_codegen.runtime.rotations.states import members_of
+
+RESOLVED = 64.0
+"""Range in roundings of the largest value from which on a coordinate moves."""
+
+
+def roundoff(words: int) -> float:
+    """Return the largest relative rounding error of numbers of one or two words."""
+    return float(2.0 ** (-53 * words))
+
+
+def first_of_groups(interface: Interface, dimension: int) -> NDArray[np.intp]:
+    """Return the indices of the first coordinates of groups with a common unit: coordinates, arrays, rotations."""
+    counts = [int(np.prod(shape)) for _, shape in coordinate_shapes(interface)]
+    if sum(counts) != dimension or interface.rotations:
+        counts = [1] * dimension
+    firsts = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    for member in members_of(dimension, interface.rotations):
+        columns = member.columns
+        if isinstance(columns, slice):
+            firsts = np.setdiff1d(firsts, np.arange(columns.start + 1, columns.stop))
+    return firsts.astype(np.intp)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """States of a run that its size is derived from.
+
+    Attributes:
+        t: (n,) times, in the direction of the run.
+        q, p: (n, m) positions and momenta.
+        firsts: as of :func:`first_of_groups`.
+        absolute: sizes below which errors do not matter, one number or (m,).
+        epsilon: largest relative rounding error.
+    """
+
+    t: Array
+    q: Array
+    p: Array
+    firsts: NDArray[np.intp]
+    epsilon: float
+    absolute: Array | float = 0.0
+
+    def sizes(self, until: float, errors: Array) -> Array:
+        """Return (2, m) sizes of positions and momenta up to a time.
+
+        Positions: max(range, absolute); of a coordinate that is at rest, up to rounding, its largest value, and of one
+        that consists of rounding errors of others, by which ``errors`` (2, m) are as large, the largest range. Momenta:
+        the largest of all.
+        """
+        rows = slice(max(1, np.count_nonzero(abs(self.t - self.t[0]) <= abs(until - self.t[0]))))
+        q, p = np.asarray(self.q)[rows], np.asarray(self.p)[rows]
+        ranges, largest = self._of_groups(np.ptp(q, axis=0)), self._of_groups(np.abs(q).max(axis=0))
+        resolution = RESOLVED * self.epsilon
+        rest = ranges <= resolution * largest
+        noise = (ranges <= resolution * ranges.max(initial=0.0)) & (100.0 * errors[0] >= ranges)
+        sizes = np.where(noise, ranges.max(initial=0.0), np.where(rest, np.maximum(ranges, largest), ranges))
+        momenta = np.full_like(sizes, np.abs(p).max(initial=0.0))
+        return np.array([np.maximum(sizes, self.absolute), momenta])
+
+    def _of_groups(self, values: Array) -> Array:
+        """Return the largest value of the group of each coordinate."""
+        counts = np.diff(self.firsts, append=len(values))
+        return np.asarray(np.repeat(np.maximum.reduceat(values, self.firsts), counts))
+
+
+def relative(errors: Array, sizes: Array) -> Array:
+    """Return errors (.., m) relative to sizes; 0 for errors of 0."""
+    with np.errstate(all="ignore"):
+        return np.asarray(np.where(errors == 0.0, 0.0, errors / sizes))

@@ -1,0 +1,288 @@
+"""Random runs with ``error=``, a third of them not smooth: none is falsely confirmed, most are confirmed.
+
+References are closed forms, or DOP853 at a relative tolerance of 1e-13 between the zeros of the switching functions.
+"""
+
+import math
+import warnings
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from notation import lagrange
+from scipy.integrate import solve_ivp
+
+import scvi_codegen as sc
+
+REFERENCE_TOLERANCE, REFERENCE_ERROR = 3e-14, 3e-12
+"""Relative tolerance of references, and their largest relative error."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A run and its reference.
+
+    Attributes:
+        kind: name of the system.
+        smooth: whether its equations are smooth.
+        stepper: stepper.
+        arguments: of :meth:`Stepper.integrate`, without ``error``.
+        positions: function of times (n,) that returns positions (n, m).
+    """
+
+    kind: str
+    smooth: bool
+    stepper: Any
+    arguments: dict[str, Any]
+    positions: Callable[[np.ndarray], np.ndarray]
+
+
+SMOOTH = {
+    "oscillator": (("x",), "x_dot**2/2 - w**2*x**2/2 - c*x**4/4", {}, {"w": 1.0, "c": 0.0}),
+    "pendulum": (("a",), "a_dot**2/2 + w**2*cos(a - c)", {}, {"w": 1.0, "c": 0.0}),
+    "Kepler": (("x", "y"), "(x_dot**2 + y_dot**2)/2 + 1/sqrt((x - c)**2 + y**2)", {}, {"c": 0.0}),
+    "driven": (("x",), "x_dot**2/2 - x**2/2 - x**4/4", {"x": "w*cos(c*t) - x_dot/8"}, {"w": 1.0, "c": 1.0}),
+    "double pendulum": (
+        ("a", "b"), "a_dot**2 + b_dot**2/2 + a_dot*b_dot*cos(a - b) + w*(2*cos(a) + cos(b))", {}, {"w": 1.0},
+    ),
+    "charge": (
+        ("x", "y", "z"), "(x_dot**2 + y_dot**2 + z_dot**2)/2 + w*(x*y_dot - y*x_dot)/2 - (x**2 + y**2 - z**2)*c/2",
+        {}, {"w": 1.0, "c": 0.1},
+    ),
+}  # fmt: skip
+NOT_SMOOTH = {
+    "floor": (("y",), "y_dot**2/2 - 9.8*y - k*positive_part(-y)**2", {}, {"k": 1e5}),
+    "motor": (("x",), "x_dot**2/2", {"x": "unit_step(t - a)"}, {"a": 5.0}),
+    "pulse": (("x",), "x_dot**2/2 - x**2/2", {"x": "unit_step(t - a)*unit_step(a + w - t)"}, {"a": 5.0, "w": 0.1}),
+    "ramp": (("x",), "x_dot**2/2 - x**2/2", {"x": "positive_part(t - a)"}, {"a": 5.0}),
+    "layer": (("x",), "x_dot**2/2", {"x": "k*unit_step(x - a)*unit_step(a + w - x)"}, {"a": 5.0, "w": 0.1, "k": 1.0}),
+    "two springs": (("x",), "x_dot**2/2 - x**2/2 - k*positive_part(x)**2/2", {}, {"k": 3.0}),
+    "saturation": (
+        ("x",), "x_dot**2/2 - x**2/2 - positive_part(x - a)**2*k - positive_part(-x - a)**2*k", {"x": "w*cos(t)"},
+        {"a": 1.0, "k": 10.0, "w": 0.5},
+    ),
+    "table": (("x",), "x_dot**2/2 - x**2/2", {"x": "u"}, {}),
+}  # fmt: skip
+METHODS = ("svi:4", "svi:6", "svi:8")
+
+
+@cache
+def stepper_of(kind: str, method: str) -> Any:
+    names, lagrangian, forces, parameters = (SMOOTH | NOT_SMOOTH)[kind]
+    inputs = "u" if kind == "table" else ""
+    return sc.compile_stepper(lagrange("motion", names, lagrangian, forces=forces, inputs=inputs, **parameters), method)
+
+
+def integrated(rates, y0, times):
+    """Return states (n, d) at times, the first one included."""
+    run = solve_ivp(rates, (times[0], times[-1]), y0, "DOP853", times, rtol=REFERENCE_TOLERANCE, atol=1e-15)
+    return run.y.T
+
+
+def linear_motion(coefficients, start, t):
+    """Return x, x_dot at times t of x'' = -W x + f + g t + A cos(t), from (t0, x0, v0)."""
+    (W, f, g, A), (t0, x0, v0) = coefficients, start
+
+    def particular(t):
+        if W == 0.0:
+            return f * t**2 / 2 + g * t**3 / 6 - A * np.cos(t), f * t + g * t**2 / 2 + A * np.sin(t)
+        x, v = (f + g * t) / W, g / W + 0.0 * t
+        if W == 1.0:
+            return x + A * t * np.sin(t) / 2, v + A * (np.sin(t) + t * np.cos(t)) / 2
+        return x + A * np.cos(t) / (W - 1), v - A * np.sin(t) / (W - 1)
+
+    (x_start, v_start), (x, v), w, s = particular(t0), particular(t), math.sqrt(W), t - t0
+    x0, v0 = x0 - x_start, v0 - v_start
+    if W == 0.0:
+        return x + x0 + v0 * s, v + v0 + 0.0 * s
+    return x + x0 * np.cos(w * s) + v0 / w * np.sin(w * s), v - x0 * w * np.sin(w * s) + v0 * np.cos(w * s)
+
+
+def switched(coefficients, guards, state, times):
+    """Return positions (n, 1) at times of a motion that is linear between the zeros of guards, functions of (t, x).
+
+    ``coefficients``: function of the signs of the guards that returns those of :func:`linear_motion`.
+    """
+    (t, end), (x, v), found = (times[0], times[-1]), state, np.empty((len(times), 1))
+    ahead = linear_motion(coefficients([g(t, x) > 0.0 for g in guards]), (t, x, v), t + 1e-9)
+    signs = [bool((g(t, x) or g(t + 1e-9, ahead[0])) > 0.0) for g in guards]
+    while True:
+        now, start = coefficients(signs), (t, x, v)
+        grid = t + (end - t) * np.linspace(0.0, 1.0, 20_001)[1:]
+        along = linear_motion(now, start, grid)[0]
+        crossing = [np.flatnonzero((g(grid, along) > 0.0) != sign) for g, sign in zip(guards, signs, strict=True)]
+        firsts = [k[0] if len(k) else len(grid) for k in crossing]
+        k, j = min((k, j) for j, k in enumerate(firsts))
+        until = end
+        if k < len(grid):
+            low, high = grid[k - 1] if k else t, grid[k]
+            for _ in range(80):
+                middle = 0.5 * (low + high)
+                there = guards[j](middle, linear_motion(now, start, middle)[0]) > 0.0
+                low, high = (middle, high) if there == signs[j] else (low, middle)
+            until = high
+        inside = (times >= t) & (times <= until)
+        found[inside, 0] = linear_motion(now, start, times[inside])[0]
+        if until == end:
+            return found
+        x, v = linear_motion(now, start, until)
+        t, signs[j] = until, not signs[j]
+
+
+def smooth_case(random, kind):
+    """Return arguments, and a function of times that returns positions."""
+    u, span = random.uniform, random.uniform(2.0, 25.0)
+    values = {"w": 10.0 ** u(-0.5, 0.7), "c": u(0.0, 2.0)}
+    if kind == "double pendulum":
+        q, p, values, span = u(-1.2, 1.2, 2), u(-0.5, 0.5, 2), {"w": values["w"]}, span / 4
+
+        def rates(t, y):
+            a, b, pa, pb = y
+            c = math.cos(a - b)
+            va, vb = (pa - c * pb) / (2 - c * c), (2 * pb - c * pa) / (2 - c * c)
+            g = va * vb * math.sin(a - b)
+            return [va, vb, -g - 2 * values["w"] * math.sin(a), g - values["w"] * math.sin(b)]
+
+    elif kind == "Kepler":
+        e, c = 1.0 - 10.0 ** u(-1.5, -0.05), random.choice([0.0, 3.0, -10.0])
+        q, p, values = np.array([1.0 - e + c, 0.0]), np.array([0.0, math.sqrt((1.0 + e) / (1.0 - e))]), {"c": c}
+
+        def rates(t, y):
+            x, z = y[0] - c, y[1]
+            r = math.hypot(x, z) ** 3
+            return [y[2], y[3], -x / r, -z / r]
+
+    elif kind == "charge":
+        q, p = u(-1.0, 1.0, 3) * [1.0, 1.0, random.choice([1.0, 1e-9])], u(-1.0, 1.0, 3) * [1.0, 1.0, 0.0]
+        w, c = values["w"], 0.1 * values["c"]
+        values["c"] = c
+
+        def rates(t, y):
+            x, z, s, px, py, pz = y
+            vx, vy = px + w * z / 2, py - w * x / 2
+            return [vx, vy, pz, w * vy / 2 - c * x, -w * vx / 2 - c * z, c * s]
+
+        span = min(span, 8.0)
+    else:
+        q, p = u(-1.5, 1.5, 1), u(-1.0, 1.0, 1)
+        w, c = values["w"], values["c"]
+        if kind == "pendulum":
+            values["c"] = c = random.choice([0.0, 2.0 * math.pi * 10, -1.0])
+            q = q + c
+        force = {
+            "oscillator": lambda t, x, v: -(w**2) * x - c * x**3,
+            "pendulum": lambda t, x, v: -(w**2) * math.sin(x - c),
+            "driven": lambda t, x, v: -x - x**3 + w * math.cos(c * t) - v / 8,
+        }[kind]
+
+        def rates(t, y):
+            return [y[1], force(t, y[0], y[1])]
+
+    m = len(q)
+    arguments = {"q": q, "p": p, "t_end": span, "parameters": values}
+    return arguments, lambda times: integrated(rates, [*q, *p], times)[:, :m]
+
+
+def case_with_kinks(random, kind):
+    """Return arguments, and a function of times that returns positions."""
+    u, span = random.uniform, random.uniform(3.0, 12.0)
+    a, w, k = u(0.1, 0.9) * span, 10.0 ** u(-4.0, 0.3), 10.0 ** u(0.0, 2.0)
+    q, p, values, inputs = u(-1.5, 1.5), u(-1.0, 1.0), {}, None
+    at = {"after": lambda t, x: t - a, "before": lambda t, x: a + w - t}
+    if kind == "floor":
+        k = 10.0 ** u(2.0, 5.0)
+        q, p, values = u(0.05, 3.0), 0.0, {"k": k}
+        span = u(1.5, 6.0) * math.sqrt(2 * q / 9.8)
+        motion = lambda s: (2 * k if s[0] else 0.0, -9.8, 0.0, 0.0), [lambda t, x: -x]
+    elif kind == "motor":
+        values, motion = {"a": a}, (lambda s: (0.0, float(s[0]), 0.0, 0.0), [at["after"]])
+    elif kind == "pulse":
+        values, motion = {"a": a, "w": w}, (lambda s: (1.0, float(s[0] and s[1]), 0.0, 0.0), [*at.values()])
+    elif kind == "ramp":
+        values = {"a": a}
+        motion = lambda s: (1.0, -a * s[0], float(s[0]), 0.0), [at["after"]]
+    elif kind == "layer":
+        q, p, a, w = 0.0, 1.0, u(0.1, 0.9) * span, 10.0 ** u(-3.0, 0.3)
+        values = {"a": a, "w": w, "k": k}
+        motion = (lambda s: (0.0, k * (s[0] and s[1]), 0.0, 0.0), [lambda t, x: x - a, lambda t, x: a + w - x])
+    elif kind == "two springs":
+        values, motion = {"k": k}, (lambda s: (1.0 + k * s[0], 0.0, 0.0, 0.0), [lambda t, x: x])
+    elif kind == "saturation":
+        a, drive = u(0.3, 1.5), u(0.1, 1.0)
+        values = {"a": a, "k": k / 2, "w": drive}
+        motion = (
+            lambda s: (1.0 + k * (s[0] or s[1]), k * a * (int(s[0]) - int(s[1])), 0.0, drive),
+            [lambda t, x: x - a, lambda t, x: -x - a],
+        )
+    else:
+        t, x = np.sort(np.append(u(0.0, span, 4), [0.0, span])), u(-1.0, 1.0, 6)
+        inputs, rates = {"u": (t, x)}, np.diff(x) / np.diff(t)
+        edges = [lambda s, x, each=each: s - each for each in t[1:-1]]
+        motion = lambda s: (1.0, x[sum(s)] - rates[sum(s)] * t[sum(s)], rates[sum(s)], 0.0), edges
+    arguments = {"q": [q], "p": [p], "t_end": span, "parameters": values}
+    if inputs:
+        arguments = {"q": [q], "p": [p], "t_end": span, "inputs": inputs}
+    return arguments, lambda times: switched(*motion, (q, p), times)
+
+
+def case_of(number: int, *, smooth: bool) -> Case:
+    """Return a random case."""
+    random = np.random.default_rng([number, smooth])
+    kinds = [*(SMOOTH if smooth else NOT_SMOOTH)]
+    kind, method = kinds[number % len(kinds)], str(random.choice(METHODS))
+    arguments, positions = (smooth_case if smooth else case_with_kinks)(random, kind)
+    arguments["error"] = 10.0 ** random.uniform(-11.0, -3.0)
+    return Case(kind, smooth, stepper_of(kind, method), arguments, positions)
+
+
+def outcome(case: Case) -> tuple[str, float]:
+    """Return ``"confirmed"``, ``"false"`` or ``"unconfirmed"``, and the true error relative to the bound."""
+    with warnings.catch_warnings(action="ignore"):
+        run = case.stepper.integrate(**case.arguments)
+    reached = run.t <= run.confirmed_until
+    times = np.unique(np.append(run.t, np.linspace(run.t[0], run.t[-1], 201)))
+    exact = case.positions(times)
+    sizes = np.ptp(exact[times <= run.confirmed_until], axis=0)
+    errors = abs(np.asarray(run.q) - exact[np.searchsorted(times, run.t)])[reached]
+    with np.errstate(all="ignore"):
+        error = np.nan_to_num(errors / sizes).max(initial=0.0)
+    ratio = float(error / case.arguments["error"])
+    if error > case.arguments["error"] + REFERENCE_ERROR:
+        return "false", ratio
+    return ("confirmed" if run.confirmation.confirmed else "unconfirmed"), ratio
+
+
+def counts(numbers, *, smooth: bool) -> Counter:
+    """Return how many cases of each kind have each outcome."""
+    found = Counter()
+    for number in numbers:
+        case = case_of(number, smooth=smooth)
+        found[case.kind, outcome(case)[0]] += 1
+    return found
+
+
+def check(found: Counter, least: float) -> None:
+    total = Counter()
+    for (_, result), count in found.items():
+        total[result] += count
+    assert total["false"] == 0, found
+    assert total["confirmed"] >= least * sum(total.values()), found
+
+
+QUICK = {True: (12, 0.9), False: (16, 0.6)}
+
+
+@pytest.mark.parametrize("smooth", [True, False], ids=["smooth", "not smooth"])
+def test_no_error_is_falsely_confirmed(smooth):
+    count, least = QUICK[smooth]
+    check(counts(range(count), smooth=smooth), least)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(("smooth", "count", "least"), [(True, 2000, 0.95), (False, 1000, 0.6)])
+def test_of_three_thousand_errors_none_is_falsely_confirmed(smooth, count, least):
+    check(counts(range(count), smooth=smooth), least)
