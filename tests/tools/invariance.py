@@ -226,7 +226,7 @@ class Cell:
         return compiled(self.kind, self.method, self.precision)
 
     def is_offered(self) -> bool:
-        """Return whether the package offers the combination at a bearable cost: no two words of arrays or low orders."""
+        """Return whether the combination exists and is affordable: in two words no arrays and no low orders."""
         return self.precision == "double" or (self.method == "svi:8" and not KINDS[self.kind].array)
 
 
