@@ -111,7 +111,7 @@ CALLS = [
     (lambda: sc.advise(KEPLER, "svi:4", [1.0, 0.0], [0.0, 1.0], 10.0), "advise requires tolerance, the error at"),
     (lambda: sc.advise(KEPLER, "svi:4", [1.0, 0.0], span=10.0, tolerance=1e-6), "give either p or velocity"),
     (lambda: sc.verify(KEPLER, "svi:1", h=0.0), "the step size h"),
-    (lambda: sc.periodic_orbit(stepper(), [0.1], [0.0], period=6.0), "(h=0.05); it got neither"),
+    (lambda: sc.periodic_orbit(stepper(), [0.1], [0.0], period=6.0, steps=9, h=1.0), "got both, steps=9 and h=1.0"),
     (lambda: input_of("u", "torque.csv"), "read a file first: t, values = numpy.loadtxt"),
     (lambda: sc.compile_stepper(KEPLER, "svi:2").energy(1.0, 0.5), "q must have shape (2,) for (q1, q2), not ()"),
     (lambda: massless(h=0.1, steps=9), "no mass is 0"),

@@ -44,6 +44,10 @@ def test_ball_on_a_vibrating_table_has_orbits_of_period_one_and_two(table):
     assert abs(orbit.multipliers.sum() - ((1 + E) ** 2 * (1 - 0.8 * np.sin(phase)) - 2 * E)) < 1e-12
     assert abs(orbit.multipliers.prod() - E**2) < 1e-13
     assert orbit.stable
+    adaptive = sc.periodic_orbit(table, [3.5], [-2.7], period=2 * np.pi, fixed_period=True)
+    assert adaptive.steps < 20
+    assert abs(adaptive.q - orbit.q).max() < 1e-12
+    assert abs(adaptive.monodromy - orbit.monodromy).max() < 1e-11
     known = {"A": 1.15}
     phase, speed = start_of_period_one(1.15)
     late = table.integrate([0.1], [speed], t=phase, h=0.1, t_end=60 * np.pi, parameters=known)

@@ -68,6 +68,42 @@ def test_a_halo_orbit_is_the_published_one(restricted):
     assert len(orbit.run(save_every=50)) == 5
 
 
+def test_the_error_of_equal_steps_is_reported(restricted):
+    """A near-rectilinear halo orbit about L2 in 60 steps, compared with adaptive ones, which DOP853 closes."""
+    guess = {"velocity": [0.0, -0.1033, 0.0], "period": 1.5112, "fixed": ["y", "z"]}
+    orbit = sc.periodic_orbit(restricted, [1.0220, 0.0, -0.1821], **guess)
+    z = np.concatenate([orbit.q, orbit.p])
+    end = solve_ivp(_motion, (0, orbit.period), z, method="DOP853", rtol=1e-13, atol=1e-15).y[:, -1]
+    assert_allclose(end, z, rtol=0, atol=1e-9)
+    assert orbit.error < 1e-9
+    assert orbit.trivial_error < 1e-6
+    with pytest.warns(sc.AccuracyWarning, match=r"its 60 steps rather .* the stability index that must be 1 differs"):
+        coarse = sc.periodic_orbit(restricted, orbit.q, orbit.p, period=orbit.period, steps=60, fixed=["y", "z"])
+    assert coarse.residual < 1e-12
+    assert coarse.error == pytest.approx(abs(coarse.period / orbit.period - 1), rel=0.5)
+    assert np.abs(coarse.stability_indices - 1.0).min() > 0.1
+
+
+BUTTERFLY = [-1.0, 0.0, 1.0, 0.0, 0.0, 0.0], (0.3068934205, 0.1255065670), 6.2346748391
+"""Positions of three unit masses, velocity and period of the butterfly I of M. Suvakov & V. Dmitrasinovic, Phys. Rev.
+Lett. 110 (2013) 114301."""
+
+
+def test_an_accurate_guess_stays_accurate():
+    """The butterfly, whose published digits close to 1e-10; 4000 equal steps move its period by 3e-5."""
+    names = ["x1", "y1", "x2", "y2", "x3", "y3"]
+    pairs = " + ".join(f"1/sqrt((x{i} - x{j})**2 + (y{i} - y{j})**2)" for i, j in ((1, 2), (2, 3), (3, 1)))
+    system = lagrange("bodies", " ".join(names), f"({' + '.join(f'{x}_dot**2' for x in names)})/2 + {pairs}")
+    stepper, (q, (vx, vy), period) = sc.compile_stepper(system, "svi:8"), BUTTERFLY
+    guess = {"velocity": [vx, vy, vx, vy, -2 * vx, -2 * vy], "period": period}
+    orbit = sc.periodic_orbit(stepper, q, **guess)
+    run = stepper.integrate(orbit.q, orbit.p, t_end=orbit.period, tolerance=1e-14)
+    assert np.abs(run.q[-1] - orbit.q).max() < 1e-10
+    assert orbit.period == pytest.approx(period, abs=1e-10)
+    assert orbit.error < 1e-10
+    assert orbit.steps < 400
+
+
 def _motion(t, z):
     """Return the rates of positions and momenta: p = v + (-y, x, 0), H = p^2/2 + y p_x - x p_y - .."""
     (x, y, w), p = z[:3], z[3:]
@@ -142,6 +178,35 @@ def test_pendulum_period_is_the_elliptic_integral():
     assert over.period == pytest.approx(2 * 2 / 2.5 * ellipk((2 / 2.5) ** 2), rel=1e-11)
 
 
+def test_adaptive_steps_reach_the_bound(galaxy, restricted):
+    """Periods by K(k), a published halo orbit, and an orbit of Henon-Heiles by equal steps."""
+    pendulum = sc.compile_stepper(sc.problem("planar-pendulum").system, sc.SVI(8))
+    values = {"m": 1.0, "l": 1.0, "g": 1.0}
+    for amplitude in (0.1, 1.0, 3.0):
+        at = {"fixed": ["q", "p_q"], "parameters": values, "error": 1e-12}
+        exact = 4 * ellipk(np.sin(amplitude / 2) ** 2)
+        orbit = sc.periodic_orbit(pendulum, [amplitude], [0.0], period=1.05 * exact, **at)
+        assert orbit.period == pytest.approx(exact, rel=1e-12)
+        assert orbit.error < 1e-12
+    over = sc.periodic_orbit(
+        pendulum, [0.0], [2.5], period=3.0, fixed=["q", "p_q"], gain=[2 * np.pi], parameters=values
+    )
+    assert over.period == pytest.approx(2 * 2 / 2.5 * ellipk((2 / 2.5) ** 2), rel=1e-11)
+    x, v, period = HALO
+    halo = sc.periodic_orbit(
+        restricted,
+        [1.001 * x[0], 0.0, x[2]],
+        velocity=[0.0, 0.998 * v[1], 0.0],
+        period=1.001 * period,
+        fixed=["y", "z"],
+    )
+    assert_allclose([*halo.q, halo.period], [*x, period], rtol=0, atol=1e-10)
+    adaptive = sc.periodic_orbit(galaxy, [0.0, 0.28], [0.4, 0.02], period=6.2, energy=1 / 8)
+    equal = sc.periodic_orbit(galaxy, [0.0, 0.28], [0.4, 0.02], period=6.2, energy=1 / 8, h=0.05)
+    assert adaptive.period == pytest.approx(equal.period, rel=1e-11)
+    assert_allclose(adaptive.monodromy, adaptive.run().tangent()[-1], rtol=0, atol=1e-9)
+
+
 def test_galactic_orbits_are_found_by_energy(galaxy):
     """The stable one at y = 0.3 or so, the unstable one below; and turned by a third, as the potential may be."""
     energy = 1 / 8
@@ -175,7 +240,11 @@ def test_forced_oscillator_has_the_period_of_its_force():
     stepper, period = sc.compile_stepper(driven, sc.SVI(6)), 2 * np.pi / 1.5
     orbit = sc.periodic_orbit(stepper, [0.5], [0.5], period=period, steps=40, fixed_period=True)
     answer = 1.0 / (1.0 - 1.5**2 + 0.3j)
-    assert_allclose([orbit.q[0], orbit.p[0]], [answer.real, (1.5j * answer).real], rtol=0, atol=1e-10)
+    adaptive = sc.periodic_orbit(stepper, [0.5], [0.5], period=period, fixed_period=True)
+    for each in (orbit, adaptive):
+        assert_allclose([each.q[0], each.p[0]], [answer.real, (1.5j * answer).real], rtol=0, atol=1e-10)
+        assert each.error < 1e-10
+        assert np.isnan(each.trivial_error)
     assert_allclose(np.abs(orbit.multipliers), np.exp(-0.1 * period), rtol=1e-9)
     assert orbit.stable
     with pytest.raises(sc.MethodError, match="not symplectic"):
@@ -225,8 +294,13 @@ def test_invalid_orbits_are_rejected(galaxy):
         sc.periodic_orbit(losing, [1.0], [0.0], period=6.0, steps=40, fixed=["q"])
     with pytest.raises(sc.StateError, match=r"fixed names 'p_z', .*; did you mean"):
         sc.periodic_orbit(galaxy, [0.0, 0.3], [0.4, 0.0], period=6.5, h=0.1, fixed=["p_z"])
-    with pytest.raises(sc.StateError, match=r"number of steps per period .steps=200. or .* it got neither"):
-        sc.periodic_orbit(galaxy, [0.0, 0.3], [0.4, 0.0], period=6.5)
+    with pytest.raises(sc.StateError, match=r"number of steps per period .steps=200., or .* got both"):
+        sc.periodic_orbit(galaxy, [0.0, 0.3], [0.4, 0.0], period=6.5, steps=65, h=0.1)
+    leapfrog = sc.compile_stepper(sc.problem("harmonic-oscillator").system, sc.StoermerVerlet())
+    with pytest.raises(sc.MethodError, match=r"give h and steps"):
+        sc.periodic_orbit(leapfrog, [1.0], [0.0], period=6.0)
+    with pytest.raises(sc.StateError, match="error must be between 0 and 1"):
+        sc.periodic_orbit(galaxy, [0.0, 0.3], [0.4, 0.0], period=6.5, error=0.0)
     with pytest.raises(sc.StateError, match="the period must be positive"):
         sc.periodic_orbit(galaxy, [0.0, 0.3], [0.4, 0.0], period=-6.5, h=0.1)
 

@@ -1,5 +1,10 @@
 """Periodic orbits: Newton's iteration on the state after one period, with the exact monodromy matrix.
 
+The steps of a period are equal, or chosen adaptively and then frozen relative to the period while Newton's method
+iterates. A run of more steps that end at other times confirms the closure: with its defect d, of the end minus the
+start, and the Jacobian A of the closing equations, -A^+ d is the distance to the orbit of the finer steps, the
+discretisation error of the orbit.
+
 Where tangent vectors grow along the guess, the period is cut into segments first (multiple shooting).
 
 Periodic orbits are not isolated: the initial point is arbitrary, and orbits form one-parameter families (by energy or
@@ -10,10 +15,12 @@ quantities are projected out (Munoz-Almaraz et al., Physica D 181 (2003) 1).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,14 +38,16 @@ from scvi_codegen.errors import (
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.representation import summary
+from scvi_codegen.runtime.accuracy.warning_switch import warnings_wanted, without_accuracy_warnings
 from scvi_codegen.runtime.core.features import require
 from scvi_codegen.runtime.core.stepper import STEPPER, Stepper
 from scvi_codegen.runtime.core.validation import Array, Parameters, check_inputs_given, checked_vector
 from scvi_codegen.runtime.estimation.measurements import state_names
+from scvi_codegen.runtime.orbits.step_sequence import StepSequence
 from scvi_codegen.runtime.rotations.reduction import Reduction
 from scvi_codegen.runtime.rotations.states import checked_pair, homogeneous_state
 from scvi_codegen.runtime.run.step_plan import StepPlan
-from scvi_codegen.runtime.run.times import steps_within, times_after
+from scvi_codegen.runtime.run.times import steps_within
 from scvi_codegen.runtime.sensitivity.fixed_steps import tangents_along
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation import checked_count, checks_arguments
@@ -47,6 +56,12 @@ SYMPLECTIC = 1e-9
 """Symplecticity defect of a monodromy matrix, relative to its squared norm, above which it is not due to rounding."""
 SAME = 1e-6
 """Deviation of a stability index from 1 that rounding may cause."""
+ERROR, ERROR_OF_EQUAL_STEPS = 1e-9, 1e-6
+"""Default bounds of the discretisation error, of adaptive steps and of those that the user chose."""
+TOLERANCES = (1e-2, 1e-4, 0.0)
+"""Local tolerances of adaptive steps, relative to the bound of the discretisation error, until one meets it."""
+TRIVIAL = 1e-3
+"""Deviation of the trivial stability index from 1 that is reported."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -57,10 +72,16 @@ class PeriodicOrbit:
         q, p: (m,) initial state.
         t: initial time.
         period: the period.
-        steps: number of steps per period, each of size ``period / steps``.
+        steps: number of steps per period.
+        sequence: ends of the steps relative to the period.
         monodromy: (2m, 2m) derivative of the end with respect to the start; of systems with rotations in canonical
             coordinates of the reduced space, with 6 rows for a rotation, 4 for a direction and 2 for a spin.
-        residual: largest entry of the end minus the start.
+        residual: largest entry of the end minus the start, of the computed map.
+        error: discretisation error of the orbit: the distance to the orbit of a run with 2.6 times as many steps, which
+            end at other times. It is the largest of three relative errors: of the positions and of the momenta at the
+            start, relative to the largest range of a position and of a momentum over the orbit, and of the period.
+        trivial_error: deviation from 1 of the stability index (of steps that are not symplectic: the multiplier)
+            nearest to 1, where motions that are shifted in time make it 1; NaN if the system depends on time.
         iterations: number of Newton iterations.
         parameters: (k,) in the order of ``stepper.parameters``.
         stepper: the compiled integrator.
@@ -73,24 +94,26 @@ class PeriodicOrbit:
     steps: int
     monodromy: Array
     residual: float
+    error: float
+    trivial_error: float
     iterations: int
     parameters: Array
     stepper: Stepper = field(repr=False)
+    sequence: StepSequence = field(repr=False)
     options: SolverOptions | None = field(default=None, repr=False)
 
-    __repr__ = summary("q", "p", "period", "steps")
+    __repr__ = summary("q", "p", "period", "steps", "error")
 
     def run(self, *, save_every: int = 1) -> Trajectory:
-        """Return the trajectory of one period, every ``save_every``-th state."""
+        """Return the trajectory of one period, every ``save_every``-th state; of adaptive steps a new adaptive run."""
+        adaptive = self.sequence.tolerance is not None
+        steps: dict[str, Any] = (
+            {"t_end": self.t + self.period, "tolerance": self.sequence.tolerance or None}
+            if adaptive
+            else {"h": self.period / self.steps, "steps": self.steps}
+        )
         return self.stepper.integrate(
-            self.q,
-            self.p,
-            h=self.period / self.steps,
-            steps=self.steps,
-            save_every=save_every,
-            t=self.t,
-            parameters=self.parameters,
-            options=self.options,
+            self.q, self.p, **steps, save_every=save_every, t=self.t, parameters=self.parameters, options=self.options
         )
 
     @property
@@ -190,6 +213,7 @@ def periodic_orbit(
     period: float,
     steps: int | None = None,
     h: float | None = None,
+    error: float | None = None,
     fixed_period: bool = False,
     energy: float | None = None,
     fixed: Sequence[str] = (),
@@ -200,8 +224,11 @@ def periodic_orbit(
 ) -> PeriodicOrbit:
     """Find a periodic orbit near an initial guess, by Newton's iteration with exact derivatives of the steps.
 
-    Where the orbit is unstable, multiple shooting improves the guess first. Give a state on the orbit, the period, and
-    ``steps`` or ``h``; without ``fixed`` or ``energy`` the orbit is one of a family near the guess. If the iteration
+    Where the orbit is unstable, multiple shooting improves the guess first. Give a state on the orbit and the period;
+    without ``fixed`` or ``energy`` the orbit is one of a family near the guess. Steps are adaptive along the guess and
+    frozen, relative to the period, while Newton's method iterates, unless ``steps`` or ``h`` makes them equal. A run
+    with more steps then measures the discretisation error, ``orbit.error``; an
+    :class:`~scvi_codegen.AccuracyWarning` reports one above the bound ``error``. If the iteration
     fails or converges to an equilibrium, it is repeated from a closed curve near the guess, and with fixed positions.
     An :class:`~scvi_codegen.AccuracyWarning` reports an orbit that differs from the guess by more than a third of its
     amplitude, with its period, this distance and its amplitude: another member of the family, or another orbit.
@@ -211,8 +238,10 @@ def periodic_orbit(
         q, p, velocity: (m,) initial guess of a state on the orbit, with one of p and velocity. Rotations must close as
             rotations, not as quaternions.
         period: initial guess of the period, positive.
-        steps: number of steps per period.
+        steps: number of equal steps per period, instead of adaptive ones.
         h: instead of ``steps``, the largest step size for the initial period; its sign is ignored.
+        error: bound of the discretisation error ``orbit.error``, by default 1e-9; adaptive steps become smaller until
+            it is met. By default 1e-6 with ``steps`` or ``h``, which it does not change.
         fixed_period: keep the period fixed; required if the system depends on time.
         energy: prescribed energy of the orbit.
         fixed: coordinates and momenta (``"p_x"``) that keep their initial values: an amplitude, or a section such as
@@ -240,12 +269,16 @@ def periodic_orbit(
         require(stepper, "energy")
     if (period := checked_number(period, "the period")) <= 0.0:
         raise StateError(f"the period must be positive, not {period:g}")
-    if (steps is None) == (h is None):
-        got = "neither" if h is None else f"both, steps={steps} and h={h}"
+    if steps is not None and h is not None:
         raise StateError(
-            "periodic_orbit requires one step size, either the number of steps per period (steps=200) or the largest "
-            f"step size (h=0.05); it got {got}"
+            "give the number of steps per period (steps=200), or the largest step size (h=0.05), or neither for "
+            f"adaptive steps; periodic_orbit got both, steps={steps} and h={h}"
         )
+    if adaptive := steps is None and h is None:
+        require(stepper, "adaptive")
+    bound = ERROR if adaptive else ERROR_OF_EQUAL_STEPS
+    if error is not None and not 0.0 < (bound := checked_number(error, "error")) < 1.0:
+        raise StateError(f"error must be between 0 and 1, a bound of the relative discretisation error, not {bound:g}")
     for name in fixed:
         if name not in names:
             raise StateError(f"fixed names '{name}', which is no coordinate or momentum{closest(name, names)}")
@@ -253,7 +286,7 @@ def periodic_orbit(
         stepper=stepper,
         reduction=Reduction(interface),
         period=period,
-        steps=checked_count(steps, "steps", least=1) if h is None else int(steps_within(period, checked_step(h))),
+        sequence=None if adaptive else StepSequence.equal(_count_of_steps(period, steps, h)),
         fixed_indices=(*map(names.index, dict.fromkeys(fixed)), *([-1] if fixed_period else [])),
         energy=None if energy is None else checked_number(energy, "the energy"),
         gain=np.zeros(stepper.dimension) if gain is None else checked_vector(interface, gain, "gain"),
@@ -263,7 +296,11 @@ def periodic_orbit(
     )
     momenta = stepper._initial_momenta(q, p, velocity, search.t, search.parameters)
     start = np.concatenate(checked_pair(stepper.interface, q, momenta))
-    return search.orbit(np.append(start, search.period))
+    return search.orbit(np.append(start, search.period), bound)
+
+
+def _count_of_steps(period: float, steps: int | None, h: float | None) -> int:
+    return checked_count(steps, "steps", least=1) if h is None else int(steps_within(period, checked_step(h)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,13 +309,14 @@ class _OrbitSearch:
 
     Attributes:
         reduction: maps between (q, p) and the tangent space without gauge directions of rotations.
+        sequence: ends of the steps relative to the period; ``None`` for adaptive ones that are not yet known.
         fixed_indices: indices of the fixed entries of z, -1 that of the period.
     """
 
     stepper: Stepper
     reduction: Reduction
     period: float
-    steps: int
+    sequence: StepSequence | None
     fixed_indices: tuple[int, ...]
     energy: float | None
     gain: Array
@@ -286,7 +324,38 @@ class _OrbitSearch:
     parameters: Array
     options: SolverOptions | None
 
-    def orbit(self, guess: Array) -> PeriodicOrbit:
+    def orbit(self, guess: Array, bound: float) -> PeriodicOrbit:
+        """Return the orbit near a guess, with a discretisation error below a bound if steps are adaptive.
+
+        Raises as :func:`periodic_orbit`.
+        """
+        if self.sequence is not None:
+            orbit = self._nearest(guess)
+        else:
+            orbit = self._adapted(guess, TOLERANCES[0] * bound)._nearest(guess)
+            for part in TOLERANCES:  # the first sequence of steps is that of the guess, a different motion
+                near = np.concatenate([orbit.q, orbit.p, [orbit.period]])
+                refreshed = self._adapted(near, part * bound)._refreshed(near)
+                orbit = replace(refreshed, iterations=orbit.iterations + refreshed.iterations)
+                if orbit.error <= bound:
+                    break
+        _warn_of_distance(orbit, guess)
+        _warn_of_discretisation(orbit, bound)
+        return orbit
+
+    def _adapted(self, z: Array, tolerance: float) -> _OrbitSearch:
+        """Return the search with the steps of an adaptive run along z."""
+        at = self.t, self.parameters, self.options
+        return replace(self, sequence=StepSequence.adaptive(self.stepper, z[:-1], float(z[-1]), tolerance, *at))
+
+    def _refreshed(self, z: Array) -> PeriodicOrbit:
+        """Return the orbit of the steps of this search next to one of other steps."""
+        try:
+            return self._described(*self._iterated(z, self._closing(z), 0), guess=z)
+        except OrbitError:
+            return self._nearest(z)
+
+    def _nearest(self, guess: Array) -> PeriodicOrbit:
         """Return the orbit near a guess, found in one of a few attempts.
 
         The first one starts at the trajectory of the guess; the second one at a closed curve near it. If nothing is
@@ -301,18 +370,25 @@ class _OrbitSearch:
             attempts += [(held, False), (held, True)]
         for search, smoothed in attempts:
             try:
-                orbit = search._orbit(guess, smoothed=smoothed)
+                iterated = search._iterated(*search._by_segments(guess, smoothed=smoothed))
+                orbit = search._described(*iterated, guess=guess)
                 if _is_near(orbit, guess):
-                    return _compared(orbit, guess)
+                    return orbit
                 far.append(orbit)
             except (OrbitError, StepFailedError, np.linalg.LinAlgError) as failure:
                 failures.append(failure)
         if far:
-            return _compared(far[0], guess, far=True)
+            return far[0]
         raise next((each for each in failures if isinstance(each, OrbitError)), failures[0])
 
-    def _orbit(self, guess: Array, *, smoothed: bool) -> PeriodicOrbit:
-        z, equations, iterations = self._iterated(*self._by_segments(guess, smoothed=smoothed))
+    @property
+    def _steps(self) -> StepSequence:
+        """Steps of the search, after they are known."""
+        assert self.sequence is not None
+        return self.sequence
+
+    def _described(self, z: Array, equations: _ClosingEquations, iterations: int, *, guess: Array) -> PeriodicOrbit:
+        """Return the orbit at the end of the iteration, after all checks; raise OrbitError if there is none."""
         m, motion = self.stepper.dimension, equations.motion
         size = float(np.abs([z[:-1], guess[:-1]]).max())
         allowed = CLOSED * max(1.0, float(np.linalg.norm(equations.monodromy, 2)))
@@ -348,9 +424,12 @@ class _OrbitSearch:
             p=z[m:-1],
             t=self.t,
             period=float(z[-1]),
-            steps=self.steps,
+            steps=len(self._steps),
+            sequence=self._steps,
             monodromy=equations.monodromy,
             residual=equations.error,
+            error=self._discretisation_error(z, equations),
+            trivial_error=math.nan if motion.by_time.any() else _trivial_error(equations.monodromy),
             iterations=iterations,
             parameters=self.parameters,
             stepper=self.stepper,
@@ -364,37 +443,39 @@ class _OrbitSearch:
         *Introduction to Numerical Analysis*, 7.3.5). The first nodes are those of half a period forward and half a
         period backward from the guess: an error of the guess grows by the square root of the growth in a period.
         """
-        half, start = self.steps // 2, guess[:-1]
+        steps, start = self._steps, guess[:-1]
+        half, count = steps.middle, len(steps)
         inward = self.reduction.inward(*np.split(start, 2))
         if self.stepper.changes_states:  # derivatives through events require runs forward in time
-            forward = self._segment(start, 0, self.steps, guess[-1])
+            forward = self._segment(start, steps, 0, count, guess[-1])
             monodromy = self._leaving(forward) @ forward.monodromy @ inward
             later = self._states_before(start, guess[-1])
         else:
-            forward = self._segment(start, 0, half, guess[-1])
-            backward = self._segment(start, 0, self.steps - half, -guess[-1])
+            forward = self._segment(start, steps, 0, half, guess[-1])
+            backward = self._segment(start, steps.reversed, 0, count - half, -guess[-1])
             forth, back = (self._leaving(each) @ each.monodromy @ inward for each in (forward, backward))
             later, monodromy = backward.states, np.asarray(np.linalg.solve(back.T, forth.T).T)
         growth = float(np.abs(np.linalg.eigvals(monodromy)).max())
         if growth <= EASY:
             return guess, self._closing(guess), 0
-        count = min(2 * int(np.ceil(np.log(growth) / np.log(GROWTH) / 2.0)) * (1 + smoothed), self.steps)
+        segments = min(2 * int(np.ceil(np.log(growth) / np.log(GROWTH) / 2.0)) * (1 + smoothed), count)
         later = later + np.append(self.gain, np.zeros(len(self.gain)))
-        path = np.vstack([start, forward.states[: self.steps - len(later)], later[-2::-1]])
+        path = np.vstack([start, forward.states[: count - len(later)], later[-2::-1]])
         if smoothed and len(later) > 1:  # distributes the jump in the middle, quadratically in time
-            middle = self.steps - len(later)
+            middle = count - len(later)
             jump = later[-1] - forward.states[middle - 1]
-            share = np.minimum(np.arange(len(path)) / middle, (self.steps - np.arange(len(path))) / len(later))
+            share = np.minimum(np.arange(len(path)) / middle, (count - np.arange(len(path))) / len(later))
             path += np.outer(np.where(np.arange(len(path)) <= middle, 0.5, -0.5) * share**2, jump)
-        nodes = np.append(path[self._bounds(count)[:-1]], guess[-1])
+        nodes = np.append(path[self._bounds(segments)[:-1]], guess[-1])
         z, _, iterations = self._iterated(nodes, self._closing(nodes), 0)
         nearer = np.append(z[: len(start)], z[-1])
         return nearer, self._closing(nearer), iterations
 
     def _states_before(self, start: Array, period: float) -> Array:
-        """Return the states before a state, in steps backward over half a period, of impacts that can be undone."""
-        plan, steps, (q, p) = StepPlan(h=-period / self.steps), self.steps - self.steps // 2, np.split(start, 2)
-        if not any(event.changes for event in self.stepper.events):
+        """Return the states before a state, in equal steps back over half a period, of impacts that can be undone."""
+        count = len(self._steps)
+        plan, steps, (q, p) = StepPlan(h=-period / count), count - count // 2, np.split(start, 2)
+        if self._steps.tolerance is None and not any(event.changes for event in self.stepper.events):
             run = self.stepper._started(q, p, None, plan, self.t, self.parameters, self.options)
             with suppress(EventError, StepFailedError):
                 motion, ends = run._recorded(steps), self.t + plan.h * np.arange(1, steps + 1)
@@ -404,7 +485,7 @@ class _OrbitSearch:
 
     def _bounds(self, count: int) -> NDArray[np.intp]:
         """Return the (count + 1,) numbers of the steps at which segments begin and end."""
-        return np.linspace(0, self.steps, count + 1).round().astype(np.intp)
+        return np.linspace(0, len(self._steps), count + 1).round().astype(np.intp)
 
     def _iterated(
         self, z: Array, equations: _ClosingEquations, iterations: int
@@ -429,9 +510,7 @@ class _OrbitSearch:
         A step length is accepted if the simplified Newton correction with the same Jacobian decreases (Deuflhard's
         natural monotonicity test), which is independent of the unstable direction that dominates the residuals.
         """
-        free = np.delete(np.arange(len(z)), self.fixed_indices)
-        inverse = np.zeros((len(z), len(equations.defects)))
-        inverse[free] = np.linalg.pinv(equations.partials[:, free], NULL_SINGULAR_VALUE)
+        inverse = self._inverse(equations)
         change = inverse @ equations.defects
         if np.linalg.norm(change) <= SETTLED * np.linalg.norm(z):
             return None
@@ -448,13 +527,24 @@ class _OrbitSearch:
                     return trial, at
         return None
 
+    def _inverse(self, equations: _ClosingEquations) -> Array:
+        """Return the pseudoinverse of the Jacobian; fixed unknowns do not change."""
+        size = equations.partials.shape[1]
+        free = np.delete(np.arange(size), self.fixed_indices)
+        inverse = np.zeros((size, len(equations.defects)))
+        inverse[free] = np.linalg.pinv(equations.partials[:, free], NULL_SINGULAR_VALUE)
+        return inverse
+
     def _closing(self, z: Array) -> _ClosingEquations:
         """Integrate one period and return the residuals with their derivatives; ``z`` has the start of each segment."""
         size = 2 * self.stepper.dimension
         starts = z[:-1].reshape(-1, size)
         count = len(starts)
         bounds = self._bounds(count)
-        segments = [self._segment(*each, z[-1]) for each in zip(starts, bounds[:-1], bounds[1:], strict=True)]
+        segments = [
+            self._segment(start, self._steps, first, last, z[-1])
+            for start, first, last in zip(starts, bounds[:-1], bounds[1:], strict=True)
+        ]
         left = self._independent_equations(starts, segments)
         rows = np.zeros((count, self.reduction.size, count * size + 1))
         defects = np.zeros(rows.shape[:2])
@@ -478,31 +568,50 @@ class _OrbitSearch:
             row = np.zeros(len(z))
             row[:size] = self._integral_gradients(first, self.t)[0]
             partials = np.vstack([partials, row])
-        return _ClosingEquations(segments, monodromy, error, wanted, partials)
+        return _ClosingEquations(segments, monodromy, error, wanted, partials, left)
 
     def _leaving(self, segment: _Segment) -> Array:
         """Return the matrix from changes of (q, p) at the end of a segment to the reduced tangent space."""
         return self.reduction.outward(*np.split(segment.states[-1], 2))
 
-    def _segment(self, start: Array, first: int, last: int, period: float) -> _Segment:
-        """Integrate from the start of step ``first`` to the start of step ``last``."""
-        size, h = len(start), period / self.steps
-        times = times_after(self.t, h, np.arange(first, last))[0]
+    def _segment(self, start: Array, steps: StepSequence, first: int, last: int, period: float) -> _Segment:
+        """Integrate from the start of step ``first`` of a sequence to the start of step ``last``."""
+        size, ends, widths = len(start), steps.ends[first : last + 1], steps.widths[first:last]
         tangents = np.zeros((size + 2, self.stepper._input_size))
         tangents[:size, :size] = np.eye(size)
-        tangents[size, -2:] = first / self.steps, 1.0 / self.steps
+        tangents[size, -2] = ends[0]
         tangents[size + 1, -2] = 1.0
-        steps = times, np.full(last - first, h)
-        states, vectors, _ = tangents_along(self.stepper, start, *steps, tangents, self.parameters, self.options)
+        variations = np.zeros((last - first, size + 2))
+        variations[:, size] = widths
+        at = self.t + period * ends[:-1], period * widths, tangents, self.parameters, self.options, variations
+        states, vectors, _ = tangents_along(self.stepper, start, *at)
         partials = vectors[-1].T.copy()
         return _Segment(
             states=states[1:],
-            start_time=self.t + period * (first / self.steps),
-            end_time=self.t + period * (last / self.steps),
+            start_time=self.t + period * float(ends[0]),
+            end_time=self.t + period * float(ends[-1]),
             monodromy=partials[:, :size],
             by_period=partials[:, size],
             by_time=partials[:, size + 1],
         )
+
+    def _discretisation_error(self, z: Array, equations: _ClosingEquations) -> float:
+        """Return the distance of a closed orbit to that of a finer sequence of steps; see :class:`PeriodicOrbit`."""
+        start, period, steps = z[:-1], float(z[-1]), self._steps.finer
+        tangents = np.zeros((0, self.stepper._input_size))
+        at = self.t + period * steps.ends[:-1], period * steps.widths, tangents, self.parameters, self.options
+        try:
+            states = tangents_along(self.stepper, start, *at)[0]
+        except (EventError, StepFailedError):
+            return math.inf
+        end = states[-1].copy()
+        end[: len(end) // 2] -= self.gain
+        outward = self.reduction.outward(*np.split(start, 2))
+        defects = equations.independent @ outward @ (self.reduction.aligned(end, start) - start)
+        change = self._inverse(equations) @ np.append(defects, np.zeros(len(equations.defects) - len(defects)))
+        moved, ranges = np.abs(change), np.ptp(states, axis=0)
+        parts = zip(np.split(moved[:-1], 2), np.split(ranges, 2), strict=True)
+        return max(float(moved[-1]) / period, *(float(part.max()) / (float(size.max()) or 1.0) for part, size in parts))
 
     def _independent_equations(self, starts: Array, segments: Sequence[_Segment]) -> Array:
         """Return the (size, size) projection onto the equations of return not implied by conserved quantities.
@@ -549,19 +658,45 @@ def _listed(values: Array) -> str:
     return f"[{', '.join(f'{x:.6g}' for x in values[:6])}{', ..' if len(values) > 6 else ''}]"
 
 
-def _compared(orbit: PeriodicOrbit, guess: Array, *, far: bool = False) -> PeriodicOrbit:
-    """Return an orbit; warn if it is another member of its family than that of the guess, or ``far`` from it."""
-    states = orbit.run()
+def _trivial_error(monodromy: Array) -> float:
+    """Return the deviation from 1 of the stability index nearest to 1, of other matrices of the multiplier."""
+    product = _inverse(monodromy) @ monodromy - np.eye(len(monodromy))
+    if float(np.abs(product).max()) > SYMPLECTIC * max(1.0, float(np.linalg.norm(monodromy, 2)) ** 2):
+        return float(np.abs(np.linalg.eigvals(monodromy) - 1.0).min())
+    return float(np.abs(np.linalg.eigvals(monodromy + _inverse(monodromy)) / 2.0 - 1.0).min())
+
+
+def _warn_of_discretisation(orbit: PeriodicOrbit, bound: float) -> None:
+    """Warn if the discretisation error of an orbit exceeds a bound, or its trivial stability index differs from 1."""
+    if not warnings_wanted() or (orbit.error <= bound and not orbit.trivial_error > TRIVIAL):
+        return
+    deviation = ""
+    if orbit.trivial_error > TRIVIAL:
+        deviation = f", and the stability index that must be 1 differs from it by {orbit.trivial_error:.1e}"
+    remedy = "Omit steps and h, for adaptive steps, or take more steps"
+    if orbit.sequence.tolerance is not None:
+        remedy = "Use a method of higher degree, or fixed_period= or fixed= if the orbit is one of a family"
+    warn(
+        f"the periodic orbit is one of its {orbit.steps} steps rather than of the system: a run with "
+        f"{len(orbit.sequence.finer)} steps is closed by an orbit at the relative distance {orbit.error:.1e} (the "
+        f"bound is {bound:.1e}){deviation}. {remedy}",
+        AccuracyWarning,
+    )
+
+
+def _warn_of_distance(orbit: PeriodicOrbit, guess: Array) -> None:
+    """Warn if an orbit is another member of its family than that of the guess, or far from it."""
+    with without_accuracy_warnings():  # that of the orbit itself is a warning of its own
+        states = orbit.run()
     amplitude = float(np.ptp(np.concatenate([states.q, states.p], axis=1), axis=0).max()) / 2.0
     away = float(np.abs(np.concatenate([orbit.q, orbit.p]) - guess[:-1]).max())
-    if far or away > OTHER * amplitude:
+    if away > OTHER * amplitude or not _is_near(orbit, guess):
         warn(
             f"the periodic orbit that was found is far from the guess: its period is {orbit.period:.6g}, not "
             f"{guess[-1]:.6g}, and its state differs by {away:.2g}, where the amplitude of the orbit is "
             f"{amplitude:.2g}. Compare both, or fix an amplitude",
             AccuracyWarning,
         )
-    return orbit
 
 
 def _is_near(orbit: PeriodicOrbit, guess: Array) -> bool:
@@ -597,6 +732,7 @@ class _ClosingEquations:
         error: largest entry of the ends minus the starts that follow.
         defects: (r,) residuals.
         partials: (r, 2m segments + 1) Jacobian of the residuals with respect to the starts of segments and the period.
+        independent: (size, size) projection of the closing equations onto those that conserved quantities do not imply.
     """
 
     segments: Sequence[_Segment]
@@ -604,6 +740,7 @@ class _ClosingEquations:
     error: float
     defects: Array
     partials: Array
+    independent: Array
 
     @property
     def motion(self) -> _Segment:

@@ -23,6 +23,7 @@ def tangents_along(
     tangents: Array,
     parameters: Array,
     options: SolverOptions | None = None,
+    size_variations: Array | None = None,
 ) -> tuple[Array, Array, Array]:
     """Return the states at the ends of steps, and tangent vectors there.
 
@@ -33,6 +34,7 @@ def tangents_along(
         tangents: (count, variables) initial variations of (q, p, parameters, t, h).
         parameters: values in order.
         options: solver options.
+        size_variations: (n, count) variations of the step sizes, which are those in ``tangents`` by default.
 
     Returns:
         (n + 1, 2m) states, (n + 1, count, 2m) variations and (count, variables) final variations.
@@ -46,6 +48,8 @@ def tangents_along(
     if not stepper.changes_states:
         starts, vectors = Starts.chain(state[:m], state[m:], t, h), np.zeros((count + 1, *tangents.shape))
         vectors[0] = tangents
+        if size_variations is not None:  # the variation of h of each step is added to that of the step before
+            vectors[0, :, -1], vectors[1:-1, :, -1] = size_variations[0], np.diff(size_variations, axis=0)
         stepper._propagate(starts, vectors, parameters, options)
         return np.concatenate([starts.q, starts.p], axis=1), vectors[..., :size], vectors[-1]
     states, vectors = np.empty((count + 1, size)), np.empty((count + 1, len(tangents), size))
@@ -53,6 +57,8 @@ def tangents_along(
     others = np.flatnonzero(np.abs(np.diff(h)) > SAME_STEP_SIZE * np.abs(h[1:])) + 1
     for first, last in pairwise([0, *others.tolist(), count]):
         length, start = float(h[first]), states[first]
+        if size_variations is not None:
+            tangents = np.concatenate([tangents[:, :-1], size_variations[first][:, np.newaxis]], axis=1)
         run = stepper._started(start[:m], start[m:], None, StepPlan(h=length), float(t[first]), parameters, options)
         trajectory = run._recorded(last - first)
         ends = times_after(float(t[first]), length, np.arange(1, last - first + 1))[0]
