@@ -109,7 +109,9 @@ def _expected(method: Method) -> tuple[int | None, bool, bool] | None:
     family, _, count = str(specification.get("quadrature", "")).partition(":")
     if kind == "svi" and family in RULES and "space" not in specification:
         degree, points = int(str(specification["degree"])), int(count)
-        order = min(2 * degree, RULES[family](points))
+        rule = RULES[family](points)
+        # Hairer, Lubich and Wanner, II.2.2: B(rule) and C(rule - s) of the points, D(s) of variations of degree s
+        order = min(2 * degree, rule, 2 * (rule - degree + 1))
         return order if points >= degree else None, True, "radau" not in family
     return {"stoermer-verlet": (2, True, True), "explicit-euler": (1, False, False)}.get(kind)
 
