@@ -16,7 +16,18 @@ from scvi_codegen.results.recording import RecordedRun
 from scvi_codegen.runtime.accuracy.tolerance_check import Known
 from scvi_codegen.runtime.core.words import low_words
 from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
+from scvi_codegen.runtime.run.step_plan import FixedSteps, InTau
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
+
+
+def _step_size(model: Model, run: Any) -> float | None:
+    """Return the fixed step size, or step of tau; ``None`` for adaptive steps."""
+    match run.plan:
+        case FixedSteps():
+            return model.h or run.h
+        case InTau(tau=tau):
+            return tau
+    return None
 
 
 def run_numbers(
@@ -33,7 +44,7 @@ def run_numbers(
         "steps": trajectory.steps,
         "rejected_steps": run.rejected_steps,
         "fallback_steps": run.fallback_steps,
-        "h": model.h or run.h if run.plan.fixed else run.plan.tau or None,
+        "h": _step_size(model, run),
         "states": len(trajectory),
         "seconds": outcome.seconds,
         "preparation_seconds": outcome.preparation,

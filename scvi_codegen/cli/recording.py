@@ -25,6 +25,7 @@ from scvi_codegen.models.time_span import whole_steps_in
 from scvi_codegen.representation import counted
 from scvi_codegen.results.recording import RecordedRun, load_run, record_run, resume_run
 from scvi_codegen.runtime.run.run import Run
+from scvi_codegen.runtime.run.step_plan import FixedSteps, InTau
 
 SUFFIX = ".run"
 MAX_STATES = 10_000
@@ -148,7 +149,7 @@ class Recording:
             run,
             Path(folder),
             first=0,
-            steps=model.whole_step_count() if run.plan.fixed else None,
+            steps=model.whole_step_count() if isinstance(run.plan, FixedSteps) else None,
             save_every=model.save_every,
             model=text,
             certificate=self.certificate,
@@ -206,7 +207,7 @@ def describe_progress(recorded: RecordedRun) -> str:
     manifest = recorded.manifest
     done, t = counted(recorded.steps, "step"), manifest.t + recorded.steps * manifest.h
     if manifest.plan:
-        how = f"of {manifest.plan.tau:g} in tau" if manifest.plan.tau else "of adaptive size"
+        how = f"of {manifest.plan.tau:g} in tau" if isinstance(manifest.plan, InTau) else "of adaptive size"
         progress_text = f"{done} {how} from t = {manifest.t:g} to t = {recorded.t[-1]:g}"
         progress_text += "" if recorded.finished else f" (of {manifest.plan.t_end:g})"
     else:

@@ -26,6 +26,7 @@ from scvi_codegen.runtime.core.words import Words, as_text
 from scvi_codegen.runtime.events.event import Crossings
 from scvi_codegen.runtime.inputs.segments import record_segments
 from scvi_codegen.runtime.run.run import Run
+from scvi_codegen.runtime.run.step_plan import Adaptive, FixedSteps, InTau
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 SHOWN_COORDINATES = 6
@@ -145,7 +146,7 @@ def _geometry(model: Model, run: Run) -> str:
     """Return whether the map is symplectic; adaptive steps destroy this property."""
     if not is_symplectic(model.method, model.system):
         return "not symplectic"
-    return "symplectic" if run.plan.fixed else "symplectic only at fixed step size"
+    return "symplectic" if isinstance(run.plan, FixedSteps) else "symplectic only at fixed step size"
 
 
 def known_at_end(model: Model, outcome: RunOutcome) -> Known | None:
@@ -168,9 +169,9 @@ def describe_step_size(model: Model, run: Run) -> str:
     """Return a description of the step sizes of a run."""
     if model.in_transformed_time:
         return f"of {run.h:g} in tau"
-    if run.plan.tau:
+    if isinstance(run.plan, InTau):
         return f"of {run.plan.tau:g} in tau by the {model.controller or 'reversible'} controller"
-    adaptive = run.plan.adaptive or model.h is None
+    adaptive = isinstance(run.plan, Adaptive) or model.h is None
     return f"of adaptive size ({run.rejected_steps} rejected)" if adaptive else f"of {model.h:g}"
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from dataclasses import fields as fields_of
@@ -315,9 +314,11 @@ class Model(TimeSpan):
             ModelFileError, StateError: for inputs that are missing, or do not cover the whole run.
         """
         if not self.system.inputs:
+            from scvi_codegen.runtime.run.step_plan import Fixed, ending_at  # not needed for reading a model
+
             if self.has_shorter_last_step or (self.in_transformed_time and self.ends_at_time):
-                run.plan = replace(run.plan, t_end=self.t + self.covered)
-            yield None if math.isfinite(run.plan.t_end) else self.step_count
+                run.plan = ending_at(run.plan, self.t + self.covered)
+            yield self.step_count if isinstance(run.plan, Fixed) else None
             return
         from scvi_codegen.runtime.inputs.segments import prepared_segments
 
@@ -404,8 +405,11 @@ class Model(TimeSpan):
         self._check_alone()
         stepper, arguments = self.stepper(), self._run_arguments()
         if self.h is None and self.has_time_transformation and self.error is None:
-            plan = self.start(stepper).plan
-            arguments |= {"h": plan.h or plan.tau, "tolerance": None}
+            from scvi_codegen.runtime.run.step_plan import InTau  # not needed for reading a model
+
+            run = self.start(stepper)
+            plan = run.plan
+            arguments |= {"h": plan.tau if isinstance(plan, InTau) else run.h, "tolerance": None}
         arguments |= {**self.initial_state(stepper), **self._common(None, threads), "parameters": self.parameters}
         trajectory: Trajectory = stepper.integrate(**arguments, progress=progress)
         return trajectory

@@ -6,7 +6,7 @@ from notation import lagrange
 
 import scvi_codegen as sc
 from scvi_codegen.runtime.run import memory
-from scvi_codegen.runtime.run.step_plan import StepPlan
+from scvi_codegen.runtime.run.step_plan import Adaptive
 
 pytestmark = pytest.mark.usefixtures("as_users_compile")
 
@@ -52,7 +52,7 @@ def test_target_times_and_parameters_may_be_changed_during_a_run(pushed):
     """The next call uses the arguments that it receives, not those of the previous call."""
     run = pushed.start([0.3], [0.1], t_end=1.0, tolerance=1e-9, parameters={"u_0": 0.2})
     run.advance(10**6)
-    run.update(parameters={"k": 2.0, "u_0": -0.1}, plan=StepPlan(t_end=2.0, tolerance=1e-9))
+    run.update(parameters={"k": 2.0, "u_0": -0.1}, plan=Adaptive(2.0, 1e-9))
     run.advance(10**6)
     first = pushed.integrate([0.3], [0.1], t_end=1.0, tolerance=1e-12, parameters={"u_0": 0.2})
     then = {"k": 2.0, "u_0": -0.1}

@@ -8,7 +8,7 @@ from notation import hamilton, lagrange
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
-from scvi_codegen.runtime.run.step_plan import StepPlan
+from scvi_codegen.runtime.run.step_plan import InTau
 
 KEPLER = sc.problem("kepler").system
 E = 0.8
@@ -91,7 +91,7 @@ def test_reversed_run_returns_on_its_own_steps(system):
     stepper = sc.compile_stepper(system, sc.SVI(4), time_transformation="frequency", flags=QUICK_FLAGS)
     run = stepper.start(*START, h=0.1, t_end=100.0)
     there = run.record(300)
-    run.plan = StepPlan(t_end=-100.0, tau=0.1)
+    run.plan = InTau(-100.0, 0.1)
     back = run.record(300)
     assert np.abs(back.t[::-1] - there.t).max() < 1e-11
     assert np.abs(back.q[::-1] - there.q).max() < 1e-11
@@ -114,7 +114,7 @@ def test_steps_that_end_at_a_time_advance_the_density_partially():
         assert max(map(off_the_time_transformation, run.pieces)) < 2e-3
     run = stepper.start(**start, t_end=3.0, parameters={"u_0": 0.0})
     for t_end in (3.0, -3.0) * 20:
-        run.plan = StepPlan(t_end=t_end, tau=0.1)
+        run.plan = InTau(t_end, 0.1)
         piece = run.record()
     assert off_the_time_transformation(piece) < 2e-3
 

@@ -91,7 +91,9 @@ def single(
         return source, run_driver(name, q, p, parameters, h, steps)
     if kind == "adaptive":
         source = sources.integrator()[0]
-        return source, run_driver(name, q, p, parameters, h, steps, t_end=t_end, tolerance=tolerance)
+        transformed = time_transformation is not None
+        adaptive = {"t_end": t_end, "tolerance": tolerance, "transformed": transformed}
+        return source, run_driver(name, q, p, parameters, h, steps, **adaptive)
     source = sources.variant("fallback") or sources.integrator()[0]
     return source, run_driver(name, q, p, parameters, h, steps)
 

@@ -53,8 +53,10 @@ def numbers(values: Sequence[float]) -> str:
     return ", ".join(float(value).hex() for value in values) or "0"
 
 
-def control_of(tolerance: float, h: float) -> str:
-    """A pointer to the control of adaptive steps, which begin at h above round-off."""
+def control_of(tolerance: float, h: float, *, transformed: bool = False) -> str:
+    """A pointer to the control of adaptive steps, which begin at h above round-off, or of steps of tau."""
+    if transformed:
+        return f"&(const CALL(step_control)){{{tolerance!r}}}"
     first = f"(const double[]){{{h!r}}}" if tolerance else "NULL"
     return f"&(const CALL(step_control)){{{tolerance!r}, INFINITY, {first}, NULL}}"
 
@@ -69,12 +71,14 @@ def run_driver(
     *,
     t_end: float = 0.0,
     tolerance: float = 0.0,
+    transformed: bool = False,
 ) -> str:
     """One step, then a run of fixed steps; of adaptive steps to t_end where that is given."""
     m = len(q)
+    control = control_of(tolerance, h, transformed=transformed)
     run = (
-        f"CALL(advance_to)(&run, {t_end!r}, {control_of(tolerance, h)}, {steps}, {steps}, parameters, NULL, t, q, p,"
-        " counts, &report, work)"
+        f"CALL(advance_to)(&run, {t_end!r}, {control}, {steps}, {steps}, parameters, NULL, t, q, p, counts,"
+        " &report, work)"
         if t_end
         else f"CALL(advance)(&run, {steps}, {max(1, steps // 3)}, parameters, NULL, t, q, p, counts, &report, work)"
     )

@@ -25,6 +25,7 @@ from scvi_codegen.runtime.rotations.quantities import named_quantities
 from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.runtime.run.run_loop import first_step_size, trajectory_of
 from scvi_codegen.runtime.run.saving import MAGIC
+from scvi_codegen.runtime.run.step_plan import Adaptive, ErrorControl, InTau
 from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.runtime.trajectory.quantities import quantities
 from scvi_codegen.runtime.trajectory.saved_states import checked_row
@@ -156,14 +157,14 @@ class RecordedRun(AttitudeHistory):
         if not memory.startswith(MAGIC):  # of earlier versions, which stored no more than the memory
             options = manifest.options
             return Run.restored(self.stepper, memory, plan=plan, parameters=manifest.parameters, options=options)
-        return self.stepper.from_checkpoint(
-            memory,
-            t_end=plan.t_end if plan else None,
-            tolerance=(plan.tolerance or None) if plan else None,
-            h=(plan.tau or None) if plan else None,
-            parameters=manifest.values,
-            options=manifest.options,
-        )
+        steps: dict[str, Any] = {}
+        match plan:
+            case InTau(t_end=t_end, tau=tau):
+                steps = {"t_end": t_end, "h": tau}
+            case Adaptive(t_end=t_end):
+                steps = {"t_end": t_end}
+                steps |= {name: value for name, value in ErrorControl.of(plan).named.items() if name != "first_step"}
+        return self.stepper.from_checkpoint(memory, **steps, parameters=manifest.values, options=manifest.options)
 
     @cached_property
     def _checkpointed_run(self) -> Run:

@@ -44,7 +44,7 @@ from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.observation import Observation, Saver
 from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.runtime.run.run_loop import record
-from scvi_codegen.runtime.run.step_plan import StepPlan
+from scvi_codegen.runtime.run.step_plan import FixedSteps, StepPlan
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation import REAL, checked_count, checks_arguments, of
 
@@ -116,7 +116,7 @@ def record_run(
         t=run.t,
         save_every=checked_count(save_every, "save_every", least=1),
         steps=_checked_steps(run, steps),
-        plan=None if run.plan.fixed else run.plan,
+        plan=None if isinstance(run.plan, FixedSteps) else run.plan,
         rows=chunk_rows(run.stepper.dimension * run.stepper.interface.words)
         if rows is None
         else checked_count(rows, "rows", least=1),
@@ -366,7 +366,7 @@ def _check_inputs(run: Run) -> None:
 
 def _checked_steps(run: Run, steps: int | None) -> int | None:
     """Return the number of fixed steps; ``None`` for adaptive steps."""
-    if run.plan.fixed:
+    if isinstance(run.plan, FixedSteps):
         return checked_count(steps, "steps", least=0)
     if steps is not None:
         raise StateError(f"adaptive steps end at t_end={run.plan.t_end:g}: omit steps={steps}")
@@ -374,7 +374,7 @@ def _checked_steps(run: Run, steps: int | None) -> int | None:
 
 
 def _extended(manifest: Manifest, run: Run, steps: int | None, t_end: float | None) -> tuple[Manifest, StepPlan]:
-    if run.plan.fixed:
+    if isinstance(run.plan, FixedSteps):
         if t_end is not None:
             raise StateError(f"the run has fixed steps h = {run.h:g}: give steps instead of t_end")
         wanted = manifest.steps if steps is None else steps

@@ -25,6 +25,7 @@ from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.accuracy.size import Motion, first_of_groups, relative, roundoff
 from scvi_codegen.runtime.accuracy.warning_switch import warnings_wanted, without_accuracy_warnings
+from scvi_codegen.runtime.run.step_plan import Adaptive
 
 Array = NDArray[np.float64]
 
@@ -216,7 +217,8 @@ def _alternative(trajectory: Any, result: GlobalError) -> str:
     """Return the recommendation of a time transformation for uneven steps of a conservative motion."""
     lengths = abs(trajectory.step_sizes[:-1])
     lengths = lengths[np.isfinite(lengths)][:-1]  # t_end shortens the last step
-    suitable = trajectory.plan.adaptive and trajectory.stepper.interface.conserves_energy and result.estimate < LOST
+    adaptive = isinstance(trajectory.plan, Adaptive)
+    suitable = adaptive and trajectory.stepper.interface.conserves_energy and result.estimate < LOST
     if not suitable or not lengths.size or lengths.max() < UNEVEN * lengths.min():
         return ""
     return (

@@ -9,7 +9,9 @@ perturbed in its last place. The repeated run stores no states and has a bounded
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
+from typing import cast
 
 import numpy as np
 
@@ -20,7 +22,7 @@ from scvi_codegen.runtime.core.features import require
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.run.memory import Memory
-from scvi_codegen.runtime.run.step_plan import StepPlan
+from scvi_codegen.runtime.run.step_plan import Adaptive, StepPlan
 from scvi_codegen.runtime.trajectory.saved_states import SavedStates
 
 MOST_STEPS, MOST_NUMBERS = 2048, 2**18
@@ -73,7 +75,7 @@ def warn_of_error_growth(
         advance_until: function that advances the run to a time; by default adaptive steps to that time.
     """
     plan = run._plan
-    if plan.h or plan.tau or requested is False or len(states.t) < 2 or not warnings_wanted():
+    if not isinstance(plan, Adaptive) or requested is False or len(states.t) < 2 or not warnings_wanted():
         return
     if run.stepper.changes_states or run.stepper.interface.words > 1:
         return
@@ -97,13 +99,13 @@ def measured_growth(stepper: Integrator, plan: StepPlan, requested: bool | None)
     """
     if requested:
         require(stepper, "check_growth")
-        if not plan.adaptive:
+        if not isinstance(plan, Adaptive):
             raise StateError(
                 "check_growth=True requires adaptive steps, but the step size is fixed: give t_end without h, or omit "
                 "check_growth"
             )
     double = stepper.interface.words == 1 and not stepper.changes_states
-    if requested is not None or not plan.adaptive or not double or not warnings_wanted():
+    if requested is not None or not isinstance(plan, Adaptive) or not double or not warnings_wanted():
         return 0
     return 1 + (plan.tolerance > ROUNDOFF) + (plan.tolerance > LOOSE_TOLERANCE)
 
@@ -128,7 +130,7 @@ class _Repetition:
 
     def __init__(self, run: Memory, states: SavedStates, advance_until: Callable[[float], None] | None) -> None:
         self.run, self.states, self.advance_until = run, states, advance_until or self._to
-        self.steps, self.tolerance = run.steps, run.plan.tolerance
+        self.steps, self.tolerance = run.steps, self._plan().tolerance
         self.nudge, self.tolerable, self.decades = _thresholds(self.tolerance)
         self.reached, self.quarter = 0, 0.0
 
@@ -194,15 +196,18 @@ class _Repetition:
     def _begin(self, nudge: float, tolerance: float) -> None:
         """Start the run at its perturbed initial state, on its constraints, with another local tolerance."""
         run, states = self.run, self.states
-        plan, t, given = StepPlan(t_end=run.plan.t_end, tolerance=tolerance), float(states.t[0]), states.parameters
+        plan, t, given = replace(self._plan(), tolerance=tolerance), float(states.t[0]), states.parameters
         factors = _factors(len(run._q), nudge)
         q, p = np.asarray(states.q[0] * factors[0]), np.asarray(states.p[0] * factors[1])
         if run.stepper.interface.constraints:
             q, p, _ = projected(run.stepper, q, p, t, given)
         run._start(q, p, plan=plan, t=t, parameters=given, options=run.options)
 
+    def _plan(self) -> Adaptive:
+        return cast(Adaptive, self.run.plan)
+
     def _to(self, t: float) -> None:
-        self.run.plan = StepPlan(t_end=t, tolerance=self.run.plan.tolerance)
+        self.run.plan = replace(self._plan(), t_end=t)
         self.run._run_to_target()
 
     def _relative_difference(self, k: int, small: float = 0.0) -> float:

@@ -15,6 +15,7 @@ from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.accuracy.warning_switch import without_accuracy_warnings
 from scvi_codegen.runtime.core.validation import Parameters, States, check_inputs_given
 from scvi_codegen.runtime.run.run import Run
+from scvi_codegen.runtime.run.step_plan import FixedSteps
 
 ROUND_OFF = 2.0**-53
 """Relative error meant by a tolerance of 0."""
@@ -89,8 +90,8 @@ def _longest(pilot: Callable[[float], tuple[float, int]], h: float, allowed: flo
 @without_accuracy_warnings()
 def _pilot(run: Run, end: float) -> tuple[float, int]:
     """Return the largest error of the first steps of a run, infinite if one fails, and their number."""
-    error, done = 0.0, 0
-    while done < PILOT_STEPS and not run.arrived and (not run.plan.fixed or (end - run.t) * run.h > 0.0):
+    error, done, fixed = 0.0, 0, isinstance(run.plan, FixedSteps)
+    while done < PILOT_STEPS and not run.arrived and not (fixed and (end - run.t) * run.h <= 0.0):
         size = max(1, done)
         try:
             error = run.record(size, save_every=size).step_error

@@ -11,6 +11,7 @@ from scvi_codegen.runtime.accuracy.warning_switch import warnings_wanted
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.run.memory import Memory
+from scvi_codegen.runtime.run.step_plan import Adaptive, FixedSteps
 from scvi_codegen.runtime.trajectory.saved_states import SavedStates
 
 TOLERABLE_ERROR: Final = 1e-3
@@ -39,7 +40,7 @@ def warn_of_inaccuracy(trajectory: SavedStates, run: Memory, *, before: float = 
     error = trajectory.step_error
     if error > TOLERABLE_ERROR:
         warn_of_large_steps(trajectory, before=before)
-    if error != error or not trajectory.plan.h:
+    if error != error or not isinstance(trajectory.plan, FixedSteps):
         warn_of_energy_error(trajectory, run)
     if trajectory.stepper.interface.layout.mesh is not None:
         warn_of_unresolved_fields(trajectory)
@@ -50,7 +51,7 @@ def warn_of_large_steps(trajectory: SavedStates, *, before: float = 0.0, remedy:
     error = trajectory.step_error
     if not error > TOLERABLE_ERROR:
         return
-    if trajectory.plan.adaptive or before > TOLERABLE_ERROR or not warnings_wanted():
+    if isinstance(trajectory.plan, Adaptive) or before > TOLERABLE_ERROR or not warnings_wanted():
         return
     warn(
         f"the step size h = {trajectory.h:g} is too large: the relative error of the step from "
@@ -66,12 +67,12 @@ def warn_of_energy_error(trajectory: SavedStates, run: Memory) -> None:
     """
     plan, stepper = trajectory.plan, trajectory.stepper
     limits: dict[str, Any] = {}
-    if plan.h and trajectory.step_error == trajectory.step_error:
-        return
-    if plan.h and stepper.interface.layout.coordinates:
+    if not isinstance(plan, Adaptive):
+        if not isinstance(plan, FixedSteps) or trajectory.step_error == trajectory.step_error:
+            return
+        if not stepper.interface.layout.coordinates:
+            return
         limits = {"tolerable": GROSS_ERROR, "why": FIXED_STEP_REMEDY}
-    elif plan.h or plan.tau:
-        return
     if not stepper.interface.conserves_energy or stepper.changes_states or not warnings_wanted():
         return
     t, q, p = trajectory.t, trajectory.q, trajectory.p

@@ -33,8 +33,8 @@ def warn_of_unresolved_members(ensemble: Any) -> None:
     count = len(ensemble.parameters) if ensemble.stepper.interface.layout.mesh is not None else 0
     for j in range(0, count, -(-count // MOST_SPECTRA) or 1):
         t, q, *_ = ensemble._one(j)
-        h = ensemble.plans[j].h if ensemble.plans else 0.0
-        if len(t) and _unresolved(ensemble.stepper, t, q, h or math.nan, f"trajectory {j}, "):
+        h = math.nan if ensemble.plans else ensemble.h
+        if len(t) and _unresolved(ensemble.stepper, t, q, h, f"trajectory {j}, "):
             return
 
 

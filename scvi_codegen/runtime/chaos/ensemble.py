@@ -42,7 +42,7 @@ from scvi_codegen.runtime.ensemble.schedule import CommonSteps
 from scvi_codegen.runtime.ensemble.thread_pool import StopCheck, run_jobs
 from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.run_loop import record
-from scvi_codegen.runtime.run.step_plan import StepPlan
+from scvi_codegen.runtime.run.step_plan import Fixed
 from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.runtime.sensitivity.step_derivatives import Starts
 from scvi_codegen.validation import checked_count
@@ -118,7 +118,7 @@ class ChaosIndicatorsEnsemble:
         for j in range(0, len(self.q), stride):
             start = self.q[j], self.p[j]
             arguments: dict[str, Any] = {"t": self.t[0], "parameters": self.parameters[j], "options": self.options}
-            memory = Memory.started(self.stepper, *start, plan=StepPlan(h=self.h), **arguments)
+            memory = Memory.started(self.stepper, *start, plan=Fixed(self.h), **arguments)
             with suppress(StepFailedError):
                 runs[j] = record(memory, steps, save_every=steps)
         worst = max(runs, key=lambda j: np.nan_to_num(runs[j].step_error), default=None)

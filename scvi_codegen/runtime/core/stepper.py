@@ -49,7 +49,16 @@ from scvi_codegen.runtime.rotations.states import homogeneous_state, is_one_stat
 from scvi_codegen.runtime.run.observation import Observe
 from scvi_codegen.runtime.run.run import Run
 from scvi_codegen.runtime.run.saving import read_checkpoint
-from scvi_codegen.runtime.run.step_plan import StepPlan, checked_plan, planned_steps
+from scvi_codegen.runtime.run.step_plan import (
+    Adaptive,
+    ErrorControl,
+    Fixed,
+    FixedSteps,
+    StepPlan,
+    Until,
+    checked_plan,
+    planned_steps,
+)
 from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.runtime.trajectory.dense_output import times_of_run
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
@@ -90,6 +99,9 @@ class Stepper(WithEventsInDouble, WithPaths, Integrator):
         steps: int | None = None,
         t_end: float | None = None,
         tolerance: float | None = None,
+        absolute_tolerance: float | Mapping[str, float] | None = None,
+        max_step: float | None = None,
+        first_step: float | None = None,
         save_every: int = 1,
         t: float = 0.0,
         parameters: Parameters = None,
@@ -119,7 +131,14 @@ class Stepper(WithEventsInDouble, WithPaths, Integrator):
             t_end: final time, instead of ``steps``. Without h steps are adaptive and the last ends there exactly. With
                 h (also in transformed time and with ``time_transformation``, :func:`~scvi_codegen.compile_stepper`) the
                 last step is shorter unless t_end - t is a multiple of h (within 1e-9).
-            tolerance: relative local error of an adaptive step; by default round-off.
+            tolerance: largest error of an adaptive step, relative to the motion of each coordinate in it; by default
+                round-off.
+            absolute_tolerance: size below which errors of a coordinate do not matter, 0 by default: the error of a
+                step is at most ``tolerance * max(motion, absolute_tolerance)``. A number, or numbers by name of
+                coordinate, array or rotation (an angle in radians).
+            max_step: largest size of an adaptive step; by default not limited.
+            first_step: size of the first adaptive step, which is reduced if its error is too large; by default
+                determined by trials.
             save_every: steps between saved states; the state at t_end is also saved.
             t: initial time.
             parameters, options: as in :meth:`step`; in transformed time the energy defaults to that of (q, p).
@@ -175,23 +194,26 @@ class Stepper(WithEventsInDouble, WithPaths, Integrator):
         if error is not None:
             wanted = checked_error(error, {"h": h, "steps": steps, "tolerance": tolerance}, self)
             start = {"velocity": velocity, "inputs": inputs, "t": t, "parameters": parameters, "options": options}
+            start |= ErrorControl(None, absolute_tolerance, max_step, first_step).named
             saved = {"t_end": t_end, "save_every": save_every, "t_eval": t_eval}
             return stepper._confirmed(wanted, q, p, {**start, "progress": progress}, saved)
         t = checked_time(t, interface.words)
         begin = 0.0 if h is None or t_end is None else hashed(t)  # one plan for all times where they do not matter
         how = interface.time_transformation, stepper.in_tau, interface.words
-        schedule = h, steps, t_end, tolerance, save_every, begin, *how
+        control = tolerance, absolute_tolerance, max_step, first_step
+        schedule = h, steps, t_end, *control, save_every, begin, *how
         try:
             plan, count = planned_steps(*schedule)
         except TypeError:  # of an argument that is not hashable, as an array
             plan, count = planned_steps.__wrapped__(*schedule)
         if inputs is not None:
-            plan = StepPlan(h=plan.h) if plan.h else plan  # each segment ends where the next begins
-            segments = InputSegments(stepper, inputs, parameters, t, final_time(t, plan.h, steps, t_end))
+            plan = Fixed(plan.h) if isinstance(plan, FixedSteps) else plan  # each segment ends where the next begins
+            segments = InputSegments(stepper, inputs, parameters, t, final_time(t, h, steps, t_end))
             parameters = segments.first
         if p is None or velocity is not None or interface.constraints:
             q, p = stepper._consistent_state(q, p, velocity, t, parameters)
-        growth = 0 if plan.h and not check_growth else measured_growth(stepper, plan, check_growth)
+        fixed = isinstance(plan, FixedSteps)
+        growth = 0 if fixed and not check_growth else measured_growth(stepper, plan, check_growth)
         times = None if t_eval is None else stepper._output_times(t_eval, t, plan, count)
         run = Run._reused(stepper)
         run._set_up(plan, parameters, options, q, p)
@@ -201,7 +223,7 @@ class Stepper(WithEventsInDouble, WithPaths, Integrator):
         else:
             run._begin(q, p, t, growth)
             trajectory = segments.record(run, save_every, progress)
-        if not plan.h:
+        if not fixed:
             repeat = None if segments is None else partial(segments.advance, run)
             warn_of_error_growth(run, trajectory, check_growth, repeat)
         run._release()
@@ -299,6 +321,9 @@ class Stepper(WithEventsInDouble, WithPaths, Integrator):
         t: float = 0.0,
         t_end: float | None = None,
         tolerance: float | None = None,
+        absolute_tolerance: float | Mapping[str, float] | None = None,
+        max_step: float | None = None,
+        first_step: float | None = None,
         parameters: Parameters = None,
         options: SolverOptions | None = None,
         tables: Mapping[str, ArrayLike] | None = None,
@@ -306,11 +331,19 @@ class Stepper(WithEventsInDouble, WithPaths, Integrator):
     ) -> Run:
         """Return a run from (q, p), or q and a velocity, at t, with fixed steps h or adaptive steps to t_end.
 
-        Tables and threads are those of :meth:`integrate`.
+        The other arguments are those of :meth:`integrate`.
         """
         self._check_not_of_run(tables, threads)
         q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
-        return self._started(q, p, velocity, self._plan(h, t_end, tolerance), t, parameters, options)
+        return self._started(
+            q,
+            p,
+            velocity,
+            self._plan(h, t_end, ErrorControl(tolerance, absolute_tolerance, max_step, first_step)),
+            t,
+            parameters,
+            options,
+        )
 
     def _started(
         self,
@@ -336,17 +369,17 @@ class Stepper(WithEventsInDouble, WithPaths, Integrator):
     def _run(self, q: Array, p: Array, **arguments: Any) -> Run:
         return Run.started(self, q, p, **arguments)
 
-    def _plan(self, h: float | None, t_end: float | None, tolerance: float | None) -> StepPlan:
-        return checked_plan(h, t_end, tolerance, self.interface.time_transformation, self.in_tau)
+    def _plan(self, h: float | None, t_end: float | None, control: ErrorControl) -> StepPlan:
+        return checked_plan(h, t_end, control, self.interface.time_transformation, self.in_tau)
 
     def _output_times(self, t_eval: ArrayLike, t: float, plan: StepPlan, steps: int | None) -> Array:
         if self.interface.words > 1:
             check_doubles(t_eval=t_eval)
         if steps is None:
-            return times_of_run(t_eval, t, plan.t_end)
+            return times_of_run(t_eval, t, cast(Until, plan).t_end)
         if self.in_tau:
             raise StateError("t_eval requires t_end instead of steps in transformed time")
-        end = times_after(t, plan.h, checked_count(steps, "steps", least=0))[0]
+        end = times_after(t, cast(Fixed, plan).h, checked_count(steps, "steps", least=0))[0]
         return times_of_run(t_eval, t, float(end))
 
     def from_checkpoint(
@@ -355,6 +388,8 @@ class Stepper(WithEventsInDouble, WithPaths, Integrator):
         *,
         t_end: float | None = None,
         tolerance: float | None = None,
+        absolute_tolerance: float | Mapping[str, float] | None = None,
+        max_step: float | None = None,
         h: float | None = None,
         parameters: Parameters = None,
         options: SolverOptions | None = None,
@@ -363,8 +398,8 @@ class Stepper(WithEventsInDouble, WithPaths, Integrator):
         """Restore a run saved by :meth:`Run.checkpoint`; it continues bitwise equally if ``t_end`` is passed again.
 
         ``h`` is required with a time transformation and not allowed otherwise. A checkpoint contains the parameters,
-        which ``parameters`` changes, and the tables of arrays of run-time sizes; ``threads`` is the number of threads
-        per step.
+        which ``parameters`` changes, the tolerances and the largest size of adaptive steps, which are changed likewise,
+        and the tables of arrays of run-time sizes; ``threads`` is the number of threads per step.
 
         Raises:
             StateError: if the bytes are damaged (their checksum differs) or belong to another integrator.
@@ -372,13 +407,18 @@ class Stepper(WithEventsInDouble, WithPaths, Integrator):
         transformed = bool(self.interface.time_transformation)
         if h is not None and not transformed:
             raise StateError("omit h: the saved run contains its step size")
-        plan = self._plan(h, t_end, tolerance) if t_end is not None or transformed else None
+        control = ErrorControl(tolerance, absolute_tolerance, max_step)
+        plan = self._plan(h, t_end, control) if t_end is not None or transformed else None
         if self._reason:
             raise StateError(f"restore this run by with_sizes(...).from_checkpoint(saved): {self._reason}")
         if not self.interface.layout.coordinates:
             self._check_not_of_run(None, threads)
         stepper: Any
-        stepper, state, known = read_checkpoint(saved, self.origin or self, threads=threads, adaptive=t_end is not None)
+        stepper, state, known, own = read_checkpoint(
+            saved, self.origin or self, threads=threads, adaptive=t_end is not None
+        )
+        if isinstance(plan, Adaptive):
+            plan = ErrorControl(**own._asdict() | control.named).to(plan.t_end)
         if parameters is None or isinstance(parameters, Mapping):
             parameters = known | dict(parameters or {})
         return Run.restored(stepper, state, parameters=parameters, options=options, plan=plan)
@@ -395,6 +435,9 @@ class Stepper(WithEventsInDouble, WithPaths, Integrator):
         steps: int | None = None,
         t_end: ArrayLike | None = None,
         tolerance: float | None = None,
+        absolute_tolerance: float | Mapping[str, float] | None = None,
+        max_step: float | None = None,
+        first_step: float | None = None,
         save_every: int = 1,
         t: float = 0.0,
         t_eval: ArrayLike | None = None,
@@ -420,7 +463,7 @@ class Stepper(WithEventsInDouble, WithPaths, Integrator):
                 time, or (k,) final times, of adaptive steps; every ``save_every``-th state and the last state of each
                 trajectory are saved, with their times in ``times``, and ``progress`` is called with the number of
                 completed trajectories.
-            tolerance: relative error of an adaptive step; by default round-off.
+            tolerance, absolute_tolerance, max_step, first_step: of adaptive steps, as in :meth:`integrate`.
             t_eval: (n,) times at which states are saved instead; NaN after the end of a trajectory.
             parameters: values by name, one number or k each; or an array (k, number of parameters).
             threads: number of threads, by default one per core.
@@ -453,6 +496,9 @@ class Stepper(WithEventsInDouble, WithPaths, Integrator):
             steps=steps,
             t_end=t_end,
             tolerance=tolerance,
+            absolute_tolerance=absolute_tolerance,
+            max_step=max_step,
+            first_step=first_step,
             t_eval=t_eval,
             save_every=save_every,
             t=t,

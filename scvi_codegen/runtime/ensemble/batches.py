@@ -24,6 +24,7 @@ from scvi_codegen.runtime.ensemble.result import INTERRUPTED, OK
 from scvi_codegen.runtime.ensemble.schedule import FixedSegments
 from scvi_codegen.runtime.ensemble.thread_pool import StopCheck, run_jobs
 from scvi_codegen.runtime.run.chunks import drive
+from scvi_codegen.runtime.run.step_plan import Adaptive, step_control
 from scvi_codegen.validation import checked_count
 
 FIRST_CHUNK_STEPS = 64
@@ -216,7 +217,7 @@ class SuccessiveRuns(Batch):
 
     Args:
         stepper: the integrator.
-        tolerance, save_every: of adaptive steps.
+        plan, save_every: of adaptive steps; the target time of the plan is not used.
         receive: receives saved states after the initial ones, row 0, possibly from several threads; they are views.
 
     Attributes:
@@ -229,14 +230,15 @@ class SuccessiveRuns(Batch):
         self,
         stepper: Integrator,
         *arguments: Any,
-        tolerance: float = 0.0,
+        plan: Adaptive | None = None,
         save_every: int = 1,
         receive: Callable[[Rows], None],
     ) -> None:
         super().__init__(stepper.binding, *arguments)
+        self.stepper = stepper
         self.words, self.sums_action = stepper.interface.words, stepper.sums_action
         self.conserves_energy = stepper.interface.conserves_energy and self.words == 1
-        self.tolerance, self.save_every, self.receive, count = tolerance, save_every, receive, len(self.q)
+        self.plan, self.save_every, self.receive, count = plan, save_every, receive, len(self.q)
         self.stored, self.fallback_steps = np.zeros((2, count), np.int64)
         self.energies = np.full((count, 2), np.nan)
 
@@ -269,9 +271,9 @@ class _SuccessiveCall(Call):
         if isinstance(work.steps, FixedSegments):
             struct.segment_end = binding.pointer(work.steps.end)
         else:
-            self.control = struct.control = binding.new("step_control *")
-            struct.t_end, self.control.tolerance = binding.pointer(work.steps), work.tolerance
-            self.control.max_step = math.inf
+            assert work.plan is not None  # by the caller
+            struct.t_end, self.control = binding.pointer(work.steps), step_control(work.stepper, work.plan)
+            struct.control = self.control[0]
             if work.conserves_energy:
                 struct.energies = binding.pointer(work.energies)
         struct.stored, struct.fallback_steps = map(binding.whole_numbers, (work.stored, work.fallback_steps))

@@ -32,6 +32,7 @@ from scvi_codegen.runtime.ensemble.schedule import CommonSteps
 from scvi_codegen.runtime.ensemble.thread_pool import StopCheck, run_jobs
 from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.descriptions import short_title
+from scvi_codegen.runtime.run.step_plan import Adaptive, absolute_tolerances
 from scvi_codegen.validation import LARGEST_COUNT
 
 FIRST_STEPS, GROWTH = 64, 8.0
@@ -287,7 +288,7 @@ class AdaptiveDeviceRuns:
         t0: float,
         t_end: Array,
         *,
-        tolerance: float,
+        plan: Adaptive,
     ) -> None:
         source = stepper._variants["thread"]
         if source is None:
@@ -297,7 +298,7 @@ class AdaptiveDeviceRuns:
                 "device"
             )
         self.stepper, self.options, self.start = stepper, options, start
-        self.values, self.t0, self.t_end, self.tolerance = parameters, t0, t_end, tolerance
+        self.values, self.t0, self.t_end, self.plan = parameters, t0, t_end, plan
         device = self.device = Device()
         self.launch, count = device.kernels(source), len(t_end)
         self.q, self.p = (device.copied(np.stack([each, each])) for each in start)
@@ -314,6 +315,7 @@ class AdaptiveDeviceRuns:
         parameters = device.copied(self.values if self.values.size else np.zeros((count, 1)))
         numbers = (0.0, 0, 0) if self.options is None else options_of(self.options)
         arrays = runs, parameters, device.copied(self.t), *ends, codes, reached
+        control = self._control()
         t_end, left, steps, first, status = (
             device.copied(self.t_end),
             np.arange(count),
@@ -324,7 +326,7 @@ class AdaptiveDeviceRuns:
         try:
             while left.size:
                 began, which = time.perf_counter(), device.copied(left)
-                plan = len(left), which, first, steps, float(self.t0), t_end, float(self.tolerance), math.inf, *numbers
+                plan = len(left), which, first, steps, float(self.t0), t_end, *control, *numbers
                 self.launch("thread_advance_to", len(left), *plan, *arrays)
                 status, self.t, self.done = map(device.copy_out, (codes, arrays[2], reached))
                 if progress is not None:
@@ -336,6 +338,15 @@ class AdaptiveDeviceRuns:
             self.status[status < 0] = INTERRUPTED
             if (status != 0).any():
                 self._replace(status, threads)
+
+    def _control(self) -> tuple[Any, ...]:
+        """Return the step control as arguments of the kernel, the last of which is on the device, or 0 for NULL."""
+        plan, absolute = self.plan, np.uint64(0)
+        if plan.absolute_tolerance != ():
+            values = absolute_tolerances(self.stepper.interface, self.stepper.dimension, plan.absolute_tolerance)
+            absolute = self.device.copied(values)
+        first = math.nan if plan.first_step is None else plan.first_step
+        return float(plan.tolerance), float(plan.max_step), first, absolute
 
     def _sorted(self, left: NDArray[np.intp]) -> NDArray[np.intp]:
         """Return trajectories in the order of the numbers of steps that they still need at their present rate."""
@@ -363,7 +374,7 @@ class AdaptiveDeviceRuns:
                 self.values[failed],
                 self.t0,
                 self.t_end[failed],
-                tolerance=self.tolerance,
+                plan=self.plan,
                 save_every=LARGEST_COUNT,
                 receive=store,
             )

@@ -60,7 +60,7 @@ from scvi_codegen.runtime.inputs.segments import (
     inputs_of_slice,
     parameters_at,
 )
-from scvi_codegen.runtime.run.step_plan import AdaptivePlans, StepPlan, checked_plan, planned_steps
+from scvi_codegen.runtime.run.step_plan import Adaptive, AdaptivePlans, ErrorControl, Until, planned_steps
 from scvi_codegen.runtime.run.times import WHOLE
 from scvi_codegen.runtime.trajectory.dense_output import times_of_run
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
@@ -116,6 +116,9 @@ class Ensemble:
         steps: int | None = None,
         t_end: ArrayLike | None = None,
         tolerance: float | None = None,
+        absolute_tolerance: float | Mapping[str, float] | None = None,
+        max_step: float | None = None,
+        first_step: float | None = None,
         save_every: int = 1,
         t: float = 0.0,
         t_eval: ArrayLike | None = None,
@@ -126,11 +129,12 @@ class Ensemble:
         observe: str | None = None,
     ) -> None:
         interface = stepper.interface
+        control = self.control = ErrorControl(tolerance, absolute_tolerance, max_step, first_step)
         _check_device(device, h, inputs, save_every, error=error, t_eval=t_eval)
         _check_observe(stepper, observe, inputs=inputs, error=error, t_eval=t_eval)
         recorded = _recorded_events(stepper, device, observe)
         t = self.t0 = checked_time(t, interface.words)
-        steps, t_end = _steps_or_end(t, h, steps, t_end, inputs, tolerance, t_eval, words=interface.words)
+        steps, t_end = _steps_or_end(t, h, steps, t_end, inputs, control, t_eval, words=interface.words)
         require(stepper, "ensembles")
         if device is not None:
             require(stepper, "device")
@@ -160,7 +164,7 @@ class Ensemble:
         self.values_at = partial(parameters_at, stepper.parameters, self.parameters, self.inputs)
         self.common: CommonRuns | DeviceRuns | None = None
         self.observe = observe
-        self.plans: Sequence[StepPlan] = ()
+        self.plans: Sequence[Until | Adaptive] = ()
         self.saved: dict[int, SavedLane] = {}
         self.error, self.confirmations = error, list[GlobalError | None]()
         self.t_eval: Array | None = None
@@ -170,7 +174,7 @@ class Ensemble:
         self.singly = bool(recorded) or of_two_words
         self.fixed = fixed
         if fixed is None or self.singly:
-            self.plans = self._plans(fixed, cast(ArrayLike, t_end), tolerance)
+            self.plans = self._plans(fixed, cast(ArrayLike, t_end), control)
             self.plans = self.plans if error is None else list(self.plans)
             self.confirmations = [None] * (0 if error is None else len(self))
             self.t_eval = self._output_times(fixed, t_eval)
@@ -234,7 +238,7 @@ class Ensemble:
             self.parameters,
             self.t0,
             ends if self.fixed is None else self.fixed.fixed_segments(),
-            tolerance=self.plans[0].tolerance,
+            plan=self.plans[0] if isinstance(self.plans[0], Adaptive) else None,
             save_every=self.save_every if self.t_eval is None else LARGEST_COUNT,
             receive=lambda states: self.states.append(states.copies()),
         )
@@ -242,28 +246,28 @@ class Ensemble:
     def _on_device(self) -> AdaptiveDeviceRuns:
         """Return the trajectories with adaptive steps that a GPU integrates."""
         arguments = self.stepper, self.options, self.start, self.parameters, self.t0, self.ends
-        return AdaptiveDeviceRuns(*arguments, tolerance=self.plans[0].tolerance)
+        return AdaptiveDeviceRuns(*arguments, plan=cast(Adaptive, self.plans[0]))
 
     def _saves_ends(self, ends: Array) -> bool:
         """Return whether the output times are the common end of all trajectories, with or without their start."""
         times = set() if self.t_eval is None else {*self.t_eval.tolist()} - {self.t0}
         return len(times) == 1 and bool((ends == times.pop()).all())
 
-    def _plans(self, fixed: CommonSteps | None, t_end: ArrayLike, tolerance: float | None) -> Sequence[StepPlan]:
+    def _plans(self, fixed: CommonSteps | None, t_end: ArrayLike, control: ErrorControl) -> Sequence[Until | Adaptive]:
         """Return the step plan of each trajectory; all must run forward or all backward."""
         if fixed is not None:
-            return (StepPlan(h=fixed.h, t_end=float(fixed.times(tau=False)[-1])),) * len(self)
+            return (Until(fixed.h, float(fixed.times(tau=False)[-1])),) * len(self)
         ends = real_array(t_end, "t_end")
         self.ends = np.full(len(self), ends) if not ends.ndim else ends
         if ends.shape not in ((), (len(self),)):
             raise StateError(f"t_end must be one time or {len(self)} times, not of shape {ends.shape}")
         worst = int(np.argmin(np.isfinite(ends)))  # the first one that is not finite
-        plan = checked_plan(None, float(ends.flat[worst]), tolerance)
+        plan = control.to(float(ends.flat[worst]))
         if (ends > self.t0).any() and (ends < self.t0).any():
             raise StateError(f"t_end lies on both sides of t = {self.t0:g}: split the ensemble into two")
         if not ends.ndim:
             return (plan,) * len(self)
-        return AdaptivePlans(ends, plan.tolerance)
+        return AdaptivePlans(ends, plan)
 
     def _output_times(self, fixed: CommonSteps | None, t_eval: ArrayLike | None) -> Array | None:
         """Return the validated output times; raise ``StateError`` if inputs do not cover a run."""
@@ -303,7 +307,7 @@ class Ensemble:
             ends = [plan.t_end for plan in self.plans[part]]
             if self.fixed is not None:
                 return arguments | self._fixed_steps()
-            return arguments | {"t_end": ends, "tolerance": self.plans[0].tolerance or None, "t_eval": self.t_eval}
+            return arguments | {"t_end": ends, "t_eval": self.t_eval} | self.control.named
         return arguments | self._fixed_steps()
 
     def _fixed_steps(self) -> dict[str, Any]:
@@ -320,7 +324,7 @@ class Ensemble:
                 self.saved[part.start + k] = SavedLane(*each, fallbacks[k], events, sums)
             if self.error is not None:
                 self.confirmations[part] = trajectories.confirmations
-                cast(list[StepPlan], self.plans)[part] = trajectories.plans
+                cast(list[Until | Adaptive], self.plans)[part] = trajectories.plans
             return
         common = cast(CommonRuns, self.common)
         common.q[:, part], common.p[:, part] = trajectories.q, trajectories.p
@@ -374,7 +378,7 @@ class Ensemble:
         }
         if self.stepper.interface.words > 1:
             arguments["parameters"] = self.parameters[j]
-        steps: dict[str, Any] = {"tolerance": plan.tolerance or None, "t_end": plan.t_end}
+        steps: dict[str, Any] = {"t_end": plan.t_end, **self.control.named}
         if self.fixed is not None:
             steps = self._fixed_steps()
         elif self.t_eval is not None:
@@ -383,8 +387,8 @@ class Ensemble:
         with without_accuracy_warnings():
             if self.error is not None:
                 with suppress(StateError, StepFailedError):
-                    states = integrate(q, p, error=self.error, t_end=plan.t_end, **arguments)
-                    self.confirmations[j], cast(list[StepPlan], self.plans)[j] = states.confirmation, states.plan
+                    states = integrate(q, p, error=self.error, **steps, **arguments)
+                    self.confirmations[j], cast(list[Any], self.plans)[j] = states.confirmation, states.plan
                     return SavedLane.of(states)
             try:
                 states = integrate(q, p, **steps, **arguments)
@@ -537,8 +541,8 @@ class Ensemble:
             status=status,
             steps=steps,
             fallback_steps=fallback_steps,
-            h=self.plans[0].h,
-            plans=() if self.plans[0].fixed else self.plans,
+            h=self.plans[0].h if isinstance(self.plans[0], Until) else 0.0,
+            plans=() if isinstance(self.plans[0], Until) else cast(Sequence[Adaptive], self.plans),
             confirmations=tuple(self.confirmations),
             parameters=self.parameters,
             stepper=self.stepper,
@@ -597,7 +601,7 @@ def _steps_or_end(
     steps: int | None,
     t_end: ArrayLike | None,
     inputs: object,
-    tolerance: float | None,
+    control: ErrorControl,
     t_eval: object,
     *,
     words: int,
@@ -615,7 +619,7 @@ def _steps_or_end(
     if h is not None and t_end is not None and np.ndim(t_end):
         raise StateError("with h all trajectories have one t_end: give one number, or omit h (adaptive step size)")
     first = None if t_end is None else float(real_array(t_end, "t_end").flat[0])
-    planned_steps.__wrapped__(h, steps, first, tolerance, 1, hashed(t), "", False, 1)
+    planned_steps.__wrapped__(h, steps, first, *control, 1, hashed(t), "", False, 1)
     if h is None or (inputs is None and first is None):
         return steps, t_end
     return None, final_time(t, h, steps, first)

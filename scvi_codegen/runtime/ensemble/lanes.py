@@ -36,7 +36,7 @@ from scvi_codegen.runtime.ensemble.thread_pool import StopCheck, run_jobs
 from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.run_loop import record
-from scvi_codegen.runtime.run.step_plan import StepPlan
+from scvi_codegen.runtime.run.step_plan import Fixed
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 
@@ -229,7 +229,7 @@ class SingleRun:
         values = work.values_at(segment.middle, slice(j, j + 1))[0]
         try:
             arguments: dict[str, Any] = {"t": work.steps.t0, "parameters": values, "options": work.options}
-            run = Memory.started(work.stepper, q, p, plan=StepPlan(h=segment.h), **arguments)
+            run = Memory.started(work.stepper, q, p, plan=Fixed(segment.h), **arguments)
         except StateError:  # a sum of finite terms has overflowed
             work.status[j] = "not finite"
         else:

@@ -24,7 +24,7 @@ from scvi_codegen.runtime.core.words import TwoWords, Words, check_keeps_words, 
 from scvi_codegen.runtime.rotations.attitude_history import AttitudeHistory
 from scvi_codegen.runtime.rotations.quantities import named_quantities
 from scvi_codegen.runtime.run.descriptions import short_title
-from scvi_codegen.runtime.run.step_plan import StepPlan
+from scvi_codegen.runtime.run.step_plan import Adaptive, Fixed
 from scvi_codegen.runtime.trajectory.joining import joined, relative_changes
 from scvi_codegen.runtime.trajectory.quantities import quantities
 from scvi_codegen.runtime.trajectory.saved_states import Pictured, checked_row
@@ -70,7 +70,7 @@ class EnsembleRuns:
     parameters: Array
     stepper: Integrator = field(repr=False)
     times: Array | None = None
-    plans: Sequence[StepPlan] = ()
+    plans: Sequence[Adaptive] = ()
     observed: Array | None = field(default=None, repr=False)
 
     def __len__(self) -> int:
@@ -116,7 +116,7 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
         j = checked_row(j, len(self))
         parts = [(good, parameters) for k, good, parameters in self._with_parameters() if k == j]
         times, in_tau = self._times()[:, j], bool(self.stepper.interface.energy_parameter)
-        plan = self.plans[j] if self.plans else StepPlan(h=self.h)
+        plan = self.plans[j] if self.plans else Fixed(self.h)
         pieces = []
         for number, (good, parameters) in enumerate(parts):
             rows = np.insert(good, 0, good[0] - 1) if number else good  # the state at a breakpoint belongs to both

@@ -19,6 +19,7 @@ from scvi_codegen.runtime.events.event import (
     UNDEFINED_CHANGE,
     Crossings,
 )
+from scvi_codegen.runtime.run.step_plan import Fixed
 from scvi_codegen.runtime.trajectory.saved_states import Array, SavedStates
 
 if TYPE_CHECKING:
@@ -112,7 +113,8 @@ class CrossingSearch:
         rows[0][0], rows[1][0], rows[2][0] = run.t, run._q, run._p
         iterations, numbers = np.zeros(most + 1, np.int32), np.full(most + 1, number, np.int64)
         filled = binding.numbers("long long *")
-        arguments = self.watch, plan.t_end, run._control, size, *run._arguments, most
+        t_end = np.inf if isinstance(plan, Fixed) else plan.t_end
+        arguments = self.watch, t_end, run._control, size, *run._arguments, most
         states = *(binding.pointer(each[1:]) for each in rows), binding.integers(iterations[1:])
         to = self._capacity, crossings, filled, run._report, run._workspace
         advance = binding.function("advance_with_changes", run._memory)

@@ -25,7 +25,7 @@ from scvi_codegen.runtime.events.detection import CrossingSearch
 from scvi_codegen.runtime.events.event import Crossings, Event
 from scvi_codegen.runtime.events.functions import EventFunctions
 from scvi_codegen.runtime.run.memory import Memory
-from scvi_codegen.runtime.run.step_plan import StepPlan
+from scvi_codegen.runtime.run.step_plan import Fixed, FixedSteps, Until
 from scvi_codegen.runtime.run.times import WHOLE
 from scvi_codegen.runtime.trajectory.dense_output import stepped_to
 
@@ -135,7 +135,7 @@ class RefinedSearch(CrossingSearch):
             begin = with_low(np.array([float(t)]), np.array([t.low]))
             return TimedState(end, *stepped_to(states, start.q, start.p, begin, end))
         if self._partial is None:
-            plan = StepPlan(h=float(end - start.t))
+            plan = Fixed(float(end - start.t))
             settings: dict[str, Any] = {"parameters": states.parameters, "options": states.options}
             self._partial = Memory.started(stepper, start.q, start.p, plan=plan, **settings)
         run, block = self._partial, map(block_of, (start.q, start.p))
@@ -151,7 +151,7 @@ class RefinedSearch(CrossingSearch):
         plan, rows, failure = run._plan, [SavedRow(_place(run), number=run.steps)], None
         memory, watch = run.stepper.binding.buffer(run._memory), self.binding.buffer(self.watch)
         for _ in range(size):
-            if self.ended or run.left_to(plan.t_end) == 0.0:
+            if self.ended or (not isinstance(plan, Fixed) and run.left_to(plan.t_end) == 0.0):
                 break
             before = bytes(memory), bytes(watch)
             try:
@@ -161,7 +161,7 @@ class RefinedSearch(CrossingSearch):
                 failure = error
                 break
         t, q, p = (stacked([row.at[k] if k else word_of(row.at.t) for row in rows]) for k in range(3))
-        sizes = np.array([*(row.size for row in rows[1:]), plan.h or np.nan])
+        sizes = np.array([*(row.size for row in rows[1:]), plan.h if isinstance(plan, FixedSteps) else np.nan])
         iterations, numbers = (np.array([row[k] for row in rows]) for k in (3, 2))
         return (t, q, p, iterations.astype(np.int32)), sizes, numbers, failure
 
@@ -200,13 +200,13 @@ class RefinedSearch(CrossingSearch):
     def _take(self, run: Memory) -> None:
         """Take one step, the last to the target time of fixed steps: shorter, or longer by the rounding of h."""
         memory, plan = run._memory, run._plan
-        last = bool(plan.h) and abs(run.left_to(plan.t_end)) < (1.0 + WHOLE) * abs(plan.h)
-        if last:
-            run._step_to(plan.t_end)
+        if not isinstance(plan, Until) or abs(run.left_to(plan.t_end)) >= (1.0 + WHOLE) * abs(plan.h):
+            run._taken(1)
+            return
+        run._step_to(plan.t_end)
         run._taken(1)
-        if last:
-            memory.t, memory.t_low = plan.t_end, 0.0
-            memory.h, memory.h_low = plan.h, 0.0
+        memory.t, memory.t_low = plan.t_end, 0.0
+        memory.h, memory.h_low = plan.h, 0.0
 
     def _located(self, run: Memory, start: TimedState, h: Fraction, number: int) -> list[list[Any]]:
         """Return the crossings in a step, which the integrator in double repeats, grouped by time."""
@@ -215,7 +215,7 @@ class RefinedSearch(CrossingSearch):
         if run._options is not twin._options:
             twin._set_options(run._options)
         while True:
-            twin.plan = StepPlan(h=float(h))
+            twin.plan = Fixed(float(h))
             twin._begin(np.asarray(start.q), np.asarray(start.p), float(start.t))
             twin._memory.step = number
             failure = super().advance(twin, 1)[-1]

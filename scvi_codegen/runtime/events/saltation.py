@@ -25,6 +25,7 @@ from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.constraints.projection import projected
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.events.event import Event
+from scvi_codegen.runtime.run.step_plan import FixedSteps
 from scvi_codegen.runtime.run.times import WHOLE
 from scvi_codegen.runtime.trajectory.recomputation import changes_by_events, steps_after
 
@@ -107,7 +108,7 @@ def _jump(
     h = SMALL_STEP * abs(states.h) if at_end else float(steps_after(states, row, row + 1)[0])
     # 1 if the next step is the rest of a step of size h, whose variation belongs to the first part
     partial = abs(h) < (1.0 - WHOLE) * abs(states.h) or abs(starts.h[k - 1]) < WHOLE * abs(states.h)
-    rest = float(not at_end and states.plan.fixed and partial)
+    rest = float(not at_end and isinstance(states.plan, FixedSteps) and partial)
     step = products(after, h, t, np.eye(size))
     departure, basis = np.zeros(2 * m), np.eye(2 * m)
     if stepper.constraints:  # tangent vectors are admissible: departure + the range of the derivative of the projection

@@ -24,6 +24,7 @@ from scvi_codegen.runtime.core.validation import Array, check_left_to_inputs, no
 from scvi_codegen.runtime.core.words import low_words, split, with_low
 from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.run_loop import record_with_stops
+from scvi_codegen.runtime.run.step_plan import Adaptive, FixedSteps, ending_at
 from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.runtime.trajectory.dense_output import checked_times
 from scvi_codegen.runtime.trajectory.joining import joined
@@ -286,7 +287,7 @@ class InputSegments:
         """Integrate with adaptive steps that end at the breakpoints and at ``stops``, in order; save all states."""
 
         def recorded(steps: int | None) -> Trajectory:
-            start, end = run.t, run.plan.t_end
+            start, end = run.t, cast(Adaptive, run.plan).t_end
             ends = [*(t for t in stops if min(start, end) < t < max(start, end)), end]
             if not run.stepper.events:
                 return record_with_stops(run, ends, progress=progress)
@@ -294,7 +295,7 @@ class InputSegments:
 
         def prepared_ends(ends: Sequence[float]) -> Iterator[None]:
             for end in ends:
-                run.plan = replace(run.plan, t_end=end)
+                run.plan = ending_at(run.plan, end)
                 yield None
 
         return record_segments(run, prepared_segments(run, self.inputs, self.t_end, self.values), recorded)
@@ -313,7 +314,7 @@ def prepared_segments(
     Yields:
         The number of steps of the segment; ``None`` for adaptive steps to the target time of the run.
     """
-    if run.plan.fixed:
+    if isinstance(run.plan, FixedSteps):
         for segment in planned_segments(run._times[0], t_end, run.h, inputs, words=run.stepper.interface.words):
             run.update(parameters=values(segment.middle), h=segment.h)
             if run.stepper.interface.words > 1 and segment.end is not None:
@@ -321,7 +322,7 @@ def prepared_segments(
             yield segment.steps
         return
     for end in breakpoints_until(run.t, t_end, inputs):
-        run.update(parameters=values(run.t + 0.5 * (end - run.t)), plan=replace(run.plan, t_end=end))
+        run.update(parameters=values(run.t + 0.5 * (end - run.t)), plan=ending_at(run.plan, end))
         yield None
 
 

@@ -46,7 +46,7 @@ from scvi_codegen.runtime.estimation.measurements import state_names
 from scvi_codegen.runtime.orbits.step_sequence import StepSequence
 from scvi_codegen.runtime.rotations.reduction import Reduction
 from scvi_codegen.runtime.rotations.states import checked_pair, homogeneous_state
-from scvi_codegen.runtime.run.step_plan import StepPlan
+from scvi_codegen.runtime.run.step_plan import Fixed
 from scvi_codegen.runtime.run.times import steps_within
 from scvi_codegen.runtime.sensitivity.fixed_steps import tangents_along
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
@@ -474,7 +474,7 @@ class _OrbitSearch:
     def _states_before(self, start: Array, period: float) -> Array:
         """Return the states before a state, in equal steps back over half a period, of impacts that can be undone."""
         count = len(self._steps)
-        plan, steps, (q, p) = StepPlan(h=-period / count), count - count // 2, np.split(start, 2)
+        plan, steps, (q, p) = Fixed(-period / count), count - count // 2, np.split(start, 2)
         if self._steps.tolerance is None and not any(event.changes for event in self.stepper.events):
             run = self.stepper._started(q, p, None, plan, self.t, self.parameters, self.options)
             with suppress(EventError, StepFailedError):

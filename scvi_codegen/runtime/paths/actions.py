@@ -13,6 +13,7 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.native.options import SolverOptions, step_failure
 from scvi_codegen.runtime.core.features import require
 from scvi_codegen.runtime.core.validation import Array
+from scvi_codegen.runtime.run.step_plan import FixedSteps
 from scvi_codegen.runtime.sensitivity.gradients import pieces, starts_of
 from scvi_codegen.runtime.sensitivity.step_derivatives import LinearisedMethod, Starts
 from scvi_codegen.runtime.trajectory.recomputation import changes_by_events, check_recomputed
@@ -96,7 +97,8 @@ def shadow_energy(states: SavedStates, order: int) -> Array:
     if order not in ORDERS:
         raise StateError(f"order must be an even number from 2 to {ORDERS[-1]}, not {order!r}")
     steps = np.diff(states.t)
-    if not states.plan.fixed or np.ptp(steps) > 1e-6 * abs(steps[0]) or abs(steps[0] - states.h) > 1e-6 * abs(states.h):
+    fixed = isinstance(states.plan, FixedSteps)
+    if not fixed or np.ptp(steps) > 1e-6 * abs(steps[0]) or abs(steps[0] - states.h) > 1e-6 * abs(states.h):
         raise StateError("shadow_energy() requires all states of a run of fixed step size: give h and save_every=1")
     if len(states) <= order:
         raise StateError(f"order {order} requires more than {order} states; the run has {len(states)}")

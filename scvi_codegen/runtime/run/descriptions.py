@@ -3,14 +3,14 @@
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.representation import one_line
 from scvi_codegen.runtime.run.memory import Memory
-from scvi_codegen.runtime.run.step_plan import StepPlan
+from scvi_codegen.runtime.run.step_plan import FixedSteps, InTau, StepPlan
 from scvi_codegen.runtime.trajectory.saved_states import SavedStates
 
 
 def describe_run(run: Memory) -> str:
     """Return ``<Run of TITLE; t = 3 after 30 steps of 0.1, solver fixed-point>``."""
     interface, unset = run.stepper.interface, ", ".join(run._unset_inputs)
-    plan = "" if run.plan.fixed else f", t_end = {run.plan.t_end:g}"
+    plan = "" if isinstance(run.plan, FixedSteps) else f", t_end = {run.plan.t_end:g}"
     solved = f", solver {interface.solver}" if interface.solver else ""
     steps = f"{run.steps} steps{describe_step_size(run.h, run.plan, tau=bool(interface.energy_parameter))}"
     waits = f", inputs not set: {unset}" if unset else ""
@@ -30,6 +30,6 @@ def short_title(interface: Interface) -> str:
 
 def describe_step_size(h: float, plan: StepPlan, *, tau: bool) -> str:
     """Describe the step size of a run."""
-    if plan.fixed:
+    if isinstance(plan, FixedSteps):
         return f" of {h:g}{' in tau' * tau}"
-    return f" of {plan.tau:g} in tau" if plan.tau else " of adaptive size"
+    return f" of {plan.tau:g} in tau" if isinstance(plan, InTau) else " of adaptive size"

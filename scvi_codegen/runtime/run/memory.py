@@ -6,7 +6,7 @@ C functions modify the struct, so a second thread that enters raises an error.
 import functools
 import math
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from fractions import Fraction
 from typing import Any, Self, TypeVar, cast
@@ -32,7 +32,7 @@ from scvi_codegen.runtime.core.words import Word, block_of, checked_time, low_wo
 from scvi_codegen.runtime.rotations.states import checked_pair
 from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.saving import checkpoint
-from scvi_codegen.runtime.run.step_plan import StepPlan
+from scvi_codegen.runtime.run.step_plan import Adaptive, Fixed, FixedSteps, InTau, StepPlan, step_control
 from scvi_codegen.validation import LARGEST_COUNT, checked_count
 
 STEPS_PER_CALL, MOST_UNTIMED = 10**5, 2**10
@@ -66,7 +66,7 @@ STEPS_FROM_REST, STEPS_NEAR_REST = 2**20, 16
 """First value of the count of steps from rest in C; number of steps in which a force moves a state away from rest."""
 EVENT_NUMBERS = ("undefined", "accumulated", "through", "jammed")
 """Numbers of events, from 1 on, in the state of the search for events; 0 for none, < 0 for an undefined change."""
-NO_OUTPUT, NO_PLAN = LARGEST_COUNT, StepPlan()
+NO_OUTPUT, NO_PLAN = LARGEST_COUNT, Fixed(math.nan)
 """Output stride that saves no state; plan of a run that was not started."""
 
 Called = TypeVar("Called", bound=Callable[..., Any])
@@ -119,7 +119,8 @@ class Memory:
             values = np.concatenate([values, np.zeros(len(values))])
             self._parameters = stepper._numbers(values)
         self._arguments = binding.pointer(values), binding.null
-        self._control = binding.null  # of adaptive steps in C
+        self._control = binding.null  # of steps in C that are not fixed
+        self._control_data: Sequence[Any] = ()  # that it refers to
         self._options: SolverOptions | None = None
         self._has_defaults = False  # whether no parameter differs from its default
         self._watch: Any = None  # state of the search for events in C
@@ -135,7 +136,9 @@ class Memory:
         self._untimed = len(self._q) <= MOST_UNTIMED  # whether ``advance`` takes steps without looking at the clock
         self._start_function = binding.function("start", memory)
         self._step_error = binding.function("step_error", memory) if binding.has("step_error") else None
-        self._plan, self.longest, self._can_measure_growth = NO_PLAN, 0.0, hasattr(memory, "measures_growth")
+        self._plan: StepPlan = NO_PLAN
+        self._h = cast("float | None", NO_PLAN.h)  # fixed step size; None for other steps
+        self.longest, self._can_measure_growth = 0.0, hasattr(memory, "measures_growth")
         self._sums_action = hasattr(memory, "actions")
         firsts = {name: parameter_index(stepper.interface, f"{name}_0") for name in stepper.interface.inputs}
         self._inputs = {name: slice(first, first + 5) for name, first in firsts.items()}
@@ -175,7 +178,7 @@ class Memory:
     def _begin(self, q: States, p: States, t: float, growth: int = 0) -> None:
         """Start at (q, p) and t after :meth:`_set_up`; ``growth``: value of ``measures_growth`` in C."""
         q, p = map(block_of, checked_pair(self.stepper.interface, q, p))
-        self._start_function(t, self._plan.h, *self.stepper.binding.pointers(q, p))
+        self._start_function(t, 0.0 if self._h is None else self._h, *self.stepper.binding.pointers(q, p))
         if isinstance(t, Word):
             self._memory.t_low = t.low
         if growth and self._can_measure_growth:
@@ -228,8 +231,8 @@ class Memory:
                 raise StateError(f"invalid saved run: {name} is {value}, not a whole number from {least} to {most}")
         if plan is None and memory.h == 0.0:
             raise StateError("the saved run has adaptive steps: give t_end")
-        plan = StepPlan(h=memory.h) if plan is None else plan
-        if plan.h != memory.h:
+        plan = Fixed(memory.h) if plan is None else plan
+        if (plan.h if isinstance(plan, FixedSteps) else 0.0) != memory.h:
             raise StateError("the saved run has fixed steps: omit t_end")
         if not stepper._has_energy(parameters):
             raise StateError("a saved run in transformed time requires its energy: give parameters=run.parameters")
@@ -246,21 +249,17 @@ class Memory:
 
     @plan.setter
     def plan(self, plan: StepPlan) -> None:
-        if not (plan.fixed or self.stepper._has_error_estimate):
+        if not (isinstance(plan, FixedSteps) or self.stepper._has_error_estimate):
             require(self.stepper, "adaptive")
-        self._plan, self._has_tau = plan, bool(plan.tau) or self.stepper.in_tau
-        self._control = self.stepper.binding.null if plan.fixed else self._step_control(plan)
+        self._control, *self._control_data = step_control(self.stepper, plan)
+        self._plan, self._h = plan, plan.h if isinstance(plan, FixedSteps) else None
+        self._has_tau = isinstance(plan, InTau) or self.stepper.in_tau
         for call in self._calls:
-            call.h, call.t_end, call.control = plan.h, plan.t_end, self._control
-
-    def _step_control(self, plan: StepPlan) -> Any:
-        """Return the control of steps in C that are not fixed."""
-        control = self.stepper.binding.new("step_control *")
-        if plan.tau:
-            control.tau = plan.tau
-        else:
-            control.tolerance, control.max_step = plan.tolerance, plan.max_step
-        return control
+            call.control = self._control
+            if isinstance(plan, FixedSteps):
+                call.h = plan.h
+            else:
+                call.t_end = plan.t_end
 
     @property
     def h(self) -> float:
@@ -321,8 +320,8 @@ class Memory:
             self._set_parameters(self.stepper._parameters(parameters, self._parameters))
             self._unset_inputs = tuple(name for name in self._unset_inputs if name in missing)
         if h is not None and checked_step(h) != self._memory.h:
-            self.plan = StepPlan(h=checked_step(h))
-            self._memory.h, self._memory.guess = self.plan.h, 0
+            self.plan = Fixed(checked_step(h))
+            self._memory.h, self._memory.guess = h, 0
             if self.stepper.interface.words > 1:
                 self._memory.h_low = 0.0
         if plan is not None:
@@ -448,7 +447,7 @@ class Memory:
             raise in_use()
         try:
             if progress is None and stop is None and self._untimed:
-                fixed = self._plan.h
+                fixed = self._h is not None
                 while left > 0 and (fixed or not self.arrived):
                     size = left if left < STEPS_PER_CALL else STEPS_PER_CALL
                     if self._unset_inputs:
@@ -519,7 +518,7 @@ class Memory:
     @property
     def arrived(self) -> bool:
         """Return whether the run has reached its target time."""
-        return not self._plan.h and self.left_to(self._plan.t_end) == 0.0
+        return not isinstance(self._plan, FixedSteps) and self.left_to(self._plan.t_end) == 0.0
 
     @property
     def ended(self) -> bool:
@@ -529,7 +528,7 @@ class Memory:
     @property
     def rejected_steps(self) -> int:
         """Number of rejected steps."""
-        return int(self._memory.rejected) if self._plan.adaptive else 0
+        return int(self._memory.rejected) if isinstance(self._plan, Adaptive) else 0
 
     @property
     def fallback_steps(self) -> int:

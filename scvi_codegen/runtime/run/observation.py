@@ -23,7 +23,7 @@ from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.observer import Observer, StateChunk
 from scvi_codegen.runtime.run.run_loop import record, trajectory_of
 from scvi_codegen.runtime.run.singular_time import ProgressWatch
-from scvi_codegen.runtime.run.step_plan import StepPlan
+from scvi_codegen.runtime.run.step_plan import Adaptive, Fixed, Until
 from scvi_codegen.runtime.run.times import WHOLE
 from scvi_codegen.runtime.trajectory.dense_output import states_and_steps_at, step_sizes_at, stepped_to
 from scvi_codegen.runtime.trajectory.time_transformation import part_of_step
@@ -236,7 +236,7 @@ class Observation:
         self.search = search_of(run.stepper, None if run.ended else run._watch) if run.stepper.events else None
         run._watch = self.search and self.search.watch
         plan = run.plan
-        self.end = plan.t_end if plan.fixed and math.isfinite(plan.t_end) else None
+        self.end = plan.t_end if isinstance(plan, Until) else None
         self.arrived, self.partial_steps, self.iterations = False, 0, 0
 
     @property
@@ -256,11 +256,11 @@ class Observation:
             EventError: if an event function is not finite.
         """
         run, plan = self.run, self.run.plan
-        unbounded = steps is None and math.isfinite(plan.t_end)
+        unbounded = steps is None and not isinstance(plan, Fixed)
         count = math.inf if unbounded else checked_count(steps, "steps", least=0)
         self._pass_on(record(run, 0), is_first=True)
         most = max(1, CHUNK_NUMBERS // run.stepper.dimension)
-        watch = None if plan.adaptive or not math.isfinite(plan.t_end) else ProgressWatch(run.stepper, plan.t_end)
+        watch = None if isinstance(plan, Adaptive | Fixed) else ProgressWatch(run.stepper, plan.t_end)
         take = self._take_with_changes if self.search is not None and self.search.changes else self._take
 
         def advance(size: int) -> int:
@@ -314,7 +314,7 @@ class Observation:
                 part, failure, self.arrived = record(self.run, reached), None, False
                 t, q, p = self.search.last
                 lengths = part.step_sizes.copy()
-                if self.run.plan.adaptive:
+                if isinstance(self.run.plan, Adaptive):
                     lengths[-1] = t - part.t[-1]
                 part = self._with_state(part, lengths, t, q, p, self._state_within_step(part, t)[2])
                 self.run._watch = self.search.watch
@@ -391,7 +391,7 @@ class Observation:
         if t == (begin := float(part.t[-1])):
             return 0.0
         settings: dict[str, Any] = {"t": begin, "parameters": self.run.parameters, "options": self.run.options}
-        run = Memory.started(self.run.stepper, part.q[-1], part.p[-1], plan=StepPlan(h=t - begin), **settings)
+        run = Memory.started(self.run.stepper, part.q[-1], part.p[-1], plan=Fixed(t - begin), **settings)
         run.advance(1)
         return float(run._memory.action)
 

@@ -17,7 +17,7 @@ from scvi_codegen.runtime.run.descriptions import describe_run
 from scvi_codegen.runtime.run.memory import Memory, alone
 from scvi_codegen.runtime.run.observation import Observation, Observe, Saver, saver_of
 from scvi_codegen.runtime.run.run_loop import FIRST_STEPS, ShortRuns, integrate_short, record
-from scvi_codegen.runtime.run.step_plan import StepPlan
+from scvi_codegen.runtime.run.step_plan import Fixed, StepPlan, Until
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation import LARGEST_COUNT
 
@@ -99,7 +99,7 @@ class Run(Memory, AttitudeHistory):
     ) -> Trajectory:
         """Return the states as :meth:`record` does, or those at ``times``, without its warnings and its lock."""
         plan = self._plan
-        if self.stepper.events or times is not None or observe is not None or (plan.h and plan.t_end != math.inf):
+        if self.stepper.events or times is not None or observe is not None or isinstance(plan, Until):
             return Observation(self, saver_of(observe, times, save_every)).advance(
                 steps, progress, stop or (lambda: False)
             )
@@ -119,9 +119,9 @@ class Run(Memory, AttitudeHistory):
     ) -> Trajectory:
         """Start a run that is set up at (q, p) and record it as :meth:`_recorded`, a short one by one C call."""
         plan, stores_all = self._plan, times is None and observe is None and progress is None
-        fits = steps is None if not plan.h else steps is not None and steps <= FIRST_STEPS * save_every
+        fits = steps is None if self._h is None else steps is not None and steps <= FIRST_STEPS * save_every
         special = self._has_tau or self._unset_inputs or self.stepper.events or self._rows is None
-        if fits and stores_all and not special and t != plan.t_end:
+        if fits and stores_all and not special and (isinstance(plan, Fixed) or t != plan.t_end):
             return integrate_short(self, q, p, t, steps, save_every, growth)
         self._begin(q, p, t, growth)
         return self._recorded(steps, save_every, times, progress, observe)

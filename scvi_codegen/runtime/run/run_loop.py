@@ -3,7 +3,6 @@
 import math
 import struct
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 from functools import lru_cache, partial
 from math import isfinite
 from typing import Any, cast
@@ -19,7 +18,7 @@ from scvi_codegen.runtime.rotations.states import checked_pair
 from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.singular_time import ProgressWatch, check_energy_surface
-from scvi_codegen.runtime.run.step_plan import StepPlan
+from scvi_codegen.runtime.run.step_plan import Adaptive, FixedSteps, InTau, ending_at
 from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation import checked_count
@@ -50,7 +49,7 @@ def record(
     Raises:
         StepFailedError: if a step fails; ``trajectory`` has the saved states, the run is left before that step.
     """
-    count = None if steps is None and not memory._plan.h else checked_count(steps, "steps", least=0)
+    count = None if steps is None and memory._h is None else checked_count(steps, "steps", least=0)
     if type(save_every) is not int or save_every != 1:
         save_every = checked_count(save_every, "save_every", least=1)
     recorder = _StateRecorder(memory, save_every, count, filled)
@@ -90,7 +89,7 @@ def record_with_stops(
     counted = None if progress is None else lambda _: progress(memory.steps - first)
     try:
         for t_end in stops:
-            memory.plan = replace(memory.plan, t_end=t_end)
+            memory.plan = ending_at(memory.plan, t_end)
             drive(recorder.advance, math.inf, first=FIRST_STEPS, ended=lambda: memory.arrived, progress=counted)
     except StepFailedError as failure:
         failure.trajectory = recorder.trajectory()
@@ -140,7 +139,7 @@ class ShortRuns(StateRows):
     def __init__(self, memory: Memory) -> None:
         super().__init__(memory, FIRST_STEPS + 3)
         stepper, m = memory.stepper, len(memory._q)
-        self.interface, self._kind = stepper.interface, (0, 0.0)
+        self.interface, self._kind = stepper.interface, (0, cast("float | None", None))
         self.shape = (m,) if m <= FEW else None  # of vectors that are checked as lists, faster than as arrays
         self._start, self._sizes = np.empty(1 + 2 * m), np.full(FIRST_STEPS + 3, math.nan)
         self._pack = partial(struct.Struct(f"{1 + 2 * m}d").pack_into, cast(Any, self._start), 0)
@@ -167,13 +166,13 @@ class ShortRuns(StateRows):
             pass
         self._start[0], self._start[1:] = t, np.concatenate(checked_pair(self.interface, q, p))
 
-    def recorded(self, count: int, h: float, save_every: int) -> tuple[States, Array]:
+    def recorded(self, count: int, h: float | None, save_every: int) -> tuple[States, Array]:
         """Return copies of the first states and of the steps that follow them."""
         if (count, h) != self._kind:
             self._kind, self._views = (count, h), self.first(count)
-            self._sizes_of_kind = _repeated(h, count) if h else self._sizes[:count]
+            self._sizes_of_kind = _repeated(h, count) if h is not None else self._sizes[:count]
         (t, q, p, iterations), sizes = self._views, self._sizes_of_kind
-        if not h:
+        if h is None:
             sizes[-1] = math.nan
             sizes = sizes.copy() if save_every == 1 else np.full(count, math.nan)
         return (t.copy(), q.copy(), p.copy(), iterations.copy()), sizes
@@ -192,7 +191,7 @@ def integrate_short(
     ``growth``: value of ``measures_growth`` in C. Raises as :func:`record`.
     """
     short: ShortRuns = run._rows
-    h = run._plan.h
+    h = run._h
     size = FIRST_STEPS * save_every if steps is None else steps
     short.begin(t, q, p)
     short.call.measures_growth = growth
@@ -200,7 +199,7 @@ def integrate_short(
     error, error_t, first, last, stored, done, rejected, fallbacks = short.results()
     if status or (steps is None and done == size):
         return record(run, steps, save_every=save_every, filled=1 + stored, status=status)
-    if not h:
+    if h is None:
         run._ends = first, last
     states, sizes = short.recorded(1 + stored, h, save_every)
     return _trajectory(run, states, sizes, done, error, error_t, rejected, fallbacks)
@@ -215,7 +214,7 @@ class _StateRecorder:
     def __init__(self, memory: Memory, save_every: int, steps: int | None, filled: int) -> None:
         plan, first = memory._plan, 0 if filled else memory._memory.step
         self.memory, self.save_every, self.first, self.filled = memory, save_every, first, filled or 1
-        if plan.h:
+        if memory._h is not None:
             assert steps is not None  # by the caller
             self.first_size = save_every * max(1, FIRST_STEPS // save_every)
             rows = (first + steps) // save_every - first // save_every + 1
@@ -231,12 +230,12 @@ class _StateRecorder:
             for each in actions:
                 each[0] = memory._memory.action
         self.earlier: list[States] = []
-        self.watch = ProgressWatch(memory.stepper, plan.t_end) if plan.tau else None
+        self.watch = ProgressWatch(memory.stepper, plan.t_end) if isinstance(plan, InTau) else None
 
     def advance(self, size: int) -> int:
         """Take ``size`` steps, fewer if the target time is reached; return their number."""
         memory, save_every, watch = self.memory, self.save_every, self.watch
-        to_end = not memory._plan.h
+        to_end = memory._h is None
         before = None if watch is None else memory.t
         if to_end and self.filled + size // save_every + 2 > len(self.rows.states[0]):
             self.earlier.append(self._states())
@@ -267,7 +266,7 @@ class _StateRecorder:
         memory, states = self.memory, self._states()
         if self.earlier:
             states = tuple(map(np.concatenate, zip(*self.earlier, states, strict=True)))
-        if not memory._plan.h:
+        if memory._h is None:
             return trajectory_of(memory, states, _differences(states[0], whole=self.save_every == 1))
         tau, h = None, memory._memory.h
         if memory.stepper.interface.energy_parameter:
@@ -288,7 +287,7 @@ def trajectory_of(
 ) -> Trajectory:
     """Return a trajectory of these states with the data of the run."""
     run, error = memory._memory, math.nan if memory._step_error is None else memory._step_error()
-    done, rejected = run.step if steps is None else steps, run.rejected if memory._plan.adaptive else 0
+    done, rejected = run.step if steps is None else steps, run.rejected if isinstance(memory._plan, Adaptive) else 0
     error_t, fallbacks = run.error_t if error >= 0.0 else 0.0, memory.fallback_steps
     trajectory = _trajectory(memory, states, step_sizes, done, error, error_t, rejected, fallbacks)
     trajectory.events, trajectory.tau = events, tau
@@ -316,7 +315,7 @@ def _trajectory(
     if stepper.shapes is not None:
         q, p = stepper.named(q), stepper.named(p)
     trajectory.t, trajectory.q, trajectory.p, trajectory.step_sizes = t, q, p, step_sizes
-    trajectory.h = plan.h or first_step_size(plan, t)
+    trajectory.h = plan.h if isinstance(plan, FixedSteps) else first_step_size(plan, t)
     trajectory.plan, trajectory.stepper, trajectory.options = plan, stepper, memory._options
     trajectory.steps, trajectory.rejected_steps, trajectory.fallback_steps = steps, rejected, fallbacks
     if error >= 0.0:
@@ -346,7 +345,7 @@ def _differences(t: Array, *, whole: bool) -> Array:
     return step_sizes
 
 
-def first_step_size(plan: StepPlan, t: Array) -> float:
+def first_step_size(plan: Adaptive | InTau, t: Array) -> float:
     """Return the first step size between states of an adaptive run, or the direction of the run; NaN without states."""
     if len(t) == 0:
         return math.nan

@@ -13,6 +13,7 @@ from scvi_codegen.representation import clipped
 from scvi_codegen.runtime.arrays.interface import RunSizes, check_accesses, read_tables
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.words import block_of, from_block
+from scvi_codegen.runtime.run.step_plan import Adaptive, ErrorControl, FixedSteps
 from scvi_codegen.validation import checked_count
 
 MAGIC = b"scvi run 4\n"
@@ -46,7 +47,8 @@ def checkpoint(run: Any) -> bytes:
         "integrator": _integrator(stepper),
         "sizes": sizes,
         "unset inputs": run._unset_inputs,
-        "adaptive": not run.plan.fixed,
+        "adaptive": not isinstance(run.plan, FixedSteps),
+        **({"control": ErrorControl.of(run.plan).named} if isinstance(run.plan, Adaptive) else {}),
     }
     arrays: list[Any] = [*places.values(), block_of(run.parameters)]
     return sealed(b"".join([json.dumps(header).encode(), b"\n", *(array.tobytes() for array in arrays), run.snapshot]))
@@ -54,8 +56,8 @@ def checkpoint(run: Any) -> bytes:
 
 def read_checkpoint(
     saved: bytes, stepper: Integrator, *, threads: int | None, adaptive: bool
-) -> tuple[Integrator, bytes, dict[str, Any]]:
-    """Return the stepper, bound to the sizes of the run, the state and the parameters by name.
+) -> tuple[Integrator, bytes, dict[str, Any], ErrorControl]:
+    """Return the stepper, bound to the sizes of the run, the state, the parameters by name and the error control.
 
     Args:
         saved: bytes of :func:`checkpoint`.
@@ -77,7 +79,7 @@ def read_checkpoint(
 
 def _read(
     body: bytes, stepper: Integrator, threads: int | None, *, adaptive: bool
-) -> tuple[Integrator, bytes, dict[str, Any]]:
+) -> tuple[Integrator, bytes, dict[str, Any], ErrorControl]:
     text, _, rest = body.partition(b"\n")
     header, layout = json.loads(text), stepper.interface.layout
     if header["integrator"] != _integrator(stepper):
@@ -108,7 +110,9 @@ def _read(
         known = {name: numbers[k : k + 1].reshape(()) for k, name in enumerate(stepper.parameters)}
     for name in header["unset inputs"]:
         del known[f"{name}_0"]
-    return stepper, rest[first + values.nbytes :], known
+    control = ErrorControl(**header.get("control", {}))
+    control.checked()
+    return stepper, rest[first + values.nbytes :], known, control
 
 
 def _integrator(stepper: Integrator) -> str:

@@ -1,78 +1,284 @@
 """Step plan of a run: fixed step size, adaptive steps to a time, or constant steps in transformed time to a time."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.errors import StateError
+from scvi_codegen.errors import StateError, closest
 from scvi_codegen.native.arguments import checked_number, checked_step
+from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.core.features import FEATURES, refusal
+from scvi_codegen.runtime.core.validation import coordinate_shapes
 from scvi_codegen.runtime.core.words import check_doubles
 from scvi_codegen.runtime.run.times import steps_to
 from scvi_codegen.validation import check_tolerance, checked_count
 
+AbsoluteTolerance: TypeAlias = float | tuple[tuple[str, float], ...]
+"""Absolute tolerance of all coordinates, or those of some coordinates, arrays and rotations by name."""
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StepPlan:
-    """Step sizes of a run and the time at which it ends.
+
+@dataclass(frozen=True, slots=True)
+class FixedSteps:
+    """Steps of one size; base of :class:`Fixed` and :class:`Until`.
 
     Attributes:
-        t_end: target time; infinite for a number of fixed steps.
-        tolerance: largest relative error of an adaptive step; 0 for round-off.
-        tau: constant step of fictitious time of the reversible controller; 0 otherwise.
-        h: fixed step size, of tau in transformed time; 0 otherwise.
+        h: step size, of tau in transformed time.
     """
 
-    t_end: float = math.inf
+    h: float
+
+
+@dataclass(frozen=True, slots=True)
+class Fixed(FixedSteps):
+    """Fixed steps, as many as a call requests."""
+
+
+@dataclass(frozen=True, slots=True)
+class Until(FixedSteps):
+    """Fixed steps to a target time, the last of which is shorter; it is not taken by the run itself.
+
+    Attributes:
+        t_end: target time.
+    """
+
+    t_end: float
+
+
+@dataclass(frozen=True, slots=True)
+class Adaptive:
+    """Adaptive steps to a target time.
+
+    The error of a step is at most ``tolerance * max(motion of the coordinate, absolute tolerance)``.
+
+    Attributes:
+        t_end: target time.
+        tolerance: admissible relative error of a step; errors below round-off count as round-off.
+        max_step: largest step size.
+        first_step: size of the first trial step; ``None`` if trials determine it.
+        absolute_tolerance: the absolute tolerances that are not 0.
+    """
+
+    t_end: float
     tolerance: float = 0.0
-    tau: float = 0.0
-    h: float = 0.0
     max_step: float = math.inf
+    first_step: float | None = None
+    absolute_tolerance: AbsoluteTolerance = ()
 
-    @property
-    def fixed(self) -> bool:
-        """Return whether h is the step size; then a last step that is shorter is not taken by the run itself."""
-        return self.h != 0.0
 
-    @property
-    def adaptive(self) -> bool:
-        """Return whether step sizes follow from the tolerance."""
-        return not (self.h or self.tau)
+@dataclass(frozen=True, slots=True)
+class InTau:
+    """Steps of one size in the fictitious time of a controller, to a target time.
+
+    Attributes:
+        t_end: target time.
+        tau: step size.
+    """
+
+    t_end: float
+    tau: float
+
+
+StepPlan: TypeAlias = Fixed | Until | Adaptive | InTau
+"""Step sizes of a run and the time at which it ends."""
+
+
+def ending_at(plan: StepPlan, t_end: float) -> StepPlan:
+    """Return a step plan with another target time."""
+    return Until(plan.h, t_end) if isinstance(plan, FixedSteps) else replace(plan, t_end=t_end)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class AdaptivePlans(Sequence[StepPlan]):
-    """Step plans of trajectories with adaptive steps of one tolerance, made when they are read.
+class AdaptivePlans(Sequence[Adaptive]):
+    """Adaptive steps of trajectories to times of their own, made when they are read.
 
     Attributes:
         ends: (k,) target times.
+        plan: that of a trajectory, whose target time is replaced.
     """
 
     ends: NDArray[np.float64]
-    tolerance: float
+    plan: Adaptive
 
     def __len__(self) -> int:
         return len(self.ends)
 
     def __getitem__(self, j: Any) -> Any:
         if isinstance(j, slice):
-            return AdaptivePlans(self.ends[j], self.tolerance)
-        return StepPlan(t_end=float(self.ends[j]), tolerance=self.tolerance)
+            return AdaptivePlans(self.ends[j], self.plan)
+        return replace(self.plan, t_end=float(self.ends[j]))
+
+
+class ErrorControl(NamedTuple):
+    """Arguments of users for adaptive steps; ``None`` where a user omits them.
+
+    Attributes:
+        tolerance: relative error of a step.
+        absolute_tolerance: error below which a step is accepted, relative to ``tolerance``: a number, or one by name.
+        max_step, first_step: largest step size; size of the first trial.
+    """
+
+    tolerance: float | None = None
+    absolute_tolerance: float | Mapping[str, float] | None = None
+    max_step: float | None = None
+    first_step: float | None = None
+
+    @property
+    def named(self) -> dict[str, Any]:
+        """The arguments that are not omitted, by name."""
+        values = {name: getattr(self, name) for name in self._fields}
+        return {name: value for name, value in values.items() if value is not None}
+
+    @classmethod
+    def of(cls, plan: Adaptive) -> Self:
+        """Return the arguments of a step plan."""
+        absolute: Any = plan.absolute_tolerance
+        return cls(
+            plan.tolerance or None,
+            (dict(absolute) or None) if isinstance(absolute, tuple) else absolute,
+            None if plan.max_step == math.inf else plan.max_step,
+            plan.first_step,
+        )
+
+    def to(self, t_end: float) -> Adaptive:
+        """Return the step plan to a target time.
+
+        Raises:
+            StateError: if a number is invalid.
+        """
+        return Adaptive(checked_number(t_end, "t_end"), **self.checked())
+
+    def checked(self) -> dict[str, Any]:
+        """Return the fields of :class:`Adaptive` without its target time."""
+        fields = self.named
+        if "tolerance" in fields:
+            check_tolerance(number := checked_number(self.tolerance, "the tolerance"))
+            fields["tolerance"] = number
+        if "absolute_tolerance" in fields:
+            fields["absolute_tolerance"] = checked_absolute_tolerance(fields["absolute_tolerance"])
+        for name in fields.keys() & {"max_step", "first_step"}:
+            if name == "max_step" and fields[name] == math.inf:
+                continue
+            fields[name] = number = checked_number(fields[name], name)
+            if not number > 0.0:
+                raise StateError(
+                    f"{name} = {number:g} must be positive: give a size, or omit it (t_end determines the direction)"
+                )
+        return fields
+
+
+def plan_to_record(plan: Adaptive | InTau) -> dict[str, Any]:
+    """Return a step plan as numbers by name for files; its first three names are those of version 0.1."""
+    if isinstance(plan, InTau):
+        return {"t_end": plan.t_end, "tolerance": 0.0, "tau": plan.tau}
+    return {"t_end": plan.t_end, "tolerance": plan.tolerance, "tau": 0.0} | ErrorControl.of(plan).named
+
+
+def plan_from_record(t_end: Any, tolerance: Any, tau: Any, **control: Any) -> Adaptive | InTau:
+    """Return the step plan of :func:`plan_to_record`.
+
+    Raises:
+        StateError, TypeError: for other names and numbers.
+    """
+    if tau:
+        if tolerance or control or not checked_number(tau, "tau") > 0.0:
+            raise StateError(f"steps of tau = {tau:g} must be positive and have no tolerance")
+        return InTau(checked_number(t_end, "t_end"), tau)
+    return ErrorControl(tolerance or None, **control).to(t_end)
+
+
+def checked_absolute_tolerance(value: Any) -> AbsoluteTolerance:
+    """Return an absolute tolerance of users; raise ``StateError`` for NaN, infinite and negative numbers."""
+    if isinstance(value, Mapping):
+        each = ((str(name), _not_negative(number, f"absolute_tolerance of {name}")) for name, number in value.items())
+        return tuple((name, number) for name, number in each if number)
+    return _not_negative(value, "absolute_tolerance") or ()
+
+
+def _not_negative(value: Any, name: str) -> float:
+    number = checked_number(value, name)
+    if number < 0.0:
+        raise StateError(
+            f"{name} = {number:g} must not be negative: give the size below which errors do not matter, or omit it"
+        )
+    return number
+
+
+def absolute_tolerances(interface: Interface, dimension: int, absolute: AbsoluteTolerance) -> NDArray[np.float64]:
+    """Return the (m,) absolute tolerances of the coordinates.
+
+    Raises:
+        StateError: if there is no coordinate, array or rotation of a name.
+    """
+    if not isinstance(absolute, tuple):
+        return np.full(dimension, absolute)
+    from scvi_codegen.runtime.rotations.states import members_of  # here, because it imports runs
+
+    values, first, columns = np.zeros(dimension), 0, dict[str, Any]()
+    for name, shape in coordinate_shapes(interface):
+        end = first + math.prod(shape)
+        columns[name], first = slice(first, end), end
+    if len(interface.coordinates) == dimension:
+        columns |= {name: slice(k, k + 1) for k, name in enumerate(interface.coordinates) if name not in columns}
+    if interface.rotations:
+        members = members_of(dimension, interface.rotations)
+        ordinary = members[0].columns.start
+        names = {name: place for name, place in columns.items() if place.start < ordinary}
+        columns = names | {member.name: member.columns for member in members}
+    for name, value in absolute:
+        if name not in columns:
+            raise StateError(
+                f"absolute_tolerance: there is no coordinate, array or rotation '{name}' (= {value:g}) in "
+                f"'{interface.system}'{closest(name, [*columns])} Known: {', '.join(columns)}"
+            )
+        values[columns[name]] = value
+    return values
+
+
+def step_control(stepper: Any, plan: StepPlan) -> tuple[Any, ...]:
+    """Return the control of steps in C, NULL for fixed ones, and the numbers that it refers to.
+
+    Args:
+        stepper: :class:`~scvi_codegen.runtime.core.integrator.Integrator` of the run.
+        plan: step plan.
+
+    Raises:
+        StateError: if there is no coordinate, array or rotation of a name.
+    """
+    binding = stepper.binding
+    match plan:
+        case InTau(tau=tau):
+            control = binding.new("step_control *")
+            control.tau = tau
+            return (control,)
+        case Adaptive():
+            control = binding.new("step_control *")
+            control.tolerance, control.max_step = plan.tolerance, plan.max_step
+            first, absolute = binding.null, np.empty(0)
+            if plan.first_step is not None:
+                first = binding.numbers("double *")
+                first[0] = plan.first_step
+            if plan.absolute_tolerance != ():
+                absolute = absolute_tolerances(stepper.interface, stepper.dimension, plan.absolute_tolerance)
+            control.first_step, control.absolute_tolerance = first, binding.pointer(absolute)
+            return control, first, absolute
+        case _:
+            return (binding.null,)
 
 
 def checked_plan(
-    h: float | None, t_end: float | None, tolerance: float | None, controller: str = "", in_tau: bool = False, /
+    h: float | None, t_end: float | None, control: ErrorControl, controller: str = "", in_tau: bool = False, /
 ) -> StepPlan:
     """Return the step plan of arguments of users.
 
     Args:
-        h, t_end, tolerance: step size; target time; relative error of an adaptive step.
+        h, t_end: step size; target time.
+        control: of adaptive steps.
         controller: time transformation of the reversible controller, "" without one.
         in_tau: whether the system is one in transformed time, which has fixed steps only.
 
@@ -80,27 +286,24 @@ def checked_plan(
         StateError: if a number is invalid, or they do not determine the steps.
     """
     if controller:
-        if h is None or t_end is None or tolerance is not None:
+        if h is None or t_end is None or control.named:
             remedy = FEATURES["adaptive", "with a time transformation"]
             raise StateError(f"the time transformation {controller} determines the step size: {remedy}")
         tau = checked_step(h)
         if tau < 0.0:
             raise StateError(f"h = {h:g} must be positive with a time transformation: t_end determines the direction")
-        return StepPlan(t_end=checked_number(t_end, "t_end"), tau=tau)
+        return InTau(checked_number(t_end, "t_end"), tau)
     if h is None and in_tau:
         raise refusal("adaptive", "in transformed time")
-    if (t_end is None) == (h is None):
-        raise StateError(
-            f"give either h (fixed step size) or t_end (adaptive step size); got {'neither' if h is None else 'both'}"
-        )
-    if h is not None:
-        if tolerance is not None:
-            raise StateError("tolerance requires adaptive steps: give t_end without h and steps")
-        return StepPlan(h=checked_step(h))
-    allowed = 0.0
-    if tolerance is not None:
-        check_tolerance(allowed := checked_number(tolerance, "the tolerance"))
-    return StepPlan(t_end=checked_number(t_end, "t_end"), tolerance=allowed)
+    if h is None:
+        if t_end is None:
+            raise StateError("give either h (fixed step size) or t_end (adaptive step size); got neither")
+        return control.to(t_end)
+    if t_end is not None:
+        raise StateError("give either h (fixed step size) or t_end (adaptive step size); got both")
+    for name in control.named:
+        raise StateError(f"{name} requires adaptive steps: give t_end without h and steps")
+    return Fixed(checked_step(h))
 
 
 @lru_cache(maxsize=256, typed=True)
@@ -109,6 +312,9 @@ def planned_steps(
     steps: int | None,
     t_end: float | None,
     tolerance: float | None,
+    absolute_tolerance: float | Mapping[str, float] | None,
+    max_step: float | None,
+    first_step: float | None,
     save_every: int,
     t: float | Fraction,
     controller: str,
@@ -119,7 +325,8 @@ def planned_steps(
     """Return the plan of :meth:`Stepper.integrate` and its number of steps, ``None`` to t_end.
 
     Args:
-        h, steps, t_end, tolerance, save_every, t: arguments of :meth:`Stepper.integrate`; t matters with h and t_end.
+        h, steps, t_end, tolerance, absolute_tolerance, max_step, first_step, save_every, t: arguments of
+            :meth:`Stepper.integrate`; t matters with h and t_end.
         controller, in_tau: as of :func:`checked_plan`.
         words: number of words of the states; runs in double-double end at t_end to 32 digits.
 
@@ -127,10 +334,11 @@ def planned_steps(
         StateError: if a number is invalid, or they do not determine the steps.
     """
     fixed = h is not None and not controller
-    plan = checked_plan(h, None if fixed else t_end, tolerance, controller, in_tau)
+    control = ErrorControl(tolerance, absolute_tolerance, max_step, first_step)
+    plan = checked_plan(h, None if fixed else t_end, control, controller, in_tau)
     if words > 1:
         check_doubles(t_end=t_end)
-    if not fixed:  # Adaptive, or equal steps of tau by the controller
+    if not isinstance(plan, FixedSteps):
         if steps is not None:
             raise StateError(f"adaptive steps end at t_end={plan.t_end:g}: omit steps={steps}, or give h and steps")
         return plan, None
@@ -146,4 +354,4 @@ def planned_steps(
         raise StateError(f"give either steps={steps} or t_end={end:g} with h, not both")
     if (end - checked_number(t, "the time t")) * plan.h < 0.0:
         raise StateError(f"h = {plan.h:g} has the wrong sign for a run from t = {t:g} to t_end = {end:g}")
-    return replace(plan, t_end=end), None
+    return Until(plan.h, end), None

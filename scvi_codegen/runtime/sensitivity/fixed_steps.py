@@ -8,7 +8,7 @@ from scvi_codegen.errors import EventError
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.core.validation import Array
-from scvi_codegen.runtime.run.step_plan import StepPlan
+from scvi_codegen.runtime.run.step_plan import Fixed
 from scvi_codegen.runtime.run.times import times_after
 from scvi_codegen.runtime.sensitivity.gradients import forward
 from scvi_codegen.runtime.sensitivity.step_derivatives import Starts
@@ -59,7 +59,7 @@ def tangents_along(
         length, start = float(h[first]), states[first]
         if size_variations is not None:
             tangents = np.concatenate([tangents[:, :-1], size_variations[first][:, np.newaxis]], axis=1)
-        run = stepper._started(start[:m], start[m:], None, StepPlan(h=length), float(t[first]), parameters, options)
+        run = stepper._started(start[:m], start[m:], None, Fixed(length), float(t[first]), parameters, options)
         trajectory = run._recorded(last - first)
         ends = times_after(float(t[first]), length, np.arange(1, last - first + 1))[0]
         if trajectory.t[-1] < ends[-1] - 0.5 * length:

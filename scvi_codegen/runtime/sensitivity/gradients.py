@@ -17,6 +17,7 @@ from scvi_codegen.native.arguments import real_array
 from scvi_codegen.representation import summary
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.events.saltation import Jump, jumps_within
+from scvi_codegen.runtime.run.step_plan import FixedSteps
 from scvi_codegen.runtime.sensitivity.step_derivatives import LinearisedMethod, Sensitivity, Starts
 from scvi_codegen.runtime.sensitivity.transformed_derivatives import time_of
 from scvi_codegen.runtime.trajectory.recomputation import SAME_STEP_SIZE, check_recomputed, steps_after, steps_between
@@ -209,7 +210,7 @@ def starts_of(states: SavedStates, first: int, last: int) -> tuple[Starts, NDArr
 
 
 def _has_fixed_step_size(states: SavedStates) -> bool:
-    if not states.plan.fixed:
+    if not isinstance(states.plan, FixedSteps):
         return False
     spans = np.diff(states.stepped)
     steps = np.rint(spans / states.h)

@@ -12,7 +12,6 @@ Measured over one revolution of the Kepler problem, e = 0.5, largest position er
 One state takes 0.65 microseconds there, four times as long as a step of the run, whose predictor is better.
 """
 
-from dataclasses import replace
 from fractions import Fraction
 from typing import Any
 
@@ -24,7 +23,7 @@ from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.native.options import step_failure
 from scvi_codegen.runtime.core.words import Words, low_words
 from scvi_codegen.runtime.run.memory import Memory
-from scvi_codegen.runtime.run.step_plan import StepPlan
+from scvi_codegen.runtime.run.step_plan import Fixed, FixedSteps, StepPlan, ending_at
 from scvi_codegen.runtime.trajectory.saved_states import ROUNDINGS, SavedStates
 from scvi_codegen.runtime.trajectory.time_transformation import part_of_step, states_in_transformed_time
 
@@ -49,7 +48,7 @@ def states_and_steps_at(states: SavedStates, times: Array) -> tuple[Array, Array
         _check_on_grid(states)
         return states_in_transformed_time(states, times)
     left = np.searchsorted(states.forward * states.t, states.forward * times, side="right") - 1
-    lengths, fixed, several = states.step_sizes[:-1], states.plan.fixed, False
+    lengths, fixed, several = states.step_sizes[:-1], isinstance(states.plan, FixedSteps), False
     if states.stepper.changes_states:
         several = not (np.abs(np.diff(states.t)) < 1.5 * np.abs(lengths)).all()
     if several or (not fixed and np.isnan(lengths).any()):
@@ -83,7 +82,7 @@ def _integrate_to_each(
     between = np.flatnonzero(times != states.t[left])
     between = between[np.lexsort((states.forward * times[between], left[between]))]
     for rows in np.split(between, np.flatnonzero(np.diff(left[between])) + 1) if between.size else ():
-        to_last = replace(plan, t_end=float(times[rows[-1]]))
+        to_last = ending_at(plan, float(times[rows[-1]]))
         settings = {"t": states.t[left[rows[0]]], "parameters": states.parameters, "options": states.options}
         run = stepper._run(q[rows[0]], p[rows[0]], plan=to_last, **settings)
         run._memory.t_low = low_words(states.t)[left[rows[0]]]
@@ -124,7 +123,7 @@ def stepped_to(
         return part_of_step(states.stepper, t[0], states.h, end, q, p, states.parameters, states.options)[:2]
     settings: dict[str, Any] = {"parameters": states.parameters, "options": states.options}
     run = Memory.started(
-        states.stepper, q, p, plan=StepPlan(h=float(end - Fraction(float(t[0])))), t=float(t[0]), **settings
+        states.stepper, q, p, plan=Fixed(float(end - Fraction(float(t[0])))), t=float(t[0]), **settings
     )
     run._memory.t_low = low_words(t)[0]
     run._step_to(end)

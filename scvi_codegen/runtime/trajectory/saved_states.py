@@ -16,7 +16,7 @@ from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.words import Words
 from scvi_codegen.runtime.run.memory import Memory
-from scvi_codegen.runtime.run.step_plan import StepPlan
+from scvi_codegen.runtime.run.step_plan import Fixed, StepPlan
 
 if TYPE_CHECKING:
     from scvi_codegen.pictures.animation import Film
@@ -86,7 +86,7 @@ class SavedStates:
     def _restarted(self, k: int, h: float) -> Memory:
         """Return a run from saved state k with fixed steps h."""
         settings: dict[str, Any] = {"parameters": self.parameters, "options": self.options}
-        run = Memory.started(self.stepper, self.q[k], self.p[k], plan=StepPlan(h=h), t=float(self.t[k]), **settings)
+        run = Memory.started(self.stepper, self.q[k], self.p[k], plan=Fixed(h), t=float(self.t[k]), **settings)
         if isinstance(self.t, Words):
             run._memory.t_low = self.t.low[k]
         return run

@@ -13,7 +13,7 @@ from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.core.words import block_of, fraction_of
 from scvi_codegen.runtime.run.memory import Memory
-from scvi_codegen.runtime.run.step_plan import StepPlan
+from scvi_codegen.runtime.run.step_plan import Fixed
 from scvi_codegen.runtime.trajectory.saved_states import SavedStates
 
 MOST_CORRECTIONS, MET, SHORT = 5, Fraction(1, 2**104), Fraction(1, 2**40)
@@ -78,7 +78,7 @@ def _part_of_two_words(
     stepper: Integrator, h: float, span: Fraction, q: Array, p: Array, parameters: Array, options: SolverOptions | None
 ) -> tuple[Array, Array, float]:
     """Return the result of :func:`part_of_step` after a time in double-double arithmetic, by Newton's method."""
-    run = Memory.started(stepper, q, p, plan=StepPlan(h=h), parameters=parameters, options=options)
+    run = Memory.started(stepper, q, p, plan=Fixed(h), parameters=parameters, options=options)
     before, whole = run.snapshot, Fraction(h)
     size = span / Fraction(float(stepper.rates(q, p, parameters)[0]))
     if abs(size) > SHORT * abs(whole):

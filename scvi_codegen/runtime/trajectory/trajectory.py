@@ -32,6 +32,7 @@ from scvi_codegen.runtime.paths.actions import actions_until, compensated_sums, 
 from scvi_codegen.runtime.rotations.attitude_history import AttitudeHistory
 from scvi_codegen.runtime.rotations.quantities import named_quantities
 from scvi_codegen.runtime.run.descriptions import describe_states, describe_step_size
+from scvi_codegen.runtime.run.step_plan import FixedSteps
 from scvi_codegen.runtime.sensitivity.trajectory_derivatives import TrajectoryDerivatives
 from scvi_codegen.runtime.trajectory.dense_output import checked_times, states_at, within
 from scvi_codegen.runtime.trajectory.joining import Number, concatenated, joined, joined_crossings, relative_changes
@@ -130,7 +131,7 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed, Pictured, Tw
         if self.pieces:
             return self._slice_of_pieces(first, last, stride, rows)
         lengths = self.step_sizes[rows]
-        if stride > 1 and not self.plan.fixed:  # the next saved state is not the end of the step
+        if stride > 1 and not isinstance(self.plan, FixedSteps):  # the next saved state is not the end of the step
             lengths = np.full_like(lengths, np.nan)
         low, high = sorted((self.t[first], self.t[range(first, last, stride)[-1]]))
         return replace(
@@ -439,7 +440,7 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed, Pictured, Tw
         return card(self.stepper.title, facts, grid(rows))
 
     def _steps(self) -> str:
-        if not self.plan.fixed:
+        if not isinstance(self.plan, FixedSteps):
             return f"{self.steps} adaptive steps, {self.rejected_steps} rejected"
         return f"h = {self.h:g}"
 

@@ -10,15 +10,16 @@ KERNEL NAME(thread_size)(long long *size)
 }
 
 /* Advances the trajectories `which` by at most `steps` steps; with `first` from t0 and the states in q, p. runs: their
- * memory between calls; parameters: (count, P). t, q, p: of each its time, and its state if it is at t_end. status: of
+ * memory between calls; parameters: (count, P). t, q, p: of each its time, and its state if it is at t_end. first_step: NaN for trials. status: of
  * the step that failed, 0 at t_end, else -1. done: numbers of completed steps. solver_tolerance: 0 for the one of
  * `tolerance`. */
 KERNEL NAME(thread_advance_to)(long long number, const long long *which, long long first, long long steps, double t0,
-    const double *t_end, double tolerance, double max_step, double solver_tolerance, long long max_iterations, long long absolute,
+    const double *t_end, double tolerance, double max_step, double first_step,
+    const double *absolute_tolerance, double solver_tolerance, long long max_iterations, long long absolute,
     run_memory *runs, const double *parameters, double *t, double *q, double *p, long long *status, long long *done)
 {
   const long long k = TRAJECTORY, every = 0x7fffffffffffffffLL;
-  const step_control control = {.tolerance = tolerance, .max_step = max_step};
+  const step_control control = {tolerance, max_step, first_step > 0.0 ? &first_step : NULL, absolute_tolerance};
   const solver_options options = {solver_tolerance, (int)max_iterations, (int)absolute};
   run_memory run;
   solver_report report;
