@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from itertools import combinations
 from typing import Any, NamedTuple
 
@@ -17,6 +17,8 @@ from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.validation import checks_arguments, of
 
 AXES = "xyz"
+UNITS = ("length", "time", "mass")
+"""Kinds of units, in an order that REBOUND accepts."""
 NEWTON = ("basic", "compensated")
 """REBOUND's names of pairwise gravity by direct summation."""
 RELATIVE_TOLERANCE = 1e-11
@@ -47,8 +49,8 @@ def from_rebound(simulation: Any) -> GravitatingBodies:
     integrator are dropped.
 
     Raises:
-        SystemDefinitionError: for anything but gravity between masses: massless bodies, softening, additional forces,
-            boundaries, collisions, variational particles.
+        SystemDefinitionError: for anything but gravity between masses: massless bodies, test particles (``N_active``),
+            softening, additional forces, changes before or after steps, boundaries, collisions, variational particles.
     """
     imported("rebound", "rebound")
     _check_plain(simulation)
@@ -72,27 +74,48 @@ def from_rebound(simulation: Any) -> GravitatingBodies:
     return GravitatingBodies(system, q, velocity, float(simulation.t), units)
 
 
-@checks_arguments(SystemDefinitionError, system=of("a LagrangianSystem", LagrangianSystem))
-def to_rebound(system: LagrangianSystem, q: ArrayLike, *, velocity: ArrayLike, t: float = 0.0) -> Any:
+BODIES = of("a LagrangianSystem, or bodies of from_rebound", LagrangianSystem, GravitatingBodies)
+
+
+@checks_arguments(SystemDefinitionError, system=BODIES)
+def to_rebound(
+    system: LagrangianSystem | GravitatingBodies,
+    q: ArrayLike | None = None,
+    *,
+    velocity: ArrayLike | None = None,
+    t: float = 0.0,
+    units: Mapping[str, str] | None = None,
+) -> Any:
     """Return a ``rebound.Simulation`` of bodies that attract each other by Newton's law.
 
     G and the masses are determined from the Lagrangian numerically, to round-off, for the values of its parameters
-    (``system.with_parameters``), whatever their names. The simulation uses IAS15, REBOUND's default, and no named
-    units: they are the system's.
+    (``system.with_parameters``), whatever their names. The simulation uses IAS15, REBOUND's default.
 
     Args:
-        system: system in Cartesian coordinates, body after body, of three axes, or two.
+        system: system in Cartesian coordinates, body after body, of three axes, or two; or the result of
+            :func:`from_rebound`, with its state, time and units.
         q, velocity: (3n,) or (2n,) state of the bodies.
         t: time.
+        units: names of the system's units of ``length``, ``mass`` and ``time``; G remains the system's.
 
     Raises:
         SystemDefinitionError: for any other system.
         StateError: for states that do not fit it.
     """
     rebound = imported("rebound", "rebound")
+    if isinstance(system, GravitatingBodies):
+        if q is not None or velocity is not None or t != 0.0 or units is not None:
+            raise StateError("bodies of from_rebound have a state, a time and units: omit q, velocity, t and units")
+        system, q, velocity, t, units = system
+    if q is None or velocity is None:
+        raise StateError("to_rebound requires the state of the bodies: give q and velocity")
     axes, G, masses = _attraction(system)
     states = [_padded(value, name, len(masses), axes) for name, value in (("q", q), ("velocity", velocity))]
     simulation = rebound.Simulation()
+    if units:
+        if set(units) != set(UNITS):
+            raise StateError(f"units must name {', '.join(UNITS)}, not {', '.join(map(str, units))}")
+        simulation.units = tuple(units[kind] for kind in UNITS)
     simulation.G, simulation.t = G, checked_number(t, "t")
     for mass, position, motion in zip(masses, *states, strict=True):
         simulation.add(
@@ -103,7 +126,8 @@ def to_rebound(system: LagrangianSystem, q: ArrayLike, *, velocity: ArrayLike, t
 
 def _check_plain(simulation: Any) -> None:
     """Raise SystemDefinitionError for features other than gravity between masses."""
-    particles = simulation.particles[: simulation.N]
+    particles, active = simulation.particles[: simulation.N], simulation.N_active
+    hooks = [name for name in ("pre_timestep_modifications", "post_timestep_modifications") if _has(simulation, name)]
     massless = [i for i, particle in enumerate(particles) if not particle.m > 0.0]
     oddities = {
         "fewer than two bodies": len(particles) < 2,
@@ -112,12 +136,20 @@ def _check_plain(simulation: Any) -> None:
         f"gravity = {simulation.gravity!r}": simulation.gravity not in NEWTON,
         f"boundary = {simulation.boundary!r}": simulation.boundary != "none",
         f"collision = {simulation.collision!r}": simulation.collision != "none",
+        f"N_active = {active}, bodies that attract no others (testparticle_type = {simulation.testparticle_type}): "
+        "set N_active to -1 to let all attract each other, or remove them": 0 <= active < len(particles),
+        f"{''.join(hooks[:1])}: write them as forces": bool(hooks),
         "variational particles": bool(simulation.N_var),
         "additional forces: write them as terms of L, or forces=": bool(simulation._additional_forces),
     }
     result = [what for what, there in oddities.items() if there]
     if result:
         raise SystemDefinitionError(f"only gravity between masses is supported; this simulation has {result[0]}")
+
+
+def _has(simulation: Any, function: str) -> bool:
+    """Return whether a function of C or Python is called by the simulation, NULL of C if not."""
+    return bool(getattr(simulation, f"_{function}", None))
 
 
 def _padded(value: ArrayLike, name: str, bodies: int, axes: int) -> Array:

@@ -24,6 +24,8 @@ NUMBER, COUNT, TEXT, CHOICE, SWITCH, METHOD = "number", "count", "text", "choice
 NUMBERS, NUMBERS_OR_NAME = "numbers", "numbers or name"
 ASSIGNMENTS, INPUTS, SIZES, EVENTS = "assignments", "inputs", "sizes", "events"
 """Kinds of values of an option; those of the last four are a section of a model file."""
+LARGEST_TOLERANCE = 0.1
+"""Largest relative update with which the iteration of a step may end: beyond it, the equations are not solved."""
 
 
 class Alternatives(NamedTuple):
@@ -178,8 +180,8 @@ class RunOptions:
     save_every: int = run_option("run", COUNT, "N", "Save every N-th state.", least=1, default=1)
     solver_tolerance: float | None = run_option(
         *("run", NUMBER, "X", "Convergence criterion: relative update of the stages [round-off]."),
-        valid=lambda value: value > 0.0,
-        invalid="solver_tolerance must be positive, not {value:g}",
+        valid=lambda value: 0.0 < value <= LARGEST_TOLERANCE,
+        invalid=f"solver_tolerance must be positive and at most {LARGEST_TOLERANCE:g}, not {{value:g}}",
         solver_option="tolerance",
         common=False,
     )

@@ -402,6 +402,7 @@ class TestCommandLine:
             ("kepler --tolerance 0", "the tolerance must be positive"),
             ("kepler --advise 1e-6 --method explicit-euler", "steps, more than 1e+09: use a method of higher order"),
             ("kepler --solver-tolerance 0", "solver_tolerance must be positive"),
+            ("kepler --solver-tolerance 2", "solver_tolerance must be positive and at most 0.1, not 2"),
         ):
             assert message in error_of(f"run {words}")
 
