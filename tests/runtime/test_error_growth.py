@@ -263,3 +263,37 @@ def test_most_chaotic_runs_and_no_regular_ones_are_reported(system, states, t_en
     random, stepper = np.random.default_rng(1), stepper_of(system)
     found = [reports(stepper, *states(random), t_end, tolerance=tolerance) for _ in range(30)]
     assert least <= sum(found) <= most
+
+
+ARENSTORF = (
+    PLANE,
+    "(x_dot**2 + y_dot**2)/2 + x*y_dot - y*x_dot + (x**2 + y**2)/2 + (1 - m)/sqrt((x + m)**2 + y**2)"
+    " + m/sqrt((x - 1 + m)**2 + y**2)",
+)
+ORBITS = {  # initial velocities and periods: Hairer, Norsett, Wanner, Solving ODEs I, sec. II.0
+    -2.00158510637908252240537862224: 17.0652165601579625588917206249,
+    -2.0317326295573368357302057924: 11.124340337266085134999734047,
+}
+
+
+@pytest.mark.parametrize("velocity", ORBITS)
+def test_growth_that_leaves_ten_digits_is_not_reported(velocity):
+    """Arenstorf's orbits return to their start with 12 digits; perturbations grow by a factor of 5e4."""
+    stepper = sc.compile_stepper(lagrange("moon", *ARENSTORF, m=0.012277471), "svi:8")
+    with warnings.catch_warnings(action="error"):
+        run = stepper.integrate([0.994, 0.0], velocity=[0.0, velocity], t_end=ORBITS[velocity])
+    assert np.abs(run.q[-1] - [0.994, 0.0]).max() < 1e-12
+
+
+def test_growth_of_coordinates_near_a_pole_is_not_reported():
+    """Angles of a spherical pendulum that passes its pole at a distance of 1e-7."""
+    with warnings.catch_warnings(action="error"):
+        stepper_of(SPHERICAL).integrate([2.0, 0.0], velocity=[0.0, 1e-7], t_end=50.0)
+
+
+def test_reported_growth_has_the_number_of_digits_left():
+    """Kepler's problem in polar coordinates with e = 1 - 5e-5: seven of sixteen digits are right at the end."""
+    with pytest.warns(sc.AccuracyWarning, match=r"leaves about [78] digits at t = 30 \(estimated\)"):
+        run = stepper_of(POLAR).integrate([1.0, 0.0], [0.0, 1e-3], t_end=30.0)
+    nearby = stepper_of(POLAR).integrate([1.0, 0.0], [0.0, 1e-3], t_end=30.0, tolerance=1e-18, check_growth=False)
+    assert 1e-10 < abs(run.q[-1, 0] - nearby.q[-1, 0]) < 1e-6

@@ -1,10 +1,12 @@
 """Growth of errors along adaptive runs, by a tangent vector or by a run from a perturbed initial state.
 
 The growth along a run of a conservative Lagrangian system is that of a tangent vector, which C propagates beside the
-run (``error_growth.h``). Along other runs it is checked afterwards, by repeating the run from a perturbed initial
-state: the difference of two runs shows how the motion amplifies an initial error. A coarse run with a larger tolerance
-shows in the first half of the steps whether errors grow exponentially; only then is the run repeated from a state
-perturbed in its last place. The repeated run stores no states and has a bounded number of steps.
+run (``error_growth.h``). It may be that of the coordinates alone, as of angles near a pole, and errors that grow may
+still be small. A run is therefore reported only if its repetition from a perturbed initial state, whose difference
+shows how the motion amplifies an initial error, confirms that fewer than ten digits are left. Along other runs growth
+is checked by repetition alone: a coarse run with a larger tolerance shows in the first half of the steps whether errors
+grow exponentially; only then is the run repeated from a state perturbed in its last place. The repeated run stores no
+states and has a bounded number of steps.
 """
 
 import math
@@ -16,6 +18,7 @@ from typing import cast
 import numpy as np
 
 from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, warn
+from scvi_codegen.runtime.accuracy.size import Motion, first_of_groups, relative, roundoff
 from scvi_codegen.runtime.accuracy.warning_switch import warnings_wanted
 from scvi_codegen.runtime.constraints.projection import projected
 from scvi_codegen.runtime.core.features import require
@@ -42,8 +45,6 @@ A decision after a quarter misses half of the chaotic motions with late close en
 """
 MANY = 256
 """Number of steps from which on the coarse run is also compared at the fraction FIRST."""
-SMALLEST = 1e-140
-"""Numbers below this, or above its inverse, are scaled before squaring to avoid underflow and overflow."""
 ALGEBRAIC = 4.0
 """Growth of a difference by twice the steps that is algebraic (2: linear), where the threshold is LARGEST."""
 SLOW = 0.6
@@ -58,6 +59,9 @@ LEAST_GROWTH, EXPONENT = math.log(2e4), 8.0
 
 Bodies that are ejected move regularly from then on, which brings the mean closer to g.
 """
+RIGHT, LOOSER, MOST_REPEATED, PARTS, DIGITS = 1e-10, 1e4, 2**16, 16, 15
+"""Difference that leaves ten digits, and its ratio to the tolerance if that is larger; most steps of a repetition that
+confirms a growth, and number of its comparisons; digits of a double."""
 ROUNDOFF, LOOSE_TOLERANCE = 1e-14, 1e-6
 """Tolerances above which the propagation of the tangent vector needs four stages, and more corrections."""
 
@@ -83,8 +87,7 @@ def warn_of_error_growth(
     if measured is not None and not requested:
         grown, excess = measured
         if grown >= LEAST_GROWTH and 2.0 * excess >= EXPONENT:
-            factor = f"{math.exp(grown):.0e}".replace("+", "")
-            _warn_of_amplification(f"small perturbations of the initial state grew by a factor of {factor}")
+            _Repetition(run, states, advance_until).confirm(grown)
         return
     if requested or run.steps * DECADES_PER_STEP >= _thresholds(plan.tolerance)[2]:
         _Repetition(run, states, advance_until).warn(requested=bool(requested))
@@ -110,10 +113,12 @@ def measured_growth(stepper: Integrator, plan: StepPlan, requested: bool | None)
     return 1 + (plan.tolerance > ROUNDOFF) + (plan.tolerance > LOOSE_TOLERANCE)
 
 
-def _warn_of_amplification(what: str) -> None:
+def _warn_of_amplification(what: str, difference: float, t: float) -> None:
+    digits = min(max(0, math.floor(-math.log10(difference))) if difference > 0.0 else DIGITS, DIGITS)
+    left = f"about {digits} digit{'s' * (digits != 1)}" if digits else "no digit"
     warn(
-        f"the motion amplifies errors: {what}, so later states are not reproducible. Use error= to find the time until "
-        "which digits are confirmed, or check_growth=False to skip this check",
+        f"the motion amplifies errors: {what}, which leaves {left} at t = {t:g} (estimated). Use error= to find the "
+        "time until which digits are confirmed, or check_growth=False to skip this check",
         AccuracyWarning,
     )
 
@@ -133,6 +138,39 @@ class _Repetition:
         self.steps, self.tolerance = run.steps, self._plan().tolerance
         self.nudge, self.tolerable, self.decades = _thresholds(self.tolerance)
         self.reached, self.quarter = 0, 0.0
+        self.firsts = first_of_groups(run.stepper.interface, len(run._q))
+
+    def confirm(self, grown: float) -> None:
+        """Warn of the growth exp(``grown``) of a tangent vector if a repetition confirms it, or would take too long.
+
+        It is confirmed by a difference of the last states, or of earlier ones by which nearly all digits are lost.
+        """
+        states, count = self.states, len(self.states.t) - 1
+        tolerable = min(max(RIGHT, LOOSER * self.tolerance), LARGEST)
+        if math.exp(min(grown, 600.0)) * self.nudge < tolerable:
+            return None
+        factor = f"{math.exp(min(grown, 600.0)):.0e}".replace("+", "")
+        what = f"small perturbations of the initial state grew by a factor of {factor}"
+        if len(states.q) != len(states.t):
+            return _warn_of_amplification(what, self.nudge * math.exp(min(grown, 600.0)), float(states.t[-1]))
+        last = count if self.steps <= MOST_REPEATED else max(1, count * MOST_REPEATED // self.steps)
+        apart, k = 0.0, 0
+        try:
+            self._begin(self.nudge, self.tolerance)
+            times = np.linspace(states.t[0], states.t[last], PARTS + 1)[1:]  # not by number: steps crowd in encounters
+            forward = math.copysign(1.0, times[-1] - states.t[0])
+            for k in sorted({*np.searchsorted(forward * states.t[:last], forward * times).tolist()} - {0}):
+                self.advance_until(float(states.t[k]))
+                apart = self._relative_difference(k)
+                if apart > LARGEST:
+                    break
+        except StepFailedError:
+            apart = 1.0
+        if k == last < count and apart <= LARGEST:
+            apart = self.nudge * math.exp(min(grown, 600.0))
+        if apart > tolerable:
+            _warn_of_amplification(what, apart, float(states.t[k]))
+        return None
 
     def warn(self, *, requested: bool) -> None:
         """Repeat the run; without a request only up to ``MOST_STEPS`` steps, and if errors grow exponentially."""
@@ -154,11 +192,11 @@ class _Repetition:
                 apart = self._relative_difference(k)
                 if not apart <= self.tolerable:
                     if not (loose and apart < ALGEBRAIC * before):
-                        self._report(f"differs by {apart:.1e} (relative) at t = {states.t[k]:g}")
+                        self._report(f"differs by {apart:.1e} (relative)", apart, float(states.t[k]))
                     return
                 before = apart
         except StepFailedError as failure:
-            self._report(f"fails at t = {failure.t:g}")
+            self._report("fails", 1.0, failure.t)
 
     def _grows_slowly(self, last: int, tolerance: float) -> bool:
         """Return whether errors grow too slowly to matter, by a coarse run of at most half of the steps.
@@ -174,7 +212,7 @@ class _Repetition:
             for k in sorted((first | {int(last * DECISIVE)}) - {0}):
                 self.advance_until(float(self.states.t[k]))
                 little = 0.0 if k in first else needed * k / last
-                apart = self._relative_difference(k, tolerance * 10.0**little)
+                apart = self._relative_difference(k)
                 grown = math.log10(max(apart / tolerance, 1.0))
                 rate = max(grown - grown_before, 0.0) / (k - before)
                 if k not in first and (grown < little or grown + rate * (last - k) < needed):
@@ -210,30 +248,17 @@ class _Repetition:
         self.run.plan = replace(self._plan(), t_end=t)
         self.run._run_to_target()
 
-    def _relative_difference(self, k: int, small: float = 0.0) -> float:
-        """Return the larger of |dq|/|q| and |dp|/|p| at a state, relative to the largest norms up to that state.
+    def _relative_difference(self, k: int) -> float:
+        """Return the largest difference at a state relative to the size of the motion up to there."""
+        states, rows = self.states, slice(k + 1)
+        q, p = np.asarray(states.q)[rows], np.asarray(states.p)[rows]
+        errors = np.abs(np.array([self.run._q - q[-1], self.run._p - p[-1]]))
+        motion = Motion(states.t[rows], q, p, self.firsts, roundoff(1))
+        return float(relative(errors, motion.sizes(float(states.t[k]), errors)).max())
 
-        If the difference relative to the state itself is at most ``small``, this cheaper bound is returned.
-        """
-        ratios = []
-        for mine, each in zip((self.run._q, self.run._p), (self.states.q, self.states.p), strict=True):
-            row = each[k]
-            difference = mine - row
-            largest = float(np.abs(row).max())
-            apart = size = 0.0
-            if SMALLEST < max(largest, float(np.abs(difference).max())) < 1.0 / SMALLEST:  # squares do not overflow
-                apart, size = math.sqrt(difference @ difference), math.sqrt(row @ row)
-            if not (size > 0.0 and apart <= small * size):
-                rows = each[: k + 1]
-                unit = float(np.abs(rows).max()) or 1.0
-                size = float(np.linalg.norm(rows / unit, axis=1).max())
-                apart = float(np.linalg.norm(difference / unit))
-            ratios.append(apart / size if apart and size else apart)
-        return max(ratios)
-
-    def _report(self, difference_text: str) -> None:
+    def _report(self, what: str, difference: float, t: float) -> None:
         perturbed = f"a run with the initial state perturbed by {self.nudge:.1e} (relative)"
-        _warn_of_amplification(f"{perturbed} {difference_text}")
+        _warn_of_amplification(f"{perturbed} {what}", difference, t)
 
 
 @lru_cache(maxsize=8)
