@@ -257,8 +257,8 @@ static inline void iterate(const step_data *step, rattle_step *now, factors *l, 
     }
 }
 
-/* Inverse sizes of the terms of the displacements, whose largest size is returned. */
-static inline real invert_term_sizes(const step_data *step, rattle_step *now, real *size)
+/* Sizes of the terms of the displacements, with reactions if requested. */
+static inline void term_sizes(const step_data *step, rattle_step *now, int reactions, real *size)
 {
   real force[M], inverse_mass[INVERSE_MASSES];
   for (int i = 0; i < M; i++)
@@ -266,7 +266,7 @@ static inline real invert_term_sizes(const step_data *step, rattle_step *now, re
 #pragma GCC unroll 64
   for (int e = 0; e < INVERSE_MASSES; e++)
     inverse_mass[e] = now->inverse_mass[0][e][0];
-  return invert_sizes(step, force, now->first_derivative, now->lambda, inverse_mass, size);
+  find_term_sizes(step, force, now->first_derivative, reactions ? now->lambda : NULL, inverse_mass, size);
 }
 
 /* Initial values: the first point, and a guess of the others from the unknowns of the previous step, or if they are

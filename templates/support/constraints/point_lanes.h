@@ -14,17 +14,17 @@
 #define PREDICTED REAL(4.0) /* multiple of the next update, from the convergence rate, that is below the tolerance */
 #define SLOWEST_MULTIPLIERS REAL(0.5) /* convergence rate of the multipliers beyond which Newton's method is faster */
 #define TRANSIENT_ITERATIONS 2 /* that need not contract */
+#define LARGEST_REACTION REAL(8.0) /* times the size of forces: larger ones indicate light bodies */
 #define REUSED_FACTORS REAL(1e-2) /* relative update below which the factors of P are reused in the next iteration */
 #ifdef VELOCITY_FORCES
-#define MULTIPLIER_ROUNDOFF (16 * REAL_EPSILON) /* updates below it that decrease slowly are rounding errors */
+#define MULTIPLIER_ROUNDOFF (16 * REAL_EPSILON) /* updates below it that decrease slowly are rounding errors, but with
+                                                * complex convergence rates: updates that grow may shrink later */
 #define ROUNDED_SHRINKING 1
 #define FASTEST_MULTIPLIERS REAL(2e-2) /* credible convergence rate; a lower one is accidental */
-#define STAGNANT_ROUNDOFF MULTIPLIER_ROUNDOFF /* complex convergence rates: updates that grow may shrink later */
 #else
 #define FASTEST_MULTIPLIERS REAL(1e-3)
 #define MULTIPLIER_ROUNDOFF (64 * REAL_EPSILON)
 #define ROUNDED_SHRINKING STOPPED_SHRINKING
-#define STAGNANT_ROUNDOFF ROUNDOFF_LEVEL
 #endif
 
 #ifdef SINGLE_PRECISION
@@ -206,23 +206,30 @@ static inline void solve_points(const factors l, lanes *x)
   solve_band(l, CONSTRAINTS, CONSTRAINT_REACH, x);
 }
 
-/* Inverse sizes of the terms of the displacements, whose largest size is returned, from the forces and derivatives at
- * the first point: forces and reactions cancel at a pinned coordinate, which may be 0. */
-static real invert_sizes(const step_data *step, const real *first_force, const real *first_derivative,
+/* Sizes of the terms of the displacements by momenta, forces and, unless lambda is NULL, reactions, from the forces and
+ * derivatives at the first point: forces and reactions cancel at a pinned coordinate, which may be 0. */
+static inline void find_term_sizes(const step_data *step, const real *first_force, const real *first_derivative,
     lanes (*lambda)[GROUPS], const real *inverse_mass, real *size)
 {
-  real largest = 0, force[M], change[M], term[INVERSE_MASSES];
+  real force[M], change[M], term[INVERSE_MASSES];
   for (int i = 0; i < M; i++)
     force[i] = MATH(fabs)(first_force[i]);
-  for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
+  for (int e = 0; lambda && e < CONSTRAINT_ENTRIES; e++)
     force[CONSTRAINT_ENTRY[e][1]] += MATH(fabs)(first_derivative[e] * lambda[CONSTRAINT_ENTRY[e][0]][0][0]);
   for (int i = 0; i < M; i++)
     force[i] = MATH(fabs)(step->p0[i]) + MATH(fabs)(step->h) * force[i];
   for (int e = 0; e < INVERSE_MASSES; e++)
     term[e] = MATH(fabs)(step->h * inverse_mass[e]);
   find_velocities(term, force, change);
-  for (int i = 0; i < M; i++) {
+  for (int i = 0; i < M; i++)
     size[i] = MATH(fabs)(step->q0[i]) + change[i];
+}
+
+/* Inverts sizes; returns the largest one. */
+static inline real invert_sizes(real *size)
+{
+  real largest = 0;
+  for (int i = 0; i < M; i++) {
     largest = larger(largest, size[i]);
     size[i] = 1 / (size[i] + REAL_MIN);
   }
@@ -247,9 +254,9 @@ static inline int accepts(const movement *moved, const movement *last, const sol
     return 1;
   if (!absolute && moved->overall <= MULTIPLIER_ROUNDOFF && now >= ROUNDED_SHRINKING * before)
     return 1;
-  if (!absolute && stagnant && moved->overall <= STAGNANT_ROUNDOFF && moved->overall >= last[0].overall)
+  if (!absolute && stagnant && moved->overall <= MULTIPLIER_ROUNDOFF && moved->overall >= last[0].overall)
     return 1;
-  return k > TRANSIENT_ITERATIONS && stagnant && moved->overall > STAGNANT_ROUNDOFF ? -1 : 0;
+  return k > TRANSIENT_ITERATIONS && stagnant && moved->overall > MULTIPLIER_ROUNDOFF ? -1 : 0;
 }
 
 #ifndef RATTLE_IN_PAIRS

@@ -237,13 +237,13 @@ static inline void update_multipliers(const step_data *step, rattle_step *now, f
     store(now->a[i], g, a[i]);
 }
 
-/* Inverse sizes of the terms of the displacements, whose largest size is returned. */
-static inline real invert_term_sizes(const step_data *step, rattle_step *now, real *size)
+/* Sizes of the terms of the displacements, with reactions if requested. */
+static inline void term_sizes(const step_data *step, rattle_step *now, int reactions, real *size)
 {
   real force[M];
   for (int i = 0; i < M; i++)
     force[i] = FIRST_FORCE(now, i);
-  return invert_sizes(step, force, now->first_derivative, now->lambda, now->inverse_mass, size);
+  find_term_sizes(step, force, now->first_derivative, reactions ? now->lambda : NULL, now->inverse_mass, size);
 }
 
 /* One iteration: updates lambda, a and u, the last by `change`. */

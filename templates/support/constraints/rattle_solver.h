@@ -1,50 +1,101 @@
 #include "point_lanes.h"
 
+#define MULTIPLIERS_KNOWN 1 /* iteration whose multipliers show the sizes of reactions */
+
 /* Constrained steps by an iteration for the multipliers at the points, then the multipliers that project p1 onto the
  * tangent space. Requires: rattle.h or coupled_rattle.h. */
 
-/* Adds the sizes that the constraints give to positions to inverse sizes; returns the largest size. Stagnation above the
- * rounding of the positions may be that of g. */
-static SELDOM real widen_sizes(const step_data *step, real *inverse_size)
+enum { LOST_DIGITS = -1 }; /* beside the status codes: Newton's method loses none */
+
+/* Sizes of positions, inverted, and the largest one; widened: of their terms without reactions, and of those of g. */
+typedef struct {
+  real inverse[M], largest;
+  int widened;
+} unknown_sizes;
+
+static inline void find_sizes(const step_data *step, rattle_step *now, unknown_sizes *sizes)
 {
-  real size[M], largest = 0;
-  for (int i = 0; i < M; i++)
-    size[i] = 1 / inverse_size[i];
-  add_constraint_sizes(step->t, step->q0, step->parameters, saddle_in(step->scratch), size);
-  for (int i = 0; i < M; i++) {
-    largest = larger(largest, size[i]);
-    inverse_size[i] = 1 / size[i];
-  }
-  return largest;
+  term_sizes(step, now, 1, sizes->inverse);
+  sizes->largest = invert_sizes(sizes->inverse);
 }
 
-/* Solves g(u) = 0 for lambda and u; evaluates forces and constraints there. Returns NOT_CONVERGED on failure. */
+/* Stagnation above the rounding of the positions may be that of g. */
+static SELDOM void widen_sizes(const step_data *step, rattle_step *now, unknown_sizes *sizes)
+{
+  sizes->widened = 1;
+  term_sizes(step, now, 0, sizes->inverse);
+  add_constraint_sizes(step->t, step->q0, step->parameters, saddle_in(step->scratch), sizes->inverse);
+  sizes->largest = invert_sizes(sizes->inverse);
+}
+
+/* Returns 1 if forces and reactions may lose digits: of a body so light that they move it in a step by much more than it
+ * moves, rounding errors of its position are relative to them. In Newton's method positions are unknowns. */
+static inline int may_lose_digits(const step_data *step, const rattle_step *now, const real *inverse_size)
+{
+  int may = 0;
+  for (int i = 0; i < M; i++) {
+    const real moved = MATH(fabs)(step->q0[i]) + MATH(fabs)(now->u[i][DEGREE - 1] - step->q0[i]);
+    may |= (moved + REAL_MIN) * inverse_size[i] < 1;
+  }
+  return may;
+}
+
+/* Returns 1 if they do: where reactions exceed momenta and forces, as of light bodies, and displacements that change a
+ * constraint by the size of its terms. A coordinate may be held at 0. */
+static SELDOM int loses_digits(const step_data *step, rattle_step *now, const real *inverse_size)
+{
+  real size[M], length[M] = {0}, rounding[CONSTRAINTS];
+  int loses = 0;
+  term_sizes(step, now, 0, size);
+  constraint_rounding(step->q0, step->t, step->parameters, rounding);
+  for (int e = 0; e < CONSTRAINT_ENTRIES; e++) {
+    const int k = CONSTRAINT_ENTRY[e][0], i = CONSTRAINT_ENTRY[e][1];
+    length[i] = larger(length[i], rounding[k] / MATH(fabs)(now->first_derivative[e]));
+  }
+  for (int i = 0; i < M; i++)
+    loses |= larger(LARGEST_REACTION * size[i], length[i]) * inverse_size[i] < 1;
+  return loses;
+}
+
+/* Solves g(u) = 0 for lambda and u; evaluates forces and constraints there. Returns NOT_CONVERGED on failure, or
+ * LOST_DIGITS. */
 static int solve_constraints(const step_data *step, rattle_step *now, const solver_options *options,
     solver_report *report)
 {
   factors l[GROUPS];
   lanes change[M * GROUPS];
-  real inverse_size[M], largest_size = 0;
+  unknown_sizes sizes = {.widened = options->absolute};
   const movement unknown = {(real)INFINITY, (real)INFINITY, (real)INFINITY, 0};
   movement last[2] = {unknown, unknown};
-  int factorised = 0, widened = 0;
+  int factorised = 0, begin = 0;
   for (int k = 0; k < least(options->max_iterations, MOST_ITERATIONS); k++) {
     movement moved;
     int verdict;
     iterate(step, now, l, factorised, change);
     if (k == 0)
-      largest_size = invert_term_sizes(step, now, inverse_size);
-    moved = measure_change(change, inverse_size, largest_size);
+      find_sizes(step, now, &sizes);
+    moved = measure_change(change, sizes.inverse, sizes.largest);
     report->iterations++;
     report->change = options->absolute ? moved.absolute : moved.relative;
     evaluate_points(step, now);
-    verdict = accepts(&moved, last, options, k);
-    if (verdict < 0 && !options->absolute && !widened) {
-      widened = 1;
-      largest_size = widen_sizes(step, inverse_size);
-      moved = measure_change(change, inverse_size, largest_size);
-      last[0] = last[1] = unknown;
-      verdict = accepts(&moved, last, options, k);
+    verdict = accepts(&moved, last, options, k - begin);
+    if ((k == MULTIPLIERS_KNOWN || verdict > 0) && may_lose_digits(step, now, sizes.inverse)) {
+      unknown_sizes of_reactions = sizes;
+      find_sizes(step, now, &of_reactions);
+      if (loses_digits(step, now, of_reactions.inverse))
+        return LOST_DIGITS;
+      if (verdict > 0 && !sizes.widened) {
+        sizes = of_reactions;
+        moved = measure_change(change, sizes.inverse, sizes.largest);
+    verdict = accepts(&moved, last, options, k - begin);
+      }
+    }
+    if (verdict < 0 && !sizes.widened) {
+      widen_sizes(step, now, &sizes);
+      moved = measure_change(change, sizes.inverse, sizes.largest);
+      last[0] = unknown;
+      begin = k;
+      verdict = 0;
     }
     if (verdict > 0)
       return OK;
