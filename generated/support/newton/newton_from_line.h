@@ -15,15 +15,54 @@ static int line_from(const step_data *step, newton_data *data)
   return status;
 }
 
-/* Newton's method from that guess. */
+/* Stages that solve the equations with a step size near 0 belong to a branch, on which those of the step lie. Newton's
+ * method from far away may converge to another root, a spurious solution: so may every method, and steps of one stage have
+ * no error estimate that shows it. Roots that take few iterations are near the initial guess. Others are computed again
+ * by continuation in the step size (Deuflhard, Newton Methods for Nonlinear Problems, sec. 5.1): from the stages at one size
+ * to those at a larger one, in few iterations each. */
+#define NEARBY_ITERATIONS 8 /* of Newton's method, to a root near the initial guess */
+#define LEAST_ADVANCE REAL(0.00390625) /* of the step size: the branch ends, or turns back */
+
+/* Follows the branch from the stages at the line to those at step->h, with the results of newton. Returns
+ * SPURIOUS_SOLUTION if there is none that far. */
+static SELDOM int follow_branch(const step_data *step, newton_data *data, real *dp, int *keep,
+    const solver_options *options, solver_report *report)
+{
+  step_data part = *step;
+  real reached = 0, advance = REAL(0.5), z[N];
+  int status = line_from(step, data);
+  memcpy(z, data->z, sizeof z);
+  while (status == OK && reached < 1) {
+    const long long before = report->iterations;
+    part.h = reached + advance < 1 ? (reached + advance) * step->h : step->h;
+    *keep = 0;
+    status = newton(&part, data, NULL, NULL, dp, keep, options, report);
+    if (status == OK && report->iterations - before <= NEARBY_ITERATIONS) {
+      memcpy(z, data->z, sizeof z);
+      reached += advance;
+      advance = 2 * advance < 1 - reached ? 2 * advance : 1 - reached;
+    } else {
+      advance /= 2;
+      status = advance < LEAST_ADVANCE ? STATUS(SPURIOUS_SOLUTION) : OK;
+      memcpy(data->z, z, sizeof z);
+    }
+  }
+  return status;
+}
+
+/* Newton's method from that guess, or by continuation if its solution may be a spurious one. */
 static int newton_from_line(const step_data *step, newton_data *data, real *dp, int *keep,
     const solver_options *options, solver_report *report)
 {
-  const int status = line_from(step, data);
+  const long long before = report->iterations;
+  int status = line_from(step, data);
   if (status != OK)
     return status;
   *keep = 0;
-  return newton(step, data, NULL, NULL, dp, keep, options, report);
+  status = newton(step, data, NULL, NULL, dp, keep, options, report);
+  if (status == OK && report->iterations - before > NEARBY_ITERATIONS)
+    return follow_branch(step, data, dp, keep, options, report);
+  return status;
 }
 
 #ifdef SPURIOUS_TESTED
