@@ -180,6 +180,33 @@ def test_constraints_hold_for_many_steps() -> None:
         assert all(np.abs(values).max() < 1e-30 for values in run.constraint_values())
 
 
+@pytest.mark.parametrize("h", [0.02, 0.001, 1e-5])
+def test_constraints_from_rest_at_zero(h: float) -> None:
+    """A four-bar linkage that starts from rest where its angles are 0 moves as with another origin of an angle.
+
+    The constraints round at their terms, of size 5, not at the angles.
+    """
+
+    def run(c: str, start: int) -> sc.Trajectory:
+        loop = [f"cos(a) - 4*cos(a + b) - 5*sin({c}) + 3", f"sin(a) - 4*sin(a + b) + 5*cos({c}) - 5"]
+        linkage = sc.LagrangianSystem.from_text(
+            name="linkage",
+            coordinates=["a", "b", "c"],
+            lagrangian="(a_dot**2 + b_dot**2 + c_dot**2)/2",
+            forces={"a": "1"},
+            constraints=loop,
+        )
+        stepper = sc.compile_stepper(linkage, "svi:4", precision="double-double")
+        return stepper.integrate([0, 0, start], velocity=[0, 0, 0], h=h, steps=5)
+
+    runs = run("c", 0), run("(c - 1)", 1)
+    with mp.workdps(40):
+        q, moved = (each.mp("q")[-1] for each in runs)
+        assert largest(q - moved + [0, 0, 1]) < 2e-31
+        assert largest(runs[0].mp("p")[-1] - runs[1].mp("p")[-1]) < 2e-31 / h
+    assert all(np.abs(values).max() < 1e-30 / h for values in runs[0].constraint_values())
+
+
 @pytest.mark.second
 def test_rod_and_angle() -> None:
     """A pendulum as a rod, with adaptive and with fixed steps, agrees with that of an angle."""

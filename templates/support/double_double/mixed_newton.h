@@ -59,7 +59,8 @@ static int refine_unknowns(const step_data *step, double *memory, double t_low, 
   newton_data *data = newton_in(workspace);
   const band shape = band_of(SITES, B);
   pair_equations at = {.t = dd_of(step->t, t_low), .h = dd_of(step->h, h_low), .parameters = step->parameters};
-  double size_p[SITES], size_q[M], last = INFINITY, largest = 0.0;
+  double size_p[SITES], size_q[M], inverse_size[M], last = INFINITY, largest = 0.0;
+  int widened = 0;
   for (int i = 0; i < M; i++) {
     at.q0[i] = dd_of(step->q0[i], step->carry_q[i]);
     at.p0[i] = dd_of(step->p0[i], step->carry_p[i]);
@@ -85,21 +86,28 @@ static int refine_unknowns(const step_data *step, double *memory, double t_low, 
   memcpy(memory + N, data->point, sizeof(double) * POINT);
   for (int i = 0; i < M; i++)
     largest = larger(largest, size_q[i]);
-  for (int i = 0; i < M; i++) {
-    size_q[i] = 1.0 / (size_q[i] + 1e-3 * largest + DBL_MIN);
-  }
+  for (int i = 0; i < M; i++)
+    inverse_size[i] = 1.0 / (size_q[i] + 1e-3 * largest + DBL_MIN);
   for (int k = 0; k < N; k++)
     at.z[k] = dd_word(data->z[k]);
   for (int k = 0;; k++) {
     evaluate_pairs(&at);
-    const double change = correct_pairs(&at, data, &shape, size_q);
+    const double change = correct_pairs(&at, data, &shape, inverse_size);
+    const int stagnates = !(change < last / 4);
     if (!is_finite(change))
       return NOT_FINITE;
-    if (change <= REFINED || (change <= REFINED_ROUNDING && !(change < last / 4)))
+    if (change <= REFINED || (change <= REFINED_ROUNDING && stagnates))
       break;
     if (k + 1 >= MOST_REFINEMENTS)
       return NOT_CONVERGED;
     last = change;
+    if (stagnates && !widened) { /* above the rounding of positions: that of constraints */
+      widened = 1;
+      add_sizes_of_constraints(step, size_q);
+      for (int i = 0; i < M; i++)
+        inverse_size[i] = 1.0 / (size_q[i] + 1e-3 * largest + DBL_MIN);
+      last = 0.0;
+    }
   }
 #ifdef TIME_TRANSFORMATION
   const dd duration = duration_of_pairs(&at);

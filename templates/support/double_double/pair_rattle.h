@@ -265,6 +265,7 @@ static int refine_points(solved_step *solved, const step_data *step, const doubl
   factors l[GROUPS];
   lanes derivative[CONSTRAINT_ENTRIES], change[M * GROUPS];
   real inverse_size[M], r[M][GROUP_LANES], last = INFINITY;
+  int widened = 0;
   dd end[M], q[M];
   const real largest = invert_term_sizes(step, &solved->now, inverse_size);
   for (int i = 0; i < M; i++)
@@ -281,13 +282,19 @@ static int refine_points(solved_step *solved, const step_data *step, const doubl
     correct_points(&solved->now, &at, l, r);
     for (int n = 0; n < M * GROUPS; n++)
       change[n] = load(r[n / GROUPS], n % GROUPS);
-    const real moved = measure_change(change, inverse_size, largest).relative;
+    real moved = measure_change(change, inverse_size, largest).relative;
     const real next = moved * larger(moved / last, FASTEST_MULTIPLIERS);
+    const int stagnates = !(moved < last / 4);
     if (!is_finite(moved))
       return NOT_FINITE;
     if (moved <= REFINED || (k > 0 && NEGLECTED * next <= REFINED))
       break;
-    if (moved <= REFINED_ROUNDING && !(moved < last / 4))
+    if (stagnates && moved > REFINED_ROUNDING && !widened) { /* above the rounding of positions: that of g */
+      widened = 1;
+      widen_sizes(step, inverse_size);
+      moved = measure_change(change, inverse_size, largest).relative;
+    }
+    if (stagnates && moved <= REFINED_ROUNDING)
       break;
     if (k + 1 >= MOST_ITERATIONS || (k > TRANSIENT_ITERATIONS && moved > SLOWEST_MULTIPLIERS * last))
       return NOT_CONVERGED;
