@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import operator
 import random
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import lru_cache
 from itertools import islice
@@ -24,7 +24,13 @@ from sympy import Add, Expr, Function, Mul, Pow, Rational, S, Symbol, log
 from sympy.core.function import AppliedUndef
 
 from scvi_codegen.formulas.adjoints import Elimination, Gradient, gradient_by_adjoints
-from scvi_codegen.formulas.intermediates import Intermediate, intermediate, intermediates
+from scvi_codegen.formulas.intermediates import (
+    Intermediate,
+    intermediate,
+    intermediates,
+    root_of_square,
+    with_even_roots,
+)
 from scvi_codegen.tables.precision import Number, mp
 
 LARGEST = 1.7976931348623157e308
@@ -299,6 +305,17 @@ def _node_problem(node: Any) -> str | None:
     return f"{kind} ('{shortened(node)}') is not supported{reason}. Use + - * / ** and {known}{advice}"
 
 
+def kinked_root(formula: Expr, variables: Collection[Symbol]) -> str | None:
+    """Return why a formula has a kink, a root of the square of a function of variables, or ``None``."""
+    kink = root_of_square(formula, variables)
+    if kink is None:
+        return None
+    return (
+        f"Abs({shortened(kink)}), the root of its square, is not differentiable where it is 0: write "
+        f"{shortened(kink)} if it is positive{BY_EVENTS}"
+    )
+
+
 def exponent_problem(exponent: Expr) -> str | None:
     """Return why the rational part of an exponent is too large: SymPy extracts 2**10**9 from 2**(x + 10**9)."""
     constant = exponent.as_coeff_Add(rational=True)[0]
@@ -357,7 +374,11 @@ def _rebuilt_node(expression: Expr, known: dict[Expr, Expr]) -> Expr:
     if not expression.args or isinstance(expression, (sympy.Derivative, AppliedUndef)):
         return expression
     arguments = [_rebuilt(argument, known) for argument in expression.args]
-    return intermediate(arguments[0]) if isinstance(expression, Intermediate) else expression.func(*arguments)
+    if isinstance(expression, Intermediate):
+        return intermediate(arguments[0])
+    rebuilt = expression.func(*arguments)
+    is_root = expression.is_Pow and not expression.exp.is_integer
+    return with_even_roots(rebuilt) if is_root or isinstance(expression, sympy.Abs) else rebuilt
 
 
 def gradient(expression: Expr, variables: Sequence[Symbol]) -> dict[int, Expr]:

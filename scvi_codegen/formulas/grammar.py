@@ -36,6 +36,7 @@ from scvi_codegen.formulas.expressions import (
     exponent_problem,
     unsupported_part,
 )
+from scvi_codegen.formulas.intermediates import with_even_roots
 from scvi_codegen.formulas.symbols import DOT
 
 MAX_CHARACTERS = 1_000_000
@@ -282,7 +283,8 @@ class Parser:
         return self.supported(Pow(base, exponent), operator.column)
 
     def supported(self, result: Expr, column: int) -> Expr:
-        """Raise an error for invalid results of legal arguments: sqrt(-1), log(0), exp(10**9), sqrt(x**2) = Abs(x)."""
+        """Return the result, with even roots in place of Abs; raise an error if it is invalid: sqrt(-1), exp(10**9)."""
+        result = with_even_roots(result)
         if result.is_number or (result.args and result.func not in NODES) or result.is_Pow:
             problem = unsupported_part(result)
             if problem:

@@ -17,7 +17,7 @@ from itertools import count
 from typing import Any
 from weakref import WeakValueDictionary
 
-from sympy import Expr, S, Symbol
+from sympy import Abs, Expr, S, Symbol, sqrt
 
 from scvi_codegen.errors import SystemDefinitionError
 
@@ -157,7 +157,37 @@ def written_out(expression: Expr) -> Expr:
     rules: dict[Expr, Expr] = {}
     for each in intermediates(expression):
         rules[each] = each.definition.xreplace(dict(rules))
-    return expression.xreplace(rules) if rules else expression
+    return with_even_roots(expression.xreplace(rules)) if rules else expression
+
+
+def with_even_roots(expression: Expr) -> Expr:
+    """Write ``Abs(u)``, which SymPy makes of even roots of powers of u, as the root of the opaque quantity u**2.
+
+    Such a root is smooth where u is not 0: for parameters u, whose values do not change along a motion.
+
+    >>> from sympy.abc import x
+    >>> a = Symbol("a", real=True)
+    >>> with_even_roots(sqrt(a**2 * (x**2 + 1)))
+    sqrt(x**2 + 1)*sqrt((a**2))
+    """
+    if not expression.has(Abs):
+        return expression
+    return expression.replace(Abs, lambda u: sqrt(intermediate(u**2)))
+
+
+def root_of_square(expression: Expr, variables: Collection[Symbol]) -> Expr | None:
+    """Return a part u of which the expression contains a root of u**2 and that depends on variables, or ``None``."""
+    waiting, seen = [expression], {expression}
+    while waiting:
+        node = waiting.pop()
+        new = [part for part in node.args if part not in seen]
+        seen.update(new)
+        waiting += new
+        if node.is_Pow and isinstance(node.base, Intermediate) and not node.exp.is_integer:
+            square = node.base.definition
+            if square.is_Pow and square.exp == 2 and not square.free_symbols.isdisjoint(variables):
+                return square.base
+    return None
 
 
 def written_size(expression: Expr) -> int:

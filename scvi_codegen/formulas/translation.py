@@ -13,6 +13,7 @@ from sympy.core.function import AppliedUndef
 
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.expressions import NAME_OF, evaluated, parts_of_type, unsupported_part
+from scvi_codegen.formulas.intermediates import Intermediate
 from scvi_codegen.formulas.symbols import DOT, TIME, identifier, symbol
 
 
@@ -171,6 +172,8 @@ def format_expression(expression: Expr) -> str:
 
 
 def _sum_text(expression: Expr) -> str:
+    if isinstance(expression, Intermediate):
+        return _sum_text(expression.definition)
     if not expression.is_Add:
         return _product_text(expression)
     first, *others = (_product_text(term) for term in expression.as_ordered_terms())
@@ -208,6 +211,8 @@ def _power_text(expression: Expr) -> str:
 
 
 def _atom_text(expression: Expr) -> str:
+    if isinstance(expression, Intermediate):
+        return f"({_sum_text(expression)})"
     if expression.is_Symbol:
         return str(expression.name)
     if expression is S.Exp1:

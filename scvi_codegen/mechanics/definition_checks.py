@@ -9,7 +9,7 @@ import sympy
 from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError, SystemDefinitionWarning, closest, warn
-from scvi_codegen.formulas.expressions import Tape, hessian, jacobian, unsupported_part
+from scvi_codegen.formulas.expressions import Tape, hessian, jacobian, kinked_root, unsupported_part
 from scvi_codegen.formulas.symbols import DOT, PARTS, TIME, check_names, number, symbol
 from scvi_codegen.mechanics.constraints import constraint_jacobian, forms_of_constraints
 from scvi_codegen.mechanics.derived_expressions import forms_of, null_direction, row_rank, sample_points, singular_part
@@ -143,6 +143,8 @@ def _check_symbols(system: MechanicalSystem, role: str, arguments: Sequence[Symb
     for where, formula in formulas.items():
         problem = unsupported_part(formula)
         if problem:
+            raise SystemDefinitionError(f"in the {where} of '{system.name}': {problem}")
+        if problem := kinked_root(formula, [*system.coordinates, *arguments, system.time]):
             raise SystemDefinitionError(f"in the {where} of '{system.name}': {problem}")
         unknown = sorted(free.name for free in formula.free_symbols.difference(known))
         if unknown:

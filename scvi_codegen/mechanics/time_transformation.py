@@ -37,6 +37,7 @@ from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.formulas.array_statements import formula_of_entries, is_indexed, momentum_arrays
 from scvi_codegen.formulas.expressions import gradient, hessian
 from scvi_codegen.formulas.grammar import parse_expression
+from scvi_codegen.formulas.intermediates import root_of_square, with_even_roots
 from scvi_codegen.formulas.rotations import RotationNames
 from scvi_codegen.formulas.symbols import input_formulas, symbol
 from scvi_codegen.formulas.translation import format_expression
@@ -219,7 +220,14 @@ def _frequency(system: MechanicalSystem) -> Expr:
     positive = positive_parameters(system)
     _, simplest = sympy.factor(sympy.simplify(squares.xreplace(positive))).as_coeff_Mul()
     root = simplest ** sympy.Rational(-1, 4)
-    return sympy.powdenest(root, force=True).xreplace({stand_in: parameter for parameter, stand_in in positive.items()})
+    made = sympy.powdenest(root, force=True).xreplace({stand_in: parameter for parameter, stand_in in positive.items()})
+    zero = root_of_square(with_even_roots(made), [*system.coordinates, system.time])
+    if zero is not None:
+        raise SystemDefinitionError(
+            f"the time transformation 'frequency' of '{system.name}' is infinite where its stiffness is 0, {zero} = 0: "
+            "use a formula in its coordinates that is positive everywhere"
+        )
+    return made
 
 
 def _distance(system: MechanicalSystem) -> Expr:

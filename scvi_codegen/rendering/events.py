@@ -41,7 +41,7 @@ from scvi_codegen.formulas.array_statements import (
     parse_constraint,
 )
 from scvi_codegen.formulas.arrays import ArrayTerm, parse_coordinate, parse_sums
-from scvi_codegen.formulas.expressions import evaluated, unsupported_part
+from scvi_codegen.formulas.expressions import evaluated, kinked_root, unsupported_part
 from scvi_codegen.formulas.rotations import RotationNames, entries_in_formulas
 from scvi_codegen.formulas.symbols import DOT, TIME, identifier, input_formulas, symbol
 from scvi_codegen.indices import Access, Array, Loop, Size
@@ -266,7 +266,7 @@ def _expression(
         expression = _translated(formula, role)
     else:
         raise EventError(f"the {role} must be text or a SymPy expression; got {formula!r}")
-    problem = unsupported_part(expression)
+    problem = unsupported_part(expression) or kinked_root(expression, names.values())
     if problem:
         raise EventError(f"in the {role}: {problem}")
     unknown = sorted(free.name for free in expression.free_symbols.difference(names.values()))

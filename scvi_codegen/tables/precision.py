@@ -5,12 +5,13 @@ Nodes, weights and cardinal functions are computed once, at generation time, and
 thread-local: functions of mpmath that raise it meanwhile do not affect tables computed by other threads.
 """
 
+import copyreg
 import threading
 from collections.abc import Iterator
 from typing import Any, TypeAlias
 
 from mpmath import MPContext
-from mpmath.libmp import dps_to_prec, mpf_pos, prec_to_dps, round_nearest, to_float
+from mpmath.libmp import MPZ, dps_to_prec, mpf_pos, prec_to_dps, round_nearest, to_float
 
 DIGITS = 60
 
@@ -53,6 +54,15 @@ Number: TypeAlias = Any
 
 Vector: TypeAlias = tuple[Number, ...]
 Matrix: TypeAlias = tuple[Vector, ...]
+
+
+def _made(sign: int, mantissa: int, exponent: int, bits: int) -> Number:
+    """Return a number of the context from the parts of :mod:`mpmath.libmp`."""
+    return mp.make_mpf((sign, MPZ(mantissa), exponent, bits))
+
+
+# pickle does not find the class of numbers, which belongs to the context, by its name
+copyreg.pickle(mp.mpf, lambda number: (_made, (number._mpf_[0], int(number._mpf_[1]), *number._mpf_[2:])))
 
 
 def nearest_float(value: Number, bits: int) -> float:

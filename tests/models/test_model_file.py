@@ -1,6 +1,7 @@
 """Model files: what is written reads back equal, and what is wrong is named."""
 
 import math
+import pickle
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -375,3 +376,11 @@ def test_initial_states_of_first_order_systems_are_whole_or_in_halves():
     whole = parse_model(text + "q = [0.3, 0.2]\n")
     assert sorted((*whole.q, *whole.p)) == [0.2, 0.3]
     assert parse_model(text + f"q = {list(whole.q)}\np = {list(whole.p)}\n") == whole
+
+
+def test_models_are_pickled_and_files_may_begin_with_a_byte_order_mark(tmp_path):
+    model = parse_model(PENDULUM)
+    assert pickle.loads(pickle.dumps(model)) == model
+    file = tmp_path / "model.toml"
+    file.write_text(dump_model(model), encoding="utf-8-sig")
+    assert load_model(file) == model

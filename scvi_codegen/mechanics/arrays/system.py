@@ -36,7 +36,7 @@ from scvi_codegen.errors import SizesRequiredError, SystemDefinitionError
 from scvi_codegen.files.cache import key_of
 from scvi_codegen.formulas.array_statements import ArrayForce, latex_sum
 from scvi_codegen.formulas.arrays import ArrayTerm, parse_array, parse_coordinate
-from scvi_codegen.formulas.expressions import gradient, gradient_tuple, hessian, unsupported_part
+from scvi_codegen.formulas.expressions import gradient, gradient_tuple, hessian, kinked_root, unsupported_part
 from scvi_codegen.formulas.neighbours import Neighbours
 from scvi_codegen.formulas.rotations import MemberArray
 from scvi_codegen.formulas.symbols import DOT, check_names, input_formulas, symbol
@@ -283,8 +283,10 @@ class ArraySystem:
 
     def __post_init__(self) -> None:
         self._check_names()
+        constant = {array.name for array in self.fields}
         for term in self.terms:
-            if problem := unsupported_part(term.formula):
+            varying = [slot for slot, access in term.slots if access.array.name not in constant]
+            if problem := unsupported_part(term.formula) or kinked_root(term.formula, [*varying, self.time]):
                 raise SystemDefinitionError(f"in the {self.function} of '{self.name}': {problem}")
         for force in self.forces:
             for access, formula in force.targets:

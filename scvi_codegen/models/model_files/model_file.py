@@ -82,7 +82,7 @@ def load_model(path: str | os.PathLike[str], changes: Document | None = None) ->
     Raises:
         ModelFileError: beginning with the path and naming the key at fault.
     """
-    text, folder = "" if is_robot(path) else text_in(path, "utf-8"), Path(path).parent
+    text, folder = "" if is_robot(path) else text_in(path, "utf-8-sig"), Path(path).parent
     try:
         if is_robot(path):
             return _read_model(document_in(path), changes or {}, folder)
@@ -95,7 +95,7 @@ def load_model(path: str | os.PathLike[str], changes: Document | None = None) ->
 
 def document_in(path: str | os.PathLike[str]) -> Document:
     """Return the sections of a model file or a robot's file."""
-    return {"system": {"robot": Path(path).name}} if is_robot(path) else read_toml(text_in(path, "utf-8"))
+    return {"system": {"robot": Path(path).name}} if is_robot(path) else read_toml(text_in(path, "utf-8-sig"))
 
 
 @checks_arguments(model=of("a Model", Model))
