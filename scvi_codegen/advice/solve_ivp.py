@@ -19,7 +19,7 @@ from scvi_codegen.mechanics.arrays.rolling import unrolled_at
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import Method, as_method, default_method
-from scvi_codegen.native.arguments import checked_number, checked_step
+from scvi_codegen.native.arguments import checked_number, checked_step, real_array
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.representation import summary
 from scvi_codegen.runtime.accuracy.global_error import checked_error
@@ -29,6 +29,7 @@ from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.core.validation import Array, States
 from scvi_codegen.runtime.events.event import EventLike
 from scvi_codegen.runtime.rotations.states import homogeneous_state
+from scvi_codegen.runtime.run.step_plan import ErrorControl
 from scvi_codegen.runtime.trajectory.dense_output import times_of_run
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation import checks_arguments, of
@@ -93,7 +94,7 @@ def solve_ivp(
     parameters: Mapping[str, float] | Sequence[float] | None = None,
     args: Sequence[float] | None = None,
     options: SolverOptions | None = None,
-    atol: float | None = None,
+    atol: float | ArrayLike | Mapping[str, float] | None = None,
     max_step: float | None = None,
     first_step: float | None = None,
 ) -> OdeResult:
@@ -114,7 +115,12 @@ def solve_ivp(
         h: upper bound of a fixed step size, reduced so that whole steps fill the span.
         tolerance: instead of ``h``: error ``|q - q_exact| / |q|`` at the end, for which :func:`advise` chooses ``h``.
             ``success`` is False if the run misses it.
-        rtol: relative local error of adaptive steps, relative to the state as a whole; by default round-off.
+        rtol: relative local error of adaptive steps, relative to the motion of each coordinate in the step; by default
+            round-off.
+        atol: absolute local error of adaptive steps: that of a step is at most ``max(rtol * motion, atol)``. A number,
+            (m,) or (2 m,) numbers in the order of y0, or numbers by name of coordinate, array or rotation; requires
+            ``rtol``. Errors of momenta have no bound of their own, so that their numbers are not used.
+        max_step, first_step: largest and first size of adaptive steps, as of ``scipy.integrate.solve_ivp``.
         error: bound on the relative global error of the whole run, as of :meth:`Stepper.integrate`;
             ``trajectory.global_error`` and ``confirmed_until`` report the estimate. ``success`` is False if the bound
             is not confirmed.
@@ -128,12 +134,10 @@ def solve_ivp(
         events: zero crossings to record, and to end at, as of :meth:`Stepper.integrate`.
         parameters, options: as of :meth:`Stepper.integrate`.
         args: as of ``solve_ivp``: all parameters in order, instead of ``parameters``.
-        atol, max_step, first_step: arguments of ``solve_ivp`` that are not supported; the error names the alternative.
 
     Raises:
         StateError, EventError: on wrong shapes, names or numbers.
     """
-    _refuse({"atol": atol, "max_step": max_step, "first_step": first_step})
     if args is not None and parameters is not None:
         raise StateError("args are the parameters in order: give args or parameters, not both")
     parameters = parameters if args is None else args
@@ -152,10 +156,11 @@ def solve_ivp(
     q, p0, velocity = homogeneous_state(stepper.interface, q, p0, velocity)
     if p0 is None and velocity is None:
         raise StateError("y0 contains positions by name: give velocity, too, or numbers for positions and momenta")
+    control = _error_control(stepper, request, atol, max_step, first_step)
     p: Any = stepper._initial_momenta(q, p0, velocity, start, parameters)
     along: dict[str, Any] = {"t": start, "parameters": parameters, "options": options}
     steps, missed = _plan(stepper, uncompiled, request, (q, p, start, end), along)
-    settings = {**steps, **along, "events": events}
+    settings = {**steps, **control.named, **along, "events": events}
     try:
         trajectory = stepper.integrate(q, p, **settings, t_eval=None if dense_output else requested_times)
         status, message = REACHED, "The end of the span was reached."
@@ -251,18 +256,36 @@ def _unconfirmed(trajectory: Trajectory) -> str:
     )
 
 
-ALTERNATIVES = {
-    "atol": "local errors are relative to the size of the state: give rtol",
-    "max_step": "the step size is adaptive with rtol, or fixed: give h, its upper bound",
-    "first_step": "the first step is adaptive like the others: give rtol, or h for a fixed step size",
-}
-"""Alternatives to arguments of ``solve_ivp`` that are not supported."""
+def _error_control(
+    stepper: Stepper, request: _StepRequest, atol: Any, max_step: float | None, first_step: float | None
+) -> ErrorControl:
+    """Return the arguments of :meth:`Stepper.integrate` for those of SciPy; the tolerance is not among them.
 
-
-def _refuse(arguments: Mapping[str, float | None]) -> None:
-    for name, value in arguments.items():
-        if value is not None:
-            raise StateError(f"solve_ivp has no {name}={value!r}: {ALTERNATIVES[name]}")
+    Raises:
+        StateError: for ``atol`` without ``rtol``, and for numbers that are invalid or too many.
+    """
+    max_step = None if max_step == math.inf else max_step  # SciPy's default
+    if atol is None:
+        return ErrorControl(None, None, max_step, first_step)
+    if request.rtol is None:
+        raise StateError(f"atol = {atol} requires rtol: the error of a step is at most max(rtol * motion, atol)")
+    for value in real_array([*atol.values()] if isinstance(atol, Mapping) else atol, "atol").flat:
+        if not value >= 0.0:
+            raise StateError(f"atol = {value:g} must be at least 0: give the size below which errors do not matter")
+    if isinstance(atol, Mapping):
+        by_name = {name: float(value) / request.rtol for name, value in atol.items()}
+        return ErrorControl(None, by_name, max_step, first_step)
+    values = real_array(atol, "atol")
+    if not values.ndim:
+        return ErrorControl(None, float(values) / request.rtol, max_step, first_step)
+    names = stepper.interface.coordinates
+    if values.shape not in ((len(names),), (2 * len(names),)):
+        raise StateError(
+            f"atol must be a number, {len(names)} or {2 * len(names)} numbers, or numbers by name, not an array of "
+            f"shape {values.shape}"
+        )
+    pairs = zip(names, (values[: len(names)] / request.rtol).tolist(), strict=True)
+    return ErrorControl(None, dict(pairs), max_step, first_step)
 
 
 def _motion(

@@ -25,6 +25,7 @@ from scvi_codegen.models.options import (
     METHOD,
     METHOD_KEYS,
     NUMBER,
+    NUMBER_OR_NAMED,
     NUMBERS,
     NUMBERS_OR_NAME,
     OPTIONS,
@@ -94,6 +95,20 @@ def _assignments(
     return tuple(result)
 
 
+def _number_or_named(
+    context: click.Context, parameter: click.Parameter, values: tuple[str, ...]
+) -> float | dict[str, float] | None:
+    """Return VALUE as a number, and NAME=VALUE, NAME=VALUE as numbers by name; ``None`` without any."""
+    if not values:
+        return None
+    if len(values) == 1 and "=" not in values[0]:
+        try:
+            return float(ExactNumber(values[0]))
+        except ValueError as error:
+            raise click.BadParameter(f"'{values[0]}' is neither VALUE nor NAME=VALUE, as in 1e-9 and x=1e-9") from error
+    return dict(_assignments(context, parameter, values))
+
+
 def _sizes(context: click.Context, parameter: click.Parameter, values: tuple[str, ...]) -> tuple[tuple[str, int], ...]:
     for name, value in (assignments := _assignments(context, parameter, values)):
         if not value.is_integer():
@@ -139,6 +154,7 @@ PARSERS: Mapping[str, Mapping[str, Any]] = {
     METHOD: {"shell_complete": complete_method},
     NUMBERS: {"callback": _numbers},
     NUMBERS_OR_NAME: {"callback": _numbers_or_name},
+    NUMBER_OR_NAMED: {"multiple": True, "callback": _number_or_named},
     ASSIGNMENTS: {"multiple": True, "callback": _assignments},
     INPUTS: {"multiple": True, "callback": _input_files},
     SIZES: {"multiple": True, "callback": _sizes},

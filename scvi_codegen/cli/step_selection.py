@@ -63,7 +63,9 @@ def model_with_global_error(model: Model, error: float) -> tuple[Model, GlobalEr
     )
     if result.h:
         signed = math.copysign(result.h, wanted.covered)
-        return replace(wanted, h=signed, span=abs(wanted.covered), error=None), result
+        return replace(
+            wanted, h=signed, absolute_tolerance=None, max_step=None, span=abs(wanted.covered), error=None
+        ), result
     precision = DOUBLE_DOUBLE if in_words else wanted.precision
     return replace(wanted, tolerance=result.steps["tolerance"], error=None, precision=precision), result
 

@@ -382,6 +382,7 @@ class Model(TimeSpan):
             h=abs(h) if h is not None and to_end else h,
             t_end=self.t + self.covered if to_end else None,
             tolerance=tolerance if h is None else None,
+            **self._control,
             parameters=self.parameters_at_start(stepper),
             **common,
         )
@@ -396,7 +397,8 @@ class Model(TimeSpan):
         arguments = {**self.initial_state(stepper), **self._common(options, threads), "parameters": self.parameters}
         if self.system.inputs:
             arguments["inputs"] = self.all_inputs()
-        trajectory: Trajectory = stepper.integrate(**arguments, t_end=self.t + self.covered, error=self.error)
+        span = {"t_end": self.t + self.covered, "error": self.error, **self._control}
+        trajectory: Trajectory = stepper.integrate(**arguments, **span)
         assert trajectory.confirmation is not None  # by construction
         return trajectory.confirmation
 

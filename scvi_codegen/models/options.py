@@ -21,7 +21,7 @@ from scvi_codegen.runtime.ensemble.observation import OBSERVED
 from scvi_codegen.validation import NUMERAL, TOLERANCE_RANGE, ExactNumber, checked_count
 
 NUMBER, COUNT, TEXT, CHOICE, SWITCH, METHOD = "number", "count", "text", "choice", "switch", "method"
-NUMBERS, NUMBERS_OR_NAME = "numbers", "numbers or name"
+NUMBERS, NUMBERS_OR_NAME, NUMBER_OR_NAMED = "numbers", "numbers or name", "number, or numbers by name"
 ASSIGNMENTS, INPUTS, SIZES, EVENTS = "assignments", "inputs", "sizes", "events"
 """Kinds of values of an option; those of the last four are a section of a model file."""
 LARGEST_TOLERANCE = 0.1
@@ -100,13 +100,16 @@ class Option:
             if not isinstance(value, bool):
                 raise ModelFileError(f"{where} must be true or false, not {value!r}")
             return value
+        if self.kind == NUMBER_OR_NAMED and isinstance(value, Mapping):
+            return {str(name): float(real(number, f"{where} of {name}")) for name, number in value.items()}
         return float(real(value, where))
 
     def checked(self, value: Any) -> Any:
         """Return a value of a field, or raise :class:`ModelFileError` with the message of the option."""
         value = self.read(value, self.field)
-        if not self.valid(value):
-            raise ModelFileError(self.invalid.format(value=value))
+        for number in value.values() if isinstance(value, Mapping) else (value,):
+            if not self.valid(number):
+                raise ModelFileError(self.invalid.format(value=number))
         return value
 
 
@@ -136,6 +139,21 @@ class RunOptions:
         brief="tolerance (error of each adaptive step)",
         valid=lambda value: 0.0 < value < 1.0,
         invalid=TOLERANCE_RANGE,
+        common=False,
+    )
+    absolute_tolerance: float | Mapping[str, float] | None = run_option(
+        *("run", NUMBER_OR_NAMED, "[NAME=]VALUE"),
+        "Size below which errors of adaptive steps do not matter, of all coordinates, or of a coordinate, array or "
+        "rotation [0]; may be repeated.",
+        valid=lambda value: value >= 0.0,
+        invalid="absolute_tolerance is {value:g}: it must not be negative; give 0 or a size below which errors do not "
+        "matter",
+        common=False,
+    )
+    max_step: float | None = run_option(
+        *("run", NUMBER, "H", "Largest size of adaptive steps."),
+        valid=lambda value: value > 0.0,
+        invalid="max_step is {value:g}: it must be positive, also for a run backward in time",
         common=False,
     )
     error: float | None = run_option(

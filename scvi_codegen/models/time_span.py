@@ -33,8 +33,11 @@ class TimeSpan(RunOptions):
             transformation, the step size in tau.
         tolerance: relative error allowed to each adaptive step, below 1, or ``None`` for round-off. With a time
             transformation, :func:`largest_step` chooses the step size in tau for it.
-        error: instead of both, bound of the relative global error of all states: runs choose their local tolerance as
-            ``integrate(error=)`` does, and warn if the bound is not confirmed.
+        absolute_tolerance: size below which errors of an adaptive step do not matter, a number or numbers by name of
+            coordinate, array or rotation; ``None`` for 0.
+        max_step: largest size of adaptive steps, or ``None``.
+        error: instead of a step size and a tolerance, bound of the relative global error of all states: runs choose
+            their local tolerance as ``integrate(error=)`` does, and warn if the bound is not confirmed.
         span: time span, positive, or ``None`` if ``steps`` is given. With adaptive steps negative for a run backward.
         steps: number of fixed steps, or ``None`` if ``span`` is given.
         save_every: stride of saved states, in steps.
@@ -62,6 +65,11 @@ class TimeSpan(RunOptions):
         for name, known in (("precision", PRECISIONS), ("device", DEVICES), ("observe", OBSERVED[:2])):
             if (value := getattr(self, name)) not in (None, *known):
                 raise ModelFileError(f"unknown {name} {value!r}: use {' or '.join(map(repr, known))}")
+        if self.h is not None and (control := self._control):
+            name, value = next(iter(control.items()))
+            raise ModelFileError(
+                f"{name} = {value} is for adaptive steps, but the step size is fixed, h = {self.h:g}: omit one of them"
+            )
         if self.h is None:
             if self.span is None:
                 raise ModelFileError("adaptive steps require a time span: give span, not steps")
@@ -113,9 +121,17 @@ class TimeSpan(RunOptions):
             section["controller"] = default_controller(in_tau=True)
         return {key: value for key, value in section.items() if value is not None}
 
+    @property
+    def _control(self) -> dict[str, Any]:
+        """Arguments of adaptive steps besides the tolerance that are set, by name."""
+        values = {name: getattr(self, name) for name in ("absolute_tolerance", "max_step")}
+        return {name: value for name, value in values.items() if value is not None}
+
     def _with_step_size(self, *, steps: int | None = None, **chosen: Any) -> Self:
         """Return the model whose step size another option determines, over the same time span or ``steps`` steps."""
         others = {option.field: None for option in OPTIONS if option.determines == STEP_SIZE and option.section}
+        if chosen.get("h") is not None:
+            others |= dict.fromkeys(self._control)
         return replace(self, **{**others, **chosen, "steps": steps, "span": None if steps else self.covered})
 
     @property

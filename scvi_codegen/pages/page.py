@@ -274,13 +274,24 @@ def _entry(folder: Path, model: Model, interface: Any, initial: Sequence[str], a
             array=interface.array, m=size, capacity=256 if size < 64 else 16, maps=len(interface.map_names),
             values=numbers, sizes=list(interface.sizes.values()) if interface.array else (), tables=tables,
             constraints=interface.constraints, adaptive=adaptive, initial=initial,
-            transformed=model.time_transformation is not None, events=model.events,
+            transformed=model.time_transformation is not None, max_step=model.max_step,
+            absolute_tolerances=_absolute_tolerances(model, interface), events=model.events,
             acting=any(each.changes_state for each in model.events), velocities=not starts_from_momenta(model),
             level=interface.parameters.index(energy) if (energy := interface.energy_parameter) else None,
             axes={f"at_{name}": nodes for name, nodes in axes.items()},
             names={f"at_{name}": k for k, name in enumerate(interface.parameters)},
         )
     )  # fmt: skip
+
+
+def _absolute_tolerances(model: Model, interface: Any) -> list[float]:
+    """Return the absolute tolerance of each coordinate; none if all are 0."""
+    from scvi_codegen.runtime.run.step_plan import absolute_tolerances, checked_absolute_tolerance
+
+    if model.absolute_tolerance is None:
+        return []
+    values = checked_absolute_tolerance(model.absolute_tolerance)
+    return [float(value) for value in absolute_tolerances(interface, interface.dimension, values)]
 
 
 def _values(model: Model, interface: Any) -> dict[str, float]:

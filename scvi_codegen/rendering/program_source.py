@@ -98,6 +98,8 @@ class ExampleRun:
         h: step size, ``None`` for adaptive steps.
         span: of time.
         tolerance: of adaptive steps; with a time transformation the step tau.
+        max_step: largest size of adaptive steps, or ``None``.
+        absolute_tolerances: (m,) of adaptive steps; none if all are 0.
         controlled: whether the integrator has adaptive steps or a time transformation.
         save_every, outputs: steps to an output and number of outputs.
         last: steps to the last output.
@@ -115,6 +117,8 @@ class ExampleRun:
     h: float | None
     span: float
     tolerance: float
+    max_step: float | None = None
+    absolute_tolerances: tuple[float, ...] = ()
     controlled: bool
     save_every: int
     outputs: int

@@ -22,6 +22,8 @@ PAGE = (Path(scvi_codegen.__file__).parents[1] / "docs" / "model_files.md").read
 RUNS = {
     "step": 0.25,
     "tolerance": 1e-6,
+    "absolute_tolerance": 1e-9,
+    "max_step": 0.5,
     "error": 1e-5,
     "span": 3.0,
     "steps": 4,
@@ -59,7 +61,7 @@ def test_key_of_an_option_sets_its_field_and_is_written(option):
         if option in (one, other):
             values.pop((other if option is one else one).name, None)
     values[option.name] = RUNS[option.name]
-    if option.name in ("tolerance", "error"):
+    if option.name in ("tolerance", "absolute_tolerance", "max_step", "error"):
         values.pop("step", None)
     sections = {"initial": [], "run": []}
     for each in FIELDS:
@@ -109,6 +111,8 @@ OCCURRENCES = {
         *("cli/commands/run.py", "cli/step_selection.py", "cli/json_documents.py", "cli/commands/verify.py"),
         *("models/model.py", "models/packages/example.py", "models/time_span.py"),
     },
+    "absolute_tolerance": {*("models/time_span.py", "models/packages/package.py", "cli/step_selection.py")},
+    "max_step": {"models/time_span.py", "models/packages/example.py", "cli/step_selection.py"},
     "error": {"cli/commands/run.py", "cli/step_selection.py", "models/model.py"},
     "save_every": {"cli/recording.py", "cli/running.py", "models/packages/example.py"},
     "solver_tolerance": set(),

@@ -292,8 +292,13 @@ def _with_time_transformation(model: Model, document: Document, specification: S
 
 
 def _without_inherited_step(layer: Document) -> Document:
-    """Drop an inherited step size, one in t, if a time transformation is added without a step size in tau."""
+    """Drop an inherited step size, one in t, if a time transformation is added without a step size in tau.
+
+    Inherited options of adaptive steps are dropped if the step size is fixed now.
+    """
     run = layer.get("run", {})
+    if run.get("step") is not None:
+        return {**layer, "run": {**dict.fromkeys(("absolute_tolerance", "max_step")), **run}}
     if "time_transformation" not in layer.get("system", {}) or STEP_KEYS & run.keys():
         return layer
     return {**layer, "run": {**run, **dict.fromkeys(STEP_KEYS)}}

@@ -83,6 +83,7 @@ def example_of(model: Model, *, controlled: bool) -> ExampleRun:
         h=model.h if model.time_transformation is None else None,
         span=model.covered,
         tolerance=tolerance,
+        max_step=model.max_step,
         controlled=controlled,
         save_every=save_every,
         outputs=outputs,

@@ -276,7 +276,7 @@ def _stepper_of_arrays(folder: Path) -> Stepper:
 
 def _texts(model: Model, prefix: str, embedded: Embedded | None, *, single_file: bool) -> dict[str, str]:
     from scvi_codegen.models.model_files.model_file import model_texts
-    from scvi_codegen.models.packages.example import example_of, package_template, readme_text
+    from scvi_codegen.models.packages.example import package_template, readme_text
     from scvi_codegen.pipeline import generate_source
     from scvi_codegen.rendering.program_source import render_example
 
@@ -296,7 +296,9 @@ def _texts(model: Model, prefix: str, embedded: Embedded | None, *, single_file:
     checked_parameters(interface, model.parameters)  # C does not check cutoffs and boxes
     source = source.single_file() if single_file else source.specialised()
     texts = source.files
-    texts |= render_example(interface, example_of(model, controlled=ADVANCE_TO in source.header), embedded or "double")
+    texts |= render_example(
+        interface, _example(model, interface, controlled=ADVANCE_TO in source.header), embedded or "double"
+    )
     texts |= written
     texts["README.md"] = readme_text(
         interface, model.events, with_model=bool(written), embedded=embedded, controlled=ADVANCE_TO in source.header
@@ -308,6 +310,19 @@ def _texts(model: Model, prefix: str, embedded: Embedded | None, *, single_file:
         described["event_declarations"] = source.beside.declarations.split("\n")
         described["events"] = [event.table for event in model.events]
     return {**texts, INTERFACE_FILE: record_text(texts, **described)}
+
+
+def _example(model: Model, interface: Interface, *, controlled: bool) -> Any:
+    """Return the run of ``main.c``, with the absolute tolerance of each coordinate."""
+    from scvi_codegen.models.packages.example import example_of
+    from scvi_codegen.runtime.run.step_plan import absolute_tolerances, checked_absolute_tolerance
+
+    example = example_of(model, controlled=controlled)
+    if model.absolute_tolerance is None:
+        return example
+    values = checked_absolute_tolerance(model.absolute_tolerance)
+    each = absolute_tolerances(interface, interface.dimension, values)
+    return replace(example, absolute_tolerances=tuple(each.tolist()))
 
 
 def _texts_of_arrays(model: Model, prefix: str, embedded: Embedded | None, *, single_file: bool) -> dict[str, str]:
