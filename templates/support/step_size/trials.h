@@ -15,6 +15,11 @@
 #define FAILURES_BEFORE_NEWTON 3 /* trials of a step in which the iteration of the multipliers fails */
 #define SHORT_MOTION REAL(0.01) /* relative to the largest position: a change so small .. */
 #define SHORT_BY_TOLERANCE 1000 /* .. and less than so many times the tolerance does not show errors of the forces */
+#define LEAP 2 /* levels by which a step is larger than the one before, whose end is then examined */
+#define MOST_EXAMINED 8 /* trials, each up to four times shorter, until no force sets in at the end of a step */
+#define BEYOND_END REAL(0.125) /* of the step: part behind its end whose forces are examined */
+#define EQUAL_FORCES REAL(1e-2) /* relative difference of the force in both halves of a free flight */
+#define OTHER_FORCE REAL(0.5) /* relative difference beyond which another force sets in */
 #define STEPS_COMPARED_AFTER_DOUBT 16 /* steps that are compared after one that was shortened by a comparison */
 
 #ifdef ARRAYS
@@ -393,6 +398,18 @@ HOT int find_step(run_memory *run, trial *now, const solver_options *options, so
   return OK;
 }
 
+/* Returns 1 for a free flight whose size is far from that of the step before: much larger, or shortened at once. */
+static inline int is_leap(const run_memory *run, const trial *now)
+{
+  if (now->change < LEAP && now->change > -LEVELS_PER_BINADE)
+    return 0;
+#ifdef NEWTON_ALONE
+  return stages_fly(run->memory);
+#else
+  return is_free_flight(&now->step, STORED(run, &now->step));
+#endif
+}
+
 /* Returns 1 if the momenta of a step are compared, too: after a step that was wrong, and where the step size fell by a
  * factor of two or more although the momenta change little. Near a singular time or a nonsmooth force the coefficients
  * of the curve do not decay and do not show its error; steps are then so short that the error is in the momenta. Not
@@ -405,10 +422,67 @@ static inline int needs_momenta(run_memory *run, const trial *now)
   return DOUBTS && (run->steps_to_compare > 0 || (shorter && changes_little(now)));
 }
 
-/* Compares a step with its half steps and shortens it while the difference is far above its error estimate. */
+/* Returns 1 if a force that is nearly constant along a step is another one at its end. Estimates see forces only at the
+ * points of a step: after a free flight steps grow, and a wall, or a force that sets in, may lie between the last point
+ * of one step and the first of the next. Momenta of three parts give mean forces: of both halves, and of a short step
+ * from the end. */
+static SELDOM int force_sets_in(const trial *now, const solver_options *options)
+{
+  const step_data *step = &now->step;
+  const section own = own_part(step);
+  step_data part = *step;
+  sums all;
+  int status;
+  VECTORS(nothing, 1, step);
+  VECTORS(q, 1, step);
+  VECTORS(p, 1, step);
+  VECTORS(halves, 1, step);
+  VECTORS(changes, 1, step);
+  VECTORS(whole, 1, step);
+  VECTORS(first, 1, step);
+  set_zero(step, nothing), set_zero(step, halves), set_zero(step, changes), set_zero(step, whole), set_zero(step, first);
+  for (long long i = own.first; i < own.end; i++) {
+    q[i] = step->q0[i] + (step->carry_q[i] + now->dq[i]);
+    p[i] = step->p0[i] + (step->carry_p[i] + now->dp[i]);
+  }
+  part.tables = NULL;
+#if defined(ERROR_GROWTH) || defined(MIXED_POINTS)
+  part.points = NULL;
+#endif
+  part.h = step->h / 2;
+  part.first = COMPARISON;
+  status = add_part(&part, options, halves, changes);
+  if (status != OK)
+    return 0;
+  part.h = BEYOND_END * step->h;
+  part.t = step->t + step->h;
+  part.q0 = q, part.p0 = p;
+  part.carry_q = part.carry_p = nothing;
+  part.first = SECOND_HALF;
+  status = add_part(&part, options, whole, first);
+  if (status != OK)
+    return 0;
+  begin_blocks(&all, step);
+  EACH_BLOCK (all) {
+    int sets_in = 0;
+    for (long long i = all.here.first; i < all.here.end; i++) {
+      const real early = 2 * changes[i], late = 2 * (now->dp[i] - changes[i]), beyond = first[i] / BEYOND_END;
+      const real force = larger(MATH(fabs)(early), MATH(fabs)(late)), change = MATH(fabs)(beyond - late);
+      sets_in |= MATH(fabs)(early - late) <= EQUAL_FORCES * force && change > OTHER_FORCE * force &&
+          change > SPURIOUS * (MATH(fabs)(p[i]) + MATH(fabs)(now->dp[i]));
+    }
+    add_block(&all, sets_in, 0);
+  }
+  meet(step);
+  return largest_over(&all, 0) > 0;
+}
+
+/* Compares a step with its half steps and shortens it while the difference is far above its error estimate, or, a
+ * limited number of times, a force sets in at its end. */
 static SELDOM int compare_step(run_memory *run, trial *now, int steps_to_compare, const solver_options *options,
     solver_report *report)
 {
+  int examined = steps_to_compare || is_leap(run, now) ? MOST_EXAMINED : 0;
   const real allowed = larger(
       ALLOWED_TO_HALVES * MATH(pow)(now->limits.most, ERROR_POWER), steps_to_compare ? ROUNDOFF_LEVEL : SPURIOUS);
   for (;;) {
@@ -416,7 +490,7 @@ static SELDOM int compare_step(run_memory *run, trial *now, int steps_to_compare
     int status = compare_trial(now, steps_to_compare, options, &apart);
     if (status > STATUS(SPURIOUS_SOLUTION))
       return status;
-    if (status == OK && apart <= allowed) {
+    if (status == OK && apart <= allowed && !(examined-- > 0 && force_sets_in(now, options))) {
       now->apart = MATH(pow)(apart, 1 / ERROR_POWER);
       run->steps_to_compare -= run->steps_to_compare > 0;
       return OK;
@@ -433,12 +507,12 @@ static SELDOM int compare_step(run_memory *run, trial *now, int steps_to_compare
   }
 }
 
-/* Compares the first step, one of COMPARED later, and those in doubt. */
+/* Compares the first step, one of COMPARED later, leaps, and those in doubt. */
 static inline int confirm_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
   const int steps_to_compare = needs_momenta(run, now);
   now->apart = 0;
-  return steps_to_compare || run->step % COMPARED == 0 ? compare_step(run, now, steps_to_compare, options, report) : OK;
+  return steps_to_compare || run->step % COMPARED == 0 || is_leap(run, now) ? compare_step(run, now, steps_to_compare, options, report) : OK;
 }
 
 /* Largest change of level after the iterations of a step. Where they are many, as in lattices whose waves are fast, the
