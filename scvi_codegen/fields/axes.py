@@ -178,9 +178,9 @@ class Axis(ABC):
             return {int(np.abs(distance).argmin()): 1.0}
         return self.between(place, distance)
 
-    def differentiated(self, values: Array, along: int) -> Array:
+    def differentiated(self, values: Array, along: int, ends: Sequence[Array | None] = (None, None)) -> Array:
         """Return the derivative at the points of values along one of their axes; see :meth:`MeshSystem.derivative`."""
-        return self.from_elements(self.derivative(self.in_elements(values, along), along), along)
+        return self.from_elements(self.derivative(self.in_elements(values, along, ends), along), along)
 
     def in_elements(self, values: Array, along: int, ends: Sequence[Array | None] = (None, None)) -> Array:
         """Return values at all points of elements, those at ends are ``ends`` if prescribed, or 0."""

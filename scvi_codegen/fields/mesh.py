@@ -89,14 +89,35 @@ class Mesh:
         """Return the integral over space of values at the points, (.., shape of the fields), by quadrature."""
         return np.sum(self.weights * self._at_points(values), axis=tuple(range(-len(self.axes), 0)))
 
-    def derivative(self, values: ArrayLike, axis: str) -> Array:
+    def derivative(
+        self, values: ArrayLike, axis: str, *, ends: tuple[ArrayLike | None, ArrayLike | None] | None = None
+    ) -> Array:
         """Return the derivative along an axis at the points, (.., shape of the fields), of the spectral interpolant.
 
-        Elements share end points, at which the mean of both derivatives is returned, weighted by length. Prescribed
-        values at ends are taken as 0.
+        Elements share end points, at which the mean of both derivatives is returned, weighted by length.
+
+        Args:
+            values: at the points, without ends where they are prescribed.
+            axis: name of the axis.
+            ends: values at the lower and the upper end where they are prescribed, numbers or (.., shape without the
+                axis); by default 0.
+
+        Raises:
+            StateError: if ends are omitted and the system prescribes values that are not 0.
         """
         position = self._position(axis)
-        return self.axes[position].differentiated(self._at_points(values), position - len(self.axes))
+        if ends is None and any(value != 0 for value in self._prescribed(axis)):
+            raise StateError(
+                f"'{self.field_system.name}' prescribes values other than 0 at an end of {axis}: give them by "
+                "ends=(lower, upper), None for an end without prescribed values"
+            )
+        known = [None if end is None else np.asarray(end, dtype=float) for end in ends or (None, None)]
+        return self.axes[position].differentiated(self._at_points(values), position - len(self.axes), known)
+
+    def _prescribed(self, axis: str) -> list[sympy.Expr]:
+        """Return the values of fields that are prescribed at the ends of an axis."""
+        ends = self.field_system.boundary[axis]
+        return [] if ends == PERIODIC else [value for end in ends if end != NATURAL for value in end.values()]
 
     def unresolved(self, values: ArrayLike) -> Any:
         """Return the part of the squared amplitude in the highest sixth of the modes, (...), the largest of all axes.
@@ -112,10 +133,10 @@ class Mesh:
         for k, each in enumerate(self.axes):
             others = tuple(range(-count, -1))
             modes = each.modes(np.moveaxis(array, k - count, -1))
-            ends = self.field_system.boundary[each.name]
-            prescribed = [] if ends == PERIODIC else [x for end in ends if end != NATURAL for x in end.values()]
             closed = each.closed
-            if closed and each.table is not None and any(value != 0 for value in prescribed):  # not known here
+            if (
+                closed and each.table is not None and any(value != 0 for value in self._prescribed(each.name))
+            ):  # not known here
                 modes[..., ~closed.inside.reshape(each.table.shape).all(axis=1), :] = 0
             highest = modes[..., -max(1, modes.shape[-1] // 6) :].sum(-1).sum(others)
             every = modes.sum(-1).sum(others)

@@ -37,6 +37,11 @@ LARGEST = 1.7976931348623157e308
 """Largest finite C double."""
 
 
+def _call(printer: Any, name: str, *arguments: Any) -> str:
+    """Return a call of a function of NumPy or mpmath, for printers of :func:`sympy.lambdify`."""
+    return f"{printer._module_format(name)}({', '.join(map(printer._print, arguments))})"
+
+
 class rint(Function):  # type: ignore[misc]  # noqa: N801  (a function of formulas, like sympy.sin)
     """Nearest whole number, of two the even one; its derivative is 0."""
 
@@ -50,6 +55,14 @@ class rint(Function):  # type: ignore[misc]  # noqa: N801  (a function of formul
     def fdiff(self, argindex: int = 1) -> Expr:
         """Return 0."""
         return S.Zero
+
+    def _numpycode(self, printer: Any) -> str:
+        return _call(printer, "numpy.rint", *self.args)
+
+    _scipycode = _numpycode
+
+    def _mpmathcode(self, printer: Any) -> str:
+        return _call(printer, "mpmath.nint", *self.args)
 
 
 class unit_step(Function):  # type: ignore[misc]  # noqa: N801
@@ -68,6 +81,14 @@ class unit_step(Function):  # type: ignore[misc]  # noqa: N801
     def fdiff(self, argindex: int = 1) -> Expr:
         """Return 0."""
         return S.Zero
+
+    def _numpycode(self, printer: Any) -> str:
+        return _call(printer, "numpy.heaviside", *self.args, S.One)
+
+    _scipycode = _numpycode
+
+    def _mpmathcode(self, printer: Any) -> str:
+        return f"({_call(printer, 'mpmath.sign', *self.args)} >= 0)"
 
 
 def kinks_of(expressions: Iterable[Expr]) -> set[Expr]:

@@ -282,3 +282,48 @@ def test_semi_discrete_lagrangian_is_read_back_from_its_text(ends, method, optio
     assert [(term.loops, term.slots) for term in read.terms] == [(term.loops, term.slots) for term in system.terms]
     for one, other in zip(read.terms, system.terms, strict=True):
         assert float(one.formula.xreplace(rule)) == pytest.approx(float(other.formula.xreplace(rule)), rel=1e-12)
+
+
+@pytest.mark.parametrize("method", [{"degree": 6, "elements": 2}, {"degree": 9}])
+def test_derivatives_take_prescribed_ends(method):
+    """The interpolant of 1 + x**2 has the prescribed values 1 and 2 at its ends, which are not among the points."""
+    string = sc.FieldSystem.from_text(
+        "string", ["u"], {"x": (0, 1)}, "u_t**2/2 - u_x**2/2", boundary={"x": [{"u": "1"}, {"u": "2"}]}
+    )
+    mesh = string.discretise("legendre" if "elements" not in method else "spectral-elements", **method)
+    x = mesh.points["x"]
+    with pytest.raises(sc.StateError, match="prescribes values other than 0 at an end of x"):
+        mesh.derivative(1 + x**2, "x")
+    assert mesh.derivative(1 + x**2, "x", ends=(1.0, 2.0)) == pytest.approx(2 * x, abs=1e-12)
+    several = np.array([1 + x**2, 1 + x**2 + 3 * x])
+    ends = np.array([1.0, 1.0]), np.array([2.0, 5.0])
+    assert mesh.derivative(several, "x", ends=ends) == pytest.approx(np.array([2 * x, 2 * x + 3]), abs=1e-12)
+
+
+@pytest.mark.filterwarnings("ignore::scvi_codegen.errors.AccuracyWarning")
+def test_densities_with_steps_and_positive_parts_have_a_highest_frequency():
+    """A step in the stiffness from 1 to 4 lies between the frequencies of both."""
+
+    def frequency(stiffness):
+        density = f"u_t**2/2 - ({stiffness})*u_x**2/2 - positive_part(u - 1)**2 - rint(x)*u**2/2"
+        ring = sc.FieldSystem.from_text("ring", ["u"], {"x": (0, 1)}, density, boundary={"x": "periodic"})
+        return ring.discretise("finite-differences", order=2, points=32)
+
+    between = frequency("1 + 3*unit_step(x - 1/2)")
+    assert between.highest_frequency() == pytest.approx(frequency("4").highest_frequency(), rel=1e-12)
+    assert between.largest_step("svi:2") < frequency("1").largest_step("svi:2")
+    run = sc.compile_stepper(between.system, "svi:2").integrate({"u": np.ones(32)}, h=0.01, steps=2)
+    assert run.t[-1] == 0.02
+
+
+def test_failing_check_does_not_lose_a_finished_run(monkeypatch):
+    from scvi_codegen.runtime.accuracy import local_error
+
+    def fails(*_, **__):
+        raise NameError("name 'unit_step' is not defined")
+
+    monkeypatch.setattr(local_error, "warn_of_energy_error", fails)
+    pendulum = sc.compile_stepper(sc.problem("planar-pendulum").system, "svi:4")
+    with pytest.warns(sc.AccuracyWarning, match=r"not checked \(NameError: name 'unit_step' is not defined\)"):
+        run = pendulum.integrate([1.0], [0.0], t_end=1.0)
+    assert run.t[-1] == 1.0
