@@ -225,6 +225,7 @@ def describe_arrays(
         solver="rattle" if system.constraints else solver,
         layout=layout,
         lengths=tuple(length for near in system.neighbours for length in near.lengths),
+        kinks=system.kinks,
     )
 
 

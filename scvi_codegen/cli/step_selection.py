@@ -67,7 +67,7 @@ def model_with_global_error(model: Model, error: float) -> tuple[Model, GlobalEr
             wanted, h=signed, absolute_tolerance=None, max_step=None, span=abs(wanted.covered), error=None
         ), result
     precision = DOUBLE_DOUBLE if in_words else wanted.precision
-    return replace(wanted, tolerance=result.steps["tolerance"], error=None, precision=precision), result
+    return replace(wanted, **result.steps, error=None, precision=precision), result
 
 
 def model_with_advised_step(

@@ -305,7 +305,7 @@ class Interface:
         originals: of a system in angles of rods, the names of the coordinates and velocities that they replace, with
             their formulas, ``("x", "l*sin(angle)")``.
         original_arrays: declarations of the arrays of the original system.
-        kinks: functions at whose zeros the equations are not smooth; not of arrays of run-time sizes.
+        kinks: functions at whose zeros the equations are not smooth, for events.
     """
 
     prefix: str

@@ -11,12 +11,14 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
+import mpmath
 import numpy as np
 import pytest
 from notation import lagrange
 from scipy.integrate import solve_ivp
 
 import scvi_codegen as sc
+from scvi_codegen.runtime.accuracy.global_error import LEAST_STOPS, irregular_stops
 
 PI = np.longdouble(4.0) * np.arctan(np.longdouble(1.0))
 REFERENCE_TOLERANCE, REFERENCE_ERROR = 3e-14, 3e-12
@@ -298,3 +300,83 @@ def test_no_error_is_falsely_confirmed(smooth):
 @pytest.mark.parametrize(("smooth", "count", "least"), [(True, 2000, 0.95), (False, 1000, 0.6)])
 def test_of_three_thousand_errors_none_is_falsely_confirmed(smooth, count, least):
     check(counts(range(count), smooth=smooth), least)
+
+
+FLOOR_HEIGHT = 2.55
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_ball_on_a_stiff_floor_is_not_falsely_confirmed(method):
+    """Free flight has the same steps for all tolerances, one of which ends inside the floor."""
+    start = {"q": [FLOOR_HEIGHT], "p": [0.0], "t_end": 3.0 * math.sqrt(2.0 * FLOOR_HEIGHT / 9.8)}
+    motion = lambda signs: (2e5 * signs[0], -9.8, 0.0, 0.0), [lambda t, x: -x]
+    exact = switched(*motion, (FLOOR_HEIGHT, 0.0), np.array([0.0, start["t_end"]]))[-1, 0]
+    assert exact == pytest.approx(0.049518, abs=1e-6)
+    with warnings.catch_warnings(action="ignore"):
+        run = stepper_of("floor", method).integrate(**start, error=1e-8)
+    assert run.confirmation.confirmed == (abs(run.q[-1, 0] - exact) < 1e-8 * FLOOR_HEIGHT)
+
+
+def test_switched_forces_are_not_falsely_confirmed():
+    """x'' = 1 from t = a on: 30 times a, each confirmed run is right; those that are not are reported."""
+    stepper, confirmed = stepper_of("motor", "svi:4"), 0
+    for a in np.linspace(0.3, 9.7, 30):
+        with warnings.catch_warnings(action="ignore"):
+            run = stepper.integrate([0.0], [1.0], t_end=10.0, parameters={"a": a}, error=1e-8)
+        exact = run.t + np.maximum(run.t - a, 0.0) ** 2 / 2
+        reached = run.t <= run.confirmed_until
+        assert np.abs(run.q[:, 0] - exact)[reached].max() <= 1e-8 * np.ptp(exact)
+        confirmed += run.confirmation.confirmed
+    assert confirmed >= 18
+
+
+@pytest.mark.parametrize("error", [1e-15, 1e-30])
+def test_bounds_below_round_off_are_refused(error):
+    stepper = stepper_of("oscillator", "svi:4")
+    for integrate, q in ((stepper.integrate, [1.0]), (stepper.integrate_ensemble, [[1.0], [0.5]])):
+        with pytest.raises(sc.StateError, match=rf"error={error:g} is below 1.1e-15, the least error that double"):
+            integrate(q, velocity=q, t_end=1.0, error=error)
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e6])
+def test_errors_are_relative_to_the_range_of_each_coordinate(offset):
+    """A small oscillation beside a large one has its own size; far from the origin positions are rounded."""
+    system = lagrange("two", ("x", "z"), "(x_dot**2 + z_dot**2)/2 - (x**2 + 2*(z - c)**2)/2", c=0.0)
+    stepper = sc.compile_stepper(system, "svi:6")
+    with warnings.catch_warnings(action="ignore"):
+        run = stepper.integrate([1.0, offset + 2.0**-20], [0.0, 0.0], t_end=5.0, parameters={"c": offset}, error=1e-6)
+    off = np.abs(run.q[:, 1] - offset - 2.0**-20 * np.cos(math.sqrt(2.0) * run.t)).max() / 2.0**-20
+    assert off <= run.global_error
+    assert run.confirmation.confirmed == (offset == 0.0)
+
+
+def test_a_coordinate_that_does_not_move_is_confirmed():
+    """An equilibrium away from the origin, and rounding errors of a coordinate beside one that moves."""
+    system = lagrange("two", ("x", "z"), "(x_dot**2 + z_dot**2)/2 - ((x - z)**2 + (x + z)**2)/4 - (z - 3)**2/2 + z*z/2")
+    run = sc.compile_stepper(system, "svi:6").integrate([1.0, 3.0], [0.0, 0.0], t_end=5.0, error=1e-9)
+    assert run.confirmation.confirmed
+
+
+def test_two_words_confirm_more_digits():
+    system = lagrange("oscillator", "x", "x_dot**2/2 - x**2/2")
+    stepper = sc.compile_stepper(system, "svi:12", precision="double-double")
+    run = stepper.integrate([1.0], [0.0], t_end=3.0, error=1e-26)
+    assert run.confirmation.confirmed
+    with mpmath.workdps(40):
+        t, x = run.mp("t")[-1], run.mp("x")[-1]
+        assert abs(x - mpmath.cos(t)) < 1e-26
+
+
+def test_a_run_for_comparison_has_other_steps():
+    """Its steps end within all long steps of the run, at irregular fractions of them."""
+    t = np.concatenate([[0.0], np.linspace(1.0, 9.0, 9), np.linspace(9.01, 10.0, 100)])
+    for forward in (1.0, -1.0):
+        stops = np.array(irregular_stops(forward * t, 0))
+        assert stops[-1] == forward * t[-1]
+        assert (np.diff(forward * stops) > 0.0).all()
+        inside = np.searchsorted(t, forward * stops[:-1])
+        assert {*range(1, 10)} <= {*inside.tolist()}
+        fractions = (forward * stops[:9] - t[inside[:9] - 1]) / np.diff(t)[inside[:9] - 1]
+        assert np.ptp(fractions) > 0.5
+        assert len({*np.round(fractions, 6)}) == 9
+    assert len(irregular_stops(np.array([0.0, 1.0]), 0)) == LEAST_STOPS + 1

@@ -36,7 +36,7 @@ from scvi_codegen.errors import SizesRequiredError, SystemDefinitionError
 from scvi_codegen.files.cache import key_of
 from scvi_codegen.formulas.array_statements import ArrayForce, latex_sum
 from scvi_codegen.formulas.arrays import ArrayTerm, parse_array, parse_coordinate
-from scvi_codegen.formulas.expressions import gradient, gradient_tuple, hessian, kinked_root, unsupported_part
+from scvi_codegen.formulas.expressions import gradient, gradient_tuple, hessian, kinked_root, kinks_of, unsupported_part
 from scvi_codegen.formulas.neighbours import Neighbours
 from scvi_codegen.formulas.rotations import MemberArray
 from scvi_codegen.formulas.symbols import DOT, check_names, input_formulas, symbol
@@ -143,9 +143,13 @@ def terms_at_rest(
 
 def constraint_text(term: ArrayTerm) -> str:
     """Return the constraint as text."""
-    behind = {loop.behind for loop in term.loops}
-    named = ", ".join(str(loop) for loop in term.loops if loop.index not in behind)
-    return f"{term.formula} = 0" + f" for {named}" * bool(term.loops)
+    return f"{term.formula} = 0{loops_text(term.loops)}"
+
+
+def loops_text(loops: Sequence[Loop]) -> str:
+    """Return loops as the text that follows a formula, ``" for i in N"``; empty without loops."""
+    behind = {loop.behind for loop in loops}
+    return f" for {', '.join(str(loop) for loop in loops if loop.index not in behind)}" if loops else ""
 
 
 def check_constraint(term: ArrayTerm, coordinates: Sequence[Array], fields: Sequence[Array], inputs: str) -> None:
@@ -387,6 +391,19 @@ class ArraySystem:
         if any(self.time in term.formula.free_symbols for term in self.constraints):
             return "constraints depend on time"
         return f"the {self.function} depends on time" if self.depends_on_time else ""
+
+    @property
+    def kinks(self) -> tuple[str, ...]:
+        """Functions as text at whose zeros terms, forces or constraints are not smooth, by unit_step or rint.
+
+        None with lists of neighbours, whose pairs are too many to search.
+        """
+        if self.neighbours:
+            return ()
+        terms = [(term.loops, [term.formula]) for term in (*self.terms, *self.constraints)]
+        forces = [(force.loops, [formula for _, formula in force.targets]) for force in self.applied_forces]
+        found = {f"{zero}{loops_text(loops)}" for loops, formulas in (*terms, *forces) for zero in kinks_of(formulas)}
+        return tuple(sorted(found))
 
     @property
     def is_first_order(self) -> bool:

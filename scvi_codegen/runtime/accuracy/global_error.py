@@ -1,21 +1,23 @@
-"""Global error of an adaptive run, estimated by runs of smaller local tolerances.
+"""Global error of an adaptive run, confirmed by runs that do not share its step sequence.
 
-A run is compared with one whose local tolerance is a thousand times smaller, so that the difference is its error; three
-times the largest difference is the estimate. While that exceeds the wanted error, a run of smaller tolerance is judged
-in the same way. Where rounding dominates, all runs have errors of the same size, and one run with nearly the same error
-is not rare: the run is compared with two others and a factor of twelve, or with three and a factor of four, for which
-agreement by chance is equally improbable. The last runs, at round-off level, are compared with each other; what they do
-not confirm stays unconfirmed. (R. D. Skeel, Thirteen ways to estimate global error, Numer. Math. 48 (1986) 1-20; E.
-Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equations I, II.4.)
+A run is compared with one whose local tolerance is a thousand times smaller, so that the difference is its error, and
+whose steps end at other, irregular times, as steps that follow from the motion alone (free flight) are the same for all
+tolerances; where formulas are not smooth, they also end where these jump or have a kink. Three times the largest
+difference is the estimate. While that exceeds the wanted error, a run of smaller tolerance is judged in the same way.
+Where rounding dominates, all runs have errors of the same size, and one run with nearly the same error is not rare: the
+run is compared with two others and a factor of twelve, or with three and a factor of four, for which agreement by
+chance is equally improbable. The last runs, at round-off level, are compared with each other; what they do not confirm
+stays unconfirmed. (R. D. Skeel, Thirteen ways to estimate global error, Numer. Math. 48 (1986) 1-20; E. Hairer, S. P.
+Norsett, G. Wanner, Solving Ordinary Differential Equations I, II.4.)
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from itertools import accumulate, repeat
+from itertools import accumulate, chain, repeat
 from operator import mul
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +27,7 @@ from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.accuracy.size import Motion, first_of_groups, relative, roundoff
 from scvi_codegen.runtime.accuracy.warning_switch import warnings_wanted, without_accuracy_warnings
-from scvi_codegen.runtime.run.step_plan import Adaptive
+from scvi_codegen.runtime.run.step_plan import Adaptive, absolute_tolerances
 
 Array = NDArray[np.float64]
 
@@ -52,6 +54,10 @@ SAFETY, SAFETY_OF_TWO, SAFETY_OF_ROUNDING = 3.0, 12.0, 4.0
 If the errors are independent normal numbers, those of two further runs are both within e / 12 of the error e of the run
 in 8 of 10,000 cases, and those of three within e / 4 in as many.
 """
+PARTS_AT_KINKS, LEAST_AT_KINKS = (math.inf, 0.0913, 0.0331, 0.0127, 0.00491), 1e-13
+"""Largest steps relative to the run, one after the other, of formulas that are not smooth: free flight has the same
+steps for all tolerances, one of which may end beyond a kink. The least tolerance of these runs, unless the first one is
+smaller."""
 LEAST_STOPS, LONG, STRIDE, MOST_STOPS = 8, 64, 16, 512
 """Of a run for comparison, numbers of times at which steps end: least; see :func:`irregular_stops`; most of others."""
 GOLDEN, MARGIN, IRREGULAR = 0.6180339887498949, 0.05, 0.8191725134
@@ -80,14 +86,15 @@ class GlobalError:
         tolerance: local tolerance of the returned run, 0 for round-off.
         h: step of tau of a run in transformed time, else 0.
         t: (n,) times at which the runs were compared: at most 512 of the saved states, where the motion is fast.
-        differences: (n,) the larger of ``|dq| / |q|`` and ``|dp| / |p|``. The norms are the largest up to that time, at
-            least those of the first sixteenth of the run.
+        differences: (n,) the largest difference of a position relative to the range of that coordinate over the run, or
+            of a momentum relative to the largest one (:mod:`scvi_codegen.runtime.accuracy.size`).
         safety: factor of the estimate: 3; where rounding may dominate the error, 12 for two comparisons, 4 for three.
-        estimate: this factor times the largest difference, at least 1.1e-15 and the tolerance; meaningless above about
-            0.1, where runs are uncorrelated.
+        estimate: this factor times the largest difference, at least ten roundings and the tolerance; meaningless above
+            about 0.1, where runs are uncorrelated.
         confirmed_until: last of the times up to which the factor times each difference is at most the requested error.
         runs: number of runs.
         precision: ``"double"`` or ``"double-double"``.
+        max_step: largest step of the returned run, limited where the formulas are not smooth.
     """
 
     requested: float
@@ -100,6 +107,7 @@ class GlobalError:
     confirmed_until: float
     runs: int
     precision: str = "double"
+    max_step: float = math.inf
 
     @property
     def confirmed(self) -> bool:
@@ -108,8 +116,11 @@ class GlobalError:
 
     @property
     def steps(self) -> dict[str, float | None]:
-        """``h``, or ``tolerance`` (``None`` for round-off), as :meth:`Stepper.integrate` takes it for this run."""
-        return {"h": self.h} if self.h else {"tolerance": self.tolerance or None}
+        """``h``, or ``tolerance`` (``None``: round-off) and ``max_step``, of :meth:`Stepper.integrate` for this run."""
+        if self.h:
+            return {"h": self.h}
+        limit = {} if self.max_step == math.inf else {"max_step": self.max_step}
+        return {"tolerance": self.tolerance or None, **limit}
 
     @property
     def digits(self) -> int:
@@ -125,7 +136,7 @@ class Confirmed:
 
     @property
     def global_error(self) -> float:
-        """Estimated relative error of all states, by a second run with other steps; NaN without ``error=``."""
+        """Relative error of all states, by a second run with other steps; NaN without ``error=``."""
         return math.nan if self.confirmation is None else self.confirmation.estimate
 
     @property
@@ -204,13 +215,24 @@ def smallest_estimate(words: int) -> float:
 def warn_of_unconfirmed_run(trajectory: Any) -> None:
     """Issue a warning for a run whose requested global error is not confirmed."""
     result: GlobalError = trajectory.confirmation
-    if not result.confirmed and warnings_wanted():
-        warn(
-            f"the global error {result.requested:g} is confirmed until t = {result.confirmed_until:.6g} only: beyond "
-            f"it, runs with other steps differ by up to about {result.estimate:.1e}. End the run there, or give a "
-            f"larger error{_alternative(trajectory, result)}",
-            AccuracyWarning,
-        )
+    if result.confirmed or not warnings_wanted():
+        return
+    warn(
+        f"the global error {result.requested:g} is {_confirmed_part(result, float(trajectory.t[0]))}: runs with other "
+        f"steps differ by up to about {result.estimate:.1e}. {_remedy(result, float(trajectory.t[0]))}"
+        f"{_alternative(trajectory, result)}",
+        AccuracyWarning,
+    )
+
+
+def _confirmed_part(result: GlobalError, start: float) -> str:
+    if result.confirmed_until == start:
+        return "confirmed at no time"
+    return f"confirmed until t = {result.confirmed_until:.6g} only"
+
+
+def _remedy(result: GlobalError, start: float) -> str:
+    return "Give a larger error" if result.confirmed_until == start else "End the run there, or give a larger error"
 
 
 def _alternative(trajectory: Any, result: GlobalError) -> str:
@@ -227,15 +249,19 @@ def _alternative(trajectory: Any, result: GlobalError) -> str:
     )
 
 
+Attempt: TypeAlias = tuple[Any, GlobalError]
+"""Run, and the estimate of its error."""
+
+
 class Runs:
     """Runs of one motion by tolerance, one of which is returned and confirmed by others.
 
     Args:
         wanted: bound of the relative global error.
-        integrate: function of ``tolerance`` or ``h`` that makes the returned run.
+        integrate: function of ``progress`` or ``None``, and ``tolerance`` or ``h``, that makes the returned run.
         confirming: function of the times at which steps end, of ``progress`` and of ``tolerance`` or ``h`` that makes a
             run for comparison.
-        start: initial time.
+        start, end: initial and final time.
         step_of_tau: function that returns the largest step of tau for a tolerance, or ``None`` without it.
         interface: of the stepper.
         smooth: whether the equations are smooth along each step of ``confirming``.
@@ -248,14 +274,18 @@ class Runs:
         integrate: Callable[..., Any],
         confirming: Callable[..., Any],
         start: float,
+        end: float,
         step_of_tau: Callable[[float], float] | None,
         interface: Interface,
         smooth: bool = True,
     ) -> None:
-        self.wanted, self.integrate, self.confirming, self.start = wanted, integrate, confirming, start
+        self.wanted, self.integrate, self.confirming = wanted, integrate, confirming
+        self.start, self.end = start, end
         self.words, self.interface = interface.words, interface
         self.first, self.h, self.count, self.most = min(wanted * FIRST, 0.1), 0.0, 0, math.inf
-        self.least, self.rounded, self.last = LEAST, ROUNDED, LAST
+        self.least, self.rounded = LEAST, ROUNDED
+        self.last: tuple[float, ...] = LAST
+        self.failure: StepFailedError | None = None
         if self.words > 1:
             self.least, self.rounded, self.last = LEAST_OF_TWO_WORDS, ROUNDED_OF_TWO_WORDS, LAST_OF_TWO_WORDS
         if not smooth:  # errors are as random as those of rounding
@@ -265,7 +295,7 @@ class Runs:
             self.h = step_of_tau(self.first)
         elif self.first < self.rounded:  # the factor of the estimate is larger there
             self.first *= FINER
-        self.made: dict[float, Any] = {}
+        self.parts = () if step_of_tau is not None or not interface.kinks else PARTS_AT_KINKS
 
     @without_accuracy_warnings()
     def confirmed_run(self) -> Any:
@@ -274,7 +304,8 @@ class Runs:
         Raises:
             StepFailedError: if the most accurate run fails.
         """
-        trajectory, trajectory.confirmation = self._judged()
+        trajectory, result = self._judged()
+        trajectory.confirmation = result
         return trajectory
 
     def _steps(self, tolerance: float, factor: float = 1.0) -> dict[str, float | None]:
@@ -282,12 +313,13 @@ class Runs:
             return {"h": factor * self.h * ((tolerance or LEAST) / self.first) ** (1.0 / ORDER)}
         return {"tolerance": tolerance or None}
 
-    def _run(self, tolerance: float) -> Any:
-        if tolerance not in self.made:
-            self.count += 1
-            self.made[tolerance] = made = self.integrate(**self._steps(tolerance))
-            self.most = min(self.most, FURTHER * made.steps + MANY)
-        return self.made[tolerance]
+    def _run(self, tolerance: float, max_step: float = math.inf) -> Any:
+        self.count += 1
+        check = self._check_count if self.most < math.inf else None
+        limit = {} if max_step == math.inf else {"max_step": max_step}
+        trajectory = self.integrate(check, **self._steps(tolerance), **limit)
+        self.most = min(self.most, FURTHER * trajectory.steps + MANY)
+        return trajectory
 
     def _other(self, tolerance: float, compared: "_Samples", number: int) -> Any:
         """Return a run for comparison, to its last state if it fails or takes too many steps."""
@@ -304,41 +336,69 @@ class Runs:
         if steps > self.most:
             raise _TooManyStepsError
 
-    def _judged(self) -> tuple[Any, GlobalError]:
-        """Return the first run that is confirmed, and its estimate; otherwise the better of the last."""
-        tolerance, rounded, best = self.first, self.rounded, list[tuple[Any, GlobalError]]()
-        while tolerance > 2.0 * self.least:
-            try:
-                trajectory = self._run(tolerance)
-            except StepFailedError:
-                tolerance *= RATIO
-                continue
-            ratio, count = (FINER, 3) if tolerance < rounded else (RATIO, 1)
-            smaller = list(accumulate(repeat(ratio, count), mul, initial=tolerance))
-            result = self._estimated(trajectory, tolerance, smaller[1:])
-            if result.confirmed:
-                return trajectory, result
-            best.append((trajectory, result))
-            if not result.estimate < 1.0:
-                break
-            powers = math.ceil(math.log(result.estimate / self.wanted, GAIN) * math.log(RATIO, ratio))
-            tolerance = list(accumulate(repeat(ratio, max(1, powers)), mul, initial=tolerance))[-1]
-        failed: StepFailedError | None = None
-        for tolerance in self.last:
-            try:
-                trajectory = self._run(tolerance)
-            except StepFailedError as failure:
-                failed = failure
-                continue
-            others = [each for each in self.last if each != tolerance]
-            best.append((trajectory, self._estimated(trajectory, tolerance, others, last=True)))
-            if best[-1][1].confirmed or best[-1][1].estimate > GAIN * self.wanted:
-                break
-        if not best and failed is not None:
-            raise failed
-        return min(best, key=lambda each: each[1].estimate)
+    def _judged(self) -> Attempt:
+        """Return the first run that is confirmed, and its estimate; otherwise the better one."""
+        attempts: list[Attempt] = []
+        for attempt in chain(self._limited() if self.parts else self._by_tolerance(), self._at_round_off()):
+            if attempt[1].confirmed:
+                return attempt
+            attempts.append(attempt)
+        if self.failure is not None and not attempts:
+            raise self.failure
+        return min(attempts, key=lambda each: each[1].estimate)
 
-    def _estimated(self, trajectory: Any, tolerance: float, others: list[float], *, last: bool = False) -> GlobalError:
+    def _by_tolerance(self) -> Iterator[Attempt]:
+        """Yield runs of smaller and smaller tolerances, until errors are too large for an extrapolation."""
+        tolerance, estimate = self.first, 0.0
+        while tolerance > 2.0 * self.least and estimate < 1.0:
+            powers, (ratio, smaller) = 1, self._smaller(tolerance)
+            with self._suppressed_failure():
+                trajectory = self._run(tolerance)
+                result = self._estimated(trajectory, tolerance, smaller)
+                yield trajectory, result
+                estimate = result.estimate
+                powers = max(1, math.ceil(math.log(estimate / self.wanted, GAIN) * math.log(RATIO, ratio)))
+            tolerance = list(accumulate(repeat(ratio, powers), mul, initial=tolerance))[-1]
+
+    def _limited(self) -> Iterator[Attempt]:
+        """Yield runs of smaller and smaller largest steps."""
+        tolerance = self.first
+        for part in self.parts:
+            max_step = part * abs(self.end - self.start)
+            with self._suppressed_failure():
+                trajectory = self._run(tolerance, max_step)
+                yield trajectory, self._estimated(trajectory, tolerance, self._smaller(tolerance)[1], max_step)
+            tolerance = max(RATIO * tolerance, min(tolerance, LEAST_AT_KINKS))
+
+    def _at_round_off(self) -> Iterator[Attempt]:
+        """Yield the last runs, as long as their errors are not far above the wanted one."""
+        for tolerance in self.last:
+            with self._suppressed_failure():
+                trajectory = self._run(tolerance)
+                others = [each for each in self.last if each != tolerance]
+                result = self._estimated(trajectory, tolerance, others, last=True)
+                yield trajectory, result
+                if result.estimate > GAIN * self.wanted:
+                    return
+
+    @contextmanager
+    def _suppressed_failure(self) -> Iterator[None]:
+        """Go on after a run that fails, or takes too many steps."""
+        try:
+            yield
+        except StepFailedError as failure:
+            self.failure = failure
+        except _TooManyStepsError:
+            pass
+
+    def _smaller(self, tolerance: float) -> tuple[float, list[float]]:
+        """Return the tolerances of the runs that a run is compared with, and their ratio."""
+        ratio, count = (FINER, 3) if tolerance < self.rounded else (RATIO, 1)
+        return ratio, list(accumulate(repeat(ratio, count), mul, initial=tolerance))[1:]
+
+    def _estimated(
+        self, trajectory: Any, tolerance: float, others: list[float], max_step: float = math.inf, *, last: bool = False
+    ) -> GlobalError:
         """Return the estimate of the error of a run by others; the last runs are compared with all of them."""
         compared = _Samples(trajectory, self.start, self.interface)
         safety = SAFETY if len(others) == 1 else SAFETY_OF_ROUNDING
@@ -361,6 +421,7 @@ class Runs:
             requested=self.wanted,
             tolerance=tolerance,
             h=float(self._steps(tolerance).get("h") or 0.0),
+            max_step=max_step,
             t=compared.t,
             differences=differences,
             safety=safety,
@@ -434,6 +495,10 @@ class _Samples:
         self.epsilon, self.firsts = roundoff(interface.words), first_of_groups(interface, m)
         self.errors = self.epsilon * np.abs(np.array([np.asarray(each) for each in self.states]))
         self.motion: Motion | None = None
+        plan = trajectory.plan
+        self.absolute: Array | float = 0.0
+        if isinstance(plan, Adaptive):
+            self.absolute = absolute_tolerances(interface, m, plan.absolute_tolerance)
 
     def compare(self, other: Any) -> bool:
         """Compare with another run, whose differences are infinite after its end; return whether it is complete."""
@@ -445,7 +510,7 @@ class _Samples:
                 states = other._states_at(self.t[some])
                 differences[:, some] = [abs(x - y[some]) for x, y in zip(states, self.states, strict=True)]
         np.maximum(self.errors, differences, out=self.errors)
-        self.motion = Motion(np.asarray(other.t), other.q, other.p, self.firsts, self.epsilon)
+        self.motion = Motion(np.asarray(other.t), other.q, other.p, self.firsts, self.epsilon, self.absolute)
         return bool(np.isfinite(differences).all())
 
     def lose(self) -> None:

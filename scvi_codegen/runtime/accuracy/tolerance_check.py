@@ -78,8 +78,8 @@ def known_digits(
         if stepper.interface.inputs:
             q, p = stepper.integrate(nudged, trajectory.p[0], inputs=inputs or {}, **arguments).at(times)
         else:
-            second = stepper.integrate(nudged, trajectory.p[0], t_eval=times, **arguments)
-            q, p = second.q, second.p
+            repeated = stepper.integrate(nudged, trajectory.p[0], t_eval=times, **arguments)
+            q, p = repeated.q, repeated.p
     except (ScviCodegenError, _TooLongError):
         return None
     size = math.sqrt(float(np.mean(np.sum(q**2, axis=1)))) or 1.0

@@ -35,7 +35,7 @@ from scvi_codegen.runtime.constraints.projection import consistent, constraint_v
 from scvi_codegen.runtime.core.compiled_method import OF_KNOWN_SIZES, Variants
 from scvi_codegen.runtime.core.features import check_together, require
 from scvi_codegen.runtime.core.integrator import Integrator
-from scvi_codegen.runtime.core.validation import Array, Parameters, States, flat_state
+from scvi_codegen.runtime.core.validation import Array, Parameters, States, coordinate_shapes, flat_state
 from scvi_codegen.runtime.core.words import check_doubles, checked_time, hashed
 from scvi_codegen.runtime.ensemble.device import check_device, on_processor
 from scvi_codegen.runtime.ensemble.ensemble import Ensemble
@@ -254,7 +254,15 @@ class Stepper(WithEventsInDouble, WithPaths, Integrator):
             span = checked_number(saved["t_end"], "the time t_end") - t
             return largest_step(self, q, momenta, span, tolerance, t=t, parameters=parameters, options=start["options"])
 
-        def confirming(stops: Sequence[float], progress: Callable[[int], None], **steps: float | None) -> Trajectory:
+        def integrate(check: Callable[[int], None] | None, **steps: Any) -> Trajectory:
+            progress = start["progress"]
+            if check is not None:
+                progress = check if progress is None else lambda count: (start["progress"](count), check(count))
+            if "max_step" in steps and "max_step" in start:
+                steps["max_step"] = min(steps["max_step"], start["max_step"])
+            return self.integrate(q, p, **{**start, "progress": progress, **saved, **steps})
+
+        def confirming(stops: Sequence[float], progress: Callable[[int], None], **steps: Any) -> Trajectory:
             arguments = {**start, "progress": progress}
             if self._has_tau:
                 return bare.integrate(q, p, **arguments, **steps, t_end=stops[-1])
@@ -262,14 +270,15 @@ class Stepper(WithEventsInDouble, WithPaths, Integrator):
 
         runs = Runs(
             wanted=error,
-            integrate=partial(self.integrate, q, p, **start, **saved),
+            integrate=integrate,
             confirming=confirming,
             start=checked_number(t, "the time t"),
+            end=checked_number(saved["t_end"], "the time t_end"),
             step_of_tau=step_of_tau if self._has_tau else None,
             interface=self.interface,
             smooth=by_pieces is not None or not self.interface.kinks,
         )
-        trajectory = runs.confirmed_run()
+        trajectory: Trajectory = runs.confirmed_run()
         assert trajectory.confirmation is not None  # by confirmed_run
         if not (trajectory.confirmation.confirmed or self._has_tau) and (precise := self._in_double_double) is not None:
             return precise._confirmed(error, q, p, start, saved)
@@ -282,6 +291,9 @@ class Stepper(WithEventsInDouble, WithPaths, Integrator):
         if not interface.kinks or self._has_tau or interface.words > 1:
             return None
         name = interface.coordinates[0]
+        if interface.layout.coordinates:
+            array, shape = coordinate_shapes(interface)[0]
+            name = f"{array}[{', '.join('0' * len(shape))}]"
         with suppress(ScviCodegenError):
             stepper = self.with_events([Event(kink, then={name: name}) for kink in interface.kinks])
             _ = stepper.binding
