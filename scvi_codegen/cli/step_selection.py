@@ -43,6 +43,7 @@ def model_with_global_error(model: Model, error: float) -> tuple[Model, GlobalEr
         warnings.simplefilter("ignore", AccuracyWarning)  # reported in the line printed below
         result = wanted.confirmed(wanted.stepper())
     local = f"local tolerance of {result.tolerance:.1e}" if result.tolerance else "local tolerance of round-off"
+    local += "" if result.max_step == math.inf else f" and steps of at most {result.max_step:.3g}"
     local = f"step of tau of {result.h:.6g}" if result.h else local
     in_words = result.precision == DOUBLE_DOUBLE
     numbers = {
@@ -52,6 +53,7 @@ def model_with_global_error(model: Model, error: float) -> tuple[Model, GlobalEr
         "confirmed": result.confirmed,
         "confirmed_until": result.confirmed_until,
         "tolerance": result.tolerance,
+        "max_step": None if result.max_step == math.inf else result.max_step,
         "h": result.h,
         "runs": result.runs,
         "precision": result.precision,

@@ -361,10 +361,11 @@ class Model(TimeSpan):
         self._check_alone()
         stepper = stepper or self.stepper()
         state, h, common = self.initial_state(stepper), self.h, self._common(options, threads)
-        tolerance = self.tolerance
+        control = {"tolerance": self.tolerance if h is None else None, **self._control}
         if self.error is not None:
             result = self.confirmed(stepper, options=options, threads=threads)
-            h, tolerance = result.steps.get("h"), result.steps.get("tolerance")
+            h, control = result.steps.get("h"), control | {"tolerance": None, **result.steps}
+            control.pop("h", None)
             if result.precision != "double":
                 stepper = stepper._in_double_double or stepper
         elif h is None and self.has_time_transformation:
@@ -381,8 +382,7 @@ class Model(TimeSpan):
             **state,
             h=abs(h) if h is not None and to_end else h,
             t_end=self.t + self.covered if to_end else None,
-            tolerance=tolerance if h is None else None,
-            **self._control,
+            **control,
             parameters=self.parameters_at_start(stepper),
             **common,
         )

@@ -14,6 +14,7 @@ from typing import Any
 import mpmath
 import numpy as np
 import pytest
+from commands import json_of
 from notation import lagrange
 from scipy.integrate import solve_ivp
 
@@ -380,3 +381,39 @@ def test_a_run_for_comparison_has_other_steps():
         assert np.ptp(fractions) > 0.5
         assert len({*np.round(fractions, 6)}) == 9
     assert len(irregular_stops(np.array([0.0, 1.0]), 0)) == LEAST_STOPS + 1
+
+
+def test_steps_of_a_confirmed_run_with_kinks_reproduce_it(tmp_path):
+    """In Python, of models and on the command line: the tolerance and the largest step."""
+    stepper = stepper_of("motor", "svi:4")
+    start = {"q": [0.0], "p": [1.0], "t_end": 10.0, "parameters": {"a": 4.1}}
+    with warnings.catch_warnings(action="ignore"):
+        for a in np.linspace(4.1, 5.9, 7):
+            start["parameters"]["a"] = float(a)
+            run = stepper.integrate(**start, error=1e-8)
+            if run.confirmation.confirmed and run.confirmation.max_step < math.inf:
+                break
+    assert run.confirmation.max_step < 1.0
+    assert np.array_equal(stepper.integrate(**start, **run.confirmation.steps).q, run.q)
+    path = tmp_path / "motor.toml"
+    system = (
+        '[system]\nname = "motion"\ncoordinates = ["x"]\nlagrangian = "x_dot**2/2"\n[forces]\nx = "unit_step(t - a)"'
+    )
+    more = f'[parameters]\na = {a}\n[method]\nmethod = "svi:4"\n[run]\nspan = 10.0\nerror = 1e-8'
+    path.write_text(f"{system}\n{more}\n[initial]\nq = [0.0]\np = [1.0]\n")
+    assert np.array_equal(sc.load_model(path).integrate().q, run.q)
+    found = json_of("run", path, "-o", tmp_path / "motor.npz")["global_error"]
+    assert (found["confirmed"], found["max_step"]) == (True, run.confirmation.max_step)
+    with np.load(tmp_path / "motor.npz") as file:
+        assert np.array_equal(file["q"], run.q)
+
+
+def test_kinks_of_arrays_are_found():
+    """Two balls on a stiff floor: the second one is at the height of the test above."""
+    system = lagrange("floor", "y[N]", "sum(i in N, y_dot[i]**2/2 - 9.8*y[i] - 1e5*positive_part(-y[i])**2)")
+    start = {"q": [1.7, FLOOR_HEIGHT], "t_end": 3.0 * math.sqrt(2.0 * FLOOR_HEIGHT / 9.8)}
+    with warnings.catch_warnings(action="ignore"):
+        run = sc.compile_stepper(system, "svi:4").integrate(**start, error=1e-6)
+    assert run.stepper.interface.kinks == ("-y[i] for i in N",)
+    assert run.confirmation.confirmed
+    assert run.q[-1, 1] == pytest.approx(0.04951824, abs=1e-6)
