@@ -69,6 +69,8 @@ LONG_NUMBER = re.compile(r"\d{12}")
 """Numbers of robots from files, with which a Lagrangian is not shown."""
 SECONDS = 30
 """Duration of the span of a model at the speed that a page begins with, unless time is in seconds or so."""
+STEPS = 1000
+"""Default number of steps of the span, from which the speed follows, of step sizes far from seconds."""
 HEIGHT = 760
 """Height of a page in a notebook, in pixels."""
 WHOLE = 24
@@ -109,7 +111,8 @@ def page(
             points; ``bodies``, points that are drawn and dragged, by default those that move; ``trails``, points whose
             paths are drawn, by default those of the bodies.
         motion: of a system, the arguments of :class:`Model`: ``q``, ``velocity`` or ``p``, ``h`` or ``tolerance``, and
-            also ``method`` (default SVI(8)) and others; default of ``span``: 30.
+            also ``method`` (default SVI(8)) and others; default of ``span``: 30, or 1000 steps of
+            a size below 0.001 or above 1.
 
     Returns:
         The page, which a notebook displays.
@@ -142,7 +145,8 @@ def _model_of(system: Any, motion: Mapping[str, Any]) -> Model:
             raise ArgumentError(f"page() takes no {name!r}{keyword_hint(name, known)}")
     if "q" not in motion:
         raise ArgumentError(f"a page of the system {system.name} requires its initial state: give q, and velocity or p")
-    default = {} if "steps" in motion else {"span": 30.0}
+    h = abs(motion.get("h") or 1.0)
+    default = {} if "steps" in motion else {"span": 30.0 if 1e-3 <= h <= 1.0 else STEPS * h}
     return Model(**{"system": system, "method": DEFAULT_METHOD, **default, **motion})
 
 
@@ -309,10 +313,16 @@ def _initial(document: Mapping[str, Any], names: Sequence[str]) -> tuple[str, ..
     if not all(isinstance(formula, str) for formula in formulas):
         return ()
     try:
-        texts = tuple(sympy.ccode(parse_expression(str(formula), known)) for formula in formulas)
+        texts = tuple(_c_text(parse_expression(str(formula), known)) for formula in formulas)
     except ExpressionError:
         return ()
     return () if any("\n" in text for text in texts) else texts  # of functions that C does not have
+
+
+def _c_text(formula: sympy.Expr) -> str:
+    """Return a formula as C without the constants of math.h that are no standard C, such as ``M_PI``."""
+    constants = {number: sympy.Float(number, 17) for number in (sympy.pi, sympy.E)}
+    return str(sympy.ccode(formula.xreplace(constants), math_macros={}))
 
 
 def _lagrangian(document: Mapping[str, Any], model: Model) -> list[str]:

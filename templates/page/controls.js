@@ -52,7 +52,7 @@ function addSlider(title, label, name, { low, high, log = false, hard = true, ge
     if (document.activeElement !== range) range.value = at;
     range.style.setProperty("--at", `${100 * at}%`);
     range.setAttribute("aria-valuetext", short(x));
-    if (document.activeElement !== number) number.value = Math.abs(x) < 1e-15 * Math.max(Math.abs(low), Math.abs(high)) ? 0 : [4, 3].map((digits) => compact(x, digits)).find((shown, k) => k || shown.length < 8);
+    if (document.activeElement !== number) number.value = Math.abs(x) < 1e-15 * Math.max(Math.abs(low), Math.abs(high)) ? 0 : [4, 3].map((digits) => compact(x, digits)).find((shown, k) => k || shown.length <= 8);
   };
   const changed = (x) => { put(x); showSliders(); writeAddress(); };
   range.addEventListener("input", () => { const s = +range.value; changed(clamped(+(log ? low * (high / low) ** s : low + (high - low) * s).toPrecision(4), low, high)); });

@@ -405,7 +405,7 @@ function ticks(low, high, wanted) {
 /** Returns a number as text of few characters, which can be read again. */
 function compact(x, digits = 3) {
   const rounded = +x.toPrecision(digits);
-  return Math.abs(x) < 1e-3 && x ? rounded.toExponential() : String(rounded);
+  return x && (Math.abs(x) < 1e-3 || Math.abs(x) >= 1e6) ? rounded.toExponential().replace("e+", "e") : String(rounded);
 }
 /** Returns a number as text of few characters, to be read by people. */
 const short = (x, digits = 3) => compact(x, digits).replace("-", "\u2212").replace("e-", "e\u2212").replace("e+", "e");

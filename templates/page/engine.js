@@ -38,6 +38,9 @@ const STORED = 2000; // states of the history at most; then every second one is 
 const TRAIL = 900; // points of a trail
 const WHOLE = about.whole; // coordinates up to which the history contains all of them
 
+/** Returns an object by names of the model, which has no other properties, whatever the names. */
+const byName = (pairs) => Object.assign(Object.create(null), Object.fromEntries(pairs));
+
 // ---- settings: they determine the motion, and are in the address
 const initial = {
   step: about.step.value, speed: about.speed.value, q: about.q, v: about.v,
@@ -46,9 +49,9 @@ const initial = {
 let settings = structuredClone(initial);
 let legs = [0]; // numbers of steps, "r" where the direction of time is reversed, and new values of inputs
 const value = (given) => (typeof given === "string" ? settings.parameters[given] : given);
-const ranges = Object.fromEntries(about.parameters.map(({ name, low, high }) => [name, [low, high]]));
-const inputs = Object.fromEntries(about.parameters.filter(({ input }) => input).map(({ name, place }) => [name, place]));
-let held = Object.fromEntries(Object.keys(inputs).map((name) => [name, initial.parameters[name]])); // present values of inputs
+const ranges = byName(about.parameters.map(({ name, low, high }) => [name, [low, high]]));
+const inputs = byName(about.parameters.filter(({ input }) => input).map(({ name, place }) => [name, place]));
+let held = byName(Object.keys(inputs).map((name) => [name, initial.parameters[name]])); // present values of inputs
 
 /** Sets the settings from the address; returns the legs to perform, or an error. */
 function readAddress(text) {
@@ -82,7 +85,7 @@ function readAddress(text) {
     }
   }
   settings = next;
-  held = Object.fromEntries(Object.keys(inputs).map((name) => [name, settings.parameters[name]]));
+  held = byName(Object.keys(inputs).map((name) => [name, settings.parameters[name]]));
   return { paused: given.has(".n"), steps };
 }
 

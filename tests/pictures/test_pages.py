@@ -419,3 +419,44 @@ def test_every_motion_of_the_site_moves_within_its_size(browser, tmp_path):
                 break
         assert (state["steps"] > 5, state["fault"], messages) == (True, 0, []), path
         view.close()
+
+
+def script(name: str, *beginnings: str) -> str:
+    """Return the lines of a script of pages that begin so, with the lines of functions."""
+    text = (Path(pages.__file__).parents[2] / "templates" / "page" / name).read_text(encoding="utf-8")
+    ends = ["^}$" if each.startswith("function") else ";$" for each in beginnings]
+    patterns = [rf"^{re.escape(each)}.*?{end}" for each, end in zip(beginnings, ends, strict=True)]
+    found = [re.search(pattern, text, re.MULTILINE | re.DOTALL) for pattern in patterns]
+    return "\n".join(match[0] for match in found if match)
+
+
+def test_names_of_properties_of_objects_are_names_and_large_numbers_keep_their_digits():
+    names = script("plots.js", "const GREEK", "const LOW_DIGITS", "function parted", "const spelled")
+    numbers = script("drawing.js", "function compact")
+    tables = script("engine.js", "const byName")
+    program = f"""{names} {numbers} {tables}
+    const ranges = byName([["mu", [0, 1]]]);
+    console.log(JSON.stringify([
+      ["constructor", "toString", "theta_1", "valueOf"].map(spelled), ["constructor", "mu"].map((key) => key in ranges),
+      [3.986e14, 1234567, 999999, 0.0001234, -2.5e7, 0].map((x) => compact(x, 4)),
+    ]));"""
+    printed = subprocess.run([needs("node"), "-e", program], capture_output=True, text=True, check=True).stdout
+    labels, known, numbers = json.loads(printed)
+    assert labels == ["constructor", "toString", "θ₁", "valueOf"]
+    assert known == [False, True]
+    assert numbers == ["3.986e14", "1.235e6", "1000000", "1.234e-4", "-2.5e7", "0"]
+
+
+def test_formulas_of_initial_values_are_standard_c():
+    document = {"initial": {"q": {"u": "sin(pi*x) + exp(1)*x"}, "q_dot": {"u": "sqrt(2)*x/pi"}}}
+    texts = pages._initial(document, ["x"])
+    assert len(texts) == 2
+    assert not any("M_" in text for text in texts)
+
+
+def test_default_span_and_speed_follow_from_the_step_size():
+    orbit = sc.problem("kepler").system
+    q, velocity = [7e6, 0.0], [0.0, 7.5e3]
+    slow = pages._model_of(orbit, {"q": q, "velocity": velocity, "h": 10.0, "method": "svi:2"})
+    assert slow.span == 1e4
+    assert pages._model_of(orbit, {"q": q, "velocity": velocity, "h": 0.1, "method": "svi:2"}).span == 30.0
