@@ -301,6 +301,9 @@ _TABLE |= {
         "path", TEXT, "NAMES", "Closed path: true, or the coordinates that follow, x2,-y2,..", common=False
     ),
     "starts": Option("path", COUNT, "N", "Number of further starts at random [0].", common=False),
+    "revolutions": Option(
+        "path", COUNT, "N", "Start around the centre, too, both ways, with up to N whole revolutions.", common=False
+    ),
 }
 OPTIONS = tuple(option.named(name) for name, option in _TABLE.items())
 KEYED = tuple(option for option in OPTIONS if option.section and not option.is_section)

@@ -88,6 +88,56 @@ def test_starts_at_random_find_paths_where_the_continuation_ends_at_a_fold():
     assert np.abs(path.run().q[-1] - q1).max() < 1e-9
 
 
+def test_a_path_through_a_singularity_is_dropped(kepler):
+    """Half of an ellipse with the semi-major axis a = 5/4; the mean of L over it is 3/(2 a) by the virial theorem."""
+    a, T = 1.25, np.pi * 1.25**1.5
+    path = kepler.path([1.0, 0.0], [-1.5, 0.0], T, steps=44)
+    assert path.dropped > 0
+    assert path.action == pytest.approx(1.5 * T / a, abs=1e-11)
+    assert abs(path.p[0]) == pytest.approx([0.0, np.sqrt(2.0 - 1.0 / a)], abs=1e-9)
+    assert path.error < 1e-9
+    assert path.energy_change < 1e-9
+    line = np.linspace([1.0, 0.0], [-1.5, 0.0], 45)
+    with pytest.raises(PathError, match="2 stationary points of the discrete action are no motions"):
+        kepler.path([1.0, 0.0], [-1.5, 0.0], T, steps=44, start=line)
+
+
+def test_starts_go_around_a_centre(kepler):
+    """Angles are those of the run of the path; the times of flight are those of Kepler's equation."""
+    angle = np.arctan2(0.8, -0.5)
+    for revolutions in (0, -1, 1, -2):
+        path = kepler.path([1.0, 0.0], [-0.5, 0.8], 10.0, steps=60, revolutions=revolutions)
+        run = path.run()
+        turned = np.unwrap(np.arctan2(run.q[:, 1], run.q[:, 0]))[-1]
+        assert turned == pytest.approx(angle + 2 * np.pi * revolutions, abs=1e-8)
+        exact = kepler.integrate(path.q[0], path.p[0], t_end=10.0)
+        assert np.abs(exact.q[-1] - [-0.5, 0.8]).max() < 1e-5
+    with pytest.raises(PathError, match="continuation in the duration ended"):
+        kepler.path([1.0, 0.0], [-0.5, 0.8], 5.0, steps=30, revolutions=1)
+    with pytest.raises(StateError, match="either start or revolutions"):
+        kepler.path([1.0, 0.0], [-0.5, 0.8], 5.0, steps=30, revolutions=1, start=np.zeros((31, 2)))
+    with pytest.raises(StateError, match="requires a rotational symmetry"):
+        compiled(["x"], "x_dot**2/2 - x**2/2").path([1.0], [0.3], 1.0, revolutions=1)
+
+
+def test_error_of_a_path_is_that_of_finer_steps(kepler):
+    exact = kepler.path([1.0, 0.0], [-0.5, 0.8], 2.0, steps=96)
+    for n in (3, 6):
+        path = kepler.path([1.0, 0.0], [-0.5, 0.8], 2.0, steps=n)
+        q, p = exact.q[:: 96 // n], exact.p[:: 96 // n]
+        away = np.abs(path.q - q).max() / np.ptp(q, axis=0).max(), np.abs(path.p - p).max() / np.abs(p).max()
+        assert max(away) / 3 < path.error < 10 * max(away)
+
+
+def test_indices_of_indefinite_kinetic_energy_are_refused():
+    stepper = compiled(["x", "y"], "(x_dot**2 - y_dot**2)/2 - (x**2 - y**2)/2 + x*y/10")
+    path = stepper.path([1.0, 0.0], [0.3, 0.2], 2.0, steps=12)
+    assert path.error < 1e-9
+    for name in ("index", "conjugate_times"):
+        with pytest.raises(MethodError, match="the kinetic energy of 'system' is indefinite"):
+            getattr(path, name)
+
+
 @pytest.mark.parametrize(("T", "index"), [(3.0, 0), (3.3, 1), (6.2, 1), (6.4, 2), (9.3, 2), (9.5, 3), (20.0, 6)])
 def test_morse_index_of_the_oscillator(oscillator, T, index):
     path = oscillator.path([1.0], [0.3], T, steps=40)

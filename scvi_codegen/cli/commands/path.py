@@ -1,6 +1,7 @@
 """Command ``scvi-codegen path``: motions between two positions in a given time, and closed paths."""
 
 import math
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path as FilePath
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 from scvi_codegen.cli.command_group import check_writable, reporting, tell
 from scvi_codegen.cli.model_options import model_arguments, read_model, with_known_sizes
 from scvi_codegen.cli.recording import check_format
-from scvi_codegen.errors import ModelFileError
+from scvi_codegen.errors import MethodError, ModelFileError
 from scvi_codegen.files.export import FORMATS
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.options import options_of
@@ -35,9 +36,10 @@ def path(model_name: str, output: str | None, plot: str | None, **choices: Any) 
 
     A path is a stationary point of the discrete action. Its steps are those of MODEL (--step), its start is --from, by
     default the initial position of MODEL. A problem may have several solutions: --starts tries curves at random as
-    well; all different paths are printed, that of least action first. With --energy the duration is unknown and --span
-    is an estimate. --closed finds a closed path near the run of MODEL over --span: 'true' for a periodic orbit, or the
-    coordinates that follow after --span, with signs, as in choreographies.
+    well, --revolutions curves around the centre of a rotational symmetry; all different paths are printed, that of
+    least action first. With --energy the duration is unknown and --span is an estimate. --closed finds a closed path
+    near the run of MODEL over --span: 'true' for a periodic orbit, or the coordinates that follow after --span, with
+    signs, as in choreographies.
 
     \b
     Examples:
@@ -84,8 +86,9 @@ def _paths(model: Model) -> list[Path]:
         arguments["inputs"] = model.all_inputs()
     span = math.copysign(model.covered, model.h)
     if closed is None:
-        ends = wanted.get("from", model.q), wanted["to"]
-        return different_paths(stepper, *ends, span, starts=wanted.get("starts", 0), **arguments)
+        q0, q1 = wanted.get("from", model.q), wanted["to"]
+        arguments |= {"starts": wanted.get("starts", 0), "revolutions": wanted.get("revolutions")}
+        return different_paths(stepper, q0, q1, span, **arguments)
     near = model.integrate()
     start = near.at(np.linspace(near.t[0], near.t[-1], steps + 1))[0]
     symmetry = True if closed in ("true", ["true"]) else closed
@@ -94,14 +97,24 @@ def _paths(model: Model) -> list[Path]:
 
 def _described(found: Path) -> str:
     p, names = np.asarray(found.p)[0], found.stepper.interface.momentum_columns
-    index = "" if found.index is None else f", Morse index {found.index}"
-    conjugate = "".join(f"\n  conjugate time between {low:g} and {high:g}" for low, high in found.conjugate_times)
+    number, times = _indices(found)
+    index = "" if number is None else f", Morse index {number}"
+    conjugate = "".join(f"\n  conjugate time between {low:g} and {high:g}" for low, high in times)
+    dropped = "\n  stationary points of the discrete action that are no motions, dropped: "
     shown = ", ".join(f"{name} = {x:.12g}" for name, x in list(zip(names, p, strict=True))[:MOST_SHOWN])
     period = f", period {found.period:.12g}" if found.solution.intervals.symmetry is not None else ""
     return (
         f"action {found.action:.12g}{index}; duration {found.t[-1] - found.t[0]:.12g}{period}; largest jump of the "
-        f"momentum {found.residual:.1e} (relative){conjugate}\n  {shown}"
+        f"momentum {found.residual:.1e}, discretisation error {found.error:.1e} (relative){conjugate}"
+        f"{f'{dropped}{found.dropped}' if found.dropped else ''}\n  {shown}"
     )
+
+
+def _indices(found: Path) -> tuple[int | None, Any]:
+    """Return the Morse index and the conjugate times, ``None`` and none where they are undefined."""
+    with suppress(MethodError):
+        return found.index, found.conjugate_times
+    return None, np.empty((0, 2))
 
 
 def _numbers(model: Model, found: list[Path]) -> dict[str, Any]:
@@ -112,8 +125,9 @@ def _numbers(model: Model, found: list[Path]) -> dict[str, Any]:
         return {
             **{
                 name: getattr(each, name)
-                for name in ("action", "index", "residual", "at_rest", "iterations", "conjugate_times")
+                for name in ("action", "residual", "error", "energy_change", "at_rest", "iterations", "dropped")
             },
+            **dict(zip(("index", "conjugate_times"), _indices(each), strict=True)),
             "duration": float(each.t[-1] - each.t[0]),
             "period": each.period if each.solution.intervals.symmetry is not None else None,
             "energy": float(each.stepper.energy(q[0], p[0], model.t, each.solution.intervals.parameters_at_start)),

@@ -123,6 +123,39 @@ class Intervals:
             raise step_failure(status, report, step=int(report.steps), h=float(self.h[report.steps]))
         return Linearised(p0, p1, actions, p1[:-1] - p0[1:]), derivatives
 
+    def refined(self, q: Array, p0: Array, count: int) -> tuple[Array, Array]:
+        """Return the (N, m) positions and momenta at the ends of all intervals from their starts, in ``count`` steps.
+
+        Raises:
+            StepFailedError: if one of these steps fails.
+        """
+        h, state = self.h / count, (np.ascontiguousarray(q[:-1]), np.ascontiguousarray(p0))
+        for k in range(count):
+            state = self._stepped(self.t + k * h, h, *state)
+        return state
+
+    def _stepped(self, t: Array, h: Array, q: Array, p: Array) -> tuple[Array, Array]:
+        """Return the ends of one step of each interval."""
+        binding, count = self.binding, len(h)
+        q1, p1 = np.empty((2, *q.shape))
+        report = binding.new("report *")
+        status = binding.function("actions")(
+            count,
+            *map(binding.pointer, (t, h, q, p, self.parameters)),
+            self.parameters.shape[1] if self.parameters.ndim == 2 else 0,
+            binding.options(self.options),
+            *map(binding.pointer, (q1, p1, np.empty(count))),
+            report,
+            binding.workspace(),
+        )
+        if status:
+            raise step_failure(status, report, step=int(report.steps), h=float(h[report.steps]))
+        return q1, p1
+
+    def products(self, blocks: Any, vectors: Array) -> Array:
+        """Return the products of the N matrices of :class:`Linearised` and (N, d) vectors."""
+        return np.asarray(np.einsum("kij,kj->ki", blocks, vectors))
+
 
 class ManyCoordinates(Intervals):
     """Intervals whose derivatives are sparse: lattices.
@@ -168,6 +201,13 @@ class ManyCoordinates(Intervals):
         entries = [derivatives[:, side * groups + chosen, p * m + self.rows] for p in (0, 1) for side in (0, 1)]
         by_h = derivatives[:, -1].reshape(-1, 2, m).transpose(1, 0, 2)
         return Linearised(values.p0, values.p1, values.actions, values.residual, np.array(entries), by_h)
+
+    def products(self, blocks: Any, vectors: Array) -> Array:
+        """See :meth:`Intervals.products`."""
+        result = np.zeros_like(vectors)
+        for row, terms in zip(result, blocks * vectors[:, self.columns], strict=True):
+            np.add.at(row, self.rows, terms)
+        return result
 
 
 class ReducedIntervals(Intervals):
@@ -234,6 +274,16 @@ class ReducedIntervals(Intervals):
             t = float(self.t[min(k, len(self.t) - 1)] + (self.h[-1] if k == len(self.t) else 0.0))
             result = self.stepper.project(result, t=t, parameters=self._parameters_of(min(k, len(self.t) - 1)))[0]
         return np.asarray(result)
+
+    def _stepped(self, t: Array, h: Array, q: Array, p: Array) -> tuple[Array, Array]:
+        """See :meth:`Intervals._stepped`."""
+        ends = [
+            self.stepper.step(
+                q[k], p[k], h=float(h[k]), t=float(t[k]), parameters=self._parameters_of(k), options=self.options
+            )
+            for k in range(len(h))
+        ]
+        return np.array([end[0] for end in ends]), np.array([end[1] for end in ends])
 
     def on_manifold_all(self, q: Array) -> Array:
         """See :meth:`Intervals.on_manifold_all`."""

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from itertools import chain, islice
-from typing import TYPE_CHECKING, Any
+from itertools import islice
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,11 +15,19 @@ from scvi_codegen.errors import AccuracyWarning, MethodError, PathError, StateEr
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.representation import summary
+from scvi_codegen.runtime.accuracy.warning_switch import warnings_wanted
 from scvi_codegen.runtime.core.features import require
 from scvi_codegen.runtime.core.validation import Array, Parameters, States, columns_of_inputs, flat_state
 from scvi_codegen.runtime.paths import solver
+from scvi_codegen.runtime.paths.discretisation import (
+    AT_REST,
+    Discretisation,
+    discretisation_of,
+    kinetic_energy_is_positive,
+)
 from scvi_codegen.runtime.paths.equations import Band, condensed_hessian, negative_directions
 from scvi_codegen.runtime.paths.intervals import Intervals, ManyCoordinates, ReducedIntervals
+from scvi_codegen.runtime.paths.starts import curves_around, curves_at_random, size_of
 from scvi_codegen.runtime.rotations.states import flat_states
 from scvi_codegen.validation import checked_count, checks_arguments
 
@@ -28,12 +36,12 @@ if TYPE_CHECKING:
 
 MANY_COORDINATES = 48
 """Number of coordinates from which derivatives are computed as sparse matrices."""
-WAVES, RANDOM_STARTS, FEW_ITERATIONS, SAME_PATH = 3, 10, 25, 1e-6
-"""Sine waves of a start at random, number of starts and of their iterations, and relative distance of equal paths."""
+RANDOM_STARTS, FEW_ITERATIONS, SAME_PATH, MOST_REVOLUTIONS = 10, 25, 1e-6, 10**6
+"""Number of starts at random and of their iterations, relative distance of equal paths, and most revolutions."""
+TOLERABLE_ERROR = 1e-3
+"""Largest discretisation error without a warning."""
 SAME_MATRIX, MOST_REPETITIONS = 1e-9, 1000
 """Distance of equal symmetries of closed paths, and the longest period in multiples of T."""
-AT_REST = 1e-9
-"""Range of the positions of a path at rest, relative to 1 + max|q|."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -44,12 +52,13 @@ class Path:
         t: (N + 1,) times.
         q, p: (N + 1, m) positions and momenta. Those of all steps agree, so that the states are those of a run.
         action: sum of the discrete Lagrangians; with forces and constraints that of L alone.
-        index: Morse index, the number of negative directions of the second variation; 0 for a minimum of the action.
-            ``None`` with forces.
-        conjugate_times: (c, 2) ends of the steps that contain points conjugate to the first one, as often as their
-            multiplicity; empty for closed paths and with many coordinates.
         residual: largest jump of the momentum between two steps, relative to the largest momentum; at rest, relative to
             the momentum of a step of the size 1 + max|q|.
+        error: discretisation error: the distance to the path of which all steps are divided by three, to first order.
+            Of positions it is relative to their largest range, of momenta to the largest one; the larger of both.
+        energy_change: range of a conserved energy over the nodes, relative to the largest p . v; else 0.
+        dropped: number of stationary points of the discrete action that were found first and are no paths of the
+            system, as those that pass through an attractive singularity.
         iterations: number of Newton iterations.
         repetitions: of a closed path, the number of times T after which all coordinates return, else 1; 0 if they do
             not return.
@@ -63,17 +72,57 @@ class Path:
     q: Array
     p: Array
     action: float
-    index: int | None
-    conjugate_times: Array
     residual: float
+    error: float
+    energy_change: float
     iterations: int
     stepper: Any = field(repr=False)
+    dropped: int = 0
     repetitions: int = 1
     zero_modes: int = 0
     arguments: Mapping[str, Any] = field(default_factory=dict, repr=False)
     solution: Any = field(default=None, repr=False)
 
-    __repr__ = summary("q", "action", "index", "residual")
+    __repr__ = summary("q", "action", "residual", "error")
+
+    @property
+    def index(self) -> int | None:
+        """Morse index, the number of negative directions of the second variation; 0 for a minimum of the action.
+
+        ``None`` with forces.
+
+        Raises:
+            MethodError: if the kinetic energy is indefinite: the index is infinite, and that of the discrete action
+                depends on the steps.
+        """
+        return self._counts[-1] if self._counts else None
+
+    @property
+    def conjugate_times(self) -> Array:
+        """(c, 2) ends of the steps that contain points conjugate to the first one, as often as their multiplicity.
+
+        Empty for closed paths and with many coordinates. Raises as :attr:`index`.
+        """
+        rises = np.diff(self._counts)
+        steps = np.repeat(np.arange(1, len(rises) + 1), rises)
+        return np.stack([self.t[steps], self.t[steps + 1]], axis=1)
+
+    @cached_property
+    def _counts(self) -> list[int]:
+        """Morse indices of [t_0, t_k], k = 1, 2, ..; that of the whole path alone if others are not known."""
+        solution = self.solution
+        at, intervals = solution.at, solution.intervals
+        if self.stepper.interface.exchange_names:
+            return []
+        if not kinetic_energy_is_positive(intervals, solution.q, np.concatenate([at.p0, at.p1[-1:]])):
+            raise MethodError(
+                f"the kinetic energy of '{self.stepper.interface.system}' is indefinite: the action has infinitely "
+                "many negative directions, so that the Morse index and conjugate times are undefined; the path itself, "
+                "its action and its momenta are not affected"
+            )
+        if intervals.symmetry is not None or intervals.sparse:
+            return [solution.factors.negative]
+        return negative_directions(at)
 
     @property
     def at_rest(self) -> bool:
@@ -133,6 +182,7 @@ class WithPaths:
         steps: int = 32,
         start: ArrayOrFunction = None,
         homotopy: bool = True,
+        revolutions: int | None = None,
         energy: float | None = None,
         closed: Any = None,
         t: float = 0.0,
@@ -144,7 +194,8 @@ class WithPaths:
 
         Newton's method on the positions of all steps, with the exact Hessian of the action. Boundary-value problems may
         have several solutions: each start leads to one. With forces, damping and inputs the equations are those of
-        Lagrange and d'Alembert.
+        Lagrange and d'Alembert. The discretisation error of the path is estimated by finer steps; a stationary point of
+        the discrete action that is no motion, as through an attractive singularity, is dropped and counted.
 
         Args:
             q0, q1: (m,) positions at t and t + T.
@@ -152,7 +203,10 @@ class WithPaths:
             steps: number of steps. A method of degree 4 to 8 needs about one to four in the shortest period over 2 pi.
             start: positions to start from: (steps + 1, m), or a function of time; by default the straight line.
             homotopy: if the straight line leads to no path, continue the path of duration T/16 to T. This finds the
-                direct one, without revolutions.
+                direct one, without revolutions. If that fails, starts around the centre of a rotational symmetry (both
+                ways) and ten curves at random follow.
+            revolutions: start from a curve around the centre of a rotational symmetry: 0 for the shorter way from q0
+                to q1, n for n more revolutions, negative for the other way around, from -1.
             energy: at the start, of closed paths the mean of all nodes; the duration is then unknown, T an estimate.
             closed: a closed path q(t + T) = M q(t) near ``start``, without q0 and q1: ``True`` (M = 1); the coordinates
                 that follow after T, in the order of all, as a permutation with signs, ``["x2", "-y2", ..]``; or an
@@ -196,31 +250,36 @@ class WithPaths:
             found = solver.closed(
                 intervals, nodes[:count], M, minimise=minimised, symmetric=not forced, energy=wanted, states=states
             )
-            closed_path = _described(stepper, found, begin, arguments, M)
-            if closed_path.at_rest:
-                warn(
-                    "path: the closed path is at rest in path.q[0], an equilibrium, which is closed for any T. For a "
-                    "motion give energy=, a start of larger amplitude, or a period of motions as T, not "
-                    f"{duration:g}; for small amplitudes it is near 2 pi over a frequency of the equilibrium",
-                    AccuracyWarning,
-                )
+            closed_path = _described(stepper, found, begin, arguments, _checked(found), M=M)
+            _warn_at_rest(closed_path, duration)
             return closed_path
         if q0 is None or q1 is None:
             raise StateError("path: give both positions q0 and q1, or closed= and start=")
         ends = [
             stepper._vector(_positions(stepper.interface, each, name), name) for each, name in ((q0, "q0"), (q1, "q1"))
         ]
-        found = _open_path(intervals, ends, nodes, duration, homotopy=homotopy and start is None)
+        if revolutions is not None:
+            attempts: list[Attempt] = [
+                partial(solver.continued_from_motion, intervals, curve, duration)
+                for curve in _around(intervals, ends, nodes, revolutions)
+            ]
+        else:
+            attempts = _attempts(intervals, ends, nodes, duration, homotopy=homotopy and nodes is None)
+        found, comparison, dropped = _first_motion(attempts)
         if wanted is not None:
             found = solver.AtEnergy(found.intervals, wanted, states).solved(found.q, found.iterations)
-        return _described(stepper, found, begin, arguments)
+            comparison = _checked(found)
+        return _described(stepper, found, begin, arguments, comparison, dropped=dropped)
 
 
-def different_paths(stepper: Any, q0: Any, q1: Any, T: float, *, starts: int = 0, **arguments: Any) -> list[Path]:
-    """Return the different paths from the straight line and from curves at random, that of least action first.
+def different_paths(
+    stepper: Any, q0: Any, q1: Any, T: float, *, starts: int = 0, revolutions: int | None = None, **arguments: Any
+) -> list[Path]:
+    """Return the different paths from the straight line and from other curves, that of least action first.
 
     Args:
         starts: number of curves at random: the line and sine waves of the size of the distance of the ends.
+        revolutions: largest number of whole revolutions, both ways, of starts around the centre of a rotation.
         arguments: further ones of :meth:`~scvi_codegen.Stepper.path`.
 
     Raises:
@@ -228,34 +287,25 @@ def different_paths(stepper: Any, q0: Any, q1: Any, T: float, *, starts: int = 0
     """
     paths, reason = list[Path](), None
     ends = [real_array(_positions(stepper.interface, each, "the ends"), "the ends") for each in (q0, q1)]
-    line = ends[0] + (ends[1] - ends[0]) * np.linspace(0.0, 1.0, arguments["steps"] + 1)[:, np.newaxis]
-    size = _size(line)
-    for start in chain([None], islice(curves_at_random(line), starts)):
+    line = _line(ends, arguments["steps"])
+    tried: list[dict[str, Any]] = [{}]
+    if revolutions is not None:
+        tried += [{"revolutions": turns} for turns in range(-1 - revolutions, 1 + revolutions)]
+    tried += [{"start": start} for start in islice(curves_at_random(line), starts)]
+    for choice in tried:
         try:
-            found = stepper.path(q0, q1, T, start=start, **arguments)
+            found = stepper.path(q0, q1, T, **choice, **arguments)
         except PathError as error:
             reason = reason or error
             continue
         known = (np.abs(each.q - found.q).max() + abs(each.t[-1] - found.t[-1]) for each in paths)
-        if all(distance > SAME_PATH * size for distance in known):
+        if all(distance > SAME_PATH * size_of(line) for distance in known):
             paths.append(found)
     if not paths:
-        raise PathError(f"{reason} ({starts} starts at random were tried)" if starts else str(reason)) from reason
+        raise PathError(
+            f"{reason} ({len(tried) - 1} further starts were tried)" if tried[1:] else str(reason)
+        ) from reason
     return sorted(paths, key=lambda each: each.action)
-
-
-def curves_at_random(line: Array) -> Iterator[Array]:
-    """Yield a straight line plus sine waves of its size, the same at each call."""
-    random, k = np.random.default_rng(0), np.arange(1, WAVES + 1)
-    shapes = np.sin(np.pi * np.linspace(0.0, 1.0, len(line))[:, np.newaxis] * k) / k
-    shapes[[0, -1]] = 0.0
-    while True:
-        yield line + _size(line) * shapes @ random.standard_normal((WAVES, line.shape[1]))
-
-
-def _size(line: Array) -> float:
-    """Return the largest entry of the positions, and of their differences."""
-    return max(float(np.abs(line).max()), float(np.ptp(line, axis=0).max())) or 1.0
 
 
 def _positions(interface: Any, values: Any, name: str) -> Any:
@@ -290,34 +340,106 @@ def _kind_of_intervals(stepper: Any, *, closed: bool, energy: bool) -> type[Inte
     return ManyCoordinates if stepper.dimension >= MANY_COORDINATES and not closed else Intervals
 
 
-def _open_path(
-    intervals: Intervals, ends: list[Array], nodes: Array | None, duration: float, *, homotopy: bool
-) -> solver.Solution:
-    """Return the path between two positions from given nodes, or from the straight line."""
+Attempt: TypeAlias = Callable[[], solver.Solution]
+
+
+def _first_motion(attempts: Sequence[Attempt]) -> tuple[solver.Solution, Discretisation, int]:
+    """Return the first path that is found and its discretisation error.
+
+    The number counts the stationary points before it that are no motions.
+
+    Raises:
+        PathError: if no attempt succeeds.
+    """
+    reasons, dropped = [], 0
+    for attempt in attempts:
+        try:
+            found = attempt()
+            comparison = discretisation_of(found)
+            if comparison.is_motion:
+                return found, comparison, dropped
+            dropped += 1
+        except solver.UNSOLVED as error:
+            reasons.append(str(error))
+    if dropped:
+        reasons.append(f"{dropped} stationary points of the discrete action are no motions: finer steps leave them")
+    raise PathError(
+        f"no path was found ({'; '.join(dict.fromkeys(reasons))}): give start=, a path nearby, or more steps"
+    )
+
+
+def _attempts(
+    intervals: Intervals, ends: Sequence[Array], nodes: Array | None, duration: float, *, homotopy: bool
+) -> list[Attempt]:
+    """Return functions that search a path from a start or the straight line, and with ``homotopy`` in other ways."""
     count = len(intervals.h)
     if nodes is None:
-        nodes = ends[0] + (ends[1] - ends[0]) * np.linspace(0.0, 1.0, count + 1)[:, np.newaxis]
+        nodes = _line(ends, count)
     elif len(nodes) != count + 1:
         raise StateError(f"start must have {count + 1} rows, one for each node, not {len(nodes)}")
     nodes[0], nodes[-1] = ends
     if isinstance(intervals, ReducedIntervals):
         nodes[1:] = [intervals.on_manifold(each, k, ends[0]) for k, each in enumerate(nodes[1:], 1)]
-    attempts: list[Callable[[], solver.Solution]] = [partial(solver.solved, intervals, nodes)]
+    attempts: list[Attempt] = [partial(solver.solved, intervals, nodes)]
     if homotopy:
         attempts.append(partial(solver.continued, intervals, nodes, duration))
     if not intervals.stepper.interface.exchange_names:  # many coordinates: quicker than the continuation
         attempts.insert(1 if intervals.sparse else len(attempts), partial(solver.descended, intervals, nodes))
     if homotopy and not intervals.sparse:
-        attempts.extend(partial(_from, intervals, start) for start in islice(curves_at_random(nodes), RANDOM_STARTS))
-    reasons = []
-    for attempt in attempts:
-        try:
-            return attempt()
-        except solver.UNSOLVED as error:
-            reasons.append(str(error))
-    raise PathError(
-        f"no path was found ({'; '.join(dict.fromkeys(reasons))}): give start=, a path nearby, or more steps"
-    )
+        around = _curves_around(intervals, nodes, 0, -1)
+        attempts.extend(partial(solver.continued_from_motion, intervals, curve, duration) for curve in around)
+        at_random = islice(curves_at_random(nodes), RANDOM_STARTS)
+        attempts.extend(partial(_from, intervals, start) for start in at_random)
+    return attempts
+
+
+def _line(ends: Sequence[Array], count: int) -> Array:
+    return np.asarray(ends[0] + (ends[1] - ends[0]) * np.linspace(0.0, 1.0, count + 1)[:, np.newaxis])
+
+
+def _around(intervals: Intervals, ends: Sequence[Array], start: Array | None, revolutions: int) -> list[Array]:
+    """Return starts around the centres of rotational symmetries; raise StateError if there is none."""
+    if start is not None:
+        raise StateError("path: give either start or revolutions, not both")
+    turns = checked_count(revolutions, "revolutions", least=-MOST_REVOLUTIONS, most=MOST_REVOLUTIONS)
+    curves = _curves_around(intervals, _line(ends, len(intervals.h)), turns)
+    if not curves:
+        raise StateError(
+            f"path: revolutions requires a rotational symmetry that turns q0 and q1, and "
+            f"'{intervals.stepper.interface.system}' has none: give start"
+        )
+    return curves
+
+
+def _curves_around(intervals: Intervals, line: Array, *revolutions: int) -> list[Array]:
+    at = float(intervals.t[0]), intervals.parameters_at_start
+    curves = [curve for turns in revolutions for curve in curves_around(intervals.stepper, line, *at, turns)]
+    if isinstance(intervals, ReducedIntervals):
+        for curve in curves:
+            curve[1:-1] = [intervals.on_manifold(each, k, curve[0]) for k, each in enumerate(curve[1:-1], 1)]
+    return curves
+
+
+def _warn_at_rest(path: Path, duration: float) -> None:
+    if path.at_rest:
+        warn(
+            "path: the closed path is at rest in path.q[0], an equilibrium, which is closed for any T. For a motion "
+            f"give energy=, a start of larger amplitude, or a period of motions as T, not {duration:g}; for small "
+            "amplitudes it is near 2 pi over a frequency of the equilibrium",
+            AccuracyWarning,
+        )
+
+
+def _checked(found: solver.Solution) -> Discretisation:
+    """Return the discretisation error of a stationary point; raise PathError if it is no motion."""
+    comparison = discretisation_of(found)
+    if not comparison.is_motion:
+        raise PathError(
+            "the stationary point of the discrete action that was found is no motion of the system: finer steps leave "
+            f"it (discretisation error {comparison.error:.1e}, change of the energy {comparison.energy_change:.1e}, "
+            "both relative): take more steps, or give another start"
+        )
+    return comparison
 
 
 def _from(intervals: Intervals, start: Array) -> solver.Solution:
@@ -328,23 +450,28 @@ def _from(intervals: Intervals, start: Array) -> solver.Solution:
 
 
 def _described(
-    stepper: Any, found: solver.Solution, begin: float, arguments: Mapping[str, Any], M: Array | None = None
+    stepper: Any,
+    found: solver.Solution,
+    begin: float,
+    arguments: Mapping[str, Any],
+    comparison: Discretisation,
+    *,
+    M: Array | None = None,
+    dropped: int = 0,
 ) -> Path:
     at, intervals, forced = found.at, found.intervals, bool(stepper.interface.exchange_names)
     count = len(intervals.h)
     t = begin + intervals.h[0] * np.arange(count + 1)
-    conjugate, zero_modes, repetitions, index = np.empty((0, 2)), 0, 1, None
+    zero_modes, repetitions = 0, 1
     if M is not None:
         repetitions = _order(M)
-        if not forced:
-            index, zero_modes = found.factors.negative, int((~found.factors.kept).sum())
-    elif intervals.sparse:
-        index = None if forced else found.factors.negative
-    elif not forced:
-        counts = negative_directions(at)
-        index, rises = counts[-1], np.diff(counts)
-        steps = np.repeat(np.arange(1, len(counts)), rises)
-        conjugate = np.stack([t[steps], t[steps + 1]], axis=1)
+        zero_modes = 0 if forced else int((~found.factors.kept).sum())
+    if comparison.error > TOLERABLE_ERROR and warnings_wanted():
+        warn(
+            f"the discretisation error of the path is about {comparison.error:.1e} (relative): take more steps than "
+            f"{count}, or a method of higher degree",
+            AccuracyWarning,
+        )
     jumps = at.residual if M is None else at.p1[:-1] - at.p0[1:]
     momenta = np.concatenate([at.p0, at.p1[-1:]])
     path = Path(
@@ -352,8 +479,9 @@ def _described(
         q=stepper.named(found.q),
         p=stepper.named(momenta),
         action=float(np.sum(at.actions)),
-        index=index,
-        conjugate_times=conjugate,
+        error=comparison.error,
+        energy_change=comparison.energy_change,
+        dropped=dropped,
         residual=float(np.abs(jumps).max(initial=0.0)),
         iterations=found.iterations,
         stepper=stepper,

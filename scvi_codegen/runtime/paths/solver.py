@@ -24,6 +24,8 @@ ROUNDING, ILL_CONDITIONED = 1e-14, 1e-7
 MOST_ITERATIONS, LEAST_STEP = 60, 1e-4
 FIRST_PART, MOST_GROWTH, LEAST_GROWTH, CONTINUED_ITERATIONS = 16, 2.0, 1.005, 15
 """Continuation: part of the duration it starts from, factors of the duration, and iterations of each."""
+DURATIONS = 2.0 ** np.linspace(-3.0, 3.0, 25)
+"""Parts of the duration in one of which a curve may be nearly a motion."""
 UNSOLVED = PathError, StepFailedError, StateError, ArithmeticError, np.linalg.LinAlgError
 MINIMISER_ITERATIONS, NEAR_CLOSED = 100, 0.01
 """Iterations of the minimiser, and relative Newton correction below which a closed path is not minimised first."""
@@ -97,21 +99,40 @@ def solved(intervals: Intervals, q: Array, most: int = MOST_ITERATIONS) -> Solut
     return Solution(q, intervals, at, factors, iterations)
 
 
-def continued(intervals: Intervals, q: Array, duration: float) -> Solution:
-    """Return the path by continuation in the duration, from a sixteenth, where the straight line is nearly exact."""
-    now, growth = duration / FIRST_PART, MOST_GROWTH
+def continued(intervals: Intervals, q: Array, duration: float, first: float | None = None) -> Solution:
+    """Return the path by continuation in the duration from ``first``.
+
+    By default this is a sixteenth, where the straight line is nearly exact.
+    """
+    now, growth = duration / FIRST_PART if first is None else first, MOST_GROWTH
     found = solved(intervals.lasting(now), q)
     total = found.iterations
-    while abs(now) < abs(duration) * (1.0 - 1e-12):
-        longer = duration if abs(now * growth) >= abs(duration) else now * growth
+    while abs(math.log(now / duration)) > 1e-12:
+        next_one = now * growth ** math.copysign(1.0, math.log(duration / now))
+        next_one = duration if abs(math.log(now / duration)) <= math.log(growth) else next_one
         try:
-            found = solved(intervals.lasting(longer), found.q, CONTINUED_ITERATIONS)
-            total, now, growth = total + found.iterations, longer, min(MOST_GROWTH, growth**1.5)
+            found = solved(intervals.lasting(next_one), found.q, CONTINUED_ITERATIONS)
+            total, now, growth = total + found.iterations, next_one, min(MOST_GROWTH, growth**1.5)
         except UNSOLVED as error:
             growth **= 0.5
             if growth < LEAST_GROWTH:
                 raise PathError(f"continuation in the duration ended at {now:g} of {duration:g}") from error
     return Solution(found.q, found.intervals, found.at, found.factors, total)
+
+
+def continued_from_motion(intervals: Intervals, q: Array, duration: float) -> Solution:
+    """Return the path by continuation from the duration in which the curve q is nearest to a motion.
+
+    It is the one of ``DURATIONS`` with the smallest jumps of the momentum relative to the momenta.
+    """
+    jumps = {}
+    for first in (duration * DURATIONS).tolist():
+        with suppress(*UNSOLVED):
+            at = intervals.lasting(first).linearised(q)
+            jumps[first] = float(np.abs(at.residual).max() / np.abs(at.p0).max())
+    if not jumps:
+        raise PathError("no step along the start has a solution")
+    return continued(intervals, q, duration, min(jumps, key=lambda first: jumps[first]))
 
 
 def descended(intervals: Intervals, q: Array) -> Solution:
@@ -167,8 +188,8 @@ class AtEnergy:
 
     def solved(self, q: Array, iterations: int = 0) -> Solution:
         """Return the path near the nodes q, and the duration of the intervals."""
-        M, intervals = self.M, self.intervals
-        x = np.append(q if M is None else q[: self.rows], float(intervals.h.sum()))
+        M = self.M
+        x = np.append(q if M is None else q[: self.rows], float(self.intervals.h.sum()))
         try:
             x, at, _, more = newton(self.evaluate, self.factorise, self.move, x, MOST_ITERATIONS)
         except UNSOLVED as error:
@@ -176,7 +197,7 @@ class AtEnergy:
                 f"no path of energy {self.energy:g} was found ({error}): give another T to start from, or another "
                 "energy, which must be that of a motion"
             ) from error
-        intervals = intervals.lasting(float(x[-1]))
+        intervals = self.intervals.lasting(float(x[-1]))
         own = factors_of(at, intervals) if M is None else Closed(at, self.intervals.basis_map(M), symmetric=True)
         return Solution(self.nodes(x), intervals, at, own, iterations + more)
 
