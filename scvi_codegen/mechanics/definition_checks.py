@@ -12,6 +12,7 @@ from scvi_codegen.errors import SystemDefinitionError, SystemDefinitionWarning, 
 from scvi_codegen.formulas.expressions import Tape, hessian, jacobian, kinked_root, unsupported_part
 from scvi_codegen.formulas.symbols import DOT, PARTS, TIME, check_names, number, symbol
 from scvi_codegen.mechanics.constraints import constraint_jacobian, forms_of_constraints
+from scvi_codegen.mechanics.continuity import corner_message, jump_message, jump_of
 from scvi_codegen.mechanics.derived_expressions import forms_of, null_direction, row_rank, sample_points, singular_part
 from scvi_codegen.mechanics.forces import check_damping
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -153,6 +154,18 @@ def _check_symbols(system: MechanicalSystem, role: str, arguments: Sequence[Symb
                 f"'{unknown[0]}' in the {where} is neither a coordinate, {kinds}, time nor a parameter{hint} "
                 "Give it a default value among the parameters, or list it as a coordinate"
             )
+    _check_continuity(system, role, formulas, [*system.coordinates, *arguments])
+
+
+def _check_continuity(
+    system: MechanicalSystem, role: str, formulas: Mapping[str, Expr], moving: Sequence[Symbol]
+) -> None:
+    """Raise :class:`SystemDefinitionError` for jumps of L or H across a surface, and for corners of constraints."""
+    if not system.lengths and (jump := jump_of(formulas[role], moving, system.constants)):  # lists end at a cutoff
+        raise SystemDefinitionError(jump_message(f"the {role} of '{system.name}'", *jump))
+    for name, g in zip(system.constraint_texts if system.constraints else (), system.constraints, strict=True):
+        if corner := jump_of(g, moving, system.constants, slopes=True):
+            raise SystemDefinitionError(corner_message(f"the constraint '{name}' of '{system.name}'", *corner))
 
 
 def check_lagrangian(system: MechanicalSystem) -> None:

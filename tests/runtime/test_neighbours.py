@@ -191,7 +191,7 @@ def test_boxes_of_other_shapes_and_none(box: Any) -> None:
     lengths = [] if box is None else [box] * 2 if isinstance(box, str) else box
     parts = [f"wrap(r[i, {a}] - r[j, {a}], {lengths[a]})" if lengths else f"(r[i, {a}] - r[j, {a}])" for a in (0, 1)]
     square = " + ".join(f"{part}**2" for part in parts)
-    pair = f"m[i]*m[j]*exp(-({square}))"
+    pair = f"m[i]*m[j]*exp(-({square}))*positive_part(1 - ({square})/1.1**2)**2"
     inside = f"unit_step(1.1**2 - ({square}))"
     runs = []
     for near, term in (({"of": "r", "cutoff": 1.1, **({"box": box} if box else {})}, pair), (None, f"{inside}*{pair}")):

@@ -41,6 +41,7 @@ from scvi_codegen.formulas.neighbours import Neighbours
 from scvi_codegen.formulas.rotations import MemberArray
 from scvi_codegen.formulas.symbols import DOT, check_names, input_formulas, symbol
 from scvi_codegen.indices import SIZES_REQUIRED, Access, Array, Convolution, Loop, Size
+from scvi_codegen.mechanics.continuity import corner_message, jump_message, jump_of
 from scvi_codegen.mechanics.definition_checks import warn_of_negative, warn_of_unused
 from scvi_codegen.mechanics.forces import check_damping
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -292,6 +293,7 @@ class ArraySystem:
             varying = [slot for slot, access in term.slots if access.array.name not in constant]
             if problem := unsupported_part(term.formula) or kinked_root(term.formula, [*varying, self.time]):
                 raise SystemDefinitionError(f"in the {self.function} of '{self.name}': {problem}")
+        self._check_continuity()
         for force in self.forces:
             for access, formula in force.targets:
                 if problem := unsupported_part(formula):
@@ -309,6 +311,18 @@ class ArraySystem:
                     f"no term contains {array.name}{DOT}: add a kinetic energy for '{array.name}', such as {entry}"
                 )
         check_damping(self.name, self.damping, self.parameters)
+
+    def _check_continuity(self) -> None:
+        """Raise :class:`SystemDefinitionError` for jumps of L or H across a surface, and for corners of constraints."""
+        constant = {array.name for array in self.fields}
+        values = dict(zip(self.parameters, self.defaults, strict=True))
+        of_energy = [] if self.neighbours else [(term, False) for term in self.terms]  # lists end at their cutoff
+        for term, slopes in (*of_energy, *((term, True) for term in self.constraints)):
+            moving = [slot for slot, access in term.slots if access.array.name not in constant]
+            if jump := jump_of(term.formula, moving, values, slopes=slopes):
+                subject = f"the constraint '{term}'" if slopes else f"the {self.function}"
+                message = corner_message if slopes else jump_message
+                raise SystemDefinitionError(message(f"{subject} of '{self.name}'", *jump))
 
     def check_run_time_sizes(self) -> None:
         """Raise :class:`SizesRequiredError` for a system that cannot be compiled for sizes known at run time."""

@@ -1,0 +1,78 @@
+"""Jumps of L and H across a surface and corners of constraints are refused; continuous functions and forces are not."""
+
+from typing import Any
+
+import pytest
+
+import scvi_codegen as sc
+
+FALL = "(x_dot**2 + y_dot**2)/2 - y"
+JUMPS = {
+    "a step of the potential": "x_dot**2/2 - 3*unit_step(x)",
+    "a step of the mass": "(1 + unit_step(x))*x_dot**2/2",
+    "a height that is 0 by default": "x_dot**2/2 - k*unit_step(x - a)",
+    "a sawtooth": "x_dot**2/2 - wrap(x, 2)",
+    "whole numbers": "x_dot**2/2 - rint(x)",
+    "a moving step": "x_dot**2/2 - unit_step(x - t)",
+    "a far step": "x_dot**2/2 - unit_step(x - 1e6)",
+    "a thin layer": "x_dot**2/2 - unit_step(x - a)*unit_step(a + 1/10 - x)",
+}
+CONTINUOUS = {
+    "a wall": "x_dot**2/2 - 1e5*positive_part(-x)**2",
+    "a corner": "x_dot**2/2 - 5*positive_part(x)",
+    "a product that vanishes on the surface": "x_dot**2/2 - unit_step(x)*x**2",
+    "two jumps that cancel": "x_dot**2/2 - unit_step(x) - unit_step(-x)",
+    "a power that is not whole": "x_dot**2/2 - 1000*positive_part(-x)**(5/2)",
+    "a time": "x_dot**2/2 - unit_step(t - a)*x",
+    "a periodic spring": "x_dot**2/2 - wrap(x, 3)**2",
+    "a shifted potential": "x_dot**2/2 - unit_step(4 - x**2)*(1/(1 + x**2) - 1/5)",
+}
+
+
+def line(text: str, **further: Any) -> sc.LagrangianSystem:
+    known = {"k": 0.0, "a": 5.0}
+    parameters = {name: value for name, value in known.items() if f"{name}*" in text or f" {name}" in text}
+    return sc.LagrangianSystem.from_text("line", ["x"], text, parameters=parameters, **further)
+
+
+@pytest.mark.parametrize("name", JUMPS)
+def test_jumps_are_refused_with_the_term(name: str) -> None:
+    with pytest.raises(
+        sc.SystemDefinitionError, match=r"the Lagrangian of 'line' jumps where .* = 0: its term .*forces"
+    ):
+        line(JUMPS[name])
+
+
+@pytest.mark.parametrize("name", CONTINUOUS)
+def test_continuous_functions_are_not(name: str) -> None:
+    line(CONTINUOUS[name])
+
+
+def test_forces_and_coefficients_of_space_may_jump() -> None:
+    line("x_dot**2/2", forces={"x": "unit_step(x)"})
+    string = "sum(i in N, (1 + unit_step(x[i] - 1/2))*u_dot[i]**2/2 - u[i]**2)"
+    sc.LagrangianSystem.from_text("string", ["u[N]"], string, parameters={"x[N]": 1.0})
+
+
+def test_jumps_of_hamiltonians_and_arrays() -> None:
+    with pytest.raises(sc.SystemDefinitionError, match="the Hamiltonian of 'h' jumps where x = 0"):
+        sc.HamiltonianSystem.from_text("h", ["x"], "p_x**2/2 + unit_step(x)")
+    with pytest.raises(sc.SystemDefinitionError, match=r"jumps where u\[i\] = 0"):
+        sc.LagrangianSystem.from_text("a", ["u[N]"], "sum(i in N, u_dot[i]**2/2 - unit_step(u[i]))")
+
+
+@pytest.mark.parametrize("text", ["y - positive_part(x)", "y - unit_step(x)", "y_dot - unit_step(x)*x_dot"])
+def test_corners_of_constraints_are_refused(text: str) -> None:
+    with pytest.raises(sc.SystemDefinitionError, match="has a corner or a jump where x = 0"):
+        sc.LagrangianSystem.from_text("ramp", ["x", "y"], FALL, constraints=[text])
+
+
+def test_corners_of_constraints_of_arrays_are_refused() -> None:
+    text, corner = "sum(i in N, sum(a in 2, q_dot[i, a]**2)/2)", "q[i, 1] - positive_part(q[i, 0]) for i in N"
+    with pytest.raises(sc.SystemDefinitionError, match=r"has a corner or a jump where q\[i, 0\] = 0"):
+        sc.LagrangianSystem.from_text("ramps", ["q[N, 2]"], text, constraints=[corner])
+
+
+@pytest.mark.parametrize("text", ["y - positive_part(x)**2", "y - positive_part(t - 1)"])
+def test_smooth_constraints_and_those_of_time_are_not(text: str) -> None:
+    sc.LagrangianSystem.from_text("ramp", ["x", "y"], FALL, constraints=[text])
