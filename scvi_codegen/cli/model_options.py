@@ -12,6 +12,7 @@ from click.shell_completion import CompletionItem
 
 from scvi_codegen.cli.command_group import Command
 from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.files.atomic import NamedFile
 from scvi_codegen.methods import ARGUMENTS, METHODS, size_of, specification_of
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.entries import ROBOT_FILES
@@ -130,7 +131,7 @@ def _input_files(
         if not name or not match:
             raise click.BadParameter(f"'{text}' is not of the form NAME=FILE[:KIND] or NAME=NUMBER, as in u=u.csv")
         entry = {key: value for key, value in match.groupdict().items() if value is not None}
-        result.append((name, entry | {"file": str(Path(entry["file"]).absolute())}))
+        result.append((name, entry | {"file": NamedFile(Path(entry["file"]).absolute())}))
     return tuple(result)
 
 

@@ -94,6 +94,25 @@ def regular(path: str | os.PathLike[str]) -> Path:
     return target
 
 
+class NamedFile(str):
+    """Path that a user named on the command line, which may be anywhere, unlike those in documents of others."""
+
+    __slots__ = ()
+
+
+def inside(folder: str | os.PathLike[str], name: str | os.PathLike[str]) -> Path:
+    """Return the path of a file that a document in the folder names; links are followed.
+
+    Raises:
+        OSError: if the file is outside the folder, unless it is a :class:`NamedFile`.
+    """
+    path = Path(folder) / name
+    if not isinstance(name, NamedFile) and not path.resolve().is_relative_to(Path(folder).resolve()):
+        where = Path(folder).resolve()
+        raise OSError(errno.EACCES, f"it is outside the folder {where} of the document that names it: copy it there")
+    return path
+
+
 def read_text(path: str | os.PathLike[str], encoding: str) -> str:
     """Return the text of a regular file."""
     return regular(path).read_text(encoding=encoding)

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from scvi_codegen.errors import ModelFileError
+from scvi_codegen.files.atomic import inside
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.galerkin import SVI
@@ -73,7 +74,11 @@ def is_robot(path: str | os.PathLike[str]) -> bool:
 
 def _robot(section: Section, folder: Path) -> Entry:
     """Return the system of a URDF or MJCF file, at rest in its reference configuration."""
-    path = folder / text_of(section, "robot", "[system]")
+    name = text_of(section, "robot", "[system]")
+    try:
+        path = inside(folder, name)
+    except OSError as error:
+        raise ModelFileError(f"[system] robot = '{name}' cannot be read: {error.strerror}") from error
     urdf = path.suffix.lower() == URDF
     check_keys(section, (*ROBOT_KEYS, *URDF_KEYS * urdf), "key", f"[system] beside robot = {path.name!r}")
     arguments: dict[str, Any] = {key: section[key] for key in ("name", "actuated", *URDF_KEYS) if key in section}

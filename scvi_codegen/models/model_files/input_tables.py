@@ -7,6 +7,7 @@ An input is kept as a table of plain numbers, which can be compared and written 
 """
 
 import csv
+import errno
 import math
 import os
 import re
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import ModelFileError, StateError
-from scvi_codegen.files.atomic import read_text
+from scvi_codegen.files.atomic import inside, read_text
 from scvi_codegen.files.export import loaded
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.models.options import real
@@ -178,7 +179,7 @@ def read_input(name: str, entry: Any, folder: str | os.PathLike[str]) -> InputTa
     if not isinstance(entry["file"], str):
         raise ModelFileError(f"{where} file must be a path between quotes, not {entry['file']!r}")
     try:
-        t, values = _read(name, Path(folder) / entry["file"])
+        t, values = _read(name, folder, entry["file"])
     except ModelFileError as error:
         raise ModelFileError(f"{where}: {entry['file']}: {error}") from error
     return InputTable(t, values, kind)
@@ -190,14 +191,15 @@ def _numbers(value: Any, where: str) -> tuple[float, ...]:
     return tuple(real(item, f"{where}[{k}]") for k, item in enumerate(value))
 
 
-def _read(name: str, path: Path) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    readers = {".csv": _read_csv, ".npz": _read_npz}
+def _read(name: str, folder: str | os.PathLike[str], file: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    readers, path = {".csv": _read_csv, ".npz": _read_npz}, Path(file)
     if path.suffix.lower() not in readers:
         raise ModelFileError(f"inputs must be in {' or '.join(readers)} files")
     try:
-        table = readers[path.suffix.lower()](path)
+        table = readers[path.suffix.lower()](inside(folder, file))
     except OSError as error:
-        raise ModelFileError(f"it cannot be read: {error.strerror or error}") from error
+        remedy = f", or name it on the command line: --input {name}={file}" * (error.errno == errno.EACCES)
+        raise ModelFileError(f"it cannot be read: {error.strerror or error}{remedy}") from error
     t = _column(table, TIME)
     others = [each for each in table.columns if each != TIME]
     column = next((each for each in (name, VALUE) if each in others), None)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sympy import Expr
 
 from scvi_codegen.errors import ExpressionError, ModelFileError
-from scvi_codegen.files.atomic import read_text
+from scvi_codegen.files.atomic import inside, read_text
 from scvi_codegen.files.export import loaded
 from scvi_codegen.formulas.arrays import parse_array
 from scvi_codegen.formulas.grammar import parse_expression
@@ -309,7 +309,7 @@ def _from_file(array: Array, value: Mapping[str, Any], where: str, folder: Path)
     if reader is None:
         raise ModelFileError(f"{where}: {name}: arrays must be in {', '.join(readers)} files")
     try:
-        return reader(folder / name, wanted, array)
+        return reader(inside(folder, name), wanted, array)
     except OSError as error:
         raise ModelFileError(f"{where}: {name}: it cannot be read: {error.strerror or error}") from error
     except ValueError as error:

@@ -444,6 +444,8 @@ def _include(root: Element) -> None:
                 child.refuse(f"must have only file, a path relative to the folder of the document: '{name}'")
             folders = [Path(each).parent for each in (root.file, child.file)]
             path = next((each / name for each in folders if (each / name).exists()), folders[0] / name)
+            if not path.resolve().is_relative_to(folders[0].resolve()):
+                child.refuse(f"names '{name}' outside the folder of the main document: copy it there")
             if path.resolve() in read:
                 child.refuse(f"names '{name}', which is included already")
             read.add(path.resolve())
