@@ -59,7 +59,7 @@ class Motion:
 
         Positions: max(range, absolute); of a coordinate that is at rest, up to rounding, its largest value, and of one
         that consists of rounding errors of others, by which ``errors`` (2, m) are as large, the largest range. Momenta:
-        the largest of all.
+        the largest of all, times the least ratio of a size to a range.
         """
         rows = slice(max(1, np.count_nonzero(abs(self.t - self.t[0]) <= abs(until - self.t[0]))))
         q, p = np.asarray(self.q)[rows], np.asarray(self.p)[rows]
@@ -68,13 +68,22 @@ class Motion:
         rest = ranges <= resolution * largest
         noise = (ranges <= resolution * ranges.max(initial=0.0)) & (100.0 * errors[0] >= ranges)
         sizes = np.where(noise, ranges.max(initial=0.0), np.where(rest, np.maximum(ranges, largest), ranges))
-        momenta = np.full_like(sizes, np.abs(p).max(initial=0.0))
-        return np.array([np.maximum(sizes, self.absolute), momenta])
+        sizes = np.maximum(sizes, self.absolute)
+        with np.errstate(all="ignore"):
+            ratio = np.fmin.reduce(sizes / ranges, initial=1.0 / self.epsilon)  # NaN: of 0 by 0
+        return np.array([sizes, np.full_like(sizes, np.abs(p).max(initial=0.0) * max(1.0, ratio))])
 
     def _of_groups(self, values: Array) -> Array:
         """Return the largest value of the group of each coordinate."""
         counts = np.diff(self.firsts, append=len(values))
         return np.asarray(np.repeat(np.maximum.reduceat(values, self.firsts), counts))
+
+
+def neighbouring(x: Array) -> Array:
+    """Return the next numbers above or below numbers other than 0, as of another rounding."""
+    x = np.asarray(x)
+    towards = np.where(np.cos(np.arange(x.size)).reshape(x.shape) > 0.0, np.inf, -np.inf)
+    return np.asarray(np.where(x == 0.0, x, np.nextafter(x, towards)))
 
 
 def relative(errors: Array, sizes: Array) -> Array:

@@ -28,6 +28,7 @@ from scvi_codegen.runtime.accuracy.growth import measured_growth, warn_of_error_
 from scvi_codegen.runtime.accuracy.largest_step import largest_step
 from scvi_codegen.runtime.accuracy.local_error import warn_of_energy_errors, warn_of_inaccuracy
 from scvi_codegen.runtime.accuracy.resolution import warn_of_unresolved_members
+from scvi_codegen.runtime.accuracy.size import neighbouring
 from scvi_codegen.runtime.arrays.interface import RunSizes, interface_of_sizes, shapes_of_call, sizes_of_run
 from scvi_codegen.runtime.chaos.ensemble import ChaosIndicatorsEnsemble
 from scvi_codegen.runtime.chaos.indicators import ChaosIndicators
@@ -303,12 +304,18 @@ class Stepper(WithEventsInDouble, WithPaths, Integrator):
     def _recorded_with_stops(
         self, q: States, p: States | None, start: dict[str, Any], stops: Sequence[float], tolerance: float | None
     ) -> Trajectory:
-        """Return a run with adaptive steps that end at each of the times ``stops``, in order, with all states."""
+        """Return a run with adaptive steps that end at each of the times ``stops``, in order, with all states.
+
+        In double its initial state is rounded differently: the next number above or below each one.
+        """
         arguments = dict(start)
         inputs, progress = arguments.pop("inputs"), arguments.pop("progress")
         segments = InputSegments(self, inputs or {}, start["parameters"], start["t"], stops[-1])
         arguments["parameters"] = segments.first
-        run = self.start(q, p, **arguments, t_end=stops[-1], tolerance=tolerance)
+        arguments |= {"t_end": stops[-1], "tolerance": tolerance}
+        run = self.start(q, p, **arguments)
+        if self.interface.words == 1:
+            run = self.start(*map(neighbouring, (run.q, run.p)), **arguments | {"velocity": None})
         return segments.record_with_stops(run, stops, progress)
 
     @property
