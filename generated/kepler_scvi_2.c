@@ -314,7 +314,8 @@ static void evaluate(const step_data *step, const double *z, double *rows, doubl
 
 #include "support/newton/newton.h"
 
-#define STAGE_POWER 1.5 /* exponent from the curve's estimate to the error of the end */
+#define STAGE_POWER 1.375 /* exponent from the curve's estimate to the error of the end */
+#define FEW_STAGE_COEFFICIENTS /* their ratio is not that of further ones */
 static const double STAGE_HIGHEST[5] = {0.0, -1.0, 1.0, 0.0, 0.0};
 static const double STAGE_NEXT[5] = {0.0, 1.0, 0.0, 0.0, 0.0};
 static const double STAGE_CURVATURE[5] = {0.0, 1.0, 0.0, 0.0, 0.0};
@@ -409,7 +410,7 @@ static inline void action_lanes(const lanes *u, lanes t, const double *parameter
 #define KEPT_UNIT(i) (step->h)
 #define RESOLVED 1.0
 #define NEXT_RESOLVED 1.0
-#define ERROR_POWER 1.5
+#define ERROR_POWER 1.375
 static const lanes HIGHEST[GROUPS] = {-1.0, 1.0};
 static const lanes NEXT[GROUPS] = {1.0, 0.0};
 

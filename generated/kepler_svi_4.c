@@ -189,7 +189,7 @@ static void evaluate(const step_data *step, const double *z, double *rows, doubl
 
 #include "support/newton/newton.h"
 
-#define STAGE_POWER 1.6666666666666667 /* exponent from the curve's estimate to the error of the end */
+#define STAGE_POWER 1.8 /* exponent from the curve's estimate to the error of the end */
 static const double STAGE_HIGHEST[4] = {-3.710270034019473, 9.39772470377753, -9.39772470377753, 3.710270034019473};
 static const double STAGE_NEXT[4] = {3.195048252113469, -3.195048252113469, -3.195048252113469, 3.195048252113469};
 static const double STAGE_CURVATURE[4] = {-1.0, 0.0, 0.0, 1.0};
@@ -277,7 +277,7 @@ static void mass(const double *u, double t, const double *parameters, double *va
 #define KEPT_UNIT(i) (data->square * data->inverse_mass[i])
 #define RESOLVED 1.0
 #define NEXT_RESOLVED 1.0
-#define ERROR_POWER 1.25
+#define ERROR_POWER 1.2857142857142858
 static const lanes HIGHEST[GROUPS] = {-0.37102700340194733, 0.939772470377753, -0.939772470377753, 0.37102700340194733};
 static const lanes NEXT[GROUPS] = {0.5325080420189116, -0.5325080420189116, -0.5325080420189116, 0.5325080420189116};
 

@@ -62,8 +62,8 @@ typedef struct {
   long long fallback_steps; /* steps that the iteration did not solve, but its fallback */
   long long iterations; /* since the last stored state */
   double error, error_t; /* largest error estimate of a step so far, and the time of that step */
-  double largest_q, largest_p; /* largest numbers of the states examined so far */
-  long long steps_from_rest; /* steps after a start at rest in the origin, while the error is rescaled with the state */
+  double largest_v[2], largest_a[2]; /* largest velocities and accelerations so far, for the size of errors */
+  double largest_motion; /* by a step, relative to which the error is measured, with fixed steps */
 } kepler_svi_4_run;
 
 /* Tolerance 2.220446049250313e-16 (relative), at most 50 iterations. */

@@ -204,7 +204,7 @@ static void mass(const double *u, double t, const double *parameters, double *va
 #define KEPT_UNIT(i) (data->square * data->inverse_mass[i])
 #define RESOLVED 1.0
 #define NEXT_RESOLVED 1.0
-#define ERROR_POWER 2.0
+#define ERROR_POWER 1.75
 static const lanes HIGHEST[GROUPS] = {0.5, 0.5};
 static const lanes NEXT[GROUPS] = {0.0, 0.0};
 

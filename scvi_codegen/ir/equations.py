@@ -333,8 +333,12 @@ class FixedPointIteration:
 
     @property
     def error_power(self) -> int:
-        """Exponent of h in the squared leading displacement over that of the curvature (all but a mean velocity)."""
-        return 2 * self.guess.degree + (0 if self.kept is StoredValues.VELOCITIES else 2)
+        """Exponent of h in the squared leading displacement over that of the curvature and the size; 0: no curve.
+
+        The size is a displacement by the step, proportional to h; of a curve of one or two points it is constant.
+        """
+        power = 2 * self.guess.degree + (0 if self.kept is StoredValues.VELOCITIES else 2)
+        return power if len(self.guess.abscissae) <= 2 else power - 1
 
     @property
     def diagonal(self) -> bool:
@@ -406,7 +410,7 @@ class Control:
         stage_growth: factor of the error estimate per level for Newton's method; 0 if there is no estimate.
         density: values of a time transformation at (q, v), or (q, p) of a Hamiltonian; instead of the predictor.
         growth: of errors, measured along runs; ``None`` if it is not.
-        whole: whether the state is to be accurate as a whole, as those of arrays are, not each coordinate by itself.
+        arrays: first and end of the named coordinates of each array of known size, which are to be accurate as a whole.
     """
 
     code: str
@@ -416,7 +420,7 @@ class Control:
     stage_growth: float = 0.0
     density: Kernel | None = None
     growth: ErrorGrowth | None = None
-    whole: bool = False
+    arrays: tuple[tuple[int, int], ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

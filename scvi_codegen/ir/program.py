@@ -62,7 +62,8 @@ class StageCurve:
         highest, next: h times this sum is the displacement due to the leading Legendre coefficient of the
             accelerations, and to the next lower one, if any.
         curvatures: h times the absolute values of these sums is the displacement due to the curvature.
-        power: exponent of h in the squared leading displacement over that of the curvature.
+        power: exponent of h in the squared leading displacement over that of the curvature and the size, which is a
+            displacement by the step, proportional to h; of one or two coefficients it is independent of h.
     """
 
     highest: tuple[Number, ...]

@@ -320,14 +320,14 @@ def _stage_curve(stages: StageSystem) -> StageCurve | None:
         first, tops = 0, _highest_of(shape, None if has_end_velocity else degree)
         differences = [(0, last), (0, (last + 1) // 2)]
         rows = [tuple(mp.mpf((b == last) - (b == first)) for b in range(count)) for first, last in differences]
-        power = 2 * degree
+        power = 2 * degree - (degree > 1)
     elif isinstance(shape, Accelerations | ShotCurve | PrintedCurve):
         c, size = shape.tableau.c, len(shape.tableau.c)
         if len({*c}) < size:
             return None
         first, tops = 1, [legendre_functional(c, k) for k in (size - 1, size - 2)]
         rows = [tuple(mp.mpf(b == only) for b in range(count)) for only in (1, size)]
-        power = 2 * size
+        power = 2 * size - (size > 2)
     else:
         return None
     before, behind = (mp.zero,) * first, (mp.zero,) * (count - first - len(tops[0]))

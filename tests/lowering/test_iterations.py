@@ -73,7 +73,7 @@ def test_first_step_takes_few_trials(p, span):
     """The search from 1e-16 of the span in factors of 16 needs 20 iterations or more; it finds the same step size."""
     run = stepper("kepler/svi-8", "fixed-point").start([0.5, 0.1], p, t_end=span, tolerance=1e-9)
     run.advance(1)
-    assert run.t == pytest.approx(2.0**-1.75 if p[1] else 2.0**-2, rel=1e-9)  # on the grid
+    assert run.t == pytest.approx(2.0**-1.5 if p[1] else 2.0**-2.25, rel=1e-9)  # on the grid
     assert run.iterations <= 17
 
 
@@ -102,7 +102,7 @@ def test_newton_factors_are_reused_in_the_next_short_step():
     assert run._memory.guess == 2
 
 
-@pytest.mark.parametrize(("name", "expected"), [("double/svi", (46, 145)), ("tangle/scvi", (26, 79))])
+@pytest.mark.parametrize(("name", "expected"), [("double/svi", (84, 190)), ("tangle/scvi", (26, 79))])
 def test_adaptive_steps_use_the_predictor_of_the_preceding_step(name, expected):
     """Compare Newton steps and iteration counts with steps of equal size."""
     given = case(name)

@@ -42,17 +42,7 @@ LARGEST_STEP, MOST_GRID_LEVEL, MOST_SUSPENDED = 2**53, 2**16, 64
 of ``suspension.h``."""
 RANGES = {
     **dict.fromkeys(
-        (
-            "step",
-            "iterations",
-            "rejected",
-            "fallback_steps",
-            "steps_from_rest",
-            "steps_to_compare",
-            "many",
-            "suspended",
-        ),
-        (0, LARGEST_STEP),
+        ("step", "iterations", "rejected", "fallback_steps", "steps_to_compare", "many", "suspended"), (0, LARGEST_STEP)
     ),
     "guess": (1 - 2 * MOST_SUSPENDED, 2),
     "turn": (0, 2),
@@ -62,8 +52,8 @@ RANGES = {
     "avoiding": (-MOST_GRID_LEVEL, LARGEST_STEP),
 }
 """Smallest and largest values of whole numbers in the memory of a run, which C uses as counts and indices."""
-STEPS_FROM_REST, STEPS_NEAR_REST = 2**20, 16
-"""First value of the count of steps from rest in C; number of steps in which a force moves a state away from rest."""
+STEPS_NEAR_REST = 16
+"""Number of steps in which a force moves a state away from rest."""
 EVENT_NUMBERS = ("undefined", "accumulated", "through", "jammed")
 """Numbers of events, from 1 on, in the state of the search for events; 0 for none, < 0 for an undefined change."""
 NO_OUTPUT, NO_PLAN = LARGEST_COUNT, Fixed(math.nan)
@@ -125,6 +115,7 @@ class Memory:
         self._has_defaults = False  # whether no parameter differs from its default
         self._watch: Any = None  # state of the search for events in C
         self._rows: Any = None  # memory for the states of short runs
+        self._starts_at_origin = False
         self._ends: tuple[float, float] | None = None  # energies at both ends of a short run
         self._has_tau = stepper.in_tau  # whether steps are steps of tau
         self._report, self._workspace = binding.new("report *"), binding.workspace(memory)
@@ -178,6 +169,7 @@ class Memory:
     def _begin(self, q: States, p: States, t: float, growth: int = 0) -> None:
         """Start at (q, p) and t after :meth:`_set_up`; ``growth``: value of ``measures_growth`` in C."""
         q, p = map(block_of, checked_pair(self.stepper.interface, q, p))
+        self._starts_at_origin = not (np.any(q) or np.any(p))
         self._start_function(t, 0.0 if self._h is None else self._h, *self.stepper.binding.pointers(q, p))
         if isinstance(t, Word):
             self._memory.t_low = t.low
@@ -580,7 +572,7 @@ class Memory:
     @property
     def _leaving(self) -> bool:
         """Return whether the run started at the origin and is still near it, where relative errors are undefined."""
-        return int(getattr(self._memory, "steps_from_rest", 0)) > STEPS_FROM_REST - STEPS_NEAR_REST
+        return self._starts_at_origin and self.steps <= STEPS_NEAR_REST
 
     @contextmanager  # the last method, because it hides the decorator of its name
     def alone(self) -> Iterator[None]:

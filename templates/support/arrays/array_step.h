@@ -35,8 +35,10 @@ static int perform_step(run_memory *run, const problem *given, const work_arrays
     solver_report *report)
 {
   step_data step = step_of(run, given, work);
+  array_motion motion = {{0.0}, {0.0}};
   solver_data data;
   int status;
+  step.motion = &motion;
   prepare(&step, &data);
   status = solve(&step, &data, history_in(&step), &run->guess, work->dq, work->dp, options, report, NULL);
   if (status != OK)

@@ -1,36 +1,52 @@
-#include "../core/step.h"
+#include "../core/sizes.h"
 #include "../newton/band.h"
 
 /* Error estimate of a step by Newton's method from the leading coefficient of its curve, as in curve_error.h. Requires:
  * stages.h, the tables STAGE_HIGHEST, STAGE_NEXT, STAGE_CURVATURE and STAGE_OTHER_CURVATURE; STAGE_POWER. */
 
+/* The largest absolute values of sums over the unknowns of a coordinate. */
+static inline real curvature_of_stages(const step_data *step, const real *z, int i)
+{
+  real curvature = 0, other = 0;
+  for (int b = 0; b < B; b++) {
+    curvature += STAGE_CURVATURE[b] * z[i * B + b];
+    other += STAGE_OTHER_CURVATURE[b] * z[i * B + b];
+  }
+  return MATH(fabs)(step->h) * (MATH(fabs)(curvature) + MATH(fabs)(other)) / 2;
+}
+
 /* Returns the estimate from the unknowns z of the stages, or `least` if that is larger. */
 static real stage_error(const step_data *step, const real *z, const real *dq, real share, real decay, real least)
 {
-  real largest = 0, fastest = 0;
+  real largest = 0, fastest = 0, farthest = 0, size[M], curvature[M];
   for (int i = 0; i < M; i++) {
-    largest = larger(largest, MATH(fabs)(step->q0[i]) + MATH(fabs)(dq[i]));
+    curvature[i] = curvature_of_stages(step, z, i);
+    size[i] = motion_of_step(step, step->h, MATH(fabs)(dq[i]), curvature[i], i);
+#ifdef FEW_STAGE_COEFFICIENTS
+    size[i] = size_for_few(step->h, size[i], curvature[i], step->largest_a ? step->largest_a[i] : 0);
+#endif
+    largest = larger(largest, size[i]);
     fastest = larger(fastest, MATH(fabs)(dq[i]));
+    farthest = larger(farthest, MATH(fabs)(step->q0[i]) + MATH(fabs)(dq[i]));
   }
-  const real rounded = SITES > M ? largest : fastest; /* constraints hold to rounding, however short the step */
+  enlarge_to_arrays(size);
+  const real rounded = SITES > M ? farthest : fastest; /* constraints hold to rounding, however short the step */
   for (int i = 0; i < M; i++) {
-    const real unit = step->h / (MATH(fabs)(step->q0[i]) + MATH(fabs)(dq[i]) + share * largest + REAL_MIN);
-    real top = 0, next = 0, curvature = 0, other = 0, noise = 0;
+    const real unit = 1 / (size[i] + share * largest + REAL_MIN);
+    real top = 0, next = 0, noise = 0;
     for (int b = 0; b < B; b++) {
       top += STAGE_HIGHEST[b] * z[i * B + b];
       next += STAGE_NEXT[b] * z[i * B + b];
       noise += CURVE_NOISE * MATH(fabs)(STAGE_HIGHEST[b]);
-      curvature += STAGE_CURVATURE[b] * z[i * B + b];
-      other += STAGE_OTHER_CURVATURE[b] * z[i * B + b];
     }
     top = MATH(fabs)(top);
     top = top > VANISHING * MATH(fabs)(next) ? larger(top, decay * MATH(fabs)(next)) : top;
-    noise *= rounded / MATH(fabs)(step->h);
-    top = top < noise ? 0 : SITES > M ? (top - noise) * unit
-                                      : top * unit;
-    curvature = MATH(fabs)(unit) * (MATH(fabs)(curvature) + MATH(fabs)(other)) + NEGLIGIBLE;
-    if (top * top > least * curvature)
-      least = top * top / curvature;
+    noise *= rounding_of_displacement(rounded) / MATH(fabs)(step->h);
+    top = top < noise ? 0 : SITES > M ? (top - noise) * unit * step->h
+                                      : top * unit * step->h;
+    const real allowed = 2 * unit * curvature[i] + NEGLIGIBLE;
+    if (top * top > least * allowed)
+      least = top * top / allowed;
   }
   return least;
 }
@@ -50,4 +66,11 @@ static SELDOM int stages_fly(const real *z)
       return 1;
   }
   return 0;
+}
+
+/* Lets V and A contain a solved step; `part` of those of former steps is kept. */
+static inline void note_stages(run_memory *run, const step_data *step, const real *z, const real *dq, real part)
+{
+  for (int i = 0; i < M; i++)
+    note_motion(run, step->h, MATH(fabs)(dq[i]), curvature_of_stages(step, z, i), part, i);
 }

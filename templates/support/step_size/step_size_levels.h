@@ -13,7 +13,7 @@ enum {
 };
 
 #define USED_PART REAL(0.5) /* of the admissible error: predicted error of an increased step */
-#define FEW_POWERS REAL(4.5) /* growth of the error estimate over a factor of two, in powers of 2, for a curve of two
+#define FEW_POWERS REAL(3.5) /* growth of the error estimate over a factor of two, in powers of 2, for a curve of two
                               * coefficients or one */
 #define LITTLE REAL(0.5) /* of the error with which a step may be two levels larger, or three at a tolerance above
                           * round-off, where errors vary more: smaller errors are not distinguished */
@@ -22,7 +22,7 @@ enum {
 #ifdef DOUBLE_DOUBLE
 #define ROUNDOFF_ERROR 1e-32
 #else
-#define ROUNDOFF_ERROR (REAL(0.03125) * REAL_EPSILON) /* of a step: the sum over a million steps is of the size of
+#define ROUNDOFF_ERROR (REAL(0.125) * REAL_EPSILON) /* of a step, relative to its motion: the sum over a run is of the size of
                                                        * rounding errors */
 #endif
 #ifdef DOUBLE_DOUBLE
@@ -33,7 +33,7 @@ enum {
 #endif
 #define NO_LARGEST_LEVEL (LLONG_MAX / 2)
 #ifndef ITERATION_PART
-#define ITERATION_PART REAL(0.00390625) /* tolerance of the stage equations relative to that of a step */
+#define ITERATION_PART REAL(0.015625) /* tolerance of the stage equations relative to that of a step */
 #endif
 
 /* Limits of the error estimate: a step above `most` is rejected; below `few` the next step may be one level larger,

@@ -7,13 +7,16 @@
  * and next_change of a step-size controller. */
 
 #define ALLOWED_TO_HALVES 100 /* admissible difference of the half steps, relative to the admissible error estimate */
-#define SPURIOUS REAL(1e-8) /* relative to the state: spurious solutions of the equations differ by more */
+#define SPURIOUS REAL(1e-8) /* relative to the motion: spurious solutions of the equations differ by more */
 #define MANY_ITERATIONS 10 /* of a step, after which the next one is not larger */
 #define TOO_MANY_ITERATIONS 13 /* the next one is smaller: about ten iterations take the least time per unit of time */
+#define TRUSTED_DECREASE (GROWTH < REAL(1.5) ? REAL(0.97) : 0) /* of the error by a step, if the curve has one \
+                                                               * coefficient, which vanishes where forces do */
+#define SMALL_PART REAL(0.1) /* of the largest momentum: smaller changes count as little */
 #define SHORT_PART REAL(0.125) /* of the time in which a state changes by its size, or of the span: early trial */
 #define SUSPENDED 8 /* steps without this rule after one that needed as many iterations as a larger one */
 #define FAILURES_BEFORE_NEWTON 3 /* trials of a step in which the iteration of the multipliers fails */
-#define SHORT_MOTION REAL(0.01) /* relative to the largest position: a change so small .. */
+#define SHORT_MOTION REAL(0.01) /* relative to the path of a run: a change so small .. */
 #define SHORT_BY_TOLERANCE 1000 /* .. and less than so many times the tolerance does not show errors of the forces */
 #define LEAP 2 /* levels by which a step is larger than the one before, whose end is then examined */
 #define MOST_EXAMINED 8 /* trials, each up to four times shorter, until no force sets in at the end of a step */
@@ -23,20 +26,12 @@
 #define STEPS_COMPARED_AFTER_DOUBT 16 /* steps that are compared after one that was shortened by a comparison */
 
 #ifdef ARRAYS
-#define SHARE_OF_TRIAL ALL
-
 /* State of a run: vectors of the caller. */
 typedef struct {
   double t, t_low, *q, *p, *carry_q, *carry_p;
 } state;
 #else
 #include "../run/run.h"
-
-#ifdef ARRAYS_OF_KNOWN_SIZES
-#define SHARE_OF_TRIAL ALL
-#else
-#define SHARE_OF_TRIAL EACH
-#endif
 #endif
 
 /* Step-size control by default: errors of round-off size. */
@@ -66,7 +61,7 @@ static real attempt(run_memory *run, step_data *step, const solver_data *data, i
   if (solve(step, data, run->memory, guess, dq, dp, options, report, step->scratch + SCRATCH) != OK)
     return INFINITY;
   *guess = 1;
-  return stage_error(step, run->memory, dq, SHARE_OF_TRIAL, decay, least);
+  return stage_error(step, run->memory, dq, EACH, decay, least);
 }
 #else
 #ifdef ARRAYS
@@ -104,7 +99,10 @@ static inline __attribute__((always_inline)) double attempt_at(run_memory *run, 
     *guess = 1;
   if (status != OK)
     return INFINITY;
-  return curve_error(step, data, STORED(run, step), dq, SHARE_OF_TRIAL, decay, least);
+#ifdef ARRAYS
+  find_displacements(step, data, STORED(run, step), dq);
+#endif
+  return curve_error(step, data, STORED(run, step), dq, EACH, decay, least);
 }
 
 /* Out of line, one copy compiles faster than two. Steps without low words have one of their own, so that others take no
@@ -171,6 +169,16 @@ typedef struct {
 #endif
 } trial;
 
+/* Lets V and A contain a solved trial; `part` of those of former steps is kept. */
+static inline void note_trial(run_memory *run, const trial *now, real part)
+{
+#ifdef NEWTON_ALONE
+  note_stages(run, &now->step, run->memory, now->dq, part);
+#else
+  note_curve(run, &now->step, &now->data, STORED(run, &now->step), now->dq, part, 1);
+#endif
+}
+
 /* Performs one trial of the next step: its increments and the error estimate of the curve if it exceeds `least`,
  * infinite if the step failed. */
 HOT void try_step(run_memory *run, trial *now, real least, const solver_options *options, solver_report *report)
@@ -183,6 +191,7 @@ HOT void try_step(run_memory *run, trial *now, real least, const solver_options 
   }
   h = next_size(now->length, rest, &now->last);
   now->iterations = report->iterations;
+  now->step.absolute = now->control->absolute_tolerance;
   report->t = now->step.t = now->at.t;
   if (now->last || now->step.h != h) {
     now->step.h = h;
@@ -226,14 +235,14 @@ static SELDOM int changes_little(const trial *now)
   return largest_change(&now->step, now->at.p, now->dp, &size) < SMALL_PART * size;
 }
 
-/* Returns 1 if the positions change by little more than the tolerance, so that their errors meet it whatever the forces
- * are, as near a pole in time. */
-static SELDOM int moves_little(const trial *now)
+/* Returns 1 if the positions change by little more than the tolerance relative to the path so far, so that their errors
+ * meet it whatever the forces are, as near a pole in time. */
+static SELDOM int moves_little(const run_memory *run, const trial *now)
 {
   const real tolerance = MATH(pow)(now->limits.most, ERROR_POWER);
   real size;
   const real moved = largest_change(&now->step, now->at.q, now->dq, &size);
-  return moved < SHORT_MOTION * size && moved < SHORT_BY_TOLERANCE * tolerance * size;
+  return moved < SHORT_MOTION * run->path && moved < SHORT_BY_TOLERANCE * tolerance * run->path;
 }
 
 /* Compares a trial with two half steps, in momenta too if requested. */
@@ -282,6 +291,15 @@ static SELDOM int levels_of_first(const trial *now, real h, real span)
   return binades > 1 ? (binades - 1) * LEVELS_PER_BINADE : 0;
 }
 
+/* A trial of the search for the first step size. V and A are those of the largest one that is solved: from rest a
+ * displacement t^k with k above what the curve represents has a large error relative to itself at any step size. */
+static inline void try_pilot(run_memory *run, trial *now, const solver_options *options, solver_report *report)
+{
+  try_step(run, now, 0, options, report);
+  if (now->error < INFINITY)
+    note_trial(run, now, 0);
+}
+
 /* Determines the first step size by increasing one that is certainly too small. The smallest trials may fail, with
  * fixed-point iteration larger ones, too: if some velocities are zero, rounding dominates them. Or their error estimate
  * is only rounding, of any size; the estimate of a curve grows as expected. */
@@ -293,23 +311,23 @@ static SELDOM void try_first_step(run_memory *run, trial *now, const solver_opti
   if (now->control->first_step) {
     run->grid_level = level_below(*now->control->first_step);
     run->grid_level += levels_within(run, now, 0);
-    try_step(run, now, 0, options, report);
+    try_pilot(run, now, options, report);
     if (now->error < INFINITY)
       return;
   }
   run->grid_level = level_below(span * FIRST_STEP);
   run->grid_level += levels_within(run, now, 0);
-  try_step(run, now, 0, options, report);
+  try_pilot(run, now, options, report);
   early = levels_within(run, now, levels_of_first(now, now->length, span));
   while (early > 0) {
     run->grid_level += early;
-    try_step(run, now, 0, options, report);
+    try_pilot(run, now, options, report);
     if (levels_up(run, now) >= LEVELS_PER_BINADE)
       break;
     run->grid_level -= early;
     early = early < 2 * MOST_UP ? 0 : early - MOST_UP;
     if (early == 0)
-      try_step(run, now, 0, options, report);
+      try_pilot(run, now, options, report);
   }
   while (!now->last && up > 0) {
     const int failed = !(now->error < INFINITY), small = now->error <= now->limits.most;
@@ -322,7 +340,7 @@ static SELDOM void try_first_step(run_memory *run, trial *now, const solver_opti
     shorter = now->error;
     run->grid_level += up;
     if (up > 0)
-      try_step(run, now, 0, options, report);
+      try_pilot(run, now, options, report);
   }
 #ifdef RATTLE
   if (!found && run->avoiding >= 0) { /* the iteration of the multipliers converges at no size */
@@ -417,7 +435,7 @@ static inline int is_leap(const run_memory *run, const trial *now)
 static inline int needs_momenta(run_memory *run, const trial *now)
 {
   const int shorter = DOUBTS && now->change <= -LEVELS_PER_BINADE;
-  if (shorter && moves_little(now))
+  if (shorter && moves_little(run, now))
     run->steps_to_compare = STEPS_COMPARED_AFTER_DOUBT;
   return DOUBTS && (run->steps_to_compare > 0 || (shorter && changes_little(now)));
 }
@@ -538,7 +556,8 @@ static inline int limit_by_iterations(run_memory *run, long long iterations)
  * size of such a step is not tried again for some steps (cf. Hairer & Wanner, Solving ODEs II, IV.8). */
 static inline void choose_size(run_memory *run, const trial *now)
 {
-  int change = next_change(run, now->error, run->error_before, &now->limits);
+  const real error = larger(now->error, TRUSTED_DECREASE * run->error_before);
+  int change = next_change(run, error, run->error_before, &now->limits);
   const int most = limit_by_iterations(run, now->iterations);
   change = change < most ? change : most;
 #ifdef RATTLE
@@ -547,11 +566,13 @@ static inline void choose_size(run_memory *run, const trial *now)
   if (run->avoiding > 0 && run->avoiding-- && run->grid_level + change >= run->failed)
     change = (int)(run->failed - 1 - run->grid_level);
   change = levels_within(run, now, change);
+  if (change > 0)
+    keep_displacements(run, size_of_level(run->grid_level) / size_of_level(run->grid_level + change));
   run->guess = now->guess;
   run->change_before = run->change;
   run->change = change;
   run->grid_level += change;
-  run->error_before = error_at(now->error, change);
+  run->error_before = error_at(error, change);
 }
 
 /* Reduces the size of the next step of a continued run to the largest one. */
@@ -609,6 +630,8 @@ static inline void accept_trial(run_memory *run, trial *now)
 #ifdef RATTLE
   run->fallback_steps += now->fallbacks;
 #endif
+  note_trial(run, now, FORMER_PART);
+  run->path += MATH(fabs)(now->step.h) * largest_velocity(run);
   if (larger(now->error, now->apart) > run->error) {
     run->error = larger(now->error, now->apart);
     run->error_t = now->at.t;
@@ -624,8 +647,10 @@ static int take_trials(run_memory *run, const job *way, solver_report *report)
   const solver_options *options = way->options ? way->options : &standard;
   trial now = {.at = {run->t, run->t_low, run->q, run->p, run->carry_q, run->carry_p}, .t_end = way->t_end};
   const work_arrays work = bind_work_arrays(run, coordinates_of(way->given));
+  array_motion motion = {{0.0}, {0.0}};
   now.step = step_of(run, way->given, &work);
   now.step.h = 0.0;
+  now.step.motion = &motion;
   now.dq = work.dq, now.dp = work.dp;
   begin_trials(run, &now, way->control, &standard);
   run->direction = (way->t_end - run->t) - run->t_low < 0 ? -1 : 1;
