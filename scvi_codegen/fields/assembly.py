@@ -74,7 +74,7 @@ class Assembly:
         texts |= {function: "\n+ ".join(map(text_of, summed))}
         forces: list[ArrayForce] = []
         if system.dissipation != 0:
-            damped = self.over_points(self.at_points(system.dissipation, system.rates))
+            damped = self.over_points(system.dissipation, lambda part: [self.at_points(part, system.rates)])
             velocities = {Array(each.name + DOT, each.axes): each for each in coordinates}
             forces += friction(self.terms([damped]), velocities)
             texts["dissipation"] = text_of(damped)
@@ -176,8 +176,12 @@ class Assembly:
         if self.system.momenta:
             return
         for each, rate in zip(self.system.fields, self.system.rates, strict=True):
-            mass = self.at_points(self.system.density.diff(rate, 2))
-            yield self.over_points(mass, self.entry(each + DOT, self.sizes, [*self.here.values()]) ** 2, Rational(1, 2))
+            velocity = self.entry(each + DOT, self.sizes, [*self.here.values()])
+
+            def energy(mass: Expr, velocity: Symbol = velocity) -> list[Expr]:
+                return [self.at_points(mass), velocity**2, Rational(1, 2)]
+
+            yield self.over_points(self.system.density.diff(rate, 2), energy)
 
     def at_places(self) -> Iterator[Summed]:
         """Yield the point Lagrangians."""
@@ -200,10 +204,33 @@ class Assembly:
             rest = formula.xreplace(dict.fromkeys(rates, sympy.S.Zero))
             yield from (((), part.xreplace(values)) for part in (sympy.expand(formula - rest), rest) if part != 0)
 
-    def over_points(self, *factors: Expr) -> Summed:
-        """Return the quadrature of a product over all points."""
+    def over_points(self, formula: Expr, at_point: Callable[[Expr], list[Expr]]) -> Summed:
+        """Return the quadrature over all points of the factors that ``at_point`` returns for a formula."""
         loops = tuple(span(f"i{axis}", f"N{axis}") for axis in self.axes)
-        return loops, reduce(mul, [*map(self.weight, self.axes), *factors])
+        return loops, self.weighted(formula, [*self.axes], at_point)
+
+    def weighted(self, formula: Expr, axes: Sequence[str], at_point: Callable[[Expr], list[Expr]]) -> Expr:
+        """Return the factors that ``at_point`` returns for a formula times the weights of a point along some axes.
+
+        At a common end of two elements functions that jump there have a value in each, with the weight of the element.
+        """
+        jumps = self.system.jumps_in(formula)
+        sided = [axis for axis in axes if self.axes[axis].one_sided and any(self.names_in(f, [axis]) for f in jumps)]
+        parts = []
+        for sides in itertools.product((0, 1), repeat=len(sided)):
+            chosen = dict(zip(sided, sides, strict=True))
+            places = {symbol(axis): self.beside(axis, "points", side) for axis, side in chosen.items()}
+            weights = [
+                self.beside(axis, "weights", chosen[axis]) if axis in chosen else self.weight(axis) for axis in axes
+            ]
+            part = formula.xreplace({jump: jump.xreplace(places) for jump in jumps}) if places else formula
+            parts.append(reduce(mul, [*weights, *at_point(part)]))
+        return Add(*parts)
+
+    def beside(self, axis: str, kind: str, side: int) -> Symbol:
+        """Return the coordinate or the weight of a point within the element to the left, 0, or to the right, 1."""
+        values = getattr(self.axes[axis].one_sided, kind)[side]
+        return self.value(f"{axis}_{kind}_{('left', 'right')[side]}", (Size(f"N{axis}"),), values, self.here[axis])
 
     def in_space(self) -> Iterator[Summed]:
         """Yield the sums of the terms without velocities, grouped by the axes of their derivatives."""
@@ -222,7 +249,7 @@ class Assembly:
             elif key:
                 yield from self.over_cells(key, term)
             else:
-                yield self.over_points(self.at_points(term))
+                yield self.over_points(term, lambda part: [self.at_points(part)])
 
     def over_pairs(self, term: Expr) -> Iterator[Summed]:
         """Yield the terms of Fourier axes: sums over pairs of points of quadratic terms, then those of derivatives."""
@@ -246,7 +273,7 @@ class Assembly:
                 symbol(name): self.fourier_derivative(rest, *self.system.derivatives[name])
                 for name in self.names_in(rest, self.system.derivatives)
             }
-            yield self.over_points(self.at_points(rest).xreplace(derivatives))
+            yield self.over_points(rest, lambda part: [self.at_points(part).xreplace(derivatives)])
 
     def fourier_derivative(self, term: Expr, each: str, orders: Mapping[str, int]) -> Expr:
         """Return a Fourier derivative of a field at a point, by convolutions or dense matrices."""
@@ -287,8 +314,11 @@ class Assembly:
             chosen = dict(zip(key, cells, strict=True))
             loops = (*(each.loop for each in cells if each.loop), *(span(f"i{axis}", f"N{axis}") for axis in others))
             factors = [factor for axis, each in chosen.items() for factor in self.size(axis, each)]
-            factors += map(self.weight, others)
-            yield loops, reduce(mul, [*factors, self.quadrature(chosen, others, term, {})])
+
+            def in_cells(part: Expr, chosen: Mapping[str, Cells] = chosen, factors: Any = factors) -> list[Expr]:
+                return [*factors, self.quadrature(chosen, others, part, {})]
+
+            yield loops, self.weighted(term, others, in_cells)
 
     def kinds(self, axis: str, term: Expr) -> list[Cells]:
         """Return the cells of an axis, of elements with their edges if a term has second derivatives along it."""
@@ -335,14 +365,24 @@ class Assembly:
             each, orders = system.derivatives[name]
             values[symbol(name)] = self.derivative(each, orders, chosen, node)
         weights = [self.quadrature_weight(axis, chosen[axis], k) for axis, k in node.items() if not chosen[axis].edge]
+        jumps = self.system.jumps_in(term)
+        inner = {
+            symbol(axis): self.in_cells(axis, chosen[axis], node[axis], inside=True)
+            for axis in node
+            if self.axes[axis].one_sided and not chosen[axis].edge and any(self.names_in(f, [axis]) for f in jumps)
+        }
+        term = term.xreplace({jump: jump.xreplace(inner) for jump in jumps}) if inner else term
         for axis in self.names_in(term, [*others, *node]):
             inside = axis in node
             values[symbol(axis)] = self.in_cells(axis, chosen[axis], node[axis]) if inside else self.coordinate(axis)
         return reduce(mul, [*weights, term.xreplace(values)])
 
-    def in_cells(self, axis: str, cells: Cells, k: Slot) -> Expr:
-        """Return the coordinate of a quadrature point of a cell, or of an edge."""
+    def in_cells(self, axis: str, cells: Cells, k: Slot, *, inside: bool = False) -> Expr:
+        """Return the coordinate of a quadrature point of a cell, slightly ``inside`` of its ends, or of an edge."""
         discretised = self.axes[axis]
+        if inside and discretised.one_sided:
+            sizes = (Size(self.extent(axis)), Size("", len(discretised.quadrature)))
+            return self.value(f"{axis}_inside_cells", sizes, discretised.one_sided.cells, cells.index, k)
         if cells.edge and discretised.edges:
             return self.value(f"{axis}_at_edges", (Size(f"F{axis}"),), discretised.edges.points, cells.index)
         sizes = (Size(self.extent(axis)), Size("", len(discretised.quadrature)))

@@ -28,7 +28,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -46,6 +46,8 @@ from scvi_codegen.tables.quadrature import Quadrature, gauss_lobatto
 from scvi_codegen.validation import checked_count
 
 Array = NDArray[np.float64]
+INWARD = 1e-6
+"""Distance of coordinates slightly inside of an element from its ends, relative to half of its length."""
 PERIODIC = "periodic"
 NATURAL = "natural"
 
@@ -118,6 +120,21 @@ class ClosedPoints:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class OneSided:
+    """Coordinates slightly inside of elements, at which functions that jump at ends of elements are evaluated.
+
+    Attributes:
+        cells: (E, p + 1) of the points of each element.
+        points: (2, N) of the points within the element to the left and to the right; equal inside of elements.
+        weights: (2, N) quadrature weights of both elements at the points; that to the right is 0 inside of elements.
+    """
+
+    cells: Array
+    points: Array
+    weights: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Axis(ABC):
     """Discretised axis. Derivatives in densities are those of its cells or, without cells, those of its pairs.
 
@@ -133,6 +150,7 @@ class Axis(ABC):
             points without a table.
         closed: all points of an axis with ends, those of each element in turn; ``None`` for equidistant periodic ones.
         edges: of elements, their ends.
+        one_sided: of elements, coordinates within each; ``None`` without elements.
         periodic: whether it has no ends.
         pairs: coefficients of the quadratic forms sum_(i<j) K_ij (u_i - u_j)^2/2 of int u_x^2/2 dx and int u_xx^2/2 dx:
             (N, N) matrices K, or (N,) values c of K_ij = c[j-i] for fast Fourier transforms.
@@ -152,6 +170,7 @@ class Axis(ABC):
     table: NDArray[np.int64] | None = None
     closed: ClosedPoints | None = None
     edges: Edges | None = None
+    one_sided: OneSided | None = None
     periodic: bool = True
     pairs: tuple[Array, ...] = ()
     rates: Array = field(default_factory=lambda: np.zeros(0))
@@ -307,7 +326,12 @@ class SpectralElements(Axis):
         points, masses = np.zeros(count), np.zeros(count)
         points[places[:, ::-1]] = local[:, ::-1]
         points[places[0, 0]] = breaks[0]  # not the end of a periodic axis
-        np.add.at(masses, places.ravel(), np.outer(half, np.array([float(each) for each in rule.weights])).ravel())
+        quadrature = np.outer(half, np.array([float(each) for each in rule.weights]))
+        np.add.at(masses, places.ravel(), quadrature.ravel())
+        inner = breaks[:-1, None] + half[:, None] * (1.0 + (1.0 - INWARD) * (offsets - 1.0))
+        sided = OneSided(cells=inner, points=np.zeros((2, count)), weights=np.zeros((2, count)))
+        sided.points[:, places[:, :-1]], sided.points[0, places[:, -1]] = inner[:, :-1], inner[:, -1]
+        sided.weights[0, places[:, 1:]], sided.weights[1, places[:, 0]] = quadrature[:, 1:], quadrature[:, 0]
         left, right = fixed or (False, False)
         if count <= left + right:
             raise SystemDefinitionError(f"'{name}' has no points between its prescribed ends: use more elements")
@@ -339,6 +363,7 @@ class SpectralElements(Axis):
             operators=(identity_matrix(p + 1), derivative, matrix_product(derivative, derivative)),
             stiffness=(largest, largest**2),
             edges=_edges(name, places, local, (rule.weights, derivative), fixed, clamped),
+            one_sided=replace(sided, points=sided.points[:, inside], weights=sided.weights[:, inside]),
             cells=tuple(kinds),
             jacobians=half,
             cell_points=local,

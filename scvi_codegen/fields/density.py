@@ -9,7 +9,7 @@ import sympy
 from sympy import Add, Expr, S, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.expressions import evaluated, hessian
+from scvi_codegen.formulas.expressions import evaluated, hessian, rint, unit_step
 from scvi_codegen.formulas.symbols import TIME, symbol
 from scvi_codegen.representation import summary
 
@@ -83,6 +83,13 @@ class Density:
                 f"the density of '{self.name}' has terms linear in velocities, {sympy.expand(linear)}, which are not "
                 "supported"
             )
+
+    def jumps_in(self, formula: Expr) -> list[Expr]:
+        """Return the functions of a formula that jump at places: ``unit_step`` and ``rint`` of axes and parameters."""
+        places = {symbol(axis) for axis in self.space}
+        moving = {*map(symbol, (*self.variables, *self.scalars, *self.derivatives, TIME)), *self.rates}
+        jumps = [each for each in formula.atoms(unit_step, rint) if each.free_symbols & places]
+        return [each for each in jumps if not each.free_symbols & moving]
 
     @property
     def rates(self) -> tuple[Symbol, ...]:

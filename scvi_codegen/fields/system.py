@@ -16,6 +16,7 @@ from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.fields.assembly import Assembly
 from scvi_codegen.fields.axes import NATURAL, PERIODIC, Axis, FiniteDifferences, Fourier, SpectralElements
 from scvi_codegen.fields.density import Density, derivatives_of
+from scvi_codegen.fields.jumps import warn_of_jumps
 from scvi_codegen.fields.laws import FieldDerivation, derivation_of
 from scvi_codegen.fields.mesh import MeshSystem
 from scvi_codegen.formulas.array_statements import array_text
@@ -232,10 +233,11 @@ class FieldSystem(Density):
 
         Args:
             method: ``"spectral-elements"`` with ``degree=`` and ``elements=``, the number of equal elements or their
-                ends; ``"legendre"``, one element of ``degree=``; ``"finite-differences"`` (periodic) with ``order=`` 2,
-                4, 6 or 8 and ``points=``; ``"fourier"`` (periodic) with ``points=`` and optionally ``derivative=``,
-                ``"fft"`` or ``"dense"`` (at most 64 points unless the density is quadratic in the derivatives): fast
-                Fourier transforms or matrices, by default transforms of 32 points or more, of odd numbers 65.
+                ends, which should contain the places where coefficients jump; ``"legendre"``, one element of
+                ``degree=``; ``"finite-differences"`` (periodic) with ``order=`` 2, 4, 6 or 8 and ``points=``;
+                ``"fourier"`` (periodic) with ``points=`` and optionally ``derivative=``, ``"fft"`` or ``"dense"`` (at
+                most 64 points unless the density is quadratic in the derivatives): fast Fourier transforms or matrices,
+                by default transforms of 32 points or more, of odd numbers 65.
             options: as above; a mapping gives each axis its own value, ``points={"x": 64, "y": 32}``.
 
         Raises:
@@ -262,6 +264,7 @@ class FieldSystem(Density):
             axes[axis] = DISCRETISATIONS[method](self, axis, **chosen)
         if not all(axis.pairs for axis in axes.values()):
             self._check_canonical_pairs(method)
+        warn_of_jumps(self, axes)
         return Assembly(self, axes).result({"method": method, **options})
 
     def _check_canonical_pairs(self, method: str) -> None:
