@@ -1,5 +1,8 @@
 """Observers receive every state of a run once, in any situation."""
 
+import signal
+import time
+
 import numpy as np
 import pytest
 
@@ -84,3 +87,38 @@ def test_energy_errors_of_observed_runs_are_those_of_saved_ones(stepper):
 def test_unknown_observers_are_rejected(stepper, observe, message):
     with pytest.raises(sc.StateError, match=message):
         stepper.integrate(**STATE, steps=3, observe=observe)
+
+
+PLANS = {"fixed": {"h": 0.01, "steps": 50_000_000}, "adaptive": {"t_end": 1e8}}
+
+
+@pytest.mark.filterwarnings("ignore::scvi_codegen.errors.AccuracyWarning")
+@pytest.mark.parametrize("plan", PLANS)
+def test_few_saved_states_do_not_delay_interruptions(plan):
+    """A call into C that ended with the next saved state would take a second and more."""
+    pendulum = sc.compile_stepper(sc.problem("planar-pendulum").system, "svi:2")
+    longest = []
+
+    def stop(signum, frame):
+        longest.append(time.perf_counter())
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGALRM, stop)
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.1)
+        began = time.perf_counter()
+        with pytest.raises(KeyboardInterrupt):
+            pendulum.integrate([1.0], [0.0], **PLANS[plan], save_every=10_000_000)
+        assert longest[0] - began < 0.9
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.parametrize("plan", [{"h": 0.1, "steps": 20_000}, {"t_end": 3000.0, "tolerance": 1e-6}])
+def test_chunks_of_few_saved_states_have_the_bits_of_all_states(plan):
+    pendulum = sc.compile_stepper(sc.problem("planar-pendulum").system, "svi:2")
+    few = pendulum.integrate([1.0], [0.0], **plan, save_every=7000)
+    whole = pendulum.integrate([1.0], [0.0], **plan)
+    assert np.array_equal(few.q[:-1], whole.q[::7000][: len(few) - 1])
+    assert np.array_equal(few.q[-1], whole.q[-1 if "t_end" in plan else 14_000])

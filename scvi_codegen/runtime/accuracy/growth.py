@@ -19,7 +19,7 @@ import numpy as np
 
 from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, warn
 from scvi_codegen.runtime.accuracy.size import Motion, first_of_groups, relative, roundoff
-from scvi_codegen.runtime.accuracy.warning_switch import check_of_finished_run, warnings_wanted
+from scvi_codegen.runtime.accuracy.warning_switch import warnings_wanted
 from scvi_codegen.runtime.constraints.projection import projected
 from scvi_codegen.runtime.core.features import require
 from scvi_codegen.runtime.core.integrator import Integrator
@@ -66,7 +66,6 @@ ROUNDOFF, LOOSE_TOLERANCE = 1e-14, 1e-6
 """Tolerances above which the propagation of the tangent vector needs four stages, and more corrections."""
 
 
-@check_of_finished_run
 def warn_of_error_growth(
     run: Memory, states: SavedStates, requested: bool | None, advance_until: Callable[[float], None] | None = None
 ) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 
 from scvi_codegen.errors import AccuracyWarning, StateError, warn
 from scvi_codegen.runtime.accuracy.resolution import warn_of_unresolved_fields
-from scvi_codegen.runtime.accuracy.warning_switch import check_of_finished_run, warnings_wanted
+from scvi_codegen.runtime.accuracy.warning_switch import warnings_wanted
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.run.memory import Memory
@@ -35,7 +35,6 @@ FIXED_STEP_REMEDY: Final = (
 )
 
 
-@check_of_finished_run
 def warn_of_inaccuracy(trajectory: SavedStates, run: Memory, *, before: float = 0.0) -> None:
     """Issue the warnings of large steps, of energy errors and of unresolved fields for the states of a run."""
     error = trajectory.step_error
@@ -84,7 +83,6 @@ def warn_of_energy_error(trajectory: SavedStates, run: Memory) -> None:
         warn_of_energies(*energies, **limits)
 
 
-@check_of_finished_run
 def warn_of_energy_errors(ensemble: Any, ends: Array | None = None) -> None:
     """Issue the warning of :func:`warn_of_energy_error` for the worst of ``MOST_CHECKED`` trajectories.
 

@@ -6,7 +6,7 @@ from typing import Any, Final
 import numpy as np
 
 from scvi_codegen.errors import AccuracyWarning, warn
-from scvi_codegen.runtime.accuracy.warning_switch import check_of_finished_run, warnings_wanted
+from scvi_codegen.runtime.accuracy.warning_switch import warnings_wanted
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array, coordinate_shapes
 from scvi_codegen.runtime.core.words import by_name
@@ -28,7 +28,6 @@ def unresolved_parts(stepper: Integrator, q: Array) -> Array | None:
     return np.asarray(np.max([mesh.unresolved(fields[name]) for name in mesh.field_system.fields], axis=0))
 
 
-@check_of_finished_run
 def warn_of_unresolved_members(ensemble: Any) -> None:
     """Issue the warning of :func:`warn_of_unresolved_fields` for the first of some trajectories that need it."""
     count = len(ensemble.parameters) if ensemble.stepper.interface.layout.mesh is not None else 0

@@ -1,14 +1,10 @@
 """Switch of the accuracy warnings, for code that takes large steps on purpose."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from functools import wraps
-from typing import Any, TypeVar, cast
 
 from scvi_codegen.errors import AccuracyWarning, warn
-
-Check = TypeVar("Check", bound=Callable[..., Any])
 
 _warnings_enabled: ContextVar[bool] = ContextVar("accuracy warnings are wanted", default=True)
 
@@ -23,22 +19,16 @@ def without_accuracy_warnings() -> Iterator[None]:
         _warnings_enabled.reset(token)
 
 
-def check_of_finished_run(check: Check) -> Check:
-    """Let a check of a finished run fail with a warning: the run must not be lost. Warnings as errors are raised."""
+def warn_of_failed_check(error: Exception) -> None:
+    """Issue a warning instead of the error of a check of a finished run, which must not be lost.
 
-    @wraps(check)
-    def checked(*arguments: Any, **named: Any) -> Any:
-        try:
-            return check(*arguments, **named)
-        except Warning:
-            raise
-        except Exception as error:  # noqa: BLE001  (whatever fails, the run is complete)
-            message = (
-                f"the accuracy of the run was not checked ({type(error).__name__}: {error}); its states are complete"
-            )
-            warn(message, AccuracyWarning)
-
-    return cast(Check, checked)
+    Raises:
+        Warning: if ``error`` is one, of filters that raise warnings.
+    """
+    if isinstance(error, Warning):
+        raise error
+    message = f"the accuracy of the run was not checked ({type(error).__name__}: {error}); its states are complete"
+    warn(message, AccuracyWarning)
 
 
 def warnings_wanted() -> bool:

@@ -29,6 +29,7 @@ from scvi_codegen.runtime.accuracy.largest_step import largest_step
 from scvi_codegen.runtime.accuracy.local_error import warn_of_energy_errors, warn_of_inaccuracy
 from scvi_codegen.runtime.accuracy.resolution import warn_of_unresolved_members
 from scvi_codegen.runtime.accuracy.size import neighbouring
+from scvi_codegen.runtime.accuracy.warning_switch import warn_of_failed_check
 from scvi_codegen.runtime.arrays.interface import RunSizes, interface_of_sizes, shapes_of_call, sizes_of_run
 from scvi_codegen.runtime.chaos.ensemble import ChaosIndicatorsEnsemble
 from scvi_codegen.runtime.chaos.indicators import ChaosIndicators
@@ -220,13 +221,10 @@ class Stepper(WithEventsInDouble, WithPaths, Integrator):
         run._set_up(plan, parameters, options, q, p)
         if segments is None:
             trajectory = run._integrated(q, p, t, growth, count, save_every, times, progress, observe)
-            warn_of_inaccuracy(trajectory, run)
         else:
             run._begin(q, p, t, growth)
             trajectory = segments.record(run, save_every, progress)
-        if not fixed:
-            repeat = None if segments is None else partial(segments.advance, run)
-            warn_of_error_growth(run, trajectory, check_growth, repeat)
+        _check(run, trajectory, check_growth, segments, fixed=fixed)
         run._release()
         return trajectory
 
@@ -807,12 +805,29 @@ class StepperOfRunTimeSizes(Stepper):
 Stepper._of_run_time_sizes = StepperOfRunTimeSizes
 
 
+def _check(
+    run: Run, trajectory: Trajectory, check_growth: bool | None, segments: InputSegments | None, *, fixed: bool
+) -> None:
+    """Issue the accuracy warnings of a finished run, with ``segments`` of inputs."""
+    try:
+        if segments is None:
+            warn_of_inaccuracy(trajectory, run)
+        if not fixed:
+            repeat = None if segments is None else partial(segments.advance, run)
+            warn_of_error_growth(run, trajectory, check_growth, repeat)
+    except Exception as error:  # noqa: BLE001  (the run is complete)
+        warn_of_failed_check(error)
+
+
 def checked_ensemble_result(work: Ensemble) -> EnsembleTrajectory:
     """Return the trajectories of an ensemble that was integrated; issue warnings of inaccurate ones."""
     trajectories = work.result()
-    warn_of_unconfirmed(trajectories.confirmations)
-    warn_of_energy_errors(trajectories, None if work.successive is None else work.successive.energies)
-    warn_of_unresolved_members(trajectories)
+    try:
+        warn_of_unconfirmed(trajectories.confirmations)
+        warn_of_energy_errors(trajectories, None if work.successive is None else work.successive.energies)
+        warn_of_unresolved_members(trajectories)
+    except Exception as error:  # noqa: BLE001  (the runs are complete)
+        warn_of_failed_check(error)
     return trajectories
 
 

@@ -35,6 +35,10 @@ from scvi_codegen.runtime.run.saving import checkpoint
 from scvi_codegen.runtime.run.step_plan import Adaptive, Fixed, FixedSteps, InTau, StepPlan, step_control
 from scvi_codegen.validation import LARGEST_COUNT, checked_count
 
+FIRST_STEPS = 256
+"""Number of saved states of the first C call, before the speed of the steps is known."""
+LONGEST_FIRST, FIRST_NUMBERS = 4096, 2**14
+"""Largest number of steps of the first C call, times positions: few saved states must not delay Ctrl-C."""
 STEPS_PER_CALL, MOST_UNTIMED = 10**5, 2**10
 """Largest number of steps per call into C, between checks for Ctrl-C, and of coordinates of which it is not timed."""
 LARGEST_STEP, MOST_GRID_LEVEL, MOST_SUSPENDED = 2**53, 2**16, 64
@@ -108,6 +112,7 @@ class Memory:
             self._q, self._p = (with_low(high, low) for high, low in zip((self._q, self._p), carries, strict=True))
             values = np.concatenate([values, np.zeros(len(values))])
             self._parameters = stepper._numbers(values)
+        self._longest_first = max(FIRST_STEPS, min(LONGEST_FIRST, FIRST_NUMBERS // len(self._q)))
         self._arguments = binding.pointer(values), binding.null
         self._control = binding.null  # of steps in C that are not fixed
         self._control_data: Sequence[Any] = ()  # that it refers to
@@ -133,6 +138,11 @@ class Memory:
         self._sums_action = hasattr(memory, "actions")
         firsts = {name: parameter_index(stepper.interface, f"{name}_0") for name in stepper.interface.inputs}
         self._inputs = {name: slice(first, first + 5) for name, first in firsts.items()}
+
+    def _first_steps(self, save_every: int) -> int:
+        """Return the largest number of steps of the first C call, of a run that saves every ``save_every``-th state."""
+        steps, most = FIRST_STEPS * save_every, self._longest_first
+        return steps if steps < most else most
 
     def _new_call(self, t: Any, q: Any, p: Any, iterations: Any) -> Any:
         """Return the arguments of C calls that store states in this memory."""

@@ -8,15 +8,16 @@ import numpy as np
 
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.accuracy.local_error import warn_of_inaccuracy
+from scvi_codegen.runtime.accuracy.warning_switch import warn_of_failed_check
 from scvi_codegen.runtime.constraints.projection import constraint_values, multipliers
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array, Parameters, States
 from scvi_codegen.runtime.core.words import scalar
 from scvi_codegen.runtime.rotations.attitude_history import AttitudeHistory
 from scvi_codegen.runtime.run.descriptions import describe_run
-from scvi_codegen.runtime.run.memory import Memory, alone
+from scvi_codegen.runtime.run.memory import FIRST_STEPS, Memory, alone
 from scvi_codegen.runtime.run.observation import Observation, Observe, Saver, saver_of
-from scvi_codegen.runtime.run.run_loop import FIRST_STEPS, ShortRuns, integrate_short, record
+from scvi_codegen.runtime.run.run_loop import ShortRuns, integrate_short, record
 from scvi_codegen.runtime.run.step_plan import Fixed, StepPlan, Until
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation import LARGEST_COUNT
@@ -78,7 +79,10 @@ class Run(Memory, AttitudeHistory):
         """
         before = 0.0 if self._leaving else self.step_error
         trajectory = self._recorded(steps, save_every=save_every, progress=progress)
-        warn_of_inaccuracy(trajectory, self, before=math.inf if self._leaving else before)
+        try:
+            warn_of_inaccuracy(trajectory, self, before=math.inf if self._leaving else before)
+        except Exception as error:  # noqa: BLE001  (the run is complete)
+            warn_of_failed_check(error)
         return trajectory
 
     def _advance_timed(self, steps: int, progress: Callable[[int], None] | None, stop: Callable[[], bool]) -> None:
@@ -119,7 +123,8 @@ class Run(Memory, AttitudeHistory):
     ) -> Trajectory:
         """Start a run that is set up at (q, p) and record it as :meth:`_recorded`, a short one by one C call."""
         plan, stores_all = self._plan, times is None and observe is None and progress is None
-        fits = steps is None if self._h is None else steps is not None and steps <= FIRST_STEPS * save_every
+        most = FIRST_STEPS if save_every == 1 else self._first_steps(save_every)
+        fits = steps is None if self._h is None else steps is not None and steps <= most
         special = self._has_tau or self._unset_inputs or self.stepper.events or self._rows is None
         if fits and stores_all and not special and (isinstance(plan, Fixed) or t != plan.t_end):
             return integrate_short(self, q, p, t, steps, save_every, growth)

@@ -16,7 +16,7 @@ from scvi_codegen.runtime.core.words import block_of, from_block
 from scvi_codegen.runtime.events.event import Crossings
 from scvi_codegen.runtime.rotations.states import checked_pair
 from scvi_codegen.runtime.run.chunks import drive
-from scvi_codegen.runtime.run.memory import Memory
+from scvi_codegen.runtime.run.memory import FIRST_STEPS, Memory
 from scvi_codegen.runtime.run.singular_time import ProgressWatch, check_energy_surface
 from scvi_codegen.runtime.run.step_plan import Adaptive, FixedSteps, InTau, ending_at
 from scvi_codegen.runtime.run.times import times_after
@@ -26,8 +26,8 @@ from scvi_codegen.validation import checked_count
 States = tuple[Any, ...]
 """Times, positions, momenta, iterations and, of a run that sums it, the action."""
 NATIVE_DOUBLE, INT32 = struct.Struct("d"), np.dtype(np.int32)
-FIRST_STEPS = 256
-"""Number of saved states of the first C call, before the speed of the steps is known."""
+GROWTH = 8.0
+"""Largest ratio of successive numbers of steps of calls that save few states."""
 
 
 def record(
@@ -64,6 +64,7 @@ def record(
                 recorder.advance,
                 math.inf if count is None else count,
                 first=1 if stop else recorder.first_size,
+                growth=GROWTH if save_every > 1 else 2.0,
                 ended=lambda: memory.arrived or bool(stop and stop()),
                 progress=progress,
             )
@@ -192,7 +193,8 @@ def integrate_short(
     """
     short: ShortRuns = run._rows
     h = run._h
-    size = FIRST_STEPS * save_every if steps is None else steps
+    first = FIRST_STEPS if save_every == 1 else run._first_steps(save_every)
+    size = first if steps is None else steps
     short.begin(t, q, p)
     short.call.measures_growth = growth
     status = short.integrate(size, save_every)
@@ -214,12 +216,11 @@ class _StateRecorder:
     def __init__(self, memory: Memory, save_every: int, steps: int | None, filled: int) -> None:
         plan, first = memory._plan, 0 if filled else memory._memory.step
         self.memory, self.save_every, self.first, self.filled = memory, save_every, first, filled or 1
+        self.first_size = memory._first_steps(save_every)
         if memory._h is not None:
             assert steps is not None  # by the caller
-            self.first_size = save_every * max(1, FIRST_STEPS // save_every)
             rows = (first + steps) // save_every - first // save_every + 1
         else:
-            self.first_size = FIRST_STEPS * save_every
             rows = min(FIRST_STEPS, (self.first_size if steps is None else steps) // save_every) + 3
         kept: StateRows | None = memory._rows
         self.rows = kept if kept is not None and rows <= len(kept.states[0]) else StateRows(memory, rows)
