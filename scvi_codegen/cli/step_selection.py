@@ -59,7 +59,7 @@ def model_with_global_error(model: Model, error: float) -> tuple[Model, GlobalEr
         "precision": result.precision,
     }
     tell(
-        f"global error: estimated at {result.estimate:.1e} (relative) from {result.runs} runs; the bound {error:g} "
+        f"global error: {result.estimate:.1e} (relative) by comparison of {result.runs} runs; the bound {error:g} "
         f"is confirmed until t = {result.confirmed_until:g}, with a {local}{f' in {DOUBLE_DOUBLE}' * in_words}",
         global_error=numbers,
     )

@@ -548,7 +548,7 @@ class TestCommandLine:
         found, saved = document["global_error"], loaded(tmp_path / "orbit.npz")
         exact = on_an_ellipse(saved["q"][0], saved["p"][0], saved["t"])
         size = np.linalg.norm(saved["q"], axis=1).max()
-        assert f"global error: estimated at {found['estimate']:.1e} (relative) from {found['runs']} runs" in printed
+        assert f"global error: {found['estimate']:.1e} (relative) by comparison of {found['runs']} runs" in printed
         assert np.linalg.norm(exact[:, :2] - saved["q"], axis=1).max() / size <= found["estimate"] <= 1e-9
         assert found["digits"] == math.floor(-math.log10(found["estimate"])) >= 9
         assert (found["requested"], found["confirmed"], found["confirmed_until"]) == (1e-9, True, saved["t"][-1])

@@ -58,7 +58,7 @@ PARTS_AT_KINKS, LEAST_AT_KINKS = (math.inf, 0.0913, 0.0331, 0.0127, 0.00491), 1e
 """Largest steps relative to the run, one after the other, of formulas that are not smooth: free flight has the same
 steps for all tolerances, one of which may end beyond a kink. The least tolerance of these runs, unless the first one is
 smaller."""
-LEAST_STOPS, LONG, STRIDE, MOST_STOPS = 8, 64, 16, 512
+LEAST_STOPS, LONG, STRIDE, MOST_STOPS = 8, 64, 16, 32
 """Of a run for comparison, numbers of times at which steps end: least; see :func:`irregular_stops`; most of others."""
 GOLDEN, MARGIN, IRREGULAR = 0.6180339887498949, 0.05, 0.8191725134
 """Golden ratio; part of a step at its ends that is not cut; ratio of steps of tau of runs for comparison."""

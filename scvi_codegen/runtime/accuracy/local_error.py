@@ -55,7 +55,7 @@ def warn_of_large_steps(trajectory: SavedStates, *, before: float = 0.0, remedy:
         return
     warn(
         f"the step size h = {trajectory.h:g} is too large: the relative error of the step from "
-        f"t = {trajectory.worst_step_time:g} is about {error:.1e}. Reduce h{remedy}",
+        f"t = {trajectory.worst_step_time:g} is about {error:.1e} (estimated). Reduce h{remedy}",
         AccuracyWarning,
     )
 

@@ -313,7 +313,8 @@ class Stepper(WithEventsInDouble, WithPaths, Integrator):
         arguments |= {"t_end": stops[-1], "tolerance": tolerance}
         run = self.start(q, p, **arguments)
         if self.interface.words == 1:
-            run = self.start(*map(neighbouring, (run.q, run.p)), **arguments | {"velocity": None})
+            states = map(neighbouring, (run.q, run.p))
+            run._begin(*self._consistent_state(*states, None, run.t, run._parameters), run.t)
         return segments.record_with_stops(run, stops, progress)
 
     @property

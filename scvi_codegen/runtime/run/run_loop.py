@@ -2,7 +2,7 @@
 
 import math
 import struct
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
 from math import isfinite
 from typing import Any, cast
@@ -28,6 +28,8 @@ States = tuple[Any, ...]
 NATIVE_DOUBLE, INT32 = struct.Struct("d"), np.dtype(np.int32)
 GROWTH = 8.0
 """Largest ratio of successive numbers of steps of calls that save few states."""
+STEPS_TO_STOP = 64
+"""Number of steps of a call towards a stop."""
 
 
 def record(
@@ -79,22 +81,26 @@ def record(
 
 
 def record_with_stops(
-    memory: Memory, stops: Iterable[float], *, progress: Callable[[int], None] | None = None
+    memory: Memory, stops: Sequence[float], *, progress: Callable[[int], None] | None = None
 ) -> Trajectory:
     """Advance with adaptive steps that end at each of the times ``stops``, and save all states.
 
     Raises:
         StepFailedError: if a step fails; ``trajectory`` has the saved states, the run is left before that step.
     """
-    recorder, first = _StateRecorder(memory, 1, None, 0), memory.steps
-    counted = None if progress is None else lambda _: progress(memory.steps - first)
+    recorder, first, target = _StateRecorder(memory, 1, None, 0), memory.steps, memory._plan
     try:
         for t_end in stops:
-            memory.plan = ending_at(memory.plan, t_end)
-            drive(recorder.advance, math.inf, first=FIRST_STEPS, ended=lambda: memory.arrived, progress=counted)
+            memory._call.t_end = t_end  # without the checks of a new plan
+            while memory.left_to(t_end) != 0.0:
+                recorder.advance(STEPS_TO_STOP)
+                if progress is not None:
+                    progress(memory.steps - first)
     except StepFailedError as failure:
         failure.trajectory = recorder.trajectory()
         raise
+    finally:
+        memory.plan = ending_at(target, stops[-1])
     return recorder.trajectory()
 
 
