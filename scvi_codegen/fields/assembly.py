@@ -360,6 +360,8 @@ class Assembly:
 
             return total(f"a{axis}", count, part) if cells.table else Add(*map(part, range(count)))
         system = self.system
+        for axis in [axis for axis in node if chosen[axis].edge]:
+            term = self.at_jumps(axis, chosen[axis], term)
         values = {symbol(each): self.combined(each, {}, chosen, node) for each in self.names_in(term, system.variables)}
         for name in self.names_in(term, system.derivatives):
             each, orders = system.derivatives[name]
@@ -376,6 +378,27 @@ class Assembly:
             inside = axis in node
             values[symbol(axis)] = self.in_cells(axis, chosen[axis], node[axis]) if inside else self.coordinate(axis)
         return reduce(mul, [*weights, term.xreplace(values)])
+
+    def at_jumps(self, axis: str, cells: Cells, term: Expr) -> Expr:
+        """Return a term at an edge, with the coefficients of second derivatives that jump there.
+
+        The moment c u_xx is continuous, so that an edge with the shares a, b of its weight in both elements has the
+        energy of the coefficient 1/(a/c_left + b/c_right) (mixed formulation).
+        """
+        edges = self.axes[axis].edges
+        assert edges is not None
+        for name in self.system.second_derivatives(term, axis):
+            factor = term.diff(name, 2)
+            inverse = sympy.S.Zero
+            for side, text in enumerate(("left", "right")):
+                place, share = (
+                    self.value(f"{axis}_{kind}_{text}_of_edges", (Size(f"F{axis}"),), values[side], cells.index)
+                    for kind, values in (("points", edges.sides), ("shares", edges.shares))
+                )
+                jumps = {each: each.xreplace({symbol(axis): place}) for each in self.system.jumps_in(factor)}
+                inverse += share / factor.xreplace(jumps)
+            term = sympy.expand_mul(term - factor * name**2 / 2) + name**2 / inverse / 2
+        return term
 
     def in_cells(self, axis: str, cells: Cells, k: Slot, *, inside: bool = False) -> Expr:
         """Return the coordinate of a quadrature point of a cell, slightly ``inside`` of its ends, or of an edge."""

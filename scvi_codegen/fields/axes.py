@@ -89,6 +89,8 @@ class Edges:
         cells: kinds of edges.
         table: (F, 2 p + 2) positions of the points of the elements to the left and to the right.
         weights, points: (F,) quadrature weights and coordinates.
+        sides, shares: (2, F) coordinates slightly inside of the elements to the left and to the right, and the parts of
+            the weights that belong to these.
         rows: by order of the derivative, (2, p + 1) coefficients to the left and to the right.
         scales: by order, (F, 2) factors of both sides.
     """
@@ -97,6 +99,8 @@ class Edges:
     table: NDArray[np.int64]
     weights: Array
     points: Array
+    sides: Array
+    shares: Array
     rows: dict[int, Array]
     scales: dict[int, Array]
 
@@ -362,7 +366,7 @@ class SpectralElements(Axis):
             quadrature=rule.weights,
             operators=(identity_matrix(p + 1), derivative, matrix_product(derivative, derivative)),
             stiffness=(largest, largest**2),
-            edges=_edges(name, places, local, (rule.weights, derivative), fixed, clamped),
+            edges=_edges(name, places, (local, inner), (rule.weights, derivative), fixed, clamped),
             one_sided=replace(sided, points=sided.points[:, inside], weights=sided.weights[:, inside]),
             cells=tuple(kinds),
             jacobians=half,
@@ -420,12 +424,16 @@ def _breaks(axis: str, start: float, end: float, elements: Any, places: Sequence
 def _edges(
     name: str,
     places: NDArray[np.int64],
-    local: Array,
+    coordinates: tuple[Array, Array],
     rule: tuple[Vector, Matrix],
     fixed: tuple[bool, bool] | None,
     clamped: tuple[bool, bool],
 ) -> Edges:
-    """Return the ends of elements; ``places`` and ``local``, (E, p + 1), are positions and coordinates of points."""
+    """Return the ends of elements.
+
+    ``places`` and ``coordinates``, (E, p + 1), are those of the points, and coordinates slightly inside of elements.
+    """
+    local, inner = coordinates
     weights = np.array([float(each) for each in rule[0]])
     derivative = np.array([[float(x) for x in row] for row in rule[1]])
     elements, size, half = len(places), places.shape[1], np.ptp(local, axis=1) / 2
@@ -450,11 +458,14 @@ def _edges(
         points = tuple(int(n > 0) if end else fixed_place(n - left) for n, end in single)
         kinds.append(Cells(None, fixed_place(int(f)), points, edge=True))
     stiffness = derivative.T @ (weights[:, None] * derivative)
+    left_of, right_of = inner[sides[:, 0], -1], inner[sides[:, 1], 0]
     return Edges(
         cells=tuple(kinds),
         table=np.clip(table - left, 0, last - left - right),
         weights=whole[:, 0],
         points=np.where(present[:, 1], local[sides[:, 1], 0], local[sides[:, 0], -1]),
+        sides=np.stack([np.where(present[:, 0], left_of, right_of), np.where(present[:, 1], right_of, left_of)]),
+        shares=(shares / whole).T,
         rows={order: matrix[[-1, 0]] for order, matrix in ((1, derivative), (2, stiffness))},
         scales={1: shares / half[sides] / whole, 2: np.where(present, -1, 0) / half[sides] / whole},
     )

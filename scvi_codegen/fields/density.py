@@ -91,6 +91,15 @@ class Density:
         jumps = [each for each in formula.atoms(unit_step, rint) if each.free_symbols & places]
         return [each for each in jumps if not each.free_symbols & moving]
 
+    def second_derivatives(self, formula: Expr, axis: str) -> list[Symbol]:
+        """Return the second derivatives along an axis whose coefficients in a formula jump along it."""
+        names = [symbol(name) for name, (_, orders) in self.derivatives.items() if orders.get(axis) == 2]
+        return [
+            name
+            for name in names
+            if any(symbol(axis) in each.free_symbols for each in self.jumps_in(formula.diff(name, 2)))
+        ]
+
     @property
     def rates(self) -> tuple[Symbol, ...]:
         """Symbols of the derivatives of the fields in time."""

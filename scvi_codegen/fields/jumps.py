@@ -24,7 +24,7 @@ MOST_SAMPLED = 10**6
 
 
 def warn_of_jumps(system: Density, axes: Mapping[str, Axis]) -> None:
-    """Issue a :class:`SystemDefinitionWarning` for coefficients that jump within elements, or multiply u_xx.
+    """Issue a :class:`SystemDefinitionWarning` for coefficients that jump within elements, or have one value at ends.
 
     Parameters have their default values.
     """
@@ -48,10 +48,11 @@ def warn_of_jumps(system: Density, axes: Mapping[str, Axis]) -> None:
                 "error does not fall exponentially with the degree. Only jumps along ends of elements do not disturb",
                 SystemDefinitionWarning,
             )
-        if any(_multiplies_second_derivative(system, jump, axis) for axis in names):
+        if any(_jumps_at_edges(system, jump, axis) for axis in names):
             warn(
-                f"the density of '{system.name}' has {jump} in the coefficient of a second derivative: its value at "
-                "ends of elements is that of one side, so that the error falls slowly with the degree",
+                f"the density of '{system.name}' has second derivatives, and {jump} in other terms with derivatives "
+                "than a factor times the square of one of them: its value at ends of elements is that of one side, so "
+                "that the error falls slowly with the degree",
                 SystemDefinitionWarning,
             )
 
@@ -82,9 +83,14 @@ def _jumps_within(function: Callable[..., Any], axes: list[Axis]) -> bool:
     return False
 
 
-def _multiplies_second_derivative(system: Density, jump: Expr, axis: str) -> bool:
-    """Return whether a coefficient of u_xx along an axis, for a field u, contains a function."""
-    return any(
-        orders.get(axis) == 2 and jump in system.density.diff(symbol(name)).atoms(type(jump))
-        for name, (_, orders) in system.derivatives.items()
-    )
+def _jumps_at_edges(system: Density, jump: Expr, axis: str) -> bool:
+    """Return whether a function is in terms that are evaluated at edges, but for the squares of second derivatives."""
+    derivatives = {symbol(name): orders for name, (_, orders) in system.derivatives.items()}
+    used = [name for name in derivatives if name in system.potential.free_symbols]
+    if not any(derivatives[name].get(axis) == 2 for name in used):
+        return False
+    rest = system.potential
+    for name in system.second_derivatives(rest, axis):
+        rest -= rest.diff(name, 2) * name**2 / 2
+    terms = sympy.Add.make_args(sympy.expand(rest))
+    return any(jump in term.atoms(type(jump)) and term.free_symbols & set(used) for term in terms)
