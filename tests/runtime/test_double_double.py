@@ -439,6 +439,46 @@ def exact_orbit(t: object, e: object = Fraction(1, 2)) -> list:
     return [mp.cos(angle) - e, mp.sqrt(1 - e**2) * mp.sin(angle)]
 
 
+def test_tolerances_are_met_or_refused() -> None:
+    """Tolerances below what error estimates resolve are refused; the error of each step is below all others."""
+    kepler, start = system("kepler"), {"q": ["0.5", 0], "velocity": [0, "1.7"], "t_end": 2.0}
+    exact = sc.compile_stepper(kepler, "svi:12", precision="double-double")
+    for method, least in (("sc:5", 2.3e-21), ("svi:4", 1e-31), ("chebyshev-gauss:6", 2.2e-20)):
+        stepper = sc.compile_stepper(kepler, method, precision="double-double")
+        with pytest.raises(StateError, match=r"tolerance=1e-32 cannot be met: .* resolve errors of"):
+            stepper.integrate(**start, tolerance=1e-32)
+        if least > 1e-27:
+            with pytest.raises(StateError, match="the default tolerance, round-off, cannot be met"):
+                stepper.integrate(**start)
+            with pytest.raises(StateError, match="tolerance=1e-28 cannot be met"):
+                stepper.integrate_ensemble([start["q"]], velocity=[start["velocity"]], t_end=2.0, tolerance=1e-28)
+        tolerance = max(least, 1e-22)
+        run = stepper.integrate(**start, tolerance=tolerance)
+        for k in range(0, len(run) - 1, len(run) // 8):
+            step = exact.integrate(run.q[k], run.p[k], t=run.t[k], t_end=float(run.t[k + 1]), tolerance=1e-30)
+            assert abs(step.mp("q")[-1] - run.mp("q")[k + 1]).max() < 10 * tolerance
+
+
+def test_dense_output_at_decimal_times() -> None:
+    """States between and at the ends of steps of 1/10, which are no multiples of it in double, are those of the motion.
+
+    x = cos t. The time left to an output time may have one word, the low one.
+    """
+    oscillator = lagrange("oscillator", "x", "x_dot**2/2 - x**2/2")
+    stepper = sc.compile_stepper(oscillator, "svi:12", precision="double-double")
+    run, (times, ends) = stepper.integrate([1], [0], h=0.1, steps=20), (np.linspace(0, 2, 21), [0.1 * 3, 0.3, 0.7, 1.9])
+    with mp.workdps(40):
+        between = stepper.integrate([1], [0], h=0.1, t_end=2.0, t_eval=times).mp("q")[:, 0]
+        for values, at in (
+            (between, times),
+            (run.at(ends)[0].mp()[:, 0], ends),
+            (run.at(run.t[3])[0].mp(), [run.t[3]]),
+        ):
+            assert max(abs(x - mp.cos(mp.mpf(float(t)))) for x, t in zip(values, at, strict=True)) < 2e-32
+        for h in (1 / 96, 1 / 3, 0.07):
+            assert abs(stepper.integrate([1], [0], h=h, t_end=2.0).mp("q")[-1][0] - mp.cos(2)) < 2e-31
+
+
 def test_every_quantity_has_both_words(tmp_path: Path) -> None:
     """Coordinates, momenta and velocities by name, of runs, in progress, of ensembles, recordings and events."""
     stepper = sc.compile_stepper(system("kepler"), "svi:4", precision="double-double", events=sc.Event("y - 3/5"))

@@ -19,6 +19,8 @@ from scvi_codegen.runtime.core.words import check_doubles
 from scvi_codegen.runtime.run.times import steps_to
 from scvi_codegen.validation import check_tolerance, checked_count
 
+ROUNDOFF_OF_TWO_WORDS = 1e-27
+"""Error of a step in double-double arithmetic that a run without a tolerance may have."""
 AbsoluteTolerance: TypeAlias = float | tuple[tuple[str, float], ...]
 """Absolute tolerance of all coordinates, or those of some coordinates, arrays and rotations by name."""
 
@@ -248,7 +250,7 @@ def step_control(stepper: Any, plan: StepPlan) -> tuple[Any, ...]:
         plan: step plan.
 
     Raises:
-        StateError: if there is no coordinate, array or rotation of a name.
+        StateError: if there is no coordinate, array or rotation of a name, or a tolerance cannot be met.
     """
     binding = stepper.binding
     match plan:
@@ -257,6 +259,8 @@ def step_control(stepper: Any, plan: StepPlan) -> tuple[Any, ...]:
             control.tau = tau
             return (control,)
         case Adaptive():
+            if stepper.interface.words > 1:
+                _check_resolved(plan.tolerance, binding.function("smallest_tolerance")())
             control = binding.new("step_control *")
             control.tolerance, control.max_step = plan.tolerance, plan.max_step
             first, absolute = binding.null, np.empty(0)
@@ -269,6 +273,20 @@ def step_control(stepper: Any, plan: StepPlan) -> tuple[Any, ...]:
             return control, first, absolute
         case _:
             return (binding.null,)
+
+
+def _check_resolved(tolerance: float, least: float) -> None:
+    """Raise ``StateError`` if error estimates do not resolve a tolerance, or round-off, 0, in double-double arithmetic.
+
+    The estimates are computed in double from the leading coefficient of the curve of a step. Of methods whose order is
+    lower than that of this coefficient squared, as ``sc``, it is a rounding error while the step still has an error.
+    """
+    if (tolerance or ROUNDOFF_OF_TWO_WORDS) < least:
+        wanted = f"tolerance={tolerance:g}" if tolerance else "the default tolerance, round-off,"
+        raise StateError(
+            f"{wanted} cannot be met: adaptive steps of this method resolve errors of {least:.1e} in double-double "
+            f"arithmetic. Give tolerance={least:.1e} or more, fixed steps h=, or a method as svi:12"
+        )
 
 
 def checked_plan(

@@ -20,6 +20,15 @@ static inline real rest_of_last(const trial *now)
   return now->last ? (span - now->step.h) + (rest - now->at.t_low) : 0;
 }
 
+#if defined(DOUBLE_DOUBLE) && defined(LEAST_UNRESOLVED)
+/* Smallest tolerance that a step of round-off meets and an error estimate in double resolves. */
+double NAME(smallest_tolerance)(void)
+{
+  const double rounding = 1e-31; /* of a step */
+  return larger(pow(LEAST_UNRESOLVED, ERROR_POWER), rounding);
+}
+#endif
+
 int NAME(advance_to)(run_memory *run, real t_end, const step_control *control, long long steps, long long every,
     const real *parameters, const solver_options *options, real *t, real *q, real *p, int *iterations,
     solver_report *report, real *workspace)
