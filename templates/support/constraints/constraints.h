@@ -10,7 +10,7 @@
  * kernels constraints, constraint_rounding and constrained_motion, and CONSTRAINT_ENTRY, the indices of the entries of G = g_q or A. */
 
 #define MAX_PROJECTIONS 100 /* Gauss-Newton iterations; more indicate that no state is near */
-#define MOST_HALVINGS 60 /* of an update */
+#define MOST_UPDATE_HALVINGS 60 /* of an update */
 #define MOMENTUM_PROJECTIONS 3 /* one suffices except for rounding and non-quadratic kinetic energies, for which the
                                 * iteration continues until an update of the velocity, relative to it, is settled */
 #define SETTLED_UPDATE REAL(1e-9)
@@ -169,7 +169,7 @@ static int project_position(real t, real *u, const real *parameters, saddle *at)
       for (int i = 0; i < M; i++)
         u[i] = nearest[i] + MATH(ldexp)(update[i], -halvings);
       now = misfit(t, u, parameters, g);
-    } while (!(now < left) && !is_rounding && ++halvings < MOST_HALVINGS);
+    } while (!(now < left) && !is_rounding && ++halvings < MOST_UPDATE_HALVINGS);
     if (!(now < left)) {
       memcpy(u, nearest, sizeof nearest);
       return is_rounding ? OK : NOT_CONVERGED;

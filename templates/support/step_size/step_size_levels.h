@@ -20,7 +20,7 @@ enum {
 #define LAST_STEP REAL(1e-6) /* relative to the step: a step that ends so near t_end ends at t_end */
 #define FIRST_STEP REAL_EPSILON /* of the whole span: first trial step size */
 #ifdef DOUBLE_DOUBLE
-#define ROUNDOFF_ERROR 1e-32
+#define ROUNDOFF_ERROR (64.0 * REAL_EPSILON * REAL_EPSILON) /* errors below are rounding errors of the estimate */
 #else
 #define ROUNDOFF_ERROR (REAL(0.125) * REAL_EPSILON) /* of a step, relative to its motion: the sum over a run is of the size of
                                                        * rounding errors */
