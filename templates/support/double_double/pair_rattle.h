@@ -264,12 +264,12 @@ static int refine_points(solved_step *solved, const step_data *step, const doubl
   rattle_pairs at;
   factors l[GROUPS];
   lanes derivative[CONSTRAINT_ENTRIES], change[M * GROUPS];
-  real inverse_size[M], r[M][GROUP_LANES], last = INFINITY;
-  int widened = 0;
+  real r[M][GROUP_LANES], last = INFINITY;
+  unknown_sizes sizes = {.widened = 0};
   dd end[M], q[M];
-  const real largest = invert_term_sizes(step, &solved->now, inverse_size);
+  find_sizes(step, &solved->now, &sizes);
   for (int i = 0; i < M; i++)
-    inverse_size[i] = 1 / (1 / inverse_size[i] + 1e-3 * largest);
+    sizes.inverse[i] = 1 / (1 / sizes.inverse[i] + 1e-3 * sizes.largest);
   begin_rattle_pairs(solved, step, t_low, h_low, &at);
   for (int g = 0; g < GROUPS; g++) {
     former_derivatives(&solved->now, g, derivative);
@@ -282,17 +282,16 @@ static int refine_points(solved_step *solved, const step_data *step, const doubl
     correct_points(&solved->now, &at, l, r);
     for (int n = 0; n < M * GROUPS; n++)
       change[n] = load(r[n / GROUPS], n % GROUPS);
-    real moved = measure_change(change, inverse_size, largest).relative;
+    real moved = measure_change(change, sizes.inverse, sizes.largest).relative;
     const real next = moved * larger(moved / last, FASTEST_MULTIPLIERS);
     const int stagnates = !(moved < last / 4);
     if (!is_finite(moved))
       return NOT_FINITE;
     if (moved <= REFINED || (k > 0 && NEGLECTED * next <= REFINED))
       break;
-    if (stagnates && moved > REFINED_ROUNDING && !widened) { /* above the rounding of positions: that of g */
-      widened = 1;
-      widen_sizes(step, inverse_size);
-      moved = measure_change(change, inverse_size, largest).relative;
+    if (stagnates && moved > REFINED_ROUNDING && !sizes.widened) { /* above the rounding of positions: that of g */
+      widen_sizes(step, &solved->now, &sizes);
+      moved = measure_change(change, sizes.inverse, sizes.largest).relative;
     }
     if (stagnates && moved <= REFINED_ROUNDING)
       break;
