@@ -101,8 +101,8 @@ int kepler_scvi_2_advance(kepler_scvi_2_run *run, long long steps, long long eve
     const kepler_scvi_2_options *options, double *t, double *q, double *p, int *iterations,
     kepler_scvi_2_report *report, double *workspace);
 /* Returns an estimate of the relative error of the worst step of a run so far, which began at run->error_t: from the
- * last coefficients of the polynomials of each step, relative to its state (near rest at the origin, to the largest
- * state of the run). Returns -1 if there is no estimate: for explicit methods, for methods with too few points, and in
+ * last coefficients of the polynomials of each step, relative to its motion (with a fixed step size, to the largest
+ * one of the run). Returns -1 if there is no estimate: for explicit methods, for methods with too few points, and in
  * code for microcontrollers (single or double precision) with fixed step size, which leaves it out to save memory. */
 double kepler_scvi_2_step_error(const kepler_scvi_2_run *run);
 

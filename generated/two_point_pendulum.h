@@ -96,8 +96,8 @@ int two_point_pendulum_advance(two_point_pendulum_run *run, long long steps, lon
     const two_point_pendulum_options *options, double *t, double *q, double *p, int *iterations,
     two_point_pendulum_report *report, double *workspace);
 /* Returns an estimate of the relative error of the worst step of a run so far, which began at run->error_t: from the
- * last coefficients of the polynomials of each step, relative to its state (near rest at the origin, to the largest
- * state of the run). Returns -1 if there is no estimate: for explicit methods, for methods with too few points, and in
+ * last coefficients of the polynomials of each step, relative to its motion (with a fixed step size, to the largest
+ * one of the run). Returns -1 if there is no estimate: for explicit methods, for methods with too few points, and in
  * code for microcontrollers (single or double precision) with fixed step size, which leaves it out to save memory. */
 double two_point_pendulum_step_error(const two_point_pendulum_run *run);
 

@@ -39,9 +39,8 @@ FAILURES = {
     ),
     "step size underflow": (
         "the step size is below machine precision",
-        "The motion ends there (a collision, a singularity, a mass of 0), its forces are not smooth, or from rest at "
-        "the origin they grow as a power of t beyond the method's degree. Set t_end before that time, or use a method "
-        "of higher degree",
+        "The motion ends there (a collision, a singularity, a mass of 0), or its forces are not smooth. Set t_end before "
+        "that time, or give h (fixed step size)",
     ),
     "spurious solution": (
         "the iteration converged to a spurious solution of the stage equations",

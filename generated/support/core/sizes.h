@@ -49,21 +49,23 @@ typedef struct array_motion {
 enum { MOTIONS = M };
 #endif
 
-/* Lets V and A of a coordinate or array contain a step; `part` of those of former steps is kept. */
-static inline void note_motion(run_memory *run, real h, real displacement, real curvature, real part, int k)
-{
-  run->largest_v[k] = larger(part * run->largest_v[k], displacement / MATH(fabs)(h));
-  run->largest_a[k] = larger(part * run->largest_a[k], curvature / (h * h));
-}
+/* What is kept of V and A when a step is added: `part`, and, of a coordinate that moves, the displacement by V in the
+ * step before, 1 / `larger_by` of its size: behind an encounter steps grow faster than its velocities are forgotten. A
+ * coordinate that is leaving rest has V and A of the trials for the first step. */
+typedef struct {
+  real part, larger_by;
+} kept_motion;
 
-/* Reduces V and A so that steps larger by 1 / `part` have no larger former displacements: behind an encounter, step
- * sizes grow faster than its velocities are forgotten. */
-static inline void keep_displacements(run_memory *run, real part)
+#define LEAVING_REST REAL(0.03) /* relative to V and A */
+
+/* Lets V and A of a coordinate or array contain a step. */
+static inline void note_motion(run_memory *run, real h, real displacement, real curvature, kept_motion kept, int k)
 {
-  for (int k = 0; k < MOTIONS; k++) {
-    run->largest_v[k] *= part;
-    run->largest_a[k] *= part * part;
-  }
+  const real v = displacement / MATH(fabs)(h), a = curvature / (h * h);
+  const int moves = v > LEAVING_REST * run->largest_v[k] || a > LEAVING_REST * run->largest_a[k];
+  const real by = moves ? kept.larger_by : 1;
+  run->largest_v[k] = larger(kept.part * by * run->largest_v[k], v);
+  run->largest_a[k] = larger(kept.part * by * by * run->largest_a[k], a);
 }
 
 /* The largest V, and the largest mu_i of a step of h of the run so far. */

@@ -68,9 +68,9 @@ static SELDOM int stages_fly(const real *z)
   return 0;
 }
 
-/* Lets V and A contain a solved step; `part` of those of former steps is kept. */
-static inline void note_stages(run_memory *run, const step_data *step, const real *z, const real *dq, real part)
+/* Lets V and A contain a solved step. */
+static inline void note_stages(run_memory *run, const step_data *step, const real *z, const real *dq, kept_motion kept)
 {
   for (int i = 0; i < M; i++)
-    note_motion(run, step->h, MATH(fabs)(dq[i]), curvature_of_stages(step, z, i), part, i);
+    note_motion(run, step->h, MATH(fabs)(dq[i]), curvature_of_stages(step, z, i), kept, i);
 }

@@ -169,13 +169,13 @@ typedef struct {
 #endif
 } trial;
 
-/* Lets V and A contain a solved trial; `part` of those of former steps is kept. */
-static inline void note_trial(run_memory *run, const trial *now, real part)
+/* Lets V and A contain a solved trial. */
+static inline void note_trial(run_memory *run, const trial *now, kept_motion kept)
 {
 #ifdef NEWTON_ALONE
-  note_stages(run, &now->step, run->memory, now->dq, part);
+  note_stages(run, &now->step, run->memory, now->dq, kept);
 #else
-  note_curve(run, &now->step, &now->data, STORED(run, &now->step), now->dq, part, 1);
+  note_curve(run, &now->step, &now->data, STORED(run, &now->step), now->dq, kept, 1);
 #endif
 }
 
@@ -295,9 +295,10 @@ static SELDOM int levels_of_first(const trial *now, real h, real span)
  * displacement t^k with k above what the curve represents has a large error relative to itself at any step size. */
 static inline void try_pilot(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
+  const kept_motion nothing = {0, 0};
   try_step(run, now, 0, options, report);
   if (now->error < INFINITY)
-    note_trial(run, now, 0);
+    note_trial(run, now, nothing);
 }
 
 /* Determines the first step size by increasing one that is certainly too small. The smallest trials may fail, with
@@ -566,8 +567,6 @@ static inline void choose_size(run_memory *run, const trial *now)
   if (run->avoiding > 0 && run->avoiding-- && run->grid_level + change >= run->failed)
     change = (int)(run->failed - 1 - run->grid_level);
   change = levels_within(run, now, change);
-  if (change > 0)
-    keep_displacements(run, size_of_level(run->grid_level) / size_of_level(run->grid_level + change));
   run->guess = now->guess;
   run->change_before = run->change;
   run->change = change;
@@ -613,6 +612,14 @@ static inline void finish_trial(run_memory *run, trial *now, real h)
   run->step++;
 }
 
+/* What the accepted step leaves of V and A. */
+static inline kept_motion kept_of_former(const trial *now)
+{
+  const kept_motion kept = {FORMER_PART,
+      now->change > 0 ? size_of_level(now->grid_level - now->change) / size_of_level(now->grid_level) : 1};
+  return kept;
+}
+
 /* Adds the increments of the accepted step to the state. */
 static inline void accept_trial(run_memory *run, trial *now)
 {
@@ -630,7 +637,7 @@ static inline void accept_trial(run_memory *run, trial *now)
 #ifdef RATTLE
   run->fallback_steps += now->fallbacks;
 #endif
-  note_trial(run, now, FORMER_PART);
+  note_trial(run, now, kept_of_former(now));
   run->path += MATH(fabs)(now->step.h) * largest_velocity(run);
   if (larger(now->error, now->apart) > run->error) {
     run->error = larger(now->error, now->apart);

@@ -1,0 +1,134 @@
+"""Adaptive steps depend neither on the origin nor on the unit of coordinates, and start at rest and at zero."""
+
+import math
+
+import numpy as np
+import pytest
+
+import scvi_codegen as sc
+
+
+def compiled(lagrangian, coordinates, method="svi:8", **parameters):
+    system = sc.LagrangianSystem.from_text("moved", coordinates, lagrangian, parameters=parameters or None)
+    return sc.compile_stepper(system, method)
+
+
+PENDULUM = "a_dot**2/2 + cos(a)"
+KEPLER = "(x_dot**2 + y_dot**2)/2 + g/sqrt((x - c)**2 + y**2)"
+CHAIN = "(a_dot**2 + b_dot**2 + d_dot**2)/2 - 10*((a - t**3)**2 + (b - a)**2 + (d - b)**2)"
+
+
+@pytest.mark.parametrize("method", ["svi:4", "svi:8"])
+def test_windings_of_an_angle_change_neither_steps_nor_errors(method):
+    stepper = compiled(PENDULUM, ["a"], method)
+    runs = [stepper.integrate([1 + 2 * math.pi * k], [0.0], t_end=50.0, tolerance=1e-8) for k in (0, 10, 1000, 100_000)]
+    ends = [run.q[-1, 0] - 2 * math.pi * k for run, k in zip(runs, (0, 10, 1000, 100_000), strict=True)]
+    assert max(run.steps for run in runs) <= min(run.steps for run in runs) + 1
+    assert np.ptp(ends) < 1e-6
+
+
+def test_shifted_ellipse_takes_the_same_steps():
+    stepper = compiled(KEPLER, ["x", "y"], "svi:4", c=0.0, g=1.0)
+    found = []
+    for shift in (0.0, 1.0, 100.0, 1e6):
+        run = stepper.integrate([0.4 + shift, 0.0], [0.0, 2.0], t_end=10.0, tolerance=1e-8, parameters={"c": shift})
+        found.append((run.steps, run.q[-1, 0] - shift, run.q[-1, 1]))
+    assert np.ptp([each[0] for each in found]) <= 1
+    assert np.ptp([each[1:] for each in found], axis=0).max() < 1e-6
+
+
+def test_units_by_powers_of_two_give_equal_bits():
+    """Lengths times 2^k: g times 2^(3k), at equal times."""
+    stepper, found = compiled(KEPLER, ["x", "y"], "svi:4", c=0.0, g=1.0), []
+    for k in (0, -20, 20):
+        unit = 2.0**k
+        run = stepper.integrate(
+            [0.4 * unit, 0.0], [0.0, 2.0 * unit], t_end=10.0, tolerance=1e-8, parameters={"g": unit**3}
+        )
+        found.append((run.t.tobytes(), (run.q / unit).tobytes()))
+    assert found[0] == found[1] == found[2]
+
+
+@pytest.mark.parametrize("start", [0.0, 1e-7, 1e-9, 1e-12, 1.2e-16])
+def test_coordinate_at_zero_beside_a_moving_one(start):
+    """Rounding errors of the fast coordinate are no errors of the slow one; 720,000 steps at 1e-12."""
+    stepper = compiled("2*s_dot**2 + a_dot**2/2 + s_dot*a_dot*cos(a) + 9.81*cos(a)", ["s", "a"])
+    run = stepper.start([0.634, start], stepper.momentum([0.634, start], [-0.707, 0.0]), t_end=5.0)
+    run.advance(100)
+    assert run.arrived
+    assert run.q[1] == pytest.approx(0.720402 * start, rel=1e-2, abs=1e-16)
+
+
+@pytest.mark.parametrize("method", ["svi:2", "svi:4", "svi:8"])
+def test_chain_at_rest_follows_a_force_that_grows_as_a_power_of_time(method):
+    """Each displacement is a power of t beyond the degree, with a large error relative to itself at any step size."""
+    run = compiled(CHAIN, ["a", "b", "d"], method).integrate([0.0] * 3, [0.0] * 3, t_end=2.0, tolerance=1e-8)
+    fine = compiled(CHAIN, ["a", "b", "d"], "svi:12").integrate([0.0] * 3, [0.0] * 3, h=0.02, steps=100)
+    assert run.steps < 4000
+    assert np.abs(run.q[-1] - fine.q[-1]).max() < 1e-5 * np.abs(fine.q[-1]).max()
+
+
+def test_double_pendulum_through_the_origin():
+    stepper = compiled("a_dot**2 + b_dot**2/2 + a_dot*b_dot*cos(a - b) + 2*cos(a) + cos(b)", ["a", "b"], "svi:4")
+    velocity = [0.7428214630175944, 0.0]
+    run = stepper.integrate([0.0, 0.0], velocity=velocity, t_end=10.0)
+    assert run.steps < 2000
+    assert np.abs(run.energy() / run.energy()[0] - 1).max() < 1e-13
+
+
+def test_ellipse_of_small_pericentre_far_from_the_origin():
+    """What is known beyond the rounding of the shift: e = .9999, shifted by 100."""
+    stepper, e, errors = compiled(KEPLER, ["x", "y"], "svi:8", c=0.0, g=1.0), 0.9999, []
+    for shift in (0.0, 100.0):
+        run = stepper.integrate(
+            [1 - e + shift, 0.0],
+            [0.0, math.sqrt((1 + e) / (1 - e))],
+            t_end=3.0,
+            tolerance=1e-12,
+            parameters={"c": shift},
+            check_growth=False,
+        )
+        errors.append(abs(run.energy()[-1] / run.energy()[0] - 1))
+        assert run.steps < 400
+    assert errors[0] < 1e-8
+    assert errors[1] < 1e-4  # rounding of the shift relative to the pericentre, 1e-14 / 1e-4, times the growth
+
+
+def test_light_planet_is_as_accurate_as_a_heavy_one():
+    """Both move about a fixed centre; the mass of the second is 1e-9."""
+    stepper = compiled(
+        "(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2) + m*(u_dot**2 + v_dot**2)/2 + m/sqrt(u**2 + v**2)",
+        ["x", "y", "u", "v"],
+        m=1e-9,
+    )
+    run = stepper.integrate([1.0, 0, 0.01, 0], velocity=[0, 1.0, 0, 10.0], t_end=0.2, tolerance=1e-9)
+    angles = 1000 * run.t
+    assert np.abs(run.q[:, 2] - 0.01 * np.cos(angles)).max() < 1e-7 * 0.01
+
+
+def test_small_coordinate_beside_a_large_one():
+    """z = 1e-14 beside x = 1: relative to its own motion."""
+    run = compiled("(x_dot**2 + z_dot**2)/2 - x**2/2 - 3*z**2/2", ["x", "z"]).integrate(
+        [1.0, 1e-14], [0.0, 0.0], t_end=10.0, tolerance=1e-9
+    )
+    assert run.q[-1, 1] == pytest.approx(1e-14 * math.cos(math.sqrt(3) * 10.0), abs=1e-21)
+
+
+def test_runs_in_parts_have_equal_bits():
+    stepper = compiled(PENDULUM, ["a"], "svi:4")
+    whole, parts = (stepper.start([1.0], [0.0], t_end=20.0, tolerance=1e-9) for _ in range(2))
+    whole.advance(10**6)
+    while not parts.arrived:
+        parts.advance(7)
+        parts = stepper.from_checkpoint(parts.checkpoint(), t_end=20.0, tolerance=1e-9)
+    assert (whole.steps, whole.q.tobytes()) == (parts.steps, parts.q.tobytes())
+
+
+def test_absolute_tolerance_of_a_coordinate_takes_fewer_steps():
+    stepper = compiled("(x_dot**2 + z_dot**2)/2 - x**2/2 - 300*z**2/2", ["x", "z"])
+    own, other = (
+        stepper.integrate([1.0, 1e-9], [0.0, 0.0], t_end=10.0, tolerance=1e-9, **options)
+        for options in ({}, {"absolute_tolerance": {"z": 1e-3}})
+    )
+    assert other.steps < 0.7 * own.steps
+    assert other.q[-1, 0] == pytest.approx(math.cos(10.0), abs=1e-7)
