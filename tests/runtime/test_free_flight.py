@@ -1,4 +1,4 @@
-"""Forces that set in between the points of two steps are seen: free flights onto stiff floors, in every kind of solver."""
+"""Forces that set in between the points of two steps are seen: free flights onto stiff floors, by every solver."""
 
 import numpy as np
 import pytest
