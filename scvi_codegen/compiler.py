@@ -52,7 +52,7 @@ SYSTEM_OR_ARRAYS = ArgumentType(
 @checks_arguments(system=SYSTEM_OR_ARRAYS, flags=TEXTS)
 def compile_stepper(
     system: MechanicalSystem | ArraySystem,
-    method: Method | str,
+    method: Method | str = "svi:8",
     *,
     solver: str = "auto",
     flags: tuple[str, ...] = TUNED_FLAGS,
@@ -79,7 +79,7 @@ def compile_stepper(
         prefix: prefix of the C names; by default made from the names of system and method.
         symmetries: symmetries to track in addition to those that are detected
             (:func:`~scvi_codegen.mechanics.symmetry.checking.check_symmetry`).
-        events: zero crossings that every run of this stepper (not ensembles) records, see :meth:`Stepper.integrate`.
+        events: zero crossings that every run of this stepper records, see :meth:`Stepper.integrate`.
         time_transformation: time-rescaling function g(q, t) > 0 (g(q, p, t) of a Hamiltonian), or a name accepted by
             :func:`~scvi_codegen.reparametrise`. Runs with h and t_end then take constant steps h in tau, dt = g dtau,
             by the reversible controller of Hairer and Soederlind; time-dependent and forced systems are supported.

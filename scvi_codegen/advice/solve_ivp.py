@@ -74,7 +74,10 @@ class OdeResult:
         return self.status >= 0
 
 
-@checks_arguments(system=of("a system or its stepper", MechanicalSystem, ArraySystem, Stepper))
+KINDS = "a system or its stepper (for a function f(t, y) use scipy.integrate.solve_ivp, see docs/limits.md)"
+
+
+@checks_arguments(system=of(KINDS, MechanicalSystem, ArraySystem, Stepper))
 def solve_ivp(
     system: MechanicalSystem | ArraySystem | Stepper,
     t_span: Sequence[float],

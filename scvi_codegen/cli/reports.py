@@ -26,12 +26,15 @@ def duration(seconds: float) -> str:
 
 
 def in_known_digits(x: float, error: float) -> str:
-    """Return a number rounded to the digits that an error leaves right; 17 digits if the error is 0 or not finite."""
+    """Return a number rounded to the digits that an error leaves right; 17 digits if the error is 0 or not finite.
+
+    A number of which no digit is right is not printed, only its error.
+    """
     if error == 0.0 or not math.isfinite(error):
         return f"{x: .17g}"
     decimals = math.floor(-math.log10(2.0 * error))
     digits = math.floor(math.log10(abs(x))) + 1 + decimals if x else 0
-    return f"{x: .{min(digits, 17)}g}" if digits > 0 else f"{x: .1g} within {error:.1g}"
+    return f"{x: .{min(digits, 17)}g}" if digits > 0 else f" no digit (error {error:.1g})"
 
 
 def table(rows: Sequence[Sequence[str]]) -> str:

@@ -242,7 +242,7 @@ def _check_constraints(system: MechanicalSystem) -> None:
     for name, g in zip(names, system.constraints, strict=True):
         if g.free_symbols.isdisjoint((*system.coordinates, *system.velocities)):
             raise SystemDefinitionError(
-                f"the constraint '{name}' contains no coordinate: constraints are {forms_of_constraints()}. Remove "
+                f"the constraint '{name} = 0' contains no coordinate: constraints are {forms_of_constraints()}. Remove "
                 "it, or write the condition in terms of the coordinates"
             )
     for k, i in jacobian(list(constraint_jacobian(system).values()), system.velocities):

@@ -9,6 +9,7 @@ Plots of paths: orbits of bodies, planes of two coordinates, phase planes, many 
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
@@ -116,7 +117,7 @@ def plot_section(
     trajectories: Motions,
     path: str | os.PathLike[str] | None = None,
     *,
-    axes: tuple[str, str],
+    axes: tuple[str, str] | None = None,
     event: int = 0,
     ax: Axes | None = None,
 ) -> Axes:
@@ -125,7 +126,8 @@ def plot_section(
     Args:
         trajectories: one or several trajectories of the same system, integrated with ``events``.
         path: file for the picture, .png, .svg or .pdf; ``None`` to write none.
-        axes: two names of coordinates or momenta (``p_`` before the coordinate, or as the Hamiltonian names it).
+        axes: two names of coordinates or momenta (``p_`` before the coordinate, or as the Hamiltonian names it); by
+            default the first coordinate that the event does not contain, and its momentum.
         event: index of the event that defines the surface.
         ax: axes to draw on; ``None`` for new ones.
 
@@ -134,6 +136,7 @@ def plot_section(
         PlotError: without matplotlib.
     """
     result = several(trajectories)
+    axes = axes or _axes_of_section(result[0], event)
     points = [[_at_crossings(motion, name, event) for name in axes] for motion in result]
     size = 2.0 if sum(len(x) for x, _ in points) > FEW_POINTS else 4.0
     stepper = result[0].stepper
@@ -144,6 +147,15 @@ def plot_section(
         drawn.set(xlabel=axes[0], ylabel=axes[1])
         drawn.set_title(plain(f"{stepper.interface.system}: {cut.function} = 0{DIRECTION_TEXT[cut.direction]}"))
     return drawn
+
+
+def _axes_of_section(motion: DrawnMotion, event: int) -> tuple[str, str]:
+    """Return the first coordinate that an event does not contain, and its momentum."""
+    interface, events = motion.stepper.interface, motion.stepper.events
+    function = str(events[event].function) if -len(events) <= event < len(events) else ""
+    pairs = zip(interface.coordinates, interface.momenta, strict=True)
+    free = [pair for pair in pairs if not re.search(rf"\b{re.escape(pair[0])}\b", function)]
+    return (free or [(interface.coordinates[0], interface.momenta[0])])[0]
 
 
 def _at_crossings(motion: DrawnMotion, name: str, event: int) -> Array:

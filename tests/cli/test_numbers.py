@@ -662,3 +662,10 @@ def test_every_field_and_line_of_an_array_system_is_correct(here):
     assert [[row[0], float(row[2]), float(row[5])] for row in final] == [
         [f"q_{i}", q[-1, i], p[-1, i]] for i in range(6)
     ]
+
+
+def test_numbers_without_a_right_digit_are_not_printed():
+    from scvi_codegen.cli.reports import in_known_digits
+
+    assert in_known_digits(6.1, 8.0) == " no digit (error 8)"
+    assert in_known_digits(6.1, 0.01) == " 6.1"

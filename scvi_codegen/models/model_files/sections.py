@@ -177,8 +177,11 @@ def check_keys(section: Section, known: Iterable[str], kind: str, where: str = "
     hint = key_hint if kind in ("key", "section") else closest
     for key in section:
         if key not in names:
+            where_else = hint(key, names)
+            if f"belongs in {where.split(' ')[0]}" in where_else:  # a key of other methods than the present one
+                where_else = "."
             raise ModelFileError(
-                f"unknown {kind} '{key}' in {where}{hint(key, names)} Known: {', '.join(dict.fromkeys(names))}"
+                f"unknown {kind} '{key}' in {where}{where_else} Known: {', '.join(dict.fromkeys(names))}"
             )
 
 

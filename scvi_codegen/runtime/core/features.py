@@ -154,7 +154,12 @@ FEATURES = {
         ),
         ("without constraints", "project multipliers", "the system has none"),
         ("with forces", "energy", "they change the energy; omit energy"),
-        ("without the work of forces", "work", f"it requires forces, and {_CURVE}, or Newton's StoermerVerlet"),
+        (
+            "without the work of forces",
+            "work",
+            f"it requires forces, and {_CURVE}, or Newton's StoermerVerlet; that of driven constraints follows from "
+            "run.multipliers()",
+        ),
         ("without an action", "discrete_lagrangian", f"it requires {_CURVE}, no forces, and a second-order system"),
         (
             "without an error estimate",
