@@ -41,7 +41,7 @@ from scvi_codegen.formulas.array_statements import (
     parse_constraint,
 )
 from scvi_codegen.formulas.arrays import ArrayTerm, parse_coordinate, parse_sums
-from scvi_codegen.formulas.expressions import evaluated, kinked_root, unsupported_part
+from scvi_codegen.formulas.expressions import evaluated, kinked_root, rint, unit_step, unsupported_part
 from scvi_codegen.formulas.rotations import RotationNames, entries_in_formulas
 from scvi_codegen.formulas.symbols import DOT, TIME, identifier, input_formulas, symbol
 from scvi_codegen.indices import Access, Array, Loop, Size
@@ -315,21 +315,44 @@ def _search(interface: Interface, events: tuple[SearchedEvent, ...], header: str
     )
     if interface.layout.coordinates:
         arrays, changed = array_events(interface, events), (0,) * any(event.changes_state for event in events)
-        known: dict[str, Any] = {"kernels": tuple(arrays.kernels), "changed": changed}
+        known: dict[str, Any] = {"kernels": tuple(arrays.kernels), "changed": changed, "timed": arrays.timed}
         return replace(search, dimension=0, arrays=arrays, uses_velocity=arrays.uses_velocity, **known)
     formulas = EventFormulas(interface, events)
     guards = [guard for _, guard in formulas.guards]
     values = [value for _, each in formulas.changes for value in each]
+    timed = [0 if search.transformed else _kind_in_time(g, formulas.arguments) for g in formulas.functions]
+    rates = [turn_rate(g) if kind else sympy.Integer(0) for g, kind in zip(formulas.functions, timed, strict=True)]
     every = {"event_functions": formulas.functions, "event_guards": guards, "event_changes": values}
+    every |= {"event_rates": rates} if any(timed) else {}
     return replace(
         search,
         elements=tuple(formulas.elements),
+        timed=tuple(timed[first] for first in (0, *accumulate(formulas.elements[:-1]))),
         guarded=tuple(number for number, _ in formulas.guards),
         kernels=tuple(formulas.kernel(name, each) for name, each in every.items() if each),
         uses_velocity=any(value.free_symbols.intersection(formulas.v) for each in every.values() for value in each),
         changed=tuple(index for indices, _ in formulas.changes for index in indices),
         first_values=(0, *accumulate(len(each) for _, each in formulas.changes)),
     )
+
+
+def _kind_in_time(g: Expr, moving: Iterable[Symbol]) -> int:
+    """Return 1 for a function of time alone, 2 for one that is affine in time, else 0."""
+    time = symbol(TIME)
+    if time not in g.free_symbols or not g.free_symbols.isdisjoint(moving):
+        return 0
+    return 1 if g.has(rint, unit_step) or time in sympy.diff(g, time).free_symbols else 2
+
+
+TURNS = {sympy.sin: 2 * sympy.pi, sympy.cos: 2 * sympy.pi, sympy.tan: sympy.pi, rint: sympy.Integer(1)}
+"""Periods of functions, of rint of its jumps."""
+
+
+def turn_rate(g: Expr) -> Expr:
+    """Return the sum of the squares of the turns per time of the sines, cosines, tangents and rint in a function."""
+    time = symbol(TIME)
+    turning = sorted(g.atoms(*TURNS), key=str)
+    return sympy.Add(*((sympy.diff(each.args[0], time) / TURNS[each.func]) ** 2 for each in turning))
 
 
 Slots: TypeAlias = Sequence[tuple[Any, Access]]
@@ -397,6 +420,7 @@ class ArrayEvents:
         }
         self.uses_velocity, self.functions, self.kernels = False, list[str](), list[Kernel]()
         self.events = [self._event(k, event) for k, event in enumerate(events)]
+        self.timed = tuple(each["timed"] for each in self.events)
 
     def terms(self, formula: Any, event: SearchedEvent) -> tuple[ArrayTerm, ...]:
         """Return the terms of a formula of an event; in the loops of the event, one term for each of their elements.
@@ -476,9 +500,24 @@ class ArrayEvents:
             line for j, each in enumerate(event.conditions) for line in self._value(f"condition_{k}_{j}", each, event)
         ]
         changes, entries = self._wall(k, event, terms) if event.restitution is not None else self._map(k, event)
+        timed, rates = self._in_time(k, event, terms)
         ranges = [(size_text(loop.first), size_text(loop.end), int(bool(loop.behind))) for loop in loops]
         code = {"accesses": tuple(self._accesses), "functions": functions, "conditions": conditions, "changes": changes}
+        code |= {"timed": timed, "rates": rates}
         return {"ranges": ranges, "count": count_text(loops), "entries": entries, **code}
+
+    def _in_time(self, k: int, event: SearchedEvent, terms: Sequence[ArrayTerm]) -> tuple[int, list[str]]:
+        """Return 1 for a function of time alone, 2 if it is affine, else 0, and statements that compute its turns."""
+        if event.loops or any(term.loops or term.slots for term in terms):
+            return 0, []
+        whole = sympy.Add(*(term.formula for term in terms))
+        kind, squares = _kind_in_time(whole, ()), turn_rate(whole)
+        if not kind or squares == 0:
+            return kind, []
+        call = self._function(
+            f"rate_{k}", replace(terms[0], formula=squares), [squares], [f"{NEXT} = value[0];"], within=False
+        )
+        return kind, [call]
 
     def _wall(self, k: int, event: SearchedEvent, terms: Sequence[ArrayTerm]) -> tuple[list[str], str]:
         """Return statements that compute the gradient of a wall and its restitution, and the number of entries."""

@@ -141,6 +141,7 @@ class EventSearch:
         nodes: (d + 1,) fractions of a part of a step at which they are evaluated.
         coefficients: (d + 1, d + 1) from values there to coefficients of powers of x in [-1, 1].
         doubts: factors of the last two coefficients in the error estimate.
+        timed: for each event 1 if its function is one of time alone, 2 if it is affine, else 0.
         guarded: index of the function of each condition of crossings; of arrays of run-time sizes of its event.
         impacts: 1 for each event that is the wall of an impact, else 0.
         conditional: 1 for each event with conditions, else 0.
@@ -161,6 +162,7 @@ class EventSearch:
     nodes: tuple[float, ...]
     coefficients: tuple[tuple[float, ...], ...]
     doubts: tuple[float, float]
+    timed: tuple[int, ...] = ()
     guarded: tuple[int, ...]
     impacts: tuple[int, ...]
     conditional: tuple[int, ...]

@@ -453,6 +453,10 @@ static int search_function(const event_step *step, int e, const event_sample *le
   return status == OK ? search_part(step, e, &from, &to, from.fraction > 0.0 ? NULL : inner, EVENT_SPLITS) : status;
 }
 
+#ifdef EVENTS_OF_TIME
+#include "event_times.h"
+#endif
+
 /* Finds the crossings of all functions on a step, in no particular order; the values at its ends are known. The first
  * one that changes the state is located first, as no later one is needed. */
 static int search_step(const event_step *step, const event_sample *left, const event_sample *right)
@@ -461,6 +465,13 @@ static int search_step(const event_step *step, const event_sample *left, const e
   int status = OK, first;
   event_sample sample;
   step->horizon->fraction = INFINITY;
+#ifdef EVENTS_OF_TIME
+  for (int e = 0; e < EVENTS && status == OK; e++)
+    if (IS_TIMED[EVENT_OF(e)])
+      status = search_times(step, e, left, right);
+  if (EVENTS_OF_TIME_ALONE)
+    return status;
+#endif
   for (int j = 1; j < EVENT_DEGREE && status == OK; j++) {
     status = state_at(step, EVENT_NODES[j], &sample);
     if (status == OK)
@@ -471,6 +482,10 @@ static int search_step(const event_step *step, const event_sample *left, const e
   if (status != OK)
     return status;
   mark_far(step, far);
+#ifdef EVENTS_OF_TIME
+  for (int e = 0; e < EVENTS; e++)
+    far[e] = IS_TIMED[EVENT_OF(e)] ? 1.0 : far[e];
+#endif
   first = first_to_change(step, far);
   if (first >= 0)
     status = search_function(step, first, left, right);
@@ -488,6 +503,16 @@ static int ends_search(event_watch *watch, const event_crossing *crossing)
   return watch->ended || watch->acts[crossing->function];
 }
 
+/* Evaluates function e at the state where a part of a step ends. */
+static int value_at_end(const event_step *step, int e, event_sample *at)
+{
+#ifdef EVENTS_OF_TIME
+  if (IS_TIMED[EVENT_OF(e)])
+    return end_value(step, e, at->t, step->h, &at->g);
+#endif
+  return evaluate_function(step, e, at);
+}
+
 /* After the crossing that ends the search, keeps those of other functions that have already changed sign at its state:
  * a search from there would not find them. */
 static int keep_coincident(const event_step *step, long long last)
@@ -500,7 +525,7 @@ static int keep_coincident(const event_step *step, long long last)
   for (long long i = last + 1; status == OK && i < filled; i++) {
     event_crossing other = step->found[i];
     if (other.fraction - end.fraction <= EVENT_TIE)
-      status = evaluate_function(step, FUNCTION_OF(&other), &at);
+      status = value_at_end(step, FUNCTION_OF(&other), &at);
     if (status != OK || other.fraction - end.fraction > EVENT_TIE || (real)other.direction * at.g < 0.0)
       continue;
     ends_search(step->watch, &other);
