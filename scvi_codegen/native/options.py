@@ -39,8 +39,8 @@ FAILURES = {
     ),
     "step size underflow": (
         "the step size is below machine precision",
-        "The motion ends there (a collision, a singularity, a mass of 0), or its forces are not smooth. Set t_end before "
-        "that time, or give h (fixed step size)",
+        "The motion ends there (a collision, a singularity, a mass of 0), or its forces are not smooth. Set t_end "
+        "before that time, or give h (fixed step size)",
     ),
     "spurious solution": (
         "the iteration converged to a spurious solution of the stage equations",
