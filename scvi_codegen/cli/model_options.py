@@ -3,6 +3,7 @@
 import math
 import os
 import re
+import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -13,10 +14,11 @@ from click.shell_completion import CompletionItem
 from scvi_codegen.cli.command_group import Command
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.files.atomic import NamedFile
+from scvi_codegen.files.toml_text import MAX_CHARACTERS
 from scvi_codegen.methods import ARGUMENTS, METHODS, size_of, specification_of
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.entries import ROBOT_FILES
-from scvi_codegen.models.model_files.model_file import catalogue_model, load_model
+from scvi_codegen.models.model_files.model_file import catalogue_model, load_model, parse_model
 from scvi_codegen.models.model_files.sections import event_entry
 from scvi_codegen.models.options import (
     ASSIGNMENTS,
@@ -44,6 +46,9 @@ Choices = Mapping[str, Any]
 """Options of the command line that override MODEL, by name; ``None`` or an empty tuple for options that are absent."""
 OFFERED_SIZES = range(1, 17)
 """Numbers that shell completion offers after ``svi:``."""
+
+STANDARD_INPUT = "-"
+"""Name of the model whose file is read from standard input; files that it names are in the present folder."""
 
 
 def sections_of(choices: Choices) -> dict[str, dict[str, Any]]:
@@ -221,9 +226,12 @@ def _check_method(choices: Choices) -> None:
 
 
 def read_model(name: str, choices: Choices) -> Model:
-    """Return the model of a file or of the catalogue, overridden by the options of the command line."""
+    """Return the model of a file, of standard input (``-``) or the catalogue, with the options of the command line."""
     check_exclusive(choices)
     _check_method(choices)
+    if name == STANDARD_INPUT:
+        text = sys.stdin.read(MAX_CHARACTERS + 1).removeprefix("\ufeff")
+        return parse_model(text, sections_of(choices), folder=Path())
     path = Path(name)
     if path.suffix.lower() in (".toml", *ROBOT_FILES) or os.sep in name or path.is_file():
         return load_model(path, sections_of(choices))

@@ -59,6 +59,14 @@ def check_plot_path(path: str | os.PathLike[str], suffixes: tuple[str, ...] = PI
 def _check_matplotlib() -> None:
     if importlib.util.find_spec("matplotlib") is None:
         raise PlotError("pictures need matplotlib, which is not installed: pip install 'scvi-codegen[plot]'")
+    try:
+        importlib.import_module("matplotlib")
+    except ValueError as error:  # of a backend that does not exist
+        chosen = os.environ.get("MPLBACKEND", "")
+        raise PlotError(
+            f"matplotlib cannot be imported ({error}): unset the environment variable MPLBACKEND={chosen!r}, or set it "
+            "to 'agg'"
+        ) from error
 
 
 def style() -> Any:

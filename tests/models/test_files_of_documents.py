@@ -5,9 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from commands import output_of
 
 import scvi_codegen as sc
+from scvi_codegen.cli import main
 from scvi_codegen.models.model_files.model_file import load_model
 
 ARM = """<mujoco><worldbody><body><joint name="a" type="hinge" axis="0 1 0"/>
@@ -96,3 +98,14 @@ def test_files_named_on_the_command_line_may_be_anywhere(folders):
     document.write_text(PUSHED.format(file="../other/u.csv"))
     printed = output_of("run", str(document), "--input", f"u={other / 'u.csv'}", "--json")
     assert json.loads(printed)["steps"] == 5
+
+
+def test_model_is_read_from_standard_input(folders, monkeypatch):
+    own, _ = folders
+    monkeypatch.chdir(own)
+    result = CliRunner().invoke(main, ["run", "-", "--json"], input=PUSHED.format(file="below/u.csv"))
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["steps"] == 5
+    refused = CliRunner().invoke(main, ["run", "-"], input="[system")
+    assert refused.exit_code == 2
+    assert "this is not TOML" in refused.output
