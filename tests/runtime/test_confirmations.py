@@ -19,6 +19,7 @@ from notation import lagrange
 from scipy.integrate import solve_ivp
 
 import scvi_codegen as sc
+from scvi_codegen.runtime.accuracy import global_error
 from scvi_codegen.runtime.accuracy.global_error import LEAST_STOPS, irregular_stops
 
 PI = np.longdouble(4.0) * np.arctan(np.longdouble(1.0))
@@ -463,7 +464,16 @@ class TestSizes:
 
     def test_absolute_tolerances_are_sizes(self):
         """Positions of a range of 1e-9, far from the origin, to 1e-6 of a size of 1."""
-        system, start = ("x", "x_dot**2/2 - (x - 1000)**2/2"), ([1000.0 + 1e-9], [0.0])
+        system, start = ("x", "x_dot**2/2 - (x - 10)**2/2"), ([10.0 + 1e-9], [0.0])
         run = confirmed(system, *start, t_end=5.0, error=1e-6)
         assert not run.confirmation.confirmed
         assert confirmed(system, *start, t_end=5.0, error=1e-6, absolute_tolerance=1.0).confirmation.confirmed
+
+
+def test_a_comparison_that_is_given_up_confirms_nothing(monkeypatch):
+    """Runs for comparison that take too many steps."""
+    monkeypatch.setattr(global_error, "MANY", -(10**6))
+    run = confirmed(("x", "x_dot**2/2 - x**2/2"), [1.0], [0.0], t_end=5.0, error=1e-6)
+    assert not run.confirmation.confirmed
+    assert run.confirmed_until == 0.0
+    assert math.isinf(run.global_error)

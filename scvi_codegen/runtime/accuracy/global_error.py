@@ -357,7 +357,7 @@ class Runs:
                 result = self._estimated(trajectory, tolerance, smaller)
                 yield trajectory, result
                 estimate = result.estimate
-                powers = max(1, math.ceil(math.log(estimate / self.wanted, GAIN) * math.log(RATIO, ratio)))
+                powers = max(1, math.ceil(math.log(min(estimate, 1.0) / self.wanted, GAIN) * math.log(RATIO, ratio)))
             tolerance = list(accumulate(repeat(ratio, powers), mul, initial=tolerance))[-1]
 
     def _limited(self) -> Iterator[Attempt]:
@@ -526,8 +526,9 @@ class _Samples:
 
         The size of an unconfirmed run is that up to the last confirmed time, as what follows is not known.
         """
-        if self.motion is None:
-            return np.zeros(len(self.t)), len(self.t)
+        if self.motion is None:  # no run for comparison was necessary, or none has ended
+            differences = np.where(np.isfinite(self.errors).all(axis=(0, 2)), 0.0, np.inf)
+            return differences, len(self.t) if np.isfinite(differences).all() else int(np.argmax(differences))
         whole, reached = np.empty(0), len(self.t)
         while reached:
             errors = self.errors[:, :reached]
