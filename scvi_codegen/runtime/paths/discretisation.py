@@ -42,7 +42,7 @@ class Discretisation:
 
     @property
     def is_motion(self) -> bool:
-        """Whether the path approximates a motion of the system."""
+        """True if the path approximates a motion of the system."""
         return self.error < NO_MOTION and self.energy_change < ENERGY_OF_NO_MOTION
 
 
