@@ -113,7 +113,7 @@ OCCURRENCES = {
     },
     "absolute_tolerance": {*("models/time_span.py", "models/packages/package.py", "cli/step_selection.py")},
     "max_step": {"models/time_span.py", "models/packages/example.py", "cli/step_selection.py"},
-    "error": {"cli/commands/run.py", "cli/step_selection.py", "models/model.py"},
+    "error": {"cli/commands/run.py", "cli/commands/path.py", "cli/step_selection.py", "models/model.py"},
     "save_every": {"cli/recording.py", "cli/running.py", "models/packages/example.py"},
     "solver_tolerance": set(),
     "max_iterations": set(),

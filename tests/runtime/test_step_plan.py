@@ -132,6 +132,19 @@ def test_absolute_tolerances_by_name_of_coordinate_array_and_rotation() -> None:
     assert values.tolist() == [0.2, *[0.1] * (stepper.dimension - 1)]
 
 
+@pytest.mark.parametrize(("method", "solver"), [("svi:4", "auto"), ("svi:4", "newton")])
+def test_coordinate_that_hardly_moves_does_not_determine_the_steps(method: str, solver: str) -> None:
+    text = "(x_dot**2 + y_dot**2 + z_dot**2)/2 + 1/sqrt(x**2 + y**2) - 50*z**2"
+    system = sc.LagrangianSystem.from_text("orbit and vibration", ["x", "y", "z"], text)
+    stepper = sc.compile_stepper(system, method, solver=solver)
+    start: dict[str, Any] = {"q": [1.0, 0.0, 1e-12], "velocity": [0.0, 1.0, 0.0], "t_end": 10.0, "tolerance": 1e-6}
+    strict, loose, other = (
+        stepper.integrate(**start, absolute_tolerance=absolute).steps for absolute in (None, {"z": 1e-3}, {"x": 1e-3})
+    )
+    assert 2 * loose < strict
+    assert abs(other - strict) < 0.1 * strict
+
+
 def test_continued_runs_keep_their_options(tmp_path: Path) -> None:
     run = kepler().start(Q, velocity=V, **LIMITED, absolute_tolerance={"y": 1e-6})
     run.advance(5)
