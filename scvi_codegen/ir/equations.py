@@ -230,6 +230,22 @@ class ShiftTables:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Remainder:
+    """Tables that extrapolate the remainder of a fixed-point iteration from its last change.
+
+    Attributes:
+        position, momentum: (lanes, lanes) coefficients of the powers of the stiffness, from the first on, at each point.
+        determinant: (lanes,) those of the denominator, whose constant one is 1.
+        largest: largest stiffness with which the iteration converges.
+    """
+
+    position: NumberTable
+    momentum: NumberTable
+    determinant: tuple[Number, ...]
+    largest: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LinearPart:
     """Constant derivatives of forces at q = 0, a symmetric band matrix.
 
@@ -275,6 +291,7 @@ class FixedPointIteration:
         final_iterations: number of iterations after the one that converges.
         in_groups: whether its C supports several vectors for the points of a step, besides one.
         linear_part: constant linear part of the forces, for which steps are solved implicitly; ``None`` without one.
+        remainder: of the iteration; ``None`` if it is not extrapolated.
     """
 
     name: IterationName
@@ -298,11 +315,14 @@ class FixedPointIteration:
     final_iterations: int = 0
     in_groups: bool = True
     linear_part: LinearPart | None = None
+    remainder: Remainder | None = None
 
     @property
     def tables(self) -> Iterator[IterationTable]:
         """All tables, in the order in which they are printed: those of the predictor last."""
         yield from self.own_tables
+        for name in ("position", "momentum", "determinant") if self.remainder else ():
+            yield IterationTable(f"REMAINDER_{name.upper()}", getattr(self.remainder, name))
         for name in ("last_alone", "last", "before"):
             yield IterationTable(name.upper(), getattr(self.guess, name))
 

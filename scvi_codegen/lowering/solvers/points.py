@@ -61,6 +61,7 @@ from scvi_codegen.lowering.solvers.tables import (
     pad_matrix,
     pad_vector,
     predictor_tables_of,
+    remainder_tables,
     resolved_degree,
     shift_tables,
     tableau_tables,
@@ -145,6 +146,7 @@ def _separable(system: LagrangianSystem, tables: VelocityTables, *, velocities: 
         serves_many=True,
         final_iterations=1,  # the final one, with double-double coefficients
         linear_part=None if velocities or points < 2 else _linear_part(system, product, lanes),
+        remainder=remainder_tables(product, end_position, tables.end_momentum, lanes),
     )
 
 

@@ -28,7 +28,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from scvi_codegen.ir.equations import FixedPointIteration, PredictorTables, ShiftTables
+from scvi_codegen.ir.equations import FixedPointIteration, PredictorTables, Remainder, ShiftTables
 from scvi_codegen.ir.kernel import Number, NumberTable, lower_matrix, lower_vector
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.legendre import equivalent_lagrangian
@@ -90,6 +90,38 @@ def pad_matrix(entries: Matrix, lanes: int) -> NumberTable:
 def pad_vector(entries: Vector, lanes: int, *, repeat: bool = False) -> tuple[Number, ...]:
     """Return the padded vector; further entries are zero, or repeat the last."""
     return lower_vector(_longer(entries, lanes, repeat=repeat))
+
+
+REMAINDER_BITS, LARGEST_RATE = 200, 0.9
+"""Fixed-point precision of the characteristic polynomial; largest rate at which a remainder is extrapolated."""
+
+
+def remainder_tables(product: Matrix, end_position: Vector, end_momentum: Vector, lanes: int) -> Remainder:
+    """Return b^T R = b^T J (1 - J)^-1, J = -lambda P, in powers of lambda for end weights b; see remainder.h.
+
+    With the adjugate of 1 + lambda P, sum_k lambda^k B_k, B_0 = 1, B_k = d_k - P B_(k-1), d_k = tr(P B_(k-1)) / k
+    (Faddeev-LeVerrier), b^T R det(1 + lambda P) = -sum_k lambda^(k+1) b^T P B_k.
+    """
+    P = np.array([[int(mp.nint(mp.ldexp(x, REMAINDER_BITS))) for x in line] for line in product], dtype=object)
+    points, adjugate, determinant = len(P), np.diag([1 << REMAINDER_BITS] * len(P)), []
+    rows: tuple[list[Vector], ...] = ([], [])
+    for k in range(1, points + 1):
+        all_of = P.dot(adjugate) >> REMAINDER_BITS
+        for table, weights in zip(rows, (end_position, end_momentum), strict=True):
+            columns = (zip(weights, all_of[:, n], strict=True) for n in range(points))
+            table.append(tuple(-mp.ldexp(mp.fsum(b * int(x) for b, x in each), -REMAINDER_BITS) for each in columns))
+        determinant.append(int(np.trace(all_of)) // k)
+        adjugate = np.diag([determinant[-1]] * points) - all_of
+    fastest = float(np.abs(np.linalg.eigvals(np.array(product, dtype=float))).max())
+    padding = (mp.zero,) * (lanes - points)
+    at_points = (tuple((*line, *padding) for line in transpose(tuple(table))) for table in rows)
+    position, momentum = (lower_matrix((*table, *((mp.zero,) * lanes,) * (lanes - points))) for table in at_points)
+    return Remainder(
+        position=position,
+        momentum=momentum,
+        determinant=pad_vector(tuple(mp.ldexp(x, -REMAINDER_BITS) for x in determinant), lanes),
+        largest=LARGEST_RATE / fastest if fastest > 0 else 0.0,
+    )
 
 
 NEWTON_STEPS = 3

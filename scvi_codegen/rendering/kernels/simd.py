@@ -137,6 +137,7 @@ def iteration_source(
         meaning=meaning,
         defines={
             "FINAL_ITERATIONS": str(fixed_point.final_iterations),
+            **({"LARGEST_STIFFNESS": repr(fixed_point.remainder.largest)} if fixed_point.remainder else {}),
             **{name: str(value) for name, value in fixed_point.facts.items()},
         },
         functions=tuple(map(_vector_function, sorted(functions))),

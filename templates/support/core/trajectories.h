@@ -3,7 +3,11 @@
 
 /* SIMD lanes are trajectories: a vector contains values of LANES trajectories at one point. points.h defines the same
  * names. Requires: vectors.h. */
-enum { GROUPS = S }; /* vectors for all points */
+enum { GROUPS = S, /* vectors for all points */
+  TERMS = S < 8 ? S : 8 /* of a polynomial with a coefficient per point: no more are needed */
+};
+#define TABLE_ENTRY(table, point, j) (table)[point][j]
+#define VECTOR_ENTRY(table, j) (table)[j]
 
 typedef lanes coordinates[M]; /* values of all coordinates at a point */
 
@@ -62,6 +66,29 @@ static inline number largest_number(const number *x)
   return largest_between(x, 0, M);
 }
 
+/* a / b in each lane, at most `bound` in size; 0 unless b is positive and the quotient a number. */
+static inline number bounded_ratio(number a, number b, double bound)
+{
+  lane_view x = {a};
+  const lane_view y = {b};
+  for (int j = 0; j < LANES; j++) {
+    const double size = fabs(x.lane[j]), large = copysign(bound, x.lane[j]);
+    const double ratio = size < bound * y.lane[j] ? x.lane[j] / y.lane[j] : large;
+    x.lane[j] = y.lane[j] > 0.0 && size < INFINITY ? ratio : 0.0;
+  }
+  return x.all;
+}
+
+/* Returns 1 if |x| is below a bound in every lane. */
+static inline int is_within(number x, double bound)
+{
+  const lane_view view = {x};
+  int outside = 0;
+  for (int j = 0; j < LANES; j++)
+    outside |= !(fabs(view.lane[j]) < bound);
+  return !outside;
+}
+
 static inline number rest_of_numbers(number a, number b, number product)
 {
   return multiply_add(a, b, -product);
@@ -105,6 +132,18 @@ static inline number weigh_apart_twice(const weight *weights, const weight *low,
   number sum = lanes_of(0.0);
   for (int n = 0; n < S; n++)
     sum += multiply_add(lanes_of(weights[n]), x[n * apart], low[n] * x[n * apart]);
+  return sum;
+}
+
+/* The same with further weights of the changes from values y. */
+static inline number weigh_apart_thrice(const weight *weights, const weight *low, const lanes *x, const lanes *further,
+    const lanes *y, long long apart)
+{
+  number sum = lanes_of(0.0);
+  for (int n = 0; n < S; n++) {
+    const lanes rest = low[n] * x[n * apart] + further[n] * (x[n * apart] - y[n * apart]);
+    sum += multiply_add(lanes_of(weights[n]), x[n * apart], rest);
+  }
   return sum;
 }
 

@@ -108,6 +108,16 @@ static inline void take_change(progress *now, lanes change, const solver_options
   report->iterations++;
 }
 
+/* Returns 1 if the last change of a trajectory exceeds a level. */
+static inline int exceeds(const progress *now, double level)
+{
+  const lane_view last = {now->last};
+  int any = 0;
+  for (int j = 0; j < LANES; j++)
+    any |= last.lane[j] > level;
+  return any;
+}
+
 /* is_one_stagnant in each lane. */
 static SELDOM int find_stagnant(progress *now, const solver_options *options, int k)
 {
