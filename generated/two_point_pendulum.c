@@ -148,6 +148,7 @@ static void evaluate(const step_data *step, const double *z, double *rows, doubl
 #define POINTS 2
 #define HOT static inline __attribute__((always_inline))
 #define FINAL_ITERATIONS 1
+#define LARGEST_STIFFNESS 5.4
 
 #define VECTOR_LIBRARY
 #include "support/core/vectors.h"
@@ -168,6 +169,9 @@ static const lanes POINT_END_POSITION[GROUPS] = {0.39433756729740643, 0.10566243
 static const lanes POINT_END_POSITION_LOW[GROUPS] = {8.362570184839086e-18, 5.515217622975371e-18};
 static const lanes POINT_END_MOMENTUM[GROUPS] = {0.5, 0.5};
 static const lanes POINT_END_MOMENTUM_LOW[GROUPS] = {0.0, 0.0};
+static const lanes REMAINDER_POSITION[POINTS * GROUPS] = {-0.06572292788290107, -0.01761040545043226, 0.0, 0.0};
+static const lanes REMAINDER_MOMENTUM[POINTS * GROUPS] = {-0.19716878364870322, -0.05283121635129678, 0.0, 0.0};
+static const lanes REMAINDER_DETERMINANT[GROUPS] = {0.16666666666666666, 0.0};
 static const lanes LAST_ALONE[POINTS * GROUPS] = {
     -0.09967936855888598, -0.37200846792814624,
     0.20534180126147955, 0.7663460352255527};

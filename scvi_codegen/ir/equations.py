@@ -234,7 +234,7 @@ class Remainder:
     """Tables that extrapolate the remainder of a fixed-point iteration from its last change.
 
     Attributes:
-        position, momentum: (lanes, lanes) coefficients of the powers of the stiffness, from the first on, at each point.
+        position, momentum: (lanes, lanes) coefficients of the powers of the stiffness from 1 on, at each point.
         determinant: (lanes,) those of the denominator, whose constant one is 1.
         largest: largest stiffness with which the iteration converges.
     """

@@ -1,8 +1,8 @@
 """Energies do not drift: the remainder that the fixed-point iteration leaves is added to the last update.
 
-The slope of the energy of an oscillator is measured in rounding errors (2^-53 of the energy) per step. A remainder left
-out has the same sign in each period: slopes of 1 to 200. The tables of the remainder are compared with the matrices that
-they stand for.
+The slope of the energy of an oscillator is measured in rounding errors (2^-53 of the energy) per step. A remainder that
+is left out has the same sign in each period: slopes of 1 to 200. The tables of the remainder are compared with the
+matrices that they stand for.
 """
 
 from __future__ import annotations

@@ -30,6 +30,12 @@ static inline void take_change(progress *now, double change, const solver_option
   report->iterations++;
 }
 
+/* Returns 1 if the last change exceeds a level. */
+static inline int exceeds(const progress *now, double level)
+{
+  return now->last > level;
+}
+
 static inline int is_stagnant(progress *now, const solver_options *options, int k)
 {
   return is_one_stagnant(now, options, k);

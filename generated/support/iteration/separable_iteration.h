@@ -24,6 +24,8 @@
 #define VELOCITIES 0
 #endif
 
+#include "remainder.h"
+
 enum { OF_EACH = 1 + VELOCITIES }; /* values per coordinate in X: positions, then velocities */
 
 #ifdef LINEAR_FORCES
@@ -72,16 +74,22 @@ typedef struct {
   number high, low;
 } drift_words;
 
-/* Arguments and arrays of a step: the points X and the forces F there. */
+/* Arguments and arrays of a step: the points X and the forces F there; those before the last iteration and the weights
+ * of their change in the increments, or NULL without a remainder. */
 typedef struct {
   const step_data *step;
   const iteration_data *data;
   lanes *X, *F;
   long long n;
   number *inverse_size;
-#ifndef ARRAYS
+  lanes *former;
+  remainder_weights *remainder;
+#ifdef ARRAYS
+  double *second; /* last points of the second iterate, then the forces there */
+#else
+  lanes *second; /* second iterate, whose forces are in `former` */
   drift_words *drifts;
-  lanes *base, *rests; /* points of the straight line; low words of the iteration, with the first forces */
+  lanes *base; /* points of the straight line */
 #endif
 } step_points;
 
@@ -106,20 +114,14 @@ PASS drift_words find_drift(const step_points *w, long long i)
   return of;
 }
 
-/* The drift of a coordinate, its points without forces and the unit of their changes. Those of few coordinates are
- * stored, those of many are computed again. Rounding of the coefficients would displace the points to the same side in
- * every step, and the last iteration alone would leave a part of that, so that for few coordinates all iterations
- * include the low words, with the first forces. */
+/* The drift of a coordinate and its points without forces. Those of few coordinates are stored, those of many are
+ * computed again. */
 #ifdef ARRAYS
 #define DRIFT_OF(w, i) find_drift(w, i)
 #define STRAIGHT_LINE(w, g, i, of) ((w)->step->q0[i] + DRIFT[g] * (of).high)
-#define WITH_LOW_WORDS(w, g, i, x) (x)
-#define RESTS(w, g, i, of) coefficient_rests(w, g, of, i)
 #else
 #define DRIFT_OF(w, i) ((w)->drifts[i])
 #define STRAIGHT_LINE(w, g, i, of) ((void)(of), (w)->base[(g) * M + (i)])
-#define WITH_LOW_WORDS(w, g, i, x) ((x) + (w)->rests[(g) * M + (i)])
-#define RESTS(w, g, i, of) ((w)->rests[(g) * M + (i)])
 #endif
 
 /* sum_j table_gj F_j of a coordinate. */
@@ -164,7 +166,7 @@ PASS lanes accurate_point(const step_points *w, int g, drift_words of, long long
   const lanes sum = SUM_OF_FORCES(PRODUCT, w, g, i);
   return sum_of_three(lanes_of_number(w->step->q0[i]),
       DRIFT[g] * of.high + data->inverse_mass[i] * (data->square * sum),
-      RESTS(w, g, i, of) + data->inverse_mass[i] * (data->square_low * sum));
+      coefficient_rests(w, g, of, i) + data->inverse_mass[i] * (data->square_low * sum));
 }
 
 /* Increments of a coordinate: of q, with its low word, and of p. */
@@ -172,18 +174,26 @@ typedef struct {
   number q, q_low, p;
 } end_increments;
 
+/* sum_n weights_n F_n of a coordinate, with the remainder of the iteration. */
+PASS number weigh_forces(const step_points *w, const weight *weights, const weight *low, const lanes *further,
+    long long i)
+{
+  if (!w->former)
+    return weigh_apart_twice(weights, low, &w->F[i], EXTENT(w->n));
+  return weigh_apart_thrice(weights, low, &w->F[i], further, &w->former[i], EXTENT(w->n));
+}
+
 PASS end_increments increments_of(const step_points *w, long long i)
 {
   const iteration_data *data = w->data;
-  const lanes *F = &w->F[i];
   const drift_words of = DRIFT_OF(w, i);
-  const number sum = weigh_apart_twice(POINT_END_POSITION, POINT_END_POSITION_LOW, F, EXTENT(w->n));
+  const number sum = weigh_forces(w, POINT_END_POSITION, POINT_END_POSITION_LOW, w->remainder->position, i);
   const number kick = data->inverse_mass[i] * (data->square * sum), q = of.high + kick, part = q - of.high;
   end_increments end;
   end.q = q;
   end.q_low =
       (of.high - (q - part)) + (kick - part) + (of.low + data->inverse_mass[i] * (data->square_low * sum));
-  end.p = weigh_apart_twice(data->kick, data->kick_low, F, EXTENT(w->n));
+  end.p = weigh_forces(w, data->kick, data->kick_low, w->remainder->momentum, i);
   return end;
 }
 
@@ -208,7 +218,7 @@ PASS lanes improve_points(const step_points *w, section here)
     for (int g = 0; g < GROUPS; g++) {
       lanes *X = &w->X[g * OF_EACH * EXTENT(w->n) + i];
       const lanes curved = unit * SUM_OF_FORCES(PRODUCT, w, g, i);
-      const lanes x = STRAIGHT_LINE(w, g, i, of) + WITH_LOW_WORDS(w, g, i, curved);
+      const lanes x = STRAIGHT_LINE(w, g, i, of) + curved;
       change = with_change(change, (x - *X) * w->inverse_size[i]);
       *X = x;
     }
@@ -216,12 +226,17 @@ PASS lanes improve_points(const step_points *w, section here)
   return change;
 }
 
-/* Computes the points of a range of coordinates with double-double coefficients. */
+/* Computes the points of a range of coordinates with double-double coefficients, which the iterations before lack, and
+ * stores their former forces. Rounding of the coefficients displaces the points to the same side in every step; the
+ * remainder extends the correction of the last iteration to a whole one. */
 PASS void refine_points(const step_points *w, section here)
 {
   for (long long i = here.first; i < here.end; i++)
-    for (int g = 0; g < GROUPS; g++)
+    for (int g = 0; g < GROUPS; g++) {
       w->X[g * OF_EACH * EXTENT(w->n) + i] = accurate_point(w, g, DRIFT_OF(w, i), i);
+      if (w->former)
+        w->former[g * EXTENT(w->n) + i] = w->F[g * EXTENT(w->n) + i];
+    }
 }
 
 #ifdef ROUGH
@@ -249,8 +264,10 @@ PASS void find_eight_increments(const step_points *w, int i, double *dq, double 
   for (int k = 0; k < 8; k++) {
     const lanes F = w->F[i + k];
     const drift_words of = DRIFT_OF(w, i + k);
-    position[k] = multiply_add(POINT_END_POSITION[0], F, POINT_END_POSITION_LOW[0] * F);
-    momentum[k] = multiply_add(data->kick[0], F, data->kick_low[0] * F);
+    const lanes moved = w->former ? F - w->former[i + k] : lanes_of(0.0);
+    position[k] = multiply_add(
+        POINT_END_POSITION[0], F, POINT_END_POSITION_LOW[0] * F + w->remainder->position[0] * moved);
+    momentum[k] = multiply_add(data->kick[0], F, data->kick_low[0] * F + w->remainder->momentum[0] * moved);
     high.lane[k] = of.high, low.lane[k] = of.low, inverse.lane[k] = data->inverse_mass[i + k];
   }
   const lanes sum = totals_of_eight(position), kick = inverse.all * (data->square * sum);
@@ -288,7 +305,8 @@ static void prepare_iteration(const step_data *step, iteration_data *data)
 
 static step_points points_in(const step_data *step, const iteration_data *data, history past)
 {
-  const step_points points = {step, data, step->work->X, past.now, step->n, step->work->inverse_size};
+  const step_points points = {step, data, step->work->X, past.now, step->n, step->work->inverse_size, NULL, NULL,
+      NULL};
   return points;
 }
 
@@ -370,6 +388,35 @@ static inline void measure_points(const step_points *w, const solver_options *op
   }
 }
 
+/* Stores the second iterate: of the points the last one, as derivatives of forces act at each point alone. */
+static inline void keep_iterate(const step_points *w)
+{
+  const section own = own_part(w->step);
+  for (long long i = own.first; i < own.end; i++) {
+    w->second[i] = at_point(&w->X[i], OF_EACH * w->n, KEPT - 1);
+    w->second[w->n + i] = at_point(&w->F[i], w->n, KEPT - 1);
+  }
+}
+
+/* Rayleigh quotient of the changes since then. */
+static inline double measure_stiffness(const step_points *w)
+{
+  sums all;
+  begin_blocks(&all, w->step);
+  EACH_BLOCK (all) {
+    double work = 0.0, size = 0.0;
+    for (long long i = all.here.first; i < all.here.end; i++) {
+      const double moved = at_point(&w->X[i], OF_EACH * w->n, KEPT - 1) - w->second[i];
+      const double weighted = moved * w->inverse_size[i] * w->inverse_size[i];
+      work += weighted * unit_of(w, i) * (at_point(&w->F[i], w->n, KEPT - 1) - w->second[w->n + i]);
+      size += weighted * moved;
+    }
+    add_block(&all, work, size);
+  }
+  meet(w->step);
+  return find_stiffness(sum_of(&all, 0), sum_of(&all, 1));
+}
+
 static inline double improve(const step_points *w)
 {
   sums all;
@@ -423,12 +470,26 @@ PASS void measure_points(const step_points *w, const solver_options *options)
   invert_sizes(options, 1.0, w->inverse_size);
 }
 
-/* Low words of the iteration, with the first forces. */
-PASS void find_rests(const step_points *w)
+/* Stores the second iterate. */
+PASS void keep_iterate(const step_points *w)
 {
-  for (int i = 0; i < M; i++)
-    for (int g = 0; g < GROUPS; g++)
-      w->rests[g * M + i] = coefficient_rests(w, g, w->drifts[i], i);
+  memcpy(w->second, w->X, sizeof(coordinates) * GROUPS);
+  memcpy(w->former, w->F, sizeof(coordinates) * GROUPS);
+}
+
+/* Rayleigh quotient of the changes since then. */
+PASS number measure_stiffness(const step_points *w)
+{
+  lanes work = lanes_of(0.0), size = lanes_of(0.0);
+  for (int i = 0; i < M; i++) {
+    const number unit = unit_of(w, i), weight = w->inverse_size[i] * w->inverse_size[i];
+    for (int g = 0; g < GROUPS; g++) {
+      const lanes moved = w->X[g * M + i] - w->second[g * M + i], weighted = weight * moved;
+      work += weighted * (unit * (w->F[g * M + i] - w->former[g * M + i]));
+      size += weighted * moved;
+    }
+  }
+  return find_stiffness(total_change(work), total_change(size));
 }
 
 PASS number improve(const step_points *w)
@@ -459,8 +520,7 @@ static number correct_points(const step_points *w)
   return total_change(change);
 }
 
-/* Corrects the points and, by their linear part, the forces, with double-double coefficients. Their low words are those
- * of the present forces: where vibrations are fast, the first ones may be wrong by orders of magnitude. */
+/* Corrects the points and, by their linear part, the forces, with double-double coefficients. */
 static void refine_forces(const step_points *w)
 {
   const iteration_data *data = w->data;
@@ -492,31 +552,38 @@ HOT int iterate(const step_data *step, const iteration_data *data, history past,
 {
 #ifdef ARRAYS
   const section own = own_part(step);
-  const step_points w = points_in(step, data, past);
+  step_points w = points_in(step, data, past);
+  w.former = VELOCITIES ? NULL : past.before;
+  w.second = dq;
 #else
   const section own = {0, M};
-  coordinates X[GROUPS], base[GROUPS], rests[GROUPS], local[GROUPS], *F = kept(past, local);
+  coordinates X[GROUPS], base[GROUPS], former[GROUPS], second[GROUPS];
+  coordinates local[GROUPS], *F = kept(past, local);
   drift_words drifts[M];
   number inverse_size[M];
-  const step_points w = {step, data, X[0], F[0], M, inverse_size, drifts, base[0], rests[0]};
+  step_points w = {step, data, X[0], F[0], M, inverse_size, implicit || rough ? NULL : former[0], NULL, second[0],
+      drifts, base[0]};
 #ifndef POINTS
   coordinates stored[S];
 #endif
 #endif
+  remainder_weights remainder;
+  number stiffness = number_of(0.0);
   progress now = before_iterations();
   int status;
+  w.remainder = &remainder;
   first_points(&w, past, *steps);
   forces(&w);
   measure_points(&w, options);
-#ifndef ARRAYS
-  if (rough)
-    memset(rests, 0, sizeof rests);
-  else if (!implicit)
-    find_rests(&w);
-#endif
   for (int k = 0; needs_iteration(&now); k++) {
-    const number change = implicit ? correct_points(&w) : improve(&w);
+    const int measures = w.former && measures_stiffness(k) && exceeds(&now, NO_REMAINDER);
+    number change;
+    if (measures)
+      keep_iterate(&w);
+    change = implicit ? correct_points(&w) : improve(&w);
     forces(&w);
+    if (measures)
+      stiffness = measure_stiffness(&w);
     take_change(&now, change, options, k, report);
 #ifndef ARRAYS
     if (is_stagnant(&now, options, k))
@@ -538,6 +605,12 @@ HOT int iterate(const step_data *step, const iteration_data *data, history past,
   if (implicit)
     refine_forces(&w);
   else {
+#ifdef ARRAYS
+    if (stiffness == 0.0)
+      w.former = NULL;
+#endif
+    if (w.former)
+      weigh_remainder(stiffness, step->h, &remainder);
     if (rough)
       improve(&w);
     else
