@@ -17,7 +17,7 @@ STEPS = 40
 Q = np.sin(np.arange(6.0)) + 0.1
 P = np.cos(2.0 * np.arange(6.0)) / 2
 WAYS = {
-    ("svi:4", "fixed-point"): {0.1: 83, 0.4: 266},
+    ("svi:4", "fixed-point"): {0.1: 83, 0.4: 215},
     ("svi:4", "newton"): {0.1: 81, 0.8: 80},
     ("stoermer-verlet", "fixed-point"): {0.1: 40},
     ("hamiltonian", "fixed-point"): {0.1: 157, 0.4: 323},

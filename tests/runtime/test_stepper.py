@@ -332,8 +332,8 @@ def test_looser_tolerance_needs_fewer_iterations_and_loses_digits(kepler):
     assert loose.iterations.sum() < tight.iterations.sum()
     assert 1e-13 < np.abs(loose.q - tight.q).max() < 1e-2
     q, _ = kepler.step(*STATE, 0.2, options=sc.SolverOptions(tolerance=1e-4))
-    assert np.array_equal(q, loose.q[1])
-    assert not np.array_equal(q, tight.q[1])
+    assert q == pytest.approx(loose.q[1], abs=1e-15)  # but for the low words of runs
+    assert np.abs(q - tight.q[1]).max() > 1e-13
     exact, rough = (
         kepler.discrete_legendre_minus(STATE[0], q, 0.2, options=options)[1]
         for options in (None, sc.SolverOptions(tolerance=0.1))

@@ -108,13 +108,22 @@ static inline void take_change(progress *now, lanes change, const solver_options
   report->iterations++;
 }
 
-/* Returns 1 if the last change of a trajectory exceeds a level. */
-static inline int exceeds(const progress *now, double level)
+/* 1 where the iteration continues and its last change exceeds a level. */
+static inline number undecided(const progress *now, double level)
 {
   const lane_view last = {now->last};
+  lane_view status = {now->status};
+  for (int j = 0; j < LANES; j++)
+    status.lane[j] = status.lane[j] == 0.0 && last.lane[j] > level ? 1.0 : 0.0;
+  return status.all;
+}
+
+static inline int any_positive(number x)
+{
+  const lane_view view = {x};
   int any = 0;
   for (int j = 0; j < LANES; j++)
-    any |= last.lane[j] > level;
+    any |= view.lane[j] > 0.0;
   return any;
 }
 

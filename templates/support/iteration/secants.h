@@ -8,24 +8,13 @@
 #define DEPENDENT 1e-8 /* relative to its square: a change that the earlier ones span is not stored */
 #define ACCELERATED_LEVEL 1e-18 /* changes below 1e-9 of the state after the first iterations need no acceleration */
 
-/* undecided: 1, or 0 if the iteration has converged or its last change is below a level; normalisation: 1 / sqrt(rest),
- * or 0 if rest is small. */
+/* normalisation: 1 / sqrt(rest), or 0 if rest is small. */
 #ifdef POINTS
 enum { SECANTS = 8 };
-
-static inline number undecided(const progress *now, double level)
-{
-  return now->last > level;
-}
 
 static inline number normalisation(number size, number rest)
 {
   return rest > DEPENDENT * size ? 1.0 / sqrt(rest) : 0.0;
-}
-
-static inline int any_positive(number x)
-{
-  return x > 0.0;
 }
 
 #define PAIR_INDEX(past, k) ((past)->count % SECANTS)
@@ -34,15 +23,6 @@ static inline int any_positive(number x)
 #else
 enum { SECANTS = 4 }; /* of each trajectory: less memory */
 
-static inline number undecided(const progress *now, double level)
-{
-  const lane_view last = {now->last};
-  lane_view status = {now->status};
-  for (int j = 0; j < LANES; j++)
-    status.lane[j] = status.lane[j] == 0.0 && last.lane[j] > level ? 1.0 : 0.0;
-  return status.all;
-}
-
 static inline number normalisation(number size, number rest)
 {
   const lane_view whole = {size};
@@ -50,15 +30,6 @@ static inline number normalisation(number size, number rest)
   for (int j = 0; j < LANES; j++)
     part.lane[j] = part.lane[j] > DEPENDENT * whole.lane[j] ? 1.0 / sqrt(part.lane[j]) : 0.0;
   return part.all;
-}
-
-static inline int any_positive(number x)
-{
-  const lane_view view = {x};
-  int any = 0;
-  for (int j = 0; j < LANES; j++)
-    any |= view.lane[j] > 0.0;
-  return any;
 }
 
 #define PAIR_INDEX(past, k) ((k) % SECANTS)
