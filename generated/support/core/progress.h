@@ -30,10 +30,15 @@ static inline void take_change(progress *now, double change, const solver_option
   report->iterations++;
 }
 
-/* Returns 1 if the last change exceeds a level. */
-static inline int exceeds(const progress *now, double level)
+/* 1 if the last change exceeds a level. */
+static inline number undecided(const progress *now, double level)
 {
   return now->last > level;
+}
+
+static inline int any_positive(number x)
+{
+  return x > 0.0;
 }
 
 static inline int is_stagnant(progress *now, const solver_options *options, int k)

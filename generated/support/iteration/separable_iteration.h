@@ -266,8 +266,9 @@ PASS void find_eight_increments(const step_points *w, int i, double *dq, double 
     const drift_words of = DRIFT_OF(w, i + k);
     const lanes moved = w->former ? F - w->former[i + k] : lanes_of(0.0);
     position[k] = multiply_add(
-        POINT_END_POSITION[0], F, POINT_END_POSITION_LOW[0] * F + w->remainder->position[0] * moved);
-    momentum[k] = multiply_add(data->kick[0], F, data->kick_low[0] * F + w->remainder->momentum[0] * moved);
+        POINT_END_POSITION[0], F, multiply_add(w->remainder->position[0], moved, POINT_END_POSITION_LOW[0] * F));
+    momentum[k] = multiply_add(
+        data->kick[0], F, multiply_add(w->remainder->momentum[0], moved, data->kick_low[0] * F));
     high.lane[k] = of.high, low.lane[k] = of.low, inverse.lane[k] = data->inverse_mass[i + k];
   }
   const lanes sum = totals_of_eight(position), kick = inverse.all * (data->square * sum);
@@ -576,14 +577,14 @@ HOT int iterate(const step_data *step, const iteration_data *data, history past,
   forces(&w);
   measure_points(&w, options);
   for (int k = 0; needs_iteration(&now); k++) {
-    const int measures = w.former && measures_stiffness(k) && exceeds(&now, NO_REMAINDER);
+    const number measures = number_of(w.former && measures_stiffness(k)) * undecided(&now, NO_REMAINDER);
     number change;
-    if (measures)
+    if (any_positive(measures))
       keep_iterate(&w);
     change = implicit ? correct_points(&w) : improve(&w);
     forces(&w);
-    if (measures)
-      stiffness = measure_stiffness(&w);
+    if (any_positive(measures))
+      stiffness += measures * (measure_stiffness(&w) - stiffness);
     take_change(&now, change, options, k, report);
 #ifndef ARRAYS
     if (is_stagnant(&now, options, k))
@@ -602,15 +603,17 @@ HOT int iterate(const step_data *step, const iteration_data *data, history past,
   status = outcome(&now, report);
   if (status != OK)
     return status;
+#ifdef ARRAYS
+  if (stiffness == 0.0)
+    w.former = NULL;
+#endif
+  if (w.former)
+    weigh_remainder(stiffness, step->h, &remainder);
+  else
+    memset(&remainder, 0, sizeof remainder);
   if (implicit)
     refine_forces(&w);
   else {
-#ifdef ARRAYS
-    if (stiffness == 0.0)
-      w.former = NULL;
-#endif
-    if (w.former)
-      weigh_remainder(stiffness, step->h, &remainder);
     if (rough)
       improve(&w);
     else
