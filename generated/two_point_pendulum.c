@@ -216,7 +216,8 @@ static const lanes NEXT[GROUPS] = {0.0, 0.0};
 static const double EXTRAPOLATION[1][1] = {{1.0}};
 
 #include "support/newton/newton_solver.h"
-#define NO_ERROR_ESTIMATE
+#define ESTIMATED_BY_HALVES /* errors of steps without a curve */
+#define ERROR_POWER 1
 #endif
 
 #include "support/run/run.h"
