@@ -176,7 +176,7 @@ def check_equal(runs: Any, stepper: sc.Stepper, arguments: dict[str, Any]) -> No
 @pytest.mark.parametrize("way", WAYS.split())
 def test_option(option: str, way: str, request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: Any) -> None:
     arguments, system, events = OPTIONS[option]
-    stepper = stepper_of(system, **{"method": "svi:3"} | SETTINGS.get(way, {})).with_events(events)
+    stepper = stepper_of(system, **{"method": "svi:4"} | SETTINGS.get(way, {})).with_events(events)
     states = Q, None if "velocity" in arguments else P
 
     def run() -> None:
