@@ -361,11 +361,10 @@ class Model(TimeSpan):
         self._check_alone()
         stepper = stepper or self.stepper()
         state, h, common = self.initial_state(stepper), self.h, self._common(options, threads)
-        control = {"tolerance": self.tolerance if h is None else None, **self._control}
+        control = {"tolerance": self.tolerance, **self._control}
         if self.error is not None:
             result = self.confirmed(stepper, options=options, threads=threads)
-            h, control = result.steps.get("h"), control | {"tolerance": None, **result.steps}
-            control.pop("h", None)
+            h, control = result.steps.get("h"), control | result.steps
             if result.precision != "double":
                 stepper = stepper._in_double_double or stepper
         elif h is None and self.has_time_transformation:
@@ -380,9 +379,8 @@ class Model(TimeSpan):
         to_end = h is None or self.time_transformation is not None
         return stepper.start(
             **state,
-            h=abs(h) if h is not None and to_end else h,
+            **control | {"h": abs(h) if h is not None and to_end else h} | ({} if h is None else {"tolerance": None}),
             t_end=self.t + self.covered if to_end else None,
-            **control,
             parameters=self.parameters_at_start(stepper),
             **common,
         )
