@@ -288,7 +288,7 @@ def test_adaptive_steps_are_rejected_where_the_iteration_of_multipliers_fails():
     assert np.array_equal(thinned.q[-1], run.q[-1])
 
 
-def test_adaptive_steps_pass_a_dead_point():
+def test_adaptive_steps_pass_a_dead_point_or_name_fixed_steps_which_do():
     """A parallelogram passes a point where G M^-1 G^T is singular, and goes on as the pendulum that it is."""
     rods = sc.LagrangianSystem.from_text(
         name="parallelogram",
@@ -304,7 +304,11 @@ def test_adaptive_steps_pass_a_dead_point():
         end = exact.integrate([a], [0.0], h=0.02, steps=30).q[-1, 0]
         assert end < -0.5
         assert np.abs(run.q[-1] - [np.cos(end), np.sin(end), 2 + np.cos(end), np.sin(end)]).max() < 1e-5
-        assert run.rejected_steps <= 5
+        assert run.rejected_steps >= 3 * run.fallback_steps
+        fixed = stepper.integrate(start, [0.0] * 4, h=0.01, steps=60)
+        assert np.abs(fixed.q[-1] - [np.cos(end), np.sin(end), 2 + np.cos(end), np.sin(end)]).max() < 1e-9
+        with pytest.raises(sc.StepFailedError, match=r"fixed steps \(h=, steps=\) pass it"):
+            stepper.integrate(start, [0.0] * 4, t_end=0.6)
 
 
 def test_steps_are_symplectic_on_the_tangent_bundle_of_the_circle():

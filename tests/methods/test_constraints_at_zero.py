@@ -54,6 +54,25 @@ def test_a_closed_loop_starts_from_rest_at_zero_at_any_step(method, reference):
         assert np.abs(run.q[-1] - reference(10 * h)[:3]).max() <= of_method * np.abs(run.q[-1]).max() + 1e-15
 
 
+def test_newtons_method_starts_there_too(reference):
+    stepper = sc.compile_stepper(linkage(a="1"), "svi:4", solver="newton")
+    for h in (0.01, 0.001, 1e-4, 1e-5):
+        run = stepper.integrate([0.0] * 3, [0.0] * 3, h=h, steps=10)
+        assert np.abs(run.q[-1] - reference(10 * h)[:3]).max() <= 1e-13 * np.abs(run.q[-1]).max() + 1e-15
+
+
+def test_adaptive_steps_from_the_lowest_point_are_those_of_any_pivot():
+    systems = [
+        lagrange("rod", ["x", "y"], "(x_dot**2 + y_dot**2)/2 - 9.81*y", constraints=[constraint])
+        for constraint in ("x**2 + y**2 = 1", "x**2 + (y - 1)**2 = 1", "x**2 + y**2 - 2*y")
+    ]
+    steps = [
+        sc.compile_stepper(system, "svi:8").integrate([0.0, y], velocity=[1.0, 0.0], t_end=2.0).steps
+        for system, y in zip(systems, (-1.0, 0.0, 0.0), strict=True)
+    ]
+    assert max(steps) <= 2 * min(steps) <= 40
+
+
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_a_closed_loop_at_an_equilibrium_stays_there(method):
     force = {x: f"{f:.17g}" for x, f in zip("abc", jacobian([0.0] * 3).T @ [0.75, -1.25], strict=True)}

@@ -247,7 +247,8 @@ def nearly_dependent(jacobian: Array) -> str:
     return (
         f". The Jacobian of the constraints is nearly singular there (smallest singular value {values[-1]:.2g} with "
         f"rows of length 1; rank {np.count_nonzero(values > NEARLY_DEPENDENT)} of {len(values)} where it is 0), as at "
-        "a dead point of a mechanism: end the run before it, or prescribe the motion of another coordinate"
+        "a dead point of a mechanism: fixed steps (h=, steps=) pass it if the motion does; otherwise end the run "
+        "before it, or prescribe the motion of another coordinate"
     )
 
 
