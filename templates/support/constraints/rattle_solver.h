@@ -20,7 +20,7 @@ static inline void find_sizes(const step_data *step, rattle_step *now, unknown_s
 }
 
 /* Stagnation above the rounding of the positions may be that of g. */
-static SELDOM void widen_sizes(const step_data *step, rattle_step *now, unknown_sizes *sizes)
+static SELDOM __attribute__((noinline)) void widen_sizes(const step_data *step, rattle_step *now, unknown_sizes *sizes)
 {
   sizes->widened = 1;
   term_sizes(step, now, 0, sizes->inverse);
@@ -35,17 +35,21 @@ static inline int may_lose_digits(const step_data *step, const rattle_step *now,
   int may = 0;
   for (int i = 0; i < M; i++) {
     const real moved = MATH(fabs)(step->q0[i]) + MATH(fabs)(now->u[i][DEGREE - 1] - step->q0[i]);
-    may |= (moved + REAL_MIN) * inverse_size[i] < 1;
+    may |= (2 * moved + REAL_MIN) * inverse_size[i] < 1;
   }
   return may;
 }
 
 /* Returns 1 if they do: where reactions exceed momenta and forces, as of light bodies, and displacements that change a
- * constraint by the size of its terms. A coordinate may be held at 0. */
-static SELDOM int loses_digits(const step_data *step, rattle_step *now, const real *inverse_size)
+ * constraint by the size of its terms. A coordinate may be held at 0. Replaces the sizes, if they are not NULL. */
+static SELDOM __attribute__((noinline)) int loses_digits(const step_data *step, rattle_step *now, unknown_sizes *sizes)
 {
   real size[M], length[M] = {0}, rounding[CONSTRAINTS];
+  unknown_sizes of_reactions = {.widened = 0};
   int loses = 0;
+  find_sizes(step, now, &of_reactions);
+  if (sizes)
+    *sizes = of_reactions;
   term_sizes(step, now, 0, size);
   constraint_rounding(step->q0, step->t, step->parameters, rounding);
   for (int e = 0; e < CONSTRAINT_ENTRIES; e++) {
@@ -53,8 +57,13 @@ static SELDOM int loses_digits(const step_data *step, rattle_step *now, const re
     length[i] = larger(length[i], rounding[k] / MATH(fabs)(now->first_derivative[e]));
   }
   for (int i = 0; i < M; i++)
-    loses |= larger(LARGEST_REACTION * size[i], length[i]) * inverse_size[i] < 1;
+    loses |= larger(LARGEST_REACTION * size[i], length[i]) * of_reactions.inverse[i] < 1;
   return loses;
+}
+
+static SELDOM __attribute__((noinline)) movement measured_again(const lanes *change, const unknown_sizes *sizes)
+{
+  return measure_change(change, sizes->inverse, sizes->largest);
 }
 
 /* Solves g(u) = 0 for lambda and u; evaluates forces and constraints there. Returns NOT_CONVERGED on failure, or
@@ -80,19 +89,16 @@ static int solve_constraints(const step_data *step, rattle_step *now, const solv
     evaluate_points(step, now);
     verdict = accepts(&moved, last, options, k - begin);
     if ((k == MULTIPLIERS_KNOWN || verdict > 0) && may_lose_digits(step, now, sizes.inverse)) {
-      unknown_sizes of_reactions = sizes;
-      find_sizes(step, now, &of_reactions);
-      if (loses_digits(step, now, of_reactions.inverse))
+      if (loses_digits(step, now, verdict > 0 && !sizes.widened ? &sizes : NULL))
         return LOST_DIGITS;
       if (verdict > 0 && !sizes.widened) {
-        sizes = of_reactions;
-        moved = measure_change(change, sizes.inverse, sizes.largest);
-    verdict = accepts(&moved, last, options, k - begin);
+        moved = measured_again(change, &sizes);
+        verdict = accepts(&moved, last, options, k - begin);
       }
     }
     if (verdict < 0 && !sizes.widened) {
       widen_sizes(step, now, &sizes);
-      moved = measure_change(change, sizes.inverse, sizes.largest);
+      moved = measured_again(change, &sizes);
       last[0] = unknown;
       begin = k;
       verdict = 0;
