@@ -227,7 +227,7 @@ def test_rod_and_angle() -> None:
         assert abs(np.log2(errors[0] / errors[1]) - 8.0) < 0.1
         assert errors[1] < 1e-27
         dense = sc.compile_stepper(system("rod"), "svi:12", precision="double-double")
-        assert error(dense.integrate(q, velocity=v, t_end=2.0, tolerance=1e-30)) < 1e-28
+        assert error(dense.integrate(q, velocity=v, t_end=2.0, tolerance=1e-28)) < 1e-28
         m = mp.mpf(1.25)
         force = dense.multipliers(q, p=[m * x for x in v])  # of m v^2 = force on a circle
         assert abs(force.mp()[0] + m * (rate**2 + mp.cos(a)) / 2) < 1e-30

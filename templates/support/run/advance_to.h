@@ -24,8 +24,7 @@ static inline real rest_of_last(const trial *now)
 /* Smallest tolerance that a step of round-off meets and an error estimate in double resolves. */
 double NAME(smallest_tolerance)(void)
 {
-  const double rounding = 1e-31; /* of a step */
-  return larger(pow(LEAST_UNRESOLVED, ERROR_POWER), rounding);
+  return larger(pow(LEAST_UNRESOLVED, ERROR_POWER), SMALLEST_TOLERANCE);
 }
 #endif
 
