@@ -285,7 +285,8 @@ def _check_resolved(tolerance: float, least: float) -> None:
         wanted = f"tolerance={tolerance:g}" if tolerance else "the default tolerance, round-off,"
         raise StateError(
             f"{wanted} cannot be met: adaptive steps of this method resolve errors of {least:.1e} in double-double "
-            f"arithmetic. Give tolerance={least:.1e} or more, fixed steps h=, or svi, whose estimates resolve round-off without constraints"
+            f"arithmetic. Give tolerance={least:.1e} or more, fixed steps h=, or svi, whose estimates resolve "
+            "round-off without constraints"
         )
 
 
