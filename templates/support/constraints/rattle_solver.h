@@ -61,9 +61,13 @@ static SELDOM __attribute__((noinline)) int loses_digits(const step_data *step, 
   return loses;
 }
 
-static SELDOM __attribute__((noinline)) movement measured_again(const lanes *change, const unknown_sizes *sizes)
+/* A change in units of other sizes. */
+static inline movement measured_again(const lanes *change, unknown_sizes sizes)
 {
-  return measure_change(change, sizes->inverse, sizes->largest);
+  lanes copied[M * GROUPS];
+  memcpy(copied, change, sizeof copied);
+  IN_MEMORY(copied);
+  return measure_change(copied, sizes.inverse, sizes.largest);
 }
 
 /* Solves g(u) = 0 for lambda and u; evaluates forces and constraints there. Returns NOT_CONVERGED on failure, or
@@ -89,16 +93,20 @@ static int solve_constraints(const step_data *step, rattle_step *now, const solv
     evaluate_points(step, now);
     verdict = accepts(&moved, last, options, k - begin);
     if ((k == MULTIPLIERS_KNOWN || verdict > 0) && may_lose_digits(step, now, sizes.inverse)) {
-      if (loses_digits(step, now, verdict > 0 && !sizes.widened ? &sizes : NULL))
+      unknown_sizes seen = sizes; /* so that `sizes` may stay in registers, as `change` */
+      if (loses_digits(step, now, verdict > 0 && !sizes.widened ? &seen : NULL))
         return LOST_DIGITS;
       if (verdict > 0 && !sizes.widened) {
-        moved = measured_again(change, &sizes);
+        sizes = seen;
+        moved = measured_again(change, sizes);
         verdict = accepts(&moved, last, options, k - begin);
       }
     }
     if (verdict < 0 && !sizes.widened) {
-      widen_sizes(step, now, &sizes);
-      moved = measured_again(change, &sizes);
+      unknown_sizes seen = sizes;
+      widen_sizes(step, now, &seen);
+      sizes = seen;
+      moved = measured_again(change, sizes);
       last[0] = unknown;
       begin = k;
       verdict = 0;
