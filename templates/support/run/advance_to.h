@@ -41,7 +41,7 @@ int NAME(advance_to)(run_memory *run, real t_end, const step_control *control, l
   report = report ? report : &unread;
   memset(report, 0, sizeof *report);
   now.step = step_from(run->t, 0, now.at.q, now.at.p, now.at.carry_q, now.at.carry_p, parameters, workspace);
-  now.step.largest_v = run->largest_v, now.step.largest_a = run->largest_a;
+  now.step.motion_of = run;
   load_state(run, &now.at);
 #ifdef MIXED_POINTS
   now.step.points = (double *)&now.points;

@@ -18,12 +18,13 @@ static inline real curvature_of_stages(const step_data *step, const real *z, int
 /* Returns the estimate from the unknowns z of the stages, or `least` if that is larger. */
 static real stage_error(const step_data *step, const real *z, const real *dq, real share, real decay, real least)
 {
-  real largest = 0, fastest = 0, farthest = 0, size[M], curvature[M];
+  real largest = 0, fastest = 0, farthest = 0, size[M], curvature[M], rounding[M];
   for (int i = 0; i < M; i++) {
     curvature[i] = curvature_of_stages(step, z, i);
     size[i] = motion_of_step(step, step->h, MATH(fabs)(dq[i]), curvature[i], i);
+    rounding[i] = rounding_of_force(step->q0[i], curvature_size(step->motion_of, step->h, curvature[i], i), size[i]);
 #ifdef FEW_STAGE_COEFFICIENTS
-    size[i] = size_for_few(step->h, size[i], curvature[i], step->largest_a ? step->largest_a[i] : 0);
+    size[i] = size_for_few(step->motion_of, step->h, size[i], curvature[i], i);
 #endif
     largest = larger(largest, size[i]);
     fastest = larger(fastest, MATH(fabs)(dq[i]));
@@ -41,7 +42,7 @@ static real stage_error(const step_data *step, const real *z, const real *dq, re
     }
     top = MATH(fabs)(top);
     top = top > VANISHING * MATH(fabs)(next) ? larger(top, decay * MATH(fabs)(next)) : top;
-    noise *= rounding_of_displacement(rounded) / MATH(fabs)(step->h);
+    noise *= larger(rounding_of_displacement(rounded), rounding[i]) / MATH(fabs)(step->h);
     top = top < noise ? 0 : SITES > M ? (top - noise) * unit * step->h
                                       : top * unit * step->h;
     const real allowed = 2 * unit * curvature[i] + NEGLIGIBLE;
@@ -69,8 +70,8 @@ static SELDOM int stages_fly(const real *z)
 }
 
 /* Lets V and A contain a solved step. */
-static inline void note_stages(run_memory *run, const step_data *step, const real *z, const real *dq, kept_motion kept)
+static inline void note_stages(run_memory *run, const step_data *step, const real *z, const real *dq, real part)
 {
   for (int i = 0; i < M; i++)
-    note_motion(run, step->h, MATH(fabs)(dq[i]), curvature_of_stages(step, z, i), kept, i);
+    note_motion(run, step->h, MATH(fabs)(dq[i]), curvature_of_stages(step, z, i), part, i);
 }

@@ -170,12 +170,12 @@ typedef struct {
 } trial;
 
 /* Lets V and A contain a solved trial. */
-static inline void note_trial(run_memory *run, const trial *now, kept_motion kept)
+static inline void note_trial(run_memory *run, const trial *now, real part)
 {
 #ifdef NEWTON_ALONE
-  note_stages(run, &now->step, run->memory, now->dq, kept);
+  note_stages(run, &now->step, run->memory, now->dq, part);
 #else
-  note_curve(run, &now->step, &now->data, STORED(run, &now->step), now->dq, kept, 1);
+  note_curve(run, &now->step, &now->data, STORED(run, &now->step), now->dq, part, 1);
 #endif
 }
 
@@ -295,10 +295,9 @@ static SELDOM int levels_of_first(const trial *now, real h, real span)
  * displacement t^k with k above what the curve represents has a large error relative to itself at any step size. */
 static inline void try_pilot(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
-  const kept_motion nothing = {0, 0};
   try_step(run, now, 0, options, report);
   if (now->error < INFINITY)
-    note_trial(run, now, nothing);
+    note_trial(run, now, 0);
 }
 
 /* Determines the first step size by increasing one that is certainly too small. The smallest trials may fail, with
@@ -612,14 +611,6 @@ static inline void finish_trial(run_memory *run, trial *now, real h)
   run->step++;
 }
 
-/* What the accepted step leaves of V and A. */
-static inline kept_motion kept_of_former(const trial *now)
-{
-  const kept_motion kept = {FORMER_PART,
-      now->change > 0 ? size_of_level(now->grid_level - now->change) / size_of_level(now->grid_level) : 1};
-  return kept;
-}
-
 /* Adds the increments of the accepted step to the state. */
 static inline void accept_trial(run_memory *run, trial *now)
 {
@@ -637,7 +628,7 @@ static inline void accept_trial(run_memory *run, trial *now)
 #ifdef RATTLE
   run->fallback_steps += now->fallbacks;
 #endif
-  note_trial(run, now, kept_of_former(now));
+  note_trial(run, now, FORMER_PART);
   run->path += MATH(fabs)(now->step.h) * largest_velocity(run);
   if (larger(now->error, now->apart) > run->error) {
     run->error = larger(now->error, now->apart);
