@@ -132,3 +132,20 @@ def test_absolute_tolerance_of_a_coordinate_takes_fewer_steps():
     )
     assert other.steps < 0.7 * own.steps
     assert other.q[-1, 0] == pytest.approx(math.cos(10.0), abs=1e-7)
+
+
+@pytest.mark.parametrize("method", ["svi:4", "svi:6", "svi:8"])
+def test_tiny_vibrations_far_from_the_origin(method: str) -> None:
+    """The rounding of x = 1000 in the force, 1e-6 of it, is no error of the step."""
+    system = sc.LagrangianSystem.from_text("far", ["x"], "x_dot**2/2 - (x - 1000)**2/2")
+    stepper = sc.compile_stepper(system, method)
+    steps = [len(stepper.integrate([1000 + a], velocity=[0.0], t_end=6.0).t) for a in (1e-7, 1e-5, 1.0)]
+    assert max(steps) <= steps[-1] + 4
+
+
+@pytest.mark.parametrize("solver", ["auto", "newton"])
+def test_turning_points_are_reached_by_short_steps(solver: str) -> None:
+    """Velocities are forgotten with time: steps of a low order near a turning point do not shrink with the velocity."""
+    system = sc.LagrangianSystem.from_text("pendulum", ["x"], "x_dot**2/2 + cos(x)")
+    run = sc.compile_stepper(system, "svi:3", solver=solver).integrate([1.2], velocity=[0.1], t_end=5.0)
+    assert len(run.t) < 3000
