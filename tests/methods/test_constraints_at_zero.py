@@ -110,3 +110,12 @@ def test_projection_ends_at_rounding_near_the_origin():
         assert np.abs(projected - q).max() <= 2 * np.abs(q).max()
     exact, _ = stepper.project([0.0] * 3, [0.0] * 3)
     assert np.all(exact == 0.0)
+
+
+@pytest.mark.parametrize("tolerance", [None, 1e-10, 1e-6])
+def test_adaptive_steps_from_rest_do_not_resolve_rounding(tolerance):
+    """Velocities of stages are rounded as the terms of the constraints, however short a step is."""
+    run = sc.compile_stepper(linkage(a="1"), "svi:4").integrate([0.0] * 3, [0.0] * 3, t_end=0.2, tolerance=tolerance)
+    exact = solve_ivp(accelerations, (0.0, 0.2), np.zeros(6), method="DOP853", rtol=1e-13, atol=1e-15).y[:3, -1]
+    assert len(run.t) <= 6
+    assert np.abs(run.q[-1] - exact).max() < 1e-3 * (tolerance or 1e-9)

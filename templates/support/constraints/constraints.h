@@ -123,6 +123,30 @@ static SELDOM void add_constraint_sizes(real t, const real *q, const real *param
   }
 }
 
+/* Largest size of positions that round as the constraints do, whatever the positions are. */
+static SELDOM real size_by_constraints(const step_data *step)
+{
+  real size[M] = {0};
+  add_constraint_sizes(step->t, step->q0, step->parameters, saddle_in(step->scratch), size);
+  return largest_of(size);
+}
+
+/* Largest displacement that changes one constraint by the size of its terms: relative to it positions on constraints are
+ * rounded, whatever they are. Unlike add_constraint_sizes it is bounded where the constraints become dependent: errors
+ * grow there, and are not to be taken for rounding. */
+static SELDOM real length_of_constraints(const step_data *step)
+{
+  real g[CONSTRAINTS], rounding[CONSTRAINTS], steepest[CONSTRAINTS] = {0}, derivative[CONSTRAINT_ENTRIES], length = 0;
+  constraints(step->q0, step->t, step->parameters, g, derivative);
+  constraint_rounding(step->q0, step->t, step->parameters, rounding);
+  for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
+    steepest[CONSTRAINT_ENTRY[e][0]] = larger(steepest[CONSTRAINT_ENTRY[e][0]], MATH(fabs)(derivative[e]));
+  for (int k = 0; k < CONSTRAINTS; k++)
+    if (steepest[k] > 0)
+      length = larger(length, rounding[k] / steepest[k]);
+  return length;
+}
+
 /* Sum of squares of g; infinite if g is not finite. */
 static real misfit(real t, const real *q, const real *parameters, real *g)
 {

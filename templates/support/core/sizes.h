@@ -52,6 +52,21 @@ static inline real rounding_of_displacement(real largest_displacement)
   return REAL_EPSILON / 2 * largest_displacement;
 }
 
+#ifndef CONSTRAINED
+/* Sizes of positions that round as constraints do: there are none. */
+static inline real size_by_constraints(const step_data *step)
+{
+  (void)step;
+  return 0;
+}
+
+static inline real length_of_constraints(const step_data *step)
+{
+  (void)step;
+  return 0;
+}
+#endif
+
 #ifdef ARRAYS
 enum { MOTIONS = COORDINATE_ARRAYS }; /* numbers V and A */
 

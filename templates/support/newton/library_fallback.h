@@ -51,7 +51,7 @@ static SELDOM int provided_step(const step_data *step, double *dq, double *dp, c
   *error = NAN;
 #ifdef STAGE_POWER
   if (status == OK)
-    *error = pow(stage_error(&own, newton_in(workspace + SCRATCH)->z, dq, ALL, DECAY, 0.0), STAGE_POWER);
+    *error = pow(stage_error(&own, newton_in(workspace + SCRATCH)->z, dq, ALL, DECAY, 0.0, 0.0), STAGE_POWER);
 #endif
   free(workspace);
   return status;

@@ -54,14 +54,14 @@ static inline real smaller(real a, real b)
 /* Computes the increments; returns the error estimate of the curve if it exceeds `least`, or infinity if the step
  * failed. afresh: without the predictor, which requires the step size of the previous step. */
 static real attempt(run_memory *run, step_data *step, const solver_data *data, int afresh, int inside, long long *guess,
-    real *dq, real *dp, real decay, real least, const solver_options *options, solver_report *report)
+    real *dq, real *dp, const error_limits *limits, real least, const solver_options *options, solver_report *report)
 {
   (void)inside;
   *guess = !afresh && run->change == 0 && run->guess > 0;
   if (solve(step, data, run->memory, guess, dq, dp, options, report, step->scratch + SCRATCH) != OK)
     return INFINITY;
   *guess = 1;
-  return stage_error(step, run->memory, dq, EACH, decay, least);
+  return stage_error(step, run->memory, dq, EACH, limits->decay, least, limits->most);
 }
 #else
 #ifdef ARRAYS
@@ -75,8 +75,8 @@ static real attempt(run_memory *run, step_data *step, const solver_data *data, i
  * failed. afresh: without the predictor; inside: levels above this one of a rejected step, whose curve is stored, or 0;
  * rough: 1 without low words. */
 static inline __attribute__((always_inline)) double attempt_at(run_memory *run, step_data *step,
-    const solver_data *data, int afresh, int inside, long long *guess, double *dq, double *dp, double decay,
-    double least, const solver_options *options, solver_report *report, int rough)
+    const solver_data *data, int afresh, int inside, long long *guess, double *dq, double *dp,
+    const error_limits *limits, double least, const solver_options *options, solver_report *report, int rough)
 {
   struct predictor_tables_of tables = {NULL, NULL, NULL};
   int status;
@@ -102,24 +102,24 @@ static inline __attribute__((always_inline)) double attempt_at(run_memory *run, 
 #ifdef ARRAYS
   find_displacements(step, data, STORED(run, step), dq);
 #endif
-  return curve_error(step, data, STORED(run, step), dq, EACH, decay, least);
+  return curve_error(step, data, STORED(run, step), dq, EACH, limits->decay, least);
 }
 
 /* Out of line, one copy compiles faster than two. Steps without low words have one of their own, so that others take no
  * longer. */
 static __attribute__((noinline)) double attempt(run_memory *run, step_data *step, const solver_data *data, int afresh,
-    int inside, long long *guess, double *dq, double *dp, double decay, double least, const solver_options *options,
-    solver_report *report)
+    int inside, long long *guess, double *dq, double *dp, const error_limits *limits, double least,
+    const solver_options *options, solver_report *report)
 {
-  return attempt_at(run, step, data, afresh, inside, guess, dq, dp, decay, least, options, report, 0);
+  return attempt_at(run, step, data, afresh, inside, guess, dq, dp, limits, least, options, report, 0);
 }
 
 #ifdef ROUGH
 static __attribute__((noinline)) double rough_attempt(run_memory *run, step_data *step, const solver_data *data,
-    int afresh, int inside, long long *guess, double *dq, double *dp, double decay, double least,
+    int afresh, int inside, long long *guess, double *dq, double *dp, const error_limits *limits, double least,
     const solver_options *options, solver_report *report)
 {
-  return attempt_at(run, step, data, afresh, inside, guess, dq, dp, decay, least, options, report, 1);
+  return attempt_at(run, step, data, afresh, inside, guess, dq, dp, limits, least, options, report, 1);
 }
 #endif
 #endif
@@ -202,7 +202,7 @@ HOT void try_step(run_memory *run, trial *now, real least, const solver_options 
   now->fallbacks = report->fallback_steps;
 #endif
   now->error = ATTEMPT(options, run, &now->step, &now->data, now->last, now->last ? 0 : now->inside, &now->guess,
-      now->dq, now->dp, now->limits.decay, least, options, report);
+      now->dq, now->dp, &now->limits, least, options, report);
   now->iterations = report->iterations - now->iterations;
 #ifdef RATTLE
   now->fallbacks = report->fallback_steps - now->fallbacks;
