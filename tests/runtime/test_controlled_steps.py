@@ -212,8 +212,11 @@ MASSES = {
     ("name", "solver"),
     [(name, solver) for name in MASSES for solver in ("auto", "newton")[: 2 - (name == "of arrays")]],
 )
-def test_equal_velocities_at_both_points_give_no_error_estimate(name, solver, method):
-    """The momenta of a Lobatto IIIA-IIIB pair of two stages are the same at both, whatever the forces are."""
+def test_equal_velocities_at_both_points_give_no_estimate_by_a_curve(name, solver, method):
+    """The momenta of a Lobatto IIIA-IIIB pair of two stages are the same at both, whatever the forces are.
+
+    Fixed steps of named coordinates are compared with half steps.
+    """
     text, kind = MASSES[name]
     system = kind.from_text(name="quartic", **text)
     if name == "of arrays":
@@ -223,7 +226,8 @@ def test_equal_velocities_at_both_points_give_no_error_estimate(name, solver, me
         start = ([0.5] * system.dimension, [0.3] * system.dimension)
     with pytest.raises(sc.MethodError, match=r"without an error estimate .* requires"):
         stepper.integrate(*start, t_end=2.0, tolerance=1e-6)
-    assert math.isnan(stepper.integrate(*start, h=0.1, steps=2).step_error)
+    estimate = stepper.integrate(*start, h=0.1, steps=2).step_error
+    assert math.isnan(estimate) if name == "of arrays" else 1e-6 < estimate < 1e-2
 
 
 @pytest.mark.parametrize("solver", ["auto", "newton"])
