@@ -32,8 +32,10 @@ def in_known_digits(x: float, error: float) -> str:
     """
     if error == 0.0 or not math.isfinite(error):
         return f"{x: .17g}"
+    if x == 0.0:
+        return f" 0 within {error:.1g}"
     decimals = math.floor(-math.log10(2.0 * error))
-    digits = math.floor(math.log10(abs(x))) + 1 + decimals if x else 0
+    digits = math.floor(math.log10(abs(x))) + 1 + decimals
     return f"{x: .{min(digits, 17)}g}" if digits > 0 else f" no digit (error {error:.1g})"
 
 

@@ -227,7 +227,10 @@ class Cell:
 
     def is_offered(self) -> bool:
         """Return whether the combination exists and is affordable: in two words no arrays and no low orders."""
-        return self.precision == "double" or (self.method == "svi:8" and not KINDS[self.kind].array)
+        kind = KINDS[self.kind]
+        if kind.constraints and not self.method.startswith("svi"):
+            return False
+        return self.precision == "double" or (self.method == "svi:8" and not kind.array)
 
 
 @cache

@@ -7,7 +7,8 @@
  *
  * Positions: Gauss-Newton iteration in the metric of the mass matrix; momenta: p -= G^T y with G H_pp G^T y = rate
  * (Hairer, Lubich & Wanner, Geometric Numerical Integration, sec. VII.1). Requires: legendre.h, band.h, the
- * kernels constraints, constraint_rounding and constrained_motion, and CONSTRAINT_ENTRY, the indices of the entries of G = g_q or A. */
+ * kernels constraints, constraint_rounding and constrained_motion, and CONSTRAINT_ENTRY, the indices of the entries of
+ * G = g_q or A. */
 
 #define MAX_PROJECTIONS 100 /* Gauss-Newton iterations; more indicate that no state is near */
 #define MOST_UPDATE_HALVINGS 60 /* of an update */
@@ -105,8 +106,8 @@ int NAME(constraint_values)(long long count, const real *t, const real *q, const
 #endif
 
 /* Adds to the sizes of positions the displacements for which constraints change by the sizes of their terms: rounding
- * leaves g_k = O(u r_k), with the rounding size r of constraint_rounding, and positions q + X_k g_k, X = M^-1 G^T (G M^-1
- * G^T)^-1, whatever |q| is. Nothing is added where the constraints are dependent. */
+ * leaves g_k = O(u r_k), with the rounding size r of constraint_rounding, and positions q + X_k g_k, X = M^-1 G^T (G
+ * M^-1 G^T)^-1, whatever |q| is. Nothing is added where the constraints are dependent. */
 static SELDOM void add_constraint_sizes(real t, const real *q, const real *parameters, saddle *at, real *size)
 {
   real u[2 * M] = {0}, g[CONSTRAINTS], rounding[CONSTRAINTS], x[M], y[CONSTRAINTS];
@@ -167,8 +168,8 @@ static int is_below(const real *g, real limit, const real *size)
 }
 
 /* Projects q onto g = 0 by Gauss-Newton steps in the metric of the mass matrix at u = (q, v). An update is halved while
- * it does not reduce |g|; the iteration ends where g is a rounding error, whose size is that of its terms: positions may
- * be 0. */
+ * it does not reduce |g|; the iteration ends where g is a rounding error, whose size is that of its terms: positions
+ * may be 0. */
 static int project_position(real t, real *u, const real *parameters, saddle *at)
 {
   real g[CONSTRAINTS], right[CONSTRAINTS], y[CONSTRAINTS], update[M], nearest[M], rounding[CONSTRAINTS];

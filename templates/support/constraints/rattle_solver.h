@@ -28,8 +28,8 @@ static SELDOM __attribute__((noinline)) void widen_sizes(const step_data *step, 
   sizes->largest = invert_sizes(sizes->inverse);
 }
 
-/* Returns 1 if forces and reactions may lose digits: of a body so light that they move it in a step by much more than it
- * moves, rounding errors of its position are relative to them. In Newton's method positions are unknowns. */
+/* Returns 1 if forces and reactions may lose digits: of a body so light that they move it in a step by much more than
+ * it moves, rounding errors of its position are relative to them. In Newton's method positions are unknowns. */
 static inline int may_lose_digits(const step_data *step, const rattle_step *now, const real *inverse_size)
 {
   int may = 0;

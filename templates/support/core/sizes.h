@@ -3,13 +3,14 @@
 /* Sizes in which the errors of a step are measured. Neither depends on the origin of a coordinate, but for the rounding
  * of the coordinate itself, and both change with its unit. Per coordinate i and step h:
  *
- * Motion    mu_i = |dq_i| + |h| V_i + h^2 A_i, V_i and A_i the largest |v_i| and |a_i| of the step and, with a forgetting
- *           factor, of former ones: at a turning point a step has the size of those around it, and an encounter does
+ * Motion    mu_i = |dq_i| + |h| V_i + h^2 A_i, V_i and A_i the largest |v_i| and |a_i| of the step and, with a
+ *           forgetting factor, of former ones: at a turning point a step has the size of those around it, and an
+ *           encounter does
  *           not loosen the rest of a run. The factor is one of time, not of steps: if V shrank with each step to a
  *           turning point, so would the steps, and never reach it.
  * Rounding  rho_i = u (|q_i| + |h v_i| + h^2 (|M^-1| F)_i + h^2 (|J| |q|)_i), F_j the sum of the absolute terms of f_j,
- *           J = da/dq, u = REAL_EPSILON / 2. In a contracting iteration h^2 |J| is at most about its rate. The increment
- *           of a step is compensated: its error is rho_i without the first term.
+ *           J = da/dq, u = REAL_EPSILON / 2. In a contracting iteration h^2 |J| is at most about its rate. The
+ *           increment of a step is compensated: its error is rho_i without the first term.
  *
  * The state itself enters nowhere else. Of arrays of run-time sizes V, A and mu are those of a whole array. */
 
@@ -22,8 +23,9 @@ static inline real curvature_size(const run_memory *former, real h, real curvatu
   return larger(curvature, former && by_a > former->largest_bend[k] ? former->largest_bend[k] : by_a);
 }
 
-/* mu_i of the displacement by a step and by its curvature, with V and A of former steps, unless NULL. The displacement by
- * V is at most the largest of former steps: behind an encounter steps grow faster than its velocities are forgotten. */
+/* mu_i of the displacement by a step and by its curvature, with V and A of former steps, unless NULL. The displacement
+ * by V is at most the largest of former steps: behind an encounter steps grow faster than its velocities are
+ * forgotten. */
 static inline real motion_size(const run_memory *former, real h, real displacement, real curvature, int k)
 {
   const real by_v = former ? MATH(fabs)(h) * former->largest_v[k] : 0;
@@ -35,11 +37,11 @@ static inline real motion_size(const run_memory *former, real h, real displaceme
  * error of a step: where forces vanish, these do, too, but the error of the step need not. */
 static inline real size_for_few(const run_memory *former, real h, real motion, real curvature, int k)
 {
-  return motion * motion / (curvature_size(former, h, curvature, k) + REAL_EPSILON * motion + REAL_MIN);
+  return motion * (motion / (curvature_size(former, h, curvature, k) + REAL_EPSILON * motion + REAL_MIN));
 }
 
-/* Rounding error of the displacement of coordinate i by that of the coordinate in the forces, h^2 |J| u |q_i|: where a motion
- * is of size mu_i, h^2 |J| is about its curvature relative to it. */
+/* Rounding error of the displacement of coordinate i by that of the coordinate in the forces, h^2 |J| u |q_i|: where a
+ * motion is of size mu_i, h^2 |J| is about its curvature relative to it. */
 static inline real rounding_of_force(real q, real curvature, real motion)
 {
   return REAL_EPSILON / 2 * MATH(fabs)(q) * (curvature / (motion + REAL_MIN));
@@ -98,7 +100,7 @@ static inline real largest_velocity(const run_memory *run)
   return largest;
 }
 
-static inline real largest_motion(const run_memory *run, real h)
+static inline real motion_of_run(const run_memory *run, real h)
 {
   real largest = 0;
   for (int k = 0; k < MOTIONS; k++)

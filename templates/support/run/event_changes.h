@@ -342,10 +342,10 @@ static int take_step(event_run *run, real t_end, const step_control *control, co
   return status;
 }
 
-int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, const step_control *control, long long steps,
-    const real *parameters, const solver_options *options, long long states, real *t, real *q, real *p, real *length,
-    int *iterations, long long *number, long long room, event_crossing *found, long long *filled, solver_report *report,
-    real *workspace)
+int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, const step_control *control,
+    long long steps, const real *parameters, const solver_options *options, long long states, real *t, real *q, real *p,
+    real *length, int *iterations, long long *number, long long room, event_crossing *found, long long *filled,
+    solver_report *report, real *workspace)
 {
   EVENT_MEMORY(watch, memory, 15 * M + CHANGE_VALUES)
   event_sample horizon = {.q = memory + 7 * M, .p = memory + 8 * M};

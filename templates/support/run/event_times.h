@@ -2,8 +2,8 @@
  *
  * Such a function is sampled a sixteenth of a turn of its sines, cosines and rint apart, so that no two zeros of one of
  * these with an affine argument are between two samples, and 64 times a step at least unless it is affine; a change of
- * its sign is bisected to neighbouring times. At the ends of a step the sign is that of eight roundings later: a zero at
- * the end of a step belongs to that step, also if its function has the former sign there by rounding. Requires:
+ * its sign is bisected to neighbouring times. At the ends of a step the sign is that of eight roundings later: a zero
+ * at the end of a step belongs to that step, also if its function has the former sign there by rounding. Requires:
  * numbers.h, IS_TIMED, turn_rate and time_value of parts/event_functions.c.jinja. */
 enum {
   EVENT_TIMES = 64, /* samples of a step at least */

@@ -10,9 +10,9 @@ KERNEL NAME(thread_size)(long long *size)
 }
 
 /* Advances the trajectories `which` by at most `steps` steps; with `first` from t0 and the states in q, p. runs: their
- * memory between calls; parameters: (count, P). t, q, p: of each its time, and its state if it is at t_end. first_step: NaN for trials. status: of
- * the step that failed, 0 at t_end, else -1. done: numbers of completed steps. solver_tolerance: 0 for the one of
- * `tolerance`. */
+ * memory between calls; parameters: (count, P). t, q, p: of each its time, and its state if it is at t_end.
+ * first_step: NaN for trials. status: of the step that failed, 0 at t_end, else -1. done: numbers of completed steps.
+ * solver_tolerance: 0 for the one of `tolerance`. */
 KERNEL NAME(thread_advance_to)(long long number, const long long *which, long long first, long long steps, double t0,
     const double *t_end, double tolerance, double max_step, double first_step,
     const double *absolute_tolerance, double solver_tolerance, long long max_iterations, long long absolute,

@@ -72,23 +72,6 @@ static real stage_error(const step_data *step, const real *z, const real *dq, re
   return error;
 }
 
-#define UNBENT REAL(1e-11) /* leading coefficients of the velocities of a free flight relative to their change */
-
-/* Returns 1 if the force on some coordinate is nearly constant along the stages, as in free flight. */
-static SELDOM int stages_fly(const real *z)
-{
-  for (int i = 0; i < M; i++) {
-    real bend = 0, slope = 0;
-    for (int b = 0; b < B; b++) {
-      bend += STAGE_HIGHEST[b] * z[i * B + b];
-      slope += STAGE_CURVATURE[b] * z[i * B + b];
-    }
-    if (MATH(fabs)(bend) <= UNBENT * MATH(fabs)(slope))
-      return 1;
-  }
-  return 0;
-}
-
 /* Lets V and A contain a solved step. */
 static inline void note_stages(run_memory *run, const step_data *step, const real *z, const real *dq, real part)
 {

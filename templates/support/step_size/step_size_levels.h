@@ -22,7 +22,8 @@ enum {
 #ifdef DOUBLE_DOUBLE
 #define ROUNDOFF_ERROR (64.0 * REAL_EPSILON * REAL_EPSILON) /* errors below are rounding errors of the estimate */
 #else
-#define ROUNDOFF_ERROR (REAL(0.125) * REAL_EPSILON) /* of a step, relative to its motion: the sum over a run is of the size of
+#define ROUNDOFF_ERROR (REAL(0.125) * REAL_EPSILON) /* of a step, relative to its motion: the sum over a run is of the
+                                                     * size of
                                                        * rounding errors */
 #endif
 #ifdef DOUBLE_DOUBLE

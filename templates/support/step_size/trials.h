@@ -416,6 +416,47 @@ HOT int find_step(run_memory *run, trial *now, const solver_options *options, so
   return OK;
 }
 
+#ifdef NEWTON_ALONE
+#define UNBENT REAL(1e-11) /* leading coefficients of the velocities of a free flight relative to their change */
+
+/* Returns 1 if the force on some coordinate is nearly constant along the stages, as in free flight. */
+static SELDOM int stages_fly(const real *z)
+{
+  for (int i = 0; i < M; i++) {
+    real bend = 0, slope = 0;
+    for (int b = 0; b < B; b++) {
+      bend += STAGE_HIGHEST[b] * z[i * B + b];
+      slope += STAGE_CURVATURE[b] * z[i * B + b];
+    }
+    if (MATH(fabs)(bend) <= UNBENT * MATH(fabs)(slope))
+      return 1;
+  }
+  return 0;
+}
+#else
+#define NEARLY_CONSTANT REAL(1e-3) /* relative change of the force of a free flight along a step */
+#define UNBENT REAL(1e-11) /* leading coefficients of its velocities relative to their change */
+
+/* Returns 1 if the force on some coordinate is nearly constant along the curve, as in free flight. */
+static SELDOM int is_free_flight(const step_data *step, stored_values of)
+{
+  sums all;
+  begin_blocks(&all, step);
+  EACH_BLOCK (all) {
+    int flies = 0;
+    for (long long i = all.here.first; i < all.here.end; i++) {
+      const double start = stored_at(of, i, 0), middle = stored_at(of, i, KEPT / 2), end = stored_at(of, i, KEPT - 1);
+      const double bend = fabs(RESOLVED * coefficient(HIGHEST, of, i)) + fabs(NEXT_RESOLVED * coefficient(NEXT, of, i));
+      const double change = fabs(end - start) + fabs(middle - start);
+      flies |= KEPT_VELOCITIES ? bend <= UNBENT * change : change <= NEARLY_CONSTANT * (fabs(start) + fabs(end));
+    }
+    add_block(&all, flies, 0.0);
+  }
+  meet(step);
+  return largest_over(&all, 0) > 0.0;
+}
+#endif
+
 /* Returns 1 for a free flight whose size is far from that of the step before: much larger, or shortened at once. */
 static inline int is_leap(const run_memory *run, const trial *now)
 {
@@ -458,7 +499,8 @@ static SELDOM int force_sets_in(const trial *now, const solver_options *options)
   VECTORS(changes, 1, step);
   VECTORS(whole, 1, step);
   VECTORS(first, 1, step);
-  set_zero(step, nothing), set_zero(step, halves), set_zero(step, changes), set_zero(step, whole), set_zero(step, first);
+  set_zero(step, nothing), set_zero(step, halves), set_zero(step, changes);
+  set_zero(step, whole), set_zero(step, first);
   for (long long i = own.first; i < own.end; i++) {
     q[i] = step->q0[i] + (step->carry_q[i] + now->dq[i]);
     p[i] = step->p0[i] + (step->carry_p[i] + now->dp[i]);
@@ -530,7 +572,8 @@ static inline int confirm_step(run_memory *run, trial *now, const solver_options
 {
   const int steps_to_compare = needs_momenta(run, now);
   now->apart = 0;
-  return steps_to_compare || run->step % COMPARED == 0 || is_leap(run, now) ? compare_step(run, now, steps_to_compare, options, report) : OK;
+  const int is_confirmed = steps_to_compare || run->step % COMPARED == 0 || is_leap(run, now);
+  return is_confirmed ? compare_step(run, now, steps_to_compare, options, report) : OK;
 }
 
 /* Largest change of level after the iterations of a step. Where they are many, as in lattices whose waves are fast, the
