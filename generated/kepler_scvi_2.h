@@ -62,7 +62,8 @@ typedef struct {
   long long fallback_steps; /* steps that the iteration did not solve, but its fallback */
   long long iterations; /* since the last stored state */
   double error, error_t; /* largest error estimate of a step so far, and the time of that step */
-  double largest_v[2], largest_a[2]; /* largest velocities and accelerations so far, for the size of errors */
+  double largest_v[2], largest_a[2]; /* velocities and accelerations so far, for the size of errors */
+  double largest_dq[2], largest_bend[2]; /* displacements by a step and by its curvature so far */
   double largest_motion; /* by a step, relative to which the error is measured, with fixed steps */
 } kepler_scvi_2_run;
 

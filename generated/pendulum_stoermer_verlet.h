@@ -63,7 +63,8 @@ typedef struct {
   long long fallback_steps; /* steps that the iteration did not solve, but its fallback */
   long long iterations; /* since the last stored state */
   double error, error_t; /* largest error estimate of a step so far, and the time of that step */
-  double largest_v[1], largest_a[1]; /* largest velocities and accelerations so far, for the size of errors */
+  double largest_v[1], largest_a[1]; /* velocities and accelerations so far, for the size of errors */
+  double largest_dq[1], largest_bend[1]; /* displacements by a step and by its curvature so far */
   double largest_motion; /* by a step, relative to which the error is measured, with fixed steps */
 } pendulum_stoermer_verlet_run;
 

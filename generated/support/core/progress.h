@@ -31,12 +31,12 @@ static inline void take_change(progress *now, double change, const solver_option
 }
 
 /* 1 if the last change exceeds a level. */
-static inline number undecided(const progress *now, double level)
+static inline double undecided(const progress *now, double level)
 {
   return now->last > level;
 }
 
-static inline int any_positive(number x)
+static inline int any_positive(double x)
 {
   return x > 0.0;
 }

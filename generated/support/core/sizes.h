@@ -6,29 +6,48 @@
 /* Sizes in which the errors of a step are measured. Neither depends on the origin of a coordinate, but for the rounding
  * of the coordinate itself, and both change with its unit. Per coordinate i and step h:
  *
- * Motion    mu_i = |dq_i| + |h| V_i + h^2 A_i, V_i and A_i the largest |v_i| and |a_i| of the step and, times FORMER_PART
- *           per step, of former ones: at a turning point a step has the size of those around it, and an encounter
- *           does not loosen the rest of a run.
+ * Motion    mu_i = |dq_i| + |h| V_i + h^2 A_i, V_i and A_i the largest |v_i| and |a_i| of the step and, with a
+ *           forgetting factor, of former ones: at a turning point a step has the size of those around it, and an
+ *           encounter does
+ *           not loosen the rest of a run. The factor is one of time, not of steps: if V shrank with each step to a
+ *           turning point, so would the steps, and never reach it.
  * Rounding  rho_i = u (|q_i| + |h v_i| + h^2 (|M^-1| F)_i + h^2 (|J| |q|)_i), F_j the sum of the absolute terms of f_j,
- *           J = da/dq, u = REAL_EPSILON / 2. In a contracting iteration h^2 |J| is at most about its rate. The increment
- *           of a step is compensated: its error is rho_i without the first term.
+ *           J = da/dq, u = REAL_EPSILON / 2. In a contracting iteration h^2 |J| is at most about its rate. The
+ *           increment of a step is compensated: its error is rho_i without the first term.
  *
  * The state itself enters nowhere else. Of arrays of run-time sizes V, A and mu are those of a whole array. */
 
-#define FORMER_PART REAL(0.97) /* of the largest velocities and accelerations of former steps: 1/2 after 23 steps */
+#define FORMER_PART REAL(0.97) /* of V and A after a motion by V / A, about a radian of a vibration */
 
-/* mu_i of the displacement by a step, and by its curvature; V and A of former steps. */
-static inline real motion_size(real h, real displacement, real curvature, real v, real a)
+/* Displacement by the curvature of a step, or of former ones: h^2 A_i, but not above the largest one of them. */
+static inline real curvature_size(const run_memory *former, real h, real curvature, int k)
 {
-  const real by_v = MATH(fabs)(h) * v, by_a = h * h * a;
-  return displacement + larger(displacement, by_v) + larger(curvature, by_a);
+  const real by_a = former ? h * h * former->largest_a[k] : 0;
+  return larger(curvature, former && by_a > former->largest_bend[k] ? former->largest_bend[k] : by_a);
+}
+
+/* mu_i of the displacement by a step and by its curvature, with V and A of former steps, unless NULL. The displacement
+ * by V is at most the largest of former steps: behind an encounter steps grow faster than its velocities are
+ * forgotten. */
+static inline real motion_size(const run_memory *former, real h, real displacement, real curvature, int k)
+{
+  const real by_v = former ? MATH(fabs)(h) * former->largest_v[k] : 0;
+  const real former_size = former && by_v > former->largest_dq[k] ? former->largest_dq[k] : by_v;
+  return displacement + larger(displacement, former_size) + curvature_size(former, h, curvature, k);
 }
 
 /* Size mu_i^2 / (h^2 A_i), about V_i^2 / A_i, relative to which a curve of one or two coefficients shows the relative
  * error of a step: where forces vanish, these do, too, but the error of the step need not. */
-static inline real size_for_few(real h, real motion, real curvature, real a)
+static inline real size_for_few(const run_memory *former, real h, real motion, real curvature, int k)
 {
-  return motion * motion / (larger(curvature, h * h * a) + REAL_EPSILON * motion + REAL_MIN);
+  return motion * (motion / (curvature_size(former, h, curvature, k) + REAL_EPSILON * motion + REAL_MIN));
+}
+
+/* Rounding error of the displacement of coordinate i by that of the coordinate in the forces, h^2 |J| u |q_i|: where a
+ * motion is of size mu_i, h^2 |J| is about its curvature relative to it. */
+static inline real rounding_of_force(real q, real curvature, real motion)
+{
+  return REAL_EPSILON / 2 * MATH(fabs)(q) * (curvature / (motion + REAL_MIN));
 }
 
 /* Rounding error of the displacement of coordinate i by terms of the size of the velocities of all coordinates, which
@@ -37,6 +56,21 @@ static inline real rounding_of_displacement(real largest_displacement)
 {
   return REAL_EPSILON / 2 * largest_displacement;
 }
+
+#ifndef CONSTRAINED
+/* Sizes of positions that round as constraints do: there are none. */
+static inline real size_by_constraints(const step_data *step)
+{
+  (void)step;
+  return 0;
+}
+
+static inline real length_of_constraints(const step_data *step)
+{
+  (void)step;
+  return 0;
+}
+#endif
 
 #ifdef ARRAYS
 enum { MOTIONS = COORDINATE_ARRAYS }; /* numbers V and A */
@@ -49,23 +83,15 @@ typedef struct array_motion {
 enum { MOTIONS = M };
 #endif
 
-/* What is kept of V and A when a step is added: `part`, and, of a coordinate that moves, the displacement by V in the
- * step before, 1 / `larger_by` of its size: behind an encounter steps grow faster than its velocities are forgotten. A
- * coordinate that is leaving rest has V and A of the trials for the first step. */
-typedef struct {
-  real part, larger_by;
-} kept_motion;
-
-#define LEAVING_REST REAL(0.03) /* relative to V and A */
-
-/* Lets V and A of a coordinate or array contain a step. */
-static inline void note_motion(run_memory *run, real h, real displacement, real curvature, kept_motion kept, int k)
+/* Lets V and A of a coordinate or array contain a step; `part` of those of former steps is kept after a time V / A. */
+static inline void note_motion(run_memory *run, real h, real displacement, real curvature, real part, int k)
 {
-  const real v = displacement / MATH(fabs)(h), a = curvature / (h * h);
-  const int moves = v > LEAVING_REST * run->largest_v[k] || a > LEAVING_REST * run->largest_a[k];
-  const real by = moves ? kept.larger_by : 1;
-  run->largest_v[k] = larger(kept.part * by * run->largest_v[k], v);
-  run->largest_a[k] = larger(kept.part * by * by * run->largest_a[k], a);
+  const real turn = MATH(fabs)(h) * run->largest_a[k], v = run->largest_v[k];
+  const real kept = part == 0 ? 0 : 1 - (1 - part) * (turn < v ? turn / v : 1);
+  run->largest_v[k] = larger(kept * v, displacement / MATH(fabs)(h));
+  run->largest_a[k] = larger(kept * run->largest_a[k], curvature / (h * h));
+  run->largest_dq[k] = larger(kept * run->largest_dq[k], displacement);
+  run->largest_bend[k] = larger(kept * run->largest_bend[k], curvature);
 }
 
 /* The largest V, and the largest mu_i of a step of h of the run so far. */
@@ -77,11 +103,11 @@ static inline real largest_velocity(const run_memory *run)
   return largest;
 }
 
-static inline real largest_motion(const run_memory *run, real h)
+static inline real motion_of_run(const run_memory *run, real h)
 {
   real largest = 0;
   for (int k = 0; k < MOTIONS; k++)
-    largest = larger(largest, motion_size(h, 0, 0, run->largest_v[k], run->largest_a[k]));
+    largest = larger(largest, motion_size(run, h, 0, 0, k));
   return largest;
 }
 
@@ -95,21 +121,16 @@ static inline real size_of_motion(const step_data *step, real motion, long long 
 /* mu_i of a step of h, with the largest V and A of all arrays. */
 static inline real motion_of_step(const step_data *step, real h, real displacement, real curvature, long long i)
 {
-  real v = 0, a = 0;
-  for (int k = 0; k < COORDINATE_ARRAYS; k++) {
-    v = larger(v, step->run->largest_v[k]);
-    a = larger(a, step->run->largest_a[k]);
-  }
-  return size_of_motion(step, motion_size(h, displacement, curvature, v, a), i);
+  real motion = 0;
+  for (int k = 0; k < COORDINATE_ARRAYS; k++)
+    motion = larger(motion, motion_size(step->run, h, displacement, curvature, k));
+  return size_of_motion(step, motion, i);
 }
 #else
 /* mu_i of a step of h from its displacement and its curvature, with V and A of the run if there is one. */
 static inline real motion_of_step(const step_data *step, real h, real displacement, real curvature, long long i)
 {
-  const int has_former = step->largest_v != NULL;
-  const real motion = motion_size(h, displacement, curvature, has_former ? step->largest_v[i] : 0,
-      has_former ? step->largest_a[i] : 0);
-  return size_of_motion(step, motion, i);
+  return size_of_motion(step, motion_size(step->motion_of, h, displacement, curvature, (int)i), i);
 }
 
 /* Replaces the sizes of the elements of an array of known size by the largest of it. */

@@ -23,8 +23,6 @@
 #define STAGNATION 0.25 /* changes above that only if they decreased by less than half in two iterations */
 #define PROGRESS_LEVEL 1e-20 /* above 1e-10, iterations that gain less than a factor of 1.4 (two: 2) are abandoned */
 #define STAGNANT 0.8 /* changes that decrease by less, and by less than half in two iterations, stagnate */
-#define LEAVING_LEVEL 1e-4 /* changes above 1e-2 of the state that increase: the iteration leaves its initial guess, and may
-                            * converge to a spurious solution */
 #define FIRST_ITERATIONS 4 /* but not among the first ones, which need not contract */
 #define LEAST_SQUARED 1e-100 /* squares of smaller numbers, or of small parts of them, may be subnormal */
 #define LARGEST_SQUARED 1e100 /* squares of larger numbers, or sums of many, may overflow */
@@ -69,8 +67,7 @@ static inline int iteration_status(double change, double last, double before, co
   const int stopped = (change == 0.0) | ((k > 0) & (change >= last) & stagnated);
   const double least = k > FIRST_ITERATIONS ? PROGRESS_LEVEL : DIVERGED;
   const int creeping = (change > 0.5 * last) & (change > STAGNATION * before) & (change > least);
-  const int leaving = (change > last) & (change > LEAVING_LEVEL);
-  const int slow = (k >= options->max_iterations) | creeping | leaving;
+  const int slow = (k >= options->max_iterations) | creeping;
   return change < INFINITY ? (small | stopped ? 1 : -slow) : -1;
 }
 

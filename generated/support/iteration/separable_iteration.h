@@ -483,9 +483,9 @@ PASS number measure_stiffness(const step_points *w)
 {
   lanes work = lanes_of(0.0), size = lanes_of(0.0);
   for (int i = 0; i < M; i++) {
-    const number unit = unit_of(w, i), weight = w->inverse_size[i] * w->inverse_size[i];
+    const number unit = unit_of(w, i), inverse_square = w->inverse_size[i] * w->inverse_size[i];
     for (int g = 0; g < GROUPS; g++) {
-      const lanes moved = w->X[g * M + i] - w->second[g * M + i], weighted = weight * moved;
+      const lanes moved = w->X[g * M + i] - w->second[g * M + i], weighted = inverse_square * moved;
       work += weighted * (unit * (w->F[g * M + i] - w->former[g * M + i]));
       size += weighted * moved;
     }

@@ -16,10 +16,10 @@ static int line_from(const step_data *step, newton_data *data)
 }
 
 /* Stages that solve the equations with a step size near 0 belong to a branch, on which those of the step lie. Newton's
- * method from far away may converge to another root, a spurious solution: so may every method, and steps of one stage have
- * no error estimate that shows it. Roots that take few iterations are near the initial guess. Others are computed again
- * by continuation in the step size (Deuflhard, Newton Methods for Nonlinear Problems, sec. 5.1): from the stages at one size
- * to those at a larger one, in few iterations each. */
+ * method from far away may converge to another root, a spurious solution: so may every method, and steps of one stage
+ * have no error estimate that shows it. Roots that take few iterations are near the initial guess. Others are computed
+ * again by continuation in the step size (Deuflhard, Newton Methods for Nonlinear Problems, sec. 5.1): from the stages
+ * at one size to those at a larger one, in few iterations each. */
 #define NEARBY_ITERATIONS 8 /* of Newton's method, to a root near the initial guess */
 #define LEAST_ADVANCE REAL(0.00390625) /* of the step size: the branch ends, or turns back */
 
@@ -75,7 +75,9 @@ static int newton_from_line(const step_data *step, newton_data *data, real *dp, 
 static SELDOM int is_spurious(const step_data *step, const real *z, const real *dq, long long iterations)
 {
 #ifdef STAGE_POWER
-  return iterations > NEARLY_LINEAR && !(MATH(pow)(stage_error(step, z, dq, ALL, DECAY, 0), STAGE_POWER) <= MOST_ERROR);
+  if (iterations <= NEARLY_LINEAR)
+    return 0;
+  return !(MATH(pow)(stage_error(step, z, dq, ALL, DECAY, 0, 0), STAGE_POWER) <= MOST_ERROR);
 #else
   (void)step, (void)z, (void)dq, (void)iterations;
   return 0;

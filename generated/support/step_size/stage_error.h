@@ -18,24 +18,18 @@ static inline real curvature_of_stages(const step_data *step, const real *z, int
   return MATH(fabs)(step->h) * (MATH(fabs)(curvature) + MATH(fabs)(other)) / 2;
 }
 
-/* Returns the estimate from the unknowns z of the stages, or `least` if that is larger. */
-static real stage_error(const step_data *step, const real *z, const real *dq, real share, real decay, real least)
+/* Of each coordinate: the motion, displacements by the curvature and by the rounding of forces; the largest motion. */
+typedef struct {
+  real size[M], curvature[M], rounding[M], largest;
+} stage_sizes;
+
+/* Returns the estimate from the unknowns z of the stages, or `least` if that is larger. Coefficients below the rounding
+ * error of displacements of the size `rounded` are none. */
+static real error_beyond(const step_data *step, const real *z, const stage_sizes *of, real rounded, real share,
+    real decay, real least)
 {
-  real largest = 0, fastest = 0, farthest = 0, size[M], curvature[M];
   for (int i = 0; i < M; i++) {
-    curvature[i] = curvature_of_stages(step, z, i);
-    size[i] = motion_of_step(step, step->h, MATH(fabs)(dq[i]), curvature[i], i);
-#ifdef FEW_STAGE_COEFFICIENTS
-    size[i] = size_for_few(step->h, size[i], curvature[i], step->largest_a ? step->largest_a[i] : 0);
-#endif
-    largest = larger(largest, size[i]);
-    fastest = larger(fastest, MATH(fabs)(dq[i]));
-    farthest = larger(farthest, MATH(fabs)(step->q0[i]) + MATH(fabs)(dq[i]));
-  }
-  enlarge_to_arrays(size);
-  const real rounded = SITES > M ? farthest : fastest; /* constraints hold to rounding, however short the step */
-  for (int i = 0; i < M; i++) {
-    const real unit = 1 / (size[i] + share * largest + REAL_MIN);
+    const real unit = 1 / (of->size[i] + share * of->largest + REAL_MIN);
     real top = 0, next = 0, noise = 0;
     for (int b = 0; b < B; b++) {
       top += STAGE_HIGHEST[b] * z[i * B + b];
@@ -44,38 +38,48 @@ static real stage_error(const step_data *step, const real *z, const real *dq, re
     }
     top = MATH(fabs)(top);
     top = top > VANISHING * MATH(fabs)(next) ? larger(top, decay * MATH(fabs)(next)) : top;
-    noise *= rounding_of_displacement(rounded) / MATH(fabs)(step->h);
+    noise *= larger(rounding_of_displacement(rounded), of->rounding[i]) / MATH(fabs)(step->h);
     top = top < noise ? 0 : SITES > M ? (top - noise) * unit * step->h
                                       : top * unit * step->h;
-    const real allowed = 2 * unit * curvature[i] + NEGLIGIBLE;
+    const real allowed = 2 * unit * of->curvature[i] + NEGLIGIBLE;
     if (top * top > least * allowed)
       least = top * top / allowed;
   }
   return least;
 }
 
-#define UNBENT REAL(1e-11) /* leading coefficients of the velocities of a free flight relative to their change */
-
-/* Returns 1 if the force on some coordinate is nearly constant along the stages, as in free flight. */
-static SELDOM int stages_fly(const real *z)
+/* The same. Constraints hold to the rounding of positions and of their own terms, however short the step is. The
+ * latter, which takes a factorisation, is determined where the error exceeds `doubtful` without it, `least` or more. */
+static real stage_error(const step_data *step, const real *z, const real *dq, real share, real decay, real least,
+    real doubtful)
 {
+  real fastest = 0, farthest = 0, error;
+  stage_sizes of = {.largest = 0};
   for (int i = 0; i < M; i++) {
-    real bend = 0, slope = 0;
-    for (int b = 0; b < B; b++) {
-      bend += STAGE_HIGHEST[b] * z[i * B + b];
-      slope += STAGE_CURVATURE[b] * z[i * B + b];
-    }
-    if (MATH(fabs)(bend) <= UNBENT * MATH(fabs)(slope))
-      return 1;
+    const real curvature = curvature_of_stages(step, z, i);
+    const real motion = motion_of_step(step, step->h, MATH(fabs)(dq[i]), curvature, i);
+    of.curvature[i] = curvature;
+    of.size[i] = motion;
+    of.rounding[i] = rounding_of_force(step->q0[i], curvature_size(step->motion_of, step->h, curvature, i), motion);
+#ifdef FEW_STAGE_COEFFICIENTS
+    of.size[i] = size_for_few(step->motion_of, step->h, motion, curvature, i);
+#endif
+    of.largest = larger(of.largest, of.size[i]);
+    fastest = larger(fastest, MATH(fabs)(dq[i]));
+    farthest = larger(farthest, MATH(fabs)(step->q0[i]) + MATH(fabs)(dq[i]));
   }
-  return 0;
+  enlarge_to_arrays(of.size);
+  error = error_beyond(step, z, &of, SITES > M ? farthest : fastest, share, decay, least);
+  if (SITES > M && error > doubtful)
+    error = error_beyond(step, z, &of, farthest + length_of_constraints(step), share, decay, least);
+  return error;
 }
 
 /* Lets V and A contain a solved step. */
-static inline void note_stages(run_memory *run, const step_data *step, const real *z, const real *dq, kept_motion kept)
+static inline void note_stages(run_memory *run, const step_data *step, const real *z, const real *dq, real part)
 {
   for (int i = 0; i < M; i++)
-    note_motion(run, step->h, MATH(fabs)(dq[i]), curvature_of_stages(step, z, i), kept, i);
+    note_motion(run, step->h, MATH(fabs)(dq[i]), curvature_of_stages(step, z, i), part, i);
 }
 
 #endif

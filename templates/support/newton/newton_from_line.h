@@ -72,7 +72,9 @@ static int newton_from_line(const step_data *step, newton_data *data, real *dp, 
 static SELDOM int is_spurious(const step_data *step, const real *z, const real *dq, long long iterations)
 {
 #ifdef STAGE_POWER
-  return iterations > NEARLY_LINEAR && !(MATH(pow)(stage_error(step, z, dq, ALL, DECAY, 0, 0), STAGE_POWER) <= MOST_ERROR);
+  if (iterations <= NEARLY_LINEAR)
+    return 0;
+  return !(MATH(pow)(stage_error(step, z, dq, ALL, DECAY, 0, 0), STAGE_POWER) <= MOST_ERROR);
 #else
   (void)step, (void)z, (void)dq, (void)iterations;
   return 0;

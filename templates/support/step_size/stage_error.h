@@ -15,15 +15,15 @@ static inline real curvature_of_stages(const step_data *step, const real *z, int
   return MATH(fabs)(step->h) * (MATH(fabs)(curvature) + MATH(fabs)(other)) / 2;
 }
 
-/* Per coordinate: size of the motion and displacements by the curvature and by the rounding of forces; the largest size. */
+/* Of each coordinate: the motion, displacements by the curvature and by the rounding of forces; the largest motion. */
 typedef struct {
   real size[M], curvature[M], rounding[M], largest;
 } stage_sizes;
 
 /* Returns the estimate from the unknowns z of the stages, or `least` if that is larger. Coefficients below the rounding
  * error of displacements of the size `rounded` are none. */
-static real error_beyond(const step_data *step, const real *z, const real *dq, const stage_sizes *of, real rounded,
-    real share, real decay, real least)
+static real error_beyond(const step_data *step, const real *z, const stage_sizes *of, real rounded, real share,
+    real decay, real least)
 {
   for (int i = 0; i < M; i++) {
     const real unit = 1 / (of->size[i] + share * of->largest + REAL_MIN);
@@ -45,8 +45,8 @@ static real error_beyond(const step_data *step, const real *z, const real *dq, c
   return least;
 }
 
-/* The same. Constraints hold to the rounding of positions and of their own terms, however short the step is. The latter,
- * which takes a factorisation, is determined where the error exceeds `doubtful` without it, `least` or more. */
+/* The same. Constraints hold to the rounding of positions and of their own terms, however short the step is. The
+ * latter, which takes a factorisation, is determined where the error exceeds `doubtful` without it, `least` or more. */
 static real stage_error(const step_data *step, const real *z, const real *dq, real share, real decay, real least,
     real doubtful)
 {
@@ -66,9 +66,9 @@ static real stage_error(const step_data *step, const real *z, const real *dq, re
     farthest = larger(farthest, MATH(fabs)(step->q0[i]) + MATH(fabs)(dq[i]));
   }
   enlarge_to_arrays(of.size);
-  error = error_beyond(step, z, dq, &of, SITES > M ? farthest : fastest, share, decay, least);
+  error = error_beyond(step, z, &of, SITES > M ? farthest : fastest, share, decay, least);
   if (SITES > M && error > doubtful)
-    error = error_beyond(step, z, dq, &of, farthest + length_of_constraints(step), share, decay, least);
+    error = error_beyond(step, z, &of, farthest + length_of_constraints(step), share, decay, least);
   return error;
 }
 
