@@ -3,6 +3,7 @@
 import math
 import warnings
 from dataclasses import replace
+from typing import Any
 
 import click
 
@@ -69,7 +70,8 @@ def model_with_global_error(model: Model, error: float) -> tuple[Model, GlobalEr
             wanted, h=signed, absolute_tolerance=None, max_step=None, span=abs(wanted.covered), error=None
         ), result
     precision = DOUBLE_DOUBLE if in_words else wanted.precision
-    return replace(wanted, **result.steps, error=None, precision=precision), result
+    steps: dict[str, Any] = dict(result.steps)
+    return replace(wanted, **steps, error=None, precision=precision), result
 
 
 def model_with_advised_step(

@@ -502,7 +502,12 @@ class ArrayEvents:
         changes, entries = self._wall(k, event, terms) if event.restitution is not None else self._map(k, event)
         timed, rates = self._in_time(k, event, terms)
         ranges = [(size_text(loop.first), size_text(loop.end), int(bool(loop.behind))) for loop in loops]
-        code = {"accesses": tuple(self._accesses), "functions": functions, "conditions": conditions, "changes": changes}
+        code: dict[str, Any] = {
+            "accesses": tuple(self._accesses),
+            "functions": functions,
+            "conditions": conditions,
+            "changes": changes,
+        }
         code |= {"timed": timed, "rates": rates}
         return {"ranges": ranges, "count": count_text(loops), "entries": entries, **code}
 

@@ -313,8 +313,8 @@ class Stepper(WithEventsInDouble, WithPaths, Integrator):
         arguments |= {"t_end": stops[-1], "tolerance": tolerance}
         run = self.start(q, p, **arguments)
         if self.interface.words == 1:
-            states = map(neighbouring, (run.q, run.p))
-            run._begin(*self._consistent_state(*states, None, run.t, run._parameters), run.t)
+            near, momenta = neighbouring(run.q), neighbouring(run.p)
+            run._begin(*self._consistent_state(near, momenta, None, run.t, run._parameters), run.t)
         return segments.record_with_stops(run, stops, progress)
 
     @property
