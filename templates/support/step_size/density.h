@@ -112,7 +112,7 @@ static int find_step(run_memory *run, trial *now, const solver_options *options,
 static int confirm_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
   (void)report;
-  return observe_error(run, &now->step, &now->data, now->dq, now->dp, options, now->step.scratch + SCRATCH);
+  return examine_error(run, &now->step, &now->data, now->dq, now->dp, options, now->step.scratch + SCRATCH);
 }
 
 /* Adds the increments to the state. */
