@@ -75,6 +75,29 @@ static real stage_error(const step_data *step, const real *z, const real *dq, re
   return error;
 }
 
+/* The same test without the sizes: returns 0 if no coefficient exceeds `least` relative to `motion`, the size of the largest
+ * coordinate or less, to which that of every coordinate is added, or the rounding error of constrained positions. */
+static inline int stages_may_exceed(const step_data *step, const real *z, real motion, real decay, real least)
+{
+  const real unit = 1 / (motion + REAL_MIN);
+  real farthest = 0;
+  int exceeded = 0;
+  for (int i = 0; SITES > M && i < M; i++)
+    farthest = larger(farthest, MATH(fabs)(step->q0[i]));
+  for (int i = 0; i < M; i++) {
+    real top = 0, next = 0, noise = 0;
+    for (int b = 0; b < B; b++) {
+      top += STAGE_HIGHEST[b] * z[i * B + b];
+      next += STAGE_NEXT[b] * z[i * B + b];
+      noise += CURVE_NOISE * MATH(fabs)(STAGE_HIGHEST[b]);
+    }
+    top = larger(MATH(fabs)(top), decay * MATH(fabs)(next)) * MATH(fabs)(step->h);
+    top = larger(top - noise * rounding_of_displacement(farthest), 0) * unit;
+    exceeded |= !(top * top <= least * (2 * unit * curvature_of_stages(step, z, i) + NEGLIGIBLE));
+  }
+  return exceeded;
+}
+
 /* Lets V and A contain a solved step. */
 static inline void note_stages(run_memory *run, const step_data *step, const real *z, const real *dq, real part)
 {
