@@ -75,8 +75,9 @@ static real stage_error(const step_data *step, const real *z, const real *dq, re
   return error;
 }
 
-/* The same test without the sizes: returns 0 if no coefficient exceeds `least` relative to `motion`, the size of the largest
- * coordinate or less, to which that of every coordinate is added, or the rounding error of constrained positions. */
+/* The same test without the sizes: returns 0 if no coefficient exceeds `least` relative to `motion`, the size of the
+ * largest coordinate or less, to which that of every coordinate is added, or the rounding error of constrained
+ * positions. */
 static inline int stages_may_exceed(const step_data *step, const real *z, real motion, real decay, real least)
 {
   const real unit = 1 / (motion + REAL_MIN);

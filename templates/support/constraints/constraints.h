@@ -132,8 +132,8 @@ static SELDOM real size_by_constraints(const step_data *step)
   return largest_of(size);
 }
 
-/* Largest displacement that changes one constraint by the size of its terms: relative to it positions on constraints are
- * rounded, whatever they are. Unlike add_constraint_sizes it is bounded where the constraints become dependent: errors
+/* Largest displacement that changes one constraint by the size of its terms: relative to it positions on constraints
+ * are rounded, whatever they are. Unlike add_constraint_sizes it is bounded where the constraints become dependent: errors
  * grow there, and are not to be taken for rounding. */
 static SELDOM real length_of_constraints(const step_data *step)
 {
