@@ -133,8 +133,8 @@ static SELDOM real size_by_constraints(const step_data *step)
 }
 
 /* Largest displacement that changes one constraint by the size of its terms: relative to it positions on constraints
- * are rounded, whatever they are. Unlike add_constraint_sizes it is bounded where the constraints become dependent: errors
- * grow there, and are not to be taken for rounding. */
+ * are rounded, whatever they are. Unlike add_constraint_sizes it is bounded where the constraints become dependent:
+ * errors grow there, and are not to be taken for rounding. */
 static SELDOM real length_of_constraints(const step_data *step)
 {
   real g[CONSTRAINTS], rounding[CONSTRAINTS], steepest[CONSTRAINTS] = {0}, derivative[CONSTRAINT_ENTRIES], length = 0;
