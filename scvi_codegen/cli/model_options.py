@@ -96,8 +96,8 @@ def _assignments(
         except ValueError:
             value = math.nan
         if not name or not equals or not math.isfinite(value):
-            form = "must have a finite number as VALUE" if name and equals else "is not of the form"
-            raise click.BadParameter(f"'{text}' {form} {'' if name and equals else 'NAME=VALUE'}, as in g=9.81")
+            form = "must have a finite number as VALUE" if name and equals else "is not of the form NAME=VALUE"
+            raise click.BadParameter(f"'{text}' {form}, as in g=9.81")
         result.append((name, value))
     return tuple(result)
 
