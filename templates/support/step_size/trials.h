@@ -22,6 +22,7 @@
 #define MOST_EXAMINED 8 /* trials, each up to four times shorter, until no force sets in at the end of a step */
 #define BEYOND_END REAL(0.125) /* of the step: part behind its end whose forces are examined */
 #define EQUAL_FORCES REAL(1e-2) /* relative difference of the force in both halves of a free flight */
+#define NO_FORCE REAL(1e-12) /* impulse relative to the largest momentum: coordinates that motion has not reached yet */
 #define OTHER_FORCE REAL(0.5) /* relative difference beyond which another force sets in */
 #define STEPS_COMPARED_AFTER_DOUBT 16 /* steps that are compared after one that was shortened by a comparison */
 
@@ -490,6 +491,7 @@ static SELDOM int force_sets_in(const trial *now, const solver_options *options)
   const step_data *step = &now->step;
   const section own = own_part(step);
   step_data part = *step;
+  real least, largest;
   sums all;
   int status;
   VECTORS(nothing, 1, step);
@@ -522,6 +524,8 @@ static SELDOM int force_sets_in(const trial *now, const solver_options *options)
   status = add_part(&part, options, whole, first);
   if (status != OK)
     return 0;
+  least = largest_change(step, p, now->dp, &largest);
+  least = NO_FORCE * (least + largest);
   begin_blocks(&all, step);
   EACH_BLOCK (all) {
     int sets_in = 0;
@@ -529,7 +533,7 @@ static SELDOM int force_sets_in(const trial *now, const solver_options *options)
       const real early = 2 * changes[i], late = 2 * (now->dp[i] - changes[i]), beyond = first[i] / BEYOND_END;
       const real force = larger(MATH(fabs)(early), MATH(fabs)(late)), change = MATH(fabs)(beyond - late);
       sets_in |= MATH(fabs)(early - late) <= EQUAL_FORCES * force && change > OTHER_FORCE * force &&
-          change > SPURIOUS * (MATH(fabs)(p[i]) + MATH(fabs)(now->dp[i]));
+          change > SPURIOUS * (MATH(fabs)(p[i]) + MATH(fabs)(now->dp[i])) + least;
     }
     add_block(&all, sets_in, 0);
   }
