@@ -80,6 +80,6 @@ static inline double drifted_size(const step_points *w, int part, long long i)
 
 static inline double first_size(const step_points *w, int part, long long i)
 {
-  const double size = size_of(w, find_drift(w, i), i);
+  const double size = size_of(w, find_drift(w, i), i, 1.0);
   return part == 0 ? size : size / fabs(w->step->h);
 }

@@ -25,6 +25,13 @@
 #define LARGEST_SQUARED 1e100 /* squares of larger numbers, or sums of many, may overflow */
 #define GOOD_GUESS 1e-6 /* after a prediction with an error below 1e-3 of the state, the next one uses two steps */
 
+/* Part of |q| in the size of a coordinate, so that the tolerance of the iteration times this part is at least the
+ * rounding error of q: a looser tolerance is one of the motion, wherever the origin is. */
+static inline double part_of_position(const solver_options *options)
+{
+  return options->tolerance > DBL_EPSILON ? DBL_EPSILON / options->tolerance : 1.0;
+}
+
 static inline double smaller(double a, double b)
 {
   return a < b ? a : b;

@@ -130,10 +130,10 @@ PASS number unit_of(const step_points *w, long long i)
   return w->data->square * w->data->inverse_mass[i];
 }
 
-/* Size of a coordinate in the step: |q| + |h v| + |h^2 F / m|. */
-PASS number size_of(const step_points *w, drift_words of, long long i)
+/* Size of a coordinate in the step: its motion |h v| + |h^2 F / m| and `part` of |q| (part_of_position). */
+PASS number size_of(const step_points *w, drift_words of, long long i, double part)
 {
-  return magnitude(w->step->q0[i]) + magnitude(of.high) + magnitude(unit_of(w, i) * at_first(&w->F[i]));
+  return part * magnitude(w->step->q0[i]) + magnitude(of.high) + magnitude(unit_of(w, i) * at_first(&w->F[i]));
 }
 
 /* Low words of a point without forces. */
@@ -362,6 +362,7 @@ static void first_points(const step_points *w, history past, long long steps)
 static inline void measure_points(const step_points *w, const solver_options *options)
 {
   coordinate_array array[COORDINATE_ARRAYS];
+  const double resolved = part_of_position(options);
   double largest = 0.0;
   sums all;
   describe_coordinate_arrays(w->step->given, array);
@@ -371,7 +372,7 @@ static inline void measure_points(const step_points *w, const solver_options *op
     for (int k = 0; k < COORDINATE_ARRAYS; k++) {
       const section part = part_in(all.here, &array[k]);
       for (long long i = part.first; i < part.end; i++) {
-        w->inverse_size[i] = size_of(w, find_drift(w, i), i);
+        w->inverse_size[i] = size_of(w, find_drift(w, i), i, resolved);
         values[k] = larger(values[k], w->inverse_size[i]);
       }
     }
@@ -463,8 +464,9 @@ PASS void first_points(const step_points *w, history past, long long steps)
 /* Sizes of the coordinates. */
 PASS void measure_points(const step_points *w, const solver_options *options)
 {
+  const double resolved = part_of_position(options);
   for (int i = 0; i < M; i++)
-    w->inverse_size[i] = size_of(w, w->drifts[i], i);
+    w->inverse_size[i] = size_of(w, w->drifts[i], i, resolved);
   invert_sizes(options, 1.0, w->inverse_size);
 }
 
