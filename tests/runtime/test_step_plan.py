@@ -112,6 +112,20 @@ def test_invalid_options_of_adaptive_steps_are_refused(arguments: dict[str, Any]
         kepler().integrate_ensemble([Q], velocity=[V], t_end=1.0, **arguments)
 
 
+@pytest.mark.parametrize(("t", "t_end", "max_step"), [(1000.0, 1005.0, 1e-18), (0.0, -5.0, 1e-15), (5.0, 0.0, 1e-15)])
+def test_largest_steps_that_times_do_not_resolve_are_refused(t: float, t_end: float, max_step: float) -> None:
+    arguments: dict[str, Any] = {"t": t, "t_end": t_end, "max_step": max_step}
+    message = f"max_step = {max_step:g} is below .* larger max_step, or omit it"
+    for start in (kepler().integrate, kepler().start):
+        with pytest.raises(sc.StateError, match=message):
+            start(Q, velocity=V, **arguments)
+    with pytest.raises(sc.StateError, match=message):
+        kepler().integrate(Q, velocity=V, error=1e-6, **arguments)
+    for ends in (t_end, [0.5 * (t + t_end), t_end]):
+        with pytest.raises(sc.StateError, match=message):
+            kepler().integrate_ensemble([Q, Q], velocity=[V, V], **arguments | {"t_end": ends})
+
+
 @pytest.mark.parametrize("name", ["max_step", "first_step", "absolute_tolerance"])
 def test_fixed_steps_have_no_options_of_adaptive_ones(name: str) -> None:
     with pytest.raises(sc.StateError, match=f"{name} requires adaptive steps"):

@@ -60,7 +60,14 @@ from scvi_codegen.runtime.inputs.segments import (
     inputs_of_slice,
     parameters_at,
 )
-from scvi_codegen.runtime.run.step_plan import Adaptive, AdaptivePlans, ErrorControl, Until, planned_steps
+from scvi_codegen.runtime.run.step_plan import (
+    Adaptive,
+    AdaptivePlans,
+    ErrorControl,
+    Until,
+    check_max_step,
+    planned_steps,
+)
 from scvi_codegen.runtime.run.times import WHOLE
 from scvi_codegen.runtime.trajectory.dense_output import times_of_run
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
@@ -265,6 +272,9 @@ class Ensemble:
         plan = control.to(float(ends.flat[worst]))
         if (ends > self.t0).any() and (ends < self.t0).any():
             raise StateError(f"t_end lies on both sides of t = {self.t0:g}: split the ensemble into two")
+        check_max_step(
+            replace(plan, t_end=float(ends.flat[np.abs(ends).argmax()])), self.t0, self.stepper.interface.words
+        )
         if not ends.ndim:
             return (plan,) * len(self)
         return AdaptivePlans(ends, plan)

@@ -32,7 +32,15 @@ from scvi_codegen.runtime.core.words import Word, block_of, checked_time, low_wo
 from scvi_codegen.runtime.rotations.states import checked_pair
 from scvi_codegen.runtime.run.chunks import drive
 from scvi_codegen.runtime.run.saving import checkpoint
-from scvi_codegen.runtime.run.step_plan import Adaptive, Fixed, FixedSteps, InTau, StepPlan, step_control
+from scvi_codegen.runtime.run.step_plan import (
+    Adaptive,
+    Fixed,
+    FixedSteps,
+    InTau,
+    StepPlan,
+    check_max_step,
+    step_control,
+)
 from scvi_codegen.validation import LARGEST_COUNT, checked_count
 
 FIRST_STEPS = 256
@@ -178,6 +186,7 @@ class Memory:
 
     def _begin(self, q: States, p: States, t: float, growth: int = 0) -> None:
         """Start at (q, p) and t after :meth:`_set_up`; ``growth``: value of ``measures_growth`` in C."""
+        check_max_step(self._plan, t, self.stepper.interface.words)
         q, p = map(block_of, checked_pair(self.stepper.interface, q, p))
         self._starts_at_origin = not (np.any(q) or np.any(p))
         self._start_function(t, 0.0 if self._h is None else self._h, *self.stepper.binding.pointers(q, p))
@@ -238,6 +247,7 @@ class Memory:
             raise StateError("the saved run has fixed steps: omit t_end")
         if not stepper._has_energy(parameters):
             raise StateError("a saved run in transformed time requires its energy: give parameters=run.parameters")
+        check_max_step(plan, _time(memory), stepper.interface.words)
         run._parameters[:], run._has_defaults = stepper._parameters(parameters), False
         run.plan = plan
         run._set_options(options)
@@ -317,6 +327,8 @@ class Memory:
             StateError: if a name or number is invalid, or position constraints would jump.
         """
         interface = self.stepper.interface
+        if plan is not None:
+            check_max_step(plan, self.t, interface.words)
         missing = inputs_not_given(interface, parameters)
         if parameters is not None:
             self._set_parameters(self.stepper._parameters(parameters, self._parameters))

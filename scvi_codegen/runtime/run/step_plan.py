@@ -21,6 +21,8 @@ from scvi_codegen.validation import check_tolerance, checked_count
 
 ROUNDOFF_OF_TWO_WORDS = 1e-27
 """Error of a step in double-double arithmetic that a run without a tolerance may have."""
+LEAST_STEP = 4
+"""Least value of ``max_step`` in roundings of the largest time."""
 AbsoluteTolerance: TypeAlias = float | tuple[tuple[str, float], ...]
 """Absolute tolerance of all coordinates, or those of some coordinates, arrays and rotations by name."""
 
@@ -273,6 +275,22 @@ def step_control(stepper: Any, plan: StepPlan) -> tuple[Any, ...]:
             return control, first, absolute
         case _:
             return (binding.null,)
+
+
+def check_max_step(plan: StepPlan, t: float, words: int = 1) -> None:
+    """Raise ``StateError`` if steps of the largest size do not advance the time of a run from t.
+
+    Those of less than ``LEAST_STEP`` roundings of the time vanish in it, or change by a large part. Times of two words
+    resolve all, but no run makes as many steps as the roundings of a double.
+    """
+    if not isinstance(plan, Adaptive) or plan.max_step == math.inf:
+        return
+    size = max(abs(t), abs(plan.t_end)) if words == 1 else abs(plan.t_end - t)
+    if plan.max_step < (least := LEAST_STEP * math.ldexp(float(size), -53)):
+        raise StateError(
+            f"max_step = {plan.max_step:g} is below {least:.2g}, {LEAST_STEP} roundings of the times of a run from "
+            f"t = {float(t):g} to t_end = {plan.t_end:g}: give a larger max_step, or omit it"
+        )
 
 
 def _check_resolved(tolerance: float, least: float) -> None:
