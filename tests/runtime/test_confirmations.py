@@ -358,6 +358,19 @@ def test_a_coordinate_that_does_not_move_is_confirmed():
     assert run.confirmation.confirmed
 
 
+@pytest.mark.filterwarnings("error")
+def test_rest_is_confirmed_and_its_energy_is_that_of_rounding():
+    body = sc.LagrangianSystem.from_text(
+        "body", [], "(omega_1**2 + 2*omega_2**2 + 3*omega_3**2)/2", rotations={"R": "omega"}
+    )
+    start = {"velocity": {"omega": [0.0, 0.0, 0.0]}, "t_end": 20.0}
+    run = sc.compile_stepper(body, "svi:6").integrate({"R": [1.0, 0.0, 0.0, 0.0]}, **start, error=1e-9)
+    assert run.confirmation.confirmed and run.confirmed_until == 20.0
+    spring = sc.compile_stepper(lagrange("spring", "x", "x_dot**2/2 - 50*(x - 1000)**2"), "svi:6")
+    assert spring.integrate([1000.0], velocity=[0.0], t_end=20.0, error=1e-9).confirmation.confirmed
+    spring.integrate([np.nextafter(1000.0, 2000.0)], velocity=[0.0], t_end=20.0)
+
+
 def test_two_words_confirm_more_digits():
     system = lagrange("oscillator", "x", "x_dot**2/2 - x**2/2")
     stepper = sc.compile_stepper(system, "svi:12", precision="double-double")

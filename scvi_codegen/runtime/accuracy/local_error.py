@@ -7,6 +7,7 @@ import numpy as np
 
 from scvi_codegen.errors import AccuracyWarning, StateError, warn
 from scvi_codegen.runtime.accuracy.resolution import warn_of_unresolved_fields
+from scvi_codegen.runtime.accuracy.size import RESOLVED, roundoff
 from scvi_codegen.runtime.accuracy.warning_switch import warnings_wanted
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array
@@ -138,8 +139,12 @@ def _changed_energies(
 ) -> tuple[float, float, float] | None:
     """Return the first and the last energy and the largest |p.v| if the energy changed; ``None`` otherwise.
 
-    ``None`` is also returned outside the domain of L. Velocities are computed only if the energies differ.
+    ``None`` is also returned outside the domain of L, and at rest up to rounding, where the energy is that of rounding
+    errors. Velocities are computed only if the energies differ.
     """
+    resolution = RESOLVED * roundoff(stepper.interface.words)
+    if (np.ptp(np.asarray(q), axis=0) <= resolution * np.abs(np.asarray(q)).max(axis=0)).all():
+        return None
     t, q, p = (each[:: max(1, len(each) - 1)].copy() for each in (t, q, p))
     try:
         energies = stepper._energies_of(t, q, p, parameters)

@@ -66,7 +66,7 @@ class Motion:
         ranges, largest = self._of_groups(np.ptp(q, axis=0)), self._of_groups(np.abs(q).max(axis=0))
         resolution = RESOLVED * self.epsilon
         rest = ranges <= resolution * largest
-        noise = (ranges <= resolution * ranges.max(initial=0.0)) & (100.0 * errors[0] >= ranges)
+        noise = (ranges < resolution * ranges.max(initial=0.0)) & (100.0 * errors[0] >= ranges)
         sizes = np.where(noise, ranges.max(initial=0.0), np.where(rest, np.maximum(ranges, largest), ranges))
         sizes = np.maximum(sizes, self.absolute)
         with np.errstate(all="ignore"):
