@@ -365,7 +365,8 @@ def test_rest_is_confirmed_and_its_energy_is_that_of_rounding():
     )
     start = {"velocity": {"omega": [0.0, 0.0, 0.0]}, "t_end": 20.0}
     run = sc.compile_stepper(body, "svi:6").integrate({"R": [1.0, 0.0, 0.0, 0.0]}, **start, error=1e-9)
-    assert run.confirmation.confirmed and run.confirmed_until == 20.0
+    assert run.confirmation.confirmed
+    assert run.confirmed_until == 20.0
     spring = sc.compile_stepper(lagrange("spring", "x", "x_dot**2/2 - 50*(x - 1000)**2"), "svi:6")
     assert spring.integrate([1000.0], velocity=[0.0], t_end=20.0, error=1e-9).confirmation.confirmed
     spring.integrate([np.nextafter(1000.0, 2000.0)], velocity=[0.0], t_end=20.0)

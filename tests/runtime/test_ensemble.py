@@ -349,6 +349,18 @@ def test_ensembles_with_few_or_no_steps() -> None:
     assert still.energy().shape == (1, COUNT)
 
 
+@pytest.mark.parametrize("t_eval", [[2.0, 5.0], [0.5, 2.0, 5.0]])
+def test_ends_with_output_times_are_those_of_terminal_events(t_eval: list[float]) -> None:
+    stepper = stepper_for("kepler", sc.SVI(5)).with_events(sc.Event("q1 - 1/2", -1, terminal=True))
+    start = {"q": [[1.0, 0.0], [1.0, 0.0]], "velocity": [[0.0, 1.0], [0.0, 1.1]], "t_end": 5.0}
+    runs, alone = (stepper.integrate_ensemble(**start, t_eval=each) for each in (t_eval, None))
+    for its, expected in zip(runs.ends, alone.ends, strict=True):
+        assert np.array_equal(its, expected)
+    assert runs.ends[0][0] == pytest.approx(np.arccos(0.5), rel=1e-12)
+    stopped = stepper.integrate_ensemble(**start | {"t_end": [0.3, 5.0]}, t_eval=[0.5, 5.0])
+    assert np.isnan(stopped.ends[0]).tolist() == [True, False]
+
+
 def test_results_have_target_times_and_are_pickled() -> None:
     runs = CASES["adaptive"].run()
     assert [plan.t_end for plan in runs.plans] == ENDS

@@ -389,17 +389,20 @@ class Ensemble:
         if self.stepper.interface.words > 1:
             arguments["parameters"] = self.parameters[j]
         steps: dict[str, Any] = {"t_end": plan.t_end, **self.control.named}
+        none = False
         if self.fixed is not None:
             steps = self._fixed_steps()
         elif self.t_eval is not None:
-            arguments["t_eval"] = self.t_eval[np.abs(self.t_eval - self.t0) <= abs(plan.t_end - self.t0)]
+            times = self.t_eval[np.abs(self.t_eval - self.t0) <= abs(plan.t_end - self.t0)]
+            none = not times.size  # before the end; runs have at least one
+            arguments["t_eval"] = np.array([plan.t_end]) if none else times
         integrate: Callable[..., Trajectory] = self.stepper.integrate
         with without_accuracy_warnings():
             if self.error is not None:
                 with suppress(StateError, StepFailedError):
                     states = integrate(q, p, error=self.error, **steps, **arguments)
                     self.confirmations[j], cast(list[Any], self.plans)[j] = states.confirmation, states.plan
-                    return SavedLane.of(states)
+                    return SavedLane.of(states, slice(0 if none else None))
             try:
                 states = integrate(q, p, **steps, **arguments)
             except StepFailedError as failure:
@@ -409,8 +412,8 @@ class Ensemble:
                     raise
                 states, status = cast(Trajectory, failure.trajectory), EVENT_FAILED
             except StateError:  # a sum of finite terms has overflowed
-                return SavedLane(stacked([self.t0]), q[np.newaxis], p[np.newaxis], "not finite", 0)
-        return SavedLane.of(states, self._common_rows(states), status)
+                return self._unfinished(j)._replace(status="not finite")
+        return SavedLane.of(states, slice(0) if none else self._common_rows(states), status)
 
     def _common_rows(self, states: Trajectory) -> Any:
         """Return the rows at the common times of fixed steps: the last states there, after changes by events."""

@@ -151,10 +151,20 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
 
     @property
     def ends(self) -> tuple[Array, Array, Array]:
-        """Time, positions and momenta of the last state of each trajectory: (k,), (k, m), (k, m)."""
-        last = np.isfinite(self.q).all(axis=2).sum(axis=0) - 1
-        j = np.arange(len(self))
-        return self._times()[last, j], self.q[last, j], self.p[last, j]
+        """Time, positions and momenta of the last state of each trajectory: (k,), (k, m), (k, m).
+
+        At common times, as of ``t_eval``, it is the crossing of the terminal event that ended a trajectory, before a
+        change by the event; NaN for a trajectory that reached no time and no such event.
+        """
+        reached = np.isfinite(self.q).all(axis=2).sum(axis=0)
+        last, j = reached - 1, np.arange(len(self))
+        t, q, p = self._times()[last, j], self.q[last, j], self.p[last, j]
+        t[reached == 0] = np.nan
+        for k, crossings in enumerate(self.events if self.times is None else ()):
+            for each in crossings:
+                if 0 < int(each.event.terminal) <= len(each):
+                    t[k], q[k], p[k] = each.t[-1], each.q[-1], each.p[-1]
+        return t, q, p
 
     def each(self) -> Iterator[tuple[Array, Array, Array, str, int]]:
         """Yield the times, positions and momenta of each trajectory, its status and its number of steps."""
