@@ -172,6 +172,11 @@ def test_a_catalogue_reference_may_be_changed():
         ("save_every", "save_evry", "unknown key 'save_evry' in [run]; did you mean 'save_every'?"),
         ("save_every", "h", "unknown key 'h' in [run]; did you mean 'step'?"),
         ("save_every", "dt", "unknown key 'dt' in [run]; did you mean 'step'?"),
+        (
+            "save_every",
+            "first_step",
+            "unknown key 'first_step' in [run]; it is an argument of integrate() in Python only",
+        ),
         ("save_every", "T", "unknown key 'T' in [run]; did you mean 'span'?"),
         ("save_every", "t_end", "unknown key 't_end' in [run]; did you mean 'span'?"),
         ("save_every", "n", "unknown key 'n' in [run]; did you mean 'steps'?"),

@@ -318,6 +318,13 @@ def test_a_ball_on_a_stiff_floor_is_not_falsely_confirmed(method):
     assert run.confirmation.confirmed == (abs(run.q[-1, 0] - exact) < 1e-8 * FLOOR_HEIGHT)
 
 
+def test_an_unconfirmed_motion_with_kinks_has_the_remedies_for_these():
+    height, span = FLOOR_HEIGHT, 3.0 * math.sqrt(2.0 * FLOOR_HEIGHT / 9.8)
+    with pytest.warns(sc.AccuracyWarning, match=r"max_step=, .*sc\.impact, sc\.Event.* not smooth where") as caught:
+        stepper_of("floor", "svi:4").integrate([height], [0.0], t_end=span, error=1e-14)
+    assert "time transformation" not in str(caught[0].message)
+
+
 def test_switched_forces_are_not_falsely_confirmed():
     """x'' = 1 from t = a on: 30 times a, each confirmed run is right; those that are not are reported."""
     stepper, confirmed = stepper_of("motor", "svi:4"), 0

@@ -31,6 +31,10 @@ LOCATIONS: Final = {
     **{key: f"there is a section [{key}]" for key in NAMED_SECTIONS},
 }
 """Location of each key in a model file."""
+PYTHON_ONLY: Final = {
+    "first_step": "; it is an argument of integrate() in Python only: omit it, or limit all steps by max_step."
+}
+"""Arguments of runs that model files do not have, and their remedies."""
 
 
 def key_hint(key: str, names: Iterable[str]) -> str:
@@ -40,6 +44,8 @@ def key_hint(key: str, names: Iterable[str]) -> str:
         key: the unknown key.
         names: known keys of its section.
     """
+    if key in PYTHON_ONLY:
+        return PYTHON_ONLY[key]
     known = list(names)
     if here := synonym_hint(key, known):
         return here

@@ -236,7 +236,15 @@ def _remedy(result: GlobalError, start: float) -> str:
 
 
 def _alternative(trajectory: Any, result: GlobalError) -> str:
-    """Return the recommendation of a time transformation for uneven steps of a conservative motion."""
+    """Return the recommendation of ends of steps at kinks, or of a time transformation for uneven steps.
+
+    The latter is for conservative motions.
+    """
+    if kinks := trajectory.stepper.interface.kinks:
+        return (
+            "; or give max_step=, a tenth of the shortest pulse or contact, or, without error=, events there "
+            f"(sc.impact, sc.Event(.., then=)): the equations are not smooth where {kinks[0]} = 0"
+        )
     lengths = abs(trajectory.step_sizes[:-1])
     lengths = lengths[np.isfinite(lengths)][:-1]  # t_end shortens the last step
     adaptive = isinstance(trajectory.plan, Adaptive)
