@@ -37,6 +37,8 @@ LOST = 1e-6
 """Bound on the relative error of 64 steps of h 2^-40; without compensation it is 1e-3, with it 1e-15."""
 LARGE_COMPENSATION = 1e-6
 """Compensation relative to the state in tests, instead of about 1e-17."""
+LARGE_IN_LANES = 1e-13
+"""The same where lanes are compared with single runs, which take it into their stages in other iterations."""
 MAX_LOSS = 1e-3
 """Part of the effect of the compensation that may be lost; the term of second order in h is a tenth of it."""
 SHORTER = 1 / 64
@@ -142,11 +144,11 @@ def _ensemble(tested: SystemUnderTest) -> Finding | None:
     first, worst = tested.states[0], 0.0
     scales = tested.scales(first)
     for h, steps, unit in (
-        (first.h, COMPENSATED_STEPS, ROUNDINGS * (tested.rounding(first) + LARGE_COMPENSATION**2 * scales)),
+        (first.h, COMPENSATED_STEPS, ROUNDINGS * (tested.rounding(first) + LARGE_IN_LANES**2 * scales)),
         (first.h * SHORT, SHORT_STEPS, LOST * SHORT_STEPS * SHORT * scales),
     ):
         state = State(first.q, first.p, first.t, h)
-        carry = _large_compensation(state, scales) if h == first.h else np.zeros_like(scales)
+        carry = LARGE_IN_LANES / LARGE_COMPENSATION * _large_compensation(state, scales) * (h == first.h)
         starts = [_perturbed(state, scales, lane) for lane in range(LANES)]
         result = _lanes(tested, starts, steps, carry)
         for start, (end, low) in zip(starts, result, strict=False):  # a block may have fewer lanes
