@@ -191,7 +191,7 @@ class TestLostEnergy:
     @pytest.mark.parametrize(
         ("method", "aside", "steps", "message"),
         [
-            ("svi:8", 3e-4, {"t_end": 6.0, "tolerance": 1e-5, "check_growth": False}, "although every step met"),
+            ("svi:8", 3e-4, {"t_end": 3.3, "tolerance": 1e-5, "check_growth": False}, "although every step met"),
             ("stoermer-verlet", 0.0, {"h": 0.01, "steps": 400}, "although the system conserves it.* Reduce h"),
         ],
     )
