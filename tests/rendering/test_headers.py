@@ -29,6 +29,7 @@ ELSEWHERE = {
     "support/frameworks/fmu.h": "tests/models/test_fmu.py",
     "support/frameworks/fmu_unsupported.h": "tests/models/test_fmu.py",
     "support/frameworks/xla_flow.h": "tests/rendering/test_flow_text.py",
+    "support/run/event_times.h": "tests/runtime/test_events_of_time.py",
     "support/run/inputs.h": "tests/models/test_package_inputs.py",
     "support/run/observation.h": "tests/runtime/test_device.py",
     "support/run/tangent_growth.h": "tests/runtime/test_device.py",

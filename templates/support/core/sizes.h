@@ -14,6 +14,7 @@
  *
  * The state itself enters nowhere else. Of arrays of run-time sizes V, A and mu are those of a whole array. */
 
+#define LOOKED_AT 4 /* fixed steps, of which one determines sizes and is tested for an accidentally small coefficient */
 #define FORMER_PART REAL(0.97) /* of V and A after a motion by V / A, about a radian of a vibration */
 
 /* Displacement by the curvature of a step, or of former ones: h^2 A_i, but not above the largest one of them. */

@@ -461,6 +461,7 @@ static SELDOM int is_free_flight(const step_data *step, stored_values of)
 /* Returns 1 for a free flight whose size is far from that of the step before: much larger, or shortened at once. */
 static inline int is_leap(const run_memory *run, const trial *now)
 {
+  (void)run;
   if (now->change < LEAP && now->change > -LEVELS_PER_BINADE)
     return 0;
 #ifdef NEWTON_ALONE
