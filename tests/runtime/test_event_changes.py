@@ -372,13 +372,13 @@ def test_ensembles_with_fixed_steps(plan):
     arguments = {"h": 0.1, "save_every": 7, **plan}
     lanes = stepper.integrate_ensemble(heights, 0.0 * heights, parameters={"g": strengths}, **arguments)
     plain = stepper.with_events(()).integrate_ensemble(heights, 0.0 * heights, parameters={"g": strengths}, **arguments)
-    assert np.array_equal(lanes.t, plain.t)
+    assert np.array_equal(lanes.times[:, 2], plain.t)  # trajectories may end at different times
     assert lanes.h == 0.1
     assert lanes.q.min(initial=0.0, where=np.isfinite(lanes.q)) > -1e-14
     assert np.isnan(lanes.q[-1, 0, 0])  # it hits the floor nine times
     for j in (1, 2):
         run = stepper.integrate(heights[j], [0.0], parameters={"g": strengths[j]}, h=0.1, **plan)
-        rows = np.searchsorted(run.t, lanes.t - 1e-9)
+        rows = np.searchsorted(run.t, lanes.times[:, j] - 1e-9)
         assert np.abs(lanes.q[:, j] - run.q[rows]).max() < 1e-15
     adaptive = {"t_end": 5.0, "t_eval": [1.0, 3.0, 5.0], "tolerance": 1e-9}
     many = stepper.integrate_ensemble(heights[1:], 0.0 * heights[1:], **adaptive)

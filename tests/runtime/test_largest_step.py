@@ -22,8 +22,12 @@ def stepper() -> sc.Stepper:
 @pytest.mark.parametrize("tolerance", [0.0, 1e-12, 1e-8])
 def test_largest_step_satisfies_the_tolerance_and_a_larger_one_does_not(tolerance: float) -> None:
     h = largest_step(stepper(), *START, 20.0, tolerance)
-    errors = [stepper().integrate(*START, h=x, t_end=20.0).step_error for x in (h, h * 2 ** (1 / REFINEMENTS))]
-    assert errors[0] <= (tolerance or 2.0**-53) < errors[1]
+    assert stepper().integrate(*START, h=h, t_end=20.0).step_error <= (tolerance or 2.0**-53)
+    try:
+        longer = stepper().integrate(*START, h=h * 2 ** (1 / REFINEMENTS), t_end=20.0).step_error
+    except sc.StepFailedError:  # the equations of a longer step are not solved
+        longer = np.inf
+    assert longer > (tolerance or 2.0**-53)
     assert largest_step(stepper(), *START, -20.0, tolerance) == pytest.approx(-h)
 
 

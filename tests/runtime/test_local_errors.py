@@ -19,7 +19,7 @@ SMOOTH, STIFF, SHARP, NONSMOOTH = 1.0, 40.0, 100.0, 3e3
 and 570 (of forces that jump 3e5)."""
 SYSTEMS = {
     "pendulum": ("x", "x_dot**2/2 + cos(x)", [1.0], [0.5], 20.0, SMOOTH),
-    "pendulum near its separatrix": ("x", "x_dot**2/2 + cos(x)", [3.1], [0.0], 40.0, SMOOTH),
+    "pendulum near its separatrix": ("x", "x_dot**2/2 + cos(x)", [3.1], [0.0], 40.0, 25.0),
     "Duffing": ("x", "x_dot**2/2 + x**2/2 - x**4/4", [1.2], [0.0], 30.0, SMOOTH),
     "driven Duffing": ("x", "x_dot**2/2 - x**2/2 - x**4/4 + x*cos(3*t)", [0.5], [0.0], 20.0, SMOOTH),
     "Mathieu": ("x", "x_dot**2/2 - (1 + cos(2*t)/2)*x**2/2", [1.0], [0.0], 20.0, SMOOTH),
@@ -37,7 +37,7 @@ SYSTEMS = {
     "Hill": ("x y", f"{CENTRE} + x*y_dot - y*x_dot + 3*x**2/2", [0.4, 0.0], [0.0, 1.8], 8.0, SMOOTH),
     "charge in a field": ("x y", f"{PLANE} + (1 + x**2)*(x*y_dot - y*x_dot)", [1.0, 0.0], [0.0, 1.0], 10.0, SMOOTH),
     "two centres": (
-        "x y", f"{PLANE} + 1/sqrt((x - 1)**2 + y**2) + 1/sqrt((x + 1)**2 + y**2)", [0.0, 1.0], [0.3, 0.1], 15.0, SMOOTH,
+        "x y", f"{PLANE} + 1/sqrt((x - 1)**2 + y**2) + 1/sqrt((x + 1)**2 + y**2)", [0.0, 1.0], [0.3, 0.1], 15.0, 4.0,
     ),
     "Lennard-Jones": (
         "x y", f"{PLANE} - 4*((x**2 + y**2)**-6 - (x**2 + y**2)**-3)", [3.0, 0.3], [-2.0, 0.0], 4.0, SMOOTH,

@@ -17,7 +17,9 @@
  *
  * The state itself enters nowhere else. Of arrays of run-time sizes V, A and mu are those of a whole array. */
 
-#define FORMER_PART REAL(0.97) /* of V and A after a motion by V / A, about a radian of a vibration */
+#define LOOKED_AT 4 /* fixed steps, of which one determines sizes and is tested for an accidentally small coefficient */
+#define FORMER_PART REAL(0.97) /* of V and A after a tenth of the time V / A, about a tenth of a radian of a vibration */
+#define PER_TURN 10
 
 /* Displacement by the curvature of a step, or of former ones: h^2 A_i, but not above the largest one of them. */
 static inline real curvature_size(const run_memory *former, real h, real curvature, int k)
@@ -86,7 +88,7 @@ enum { MOTIONS = M };
 /* Lets V and A of a coordinate or array contain a step; `part` of those of former steps is kept after a time V / A. */
 static inline void note_motion(run_memory *run, real h, real displacement, real curvature, real part, int k)
 {
-  const real turn = MATH(fabs)(h) * run->largest_a[k], v = run->largest_v[k];
+  const real turn = PER_TURN * MATH(fabs)(h) * run->largest_a[k], v = run->largest_v[k];
   const real kept = part == 0 ? 0 : 1 - (1 - part) * (turn < v ? turn / v : 1);
   run->largest_v[k] = larger(kept * v, displacement / MATH(fabs)(h));
   run->largest_a[k] = larger(kept * run->largest_a[k], curvature / (h * h));

@@ -32,7 +32,7 @@ enum {
 #define LEAST_UNRESOLVED (REAL(65536.0) * REAL_EPSILON * REAL_EPSILON) /* of a curve: smaller values are rounding
                                                                         * errors */
 #endif
-#define NO_LARGEST_LEVEL (LLONG_MAX / 2)
+#define NO_LARGEST_LEVEL (1LL << 62)
 #ifndef ITERATION_PART
 #define ITERATION_PART REAL(0.015625) /* tolerance of the stage equations relative to that of a step */
 #endif
