@@ -6,10 +6,11 @@
 /* Convergence criterion of the fixed-point iteration. Requires: FINAL_ITERATIONS, the number of iterations after the
  * last one that is measured. Changes are squared, and so are the thresholds here. */
 
-#if FINAL_ITERATIONS && !defined(NEWTON_KRYLOV) && !defined(FORCES_OF_VELOCITIES)
-#define MARGIN 1.0 /* the remaining change must be below the tolerance: most of it is extrapolated (remainder.h) */
+#define UNEXTRAPOLATED 16.0 /* the remaining change must be below 1/4 of the tolerance, or 1/2 at slow convergence */
+#if defined(NEWTON_KRYLOV) || defined(FORCES_OF_VELOCITIES)
+#define MARGIN UNEXTRAPOLATED
 #else
-#define MARGIN 16.0 /* the remaining change must be below 1/4 of the tolerance, or 1/2 if the convergence is slow */
+#define MARGIN (FINAL_ITERATIONS ? 1.0 : UNEXTRAPOLATED) /* below the tolerance: remainder.h extrapolates most of it */
 #endif
 #define FASTEST_CONVERGENCE 1e-6 /* fastest credible convergence: a factor of 1000 per iteration */
 #define SLOWEST_CONVERGENCE 0.5 /* slowest convergence rate assumed; a slower iteration ends where its changes stop

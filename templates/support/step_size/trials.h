@@ -360,6 +360,14 @@ static inline int down_from_stored(const trial *now, int solved, int down)
   return levels <= LEVELS_INSIDE ? levels : 0;
 }
 
+/* Smallest step size relative to the time. Positions on constraints are rounded in each step, so that shorter ones would
+ * not end: where a mechanism comes to a dead point, their errors are rounding errors of any size. */
+#ifdef CONSTRAINED
+#define SMALLEST_SHORTENED REAL_EPSILON
+#else
+#define SMALLEST_SHORTENED SMALLEST_RELATIVE_STEP
+#endif
+
 /* Reduces the step size after a failed or rejected trial, by 2 to `most` levels; returns 0 on step size underflow. */
 static int shorten(run_memory *run, trial *now, int most)
 {
@@ -373,7 +381,7 @@ static int shorten(run_memory *run, trial *now, int most)
   run->guess = 0;
   run->rejected++;
   const real left = MATH(fabs)(now->t_end - now->at.t);
-  return size_of_level(run->grid_level) > SMALLEST_RELATIVE_STEP * (MATH(fabs)(now->at.t) + REAL_EPSILON * left);
+  return size_of_level(run->grid_level) > SMALLEST_SHORTENED * (MATH(fabs)(now->at.t) + REAL_EPSILON * left);
 }
 
 /* Excludes the size of a failed trial from the next steps. The iteration of the multipliers is cheaper at two smaller
