@@ -218,10 +218,11 @@ class Assembly:
         sided = [axis for axis in axes if self.axes[axis].one_sided and any(self.names_in(f, [axis]) for f in jumps)]
         parts = []
         for sides in itertools.product((0, 1), repeat=len(sided)):
-            chosen = dict(zip(sided, sides, strict=True))
-            places = {symbol(axis): self.beside(axis, "points", side) for axis, side in chosen.items()}
+            side_along = dict(zip(sided, sides, strict=True))
+            places = {symbol(axis): self.beside(axis, "points", side) for axis, side in side_along.items()}
             weights = [
-                self.beside(axis, "weights", chosen[axis]) if axis in chosen else self.weight(axis) for axis in axes
+                self.beside(axis, "weights", side_along[axis]) if axis in side_along else self.weight(axis)
+                for axis in axes
             ]
             part = formula.xreplace({jump: jump.xreplace(places) for jump in jumps}) if places else formula
             parts.append(reduce(mul, [*weights, *at_point(part)]))
@@ -395,7 +396,7 @@ class Assembly:
                     self.value(f"{axis}_{kind}_{text}_of_edges", (Size(f"F{axis}"),), values[side], cells.index)
                     for kind, values in (("points", edges.sides), ("shares", edges.shares))
                 )
-                jumps = {each: each.xreplace({symbol(axis): place}) for each in self.system.jumps_in(factor)}
+                jumps = {jump: jump.xreplace({symbol(axis): place}) for jump in self.system.jumps_in(factor)}
                 inverse += share / factor.xreplace(jumps)
             term = sympy.expand_mul(term - factor * name**2 / 2) + name**2 / inverse / 2
         return term

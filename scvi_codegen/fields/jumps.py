@@ -74,7 +74,7 @@ def _jumps(function: Callable[..., Any], axis: Axis) -> Iterator[tuple[float, tu
 def _jumps_within(function: Callable[..., Any], axes: list[Axis]) -> bool:
     """Return whether a function of several axes changes within an element."""
     cells = [axis.one_sided.cells for axis in axes if axis.one_sided is not None]
-    if int(np.prod([each.size for each in cells])) > MOST_SAMPLED:
+    if int(np.prod([cell.size for cell in cells])) > MOST_SAMPLED:
         return False
     for element in itertools.product(*cells):
         grid = np.meshgrid(*element, indexing="ij")

@@ -139,7 +139,7 @@ TABLE = [
     ("growing after an iteration that contracted by chance", 2.7e-13, 2.0e-13, ROUNDED, 0, 3, ON, 1.7e-10),
     ("the same below 1e-14", 0.9e-14, 0.8e-14, ROUNDED, 0, 3, DONE, 1.7e-10),
     ("far below the last by chance", 2e-14, 2e-11, ROUNDED, 0, 3, DONE, 2e-8),
-    ("as far, after slower ones", 2e-13, 2e-10, ROUNDED, 0, 3, ON, 4e-10),
+    ("as far, after slower ones", 5e-13, 5e-10, ROUNDED, 0, 3, ON, 1e-9),
     ("shrinking at the level of rounding", 1e-13, 2e-13, ROUNDED, 0, 3, ON),
     ("nothing at all", 0.0, 1e-3, ROUNDED, 0, 2, DONE),
     ("nothing at all, at once", 0.0, np.inf, ROUNDED, 0, 0, DONE),
@@ -177,17 +177,19 @@ def test_convergence_criterion_of_the_fixed_point_iteration(
 
 @pytest.mark.parametrize("after", [0, 1])
 @pytest.mark.parametrize("rate", [0.01, 0.1, 0.3, 0.6])
-def test_residual_at_convergence_is_a_quarter_of_the_tolerance(tmp_path_factory, after, rate):
+def test_residual_at_convergence_is_a_part_of_the_tolerance(tmp_path_factory, after, rate):
     """Changes decrease geometrically: compare the sum of the omitted ones with the criterion.
 
-    At most; up to half of it where they contract slowly, for 1 / (1 - r) is taken from squares.
+    A quarter of the tolerance, or all of it where an iteration follows, whose remainder is extrapolated. At most; up to
+    twice that where they contract slowly, for 1 / (1 - r) is taken from squares.
     """
     tolerance, change = 1e-7, 1e-5
     verdict = header(tmp_path_factory.getbasetemp(), after).verdict
     ends = [k for k in range(60) if verdict(*(change * rate ** (k - j) for j in (0, 1, 2)), tolerance, 0, 3) == DONE]
     left = [change * rate ** (k + 1 + after) / (1 - rate) for k in (ends[0], ends[0] - 1)]
-    assert left[0] < (1 + rate) * tolerance / 4 * 1.001
-    assert left[1] > (1 + rate) * tolerance / 4
+    wanted = (1 + rate) * (tolerance if after else tolerance / 4)
+    assert left[0] < wanted * 1.001
+    assert left[1] > wanted
 
 
 def test_predictor_uses_two_steps_after_an_accurate_guess(tmp_path_factory):

@@ -100,10 +100,10 @@ static inline int stages_may_exceed(const step_data *step, const real *z, real m
 }
 
 /* Lets V and A contain a solved step. */
-static inline void note_stages(run_memory *run, const step_data *step, const real *z, const real *dq, real part)
+static inline void note_stages(run_memory *run, const step_data *step, const real *z, const real *dq)
 {
   for (int i = 0; i < M; i++)
-    note_motion(run, step->h, MATH(fabs)(dq[i]), curvature_of_stages(step, z, i), part, i);
+    note_motion(run, step->h, MATH(fabs)(dq[i]), curvature_of_stages(step, z, i), i);
 }
 
 #endif

@@ -457,9 +457,9 @@ def irregular_stops(t: Array, number: int) -> list[float]:
     """
     sizes = np.diff(t)
     pieces = max(1, -(-LEAST_STOPS // max(1, len(sizes))))
-    chosen = abs(sizes) * LONG > abs(t[-1] - t[0])
-    chosen[number :: max(STRIDE, -(-len(sizes) // MOST_STOPS))] = True
-    k = np.repeat(np.flatnonzero(chosen), pieces)
+    is_cut = abs(sizes) * LONG > abs(t[-1] - t[0])
+    is_cut[number :: max(STRIDE, -(-len(sizes) // MOST_STOPS))] = True
+    k = np.repeat(np.flatnonzero(is_cut), pieces)
     parts = (np.arange(1, len(k) + 1) * GOLDEN + number / 3.0) % 1.0
     stops = np.unique(t[k] + (MARGIN + (1.0 - 2.0 * MARGIN) * parts) * sizes[k])
     inner = stops[(stops != t[0]) & (stops != t[-1])]

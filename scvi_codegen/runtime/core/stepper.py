@@ -209,7 +209,8 @@ class Stepper(WithEventsInDouble, WithPaths, Integrator):
             plan, count = planned_steps(*schedule)
         except TypeError:  # of an argument that is not hashable, as an array
             plan, count = planned_steps.__wrapped__(*schedule)
-        check_max_step(plan, t, interface.words)
+        if max_step is not None:
+            check_max_step(plan, t, interface.words)
         if inputs is not None:
             plan = Fixed(plan.h) if isinstance(plan, FixedSteps) else plan  # each segment ends where the next begins
             segments = InputSegments(stepper, inputs, parameters, t, final_time(t, h, steps, t_end))

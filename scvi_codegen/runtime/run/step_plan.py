@@ -123,7 +123,7 @@ class ErrorControl(NamedTuple):
 
     Attributes:
         tolerance: relative error of a step.
-        absolute_tolerance: error below which a step is accepted, relative to ``tolerance``: a number, or one by name.
+        absolute_tolerance: smallest size of a coordinate, relative to which errors are measured: a number, or by name.
         max_step, first_step: largest step size; size of the first trial.
     """
 

@@ -5,9 +5,8 @@
  *
  * Motion    mu_i = |dq_i| + |h| V_i + h^2 A_i, V_i and A_i the largest |v_i| and |a_i| of the step and, with a
  *           forgetting factor, of former ones: at a turning point a step has the size of those around it, and an
- *           encounter does
- *           not loosen the rest of a run. The factor is one of time, not of steps: if V shrank with each step to a
- *           turning point, so would the steps, and never reach it.
+ *           encounter does not loosen the rest of a run. The factor is one of time, not of steps: if V shrank with
+ *           each step to a turning point, so would the steps, and never reach it.
  * Rounding  rho_i = u (|q_i| + |h v_i| + h^2 (|M^-1| F)_i + h^2 (|J| |q|)_i), F_j the sum of the absolute terms of f_j,
  *           J = da/dq, u = REAL_EPSILON / 2. In a contracting iteration h^2 |J| is at most about its rate. The
  *           increment of a step is compensated: its error is rho_i without the first term.
@@ -15,14 +14,18 @@
  * The state itself enters nowhere else. Of arrays of run-time sizes V, A and mu are those of a whole array. */
 
 #define LOOKED_AT 4 /* fixed steps, of which one determines sizes and is tested for an accidentally small coefficient */
-#define FORMER_PART REAL(0.97) /* of V and A after a tenth of the time V / A, about a tenth of a radian of a vibration */
-#define PER_TURN 10
+#define FORGETTING REAL(0.03) /* of V and A in a tenth of the time V / A, about a tenth of a radian of a vibration */
+#define TENTHS 10
+
+static inline real smallest(real a, real b)
+{
+  return a < b ? a : b;
+}
 
 /* Displacement by the curvature of a step, or of former ones: h^2 A_i, but not above the largest one of them. */
 static inline real curvature_size(const run_memory *former, real h, real curvature, int k)
 {
-  const real by_a = former ? h * h * former->largest_a[k] : 0;
-  return larger(curvature, former && by_a > former->largest_bend[k] ? former->largest_bend[k] : by_a);
+  return former ? larger(curvature, smallest(h * h * former->largest_a[k], former->largest_bend[k])) : curvature;
 }
 
 /* mu_i of the displacement by a step and by its curvature, with V and A of former steps, unless NULL. The displacement
@@ -30,9 +33,8 @@ static inline real curvature_size(const run_memory *former, real h, real curvatu
  * forgotten. */
 static inline real motion_size(const run_memory *former, real h, real displacement, real curvature, int k)
 {
-  const real by_v = former ? MATH(fabs)(h) * former->largest_v[k] : 0;
-  const real former_size = former && by_v > former->largest_dq[k] ? former->largest_dq[k] : by_v;
-  return displacement + larger(displacement, former_size) + curvature_size(former, h, curvature, k);
+  const real by_v = former ? smallest(MATH(fabs)(h) * former->largest_v[k], former->largest_dq[k]) : 0;
+  return displacement + larger(displacement, by_v) + curvature_size(former, h, curvature, k);
 }
 
 /* Size mu_i^2 / (h^2 A_i), about V_i^2 / A_i, relative to which a curve of one or two coefficients shows the relative
@@ -82,15 +84,31 @@ typedef struct array_motion {
 enum { MOTIONS = M };
 #endif
 
-/* Lets V and A of a coordinate or array contain a step; `part` of those of former steps is kept after a time V / A. */
-static inline void note_motion(run_memory *run, real h, real displacement, real curvature, real part, int k)
+/* Lets V and A of a coordinate or array contain a step. */
+static inline void note_motion(run_memory *run, real h, real displacement, real curvature, int k)
 {
-  const real turn = PER_TURN * MATH(fabs)(h) * run->largest_a[k], v = run->largest_v[k];
-  const real kept = part == 0 ? 0 : 1 - (1 - part) * (turn < v ? turn / v : 1);
-  run->largest_v[k] = larger(kept * v, displacement / MATH(fabs)(h));
-  run->largest_a[k] = larger(kept * run->largest_a[k], curvature / (h * h));
-  run->largest_dq[k] = larger(kept * run->largest_dq[k], displacement);
-  run->largest_bend[k] = larger(kept * run->largest_bend[k], curvature);
+  run->largest_v[k] = larger(run->largest_v[k], displacement / MATH(fabs)(h));
+  run->largest_a[k] = larger(run->largest_a[k], curvature / (h * h));
+  run->largest_dq[k] = larger(run->largest_dq[k], displacement);
+  run->largest_bend[k] = larger(run->largest_bend[k], curvature);
+}
+
+/* Reduces V and A by what is forgotten during a step. */
+static inline void forget_motion(run_memory *run, real h)
+{
+  for (int k = 0; k < MOTIONS; k++) {
+    const real turn = TENTHS * MATH(fabs)(h) * run->largest_a[k], v = run->largest_v[k];
+    const real kept = 1 - FORGETTING * (turn < v ? turn / v : 1);
+    run->largest_v[k] *= kept, run->largest_a[k] *= kept;
+    run->largest_dq[k] *= kept, run->largest_bend[k] *= kept;
+  }
+}
+
+/* Lets V and A be those of the next step alone. */
+static inline void begin_motion(run_memory *run)
+{
+  memset(run->largest_v, 0, sizeof run->largest_v), memset(run->largest_a, 0, sizeof run->largest_a);
+  memset(run->largest_dq, 0, sizeof run->largest_dq), memset(run->largest_bend, 0, sizeof run->largest_bend);
 }
 
 /* The largest V, and the largest mu_i of a step of h of the run so far. */

@@ -171,12 +171,12 @@ typedef struct {
 } trial;
 
 /* Lets V and A contain a solved trial. */
-static inline void note_trial(run_memory *run, const trial *now, real part)
+static inline void note_trial(run_memory *run, const trial *now)
 {
 #ifdef NEWTON_ALONE
-  note_stages(run, &now->step, run->memory, now->dq, part);
+  note_stages(run, &now->step, run->memory, now->dq);
 #else
-  note_curve(run, &now->step, &now->data, STORED(run, &now->step), now->dq, part, 1);
+  note_curve(run, &now->step, &now->data, STORED(run, &now->step), now->dq, 1);
 #endif
 }
 
@@ -297,8 +297,10 @@ static SELDOM int levels_of_first(const trial *now, real h, real span)
 static inline void try_pilot(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
   try_step(run, now, 0, options, report);
-  if (now->error < INFINITY)
-    note_trial(run, now, 0);
+  if (now->error < INFINITY) {
+    begin_motion(run);
+    note_trial(run, now);
+  }
 }
 
 /* Determines the first step size by increasing one that is certainly too small. The smallest trials may fail, with
@@ -684,7 +686,8 @@ static inline void accept_trial(run_memory *run, trial *now)
 #ifdef RATTLE
   run->fallback_steps += now->fallbacks;
 #endif
-  note_trial(run, now, FORMER_PART);
+  forget_motion(run, now->step.h);
+  note_trial(run, now);
   run->path += MATH(fabs)(now->step.h) * largest_velocity(run);
   if (larger(now->error, now->apart) > run->error) {
     run->error = larger(now->error, now->apart);
