@@ -28,7 +28,7 @@ VANISHING = mp.mpf(10) ** -28
 
 
 def jump_of(
-    formula: Expr, moving: Iterable[Symbol], constants: Mapping[Symbol, float], *, slopes: bool = False
+    formula: Expr, moving: Iterable[Symbol], constants: Mapping[Symbol, float], *, first_derivatives: bool = False
 ) -> tuple[Expr, Expr] | None:
     """Return a function u and the term of a formula that jumps where u is 0; ``None`` if no term does.
 
@@ -36,7 +36,7 @@ def jump_of(
         formula: function of the symbols of a state, time and parameters.
         moving: symbols that vary along a motion, without time.
         constants: values of the parameters; others are tried for those that are 0.
-        slopes: whether jumps of first derivatives count as well, which are corners of the formula.
+        first_derivatives: whether jumps of first derivatives count as well, which are corners of the formula.
     """
     variables = set(moving)
     for surface in sorted(kinks_of([formula]), key=str)[:MOST_SURFACES]:
@@ -47,7 +47,7 @@ def jump_of(
         rest = [term for term in terms if term not in near and term.free_symbols & surface.free_symbols]
         whole = sympy.Add(*near, *rest)
         functions = [whole]
-        if slopes:
+        if first_derivatives:
             functions += jacobian([whole], sorted(whole.free_symbols & variables, key=str)).values()
         if any(_jumps(each, surface, variables, constants) for each in functions):
             return surface, near[0]

@@ -164,7 +164,7 @@ def _check_continuity(
     if not system.lengths and (jump := jump_of(formulas[role], moving, system.constants)):  # lists end at a cutoff
         raise SystemDefinitionError(jump_message(f"the {role} of '{system.name}'", *jump))
     for name, g in zip(system.constraint_texts if system.constraints else (), system.constraints, strict=True):
-        if corner := jump_of(g, moving, system.constants, slopes=True):
+        if corner := jump_of(g, moving, system.constants, first_derivatives=True):
             raise SystemDefinitionError(corner_message(f"the constraint '{name}' of '{system.name}'", *corner))
 
 

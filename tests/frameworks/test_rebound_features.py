@@ -67,7 +67,7 @@ def test_simulations_whose_bodies_all_attract_are_accepted(simulation, active):
     assert sc.from_rebound(simulation).system.dimension == 9
 
 
-def test_conversion_there_and_back_keeps_state_time_and_units(simulation):
+def test_conversion_there_and_back_preserves_state_time_and_units(simulation):
     simulation.units, simulation.t = ("au", "yr", "msun"), 2.5
     bodies = sc.from_rebound(simulation)
     back = sc.from_rebound(sc.to_rebound(bodies))

@@ -1,7 +1,7 @@
 """Energies do not drift: the remainder that the fixed-point iteration leaves is added to the last update.
 
 The slope of the energy of an oscillator is measured in rounding errors (2^-53 of the energy) per step. A remainder that
-is left out has the same sign in each period: slopes of 1 to 200. The tables of the remainder are compared with the
+is left out has the same sign in each period: rates of 1 to 200. The tables of the remainder are compared with the
 matrices that they stand for.
 """
 
@@ -58,7 +58,7 @@ WORST = [
     ("svi:8", 2.5),
     ("gauss:3", 0.9),
 ]
-"""Where the slopes were largest."""
+"""Where the rates were largest."""
 
 
 def slope(system: LagrangianSystem, method: str, q: list[float], angle: float) -> float | None:
@@ -92,8 +92,8 @@ def test_the_energy_of_a_lattice_does_not_drift(method, angle):
 @pytest.mark.full
 @pytest.mark.parametrize("method", [*(f"svi:{s}" for s in range(2, 13)), *(f"gauss:{s}" for s in range(2, 7))])
 def test_no_energy_drifts_at_any_step_size_at_which_the_iteration_converges(method):
-    slopes = {angle: slope(OSCILLATOR, method, [1.0], angle) for angle in ANGLES}
-    assert not {angle: found for angle, found in slopes.items() if found is not None and found > LARGEST_SLOPE}
+    rates = {angle: slope(OSCILLATOR, method, [1.0], angle) for angle in ANGLES}
+    assert not {angle: found for angle, found in rates.items() if found is not None and found > LARGEST_SLOPE}
 
 
 def test_tables_of_the_remainder_are_those_of_the_matrix():

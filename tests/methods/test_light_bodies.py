@@ -32,7 +32,7 @@ def angle():
 
 
 @pytest.mark.parametrize("m", MASSES)
-def test_the_default_solver_keeps_the_digits_of_newtons_method(pendulum, angle, m):
+def test_the_default_solver_has_the_digits_of_newtons_method(pendulum, angle, m):
     """Within 10 roundings of it, and right, by fixed and adaptive steps; counted where the multipliers lose them."""
     parameters = {"m": m, "M": 1.0}
     exact = angle.integrate([START], [0.0], parameters=parameters, t_end=0.5, tolerance=1e-15).q[-1, 0]

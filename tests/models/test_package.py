@@ -100,7 +100,7 @@ def test_generated_c_is_compiled_unchanged(pendulum, tmp_path):
             "fixed-point",
             "the step from t = 0 failed: the iteration on the stage equations did not converge; use a smaller step",
         ),
-        (1.5, "auto", "the step from t = 1.5 failed: the iteration converged to a spurious solution"),
+        (1.5, "auto", ""),
     ],
 )
 def test_c_program_falls_back_to_newton_where_the_fixed_point_fails(h, solver, reported, tmp_path):

@@ -50,7 +50,7 @@ def test_units_by_powers_of_two_give_equal_bits():
 
 
 @pytest.mark.parametrize("start", [0.0, 1e-7, 1e-9, 1e-12, 1.2e-16])
-def test_coordinate_at_zero_beside_a_moving_one(start):
+def test_coordinate_at_zero_next_to_a_moving_one(start):
     """Rounding errors of the fast coordinate are no errors of the slow one; 720,000 steps at 1e-12."""
     stepper = compiled("2*s_dot**2 + a_dot**2/2 + s_dot*a_dot*cos(a) + 9.81*cos(a)", ["s", "a"])
     run = stepper.start([0.634, start], stepper.momentum([0.634, start], [-0.707, 0.0]), t_end=5.0)
@@ -106,7 +106,7 @@ def test_light_planet_is_as_accurate_as_a_heavy_one():
     assert np.abs(run.q[:, 2] - 0.01 * np.cos(angles)).max() < 1e-6 * 0.01
 
 
-def test_small_coordinate_beside_a_large_one():
+def test_small_coordinate_next_to_a_large_one():
     """z = 1e-14 beside x = 1: relative to its own motion."""
     run = compiled("(x_dot**2 + z_dot**2)/2 - x**2/2 - 3*z**2/2", ["x", "z"]).integrate(
         [1.0, 1e-14], [0.0, 0.0], t_end=10.0, tolerance=1e-9

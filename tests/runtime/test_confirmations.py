@@ -290,7 +290,7 @@ def check(found: Counter, least: float) -> None:
 
 
 @pytest.mark.parametrize("kind", [*SMOOTH, *NOT_SMOOTH])
-def test_no_error_is_falsely_confirmed(kind):
+def test_no_error_is_confirmed_but_wrong(kind):
     """Three cases of each kind; most smooth ones are confirmed."""
     smooth = kind in SMOOTH
     first, stride = [*(SMOOTH if smooth else NOT_SMOOTH)].index(kind), len(SMOOTH if smooth else NOT_SMOOTH)
@@ -299,7 +299,7 @@ def test_no_error_is_falsely_confirmed(kind):
 
 @pytest.mark.full
 @pytest.mark.parametrize(("smooth", "count", "least"), [(True, 2000, 0.95), (False, 1000, 0.6)])
-def test_of_three_thousand_errors_none_is_falsely_confirmed(smooth, count, least):
+def test_no_false_confirmation_in_three_thousand_cases(smooth, count, least):
     check(counts(range(count), smooth=smooth), least)
 
 
@@ -449,7 +449,7 @@ def confirmed(system, q, p, method="svi:6", **arguments):
 class TestSizes:
     """Motions beside larger ones, far from the origin and in encounters."""
 
-    def test_a_tiny_motion_beside_a_large_one_has_its_own_size(self):
+    def test_a_tiny_motion_next_to_a_large_one_has_its_own_size(self):
         run = confirmed(
             ("x z", "(x_dot**2 + z_dot**2)/2 - x**2/2 - z**2"), [1.0, 1e-14], [0.0, 0.0], t_end=5.0, error=1e-8
         )

@@ -518,10 +518,10 @@ def test_every_quantity_has_both_words(tmp_path: Path) -> None:
         assert now.energy.mp() == run.mp("energy")[8]
         assert (now.velocity.mp() == run.mp("velocity")[8]).all()
         assert (now.momentum_maps.mp() == run.mp("momentum_maps")[8]).all()
-        (crossings,), (kept,) = run.events, recorded.events
+        (crossings,), (saved,) = run.events, recorded.events
         assert len(crossings) == 1
         assert abs(crossings.q.mp()[0, 1] - mp.mpf(3) / 5) < 1e-31
-        assert crossings.t.mp()[0] == kept.t.mp()[0]
+        assert crossings.t.mp()[0] == saved.t.mp()[0]
         q, p = run.at(0.4)
         again = stepper.integrate(run.q[0], run.p[0], t=run.t[0], h=1 / 16, t_end=0.4, parameters={"m": "1.1"})
         assert abs(q.mp() - again.mp("q")[-1]).max() < 1e-30

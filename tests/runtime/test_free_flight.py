@@ -19,14 +19,14 @@ def largest_energy_error(stepper: sc.Stepper, q: object, v: object) -> float:
         ("x_dot**2/2 + y_dot**2/2 + x_dot*y_dot/4 - 9.8*y - 1e5*positive_part(-y)**2", "newton", 1e-4),
     ],
 )
-def test_ball_on_a_stiff_floor_keeps_its_energy(lagrangian: str, solver: str, allowed: float) -> None:
+def test_ball_on_a_stiff_floor_conserves_its_energy(lagrangian: str, solver: str, allowed: float) -> None:
     system = sc.LagrangianSystem.from_text("ball", ["x", "y"], lagrangian)
     stepper = sc.compile_stepper(system, "svi:8", solver=solver)
     errors = [largest_energy_error(stepper, [0.0, height], [0.3, 0.0]) for height in np.linspace(0.5, 3.0, 21)]
     assert max(errors) < allowed, errors
 
 
-def test_array_of_balls_on_a_stiff_floor_keeps_its_energy() -> None:
+def test_array_of_balls_on_a_stiff_floor_conserves_its_energy() -> None:
     system = sc.LagrangianSystem.from_text(
         "balls", ["q[N]"], "sum(i in N, q_dot[i]**2/2 - 9.8*q[i] - 1e5*positive_part(-q[i])**2)"
     )

@@ -7,7 +7,7 @@ from notation import lagrange
 import scvi_codegen as sc
 
 PLANE = "(x_dot**2 + y_dot**2)/2"
-CENTRE, BENT = f"{PLANE} + 1/sqrt(x**2 + y**2)", "(2*positive_part(x) - x)"
+CENTRE, CURVED = f"{PLANE} + 1/sqrt(x**2 + y**2)", "(2*positive_part(x) - x)"
 PENDULA = "x_dot**2 + y_dot**2/2 + x_dot*y_dot*cos(x - y) + 2*cos(x) + cos(y)"
 BODIES = (
     "3*(a_dot**2 + b_dot**2)/2 + 2*(c_dot**2 + d_dot**2) + 5*(e_dot**2 + f_dot**2)/2 + 12/sqrt((a - c)**2 + (b - d)**2)"
@@ -53,8 +53,8 @@ SYSTEMS = {
     "backlash": (
         "x", "x_dot**2/2 - 50*(positive_part(x - 1)**2 + positive_part(-1 - x)**2)", [0.0], [1.0], 20.0, NONSMOOTH,
     ),
-    "cubic modulus": ("x", f"x_dot**2/2 - x**2*{BENT}/3", [1.0], [0.1], 20.0, NONSMOOTH),
-    "bilinear spring": ("x", f"x_dot**2/2 - x**2/2 - x*{BENT}/4", [1.0], [0.1], 20.0, NONSMOOTH),
+    "cubic modulus": ("x", f"x_dot**2/2 - x**2*{CURVED}/3", [1.0], [0.1], 20.0, NONSMOOTH),
+    "bilinear spring": ("x", f"x_dot**2/2 - x**2/2 - x*{CURVED}/4", [1.0], [0.1], 20.0, NONSMOOTH),
     "quadratic drag": (
         "x y", f"{PLANE} - y - 20*(sqrt(x**2 + y**2) - 1)**2", [1.2, 0.1], [0.0, 0.13], 12.0, NONSMOOTH,
     ),

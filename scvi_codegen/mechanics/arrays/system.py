@@ -317,11 +317,11 @@ class ArraySystem:
         constant = {array.name for array in self.fields}
         values = dict(zip(self.parameters, self.defaults, strict=True))
         of_energy = [] if self.neighbours else [(term, False) for term in self.terms]  # lists end at their cutoff
-        for term, slopes in (*of_energy, *((term, True) for term in self.constraints)):
+        for term, first_derivatives in (*of_energy, *((term, True) for term in self.constraints)):
             moving = [slot for slot, access in term.slots if access.array.name not in constant]
-            if jump := jump_of(term.formula, moving, values, slopes=slopes):
-                subject = f"the constraint '{term}'" if slopes else f"the {self.function}"
-                message = corner_message if slopes else jump_message
+            if jump := jump_of(term.formula, moving, values, first_derivatives=first_derivatives):
+                subject = f"the constraint '{term}'" if first_derivatives else f"the {self.function}"
+                message = corner_message if first_derivatives else jump_message
                 raise SystemDefinitionError(message(f"{subject} of '{self.name}'", *jump))
 
     def check_run_time_sizes(self) -> None:

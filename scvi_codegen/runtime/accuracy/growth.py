@@ -157,7 +157,7 @@ class _Repetition:
         apart, k = 0.0, 0
         try:
             self._begin(self.nudge, self.tolerance)
-            times = np.linspace(states.t[0], states.t[last], PARTS + 1)[1:]  # not by number: steps crowd in encounters
+            times = np.linspace(states.t[0], states.t[last], PARTS + 1)[1:]  # not by number: encounters take most steps
             forward = math.copysign(1.0, times[-1] - states.t[0])
             for k in sorted({*np.searchsorted(forward * states.t[:last], forward * times).tolist()} - {0}):
                 self.advance_until(float(states.t[k]))

@@ -362,8 +362,8 @@ static inline int down_from_stored(const trial *now, int solved, int down)
   return levels <= LEVELS_INSIDE ? levels : 0;
 }
 
-/* Smallest step size relative to the time. Positions on constraints are rounded in each step, so that shorter ones would
- * not end: where a mechanism comes to a dead point, their errors are rounding errors of any size. */
+/* Smallest step size relative to the time. Positions on constraints are rounded in each step, so that shorter ones
+ * would not end: where a mechanism comes to a dead point, their errors are rounding errors of any size. */
 #ifdef CONSTRAINED
 #define SMALLEST_SHORTENED REAL_EPSILON
 #else
