@@ -87,11 +87,11 @@ class TestCases:
 
     @pytest.mark.second
     def test_published_end_of_the_suite_of_heyoka_is_reached(self):
-        """Sun, Jupiter and Saturn after 100,000 years: positions of published quadruple precision, within 2e-9."""
+        """Sun, Jupiter and Saturn after 100,000 years: positions of published quadruple precision, within 4e-9."""
         chosen = suite_case("heyoka:three-bodies")
         stepper = compile_stepper(chosen.system, "svi:8")
         run = stepper.integrate(chosen.q[0], velocity=chosen.velocity[0], t_end=chosen.span, check_growth=False)
-        assert rms_error(run.q[-1:], SUITE_ENDS["heyoka:three-bodies"](chosen, None)) < 2e-9
+        assert rms_error(run.q[-1:], SUITE_ENDS["heyoka:three-bodies"](chosen, None)) < 4e-9
 
     def test_the_formulation_in_momenta_agrees_with_the_one_in_velocities(self):
         chosen = unforced.case("relativistic-particle")

@@ -369,7 +369,7 @@ def test_nvrtc_spills_less_if_threads_share_a_trajectory() -> None:
     assert spilled["points"] < spilled["ensemble"] / 3
 
 
-LIMITS = {("kepler", 4): (220, 0), ("henon-heiles", 4): (206, 0), ("kepler", 8): (255, 352)}
+LIMITS = {("kepler", 4): (235, 0), ("henon-heiles", 4): (216, 0), ("kepler", 8): (255, 352)}
 """Registers and bytes of spilled loads that are accepted; those on sm_90 by NVRTC 13.5, and 3 % more."""
 
 
