@@ -166,10 +166,11 @@ class BuildError(ScviCodegenError, RuntimeError):
 
 
 class StepFailedError(ScviCodegenError, ArithmeticError):
-    """Failure to solve a step; the state before it is unchanged.
+    """Failure to solve a step, or to store its state; the state before it is unchanged.
 
     Attributes:
-        status: the status word of the C code (``"not converged"``, ``"singular"``, ``"not finite"``).
+        status: the status word of the C code (``"not converged"``, ``"singular"``, ``"not finite"``), or ``"too many
+            states"``.
         step: index of the failed step, counted from 0.
         t: time at the start of the failed step.
         residual: the last scaled Newton update.

@@ -13,6 +13,7 @@ from scvi_codegen.cli.supervision import check_memory, interruptions, progress_b
 from scvi_codegen.files.energy import MOST_BALANCED_STEPS, energy_account, energy_reason
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.ensemble_file import EnsembleStates
+from scvi_codegen.native.capacity import TOO_MANY_STATES
 from scvi_codegen.native.options import FAILURES
 from scvi_codegen.representation import counted
 from scvi_codegen.runtime.core.stepper import Stepper
@@ -129,7 +130,10 @@ def _failures(result: EnsembleTrajectory) -> Iterator[str]:
         t = result.ends[0][j] if own else result.t[0] + result.steps[j] * result.h
         status = str(result.status[j])
         why = FAILURES[status][0] if status in FAILURES else status
-        yield f"  trajectory {j}: step {result.steps[j]} at t = {t:g} failed: {why}"
+        failed = f"step {result.steps[j]} at t = {t:g} failed"
+        if status == TOO_MANY_STATES:
+            failed, why = f"ended after step {result.steps[j]} at t = {t:g}", f"{why}: use --save-every"
+        yield f"  trajectory {j}: {failed}: {why}"
     if len(lost) > SHOWN_FAILURES:
         yield f"  and {len(lost) - SHOWN_FAILURES} more"
 

@@ -1,17 +1,10 @@
-"""Supervision of a run: check of the memory that it needs, progress bar, and handling of SIGINT and SIGTERM.
-
-The memory is checked before the run starts: the system kills larger processes without a message.
-"""
+"""Supervision of a run: check of the memory that it needs, progress bar, and handling of SIGINT and SIGTERM."""
 
 import contextlib
-import math
-import os
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import suppress
-from pathlib import Path
 from types import FrameType
 
 import click
@@ -19,11 +12,7 @@ import click
 from scvi_codegen.cli.command_group import is_quiet
 from scvi_codegen.errors import StateError
 from scvi_codegen.models.model import Model
-
-COPIES = 2
-"""Copies of the states that exist at once: the segments, and the arrays that join them."""
-CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
-"""File with the memory limit of a Linux control group (container)."""
+from scvi_codegen.native.capacity import COPIES, room_for_states
 
 
 def check_memory(model: Model, steps: int | None = None, trajectories: int = 1) -> None:
@@ -32,7 +21,7 @@ def check_memory(model: Model, steps: int | None = None, trajectories: int = 1) 
         steps = 0 if model.ends_at_time else model.step_count
     saved = steps // model.save_every + 1
     each = 16 * model.dimension * trajectories + 12  # q and p of each; time and iterations
-    room = usable_memory() / (COPIES * each)
+    room = room_for_states() / each
     if saved <= room:
         return
     states, remedies = f"{saved} states", list[str]()
@@ -44,16 +33,6 @@ def check_memory(model: Model, steps: int | None = None, trajectories: int = 1) 
         states += f" of each of {trajectories} trajectories"
     needed = f"{COPIES * each * saved / 1e9:.3g} GB of memory"
     raise StateError(f"{states} need {needed}: {' or '.join(remedies or ['reduce the number of steps'])}")
-
-
-def usable_memory() -> float:
-    """Return the bytes of memory available to this process; infinity if the system does not report them."""
-    result = [math.inf]
-    with suppress(AttributeError, OSError, ValueError):
-        result.append(float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")))
-    with suppress(OSError, ValueError):
-        result.append(float(CGROUP_LIMIT.read_text()))
-    return min(result)
 
 
 BAR_LENGTH = 1000

@@ -9,8 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import StateError
+from scvi_codegen.native.capacity import room_for_states
 
 LONGEST_SHOWN = 60
+FEW_NUMBERS = 2**24
+"""Numbers that fit into the memory of any machine."""
 REAL_KINDS = "iufO"
 """Accepted kinds of numbers: not complex ones, whose imaginary part would be lost, dates, text or truth values."""
 
@@ -67,6 +70,8 @@ def _advice_for_text(entries: list[Any]) -> str:
 def empty_array(shape: tuple[int, ...]) -> NDArray[np.float64]:
     """Return memory for states; raise StateError if there is not enough."""
     try:
+        if (numbers := math.prod(shape)) > FEW_NUMBERS and 8 * numbers > room_for_states():
+            raise MemoryError
         return np.empty(shape)
     except (MemoryError, ValueError) as error:
         raise StateError(f"{shape[0]} states do not fit into the memory: store fewer of them (save_every)") from error

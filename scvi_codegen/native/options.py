@@ -6,6 +6,7 @@ from typing import Any
 
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.native.arguments import checked_number
+from scvi_codegen.native.capacity import TOO_MANY_STATES
 from scvi_codegen.rendering.text import MAX_ITERATIONS, TOLERANCE
 from scvi_codegen.validation import checked_count
 
@@ -49,6 +50,10 @@ FAILURES = {
     "no memory": (
         "there is not enough memory for Newton's method",
         "Free memory, or use solver='fixed-point' with a smaller step",
+    ),
+    TOO_MANY_STATES: (
+        "its states exceed the memory, and only the first and the last are returned",
+        "Save fewer states (t_eval or save_every), or observe fixed steps (h, steps and observe)",
     ),
 }
 """Cause and remedy of a failure, by status."""

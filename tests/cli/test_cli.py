@@ -355,7 +355,7 @@ class TestRun:
         assert len(arrays("a.npz")["t"]) == 1
 
     def test_states_beyond_memory_are_saved_as_advised(self, monkeypatch):
-        monkeypatch.setattr("scvi_codegen.cli.supervision.usable_memory", lambda: 20_000.0)
+        monkeypatch.setattr("scvi_codegen.native.capacity.usable_memory", lambda: 20_000.0)
         save_every = re.search(r"--save-every (\d+)", error_of("run", "kepler", "--steps", "1000"))[1]
         assert 1 < int(save_every) < 10
         assert "1000 steps" in output_of("run", "kepler", "--steps", "1000", "--save-every", save_every)

@@ -8,8 +8,8 @@ from commands import error_of, output_of
 from recorded_runs import STATE, StopsAfter, assert_same, digests, recorded
 
 import scvi_codegen as sc
-from scvi_codegen.cli import supervision
 from scvi_codegen.models.model_files.model_file import dump_model, parse_model
+from scvi_codegen.native import capacity
 
 pytestmark = pytest.mark.usefixtures("here")
 
@@ -120,7 +120,7 @@ def test_the_command_line_runs_records_and_resumes_it(kepler):
 
 def test_run_beyond_the_memory_ends_with_advice(monkeypatch):
     Path("k.toml").write_text(MODEL)
-    monkeypatch.setattr(supervision, "usable_memory", lambda: 8000.0)
+    monkeypatch.setattr(capacity, "usable_memory", lambda: 8000.0)
     error = error_of("run", "k.toml")
     assert "save fewer (--save-every" in error
     assert "-o NAME.run" in error

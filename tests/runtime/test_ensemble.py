@@ -792,7 +792,7 @@ class TestCommandLine:
             ("planar-pendulum --ensemble grid.toml", "'q1' is not a coordinate"),
             (
                 "kepler --steps 1000000000000 --ensemble grid.toml",
-                "1000000000001 states of each of 6 trajectories need 4.08e+05 GB of memory: save fewer (--save-every ",
+                "1000000000001 states of each of 6 trajectories need 6.12e+05 GB of memory: save fewer (--save-every ",
             ),
         ],
     )

@@ -826,6 +826,7 @@ def _check(
 def checked_ensemble_result(work: Ensemble) -> EnsembleTrajectory:
     """Return the trajectories of an ensemble that was integrated; issue warnings of inaccurate ones."""
     trajectories = work.result()
+    work.warn_of_too_many_states(trajectories)
     try:
         warn_of_unconfirmed(trajectories.confirmations)
         warn_of_energy_errors(trajectories, None if work.successive is None else work.successive.energies)

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.native.binding import Binding
+from scvi_codegen.native.capacity import TOO_MANY_STATES
 from scvi_codegen.native.options import OUTCOMES, SolverOptions
 from scvi_codegen.runtime.core.integrator import Integrator
 from scvi_codegen.runtime.core.validation import Array
@@ -35,8 +36,10 @@ GROWTH = 8.0
 """Largest ratio of successive numbers of steps of calls."""
 MOST_NUMBERS, FEWEST_ROWS = 2**16, 8
 """Numbers in the memory for states of a call, and the fewest states."""
-NAMES = np.array([OK, *OUTCOMES, INTERRUPTED], dtype="<U32")
-"""Reasons of the end by the status of C; the last one of -1."""
+NAMES = np.array([OK, *OUTCOMES, TOO_MANY_STATES, INTERRUPTED], dtype="<U32")
+"""Reasons of the end by the status of C, or of a trajectory with too many states; the last one of -1."""
+FULL = len(OUTCOMES) + 1
+"""Status of a trajectory with too many states."""
 
 
 class Rows(NamedTuple):
@@ -186,6 +189,7 @@ class Call:
             taken = self.take(size)
             if self.struct.entered:
                 self.enter(self.struct.segment)
+            self.limit()
             self.store()
             return taken
 
@@ -208,6 +212,9 @@ class Call:
             part = slice(first, min(first + work.width, len(work.q)))
             work.parameters[part] = work.values_at(float(work.steps.middle[segment]), part)
 
+    def limit(self) -> None:
+        """End the present trajectory if it has too many states."""
+
     def store(self, *, last: bool = False) -> None:
         """Pass on the states in memory, if it is nearly full or after the last call."""
 
@@ -218,6 +225,7 @@ class SuccessiveRuns(Batch):
     Args:
         stepper: the integrator.
         plan, save_every: of adaptive steps; the target time of the plan is not used.
+        most_states: number of states with which a trajectory ends.
         receive: receives saved states after the initial ones, row 0, possibly from several threads; they are views.
 
     Attributes:
@@ -232,6 +240,7 @@ class SuccessiveRuns(Batch):
         *arguments: Any,
         plan: Adaptive | None = None,
         save_every: int = 1,
+        most_states: float = math.inf,
         receive: Callable[[Rows], None],
     ) -> None:
         super().__init__(stepper.binding, *arguments)
@@ -239,6 +248,7 @@ class SuccessiveRuns(Batch):
         self.words, self.sums_action = stepper.interface.words, stepper.sums_action
         self.conserves_energy = stepper.interface.conserves_energy and self.words == 1
         self.plan, self.save_every, self.receive, count = plan, save_every, receive, len(self.q)
+        self.most_states = most_states
         self.stored, self.fallback_steps = np.zeros((2, count), np.int64)
         self.energies = np.full((count, 2), np.nan)
 
@@ -285,6 +295,13 @@ class _SuccessiveCall(Call):
         struct.actions = binding.pointer(self.actions)
         self.states = tuple(np.empty((self.capacity, numbers)) for numbers in (work.words, m, m))
         struct.times, struct.positions, struct.momenta = binding.pointers(*self.states)
+
+    def limit(self) -> None:
+        """End the present trajectory if it has too many states."""
+        call, work = self.struct, self.work
+        if call.next < call.end and call.segment >= 0 and work.stored[call.next] > work.most_states:
+            work.status[call.next], call.segment = FULL, -1
+            call.next += 1
 
     def store(self, *, last: bool = False) -> None:
         """Pass on the states in memory, with their trajectories and rows."""

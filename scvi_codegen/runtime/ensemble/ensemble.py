@@ -9,26 +9,28 @@ results are bitwise equal for any number of threads.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 from itertools import pairwise
 from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.errors import EventError, StateError, StepFailedError
+from scvi_codegen.errors import AccuracyWarning, EventError, StateError, StepFailedError, warn
 from scvi_codegen.native.arguments import real_array
-from scvi_codegen.native.options import SolverOptions, checked_options
+from scvi_codegen.native.capacity import TOO_MANY_STATES, room_for_states, too_many_states
+from scvi_codegen.native.options import FAILURES, SolverOptions, checked_options
 from scvi_codegen.rendering.source import Source
 from scvi_codegen.runtime.accuracy.global_error import GlobalError
 from scvi_codegen.runtime.accuracy.warning_switch import without_accuracy_warnings
 from scvi_codegen.runtime.core.features import check_together, require
 from scvi_codegen.runtime.core.validation import Array, States, check_left_to_inputs, columns_of_inputs, parameter_index
 from scvi_codegen.runtime.core.words import check_doubles, checked_time, hashed, missing, stacked
-from scvi_codegen.runtime.ensemble.batches import Rows, SuccessiveRuns
+from scvi_codegen.runtime.ensemble.batches import FULL, Rows, SuccessiveRuns
 from scvi_codegen.runtime.ensemble.device import (
     FEWEST_COORDINATES,
     AdaptiveDeviceRuns,
@@ -95,6 +97,14 @@ class SavedLane(NamedTuple):
         actions = None if states.actions is None else states.actions[rows]
         about = status, states.steps, states.fallback_steps, states.events, actions
         return cls(states.t[rows], states.q[rows], states.p[rows], *about)
+
+    def limited(self, most: float) -> SavedLane:
+        """Return the first and the last state alone of a trajectory with more than ``most`` states, or too many."""
+        if len(self.t) <= most and self.status != TOO_MANY_STATES:
+            return self
+        ends = slice(None, None, max(len(self.t) - 1, 1))
+        actions = None if self.actions is None else self.actions[ends]
+        return self._replace(t=self.t[ends], q=self.q[ends], p=self.p[ends], actions=actions, status=TOO_MANY_STATES)
 
 
 class Ensemble:
@@ -247,6 +257,7 @@ class Ensemble:
             ends if self.fixed is None else self.fixed.fixed_segments(),
             plan=self.plans[0] if isinstance(self.plans[0], Adaptive) else None,
             save_every=self.save_every if self.t_eval is None else LARGEST_COUNT,
+            most_states=self.most_states,
             receive=lambda states: self.states.append(states.copies()),
         )
 
@@ -294,6 +305,12 @@ class Ensemble:
 
     def __len__(self) -> int:
         return len(self.start[0])
+
+    @cached_property
+    def most_states(self) -> float:
+        """Largest number of states of a trajectory: arrays of all have the size of the longest one."""
+        numbers = self.stepper.interface.words * (1 + 2 * self.stepper.dimension)  # of a state
+        return math.inf if self.t_eval is not None else room_for_states() / (8 * numbers * max(len(self), 1))
 
     @property
     def length(self) -> int:
@@ -384,7 +401,7 @@ class Ensemble:
             "t": self.t0,
             "save_every": 1 if self.inputs and self.t_eval is not None else self.save_every,
             "options": self.options,
-            "progress": check_stop,
+            "progress": partial(self._check, check_stop),
         }
         if self.stepper.interface.words > 1:
             arguments["parameters"] = self.parameters[j]
@@ -414,6 +431,12 @@ class Ensemble:
             except StateError:  # a sum of finite terms has overflowed
                 return self._unfinished(j)._replace(status="not finite")
         return SavedLane.of(states, slice(0) if none else self._common_rows(states), status)
+
+    def _check(self, check_stop: StopCheck, steps: int) -> None:
+        """Raise an error if another trajectory failed, or if a run has more states than :attr:`most_states`."""
+        check_stop(steps)
+        if steps // self.save_every > self.most_states:
+            raise too_many_states(steps // self.save_every, steps, math.nan)
 
     def _common_rows(self, states: Trajectory) -> Any:
         """Return the rows at the common times of fixed steps: the last states there, after changes by events."""
@@ -446,6 +469,19 @@ class Ensemble:
             parameters=self.parameters,
             stepper=self.stepper,
             spans=spans,
+        )
+
+    def warn_of_too_many_states(self, trajectories: EnsembleTrajectory) -> None:
+        """Issue a warning if trajectories ended because their states exceed the memory."""
+        full = np.flatnonzero(trajectories.status == TOO_MANY_STATES)
+        if not full.size:
+            return
+        j, others, (cause, remedy) = int(full[0]), len(full) - 1, FAILURES[TOO_MANY_STATES]
+        warn(
+            f"trajectory {j}{f' (and {others} more)' * (others > 0)} ended at t = {trajectories.ends[0][j]:g}, after "
+            f"{trajectories.steps[j]} steps: {cause}. The memory holds {int(self.most_states)} states of each of "
+            f"{len(self)} trajectories. {remedy}",
+            AccuracyWarning,
         )
 
     def device_result(self) -> DeviceEnsemble:
@@ -485,7 +521,7 @@ class Ensemble:
             return EnsembleTrajectory(q=q, p=p, **self._adaptive_fields())
         if self.successive is not None and not self.saved:
             return self._successive_result(self.successive)
-        lanes = [self.saved.get(j) or self._unfinished(j) for j in range(len(self))]
+        lanes = [(self.saved.get(j) or self._unfinished(j)).limited(self.most_states) for j in range(len(self))]
         count = max(len(each.t) for each in lanes) if self.t_eval is None else len(self.t_eval)
         t = np.arange(count, dtype=float) if self.t_eval is None else self.t_eval
         words, shape = self.stepper.interface.words, (count, len(self), self.stepper.dimension)
@@ -508,11 +544,16 @@ class Ensemble:
         return replace(whole, actions=actions, events=tuple(each.events for each in lanes))
 
     def _successive_result(self, work: SuccessiveRuns) -> EnsembleTrajectory:
-        count, rows, words = len(self), 1 + int(work.stored.max()), self.stepper.interface.words
-        indices = [each.indices() for each in self.states]
-        places = [np.arange(count), *(row * count + trajectory for row, trajectory in indices)]
+        count, words, full = len(self), self.stepper.interface.words, work.status == FULL
+        stored = np.where(full, np.minimum(work.stored, 1), work.stored)  # the last state of those with too many
+        rows = 1 + int(stored.max())
         index = np.full((rows, count), -1)  # of the states in the order in which C stored them; the last row is NaN
-        index.reshape(-1)[np.concatenate(places)] = np.arange(sum(map(len, places)))
+        index[0], first = np.arange(count), count
+        for row, trajectory in (each.indices() for each in self.states):
+            place = np.where(full[trajectory], np.where(row == work.stored[trajectory], 1, rows), row)
+            wanted = place < rows
+            index[place[wanted], trajectory[wanted]] = first + np.flatnonzero(wanted)
+            first += len(row)
 
         def ordered(name: str, first: Array) -> Array:
             """Return the rows of all trajectories, NaN after their ends."""
@@ -527,7 +568,7 @@ class Ensemble:
             numbers, times = np.arange(rows, dtype=float), ordered("t", start)
             own: Array | None = times
             if self.fixed is not None:
-                numbers, own = times[:, work.stored.argmax()], None
+                numbers, own = times[:, stored.argmax()], None
             whole = self._trajectories(numbers, own, q, p, work.names, work.done, work.fallback_steps)
             sums = self.stepper.sums_action
             return replace(whole, actions=ordered("actions", np.zeros(count))) if sums else whole

@@ -52,7 +52,7 @@ class EnsembleRuns:
     Attributes:
         t: (n,) common times; tau from 0 in transformed time; row numbers if every trajectory has its own times.
         status: (k,) ``"ok"``, or the reason of the end (``"not converged"``, ``"singular"``, ``"not finite"``,
-            ``"step size underflow"``, ``"interrupted"``).
+            ``"step size underflow"``, ``"interrupted"``, ``"too many states"`` for the memory).
         steps: (k,) completed steps.
         h: step size; 0 for adaptive steps.
         parameters: (k, number of parameters) values; zeros for the parameters of inputs.

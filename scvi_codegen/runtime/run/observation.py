@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import EventError, StateError, StepFailedError, closest
 from scvi_codegen.native.arguments import real_array
+from scvi_codegen.native.capacity import room_for_states, too_many_states
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.core.words import Words, fraction_of, stacked
 from scvi_codegen.runtime.events.refinement import search_of
@@ -84,6 +85,14 @@ class Saver(Observer):
     def __init__(self, save_every: int = 1, *, within_steps: bool = True) -> None:
         self.save_every, self.within_steps = checked_count(save_every, "save_every", least=1), within_steps
         self.rows: list[tuple[Array, Array, Array, Array, Array, NDArray[np.int64], Array]] = []
+        self.measured, self.bytes = 0, 0
+
+    def check_room(self, run: Memory) -> None:
+        """Raise ``StepFailedError`` if the saved states fill the memory."""
+        self.bytes += sum(each.nbytes for rows in self.rows[self.measured :] for each in rows)
+        self.measured = len(self.rows)
+        if self.bytes > room_for_states():
+            raise too_many_states(sum(len(each[0]) for each in self.rows), run.steps, float(run.t))
 
     def wanted(self, chunk: StateChunk) -> NDArray[np.bool_]:
         """Return which states of a chunk to save."""
@@ -267,6 +276,7 @@ class Observation:
             before, number = run.t, run.steps
             part, numbers, failure = take(int(min(size, self.saver.most_steps(run))))
             self._pass_on(part, numbers)
+            self.saver.check_room(run)
             if isinstance(failure, EventError):
                 failure.trajectory = self.trajectory()
             if failure is not None:

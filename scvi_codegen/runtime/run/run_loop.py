@@ -11,6 +11,7 @@ import numpy as np
 
 from scvi_codegen.errors import StepFailedError
 from scvi_codegen.native.arguments import empty_array
+from scvi_codegen.native.capacity import room_for_states, too_many_states
 from scvi_codegen.runtime.core.validation import BINARY64, FEW, NUMBERS, SEQUENCES, Array
 from scvi_codegen.runtime.core.words import block_of, from_block
 from scvi_codegen.runtime.events.event import Crossings
@@ -237,6 +238,7 @@ class _StateRecorder:
             for each in actions:
                 each[0] = memory._memory.action
         self.earlier: list[States] = []
+        self.bytes = 0
         self.watch = ProgressWatch(memory.stepper, plan.t_end) if isinstance(plan, InTau) else None
 
     def advance(self, size: int) -> int:
@@ -246,6 +248,10 @@ class _StateRecorder:
         before = None if watch is None else memory.t
         if to_end and self.filled + size // save_every + 2 > len(self.rows.states[0]):
             self.earlier.append(self._states())
+            self.bytes += sum(each.nbytes for each in self.earlier[-1])
+            if self.bytes > room_for_states():
+                self.filled = 0
+                raise too_many_states(sum(len(each[0]) for each in self.earlier), memory.steps, float(memory.t))
             self.rows, self.filled = StateRows(memory, size // save_every + 2), 0
         rows, filled = self.rows, self.filled
         status = memory._advance(size, save_every, rows.after(filled))
