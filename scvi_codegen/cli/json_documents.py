@@ -58,6 +58,7 @@ def run_numbers(
         "final_error": None if known is None else {"q": _named(model, known.q), "p": _named(model, known.p)},
         "chaotic": None if known is None else known.chaotic,
         "failure": failure_text(outcome),
+        "missed": outcome.missed or _missed_end(outcome, t, f"t = {model.t + model.covered:g}"),
     }
 
 
@@ -73,6 +74,17 @@ def failure_text(outcome: RunOutcome | RecordedOutcome) -> str | None:
     if outcome.interrupted:
         return "interrupted"
     return None if outcome.failure is None else str(outcome.failure)
+
+
+def _missed_end(outcome: RunOutcome | RecordedOutcome, t: float, end: str) -> str | None:
+    """Return the message that a run is incomplete; ``None`` if it is complete."""
+    return None if failure_text(outcome) is None else f"the run ended at t = {t:g}, before {end}"
+
+
+def outcome_numbers(outcome: RecordedOutcome) -> dict[str, Any]:
+    """Return the numbers of a run that was recorded or resumed in a folder."""
+    end = _missed_end(outcome, float(outcome.recorded.t[-1]), "its end")
+    return {**recorded_numbers(outcome.recorded), "failure": failure_text(outcome), "missed": end}
 
 
 def recorded_numbers(recorded: RecordedRun) -> dict[str, Any]:
@@ -98,6 +110,7 @@ def recorded_numbers(recorded: RecordedRun) -> dict[str, Any]:
 def ensemble_numbers(model: Model, outcome: EnsembleOutcome, balance: float | None) -> dict[str, Any]:
     """Return the numbers of an ensemble."""
     result = outcome.result
+    lost = len(result) - np.count_nonzero(result.ok)
     return {
         **_about(model),
         "trajectories": len(result),
@@ -110,6 +123,7 @@ def ensemble_numbers(model: Model, outcome: EnsembleOutcome, balance: float | No
         "action": result.action() if model.action else None,
         "energy_balance": balance,
         "failure": "interrupted" if outcome.interrupted else None,
+        "missed": f"{lost} of {len(result)} trajectories ended before their final time" if lost else None,
     }
 
 

@@ -213,15 +213,15 @@ def _check_method(choices: Choices) -> None:
     if method is None:
         return
     message = specification_of(method)
-    taken = ARGUMENTS[message["method"]]
+    taken, flags = ARGUMENTS[message["method"]], {option.name: option.flag for option in OPTIONS}
     for option in METHOD_KEYS[1:]:
         value = choices.get(option)
         if value is not None and option not in taken:
-            takes = ", ".join(f"--{one}" for one in taken if one in METHOD_KEYS) or "no options"
-            raise click.UsageError(f"--method {method} takes no --{option}; it takes {takes}")
+            takes = ", ".join(flags[one] for one in taken if one in METHOD_KEYS) or "no options"
+            raise click.UsageError(f"--method {method} takes no {flags[option]}; it takes {takes}")
         if value is not None and message.get(option, value) != value:
             raise click.UsageError(
-                f"--method {method} and --{option} {value} contradict each other: leave one of them out"
+                f"--method {method} and {flags[option]} {value} contradict each other: leave one of them out"
             )
 
 

@@ -13,6 +13,7 @@ from scvi_codegen.cli.reports import duration
 from scvi_codegen.errors import AccuracyWarning, StateError
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.ensemble_file import EnsembleStates
+from scvi_codegen.models.options import OF_ADAPTIVE_STEPS
 from scvi_codegen.rendering.source import DOUBLE_DOUBLE, PRECISIONS
 from scvi_codegen.runtime.accuracy.global_error import GlobalError
 from scvi_codegen.runtime.core.features import refusal, require
@@ -66,9 +67,8 @@ def model_with_global_error(model: Model, error: float) -> tuple[Model, GlobalEr
     )
     if result.h:
         signed = math.copysign(result.h, wanted.covered)
-        return replace(
-            wanted, h=signed, absolute_tolerance=None, max_step=None, span=abs(wanted.covered), error=None
-        ), result
+        fixed: dict[str, Any] = dict.fromkeys(OF_ADAPTIVE_STEPS)
+        return replace(wanted, h=signed, **fixed, span=abs(wanted.covered), error=None), result
     precision = DOUBLE_DOUBLE if in_words else wanted.precision
     steps: dict[str, Any] = dict(result.steps)
     return replace(wanted, **steps, error=None, precision=precision), result

@@ -62,25 +62,13 @@ def with_time_transformation(
             Integration*, VIII.2 and VIII.3.
 
     Raises:
-        SystemDefinitionError: for a controller of steps in tau without a time transformation, or of others with one,
-            an unknown controller, and as :func:`reparametrise`.
+        SystemDefinitionError: as :func:`check_controller` and as :func:`reparametrise`.
     """
-    if controller not in (None, SYMPLECTIC, *CONTROLLERS):
-        raise SystemDefinitionError(f"controller must be {' or '.join([SYMPLECTIC, *CONTROLLERS])}, not {controller!r}")
-    in_tau = controller == SYMPLECTIC or (controller is not None and CONTROLLERS[controller].in_tau)
+    check_controller(controller, transformed=g is not None)
     if g is None:
-        if in_tau:
-            raise SystemDefinitionError(
-                f'the {controller} controller requires a time transformation: give "frequency", or a formula'
-            )
         return system, None
     if controller in (None, SYMPLECTIC):
         return reparametrise(system, g), None
-    if not in_tau:
-        raise SystemDefinitionError(
-            f"the {controller} controller determines adaptive steps: leave out the time transformation, or give "
-            "another controller"
-        )
     if system.clock is not None:
         raise SystemDefinitionError(
             f"'{system.name}' has a time transformation already, which controls its steps: leave out "
@@ -88,3 +76,19 @@ def with_time_transformation(
         )
     time_rescaling_function(system, g, in_time=True)  # validated here rather than at the first step
     return system, g
+
+
+def check_controller(controller: str | None, *, transformed: bool) -> None:
+    """Raise ``SystemDefinitionError`` for an unknown controller, and for one of tau, or of time, that cannot act."""
+    if controller not in (None, SYMPLECTIC, *CONTROLLERS):
+        raise SystemDefinitionError(f"controller must be {' or '.join([SYMPLECTIC, *CONTROLLERS])}, not {controller!r}")
+    in_tau = controller == SYMPLECTIC or (controller is not None and CONTROLLERS[controller].in_tau)
+    if in_tau and not transformed:
+        raise SystemDefinitionError(
+            f'the {controller} controller requires a time transformation: give "frequency", or a formula'
+        )
+    if transformed and controller is not None and not in_tau:
+        raise SystemDefinitionError(
+            f"the {controller} controller determines adaptive steps: leave out the time transformation, or give "
+            "another controller"
+        )

@@ -11,7 +11,7 @@ from sympy import Expr, Symbol
 from scvi_codegen.errors import SystemDefinitionError, SystemDefinitionWarning, closest, warn
 from scvi_codegen.formulas.expressions import Tape, hessian, jacobian, kinked_root, unsupported_part
 from scvi_codegen.formulas.symbols import DOT, PARTS, TIME, check_names, number, symbol
-from scvi_codegen.mechanics.constraints import constraint_jacobian, forms_of_constraints
+from scvi_codegen.mechanics.constraints import constraint_jacobian, forms_of_constraints, without_coordinate
 from scvi_codegen.mechanics.continuity import corner_message, jump_message, jump_of
 from scvi_codegen.mechanics.derived_expressions import forms_of, null_direction, row_rank, sample_points, singular_part
 from scvi_codegen.mechanics.forces import check_damping
@@ -241,10 +241,7 @@ def _check_constraints(system: MechanicalSystem) -> None:
     names = system.constraint_texts
     for name, g in zip(names, system.constraints, strict=True):
         if g.free_symbols.isdisjoint((*system.coordinates, *system.velocities)):
-            raise SystemDefinitionError(
-                f"the constraint '{name} = 0' contains no coordinate: constraints are {forms_of_constraints()}. Remove "
-                "it, or write the condition in terms of the coordinates"
-            )
+            raise SystemDefinitionError(without_coordinate(f"{name} = 0"))
     for k, i in jacobian(list(constraint_jacobian(system).values()), system.velocities):
         name = names[list(constraint_jacobian(system))[k][0]]
         raise SystemDefinitionError(

@@ -250,7 +250,7 @@ class Model(TimeSpan):
         constants = zip(self.system.parameters, self.system.defaults, strict=True)
         return {**{symbol.name: value for symbol, value in constants if symbol.name not in others}, **self.fields}
 
-    def first_step(self, stepper: Stepper) -> float:
+    def first_step_size(self, stepper: Stepper) -> float:
         """Return h, or the size of the first adaptive step; with a time transformation, the step size in tau."""
         if self.h is not None and self.time_transformation is None:
             return self.h

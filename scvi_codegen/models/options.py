@@ -156,6 +156,12 @@ class RunOptions:
         invalid="max_step is {value:g}: it must be positive, also for a run backward in time",
         common=False,
     )
+    first_step: float | None = run_option(
+        *("run", NUMBER, "H", "Size of the first adaptive step, reduced if its error is too large."),
+        valid=lambda value: value > 0.0,
+        invalid="first_step is {value:g}: it must be positive, also for a run backward in time",
+        common=False,
+    )
     error: float | None = run_option(
         *("run", NUMBER, "X"),
         "Adaptive step size with this bound on the relative global error, confirmed by runs with other step sizes.",
@@ -326,6 +332,8 @@ RUN_FIELDS = tuple(option for option in FIELDS if option.kind != NUMBERS)
 """Those of them that are fields of :class:`RunOptions`."""
 METHOD_KEYS = tuple(option.name for option in options_of("method") if option.common)
 """Options that specify the method."""
+OF_ADAPTIVE_STEPS = ("absolute_tolerance", "max_step", "first_step")
+"""Options of adaptive steps besides the tolerance."""
 STATE = {option.key: option.field for option in options_of("initial") if option.kind == NUMBERS}
 """Field of a model by key of ``[initial]``."""
 

@@ -10,6 +10,7 @@ from scvi_codegen.controllers import default_controller
 from scvi_codegen.errors import MethodWarning, ModelFileError, warn
 from scvi_codegen.models.options import (
     DURATION,
+    OF_ADAPTIVE_STEPS,
     OPTIONS,
     RUN_FIELDS,
     STEP_SIZE,
@@ -35,7 +36,7 @@ class TimeSpan(RunOptions):
             transformation, :func:`largest_step` chooses the step size in tau for it.
         absolute_tolerance: size below which errors of an adaptive step do not matter, a number or numbers by name of
             coordinate, array or rotation; ``None`` for 0.
-        max_step: largest size of adaptive steps, or ``None``.
+        max_step, first_step: largest and first size of adaptive steps, or ``None``.
         error: instead of a step size and a tolerance, bound of the relative global error of all states: runs choose
             their local tolerance as ``integrate(error=)`` does, and warn if the bound is not confirmed.
         span: time span, positive, or ``None`` if ``steps`` is given. With adaptive steps negative for a run backward.
@@ -124,7 +125,7 @@ class TimeSpan(RunOptions):
     @property
     def _control(self) -> dict[str, Any]:
         """Arguments of adaptive steps besides the tolerance that are set, by name."""
-        values = {name: getattr(self, name) for name in ("absolute_tolerance", "max_step")}
+        values = {name: getattr(self, name) for name in OF_ADAPTIVE_STEPS}
         return {name: value for name, value in values.items() if value is not None}
 
     def _with_step_size(self, *, steps: int | None = None, **chosen: Any) -> Self:

@@ -279,6 +279,7 @@ def _entry(folder: Path, model: Model, interface: Any, initial: Sequence[str], a
             values=numbers, sizes=list(interface.sizes.values()) if interface.array else (), tables=tables,
             constraints=interface.constraints, adaptive=adaptive, initial=initial,
             transformed=model.time_transformation is not None, max_step=model.max_step,
+            first_step=model.first_step,
             absolute_tolerances=_absolute_tolerances(model, interface), events=model.events,
             acting=any(each.changes_state for each in model.events), velocities=not starts_from_momenta(model),
             level=interface.parameters.index(energy) if (energy := interface.energy_parameter) else None,

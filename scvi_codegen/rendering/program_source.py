@@ -98,7 +98,7 @@ class ExampleRun:
         h: step size, ``None`` for adaptive steps.
         span: of time.
         tolerance: of adaptive steps; with a time transformation the step tau.
-        max_step: largest size of adaptive steps, or ``None``.
+        max_step, first_step: largest and first size of adaptive steps, or ``None``.
         absolute_tolerances: (m,) of adaptive steps; none if all are 0.
         controlled: whether the integrator has adaptive steps or a time transformation.
         save_every, outputs: steps to an output and number of outputs.
@@ -118,6 +118,7 @@ class ExampleRun:
     span: float
     tolerance: float
     max_step: float | None = None
+    first_step: float | None = None
     absolute_tolerances: tuple[float, ...] = ()
     controlled: bool
     save_every: int

@@ -57,6 +57,7 @@ def test_quiet_prints_nothing_and_json_prints_one_document(words):
 def test_failed_run_reports_how_far_it_got():
     found = json_of("run", "kepler", "--q", "1,0", "--velocity", "0,0", "--tolerance", "1e-9", "--span", "3", status=1)
     assert "step" in found["failure"]
+    assert re.fullmatch(r"the run ended at t = 1\.1\d*, before t = 3", found["missed"])
     assert 1.0 < found["final"]["t"] < math.pi / 8**0.5
     far = (
         "--q",

@@ -716,3 +716,8 @@ def test_ball_joints_of_rotations_need_no_newton_iteration():
     assert one.fallback_steps == 0
     assert np.abs(one.q[-1] - other.q[-1]).max() < 1e-14
     assert np.abs(one.p[-1] - other.p[-1]).max() < 1e-14
+
+
+def test_constraint_of_numbers_is_refused_as_written():
+    with pytest.raises(sc.SystemDefinitionError, match="the constraint '1=2' contains no coordinate"):
+        sc.LagrangianSystem.from_text("a", ["x"], "x_dot**2/2", constraints=["1=2"])

@@ -174,4 +174,4 @@ def test_names_that_are_not_inputs_are_rejected():
     with pytest.raises(ModelFileError, match=message):
         next(model.segments(model.start(stepper)))
     with pytest.raises(ModelFileError, match=message):
-        Model(**given | {"h": None}).first_step(stepper)
+        Model(**given | {"h": None}).first_step_size(stepper)

@@ -76,7 +76,7 @@ def test_single_step_functions_use_the_first_step_of_the_run(run: dict[str, floa
     """Single steps, as certificates take them, are steps of tau in transformed time."""
     model = catalogue_model("kepler", {"run": run, "system": system})
     stepper = model.stepper()
-    h = model.first_step(stepper)
+    h = model.first_step_size(stepper)
     started = model.start(stepper)
     started.advance(1)
     if system:

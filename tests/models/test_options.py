@@ -24,6 +24,7 @@ RUNS = {
     "tolerance": 1e-6,
     "absolute_tolerance": 1e-9,
     "max_step": 0.5,
+    "first_step": 0.125,
     "error": 1e-5,
     "span": 3.0,
     "steps": 4,
@@ -61,7 +62,7 @@ def test_key_of_an_option_sets_its_field_and_is_written(option):
         if option in (one, other):
             values.pop((other if option is one else one).name, None)
     values[option.name] = RUNS[option.name]
-    if option.name in ("tolerance", "absolute_tolerance", "max_step", "error"):
+    if option.name in ("tolerance", "absolute_tolerance", "max_step", "first_step", "error"):
         values.pop("step", None)
     sections = {"initial": [], "run": []}
     for each in FIELDS:
@@ -111,8 +112,9 @@ OCCURRENCES = {
         *("cli/commands/run.py", "cli/step_selection.py", "cli/json_documents.py", "cli/commands/verify.py"),
         *("models/model.py", "models/packages/example.py", "models/time_span.py"),
     },
-    "absolute_tolerance": {*("models/time_span.py", "models/packages/package.py", "cli/step_selection.py")},
-    "max_step": {"models/time_span.py", "models/packages/example.py", "cli/step_selection.py"},
+    "absolute_tolerance": {"models/packages/package.py"},
+    "max_step": {"models/packages/example.py", "cli/step_selection.py"},
+    "first_step": {"models/packages/example.py"},
     "error": {"cli/commands/run.py", "cli/commands/path.py", "cli/step_selection.py", "models/model.py"},
     "save_every": {"cli/recording.py", "cli/running.py", "models/packages/example.py"},
     "solver_tolerance": set(),

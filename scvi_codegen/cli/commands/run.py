@@ -16,7 +16,7 @@ from scvi_codegen.cli.command_group import (
     tell,
 )
 from scvi_codegen.cli.ensembles import energy_balance, ensemble_summary, integrate_states
-from scvi_codegen.cli.json_documents import ensemble_numbers, failure_text, recorded_numbers, run_numbers
+from scvi_codegen.cli.json_documents import ensemble_numbers, outcome_numbers, run_numbers
 from scvi_codegen.cli.model_options import check_flag, model_arguments, read_model, with_known_sizes
 from scvi_codegen.cli.recording import RecordedOutcome, Recording, check_format, check_resumed, is_run_folder
 from scvi_codegen.cli.reports import known_account
@@ -255,21 +255,20 @@ def _run_one(model: Model, output: str | None, plot: str | None, *, advised: flo
     if outcome.interrupted:
         raise CommandFailure(f"interrupted at t = {outcome.run.t:g}\n{_kept(outcome, written)}", INTERRUPTED)
     if outcome.missed is not None:
-        tell(missed=outcome.missed)
         raise CommandFailure(f"{outcome.missed}\n{_kept(outcome, written)}", FAILURE)
     for path in written:
         tell(f"wrote {path}")
     missed = ""
     if advised is not None:
         missed = missed_tolerance(second_stepper(model.system), outcome.trajectory, advised, known)
-    tell(missed=missed or None)
     if missed:
+        tell(missed=missed)
         raise CommandFailure(missed, FAILURE)
 
 
 def _finish_recording(outcome: RecordedOutcome) -> None:
     """Print the summary of a run in a folder, and how to continue it."""
-    tell(outcome.summary(), **recorded_numbers(outcome.recorded), failure=failure_text(outcome))
+    tell(outcome.summary(), **outcome_numbers(outcome))
     if outcome.failure is not None:
         raise CommandFailure(f"{outcome.failure}\n{outcome.continuation()}", FAILURE)
     if outcome.interrupted:
@@ -299,8 +298,8 @@ def _run_ensemble(
     if advised is not None:
         second, good = second_stepper(model.system), outcome.result.ok[member]
         missed = missed_tolerance(second, outcome.result[member], advised) if good else ""
-        tell(missed=missed or None)
         if missed:
+            tell(missed=missed)
             raise CommandFailure(f"trajectory {member}: {missed}", FAILURE)
 
 

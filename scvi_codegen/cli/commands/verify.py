@@ -74,7 +74,7 @@ def _certificate(model: Model, stepper: Stepper) -> Certificate:
     if model.array_system is not None:
         arguments: dict[str, Any] = {"h": model.step, "parameters": model.fields}
     else:
-        arguments = {"h": model.first_step(stepper), "tolerance": model.allowed_error, "solver": model.solver}
+        arguments = {"h": model.first_step_size(stepper), "tolerance": model.allowed_error, "solver": model.solver}
     return verification.verify(model.system, model.method, **state, **arguments, stepper=stepper)
 
 

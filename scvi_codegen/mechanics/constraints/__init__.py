@@ -33,6 +33,14 @@ def forms_of_constraints() -> str:
     return ", or ".join(kind.form for kind in CONSTRAINT_KINDS.values())
 
 
+def without_coordinate(shown: str) -> str:
+    """Return the message for a constraint without coordinates."""
+    return (
+        f"the constraint '{shown}' contains no coordinate: constraints are {forms_of_constraints()}. Remove it, or "
+        "write the condition in terms of the coordinates"
+    )
+
+
 def constraint_sides(formula: Any) -> tuple[list[Any], Callable[[Sequence[Expr], Rate], Expr]]:
     """Return the sides of a constraint, and the function that returns its expression from them.
 
@@ -63,9 +71,18 @@ def constraints_of(constraints: Iterable[Any] | None, read: Callable[[Any], Expr
         constraints: formulas and equations.
         read: converts a side to an expression in canonical symbols.
         rate: returns the time derivative of such an expression.
+
+    Raises:
+        SystemDefinitionError: for a formula of numbers.
     """
-    split = map(constraint_sides, constraints or ())
-    return tuple(expression([read(side) for side in sides], rate) for sides, expression in split)
+    result = []
+    for formula in constraints or ():
+        sides, expression = constraint_sides(formula)
+        read_sides = [read(side) for side in sides]
+        if all(side.is_number for side in read_sides):
+            raise SystemDefinitionError(without_coordinate(str(formula)))
+        result.append(expression(read_sides, rate))
+    return tuple(result)
 
 
 def kind_of(system: Constrained, expression: Expr) -> ConstraintKind:

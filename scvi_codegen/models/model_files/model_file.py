@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from scvi_codegen.controllers import SYMPLECTIC, default_controller, with_time_transformation
+from scvi_codegen.controllers import SYMPLECTIC, check_controller, default_controller, with_time_transformation
 from scvi_codegen.errors import ModelFileError, SystemDefinitionWarning
 from scvi_codegen.files.atomic import write_text
 from scvi_codegen.files.toml_text import read_toml
@@ -52,7 +52,7 @@ from scvi_codegen.models.model_files.sections import (
     words_of,
 )
 from scvi_codegen.models.model_files.values import read_values
-from scvi_codegen.models.options import STATE, STEP_KEYS, options_of, with_exact_numbers
+from scvi_codegen.models.options import OF_ADAPTIVE_STEPS, STATE, STEP_KEYS, options_of, with_exact_numbers
 from scvi_codegen.rendering.source import DOUBLE_DOUBLE
 from scvi_codegen.validation import ExactNumber, checks_arguments, of
 
@@ -276,6 +276,7 @@ def _with_time_transformation(model: Model, document: Document, specification: S
     """Return the model with the time transformation of its file; warn of probable mistakes in the formulas."""
     g, controller = document.get("system", {}).get("time_transformation"), document["run"].get("controller")
     if g is not None or controller is not None:
+        in_section("[run] controller", partial(check_controller, controller, transformed=g is not None))
         model, where = model.with_known_sizes() if g else model, "[system] time_transformation"
         system, g = in_section(where, lambda: with_time_transformation(model.system, g, controller))
         default = default_controller(in_tau=g is not None)
@@ -298,7 +299,7 @@ def _without_inherited_step(layer: Document) -> Document:
     """
     run = layer.get("run", {})
     if run.get("step") is not None:
-        return {**layer, "run": {**dict.fromkeys(("absolute_tolerance", "max_step")), **run}}
+        return {**layer, "run": {**dict.fromkeys(OF_ADAPTIVE_STEPS), **run}}
     if "time_transformation" not in layer.get("system", {}) or STEP_KEYS & run.keys():
         return layer
     return {**layer, "run": {**run, **dict.fromkeys(STEP_KEYS)}}

@@ -15,7 +15,16 @@ from scvi_codegen.mechanics.legendre import lagrangian_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import ARGUMENTS, Method, method_from_specification, sized, specification_of
 from scvi_codegen.models.model import DEFAULT_METHOD
-from scvi_codegen.models.options import ALTERNATIVE_KEYS, FIELDS, KEYED, STEP_KEYS, alternatives, options_of, real
+from scvi_codegen.models.options import (
+    ALTERNATIVE_KEYS,
+    FIELDS,
+    KEYED,
+    STEP_KEYS,
+    SWITCH,
+    alternatives,
+    options_of,
+    real,
+)
 from scvi_codegen.runtime.events.event import Event
 from scvi_codegen.validation import FORMULA, checked_count, likely_names, synonym_hint
 
@@ -31,10 +40,6 @@ LOCATIONS: Final = {
     **{key: f"there is a section [{key}]" for key in NAMED_SECTIONS},
 }
 """Location of each key in a model file."""
-PYTHON_ONLY: Final = {
-    "first_step": "; it is an argument of integrate() in Python only: omit it, or limit all steps by max_step."
-}
-"""Arguments of runs that model files do not have, and their remedies."""
 
 
 def key_hint(key: str, names: Iterable[str]) -> str:
@@ -44,8 +49,6 @@ def key_hint(key: str, names: Iterable[str]) -> str:
         key: the unknown key.
         names: known keys of its section.
     """
-    if key in PYTHON_ONLY:
-        return PYTHON_ONLY[key]
     known = list(names)
     if here := synonym_hint(key, known):
         return here
@@ -111,6 +114,10 @@ def _changed_method(base: Section, changes: Section) -> Section:
     if name != base_section.get("method"):
         accepted = ARGUMENTS.get(name, ())
         base_section = {key: value for key, value in base_section.items() if key in INHERITED and key in accepted}
+    for option in options_of("method"):  # a switch is named otherwise on the command line
+        if option.kind == SWITCH and option.key in changes and option.key not in ARGUMENTS.get(name, (option.key,)):
+            takers = " or ".join(other for other in ARGUMENTS if option.key in ARGUMENTS[other])
+            raise ModelFileError(f"{option.flag} is for the method {takers}, not for {name}: omit it")
     if {"abscissae", "space"} & changes.keys():
         base_section.pop("nodes", None)  # alternatives to nodes
     return sized({**base_section, **changes}) if "method" in changes else {**base_section, **changes}

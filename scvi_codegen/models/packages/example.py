@@ -84,6 +84,7 @@ def example_of(model: Model, *, controlled: bool) -> ExampleRun:
         span=model.covered,
         tolerance=tolerance,
         max_step=model.max_step,
+        first_step=model.first_step,
         controlled=controlled,
         save_every=save_every,
         outputs=outputs,

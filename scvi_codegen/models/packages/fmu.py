@@ -206,7 +206,7 @@ def generate_fmu(
     target = Path(path)
     if target.suffix != ".fmu":
         raise PackageError(f"the name of an FMU must end with .fmu, as in {target.name or 'model'}.fmu")
-    prefix = prefix_of(target.with_suffix(""))
+    prefix = prefix_of(target.with_suffix(""), "FMU", target.suffix)
     _check(platforms)
     if not force:
         _refuse_to_lose(target)

@@ -164,24 +164,24 @@ def damaged(folder: Path, error: Exception) -> PackageError:
     return PackageError(f"{folder / INTERFACE_FILE} is damaged ({error!r}): generate the folder again")
 
 
-def prefix_of(folder: Path) -> str:
-    """Return the name of the folder, validated as a prefix of C names and as a Python module."""
+def prefix_of(folder: Path, kind: str = "folder", suffix: str = "") -> str:
+    """Return the name of a folder, or of another kind of target, validated as a prefix of C names and of a module."""
     from scvi_codegen.pipeline import LONGEST_PREFIX, c_identifier  # imported here: it imports SymPy
 
     try:
         name = folder.resolve().name
         name.encode()
     except ValueError as error:
-        raise PackageError(f"{str(folder)!r} cannot be the name of a folder: {error}") from error
+        raise PackageError(f"{str(folder)!r} cannot be the name of a {kind}: {error}") from error
     cleaned = c_identifier(name)
     if name != cleaned:
         raise PackageError(
-            "the name of the folder must be a prefix of C names and a name of a Python package; "
+            f"the name of the {kind} must be a prefix of C names and a name of a Python package; "
             f"'{name}' is not (lower-case letters, digits and underscores, at most {LONGEST_PREFIX}): "
-            f"use '{cleaned}'"
+            f"use '{cleaned}{suffix}'{', or give --fmu' if name.endswith('.fmu') else ''}"
         )
     if keyword.iskeyword(name) or name in sys.stdlib_module_names or name in OTHER_NAMES:
-        raise PackageError(f"'{name}' is reserved in C or Python: use '{name}_integrator' for the folder")
+        raise PackageError(f"'{name}' is reserved in C or Python: use '{name}_integrator{suffix}' for the {kind}")
     return name
 
 
