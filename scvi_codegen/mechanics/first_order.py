@@ -145,6 +145,14 @@ class OneForm:
         """H, minus the terms without velocities."""
         return -self.lagrangian.xreplace(dict.fromkeys(self.velocities, sympy.S.Zero))
 
+    def at(self, places: Mapping[Symbol, Expr]) -> "OneForm":
+        """Return the form in the coordinates a z + b of ``places``, with the names of z."""
+        moved: dict[Expr, Expr] = {}
+        for z, v in zip(self.coordinates, self.velocities, strict=True):
+            factor = places[z].diff(z)
+            moved |= {v: v / factor, z: (z - places[z]) / factor + z, places[z]: z}
+        return replace(self, lagrangian=self.lagrangian.xreplace(moved))
+
     def omega(self, i: int, j: int) -> Expr:
         """Return the entry d theta_j / d z_i - d theta_i / d z_j of the two-form d theta."""
         return self.theta[j].diff(self.coordinates[i]) - self.theta[i].diff(self.coordinates[j])
@@ -230,8 +238,36 @@ def first_order_system(fields: Mapping[str, Any]) -> FirstOrderSystem | None:
     return FirstOrderSystem(**common, **first_order_form(form), definition=fields.get("definition") or text)
 
 
+def places(form: OneForm) -> dict[Symbol, Expr]:
+    """Return for each coordinate z the expression a z + b in which theta contains it most often, or z itself.
+
+    a and b depend on parameters alone. Of equally frequent ones z is preferred, then the first.
+    """
+    kinds: dict[Symbol, dict[Expr, list[Expr]]] = {z: {} for z in form.coordinates}  # by their zero
+    variables = {*form.coordinates, form.time}
+
+    def collect(expression: Expr) -> None:
+        occurring = expression.free_symbols & variables
+        if len(occurring) == 1 and (z := next(iter(occurring))) in kinds:
+            factor = expression.diff(z)
+            if not factor.has(z):
+                zero = sympy.expand(z - expression / factor)
+                kinds[z].setdefault(zero, []).append(expression if zero else z)
+                return
+        for argument in expression.args if occurring else ():
+            collect(argument)
+
+    for component in form.theta:
+        collect(component)
+    most = {z: max(kind.values(), key=lambda each: (len(each), each[0] == z), default=[z]) for z, kind in kinds.items()}
+    return {z: max(expressions, key=expressions.count) for z, expressions in most.items()}
+
+
 def first_order_form(form: OneForm) -> dict[str, Any]:
     """Return the fields of a :class:`FirstOrderSystem` that its one-form determines.
+
+    Integrals are expanded about the origins and in the units in which theta is written, x - 1000 or x/l + c:
+    expanded about x = 0, momenta there would be small differences of large terms.
 
     Raises:
         SystemDefinitionError: if omega is singular, does not vanish between any half of the coordinates, or theta_y has
@@ -241,20 +277,28 @@ def first_order_form(form: OneForm) -> dict[str, Any]:
     candidates: list[tuple[int, tuple[int, ...], Expr, tuple[Expr, ...]]] = []
     refused: list[tuple[int, ...]] = []
     z, n = form.coordinates, len(form.coordinates)
-    for chosen, _ in zip(form.choices(), range(MOST_CHOICES), strict=False):
-        integral = form.integral(chosen)
+    placed = form.at(expressions := places(form))
+    for chosen, _ in zip(placed.choices(), range(MOST_CHOICES), strict=False):
+        integral = placed.integral(chosen)
         if integral is None:
             refused.append(chosen)
             continue
         rest = [i for i in range(n) if i not in chosen]
-        theta = tuple(sympy.expand(form.theta[i] - integral.diff(z[i])) if integral else form.theta[i] for i in rest)
+        theta = tuple(
+            sympy.expand(placed.theta[i] - integral.diff(z[i])) if integral else placed.theta[i] for i in rest
+        )
         candidates.append((int(sympy.count_ops(theta)), chosen, integral, theta))
         if integral == 0:
             break
     if not candidates:
         raise SystemDefinitionError(_refusal(form, refused))
     _, chosen, integral, theta = min(candidates, key=lambda each: each[:2])
+    integral = integral.xreplace(expressions)
     rest = [i for i in range(n) if i not in chosen]
+    theta = tuple(
+        expressions[z[i]].diff(z[i]) * each.xreplace(expressions) if integral else form.theta[i]
+        for i, each in zip(rest, theta, strict=True)
+    )
     y = tuple(z[i] for i in chosen)
     order = sorted(range(len(y)), key=lambda k: theta.index(y[k])) if set(theta) == set(y) else range(len(y))
     return {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -280,6 +281,31 @@ def test_the_choice_with_the_shortest_one_form_is_used() -> None:
     fields = short.coordinates, short.momenta, short.one_form, short.integrated, short.hamiltonian
     x, y = short.variables
     assert fields == ((x,), (y,), (y**2,), x * y, x**2 + y**2)
+
+
+@pytest.mark.parametrize("name", ["Lotka-Volterra", "massless particle"])
+def test_integrals_are_expanded_about_the_origins_of_the_lagrangian(name: str) -> None:
+    """A motion at 1000 takes the steps of the same one at 0, also near an equilibrium, with errors of u |q|."""
+    names, text, _, start = CASES[name]
+    text = re.sub(r"\b([xy])\b", r"(\1 - 1000)", text)
+    here, there = system(name), sc.LagrangianSystem.from_text("moved", names, text)
+    moved = dict(zip(here.variables, (z - 1000 for z in there.variables), strict=True))
+    assert there.one_form == tuple(each.xreplace(moved) for each in here.one_form)
+    steppers = [sc.compile_stepper(each, "svi:2") for each in (here, there)]
+    equilibrium = {"Lotka-Volterra": (1.0, 2.0), "massless particle": (0.0, 0.0)}[name]
+    for state in (start, np.array(equilibrium) + 1e-3):
+        ends: dict[float | None, list[np.ndarray]] = {}
+        for tolerance in (None, 1e-6):
+            runs = [
+                stepper.integrate(np.array(state) + origin, t_end=1.0, tolerance=tolerance)
+                for stepper, origin in zip(steppers, (0.0, 1000.0), strict=True)
+            ]
+            fewer, more = sorted(len(run.t) + run.rejected_steps for run in runs)
+            assert more < 1.5 * fewer + 4
+            ends[tolerance] = [runs[0].variables[-1], runs[1].variables[-1] - 1000]
+        true = ends[None][0]
+        assert np.abs(ends[None][1] - true).max() < 1e-11
+        assert np.abs(ends[1e-6][1] - true).max() < 10 * np.abs(ends[1e-6][0] - true).max()
 
 
 def test_velocities_are_refused_and_available() -> None:
