@@ -1,6 +1,7 @@
 """Fixtures of all tests; what they are made from is in ``tools/samples.py``."""
 
 import gc
+import logging
 import os
 import signal
 import sys
@@ -20,6 +21,7 @@ from scvi_codegen import LagrangianSystem, Stepper
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.building import FLAGS_VARIABLE
 
+logging.getLogger("scvi_codegen").setLevel(logging.WARNING)  # slow compilations are not announced on stderr
 sys.addaudithook(programs.audit)
 signal.signal(signal.SIGINT, signal.default_int_handler)  # also where the tests run in the background of a shell
 

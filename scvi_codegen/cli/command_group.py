@@ -1,7 +1,8 @@
 """Framework shared by all commands: command group, error handling, exit status, reports and output files.
 
 A command whose result a program can use is decorated with :func:`reporting` and reports with :func:`tell`, as text and
-as numbers: by default the text is printed, with ``--json`` the numbers, with ``--quiet`` neither.
+as numbers: by default the text is printed, with ``--json`` the numbers, with ``--quiet`` neither. The document of
+``--json`` also contains the error that ended a command.
 """
 
 import json
@@ -106,9 +107,28 @@ class Commands(click.Group):
         return super().main(*arguments, **named)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run a command; convert errors into messages and exit statuses."""
-        with errors_as_messages():
-            return super().invoke(ctx)
+        """Run a command; convert errors into messages and exit statuses, with ``--json`` also into a document."""
+        if "--json" in ctx.args:
+            _begin_report(ctx)
+        try:
+            with errors_as_messages():
+                return super().invoke(ctx)
+        except click.ClickException as error:
+            if REPORT in ctx.meta:
+                ctx.meta[REPORT]["error"] = _described(error)
+            raise
+
+
+ERROR_FIELDS = ("status", "step", "t", "text", "column")
+"""Attributes of errors that their documents contain."""
+
+
+def _described(error: click.ClickException) -> dict[str, Any]:
+    """Return the type, the message, the exit status and the attributes of an error."""
+    cause = error.__cause__ or error
+    fields = {name: getattr(cause, name) for name in ERROR_FIELDS if hasattr(cause, name) and cause is not error}
+    about = {"type": type(cause).__name__, "message": error.format_message(), "exit_status": error.exit_code}
+    return about | fields
 
 
 @contextmanager
@@ -153,14 +173,12 @@ def _warnings_as_lines() -> Iterator[None]:
 def reporting(command: Command) -> Command:
     """Add the options ``--json`` and ``--quiet``, which :func:`tell` obeys, to a command."""
     flag = partial(click.option, is_flag=True, expose_value=False)
-    as_json = flag("--json", callback=_begin_report, help="Print one JSON document instead of text.")
+    as_json = flag("--json", help="Print one JSON document instead of text.")
     quiet = flag("--quiet", callback=_be_quiet, help="Print only errors and warnings; see the exit status.")
     return quiet(as_json(command))
 
 
-def _begin_report(context: click.Context, parameter: click.Parameter, wanted: bool) -> None:
-    if not wanted:
-        return
+def _begin_report(context: click.Context) -> None:
     report: dict[str, Any] = {}
     context.meta[REPORT] = report
 

@@ -1,6 +1,7 @@
 """Announcement of derivations and compilations that take longer than a second.
 
-They are announced on stderr where that is a terminal, and always by the logger ``scvi_codegen`` at level INFO.
+They are announced by the logger ``scvi_codegen`` at level INFO, and by a line on stderr unless that logger passes on
+messages of this level, or has a higher level, as by ``logging.getLogger("scvi_codegen").setLevel("WARNING")``.
 """
 
 import logging
@@ -20,8 +21,8 @@ def _print(message: str) -> None:
         print(f"scvi-codegen: {message} ...", file=sys.stderr, flush=True)
 
 
-def _print_on_terminal(message: str) -> None:
-    if sys.stderr is not None and sys.stderr.isatty():
+def _print_unless_logged(message: str) -> None:
+    if not LOGGER.isEnabledFor(logging.INFO) and LOGGER.level <= logging.INFO:
         _print(message)
 
 
@@ -36,7 +37,7 @@ def tell(message: str) -> None:
 @contextmanager
 def announced(message: str) -> Iterator[None]:
     """Announce a computation if it takes longer than a second."""
-    listener = _listener.get() or _print_on_terminal
+    listener = _listener.get() or _print_unless_logged
 
     def announce() -> None:
         LOGGER.info(message)

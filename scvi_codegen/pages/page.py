@@ -39,7 +39,7 @@ from scvi_codegen.models.model_files.page_section import (
     starts_from_momenta,
 )
 from scvi_codegen.models.packages.package import generate_package
-from scvi_codegen.pages.webassembly import LICENCES, webassembly
+from scvi_codegen.pages.webassembly import LICENCES, check_compiler, webassembly
 from scvi_codegen.pictures.recognition import shape_of
 from scvi_codegen.pictures.shape import DrawnSystem, shape_of_picture
 from scvi_codegen.rendering.environment import template_environment
@@ -124,6 +124,7 @@ def page(
         ArgumentError: for unknown arguments, and those of a motion beside a model.
         BuildError: without the extra ``compiler``, or if compilation fails.
     """
+    check_compiler()  # before the equations are derived
     given = {"ranges": ranges, "speed": speed, "plots": plots}
     settings = {name: value for name, value in given.items() if value is not None}
     if picture is not None:

@@ -45,14 +45,19 @@ LICENCES = (
 """Paragraphs of the notice of what is embedded in a page."""
 
 
+def check_compiler() -> None:
+    """Raise ``BuildError`` without the extra ``compiler``."""
+    if importlib.util.find_spec("ziglang") is None:
+        raise BuildError("a page requires a compiler to WebAssembly: pip install 'scvi-codegen[compiler]' (ziglang)")
+
+
 def webassembly(folder: Path, sources: tuple[str, ...]) -> str:
     """Return the compressed WebAssembly of C files in a folder, in base64.
 
     Raises:
         BuildError: without the extra ``compiler``, or if it rejects a file.
     """
-    if importlib.util.find_spec("ziglang") is None:
-        raise BuildError("a page requires a compiler to WebAssembly: pip install 'scvi-codegen[compiler]' (ziglang)")
+    check_compiler()
 
     def compiled() -> str:
         command = [sys.executable, "-m", "ziglang", "cc", *FLAGS, *sources, "-lm", "-o", "page.wasm"]

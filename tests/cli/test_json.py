@@ -72,7 +72,33 @@ def test_failed_run_reports_how_far_it_got():
     assert (
         "use another time transformation" in json_of("run", "kepler", *far, "--tolerance", "1e-10", status=1)["missed"]
     )
-    assert invoke("run", "keplr", "--json", status=2).stdout == ""
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "error"),
+    [
+        ("run keplr", 2, {"type": "SystemDefinitionError", "message": "there is no problem 'keplr'; did you mean"}),
+        ("run kepler --steps x", 2, {"type": "BadParameter", "message": "'x' is not a valid integer"}),
+        ("run kepler --nothing", 2, {"type": "NoSuchOption", "message": "--nothing"}),
+        ("rum kepler", 2, {"type": "UsageError", "message": "there is no command 'rum'; did you mean 'run'?"}),
+        (
+            "run kepler --q 1,0 --velocity 0,0 --tolerance 1e-9 --span 3",
+            1,
+            {"type": "StepFailedError", "message": "failed", "status": "", "step": 1, "t": 1.0},
+        ),
+        ("run wrong.toml", 2, {"type": "ModelFileError", "message": "wrong.toml: "}),
+    ],
+)
+def test_errors_are_entries_of_the_document(words, status, error):
+    Path("wrong.toml").write_text('[system]\nname = "a"\ncoordinates = ["x"]\nlagrangian = "x_dot**2/2 +"\n')
+    result = invoke(words, "--json", status=status)
+    found = json.loads(result.stdout)["error"]
+    assert found.keys() == error.keys() | {"exit_status"}
+    assert found["type"] == error["type"]
+    assert error["message"] in found["message"]
+    assert found["exit_status"] == status
+    assert found["message"] in result.stderr
+    assert all(type(found[name]) is type(value) for name, value in error.items())
 
 
 def test_json_of_several_momentum_maps():

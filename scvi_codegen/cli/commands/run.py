@@ -251,7 +251,7 @@ def _run_one(model: Model, output: str | None, plot: str | None, *, advised: flo
     written = _write_outputs(model, result, output, plot, draw=draw)
     tell(written=written)
     if outcome.failure is not None:
-        raise CommandFailure(f"{outcome.failure}\n{_kept(outcome, written)}", FAILURE)
+        raise CommandFailure(f"{outcome.failure}\n{_kept(outcome, written)}", FAILURE) from outcome.failure
     if outcome.interrupted:
         raise CommandFailure(f"interrupted at t = {outcome.run.t:g}\n{_kept(outcome, written)}", INTERRUPTED)
     if outcome.missed is not None:
@@ -270,7 +270,7 @@ def _finish_recording(outcome: RecordedOutcome) -> None:
     """Print the summary of a run in a folder, and how to continue it."""
     tell(outcome.summary(), **outcome_numbers(outcome))
     if outcome.failure is not None:
-        raise CommandFailure(f"{outcome.failure}\n{outcome.continuation()}", FAILURE)
+        raise CommandFailure(f"{outcome.failure}\n{outcome.continuation()}", FAILURE) from outcome.failure
     if outcome.interrupted:
         raise CommandFailure(f"interrupted at t = {outcome.run.t:g}\n{outcome.continuation()}", INTERRUPTED)
     tell(f"wrote {outcome.recorded.folder}", written=[outcome.recorded.folder])
