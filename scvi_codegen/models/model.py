@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from scvi_codegen.display.cards import Html, card, listed, plain
 from scvi_codegen.errors import ModelFileError, StateError
 from scvi_codegen.formulas.symbols import input_parameters
 from scvi_codegen.lowering.arrays import check_solver, one_coordinate
@@ -98,6 +99,19 @@ class Model(TimeSpan):
     picture: Mapping[str, Any] = field(default_factory=dict)
 
     __repr__ = summary("system", "method", "h", "span", "steps")
+
+    def _repr_html_(self) -> str:
+        state = [(name, getattr(self, name)) for name in STATE.values() if getattr(self, name) is not None]
+        named = {**self.inputs, **self.fields, **self.tables}
+        facts = (
+            ("method", plain(self.method.title)),
+            *((name, _vector(values)) for name, values in state),
+            ("run", listed([f"{name} = {value}" for name, value in self._run_section().items()])),
+            *([("events", listed([each.function for each in self.events]))] if self.events else []),
+            *([("inputs, arrays", listed(list(named)))] if named else []),
+        )
+        shown = Html(self.system._repr_html_()) if self.array_system is None else plain(repr(self.system))
+        return card(self.system.name, facts, shown)
 
     def __post_init__(self) -> None:
         check_kind(SYSTEM_OR_ARRAYS, self.system, "system", ModelFileError)
@@ -445,6 +459,13 @@ class Model(TimeSpan):
         if self.in_double_double:
             values = tuple(with_exact_numbers(values))
         return tuple(real(value, f"{name}[{i}] ({names[i]})") for i, value in enumerate(values))
+
+
+def _vector(values: Any) -> Html:
+    """Return a vector, or arrays by name, for a card."""
+    if isinstance(values, Mapping):
+        return listed([f"{name} of shape {np.shape(value)}" for name, value in values.items()])
+    return listed([f"{float(value):g}" for value in values])
 
 
 def _with_lists(value: Any) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -12,6 +13,7 @@ from typing import IO, TYPE_CHECKING, Any, TypeAlias, cast, overload
 import numpy as np
 from numpy.typing import NDArray
 
+from scvi_codegen.display.cards import card, grid, listed, plain, sparkline
 from scvi_codegen.errors import StateError
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.files.export import FORMATS, LABELLED, check_format, write_whole
@@ -40,6 +42,8 @@ OK, INTERRUPTED, EVENT_FAILED = "ok", "interrupted", "event failed"
 
 MOST_DRAWN = 64
 """Largest number of trajectories in a picture."""
+MOST_SHOWN = 3
+"""Largest number of trajectories, and of coordinates, that a notebook shows."""
 
 Span: TypeAlias = tuple[slice, slice, Callable[[slice], Array]]
 """Rows of states, a slice of trajectories, and a function returning the parameters of trajectories in these rows."""
@@ -148,6 +152,24 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
     def __repr__(self) -> str:
         states = f"{len(self.t)} states of each of {len(self)} trajectories, {np.count_nonzero(self.ok)} of them ok"
         return one_line(self, short_title(self.stepper.interface), states)
+
+    def _repr_html_(self) -> str:
+        interface, counts = self.stepper.interface, Counter(self.status.tolist())
+        names = interface.coordinates[:MOST_SHOWN]
+        steps = f"{self.steps.min()} to {self.steps.max()}" if len(self) else "0"
+        facts = (
+            ("trajectories", plain(f"{len(self)}: {', '.join(f'{each} {word}' for word, each in counts.items())}")),
+            ("steps", plain(f"{steps} of {f'size {self.h:g}' if self.h else 'adaptive size'}")),
+            ("states", plain(f"{len(self.t)} of each; q and p of shape {self.q.shape}")),
+            ("coordinates", listed(interface.coordinates)),
+            ("parameters", listed(interface.parameters)),
+        )
+        rows = []
+        for j in range(min(len(self), MOST_SHOWN)):
+            q = self.q[self._reached(j), j]
+            curves = zip(names, q[:: max(1, -(-len(q) // MOST_DRAWN))].T, strict=False)
+            rows.append([plain(f"trajectory {j}"), *(sparkline(values.tolist(), name) for name, values in curves)])
+        return card(self.stepper.title, facts, grid(rows, head=("", *names)))
 
     @property
     def ends(self) -> tuple[Array, Array, Array]:
