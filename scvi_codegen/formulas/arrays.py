@@ -8,7 +8,7 @@ Loops and indices are those of :mod:`scvi_codegen.indices`. A sum within a sum h
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -194,6 +194,10 @@ class _Declaration(_Indices):
         return size
 
 
+def _shown(size: Size) -> str:
+    return size.name or str(size.number)
+
+
 class ArrayParser(_Indices):
     """Parser for formulas with array entries and sums."""
 
@@ -227,7 +231,12 @@ class ArrayParser(_Indices):
             self.refuse(f"'{name}' is an index table, whose entries are indices: write q[{name}[.., 0]]", column)
         if self.peek().text == "[":
             known = ", ".join(map(str, self.arrays.values())) or "none"
-            self.refuse(f"'{name}' is not an array{closest(name, self.arrays)} Arrays: {known}", column)
+            declared = f"{name}[{', '.join(self.axes_here())}]"
+            self.refuse(
+                f"'{name}' is not an array{closest(name, self.arrays)} Arrays: {known}; declare an array of constants "
+                f"as a parameter: parameters={{'{declared}': 1.0}}, in files [parameters] \"{declared}\" = 1.0",
+                column,
+            )
         if name in self.in_scope or name in self.sizes:
             kind = "an index" if name in self.in_scope else "a size"
             self.refuse(
@@ -235,6 +244,20 @@ class ArrayParser(_Indices):
                 column,
             )
         return super().name(name, column)
+
+    def axes_here(self) -> Iterator[str]:
+        """Yield the size of each axis that the indices in the brackets here run over, else of the first axis known."""
+        first = next((array.axes[0] for array in self.arrays.values()), Size("N", 0))
+        position, depth, size = 0, 0, None
+        while (text := self.peek(position).text) and not (text == "]" and depth == 1):
+            depth += (text in ("(", "[")) - (text in (")", "]"))
+            if text == "," and depth == 1:
+                yield _shown(size or first)
+                size = None
+            elif isinstance(bound := self.in_scope.get(text), Loop):
+                size = size or bound.end
+            position += 1
+        yield _shown(size or first)
 
     def summed(self, column: int) -> Expr:
         """Parse ``sum(loops, formula)`` after ``sum``."""

@@ -59,6 +59,8 @@ def test_index_notation_is_parsed(text: str, read: list[str] | None) -> None:
         ("sum(i in N, q[i, 0])", "has 1 axes, but 2 indices are given"),
         ("sum(i in M, q[i])", "'M' is not the size of an array"),
         ("sum(i in N, x[i])", "'x' is not an array"),
+        ("sum(i in N, m[i]*q[i]**2)", "constants as a parameter: parameters={'m[N]': 1.0}, in files"),
+        ("sum(i in N, b in B, m[i, (b)]*q[i]**2)", 'in files [parameters] "m[N, B]" = 1.0'),
         ("sum(i in N, q[j])", "'j' is not an index"),
         ("sum(i in N, q)", "'q' is an array, q[N]: write an entry, q[i]"),
         ("sum(i in N, i*q[i])", "'i' is an index, which may occur only in brackets"),
