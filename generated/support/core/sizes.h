@@ -87,11 +87,11 @@ typedef struct array_motion {
 enum { MOTIONS = M };
 #endif
 
-/* Lets V and A of a coordinate or array contain a step. */
-static inline void note_motion(run_memory *run, real h, real displacement, real curvature, int k)
+/* Lets V and A of a coordinate or array contain a step of 1 / rate. */
+static inline void note_motion(run_memory *run, real rate, real displacement, real curvature, int k)
 {
-  run->largest_v[k] = larger(run->largest_v[k], displacement / MATH(fabs)(h));
-  run->largest_a[k] = larger(run->largest_a[k], curvature / (h * h));
+  run->largest_v[k] = larger(run->largest_v[k], rate * displacement);
+  run->largest_a[k] = larger(run->largest_a[k], rate * rate * curvature);
   run->largest_dq[k] = larger(run->largest_dq[k], displacement);
   run->largest_bend[k] = larger(run->largest_bend[k], curvature);
 }
@@ -131,10 +131,12 @@ static inline real motion_of_run(const run_memory *run, real h)
   return largest;
 }
 
-/* Size of coordinate i in which errors are measured: its motion, or the absolute one if that is larger. */
-static inline real size_of_motion(const step_data *step, real motion, long long i)
+/* Enlarges the sizes of some coordinates, in which errors are measured, to the absolute ones. Not in the loops that
+ * determine them: vectorised loads that a null pointer masks are slow. */
+static inline void enlarge_to_absolute(const step_data *step, section here, real *size)
 {
-  return step->absolute ? larger(motion, step->absolute[i]) : motion;
+  for (long long i = here.first; step->absolute && i < here.end; i++)
+    size[i - here.first] = larger(size[i - here.first], step->absolute[i]);
 }
 
 #ifdef ARRAYS
@@ -144,13 +146,14 @@ static inline real motion_of_step(const step_data *step, real h, real displaceme
   real motion = 0;
   for (int k = 0; k < COORDINATE_ARRAYS; k++)
     motion = larger(motion, motion_size(step->run, h, displacement, curvature, k));
-  return size_of_motion(step, motion, i);
+  (void)i;
+  return motion;
 }
 #else
 /* mu_i of a step of h from its displacement and its curvature, with V and A of the run if there is one. */
 static inline real motion_of_step(const step_data *step, real h, real displacement, real curvature, long long i)
 {
-  return size_of_motion(step, motion_size(step->motion_of, h, displacement, curvature, (int)i), i);
+  return motion_size(step->motion_of, h, displacement, curvature, (int)i);
 }
 
 /* Replaces the sizes of the elements of an array of known size by the largest of it. */

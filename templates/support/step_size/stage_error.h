@@ -51,6 +51,7 @@ static real stage_error(const step_data *step, const real *z, const real *dq, re
     real doubtful)
 {
   real fastest = 0, farthest = 0, error;
+  const section all = {0, M};
   stage_sizes of = {.largest = 0};
   for (int i = 0; i < M; i++) {
     const real curvature = curvature_of_stages(step, z, i);
@@ -61,10 +62,12 @@ static real stage_error(const step_data *step, const real *z, const real *dq, re
 #ifdef FEW_STAGE_COEFFICIENTS
     of.size[i] = size_for_few(step->motion_of, step->h, motion, curvature, i);
 #endif
-    of.largest = larger(of.largest, of.size[i]);
     fastest = larger(fastest, MATH(fabs)(dq[i]));
     farthest = larger(farthest, MATH(fabs)(step->q0[i]) + MATH(fabs)(dq[i]));
   }
+  enlarge_to_absolute(step, all, of.size);
+  for (int i = 0; i < M; i++)
+    of.largest = larger(of.largest, of.size[i]);
   enlarge_to_arrays(of.size);
   error = error_beyond(step, z, &of, SITES > M ? farthest : fastest, share, decay, least);
   if (SITES > M && error > doubtful)
@@ -99,6 +102,7 @@ static inline int stages_may_exceed(const step_data *step, const real *z, real m
 /* Lets V and A contain a solved step. */
 static inline void note_stages(run_memory *run, const step_data *step, const real *z, const real *dq)
 {
+  const real rate = 1 / MATH(fabs)(step->h);
   for (int i = 0; i < M; i++)
-    note_motion(run, step->h, MATH(fabs)(dq[i]), curvature_of_stages(step, z, i), i);
+    note_motion(run, rate, MATH(fabs)(dq[i]), curvature_of_stages(step, z, i), i);
 }
