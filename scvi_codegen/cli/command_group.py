@@ -119,16 +119,15 @@ class Commands(click.Group):
             raise
 
 
-ERROR_FIELDS = ("status", "step", "t", "text", "column")
-"""Attributes of errors that their documents contain."""
-
-
 def _described(error: click.ClickException) -> dict[str, Any]:
-    """Return the type, the message, the exit status and the attributes of an error."""
-    cause = error.__cause__ or error
-    fields = {name: getattr(cause, name) for name in ERROR_FIELDS if hasattr(cause, name) and cause is not error}
-    about = {"type": type(cause).__name__, "message": error.format_message(), "exit_status": error.exit_code}
-    return about | fields
+    """Return the type, the message, the exit status, and the numbers and texts that are attributes of its causes."""
+    fields: dict[str, Any] = {}
+    cause = error.__cause__
+    while cause is not None:
+        fields = {name: each for name, each in vars(cause).items() if isinstance(each, str | int | float)} | fields
+        cause = cause.__cause__
+    kind = type(error.__cause__ or error).__name__
+    return {"type": kind, "message": error.format_message(), "exit_status": error.exit_code} | fields
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from click.shell_completion import CompletionItem
 
 from scvi_codegen.cli.command_group import Command
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.files.atomic import NamedFile
+from scvi_codegen.files.atomic import NamedFile, naming_folders
 from scvi_codegen.files.toml_text import MAX_CHARACTERS
 from scvi_codegen.methods import ARGUMENTS, METHODS, size_of, specification_of
 from scvi_codegen.models.model import Model
@@ -180,10 +180,22 @@ def _flag(option: Option) -> Callable[[Command], Command]:
     return click.option(option.flag, option.name, metavar=option.metavar or None, help=option.help, **further)
 
 
+_folders = click.option(
+    "--folder",
+    type=click.Path(exists=True, file_okay=False),
+    multiple=True,
+    metavar="DIR",
+    expose_value=False,
+    callback=lambda context, parameter, values: context.with_resource(naming_folders(values)),
+    help="Folder with files that MODEL may name (arrays, inputs, robots), besides its own; may be repeated.",
+)
+
+
 def model_arguments(*further: str, required: bool = True) -> Callable[[Command], Command]:
     """Return the decorator that adds the argument MODEL, the options that override it, and further ones by name."""
 
     def decorated(command: Command) -> Command:
+        command = _folders(command)
         for option in reversed(OPTIONS):
             if option.common or option.name in further:
                 command = _flag(option)(command)

@@ -5,8 +5,9 @@ import os
 import shutil
 import stat
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from pathlib import Path
 from typing import IO
 
@@ -94,22 +95,45 @@ def regular(path: str | os.PathLike[str]) -> Path:
     return target
 
 
+FOLDERS = "--folder DIR, load_model(.., folders=)"
+"""Ways to name a folder with files that documents may name."""
+
+
 class NamedFile(str):
     """Path that a user named on the command line, which may be anywhere, unlike those in documents of others."""
 
     __slots__ = ()
 
 
+_named_folders: ContextVar[tuple[Path, ...]] = ContextVar("named_folders", default=())
+
+
+@contextmanager
+def naming_folders(folders: Iterable[str | os.PathLike[str]]) -> Iterator[None]:
+    """Allow documents to name files in these folders, which a user named."""
+    token = _named_folders.set(tuple(Path(folder).resolve() for folder in folders))
+    try:
+        yield
+    finally:
+        _named_folders.reset(token)
+
+
+def is_inside(folder: str | os.PathLike[str], path: Path) -> bool:
+    """Return whether a path is in a folder, or in one of :func:`naming_folders`; links are followed."""
+    return any(path.resolve().is_relative_to(each) for each in (Path(folder).resolve(), *_named_folders.get()))
+
+
 def inside(folder: str | os.PathLike[str], name: str | os.PathLike[str]) -> Path:
     """Return the path of a file that a document in the folder names; links are followed.
 
     Raises:
-        OSError: if the file is outside the folder, unless it is a :class:`NamedFile`.
+        OSError: if the file is outside the folder and those of :func:`naming_folders`, unless it is a
+            :class:`NamedFile`.
     """
     path = Path(folder) / name
-    if not isinstance(name, NamedFile) and not path.resolve().is_relative_to(Path(folder).resolve()):
-        where = Path(folder).resolve()
-        raise OSError(errno.EACCES, f"it is outside the folder {where} of the document that names it: copy it there")
+    if not isinstance(name, NamedFile) and not is_inside(folder, path):
+        where = f"it is outside the folder {Path(folder).resolve()} of the document that names it"
+        raise OSError(errno.EACCES, f"{where}: copy it there, or name its folder ({FOLDERS})")
     return path
 
 

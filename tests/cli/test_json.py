@@ -84,9 +84,9 @@ def test_failed_run_reports_how_far_it_got():
         (
             "run kepler --q 1,0 --velocity 0,0 --tolerance 1e-9 --span 3",
             1,
-            {"type": "StepFailedError", "message": "failed", "status": "", "step": 1, "t": 1.0},
+            {"type": "StepFailedError", "message": "failed", "status": "", "step": 1, "t": 1.0, "residual": 1.0},
         ),
-        ("run wrong.toml", 2, {"type": "ModelFileError", "message": "wrong.toml: "}),
+        ("run wrong.toml", 2, {"type": "ModelFileError", "message": "wrong.toml: ", "text": "", "column": 0}),
     ],
 )
 def test_errors_are_entries_of_the_document(words, status, error):

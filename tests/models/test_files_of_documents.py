@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from commands import output_of
+from commands import error_of, output_of
 
 import scvi_codegen as sc
 from scvi_codegen.cli import main
@@ -98,6 +98,24 @@ def test_files_named_on_the_command_line_may_be_anywhere(folders):
     document.write_text(PUSHED.format(file="../other/u.csv"))
     printed = output_of("run", str(document), "--input", f"u={other / 'u.csv'}", "--json")
     assert json.loads(printed)["steps"] == 5
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_files_in_folders_that_a_user_names_may_be_anywhere(folders, name):
+    own, other = folders
+    document = own / "model.toml"
+    document.write_text(KINDS[name].format(file=f"../other/{name}"))
+    assert load_model(document, folders=[other]).steps == 5
+    with pytest.raises(sc.ModelFileError, match="or name its folder \\(--folder DIR"):
+        load_model(document)
+    assert json.loads(output_of("run", str(document), "--folder", str(other), "--json"))["steps"] == 5
+    assert "outside the folder" in error_of("run", str(document), "--folder", str(own))
+
+
+def test_includes_in_folders_that_a_user_names_may_be_anywhere(folders):
+    own, other = folders
+    (own / "robot.xml").write_text('<mujoco><include file="../other/arm.xml"/></mujoco>')
+    assert load_model(own / "robot.xml", folders=[other]).dimension == 1
 
 
 def test_model_is_read_from_standard_input(folders, monkeypatch):

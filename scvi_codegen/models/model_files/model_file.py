@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -16,7 +16,7 @@ from typing import Any
 
 from scvi_codegen.controllers import SYMPLECTIC, check_controller, default_controller, with_time_transformation
 from scvi_codegen.errors import ModelFileError, SystemDefinitionWarning
-from scvi_codegen.files.atomic import write_text
+from scvi_codegen.files.atomic import naming_folders, write_text
 from scvi_codegen.files.toml_text import read_toml
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.lowering.arrays import one_coordinate
@@ -76,12 +76,19 @@ ARRAY_SECTIONS = ("sizes", "tables")
 
 
 @checks_arguments()
-def load_model(path: str | os.PathLike[str], changes: Document | None = None) -> Model:
+def load_model(
+    path: str | os.PathLike[str], changes: Document | None = None, *, folders: Iterable[str | os.PathLike[str]] = ()
+) -> Model:
     """Read a model file, with the sections ``changes`` merged over its own.
+
+    ``folders``: further ones with files that it may name (arrays, inputs, robots), besides its own.
 
     Raises:
         ModelFileError: beginning with the path and naming the key at fault.
     """
+    if folders := [*folders]:
+        with naming_folders(folders):
+            return load_model(path, changes)
     text, folder = "" if is_robot(path) else text_in(path, "utf-8-sig"), Path(path).parent
     try:
         if is_robot(path):

@@ -16,6 +16,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from scvi_codegen.errors import closest
+from scvi_codegen.files.atomic import FOLDERS, is_inside
 from scvi_codegen.formulas.rotations import matrix_of
 from scvi_codegen.mechanics.multibody.trees.closures import Closure, Coupling, at_reference
 from scvi_codegen.mechanics.multibody.trees.document import Element, Unread, root_of
@@ -444,8 +445,9 @@ def _include(root: Element) -> None:
                 child.refuse(f"must have only file, a path relative to the folder of the document: '{name}'")
             folders = [Path(each).parent for each in (root.file, child.file)]
             path = next((each / name for each in folders if (each / name).exists()), folders[0] / name)
-            if not path.resolve().is_relative_to(folders[0].resolve()):
-                child.refuse(f"names '{name}' outside the folder of the main document: copy it there")
+            if not is_inside(folders[0], path):
+                where = "outside the folder of the main document"
+                child.refuse(f"names '{name}' {where}: copy it there, or name its folder ({FOLDERS})")
             if path.resolve() in read:
                 child.refuse(f"names '{name}', which is included already")
             read.add(path.resolve())
