@@ -90,7 +90,10 @@ def test_failed_run_reports_how_far_it_got():
     ],
 )
 def test_errors_are_entries_of_the_document(words, status, error):
-    Path("wrong.toml").write_text('[system]\nname = "a"\ncoordinates = ["x"]\nlagrangian = "x_dot**2/2 +"\n')
+    Path("wrong.toml").write_text(
+        '[system]\nname = "a"\ncoordinates = ["x"]\nlagrangian = "x_dot**2/2 +"\n'
+        "[initial]\nq = [0]\np = [0]\n[run]\nspan = 1\n"
+    )
     result = invoke(words, "--json", status=status)
     found = json.loads(result.stdout)["error"]
     assert found.keys() == error.keys() | {"exit_status"}
