@@ -161,8 +161,8 @@ def test_growth_is_that_of_nearby_runs(name, tolerance):
     run._run_to_target()
     states = np.array([[*q, *stepper.velocity(q, p)]]) * (1.0 + size * np.array([[0.0] * 4, np.cos([0, 1, 1, 2])]))
     one, other = (stepper.integrate(x[:2], velocity=x[2:], t_end=t_end, check_growth=False) for x in states)
-    pairs = (one.q, other.q), (one.p, other.p)
-    apart = max(np.linalg.norm(b[-1] - a[-1]) / np.linalg.norm(a, axis=1).max() for a, b in pairs)
+    pairs = (one.q, other.q, one.q[0]), (one.velocity, other.velocity, 0.0)
+    apart = max(np.linalg.norm(b[-1] - a[-1]) / np.linalg.norm(a - c, axis=1).max() for a, b, c in pairs)
     assert run._growth[0] > 5.0
     assert run._growth[0] == pytest.approx(math.log(apart / size), abs=1.5)
 
@@ -284,6 +284,23 @@ def test_growth_that_leaves_ten_digits_is_not_reported(velocity):
     with warnings.catch_warnings(action="error"):
         run = stepper.integrate([0.994, 0.0], velocity=[0.0, velocity], t_end=ORBITS[velocity])
     assert np.abs(run.q[-1] - [0.994, 0.0]).max() < 1e-12
+
+
+@pytest.mark.parametrize("method", ["svi:4", "svi:8"])
+def test_a_fall_from_the_rounded_equilibrium_is_reported(method):
+    """The angle pi is rounded: the fall of a pendulum at rest is amplified rounding from its start."""
+    stepper = stepper_of((("a",), "a_dot**2/2 + cos(a)"), method)
+    with pytest.warns(sc.AccuracyWarning, match="leaves no digit"):
+        stepper.integrate([math.pi], [0.0], t_end=45.0)
+
+
+@pytest.mark.parametrize("origin", [0.0, 1000.0])
+def test_a_regular_motion_in_a_magnetic_field_is_not_reported_far_from_the_origin(origin):
+    """Its momenta are those of the vector potential there."""
+    field = "(x_dot**2 + y_dot**2)/2 - (x - c)**2/2 - y**2/2 + x*y_dot + (x - c)**2*y_dot/7"
+    stepper = sc.compile_stepper(lagrange("charge", PLANE, field, c=0.0), "svi:8")
+    with warnings.catch_warnings(action="error"):
+        stepper.integrate([origin + 1.0, 0.2], velocity=[0.0, 1.0], t_end=200.0, parameters={"c": origin})
 
 
 def test_growth_of_coordinates_near_a_pole_is_not_reported():

@@ -129,6 +129,29 @@ def test_error_of_a_path_is_that_of_finer_steps(kepler):
         assert max(away) / 3 < path.error < 10 * max(away)
 
 
+@pytest.mark.parametrize("amplitude", [1.0, 1e-9])
+@pytest.mark.parametrize("origin", [0.0, 1000.0])
+@pytest.mark.parametrize("gauge", ["0", "1"])
+def test_error_of_a_path_depends_neither_on_the_origin_nor_on_the_gauge(amplitude, origin, gauge):
+    """An oscillator about the origin, whose L has the derivative of b x^2 as a gauge: x = x0 cos t + v0 sin t."""
+    stepper = compiled(["x"], "x_dot**2/2 - (x - c)**2/2 + b*x*x_dot", parameters={"b": 0.0, "c": 0.0})
+    path = stepper.path(
+        [origin + 0.1 * amplitude],
+        [origin + 0.9 * amplitude],
+        2.0,
+        steps=4,
+        parameters={"b": float(gauge), "c": origin},
+    )
+    x0, x1 = 0.1 * amplitude, 0.9 * amplitude
+    v0 = (x1 - x0 * np.cos(2.0)) / np.sin(2.0)
+    x, v = x0 * np.cos(path.t) + v0 * np.sin(path.t), v0 * np.cos(path.t) - x0 * np.sin(path.t)
+    q, p = path.q[:, 0] - origin, path.p[:, 0] - float(gauge) * path.q[:, 0]
+    true = max(np.abs(q - x).max() / np.ptp(x), np.abs(p - v).max() / np.abs(v).max())
+    rounding = 2.0**-53 * (origin + amplitude) / amplitude
+    assert true - 4 * rounding <= path.error <= 1.2 * true + 16 * rounding
+    assert not path.at_rest
+
+
 def test_indices_of_indefinite_kinetic_energy_are_refused():
     stepper = compiled(["x", "y"], "(x_dot**2 - y_dot**2)/2 - (x**2 - y**2)/2 + x*y/10")
     path = stepper.path([1.0, 0.0], [0.3, 0.2], 2.0, steps=12)

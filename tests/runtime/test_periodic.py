@@ -267,12 +267,12 @@ def test_orbits_are_found_from_a_guess_that_is_15_percent_off(planar, speed, dur
 
 def test_another_orbit_is_reported(planar):
     with pytest.warns(sc.AccuracyWarning, match=r"far from the guess: its period is .*, not 2\.78019"):
-        sc.periodic_orbit(planar, [0.82, 0.0], velocity=[0.0, 0.18689], period=2.780187, steps=200, fixed=["x", "y"])
+        sc.periodic_orbit(planar, [0.82, 0.0], velocity=[0.0, 0.17876], period=2.780187, steps=200, fixed=["y", "p_x"])
 
 
 def test_another_member_of_the_family_is_reported(planar):
-    """A velocity 10 % too large leads to an orbit of 2.5 times the amplitude; one 10 % too small to a neighbour."""
-    for speed, reported in ((1.1, True), (0.9, False)):
+    """A velocity 20 % too large leads to a distant orbit of the family; one 10 % too small to a neighbour."""
+    for speed, reported in ((1.2, True), (0.9, False)):
         with warnings.catch_warnings(record=True, action="always") as caught:
             velocity = [0.0, 0.1625133 * speed]
             orbit = sc.periodic_orbit(planar, [0.82, 0.0], velocity=velocity, period=2.780187, steps=200)
@@ -349,6 +349,20 @@ def test_names_of_a_state_are_unique():
     along = sc.periodic_orbit(stepper, *given, period=6.0, steps=60, fixed=["p_x", "p_p_x", "x"])
     assert along.p[0] != 0.3
     assert sc.periodic_orbit(stepper, *given, period=6.0, steps=60, fixed=["_p_x"]).p[0] == 0.3
+
+
+@pytest.mark.parametrize("amplitude", [1.0, 1e-3, 1e-9])
+@pytest.mark.parametrize("origin", [0.0, 1000.0])
+def test_orbits_depend_neither_on_the_origin_nor_on_the_amplitude(amplitude, origin):
+    """The period of a pendulum is 4 K(sin^2(a/2)); errors are those of rounding, also of the origin."""
+    system = lagrange("pendulum", "x", "x_dot**2/2 + cos(x - c)", c=0.0)
+    guess, given = [origin + amplitude], {"period": 6.3 if amplitude < 1 else 6.7, "parameters": {"c": origin}}
+    with warnings.catch_warnings(action="ignore"):  # four digits are left of 1e-9 beside 1000
+        orbit = sc.periodic_orbit(sc.compile_stepper(system, "svi:8"), guess, [0.0], fixed=["x"], **given)
+    exact, rounding = 4.0 * ellipk(np.sin(0.5 * (orbit.q[0] - origin)) ** 2), 2.0**-53 * (origin + 1.0) / amplitude
+    assert orbit.q[0] == pytest.approx(guess[0], rel=1e-15)
+    assert abs(orbit.period / exact - 1.0) <= orbit.error + 64 * rounding
+    assert orbit.error < 1e-9 + 1000 * rounding
 
 
 @pytest.mark.parametrize("q", [0.0, np.pi])

@@ -18,7 +18,7 @@ from typing import cast
 import numpy as np
 
 from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, warn
-from scvi_codegen.runtime.accuracy.size import Motion, first_of_groups, relative, roundoff
+from scvi_codegen.runtime.accuracy.size import Motion, first_of_groups, largest_range, relative, roundoff
 from scvi_codegen.runtime.accuracy.warning_switch import warnings_wanted
 from scvi_codegen.runtime.constraints.projection import projected
 from scvi_codegen.runtime.core.features import require
@@ -147,12 +147,15 @@ class _Repetition:
         """
         states, count = self.states, len(self.states.t) - 1
         tolerable = min(max(RIGHT, LOOSER * self.tolerance), LARGEST)
-        if math.exp(min(grown, 600.0)) * self.nudge < tolerable:
+        distance = float(np.abs(states.q[0]).max()) / (largest_range(states.q) or math.inf)  # of the origin
+        growth = math.exp(min(grown, 600.0)) / max(distance, 1.0)
+        expected = growth * max(self.nudge, NUDGE * distance)
+        if expected < tolerable:
             return None
-        factor = f"{math.exp(min(grown, 600.0)):.0e}".replace("+", "")
+        factor = f"{growth:.0e}".replace("+", "")
         what = f"small perturbations of the initial state grew by a factor of {factor}"
         if len(states.q) != len(states.t):
-            return _warn_of_amplification(what, self.nudge * math.exp(min(grown, 600.0)), float(states.t[-1]))
+            return _warn_of_amplification(what, expected, float(states.t[-1]))
         last = count if self.steps <= MOST_REPEATED else max(1, count * MOST_REPEATED // self.steps)
         apart, k = 0.0, 0
         try:
@@ -167,7 +170,7 @@ class _Repetition:
         except StepFailedError:
             apart = 1.0
         if k == last < count and apart <= LARGEST:
-            apart = self.nudge * math.exp(min(grown, 600.0))
+            apart = expected
         if apart > tolerable:
             _warn_of_amplification(what, apart, float(states.t[k]))
         return None
@@ -235,8 +238,7 @@ class _Repetition:
         """Start the run at its perturbed initial state, on its constraints, with another local tolerance."""
         run, states = self.run, self.states
         plan, t, given = replace(self._plan(), tolerance=tolerance), float(states.t[0]), states.parameters
-        factors = _factors(len(run._q), nudge)
-        q, p = np.asarray(states.q[0] * factors[0]), np.asarray(states.p[0] * factors[1])
+        q, p = (_perturbed(np.asarray(each), nudge, i) for i, each in enumerate((states.q, states.p)))
         if run.stepper.interface.constraints:
             q, p, _ = projected(run.stepper, q, p, t, given)
         run._start(q, p, plan=plan, t=t, parameters=given, options=run.options)
@@ -261,7 +263,11 @@ class _Repetition:
         _warn_of_amplification(f"{perturbed} {what}", difference, t)
 
 
-@lru_cache(maxsize=8)
-def _factors(size: int, nudge: float) -> tuple[Array, Array]:
-    """Return factors for positions and momenta that change them by about ``nudge``, relatively."""
-    return 1.0 + nudge * np.cos(np.arange(size)), 1.0 + nudge * np.cos(np.arange(size) + 1)
+def _perturbed(values: Array, nudge: float, first: int) -> Array:
+    """Return the first of (n, m) positions or momenta, changed by ``nudge`` of itself, or of its range if smaller.
+
+    The change is at least about the rounding error. A state of zeros is changed by parts of its ranges.
+    """
+    sizes, ranges = np.abs(values[0]), np.ptp(values, axis=0)
+    changes = np.maximum(NUDGE * sizes, nudge * (np.minimum(sizes, ranges) if values[0].any() else ranges))
+    return np.asarray(values[0] + np.copysign(changes, values[0]) * np.cos(np.arange(first, first + len(sizes))))

@@ -4,17 +4,22 @@ A size that is the coordinate itself would depend on the origin. Coordinates tha
 entries of an array, the components of a rotation.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from scvi_codegen.errors import StateError
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.core.validation import Array, coordinate_shapes
 from scvi_codegen.runtime.rotations.states import members_of
 
 RESOLVED = 64.0
 """Range in roundings of the largest value from which on a coordinate moves."""
+UPDATE_ROUNDING = 4.0
+"""Newton updates of so many roundings of the largest value cannot be reduced."""
 
 
 def roundoff(words: int) -> float:
@@ -77,6 +82,56 @@ class Motion:
         """Return the largest value of the group of each coordinate."""
         counts = np.diff(self.firsts, append=len(values))
         return np.asarray(np.repeat(np.maximum.reduceat(values, self.firsts), counts))
+
+
+def largest_range(values: Array) -> float:
+    """Return the largest range of a column of (n, m) values."""
+    return float(np.ptp(np.asarray(values), axis=0).max(initial=0.0))
+
+
+@dataclass(frozen=True, slots=True)
+class SizeOfMotion:
+    """Sizes of a motion that was found, a path or an orbit, of which its errors are parts.
+
+    Attributes:
+        position: largest range of a coordinate.
+        momentum: largest momentum of a velocity.
+        rounding: (2,) rounding errors of positions and of momenta.
+    """
+
+    position: float
+    momentum: float
+    rounding: tuple[float, float]
+
+    @classmethod
+    def of(cls, stepper: Any, q: Array, p: Array, t: float, parameters: Array) -> "SizeOfMotion":
+        """Return the sizes of (n, m) states; momenta of rest, of the gauge of L, are those at one time."""
+        kinetic = p - _momenta_at_rest(stepper, q, t, parameters)
+        of_q, of_p = (roundoff(1) * float(np.abs(each).max(initial=0.0)) for each in (q, p))
+        return cls(largest_range(q), float(np.abs(kinetic).max(initial=0.0)), (of_q, of_p))
+
+    def error(self, position: float, momentum: float) -> float:
+        """Return the larger one of both errors, with those of rounding, relative to these sizes."""
+        of_q, of_p = self.rounding
+        return max((position + of_q) / (self.position or 1.0), (momentum + of_p) / (self.momentum or 1.0))
+
+
+def _momenta_at_rest(stepper: Any, q: Array, t: float, parameters: Array) -> Array:
+    """Return the (n, m) momenta without velocity at q; those of three states show whether all are 0, or undefined."""
+    few = q[[0, len(q) // 2, -1]]
+    with suppress(StateError):
+        if np.any(stepper.momentum(few, np.zeros_like(few), t, parameters)):
+            return np.asarray(stepper.momentum(q, np.zeros_like(q), t, parameters))
+    return np.zeros_like(q)
+
+
+def size_for_updates(q: Array, settled: float, least: float = 0.0) -> float:
+    """Return the size of (n, m) positions of which updates below the part ``settled`` end an iteration.
+
+    It is the largest range, or ``least``, or what makes ``settled`` some roundings of the positions.
+    """
+    rounding = UPDATE_ROUNDING * roundoff(1) * float(np.abs(q).max(initial=0.0))
+    return max(largest_range(q), least, rounding / settled)
 
 
 def neighbouring(x: Array) -> Array:

@@ -38,6 +38,7 @@ from scvi_codegen.errors import (
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.representation import summary
+from scvi_codegen.runtime.accuracy.size import RESOLVED, SizeOfMotion, roundoff
 from scvi_codegen.runtime.accuracy.warning_switch import warnings_wanted, without_accuracy_warnings
 from scvi_codegen.runtime.core.features import require
 from scvi_codegen.runtime.core.stepper import STEPPER, Stepper
@@ -79,7 +80,8 @@ class PeriodicOrbit:
         residual: largest entry of the end minus the start, of the computed map.
         error: discretisation error of the orbit: the distance to the orbit of a run with 2.6 times as many steps, which
             end at other times. It is the largest of three relative errors: of the positions and of the momenta at the
-            start, relative to the largest range of a position and of a momentum over the orbit, and of the period.
+            start, with their rounding errors, relative to the largest range of a position and the largest momentum of a
+            velocity over the orbit, and of the period.
         trivial_error: deviation from 1 of the stability index (of steps that are not symplectic: the multiplier)
             nearest to 1, where motions that are shifted in time make it 1; NaN if the system depends on time.
         iterations: number of Newton iterations.
@@ -184,23 +186,27 @@ EASY, GROWTH = 10.0, 4.0
 NULL_SINGULAR_VALUE = 1e-9
 """Singular values below this fraction of the largest count as zero in the pseudoinverse."""
 CLOSED = 1e-11
-"""Largest closing error, relative to the size of the state and the norm of the monodromy matrix."""
+"""Largest closing error, relative to the size of the motion and the norm of the monodromy matrix."""
 CONSERVED = 1e-3
 """Relative error of the transported gradient of an integral up to which the integral counts as conserved."""
 DIFFERENCE_INCREMENT = 1e-6
-"""Increment of the finite differences of integrals, relative to the size of the state."""
+"""Increment of the finite differences of integrals, relative to the size of the motion, or of the flow, relative to
+the period."""
 SETTLED = 1e-13
-"""Newton step, relative to state and period, below which the iteration ends."""
+"""Newton step, relative to the motion and the period, below which the iteration ends."""
 MOST_INCREASE = 10.0
 """Largest factor by which a Newton step may increase the residual."""
+LEAST_SIZE = 1e-300
+"""Size of a motion at rest at the origin."""
 FREEDOM = 3.0
 """Largest factor by which the period of an orbit may differ from its guess."""
 FAR = 1.5
-"""Factor between the periods, and part of the size of the state, beyond which an orbit is not the guessed one."""
+"""Factor between the periods, and part of the distance of the guess from the middle of the orbit, beyond which an
+orbit is not the guessed one."""
 OTHER = 1.0 / 3.0
 """Part of the amplitude of an orbit from which its distance to the guess is reported."""
 EQUILIBRIUM_MOTION = 1e-6
-"""Motion over a period, relative to the size of the state, below which an orbit counts as an equilibrium."""
+"""Ranges over a period, relative to the distance from the guess, below which an orbit counts as an equilibrium."""
 
 
 @checks_arguments(StateError, stepper=STEPPER)
@@ -372,7 +378,7 @@ class _OrbitSearch:
             try:
                 iterated = search._iterated(*search._by_segments(guess, smoothed=smoothed))
                 orbit = search._described(*iterated, guess=guess)
-                if _is_near(orbit, guess):
+                if _is_near(orbit, guess, iterated[1].motion.states):
                     return orbit
                 far.append(orbit)
             except (OrbitError, StepFailedError, np.linalg.LinAlgError) as failure:
@@ -390,17 +396,21 @@ class _OrbitSearch:
     def _described(self, z: Array, equations: _ClosingEquations, iterations: int, *, guess: Array) -> PeriodicOrbit:
         """Return the orbit at the end of the iteration, after all checks; raise OrbitError if there is none."""
         m, motion = self.stepper.dimension, equations.motion
-        size = float(np.abs([z[:-1], guess[:-1]]).max())
-        allowed = CLOSED * max(1.0, float(np.linalg.norm(equations.monodromy, 2)))
-        if not equations.error <= allowed * size:
+        sizes = equations.sizes
+        reduced = self._reduced(sizes)
+        rounding = RESOLVED * roundoff(1) * float((np.abs(z[:-1]) / sizes).max())
+        scaled_norm = float(np.linalg.norm(equations.monodromy / reduced[:, np.newaxis] * reduced, 2))
+        allowed = (CLOSED + rounding) * max(1.0, scaled_norm)
+        if not equations.relative_error <= allowed:
             raise OrbitError(
                 f"no periodic orbit was found near the guess: after {iterations} iterations the closing error is "
                 f"{equations.error:.1e}, for q = {_listed(z[:m])}, p = {_listed(z[m:-1])}, period {z[-1]:.6g}. "
                 "Give a better initial guess (unstable orbits need one within a few percent), fix an "
                 "amplitude, fixed=['x', ..], or the period, fixed_period=True, or take more steps"
             )
-        self._check_energy(equations, allowed * size)
-        if np.linalg.norm(self._leaving(motion) @ motion.by_period) * z[-1] <= EQUILIBRIUM_MOTION * size:
+        self._check_energy(equations, allowed)
+        ranges, far = (each.reshape(2, m).max(axis=1) for each in (np.ptp(motion.states, axis=0), abs(z - guess)[:-1]))
+        if (ranges < EQUILIBRIUM_MOTION * far).any() or ranges[0] <= RESOLVED * roundoff(1) * np.abs(z[:m]).max():
             raise OrbitError(
                 f"the iteration converged to an equilibrium, q = {_listed(z[:m])}, p = {_listed(z[m:-1])}: fix an "
                 "amplitude, fixed=['x', ..], or give a better initial guess"
@@ -413,8 +423,9 @@ class _OrbitSearch:
                     "with fixed_period=True"
                 )
             later = replace(self, t=self.t + period)._closing(z)
-            away = max(float(np.abs(later.motion.states[-1] - equations.motion.states[-1]).max()), later.error)
-            if not away <= (allowed * size):
+            apart = np.abs(later.motion.states[-1] - equations.motion.states[-1]) / sizes
+            away = max(float(apart.max()), later.relative_error)
+            if not away <= allowed:
                 raise OrbitError(
                     f"the orbit from t = {self.t:g} does not close in the next period (error {away:.1e}): "
                     f"'{self.stepper.interface.system}' is not periodic in time with the period {period:.10g}"
@@ -496,9 +507,14 @@ class _OrbitSearch:
         return z, equations, iterations
 
     def _check_energy(self, equations: _ClosingEquations, allowed: float) -> None:
-        """Raise :class:`OrbitError` if a closed orbit has another energy; ``allowed`` is the error of its state."""
-        away, partials = float(equations.defects[-1]), equations.partials[-1]
-        if self.energy is not None and not abs(away) <= allowed * max(1.0, float(np.linalg.norm(partials))):
+        """Raise :class:`OrbitError` if a closed orbit has another energy.
+
+        ``allowed`` is the error of its state relative to the motion; that of the energy may be its rounding error.
+        """
+        if self.energy is None:
+            return
+        away, row = float(equations.defects[-1]), float(self._row_units(equations)[-1])
+        if not abs(away) <= allowed * row + RESOLVED * roundoff(1) * abs(self.energy):
             raise OrbitError(
                 f"the periodic orbit near the guess has the energy {self.energy + away:.10g}, not {self.energy:.10g}: "
                 "fix fewer entries of the state, or give a better initial guess"
@@ -510,9 +526,11 @@ class _OrbitSearch:
         A step length is accepted if the simplified Newton correction with the same Jacobian decreases (Deuflhard's
         natural monotonicity test), which is independent of the unstable direction that dominates the residuals.
         """
-        inverse = self._inverse(equations)
+        inverse, units = self._inverse(equations), self._units(equations)
         change = inverse @ equations.defects
-        if np.linalg.norm(change) <= SETTLED * np.linalg.norm(z):
+        rows, size = self._row_units(equations), float(np.linalg.norm(change / units))
+        residual = float(np.linalg.norm(equations.defects / rows))
+        if size <= SETTLED * math.sqrt(len(z)):
             return None
         for shortened in 0.5 ** np.arange(MOST_HALVINGS):
             trial = z - shortened * change
@@ -522,18 +540,44 @@ class _OrbitSearch:
             trial[:-1] = np.ravel([self.reduction.normalised(*state) for state in states])
             with suppress(EventError, StepFailedError):
                 at = self._closing(trial)
-                less = np.linalg.norm(inverse @ at.defects) < (1.0 - shortened / 4.0) * np.linalg.norm(change)
-                if less and np.linalg.norm(at.defects) < MOST_INCREASE * np.linalg.norm(equations.defects):
+                less = np.linalg.norm(inverse @ at.defects / units) < (1.0 - shortened / 4.0) * size
+                if less and np.linalg.norm(at.defects / rows) < MOST_INCREASE * residual:
                     return trial, at
         return None
 
+    def _units(self, equations: _ClosingEquations) -> Array:
+        """Return the sizes of the unknowns: of the motion for each start of a segment, and the period."""
+        return np.append(np.tile(equations.sizes, len(equations.segments)), self.period)
+
+    def _row_units(self, equations: _ClosingEquations) -> Array:
+        """Return the sizes of the equations, of that of the energy the change by the size of the motion."""
+        rows = np.tile(self._reduced(equations.sizes), len(equations.segments))
+        if self.energy is None:
+            return rows
+        return np.append(rows, float(np.linalg.norm(equations.partials[-1] * self._units(equations))) or 1.0)
+
     def _inverse(self, equations: _ClosingEquations) -> Array:
-        """Return the pseudoinverse of the Jacobian; fixed unknowns do not change."""
-        size = equations.partials.shape[1]
-        free = np.delete(np.arange(size), self.fixed_indices)
-        inverse = np.zeros((size, len(equations.defects)))
-        inverse[free] = np.linalg.pinv(equations.partials[:, free], NULL_SINGULAR_VALUE)
+        """Return the pseudoinverse of the Jacobian in units of the motion; fixed unknowns do not change."""
+        units, rows = self._units(equations), self._row_units(equations)
+        free = np.delete(np.arange(len(units)), self.fixed_indices)
+        inverse = np.zeros((len(units), len(rows)))
+        scaled = equations.partials[:, free] * units[free] / rows[:, np.newaxis]
+        inverse[free] = units[free, np.newaxis] * np.linalg.pinv(scaled, NULL_SINGULAR_VALUE) / rows
         return inverse
+
+    def _reduced(self, sizes: Array) -> Array:
+        """Return sizes (2m,) of positions and momenta as those of the coordinates of the reduced tangent space."""
+        return np.repeat(sizes[[0, -1]], self.reduction.size // 2)
+
+    def _size_of(self, states: Array) -> SizeOfMotion:
+        q, p = np.split(states, 2, axis=1)
+        return SizeOfMotion.of(self.stepper, q, p, self.t, self.parameters)
+
+    def _sizes_of(self, states: Array) -> Array:
+        """Return the (2m,) sizes of positions and momenta along states, at least their rounding errors."""
+        size = self._size_of(states)
+        of_q, of_p = (RESOLVED * each or LEAST_SIZE for each in size.rounding)
+        return np.repeat([max(size.position, of_q), max(size.momentum, of_p)], self.stepper.dimension)
 
     def _closing(self, z: Array) -> _ClosingEquations:
         """Integrate one period and return the residuals with their derivatives; ``z`` has the start of each segment."""
@@ -545,7 +589,8 @@ class _OrbitSearch:
             self._segment(start, self._steps, first, last, z[-1])
             for start, first, last in zip(starts, bounds[:-1], bounds[1:], strict=True)
         ]
-        left = self._independent_equations(starts, segments)
+        sizes = self._sizes_of(np.vstack([starts, *(segment.states for segment in segments)]))
+        left = self._independent_equations(starts, segments, sizes)
         rows = np.zeros((count, self.reduction.size, count * size + 1))
         defects = np.zeros(rows.shape[:2])
         for k, segment in enumerate(segments):
@@ -557,7 +602,7 @@ class _OrbitSearch:
             rows[k, :, k * size : (k + 1) * size] = leaving @ segment.monodromy
             rows[k, :, after * size : (after + 1) * size] -= outward
             rows[k, :, -1] = leaving @ segment.by_period
-        error = float(np.abs(defects).max())
+        error, relative_error = (float(np.abs(each).max()) for each in (defects, defects / self._reduced(sizes)))
         monodromy = leaving @ segments[-1].monodromy @ self.reduction.inward(*np.split(starts[-1], 2))
         rows[-1], defects[-1] = left @ rows[-1], left @ defects[-1]
         partials, wanted = rows.reshape(defects.size, -1), defects.ravel()
@@ -566,9 +611,9 @@ class _OrbitSearch:
             energy = self.stepper.energy(first[: size // 2], first[size // 2 :], self.t, self.parameters)
             wanted = np.append(wanted, energy - self.energy)
             row = np.zeros(len(z))
-            row[:size] = self._integral_gradients(first, self.t)[0]
+            row[:size] = self._integral_gradients(first, self.t, sizes)[0]
             partials = np.vstack([partials, row])
-        return _ClosingEquations(segments, monodromy, error, wanted, partials, left)
+        return _ClosingEquations(segments, monodromy, error, relative_error, sizes, wanted, partials, left)
 
     def _leaving(self, segment: _Segment) -> Array:
         """Return the matrix from changes of (q, p) at the end of a segment to the reduced tangent space."""
@@ -609,43 +654,45 @@ class _OrbitSearch:
         outward = self.reduction.outward(*np.split(start, 2))
         defects = equations.independent @ outward @ (self.reduction.aligned(end, start) - start)
         change = self._inverse(equations) @ np.append(defects, np.zeros(len(equations.defects) - len(defects)))
-        moved, ranges = np.abs(change), np.ptp(states, axis=0)
-        parts = zip(np.split(moved[:-1], 2), np.split(ranges, 2), strict=True)
-        return max(float(moved[-1]) / period, *(float(part.max()) / (float(size.max()) or 1.0) for part, size in parts))
+        q, p = (float(np.abs(part).max()) for part in np.split(change[:-1], 2))
+        return max(float(abs(change[-1])) / period, self._size_of(states).error(q, p))
 
-    def _independent_equations(self, starts: Array, segments: Sequence[_Segment]) -> Array:
+    def _independent_equations(self, starts: Array, segments: Sequence[_Segment], sizes: Array) -> Array:
         """Return the (size, size) projection onto the equations of return not implied by conserved quantities.
 
         Energy and momentum maps count as conserved if the Jacobian of every segment maps their gradients accordingly,
         and if events that change the state leave their values at the ends of steps unchanged.
         """
-        conserved_masks = []
+        conserved_masks, units = [], self._reduced(sizes)
         for start, segment in zip(starts, segments, strict=True):
-            begin = self._reduced_gradients(start, segment.start_time)
-            end = self._reduced_gradients(segment.states[-1], segment.end_time)
+            begin = self._reduced_gradients(start, segment.start_time, sizes)
+            end = self._reduced_gradients(segment.states[-1], segment.end_time, sizes)
             monodromy = self._leaving(segment) @ segment.monodromy @ self.reduction.inward(*np.split(start, 2))
-            sizes = np.linalg.norm(end, axis=1) * np.linalg.norm(monodromy, 2)
-            conserved_masks.append(np.linalg.norm(end @ monodromy - begin, axis=1) <= CONSERVED * sizes)
+            monodromy = monodromy / units[:, np.newaxis] * units
+            largest = np.linalg.norm(end, axis=1) * np.linalg.norm(monodromy, 2)
+            conserved_masks.append(np.linalg.norm(end @ monodromy - begin, axis=1) <= CONSERVED * largest)
             if self.stepper.changes_states:
                 states = np.vstack([start, segment.states])
                 values = self._integrals(states, np.linspace(segment.start_time, segment.end_time, len(states)))
-                largest = np.linalg.norm(begin, axis=1) * np.linalg.norm(states, axis=1).max()
-                conserved_masks.append(np.ptp(values, axis=0) <= CONSERVED * largest)
-        conserved = self._reduced_gradients(starts[0], self.t)[np.all(conserved_masks, axis=0)]
+                conserved_masks.append(np.ptp(values, axis=0) <= CONSERVED * np.linalg.norm(begin, axis=1))
+        conserved = self._reduced_gradients(starts[0], self.t, sizes)[np.all(conserved_masks, axis=0)]
+        conserved /= np.maximum(np.linalg.norm(conserved, axis=1), LEAST_SIZE)[:, np.newaxis]
         directions, strengths, _ = np.linalg.svd(conserved.T, full_matrices=False)
         directions = directions[:, strengths > CONSERVED * strengths.max(initial=0.0)]
-        return np.asarray(np.eye(self.reduction.size) - directions @ directions.T)
+        projection = np.eye(self.reduction.size) - directions @ directions.T
+        return np.asarray(units[:, np.newaxis] * projection / units)
 
-    def _reduced_gradients(self, state: Array, t: float) -> Array:
-        """Return (r, size) gradients in the reduced tangent space."""
-        return np.asarray(self._integral_gradients(state, t) @ self.reduction.inward(*np.split(state, 2)))
+    def _reduced_gradients(self, state: Array, t: float, sizes: Array) -> Array:
+        """Return (r, size) gradients in the reduced tangent space, in units of the motion."""
+        gradients = self._integral_gradients(state, t, sizes) @ self.reduction.inward(*np.split(state, 2))
+        return np.asarray(gradients * self._reduced(sizes))
 
-    def _integral_gradients(self, state: Array, t: float) -> Array:
+    def _integral_gradients(self, state: Array, t: float, sizes: Array) -> Array:
         """Return (r, 2m) gradients of the energy and the momentum maps by finite differences, for directions only."""
-        size, width = len(state), DIFFERENCE_INCREMENT * max(1.0, float(np.abs(state).max()))
-        states = np.vstack([state + width * np.eye(size), state - width * np.eye(size)])
+        size, widths = len(state), DIFFERENCE_INCREMENT * sizes
+        states = np.vstack([state + np.diag(widths), state - np.diag(widths)])
         values = self._integrals(states, np.full(2 * size, t))
-        return np.asarray((values[:size] - values[size:]).T / (2.0 * width))
+        return np.asarray((values[:size] - values[size:]).T / (2.0 * widths))
 
     def _integrals(self, states: Array, t: Array) -> Array:
         """Return (n, r) values of the energy and the momentum maps of states."""
@@ -690,7 +737,7 @@ def _warn_of_distance(orbit: PeriodicOrbit, guess: Array) -> None:
         states = orbit.run()
     amplitude = float(np.ptp(np.concatenate([states.q, states.p], axis=1), axis=0).max()) / 2.0
     away = float(np.abs(np.concatenate([orbit.q, orbit.p]) - guess[:-1]).max())
-    if away > OTHER * amplitude or not _is_near(orbit, guess):
+    if away > OTHER * amplitude or not _is_near(orbit, guess, np.concatenate([states.q, states.p], axis=1)):
         warn(
             f"the periodic orbit that was found is far from the guess: its period is {orbit.period:.6g}, not "
             f"{guess[-1]:.6g}, and its state differs by {away:.2g}, where the amplitude of the orbit is "
@@ -699,9 +746,11 @@ def _warn_of_distance(orbit: PeriodicOrbit, guess: Array) -> None:
         )
 
 
-def _is_near(orbit: PeriodicOrbit, guess: Array) -> bool:
-    away = float(np.abs(np.concatenate([orbit.q, orbit.p]) - guess[:-1]).max())
-    return bool(1 / FAR < orbit.period / guess[-1] < FAR and away < FAR * np.abs(guess[:-1]).max())
+def _is_near(orbit: PeriodicOrbit, guess: Array, states: Array) -> bool:
+    """Return whether an orbit with (n, 2m) states is near the guess, by the distance of the guess from its middle."""
+    away, middle = np.concatenate([orbit.q, orbit.p]) - guess[:-1], (states.max(axis=0) + states.min(axis=0)) / 2.0
+    near = np.abs(away).max() <= FAR * np.abs(guess[:-1] - middle).max()
+    return bool(1 / FAR < orbit.period / guess[-1] < FAR and near)
 
 
 @dataclass(frozen=True, eq=False)
@@ -729,7 +778,8 @@ class _ClosingEquations:
     Attributes:
         segments: in their order.
         monodromy: derivative of the end of the last segment by its start, without gauge directions.
-        error: largest entry of the ends minus the starts that follow.
+        error, relative_error: largest entry of the ends minus the starts that follow, itself and relative to sizes.
+        sizes: (2m,) sizes of the motion.
         defects: (r,) residuals.
         partials: (r, 2m segments + 1) Jacobian of the residuals with respect to the starts of segments and the period.
         independent: (size, size) projection of the closing equations onto those that conserved quantities do not imply.
@@ -738,6 +788,8 @@ class _ClosingEquations:
     segments: Sequence[_Segment]
     monodromy: Array
     error: float
+    relative_error: float
+    sizes: Array
     defects: Array
     partials: Array
     independent: Array

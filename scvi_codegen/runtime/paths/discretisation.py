@@ -14,14 +14,15 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.errors import StepFailedError
+from scvi_codegen.runtime.accuracy.size import RESOLVED, roundoff
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.paths.intervals import Intervals
 from scvi_codegen.runtime.paths.solver import Solution
 
-AT_REST = 1e-9
-"""Range of the positions of a path at rest, relative to 1 + max|q|."""
 FINER = 3
 """Number of steps by which each interval is solved again."""
+OF_FINER = FINER**2 / (FINER**2 - 1.0)
+"""Largest ratio of the error to the distance from the path of the finer steps, of a method of order 2 at least."""
 NO_MOTION, ENERGY_OF_NO_MOTION = 0.1, 0.5
 """Discretisation error, and relative change of a conserved energy from node to node, from which a stationary point of
 the discrete action is no path of the system, as one that passes through an attractive singularity."""
@@ -32,8 +33,8 @@ class Discretisation:
     """Comparison of a path with the motion of the system.
 
     Attributes:
-        error: of positions relative to their largest range, or of momenta relative to the largest one, whichever is
-            larger; infinite if a finer step fails.
+        error: of positions relative to their largest range, or of momenta relative to the largest one of a velocity,
+            whichever is larger, and the rounding error of both; infinite if a finer step fails.
         energy_change: range of the energy of the nodes relative to the largest p . v; 0 if it is not conserved.
     """
 
@@ -48,11 +49,10 @@ class Discretisation:
 
 def discretisation_of(solution: Solution) -> Discretisation:
     """Return the discretisation error of a path and the change of its energy."""
-    momenta = np.concatenate([solution.at.p0, solution.at.p1[-1:]])
-    return Discretisation(_error(solution, momenta), _energy_change(solution, momenta))
+    return Discretisation(_error(solution), _energy_change(solution))
 
 
-def _error(solution: Solution, momenta: Array) -> float:
+def _error(solution: Solution) -> float:
     intervals, at, q = solution.intervals, solution.at, solution.q
     try:
         end, end_momenta = intervals.refined(q, at.p0, FINER)
@@ -62,7 +62,7 @@ def _error(solution: Solution, momenta: Array) -> float:
         np.array([intervals.tangent(k, row) for k, row in enumerate(rows, 1)])
         for rows in (end - q[1:], end_momenta - at.p1)
     )
-    _, before, _, after = at.blocks
+    own, before, other, after = at.blocks
     first, last = intervals.products(before, moved), kicked - intervals.products(after, moved)
     defects = last[:-1] + first[1:]
     if (M := intervals.symmetry) is not None:
@@ -73,25 +73,27 @@ def _error(solution: Solution, momenta: Array) -> float:
         nodes[1:-1] = changes
     else:
         nodes[:-1], nodes[-1] = changes, intervals.basis_map(M) @ changes[0]
-    impulses = intervals.products(at.blocks[0], nodes[:-1]) + intervals.products(before, nodes[1:] - moved)
-    size, largest = float(np.ptp(q, axis=0).max()), float(np.abs(momenta).max())
-    if size <= AT_REST * (1.0 + np.abs(q).max()):
-        size = 1.0 + float(np.abs(q).max())
-        largest = size * float(np.abs(at.blocks).max())
-    return max(float(np.abs(nodes).max(initial=0.0)) / size, float(np.abs(impulses).max()) / largest)
+    ends = nodes[1:] - moved
+    impulses = [
+        intervals.products(own, nodes[:-1]) + intervals.products(before, ends),
+        intervals.products(other, nodes[:-1]) + intervals.products(after, ends) + kicked,
+    ]
+    position, momentum = (OF_FINER * float(np.abs(each).max(initial=0.0)) for each in (nodes, impulses))
+    return solution.size.error(position, momentum)
 
 
-def _energy_change(solution: Solution, momenta: Array) -> float:
-    intervals, q = solution.intervals, solution.q
+def _energy_change(solution: Solution) -> float:
+    intervals, q, momenta = solution.intervals, solution.q, solution.momenta
     stepper: Any = intervals.stepper
-    if not stepper.interface.conserves_energy or intervals.parameters.ndim == 2:
-        return 0.0
-    if np.ptp(q, axis=0).max() <= AT_REST * (1.0 + np.abs(q).max()):
+    if not stepper.interface.conserves_energy or intervals.parameters.ndim == 2 or solution.at_rest:
         return 0.0
     t = np.append(intervals.t, intervals.t[-1] + intervals.h[-1])
     energies = stepper.energy(q, momenta, t, intervals.parameters)
-    kinetic = np.abs(np.sum(momenta * stepper.velocity(q, momenta, t, intervals.parameters), axis=1)).max()
-    return float(np.ptp(energies) / kinetic) if kinetic else 0.0
+    velocities = stepper.velocity(q, momenta, t, intervals.parameters)
+    kinetic = np.abs(np.sum(momenta * velocities, axis=1)).max()
+    of_momenta = np.abs(q).max() * np.abs(solution.at.blocks).max() * np.abs(velocities).max()
+    rounding = RESOLVED * roundoff(1) * (np.abs(energies).max() + of_momenta)
+    return float(max(np.ptp(energies) - rounding, 0.0) / kinetic) if kinetic else 0.0
 
 
 def kinetic_energy_is_positive(intervals: Intervals, q: Array, p: Array) -> bool:

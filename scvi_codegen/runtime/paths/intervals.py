@@ -15,11 +15,12 @@ import numpy as np
 
 from scvi_codegen.errors import PathError, StateError
 from scvi_codegen.native.options import SolverOptions, step_failure
+from scvi_codegen.runtime.accuracy.size import size_for_updates
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.rotations.states import members_of
 
 CONVERGED, MOST_ITERATIONS = 1e-13, 20
-"""Largest relative miss of a step that is solved by shooting, and most Newton iterations."""
+"""Largest miss, relative to the range of the path, of a step that is solved by shooting, and most Newton iterations."""
 SMALL_PART = 1e-5
 """Part of a step by which it is lengthened for its derivative."""
 PROBED = 1e-5
@@ -53,6 +54,7 @@ class Intervals:
 
     sparse = False
     symmetry: Array | None = None  # of a closed path
+    range_of_start = 0.0  # largest range of the positions from which the search starts
 
     def __init__(self, stepper: Any, t: Array, h: Array, parameters: Array, options: SolverOptions | None) -> None:
         self.stepper, self.t, self.h, self.parameters, self.options = stepper, t, h, parameters, options
@@ -328,6 +330,7 @@ class ReducedIntervals(Intervals):
             if self.members:
                 u = self._covector(q[k], Z0, (q[k + 1] - q[k]) / h, times[k], own[k])
             step = {"h": h, "t": times[k], "parameters": own[k]}
+            allowed = CONVERGED * size_for_updates(q, CONVERGED)
             for _ in range(MOST_ITERATIONS):
                 p0[k] = drift + W @ u
                 reached, p1[k] = self.stepper.step(q[k], p0[k], options=self.options, **step)
@@ -339,7 +342,7 @@ class ReducedIntervals(Intervals):
                 except np.linalg.LinAlgError as error:
                     raise PathError(f"no step leads from node {k} to the next") from error
                 u = u - correction
-                if np.abs(missed).max() <= CONVERGED * (1.0 + np.abs(q).max()):
+                if np.abs(missed).max() <= allowed:
                     break
             else:
                 raise PathError(f"no step from node {k} to the next was found")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from itertools import islice
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -15,19 +15,15 @@ from scvi_codegen.errors import AccuracyWarning, MethodError, PathError, StateEr
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.representation import summary
+from scvi_codegen.runtime.accuracy.size import largest_range, size_for_updates
 from scvi_codegen.runtime.accuracy.warning_switch import warnings_wanted
 from scvi_codegen.runtime.core.features import require
 from scvi_codegen.runtime.core.validation import Array, Parameters, States, columns_of_inputs, flat_state
 from scvi_codegen.runtime.paths import solver
-from scvi_codegen.runtime.paths.discretisation import (
-    AT_REST,
-    Discretisation,
-    discretisation_of,
-    kinetic_energy_is_positive,
-)
+from scvi_codegen.runtime.paths.discretisation import Discretisation, discretisation_of, kinetic_energy_is_positive
 from scvi_codegen.runtime.paths.equations import Band, condensed_hessian, negative_directions
 from scvi_codegen.runtime.paths.intervals import Intervals, ManyCoordinates, ReducedIntervals
-from scvi_codegen.runtime.paths.starts import curves_around, curves_at_random, size_of
+from scvi_codegen.runtime.paths.starts import curves_around, curves_at_random
 from scvi_codegen.runtime.rotations.states import flat_states
 from scvi_codegen.validation import checked_count, checks_arguments
 
@@ -52,10 +48,11 @@ class Path:
         t: (N + 1,) times.
         q, p: (N + 1, m) positions and momenta. Those of all steps agree, so that the states are those of a run.
         action: sum of the discrete Lagrangians; with forces and constraints that of L alone.
-        residual: largest jump of the momentum between two steps, relative to the largest momentum; at rest, relative to
-            the momentum of a step of the size 1 + max|q|.
-        error: discretisation error: the distance to the path of which all steps are divided by three, to first order.
-            Of positions it is relative to their largest range, of momenta to the largest one; the larger of both.
+        residual: largest jump of the momentum between two steps, relative to the largest momentum of a velocity; at
+            rest, relative to the momentum of a step of the size of the start of the search.
+        error: discretisation error: the distance to the path of which all steps are divided by three, to first order,
+            and the rounding error. Of positions it is relative to their largest range, of momenta to the largest one of
+            a velocity; the larger of both.
         energy_change: range of a conserved energy over the nodes, relative to the largest p . v; else 0.
         dropped: number of stationary points of the discrete action that were found first and are no paths of the
             system, as those that pass through an attractive singularity.
@@ -127,8 +124,7 @@ class Path:
     @property
     def at_rest(self) -> bool:
         """True if all positions are equal: an equilibrium."""
-        q = np.asarray(self.q)
-        return bool(np.ptp(q, axis=0).max() <= AT_REST * (1.0 + np.abs(q).max()))
+        return bool(self.solution.at_rest)
 
     @property
     def period(self) -> float:
@@ -245,6 +241,7 @@ class WithPaths:
         if closed is not None:
             if nodes is None:
                 raise StateError("closed paths require start=: an array (steps + 1, m), or a function of time")
+            intervals.range_of_start = largest_range(nodes)
             M, forced = _symmetry(stepper.interface, closed), bool(stepper.interface.exchange_names)
             minimised = not (forced or isinstance(intervals, ReducedIntervals))
             found = solver.closed(
@@ -258,6 +255,7 @@ class WithPaths:
         ends = [
             stepper._vector(_positions(stepper.interface, each, name), name) for each, name in ((q0, "q0"), (q1, "q1"))
         ]
+        intervals.range_of_start = largest_range(np.array(ends) if nodes is None else nodes)
         if revolutions is not None:
             attempts: list[Attempt] = [
                 partial(solver.continued_from_motion, intervals, curve, duration)
@@ -299,7 +297,7 @@ def different_paths(
             reason = reason or error
             continue
         known = (np.abs(each.q - found.q).max() + abs(each.t[-1] - found.t[-1]) for each in paths)
-        if all(distance > SAME_PATH * size_of(line) for distance in known):
+        if all(distance > SAME_PATH * size_for_updates(found.q, SAME_PATH) for distance in known):
             paths.append(found)
     if not paths:
         raise PathError(
@@ -473,16 +471,15 @@ def _described(
             AccuracyWarning,
         )
     jumps = at.residual if M is None else at.p1[:-1] - at.p0[1:]
-    momenta = np.concatenate([at.p0, at.p1[-1:]])
-    path = Path(
+    return Path(
         t=t,
         q=stepper.named(found.q),
-        p=stepper.named(momenta),
+        p=stepper.named(found.momenta),
         action=float(np.sum(at.actions)),
         error=comparison.error,
         energy_change=comparison.energy_change,
         dropped=dropped,
-        residual=float(np.abs(jumps).max(initial=0.0)),
+        residual=float(np.abs(jumps).max(initial=0.0)) / (found.size.momentum or 1.0),
         iterations=found.iterations,
         stepper=stepper,
         repetitions=repetitions,
@@ -490,8 +487,6 @@ def _described(
         arguments=arguments,
         solution=found,
     )
-    size = float(np.abs(at.blocks).max() * (1.0 + np.abs(found.q).max()) if path.at_rest else np.abs(momenta).max())
-    return replace(path, residual=path.residual / (size or 1.0))
 
 
 def _parameters_of_steps(stepper: Any, parameters: Parameters, inputs: Mapping[str, Any] | None, times: Array) -> Array:

@@ -7,20 +7,24 @@ Newton Methods for Nonlinear Problems, sec. 3.3), which does not depend on units
 import math
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from scvi_codegen.errors import PathError, StateError, StepFailedError
+from scvi_codegen.runtime.accuracy.size import RESOLVED, SizeOfMotion, largest_range, roundoff, size_for_updates
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.paths.equations import Bordered, BorderedClosed, Closed, closed_residual, factors_of
 from scvi_codegen.runtime.paths.intervals import Intervals, Linearised
 
 TOLERANCE = 1e-11
-"""Newton correction, relative to 1 + max|q|, at which the iteration ends."""
+"""Newton correction, relative to the range of the path, at which the iteration ends."""
 ROUNDING, ILL_CONDITIONED = 1e-14, 1e-7
 """Residual, relative to the momenta, that is rounding, and the correction that then ends the iteration."""
+AT_REST = 1e-9
+"""Range of the positions of a path at rest, relative to that of the start of the search."""
 MOST_ITERATIONS, LEAST_STEP = 60, 1e-4
 FIRST_PART, MOST_GROWTH, LEAST_GROWTH, CONTINUED_ITERATIONS = 16, 2.0, 1.005, 15
 """Continuation: part of the duration it starts from, factors of the duration, and iterations of each."""
@@ -48,15 +52,48 @@ class Solution:
     factors: Any
     iterations: int
 
+    @property
+    def at_rest(self) -> bool:
+        """True if all positions are equal, up to rounding or relative to the start of the search."""
+        rounding = RESOLVED * roundoff(1) * float(np.abs(self.q).max())
+        return largest_range(self.q) <= max(AT_REST * self.intervals.range_of_start, rounding)
+
+    @property
+    def momenta(self) -> Array:
+        """(N + 1, m) momenta of the nodes."""
+        return np.concatenate([self.at.p0, self.at.p1[-1:]])
+
+    @property
+    def size(self) -> SizeOfMotion:
+        """Size of the motion; of a path at rest that of the start of the search."""
+        intervals, steepness = self.intervals, float(np.abs(self.at.blocks).max())
+        at = float(intervals.t[0]), intervals.parameters_at_start
+        own = SizeOfMotion.of(intervals.stepper, self.q, self.momenta, *at)
+        of_q, of_p = own.rounding
+        own = replace(own, rounding=(of_q, of_p + of_q * steepness))
+        if not self.at_rest:
+            return own
+        position = intervals.range_of_start or float(np.abs(self.q).max())
+        return replace(own, position=position, momentum=position * steepness)
+
 
 def newton(
     evaluate: Callable[[Array, bool], tuple[Linearised, Array]],
     factorise: Callable[[Linearised], Any],
     move: Callable[[Array, Array], Array],
+    relative: Callable[[Array, Array], float],
     q: Array,
     most: int,
 ) -> tuple[Array, Linearised, Any, int]:
-    """Solve r(q) = 0 by Newton's method; ``evaluate`` returns the steps, with derivatives if requested, and r.
+    """Solve r(q) = 0 by Newton's method.
+
+    Args:
+        evaluate: function of q that returns the steps, with derivatives if requested, and r.
+        factorise: function that returns the factors of the derivatives of r.
+        move: function of q and a correction that returns the unknowns moved by it.
+        relative: function of q and a correction that returns its size relative to the motion.
+        q: start of the iteration.
+        most: largest number of iterations.
 
     Raises:
         PathError: if the iteration does not converge.
@@ -70,7 +107,7 @@ def newton(
         if not np.isfinite(size):
             break
         rounding = float(np.abs(r).max(initial=0.0)) <= ROUNDING * float(np.abs(at.p0).max() + np.abs(at.p1).max())
-        if size <= (ILL_CONDITIONED if rounding else TOLERANCE) * (1.0 + float(np.abs(q).max())):
+        if relative(q, correction) <= (ILL_CONDITIONED if rounding else TOLERANCE):
             return move(q, correction), at, factors, iteration
         damping = min(1.0, 2.0 * damping)
         while True:
@@ -88,6 +125,12 @@ def newton(
     raise PathError(f"Newton's method did not converge in {most} iterations")
 
 
+def _relative(intervals: Intervals, q: Array, correction: Array) -> float:
+    """Return the largest correction of a node relative to the range of the path, or to that of a path at rest."""
+    size = size_for_updates(q, TOLERANCE, AT_REST * intervals.range_of_start)
+    return float(np.abs(correction).max(initial=0.0)) / (size or 1.0)
+
+
 def solved(intervals: Intervals, q: Array, most: int = MOST_ITERATIONS) -> Solution:
     """Return the path between fixed ends near q."""
 
@@ -95,7 +138,9 @@ def solved(intervals: Intervals, q: Array, most: int = MOST_ITERATIONS) -> Solut
         at = intervals.linearised(q) if derivatives else intervals.evaluated(q)
         return at, at.residual
 
-    q, at, factors, iterations = newton(evaluate, lambda at: factors_of(at, intervals), intervals.moved, q, most)
+    q, at, factors, iterations = newton(
+        evaluate, lambda at: factors_of(at, intervals), intervals.moved, partial(_relative, intervals), q, most
+    )
     return Solution(q, intervals, at, factors, iterations)
 
 
@@ -162,7 +207,7 @@ def descended(intervals: Intervals, q: Array) -> Solution:
             shift *= 4.0
             continue
         q, at, shift = trial, there, shift / 4.0
-        if float(np.abs(correction).max()) <= NEAR * (1.0 + float(np.abs(q).max())):
+        if _relative(intervals, q, correction) <= NEAR:
             break
     found = solved(intervals, q)
     return Solution(found.q, intervals, found.at, found.factors, iterations + found.iterations)
@@ -191,7 +236,7 @@ class AtEnergy:
         M = self.M
         x = np.append(q if M is None else q[: self.rows], float(self.intervals.h.sum()))
         try:
-            x, at, _, more = newton(self.evaluate, self.factorise, self.move, x, MOST_ITERATIONS)
+            x, at, _, more = newton(self.evaluate, self.factorise, self.move, self.relative, x, MOST_ITERATIONS)
         except UNSOLVED as error:
             raise PathError(
                 f"no path of energy {self.energy:g} was found ({error}): give another T to start from, or another "
@@ -229,6 +274,10 @@ class AtEnergy:
         first = at.blocks[1][0] if not intervals.sparse else _first_block(at, intervals)
         return Bordered(factors_of(at, intervals), border, -(first.T @ velocities[0]), corner)
 
+    def relative(self, x: Array, correction: Array) -> float:
+        """Return the larger one of the relative corrections of the nodes and of the duration."""
+        return max(_relative(self.intervals, self.nodes(x), correction[:-1]), float(abs(correction[-1] / x[-1])))
+
     def move(self, x: Array, correction: Array) -> Array:
         """Return the nodes and the duration moved by a correction."""
         q = self.intervals.moved(self.nodes(x), correction[:-1].reshape(self.rows, -1))
@@ -265,14 +314,20 @@ def closed(
     if energy is not None:
         with suppress(*UNSOLVED):
             return AtEnergy(intervals, energy, states, M).solved(q)
+
+    def relative(nodes: Array, correction: Array) -> float:
+        return _relative(intervals, whole(nodes), correction)
+
     at, r = evaluate(q, True)
-    near = float(np.abs(Closed(at, intervals.basis_map(M), symmetric=symmetric).solve(r)).max()) < NEAR_CLOSED * float(
-        np.abs(q).max()
-    )
-    if minimise and not near:
+    if minimise and relative(q, Closed(at, intervals.basis_map(M), symmetric=symmetric).solve(r)) >= NEAR_CLOSED:
         q = _minimised(evaluate, q)
     found, at, factors, iterations = newton(
-        evaluate, lambda at: Closed(at, intervals.basis_map(M), symmetric=symmetric), moved, q, MOST_ITERATIONS
+        evaluate,
+        lambda at: Closed(at, intervals.basis_map(M), symmetric=symmetric),
+        moved,
+        relative,
+        q,
+        MOST_ITERATIONS,
     )
     if energy is not None:
         return AtEnergy(intervals, energy, states, M).solved(found, iterations)

@@ -1,12 +1,13 @@
 #include "../run/run.h"
 
-/* Growth of errors along an adaptive run: the relative size of one tangent vector (dq, dv), which an explicit
- * Runge-Kutta-Nystroem scheme advances by each accepted step. Its accelerations are those of the variational equations,
+/* Growth of errors along an adaptive run: the size of one tangent vector (dq, dv) relative to the motion, the largest
+ * distance from the start and the largest velocity, which depend neither on the origin nor on a gauge. An explicit
+ * Runge-Kutta-Nystroem scheme advances it by each accepted step. Its accelerations are those of the variational equations,
  *   dq'' = F_q dq / m,      or      L_vv dq'' = -E_q dq - E_v dv   (VARIABLE_ACCELERATIONS),
  * with E(q, v, a) the Euler-Lagrange residual at the points of the step, whose derivatives are evaluated in SIMD lanes.
  * The nodes of the scheme are some of the points; a_0 is extrapolated from the step before. Where h^2 dq'' is large,
  * the scheme is corrected by fixed-point iterations of the collocation equations at all points. Every second or fourth
- * step the vector is projected on the energy surface (in the metric of the sizes of q and v): its part along the
+ * step the vector is projected on the energy surface (in the metric of the sizes of the motion): its part along the
  * gradient of the energy, which is conserved, grows by the error of the scheme only. Requires: the iteration, the
  * tables of the scheme, point_derivatives and derivative_product; with VARIABLE_ACCELERATIONS energy_gradient. */
 
@@ -337,29 +338,34 @@ static inline void end_gradient(const run_memory *run, const step_data *step, co
 #endif
 }
 
-/* Projects the tangent vector on the energy surface at the end of the step and measures it. */
+/* Projects the tangent vector on the energy surface at the end of the step and measures it, if there is a motion.
+ * Exponential growth is that of its size max(dq, dv Q / V) with the sizes Q, V of the motion: relative to a motion that
+ * is itself amplified rounding, as one from rest at an unstable equilibrium, it would be constant. */
 static inline void sample_growth(run_memory *run, const step_data *step, const iteration_data *data, const double *dq,
     const double *dp)
 {
-  double q[M], v[M], by_q[M], by_v[M], q2 = 0.0, v2 = 0.0, dq2 = 0.0, dv2 = 0.0, growth;
+  double q[M], v[M], by_q[M], by_v[M], q2 = 0.0, v2 = 0.0, dq2 = 0.0, dv2 = 0.0, size, growth;
 #ifdef ENERGY_CONSERVED
-  double along = 0.0, size = 0.0;
+  double along = 0.0, square = 0.0;
 #endif
   for (int i = 0; i < M; i++)
     q[i] = step->q0[i] + dq[i];
   end_gradient(run, step, data, q, dp, v, by_q, by_v);
   for (int i = 0; i < M; i++) {
-    q2 += q[i] * q[i];
+    const double away = (step->q0[i] - run->growth_start[i]) + dq[i];
+    q2 += away * away;
     v2 += v[i] * v[i];
   }
-  run->largest_q2 = larger(run->largest_q2, q2);
-  run->largest_v2 = larger(run->largest_v2, v2);
+  q2 = run->largest_q2 = larger(run->largest_q2, q2);
+  v2 = run->largest_v2 = larger(run->largest_v2, v2);
+  if (q2 == 0 || v2 == 0)
+    return;
 #ifdef ENERGY_CONSERVED
   for (int i = 0; i < M; i++) {
     along += by_v[i] * run->tangent_v[i] + by_q[i] * run->tangent_q[i];
-    size += by_q[i] * by_q[i] * q2 + by_v[i] * by_v[i] * v2;
+    square += by_q[i] * by_q[i] * q2 + by_v[i] * by_v[i] * v2;
   }
-  along /= size;
+  along /= square;
   for (int i = 0; i < M; i++) {
     run->tangent_q[i] -= along * q2 * by_q[i];
     run->tangent_v[i] -= along * v2 * by_v[i];
@@ -369,14 +375,15 @@ static inline void sample_growth(run_memory *run, const step_data *step, const i
     dq2 += run->tangent_q[i] * run->tangent_q[i];
     dv2 += run->tangent_v[i] * run->tangent_v[i];
   }
-  growth = 0.5 * LOG_2 *
-      logarithm(larger(dq2 * run->largest_v2, dv2 * run->largest_q2) / (run->largest_q2 * run->largest_v2));
+  size = larger(dq2, dv2 * q2 / v2);
+  growth = 0.5 * LOG_2 * logarithm(size / q2);
+  size = 0.5 * LOG_2 * logarithm(size);
   run->growth = growth;
-  run->growth_sum += growth;
+  run->growth_sum += size;
   run->growth_samples++;
   if (growth >= LEAST_GROWTH)
-    run->growth_excess = larger(run->growth_excess, growth - run->growth_sum / (double)run->growth_samples);
-  if (!(fabs(growth) < LARGEST_GROWTH && larger(run->largest_q2, run->largest_v2) < LARGEST_SQUARE)) {
+    run->growth_excess = larger(run->growth_excess, size - run->growth_sum / (double)run->growth_samples);
+  if (!(fabs(growth) < LARGEST_GROWTH && larger(q2, v2) < LARGEST_SQUARE)) {
     run->measures_growth = 0;
     run->growth_samples = KNOWN(growth) ? run->growth_samples : 0;
   }
@@ -394,6 +401,7 @@ static __attribute__((noinline)) void measure_growth(run_memory *run, const step
     lanes_load(run->memory, V);
 #endif
     for (int i = 0; i < M; i++) {
+      run->growth_start[i] = step->q0[i];
       run->tangent_q[i] = START(step->q0[i], dq[i]) * cos(i);
 #ifdef VARIABLE_ACCELERATIONS
       run->tangent_v[i] = START(at_start(V, i), dq[i] / step->h) * cos(i + 1);
