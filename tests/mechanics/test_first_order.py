@@ -429,7 +429,7 @@ def test_sensitivities_fits_and_chaos_indicators_of_runs() -> None:
 
 def test_periodic_orbits() -> None:
     particle = system("massless particle")
-    orbit = sc.periodic_orbit(sc.compile_stepper(particle, "svi:4"), [1.0], [0.2], period=11.8, steps=40)
+    orbit = sc.periodic_orbit(sc.compile_stepper(particle, "svi:4"), [0.2], [-1.0], period=11.8, steps=40)
     run = sc.compile_stepper(particle, "svi:4").integrate(orbit.q, orbit.p, h=orbit.period / 40, steps=40)
     assert np.abs(run.variables[-1] - run.variables[0]).max() < 1e-11
 

@@ -4,14 +4,11 @@ A size that is the coordinate itself would depend on the origin. Coordinates tha
 entries of an array, the components of a rotation.
 """
 
-from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.errors import StateError
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.core.validation import Array, coordinate_shapes
 from scvi_codegen.runtime.rotations.states import members_of
@@ -104,25 +101,15 @@ class SizeOfMotion:
     rounding: tuple[float, float]
 
     @classmethod
-    def of(cls, stepper: Any, q: Array, p: Array, t: float, parameters: Array) -> "SizeOfMotion":
-        """Return the sizes of (n, m) states; momenta of rest, of the gauge of L, are those at one time."""
-        kinetic = p - _momenta_at_rest(stepper, q, t, parameters)
+    def of(cls, q: Array, p: Array, at_rest: Array | float = 0.0) -> "SizeOfMotion":
+        """Return the sizes of (n, m) states; ``at_rest``: (m,) momenta without velocity, of the gauge of L."""
         of_q, of_p = (roundoff(1) * float(np.abs(each).max(initial=0.0)) for each in (q, p))
-        return cls(largest_range(q), float(np.abs(kinetic).max(initial=0.0)), (of_q, of_p))
+        return cls(largest_range(q), float(np.abs(p - at_rest).max(initial=0.0)), (of_q, of_p))
 
     def error(self, position: float, momentum: float) -> float:
         """Return the larger one of both errors, with those of rounding, relative to these sizes."""
         of_q, of_p = self.rounding
         return max((position + of_q) / (self.position or 1.0), (momentum + of_p) / (self.momentum or 1.0))
-
-
-def _momenta_at_rest(stepper: Any, q: Array, t: float, parameters: Array) -> Array:
-    """Return the (n, m) momenta without velocity at q; those of three states show whether all are 0, or undefined."""
-    few = q[[0, len(q) // 2, -1]]
-    with suppress(StateError):
-        if np.any(stepper.momentum(few, np.zeros_like(few), t, parameters)):
-            return np.asarray(stepper.momentum(q, np.zeros_like(q), t, parameters))
-    return np.zeros_like(q)
 
 
 def size_for_updates(q: Array, settled: float, least: float = 0.0) -> float:

@@ -288,21 +288,29 @@ def periodic_orbit(
     for name in fixed:
         if name not in names:
             raise StateError(f"fixed names '{name}', which is no coordinate or momentum{closest(name, names)}")
+    t, values = checked_number(t, "the time t"), stepper._parameters(parameters)
+    momenta = stepper._initial_momenta(q, p, velocity, t, values)
+    start = np.concatenate(checked_pair(stepper.interface, q, momenta))
     search = _OrbitSearch(
         stepper=stepper,
+        at_rest=_momenta_at_rest(stepper, start[: stepper.dimension], t, values),
         reduction=Reduction(interface),
         period=period,
         sequence=None if adaptive else StepSequence.equal(_count_of_steps(period, steps, h)),
         fixed_indices=(*map(names.index, dict.fromkeys(fixed)), *([-1] if fixed_period else [])),
         energy=None if energy is None else checked_number(energy, "the energy"),
         gain=np.zeros(stepper.dimension) if gain is None else checked_vector(interface, gain, "gain"),
-        t=checked_number(t, "the time t"),
-        parameters=stepper._parameters(parameters),
+        t=t,
+        parameters=values,
         options=options,
     )
-    momenta = stepper._initial_momenta(q, p, velocity, search.t, search.parameters)
-    start = np.concatenate(checked_pair(stepper.interface, q, momenta))
     return search.orbit(np.append(start, search.period), bound)
+
+
+def _momenta_at_rest(stepper: Stepper, q: Array, t: float, parameters: Array) -> Array:
+    with suppress(StateError):  # undefined of most Hamiltonians
+        return stepper.momentum(q, np.zeros_like(q), t, parameters)
+    return np.zeros_like(q)
 
 
 def _count_of_steps(period: float, steps: int | None, h: float | None) -> int:
@@ -317,10 +325,12 @@ class _OrbitSearch:
         reduction: maps between (q, p) and the tangent space without gauge directions of rotations.
         sequence: ends of the steps relative to the period; ``None`` for adaptive ones that are not yet known.
         fixed_indices: indices of the fixed entries of z, -1 that of the period.
+        at_rest: (m,) momenta without velocity at the guess, which are no size of the motion.
     """
 
     stepper: Stepper
     reduction: Reduction
+    at_rest: Array
     period: float
     sequence: StepSequence | None
     fixed_indices: tuple[int, ...]
@@ -546,8 +556,8 @@ class _OrbitSearch:
         return None
 
     def _units(self, equations: _ClosingEquations) -> Array:
-        """Return the sizes of the unknowns: of the motion for each start of a segment, and the period."""
-        return np.append(np.tile(equations.sizes, len(equations.segments)), self.period)
+        """Return the sizes of the unknowns: of the motion for each start of a segment, and the time of one radian."""
+        return np.append(np.tile(equations.sizes, len(equations.segments)), self.period / (2.0 * math.pi))
 
     def _row_units(self, equations: _ClosingEquations) -> Array:
         """Return the sizes of the equations, of that of the energy the change by the size of the motion."""
@@ -571,7 +581,7 @@ class _OrbitSearch:
 
     def _size_of(self, states: Array) -> SizeOfMotion:
         q, p = np.split(states, 2, axis=1)
-        return SizeOfMotion.of(self.stepper, q, p, self.t, self.parameters)
+        return SizeOfMotion.of(q, p, self.at_rest)
 
     def _sizes_of(self, states: Array) -> Array:
         """Return the (2m,) sizes of positions and momenta along states, at least their rounding errors."""
@@ -590,7 +600,11 @@ class _OrbitSearch:
             for start, first, last in zip(starts, bounds[:-1], bounds[1:], strict=True)
         ]
         sizes = self._sizes_of(np.vstack([starts, *(segment.states for segment in segments)]))
-        left = self._independent_equations(starts, segments, sizes)
+        gradients = [
+            self._integral_gradients(start, segment.start_time, sizes)
+            for start, segment in zip(starts, segments, strict=True)
+        ]
+        left = self._independent_equations(starts, segments, gradients, sizes)
         rows = np.zeros((count, self.reduction.size, count * size + 1))
         defects = np.zeros(rows.shape[:2])
         for k, segment in enumerate(segments):
@@ -611,7 +625,7 @@ class _OrbitSearch:
             energy = self.stepper.energy(first[: size // 2], first[size // 2 :], self.t, self.parameters)
             wanted = np.append(wanted, energy - self.energy)
             row = np.zeros(len(z))
-            row[:size] = self._integral_gradients(first, self.t, sizes)[0]
+            row[:size] = gradients[0][0]
             partials = np.vstack([partials, row])
         return _ClosingEquations(segments, monodromy, error, relative_error, sizes, wanted, partials, left)
 
@@ -657,17 +671,22 @@ class _OrbitSearch:
         q, p = (float(np.abs(part).max()) for part in np.split(change[:-1], 2))
         return max(float(abs(change[-1])) / period, self._size_of(states).error(q, p))
 
-    def _independent_equations(self, starts: Array, segments: Sequence[_Segment], sizes: Array) -> Array:
+    def _independent_equations(
+        self, starts: Array, segments: Sequence[_Segment], gradients: Sequence[Array], sizes: Array
+    ) -> Array:
         """Return the (size, size) projection onto the equations of return not implied by conserved quantities.
 
         Energy and momentum maps count as conserved if the Jacobian of every segment maps their gradients accordingly,
         and if events that change the state leave their values at the ends of steps unchanged.
         """
         conserved_masks, units = [], self._reduced(sizes)
-        for start, segment in zip(starts, segments, strict=True):
-            begin = self._reduced_gradients(start, segment.start_time, sizes)
-            end = self._reduced_gradients(segment.states[-1], segment.end_time, sizes)
-            monodromy = self._leaving(segment) @ segment.monodromy @ self.reduction.inward(*np.split(start, 2))
+        inward = [self.reduction.inward(*np.split(start, 2)) for start in starts]
+        begins = [gradient @ own * units for gradient, own in zip(gradients, inward, strict=True)]
+        for start, segment, begin, own in zip(starts, segments, begins, inward, strict=True):
+            last = segment.states[-1]
+            end = self._integral_gradients(last, segment.end_time, sizes) @ self.reduction.inward(*np.split(last, 2))
+            end *= units
+            monodromy = self._leaving(segment) @ segment.monodromy @ own
             monodromy = monodromy / units[:, np.newaxis] * units
             largest = np.linalg.norm(end, axis=1) * np.linalg.norm(monodromy, 2)
             conserved_masks.append(np.linalg.norm(end @ monodromy - begin, axis=1) <= CONSERVED * largest)
@@ -675,17 +694,12 @@ class _OrbitSearch:
                 states = np.vstack([start, segment.states])
                 values = self._integrals(states, np.linspace(segment.start_time, segment.end_time, len(states)))
                 conserved_masks.append(np.ptp(values, axis=0) <= CONSERVED * np.linalg.norm(begin, axis=1))
-        conserved = self._reduced_gradients(starts[0], self.t, sizes)[np.all(conserved_masks, axis=0)]
+        conserved = begins[0][np.all(conserved_masks, axis=0)]
         conserved /= np.maximum(np.linalg.norm(conserved, axis=1), LEAST_SIZE)[:, np.newaxis]
         directions, strengths, _ = np.linalg.svd(conserved.T, full_matrices=False)
         directions = directions[:, strengths > CONSERVED * strengths.max(initial=0.0)]
         projection = np.eye(self.reduction.size) - directions @ directions.T
         return np.asarray(units[:, np.newaxis] * projection / units)
-
-    def _reduced_gradients(self, state: Array, t: float, sizes: Array) -> Array:
-        """Return (r, size) gradients in the reduced tangent space, in units of the motion."""
-        gradients = self._integral_gradients(state, t, sizes) @ self.reduction.inward(*np.split(state, 2))
-        return np.asarray(gradients * self._reduced(sizes))
 
     def _integral_gradients(self, state: Array, t: float, sizes: Array) -> Array:
         """Return (r, 2m) gradients of the energy and the momentum maps by finite differences, for directions only."""

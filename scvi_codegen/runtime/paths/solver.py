@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,8 @@ ROUNDING, ILL_CONDITIONED = 1e-14, 1e-7
 """Residual, relative to the momenta, that is rounding, and the correction that then ends the iteration."""
 AT_REST = 1e-9
 """Range of the positions of a path at rest, relative to that of the start of the search."""
+GAUGED = 1.2
+"""Ratio of momenta to those of velocities from which on the latter are their size."""
 MOST_ITERATIONS, LEAST_STEP = 60, 1e-4
 FIRST_PART, MOST_GROWTH, LEAST_GROWTH, CONTINUED_ITERATIONS = 16, 2.0, 1.005, 15
 """Continuation: part of the duration it starts from, factors of the duration, and iterations of each."""
@@ -42,7 +44,7 @@ States = Callable[[Array, Array], tuple[Array, Array]]
 """Type of a function of (n, m) positions and momenta that returns (n,) energies and (n, m) velocities."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Solution:
     """Positions of a path, its steps with their derivatives, and the factors of its Hessian."""
 
@@ -52,7 +54,7 @@ class Solution:
     factors: Any
     iterations: int
 
-    @property
+    @cached_property
     def at_rest(self) -> bool:
         """True if all positions are equal, up to rounding or relative to the start of the search."""
         rounding = RESOLVED * roundoff(1) * float(np.abs(self.q).max())
@@ -63,17 +65,22 @@ class Solution:
         """(N + 1, m) momenta of the nodes."""
         return np.concatenate([self.at.p0, self.at.p1[-1:]])
 
-    @property
+    @cached_property
     def size(self) -> SizeOfMotion:
-        """Size of the motion; of a path at rest that of the start of the search."""
-        intervals, steepness = self.intervals, float(np.abs(self.at.blocks).max())
-        at = float(intervals.t[0]), intervals.parameters_at_start
-        own = SizeOfMotion.of(intervals.stepper, self.q, self.momenta, *at)
+        """Size of the motion; of a path at rest that of the start of the search.
+
+        Momenta of velocities are about dp/dq1 times the displacements in steps: other ones are those of a gauge of L.
+        """
+        intervals, q, steepness = self.intervals, self.q, float(np.abs(self.at.blocks).max())
+        moved = np.array([intervals.tangent(k, row) for k, row in enumerate(np.diff(q, axis=0))])
+        of_velocity = float(np.abs(intervals.products(self.at.blocks[1], moved)).max())
+        own = SizeOfMotion.of(q, self.momenta)
+        own = replace(own, momentum=of_velocity) if own.momentum > GAUGED * of_velocity else own
         of_q, of_p = own.rounding
         own = replace(own, rounding=(of_q, of_p + of_q * steepness))
         if not self.at_rest:
             return own
-        position = intervals.range_of_start or float(np.abs(self.q).max())
+        position = intervals.range_of_start or float(np.abs(q).max())
         return replace(own, position=position, momentum=position * steepness)
 
 
