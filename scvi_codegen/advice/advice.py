@@ -87,7 +87,7 @@ class Advice:
         steps: number of steps.
         degree: degree or number of stages of ``method``, ``None`` if it has none.
         method: recommended method: the one passed, or the one of the best degree.
-        expected_error: error of the positions at the end, relative to their size.
+        expected_error: error of the positions at the end, relative to their distance from their mean.
         member: index of the trajectory that determines the step of an ensemble, ``None`` for a single state.
         evidence: pilot runs of ``method``, largest step size first.
         message: recommendation in a few sentences.
@@ -158,7 +158,7 @@ def advise(
         q, p, velocity: (m,) initial positions with one of momenta and velocities, or arrays by name; of an ensemble
             (k, m) each.
         span: duration of the run, negative to integrate backward; required.
-        tolerance: required: wanted error ``|q - q_exact| / |q|`` at the end; the step size aims at half of it.
+        tolerance: required: wanted error ``|q - q_exact| / |q - mean q|`` at the end; the step size aims at half of it.
         parameters: values by name (others keep their defaults), or all in order; of an ensemble also (k,) values.
         t: initial time.
         degree: also choose the degree (or number of stages) among 2, 4, ..., 12: the one with the fewest evaluations in

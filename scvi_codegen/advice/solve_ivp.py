@@ -116,8 +116,8 @@ def solve_ivp(
         velocity: (m,) initial velocities, instead of momenta, or arrays by name.
         method: method, or its name, as ``"svi:6"``; by default ``SVI(8)``, with constraints at Gauss-Lobatto points.
         h: upper bound of a fixed step size, reduced so that whole steps fill the span.
-        tolerance: instead of ``h``: error ``|q - q_exact| / |q|`` at the end, for which :func:`advise` chooses ``h``.
-            ``success`` is False if the run misses it.
+        tolerance: instead of ``h``: error ``|q - q_exact| / |q - mean q|`` at the end, for which :func:`advise` chooses
+            ``h``. ``success`` is False if the run misses it.
         rtol: relative local error of adaptive steps, relative to the motion of each coordinate in the step; by default
             round-off.
         atol: absolute local error of adaptive steps: that of a step is at most ``max(rtol * motion, atol)``. A number,

@@ -412,3 +412,14 @@ def test_symplecticity_is_not_claimed_under_forces():
     damped = lagrange("damped", "q", "q_dot**2/2 - q**2/2", dissipation="q_dot**2/10")
     assert "symplectic" in saved.message
     assert "symplectic" not in advise(damped, SVI(4), [0.5], [0.0], 5.0, 1e-6).message
+
+
+@pytest.mark.parametrize(("origin", "amplitude"), [(1000.0, 1.0), (0.0, 1e-9)])
+def test_recommended_steps_depend_neither_on_the_origin_nor_on_the_amplitude(origin, amplitude):
+    text = "x_dot**2/2 - (x - c)**2/2 - (x - c)**4/(4*a**2)"
+    vibrating = LagrangianSystem.from_text("vibrating", ["x"], text, parameters={"c": 0.0, "a": 1.0})
+    steps = [
+        advise(vibrating, SVI(4), [c + a], [0.0], span=100.0, tolerance=1e-6, parameters={"c": c, "a": a}).steps
+        for c, a in ((0.0, 1.0), (origin, amplitude))
+    ]
+    assert 0.9 * steps[0] <= steps[1] <= 1.1 * steps[0]

@@ -5,9 +5,10 @@ resolve. Its length grows from a short one, and the step sizes with it, so that 
 trusted. Errors at the end of the span are extrapolated from the end of the pilot run by the growth observed: linear or
 quadratic in time, or exponential if two runs from neighbouring states diverge exponentially (chaos).
 
-Error means |q - q_exact| / |q| with Euclidean norms over all coordinates; |q| is the root mean square over the later
-half of the pilot run. Several initial states are integrated together, as an ensemble: each has its own error, growth
-and size, and the largest error counts, or the one that a stated part of the trajectories does not exceed.
+Error means |q - q_exact| / |q - mean q| with Euclidean norms over all coordinates; the latter is the root mean square
+over the later half of the pilot run, which does not depend on the origin. Several initial states are integrated
+together, as an ensemble: each has its own error, growth and size, and the largest error counts, or the one that a
+stated part of the trajectories does not exceed.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import numpy as np
 
 from scvi_codegen.errors import StepFailedError, UnresolvedError
 from scvi_codegen.methods import Method
+from scvi_codegen.runtime.accuracy.size import distances_from_mean
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.core.validation import Array, States, flat_state
 from scvi_codegen.runtime.core.words import low_words, split, with_low
@@ -321,18 +323,19 @@ class Pilot:
         """Return (k,) exponential growth rates of a perturbation of the initial positions, 0 if not exponential."""
         h = math.copysign(self.step(self.finest), self.span)
         steps = min(most, int(self.span / h))
-        sizes = np.asarray(_rms(self.q.T))
         nudges = PERTURBATION * np.cos(np.arange(self.q.shape[-1]))
-        nudged = self.q + nudges * np.where(sizes > 0.0, sizes, 1.0)[..., np.newaxis]
+
+        def run(q: Array) -> Array:
+            return np.asarray(self.integrate(q, h=h, steps=steps, save_every=1).q[1:].reshape(steps, self.count, -1))
+
         try:
-            one, other = (
-                self.integrate(q, h=h, steps=steps, save_every=1).q[1:].reshape(steps, self.count, -1)
-                for q in (self.q, nudged)
-            )
+            one = run(self.q)
+            sizes = distances_from_mean(one)
+            shifts = nudges * sizes[:, np.newaxis] / math.sqrt(self.q.shape[-1])
+            other = run(self.q + shifts.reshape(self.q.shape))
         except StepFailedError:
             return np.zeros(self.count)
-        norms = _rms(np.linalg.norm(one, axis=-1))
-        differences = np.linalg.norm(other - one, axis=-1) / np.where(norms > 0.0, norms, 1.0)
+        differences = np.linalg.norm(other - one, axis=-1) / sizes
         rates = np.zeros(self.count)
         for j, difference in enumerate(differences.T):
             near = difference[: int(np.argmax(difference > RESOLVED)) or steps]
@@ -392,10 +395,10 @@ class Pilot:
         if (known := self._errors_of.get((n, finest))) is not None:
             return known
         reference, positions = self.runs[finest].q, self.runs[n].q
-        size = _rms(np.linalg.norm(reference[len(reference) // 2 :], axis=-1))
+        size = distances_from_mean(reference)
         count = math.gcd(len(reference), len(positions))
         both = [q[len(q) // count - 1 :: len(q) // count] for q in (reference, positions)]
-        errors: Array = np.linalg.norm(both[1] - both[0], axis=-1) / np.where(size == 0.0, 1.0, size)
+        errors: Array = np.linalg.norm(both[1] - both[0], axis=-1) / size
         # The reference has the error e_ref = (n/finest)^order e_n, so that |q_n - q_ref| = (1 - (n/finest)^order) e_n.
         errors = errors / (1.0 - (n / finest) ** self.order)
         self._errors_of[n, finest] = errors = np.where(np.isfinite(errors), errors, math.inf)

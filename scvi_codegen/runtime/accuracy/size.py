@@ -112,6 +112,19 @@ class SizeOfMotion:
         return max((position + of_q) / (self.position or 1.0), (momentum + of_p) / (self.momentum or 1.0))
 
 
+def distances_from_mean(q: Array) -> Array:
+    """Return (..) root mean square distances of the later half of (n, .., m) positions from the mean of all.
+
+    Those of positions at rest, up to rounding, are from the origin; those of none are 1.
+    """
+    q = np.asarray(q)
+    with np.errstate(all="ignore"):  # runs that failed
+        late, mean = q[len(q) // 2 :], q.mean(axis=0)
+        away, far = (np.sqrt(np.mean(np.sum(each**2, axis=-1), axis=0)) for each in (late - mean, late))
+        sizes = np.where(away <= RESOLVED * roundoff(1) * far, far, away)
+    return np.asarray(np.where(sizes == 0.0, 1.0, sizes))
+
+
 def size_for_updates(q: Array, settled: float, least: float = 0.0) -> float:
     """Return the size of (n, m) positions of which updates below the part ``settled`` end an iteration.
 

@@ -14,6 +14,7 @@ from typing import Any, cast
 import numpy as np
 
 from scvi_codegen.errors import ScviCodegenError, StateError
+from scvi_codegen.runtime.accuracy.size import distances_from_mean
 from scvi_codegen.runtime.accuracy.warning_switch import without_accuracy_warnings
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.core.validation import Array
@@ -82,7 +83,7 @@ def known_digits(
             q, p = repeated.q, repeated.p
     except (ScviCodegenError, _TooLongError):
         return None
-    size = math.sqrt(float(np.mean(np.sum(q**2, axis=1)))) or 1.0
+    size = distances_from_mean(q)
     q, p = np.abs(q - trajectory.q[chosen]), np.abs(p - trajectory.p[chosen])
     tenfold = _tenfold(np.linalg.norm(q, axis=1) / size, abs(float(times[-1] - times[0])))
     return Known(q=_final_error(q), p=_final_error(p), tenfold=tenfold)
@@ -136,7 +137,7 @@ def missed_tolerance(
     Args:
         second: function that returns a stepper of the same system with adaptive steps, for a second run.
         trajectory: run whose states are all at the ends of steps.
-        tolerance: error |q - q_exact| / |q| for which the step size was recommended.
+        tolerance: error |q - q_exact| / |q - mean q| for which the step size was recommended.
         known: error estimate from a second run.
     """
     if isinstance(trajectory.q, Words):
@@ -146,7 +147,7 @@ def missed_tolerance(
         known = known_digits(second, trajectory, most=SECOND_RUN + 4 * trajectory.steps)
     if known is None or known.chaotic:
         return f"{doubt}; {REMEDY}" if doubt else ""
-    error = float(np.linalg.norm(known.q)) / (float(np.linalg.norm(_final_error(np.abs(trajectory.q)))) or 1.0)
+    error = float(np.linalg.norm(known.q) / distances_from_mean(trajectory.q))
     if error <= SECOND_MARGIN * tolerance + SECOND_RUN_ERROR:
         return ""
     message = doubt or f"the tolerance {tolerance:g} is missed"
@@ -164,7 +165,7 @@ def _missed_in_two_words(trajectory: Trajectory, tolerance: float) -> str:
     except ScviCodegenError:
         return ""
     late = np.asarray(second.velocity[-1]) * float(second.t[-1] - trajectory.t[-1])
-    error = float(np.linalg.norm(second.q[-1] - trajectory.q[-1] - late) / np.linalg.norm(trajectory.q[-1]))
+    error = float(np.linalg.norm(second.q[-1] - trajectory.q[-1] - late) / distances_from_mean(trajectory.q))
     return f"the tolerance {tolerance:g} is missed: a second run differs by {error:.1e} at the end; {REMEDY}" * (
         error > SECOND_MARGIN * tolerance
     )
