@@ -108,8 +108,8 @@ class Commands(click.Group):
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run a command; convert errors into messages and exit statuses, with ``--json`` also into a document."""
-        if "--json" in ctx.args:
-            _begin_report(ctx)
+        if "--json" in ctx.args:  # before arguments are read, whose errors it contains
+            _begin_report(ctx, None, wanted=True)
         try:
             with errors_as_messages():
                 return super().invoke(ctx)
@@ -172,12 +172,14 @@ def _warnings_as_lines() -> Iterator[None]:
 def reporting(command: Command) -> Command:
     """Add the options ``--json`` and ``--quiet``, which :func:`tell` obeys, to a command."""
     flag = partial(click.option, is_flag=True, expose_value=False)
-    as_json = flag("--json", help="Print one JSON document instead of text.")
+    as_json = flag("--json", callback=_begin_report, help="Print one JSON document instead of text.")
     quiet = flag("--quiet", callback=_be_quiet, help="Print only errors and warnings; see the exit status.")
     return quiet(as_json(command))
 
 
-def _begin_report(context: click.Context) -> None:
+def _begin_report(context: click.Context, parameter: click.Parameter | None, wanted: bool) -> None:
+    if not wanted or REPORT in context.meta:
+        return
     report: dict[str, Any] = {}
     context.meta[REPORT] = report
 

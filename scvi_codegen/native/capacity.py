@@ -22,11 +22,6 @@ def usable_memory() -> float:
         result.append(float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")))
     with suppress(OSError, ValueError):
         result.append(float(CGROUP_LIMIT.read_text()))
-    with suppress(ImportError, OSError, ValueError):
-        import resource  # not on Windows
-
-        if (limit := resource.getrlimit(resource.RLIMIT_AS)[0]) != resource.RLIM_INFINITY:
-            result.append(float(limit))
     return min(result)
 
 

@@ -124,7 +124,6 @@ def page(
         ArgumentError: for unknown arguments, and those of a motion beside a model.
         BuildError: without the extra ``compiler``, or if compilation fails.
     """
-    check_compiler()  # before the equations are derived
     given = {"ranges": ranges, "speed": speed, "plots": plots}
     settings = {name: value for name, value in given.items() if value is not None}
     if picture is not None:
@@ -165,6 +164,7 @@ def page_of(model: Model, document: Mapping[str, Any], settings: Mapping[str, An
     model = replace(model, page={**model.page, **settings, "ranges": ranges})
     model._check_double("a page")
     _check(model, ranges)
+    check_compiler()  # before the equations are derived
     adaptive = model.h is None or model.time_transformation is not None
     acting = tuple(
         each for each in model.events if each.changes_state or each.terminal

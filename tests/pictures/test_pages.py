@@ -90,6 +90,7 @@ def described(text):
 @pytest.fixture
 def without_compiler(monkeypatch):
     """Replace compilation."""
+    monkeypatch.setattr(pages, "check_compiler", lambda: None)
     monkeypatch.setattr(pages, "webassembly", lambda folder, sources: "")
 
 

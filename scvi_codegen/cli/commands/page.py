@@ -10,7 +10,6 @@ from scvi_codegen.cli.model_options import model_arguments, read_model, sections
 from scvi_codegen.models.model_files.document import document_of
 from scvi_codegen.models.model_files.model_file import document_in
 from scvi_codegen.pages.page import page_of
-from scvi_codegen.pages.webassembly import check_compiler
 
 
 @click.command()
@@ -38,7 +37,6 @@ def page(model_name: str, output: str, ranges: tuple[tuple[str, float, float], .
       scvi-codegen page kinks.toml --range v 0.05 0.95 -o kinks.html
     """
     check_writable(Path(output), "'-o'")
-    check_compiler()
     model = read_model(model_name, choices)
     own = Path(model_name).is_file() and not {"initial", "system", "field"} & sections_of(choices).keys()
     document = document_in(model_name) if own else document_of(model)
