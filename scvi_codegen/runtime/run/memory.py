@@ -548,7 +548,8 @@ class Memory:
     def fallback_steps(self) -> int:
         """Number of steps that the iteration did not solve, but its fallback, Newton's method.
 
-        Where they are many, a smaller step or ``solver="newton"`` is faster. Arrays of run-time sizes have no fallback.
+        Where they are many, a smaller fixed step or ``solver="newton"`` is faster. Arrays of run-time sizes have no
+        fallback.
         """
         return int(getattr(self._memory, "fallback_steps", 0))
 

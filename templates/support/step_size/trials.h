@@ -18,6 +18,8 @@
 #define FEW_ITERATIONS 3 /* of a trial that is much shorter than the time in which forces change */
 #define SUSPENDED 8 /* steps without this rule after one that needed as many iterations as a larger one */
 #define FAILURES_BEFORE_NEWTON 3 /* trials of a step in which the iteration of the multipliers fails */
+#define TRIED_AGAIN (-1) /* run->avoiding of the step after those by Newton's method */
+#define GAIN_OF_NEWTON (3 * LEVELS_PER_BINADE) /* levels by which its steps are larger, so that they take less time */
 #define SHORT_MOTION REAL(0.01) /* relative to the path of a run: a change so small .. */
 #define SHORT_BY_TOLERANCE 1000 /* .. and less than so many times the tolerance does not show errors of the forces */
 #define LEAP 2 /* levels by which a step is larger than the one before, whose end is then examined */
@@ -105,6 +107,7 @@ static inline __attribute__((always_inline)) double attempt_at(run_memory *run, 
 #ifdef ARRAYS
   find_displacements(step, data, STORED(run, step), dq);
 #endif
+  step->noise = report->noise;
   return curve_error(step, data, STORED(run, step), dq, EACH, limits->decay, least);
 }
 
@@ -134,6 +137,13 @@ static __attribute__((noinline)) double rough_attempt(run_memory *run, step_data
 #define ATTEMPT(options, ...) attempt(__VA_ARGS__)
 #endif
 
+#if !defined(NEWTON_ALONE) && !defined(ARRAYS) && !defined(NO_FALLBACK)
+#define NEWTON_ADMITTED /* where the fixed-point iteration limits the steps */
+#endif
+#if defined(RATTLE) || defined(NEWTON_ADMITTED)
+#define NEWTON_IN_PLACE /* of another iteration, in some steps */
+#endif
+
 #ifdef NEWTON_KRYLOV
 #define DOUBTS 0 /* steps may leave vibrations unresolved */
 #else
@@ -158,9 +168,10 @@ typedef struct {
   long long guess, grid_level; /* level of the step size */
   long long change; /* of the level, from the previous step to this */
   long long iterations; /* of the last trial */
-#ifdef RATTLE
+#ifdef NEWTON_IN_PLACE
   long long fallbacks; /* 1 if Newton's method solved it */
 #endif
+  int status; /* other than OK if no smaller step can succeed */
   real length; /* step size; 0 before the first trial */
   real pilot; /* that of the largest trial so far, in the search for the first step, that was solved */
   int last; /* 1 if the step ends at t_end */
@@ -173,15 +184,41 @@ typedef struct {
 #endif
 } trial;
 
+/* Returns 1 if Newton's method solved a trial, which then has no curve. */
+static inline int by_newton(const trial *now)
+{
+#ifdef NEWTON_ADMITTED
+  return now->fallbacks > 0;
+#else
+  (void)now;
+  return 0;
+#endif
+}
+
 /* Lets V and A contain a solved trial. */
 static inline void note_trial(run_memory *run, const trial *now)
 {
 #ifdef NEWTON_ALONE
   note_stages(run, &now->step, run->memory, now->dq);
 #else
-  note_curve(run, &now->step, &now->data, STORED(run, &now->step), now->dq, 1);
+  note_curve(run, &now->step, &now->data, STORED(run, &now->step), now->dq, !by_newton(now));
 #endif
 }
+
+#ifdef NEWTON_ADMITTED
+/* A trial by Newton's method; returns the error estimate of its stages, converted to that of curves. */
+static SELDOM double attempt_by_newton(trial *now, const solver_options *options, solver_report *report)
+{
+  double *workspace = now->step.scratch + SCRATCH, error;
+  const error_measure measure = {EACH, now->limits.decay};
+  const int status = fall_back(NOT_CONVERGED, &now->step, now->dq, now->dp, options, report, workspace, &measure);
+  now->guess = 0;
+  now->status = status > STATUS(SPURIOUS_SOLUTION) ? status : OK; /* Newton's method is not there */
+  now->fallbacks = status == OK && reaches(&now->step, now->dq, now->dp);
+  error = now->fallbacks ? fallback_error(&now->step, now->dq, workspace, &measure) : INFINITY;
+  return error < INFINITY ? error : INFINITY;
+}
+#endif
 
 /* Performs one trial of the next step: its increments and the error estimate of the curve if it exceeds `least`,
  * infinite if the step failed. */
@@ -205,8 +242,14 @@ HOT void try_step(run_memory *run, trial *now, real least, const solver_options 
   now->data.rattle_alone = run->avoiding >= 0;
   now->fallbacks = report->fallback_steps;
 #endif
-  now->error = ATTEMPT(options, run, &now->step, &now->data, now->last, now->last ? 0 : now->inside, &now->guess,
-      now->dq, now->dp, &now->limits, least, options, report);
+#ifdef NEWTON_ADMITTED
+  now->fallbacks = 0;
+  if (run->avoiding < TRIED_AGAIN)
+    now->error = larger(attempt_by_newton(now, options, report), least);
+  else
+#endif
+    now->error = ATTEMPT(options, run, &now->step, &now->data, now->last, now->last ? 0 : now->inside, &now->guess,
+        now->dq, now->dp, &now->limits, least, options, report);
   now->iterations = report->iterations - now->iterations;
 #ifdef RATTLE
   now->fallbacks = report->fallback_steps - now->fallbacks;
@@ -417,6 +460,10 @@ static int shorten(run_memory *run, trial *now, int most)
  * a mechanism, Newton's method is admitted for some steps: run->avoiding is then minus their number. */
 static SELDOM void avoid_size(run_memory *run, trial *now)
 {
+#ifdef NEWTON_ADMITTED
+  if (run->avoiding < TRIED_AGAIN) /* not the iteration, but Newton's method failed */
+    return;
+#endif
   run->failed = run->grid_level;
   run->avoiding = AVOIDED;
 #ifdef RATTLE
@@ -427,11 +474,41 @@ static SELDOM void avoid_size(run_memory *run, trial *now)
 #endif
 }
 
+/* Tries the step by Newton's method where the iteration, not the error, limits the steps: where it fails again at about
+ * the size at which it failed before, after a step whose error the estimate does not distinguish from rounding.
+ * Newton's method takes several times as long, so that its step has to be so many times as large; it then solves the
+ * next steps. Returns 0 where the step has an inadmissible error. The iteration is tried again after those steps; where
+ * it has no admissible step of the same size, Newton's method solves the next ones, too. */
+static inline int try_by_newton(run_memory *run, trial *now, const solver_options *options, solver_report *report)
+{
+#ifdef NEWTON_ADMITTED
+  const long long level = run->grid_level, above = run->failed + GAIN_OF_NEWTON - level;
+  const int again = run->avoiding == TRIED_AGAIN;
+  const int first = now->change + level == run->change; /* trial of the step */
+  const int repeated = first && run->avoiding == 0 && run->failed - level <= LEVELS_PER_BINADE;
+  const int unlimited = repeated && levels_within(run, now, INT_MAX) >= above;
+  if (!again && !(unlimited && error_at(run->error_before, -(int)run->change) <= GROWTH * now->limits.least))
+    return 0;
+  run->avoiding = -AVOIDED;
+  run->grid_level += again || above < 0 ? 0 : above;
+  try_step(run, now, now->limits.least, options, report);
+  if (again || now->status != OK || now->error <= now->limits.most)
+    return 1;
+  run->avoiding = 0;
+  run->grid_level = level;
+  now->error = INFINITY;
+#else
+  (void)run, (void)now, (void)options, (void)report;
+#endif
+  return 0;
+}
+
 /* Tries the next step with smaller and smaller sizes until its error is admissible, or STEP_SIZE_UNDERFLOW. */
 HOT int find_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
   const real least = now->limits.least;
   now->change = run->change - run->grid_level;
+  now->status = OK;
 #ifdef RATTLE
   now->failures = 0;
 #endif
@@ -439,8 +516,10 @@ HOT int find_step(run_memory *run, trial *now, const solver_options *options, so
     try_step(run, now, least, options, report);
   else
     try_first_step(run, now, options, report);
-  while (!(now->error <= now->limits.most * GROWTH)) {
+  while (now->status == OK && !(now->error <= now->limits.most * GROWTH)) {
     const int failed = run->error_before > 0 && !(now->error < INFINITY);
+    if ((failed || run->avoiding == TRIED_AGAIN) && try_by_newton(run, now, options, report))
+      continue;
     if (failed)
       avoid_size(run, now);
     if (!shorten(run, now, failed ? DOWN_FAILED : MOST_DOWN))
@@ -450,7 +529,7 @@ HOT int find_step(run_memory *run, trial *now, const solver_options *options, so
   now->error = larger(now->error, least);
   now->inside = 0;
   now->change += run->grid_level;
-  return OK;
+  return now->status;
 }
 
 #ifdef NEWTON_ALONE
@@ -498,6 +577,8 @@ static SELDOM int is_free_flight(const step_data *step, stored_values of)
 static inline int is_leap(const run_memory *run, const trial *now)
 {
   (void)run;
+  if (by_newton(now))
+    return 0;
   if (now->change < LEAP && now->change > -LEVELS_PER_BINADE)
     return 0;
 #ifdef NEWTON_ALONE
@@ -513,10 +594,10 @@ static inline int is_leap(const run_memory *run, const trial *now)
  * for Newton's method, whose steps may leave vibrations of stiff systems unresolved. */
 static inline int needs_momenta(run_memory *run, const trial *now)
 {
-  const int shorter = DOUBTS && now->change <= -LEVELS_PER_BINADE;
+  const int shorter = DOUBTS && !by_newton(now) && now->change <= -LEVELS_PER_BINADE;
   if (shorter && moves_little(run, now))
     run->steps_to_compare = STEPS_COMPARED_AFTER_DOUBT;
-  return DOUBTS && (run->steps_to_compare > 0 || (shorter && changes_little(now)));
+  return DOUBTS && !by_newton(now) && (run->steps_to_compare > 0 || (shorter && changes_little(now)));
 }
 
 /* Returns 1 if a force that is nearly constant along a step is another one at its end. Estimates see forces only at the
@@ -613,17 +694,24 @@ static inline int confirm_step(run_memory *run, trial *now, const solver_options
 {
   const int steps_to_compare = needs_momenta(run, now);
   now->apart = 0;
-  const int is_confirmed = steps_to_compare || run->step % COMPARED == 0 || is_leap(run, now);
+  const int is_confirmed = steps_to_compare || run->step % COMPARED == 0 ||
+      (by_newton(now) && now->change >= LEVELS_PER_BINADE) || is_leap(run, now);
   return is_confirmed ? compare_step(run, now, steps_to_compare, options, report) : OK;
 }
 
 /* Largest change of level after the iterations of a step. Where they are many, as in lattices whose waves are fast, the
  * time that a unit of time takes grows with the step size (cf. Gustafsson & Soederlind, SIAM J. Sci. Comput. 18 (1997)
- * 23). If a smaller step needs as many, the step size is not their cause, and the rule is suspended. */
-static inline int limit_by_iterations(run_memory *run, long long iterations)
+ * 23). If a smaller step needs as many, the step size is not their cause, and the rule is suspended. Newton's method
+ * needs hundreds where it follows a branch of solutions: the next steps in its place are smaller. */
+static inline int limit_by_iterations(run_memory *run, const trial *now)
 {
+  const long long iterations = now->iterations;
   int most = MOST_UP;
-  if (run->suspended > 0) {
+  if (by_newton(now)) {
+    most = iterations > TOO_MANY_ITERATIONS ? -1 : run->suspended > 0 ? 0
+                                                                      : most;
+    run->suspended = most < 0 ? AVOIDED : run->suspended - (most == 0);
+  } else if (run->suspended > 0) {
     run->suspended--;
   } else if (run->many > 0 && iterations >= run->many) {
     run->many = 0;
@@ -642,9 +730,9 @@ static inline void choose_size(run_memory *run, const trial *now)
 {
   const real error = larger(now->error, TRUSTED_DECREASE * run->error_before);
   int change = next_change(run, error, run->error_before, &now->limits);
-  const int most = limit_by_iterations(run, now->iterations);
+  const int most = limit_by_iterations(run, now);
   change = change < most ? change : most;
-#ifdef RATTLE
+#ifdef NEWTON_IN_PLACE
   run->avoiding += run->avoiding < 0;
 #endif
   if (run->avoiding > 0 && run->avoiding-- && run->grid_level + change >= run->failed)
@@ -702,6 +790,8 @@ static inline void accept_trial(run_memory *run, trial *now)
   continue_steps(run, &now->step, now->dq, now->dp);
 #else
 #ifdef ERROR_GROWTH
+  if (by_newton(now))
+    run->measures_growth = run->growth_samples = 0; /* it has no points for the tangent vector */
   if (run->measures_growth)
     measure_growth(run, &now->step, &now->data, now->points, now->dq, now->dp);
 #endif
@@ -709,7 +799,7 @@ static inline void accept_trial(run_memory *run, trial *now)
   add_increments(now->at.q, now->at.carry_q, now->dq);
   add_increments(now->at.p, now->at.carry_p, now->dp);
 #endif
-#ifdef RATTLE
+#ifdef NEWTON_IN_PLACE
   run->fallback_steps += now->fallbacks;
 #endif
   forget_motion(run, now->step.h);
