@@ -38,7 +38,9 @@ GRAZING = 2.0**-20
 SMALL_STEP = 2.0**-15
 """Fraction of a step from which the rate of the flow at a last state is computed."""
 DIFFERENCE = 2.0**-10
-"""Relative increment of differences of sixth order."""
+"""Increment of differences of sixth order, of parameters and momenta above 1 relative to them."""
+OF_STEP = 0.25
+"""Increments of the time and of positions relative to their mean change in a step; of positions at least DIFFERENCE."""
 ADMISSIBLE = 0.5
 """Singular values of the derivative of a projection are at least 1, or 0 for inadmissible directions."""
 WEIGHTS = np.array([1.0, -9.0, 45.0]) / 60.0
@@ -215,7 +217,7 @@ def _impact(states: SavedStates, values: Values, before: Array, after: Array, t:
     residual += _energy_differences(states, q, (p, p1), t, all_inputs)
     residual_by_impulse = n @ v1 + values.value[m]
     if stepper.constraints:
-        work = (p1 - p - full * n) @ _differences(stepper.velocity, q, p1, parameters, t, all_inputs=all_inputs)
+        work = (p1 - p - full * n) @ _differences(stepper.velocity, states, q, p1, t, all_inputs=all_inputs)
         by_momentum = work[m : 2 * m].copy()
         work[m : 2 * m] = 0.0
         residual -= work + by_momentum @ p1_by
@@ -235,35 +237,43 @@ def _projection(states: SavedStates, state: Array, t: float, *, all_inputs: bool
         return np.concatenate(projected(stepper, q, p, t, values)[:2])
 
     q, p = np.split(state, 2)
-    return onto(q, p, t, parameters), _differences(onto, q, p, parameters, t, all_inputs=all_inputs)
+    return onto(q, p, t, parameters), _differences(onto, states, q, p, t, all_inputs=all_inputs)
 
 
 def _differences(
     function: Callable[[Array, Array, float, Array], Array],
+    states: SavedStates,
     q: Array,
     p: Array,
-    parameters: Array,
     t: float,
     *,
     all_inputs: bool,
 ) -> Array:
     """Return the (.., x) derivative of a function of q, p, t and parameters by differences of sixth order."""
-    m, x = len(q), np.concatenate([q, p, parameters, [t]])
+    m, parameters = len(q), states.parameters
+    x, moved = np.concatenate([q, p, parameters, [t]]), _increments(states)
+    steps = DIFFERENCE * np.maximum(1.0, np.abs(x))
+    steps[:m], steps[-1] = moved[:-1], moved[-1]
     columns = np.zeros((len(x), len(function(q, p, t, parameters))))
     for k in (*range(2 * m), *(range(2 * m, len(x) - 1) if all_inputs else ()), -1):
-        step, values = DIFFERENCE * max(1.0, abs(x[k])), np.tile(x, (len(PLACES), 1))
+        step, values = steps[k], np.tile(x, (len(PLACES), 1))
         values[:, k] += step * PLACES
         at = [np.asarray(function(y[:m], y[m : 2 * m], float(y[-1]), y[2 * m : -1])) for y in values]
         columns[k] = _central_differences(np.stack(at, axis=-1)) / step
     return columns.T
 
 
+def _increments(states: SavedStates) -> Array:
+    """Return the (m + 1,) increments of q and t, which do not depend on their origins, as windings of angles do."""
+    by_q, by_t = (np.abs(np.diff(each, axis=0)).mean(axis=0) for each in (np.asarray(states.q), np.asarray(states.t)))
+    return np.append(np.maximum(DIFFERENCE, OF_STEP * by_q), OF_STEP * by_t)
+
+
 def _energy_differences(states: SavedStates, q: Array, ends: tuple[Array, Array], t: float, all_inputs: bool) -> Array:
     """Return the derivatives of H(q, p1) - H(q, p0) at fixed momenta by x = (q, p, parameters, t), 0 by p."""
     stepper, parameters, m = states.stepper, states.parameters, len(q)
     result = np.zeros(2 * m + len(parameters) + 1)
-    x = np.append(q, t)
-    steps = DIFFERENCE * np.maximum(1.0, np.abs(x))
+    x, steps = np.append(q, t), _increments(states)
     shifted = (x + (np.diag(steps)[:, np.newaxis] * PLACES[:, np.newaxis])).reshape(-1, m + 1)
 
     def difference(values: Array) -> Array:
