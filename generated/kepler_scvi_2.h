@@ -44,6 +44,7 @@ typedef struct {
   long long steps; /* completed */
   long long iterations; /* of the solver, over all steps */
   double change; /* the last update, measured as above */
+  double noise; /* the update by rounding alone, if that ended the iteration */
   double t; /* start of the last step tried */
   long long fallback_steps; /* solved by the fallback of the iteration */
   double duration; /* of the last step: h */
@@ -57,13 +58,13 @@ typedef struct {
   long long step; /* completed */
   double q[2], p[2];
   double carry_q[2], carry_p[2];
+  double largest_v[2], largest_a[2]; /* velocities and accelerations so far, for the size of errors */
+  double largest_dq[2], largest_bend[2]; /* displacements by a step and by its curvature so far */
   double memory[14];
   long long guess; /* what memory contains of the previous steps; 0: nothing; < 0: the iteration failed */
   long long fallback_steps; /* steps that the iteration did not solve, but its fallback */
   long long iterations; /* since the last stored state */
   double error, error_t; /* largest error estimate of a step so far, and the time of that step */
-  double largest_v[2], largest_a[2]; /* velocities and accelerations so far, for the size of errors */
-  double largest_dq[2], largest_bend[2]; /* displacements by a step and by its curvature so far */
   double largest_motion; /* by a step, relative to which the error is measured, with fixed steps */
 } kepler_scvi_2_run;
 

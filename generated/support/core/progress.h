@@ -68,6 +68,7 @@ static inline double amplification(const progress *now)
 static inline int outcome(const progress *now, solver_report *report)
 {
   report->change = sqrt(now->last);
+  report->noise = sqrt(now->amplified);
   if (now->status < 0)
     return now->last < INFINITY ? NOT_CONVERGED : NOT_FINITE;
   return OK;

@@ -13,9 +13,9 @@
 #elif defined(NO_FALLBACK)
 /* No fallback: if the fixed-point iteration fails, the step fails. */
 static int fall_back(int status, const step_data *step, double *dq, double *dp, const solver_options *options,
-    solver_report *report, double *workspace)
+    solver_report *report, double *workspace, const error_measure *measure)
 {
-  (void)step, (void)dq, (void)dp, (void)options, (void)report, (void)workspace;
+  (void)step, (void)dq, (void)dp, (void)options, (void)report, (void)workspace, (void)measure;
   return status;
 }
 #else
@@ -24,11 +24,12 @@ static int fall_back(int status, const step_data *step, double *dq, double *dp, 
 /* Fallback to Newton's method when the fixed-point iteration fails. */
 
 static SELDOM int fall_back(int status, const step_data *step, double *dq, double *dp, const solver_options *options,
-    solver_report *report, double *workspace)
+    solver_report *report, double *workspace, const error_measure *measure)
 {
   newton_data *newtons = newton_in(workspace);
   const long long before = report->iterations;
   int keep;
+  (void)measure;
 #ifdef MIXED_VELOCITIES
   if (step->points)
     ((solved_step *)step->points)->by_iteration = 0;
@@ -59,7 +60,7 @@ static __attribute__((noinline)) int solve_afresh(const step_data *step, const s
   if (!is_suspended(*guess))
     status = fixed_point(step, data, memory, &steps, dq, dp, options, report);
   if (status != OK) {
-    status = fall_back(status, step, dq, dp, options, report, workspace);
+    status = fall_back(status, step, dq, dp, options, report, workspace, &(error_measure){ALL, DECAY});
     if (status == OK && !reaches(step, dq, dp))
       status = NOT_FINITE;
 #ifndef NO_FALLBACK
