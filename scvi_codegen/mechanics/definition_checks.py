@@ -8,7 +8,7 @@ import numpy as np
 import sympy
 from sympy import Expr, Symbol
 
-from scvi_codegen.errors import SystemDefinitionError, SystemDefinitionWarning, closest, warn
+from scvi_codegen.errors import SMALL_MASS, SystemDefinitionError, SystemDefinitionWarning, closest, warn
 from scvi_codegen.formulas.expressions import Tape, hessian, jacobian, kinked_root, unsupported_part
 from scvi_codegen.formulas.symbols import DOT, PARTS, TIME, check_names, number, symbol
 from scvi_codegen.mechanics.constraints import constraint_jacobian, forms_of_constraints, without_coordinate
@@ -212,6 +212,8 @@ def _check_mass_matrix(system: MechanicalSystem) -> None:
                 "a thin rod as a unit vector instead: directions=['n']"
             )
     remedy = f"{zero} = 0 is the default: give it a positive value" if zero else REDUNDANT
+    if zero and system.constraints:
+        remedy = f"{zero} = 0 is the default. {SMALL_MASS}"
     raise SystemDefinitionError(
         f"{subject} in {names} is singular at every sampled point{values}{motion}. {REQUIRED} {remedy}"
     )
@@ -233,6 +235,7 @@ def _degenerate_message(system: MechanicalSystem, velocities: Sequence[Symbol], 
         f"coordinate '{names[0]}' of '{system.name}' has no kinetic energy: velocity '{velocities[0]}' {how}. "
         f"{REQUIRED} Add the missing term, such as m*{velocities[0]}**2/2{hint if multiplies else ''}; if {names[0]} "
         "is a known function of time, make it an input or write the function out"
+        f"{f'. {SMALL_MASS}' if system.constraints else ''}"
     )
 
 

@@ -47,6 +47,18 @@ def test_the_default_solver_has_the_digits_of_newtons_method(pendulum, angle, m)
         assert run.steps <= 1.1 * other.steps + 2
 
 
+def test_a_massless_rod_is_refused_by_its_cause_and_the_remedy_works(pendulum, angle):
+    with pytest.raises(sc.StateError, match=r"x, y, a have no kinetic energy there.*1e-9 of the others"):
+        pendulum[0].integrate(POSITION, [0.0] * 5, parameters={"m": 0.0, "M": 1.0}, h=0.005, steps=10)
+    with pytest.raises(sc.SystemDefinitionError, match=r"m = 0 is the default.*1e-9 of the others"):
+        lagrange("rod", "x X", "(m*x_dot**2 + X_dot**2)/2", constraints=["X - x - 1"], m=0.0)
+    with pytest.raises(sc.SystemDefinitionError, match=r"'x' .* has no kinetic energy.*1e-9 of the others"):
+        lagrange("rod", "x X", "X_dot**2/2", constraints=["X - x - 1"])
+    run = pendulum[0].integrate(POSITION, [0.0] * 5, parameters={"m": 1e-9, "M": 1.0}, h=0.005, steps=100)
+    exact = angle.integrate([START], [0.0], parameters={"m": 0.0, "M": 1.0}, t_end=0.5, tolerance=1e-15)
+    assert run.q[-1, 2] == pytest.approx(exact.q[-1, 0], abs=2e-9)
+
+
 @pytest.mark.parametrize("power", [-40, 3, 50])
 def test_masses_times_powers_of_two_give_equal_bits(pendulum, power):
     """But where Newton's method chooses other pivots."""

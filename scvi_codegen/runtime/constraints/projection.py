@@ -13,7 +13,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.errors import AccuracyWarning, StateError, warn
+from scvi_codegen.errors import SMALL_MASS, AccuracyWarning, StateError, warn
 from scvi_codegen.native.options import REASONS, STATUS
 from scvi_codegen.rendering.text import INPUT_PRECISION, LARGEST_VIOLATION, ROUNDING_UNITS
 from scvi_codegen.runtime.core.features import require
@@ -175,7 +175,25 @@ def _dependent(stepper: Integrator, q: Array, t: float, parameters: Parameters, 
     """Return the message of :func:`rank_deficiency`; "" for run-time sizes too large for dense linear algebra."""
     if stepper.interface.layout.coordinates and max(stepper.dimension, len(stepper.constraints)) > MOST_DENSE:
         return ""
-    return rank_deficiency(stepper.constraints, q, _linearised(stepper, t, parameters), nearest=nearest)
+    massless = _massless(stepper, q, t, parameters)
+    return massless or rank_deficiency(stepper.constraints, q, _linearised(stepper, t, parameters), nearest=nearest)
+
+
+def _massless(stepper: Integrator, q: Array, t: float, parameters: Parameters) -> str:
+    """Return what is wrong with coordinates whose velocities contribute to no momentum, and the remedy, or ""."""
+    unit = np.concatenate([np.zeros((1, stepper.dimension)), np.eye(stepper.dimension)])
+    try:
+        momenta = stepper.momentum(np.tile(q, (len(unit), 1)), unit, t, parameters)
+    except StateError:
+        return ""
+    names = [name for name, p in zip(stepper.coordinates, momenta[1:], strict=True) if (p == momenta[0]).all()]
+    if not names:
+        return ""
+    listed = ", ".join(names[:MOST_SHOWN]) + ", .." * (len(names) > MOST_SHOWN)
+    return (
+        f"{listed} ha{'ve' if len(names) > 1 else 's'} no kinetic energy there, so that momenta do not determine "
+        f"velocities. {SMALL_MASS}"
+    )
 
 
 def singular_position(stepper: Integrator, q: Array, t: float, parameters: Array) -> str:
