@@ -761,7 +761,7 @@ def test_derivatives_through_impacts_do_not_depend_on_the_turns_of_an_angle(turn
     )
     start, p = np.array([0.3 + 2 * np.pi * turns, 0.2]), stepper.momentum([0.3, 0.2], [0.0, 1.5])
     run = stepper.integrate(start, p, h=0.02, steps=80)
-    ends = [stepper.integrate(start + [d, 0.0], p, h=0.02, steps=80) for d in (1e-5, -1e-5)]
+    ends = [stepper.integrate(start + np.array([d, 0.0]), p, h=0.02, steps=80) for d in (1e-5, -1e-5)]
     differences = [(getattr(ends[0], each)[-1] - getattr(ends[1], each)[-1]) / 2e-5 for each in "qp"]
     assert len(run.events[0].t) == 1
     assert run.sensitivity().state[-1][:, 0] == pytest.approx(np.concatenate(differences), rel=1e-4, abs=1e-4)
