@@ -3,6 +3,7 @@
 import math
 import os
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 
 from scvi_codegen.errors import StepFailedError
@@ -15,6 +16,7 @@ CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
 """File with the memory limit of a Linux control group (container)."""
 
 
+@cache  # runs ask in each chunk
 def usable_memory() -> float:
     """Return the bytes of memory available to this process; infinity if the system does not report them."""
     result = [math.inf]
