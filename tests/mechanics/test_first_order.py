@@ -308,6 +308,18 @@ def test_integrals_are_expanded_about_the_origins_of_the_lagrangian(name: str) -
         assert np.abs(ends[1e-6][1] - true).max() < 10 * np.abs(ends[1e-6][0] - true).max()
 
 
+def test_motions_that_are_small_beside_one_coordinate() -> None:
+    """y begins at 0 and moves by 1e-6, and the rounding errors of x = 1 are larger than those of y."""
+    text = "x**3*y_dot - (x - 1)**2 - y**2 - (x - 1)**4"
+    stepper = sc.compile_stepper(sc.LagrangianSystem.from_text("bowl", ["x", "y"], text), "svi:4")
+    omega = 2 / 3  # of the linear vibration about (1, 0)
+    for steps in ({"t_end": 3.0}, {"t_end": 3.0, "tolerance": 1e-6}, {"h": 0.02, "steps": 150}):
+        run = stepper.integrate([1 + 1e-6, 0.0], **steps)
+        assert len(run.t) < 160
+        vibration = 1e-6 * np.array([math.cos(3.0 * omega), math.sin(3.0 * omega)])
+        assert run.variables[-1] - [1.0, 0.0] == pytest.approx(vibration, abs=1e-11)
+
+
 def test_velocities_are_refused_and_available() -> None:
     stepper = sc.compile_stepper(system("coupled"), "svi:2")
     start = CASES["coupled"][3]
