@@ -278,6 +278,8 @@ def first_order_form(form: OneForm) -> dict[str, Any]:
     refused: list[tuple[int, ...]] = []
     z, n = form.coordinates, len(form.coordinates)
     placed = form.at(expressions := places(form))
+    if not any(placed.integral(chosen) is not None for chosen in islice(placed.choices(), MOST_CHOICES)):
+        placed = form.at(expressions := {each: each for each in z})
     for chosen, _ in zip(placed.choices(), range(MOST_CHOICES), strict=False):
         integral = placed.integral(chosen)
         if integral is None:

@@ -308,7 +308,7 @@ def test_integrals_are_expanded_about_the_origins_of_the_lagrangian(name: str) -
         assert np.abs(ends[1e-6][1] - true).max() < 10 * np.abs(ends[1e-6][0] - true).max()
 
 
-def test_motions_that_are_small_beside_one_coordinate() -> None:
+def test_vibrations_within_the_rounding_of_another_coordinate() -> None:
     """y begins at 0 and moves by 1e-6, and the rounding errors of x = 1 are larger than those of y."""
     text = "x**3*y_dot - (x - 1)**2 - y**2 - (x - 1)**4"
     stepper = sc.compile_stepper(sc.LagrangianSystem.from_text("bowl", ["x", "y"], text), "svi:4")
