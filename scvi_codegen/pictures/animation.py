@@ -172,13 +172,11 @@ class Film:
     @cached_property
     def shown(self) -> tuple[DrawnMotion, ...]:
         """Trajectories with the states that are drawn: all, or those of dense output at common times."""
-        from scvi_codegen.runtime.run.step_plan import FixedSteps  # not needed for pictures of data
-
         motions = several(self.trajectory)
         longest = max(motions, key=lambda each: abs(float(each.t[-1] - each.t[0])))
         common = all(len(each.t) == len(longest.t) and (each.t == longest.t).all() for each in motions)
         plans = [getattr(each, "plan", None) for each in motions]
-        if common and all(plan is None or isinstance(plan, FixedSteps) for plan in plans):
+        if common and all(plan is None or hasattr(plan, "h") for plan in plans):
             return tuple(motions)
         count = max(1, round(self.seconds * FRAMES_PER_SECOND) - 1) * STATES_PER_FRAME + 1
         times = np.linspace(longest.t[0], longest.t[-1], count)

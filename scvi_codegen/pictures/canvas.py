@@ -217,10 +217,8 @@ MOST_NUMBERS = 4_000_000
 
 def smooth(motion: Any) -> Any:
     """Return a trajectory of adaptive steps with states between its saved ones, by dense output; others as they are."""
-    from scvi_codegen.runtime.run.step_plan import FixedSteps  # not needed for pictures of data
-
     plan, n = getattr(motion, "plan", None), len(motion.t)
-    if plan is None or (isinstance(plan, FixedSteps) and motion.tau is None) or motion.observed is not None or n < 2:
+    if plan is None or (hasattr(plan, "h") and motion.tau is None) or motion.observed is not None or n < 2:
         return motion
     parts = min(64, SMOOTH // (n - 1), MOST_NUMBERS // motion.q.size)
     return (

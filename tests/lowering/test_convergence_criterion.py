@@ -325,7 +325,7 @@ typedef union {{ lanes all; double lane[LANES]; }} lane_view;
 typedef lanes number, coordinates[1];
 typedef int step_data;
 typedef struct {{ double tolerance; long long max_iterations; int absolute; }} solver_options;
-typedef struct {{ double change, *active; int shared; long long iterations; }} solver_report;
+typedef struct {{ double change, noise, *active; int shared; long long iterations; }} solver_report;
 enum {{ M = 1, S = 1, FINAL_ITERATIONS = 0, OK = 0, NOT_CONVERGED = 1, NOT_FINITE = 2, LAST_ALONE, LAST, BEFORE }};
 #define SELDOM
 #define SUPPORT_NUMBERS_H

@@ -187,13 +187,15 @@ PASS end_increments increments_of(const step_points *w, long long i)
 {
   const iteration_data *data = w->data;
   const drift_words of = DRIFT_OF(w, i);
-  const number sum = weigh_forces(w, POINT_END_POSITION, POINT_END_POSITION_LOW, w->remainder->position, i);
+  const lanes *position = w->former ? w->remainder->position : NULL;
+  const lanes *momentum = w->former ? w->remainder->momentum : NULL;
+  const number sum = weigh_forces(w, POINT_END_POSITION, POINT_END_POSITION_LOW, position, i);
   const number kick = data->inverse_mass[i] * (data->square * sum), q = of.high + kick, part = q - of.high;
   end_increments end;
   end.q = q;
   end.q_low =
       (of.high - (q - part)) + (kick - part) + (of.low + data->inverse_mass[i] * (data->square_low * sum));
-  end.p = weigh_forces(w, data->kick, data->kick_low, w->remainder->momentum, i);
+  end.p = weigh_forces(w, data->kick, data->kick_low, momentum, i);
   return end;
 }
 

@@ -143,11 +143,27 @@ static int linearise(const step_data *step, newton_data *data, const band *shape
   return factorise(data->factors, shape, data->pivot);
 }
 
-/* Displacements that round as g does: positions and multipliers that stagnate above the rounding of the former. */
-static inline void add_sizes_of_constraints(const step_data *step, real *size)
+/* Adds displacements whose rounding errors are those of what they depend on, above that of the positions: of g, and of
+ * the velocities v(q, y) of a first-order system, |h| |dv/du| |u| for u = (q, y). There updates stagnate. */
+static SELDOM void add_sizes_of_arguments(const step_data *step, real *size)
 {
 #ifdef CONSTRAINED
   add_constraint_sizes(step->t, step->q0, step->parameters, saddle_in(step->scratch), size);
+#elif defined(FIRST_ORDER_SYSTEM) && !defined(DOUBLE_DOUBLE) /* whose error estimates resolve these */
+  const real part = MATH(sqrt)(REAL_EPSILON);
+  real u[2 * M], v[M], moved[M];
+  memcpy(u, step->q0, sizeof(real) * M);
+  memcpy(u + M, step->p0, sizeof(real) * M);
+  if (find_velocity(step->t, u, u + M, step->parameters, v, step->scratch) != OK)
+    return;
+  for (int k = 0; k < 2 * M; k++) {
+    const real before = u[k];
+    u[k] += part * before;
+    if (find_velocity(step->t, u, u + M, step->parameters, moved, step->scratch) == OK)
+      for (int i = 0; i < M; i++)
+        size[i] += MATH(fabs)(step->h * (moved[i] - v[i])) / part;
+    u[k] = before;
+  }
 #else
   (void)step, (void)size;
 #endif
@@ -188,7 +204,7 @@ static int newton(const step_data *step, newton_data *data, const real *q1, real
       }
       slow += moved.relative >= STOPPED_SHRINKING * last;
       if (slow == STAGNATIONS)
-        add_sizes_of_constraints(step, added);
+        add_sizes_of_arguments(step, added);
       last = moved.relative;
     }
     if (k >= least(options->max_iterations, MOST_ITERATIONS))

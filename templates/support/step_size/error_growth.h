@@ -2,7 +2,8 @@
 
 /* Growth of errors along an adaptive run: the size of one tangent vector (dq, dv) relative to the motion, the largest
  * distance from the start and the largest velocity, which depend neither on the origin nor on a gauge. An explicit
- * Runge-Kutta-Nystroem scheme advances it by each accepted step. Its accelerations are those of the variational equations,
+ * Runge-Kutta-Nystroem scheme advances it by each accepted step. Its accelerations are those of the variational
+ * equations,
  *   dq'' = F_q dq / m,      or      L_vv dq'' = -E_q dq - E_v dv   (VARIABLE_ACCELERATIONS),
  * with E(q, v, a) the Euler-Lagrange residual at the points of the step, whose derivatives are evaluated in SIMD lanes.
  * The nodes of the scheme are some of the points; a_0 is extrapolated from the step before. Where h^2 dq'' is large,

@@ -351,8 +351,8 @@ static inline void try_pilot(run_memory *run, trial *now, const solver_options *
   }
 }
 
-/* Levels by which a trial with an inadmissible error, in which some velocity rises from rest, is increased: sizes of the
- * state, which may be zero, made it too short for a pilot. v: velocities of the trial before. At most `most`. */
+/* Levels by which a trial with an inadmissible error, in which some velocity rises from rest, is increased: sizes of
+ * the state, which may be zero, made it too short for a pilot. v: velocities of the trial before. At most `most`. */
 static SELDOM int levels_from_rest(const run_memory *run, const trial *now, const real *v, int most)
 {
   int rises = 0;
