@@ -94,7 +94,7 @@ class unit_step(Function):  # type: ignore[misc]  # noqa: N801
 def kinks_of(expressions: Iterable[Expr]) -> set[Expr]:
     """Return functions at whose zeros expressions may jump or have a kink: x of unit_step(x), cos(pi x) of rint(x)."""
     found = {f for e in expressions for f in (e, *(each.definition for each in intermediates(e)))}
-    jumps = {each for formula in found for each in formula.atoms(unit_step, rint)}
+    jumps = {part for part in parts(*found) if isinstance(part, unit_step | rint)}
     return {each.args[0] if isinstance(each, unit_step) else sympy.cos(sympy.pi * each.args[0]) for each in jumps}
 
 

@@ -102,7 +102,7 @@ def test_a_steady_rotation_is_a_periodic_orbit_although_its_quaternion_changes_s
     )
     spin = orbit.run().angular_velocity()[0]
     assert orbit.period * spin[2] == pytest.approx(2 * np.pi, abs=1e-11)
-    np.testing.assert_allclose(orbit.run().quaternion()[-1], -orbit.run().quaternion()[0], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(orbit.run().quaternion()[-1], -orbit.run().quaternion()[0], rtol=0, atol=1e-11)
     nutation = np.cos(2 * np.pi * np.sqrt((2.5 - 1) * (2.5 - 2) / (1 * 2)))
     np.testing.assert_allclose(sorted(orbit.stability_indices.real), [nutation, 1, 1], rtol=0, atol=1e-7)
     assert orbit.monodromy.shape == (6, 6)

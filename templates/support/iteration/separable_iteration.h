@@ -563,7 +563,7 @@ HOT int iterate(const step_data *step, const iteration_data *data, history past,
   coordinates local[GROUPS], *F = kept(past, local);
   drift_words drifts[M];
   number inverse_size[M];
-  memset(second, 0, sizeof second);
+  memset(second, 0, sizeof second), memset(former, 0, sizeof former);
   step_points w = {step, data, X[0], F[0], M, inverse_size, implicit || rough ? NULL : former[0], NULL, second[0],
       drifts, base[0]};
 #ifndef POINTS
