@@ -154,7 +154,6 @@ class Ensemble:
         steps, t_end = _steps_or_end(t, h, steps, t_end, inputs, control, t_eval, words=interface.words)
         require(stepper, "ensembles")
         if device is not None:
-            require(stepper, "device")
             q, p, velocity, parameters = (on_processor(each) for each in (q, p, velocity, parameters))
         if h is None:
             require(stepper, "adaptive")
@@ -635,6 +634,8 @@ def _check_device(device: str | None, h: float | None, inputs: object, save_ever
 
 def _recorded_events(stepper: Any, device: str | None, observe: str | None) -> tuple[Event, ...]:
     """Return the events that trajectories record, none if they are counted; raise an error where that is impossible."""
+    if device is not None:
+        require(stepper, "device")
     recorded: tuple[Event, ...] = stepper.events if observe != "events" else ()
     if recorded:
         check_together(events=recorded, device=device, observe_ensemble=observe)
