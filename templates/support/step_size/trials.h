@@ -137,8 +137,10 @@ static __attribute__((noinline)) double rough_attempt(run_memory *run, step_data
 #define ATTEMPT(options, ...) attempt(__VA_ARGS__)
 #endif
 
-#if !defined(NEWTON_ALONE) && !defined(ARRAYS) && !defined(NO_FALLBACK)
+#ifndef ARRAYS
+#if !defined(NEWTON_ALONE) && !defined(NO_FALLBACK)
 #define NEWTON_ADMITTED /* where the fixed-point iteration limits the steps */
+#endif
 #endif
 #if defined(RATTLE) || defined(NEWTON_ADMITTED)
 #define NEWTON_IN_PLACE /* of another iteration, in some steps */
