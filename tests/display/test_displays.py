@@ -268,5 +268,5 @@ def test_displays_render_in_a_browser(browser, tmp_path, size, scheme):
         assert view.evaluate("document.documentElement.scrollWidth") <= view.width
         assert view.evaluate(UNREADABLE) == []
         boxes = view.evaluate("[...document.querySelectorAll('polyline')].map(e => e.getBoundingClientRect().width)")
-        assert len(boxes) == 3
+        assert len(boxes) == 7  # of three runs, and two coordinates each of two trajectories of an ensemble
         assert min(boxes) > 100.0
