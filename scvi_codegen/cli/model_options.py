@@ -229,7 +229,7 @@ def _check_method(choices: Choices) -> None:
     for option in METHOD_KEYS[1:]:
         value = choices.get(option)
         if value is not None and option not in taken:
-            takes = ", ".join(flags[one] for one in taken if one in METHOD_KEYS) or "no options"
+            takes = ", ".join(flags[key] for key in taken if key in METHOD_KEYS) or "no options"
             raise click.UsageError(f"--method {method} takes no {flags[option]}; it takes {takes}")
         if value is not None and message.get(option, value) != value:
             raise click.UsageError(
@@ -237,22 +237,28 @@ def _check_method(choices: Choices) -> None:
             )
 
 
-def read_model(name: str, choices: Choices) -> Model:
-    """Return the model of a file, of standard input (``-``) or the catalogue, with the options of the command line."""
+def read_model(name: str, choices: Choices, steps: Mapping[str, float] | None = None) -> Model:
+    """Return the model of a file, of standard input (``-``) or the catalogue, with the options of the command line.
+
+    ``steps``: entries of [run] that replace a step size, without which options of adaptive steps would be refused.
+    """
     check_exclusive(choices)
     _check_method(choices)
+    sections = sections_of(choices)
+    if steps:
+        sections["run"] = {**sections.get("run", {}), **steps}
     if name == STANDARD_INPUT:
         text = sys.stdin.read(MAX_CHARACTERS + 1).removeprefix("\ufeff")
-        return parse_model(text, sections_of(choices), folder=Path())
+        return parse_model(text, sections, folder=Path())
     path = Path(name)
     if path.suffix.lower() in (".toml", *ROBOT_FILES) or os.sep in name or path.is_file():
-        return load_model(path, sections_of(choices))
+        return load_model(path, sections)
     if name.partition(":")[0] not in PROBLEMS:
         try:
             problem(name)
         except SystemDefinitionError as error:
             raise SystemDefinitionError(f"{error} (There is no model file '{name}' either.)") from error
-    return catalogue_model(name, sections_of(choices))
+    return catalogue_model(name, sections)
 
 
 def with_known_sizes(model: Model, option: str) -> Model:

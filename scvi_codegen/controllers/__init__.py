@@ -79,7 +79,10 @@ def with_time_transformation(
 
 
 def check_controller(controller: str | None, *, transformed: bool) -> None:
-    """Raise ``SystemDefinitionError`` for an unknown controller, and for one of tau, or of time, that cannot act."""
+    """Raise ``SystemDefinitionError`` for a controller that is unknown or excluded.
+
+    Those of tau require a transformation of time, which those of time exclude.
+    """
     if controller not in (None, SYMPLECTIC, *CONTROLLERS):
         raise SystemDefinitionError(f"controller must be {' or '.join([SYMPLECTIC, *CONTROLLERS])}, not {controller!r}")
     in_tau = controller == SYMPLECTIC or (controller is not None and CONTROLLERS[controller].in_tau)

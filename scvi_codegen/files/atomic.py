@@ -120,7 +120,8 @@ def naming_folders(folders: Iterable[str | os.PathLike[str]]) -> Iterator[None]:
 
 def is_inside(folder: str | os.PathLike[str], path: Path) -> bool:
     """Return whether a path is in a folder, or in one of :func:`naming_folders`; links are followed."""
-    return any(path.resolve().is_relative_to(each) for each in (Path(folder).resolve(), *_named_folders.get()))
+    admitted = (Path(folder).resolve(), *_named_folders.get())
+    return any(path.resolve().is_relative_to(place) for place in admitted)
 
 
 def inside(folder: str | os.PathLike[str], name: str | os.PathLike[str]) -> Path:

@@ -259,7 +259,9 @@ def places(form: OneForm) -> dict[Symbol, Expr]:
 
     for component in form.theta:
         collect(component)
-    most = {z: max(kind.values(), key=lambda each: (len(each), each[0] == z), default=[z]) for z, kind in kinds.items()}
+    most = {
+        z: max(kind.values(), key=lambda forms: (len(forms), forms[0] == z), default=[z]) for z, kind in kinds.items()
+    }
     return {z: max(expressions, key=expressions.count) for z, expressions in most.items()}
 
 
@@ -279,7 +281,7 @@ def first_order_form(form: OneForm) -> dict[str, Any]:
     z, n = form.coordinates, len(form.coordinates)
     placed = form.at(expressions := places(form))
     if not any(placed.integral(chosen) is not None for chosen in islice(placed.choices(), MOST_CHOICES)):
-        placed = form.at(expressions := {each: each for each in z})
+        placed = form.at(expressions := {symbol: symbol for symbol in z})
     for chosen, _ in zip(placed.choices(), range(MOST_CHOICES), strict=False):
         integral = placed.integral(chosen)
         if integral is None:
@@ -298,8 +300,8 @@ def first_order_form(form: OneForm) -> dict[str, Any]:
     integral = integral.xreplace(expressions)
     rest = [i for i in range(n) if i not in chosen]
     theta = tuple(
-        expressions[z[i]].diff(z[i]) * each.xreplace(expressions) if integral else form.theta[i]
-        for i, each in zip(rest, theta, strict=True)
+        expressions[z[i]].diff(z[i]) * component.xreplace(expressions) if integral else form.theta[i]
+        for i, component in zip(rest, theta, strict=True)
     )
     y = tuple(z[i] for i in chosen)
     order = sorted(range(len(y)), key=lambda k: theta.index(y[k])) if set(theta) == set(y) else range(len(y))

@@ -26,7 +26,7 @@ from scvi_codegen.compiler import second_stepper
 from scvi_codegen.files.export import FORMATS
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_files.ensemble_file import EnsembleStates, load_ensemble
-from scvi_codegen.models.options import IN_ENSEMBLE, OPTIONS, STEP_SIZE, WITH_INPUTS, check_available
+from scvi_codegen.models.options import IN_ENSEMBLE, OF_ADAPTIVE_STEPS, OPTIONS, STEP_SIZE, WITH_INPUTS, check_available
 from scvi_codegen.pictures.animation import FILMS
 from scvi_codegen.pictures.canvas import PICTURES, check_plot_path
 from scvi_codegen.rendering.source import AUTO, DOUBLE_DOUBLE
@@ -134,7 +134,9 @@ def run(
     _check_outputs(output, plot, ensemble)
     wanted = {name: choices.pop(name) for name in ERRORS}
     _check_combination(choices, plot=plot, ensemble=ensemble, wanted=wanted, folder=output if recorded else None)
-    model = read_model(model_name, choices)
+    is_controlled = any(choices.get(name) is not None for name in OF_ADAPTIVE_STEPS)
+    errors = {name: wanted[name] for name in ("tolerance", "error") if wanted[name] is not None}
+    model = read_model(model_name, choices, errors if is_controlled else None)
     _check_words(model, {"-o": output})
     if model.precision in (DOUBLE_DOUBLE, AUTO):
         model = model.with_known_sizes()
