@@ -1,10 +1,9 @@
-"""Integrators that are certified, and sabotaged: systems at states without symmetry, and methods of every kind."""
+"""Integrators that are certified: systems at states without symmetry, and methods of every kind."""
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
-from sabotage import Case
 from samples import (
     damped_pendulum,
     driven_duffing,
@@ -24,6 +23,20 @@ import scvi_codegen as sc
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import Method
 from scvi_codegen.models.systems import point_vortices
+
+
+@dataclass(frozen=True)
+class Case:
+    """A system at a state with a method, and the tolerance and the time transformation of its runs, if any."""
+
+    system: MechanicalSystem
+    method: Callable[[], Method]
+    q: tuple[float, ...]
+    p: tuple[float, ...]
+    h: float
+    tolerance: float | None = None
+    time_transformation: str | None = None
+
 
 STATES: dict[str, tuple[MechanicalSystem, tuple[float, ...], tuple[float, ...], float]] = {
     "pendulum": (sc.problem("planar-pendulum").system, (0.7,), (0.9,), 0.2),
@@ -102,4 +115,3 @@ CASES = {
     "kepler/svi-3, controlled": CONTROLLED,
     "kepler/svi-3, reversible": REVERSIBLE,
 }
-"""Everything that is sabotaged, whole."""

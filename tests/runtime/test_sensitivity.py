@@ -4,9 +4,9 @@ from functools import cache
 
 import numpy as np
 import pytest
+from certified_cases import Case
 from certified_cases import case as certified
 from numpy.testing import assert_allclose
-from sabotage import Case
 from samples import QUICK_FLAGS
 from scipy.linalg import block_diag
 

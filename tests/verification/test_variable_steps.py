@@ -1,11 +1,10 @@
-"""Certificates of runs in transformed time and with adaptive steps. Planted faults: ``faults/c_edits.py``."""
+"""Certificates of runs in transformed time and with adaptive steps."""
 
 from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from certified_cases import CONTROLLED, REVERSIBLE, case
-from sabotage import Case
+from certified_cases import CONTROLLED, REVERSIBLE, Case, case
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
