@@ -105,17 +105,6 @@ class TestRecording:
         assert (about["model"], about["steps"], about["builds"][0]["step"]) == (text, 10, 0)
         assert found.manifest.about()["method"] == kepler.interface.method
 
-    def test_a_manifest_with_the_keys_of_version_0_1_is_read(self, kepler):
-        text = dump_model(sc.Model.from_problem(sc.problem("kepler")))
-        found = recorded(kepler, 10, save_every=5, model=text)
-        path = Path("a.run/manifest.json")
-        former = json.loads(path.read_text().replace("save_every", "every"))
-        del former["sha256"]
-        assert "every" in former
-        assert "save_every" not in former["model"]
-        path.write_text(json.dumps(former, indent=1))
-        assert sc.load_run("a.run").manifest == found.manifest
-
     def test_certificate_is_accepted_as_file_or_object(self, kepler):
         Path("c.json").write_text('{"order": 8}')
         assert recorded(kepler, 1, certificate="c.json").manifest.certificate == {"order": 8}
