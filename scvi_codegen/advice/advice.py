@@ -173,7 +173,7 @@ def advise(
         is uncertain.
 
     Raises:
-        StateError: on wrong shapes, names or numbers.
+        StateError: on wrong shapes, names or numbers, and for a motion at rest, relative to which errors are undefined.
         UnresolvedError: if no pilot run is accurate.
         MethodError: if the degree is to be chosen for a method that has none, or time is transformed.
         BuildError: without a C compiler.

@@ -30,6 +30,21 @@ def exact(t, q, p):
     return forced * np.cos(t) + b * np.cos(w * (t - T)) + c * np.sin(w * (t - T))
 
 
+@pytest.mark.parametrize("turns", [0, 1])
+def test_motion_at_rest_has_no_advice(turns):
+    """Neither at the origin nor elsewhere; an ensemble has advice if the trajectory that decides moves."""
+    pendulum = lagrange("pendulum", "a", "a_dot**2/2 + cos(a)")
+    q, settings = 2.0 * math.pi * turns, {"span": 5.0, "tolerance": 1e-4}
+    with pytest.raises(sc.StateError, match="at rest"):
+        sc.advise(pendulum, "svi:4", [q], velocity=[0.0], **settings)
+    moving, both = ([q + 1.0], [0.0]), ([[q], [q + 1.0]], [[0.0], [0.0]])
+    alone, together = (sc.advise(pendulum, "svi:4", x, velocity=v, **settings) for x, v in (moving, both))
+    assert together.member == 1
+    assert together.h == alone.h
+    with pytest.raises(sc.StateError, match="1 of 2 trajectories are at rest"):
+        sc.advise(pendulum, "svi:4", both[0], velocity=both[1], quantile=0.5, **settings)
+
+
 def run(system, h, q=0.75, p=-0.5):
     steps = round(SPAN / h)
     return sc.compile_stepper(system, "svi:2").integrate([q], [p], h=h, steps=steps, t=T, parameters=STIFFER)
@@ -67,7 +82,7 @@ def test_chaotic_trajectory_is_classified_as_chaotic():
 
 def claimed_run(**more):
     """A run whose worst step and energy are in doubt or not."""
-    q = np.ones((64, 1))
+    q = np.sqrt(2.0) * np.cos(np.pi * (np.arange(64.0) + 0.5) / 32.0)[:, np.newaxis]  # 1 is its distance from its mean
     stepper = SimpleNamespace(interface=SimpleNamespace(conserves_energy=True))
     stated = {"step_error": 1e-12, "worst_step_time": 3.25, "q": q, "p": q, "velocity": q, "steps": 63}
     stated["stepper"] = stepper

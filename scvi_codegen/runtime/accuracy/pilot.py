@@ -22,9 +22,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from scvi_codegen.errors import StepFailedError, UnresolvedError
+from scvi_codegen.errors import StateError, StepFailedError, UnresolvedError
 from scvi_codegen.methods import Method
-from scvi_codegen.runtime.accuracy.size import distances_from_mean
+from scvi_codegen.runtime.accuracy.size import distances_from_mean, relative, relative_to_motion
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.core.validation import Array, States, flat_state
 from scvi_codegen.runtime.core.words import low_words, split, with_low
@@ -170,6 +170,7 @@ def run_pilot(
         quantile: part of the trajectories whose errors must be within the bound.
 
     Raises:
+        StateError: if the motion is at rest.
         UnresolvedError: if the solution seems to end in a singularity, or no step size resolves it from the start.
     """
     pilot, first = None, 1
@@ -188,6 +189,12 @@ def run_pilot(
         )
     if not pilot.whole:
         pilot.rates = pilot.divergence_rates(most // SEARCH)
+    if (count := pilot.count_at_rest) > pilot._rank(pilot.count):
+        which = f"{count} of {pilot.count} trajectories are" if pilot.count > 1 else "the motion is"
+        raise StateError(
+            f"{which} at rest over t = {pilot.length:.3g}: errors relative to its size are undefined; give an "
+            "initial state that moves, or choose h below the shortest period"
+        )
     pilot.complete(target_error, most)
     return pilot
 
@@ -269,6 +276,11 @@ class Pilot:
         return float(np.median([_power(self._errors(n)) for n in self._halved()[:3]]))
 
     @property
+    def count_at_rest(self) -> int:
+        """Number of trajectories at rest, of which no error says anything about a step size."""
+        return int(np.count_nonzero(distances_from_mean(self.runs[self.good[-1]].q) == 0.0))
+
+    @property
     def rate(self) -> float:
         """Exponential growth rate of errors, 0 if they do not grow exponentially."""
         return self._worst(self.rates)
@@ -335,7 +347,7 @@ class Pilot:
             other = run(self.q + shifts.reshape(self.q.shape))
         except StepFailedError:
             return np.zeros(self.count)
-        differences = np.linalg.norm(other - one, axis=-1) / sizes
+        differences = relative(np.linalg.norm(other - one, axis=-1), sizes)
         rates = np.zeros(self.count)
         for j, difference in enumerate(differences.T):
             near = difference[: int(np.argmax(difference > RESOLVED)) or steps]
@@ -395,10 +407,9 @@ class Pilot:
         if (known := self._errors_of.get((n, finest))) is not None:
             return known
         reference, positions = self.runs[finest].q, self.runs[n].q
-        size = distances_from_mean(reference)
         count = math.gcd(len(reference), len(positions))
         both = [q[len(q) // count - 1 :: len(q) // count] for q in (reference, positions)]
-        errors: Array = np.linalg.norm(both[1] - both[0], axis=-1) / size
+        errors = relative_to_motion(np.linalg.norm(both[1] - both[0], axis=-1), reference)
         # The reference has the error e_ref = (n/finest)^order e_n, so that |q_n - q_ref| = (1 - (n/finest)^order) e_n.
         errors = errors / (1.0 - (n / finest) ** self.order)
         self._errors_of[n, finest] = errors = np.where(np.isfinite(errors), errors, math.inf)

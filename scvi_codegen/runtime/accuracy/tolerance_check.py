@@ -14,7 +14,7 @@ from typing import Any, cast
 import numpy as np
 
 from scvi_codegen.errors import ScviCodegenError, StateError
-from scvi_codegen.runtime.accuracy.size import distances_from_mean
+from scvi_codegen.runtime.accuracy.size import relative_to_motion
 from scvi_codegen.runtime.accuracy.warning_switch import without_accuracy_warnings
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.core.validation import Array
@@ -83,9 +83,9 @@ def known_digits(
             q, p = repeated.q, repeated.p
     except (ScviCodegenError, _TooLongError):
         return None
-    size = distances_from_mean(q)
+    positions = q
     q, p = np.abs(q - trajectory.q[chosen]), np.abs(p - trajectory.p[chosen])
-    tenfold = _tenfold(np.linalg.norm(q, axis=1) / size, abs(float(times[-1] - times[0])))
+    tenfold = _tenfold(relative_to_motion(np.linalg.norm(q, axis=1), positions), abs(float(times[-1] - times[0])))
     return Known(q=_final_error(q), p=_final_error(p), tenfold=tenfold)
 
 
@@ -147,7 +147,7 @@ def missed_tolerance(
         known = known_digits(second, trajectory, most=SECOND_RUN + 4 * trajectory.steps)
     if known is None or known.chaotic:
         return f"{doubt}; {REMEDY}" if doubt else ""
-    error = float(np.linalg.norm(known.q) / distances_from_mean(trajectory.q))
+    error = float(relative_to_motion(np.linalg.norm(known.q), trajectory.q))
     if error <= SECOND_MARGIN * tolerance + SECOND_RUN_ERROR:
         return ""
     message = doubt or f"the tolerance {tolerance:g} is missed"
@@ -165,7 +165,7 @@ def _missed_in_two_words(trajectory: Trajectory, tolerance: float) -> str:
     except ScviCodegenError:
         return ""
     late = np.asarray(second.velocity[-1]) * float(second.t[-1] - trajectory.t[-1])
-    error = float(np.linalg.norm(second.q[-1] - trajectory.q[-1] - late) / distances_from_mean(trajectory.q))
+    error = float(relative_to_motion(np.linalg.norm(second.q[-1] - trajectory.q[-1] - late), trajectory.q))
     return f"the tolerance {tolerance:g} is missed: a second run differs by {error:.1e} at the end; {REMEDY}" * (
         error > SECOND_MARGIN * tolerance
     )
