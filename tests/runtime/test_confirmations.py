@@ -498,3 +498,16 @@ def test_a_comparison_that_is_given_up_confirms_nothing(monkeypatch):
     assert not run.confirmation.confirmed
     assert run.confirmed_until == 0.0
     assert math.isinf(run.global_error)
+
+
+@pytest.mark.parametrize("mass", [1.0, 2.0**-30])
+def test_momenta_of_light_bodies_count(mass):
+    """A body that crosses ripples: errors of its velocity are 100 times those of its position relative to its range."""
+    text = "x_dot**2/2 - x**2/2 + m*(y_dot**2/2 + cos(9*y)/2)"
+    ripples = sc.compile_stepper(lagrange("ripples", ("x", "y"), text, m=mass), "svi:4")
+    run = ripples.integrate([1.0, 0.25], velocity=[0.0, 1.5], t_end=15.0, error=1e-5)
+    y, v = integrated(lambda t, z: [z[1], -4.5 * math.sin(9.0 * z[0])], [0.25, 1.5], run.t).T
+    of_q, of_v = (abs(x).max() / np.ptp(of) for x, of in ((run.q[:, 1] - y, y), (run.p[:, 1] / mass - v, v)))
+    assert of_v > 10.0 * of_q
+    assert run.confirmation.confirmed
+    assert of_v / 2.0 < run.global_error < 1e-5  # of some of the states

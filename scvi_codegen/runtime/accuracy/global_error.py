@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, warn
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.rendering.source import Interface
-from scvi_codegen.runtime.accuracy.size import Motion, first_of_groups, relative, roundoff
+from scvi_codegen.runtime.accuracy.size import Motion, first_of_groups, momenta_of_velocities, relative, roundoff
 from scvi_codegen.runtime.accuracy.warning_switch import warnings_wanted, without_accuracy_warnings
 from scvi_codegen.runtime.run.step_plan import Adaptive, absolute_tolerances
 
@@ -70,6 +70,8 @@ ORDER = 10.0
 """Power of a step of tau that a local tolerance stands for: ``RATIO`` halves the steps of a time transformation."""
 UNEVEN = 30.0
 """Ratio of the longest to the shortest step from which on a time transformation is recommended."""
+SLIGHT = 1e-12
+"""Ratio to the largest position or momentum below which a change is no reason to compare a state."""
 TINY = math.ulp(0.0)
 """Smallest positive number."""
 LOST = 0.1
@@ -87,7 +89,7 @@ class GlobalError:
         h: step of tau of a run in transformed time, else 0.
         t: (n,) times at which the runs were compared: at most 512 of the saved states, where the motion is fast.
         differences: (n,) the largest difference of a position relative to the range of that coordinate over the run, or
-            of a momentum relative to the largest one (:mod:`scvi_codegen.runtime.accuracy.size`).
+            of a momentum relative to its own or that of its velocity (:mod:`scvi_codegen.runtime.accuracy.size`).
         safety: factor of the estimate: 3; where rounding may dominate the error, 12 for two comparisons, 4 for three.
         estimate: this factor times the largest difference, at least ten roundings and the tolerance; meaningless above
             about 0.1, where runs are uncorrelated.
@@ -473,6 +475,7 @@ class _Samples:
         t, states: (k,) times, and (2, k, m) positions and momenta: the last state, and from each of equal numbers of
             states the one where positions or momenta change fastest relative to their sizes, as an error in time has
             the largest effect there.
+        kinetic: (k, m) momenta of velocities.
         errors: (2, k, m) largest differences from other runs, at least the rounding errors of the states.
         steps_of_run: (n,) initial time, and times of all saved states.
         end: last time.
@@ -490,7 +493,8 @@ class _Samples:
             speed = np.zeros(steps)
             with np.errstate(all="ignore"):
                 for each in map(np.asarray, states):
-                    unit = np.abs(each).max() or 1.0
+                    largest = np.abs(each).max(axis=0)
+                    unit = np.maximum(largest, SLIGHT * largest.max() or 1.0)
                     speed = np.fmax(speed, np.abs(np.diff(each / unit, axis=0)).max(axis=1))
                 speed /= np.maximum(abs(np.diff(t)), TINY)
             size = -(-steps // count)
@@ -503,6 +507,7 @@ class _Samples:
         self.epsilon, self.firsts = roundoff(interface.words), first_of_groups(interface, m)
         self.errors = self.epsilon * np.abs(np.array([np.asarray(each) for each in self.states]))
         self.motion: Motion | None = None
+        self.kinetic = momenta_of_velocities(trajectory.stepper, self.t, *self.states, trajectory.parameters)
         plan = trajectory.plan
         self.absolute: Array | float = 0.0
         if isinstance(plan, Adaptive):
@@ -540,7 +545,9 @@ class _Samples:
         whole, reached = np.empty(0), len(self.t)
         while reached:
             errors = self.errors[:, :reached]
-            sizes = self.motion.sizes(float(self.t[reached - 1]), errors.max(axis=1))
+            sizes = self.motion.sizes(
+                float(self.t[reached - 1]), errors.max(axis=1), self.kinetic[:reached].max(axis=0)
+            )
             differences = relative(errors, sizes[:, None]).max(axis=(0, 2))
             whole = whole if whole.size else differences
             met = np.ones(reached, bool) if within is None else within(differences)

@@ -18,7 +18,14 @@ from typing import cast
 import numpy as np
 
 from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, warn
-from scvi_codegen.runtime.accuracy.size import Motion, first_of_groups, largest_range, relative, roundoff
+from scvi_codegen.runtime.accuracy.size import (
+    Motion,
+    first_of_groups,
+    largest_range,
+    momenta_of_velocities,
+    relative,
+    roundoff,
+)
 from scvi_codegen.runtime.accuracy.warning_switch import warnings_wanted
 from scvi_codegen.runtime.constraints.projection import projected
 from scvi_codegen.runtime.core.features import require
@@ -256,7 +263,8 @@ class _Repetition:
         q, p = np.asarray(states.q)[rows], np.asarray(states.p)[rows]
         errors = np.abs(np.array([self.run._q - q[-1], self.run._p - p[-1]]))
         motion = Motion(states.t[rows], q, p, self.firsts, roundoff(1))
-        return float(relative(errors, motion.sizes(float(states.t[k]), errors)).max())
+        kinetic = momenta_of_velocities(self.run.stepper, states.t[rows], q, p, states.parameters).max(axis=0)
+        return float(relative(errors, motion.sizes(float(states.t[k]), errors, kinetic)).max())
 
     def _report(self, what: str, difference: float, t: float) -> None:
         perturbed = f"a run with the initial state perturbed by {self.nudge:.1e} (relative)"

@@ -4,17 +4,24 @@ A size that is the coordinate itself would depend on the origin. Coordinates tha
 entries of an array, the components of a rotation.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from scvi_codegen.errors import StateError
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.core.validation import Array, coordinate_shapes
 from scvi_codegen.runtime.rotations.states import members_of
 
 RESOLVED = 64.0
 """Range in roundings of the largest value from which on a coordinate moves."""
+NOISE_OF_MOMENTA = 1e4
+"""The same of momenta, relative to the largest one: those that are conserved accumulate rounding errors."""
+SAMPLES = 16
+"""Number of states whose momenta without velocity are computed."""
 UPDATE_ROUNDING = 4.0
 """Newton updates of so many roundings of the largest value cannot be reduced."""
 
@@ -56,29 +63,52 @@ class Motion:
     epsilon: float
     absolute: Array | float = 0.0
 
-    def sizes(self, until: float, errors: Array) -> Array:
+    def sizes(self, until: float, errors: Array, kinetic: Array | float = 0.0) -> Array:
         """Return (2, m) sizes of positions and momenta up to a time.
 
-        Positions: max(range, absolute); of a coordinate that is at rest, up to rounding, its largest value, and of one
-        that consists of rounding errors of others, by which ``errors`` (2, m) are as large, the largest range. Momenta:
-        the largest of all, times the least ratio of a size to a range.
+        Positions: max(range, absolute); of a coordinate that is at rest, up to rounding, its largest value. Momenta:
+        the range, at least ``kinetic`` (m,), those of velocities, times the ratio of the size to the range of their
+        coordinate, or the least one. Of those that consist of rounding errors of others, by which ``errors`` (2, m) are
+        as large, both are the largest one.
         """
         rows = slice(max(1, np.count_nonzero(abs(self.t - self.t[0]) <= abs(until - self.t[0]))))
         q, p = np.asarray(self.q)[rows], np.asarray(self.p)[rows]
         ranges, largest = self._of_groups(np.ptp(q, axis=0)), self._of_groups(np.abs(q).max(axis=0))
+        momenta = self._of_groups(np.maximum(np.ptp(p, axis=0), kinetic))
         resolution = RESOLVED * self.epsilon
         rest = ranges <= resolution * largest
-        noise = (ranges < resolution * ranges.max(initial=0.0)) & (100.0 * errors[0] >= ranges)
+        noise = _is_noise(ranges, errors[0], resolution)
         sizes = np.where(noise, ranges.max(initial=0.0), np.where(rest, np.maximum(ranges, largest), ranges))
         sizes = np.maximum(sizes, self.absolute)
         with np.errstate(all="ignore"):
-            ratio = np.fmin.reduce(sizes / ranges, initial=1.0 / self.epsilon)  # NaN: of 0 by 0
-        return np.array([sizes, np.full_like(sizes, np.abs(p).max(initial=0.0) * max(1.0, ratio))])
+            ratio = np.maximum(1.0, sizes / ranges)
+            least = np.fmin.reduce(ratio, initial=1.0 / self.epsilon)  # NaN: of 0 by 0
+            noise_of_p = _is_noise(momenta, errors[1], NOISE_OF_MOMENTA * resolution)
+            of_p = np.where(noise_of_p, momenta.max(initial=0.0), momenta) * np.where(rest | noise, least, ratio)
+        return np.array([sizes, of_p])
 
     def _of_groups(self, values: Array) -> Array:
         """Return the largest value of the group of each coordinate."""
         counts = np.diff(self.firsts, append=len(values))
         return np.asarray(np.repeat(np.maximum.reduceat(values, self.firsts), counts))
+
+
+def _is_noise(sizes: Array, errors: Array, resolution: float) -> NDArray[np.bool_]:
+    """Return which sizes are rounding errors of the largest one: errors are as large."""
+    return np.asarray((sizes < resolution * sizes.max(initial=0.0)) & (100.0 * errors >= sizes))
+
+
+def momenta_of_velocities(stepper: Any, t: Array, q: Array, p: Array, parameters: Array) -> Array:
+    """Return (n, m) absolute p(q, v) - p(q, 0) of ``SAMPLES`` states, 0 of the others; |p| if that is undefined.
+
+    Those without velocity, of a vector potential, depend on its gauge.
+    """
+    kinetic, rows = np.zeros(np.shape(p)), slice(None, None, -(-len(t) // SAMPLES))
+    at_rest: Any = 0.0
+    with suppress(StateError):  # Hamiltonians, inputs that are not set
+        at_rest = np.asarray(stepper.momentum(q[rows], np.zeros_like(kinetic[rows]), t[rows], parameters))
+    kinetic[rows] = np.abs(np.asarray(p[rows]) - at_rest)
+    return kinetic
 
 
 def largest_range(values: Array) -> float:
