@@ -13,9 +13,8 @@ import hypothesis
 import programs
 import pytest
 from browsing import chromium
-from record_tiers import COSTS_VARIABLE
 from samples import UNOPTIMISED, Sample, compile_quickly, sample_named, stepper_for
-from tiers import UNOPTIMISED_TIERS, long_ones_first, mark_later_tiers, mark_the_rest_full
+from tiers import QUICK, SECOND, UNOPTIMISED_TIERS, long_ones_first, mark_later_tiers, mark_the_rest_full
 
 from scvi_codegen import LagrangianSystem, Stepper
 from scvi_codegen.methods.method import Method
@@ -31,10 +30,18 @@ def pytest_configure(config: pytest.Config) -> None:
 
     The results of the C code do not depend on the optimisation. New examples are drawn with ``-m full`` or a seed.
     """
+    if config.option.markexpr == QUICK and _are_named(config):
+        config.option.markexpr = "not full"
+    if config.option.markexpr == "second":
+        config.option.markexpr = SECOND
     if config.option.markexpr in UNOPTIMISED_TIERS:
         os.environ.setdefault(FLAGS_VARIABLE, " ".join(UNOPTIMISED))
         hypothesis.settings.register_profile("default", derandomize=config.getoption("hypothesis_seed", None) is None)
         hypothesis.settings.load_profile("default")
+
+
+def _are_named(config: pytest.Config) -> bool:
+    return any("::" in argument for argument in config.args)
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -47,7 +54,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
-    """Append the processor time of each test to a file, for ``tools/record_tiers.py``."""
+    """Append the processor time of each test, of the processes that it starts, too, to a file: for its tier."""
     begin = sum(os.times()[:4])
     result = yield
     if path := os.environ.get(COSTS_VARIABLE):
@@ -56,6 +63,8 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     return result
 
 
+COSTS_VARIABLE = "SCVI_CODEGEN_TESTS_COSTS"
+"""Name of the file to which processor seconds and names of tests are appended."""
 SKIPPED_VARIABLE = "SCVI_CODEGEN_TESTS_SKIPPED"
 """Name of a file to which the tests that were skipped are appended, one a line, for a later run with more programs."""
 
@@ -79,7 +88,7 @@ def _record_skipped(report: pytest.TestReport | pytest.CollectReport) -> None:
 @pytest.hookimpl(tryfirst=True)  # before those of other tiers are left out
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     mark_the_rest_full(items)
-    if not any("::" in argument for argument in config.args):  # tests that are named run in any tier but the full one
+    if not _are_named(config):
         mark_later_tiers(items)
     long_ones_first(items)
 

@@ -45,6 +45,7 @@ class TestLongSteps:
             going.record(10)
         assert going.record(5).step_error > 1e-3  # and raises no warning
 
+    @pytest.mark.tiers(1)
     @pytest.mark.filterwarnings("error")
     @pytest.mark.parametrize(("name", "h"), [("cart-pole", 0.02), ("charged-particle", 0.1)])
     def test_coordinate_that_hardly_moves_from_0_does_not_warn(self, name, h):
@@ -57,6 +58,7 @@ class TestLongSteps:
         true = np.abs(run.q[k + 1] - better).max() / np.abs(better).max()
         assert true / 10 < run.step_error < 1e-3
 
+    @pytest.mark.tiers(1, 3)
     @pytest.mark.sampled(3)
     @pytest.mark.filterwarnings("error")
     @pytest.mark.parametrize("method", ["svi:1", "svi:2", "scvi:2", "svi:3"])
@@ -87,6 +89,7 @@ class TestLongSteps:
             going.record(1)
         assert 0.0 < going.step_error < 1e-3
 
+    @pytest.mark.tiers(1, 2)
     @pytest.mark.sampled(2)
     @pytest.mark.parametrize("method", ["svi:1", "svi:2", "svi:3", "svi:4"])
     def test_impulse_misjudged_by_the_first_step_warns(self, method):
@@ -108,6 +111,7 @@ class TestLongSteps:
         with pytest.warns(sc.AccuracyWarning, match="h = 0.02 is too large: .* from t = 3.14 is"):
             stepper.integrate([1.95, 0.0], [0.0, math.sqrt(2 / 1.95 - 1)], h=0.02, steps=300)
 
+    @pytest.mark.tiers(1, 2)
     @pytest.mark.sampled(2)
     @pytest.mark.filterwarnings("error")
     @pytest.mark.parametrize("solver", ["fixed-point", "newton"])
@@ -131,6 +135,7 @@ class TestLongSteps:
 
 
 class TestAnotherRoot:
+    @pytest.mark.tiers(0, 1)
     @pytest.mark.sampled(2)
     @pytest.mark.parametrize(
         ("name", "method", "h", "q", "p"),
@@ -188,6 +193,7 @@ class TestLostEnergy:
         ):
             kepler.integrate_ensemble(*starts, t_end=3.0, tolerance=1e-6)
 
+    @pytest.mark.second
     @pytest.mark.parametrize(
         ("method", "aside", "steps", "message"),
         [
@@ -238,6 +244,7 @@ class TestTolerances:
         )
         assert missed_tolerance(second_stepper(system), trajectory, 1e-3) == ""
 
+    @pytest.mark.tiers(0, 1)
     @pytest.mark.parametrize(
         ("name", "method"), [("planar-pendulum", "svi:2"), ("cart-pole", "svi:3"), ("harmonic-oscillator", "svi:3")]
     )
@@ -273,6 +280,7 @@ class TestTolerances:
         trajectory = euler.integrate([1.0, 0.0], [0.0, 1.0], h=0.001, steps=5000)
         assert "energy" in missed_tolerance(second_stepper(sc.problem("kepler").system), trajectory, 3e-5)
 
+    @pytest.mark.second
     @pytest.mark.parametrize(
         "given", [{"forces": {"q": "-q_dot/2"}}, {"damping": "1/2"}], ids=lambda each: next(iter(each))
     )

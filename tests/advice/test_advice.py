@@ -120,6 +120,7 @@ def test_warnings_name_their_numbers() -> None:
 
 
 class TestAchievedErrors:
+    @pytest.mark.tiers(0, 2)
     @pytest.mark.sampled(4)
     @pytest.mark.parametrize(
         ("method", "span", "tolerance"),
@@ -144,6 +145,7 @@ class TestAchievedErrors:
         error = achieved(system, advice, q, p, kepler_end(0.2, span), 1.0)
         assert_achieved(advice, error, tolerance)
 
+    @pytest.mark.rotated
     @pytest.mark.sampled(2)
     @pytest.mark.parametrize(
         ("method", "tolerance"), [(SVI(8), 1e-6), (SVI(8), 1e-9), (SVI(8), 1e-11), (SVI(5), 1e-9)], ids=name
@@ -158,6 +160,7 @@ class TestAchievedErrors:
         error = achieved(system, advice, q, p, exact, float(np.linalg.norm(exact)))
         assert_achieved(advice, error, tolerance)
 
+    @pytest.mark.second
     def test_advice_backward_with_parameters_and_time(self):
         system, span = problem("duffing").system, -40.0
         values = {"gamma": 0.3, "omega": 1.2}
@@ -185,6 +188,7 @@ def outer_reference(span: float) -> np.ndarray:
 
 
 class TestDegree:
+    @pytest.mark.rotated
     @pytest.mark.sampled(1)
     @pytest.mark.filterwarnings("ignore::scvi_codegen.errors.AccuracyWarning")  # two digits are wanted
     @pytest.mark.parametrize("tolerance", [1e-2, 1e-6, 1e-11])
@@ -208,6 +212,7 @@ class TestDegree:
         first, second = (advise(system, Gauss(4), q, p, 50.0, 1e-8, degree=True) for _ in range(2))
         assert (first.degree, first.h, first.message) == (second.degree, second.h, second.message)
 
+    @pytest.mark.second
     def test_time_of_evidence_is_per_unit_of_time(self, monkeypatch: pytest.MonkeyPatch):
         """Pilot runs over the whole span of one second each."""
         times = count()
@@ -227,6 +232,7 @@ class TestDegree:
             advise(pendulum(), StoermerVerlet(), [1.5], [0.0], 20.0, 1e-3, degree=True)
 
 
+@pytest.mark.second
 class TestHonesty:
     def test_a_step_for_newton_alone_is_not_advised(self):
         """For a chain of springs, steps beyond the fixed-point limit meet the tolerance at ten times the cost."""
@@ -236,6 +242,7 @@ class TestHonesty:
         advice = advise(chosen.system, SVI(8), chosen.q, p, 200.0, 1e-6)
         iterated.integrate(chosen.q, p, h=advice.h, steps=advice.steps, save_every=advice.steps)
 
+    @pytest.mark.tiers(0, 2)
     @pytest.mark.parametrize("span", [100.0, 2000.0, 50_000.0])
     def test_tolerance_below_rounding_is_reported(self, span: float):
         system, (q, p) = problem("kepler").system, kepler_start(0.2)
@@ -245,6 +252,7 @@ class TestHonesty:
         assert 0.02 * advice.expected_error < error < 20.0 * advice.expected_error
         assert 0.1 < advice.h < 1.0  # shorter steps would be for nothing
 
+    @pytest.mark.rotated
     @pytest.mark.sampled(2)
     @pytest.mark.parametrize("method", [SVI(8), StoermerVerlet()], ids=name)
     @pytest.mark.parametrize("span", [50.0, 1000.0])
@@ -255,6 +263,7 @@ class TestHonesty:
         assert advice.expected_error > 1e-2
         assert any("chaos" in warning for warning in advice.warnings)
 
+    @pytest.mark.rotated
     def test_chaos_beyond_the_pilot_run_is_not_certified(self):
         entry = problem("double-pendulum")
         p = compile_stepper(entry.system, StoermerVerlet()).momentum(entry.q, entry.velocity)
@@ -263,6 +272,7 @@ class TestHonesty:
         assert len(advice.warnings) == 1
         assert re.search(r"diverge tenfold every \S+ units of time \(chaos\).*uncertain", advice.warnings[0])
 
+    @pytest.mark.rotated
     @pytest.mark.parametrize(("k", "direction"), [(1.0, 1), (4.0, -1)])
     def test_growth_times_are_those_of_a_saddle(self, k: float, direction: int):
         """Errors of a motion that decays at a saddle grow tenfold in log(10)/sqrt(k)."""
@@ -314,6 +324,7 @@ class TestHonesty:
         ends = [stepper.integrate(q, p, h=advice.h / n, steps=n * advice.steps).q[-1, 0] for n in (1, 4)]
         assert abs(ends[0] - ends[1]) <= 4e-9 * max(*np.abs(q), *np.abs(p))
 
+    @pytest.mark.quick
     @pytest.mark.parametrize(
         ("changes", "message"),
         [
@@ -348,6 +359,7 @@ class TestEnsembles:
         for e in self.ECCENTRICITIES:
             assert achieved(system, advice, *kepler_start(e), kepler_end(e, 100.0), 1.0) < 1e-8
 
+    @pytest.mark.rotated
     def test_short_pilot_of_many_trajectories_is_extrapolated_as_one_of_the_worst(self):
         """Of 200 orbits, one has an error that seems to grow quadratically over a few revolutions."""
         q, p = map(np.array, zip(*map(kepler_start, np.linspace(0.05, 0.5, 200)), strict=True))
@@ -373,6 +385,7 @@ class TestEnsembles:
         alone = advise(system, SVI(4), [1.0], [0.0], 10.0, 1e-6, parameters={"k": 25.0})
         assert advice.steps == pytest.approx(alone.steps, rel=0.1)
 
+    @pytest.mark.second
     def test_failing_trajectory_counts_unless_the_quantile_excludes_it(self):
         system = lagrange("runaway", "q", "q_dot**2/2 + a*q**3/3 - q**2/2", a=1.0)
         states, given = ([[0.1], [1.0], [0.2]], [[0.0], [1.0], [0.0]]), {"a": [0.0, 1.0, 0.0]}
@@ -388,10 +401,12 @@ class TestCommandLine:
     def test_backward_and_from_a_number_of_steps(self):
         assert "to t = 0;" in output_of("run kepler --time 50 --step -0.25 --span 50")
 
+    @pytest.mark.second
     def test_warnings_go_to_stderr(self):
         warned = invoke("run", "double-pendulum", "--span", "500", "--advise", "1e-9").stderr
         assert "Warning: the tolerance cannot be met" in warned
 
+    @pytest.mark.rotated
     def test_mistakes_are_usage_errors(self):
         for words, message in (
             ("kepler --advise 1e-6 --step 0.1", "--advise determines the step size: omit --step"),
@@ -407,6 +422,7 @@ class TestCommandLine:
             assert message in error_of(f"run {words}")
 
 
+@pytest.mark.second
 def test_symplecticity_is_not_claimed_under_forces():
     saved = advise(problem("duffing").system, SVI(4), [0.5], [0.0], 5.0, 1e-6)
     damped = lagrange("damped", "q", "q_dot**2/2 - q**2/2", dissipation="q_dot**2/10")

@@ -50,6 +50,7 @@ def run(system, h, q=0.75, p=-0.5):
     return sc.compile_stepper(system, "svi:2").integrate([q], [p], h=h, steps=steps, t=T, parameters=STIFFER)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("h", [0.125, 0.03125])
 def test_the_second_run_has_the_time_and_parameters_of_the_first(driven, h):
     trajectory = run(driven, h)
@@ -68,6 +69,7 @@ def test_accidentally_small_final_error_is_not_the_error():
     assert _final_error(apart)[0] == 5e-3
 
 
+@pytest.mark.second
 def test_chaotic_trajectory_is_classified_as_chaotic():
     double = sc.problem("double-pendulum")
     stepper = sc.compile_stepper(double.system, "svi:4")

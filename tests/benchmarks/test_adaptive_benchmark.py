@@ -28,6 +28,7 @@ def test_every_case_has_eight_states_of_one_energy_scale():
         assert chosen.q.shape == chosen.velocity.shape == (8, chosen.dimension)
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(1)
 @needs_extended
 @pytest.mark.parametrize("e", [0.0, 0.9, 0.999])
@@ -75,6 +76,7 @@ def test_reference_uses_smaller_steps_where_large_ones_fail(monkeypatch):
         references._with_two_steps(lambda x: x, np.zeros((1, 2)), np.full(3, 9.0))
 
 
+@pytest.mark.rotated
 @needs_extended
 def test_all_modes_run_and_agree():
     chosen = replace(adaptive_case("kepler:0.5"), span=20.0)

@@ -66,6 +66,7 @@ MOVED = (
 
 
 class TestCases:
+    @pytest.mark.tiers(2, 4)
     @pytest.mark.sampled(4)
     @pytest.mark.parametrize("name", MOVED)
     def test_hand_solved_accelerations_are_those_of_the_equations_of_motion(self, name):
@@ -104,6 +105,7 @@ class TestCases:
         assert p_rate == pytest.approx(acceleration * (1 - v * v) ** -1.5, rel=1e-14)
         assert not chosen.velocity.any()
 
+    @pytest.mark.second
     def test_every_case_has_eight_different_states(self):
         for name in unforced.CASES:
             chosen = unforced.case(name)
@@ -183,6 +185,7 @@ class TestReference:
         assert np.abs(a @ c**5 - c**6 / 6).max() < 1e-18
         assert np.abs(guess @ c**3 - (1 + c) ** 3).max() < 1e-8
 
+    @pytest.mark.rotated
     def test_kepler_against_its_closed_form(self):
         chosen = short("kepler:0.5", 40.0)
         found = reference(chosen)
@@ -199,6 +202,7 @@ class TestReference:
         exact = [2 * np.cos(t) - np.cos(2 * t), 2 * np.sin(2 * t) - 2 * np.sin(t)]
         assert np.abs(end[0] - exact).max() < 4e-18
 
+    @pytest.mark.second
     def test_reference_is_stored_and_reloaded(self, monkeypatch):
         chosen = short("planar-pendulum", 5.0)
         first = reference(chosen)
@@ -366,6 +370,7 @@ class TestMeasuring:
 
 @needs_extended
 class TestCommand:
+    @pytest.mark.rotated
     def test_runs_without_peers(self, tmp_path, monkeypatch):
         monkeypatch.setattr(peers.importlib.util, "find_spec", lambda name: None)
         path = tmp_path / "out.json"
@@ -430,6 +435,7 @@ class TestCommand:
         assert "time of a trajectory, ms" in text
         assert text.count("heyoka fast_math") == 1
 
+    @pytest.mark.tiers(1, 2)
     @pytest.mark.parametrize("panels", [1, 2, 4])
     def test_all_names_are_in_the_picture(self, panels):
         names = "scvi-codegen controlled, scvi-codegen fixed, scvi-codegen transformed, heyoka, heyoka fast_math, "
@@ -483,6 +489,7 @@ class TestTables:
         assert max(each.error for each in result.measurements) < 1e-6
         assert min(each.seconds for each in result.measurements) > 0.0
 
+    @pytest.mark.rotated
     def test_start_up_time_is_measured(self):
         cold, cached = tables.run_first_steps(bench.Plan(repeats=1, quick=True), lambda text: None).rows
         assert (cold["cache"], cached["cache"]) == ("empty", "filled")
@@ -491,6 +498,7 @@ class TestTables:
         assert cold["lines_of_C"] > 100
         assert cold["compiler_cpu_s"] > 0.0
 
+    @pytest.mark.tiers(1, 3)
     @pytest.mark.parametrize("section", ["scaling", "threads", "transforms", "newton", "derivatives", "builds"])
     def test_times_of_steps_are_measured(self, section):
         table = bench.SECTIONS[section](bench.Plan(repeats=1, quick=True), lambda text: None)

@@ -54,6 +54,7 @@ def energies(port, start, energy, h, chunk, samples):
     return *map(float, errors), iterations / (chunk * samples)
 
 
+@pytest.mark.second
 @needs_extended
 @pytest.mark.usefixtures("as_users_compile")
 class TestPublished:
@@ -121,6 +122,7 @@ class TestPublished:
         assert found[1] < 3 * local
 
 
+@pytest.mark.second
 @needs_extended
 @pytest.mark.parametrize("second_order", [True, False])
 def test_the_order_is_16(second_order):
@@ -170,6 +172,7 @@ def test_published_cases_have_one_motion_in_velocities_and_in_momenta():
     assert np.array(plain.rates([*q, *v], of, m)[2:]) == pytest.approx((moved[0] - moved[1]) / (2 * small), rel=1e-7)
 
 
+@pytest.mark.second
 @needs_extended
 def test_contenders_reach_round_off():
     for name in ("planar-pendulum", "published:black-hole"):

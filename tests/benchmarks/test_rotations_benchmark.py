@@ -21,6 +21,7 @@ def own_cache(tmp_path_factory, monkeypatch):
     monkeypatch.setenv(building.CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "rotations-cache"))
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("name", ROTATIONS)
 def test_the_compiled_lagrangian_obeys_the_equations_derived_by_hand(name):
     chosen = replace(ROTATIONS[name](), span=5.0)
@@ -40,6 +41,7 @@ def test_bodies_tumble_in_mujoco_as_in_the_equations():
     assert rms_error(contender.prepare(0)()(), reference(chosen)) < 1e-4
 
 
+@pytest.mark.rotated
 def test_bodies_are_measured_without_peers():
     result = bench.SECTIONS["rotations:bodies"](bench.Plan(quick=True, peers=(), repeats=1), lambda text: None)
     assert result.methods() == [

@@ -31,6 +31,7 @@ def ours(case, method, steps):
     return end(contender)
 
 
+@pytest.mark.tiers(1)
 @pytest.mark.parametrize("case", [ring(8, 1.0), field(6, 0.2)], ids=lambda case: case.name)
 def test_lattices_by_hand_move_as_generated_ones(case):
     by_hand, generated = end(arrays.by_hand(case, "", 8, 10)), ours(case, Composition(8), 10)
@@ -67,6 +68,7 @@ def test_array_systems_are_measured_at_equal_error():
     assert min(each.error for each in result.measurements) < 1e-12
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize("make", [lambda: chain(2), four_bar], ids=["chain", "four-bar"])
 def test_multibody_systems_are_measured_without_peers(make):
     plan = bench.Plan(quick=True, peers=(), repeats=1)
@@ -86,6 +88,7 @@ def test_chains_move_in_engines_as_here(name, setting):
     assert np.abs(found - ours(robot, "svi:4", 200)).max() < 2e-6
 
 
+@pytest.mark.second
 def test_closed_loops_in_mujoco_are_soft_unless_stiff():
     pytest.importorskip("mujoco", reason="extra bench")
     linkage = four_bar()
@@ -142,6 +145,7 @@ def test_exact_solutions_of_fields_solve_their_equations(name):
     assert np.abs(rest).max() < 1e-4 * max(1.0, np.abs(now[0]).max())
 
 
+@pytest.mark.rotated
 def test_fields_are_measured_without_peers_and_by_split_steps():
     case = FIELDS["breather"]()
     here = [each.error(end(each)) for each in our_fields(case, quick=True)]

@@ -10,7 +10,7 @@ from commands import output_of
 from scvi_codegen import SVI, Event, LagrangianSystem, Model, StateError, compile_stepper, generate_package, save_model
 from scvi_codegen.files.energy import MOST_BALANCED_COORDINATES, MOST_BALANCED_STEPS, energy_account
 
-pytestmark = pytest.mark.usefixtures("here")
+pytestmark = [pytest.mark.usefixtures("here"), pytest.mark.rotated]
 MODEL = """
 [system]
 name = "damped pair"
@@ -48,6 +48,7 @@ def test_damping_and_inputs_have_a_work_balance():
     assert "energy balance |E - E0 - W|" in printed(driven + inputs)
 
 
+@pytest.mark.tiers(0, 2)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     "changed",
@@ -70,6 +71,7 @@ def test_conservative_systems_have_no_balance(changed):
     assert found["energy_balance"] is None
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("sizes", [{"N": MOST_BALANCED_COORDINATES + 1}, None])
 def test_many_coordinates_have_no_balance_unless_it_is_asked_for(sizes):
     system = LagrangianSystem.from_text(

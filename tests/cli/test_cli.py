@@ -172,12 +172,14 @@ class TestChoices:
         assert model.system.defaults == (3.0,)
         assert chosen(step=0.5).step_count == 400
 
+    @pytest.mark.second
     def test_options_select_a_problem(self):
         words = "--q -1,0 --velocity 0,-1.1 --parameter mu=1.5 --step 0.1 --steps 10 --method gauss --stages 2"
         text = output_of(f"run kepler {words}")
         assert "10 steps of 0.1 from t = 0 to t = 1; 11 states saved" in text
         assert "gauss:2" in text
 
+    @pytest.mark.tiers(14, 35)
     @pytest.mark.parametrize(
         ("words", "message"),
         [
@@ -253,6 +255,7 @@ class TestChoices:
     def test_mistakes_are_usage_errors(self, words, message):
         assert message in error_of(f"run {words}")
 
+    @pytest.mark.second
     def test_warnings_are_one_line_each(self):
         result = invoke("run", "harmonic-oscillator", "--degree", "3", "--quadrature", "gauss-legendre:2")
         assert result.stderr.count("Warning: 2 quadrature points do not determine a curve of degree 3") == 1
@@ -264,6 +267,7 @@ class TestRun:
         text = output_of("run", "kepler", "--tolerance", "1e-12", "--span", "3")
         assert "order 16, symplectic only at fixed step size, symmetric" in text
 
+    @pytest.mark.second
     def test_a_run_ends_at_its_span_with_a_shorter_last_step(self):
         """The last states of single runs, ensembles and array systems are those of Python's t_end."""
         Path("s.csv").write_text("q1,q2,q1_dot,q2_dot\n1.0,0.0,0.0,1.0\n")
@@ -286,6 +290,7 @@ class TestRun:
             assert saved["q"][-1] == pytest.approx(whole.q["q"][-1], abs=1e-15)
         assert model.integrate().t[-1] == 1.0
 
+    @pytest.mark.second
     def test_equal_steps_of_recorded_runs_and_programs_end_elsewhere_with_a_warning(self):
         for words in (("run", "kepler", "-o", "a.run"), ("generate", "kepler", "-o", "program")):
             found = invoke(*words, "--step", "0.3", "--span", "1")
@@ -296,6 +301,7 @@ class TestRun:
             assert "whole number" not in output_of(f"run kepler {words}", "-o", "b.run")
             shutil.rmtree("b.run")
 
+    @pytest.mark.second
     def test_solver_can_be_selected(self):
         for solver in ("newton", "fixed-point"):
             assert "a step" in output_of("run", "kepler", "--span", "5", "--solver", solver)
@@ -316,6 +322,7 @@ class TestRun:
             exact = stepper.integrate([start, 0.0], velocity=[0.0, 1.0], t_end=20.0).q[-1]
             assert np.linalg.norm(end - exact) < 1e-6 * np.linalg.norm(exact)
 
+    @pytest.mark.second
     def test_energy_drift_is_detected(self):
         text = output_of("run", "kepler", "--method", "explicit-euler", "--step", "0.001", "--span", "10")
         assert float(re.search(r"drift (\S+) over", text)[1]) > 1e-3
@@ -326,6 +333,7 @@ class TestRun:
             "run", "kepler", "--method", "explicit-euler", "--step", "0.1", "--span", "10"
         )
 
+    @pytest.mark.second
     @pytest.mark.parametrize("option", ["--quiet", "--json"])
     def test_far_too_long_step_warns_for_every_output_format(self, option):
         """One point and a step of a quarter of the period: the energy of so few states is constant, by chance."""
@@ -342,6 +350,7 @@ class TestRun:
         assert errors[-1] < 0.01 * errors.max()
         assert f"relative energy error: {errors.max():.2e} at most" in energy_report(run)
 
+    @pytest.mark.second
     def test_long_states_are_abbreviated(self):
         text = output_of("run", "fput-chain:9", "--steps", "3")
         assert "and 3 more coordinates" in text
@@ -363,6 +372,7 @@ class TestRun:
         assert 1 < int(save_every) < 10
         assert "1000 steps" in output_of("run", "kepler", "--steps", "1000", "--save-every", save_every)
 
+    @pytest.mark.second
     def test_draws_a_picture(self):
         assert "wrote orbit.svg" in output_of("run", "kepler", "--steps", "50", "--plot", "orbit.svg")
         assert Path("orbit.svg").read_text().startswith("<?xml")
@@ -383,6 +393,7 @@ class TestRun:
         assert np.allclose(np.diff(t), 0.25)
         assert "relative energy error" in result.stdout
 
+    @pytest.mark.second
     def test_failing_step_saves_computed_states(self):
         # Falls into the centre of attraction along a line that a step of Newton's method cannot pass.
         words = "--method gauss --stages 1 --velocity 0,0 --step 0.01 --max-iterations 3 -o fall.npz"
@@ -397,6 +408,7 @@ class TestRun:
         assert np.array_equal(written["t"], 0.01 * np.arange(step + 1))
         assert np.isfinite(written["q"]).all()
 
+    @pytest.mark.second
     def test_failure_of_the_first_step_is_one_short_message(self):
         result = invoke("run", "double-pendulum", "--step", "5", status=1)
         assert "Error: step 0 at t = 0 with h = 5 failed" in result.stderr
@@ -419,6 +431,7 @@ class TestRun:
         assert "pip install 'scvi-codegen[plot]'" in error_of("run", "kepler", "--plot", "a.png")
 
 
+@pytest.mark.rotated
 @pytest.mark.skipif(COMMAND is None, reason="the command is not installed beside this Python")
 class TestInstalledCommand:
     def test_ctrl_c_while_it_compiles_is_one_line(self, tmp_path, monkeypatch):
@@ -494,6 +507,7 @@ class TestListings:
         assert "gauss" in error_of("methods", "--tableau", "gaus:3")
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize("stream", ["1", "2"])
 def test_a_run_with_a_closed_stream_writes_its_file(stream, tmp_path):
     """A closed stream, as in ``2>&-`` of a shell, loses only what is printed there."""

@@ -43,6 +43,7 @@ def no_compiler(monkeypatch: pytest.MonkeyPatch, empty: Path) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *more: name != "ziglang" and find(name, *more))
 
 
+@pytest.mark.rotated
 def test_trial_stepper_is_compiled_in_a_temporary_folder(tmp_path, monkeypatch):
     monkeypatch.setenv("SCVI_CODEGEN_CACHE", str(tmp_path / "cache"))
     status, report = doctor()
@@ -71,6 +72,7 @@ def test_missing_named_compiler_is_reported(monkeypatch):
     assert "in the environment variable CC ('no-such-cc')" in findings(1)["compiler"]["remedy"]
 
 
+@pytest.mark.rotated
 def test_output_of_a_failing_compiler_is_quoted(monkeypatch):
     monkeypatch.setenv("SCVI_CODEGEN_CFLAGS", "-no-such-flag")
     found = findings(1)
@@ -81,6 +83,7 @@ def test_output_of_a_failing_compiler_is_quoted(monkeypatch):
     assert "-no-such-flag" in found["flags"]["result"]
 
 
+@pytest.mark.rotated
 def test_illegal_instructions_end_only_the_trial_process(tmp_path, monkeypatch):
     header = tmp_path / "trap.h"
     header.write_text("__attribute__((constructor)) static void trap(void) { __builtin_trap(); }\n")
@@ -88,6 +91,7 @@ def test_illegal_instructions_end_only_the_trial_process(tmp_path, monkeypatch):
     assert re.search("the compiled program was ended by SIG(ILL|TRAP)", findings(1)["trial"]["remedy"])
 
 
+@pytest.mark.rotated
 def test_faulty_arithmetic_is_detected(tmp_path, monkeypatch):
     header = tmp_path / "coarse.h"
     header.write_text("#include <math.h>\n#define sin(x) (0.9 * sin(x))\n")
@@ -95,6 +99,7 @@ def test_faulty_arithmetic_is_detected(tmp_path, monkeypatch):
     assert "violate IEEE 754 arithmetic" in findings(1)["trial"]["remedy"]
 
 
+@pytest.mark.rotated
 def test_steppers_with_and_without_vector_functions_are_distinguished(monkeypatch):
     monkeypatch.setenv("SCVI_CODEGEN_CFLAGS", "-O1")
     tuned = findings()["vectors"]["status"]

@@ -43,6 +43,7 @@ def model(here):
 RUN = ("run", "pushed.toml")
 
 
+@pytest.mark.second
 def test_inputs_of_the_command_line_replace_those_of_the_file(model):
     (Path("elsewhere")).mkdir()
     Path("pushed.toml").rename("elsewhere/pushed.toml")
@@ -80,6 +81,7 @@ def test_unsupported_options_are_rejected(words, message):
     assert message in error_of(*RUN, *words)
 
 
+@pytest.mark.second
 def test_ensemble_of_runs_with_inputs(model):
     Path("many.csv").write_text("q,q_dot\n0.1,0\n0.2,1\n0.3,-1\n")
     Path("pushed.toml").write_text(MODEL.replace("cos(q)", "(1 + u)*cos(q)").replace('[forces]\nq = "u"\n', ""))
@@ -108,6 +110,7 @@ def test_missing_input_is_reported():
     assert "final state" in output_of(*RUN, "--input", "u=u.csv")
 
 
+@pytest.mark.second
 def test_failing_step_saves_the_preceding_segments(model):
     """Towards the end the push has no numbers left."""
     Path("pushed.toml").write_text(MODEL.replace('q = "u"', 'q = "sqrt(u + 0.5)"'))
@@ -134,6 +137,7 @@ def test_signal_stops_a_run_between_chunks(model, monkeypatch):
     assert outcome.trajectory.t[0] == 0.0
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("inputs", [True, False])
 def test_terminal_event_is_the_last_saved_state(model, inputs):
     """With several segments: of inputs, or of a last step that is shorter."""

@@ -43,6 +43,7 @@ def test_every_command_is_tested():
     assert {words[0] for words in QUIET_COMMANDS} == set(main.list_commands(click.Context(main)))
 
 
+@pytest.mark.tiers(2, 6)
 @pytest.mark.parametrize("words", QUIET_COMMANDS, ids=lambda words: " ".join(words[:2]).replace("/", " "))
 def test_quiet_prints_nothing_and_json_prints_one_document(words):
     if words[0] == "page":
@@ -54,6 +55,7 @@ def test_quiet_prints_nothing_and_json_prints_one_document(words):
     assert json_of(*words)
 
 
+@pytest.mark.second
 def test_failed_run_reports_how_far_it_got():
     found = json_of("run", "kepler", "--q", "1,0", "--velocity", "0,0", "--tolerance", "1e-9", "--span", "3", status=1)
     assert "step" in found["failure"]
@@ -104,6 +106,7 @@ def test_errors_are_entries_of_the_document(words, status, error):
     assert all(type(found[name]) is type(value) for name, value in error.items())
 
 
+@pytest.mark.second
 def test_json_of_several_momentum_maps():
     """Explicit steps do not conserve the angular momentum."""
     Path("spiral.toml").write_text(
@@ -120,6 +123,7 @@ def test_json_of_several_momentum_maps():
     assert [*found.values()] == np.abs(run.momentum_errors()).max(axis=0).tolist()
 
 
+@pytest.mark.second
 def test_json_of_ensembles_with_unequal_steps():
     """Bodies that fall to the centre in pi/sqrt(8) r**1.5."""
     Path("grid.toml").write_text("[grid]\nq1 = [2.0, 1.0, 3.0]\n")
@@ -156,6 +160,7 @@ def test_json_of_lists_and_model_files():
     assert np.sum(tableau["A"], axis=1) == pytest.approx(tableau["c"], abs=1e-16)
 
 
+@pytest.mark.rotated
 def test_json_of_paths_is_that_of_the_model_file_and_of_the_interface():
     words = ("--from", "0,0", "--to", "0.1,0.3", "--span", "3", "--step", "0.25", "--starts", "2", "--method", "svi:4")
     found = json_of("path", "henon-heiles", *words, "-o", "path.npz")
@@ -185,6 +190,7 @@ def test_json_of_paths_is_that_of_the_model_file_and_of_the_interface():
         assert message in invoke("path", "harmonic-oscillator", *wrong, status=status).output
 
 
+@pytest.mark.rotated
 def test_certificate_equals_the_saved_one():
     found = json_of("verify", "planar-pendulum", "--method", "svi:1", "-o", "certificate.json")
     assert found == json.loads(Path("certificate.json").read_text())

@@ -21,7 +21,7 @@ from benchmarks.__main__ import main as benchmarks
 from benchmarks.cases.unforced import case
 from scvi_codegen.cli import main
 
-pytestmark = [pytest.mark.long, pytest.mark.usefixtures("here")]
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("here"), pytest.mark.rotated]
 
 Array = Any
 QUICK = 0.05

@@ -377,6 +377,7 @@ def tau_fits(done: Done, h: float) -> bool:
     return bool(np.allclose(tau, done.kind.save_every * h, rtol=done.kind.tau, atol=0.0)) and varied
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(5)
 def test_steps_of_tau_are_those_of_the_time_transformation(done):
     assert done.kind.tau == 0.0 or tau_fits(done, done.numbers["h"])
@@ -393,6 +394,7 @@ def balance_fits(done: Done, found: float) -> bool:
     return abs(found - largest(energy - energy[0] - run.work())) < 1e-14 and found > 0.0
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(5)
 def test_every_field_of_the_json_is_correct(done):
     checks = expected_fields(done)
@@ -451,6 +453,7 @@ def energy_line(done: Done, line: str) -> None:
     assert float(found[2]) == pytest.approx(drift(done, abs(energy[0])), rel=0.06)
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(5)
 def test_every_line_of_the_text_is_correct(done):
     lines = list(done.lines)
@@ -488,6 +491,7 @@ def springs(here: Path) -> Kind:
     return kind
 
 
+@pytest.mark.second
 def test_every_field_and_line_of_an_ensemble_is_correct(springs):
     Path("grid.toml").write_text("[grid]\nx = [0.5, 1.0, 1.5]\nk = [0.5, 2.0]\n")
     words = ("run", "model.toml", *springs.words, "--parameter", f"m={M}", "--parameter", f"c={C}", "--ensemble")
@@ -533,6 +537,7 @@ def test_every_field_and_line_of_an_ensemble_is_correct(springs):
     assert len(lines) == 7
 
 
+@pytest.mark.second
 def test_every_field_and_line_of_a_recorded_run_is_correct(springs):
     words = ("run", "model.toml", *springs.words, *CHANGED)
     numbers, memory = json_of(*words, "-o", "long.run"), json_of(*words)
@@ -559,6 +564,7 @@ def test_every_field_and_line_of_a_recorded_run_is_correct(springs):
     assert finals == expected
 
 
+@pytest.mark.rotated
 def test_every_number_of_advice_is_correct(springs):
     words = ("run", "model.toml", "--span", "5.25", *CHANGED, "--advise", "1e-6")
     numbers = json_of(*words, "-o", "advised.npz")

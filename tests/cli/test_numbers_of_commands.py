@@ -15,6 +15,7 @@ from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.accuracy.tolerance_check import Known
 
 
+@pytest.mark.tiers(0, 2)
 @pytest.mark.parametrize(
     ("model", "method", "q", "p", "h"),
     [
@@ -63,6 +64,7 @@ def test_systems_have_their_coordinates_and_parameters():
         assert entry["description"]
 
 
+@pytest.mark.rotated
 def test_checks_of_verify_compare_what_they_measured_with_their_bounds():
     numbers = json_of("verify", "planar-pendulum", "--method", "svi:2")
     checks = {check["name"]: check for check in numbers["checks"] if check["bound"] is not None}

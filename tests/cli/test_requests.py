@@ -62,6 +62,7 @@ def tried(command: str, kind: str, status: int | None = None) -> Result:
     return invoke(name, "model.toml", *options, *lengths, status=status)
 
 
+@pytest.mark.tiers(6, 10)
 @each_cell
 def test_allowed_requests_are_compiled_and_others_rejected(command, kind, served, here, monkeypatch):
     def unbuilt(*_, **__):

@@ -49,6 +49,7 @@ def ring(here: Path) -> str:
     return "ring.toml"
 
 
+@pytest.mark.rotated
 def test_adaptive_run_of_an_array_system(ring: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The tolerance replaces the step of the file; verify and generate compile the sizes."""
     found = json_of("run", ring, "--tolerance", "1e-9", "--span", "7")
@@ -98,6 +99,7 @@ def test_unsupported_options_of_array_systems_are_rejected(ring: str, words: tup
     assert "belongs to coordinates that are arrays" in error_of("run", "kepler", "--size", "N=1")
 
 
+@pytest.mark.rotated
 def test_options_that_compile_the_model_with_its_sizes(ring: str) -> None:
     """Every other option unrolls the arrays; final states agree with those of the code for any sizes."""
     expected = json_of("run", ring)["final"]["q"]["q"]
@@ -146,6 +148,7 @@ def test_derive_for_an_array_system(ring: str) -> None:
     assert r"\sum_{i \in \mathbb{Z}_{N}}" in output_of("derive", ring, "--latex")
 
 
+@pytest.mark.rotated
 def test_generate_for_an_array_system(ring: str) -> None:
     """A folder whose program gives the states of the command, to round-off."""
     document = json_of("run", ring)
@@ -216,6 +219,7 @@ def test_folder_is_verified_with_its_own_files(ring: str, tmp_path: Path) -> Non
     invoke("verify", "ring_svi", status=1)
 
 
+@pytest.mark.tiers(1)
 @pytest.mark.parametrize("axes", ["q[N]", "q[N, 2]", "q[N, M]"])
 def test_pictures_of_an_array_system(axes: str, tmp_path: Path) -> None:
     """Line in time, bodies in space, and a plane."""

@@ -81,6 +81,7 @@ class TestEquations:
     def test_rolled_sums_equal_unrolled_terms(self, method):
         assert all(abs(one - other) < 1e-18 for one, other in compared(tilted(), method))
 
+    @pytest.mark.second
     def test_rolled_sums_of_a_composition_equal_unrolled_terms(self):
         assert all(abs(one - other) < 1e-18 for one, other in compared(driven_duffing(), sc.Composition(8)))
 
@@ -167,6 +168,7 @@ class TestPage:
         assert re.findall(r"\((\d+)\)", part) == numbers
         assert part.count("\u2297") == {"position": 3, "phase-space": 4}[form]
 
+    @pytest.mark.tiers(2, 5)
     @pytest.mark.sampled(5)
     @pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
     def test_every_method_has_a_well_formed_self_contained_page(self, method):
@@ -180,6 +182,7 @@ class TestPage:
         assert parsed.all("script") == []
         assert not re.search(r"https?:|@import|url\(", page)
 
+    @pytest.mark.second
     def test_every_kernel_and_every_function_of_the_step_is_shown(self):
         system = sc.problem("double-pendulum").system
         program = program_of(system, sc.SVI(2), prefix="double_pendulum")
@@ -223,6 +226,7 @@ class TestPage:
         assert "<msqrt><mn>3</mn></msqrt>" in page
         assert "\N{MINUS SIGN}0.57735026918962576" in page
 
+    @pytest.mark.rotated
     def test_equation_numbers_of_the_paper_are_shown(self):
         page = kepler_page(sc.SCVI(2))
         numbers = set(re.findall(r'<span class="number">\(([^)]*)\)', page))
@@ -248,6 +252,7 @@ class TestPage:
         assert "<h1>&lt;b&gt; &amp; */ q</h1>" in page
         Page(page)
 
+    @pytest.mark.rotated
     def test_large_system_is_abbreviated_with_a_note(self):
         system = sc.problem("outer-solar-system").system
         page = derivation_html(system, sc.SVI(8))
@@ -268,6 +273,7 @@ class TestPage:
         assert derivation_html(sc.problem("kepler").system, sc.SVI(2)) == kepler_page(sc.SVI(2))
 
 
+@pytest.mark.tiers(0, 3)
 @pytest.mark.parametrize(("size", "scheme"), VIEWS)
 def test_page_renders_in_a_browser(browser, tmp_path, size, scheme):
     with opened(browser, kepler_page(sc.SCVI(2)), tmp_path / "kepler.html", size, scheme) as view:
@@ -302,15 +308,18 @@ class TestCommand:
         )
         assert list(tmp_path.iterdir()) == []
 
+    @pytest.mark.rotated
     def test_missing_folder_is_named(self):
         assert "there is no folder 'no'" in error_of("derive", "kepler", "--html", "no/page.html")
 
 
+@pytest.mark.rotated
 def test_operations_are_those_of_sympy():
     x = sympy.Symbol("x")
     assert operations(sympy.sin(x) ** 2 / 3 + x) == sympy.count_ops(sympy.sin(x) ** 2 / 3 + x) == 4
 
 
+@pytest.mark.rotated
 def test_omitted_terms_are_counted():
     x = sympy.symbols("x:300")
     short, long = Formula(x[0] + x[1]), Formula(sympy.Add(*(s**2 for s in x)))

@@ -97,6 +97,7 @@ def every_method_and_system():
             yield pytest.param(system, method, marks=marks, id=f"{method.name}-{system.name}")
 
 
+@pytest.mark.tiers(1, 2)
 @pytest.mark.sampled(8)
 @pytest.mark.parametrize(("system", "method"), [*every_method_and_system()])
 def test_closed_form_and_compiled_step_agree(system, method):

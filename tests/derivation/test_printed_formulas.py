@@ -403,6 +403,7 @@ def compiled_step(name: str) -> tuple[Any, Any]:
         return stepper.step([float(x) for x in q], [float(x) for x in p], h, t, PARAMETERS)
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(6)
 @pytest.mark.parametrize("name", NAMES)
 def test_the_printed_stage_equations_are_those_of_the_step(name):
@@ -413,6 +414,7 @@ def test_the_printed_stage_equations_are_those_of_the_step(name):
         np.testing.assert_allclose(found.astype(float), expected, rtol=2e-14, atol=1e-15)
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(4)
 @pytest.mark.parametrize("name", [name for name in NAMES if name.values[0] not in WITHOUT_STAGES])
 def test_printed_compiled_equations_are_those_of_the_step(name):
@@ -751,6 +753,7 @@ CHECKS: dict[str, Callable[[str, Entry, int], bool]] = {
 """By section of the page; what is not here fails."""
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("name", NAMES)
 def test_every_entry_of_the_page_is_right(name):
     page, counts = made(name)[2], dict.fromkeys(CHECKS, 0)
@@ -814,6 +817,7 @@ def check_table(name: str, table: PrintedTable) -> None:  # noqa: C901
                     assert abs(cell_number(cell) - known[own]) < mp.mpf("2e-17") * max(1, abs(known[own])) * 10, own
 
 
+@pytest.mark.tiers(1, 1)
 @pytest.mark.parametrize("name", NAMES)
 def test_tables_have_the_numbers_of_the_equations(name):
     tables = made(name)[2].tables
@@ -837,6 +841,7 @@ def derived(name: str) -> Any:
         return derive(case.system, method)
 
 
+@pytest.mark.tiers(1, 2)
 @pytest.mark.parametrize("name", SHORT)
 def test_latex_is_the_same_equations(name):
     """Residuals that vanish on the step, values at its end, entries of tables; momentum maps are theirs."""
@@ -859,6 +864,7 @@ def test_latex_is_the_same_equations(name):
             assert abs(value(tree_of_latex(side), known.__getitem__) - known[next(names(name_of))]) < mp.mpf("1e-16")
 
 
+@pytest.mark.tiers(1, 2)
 @pytest.mark.parametrize("name", NAMES)
 def test_text_is_the_same_equations(name):
     """Read by Python itself: residuals that vanish, ends, first guesses, numbers of tables."""

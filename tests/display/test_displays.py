@@ -86,6 +86,7 @@ DISPLAYED: dict[str, Callable[[], Any]] = {
 } | {method.name: lambda method=method: method for method in METHODS}
 
 
+@pytest.mark.tiers(5, 16)
 @pytest.mark.parametrize("name", DISPLAYED)
 def test_every_display_is_well_formed_and_short(name):
     shown = DISPLAYED[name]()._repr_html_()
@@ -256,6 +257,7 @@ def test_cards_escape_text():
     assert listed([]) == "none"
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize(("size", "scheme"), VIEWS)
 def test_displays_render_in_a_browser(browser, tmp_path, size, scheme):

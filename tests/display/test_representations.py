@@ -68,6 +68,7 @@ def runs(folder: Path) -> Iterator[Any]:
     yield mesh.local_laws(flat, "energy")["energy"]
 
 
+@pytest.mark.rotated
 @pytest.mark.filterwarnings("ignore")
 def test_a_representation_fits_in_a_line(tmp_path):
     pytest.importorskip("matplotlib")

@@ -26,6 +26,7 @@ def largest_difference(left, right):
     return max(abs(mp.convert(str(a)) - b) for a, b in zip(left, right, strict=True))
 
 
+@pytest.mark.tiers(3, 4)
 @pytest.mark.parametrize(("digits", "h"), [(1, "0.5"), (15, "0.5"), (30, "0.5"), (50, "0.5"), (30, "20"), (30, "-2")])
 def test_harmonic_oscillator_has_the_requested_digits(digits, h):
     h, m, k, q0, q1 = mp.mpf(h), mp.mpf(2), mp.mpf(3), mp.mpf(1), mp.mpf("0.3")
@@ -57,6 +58,7 @@ def test_uniform_field_is_exact():
     assert abs(found.action - expected) < mp.mpf("1e-45")
 
 
+@pytest.mark.second
 def test_kepler_ellipse_agrees_with_keplers_equation():
     """q = (cos E - e, sqrt(1 - e^2) sin E) with E - e sin E = t, from perihelion."""
     e, h = mp.mpf("0.5"), mp.mpf("0.75")
@@ -115,6 +117,7 @@ def all_but(long):
     return [pytest.param(name, marks=[pytest.mark.full] if name == long else []) for name in CASES]
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", all_but("double-pendulum"))
 def test_momenta_and_energy_are_the_derivatives_of_the_action(name):
@@ -137,6 +140,7 @@ def test_momenta_and_energy_are_the_derivatives_of_the_action(name):
     assert abs(derivative - expected) < mp.mpf("1e-18")
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", all_but("pumped-cart-pole"))
 def test_flow_connects_its_end_points_and_is_reversible(name):
@@ -152,6 +156,7 @@ def test_flow_connects_its_end_points_and_is_reversible(name):
     assert largest_difference(back.q1, flow.q0) < mp.mpf("1e-29")
 
 
+@pytest.mark.tiers(1)
 @pytest.mark.parametrize("name", ["double-pendulum", "pumped-cart-pole"])
 def test_exact_flow_is_the_limit_of_the_oracle(name):
     """Gauss's method of 6 stages on Hamilton's equations, formulas of its own: error of order h^13."""
@@ -165,6 +170,7 @@ def test_exact_flow_is_the_limit_of_the_oracle(name):
     assert largest_difference(step[1], flow.p1) < mp.mpf("1e-24")
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize("digits", [12, pytest.param(30, marks=pytest.mark.full)])
 def test_long_steps_are_divided(digits):
     flow = exact_map(PENDULUM, [2], [0], 10, digits=digits)
@@ -175,6 +181,7 @@ def test_long_steps_are_divided(digits):
     assert abs(flow.action - half.action - halves.action) < 100 * mp.mpf(10) ** -digits
 
 
+@pytest.mark.rotated
 def test_initial_guess_selects_one_of_several_solutions():
     """Start from rest at 2 radians for 5 time units; another trajectory connects the same points."""
     flow = exact_map(PENDULUM, [2], [0], 5, digits=12)
@@ -221,6 +228,7 @@ def test_errors_state_the_remedy(call, words):
         call()
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("method", "order"),

@@ -7,6 +7,8 @@ from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 
+pytestmark = pytest.mark.rotated
+
 BEAM = "u_t**2/2 - u_xx**2/2"
 CLAMPED, CANTILEVER = 4.730040744862704, 1.8751040687119611
 

@@ -37,6 +37,7 @@ CASES = [
 ]
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize(("field", "mesh"), CASES)
 def test_integrators_of_meshes_have_their_properties(field, mesh):
     method, options = mesh

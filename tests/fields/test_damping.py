@@ -10,6 +10,7 @@ import scvi_codegen as sc
 STRING = "u_t**2/2 - u_x**2/2"
 
 
+@pytest.mark.second
 def test_waves_leave_through_an_absorbing_end():
     field = sc.FieldSystem.from_text(
         "string", ["u"], {"x": (0, 12)}, STRING, dissipation="2*exp(-(x - 12)**2/6)*u_t**2/2"
@@ -25,6 +26,7 @@ def test_waves_leave_through_an_absorbing_end():
     assert run.energy()[-1] < 1e-3 * run.energy()[0]
 
 
+@pytest.mark.second
 def test_damped_waves_in_one_legendre_interval():
     field = sc.FieldSystem.from_text(
         "string", ["u"], {"x": (0, 1)}, STRING, boundary={"x": (0, 0)}, parameters={"g": 0.4}, dissipation="g*u_t**2/2"

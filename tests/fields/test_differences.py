@@ -36,6 +36,7 @@ def dense(axis, fixed):
     return rows / h, h * weights, axis.closed.weights
 
 
+@pytest.mark.tiers(3)
 @pytest.mark.parametrize("order", [2, 4, 6, 8])
 def test_operators_satisfy_summation_by_parts(order):
     """D is exact to degree m, the weights integrate to degree 2 m - 1, and D^T W g is -M g' with the ends."""
@@ -59,6 +60,7 @@ def test_operators_satisfy_summation_by_parts(order):
     assert largest < axis.stiffness[0] < 1.03 * largest
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize("order", [2, 4, 6, 8])
 @pytest.mark.parametrize(
@@ -76,6 +78,7 @@ def test_fields_have_order_m_plus_one_and_energy_does_not_drift(order, ends, mod
     assert errors[1] < {2: 3e-4, 4: 5e-5, 6: 8e-6, 8: 1e-6}[order]
 
 
+@pytest.mark.tiers(3)
 @pytest.mark.parametrize("order", [2, 4, 6, 8])
 def test_frequencies_have_the_full_order(order):
     """Lowest but three of a string with one natural end, from a generalised eigenvalue problem."""
@@ -89,6 +92,7 @@ def test_frequencies_have_the_full_order(order):
     assert np.log2(errors[0] / errors[1]) > order - 0.2
 
 
+@pytest.mark.rotated
 def test_moving_ends_coefficients_and_a_plane():
     """u = sin 5(x + t) with prescribed ends; u = sin(log(1 + x) - t) of a density with coefficients; a membrane."""
     mesh = line(("sin(5*t)", "sin(5*t + 5)")).discretise("finite-differences", order=8, points=81)
@@ -112,6 +116,7 @@ def test_moving_ends_coefficients_and_a_plane():
     assert run.energy_error() < 1e-14
 
 
+@pytest.mark.rotated
 def test_products_of_a_field_and_its_derivative_converge():
     """u^2 u_x^2 is interpolated at the ends."""
     found = []
@@ -136,6 +141,7 @@ def test_spectrum_and_derivative_of_a_line_with_ends():
     assert mesh.integral(x * exp(x)) == pytest.approx(1, abs=1e-10)
 
 
+@pytest.mark.rotated
 def test_points_and_hamiltonian_densities_have_ends():
     """A mass at the end, m w = cot w; a particle in a box, w = pi^2/2 k^2."""
     w = brentq(lambda w: 0.7 * w * sin(w) - cos(w), 0.1, 1.5)

@@ -52,6 +52,7 @@ def test_derivative_at_prescribed_ends_and_between_elements():
     assert mesh.derivative(x * (1 + x), "x") == pytest.approx(1 + 2 * x, abs=1e-12)
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("field", "method", "options"),
@@ -126,6 +127,7 @@ def test_sympy_expressions_of_momenta_damping_and_places_are_those_of_text():
     assert symbolic.derive().to_text().endswith("conservation laws: none found, the density is damped\n")
 
 
+@pytest.mark.second
 def test_other_parameters_and_arrays_of_a_run_replace_those_of_the_mesh():
     mesh = string("u_t**2/2 - c*u_x**2/2", boundary={"x": (0, 0)}, parameters={"c": 1}).discretise(
         "spectral-elements", degree=6, elements=2
@@ -239,6 +241,7 @@ def test_model_file_contains_the_arrays_of_the_mesh(tmp_path):
     assert np.asarray(again.integrate().q) == pytest.approx(np.asarray(model.integrate().q), abs=1e-15)
 
 
+@pytest.mark.tiers(1, 1)
 @pytest.mark.parametrize("ends", ["natural", (0, 0), (0, "natural"), ("natural", 0)])
 @pytest.mark.parametrize("others", ["natural", (0, 0)])
 def test_mixed_derivatives_are_exact_for_polynomials_at_all_ends(ends, others):

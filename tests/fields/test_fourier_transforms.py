@@ -75,6 +75,7 @@ def test_two_axes_are_transformed_as_by_numpy():
     np.testing.assert_array_equal(*runs)
 
 
+@pytest.mark.rotated
 @pytest.mark.filterwarnings("ignore:the mesh does not resolve")
 def test_transforms_equal_matrices_for_first_order_fields_and_adaptive_steps():
     hamiltonian = "u_x**2/2 + p_x**2/2 - (u**2 + p**2)**2/2 + (u_xx**2 + p_xx**2)/100"
@@ -108,6 +109,7 @@ CONVOLVED = sc.LagrangianSystem.from_text(
 METHODS = [("stoermer-verlet", None), pytest.param("svi:2", None, marks=pytest.mark.full), ("svi:2", "newton")]
 
 
+@pytest.mark.tiers(1, 2)
 @pytest.mark.parametrize(("method", "solver"), METHODS)
 def test_convolutions_of_any_size_and_coefficients(method, solver):
     """Energies and forces of functions of convolutions and of their powers, along one axis and both, are NumPy's."""
@@ -194,6 +196,7 @@ LARGE = {
 }
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("name", ["membrane", *(pytest.param(each, marks=pytest.mark.full) for each in [*LARGE][1:])])
 def test_products_of_large_steps_are_bounded(name):
     """Steps of 20 and 100 times the limit of the fixed-point iteration, with the Fourier preconditioner."""
@@ -219,6 +222,7 @@ def test_products_of_large_steps_are_bounded(name):
     np.testing.assert_allclose(end, exact, rtol=0, atol=1e-6)
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize(("method", "names"), [("svi:1", "x"), pytest.param("gauss:3", "xy", marks=pytest.mark.full)])
 def test_large_steps_of_first_order_fields(method, names):
     """A complex field: corrections depend on h alone, and states are those of fixed-point iterations."""

@@ -9,6 +9,8 @@ from samples import QUICK_FLAGS
 import scvi_codegen as sc
 from scvi_codegen.fields.laws import vanishes
 
+pytestmark = pytest.mark.second
+
 PLANE = {"x": (0, "2*pi"), "y": (0, "2*pi")}
 PERIODIC = dict.fromkeys(PLANE, "periodic")
 LINE = {"x": (-1, 1)}
@@ -54,6 +56,7 @@ LAWS = {
 }  # fmt: skip
 
 
+@pytest.mark.tiers(3, 4)
 @pytest.mark.sampled(6)
 @pytest.mark.parametrize("name", LAWS)
 def test_laws_found_hold_on_solutions(name):
@@ -68,12 +71,14 @@ def test_laws_found_hold_on_solutions(name):
         assert vanishes(total), law
 
 
+@pytest.mark.quick
 def test_formulas_are_zero_only_if_identically():
     x, y = sympy.symbols("x y")
     assert vanishes(sympy.sin(x + y) - sympy.sin(x) * sympy.cos(y) - sympy.cos(x) * sympy.sin(y))
     assert not vanishes(sympy.sin(x + y) - sympy.sin(x) * sympy.cos(y))
 
 
+@pytest.mark.quick
 def test_derivation_contains_equations_energy_and_laws():
     field = lagrangian("u_t**2/2 - u_x**2/2 - u_xx**2/2", boundary={"x": "periodic"})
     text = field.discretise("finite-differences", order=2, points=16).derive().to_text()
@@ -105,6 +110,7 @@ def waves_between_moving_ends(degree):
     return mesh, mesh.local_laws(run), 2 * 9 * cos(3 * (run.t[:, None] - x)) ** 2, run
 
 
+@pytest.mark.rotated
 def test_local_laws_hold_to_the_accuracy_of_the_mesh():
     found = []
     for degree in (6, 9, 12):
@@ -168,6 +174,7 @@ def test_conserved_quantities_of_a_soliton():
     assert max(np.abs(law.residual).max() for law in laws.values()) < 1e-4  # u_t by the equations, h^4 by SVI(2)
 
 
+@pytest.mark.rotated
 def test_momentum_is_exact_on_equidistant_points_and_spectrally_accurate_on_elements():
     field = lagrangian("u_t**2/2 - u_x**2/2 - u**4/4", space={"x": (0, "2*pi")}, boundary={"x": "periodic"})
     defects = []

@@ -7,6 +7,8 @@ from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 
+pytestmark = pytest.mark.rotated
+
 RANDOM = np.random.default_rng(2)
 LINEAR = "u_t**2/2 - u_x**2/2 - u**2/2"
 GRADED = [0, 0.02, 0.1, 0.3, 1.0, 2.0, 2.5]
@@ -105,6 +107,7 @@ def pairs_on(name, hamiltonian, method=None, end=2.5, **options):
     return field.discretise(method or default, **(options or further))
 
 
+@pytest.mark.second
 @pytest.mark.covering
 @pytest.mark.parametrize("name", HAMILTONIANS)
 def test_one_correction_solves_linear_hamiltonians(name):
@@ -144,6 +147,7 @@ def test_hamiltonian_steps_equal_those_of_fixed_point_iteration_and_of_other_thr
     assert ends[1].tobytes() == ends[2].tobytes()
 
 
+@pytest.mark.quick
 def test_steps_of_a_lattice_equal_dense_newton_steps():
     """Gauss(2) in NumPy for a discrete nonlinear Schroedinger equation with stiff random couplings."""
     n, h, root = 6, 0.2, np.sqrt(3.0) / 6
@@ -181,6 +185,7 @@ def test_steps_of_a_lattice_equal_dense_newton_steps():
     assert np.abs(np.concatenate([run.q["q"][-1], run.p["q"][-1]]) - end).max() < 1e-12
 
 
+@pytest.mark.second
 def test_one_correction_solves_linear_dissipation_and_gyroscopic_forces():
     """Damping far above the critical one, between neighbours and with a part that is not symmetric."""
     chain = sc.LagrangianSystem.from_text(
@@ -209,6 +214,7 @@ def test_one_correction_solves_linear_dissipation_and_gyroscopic_forces():
     assert np.abs(np.concatenate([run.q["q"][-1], run.q["r"][-1]]) - state[:18]).max() < 1e-10
 
 
+@pytest.mark.second
 def test_damped_steps_equal_those_of_fixed_point_iteration():
     field = sc.FieldSystem.from_text(
         "layer",
@@ -226,6 +232,7 @@ def test_damped_steps_equal_those_of_fixed_point_iteration():
     assert np.abs(ends[0] - ends[1]).max() < 1e-13 < 1e-3 < np.abs(ends[0][-1] - ends[0][0]).max()
 
 
+@pytest.mark.second
 def test_hamiltonians_with_too_many_couplings_are_refused():
     all_pairs = hamilton("all pairs", "q[N]", "sum(i in N, p_q[i]**2/2) + sum(i < j in N, (q[i] - q[j])**4)")
     stepper = sc.compile_stepper(all_pairs, "svi:1", solver="newton", flags=QUICK_FLAGS)

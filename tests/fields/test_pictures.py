@@ -8,6 +8,8 @@ from samples import QUICK_FLAGS
 import scvi_codegen as sc
 from scvi_codegen.pictures.animation import positions_of
 
+pytestmark = pytest.mark.second
+
 
 def run_of(axes, boundary, method, start, *, velocity=None, steps=20, **options):
     density = "u_t**2/2" + "".join(f" - u_{axis}**2/2" for axis in axes)
@@ -31,6 +33,7 @@ def in_the_plane(**others):
     return run_of("xy", boundary, "spectral-elements", wave, **size, **others)
 
 
+@pytest.mark.rotated
 def test_space_time_diagram_and_image_have_the_values_of_the_field(tmp_path):
     _, run = on_a_line()
     ax = run.plot.field(tmp_path / "u.png")
@@ -48,6 +51,7 @@ def test_space_time_diagram_and_image_have_the_values_of_the_field(tmp_path):
     assert mesh.points["y"][0, 0] == 0
 
 
+@pytest.mark.rotated
 def test_spectrum_decays_where_the_field_is_resolved(tmp_path):
     _, run = run_of("x", {"x": "periodic"}, "fourier", lambda x: cos(6 * pi * x), points=16)
     first, last = run.plot.spectrum(tmp_path / "s.png").lines
@@ -74,6 +78,7 @@ def test_animation_shows_the_graph_over_the_points(made, lines, dimension):
     film.animation.to_jshtml()
 
 
+@pytest.mark.rotated
 def test_dataset_has_the_coordinates_of_the_mesh(tmp_path):
     mesh, run = in_the_plane()
     data = run.to_xarray()

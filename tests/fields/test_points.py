@@ -33,6 +33,7 @@ def change(mesh, state, *, to, by="svi:4", h=0.01, steps=100):
     return [float(np.abs(run.q[name][-1] - to * values).max()) for name, values in state.items()]
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("mode", [0, 1, 2])
 def test_string_with_a_mass_at_its_end_has_the_frequencies_of_the_transcendental_equation(mode):
     """m w = cot w for a string of length, density and tension 1."""
@@ -43,6 +44,7 @@ def test_string_with_a_mass_at_its_end_has_the_frequencies_of_the_transcendental
     assert change(mesh, {"u": sin(w * mesh.points["x"])}, to=cos(w))[0] < 1e-9
 
 
+@pytest.mark.rotated
 def test_oscillator_on_a_spring_at_a_place_inside():
     """Its force is the jump of u_x, w (cot w (1 - a) + cot w a) = k M w^2/(k - M w^2); an element ends there."""
     a, mass, k = 0.37, 0.3, 2.0
@@ -55,6 +57,7 @@ def test_oscillator_on_a_spring_at_a_place_inside():
     assert max(change(mesh, {"u": u, "X": np.array(k / (k - mass * w * w))}, to=cos(w))) < 2e-12
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(
     ("method", "options", "bound"),
     [
@@ -117,6 +120,7 @@ def test_highest_frequency_contains_points():
     assert mesh.highest_frequency(k=0.0) < 60
 
 
+@pytest.mark.second
 def test_plane_with_a_mass_conserves_energy_and_is_derived():
     plane = sc.FieldSystem.from_text(
         "membrane",

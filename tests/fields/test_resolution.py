@@ -22,6 +22,7 @@ def ring(density=STRING, **others):
     return sc.FieldSystem.from_text("ring", ["u"], {"x": (0, "2*pi")}, density, boundary={"x": "periodic"}, **others)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("method", MESHES)
 def test_runs_report_the_unresolved_part_and_warn_of_it(method, recwarn):
     mesh = ring("u_t**2/2 - u_x**2/2 - u_x**3/6").discretise("spectral-elements", degree=6, elements=20)
@@ -75,6 +76,7 @@ def test_recordings_report_the_unresolved_part_and_warn_of_it(tmp_path):
     np.testing.assert_array_equal(sc.load_run(tmp_path / "run").unresolved(), expected)
 
 
+@pytest.mark.second
 def test_recordings_contain_their_mesh(tmp_path):
     """A driven end, elements of several sizes, a parameter, a momentum and its weights: all from the folder."""
     field = sc.FieldSystem.from_text(
@@ -117,6 +119,7 @@ def test_systems_without_a_mesh_report_no_resolution():
         run.unresolved()
 
 
+@pytest.mark.tiers(1)
 @pytest.mark.parametrize("method", ["stoermer-verlet", "composition:8"])
 def test_explicit_steps_are_stable_up_to_the_largest_step(method):
     mesh = ring().discretise("fourier", points=16)  # its bound of the frequency is exact
@@ -131,6 +134,7 @@ def test_explicit_steps_are_stable_up_to_the_largest_step(method):
     assert np.abs(unstable.q["u"]).max() > 1e3
 
 
+@pytest.mark.tiers(1, 2)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("points", [1, 2, 4, 8])
 def test_fixed_point_iterations_converge_up_to_the_largest_step(points):
@@ -155,6 +159,7 @@ DENSITIES = {
 }
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(4)
 @pytest.mark.parametrize("density", DENSITIES)
 @pytest.mark.parametrize("name", DISCRETISATIONS)

@@ -247,6 +247,7 @@ FULL = [
 ]
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(
     ("name", "method", "options", "bound", "plan"),
     [*MESHES, *(pytest.param(*each, marks=pytest.mark.full) for each in FULL)],
@@ -261,6 +262,7 @@ def test_waves_are_within_the_error_of_the_mesh(name, method, options, bound, pl
         check(mesh, run)
 
 
+@pytest.mark.rotated
 def test_errors_of_elements_fall_exponentially_with_the_degree():
     options = [{"degree": degree, "elements": 4} for degree in (4, 6, 8, 10)]
     found = [evolved(*WAVES["octave"], ELEMENTS, each, h=0.005, end=0.25)[2] for each in options]
@@ -268,6 +270,7 @@ def test_errors_of_elements_fall_exponentially_with_the_degree():
     assert found[-1] < 1e-10
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("order", [2, 4, 6, 8])
 def test_differences_have_their_order(order):
@@ -276,6 +279,7 @@ def test_differences_have_their_order(order):
     assert np.log2(one / two) == pytest.approx(order, abs=0.35)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("method", "order"), [("svi:1", 2), ("svi:2", 4)])
 def test_order_in_time_is_twice_the_number_of_points(method, order):
     ends = []

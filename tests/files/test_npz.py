@@ -76,6 +76,7 @@ def with_input(table: Any) -> Result:
 KINDS = [trajectory, ensemble, ensemble_to_ends, driven, driven_without_breakpoints]
 
 
+@pytest.mark.tiers(1, 3)
 @pytest.mark.parametrize("made", KINDS, ids=lambda made: made.__name__)
 def test_files_contain_the_result_and_its_description(made: Callable[[], Result], tmp_path: Path) -> None:
     result, expected = made()

@@ -52,6 +52,7 @@ def test_unknown_node_is_rejected() -> None:
         gradient(sympy.Piecewise((X, X > 0), (0, True)), [X])
 
 
+@pytest.mark.second
 def test_long_lattice_is_fast_and_sparse() -> None:
     q = [Symbol(f"q{index}", real=True) for index in range(257)]
     energy = sympy.Add(*((b - a) ** 2 / 2 + (b - a) ** 4 / 4 for a, b in pairwise(q)))

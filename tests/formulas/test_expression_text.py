@@ -153,6 +153,7 @@ def test_declared_symbols_may_be_python_keywords() -> None:
     assert parse_expression("lambda**2", {"lambda": symbol}) == symbol**2
 
 
+@pytest.mark.rotated
 def test_long_sums_and_products_do_not_recurse() -> None:
     with at_most(10_000_000):
         assert parse("+".join(["x"] * 40_000)) == 40_000 * X
@@ -161,6 +162,7 @@ def test_long_sums_and_products_do_not_recurse() -> None:
         assert parse("-" * 50_000 + "x") == X
 
 
+@pytest.mark.tiers(4, 6)
 @pytest.mark.sampled(6)
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_nested_expressions_are_read_or_rejected_without_crashing(name: str) -> None:
@@ -172,6 +174,7 @@ def test_nested_expressions_are_read_or_rejected_without_crashing(name: str) -> 
         assert "nested too deeply" in str(error)  # noqa: PT017  (either outcome is right)
 
 
+@pytest.mark.rotated
 def test_coefficients_of_like_terms_are_bounded() -> None:
     with pytest.raises(ExpressionError, match="2048 bits"):
         parse("+".join(f"x/{n}" for n in range(10_001, 19_999, 2)))
@@ -205,6 +208,7 @@ def grown(children: st.SearchStrategy[sympy.Expr]) -> st.SearchStrategy[sympy.Ex
 EXPRESSIONS = st.recursive(st.one_of(st.sampled_from([X, Y, Z]), numbers()), grown, max_leaves=10)
 
 
+@pytest.mark.rotated
 @settings(max_examples=400, deadline=None)
 @given(EXPRESSIONS)
 def test_round_trip_of_random_expressions(expression: sympy.Expr) -> None:

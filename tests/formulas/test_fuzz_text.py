@@ -64,6 +64,7 @@ def try_formula(number: int) -> bool:
     return True
 
 
+@pytest.mark.second
 def test_formulas_are_read_or_rejected():
     assert sum(map(try_formula, range(1000))) > 100
 
@@ -73,6 +74,7 @@ def test_seven_hundred_thousand_random_formulas():
     assert sum(map(try_formula, range(10_000, 710_000))) > 70_000
 
 
+@pytest.mark.rotated
 @given(
     st.one_of(st.text(max_size=200), st.lists(st.sampled_from([*NAMES, *FUNCTIONS, *NUMBERS, *POISON])).map("".join))
 )
@@ -152,6 +154,7 @@ def try_model(number: int) -> bool:
     return True
 
 
+@pytest.mark.rotated
 def test_model_files_are_read_or_rejected():
     assert sum(map(try_model, range(1000))) > 20
 
@@ -171,6 +174,7 @@ def test_grids_are_read_or_rejected(tmp_path):
         quietly(load_ensemble, path, model, expected=sc.ModelFileError)
 
 
+@pytest.mark.tiers(8)
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -271,6 +275,7 @@ def test_absurd_counts_are_rejected_immediately(count):
             method_from_specification(data)
 
 
+@pytest.mark.rotated
 def test_splines_of_too_many_velocities_are_rejected():
     with guarded(3_000_000), pytest.raises(sc.MethodError):
         method_from_specification({"method": "svi", "degree": 64, "space": "splines:64"})
@@ -296,6 +301,7 @@ def code_of(text: str) -> str:
     return re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL)
 
 
+@pytest.mark.tiers(2, 7)
 @pytest.mark.parametrize("title", TITLES, ids=lambda title: repr(title)[:20])
 def test_system_name_occurs_only_in_comments_and_prose(title, tmp_path):
     plain = sc.generate_package(hostile_model("plain"), tmp_path / "a" / "pendulum")
@@ -314,6 +320,7 @@ def test_system_name_occurs_only_in_comments_and_prose(title, tmp_path):
         assert code_of((folder / name).read_text()) == code_of((plain / name).read_text())
 
 
+@pytest.mark.tiers(21)
 @pytest.mark.parametrize(
     "name", [*TITLES, "", ".", "..", "-rf", "a b", "A", "a.b", "main", "os", "int", "é", "a/..", "~"]
 )
@@ -343,6 +350,7 @@ def try_identifier(random: Random) -> None:
         assert name not in re.findall(r"\w+", code) or len(name) < 9
 
 
+@pytest.mark.rotated
 def test_names_of_variables_are_identifiers():
     random = Random(1)
     for _ in range(150):

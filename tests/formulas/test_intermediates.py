@@ -39,6 +39,7 @@ def assert_near(found, expected):
     assert all(abs(found[k] - expected[k]) < mp.mpf("1e-50") for k in expected)
 
 
+@pytest.mark.rotated
 def test_derivatives_are_those_of_the_formula_written_out():
     formula = nested(2)
     plain = written_out(formula)
@@ -59,6 +60,7 @@ def test_derivatives_are_those_of_the_formula_written_out():
     assert_near({0: evaluate(formula.diff(X), POINT)}, {0: expected[0]})
 
 
+@pytest.mark.rotated
 def test_deep_formulas_take_linear_time():
     """Written out, this formula has more terms than there are atoms."""
     formula = nested(400)
@@ -142,6 +144,7 @@ def test_operations_of_a_chain_of_bodies_are_linear_and_those_of_its_mass_matrix
     assert many[2] < 30 * 24**2 + 300 * 24
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize(("method", "solver", "options"), [
     ("svi:2", "fixed-point", {"h": 0.02, "steps": 50}),

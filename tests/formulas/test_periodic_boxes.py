@@ -52,6 +52,7 @@ def pair(power: int) -> sc.LagrangianSystem:
     )
 
 
+@pytest.mark.tiers(1)
 @pytest.mark.parametrize("solver", ["auto", "newton"])
 def test_particles_that_pass_through_the_box_keep_energy_and_momentum(solver: str) -> None:
     stepper = sc.compile_stepper(pair(6), "svi:4", solver=solver)
@@ -61,6 +62,7 @@ def test_particles_that_pass_through_the_box_keep_energy_and_momentum(solver: st
     assert run.momentum_errors().max() < 1e-13
 
 
+@pytest.mark.second
 def test_order_is_preserved_up_to_the_smoothness_at_the_cut_off() -> None:
     """positive_part()**k has k - 1 continuous derivatives: order 4 with k = 6, no more than about 2 with k = 1."""
 

@@ -34,6 +34,7 @@ def called(binding, name, head, arrays, shape):
     return found
 
 
+@pytest.mark.second
 def test_values_of_batches():
     found = called(flow().library, "flow_rows", (0, STEPS, EVERY, 0, 2), [ROWS, ROWS], (2, SAVED, 4))
     assert_allclose(found, [states(row) for row in ROWS], **WAYS)
@@ -79,6 +80,7 @@ def test_failed_steps_are_reported_with_their_number_and_time(part):
     assert report.t == pytest.approx(OVERFLOWS[0, 8] + failing * OVERFLOWS[0, 9])
 
 
+@pytest.mark.second
 def test_second_derivatives_of_batches():
     same, changes = np.tile(weights(), (2, SIZE, 1, 1)), np.tile(np.eye(SIZE), (2, 1, 1))
     found = called(
@@ -128,6 +130,7 @@ def test_external_functions_of_casadi_are_exported():
         assert_allclose(pulled, np.tensordot(weights(), partials(row), 2), rtol=1e-11, atol=1e-11)
 
 
+@pytest.mark.second
 def test_second_derivatives_and_absent_adjoint_variables_of_casadi():
     """CasADi passes NULL for adjoint variables that are zero and for results that it does not need."""
     source, name = (

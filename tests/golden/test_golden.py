@@ -13,6 +13,7 @@ QUICK = ("damped", "forms_newton", "kepler_second", "rods_newton", "swings")
 """Of these five kinds of system and run, which include most headers, each change is compared in the quick tier."""
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(22)
 @pytest.mark.parametrize("name", [pytest.param(x, marks=pytest.mark.quick) if x in QUICK else x for x in CELLS])
 def test_results_have_the_bits_of_the_recorded_source(name: str, tmp_path: Path) -> None:

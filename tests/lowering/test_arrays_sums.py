@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import sympy
 from samples import QUICK_FLAGS
 
@@ -58,6 +59,7 @@ def states(system: LagrangianSystem, force: Kernel | None) -> tuple[np.ndarray, 
     return np.hstack([run.q, run.p]), np.array([many.q, many.p])
 
 
+@pytest.mark.second
 def test_loop_over_bonds_equals_its_unrolled_terms() -> None:
     system, bonds = chain(6)
     rolled = rolled_force(system, "force_lanes", bonds)

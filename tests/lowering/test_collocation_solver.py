@@ -25,6 +25,7 @@ COUPLED = ("double-pendulum", "pumped-cart-pole", "charged-particle", "relativis
 named = {"ids": lambda value: getattr(value, "name", value)}
 
 
+@pytest.mark.tiers(9)
 @pytest.mark.parametrize("method", [*POSITION, *PRINTED], **named)
 def test_every_coupled_system_has_an_iteration_on_accelerations(sample, method):
     kinds = {fixed_point(sample(name).system, method).name for name in COUPLED}
@@ -38,6 +39,7 @@ def test_separable_systems_iterate_on_positions_but_for_the_printed_form(sample)
     assert fixed_point(system, sc.SCVI(1, variational=False)).name == "separable"
 
 
+@pytest.mark.rotated
 def test_more_points_than_lanes_use_newton(sample):
     system = sample("double-pendulum").system
     assert fixed_point(system, sc.SpectralCollocation(32)) is not None
@@ -45,6 +47,7 @@ def test_more_points_than_lanes_use_newton(sample):
     assert fixed_point(system, sc.SCVI(2, "gauss-legendre:33", variational=False)) is None
 
 
+@pytest.mark.tiers(0, 2)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("method", [sc.SVI(3), sc.SCVI(2), sc.SpectralCollocation(3), PRINTED[0]], **named)
 def test_start_from_rest_does_not_need_newton(sample, compiled, method):
@@ -56,6 +59,7 @@ def test_start_from_rest_does_not_need_newton(sample, compiled, method):
     assert np.abs(np.subtract(*steps)).max() < 1e-14
 
 
+@pytest.mark.tiers(1)
 @pytest.mark.parametrize("method", [sc.SpectralCollocation(3), PRINTED[0]], **named)
 def test_stored_velocity_is_recomputed_for_new_parameters(sample, compiled, method):
     stepper = compiled("pumped-cart-pole", method, solver="fixed-point")

@@ -35,6 +35,7 @@ def scaling():
     return HamiltonianSystem.from_text(name="scaling", coordinates=["x"], hamiltonian="x*p_x")
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("method", [SVI(1), SCVI(2), SVI(3, "clenshaw-curtis:4")], ids=lambda method: method.name)
 def test_long_steps_of_an_oscillator_equal_those_in_an_ensemble(method):
     system = problem("harmonic-oscillator").system
@@ -50,6 +51,7 @@ def test_long_steps_of_an_oscillator_equal_those_in_an_ensemble(method):
             assert abs(found - float(q[0])) < 2 * STEPS * ROUNDING
 
 
+@pytest.mark.second
 def test_slow_convergence_is_not_mistaken_for_rounding():
     """Near its limit the iteration of a coupled system stops shrinking a while, at 1e-10 of the state, and fails."""
     heavy = lagrange("heavy", "x", "x_dot**2*(1 + x**2/100)/2 - x**2/2")
@@ -63,6 +65,7 @@ def test_slow_convergence_is_not_mistaken_for_rounding():
             assert found == pytest.approx(np.concatenate(newton.step([1.0], [0.3], h)), abs=1e-12)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("deviation", [1e-9, 1e-11])
 def test_rotating_iteration_that_stagnates_has_not_converged(deviation):
     """A rotation about a moving point contracts by h**2 in two iterations, the first of which enlarges the change."""
@@ -220,6 +223,7 @@ HEAVY_TOP = (
 )
 
 
+@pytest.mark.rotated
 def test_rotating_fixed_point_iterations_converge_to_rounding():
     """Factors of contraction are complex: one change may be as large as the last, though two are a hundredth of it."""
     system = HamiltonianSystem.from_text(name="top", coordinates=["w", "x", "y", "z"], hamiltonian=HEAVY_TOP)
@@ -262,6 +266,7 @@ LATTICES = {
 }
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", LATTICES)
 @pytest.mark.parametrize("method", ["svi:4", "svi:8"])
@@ -279,6 +284,7 @@ def test_standing_waves_converge_up_to_the_largest_step(name, method):
         assert counts[0] <= (1.1 * counts[1] + 0.2 if "array" in name else counts[1] + 5)
 
 
+@pytest.mark.second
 def test_standing_waves_of_an_ensemble_converge_at_known_sizes():
     phase = 4 * np.pi * np.arange(SITES) / SITES
     system = either_system(name="ring", **LATTICES["array"])
@@ -298,6 +304,7 @@ def test_bodies_of_known_number_are_measured_one_by_one():
     assert not any(array.is_field for array in system.arrays)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("form", ["", "*(1 + y**2/1000)"])
 def test_middle_of_a_molecule_at_rest_converges(form):
     """Three masses: in the antisymmetric mode the second one stays at 0. Beside the formula, and in ensembles."""

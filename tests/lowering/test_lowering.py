@@ -169,6 +169,7 @@ def test_integer_powers_are_products_and_others_are_calls():
     assert kernel_of(x**y).operation_counts() == {"pow": 1}
 
 
+@pytest.mark.tiers(3)
 @pytest.mark.parametrize("family", [SVI, SCVI, SpectralCollocation, Gauss], ids=lambda family: family.__name__)
 @pytest.mark.parametrize("system", [DOUBLE_PENDULUM, DUFFING], ids=lambda system: system.name)
 def test_symbolic_cost_does_not_grow_with_the_degree(family, system):
@@ -177,6 +178,7 @@ def test_symbolic_cost_does_not_grow_with_the_degree(family, system):
     assert large.equations.blocks > small.equations.blocks
 
 
+@pytest.mark.second
 def test_a_chain_of_256_masses_lowers_without_recursion():
     system = fput_chain(256)
     state = (*system.coordinates, *system.velocities)
@@ -232,6 +234,7 @@ def compiled_values(expressions: Sequence[Expression], tmp_path: Any) -> np.ndar
     return values
 
 
+@pytest.mark.second
 def test_printed_c_evaluates_to_the_expression(tmp_path):
     expressions = level(level(LEAVES))
     sources = {"u": np.float64(POINT[0]), "w": np.float64(POINT[1])}
@@ -250,6 +253,7 @@ def test_printed_c_evaluates_to_the_expression(tmp_path):
     assert len(expressions) > 5000
 
 
+@pytest.mark.second
 @settings(deadline=None)
 @given(st.floats(allow_nan=False, allow_infinity=False))
 def test_printed_numbers_read_back_as_the_same_double(number):

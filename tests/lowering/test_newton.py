@@ -38,6 +38,7 @@ def chain(method: object, *, pumped: bool = False) -> sc.Stepper:
     return sc.compile_stepper(pumped_chain(SIZE) if pumped else fput_chain(SIZE), method, solver="newton")
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.full)])
 def test_the_order_of_the_coordinates_does_not_matter(seed):
     shuffled, ordered = ring(seed), ring()
@@ -50,6 +51,7 @@ def test_the_order_of_the_coordinates_does_not_matter(seed):
     np.testing.assert_allclose(found.energy(), expected.energy(), rtol=1e-14)
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("method", [sc.SVI(2), sc.SCVI(2), sc.SpectralCollocation(2)], ids=lambda method: method.name)
 def test_rows_are_pivoted_within_the_band(method):
     """Masses x_dot y_dot have no diagonal: every diagonal pivot is zero. In u = x + y, w = x - y they have."""
@@ -72,6 +74,7 @@ def test_rows_are_pivoted_within_the_band(method):
     np.testing.assert_allclose(turn.T @ first[1], second[1], rtol=0, atol=1e-13)
 
 
+@pytest.mark.rotated
 def test_memory_grows_linearly_with_the_length_of_a_chain():
     sizes = [workspace_size(lowered(fput_chain(n), sc.SVI(8))) for n in (32, 64, 128)]
     assert sizes[2] - sizes[1] == pytest.approx(2 * (sizes[1] - sizes[0]), rel=1e-3)
@@ -87,6 +90,7 @@ def test_newton_matrix_has_minimal_size():
 class TestReusedFactors:
     """Runs of a chain with enough unknowns that factors go from step to step."""
 
+    @pytest.mark.second
     def test_runs_reuse_enough_factors(self, method):
         assert chain(method).interface.unknowns >= LEAST_REUSED_UNKNOWNS
 
@@ -101,6 +105,7 @@ class TestReusedFactors:
         assert np.array_equal(last.p[-1], expected.p[-1])
         assert last.iterations[-1] == expected.iterations[-1]
 
+    @pytest.mark.tiers(1)
     def test_run_with_time_dependent_springs_split_anywhere_is_bitwise_equal(self, method):
         """Factors are made again where and when they were made: with all that their matrix depends on."""
         q, p = state()

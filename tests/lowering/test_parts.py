@@ -44,6 +44,7 @@ def test_short_kernel_is_not_split():
     assert (part.name, part.statements) == ("k", tuple(whole.statements()))
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(1)
 @pytest.mark.covering
 @pytest.mark.parametrize("solver", ["newton", "fixed-point"])
@@ -67,6 +68,7 @@ def test_split_kernels_give_bitwise_equal_trajectories(name, solver, cut_after, 
         np.testing.assert_array_equal(many.q, many_cut.q)
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("method", "solver"), [("svi:3", "newton"), ("svi:3", "fixed-point"), ("stoermer-verlet", "fixed-point")]

@@ -44,6 +44,7 @@ def oscillators(kind, degree):
     return system, [mass] * len(names)
 
 
+@pytest.mark.tiers(0, 2)
 @pytest.mark.covering
 @pytest.mark.parametrize("degree", [3, 9], ids=["one vector of points", "several"])
 @pytest.mark.parametrize("kind", ENERGIES)

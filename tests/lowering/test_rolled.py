@@ -70,6 +70,7 @@ CASES = [
 ]
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize(("make", "method"), CASES)
 @pytest.mark.usefixtures("few")
@@ -91,6 +92,7 @@ def test_steps_energies_and_ensembles_equal_those_of_unrolled_terms(make, method
     assert np.abs(many.q - others.q).max() < 1e-13 * np.abs(q).max()
 
 
+@pytest.mark.second
 @pytest.mark.usefixtures("few")
 def test_symmetries_equal_those_of_unrolled_terms(monkeypatch):
     rolled = symmetries(bodies("rolled", 14))
@@ -100,6 +102,7 @@ def test_symmetries_equal_those_of_unrolled_terms(monkeypatch):
     assert len(rolled) == 9
 
 
+@pytest.mark.second
 @pytest.mark.usefixtures("few")
 def test_the_number_of_operations_in_the_text_does_not_grow_with_the_number_of_terms():
     sizes = []
@@ -112,6 +115,7 @@ def test_the_number_of_operations_in_the_text_does_not_grow_with_the_number_of_t
     assert sizes[0] == sizes[1]
 
 
+@pytest.mark.rotated
 def test_few_terms_and_constraints_remain_unrolled():
     assert module.roll_terms(bodies("few", 5)) is None
     rods = [f"(x{i} - x{i + 1})**2 + (y{i} - y{i + 1})**2 + (z{i} - z{i + 1})**2 = 1" for i in range(46)]

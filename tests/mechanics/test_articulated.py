@@ -17,6 +17,8 @@ from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.multibody.trees import energies
 from scvi_codegen.tables.precision import mp
 
+pytestmark = pytest.mark.rotated
+
 ROBOTS = Path(__file__).parent / "robots"
 SMALL = 1e-13  # constant rotations are orthogonal to round-off
 FOLLOWING = '<mimic joint="shoulder" multiplier="-0.5" offset="0.2"/>'
@@ -108,6 +110,7 @@ def test_operations_of_the_recursion_are_linear(tmp_path, always):
     assert many[2] < many[0] / 2  # most depends on positions only
 
 
+@pytest.mark.quick
 def test_separated_parts_do_not_depend_on_the_variables():
     x, y, z = sympy.symbols("x y z", real=True)
     inner = intermediate(sympy.sin(y) * x + 3 * y**2)
@@ -158,6 +161,7 @@ def test_slow_iterations_are_accelerated():
     assert run.iterations.sum() < 17 * 50  # 20.4 a step without acceleration
 
 
+@pytest.mark.quick
 def test_turned_vectors_have_no_entries_of_rounding_errors():
     numbers = robots.chain(4).system.lagrangian.atoms(sympy.Rational)
     inner = {

@@ -75,6 +75,7 @@ CASES = {
 SECOND_TIER = ("two masses", "wheel", "magnetic field", "slider crank", "length that changes")
 
 
+@pytest.mark.tiers(4)
 @pytest.mark.parametrize("case", [pytest.param(x, marks=[pytest.mark.second] * (x in SECOND_TIER)) for x in CASES])
 def test_motion_in_angles_is_that_with_constraints(case: str) -> None:
     """Accelerations agree in 60 digits; states return from the original coordinates."""

@@ -46,6 +46,7 @@ def named(values, letters="xyz"):
     return {f"{letter}_box": float(value) for letter, value in zip(letters, values, strict=True)}
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     "equality",
@@ -67,6 +68,7 @@ def test_welded_bodies_move_as_one(equality, tmp_path):
     np.testing.assert_allclose(run.rotation("R_box")[-1], one.rotation()[-1] @ TURNED, rtol=0, atol=atol)
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     "equality", ['<connect body1="box" body2="rod" anchor="0 0.2 0.1"/>', '<connect site1="end" site2="top"/>']
@@ -90,6 +92,7 @@ def test_a_connection_of_points_is_a_ball_joint(equality, tmp_path):
     np.testing.assert_allclose(run.rotation("R_box")[-1], expected, rtol=0, atol=1e-10)
 
 
+@pytest.mark.rotated
 def test_a_polynomial_between_joints_reduces_the_motion_to_one_coordinate(tmp_path):
     slides = "".join(
         f'<body><joint name="{name}" type="slide" axis="0 0 1" ref="{ref}"/>'
@@ -134,6 +137,7 @@ BARS = (
 )
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(
     ("equality", "sites", "count"),
     [

@@ -65,6 +65,7 @@ METHODS = (
 """Methods with their order and the smaller number of steps."""
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", CASES)
 def test_order_2s_against_the_equations_without_gauge(name: str) -> None:
@@ -112,6 +113,7 @@ def test_velocities_where_a_pivot_vanishes() -> None:
         _ = stepper.integrate((d, -10.0, b, c), h=1e-3, steps=0).velocity
 
 
+@pytest.mark.second
 def test_one_forms_that_depend_on_time_change_the_energy() -> None:
     """H changes by 20 %, without a warning that the motion amplifies errors; at rest in time it is conserved."""
     for factor, conserved in (("sin(t)", False), ("1/3", True)):
@@ -122,6 +124,7 @@ def test_one_forms_that_depend_on_time_change_the_energy() -> None:
         assert (abs(run.energy() / run.energy()[0] - 1).max() < 1e-12) == conserved
 
 
+@pytest.mark.second
 def test_energy_does_not_drift() -> None:
     stepper = sc.compile_stepper(system("massless particle"), "svi:2")
     run = stepper.integrate([1.0, 0.2], h=0.1, steps=100_000, save_every=7)
@@ -129,6 +132,7 @@ def test_energy_does_not_drift() -> None:
     assert errors[-2000:].max() < 1.01 * errors[:2000].max() < 1e-6
 
 
+@pytest.mark.second
 def test_vortices_on_a_curved_surface_agree_with_the_published_reference() -> None:
     """GeometricProblems.jl, ``point_vortices``: ``reference_solution`` at t = 10."""
     places = [f"(1 + x{i}**2 + y{i}**2)" for i in (1, 2)]
@@ -141,6 +145,7 @@ def test_vortices_on_a_curved_surface_agree_with_the_published_reference() -> No
     assert run.energy_error() < 1e-14
 
 
+@pytest.mark.second
 def test_lotka_volterra_in_two_dimensions_agrees_with_the_published_reference() -> None:
     """GeometricProblems.jl, ``lotka_volterra_2d``: ``reference_solution`` at t = 100, of energy error 5.6e-11."""
     prey = "(y + log(y)/x)*x_dot + x*y_dot + x + y - log(x) - 2*log(y)"
@@ -155,6 +160,7 @@ def test_lotka_volterra_in_two_dimensions_agrees_with_the_published_reference() 
     assert np.abs(run.variables[-1] - expected).max() < 3e-12
 
 
+@pytest.mark.second
 def test_lotka_volterra_in_four_dimensions_agrees_with_the_published_reference() -> None:
     """GeometricProblems.jl, ``lotka_volterra_4d``: ``reference_solution`` at t = 100; in logarithms, sheared."""
     energy = "(exp({a}) + exp(b) + exp(c) + exp(d) - {a} - 2*b - c - d)"
@@ -169,6 +175,7 @@ def test_lotka_volterra_in_four_dimensions_agrees_with_the_published_reference()
     assert np.abs(np.exp([a + c, b, c, d]) - published).max() < 1e-11
 
 
+@pytest.mark.second
 def test_a_shear_of_the_toroidal_angle() -> None:
     """Guiding centre in the tokamak field of H. Qin, X. Guan, W. Tang, Physics of Plasmas 16 (2009) 042510."""
     R, _, Z, u, q0, mu = z = sympy.symbols("R phi Z u q0 mu")
@@ -219,6 +226,7 @@ def test_translations_of_vortices_conserve_their_centre() -> None:
     assert run.momentum_errors().max() < 1e-13
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("size", ["3", "N"])
 def test_arrays_of_vortices(size: str) -> None:
     pairs = f"sum(i in {size}, j in {size}, G[i]*G[j]*log((x[i] - x[j])**2 + (y[i] - y[j])**2 + 0.1))/(8*pi)"
@@ -246,6 +254,7 @@ def test_canonical_one_forms_use_the_fixed_point_iteration() -> None:
     assert run.variables[-1] == pytest.approx([math.cos(1.0), math.sin(1.0)], abs=1e-13)
 
 
+@pytest.mark.rotated
 def test_certificate_measures_the_two_form_and_the_order() -> None:
     certificate = sc.verify(system("guiding centre"), "svi:2")
     assert certificate.passed, str(certificate)
@@ -253,6 +262,7 @@ def test_certificate_measures_the_two_form_and_the_order() -> None:
     assert {"stage equations", "symplecticity", "order", "reversal", "Newton's matrix"} <= names
 
 
+@pytest.mark.second
 def test_states_by_name_and_in_order() -> None:
     stepper = sc.compile_stepper(system("guiding centre"), "svi:2")
     start = dict(zip("xyzu", CASES["guiding centre"][3], strict=True))
@@ -331,6 +341,7 @@ def test_velocities_are_refused_and_available() -> None:
     assert run.velocity[0] == pytest.approx([expected[names.index(name)] for name in stepper.coordinates], abs=1e-15)
 
 
+@pytest.mark.second
 def test_model_files(tmp_path) -> None:
     model = sc.Model(system=system("guiding centre"), method="svi:2", q=CASES["guiding centre"][3], h=0.1, span=1.0)
     sc.save_model(model, tmp_path / "model.toml")
@@ -358,6 +369,7 @@ def test_lagrangians_without_a_gauge(coordinates: str, lagrangian: str, message:
         sc.LagrangianSystem.from_text("system", coordinates.split(), lagrangian)
 
 
+@pytest.mark.second
 def test_unsupported_uses_are_named() -> None:
     with pytest.raises(sc.SystemDefinitionError, match="does not support forces: half of"):
         sc.LagrangianSystem.from_text("system", ["x", "y"], "x*y_dot - x**2 - y**2", forces={"x": "-x_dot"})
@@ -379,6 +391,7 @@ def test_unsupported_uses_are_named() -> None:
         sc.compile_stepper(particle, "svi:2", time_transformation="1 + x**2").integrate([1.0, 0.2], h=0.1, t_end=1.0)
 
 
+@pytest.mark.second
 def test_transformed_time() -> None:
     particle = system("massless particle")
     slow = sc.compile_stepper(sc.reparametrise(particle, "1 + x**2"), "svi:6").integrate([1.0, 0.2], h=0.05, t_end=2.0)
@@ -396,6 +409,7 @@ def differences(function, size: int, width: float = 1e-3) -> np.ndarray:
     return np.array(columns).T
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("method", ["svi:2", "stoermer-verlet", "radau-iia:2"])
 def test_derivatives_of_steps_against_differences(method: str) -> None:
     """The one-form and H depend on parameters and time, so that every derivative of theta occurs."""
@@ -439,6 +453,7 @@ def test_sensitivities_fits_and_chaos_indicators_of_runs() -> None:
     assert exponents[0] > exponents[-1]
 
 
+@pytest.mark.second
 def test_periodic_orbits() -> None:
     particle = system("massless particle")
     orbit = sc.periodic_orbit(sc.compile_stepper(particle, "svi:4"), [0.2], [-1.0], period=11.8, steps=40)

@@ -143,6 +143,7 @@ def test_missing_legendre_transform_is_named() -> None:
 # Steps of regular Hamiltonians.
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(4)
 @pytest.mark.covering
 @pytest.mark.parametrize("name", ["double-pendulum", "relativistic-particle"])
@@ -158,6 +159,7 @@ def test_a_regular_hamiltonian_gives_the_steps_of_its_lagrangian(sample, name, m
         assert np.abs(np.array(stepper.step(q, p, h, t)) - expected).max() < ROUND_OFF
 
 
+@pytest.mark.second
 def test_transforms_and_energy_are_those_of_the_lagrangian(sample) -> None:
     system = sample("double-pendulum").system
     one, two = (
@@ -176,6 +178,7 @@ def test_transforms_and_energy_are_those_of_the_lagrangian(sample) -> None:
 # Singular Hamiltonians.
 
 
+@pytest.mark.tiers(1, 2)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("method", "error"),
@@ -249,6 +252,7 @@ def test_point_vortices_agree_with_gauss_by_hand() -> None:
     assert np.abs(np.concatenate(stepper.step(entry.q, entry.p, h)) - expected).max() < ROUND_OFF
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(4)
 @pytest.mark.parametrize(
     "method", [sc.SVI(6), sc.Gauss(3), sc.RadauIIA(3), sc.StoermerVerlet()], ids=lambda method: method.name

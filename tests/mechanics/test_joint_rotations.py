@@ -78,6 +78,7 @@ def test_a_spherical_joint_moves_as_in_angles():
     np.testing.assert_allclose(run.q[-1, 0], end[3], rtol=0, atol=1e-10)
 
 
+@pytest.mark.second
 def test_reading_does_not_change_the_system():
     model, _, ball = arm_on_a_ball_joint()
     before = ball.child.masscenter.vel(model.frame), ball.child.frame.dcm(model.frame), model.q, model.kdes
@@ -121,6 +122,7 @@ MJCF = """
 """
 
 
+@pytest.mark.rotated
 def test_a_body_without_joints_to_the_frame_is_free_as_in_mjcf(tmp_path):
     ground, base, leg = RigidBody("ground"), body("base", 2, 0.5, 0.4, 0.3), body("leg", 0.7, 0.1, 0.12, 0.02)
     parent, child = (3 * base.x - base.z) / 10, 2 * leg.z / 5

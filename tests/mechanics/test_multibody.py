@@ -40,6 +40,7 @@ def assert_moves_alike(mechanism: Mechanism, steps: int = 200) -> None:
     np.testing.assert_allclose(run.velocity[-1], v, rtol=0, atol=1e-9)
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(4)
 @pytest.mark.parametrize("name", MECHANISMS)
 def test_trajectories_agree_with_sympys_equations(name: str) -> None:
@@ -133,6 +134,7 @@ def test_time_dependent_forces_are_inputs_or_set_to_zero_order_hold() -> None:
         taken(method)
 
 
+@pytest.mark.second
 def test_weights_and_springs_become_a_potential_and_dampers_remain_forces() -> None:
     mechanism = MECHANISMS["particles on a spring"]()
     system = mechanism.system().with_parameters(c=0.0, g=0.0)
@@ -178,6 +180,7 @@ def test_velocity_constraints_implied_by_configuration_constraints_are_dropped()
     assert taken(kanes_method(Q1, Q2, **{**options, "q": (Q1, Q2)}, velocity_constraints=rate)) == rolling
 
 
+@pytest.mark.rotated
 def test_bicycle_has_the_constraints_of_its_wheels() -> None:
     """Contact of the front wheel, its rolling (two), and the rear wheel whose rolling is in the velocities."""
     lengths = dict.fromkeys(("htangle", "WRrad", "WFrad", "framelength", "forkoffset", "forklength", "g"), 0.5)

@@ -58,6 +58,7 @@ def compare(robot: Any, expected: list[float], folder: Any) -> None:
         assert np.abs(np.subtract(equations, residual)).min() < 1e-9
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize("seed", range(SEEDS))
 @pytest.mark.parametrize("kind", ["mjcf", "urdf"])
 def test_random_robots_have_the_recorded_energies(kind, seed, tmp_path):
@@ -65,6 +66,7 @@ def test_random_robots_have_the_recorded_energies(kind, seed, tmp_path):
     compare(robot, json.loads(RECORDED.read_text())[kind][seed], tmp_path)
 
 
+@pytest.mark.tiers(1, 1)
 @pytest.mark.parametrize("seed", MORE)
 def test_random_models_have_the_energies_of_mujoco(seed, tmp_path):
     mujoco = pytest.importorskip("mujoco", reason="pip install mujoco")
@@ -80,6 +82,7 @@ def test_random_models_have_the_energies_of_mujoco(seed, tmp_path):
             raise
 
 
+@pytest.mark.tiers(1, 1)
 @pytest.mark.parametrize("seed", MORE)
 def test_random_robots_have_the_energies_of_pinocchio(seed, tmp_path):
     pytest.importorskip("pinocchio", reason="pip install pin")

@@ -136,6 +136,7 @@ def turning(start: Any, rates: Any) -> Callable[[float], Any]:
     return lambda t: start @ about(rates, np.linalg.norm(rates) * t)
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize("seed", [1, 2])
 def test_energies_of_urdf_are_those_of_composed_poses(seed):
     draw = np.random.default_rng(seed)
@@ -155,6 +156,7 @@ def test_energies_of_urdf_are_those_of_composed_poses(seed):
     assert ours == pytest.approx(kinetic(arm, motion) - potential, abs=1e-8)
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("seed", "compensated"), [(1, 0.0), (2, 0.3)])
 def test_energies_of_mjcf_are_those_of_composed_poses(seed, compensated, tmp_path):
     draw = np.random.default_rng(seed)
@@ -183,6 +185,7 @@ def test_energies_of_mjcf_are_those_of_composed_poses(seed, compensated, tmp_pat
     assert ours == pytest.approx(expected, rel=1e-8)
 
 
+@pytest.mark.tiers(1, 4)
 @pytest.mark.parametrize("shape", SHAPES)
 def test_inertias_of_shapes_are_integrals(shape):
     size = np.array([0.5, 0.7, 0.9][: SHAPES[shape][0]])
@@ -208,6 +211,7 @@ def test_damping_and_actuators_act_on_joints():
     assert sympy.Symbol("tau_rail_1_0") in {sympy.Symbol(each.name) for each in system.forces[1].free_symbols}
 
 
+@pytest.mark.rotated
 def test_runs_of_a_ball_joint_and_a_hinge_keep_energy_and_vertical_momentum():
     stepper = sc.compile_stepper(sc.LagrangianSystem.from_mjcf(ROBOTS / "ball.xml"), "svi:3")
     start, rates = {"R_ball": [1, 0.2, 0.1, 0], "swing": 0.4}, {"omega_ball": [0.3, 0.2, 1.0], "swing": 0.5}
@@ -401,6 +405,7 @@ def test_limits_and_dry_friction_are_named_in_one_warning(tmp_path):
     assert Path(caught[0].filename).name == "test_robots.py"
 
 
+@pytest.mark.rotated
 def test_parts_of_models_that_are_not_read_are_named_in_one_warning(tmp_path):
     text, file = (ROBOTS / "figure.xml").read_text(), tmp_path / "figure.xml"
     text = text.replace('name="flex"', 'name="flex" range="-90 90" frictionloss="0.1"')

@@ -53,6 +53,7 @@ def canonical(count):
 EXAMPLES = [bodies(4), bodies(12), lattice(5), lattice(13), damped(6), canonical(5)]
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize("system", EXAMPLES, ids=lambda each: each.name)
 def test_rolled_system_has_equal_trajectories(system):
@@ -103,6 +104,7 @@ def test_unsupported_systems_are_rejected(system, message):
         sc.roll_sums(system)
 
 
+@pytest.mark.second
 def test_inputs_retain_their_names():
     q = [f"q{i}" for i in range(4)]
     springs = "".join(f" - ({b} - {a})**2/2" for a, b in pairwise(q))
@@ -128,6 +130,7 @@ def test_inputs_retain_their_names():
     assert run.q["q"][-1] == pytest.approx(other.q[-1], abs=1e-14)
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(
     "term", ["3", *(pytest.param(x, marks=pytest.mark.full) for x in ("3*sin(t)", "g")), "g*cos(t) + x*0 + 2"]
 )
@@ -144,6 +147,7 @@ def test_terms_without_coordinates_give_a_runnable_system(term):
     assert np.abs(own.energy() - other.energy()).max() < 1e-14
 
 
+@pytest.mark.tiers(1, 3)
 @pytest.mark.sampled(4)
 @pytest.mark.parametrize("name", ["b", "q", "N", "at0", "B0", "q_dot", "c0_1", "p_q"])
 def test_parameter_names_differ_from_names_of_arrays_and_tables(name):

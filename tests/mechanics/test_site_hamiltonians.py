@@ -18,6 +18,7 @@ CHARGES = (
 )
 
 
+@pytest.mark.rotated
 def test_masses_that_depend_on_position_against_scipy():
     system = sc.LagrangianSystem.from_text("chain", ["q[N]"], CHAIN, parameters={"m[N]": 1})
     stepper, given = sc.compile_stepper(system, "svi:4", flags=QUICK_FLAGS), {"parameters": {"m": MASS}}
@@ -41,6 +42,7 @@ def test_masses_that_depend_on_position_against_scipy():
     assert len(crossed.t) == (np.diff(np.sign(run.velocity[:, 0])) != 0).sum()
 
 
+@pytest.mark.second
 def test_charges_in_a_magnetic_field_keep_their_angular_momentum():
     system = sc.LagrangianSystem.from_text("charges", ["r[N, 2]"], CHARGES, parameters={"B": 0.5})
     stepper = sc.compile_stepper(system, "svi:2", flags=QUICK_FLAGS)
@@ -69,6 +71,7 @@ def test_other_kinetic_energies_have_no_hamiltonian_by_elements(lagrangian):
     assert site_hamiltonian(sc.LagrangianSystem.from_text("other", ["q[N]"], lagrangian)) is None
 
 
+@pytest.mark.second
 def test_pendulums_in_spherical_angles():
     """Sums of several loops, and blocks of several arrays."""
     system = sc.LagrangianSystem.from_text(
@@ -86,6 +89,7 @@ def test_pendulums_in_spherical_angles():
     assert run.momentum_maps() == pytest.approx(known.momentum_maps()[:, :1], abs=1e-13)
 
 
+@pytest.mark.rotated
 def test_many_coupled_velocities_are_solved_by_newton():
     """Full mass matrices at all points, on the stack, are left to the banded ones of Newton's method."""
     text = "sum(i in N, q_dot[i]**2/2 - q[i]**2/2) + sum(i in 0..N-2, q_dot[i]*q_dot[i+1]/9)"

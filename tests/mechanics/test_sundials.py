@@ -15,6 +15,7 @@ def partials(q):
     return 2 * np.array([[q[0], q[1], 0, 0], [-x, -y, x, y]])
 
 
+@pytest.mark.second
 def test_double_pendulum_of_rods_agrees_with_ida():
     """IDA solves the index-1 form, with constraints differentiated twice, to about 1e-7."""
     ida = pytest.importorskip("sksundae.ida")

@@ -253,6 +253,7 @@ def test_each_momentum_map_is_conserved_identically(system):
         assert sympy.expand(sympy.Add(*products) - symmetry.gauge - symmetry.momentum_map) == 0
 
 
+@pytest.mark.second
 def test_symmetry_search_is_fast():
     for name in (*sc.PROBLEMS, "fput-chain:64"):
         system = sc.problem(name).system
@@ -348,6 +349,7 @@ def test_a_gauge_that_is_not_quadratic_is_found(name):
     assert sc.check_symmetry(system, direction, gauge=found.gauge).momentum_map == found.momentum_map
 
 
+@pytest.mark.rotated
 def test_undecided_symmetries_are_not_denied():
     drift = "exp(x**2)*sin(x)"
     system = lagrange("drift", "x", f"x_dot**2/2 + {drift}*x_dot")
@@ -392,6 +394,7 @@ def test_symmetry_of_another_system_or_with_a_used_name_is_rejected():
 # Compiled, tracked, shown.
 
 
+@pytest.mark.second
 def test_values_agree_with_the_formulas(quickly_compiled):
     system = magnetic()
     stepper = quickly_compiled(system, sc.SVI(2))
@@ -434,6 +437,7 @@ EXACT = [
 ]
 
 
+@pytest.mark.tiers(1, 3)
 @pytest.mark.sampled(7)
 @pytest.mark.parametrize(("name", "method"), EXACT, ids=lambda value: getattr(value, "name", value))
 def test_claimed_conservation_is_measured(quickly_compiled, name, method):
@@ -456,6 +460,7 @@ BROKEN = [
 ]
 
 
+@pytest.mark.tiers(1, 2)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize(("name", "method", "broken"), BROKEN, ids=lambda value: getattr(value, "name", value))
 def test_unclaimed_conservation_may_be_violated(quickly_compiled, name, method, broken):

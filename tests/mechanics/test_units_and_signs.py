@@ -9,6 +9,7 @@ import scvi_codegen as sc
 from scvi_codegen.errors import MethodError
 
 
+@pytest.mark.second
 def test_multipliers_of_an_orbit_are_those_of_its_variations():
     """A damped pendulum that is driven: two multipliers, not in pairs, by differences of DOP853."""
     parameters = {"m": 1.75, "k": 2.5, "a": 0.375, "w": 1.25}

@@ -45,6 +45,7 @@ def test_variable_masses_have_no_variational_equations():
     assert with_tangent_vectors(magnetic, 1) is None
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     "method", [sc.SVI(5), sc.SVI(3, "gauss-lobatto:5"), sc.Gauss(3)], ids=["svi", "other points", "gauss"]

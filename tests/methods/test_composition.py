@@ -6,12 +6,15 @@ from notation import lagrange
 
 from scvi_codegen import Composition, MethodError, StoermerVerlet, compile_stepper, problem
 
+pytestmark = pytest.mark.second
+
 DOUBLE_PENDULUM, DUFFING, KEPLER = (problem(name).system for name in ("double-pendulum", "duffing", "kepler"))
 
 DRIVEN = DUFFING.with_parameters(gamma=0.3, omega=1.3)
 STATES = {1: ([0.7], [0.4], 0.2), 2: ([0.7, -0.3], [0.3, 0.9], 0.15)}
 
 
+@pytest.mark.tiers(1, 3)
 @pytest.mark.sampled(4)
 @pytest.mark.parametrize("system", [KEPLER, DRIVEN], ids=lambda s: s.name)
 @pytest.mark.parametrize("method", [StoermerVerlet(), Composition(2), Composition(8), Composition(10)])

@@ -59,6 +59,7 @@ def swung():
     return float(run.q[-1, 0]), float(run.velocity[-1, 0])
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("s", [1, 2, 3, 4])
 def test_order_is_2s_and_constraints_hold_to_rounding(s, swung):
@@ -114,6 +115,7 @@ TIERS = {
 }
 
 
+@pytest.mark.tiers(0, 0)
 @pytest.mark.parametrize("name", [pytest.param(name, marks=TIERS.get(name, ())) for name in WITHOUT_NEWTON])
 def test_multipliers_are_solved_without_newton_iteration(name):
     """Compare with the states of Newton's iteration, for weak and strong forces, also with adaptive steps."""
@@ -161,6 +163,7 @@ VARYING = {
 }
 
 
+@pytest.mark.tiers(1)
 @pytest.mark.parametrize(
     ("kind", "s"),
     [
@@ -260,6 +263,7 @@ def test_bits_do_not_depend_on_the_width_of_a_vector_register(monkeypatch):
     assert np.array_equal(states[0], states[2])
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(
     "more",
     [{}, {"forces": {"x": "c*y_dot", "y": "-c*x_dot"}}, {"terms": " + c*(x*y_dot - y*x_dot)*x"}],
@@ -333,6 +337,7 @@ def test_steps_are_symplectic_on_the_tangent_bundle_of_the_circle():
     assert after == pytest.approx(before, rel=1e-8)
 
 
+@pytest.mark.second
 def test_energy_is_bounded_and_momenta_are_conserved():
     """A spherical pendulum of two rods: energy without drift over 20,000 steps, the angular momentum to rounding."""
     system = two_rods(axes="xyz", m=1.0)
@@ -391,6 +396,7 @@ def test_constraints_that_depend_on_time_forces_and_coupled_masses():
     assert np.log2(errors[0] / errors[1]) == pytest.approx(4, abs=0.3)
 
 
+@pytest.mark.tiers(1, 2)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("third", "message_text"),
@@ -471,6 +477,7 @@ def test_angles_at_zero_satisfy_constraints_up_to_rounding():
     assert np.abs(run.constraint_values()[0]).max() < 1e-15
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("unit", [1e3, 1e-3])
 def test_constraint_violation_is_independent_of_units(unit):
     """For a slide in metres and an angle in radians, reports and rejections do not depend on the unit of length."""
@@ -504,6 +511,7 @@ def test_constraint_violation_is_independent_of_units(unit):
         assert found[0] == found[1]
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("coordinates", "a", "b"), [(["a", "b"], "a", "b"), (["q[N]"], "q[0]", "q[1]")])
 def test_residuals_at_rounding_near_the_origin_are_accepted(coordinates, a, b):
     velocities = "sum(i in N, q_dot[i]**2)" if "[" in a else "a_dot**2 + b_dot**2"
@@ -528,6 +536,7 @@ def test_dense_output_events_and_adaptive_steps_with_constraints():
     assert np.abs(run.events[0].q[:, 0]).max() < 1e-12
 
 
+@pytest.mark.tiers(2)
 @pytest.mark.parametrize("s", [1, 2, 3, 4])
 def test_error_estimate_uses_the_velocity_at_the_end_of_the_step(s):
     """An estimate by the curve alone was 1500 times too large for degree 3 (median), and 0 for degree 1."""
@@ -620,6 +629,7 @@ def test_methods_without_constraint_support_are_rejected(method):
         sc.compile_stepper(rod(), method)
 
 
+@pytest.mark.rotated
 def test_time_transformation_preserves_constraints_and_orders():
     """A bead on a circle past a centre; multipliers are forces in the time as it is."""
     bead = lagrange(
@@ -667,6 +677,7 @@ def test_constraints_of_a_hamiltonian_equal_those_of_its_lagrangian():
         sc.HamiltonianSystem.from_text(hamiltonian=formula, constraints=circle, **text)
 
 
+@pytest.mark.second
 def test_unsupported_combinations_with_constraints_are_rejected():
     rolling = lagrange("blade", "x y", "(x_dot**2 + y_dot**2)/2", constraints=["x_dot = y*y_dot"])
     with pytest.raises(sc.SystemDefinitionError, match="nonholonomic constraints"):

@@ -44,6 +44,7 @@ def reference():
     ).sol
 
 
+@pytest.mark.tiers(3)
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_a_closed_loop_starts_from_rest_at_zero_at_any_step(method, reference):
     stepper = sc.compile_stepper(linkage(a="1"), method)
@@ -61,6 +62,7 @@ def test_newtons_method_starts_there_too(reference):
         assert np.abs(run.q[-1] - reference(10 * h)[:3]).max() <= 1e-13 * np.abs(run.q[-1]).max() + 1e-15
 
 
+@pytest.mark.second
 def test_adaptive_steps_from_the_lowest_point_are_those_of_any_pivot():
     systems = [
         lagrange("rod", ["x", "y"], "(x_dot**2 + y_dot**2)/2 - 9.81*y", constraints=[constraint])
@@ -73,6 +75,7 @@ def test_adaptive_steps_from_the_lowest_point_are_those_of_any_pivot():
     assert max(steps) <= 2 * min(steps) <= 40
 
 
+@pytest.mark.tiers(2)
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_a_closed_loop_at_an_equilibrium_stays_there(method):
     force = {x: f"{f:.17g}" for x, f in zip("abc", jacobian([0.0] * 3).T @ [0.75, -1.25], strict=True)}
@@ -83,6 +86,7 @@ def test_a_closed_loop_at_an_equilibrium_stays_there(method):
         assert run.fallback_steps == 0
 
 
+@pytest.mark.tiers(3)
 @pytest.mark.parametrize("pivot", [(0.0, 0.0), (0.0, 1.0), (0.0, 100.0), (0.0, -1e3)], ids=str)
 def test_a_pendulum_hangs_and_swings_from_any_pivot(pivot):
     """Initial states that are exact, or nearly so, are accepted as they are, wherever the origin is."""

@@ -40,6 +40,7 @@ def test_free_dumbbell_has_uniform_translation_and_rotation():
     assert_allclose(-2 * 0.8 * run.multipliers()[:, 0], 0.75 * turning**2 * 0.8, rtol=0, atol=1e-9)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("bend", [np.pi / 2, 0.7, 2.5])
 def test_angle_between_two_rods_equals_a_rigid_hook(bend):
     hook = JOINTS.bent_pendulum()
@@ -65,6 +66,7 @@ def test_angle_between_two_rods_equals_a_rigid_hook(bend):
     assert_allclose(run.q[:, 2:], middle + b * np.column_stack([np.sin(outer), -np.cos(outer)]), rtol=0, atol=1e-9)
 
 
+@pytest.mark.second
 def test_a_point_slides_on_its_line():
     run = ran(JOINTS.pendulum_on_a_slide())
     s, f = reduced(
@@ -93,6 +95,7 @@ def test_welded_bodies_tumble_as_one():
     assert_allclose(run.multipliers()[:, 2], 0.0, rtol=0, atol=1e-8)
 
 
+@pytest.mark.tiers(1)
 @pytest.mark.parametrize("meshing", [False, True], ids=["belt", "gears"])
 def test_belt_and_gears_transmit_the_torque(meshing):
     sign, winch = (-1.0 if meshing else 1.0), JOINTS.winch()
@@ -134,6 +137,7 @@ def test_member_forces_of_a_bridge_equal_the_method_of_joints():
     assert_allclose(pulls[0, top], -moment / JOINTS.HEIGHT, rtol=0, atol=1e-10)
 
 
+@pytest.mark.rotated
 def test_bridge_oscillates_as_a_pendulum():
     """Rods of equal length do not rotate the bridge; all joints move on the same circle."""
     mechanism = JOINTS.bridge(0.3)

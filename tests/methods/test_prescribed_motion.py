@@ -43,6 +43,7 @@ def inverse_dynamics(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.array(positions), np.array(multipliers)
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("method", [sc.SVI(1, "gauss-lobatto:2"), "svi:3"])
 @pytest.mark.parametrize("solver", ["auto", "newton"])
@@ -56,6 +57,7 @@ def test_multipliers_are_the_forces_of_inverse_dynamics(method, solver):
     assert_allclose(run.at(between)[0], inverse_dynamics(between)[0], rtol=0, atol=1e-13)
 
 
+@pytest.mark.second
 def test_adaptive_steps_and_ensembles():
     stepper = sc.compile_stepper(linkage(), "svi:4")
     start = stepper.project(NEAR)
@@ -90,6 +92,7 @@ def test_prescribed_velocities():
     assert_allclose(run.multipliers(), [[3.0, 1.0]] * 11, rtol=0, atol=1e-12)
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(1)
 def test_certificate_and_tangents():
     system = lagrange("crank", "x y", "(x_dot**2 + y_dot**2)/2", constraints=["x = cos(t)", "y = sin(t)"])
@@ -127,6 +130,7 @@ def test_overconstrained_systems_are_rejected():
         sc.LagrangianSystem.from_text(**SLIDER, constraints=["x = t", "angle = t", "x = 3"])
 
 
+@pytest.mark.second
 def test_impacts_are_impossible():
     stepper = sc.compile_stepper(linkage(), "svi:1")
     with pytest.raises(sc.EventError, match=r"changes of the state by 'x1' .* constraints leave no motion away"):

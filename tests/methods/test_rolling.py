@@ -33,6 +33,7 @@ def by_accelerations(t, state):
     return [vx, vy, w, *found[:3]]
 
 
+@pytest.mark.tiers(1, 2)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize(("s", "steps"), [(1, 20), (2, 10), (3, 10), (4, 5)])
 def test_the_order_is_2s_and_the_step_is_symmetric(s, steps):
@@ -50,6 +51,7 @@ def test_the_order_is_2s_and_the_step_is_symmetric(s, steps):
         assert_allclose(free.q[-1], end.y[:3, -1], rtol=0, atol=1e-11)
 
 
+@pytest.mark.second
 def test_chaplygin_sleigh_agrees_with_its_closed_form():
     """Without springs: speed V tanh(k t), rate of turning W sech(k t), k = m d V / J; from a turn on the spot."""
     m, j, d, turning = 1.3, 0.7, 0.2, 0.9
@@ -85,6 +87,7 @@ def test_rolling_disk_moves_in_circles_and_conserves_free_momenta():
     assert_allclose(run.multipliers().T, centripetal, rtol=0, atol=1e-11)
 
 
+@pytest.mark.second
 def test_energy_does_not_drift():
     """Area is not preserved; the steps are symmetric and the system is reversible."""
     system = sleigh()
@@ -97,6 +100,7 @@ def test_energy_does_not_drift():
     assert abs(energy[-500:].mean() - energy[:500].mean()) < 1e-8
 
 
+@pytest.mark.second
 def test_holonomic_and_moving_nonholonomic_constraints_combine():
     """A slope x = 4 z equals the system with z eliminated; and a moving constraint x_dot = cos(t)."""
     common = {"parameters": {"m": 1.0, "J": 0.3, "g": 9.81}, "name": "sleigh on a slope"}
@@ -145,6 +149,7 @@ def test_a_blade_of_prescribed_direction_does_no_work():
     assert np.abs(run.energy() - 0.5).max() < 1e-12 < 0.1 < np.ptp(run.velocity[:, 0])
 
 
+@pytest.mark.second
 def test_nonholonomic_constraints_from_sympy_mechanics():
     x, y, a = dynamicsymbols("x y a")
     m, j, d, k = sympy.symbols("m J d k")
@@ -178,6 +183,7 @@ def test_invalid_nonholonomic_constraints_are_rejected():
     assert_allclose(q, [0.0, 0.0, 0.5], rtol=0, atol=0.0)
 
 
+@pytest.mark.second
 def test_violated_velocity_constraints_of_rotations_are_named_without_a_rate():
     text, constraints = "omega_1**2 + omega_2**2 + 2*omega_3**2 - R_33", ["omega_3 = 0.2"]
     system = sc.LagrangianSystem.from_text("top", lagrangian=text, rotations={"R": "omega"}, constraints=constraints)

@@ -71,6 +71,7 @@ def test_model_file_is_read_completely(net: Path) -> None:
     assert np.array_equal(own.q["r"], other.q["r"])
 
 
+@pytest.mark.second
 def test_solver_is_read_from_the_file(net: Path) -> None:
     """The run equals Newton's iteration bitwise; the solver is retained if the method changes."""
     net.write_text(net.read_text().replace('"svi:2"', '"svi:2"\nsolver = "newton"'))
@@ -186,6 +187,7 @@ span = 1.0
 """
 
 
+@pytest.mark.rotated
 def test_long_arrays_are_written_to_tables(tmp_path: Path) -> None:
     """Files beside a saved model, and in a generated folder, whose stepper is loaded with them."""
     text = (
@@ -207,6 +209,7 @@ def test_long_arrays_are_written_to_tables(tmp_path: Path) -> None:
     assert np.array_equal(run.q["q"], model.integrate().q["q"][-1])
 
 
+@pytest.mark.second
 def test_models_of_arrays_have_inputs(tmp_path: Path) -> None:
     """The mean moves as the exact integral of the force; known sizes give the same states."""
     path = tmp_path / "driven.toml"
@@ -275,6 +278,7 @@ def test_tolerance_selects_adaptive_steps(net: Path) -> None:
     assert sc.load_model(net, {"run": {"step": 0.1, "span": 1.0}}).step_count == 10
 
 
+@pytest.mark.second
 def test_generated_example_frees_memory_and_rejects_indices_out_of_range(
     net: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

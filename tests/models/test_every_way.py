@@ -188,6 +188,7 @@ def compiled(case, model, **options):
     return stepper, stepper.integrate(model.q, **moving(model), **case.arguments)
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("name", CASES)
 def test_every_way_gives_the_states_of_integrate(name):
     case = CASES[name]
@@ -221,6 +222,7 @@ def printed_states(folder, compiler):
     return np.array([line.split() for line in lines if line[0] != "#"], dtype=float), [x for x in lines if x[0] == "#"]
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(
     ("name", "compiler"), [*((name, "cc") for name in CASES if name != "array"), ("driven", "gcc"), ("driven", "clang")]
 )

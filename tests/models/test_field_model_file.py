@@ -96,6 +96,7 @@ steps = 5
 """
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("text", [STRING, SCHROEDINGER, PLANE, OSCILLATOR])
 @pytest.mark.filterwarnings("ignore::scvi_codegen.AccuracyWarning")
@@ -126,6 +127,7 @@ def test_models_have_the_mesh_of_their_density():
     assert model.stepper().interface.layout.mesh is not None
 
 
+@pytest.mark.rotated
 def test_models_with_known_sizes_keep_the_mesh():
     model = parse_model(SCHROEDINGER).with_known_sizes()
     assert model.stepper().interface.layout.mesh is model.mesh is not None
@@ -161,6 +163,7 @@ def test_invalid_files_are_rejected_by_name(old, new, message):
         parse_model(STRING.replace(old, new, 1)).start()
 
 
+@pytest.mark.second
 def test_commands_accept_a_density(here):
     """Equations first; the folder runs and keeps the density."""
     Path("nls.toml").write_text(SCHROEDINGER)

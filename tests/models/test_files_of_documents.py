@@ -92,6 +92,7 @@ def test_includes_outside_the_folder_of_a_robot_are_refused(folders, file):
     assert sc.LagrangianSystem.from_mjcf(robot).dimension == 1
 
 
+@pytest.mark.second
 def test_files_named_on_the_command_line_may_be_anywhere(folders):
     own, other = folders
     document = own / "model.toml"
@@ -100,6 +101,7 @@ def test_files_named_on_the_command_line_may_be_anywhere(folders):
     assert json.loads(printed)["steps"] == 5
 
 
+@pytest.mark.tiers(1, 2)
 @pytest.mark.parametrize("name", KINDS)
 def test_files_in_folders_that_a_user_names_may_be_anywhere(folders, name):
     own, other = folders

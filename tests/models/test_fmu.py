@@ -71,6 +71,7 @@ MODELS = {
 }
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", MODELS)
 def test_states_equal_those_of_the_stepper_bitwise(name, tmp_path):
@@ -131,6 +132,7 @@ def check_event_mode(fmu, model, run):
     assert one.update_discrete_states() == (True, True)
 
 
+@pytest.mark.rotated
 def test_impacts_within_communication_steps(tmp_path):
     """States equal those of the stepper, also from a saved state; the crossing of x = -2 ends the simulation."""
     system = lagrange("ball", "x y", "(x_dot**2 + y_dot**2)/2 - g*y - y**4/40", g=1.0)
@@ -156,6 +158,7 @@ def test_impacts_within_communication_steps(tmp_path):
         sc.generate_fmu(replace(model, events=walls[2:]), tmp_path / "ended.fmu")
 
 
+@pytest.mark.second
 def test_inputs_are_zero_order_hold_and_parameters_may_change(fmu):
     model, one = pushed(), Slave(fmu)
     assert one.start(0.5, u=0.25, w=0.1) == OK
@@ -173,6 +176,7 @@ def test_inputs_are_zero_order_hold_and_parameters_may_change(fmu):
     assert one.get("q_dot") == [run.p[0] / (2.5 + w)]
 
 
+@pytest.mark.second
 def test_communication_steps_of_any_length_are_divided_equally(fmu):
     one, stepper = Slave(fmu), stepper_of(pushed())
     assert one.start(0.5) == OK
@@ -398,6 +402,7 @@ def test_names_are_made_unique(tmp_path):
     assert len(set(names)) == len(names) == 8
 
 
+@pytest.mark.rotated
 def test_archive_is_reproducible_and_contains_all_sources(tmp_path):
     first, second = (sc.generate_fmu(pushed(), part / "push.fmu") for part in _folders(tmp_path, "a", "b"))
     assert first.read_bytes() == second.read_bytes()
@@ -434,6 +439,7 @@ def test_all_functions_of_the_standard_are_there(fmu):
     assert len(exported) == 75
 
 
+@pytest.mark.second
 def test_unsuitable_models_and_names_are_rejected(tmp_path):
     model = pushed()
     for wrong, words in (
@@ -465,6 +471,7 @@ def test_unsuitable_models_and_names_are_rejected(tmp_path):
         sc.generate_fmu(model, tmp_path / "missing" / "push.fmu")
 
 
+@pytest.mark.second
 def test_command_line_writes_an_fmu(tmp_path):
     target = tmp_path / "kepler.fmu"
     invoke("generate", "kepler", "--method", "svi:2", "--fmu", "-o", target)

@@ -100,6 +100,7 @@ def test_every_kind_of_method_survives_a_round_trip(method):
     assert parse_model(dump_model(model)) == model
 
 
+@pytest.mark.rotated
 @given(
     q=st.tuples(finite, finite),
     p=st.tuples(finite, finite),

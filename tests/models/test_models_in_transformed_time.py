@@ -10,6 +10,8 @@ import scvi_codegen as sc
 from scvi_codegen.errors import ModelFileError
 from scvi_codegen.models.model_files.model_file import catalogue_model, dump_model, parse_model
 
+pytestmark = pytest.mark.second
+
 BY_CLOCK = {"system": {"time_transformation": "frequency"}, "run": {"step": 0.2, "span": 20.0}}
 
 
@@ -18,6 +20,7 @@ def model() -> sc.Model:
     return catalogue_model("kepler", BY_CLOCK)
 
 
+@pytest.mark.quick
 @pytest.mark.parametrize("time_transformation", ["frequency", "(q1**2 + q2**2)**(3/4)"])
 def test_files_contain_the_time_transformation(time_transformation: str) -> None:
     found = catalogue_model(
@@ -70,6 +73,7 @@ def test_command_line_finds_a_step_and_reports_unsuitable_steps() -> None:
     assert "Error" in error_of("run", "kepler", *far, "--tolerance", "1e-10", status=1)
 
 
+@pytest.mark.tiers(3)
 @pytest.mark.parametrize("run", [{"tolerance": 1e-8}, {"tolerance": 1e-8, "span": -5.0}, {"step": 0.1}])
 @pytest.mark.parametrize("system", [{}, {"time_transformation": "frequency"}], ids=["t", "tau"])
 def test_single_step_functions_use_the_first_step_of_the_run(run: dict[str, float], system: dict[str, str]) -> None:

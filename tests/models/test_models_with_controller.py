@@ -16,6 +16,8 @@ from scvi_codegen import ModelFileError, StateError, SystemDefinitionError, gene
 from scvi_codegen.models.model_files.model_file import catalogue_model, dump_model, parse_model
 from scvi_codegen.runtime.accuracy.largest_step import REFINEMENTS, largest_step
 
+pytestmark = pytest.mark.second
+
 SHAKEN = """
 [system]
 name = "shaken comet"
@@ -62,6 +64,7 @@ def test_controller_of_a_time_transformation_can_be_replaced() -> None:
     assert parse_model(dump_model(symplectic), {"run": {"controller": "reversible"}}) == reversible
 
 
+@pytest.mark.rotated
 def test_command_line_finds_the_step_in_tau(shaken: Path) -> None:
     printed = output_of("run", str(shaken), "--tolerance", "1e-8")
     error = float(printed.partition("largest local error: ")[2].partition(" ")[0])
@@ -87,6 +90,7 @@ def test_run_continues_from_a_folder(shaken: Path, tmp_path: Path) -> None:
     assert np.abs(sc.load_run(folder)[-1:].q - exact.q[-1]).max() < 1e-9
 
 
+@pytest.mark.quick
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
 @pytest.mark.parametrize("tolerance", [0.0, 1e-8])
@@ -146,6 +150,7 @@ def test_steps_end_at_breakpoints_of_inputs() -> None:
         searching.start(searching.stepper())
 
 
+@pytest.mark.quick
 @pytest.mark.parametrize(
     ("words", "printed"),
     [
@@ -170,6 +175,7 @@ def test_python_and_the_command_line_choose_the_same_step_of_tau() -> None:
     assert run.plan.tau > 0.0
 
 
+@pytest.mark.quick
 def test_unsupported_model_fields_are_reported(shaken: Path, tmp_path: Path) -> None:
     model = sc.load_model(shaken)
     with pytest.raises(ModelFileError, match="reversible controller"):
@@ -185,6 +191,7 @@ def test_unsupported_model_fields_are_reported(shaken: Path, tmp_path: Path) -> 
         parse_model(SHAKEN.replace('"reversible"', '"pid"'))
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize(("solver", "embedded"), [("auto", None), ("newton", None), ("auto", "single")])
 def test_folder_contains_the_controller_in_c_and_in_python(
     shaken: Path, tmp_path: Path, solver: str, embedded: str | None

@@ -178,6 +178,7 @@ def test_generated_programs_refuse_a_controller_with_a_step_size(generate, tmp_p
         write(model, tmp_path / "one.fmu" if generate == "generate_fmu" else tmp_path / "one")
 
 
+@pytest.mark.rotated
 def test_iterations_of_a_model_are_limited():
     from scvi_codegen import StepFailedError
 

@@ -43,6 +43,7 @@ def test_folder_contains_a_complete_integrator(pendulum, tmp_path):
     assert "pendulum_svi_step" in (folder / "README.md").read_text()
 
 
+@pytest.mark.rotated
 def test_a_single_file_computes_the_same_bits(tmp_path):
     pendulum = model_of("planar-pendulum", method=sc.SVI(3), steps=200, span=None)
     many = sc.generate_package(pendulum, tmp_path / "many" / "pendulum_svi")
@@ -71,6 +72,7 @@ def test_equal_models_give_equal_bytes(pendulum, tmp_path):
         assert path.read_bytes() == (two / path.relative_to(one)).read_bytes()
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", ["planar-pendulum", "kepler", "spherical-pendulum"])
 def test_package_steps_as_the_compiled_system_without_sympy(name, tmp_path):
@@ -91,6 +93,7 @@ def test_generated_c_is_compiled_unchanged(pendulum, tmp_path):
         sc.load_package(folder)
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize(
     ("h", "solver", "reported"),
     [
@@ -145,6 +148,7 @@ vortex_pairs.toml
 """
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(5)
 @pytest.mark.parametrize("words", KINDS.strip().splitlines())
 def test_every_kind_of_folder_is_built_without_a_warning(words, tmp_path):
@@ -160,6 +164,7 @@ def test_every_kind_of_folder_is_built_without_a_warning(words, tmp_path):
     assert (result.returncode, result.stderr) == (0, "")
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("steps", "lines"), [(7, 8), (20, 21), (39, 21), (41, 15)])
 def test_examples_print_at_most_twenty_states_up_to_the_end(steps, lines, tmp_path):
     """41 steps: 13 states of 3 steps each, and one of 2."""
@@ -182,6 +187,7 @@ def test_large_workspaces_are_not_on_the_stack(tmp_path):
     assert "static kepler_svi_run run;" in text
 
 
+@pytest.mark.rotated
 def test_user_names_do_not_occur_in_the_program(tmp_path):
     base = model_of("planar-pendulum", method=sc.SVI(1))
     model = replace(base, system=replace(base.system, name='*/ #error " ? \\\n """ evil'))
@@ -191,6 +197,7 @@ def test_user_names_do_not_occur_in_the_program(tmp_path):
     subprocess.run([sys.executable, "-c", "import pendulum_svi"], cwd=tmp_path, check=True)
 
 
+@pytest.mark.tiers(1, 2)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", ["main.c", "pendulum_svi.c", "__init__.py", "README.md", "interface.json"])
 def test_foreign_and_edited_files_require_force(pendulum, tmp_path, name):

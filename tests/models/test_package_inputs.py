@@ -37,6 +37,7 @@ def states_printed(folder, flags=STRICT):
     return np.loadtxt(printed.splitlines(), comments="#"), printed
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize("h", [0.03, None])
 @pytest.mark.parametrize("restitution", [0.8, None])
 def test_events_of_a_system_with_inputs(model, h, restitution, tmp_path):
@@ -109,6 +110,7 @@ def _tables(stepper, inputs):
     return table, saved
 
 
+@pytest.mark.rotated
 def test_inputs_without_data_are_zero(model, tmp_path):
     folder = generate_package(replace(model, inputs={}), tmp_path / "still")
     states, _ = states_printed(folder)
@@ -118,6 +120,7 @@ def test_inputs_without_data_are_zero(model, tmp_path):
     assert (np.isin(states[:, 0], run.t)).all()
 
 
+@pytest.mark.tiers(1)
 @pytest.mark.parametrize("precision", ["double", "single"])
 def test_inputs_on_a_microcontroller(model, precision, tmp_path):
     folder = generate_package(model, tmp_path / "pushed", embedded=precision)

@@ -87,6 +87,7 @@ def test_spherical_pendulum_is_a_particle_on_a_sphere() -> None:
     assert sympy.simplify(problem("spherical-pendulum").system.lagrangian - expected) == 0
 
 
+@pytest.mark.second
 def test_outer_solar_system_satisfies_newtons_equations() -> None:
     entry = problem("outer-solar-system")
     system = entry.system
@@ -121,6 +122,7 @@ def test_forces_of_a_chain(n: int) -> None:
     assert system.defaults == (0.25, 0.5)
 
 
+@pytest.mark.rotated
 def test_long_chain_is_defined_fast() -> None:
     with at_most(5_000_000):
         entry = problem("fput-chain:256")

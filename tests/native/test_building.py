@@ -272,6 +272,7 @@ DAMAGE = {
 }
 
 
+@pytest.mark.tiers(5)
 @pytest.mark.parametrize("damage", DAMAGE)
 def test_damaged_entry_is_rebuilt(damage, cache, monkeypatch):
     answer()
@@ -297,6 +298,7 @@ def of_another_system(_data: bytes) -> bytes:
 LOADING = "import test_building; print(test_building.answer())"
 
 
+@pytest.mark.tiers(1)
 @pytest.mark.parametrize("changed", [of_another_processor, of_another_system])
 @pytest.mark.skipif(sys.platform == "darwin", reason="the header is that of ELF files")
 def test_foreign_library_with_matching_manifest_is_rebuilt(changed, cache):
@@ -362,6 +364,7 @@ def racer(cache: str, barrier, results) -> None:
     results.put(race(cache, barrier))
 
 
+@pytest.mark.rotated
 def test_concurrent_builds_into_an_empty_cache_give_one_entry(cache):
     context = multiprocessing.get_context("spawn")
     barrier, results = context.Barrier(6), context.Queue()
@@ -428,6 +431,7 @@ def test_the_compiler_from_the_wheel_is_the_last_resort(monkeypatch):
     assert compilers.find_compiler() == (sys.executable, "-m", "ziglang", "cc")
 
 
+@pytest.mark.rotated
 @pytest.mark.skipif(importlib.util.find_spec("ziglang") is None, reason="pip install 'scvi-codegen[compiler]'")
 def test_the_compiler_from_the_wheel_compiles(monkeypatch):
     monkeypatch.setenv("CC", f"{sys.executable} -m ziglang cc")

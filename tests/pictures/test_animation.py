@@ -103,6 +103,7 @@ class TestShapes:
         (places,) = positions(run, [[0.0]])
         assert np.allclose(places, [[0.0, 0.0], [0.0, 3.0]])
 
+    @pytest.mark.tiers(1, 2)
     @pytest.mark.sampled(2)
     @pytest.mark.parametrize(
         ("lagrangian", "coordinates"),
@@ -120,6 +121,7 @@ class TestShapes:
     def test_systems_that_resemble_pendulums_are_not_drawn_as_such(self, lagrangian, coordinates):
         assert not is_pendulum(run_with(lagrangian, coordinates))
 
+    @pytest.mark.rotated
     def test_bodies_are_points_with_names(self):
         run = run_of("outer-solar-system", 2)
         assert tuple(mark["name"] for mark in drawn_shape(run).marks) == (
@@ -180,6 +182,7 @@ class TestFilm:
         assert (len(frames), frames[0], frames[-1]) == (50, 0, 1000)
         assert np.ptp(np.diff(run.t[frames])) <= 1.001 * run.h
 
+    @pytest.mark.rotated
     def test_each_frame_shows_its_state(self):
         run = run_of("double-pendulum")
         film = run.animate()
@@ -192,12 +195,14 @@ class TestFilm:
             assert any(np.allclose(line.get_xydata(), rods) for line in axes.lines if len(line.get_xdata()) == 3)
             assert axes.get_title() == f"double pendulum, t = {run.t[frame]:.6g}"
 
+    @pytest.mark.tiers(0, 1)
     @pytest.mark.sampled(2)
     @pytest.mark.parametrize("name", ["charged-particle", "fput-chain", "planar-pendulum", "outer-solar-system"])
     def test_animation_has_a_notebook_display(self, name):
         shown = run_of(name, 3).animate(seconds=0.2)._repr_html_()
         assert shown.count("data:image/png") == 4
 
+    @pytest.mark.rotated
     def test_frames_of_adaptive_steps_are_dense_output_at_equal_times(self, capsys):
         run = run_of("kepler", 1).stepper.integrate([0.5, 0.0], [0.0, 3**0.5], t_end=6.0, tolerance=1e-5)
         drawn = []
@@ -209,6 +214,7 @@ class TestFilm:
         assert drawn[-1] == (25, 25)
         assert capsys.readouterr().err == ""  # no terminal
 
+    @pytest.mark.second
     def test_drawing_of_an_ensemble_reports_its_progress(self):
         stepper = run_of("kepler", 1).stepper
         runs, drawn = stepper.integrate_ensemble([[1.0, 0.0]] * 2, [[0.0, 1.0], [0.0, 1.1]], h=0.1, steps=9), []
@@ -220,6 +226,7 @@ class TestFilm:
         back = run.stepper.integrate(run.q[-1], run.p[-1], h=-run.h, steps=10)
         assert list(back.animate(seconds=1.0).frames) == list(range(11))
 
+    @pytest.mark.rotated
     def test_files_are_complete_animations(self, tmp_path):
         run = run_of("kepler", 4)
         run.animate(tmp_path / "film.gif", seconds=0.2)

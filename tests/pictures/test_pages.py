@@ -168,6 +168,7 @@ plots = [["x", "p_x"], ["t", "energy"]]
 """
 
 
+@pytest.mark.second
 @pytest.mark.usefixtures("without_compiler")
 def test_the_section_page_sets_sliders_speed_and_plots_and_arguments_replace_it(tmp_path):
     path = written(tmp_path, OSCILLATOR + PAGE)

@@ -32,6 +32,7 @@ def kepler() -> sc.Trajectory:
     return trajectory_of("kepler")
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize("suffix", [".png", ".svg", ".pdf"])
 def test_equal_trajectories_give_equal_bytes(kepler, tmp_path, suffix):
     one, two = tmp_path / f"one{suffix}", tmp_path / f"two{suffix}"
@@ -52,6 +53,7 @@ def test_bodies_are_named_in_the_legend_and_drawn_where_they_are():
     assert labels == ["sun", "jupiter", "saturn", "uranus", "neptune", "pluto"]
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", ["kepler", "planar-pendulum", "fput-chain:12"])
 @pytest.mark.parametrize("steps", [0, 1])
@@ -59,10 +61,12 @@ def test_a_single_state_can_be_drawn(name, steps, tmp_path):
     sc.plot_trajectory(trajectory_of(name, steps), tmp_path / "short.png")
 
 
+@pytest.mark.rotated
 def test_a_run_backward_can_be_drawn(tmp_path):
     sc.plot_trajectory(trajectory_of("fput-chain:12", h=-0.1), tmp_path / "back.svg")
 
 
+@pytest.mark.second
 def test_an_exactly_conserved_energy_can_be_drawn(tmp_path):
     sc.plot_trajectory(trajectory_of("charged-particle", 2), tmp_path / "exact.png")
 
@@ -116,6 +120,7 @@ def test_failed_picture_leaves_no_file(kepler, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.second
 def test_dollar_signs_in_names_are_escaped(tmp_path):
     model = sc.Model.from_problem(sc.problem("planar-pendulum"))
     system = replace(model.system, name="a $ b $ {")
@@ -130,6 +135,7 @@ def orbits() -> list[sc.Trajectory]:
     return [stepper.integrate([0.0, y], [0.3, 0.0], h=0.1, steps=3000) for y in (-0.1, 0.2)]
 
 
+@pytest.mark.second
 def test_section_contains_the_states_at_the_crossings(orbits, tmp_path):
     axes = sc.plot_section(orbits, axes=("y", "p_y"), event=1)
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("y", "p_y")
@@ -184,6 +190,7 @@ class TestAdaptiveSteps:
         with pytest.raises(sc.StateError, match=r"there is no quantity 'q3'.*Known: q1, q2, p_q1"):
             ellipse["q3"]
 
+    @pytest.mark.rotated
     def test_ensembles_are_drawn_together(self, ellipse, tmp_path):
         q, p = np.array([[0.5, 0.0], [0.4, 0.1]]), np.array([[0.0, 1.7]] * 2)
         runs = ellipse.stepper.integrate_ensemble(q, p, t_end=[3.0, 2.0], tolerance=1e-4)
@@ -215,6 +222,7 @@ class TestOnePicture:
         assert pyplot.gcf() is axes.figure
         assert mpl.rcParams["axes.grid"] is False
 
+    @pytest.mark.second
     def test_path_writes_a_file_and_closes_the_figure(self, kepler, tmp_path):
         kepler.plot.momentum_maps(tmp_path / "maps.svg")
         assert "angular momentum" in (tmp_path / "maps.svg").read_text(encoding="utf-8")

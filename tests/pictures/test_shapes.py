@@ -45,6 +45,7 @@ walls = [["left", "wall"]]
 """
 
 
+@pytest.mark.second
 def test_a_picture_is_drawn_in_films_and_written_to_files(tmp_path):
     pytest.importorskip("matplotlib")
     (tmp_path / "cart.toml").write_text(CART, encoding="utf-8")

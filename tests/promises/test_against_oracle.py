@@ -56,6 +56,7 @@ def check(sample, compiled, name, method, *, h=H, t=T, **how):
     assert relative(compiled(name, method, **how).step(q, p, h, t), case.oracle(method, q, p, h, t)) < TOLERANCE
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(3)
 @pytest.mark.covering
 @pytest.mark.parametrize("name", SYSTEMS)
@@ -84,6 +85,7 @@ SOLVED_BOTH_WAYS = (
 )
 
 
+@pytest.mark.tiers(1, 3)
 @pytest.mark.sampled(6)
 @pytest.mark.parametrize("solver", ["newton", "fixed-point"])
 @pytest.mark.parametrize(("name", "method"), SOLVED_BOTH_WAYS, ids=lambda value: getattr(value, "name", value))
@@ -91,6 +93,7 @@ def test_both_solvers_agree_with_the_oracle(sample, compiled, name, method, solv
     check(sample, compiled, name, method, solver=solver)
 
 
+@pytest.mark.tiers(1, 3)
 @pytest.mark.sampled(18)
 @pytest.mark.parametrize("method", first_of_each(MANY, family), ids=lambda method: method.name)
 def test_every_family_of_methods_agrees_with_the_oracle(sample, compiled, method):
@@ -105,6 +108,7 @@ def test_every_method_on_every_system_agrees_with_the_oracle(sample, compiled, n
     check(sample, compiled, name, method, flags=UNOPTIMISED_FLAGS)
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("degree", [20, *(pytest.param(s, marks=pytest.mark.full) for s in (17, 24, 28, 32))])
 @pytest.mark.parametrize("name", ["kepler", "pumped-cart-pole"])
@@ -121,6 +125,7 @@ def test_steps_of_more_than_16_points_agree_with_the_oracle(sample, compiled, na
     assert relative(stepper.jacobian(q, p, H, T), np.subtract(after, before).T / 2e-5) < 1e-8
 
 
+@pytest.mark.tiers(1, 2)
 @pytest.mark.covering
 @pytest.mark.parametrize(
     "method", [sc.SVI(2, "gauss-legendre:3"), sc.SCVI(3), sc.RadauIIA(2)], ids=lambda method: method.name
@@ -130,6 +135,7 @@ def test_backward_steps_and_large_times_agree_with_the_oracle(sample, compiled, 
     check(sample, compiled, "pumped-cart-pole", method, h=h, t=t)
 
 
+@pytest.mark.tiers(1, 1)
 @pytest.mark.parametrize("method", [sc.SVI(2, "gauss-legendre:3"), sc.SCVI(3)], ids=lambda method: method.name)
 def test_parameters_of_a_step_agree_with_the_oracle(sample, compiled, method):
     case, changed = sample("pumped-cart-pole"), {"a": 0.35, "m": 1.3, "k": -0.2}
@@ -150,6 +156,7 @@ def test_verlet_is_the_leapfrog_of_separable_systems(sample, compiled, name):
     assert relative(compiled(name, sc.StoermerVerlet()).step(q, p, H, T), expected) < TOLERANCE
 
 
+@pytest.mark.second
 def test_oracle_distinguishes_neighbouring_methods_and_times(sample):
     """The comparison has teeth: neighbouring methods and a slightly other time are far outside the tolerance."""
     case = sample("pumped-cart-pole")

@@ -66,6 +66,7 @@ def test_sanitizers_report_no_error(tmp_path):
     run_stepper_tests(tmp_path, SANITIZERS, *files, CC="gcc", LD_PRELOAD=libraries, ASAN_OPTIONS=options)
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", ["kepler", "double-pendulum", "charged-particle"])
 def test_portable_flags_are_bitwise_reproducible(tmp_path, monkeypatch, name):

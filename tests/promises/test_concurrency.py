@@ -85,6 +85,7 @@ def at_once(processes: list[subprocess.Popen[str]]) -> list[tuple[str, str]]:
     return [process.communicate(timeout=300) for process in processes]
 
 
+@pytest.mark.rotated
 def test_concurrent_processes_compile_into_an_empty_cache(folder):
     results = at_once([loading(folder, i % 4) for i in range(PROCESSES)])
     assert results == [(f"{i % 4}.0\n", "") for i in range(PROCESSES)]
@@ -93,6 +94,7 @@ def test_concurrent_processes_compile_into_an_empty_cache(folder):
     assert all(building._is_intact(folder / name) for name in found)
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("rounds", [1, pytest.param(12, marks=pytest.mark.full)])
 def test_entries_removed_during_loading_are_rebuilt(folder, rounds):
     """The cache has room for one entry, so each process removes the others' entries."""
@@ -138,6 +140,7 @@ def killed(folder: Path, seconds: float, generator: random.Random) -> None:
         process.kill()
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("times", [3, pytest.param(40, marks=pytest.mark.full)])
 def test_killed_compilation_leaves_a_usable_cache(folder, times, monkeypatch):
     generator, left = random.Random(times), 0
@@ -250,6 +253,7 @@ def test_threads_derive_at_once(folder):
         assert list(pool.map(lambda system: sc.generate_source(system, SVI(2)), systems * 2)) == alone * 2
 
 
+@pytest.mark.tiers(1, 1)
 @pytest.mark.parametrize("method", ["fork", "spawn", pytest.param("forkserver", marks=pytest.mark.full)])
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
 def test_steppers_are_pickled_to_other_processes(kepler, finals, method):
@@ -264,6 +268,7 @@ def test_joblib_runs_steppers(kepler, finals, backend):
     assert joblib.Parallel(n_jobs=2, backend=backend)(work) == finals[:6]
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("scheduler", ["threads", "processes"])
 def test_dask_runs_steppers(kepler, finals, scheduler):
     dask = pytest.importorskip("dask")

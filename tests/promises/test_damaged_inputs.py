@@ -140,6 +140,7 @@ def _is_huge(x: Any) -> bool:
     return isinstance(x, int | float) and not isinstance(x, bool) and abs(x) > 1e6
 
 
+@pytest.mark.tiers(3, 18)
 @pytest.mark.parametrize("name", CALLS)
 def test_special_values_are_rejected_or_handled(name: str, here: Path) -> None:
     failed = []
@@ -203,6 +204,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize("part", [0, *(pytest.param(part, marks=pytest.mark.full) for part in range(1, PARTS))])
 def test_damaged_manifests_are_rejected(recorded: Path, part: int) -> None:
     """Every entry of a manifest with every value: refused as a recording, or read and used without harm."""
@@ -276,6 +278,7 @@ WORDS = [
 ]  # fmt: skip
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("part", range(3))
 @pytest.mark.parametrize("text", [GAS, TRANSFORMED, MODEL], ids=["gas", "transformed", "driven"])

@@ -31,6 +31,7 @@ def damped(lagrangian=L, **extra):
     )
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(3)
 @pytest.mark.covering
 @pytest.mark.parametrize("solver", ["auto", "newton"])
@@ -60,6 +61,7 @@ def test_a_step_is_that_of_the_scaled_lagrangian(method, solver):
         assert np.abs(p - grown_p / np.exp(GAMMA * (t + h))).max() < 4e-15
 
 
+@pytest.mark.tiers(1)
 @pytest.mark.parametrize(
     "method", [sc.SVI(1), sc.SVI(3), sc.Gauss(2), sc.StoermerVerlet()], ids=lambda method: method.name
 )
@@ -71,6 +73,7 @@ def test_linear_steps_contract_area_exactly(method):
         assert np.linalg.det(columns) == pytest.approx(np.exp(-0.3 * 0.2), rel=5e-16)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("h", [0.1, 0.8])
 def test_curved_steps_contract_area_exactly(h):
     """Check the compiled derivative for every step size; two backward steps return to the start."""
@@ -92,6 +95,7 @@ def rates(t, z):
     return [v, w, *np.linalg.solve(mass, right)]
 
 
+@pytest.mark.tiers(1, 2)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("method", "order", "counts"),
@@ -116,6 +120,7 @@ def test_order_is_that_without_damping(method, order, counts):
     assert errors[1] < 1e-4
 
 
+@pytest.mark.second
 def test_momentum_maps_decay_exactly_and_work_is_reported():
     """The angular momentum of a body about a centre; damping takes energy to the order of the method."""
     system = lagrange(
@@ -136,6 +141,7 @@ def test_momentum_maps_decay_exactly_and_work_is_reported():
     assert taken < 1e-9
 
 
+@pytest.mark.second
 def test_damping_with_adaptive_steps_ensembles_and_hamiltonians():
     """Lanes with different rates; H, its Lagrangian, additional forces; constrained systems."""
     hamiltonian = hamilton(
@@ -159,6 +165,7 @@ def test_damping_with_adaptive_steps_ensembles_and_hamiltonians():
         assert np.abs(np.concatenate([many.q[-1], many.p[-1]], axis=1) - ends).max() < 1e-8
 
 
+@pytest.mark.second
 def test_constrained_motion_is_that_of_the_angle():
     rod = lagrange(
         "damped rod", "x y", "(x_dot**2 + y_dot**2)/2 - y", c=0.5, damping="c", constraints=["x**2 + y**2 = 1"]
@@ -173,6 +180,7 @@ def test_constrained_motion_is_that_of_the_angle():
     assert np.log2(errors[0] / errors[1]) > 3.7
 
 
+@pytest.mark.rotated
 def test_certificate_reports_damping():
     certificate = sc.verify(damped(), sc.SVI(2), [0.3, -0.4], [0.5, 0.7], h=0.1, flags=QUICK_FLAGS)
     assert certificate.passed, certificate.to_text()

@@ -21,7 +21,7 @@ from scipy.optimize import brentq
 from scvi_codegen.models.model_files.model_file import load_model
 from scvi_codegen.native.building import FLAGS_VARIABLE
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.rotated]
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 SCRIPTS = (
@@ -73,11 +73,13 @@ def output_of(tmp_path, monkeypatch, capfd) -> Callable[..., str]:
     return output
 
 
+@pytest.mark.quick
 def test_every_example_is_tested():
     assert {path.stem for path in EXAMPLES.glob("*.py")} == set(SCRIPTS)
     assert {path.stem for path in EXAMPLES.glob("*.toml")} == {*ENERGY_ERRORS, "shaken_tower", "fput_ring"}
 
 
+@pytest.mark.tiers(0, 2)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", ENERGY_ERRORS)
 def test_model_files_run_and_conserve_energy(name, tmp_path):
@@ -90,6 +92,7 @@ def test_model_files_run_and_conserve_energy(name, tmp_path):
         assert len(written["t"]) == model.step_count // model.save_every + 1
 
 
+@pytest.mark.tiers(0, 1)
 def test_ring_conserves_energy_and_momentum(tmp_path):
     output = tmp_path / "run.npz"
     words = ["run", str(EXAMPLES / "fput_ring.toml"), "--steps", "100", "-o", str(output)]
@@ -103,6 +106,7 @@ def test_ring_conserves_energy_and_momentum(tmp_path):
     assert np.ptp(p.sum(axis=1)) < 1e-14
 
 
+@pytest.mark.tiers(0, 1)
 def test_shaken_tower_agrees_with_dop853(tmp_path):
     """Compare with DOP853 between breakpoints of SciPy's spline through the same table."""
     assert "too long" not in invoke("run", EXAMPLES / "shaken_tower.toml", "-o", tmp_path / "run.csv").output
@@ -119,6 +123,7 @@ def test_shaken_tower_agrees_with_dop853(tmp_path):
     assert last[:5] == pytest.approx([8.0, *state], abs=1e-8)
 
 
+@pytest.mark.tiers(0, 1)
 def test_kepler_conservation_distinguishes_the_methods(output_of):
     errors = {
         line[:32].strip(): [float(word) for word in line[32:].split()]
@@ -130,6 +135,7 @@ def test_kepler_conservation_distinguishes_the_methods(output_of):
     assert min(errors["explicit Euler"]) > 0.1
 
 
+@pytest.mark.tiers(0, 1)
 def test_eccentric_comet_conserves_energy(output_of):
     rows = [line[12:].split() for line in output_of("eccentric_comet").splitlines()[1:]]
     (stretched, regular) = ([float(word) for word in row] for row in rows)
@@ -164,11 +170,13 @@ def test_every_step_size_selection_has_its_documented_accuracy(output_of):
     assert max(error[way] for way in (controlled, transformed, reversible)) < 1e-8 < error[fixed]
 
 
+@pytest.mark.tiers(0, 1)
 def test_comet_returns_after_a_near_collision(output_of):
     errors = [float(line.split()[-1]) for line in output_of("collisions_in_space").splitlines()[1:]]
     assert max(errors) < 1e-11
 
 
+@pytest.mark.tiers(0, 1)
 def test_leapfrog_with_logarithmic_hamiltonian_preserves_an_ellipse(output_of):
     rows = [line.split() for line in output_of("logarithmic_hamiltonian").splitlines()[1:]]
     _, away, period = zip(*(map(float, row) for row in rows), strict=True)
@@ -205,12 +213,14 @@ def test_curves_and_quadratures_have_their_documented_advantages(output_of):
     assert more < 1e-7 < hermite < trapezoid
 
 
+@pytest.mark.tiers(0, 1)
 def test_import_generated_stepper_runs_without_sympy(output_of):
     output = output_of("import_generated_stepper")
     assert "pendulum_svi.c" in output
     assert float(output.rsplit(maxsplit=1)[1]) < 1e-8
 
 
+@pytest.mark.quick
 def test_custom_sympy_system_finds_the_bifurcation(output_of):
     output = output_of("custom_sympy_system")
     assert "the same from LagrangesMethod: True" in output
@@ -279,6 +289,7 @@ def test_joint_forces_are_the_documented_ones(output_of):
     assert sum(hangers) == pytest.approx((9 * 0.2 + 3.0) * 9.81, abs=1e-3)
 
 
+@pytest.mark.quick
 def test_a_cart_balances_its_pole(output_of):
     output = output_of("balanced_cart_pole")
     assert float(re.search(r"formula to (\S+)", output)[1]) < 1e-9
@@ -301,6 +312,7 @@ def test_orbit_of_ceres_determines_the_mass_of_jupiter(output_of, tmp_path):
     assert (tmp_path / "ceres_orbit.png").stat().st_size > 10_000
 
 
+@pytest.mark.tiers(0, 1)
 def test_duffing_oscillator_is_identified_from_noisy_data(output_of):
     output = output_of("duffing_fit")
     for name, true in {"alpha": -1.0, "beta": 1.0, "delta": 0.3}.items():

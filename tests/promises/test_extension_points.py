@@ -15,6 +15,8 @@ from scvi_codegen import SVI, MethodError
 from scvi_codegen.lowering.stage_groups import layout_of
 from scvi_codegen.methods.discretise import discretise
 
+pytestmark = pytest.mark.rotated
+
 ROOT = Path(scvi_codegen.__file__).parents[1]
 PAGE = ROOT / "docs" / "extending.md"
 
@@ -63,6 +65,7 @@ def run(folder: Path, script: str) -> str:
     return found.stdout
 
 
+@pytest.mark.quick
 def test_documented_additions_need_one_file_and_one_line() -> None:
     new, changes = additions()
     lines = [line for _, change in changes for line in change.splitlines() if line[:1] in "+-"]
@@ -289,6 +292,7 @@ for observe in ("variance", Variance()):
     assert run(extended, script).split() == ["True", "2", "True"] * 2
 
 
+@pytest.mark.quick
 def test_two_block_sizes_need_blocks_and_rows_of_each() -> None:
     """Multipliers are blocks of as many components as there are constraints."""
     rod = lagrange("mass on a rod", "x y", "(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 = 1"])

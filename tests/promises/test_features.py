@@ -177,6 +177,7 @@ def situations():
     return cache(lambda name: SITUATIONS[name]())
 
 
+@pytest.mark.tiers(1, 3)
 @pytest.mark.parametrize("situation", SITUATIONS)
 def test_refusals_of_the_table_are_those_of_the_operations(situation, situations):
     stepper = situations(situation)
@@ -192,6 +193,7 @@ def test_refusals_of_the_table_are_those_of_the_operations(situation, situations
         assert remedy in str(error.value), (operation, situation)
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("half", [0, pytest.param(1, marks=pytest.mark.full)])
 @pytest.mark.parametrize("situation", [name for name in SITUATIONS if name != "without derivatives"])
 def test_operations_that_a_stepper_supports_work(situation, half, situations):
@@ -228,6 +230,7 @@ def test_page_lists_the_names_and_what_excludes_them():
     assert PAGE.endswith(refusals())
 
 
+@pytest.mark.second
 def test_known_sizes_of_rattle_compute_the_same_run():
     stepper = array_with_constraint("stoermer-verlet")
     run, known = (run_of(each, steps=30) for each in (stepper, stepper.with_sizes(N=2)))

@@ -101,6 +101,7 @@ def named(case):
     return case[0].name
 
 
+@pytest.mark.tiers(1, 2)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("case", QUICK, ids=named)
 def test_order_is_that_without_forces(quickly_compiled, case):

@@ -304,6 +304,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+@pytest.mark.rotated
 def test_damaged_files_are_read_or_rejected(root: Path) -> None:
     assert sum(try_file(number, root) for number in range(240)) > 12
 
@@ -339,6 +340,7 @@ def test_paths_with_null_characters_are_rejected(load: Callable[[str], Any]) -> 
         load("a\0b")
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize("degree", [31, pytest.param(63, marks=pytest.mark.full)])
 def test_elements_of_high_degree_are_assembled_in_bounded_work(degree: int, tmp_path: Path) -> None:
     (tmp_path / "model.toml").write_text(FIELD.replace("degree = 4", f"degree = {degree}"))
@@ -346,6 +348,7 @@ def test_elements_of_high_degree_are_assembled_in_bounded_work(degree: int, tmp_
         load_model(tmp_path / "model.toml")
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", ["model.toml", "u.csv", "v.npz", "grid.toml", "states.csv", "manifest.json"])
 @pytest.mark.parametrize("other", ["device", "pipe", "folder"])
 def test_only_regular_files_are_read(name: str, other: str, tmp_path: Path) -> None:
@@ -375,6 +378,7 @@ def test_a_full_disk_before_the_manifest_leaves_nothing_to_resume(tmp_path: Path
     assert "resume" not in str(caught.value)
 
 
+@pytest.mark.second
 def test_an_undefined_change_of_the_state_is_not_one_of_the_event_function() -> None:
     stepper = sc.compile_stepper(
         sc.problem("harmonic-oscillator").system,

@@ -270,6 +270,7 @@ def check_oscillator(stepper: sc.Stepper, random: Random) -> bool:
     return True
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize("solver", ["auto", "newton", "fixed-point"])
 @pytest.mark.parametrize("kind", ["lagrangian", "hamiltonian"])
@@ -281,6 +282,7 @@ def test_oscillator_of_any_size_with_any_step_is_correct_or_rejected(kind, solve
     assert done > 100
 
 
+@pytest.mark.second
 def test_ensemble_with_any_sizes_is_correct_or_reports_failures():
     stepper = prepared(sc.compile_stepper(oscillator("lagrangian"), sc.SVI(2), flags=QUICK_FLAGS))
     random = Random(3)
@@ -328,6 +330,7 @@ def check_nonlinear(name: str, method: Any, random: Random) -> bool:
     return len(found) == 2
 
 
+@pytest.mark.tiers(1, 1)
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize(("name", "method"), NONLINEAR, ids=lambda value: str(getattr(value, "name", value)))
 def test_any_state_gives_a_finite_step_or_is_rejected(name, method):

@@ -147,6 +147,7 @@ BETWEEN = (
 """Degrees whose neighbours are in the default tier."""
 
 
+@pytest.mark.tiers(0, 2)
 @pytest.mark.parametrize(
     ("name", "system", "ways", "least"),
     [
@@ -165,6 +166,7 @@ def test_methods_are_one_map_or_different_ones(sample, compiled, name, system, w
         assert min(distance(*each) for each in combinations(maps, 2)) > least
 
 
+@pytest.mark.tiers(1, 4)
 @pytest.mark.parametrize("name", ANY)
 def test_svi_of_degree_one_with_one_gauss_point_is_the_midpoint_rule(sample, compiled, name):
     """The midpoint rule on (q, p): q1 = q0 + h v, p1 = p0 + h L_q, both at the mean of the states."""
@@ -198,6 +200,7 @@ def with_gauge(name, order):
     return lagrange(name, "q", lagrangian + (gauge if order else ""), alpha=1.2)
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     ("method", "order", "exact"),

@@ -121,6 +121,7 @@ def circle(used: dict[str, set[str]]) -> list[str]:
     return []
 
 
+@pytest.mark.rotated
 def test_every_package_belongs_to_one_layer():
     assert len(FLOOR_OF) == len(FLOORS.split())
     assert {room_of(module) for module in names()} == set(FLOOR_OF)
@@ -137,17 +138,20 @@ def test_folders_have_at_most_16_files():
     assert [str(folder) for folder, count in counts.items() if count > 16] == []
 
 
+@pytest.mark.rotated
 def test_imports_point_to_lower_layers_only():
     pairs = [(m, other) for m, others in used().items() for other in others if room_of(other) != room_of(m)]
     assert [pair for pair in pairs if FLOOR_OF[room_of(pair[1])] >= FLOOR_OF[room_of(pair[0])]] == []
 
 
+@pytest.mark.rotated
 def test_the_package_imports_nothing_else_of_the_checkout():
     folders = {path.name for path in PACKAGE.parent.iterdir() if path.is_dir()} - {PACKAGE.name}
     assert {"benchmarks", "tests", "examples"} <= folders
     assert {name for imported in names().values() for name in imported if name.split(".")[0] in folders} == set()
 
 
+@pytest.mark.rotated
 def test_no_module_imports_itself_indirectly():
     assert circle(used()) == []
 
@@ -156,6 +160,7 @@ def test_circular_import_is_detected():
     assert circle({"a": {"b"}, "b": {"c"}, "c": {"a", "d"}})
 
 
+@pytest.mark.second
 def test_third_party_libraries_are_imported_by_assigned_packages_only():
     users = {(name.split(".")[0], room_of(m)) for m, imported in names().items() for name in imported}
     assert {(name, room) for name, room in users if room not in OWNERS.get(name, room).split()} == set()
@@ -164,6 +169,7 @@ def test_third_party_libraries_are_imported_by_assigned_packages_only():
 POSIX = {"fcntl", "grp", "posix", "pty", "pwd", "resource", "termios"}
 
 
+@pytest.mark.second
 def test_modules_specific_to_one_kind_of_system_are_not_imported():
     assert [m for m, imported in names().items() if POSIX & {name.split(".")[0] for name in imported}] == []
 
@@ -203,6 +209,7 @@ def test_importing_the_package_loads_no_heavy_library(tmp_path):
     assert loaded.isdisjoint([*HEAVY, "numpy", "cffi"])
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize("use", [STEPPING, RECORDING], ids=["stepping", "recording"])
 def test_a_generated_package_loads_no_heavy_library(tmp_path, use):
     folder = generate_package(Model.from_problem(problem("planar-pendulum")), tmp_path / "pendulum_svi")

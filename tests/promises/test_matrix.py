@@ -33,6 +33,7 @@ def identity(name: str, case: Case) -> str:
     return f"{name}-{case.problem.name}-{word}-{solver}-{case.situation}"
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(14)
 @pytest.mark.parametrize(
     ("name", "case"),

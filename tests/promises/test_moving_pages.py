@@ -87,6 +87,7 @@ def middle_of(view: Any) -> tuple[float, float]:
     return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
 
 
+@pytest.mark.quick
 @pytest.mark.second
 def test_a_page_computes_the_bits_of_python_and_asks_for_nothing(view, pages):
     state = opened(view, pages["figure_eight"], "#.n=1000", 1000)
@@ -118,6 +119,7 @@ def test_a_link_reproduces_the_bits_after_reversal_and_a_change_of_parameters(vi
     assert {key: again[key] for key in ("t", "q", "p")} == {key: state[key] for key in ("t", "q", "p")}
 
 
+@pytest.mark.quick
 def test_a_link_reproduces_the_inputs_of_each_step_through_impacts(view, tmp_path):
     pytest.importorskip("ziglang", reason="pages are compiled by the extra compiler")
     system = sc.LagrangianSystem.from_text("ball", ["y"], lagrangian="y_dot**2/2 - y", inputs=["F"], forces={"y": "F"})
@@ -196,6 +198,7 @@ def test_keys_play_step_and_restart(view, pages):
     assert view.inner_text("#play") == "Play"
 
 
+@pytest.mark.quick
 @pytest.mark.parametrize(
     ("name", "address", "message"),
     [

@@ -4,11 +4,14 @@ import ast
 from collections import defaultdict
 from pathlib import Path
 
+import pytest
+
 import scvi_codegen
 
 PACKAGE = Path(scvi_codegen.__file__).parent
 
 
+@pytest.mark.rotated
 def test_no_two_classes_have_one_name():
     homes = defaultdict(list)
     for path in sorted(PACKAGE.rglob("*.py")):

@@ -70,6 +70,7 @@ def test_results_are_below_their_cells(tmp_path):
     assert page.count("```text\n2\n```") == page.count("```text\n3\n```") == page.count(":alt: a line") == 1
 
 
+@pytest.mark.second
 def test_error_of_a_cell_names_it(tmp_path):
     process = notebooks.run_in_process(saved(tmp_path / "one.ipynb", "1", "1/0"))
     _, errors = process.communicate(timeout=60)
@@ -81,6 +82,7 @@ SECOND = ("crane", "first_steps")
 """Notebooks that the second tier executes; the site and the full tier execute all."""
 
 
+@pytest.mark.tiers(0, 0)
 @pytest.mark.parametrize(
     "path",
     [

@@ -76,6 +76,7 @@ METHODS = (
 LOW = tuple(method for method in METHODS if method.order <= 6 and method not in SPECIAL)
 
 
+@pytest.mark.tiers(0, 2)
 @pytest.mark.sampled(10)
 @pytest.mark.parametrize("method", first_of_each(METHODS, family), ids=lambda method: method.name)
 def test_global_error_on_kepler_has_the_claimed_order(compiled, sample, method):
@@ -100,6 +101,7 @@ def test_certificate_measures_the_order_below_rounding(compiled, sample, method)
     assert method.order - 0.25 < order.measured < method.order + 0.3
 
 
+@pytest.mark.tiers(0, 2)
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize("method", LOW[::5], ids=lambda method: method.name)
 def test_global_error_on_a_coupled_time_dependent_system_has_the_claimed_order(compiled, sample, method):
@@ -112,6 +114,7 @@ def test_every_low_order_method_has_its_order_on_a_time_dependent_system(compile
     assert measured_order(compiled, sample, "pumped-cart-pole", method) == pytest.approx(method.order, abs=0.25)
 
 
+@pytest.mark.tiers(0, 2)
 @pytest.mark.sampled(2)
 @pytest.mark.covering
 @pytest.mark.parametrize("name", ["kepler", "planar-pendulum"])
@@ -122,6 +125,7 @@ def test_the_printed_shooting_equations_have_order_one_less_than_their_degree(co
     assert measured_order(compiled, sample, name, method) == pytest.approx(s - 1, abs=0.2)
 
 
+@pytest.mark.tiers(1)
 @pytest.mark.parametrize("method", [sc.SVI(2), sc.RadauIIA(3), sc.SCVI(2)], ids=lambda method: method.name)
 def test_the_reference_is_the_exact_solution_where_there_is_one(compiled, sample, method):
     """q'' = -q: the order from the closed form is equal, so errors of the reference would be detected."""

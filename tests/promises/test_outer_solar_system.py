@@ -10,7 +10,7 @@ import pytest
 from nbody_reference import integrate
 from outer_planets import GRAVITY, MASSES, POSITIONS, VELOCITIES
 
-pytestmark = pytest.mark.usefixtures("as_users_compile")
+pytestmark = [pytest.mark.usefixtures("as_users_compile"), pytest.mark.rotated]
 
 MODEL = Path(__file__).parents[2] / "examples" / "outer_solar_system.toml"
 SPAN = 200_000.0
@@ -50,6 +50,7 @@ def test_momenta_are_conserved_to_round_off(run):
     assert np.abs(angular - angular[0]).max() < 1e-14 * np.abs(angular[0]).max()
 
 
+@pytest.mark.second
 def test_errors_are_those_of_the_readme(run, reference):
     text = " ".join((MODEL.parents[1] / "README.md").read_text(encoding="utf-8").split())
     stated = r"(\d+) steps of (\d+) days: relative energy error (\S+), final positions within (\S+) AU"

@@ -55,6 +55,7 @@ def test_pickled_stepper_in_double_double_takes_the_same_steps() -> None:
         assert np.array_equal(*(getattr(run, name) for run in runs))
 
 
+@pytest.mark.tiers(2, 3)
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize("option", STEPPERS)
 def test_pickled_stepper_is_equal(option: str) -> None:
@@ -117,6 +118,7 @@ def test_pickled_run_continues_identically(argument: str, steps: int) -> None:
     check_same_run(run, copied(run), lambda each: each.record(STEPS if isinstance(each.plan, FixedSteps) else None))
 
 
+@pytest.mark.second
 def test_pickled_run_with_time_transformation_continues_identically() -> None:
     run = stepper("time_transformation").start(Q, P, h=0.2, t_end=0.9)
     run.record(2)

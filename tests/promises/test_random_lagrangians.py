@@ -126,6 +126,7 @@ def check(case, quickly_compiled):
 COMMON = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow], "database": None}
 
 
+@pytest.mark.rotated
 @given(case=cases())
 @settings(max_examples=12, derandomize=True, **COMMON)
 def test_random_steps_agree_with_the_oracle(quickly_compiled, case):

@@ -6,6 +6,8 @@ from tiers import family, first_of_each
 
 import scvi_codegen as sc
 
+pytestmark = pytest.mark.second
+
 DERIVATIVE_WEIGHTS = {1: 3 / 4, 2: -3 / 20, 3: 1 / 60}
 """Central differences of order six."""
 WIDTH = 2e-3
@@ -64,6 +66,7 @@ ON_SYSTEMS = (
 )
 
 
+@pytest.mark.tiers(1, 3)
 @pytest.mark.sampled(6)
 @pytest.mark.parametrize(("name", "method"), ON_SYSTEMS, ids=lambda value: getattr(value, "name", value))
 def test_symplectic_methods_preserve_the_two_form(sample, compiled, name, method):
@@ -83,6 +86,7 @@ PRINTED = {(2, 2): (0.0, 0.0), (3, 2): (4.6e-2, -2.3e-2), (5, 4): (6.6e-4, 6.7e-
 KEPLER = np.array([0.3, 0.8]), np.array([-1.1, 0.4])
 
 
+@pytest.mark.tiers(0, 2)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize(("size", "expected"), PRINTED.items())
 def test_printed_shooting_equations_are_not_symplectic_but_variational_ones_are(compiled, size, expected):
@@ -130,6 +134,7 @@ METHODS = (
 )
 
 
+@pytest.mark.tiers(0, 4)
 @pytest.mark.sampled(12)
 @pytest.mark.parametrize("name", ["pumped-cart-pole", pytest.param("double-pendulum", marks=pytest.mark.full)])
 @pytest.mark.parametrize("method", first_of_each(METHODS, family), ids=lambda method: method.name)
@@ -156,6 +161,7 @@ VARIATIONAL = (sc.SVI(4), sc.SVI(2, "gauss-legendre:3"), sc.SCVI(4), sc.Stoermer
 STEPS = 10_000
 
 
+@pytest.mark.quick
 @pytest.mark.parametrize("method", VARIATIONAL, ids=lambda method: method.name)
 def test_kepler_conserves_angular_momentum_to_round_off(compiled, method):
     entry = sc.problem("kepler")
@@ -164,6 +170,7 @@ def test_kepler_conserves_angular_momentum_to_round_off(compiled, method):
     assert np.abs(L - L[0]).max() < 2e-14
 
 
+@pytest.mark.quick
 def test_newton_solver_conserves_angular_momentum_to_round_off(compiled):
     entry = sc.problem("kepler")
     run = compiled("kepler", sc.SVI(4), solver="newton").integrate(entry.q, entry.velocity, h=0.05, steps=STEPS)
@@ -171,6 +178,7 @@ def test_newton_solver_conserves_angular_momentum_to_round_off(compiled):
     assert np.abs(L - L[0]).max() < 2e-14
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("method", VARIATIONAL, ids=lambda method: method.name)
 def test_spherical_pendulum_conserves_azimuthal_momentum_exactly(sample, compiled, method):
@@ -234,6 +242,7 @@ DRIFTLESS = (sc.SVI(3), sc.SVI(3, "gauss-legendre:4"), sc.SCVI(3), sc.StoermerVe
 DRIFTING = (sc.SpectralCollocation(3), sc.RadauIIA(3), sc.SCVI(3, variational=False))
 
 
+@pytest.mark.tiers(2, 3)
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize("method", DRIFTLESS, ids=lambda method: method.name)
 @pytest.mark.parametrize("name", ["planar-pendulum", "henon-heiles"])
@@ -242,6 +251,7 @@ def test_symplectic_methods_show_no_energy_drift(sample, compiled, name, method)
     assert 0.0 < last < 1.1 * first
 
 
+@pytest.mark.tiers(1)
 @pytest.mark.parametrize("method", DRIFTING, ids=lambda method: method.name)
 def test_nonsymplectic_methods_drift(sample, compiled, method):
     first, last = energy_errors(compiled, "planar-pendulum", method, *sample("planar-pendulum").state, 0.3)

@@ -111,6 +111,7 @@ def refused(function: Any, given: dict[str, Any]) -> None:
             assert re.search(rf"\b{words}\b", str(caught.value)), (argument, wrong, str(caught.value))
 
 
+@pytest.mark.tiers(4)
 @pytest.mark.parametrize("name", PLAIN)
 def test_functions_refuse_wrong_types_by_name(name):
     function: Any = sc
@@ -119,6 +120,7 @@ def test_functions_refuse_wrong_types_by_name(name):
     refused(function, PLAIN[name])
 
 
+@pytest.mark.tiers(4)
 @pytest.mark.parametrize("name", OF_STEPPERS)
 def test_steppers_refuse_wrong_types_by_name(name, quickly_compiled):
     refused(getattr(quickly_compiled(SYSTEM, sc.SVI(2)), name), OF_STEPPERS[name])

@@ -63,6 +63,7 @@ def rendered(name: str, method: str, *, newton: bool = False) -> Source:
     return render(program, control)
 
 
+@pytest.mark.tiers(1, 3)
 @pytest.mark.sampled(5)
 @pytest.mark.parametrize(
     ("name", "method"),
@@ -73,6 +74,7 @@ def test_generated_code_is_strict_c(name: str, method: str, tmp_path: Path) -> N
     check_strict(rendered(name, method), tmp_path)
 
 
+@pytest.mark.tiers(0, 2)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", ["bodies", "all forms", "lattices", "hamiltonian", "damped"])
 def test_newton_iteration_is_strict_c(name: str, tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ from scvi_codegen.models.systems import fput_chain
 from scvi_codegen.native.building import TUNED_FLAGS, _mathematics
 from scvi_codegen.rendering.source import Interface, Source
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.rotated]
 
 C99 = "-std=c99 -Wall -Wextra -Wpedantic -Wshadow -Wconversion -Werror".split()  # noqa: SIM905  (reads as one types it)
 CXX = "-std=c++11 -Wall -Wextra -Wpedantic -Werror".split()  # noqa: SIM905  (as above)
@@ -114,6 +114,7 @@ def share_of(method: str, share: int) -> list[Source]:
     return [source for source, _ in generated(method).values()][share::SHARES]
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(6)
 @pytest.mark.covering
 @pytest.mark.parametrize("share", range(SHARES))
@@ -127,6 +128,7 @@ def test_code_compiles_without_warnings(method, share, tmp_path):
             check_symbols(Path(file).stem, tmp_path)
 
 
+@pytest.mark.tiers(0, 2)
 @pytest.mark.sampled(6)
 @pytest.mark.covering
 @pytest.mark.parametrize("share", range(SHARES))
@@ -168,6 +170,7 @@ def check_symbols(prefix: str, folder: Path) -> None:
     assert line.split()[1:3] == ["0", "0"]  # data, bss
 
 
+@pytest.mark.tiers(1, 2)
 @pytest.mark.parametrize("method", METHODS)
 def test_code_allocates_nothing_writes_nothing_and_has_no_static_state(method):
     for source, _ in generated(method).values():
@@ -292,6 +295,7 @@ def named_system(names: Sequence[str], name: str = "oscillators") -> sc.Lagrangi
     return sc.LagrangianSystem.from_text(name=name, coordinates=coordinates, lagrangian=lagrangian, parameters=values)
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("method", TESTED, ids=lambda method: method.name)
 def test_reserved_names_of_c_are_valid_coordinates(method, tmp_path):
     hostile = accepted(C_NAMES)
@@ -318,6 +322,7 @@ TITLES = [
 ]
 
 
+@pytest.mark.tiers(1, 2)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("title", TITLES)
 def test_title_cannot_end_its_comment(title, tmp_path):
@@ -328,6 +333,7 @@ def test_title_cannot_end_its_comment(title, tmp_path):
     run([needs("gcc"), *C99, "-c", file], tmp_path)
 
 
+@pytest.mark.tiers(1, 3)
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize("prefix", ["fabs", "errno", "NULL", "main", "newton", "step", "int", "m", "b"])
 def test_reserved_prefixes_of_c_are_valid(prefix, tmp_path):
@@ -438,6 +444,7 @@ def test_method_families_pass_the_sanitizers(command, method, tmp_path):
     check_sanitized([generated(method)["pumped-cart-pole"]], command, tmp_path)
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(3)
 @pytest.mark.covering
 @SANITIZERS
@@ -459,6 +466,7 @@ def test_band_solver_and_reused_factors_pass_the_sanitizers(command, masses, met
     check_sanitized([(source, interface)], command, tmp_path)
 
 
+@pytest.mark.second
 @SANITIZERS
 def test_phase_space_iterations_pass_the_sanitizers(command, tmp_path):
     sanitizer(command, tmp_path)

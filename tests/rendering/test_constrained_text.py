@@ -13,6 +13,8 @@ import scvi_codegen as sc
 from scvi_codegen.exact.step import compiled_equations, derived_step
 from scvi_codegen.models.model_files.model_file import dump_model, parse_model
 
+pytestmark = pytest.mark.rotated
+
 STRICT = ["-std=c99", "-O0", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Wconversion", "-Werror"]
 LINKAGE = linkage()
 PENDULUM = sc.LagrangianSystem.from_text(
@@ -63,6 +65,7 @@ def test_constrained_code_compiles_without_warnings(compiler, tmp_path):
         assert found.returncode == 0, found.stderr
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("s", [1, 2, 3])
 def test_steps_are_those_of_the_equations_in_60_digits(s):
     stepper = sc.compile_stepper(LINKAGE, lobatto(s))
@@ -75,6 +78,7 @@ def test_steps_are_those_of_the_equations_in_60_digits(s):
         assert_allclose(found[1], np.array(exact.p, dtype=float), rtol=0, atol=4e-15)
 
 
+@pytest.mark.quick
 def test_model_files_select_compatible_points():
     stepper = sc.compile_stepper(LINKAGE, "svi:3")
     q, _ = stepper.project(NEAR)

@@ -29,6 +29,7 @@ CASES = {
 }
 
 
+@pytest.mark.tiers(1, 2)
 @pytest.mark.sampled(4)
 @pytest.mark.covering
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])

@@ -142,6 +142,7 @@ def test_board_and_host_give_equal_numbers(case, name, tmp_path):
     np.testing.assert_allclose(found, expected, rtol=0, atol=300 * unit * np.abs(expected).max())
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("case", CASES)
 def test_double_precision_equals_the_compiled_stepper_and_single_is_close(case, tmp_path):
@@ -215,6 +216,7 @@ def test_models_with_numbers_beyond_single_precision_are_rejected(number):
             sc.generate_source(system, sc.SVI(1), embedded="single")
 
 
+@pytest.mark.second
 def test_energy_does_not_drift_in_single_precision(tmp_path):
     """Twenty thousand steps of the pendulum: the error stays at that of a few, which for a sum without care grows."""
     needs("gcc")
@@ -237,6 +239,7 @@ def test_energy_does_not_drift_in_single_precision(tmp_path):
 FOLDER = ("main.c", "Makefile", "README.md", "interface.json", "model.toml")
 
 
+@pytest.mark.rotated
 def test_the_command_line_writes_a_folder_without_python(tmp_path):
     needs("gcc")
     outputs = {}
@@ -263,6 +266,7 @@ def test_lanes_are_rejected_by_name():
     assert "lanes" not in sc.generate_source(system, sc.SVI(2), embedded="double")[0].code
 
 
+@pytest.mark.second
 def test_all_methods_compile_in_either_precision(tmp_path):
     needs("gcc")
     methods = {"collocation": sc.SpectralCollocation(2, form="position"), "printed": sc.SCVI(2, variational=False)}
@@ -302,6 +306,7 @@ int main(void)
 """
 
 
+@pytest.mark.rotated
 def test_impacts_without_allocation(tmp_path):
     """The bounces of a ball by C alone, which allocates no memory, equal those of Python."""
     needs("gcc")

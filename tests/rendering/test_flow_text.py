@@ -37,6 +37,7 @@ def compile_with(compiler, flags, source, folder):
     assert found.returncode == 0, found.stderr
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(4)
 @pytest.mark.covering
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
@@ -47,6 +48,7 @@ def test_flows_compile_without_warnings(name, compiler, tmp_path):
     compile_with(compiler, ["-Wno-missing-prototypes"], source, tmp_path)
 
 
+@pytest.mark.rotated
 def test_flows_of_batches_compile_without_warnings(tmp_path):
     first, second = source_of("kepler"), source_of("kepler", "second_derivatives")
     for source in (with_flow_of_rows(first), with_flow_of_rows(second, second=True)):
@@ -54,6 +56,7 @@ def test_flows_of_batches_compile_without_warnings(tmp_path):
         compile_with("gcc", ["-Wno-missing-prototypes"], source.amalgamated(), tmp_path)
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 def test_second_derivatives_compile_without_warnings(compiler, tmp_path):
     source = with_casadi_flow(source_of("kepler", "second_derivatives"), 10, 5, second=True).amalgamated()

@@ -53,6 +53,7 @@ def test_no_file_is_outdated():
         pytest.fail(f"generated files are stale, {REMEDY}\n{''.join(changes)}", pytrace=False)
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 def test_every_file_compiles_with_all_warnings_as_errors(compiler, tmp_path):
     needs(compiler)

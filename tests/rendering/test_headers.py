@@ -160,6 +160,7 @@ def test_header_without_an_integrator_names_what_is_missing(tmp_path):
     assert "NAME is not defined" in done.stderr
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize("k", range(len(CELLS)), ids=CELLS)
 def test_headers_of_one_integrator_lack_its_unused_alternatives(k):
     source = sources()[k]

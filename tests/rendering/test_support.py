@@ -103,6 +103,7 @@ int main(void)
 """
 
 
+@pytest.mark.rotated
 def test_intervals_are_split_only_where_a_root_is_uncertain(tmp_path):
     """x: slope 1, x^3 - x/4: slope -1/4 in the middle and 1/2 outside, both against eight doubts; hollows
     0.01 and 0.001 above zero, of one extremum and of two; the highest power alone."""
@@ -148,6 +149,7 @@ int main(void)
 """
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("solver", ["fixed-point", "newton"])
 @pytest.mark.parametrize(

@@ -205,6 +205,7 @@ def test_text_with_warnings_is_always_read(made):
         sc.compile_stepper(system, "svi:2")
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     "make",
@@ -346,6 +347,7 @@ def described() -> list:
     return [driven(), lattice, turned, vortices, sc.symmetries(turned)[0], *own]
 
 
+@pytest.mark.tiers(1, 5)
 @pytest.mark.parametrize("number", range(9))
 def test_every_field_of_a_source_description_changes_its_key(number):
     given = described()[number]

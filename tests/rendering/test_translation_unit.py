@@ -60,6 +60,7 @@ def written(source: Source, folder: Path) -> None:
         (folder / name).write_text(text)
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 def test_two_integrators_in_one_translation_unit_agree_with_python(compiler, tmp_path):
     kepler, arrays = catalogue("kepler")(), ring()

@@ -43,6 +43,7 @@ def both(case, monkeypatch, flags):
     return steppers
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize("case", CASES)
 def test_unrolled_and_tabulated_methods_are_equal(case, monkeypatch):
@@ -55,6 +56,7 @@ def test_unrolled_and_tabulated_methods_are_equal(case, monkeypatch):
     assert (ours.p == theirs.p).all()
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("case", first_of_each(CASES, lambda case: type(CASES[case][0])))
 def test_unrolled_and_tabulated_methods_agree_to_round_off_with_fma(case, monkeypatch):
     m = CASES[case][0].dimension

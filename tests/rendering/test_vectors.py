@@ -11,7 +11,7 @@ from programs import needs
 
 import scvi_codegen as sc
 
-pytestmark = pytest.mark.usefixtures("as_users_compile")
+pytestmark = [pytest.mark.usefixtures("as_users_compile"), pytest.mark.rotated]
 
 CHECK = """
 #include "power.c"
@@ -48,6 +48,7 @@ int check(const double *x)
 """
 
 
+@pytest.mark.second
 def test_sums_of_eight_vectors_have_the_bits_of_single_ones(tmp_path):
     compiler = needs("cc")
     system = sc.LagrangianSystem.from_text(name="power", coordinates=["q"], lagrangian="q_dot**2/2 - q**4")
@@ -59,6 +60,7 @@ def test_sums_of_eight_vectors_have_the_bits_of_single_ones(tmp_path):
     assert ctypes.CDLL(str(tmp_path / "check.so")).check(x.ctypes.data_as(ctypes.c_void_p)) == 0
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(2)
 @pytest.mark.covering
 @pytest.mark.parametrize("flags", ["-march=native -O2", "-O2"])

@@ -28,6 +28,7 @@ FIGURES = {f"figure-{n}": EXPERIMENTS[f"figure-{n}"] for n in (1, *range(3, 6), 
 IN_PART = {"figure-1", "figure-3", "figure-4", "figure-27", "figure-29"}
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(6)
 @pytest.mark.long
 @pytest.mark.parametrize("name", FIGURES)
@@ -66,6 +67,7 @@ SIZES = [
 ]
 
 
+@pytest.mark.tiers(1, 3)
 @pytest.mark.parametrize(("setting", "key", "expected"), SIZES)
 def test_errors_are_those_measured_by_other_programs(setting, key, expected):
     """0 means round-off."""
@@ -80,6 +82,7 @@ def test_exact_flow_agrees_with_a_fine_run():
     assert np.abs([run.q - q, run.p - p]).max() < 1e-12
 
 
+@pytest.mark.second
 def test_exact_orbits_stay_on_their_ellipse_and_period():
     exact = Scheme("exact", sc.SVI(10), "exact")
     q, velocity = perihelion(0.5)
@@ -89,6 +92,7 @@ def test_exact_orbits_stay_on_their_ellipse_and_period():
     assert run.revolutions == pytest.approx([2 * np.pi] * 5, abs=1e-3)
 
 
+@pytest.mark.second
 def test_spectral_collocation_with_two_points_falls_into_the_centre():
     run = SETTINGS["kepler-two-points"].run("sc2")
     assert run.failed
@@ -96,6 +100,7 @@ def test_spectral_collocation_with_two_points_falls_into_the_centre():
     assert run.last_energy < -1.5
 
 
+@pytest.mark.second
 def test_ten_thousand_periods_with_two_points():
     run = SETTINGS["kepler-10000-periods"].run("scvi")
     assert run.steps == 400_000
@@ -103,6 +108,7 @@ def test_ten_thousand_periods_with_two_points():
     assert run.momentum < 1e-11
 
 
+@pytest.mark.second
 def test_two_points_make_the_printed_form_the_variational_one():
     whole, printed = (sc.SCVI(1, "gauss-legendre:2", variational=flag) for flag in (True, False))
     pendulum = SETTINGS["pendulum"].system
@@ -126,6 +132,7 @@ def test_area_changes_as_the_energy_of_an_oscillator():
     assert run.area == pytest.approx(np.exp(-np.log1p(1e-4) * 0.8 * 20_000) - 1.0, rel=0.02)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("conditions", "verdict"),
     [
@@ -144,6 +151,7 @@ def test_verdicts_follow_from_conditions(conditions, verdict):
     assert found.measured.endswith("; last t: 100.0 (SC). Note.")
 
 
+@pytest.mark.second
 def test_a_missing_quantity_satisfies_no_condition():
     runs = {"sc2": SETTINGS["kepler-two-points"].run("sc2")}
     assert runs["sc2"].last_revolution is None
@@ -162,6 +170,7 @@ STRUCTURE = {(2, 2): (0.0, 0.0), (3, 2): (4.6e-2, -2.3e-2), (5, 4): (6.6e-4, 6.7
 """(points, Gauss points) -> (defect, change of momentum) of the printed step."""
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize(("row", "expected"), STRUCTURE.items())
 def test_defects_and_momenta_of_a_step(row, expected):
     printed, full = (correction.measured(*row, variational=form) for form in (False, True))
@@ -171,6 +180,7 @@ def test_defects_and_momenta_of_a_step(row, expected):
     assert abs(full.momentum) < 1e-14
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("degree", [2, 3, 4, 5])
 def test_missing_term_lowers_the_order(degree):
     printed, full = (correction.measured(degree + 1, degree, variational=form) for form in (False, True))

@@ -56,6 +56,7 @@ ORDERS = [
 """Powers of h by scheme for N = 2, 4, 6 and each quantity; on the circle q1 has the lines that the paper draws."""
 
 
+@pytest.mark.tiers(1, 2)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize(("case", "quantities", "expected"), ORDERS)
 def test_convergence_orders_of_the_local_error(case, quantities, expected):
@@ -72,6 +73,7 @@ def test_constants_of_two_points_are_those_found_by_hand():
     assert two == pytest.approx([5 / 6, 7 / 360], rel=0.01)
 
 
+@pytest.mark.second
 def test_errors_are_those_of_an_independent_step():
     """SVI with as many Gauss points as the degree maps (q, p) as the stability function of Gauss collocation does."""
     P, Q = sc.Gauss(16).tableau.stability_function()
@@ -81,6 +83,7 @@ def test_errors_are_those_of_an_independent_step():
     assert found == pytest.approx(float(abs(exact.imag - mp.sin(20))), rel=1e-6)
 
 
+@pytest.mark.tiers(1)
 @pytest.mark.parametrize("case", [CASES["N points"], CASES["e = 0.5, N the degree"]])
 @pytest.mark.parametrize("scheme", ["SVI", "SC"])
 def test_compiled_errors_are_those_in_60_digits(case, scheme):
@@ -89,6 +92,7 @@ def test_compiled_errors_are_those_in_60_digits(case, scheme):
         assert list(compiled.values()) == pytest.approx(list(precise.values()), rel=1e-6, abs=1e-14)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("scheme", "constant", "base"), [("SVI", 1e10, 0.03), ("SC", 1e7, 0.1)])
 def test_errors_on_the_circle_follow_the_lines_of_figure_16(scheme, constant, base):
     for points in (10, 14):

@@ -64,6 +64,7 @@ class TestRunner:
         assert failures["after-broken"].message == "its dependency 'broken' failed"
         assert failures["last"].message == "its dependency 'after-broken' failed"
 
+    @pytest.mark.rotated
     def test_parallel_processes_give_equal_results_and_survive_a_crash(self):
         seen: list[tuple[str, ...]] = []
         names = ["crash", "table-8", "unportable", "table-9", "broken"]
@@ -82,6 +83,7 @@ class TestRunner:
         order = [outcome.name for outcome in outcomes]
         assert order.index("figure-4") < order.index("table-8")
 
+    @pytest.mark.rotated
     def test_closing_the_runner_ends_the_processes(self):
         others = multiprocessing.active_children()  # what another test left
         outcomes = run_experiments(["table-9", "slow"], 2, module=TOYS)
@@ -126,6 +128,7 @@ def test_cells_are_formatted():
 
 
 class TestPage:
+    @pytest.mark.rotated
     def test_page_is_complete_and_well_formed(self, page, results):
         parsed = Page(page)
         assert parsed.all("html") == [{"lang": "en"}]
@@ -137,6 +140,7 @@ class TestPage:
         assert document == draw(results["figure-4"].picture, "svg")
         assert len(parsed.all("caption")) == len(parsed.all("table")) == 4
 
+    @pytest.mark.rotated
     def test_identifiers_are_unique_and_references_resolve(self, page):
         parsed = Page(page)
         identifiers = [attributes["id"] for _, attributes in parsed.elements if "id" in attributes]
@@ -145,6 +149,7 @@ class TestPage:
         assert referred <= set(identifiers)
         assert set(GOOD) <= referred
 
+    @pytest.mark.second
     def test_page_is_self_contained(self, page):
         parsed = Page(page)
         assert parsed.all("script") == []
@@ -155,6 +160,7 @@ class TestPage:
         assert "https:" not in page
         assert "@import" not in page
 
+    @pytest.mark.second
     def test_text_is_escaped_and_its_numbers_are_typeset(self, page):
         assert "Energy errors of &lt;SVI&gt; &amp; SC" in page
         assert "&lt;the positions&gt;" in page
@@ -162,6 +168,7 @@ class TestPage:
         assert "2.10\N{NO-BREAK SPACE}×\N{NO-BREAK SPACE}10<sup>\N{MINUS SIGN}9</sup>" in page
         assert "Q<sup>1</sup>" in page
 
+    @pytest.mark.second
     def test_names_of_results_are_links(self, page):
         assert f'See <a href="#figure-4">Figure{N}4</a>, not figure-40.' in page
 
@@ -180,6 +187,7 @@ class TestPage:
         assert page.count('<span class="verdict partly">') == 5
         assert "The equations of one step</span>" in page
 
+    @pytest.mark.rotated
     def test_equal_results_give_equal_pages(self, page, results):
         assert report_html(list(results.values())) == page
 
@@ -201,6 +209,7 @@ COMMAND = ("reproduce", "--jobs", "1")
 
 @pytest.mark.usefixtures("toys")
 class TestCommand:
+    @pytest.mark.rotated
     def test_command_writes_files_and_the_page(self):
         text = output_of(*COMMAND, "section-3.1", "table-8", "-o", "made/here", "--html", "all.html")
         assert sorted(path.name for path in Path("made/here").iterdir()) == [
@@ -258,6 +267,7 @@ class TestCommand:
         assert output_of(*COMMAND, "--list", "table-8") == "figure-4  Energy errors\ntable-8   Iterations\n"
         assert experiments_table(experiments_titles(module=TOYS)) == listed.rstrip("\n")
 
+    @pytest.mark.rotated
     def test_json_and_quiet_output(self):
         assert json_of(*COMMAND, "--list")["experiments"]["figure-4"] == "Energy errors"
         found = json_of(*COMMAND, "broken", "table-8", status=1)
@@ -282,6 +292,7 @@ print("interrupted" if done.interrupted else "not interrupted", [path.name for p
 """
 
 
+@pytest.mark.rotated
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals for process groups")
 def test_interrupt_ends_all_processes_and_saves_results(tmp_path):
     path = f"import sys; sys.path[:0] = {sys.path!r}\n"

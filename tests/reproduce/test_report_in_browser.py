@@ -11,6 +11,8 @@ from toy_experiments import GOOD
 from scvi_codegen.reproduce.experiment import Result, report_html
 from scvi_codegen.reproduce.runner import run_experiments
 
+pytestmark = pytest.mark.rotated
+
 
 @pytest.fixture(scope="module")
 def page() -> str:
@@ -28,6 +30,7 @@ def view(
 
 
 class TestInABrowser:
+    @pytest.mark.tiers(0, 1)
     @pytest.mark.sampled(2)
     def test_page_loads_nothing_and_logs_no_error(self, view):
         assert_it_asks_for_nothing(view)
@@ -37,6 +40,7 @@ class TestInABrowser:
         boxes = "[...document.querySelectorAll('.scroll')].map(e => [e.scrollWidth, e.clientWidth])"
         assert view.width > 190 or sum(inside > outside for inside, outside in view.evaluate(boxes)) > 3
 
+    @pytest.mark.tiers(0, 1)
     def test_single_panel_fits_a_phone_and_wider_pictures_scroll(self, view):
         figures = """[...document.querySelectorAll('figure .scroll')].map(e => {
             const width = e.querySelector('img').style.getPropertyValue('--width');
@@ -51,6 +55,7 @@ class TestInABrowser:
     def test_all_text_has_sufficient_contrast(self, view):
         assert view.evaluate(UNREADABLE) == []
 
+    @pytest.mark.tiers(0, 3)
     def test_print_style_is_light_and_does_not_split_figures(self, view):
         view.emulate_media(media="print")
         style = "e => getComputedStyle(document.querySelector(e))"

@@ -21,6 +21,7 @@ def test_the_printed_iterations_are_those_of_the_paper():
     assert sum(count.total is not None for count in iterations.printed_counts(9).values()) == 24
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize(
     ("number", "cells", "by_points", "by_degree"),
     [pytest.param(8, 50, 47, 46, marks=pytest.mark.full), (9, 40, 37, 35)],
@@ -36,6 +37,7 @@ def test_picard_iteration_fails_where_the_tables_have_dashes(number, cells, by_p
     assert sum(h >= 1.0 and n > 2 for h, n, _ in wrong[0]) == 1
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("degree", [1, 4, 9, 19])
 def test_picard_iteration_converges_to_the_compiled_step(degree):

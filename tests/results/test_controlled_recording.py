@@ -43,6 +43,7 @@ def test_recording_equals_the_run_in_memory(kepler, save_every):
     assert [len(piece) for piece in found.pieces()][:-1] == [64] * ((len(found) - 1) // 64)
 
 
+@pytest.mark.tiers(1)
 @pytest.mark.parametrize("save_every", [1, 9])
 def test_interrupted_recording_is_bytewise_equal(kepler, save_every):
     whole = controlled(kepler, "whole.run", save_every=save_every)

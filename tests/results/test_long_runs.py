@@ -81,6 +81,7 @@ def killed_at_random(stepper: sc.Stepper, times: int, generator: random.Random) 
     return steps
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize("times", [5, pytest.param(100, marks=pytest.mark.full)])
 def test_run_killed_at_random_times_continues(kepler, times):
     steps = killed_at_random(kepler, times, random.Random(times))
@@ -89,6 +90,7 @@ def test_run_killed_at_random_times_continues(kepler, times):
     assert_whole(kepler)
 
 
+@pytest.mark.rotated
 def test_file_size_limit_is_reported_with_the_state_of_the_run(kepler):
     limit = "resource.setrlimit(resource.RLIMIT_FSIZE, (500_000, resource.RLIM_INFINITY))"
     with child(kepler, before=limit, rows=20_000) as process:
@@ -152,6 +154,7 @@ if os.geteuid() == 0:  # give up CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH, with 
 """
 
 
+@pytest.mark.second
 def test_unwritable_folder_is_reported_before_the_run(kepler, tmp_path):
     recorded(kepler, 100, save_every=20, rows=5000)
     before = digests("a.run")
@@ -176,6 +179,7 @@ def test_exception_in_a_callback_loses_nothing(kepler):
     assert_same(sc.resume_run("a.run", steps=3000), kepler.integrate(**STATE, h=H, steps=3000))
 
 
+@pytest.mark.second
 def test_failed_step_saves_the_preceding_states(compiled):
     stepper = compiled("runaway", sc.SVI(4))
     run = stepper.start([1.0], [1.0], h=0.05)
@@ -224,6 +228,7 @@ class TestCommandLine:
         words = words.replace("kepler -o", "kepler --method stoermer-verlet --steps 10 -o")
         assert message in error_of(words, status=status)
 
+    @pytest.mark.rotated
     def test_interrupt_prints_how_to_continue(self):
         words = "run kepler --method stoermer-verlet --step 0.01 --steps 1000000000000 --save-every 100000 -o a.run"
         command = [sys.executable, "-m", "scvi_codegen", *words.split(), "--checkpoint", "0.1"]

@@ -35,6 +35,7 @@ class TestRecording:
         found = recorded(kepler, 1001, rows=100)
         assert [len(piece) for piece in found.pieces()] == [100] * 10 + [2]
 
+    @pytest.mark.tiers(0, 2)
     @pytest.mark.sampled(3)
     @pytest.mark.parametrize("method", [sc.SVI(4), sc.Gauss(2), sc.StoermerVerlet()], ids=lambda method: method.name)
     @pytest.mark.parametrize("save_every", [1, 40, 400])
@@ -114,6 +115,7 @@ class TestRecording:
             with pytest.raises(sc.StateError, match="the certificate"):
                 recorded(kepler, 1, certificate=wrong, folder="c.run")
 
+    @pytest.mark.second
     def test_memory_does_not_grow_with_run_length(self, kepler):
         recorded(kepler, 10, folder="first.run")  # what is imported on the way is not counted
         tracemalloc.start()
@@ -210,6 +212,7 @@ class TestFolders:
         with pytest.raises(sc.RecordingError, match=r"manifest\.json' is damaged"):
             sc.resume_run("a.run")
 
+    @pytest.mark.second
     def test_a_flipped_bit_in_a_recording_is_rejected(self, kepler):
         run, random = recorded(kepler, 10), np.random.default_rng(3)
         for path in (Path("a.run/manifest.json"), Path("a.run/states-000000.npz")):
@@ -329,6 +332,7 @@ class TestReading:
         with pytest.raises(TypeError, match="must be a whole number or a slice"):
             lazy[0.5]
 
+    @pytest.mark.rotated
     def test_active_run_can_be_read(self, kepler):
         lengths = []
 
@@ -377,6 +381,7 @@ class TestFiles:
             assert file["q"].dims[1][0][:].tolist() == [b"q1", b"q2"]
             assert ("certificate" in file.attrs) == isinstance(given, sc.RecordedRun)
 
+    @pytest.mark.tiers(1)
     def test_zarr_is_read_by_xarray(self, saved):
         pytest.importorskip("zarr")
         xarray = pytest.importorskip("xarray")
@@ -388,6 +393,7 @@ class TestFiles:
         assert (dataset.q.dims, list(dataset.coordinate)) == (("t", "coordinate"), ["q1", "q2"])
         assert dataset.attrs["method"] == whole.stepper.interface.method
 
+    @pytest.mark.tiers(2)
     @pytest.mark.parametrize("suffix", ["h5", "hdf5", "nc"])
     def test_hdf5_is_read_by_xarray(self, saved, suffix):
         pytest.importorskip("h5netcdf")

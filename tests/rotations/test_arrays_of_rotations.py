@@ -49,6 +49,7 @@ def named() -> sc.LagrangianSystem:
     )
 
 
+@pytest.mark.rotated
 def test_arrays_of_rotations_move_as_by_names(tmp_path):
     stepper = sc.compile_stepper(bodies(), "svi:2", flags=QUICK_FLAGS)
     q, velocity = {"x": 0.3, "R": QUATERNIONS, "n": UNIT}, {"x": 0.1, "omega": OMEGA, "n": TANGENTS}
@@ -82,6 +83,7 @@ def test_torque_on_an_array_without_an_index_is_refused():
         )
 
 
+@pytest.mark.second
 def test_model_file_with_an_array_of_rotations(tmp_path):
     path = tmp_path / "bodies.toml"
     path.write_text(
@@ -96,6 +98,7 @@ def test_model_file_with_an_array_of_rotations(tmp_path):
     assert again.integrate().q == pytest.approx(np.asarray(model.integrate().q), abs=1e-15)
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize("size", ["6", "N"])
 def test_spin_chain_against_scipy(size):
     """ds/dt = s x dH/ds with the field of the neighbours."""

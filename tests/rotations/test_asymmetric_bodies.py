@@ -101,6 +101,7 @@ def stepper():
     return sc.compile_stepper(BODY, "composition:8", flags=QUICK_FLAGS)
 
 
+@pytest.mark.tiers(1, 5)
 @pytest.mark.parametrize("name", CASES)
 def test_steps_equal_taylor_series_in_50_digits(stepper, name):
     moments, omega, h = CASES[name]
@@ -151,6 +152,7 @@ def test_energy_and_angular_momentum_after_many_steps(stepper):
     assert np.abs(np.sum(run.q**2, axis=1) - 1).max() < 1e-13
 
 
+@pytest.mark.second
 def test_the_expressions_of_which_derivatives_are_taken_are_the_same_flow():
     split = kinetic_splitting(discretised_form(BODY, sc.Composition(8)))
     u = tuple(symbol(f"u_{i}") for i in range(4))

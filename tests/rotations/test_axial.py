@@ -9,6 +9,8 @@ import scvi_codegen as sc
 from scvi_codegen.mechanics.rotations.axial import axial_turns
 from scvi_codegen.mechanics.rotations.hamiltonian import hamiltonian_of_rotations
 
+pytestmark = pytest.mark.second
+
 KINETIC = "(A*(omega_1**2 + omega_2**2) + C*omega_3**2)/2"
 THREE = "(A*omega_1**2 + B*omega_2**2 + C*omega_3**2)/2"
 START = {"R": [0.9, 0.3, -0.2, 0.1]}
@@ -24,6 +26,7 @@ def three(potential="w*R_33"):
     return body(f"{THREE} - {potential}", parameters={"A": 1.0, "B": 1.0, "C": 0.5, "w": 1.0})
 
 
+@pytest.mark.tiers(3)
 @pytest.mark.parametrize(
     ("lagrangian", "arguments", "axes"),
     [
@@ -45,6 +48,7 @@ def test_axes_of_symmetry(lagrangian, arguments, axes):
     assert (core is system) == (not axes)
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize("solver", ["auto", pytest.param("newton", marks=pytest.mark.full)])
 def test_a_symmetric_top_moves_as_one_with_three_moments(solver):
     ours, other = (sc.compile_stepper(each, "svi:6", solver=solver) for each in (body(f"{KINETIC} - w*R_33"), three()))
@@ -143,6 +147,7 @@ def test_energy_and_momenta_over_100_000_steps(top):
     assert abs(np.sum(run.q**2, axis=1) / np.sum(run.q[0] ** 2) - 1).max() < 3e-13
 
 
+@pytest.mark.quick
 @pytest.mark.parametrize("h", [0.01, 3.0, pytest.param(400.0, marks=pytest.mark.quick)])
 def test_steps_without_a_potential_are_exact(top, h):
     """The attitude is that after rotations about the angular momentum and about the axis (Routh)."""

@@ -8,6 +8,8 @@ from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 
+pytestmark = pytest.mark.second
+
 TOP = sc.LagrangianSystem.from_text(
     "top",
     rotations={"R": "omega"},

@@ -24,6 +24,7 @@ def end(system, method="svi:6", t_end=1.0, name="R"):
     return stepper.integrate(**start, t_end=t_end).rotation()[-1]
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("by_speeds", [True, False])
 def test_a_frame_of_sympy_oriented_by_a_quaternion_is_a_rotation(by_speeds):
@@ -68,6 +69,7 @@ def test_spins_and_rotations_of_a_hamiltonian_are_read_from_sympy():
     assert by_sympy == by_text
 
 
+@pytest.mark.second
 def test_the_hamiltonian_of_a_top_has_its_rotation():
     np.testing.assert_allclose(end(sc.hamiltonian_of(TOP)), end(TOP), rtol=0, atol=1e-14)
 

@@ -60,6 +60,7 @@ def moving():
     return stepper, stepper.integrate(start, velocity={"x": 0.2, "omega": [0.7, -0.4, 1.5]}, h=0.05, steps=20_000)
 
 
+@pytest.mark.rotated
 def test_steps_are_symplectic_reversible_and_keep_the_gauge(moving):
     stepper, run = moving
     reduction = Reduction(stepper.interface)
@@ -74,6 +75,7 @@ def test_steps_are_symplectic_reversible_and_keep_the_gauge(moving):
     assert np.abs(np.sum(run.q[:, 1:] * run.p[:, 1:], axis=1)).max() < 1e-12
 
 
+@pytest.mark.rotated
 def test_explicit_steps_with_time_dependent_torques_solve_the_stage_equations():
     state = {"x": 0.5, "R": ATTITUDE}, {"x": 0.2, "omega": [0.7, -0.4, 1.5]}
     ends = []
@@ -85,12 +87,14 @@ def test_explicit_steps_with_time_dependent_torques_solve_the_stage_equations():
     np.testing.assert_allclose(ends[0], ends[1], rtol=0, atol=1e-14)
 
 
+@pytest.mark.second
 def test_hamiltonians_with_rotations_have_the_same_steps(moving):
     _, run = moving
     q, p = compiled(CANONICAL, "stoermer-verlet").step(run.q[0], run.p[0], 0.05)
     np.testing.assert_allclose(np.ravel([q, p]), np.ravel([run.q[1], run.p[1]]), rtol=0, atol=1e-15)
 
 
+@pytest.mark.second
 def test_arrays_of_bodies_move_as_by_an_implicit_method():
     body = "2*omega_1[i]**2 + J[i]*omega_2[i]**2 + 2*omega_3[i]**2 + x_dot[i]**2/2 - x[i]*R_33[i]"
     system = sc.LagrangianSystem.from_text(
@@ -110,6 +114,7 @@ def test_arrays_of_bodies_move_as_by_an_implicit_method():
     np.testing.assert_allclose(*ends, rtol=0, atol=1e-11)
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize("moments", [(1, 2, 4), pytest.param((3, 1, 3), marks=pytest.mark.full)])
 def test_products_of_inertia_do_not_change_the_motion(moments):
     axes = [np.array([[-15, 0, 20], [16, -15, 12], [12, 20, 9]]) / 25, np.eye(3)]  # of the second body: its own

@@ -83,6 +83,7 @@ def test_a_model_is_written_with_its_rotations(text):
     assert parse_model(written) == model
 
 
+@pytest.mark.rotated
 def test_the_command_line_runs_a_file_with_rotations(tmp_path):
     path = tmp_path / "top.toml"
     path.write_text(TOP)

@@ -367,6 +367,7 @@ def expected_of(name):
     return np.concatenate([np.ravel(each) for each in MOTIONS[name].expected()])
 
 
+@pytest.mark.tiers(1, 1)
 @pytest.mark.parametrize(("name", "method", "counts", "order"), CASES)
 def test_motions_converge_with_the_order_of_the_method_and_reverse(name, method, counts, order):
     motion, errors = MOTIONS[name], []
@@ -491,6 +492,7 @@ CONSERVED = {
 LONG = ("ball, long", "double body", "double body, long", "weightless", "composition")
 
 
+@pytest.mark.tiers(0, 2)
 @pytest.mark.parametrize("case", [pytest.param(case, marks=FULL if case in LONG else ()) for case in INVARIANTS])
 def test_first_integrals_do_not_drift(case):
     motion, method, h, steps, constants = INVARIANTS[case]
@@ -507,6 +509,7 @@ def test_first_integrals_do_not_drift(case):
         np.testing.assert_allclose(run.angular_momentum()[0], TURNED[0].apply(INERTIA * OMEGA), rtol=0, atol=1e-14)
 
 
+@pytest.mark.second
 def test_states_by_name_are_projected_and_constraints_are_reported_as_written():
     stepper, turning = sc.compile_stepper(BALL, "svi:4", flags=QUICK_FLAGS), ATTITUDE[0].apply(ROLLING)
     assert stepper.constraints[0] == "-R_21*omega_1 - R_22*omega_2 - R_23*omega_3 + x_dot"
@@ -526,6 +529,7 @@ def test_a_bound_of_the_global_error_is_confirmed_for_attitudes():
     assert run.confirmed_digits >= 9
 
 
+@pytest.mark.second
 def test_the_fast_top_of_bruels_and_cardona_has_the_published_attitude():
     """O. Bruels, A. Cardona, J. Comput. Nonlinear Dyn. 5 (2010) 031002; quaternion at 0.2 s of Exudyn's heavyTop.py."""
     stepper = sc.compile_stepper(top((15.234375, 0.46875, 15.234375), "15*9.81*R_32"), "svi:8", flags=QUICK_FLAGS)

@@ -9,6 +9,8 @@ from scvi_codegen.pictures.animation import positions_of
 
 pytest.importorskip("matplotlib")
 
+pytestmark = pytest.mark.rotated
+
 
 @pytest.fixture(scope="module")
 def run():
@@ -41,6 +43,7 @@ def test_paths_of_a_body_axis_and_a_direction_are_drawn_on_the_sphere(run, tmp_p
         sc.plot_attitude(pendulum.integrate([0.0], [1.0], h=0.1, steps=2), tmp_path / "none.png")
 
 
+@pytest.mark.second
 def test_the_overview_shows_body_axes_in_the_unit_circle(run, tmp_path):
     first, second, _ = run.plot(tmp_path / "overview.png")
     for axes, plane in ((first, (0, 1)), (second, (0, 2))):

@@ -32,6 +32,7 @@ POINT = ["0.2", "-0.1", "0.5"]
 IN_SPACE = ["sin(t)", "c*x_dot", "-y"]
 
 
+@pytest.mark.second
 def test_force_in_space_acts_on_position_and_attitude():
     force = {"body": "R", "origin": ["x", "y", "z"], "point": POINT, "force": IN_SPACE}
     turned = [f"unrotate_{k}(R, {', '.join(IN_SPACE)})" for k in (1, 2, 3)]
@@ -40,6 +41,7 @@ def test_force_in_space_acts_on_position_and_attitude():
     assert np.abs(end_of() - by_hand).max() > 1e-2
 
 
+@pytest.mark.second
 def test_force_in_the_body_frame_is_turned():
     force = {"body": "R", "origin": ["x", "y", "z"], "point": POINT, "force": IN_SPACE, "frame": "body"}
     turned = [f"rotate_{k}(R, {', '.join(IN_SPACE)})" for k in (1, 2, 3)]
@@ -59,6 +61,7 @@ def test_sympy_expressions_give_the_same_forces():
     assert all(sympy.expand(one - other) == 0 for one, other in zip(text.forces, same.forces, strict=True))
 
 
+@pytest.mark.second
 def test_two_forces_and_others_on_the_same_body_are_added():
     force = {"body": "R", "point": POINT, "force": IN_SPACE}
     both = end_of(point_forces=[force, force], torques={"R": ["0", "c", "0"]}, forces={"x": "-c*x_dot"})
@@ -69,6 +72,7 @@ def test_two_forces_and_others_on_the_same_body_are_added():
     )
 
 
+@pytest.mark.rotated
 def test_point_given_in_space_between_two_bodies_and_a_direction_is_a_potential_force():
     arm = [f"{'x + ' * (k == 1)}rotate_{k}(A, 1, 0, 0) - rotate_{k}(B, 0, 1, 0) + n_{k}" for k in (1, 2, 3)]
     common = {"rotations": {"A": "v", "B": "w"}, "directions": ["n"], "coordinates": ["x"], "parameters": {"k": 1.7}}
@@ -111,6 +115,7 @@ def test_wrong_entries_are_refused_by_name(entry, message):
         end_of(point_forces=[entry])
 
 
+@pytest.mark.second
 def test_model_files_contain_forces_at_points():
     text = """
     [system]

@@ -16,6 +16,8 @@ from scvi_codegen.runtime.rotations.reduction import Reduction
 from scvi_codegen.verification.structure import structure_checks
 from scvi_codegen.verification.system_under_test import State, SystemUnderTest
 
+pytestmark = pytest.mark.rotated
+
 BODY = sc.LagrangianSystem.from_text(
     "free body", rotations={"R": "omega"}, lagrangian="(omega_1**2 + 2*omega_2**2 + 2.5*omega_3**2)/2"
 )
@@ -85,6 +87,7 @@ def test_a_rotation_has_six_lyapunov_exponents_and_they_are_those_of_the_lineari
     np.testing.assert_allclose(together.lyapunov_exponents()[-1, 0], exponents, rtol=0, atol=1e-10)
 
 
+@pytest.mark.second
 def test_directions_of_changes_are_projected_and_pure_gauge_is_rejected():
     run = compiled(BODY, "svi:2").integrate({"R": [1, 0, 0, 0]}, velocity={"omega": [0.1, 1, 0.1]}, h=0.1, steps=20)
     gauge = np.append(run.q[0], -run.p[0])
@@ -95,6 +98,7 @@ def test_directions_of_changes_are_projected_and_pure_gauge_is_rejected():
         run.chaos_indicators(directions=gauge)
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("method", ["svi:4", pytest.param("scvi:4", marks=pytest.mark.full)])
 def test_a_steady_rotation_is_a_periodic_orbit_although_its_quaternion_changes_sign(method):
     orbit = sc.periodic_orbit(
@@ -196,11 +200,13 @@ def test_certificates_contain_gauge_invariance_and_reduced_symplecticity(system,
     assert ("T*SO(3) and T*S^2" if system is MIXED else "(S^2)") in checks["reduced symplecticity"].statement
 
 
+@pytest.mark.second
 def test_violations_of_the_reduced_map_are_found():
     checks = checks_of(BODY, ({"R": [1, 0, 0, 0]}, {"omega": [0.7, -0.4, 2.5]}), step=Contracting)
     assert [checks[name].outcome.name for name in REDUCED] == ["VIOLATED"] * 2
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("system", [MIXED, SPINS], ids=lambda system: system.name)
 def test_derivatives_of_the_gauge_are_those_of_differences(system):
     reduction = Reduction(Sources(system, sc.as_method("svi:1")).integrator()[1])

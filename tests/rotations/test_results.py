@@ -8,6 +8,8 @@ from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 
+pytestmark = pytest.mark.rotated
+
 TOP = sc.LagrangianSystem.from_text(
     "top on a spring beside a pendulum",
     ["x"],
@@ -65,6 +67,7 @@ def test_datasets_have_vectors_with_named_axes(stepper, run):
         np.testing.assert_allclose(together[name].isel(trajectory=1), data[name], rtol=0, atol=1e-13)
 
 
+@pytest.mark.quick
 def test_spins_and_body_momenta_of_a_hamiltonian_are_named():
     pytest.importorskip("pandas")
     system = sc.HamiltonianSystem.from_text(
@@ -94,6 +97,7 @@ def test_attitudes_between_saved_states_are_dense_output(stepper, run):
         together.rotation(t=0.05)
 
 
+@pytest.mark.second
 def test_a_run_in_progress_has_the_attitude_of_its_state(stepper, run):
     running = stepper.start(Q, velocity=V, h=0.1)
     running.advance(20)
@@ -101,6 +105,7 @@ def test_a_run_in_progress_has_the_attitude_of_its_state(stepper, run):
         np.testing.assert_array_equal(getattr(running, quantity)(), getattr(run, quantity)()[-1], err_msg=quantity)
 
 
+@pytest.mark.second
 def test_a_recorded_run_has_the_attitudes_of_the_run(stepper, tmp_path):
     start = {"q": Q, "velocity": V, "h": 0.05}
     sc.record_run(stepper.start(**start), tmp_path / "top.run", steps=40, save_every=2, rows=8)

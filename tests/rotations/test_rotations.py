@@ -183,6 +183,7 @@ def test_an_event_sets_an_angular_momentum():
     np.testing.assert_allclose(run.body_momentum()[-1], before * [1, -1, 1], rtol=0, atol=1e-7)
 
 
+@pytest.mark.second
 def test_events_are_found_in_the_names_of_rotations():
     run = compiled(TOP, "svi:6").integrate({"R": ATTITUDE}, velocity={"omega": OMEGA}, h=0.1, steps=60, events=EVENTS)
     tilt, rate, momentum, point = run.events
@@ -199,6 +200,7 @@ def test_events_are_found_in_the_names_of_rotations():
         assert abs(end.angular_velocity()[-1, 0]) < 1e-9
 
 
+@pytest.mark.rotated
 def test_the_derivation_shows_the_form_that_is_stepped():
     by_momenta = sc.derive(TOP, "svi:1").to_text()
     by_velocities = sc.derive(TOP, sc.SVI(1, sc.gauss_legendre(2))).to_text()
@@ -250,6 +252,7 @@ def test_a_system_in_sympy_is_that_in_text():
 DIRECTED = ("spherical", ["q"], "(q_dot**2 + n_1_dot**2 + n_2_dot**2 + n_3_dot**2 - q**2)/2 - n_3*q")
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("state", "message"),
     [
@@ -270,6 +273,7 @@ def test_states_of_directions_that_are_refused(state, message):
         stepper.integrate(**{"q": {"q": 0, "n": [0, 0, 1]}, **rest, **state}, h=0.1, steps=1)
 
 
+@pytest.mark.second
 def test_spins_and_directions_of_all_lengths_are_read():
     """Directions have any length, spins keep theirs; a small radial part of typed digits is removed."""
     stepper = sc.compile_stepper(sc.LagrangianSystem.from_text(*DIRECTED, directions=["n"]), "svi:1")

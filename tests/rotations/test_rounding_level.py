@@ -28,6 +28,7 @@ MOST_AFTER_ROUNDING = 5.0
 """Iterations from changes of 1e-14 to the end: three to the unit roundoff, and two in which changes stop decreasing."""
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(1)
 @pytest.mark.filterwarnings("ignore::scvi_codegen.AccuracyWarning")
 @pytest.mark.parametrize("name", CASES)

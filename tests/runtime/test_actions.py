@@ -8,6 +8,8 @@ import scvi_codegen as sc
 from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.runtime.paths.actions import compensated_sums
 
+pytestmark = pytest.mark.second
+
 HENON_HEILES = sc.problem("henon-heiles").system
 START = np.array([0.0, -0.25, 0.42, 0.0])
 
@@ -22,6 +24,7 @@ def central(function, h=1e-3):
     return sum(w * (function(k * h) - function(-k * h)) for k, w in ((1, 0.75), (2, -0.15), (3, 1 / 60))) / h
 
 
+@pytest.mark.rotated
 def test_action_is_the_sum_of_discrete_lagrangians(stepper):
     run = stepper.integrate(START[:2], START[2:], h=0.2, steps=40)
     each = [stepper.discrete_lagrangian(*run.q[k : k + 2], 0.2) for k in range(40)]
@@ -82,6 +85,7 @@ SUMMED = [
 KINDS = ["gauss", "adaptive", "forces", "inputs", "explicit", "scvi", "damping", "rod"]
 
 
+@pytest.mark.tiers(0, 0)
 @pytest.mark.parametrize(
     ("arguments", "method", "steps"),
     [pytest.param(*case, marks=pytest.mark.second if k > 4 else ()) for k, case in enumerate(SUMMED)],
@@ -97,6 +101,7 @@ def test_action_summed_by_the_run_is_that_of_its_steps(arguments, method, steps)
     assert abs(run[2:].action() - without[2:].action()) < 1e-14 if not run.pieces else True
 
 
+@pytest.mark.rotated
 def test_action_is_summed_for_hamiltonians_rotations_and_arrays():
     top = lagrange("top", [], "(omega_1**2 + 2*omega_2**2 + 3*omega_3**2)/2 - R_33", rotations={"R": "omega"})
     oscillator = sc.HamiltonianSystem.from_text("oscillator", ["x"], "p_x**2/2 + p_x**4/8 + x**2/2 + x*p_x/5")
@@ -136,6 +141,7 @@ def test_actions_of_constraints_forces_damping_and_ensembles(stepper):
     assert runs.action(cumulative=True).shape == (21, 2)
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize(
     "steps", [{"h": 0.2, "t_end": 4.1, "save_every": 4}, {"t_end": 6.0}], ids=["lanes", "adaptive"]
 )
@@ -154,12 +160,14 @@ def test_ensembles_sum_the_actions_of_their_runs(stepper, steps):
         assert wild.ok[2] or np.isnan(wild.action()[2])
 
 
+@pytest.mark.quick
 def test_sums_are_compensated():
     terms = np.concatenate([[1.0], np.full(10_000, 1e-17)])
     assert np.cumsum(terms)[-1] == 1.0
     assert compensated_sums(terms)[-1] == 1.0 + 1e-13
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("method", "h"), [("svi:1", 0.05), ("stoermer-verlet", 0.05), ("composition:4", 0.05)])
 def test_shadow_energy_is_constant_and_shows_a_drift(method, h):
     stepper = sc.compile_stepper(HENON_HEILES, method)

@@ -8,7 +8,7 @@ import scvi_codegen as sc
 from scvi_codegen.runtime.run import memory
 from scvi_codegen.runtime.run.step_plan import Adaptive
 
-pytestmark = pytest.mark.usefixtures("as_users_compile")
+pytestmark = [pytest.mark.usefixtures("as_users_compile"), pytest.mark.second]
 
 PUSHED = lagrange("pushed pendulum", "q", "q_dot**2/2 + k*cos(q)", k=1.0, forces={"q": "u"}, inputs="u")
 
@@ -61,6 +61,7 @@ def test_target_times_and_parameters_may_be_changed_during_a_run(pushed):
     assert run.q == pytest.approx(second.q[-1], abs=1e-8)
 
 
+@pytest.mark.quick
 @pytest.mark.parametrize("save_every", [3, 4001, 10**9])
 def test_the_end_is_saved_if_whole_steps_reach_it(save_every):
     problem = sc.problem("kepler")

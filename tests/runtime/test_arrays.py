@@ -32,6 +32,7 @@ FIELD = sc.LagrangianSystem.from_text(
 )
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("count", [2, 3, 64, 1000])
 def test_one_library_is_used_for_every_size(count: int) -> None:
     """A ring of coupled oscillators against its normal modes; momentum to round-off."""
@@ -48,6 +49,7 @@ def test_one_library_is_used_for_every_size(count: int) -> None:
     assert np.ptp(run.momentum_maps()[:, 0]) < 1e-14 * np.sqrt(count)
 
 
+@pytest.mark.second
 def test_energy_does_not_drift() -> None:
     """Over 20 000 steps of a variational method; an explicit one of its order oscillates."""
     ring = lagrange("ring", "q[N]", f"{KINETIC} - sum(i in N periodic, (q[i+1] - q[i])**2/2 + (q[i+1] - q[i])**4/4)")
@@ -118,6 +120,7 @@ def test_energies_are_drawn() -> None:
     assert line.get_ydata()[1:] == pytest.approx(abs(run.energy() / run.energy()[0] - 1)[1:], abs=1e-15)
 
 
+@pytest.mark.tiers(10)
 @pytest.mark.parametrize(
     ("q", "given", "message"),
     [
@@ -162,6 +165,7 @@ def test_incompatible_arrays_are_rejected(q: Any, given: dict[str, Any], message
         sc.compile_stepper(net, "svi:2").start(q, **{"h": 0.1, **given})
 
 
+@pytest.mark.second
 def test_failures_of_array_runs() -> None:
     """A too large step fails and the preceding states are saved; a coordinate without mass is reported."""
     with pytest.raises(sc.StepFailedError, match="Use a smaller h") as caught:
@@ -186,6 +190,7 @@ def test_index_out_of_range_of_a_table_is_rejected() -> None:
         sc.unroll_sums(system, {"N": 5, "B": 1}, tables={"bonds": [[0, 1]]})
 
 
+@pytest.mark.tiers(0, 2)
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize(("method", "most"), [("svi:1", 1.3), ("svi:2", 1.6), ("svi:4", 2.2), ("svi:8", 3.4)])
 @pytest.mark.parametrize("form", ["lagrangian", "hamiltonian"])
@@ -204,6 +209,7 @@ def test_fixed_point_converges_up_to_the_documented_step_size(form: str, method:
     assert np.isnan(run.step_error) == (method == "svi:1" and form == "hamiltonian")
 
 
+@pytest.mark.second
 def test_uniform_damping_has_the_exact_rate() -> None:
     """Damped oscillators of mass 2, in closed form; for a Hamiltonian it requires known sizes."""
     system = lagrange("damped", "q[N]", "sum(i in N, q_dot[i]**2 - q[i]**2)", damping=0.4)

@@ -95,6 +95,7 @@ def test_chains_ordered_from_an_end_need_no_iteration_for_their_linear_systems(s
     assert np.abs(run.q["r"] - ordered.q["r"]).max() < 1e-14
 
 
+@pytest.mark.second
 def test_cloth_conserves_rod_lengths_and_energy():
     stepper = sc.compile_stepper(net(3), "stoermer-verlet")
     q, velocity, data = cloth(12)
@@ -158,6 +159,7 @@ def test_momentum_maps_compatible_with_constraints_are_conserved():
     assert np.abs(np.ptp(run.momentum_maps(), axis=0)).max() < 1e-13
 
 
+@pytest.mark.second
 def test_time_dependent_constraints_are_satisfied():
     """A pendulum whose pivot shakes is that written out in its angle."""
     shaken = sc.LagrangianSystem.from_text(
@@ -194,6 +196,7 @@ steps = 20
 """
 
 
+@pytest.mark.second
 def test_model_files_and_generated_programs_have_constraints(tmp_path):
     (tmp_path / "chain.toml").write_text(MODEL)
     model = sc.load_model(tmp_path / "chain.toml")
@@ -271,6 +274,7 @@ def windy():
     )
 
 
+@pytest.mark.rotated
 def test_velocity_dependent_forces(windy):
     q, data = chain(3)
     unrolled = sc.unroll_sums(windy, {"N": 4, "B": 3, "P": 1}, **with_fields(data, 3))

@@ -52,6 +52,7 @@ def prototypes(header: str, prefix: str) -> dict[str, str]:
     return {name: " ".join(f"{result}({of})".replace(f"{prefix}_", "").split()) for name, result, of in types}
 
 
+@pytest.mark.tiers(1, 2)
 def test_functions_have_the_prototypes_of_named_coordinates(steppers) -> None:
     any_size, known, *_ = steppers
     ours, theirs = (prototypes(each.source.header, each.interface.prefix) for each in (any_size, known))
@@ -75,6 +76,7 @@ def test_functions_have_the_prototypes_of_named_coordinates(steppers) -> None:
     assert ours.keys() - common <= BOUND
 
 
+@pytest.mark.tiers(1, 2)
 def test_functions_of_states_equal_those_of_known_sizes(steppers) -> None:
     """Of states that are not adjacent in memory, all in one call."""
     any_size, known, (q, p), parameters = steppers
@@ -94,6 +96,7 @@ def test_functions_of_states_equal_those_of_known_sizes(steppers) -> None:
             assert values[:, any_size.momentum_map_names.index("momentum of q")] == pytest.approx(flat.sum(axis=1))
 
 
+@pytest.mark.tiers(1, 2)
 def test_energies_in_the_memory_of_a_run_do_not_change_it(steppers) -> None:
     any_size, _, (q, p), parameters = steppers
     array = any_size.interface.coordinates[0]
@@ -112,6 +115,7 @@ def test_energies_in_the_memory_of_a_run_do_not_change_it(steppers) -> None:
     assert run.snapshot == other.snapshot
 
 
+@pytest.mark.tiers(1, 2)
 def test_parameters_that_change_are_those_of_the_next_step(steppers) -> None:
     """The masses, forces and fields of a run follow its parameters, as in a run that starts there."""
     any_size, _, (q, p), parameters = steppers

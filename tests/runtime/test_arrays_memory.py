@@ -148,6 +148,7 @@ class TestDamage:
         with pytest.raises(sc.StateError, match=name):
             chain.from_checkpoint(put_together(header, bytes(fields)), t_end=2.0)
 
+    @pytest.mark.second
     @pytest.mark.parametrize("which", ["chain", "pendulums"])
     def test_damage_behind_a_right_checksum_is_detected(self, which: str, request: Any) -> None:
         stepper = request.getfixturevalue(which)

@@ -33,6 +33,7 @@ def molecules():
     )
 
 
+@pytest.mark.second
 def test_stiff_bonds_at_rest_do_not_limit_the_step_size():
     count, stiff = 40, 1e6
     chain = np.array([(i, i + 1) for i in range(count - 1)])
@@ -52,6 +53,7 @@ def test_stiff_bonds_at_rest_do_not_limit_the_step_size():
     assert np.abs(np.ptp(run.momentum_maps(), axis=0)).max() < 1e-9
 
 
+@pytest.mark.second
 def test_step_without_convergence_fails():
     system = lagrange(
         "long waves", "q[N]", "sum(i in N, q_dot[i]**2/2) - 1e12*sum(i in N periodic, (q[i+1] - q[i])**2/2 - cos(q[i]))"
@@ -75,6 +77,7 @@ def test_unknown_solvers_are_rejected():
         sc.compile_stepper(field(1.0), "svi:4", solver="krylov")
 
 
+@pytest.mark.tiers(1)
 @pytest.mark.parametrize("solver", ["auto", "newton"])
 def test_methods_without_a_basis_of_eigenvectors_are_compiled_with_known_sizes(solver):
     """The matrix of these steps has the double eigenvalue 0 with one eigenvector."""

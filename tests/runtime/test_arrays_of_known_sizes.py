@@ -39,12 +39,14 @@ def known():
     return sc.compile_stepper(body_on_ring("N"), "svi:4", sizes={"N": 5})
 
 
+@pytest.mark.second
 def test_threads_do_not_change_single_coordinates(at_run_time):
     start = {"x": 0.3, "q": np.random.default_rng(1).normal(size=20_000)}
     runs = [at_run_time.integrate(start, h=0.1, steps=3, parameters={"k": 1e-4}, threads=n) for n in (1, 2)]
     assert runs[0].q["x"][-1] == runs[1].q["x"][-1]
 
 
+@pytest.mark.second
 def test_literal_sizes_are_sizes_given_to_compile_stepper(known):
     literal = body_on_ring("5")
     assert [q.name for q in literal.coordinates] == ["x", "q_0", "q_1", "q_2", "q_3", "q_4"]
@@ -90,6 +92,7 @@ def test_invalid_states_are_rejected(known, q, message):
         known.integrate(q, np.zeros(6), h=0.1, steps=1)
 
 
+@pytest.mark.tiers(1)
 @pytest.mark.parametrize(
     ("extra", "method", "message"),
     [

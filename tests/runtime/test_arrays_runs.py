@@ -46,6 +46,7 @@ def driven():
     )
 
 
+@pytest.mark.rotated
 def test_slices_have_the_states_of_the_run(steppers):
     run = steppers[0].integrate(Q, velocity=V, h=0.1, steps=30, events="q[1] - q[2]")
     for rows in (slice(2, None), slice(1, -1, 3), slice(3, 4)):
@@ -70,6 +71,7 @@ def test_slices_have_the_states_of_the_run(steppers):
 
 
 class TestControlledSteps:
+    @pytest.mark.second
     @pytest.mark.parametrize("tolerance", [1e-4, 1e-6, 1e-9])
     def test_error_satisfies_the_tolerance(self, steppers, tolerance):
         stepper, other = steppers
@@ -82,6 +84,7 @@ class TestControlledSteps:
 
 
 class TestStatesBetween:
+    @pytest.mark.second
     def test_unsaved_states_are_not_available(self, steppers):
         run = steppers[0].integrate(Q, h=0.1, steps=4, observe=lambda run: run.energy)
         with pytest.raises(sc.StateError, match="omit observe"):
@@ -91,6 +94,7 @@ class TestStatesBetween:
 
 
 class TestEvents:
+    @pytest.mark.second
     def test_new_state_has_the_opposite_sign(self, steppers):
         run = steppers[0].integrate(Q, velocity=V, t_end=6.0, tolerance=1e-9, events="q[1] - q[2]")
         assert len(run.events[0]) > 1
@@ -105,6 +109,7 @@ class TestEvents:
         )
         assert (again.events[0].t > first.t[-1] + 0.1).all()
 
+    @pytest.mark.second
     def test_invalid_events_are_rejected(self, steppers):
         stepper, _ = steppers
         for function, message in (
@@ -118,6 +123,7 @@ class TestEvents:
 
 
 class TestInputs:
+    @pytest.mark.tiers(1)
     @pytest.mark.parametrize("method", ["svi:2", "svi:6"])
     def test_equal_samples_do_not_reset_the_predictor(self, driven, method):
         """Equal samples need no additional iteration; different ones need fewer than without a predictor."""
@@ -184,6 +190,7 @@ def test_error_estimate_survives_a_zero_of_one_coefficient() -> None:
     assert worst < 3e-5  # 2e-4 where it is
 
 
+@pytest.mark.rotated
 def test_advice_solutions_and_recorded_runs_are_those_of_known_sizes(ring, steppers, tmp_path) -> None:
     """What compiles the sizes of a call gives the results of the unrolled system."""
     known = sc.unroll_sums(ring, {"N": N})
@@ -208,6 +215,7 @@ def test_advice_solutions_and_recorded_runs_are_those_of_known_sizes(ring, stepp
         assert run.steps == 0
 
 
+@pytest.mark.rotated
 def test_advice_of_ensembles_by_name(ring) -> None:
     """The advice is that of the unrolled system, with parameters of each trajectory or of all."""
     springs = sc.LagrangianSystem.from_text(

@@ -142,6 +142,7 @@ def test_terms_are_distributed_over_threads(name: str) -> None:
     assert {sharing_of(rolled) for rolled in program.loops.forces} == {CASES[name].shared}
 
 
+@pytest.mark.tiers(2, 5)
 @pytest.mark.sampled(5)
 @pytest.mark.parametrize("threads", [1, 3])
 @pytest.mark.parametrize("name", CASES)
@@ -155,6 +156,7 @@ def test_every_term_is_counted_once(name: str, threads: int) -> None:
     np.testing.assert_allclose(run.p["q"][1], kick, rtol=0, atol=2e-15 * np.abs(kick).max())
 
 
+@pytest.mark.tiers(2, 3)
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     ("name", "method"),
@@ -168,6 +170,7 @@ def test_results_do_not_depend_on_the_number_of_threads(name: str, method: str) 
     assert found[1:] == found[:1] * (len(THREADS) - 1)
 
 
+@pytest.mark.rotated
 def test_iterative_methods_agree_with_leapfrog() -> None:
     """Both methods take small steps."""
     for name in ("ring", "pairs", "net"):
@@ -181,6 +184,7 @@ def test_iterative_methods_agree_with_leapfrog() -> None:
         np.testing.assert_allclose(ends[0].q["q"][-1], ends[1].q["q"][-1], rtol=0, atol=1e-9)
 
 
+@pytest.mark.rotated
 def test_newton_iteration_with_threads() -> None:
     """The last bits of a large step from q = 0 depend on the order in which inner products are summed."""
     stepper, start = stepper_of("ring", "svi:2", "newton"), start_of("ring")
@@ -193,6 +197,7 @@ def test_newton_iteration_with_threads() -> None:
     assert one == two
 
 
+@pytest.mark.second
 def test_adaptive_steps_with_threads() -> None:
     stepper = stepper_of("pairs", "svi:4")
     found = [
@@ -201,6 +206,7 @@ def test_adaptive_steps_with_threads() -> None:
     assert found[1:] == found[:1] * (len(THREADS) - 1)
 
 
+@pytest.mark.rotated
 def test_hamiltonians_and_velocity_dependent_forces_with_threads() -> None:
     field = sc.HamiltonianSystem.from_text(
         name="field",
@@ -328,6 +334,7 @@ def test_neighbouring_blocks_are_never_processed_concurrently(windows: dict[tupl
     assert several >= 10
 
 
+@pytest.mark.rotated
 def test_pair_blocks_form_a_round_robin_schedule(windows: dict[tuple[str, int], list[list[int]]]) -> None:
     most = 0
     for (what, size), each in windows.items():
@@ -403,6 +410,7 @@ def program(name: str, method: str, solver: str, folder: Path, **numbers: int) -
     (folder / "main.c").write_text(RACES.format(**texts, **numbers))
 
 
+@pytest.mark.second
 def test_as_many_threads_are_started_as_requested(tmp_path: Path) -> None:
     """The caller is one of them; the largest number is that of the table of threads."""
     (tmp_path / "counted.c").write_text(COUNTED)

@@ -294,6 +294,7 @@ def written(formula):
     )
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(
     ("name", "method", "solver", "situation"), [*CASES, *(pytest.param(*each, marks=pytest.mark.full) for each in FULL)]
 )
@@ -362,6 +363,7 @@ CONTINUED = [
 ]
 
 
+@pytest.mark.tiers(2, 10)
 @pytest.mark.parametrize("adaptive", [False, True])
 @pytest.mark.parametrize(("name", "method", "solver", "way"), CONTINUED)
 def test_continued_runs_equal_undivided_runs_bitwise(name, method, solver, way, adaptive):
@@ -385,6 +387,7 @@ def test_continued_runs_equal_undivided_runs_bitwise(name, method, solver, way, 
         assert each.energy == whole.energy
 
 
+@pytest.mark.second
 def test_inputs_are_set_between_steps():
     motion = MOTIONS["data"]
     runs = [
@@ -400,6 +403,7 @@ def test_inputs_are_set_between_steps():
         runs[0].set_inputs(G=1.0)
 
 
+@pytest.mark.rotated
 def test_known_sizes_names_and_ensembles():
     """Sizes that are known when compiled, literal or by an argument, are those of the unrolled system."""
     motion = MOTIONS["body on ring"]

@@ -12,6 +12,8 @@ from scipy.integrate import solve_ivp
 import scvi_codegen as sc
 from scvi_codegen.runtime.chaos.indicators import SERIES, InitialTangents
 
+pytestmark = pytest.mark.second
+
 REGULAR, CHAOTIC = ((0.0, 0.0), (0.5, 0.0)), ((0.0, -0.25), (0.42, 0.0))
 """Of Henon and Heiles near the energy 1/8: Skokos, Bountis & Antonopoulos, Physica D 231 (2007) 30, section 3."""
 
@@ -111,6 +113,7 @@ def test_stride_does_not_change_the_indicators(galaxy):
     assert np.abs(back.lyapunov_exponents() + back.lyapunov_exponents()[::-1]).max() < 1e-13
 
 
+@pytest.mark.quick
 def test_maximal_growth_between_saved_states_is_found(galaxy):
     """Between states that are kept, too: of a regular motion, whose changes come and go."""
     run, start = galaxy.integrate(*REGULAR, h=0.2, steps=60), ([REGULAR[0]], [REGULAR[1]])
@@ -211,6 +214,7 @@ FORCED = sc.LagrangianSystem.from_text(
 OPEN = hamilton("open", "x y", "a**2/2 + b**2/3 + x**2*y + x**4 + y**2", momenta="a b")
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("system", "method", "options"),
@@ -233,6 +237,7 @@ def test_lanes_have_the_derivatives_of_the_steps(system, method, options):
     same(found, alone.chaos_indicators_ensemble(*start, **options), 1e-12)
 
 
+@pytest.mark.rotated
 def test_fast_growing_tangent_vectors_in_lanes_use_shorter_segments():
     """x'' = 100 x: growth e^20 in ten steps, e^600 in total; compare with the closed form and the derivatives."""
     saddle = sc.LagrangianSystem.from_text(name="saddle", coordinates=["x"], lagrangian="(x_dot**2 + 100*x**2)/2")
@@ -271,6 +276,7 @@ def test_failed_steps_are_rejected_as_in_runs():
     assert np.isnan(found.megno()[-1]).all()
 
 
+@pytest.mark.quick
 def test_more_trajectories_than_one_batch_are_distinguished(galaxy):
     """A row of a map equals its single trajectories for any number of threads."""
     y = np.linspace(-0.2, 0.3, 261)
@@ -297,6 +303,7 @@ def test_ensembles_have_the_time_and_the_parameters_of_their_trajectories():
         assert_allclose(found.log_norms[:, j], alone.log_norms, rtol=0, atol=1e-13)
 
 
+@pytest.mark.quick
 def test_last_step_of_an_event_run_is_not_changed(galaxy):
     """The step size is fixed: the derivative is that of the state at that time, not of the crossing."""
     run = galaxy.integrate(*CHAOTIC, h=0.2, steps=1000, events=sc.Event("y", terminal=True, direction=1))
@@ -308,6 +315,7 @@ def test_last_step_of_an_event_run_is_not_changed(galaxy):
     assert run.chaos_indicators(1).log_norms[-1, 0] == pytest.approx(np.log(np.linalg.norm(moved)), abs=1e-12)
 
 
+@pytest.mark.tiers(1)
 @pytest.mark.parametrize(
     "given",
     [
@@ -363,6 +371,7 @@ def test_regular_and_chaotic_planets_agree_with_rebound():
             assert min(found, known.megno()) > 6.0
 
 
+@pytest.mark.quick
 def test_invalid_arguments_are_rejected(galaxy):
     run = galaxy.integrate(*REGULAR, h=0.2, steps=4)
     with pytest.raises(sc.StateError, match="a run of at least one step"):

@@ -9,6 +9,8 @@ import scvi_codegen as sc
 from scvi_codegen.lowering.program import lower
 from scvi_codegen.runtime.arrays import envelope
 
+pytestmark = pytest.mark.second
+
 RANDOM = np.random.default_rng(1)
 ROUNDING = 2.0**-52
 KINETIC = {1: "sum(i in N, q_dot[i]**2/2)", 2: "sum(i in NX, j in NY, q_dot[i, j]**2/2)"}
@@ -60,6 +62,7 @@ def products_of(stepper, q, h, *, steps=1, **given):
     return report.products
 
 
+@pytest.mark.tiers(0, 6)
 @pytest.mark.sampled(9)
 @pytest.mark.parametrize("size", [8, 12, 13, 34, 60, 77, 169, 500, 1001])
 @pytest.mark.parametrize("method", ["svi:2", "svi:4", "gauss:3"])
@@ -91,6 +94,7 @@ def test_each_array_has_its_circulant_preconditioner():
     assert products_of(stepper, start, 1.0) <= 3
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize(("name", "shape", "most"), COUNTS)
 def test_boundaries_and_amplitudes_need_few_products(name, shape, most):
@@ -98,6 +102,7 @@ def test_boundaries_and_amplitudes_need_few_products(name, shape, most):
     assert products_of(stepper_of(name), smooth(shape), 1.0, steps=3, parameters={"k": 1e4}) <= 3 * most
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(3)
 @pytest.mark.covering
 @pytest.mark.parametrize("name", LATTICES)
@@ -148,6 +153,7 @@ def test_diagonal_preconditioner_is_used_for_nonuniform_lattices():
     assert products_of(stepper, RANDOM.normal(size=400), 1.0, parameters={"w": w}) <= 120
 
 
+@pytest.mark.quick
 @pytest.mark.parametrize(
     ("term", "reach"),
     [
@@ -172,6 +178,7 @@ def test_systems_with_a_circulant_preconditioner(term, reach):
     assert lower(system, sc.as_method("svi:2"), prefix="some", solver="newton").loops.reach == reach
 
 
+@pytest.mark.quick
 @pytest.mark.parametrize(("coordinates", "reach"), [(["u[N]"], 1), (["u[N]", "s"], 0), (["u[N]", "r[3]"], 0)])
 def test_circulant_preconditioner_requires_lattices_only(coordinates, reach):
     system = sc.LagrangianSystem.from_text(

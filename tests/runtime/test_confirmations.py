@@ -289,6 +289,7 @@ def check(found: Counter, least: float) -> None:
     assert total["confirmed"] >= least * sum(total.values()), found
 
 
+@pytest.mark.tiers(2, 4)
 @pytest.mark.parametrize("kind", [*SMOOTH, *NOT_SMOOTH])
 def test_no_error_is_confirmed_but_wrong(kind):
     """Three cases of each kind; most smooth ones are confirmed."""

@@ -67,6 +67,7 @@ def test_ellipse_is_followed_to_round_off_without_step_arguments(kepler, e, erro
     assert run.iterations.sum() < 6 * run.steps
 
 
+@pytest.mark.rotated
 @pytest.mark.covering
 @pytest.mark.parametrize("tolerance", [1e-4, 1e-7, 1e-10])
 @pytest.mark.parametrize("degree", [4, 8])
@@ -84,6 +85,7 @@ def test_end_of_a_step_has_the_requested_accuracy(tolerance, degree):
     assert run.steps < len(stepper.integrate([0.3, 0.2], [0.2, 0.3], t_end=30.0, tolerance=tolerance / 100.0))
 
 
+@pytest.mark.tiers(2)
 @pytest.mark.parametrize(("degree", "e", "tolerance"), [(8, 0.9, 1e-12), (8, 0.999, 1e-12), (12, 0.9, None)])
 def test_step_sizes_are_smaller_where_errors_grow(degree, e, tolerance):
     """Step sizes change a thousandfold before the pericentre; a third of the trials was rejected."""
@@ -105,6 +107,7 @@ def test_adaptive_steps_backward_in_time(kepler):
     assert np.array_equal(mirrored.q, there.q)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("method", [sc.Gauss(6), sc.SCVI(4), sc.SpectralCollocation(6)])
 def test_every_iterative_method_has_adaptive_steps(method, pendulums):
     stepper = sc.compile_stepper(sc.problem("double-pendulum").system, method)
@@ -115,6 +118,7 @@ def test_every_iterative_method_has_adaptive_steps(method, pendulums):
     assert np.abs(energy / energy[0] - 1.0).max() < 1e-12
 
 
+@pytest.mark.second
 def test_hamiltonian_has_adaptive_steps():
     system = hamilton("relativistic", "x", "sqrt(1 + p**2) + x**2/2", momenta="p")
     run = sc.compile_stepper(system, sc.SVI(8)).integrate([1.0], [0.5], t_end=30.0)
@@ -169,6 +173,7 @@ def test_collision_is_rejected_where_it_occurs(kepler):
     assert len(failure.value.trajectory) > 10
 
 
+@pytest.mark.second
 def test_equilibria_and_free_particles_need_few_steps():
     free = sc.compile_stepper(lagrange("free", "x", "x_dot**2/2"), sc.SVI(8))
     run = free.integrate([0.0], [2.0], t_end=1000.0)
@@ -230,6 +235,7 @@ def test_equal_velocities_at_both_points_give_no_estimate_by_a_curve(name, solve
     assert math.isnan(estimate) if name == "of arrays" else 1e-6 < estimate < 1e-2
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("solver", ["auto", "newton"])
 def test_three_lobatto_points_estimate_errors_by_the_momentum_derivative(solver):
     """The highest coefficient of the velocities is 0 in every step."""
@@ -241,6 +247,7 @@ def test_three_lobatto_points_estimate_errors_by_the_momentum_derivative(solver)
     assert 1e-8 < run.step_error < 2e-5
 
 
+@pytest.mark.tiers(1)
 @pytest.mark.parametrize("method", [sc.SVI(8), sc.SVI(6, "gauss-legendre:9")])
 def test_newton_iteration_has_adaptive_steps(method):
     stepper = sc.compile_stepper(sc.problem("kepler").system, method, solver="newton")
@@ -258,6 +265,7 @@ def test_newton_iteration_has_adaptive_steps(method):
     assert np.array_equal(np.concatenate([first.q, rest.q[1:]]), run.q)
 
 
+@pytest.mark.second
 def test_newton_solves_stiff_systems_with_steps_of_the_slow_time_scale():
     system = lagrange("penalty pendulum", "x y", "(x_dot**2 + y_dot**2)/2 - y - k*(x**2 + y**2 - 1)**2/8", k=1e10)
     start, rest = [math.sin(1.0), -math.cos(1.0)], [0.0, 0.0]
@@ -281,6 +289,7 @@ def test_solve_ivp_accepts_the_tolerance_of_steps(kepler):
     assert not sc.solve_ivp(kepler, (0.0, 2.0), [1.0, 0.0, 0.0, 0.0], rtol=1e-12).success
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(
     "method", ["svi:5", *(pytest.param(name, marks=pytest.mark.full) for name in ("svi:8", "gauss:4"))]
 )
@@ -330,6 +339,7 @@ def test_a_singular_time_inside_a_run_is_resolved_or_its_error_reported():
         assert error < 10.0 * run.step_error <= 1e3 * wanted, tolerance
 
 
+@pytest.mark.tiers(2, 3)
 @pytest.mark.parametrize("method", ["svi:4", "svi:8"])
 @pytest.mark.parametrize("force", ["1/(t - a)", "x/(t - a)", "1/(t - a)**2"])
 def test_a_pole_in_time_ends_a_run(method, force):
@@ -405,6 +415,7 @@ def far_away():
 WAYS = ["adaptive", "reversible", "clocked", "driven", "driven, adaptive", "indexed"]
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(4)
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("span", [2.0, -2.0])
@@ -452,6 +463,7 @@ class TestStepsOfHLeadToAnEnd:
         q, _ = run.at(between)
         assert np.abs((q if name == "q" else q["q"])[:, 0] - np.cos(between)).max() < 1e-9
 
+    @pytest.mark.second
     def test_events_in_steps_and_in_the_shortened_last_step_are_found(self, oscillators, name, sign):
         wanted = [f"{name} - 0.5", f"{name} - cos(1.95)", sc.Event(f"{name} - cos(1.99)", terminal=True)]
         run = oscillators[name].integrate([1.0], [0.0], h=sign * 0.3, t_end=sign * 2.0, events=wanted)
@@ -487,6 +499,7 @@ def test_invalid_steps_and_ends_are_rejected(oscillators, name, given, message):
         oscillators[name].integrate([1.0], [0.0], **given)
 
 
+@pytest.mark.second
 def test_many_iterations_limit_the_step_size():
     """At 1e-3 the error of a charge in a field that depends on z allows sizes at which the iteration diverges."""
     system = lagrange("charge", "x y z", "(x_dot**2 + y_dot**2 + z_dot**2)/2 + (5 + 5*z**2/2)*(x*y_dot - y*x_dot)")
@@ -514,6 +527,7 @@ def test_step_sizes_do_not_depend_on_the_origin_of_time():
     assert np.array_equal(shifted.step_sizes[:-2], first.step_sizes[:-2])
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("solver", ["fixed-point", "newton"])
 def test_known_sizes_take_the_adaptive_steps_of_arrays_at_the_nodes_of_a_wave(solver):
     text = "sum(i in N, q_dot[i]**2/2 - q[i]**4/4) - sum(i in N periodic, (q[i+1] - q[i])**2/2)"

@@ -36,6 +36,7 @@ def kepler() -> sc.Stepper:
 # Order, continuity, ends.
 
 
+@pytest.mark.tiers(1, 4)
 @each_method
 def test_dense_output_has_the_order_of_the_method(method):
     stepper = sc.compile_stepper(sc.problem("kepler").system, method, flags=FLAGS)
@@ -52,6 +53,7 @@ def test_dense_output_has_the_order_of_the_method(method):
     assert between[1] < 1.3 * saved[1]
 
 
+@pytest.mark.tiers(1, 4)
 @each_method
 @pytest.mark.parametrize("h", [0.1, -0.1])
 def test_dense_output_is_continuous_at_saved_states(compiled, sample, method, h):
@@ -129,6 +131,7 @@ def test_requested_times_are_checked(kepler, arguments, words):
             kepler.integrate(**START, **way, **arguments)
 
 
+@pytest.mark.second
 def test_states_before_a_failure_are_available():
     runaway = sc.LagrangianSystem.from_text(name="runaway", coordinates=["q"], lagrangian="q_dot**2/2 + q**3/3")
     stepper = sc.compile_stepper(runaway, sc.SVI(3), flags=FLAGS)
@@ -140,6 +143,7 @@ def test_states_before_a_failure_are_available():
 # The call that is like solve_ivp.
 
 
+@pytest.mark.second
 def test_solve_ivp_agrees_with_scipy():
     """Arguments, attributes and shapes are equal; pendulum from rest at 2, four turning points."""
     asked = np.linspace(0, 10, 33)

@@ -109,6 +109,7 @@ def directions_of(form):
     return found / np.linalg.norm(found, axis=0)
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("form", FORMS)
 def test_derivatives_of_a_step_by_all_arguments(form):
@@ -126,6 +127,7 @@ def test_derivatives_of_a_step_by_all_arguments(form):
     assert np.abs(found[:4, :4] - projected).max() > 1e-4
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize(
     "form", [form if form == "L" else pytest.param(form, marks=pytest.mark.full) for form in FORMS]
 )
@@ -142,6 +144,7 @@ def test_derivatives_of_runs_by_steps_and_to_an_end_time(form):
     assert ended.sensitivity().h is None
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("form", ["L", "K, momenta"])
 def test_steps_are_symplectic_with_time_and_its_momentum(form):
     """(q, t, p, -E): what moves the energy of the start moves the time, and nothing else is lost."""
@@ -216,6 +219,7 @@ def test_derivatives_at_an_end_time_agree_with_fixed_steps_of_time():
     assert_allclose(ended, own, rtol=0, atol=1e-8 * np.abs(own).max())
 
 
+@pytest.mark.second
 def test_derivatives_of_a_rod_in_transformed_time():
     """With a constraint, compare with the transpose and with differences of steps."""
     rod = lagrange("rod", "x y", "(x_dot**2 + y_dot**2)/2 - g*y", g=1.0, constraints=["x**2 + y**2 - 1"])
@@ -231,6 +235,7 @@ def test_derivatives_of_a_rod_in_transformed_time():
     assert forward[1, -1, -2] == pytest.approx((ends[0] - ends[1]) / 2e-4, rel=1e-7)
 
 
+@pytest.mark.second
 def test_unsupported_derivatives_in_transformed_time():
     made = stepper("L")
     run = made.integrate(Q, P, h=H, steps=3)
@@ -244,6 +249,7 @@ def test_unsupported_derivatives_in_transformed_time():
         made.integrate(Q, P, h=H, t_end=2.7, save_every=4).tangent()
 
 
+@pytest.mark.second
 def test_hamiltonian_linear_in_momenta_has_an_energy_surface():
     vortex = hamilton("turn", "q", "w*(q**2 + p**2)/2", momenta="p", w=1.5)
     made = sc.compile_stepper(sc.reparametrise(vortex, "1/(1 + q**2)"), sc.Gauss(2), flags=QUICK_FLAGS)

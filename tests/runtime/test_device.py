@@ -26,6 +26,8 @@ from scvi_codegen.runtime.ensemble import ensemble
 from scvi_codegen.runtime.ensemble.device import DeviceEnsemble
 from scvi_codegen.runtime.ensemble.ensemble import Ensemble
 
+pytestmark = pytest.mark.second
+
 CASES = {
     "kepler": "svi:8",
     "double-pendulum": "svi:3",
@@ -111,6 +113,7 @@ def test_inputs_change_parameters_and_step_sizes_between_launches(gpu: EmulatedG
     assert np.isfinite(host.energy()).all()
 
 
+@pytest.mark.rotated
 @pytest.mark.filterwarnings("ignore::scvi_codegen.errors.AccuracyWarning")
 def test_trajectories_that_stop_are_continued_by_the_processor(gpu: EmulatedGpu) -> None:
     e = np.array([0.1, 0.97, 0.98, 0.99, 0.5])
@@ -173,6 +176,7 @@ def test_trajectories_that_leave_their_lane_are_observed(gpu: EmulatedGpu) -> No
 ENDS = np.array([9.0, 4.0, 6.0, 0.0, 7.5])
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.filterwarnings("ignore::scvi_codegen.errors.AccuracyWarning")
 @pytest.mark.parametrize(
     "system",
@@ -247,6 +251,7 @@ def test_chaos_indicators_agree_with_those_of_the_processor(gpu: EmulatedGpu, co
     assert gpu.launches == [("advance", 64)]
 
 
+@pytest.mark.quick
 def test_interrupted_runs_have_the_states_so_far(gpu: EmulatedGpu) -> None:
     stepper, (q, p) = compiled("kepler", sc.SVI(4)), states("kepler")
     work = Ensemble(stepper, q, p, h=0.05, steps=200, device="cuda")
@@ -346,6 +351,7 @@ def test_code_of_the_page_runs(gpu: EmulatedGpu, monkeypatch: pytest.MonkeyPatch
     assert capsys.readouterr().out == "True (10,)\nTrue\nTrue (10, 2)\n(6,)\n"
 
 
+@pytest.mark.quick
 def test_without_a_gpu_the_error_names_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     class WithoutDriver:
         @staticmethod
@@ -399,6 +405,7 @@ def test_ptx_of_nvrtc_computes_the_same_growth_as_c(gpu: EmulatedGpu) -> None:
     assert np.array_equal(by_ptx.mean_rates, by_c.mean_rates)
 
 
+@pytest.mark.quick
 @pytest.mark.second
 @pytest.mark.parametrize(
     ("system", "method", "plan"),

@@ -55,6 +55,7 @@ def test_parts_are_multiples_of_the_register_width():
         assert all((part.stop - part.start) % 8 == 0 for part in parts[:-1])
 
 
+@pytest.mark.second
 class TestCluster:
     def test_default_is_the_current_process(self, distributed: Any, kepler: sc.Stepper):
         q, p = states()
@@ -81,6 +82,7 @@ class TestCluster:
             assert np.array_equal(found, expected, equal_nan=True)
         assert np.array_equal(result.energy(), here.energy(), equal_nan=True)
 
+    @pytest.mark.quick
     def test_invalid_arguments_are_reported_before_distribution(self, kepler: sc.Stepper):
         q, p = states()
         for faults in ({"h": 0.0}, {"steps": -1}, {"blocks": 0}, {"parameters": {"nu": 1.0}}):
@@ -97,6 +99,7 @@ class TestCluster:
         assert np.flatnonzero(~result.ok).tolist() == [5]
         assert result.steps[5] < 50
 
+    @pytest.mark.rotated
     def test_killed_worker_loses_nothing(self, distributed: Any, cluster: Any, kepler: sc.Stepper):
         q, p = states()
         arguments = {"h": 0.05, "steps": 15_000, "save_every": 5_000}
@@ -117,6 +120,7 @@ class TestCluster:
         assert np.array_equal(result.q, here.q)
         assert np.array_equal(result.p, here.p)
 
+    @pytest.mark.rotated
     def test_worker_compiles_the_source_into_its_cache(self, distributed: Any, kepler: sc.Stepper, tmp_path: Path):
         q, p = states()
         with distributed.LocalCluster(
@@ -156,12 +160,14 @@ class TestCluster:
             assert not any(client.processing().values())
 
 
+@pytest.mark.rotated
 def test_workers_compile_the_source_once(kepler: sc.Stepper):
     pickled = pickle.dumps(kepler)
     assert kepler.source.code.encode() in pickled
     assert _stepper(pickled) is _stepper(pickled)
 
 
+@pytest.mark.rotated
 def test_missing_extra_names_what_to_install(kepler: sc.Stepper, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(ImportError, match=r"pip install 'scvi-codegen\[distributed\]'"):

@@ -130,6 +130,7 @@ def largest_errors(folder: Path, count: int) -> dict[str, float]:
     return worst
 
 
+@pytest.mark.tiers(0, 0)
 @pytest.mark.parametrize(
     "count", [pytest.param(1000, marks=pytest.mark.second), pytest.param(MANY, marks=pytest.mark.full)]
 )
@@ -201,6 +202,7 @@ def gauss_step(name: str, q: list, v: list, t: object, h: object, stages: int) -
     return q1, [v[i] + h * mp.fdot(b, [f[i] for f in F]) for i in range(len(q))]
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("name", "stages", "h"), [("kepler", 8, 0.125), ("driven", 6, 0.25), ("quartic", 3, 0.0625)])
 def test_step(name: str, stages: int, h: float) -> None:
     """One step is accurate to 2e-30, from a state of two words; later ones use the predictor."""
@@ -269,6 +271,7 @@ def test_near_zeros(tmp_path: Path) -> None:
                     assert abs(value - exact) <= 1e-31 * abs(exact) + 1e-47 * a
 
 
+@pytest.mark.rotated
 def test_conserved_quantities() -> None:
     """Energy and angular momentum of 1000 steps stay within 1e-29, also with parameters of two words."""
     stepper = sc.compile_stepper(system("kepler"), "svi:12", precision="double-double")
@@ -355,6 +358,7 @@ def test_states_by_name() -> None:
         assert run.q_low[0].all()
 
 
+@pytest.mark.rotated
 def test_large_steps() -> None:
     """Corrections whose last changes are rounding errors are accepted, near pericentre with 16 steps a period."""
     stepper = sc.compile_stepper(system("kepler"), "svi:24", precision="double-double")
@@ -439,6 +443,7 @@ def exact_orbit(t: object, e: object = Fraction(1, 2)) -> list:
     return [mp.cos(angle) - e, mp.sqrt(1 - e**2) * mp.sin(angle)]
 
 
+@pytest.mark.second
 def test_tolerances_are_met_or_refused() -> None:
     """Tolerances below what error estimates resolve are refused; the error of each step is below all others."""
     kepler, start = system("kepler"), {"q": ["0.5", 0], "velocity": [0, "1.7"], "t_end": 2.0}
@@ -459,6 +464,7 @@ def test_tolerances_are_met_or_refused() -> None:
             assert abs(step.mp("q")[-1] - run.mp("q")[k + 1]).max() < 10 * tolerance
 
 
+@pytest.mark.second
 def test_cost_of_the_default_tolerance() -> None:
     """Adaptive steps to round-off are at most twice as many as those of 1e-28, also from and through zero."""
     text = "a_dot**2 + b_dot**2/2 + a_dot*b_dot*cos(a - b) + 2*cos(a) + cos(b)"
@@ -569,6 +575,7 @@ def test_velocities_at_times_of_two_words() -> None:
         assert abs(np.array([moved[0].mp() - q, moved[1].mp() - v])).max() < 1e-31
 
 
+@pytest.mark.rotated
 def test_runs() -> None:
     """Adaptive steps, a shorter last step, output times, dense output and restarts have both words."""
     stepper = sc.compile_stepper(system("kepler"), "svi:12", precision="double-double")
@@ -607,6 +614,7 @@ def test_runs() -> None:
         assert np.abs(fixed[:86].sensitivity().state - double.sensitivity().state).max() < 1e-9
 
 
+@pytest.mark.second
 def test_events() -> None:
     """Times and states of crossings have two words: y = 0 at multiples of pi, x = 0 at a known anomaly."""
     stepper = sc.compile_stepper(system("kepler"), "svi:12", precision="double-double")
@@ -696,6 +704,7 @@ def test_advice_of_ensembles() -> None:
         assert 1e-27 < max(errors) == errors[1] < 1e-24
 
 
+@pytest.mark.second
 def test_ensembles(tmp_path: Path) -> None:
     """Trajectories of ensembles equal single runs, with adaptive steps bit for bit, and the exact orbit; in files."""
     stepper = sc.compile_stepper(system("kepler"), "svi:12", precision="double-double")
@@ -797,6 +806,7 @@ def lane_starts() -> tuple[dict[str, list], dict[str, object], list[dict[str, ob
     return start, numbers, [{"m": m, "mu": "1/3"} for m in numbers["m"]]
 
 
+@pytest.mark.tiers(1)
 @pytest.mark.parametrize(
     ("method", "plan"),
     [
@@ -990,6 +1000,7 @@ def test_velocities_of_files() -> None:
     assert np.array_equal(derived(run.t, run.q, run.p)["velocity"], run.p)
 
 
+@pytest.mark.rotated
 def test_associative_math_is_an_error(tmp_path: Path) -> None:
     """The C itself refuses to be compiled with reordered sums."""
     stepper = sc.compile_stepper(system("kepler"), "svi:4", precision="double-double")
@@ -1003,6 +1014,7 @@ def test_associative_math_is_an_error(tmp_path: Path) -> None:
         assert wanted in done.stderr
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("h", "t_end"), [(0.1, 20.0), (0.3, 3.0), (0.7, 2.1), (-0.3, -3.0), (0.25, 2.0), (0.15, 2.0)])
 def test_fixed_steps_end_at_the_final_time(h: float, t_end: float) -> None:
     """y = 1 - t^2/2, and between impacts y = T s - s^2/2 with T = sqrt(2), at t_end, not at the multiple of h."""
@@ -1025,6 +1037,7 @@ def test_fixed_steps_end_at_the_final_time(h: float, t_end: float) -> None:
         assert abs(many.mp("q")[-1][0][0] - expected[0]) < 1e-30 * (1 + t**2)
 
 
+@pytest.mark.rotated
 def test_times_have_two_words_or_are_refused() -> None:
     """x = cos(a) - cos(t) - (t - a) sin(a) from rest at the origin at a = 1/10, where the size of the state is zero."""
     system = lagrange("driven", "x", "x_dot**2/2 + x*cos(t)")

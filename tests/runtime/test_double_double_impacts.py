@@ -107,6 +107,7 @@ def test_runs_in_parts() -> None:
     assert len(back.events[0]) == len(whole.events[0])
 
 
+@pytest.mark.second
 def test_return() -> None:
     """A pendulum between elastic walls, integrated forward and back, returns, with its energy and 31 digits."""
     pendulum = sc.LagrangianSystem.from_text(name="pendulum", coordinates=["q"], lagrangian="q_dot**2/2 + cos(q)")
@@ -244,6 +245,7 @@ def test_reversible_controller() -> None:
         assert largest(run.mp("q")[-1] - adaptive.mp("q")[-1]) < 1e-28
 
 
+@pytest.mark.second
 def test_errors() -> None:
     """Accumulating impacts end the run with a warning, a start behind a wall and transformed time are errors."""
     dead = sc.LagrangianSystem.from_text(name="dead", coordinates=["y"], lagrangian="y_dot**2/2 - y")

@@ -15,6 +15,8 @@ from scvi_codegen.methods import as_method
 from scvi_codegen.runtime.core.pairs import product_of, quotient_of, sum_of
 from scvi_codegen.runtime.core.words import as_mpmath, with_low
 
+pytestmark = pytest.mark.second
+
 KEPLER = sc.LagrangianSystem.from_text(
     name="kepler",
     coordinates=["x", "y"],
@@ -65,6 +67,7 @@ def gauss_tables() -> tuple[list, list]:
     return [[quarter, quarter - root], [quarter + root, quarter]], [mp.mpf(1) / 2] * 2
 
 
+@pytest.mark.quick
 @pytest.mark.parametrize("hamiltonian", [False, True])
 def test_step(hamiltonian: bool) -> None:
     """A step of K = r (H - E) and its duration, the integral of r, are those of Gauss's method in 60 digits."""
@@ -205,6 +208,7 @@ def walk_of_energy(g: str, method: str, steps: int) -> np.ndarray:
     return K - K[:, 1:51].mean(axis=1, keepdims=True)
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize(
     ("g", "steps", "most"),
     [
@@ -221,6 +225,7 @@ def test_energy_performs_a_random_walk(g: str, steps: int, most: float) -> None:
         assert np.sqrt((ends**2).mean()) < most * np.sqrt(part / 1000 * steps)
 
 
+@pytest.mark.quick
 def test_other_systems() -> None:
     """Constraints and arrays of known sizes in transformed time; what it excludes stays an error with its remedy."""
     swing = sc.compile_stepper(sc.reparametrise(ROD, "2 + y"), "svi:4", precision="double-double")
@@ -232,6 +237,7 @@ def test_other_systems() -> None:
         swing.integrate(q, p, t_end=1.0)
 
 
+@pytest.mark.quick
 def test_arithmetic() -> None:
     """Sums, products and quotients of arrays of two words are accurate to 1e-31; of doubles they are those of NumPy."""
     rng = np.random.default_rng(5)

@@ -14,6 +14,8 @@ from scvi_codegen.methods.discretise import discretised_form
 from scvi_codegen.runtime.core.words import fraction_of, two_words, word
 from scvi_codegen.runtime.rotations.attitudes import momenta_of_body
 
+pytestmark = pytest.mark.second
+
 LINKS = "(x_dot**2 + y_dot**2)/2 + 0.75*(u_dot**2 + w_dot**2)/2 - y - 0.75*w"
 MUTUAL = "a_dot**2 + b_dot**2/2 + a_dot*b_dot*cos(a - b) + 2*cos(a) + cos(b)"
 RELATIVISTIC = "-sqrt(1 - x_dot**2 - y_dot**2) + 1/sqrt(x**2 + y**2) + sin(t)*x/8"
@@ -136,6 +138,7 @@ def test_first_order() -> None:
         assert abs(v.mp()[0] + mp.sin(x) / (1 + 2 * (x * x + y * y))) < 1e-31
 
 
+@pytest.mark.quick
 def test_numbers_of_first_order_states() -> None:
     """Values of variables in order or by name, and coordinates beside a rotation, have both words."""
     text = "(1 + x**2 + y**2)*(x*y_dot - y*x_dot)/2 - cos(x) - sin(y)"
@@ -233,6 +236,7 @@ def test_rod_and_angle() -> None:
         assert abs(force.mp()[0] + m * (rate**2 + mp.cos(a)) / 2) < 1e-30
 
 
+@pytest.mark.quick
 def test_initial_states() -> None:
     """A state that violates the constraints is projected to 32 digits, and one that satisfies them is not moved."""
     stepper = compiled("rod", "svi:1")
@@ -287,6 +291,7 @@ def test_constraints_by_multipliers(degree: int) -> None:
 STIFF = "(1 + b**2)*a_dot**2/2 + b_dot**2/2 - 5000*a**2 - b**2"
 
 
+@pytest.mark.tiers(0, 0)
 @pytest.mark.parametrize("degree", [3, *(pytest.param(s, marks=pytest.mark.second) for s in (9, 18))])
 def test_velocities_by_iteration(degree: int) -> None:
     """Steps of variable masses by fixed-point iteration agree with those by the factors of all unknowns."""
@@ -309,6 +314,7 @@ def test_velocities_by_iteration(degree: int) -> None:
                 assert abs(runs[0].mp(name) - runs[1].mp(name)).max() < 1e-30
 
 
+@pytest.mark.quick
 def test_newton_after_the_iteration() -> None:
     """Steps whose iteration fails are those of Newton's method, in two words."""
     stiff = sc.LagrangianSystem.from_text(name="stiff", coordinates=["a", "b"], lagrangian=STIFF)

@@ -8,7 +8,7 @@ import scvi_codegen as sc
 from scvi_codegen.models.systems import point_vortices
 from scvi_codegen.native.building import PORTABLE_FLAGS, TUNED_FLAGS
 
-pytestmark = pytest.mark.usefixtures("as_users_compile")
+pytestmark = [pytest.mark.usefixtures("as_users_compile"), pytest.mark.rotated]
 
 STEPS = 2_000_000
 

@@ -45,6 +45,7 @@ def sloped(t, inner):
     return np.interp(t, KNOTS, VALUES)
 
 
+@pytest.mark.tiers(5, 6)
 @pytest.mark.parametrize(
     ("kind", "exact"),
     [("constant", zero_order_hold), ("linear", sloped), ("cubic", lambda t, _: CubicSpline(KNOTS, VALUES)(t))],
@@ -114,6 +115,7 @@ def test_inputs_from_sympy_and_scipy():
         assert_allclose(run.q[-1, 0], given.antiderivative(2)(2.6), rtol=0, atol=1e-14)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("t_end", [2.3, 2.05])
 def test_states_at_breakpoints_are_saved_for_any_save_every(pendulum, t_end):
     """Dense output, work and iterations do not depend on the stride."""
@@ -139,6 +141,7 @@ def test_states_at_breakpoints_are_saved_for_any_save_every(pendulum, t_end):
         full.at(3.0)
 
 
+@pytest.mark.second
 def test_files_contain_energies_with_the_inputs_of_their_times(pendulum, tmp_path):
     stepper = sc.compile_stepper(pendulum, sc.SVI(4))
     inputs = {"u": (KNOTS, VALUES), "w": ([0.0, 1.0, 3.0], [0.0, 0.5, 0.0])}
@@ -195,6 +198,7 @@ def test_invalid_inputs_are_rejected(pendulum, inputs, message):
         sc.compile_stepper(pendulum, sc.SVI(2)).integrate([0.3], [0.0], inputs=inputs, h=0.1, t_end=2.3)
 
 
+@pytest.mark.second
 def test_velocities_at_a_breakpoint_use_the_following_segment():
     """Also on the way back, in the first state of runs of all kinds."""
     system = lagrange("drawn", "q", "q_dot**2/2 + u*q_dot - q**2/2", inputs="u")
@@ -252,6 +256,7 @@ def test_runs_with_inputs_have_finite_ends_and_valid_names(pendulum):
         sc.LagrangianSystem.from_text(name="s", coordinates=["q"], lagrangian="q_dot**2/2 + q", inputs=["q"])
 
 
+@pytest.mark.second
 def test_empty_and_contradictory_runs_with_inputs(pendulum):
     stepper, inputs = sc.compile_stepper(pendulum, sc.SVI(2)), {"u": (KNOTS, VALUES), "w": (KNOTS, VALUES)}
     with pytest.raises(sc.StateError, match="give either steps=3 or t_end=2 with h"):
@@ -270,6 +275,7 @@ def test_empty_and_contradictory_runs_with_inputs(pendulum):
         assert (still.t.tolist(), still.q.tolist(), still.p.tolist()) == ([1.0], [[0.3]], [[0.2]])
 
 
+@pytest.mark.second
 def test_missing_input_is_not_zero(pendulum):
     """Wherever a step would be taken; what is given by a name, in order, or held, is taken."""
     stepper, state = sc.compile_stepper(pendulum, sc.SVI(2)), ([0.3], [0.0])
@@ -300,6 +306,7 @@ def test_missing_input_is_not_zero(pendulum):
     assert_allclose(lanes.q[:, 0], given.q, rtol=1e-15)
 
 
+@pytest.mark.second
 def test_events_and_time_transformations_use_inputs_by_name(pendulum):
     """A crossing of the torque with a number, and of the angle with a line that is data."""
     inputs = {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], [0.0, 0.3])}
@@ -321,6 +328,7 @@ def test_events_and_time_transformations_use_inputs_by_name(pendulum):
         stepper.with_events("v - 1")
 
 
+@pytest.mark.second
 def test_inputs_survive_changes_of_coordinates_and_formulation(pendulum):
     inputs, data = ("u", "w"), {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], [0.0, 0.3])}
     expected = sc.compile_stepper(pendulum, sc.SVI(4)).integrate([0.3], [0.1], inputs=data, h=0.05, t_end=2.3)
@@ -385,6 +393,7 @@ def test_slices_of_runs_with_inputs(pendulum):
             run[rows]
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize("h", [0.05, 0.0125])
 def test_step_errors_of_a_start_at_rest_are_relative_to_where_it_leads(h: float) -> None:
     """The first force is 0: relative to the first states the error was 2e-8 for every h, where 12 digits were right."""
@@ -396,6 +405,7 @@ def test_step_errors_of_a_start_at_rest_are_relative_to_where_it_leads(h: float)
     assert error / steps < run.step_error < 1e-8 * (h / 0.05) ** 3
 
 
+@pytest.mark.second
 def test_failed_run_with_inputs_ends_with_the_last_state():
     edge = sc.LagrangianSystem.from_text("edge", ["q"], "q_dot**2/2 + sqrt(1 - q)", forces={"q": "u"}, inputs=["u"])
     stepper = sc.compile_stepper(edge, sc.SVI(2))

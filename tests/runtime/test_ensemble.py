@@ -265,17 +265,20 @@ FAILING = {
 """With one trajectory that fails: between others, as the last, whose lane is filled with a copy, and in a segment."""
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("name", FAILING)
 def test_a_failing_trajectory_equals_its_single_run_and_does_not_affect_others(name: str) -> None:
     FAILING[name].check()
 
 
+@pytest.mark.tiers(5, 6)
 @pytest.mark.filterwarnings("ignore::scvi_codegen.errors.AccuracyWarning")
 @pytest.mark.parametrize("name", CASES)
 def test_each_trajectory_equals_the_single_run(name: str) -> None:
     CASES[name].check()
 
 
+@pytest.mark.tiers(0, 2)
 @pytest.mark.sampled(2)
 @pytest.mark.covering
 @pytest.mark.parametrize("kind", KINDS)
@@ -285,6 +288,7 @@ def test_systems_and_methods_equal_single_runs(kind: str, method: Method) -> Non
     Case(KINDS[kind], method, 3, {"h": 0.02, "steps": 60, "save_every": 20, "t": 0.3}, 3e-13).check()
 
 
+@pytest.mark.tiers(0, 2)
 @pytest.mark.sampled(3)
 @pytest.mark.filterwarnings("ignore::scvi_codegen.errors.AccuracyWarning")
 @pytest.mark.parametrize("kind", ["constant", "linear", "cubic"])
@@ -296,6 +300,7 @@ def test_trajectories_with_inputs_equal_single_runs(method: Method, kind: str) -
         Case("pushed pendulum", method, COUNT, common | plan, 4e-15).check()
 
 
+@pytest.mark.second
 def test_iterations_of_coupled_systems_start_with_velocities() -> None:
     stepper = stepper_of("coupled with inputs", sc.SVI(3))
     assert stepper.ensemble is not None
@@ -311,6 +316,7 @@ def test_constant_inputs_are_parameters() -> None:
         assert np.array_equal(by_input.q, by_name.q)
 
 
+@pytest.mark.second
 def test_parameters_are_named_rows_or_one_row_per_trajectory() -> None:
     stepper = stepper_for("planar-pendulum", sc.SVI(5))
     q, p = states("planar-pendulum", 3)
@@ -323,6 +329,7 @@ def test_parameters_are_named_rows_or_one_row_per_trajectory() -> None:
     assert np.array_equal(same.parameters, np.tile(each.parameters[0], (3, 1)))
 
 
+@pytest.mark.second
 def test_options_are_passed_to_the_lanes() -> None:
     stepper = stepper_for("double-pendulum", sc.SVI(5))
     q, p = states("double-pendulum", 8)
@@ -361,6 +368,7 @@ def test_ends_with_output_times_are_those_of_terminal_events(t_eval: list[float]
     assert np.isnan(stopped.ends[0]).tolist() == [True, False]
 
 
+@pytest.mark.second
 def test_results_have_target_times_and_are_pickled() -> None:
     runs = CASES["adaptive"].run()
     assert [plan.t_end for plan in runs.plans] == ENDS
@@ -382,6 +390,7 @@ def kepler() -> sc.Stepper:
 
 
 class TestFailures:
+    @pytest.mark.second
     def test_block_without_active_trajectories_stops(self):
         stepper = stepper_for("relativistic-particle", sc.SVI(5))
         q, p = states("relativistic-particle", 8)
@@ -416,6 +425,7 @@ class TestFailures:
         assert len(set(ends)) == 1
 
 
+@pytest.mark.tiers(3, 4)
 @pytest.mark.filterwarnings("ignore::scvi_codegen.errors.AccuracyWarning")
 @pytest.mark.parametrize(
     ("name", "method", "plan"),
@@ -522,6 +532,7 @@ class TestThreadsAndInterruption:
         with pytest.raises(RuntimeError, match="out of order"):
             kepler.integrate_ensemble(*states("kepler", 20), h=0.05, steps=10)
 
+    @pytest.mark.rotated
     def test_memory_is_bounded_by_save_every(self, kepler: sc.Stepper):
         q, p = states("kepler", 64)
         kepler.integrate_ensemble(q, p, h=0.05, steps=1)
@@ -846,6 +857,7 @@ def test_splines_of_scipy_are_accepted():
     assert (by_values.q == by_spline.q).all()
 
 
+@pytest.mark.second
 @pytest.mark.filterwarnings("ignore::scvi_codegen.errors.AccuracyWarning")
 def test_lane_with_failed_iteration_continues_as_scalar_across_breakpoints():
     """Stiff from the second piece on, where Newton's iteration alone leads on."""
@@ -924,6 +936,7 @@ def test_command_line_runs_a_grid(here: Path) -> None:
         assert (np.nanmax(file["times"], axis=0) == 9.0).all()
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(2)
 @pytest.mark.usefixtures("as_users_compile")
 @pytest.mark.parametrize("h", [6e-2, 1e-2, 1e-4, 2e-14])

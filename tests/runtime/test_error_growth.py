@@ -113,6 +113,7 @@ CHAOTIC = {
 }
 
 
+@pytest.mark.tiers(0, 12)
 @pytest.mark.covering(2)
 @pytest.mark.parametrize("tolerance", TOLERANCES)
 @pytest.mark.parametrize("name", [*REGULAR, *CHAOTIC])
@@ -143,6 +144,7 @@ def test_chaos_under_forces_is_reported_by_a_tangent_vector(name, tolerance):
     assert reports(stepper, q, p, t_end, tolerance=tolerance) == chaotic
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("method", ["svi:3", "svi:12", "svi:16"])
 @pytest.mark.parametrize("name", ["Kepler 0.9", "Henon-Heiles, E = 1/6.2"])
 def test_other_methods_report_the_same(name, method):
@@ -167,6 +169,7 @@ def test_growth_is_that_of_nearby_runs(name, tolerance):
     assert run._growth[0] == pytest.approx(math.log(apart / size), abs=1.5)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("system", "method", "measured"),
     [
@@ -189,6 +192,7 @@ def test_which_systems_have_a_tangent_vector(system, method, measured):
     )
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     "more",
     [{"save_every": 7}, {"t_eval": np.linspace(0.0, 300.0, 20)}, {"observe": lambda run: run.q[0]}, {"events": "x"}],
@@ -216,6 +220,7 @@ def test_growth_is_measured_only_where_the_check_needs_it():
     assert reports(stepper, q, p, t_end)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("scale", [2.0**-600, 2.0**600])
 def test_states_of_extreme_size_are_checked_by_repetition(scale):
     """Squares of such numbers are not representable."""

@@ -23,6 +23,8 @@ from scvi_codegen.verification.certificate import Outcome
 from scvi_codegen.verification.impacts import impact_checks
 from scvi_codegen.verification.system_under_test import State, SystemUnderTest
 
+pytestmark = pytest.mark.second
+
 FLAGS = ("-O1",)
 BALL = lagrange("ball", "y", "y_dot**2/2 - g*y", g=1.0)
 POINT = sc.LagrangianSystem.from_text(name="point", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2")
@@ -56,6 +58,7 @@ def folded(start: float, v: float, t: float) -> float:
     return abs((start + v * t + 1.0) % 2.0 - 1.0)
 
 
+@pytest.mark.tiers(0, 2)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("kind", BOUNCES)
 def test_bounces_of_a_ball_form_a_geometric_series(ball, kind):
@@ -82,6 +85,7 @@ def test_accumulation_ends_the_run_and_is_named(ball, e):
     assert run.q.min() > -1e-14
 
 
+@pytest.mark.quick
 def test_time_is_one_double_where_impacts_accumulate(ball):
     """The sum of steps of 0.1 has a low word, the time of the last impact has none."""
     run = ball.with_events(sc.impact("y", 0.5)).start([1.0], [0.0], h=0.1)
@@ -108,6 +112,7 @@ def test_start_behind_a_wall(ball):
     assert abs(run.events[0].t[0] - (1.5 + math.sqrt(1.25))) < 1e-14
 
 
+@pytest.mark.rotated
 def test_accumulation_of_a_relativistic_ball():
     """Its momentum is linear in time and multiplied by -e at each bounce: small impulses are as precise as large ones.
 
@@ -124,6 +129,7 @@ def test_accumulation_of_a_relativistic_ball():
     assert np.abs(np.diff(run.t) - run.step_sizes[:-1]).max() < 1e-12
 
 
+@pytest.mark.tiers(0, 3)
 @pytest.mark.covering
 @pytest.mark.parametrize("t0", [0.0, 7e4])
 @pytest.mark.parametrize("h", [50.0, 5.0, 0.5])
@@ -158,6 +164,7 @@ def test_moving_wall_accelerates_a_point():
             assert abs(t[k] - float(now)) < 3e-13
 
 
+@pytest.mark.rotated
 def test_energy_of_a_double_pendulum_at_a_wall():
     """The mass matrix depends on the state; impulses conserve energy to round-off, trajectories have order 16."""
     system = lagrange("double pendulum", "a b", "a_dot**2 + b_dot**2/2 + a_dot*b_dot*cos(a - b) + 2*cos(a) + cos(b)")
@@ -299,6 +306,7 @@ FAULTS = {
 }
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize("fault", FAULTS)
 def test_certificates_measure_impacts(fault):
     """A planted error of 1e-7 of the impulse, or of 1e-9 of the state, is noticed."""
@@ -318,6 +326,7 @@ def test_certificates_measure_impacts(fault):
     assert fault in violated if fault != "none" else not violated
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("flags", [("-O0",), ("-O3",)], ids=" ".join)
 @pytest.mark.parametrize("restitution", [1.0, 0.9])
@@ -345,6 +354,7 @@ def test_conditions_select_crossings(point):
         assert len(run.events[0]) == (end > 0)
 
 
+@pytest.mark.quick
 @pytest.mark.parametrize("save_every", [1, 7])
 def test_terminal_event_ends_a_run_after_the_change(ball, save_every):
     run = ball.integrate([1.0], [0.0], h=0.1, t_end=9.0, events=sc.impact("y", 0.8, terminal=3), save_every=save_every)
@@ -355,6 +365,7 @@ def test_terminal_event_ends_a_run_after_the_change(ball, save_every):
     assert run.p[-1, 0] == pytest.approx(-0.8 * run.events[0].p[-1, 0])
 
 
+@pytest.mark.quick
 def test_states_after_impacts_count_as_ends_of_adaptive_steps(ball):
     given = {"t_end": 7.0, "tolerance": 1e-3, "events": sc.impact("y", 0.8)}
     every, some = (ball.integrate([1.0], [0.0], save_every=k, **given) for k in (1, 3))
@@ -403,6 +414,7 @@ CHAIN = sc.LagrangianSystem.from_text(
 )
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize(
     ("plan", "bound"), [({"h": 0.25, "steps": 160}, 1e-11), ({"t_end": 40.0, "tolerance": 1e-10}, 1e-7)]
 )
@@ -463,6 +475,7 @@ def chart(x, t):
     return np.array(columns).T
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize(("b", "e"), [(0.0, 1.0), (0.0, 0.8), (0.2, 1.0), (0.2, 0.7)])
 def test_impacts_of_constrained_systems_equal_those_of_free_coordinates(b, e):
@@ -498,6 +511,7 @@ def test_impacts_of_constrained_systems_equal_those_of_free_coordinates(b, e):
         assert np.abs(adjoint - cotangents[-1] @ found).max() < 1e-13 * np.abs(found).max()
 
 
+@pytest.mark.rotated
 def test_impacts_of_relativistic_pendulums_contain_the_work_of_a_moving_constraint():
     """The impulse of a moving rod does work: H(p + lambda g_q + G^T mu) - H(p) = -lambda g_t - mu c_t."""
     options = {"coordinates": ["x", "y"], "parameters": {"b": 0.3}, "constraints": ["(x - b*sin(t))**2 + y**2 - 1"]}
@@ -514,6 +528,7 @@ def test_impacts_of_relativistic_pendulums_contain_the_work_of_a_moving_constrai
     assert np.abs(one.q[-1] - [0.3 * np.sin(16.0) + np.sin(two.q[-1, 0]), -np.cos(two.q[-1, 0])]).max() < 1e-10
 
 
+@pytest.mark.rotated
 def test_derivatives_through_impacts_of_a_moving_rod_with_a_quartic_kinetic_energy():
     """Differences of sixth order also require impacts that depend smoothly on the initial state, to round-off."""
     rod = sc.LagrangianSystem.from_text(
@@ -544,6 +559,7 @@ def test_derivatives_through_impacts_of_a_moving_rod_with_a_quartic_kinetic_ener
     assert np.abs(ends - np.polynomial.Polynomial.fit(u, ends, 5)(u)).max() < 1e-14
 
 
+@pytest.mark.rotated
 def test_impacts_of_constrained_arrays():
     """A pendulum of five links that hits a wall, in index notation and with known sizes."""
     links = sc.LagrangianSystem.from_text(
@@ -569,6 +585,7 @@ def test_impacts_of_constrained_arrays():
     assert np.abs(tangents[0] - tangents[1]).max() < 1e-10 * np.abs(tangents[1]).max()
 
 
+@pytest.mark.rotated
 def test_impacts_with_a_time_transformation():
     """Reversible steps through close encounters, against adaptive ones."""
     kepler = lagrange("kepler", "x y", "(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2) + 0*e", e=0.97)
@@ -599,6 +616,7 @@ BODY = sc.LagrangianSystem.from_text(
 )
 
 
+@pytest.mark.rotated
 def test_corners_of_a_rigid_body_hit_the_floor():
     """Energy and what the floor does not change are conserved; momenta stay tangent to the unit quaternions."""
     stepper = sc.compile_stepper(BODY, "svi:6")
@@ -647,6 +665,7 @@ def test_derivatives_through_impacts_of_a_rigid_body(k):
     assert np.abs(found - np.concatenate([q, p])).max() < 1e-10
 
 
+@pytest.mark.rotated
 def test_impacts_of_a_body_that_turns_in_a_plane():
     """A rod that falls on its ends: with a rotation about one axis and with an angle."""
     rod = sc.LagrangianSystem.from_text("plane", coordinates=["z", "a"], lagrangian="z_dot**2/2 + 2*a_dot**2/10 - z")
@@ -702,6 +721,7 @@ def differences(run, z, values):
     return np.array(columns).T
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     ("event", "method", "e", "tolerance"),
@@ -752,6 +772,7 @@ def test_lyapunov_exponent_of_the_stadium_billiard(point):
     assert abs(exponents[0] + exponents[3]) < 1e-10
 
 
+@pytest.mark.quick
 @pytest.mark.parametrize("turns", [0, 10_000])
 def test_derivatives_through_impacts_do_not_depend_on_the_turns_of_an_angle(turns):
     """Differences of states over a step of 61 rad, about 10,000 turns times 2^-10, were no derivatives."""
@@ -767,6 +788,7 @@ def test_derivatives_through_impacts_do_not_depend_on_the_turns_of_an_angle(turn
     assert run.sensitivity().state[-1][:, 0] == pytest.approx(np.concatenate(differences), rel=1e-4, abs=1e-4)
 
 
+@pytest.mark.rotated
 def test_derivatives_are_refused_where_they_do_not_exist(point, ball):
     grazing = point.integrate(
         [-3.0, 1.0 - 1e-14], velocity=[1.0, 0.0], h=0.37, t_end=6.0, events=sc.impact("x**2 + y**2 - 1")
@@ -799,6 +821,7 @@ def test_grazing_impacts_are_found(point, depth):
 # Messages.
 
 
+@pytest.mark.tiers(11, 13)
 @pytest.mark.parametrize(
     ("make", "words"),
     [
@@ -844,6 +867,7 @@ def test_errors_name_the_symbol_and_the_remedy(ball, make, words):
         run(make())
 
 
+@pytest.mark.quick
 def test_unsupported_combinations_are_refused(ball):
     for formula in ("abs(y)", "sign(y)", "max(y, 0)", "Heaviside(y)"):
         with pytest.raises(sc.SystemDefinitionError, match=r"sc\.impact\(\.\.\), or sc\.Event"):
@@ -902,6 +926,7 @@ def test_model_files_contain_events(tmp_path):
         parse_model(MODEL.replace("where", "were"))
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize("steps", ["step = 0.1\n", pytest.param("", marks=pytest.mark.full)])
 def test_generated_programs_print_events(tmp_path, steps):
     """The C program and the Python package of a folder have the events of a run of the model."""
@@ -938,6 +963,7 @@ def test_events_of_the_command_line_add_to_those_of_the_file(tmp_path):
     assert "NOT conserved" not in result.output
 
 
+@pytest.mark.quick
 def test_backward_runs_invert_impacts_and_apply_changes_as_written():
     """A run backward in time returns through an impact to its start; ``then=`` is no inverse of itself."""
     returned = []

@@ -20,6 +20,8 @@ from scvi_codegen.methods.method import Method
 from scvi_codegen.runtime.core import compiled_method
 from scvi_codegen.runtime.events.event import as_events
 
+pytestmark = pytest.mark.second
+
 METHODS = (sc.SVI(3), sc.SpectralCollocation(6), sc.Composition(8))
 MORE_METHODS = (
     sc.SCVI(3),
@@ -68,6 +70,7 @@ def crossings_in_one_step(function: str, h: float = 1.0) -> np.ndarray:
 # Exact times.
 
 
+@pytest.mark.rotated
 def test_the_period_of_the_pendulum_is_an_elliptic_integral(pendulum):
     amplitude, rate = 2.5, math.sqrt(9.81)
     parameters = {"m": 1.0, "l": 1.0, "g": 9.81}
@@ -79,6 +82,7 @@ def test_the_period_of_the_pendulum_is_an_elliptic_integral(pendulum):
     assert np.abs(run.events[0].q).max() < 1e-14
 
 
+@pytest.mark.tiers(0, 1)
 @each_method
 def test_times_converge_with_the_order_of_the_method_and_energy_stays(method):
     stepper = compiled_plainly(sc.problem("kepler").system, method)
@@ -115,6 +119,7 @@ def polynomials() -> sc.Stepper:
     return sc.compile_stepper(system, sc.StoermerVerlet(), flags=FLAGS, events=[*functions, near])
 
 
+@pytest.mark.rotated
 @settings(max_examples=300, deadline=None)
 @given(
     st.lists(st.integers(1, 199), min_size=4, max_size=4, unique=True),
@@ -151,6 +156,7 @@ def test_pairs_of_close_roots_are_found(polynomials, middle, exponent, sign):
     assert np.abs(found.t - [middle - distance, middle + distance]).max() < 1e-15 / distance
 
 
+@pytest.mark.tiers(0, 2)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     "function", ["cos(6*t) - 0.97", "exp(t) - 1.8 - 0.05*sin(20*t)", "sin(3*pi*t + 0.1)*(t + 1)", "sin(15*pi*t + 0.1)"]
@@ -193,6 +199,7 @@ def test_root_at_the_start_is_ignored_and_one_at_the_end_is_found():
     assert [found.t.tolist() for found in run.events] == [[], [2.0], []]
 
 
+@pytest.mark.rotated
 def test_more_crossings_than_the_buffer_of_one_call(pendulum):
     run = pendulum.integrate([0.1], [0.0], h=0.5, steps=3000, events=["sin(8*t)", "cos(8*t)"])
     for found, first in zip(run.events, (0.0, 0.5), strict=True):
@@ -232,6 +239,7 @@ def test_a_terminal_event_ends_the_run_at_its_crossing(pendulum, save_every):
     assert run.events[0].t[-1] < last.t[-1]
 
 
+@pytest.mark.quick
 def test_run_ends_before_the_step_of_the_terminal_event(pendulum):
     run = pendulum.with_events(sc.Event("q", terminal=True)).start([0.5], [0.0], h=0.1)
     first = run.record(400)
@@ -239,6 +247,7 @@ def test_run_ends_before_the_step_of_the_terminal_event(pendulum):
     assert run.record(400).t.tolist() == [first.t[-2], first.t[-1]]
 
 
+@pytest.mark.quick
 def test_run_from_a_crossing_does_not_repeat_it(pendulum):
     q, p, t, found = [0.5], [0.0], 0.0, []
     whole = pendulum.integrate(q, p, h=0.1, steps=400, events="q").events[0].t
@@ -285,6 +294,7 @@ def test_events_with_explicit_time_and_parameters(compiled):
     assert np.abs(run.events[0].t - math.pi / 2 * np.arange(2, 9)).max() < 1e-13
 
 
+@pytest.mark.rotated
 def test_momenta_of_hamiltonians_have_user_defined_names():
     system = hamilton("pendulum", "q", "J**2/2 - cos(q)", momenta="J")
     run = compiled_plainly(system, sc.SVI(4)).integrate([1.0], [0.0], h=0.1, steps=100, events=["J", "q_dot", "q"])
@@ -295,6 +305,7 @@ def test_momenta_of_hamiltonians_have_user_defined_names():
     assert np.abs(run.events[2].t - expected[1].t).max() < 1e-12
 
 
+@pytest.mark.rotated
 def test_point_vortices_have_no_velocity_kernel():
     vortices = sc.problem("point-vortices")
     stepper = compiled_plainly(vortices.system, sc.SVI(3))
@@ -317,6 +328,7 @@ def test_events_from_sympy_functions_of_time():
     assert np.abs(run.events[2].q - 0.1).max() < 1e-14
 
 
+@pytest.mark.tiers(6)
 @pytest.mark.parametrize(
     ("event", "error", "words"),
     [
@@ -334,6 +346,7 @@ def test_errors_name_the_symbol_or_function(pendulum, event, error, words):
         pendulum.integrate([0.5], [0.0], h=0.1, steps=100, events=event)
 
 
+@pytest.mark.quick
 @pytest.mark.parametrize(("arguments", "error"), [({"direction": 2}, sc.EventError), ({"terminal": -1}, sc.StateError)])
 def test_invalid_events_are_rejected(arguments, error):
     with pytest.raises(error):
@@ -348,6 +361,7 @@ def test_stepper_with_events_is_pickled(pendulum):
     assert watched.with_events(()).source == pendulum.source
 
 
+@pytest.mark.rotated
 @pytest.mark.covering
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 @pytest.mark.parametrize(
@@ -376,6 +390,7 @@ def test_source_with_events_extends_the_plain_one_without_warnings(compiler, nam
     assert (result.returncode, result.stderr) == (0, "")
 
 
+@pytest.mark.rotated
 def test_a_stepper_may_be_compiled_with_events():
     stepper = sc.compile_stepper(FREE, sc.SVI(2), flags=FLAGS, events=sc.Event("q - 1", terminal=True))
     assert "free_particle" in stepper.source.prefix
@@ -416,6 +431,7 @@ def thrown(request):
     return compiled_plainly(BALL, sc.SVI(2)), compiled_plainly(DISC, sc.SVI(2)), ("y", "x", "y")
 
 
+@pytest.mark.rotated
 @pytest.mark.covering
 @pytest.mark.filterwarnings("ignore::scvi_codegen.AccuracyWarning")
 @pytest.mark.parametrize(("floor", "error"), [(0.0, 1e-12), (1000.0, 2e-5)])
@@ -444,6 +460,7 @@ def test_bouncing_ball_runs_until_its_bounces_accumulate(thrown, floor, error, h
     assert abs(abs(float(str(raised.value).split("t = ")[1].split(":")[0])) - end) < error
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.covering
 @pytest.mark.parametrize("t0", [0.0, 7e4])
 @pytest.mark.parametrize(("h", "start", "velocity"), CORNERS)
@@ -486,6 +503,7 @@ def test_equal_events_are_parsed_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(stepper._event_variants) == compiled_method.MOST_EVENT_SETS
 
 
+@pytest.mark.quick
 def test_tuples_of_events_and_conditions_are_those_of_lists():
     wall, where = sc.Event("x", where=["y > 0", "y < 2"]), ("y > 0", "y < 2")
     assert wall.where == sc.Event("x", where=where).where == where

@@ -8,6 +8,8 @@ import scvi_codegen as sc
 from scvi_codegen.runtime.events import detection
 from scvi_codegen.verification.certificate import Outcome
 
+pytestmark = pytest.mark.second
+
 FLAGS = ("-O1",)
 GAS = lagrange("gas", ["r[N, 2]"], "sum(i in N, (r_dot[i, 0]**2 + r_dot[i, 1]**2)/2 + 0*d)", d=0.25)
 CHAIN = sc.LagrangianSystem.from_text(
@@ -44,6 +46,7 @@ def test_a_box_of_particles(gas):
     assert abs(np.sum(run.p["r"][-1] ** 2) / np.sum(v**2) - 1.0) < 1e-14
 
 
+@pytest.mark.quick
 def test_a_restored_run_continues_with_its_events(gas):
     run = gas.with_events(BOX).start({"r": [[0.3, 0.6], [0.8, 0.2]]}, velocity={"r": [[0.5, -0.3], [1.0, 0.7]]}, h=0.1)
     run.advance(20)
@@ -80,6 +83,7 @@ def test_impacts_pass_through_discs_that_touch(gas):
     assert np.ptp(run.events[0].t) == 0.0
 
 
+@pytest.mark.quick
 def test_more_impacts_in_a_step_than_memory_for_them(gas, monkeypatch):
     """A step whose crossings do not fit is repeated: 20 impacts at different times in one step, and memory for 8."""
     monkeypatch.setattr(detection, "INITIAL_CAPACITY", 8)
@@ -90,6 +94,7 @@ def test_more_impacts_in_a_step_than_memory_for_them(gas, monkeypatch):
     assert np.abs(run.q["r"][-1] - folded(r, v, 1.0)).max() < 1e-14
 
 
+@pytest.mark.rotated
 def test_an_event_of_every_element_equals_events_of_entries():
     """Conditions, maps of velocities and restitution in loops, their derivatives, and adaptive steps."""
     stepper, n = sc.compile_stepper(CHAIN, "svi:4", flags=FLAGS), 4
@@ -123,6 +128,7 @@ def test_an_event_of_every_element_equals_events_of_entries():
     assert np.abs(tangents[0] - tangents[1]).max() < 1e-11 * np.abs(tangents[1]).max()
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("of_known_sizes", [False, pytest.param(True, marks=pytest.mark.full)])
 def test_gradients_through_events_of_elements(of_known_sizes):
     """The adjoint equals the tangents to round-off, and extrapolated differences of the run."""
@@ -203,6 +209,7 @@ AROUND = [
 ]
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("of_known_sizes", [False, pytest.param(True, marks=pytest.mark.full)])
 @pytest.mark.parametrize("h", [0.05, None])
 def test_ensembles_with_inputs_and_events_equal_single_runs(of_known_sizes, h):

@@ -13,7 +13,7 @@ import scvi_codegen as sc
 from scvi_codegen.native import building
 from scvi_codegen.native.building import PORTABLE_FLAGS
 
-pytestmark = pytest.mark.usefixtures("as_users_compile")
+pytestmark = [pytest.mark.usefixtures("as_users_compile"), pytest.mark.rotated]
 
 LONG = 0.2
 """A step of the double pendulum at which the fixed-point iteration sometimes fails and Newton's iteration converges."""
@@ -133,6 +133,7 @@ def test_low_words_do_not_depend_on_the_split_of_a_run():
     assert whole.checkpoint() == cut.checkpoint()
 
 
+@pytest.mark.second
 def test_failed_run_ends_before_the_step(start):
     borrowing, _ = both(sc.SVI(4))
     run = borrowing.start(*start, h=40.0)
@@ -225,6 +226,7 @@ def test_iteration_that_fails_is_tried_again_after_growing_numbers_of_steps():
     assert after.fallback_steps == 35
 
 
+@pytest.mark.second
 def test_steps_are_counted_that_fail_without_newtons_method():
     system = sc.LagrangianSystem.from_text(name="stiff", **STIFF)
     source, interface = sc.generate_source(system, "svi:4")

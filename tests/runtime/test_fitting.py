@@ -56,6 +56,7 @@ def recorded(seed=None):
     return values if seed is None else values + NOISE * np.random.default_rng(seed).normal(size=values.shape)
 
 
+@pytest.mark.second
 def test_noise_free_data_give_the_true_values():
     found = sc.fit(oscillator(), TIMES, recorded()[0], unknown=SOME, **GUESS)
     assert found.names == (*SOME, "x", "p_x")
@@ -65,6 +66,7 @@ def test_noise_free_data_give_the_true_values():
     assert np.abs(found.residuals).max() < 1e-9
 
 
+@pytest.mark.second
 def test_estimates_and_errors_agree_with_curve_fit():
     """curve_fit integrates with DOP853 and uses finite differences."""
     measured = recorded(1)[0]
@@ -81,6 +83,7 @@ def test_estimates_and_errors_agree_with_curve_fit():
     assert "alpha = " in str(found)
 
 
+@pytest.mark.second
 def test_standard_errors_agree_with_the_covariance():
     """The sum of squares of 5 errors, in their own deviations, over 20 series of noise: chi squared, 100 +- 14."""
     true, total = np.array([*(TRUE[name] for name in SOME), 0.8, 0.1]), 0.0
@@ -91,6 +94,7 @@ def test_standard_errors_agree_with_the_covariance():
     assert 58.0 < total < 142.0
 
 
+@pytest.mark.second
 def test_several_quantities_with_gaps_and_individual_noise():
     both = recorded(2).T.copy()
     both[:, 1] += 9 * NOISE * np.random.default_rng(3).normal(size=len(TIMES))
@@ -117,6 +121,7 @@ def pushed():
     return stepper, push, run, times
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("segments", [1, 4])
 def test_fit_with_known_start_and_tabulated_inputs(pushed, segments):
     """The cart is pushed as measured; what is known is not found."""
@@ -128,6 +133,7 @@ def test_fit_with_known_start_and_tabulated_inputs(pushed, segments):
     assert_allclose(found.values, [1.5, 2.0], rtol=1e-8 if segments == 1 else 1e-7)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -180,6 +186,7 @@ def test_invalid_arguments_are_named(options, message):
         sc.fit(oscillator(), **{"t": TIMES, "measured": recorded()[0], "unknown": SOME} | GUESS | options)
 
 
+@pytest.mark.rotated
 def test_biased_parameters_warn_of_too_long_steps():
     """With large second-order steps, estimates are off by twelve standard errors, which is reported."""
     soft = lagrange("hard", "x", "x_dot**2/2 - a*x**2/2 - b*x**4/4", a=1.0, b=1.0)
@@ -195,6 +202,7 @@ def test_biased_parameters_warn_of_too_long_steps():
     assert abs(sc.fit(coarse, times, noisy, h=0.02, **given).parameters["b"] - 1.0) < 0.02
 
 
+@pytest.mark.second
 def test_initial_guess_with_failing_runs_is_accepted():
     """A soft spring: on the way to the truth a trial leaves its well and goes to infinity."""
     soft = lagrange("soft", "x", "x_dot**2/2 - a*x**2/2 + x**4/4", a=1.0)
@@ -269,6 +277,7 @@ def two_rods():
     return stepper, run, run.q + NOISE * np.random.default_rng(0).normal(size=run.q.shape)
 
 
+@pytest.mark.rotated
 def test_chaotic_record_is_fitted_in_segments():
     """Nearby motions part e^17-fold: from its start alone the motion is lost, in segments it is found."""
     stepper, run, noisy = two_rods()
@@ -303,6 +312,7 @@ def test_segments_and_single_shooting_agree():
 BOUNDS = [{"delta": (0.25, 0.5)}, {"delta": (0.0, 1.0)}, {"alpha": (-0.95, 0.0), "x": (0.6, 0.75)}]
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("bounds", BOUNDS)
 def test_segments_with_bounds_agree_with_single_shooting(bounds):
     one = sc.fit(oscillator(), TIMES, recorded(3)[0], bounds=bounds, unknown=SOME, **GUESS)
@@ -317,6 +327,7 @@ def test_segments_with_bounds_agree_with_single_shooting(bounds):
     assert_allclose(np.sqrt(np.diag(parts.covariance))[free], errors, rtol=1e-2)
 
 
+@pytest.mark.rotated
 def test_least_squares_with_equality_constraints_and_bounds():
     """Beside the best of all choices of unknowns that a bound holds."""
     rng = np.random.default_rng(5)
@@ -352,6 +363,7 @@ def kepler():
     return sc.compile_stepper(system, sc.SVI(8), flags=QUICK_FLAGS)
 
 
+@pytest.mark.tiers(0, 2)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("length", "time", "segments"), [(1.0, 1.0, 1), (1e6, 1e-6, 1), (1e-6, 1e6, 3), (1e6, 1e6, 1), (1e-6, 1e-6, 3)]

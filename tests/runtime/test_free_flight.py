@@ -11,6 +11,7 @@ def largest_energy_error(stepper: sc.Stepper, q: object, v: object) -> float:
     return float(np.abs(run.energy() / run.energy()[0] - 1).max())
 
 
+@pytest.mark.tiers(1)
 @pytest.mark.parametrize(
     ("lagrangian", "solver", "allowed"),
     [

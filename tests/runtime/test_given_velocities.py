@@ -28,6 +28,7 @@ def test_velocities_are_converted_with_the_parameters_and_time_of_the_run():
     assert np.array_equal(run.record(20).q, one.q)
 
 
+@pytest.mark.tiers(1)
 @pytest.mark.parametrize(
     ("coordinates", "lagrangian", "q", "v", "dropped"),
     [

@@ -152,6 +152,7 @@ def check_claims(name, run, error):
 class TestMotions:
     """Regular and chaotic motions compared with records of 30 digits."""
 
+    @pytest.mark.second
     @pytest.mark.parametrize("error", [1e-5, 1e-9, 1e-11])
     @pytest.mark.parametrize("name", ["oscillator", "driven", "kepler .999"])
     @pytest.mark.filterwarnings("ignore:the global error")
@@ -228,6 +229,7 @@ class TestMotions:
         assert run.step_sizes[-2] < 0.01 * run.step_sizes[-3]
         assert _alternative(run, lost) == ""
 
+    @pytest.mark.rotated
     def test_time_transformations_can_be_combined(self):
         """Kepler's problem with e = 0.99: one is recommended, and confirms a hundredth of the error without it."""
         name, system = "kepler .99", made("k", ["x", "y"], "(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2)")
@@ -251,6 +253,7 @@ class TestMotions:
 class TestChaos:
     """Burrau's problem loses thirteen digits until t = 70, a double pendulum all of them until t = 50."""
 
+    @pytest.mark.rotated
     def test_digits_are_confirmed_until_chaos_destroys_them(self, burrau_stepper):
         q, p = PYTHAGOREAN
         until = {}
@@ -276,6 +279,7 @@ class TestChaos:
         assert apart[:-1].max() <= 1e-6 * np.linalg.norm(q)
         assert apart[-1] <= run.global_error * np.linalg.norm(run.q[-1])
 
+    @pytest.mark.second
     @pytest.mark.parametrize("more", [{}, {"save_every": 7}, {"t_eval": np.linspace(0.0, 70.0, 50)}])
     def test_default_run_warns_of_chaos(self, burrau_stepper, more):
         with pytest.warns(sc.AccuracyWarning, match="errors: small perturbations of the initial state grew"):
@@ -283,6 +287,7 @@ class TestChaos:
         with pytest.warns(sc.AccuracyWarning, match="a run with the initial state perturbed by 8.9e-16"):
             burrau_stepper.integrate(*PYTHAGOREAN, t_end=70.0, **more, check_growth=True)
 
+    @pytest.mark.second
     def test_late_encounters_are_detected_in_most_runs(self, burrau_stepper):
         """Errors of nearby initial states grow in bursts, some of them late; all are found by repeating all steps."""
         random, found = np.random.default_rng(1), []
@@ -313,6 +318,7 @@ class TestChaos:
         other = burrau_stepper.integrate(*PYTHAGOREAN, t_end=70.0, check_growth=False)
         assert np.array_equal(one.q, other.q)
 
+    @pytest.mark.second
     def test_long_runs_are_checked_up_to_a_limit_or_completely(self):
         """Duffing's oscillator with two wells, chaotic after t = 1000 alone; damping excludes tangent vectors."""
         late = "(1 + tanh(t - 1000))/2"
@@ -392,6 +398,7 @@ class TestEnsembles:
             assert t[-1] <= self.ENDS[j]
             assert np.abs(q - kepler_positions(self.ECCENTRICITIES[j], t)).max() < 1e-7
 
+    @pytest.mark.rotated
     def test_chaotic_and_failed_trajectories_are_named(self):
         """One of them falls into the centre, and one is confirmed."""
         stepper = sc.compile_stepper(
@@ -437,7 +444,9 @@ class TestEnsembles:
             kepler_stepper.integrate_ensemble(**self._start(), error=1e-9, **more)
 
 
+@pytest.mark.second
 class TestOtherRuns:
+    @pytest.mark.quick
     def test_without_error_argument_nothing_is_confirmed(self, kepler_stepper):
         run = kepler_stepper.integrate([1.6, 0.0], [0.0, 0.5], t_end=1.0)
         assert run.confirmation is None
@@ -469,6 +478,7 @@ class TestOtherRuns:
         apart = np.hypot(run.q[:, 0] - np.cos(exact), run.q[:, 1] - np.sin(exact))
         assert apart.max() <= run.global_error <= 1e-8
 
+    @pytest.mark.tiers(1)
     @pytest.mark.parametrize("indexed", [False, True], ids=["scalar", "array"])
     def test_confirmed_runs_with_inputs(self, indexed):
         """x'' = -x + u with u = 1 - t/2 until t = 2, then 0, from t = 0.5: exact."""
@@ -566,6 +576,7 @@ class TestCommandLine:
         '[method]\nmethod = "svi:8"\n[run]\nspan = {span}\nerror = 1e-8\n[initial]\nq = {q}\n'
     )
 
+    @pytest.mark.second
     def test_confirmed_array_runs_on_the_command_line(self, tmp_path):
         path, output = tmp_path / "arrays.toml", tmp_path / "a.npz"
         path.write_text(self.ARRAYS.format(span=8.0, q=[0.2, 0.1, 0.0]))
@@ -594,6 +605,7 @@ class TestCommandLine:
         path.write_text(f'[system]\ncatalogue = "kepler"\n[run]\nspan = 20.0\n{run}\n')
         assert message in error_of("run", path, *words)
 
+    @pytest.mark.second
     @pytest.mark.parametrize("controller", ["symplectic", "reversible"])
     def test_error_and_time_transformation_can_be_combined(self, tmp_path, controller):
         """In a file and by an option; the printed run is the confirmed one."""

@@ -63,6 +63,7 @@ def test_invalid_time_transformations_are_named(g, message):
         compiled(system, time_transformation=g)
 
 
+@pytest.mark.rotated
 def test_events_of_the_stepper_equal_events_of_the_run(ring):
     event = f"q[0]*q[1] - sum(i in {size_of(ring)}, q[i]**2)/8"
     options = {"velocity": 0 * Q, "h": 0.1, "steps": 150}
@@ -75,6 +76,7 @@ def test_events_of_the_stepper_equal_events_of_the_run(ring):
     np.testing.assert_allclose(own.t, of_entries.t, rtol=0, atol=1e-13)
 
 
+@pytest.mark.second
 def test_events_in_index_notation_change_the_state():
     system = sc.LagrangianSystem.from_text(name="ring", coordinates=["q[4]"], lagrangian=RING.format(N=4))
     by_index = sc.Event("q[2] - sum(i in 4, q[i])**2", then={"p_q[2]": "-p_q[2]/2"}, where="q_dot[1] < 1")

@@ -9,6 +9,8 @@ from samples import fixed_point, tangle
 import scvi_codegen as sc
 from scvi_codegen.lowering import derivatives
 
+pytestmark = pytest.mark.rotated
+
 WHIRL = sc.LagrangianSystem.from_text(
     name="whirl in a moving trap",
     coordinates=["x", "y"],
@@ -107,6 +109,7 @@ def test_steps_beyond_the_limit_of_iterations_are_differentiated_by_factorisatio
         )
 
 
+@pytest.mark.quick
 def test_large_jacobians_are_factorised(monkeypatch):
     system = sc.problem("kepler").system
     found = fixed_point(system, sc.SVI(2))

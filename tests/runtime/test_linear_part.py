@@ -47,6 +47,7 @@ def exact_step(system: sc.LagrangianSystem, stepper: sc.Stepper, h: float, stage
     return np.array((mp.inverse(down) * up).tolist(), dtype=float)
 
 
+@pytest.mark.tiers(1, 1)
 @pytest.mark.parametrize(("degree", "h"), [(8, 9.0), (3, 4.0)])
 def test_linear_chain(degree, h):
     system = ring()
@@ -59,6 +60,7 @@ def test_linear_chain(degree, h):
     assert run.iterations.max() <= 3
 
 
+@pytest.mark.second
 def test_nonlinear_chain_equals_newtons_method():
     q, p = start()
     runs = [
@@ -72,6 +74,7 @@ def test_nonlinear_chain_equals_newtons_method():
     assert runs[0].iterations.mean() < 8
 
 
+@pytest.mark.second
 def test_energy_of_long_runs_does_not_drift(as_users_compile):
     """With the low words of the first forces, which are far off at such steps, it drifted by 1e-14 a step."""
     pinned = ring(further="".join(f"-k*q{i}**2/9" for i in range(COUNT)), name="pinned_ring")
@@ -103,6 +106,7 @@ def test_ring_is_a_narrow_band():
     assert len(linear.entries) == 2 * COUNT
 
 
+@pytest.mark.rotated
 def test_fast_vibrations_that_cannot_be_extrapolated_begin_with_a_straight_line():
     """With former steps extrapolated whatever the error, the run takes 500 iterations."""
     count, q = 8, [0.9 * np.sin(np.pi * (k + 1) / 9) for k in range(8)]

@@ -142,6 +142,7 @@ class Begun:
         return float(momentum - first), float(places - begun - first * (self.time() - t))
 
 
+@pytest.mark.tiers(1, 4)
 @pytest.mark.sampled(6)
 @pytest.mark.parametrize("name", CASES)
 def test_sums_of_high_and_low_words_are_exact(name: str) -> None:
@@ -160,6 +161,7 @@ def test_sums_of_high_and_low_words_are_exact(name: str) -> None:
     assert worst[1] < (1e-16 if "composition" in name else 1e-17)  # whose coefficients have 53 bits
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", ["svi", "gauss of a Hamiltonian", "svi, coupled"])
 def test_ensemble_states_are_within_a_rounding_of_exact_sums(name: str) -> None:
     """Low words keep what sums leave: high words alone are off by no more than half a rounding each, however long."""
@@ -176,6 +178,7 @@ def test_ensemble_states_are_within_a_rounding_of_exact_sums(name: str) -> None:
             assert abs(exact(*(q * MASSES)) - begun_at - first * 64 * k * Fraction(H)) <= most_q * 1.01
 
 
+@pytest.mark.tiers(1, 1)
 @pytest.mark.parametrize("name", ["rattle", "lobatto"])
 def test_constraints_hold_for_the_sum_of_high_and_low_words(name: str) -> None:
     """A thousandth of the state as its low word: that sum, and not the high word, meets the constraint after a step."""
@@ -188,6 +191,7 @@ def test_constraints_hold_for_the_sum_of_high_and_low_words(name: str) -> None:
     assert abs((x - y) ** 2 + w**2 - 1) < 1e-14
 
 
+@pytest.mark.tiers(0, 2)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("lengths", ["h", "tolerance", "time_transformation"])
 @pytest.mark.parametrize("sign", [1.0, -1.0], ids=["forward", "back"])
@@ -254,6 +258,7 @@ def test_coefficients_and_their_low_words_are_exact(text: str) -> None:
             assert abs(Fraction(two) + Fraction(one) - Fraction(str(x))) <= Fraction(abs(two)) / 2**52, name
 
 
+@pytest.mark.second
 def test_work_is_the_sum_over_steps() -> None:
     """Comparison with the exact sum, over steps recomputed between saved states."""
     system = lagrange("rubbed", "x", "x_dot**2 - x**2", forces={"x": "sin(3*t) - x_dot/5"})
@@ -272,6 +277,7 @@ BY_DESIGN = ("Newton", "rattle", "lobatto")
 """Forces at the start of their steps are those of the high word: an error like a rounding of the increment."""
 
 
+@pytest.mark.tiers(1, 3)
 @pytest.mark.parametrize("name", [name for name in CASES if not any(each in name for each in BY_DESIGN)])
 def test_low_words_enter_everywhere_the_state_does(name: str) -> None:
     """A thousandth of the state as its low word, or in its high word: a step has the same forces and velocities."""

@@ -45,6 +45,7 @@ def apart(r: Any, lengths: Any) -> Any:
     return np.sqrt((between**2).sum(axis=-1))[np.triu_indices(len(r), 1)]
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("lengths", [LENGTHS, LONGER], ids=["default", "longer"])
 def test_temperature_and_pressure_are_those_of_sums_over_all_pairs(lengths: Any) -> None:
     run = motion(lengths)
@@ -113,6 +114,7 @@ def test_free_particles_are_an_ideal_gas() -> None:
     assert sc.radial_distribution(run, "L", bins=4)[1] == pytest.approx(np.ones(4), rel=0.02)
 
 
+@pytest.mark.second
 def test_unknown_boxes_and_other_systems_are_refused() -> None:
     run = motion()
     with pytest.raises(sc.ArgumentError, match="'L' is not a parameter"):

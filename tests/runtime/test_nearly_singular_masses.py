@@ -6,6 +6,8 @@ from scipy.integrate import solve_ivp
 
 import scvi_codegen as sc
 
+pytestmark = pytest.mark.second
+
 LIGHT, SPAN = 1e-4, 5.0
 
 
@@ -37,6 +39,7 @@ def angle_alone():
     return solve_ivp(derivative, (0.0, SPAN), (1.0, 0.0), method="DOP853", rtol=1e-13, atol=1e-13).y[0, -1]
 
 
+@pytest.mark.tiers(0, 2)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("method", ["svi:8", "scvi:4"])
 @pytest.mark.parametrize("tolerance", [None, 1e-9])
@@ -60,6 +63,7 @@ def test_step_count_is_bounded_by_the_tolerance(stepper):
     assert exact.rejected_steps < 50
 
 
+@pytest.mark.quick
 def test_batched_and_single_steps_are_equal(stepper):
     angles = 1.0 + 0.01 * np.arange(9)
     start = np.column_stack([0.0 * angles, angles])
@@ -83,6 +87,7 @@ def test_first_step_of_a_sleeping_top_is_not_tiny():
     assert np.ptp(run.energy()) < 1e-13 * run.energy()[0]
 
 
+@pytest.mark.rotated
 @pytest.mark.usefixtures("as_users_compile")
 def test_velocities_are_found_where_newton_converges_slowly(cart):
     """At one state in a thousand Newton's corrections shrank the misfit by a rounding each, and were given up.

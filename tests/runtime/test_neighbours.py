@@ -79,6 +79,7 @@ def test_no_pair_is_missed_in_a_long_run() -> None:
     assert abs(run.momentum_maps()).max() < 1e-11
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", ["stoermer-verlet", "composition:8", "svi:2"])
 def test_no_bit_depends_on_skin_and_interruptions(method: str) -> None:
@@ -97,6 +98,7 @@ def test_no_bit_depends_on_skin_and_interruptions(method: str) -> None:
     assert run.q["r"] == pytest.approx(all_pairs.q["r"], abs=1e-10)
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", ["stoermer-verlet", "svi:2"])
 def test_threads_evaluate_the_same_pairs(method: str) -> None:
@@ -110,6 +112,7 @@ def test_threads_evaluate_the_same_pairs(method: str) -> None:
     assert alone.q["r"] == pytest.approx(all_pairs.q["r"], abs=1e-11)
 
 
+@pytest.mark.rotated
 def test_adaptive_steps_and_ensembles_have_the_pairs_of_all() -> None:
     r, v = start()
     run, other = (stepper("svi:3", skin).integrate(r, velocity=v, t_end=0.4, tolerance=1e-7) for skin in (0.2, None))
@@ -124,6 +127,7 @@ def test_adaptive_steps_and_ensembles_have_the_pairs_of_all() -> None:
 SOFT = f"positive_part(1 - {SQUARE}/cut**2)**4"
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", ["stoermer-verlet", "svi:2"])
 def test_steps_longer_than_the_skin_miss_no_pair(method: str) -> None:
@@ -156,6 +160,7 @@ def of_other_kind(kind: str, near: str) -> Any:
     return sc.LagrangianSystem.from_text(**given, lagrangian=lagrangian, dissipation=friction)
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("kind", "method"), [("hamiltonian", "svi:2"), ("bonds", "stoermer-verlet"), ("friction", "svi:2")]
@@ -172,6 +177,7 @@ def test_hamiltonians_constraints_and_friction_have_lists(kind: str, method: str
     assert run.q["r"] == pytest.approx(other.q["r"], abs=1e-11)
 
 
+@pytest.mark.second
 def test_parameters_that_change_make_another_list() -> None:
     r, v = start()
     runs = []
@@ -184,6 +190,7 @@ def test_parameters_that_change_make_another_list() -> None:
     assert runs[0] == pytest.approx(runs[1], abs=1e-12)
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("box", [None, "5", ["5", "L"], ["9", "4*L"]])
 def test_boxes_of_other_shapes_and_none(box: Any) -> None:
@@ -214,6 +221,7 @@ def test_boxes_of_other_shapes_and_none(box: Any) -> None:
     assert runs[0][1] == pytest.approx(runs[1][1], abs=1e-10)
 
 
+@pytest.mark.rotated
 def test_known_sizes_model_files_and_sympy_have_the_same_sum(tmp_path: Path) -> None:
     r, v = start()
     few = {"r": r[:4]}
@@ -231,6 +239,7 @@ def test_known_sizes_model_files_and_sympy_have_the_same_sum(tmp_path: Path) -> 
     assert again.integrate().q["r"][-1] == pytest.approx(expected.q["r"][-1], abs=1e-12)
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize("sanitizer", ["address,undefined", pytest.param("thread", marks=pytest.mark.full)])
 def test_programs_of_packages_make_their_lists(sanitizer: str, tmp_path: Path) -> None:
     """With three threads and the compiler's sanitizers, from the same start to the same bits."""
@@ -310,6 +319,7 @@ INVALID: tuple[tuple[dict[str, float], str], ...] = (
 )
 
 
+@pytest.mark.tiers(1)
 @pytest.mark.parametrize("kind", ["run-time sizes", "known sizes"])
 def test_lengths_are_checked_before_every_run(kind: str) -> None:
     points = np.array([[0.0, 0.0, 0.0], [0.9, 0.0, 0.0], [0.0, 1.1, 0.0]])

@@ -86,6 +86,7 @@ def test_recorded_scalar_run_belongs_to_one_thread(stepper: sc.Stepper) -> None:
         enter()
 
 
+@pytest.mark.second
 def test_advancing_array_run_belongs_to_one_thread(arrays: sc.Stepper) -> None:
     run = arrays.start([1.0, 0.5], h=0.1)
     with Holder(run, lambda wait: run.advance(1, progress=lambda _: wait())):
@@ -133,6 +134,7 @@ def test_steps_of_racing_threads_are_all_counted(kind: str, stepper: sc.Stepper,
     assert np.isfinite(run.t)
 
 
+@pytest.mark.rotated
 def test_threads_may_read_a_recorded_run(stepper: sc.Stepper, tmp_path: Any) -> None:
     run = sc.record_run(stepper.start([1.0], [0.0], h=0.1), tmp_path / "run", steps=199, rows=5)
     expected = np.asarray(run.q)

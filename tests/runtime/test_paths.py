@@ -11,6 +11,8 @@ from scvi_codegen.runtime.paths import solver
 from scvi_codegen.runtime.paths.equations import condensed_hessian
 from scvi_codegen.runtime.paths.intervals import Intervals, ManyCoordinates
 
+pytestmark = pytest.mark.second
+
 KEPLER = sc.problem("kepler").system
 
 
@@ -28,6 +30,7 @@ def oscillator():
     return compiled(["x"], "x_dot**2/2 - x**2/2")
 
 
+@pytest.mark.quick
 def test_path_is_a_run(kepler):
     path = kepler.path([1.0, 0.0], [-0.5, 0.8], 2.0, steps=12)
     run = path.run()
@@ -39,6 +42,7 @@ def test_path_is_a_run(kepler):
     assert np.array_equal(path.q[[0, -1]], [[1.0, 0.0], [-0.5, 0.8]])
 
 
+@pytest.mark.quick
 def test_lambert_problem_of_vallado(kepler):
     """Vallado, Fundamentals of Astrodynamics, example 7-5: 76 min; published v1 = (2.058913, 2.915965) km/s."""
     mu, unit = 398600.4418, 6378.137
@@ -49,6 +53,7 @@ def test_lambert_problem_of_vallado(kepler):
     assert np.abs(fine - coarse).max() < 1e-8
 
 
+@pytest.mark.quick
 def test_several_starts_lead_to_several_paths(kepler):
     ends, n = [[1.0, 0.0], [-0.5, 0.8]], 24
     angle = np.arctan2(0.8, -0.5)
@@ -63,6 +68,7 @@ def test_several_starts_lead_to_several_paths(kepler):
     assert all(np.abs(path.run().q[-1] - ends[1]).max() < 1e-11 for path in (left, right))
 
 
+@pytest.mark.quick
 def test_continuation_finds_what_the_straight_line_does_not(kepler):
     q1 = kepler.integrate([1.0, 0.0], [0.0, 1.0], h=0.1, steps=140).q[-1]
     h = np.full(56, 0.25)
@@ -88,6 +94,7 @@ def test_starts_at_random_find_paths_where_the_continuation_ends_at_a_fold():
     assert np.abs(path.run().q[-1] - q1).max() < 1e-9
 
 
+@pytest.mark.quick
 def test_a_path_through_a_singularity_is_dropped(kepler):
     """Half of an ellipse with the semi-major axis a = 5/4; the mean of L over it is 3/(2 a) by the virial theorem."""
     a, T = 1.25, np.pi * 1.25**1.5
@@ -102,6 +109,7 @@ def test_a_path_through_a_singularity_is_dropped(kepler):
         kepler.path([1.0, 0.0], [-1.5, 0.0], T, steps=44, start=line)
 
 
+@pytest.mark.quick
 def test_starts_go_around_a_centre(kepler):
     """Angles are those of the run of the path; the times of flight are those of Kepler's equation."""
     angle = np.arctan2(0.8, -0.5)
@@ -120,6 +128,7 @@ def test_starts_go_around_a_centre(kepler):
         compiled(["x"], "x_dot**2/2 - x**2/2").path([1.0], [0.3], 1.0, revolutions=1)
 
 
+@pytest.mark.quick
 def test_error_of_a_path_is_that_of_finer_steps(kepler):
     exact = kepler.path([1.0, 0.0], [-0.5, 0.8], 2.0, steps=96)
     for n in (3, 6):
@@ -129,6 +138,7 @@ def test_error_of_a_path_is_that_of_finer_steps(kepler):
         assert max(away) / 3 < path.error < 10 * max(away)
 
 
+@pytest.mark.quick
 @pytest.mark.parametrize("amplitude", [1.0, 1e-9])
 @pytest.mark.parametrize("origin", [0.0, 1000.0])
 @pytest.mark.parametrize("gauge", ["0", "1"])
@@ -152,6 +162,7 @@ def test_error_of_a_path_depends_neither_on_the_origin_nor_on_the_gauge(amplitud
     assert not path.at_rest
 
 
+@pytest.mark.quick
 def test_indices_of_indefinite_kinetic_energy_are_refused():
     stepper = compiled(["x", "y"], "(x_dot**2 - y_dot**2)/2 - (x**2 - y**2)/2 + x*y/10")
     path = stepper.path([1.0, 0.0], [0.3, 0.2], 2.0, steps=12)
@@ -170,6 +181,7 @@ def test_morse_index_of_the_oscillator(oscillator, T, index):
         assert before <= k * np.pi <= after
 
 
+@pytest.mark.quick
 def test_hessian_by_both_ends_is_that_of_the_run():
     stepper = sc.compile_stepper(sc.problem("henon-heiles").system, "svi:4")
     run = stepper.integrate([0.1, 0.2], [0.3, 0.1], h=0.4, steps=25)
@@ -184,6 +196,7 @@ def test_hessian_by_both_ends_is_that_of_the_run():
     assert path.index == 5 == np.count_nonzero(np.diff(np.sign(determinants)))
 
 
+@pytest.mark.quick
 def test_duration_at_a_given_energy(kepler):
     run = kepler.integrate([1.0, 0.0], [0.0, 1.1], h=0.1, steps=20)
     path = kepler.path(run.q[0], run.q[-1], 2.2, steps=20, energy=float(run.energy()[0]))
@@ -191,6 +204,7 @@ def test_duration_at_a_given_energy(kepler):
     assert np.abs(path.p - run.p).max() < 1e-8
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(
     ("arguments", "q"),
     [
@@ -285,6 +299,7 @@ def test_constrained_index_is_that_of_the_angle():
         assert abs(path.action - angle / 2) < 1e-9
 
 
+@pytest.mark.rotated
 def test_paths_of_arrays_of_run_time_sizes():
     chain = lagrange("chain", "u[N]", "sum(i in N, u_dot[i]**2/2 - u[i]**4/4) - sum(i in 0..N-2, (u[i+1] - u[i])**2/2)")
     stepper = sc.compile_stepper(chain, "svi:3")
@@ -363,6 +378,7 @@ def test_closed_paths_of_given_energy_have_the_period_of_formulas(arguments, clo
     assert path.zero_modes == zero_modes
 
 
+@pytest.mark.quick
 def test_closed_path_at_rest_is_reported(oscillator):
     with pytest.warns(sc.AccuracyWarning, match="give energy="):
         path = oscillator.path(T=5.0, steps=20, closed=True, start=lambda t: [np.cos(t)])
@@ -414,6 +430,7 @@ def choreography(n, curve, steps, method):
     return stepper, path, float(stepper.energy(path.q[0], path.p[0]))
 
 
+@pytest.mark.rotated
 def test_lagrange_triangle_has_the_energy_of_its_closed_form():
     _, path, energy = choreography(3, lambda a: [0.9 * np.cos(a), 0.7 * np.sin(a)], 12, "svi:6")
     assert abs(energy + 1.5 / 3 ** (1 / 3)) < 1e-10

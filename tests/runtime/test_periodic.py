@@ -47,6 +47,7 @@ def galaxy():
     return sc.compile_stepper(sc.problem("henon-heiles").system, sc.SVI(4))
 
 
+@pytest.mark.rotated
 def test_a_halo_orbit_is_the_published_one(restricted):
     """From a guess with an error in the third digit to ten digits; its monodromy is compared with DOP853."""
     x, v, period = HALO
@@ -127,6 +128,7 @@ def _monodromy(orbit):
     return np.array(columns).T
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("error", [0.01, -0.01, 0.02, -0.02, 0.05, -0.05])
 def test_unstable_orbit_is_found_from_an_inaccurate_velocity(restricted, error):
@@ -154,6 +156,7 @@ def _lyapunov_orbit(x):
     return speed, 2.0 * half(speed)[1]
 
 
+@pytest.mark.second
 def test_pendulum_period_is_the_elliptic_integral():
     """The amplitude held, then the period, then the energy; and one that turns over."""
     pendulum = sc.compile_stepper(sc.problem("planar-pendulum").system, sc.SVI(8))
@@ -227,6 +230,7 @@ def test_galactic_orbits_are_found_by_energy(galaxy):
     assert_allclose(turned.stability_indices, stable.stability_indices, rtol=0, atol=1e-9)
 
 
+@pytest.mark.second
 def test_forced_oscillator_has_the_period_of_its_force():
     """x'' = -x - c x' + cos(w t): the closed form; multipliers exp(-c/2 +- i ..), no pairs."""
     driven = sc.LagrangianSystem.from_text(
@@ -253,6 +257,7 @@ def test_forced_oscillator_has_the_period_of_its_force():
         sc.periodic_orbit(stepper, [0.5], [0.5], period=period, steps=40, energy=1.0)
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize(
     ("speed", "duration", "fixed"), [(1, 0.85, []), (1, 1.15, []), (0.85, 0.85, []), (0.85, 1, ["x", "y"])]
 )
@@ -265,11 +270,13 @@ def test_orbits_are_found_from_a_guess_that_is_15_percent_off(planar, speed, dur
         assert orbit.period == pytest.approx(2.780186915, abs=1e-8)
 
 
+@pytest.mark.rotated
 def test_another_orbit_is_reported(planar):
     with pytest.warns(sc.AccuracyWarning, match=r"far from the guess: its period is .*, not 2\.78019"):
         sc.periodic_orbit(planar, [0.82, 0.0], velocity=[0.0, 0.17876], period=2.780187, steps=200, fixed=["y", "p_x"])
 
 
+@pytest.mark.rotated
 def test_another_member_of_the_family_is_reported(planar):
     """A velocity 15 % too large leads to a distant orbit of the family; one 10 % too small to a neighbour."""
     for speed, reported in ((1.15, True), (0.9, False)):
@@ -284,6 +291,7 @@ def test_another_member_of_the_family_is_reported(planar):
         assert (away > amplitude / 3) == reported
 
 
+@pytest.mark.second
 def test_invalid_orbits_are_rejected(galaxy):
     with pytest.raises(sc.OrbitError, match=r"an equilibrium|no periodic orbit was found"):
         sc.periodic_orbit(galaxy, [0.01, 0.01], [0.0, 0.0], period=2.0, steps=40, fixed_period=True)
@@ -305,6 +313,7 @@ def test_invalid_orbits_are_rejected(galaxy):
         sc.periodic_orbit(galaxy, [0.0, 0.3], [0.4, 0.0], period=-6.5, h=0.1)
 
 
+@pytest.mark.second
 def test_nonautonomous_orbits_have_a_period_of_the_system():
     """A forced oscillator closes after any time from some state, and goes elsewhere the next time round."""
     system = lagrange(
@@ -320,6 +329,7 @@ def test_nonautonomous_orbits_have_a_period_of_the_system():
     assert_allclose(np.append(twice.q, twice.p), np.append(once.q, once.p), rtol=0, atol=1e-12)
 
 
+@pytest.mark.second
 def test_orbit_has_the_requested_energy():
     oscillator = sc.LagrangianSystem.from_text(name="o", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2")
     stepper = sc.compile_stepper(oscillator, sc.SVI(3))
@@ -329,6 +339,7 @@ def test_orbit_has_the_requested_energy():
     assert found.energy == pytest.approx(5.0, rel=1e-12)
 
 
+@pytest.mark.second
 def test_missing_inputs_are_not_zero_and_time_transformations_not_fixed_steps():
     pushed = lagrange("pushed", "x", "x_dot**2/2 - x**2/2", forces={"x": "u"}, inputs="u")
     with pytest.raises(sc.StateError, match="the input 'u' is not set"):
@@ -340,6 +351,7 @@ def test_missing_inputs_are_not_zero_and_time_transformations_not_fixed_steps():
         watched.chaos_indicators_ensemble([[1.0, 0.0]], [[0.0, 1.0]], h=0.1, steps=4)
 
 
+@pytest.mark.second
 def test_names_of_a_state_are_unique():
     """A coordinate called p_x in addition to x: the momentum of x has another name."""
     plane = lagrange("plane", "x p_x", "(x_dot**2 + p_x_dot**2)/2 - x**2/2 - p_x**2")

@@ -126,6 +126,7 @@ def differences(function, x, width=1e-4):
     return np.array(columns).T
 
 
+@pytest.mark.tiers(1, 2)
 @pytest.mark.parametrize(("name", "situation"), CASES)
 def test_derivatives_of_runs_are_products_of_those_of_steps(name, situation):
     motion, changes = MOTIONS[name], SITUATIONS[situation]
@@ -159,6 +160,7 @@ def test_gradients_are_the_transpose_of_sensitivities(name, situation):
     assert (gradient.h is None) == (situation == "adaptive" or name in VARYING_STEPS)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("situation", ["all", "sparse", "backward"])
 def test_hessians_are_derivatives_of_gradients(situation):
     """F = sum w . x + x . C x/2 of all states; more directions than pass through a step at once."""
@@ -190,6 +192,7 @@ def test_hessians_of_adaptive_runs_are_symmetric():
     assert_close(found, found.T, 1e-11)
 
 
+@pytest.mark.rotated
 def test_derivatives_by_data_and_named_parameters():
     motion = MOTIONS["data"]
     run, start = motion.run(), np.array([*motion.x, 0.1, 1.2])
@@ -215,6 +218,7 @@ def test_derivatives_by_data_and_named_parameters():
     assert product.inputs["u"].shape == (4, 4, 4)
 
 
+@pytest.mark.second
 def test_long_runs_are_taken_in_segments():
     whole, sparse = (MOTIONS["driven"].run(steps=2500, save_every=n) for n in (1, 500))
     w, C = np.zeros((2501, 2)), np.zeros((2501, 2, 2))
@@ -225,6 +229,7 @@ def test_long_runs_are_taken_in_segments():
     assert_close(stacked(found), stacked(expected), 1e-8)
 
 
+@pytest.mark.second
 def test_derivatives_of_conserved_energies():
     """Energy at the end is that at the start; after a Kepler period only the phase depends on the energy."""
     stepper = sc.compile_stepper(sc.problem("planar-pendulum").system, sc.SVI(8), flags=QUICK_FLAGS)
@@ -303,6 +308,7 @@ def test_arguments_of_derivatives_are_checked(name, call, error, message):
         call(MOTIONS[name].run())
 
 
+@pytest.mark.rotated
 def test_runs_without_derivatives_are_rejected():
     with pytest.raises(sc.StateError, match="whole steps"):
         MOTIONS["driven"].run(steps=9, t=0.0, t_eval=[0.03, 0.1]).sensitivity()

@@ -17,6 +17,7 @@ def stepper():
     return sc.compile_stepper(FREE, "svi:2", flags=QUICK_FLAGS)
 
 
+@pytest.mark.second
 def test_display_of_a_run_and_its_saved_states(stepper):
     run = stepper.start([1.0], [0.0], h=0.5)
     saved = run.record(4)
@@ -41,6 +42,7 @@ def test_display_of_steps_in_tau():
     assert "0 steps of 0.1 in tau, solver" in repr(slow.start([1.0, 0.0], [0.0, 1.1], h=0.1))
 
 
+@pytest.mark.tiers(1)
 @pytest.mark.parametrize(
     ("method", "solver"), [("stoermer-verlet", "explicit"), ("gauss:2", "fixed-point"), ("svi:3", "newton")]
 )

@@ -76,6 +76,7 @@ def by_differences(case, q, p, h, t, directions):
     return np.array(columns).T
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize("name", NAMES)
 def test_derivatives_of_a_step_by_all_arguments(name):
@@ -118,6 +119,7 @@ def second_difference(case, start, direction, weights):
     return float((ends[0] - 2 * ends[1] + ends[2]) / width**2)
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize("name", NAMES)
 def test_second_derivatives_of_a_step_by_all_arguments(name):
@@ -136,6 +138,7 @@ def test_second_derivatives_of_a_step_by_all_arguments(name):
         assert abs(direction @ scaled @ direction - exact) < tolerance * np.abs(direction).sum() ** 2
 
 
+@pytest.mark.tiers(0, 2)
 @pytest.mark.parametrize("name", NAMES)
 def test_vector_products_agree_with_the_jacobian(name):
     _, stepper, q, p, h = given(name)
@@ -151,6 +154,7 @@ def test_vector_products_agree_with_the_jacobian(name):
         stepper.jvp(*at, tangents=np.zeros((2, 1)))
 
 
+@pytest.mark.tiers(1, 3)
 @pytest.mark.parametrize("name", NAMES)
 def test_the_adjoint_is_the_transpose(name):
     """(J v, w) = (v, J^T w) for all v and w of a basis."""

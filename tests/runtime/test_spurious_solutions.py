@@ -14,6 +14,7 @@ PENDULUM = sc.LagrangianSystem.from_text(
 STEPS = (0.05, 0.1, 0.2, 0.3)
 
 
+@pytest.mark.tiers(0, 3)
 @pytest.mark.parametrize("count", [400, pytest.param(20_000, marks=pytest.mark.full)])
 @pytest.mark.parametrize("solver", ["auto", "newton"])
 @pytest.mark.parametrize("method", ["svi:1", "gauss:1", "svi:2", "radau-iia:2"])

@@ -146,6 +146,7 @@ def test_absolute_tolerances_by_name_of_coordinate_array_and_rotation() -> None:
     assert values.tolist() == [0.2, *[0.1] * (stepper.dimension - 1)]
 
 
+@pytest.mark.tiers(1)
 @pytest.mark.parametrize(("method", "solver"), [("svi:4", "auto"), ("svi:4", "newton")])
 def test_coordinate_that_hardly_moves_does_not_determine_the_steps(method: str, solver: str) -> None:
     text = "(x_dot**2 + y_dot**2 + z_dot**2)/2 + 1/sqrt(x**2 + y**2) - 50*z**2"

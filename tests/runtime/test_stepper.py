@@ -42,6 +42,7 @@ def kepler(compiled):
 # Steps and runs.
 
 
+@pytest.mark.tiers(1, 3)
 @each_method
 def test_run_equals_repeated_steps(sample, compiled, method):
     stepper, (q, p) = compiled("pumped-cart-pole", method), sample("pumped-cart-pole").state
@@ -109,6 +110,7 @@ def test_progress_receives_the_completed_steps(kepler):
     assert reported[-1] == 3000
 
 
+@pytest.mark.tiers(2)
 @pytest.mark.parametrize("method", SYMMETRIC, ids=lambda method: method.name)
 def test_symmetric_method_returns_along_its_trajectory(sample, compiled, method):
     stepper, state = compiled("pumped-cart-pole", method), sample("pumped-cart-pole").state
@@ -122,6 +124,7 @@ def test_symmetric_method_returns_along_its_trajectory(sample, compiled, method)
 # Saving and restoring.
 
 
+@pytest.mark.tiers(0, 2)
 @pytest.mark.sampled(2)
 @each_method
 def test_restored_run_continues_bitwise(sample, compiled, method):
@@ -150,6 +153,7 @@ def test_checkpoints_contain_the_parameters(kepler):
     assert not same(kepler.from_checkpoint(saved, parameters={"mu": 1.0}).record(5), expected)
 
 
+@pytest.mark.second
 def test_checkpoints_of_other_systems_are_rejected(kepler):
     """Their memory may have the same size."""
     text = "a_dot**2/2 + b_dot**2/2 - (a - b)**4/4 - mu*a**2"
@@ -263,6 +267,7 @@ def test_step_beyond_the_domain_fails_with_a_message(compiled):
     assert caught.value.trajectory is None
 
 
+@pytest.mark.second
 def test_a_step_without_solution_fails_with_advice(compiled):
     """q'' = q^2 by the midpoint rule requires a root of h^2 x^2 / 2 - 2 x + 2 q + h v: none exists for this h."""
     with pytest.raises(sc.StepFailedError, match=r"step 0 at t = 1\.5 with h = 2 failed: .*smaller step") as caught:
@@ -362,6 +367,7 @@ def test_absolute_tolerance_bounds_the_update(kepler):
 # Legendre transforms and energy.
 
 
+@pytest.mark.tiers(3)
 @pytest.mark.parametrize("name", ["kepler", "pumped-cart-pole", "charged-particle", "relativistic-particle"])
 def test_momentum_velocity_and_energy_agree_with_the_oracle(sample, compiled, name):
     case, stepper = sample(name), compiled(name, sc.SVI(3))
@@ -384,6 +390,7 @@ def test_velocity_is_found_where_momenta_cancel(quickly_compiled):
         assert stepper.velocity(q, p) == pytest.approx(p - 5.345 * np.sin(q), abs=2e-15)
 
 
+@pytest.mark.second
 def test_velocity_is_undefined_beyond_the_range_of_the_momenta(compiled, sample):
     """A momentum that no velocity below c gives in a system where there is one to find; and one given as nan."""
     stepper = compiled("relativistic-particle", sc.SVI(3))
@@ -408,6 +415,7 @@ def test_energies_of_many_states_equal_single_energies(sample, compiled):
 # The discrete Lagrangian.
 
 
+@pytest.mark.tiers(0, 3)
 @pytest.mark.covering
 @each_action
 @pytest.mark.parametrize("name", ["kepler", "pumped-cart-pole"])
@@ -423,6 +431,7 @@ def test_step_is_the_plus_transform_after_the_inverse_of_the_minus_transform(sam
     assert plus[1] == pytest.approx(p1, abs=1e-13)
 
 
+@pytest.mark.tiers(0, 2)
 @pytest.mark.sampled(2)
 @each_action
 def test_momenta_are_derivatives_of_the_discrete_lagrangian(sample, compiled, method):
@@ -439,6 +448,7 @@ def test_momenta_are_derivatives_of_the_discrete_lagrangian(sample, compiled, me
         assert weights @ second == pytest.approx(p1[i], abs=1e-9)
 
 
+@pytest.mark.second
 def test_the_discrete_lagrangian_is_the_quadrature_along_the_oracles_curve(sample, compiled):
     """The nodal curve of the oracle, whose end values give L_d by (25)."""
     case, (c, w) = sample("pumped-cart-pole"), oracle.rule("gauss-legendre:3")
@@ -458,6 +468,7 @@ def test_the_discrete_lagrangian_is_the_quadrature_along_the_oracles_curve(sampl
     assert found == pytest.approx(float(along(middle)), abs=1e-14)
 
 
+@pytest.mark.tiers(1, 2)
 @each_action
 def test_two_point_form_gives_the_same_positions(sample, compiled, method):
     stepper, state = compiled("pumped-cart-pole", method), sample("pumped-cart-pole").state
@@ -517,6 +528,7 @@ def test_a_stepper_shows_system_and_method(kepler):
     assert kepler.dimension == 2
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(2)
 @pytest.mark.covering
 @pytest.mark.parametrize("name", ["double-pendulum", "relativistic-particle", "planar-pendulum", "harmonic-oscillator"])

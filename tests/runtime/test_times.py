@@ -26,6 +26,7 @@ def in_last_places(time: float, t: float, h: float, n: int) -> float:
     return float(abs(Fraction(time) - (Fraction(t) + n * Fraction(h))) / Fraction(math.ulp(time)))
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("t", "h"), GRIDS)
 def test_the_time_of_a_run_is_the_sum_of_its_steps_rounded(free, t, h):
     run = free.integrate([0.0], [0.0], h=h, steps=3_000, t=t)
@@ -47,6 +48,7 @@ def test_times_are_rounded_with_compensation(t, h):
         assert wrong <= Fraction(math.ulp(high)) / 2**50
 
 
+@pytest.mark.rotated
 def test_states_store_the_following_step_size(free):
     run = free.integrate([0.1], [0.0], h=0.25, steps=8, save_every=2)
     assert run.step_sizes.tolist() == [0.25] * 5
@@ -65,6 +67,7 @@ def test_spans_are_divided_into_equal_steps_below_the_maximum():
         steps_within(1e300, 1e-300)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("t", "h", "t_end"), [(0.0, 0.1, 0.35), (1e16, 3.0, 1e16 + 8)])
 def test_runs_backward_end_as_those_forward(free, t, h, t_end):
     """The third step of 3 from 1e16 ends beyond 1e16 + 8, which is its end when rounded: it is shortened."""

@@ -47,6 +47,7 @@ def kepler_time(q: Any) -> Any:
 WAYS = [(form, solver) for form in FORMS for solver in ("auto", "newton")]
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize(("form", "solver"), WAYS)
 def test_time_satisfies_keplers_equation(form: str, solver: str) -> None:
@@ -58,6 +59,7 @@ def test_time_satisfies_keplers_equation(form: str, solver: str) -> None:
     assert np.array_equal(run.tau, 0.1 * np.arange(301)) or np.abs(run.tau - 0.1 * np.arange(301)).max() < 1e-14
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(2)
 @pytest.mark.covering
 @pytest.mark.parametrize("method", METHODS)
@@ -68,6 +70,7 @@ def test_every_solver_gives_the_same_time(form: str, method: str) -> None:
     assert np.abs(runs[0].q - runs[1].q).max() < 1e-12
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize(("form", "method"), [("L", "three points"), ("K", "radau"), ("K, momenta", "lobatto")])
 def test_order_of_the_time_is_that_of_the_method(form: str, method: str) -> None:
     """Compare one step with the exact solution of (q, p) and t = integral of the rate, in 45 digits."""
@@ -99,6 +102,7 @@ def _exact_time(form: str, h: float) -> float:
     return float(motion.flow([*q, 0], [*p, 0], mp.mpf(h))[0][-1])
 
 
+@pytest.mark.second
 def test_run_of_many_orbits_conserves_time_and_energy() -> None:
     """Time is summed in two pieces: over a thousand orbits nothing but the method's phase error is left."""
     run = stepper().integrate(*START, h=0.25, steps=30_000, save_every=1_000)
@@ -115,6 +119,7 @@ def test_run_of_many_orbits_conserves_time_and_energy() -> None:
     assert abs(float(np.sum(increments, dtype=np.longdouble)) - parts[0].t[-1]) <= 2e-16 * parts[0].t[-1]
 
 
+@pytest.mark.second
 def test_energy_is_that_of_the_initial_state() -> None:
     own = sc.compile_stepper(KEPLER, sc.SVI(4))
     made = stepper()
@@ -137,6 +142,7 @@ def test_velocities_are_derivatives_by_physical_time() -> None:
     assert np.abs(dataset["velocity"].values - dataset["p"].values).max() < 1e-15  # of a unit mass
 
 
+@pytest.mark.tiers(1)
 @pytest.mark.parametrize("form", FORMS)
 def test_runs_end_at_a_physical_time(form: str) -> None:
     run = stepper(form).integrate(*START, h=0.1, t_end=9.0)
@@ -171,6 +177,7 @@ def test_dense_output_is_in_physical_time() -> None:
     assert np.array_equal(p, seldom.p[3])
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("form", FORMS)
 def test_events_are_located_in_physical_time(form: str) -> None:
@@ -240,6 +247,7 @@ def test_levi_civita_follows_an_ellipse_that_is_almost_a_line() -> None:
     assert run.parameters[-1] == pytest.approx(-0.5, rel=1e-13)
 
 
+@pytest.mark.second
 def test_unsupported_transformations_are_rejected() -> None:
     made = stepper()
     with pytest.raises(sc.StateError, match="give either steps=3 or t_end=1"):

@@ -6,6 +6,8 @@ from notation import lagrange
 
 import scvi_codegen as sc
 
+pytestmark = pytest.mark.second
+
 DRAG = {"x": "-c*x_dot*sqrt(x_dot**2 + y_dot**2) + w*cos(3*t)", "y": "-c*y_dot*sqrt(x_dot**2 + y_dot**2)"}
 
 
@@ -22,6 +24,7 @@ def balance(stepper, h, span=2.0, **options):
     return np.abs(energy - energy[0] - work).max(), np.abs(angular - angular[0] - run.impulses()[:, 0]).max()
 
 
+@pytest.mark.tiers(1)
 @pytest.mark.parametrize("method", [sc.SVI(2), sc.Gauss(3), sc.StoermerVerlet()], ids=lambda method: method.name)
 def test_impulses_are_exact_and_work_is_of_the_order_of_the_method(thrown, method):
     stepper = sc.compile_stepper(thrown, method, solver="newton")
@@ -38,6 +41,7 @@ def test_shooting_has_a_work_balance_of_the_order_of_its_curve(thrown):
     assert np.log2(coarse[1] / fine[1]) > 2.8
 
 
+@pytest.mark.rotated
 def test_work_balance_of_hamiltonians_iterations_and_parameters(thrown):
     """The balance of H is equal; fixed-point steps use the fallback; parameters and time are those of the run."""
     hamiltonian = sc.HamiltonianSystem.from_text(
@@ -79,6 +83,7 @@ def test_work_balance_with_dense_output_and_adaptive_steps(thrown):
         stepper.integrate(*start, t_end=2.0, t_eval=[0.3, 1.1]).work()
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize("plan", [{"h": 0.05}, {}])
 def test_work_balance_with_impacts(thrown, plan):
     """Steps end in the states before impacts, which conserve the energy."""

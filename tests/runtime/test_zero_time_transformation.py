@@ -13,6 +13,7 @@ KEPLER = sc.problem("kepler").system
 NEAR = [1.99999, 0.0], [0.0, (1e-5 / 1.99999) ** 0.5]
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("time_transformation", ["x", "x**2"])
 def test_run_stops_where_the_time_transformation_is_zero(time_transformation):
     stretched = sc.compile_stepper(sc.reparametrise(OSCILLATOR, time_transformation), sc.SVI(4))
@@ -23,6 +24,7 @@ def test_run_stops_where_the_time_transformation_is_zero(time_transformation):
     assert 100 < len(failure.value.trajectory) < 10**6
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("events", [None, ["x - 2"]], ids=["alone", "with events"])
 def test_reversible_controller_stops_where_the_time_transformation_is_zero(events):
     controlled = sc.compile_stepper(OSCILLATOR, sc.SVI(4), time_transformation="x**2", events=events)
@@ -31,6 +33,7 @@ def test_reversible_controller_stops_where_the_time_transformation_is_zero(event
     assert failure.value.status == "time transformation singular"
 
 
+@pytest.mark.second
 def test_solve_ivp_reports_a_zero_time_transformation():
     motion = sc.solve_ivp(OSCILLATOR, (0.0, 4.0), [1.0, 0.0], time_transformation="x**2", method="svi:4")
     assert not motion.success

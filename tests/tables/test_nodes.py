@@ -21,6 +21,7 @@ DEGREES = [1, 2, 3, 4, 5, 8, 13, 30, 47]
 FIFTY_DIGITS = mp.mpf("1e-50")
 
 
+@pytest.mark.tiers(56)
 @pytest.mark.parametrize("name", NODE_FAMILIES)
 @pytest.mark.parametrize("degree", DEGREES)
 def test_every_family_gives_ascending_points_under_its_name(name: str, degree: int) -> None:
@@ -32,6 +33,7 @@ def test_every_family_gives_ascending_points_under_its_name(name: str, degree: i
     assert nodes_by_name(name, degree) is nodes
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("degree", [9, 30])
 def test_legendre_families_are_roots_to_fifty_digits_of_mpmath_polynomials(degree: int) -> None:
     other = MPContext()

@@ -106,6 +106,7 @@ def test_too_few_points_for_the_intervals_warn() -> None:
 # Exactness and order.
 
 
+@pytest.mark.tiers(1, 2)
 @pytest.mark.sampled(2)
 @pytest.mark.covering
 @pytest.mark.parametrize("degree", [2, 3, 4, 5])
@@ -129,6 +130,7 @@ ORDERS = (
 )
 
 
+@pytest.mark.tiers(0, 4)
 @pytest.mark.sampled(4)
 @pytest.mark.parametrize(("method", "order"), ORDERS, ids=lambda value: getattr(value, "name", value))
 def test_order_of_methods_on_other_spaces(method: SVI, order: int) -> None:
@@ -140,6 +142,7 @@ def test_order_of_methods_on_other_spaces(method: SVI, order: int) -> None:
     assert np.log2(errors[0] / errors[1]) > order - 0.45
 
 
+@pytest.mark.second
 def test_the_order_of_trigonometric_curves_whose_frequency_shrinks_with_the_step() -> None:
     system, start = problem("planar-pendulum").system, ([1.0], [0.3])
     fine = stepper(system, SVI(10)).integrate(*start, h=0.25, steps=16)
@@ -160,6 +163,7 @@ STRUCTURED = (
 )
 
 
+@pytest.mark.tiers(2, 3)
 @pytest.mark.sampled(3)
 @pytest.mark.covering
 @pytest.mark.parametrize("method", STRUCTURED, ids=lambda method: method.name)
@@ -186,6 +190,7 @@ def test_symplecticity_momentum_and_reversibility(method: SVI, solver: str) -> N
     assert (np.abs(back - z).max() < 1e-14) == method.symmetric
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("method", [SVI(3, "hermite:3"), SVI(4, "hermite-2:3")], ids=lambda method: method.name)
 def test_discrete_lagrangian_includes_derivatives(method: SVI) -> None:
     """L_d generates the step, p0 = -D1 L_d and p1 = D2 L_d by differences, and approximates the action."""

@@ -150,6 +150,7 @@ def test_simplifying_conditions_are_those_of_the_table(family: Callable[[int], T
     assert simplifying_conditions(family(s)) == CONDITIONS[family](s)
 
 
+@pytest.mark.tiers(6, 9)
 @pytest.mark.sampled(9)
 @pytest.mark.parametrize("tableau", [*members([1, 2, 3, 4]), explicit_euler()], ids=lambda tableau: tableau.name)
 def test_the_order_is_that_of_the_error_of_one_step_on_a_nonlinear_equation(tableau: Tableau) -> None:

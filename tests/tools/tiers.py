@@ -1,37 +1,37 @@
-"""Tiers of the tests: quick (the default), second, full.
+"""Tiers of the tests: quick (the default), second, full, by the markers ``quick``, ``second`` and ``full``.
 
-``second_tier.txt`` lists test functions after two numbers of cases, in the order of the file: the first ones are quick,
-the further ones up to the second number are of the second tier, the others are full. Cases marked ``quick`` and
-functions that are not listed are quick; the marks ``second`` and ``full`` are left as they are. The file is measured:
-``record_tiers.py`` writes it. Of the cases that it makes full, one in ``PARTS`` is of the second tier where the
-environment variable ``SCVI_CODEGEN_TESTS_PART`` is a number, which ``.ci/run`` sets to the number of commits: so many
-runs reach all of them. With ``all`` all of them are.
+Tests without a marker are quick; a marker of a test prevails over those of its class and of its file. Of a test with
+``@pytest.mark.tiers(m)`` the first m cases are quick, the others of the second tier; with ``tiers(m, n)`` the first m
+are quick, those up to the n-th of the second tier, the others rotated. One in ``PARTS`` of the rotated cases is of the
+second tier where the environment variable ``SCVI_CODEGEN_TESTS_PART`` is a number, which ``.ci/run`` sets to the number
+of commits: so many runs reach all of them. With ``all`` all of them are; without it they are full. Tests that are named
+(``file::test``) run in any tier but the full one.
 
 ``@pytest.mark.covering`` on a test with several parametrised arguments keeps few of their combinations, so that each
 value of each argument is in one; ``@pytest.mark.covering(2)`` so that each is in two (where there are as many).
-``@pytest.mark.sampled(n)`` keeps n of the cases of a test, evenly spaced in the order of their names.
-``first_of_each`` does the like for one argument, by what its values have in common. ``pytest.mark.long`` on a file
-begins it before others, so that no process waits for another at the end.
+``@pytest.mark.sampled(n)`` keeps n of the cases of a test, evenly spaced in the order of their names; the others are
+full. ``first_of_each`` does the like for one argument, by what its values have in common. ``pytest.mark.long`` on a
+file begins it before others, so that no process waits for another at the end.
 """
 
+import math
 import os
 import re
 import zlib
 from collections import Counter, defaultdict
 from collections.abc import Callable, Hashable, Iterable, Sequence
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from scvi_codegen.methods.method import Method
 
-QUICK, SECOND = "not full and not second", "second"
-"""Expressions of the quick tier, as in pyproject.toml, and of the second."""
+QUICK, SECOND = "not full and (quick or not second)", "second and not quick and not full"
+"""Expressions of the quick tier, as in pyproject.toml, and of the second, for which ``-m second`` stands."""
 UNOPTIMISED_TIERS = (QUICK, SECOND, "not full")
-SECOND_TIER = Path(__file__).with_name("second_tier.txt")
+TIERS = ("quick", "second", "full", "rotated", "tiers")
 PARTS = 16
-"""Number of parts of the measured full tier, of which a run with SCVI_CODEGEN_TESTS_PART takes one."""
+"""Number of parts of the rotated cases, of which a run with SCVI_CODEGEN_TESTS_PART takes one."""
 
 Combination = tuple[tuple[str, int], ...]
 """Which value of each argument."""
@@ -76,29 +76,20 @@ def mark_the_rest_full(items: Iterable[pytest.Item]) -> None:
             item.add_marker(pytest.mark.full)
 
 
-def function_of(nodeid: str) -> str:
-    """Return the name of a test without the case, as in ``second_tier.txt``."""
-    return nodeid.partition("[")[0]
-
-
-def listed_cases() -> dict[str, tuple[int, int]]:
-    """Return the numbers of cases in the quick tier and in both, by test function of ``second_tier.txt``."""
-    lines = (line.split() for line in SECOND_TIER.read_text(encoding="utf-8").splitlines())
-    return {name: (int(quick), int(both)) for quick, both, name in lines}
-
-
 def mark_later_tiers(items: Iterable[pytest.Item]) -> None:
-    """Mark the cases of listed tests that are not quick."""
-    listed, part = listed_cases(), os.environ.get("SCVI_CODEGEN_TESTS_PART", "")
-    seen: Counter[str] = Counter()
+    """Mark the cases of tests marked ``tiers`` or ``rotated`` as quick, of the second tier, or full."""
+    part, seen = os.environ.get("SCVI_CODEGEN_TESTS_PART", ""), Counter[str]()
     for item in items:
-        name = function_of(item.nodeid)
-        if name in listed and not any(map(item.get_closest_marker, ("quick", "second", "full"))):
-            quick, both = listed[name]
-            seen[name] += 1
-            rotated = part == "all" or (part.isdigit() and (zlib.crc32(item.nodeid.encode()) - int(part)) % PARTS == 0)
-            if seen[name] > quick:
-                item.add_marker(pytest.mark.second if seen[name] <= both or rotated else pytest.mark.full)
+        if len([marker for marker in item.own_markers if marker.name in TIERS]) > 1:
+            continue  # a case with a tier of its own
+        marker = next((marker for marker in item.iter_markers() if marker.name in TIERS), None)
+        if marker is None or marker.name not in ("rotated", "tiers"):
+            continue
+        quick, both = (*marker.args, math.inf)[:2] if marker.args else (0, 0)
+        seen[name := item.nodeid.partition("[")[0]] += 1
+        rotated = part == "all" or (part.isdigit() and (zlib.crc32(item.nodeid.encode()) - int(part)) % PARTS == 0)
+        later = "second" if seen[name] <= both or rotated else "full"
+        item.add_marker("quick" if seen[name] <= quick else later)
 
 
 def long_ones_first(items: list[pytest.Item]) -> None:

@@ -139,6 +139,7 @@ def test_planted_faults_find_their_source_lines(name: str, method: str) -> None:
     assert [what for what, pattern in here.items() if not re.search(pattern, code)] == []
 
 
+@pytest.mark.rotated
 @pytest.mark.parametrize(
     "fault", [pytest.param(name, marks=() if name in QUICK else pytest.mark.full) for name in FAULTS]
 )
@@ -161,6 +162,7 @@ def test_planted_faults_are_detected(fault: str, monkeypatch: pytest.MonkeyPatch
     assert found.violated, found.to_text()
 
 
+@pytest.mark.second
 def test_model_file_is_verified(tmp_path: Path) -> None:
     """Beside it lies the certificate; the exit status is 0."""
     path = tmp_path / "oscillators.toml"

@@ -33,7 +33,7 @@ from scvi_codegen.verification.convergence import _expected
 from scvi_codegen.verification.stepping import step_checks
 from scvi_codegen.verification.structure import structure_checks
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.rotated]
 
 
 def of_result(change: Callable[[Any], Any]) -> Callable[[Any], Any]:
@@ -118,7 +118,6 @@ def violated_by(fault: str) -> tuple[Check, ...]:
         return certified(case(name), f"-DFAULT_{next(_numbers)}").violated
 
 
-@pytest.mark.sampled(3)
 @pytest.mark.parametrize("fault", FAULTS)
 def test_planted_fault_is_detected(fault: str) -> None:
     assert violated_by(fault)
@@ -131,6 +130,7 @@ def test_planted_fault_leaves_no_trace_in_the_process() -> None:
     assert certified(case(FAULTS[fault][0])).passed
 
 
+@pytest.mark.tiers(0, 0)
 @pytest.mark.parametrize(
     "name",
     [pytest.param(each, marks=getattr(pytest.mark, "second" if "composition" in each else "full")) for each in CASES],
@@ -214,6 +214,7 @@ def test_inputs_are_certified_at_small_values(method) -> None:
     assert len(certificate.checks) > 15
 
 
+@pytest.mark.second
 def test_constraints_are_certified_with_constant_inputs() -> None:
     """Cubics of time would push with 5000 after 50 units of it, and steps fail."""
     pushed = sc.LagrangianSystem.from_text(
@@ -238,6 +239,7 @@ def test_different_integrator_is_not_certified() -> None:
     assert {"stage equations", "symplecticity", "reversal"} <= names
 
 
+@pytest.mark.quick
 @pytest.mark.parametrize(
     ("measure", "outcome"),
     [
@@ -264,6 +266,7 @@ def violated(error: Exception) -> Finding:
 # What it measures with.
 
 
+@pytest.mark.quick
 def test_exact_solution_is_exact() -> None:
     oscillator = sc.problem("harmonic-oscillator").system
     q, p = exact_motion(oscillator).flow([1.0], [0.0], 2)
@@ -271,6 +274,7 @@ def test_exact_solution_is_exact() -> None:
     assert abs(p[0] + mp.sin(2)) < mp.mpf("1e-43")
 
 
+@pytest.mark.quick
 @pytest.mark.parametrize("name", ["relativistic-particle", "double-pendulum"])
 def test_velocities_are_found_where_newton_leaves_the_domain(name: str) -> None:
     motion = exact_motion(sc.problem(name).system)
@@ -280,6 +284,7 @@ def test_velocities_are_found_where_newton_leaves_the_domain(name: str) -> None:
     assert max(abs(found - v)) < mp.mpf("1e-40")
 
 
+@pytest.mark.quick
 def test_the_derived_step_is_that_of_the_closed_form() -> None:
     """Its unknowns satisfy the equations that ``derive`` prints."""
     system, method = sc.problem("planar-pendulum").system, sc.SVI(2)
@@ -322,6 +327,7 @@ def test_model_file_and_its_generated_folder_are_verified(tmp_path: Path) -> Non
     assert command(str(folder), "--degree", "3")[0] == 2
 
 
+@pytest.mark.quick
 def test_certificate_reports_slow_checks_and_their_duration(quickly_compiled, monkeypatch, capsys):
     entry = sc.problem("harmonic-oscillator")
     message: list[str] = []
@@ -338,6 +344,7 @@ def test_certificate_reports_slow_checks_and_their_duration(quickly_compiled, mo
     assert any("unknowns per step are solved in 60 digits, which takes about" in line for line in message)
 
 
+@pytest.mark.quick
 @pytest.mark.parametrize(
     "method",
     [

@@ -162,6 +162,7 @@ def test_every_stepping_algorithm_is_verified() -> None:
     assert HEADERS - covered == set(OTHERS)
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_certificates_are_satisfied(name: str) -> None:

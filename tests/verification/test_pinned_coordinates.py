@@ -49,6 +49,7 @@ CASES: dict[str, tuple[Any, Any, Any, float]] = {
 }
 
 
+@pytest.mark.rotated
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", CASES)
 def test_pinned_coordinates_are_certified(name: str) -> None:
@@ -57,6 +58,7 @@ def test_pinned_coordinates_are_certified(name: str) -> None:
     assert certificate.passed, certificate.to_text()
 
 
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("degree", "h"), [(2, 0.01), (3, 0.005)])
 def test_constraints_of_long_runs_hold_to_rounding(degree: int, h: float, as_users_compile: object) -> None:
     """Rounding at the pinned coordinates ended the iteration of the others at changes of 1e-11."""
@@ -68,6 +70,7 @@ def test_constraints_of_long_runs_hold_to_rounding(degree: int, h: float, as_use
     assert run.iterations[1:].mean() < 5.5
 
 
+@pytest.mark.second
 def test_a_structure_at_rest_continues_from_its_own_state() -> None:
     """Its momenta are rounding errors, which violated the rates of the constraints by 1 (relative)."""
     stepper = sc.compile_stepper(point("x**2 + y**2 - 1", "(x - 2)**2 + y**2 - 3"), RATTLE, flags=QUICK_FLAGS)

@@ -35,6 +35,7 @@ def checks_of(given: Case) -> Iterator[Check]:
     return variable_step_checks(VariableSteps(tested, runs, own, given.system, given.tolerance))
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", STEP_CHECKS)
 def test_local_error_of_run_steps_is_measured(name: str) -> None:
     given, claims = STEP_CHECKS[name]
