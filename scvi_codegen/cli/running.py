@@ -82,7 +82,6 @@ def integrate_model(model: Model) -> RunOutcome:
         def look(_: int) -> None:
             reached = int(BAR_LENGTH * (run.t - model.t) / model.covered) if by_time else run.steps
             show_progress(min(length, reached))
-            check_memory(model, run.steps)
 
         def stop() -> bool:
             nonlocal stopped

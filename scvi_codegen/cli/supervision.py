@@ -15,10 +15,9 @@ from scvi_codegen.models.model import Model
 from scvi_codegen.native.capacity import COPIES, room_for_states
 
 
-def check_memory(model: Model, steps: int | None = None, trajectories: int = 1) -> None:
-    """Reject a run whose saved states do not fit into memory; adaptive runs call it with the ``steps`` done so far."""
-    if steps is None:
-        steps = 0 if model.ends_at_time else model.step_count
+def check_memory(model: Model, trajectories: int = 1) -> None:
+    """Reject a run of a known number of steps whose saved states do not fit into memory; others end with them."""
+    steps = 0 if model.ends_at_time else model.step_count
     saved = steps // model.save_every + 1
     each = 16 * model.dimension * trajectories + 12  # q and p of each; time and iterations
     room = room_for_states() / each

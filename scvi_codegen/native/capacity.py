@@ -36,6 +36,6 @@ def too_many_states(count: int, step: int, t: float) -> StepFailedError:
     """Return the error that ends a run with ``count`` saved states after a step, at time t."""
     message = (
         f"the {count} states of the run up to t = {t:g} fill the memory. Save fewer of them (t_eval, save_every), only "
-        "results of them (observe), or record the run in a folder (record_run)"
+        "results of them (observe), or record the run in a folder (record_run, -o NAME.run)"
     )
     return StepFailedError(message, status=TOO_MANY_STATES, step=step, t=t, residual=math.nan)

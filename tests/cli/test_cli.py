@@ -372,6 +372,18 @@ class TestRun:
         assert 1 < int(save_every) < 10
         assert "1000 steps" in output_of("run", "kepler", "--steps", "1000", "--save-every", save_every)
 
+    @pytest.mark.parametrize("inputs", ["", "inputs = ['u']\n[forces]\nx = 'u'\n[inputs]\nu = {file = 'u.csv'}\n"])
+    def test_adaptive_run_that_fills_the_memory_writes_its_states(self, inputs, monkeypatch):
+        monkeypatch.setattr("scvi_codegen.native.capacity.usable_memory", lambda: 30_000.0)
+        text = f"[system]\nname = 'o'\ncoordinates = ['x']\nlagrangian = 'x_dot**2/2-x**2/2'\n{inputs}"
+        Path("o.toml").write_text(f"{text}[initial]\nq = [1.0]\np = [0.0]\n", encoding="utf-8")
+        Path("u.csv").write_text("t,value\n" + "".join(f"{t},{t % 2}\n" for t in range(1001)), encoding="utf-8")
+        words = "run", "o.toml", "--method", "svi:4", "--tolerance", "1e-9", "--span", "1000", "-o", "o.npz"
+        message = error_of(*words, status=1)
+        t = arrays("o.npz")["t"]
+        assert f"the {len(t)} states of the run up to t = {t[-1]:g} fill the memory" in message
+        assert f"the {len(t)} states computed before were written: o.npz" in message
+
     @pytest.mark.second
     def test_draws_a_picture(self):
         assert "wrote orbit.svg" in output_of("run", "kepler", "--steps", "50", "--plot", "orbit.svg")

@@ -507,7 +507,8 @@ class _Samples:
         self.epsilon, self.firsts = roundoff(interface.words), first_of_groups(interface, m)
         self.errors = self.epsilon * np.abs(np.array([np.asarray(each) for each in self.states]))
         self.motion: Motion | None = None
-        self.kinetic = momenta_of_velocities(trajectory.stepper, self.t, *self.states, trajectory.parameters)
+        q, p = self.states
+        self.kinetic = momenta_of_velocities(trajectory.stepper, self.t, q, p, trajectory.parameters)
         plan = trajectory.plan
         self.absolute: Array | float = 0.0
         if isinstance(plan, Adaptive):

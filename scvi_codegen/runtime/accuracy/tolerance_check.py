@@ -147,7 +147,7 @@ def missed_tolerance(
         known = known_digits(second, trajectory, most=SECOND_RUN + 4 * trajectory.steps)
     if known is None or known.chaotic:
         return f"{doubt}; {REMEDY}" if doubt else ""
-    error = float(relative_to_motion(np.linalg.norm(known.q), trajectory.q))
+    error = float(relative_to_motion(np.asarray(np.linalg.norm(known.q)), trajectory.q))
     if error <= SECOND_MARGIN * tolerance + SECOND_RUN_ERROR:
         return ""
     message = doubt or f"the tolerance {tolerance:g} is missed"
@@ -165,7 +165,8 @@ def _missed_in_two_words(trajectory: Trajectory, tolerance: float) -> str:
     except ScviCodegenError:
         return ""
     late = np.asarray(second.velocity[-1]) * float(second.t[-1] - trajectory.t[-1])
-    error = float(relative_to_motion(np.linalg.norm(second.q[-1] - trajectory.q[-1] - late), trajectory.q))
+    difference = np.asarray(np.linalg.norm(second.q[-1] - trajectory.q[-1] - late))
+    error = float(relative_to_motion(difference, trajectory.q))
     return f"the tolerance {tolerance:g} is missed: a second run differs by {error:.1e} at the end; {REMEDY}" * (
         error > SECOND_MARGIN * tolerance
     )

@@ -15,6 +15,7 @@ import numpy as np
 
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.native.arguments import checked_number, checked_step, real_array
+from scvi_codegen.native.capacity import room_for_states, too_many_states
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.accuracy.local_error import warn_of_large_steps
 from scvi_codegen.runtime.accuracy.resolution import warn_of_unresolved_fields
@@ -239,14 +240,18 @@ def record_segments(
         recorded: records a number of steps.
         stopped: returns whether the run was stopped in the last segment; a terminal event ends it as well.
     """
-    pieces: list[Trajectory] = []
+    pieces, size = list[Trajectory](), 0
     for steps in segments:
         try:
+            if size > room_for_states():
+                raise too_many_states(sum(len(each) - 1 for each in pieces) + 1, run.steps, float(run.t))
             piece = recorded(steps)
         except StepFailedError as failure:
-            failure.trajectory = joined([*pieces, with_final_state(Trajectory.before(failure), run)])
+            last = [] if failure.trajectory is None else [with_final_state(Trajectory.before(failure), run)]
+            failure.trajectory = joined([*pieces, *last])
             raise
         pieces.append(piece if run.ended else with_final_state(piece, run))
+        size += sum(each.nbytes for each in (piece.t, piece.q, piece.p))
         if run.ended or stopped():
             break
     return joined(pieces or [recorded(0)])
