@@ -4,35 +4,34 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from scvi_codegen import SCVI, SVI, StoermerVerlet, generate_source, problem
+from scvi_codegen import SCVI, SVI, LagrangianSystem, compile_stepper, generate_source, problem
 
 FOLDER = Path(__file__).parent
-
-INTEGRATORS = {
-    "two_point_pendulum": ("planar-pendulum", SCVI(1, "gauss-legendre:2")),
-    "pendulum_stoermer_verlet": ("planar-pendulum", StoermerVerlet()),
-    "kepler_svi_4": ("kepler", SVI(4)),
-    "kepler_scvi_2": ("kepler", SCVI(2)),
-}
+RING = LagrangianSystem.from_text(
+    "FPUT ring",
+    ["q[N]"],
+    "sum(i in N, q_dot[i]**2/2) - sum(i in N periodic, (q[i+1] - q[i])**2/2 + beta*(q[i+1] - q[i])**4/4)",
+    parameters={"beta": 0.25},
+)
 
 
 def texts() -> dict[str, str]:
-    """Return the text of each file by its name; the support headers serve all integrators."""
-    files = {}
-    for prefix, (name, method) in INTEGRATORS.items():
-        source, _ = generate_source(problem(name).system, method, prefix=prefix)
-        files |= source.files
-    return files
+    """Return the text of each file by its name, the headers that all integrators share (``support/``) included."""
+    pendulum, _ = generate_source(
+        problem("planar-pendulum").system, SCVI(1, "gauss-legendre:2"), prefix="two_point_pendulum"
+    )
+    kepler, _ = generate_source(problem("kepler").system, SVI(4), prefix="kepler_svi_4")
+    ring = compile_stepper(RING, "stoermer-verlet").source
+    return pendulum.files | kepler.files | ring.files
 
 
 def main() -> None:
-    """Write every file, and remove C files that are no longer made."""
-    files = texts()
-    for path in {*FOLDER.glob("**/*.[ch]")} - {FOLDER / name for name in files}:
+    """Write the integrators, and remove C files that are no longer made."""
+    files = {FOLDER / name: text for name, text in texts().items() if "/" not in name}
+    for path in {*FOLDER.glob("*.[ch]")} - set(files):
         path.unlink()
-    for name, text in files.items():
-        (FOLDER / name).parent.mkdir(parents=True, exist_ok=True)
-        (FOLDER / name).write_text(text, encoding="utf-8", newline="\n")
+    for path, text in files.items():
+        path.write_text(text, encoding="utf-8", newline="\n")
 
 
 if __name__ == "__main__":

@@ -30,14 +30,11 @@ def fresh() -> dict[str, str]:
 
 def stored() -> dict[str, str]:
     """Return the text of each file of the folder, by name."""
-    return {
-        path.relative_to(FOLDER).as_posix(): path.read_bytes().decode("utf-8")
-        for path in sorted(FOLDER.glob("**/*.[ch]"))
-    }
+    return {path.name: path.read_bytes().decode("utf-8") for path in sorted(FOLDER.glob("*.[ch]"))}
 
 
 def test_no_file_is_missing_or_orphaned():
-    assert sorted(stored()) == sorted(fresh()), REMEDY
+    assert sorted(stored()) == sorted(name for name in fresh() if "/" not in name), REMEDY
 
 
 def test_no_file_is_outdated():
@@ -57,9 +54,11 @@ def test_no_file_is_outdated():
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 def test_every_file_compiles_with_all_warnings_as_errors(compiler, tmp_path):
     needs(compiler)
-    files = sorted(FOLDER.glob("*.c"))
-    assert files
-    command = [compiler, *STRICT, "-c", *map(str, files)]
+    for name, text in fresh().items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    command = [compiler, *STRICT, "-c", *(name for name in stored() if name.endswith(".c"))]
+    assert len(command) > len(STRICT) + 2
     result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
     assert "warning" not in result.stderr
@@ -73,5 +72,5 @@ def test_text_contains_no_date_path_or_version():
 
 def test_readme_lists_every_integrator():
     readme = (FOLDER / "README.md").read_text(encoding="utf-8")
-    names = {Path(name).stem for name in stored() if "/" not in name}
+    names = {Path(name).stem for name in stored()}
     assert names == set(re.findall(r"^\| `(\w+)`", readme, re.MULTILINE))

@@ -1,0 +1,219 @@
+/* FPUT ring: Stoermer-Verlet (Lobatto IIIA-IIIB pair of two stages); see fput_ring_stoermer_verlet.h. */
+#include "fput_ring_stoermer_verlet.h"
+
+#include <float.h>
+#include <limits.h>
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
+
+#define NAME(word) fput_ring_stoermer_verlet_##word /* prefix of every exported name */
+#define STATUS(word) FPUT_RING_STOERMER_VERLET_##word
+#define ARRAYS /* the number of coordinates is known at run time */
+#define TOLERANCE 2.220446049250313e-16 /* default */
+
+enum {
+  M = 1, /* coordinates in a vector */
+  COORDINATE_ARRAYS = 1,
+  MAX_ITERATIONS = 50, /* default */
+  MOST_THREADS = 64, /* that share a step */
+  TABLES = 0,
+  FIELDS = 0,
+  SCALARS = 1, /* parameters before the fields */
+  WORK = 4, /* numbers per coordinate for steps */
+  CONTINUED = 0 /* whether predictors are extrapolated, else forces are used again */
+};
+
+#include "support/core/numbers.h"
+#include "support/core/status_codes.h"
+#include "support/arrays/arrays.h"
+#include "support/core/step.h"
+
+/* A mass. Operations: constants. */
+static void mass_0(const double *u, double t, const double *parameters, double *value)
+{
+  (void)u, (void)t, (void)parameters;
+  value[0] = 1.0;
+}
+
+/* The term. Operations: 5 *, 1 +, 1 -. */
+static void term_0(const double *u, double t, const double *parameters, double *value)
+{
+  (void)t;
+  const double w0 = u[0] - u[1];
+  const double w1 = w0 * w0;
+  value[0] = (-0.25) * (2.0 * w1 + parameters[0] * (w1 * w1));
+}
+
+/* Derivatives with respect to its coordinates. Operations: 3 *, 1 +, 2 -, 2 neg. */
+static void force_0(const double *u, double t, const double *parameters, double *value)
+{
+  (void)t;
+  const double w0 = -(u[1] - u[0]);
+  const double w1 = parameters[0] * (w0 * w0 * w0) - u[1] + u[0];
+  value[0] = -w1;
+  value[1] = w1;
+}
+
+/* mass of q[i] */
+static void add_mass_0(const problem *given, double *mass)
+{
+  const long long size_N = given->size[0];
+  const long long start_q = 0;
+  double value[1];
+  double parameters[1] = {0};
+  parameters[0] = given->parameters[0];
+  (void)given;
+  for (long long index_i = 0; index_i < size_N; index_i++) {
+    mass_0(NULL, 0.0, parameters, value);
+    mass[start_q + index_i] += value[0];
+  }
+}
+
+/* sum(i in N periodic, -beta*(q[i+1] - q[i])**4/4 - (q[i+1] - q[i])**2/2) */
+static void sum_term_0(const problem *given, const double *q, double t, compensated *total)
+{
+  const long long size_N = given->size[0];
+  const long long start_q = 0;
+  double u[2];
+  double value[1];
+  double parameters[1] = {0};
+  parameters[0] = given->parameters[0];
+  (void)given;
+  for (long long begin = 0, end; begin < size_N; begin = end) {
+    end = size_N;
+    const long long shift_i_plus_1 = around(begin, 1, size_N, &end);
+    for (long long index_i = begin; index_i < end; index_i++) {
+      u[0] = q[start_q + index_i + shift_i_plus_1];
+      u[1] = q[start_q + index_i];
+      term_0(u, t, parameters, value);
+      add_to_sum(total, value[0]);
+    }
+  }
+}
+
+/* Number of coordinates, and the numbers of entries of the fields. */
+static long long coordinates_of(const problem *given)
+{
+  const long long size_N = given->size[0];
+  (void)given;
+  return size_N;
+}
+
+static void field_lengths(const problem *given, long long *length)
+{
+  (void)given, (void)length;
+}
+
+static int compute_inverse_masses(const problem *given, double *inverse_mass)
+{
+  memset(inverse_mass, 0, sizeof(double) * (size_t)coordinates_of(given));
+  add_mass_0(given, inverse_mass);
+  return invert_masses(inverse_mass, coordinates_of(given));
+}
+
+static void state_energies(const problem *given, double t, const double *q, const double *p, const double *inverse_mass,
+    double *energies)
+{
+  compensated kinetic = {0.0, 0.0}, terms = {0.0, 0.0};
+  add_kinetic_energy(&kinetic, p, inverse_mass, coordinates_of(given));
+  sum_term_0(given, q, t, &terms);
+  (void)t, (void)q;
+  energies[0] = kinetic.sum + kinetic.rest;
+  energies[1] = -(terms.sum + terms.rest);
+  energies[2] = (kinetic.sum - terms.sum) + (kinetic.rest - terms.rest);
+}
+
+typedef double lanes, times; /* one point at a time */
+enum { CHUNK = 512 }; /* values computed before any is added */
+
+/* sum(i in N periodic, -beta*(q[i+1] - q[i])**4/4 - (q[i+1] - q[i])**2/2) */
+static void add_force_0(const problem *given, const lanes *restrict X, times t, double by, lanes *restrict F,
+    const window *here)
+{
+  const long long size_N = given->size[0];
+  const long long start_q = 0;
+  lanes u[2];
+  lanes value[2];
+  double parameters[1] = {0};
+  parameters[0] = given->parameters[0];
+  for (long long begin = here->of.first, end; begin < here->of.end; begin = end) {
+    end = here->of.end - begin > CHUNK ? begin + CHUNK : here->of.end;
+    const long long shift_i_plus_1 = around(begin, 1, size_N, &end);
+    lanes values[2][CHUNK];
+    for (long long index_i = begin; index_i < end; index_i++) {
+      u[0] = X[start_q + index_i + shift_i_plus_1];
+      u[1] = X[start_q + index_i];
+      force_0(u, t, parameters, value);
+      values[0][index_i - begin] = by * value[0];
+      values[1][index_i - begin] = by * value[1];
+    }
+    for (long long index_i = begin; index_i < end; index_i++)
+      F[start_q + index_i + shift_i_plus_1] += values[0][index_i - begin];
+    for (long long index_i = begin; index_i < end; index_i++)
+      F[start_q + index_i] += values[1][index_i - begin];
+  }
+}
+
+/* Its rounds of tasks. */
+static sharing share_force_0(const run_memory *run, const problem *given, long long n)
+{
+  const long long size_N = given->size[0];
+  (void)run;
+  (void)given;
+  (void)n;
+  return alternating_blocks(0, size_N, 1, 1);
+}
+
+/* F += by times the forces at X. */
+static void add_forces(const run_memory *run, const problem *given, const double *X, double t, double by, double *F)
+{
+  const long long n = coordinates_of(given);
+  sharing how;
+  wait_at_barrier(run);
+  how = share_force_0(run, given, n);
+  for (long long round = 0; round < how.rounds; round++) {
+    const section tasks = share_of(run, tasks_in(&how, round));
+    for (long long k = tasks.first; k < tasks.end; k++) {
+      const window here = window_of(&how, round, k);
+      add_force_0(given, X, t, by, F, &here);
+    }
+    wait_at_barrier(run);
+  }
+}
+
+enum { LEAPS = 2 };
+static const double KICK[2] = {0.5, 0.5};
+static const double DRIFT[2] = {1.0, 0.0};
+static const double KICK_ABSCISSA[2] = {0.0, 1.0};
+#define NO_ERROR_ESTIMATE
+
+#include "support/arrays/array_splitting.h"
+
+/* Returns 1 if there is enough work for more than one thread. */
+static inline int is_worth_sharing(const run_memory *run, const problem *given)
+{
+  const long long n = coordinates_of(given);
+  int shared = blocks_of(n) > 1;
+  shared |= share_force_0(run, given, n).blocks > 1;
+  (void)run;
+  return shared;
+}
+
+#include "support/arrays/array_memory.h"
+#include "support/arrays/array_run.h"
+
+#define MOMENTUM_MAPS
+enum { MAPS = 1 };
+#include "support/arrays/array_states.h"
+
+static void describe_maps(const problem *given, momentum_map *all)
+{
+  const long long size_N = given->size[0];
+  const long long start_q = 0;
+  const momentum_map each[MAPS] = {
+      {start_q, start_q + size_N, 1, 0, 0, TRANSLATION},
+  };
+  (void)given;
+  memcpy(all, each, sizeof each);
+}
