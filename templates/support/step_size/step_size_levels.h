@@ -13,7 +13,7 @@ enum {
 };
 
 #define USED_PART REAL(0.5) /* of the admissible error: predicted error of an increased step */
-#define FEW_POWERS REAL(3.5) /* growth of the error estimate over a factor of two, in powers of 2, for a curve of two
+#define FEW_POWERS REAL(4.5) /* growth of the error estimate over a factor of two, in powers of 2, for a curve of two
                               * coefficients or one */
 #define LITTLE REAL(0.5) /* of the error with which a step may be two levels larger, or three at a tolerance above
                           * round-off, where errors vary more: smaller errors are not distinguished */

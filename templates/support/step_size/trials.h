@@ -20,8 +20,9 @@
 #define FAILURES_BEFORE_NEWTON 3 /* trials of a step in which the iteration of the multipliers fails */
 #define TRIED_AGAIN (-1) /* run->avoiding of the step after those by Newton's method */
 #define GAIN_OF_NEWTON (3 * LEVELS_PER_BINADE) /* levels by which its steps are larger, so that they take less time */
-#define SHORT_MOTION REAL(0.01) /* relative to the path of a run: a change so small .. */
+#define SHORT_MOTION REAL(0.01) /* relative to the path of recent steps: a change so small .. */
 #define SHORT_BY_TOLERANCE 1000 /* .. and less than so many times the tolerance does not show errors of the forces */
+#define FORMER_PATH REAL(0.9) /* part of the path of former steps that counts with a step: that of about ten */
 #define LEAP 2 /* levels by which a step is larger than the one before, whose end is then examined */
 #define MOST_EXAMINED 8 /* trials, each up to four times shorter, until no force sets in at the end of a step */
 #define BEYOND_END REAL(0.125) /* of the step: part behind its end whose forces are examined */
@@ -806,7 +807,7 @@ static inline void accept_trial(run_memory *run, trial *now)
 #endif
   forget_motion(run, now->step.h);
   note_trial(run, now);
-  run->path += MATH(fabs)(now->step.h) * largest_velocity(run);
+  run->path = FORMER_PATH * run->path + MATH(fabs)(now->step.h) * largest_velocity(run);
   if (larger(now->error, now->apart) > run->error) {
     run->error = larger(now->error, now->apart);
     run->error_t = now->at.t;
