@@ -10,6 +10,8 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 TOO_LONG = 300
 """Seconds of work of one process, after which what does not end counts as noticed, on a busy machine, too."""
+BOTH_TIERS = ("-m", "not full")
+"""Options of pytest: the quick tier and the second."""
 OF_TESTS = tuple(f"tests/{name}" for name in ("oracles", "tools", "faults"))
 
 

@@ -25,7 +25,7 @@ from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
-from checkout import ROOT, copied, run
+from checkout import BOTH_TIERS, ROOT, copied, run
 from golden import changed_program
 from operators import Place, places
 from reach import Reach
@@ -53,11 +53,11 @@ MOST_CASES = 4
 OF_CLANG = () if shutil.which("clang") else ("-k", "not clang")
 OF_TEXT = ("--deselect", "tests/rendering/test_generated.py::test_no_file_is_outdated")
 """Notices that a text is another one, as it would of what is no fault."""
-PYTEST = (sys.executable, "-m", "pytest", "-qx", "-p", "no:cacheprovider", *OF_CLANG, *OF_TEXT)
+PYTEST = (sys.executable, "-m", "pytest", "-qx", "-p", "no:cacheprovider", *BOTH_TIERS, *OF_CLANG, *OF_TEXT)
 UNSTYLED = "def check_style(text: str) -> None:\n    pass\n"
 """In the place of tests/tools/style.py: how a fault is set is no notice of it."""
 NOTHING_RUN = 4
-"""Status of pytest where a name was cut; one more where a file has no test of the default tier."""
+"""Status of pytest where a name was cut; one more where a file has no test of the two tiers."""
 HANGS = 100
 """Seconds of work after which certificates of few cases count as hanging."""
 AROUND = 60

@@ -1,4 +1,4 @@
-"""Tests of the default tier by the lines of the package and the templates that they reach, and how long they take.
+"""Tests of both tiers by the lines of the package and the templates that they reach, and how long they take.
 
     python tests/faults/reach.py reach.json
 
@@ -20,7 +20,7 @@ import tempfile
 from difflib import SequenceMatcher
 from pathlib import Path
 
-from checkout import ROOT
+from checkout import BOTH_TIERS, ROOT
 from coverage import CoverageData
 
 FOLDER_VARIABLE = "SCVI_CODEGEN_REACH"
@@ -78,7 +78,7 @@ class Reach:
                 f"{FOLDER_VARIABLE}_TEMPLATES": str(ROOT / "templates" / "_")[:-1],
             }
             before = _spent()
-            options = ("-q", "-p", "no:cacheprovider", "--cov=scvi_codegen", "--cov-report=")
+            options = (*BOTH_TIERS, "-q", "-p", "no:cacheprovider", "--cov=scvi_codegen", "--cov-report=")
             code = subprocess.run(
                 (sys.executable, "-m", "pytest", *options, test),
                 cwd=ROOT,

@@ -224,14 +224,6 @@ class TestFolders:
             path.write_bytes(data)
         assert np.array_equal(sc.load_run("a.run").q, run.q)
 
-    def test_states_of_earlier_versions_have_no_checksum(self, kepler):
-        run = recorded(kepler, 10)
-        path = Path("a.run/states-000000.npz")
-        with np.load(path) as file:
-            arrays = dict(file)
-        np.savez(path, **arrays)
-        assert np.array_equal(sc.load_run("a.run").q, run.q)
-
     @pytest.mark.parametrize(
         ("place", "value"),
         [
