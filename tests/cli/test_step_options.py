@@ -14,7 +14,8 @@ from commands import error_of, output_of
 
 import scvi_codegen as sc
 
-BASE = "[system]\nname = 'pendulum'\ncoordinates = ['x']\nlagrangian = 'x_dot**2/2 + cos(x)'\n[method]\nmethod = 'svi'\ndegree = 4\n"
+BASE = "[system]\nname = 'pendulum'\ncoordinates = ['x']\nlagrangian = 'x_dot**2/2 + cos(x)'\n"
+BASE += "[method]\nmethod = 'svi'\ndegree = 4\n"
 STATE = "[initial]\nq = [1.0]\np = [0.25]\n"
 STEPS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "steps": ({"step": 0.125, "steps": 16}, {"h": 0.125, "steps": 16}),
