@@ -8,10 +8,6 @@ from collections.abc import Iterable
 from typing import Any
 
 PACKAGE = __name__.partition(".")[0]
-SMALL_MASS = (
-    "Give a massless body among constraints a small mass, such as 1e-9 of the others: its motion differs by about as "
-    "much, and is computed with the digits of ordinary masses"
-)
 
 
 def closest(name: str, known: Iterable[str]) -> str:

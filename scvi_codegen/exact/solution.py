@@ -71,11 +71,13 @@ class ExactMotion:
 
     @cached_property
     def _by_second(self) -> Tape:
-        """Legendre transform dL/dv, or dH/dp with the gauge energy of the system."""
+        """Legendre transform dL/dv, or dH/dp, with the gauge energy of the system."""
+        return Tape(self._regular_expressions, self.symbols)
+
+    @cached_property
+    def _regular_expressions(self) -> list[sympy.Expr]:
         gauge = getattr(self.system, "gauge", sympy.S.Zero)
-        return Tape(
-            [f + gauge.diff(x) for f, x in zip(self._momentum_expressions, self.second, strict=True)], self.symbols
-        )
+        return [f + gauge.diff(x) for f, x in zip(self._momentum_expressions, self.second, strict=True)]
 
     @cached_property
     def _curvature(self) -> list[list[sympy.Expr]]:
@@ -85,9 +87,8 @@ class ExactMotion:
 
     @cached_property
     def _mass(self) -> Tape:
-        """Mass matrix d2L/dv2, row by row."""
-        m = len(self.second)
-        return Tape([entry for row in self._curvature for entry in row[:m]], self.symbols)
+        """Mass matrix d2L/dv2 with the gauge energy, row by row."""
+        return Tape([p.diff(v) for p in self._regular_expressions for v in self.second], self.symbols)
 
     @cached_property
     def _by_position(self) -> list[sympy.Expr]:

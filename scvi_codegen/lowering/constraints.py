@@ -33,6 +33,7 @@ Chem. 16 (1995), on the iteration.
 """
 
 from collections.abc import Container, Iterable, Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import TypeAlias
 
@@ -59,6 +60,7 @@ from scvi_codegen.mechanics.constraints import (
     velocity_conditions,
 )
 from scvi_codegen.mechanics.derived_expressions import forms_of
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import StageSystem, Velocities
@@ -77,6 +79,8 @@ def rattle_of(system: MechanicalSystem, stages: StageSystem, predictor: NumberTa
     """
     forms, tables = forms_of(system), velocity_tables(stages.shape)
     if any(velocity_conditions(system)) or tables is None or not forms.has_quadratic_energy:
+        return None
+    if forms.regular_legendre is not forms.legendre:  # massless coordinates: M has no inverse
         return None
     groups = coupled_coordinates(forms.lower_mass, system.dimension)
     if max(map(len, groups)) > MOST_COUPLED_MASSES:
@@ -250,7 +254,9 @@ def _kernels(system: ArraySystem) -> Iterator[tuple[RolledKernel, RolledKernel]]
 
 def lowered_constraints(system: MechanicalSystem) -> Constraints:
     """Return the kernels of the constraints of a system."""
+    assert isinstance(system, LagrangianSystem)  # others have no constraints
     partials, rates = constraint_jacobian(system), constraint_rates(system)
+    regular = replace(system, lagrangian=system.lagrangian + system.gauge) if system.gauge != 0 else system
     return Constraints(
         formulas=system.constraint_texts,
         kernel=system_kernel(
@@ -273,7 +279,7 @@ def lowered_constraints(system: MechanicalSystem) -> Constraints:
         motion=system_kernel(
             system,
             "constrained_motion",
-            (*forms_of(system).applied_force, *rates, *time_derivatives(system, rates)),
+            (*forms_of(regular).applied_force, *rates, *time_derivatives(system, rates)),
             u=(*system.coordinates, *system.velocities),
             purpose="L_q - L_vq v - L_vt + f, then rates G v + .., and their derivatives in time at constant v.",
         ),

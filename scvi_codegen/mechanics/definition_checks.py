@@ -8,12 +8,20 @@ import numpy as np
 import sympy
 from sympy import Expr, Symbol
 
-from scvi_codegen.errors import SMALL_MASS, SystemDefinitionError, SystemDefinitionWarning, closest, warn
+from scvi_codegen.errors import SystemDefinitionError, SystemDefinitionWarning, closest, warn
 from scvi_codegen.formulas.expressions import Tape, hessian, jacobian, kinked_root, unsupported_part
 from scvi_codegen.formulas.symbols import DOT, PARTS, TIME, check_names, number, symbol
 from scvi_codegen.mechanics.constraints import constraint_jacobian, forms_of_constraints, without_coordinate
+from scvi_codegen.mechanics.constraints.massless import gauge_of_rates
 from scvi_codegen.mechanics.continuity import corner_message, jump_message, jump_of
-from scvi_codegen.mechanics.derived_expressions import forms_of, null_direction, row_rank, sample_points, singular_part
+from scvi_codegen.mechanics.derived_expressions import (
+    Entries,
+    forms_of,
+    null_direction,
+    row_rank,
+    sample_points,
+    singular_part,
+)
 from scvi_codegen.mechanics.forces import check_damping
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.precision import Number, mp
@@ -168,32 +176,46 @@ def _check_continuity(
             raise SystemDefinitionError(corner_message(f"the constraint '{name}' of '{system.name}'", *corner))
 
 
-def check_lagrangian(system: MechanicalSystem) -> None:
-    """Raise :class:`SystemDefinitionError` for an invalid or singular Lagrangian, or invalid constraints."""
+def checked_gauge(system: MechanicalSystem) -> Expr:
+    """Return the energy of the rates of constraints that L needs for a regular mass matrix, 0 if its own is regular.
+
+    Raises:
+        SystemDefinitionError: for an invalid or singular Lagrangian, or invalid constraints.
+    """
     check_definition(system, "Lagrangian", system.velocities, "a velocity")
-    free = system.lagrangian.free_symbols
-    missing = tuple(velocity for velocity in system.velocities if velocity not in free)
-    if missing:
-        raise SystemDefinitionError(_degenerate_message(system, missing, "does not occur in the Lagrangian"))
-    _check_mass_matrix(system)
     if system.constraints:
         _check_constraints(system)
-
-
-def _check_mass_matrix(system: MechanicalSystem) -> None:
-    if forms_of(system).inverse_mass:
-        return
-    others = (*system.coordinates, system.time)
-    singular = singular_part(system.lagrangian, system.velocities, others, system.constants)
+    elif forms_of(system).inverse_mass:
+        return sympy.S.Zero
+    singular = _singular_velocities(system, system.lagrangian)
     if singular is None:
-        return
-    velocities, block = singular
+        return sympy.S.Zero
+    gauge, free = gauge_of_rates(system) if system.constraints else (sympy.S.Zero, ())
+    if gauge == 0 or _singular_velocities(system, system.lagrangian + gauge):
+        raise SystemDefinitionError(_singular_message(system, *singular, free))
+    return gauge
+
+
+def _singular_velocities(system: MechanicalSystem, lagrangian: Expr) -> tuple[tuple[Symbol, ...], Entries] | None:
+    """Return :func:`singular_part` of L, with an empty block for velocities that do not occur in it."""
+    if missing := tuple(velocity for velocity in system.velocities if velocity not in lagrangian.free_symbols):
+        return missing, {}
+    return singular_part(lagrangian, system.velocities, (*system.coordinates, system.time), system.constants)
+
+
+def _singular_message(
+    system: MechanicalSystem, velocities: Sequence[Symbol], block: Entries, free: Sequence[str]
+) -> str:
+    """Return the error message for velocities with a singular block of the mass matrix.
+
+    ``free``: massless coordinates that the constraints do not determine.
+    """
     names = ", ".join(velocity.name for velocity in velocities)
     if velocities and not block:
-        raise SystemDefinitionError(_degenerate_message(system, velocities, "occurs only linearly in L"))
+        return _degenerate_message(system, velocities, free)
     subject = f"the mass matrix d2L/dv2 of '{system.name}'"
     if not block:
-        raise SystemDefinitionError(
+        return (
             f"{subject} is singular: some velocities occur only in products with too few others. "
             f"{REQUIRED} Give each coordinate its own kinetic energy"
         )
@@ -206,20 +228,17 @@ def _check_mass_matrix(system: MechanicalSystem) -> None:
     names_of_velocities = {velocity.name for velocity in velocities}
     for each in system.rotations:
         if not zero and names_of_velocities & {name + DOT for name in each.coordinates}:
-            raise SystemDefinitionError(
+            return (
                 f"the inertia of the rotation '{each.name}' of '{system.name}' is singular{values}: turning about some "
                 "axis has no kinetic energy. Give all three moments of inertia positive values, or declare the axis of "
                 "a thin rod as a unit vector instead: directions=['n']"
             )
     remedy = f"{zero} = 0 is the default: give it a positive value" if zero else REDUNDANT
-    if zero and system.constraints:
-        remedy = f"{zero} = 0 is the default. {SMALL_MASS}"
-    raise SystemDefinitionError(
-        f"{subject} in {names} is singular at every sampled point{values}{motion}. {REQUIRED} {remedy}"
-    )
+    remedy += _undetermined(free)
+    return f"{subject} in {names} is singular at every sampled point{values}{motion}. {REQUIRED} {remedy}"
 
 
-def _degenerate_message(system: MechanicalSystem, velocities: Sequence[Symbol], how: str) -> str:
+def _degenerate_message(system: MechanicalSystem, velocities: Sequence[Symbol], free: Sequence[str]) -> str:
     """Return the error message for coordinates whose velocities occur at most linearly in L."""
     names = [velocity.name[: -len(DOT)] for velocity in velocities]
     if not hessian(system.lagrangian, system.velocities):
@@ -228,6 +247,8 @@ def _degenerate_message(system: MechanicalSystem, velocities: Sequence[Symbol], 
             f"the Lagrangian of '{system.name}' is degenerate: it is at most linear in {every} (no kinetic energy). "
             f"{REQUIRED} Add the missing kinetic energy, such as m*{velocities[0]}**2/2"
         )
+    occurs = velocities[0] in system.lagrangian.free_symbols
+    how = "occurs only linearly in L" if occurs else "does not occur in the Lagrangian"
     derivative = sympy.expand(system.lagrangian.diff(symbol(names[0])))
     multiplies = derivative.has(*system.coordinates) and not derivative.has(symbol(names[0]), *system.velocities)
     hint = f"; if {names[0]} is a Lagrange multiplier, give constraints=['{system.text_of(derivative)}'] in its place"
@@ -235,8 +256,13 @@ def _degenerate_message(system: MechanicalSystem, velocities: Sequence[Symbol], 
         f"coordinate '{names[0]}' of '{system.name}' has no kinetic energy: velocity '{velocities[0]}' {how}. "
         f"{REQUIRED} Add the missing term, such as m*{velocities[0]}**2/2{hint if multiplies else ''}; if {names[0]} "
         "is a known function of time, make it an input or write the function out"
-        f"{f'. {SMALL_MASS}' if system.constraints else ''}"
+        f"{_undetermined(free)}"
     )
+
+
+def _undetermined(free: Sequence[str]) -> str:
+    """Return the remark of a message that constraints do not determine the velocities of massless coordinates."""
+    return f". The constraints leave {', '.join(free)} free where all bodies with mass rest" if free else ""
 
 
 def _check_constraints(system: MechanicalSystem) -> None:

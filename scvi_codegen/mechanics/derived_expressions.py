@@ -157,11 +157,11 @@ class Forms:
 
     @cached_property
     def regular_legendre(self) -> tuple[Expr, ...]:
-        """Legendre transform with the energy of the gauge motion, by which it is invertible: (H + gauge)_p, or L_v."""
+        """Legendre transform with the gauge energy, by which it is invertible: (H + gauge)_p, or (L + gauge)_v."""
         energy = getattr(self.system, "gauge", sympy.S.Zero)
         if energy == 0:
             return self.legendre
-        gauge = gradient_tuple(energy, self.system.auxiliaries)
+        gauge = gradient_tuple(energy, self.legendre_arguments[self.system.dimension :])
         return tuple(map(sympy.Add, self.legendre, gauge))
 
     @cached_property
@@ -169,7 +169,9 @@ class Forms:
         """Jacobian of ``regular_legendre``: L_vv, or H_pp; empty if the inverse of L_vv is known."""
         if self.inverse_mass:
             return {}
-        return jacobian(self.regular_legendre, self.system.auxiliaries) if self.system.auxiliaries else self.mass
+        if not self.system.auxiliaries and self.regular_legendre is self.momentum:
+            return self.mass
+        return jacobian(self.regular_legendre, self.legendre_arguments[self.system.dimension :])
 
     @cached_property
     def energy(self) -> Expr:

@@ -10,7 +10,7 @@ differentiation, so the computed x and m x' are the derivatives of the computed 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import replace
 
 import sympy
@@ -76,6 +76,7 @@ def in_other_coordinates(
     *,
     name: str,
     lagrangian: Callable[[Mapping[Expr, Expr]], Expr] | None = None,
+    omitted: Container[int] = (),
 ) -> LagrangianSystem:
     """Return the system with coordinates replaced by expressions in the variables, which need not be as many.
 
@@ -85,6 +86,7 @@ def in_other_coordinates(
         variables: the new coordinates, in order.
         name: name of the new system.
         lagrangian: returns the new Lagrangian from the replacements; by default they are substituted.
+        omitted: indices of the constraints that hold identically in the variables.
     """
     replaced: dict[Expr, Expr] = {**positions}
     replaced |= {symbol(q.name + DOT): rate_of(f, variables, system.time) for q, f in positions.items()}
@@ -98,7 +100,7 @@ def in_other_coordinates(
         lagrangian=lagrangian(replaced) if lagrangian else system.lagrangian.xreplace(replaced),
         clock=clock,
         forces=_projected(system, positions, replaced, variables),
-        constraints=tuple(g.xreplace(replaced) for g in system.constraints),
+        constraints=tuple(g.xreplace(replaced) for k, g in enumerate(system.constraints) if k not in omitted),
         inputs=system.inputs,
         damping=system.damping,
     )

@@ -300,13 +300,13 @@ def _in_angles(system: LagrangianSystem, rods: Sequence[Rod], reasons: Mapping[s
         positions=tuple(places.get(q, q) for q in system.coordinates),
         remaining=dict(reasons),
     )
-    eliminated = {rod.constraint for rod in rods}
     moved = in_other_coordinates(
-        replace(system, constraints=tuple(g for k, g in enumerate(system.constraints) if k not in eliminated)),
+        system,
         places,
         elimination.coordinates,
         name=f"{system.name} in angles",
         lagrangian=lambda replaced: _lagrangian(system, rods, replaced, elimination.coordinates),
+        omitted={rod.constraint for rod in rods},
     )
     return replace(moved, eliminated=elimination, indices=system.indices)
 

@@ -43,26 +43,29 @@ class LagrangianSystem(MechanicalSystem):
         dual_energy: the kinetic energy as a function of coordinates and momenta if that takes fewer operations than the
             mass matrix, which then is not computed, else 0.
         links: of a robot from a file, the geometry of its moving links, for pictures.
+        gauge: energy of the rates of constraints that determine the velocities of massless coordinates, else 0
+            (:mod:`scvi_codegen.mechanics.constraints.massless`).
         eliminated: of a system in angles of rods, the maps from and to the original system: :attr:`elimination`.
 
     Raises:
         SystemDefinitionError: naming the symbol at fault, if a name is invalid or used twice, L contains an unknown
             symbol or an unsupported function, a default value is not a finite number, a velocity does not occur in L,
-            or the mass matrix d2L/dv2 is singular at every sampled point.
+            or the mass matrix d2L/dv2 is singular at every sampled point, and constraints do not make up for it.
     """
 
     lagrangian: Expr
     reduced: Reduced | None = None
     dual_energy: Expr = field(default_factory=zero)
+    gauge: Expr = field(default_factory=zero, init=False, compare=False, repr=False)
     links: tuple[Any, ...] = field(default=(), compare=False, repr=False)
     eliminated: Any = field(default=None, compare=False, repr=False)
 
     __repr__ = summary("name", "coordinates")
 
     def __post_init__(self) -> None:
-        from scvi_codegen.mechanics.definition_checks import check_lagrangian
+        from scvi_codegen.mechanics.definition_checks import checked_gauge
 
-        check_lagrangian(self)
+        object.__setattr__(self, "gauge", checked_gauge(self))
 
     auxiliaries = ()
 

@@ -46,6 +46,17 @@ def named(values, letters="xyz"):
     return {f"{letter}_box": float(value) for letter, value in zip(letters, values, strict=True)}
 
 
+def test_massless_links_follow_the_crank_of_a_parallelogram(tmp_path):
+    hinge = '<joint name="{0}" type="hinge" axis="0 1 0"/><inertial pos="{1}" mass="{2}" diaginertia="{2} {2} {2}"/>'
+    crank = '<body name="crank">' + hinge.format("crank", "0 0 0.5", 1) + "{}</body>"
+    coupler = '<body name="coupler" pos="0 0 1">' + hinge.format("coupler", "0.5 0 0", 0) + "</body>"
+    rocker = '<body name="rocker" pos="1 0 0">' + hinge.format("rocker", "0 0 0.5", 0) + "</body>"
+    loop = '<connect body1="coupler" body2="rocker" anchor="1 0 0"/>'
+    closed = run_of(model(tmp_path, crank.format(coupler) + rocker, loop), [0.3, -0.3, 0.3], np.zeros(3))
+    alone = run_of(model(tmp_path, crank.format("")), [0.3], [0.0])
+    assert closed.q[-1] == pytest.approx(alone.q[-1, 0] * np.array([1, -1, 1]), abs=1e-13)
+
+
 @pytest.mark.rotated
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.errors import SMALL_MASS, AccuracyWarning, StateError, warn
+from scvi_codegen.errors import AccuracyWarning, StateError, warn
 from scvi_codegen.native.options import REASONS, STATUS
 from scvi_codegen.rendering.text import INPUT_PRECISION, LARGEST_VIOLATION, ROUNDING_UNITS
 from scvi_codegen.runtime.core.features import require
@@ -192,7 +192,8 @@ def _massless(stepper: Integrator, q: Array, t: float, parameters: Parameters) -
     listed = ", ".join(names[:MOST_SHOWN]) + ", .." * (len(names) > MOST_SHOWN)
     return (
         f"{listed} ha{'ve' if len(names) > 1 else 's'} no kinetic energy there, so that momenta do not determine "
-        f"velocities. {SMALL_MASS}"
+        "velocities. Where the constraints do, compile the system with a mass of 0 as the default, "
+        "system.with_parameters(m=0): then all its values are accepted"
     )
 
 
