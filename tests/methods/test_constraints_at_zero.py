@@ -123,3 +123,20 @@ def test_adaptive_steps_from_rest_do_not_resolve_rounding(tolerance):
     exact = solve_ivp(accelerations, (0.0, 0.2), np.zeros(6), method="DOP853", rtol=1e-13, atol=1e-15).y[:3, -1]
     assert len(run.t) <= 6
     assert np.abs(run.q[-1] - exact).max() < 1e-3 * (tolerance or 1e-9)
+
+
+@pytest.mark.parametrize("method", METHODS[1:], ids=str)
+@pytest.mark.parametrize("constraint", ["x**2 + (y + 1)**2 = 1", "x**2 + (y - 1)**2 = 1", "x**2 + y**2 = 2*y"])
+def test_adaptive_steps_hang_at_rest_and_nearly_so(method, constraint):
+    """Reactions cancel the weight: what rounding leaves is no force that sets in, and no error of a step."""
+    rod = lagrange("rod", ["x", "y"], "(x_dot**2 + y_dot**2)/2 - 9.81*y", constraints=[constraint])
+    stepper, bottom = sc.compile_stepper(rod, method), -2.0 if "+ 1" in constraint else 0.0
+    hanging = stepper.integrate([0.0, bottom], velocity=[0.0, 0.0], t_end=3.0)
+    assert hanging.steps <= 3
+    assert np.abs(hanging.q - [0.0, bottom]).max() <= 8 * 2**-52
+    for x, v in ((1e-9, 0.0), (0.0, 1e-9), (0.0, 1e-5)):
+        run = stepper.integrate([x, bottom + x**2 / 2], velocity=[v, 0.0], t_end=3.0, check_growth=False)
+        frequency = np.sqrt(9.81)
+        exact = x * np.cos(3 * frequency) + v / frequency * np.sin(3 * frequency)
+        assert abs(run.q[-1, 0] - exact) <= 3e-15 + 1e-9 * (x + v)
+        assert run.steps < 200

@@ -124,17 +124,41 @@ static SELDOM void add_constraint_sizes(real t, const real *q, const real *param
   }
 }
 
-/* Largest size of positions that round as the constraints do, whatever the positions are. */
+/* Displacement of the heaviest body by reactions in the last solved step of a run, h^2 |G^T lambda| / M: at rest they
+ * cancel the other forces, whose rounding remains, where positions and terms of constraints may vanish. Reactions on
+ * light bodies cancel each other, too. */
+static SELDOM real displacement_by_reactions(const step_data *step)
+{
+  const real *z = step->motion_of ? step->motion_of->memory : NULL;
+  real u[2 * M] = {0}, p[M], mass[MASS_ENTRIES], g[CONSTRAINTS], derivative[CONSTRAINT_ENTRIES], force[M] = {0};
+  real heaviest = 0;
+  if (!z)
+    return 0;
+  memcpy(u, step->q0, sizeof(real) * M);
+  legendre(u, step->t, step->parameters, p, mass);
+  constraints(u, step->t, step->parameters, g, derivative);
+  for (int e = 0; e < CONSTRAINT_ENTRIES; e++) {
+    real strongest = 0;
+    for (int b = 0; b < B; b++)
+      strongest = larger(strongest, MATH(fabs)(z[(M + CONSTRAINT_ENTRY[e][0]) * B + b]));
+    force[CONSTRAINT_ENTRY[e][1]] += MATH(fabs)(derivative[e]) * strongest;
+  }
+  for (int e = 0; e < MASS_ENTRIES; e++)
+    heaviest = larger(heaviest, MATH(fabs)(mass[e]));
+  return heaviest > 0 ? step->h * step->h * largest_of(force) / heaviest : 0;
+}
+
+/* Largest size of positions that round as the constraints and reactions do, whatever the positions are. */
 static SELDOM real size_by_constraints(const step_data *step)
 {
   real size[M] = {0};
   add_constraint_sizes(step->t, step->q0, step->parameters, saddle_in(step->scratch), size);
-  return largest_of(size);
+  return largest_of(size) + displacement_by_reactions(step);
 }
 
-/* Largest displacement that changes one constraint by the size of its terms: relative to it positions on constraints
- * are rounded, whatever they are. Unlike add_constraint_sizes it is bounded where the constraints become dependent:
- * errors grow there, and are not to be taken for rounding. */
+/* Largest displacement that changes one constraint by the size of its terms, and that by reactions: relative to it
+ * positions on constraints are rounded, whatever they are. Unlike add_constraint_sizes it is bounded where the
+ * constraints become dependent: errors grow there, and are not to be taken for rounding. */
 static SELDOM real length_of_constraints(const step_data *step)
 {
   real g[CONSTRAINTS], rounding[CONSTRAINTS], steepest[CONSTRAINTS] = {0}, derivative[CONSTRAINT_ENTRIES], length = 0;
@@ -145,7 +169,7 @@ static SELDOM real length_of_constraints(const step_data *step)
   for (int k = 0; k < CONSTRAINTS; k++)
     if (steepest[k] > 0)
       length = larger(length, rounding[k] / steepest[k]);
-  return length;
+  return length + displacement_by_reactions(step);
 }
 
 /* Sum of squares of g; infinite if g is not finite. */

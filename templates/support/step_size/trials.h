@@ -606,13 +606,14 @@ static inline int needs_momenta(run_memory *run, const trial *now)
 /* Returns 1 if a force that is nearly constant along a step is another one at its end. Estimates see forces only at the
  * points of a step: after a free flight steps grow, and a wall, or a force that sets in, may lie between the last point
  * of one step and the first of the next. Momenta of three parts give mean forces: of both halves, and of a short step
- * from the end. */
+ * from the end. A force that displaces the short step by no more than rounding is none: at rest on constraints all are
+ * what rounding leaves of forces that cancel. */
 static SELDOM int force_sets_in(const trial *now, const solver_options *options)
 {
   const step_data *step = &now->step;
   const section own = own_part(step);
   step_data part = *step;
-  real least, largest;
+  real least, largest, rounded;
   sums all;
   int status;
   VECTORS(nothing, 1, step);
@@ -647,13 +648,17 @@ static SELDOM int force_sets_in(const trial *now, const solver_options *options)
     return 0;
   least = largest_change(step, p, now->dp, &largest);
   least = NO_FORCE * (least + largest);
+  rounded = size_by_constraints(step);
   begin_blocks(&all, step);
   EACH_BLOCK (all) {
     int sets_in = 0;
     for (long long i = all.here.first; i < all.here.end; i++) {
       const real early = 2 * changes[i], late = 2 * (now->dp[i] - changes[i]), beyond = first[i] / BEYOND_END;
       const real force = larger(MATH(fabs)(early), MATH(fabs)(late)), change = MATH(fabs)(beyond - late);
+      const real bend = 4 * (now->dq[i] - 2 * halves[i]); /* h^2 a, by a constant acceleration a */
+      const real flight = BEYOND_END * (now->dq[i] + bend * (1 + BEYOND_END) / 2);
       sets_in |= MATH(fabs)(early - late) <= EQUAL_FORCES * force && change > OTHER_FORCE * force &&
+          MATH(fabs)(whole[i] - flight) > ROUNDING_OF_HALVES * (MATH(fabs)(q[i]) + rounded) &&
           change > SPURIOUS * (MATH(fabs)(p[i]) + MATH(fabs)(now->dp[i])) + least;
     }
     add_block(&all, sets_in, 0);
