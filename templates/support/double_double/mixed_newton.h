@@ -9,7 +9,7 @@
  * newton.h, evaluate_pairs, the rows in pairs. */
 
 #define REFINED 1e-34 /* change by the last correction, relative to the state: momenta are those before it */
-#define REFINED_ROUNDING 1e-27 /* changes that may be rounding errors, if they stop decreasing */
+#define REFINED_ROUNDING 1e-24 /* changes that may be rounding errors, if they stop decreasing */
 #define MOST_REFINEMENTS 8
 
 /* Solves for a correction of the unknowns and adds it; returns its size relative to the state. */
@@ -51,8 +51,8 @@ static inline int variable_pairs(const step_data *step, const pair_equations *at
 }
 #endif
 
-/* Replaces the increments of a step, solved in double, by those in two words; `memory` has its unknowns. The workspace
- * then has the factors of the Jacobian at these. On failure they are undefined. */
+/* Replaces the increments of a step, solved in double, by those in two words, and its unknowns, which `memory` has. The
+ * workspace then has the factors of the Jacobian at the former ones. On failure they are undefined. */
 static int refine_unknowns(const step_data *step, double *memory, double t_low, double h_low, double *dq, double *dp,
     double *passed, double *workspace)
 {
@@ -109,6 +109,8 @@ static int refine_unknowns(const step_data *step, double *memory, double t_low, 
       last = 0.0;
     }
   }
+  for (int k = 0; k < N; k++)
+    memory[k] = at.z[k].high;
 #ifdef TIME_TRANSFORMATION
   const dd duration = duration_of_pairs(&at);
   passed[0] = duration.high, passed[1] = duration.low;

@@ -49,6 +49,8 @@ step_control NAME(default_step_control)(void)
 
 #ifdef NEWTON_ALONE
 #define HOT static
+#define AMPLIFIED 1e-14 /* last update of Newton's method beyond which the unknowns have too few digits for the estimate \
+                         * of an error in two words */
 #define SHORT_STEPS_FAIL 0
 #define LEVELS_INSIDE 0 /* no predictor from a rejected step */
 
@@ -66,6 +68,15 @@ static real attempt(run_memory *run, step_data *step, const solver_data *data, i
   *guess = !afresh && run->change == 0 && run->guess > 0;
   if (solve(step, data, run->memory, guess, dq, dp, options, report, step->scratch + SCRATCH) != OK)
     return INFINITY;
+#ifdef DOUBLE_DOUBLE
+  step->noise = report->change > AMPLIFIED ? report->change : 0;
+  if (step->noise > 0) {
+    real passed[2], both[2 * M], changes[2 * M];
+    memcpy(both, dq, sizeof(real) * M), memcpy(changes, dp, sizeof(real) * M);
+    if (refine_increments(step, run->memory, run->t_low, 0, both, changes, passed, step->scratch + SCRATCH) != OK)
+      return INFINITY;
+  }
+#endif
   *guess = 1;
   return stage_error(step, run->memory, dq, EACH, limits->decay, least, limits->most);
 }
