@@ -33,6 +33,22 @@ static inline double undecided(const progress *now, double level)
   return now->last > level;
 }
 
+/* 1 if the stiffness is measured in iteration k: in the third, and in some of many, in which the fastest vibrations
+ * come to dominate the changes. Of fewer iterations the last one shows it. */
+static inline double measures_stiffness(const progress *now, int k)
+{
+  return (k == 2 || k % 8 == 5) && now->last > NO_REMAINDER;
+}
+
+/* Returns 1 if the remainder may count beside rounding errors: that of the coefficients times the rate, or the last
+ * change times the square of the rate, by the last changes and, since rates vary, by the two iterations before. */
+static inline int has_remainder(const progress *now, const solver_options *options)
+{
+  const double last = now->last, before = now->before;
+  const double least = NEGLIGIBLE_REMAINDER * options->tolerance * options->tolerance;
+  return last > SLOWLY * before || last * last * last > least * before * before || last * last > least * now->earlier;
+}
+
 static inline int any_positive(double x)
 {
   return x > 0.0;

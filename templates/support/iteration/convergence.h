@@ -24,6 +24,9 @@
 #define FIRST_ITERATIONS 4 /* but not among the first ones, which need not contract */
 #define LEAST_SQUARED 1e-100 /* squares of smaller numbers, or of small parts of them, may be subnormal */
 #define LARGEST_SQUARED 1e100 /* squares of larger numbers, or sums of many, may overflow */
+#define NO_REMAINDER 1e-24 /* after changes below 1e-12 of the state, the remainder is far below rounding */
+#define SLOWLY 1e-3 /* remainders of rounding errors count if the iteration gains less than a factor of 30 */
+#define NEGLIGIBLE_REMAINDER 3e-4 /* 1/60 of the tolerance */
 #define GOOD_GUESS 1e-6 /* after a prediction with an error below 1e-3 of the state, the next one uses two steps */
 
 /* Part of |q| in the size of a coordinate, so that the tolerance of the iteration times this part is at least the

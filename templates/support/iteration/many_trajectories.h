@@ -118,6 +118,19 @@ static inline number undecided(const progress *now, double level)
   return status.all;
 }
 
+/* 1 where the stiffness is measured in iteration k: in the second, and in some of many. */
+static inline number measures_stiffness(const progress *now, int k)
+{
+  return number_of(k == 1 || k % 8 == 5) * undecided(now, NO_REMAINDER);
+}
+
+/* The last iteration does not show the stiffness: the points of trajectories that converged before others are lost. */
+static inline int has_remainder(const progress *now, const solver_options *options)
+{
+  (void)now, (void)options;
+  return 0;
+}
+
 static inline int any_positive(number x)
 {
   const lane_view view = {x};

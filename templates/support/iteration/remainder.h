@@ -7,20 +7,12 @@
  * products of the end weights b with R are b^T R = sum_k lambda^k r_k / det, with tables r_k of the method. Without it
  * the remainder, although below rounding, has the same sign in every period of an oscillation, and energies drift.
  * Requires: points.h or trajectories.h, the tables REMAINDER_*, LARGEST_STIFFNESS. */
-#define NO_REMAINDER 1e-24 /* squared: after changes below 1e-12 of the state, the remainder is far below rounding */
 #define FIRST_ORDER 0.01 /* part of the largest lambda below which R = J is as good */
 
 /* b^T R at the points, for the end weights of positions and momenta. */
 typedef struct {
   lanes position[GROUPS], momentum[GROUPS];
 } remainder_weights;
-
-/* Returns 1 if lambda is measured in iteration k: in the second, and in some of many, in which the fastest vibrations
- * come to dominate the changes. */
-static inline int measures_stiffness(int k)
-{
-  return k == 1 || k % 8 == 5;
-}
 
 /* lambda = -sum w h^2/m dF dX / sum w dX^2 for weights w, bounded so that the remainder exists; 0 without a change. */
 static inline number find_stiffness(number work, number size)

@@ -82,9 +82,9 @@ typedef struct {
   lanes *former;
   remainder_weights *remainder;
 #ifdef ARRAYS
-  double *second; /* last points of the second iterate, then the forces there */
+  double *earlier; /* last points of an earlier iterate, then the forces there */
 #else
-  lanes *second; /* second iterate, whose forces are in `former` */
+  lanes *earlier; /* an earlier iterate, whose forces are in `former` */
   drift_words *drifts;
   lanes *base; /* points of the straight line */
 #endif
@@ -389,13 +389,13 @@ static inline void measure_points(const step_points *w, const solver_options *op
   }
 }
 
-/* Stores the second iterate: of the points the last one, as derivatives of forces act at each point alone. */
+/* Stores the present iterate: of the points the last one, as derivatives of forces act at each point alone. */
 static inline void keep_iterate(const step_points *w)
 {
   const section own = own_part(w->step);
   for (long long i = own.first; i < own.end; i++) {
-    w->second[i] = at_point(&w->X[i], OF_EACH * w->n, KEPT - 1);
-    w->second[w->n + i] = at_point(&w->F[i], w->n, KEPT - 1);
+    w->earlier[i] = at_point(&w->X[i], OF_EACH * w->n, KEPT - 1);
+    w->earlier[w->n + i] = at_point(&w->F[i], w->n, KEPT - 1);
   }
 }
 
@@ -407,9 +407,9 @@ static inline double measure_stiffness(const step_points *w)
   EACH_BLOCK (all) {
     double work = 0.0, size = 0.0;
     for (long long i = all.here.first; i < all.here.end; i++) {
-      const double moved = at_point(&w->X[i], OF_EACH * w->n, KEPT - 1) - w->second[i];
+      const double moved = at_point(&w->X[i], OF_EACH * w->n, KEPT - 1) - w->earlier[i];
       const double weighted = moved * w->inverse_size[i] * w->inverse_size[i];
-      work += weighted * unit_of(w, i) * (at_point(&w->F[i], w->n, KEPT - 1) - w->second[w->n + i]);
+      work += weighted * unit_of(w, i) * (at_point(&w->F[i], w->n, KEPT - 1) - w->earlier[w->n + i]);
       size += weighted * moved;
     }
     add_block(&all, work, size);
@@ -472,10 +472,10 @@ PASS void measure_points(const step_points *w, const solver_options *options)
   invert_sizes(options, 1.0, w->inverse_size);
 }
 
-/* Stores the second iterate. */
+/* Stores the present iterate. */
 PASS void keep_iterate(const step_points *w)
 {
-  memcpy(w->second, w->X, sizeof(coordinates) * GROUPS);
+  memcpy(w->earlier, w->X, sizeof(coordinates) * GROUPS);
   memcpy(w->former, w->F, sizeof(coordinates) * GROUPS);
 }
 
@@ -486,7 +486,7 @@ PASS number measure_stiffness(const step_points *w)
   for (int i = 0; i < M; i++) {
     const number unit = unit_of(w, i), inverse_square = w->inverse_size[i] * w->inverse_size[i];
     for (int g = 0; g < GROUPS; g++) {
-      const lanes moved = w->X[g * M + i] - w->second[g * M + i], weighted = inverse_square * moved;
+      const lanes moved = w->X[g * M + i] - w->earlier[g * M + i], weighted = inverse_square * moved;
       work += weighted * (unit * (w->F[g * M + i] - w->former[g * M + i]));
       size += weighted * moved;
     }
@@ -556,15 +556,14 @@ HOT int iterate(const step_data *step, const iteration_data *data, history past,
   const section own = own_part(step);
   step_points w = points_in(step, data, past);
   w.former = VELOCITIES ? NULL : past.before;
-  w.second = dq;
+  w.earlier = dq;
 #else
   const section own = {0, M};
-  coordinates X[GROUPS], base[GROUPS], former[GROUPS], second[GROUPS];
+  coordinates X[GROUPS], base[GROUPS], former[GROUPS], earlier[GROUPS];
   coordinates local[GROUPS], *F = kept(past, local);
   drift_words drifts[M];
   number inverse_size[M];
-  memset(second, 0, sizeof second), memset(former, 0, sizeof former);
-  step_points w = {step, data, X[0], F[0], M, inverse_size, implicit || rough ? NULL : former[0], NULL, second[0],
+  step_points w = {step, data, X[0], F[0], M, inverse_size, implicit || rough ? NULL : former[0], NULL, earlier[0],
       drifts, base[0]};
 #ifndef POINTS
   coordinates stored[S];
@@ -573,20 +572,21 @@ HOT int iterate(const step_data *step, const iteration_data *data, history past,
   remainder_weights remainder;
   number stiffness = number_of(0.0);
   progress now = before_iterations();
-  int status;
+  int measures, status;
   w.remainder = &remainder;
   first_points(&w, past, *steps);
   forces(&w);
   measure_points(&w, options);
   for (int k = 0; needs_iteration(&now); k++) {
-    const number measures = number_of(w.former && measures_stiffness(k)) * undecided(&now, NO_REMAINDER);
+    const number measured = number_of(w.former != NULL) * measures_stiffness(&now, k);
     number change;
-    if (any_positive(measures))
+    measures = any_positive(measured);
+    if (measures)
       keep_iterate(&w);
     change = implicit ? correct_points(&w) : improve(&w);
     forces(&w);
-    if (any_positive(measures))
-      stiffness += measures * (measure_stiffness(&w) - stiffness);
+    if (measures)
+      stiffness += measured * (measure_stiffness(&w) - stiffness);
     take_change(&now, change, options, k, report);
 #ifndef ARRAYS
     if (is_stagnant(&now, options, k))
@@ -605,17 +605,15 @@ HOT int iterate(const step_data *step, const iteration_data *data, history past,
   status = outcome(&now, report);
   if (status != OK)
     return status;
-#ifdef ARRAYS
-  if (stiffness == 0.0)
+  measures = !any_positive(magnitude(stiffness));
+  if (measures && !has_remainder(&now, options))
     w.former = NULL;
-#endif
-  if (w.former)
-    weigh_remainder(stiffness, step->h, &remainder);
-  else
-    memset(&remainder, 0, sizeof remainder);
+  measures = measures && w.former;
   if (implicit)
     refine_forces(&w);
   else {
+    if (measures)
+      keep_iterate(&w);
     if (rough)
       improve(&w);
     else
@@ -624,6 +622,10 @@ HOT int iterate(const step_data *step, const iteration_data *data, history past,
     improve_velocities(&w, own);
 #endif
     forces(&w);
+    if (measures)
+      stiffness = measure_stiffness(&w);
+    if (w.former)
+      weigh_remainder(stiffness, step->h, &remainder);
   }
   if (rough)
     find_rough_increments(&w, dq, dp);
