@@ -1076,3 +1076,19 @@ def test_times_have_two_words_or_are_refused() -> None:
             stepper.integrate([0.0], [0.0], **times)
         with pytest.raises(StateError, match="must be doubles"):
             stepper.integrate_ensemble([[0.0]], [[0.0]], **times)
+
+
+def test_outputs_have_both_words_or_are_refused():
+    body = lagrange("body", "x", "(omega_1**2 + 2*omega_2**2 + 3*omega_3**2 + x_dot**2)/2", rotations={"R": "omega"})
+    stepper = sc.compile_stepper(body, "svi:3", precision="double-double")
+    start, moving = {"R": np.eye(3), "x": 1.0}, {"omega": [0.3, 0.8, 0.5], "x": 0.1}
+    run = stepper.integrate(start, velocity=moving, h=0.125, steps=8)
+    for name in ("x", "R_w", "q", "p", "velocity", "energy"):
+        values = run.mp(name)
+        assert max(abs(x - float(x)) for x in values[1:].ravel()) > 0.0, name
+    for name in ("R", "omega"):
+        with pytest.raises(sc.StateError, match=f"'{name}' has one word"):
+            run.mp(name)
+    for export in (run.to_dataframe, run.to_xarray):
+        with pytest.raises(sc.StateError, match="would lose the low words"):
+            export()

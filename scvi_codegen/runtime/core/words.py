@@ -227,9 +227,11 @@ def block_of(values: Any) -> Array:
 
 
 def check_keeps_words(words: int, path: Any) -> None:
-    """Raise :class:`StateError` for a file of a format that has no low words."""
+    """Raise :class:`StateError` for a file, or another format, that has no low words."""
     if words > 1 and Path(path).suffix.lower() != ".npz":
-        raise StateError(f"{path} would lose the low words of double-double arithmetic: give a file NAME.npz")
+        raise StateError(
+            f"{path} would lose the low words of double-double arithmetic: save a file NAME.npz, or use mp"
+        )
 
 
 def as_mpmath(values: Any) -> Any:
@@ -358,8 +360,14 @@ class TwoWords:
             name: ``"t"``, ``"q"``, ``"p"``, ``"parameters"``, ``"energy"``, ``"momentum_maps"``, or a coordinate.
 
         Raises:
-            StateError: for an unknown name.
+            StateError: for an unknown name, or a quantity that is computed in one word of two: rotations, angular
+                velocities and other coordinates than those of the states.
         """
         if name in ("energy", "momentum_maps"):
             return as_mpmath(getattr(self, name)())
-        return as_mpmath(getattr(self, name) if name in ("t", "q", "p", "parameters") else self[name])  # type: ignore[index]
+        if name in ("t", "q", "p", "parameters"):
+            return as_mpmath(getattr(self, name))
+        values = self[name]  # type: ignore[index]
+        if isinstance(self.q, Words) and not isinstance(values, Words):
+            raise StateError(f"'{name}' has one word of double-double arithmetic: compute it from mp('q') and mp('p')")
+        return as_mpmath(values)

@@ -288,10 +288,11 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
             units: as of :meth:`Trajectory.to_xarray`.
 
         Raises:
-            StateError: if units name an unknown variable.
+            StateError: if units name an unknown variable, or for states of two words.
             MissingLibraryError: if xarray is not installed (extra ``data``).
         """
         self._check_common_times()
+        check_keeps_words(self.stepper.interface.words, "a dataset")
         return to_dataset(self._labelled(checked_units(units)))
 
     def _check_common_times(self) -> None:

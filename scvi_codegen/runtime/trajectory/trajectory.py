@@ -476,17 +476,20 @@ class Trajectory(TrajectoryDerivatives, AttitudeHistory, Confirmed, Pictured, Tw
                 follow.
 
         Raises:
-            StateError: if units name an unknown variable.
+            StateError: if units name an unknown variable, or for states of two words.
             MissingLibraryError: if xarray is not installed (extra ``data``).
         """
+        check_keeps_words(self.stepper.interface.words, "a dataset")
         return to_dataset(self.states(units).labelled())
 
     def to_dataframe(self) -> pandas.DataFrame:
         """Return one row per state, indexed by time, with the columns of a CSV file (:meth:`save`).
 
         Raises:
+            StateError: for states of two words, of which it has one.
             MissingLibraryError: if pandas is not installed (extra ``data``).
         """
+        check_keeps_words(self.stepper.interface.words, "a data frame")
         return to_dataframe(self.states())
 
 
