@@ -45,8 +45,8 @@ static real error_beyond(const step_data *step, const real *z, const stage_sizes
   return least;
 }
 
-/* The same. Constraints hold to the rounding of positions and of their own terms, however short the step is, and to that
- * of reactions. The latter two are determined where the error exceeds `doubtful` without them, `least` or more. */
+/* The same. Constraints hold to the rounding of positions and of their own terms, however short the step is, and to
+ * that of reactions. The latter two are determined where the error exceeds `doubtful` without them, `least` or more. */
 static real stage_error(const step_data *step, const real *z, const real *dq, real share, real decay, real least,
     real doubtful)
 {

@@ -49,8 +49,7 @@ step_control NAME(default_step_control)(void)
 
 #ifdef NEWTON_ALONE
 #define HOT static
-#define AMPLIFIED 1e-14 /* last update of Newton's method beyond which the unknowns have too few digits for the estimate \
-                         * of an error in two words */
+#define AMPLIFIED 1e-14 /* last update beyond which unknowns do not resolve errors in two words */
 #define SHORT_STEPS_FAIL 0
 #define LEVELS_INSIDE 0 /* no predictor from a rejected step */
 
