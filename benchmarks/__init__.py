@@ -37,8 +37,8 @@ from benchmarks.sections import BUILDERS
 from benchmarks.settings import Plan, ReportActivity
 from benchmarks.steps import run_builds, run_derivatives, run_newton, run_scaling, run_threads, run_transforms
 from benchmarks.tables import run_drift, run_first_steps
-from scvi_codegen.errors import ScviCodegenError, StateError, closest
-from scvi_codegen.files.atomic import write_text
+from scvi_codegen.common.atomic import write_text
+from scvi_codegen.common.errors import ScviCodegenError, StateError, closest
 
 __all__ = ["CASES", "PEERS", "SCHEMA", "SECTIONS", "Plan", "Report", "benchmark"]
 
@@ -134,7 +134,7 @@ def benchmark(
     """
     sections = tuple(section for name in names for section in _sections(name))
     if plot_path is not None:
-        from scvi_codegen.pictures.canvas import check_plot_path
+        from scvi_codegen.interfaces.pictures.canvas import check_plot_path
 
         check_plot_path(plot_path)
     for report in _reports(tuple(dict.fromkeys(sections or SECTIONS)), plan or Plan(), report_activity, show):

@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 
 from benchmarks import PEERS, Plan, benchmark
-from scvi_codegen.cli.command_group import (
+from scvi_codegen.interfaces.cli.command_group import (
     INTERRUPTED,
     CommandFailure,
     check_writable,

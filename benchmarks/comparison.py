@@ -17,8 +17,8 @@ from benchmarks.cases.unforced import STATES, Array, Case
 from benchmarks.contenders.peers import PEERS
 from benchmarks.report import CaseResult, Contender, Measurement
 from benchmarks.settings import Plan, ReportActivity
-from scvi_codegen.errors import ScviCodegenError
-from scvi_codegen.runtime.accuracy.warning_switch import without_accuracy_warnings
+from scvi_codegen.common.errors import ScviCodegenError
+from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

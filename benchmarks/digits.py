@@ -13,9 +13,9 @@ from benchmarks.cases.unforced import Case, Vector, case
 from benchmarks.comparison import measure
 from benchmarks.report import LEAST, Contender, Measurement, ResultTable, common_error, time_at
 from benchmarks.settings import Plan, ReportActivity
-from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.runtime.accuracy.warning_switch import without_accuracy_warnings
-from scvi_codegen.runtime.core.words import as_mpmath
+from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
+from scvi_codegen.runs.compiler import compile_stepper
+from scvi_codegen.runs.states.words import as_mpmath
 
 SPANS = {
     "planar-pendulum": (1536.0, 384),

@@ -6,8 +6,8 @@ import platform
 from collections.abc import Iterable
 from pathlib import Path
 
-from scvi_codegen.native.building import TUNED_FLAGS
-from scvi_codegen.native.compilers import compiler_title
+from scvi_codegen.codegen.native.building import TUNED_FLAGS
+from scvi_codegen.codegen.native.compilers import compiler_title
 from scvi_codegen.version import __version__
 
 PACKAGES = ("numpy", "scipy", "sympy", "heyoka", "rebound", "CyRK", "numba", "pydy", "mujoco", "pin", "py-pde")

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from benchmarks.contenders.peers import PEERS
-from scvi_codegen.errors import StateError
+from scvi_codegen.common.errors import StateError
 from scvi_codegen.methods.method import Method
 
 Result = TypeVar("Result")

@@ -19,10 +19,10 @@ from benchmarks.cases.unforced import Array, Case, case
 from benchmarks.contenders.ours import momenta_of
 from benchmarks.report import ResultTable
 from benchmarks.settings import Plan, ReportActivity
-from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import StepFailedError
+from scvi_codegen.codegen.native.building import PORTABLE_FLAGS, TUNED_FLAGS
+from scvi_codegen.common.errors import StepFailedError
 from scvi_codegen.fields.system import FieldSystem
-from scvi_codegen.native.building import PORTABLE_FLAGS, TUNED_FLAGS
+from scvi_codegen.runs.compiler import compile_stepper
 
 Start = tuple[Array, Array]
 """Initial positions and velocities."""

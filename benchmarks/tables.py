@@ -22,9 +22,9 @@ from benchmarks.contenders.ours import momenta_of
 from benchmarks.contenders.taylor import heyoka_states
 from benchmarks.report import OURS, ResultTable
 from benchmarks.settings import Plan, ReportActivity, timed
-from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.native import building
-from scvi_codegen.runtime.accuracy.warning_switch import without_accuracy_warnings
+from scvi_codegen.codegen.native import building
+from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
+from scvi_codegen.runs.compiler import compile_stepper
 
 DRIFTS = {"kepler:0.2": (0.5, 0.35, 0.2), "kepler:0.5": (0.2, 0.15, 0.1)}
 """Three step sizes for each case, from the largest without a visible truncation error down."""

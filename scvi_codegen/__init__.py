@@ -9,6 +9,11 @@
     >>> bool(abs(run.energy() - run.energy()[0]).max() < 1e-9)
     True
 
+The rooms, in the order of the way from L to a run: ``common`` (errors, checks, files), ``systems`` (what
+the user states), ``methods`` (tables, discretisations), ``codegen`` (intermediate form, C), ``fields`` (densities on
+meshes), ``runs`` (states, steps, results), ``analysis`` (chaos, orbits, paths, estimation), ``interfaces``
+(command line, model files, packages, pictures) and ``paper`` (its reproduction). Imports go to the left.
+
 Names are imported when they are first used, so code that only steps never imports SymPy.
 """
 

@@ -17,8 +17,8 @@ from samples import UNOPTIMISED, Sample, compile_quickly, sample_named, stepper_
 from tiers import QUICK, SECOND, UNOPTIMISED_TIERS, long_ones_first, mark_later_tiers, mark_the_rest_full
 
 from scvi_codegen import LagrangianSystem, Stepper
+from scvi_codegen.codegen.native.building import FLAGS_VARIABLE
 from scvi_codegen.methods.method import Method
-from scvi_codegen.native.building import FLAGS_VARIABLE
 
 logging.getLogger("scvi_codegen").setLevel(logging.WARNING)  # slow compilations are not announced on stderr
 sys.addaudithook(programs.audit)

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from benchmarks.cases.unforced import Case, Vector, double_pendulum, hand_solved, scaled
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.systems.lagrangian import LagrangianSystem
 
 PARAMETERS = dict.fromkeys(("m1", "m2", "l1", "l2", "g"), 1.0) | {"c": 0.02, "F": 0.1, "w": 0.7}
 """Units; friction of a joint; amplitude and frequency of the torque of the motor."""

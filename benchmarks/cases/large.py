@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from benchmarks.cases.unforced import SYSTEMS, Array, Arrays, Bodies, Case
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.systems.lagrangian import LagrangianSystem
 
 SEED = 20261121
 SPACING = 0.98 * 2 ** (2 / 3)

@@ -22,8 +22,8 @@ from benchmarks.cases.unforced import (
     henon_heiles,
     scaled,
 )
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.models.problems import problem
+from scvi_codegen.interfaces.models.problems import problem
+from scvi_codegen.systems.lagrangian import LagrangianSystem
 
 EPHEMERIS: Mapping[str, Any] = SYSTEMS["published"]["outer-solar-system"]
 BLACK_HOLE: Mapping[str, Any] = SYSTEMS["published"]["black-hole"]

@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 
 from benchmarks.cases.unforced import Array, Case
 from benchmarks.contenders.tracing import rates_text
-from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import StateError
-from scvi_codegen.files.atomic import write_atomically
+from scvi_codegen.codegen.native import building
+from scvi_codegen.common.atomic import write_atomically
+from scvi_codegen.common.errors import StateError
 from scvi_codegen.methods.galerkin import SVI
-from scvi_codegen.native import building
+from scvi_codegen.runs.compiler import compile_stepper
 
 Extended = NDArray[np.longdouble]
 Field = Callable[[Extended, Extended], Extended]

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.cases.unforced import Array, Case
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.systems.lagrangian import LagrangianSystem
 
 CHAINS = (2, 5, 10, 30)
 """Numbers of hinges."""

@@ -14,9 +14,9 @@ import numpy as np
 from benchmarks.cases.unforced import Array, Case, Vector, hand_solved, scaled
 from benchmarks.contenders.ours import ADAPTIVE_TOLERANCES, compiled
 from benchmarks.report import OURS, Contender
-from scvi_codegen.mechanics.elimination import eliminate_constraints
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods.galerkin import SVI
+from scvi_codegen.systems.elimination import eliminate_constraints
+from scvi_codegen.systems.lagrangian import LagrangianSystem
 
 RODS = (1, 2, 5)
 SPANS = {1: 100.0, 2: 50.0, 5: 20.0}

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.cases.unforced import STATES, SYSTEMS, Case, Formulation, Vector, scaled
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.systems.lagrangian import LagrangianSystem
 
 BODIES, FEW_BODIES = 1000, 24
 SEED = 20261123

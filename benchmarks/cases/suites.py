@@ -33,8 +33,8 @@ from benchmarks.cases.unforced import (
     henon_heiles,
     pendulum,
 )
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.models.problems import problem
+from scvi_codegen.interfaces.models.problems import problem
+from scvi_codegen.systems.lagrangian import LagrangianSystem
 
 SUITES: Mapping[str, Any] = SYSTEMS["suites"]
 

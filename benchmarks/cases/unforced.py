@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.errors import SystemDefinitionError, closest
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.models.problems import problem
+from scvi_codegen.common.errors import SystemDefinitionError, closest
+from scvi_codegen.interfaces.models.problems import problem
+from scvi_codegen.systems.lagrangian import LagrangianSystem
+from scvi_codegen.systems.system import MechanicalSystem
 
 Array = NDArray[np.float64]
 Vector = Sequence[Any]

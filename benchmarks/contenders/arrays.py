@@ -8,10 +8,10 @@ import numpy as np
 
 from benchmarks.cases.unforced import Array, Case
 from benchmarks.report import Contender
+from scvi_codegen.codegen.native import building
+from scvi_codegen.codegen.rendering.source import Source
 from scvi_codegen.methods.composition import Composition
 from scvi_codegen.methods.leapfrog_stages import kicks_and_drifts
-from scvi_codegen.native import building
-from scvi_codegen.rendering.source import Source
 
 DECLARATIONS = (
     "void leapfrog(int is_field, double *q, double *v, double *work, long n, double strength, double h, long steps, "

@@ -19,9 +19,9 @@ from mpmath import mp
 from benchmarks.cases.unforced import Array, Case, Formulation
 from benchmarks.contenders.tracing import assignments
 from benchmarks.report import Contender
-from scvi_codegen.native import building
-from scvi_codegen.rendering.source import Source
-from scvi_codegen.tables.tableau import gauss
+from scvi_codegen.codegen.native import building
+from scvi_codegen.codegen.rendering.source import Source
+from scvi_codegen.methods.tables.tableau import gauss
 
 PORT = Path(__file__).parents[1] / "irkgl16.c"
 DECLARATIONS = (

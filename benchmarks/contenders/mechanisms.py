@@ -17,7 +17,7 @@ from sympy.physics.mechanics.models import n_link_pendulum_on_cart
 from benchmarks.cases.unforced import Array, Case
 from benchmarks.contenders.dop853 import LOOSE, dop853, start_of
 from benchmarks.report import Contender
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.systems.lagrangian import LagrangianSystem
 
 LINKS = (2, 5, 10, 20)
 ANGLE = 0.3

@@ -17,14 +17,14 @@ import numpy as np
 from benchmarks.cases.unforced import Array, Case
 from benchmarks.report import OURS, Contender
 from benchmarks.settings import set_variable
-from scvi_codegen.advice.advice import advise
-from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import StateError
+from scvi_codegen.analysis.advice.advice import advise
+from scvi_codegen.codegen.native import building
+from scvi_codegen.common.errors import StateError
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.method import Method
-from scvi_codegen.native import building
-from scvi_codegen.runtime.core.stepper import Stepper
-from scvi_codegen.runtime.rotations.states import homogeneous_state, members_of
+from scvi_codegen.runs.compiler import compile_stepper
+from scvi_codegen.runs.states.rotations import homogeneous_state, members_of
+from scvi_codegen.runs.stepper import Stepper
 
 TOLERANCES = (1e-4, 1e-5, 1e-6, 1e-8, 1e-9, 1e-10, 3e-11, 1e-11, 3e-12, 1e-12, 5e-13, 3e-13, 2e-13, 1e-13)
 """Tolerances for which a step size is recommended; the errors reached are measured."""

@@ -24,7 +24,7 @@ import numpy as np
 
 from benchmarks.cases.unforced import STATES, Array, Case, Formulation
 from benchmarks.report import Contender
-from scvi_codegen.mechanics.derived_expressions import forms_of
+from scvi_codegen.systems.derived_expressions import forms_of
 
 TOLERANCES = (0.0, 1e-15, 1e-14, 1e-13, 1e-12, 1e-11, 1e-10, 1e-8)
 """Tolerances; 0 is heyoka's default, 2^-52."""

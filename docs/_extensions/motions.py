@@ -34,7 +34,9 @@ MADE_OF = b"".join(
     + [
         path
         for name in ("pages", "pictures")
-        for path in sorted((HERE.parents[1] / "scvi_codegen" / name).glob("*.py"))
+        for path in sorted(
+            (HERE.parents[1] / "scvi_codegen" / "interfaces" / name).glob("*.py")
+        )
     ]
 )
 """Sources of a page besides its model: a page is written again when they change."""

@@ -19,15 +19,15 @@ import numpy as np
 import sympy
 from sympy import Add, Expr, Float, Rational, Symbol
 
-from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.fields.axes import Axis, Cells, fixed_place, rational, same, span
 from scvi_codegen.fields.density import Density, place_text
 from scvi_codegen.fields.mesh import Mesh, MeshSystem
-from scvi_codegen.formulas.array_statements import ArrayForce, array_text
-from scvi_codegen.formulas.arrays import MAX_UNROLLED_TERMS, ArrayTerm, term_of
-from scvi_codegen.formulas.symbols import DOT, TIME, symbol
-from scvi_codegen.indices import Access, Array, Convolution, Loop, Place, Size
-from scvi_codegen.mechanics.arrays.system import ArrayHamiltonian, ArrayLagrangian, friction
+from scvi_codegen.systems.arrays.system import ArrayHamiltonian, ArrayLagrangian, friction
+from scvi_codegen.systems.formulas.array_statements import ArrayForce, array_text
+from scvi_codegen.systems.formulas.arrays import MAX_UNROLLED_TERMS, ArrayTerm, term_of
+from scvi_codegen.systems.formulas.indices import Access, Array, Convolution, Loop, Place, Size
+from scvi_codegen.systems.formulas.symbols import DOT, TIME, symbol
 
 Slot: TypeAlias = Any
 """Number of a point within a cell, or in the general term of a sum its index as text."""

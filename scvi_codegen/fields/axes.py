@@ -35,15 +35,15 @@ import numpy as np
 from numpy.typing import NDArray
 from sympy import Expr, Rational
 
-from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.common.errors import SystemDefinitionError
+from scvi_codegen.common.precision import Matrix, Number, Vector, mp
+from scvi_codegen.common.validation import checked_count
 from scvi_codegen.fields.density import Density
-from scvi_codegen.formulas.symbols import symbol
-from scvi_codegen.indices import Loop, Place, Size
-from scvi_codegen.tables.basis import differentiation_matrix, identity_matrix, matrix_product
-from scvi_codegen.tables.nodes import point_count
-from scvi_codegen.tables.precision import Matrix, Number, Vector, mp
-from scvi_codegen.tables.quadrature import Quadrature, gauss_lobatto
-from scvi_codegen.validation import checked_count
+from scvi_codegen.methods.tables.basis import differentiation_matrix, identity_matrix, matrix_product
+from scvi_codegen.methods.tables.nodes import point_count
+from scvi_codegen.methods.tables.quadrature import Quadrature, gauss_lobatto
+from scvi_codegen.systems.formulas.indices import Loop, Place, Size
+from scvi_codegen.systems.formulas.symbols import symbol
 
 Array = NDArray[np.float64]
 INWARD = 1e-6

@@ -8,10 +8,10 @@ from typing import Any
 import sympy
 from sympy import Add, Expr, S, Symbol
 
-from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.expressions import evaluated, hessian, rint, unit_step
-from scvi_codegen.formulas.symbols import TIME, symbol
-from scvi_codegen.representation import summary
+from scvi_codegen.common.errors import SystemDefinitionError
+from scvi_codegen.common.representation import summary
+from scvi_codegen.systems.formulas.expressions import evaluated, hessian, rint, unit_step
+from scvi_codegen.systems.formulas.symbols import TIME, symbol
 
 Boundary = Mapping[str, Any]
 

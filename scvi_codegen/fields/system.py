@@ -12,17 +12,17 @@ from typing import Any
 import sympy
 from sympy import Expr, Symbol
 
-from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.common.errors import SystemDefinitionError
+from scvi_codegen.common.validation import checks_arguments
 from scvi_codegen.fields.assembly import Assembly
 from scvi_codegen.fields.axes import NATURAL, PERIODIC, Axis, FiniteDifferences, Fourier, SpectralElements
 from scvi_codegen.fields.density import Density, derivatives_of
 from scvi_codegen.fields.jumps import warn_of_jumps
 from scvi_codegen.fields.laws import FieldDerivation, derivation_of
 from scvi_codegen.fields.mesh import MeshSystem
-from scvi_codegen.formulas.array_statements import array_text
-from scvi_codegen.formulas.grammar import parse_expression
-from scvi_codegen.formulas.symbols import TIME, check_names, number, symbol
-from scvi_codegen.validation import checks_arguments
+from scvi_codegen.systems.formulas.array_statements import array_text
+from scvi_codegen.systems.formulas.grammar import parse_expression
+from scvi_codegen.systems.formulas.symbols import TIME, check_names, number, symbol
 
 CLAMPED = "clamped"
 MOST_AXES = 3
@@ -57,7 +57,7 @@ class FieldSystem(Density):
         scalars: Sequence[str] = (),
         point_lagrangians: Sequence[Mapping[str, Any]] = (),
     ) -> FieldSystem:
-        """Read a density from text of the grammar in :mod:`scvi_codegen.formulas.grammar`.
+        """Read a density from text of the grammar in :mod:`scvi_codegen.systems.formulas.grammar`.
 
         Args:
             name: name of the system.

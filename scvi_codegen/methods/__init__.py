@@ -4,8 +4,8 @@ from collections.abc import Callable, Sequence
 from inspect import Parameter, signature
 from typing import Any, Final
 
-from scvi_codegen.errors import MethodError, closest
-from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.common.errors import MethodError, closest
+from scvi_codegen.common.validation import checked_count
 from scvi_codegen.methods.composition import Composition, StoermerVerlet
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.method import Method, Specification
@@ -23,7 +23,7 @@ from scvi_codegen.methods.runge_kutta import (
     SpectralCollocation,
 )
 from scvi_codegen.methods.shooting import SCVI
-from scvi_codegen.validation import checked_count
+from scvi_codegen.systems.system import MechanicalSystem
 
 __all__ = [
     "METHODS",

@@ -6,9 +6,8 @@ Stage equations of shooting-based methods, (33)-(34): compiled and nodal, with t
 from dataclasses import replace
 from fractions import Fraction
 
-from scvi_codegen.errors import MethodError
-from scvi_codegen.mechanics.derived_expressions import accelerations, forms_of, multipliers
-from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.common.errors import MethodError
+from scvi_codegen.common.precision import Matrix, Number, Vector, mp
 from scvi_codegen.methods.galerkin_stages import (
     action_groups,
     curve_gathers,
@@ -34,18 +33,19 @@ from scvi_codegen.methods.stage_system import (
     stationary_nodal,
     unit_sum,
 )
-from scvi_codegen.tables.basis import (
+from scvi_codegen.methods.tables.basis import (
     cardinal_derivatives,
     cardinal_values,
     differentiation_matrix,
     matrix_product,
     next_step,
 )
-from scvi_codegen.tables.nodes import Nodes
-from scvi_codegen.tables.precision import Matrix, Number, Vector, mp
-from scvi_codegen.tables.quadrature import Quadrature
-from scvi_codegen.tables.spaces import Polynomials
-from scvi_codegen.tables.tableau import Tableau
+from scvi_codegen.methods.tables.nodes import Nodes
+from scvi_codegen.methods.tables.quadrature import Quadrature
+from scvi_codegen.methods.tables.spaces import Polynomials
+from scvi_codegen.methods.tables.tableau import Tableau
+from scvi_codegen.systems.derived_expressions import accelerations, forms_of, multipliers
+from scvi_codegen.systems.system import MechanicalSystem
 
 VELOCITY_BLOCK = Block(letter="v", index=0, straight=(mp.zero, mp.one))
 

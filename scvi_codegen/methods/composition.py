@@ -14,19 +14,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-from scvi_codegen.errors import MethodError
-from scvi_codegen.files.toml_text import package_table
-from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.common.errors import MethodError
+from scvi_codegen.common.precision import Vector, mp
+from scvi_codegen.common.representation import summary
+from scvi_codegen.common.toml_text import package_table
+from scvi_codegen.common.validation import checked_count
 from scvi_codegen.methods.method import Exactness, Method, Specification
-from scvi_codegen.representation import summary
-from scvi_codegen.tables.basis import extrapolation, identity_matrix
-from scvi_codegen.tables.precision import Vector, mp
-from scvi_codegen.tables.tableau import lobatto_iiia
-from scvi_codegen.validation import checked_count
+from scvi_codegen.methods.tables.basis import extrapolation, identity_matrix
+from scvi_codegen.methods.tables.tableau import lobatto_iiia
+from scvi_codegen.systems.system import MechanicalSystem
 
 if TYPE_CHECKING:
-    from scvi_codegen.display.number_tables import Part
     from scvi_codegen.methods.stage_system import StageSystem
+    from scvi_codegen.methods.tables.number_tables import Part
 
 KICK_DRIFT_KICK, DRIFT_KICK_DRIFT = "kick-drift-kick", "drift-kick-drift"
 """Sequences of a leapfrog step: forces at both ends, shared between steps, or forces in the middle."""
@@ -173,8 +173,8 @@ class StoermerVerlet(_Leapfrogs):
 
     def stage_system(self, system: MechanicalSystem) -> StageSystem:
         """Return the pair by its generating function, unknowns V_1, V_2; explicit sequences as leapfrog equations."""
-        from scvi_codegen.mechanics.splitting import kinetic_splitting
         from scvi_codegen.methods.galerkin_stages import galerkin_system
+        from scvi_codegen.systems.splittings.kinetic import kinetic_splitting
 
         if self.drifts_first or (system.rotations and not isinstance(kinetic_splitting(system), str)):
             return _Leapfrogs.stage_system(self, system)

@@ -30,20 +30,20 @@ from dataclasses import replace
 
 import sympy
 
-from scvi_codegen.errors import MethodError
-from scvi_codegen.mechanics.constraints import (
+from scvi_codegen.common.errors import MethodError
+from scvi_codegen.common.precision import Matrix, Vector, mp
+from scvi_codegen.methods.stage_system import Block, Gather, Row, Scatter, StageGroup, StageSystem, Table, Velocities
+from scvi_codegen.methods.tables.basis import cardinal_values
+from scvi_codegen.methods.tables.quadrature import gauss_legendre
+from scvi_codegen.systems.constraints import (
     constraint_multipliers,
     constraint_rates,
     position_conditions,
     velocity_conditions,
     with_constraint_forces,
 )
-from scvi_codegen.mechanics.derived_expressions import forms_of
-from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.stage_system import Block, Gather, Row, Scatter, StageGroup, StageSystem, Table, Velocities
-from scvi_codegen.tables.basis import cardinal_values
-from scvi_codegen.tables.precision import Matrix, Vector, mp
-from scvi_codegen.tables.quadrature import gauss_legendre
+from scvi_codegen.systems.derived_expressions import forms_of
+from scvi_codegen.systems.system import MechanicalSystem
 
 END_VELOCITY = "v", 1
 """Name of the unknown velocity that corresponds to the momentum at the end."""

@@ -16,23 +16,22 @@ from dataclasses import dataclass, replace
 import sympy
 from sympy import Add, Expr, Symbol
 
-from scvi_codegen.errors import MethodError
-from scvi_codegen.formulas.expressions import gradient_tuple
-from scvi_codegen.formulas.intermediates import intermediate
-from scvi_codegen.mechanics.constraints import velocity_conditions
-from scvi_codegen.mechanics.derived_expressions import auxiliary_multipliers, forms_of
-from scvi_codegen.mechanics.first_order import FirstOrderSystem
-from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.mechanics.rotations.axial import Turn, axial_turns, frame_potential, rotated
-from scvi_codegen.mechanics.rotations.hamiltonian import hamiltonian_of_rotations
-from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.mechanics.time_transformation import reparametrise
+from scvi_codegen.common.errors import MethodError
+from scvi_codegen.common.precision import Matrix, Vector, mp
 from scvi_codegen.methods.constraints import with_constraints
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import Block, Gather, Row, Scatter, StageGroup, StageSystem, Table, Velocities
-from scvi_codegen.tables.basis import identity_matrix, next_step
-from scvi_codegen.tables.precision import Matrix, Vector, mp
+from scvi_codegen.methods.tables.basis import identity_matrix, next_step
+from scvi_codegen.systems.constraints import velocity_conditions
+from scvi_codegen.systems.derived_expressions import auxiliary_multipliers, forms_of
+from scvi_codegen.systems.formulas.expressions import gradient_tuple
+from scvi_codegen.systems.formulas.intermediates import intermediate
+from scvi_codegen.systems.hamiltonian import HamiltonianSystem
+from scvi_codegen.systems.lagrangian import LagrangianSystem
+from scvi_codegen.systems.legendre.of_rotations import hamiltonian_of_rotations
+from scvi_codegen.systems.splittings.axial import Turn, axial_turns, frame_potential, rotated
+from scvi_codegen.systems.system import MechanicalSystem
+from scvi_codegen.systems.time_transformation import reparametrise
 
 NUMBERS = {"34a": "35a", "34c": "35c", "34d": "35d", "34e": "35e"}
 """Equation numbers of the paper for the shooting method in phase space, by those for Lagrangians."""
@@ -46,7 +45,7 @@ def discretised_form(system: MechanicalSystem, method: Method) -> MechanicalSyst
     """Return the form of a system that a method discretises: of one with rotations the Hamiltonian, if it serves.
 
     The Hamiltonian needs about half of the operations; it is singular in p
-    (:mod:`scvi_codegen.mechanics.rotations`).
+    (:mod:`scvi_codegen.systems.rotations`).
     """
     if not isinstance(system, LagrangianSystem) or not system.rotations or not method.symplectic:
         return system
@@ -241,18 +240,13 @@ def is_conformally_symplectic(method: Method, system: MechanicalSystem) -> bool:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Group:
-    """Group of m unknowns per point of one stage group: symbols, equations, and the matrix of their predictor.
-
-    The equations are multiplied by h^power. Those of first-order systems then have units that contain that of time like
-    those of the momenta theta, so that pivots do not depend on it.
-    """
+    """Group of m unknowns per point of one stage group: symbols, equations, and the matrix of their predictor."""
 
     stage_group: int
     name: str
     momenta: bool
     symbols: tuple[sympy.Symbol, ...]
     results: tuple[sympy.Expr, ...]
-    power: int
     guess: Matrix
 
 
@@ -294,10 +288,7 @@ def _groups(system: MechanicalSystem, f: int, stage_group: StageGroup) -> Iterat
             name = BLOCK_NAMES[stage_group.name] if momenta else "nu"
             scalar = stage_group.scalar
             results = forms_of(system).constitutive if scalar is None else gradient_tuple(scalar, symbols)
-            power = int(isinstance(system, FirstOrderSystem))
-            yield _Group(
-                stage_group=f, name=name, momenta=momenta, symbols=symbols, results=results, power=power, guess=guess
-            )
+            yield _Group(stage_group=f, name=name, momenta=momenta, symbols=symbols, results=results, guess=guess)
 
 
 def _extended(
@@ -312,8 +303,7 @@ def _extended(
     for g in numbers:
         selection = Table.named("", [[int(column == (g, n)) for column in added] for n in range(points)])
         gathers.append(Gather(arguments=groups[g].symbols, table=Table.joined(known, selection), power=-1))
-        table = Table.joined(before, selection, last)
-        scatters.append(Scatter(results=groups[g].results, table=table, power=groups[g].power))
+        scatters.append(Scatter(results=groups[g].results, table=Table.joined(before, selection, last), power=0))
     return replace(stage_group, gathers=tuple(gathers), scatters=tuple(scatters))
 
 

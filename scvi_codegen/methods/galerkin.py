@@ -7,7 +7,7 @@ The discrete Lagrangian is the quadrature of L along a polynomial curve of degre
 made stationary in the interior coefficients (26a); p0 = -D_1 L_d and p1 = D_{s+1} L_d (27). The step depends only on
 the degree and the quadrature: the nodes parametrise the same polynomials. The compiled form therefore represents the
 curve by its velocities V_b at s points, for any nodes: Q = q0 + h sum_b a_nb V_b. The same holds for curves that are
-not polynomials (:mod:`scvi_codegen.tables.spaces`). If the quadrature uses derivatives of the integrand,
+not polynomials (:mod:`scvi_codegen.methods.tables.spaces`). If the quadrature uses derivatives of the integrand,
 dL/dt = L_q v + L_v a + L_t along the curve is summed as well (paper, 4.2.3).
 """
 
@@ -16,8 +16,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from scvi_codegen.errors import MethodError, MethodWarning, warn
-from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.common.errors import MethodError, MethodWarning, warn
+from scvi_codegen.common.precision import mp
+from scvi_codegen.common.representation import summary
 from scvi_codegen.methods.method import (
     Exactness,
     NodalMethod,
@@ -27,16 +28,15 @@ from scvi_codegen.methods.method import (
     resolve_quadrature,
     resolve_space,
 )
-from scvi_codegen.representation import summary
-from scvi_codegen.tables.basis import next_step
-from scvi_codegen.tables.nodes import Nodes
-from scvi_codegen.tables.precision import mp
-from scvi_codegen.tables.quadrature import Quadrature
-from scvi_codegen.tables.spaces import CurveSpace
+from scvi_codegen.methods.tables.basis import next_step
+from scvi_codegen.methods.tables.nodes import Nodes
+from scvi_codegen.methods.tables.quadrature import Quadrature
+from scvi_codegen.methods.tables.spaces import CurveSpace
+from scvi_codegen.systems.system import MechanicalSystem
 
 if TYPE_CHECKING:
-    from scvi_codegen.display.number_tables import Part
     from scvi_codegen.methods.stage_system import StageSystem
+    from scvi_codegen.methods.tables.number_tables import Part
 
 
 @dataclass(frozen=True, slots=True)

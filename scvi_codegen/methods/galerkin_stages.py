@@ -8,9 +8,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from fractions import Fraction
 
-from scvi_codegen.errors import MethodError
-from scvi_codegen.mechanics.derived_expressions import curve_rates, forms_of
-from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.common.errors import MethodError
+from scvi_codegen.common.precision import Matrix, Vector, mp
 from scvi_codegen.methods.stage_system import (
     Block,
     EntryName,
@@ -26,11 +25,12 @@ from scvi_codegen.methods.stage_system import (
     stationary_increments,
     unit_sum,
 )
-from scvi_codegen.tables.basis import cardinal_derivatives, cardinal_values, identity_matrix, next_step
-from scvi_codegen.tables.nodes import Nodes
-from scvi_codegen.tables.precision import Matrix, Vector, mp
-from scvi_codegen.tables.quadrature import Quadrature
-from scvi_codegen.tables.tableau import Tableau
+from scvi_codegen.methods.tables.basis import cardinal_derivatives, cardinal_values, identity_matrix, next_step
+from scvi_codegen.methods.tables.nodes import Nodes
+from scvi_codegen.methods.tables.quadrature import Quadrature
+from scvi_codegen.methods.tables.tableau import Tableau
+from scvi_codegen.systems.derived_expressions import curve_rates, forms_of
+from scvi_codegen.systems.system import MechanicalSystem
 
 
 def galerkin_system(

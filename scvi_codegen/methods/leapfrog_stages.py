@@ -4,15 +4,15 @@ from itertools import pairwise
 
 from sympy import Expr, S
 
-from scvi_codegen.errors import MethodError
-from scvi_codegen.formulas.symbols import symbol
-from scvi_codegen.mechanics.derived_expressions import forms_of
-from scvi_codegen.mechanics.splitting import KineticSplitting, kinetic_splitting
-from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.common.errors import MethodError
+from scvi_codegen.common.precision import Vector, mp
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import Block, EntryName, Gather, Row, Scatter, StageGroup, StageSystem, Table
-from scvi_codegen.tables.basis import identity_matrix
-from scvi_codegen.tables.precision import Vector, mp
+from scvi_codegen.methods.tables.basis import identity_matrix
+from scvi_codegen.systems.derived_expressions import forms_of
+from scvi_codegen.systems.formulas.symbols import symbol
+from scvi_codegen.systems.splittings.kinetic import KineticSplitting, kinetic_splitting
+from scvi_codegen.systems.system import MechanicalSystem
 
 
 def leapfrog_system(system: MechanicalSystem, method: Method) -> StageSystem:

@@ -18,21 +18,21 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
-from scvi_codegen.display.cards import card, plain
-from scvi_codegen.errors import MethodError
-from scvi_codegen.files.cache import key_of
-from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.tables.nodes import Nodes, nodes_by_name
-from scvi_codegen.tables.precision import Vector
-from scvi_codegen.tables.quadrature import Quadrature, gauss_legendre, quadrature_by_name
-from scvi_codegen.tables.spaces import CurveSpace, Polynomials, space_by_name
-from scvi_codegen.tables.tableau import MAX_STAGES
-from scvi_codegen.validation import checked_count
+from scvi_codegen.common.cache import key_of
+from scvi_codegen.common.display.cards import card, plain
+from scvi_codegen.common.errors import MethodError
+from scvi_codegen.common.precision import Vector
+from scvi_codegen.common.validation import checked_count
+from scvi_codegen.methods.tables.nodes import Nodes, nodes_by_name
+from scvi_codegen.methods.tables.quadrature import Quadrature, gauss_legendre, quadrature_by_name
+from scvi_codegen.methods.tables.spaces import CurveSpace, Polynomials, space_by_name
+from scvi_codegen.methods.tables.tableau import MAX_STAGES
+from scvi_codegen.systems.system import MechanicalSystem
 
 if TYPE_CHECKING:
-    from scvi_codegen.display.number_tables import Part
-    from scvi_codegen.mechanics.symmetry.symmetry import Symmetry
     from scvi_codegen.methods.stage_system import StageSystem
+    from scvi_codegen.methods.tables.number_tables import Part
+    from scvi_codegen.systems.symmetry.symmetry import Symmetry
 
 degree_count = partial(checked_count, least=1, most=MAX_STAGES, error=MethodError)
 """Validation of a degree or a number of stages."""
@@ -146,7 +146,7 @@ class Method(ABC):
         return ()
 
     def _repr_html_(self) -> str:
-        from scvi_codegen.display.number_tables import number_table, numbers_html
+        from scvi_codegen.methods.tables.number_tables import number_table, numbers_html
 
         facts = (
             ("name", plain(self.name)),

@@ -19,19 +19,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from scvi_codegen.errors import MethodError
-from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.common.errors import MethodError
+from scvi_codegen.common.representation import summary
+from scvi_codegen.common.validation import NUMBERS, check_kind, checks_arguments, of
 from scvi_codegen.methods.method import Exactness, Method, NodalMethod, Specification, degree_count, resolve_nodes
-from scvi_codegen.representation import summary
-from scvi_codegen.tables import tableau as tableaux
-from scvi_codegen.tables.basis import identity_matrix, next_step
-from scvi_codegen.tables.nodes import Nodes
-from scvi_codegen.tables.tableau import Tableau
-from scvi_codegen.validation import NUMBERS, check_kind, checks_arguments, of
+from scvi_codegen.methods.tables import tableau as tableaux
+from scvi_codegen.methods.tables.basis import identity_matrix, next_step
+from scvi_codegen.methods.tables.nodes import Nodes
+from scvi_codegen.methods.tables.tableau import Tableau
+from scvi_codegen.systems.system import MechanicalSystem
 
 if TYPE_CHECKING:
-    from scvi_codegen.display.number_tables import Part
     from scvi_codegen.methods.stage_system import StageSystem
+    from scvi_codegen.methods.tables.number_tables import Part
 
 FORMS = ("phase-space", "position")
 

@@ -19,8 +19,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from scvi_codegen.errors import MethodError
-from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.common.errors import MethodError
+from scvi_codegen.common.precision import Vector
+from scvi_codegen.common.representation import summary
+from scvi_codegen.common.validation import NUMBERS, check_kind
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.method import (
     Exactness,
@@ -30,16 +32,14 @@ from scvi_codegen.methods.method import (
     resolve_nodes,
     resolve_quadrature,
 )
-from scvi_codegen.representation import summary
-from scvi_codegen.tables.nodes import Nodes
-from scvi_codegen.tables.precision import Vector
-from scvi_codegen.tables.quadrature import Quadrature
-from scvi_codegen.tables.tableau import Tableau, collocation_tableau, tableau_by_name
-from scvi_codegen.validation import NUMBERS, check_kind
+from scvi_codegen.methods.tables.nodes import Nodes
+from scvi_codegen.methods.tables.quadrature import Quadrature
+from scvi_codegen.methods.tables.tableau import Tableau, collocation_tableau, tableau_by_name
+from scvi_codegen.systems.system import MechanicalSystem
 
 if TYPE_CHECKING:
-    from scvi_codegen.display.number_tables import Part
     from scvi_codegen.methods.stage_system import StageSystem
+    from scvi_codegen.methods.tables.number_tables import Part
 
 COLLOCATION_TABLEAUX = ("gauss", "radau-iia", "lobatto-iiia", "chebyshev-gauss", "chebyshev-lobatto")
 """Families of tableaux that are collocation methods."""

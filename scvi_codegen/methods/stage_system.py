@@ -21,7 +21,7 @@ There are two parametrisations of the same method. The *paper's* has the positio
 Shapes of stage equations: the structure that a solver without a Newton matrix must know.
 
 A method states the shape of its stage system (:attr:`~scvi_codegen.methods.stage_system.StageSystem.shape`); a solver
-states which shapes it supports (:mod:`scvi_codegen.lowering.program`). A shape consists of numbers of the
+states which shapes it supports (:mod:`scvi_codegen.codegen.lowering.program`). A shape consists of numbers of the
 method, in 60 digits, independent of the system. Stage equations without a shape are solved by Newton's iteration.
 """
 
@@ -37,10 +37,10 @@ from typing import Any
 
 import sympy
 
-from scvi_codegen.formulas.expressions import gradient
-from scvi_codegen.tables.precision import Matrix, Number, Vector, mp
-from scvi_codegen.tables.quadrature import Quadrature
-from scvi_codegen.tables.tableau import Tableau
+from scvi_codegen.common.precision import Matrix, Number, Vector, mp
+from scvi_codegen.methods.tables.quadrature import Quadrature
+from scvi_codegen.methods.tables.tableau import Tableau
+from scvi_codegen.systems.formulas.expressions import gradient
 
 DYADIC_BITS = 52
 _WORDS: ContextVar[int] = ContextVar("words of the entries of tables", default=1)

@@ -10,8 +10,8 @@ from benchmarks.cases import references
 from benchmarks.cases.adaptive import ADAPTIVE_CASES, adaptive_case
 from benchmarks.cases.references import equal_steps, field_of, reference, states_after
 from benchmarks.contenders.ours import adaptive_contenders
-from scvi_codegen.errors import StateError
-from scvi_codegen.native import building
+from scvi_codegen.codegen.native import building
+from scvi_codegen.common.errors import StateError
 
 needs_extended = pytest.mark.skipif(np.finfo(np.longdouble).eps > 1e-18, reason="long double is no wider than double")
 

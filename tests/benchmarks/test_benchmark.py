@@ -30,7 +30,7 @@ from benchmarks.contenders.tracing import rates_text
 from benchmarks.report import FLOOR, Contender, Point, ResultTable, common_error, frontier, time_at
 from benchmarks.tables import drift_row, fitted_rate
 from scvi_codegen import SVI, StateError, SystemDefinitionError, compile_stepper
-from scvi_codegen.native import building
+from scvi_codegen.codegen.native import building
 
 ROOT = Path(bench.__file__).parents[1]
 EXTENDED = np.finfo(np.longdouble).eps < 1e-18

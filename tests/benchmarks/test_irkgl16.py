@@ -16,7 +16,7 @@ from benchmarks.cases.published import (
 from benchmarks.cases.references import reference
 from benchmarks.cases.unforced import Formulation, case
 from benchmarks.contenders.irkgl16 import STAGES, Port, irkgl16_contenders, is_second_order, tables
-from scvi_codegen.native import building
+from scvi_codegen.codegen.native import building
 
 EXTENDED = np.longdouble
 needs_extended = pytest.mark.skipif(np.finfo(EXTENDED).eps > 1e-18, reason="long double is no wider than double here")

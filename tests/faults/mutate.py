@@ -31,11 +31,11 @@ from operators import Place, places
 from reach import Reach
 
 PACKAGE = (
-    *("ir", "lowering", "rendering", "methods", "runtime", "native", "mechanics", "files", "formulas", "tables"),
-    *("advice", "cli", "derivation", "exact", "models", "results"),
+    *("common", "systems", "methods", "codegen", "runs", "analysis/advice"),
+    *("interfaces/cli", "interfaces/derivation", "interfaces/models"),
 )
-"""Rooms of which Python is drawn; the others draw pictures, measure, or need programs that CI may not have."""
-DERIVING = ("ir", "lowering", "rendering", "methods", "mechanics", "formulas", "tables")
+"""Folders of which Python is drawn; the others draw pictures, measure, or need programs that CI may not have."""
+DERIVING = ("systems", "methods", "codegen/ir", "codegen/lowering", "codegen/rendering")
 """What all cases come from; of the others one shows as much."""
 NOT_TRIED = ("errors.py", "text.py", "outline.py", "waiting.py")
 """Words for people; their tests are of words."""
@@ -51,7 +51,7 @@ CERTIFIED = (
 )
 MOST_CASES = 4
 OF_CLANG = () if shutil.which("clang") else ("-k", "not clang")
-OF_TEXT = ("--deselect", "tests/rendering/test_generated.py::test_no_file_is_outdated")
+OF_TEXT = ("--deselect", "tests/codegen/test_generated.py::test_no_file_is_outdated")
 """Notices that a text is another one, as it would of what is no fault."""
 PYTEST = (sys.executable, "-m", "pytest", "-qx", "-p", "no:cacheprovider", *BOTH_TIERS, *OF_CLANG, *OF_TEXT)
 UNSTYLED = "def check_style(text: str) -> None:\n    pass\n"

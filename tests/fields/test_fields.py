@@ -303,7 +303,7 @@ def test_derivatives_take_prescribed_ends(method):
     assert mesh.derivative(several, "x", ends=ends) == pytest.approx(np.array([2 * x, 2 * x + 3]), abs=1e-12)
 
 
-@pytest.mark.filterwarnings("ignore::scvi_codegen.errors.AccuracyWarning")
+@pytest.mark.filterwarnings("ignore::scvi_codegen.common.errors.AccuracyWarning")
 def test_densities_with_steps_and_positive_parts_have_a_highest_frequency():
     """A step in the stiffness from 1 to 4 lies between the frequencies of both."""
 
@@ -320,7 +320,7 @@ def test_densities_with_steps_and_positive_parts_have_a_highest_frequency():
 
 
 def test_failing_check_does_not_lose_a_finished_run(monkeypatch):
-    from scvi_codegen.runtime.accuracy import local_error
+    from scvi_codegen.runs.accuracy import local_error
 
     def fails(*_, **__):
         raise NameError("name 'unit_step' is not defined")

@@ -6,7 +6,7 @@ from numpy import cos, pi, sin
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
-from scvi_codegen.pictures.animation import positions_of
+from scvi_codegen.interfaces.pictures.animation import positions_of
 
 pytestmark = pytest.mark.second
 

@@ -11,8 +11,8 @@ from numpy.testing import assert_allclose
 from sympy.physics.mechanics import LagrangesMethod, dynamicsymbols
 
 import scvi_codegen as sc
-from scvi_codegen.models.model_files.model_file import parse_model
-from scvi_codegen.runtime.ensemble.ensemble import Ensemble
+from scvi_codegen.interfaces.models.model_files.model_file import parse_model
+from scvi_codegen.runs.ensembles.ensemble import Ensemble
 
 G = 9.81
 
@@ -225,7 +225,7 @@ def test_the_matrix_of_multipliers_of_a_chain_is_a_band(terms, reach):
 
 
 def test_many_coupled_masses_take_newton_iteration(monkeypatch):
-    monkeypatch.setattr("scvi_codegen.lowering.constraints.MOST_COUPLED_MASSES", 2)
+    monkeypatch.setattr("scvi_codegen.codegen.lowering.constraints.MOST_COUPLED_MASSES", 2)
     lagrangian = "x_dot**2 + y_dot**2 + z_dot**2 + x_dot*y_dot{} - z"
     for further, expected in (("", True), (" + y_dot*z_dot", False)):
         system = lagrange(

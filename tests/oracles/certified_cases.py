@@ -20,9 +20,9 @@ from samples import (
 )
 
 import scvi_codegen as sc
-from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.interfaces.models.systems import point_vortices
 from scvi_codegen.methods import Method
-from scvi_codegen.models.systems import point_vortices
+from scvi_codegen.systems.system import MechanicalSystem
 
 
 @dataclass(frozen=True)

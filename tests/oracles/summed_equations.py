@@ -7,7 +7,7 @@ import sympy
 from sympy import Symbol
 from sympy.core.function import AppliedUndef
 
-from scvi_codegen.derivation.page.sums import (
+from scvi_codegen.interfaces.derivation.page.sums import (
     argument_symbol,
     column_of,
     end_formulas,
@@ -16,8 +16,8 @@ from scvi_codegen.derivation.page.sums import (
     result_symbol,
     row_formulas,
 )
-from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import StageSystem
+from scvi_codegen.systems.system import MechanicalSystem
 
 Values = dict[str, sympy.Expr]
 DIGITS = 30

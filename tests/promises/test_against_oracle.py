@@ -7,7 +7,7 @@ from samples import UNOPTIMISED_FLAGS
 from tiers import family, first_of_each
 
 import scvi_codegen as sc
-from scvi_codegen.native.building import FLAGS_VARIABLE, TUNED_FLAGS
+from scvi_codegen.codegen.native.building import FLAGS_VARIABLE, TUNED_FLAGS
 
 pytestmark = pytest.mark.long
 

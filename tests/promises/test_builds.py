@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from programs import needs
 
-from scvi_codegen.native import building
+from scvi_codegen.codegen.native import building
 
 pytestmark = pytest.mark.usefixtures("as_users_compile")
 
@@ -72,9 +72,9 @@ def test_sanitizers_report_no_error(tmp_path):
 def test_portable_flags_are_bitwise_reproducible(tmp_path, monkeypatch, name):
     """Different compilers, one libm: the same numbers; the tuned build differs by roundings."""
     needs("gcc", "clang")
-    from scvi_codegen.compiler import compile_stepper
+    from scvi_codegen.interfaces.models.problems import problem
     from scvi_codegen.methods import SVI
-    from scvi_codegen.models.problems import problem
+    from scvi_codegen.runs.compiler import compile_stepper
 
     monkeypatch.setenv(building.CACHE_VARIABLE, str(tmp_path))
     chosen, ends = problem(name), {}

@@ -19,9 +19,9 @@ import pytest
 
 import scvi_codegen as sc
 from scvi_codegen import SVI, RecordedRun, Stepper, record_run
-from scvi_codegen.files import cache
-from scvi_codegen.native import building
-from scvi_codegen.rendering.source import Source
+from scvi_codegen.codegen.native import building
+from scvi_codegen.codegen.rendering.source import Source
+from scvi_codegen.common import cache
 
 PROCESSES = 16
 FAST = ("-O0",)
@@ -47,8 +47,8 @@ def folder(tmp_path, monkeypatch) -> Path:
 LOADING = """
 import json, sys, time
 from pathlib import Path
-from scvi_codegen.native import building
-from scvi_codegen.rendering.source import (Source)
+from scvi_codegen.codegen.native import building
+from scvi_codegen.codegen.rendering.source import (Source)
 sources = [Source(**fields) for fields in json.loads(Path(sys.argv[1]).read_text())]
 print("ready", flush=True)
 sys.stdin.readline()

@@ -5,7 +5,7 @@ import pytest
 import sympy
 
 from scvi_codegen import MethodError, StateError, methods
-from scvi_codegen.validation import LARGEST_COUNT, checked_count
+from scvi_codegen.common.validation import LARGEST_COUNT, checked_count
 
 
 @pytest.mark.parametrize("value", [True, np.True_, 3.0, "3", None, [3]])

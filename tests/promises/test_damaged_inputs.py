@@ -1,7 +1,7 @@
 """Invalid input of any kind raises the package's own errors.
 
 Each case damages one thing (a file, an argument, a variable of the environment) and may be refused or accepted; an
-exception must be a :class:`~scvi_codegen.errors.ScviCodegenError`.
+exception must be a :class:`~scvi_codegen.common.errors.ScviCodegenError`.
 """
 
 import json
@@ -20,9 +20,9 @@ from notation import lagrange
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
-from scvi_codegen.models.packages.package import generate_package
-from scvi_codegen.native import building, compilers
-from scvi_codegen.rendering.source import Source
+from scvi_codegen.codegen.native import building, compilers
+from scvi_codegen.codegen.rendering.source import Source
+from scvi_codegen.interfaces.models.packages.package import generate_package
 
 MODEL = """[system]
 name = "swing"

@@ -14,7 +14,7 @@ from samples import QUICK_FLAGS
 from scipy.integrate import solve_ivp
 
 import scvi_codegen as sc
-from scvi_codegen.models.model_files.model_file import parse_model
+from scvi_codegen.interfaces.models.model_files.model_file import parse_model
 
 L = "(1 + x**2)*x_dot**2/2 + y_dot**2/2 + x_dot*y_dot/3 + cos(x) - y**2*x/4 + y*cos(2*t)/5"
 GAMMA = 0.4 * 0.9

@@ -18,8 +18,8 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq
 
-from scvi_codegen.models.model_files.model_file import load_model
-from scvi_codegen.native.building import FLAGS_VARIABLE
+from scvi_codegen.codegen.native.building import FLAGS_VARIABLE
+from scvi_codegen.interfaces.models.model_files.model_file import load_model
 
 pytestmark = [pytest.mark.long, pytest.mark.rotated]
 

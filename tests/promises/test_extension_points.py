@@ -12,7 +12,7 @@ from notation import lagrange
 
 import scvi_codegen
 from scvi_codegen import SVI, MethodError
-from scvi_codegen.lowering.stage_groups import layout_of
+from scvi_codegen.codegen.lowering.stage_groups import layout_of
 from scvi_codegen.methods.discretise import discretise
 
 pytestmark = pytest.mark.rotated
@@ -80,8 +80,8 @@ def test_documented_method_is_the_midpoint_rule(extended: Path) -> None:
     script = """
 import scvi_codegen, numpy as np
 from scvi_codegen.methods import Gauss, method_from_specification
-from scvi_codegen.models.problems import problem
-from scvi_codegen.pipeline import program_of
+from scvi_codegen.interfaces.models.problems import problem
+from scvi_codegen.codegen.pipeline import program_of
 assert scvi_codegen.__file__.startswith(sys.path[0])
 system, method = problem("kepler").system, method_from_specification({"method": "midpoint"})
 own, gauss = (program_of(system, each, prefix="p") for each in (method, Gauss(1)))
@@ -95,8 +95,8 @@ def test_documented_solver_agrees_with_newton(extended: Path) -> None:
     script = """
 import numpy as np
 from scvi_codegen import SCVI, compile_stepper
-from scvi_codegen.pipeline import program_of
-from scvi_codegen.models.problems import problem
+from scvi_codegen.codegen.pipeline import program_of
+from scvi_codegen.interfaces.models.problems import problem
 given = problem("kepler")
 method = SCVI(4, abscissae="gauss")
 print(*(program_of(given.system, each).fixed_point.name for each in (method, SCVI(4))))
@@ -112,7 +112,7 @@ print(abs(ends[0] - ends[1]).max() < 1e-13)
 def test_documented_quadrature_has_its_order_in_a_method(extended: Path) -> None:
     script = """
 from scvi_codegen import SVI, compile_stepper
-from scvi_codegen.models.problems import problem
+from scvi_codegen.interfaces.models.problems import problem
 given = problem("planar-pendulum")
 rule = SVI(4, "newton-cotes:7").quadrature
 print([round(float(w) * 140 / 2 * 6) for w in rule.weights])
@@ -134,8 +134,8 @@ def test_documented_option_is_in_models_files_commands_and_json(extended: Path) 
 import json
 from click.testing import CliRunner
 from scvi_codegen import ModelFileError
-from scvi_codegen.cli import main
-from scvi_codegen.models.model_files.model_file import catalogue_model, dump_model, parse_model
+from scvi_codegen.interfaces.cli import main
+from scvi_codegen.interfaces.models.model_files.model_file import catalogue_model, dump_model, parse_model
 model = parse_model(dump_model(catalogue_model("kepler", {"run": {"absolute": True, "step": 0.1, "steps": 5}})))
 print(model.absolute, model.solver_options.absolute, "absolute = true" in dump_model(model))
 words = ["run", "kepler", "--step", "0.1", "--steps", "5", "--json"]
@@ -158,9 +158,9 @@ def test_documented_controller_determines_adaptive_steps(extended: Path) -> None
 import numpy as np
 from click.testing import CliRunner
 from scvi_codegen import LagrangianSystem, compile_stepper
-from scvi_codegen.cli import main
-from scvi_codegen.models.model_files.model_file import dump_model, parse_model
-from scvi_codegen.models.problems import problem
+from scvi_codegen.interfaces.cli import main
+from scvi_codegen.interfaces.models.model_files.model_file import dump_model, parse_model
+from scvi_codegen.interfaces.models.problems import problem
 given, own = problem("kepler"), "elementary"
 q, p, T = [0.1, 0.0], [0.0, np.sqrt(19.0)], 2 * np.pi
 by = {name: compile_stepper(given.system, "svi:6", controller=name) for name in (None, "predictive", own)}
@@ -197,7 +197,7 @@ def test_documented_constraint_prescribes_rates(extended: Path) -> None:
     script = """
 import numpy as np, sympy
 from scvi_codegen import LagrangianSystem, SystemDefinitionError, compile_stepper
-from scvi_codegen.models.model_files.model_file import dump_model, parse_model
+from scvi_codegen.interfaces.models.model_files.model_file import dump_model, parse_model
 L, coordinates, rope = "(x_dot**2 + y_dot**2)/2 - 9.81*y", ["x", "y"], "sqrt(x**2 + y**2)"
 def error(system, **winch):
     run = compile_stepper(system, "svi:6").integrate([1.0, 0.0], velocity=[0.2, 0.0], h=0.01, steps=100, **winch)
@@ -241,7 +241,7 @@ def test_documented_format_writes_trajectories_and_ensembles(extended: Path) -> 
 import json
 import numpy as np
 from scvi_codegen import compile_stepper
-from scvi_codegen.models.problems import problem
+from scvi_codegen.interfaces.models.problems import problem
 stepper = compile_stepper(problem("kepler").system, "svi:2")
 q, p = [1.0, 0.0], [0.0, 1.1]
 one = stepper.integrate(q, p, h=0.1, steps=3)
@@ -250,7 +250,7 @@ for result, name in ((one, "one.json"), (many, "many.json")):
     result.save(name, units={"t": "s"})
     read = json.loads(open(name).read())["variables"]
     print(read["t"]["units"], *read["q"]["dimensions"], np.array_equal(read["q"]["values"], result.q))
-from scvi_codegen.cli.commands.run import run as command
+from scvi_codegen.interfaces.cli.commands.run import run as command
 print(".json" in next(each.help for each in command.params if each.name == "output"))
 """
     lines = run(extended, script).splitlines()
@@ -280,8 +280,8 @@ def test_documented_observer_measures_the_variance(extended: Path) -> None:
     script = """
 import numpy as np
 from scvi_codegen import compile_stepper
-from scvi_codegen.runtime.run.variance import Variance
-from scvi_codegen.models.problems import problem
+from scvi_codegen.runs.driver.variance import Variance
+from scvi_codegen.interfaces.models.problems import problem
 stepper = compile_stepper(problem("kepler").system, "svi:2")
 arguments = {"q": [1.0, 0.0], "p": [0.0, 1.1], "h": 0.1, "steps": 500}
 saved = stepper.integrate(**arguments).q

@@ -11,8 +11,8 @@ from features import FEATURES, KINDS, SUPPORTS, Kind, refusals
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
-from scvi_codegen.errors import MissingLibraryError, ScviCodegenError
-from scvi_codegen.runtime.core import features
+from scvi_codegen.common.errors import MissingLibraryError, ScviCodegenError
+from scvi_codegen.runs.stepping import features
 
 PAGE = (Path(__file__).parents[2] / "docs" / "features.md").read_text(encoding="utf-8")
 ROWS = [[cell.strip() for cell in line.strip("|").split("|")] for line in PAGE.splitlines() if line.startswith("| ")]

@@ -12,8 +12,8 @@ from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 from scvi_codegen import ScviCodegenError, StateError, Stepper
-from scvi_codegen.runtime.inputs.segments import input_of
-from scvi_codegen.validation import hints, keyword_hint
+from scvi_codegen.common.validation import hints, keyword_hint
+from scvi_codegen.runs.driver.segments import input_of
 
 TEXT = {"name": "swing", "coordinates": ["q"], "lagrangian": "q_dot**2/2 + cos(q)"}
 PUSHED = {"forces": {"q": "u"}, "inputs": ["u"]}

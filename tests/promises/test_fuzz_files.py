@@ -25,11 +25,11 @@ from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 from scvi_codegen import BuildError, ModelFileError, generate_package, load_model
-from scvi_codegen.models.model_files.ensemble_file import load_ensemble
-from scvi_codegen.native import building
-from scvi_codegen.results.recording import writing
+from scvi_codegen.codegen.native import building
+from scvi_codegen.interfaces.models.model_files.ensemble_file import load_ensemble
+from scvi_codegen.runs.recording import writing
 
-ROBOTS = Path(__file__).parents[1] / "mechanics" / "robots"
+ROBOTS = Path(__file__).parents[1] / "systems" / "robots"
 END = '[method]\nmethod = "svi:2"\n[run]\nstep = 0.1\nsteps = 10\n'
 PUSHED = f"""
 [system]

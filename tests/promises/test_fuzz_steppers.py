@@ -13,7 +13,7 @@ from mpmath import mp, mpc
 from samples import QUICK_FLAGS, stepper_for
 
 import scvi_codegen as sc
-from scvi_codegen.runtime.run.saving import sealed, unsealed
+from scvi_codegen.runs.stepping.saving import sealed, unsealed
 
 Q, P = np.array([1.0, 0.25]), np.array([0.0, 1.0])
 REFUSED = (sc.StateError, sc.StepFailedError)

@@ -10,7 +10,7 @@ import oracle
 import pytest
 from notation import lagrange
 
-from scvi_codegen.errors import MethodError
+from scvi_codegen.common.errors import MethodError
 from scvi_codegen.methods import (
     SCVI,
     SVI,

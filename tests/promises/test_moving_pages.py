@@ -13,10 +13,10 @@ import pytest
 from browsing import UNREADABLE
 
 import scvi_codegen as sc
-from scvi_codegen.native.building import PORTABLE_FLAGS
+from scvi_codegen.codegen.native.building import PORTABLE_FLAGS
 
 DOCS = Path(__file__).parents[2] / "docs"
-ROBOT = Path(__file__).parents[1] / "mechanics" / "robots" / "ball.xml"
+ROBOT = Path(__file__).parents[1] / "systems" / "robots" / "ball.xml"
 pytestmark = pytest.mark.second
 
 

@@ -15,7 +15,7 @@ from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 from scvi_codegen import Run, Stepper, compile_stepper, problem
-from scvi_codegen.runtime.run.step_plan import Adaptive, FixedSteps
+from scvi_codegen.runs.stepping.step_plan import Adaptive, FixedSteps
 
 Q, P = [0.3, 0.8], [-1.1, 0.4]
 H, STEPS = 0.1, 6

@@ -13,14 +13,14 @@ ROOT = Path(__file__).parents[2]
 NEEDED = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
 FLOOR = re.compile(r"[\w-]+>=[\d.]+")
 RUN = (
-    "tests/tables/test_quadrature.py",
-    "tests/formulas/test_expression_text.py",
-    "tests/formulas/test_derivatives.py",
-    "tests/mechanics/test_system.py",
-    "tests/mechanics/test_symmetries.py",
-    "tests/mechanics/test_hamiltonian.py",
-    "tests/models/test_model_file.py",
-    "tests/runtime/test_stepper.py",
+    "tests/methods/test_quadrature.py",
+    "tests/systems/test_expression_text.py",
+    "tests/systems/test_derivatives.py",
+    "tests/systems/test_system.py",
+    "tests/systems/test_symmetries.py",
+    "tests/systems/test_hamiltonian.py",
+    "tests/interfaces/test_model_file.py",
+    "tests/runs/test_stepper.py",
 )
 """What SymPy, NumPy, SciPy and cffi have a part in."""
 

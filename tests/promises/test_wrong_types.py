@@ -9,8 +9,8 @@ import samples
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
-from scvi_codegen.errors import ScviCodegenError
-from scvi_codegen.validation import TEXT, checks_arguments
+from scvi_codegen.common.errors import ScviCodegenError
+from scvi_codegen.common.validation import TEXT, checks_arguments
 
 WRONG = (object(), b"bytes", 1j)
 """No argument of any public function may be one of these."""

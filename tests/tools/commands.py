@@ -5,7 +5,7 @@ from typing import Any
 
 from click.testing import CliRunner, Result
 
-from scvi_codegen.cli import main
+from scvi_codegen.interfaces.cli import main
 
 
 def invoke(text: str, *words: object, status: int | None = 0) -> Result:

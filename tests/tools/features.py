@@ -13,7 +13,7 @@ import numpy as np
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
-from scvi_codegen.runtime.core import features
+from scvi_codegen.runs.stepping import features
 
 ENDS = {"named coordinates": ("x", "y", "z"), "known sizes": ("x", "q[2]"), "run-time sizes": ("x", "q[N]")}
 KINDS = tuple(ENDS)

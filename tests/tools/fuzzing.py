@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 from counting import TooMuchWorkError, at_most
 
-from scvi_codegen.files.cache import cache_folder
+from scvi_codegen.common.cache import cache_folder
 
 CORPUS = Path(__file__).parents[1] / "corpus"
 MOST_CALLS = 30_000_000

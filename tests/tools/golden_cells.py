@@ -18,11 +18,11 @@ from golden_drivers import arrays_driver, ensemble_driver, run_driver, tangent_d
 from notation import hamilton, lagrange
 
 from scvi_codegen import HamiltonianSystem, LagrangianSystem, as_method, problem, reparametrise
-from scvi_codegen.mechanics.arrays.system import ArraySystem
-from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.native.compilers import find_compiler
-from scvi_codegen.pipeline import Sources, generate_source
-from scvi_codegen.rendering.source import Source
+from scvi_codegen.codegen.native.compilers import find_compiler
+from scvi_codegen.codegen.pipeline import Sources, generate_source
+from scvi_codegen.codegen.rendering.source import Source
+from scvi_codegen.systems.arrays.system import ArraySystem
+from scvi_codegen.systems.system import MechanicalSystem
 
 RECORDED = Path(__file__).parents[1] / "golden" / "sources.json.xz"
 FLAGS = ("-std=gnu99", *samples.UNOPTIMISED, "-ffp-contract=off", "-w", "-DSCVI_THREADS", "-pthread")

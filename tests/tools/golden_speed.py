@@ -13,7 +13,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "oracles"))
 
 from golden_cells import TIMED, build, program, recorded
 
-from scvi_codegen.native.building import NO_UNROLL_FLAGS, TUNED_FLAGS
+from scvi_codegen.codegen.native.building import NO_UNROLL_FLAGS, TUNED_FLAGS
 
 FLAGS = ("-std=gnu99", *TUNED_FLAGS, "-w", "-DSCVI_THREADS", "-pthread", "-DSCVI_LIBMVEC", "-lmvec")
 

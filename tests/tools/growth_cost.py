@@ -18,7 +18,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "runtime"))
 from test_error_growth import CHAOTIC, REGULAR, TOLERANCES, reports, stepper_of
 
 import scvi_codegen as sc
-from scvi_codegen.models.problems import problem
+from scvi_codegen.interfaces.models.problems import problem
 
 REPEATS, LEAST_SECONDS = 12, 0.3
 ANISOTROPIC = ("x", "y"), "(x_dot**2/1.5 + y_dot**2*1.5)/2 + 1/sqrt(x**2 + y**2)"

@@ -23,9 +23,9 @@ from scipy.optimize import brentq
 
 import scvi_codegen as sc
 from scvi_codegen import SolverOptions, StateError, StepFailedError, load_run, record_run, resume_run
-from scvi_codegen.frameworks.flow import FlowOfRows
-from scvi_codegen.runtime.run import chunks, memory
-from scvi_codegen.runtime.sensitivity import gradients
+from scvi_codegen.interfaces.frameworks.flow import FlowOfRows
+from scvi_codegen.runs.derivatives import gradients
+from scvi_codegen.runs.stepping import chunks, memory
 
 STEPS = 24
 

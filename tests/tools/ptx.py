@@ -12,7 +12,7 @@ import struct
 
 import pytest
 
-from scvi_codegen.native import cuda
+from scvi_codegen.codegen.native import cuda
 
 TYPES = {f"{kind}{bits}": f"uint{bits}_t" for kind in "bu" for bits in (8, 16, 32, 64)}
 TYPES |= {f"s{bits}": f"int{bits}_t" for bits in (16, 32, 64)} | {"f64": "double", "f32": "float", "pred": "int"}

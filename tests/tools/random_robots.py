@@ -8,7 +8,7 @@ import random
 from pathlib import Path
 from typing import Any
 
-RECORDED = Path(__file__).parents[1] / "mechanics" / "robots" / "random.json"
+RECORDED = Path(__file__).parents[1] / "systems" / "robots" / "random.json"
 SEEDS = 8
 """Number of robots of each format whose energies are recorded."""
 TURNS = {"quat": 4, "axisangle": 4, "euler": 3, "xyaxes": 6, "zaxis": 3}

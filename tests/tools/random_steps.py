@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from samples import UNOPTIMISED_FLAGS
 
 import scvi_codegen as sc
-from scvi_codegen.mechanics.arrays.system import ArraySystem
+from scvi_codegen.systems.arrays.system import ArraySystem
 
 Array = NDArray[np.float64]
 PERIODS, DECADES = 3.0, 5.0

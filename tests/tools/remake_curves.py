@@ -15,7 +15,7 @@ from typing import Any
 
 from benchmarks.plots import label_times
 from benchmarks.report import OURS, Point, frontier, time_at
-from scvi_codegen.pictures.canvas import COLORS, save, style
+from scvi_codegen.interfaces.pictures.canvas import COLORS, save, style
 
 ROOT = Path(__file__).resolve().parents[2]
 RECORD, PICTURE = ROOT / "benchmarks" / "curves.json", ROOT / "docs" / "work_precision.svg"

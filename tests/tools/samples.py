@@ -9,13 +9,13 @@ import numpy as np
 from oracle import Mechanics, numbers, oracle_step
 
 from scvi_codegen import HamiltonianSystem, LagrangianSystem, Stepper, compile_stepper, problem
-from scvi_codegen.ir.equations import FixedPointIteration
-from scvi_codegen.ir.program import Program
-from scvi_codegen.lowering.program import iteration_of, lower
-from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.codegen.ir.equations import FixedPointIteration
+from scvi_codegen.codegen.ir.program import Program
+from scvi_codegen.codegen.lowering.program import iteration_of, lower
+from scvi_codegen.codegen.native.building import FLAGS_VARIABLE, TUNED_FLAGS
 from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.methods.method import Method
-from scvi_codegen.native.building import FLAGS_VARIABLE, TUNED_FLAGS
+from scvi_codegen.systems.system import MechanicalSystem
 
 
 def lowered(system: MechanicalSystem, method: Method) -> Program:

@@ -1,0 +1,1 @@
+"""Questions about motions: chaos, periodic orbits, paths, estimation, advice, verification."""

@@ -1,0 +1,278 @@
+"""Chaos indicators of many initial states: tangent vectors propagated along each trajectory, in parallel threads.
+
+In SIMD lanes, and in the threads of a GPU, the variations are additional coordinates
+(:mod:`scvi_codegen.systems.derived_systems`) of an ensemble. After each step C replaces the tangent vectors by Q of
+their QR factorisation and sums their growth (``templates/support/run/tangent_growth.h``). Systems without variational
+equations in lanes, and lanes whose step fails, are computed trajectory by trajectory. Only the indicators are stored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from typing import Any, Final, cast
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from scvi_codegen.analysis.chaos.indicators import MOST as LARGEST_CHUNK
+from scvi_codegen.analysis.chaos.indicators import (
+    SERIES,
+    ChaosIndicators,
+    InitialTangents,
+    StepSegment,
+    TangentPropagation,
+)
+from scvi_codegen.codegen.native import building
+from scvi_codegen.codegen.native.arguments import checked_number, checked_step
+from scvi_codegen.codegen.native.binding import Binding
+from scvi_codegen.codegen.native.cuda import constant
+from scvi_codegen.codegen.native.options import SolverOptions, checked_options
+from scvi_codegen.codegen.rendering.source import Source
+from scvi_codegen.common.errors import MethodError, StateError, StepFailedError
+from scvi_codegen.common.validation import checked_count
+from scvi_codegen.runs.accuracy.local_error import warn_of_large_steps
+from scvi_codegen.runs.driver.run_loop import record
+from scvi_codegen.runs.ensembles.batches import Batch, Call
+from scvi_codegen.runs.ensembles.device import DeviceRuns, check_device, on_processor
+from scvi_codegen.runs.ensembles.initial_states import momenta_of_each, start_of_ensemble
+from scvi_codegen.runs.ensembles.result import OK
+from scvi_codegen.runs.ensembles.schedule import CommonSteps
+from scvi_codegen.runs.ensembles.thread_pool import StopCheck, run_jobs
+from scvi_codegen.runs.states.rotations import homogeneous_state
+from scvi_codegen.runs.states.times import times_after
+from scvi_codegen.runs.states.validation import Array, EnsembleParameters, States
+from scvi_codegen.runs.stepping.features import require
+from scvi_codegen.runs.stepping.integrator import Integrator
+from scvi_codegen.runs.stepping.memory import Memory
+from scvi_codegen.runs.stepping.step_derivatives import Starts
+from scvi_codegen.runs.stepping.step_plan import Fixed
+
+CHECKED_STRIDE: Final = 64
+"""Stride of the trajectories whose step error is estimated."""
+
+
+class ChaosIndicatorsEnsemble:
+    """Computation of the chaos indicators of many initial states; arguments as of ``chaos_indicators_ensemble``."""
+
+    def __init__(
+        self,
+        stepper: Integrator,
+        q: States,
+        p: States,
+        *,
+        h: float,
+        steps: int,
+        count: int | None,
+        directions: ArrayLike | None,
+        save_every: int | None,
+        t: float,
+        parameters: EnsembleParameters,
+        options: SolverOptions | None,
+        device: str | None = None,
+    ) -> None:
+        require(stepper, "chaos_ensemble")
+        self.device = device
+        self.stepper, self.options = stepper, checked_options(options)
+        self.h, steps = checked_step(h), checked_count(steps, "steps", least=1)
+        self.save_every = steps if save_every is None else checked_count(save_every, "save_every", least=1)
+        if steps % self.save_every:
+            raise StateError(
+                f"steps={steps} must be a multiple of save_every={self.save_every}, so that the last value is saved"
+            )
+        start = checked_number(t, "the time t")
+        self.t = times_after(start, self.h, np.arange(steps + 1))[0]
+        self.q, self.p, self.parameters = start_of_ensemble(stepper, q, p, start, parameters)
+        self.changes = InitialTangents.checked(stepper, count, directions)
+        self.status = np.full(len(self.q), OK, dtype="<U32")
+        self.values = np.full((len(SERIES), len(self.t[:: self.save_every]), len(self.q), self._width()), np.nan)
+
+    def run(self, *, progress: Callable[[int], None] | None, threads: int | None) -> ChaosIndicators:
+        """Compute the indicators; ``progress`` is called with the number of finished trajectories and may raise.
+
+        Trajectories without SIMD support, or whose SIMD steps failed, use the derivatives of single steps.
+        """
+        report, left = progress or (lambda _: None), np.arange(len(self.q))
+        if self.device is not None:
+            left = self._on_device(report, threads)
+        elif (source := self._source()) is not None:
+            left = self._in_lanes(source, report, threads)
+        if len(left):
+            self.stepper.tangent  # noqa: B018  (compiled once, before threads ask for it)
+            before = len(self.q) - len(left)
+            run_jobs(
+                len(left),
+                lambda k, check_stop: self._follow(int(left[k]), check_stop),
+                progress=lambda done: report(before + done),
+                threads=threads,
+            )
+        self._warn_of_long_steps()
+        return ChaosIndicators.of(self.t[:: self.save_every], self.values, self.status)
+
+    def _warn_of_long_steps(self) -> None:
+        """Warn of too large steps: rerun every ``CHECKED_STRIDE``-th trajectory, as SIMD steps estimate no error.
+
+        Of trajectories on a GPU at most about ``CHECKED_STRIDE`` are run.
+        """
+        steps, runs = len(self.t) - 1, {}
+        stride = CHECKED_STRIDE if self.device is None else max(CHECKED_STRIDE, len(self.q) // CHECKED_STRIDE)
+        for j in range(0, len(self.q), stride):
+            start = self.q[j], self.p[j]
+            arguments: dict[str, Any] = {"t": self.t[0], "parameters": self.parameters[j], "options": self.options}
+            memory = Memory.started(self.stepper, *start, plan=Fixed(self.h), **arguments)
+            with suppress(StepFailedError):
+                runs[j] = record(memory, steps, save_every=steps)
+        worst = max(runs, key=lambda j: np.nan_to_num(runs[j].step_error), default=None)
+        if worst is not None:
+            warn_of_large_steps(runs[worst], remedy=f" (trajectory {worst} of {len(self.q)})")
+
+    def _source(self) -> Source | None:
+        """Return the source of an ensemble with tangent vectors, or ``None``."""
+        if self.stepper.interface.constraints or self.stepper.interface.rotations:
+            return None
+        return self.stepper._variants[f"changes {self.values.shape[-1]}"]
+
+    def _on_device(self, report: Callable[[int], None], threads: int | None) -> NDArray[np.intp]:
+        """Process all trajectories on a GPU; return those that failed."""
+        source = self._source()
+        if source is None or constant(source, f"{source.prefix.upper()}_NEEDS_VELOCITIES"):
+            raise MethodError(
+                f"chaos indicators on a GPU are not available for '{self.stepper.title}': they require constant "
+                "diagonal masses, forces of positions and time, and SVI or collocation; omit device"
+            )
+        growth, plan, count = self._growth(source), self._plan(), len(self.q)
+        arguments = self.stepper, self.options, self._start(growth), self.parameters
+        runs = DeviceRuns(*arguments, lambda _, part: self.parameters[part], plan, record=growth)
+        runs.run(progress=lambda done: report(done * count // plan.steps), threads=threads)
+        return self._take(runs.device.copy_out(runs.q), runs.done == plan.steps)
+
+    def _in_lanes(self, source: Source, report: Callable[[int], None], threads: int | None) -> NDArray[np.intp]:
+        """Process all trajectories in SIMD lanes; return those that failed."""
+        growth, plan = self._growth(source), self._plan()
+        binding = Binding(building.load(source, flags=self.stepper.flags), source.prefix)
+        arguments = binding, self.options, self._start(growth), self.parameters, plan.t0, plan.fixed_segments()
+        runs = _GrowthRuns(growth, len(plan.numbers), *arguments)
+        runs.run(progress=lambda _: report(int(np.count_nonzero(runs.status == 0))), threads=threads)
+        return self._take(runs.saved, runs.status == 0)
+
+    def _growth(self, source: Source) -> _Growth:
+        return _Growth(source, self._first(0), len(self.q))
+
+    def _plan(self) -> CommonSteps:
+        steps = len(self.t) - 1
+        return CommonSteps(self.t[0], self.h, steps=steps, t_end=None, inputs={}, save_every=self.save_every)
+
+    def _start(self, growth: _Growth) -> tuple[Array, Array]:
+        """Return initial positions and momenta with those of the tangent vectors."""
+        count = len(self.q)
+        q, p = (np.hstack([x, np.tile(growth.frame(part), (count, 1))]) for part, x in enumerate((self.q, self.p)))
+        return q, p
+
+    def _take(self, saved: Array, ended: NDArray[np.bool_]) -> NDArray[np.intp]:
+        """Store (n, K, 5 k) values of the trajectories that have ended; return the others."""
+        values = saved.reshape(len(saved), len(self.q), len(SERIES), -1)
+        self.values[:, :, ended] = values.transpose(2, 0, 1, 3)[:, :, ended]
+        return np.flatnonzero(~ended)
+
+    def _width(self) -> int:
+        """Return the number of tangent vectors of the first trajectory that can be started (constraints reduce it)."""
+        for j in range(len(self.q)):
+            with suppress(StepFailedError):
+                return int(self._first(j).shape[1])
+        return self.changes.count or self.changes.size
+
+    def _first(self, j: int) -> Array:
+        """Return the (2m, k) initial tangent vectors of trajectory j."""
+        start = self.q[j], self.p[j], self.h, float(self.t[0])
+        return self.changes.at(*start, self.parameters[j], self.options)
+
+    def _follow(self, j: int, check_stop: StopCheck) -> None:
+        """Integrate trajectory j with tangent vectors, by derivatives of single steps; NaN after a failed step."""
+        stepper, steps = self.stepper, len(self.t) - 1
+
+        def propagate_chunk(part: Starts, numbers: NDArray[np.intp], vectors: Array) -> None:
+            check_stop(int(numbers[-1]))
+            stepper._propagate(part, vectors, self.parameters[j], self.options)
+
+        def step_segments() -> Iterator[StepSegment]:
+            now = self.q[j], self.p[j]
+            for first in range(0, steps, LARGEST_CHUNK):
+                last = min(first + LARGEST_CHUNK, steps)
+                starts = Starts.chain(*now, self.t[first:last], np.full(last - first, self.h))
+                reached = np.arange(first, last + 1)
+                yield starts, np.where(reached % self.save_every, -1, reached // self.save_every)
+                now = starts.q[-1], starts.p[-1]
+
+        propagation = None
+        try:
+            propagation = TangentPropagation(self.changes, self._first(j), self.t[:: self.save_every])
+            propagation.follow(step_segments(), propagate_chunk)
+        except StepFailedError as failure:
+            self.status[j] = failure.status
+        self.values[:, :, j] = np.nan if propagation is None else propagation.growth.values
+
+
+class _Growth:
+    """Growth of the same initial tangent vectors (2m, k) of K trajectories, in SIMD lanes or threads of a GPU."""
+
+    def __init__(self, source: Source, tangents: Array, count: int) -> None:
+        self.source, (self.orthonormal, triangle) = source, np.linalg.qr(tangents)
+        k = tangents.shape[1]
+        with np.errstate(divide="ignore"):  # linearly dependent directions span zero volume
+            diagonal = np.log(np.abs(np.diagonal(triangle)))
+        self.numbers = np.concatenate([np.zeros(2 * k), diagonal, np.zeros(3 * k), triangle.ravel()])
+        self.rows = np.tile(self.numbers[:, np.newaxis], count)
+        self.saved: Array | None = np.tile(self.numbers[: len(SERIES) * k], (count, 1))
+
+    def frame(self, part: int) -> Array:
+        """Return the (m k,) positions or momenta of the orthonormal tangent vectors, one after the other."""
+        return np.split(self.orthonormal, 2)[part].T.ravel()
+
+
+class _GrowthRuns(Batch):
+    """Trajectories in SIMD lanes whose growth of tangent vectors is saved; further arguments as of :class:`Batch`.
+
+    Attributes:
+        saved: (rows, K, 5 k) values, NaN where not reached.
+    """
+
+    def __init__(self, growth: _Growth, rows: int, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self.growth, self.width = growth, len(self.binding.new("block *").active)
+        first = cast(Array, growth.saved)
+        self.saved = np.full((rows, *first.shape), np.nan)
+        self.saved[0] = first
+
+    def call(self, first: int, end: int) -> _GrowthCall:
+        """Return the calls for a range of trajectories."""
+        return _GrowthCall(self, first, end)
+
+
+class _GrowthCall(Call):
+    """Calls with the memory of a block."""
+
+    def __init__(self, work: _GrowthRuns, first: int, end: int) -> None:
+        super().__init__(work, first, end)
+        self.memory = self.struct.block = work.binding.new("block *")
+        self.struct.positions, self.struct.growth = work.binding.pointers(work.saved, work.growth.numbers)
+        self.struct.trajectories = len(work.q)
+
+
+def indicators_of_ensemble(
+    stepper: Any,
+    q: States,
+    p: States | None,
+    velocity: States | None,
+    *,
+    progress: Callable[[int], None] | None,
+    threads: int | None,
+    **settings: Any,
+) -> ChaosIndicators:
+    """Return the indicators of :meth:`scvi_codegen.Stepper.chaos_indicators_ensemble`."""
+    q, p, velocity = homogeneous_state(stepper.interface, q, p, velocity)
+    if settings["device"] is not None:
+        check_device(settings["device"])
+        q, p, velocity = map(on_processor, (q, p, velocity))
+        settings["parameters"] = on_processor(settings["parameters"])
+    p = momenta_of_each(stepper, q, p, velocity, settings["t"], settings["parameters"])
+    return ChaosIndicatorsEnsemble(stepper, q, p, **settings).run(progress=progress, threads=threads)

@@ -1,0 +1,814 @@
+"""Periodic orbits: Newton's iteration on the state after one period, with the exact monodromy matrix.
+
+The steps of a period are equal, or chosen adaptively and then frozen relative to the period while Newton's method
+iterates. A run of more steps that end at other times confirms the closure: with its defect d, of the end minus the
+start, and the Jacobian A of the closing equations, -A^+ d is the distance to the orbit of the finer steps, the
+discretisation error of the orbit.
+
+Where tangent vectors grow along the guess, the period is cut into segments first (multiple shooting).
+
+Periodic orbits are not isolated: the initial point is arbitrary, and orbits form one-parameter families (by energy or
+another conserved quantity). Each Newton step is the minimum-norm solution of the linearised equations (Moore-Penrose
+inverse), so the iteration converges to a nearby orbit without phase conditions. Equations implied by conserved
+quantities are projected out (Munoz-Almaraz et al., Physica D 181 (2003) 1).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from scvi_codegen.analysis.estimation.fixed_steps import tangents_along
+from scvi_codegen.analysis.estimation.measurements import state_names
+from scvi_codegen.analysis.orbits.step_sequence import StepSequence
+from scvi_codegen.codegen.native.arguments import checked_number, checked_step
+from scvi_codegen.codegen.native.options import SolverOptions
+from scvi_codegen.common.errors import (
+    AccuracyWarning,
+    EventError,
+    MethodError,
+    OrbitError,
+    StateError,
+    StepFailedError,
+    closest,
+    warn,
+)
+from scvi_codegen.common.representation import summary
+from scvi_codegen.common.validation import checked_count, checks_arguments
+from scvi_codegen.runs.accuracy.size import RESOLVED, SizeOfMotion, roundoff
+from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted, without_accuracy_warnings
+from scvi_codegen.runs.states.reduction import Reduction
+from scvi_codegen.runs.states.rotations import checked_pair, homogeneous_state
+from scvi_codegen.runs.states.times import steps_within
+from scvi_codegen.runs.states.validation import Array, Parameters, check_inputs_given, checked_vector
+from scvi_codegen.runs.stepper import STEPPER, Stepper
+from scvi_codegen.runs.stepping.features import require
+from scvi_codegen.runs.stepping.step_plan import Fixed
+from scvi_codegen.runs.trajectory import Trajectory
+
+SYMPLECTIC = 1e-9
+"""Symplecticity defect of a monodromy matrix, relative to its squared norm, above which it is not due to rounding."""
+SAME = 1e-6
+"""Deviation of a stability index from 1 that rounding may cause."""
+ERROR, ERROR_OF_EQUAL_STEPS = 1e-9, 1e-6
+"""Default bounds of the discretisation error, of adaptive steps and of those that the user chose."""
+TOLERANCES = (1e-2, 1e-4, 0.0)
+"""Local tolerances of adaptive steps, relative to the bound of the discretisation error, until one meets it."""
+TRIVIAL = 1e-3
+"""Deviation of the trivial stability index from 1 that is reported."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PeriodicOrbit:
+    """Periodic orbit of the computed map.
+
+    Attributes:
+        q, p: (m,) initial state.
+        t: initial time.
+        period: the period.
+        steps: number of steps per period.
+        sequence: ends of the steps relative to the period.
+        monodromy: (2m, 2m) derivative of the end with respect to the start; of systems with rotations in canonical
+            coordinates of the reduced space, with 6 rows for a rotation, 4 for a direction and 2 for a spin.
+        residual: largest entry of the end minus the start, of the computed map.
+        error: discretisation error of the orbit: the distance to the orbit of a run with 2.6 times as many steps, which
+            end at other times. It is the largest of three relative errors: of the positions and of the momenta at the
+            start, with their rounding errors, relative to the largest range of a position and the largest momentum of a
+            velocity over the orbit, and of the period.
+        trivial_error: deviation from 1 of the stability index (of steps that are not symplectic: the multiplier)
+            nearest to 1, where motions that are shifted in time make it 1; NaN if the system depends on time.
+        iterations: number of Newton iterations.
+        parameters: (k,) in the order of ``stepper.parameters``.
+        stepper: the compiled integrator.
+    """
+
+    q: Array
+    p: Array
+    t: float
+    period: float
+    steps: int
+    monodromy: Array
+    residual: float
+    error: float
+    trivial_error: float
+    iterations: int
+    parameters: Array
+    stepper: Stepper = field(repr=False)
+    sequence: StepSequence = field(repr=False)
+    options: SolverOptions | None = field(default=None, repr=False)
+
+    __repr__ = summary("q", "p", "period", "steps", "error")
+
+    def run(self, *, save_every: int = 1) -> Trajectory:
+        """Return the trajectory of one period, every ``save_every``-th state; of adaptive steps a new adaptive run."""
+        adaptive = self.sequence.tolerance is not None
+        steps: dict[str, Any] = (
+            {"t_end": self.t + self.period, "tolerance": self.sequence.tolerance or None}
+            if adaptive
+            else {"h": self.period / self.steps, "steps": self.steps}
+        )
+        return self.stepper.integrate(
+            self.q, self.p, **steps, save_every=save_every, t=self.t, parameters=self.parameters, options=self.options
+        )
+
+    @property
+    def energy(self) -> float:
+        """Energy of the initial state."""
+        return float(self.stepper.energy(self.q, self.p, self.t, self.parameters))
+
+    @cached_property
+    def multipliers(self) -> NDArray[np.complex128]:
+        """(2m,) Floquet multipliers, the eigenvalues of the monodromy matrix, in descending order of modulus.
+
+        Multiple eigenvalues at 1, caused by conserved quantities, are accurate to half of the digits only.
+        """
+        values = np.linalg.eigvals(self.monodromy).astype(complex)
+        return values[np.argsort(-np.abs(values))]
+
+    @property
+    def reciprocal_error(self) -> float:
+        """Deviation of the multipliers' moduli from the pairs s, 1/s of symplectic maps: the largest ``|s s' - 1|``."""
+        sizes = np.abs(self.multipliers)
+        return float(np.abs(sizes * sizes[::-1] - 1.0).max())
+
+    @property
+    def symplectic_error(self) -> float:
+        """Symplecticity defect of the monodromy matrix, relative to its squared norm."""
+        product = _inverse(self.monodromy) @ self.monodromy - np.eye(len(self.monodromy))
+        return float(np.abs(product).max() / max(1.0, np.linalg.norm(self.monodromy, 2) ** 2))
+
+    @cached_property
+    def stability_indices(self) -> NDArray[np.complex128]:
+        """(m,) stability indices (s + 1/s)/2 of the pairs of multipliers s, 1/s, descending; stable between -1 and 1.
+
+        They have the accuracy of the monodromy matrix, also at 1 (Broucke, AIAA J. 7 (1969) 1003; Howell, Celest. Mech.
+        32 (1984) 53).
+
+        Raises:
+            MethodError: if the steps are not symplectic.
+        """
+        if self.symplectic_error > SYMPLECTIC:
+            raise MethodError(
+                f"stability indices are undefined: steps of '{self.stepper.title}' are not symplectic; use multipliers"
+            )
+        left = list(np.linalg.eigvals(self.monodromy + _inverse(self.monodromy)).astype(complex) / 2.0)
+        indices = []
+        while left:
+            one = left.pop(int(np.argmax(np.abs(left))))
+            indices.append((one + left.pop(int(np.argmin(np.abs(np.array(left) - one))))) / 2.0)
+        return np.array(indices)
+
+    @property
+    def stable(self) -> bool:
+        """Return whether no multiplier exceeds 1 in modulus, up to rounding."""
+        if self.symplectic_error > SYMPLECTIC:
+            return bool(np.abs(self.multipliers).max() <= 1.0 + SAME)
+        indices = self.stability_indices
+        return bool((np.abs(indices.real) <= 1.0 + SAME).all() and (np.abs(indices.imag) <= SAME).all())
+
+
+def _inverse(matrix: Array) -> Array:
+    m = len(matrix) // 2
+    a, b, c, d = matrix[:m, :m], matrix[:m, m:], matrix[m:, :m], matrix[m:, m:]
+    return np.block([[d.T, -b.T], [-c.T, a.T]])
+
+
+MOST_ITERATIONS, MOST_HALVINGS = 50, 12
+EASY, GROWTH = 10.0, 4.0
+"""Growth of tangent vectors in a period up to which one segment is enough, and that in each of more segments."""
+NULL_SINGULAR_VALUE = 1e-9
+"""Singular values below this fraction of the largest count as zero in the pseudoinverse."""
+CLOSED = 1e-11
+"""Largest closing error, relative to the size of the motion and the norm of the monodromy matrix."""
+CONSERVED = 1e-3
+"""Relative error of the transported gradient of an integral up to which the integral counts as conserved."""
+DIFFERENCE_INCREMENT = 1e-6
+"""Increment of the finite differences of integrals, relative to the size of the motion, or of the flow, relative to
+the period."""
+SETTLED = 1e-13
+"""Newton step, relative to the motion and the period, below which the iteration ends."""
+MOST_INCREASE = 10.0
+"""Largest factor by which a Newton step may increase the residual."""
+LEAST_SIZE = 1e-300
+"""Size of a motion at rest at the origin."""
+FREEDOM = 3.0
+"""Largest factor by which the period of an orbit may differ from its guess."""
+FAR = 1.5
+"""Factor between the periods, and part of the distance of the guess from the middle of the orbit, beyond which an
+orbit is not the guessed one."""
+OTHER = 1.0 / 3.0
+"""Part of the amplitude of an orbit from which its distance to the guess is reported."""
+EQUILIBRIUM_MOTION = 1e-6
+"""Ranges over a period, relative to the distance from the guess, below which an orbit counts as an equilibrium."""
+
+
+@checks_arguments(StateError, stepper=STEPPER)
+def periodic_orbit(
+    stepper: Stepper,
+    q: ArrayLike,
+    p: ArrayLike | None = None,
+    *,
+    velocity: ArrayLike | None = None,
+    period: float,
+    steps: int | None = None,
+    h: float | None = None,
+    error: float | None = None,
+    fixed_period: bool = False,
+    energy: float | None = None,
+    fixed: Sequence[str] = (),
+    gain: ArrayLike | None = None,
+    t: float = 0.0,
+    parameters: Parameters = None,
+    options: SolverOptions | None = None,
+) -> PeriodicOrbit:
+    """Find a periodic orbit near an initial guess, by Newton's iteration with exact derivatives of the steps.
+
+    Where the orbit is unstable, multiple shooting improves the guess first. Give a state on the orbit and the period;
+    without ``fixed`` or ``energy`` the orbit is one of a family near the guess. Steps are adaptive along the guess and
+    frozen, relative to the period, while Newton's method iterates, unless ``steps`` or ``h`` makes them equal. A run
+    with more steps then measures the discretisation error, ``orbit.error``; an
+    :class:`~scvi_codegen.AccuracyWarning` reports one above the bound ``error``. If the iteration
+    fails or converges to an equilibrium, it is repeated from a closed curve near the guess, and with fixed positions.
+    An :class:`~scvi_codegen.AccuracyWarning` reports an orbit that differs from the guess by more than a third of its
+    amplitude, with its period, this distance and its amplitude: another member of the family, or another orbit.
+
+    Args:
+        stepper: the compiled stepper.
+        q, p, velocity: (m,) initial guess of a state on the orbit, with one of p and velocity. Rotations must close as
+            rotations, not as quaternions.
+        period: initial guess of the period, positive.
+        steps: number of equal steps per period, instead of adaptive ones.
+        h: instead of ``steps``, the largest step size for the initial period; its sign is ignored.
+        error: bound of the discretisation error ``orbit.error``, by default 1e-9; adaptive steps become smaller until
+            it is met. By default 1e-6 with ``steps`` or ``h``, which it does not change.
+        fixed_period: keep the period fixed; required if the system depends on time.
+        energy: prescribed energy of the orbit.
+        fixed: coordinates and momenta (``"p_x"``) that keep their initial values: an amplitude, or a section such as
+            ``["y"]``.
+        gain: (m,) increase of the positions over a period: 2 pi for a rotating angle, by default 0.
+        t, parameters, options: as of :meth:`Stepper.integrate`.
+
+    Returns:
+        A :class:`PeriodicOrbit`.
+
+    Raises:
+        OrbitError: if the iteration does not converge, converges to an equilibrium or to another energy, or if the
+            system is not periodic in time with this period.
+        MethodError: if time is transformed, the stepper has constraints, an energy is prescribed with
+            forces, or the period of a time-dependent system is free.
+        StateError: if a shape, name or number is invalid, or an input is not set.
+        StepFailedError: if a step from the initial guess fails.
+    """
+    stepper = stepper.bind(q, parameters)[0]._known_with_events
+    q, p, velocity = homogeneous_state(stepper.interface, q, p, velocity)
+    interface, names = stepper.interface, state_names(stepper)
+    require(stepper, "periodic_orbit")
+    check_inputs_given(interface, parameters)
+    if energy is not None:
+        require(stepper, "energy")
+    if (period := checked_number(period, "the period")) <= 0.0:
+        raise StateError(f"the period must be positive, not {period:g}")
+    if steps is not None and h is not None:
+        raise StateError(
+            "give the number of steps per period (steps=200), or the largest step size (h=0.05), or neither for "
+            f"adaptive steps; periodic_orbit got both, steps={steps} and h={h}"
+        )
+    if adaptive := steps is None and h is None:
+        require(stepper, "adaptive")
+    bound = ERROR if adaptive else ERROR_OF_EQUAL_STEPS
+    if error is not None and not 0.0 < (bound := checked_number(error, "error")) < 1.0:
+        raise StateError(f"error must be between 0 and 1, a bound of the relative discretisation error, not {bound:g}")
+    for name in fixed:
+        if name not in names:
+            raise StateError(f"fixed names '{name}', which is no coordinate or momentum{closest(name, names)}")
+    t, values = checked_number(t, "the time t"), stepper._parameters(parameters)
+    momenta = stepper._initial_momenta(q, p, velocity, t, values)
+    start = np.concatenate(checked_pair(stepper.interface, q, momenta))
+    search = _OrbitSearch(
+        stepper=stepper,
+        at_rest=_momenta_at_rest(stepper, start[: stepper.dimension], t, values),
+        reduction=Reduction(interface),
+        period=period,
+        sequence=None if adaptive else StepSequence.equal(_count_of_steps(period, steps, h)),
+        fixed_indices=(*map(names.index, dict.fromkeys(fixed)), *([-1] if fixed_period else [])),
+        energy=None if energy is None else checked_number(energy, "the energy"),
+        gain=np.zeros(stepper.dimension) if gain is None else checked_vector(interface, gain, "gain"),
+        t=t,
+        parameters=values,
+        options=options,
+    )
+    return search.orbit(np.append(start, search.period), bound)
+
+
+def _momenta_at_rest(stepper: Stepper, q: Array, t: float, parameters: Array) -> Array:
+    with suppress(StateError):  # undefined of most Hamiltonians
+        return stepper.momentum(q, np.zeros_like(q), t, parameters)
+    return np.zeros_like(q)
+
+
+def _count_of_steps(period: float, steps: int | None, h: float | None) -> int:
+    return checked_count(steps, "steps", least=1) if h is None else int(steps_within(period, checked_step(h)))
+
+
+@dataclass(frozen=True, eq=False)
+class _OrbitSearch:
+    """Equations of a periodic orbit as a function of z = (q, p, period).
+
+    Attributes:
+        reduction: maps between (q, p) and the tangent space without gauge directions of rotations.
+        sequence: ends of the steps relative to the period; ``None`` for adaptive ones that are not yet known.
+        fixed_indices: indices of the fixed entries of z, -1 that of the period.
+        at_rest: (m,) momenta without velocity at the guess, which are no size of the motion.
+    """
+
+    stepper: Stepper
+    reduction: Reduction
+    at_rest: Array
+    period: float
+    sequence: StepSequence | None
+    fixed_indices: tuple[int, ...]
+    energy: float | None
+    gain: Array
+    t: float
+    parameters: Array
+    options: SolverOptions | None
+
+    def orbit(self, guess: Array, bound: float) -> PeriodicOrbit:
+        """Return the orbit near a guess, with a discretisation error below a bound if steps are adaptive.
+
+        Raises as :func:`periodic_orbit`.
+        """
+        if self.sequence is not None:
+            orbit = self._nearest(guess)
+        else:
+            orbit = self._adapted(guess, TOLERANCES[0] * bound)._nearest(guess)
+            for part in TOLERANCES:  # the first sequence of steps is that of the guess, a different motion
+                near = np.concatenate([orbit.q, orbit.p, [orbit.period]])
+                refreshed = self._adapted(near, part * bound)._refreshed(near)
+                orbit = replace(refreshed, iterations=orbit.iterations + refreshed.iterations)
+                if orbit.error <= bound:
+                    break
+        _warn_of_distance(orbit, guess)
+        _warn_of_discretisation(orbit, bound)
+        return orbit
+
+    def _adapted(self, z: Array, tolerance: float) -> _OrbitSearch:
+        """Return the search with the steps of an adaptive run along z."""
+        at = self.t, self.parameters, self.options
+        return replace(self, sequence=StepSequence.adaptive(self.stepper, z[:-1], float(z[-1]), tolerance, *at))
+
+    def _refreshed(self, z: Array) -> PeriodicOrbit:
+        """Return the orbit of the steps of this search next to one of other steps."""
+        try:
+            return self._described(*self._iterated(z, self._closing(z), 0), guess=z)
+        except OrbitError:
+            return self._nearest(z)
+
+    def _nearest(self, guess: Array) -> PeriodicOrbit:
+        """Return the orbit near a guess, found in one of a few attempts.
+
+        The first one starts at the trajectory of the guess; the second one at a closed curve near it. If nothing is
+        fixed two more keep the positions, so that the amplitude cannot vanish: then the iteration does not converge to
+        an equilibrium.
+        """
+        failures: list[Exception] = []
+        far: list[PeriodicOrbit] = []
+        attempts = [(self, False), (self, True)]
+        if self.energy is None and not set(self.fixed_indices) - {-1}:
+            held = replace(self, fixed_indices=(*self.fixed_indices, *range(self.stepper.dimension)))
+            attempts += [(held, False), (held, True)]
+        for search, smoothed in attempts:
+            try:
+                iterated = search._iterated(*search._by_segments(guess, smoothed=smoothed))
+                orbit = search._described(*iterated, guess=guess)
+                if _is_near(orbit, guess, iterated[1].motion.states):
+                    return orbit
+                far.append(orbit)
+            except (OrbitError, StepFailedError, np.linalg.LinAlgError) as failure:
+                failures.append(failure)
+        if far:
+            return far[0]
+        raise next((each for each in failures if isinstance(each, OrbitError)), failures[0])
+
+    @property
+    def _steps(self) -> StepSequence:
+        """Steps of the search, after they are known."""
+        assert self.sequence is not None
+        return self.sequence
+
+    def _described(self, z: Array, equations: _ClosingEquations, iterations: int, *, guess: Array) -> PeriodicOrbit:
+        """Return the orbit at the end of the iteration, after all checks; raise OrbitError if there is none."""
+        m, motion = self.stepper.dimension, equations.motion
+        sizes = equations.sizes
+        reduced = self._reduced(sizes)
+        rounding = RESOLVED * roundoff(1) * float((np.abs(z[:-1]) / sizes).max())
+        scaled_norm = float(np.linalg.norm(equations.monodromy / reduced[:, np.newaxis] * reduced, 2))
+        allowed = (CLOSED + rounding) * max(1.0, scaled_norm)
+        if not equations.relative_error <= allowed:
+            raise OrbitError(
+                f"no periodic orbit was found near the guess: after {iterations} iterations the closing error is "
+                f"{equations.error:.1e}, for q = {_listed(z[:m])}, p = {_listed(z[m:-1])}, period {z[-1]:.6g}. "
+                "Give a better initial guess (unstable orbits need one within a few percent), fix an "
+                "amplitude, fixed=['x', ..], or the period, fixed_period=True, or take more steps"
+            )
+        self._check_energy(equations, allowed)
+        ranges, far = (each.reshape(2, m).max(axis=1) for each in (np.ptp(motion.states, axis=0), abs(z - guess)[:-1]))
+        if (ranges < EQUILIBRIUM_MOTION * far).any() or ranges[0] <= RESOLVED * roundoff(1) * np.abs(z[:m]).max():
+            raise OrbitError(
+                f"the iteration converged to an equilibrium, q = {_listed(z[:m])}, p = {_listed(z[m:-1])}: fix an "
+                "amplitude, fixed=['x', ..], or give a better initial guess"
+            )
+        if motion.by_time.any():
+            period = float(z[-1])
+            if -1 not in self.fixed_indices:
+                raise MethodError(
+                    f"'{self.stepper.interface.system}' depends on time: give the period of this dependence as period, "
+                    "with fixed_period=True"
+                )
+            later = replace(self, t=self.t + period)._closing(z)
+            apart = np.abs(later.motion.states[-1] - equations.motion.states[-1]) / sizes
+            away = max(float(apart.max()), later.relative_error)
+            if not away <= allowed:
+                raise OrbitError(
+                    f"the orbit from t = {self.t:g} does not close in the next period (error {away:.1e}): "
+                    f"'{self.stepper.interface.system}' is not periodic in time with the period {period:.10g}"
+                )
+        return PeriodicOrbit(
+            q=z[:m],
+            p=z[m:-1],
+            t=self.t,
+            period=float(z[-1]),
+            steps=len(self._steps),
+            sequence=self._steps,
+            monodromy=equations.monodromy,
+            residual=equations.error,
+            error=self._discretisation_error(z, equations),
+            trivial_error=math.nan if motion.by_time.any() else _trivial_error(equations.monodromy),
+            iterations=iterations,
+            parameters=self.parameters,
+            stepper=self.stepper,
+            options=self.options,
+        )
+
+    def _by_segments(self, guess: Array, *, smoothed: bool) -> tuple[Array, _ClosingEquations, int]:
+        """Improve a guess by multiple shooting where tangent vectors grow along it; one segment needs no improvement.
+
+        States at the ends of segments are further unknowns, and continuity there further equations (Stoer & Bulirsch,
+        *Introduction to Numerical Analysis*, 7.3.5). The first nodes are those of half a period forward and half a
+        period backward from the guess: an error of the guess grows by the square root of the growth in a period.
+        """
+        steps, start = self._steps, guess[:-1]
+        half, count = steps.middle, len(steps)
+        inward = self.reduction.inward(*np.split(start, 2))
+        if self.stepper.changes_states:  # derivatives through events require runs forward in time
+            forward = self._segment(start, steps, 0, count, guess[-1])
+            monodromy = self._leaving(forward) @ forward.monodromy @ inward
+            later = self._states_before(start, guess[-1])
+        else:
+            forward = self._segment(start, steps, 0, half, guess[-1])
+            backward = self._segment(start, steps.reversed, 0, count - half, -guess[-1])
+            forth, back = (self._leaving(each) @ each.monodromy @ inward for each in (forward, backward))
+            later, monodromy = backward.states, np.asarray(np.linalg.solve(back.T, forth.T).T)
+        growth = float(np.abs(np.linalg.eigvals(monodromy)).max())
+        if growth <= EASY:
+            return guess, self._closing(guess), 0
+        segments = min(2 * int(np.ceil(np.log(growth) / np.log(GROWTH) / 2.0)) * (1 + smoothed), count)
+        later = later + np.append(self.gain, np.zeros(len(self.gain)))
+        path = np.vstack([start, forward.states[: count - len(later)], later[-2::-1]])
+        if smoothed and len(later) > 1:  # distributes the jump in the middle, quadratically in time
+            middle = count - len(later)
+            jump = later[-1] - forward.states[middle - 1]
+            share = np.minimum(np.arange(len(path)) / middle, (count - np.arange(len(path))) / len(later))
+            path += np.outer(np.where(np.arange(len(path)) <= middle, 0.5, -0.5) * share**2, jump)
+        nodes = np.append(path[self._bounds(segments)[:-1]], guess[-1])
+        z, _, iterations = self._iterated(nodes, self._closing(nodes), 0)
+        nearer = np.append(z[: len(start)], z[-1])
+        return nearer, self._closing(nearer), iterations
+
+    def _states_before(self, start: Array, period: float) -> Array:
+        """Return the states before a state, in equal steps back over half a period, of impacts that can be undone."""
+        count = len(self._steps)
+        plan, steps, (q, p) = Fixed(-period / count), count - count // 2, np.split(start, 2)
+        if self._steps.tolerance is None and not any(event.changes for event in self.stepper.events):
+            run = self.stepper._started(q, p, None, plan, self.t, self.parameters, self.options)
+            with suppress(EventError, StepFailedError):
+                motion, ends = run._recorded(steps), self.t + plan.h * np.arange(1, steps + 1)
+                rows = np.searchsorted(-motion.t, -ends + 0.5**30 * period, side="right") - 1
+                return np.concatenate([motion.q, motion.p], axis=1)[rows]
+        return start[np.newaxis]
+
+    def _bounds(self, count: int) -> NDArray[np.intp]:
+        """Return the (count + 1,) numbers of the steps at which segments begin and end."""
+        return np.linspace(0, len(self._steps), count + 1).round().astype(np.intp)
+
+    def _iterated(
+        self, z: Array, equations: _ClosingEquations, iterations: int
+    ) -> tuple[Array, _ClosingEquations, int]:
+        """Iterate until no step helps; return the unknowns, their equations, and the number of all iterations."""
+        while iterations < MOST_ITERATIONS and (nearer := self._newton_iterate(z, equations)) is not None:
+            (z, equations), iterations = nearer, iterations + 1
+        return z, equations, iterations
+
+    def _check_energy(self, equations: _ClosingEquations, allowed: float) -> None:
+        """Raise :class:`OrbitError` if a closed orbit has another energy.
+
+        ``allowed`` is the error of its state relative to the motion; that of the energy may be its rounding error.
+        """
+        if self.energy is None:
+            return
+        away, row = float(equations.defects[-1]), float(self._row_units(equations)[-1])
+        if not abs(away) <= allowed * row + RESOLVED * roundoff(1) * abs(self.energy):
+            raise OrbitError(
+                f"the periodic orbit near the guess has the energy {self.energy + away:.10g}, not {self.energy:.10g}: "
+                "fix fewer entries of the state, or give a better initial guess"
+            )
+
+    def _newton_iterate(self, z: Array, equations: _ClosingEquations) -> tuple[Array, _ClosingEquations] | None:
+        """Return the damped Newton iterate, or ``None`` if no step length succeeds or the step is negligible.
+
+        A step length is accepted if the simplified Newton correction with the same Jacobian decreases (Deuflhard's
+        natural monotonicity test), which is independent of the unstable direction that dominates the residuals.
+        """
+        inverse, units = self._inverse(equations), self._units(equations)
+        change = inverse @ equations.defects
+        rows, size = self._row_units(equations), float(np.linalg.norm(change / units))
+        residual = float(np.linalg.norm(equations.defects / rows))
+        if size <= SETTLED * math.sqrt(len(z)):
+            return None
+        for shortened in 0.5 ** np.arange(MOST_HALVINGS):
+            trial = z - shortened * change
+            if not self.period / FREEDOM <= trial[-1] <= self.period * FREEDOM:
+                continue
+            states = trial[:-1].reshape(-1, 2, self.stepper.dimension)
+            trial[:-1] = np.ravel([self.reduction.normalised(*state) for state in states])
+            with suppress(EventError, StepFailedError):
+                at = self._closing(trial)
+                less = np.linalg.norm(inverse @ at.defects / units) < (1.0 - shortened / 4.0) * size
+                if less and np.linalg.norm(at.defects / rows) < MOST_INCREASE * residual:
+                    return trial, at
+        return None
+
+    def _units(self, equations: _ClosingEquations) -> Array:
+        """Return the sizes of the unknowns: of the motion for each start of a segment, and the time of one radian."""
+        return np.append(np.tile(equations.sizes, len(equations.segments)), self.period / (2.0 * math.pi))
+
+    def _row_units(self, equations: _ClosingEquations) -> Array:
+        """Return the sizes of the equations, of that of the energy the change by the size of the motion."""
+        rows = np.tile(self._reduced(equations.sizes), len(equations.segments))
+        if self.energy is None:
+            return rows
+        return np.append(rows, float(np.linalg.norm(equations.partials[-1] * self._units(equations))) or 1.0)
+
+    def _inverse(self, equations: _ClosingEquations) -> Array:
+        """Return the pseudoinverse of the Jacobian in units of the motion; fixed unknowns do not change."""
+        units, rows = self._units(equations), self._row_units(equations)
+        free = np.delete(np.arange(len(units)), self.fixed_indices)
+        inverse = np.zeros((len(units), len(rows)))
+        scaled = equations.partials[:, free] * units[free] / rows[:, np.newaxis]
+        inverse[free] = units[free, np.newaxis] * np.linalg.pinv(scaled, NULL_SINGULAR_VALUE) / rows
+        return inverse
+
+    def _reduced(self, sizes: Array) -> Array:
+        """Return sizes (2m,) of positions and momenta as those of the coordinates of the reduced tangent space."""
+        return np.repeat(sizes[[0, -1]], self.reduction.size // 2)
+
+    def _size_of(self, states: Array) -> SizeOfMotion:
+        q, p = np.split(states, 2, axis=1)
+        return SizeOfMotion.of(q, p, self.at_rest)
+
+    def _sizes_of(self, states: Array) -> Array:
+        """Return the (2m,) sizes of positions and momenta along states, at least their rounding errors."""
+        size = self._size_of(states)
+        of_q, of_p = (RESOLVED * each or LEAST_SIZE for each in size.rounding)
+        return np.repeat([max(size.position, of_q), max(size.momentum, of_p)], self.stepper.dimension)
+
+    def _closing(self, z: Array) -> _ClosingEquations:
+        """Integrate one period and return the residuals with their derivatives; ``z`` has the start of each segment."""
+        size = 2 * self.stepper.dimension
+        starts = z[:-1].reshape(-1, size)
+        count = len(starts)
+        bounds = self._bounds(count)
+        segments = [
+            self._segment(start, self._steps, first, last, z[-1])
+            for start, first, last in zip(starts, bounds[:-1], bounds[1:], strict=True)
+        ]
+        sizes = self._sizes_of(np.vstack([starts, *(segment.states for segment in segments)]))
+        gradients = [
+            self._integral_gradients(start, segment.start_time, sizes)
+            for start, segment in zip(starts, segments, strict=True)
+        ]
+        left = self._independent_equations(starts, segments, gradients, sizes)
+        rows = np.zeros((count, self.reduction.size, count * size + 1))
+        defects = np.zeros(rows.shape[:2])
+        for k, segment in enumerate(segments):
+            after = (k + 1) % count
+            leaving, outward = self._leaving(segment), self.reduction.outward(*np.split(starts[after], 2))
+            end = segment.states[-1].copy()
+            end[: size // 2] -= self.gain * (after == 0)
+            defects[k] = outward @ (self.reduction.aligned(end, starts[after]) - starts[after])
+            rows[k, :, k * size : (k + 1) * size] = leaving @ segment.monodromy
+            rows[k, :, after * size : (after + 1) * size] -= outward
+            rows[k, :, -1] = leaving @ segment.by_period
+        error, relative_error = (float(np.abs(each).max()) for each in (defects, defects / self._reduced(sizes)))
+        monodromy = leaving @ segments[-1].monodromy @ self.reduction.inward(*np.split(starts[-1], 2))
+        rows[-1], defects[-1] = left @ rows[-1], left @ defects[-1]
+        partials, wanted = rows.reshape(defects.size, -1), defects.ravel()
+        if self.energy is not None:
+            first = starts[0]
+            energy = self.stepper.energy(first[: size // 2], first[size // 2 :], self.t, self.parameters)
+            wanted = np.append(wanted, energy - self.energy)
+            row = np.zeros(len(z))
+            row[:size] = gradients[0][0]
+            partials = np.vstack([partials, row])
+        return _ClosingEquations(segments, monodromy, error, relative_error, sizes, wanted, partials, left)
+
+    def _leaving(self, segment: _Segment) -> Array:
+        """Return the matrix from changes of (q, p) at the end of a segment to the reduced tangent space."""
+        return self.reduction.outward(*np.split(segment.states[-1], 2))
+
+    def _segment(self, start: Array, steps: StepSequence, first: int, last: int, period: float) -> _Segment:
+        """Integrate from the start of step ``first`` of a sequence to the start of step ``last``."""
+        size, ends, widths = len(start), steps.ends[first : last + 1], steps.widths[first:last]
+        tangents = np.zeros((size + 2, self.stepper._input_size))
+        tangents[:size, :size] = np.eye(size)
+        tangents[size, -2] = ends[0]
+        tangents[size + 1, -2] = 1.0
+        variations = np.zeros((last - first, size + 2))
+        variations[:, size] = widths
+        at = self.t + period * ends[:-1], period * widths, tangents, self.parameters, self.options, variations
+        states, vectors, _ = tangents_along(self.stepper, start, *at)
+        partials = vectors[-1].T.copy()
+        return _Segment(
+            states=states[1:],
+            start_time=self.t + period * float(ends[0]),
+            end_time=self.t + period * float(ends[-1]),
+            monodromy=partials[:, :size],
+            by_period=partials[:, size],
+            by_time=partials[:, size + 1],
+        )
+
+    def _discretisation_error(self, z: Array, equations: _ClosingEquations) -> float:
+        """Return the distance of a closed orbit to that of a finer sequence of steps; see :class:`PeriodicOrbit`."""
+        start, period, steps = z[:-1], float(z[-1]), self._steps.finer
+        tangents = np.zeros((0, self.stepper._input_size))
+        at = self.t + period * steps.ends[:-1], period * steps.widths, tangents, self.parameters, self.options
+        try:
+            states = tangents_along(self.stepper, start, *at)[0]
+        except (EventError, StepFailedError):
+            return math.inf
+        end = states[-1].copy()
+        end[: len(end) // 2] -= self.gain
+        outward = self.reduction.outward(*np.split(start, 2))
+        defects = equations.independent @ outward @ (self.reduction.aligned(end, start) - start)
+        change = self._inverse(equations) @ np.append(defects, np.zeros(len(equations.defects) - len(defects)))
+        q, p = (float(np.abs(part).max()) for part in np.split(change[:-1], 2))
+        return max(float(abs(change[-1])) / period, self._size_of(states).error(q, p))
+
+    def _independent_equations(
+        self, starts: Array, segments: Sequence[_Segment], gradients: Sequence[Array], sizes: Array
+    ) -> Array:
+        """Return the (size, size) projection onto the equations of return not implied by conserved quantities.
+
+        Energy and momentum maps count as conserved if the Jacobian of every segment maps their gradients accordingly,
+        and if events that change the state leave their values at the ends of steps unchanged.
+        """
+        conserved_masks, units = [], self._reduced(sizes)
+        inward = [self.reduction.inward(*np.split(start, 2)) for start in starts]
+        begins = [gradient @ own * units for gradient, own in zip(gradients, inward, strict=True)]
+        for start, segment, begin, own in zip(starts, segments, begins, inward, strict=True):
+            last = segment.states[-1]
+            end = self._integral_gradients(last, segment.end_time, sizes) @ self.reduction.inward(*np.split(last, 2))
+            end *= units
+            monodromy = self._leaving(segment) @ segment.monodromy @ own
+            monodromy = monodromy / units[:, np.newaxis] * units
+            largest = np.linalg.norm(end, axis=1) * np.linalg.norm(monodromy, 2)
+            conserved_masks.append(np.linalg.norm(end @ monodromy - begin, axis=1) <= CONSERVED * largest)
+            if self.stepper.changes_states:
+                states = np.vstack([start, segment.states])
+                values = self._integrals(states, np.linspace(segment.start_time, segment.end_time, len(states)))
+                conserved_masks.append(np.ptp(values, axis=0) <= CONSERVED * np.linalg.norm(begin, axis=1))
+        conserved = begins[0][np.all(conserved_masks, axis=0)]
+        conserved /= np.maximum(np.linalg.norm(conserved, axis=1), LEAST_SIZE)[:, np.newaxis]
+        directions, strengths, _ = np.linalg.svd(conserved.T, full_matrices=False)
+        directions = directions[:, strengths > CONSERVED * strengths.max(initial=0.0)]
+        projection = np.eye(self.reduction.size) - directions @ directions.T
+        return np.asarray(units[:, np.newaxis] * projection / units)
+
+    def _integral_gradients(self, state: Array, t: float, sizes: Array) -> Array:
+        """Return (r, 2m) gradients of the energy and the momentum maps by finite differences, for directions only."""
+        size, widths = len(state), DIFFERENCE_INCREMENT * sizes
+        states = np.vstack([state + np.diag(widths), state - np.diag(widths)])
+        values = self._integrals(states, np.full(2 * size, t))
+        return np.asarray((values[:size] - values[size:]).T / (2.0 * widths))
+
+    def _integrals(self, states: Array, t: Array) -> Array:
+        """Return (n, r) values of the energy and the momentum maps of states."""
+        q, p = map(np.ascontiguousarray, np.split(states, 2, axis=1))
+        maps = self.stepper.momentum_maps(q, p, t, self.parameters).reshape(len(t), -1)
+        return np.column_stack([self.stepper.energy(q, p, t, self.parameters), maps])
+
+
+def _listed(values: Array) -> str:
+    return f"[{', '.join(f'{x:.6g}' for x in values[:6])}{', ..' if len(values) > 6 else ''}]"
+
+
+def _trivial_error(monodromy: Array) -> float:
+    """Return the deviation from 1 of the stability index nearest to 1, of other matrices of the multiplier."""
+    product = _inverse(monodromy) @ monodromy - np.eye(len(monodromy))
+    if float(np.abs(product).max()) > SYMPLECTIC * max(1.0, float(np.linalg.norm(monodromy, 2)) ** 2):
+        return float(np.abs(np.linalg.eigvals(monodromy) - 1.0).min())
+    return float(np.abs(np.linalg.eigvals(monodromy + _inverse(monodromy)) / 2.0 - 1.0).min())
+
+
+def _warn_of_discretisation(orbit: PeriodicOrbit, bound: float) -> None:
+    """Warn if the discretisation error of an orbit exceeds a bound, or its trivial stability index differs from 1."""
+    if not warnings_wanted() or (orbit.error <= bound and not orbit.trivial_error > TRIVIAL):
+        return
+    deviation = ""
+    if orbit.trivial_error > TRIVIAL:
+        deviation = f", and the stability index that must be 1 differs from it by {orbit.trivial_error:.1e}"
+    remedy = "Omit steps and h, for adaptive steps, or take more steps"
+    if orbit.sequence.tolerance is not None:
+        remedy = "Use a method of higher degree, or fixed_period= or fixed= if the orbit is one of a family"
+    warn(
+        f"the periodic orbit is one of its {orbit.steps} steps rather than of the system: a run with "
+        f"{len(orbit.sequence.finer)} steps is closed by an orbit at the relative distance {orbit.error:.1e} (the "
+        f"bound is {bound:.1e}){deviation}. {remedy}",
+        AccuracyWarning,
+    )
+
+
+def _warn_of_distance(orbit: PeriodicOrbit, guess: Array) -> None:
+    """Warn if an orbit is another member of its family than that of the guess, or far from it."""
+    with without_accuracy_warnings():  # that of the orbit itself is a warning of its own
+        states = orbit.run()
+    amplitude = float(np.ptp(np.concatenate([states.q, states.p], axis=1), axis=0).max()) / 2.0
+    away = float(np.abs(np.concatenate([orbit.q, orbit.p]) - guess[:-1]).max())
+    if away > OTHER * amplitude or not _is_near(orbit, guess, np.concatenate([states.q, states.p], axis=1)):
+        warn(
+            f"the periodic orbit that was found is far from the guess: its period is {orbit.period:.6g}, not "
+            f"{guess[-1]:.6g}, and its state differs by {away:.2g}, where the amplitude of the orbit is "
+            f"{amplitude:.2g}. Compare both, or fix an amplitude",
+            AccuracyWarning,
+        )
+
+
+def _is_near(orbit: PeriodicOrbit, guess: Array, states: Array) -> bool:
+    """Return whether an orbit with (n, 2m) states is near the guess, by the distance of the guess from its middle."""
+    away, middle = np.concatenate([orbit.q, orbit.p]) - guess[:-1], (states.max(axis=0) + states.min(axis=0)) / 2.0
+    near = np.abs(away).max() <= FAR * np.abs(guess[:-1] - middle).max()
+    return bool(1 / FAR < orbit.period / guess[-1] < FAR and near)
+
+
+@dataclass(frozen=True, eq=False)
+class _Segment:
+    """Trajectory along some of the steps of a period.
+
+    Attributes:
+        states: (n, 2m) states after each step.
+        start_time, end_time: times of its ends.
+        monodromy, by_period, by_time: derivatives of the end; the last is 0 for autonomous systems.
+    """
+
+    states: Array
+    start_time: float
+    end_time: float
+    monodromy: Array
+    by_period: Array
+    by_time: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _ClosingEquations:
+    """Residuals of the conditions of continuity and closing.
+
+    Attributes:
+        segments: in their order.
+        monodromy: derivative of the end of the last segment by its start, without gauge directions.
+        error, relative_error: largest entry of the ends minus the starts that follow, itself and relative to sizes.
+        sizes: (2m,) sizes of the motion.
+        defects: (r,) residuals.
+        partials: (r, 2m segments + 1) Jacobian of the residuals with respect to the starts of segments and the period.
+        independent: (size, size) projection of the closing equations onto those that conserved quantities do not imply.
+    """
+
+    segments: Sequence[_Segment]
+    monodromy: Array
+    error: float
+    relative_error: float
+    sizes: Array
+    defects: Array
+    partials: Array
+    independent: Array
+
+    @property
+    def motion(self) -> _Segment:
+        (motion,) = self.segments
+        return motion

@@ -1,0 +1,111 @@
+"""Step sequence of a periodic orbit: where its steps end, relative to the period.
+
+An adaptive run along the guess determines the sequence. It is frozen while Newton's method iterates, so that the
+computed map is smooth and its derivatives are exact, and determined again from the orbit that was found.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from scvi_codegen.codegen.native.options import SolverOptions
+from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
+from scvi_codegen.runs.states.validation import Array
+from scvi_codegen.runs.stepper import Stepper
+
+FINER = 2.6
+"""Factor between the numbers of steps of a sequence and of the finer one that confirms it; no whole number, so that
+both have no inner end in common."""
+
+
+@dataclass(frozen=True, eq=False)
+class StepSequence:
+    """Ends of consecutive steps as fractions of the period.
+
+    Attributes:
+        ends: (n + 1,) ascending, from 0 to 1.
+        tolerance: that of the adaptive run from which they are; ``None`` of equal steps.
+    """
+
+    ends: Array
+    tolerance: float | None = None
+
+    @classmethod
+    def equal(cls, count: int) -> StepSequence:
+        """Return the sequence of equal steps."""
+        return cls(np.arange(count + 1) / count)
+
+    @classmethod
+    def adaptive(
+        cls,
+        stepper: Stepper,
+        start: Array,
+        period: float,
+        tolerance: float,
+        t: float,
+        parameters: Array,
+        options: SolverOptions | None,
+    ) -> StepSequence:
+        """Return the sequence of adaptive steps along a guess, half a period forward and half a period backward.
+
+        Both halves stay closer to the orbit than a whole period in one direction. Runs with events that change the
+        state go forward only, and their steps end at no event, whose time varies with the start.
+
+        Args:
+            stepper: the compiled stepper.
+            start, period: (2m,) state and period of the guess.
+            tolerance: that of the local error; 0 for round-off.
+            t, parameters, options: as of :class:`_OrbitSearch`.
+        """
+
+        def ends_of(duration: float) -> Array:
+            run = stepper.integrate(
+                *np.split(start, 2),
+                t_end=t + duration,
+                tolerance=tolerance or None,
+                t=t,
+                parameters=parameters,
+                options=options,
+                check_growth=False,
+            )
+            times, counts = np.unique(np.asarray(run.t), return_counts=True)
+            ends = np.abs(times - t)[(counts == 1) | (times == t)] / period
+            return np.sort(ends)
+
+        with without_accuracy_warnings():
+            if stepper.changes_states:
+                ends = ends_of(period)
+            else:
+                ends = np.concatenate([ends_of(0.5 * period), 1.0 - ends_of(-0.5 * period)[-2::-1]])
+        ends[0], ends[-1] = 0.0, 1.0
+        return cls(ends, tolerance)
+
+    def __len__(self) -> int:
+        return len(self.ends) - 1
+
+    @cached_property
+    def widths(self) -> Array:
+        """(n,) step sizes relative to the period."""
+        return np.full(len(self), 1.0 / len(self)) if self.tolerance is None else np.diff(self.ends)
+
+    @property
+    def middle(self) -> int:
+        """Number of the step that begins nearest to half a period."""
+        return len(self) // 2 if self.tolerance is None else int(np.abs(self.ends - 0.5).argmin())
+
+    @property
+    def reversed(self) -> StepSequence:
+        """Sequence of the same steps backward in time."""
+        return StepSequence(1.0 - self.ends[::-1], self.tolerance)
+
+    @property
+    def finer(self) -> StepSequence:
+        """Sequence of ``FINER`` times as many steps with the same relative density, and with other ends."""
+        count = int(np.ceil(FINER * len(self))) | 1
+        if self.tolerance is None:
+            return StepSequence.equal(count)
+        numbers = np.linspace(0.0, len(self), count + 1)
+        return StepSequence(np.interp(numbers, np.arange(len(self) + 1), self.ends), self.tolerance)

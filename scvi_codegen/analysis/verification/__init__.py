@@ -1,0 +1,217 @@
+"""Certificates of integrators: measurement of every guaranteed property of the code as built.
+
+Three independent computations are compared. The *compiled* step is compared with the paper's equations solved in 60
+digits (:mod:`scvi_codegen.methods.exact.step`) and, for its structure, with finite differences of itself. *These
+digits* are compared with the exact motion, computed from the formula of L or H alone
+(:mod:`scvi_codegen.methods.exact.solution`), and with other methods that are the same map. An error in the printed C,
+the tables, a kernel or a solver shows in the first comparison; an error in the derivation, which both sides share, in
+the second.
+
+States and parameters are perturbed slightly, so that no symmetry and no mass of 1 hides an error.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from scvi_codegen.analysis.verification.certificate import Certificate, Check, Outcome, issued
+from scvi_codegen.analysis.verification.convergence import convergence_checks, identity_checks
+from scvi_codegen.analysis.verification.derivatives import derivative_checks, time_transformation_derivative_checks
+from scvi_codegen.analysis.verification.elimination import elimination_checks
+from scvi_codegen.analysis.verification.impacts import impact_checks
+from scvi_codegen.analysis.verification.roundoff import roundoff_checks
+from scvi_codegen.analysis.verification.stepping import predictor_checks, step_checks
+from scvi_codegen.analysis.verification.structure import largest_step, structure_checks
+from scvi_codegen.analysis.verification.system_under_test import State, SystemUnderTest
+from scvi_codegen.analysis.verification.variable_steps import VariableSteps, at_fixed_energy, variable_step_checks
+from scvi_codegen.codegen.native.arguments import checked_number, checked_step
+from scvi_codegen.codegen.native.building import TUNED_FLAGS
+from scvi_codegen.common.errors import StateError, StepFailedError
+from scvi_codegen.common.validation import TEXTS, checks_arguments
+from scvi_codegen.methods import as_method
+from scvi_codegen.methods.discretise import discretised_form
+from scvi_codegen.methods.method import Method
+from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
+from scvi_codegen.runs.compiler import compile_stepper
+from scvi_codegen.runs.states.rotations import checked_pair
+from scvi_codegen.runs.states.validation import Array
+from scvi_codegen.runs.stepper import STEPPER, Stepper
+from scvi_codegen.systems.arrays.system import SYSTEM_OR_ARRAYS, ArraySystem
+from scvi_codegen.systems.system import MechanicalSystem
+
+__all__ = ["Certificate", "Check", "Outcome", "verify"]
+
+
+SEEDS = range(20)
+"""Seeds of the random states that are tried if no state is passed."""
+LONGEST, HALVINGS, PART = 1.0, 40, 0.1
+"""Largest step tried, number of halvings, and the largest change of the state per step relative to its size."""
+
+
+@checks_arguments(system=SYSTEM_OR_ARRAYS, stepper=STEPPER, flags=TEXTS)
+@without_accuracy_warnings()
+def verify(
+    system: MechanicalSystem | ArraySystem,
+    method: Method | str,
+    q: ArrayLike | Mapping[str, ArrayLike] | None = None,
+    p: ArrayLike | Mapping[str, ArrayLike] | None = None,
+    *,
+    h: float | None = None,
+    t: float = 0.0,
+    stepper: Stepper | None = None,
+    tolerance: float | None = None,
+    solver: str = "auto",
+    flags: Sequence[str] = TUNED_FLAGS,
+    velocity: ArrayLike | Mapping[str, ArrayLike] | None = None,
+    parameters: Mapping[str, ArrayLike] | None = None,
+    tables: Mapping[str, ArrayLike] | None = None,
+) -> Certificate:
+    """Measure the guaranteed properties of the integrator of ``system`` by ``method`` and return a certificate.
+
+    Inputs are cubic polynomials in time, as between breakpoints.
+
+    Args:
+        system: mechanical system.
+        method: method, or its name, as ``"svi:8"``.
+        q, p: (m,) state at which to measure, both or neither; by default a random state at which steps succeed.
+        h: step size, in transformed time of tau; by default one that changes this state by about a tenth of its size.
+        t: time.
+        stepper: stepper under test, for example from ``load_package``; by default compiled now. For a stepper with a
+            time-rescaling function (:func:`~scvi_codegen.compile_stepper`) its adaptive steps are measured, too.
+        tolerance: also measure runs with adaptive step size and this relative local error; 0: round-off.
+        solver, flags: as for ``compile_stepper``.
+        velocity, parameters, tables: only for arrays of run-time sizes, which also need q and h (fields on a mesh do
+            not), as of :meth:`Stepper.integrate`: properties are measured on a few indices of the arrays first, then at
+            full size; the state of the certificate is that of the few indices.
+
+    Returns:
+        The certificate. The properties follow from the method (order, symmetry, symplecticity) and the system (momentum
+        maps). A property that cannot be measured has the reason in its remark.
+
+    Raises:
+        BuildError: without a C compiler.
+        MethodError: if the method does not apply to the system, or has no such solver.
+        StateError: if only one of q and p is passed, or no state is found.
+    """
+    more: dict[str, Any] = {"velocity": velocity, "parameters": parameters, "tables": tables}
+    if isinstance(system, ArraySystem):
+        from scvi_codegen.analysis.verification.arrays import (
+            verify_arrays,  # imported here: it imports modules of this package
+        )
+
+        more |= {"stepper": stepper, "tolerance": tolerance, "flags": flags, "of_known_sizes": verify}
+        return verify_arrays(system, method, q, p, h=h, t=t, **more)
+    for name, value in more.items():
+        if value is not None:
+            raise StateError(
+                f"{name} is for arrays of run-time sizes: give p, and parameters as defaults of the system"
+            )
+    if stepper is not None and stepper.run_time_sizes:
+        raise StateError(f"{stepper!r} is for arrays of run-time sizes, but the sizes of '{system.name}' are known")
+    t, h = checked_number(t, "the time t"), None if h is None else checked_step(h)
+    began, method = time.perf_counter(), as_method(method, system)
+    system = discretised_form(system, method)
+    flags = tuple(flags if stepper is None else stepper.flags)
+    stepper = stepper or compile_stepper(system, method, solver=solver, flags=flags)
+    start = _initial_state(system, stepper, q, p, h, t)
+    return _certificate(system, method, stepper, start, began, solver=solver, tolerance=tolerance)
+
+
+def _certificate(
+    system: MechanicalSystem,
+    method: Method,
+    stepper: Stepper,
+    start: State,
+    began: float,
+    *,
+    solver: str,
+    tolerance: float | None,
+) -> Certificate:
+    flags, watched, stepper = stepper.flags, stepper, stepper.with_events(())
+    steps, single = stepper, at_fixed_energy(system, stepper.energy(start.q, start.p, start.t))
+    if single is not system or stepper.interface.time_transformation:
+        steps = compile_stepper(single, method, solver=solver, flags=flags)
+    tested = SystemUnderTest(single, method, steps, _newton(single, method, steps, solver, flags), start)
+    paced = steps is not stepper or tolerance is not None
+    in_time = system.clock.plain if system.clock and system.clock.plain else system
+    runs = VariableSteps(tested, stepper, in_time, system, tolerance)
+    checks = (
+        *(variable_step_checks(runs) if paced else ()),
+        *step_checks(tested),
+        *predictor_checks(tested),
+        *(() if system.constraints else roundoff_checks(tested)),
+        *structure_checks(tested),
+        *derivative_checks(tested),
+        *(time_transformation_derivative_checks(runs) if system.clock else ()),
+        *convergence_checks(tested),
+        *identity_checks(tested),
+        *elimination_checks(in_time, start),
+        *impact_checks(tested, watched),
+        largest_step(tested),
+    )
+    parameters = {name.name: value for name, value in single.constants.items()}
+    return issued(
+        stepper, start, began=began, system=single.name, method=method.name, parameters=parameters, checks=checks
+    )
+
+
+def _newton(
+    system: MechanicalSystem, method: Method, stepper: Stepper, solver: str, flags: tuple[str, ...]
+) -> Stepper | None:
+    """Return a stepper that uses Newton's method alone, to compare with; ``None`` for an explicit or other solver."""
+    if solver == "newton":
+        return stepper
+    if solver != "auto" or not method.implicit:
+        return None
+    return compile_stepper(system, method, solver="newton", flags=flags)
+
+
+def _initial_state(system: MechanicalSystem, stepper: Stepper, q: Any, p: Any, h: float | None, t: float) -> State:
+    if (q is None) != (p is None):
+        raise StateError("only one of q and p was passed: give both, or neither")
+    if q is None or p is None:
+        return _random_state(system, stepper, h, t)
+    position, momentum = checked_pair(stepper.interface, q, p)
+    if system.constraints:
+        position, momentum = stepper.project(position, momentum, t=t)
+    return State(position, momentum, t, h if h else _step(stepper, position, momentum, t))
+
+
+def _random_state(system: MechanicalSystem, stepper: Stepper, h: float | None, t: float) -> State:
+    """Return a random state of size 1 at which steps succeed and the energy is finite."""
+    for seed in SEEDS:
+        generator = np.random.default_rng(seed)
+        q, v = generator.uniform(0.2, 1.0, (2, system.dimension))
+        try:
+            p = v if system.auxiliaries else stepper.momentum(q, v, t)
+            if system.constraints:
+                q, p = stepper.project(q, p, t=t)
+            step = h or _step(stepper, q, p, t)
+            stepper.step(q, p, step, t, stepper.defaults)
+        except (StateError, StepFailedError):
+            continue
+        return State(q, p, t, step)
+    raise StateError(
+        f"no random state of '{system.name}' of size 1 was found at which a step succeeds: give q, p and h"
+    )
+
+
+def _step(stepper: Stepper, q: Array, p: Array, t: float) -> float:
+    """Return a step size that changes q and p by at most a tenth of their size."""
+    h = LONGEST
+    for _ in range(HALVINGS):
+        try:
+            q1, p1 = stepper.step(q, p, h, t, stepper.defaults)
+        except StepFailedError:
+            h /= 2
+            continue
+        change = max(np.abs(q1 - q).max() / (np.abs(q).max() or 1.0), np.abs(p1 - p).max() / (np.abs(p).max() or 1.0))
+        if change <= PART:
+            return h
+        h /= 2
+    raise StateError("no step of any size succeeds at this state: give h, or another state")

@@ -1,0 +1,249 @@
+"""Certificates of integrators of array systems.
+
+At small sizes, cut out of the arrays, the loops are compared with the unrolled system (:func:`unroll_sums`): its
+equations in 60 digits, its exact motion and its compiled steps, none of which has loops. At full size, the rates are
+compared with NumPy, and conserved quantities are measured along a run.
+"""
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.analysis.verification.arrays.whole import WholeStart, whole_checks
+from scvi_codegen.analysis.verification.certificate import Certificate, Check, Finding, checked, information, issued
+from scvi_codegen.analysis.verification.convergence import convergence_checks
+from scvi_codegen.analysis.verification.impacts import impact_checks
+from scvi_codegen.analysis.verification.stepping import step_checks
+from scvi_codegen.analysis.verification.structure import structure_checks
+from scvi_codegen.analysis.verification.system_under_test import State, SystemUnderTest
+from scvi_codegen.codegen.lowering.arrays import one_coordinate
+from scvi_codegen.codegen.rendering.source import Interface
+from scvi_codegen.common.errors import StateError
+from scvi_codegen.methods import SVI, StoermerVerlet, as_method
+from scvi_codegen.methods.method import Method
+from scvi_codegen.runs.compiler import compile_stepper
+from scvi_codegen.runs.stepper import Stepper, StepperOfRunTimeSizes
+from scvi_codegen.runs.stepping.array_interface import RunArrays, check_accesses, read_arrays
+from scvi_codegen.systems.arrays.system import ArraySystem
+from scvi_codegen.systems.formulas.indices import Array
+from scvi_codegen.systems.rolling import unroll_sums
+
+__all__ = ["verify_arrays"]
+
+SMALL_STEPS, MOST_COORDINATES = 40, 64
+ROUNDINGS = 16.0 * SMALL_STEPS
+"""Bound on the deviation after ``SMALL_STEPS`` steps, in units of rounding."""
+
+
+def verify_arrays(
+    system: ArraySystem,
+    method: Method | str,
+    q: Any,
+    p: Any,
+    *,
+    h: float | None,
+    t: float,
+    stepper: Stepper | None,
+    tolerance: float | None,
+    flags: Sequence[str],
+    of_known_sizes: Callable[..., Certificate],
+    **arrays_of_run: Any,
+) -> Certificate:
+    """Return the certificate of arrays of run-time sizes; arguments as of ``of_known_sizes``, which is ``verify``.
+
+    Properties are measured on a few indices of the arrays first, then at full size; adaptive steps, constraints, and
+    systems without an integrator for arrays of run-time sizes with known sizes only.
+    """
+    if q is None and p is None and system.mesh is not None:
+        q, p, h = _state_of_fields(system.mesh, method, h)
+    if q is None or h is None:
+        raise StateError(f"verify requires q and h for arrays of '{system.name}': their shapes determine the sizes")
+    if stepper is not None and not stepper.run_time_sizes:
+        raise StateError(f"stepper must be one of run-time sizes, not {stepper!r}: compile it without sizes")
+    began = time.perf_counter()
+    chosen = as_method(method, one_coordinate(system))
+    watched = stepper or compile_stepper(system, chosen, flags=tuple(flags))
+    stepper = watched.with_events(())
+    run = stepper.start(q, p, h=h, t=t, **arrays_of_run)
+    arrays = read_arrays(stepper.interface, q, arrays_of_run["parameters"], arrays_of_run["tables"])
+    parameters = dict(zip(stepper.interface.parameters, arrays.numbers, strict=True))
+    if stepper.source is None or system.coupled_terms or tolerance is not None or system.constraints:
+        known = unroll_sums(system, arrays.sizes, tables=arrays.places, parameters={**parameters, **arrays.fields})
+        options: dict[str, Any] = {"h": run.h, "t": run.t, "tolerance": tolerance, "flags": flags}
+        if watched.events:
+            options["stepper"] = compile_stepper(known, chosen, flags=watched.flags, events=watched.events)
+        if system.constraints and isinstance(chosen, StoermerVerlet):
+            chosen = SVI(1, "gauss-lobatto:2")  # RATTLE under its name for known sizes
+        certificate = of_known_sizes(known, chosen, run.q, run.p, **options)
+        if stepper.source is None:
+            return certificate
+        loops = SystemUnderTest(known, chosen, _bound(stepper, arrays), None, State(run.q, run.p, run.t, run.h))
+        return replace(certificate, checks=(*_unrolled_checks(loops), *certificate.checks))
+    start = WholeStart(system, chosen, stepper, arrays, run.stepper.arrays(run.p), run.h, run.t)
+    tested = _subject(start)
+    checks = (
+        *_unrolled_checks(tested),
+        *step_checks(tested),
+        *structure_checks(tested),
+        *convergence_checks(tested),
+        *whole_checks(start),
+        *_impact_checks(start, watched.bind(arrays.state, arrays_of_run["parameters"], arrays.places)[0]),
+    )
+    return issued(
+        stepper,
+        tested.initial,
+        began=began,
+        system=system.name,
+        method=chosen.name,
+        parameters=parameters,
+        checks=checks,
+    )
+
+
+def _impact_checks(start: WholeStart, watched: Stepper) -> Iterator[Check]:
+    """Yield the checks of events that change the state, which are compared with formulas of all coordinates."""
+    if not watched.changes_states:
+        return
+    if watched.dimension > MOST_COORDINATES:
+        yield information("impacts", f"measured for at most {MOST_COORDINATES} coordinates: give fewer", None)
+        return
+    arrays = start.arrays
+    known = unroll_sums(start.system, arrays.sizes, tables=arrays.places, parameters=start.parameters)
+    q, p = (np.concatenate([values.reshape(-1) for values in state.values()]) for state in (arrays.state, start.p))
+    tested = SystemUnderTest(known, start.method, watched, None, State(q, p, start.t, start.h))
+    numbers = np.concatenate([arrays.numbers, *(values.reshape(-1) for values in arrays.fields.values())])
+    yield from impact_checks(tested, watched, numbers)
+
+
+def _state_of_fields(mesh: Any, method: Method | str, h: float | None) -> tuple[Any, Any, float]:
+    """Return random fields at the points of a mesh, their momenta, and a step size at which iterations converge."""
+    random = np.random.default_rng(0)
+    q, p = ({each: random.uniform(-0.5, 0.5, mesh.weights.shape) for each in mesh.field_system.fields} for _ in "qp")
+    q |= dict.fromkeys(mesh.field_system.scalars, np.array(0.1))
+    return q, {each: mesh.weights * values for each, values in p.items()}, h or min(mesh.largest_step(method) / 4, 0.05)
+
+
+def _subject(start: WholeStart) -> SystemUnderTest:
+    """Return the loops on a few indices as an integrator of the unrolled system."""
+    small = small_start(start)
+    arrays = small.arrays
+    written = unroll_sums(start.system, arrays.sizes, tables=arrays.places, parameters=small.parameters)
+    q, p = (np.concatenate([values.reshape(-1) for values in state.values()]) for state in (arrays.state, small.p))
+    return SystemUnderTest(written, start.method, _bound(start.stepper, arrays), None, State(q, p, start.t, start.h))
+
+
+def _bound(stepper: Stepper, arrays: RunArrays) -> Stepper:
+    """Return a stepper of arrays at these sizes, as one of named coordinates."""
+    result = cast(StepperOfRunTimeSizes, stepper)._bound_to(arrays)._copy(())
+    result.interface = replace(result.interface, map_names=())  # whole_checks examines momentum maps
+    return result
+
+
+def _unrolled_checks(tested: SystemUnderTest) -> Iterator[Check]:
+    statement = f"{SMALL_STEPS} steps equal those of the unrolled system"
+    return checked("unrolled system", statement, partial(_compared_with_unrolled, tested))
+
+
+def _compared_with_unrolled(tested: SystemUnderTest) -> Finding:
+    """Return the largest difference from the compiled unrolled system, in units of rounding of the first step."""
+    first = tested.states[0]
+    other = compile_stepper(tested.system, tested.method, flags=tested.stepper.flags)
+    run: dict[str, Any] = {"h": first.h, "t": first.t, "steps": SMALL_STEPS, "parameters": tested.parameters}
+    rolled, expected = (each.integrate(first.q, first.p, **run) for each in (tested.stepper, other))
+    difference = np.abs(np.concatenate([rolled.q - expected.q, rolled.p - expected.p], axis=1)) / tested.rounding(first)
+    return Finding(float(difference.max()), ROUNDINGS, "in units of rounding of a step")
+
+
+Numbers = NDArray[np.float64]
+
+CUT_SIZES = ((5, 6), (4, 4), (3, 3), (3, 2), (2, 2), (2, 1), (6, 6), (8, 8), (12, 12), (16, 16))
+"""Numbers of indices of a size and of rows of a table; the first pair that is consistent and small is used."""
+MAX_COORDINATES = 9
+"""Largest number of coordinates; steps in 60 digits take seconds for it."""
+
+
+def small_start(start: WholeStart) -> WholeStart:
+    """Cut out a few indices where the arrays are largest, and table rows with the indices that occur in them.
+
+    Raises:
+        StateError: if no small cut is closed under the accesses of the system.
+    """
+    interface, arrays, result = start.stepper.interface, start.arrays, None
+    for window, rows in CUT_SIZES:
+        tables = {table.axes[0].name for table in interface.layout.tables}
+        chosen = {name: np.arange(min(arrays.sizes[name], rows)) for name in tables}
+        for name in interface.layout.sizes:
+            if name in chosen:
+                continue
+            used = [
+                arrays.places[table][chosen[row], column]
+                for table, row, column, size in _columns(interface)
+                if size == name
+            ]
+            known = np.unique(np.concatenate([*used, np.empty(0, dtype=np.int64)]))
+            others = np.setdiff1d(_around(start, name, window), known)
+            chosen[name] = np.union1d(known, others[: max(0, window - len(known))])
+        small = _cut(start, chosen)
+        try:
+            check_accesses(interface.layout, small.arrays.sizes, small.arrays.places)
+        except StateError:
+            continue
+        count = sum(values.size for values in small.arrays.state.values())
+        if count <= MAX_COORDINATES:
+            return small
+        result = result or small
+    if result is None:
+        raise StateError("no small array sizes were found at which all indices are in range")
+    return result
+
+
+def _columns(interface: Interface) -> Iterator[tuple[str, str, int, str]]:
+    """Yield table, row size and column of each table access, and the size that its indices refer to."""
+    rows = {table.name: table.axes[0].name for table in interface.layout.tables}
+    for access, _ in interface.layout.accesses:
+        for subscript, axis in zip(access.places, access.array.axes, strict=True):
+            if subscript.table and axis.name:
+                yield subscript.table, rows[subscript.table], subscript.column, axis.name
+
+
+def _around(start: WholeStart, size: str, window: int) -> NDArray[np.int64]:
+    """Return consecutive indices around the maximum of the first array of that size."""
+    length, centre = start.arrays.sizes[size], 0
+    for array in start.stepper.interface.layout.coordinates:
+        axes = [k for k, axis in enumerate(array.axes) if axis.name == size]
+        if axes:
+            others = tuple(k for k in range(len(array.axes)) if k != axes[0])
+            sizes = np.abs(start.arrays.state[array.name]) + np.abs(start.p[array.name])
+            centre = int(np.argmax(sizes.max(axis=others)))
+            break
+    first = max(0, min(centre - window // 2, length - window))
+    return np.arange(first, min(length, first + window))
+
+
+def _cut(start: WholeStart, indices: Mapping[str, NDArray[np.int64]]) -> WholeStart:
+    interface, arrays = start.stepper.interface, start.arrays
+
+    def part(array: Array, values: Numbers) -> Numbers:
+        return np.ascontiguousarray(
+            values[np.ix_(*(indices[axis.name] if axis.name else np.arange(axis.number) for axis in array.axes))]
+        )
+
+    tables = {table.name: arrays.places[table.name][indices[table.axes[0].name]] for table in interface.layout.tables}
+    for table, row, column, size in _columns(interface):
+        old = arrays.places[table][indices[row], column]
+        new = np.minimum(np.searchsorted(indices[size], old), len(indices[size]) - 1)
+        tables[table][:, column] = np.where(indices[size][new] == old, new, old % len(indices[size]))
+    cut = replace(
+        arrays,
+        sizes={name: len(indices[name]) for name in interface.layout.sizes},
+        state={array.name: part(array, arrays.state[array.name]) for array in interface.layout.coordinates},
+        fields={array.name: part(array, arrays.fields[array.name]) for array in interface.layout.fields},
+        places=tables,
+    )
+    p = {array.name: part(array, start.p[array.name]) for array in interface.layout.coordinates}
+    return replace(start, arrays=cut, p=p)

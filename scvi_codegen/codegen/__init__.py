@@ -1,0 +1,1 @@
+"""From the equations of a step to compiled C: representation, lowering, templates, compilers."""

@@ -1,0 +1,357 @@
+"""Adaptive step sizes on the grid h = 2^(k/4), and the step density of a time transformation.
+
+The stored values of the last step, or of the last two, are extrapolated into the next by least-squares polynomials
+(:mod:`scvi_codegen.codegen.lowering.solvers.tables`); the grid has few ratios of step sizes, each with its own table.
+As predictors they need only double precision, by Stieltjes' procedure (Gautschi, *Orthogonal Polynomials*, 2004,
+section 2.2), in sums that round the same on all platforms.
+
+Growth of errors along adaptive runs: a tangent vector by an explicit Runge-Kutta-Nystroem scheme.
+
+The variational equation dq'' = F_q dq / m of a separable system, or L_vv dq'' = -E_q dq - E_v dq' with the residual
+E(q, v, a) of the Euler-Lagrange equations, is integrated over each accepted step. Its nodes c_s are a few of the points
+of the step, at which the derivatives are evaluated in SIMD lanes; the acceleration a_0 at the start of the step is
+extrapolated from the step before. The stages
+
+    x_s = dq + c_s h dv + h^2 sum_{j < s} position[s][j] a_j,      a_s = F_q(X_s) x_s / m,
+
+are explicit, with the integrals of the polynomial through a_0, .., a_{s-1}; the polynomial through a_1, .., a_n gives
+the end. (Nystroem methods: Hairer, Norsett & Wanner, Solving ODEs I, sec. II.14.)
+"""
+
+import math
+import operator
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+
+from sympy import Expr
+
+from scvi_codegen.codegen.ir.arithmetic import INVERSE_ROOTS
+from scvi_codegen.codegen.ir.equations import (
+    AdaptivePredictor,
+    Control,
+    ErrorGrowth,
+    FixedPointIteration,
+    IterationTable,
+    StoredValues,
+    TangentScheme,
+)
+from scvi_codegen.codegen.ir.kernel import (
+    Expression,
+    Kernel,
+    Load,
+    Number,
+    NumberTable,
+    Operation,
+    lower_matrix,
+    lower_vector,
+)
+from scvi_codegen.codegen.ir.program import Program
+from scvi_codegen.codegen.lowering.derivatives import NOTHING, force_derivatives, vector_product
+from scvi_codegen.codegen.lowering.solvers.tables import (
+    DEGREE_OF_ONE,
+    DEGREE_OF_TWO,
+    INTERPOLATED,
+    pad_matrix,
+    pad_vector,
+)
+from scvi_codegen.codegen.lowering.stage_groups import system_kernel
+from scvi_codegen.common.precision import Matrix, Vector, mp
+from scvi_codegen.methods.controllers import Controller
+from scvi_codegen.methods.controllers.predictive import PREDICTIVE
+from scvi_codegen.methods.tables.basis import (
+    cardinal_integrals,
+    cardinal_values,
+    differentiation_matrix,
+    least_squares,
+    transpose,
+)
+from scvi_codegen.methods.tables.quadrature import gauss_legendre
+from scvi_codegen.systems.derived_expressions import accelerations, forms_of
+from scvi_codegen.systems.formulas.expressions import gradient_tuple, jacobian
+from scvi_codegen.systems.formulas.intermediates import distinct_nodes
+from scvi_codegen.systems.lagrangian import LagrangianSystem
+from scvi_codegen.systems.legendre.transform import equivalent_lagrangian
+from scvi_codegen.systems.system import MechanicalSystem
+
+LEVELS_PER_BINADE, REACH, REACH_INSIDE = 4, 2, 8
+"""Levels per factor of two; largest changes of level for which there are predictors from accepted steps and, downwards,
+from a rejected one."""
+MANTISSAS = tuple(round(2.0 ** (k / LEVELS_PER_BINADE + 32)) / 2.0**32 for k in range(LEVELS_PER_BINADE))
+"""Step sizes in one octave, rounded to 32 bits.
+
+In 53 bits the square of the root of 2 is 2 plus an ulp; the resulting rounding error of a product depends only on the
+leading digits, is the same in every orbit, and accumulates: 2e-17 to 7e-17 of the energy per Kepler orbit at e = 0.9.
+"""
+
+
+def control_of(
+    program: Program,
+    controller: Controller = PREDICTIVE,
+    system: MechanicalSystem | None = None,
+    g: str | Expr | None = None,
+) -> Control | None:
+    """Return the step-size control of a program; ``None`` for adaptive steps whose curves give no error estimate.
+
+    Args:
+        program: the lowered program.
+        controller: the step-size controller.
+        system, g: of a controller of steps in tau, the system in physical time and the time-rescaling function.
+    """
+    if controller.values is not None:
+        assert system is not None  # by the caller
+        assert g is not None
+        kernel = system_kernel(
+            system,
+            "step_density",
+            controller.values(system, g),
+            u=forms_of(system).legendre_arguments,
+            purpose="1/g and -d(log g)/dt of the time rescaling g at u = "
+            f"{'(q, p)' if system.auxiliaries else '(q, v)'}.",
+        )
+        return Control(code=controller.code, memory=controller.memory, density=kernel)
+    if not program.error_power or program.quantities.integrals:
+        return None
+    stage_curve = program.equations.stage_curve
+    return Control(
+        code=controller.code,
+        memory=controller.memory,
+        mantissas=MANTISSAS,
+        predictor=predictor_of(program.fixed_point) if program.fixed_point else None,
+        stage_growth=2.0 ** (stage_curve.power / LEVELS_PER_BINADE) if stage_curve else 0.0,
+        arrays=() if system is None or program.of_arrays else tuple(_ranges_of_arrays(system)),
+    )
+
+
+def _ranges_of_arrays(system: MechanicalSystem) -> Iterator[tuple[int, int]]:
+    """Yield first and end of the coordinates that are the entries of an array of known size."""
+    names = [q.name for q in system.coordinates]
+    for elements in (array.elements for array in system.arrays if array.axes):
+        first = names.index(elements[0]) if elements[0] in names else len(names)
+        if names[first : first + len(elements)] == [*elements]:
+            yield first, first + len(elements)
+
+
+def predictor_of(fixed_point: FixedPointIteration) -> AdaptivePredictor:
+    """Return the predictor tables of a fixed-point iteration."""
+    points = _doubles(fixed_point.guess.abscissae)
+    ratios = [2.0 ** (change / LEVELS_PER_BINADE) for change in range(-REACH, REACH + 1)]
+    degree = min(len(points) - 1, DEGREE_OF_ONE)
+    alone = _tables_by_ratio(fixed_point, ratios, points, degree, (1.0,))
+    shorter = [2.0 ** (-down / LEVELS_PER_BINADE) for down in range(1, REACH_INSIDE + 1)]
+    inside = _tables_by_ratio(fixed_point, shorter, points, len(points) - 1, (1.0,), begin=0.0)
+    pairs = []
+    for ratio in ratios:
+        sources = (*points, *((x - 1.0) / ratio for x in points))
+        most = min(len(set(sources)) - 1, max(2 * len(points) - 2, INTERPOLATED), DEGREE_OF_TWO)
+        pairs.append(_tables_by_ratio(fixed_point, ratios, sources, most, (1.0, ratio)))
+    return AdaptivePredictor(
+        reach=REACH,
+        alone=tuple(table for (table,) in alone),
+        last=tuple(tuple(last for last, _ in line) for line in pairs),
+        before=tuple(tuple(before for _, before in line) for line in pairs),
+        inside=tuple(table for (table,) in inside),
+        growth=2.0 ** (fixed_point.error_power / LEVELS_PER_BINADE),
+    )
+
+
+def _tables_by_ratio(
+    fixed_point: FixedPointIteration,
+    ratios: Sequence[float],
+    sources: Sequence[float],
+    degree: int,
+    ages: Sequence[float],
+    begin: float = 1.0,
+) -> list[list[NumberTable]]:
+    """Return tables by ratio of the next step size to the last, and by step.
+
+    Args:
+        fixed_point: the iteration.
+        ratios: ratios of the next step size to the last.
+        sources: times of the stored values, in units of the last step size.
+        degree: of the polynomial.
+        ages: last step size by those of the steps.
+        begin: of the next step, in units of the last step size.
+    """
+    points = _doubles(fixed_point.guess.abscissae)
+    through = tuple(map(_doubles, fixed_point.predictor_matrix))
+    count = len(points)
+    targets = [begin + ratio * x for ratio in ratios for x in points]
+    rows = least_squares(sources, targets, degree, lambda a, b: math.fsum(map(operator.mul, a, b)))
+    tables = []
+    for k, ratio in enumerate(ratios):
+        scales = [ratio * age if fixed_point.kept is StoredValues.ACCELERATIONS else 1.0 for age in ages]
+        part = rows[k * count : (k + 1) * count]
+        tables.append(
+            [
+                _padded(
+                    [[scale * x for x in row[n * count : (n + 1) * count]] for row in part], through, fixed_point.lanes
+                )
+                for n, scale in enumerate(scales)
+            ]
+        )
+    return tables
+
+
+def _doubles(numbers: Sequence[Number]) -> tuple[float, ...]:
+    return tuple(map(float, numbers))
+
+
+def _padded(rows: list[list[float]], through: NumberTable, lanes: int) -> NumberTable:
+    """Return a table, times another one if given, padded to whole vectors; further rows repeat the last."""
+    count = len(rows)
+    if through:
+        columns = list(zip(*rows, strict=True))
+        rows = [
+            [math.fsum(a * x for a, x in zip(line, column, strict=False)) for column in columns]
+            for line in through[:count]
+        ]
+    wide = [(*row, *(0.0,) * (lanes - count)) for row in rows]
+    return (*wide, *(wide[-1],) * (lanes - count))
+
+
+MOST_NODES = 3, 4
+"""Largest numbers of nodes at round-off level and above; those nearest to the Gauss points of as many are chosen."""
+MOST_COORDINATES, MOST_DERIVATIVES, MOST_OPERATIONS = 20, 180, 1500
+"""Largest numbers of coordinates, of distinct derivatives F_q and of operations in coupled equations (a chain of five
+links has 1200): their derivatives would take more than half of the time of compilation of larger systems."""
+
+
+def error_growth_of(system: MechanicalSystem, program: Program) -> ErrorGrowth | None:
+    """Return kernels and tables; ``None`` for damping, inputs or constraints, and for systems that are too large."""
+    fixed_point = program.fixed_point
+    if fixed_point is None or program.newton or program.damping or system.dimension > MOST_COORDINATES:
+        return None
+    if system.inputs:
+        return None
+    make = GROWTH_KERNELS.get(fixed_point.derivatives_part)
+    twin = equivalent_lagrangian(system) if make else None
+    points = fixed_point.guess.abscissae
+    which = [_nodes(points, most) for most in MOST_NODES]
+    if make is None or twin is None or len(set(points)) < len(points) or len(which[0]) < 2:
+        return None
+    kernels = make(twin)
+    if kernels is None or kernels[0].values > MOST_DERIVATIVES:
+        return None
+    partials, product, energy = kernels
+    lanes = fixed_point.lanes
+    tables = (
+        IterationTable("TANGENT_INTEGRALS", pad_matrix(cardinal_integrals(points, points, mp.zero), lanes)),
+        IterationTable("TANGENT_END", pad_vector(cardinal_integrals(points, (mp.one,), mp.zero)[0], lanes)),
+        IterationTable("VELOCITY_RATE", pad_matrix(differentiation_matrix(points), lanes)),
+    )
+    of_roundoff, of_tolerance = (_tangent_scheme(points, each, lanes) for each in which)
+    return ErrorGrowth(
+        partials=_with_common_roots(partials),
+        product=product,
+        energy=energy,
+        conserves_energy=not system.changes_energy,
+        schemes=(of_roundoff, of_tolerance),
+        at_end=pad_vector(cardinal_values(points, (mp.one,))[0], lanes),
+        tables=() if make is _separable_growth else tables,
+    )
+
+
+def _tangent_scheme(points: Vector, which: tuple[int, ...], lanes: int) -> TangentScheme:
+    nodes = tuple(points[n] for n in which)
+    return TangentScheme(
+        which=which,
+        nodes=lower_vector(nodes),
+        position=_explicit(nodes, _twice_integrated),
+        velocity=_explicit(nodes, lambda known, at: cardinal_integrals(known, at, mp.zero)),
+        expected=lower_vector(cardinal_values((mp.zero, *nodes[:-1]), nodes[-1:])[0]),
+        end_position=lower_vector(_twice_integrated(nodes, (mp.one,))[0]),
+        end_velocity=lower_vector(cardinal_integrals(nodes, (mp.one,), mp.zero)[0]),
+        end_acceleration=lower_vector(cardinal_values(nodes, (mp.one,))[0]),
+        at_points=tuple(pad_vector(column, lanes) for column in transpose(cardinal_values(nodes, points))),
+    )
+
+
+def _separable_growth(system: LagrangianSystem) -> tuple[Kernel, Kernel, None]:
+    partials, products = force_derivatives(system)
+    return partials, products[0], None
+
+
+def _coupled_growth(system: LagrangianSystem) -> tuple[Kernel, Kernel, Kernel | None] | None:
+    """Return kernels of L_vv dq'' = -E_q dq - E_v dq', E(q, v, a) the Euler-Lagrange residual, unless too large."""
+    forms, of = forms_of(system), (*system.coordinates, *system.velocities)
+    residual = [-each for each in forms.euler_lagrange]
+    if distinct_nodes(residual) > MOST_OPERATIONS:
+        return None
+    entries = jacobian(residual, of) or NOTHING
+    different = tuple(dict.fromkeys(entries.values()))
+    partials = system_kernel(
+        system,
+        "point_derivatives",
+        different,
+        u=(*of, *accelerations(system)),
+        partials=forms.mass_terms,
+        purpose="The distinct entries of -E_q and -E_v, and terms of L_vv at all points.",
+    )
+    product = vector_product(
+        system,
+        "derivative_product",
+        entries,
+        different,
+        shape=(system.dimension, len(of)),
+        purpose="The matrix of derivatives times x, u = (x, its entries).",
+    )
+    if system.changes_energy:
+        return partials, product, None
+    energy = system_kernel(
+        system, "energy_gradient", gradient_tuple(forms.energy, of), u=of, purpose="E_q and E_v of the energy E."
+    )
+    return partials, product, energy
+
+
+GROWTH_KERNELS: Mapping[str, Callable[[LagrangianSystem], tuple[Kernel, Kernel, Kernel | None] | None]] = {
+    "separable_derivatives": _separable_growth,
+    "coupled_derivatives": _coupled_growth,
+}
+
+
+def _explicit(nodes: Vector, integrated: Callable[[Vector, Vector], Matrix]) -> NumberTable:
+    """Return integrals up to each node of the polynomial through the start and the nodes before, padded by zeros."""
+    width = max(MOST_NODES)
+    rows = ((*integrated((mp.zero, *nodes[:s]), (c,))[0], *(mp.zero,) * (width - s)) for s, c in enumerate(nodes))
+    return lower_matrix(tuple(rows))
+
+
+def _nodes(points: Vector, most: int) -> tuple[int, ...]:
+    """Return the indices of the nodes among the points; the start of the step is not one."""
+    inner = [n for n, c in enumerate(points) if c > 0]
+    if len(inner) <= most:
+        return tuple(inner)
+    gauss = [(1 + x) / 2 for x in gauss_legendre(most).points]
+    distances = ([abs(points[n] - c) for n in inner] for c in gauss)
+    return tuple(dict.fromkeys(inner[each.index(min(each))] for each in distances))
+
+
+def _twice_integrated(points: Vector, ends: Vector) -> Matrix:
+    """Return the integrals of (c - u) l_j(u) from 0 to c for each c of ``ends``."""
+    rule = gauss_legendre(len(points) // 2 + 1)
+    rows = []
+    for c in ends:
+        u = [c * (1 + x) / 2 for x in rule.points]
+        weights = [w * c / 2 * (c - x) for w, x in zip(rule.weights, u, strict=True)]
+        rows.append(tuple(mp.fdot(weights, column) for column in transpose(cardinal_values(points, u))))
+    return tuple(rows)
+
+
+def _with_common_roots(kernel: Kernel) -> Kernel:
+    """Return the kernel with inverse roots x^(-k/2) as powers of x^(-1/2), which is computed once for each x."""
+    temporaries, results = (tuple(map(_powers_of_root, each)) for each in (kernel.temporaries, kernel.results))
+    return replace(kernel, temporaries=temporaries, results=results)
+
+
+def _powers_of_root(expression: Expression) -> Expression:
+    if not isinstance(expression, Operation):
+        return expression
+    operands = tuple(map(_powers_of_root, expression.operands))
+    k = {name: k for k, name in INVERSE_ROOTS.items()}.get(expression.operator, 0)
+    if k < 3 or not isinstance(operands[0], Load):
+        return Operation(expression.operator, operands)
+    root = Operation(INVERSE_ROOTS[1], operands)
+    power: Expression = root
+    for _ in range(k // 2):
+        power = Operation("*", (power, Operation("*", (root, root))))
+    return power

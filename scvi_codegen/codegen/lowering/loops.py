@@ -1,0 +1,263 @@
+"""Loops around kernels: the terms of systems of arrays, and the term groups of named coordinates."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import chain, combinations, islice, product
+
+from sympy import Add, Expr, S, Symbol, preorder_traversal
+
+from scvi_codegen.codegen.ir.arithmetic import lower_kernel
+from scvi_codegen.codegen.ir.equations import ConstrainedSteps
+from scvi_codegen.codegen.ir.kernel import Constant, Load, RolledKernel, exact_number
+from scvi_codegen.codegen.ir.program import Program, RolledTerms
+from scvi_codegen.codegen.lowering.stage_groups import rolled_kernel
+from scvi_codegen.systems.arrays.system import ArraySystem, entries_of, force_of
+from scvi_codegen.systems.formulas.array_statements import ArrayForce
+from scvi_codegen.systems.formulas.arrays import ArrayTerm, term_of
+from scvi_codegen.systems.formulas.expressions import gradient
+from scvi_codegen.systems.formulas.indices import Access, Array, Place
+from scvi_codegen.systems.formulas.neighbours import MAX_COMPONENTS, Neighbours
+from scvi_codegen.systems.formulas.symbols import DOT
+from scvi_codegen.systems.legendre.of_arrays import SiteHamiltonian
+from scvi_codegen.systems.system import MechanicalSystem
+from scvi_codegen.systems.term_groups import SplitSystem, TermGroup
+
+LONG_FORMULA = 1000
+"""Nodes of the expressions from which on a comment does not contain a formula."""
+
+
+def rolled_terms(system: ArraySystem, constrained: ConstrainedSteps | None, *, newton: bool) -> RolledTerms:
+    """Return the kernels of the terms of a system of arrays; ``newton``: with the Jacobian of the forces."""
+    potentials = [part for term in system.potentials for part in _parts(system, term)]
+    arguments = (*system.state, *system.velocities)
+    products, diagonals = _jacobian(system, potentials) if newton else ((), ())
+    masses = [
+        (f"mass of {access}", mass, number) for number, mass in enumerate(system.masses) for access, _ in mass.targets
+    ]
+    return RolledTerms(
+        forces=(
+            *(_potential(system, *part, number) for number, part in enumerate(potentials)),
+            *(
+                _added(system, f"force_{number}", force, arguments, f"forces {_shown(force)}", "Forces.")
+                for number, force in enumerate(system.applied_forces, len(potentials))
+            ),
+        ),
+        masses=tuple(_added(system, f"mass_{number}", mass, (), text, "A mass.") for text, mass, number in masses),
+        constants=tuple(
+            rolled_kernel(system, f"constant_{number}", [term.formula], term, text=_shown(term), purpose="The term.")
+            for number, term in enumerate(system.energy_offsets)
+        ),
+        constrained=constrained,
+        products=products,
+        diagonals=diagonals,
+        reach=reach_of(system.coordinates, diagonals),
+        neighbours=tuple(_list(system, each) for each in system.neighbours),
+    )
+
+
+def transforms(sites: SiteHamiltonian) -> dict[str, tuple[RolledKernel, ...]]:
+    """Return the kernels of velocities in (q, p), and of momenta in (q, v), as functions of the joined state.
+
+    In both the momenta or velocities follow the positions, so both are read as entries of the momenta.
+    """
+    system, moving = sites.system, dict[str, tuple[Array, Array]]()
+    for array, momentum in zip(sites.system.coordinates, sites.system.momenta, strict=True):
+        moving |= {array.name + DOT: (array, momentum), momentum.name: (array, momentum)}
+
+    def rolled_of(name: str, number: int, force: ArrayForce) -> RolledKernel:
+        slots = tuple(
+            (slot, replace(access, array=moving[access.array.name][1]) if access.array.name in moving else access)
+            for slot, access in force.slots
+        )
+        targets = tuple((replace(access, array=moving[access.array.name][0]), x) for access, x in force.targets)
+        rates, purpose = replace(force, slots=slots, targets=targets), f"{name.capitalize()}."
+        return _added(system, f"{name}_{number}", rates, system.state, f"{name} {_shown(force)}", purpose)
+
+    return {
+        "velocities": tuple(rolled_of("velocities", *pair) for pair in enumerate(sites.velocities)),
+        "momenta": tuple(rolled_of("momenta", *pair) for pair in enumerate(sites.momenta)),
+    }
+
+
+def _list(system: ArraySystem, near: Neighbours) -> tuple[str, int, RolledKernel]:
+    """Return name, components and lengths of a list of neighbours."""
+    lengths = [*near.box, *[S.Zero] * (MAX_COMPONENTS - len(near.box)), near.cutoff, near.skin]
+    none = ArrayTerm(loops=(), formula=S.One, slots=())
+    first = Access(array=near.array, places=(Place(),) * len(near.array.axes))
+    name, purpose = f"list_{near.name}", "Periods, cutoff and skin of a list of neighbours."
+    rolled = rolled_kernel(system, name, lengths, none, targets=[first], text=near.name, purpose=purpose)
+    return near.name, near.components, rolled
+
+
+def _added(
+    system: ArraySystem, name: str, force: ArrayForce, arguments: Sequence[Array], text: str, purpose: str
+) -> RolledKernel:
+    """Return the kernel of formulas that are added to entries, as functions of entries of certain arrays."""
+    targets, formulas = zip(*force.targets, strict=True)
+    u = entries_of(force, arguments)
+    return rolled_kernel(system, name, formulas, force, u, targets=targets, text=text, purpose=purpose)
+
+
+def _potential(system: ArraySystem, term: ArrayTerm, axis: int | None, number: int) -> RolledKernel:
+    """Return the derivatives of a term by coordinates and momenta, and the term; ``axis``: of a circulant matrix."""
+    force = _signed(system, force_of(term, system.state))
+    purpose = "Derivatives with respect to its coordinates."
+    rolled = _added(system, f"force_{number}", force, system.state, _shown(term), purpose)
+    u = entries_of(term, system.state)
+    scalar = rolled_kernel(system, f"term_{number}", [term.formula], term, u, text="", purpose="The term.")
+    return replace(rolled, scalar=scalar.kernel, circulant=axis)
+
+
+def _parts(system: ArraySystem, term: ArrayTerm) -> Iterator[tuple[ArrayTerm, int | None]]:
+    """Yield the parts f sum_(i<j) c[j-i] (x_i - x_j)^2 / 2 of a term, f constant, with the axis of i; then the rest."""
+    whole = {Place(index=loop.index): loop.end for loop in term.loops if loop.is_whole and not loop.near}
+    accesses, rest = dict(term.slots), term.formula
+    coefficients = [slot for slot, access in term.slots if len(access.places) == 1 and access.places[0].minus]
+    for c, (x, y) in product(coefficients, combinations(entries_of(term, system.state), 2)):
+        one, two, factor = x[1], y[1], term.formula.diff(c, x[0], x[0])
+        axes = [k for k, places in enumerate(zip(one.places, two.places, strict=False)) if places[0] != places[1]]
+        alike = one.array == two.array and not (one.sums or two.sums)
+        covered = alike and {*one.places, *two.places} == {*whole} and len(whole) == len(term.loops)
+        sizes = tuple(whole.get(place) for place in one.places)
+        if covered and len(axes) == 1 and sizes == one.array.axes and factor and not factor.free_symbols & {*accesses}:
+            part = factor * c * (x[0] - y[0]) ** 2 / 2
+            rest -= part
+            yield term_of(term.loops, part, accesses), axes[0]
+    if rest is term.formula:
+        yield term, None
+    elif rest := rest.expand():
+        yield term_of(term.loops, rest, accesses), None
+
+
+def _signed(system: ArraySystem, force: ArrayForce) -> ArrayForce:
+    """Return the rates of a term of -H, -H_q and H_p; the forces of a Lagrangian are returned as they are."""
+    signed = ((access, -value if access.array in system.momenta else value) for access, value in force.targets)
+    return replace(force, targets=tuple(signed))
+
+
+def _shown(term: ArrayTerm | ArrayForce) -> str:
+    """Return a term or force as text for a comment; instead of long formulas, the arrays that they contain."""
+    formulas = [term.formula] if isinstance(term, ArrayTerm) else [formula for _, formula in term.targets]
+    if sum(1 for _ in islice(chain(*map(preorder_traversal, formulas)), LONG_FORMULA)) < LONG_FORMULA:
+        return str(term)
+    loops = ", ".join(map(str, term.loops))
+    return f"a long formula of {', '.join(sorted({access.array.name for _, access in term.slots}))} for {loops}"
+
+
+def _jacobian(
+    system: ArraySystem, potentials: Sequence[tuple[ArrayTerm, int | None]]
+) -> tuple[tuple[RolledKernel, ...], tuple[RolledKernel, ...]]:
+    """Return the Jacobian of the forces times a direction, by term groups; by term groups also its diagonal."""
+    forces = [(force_of(term, system.state), axis) for term, axis in potentials]
+    forces += [(force, None) for force in system.applied_forces]
+    derived = [_derived(system, *force, number) for number, force in enumerate(forces)]
+    pairs = [pair for pair in derived if pair]
+    circulant = any(axis is not None or any(access.sums for access, _ in force.targets) for force, axis in forces)
+    modes = not system.velocities and (circulant or not system.momenta)
+    diagonals = tuple(diagonal for _, diagonal in pairs) if modes else ()
+    return tuple(product for product, _ in pairs), diagonals
+
+
+def _derived(
+    system: ArraySystem, force: ArrayForce, axis: int | None, number: int
+) -> tuple[RolledKernel, RolledKernel] | None:
+    """Return the kernels of a force for :func:`_jacobian`; ``None`` if it does not depend on the state."""
+    signed = _signed(system, force)
+    force = replace(force, targets=tuple(pair for pair in signed.targets if pair[1] != 0))
+    moving = entries_of(force, (*system.state, *system.velocities))
+    u, w = [slot for slot, _ in moving], [Symbol(f"{slot.name} along", real=True) for slot, _ in moving]
+    rows = [gradient(formula, u) for _, formula in force.targets]
+    if not any(rows):
+        return None
+    along = [Add(*(derivative * w[k] for k, derivative in row.items())) for row in rows]
+    targets = [
+        Add(*(derivative for k, derivative in row.items() if moving[k][1] == access))
+        for row, (access, _) in zip(rows, force.targets, strict=True)
+    ]
+    rolled = partial(
+        rolled_kernel,
+        system,
+        term=force,
+        u=moving,
+        targets=[access for access, _ in force.targets],
+        text=f"derivatives of {_shown(force)}",
+    )
+    jacobian = rolled(f"product_{number}", along, along=w, purpose="Jacobian of the forces times a direction.")
+    diagonal = rolled(f"diagonal_{number}", targets, purpose="Diagonal of the Jacobian of the forces.")
+    return replace(jacobian, circulant=axis), replace(diagonal, circulant=axis)
+
+
+def with_sums(program: Program, split: SplitSystem) -> Program | None:
+    """Return the program of ``of.rest`` with the forces and the energy of the term groups.
+
+    ``None`` if forces enter otherwise than as values of kernels, in Newton's method and shooting, or if steps without
+    the forces of ``of.rest`` have no kicks.
+    """
+    rest, energy, sign = split.rest, program.quantities.energy, -1 if split.rest.auxiliaries else 1
+    forces, terms = [], []
+    for number, group in enumerate(split.term_groups):
+        first = ((0,),) * len(group.places)
+        forces.append(_over_terms(rest, f"pull_{number}", group, group.partials, ()))
+        terms.append(_over_terms(rest, f"term_{number}", group, (sign * group.formula,), first))
+    fixed_point, splitting = program.fixed_point and program.fixed_point.with_forces(tuple(forces)), program.splitting
+    if program.newton or energy is None or not (fixed_point or (splitting and any(splitting.kicks))):
+        return None
+    return replace(
+        program,
+        quantities=replace(program.quantities, energy=energy.with_sums(tuple(terms))),
+        fixed_point=fixed_point,
+        splitting=replace(splitting, force=splitting.force.with_sums(tuple(forces))) if splitting else None,
+    )
+
+
+def _over_terms(
+    system: MechanicalSystem, name: str, group: TermGroup, values: Sequence[Expr], targets: tuple[tuple[int, ...], ...]
+) -> RolledKernel:
+    kernel = lower_kernel(
+        name,
+        arguments=(*group.slots, *group.constants),
+        time=system.time,
+        parameters=system.parameters,
+        values=values,
+        constants=len(group.constants),
+    )
+    index = {parameter: k for k, parameter in enumerate(system.parameters)}
+    coefficients = tuple(
+        tuple(Load("parameters", index[x]) if x in index else Constant(exact_number(x)) for x in column)
+        for column in group.values
+    )
+    return RolledKernel.over_rows(kernel, group.places, coefficients, targets)
+
+
+def reach_of(arrays: Iterable[Array], term_groups: Iterable[RolledKernel]) -> int:
+    """Return the largest distance on an axis of places that forces couple.
+
+    Args:
+        arrays: of coordinates; in a lattice the first axes are named sizes, the last ones integers.
+        term_groups: term groups of forces, with the coordinates that each depends on.
+
+    Returns:
+        0 if no places are coupled, if an array is no lattice, or if a term group couples places by a table, all pairs
+        or a convolution.
+    """
+    if not all(array.is_lattice for array in arrays) or any(each.sums for one in term_groups for each in one.reads):
+        return 0
+    pairs = [
+        (target, slot)
+        for rolled in term_groups
+        if rolled.loops
+        for target in rolled.writes
+        for slot in rolled.reads
+        if target != slot
+    ]
+    axes = [axis for target, slot in pairs for axis in zip(target.places, slot.places, strict=False)]
+    if any(a.table or b.table or a.index != b.index for a, b in axes):
+        return 0
+    distant = any(_distance(*pair) for pair in pairs if pair[0].array == pair[1].array)
+    return max(_distance(*pair) for pair in pairs) if distant else 0
+
+
+def _distance(one: Access, other: Access) -> int:
+    pairs = zip(one.places, other.places, strict=False)
+    return max((abs(a.base.number - b.base.number) for a, b in pairs if a.index), default=0)

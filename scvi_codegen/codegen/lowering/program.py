@@ -1,0 +1,421 @@
+"""Lowering of a symbolic system and a method to a program: kernels, tables and loops (:mod:`scvi_codegen.codegen.ir`).
+
+Fixed-point solvers (``FIXED_POINTS``) iterate on kernels at points that are the lanes of one vector, without a Newton
+matrix: on positions, on velocities, or on momenta and velocities
+(:mod:`~scvi_codegen.codegen.lowering.solvers.points`); on accelerations, or on accelerations and multipliers
+(:mod:`~scvi_codegen.codegen.lowering.solvers.curves`).
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+
+import sympy
+
+from scvi_codegen.codegen.ir.equations import FixedPointIteration, Splitting
+from scvi_codegen.codegen.ir.kernel import Kernel, lower_matrix, lower_vector
+from scvi_codegen.codegen.ir.program import (
+    FEW_UNKNOWNS,
+    Integrals,
+    Layout,
+    MomentumMap,
+    Program,
+    Quantities,
+    StageCurve,
+    StageEquations,
+)
+from scvi_codegen.codegen.lowering.arrays import check_solver_of_arrays, one_coordinate
+from scvi_codegen.codegen.lowering.constraints import constrained_steps, lowered_constraints, rattle_of
+from scvi_codegen.codegen.lowering.loops import rolled_terms
+from scvi_codegen.codegen.lowering.solvers.curves import curve_iteration
+from scvi_codegen.codegen.lowering.solvers.points import coupled_iteration, hamiltonian_iteration, separable_iteration
+from scvi_codegen.codegen.lowering.solvers.tables import (
+    Solver,
+    StepProblem,
+    resolved_degree,
+    shift_tables,
+    velocity_tables,
+)
+from scvi_codegen.codegen.lowering.stage_groups import (
+    bandwidth,
+    bandwidth_ordering,
+    comment_text,
+    damping_kernel,
+    has_action,
+    integrand_kernel,
+    layout_of,
+    lowered_stage_group,
+    system_kernel,
+)
+from scvi_codegen.common.errors import MethodError
+from scvi_codegen.common.precision import Matrix, Vector, mp
+from scvi_codegen.methods.constraints import END_VELOCITY
+from scvi_codegen.methods.discretise import discretise, is_conformally_symplectic, is_symplectic
+from scvi_codegen.methods.leapfrog_stages import kicks_and_drifts
+from scvi_codegen.methods.method import Method
+from scvi_codegen.methods.stage_system import Accelerations, PrintedCurve, ShotCurve, StageSystem, Velocities
+from scvi_codegen.methods.tables.basis import cardinal_values, legendre_functional
+from scvi_codegen.systems.arrays.system import ArraySystem
+from scvi_codegen.systems.derived_expressions import forms_of
+from scvi_codegen.systems.first_order import FirstOrderSystem
+from scvi_codegen.systems.formulas.expressions import gradient_tuple
+from scvi_codegen.systems.formulas.indices import Array
+from scvi_codegen.systems.formulas.symbols import symbol
+from scvi_codegen.systems.lagrangian import LagrangianSystem
+from scvi_codegen.systems.splittings.kinetic import kinetic_splitting
+from scvi_codegen.systems.symmetry.symmetry import Symmetry, work_rates
+from scvi_codegen.systems.system import MechanicalSystem
+
+FIXED_POINTS: tuple[Solver, ...] = (
+    separable_iteration,  # constant masses
+    hamiltonian_iteration,
+    coupled_iteration,  # velocities of any Lagrangian
+    curve_iteration,  # accelerations
+)
+"""Fixed-point solvers, the fastest first; the first that is applicable is used."""
+
+
+def iteration_of(
+    system: MechanicalSystem, stages: StageSystem, *, velocities: bool = False
+) -> FixedPointIteration | None:
+    """Return the fixed-point iteration of the stage equations of a system, or ``None`` if there is none.
+
+    With ``velocities`` it has a table of those at the points, on which forces depend.
+    """
+    if system.constraints or forms_of(system).one_form:
+        return None
+    problem = StepProblem(system, stages.shape)
+    if velocities:
+        return separable_iteration(problem, velocities=True)
+    return next((fixed_point for solver in FIXED_POINTS if (fixed_point := solver(problem)) is not None), None)
+
+
+def check_solver(
+    solver: str, method: Method, names: Sequence[str], *, found: FixedPointIteration | Splitting | None
+) -> None:
+    """Raise :class:`MethodError` for an unknown solver, or one that this method and system do not have."""
+    if solver not in names:
+        raise MethodError(f"unknown solver {solver!r}: use one of {', '.join(names)}")
+    if solver == "explicit" and found is None:
+        raise MethodError(f"{method.name} is not explicit for this system: use solver='auto'")
+    if solver == "fixed-point" and found is None:
+        raise MethodError(
+            f"{method.name} has no fixed-point iteration for this system: use solver='auto' or 'newton', "
+            "or at most 32 points (an SVI: at least as many as its degree; a variational SCVI: at most 8 coordinates)"
+        )
+
+
+def splitting_of(system: MechanicalSystem, method: Method) -> Splitting | None:
+    """Return the sequence of kicks and drifts, or ``None`` if the method is implicit."""
+    if not method.fractions or system.constraints or isinstance(split := kinetic_splitting(system), str):
+        return None
+    moved, (kicks, drifts) = split.system, kicks_and_drifts(method, split)
+    turned = any(not each.is_diagonal() for each in split.axes)
+    turning = system_kernel(moved, "turning", sum(split.rates, ()), u=(), purpose="a_i, a_j - a_i, a_k - a_i.")
+    if split.velocity:
+        drift = system_kernel(moved, "drift_velocity", split.velocity, u=moved.auxiliaries, purpose="H_p at u = p.")
+    else:
+        drift = system_kernel(moved, "mass", forms_of(moved).mass.values(), u=(), purpose="The constant masses.")
+    return Splitting(
+        kicks=lower_vector(kicks),
+        drifts=lower_vector(drifts),
+        abscissae=lower_vector(tuple(mp.fsum(drifts[:n]) for n in range(len(kicks)))),
+        force=system_kernel(moved, "force", split.force, u=moved.coordinates, purpose="L_q at u = q."),
+        drift=drift,
+        by_masses=not split.velocity,
+        bodies=tuple((first, *axes) for first, _, *axes in split.bodies),
+        turning=turning if split.bodies else None,
+        principal=lower_matrix(tuple(tuple(map(mp.mpf, map(str, each))) for each in split.axes if turned)),
+    )
+
+
+def summing_splitting(splitting: Splitting, system: MechanicalSystem) -> Splitting:
+    """Return a splitting with the kernel of L at rest, whose sum with the kinetic energies is the action of a run."""
+    split = kinetic_splitting(system)
+    assert not isinstance(split, str)  # since there is a splitting
+    assert isinstance(split.system, LagrangianSystem)
+    moved = split.system
+    value = moved.lagrangian.xreplace(dict.fromkeys(moved.velocities, sympy.S.Zero))
+    kernel = system_kernel(moved, "at_rest", (value,), u=moved.coordinates, purpose="L at v = 0, u = q.")
+    return replace(splitting, at_rest=kernel)
+
+
+SOLVERS = ("auto", "explicit", "fixed-point", "newton")
+
+
+def lower(
+    system: MechanicalSystem | ArraySystem,
+    method: Method,
+    *,
+    prefix: str,
+    solver: str = "auto",
+    symmetries: Sequence[Symmetry] = (),
+    lanes: bool = True,
+    fallback: bool = True,
+) -> Program:
+    """Return the program of one step of ``method`` for ``system``; exported C names begin with ``prefix``.
+
+    Systems of arrays of run-time sizes have constant masses, so that the tables of a method are the same for every
+    coordinate: those of a system of one coordinate serve all.
+
+    Args:
+        system, method: the system, of named coordinates or of arrays, and the method.
+        prefix: a C identifier.
+        solver: as in :func:`~scvi_codegen.compile_stepper`.
+        symmetries: whose momentum maps are included.
+        lanes: allow a solver that uses SIMD lanes.
+        fallback: include Newton's iteration as a fallback. Systems with integrals along the curve always include it.
+
+    Raises:
+        MethodError: if the solver is not available for the method and the system.
+    """
+    arrays = system if isinstance(system, ArraySystem) else None
+    one = one_coordinate(system) if isinstance(system, ArraySystem) else system
+    stages, velocities = discretise(one, method), bool(arrays and arrays.velocities)
+    explicit = arrays or solver in ("auto", "explicit")
+    splitting = splitting_of(one, method) if explicit and not (system.constraints or one.integrands) else None
+    iterated = not system.constraints if arrays else lanes and solver in ("auto", "fixed-point")
+    fixed_point = iteration_of(one, stages, velocities=velocities) if iterated and splitting is None else None
+    program = partial(
+        Program,
+        prefix=prefix,
+        title=comment_text(f"{system.name}: {method.title}"),
+        notes=_notes(method, one, forced=bool(arrays and arrays.applied_forces)),
+        order=method.order or len(stages.blocks),
+        layout=_layout(system),
+        fixed_point=fixed_point,
+        splitting=splitting,
+    )
+    if isinstance(system, ArraySystem):
+        loops = rolled_terms(system, constrained_steps(system, stages, method), newton=solver == "newton")
+        if loops.products and fixed_point and fixed_point.matrix:
+            loops = replace(loops, shifts=shift_tables(fixed_point.matrix, fixed_point.lanes))
+        check_solver_of_arrays(system, method, solver, splitting or loops.constrained or fixed_point, loops)
+        return program(loops=loops, polynomial_curves=bool(fixed_point and (fixed_point.points > 1 or not velocities)))
+    check_solver(solver, method, SOLVERS, found=splitting if solver == "explicit" else fixed_point)
+    alone = fixed_point is not None and not fallback and not system.integrands
+    newton = solver in ("auto", "newton") and splitting is None and not alone
+    polynomial = method.exactness.curve != 0
+    curve = newton and polynomial and splitting is None
+    equations = _equations(system, method, stages, newton=newton, curve=curve)
+    return program(
+        newton=newton,
+        polynomial_curves=polynomial,
+        equations=equations,
+        quantities=_quantities(system, method, stages, symmetries),
+        constraints=lowered_constraints(system) if system.constraints else None,
+        rattle=rattle_of(system, stages, equations.extrapolation) if system.constraints and solver == "auto" else None,
+        damping=damping_kernel(system),
+    )
+
+
+def _layout(system: MechanicalSystem | ArraySystem) -> Layout:
+    numbers = {"parameters": tuple(each.name for each in system.parameters), "defaults": system.defaults}
+    if isinstance(system, ArraySystem):
+        kinds = ("coordinates", "momenta", "velocities", "sums", "fields", "tables", "sizes")
+        return Layout(**{kind: getattr(system, kind) for kind in kinds}, **numbers)
+    return Layout(
+        coordinates=tuple(Array(q.name, ()) for q in system.coordinates),
+        inputs=tuple((name, system.parameters.index(symbol(f"{name}_0"))) for name in system.inputs),
+        coupled=tuple(_coupled_coordinates(system)),
+        **numbers,
+    )
+
+
+def _coupled_coordinates(system: MechanicalSystem) -> Iterator[tuple[int, int]]:
+    names = [each.name for each in system.coordinates]
+    for elements in (array.elements for array in system.arrays if array.is_field):
+        first = names.index(elements[0]) if elements[0] in names else len(names)
+        if names[first : first + len(elements)] == [*elements]:
+            yield first, first + len(elements)
+
+
+def _equations(
+    system: MechanicalSystem, method: Method, stages: StageSystem, *, newton: bool, curve: bool
+) -> StageEquations:
+    """Return the stage equations; ``newton``: with the stage groups, ``curve``: with the error estimate."""
+    m, sites = system.dimension, layout_of(stages, system.dimension)
+    blocks, rows = [stages.blocks[b] for b in sites.columns[None]], [stages.rows[r] for r in sites.rows[None]]
+    stage_groups = tuple(lowered_stage_group(system, group, sites) for group in stages.stage_groups) if newton else ()
+    pairs = (pair for group in stage_groups for block in group.blocks for pair in block.entries)
+    coupled = [*forms_of(system).legendre_jacobian, *pairs]  # with a nonzero derivative
+    order = bandwidth_ordering(coupled, sites.count)
+    return StageEquations(
+        sites=sites.count,
+        blocks=len(blocks),
+        stage_groups=stage_groups,
+        places=order,
+        mass_positions=tuple(sorted(range(m), key=order.__getitem__).index(i) for i in range(m)),
+        bandwidth=bandwidth(coupled, order),
+        momentum_rows=lower_vector(tuple(row.momentum for row in rows)),
+        end_position=lower_vector(stages.end_position.columns([b + 1 for b in sites.columns[None]]).entries[0]),
+        straight=tuple(int(block.straight[1]) for block in blocks),
+        momentum_blocks=tuple(block.momentum for block in blocks),
+        moving_blocks=tuple(int(block.moves) for block in blocks),
+        extrapolation=lower_matrix(
+            tuple(line for columns in sites.columns.values() for line in _required_extrapolation(stages, columns))
+        ),
+        acts=sites.count == m
+        and not forms_of(system).one_form
+        and has_action(system)
+        and any(group.in_action for group in stages.stage_groups),
+        stage_curve=_stage_curve(stages) if curve else None,
+        numbers=_numbers(system, method, len(rows)) if len(blocks) * sites.count <= FEW_UNKNOWNS else ("", "", ""),
+    )
+
+
+def _quantities(
+    system: MechanicalSystem, method: Method, stages: StageSystem, symmetries: Sequence[Symmetry]
+) -> Quantities:
+    """Return the functions of the state that a run evaluates or integrates."""
+    name, purpose = ("hamiltonian", "H at u = (q, p).") if system.auxiliaries else ("lagrangian", "L at u = (q, v).")
+    forms, integrates = forms_of(system), any(group.in_action for group in stages.stage_groups)
+    return Quantities(
+        legendre=system_kernel(
+            system,
+            "legendre",
+            forms.regular_legendre,
+            u=forms.legendre_arguments,
+            partials=forms.legendre_jacobian.values(),
+            purpose="Momenta theta and their derivatives by y at u = (q, y)."
+            if forms.one_form
+            else "H_p and H_pp at u = (q, p)."
+            if system.auxiliaries
+            else f"Momenta L_v {'' if forms.inverse_mass else 'and mass matrix L_vv '}at u = (q, v).",
+        ),
+        inverse_legendre=_inverse_legendre_kernel(system),
+        mass_entries=tuple(forms.legendre_jacobian),
+        energy=system_kernel(system, name, (system.formula,), u=forms.legendre_arguments, purpose=purpose),
+        hamiltonian=bool(system.auxiliaries),
+        momentum_maps=tuple(_momentum_map(each, method) for each in symmetries),
+        momentum_kernel=_momentum_kernel(system, symmetries),
+        first_order_rates=_rates_of_first_order(system),
+        integrals=_integrals(system, method, stages),
+        work_and_impulses=tuple(each.name for each in work_rates(system)) if integrates else (),
+        integrates=integrates,
+    )
+
+
+def _momentum_map(symmetry: Symmetry, method: Method) -> MomentumMap:
+    name, formula = comment_text(symmetry.name), comment_text(symmetry.formula)
+    return MomentumMap(name=name, formula=formula, exact=method.exactness.conserves(symmetry))
+
+
+def _numbers(system: MechanicalSystem, method: Method, count: int) -> tuple[str, str, str]:
+    """Return the paper's equation numbers of the last ``count`` rows, of q1 and of p1."""
+    paper = method.paper_form(system)
+    known = dict.fromkeys(row.number for row in paper.rows[-count:] if row.number[:1].isdigit())
+    rows = ", ".join(f"({number})" for number in known)
+    q1, p1 = (f"({number})" if number[:1].isdigit() else "" for number in paper.end_numbers)
+    return rows, q1, p1
+
+
+def _stage_curve(stages: StageSystem) -> StageCurve | None:
+    """Return the error estimate for unknowns that are velocities along a curve, or a first velocity and accelerations.
+
+    With constraints, the velocity at the end is determined separately, with the accuracy of the step. Its difference
+    from that of the curve is the first Legendre coefficient that the curve does not have: a better estimate than the
+    last one that it has, and also available for one velocity.
+    """
+    shape, count = stages.shape, len([block for block in stages.blocks if block.size is None])
+    has_end_velocity = any((block.letter, block.index) == END_VELOCITY for block in stages.blocks)
+    if isinstance(shape, Velocities) and _moves(stages, shape):
+        tables, last = velocity_tables(shape), len(shape.blocks) - 1 + has_end_velocity
+        degree = last if has_end_velocity or tables is None else resolved_degree(tables)
+        if degree == 0:
+            return None
+        first, tops = 0, _highest_of(shape, None if has_end_velocity else degree)
+        differences = [(0, last), (0, (last + 1) // 2)]
+        rows = [tuple(mp.mpf((b == last) - (b == first)) for b in range(count)) for first, last in differences]
+        power = 2 * degree - (degree > 1)
+    elif isinstance(shape, Accelerations | ShotCurve | PrintedCurve):
+        c, size = shape.tableau.c, len(shape.tableau.c)
+        if len({*c}) < size:
+            return None
+        first, tops = 1, [legendre_functional(c, k) for k in (size - 1, size - 2)]
+        rows = [tuple(mp.mpf(b == only) for b in range(count)) for only in (1, size)]
+        power = 2 * size - (size > 2)
+    else:
+        return None
+    before, behind = (mp.zero,) * first, (mp.zero,) * (count - first - len(tops[0]))
+    highest, below = (lower_vector((*before, *top, *behind)) for top in tops)
+    return StageCurve(
+        highest=highest, next=below, curvatures=(lower_vector(rows[0]), lower_vector(rows[1])), power=power
+    )
+
+
+def _highest_of(shape: Velocities, degree: int | None) -> list[Vector]:
+    """Return the weights of the leading coefficient of the accelerations, and of the next lower one."""
+    if degree is None:
+        line = (*(-x for x in cardinal_values(shape.blocks, (mp.one,))[0]), mp.one)
+        return [tuple((4 * len(shape.blocks) - 2) * x for x in line), (mp.zero,) * len(line)]
+    lines = {k: legendre_functional(shape.blocks, k) for k in (degree, degree - 1)}
+    return [tuple(max(4 * k - 2, 0) * x for x in line) for k, line in lines.items()]
+
+
+def _moves(stages: StageSystem, shape: Velocities) -> bool:
+    """Return whether the velocities, the first blocks, are the only unknowns that displace positions."""
+    degree = len(shape.blocks)
+    return degree == len({*shape.blocks}) and all(block.moves == (b < degree) for b, block in enumerate(stages.blocks))
+
+
+def _integrals(system: MechanicalSystem, method: Method, stages: StageSystem) -> Integrals | None:
+    kernel = integrand_kernel(system, "integrands", stages.stage_groups[0].arguments)
+    if kernel is None:
+        return None
+    if not isinstance(stages.shape, Velocities):
+        raise MethodError(
+            f"{method.name} does not support the time transformation of '{system.name}': use "
+            "an SVI, or a Runge-Kutta method in phase space"
+        )
+    return Integrals(kernel=kernel, weights=lower_vector(stages.shape.weights))
+
+
+def _inverse_legendre_kernel(system: MechanicalSystem) -> Kernel | None:
+    """Return the kernel of the velocities at (q, p), ``None`` if they have no formula."""
+    inverse, arguments = forms_of(system).inverse_mass, (*system.coordinates, *system.momentum_symbols)
+    if inverse is None:
+        return None
+    return system_kernel(
+        system, "inverse_legendre", inverse.velocities, u=arguments, purpose="L_vv^-1 p at u = (q, p)."
+    )
+
+
+def _rates_of_first_order(system: MechanicalSystem) -> Kernel | None:
+    """Return the kernel of the right-hand side of the velocities of a first-order system, ``None`` for others."""
+    if not isinstance(system, FirstOrderSystem) or system.is_canonical:
+        return None
+    right = gradient_tuple(system.hamiltonian, system.momenta)
+    arguments = forms_of(system).legendre_arguments
+    return system_kernel(system, "first_order_rates", right, u=arguments, purpose="H_y = theta_y^T q' at u = (q, y).")
+
+
+def _momentum_kernel(system: MechanicalSystem, symmetries: Sequence[Symmetry]) -> Kernel | None:
+    """Return the kernel of the momentum maps, then of the sums of the squares of their terms."""
+    if not symmetries:
+        return None
+    maps = [symmetry.momentum_map for symmetry in symmetries]
+    squares = [sympy.Add(*(term**2 for term in sympy.Add.make_args(J))) for J in maps]
+    return system_kernel(
+        system,
+        "momentum_maps",
+        (*maps, *squares),
+        u=(*symmetries[0].coordinates, *symmetries[0].momenta),
+        purpose="Momentum maps at u = (q, p), then the sums of the squares of their terms.",
+    )
+
+
+def _notes(method: Method, system: MechanicalSystem, *, forced: bool) -> tuple[str, ...]:
+    """Return the lines of the header's comment: order, symplecticity, symmetry; ``forced``: with further forces."""
+    order = "no order claimed" if method.order is None else f"order {method.order}"
+    geometry = "symplectic" if is_symplectic(method, system) else "conformally symplectic"
+    if forced or not is_conformally_symplectic(method, system):
+        geometry = "not symplectic"
+    return order, geometry, "symmetric" if method.symmetric else "not symmetric"
+
+
+def _required_extrapolation(stages: StageSystem, columns: Sequence[int]) -> Matrix:
+    """Return the extrapolation table of a group of blocks, transposed."""
+    if stages.extrapolation is None or any(block.power != 1 for block in stages.blocks):
+        raise TypeError("only stage systems with velocities as unknowns can be lowered")
+    return tuple(tuple(stages.extrapolation[i][j] for i in columns) for j in columns)

@@ -1,0 +1,387 @@
+"""Kernels of a system, and stage groups: kernels with their derivatives, and gathers and scatters as loops.
+
+There is one group of sites per coordinate, then one per component of other unknowns. Two coordinates are coupled if a
+mixed second derivative of the Lagrangian does not vanish. The Newton matrix has a block for every coupled pair; in a
+good ordering the blocks are in a narrow band, outside of which nothing is stored or computed. An open chain has
+bandwidth 1, a closed one 2, and if all coordinates are coupled the band is the whole matrix.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import sympy
+from sympy import Expr, Symbol
+
+from scvi_codegen.codegen.ir.arithmetic import lower_kernel
+from scvi_codegen.codegen.ir.equations import DerivativeBlock, GatherLoop, LoweredStageGroup, ScatterLoop
+from scvi_codegen.codegen.ir.kernel import Kernel, RolledKernel, lower_matrix, lower_vector
+from scvi_codegen.common.errors import MethodError
+from scvi_codegen.common.precision import mp
+from scvi_codegen.methods.stage_system import Gather, Scatter, StageGroup, StageSystem, Table
+from scvi_codegen.systems.arrays.system import ArraySystem
+from scvi_codegen.systems.derived_expressions import auxiliary_multipliers, curve_rates, multipliers
+from scvi_codegen.systems.formulas.array_statements import ArrayForce
+from scvi_codegen.systems.formulas.arrays import ArrayTerm
+from scvi_codegen.systems.formulas.expressions import Tape, jacobian
+from scvi_codegen.systems.formulas.indices import Access
+from scvi_codegen.systems.hamiltonian import HamiltonianSystem
+from scvi_codegen.systems.symmetry.symmetry import work_rates
+from scvi_codegen.systems.system import MechanicalSystem
+
+
+def integrand_kernel(system: MechanicalSystem, name: str, u: Iterable[Symbol]) -> Kernel | None:
+    """Return the kernel of the functions that a run integrates along its curve; ``None`` if there are none."""
+    if not system.integrands:
+        return None
+    return system_kernel(system, name, system.integrands, u=u, purpose="Functions that are integrated along the curve.")
+
+
+def damping_kernel(system: MechanicalSystem) -> Kernel | None:
+    """Return the kernel of the rate of a uniform damping; ``None`` without damping."""
+    if system.damping == 0:
+        return None
+    return system_kernel(system, "damping", (system.damping,), u=(), purpose="The rate gamma of the damping.")
+
+
+def system_kernel(
+    system: MechanicalSystem,
+    name: str,
+    values: Iterable[Expr],
+    *,
+    u: Iterable[Symbol],
+    partials: Iterable[Expr] = (),
+    purpose: str = "",
+    paired: bool = False,
+    of_rounding: bool = False,
+) -> Kernel:
+    """Return the kernel ``name`` as a function of the time and parameters of a system.
+
+    Args:
+        system, name: the system, and the C identifier.
+        values: expressions of the values.
+        u: the arguments.
+        partials: expressions of derivatives, stored after the values.
+        purpose: one sentence on what it computes, for the comment above it.
+        paired: whether its sums have short chains of operations instead of few operations.
+        of_rounding: whether it computes bounds of the rounding errors of the values instead.
+    """
+    kernel = lower_kernel(
+        name,
+        arguments=tuple(u),
+        time=system.time,
+        parameters=system.parameters,
+        values=tuple(values),
+        partials=tuple(partials),
+        paired=paired,
+        of_rounding=of_rounding,
+    )
+    return replace(kernel, purpose=purpose)
+
+
+def rolled_kernel(
+    system: ArraySystem,
+    name: str,
+    values: Iterable[Expr],
+    term: ArrayTerm | ArrayForce,
+    u: Sequence[tuple[Symbol, Access]] = (),
+    *,
+    along: Sequence[Symbol] = (),
+    targets: Sequence[Access] | None = None,
+    text: str,
+    purpose: str,
+) -> RolledKernel:
+    """Return the kernel ``name`` in the loops of a term.
+
+    Args:
+        system, name, values, purpose: as of :func:`system_kernel`.
+        term: the term, whose other entries are the last parameters.
+        u: entries that are arguments.
+        along: further arguments, the components of a direction by these entries.
+        targets: entries that the values are added to; by default ``u``.
+        text: formula for the comment.
+    """
+    symbols, accesses = [slot for slot, _ in u], tuple(access for _, access in u)
+    constants = [(slot, access) for slot, access in term.slots if slot not in symbols]
+    kernel = lower_kernel(
+        name,
+        arguments=(*symbols, *along),
+        time=system.time,
+        parameters=(*system.parameters, *(slot for slot, _ in constants)),
+        values=tuple(values),
+    )
+    return RolledKernel(
+        kernel=replace(kernel, purpose=purpose),
+        loops=term.loops,
+        reads=accesses * (2 if along else 1),
+        writes=accesses if targets is None else tuple(targets),
+        given=tuple(access for _, access in constants),
+        text=comment_text(text),
+        along=len(along),
+    )
+
+
+def comment_text(text: str) -> str:
+    """Return one printable line that neither ends nor begins a C comment."""
+    line = "".join(character if character.isprintable() else "?" for character in " ".join(text.split()))
+    return line.replace("*/", "* /").replace("/*", "/ *").replace("??/", "? ? /")
+
+
+@dataclass(frozen=True, slots=True)
+class UnknownLayout:
+    """Groups of blocks of the same size, each at as many sites: first those at the coordinates, of size ``None``.
+
+    Attributes:
+        dimension: number of coordinates.
+        first: the first site, by size.
+        columns: the indices of the B blocks, by size.
+        rows: the indices of the B rows, by size.
+        count: number of sites.
+    """
+
+    dimension: int
+    first: dict[int | None, int]
+    columns: dict[int | None, tuple[int, ...]]
+    rows: dict[int | None, tuple[int, ...]]
+    count: int
+
+    def size(self, count: int, table: Table, members: dict[int | None, tuple[int, ...]], first: int = 0) -> int | None:
+        """Return the size of the ``members`` in a table of ``count`` components: multipliers may be as many as m."""
+        used = any(line[k + first] for line in table.entries for k in members.get(count, ()))
+        return count if used or count != self.dimension else None
+
+
+def layout_of(stages: StageSystem, dimension: int) -> UnknownLayout:
+    """Return the sites of stage equations.
+
+    Raises:
+        MethodError: unless there are as many blocks as rows, and equally many, of every size.
+    """
+    blocks, rows = [block.size for block in stages.blocks], [row.size for row in stages.rows]
+    sizes = [None, *sorted({size for size in (*blocks, *rows) if size is not None})]
+    numbers = [dimension if size is None else size for size in sizes]
+    columns, lines = (
+        {size: tuple(k for k, each in enumerate(items) if each == size) for size in sizes} for items in (blocks, rows)
+    )
+    if len({len(places) for group in (columns, lines) for places in group.values()}) > 1:
+        counts = ", ".join(
+            f"{len(columns[size])} blocks and {len(lines[size])} rows of {number}"
+            for size, number in zip(sizes, numbers, strict=True)
+        )
+        raise MethodError(
+            "stage equations must have as many blocks as rows of every size, and equally many of all "
+            f"sizes; got {counts}"
+        )
+    first = {size: sum(numbers[:k]) for k, size in enumerate(sizes)}
+    return UnknownLayout(dimension, first, columns, lines, sum(numbers))
+
+
+def _block_size(gather: Gather, sites: UnknownLayout) -> int | None:
+    return sites.size(len(gather.arguments), gather.table, sites.columns, 1)
+
+
+def _row_size(scatter: Scatter, sites: UnknownLayout) -> int | None:
+    return sites.size(len(scatter.results), scatter.table, sites.rows)
+
+
+Pairs = Iterable[tuple[int, int]]
+
+
+def bandwidth(pairs: Pairs, positions: tuple[int, ...]) -> int:
+    """Return the largest distance of two coupled coordinates in an ordering.
+
+    >>> bandwidth([(0, 2), (1, 2)], (0, 1, 2))
+    2
+    """
+    return max((abs(positions[i] - positions[j]) for i, j in pairs), default=0)
+
+
+def bandwidth_ordering(pairs: Pairs, count: int) -> tuple[int, ...]:
+    """Return the position of each coordinate: the original order, or reverse Cuthill-McKee if that is narrower.
+
+    >>> bandwidth_ordering([(0, 2), (1, 2)], 3)
+    (2, 0, 1)
+    """
+    coupled = {(max(pair), min(pair)) for pair in pairs if pair[0] != pair[1]}
+    original = tuple(range(count))
+    if bandwidth(coupled, original) <= 1 or 2 * len(coupled) == count * (count - 1):
+        return original
+    order = _cuthill_mckee(coupled, count)
+    return order if bandwidth(coupled, order) < bandwidth(coupled, original) else original
+
+
+def _cuthill_mckee(coupled: set[tuple[int, int]], count: int) -> tuple[int, ...]:
+    # Imported here because SciPy is slow to import and most systems do not need it.
+    from scipy.sparse import csr_matrix
+    from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+    rows, columns = np.array(sorted(coupled | {(j, i) for i, j in coupled})).T
+    graph = csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count))
+    order = reverse_cuthill_mckee(graph, symmetric_mode=True)
+    return tuple(int(place) for place in np.argsort(order))
+
+
+MOST_PAIRS_COMPARED, LARGEST_DIFFERENCE = 16, mp.mpf(10) ** -20
+"""Number of pairs of mixed derivatives that are compared by value, and their largest relative difference."""
+
+
+def has_action(system: MechanicalSystem) -> bool:
+    """Return whether the discrete Lagrangian exists as a function of both ends of a step.
+
+    It does not if velocities do not determine momenta, with forces, with constraints, or with damping.
+    """
+    if system.forces or system.constraints or system.damping != 0:
+        return False
+    return not isinstance(system, HamiltonianSystem) or system.is_regular
+
+
+def lowered_stage_group(system: MechanicalSystem, group: StageGroup, sites: UnknownLayout) -> LoweredStageGroup:
+    """Return a stage group in loops: its kernel with derivatives, and rounded tables."""
+    partials, blocks = _derivative_blocks(group, sites)
+    names = tuple(argument_name(system, gather) for gather in group.gathers)
+    u = f"u = ({', '.join(names)})"
+    return LoweredStageGroup(
+        name=group.name,
+        arguments=names,
+        abscissae=lower_vector(group.abscissae),
+        weights=lower_vector(group.weights),
+        gathers=tuple(_gather_loop(group, g, sites) for g in range(len(group.gathers))),
+        scatters=tuple(_scatter_loop(group, s, sites) for s in range(len(group.scatters))),
+        value=system_kernel(
+            system, f"{group.name}_value", group.results, u=group.arguments, purpose=f"{_results(group, names)} at {u}."
+        ),
+        derivative=system_kernel(
+            system,
+            f"{group.name}_derivatives",
+            group.results,
+            u=group.arguments,
+            partials=partials,
+            purpose=f"The same, and the nonzero derivatives with respect to {u}.",
+        ),
+        blocks=blocks,
+        integrand=_integrand(system, group, u) if group.in_action else None,
+        integrand_power=group.scalar_power,
+        integrand_weights=lower_vector(group.scalar_weights),
+    )
+
+
+def _results(group: StageGroup, names: tuple[str, ...]) -> str:
+    if group.computes:
+        return group.computes
+    if group.name == "node":
+        return "Derivatives of lambda . E" if "lambda" in names else "The Euler-Lagrange residual E"
+    if group.scalar_power:
+        return f"Derivatives of d^{group.scalar_power}L/dt^{group.scalar_power}"
+    partials = [f"L_{name}" for name in names]
+    if group.forced:
+        partials[0] += " + f"
+    return " and ".join(partials) if len(group.scatters) == len(names) else "L_v"
+
+
+def _integrand(system: MechanicalSystem, group: StageGroup, u: str) -> Kernel | None:
+    """Return the kernel that is summed along the curve: work and impulses of forces, then the action."""
+    assert group.scalar is not None
+    if rates_of_forces := work_rates(system):
+        rates = [*(each.rate for each in rates_of_forces), group.scalar]
+        purpose = f"Power and impulse rates of the forces, and L, at {u}."
+        return system_kernel(system, "exchanges", rates, u=group.arguments, purpose=purpose)
+    k = group.scalar_power
+    rate = f"d{f'^{k}' * (k > 1)}L/dt{f'^{k}' * (k > 1)}"
+    return system_kernel(
+        system,
+        "lagrangian" if group.name == "quadrature" else f"{group.name}_action",
+        (group.scalar,),
+        u=group.arguments,
+        purpose=f"{rate if k else 'p . v - H' if system.auxiliaries else 'L'} at {u}.",
+    )
+
+
+def argument_name(system: MechanicalSystem, gather: Gather) -> str:
+    """Return the name of the arguments of a gather as used in formulas."""
+    names = {
+        system.coordinates: "q",
+        system.velocities: "v",
+        **dict(zip(curve_rates(system, 3), ("a", "j", "s"), strict=True)),
+        multipliers(system): "lambda",
+        system.auxiliaries: "p",
+        auxiliary_multipliers(system): "nu",
+    }
+    name = gather.arguments[0].name.rpartition("_")[0] if gather.arguments else ""
+    return names.get(gather.arguments, name)
+
+
+def _derivative_blocks(
+    group: StageGroup, sites: UnknownLayout
+) -> tuple[tuple[sympy.Expr, ...], tuple[DerivativeBlock, ...]]:
+    entries = _partials(group)
+    partials: list[sympy.Expr] = []
+    blocks = []
+    for s, scatter in enumerate(group.scatters):
+        top = sum(len(other.results) for other in group.scatters[:s])
+        for g, gather in enumerate(group.gathers):
+            left = sum(len(other.arguments) for other in group.gathers[:g])
+            rows, columns = range(top, top + len(scatter.results)), range(left, left + len(gather.arguments))
+            nonzero = [(i - top, j - left) for i, j in entries if i in rows and j in columns]
+            if nonzero:
+                row, column = sites.first[_row_size(scatter, sites)], sites.first[_block_size(gather, sites)]
+                pairs = tuple((row + i, column + j) for i, j in nonzero)
+                blocks.append(DerivativeBlock(scatter=s, gather=g, first=len(partials), entries=pairs))
+                partials.extend(entries[top + i, left + j] for i, j in nonzero)
+    return tuple(partials), tuple(blocks)
+
+
+def _partials(group: StageGroup) -> dict[tuple[int, int], sympy.Expr]:
+    """Return the nonzero derivatives of results with respect to arguments; symmetric for a gradient."""
+    entries = jacobian(group.results, group.arguments)
+    if group.scalar is None or group.forced:
+        return entries
+    _check_symmetry(group, entries)
+    return {(i, j): entries.get((min(i, j), max(i, j)), entry) for (i, j), entry in entries.items()}
+
+
+def _check_symmetry(group: StageGroup, entries: Mapping[tuple[int, int], sympy.Expr]) -> None:
+    """Raise :class:`MethodError` if mixed derivatives differ: Newton's method would not converge with them."""
+    unlike = [(i, j) for (i, j), entry in entries.items() if i < j and entry != entries.get((j, i))]
+    for i, j in unlike[:MOST_PAIRS_COMPARED]:
+        pair = entries[i, j], entries.get((j, i), sympy.S.Zero)
+        symbols = sorted(pair[0].free_symbols | pair[1].free_symbols, key=str)
+        terms = [term for entry in pair for term in sympy.Add.make_args(entry)]
+        try:
+            one, other, *sizes = Tape([*pair, *terms], symbols)([mp.mpf(k + 3) / (k + 5) for k in range(len(symbols))])
+        except ArithmeticError:
+            continue
+        if abs(one - other) > LARGEST_DIFFERENCE * sum(map(abs, sizes)):  # the terms may cancel
+            u = group.arguments
+            raise MethodError(
+                f"the results of the stage group '{group.name}' are not the gradient of its scalar: the "
+                "derivative of that "
+                f"for {u[i]} by {u[j]} is {pair[0]}, of that for {u[j]} by {u[i]} {pair[1]}. They must be equal: check "
+                "the signs and the order of the results in its scatters, or give the stage group no scalar"
+            )
+
+
+def _gather_loop(group: StageGroup, index: int, sites: UnknownLayout) -> GatherLoop:
+    gather = group.gathers[index]
+    size = _block_size(gather, sites)
+    return GatherLoop(
+        name=f"{group.name}_gather_{index}",
+        first=sites.first[size],
+        sites=len(gather.arguments),
+        offset=sum(len(other.arguments) for other in group.gathers[:index]),
+        from_state=bool(gather.table.entries[0][0]),
+        power=gather.power + 1,
+        table=lower_matrix(gather.table.columns([b + 1 for b in sites.columns[size]]).entries),
+    )
+
+
+def _scatter_loop(group: StageGroup, index: int, sites: UnknownLayout) -> ScatterLoop:
+    scatter = group.scatters[index]
+    size = _row_size(scatter, sites)
+    return ScatterLoop(
+        name=f"{group.name}_scatter_{index}",
+        first=sites.first[size],
+        sites=len(scatter.results),
+        offset=sum(len(other.results) for other in group.scatters[:index]),
+        power=scatter.power,
+        table=lower_matrix(scatter.table.columns([*sites.rows[size], -1]).entries),
+    )

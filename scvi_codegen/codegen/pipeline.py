@@ -1,0 +1,537 @@
+"""C sources of one integrator and its variants.
+
+    MechanicalSystem, Method
+      -> discretise  StageSystem   points, kernel and tables: the equations of one step
+                                   (:mod:`scvi_codegen.methods.discretise`)
+      -> iteration   Iteration     fixed-point iteration, if the system admits one; splitting_of: explicit splitting
+                                   (:mod:`scvi_codegen.codegen.lowering.program`)
+      -> symmetries  Symmetry      conserved quantities (:mod:`scvi_codegen.systems.symmetry.symmetry`)
+      -> lower       Program       kernels, tables, loops: intermediate form (:mod:`.lowering.program`)
+      -> render      Source        header, source: from ``templates/`` (:mod:`.rendering.program_source`);
+                                   plus event detection, if requested (:mod:`scvi_codegen.codegen.rendering.events`)
+
+Two other consumers read a ``StageSystem``: :func:`scvi_codegen.interfaces.derivation.equations.derive` prints the
+equations in the paper's notation, and :func:`scvi_codegen.methods.exact.step.derived_step` solves them in 60-digit
+arithmetic. :mod:`scvi_codegen.interfaces.frameworks` extends the C source of one step and its derivatives to many steps
+for JAX, PyTorch and CasADi; :func:`scvi_codegen.interfaces.frameworks.casadi.casadi_step` exports the stage equations
+as CasADi expressions.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cached_property, partial
+from typing import Any
+
+from sympy import Expr
+
+from scvi_codegen.codegen.ir.derivatives import PointDerivatives
+from scvi_codegen.codegen.ir.program import Program
+from scvi_codegen.codegen.lowering.arrays import check_solver as check_solver_of_arrays
+from scvi_codegen.codegen.lowering.control import control_of, error_growth_of
+from scvi_codegen.codegen.lowering.derivatives import correction_of, derivatives_of
+from scvi_codegen.codegen.lowering.loops import transforms, with_sums
+from scvi_codegen.codegen.lowering.program import lower, summing_splitting
+from scvi_codegen.codegen.lowering.solvers.points import summing_action
+from scvi_codegen.codegen.lowering.stage_groups import system_kernel
+from scvi_codegen.codegen.native.announcements import announced
+from scvi_codegen.codegen.rendering.events import EventFormulas, with_events
+from scvi_codegen.codegen.rendering.kernels.simd import Fallback
+from scvi_codegen.codegen.rendering.program_source import (
+    EMBEDDED,
+    Embedded,
+    in_pairs,
+    render,
+    render_derivatives,
+    render_double_double,
+    render_embedded,
+    render_ensemble,
+    render_ensemble_in_pairs,
+    render_points,
+    render_thread,
+    workspace_size,
+)
+from scvi_codegen.codegen.rendering.source import DOUBLE_DOUBLE, ArrayLayout, Interface, Source
+from scvi_codegen.common.errors import MethodError, SizesRequiredError, SystemDefinitionError
+from scvi_codegen.common.validation import checks_arguments
+from scvi_codegen.methods import as_method
+from scvi_codegen.methods.controllers import controller_named
+from scvi_codegen.methods.discretise import discretise, discretised_form
+from scvi_codegen.methods.method import Method
+from scvi_codegen.methods.stage_system import tables_in_two_words
+from scvi_codegen.systems.arrays.symmetry import momentum_maps
+from scvi_codegen.systems.arrays.system import ArraySystem
+from scvi_codegen.systems.derived_expressions import forms_of
+from scvi_codegen.systems.derived_systems import with_tangent_vectors
+from scvi_codegen.systems.event import EventLike, as_events
+from scvi_codegen.systems.formulas.expressions import gradient_tuple
+from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED
+from scvi_codegen.systems.legendre.of_arrays import SiteHamiltonian, site_hamiltonian
+from scvi_codegen.systems.legendre.transform import energy_of_states, equivalent_lagrangian
+from scvi_codegen.systems.symmetry.symmetry import SYMMETRIES, Symmetry, all_symmetries
+from scvi_codegen.systems.system import SYSTEM, MechanicalSystem
+from scvi_codegen.systems.term_groups import roll_terms
+
+LONGEST_PREFIX = 64
+C_HEADERS = frozenset(
+    """
+    assert complex ctype errno fenv float inttypes iso646 limits locale math setjmp signal stdarg stdbool stddef
+    stdint stdio stdlib string tgmath time wchar wctype unistd
+    """.split()  # noqa: SIM905  (a paragraph of words reads better than thirty quoted ones)
+)
+
+
+def program_of(
+    system: MechanicalSystem,
+    method: Method,
+    *,
+    solver: str = "auto",
+    prefix: str | None = None,
+    symmetries: Sequence[Symmetry] = (),
+    lanes: bool = True,
+    fallback: bool = True,
+) -> Program:
+    """Return the lowered program of an integrator; other arguments as of :func:`compile_stepper`.
+
+    ``lanes`` and ``fallback`` are those of :func:`~scvi_codegen.codegen.lowering.program.lower`.
+    """
+    name = c_identifier(prefix or f"{system.name}_{method.name}")
+    tracked = all_symmetries(system, symmetries)
+    program_part = partial(
+        lower, method=method, prefix=name, solver=solver, symmetries=tracked, lanes=lanes, fallback=fallback
+    )
+    parts = roll_terms(system)
+    rolled = with_sums(program_part(parts.rest), parts) if parts else None
+    return rolled or program_part(system)
+
+
+def lower_unrolled(
+    system: MechanicalSystem, method: Method, *, prefix: str, symmetries: Sequence[Symmetry] = (), **further: Any
+) -> Program:
+    """Return the program without loops over terms, which kernels in double-double arithmetic do not have."""
+    return lower(system, method, prefix=c_identifier(prefix), symmetries=all_symmetries(system, symmetries), **further)
+
+
+def c_identifier(name: str) -> str:
+    """Return a name of lower-case letters, digits and underscores that begins with a letter, of limited length.
+
+    Single letters (``X_OK`` is a POSIX macro) and names of C headers get a suffix.
+    """
+    cleaned = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")[:LONGEST_PREFIX].strip("_")
+    if not cleaned[:1].isalpha():
+        return f"integrator_{cleaned}".rstrip("_")
+    return f"{cleaned}_integrator" if len(cleaned) == 1 or cleaned in C_HEADERS else cleaned
+
+
+def describe(
+    program: Program,
+    system: MechanicalSystem,
+    method: Method,
+    *,
+    uses_fallback_library: bool = False,
+    g: str | Expr | None = None,
+) -> Interface:
+    """Return the interface of a program; ``uses_fallback_library``: a separate library has Newton's iteration."""
+    return Interface(
+        prefix=program.prefix,
+        title=program.title,
+        notes=program.notes,
+        system=system.name,
+        method=method.name,
+        coordinates=program.layout.names,
+        parameters=program.layout.parameters,
+        defaults=program.layout.defaults,
+        unknowns=program.equations.unknowns,
+        workspace=workspace_size(program) + uses_fallback_library,
+        has_action=program.action or (uses_fallback_library and program.equations.acts),
+        sums_action=program.quantities.integrates,
+        map_names=tuple(each.name for each in program.quantities.momentum_maps),
+        map_formulas=tuple(each.formula for each in program.quantities.momentum_maps),
+        map_exact=tuple(each.exact for each in program.quantities.momentum_maps),
+        has_fallback=uses_fallback_library or (program.newton and program.fixed_point is not None),
+        momentum_names=tuple(momentum.name for momentum in system.momentum_symbols),
+        time_transformation="" if g is None else str(g),
+        exchange_names=program.quantities.work_and_impulses,
+        constraints=program.constraints.formulas if program.constraints else (),
+        inputs=system.inputs,
+        conserves_energy=not system.changes_energy and not system.inputs,
+        changes_energy=system.changes_energy or "inputs act" * bool(system.inputs),
+        balances_energy=system.balances_energy,
+        arrays=_arrays_of(system),
+        indices=tuple(f"{name} = {value}" for name, value in system.indices.items()),
+        rotations=tuple(each.declaration for each in system.rotations),
+        energy_parameter=system.clock.energy.name if system.clock else "",
+        solver=_solver_of(program),
+        variables=tuple(each.name for each in getattr(system, "variables", ())),
+        lengths=system.lengths,
+        originals=tuple((x.name, system.text_of(f)) for x, f in system.replaced.items()),
+        original_arrays=tuple(map(str, system.eliminated.original.arrays)) if system.replaced else (),  # type: ignore[attr-defined]
+        kinks=system.kinks,
+    )
+
+
+def _arrays_of(system: MechanicalSystem) -> tuple[str, ...]:
+    """Return the declarations of the arrays whose entries are all of the coordinates, or parameters."""
+    names = [each.name for each in (*system.coordinates, *system.parameters)]
+    known = [array for array in system.arrays if set(array.elements) <= set(names)]
+    listed = [name for array in known for name in array.elements]
+    whole = listed[: system.dimension] == names[: system.dimension]
+    return tuple(str(array) for array in known if array.axes or whole) if whole else ()
+
+
+def _solver_of(program: Program) -> str:
+    if program.splitting:
+        return "explicit"
+    return "rattle" if program.rattle else "fixed-point" if program.fixed_point else "newton"
+
+
+def describe_arrays(
+    system: ArraySystem, method: Method, *, prefix: str, solver: str, sites: SiteHamiltonian | None
+) -> Interface:
+    """Return the interface of an integrator of arrays whose sizes are known at run time."""
+    layout = ArrayLayout(
+        sizes=system.sizes,
+        coordinates=system.positions,
+        momenta=system.momenta,
+        fields=system.fields,
+        tables=system.tables,
+        field_defaults=system.field_defaults,
+        maps=momentum_maps(system),
+        accesses=system.accesses,
+        depends_on_time=system.depends_on_time,
+        constraints=tuple(term.loops for term in system.constraints),
+        continued=not (method.fractions or system.constraints),
+        momentum_formulas=sites.momenta if sites else (),
+        velocity_formulas=sites.velocities if sites else (),
+        couplings=(*system.potentials, *system.applied_forces) if solver == "newton" else (),
+        symmetric=not (system.momenta or system.velocities),
+        data=system.data,
+        neighbours=tuple(near.name for near in system.neighbours),
+        mesh=system.mesh,
+    )
+    return Interface(
+        prefix=prefix,
+        title=f"{system.name}: {method.title}",
+        system=system.name,
+        method=method.name,
+        coordinates=tuple(array.name for array in system.positions),
+        parameters=tuple(parameter.name for parameter in system.parameters),
+        defaults=system.defaults,
+        inputs=system.inputs,
+        conserves_energy=not (system.momenta or system.changes_energy or system.inputs),
+        changes_energy=system.changes_energy or "inputs act" * bool(system.inputs),
+        balances_energy=(bool(system.forces) or system.damping != 0) and not system.depends_on_time,
+        solver="rattle" if system.constraints else solver,
+        layout=layout,
+        lengths=tuple(length for near in system.neighbours for length in near.lengths),
+        kinks=system.kinks,
+    )
+
+
+OF_ONE_WORD = ("observing", "thread", "points", "fallback")
+"""Variants that double-double arithmetic lacks."""
+
+
+class Sources:
+    """C sources of one integrator and its variants; the equations are derived on first use.
+
+    Those of arrays whose sizes are known at run time consist of loops over the arrays and have no variants.
+    """
+
+    def __init__(
+        self,
+        system: MechanicalSystem | ArraySystem,
+        method: Method,
+        solver: str = "auto",
+        prefix: str | None = None,
+        symmetries: Sequence[Symmetry] = (),
+        g: str | Expr | None = None,
+        controller: str | None = None,
+        precision: str = "double",
+    ) -> None:
+        self.method, self.solver, self.g, self.precision = method, solver, g, precision
+        self._arguments = system, method, solver, prefix, symmetries, g, controller
+        self.controller = controller_named(controller, in_tau=g is not None)
+        self.prefix = c_identifier(prefix or f"{system.name}_{method.name}")
+        self._programs: dict[bool, Program] = {}
+        self.system: Any
+        self.sites: SiteHamiltonian | None = None
+        self._derived: Callable[..., Program]
+        self.of_arrays = isinstance(system, ArraySystem)
+        if isinstance(system, ArraySystem):
+            self.system, self._derived = system, self._program_of_arrays
+            self.solver = "fixed-point" if solver == "auto" else solver
+            check_solver_of_arrays(self.solver)
+            if system.coupled_terms and g is None and self.solver == "fixed-point":
+                self.sites = site_hamiltonian(system)
+        else:
+            self.system = form = discretised_form(system, method)
+            derive = lower_unrolled if precision == DOUBLE_DOUBLE else program_of
+            self._derived = partial(derive, form, method, prefix=self.prefix, symmetries=symmetries)
+
+    def _program_of_arrays(self, **_: bool) -> Program:
+        """Return the program of arrays; raise :class:`SizesRequiredError` if there is none for run-time sizes."""
+        system = self.sites.system if self.sites else self.system
+        system.check_run_time_sizes()
+        try:
+            if self.g is not None:
+                raise SizesRequiredError("time_transformation is not available for arrays of run-time sizes")
+            program = lower(system, self.method, prefix=self.prefix, solver=self.solver)
+        except SizesRequiredError as error:
+            raise SizesRequiredError(f"{error}. This concerns '{self.system.name}': {SIZES_REQUIRED}") from error
+        layout = self.interface.layout
+        functions: dict[str, Any] = transforms(self.sites) if self.sites else {}
+        loops = replace(program.loops, maps=layout.maps, continued=layout.continued, **functions)
+        return replace(program, loops=loops)
+
+    @cached_property
+    def _in_double(self) -> Sources:
+        return Sources(*self._arguments)
+
+    def program(self, *, fallback: bool = False) -> Program:
+        """Return the lowered program; with ``fallback`` it also contains Newton's iteration as a fallback."""
+        if fallback not in self._programs:
+            with announced(f"deriving the equations of {self.system.name} by {self.method.name}"):
+                program = self._derived(solver=self.solver, fallback=fallback)
+                if self.precision == DOUBLE_DOUBLE and not (self._corrected(program) or self._in_pairs(program)):
+                    with tables_in_two_words():  # RATTLE is an iteration for the solution of Newton's equations
+                        by_newton = self.solver == "auto" and not (program.rattle or self._correction(program))
+                        program = self._derived(solver="newton" if by_newton else self.solver)
+                self._programs[fallback] = program
+        return self._programs[fallback]
+
+    @property
+    def uses_fallback_library(self) -> bool:
+        """Return whether Newton's iteration comes from a separate fallback library."""
+        if self.precision == DOUBLE_DOUBLE:
+            return False
+        return self.solver == "auto" and self.program().fixed_point is not None and not self.program().newton
+
+    @cached_property
+    def interface(self) -> Interface:
+        """Interface of the generated library."""
+        if self.of_arrays:
+            return describe_arrays(self.system, self.method, prefix=self.prefix, solver=self.solver, sites=self.sites)
+        interface = describe(
+            self.program(), self.system, self.method, uses_fallback_library=self.uses_fallback_library, g=self.g
+        )
+        return replace(interface, precision="" if self.precision == "double" else self.precision)
+
+    def integrator(self, *, controlled: bool = True) -> tuple[Source, Interface]:
+        """Return the C source and its interface.
+
+        It has fixed steps and, if ``controlled`` and the method has an error estimate, those of the controller.
+        """
+        program = self.program()
+        if self.precision == DOUBLE_DOUBLE:
+            self._check_double_double()
+            correction = self._correction(program)
+            control = control_of(program, self.controller, self.system, self.g) if controlled else None
+            return render_double_double(program, correction, control), self.interface
+        control = control_of(program, self.controller, self.system, self.g)
+        if control and controlled and not (self.of_arrays or control.density):
+            control = replace(control, growth=error_growth_of(self.system, program))
+        fallback: Fallback | None = "external" if self.uses_fallback_library else None
+        return render(program, control if controlled else None, fallback=fallback), self.interface
+
+    def _correction(self, program: Program) -> PointDerivatives | None:
+        """Return the kernels for the correction of a fixed-point iteration to two words, if it has one."""
+        return correction_of(self.system, program.fixed_point) if program.fixed_point else None
+
+    def _corrected(self, program: Program) -> PointDerivatives | None:
+        """Return the same for constant masses, and forces of position and time, without Newton's method."""
+        separable = program.fixed_point and program.fixed_point.name == "separable"
+        return self._correction(program) if separable else None
+
+    def _in_pairs(self, program: Program) -> bool:
+        """Return whether double-double steps are explicit."""
+        return in_pairs(program) and self.g is None and self.system.clock is None
+
+    def _check_double_double(self) -> None:
+        """Raise :class:`MethodError` if the system or the method has no steps in double-double arithmetic."""
+        reason = ""
+        if self.of_arrays:
+            reason = "arrays have sizes known at run time: pass sizes={..}"
+        elif self.solver == "fixed-point" and not self._corrected(self.program()):
+            reason = (
+                f"solver={self.solver!r} requires constant diagonal masses and forces of position and time: omit it"
+            )
+        elif self.solver == "explicit" and not self._in_pairs(self.program()):
+            reason = "solver='explicit' requires constant diagonal masses and fixed steps h in physical time: omit it"
+        if reason:
+            raise MethodError(
+                f"precision='double-double' is not available for '{self.system.name}' by {self.method.name}: {reason}"
+            )
+
+    def fallback(self) -> Source | None:
+        """Return the source with Newton's iteration if the integrator itself contains none."""
+        return render(self.program(fallback=True), fallback="provided") if self.uses_fallback_library else None
+
+    def tangent(self, *, second: bool = False) -> Source | None:
+        """Return the source with first, or also second, derivatives of steps with respect to all their arguments.
+
+        Second derivatives are unavailable in transformed time, for damped and for first-order systems, and derivatives
+        of first-order systems in transformed time.
+        """
+        excluding = second, bool(self.system.clock), bool(forms_of(self.system).one_form)  # each excludes the others
+        if sum(excluding) > 1 or (second and self.system.damping):
+            return None
+        program = self.program(fallback=True)
+        if not program.newton:  # explicit steps
+            program = self._derived(solver="newton")
+        stages = discretise(self.system, self.method)
+        with announced(f"deriving the {'second ' * second}derivatives of {self.system.name} by {self.method.name}"):
+            return render_derivatives(derivatives_of(self.system, stages, program, second=second))
+
+    def _acting_program(self) -> Program | None:
+        """Return the program of runs that sum the action of their steps; ``None`` if they are computed again for it."""
+        program = self.program()
+        if not program.quantities.integrates or self.g is not None or self.system.integrands:
+            return None
+        if program.splitting:
+            return replace(program, splitting=summing_splitting(program.splitting, self.system), acts_along=True)
+        if program.fixed_point is None:
+            return replace(program, summed=True, acts_along=True)
+        found = summing_action(program.fixed_point, self.system, discretise(self.system, self.method).shape)
+        if found is None or not self.uses_fallback_library:
+            return None
+        return replace(program, fixed_point=found, acts_along=True)
+
+    def acting(self) -> Source | None:
+        """Return the source of runs that sum the action of their steps, or ``None``."""
+        program = self._acting_program()
+        if program is None:
+            return None
+        control = control_of(self.program(), self.controller, self.system, None)
+        if control:
+            control = replace(control, growth=error_growth_of(self.system, self.program()))
+        return render(program, control, fallback="external" if self.uses_fallback_library else None)
+
+    def acting_ensemble(self) -> Source | None:
+        """Return the source of trajectories in SIMD lanes that sum the action; ``None`` unless forces are stored."""
+        program = self._acting_program()
+        separable = program and program.fixed_point and program.fixed_point.name == "separable"
+        return render_ensemble(program) if program and separable else None
+
+    def changes(self, count: int) -> Source | None:
+        """Return the ensemble source with tangent vectors; ``None`` unless it is a fixed point with constant mass."""
+        twin, fixed_point = equivalent_lagrangian(self.system), self.program().fixed_point
+        if not (twin and fixed_point and fixed_point.serves_many and fixed_point.constant_mass):
+            return None
+        varied = with_tangent_vectors(twin, count)
+        if varied is None:
+            return None
+        program = lower(varied, self.method, prefix=self.prefix, solver="fixed-point")
+        return render_ensemble(program, tangents=count)
+
+    def observing(self, functions: str) -> Source | None:
+        """Return the ensemble source that observes functions of the state; ``None`` without trajectories in lanes.
+
+        Args:
+            functions: ``"extremes"`` of positions and momenta, ``"energy"``, or formulas of events, one a line.
+
+        Raises:
+            EventError: for an invalid formula.
+            MethodError: if velocities at given momenta, on which a function depends, have no formula.
+        """
+        system, program = self.system, self.program()
+        if render_ensemble(program) is None:
+            return None
+        states = *system.coordinates, *system.momentum_symbols
+        if functions == "extremes":
+            values: Sequence[Expr] = states
+        else:
+            formulas = EventFormulas(self.interface, as_events(functions.split("\n") if functions != "energy" else ()))
+            values = [
+                value.xreplace(dict(zip(formulas.p, system.momentum_symbols, strict=True)))
+                for value in formulas.functions
+            ]
+            if not values or any(value.free_symbols & {*system.velocities} for value in values):
+                values = self._at_momenta(values)
+        counts = functions not in ("extremes", "energy")
+        return render_ensemble(program, system_kernel(system, "observed_lanes", values, u=states), counts=counts)
+
+    def _at_momenta(self, values: Sequence[Expr]) -> Sequence[Expr]:
+        """Return functions of velocities as functions of momenta; the energy if there are none."""
+        system = self.system
+        try:
+            energy = energy_of_states(system)
+        except SystemDefinitionError as error:
+            raise MethodError(
+                f"ensembles of '{system.name}' cannot observe velocities or energies, whose formulas are unknown "
+                f"({error}): save states, or observe functions of coordinates and momenta"
+            ) from error
+        velocities = gradient_tuple(energy, system.momentum_symbols)
+        replaced = dict(zip(system.velocities, velocities, strict=True))
+        return [value.xreplace(replaced) for value in values] or [energy]
+
+    def variant(self, name: str) -> Source | None:
+        """Return the source of a variant, named as in :class:`~scvi_codegen.runs.stepping.compiled_method.Variants`."""
+        kind, _, count = name.partition(" ") if name.startswith(("changes", "observing")) else (name, "", "")
+        variants: dict[str, Callable[[], Source | None]] = {
+            "ensemble": lambda: render_ensemble(self.program()),
+            "fallback": self.fallback,
+            "acting": self.acting,
+            "acting ensemble": self.acting_ensemble,
+            "derivatives": self.tangent,
+            "second_derivatives": lambda: self.tangent(second=True),
+            "changes": lambda: self.changes(int(count)),
+            "observing": lambda: self.observing(count),
+            "points": lambda: render_points(self.program()),
+            "thread": lambda: render_thread(self.program(), control_of(self.program(), self.controller, self.system)),
+        }
+        if self.precision == DOUBLE_DOUBLE:  # derivatives are those of the step in double
+            if kind == "ensemble":
+                return render_ensemble_in_pairs(self.program(), self._corrected(self.program()))
+            return None if kind in OF_ONE_WORD else self._in_double.variant(name)
+        return None if self.of_arrays else variants[kind]()
+
+
+@checks_arguments(system=SYSTEM, symmetries=SYMMETRIES)
+def generate_source(
+    system: MechanicalSystem,
+    method: Method | str,
+    *,
+    solver: str = "auto",
+    prefix: str | None = None,
+    symmetries: Sequence[Symmetry] = (),
+    events: EventLike | Sequence[EventLike] | None = None,
+    embedded: Embedded | None = None,
+    amalgamate: bool = False,
+    controlled: bool = False,
+    time_transformation: str | Expr | None = None,
+    controller: str | None = None,
+) -> tuple[Source, Interface]:
+    """Return the C source of an integrator and its interface; other arguments as of :func:`compile_stepper`.
+
+    Args:
+        embedded: precision, ``"double"`` or ``"single"``, of source for a microcontroller. Its solver is explicit or
+            Newton, which needs half the stack of the SIMD fixed-point iteration without vector registers.
+        amalgamate: include the support headers in the source; always done for a microcontroller.
+        controlled: use adaptive steps, if the method has an error estimate.
+        time_transformation: use constant steps in tau instead, dt = g dtau, by the reversible controller.
+        controller: step-size controller, as of :func:`compile_stepper`.
+
+    Raises:
+        MethodError: if the solver is not available for the method, if a constant exceeds single precision, and if
+            events are combined with ``embedded="single"``.
+    """
+    method = as_method(method, system)
+    system = discretised_form(system, method)
+    searched = as_events(events)
+    if embedded not in (None, *EMBEDDED):
+        raise MethodError(f"embedded must be {' or '.join(EMBEDDED)}, not {embedded!r}")
+    if embedded and solver == "fixed-point":
+        raise MethodError("solver='fixed-point' is unavailable with embedded: use 'newton' or 'explicit'")
+    if embedded == "single" and searched:
+        raise MethodError("events require double precision, in which they are located: use embedded='double'")
+    program = program_of(system, method, solver=solver, prefix=prefix, symmetries=symmetries, lanes=embedded is None)
+    g = time_transformation
+    chosen = controller_named(controller, in_tau=g is not None)
+    control = control_of(program, chosen, system, g) if controlled or g is not None else None
+    source = render_embedded(program, embedded, control) if embedded else render(program, control)
+    interface = describe(program, system, method, g=g)
+    complete = with_events(source, interface, searched) if searched else source
+    return (complete.single_file() if amalgamate or embedded else complete), interface

@@ -1,0 +1,572 @@
+"""Event functions in C: formulas to a kernel, and a search for its zeros besides the source of an integrator.
+
+The search uses only the public functions of an integrator, so that it is available for every method and solver, and the
+source without events does not change. On a step (``templates/support/run/events.h``):
+
+* the functions are evaluated at its ends and at three states between them, each by a step of a fraction of h, and
+  interpolated by polynomials of degree 4;
+* the polynomial determines the number of zero crossings. At an extremum so near zero that its sign is uncertain (nearer
+  than the last two Chebyshev coefficients), the step is subdivided, several times if necessary;
+* each crossing is enclosed by partial steps until the ends are neighbouring numbers.
+
+All crossings are detected if a function is a polynomial of degree 4 in time along a step. Of other functions those are
+detected that the polynomials indicate; a function that oscillates faster within a step can have undetected crossings.
+
+At known sizes one kernel evaluates the functions of all entries. At run-time sizes an event ``g for i in N`` has a
+function for each element of its loops, evaluated in these loops, or one of them with ranges of one element; gradients
+and maps are lists of entries: the work of a change does not grow with the number of coordinates that it does not
+involve.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from itertools import accumulate
+from typing import Any, Protocol, TypeAlias, cast
+
+import numpy as np
+import sympy
+from sympy import Expr, Symbol
+from sympy.core.function import AppliedUndef
+
+from scvi_codegen.codegen.ir.arithmetic import lower_kernel
+from scvi_codegen.codegen.ir.kernel import Kernel, RolledKernel, lower_matrix, lower_vector
+from scvi_codegen.codegen.ir.program import Layout
+from scvi_codegen.codegen.rendering.kernels.loop_nests import Nest, count_text, size_text
+from scvi_codegen.codegen.rendering.program_source import EventSearch, render_events
+from scvi_codegen.codegen.rendering.source import Interface, Source
+from scvi_codegen.common.errors import EventError, ScviCodegenError, SystemDefinitionError, closest
+from scvi_codegen.common.precision import mp
+from scvi_codegen.methods.tables.nodes import chebyshev_lobatto, to_unit
+from scvi_codegen.systems.formulas.array_statements import (
+    EntryRules,
+    entry_names,
+    formula_of_entries,
+    is_indexed,
+    momentum_arrays,
+    parse_constraint,
+)
+from scvi_codegen.systems.formulas.arrays import ArrayTerm, parse_coordinate, parse_sums
+from scvi_codegen.systems.formulas.expressions import evaluated, kinked_root, rint, unit_step, unsupported_part
+from scvi_codegen.systems.formulas.indices import Access, Array, Loop, Size
+from scvi_codegen.systems.formulas.rotations import RotationNames, entries_in_formulas
+from scvi_codegen.systems.formulas.symbols import DOT, TIME, identifier, input_formulas, symbol
+
+DEGREE = 4
+Formula: TypeAlias = "str | Expr | float"
+
+
+class SearchedEvent(Protocol):
+    """Event with the attributes of :class:`~scvi_codegen.systems.event.Event`, which is of a higher layer."""
+
+    @property
+    def function(self) -> str | Expr: ...
+    @property
+    def restitution(self) -> Formula | None: ...
+    @property
+    def changes(self) -> tuple[tuple[str, Formula], ...]: ...
+    @property
+    def conditions(self) -> tuple[Formula, ...]: ...
+    @property
+    def loops(self) -> str: ...
+    @property
+    def changes_state(self) -> bool: ...
+    def check_function(self, moving: Sequence[str], *, constant: bool) -> None: ...
+
+
+@lru_cache(maxsize=64)
+def with_events(source: Source, interface: Interface, events: tuple[SearchedEvent, ...]) -> Source:
+    """Return the source of an integrator with the search for its events and their changes of the state.
+
+    Args:
+        source, interface: of the integrator, without events.
+        events: with formulas as text or SymPy expressions in the names of the interface.
+
+    Raises:
+        ExpressionError: for text outside the grammar, with its column.
+        EventError: naming the invalid symbol or function, or what events that change the state do not support.
+    """
+    return replace(source, beside=render_events(_search(interface, events, source.header)))
+
+
+class EventFormulas:
+    """Formulas of events in canonical symbols: functions, conditions, and changes of the state.
+
+    Attributes:
+        q, v, p: symbols of the state, v of its velocities.
+        functions: g of each event.
+        guards: index of its event and formula of each condition, which is satisfied where it is >= 0.
+        changes: for each event the indices of the variables among (q, p, v) that it changes, and their new values; for
+            an impact its gradient g_q, g_t, and the coefficient of restitution.
+    """
+
+    def __init__(self, interface: Interface, events: Sequence[SearchedEvent]) -> None:
+        self.interface = interface
+        self._turning = RotationNames.of_states(interface.rotations, _names(interface))
+        own = _names(interface)
+        self._known, self._grammar = self._turning.symbols | own, _Grammar(interface, self._turning)
+        self._replaced = {symbol(name): self._turning.read(text, own) for name, text in interface.originals}
+        self._known |= {each.name: each for each in self._replaced}
+        elements = [self._elements(event) for event in events]
+        self.elements, self.events = [*map(len, elements)], [each for element in elements for each in element]
+        self.q = [symbol(name) for name in interface.coordinates]
+        self.v = [symbol(name + DOT) for name in interface.coordinates]
+        self.parameters = tuple(symbol(name) for name in interface.parameters)
+        taken = {*self.q, *self.v, symbol(TIME), *self.parameters}
+        self.p = [sympy.Dummy() if symbol(name) in taken else symbol(name) for name in interface.momenta]
+        self.functions = [self._read(event.function, f"event function '{event.function}'") for event in self.events]
+        for event, function in zip(self.events, self.functions, strict=True):
+            if interface.variables and event.restitution is not None:
+                raise EventError(f"'{interface.system}' is a first-order system without impacts: write them in then=")
+            moving = sorted(free.name for free in function.free_symbols & {*self.p, *self.v})
+            event.check_function(moving, constant=not function.free_symbols)
+        self.guards = [
+            (number, self._read(condition, f"condition where='{condition}'"))
+            for number, event in enumerate(self.events)
+            for condition in event.conditions
+        ]
+        self.changes = [self._changes(*each) for each in zip(self.events, self.functions, strict=True)]
+        if interface.energy_parameter and any(event.changes_state for event in events):
+            raise EventError(
+                "events that change the state are impossible in transformed time, where the energy is the constant "
+                f"'{interface.energy_parameter}': compile the original system with time_transformation=.., or use "
+                "adaptive steps (t_end)"
+            )
+
+    @property
+    def arguments(self) -> tuple[Symbol, ...]:
+        """Arguments (q, p, v) of the kernels."""
+        return (*self.q, *self.p, *self.v)
+
+    def kernel(self, name: str, values: Sequence[Expr]) -> Kernel:
+        """Return the kernel of some of the formulas."""
+        time, parameters = symbol(TIME), self.parameters
+        return lower_kernel(name, arguments=self.arguments, time=time, parameters=parameters, values=values)
+
+    def _read(self, formula: Formula, role: str) -> Expr:
+        grammar = self._grammar
+        if isinstance(formula, str) and grammar.arrays and is_indexed(formula):
+            formula = formula_of_entries(formula, grammar.arrays, self._known, grammar.tables, grammar.rules)
+        expression = self._turning.in_coordinates(_expression(formula, self._known, role, self._turning.read))
+        return cast(
+            Expr, expression.xreplace({**self._replaced, **input_formulas(self.interface.inputs, symbol(TIME))})
+        )
+
+    def _elements(self, event: SearchedEvent) -> list[SearchedEvent]:
+        """Return the events of the elements of the loops of an event, with formulas of the entries of arrays."""
+        if not event.loops:
+            return [event]
+
+        def formulas(text: Any) -> list[Expr]:
+            whole, grammar = str(text) if text is event.function else f"{text}{event.loops}", self._grammar
+            try:
+                term = parse_constraint(whole, grammar.arrays, self._known, grammar.tables)
+                return [cast("Expr", term.formula.xreplace(rule)) for _, rule in grammar.rules.rules(term)]
+            except ScviCodegenError as error:
+                raise EventError(f"the formula '{text}' of the event '{event.function}': {error}") from error
+
+        functions = formulas(event.function)
+        changes = [(formulas(name), formulas(value)) for name, value in event.changes]
+        conditions = [formulas(each) for each in event.conditions]
+        restitutions = None if event.restitution is None else formulas(event.restitution)
+        return [
+            replace(
+                cast(Any, event),
+                function=function,
+                then={str(names[k]): values[k] for names, values in changes} or None,
+                where=tuple(cast(Any, each[k]) >= 0 for each in conditions) or None,
+                restitution=restitutions and restitutions[k],
+            )
+            for k, function in enumerate(functions)
+        ]
+
+    def _changes(self, event: SearchedEvent, g: Expr) -> tuple[list[int], list[Expr]]:
+        if event.restitution is not None:
+            gradient = [sympy.diff(g, each) for each in (*self.q, symbol(TIME))]
+            restitution = self._read(event.restitution, f"restitution '{event.restitution}'")
+            return [*range(len(self.q)), 0, 0], [*gradient, restitution]
+        settable = (*self.q, *self.p) if self.interface.variables else self.arguments
+        variables = {each: k for k, each in enumerate(settable)}
+        named = {name: variables[each] for name, each in self._known.items() if each in variables}
+        new = {
+            str(self._read(name, "then=")) if "[" in name else name: self._read(value, f"value '{value}' of '{name}'")
+            for name, value in event.changes
+        }
+        self._set_rates_of_rotations(new)
+        indices = [named.get(name, -1) for name in new]
+        for index, (name, value) in zip(indices, new.items(), strict=True):
+            if index < 0 and symbol(name) in self._replaced:
+                raise EventError(
+                    f"the event '{event.function}' sets '{name}', which follows from the angles of rods: set these or "
+                    "their velocities, use impact(..) for a wall, or integrate with constraints"
+                )
+            if index < 0:
+                known = [str(x) for each in self._turning.rotations for x in (*each.rates, *each.momenta)] + [*named]
+                raise EventError(
+                    f"then={{'{name}': '{value}'}} of the event '{event.function}': '{name}' is not a coordinate, a "
+                    f"momentum or a velocity{closest(name, known)} An event can set: {', '.join(known)}"
+                )
+        if {index // len(self.q) for index in indices} >= {1, 2}:
+            raise EventError(f"the event '{event.function}' sets momenta and velocities: set one or the other")
+        return indices, [*new.values()]
+
+    def _set_rates_of_rotations(self, new: dict[str, Expr]) -> None:
+        """Replace new angular velocities or momenta of rotations by the derivatives or momenta of quaternions."""
+        for member in self._turning.rotations:
+            for symbols in dict.fromkeys((member.rates, member.momenta)):
+                if set(new).isdisjoint(each.name for each in symbols):
+                    continue
+                values = [new.pop(each.name, self._turning.values[each]) for each in symbols]
+                p = member.forces(values)  # p = 2 E(q) m / |q|^2 of the angular momentum m, q_dot = |q|^2 p / 4
+                size = sympy.Add(*(symbol(name) ** 2 for name in member.coordinates))
+                for name, value in zip(member.coordinates, p, strict=True):
+                    of_momentum = symbols == member.momenta
+                    new[f"p_{name}" if of_momentum else name + DOT] = value if of_momentum else value * size / 4
+
+
+class _Grammar:
+    """Index notation at known sizes: arrays, index tables, and the names of entries."""
+
+    def __init__(self, interface: Interface, turning: RotationNames) -> None:
+        indices = interface.index_values
+        sizes = {name: value for name, value in indices.items() if isinstance(value, int)}
+        tables = {name: np.array(value) for name, value in indices.items() if name not in sizes}
+        arrays = _arrays(interface)
+        of_rotations = entries_in_formulas(arrays, turning.members, {})
+        names = {array: entry_names(array, {}) for array in arrays if not array.name.endswith(DOT)} | of_rotations
+        self.rules = EntryRules(sizes, tables, {array.name: each for array, each in names.items()})
+        self.arrays = [*arrays, *of_rotations, *([Array("", tuple(map(Size, sizes)))] if sizes else ())]
+        self.tables = [Array(name, tuple(Size("", n) for n in table.shape)) for name, table in tables.items()]
+
+
+def _arrays(interface: Interface) -> list[Array]:
+    """Return the arrays whose entries a function may contain: coordinates, parameters, velocities and momenta."""
+    own = [parse_coordinate(declaration) for declaration in interface.arrays]
+    arrays = [*own, *map(parse_coordinate, interface.original_arrays)]
+    positions = {*interface.coordinates, *(name for name, _ in interface.originals)}
+    moving = [Array(array.name + DOT, array.axes) for array in arrays if array.elements[0] in positions]
+    return [*arrays, *moving, *momentum_arrays(own, interface.momenta)]
+
+
+def _names(interface: Interface) -> dict[str, Symbol]:
+    """Return the names that a function may use; coordinates and parameters precede default names of momenta."""
+    velocities = [name + DOT for name in interface.coordinates]
+    moving = *interface.coordinates, *velocities, *interface.momenta
+    return {name: symbol(name) for name in (*moving, TIME, *interface.parameters, *interface.inputs)}
+
+
+def _expression(
+    formula: Formula, names: Mapping[str, Symbol], role: str, read: Callable[[str, Mapping[str, Symbol]], Expr]
+) -> Expr:
+    if isinstance(formula, str | int | float):
+        expression = read(str(formula), names)
+    elif isinstance(formula, Expr):
+        expression = _translated(formula, role)
+    else:
+        raise EventError(f"the {role} must be text or a SymPy expression; got {formula!r}")
+    problem = unsupported_part(expression) or kinked_root(expression, names.values())
+    if problem:
+        raise EventError(f"in the {role}: {problem}")
+    unknown = sorted(free.name for free in expression.free_symbols.difference(names.values()))
+    if unknown:
+        raise EventError(
+            f"'{unknown[0]}' in the {role} is neither a coordinate, a velocity, a momentum, time, an input nor a "
+            f"parameter{closest(unknown[0], names)} Known here: {', '.join(names)}"
+        )
+    return expression
+
+
+def _translated(function: Expr, role: str) -> Expr:
+    """Return the expression with functions of time, their derivatives and symbols as canonical symbols."""
+    rules: dict[Expr, Expr] = {free: symbol(identifier(free.name)) for free in function.free_symbols}
+    for moving in function.atoms(AppliedUndef):
+        rules[moving] = symbol(identifier(moving.func.__name__))
+    for rate in function.atoms(sympy.Derivative):
+        if not isinstance(rate.expr, AppliedUndef) or rate.derivative_count != 1:
+            raise EventError(
+                f"'{rate}' in the {role} is not the velocity of a coordinate: use first derivatives of coordinates"
+            )
+        rules[rate] = symbol(identifier(rate.expr.func.__name__) + DOT)
+    try:
+        return evaluated(function, rules)
+    except SystemDefinitionError as error:
+        raise EventError(f"in the {role}: {error}") from error
+
+
+def _search(interface: Interface, events: tuple[SearchedEvent, ...], header: str) -> EventSearch:
+    """Return the search: Chebyshev points of the second kind, inverse Vandermonde matrix; ``header`` of the steps."""
+    points = chebyshev_lobatto(DEGREE).points
+    inverse = mp.matrix([[x**k for k in range(DEGREE + 1)] for x in points]) ** -1
+    coefficients = tuple(tuple(inverse[k, j] for j in range(DEGREE + 1)) for k in range(DEGREE + 1))
+    search = EventSearch(
+        prefix=interface.prefix,
+        dimension=interface.dimension,
+        transformed=bool(interface.energy_parameter),
+        constrained=bool(interface.constraints or interface.layout.constraints),
+        nodes=lower_vector(to_unit(points)),
+        coefficients=lower_matrix(coefficients),
+        doubts=(0.5 ** (DEGREE - 2), 0.5 ** (DEGREE - 1)),
+        guarded=tuple(number for number, event in enumerate(events) for _ in event.conditions),
+        impacts=tuple(int(event.restitution is not None) for event in events),
+        conditional=tuple(int(bool(event.conditions)) for event in events),
+        controlled="_advance_to(" in header,
+    )
+    if interface.layout.coordinates:
+        arrays, changed = array_events(interface, events), (0,) * any(event.changes_state for event in events)
+        known: dict[str, Any] = {"kernels": tuple(arrays.kernels), "changed": changed, "timed": arrays.timed}
+        return replace(search, dimension=0, arrays=arrays, uses_velocity=arrays.uses_velocity, **known)
+    formulas = EventFormulas(interface, events)
+    guards = [guard for _, guard in formulas.guards]
+    values = [value for _, each in formulas.changes for value in each]
+    timed = [0 if search.transformed else _kind_in_time(g, formulas.arguments) for g in formulas.functions]
+    rates = [turn_rate(g) if kind else sympy.Integer(0) for g, kind in zip(formulas.functions, timed, strict=True)]
+    every = {"event_functions": formulas.functions, "event_guards": guards, "event_changes": values}
+    every |= {"event_rates": rates} if any(timed) else {}
+    return replace(
+        search,
+        elements=tuple(formulas.elements),
+        timed=tuple(timed[first] for first in (0, *accumulate(formulas.elements[:-1]))),
+        guarded=tuple(number for number, _ in formulas.guards),
+        kernels=tuple(formulas.kernel(name, each) for name, each in every.items() if each),
+        uses_velocity=any(value.free_symbols.intersection(formulas.v) for each in every.values() for value in each),
+        changed=tuple(index for indices, _ in formulas.changes for index in indices),
+        first_values=(0, *accumulate(len(each) for _, each in formulas.changes)),
+    )
+
+
+def _kind_in_time(g: Expr, moving: Iterable[Symbol]) -> int:
+    """Return 1 for a function of time alone, 2 for one that is affine in time, else 0.
+
+    Polynomials of degree 4 and higher are searched along each step, which misses few pairs of close roots.
+    """
+    time = symbol(TIME)
+    if time not in g.free_symbols or not g.free_symbols.isdisjoint(moving):
+        return 0
+    if g.is_polynomial(time) and sympy.degree(g, time) > 3:
+        return 0
+    return 1 if g.has(rint, unit_step) or time in sympy.diff(g, time).free_symbols else 2
+
+
+TURNS = {sympy.sin: 2 * sympy.pi, sympy.cos: 2 * sympy.pi, sympy.tan: sympy.pi, rint: sympy.Integer(1)}
+"""Periods of functions, of rint of its jumps."""
+
+
+def turn_rate(g: Expr) -> Expr:
+    """Return the sum of the squares of the turns per time of the sines, cosines, tangents and rint in a function."""
+    time = symbol(TIME)
+    turning = sorted(g.atoms(*TURNS), key=str)
+    return sympy.Add(*((sympy.diff(each.args[0], time) / TURNS[each.func]) ** 2 for each in turning))
+
+
+Slots: TypeAlias = Sequence[tuple[Any, Access]]
+ARGUMENTS = ("const problem *given", "const event_point *at", "const section *in", "event_entries *to")
+NEXT = "to->value[to->count]"
+
+
+class _Entries(Nest):
+    """Loops that read entries of q, p and v, in all their elements or in the ranges ``in`` of the caller."""
+
+    def __init__(self, code: ArrayEvents, rolled: RolledKernel, *, within: bool) -> None:
+        super().__init__(code.layout, rolled, "double", "at" if rolled.kernel.values else "")
+        self.code, self.within = code, within
+
+    def read(self, k: int, slot: Access) -> str:
+        return f"u[{k}] = at->{'qpv'[self.code.moving[slot.array.name][0]]}[{self.place_of(slot)}];"
+
+    def place_of(self, access: Access) -> str:
+        """Return the index of an entry in q, p or v."""
+        return f"start_{self.code.moving[access.array.name][1]} + {self.place(access)}"
+
+    def _span(self, loop: Loop) -> tuple[str, str]:
+        if not self.within:
+            return super()._span(loop)
+        here = f"in[{self.levels[loop.index] - 1}]"
+        first = f"between({here}.first, index_{loop.behind} + 1, {here}.end)" if loop.behind else f"{here}.first"
+        return first, f"{here}.end"
+
+
+class ArrayEvents:
+    """C of events in index notation.
+
+    Args:
+        interface: of the stepper of run-time sizes.
+        events: the events.
+
+    Attributes:
+        events: C of each: ``functions``, ``conditions`` and ``changes``, statements; ``ranges``, the first index, end,
+            and whether it is the greater index of a pair, of each loop; ``count`` of functions; ``entries``, the
+            largest number of variables that one changes; ``accesses`` of arrays, with the loops around them.
+        functions: texts of the functions that their statements call.
+        kernels: the kernels that these call.
+        positions, rates: arrays whose entries may occur: coordinates, fields and momenta; velocities, of which a
+            system that is defined by a Hamiltonian has none.
+        symbols: time and parameters by name.
+        uses_velocity: whether velocities occur.
+
+    Raises:
+        EventError: if a formula is invalid, or velocities are required and unknown.
+    """
+
+    def __init__(self, interface: Interface, events: Sequence[SearchedEvent]) -> None:
+        layout = interface.layout
+        arrays = {name: getattr(layout, name) for name in ("coordinates", "fields", "tables", "sizes")}
+        self.layout = Layout(**arrays, parameters=interface.parameters)
+        momenta = [*layout.momenta] or [Array(f"p_{array.name}", array.axes) for array in layout.coordinates]
+        rates = [Array(array.name + DOT, array.axes) for array in layout.coordinates if not layout.momenta]
+        vectors = layout.coordinates, momenta, rates
+        self.positions, self.rates = [*layout.coordinates, *layout.fields, *momenta], rates
+        self.symbols = {name: symbol(name) for name in (TIME, *interface.parameters)}
+        self.moving = {
+            array.name: (k, layout.coordinates[j].name)
+            for k, each in enumerate(vectors)
+            for j, array in enumerate(each)
+        }
+        self.uses_velocity, self.functions, self.kernels = False, list[str](), list[Kernel]()
+        self.events = [self._event(k, event) for k, event in enumerate(events)]
+        self.timed = tuple(each["timed"] for each in self.events)
+
+    def terms(self, formula: Any, event: SearchedEvent) -> tuple[ArrayTerm, ...]:
+        """Return the terms of a formula of an event; in the loops of the event, one term for each of their elements.
+
+        Raises:
+            EventError: if the formula is invalid.
+        """
+        text, known = str(formula), ([*self.positions, *self.rates], self.symbols, self.layout.tables)
+        try:
+            if event.loops:
+                each = parse_constraint(text if formula is event.function else text + event.loops, *known)
+            terms = (each,) if event.loops else parse_sums(text, *known)
+        except ScviCodegenError as error:
+            raise EventError(f"the formula '{formula}' of the event '{event.function}': {error}") from error
+        self._accesses += [(access, term.loops) for term in terms for _, access in term.slots]
+        return terms
+
+    def _function(
+        self, name: str, term: Any, values: Sequence[Expr], lines: Iterable[str], to: Slots = (), *, within: bool
+    ) -> str:
+        """Add a function that evaluates formulas in the loops of a term; return its call.
+
+        Args:
+            name, values: of the kernel.
+            term: a term or force, with its loops and slots.
+            lines: statements after each evaluation; ``{0}``, ``{1}``, .. for the indices of the entries ``to``.
+            to: slots of these entries.
+            within: whether the loops have the ranges of the caller.
+        """
+        moving = [(slot, access) for slot, access in term.slots if access.array.name in self.moving and values]
+        constants = [(slot, access) for slot, access in term.slots if access.array.name not in self.moving]
+        self.uses_velocity |= any(self.moving[access.array.name][0] == 2 for _, access in moving)
+        kernel = lower_kernel(
+            name,
+            arguments=[slot for slot, _ in moving],
+            time=symbol(TIME),
+            parameters=(*map(symbol, self.layout.parameters), *(slot for slot, _ in constants)),
+            values=tuple(values),
+        )
+        rolled = RolledKernel(
+            kernel=replace(kernel, purpose="Formulas of an event."),
+            loops=term.loops,
+            reads=tuple(access for _, access in moving),
+            writes=(),
+            given=tuple(access for _, access in constants),
+            text=f"Adds {name.replace('_', ' ')}.",
+        )
+        nest = _Entries(self, rolled, within=within)
+        places = [nest.place_of(access) for _, access in to]
+        inner = [f"{name}(u, at->t, parameters, value);"] * bool(values) + [line.format(*places) for line in lines]
+        body = ["(void)given, (void)at, (void)in, (void)to;", *nest.text(innermost=inner)]
+        declared = f"double value[{len(values)}]" if values else ""
+        self.kernels += [rolled.kernel] * bool(values)
+        self.functions.append(nest.function(f"static void add_{name}", ARGUMENTS, body, values=declared))
+        return f"add_{name}(given, at, in, to);"
+
+    def _value(self, name: str, formula: Any, event: SearchedEvent, to: str = NEXT) -> list[str]:
+        """Return statements that compute a formula at one element; a ``NEXT`` value is counted."""
+        lines, within = [f"{to} = 0.0;"], bool(event.loops)
+        for j, each in enumerate(self.terms(formula, event)):
+            lines.append(self._function(f"{name}_{j}", each, [each.formula], [f"{to} += value[0];"], within=within))
+        return [*lines, "to->count++;"] if to == NEXT else lines
+
+    def _event(self, k: int, event: SearchedEvent) -> dict[str, Any]:
+        self._accesses = list[tuple[Access, tuple[Loop, ...]]]()
+        terms = self.terms(event.function, event)
+        names = [access.array.name for term in terms for _, access in term.slots]
+        moving = [name for name in names if self.moving.get(name, (0,))[0]]
+        event.check_function(moving, constant=not any(term.formula.free_symbols for term in terms))
+        loops = terms[0].loops if event.loops else ()
+        if event.loops:
+            line = "to->value[to->count++] = value[0];"
+            functions = [self._function(f"event_{k}", terms[0], [terms[0].formula], [line], within=True)]
+        else:
+            functions = self._value(f"event_{k}", event.function, event)
+        conditions = [
+            line for j, each in enumerate(event.conditions) for line in self._value(f"condition_{k}_{j}", each, event)
+        ]
+        changes, entries = self._wall(k, event, terms) if event.restitution is not None else self._map(k, event)
+        timed, rates = self._in_time(k, event, terms)
+        ranges = [(size_text(loop.first), size_text(loop.end), int(bool(loop.behind))) for loop in loops]
+        code: dict[str, Any] = {
+            "accesses": tuple(self._accesses),
+            "functions": functions,
+            "conditions": conditions,
+            "changes": changes,
+        }
+        code |= {"timed": timed, "rates": rates}
+        return {"ranges": ranges, "count": count_text(loops), "entries": entries, **code}
+
+    def _in_time(self, k: int, event: SearchedEvent, terms: Sequence[ArrayTerm]) -> tuple[int, list[str]]:
+        """Return 1 for a function of time alone, 2 if it is affine, else 0, and statements that compute its turns."""
+        if event.loops or any(term.loops or term.slots for term in terms):
+            return 0, []
+        whole = sympy.Add(*(term.formula for term in terms))
+        kind, squares = _kind_in_time(whole, ()), turn_rate(whole)
+        if not kind or squares == 0:
+            return kind, []
+        call = self._function(
+            f"rate_{k}", replace(terms[0], formula=squares), [squares], [f"{NEXT} = value[0];"], within=False
+        )
+        return kind, [call]
+
+    def _wall(self, k: int, event: SearchedEvent, terms: Sequence[ArrayTerm]) -> tuple[list[str], str]:
+        """Return statements that compute the gradient of a wall and its restitution, and the number of entries."""
+        if not self.rates:
+            raise EventError(
+                f"the impact '{event.function}' requires velocities, which are unknown for a system that is defined by "
+                "a Hamiltonian: write the change of the momenta with then="
+            )
+        calls, counts, within = list[str](), list[str](), bool(event.loops)
+        push = "event_host->places[to->count] = (int)({{{0}}});", "to->value[to->count++] = value[{0}];"
+        for j, term in enumerate(terms):
+            to = [(slot, access) for slot, access in term.slots if access.array.name in self.moving]
+            values = [term.formula.diff(slot) for slot in (*(slot for slot, _ in to), symbol(TIME))]
+            lines = [line.format(i) for i in range(len(to)) for line in push]
+            lines.append(f"to->by_time += value[{len(to)}];")
+            calls.append(self._function(f"normal_{k}_{j}", term, values, lines, to, within=within))
+            counts.append(f"{len(to)} * {'1' if within else count_text(term.loops)}")
+        calls += self._value(f"restitution_{k}", event.restitution, event, "to->restitution")
+        return calls, " + ".join(counts)
+
+    def _map(self, k: int, event: SearchedEvent) -> tuple[list[str], str]:
+        """Return statements that compute the new values of variables, and their number."""
+        calls, kinds = list[str](), set[int]()
+        for j, (name, formula) in enumerate(event.changes):
+            target = self.terms(name, event)
+            slots = [pair for term in target for pair in term.slots]
+            kind = self.moving.get(slots[0][1].array.name) if len(slots) == 1 else None
+            if not kind or target[0].formula != slots[0][0] or (target[0].loops and not event.loops):
+                raise EventError(
+                    f"then={{'{name}': '{formula}'}} of the event '{event.function}': '{name}' is not an entry of a "
+                    f"coordinate, a momentum or a velocity, such as {self.positions[-1]}"
+                )
+            kinds.add(kind[0])
+            line = f"event_host->places[to->count - 1] = (int)({kind[0]} * M + {{0}});"
+            calls += self._value(f"change_{k}_{j}", formula, event)
+            calls.append(self._function(f"place_{k}_{j}", target[0], (), [line], slots, within=True))
+        if kinds >= {1, 2}:
+            raise EventError(f"the event '{event.function}' sets momenta and velocities: set one or the other")
+        return calls, str(len(event.changes))
+
+
+array_events = lru_cache(maxsize=64)(ArrayEvents)

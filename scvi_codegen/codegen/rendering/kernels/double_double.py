@@ -1,0 +1,221 @@
+"""Kernels in double-double arithmetic as C, and the headers of this arithmetic for numbers and for vectors.
+
+A kernel becomes calls of functions of pairs, ``dd_multiply(w0, w1)``: pairs of numbers are ``dd``, pairs of vectors
+``ddl``. Constants that one double represents are single words. Arguments are arrays of pairs; parameters are an array
+of numbers, all high words before all low words.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from functools import cache
+
+from scvi_codegen.codegen.ir.kernel import Constant, Expression, Kernel, Load, Number, Operation
+from scvi_codegen.codegen.rendering.kernels.printer import INVERSE_ROOT, scalar_functions
+from scvi_codegen.codegen.rendering.kernels.simd import Lanes
+from scvi_codegen.codegen.rendering.text import table, wrapped, wrapped_comment, wrapped_prototype
+from scvi_codegen.common.cache import template_folder
+from scvi_codegen.common.errors import MethodError
+from scvi_codegen.common.precision import mp
+
+OPERATORS = {"+": "sum", "-": "difference", "/": "divide", "neg": "negative"}
+SUMS = ("+", "-", "neg")
+PRODUCTS, SETTLED_PRODUCTS = ("squared", "multiple", "product"), ("square", "scale", "multiply")
+"""Functions of ``templates/support/double_double/pairs.h``: square, product with one word, and of pairs."""
+ROOTS = frozenset(("sqrt", *(f"{INVERSE_ROOT}{k}" for k in (1, 3, 5, 7))))
+FUNCTIONS = frozenset(
+    "sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh exp log pow".split()  # noqa: SIM905
+)
+"""Elementary functions of ``templates/support/double_double/functions.h``."""
+
+PER_TURN, PER_BINADE, NEAR = 128, 64, 64
+"""Rows of the tables of sines and cosines, of powers of 2, and of powers less 1."""
+
+
+def unsupported(kernels: tuple[Kernel, ...]) -> set[str]:
+    """Return the functions of kernels that have no double-double form."""
+    return set().union(*map(scalar_functions, kernels)) - ROOTS - FUNCTIONS
+
+
+def uses_functions(kernels: tuple[Kernel, ...]) -> bool:
+    """Return whether elementary functions other than roots occur."""
+    return bool(set().union(*map(scalar_functions, kernels)) & FUNCTIONS)
+
+
+@dataclass(frozen=True, slots=True)
+class _Printed:
+    """C source of a pair, or of one word: ``kind`` is ``"dd"``, ``"ddl"`` or ``"word"``.
+
+    ``form`` is that of its low word: ``"settled"``; ``"product"`` if it is a few units of the high word; ``"sum"``
+    if it may be of any size relative to it, as after cancellation.
+    """
+
+    text: str
+    kind: str
+    form: str = "settled"
+
+    def as_pair(self, kind: str, *, summed: bool = False) -> str:
+        """Return the source of a pair of this kind; of a sum a settled one, unless it is summed further."""
+        if self.kind == "word":
+            return f"{kind}_word({self.text if kind == 'dd' else f'lanes_of({self.text})'})"
+        text = self.text if self.kind == kind else f"ddl_of({self.text})"
+        return f"{kind}_settled({text})" if self.form == "sum" and not summed else text
+
+    def settled(self, kind: str) -> str:
+        """Return the source of a settled pair of this kind."""
+        return replace(self, form="settled" if self.form == "settled" else "sum").as_pair(kind)
+
+
+class _PairPrinter:
+    """Printer of the expressions of a kernel, whose temporaries are pairs of numbers or of vectors."""
+
+    def __init__(self, lanes: Lanes | None) -> None:
+        self.sources = lanes.sources if lanes else ()
+        self.temporaries: dict[int, tuple[str, str]] = {}  # kind and form
+
+    def kind_of(self, source: str) -> str:
+        """Return the kind of pairs of an argument."""
+        return "ddl" if source in self.sources else "dd"
+
+    def printed(self, expression: Expression) -> _Printed:
+        if isinstance(expression, Constant):
+            high, low = _words(mp.convert(expression.value), 2)  # of small constants as well, unlike Target.rest
+            return _Printed(f"dd_of({high}, {low})", "dd") if float(low) else _Printed(high, "word")
+        if isinstance(expression, Load):
+            return self._load(expression)
+        operands = [self.printed(each) for each in expression.operands]
+        result = "ddl" if any(each.kind == "ddl" for each in operands) else "dd"
+        if expression.operator == "*":
+            return self._product(expression, operands, result)
+        name, added = OPERATORS.get(expression.operator, expression.operator), expression.operator in SUMS
+        form = "settled" if not added else operands[0].form if name == "negative" else "sum"
+        texts = (each.as_pair(result, summed=added) for each in operands)
+        return _Printed(f"{result}_{name}({', '.join(texts)})", result, form)
+
+    def _product(self, expression: Operation, operands: list[_Printed], kind: str) -> _Printed:
+        """Return a product, whose low word is settled if those of its factors are not."""
+        factors = {each.form for each in operands}
+        names, form = (SETTLED_PRODUCTS, "settled") if "product" in factors else (PRODUCTS, "product")
+        if len(set(expression.operands)) == 1:
+            return _Printed(f"{kind}_{names[0]}({operands[0].as_pair(kind)})", kind, form)
+        word, pair = sorted(operands, key=lambda each: each.kind != "word")
+        if word.kind != "word":
+            return _Printed(f"{kind}_{names[2]}({', '.join(each.as_pair(kind) for each in operands)})", kind, form)
+        exact = math.frexp(abs(float(word.text)))[0] == 0.5  # a power of two
+        name, form = ("times_power", pair.form) if exact else (names[1], form)
+        number = word.text if kind == "dd" else f"lanes_of({word.text})"
+        return _Printed(f"{kind}_{name}({pair.as_pair(kind, summed=exact)}, {number})", kind, form)
+
+    def _load(self, load: Load) -> _Printed:
+        if load.source == "w":
+            return _Printed(f"w{load.index}", *self.temporaries[load.index])
+        kind = self.kind_of(load.source)
+        if load.source == "parameters":
+            return _Printed(f"PARAMETER{'_OF_LANES' if kind == 'ddl' else ''}({load.index})", kind)
+        return _Printed("t" if load.source == "t" else f"u[{load.index}]", kind)
+
+
+def pair_kernel_text(kernel: Kernel, lanes: Lanes | None = None) -> str:
+    """Return the function ``<name>_pairs`` of numbers, or with ``lanes`` of vectors, and its comment.
+
+    Raises:
+        MethodError: for a function that has no double-double form.
+    """
+    if missing := unsupported((kernel,)):
+        names = ", ".join(sorted(missing)).replace("copysign", "unit_step").replace("rint", "rint (wrap)")
+        raise MethodError(
+            f"{names} in the formulas is not available with precision='double-double': use precision='double', "
+            f"or {', '.join(sorted(FUNCTIONS))} and powers"
+        )
+    kind, printer, statements = "ddl" if lanes else "dd", _PairPrinter(lanes), []
+    for array, k, expression in kernel.statements():
+        value = printer.printed(expression)
+        if array == "w":
+            own = "dd" if value.kind == "word" else value.kind
+            printer.temporaries[k] = own, value.form.replace("sum", "settled")
+            statements.append(f"const {own} w{k} = {value.as_pair(own)};")
+        elif array == "value":
+            statements.append(f"value[{k}] = {value.settled(kind)};")
+    parameters = "lanes" if printer.kind_of("parameters") == "ddl" else "double"
+    arguments = f"const {kind} *u, {printer.kind_of('t')} t, const {parameters} *parameters, {kind} *value"
+    unused = ", ".join(f"(void){name}" for name in ("u", "t", "parameters") if not kernel.uses(name))
+    body = "\n".join(wrapped(each) for each in ([f"{unused};"] if unused else []) + statements)
+    purpose = wrapped_comment(f"{kernel.purpose} In pairs.".strip())
+    head = wrapped_prototype(f"static inline void {kernel.name}_pairs({arguments})")
+    return f"{purpose}\n{head}\n{{\n  /* clang-format off */\n{body}\n  /* clang-format on */\n}}"
+
+
+@cache
+def arithmetic_headers() -> dict[str, str]:
+    """Return the headers of pairs of numbers and of vectors, by name."""
+    folder = template_folder() / "support" / "double_double"
+    pairs, functions = ((folder / f"{name}.h").read_text(encoding="utf-8") for name in ("pairs", "functions"))
+    of_numbers = {
+        "NUMBER": "double",
+        "PAIR": "dd",
+        "OF(name)": "dd_##name",
+        "FMA(a, b, c)": "fma(a, b, c)",
+        "BROADCAST(x)": "(x)",
+        "INLINE": "static inline",
+        "PICK(k, table, column)": "table[dd_row(k, (int)(sizeof table / sizeof table[0]))][column]",
+    }
+    of_vectors = {
+        "NUMBER": "lanes",
+        "PAIR": "ddl",
+        "OF(name)": "ddl_##name",
+        "FMA(a, b, c)": "multiply_add(a, b, c)",
+        "BROADCAST(x)": "lanes_of(x)",
+        "INLINE": "static inline __attribute__((always_inline))",  # in long kernels as well
+        "PICK(k, table, column)": "ddl_entries(k, &table[0][column], (int)(sizeof table / sizeof table[0]), "
+        "(int)(sizeof table[0] / sizeof table[0][0]))",
+    }
+    texts = {}
+    for kind, macros in (("number", of_numbers), ("vector", of_vectors)):
+        defined = "".join(f"#define {name} {value}\n" for name, value in macros.items())
+        undefined = "".join(f"#undef {name.partition('(')[0]}\n" for name in macros)
+        for name, text in (("pairs", pairs), ("functions", functions)):
+            texts[f"support/double_double/{kind}_{name}.h"] = f"{defined}\n{text}\n{undefined}"
+    texts["support/double_double/tables_of_functions.h"] = _tables_of_functions()
+    return texts
+
+
+def _words(value: Number, count: int) -> list[str]:
+    """Return the literals of a number in words, each the rest of those before."""
+    words = []
+    for _ in range(count):
+        words.append(float(value))
+        value -= words[-1]
+    return [repr(word) for word in words]
+
+
+def _tables_of_functions() -> str:
+    """Return the tables and coefficients of the elementary functions of pairs."""
+    with mp.workdps(80):
+        angle, exponent = mp.pi / 64, mp.log(2) / PER_BINADE
+        sines = [(-1) ** (n + 1) / mp.factorial(2 * n + 3) for n in range(7)]
+        cosines = [(-1) ** (n + 1) / mp.factorial(2 * n + 2) for n in range(7)]
+        exponential = [1 / mp.factorial(n + 2) for n in range(11)]
+        turn = []
+        for k in range(PER_TURN):
+            both = [mp.zero if abs(x) < mp.mpf(10) ** -60 else x for x in (mp.sin(k * angle), mp.cos(k * angle))]
+            turn.append([*_words(both[0], 2), *_words(both[1], 2)])
+        powers = [_words(mp.exp(k * exponent), 2) for k in range(PER_BINADE)]
+        signed = [k if k < NEAR else k - 2 * NEAR for k in range(2 * NEAR)]  # row of k: k modulo the number of rows
+        near = [_words(mp.expm1(k * exponent), 2) for k in signed]
+        scalars = {"PER_UNIT_OF_ANGLE": 1 / angle, "PER_UNIT_OF_EXPONENT": 1 / exponent}
+        units = {"UNIT_OF_ANGLE": _words(angle, 3), "UNIT_OF_EXPONENT": _words(exponent, 3)}
+        rows = {
+            "SINE": [_words(x, 2) for x in sines],
+            "COSINE": [_words(x, 2) for x in cosines],
+            "EXPONENTIAL": [_words(x, 2) for x in exponential],
+            "CIRCLE": turn,
+            "POWERS": powers,
+            "POWERS_LESS_1": near,
+        }
+    lines = [
+        "/* Tables of the elementary functions of pairs: units pi/64 and log(2)/64 in three words; Taylor series;",
+        " * sine and cosine of k pi/64, 2^(k/64), and 2^(k/64) - 1 for |k| <= 32, row k modulo the number of rows. */",
+        *(f"static const double {name} = {float(value)!r};" for name, value in scalars.items()),
+        *(table(f"static const double {name}[3]", words) for name, words in units.items()),
+        *(table(f"static const double {name}[{len(x)}][{len(x[0])}]", x) for name, x in rows.items()),
+    ]
+    return "\n".join(lines) + "\n"

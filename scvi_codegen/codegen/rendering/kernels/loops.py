@@ -1,0 +1,390 @@
+"""Systems of arrays as C: functions of nested loops around kernels, lattices, and the template's context."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import accumulate, groupby
+from math import prod
+from typing import Any
+
+from scvi_codegen.codegen.ir.equations import ConstrainedSteps
+from scvi_codegen.codegen.ir.kernel import Kernel, RolledKernel, is_divided
+from scvi_codegen.codegen.ir.program import Program, RolledTerms
+from scvi_codegen.codegen.rendering.kernels.functions import kernel_text
+from scvi_codegen.codegen.rendering.kernels.loop_nests import (
+    DIRECTION,
+    Nest,
+    Sharing,
+    count_text,
+    counter,
+    product_text,
+    sharing_of,
+    sharing_text,
+    size_text,
+    sizes_text,
+    starts_text,
+)
+from scvi_codegen.codegen.rendering.kernels.printer import DOUBLE, inverse_roots
+from scvi_codegen.codegen.rendering.kernels.simd import POINTS, iteration_source, loop_functions
+from scvi_codegen.systems.formulas.indices import MOST_THREADS, Array, Convolution, couples_elements
+
+EXPLICIT_VECTORS, CONSTRAINED_VECTORS, ITERATION_VECTORS = 4, 7, 4
+"""Number of vectors in ``work``.
+
+Positions, forces, increments; with constraints also constraint forces and trial increments; for iterations positions
+at the points, forces in this step and in two former ones.
+"""
+NEWTON_VECTORS = 4 + 17
+"""Further vectors: residual, correction, products, and the basis of GMRES (templates/support/arrays/newton_gmres.h)."""
+FOURIER_VECTORS = 2
+"""Further vectors: Fourier transforms (templates/support/arrays/preconditioner.h)."""
+PLAN_VECTORS, TRANSFORM_VECTORS, TRANSFORM_ALIGNMENT = 7, 4, 8
+"""Further vectors: plan of each circulant matrix, transforms and their alignment (support/arrays/circulant.h)."""
+STEP_VECTORS = 14
+"""Further vectors: inverse sizes, half steps, increments of a step (templates/support/arrays/work_arrays.h)."""
+
+
+def loop_context(program: Program) -> dict[str, Any]:
+    """Return the template's context for the program of a system of arrays."""
+    loops, constrained, pairs = program.loops, program.loops.constrained, _circulants(program)
+    sums, fixed_point = _convolutions(program), program.fixed_point
+    starts, lengths = [*starts_text(program.layout, " ".join(sums))], [*map(product_text, program.layout.fields)]
+    terms = [(each, each.scalar) for each in loops.forces if each.scalar]
+    terms += [(each, each.kernel) for each in loops.constants]
+    scalars = [each.kernel for each in loops.masses] + [scalar for _, scalar in terms]
+    if fixed_point is None:
+        scalars += [each.kernel for each in loops.forces]
+    if constrained:
+        scalars += [each.kernel for each in (*constrained.conditions, *constrained.curvatures)]
+    scalars += [each.kernel for each in (*loops.velocities, *loops.momenta)]
+    return {
+        "program": program,
+        "most_threads": 1 if constrained else MOST_THREADS,
+        "cut": is_divided((*scalars, *(each.kernel for each in loops.applied))),
+        "forces": [_force_text(program, each) for each in loops.applied],
+        "energies": [_energy_text(program, each, scalar, declared=each in pairs) for each, scalar in terms],
+        "masses": [_mass_text(program, each) for each in loops.masses],
+        "lists": [(name, _list_text(program, count, lengths)) for name, count, lengths in loops.neighbours],
+        "circulants": {each.kernel.name: _circulant_text(program, each) for each in pairs},
+        "sums": sums,
+        "names_of_sums": [*sizes_text(program.layout, " ".join([*sums, *starts])), *starts],
+        "summed": [each.kernel.name for each in loops.applied if _has_sums(each)],
+        "plans": len(_plans(program)),
+        "most_stages": max((len(_stages(each)) for each in program.layout.sums), default=0),
+        "force_names": [each.kernel.name for each in loops.forces],
+        "energy_names": [(scalar.name, _has_sums(each)) for each, scalar in terms],
+        "mass_names": [each.kernel.name for each in loops.masses],
+        "scalar_kernels": [kernel_text(kernel, DOUBLE) for kernel in scalars],
+        "inverse_roots": inverse_roots(scalars),
+        "vector_functions": _vector_functions(program),
+        "coordinates": " + ".join(map(product_text, program.layout.coordinates)),
+        "fixed_point": fixed_point
+        and iteration_source(fixed_point, POINTS, kernels=[each.kernel for each in loops.applied]),
+        "work": _step_work(program) + _transform_work(program),
+        "continued": loops.continued,
+        "site_functions": [_site_text(program, each) for each in (*loops.velocities, *loops.momenta)],
+        "field_lengths": lengths,
+        "field_sizes": [*sizes_text(program.layout, " ".join(lengths))],
+        **_map_context(program),
+        "hot": "static",
+        "waves": _lattice_context(program) if _on_lattices(program) else None,
+        "arrays": [(product_text(each), _is_field(each, loops)) for each in program.layout.coordinates],
+        **_constraint_context(program, constrained),
+    }
+
+
+def _map_context(program: Program) -> dict[str, Any]:
+    """Return the initialisers of the descriptions of momentum maps in C (templates/support/arrays/array_states.h)."""
+    arrays = {array.name: array for array in program.layout.coordinates}
+    texts = []
+    for each in program.loops.maps:
+        array, whole = arrays[each.array], each.component is None
+        kind = "PHASE" if each.phase else "TRANSLATION" if each.other is None else "ROTATION"
+        components, numbers = (1 if whole else array.axes[-1].number, f"{each.component or 0}, {each.other or 0}")
+        start = f"start_{array.name}"
+        texts.append(f"{{{start}, {start} + {product_text(array)}, {components}, {numbers}, {kind}}}")
+    starts = list(starts_text(program.layout, " ".join(texts)))
+    return {"maps": texts, "map_sizes": [*sizes_text(program.layout, " ".join([*texts, *starts])), *starts]}
+
+
+def _site_text(program: Program, rolled: RolledKernel) -> str:
+    """Return a function that computes velocities or momenta of the elements of a term, from the joined state."""
+    place_of, name = Nest(program.layout, rolled, "", "").place_of, rolled.kernel.name
+    stored = [f"result[{place_of(access)}] = value[{k}];" for k, access in enumerate(rolled.writes)]
+    arguments = ["const double *X", "double t", "double *result"]
+    lines = [f"{name}(u, t, parameters, value);", *stored]
+    return _function(program, rolled, f"find_{name}", arguments, lines, values=len(stored))
+
+
+def _circulants(program: Program) -> list[RolledKernel]:
+    """Return the terms whose forces, or products with a direction, are products with circulant matrices."""
+    return [each for each in program.loops.applied if each.circulant is not None]
+
+
+def _has_sums(rolled: RolledKernel) -> bool:
+    return any(each.sums for each in rolled.reads)
+
+
+def _stages(sums: Sequence[Convolution]) -> list[tuple[int, str, int]]:
+    """Return the axis, the array of coefficients and the power of each circulant matrix of convolutions in turn."""
+    alike = groupby(sums, key=lambda each: (each.axis, each.coefficients.name))
+    return [(*stage, len([*group])) for stage, group in alike]
+
+
+def _plans(program: Program) -> list[tuple[str, int]]:
+    """Return the arrays of coefficients and powers of all circulant matrices; of sums over pairs the power is 0."""
+    pairs = [(each.given[0].array.name, 0) for each in _circulants(program)]
+    return [*dict.fromkeys([*pairs, *(stage[1:] for sums in program.layout.sums for stage in _stages(sums))])]
+
+
+def _convolutions(program: Program) -> list[str]:
+    """Return the convolutions of each array in C: their number, whether forces are derivatives by them, stages."""
+    kernels = program.loops.applied
+    reads, writes = (
+        dict.fromkeys((each.sums, each.array) for one in kernels for each in getattr(one, kind) if each.sums)
+        for kind in ("reads", "writes")
+    )
+    texts = []
+    for sums, array in reads:
+        stages = [_circulant_matrix(program, array, *stage) for stage in _stages(sums)]
+        number, target = program.layout.sums.index(sums), int((sums, array) in writes)
+        texts.append(f"{{{number}, {target}, {len(stages)}, {{{', '.join(stages)}}}}}")
+    return texts
+
+
+def _transform_work(program: Program) -> int:
+    """Return the number of doubles per coordinate of Fourier transforms."""
+    lanes, plans = program.fixed_point.lanes if program.fixed_point else 1, len(_plans(program))
+    states = 2 if program.layout.momenta or program.layout.velocities else 1
+    each = 3 if program.loops.products else 2  # values, derivatives by them, and values along a direction
+    vectors = TRANSFORM_VECTORS + states * each * len(program.layout.sums)
+    return vectors * lanes + TRANSFORM_ALIGNMENT + PLAN_VECTORS * plans if plans else 0
+
+
+def _step_work(program: Program) -> int:
+    """Return the number of doubles per coordinate that the method uses."""
+    if program.fixed_point is None:
+        return CONSTRAINED_VECTORS + bool(program.layout.velocities) if program.loops.constrained else EXPLICIT_VECTORS
+    momenta, velocities = bool(program.layout.momenta), bool(program.layout.velocities)
+    iteration = (1 + momenta) * ITERATION_VECTORS + velocities
+    newton = (1 + momenta + velocities) * NEWTON_VECTORS + program.fixed_point.lanes
+    linear = newton if program.loops.products else 0
+    roots = 2 * max(map(_axes, program.layout.coordinates))  # of unity, of every axis
+    waves = (1 + momenta) * FOURIER_VECTORS * program.fixed_point.lanes + roots if _on_lattices(program) else 0
+    return (iteration + linear) * program.fixed_point.lanes + waves + STEP_VECTORS
+
+
+def _vector_functions(program: Program) -> list[str]:
+    """Return the functions of the vector library that occur in the forces of an explicit method."""
+    return loop_functions([each.kernel for each in program.loops.forces] if program.fixed_point is None else [])
+
+
+def _force_text(program: Program, rolled: RolledKernel) -> str:
+    """Return a function that adds to the forces; for an explicit method, with a factor."""
+    explicit = program.fixed_point is None
+    chunked, sharing = explicit and bool(rolled.loops), sharing_of(rolled)
+    nest = Nest(program.layout, rolled, "lanes", "X", chunked=chunked, sharing=sharing)
+    slots = range(len(rolled.writes))
+    inner = [nest.is_innermost(target) for target in rolled.writes]
+
+    def added(k: int, value: str) -> list[str]:
+        return nest.adding(k, value) if inner[k] else [f"sum_{k} += {value};"]
+
+    call = f"{rolled.kernel.name}(u, t, parameters, value);"
+    if nest.chunked:
+        here = f"[{counter(rolled.loops[-1])} - begin]"
+        innermost = [call, *(f"values[{k}]{here} = by * value[{k}];" for k in slots)]
+        behind = [added(k, f"values[{k}]{here}") for k in slots]
+    else:
+        innermost = [call, *(line for k in slots for line in added(k, f"{'by * ' * explicit}value[{k}]"))]
+        behind = []
+    lines = nest.text(
+        prepare=lambda k: [f"lanes sum_{k} = zero;"],
+        innermost=innermost,
+        behind=behind,
+        finish=lambda k: nest.adding(k, f"sum_{k}"),
+    )
+    zero = [] if all(inner) else ["const lanes zero = {0};"]
+    factor = ["double by"] if explicit else []
+    direction = [f"const lanes *{DIRECTION}"] if rolled.along else []
+    arguments = ["const problem *given", "const lanes *restrict X", "times t", *direction, *factor, "lanes *restrict F"]
+    arguments += ["const window *here", *(["const images *sums"] if _has_sums(rolled) else [])]
+    if sharing is Sharing.BY_PLACES:
+        zero.append("const int whole = here->whole;")
+    unused = ["(void)here;"] if sharing is Sharing.ALONE else []
+    values, name = f"lanes value[{len(rolled.writes)}]", f"static void add_{rolled.kernel.name}"
+    text = nest.function(name, arguments, [*unused, *zero, *lines], values=values)
+    if text.count("given") == 1:  # among the arguments
+        text = nest.function(name, arguments, ["(void)given;", *unused, *zero, *lines], values=values)
+    return f"{text}\n\n{_sharing_text(program, rolled)}"
+
+
+def _circulant_text(program: Program, rolled: RolledKernel) -> str:
+    """Return functions that describe the circulant matrix of a term and return its factor, and that add its energy."""
+    nest, name, scalar = Nest(program.layout, rolled, "lanes", "X"), rolled.kernel.name, rolled.scalar
+    matrix = _matrix_of_pairs(program, rolled)
+    unit = f"parameters[{len(program.layout.parameters)}] = 1.0;"
+    lines = [
+        f"*matrix = {matrix};",
+        *(f"u[{k}] = lanes_of({1 - k % 2}.0);" for k in range(len(rolled.reads))),
+        unit,
+        f"{name}(u, t, parameters, value);",
+        "return value[0];",
+    ]
+    arguments = ["const problem *given", "times t", "circulant *matrix"]
+    force = nest.function(f"static lanes describe_{name}", arguments, lines, values="lanes value[2]")
+    return f"{force}\n\n{_energy_text(program, rolled, scalar, before=[unit])}" if scalar else force
+
+
+def _matrix_of_pairs(program: Program, rolled: RolledKernel) -> str:
+    """Return the description of the circulant matrix of a sum over pairs in C."""
+    array, name = rolled.reads[0].array, rolled.given[0].array.name
+    return f"(circulant){_circulant_matrix(program, array, rolled.circulant or 0, name, 0)}"
+
+
+def _circulant_matrix(program: Program, array: Array, axis: int, coefficients: str, power: int) -> str:
+    """Return the initialiser of the description of a circulant matrix in C."""
+    outer, inner = (product_text(replace(array, axes=axes)) for axes in (array.axes[:axis], array.axes[axis + 1 :]))
+    plan, size = _plans(program).index((coefficients, power)), size_text(array.axes[axis])
+    field = [each.name for each in program.layout.fields].index(coefficients)
+    return f"{{start_{array.name}, {outer}, {size}, {inner}, given->field[{field}], {power}, {plan}}}"
+
+
+def _list_text(program: Program, components: int, lengths: RolledKernel) -> str:
+    """Return a function that describes the points of a list of neighbours."""
+    nest = Nest(program.layout, lengths, "double", "")
+    start, name = nest.place_of(lengths.writes[0]), lengths.kernel.name
+    lines = [
+        f"{name}(NULL, 0.0, given->parameters, of->lengths);",
+        f"of->start = {start};",
+        f"of->count = {size_text(lengths.writes[0].array.axes[0])};",
+        f"of->components = {components};",
+    ]
+    text = nest.function(f"static void describe_{name}", ["const problem *given", "points *of"], lines)
+    return f"{kernel_text(lengths.kernel, DOUBLE)}\n\n{text}"
+
+
+def _sharing_text(program: Program, rolled: RolledKernel) -> str:
+    """Return a function that describes how threads share a term group."""
+    how = sharing_text(rolled)
+    known = [*sizes_text(program.layout, how), *(f"(void){name};" for name in ("run", "given", "n"))]
+    head = f"static sharing share_{rolled.kernel.name}(const run_memory *run, const problem *given, long long n)"
+    lines = "\n".join(f"  {line}" for line in [*known, f"return {how};"])
+    return f"/* Its rounds of tasks. */\n{head}\n{{\n{lines}\n}}"
+
+
+def _function(
+    program: Program,
+    rolled: RolledKernel,
+    name: str,
+    arguments: Sequence[str],
+    lines: Sequence[str],
+    *,
+    values: int = 1,
+    source: str = "X",
+    before: Sequence[str] = (),
+) -> str:
+    """Return a function of numbers with the same statements for every element, and others before."""
+    nest = Nest(program.layout, rolled, "double", source)
+    text = ["(void)given;", *before, *nest.text(innermost=lines)]
+    declared = f"double value[{values}]" if values else ""
+    return nest.function(f"static void {name}", ["const problem *given", *arguments], text, values=declared)
+
+
+def _energy_text(
+    program: Program, rolled: RolledKernel, kernel: Kernel, *, declared: bool = False, before: Sequence[str] = ()
+) -> str:
+    """Return a function that sums the terms; ``before``: for the factor of a circulant matrix, at u = (1, 0)."""
+    arguments = ["const double *q", "double t", "compensated *total"]
+    arguments += ["const double *image", "long long length"] if _has_sums(rolled) else []
+    call = f"{kernel.name}(u, t, parameters, value);"
+    if declared:
+        return f"static void sum_{kernel.name}(const problem *given, {', '.join(arguments)});"
+    if before:
+        matrix = _matrix_of_pairs(program, rolled)
+        added = "if (add_energy(&matrix, q, value[0], total))"
+        before = [f"const circulant matrix = {matrix};", "u[0] = 1.0, u[1] = 0.0;", *before, call, added, "  return;"]
+    lines = [call, "add_to_sum(total, value[0]);"]
+    return _function(program, rolled, f"sum_{kernel.name}", arguments, lines, source="q", before=before)
+
+
+def _mass_text(program: Program, rolled: RolledKernel) -> str:
+    name, place = rolled.kernel.name, Nest(program.layout, rolled, "", "").place_of(rolled.writes[0])
+    lines = [f"{name}(NULL, 0.0, parameters, value);", f"mass[{place}] += value[0];"]
+    return _function(program, rolled, f"add_{name}", ["double *mass"], lines, source="")
+
+
+def _constraint_context(program: Program, held: ConstrainedSteps | None) -> dict[str, Any]:
+    if held is None:
+        return {"held": None}
+    counts = [count_text(each.loops) for each in held.conditions]
+    entries = [f"{count} * {len(each.reads)}" for count, each in zip(counts, held.conditions, strict=True)]
+    pairs = zip(held.conditions, held.curvatures, strict=True)
+    context = {
+        "functions": [text for pair in pairs for text in _constraint_texts(program, *pair)],
+        "conditions": [each.kernel.name for each in held.conditions],
+        "curvatures": [each.kernel.name for each in held.curvatures],
+        "sizes": list(sizes_text(program.layout, " ".join(counts))),
+        "count": " + ".join(counts),
+        "entries": " + ".join(entries),
+    }
+    return {"held": context, "part_ends": list(accumulate(held.parts))}
+
+
+def _constraint_texts(program: Program, condition: RolledKernel, curvature: RolledKernel) -> Iterator[str]:
+    """Yield functions of a constraint: g, g_t and derivatives; second derivatives; indices of its coordinates."""
+    name, count = condition.kernel.name, len(condition.reads)
+    X, now = "const double *restrict X", "condition *now"
+    lines = [
+        f"{name}(u, t, parameters, value);",
+        "now->g[now->count] = value[0];",
+        "now->rate[now->count++] = value[1];",
+        *(f"now->derivative[now->entries++] = value[{k + 2}];" for k in range(count)),
+    ]
+    yield _function(program, condition, f"find_{name}", [X, "double t", now], lines, values=count + 2)
+    second = curvature.kernel.name
+    lines = [f"{second}(u, t, parameters, value);", "now->g[now->count++] = value[0];"]
+    arguments = [X, f"const double *restrict {DIRECTION}", "double t", now]
+    yield _function(program, curvature, f"find_{second}", arguments, lines)
+    bare = replace(condition, reads=(), given=())
+    places = map(Nest(program.layout, bare, "", "").place_of, condition.writes)
+    lines = [
+        "now->first[now->count++] = (int)now->entries;",
+        *(f"now->place[now->entries++] = (int)({place});" for place in places),
+    ]
+    yield _function(program, bare, f"place_{name}", [now], lines, values=0, source="")
+
+
+def _is_field(array: Array, loops: RolledTerms) -> int:
+    return int(any(couples_elements(array, each.reads, each.given) for each in loops.applied))
+
+
+def _on_lattices(program: Program) -> bool:
+    """Return whether Newton's method has the Fourier preconditioner: places in stencils, or circulant matrices."""
+    alike = all(array.is_lattice for array in program.layout.coordinates) and not program.layout.tables
+    return bool(program.loops.reach or (program.loops.diagonals and _plans(program) and alike))
+
+
+def _lattice_context(program: Program) -> dict[str, Any]:
+    before: list[str] = []
+    lines: list[str] = []
+    for array in program.layout.coordinates:
+        sizes = ", ".join(size_text(axis) for axis in array.axes if axis.name)
+        first = " + ".join(before) or "0"
+        lines.append(
+            f"{{.first = {first}, .components = {_components(array)}, .size = {{{sizes}}}, .axes = {_axes(array)}}}"
+        )
+        before.append(product_text(array))
+    return {
+        "lattices": lines,
+        "axes": max(map(_axes, program.layout.coordinates)),
+        "components": sum(map(_components, program.layout.coordinates)),
+        "sizes": list(sizes_text(program.layout, " ".join(lines))),
+    }
+
+
+def _axes(array: Array) -> int:
+    return sum(bool(axis.name) for axis in array.axes)
+
+
+def _components(array: Array) -> int:
+    return prod(axis.number for axis in array.axes if not axis.name)

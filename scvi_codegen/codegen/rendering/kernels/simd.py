@@ -1,0 +1,251 @@
+"""Fixed-point iterations in vectors as C: support headers and tables, for either meaning of a SIMD lane.
+
+A lane is a point of a step of one trajectory, or one of many trajectories; the source of the iterations is the same for
+both (``templates/support``), and so are the kernels except for the variables that differ between lanes.
+
+If the iteration fails, Newton's method is the fallback, in the same or in a second library. Its kernels contain second
+derivatives of the Lagrangian: for larger systems they are most of the source, and of the time of derivation and
+compilation, and most runs never need them. So a source that is compiled here has only the fixed-point iteration and
+uses a second library, compiled when the iteration first fails; an exported source includes Newton's method. The second
+library is set once, for all steppers of a source: one generator makes one Newton solver for the same iteration.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias
+
+from scvi_codegen.codegen.ir.equations import (
+    AdaptivePredictor,
+    FixedPointIteration,
+    LinearPart,
+    Splitting,
+    StoredValues,
+)
+from scvi_codegen.codegen.ir.kernel import Kernel, Number, NumberTable
+from scvi_codegen.codegen.rendering.kernels.printer import (
+    DOUBLE,
+    INVERSE_ROOT,
+    TIMES,
+    Sources,
+    lane_functions,
+    print_number,
+    scalar_functions,
+)
+from scvi_codegen.codegen.rendering.kernels.roots import with_factors_in_roots
+from scvi_codegen.codegen.rendering.text import table
+
+Fallback: TypeAlias = Literal["own", "external", "provided", "none"]
+"""Fallback of a source: its own, that of another library (``external``), one for others (``provided``), or none."""
+
+
+LIBRARY = ("sin", "cos", "exp", "log", "pow")
+"""Functions that glibc's libmvec has for every x86-64 vector width since 2.22."""
+
+OF_TWO = ("pow", "atan2", "copysign")
+
+
+@dataclass(frozen=True, slots=True)
+class Lanes:
+    """Meaning of a lane.
+
+    Attributes:
+        sources: loads of a kernel that differ between lanes.
+        meaning: its support header, before the tables.
+        memory: further headers, after the tables.
+    """
+
+    sources: Sources
+    meaning: str
+    memory: tuple[str, ...]
+
+    @property
+    def are_points(self) -> bool:
+        """True if lanes are points of one trajectory."""
+        return "t" in self.sources
+
+    def type_of(self, source: str) -> str:
+        """Return the C type of the time or of a parameter."""
+        return "lanes" if source in self.sources else "double"
+
+
+POINTS = Lanes(("u", "t"), "points", ("core/progress", "iteration/one_trajectory"))
+TRAJECTORIES = Lanes(("u", "parameters"), "trajectories", ("iteration/many_trajectories",))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IterationSource:
+    """Template data of a fixed-point iteration.
+
+    Attributes:
+        lanes: number of points, in one vector or in several, depending on the processor.
+        whole: whether in one.
+        meaning: of a lane.
+        defines: macros and values that the support headers require.
+        functions: lines that define functions of vectors.
+        tables: C source of each.
+        kernels: on lanes.
+        mass: the constant masses, if any.
+        damping: the rate of a damping that differs between lanes.
+        support: headers from the tables on.
+        linear_part: of the forces, for which steps are solved implicitly.
+        error_defines, highest, next: macros and values, and the tables, of the error estimate.
+    """
+
+    lanes: int
+    whole: bool
+    meaning: Lanes
+    defines: Mapping[str, str]
+    functions: tuple[str, ...]
+    tables: tuple[str, ...]
+    kernels: tuple[Kernel, ...]
+    mass: Kernel | None
+    damping: Kernel | None
+    support: tuple[str, ...]
+    error_defines: Mapping[str, str] = field(default_factory=dict)
+    highest: str = ""
+    next: str = ""
+    linear_part: LinearPart | None = None
+
+    @property
+    def inverse_roots(self) -> bool:
+        """True if there are inverse roots."""
+        return any("INVERSE_ROOT" in line for line in self.functions)
+
+    @property
+    def library(self) -> bool:
+        """True if functions of the vector library occur."""
+        return any("LIBRARY" in line for line in self.functions)
+
+
+def iteration_source(
+    fixed_point: FixedPointIteration, meaning: Lanes, *, kernels: Sequence[Kernel] | None = None, changes: bool = False
+) -> IterationSource:
+    """Return the template data of a fixed-point iteration.
+
+    Args:
+        fixed_point: the iteration.
+        meaning: of a lane.
+        kernels: those applied to vectors, if they are not the iteration's own.
+        changes: whether it also propagates tangent and adjoint vectors.
+    """
+    kernels = tuple(fixed_point.kernels if kernels is None else kernels)
+    if meaning.are_points:
+        kernels = tuple(map(with_factors_in_roots, kernels))
+    mass = fixed_point.constant_mass
+    damping = None if meaning.are_points else fixed_point.damping
+    applied = (*kernels, *((mass,) if mass and not meaning.are_points else ()), *((damping,) if damping else ()))
+    functions = {name.removesuffix(TIMES) for each in applied for name in lane_functions(each, meaning.sources)}
+    solver = ("iteration/iteration_solver",) if meaning.are_points else ()
+    parts = (f"iteration/{name}" for name in fixed_point.parts)
+    return IterationSource(
+        lanes=fixed_point.lanes,
+        whole=meaning.are_points and not fixed_point.in_groups,
+        meaning=meaning,
+        defines={
+            "FINAL_ITERATIONS": str(fixed_point.final_iterations),
+            **({"LARGEST_STIFFNESS": repr(fixed_point.remainder.largest)} if fixed_point.remainder else {}),
+            **{name: str(value) for name, value in fixed_point.facts.items()},
+        },
+        functions=tuple(map(_vector_function, sorted(functions))),
+        tables=tuple(_tables(fixed_point, meaning, changes=changes)),
+        kernels=kernels,
+        mass=mass,
+        damping=damping,
+        support=("iteration/convergence", *meaning.memory, *parts, *solver),
+        error_defines=_kept(fixed_point),
+        highest=lane_table("HIGHEST", fixed_point.guess.highest),
+        next=lane_table("NEXT", fixed_point.guess.next),
+        linear_part=fixed_point.linear_part if meaning.are_points else None,
+    )
+
+
+def splitting_source(split: Splitting, observed: Kernel | None = None) -> IterationSource:
+    """Return the template data of explicit steps of many trajectories, which are lanes."""
+    kernels = (split.force, *(() if split.by_masses else (split.drift,)), *((observed,) if observed else ()))
+    functions = {name for each in (*kernels, split.drift) for name in lane_functions(each, TRAJECTORIES.sources)}
+    sizes = {"LEAPS": str(len(split.kicks)), "EXPLICIT_STEPS": "1", "SPLITTING": "static inline"}
+    tables = (("KICK", split.kicks), ("DRIFT", split.drifts), ("KICK_ABSCISSA", split.abscissae))
+    return IterationSource(
+        lanes=1,
+        whole=False,
+        meaning=TRAJECTORIES,
+        defines=sizes | ({"CONSTANT_MASSES": "1"} if split.by_masses else {}),
+        functions=tuple(map(_vector_function, sorted(functions))),
+        tables=tuple(lane_table(name, numbers, len(numbers)) for name, numbers in tables),
+        kernels=kernels,
+        mass=split.drift if split.by_masses else None,
+        damping=None,
+        support=("iteration/splitting",),
+    )
+
+
+def loop_functions(kernels: Iterable[Kernel]) -> list[str]:
+    """Return the functions of the vector library that occur in kernels, for loops that the compiler vectorises."""
+    return sorted(set(LIBRARY) & set().union(*map(scalar_functions, kernels)))
+
+
+def _kept(fixed_point: FixedPointIteration) -> dict[str, str]:
+    """Return the macros of the error estimate."""
+    # coefficient k of velocities is h / (4k - 2) times coefficient k - 1 of accelerations
+    velocities, degree = fixed_point.kept is StoredValues.VELOCITIES, fixed_point.guess.degree
+    forces = fixed_point.kept is StoredValues.FORCES
+    return {
+        "KEPT": str(len(fixed_point.guess.abscissae)),
+        "KEPT_VELOCITIES": str(int(velocities)),
+        "KEPT_UNIT(i)": "(data->square * data->inverse_mass[i])" if forces else "(step->h)",
+        "RESOLVED": f"{4 * degree - 2 if velocities else 1}.0",
+        "NEXT_RESOLVED": f"{max(4 * degree - 6, 0) if velocities else 1}.0",
+    }
+
+
+def _vector_function(name: str) -> str:
+    if name.startswith(INVERSE_ROOT):
+        k = int(name.removeprefix(INVERSE_ROOT))
+        powers = " * ".join(["square"] * (k // 2) + ["y"])
+        return f"LANES_INVERSE_ROOT({k}, ({powers}), ({' * '.join(['inverse'] * ((k + 1) // 2))}))"
+    return f"LANES_{'LIBRARY_' * (name in LIBRARY)}FUNCTION{'_OF_TWO' * (name in OF_TWO)}({name})"
+
+
+def _tables(fixed_point: FixedPointIteration, meaning: Lanes, *, changes: bool) -> Iterator[str]:
+    one_each = fixed_point.in_groups and not meaning.are_points
+    points = len(fixed_point.guess.abscissae) if one_each else 0
+    for each in (*fixed_point.tables, *(fixed_point.derivatives_tables if changes else ())):
+        yield lane_table(each.name, each.numbers, points, groups=fixed_point.in_groups)
+        if each.in_two_parts:
+            low = tuple(tuple(map(DOUBLE.rest, x)) if each.is_matrix else DOUBLE.rest(x) for x in each.numbers)
+            yield lane_table(f"{each.name}_LOW", low, points, groups=fixed_point.in_groups)
+
+
+def lane_table(name: str, numbers: tuple[Number, ...] | NumberTable, points: int = 0, *, groups: bool = True) -> str:
+    """Return a table over points: one number for each of ``points``; if 0, vectors, those of a matrix by columns."""
+    kind, is_matrix = "double" if points else "lanes", isinstance(numbers[0], tuple)
+    if not is_matrix:
+        size = f"[{points}]" if points else "[GROUPS]" if groups else ""
+        return table(f"static const {kind} {name}{size}", [print_number(x) for x in numbers[: points or None]])
+    rows = [row[:points] for row in numbers[:points]] if points else [*zip(*numbers, strict=True)]
+    size = f"[{points}][{points}]" if points else "[POINTS * GROUPS]"
+    lines = [[print_number(x) for x in row] for row in rows]
+    return table(f"static const {kind} {name}{size}", lines, braces=bool(points))
+
+
+HEAD = "/* Predictor tables from former steps to the next, by changes of the step-size level. Requires: points.h. */\n"
+
+
+def predictor_text(predictor: AdaptivePredictor) -> str:
+    """Return the header."""
+    return HEAD + "".join(f"{table}\n" for table in _predictor_tables(predictor))
+
+
+def _predictor_tables(predictor: AdaptivePredictor) -> Iterator[str]:
+    """Yield the tables from stored values to predicted ones: of a rejected step, the last one, each of the last two."""
+    changes, size = len(predictor.alone), "[POINTS * GROUPS]"
+    for name, tables in (("INSIDE", predictor.inside), ("ALONE", predictor.alone)):
+        yield table(f"static const lanes PREDICTOR_{name}[{len(tables)}]{size}", list(map(_columns, tables)))
+    for name, lines in (("LAST", predictor.last), ("BEFORE", predictor.before)):
+        rows = [[f"{{{', '.join(_columns(each))}}}" for each in line] for line in lines]
+        yield table(f"static const lanes PREDICTOR_{name}[{changes}][{changes}]{size}", rows)
+
+
+def _columns(rows: NumberTable) -> list[str]:
+    """Return the table by columns: the contributions of point j to all points."""
+    return [print_number(number) for column in zip(*rows, strict=True) for number in column]

@@ -1,0 +1,755 @@
+"""Rendering of programs through the Jinja templates.
+
+Entry templates are named after the file they make; parts are in ``templates/parts``. Templates contain only structure:
+loops over the program's tables and the C that does not depend on it. Kernels are printed by
+:mod:`scvi_codegen.codegen.rendering.kernels.printer` through filters.
+
+Flow of many steps as one C function with its derivatives, added to a source that has those of a step.
+
+The support headers contain all of it: ``flow.h`` the function, ``xla_flow.h`` and ``casadi_flow.h`` the interfaces of
+frameworks.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import accumulate, chain
+from typing import Any, Literal, TypeAlias, cast, get_args
+
+from scvi_codegen.codegen.ir.derivatives import Derivatives, PointDerivatives
+from scvi_codegen.codegen.ir.equations import Control, FixedPointIteration, IterationTable, Rattle, StoredValues
+from scvi_codegen.codegen.ir.kernel import Kernel, Number, is_divided
+from scvi_codegen.codegen.ir.program import Program
+from scvi_codegen.codegen.rendering.environment import support_text, template_environment
+from scvi_codegen.codegen.rendering.kernels.double_double import arithmetic_headers, uses_functions
+from scvi_codegen.codegen.rendering.kernels.functions import unrolled_equations
+from scvi_codegen.codegen.rendering.kernels.loops import loop_context
+from scvi_codegen.codegen.rendering.kernels.printer import DOUBLE, SINGLE, Target, constants, inverse_roots
+from scvi_codegen.codegen.rendering.kernels.simd import (
+    POINTS,
+    TRAJECTORIES,
+    Fallback,
+    IterationSource,
+    iteration_source,
+    lane_table,
+    loop_functions,
+    predictor_text,
+    splitting_source,
+)
+from scvi_codegen.codegen.rendering.source import POINT_THREADS, ExampleInput, Interface, Source
+from scvi_codegen.codegen.rendering.text import (
+    INPUT_PRECISION,
+    LARGEST_VIOLATION,
+    MAX_ITERATIONS,
+    ROUNDING_UNITS,
+    included,
+)
+
+Embedded: TypeAlias = Literal["double", "single"]
+"""Precision of C source for a microcontroller."""
+
+EMBEDDED: tuple[Embedded, ...] = get_args(Embedded)
+
+TARGETS: dict[Embedded, Target] = {"double": DOUBLE, "single": SINGLE}
+
+DECLARATIONS = {
+    "stepper": "parts/declarations.h.jinja",
+    "ensemble": "parts/ensemble_declarations.h.jinja",
+    "events": "parts/events_declarations.h.jinja",
+}
+"""Inner part of a header by the name of its template."""
+
+
+OF_THREE_WORDS = ("DRIFT", "PRODUCT", "POINT_END_POSITION", "POINT_END_MOMENTUM")
+"""Tables of a separable iteration in double-double arithmetic, by their names in C."""
+LARGEST_INLINED = 150
+"""Largest number of operations of the kernels of an iteration that is inlined into the loop over steps.
+
+Larger ones are slower inlined: six bodies by 3 per cent, a chain of 64 masses by 20.
+"""
+
+
+LARGEST_IN_LANES = 256
+"""Largest number of values at the points of a step in two words in which trajectories, not points, are SIMD lanes.
+
+With 216 (outer solar system, SVI(12)) a trajectory takes 0.7 of the time, with 288 or 512 (SVI(16); chain of 64 masses,
+SVI(8)) there is no gain: the vectors exceed the cache.
+"""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExampleArrays:
+    """Arrays of an example run whose sizes are known at run time, which ``main.c`` reads from text files.
+
+    Attributes:
+        count: number of coordinates.
+        sizes: by name.
+        fields: number of entries by file.
+        tables: number of entries, and limits of the indices in each column, by file.
+        moving: file of the initial momenta or velocities, "p" or "velocity", or nothing for a start from rest.
+    """
+
+    count: int
+    sizes: dict[str, int]
+    fields: dict[str, int]
+    tables: dict[str, tuple[int, list[int]]]
+    moving: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExampleRun:
+    """Run of the generated ``main.c``: initial state, step, and output interval.
+
+    Attributes:
+        h: step size, ``None`` for adaptive steps.
+        span: of time.
+        tolerance: of adaptive steps; with a time transformation the step tau.
+        max_step, first_step: largest and first size of adaptive steps, or ``None``.
+        absolute_tolerances: (m,) of adaptive steps; none if all are 0.
+        controlled: whether the integrator has adaptive steps or a time transformation.
+        save_every, outputs: steps to an output and number of outputs.
+        last: steps to the last output.
+        to_end: whether it continues to the end of the span, in a number of steps of tau that is not known before.
+        inputs: of a system that has any, if they are set; ``parameters`` has their values at the start.
+        end: of a run with inputs.
+        arrays: of a system whose array sizes are known at run time; ``outputs`` is then the number of steps.
+        events: of the run, also of its source.
+    """
+
+    q: tuple[float, ...]
+    p: tuple[float, ...]
+    parameters: tuple[float, ...]
+    t: float
+    h: float | None
+    span: float
+    tolerance: float
+    max_step: float | None = None
+    first_step: float | None = None
+    absolute_tolerances: tuple[float, ...] = ()
+    controlled: bool
+    save_every: int
+    outputs: int
+    last: int = 0
+    to_end: bool = False
+    inputs: tuple[ExampleInput, ...] = ()
+    end: float = 0.0
+    arrays: ExampleArrays | None = None
+    events: tuple[Any, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EventSearch:
+    """Data of the search for zeros of functions of the state.
+
+    Attributes:
+        prefix, dimension: of the integrator; 0 for arrays of run-time sizes.
+        transformed: whether time is, so that the integrator's velocities are dq/dtau.
+        constrained: whether states satisfy constraints, also after changes.
+        nodes: (d + 1,) fractions of a part of a step at which they are evaluated.
+        coefficients: (d + 1, d + 1) from values there to coefficients of powers of x in [-1, 1].
+        doubts: factors of the last two coefficients in the error estimate.
+        timed: for each event 1 if its function is one of time alone, 2 if it is affine, else 0.
+        guarded: index of the function of each condition of crossings; of arrays of run-time sizes of its event.
+        impacts: 1 for each event that is the wall of an impact, else 0.
+        conditional: 1 for each event with conditions, else 0.
+        controlled: whether the integrator has adaptive steps.
+        kernels: the functions at u = (q, p, v); conditions; values of variables that crossings change, gradient and
+            restitution of impacts. Of arrays of run-time sizes those of their functions.
+        uses_velocity: whether v occurs in the formulas.
+        changed: index among (q, p, v) of the variable of each value of the changes.
+        first_values: index of the first value of each function, and the number of values.
+        elements: number of functions of each event at known sizes, one for each element of its loops.
+        arrays: :class:`~scvi_codegen.codegen.rendering.events.ArrayEvents` at run-time sizes, without kernels of all
+            functions.
+    """
+
+    prefix: str
+    dimension: int
+    transformed: bool
+    constrained: bool
+    nodes: tuple[float, ...]
+    coefficients: tuple[tuple[float, ...], ...]
+    doubts: tuple[float, float]
+    timed: tuple[int, ...] = ()
+    guarded: tuple[int, ...]
+    impacts: tuple[int, ...]
+    conditional: tuple[int, ...]
+    controlled: bool
+    kernels: tuple[Kernel, ...] = ()
+    uses_velocity: bool = False
+    changed: tuple[int, ...] = ()
+    first_values: tuple[int, ...] = ()
+    elements: tuple[int, ...] = ()
+    arrays: Any = None
+
+    @property
+    def first_functions(self) -> list[int]:
+        """Index of the first function of each event, and the number of functions."""
+        return [0, *accumulate(self.elements)]
+
+    @property
+    def event_of_function(self) -> list[int]:
+        """Index of the event of each function."""
+        return [event for event, count in enumerate(self.elements) for _ in range(count)]
+
+
+def render(program: Program, control: Control | None = None, *, fallback: Fallback | None = None) -> Source:
+    """Return header and source of a program; with control, with adaptive steps. Equal programs give equal bytes.
+
+    If the fixed-point iteration fails, Newton's method is the fallback if the program has it, unless another is named.
+    """
+    if program.of_arrays:
+        return _render(program.prefix, loop_context(program) | _control_context(program, control), "arrays")
+    return _render(program.prefix, _context(program, DOUBLE, control, fallback))
+
+
+def render_derivatives(derivatives: Derivatives) -> Source:
+    """Return the source of a program solved by Newton's method, with the derivative of steps and its transpose."""
+    program = derivatives.program
+    context = _context(program, DOUBLE, None, kernels=(*program.kernels, *derivatives.kernels), beside=derivatives)
+    return _render(program.prefix, context | {"derivatives": derivatives, "unrolled_equations": None})
+
+
+def render_double_double(
+    program: Program, derivatives: PointDerivatives | None, control: Control | None = None
+) -> Source:
+    """Return the source of a program in double-double arithmetic; control as of :func:`render`.
+
+    Args:
+        program: with a fixed-point iteration of separable systems, or with Newton's method, also as the fallback of
+            another iteration.
+        derivatives: at the points of a fixed-point iteration, which correct it to two words.
+
+    Raises:
+        MethodError: for a function that has no double-double form.
+    """
+    fixed_point = program.fixed_point
+    if in_pairs(program):
+        return _render_explicit(program)
+    if program.newton:
+        return _render_mixed_newton(program, derivatives, control)
+    assert fixed_point is not None  # by the caller
+    assert derivatives is not None
+    mass = fixed_point.constant_mass
+    assert mass is not None  # of separable systems
+    program = _in_three_words(program)
+    quantities, lanes = program.quantities, (derivatives.partials, derivatives.products[0])
+    states = (quantities.energy, *((quantities.momentum_kernel,) if quantities.momentum_kernel else ()))
+    numbers, vectors = (mass, *states), derivatives.in_pairs
+    context = _context(program, DOUBLE, control)
+    context |= {
+        **_lane_context(program, lanes, changes=False),
+        "cut": context["cut"] or is_divided(lanes),
+        "two_words": {
+            "derivatives": derivatives.count,
+            "anchor": _anchor(program),
+            "of_numbers": numbers,
+            "of_vectors": vectors,
+            "meaning": POINTS,
+            "functions": uses_functions((*numbers, *vectors)),
+        },
+        "own_headers": {**arithmetic_headers(), **cast("Mapping[str, str]", context["own_headers"])},
+    }
+    return _render(program.prefix, context)
+
+
+def _in_three_words(program: Program) -> Program:
+    """Return a program of a separable iteration whose tables have the low words that steps in pairs use."""
+    fixed_point = program.fixed_point
+    assert fixed_point is not None  # by the caller
+    tables = [replace(each, in_two_parts=not each.is_matrix or each.in_two_parts) for each in fixed_point.own_tables]
+    tables += [_lowest_words(each) for each in tables if each.name in OF_THREE_WORDS]
+    return replace(program, fixed_point=replace(fixed_point, own_tables=tuple(tables), linear_part=None))
+
+
+def _anchor(program: Program) -> float:
+    """Return three times the largest sum of the absolute values of a row of the tables of the forces."""
+    fixed_point = program.fixed_point
+    assert fixed_point is not None  # by the caller
+    rows = (row for name in OF_THREE_WORDS[1:] for row in fixed_point.numbers(name))
+    return 3 * max(float(sum(map(abs, row))) for row in rows)
+
+
+def _lowest_words(table: IterationTable) -> IterationTable:
+    """Return the table of what two words of each number leave."""
+
+    def lowest(x: Number) -> Number:
+        return DOUBLE.rest(DOUBLE.rest(x))
+
+    numbers: Any = tuple(tuple(map(lowest, x)) if isinstance(x, tuple) else lowest(x) for x in table.numbers)
+    return replace(table, name=f"{table.name}_LOWEST", numbers=numbers, in_two_parts=False)
+
+
+def in_pairs(program: Program) -> bool:
+    """Return whether double-double steps are explicit: kicks by forces of position and time, drifts by masses."""
+    return program.splitting is not None and program.splitting.by_masses
+
+
+def _render_explicit(program: Program) -> Source:
+    """Return the source of explicit steps in pairs."""
+    quantities, split = program.quantities, program.splitting
+    assert split is not None  # by the caller
+    states = quantities.energy, *((quantities.momentum_kernel,) if quantities.momentum_kernel else ())
+    kernels = split.drift, split.force, *states
+    context = _context(program, DOUBLE, None)
+    words = {"derivatives": 0, "of_numbers": kernels, "of_vectors": (), "functions": uses_functions(kernels)}
+    memory = 4 * program.dimension + 1  # inverse masses, last force
+    sizes = {"memory": memory, "workspace": workspace_size(program) + memory - program.memory}
+    return _render(program.prefix, context | sizes | {"two_words": words, "own_headers": arithmetic_headers()})
+
+
+def render_ensemble_in_pairs(program: Program, derivatives: PointDerivatives | None) -> Source | None:
+    """Return the source of steps in pairs of many trajectories, which are lanes.
+
+    ``None`` for steps by Newton's method, and for many values at the points of a step.
+
+    Args:
+        program: with explicit steps, or with a fixed-point iteration of separable systems.
+        derivatives: as of :func:`render_double_double`.
+    """
+    split, fixed_point = program.splitting, program.fixed_point
+    kernels, beside, own = tuple[Kernel, ...](), tuple[Kernel, ...](), dict[str, object]()
+    if split is not None and in_pairs(program):
+        kernels = split.drift, split.force
+        own = {"points": 2, "fixed_point": None}  # points: words of the stored force
+    elif fixed_point and derivatives and program.dimension * fixed_point.points <= LARGEST_IN_LANES:
+        program, mass = _in_three_words(program), fixed_point.constant_mass
+        assert mass is not None  # of separable systems
+        kernels, beside = (mass, *fixed_point.kernels), (derivatives.partials, derivatives.products[0])
+        iteration = cast(FixedPointIteration, program.fixed_point)
+        source = iteration_source(iteration, TRAJECTORIES, kernels=(*fixed_point.kernels, *beside))
+        own = {"points": fixed_point.points, "fixed_point": source}
+    else:
+        return None
+    context = own | {
+        "program": program,
+        "observed": 0,
+        "counts": False,
+        "tangents": 0,
+        "cut": is_divided((*kernels, *beside)),
+        "needs_velocities": False,
+        "hot": "static",
+        "two_words": {
+            **({"derivatives": derivatives.count, "anchor": _anchor(program)} if derivatives else {}),
+            "of_numbers": (),
+            "of_vectors": kernels,
+            "meaning": TRAJECTORIES,
+            "functions": uses_functions(kernels),
+        },
+        "own_headers": arithmetic_headers(),
+    }
+    return _render(f"{program.prefix}_ensemble", context, "ensemble")
+
+
+def _render_mixed_newton(program: Program, correction: PointDerivatives | None, control: Control | None) -> Source:
+    """Return the source of a program with Newton's method, whose solution is corrected in pairs.
+
+    With a correction, of the fixed-point iteration that Newton's method is the fallback of.
+    """
+    quantities, constraints = program.quantities, program.constraints
+    of_states = (
+        *(group.value for group in program.equations.stage_groups),
+        *(quantities.energy, quantities.inverse_legendre, quantities.momentum_kernel),
+        *(quantities.first_order_rates, program.damping),
+        quantities.integrals and quantities.integrals.kernel,
+        constraints and constraints.motion,
+    )
+    with_partials = quantities.legendre, constraints and constraints.kernel
+    kernels = (
+        *(kernel for kernel in of_states if kernel),
+        *(replace(kernel, values=len(kernel.results)) for kernel in with_partials if kernel),
+    )
+    rattle, vectors = program.rattle, tuple[Kernel, ...]()
+    plain = not (program.damping or quantities.integrals)
+    if rattle and constraints and rattle.points > 1 and plain and _of_forces_alone(rattle):
+        kernels = *kernels, *rattle.kernels
+        of_points = *rattle.kernels, replace(constraints.kernel, values=len(constraints.kernel.results))
+        vectors = tuple(replace(each, name=f"{each.name}_of_points") for each in of_points)
+    in_pairs, lanes = vectors != (), tuple[Kernel, ...]()
+    if correction and program.fixed_point:
+        own = tuple(replace(each, in_two_parts=True) for each in program.fixed_point.own_tables)
+        program = replace(program, fixed_point=replace(program.fixed_point, own_tables=own))
+        vectors, lanes = correction.in_pairs, (correction.partials, correction.products[0])
+    context = _context(program, DOUBLE, control)
+    context |= {
+        **_lane_context(program, lanes, changes=False),
+        "cut": context["cut"] or is_divided(lanes),
+        "unrolled_equations": None,
+        "rattle_in_pairs": in_pairs,
+        "two_words": {
+            "derivatives": correction.count if correction else 0,
+            "of_numbers": kernels,
+            "of_vectors": vectors,
+            "meaning": POINTS,
+            "functions": bool(program.damping) or uses_functions((*kernels, *vectors)),
+        },
+        "own_headers": {**arithmetic_headers(), **cast("Mapping[str, str]", context["own_headers"])},
+    }
+    return _render(program.prefix, context)
+
+
+def _of_forces_alone(rattle: Rattle) -> bool:
+    """Return whether masses are constant, and forces and momenta do not depend on velocities and positions."""
+    return rattle.part == "rattle" and not rattle.macros
+
+
+def render_embedded(program: Program, precision: Embedded, control: Control | None = None) -> Source:
+    """Return the source for a microcontroller: one file, bounded iterations, scalars of its registers.
+
+    Raises:
+        MethodError: for a number outside the range of single precision.
+    """
+    target = TARGETS[precision]
+    target.check((*program.layout.defaults, *chain(*map(constants, _scalar_kernels(program, control)))))
+    bound = f"{program.prefix.upper()}_MAX_ITERATIONS"
+    bounded = {"embedded": True, "longest": MAX_ITERATIONS, "max_iterations": bound, "most_iterations": bound}
+    return _render(program.prefix, _context(program, target, control) | bounded).single_file()
+
+
+def _render(prefix: str, context: Mapping[str, object], entry: str = "stepper") -> Source:
+    """Return the source of entry templates from their context, with defaults for all of them."""
+    common = {
+        "prefix": prefix,
+        "target": DOUBLE,
+        "real": DOUBLE.scalar,
+        "max_iterations": MAX_ITERATIONS,
+        "on_device": False,
+    }
+    environment, context = template_environment(), {**common, "two_words": None, "rattle_in_pairs": False, **context}
+    header = entry if entry in DECLARATIONS else "stepper"
+    code = environment.get_template(f"{entry}.c.jinja").render(context)
+    headers = cast("Mapping[str, str]", context.get("own_headers", {}))
+    return Source(
+        prefix=prefix,
+        header=environment.get_template(f"{header}.h.jinja").render(context),
+        code=code,
+        declarations=environment.get_template(DECLARATIONS[header]).render(context),
+        support=included(code, lambda name: headers.get(name) or support_text(name)),
+    )
+
+
+def _control_context(program: Program, control: Control | None) -> dict[str, object]:
+    """Return the template's context for adaptive steps; the predictor tables are a separate header."""
+    name = f"support/{program.prefix}_predictor.h"
+    if not (control and control.predictor and program.fixed_point):
+        return {"control": control, "own_headers": {}}
+    text, tables = predictor_text(control.predictor), control.growth.tables if control.growth else ()
+    growth_tables = [lane_table(each.name, each.numbers) for each in tables]
+    return {"control": control, "own_headers": {name: text}, "growth_tables": growth_tables}
+
+
+def render_ensemble(
+    program: Program, observed: Kernel | None = None, *, counts: bool = False, tangents: int = 0
+) -> Source | None:
+    """Return source that integrates many trajectories at once, one per lane, by fixed-point iteration or explicitly.
+
+    ``None`` for other steps, for rigid bodies turned in closed form, and with integrals: with a time transformation,
+    trajectories have no common times.
+
+    Args:
+        program: the program.
+        observed: functions whose extremes are recorded.
+        counts: whether changes of their signs are counted instead.
+        tangents: number of tangent vectors among the coordinates.
+    """
+    fixed_point, split = program.fixed_point, program.splitting
+    if program.quantities.integrals:
+        return None
+    if split is not None and not split.bodies:
+        kernels, points, source = split.kernels, 1, splitting_source(split, observed)
+    elif fixed_point is not None and fixed_point.serves_many:
+        kernels, points = fixed_point.kernels, len(fixed_point.guess.abscissae)
+        source = iteration_source(fixed_point, TRAJECTORIES, kernels=(*kernels, *((observed,) if observed else ())))
+    else:
+        return None
+    prefix = f"{program.prefix}_ensemble"
+    context = {
+        "program": program,
+        "points": points,
+        "observed": observed.values if observed else 0,
+        "counts": counts,
+        "tangents": tangents,
+        "cut": is_divided((*kernels, *((observed,) if observed else ()))),
+        "needs_velocities": fixed_point is not None and fixed_point.kept is StoredValues.VELOCITIES,
+        "hot": "static",
+        "fixed_point": source,
+    }
+    return _render(prefix, context, "ensemble")
+
+
+def render_points(program: Program) -> Source | None:
+    """Return source of fixed steps whose points are threads of a GPU; ``None`` unless there are 8, and forces alone."""
+    fixed_point = program.fixed_point
+    if not fixed_point or fixed_point.name != "separable" or fixed_point.lanes != POINT_THREADS:
+        return None
+    if program.quantities.integrals:
+        return None
+    program = replace(program, prefix=f"{program.prefix}_points", fixed_point=replace(fixed_point, linear_part=None))
+    context = _context(program, DOUBLE, None, "none")
+    text = cast(IterationSource, context["fixed_point"])
+    tables = tuple(map(_at_own_point, text.tables))
+    own = program.memory // POINT_THREADS
+    sizes = {"memory": own, "workspace": workspace_size(program) - program.memory + own}
+    return _render(
+        program.prefix, {**context, **sizes, "fixed_point": replace(text, tables=tables), "on_device": "points"}
+    )
+
+
+def _at_own_point(table: str) -> str:
+    """Return a table of vectors over points as one of numbers, which begins at the point of the thread."""
+    size = "[POINTS * POINTS]" if "[POINTS * GROUPS]" in table else "[POINTS]"
+    head, name, rest = re.split(r"lanes (\w+)\[[^]]*\]", table, maxsplit=1)
+    return f"{head}double {name}_OF_POINTS{size}{rest}\n#define {name} ({name}_OF_POINTS + OWN_POINT)"
+
+
+def render_thread(program: Program, control: Control | None) -> Source | None:
+    """Return source of adaptive steps in threads of a GPU; ``None`` unless they are by fixed-point iteration."""
+    fixed_point = program.fixed_point
+    if not (control and control.predictor and fixed_point and fixed_point.in_groups) or program.quantities.integrals:
+        return None
+    program = replace(program, prefix=f"{program.prefix}_thread", fixed_point=replace(fixed_point, linear_part=None))
+    context = _context(program, DOUBLE, replace(control, growth=None), "none")
+    return _render(program.prefix, {**context, "on_device": True})
+
+
+def render_events(search: EventSearch) -> Source:
+    """Return header and source of the search for events."""
+    context = {
+        "search": search,
+        "prefix": search.prefix,
+        "cut": is_divided(search.kernels),
+        "inverse_roots": inverse_roots(search.kernels),
+    }
+    return _render(f"{search.prefix}_events", context, "events")
+
+
+def render_example(interface: Interface, start: ExampleRun, precision: Embedded = "double") -> dict[str, str]:
+    """Return ``main.c`` and ``Makefile`` that run the integrator with nothing but a C compiler."""
+    target = TARGETS[precision]
+    target.check((*start.q, *start.p, *start.parameters, start.t, start.h or start.span))
+    for each in start.inputs:
+        target.check((*each.breakpoints, *chain(*each.coefficients)))
+    context = {
+        "interface": interface,
+        "prefix": interface.prefix,
+        "start": start,
+        "distances": (ROUNDING_UNITS, INPUT_PRECISION, LARGEST_VIOLATION),
+        "target": target,
+        "real": target.scalar,
+        "threads": start.arrays is not None,
+    }
+    environment = template_environment()
+    return {name: environment.get_template(f"{name}.jinja").render(context) for name in ("main.c", "Makefile")}
+
+
+def workspace_size(program: Program) -> int:
+    """Return the doubles of workspace: scratch, memory; unknowns, rows, update, pivots, Jacobian, point of Newton.
+
+    Without Newton's method one instead, for the result of a fallback.
+    """
+    if not program.newton:
+        return scratch_size(program) + program.memory + 1
+    rows = program.equations.unknowns + program.equations.sites
+    newton = program.equations.unknowns + program.point + 3 * rows + jacobian_size(program)
+    return scratch_size(program) + program.memory + newton
+
+
+def jacobian_size(program: Program) -> int:
+    """Return the doubles of Newton's factors, with p0 as a further unknown for a step between positions."""
+    return program.matrix_size(program.equations.sites, program.equations.blocks + program.between)
+
+
+def scratch_size(program: Program) -> int:
+    """Return the doubles for kernels: of one stage group, of the mass matrix, or of the constraints.
+
+    These are the mass matrix with its derivatives, and a saddle point matrix with its pivots and a right-hand side.
+    """
+    sites, matrix_size = program.equations.sites, program.matrix_size
+    mass = matrix_size(program.dimension, 1) + len(program.quantities.mass_entries)
+    saddle = matrix_size(sites, 1) + 2 * sites if program.constraints else 0
+    return max(mass, saddle, *(group.scratch for group in program.equations.stage_groups)) if program.newton else mass
+
+
+def _context(
+    program: Program,
+    target: Target,
+    control: Control | None,
+    fallback: Fallback | None = None,
+    *,
+    kernels: Sequence[Kernel] | None = None,
+    beside: Derivatives | None = None,
+) -> dict[str, object]:
+    kernels = program.kernels if kernels is None else kernels
+    fallback, scalars = fallback or ("own" if program.newton else "none"), _scalar_kernels(program, control, kernels)
+    growth = control.growth if control else None
+    lanes = beside.lane_kernels if beside else growth.kernels if growth else ()
+    return {
+        "program": program,
+        "target": target,
+        "real": target.scalar,
+        "kernels": kernels,
+        "cut": is_divided((*scalars, *(program.fixed_point.kernels if program.fixed_point else ()), *lanes)),
+        "inverse_roots": inverse_roots(scalars),
+        "memory": program.memory,
+        "workspace": workspace_size(program) + (fallback == "external"),
+        "scratch": scratch_size(program) + (fallback == "external"),
+        "jacobian": jacobian_size(program),
+        "most_iterations": "INT_MAX",
+        "embedded": False,
+        "derivatives": None,
+        "unrolled_equations": unrolled_equations(program, target),
+        "vector_functions": loop_functions(_kernels_of_points(program)),
+        "fallback": fallback,
+        **_control_context(program, control),
+        **_lane_context(program, lanes, changes=beside is not None and bool(lanes)),
+    }
+
+
+def _kernels_of_points(program: Program) -> tuple[Kernel, ...]:
+    """Return the kernels that are evaluated in loops over the points of a constrained step."""
+    rattle, constraints = program.rattle, program.constraints
+    return (*rattle.kernels, constraints.kernel) if rattle and constraints and rattle.lanes > 1 else ()
+
+
+def _scalar_kernels(
+    program: Program, control: Control | None, kernels: Sequence[Kernel] | None = None
+) -> tuple[Kernel, ...]:
+    kernels_of_step = program.kernels if kernels is None else kernels
+    splitting = program.splitting.kernels if program.splitting else ()
+    return (*kernels_of_step, *splitting, *((control.density,) if control and control.density else ()))
+
+
+def _lane_context(program: Program, beside: Sequence[Kernel], *, changes: bool) -> dict[str, object]:
+    """Return the template's context for the fixed-point iteration.
+
+    Args:
+        program: the program.
+        beside: kernels of its derivative.
+        changes: whether tangent and adjoint vectors are propagated, too.
+    """
+    fixed_point = program.fixed_point
+    hot_kernels = (fixed_point or program.splitting or program).kernels
+    operations = sum(sum(kernel.operation_counts().values()) for kernel in hot_kernels)
+    if fixed_point is None:
+        return {"fixed_point": None, "hot": "static inline" if operations <= LARGEST_INLINED else "static"}
+    hot = "static inline __attribute__((always_inline))" if operations <= LARGEST_INLINED else "static"
+    kernels = (*fixed_point.kernels, *beside)
+    text = iteration_source(fixed_point, POINTS, kernels=kernels, changes=changes)
+    return {"fixed_point": text, "hot": hot}
+
+
+def with_fmu(
+    source: Source,
+    interface: Interface,
+    start: ExampleRun,
+    *,
+    by_velocity: bool,
+    input_indices: Sequence[int],
+    token: str,
+    events: Sequence[tuple[int, int, int]] = (),
+) -> Source:
+    """Return the source of an integrator with the functions of FMI.
+
+    Args:
+        source, interface: of the integrator.
+        start: initial state, with velocities instead of p if ``by_velocity``; parameters, time, and the step size.
+        by_velocity: whether initial velocities are set instead of momenta.
+        input_indices: index of the first parameter of each input.
+        token: instantiation token of the model description.
+        events: of the source, which change the state: direction, number of the crossing that ends the simulation, and
+            1 if its crossings change the state.
+    """
+    context = {
+        "events": events,
+        "interface": interface,
+        "prefix": interface.prefix,
+        "start": start,
+        "by_velocity": by_velocity,
+        "places": input_indices,
+        "token": token,
+        "target": DOUBLE,
+    }
+    environment = template_environment()
+    code = environment.get_template("fmu.c.jinja").render(context)
+    beside = Source(
+        prefix=f"{interface.prefix}_fmu",
+        header=environment.get_template("fmu.h.jinja").render(context),
+        code=code,
+        declarations="",
+        support=included(code, support_text),
+    )
+    return replace(source, beside=replace(beside, beside=source.beside))
+
+
+XLA_PARTS = ("states", "jvp", "vjp")
+"""XLA handlers: states, tangent vectors of states (JVP), gradients with respect to inputs (VJP)."""
+XLA_SECOND_ORDER = "vjp_derivative"
+"""XLA handler of derivatives of gradients."""
+
+
+def with_xla_flow(derivatives: Source, version: str, *, second: bool = False) -> Source:
+    """Return a source with the XLA custom calls ``<prefix>_xla_states``, ``_jvp``, ``_vjp``.
+
+    Args:
+        derivatives: a source with derivatives of steps.
+        version: of the library whose ``xla/ffi/api/c_api.h`` it is compiled with; a source is specific to one version.
+        second: whether to add second derivatives, ``_curvature``, which the source must have.
+    """
+    parts = (*XLA_PARTS, *([XLA_SECOND_ORDER] if second else ()))
+    handlers = "".join(f"void *{derivatives.prefix}_xla_{part}(void *frame);\n" for part in parts)
+    headers = ("flow", "xla_flow")
+    return _behind(derivatives, f"\n/* For jaxlib {version}. */\n", headers, handlers, second=second)
+
+
+def with_flow_of_rows(derivatives: Source, *, second: bool = False) -> Source:
+    """Return a source with the flow of many rows, ``<prefix>_flow_rows``.
+
+    Args:
+        derivatives: a source with derivatives of steps.
+        second: whether to add second derivatives, ``<prefix>_hessian_rows``, which the source must have.
+    """
+    prefix = derivatives.prefix
+    shape = "long long steps, long long every, int count, long long rows"
+    rest = f"double *found, {prefix}_report *report"
+    declared = f"int {prefix}_flow_rows(int part, {shape}, const double *x, const double *given, {rest});\n"
+    if second:
+        declared += f"int {prefix}_hessian_rows({shape}, const double *x, "
+        declared += f"const double *partials, const double *changes, {rest});\n"
+    return _behind(derivatives, "\n#define FLOW_OF_ROWS\n", ("flow",), declared, second=second)
+
+
+def casadi_name(prefix: str) -> str:
+    """Return the name of the function that CasADi looks up in a library."""
+    return f"{prefix}_flow"
+
+
+def with_casadi_flow(derivatives: Source, steps: int, save_every: int, *, second: bool = False) -> Source:
+    """Return a source with the flow of ``steps`` steps and its derivatives, by CasADi's naming convention.
+
+    Args:
+        derivatives: a source with derivatives of steps.
+        steps: number of steps; save_every: steps between stored states.
+        second: whether to add the Jacobian of the adjoint, from second derivatives that the source must have.
+    """
+    name = casadi_name(derivatives.prefix)
+    fixed = f"\nenum {{\n  FLOW_STEPS = {steps},\n  FLOW_EVERY = {save_every}\n}};\n\n"
+    headers = ("flow", "casadi_flow")
+    return _behind(
+        derivatives, f"{fixed}#define EXTERNAL(before, after) before##{name}##after\n\n", headers, "", second=second
+    )
+
+
+def _behind(source: Source, text: str, headers: Sequence[str], declarations: str, *, second: bool) -> Source:
+    tail = (
+        text
+        + "#define SECOND_DERIVATIVES\n" * second
+        + "".join(f'#include "support/frameworks/{header}.h"\n' for header in headers)
+    )
+    texts = dict(source.support)
+    code = source.code + tail
+    return replace(
+        source,
+        code=code,
+        declarations=source.declarations + declarations,
+        support=included(code, lambda name: texts.get(name) or support_text(name)),
+    )

@@ -1,0 +1,404 @@
+"""C source of an integrator, and the interface that is needed to call it.
+
+An integrator is one header and one source file, ``<prefix>.h`` and ``<prefix>.c``. The latter includes support headers,
+plain C that is the same for every integrator, from a folder ``support``; amalgamated, it contains them.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from scvi_codegen.codegen.rendering.text import preprocessed, specialised, with_own_names
+from scvi_codegen.systems.formulas.indices import Access, ArrayDeclarations, ArrayMap, Loop
+from scvi_codegen.version import __version__
+
+TEXTS = ("header", "code", "declarations")
+PREFIX = re.compile(r"[A-Za-z_]\w*", re.ASCII)
+SUPPORT = re.compile(r"support/(?:\w+/)?\w+\.h", re.ASCII)
+"""Names of files, which are written into a folder and must not lead out of it."""
+KINDS: dict[str, Callable[[Any], bool]] = {
+    "str": lambda value: isinstance(value, str),
+    "int": lambda value: type(value) is int and 0 <= value < 2**40,
+    "bool": lambda value: isinstance(value, bool),
+    "tuple[str, ...]": lambda value: isinstance(value, tuple) and all(isinstance(each, str) for each in value),
+    "tuple[bool, ...]": lambda value: isinstance(value, tuple) and all(isinstance(each, bool) for each in value),
+    "tuple[float, ...]": lambda value: isinstance(value, tuple) and all(map(_is_number, value)),
+    "tuple[tuple[str, ...], ...]": lambda value: isinstance(value, tuple) and all(map(KINDS["tuple[str, ...]"], value)),
+    "ArrayLayout": lambda value: False,
+}
+"""Checks of values read from JSON against the annotations of :class:`Interface`."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Source:
+    """C source of an integrator.
+
+    Attributes:
+        prefix: of every exported C name.
+        header, code: contents of ``<prefix>.h`` and ``<prefix>.c``.
+        declarations: the header's inner part.
+        support: names and contents of the headers that the code includes, in order.
+        beside: a further header and source that call this one: the search for zero crossings, or FMI.
+    """
+
+    prefix: str
+    header: str
+    code: str
+    declarations: str
+    support: tuple[tuple[str, str], ...] = ()
+    beside: Source | None = None
+
+    @property
+    def files(self) -> dict[str, str]:
+        """File contents by file name, ``/`` between folders."""
+        files = {f"{self.prefix}.h": self.header, f"{self.prefix}.c": self.code, **dict(self.support)}
+        return files | (self.beside.files if self.beside else {})
+
+    @property
+    def workspace(self) -> int:
+        """Doubles of workspace per call, 0 for arrays of run-time sizes."""
+        found = re.search(r"_WORKSPACE (\d+)$", self.header, re.MULTILINE)
+        return int(found[1]) if found else 0
+
+    def write(self, folder: Path) -> None:
+        """Write all files into a folder."""
+        for name, text in self.files.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_text(text, encoding="utf-8")
+
+    @property
+    def sources(self) -> tuple[Source, ...]:
+        """Sources to compile: this one, and those of :attr:`beside`."""
+        return (self, *self.beside.sources) if self.beside else (self,)
+
+    def specialised(self) -> Source:
+        """Return the source with support headers for it alone, without alternatives that it does not use."""
+        return replace(self, support=tuple(specialised(self.code, dict(self.support).__getitem__).items()))
+
+    def amalgamated(self) -> Source:
+        """Return the source as one file: support headers inserted, without alternatives that it does not use."""
+        code, _ = preprocessed(self.code, dict(self.support).__getitem__)
+        beside = self.beside.amalgamated() if self.beside else None
+        return replace(self, code=code, support=(), beside=beside)
+
+    def single_file(self) -> Source:
+        """Return the source as one file whose names have the integrator's prefix.
+
+        Files of several integrators can be included in one translation unit.
+        """
+        code = with_own_names(self.amalgamated().code, self.prefix, self.header)
+        return replace(self, code=code, support=(), beside=self.beside.single_file() if self.beside else None)
+
+    def to_record(self) -> dict[str, Any]:
+        """Return plain data, contents line by line, for :meth:`from_record`."""
+        return {
+            "prefix": self.prefix,
+            **{name: getattr(self, name).split("\n") for name in TEXTS},
+            "support": {name: text.split("\n") for name, text in self.support},
+            "beside": self.beside.to_record() if self.beside else None,
+        }
+
+    @classmethod
+    def from_record(cls, record: Mapping[str, Any]) -> Source:
+        """Return the source from :meth:`to_record`, also of version 0.1, which has no support headers.
+
+        Raises:
+            ValueError: for invalid names of files, and contents that are not lists of lines.
+        """
+        names = record["prefix"], *record.get("support", {})
+        for name, pattern in zip(names, (PREFIX, *[SUPPORT] * len(names)), strict=False):
+            if not (isinstance(name, str) and pattern.fullmatch(name)):
+                raise ValueError(
+                    f"{name!r} is not the name of a file of an integrator: it must be a C identifier, or support/NAME.h"
+                )
+        beside = record.get("beside")
+        return cls(
+            prefix=record["prefix"],
+            **{name: "\n".join(record[name]) for name in TEXTS},
+            support=tuple((name, "\n".join(lines)) for name, lines in record.get("support", {}).items()),
+            beside=cls.from_record(beside) if beside else None,
+        )
+
+    def to_json(self) -> str:
+        """Return text for :meth:`from_json`."""
+        return json.dumps(self.to_record())
+
+    @classmethod
+    def from_json(cls, text: str) -> Source:
+        """Return the source from :meth:`to_json`."""
+        return cls.from_record(json.loads(text))
+
+
+DOUBLE_DOUBLE = "double-double"
+"""Precision of states of two words, 31 digits."""
+AUTO = "auto"
+"""Precision of runs with ``error=``: double where it suffices, else double-double."""
+PRECISIONS = ("double", DOUBLE_DOUBLE, AUTO)
+POINT_THREADS = 8
+"""Threads of a GPU that share a trajectory with many coordinates, one for each point of a step."""
+COMPONENTS = {"rotation": 4, "direction": 3, "spin": 2}
+"""Number of homogeneous coordinates by kind."""
+NUMBER = re.compile(r"\d+(\.\d*)?", re.ASCII)
+NAME_IN_FORMULA = re.compile(r"(?<![\w.])[A-Za-z_]\w*(?!\w*\()")
+"""Names in formulas but those of functions."""
+DECLARED = re.compile(r"rotation [A-Za-z]\w* [A-Za-z]\w*( momentum)?|(direction|spin) [A-Za-z]\w*", re.ASCII)
+
+
+def _as_tuples(value: Any) -> Any:
+    """Return a value of JSON with tuples in place of lists, and of lists in them."""
+    return (
+        tuple(tuple(each) if isinstance(each, list) else each for each in value) if isinstance(value, list) else value
+    )
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def check_interface(source: Source, interface: Interface) -> None:
+    """Raise :class:`ValueError` if an interface has other sizes than the C source, which determine those of arrays."""
+    sizes = {
+        "COORDINATES": interface.dimension,
+        "PARAMETERS": len(interface.parameters),
+        "UNKNOWNS": interface.unknowns,
+        "WORKSPACE": interface.workspace,
+    }
+    for name, size in sizes.items():
+        _compare(name, size, re.search(rf"^#define {source.prefix.upper()}_{name} (\d+)$", source.header, re.MULTILINE))
+    for name, size in {"MAPS": len(interface.map_names), "CONSTRAINTS": len(interface.constraints)}.items():
+        _compare(name, size, re.search(rf"^  (?:\w+_)?{name} = (\d+),", source.code, re.MULTILINE))
+    sums = re.search(r"^  (?:\w+_)?SUMS = (\d+),", source.code, re.MULTILINE)
+    if interface.exchange_names and sums:
+        _compare("SUMS", len(interface.exchange_names) + 1, sums)
+    lengths: dict[str, tuple[object, object]] = {"prefix": (interface.prefix, source.prefix)}
+    lengths["defaults"] = (len(interface.defaults), len(interface.parameters))
+    lengths["momentum_names"] = (len(interface.momentum_names), interface.dimension if interface.momentum_names else 0)
+    lengths["map_formulas"] = (len(interface.map_formulas), len(interface.map_names))
+    for name, (length, wanted) in lengths.items():
+        if length != wanted:
+            raise ValueError(f"{name}: the interface has {length}; {wanted} is required")
+    _check_lengths(interface)
+    _check_names(source, interface)
+
+
+def _check_lengths(interface: Interface) -> None:
+    """Raise :class:`ValueError` if the lengths of neighbours are not those of lists with a cutoff, in parameters."""
+    with_cutoff: set[str] = set()
+    for each in interface.lengths:
+        with_cutoff |= {each[0]} if each[1:2] == ("cutoff",) else set()
+        if len(each) != 3 or each[0] not in with_cutoff or each[1] not in ("cutoff", "skin", "box"):
+            raise ValueError(f"lengths: {each!r} must be neighbours, cutoff, skin or box, and a formula, cutoffs first")
+        unknown = {*NAME_IN_FORMULA.findall(each[2])} - {*interface.parameters, "pi"}
+        if unknown or not (NUMBER.fullmatch(each[2]) or re.search("[A-Za-z]", each[2])):
+            raise ValueError(f"lengths: {each[2]!r} must be a formula of the parameters {interface.parameters}")
+
+
+def _check_names(source: Source, interface: Interface) -> None:
+    """Raise :class:`ValueError` if names that others refer to are missing."""
+    first = {name[:-2] for name in interface.parameters if name.endswith("_0")}
+    if not set(interface.inputs) <= first:
+        raise ValueError(f"the inputs {interface.inputs} must each have a first parameter NAME_0")
+    parameter, functions = interface.energy_parameter, f"{source.prefix}_rates(" in source.header
+    if functions != bool(parameter) or not {parameter} <= {"", *interface.parameters}:
+        raise ValueError(f"energy_parameter: {parameter!r} must be a parameter of systems in transformed time")
+    if interface.variables and not len(interface.variables) == 2 * len(interface.momentum_names):
+        raise ValueError(f"variables: {interface.variables} must be the coordinates and momenta")
+
+
+def _compare(name: str, size: int, match: re.Match[str] | None) -> None:
+    wanted = int(match[1]) if match else 0
+    if size != wanted:
+        raise ValueError(f"{name} is {size} in the interface and {wanted} in the C source: they must be equal")
+
+
+class ExampleInput(NamedTuple):
+    """Input as a function of time: (n + 1,) breakpoints, and (n, 4) coefficients of powers of the time since."""
+
+    name: str
+    breakpoints: tuple[float, ...]
+    coefficients: tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ArrayLayout(ArrayDeclarations):
+    """Arrays of an integrator, whose sizes follow from those of a run.
+
+    Attributes:
+        field_defaults: fill values of fields that are not passed.
+        maps: momentum maps.
+        accesses: every array access, with the loops around it.
+        depends_on_time: whether L or H depends on t explicitly.
+        constraints: loops of each constraint.
+        continued: whether the predictor extrapolates previous steps instead of reusing the forces at their end.
+        momentum_formulas, velocity_formulas: L_v in (q, v) and H_p in (q, p) of a Lagrangian that is integrated by its
+            Hamiltonian (:class:`~scvi_codegen.systems.formulas.array_statements.ArrayForce`).
+        couplings: terms of the potential energy and forces, which couple the coordinates that occur in them.
+        symmetric: whether the linear part of a step is symmetric: without momenta and forces of velocities.
+        data: values of fields and tables by name for runs that pass none.
+        neighbours: names of the lists of neighbours.
+        mesh: of the fields of a density (:class:`~scvi_codegen.fields.mesh.Mesh`).
+        links: of a robot from a file.
+    """
+
+    field_defaults: tuple[float, ...] = ()
+    maps: tuple[ArrayMap, ...] = ()
+    accesses: tuple[tuple[Access, tuple[Loop, ...]], ...] = ()
+    depends_on_time: bool = False
+    constraints: tuple[tuple[Loop, ...], ...] = ()
+    continued: bool = False
+    momentum_formulas: tuple[Any, ...] = ()
+    velocity_formulas: tuple[Any, ...] = ()
+    couplings: tuple[Any, ...] = ()
+    symmetric: bool = True
+    data: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
+    neighbours: tuple[str, ...] = ()
+    mesh: Any = field(default=None, compare=False, repr=False)
+    links: tuple[Any, ...] = field(default=(), compare=False, repr=False)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Interface:
+    """Interface of a compiled integrator.
+
+    Attributes:
+        prefix: of every exported C name.
+        title: system and method, one line.
+        notes: order, symplecticity, symmetry as text.
+        system, method: their names.
+        coordinates, parameters: names in order.
+        defaults: default values of the parameters.
+        unknowns: length of the run's memory of its last stages.
+        workspace: doubles of workspace per call.
+        has_action: whether the method has a discrete Lagrangian.
+        sums_action: whether it sums L along the curve of a step, also with forces and constraints.
+        has_fallback: whether Newton's method is tried if the fixed-point iteration fails.
+        map_names, map_formulas: of the momentum maps, the first integrals from symmetries.
+        map_exact: whether the method is known to conserve them exactly, to round-off.
+        momentum_names: in order; none in folders of version 0.1 for a Lagrangian: see :attr:`momenta`.
+        exchange_names: of work and impulses of forces in a step: energy and momentum maps; none without forces.
+        constraints: formulas g of the constraints g = 0.
+        inputs: names of tabulated inputs, each of which has five parameters.
+        energy_parameter: of a time-transformed system, the parameter that is the energy of the initial state, else "".
+        time_transformation: time-rescaling function g in dt = g dtau that determines its step sizes, or "".
+        conserves_energy: whether energy is a first integral; unknown for folders of version 0.1.
+        changes_energy: reason why it is not conserved; empty if it is, and for folders of version 0.1.
+        balances_energy: whether it changes by the work of forces or damping only.
+        arrays: declarations of arrays of known sizes, first those whose entries are the coordinates in order, then
+            those whose entries are parameters; none without arrays.
+        indices: sizes and index tables of these arrays, ``"N = 3"``, ``"pairs = [[0, 1], [1, 2]]"``.
+        solver: of the stage equations, as in ``compile_stepper``, with or without a fallback; unknown for folders of
+            version 0.1.
+        rotations: declarations of rotations, directions and spins, ``"rotation R omega"``, ``"direction n"``, ``"spin
+            s"``, in the order of their coordinates, which follow the ordinary ones.
+        layout: of arrays whose sizes are known at run time; the coordinates are their names.
+        variables: of a first-order system all coordinates in the order of the user, half of which are ``coordinates``
+            and half of which take the place of momenta; else none.
+        lengths: cutoffs, skins and periods of lists of neighbours, ``("near", "cutoff", "5*s/2")``, which every run
+            checks.
+        precision: :data:`DOUBLE_DOUBLE`, or "" for double precision.
+        originals: of a system in angles of rods, the names of the coordinates and velocities that they replace, with
+            their formulas, ``("x", "l*sin(angle)")``.
+        original_arrays: declarations of the arrays of the original system.
+        kinks: functions at whose zeros the equations are not smooth, for events.
+    """
+
+    prefix: str
+    title: str
+    notes: tuple[str, ...] = ()
+    system: str
+    method: str
+    coordinates: tuple[str, ...]
+    parameters: tuple[str, ...]
+    defaults: tuple[float, ...]
+    unknowns: int = 0
+    workspace: int = 0
+    has_action: bool = False
+    sums_action: bool = False
+    map_names: tuple[str, ...] = ()
+    map_formulas: tuple[str, ...] = ()
+    map_exact: tuple[bool, ...] = ()
+    momentum_names: tuple[str, ...] = ()
+    has_fallback: bool = False
+    energy_parameter: str = ""
+    time_transformation: str = ""
+    exchange_names: tuple[str, ...] = ()
+    constraints: tuple[str, ...] = ()
+    inputs: tuple[str, ...] = ()
+    conserves_energy: bool = False
+    changes_energy: str = ""
+    balances_energy: bool = False
+    solver: str = ""
+    arrays: tuple[str, ...] = ()
+    indices: tuple[str, ...] = ()
+    rotations: tuple[str, ...] = ()
+    layout: ArrayLayout = ArrayLayout()
+    variables: tuple[str, ...] = ()
+    lengths: tuple[tuple[str, ...], ...] = ()
+    precision: str = ""
+    originals: tuple[tuple[str, ...], ...] = ()
+    original_arrays: tuple[str, ...] = ()
+    kinks: tuple[str, ...] = ()
+
+    @property
+    def words(self) -> int:
+        """Number of doubles of each number of a state: 2 in double-double arithmetic."""
+        return 2 if self.precision == DOUBLE_DOUBLE else 1
+
+    @property
+    def dimension(self) -> int:
+        """Degrees of freedom m."""
+        return len(self.coordinates)
+
+    @property
+    def index_values(self) -> dict[str, Any]:
+        """:attr:`indices` by name: whole numbers, and rows of whole numbers."""
+        return {name: json.loads(value) for name, value in (each.split(" = ") for each in self.indices)}
+
+    def about(self) -> dict[str, str]:
+        """Return title, system, method, and version of this package, to accompany every computed number."""
+        return {"title": self.title, "system": self.system, "method": self.method, "version": __version__}
+
+    @property
+    def momenta(self) -> tuple[str, ...]:
+        """Names of the momenta: those of a Hamiltonian, else ``p_`` and the coordinate's name."""
+        return self.momentum_names or tuple(f"p_{name}" for name in self.coordinates)
+
+    @property
+    def momentum_columns(self) -> tuple[str, ...]:
+        """Names of columns with p: ``p_`` and the coordinate's name, or the variables in its place."""
+        return self.momentum_names if self.variables else tuple(f"p_{name}" for name in self.coordinates)
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the fields for :meth:`from_record`, which supports named coordinates only."""
+        return {name: value for name, value in asdict(self).items() if name != "layout"}
+
+    @classmethod
+    def from_record(cls, record: Mapping[str, Any]) -> Interface:
+        """Return the interface from :meth:`to_record`, also from its JSON.
+
+        Raises:
+            ValueError, TypeError: for other fields, and values of other types.
+        """
+        arguments: dict[str, Any] = {key: _as_tuples(value) for key, value in record.items()}
+        for each in fields(cls):
+            if each.name in arguments and not KINDS[str(each.type)](arguments[each.name]):
+                raise ValueError(f"{each.name} is {arguments[each.name]!r:.60}: it must be of type {each.type}")
+        interface = cls(**arguments)
+        try:
+            valid = all(isinstance(value, int | list) for value in interface.index_values.values())
+        except RecursionError:
+            valid = False
+        if not valid:
+            raise ValueError(f"indices is {interface.indices!r:.60}: it must contain whole numbers")
+        if any(len(each) != 2 for each in interface.originals):
+            raise ValueError(f"originals is {interface.originals!r:.60}: it must contain names, each with a formula")
+        kinds = [kind for kind, *_ in map(str.split, filter(DECLARED.fullmatch, interface.rotations))]
+        if len(kinds) < len(interface.rotations) or sum(COMPONENTS[kind] for kind in kinds) > interface.dimension:
+            raise ValueError(f"rotations is {interface.rotations!r:.60}: it must declare some of the coordinates")
+        return interface

@@ -1,3 +1,0 @@
-"""Import path of :mod:`scvi_codegen.runtime.distributed` for user programs."""
-
-from scvi_codegen.runtime.distributed import integrate_ensemble as integrate_ensemble

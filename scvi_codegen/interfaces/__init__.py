@@ -1,0 +1,1 @@
+"""How programs and people meet the integrators: command line, model files, packages, pictures, pages."""

@@ -1,0 +1,257 @@
+"""Framework shared by all commands: command group, error handling, exit status, reports and output files.
+
+A command whose result a program can use is decorated with :func:`reporting` and reports with :func:`tell`, as text and
+as numbers: by default the text is printed, with ``--json`` the numbers, with ``--quiet`` neither. The document of
+``--json`` also contains the error that ended a command.
+"""
+
+import json
+import math
+import os
+import sys
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+from click.shell_completion import CompletionItem
+
+from scvi_codegen.codegen.native.announcements import announce_to
+from scvi_codegen.common.atomic import write_text
+from scvi_codegen.common.errors import (
+    AccuracyWarning,
+    BuildError,
+    MethodWarning,
+    PathError,
+    RecordingError,
+    ScviCodegenError,
+    StepFailedError,
+    SystemDefinitionWarning,
+    UnresolvedError,
+    closest,
+)
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+REPORT, QUIET = f"{__name__}.report", f"{__name__}.quiet"
+"""Keys of click's context for the document of ``--json`` and for the flag of ``--quiet``."""
+
+FAILURE, USAGE, INTERRUPTED = 1, 2, 130
+"""Exit statuses: numerical failure, no compiler or no file written; invalid input; Ctrl-C."""
+
+
+class CommandFailure(click.ClickException):
+    """Error of a command: a message for the user and an exit status."""
+
+    def __init__(self, message: str, status: int) -> None:
+        super().__init__(message)
+        self.status = status
+
+    @property
+    def exit_code(self) -> int:  # type: ignore[override]  # click's is a class variable
+        """Exit status of the command."""
+        return self.status
+
+
+class Commands(click.Group):
+    """Command group that imports the module ``folder``.NAME, or another, for the function NAME of a command.
+
+    The module of a command can therefore import what it needs at the top, while ``--help`` imports none of them. Every
+    error that a user can cause becomes one message and an exit status.
+    """
+
+    def __init__(
+        self, *words: Any, folder: str, modules: Mapping[str, str], about: Mapping[str, str], **settings: Any
+    ) -> None:
+        super().__init__(*words, **settings)
+        self.folder, self.modules, self.about = folder, modules, about
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the names in alphabetical order."""
+        return sorted(self.about)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Return the command of a name; imports its module."""
+        if cmd_name not in self.about:
+            return None
+        module = import_module(self.modules.get(cmd_name, f"{self.folder}.{cmd_name}"))
+        command: click.Command = getattr(module, cmd_name)
+        return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Return the command that the arguments name; propose the closest name for an unknown one."""
+        if args and args[0] not in self.about and not args[0].startswith("-"):
+            hint = closest(args[0], self.about)
+            ctx.fail(f"there is no command '{args[0]}'{hint} Known: {', '.join(sorted(self.about))}")
+        return super().resolve_command(ctx, args)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the list of commands of the overview."""
+        with formatter.section("Commands"):
+            formatter.write_dl(sorted(self.about.items()))
+
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
+        """Offer names of commands for shell completion."""
+        names = [name for name in sorted(self.about) if name.startswith(incomplete)]
+        result = [CompletionItem(name, help=self.about[name]) for name in names]
+        return [*result, *click.Command.shell_complete(self, ctx, incomplete)]
+
+    def main(self, *arguments: Any, **named: Any) -> Any:
+        """Run with writable streams, also if a shell closed them (``2>&-``)."""
+        for name in ("stdout", "stderr"):
+            if getattr(sys, name) is None:
+                nowhere = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115  (as long as the process)
+                setattr(sys, name, nowhere)
+        return super().main(*arguments, **named)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run a command; convert errors into messages and exit statuses, with ``--json`` also into a document."""
+        if "--json" in ctx.args:  # before arguments are read, whose errors it contains
+            _begin_report(ctx, None, wanted=True)
+        try:
+            with errors_as_messages():
+                return super().invoke(ctx)
+        except click.ClickException as error:
+            if REPORT in ctx.meta:
+                ctx.meta[REPORT]["error"] = _described(error)
+            raise
+
+
+def _described(error: click.ClickException) -> dict[str, Any]:
+    """Return the type, the message, the exit status, and the numbers and texts that are attributes of its causes."""
+    fields: dict[str, Any] = {}
+    cause = error.__cause__
+    while cause is not None:
+        fields = {name: each for name, each in vars(cause).items() if isinstance(each, str | int | float)} | fields
+        cause = cause.__cause__
+    kind = type(error.__cause__ or error).__name__
+    return {"type": kind, "message": error.format_message(), "exit_status": error.exit_code} | fields
+
+
+@contextmanager
+def errors_as_messages() -> Iterator[None]:
+    """Convert errors that a user can cause into one message and an exit status, and warnings into lines."""
+    try:
+        with _warnings_as_lines():
+            yield
+    except (StepFailedError, UnresolvedError, PathError, BuildError, RecordingError) as error:
+        raise CommandFailure(str(error), FAILURE) from error
+    except ScviCodegenError as error:
+        cause = error.__cause__
+        unwritten = isinstance(cause, OSError) and not isinstance(cause, FileNotFoundError)
+        raise CommandFailure(str(error), FAILURE if unwritten else USAGE) from error
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise CommandFailure(str(error), FAILURE) from error
+    except MemoryError as error:
+        raise CommandFailure("not enough memory", FAILURE) from error
+    except KeyboardInterrupt as error:
+        raise CommandFailure("interrupted", INTERRUPTED) from error
+
+
+@contextmanager
+def _warnings_as_lines() -> Iterator[None]:
+    """Print each warning of this package once, as one line."""
+    shown: set[str] = set()
+
+    def show(message: Warning | str, category: type[Warning], *location: Any, **more: Any) -> None:
+        if str(message) not in shown:
+            shown.add(str(message))
+            click.echo(f"Warning: {message}", err=True)
+
+    with warnings.catch_warnings():
+        for kind in (MethodWarning, AccuracyWarning, SystemDefinitionWarning):
+            warnings.simplefilter("always", kind)
+        warnings.showwarning = show
+        yield
+
+
+def reporting(command: Command) -> Command:
+    """Add the options ``--json`` and ``--quiet``, which :func:`tell` obeys, to a command."""
+    flag = partial(click.option, is_flag=True, expose_value=False)
+    as_json = flag("--json", callback=_begin_report, help="Print one JSON document instead of text.")
+    quiet = flag("--quiet", callback=_be_quiet, help="Print only errors and warnings; see the exit status.")
+    return quiet(as_json(command))
+
+
+def _begin_report(context: click.Context, parameter: click.Parameter | None, wanted: bool) -> None:
+    if not wanted or REPORT in context.meta:
+        return
+    report: dict[str, Any] = {}
+    context.meta[REPORT] = report
+
+    def print_report() -> None:
+        if report:
+            click.echo(json.dumps(_plain(report), indent=1))
+
+    context.call_on_close(print_report)
+
+
+def _be_quiet(context: click.Context, parameter: click.Parameter, wanted: bool) -> None:
+    context.meta[QUIET] = wanted
+    if wanted:
+        context.with_resource(announce_to(lambda _: None))
+
+
+def is_quiet() -> bool:
+    """Return True if the running command, if any, has the option ``--quiet``."""
+    context = click.get_current_context(silent=True)
+    return context is not None and bool(context.meta.get(QUIET))
+
+
+def note(text: str) -> None:
+    """Print a remark to stderr, unless ``--quiet``."""
+    if not is_quiet():
+        click.echo(text, err=True)
+
+
+def tell(text: str = "", /, *, nl: bool = True, **numbers: Any) -> None:
+    """Print a text; with ``--json`` add the numbers to the document that is printed at the end, also after an error."""
+    meta = click.get_current_context().meta
+    if REPORT in meta:
+        meta[REPORT] |= numbers
+    elif text and not is_quiet():
+        click.echo(text, nl=nl)
+
+
+def _plain(value: Any) -> Any:
+    """Return a value in the types of JSON: NaN and infinity as ``None``, arrays as lists, paths as strings."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {str(key): _plain(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return str(value) if isinstance(value, Path) else value
+
+
+def check_writable(path: Path, hint: str) -> None:
+    """Raise an error of usage unless a file can be written; ``hint`` names the option that requires it.
+
+    Called before long computations.
+    """
+    if path.is_dir() and path.suffix.lower() != ".zarr":
+        raise click.BadParameter(f"'{path}' is a folder", param_hint=hint)
+    if not path.parent.is_dir():
+        raise click.BadParameter(f"there is no folder '{path.parent}'", param_hint=hint)
+    if not os.access(path.parent, os.W_OK):
+        raise click.BadParameter(f"the folder '{path.parent}' is not writable", param_hint=hint)
+
+
+def emit(text: str, /, output: str | None, **numbers: Any) -> None:
+    """Print a text, or write it to a file atomically; ``numbers`` as for :func:`tell`."""
+    if output is None:
+        tell(text, **numbers)
+        return
+    check_writable(Path(output), "'-o'")
+    write_text(output, text.rstrip("\n") + "\n")
+    tell(**numbers, written=[output])
+    note(f"wrote {output}")

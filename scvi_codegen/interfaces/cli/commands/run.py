@@ -1,0 +1,333 @@
+"""Command ``scvi-codegen run``: integrate a model or an ensemble, in memory or into a folder, and print a summary."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import click
+
+from scvi_codegen.analysis.advice.tolerance_check import missed_tolerance
+from scvi_codegen.codegen.rendering.source import AUTO, DOUBLE_DOUBLE
+from scvi_codegen.interfaces.cli.command_group import (
+    FAILURE,
+    INTERRUPTED,
+    CommandFailure,
+    check_writable,
+    is_quiet,
+    reporting,
+    tell,
+)
+from scvi_codegen.interfaces.cli.ensembles import energy_balance, ensemble_summary, integrate_states
+from scvi_codegen.interfaces.cli.json_documents import ensemble_numbers, outcome_numbers, run_numbers
+from scvi_codegen.interfaces.cli.model_options import check_flag, model_arguments, read_model, with_known_sizes
+from scvi_codegen.interfaces.cli.recording import RecordedOutcome, Recording, check_format, check_resumed, is_run_folder
+from scvi_codegen.interfaces.cli.reports import known_account
+from scvi_codegen.interfaces.cli.running import RunOutcome, integrate_model, known_at_end, summary
+from scvi_codegen.interfaces.cli.step_selection import (
+    model_with_adaptive_steps,
+    model_with_advised_step,
+    model_with_global_error,
+)
+from scvi_codegen.interfaces.models.model import Model
+from scvi_codegen.interfaces.models.model_files.ensemble_file import EnsembleStates, load_ensemble
+from scvi_codegen.interfaces.models.options import (
+    IN_ENSEMBLE,
+    OF_ADAPTIVE_STEPS,
+    OPTIONS,
+    STEP_SIZE,
+    WITH_INPUTS,
+    check_available,
+)
+from scvi_codegen.interfaces.pictures.animation import FILMS
+from scvi_codegen.interfaces.pictures.canvas import PICTURES, check_plot_path
+from scvi_codegen.runs.accuracy.global_error import GlobalError
+from scvi_codegen.runs.compiler import second_stepper
+from scvi_codegen.runs.results.export import FORMATS
+
+ABOUT = """\
+Integrate MODEL; report conserved quantities and the final state.
+
+If a step fails, or after Ctrl-C, the states computed so far are summarised and written to the output files.
+
+Step size: fixed with --step; adaptive with --tolerance, the relative local error. --error bounds the global error of
+the whole run: the local tolerance is reduced until runs with other step sizes confirm the bound; if they confirm it
+only in part, the exit status is 1 and the time until which they do is printed. --advise chooses one fixed step size
+for an error at the end, by short pilot runs; the recommendation is printed, and if the run does not meet it, the exit
+status is 1.
+
+--time-transformation makes the step constant in a transformed time tau, dt = G dtau (smaller steps where the motion is
+fast); the map remains symplectic. --step is then the step of tau; without it one is chosen for --tolerance or
+round-off. --span and all times are of t. For systems with explicit time or forces use --controller reversible, a
+time-reversible step-size controller.
+
+An array model (array coordinates, q[N]) takes sizes from its arrays, [sizes] or --size; its plot is an image over
+index and time. With --ensemble, --advise, --time-transformation, and a folder as output, it is compiled for its sizes.
+
+A system with inputs (measured or commanded signals) takes their values from the section [inputs] of its file or from
+--input: a table with columns t and value, or a number. Steps end at breakpoints of the inputs.
+
+With --ensemble MODEL is run from many initial states. A grid has one section; every combination is run:
+
+\b
+  [grid]
+  q1 = { from = 0.5, to = 1.5, count = 11 }
+  q2_dot = [0.9, 1.0, 1.1]
+  mu = 2.0
+
+A table is a CSV file with the names in its first line. Names are those of coordinates, velocities (q1_dot) or
+momenta (p_q1), and parameters; the others are as in MODEL. An .npz file has arrays q and p of shape (states,
+trajectories, coordinates); a .csv file has one line per state.
+
+Checkpoint and restart: with a folder as output (-o long.run) states and checkpoints are written during the run, in
+constant memory. It may be killed at any time; --resume continues it bit for bit, optionally beyond its original end
+(--steps, --span). 'scvi-codegen export' writes its states to one file.
+
+\b
+Examples:
+  scvi-codegen run outer-solar-system --plot orbits.png
+  scvi-codegen run kepler --step 0.1 --steps 100000 --save-every 100 -o orbit.npz
+  scvi-codegen run kepler --tolerance 1e-12
+  scvi-codegen run kepler --error 1e-9
+  scvi-codegen run kepler --advise 1e-9
+  scvi-codegen run kepler --time-transformation frequency --span 1000
+  scvi-codegen run kepler --time-transformation frequency --controller reversible --step 0.2
+  scvi-codegen run kepler --json > kepler.json
+  scvi-codegen run ring.toml --size N=10000 --plot ring.png
+"""
+
+OWN = tuple(option for option in OPTIONS if not (option.common or option.section == "path"))
+"""Options that other commands do not have."""
+ERRORS = {option.name: option for option in OWN if option.determines == STEP_SIZE}
+"""Those of an error that determines the step size."""
+
+
+@click.command(help=ABOUT)
+@model_arguments(*(option.name for option in OWN), required=False)
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(),
+    metavar="PATH",
+    help=f"Trajectory: {FORMATS}; or a folder, NAME.run or NAME/, for a run of any length.",
+)
+@click.option("--resume", type=click.Path(), metavar="FOLDER", help="Continue the run in a folder (without MODEL).")
+@click.option(
+    "--checkpoint", type=float, metavar="SECONDS", help="Longest time between checkpoints of a run in a folder [10]."
+)
+@click.option("--checkpoint-steps", type=int, metavar="N", help="Most steps between checkpoints.")
+@click.option("--certificate", type=click.Path(), metavar="FILE", help="JSON file to store in the folder.")
+@click.option("--plot", type=click.Path(), metavar="FILE", help="Plot (.png, .svg, .pdf) or film (.gif, .html, .mp4).")
+@click.option(
+    "--ensemble", type=click.Path(), metavar="FILE", help="Many initial states: a grid (.toml) or a table (.csv)."
+)
+@reporting
+def run(
+    model_name: str | None,
+    output: str | None,
+    resume: str | None,
+    checkpoint: float | None,
+    checkpoint_steps: int | None,
+    certificate: str | None,
+    plot: str | None,
+    ensemble: str | None,
+    **choices: Any,
+) -> None:
+    """Integrate MODEL; the help text is ``ABOUT``."""
+    recording = Recording(seconds=checkpoint, steps=checkpoint_steps, certificate=certificate)
+    if resume is not None:
+        check_resumed(click.get_current_context())
+        _finish_recording(recording.resume(resume, steps=choices["steps"], span=choices["span"]))
+        return
+    if model_name is None:
+        raise click.UsageError("Missing argument 'MODEL', or --resume FOLDER.")
+    recorded = output is not None and is_run_folder(output)
+    recording.check(recorded)
+    _check_outputs(output, plot, ensemble)
+    wanted = {name: choices.pop(name) for name in ERRORS}
+    _check_combination(choices, plot=plot, ensemble=ensemble, wanted=wanted, folder=output if recorded else None)
+    is_controlled = any(choices.get(name) is not None for name in OF_ADAPTIVE_STEPS)
+    errors = {name: wanted[name] for name in ("tolerance", "error") if wanted[name] is not None}
+    model = read_model(model_name, choices, errors if is_controlled else None)
+    _check_words(model, {"-o": output})
+    if model.precision in (DOUBLE_DOUBLE, AUTO):
+        model = model.with_known_sizes()
+    if ensemble is not None:
+        _check_ensemble(model)
+    else:
+        model._check_alone()
+    for option, needed in (
+        ("--ensemble", ensemble is not None),
+        ("--advise", wanted["advise"] is not None),
+        (f"-o {output}", recorded),
+    ):
+        model = with_known_sizes(model, option) if needed else model
+    if model.system.inputs and wanted["advise"] is not None:
+        check_flag(ERRORS["advise"], WITH_INPUTS)
+    if model.system.inputs and recorded:
+        raise click.UsageError("a run with inputs cannot be recorded in a folder: write it to a file (-o NAME.npz)")
+    states = None if ensemble is None else load_ensemble(ensemble, model)
+    model, confirmation, member = _with_steps(model, wanted, states)
+    _check_words(model, {"-o": output})  # with precision = "auto"
+    if states is not None:
+        _run_ensemble(replace(states, model=model), (output, plot), advised=wanted["advise"], member=member)
+        return
+    if output is not None and recorded:
+        _finish_recording(recording.record(model, output))
+    else:
+        _run_one(model, output, plot, advised=wanted["advise"])
+    _check_confirmed(confirmation)
+
+
+def _check_ensemble(model: Model) -> None:
+    """Reject models and options that ensembles do not have."""
+    if model.has_time_transformation:
+        raise click.UsageError(
+            "--ensemble is not available with a time transformation: each trajectory has its own times"
+        )
+    check_available(model, IN_ENSEMBLE)
+
+
+def _check_words(model: Model, options: dict[str, Any]) -> None:
+    """Reject options that states of two words do not have, if those of the model have two."""
+    for flag, value in options.items() if model.in_double_double else ():
+        kept = flag == "-o" and value is not None and (is_run_folder(value) or Path(value).suffix.lower() == ".npz")
+        if value is not None and not kept:
+            model._check_double(f"{flag} {value}{' (write a file NAME.npz)' * (flag == '-o')}")
+
+
+def _check_confirmed(confirmation: GlobalError | None) -> None:
+    """End with exit status 1 if a global error bound was requested and is not confirmed."""
+    if confirmation is not None and not confirmation.confirmed:
+        end = confirmation.confirmed_until
+        unconfirmed = f"the bound {confirmation.requested:g} on the global error is confirmed only until t = {end:g}"
+        tell(missed=unconfirmed)
+        raise CommandFailure(unconfirmed, FAILURE)
+
+
+def _with_steps(
+    model: Model, wanted: dict[str, float | None], states: EnsembleStates | None
+) -> tuple[Model, GlobalError | None, int]:
+    """Return the model with the steps that one of the requested errors determines, and the estimated global error.
+
+    The third value is the index of the trajectory that determines the step of an ensemble.
+    """
+    tolerance, error, advise = wanted["tolerance"], wanted["error"], wanted["advise"]
+    if tolerance is not None:
+        return model_with_adaptive_steps(model, tolerance), None, 0
+    if advise is not None:
+        model, advice = model_with_advised_step(model, advise, states)
+        return model, None, advice.member or 0
+    if (wanted_error := model.error if error is None else error) is not None:
+        return *model_with_global_error(model, wanted_error), 0
+    return model, None, 0
+
+
+def _check_outputs(output: str | None, plot: str | None, ensemble: str | None) -> None:
+    """Check before a long run that its files can be written."""
+    if output is not None and not (ensemble is None and is_run_folder(output)):
+        check_format(output, ensemble=ensemble is not None)
+        check_writable(Path(output), "'-o'")
+    if plot is not None:
+        check_writable(Path(plot), "'--plot'")
+        check_plot_path(plot, PICTURES + FILMS)
+
+
+def _check_combination(
+    choices: dict[str, Any],
+    *,
+    plot: str | None,
+    ensemble: str | None,
+    wanted: dict[str, float | None],
+    folder: str | None,
+) -> None:
+    if folder is not None and plot is not None:
+        raise click.UsageError("--plot is not available for a run recorded in a folder: it needs the states in memory")
+    arguments = [name for name, value in wanted.items() if value is not None]
+    if len(arguments) > 1:
+        raise click.UsageError(
+            f"--{arguments[0]} and --{arguments[1]} exclude each other: each determines the step size; give one"
+        )
+    for name in ("step", "steps") if arguments else ():
+        if choices[name] is not None:
+            raise click.UsageError(f"--{arguments[0]} determines the step size: omit --{name} (--span is the duration)")
+    if ensemble is not None and arguments:
+        check_flag(ERRORS[arguments[0]], IN_ENSEMBLE)
+
+
+def _run_one(model: Model, output: str | None, plot: str | None, *, advised: float | None) -> None:
+    outcome = integrate_model(model)
+    known = known_at_end(model, outcome)
+    account = known_account(outcome.trajectory)
+    tell(summary(model, outcome, known, account), **run_numbers(model, outcome, known, account))
+    result = outcome.trajectory
+    draw = result.plot if model.array_system is None else result.plot.field
+    written = _write_outputs(model, result, output, plot, draw=draw)
+    tell(written=written)
+    if outcome.failure is not None:
+        raise CommandFailure(f"{outcome.failure}\n{_kept(outcome, written)}", FAILURE) from outcome.failure
+    if outcome.interrupted:
+        raise CommandFailure(f"interrupted at t = {outcome.run.t:g}\n{_kept(outcome, written)}", INTERRUPTED)
+    if outcome.missed is not None:
+        raise CommandFailure(f"{outcome.missed}\n{_kept(outcome, written)}", FAILURE)
+    for path in written:
+        tell(f"wrote {path}")
+    missed = ""
+    if advised is not None:
+        missed = missed_tolerance(second_stepper(model.system), outcome.trajectory, advised, known)
+    if missed:
+        tell(missed=missed)
+        raise CommandFailure(missed, FAILURE)
+
+
+def _finish_recording(outcome: RecordedOutcome) -> None:
+    """Print the summary of a run in a folder, and how to continue it."""
+    tell(outcome.summary(), **outcome_numbers(outcome))
+    if outcome.failure is not None:
+        raise CommandFailure(f"{outcome.failure}\n{outcome.continuation()}", FAILURE) from outcome.failure
+    if outcome.interrupted:
+        raise CommandFailure(f"interrupted at t = {outcome.run.t:g}\n{outcome.continuation()}", INTERRUPTED)
+    tell(f"wrote {outcome.recorded.folder}", written=[outcome.recorded.folder])
+
+
+def _run_ensemble(
+    states: EnsembleStates, outputs: tuple[str | None, str | None], *, advised: float | None, member: int
+) -> None:
+    model = states.model
+    outcome = integrate_states(states)
+    balance = energy_balance(outcome.result)
+    tell(ensemble_summary(model, outcome, balance), **ensemble_numbers(model, outcome, balance))
+    written = _write_outputs(model, outcome.result, *outputs, draw=outcome.result.plot)
+    continuation = (
+        f"the computed states were {'written: ' + ' and '.join(written) if written else 'not written to a file (-o)'}"
+    )
+    if outcome.interrupted:
+        raise CommandFailure(
+            f"interrupted after {outcome.result.steps.mean():.0f} steps on average\n{continuation}", INTERRUPTED
+        )
+    if not outcome.result.ok.any():
+        raise CommandFailure(f"every trajectory failed\n{continuation}", FAILURE)
+    for path in written:
+        tell(f"wrote {path}", written=written)
+    if advised is not None:
+        second, good = second_stepper(model.system), outcome.result.ok[member]
+        missed = missed_tolerance(second, outcome.result[member], advised) if good else ""
+        if missed:
+            tell(missed=missed)
+            raise CommandFailure(f"trajectory {member}: {missed}", FAILURE)
+
+
+def _write_outputs(model: Model, result: Any, output: str | None, plot: str | None, *, draw: Any) -> list[str]:
+    if output is not None:
+        result.save(output)
+    if plot is not None and Path(plot).suffix.lower() in FILMS:
+        progress = (lambda *_: None) if is_quiet() else None
+        result.animate(plot, picture=model.picture or None, progress=progress)
+    elif plot is not None:
+        draw(plot)
+    return [path for path in (output, plot) if path is not None]
+
+
+def _kept(outcome: RunOutcome, written: list[str]) -> str:
+    count = len(outcome.trajectory)
+    states = "the initial state was" if count == 1 else f"the {count} states computed before were"
+    return f"{states} written: {' and '.join(written)}" if written else f"{states} not written to a file (-o, --plot)"

@@ -1,0 +1,271 @@
+"""The argument MODEL and the options that override it, converted to a :class:`Model`."""
+
+import math
+import os
+import re
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import click
+from click.shell_completion import CompletionItem
+
+from scvi_codegen.common.atomic import NamedFile, naming_folders
+from scvi_codegen.common.errors import SystemDefinitionError
+from scvi_codegen.common.toml_text import MAX_CHARACTERS
+from scvi_codegen.common.validation import ExactNumber
+from scvi_codegen.interfaces.cli.command_group import Command
+from scvi_codegen.interfaces.models.model import Model
+from scvi_codegen.interfaces.models.model_files.entries import ROBOT_FILES
+from scvi_codegen.interfaces.models.model_files.model_file import catalogue_model, load_model, parse_model
+from scvi_codegen.interfaces.models.model_files.sections import event_entry
+from scvi_codegen.interfaces.models.options import (
+    ASSIGNMENTS,
+    COUNT,
+    EVENTS,
+    INPUTS,
+    METHOD,
+    METHOD_KEYS,
+    NUMBER,
+    NUMBER_OR_NAMED,
+    NUMBERS,
+    NUMBERS_OR_NAME,
+    OPTIONS,
+    SIZES,
+    SWITCH,
+    Option,
+    excluded,
+)
+from scvi_codegen.interfaces.models.problems import PROBLEMS, problem
+from scvi_codegen.methods import ARGUMENTS, METHODS, size_of, specification_of
+
+MOST_COORDINATES = 2000
+"""Largest number of coordinates of an array model that is compiled with its sizes: its equations are unrolled."""
+Choices = Mapping[str, Any]
+"""Options of the command line that override MODEL, by name; ``None`` or an empty tuple for options that are absent."""
+OFFERED_SIZES = range(1, 17)
+"""Numbers that shell completion offers after ``svi:``."""
+
+STANDARD_INPUT = "-"
+"""Name of the model whose file is read from standard input; files that it names are in the present folder."""
+
+
+def sections_of(choices: Choices) -> dict[str, dict[str, Any]]:
+    """Return the options as sections of a model file."""
+    document: dict[str, Any] = {}
+    for option in OPTIONS:
+        value = choices.get(option.name)
+        if value in (None, (), option.default):
+            continue
+        if option.kind == EVENTS:
+            document[option.section] = [event_entry(text) for text in value]
+        elif option.is_section:
+            document[option.section] = dict(value)
+        elif option.section:
+            section = document.setdefault(option.section, {})
+            section[option.key] = list(value) if isinstance(value, tuple) else value
+    return document
+
+
+def _numbers(context: click.Context, parameter: click.Parameter, value: str | None) -> tuple[float, ...] | None:
+    if value is None:
+        return None
+    try:
+        return tuple(ExactNumber(word) for word in re.split(r"[,\s]+", value.strip()))
+    except ValueError as error:
+        raise click.BadParameter(f"{error}; give numbers separated by commas, as in 0.5,-1.2e-3") from error
+
+
+def _numbers_or_name(
+    context: click.Context, parameter: click.Parameter, value: str | None
+) -> tuple[float, ...] | str | None:
+    if value is not None and re.fullmatch(r"[a-z]+(-[a-z]+)*", value):
+        return value
+    return _numbers(context, parameter, value)
+
+
+def _assignments(
+    context: click.Context, parameter: click.Parameter, values: tuple[str, ...]
+) -> tuple[tuple[str, float], ...]:
+    result = []
+    for text in values:
+        name, equals, number = (part.strip() for part in text.partition("="))
+        try:
+            value: float = ExactNumber(number)
+        except ValueError:
+            value = math.nan
+        if not name or not equals or not math.isfinite(value):
+            form = "must have a finite number as VALUE" if name and equals else "is not of the form NAME=VALUE"
+            raise click.BadParameter(f"'{text}' {form}, as in g=9.81")
+        result.append((name, value))
+    return tuple(result)
+
+
+def _number_or_named(
+    context: click.Context, parameter: click.Parameter, values: tuple[str, ...]
+) -> float | dict[str, float] | None:
+    """Return VALUE as a number, and NAME=VALUE, NAME=VALUE as numbers by name; ``None`` without any."""
+    if not values:
+        return None
+    if len(values) == 1 and "=" not in values[0]:
+        try:
+            return float(ExactNumber(values[0]))
+        except ValueError as error:
+            raise click.BadParameter(f"'{values[0]}' is neither VALUE nor NAME=VALUE, as in 1e-9 and x=1e-9") from error
+    return dict(_assignments(context, parameter, values))
+
+
+def _sizes(context: click.Context, parameter: click.Parameter, values: tuple[str, ...]) -> tuple[tuple[str, int], ...]:
+    for name, value in (assignments := _assignments(context, parameter, values)):
+        if not value.is_integer():
+            raise click.BadParameter(f"the size {name} must be an integer, not {value:g}")
+    return tuple((name, int(value)) for name, value in assignments)
+
+
+def _input_files(
+    context: click.Context, parameter: click.Parameter, values: tuple[str, ...]
+) -> tuple[tuple[str, float | dict[str, str]], ...]:
+    """Return NAME=FILE[:KIND] and NAME=NUMBER as entries of the section [inputs]; paths are made absolute."""
+    result = list[tuple[str, float | dict[str, str]]]()
+    for text in values:
+        name, _, arguments = (part.strip() for part in text.partition("="))
+        if name and re.fullmatch(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", arguments, re.ASCII | re.IGNORECASE):
+            result.append((name, float(arguments)))
+            continue
+        match = re.fullmatch(r"(?P<file>.+?\.\w+)(:(?P<kind>[a-z]+))?", arguments)
+        if not name or not match:
+            raise click.BadParameter(f"'{text}' is not of the form NAME=FILE[:KIND] or NAME=NUMBER, as in u=u.csv")
+        entry = {key: value for key, value in match.groupdict().items() if value is not None}
+        result.append((name, entry | {"file": NamedFile(Path(entry["file"]).absolute())}))
+    return tuple(result)
+
+
+def complete_method(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Offer names of methods for shell completion; after a colon with degree, number of stages or order."""
+    name, colon, _ = incomplete.partition(":")
+    offered = [f"{name}:{number}" for number in OFFERED_SIZES] if colon and size_of(name) else METHODS
+    return [CompletionItem(one) for one in offered if one.startswith(incomplete)]
+
+
+def complete_model(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Offer files and names of the catalogue for shell completion; files first, as bash requires."""
+    names = [CompletionItem(name) for name in PROBLEMS if name.startswith(incomplete)]
+    return [CompletionItem(incomplete, type="file"), *names]
+
+
+PARSERS: Mapping[str, Mapping[str, Any]] = {
+    NUMBER: {"type": float},
+    COUNT: {"type": int},
+    SWITCH: {"is_flag": True, "default": None},
+    METHOD: {"shell_complete": complete_method},
+    NUMBERS: {"callback": _numbers},
+    NUMBERS_OR_NAME: {"callback": _numbers_or_name},
+    NUMBER_OR_NAMED: {"multiple": True, "callback": _number_or_named},
+    ASSIGNMENTS: {"multiple": True, "callback": _assignments},
+    INPUTS: {"multiple": True, "callback": _input_files},
+    SIZES: {"multiple": True, "callback": _sizes},
+    EVENTS: {"multiple": True},
+}
+"""Arguments of :func:`click.option` by kind of option."""
+
+
+def _flag(option: Option) -> Callable[[Command], Command]:
+    """Return the decorator that adds the flag of an option to a command."""
+    further = dict(PARSERS.get(option.kind, {}))
+    if option.choices:
+        further["type"] = click.Choice(option.choices)
+    if option.default is not None:
+        further |= {"default": option.default, "show_default": True}
+    return click.option(option.flag, option.name, metavar=option.metavar or None, help=option.help, **further)
+
+
+_folders = click.option(
+    "--folder",
+    type=click.Path(exists=True, file_okay=False),
+    multiple=True,
+    metavar="DIR",
+    expose_value=False,
+    callback=lambda context, parameter, values: context.with_resource(naming_folders(values)),
+    help="Folder with files that MODEL may name (arrays, inputs, robots), besides its own; may be repeated.",
+)
+
+
+def model_arguments(*further: str, required: bool = True) -> Callable[[Command], Command]:
+    """Return the decorator that adds the argument MODEL, the options that override it, and further ones by name."""
+
+    def decorated(command: Command) -> Command:
+        command = _folders(command)
+        for option in reversed(OPTIONS):
+            if option.common or option.name in further:
+                command = _flag(option)(command)
+        return click.argument(
+            "model_name", metavar="MODEL" if required else "[MODEL]", required=required, shell_complete=complete_model
+        )(command)
+
+    return decorated
+
+
+def check_exclusive(choices: Choices) -> None:
+    """Reject options that exclude each other."""
+    names = [name for name, value in choices.items() if value is not None]
+    if pair := next(excluded(names, "initial", "run"), None):
+        raise click.UsageError(f"{pair[0].flag} and {pair[1].flag} exclude each other")
+
+
+def check_flag(option: Option, situation: str) -> None:
+    """Reject an option of the command line if it is not available in a situation."""
+    if situation in option.unavailable:
+        raise click.UsageError(f"{option.flag} is not available {situation}: {option.unavailable[situation]}")
+
+
+def _check_method(choices: Choices) -> None:
+    """Reject options that the chosen method does not take or that contradict the number in its name."""
+    method = choices.get("method")
+    if method is None:
+        return
+    message = specification_of(method)
+    taken, flags = ARGUMENTS[message["method"]], {option.name: option.flag for option in OPTIONS}
+    for option in METHOD_KEYS[1:]:
+        value = choices.get(option)
+        if value is not None and option not in taken:
+            takes = ", ".join(flags[key] for key in taken if key in METHOD_KEYS) or "no options"
+            raise click.UsageError(f"--method {method} takes no {flags[option]}; it takes {takes}")
+        if value is not None and message.get(option, value) != value:
+            raise click.UsageError(
+                f"--method {method} and {flags[option]} {value} contradict each other: leave one of them out"
+            )
+
+
+def read_model(name: str, choices: Choices, steps: Mapping[str, float] | None = None) -> Model:
+    """Return the model of a file, of standard input (``-``) or the catalogue, with the options of the command line.
+
+    ``steps``: entries of [run] that replace a step size, without which options of adaptive steps would be refused.
+    """
+    check_exclusive(choices)
+    _check_method(choices)
+    sections = sections_of(choices)
+    if steps:
+        sections["run"] = {**sections.get("run", {}), **steps}
+    if name == STANDARD_INPUT:
+        text = sys.stdin.read(MAX_CHARACTERS + 1).removeprefix("\ufeff")
+        return parse_model(text, sections, folder=Path())
+    path = Path(name)
+    if path.suffix.lower() in (".toml", *ROBOT_FILES) or os.sep in name or path.is_file():
+        return load_model(path, sections)
+    if name.partition(":")[0] not in PROBLEMS:
+        try:
+            problem(name)
+        except SystemDefinitionError as error:
+            raise SystemDefinitionError(f"{error} (There is no model file '{name}' either.)") from error
+    return catalogue_model(name, sections)
+
+
+def with_known_sizes(model: Model, option: str) -> Model:
+    """Return the model of named coordinates that an option requires."""
+    if model.array_system is not None and model.dimension > MOST_COORDINATES:
+        raise click.UsageError(
+            f"{option} compiles an array model with its sizes, which is limited to {MOST_COORDINATES} coordinates: "
+            f"omit {option}, or reduce the sizes ({model.dimension} coordinates here)"
+        )
+    return model.with_known_sizes()

@@ -1,0 +1,219 @@
+"""Runs in folders, with checkpoints: ``run -o FOLDER.run``, ``run --resume FOLDER`` and ``export``."""
+
+import math
+import os
+import shlex
+import time
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+from scvi_codegen.common.errors import ModelFileError, StepFailedError
+from scvi_codegen.common.representation import counted
+from scvi_codegen.interfaces.cli.model_options import check_exclusive
+from scvi_codegen.interfaces.cli.reports import duration
+from scvi_codegen.interfaces.cli.running import conserved, event_counts, final_state
+from scvi_codegen.interfaces.cli.supervision import interruptions, progress_bar
+from scvi_codegen.interfaces.models.model import Model
+from scvi_codegen.interfaces.models.model_files.model_file import dump_model, parse_model
+from scvi_codegen.interfaces.models.options import DURATION, OPTIONS
+from scvi_codegen.interfaces.models.time_span import whole_steps_in
+from scvi_codegen.runs.driver.run import Run
+from scvi_codegen.runs.recording import RecordedRun, load_run, record_run, resume_run
+from scvi_codegen.runs.results import export
+from scvi_codegen.runs.stepping.step_plan import FixedSteps, InTau
+
+SUFFIX = ".run"
+MAX_STATES = 10_000
+"""Largest number of states used to summarise what was conserved."""
+WITH_RESUME = {
+    "resume",
+    "checkpoint",
+    "checkpoint_steps",
+    *(each.name for each in OPTIONS if each.determines == DURATION),
+}
+"""Options that are allowed with ``--resume``."""
+
+
+def is_run_folder(output: str) -> bool:
+    """Return True if an output is a folder for a run: NAME.run, or a path that ends in a slash."""
+    return output.endswith(("/", os.sep)) or Path(output).suffix.lower() == SUFFIX
+
+
+def check_format(output: str, *, ensemble: bool) -> None:
+    """Check that a file format exists and that its library is installed."""
+    if Path(output).suffix.lower() not in export.WRITERS:
+        formats = f"an ensemble is written as {export.FORMATS}"
+        if not ensemble:
+            formats = f"a trajectory is written as {export.FORMATS} or into a folder {SUFFIX}"
+        raise click.BadParameter(f"{formats}, not as '{output}'", param_hint="'-o'")
+    export.check_format(output)
+
+
+def check_resumed(context: click.Context) -> None:
+    """Reject options that would change the run that ``--resume`` continues."""
+    for name in context.params:
+        chosen = context.get_parameter_source(name) is not click.core.ParameterSource.DEFAULT
+        if chosen and name not in WITH_RESUME:
+            word = "MODEL" if name == "model_name" else f"--{name.replace('_', '-')}"
+            raise click.UsageError(
+                f"{word} is not allowed with --resume: the folder defines the run; only --steps or --span may extend it"
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordedOutcome:
+    """Result of a run in a folder.
+
+    Attributes:
+        recorded: contents of the folder.
+        run: state of the integration at the last checkpoint.
+        first: number of steps completed before this call.
+        seconds: seconds spent in this call.
+        failure: error of the step that failed, or ``None``.
+        interrupted: True if a signal ended the run.
+    """
+
+    recorded: RecordedRun
+    run: Run
+    first: int
+    seconds: float
+    failure: StepFailedError | None
+    interrupted: bool
+
+    def summary(self) -> str:
+        """Return a summary of the run in a few lines."""
+        steps = self.run.steps - self.first
+        lines = [describe_progress(self.recorded)]
+        if steps:
+            since = f" since step {self.first}" if self.first else ""
+            lines.append(f"{self.seconds:.3g} s{since}, {duration(self.seconds / steps)} per step, including writing")
+        end = final_state(self.run.stepper.interface, self.run.q, self.run.p)
+        return "\n".join([*lines, *self._conserved(), *event_counts(self.recorded.events), *end])
+
+    def _conserved(self) -> list[str]:
+        """Return lines on conserved quantities if the folder names a model that determines them."""
+        if self.recorded.manifest.model is None or not self.run.steps:
+            return []
+        stride = -(-len(self.recorded) // MAX_STATES)
+        with np.errstate(all="ignore"):
+            lines = list(conserved(self.recorded[::stride]))
+        return [f"in every {stride}th saved state:", *lines] if stride > 1 else lines
+
+    def continuation(self) -> str:
+        """Return a line on what was written, and the command that continues the run unless a step failed."""
+        folder = self.recorded.folder
+        states = f"the {len(self.recorded)} states computed before are in '{folder}'"
+        if self.failure is not None:
+            return states
+        return f"{states}; continue with: scvi-codegen run --resume {shlex.quote(str(folder))}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recording:
+    """Checkpoint interval and certificate of a run in a folder.
+
+    Attributes:
+        seconds: seconds between checkpoints; ``None`` for the default.
+        steps: steps between checkpoints; ``None`` for no such limit.
+        certificate: path of a JSON file to store with the run, or ``None``.
+    """
+
+    seconds: float | None
+    steps: int | None
+    certificate: str | None
+
+    def check(self, recorded: bool) -> None:
+        """Reject options that have no effect on a run in memory."""
+        options = {"--checkpoint": self.seconds, "--checkpoint-steps": self.steps, "--certificate": self.certificate}
+        for name, value in options.items():
+            if value is not None and not recorded:
+                raise click.UsageError(f"{name} requires a run recorded in a folder (-o NAME{SUFFIX})")
+
+    def record(self, model: Model, folder: str) -> RecordedOutcome:
+        """Integrate a model into a folder until its end, a failure or a signal; raises as :func:`record_run`."""
+        text = None
+        with suppress(ModelFileError):
+            text = dump_model(model)
+        if model.system.clock is not None and model.ends_at_time:
+            raise click.UsageError(
+                "a recorded run in transformed time needs a number of steps: give --step and --steps"
+            )
+        run = model.start()
+        return self._with_progress(
+            record_run,
+            run,
+            Path(folder),
+            first=0,
+            steps=model.whole_step_count() if isinstance(run.plan, FixedSteps) else None,
+            save_every=model.save_every,
+            model=text,
+            certificate=self.certificate,
+        )
+
+    def resume(self, folder: str, *, steps: int | None, span: float | None) -> RecordedOutcome:
+        """Continue the run in a folder; raises as :func:`resume_run`."""
+        check_exclusive({"steps": steps, "span": span})
+        recorded = load_run(folder)
+        manifest, further = recorded.manifest, dict[str, Any]()
+        if manifest.plan and span is not None:
+            further["t_end"] = manifest.t + math.copysign(span, manifest.plan.t_end - manifest.t)
+        elif span is not None and manifest.interface.energy_parameter:
+            raise click.UsageError(
+                "a recorded run in transformed time needs a number of steps: give --steps, not --span"
+            )
+        elif span is not None:
+            steps = whole_steps_in(span, manifest.h, manifest.t)
+        plan = manifest.steps if steps is None else steps
+        if manifest.model is not None and (system := parse_model(manifest.model).array_system):
+            further["mesh"] = system.mesh
+        return self._with_progress(resume_run, Path(folder), first=recorded.steps, steps=plan, **further)
+
+    def _with_progress(
+        self, act: Any, *arguments: Any, first: int, steps: int | None, **settings: Any
+    ) -> RecordedOutcome:
+        """Record or resume with a progress bar; SIGINT and SIGTERM end the run at a checkpoint."""
+        checkpoint_interval = {"checkpoint_seconds": self.seconds, "checkpoint_steps": self.steps}
+        settings |= {name: value for name, value in checkpoint_interval.items() if value is not None}
+        folder, failure, began = arguments[-1], None, time.perf_counter()
+        with interruptions() as caught, progress_bar(0 if steps is None else steps - first) as show_progress:
+            try:
+                act(
+                    *arguments,
+                    steps=steps,
+                    progress=lambda done: show_progress(done - first),
+                    stop=lambda: bool(caught),
+                    **settings,
+                )
+            except StepFailedError as error:
+                failure = error
+        recorded = load_run(folder)
+        return RecordedOutcome(
+            recorded=recorded,
+            run=recorded.resumed(),
+            first=first,
+            seconds=time.perf_counter() - began,
+            failure=failure,
+            interrupted=bool(caught) and not recorded.finished,
+        )
+
+
+def describe_progress(recorded: RecordedRun) -> str:
+    """Return two lines: the integrator of a run in a folder, and its progress."""
+    manifest = recorded.manifest
+    done, t = counted(recorded.steps, "step"), manifest.t + recorded.steps * manifest.h
+    if manifest.plan:
+        how = f"of {manifest.plan.tau:g} in tau" if isinstance(manifest.plan, InTau) else "of adaptive size"
+        progress_text = f"{done} {how} from t = {manifest.t:g} to t = {recorded.t[-1]:g}"
+        progress_text += "" if recorded.finished else f" (of {manifest.plan.t_end:g})"
+    else:
+        far = "all" if recorded.finished else f"of {manifest.steps}"
+        if manifest.interface.energy_parameter:
+            done, t = f"{done} in tau", float(recorded.t[-1])
+        progress_text = f"{done} ({far}) of {manifest.h:g} from t = {manifest.t:g} to t = {t:g}"
+    continuation = f"{counted(len(recorded), 'state')} saved in '{recorded.folder}'"
+    return f"{' '.join(manifest.interface.title.split())}\n{progress_text}; {continuation}"

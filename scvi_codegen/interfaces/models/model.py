@@ -1,0 +1,485 @@
+"""Validated model: a system with a method, an initial state and a time span."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from dataclasses import fields as fields_of
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from scvi_codegen.codegen.lowering.arrays import check_solver, one_coordinate
+from scvi_codegen.common.display.cards import Html, card, listed, plain
+from scvi_codegen.common.errors import ModelFileError, StateError
+from scvi_codegen.common.representation import summary
+from scvi_codegen.common.validation import check_kind
+from scvi_codegen.interfaces.models.options import (
+    RUN_FIELDS,
+    STATE,
+    VELOCITY,
+    check_alternatives,
+    checked_path_value,
+    real,
+    with_exact_numbers,
+)
+from scvi_codegen.interfaces.models.problems import Problem
+from scvi_codegen.interfaces.models.time_span import TimeSpan, check_length
+from scvi_codegen.methods import Method, as_method
+from scvi_codegen.methods.galerkin import SVI
+from scvi_codegen.systems.arrays.system import SYSTEM_OR_ARRAYS, ArraySystem
+from scvi_codegen.systems.first_order import FirstOrderSystem
+from scvi_codegen.systems.formulas.symbols import input_parameters
+from scvi_codegen.systems.rolling import unroll_sums
+from scvi_codegen.systems.system import MechanicalSystem
+
+if TYPE_CHECKING:
+    from scvi_codegen.codegen.native.options import SolverOptions
+    from scvi_codegen.interfaces.models.input_tables import InputTable
+    from scvi_codegen.runs.accuracy.global_error import GlobalError
+    from scvi_codegen.runs.driver.run import Run
+    from scvi_codegen.runs.driver.segments import Input
+    from scvi_codegen.runs.states.validation import Array
+    from scvi_codegen.runs.stepper import Stepper
+    from scvi_codegen.runs.trajectory import Trajectory
+    from scvi_codegen.systems.event import Event
+
+DEFAULT_METHOD = SVI(8)
+"""Default method for the problems of the catalogue."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Model(TimeSpan):
+    """System, method, initial state and time span; equality is structural.
+
+    For a system of arrays whose sizes are known at run time, q, p and velocity are arrays by the name of their
+    coordinate array, the shapes of q determine the sizes, and p or velocity may be omitted: the default is 0.
+
+    Attributes:
+        system: the mechanical system, with the parameter values of the run as its defaults.
+        method: its discretisation; a name, ``"svi:8"``, is converted to the method.
+        solver: of the stage equations, as of :func:`~scvi_codegen.compile_stepper`.
+        q: (m,) initial coordinates, or all variables of a first-order system, by name or in order, without p; with
+            rotations also by name, as of :meth:`Stepper.integrate`: attitudes as quaternions, matrices, Euler angles,
+            or axis and angle.
+        p: (m,) initial momenta, or ``None`` if ``velocity`` is given.
+        velocity: (m,) initial velocities, or ``None`` if ``p`` is given.
+        h, tolerance, error, span, steps, save_every, t, time_transformation, controller, precision, device, observe,
+            solver_tolerance, max_iterations, threads, action: as of
+                :class:`~scvi_codegen.interfaces.models.time_span.TimeSpan`.
+        inputs: by name a table of values, ``(t, values)`` or ``(t, values, kind)`` as :meth:`Stepper.integrate` accepts
+            it, or a number; a run requires all inputs of the system.
+        fields: arrays of parameters by name, for array sizes known at run time; others keep their default value.
+        tables: index tables of shape (rows, columns) by name, for array sizes known at run time.
+        events: zero crossings that runs record, which may change the state.
+        mesh: of the fields of a density.
+        path: ends and kind of the paths of ``scvi-codegen path``, by the keys of the section ``[path]``.
+        page: ranges of sliders, speed and plots of :func:`~scvi_codegen.page`, as its arguments.
+        picture: points, and rods, springs, walls, bodies and trails between them, as of :func:`~scvi_codegen.page`.
+
+    Raises:
+        ModelFileError: naming the field, unless exactly one of p and velocity, at most one of h, tolerance and error,
+            and exactly one of span and steps is given, each vector has m entries, and every number is finite and valid.
+            Arrays of run-time sizes are validated when a run begins.
+    """
+
+    system: MechanicalSystem
+    method: Method
+    q: Any
+    p: Any = None
+    velocity: Any = None
+    solver: str = "auto"
+    inputs: Mapping[str, InputTable | float] = field(default_factory=dict)
+    fields: Mapping[str, Any] = field(default_factory=dict)
+    tables: Mapping[str, Any] = field(default_factory=dict)
+    events: tuple[Event, ...] = ()
+    mesh: Any = field(default=None, compare=False, repr=False)
+    path: Mapping[str, Any] = field(default_factory=dict)
+    page: Mapping[str, Any] = field(default_factory=dict)
+    picture: Mapping[str, Any] = field(default_factory=dict)
+
+    __repr__ = summary("system", "method", "h", "span", "steps")
+
+    def _repr_html_(self) -> str:
+        state = [(name, getattr(self, name)) for name in STATE.values() if getattr(self, name) is not None]
+        named = {**self.inputs, **self.fields, **self.tables}
+        facts = (
+            ("method", plain(self.method.title)),
+            *((name, _vector(values)) for name, values in state),
+            ("run", listed([f"{name} = {value}" for name, value in self._run_section().items()])),
+            *([("events", listed([each.function for each in self.events]))] if self.events else []),
+            *([("inputs, arrays", listed(list(named)))] if named else []),
+        )
+        shown = Html(self.system._repr_html_()) if self.array_system is None else plain(repr(self.system))
+        return card(self.system.name, facts, shown)
+
+    def __post_init__(self) -> None:
+        check_kind(SYSTEM_OR_ARRAYS, self.system, "system", ModelFileError)
+        arrays = self.array_system
+        if arrays is not None and self.mesh is None:
+            object.__setattr__(self, "mesh", arrays.mesh)
+        object.__setattr__(self, "page", _with_lists(self.page))
+        object.__setattr__(self, "path", {key: checked_path_value(key, each) for key, each in self.path.items()})
+        object.__setattr__(self, "picture", _with_lists(self.picture))
+        object.__setattr__(self, "method", as_method(self.method, one_coordinate(arrays) if arrays else self.system))
+        if isinstance(self.system, FirstOrderSystem) and self.p is self.velocity is None:
+            for name, half in zip(("q", "p"), self.system.halves(self.q), strict=True):
+                object.__setattr__(self, name, half)
+        if arrays is None:
+            self._take_attitudes()
+            check_alternatives(self, VELOCITY)
+            if self.threads is not None:
+                raise ModelFileError(
+                    "threads require arrays whose sizes are names, coordinates = ['q[N]']: omit threads (--threads)"
+                )
+            for name in STATE.values():
+                if (vector := getattr(self, name)) is not None:
+                    object.__setattr__(self, name, self._vector(name, vector))
+        else:
+            self._take_arrays(arrays)
+        if self.time_transformation is not None and (self.system.clock is not None or self.span is None):
+            raise ModelFileError(
+                f"the reversible controller of the time transformation {self.time_transformation} requires a time "
+                "span (give span, not steps), and a system without a time transformation"
+            )
+        self._check_time_span()
+        if self.inputs:
+            from scvi_codegen.interfaces.models.input_tables import checked_tables  # not needed for reading a model
+
+            object.__setattr__(self, "inputs", checked_tables(self.system, self.inputs))
+
+    def _take_attitudes(self) -> None:
+        """Replace a state by name of rotations, directions and spins by that of all coordinates."""
+        if not (self.system.rotations and isinstance(self.q, Mapping)):
+            return
+        from scvi_codegen.runs.states.rotations import state_by_name  # not needed for other systems
+
+        try:
+            state = state_by_name(self.system, self.q, self.p, self.velocity)
+        except StateError as error:
+            raise ModelFileError(str(error)) from error
+        for name, vector in zip(STATE.values(), state, strict=True):
+            object.__setattr__(self, name, vector)
+
+    def _take_arrays(self, arrays: ArraySystem) -> None:
+        """Check the fields of a model of arrays, and supplement the values of arrays and tables by their defaults."""
+        if self.solver != "auto":
+            check_solver(self.solver, ModelFileError)
+        if self.p is not None and self.velocity is not None:
+            raise ModelFileError("give p or velocity (q_dot), not both")
+        if self.time_transformation is not None:
+            raise ModelFileError(
+                "a time transformation requires known array sizes: use that of the model with_known_sizes()"
+            )
+        for name, declared in (("fields", arrays.fields), ("tables", arrays.tables)):
+            default = {each.name: arrays.data[each.name] for each in declared if each.name in arrays.data}
+            object.__setattr__(self, name, default | dict(getattr(self, name)))
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Model):
+            return NotImplemented
+        return all(
+            _equal(getattr(self, each.name), getattr(other, each.name)) for each in fields_of(self) if each.compare
+        )
+
+    def __hash__(self) -> int:
+        return hash((self.system, self.method, self.h, self.tolerance, self.span, self.steps, self.t))
+
+    @classmethod
+    def from_problem(cls, entry: Problem, method: Method = DEFAULT_METHOD) -> Model:
+        """Return the model of a catalogue entry with a method."""
+        return cls(
+            system=entry.system,
+            method=method,
+            q=entry.q,
+            p=entry.p,
+            velocity=entry.velocity,
+            h=entry.step,
+            span=entry.span,
+        )
+
+    @property
+    def array_system(self) -> ArraySystem | None:
+        """The system if it has arrays whose sizes are known at run time only, else ``None``."""
+        return self.arrays_of(self.system)
+
+    @staticmethod
+    def arrays_of(system: Any) -> ArraySystem | None:
+        """Return a system if it has arrays whose sizes are known at run time only, else ``None``."""
+        return system if isinstance(system, ArraySystem) else None
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Array sizes known at run time, by name; empty for a system of named coordinates."""
+        if (system := self.array_system) is None:
+            return {}
+        of_rotations = {name: each.as_quat() for name, each in self.q.items() if hasattr(each, "as_quat")}
+        known = {**self.q, **self.fields, **self.tables, **of_rotations}
+        arrays = [array for array in system.arrays if array.name in known]
+        axes = [(array, np.shape(known[array.name])) for array in arrays]
+        return {size.name: length for array, shape in axes for size, length in zip(array.axes, shape) if size.name}  # noqa: B905
+
+    @property
+    def dimension(self) -> int:
+        """Number m of coordinates."""
+        return len(self.q) if self.array_system is None else sum(map(np.size, self.q.values()))
+
+    def with_known_sizes(self) -> Model:
+        """Return the model of the same motion with all array entries as named coordinates, which has every feature.
+
+        Compiling it takes time that grows with the number of coordinates.
+        """
+        if (system := self.array_system) is None:
+            return self
+        known = unroll_sums(system, self.sizes, tables=self.tables, parameters=self.fields)
+        vectors = {name: getattr(self, name) for name in STATE.values() if getattr(self, name) is not None}
+        if not system.rotations:
+            order = [array.name for array in system.coordinates]
+            vectors = {key: [x for name in order for x in np.ravel(each[name])] for key, each in vectors.items()}
+        if len(vectors) == 1 and not any(each.declaration.startswith("spin") for each in known.rotations):
+            vectors["p" if known.auxiliaries else "velocity"] = (0.0,) * known.dimension
+        changed: dict[str, Any] = {"fields": {}, "tables": {}, **vectors}
+        return replace(self, system=known, mesh=system.mesh, **changed)
+
+    @property
+    def ends_at_time(self) -> bool:
+        """True if the run ends at a time, after a number of steps that is not known in advance."""
+        return self.h is None or (self.has_time_transformation and self.span is not None)
+
+    @property
+    def has_time_transformation(self) -> bool:
+        """True if there is a time transformation, so that a step size is one in tau."""
+        return self.time_transformation is not None or self.in_transformed_time
+
+    @property
+    def in_transformed_time(self) -> bool:
+        """True if the system moves in fictitious time tau."""
+        return self.array_system is None and self.system.clock is not None
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """Parameters by name: the system's defaults, without the energy of a transformation and inputs; and fields."""
+        clock = None if self.array_system else self.system.clock
+        others = {clock.energy.name if clock else "", *input_parameters(self.system.inputs)}
+        constants = zip(self.system.parameters, self.system.defaults, strict=True)
+        return {**{symbol.name: value for symbol, value in constants if symbol.name not in others}, **self.fields}
+
+    def first_step_size(self, stepper: Stepper) -> float:
+        """Return h, or the size of the first adaptive step; with a time transformation, the step size in tau."""
+        if self.h is not None and self.time_transformation is None:
+            return self.h
+        self.all_inputs()
+        run = self.start(stepper)
+        if self.in_transformed_time:
+            return run.h
+        run.advance(1)
+        return run.t - self.t
+
+    def stepper(self) -> Stepper:
+        """Compile a stepper for runs of this model; raises as :func:`~scvi_codegen.compile_stepper`."""
+        from scvi_codegen.runs.compiler import compile_stepper  # imported here: not needed for reading a model
+
+        self._check_controller()
+        stepper = compile_stepper(
+            self.system,
+            self.method,
+            solver=self.solver,
+            time_transformation=self.time_transformation,
+            controller=self.controller,
+            precision=self.precision or "double",
+        )
+        if self.mesh is not None and stepper.interface.layout.mesh is None:
+            stepper.interface = replace(stepper.interface, layout=replace(stepper.interface.layout, mesh=self.mesh))
+        if self.action:
+            from scvi_codegen.runs.stepping.features import require  # not needed for reading a model
+
+            require(stepper, "action")
+            stepper = stepper.acting
+        return stepper.with_events(self.events) if self.events else stepper
+
+    def momenta(self, stepper: Stepper) -> Array:
+        """Return the (m,) initial momenta: ``p``, or the Legendre transform of the velocities."""
+        if self.p is not None:
+            return self.p if self.in_double_double else np.array(self.p)
+        assert self.velocity is not None  # by construction
+        return stepper.momentum(self.q, self.velocity, self.t, self.parameters_at_start(stepper))
+
+    def initial_state(self, stepper: Stepper) -> dict[str, Any]:
+        """Return the arguments of :meth:`Stepper.start` for the initial state: q, p or velocity, t, and tables."""
+        if self.array_system is None:
+            return {"q": self.q, "p": self.momenta(stepper), "t": self.t}
+        return {"t": self.t, "tables": self.tables, **{name: getattr(self, name) for name in STATE.values()}}
+
+    def parameters_at_start(self, stepper: Stepper) -> Mapping[str, Any] | Array:
+        """Return the initial parameters, including components of inputs if these are given."""
+        if not self.inputs or self.array_system is not None:
+            return self.parameters
+        from scvi_codegen.runs.driver.segments import first_inner_time
+
+        return self._inputs_and_parameters(stepper)[1](first_inner_time(self.t, self.end))
+
+    def segments(self, run: Run) -> Iterator[int | None]:
+        """Prepare a run of this model for its end, or for each segment between breakpoints of its inputs.
+
+        Yields:
+            Number of steps of the segment; ``None`` for steps up to the target time of the run.
+
+        Raises:
+            ModelFileError, StateError: for inputs that are missing, or do not cover the whole run.
+        """
+        if not self.system.inputs:
+            from scvi_codegen.runs.stepping.step_plan import Fixed, ending_at  # not needed for reading a model
+
+            if self.has_shorter_last_step or (self.in_transformed_time and self.ends_at_time):
+                run.plan = ending_at(run.plan, self.t + self.covered)
+            yield self.step_count if isinstance(run.plan, Fixed) else None
+            return
+        from scvi_codegen.runs.driver.segments import prepared_segments
+
+        inputs, values = self._inputs_and_parameters(run)
+        yield from prepared_segments(run, inputs, self.end, values)
+
+    @property
+    def end(self) -> float:
+        """Final time."""
+        from scvi_codegen.runs.driver.segments import final_time
+
+        return final_time(self.t, self.h, self.steps, None if self.span is None else self.t + self.covered)
+
+    def all_inputs(self) -> Mapping[str, InputTable | float]:
+        """Return the inputs; ModelFileError unless all inputs of the system are given."""
+        for name in self.system.inputs:
+            if name not in self.inputs:
+                way = f'[inputs] {name} = {{ file = "{name}.csv" }}, or --input {name}=FILE'
+                raise ModelFileError(f"the input {name} is not set: give {way}")
+        return self.inputs
+
+    def _inputs_and_parameters(self, integrator: Stepper | Run) -> tuple[dict[str, Input], Callable[[float], Array]]:
+        """Return the inputs, and the scalar parameters as a function of time."""
+        from scvi_codegen.runs.driver.segments import checked_inputs, parameters_at
+
+        stepper: Any = getattr(integrator, "stepper", integrator)
+        inputs = checked_inputs(stepper.interface, self.all_inputs())
+        return inputs, partial(parameters_at, stepper.parameters, stepper._parameters(self.parameters), inputs)
+
+    def start(
+        self, stepper: Stepper | None = None, *, options: SolverOptions | None = None, threads: int | None = None
+    ) -> Run:
+        """Start the run of this model at its initial state, to be advanced by its :meth:`segments` or to its end.
+
+        Args:
+            stepper: that of :meth:`stepper`, which is compiled by default.
+            options: convergence criterion of the solver; by default :attr:`solver_options`.
+            threads: number of threads per step, for array sizes known at run time; by default those of the model.
+        """
+        self._check_alone()
+        stepper = stepper or self.stepper()
+        state, h, common = self.initial_state(stepper), self.h, self._common(options, threads)
+        control = {"tolerance": self.tolerance, **self._control}
+        if self.error is not None:
+            result = self.confirmed(stepper, options=options, threads=threads)
+            h, control = result.steps.get("h"), control | result.steps
+            if result.precision != "double":
+                stepper = stepper._in_double_double or stepper
+        elif h is None and self.has_time_transformation:
+            from scvi_codegen.analysis.advice.largest_step import largest_step  # imported here: not needed for reading
+
+            if self.system.inputs:
+                raise ModelFileError(
+                    "with inputs, a step size in tau cannot be found by a pilot run: give one (--step, [run] step)"
+                )
+            arguments: dict[str, Any] = {"t": self.t, "parameters": self.parameters, "options": common["options"]}
+            h = largest_step(stepper, self.q, state["p"], self.covered, self.tolerance or 0.0, **arguments)
+        to_end = h is None or self.time_transformation is not None
+        return stepper.start(
+            **state,
+            **control | {"h": abs(h) if h is not None and to_end else h} | ({} if h is None else {"tolerance": None}),
+            t_end=self.t + self.covered if to_end else None,
+            parameters=self.parameters_at_start(stepper),
+            **common,
+        )
+
+    def confirmed(
+        self, stepper: Stepper, *, options: SolverOptions | None = None, threads: int | None = None
+    ) -> GlobalError:
+        """Return the local tolerance (or step of tau) for :attr:`error`, confirmed by runs with other steps.
+
+        A run with it is bitwise equal to the one that was confirmed.
+        """
+        arguments = {**self.initial_state(stepper), **self._common(options, threads), "parameters": self.parameters}
+        if self.system.inputs:
+            arguments["inputs"] = self.all_inputs()
+        span = {"t_end": self.t + self.covered, "error": self.error, **self._control}
+        trajectory: Trajectory = stepper.integrate(**arguments, **span)
+        assert trajectory.confirmation is not None  # by construction
+        return trajectory.confirmation
+
+    def integrate(self, *, progress: Callable[[int], None] | None = None, threads: int | None = None) -> Trajectory:
+        """Integrate over the whole span; raises as :meth:`Stepper.integrate`."""
+        self._check_alone()
+        stepper, arguments = self.stepper(), self._run_arguments()
+        if self.h is None and self.has_time_transformation and self.error is None:
+            from scvi_codegen.runs.stepping.step_plan import InTau  # not needed for reading a model
+
+            run = self.start(stepper)
+            plan = run.plan
+            arguments |= {"h": plan.tau if isinstance(plan, InTau) else run.h, "tolerance": None}
+        arguments |= {**self.initial_state(stepper), **self._common(None, threads), "parameters": self.parameters}
+        trajectory: Trajectory = stepper.integrate(**arguments, progress=progress)
+        return trajectory
+
+    def _run_arguments(self) -> dict[str, Any]:
+        """Return the arguments of :meth:`Stepper.integrate` and ensembles for time, steps, saved states and inputs."""
+        others = ("span", "threads", "action")  # and choices, which are arguments of the stepper
+        arguments = {
+            option.field: getattr(self, option.field)
+            for option in RUN_FIELDS
+            if option.field not in others and not option.solver_option
+        }
+        if self.system.inputs:
+            arguments["inputs"] = self.all_inputs()
+        if self.ends_at_time or self.has_shorter_last_step or (self.system.inputs and self.span is not None):
+            if self.h is not None and self.time_transformation is not None:
+                arguments["h"] = abs(self.h)  # the end determines the direction
+            return arguments | {"t_end": self.t + self.covered, "steps": None}
+        return arguments | {"steps": self.step_count}
+
+    def _common(self, options: SolverOptions | None, threads: int | None) -> dict[str, Any]:
+        options, threads = options or self.solver_options, threads or self.threads
+        if threads is not None and self.array_system is None:
+            raise ModelFileError("threads require arrays whose sizes are names, coordinates = ['q[N]']: omit threads")
+        return {"options": options} if threads is None else {"options": options, "threads": threads}
+
+    def _vector(self, name: str, values: Sequence[float]) -> tuple[float, ...]:
+        names = [coordinate.name for coordinate in self.system.coordinates]
+        if not isinstance(values, Iterable):
+            raise ModelFileError(f"{name} must be {len(names)} numbers, not {values!r}")
+        values = tuple(values)
+        check_length(values, names, name)
+        if self.in_double_double:
+            values = tuple(with_exact_numbers(values))
+        return tuple(real(value, f"{name}[{i}] ({names[i]})") for i, value in enumerate(values))
+
+
+def _vector(values: Any) -> Html:
+    """Return a vector, or arrays by name, for a card."""
+    if isinstance(values, Mapping):
+        return listed([f"{name} of shape {np.shape(value)}" for name, value in values.items()])
+    return listed([f"{float(value):g}" for value in values])
+
+
+def _with_lists(value: Any) -> Any:
+    """Return a value with lists for tuples, as in model files."""
+    if isinstance(value, Mapping):
+        return {name: _with_lists(each) for name, each in value.items()}
+    return [_with_lists(each) for each in value] if isinstance(value, list | tuple) else value
+
+
+def _equal(one: Any, other: Any) -> bool:
+    """Return whether two values are equal, arrays and mappings of arrays by their entries."""
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        return one.keys() == other.keys() and all(_equal(each, other[name]) for name, each in one.items())
+    if hasattr(one, "shape") or hasattr(other, "shape"):
+        return np.array_equal(one, other)
+    return bool(one == other)

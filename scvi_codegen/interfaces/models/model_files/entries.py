@@ -1,0 +1,110 @@
+"""Systems that a section ``[system]`` names instead of writing them out: of the catalogue, and of robots' files."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from scvi_codegen.common.atomic import inside
+from scvi_codegen.common.errors import ModelFileError
+from scvi_codegen.interfaces.models.model import Model
+from scvi_codegen.interfaces.models.model_files.document import motion_of
+from scvi_codegen.interfaces.models.model_files.sections import Document, Section, check_keys, in_section, text_of
+from scvi_codegen.interfaces.models.options import STATE
+from scvi_codegen.interfaces.models.problems import problem
+from scvi_codegen.methods.galerkin import SVI
+from scvi_codegen.systems.lagrangian import LagrangianSystem
+from scvi_codegen.systems.system import MechanicalSystem
+
+CHANGES = ("time_transformation", "eliminate_constraints")
+"""Keys beside ``catalogue`` and ``robot``."""
+ROBOT_KEYS = ("robot", "name", "actuated", *CHANGES)
+URDF_KEYS = ("floating", "gravity")
+URDF = ".urdf"
+ROBOT_FILES = (URDF, ".xml", ".mjcf")
+"""Suffixes of robots' files, which are models by themselves."""
+METHOD, STEP, SPAN = SVI(3), 0.005, 10.0
+"""Method, step size and span of a robot without ``[method]`` and ``[run]``."""
+
+
+class Entry(NamedTuple):
+    """System that a file names, and the sections of its default motion."""
+
+    system: MechanicalSystem
+    motion: Document
+
+    def completed(self, initial: Section) -> dict[str, Any]:
+        """Return an initial state that was merged over that of the entry: tables by name change a part of it."""
+        default = self.motion["initial"]
+        changed = {key: initial[key] for key in STATE if key in initial and initial[key] is not default.get(key)}
+        tables = {
+            key: default[key] | each for key, each in changed.items() if isinstance(each, dict) and key in default
+        }
+        if self.system.rotations and any(isinstance(each, list) for each in changed.values()):
+            from scvi_codegen.runs.states.rotations import state_by_name  # not needed for other systems
+
+            rest = state_by_name(self.system, default["q"], None, default["q_dot"])
+            vectors = {key: each.tolist() for key, each in zip(STATE, rest, strict=True) if each is not None}
+            tables |= {key: each for key, each in vectors.items() if initial.get(key) is default[key]}
+        return {**initial, **tables}
+
+
+def read_entry(section: Section, folder: str | os.PathLike[str]) -> Entry | None:
+    """Return the system that a section ``[system]`` names, if it names one.
+
+    Raises:
+        ModelFileError: for other keys than those of the entry, an unknown name and a file that is no robot.
+    """
+    if "catalogue" in section:
+        check_keys(section, ("catalogue", *CHANGES), "key", "[system] beside catalogue")
+        entry = in_section("[system]", lambda: problem(text_of(section, "catalogue", "[system]")))
+        return Entry(
+            entry.system, motion_of(Model.from_problem(entry), [each.name for each in entry.system.coordinates])
+        )
+    return _robot(section, Path(folder)) if "robot" in section else None
+
+
+def is_robot(path: str | os.PathLike[str]) -> bool:
+    """Return whether a file is that of a robot, by its suffix."""
+    return Path(path).suffix.lower() in ROBOT_FILES
+
+
+def _robot(section: Section, folder: Path) -> Entry:
+    """Return the system of a URDF or MJCF file, at rest in its reference configuration."""
+    name = text_of(section, "robot", "[system]")
+    try:
+        path = inside(folder, name)
+    except OSError as error:
+        raise ModelFileError(f"[system] robot = '{name}' cannot be read: {error.strerror}") from error
+    urdf = path.suffix.lower() == URDF
+    check_keys(section, (*ROBOT_KEYS, *URDF_KEYS * urdf), "key", f"[system] beside robot = {path.name!r}")
+    arguments: dict[str, Any] = {key: section[key] for key in ("name", "actuated", *URDF_KEYS) if key in section}
+    if not isinstance(arguments.get("floating", False), bool):
+        raise ModelFileError(f"[system] floating must be true or false, not {arguments['floating']!r}")
+    if "name" in arguments:
+        text_of(section, "name", "[system]")
+    read: Any = LagrangianSystem.from_urdf if urdf else LagrangianSystem.from_mjcf
+    system = in_section("[system] robot", lambda: read(path, **arguments))
+    q: dict[str, Any] = {}
+    rates: dict[str, Any] = {}
+    for link in system.links:
+        if link.kind == "free":
+            q |= {f"{axis}_{link.name}": each for axis, each in zip("xyz", link.position, strict=True)}
+            rates |= {f"{axis}_{link.name}": 0.0 for axis in "xyz"}
+        if link.kind in ("free", "ball"):
+            turned = [list(row) for row in link.rotation]
+            q[f"R_{link.name}"] = (
+                [1.0, 0.0, 0.0, 0.0] if link.kind == "ball" or turned == np.eye(3).tolist() else turned
+            )
+            rates[f"omega_{link.name}"] = [0.0, 0.0, 0.0]
+        elif link.follows is None:
+            q[link.name], rates[link.name] = link.zero, 0.0
+    motion = {
+        "initial": {"q": q, "q_dot": rates},
+        "method": METHOD.specification(),
+        "run": {"span": SPAN, "step": STEP},
+    }
+    return Entry(system, motion)

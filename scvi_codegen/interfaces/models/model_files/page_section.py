@@ -1,0 +1,96 @@
+"""Sections ``[page]`` and ``[picture]`` of model files: sliders, speed and plots of a page, and what is drawn."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from scvi_codegen.common.errors import ModelFileError
+from scvi_codegen.interfaces.models.model import Model
+from scvi_codegen.interfaces.models.model_files.sections import Section, check_keys
+from scvi_codegen.interfaces.models.options import real
+from scvi_codegen.interfaces.pictures.shape import MARKS, DrawnSystem, shape_of_picture
+from scvi_codegen.systems.hamiltonian import HamiltonianSystem
+
+PAGE_KEYS = ("ranges", "speed", "plots")
+PICTURE_KEYS = ("points", "fields", *MARKS)
+
+
+def starts_from_momenta(model: Model) -> bool:
+    """Return whether a page starts from momenta instead of velocities: of a Hamiltonian, and in transformed time."""
+    if model.array_system is not None:
+        return model.p is not None
+    return model.in_transformed_time or (isinstance(model.system, HamiltonianSystem) and not model.system.rotations)
+
+
+def slider_names(model: Model) -> list[str]:
+    """Return the names of sliders: scalar parameters, inputs, coordinates without rotations, velocities or momenta."""
+    names = [name for name, value in model.parameters.items() if np.ndim(value) == 0]
+    names += getattr(model.system, "inputs", ())
+    if model.array_system is not None or model.mesh is not None:
+        return names
+    turning = {name for each in model.system.rotations for name in each.coordinates}
+    free = [each.name for each in model.system.coordinates if each.name not in turning]
+    if starts_from_momenta(model):
+        momenta = getattr(model.system, "momenta", None) or [f"p_{name}" for name in free]
+        return [*names, *free, *map(str, momenta)]
+    return [*names, *free, *(f"{name}_dot" for name in free)]
+
+
+def check_page(section: Section, model: Model, where: str = "[page]") -> None:
+    """Raise ModelFileError for unknown keys and sliders, and values of the wrong form.
+
+    A range need not contain the value of its parameter, which options of the command line change, and names of plots
+    are known when the page is made: see :func:`scvi_codegen.page`.
+    """
+    check_keys(section, PAGE_KEYS, "key", where)
+    ranges = section.get("ranges", {})
+    if not isinstance(ranges, dict):
+        raise ModelFileError(f"{where} ranges must be a table, {{ v = [0.1, 0.9] }}, not {ranges!r}")
+    check_keys(ranges, slider_names(model), "slider", f"{where} ranges")
+    for name, limits in ranges.items():
+        place = f"{where} ranges {name}"
+        if not isinstance(limits, list | tuple) or len(limits) != 2:
+            raise ModelFileError(f"{place} must be two numbers, [lowest, highest], not {limits!r}")
+        low, high = (real(each, place) for each in limits)
+        if not low < high:
+            raise ModelFileError(f"{place} is {low:g} .. {high:g}: the first number must be less than the second")
+    if real(section.get("speed", 1.0), f"{where} speed") <= 0:
+        raise ModelFileError(f"{where} speed is {section['speed']:g}: it must be positive")
+    plots: Any = section.get("plots", [])
+    pairs = isinstance(plots, list | tuple) and all(isinstance(each, list | tuple) and len(each) == 2 for each in plots)
+    if not pairs or not all(isinstance(name, str) for each in plots for name in each):
+        raise ModelFileError(f'{where} plots must be pairs of names, [["t", "energy"]], not {plots!r}')
+
+
+def drawn_system_of_model(model: Model) -> DrawnSystem:
+    """Return what formulas of a picture may use of a model: names of coordinates, momenta, parameters and rotations."""
+    system, scalars = model.system, [name for name, value in model.parameters.items() if np.ndim(value) == 0]
+    if model.array_system is not None:
+        interface = SimpleNamespace(coordinates=[], parameters=scalars, rotations=[], constraints=[], map_names=[])
+        lengths = [length for each in model.array_system.neighbours for length in each.lengths]
+        sized = {name: np.shape(values) for name, values in model.q.items()}
+        return DrawnSystem(
+            interface=interface, momenta=[], shapes=sized, mesh=model.mesh, lengths=lengths, tables=model.tables
+        )
+    interface = SimpleNamespace(
+        coordinates=[each.name for each in system.coordinates], parameters=[each.name for each in system.parameters],
+        rotations=[each.declaration for each in system.rotations], constraints=[], map_names=[],
+    )  # fmt: skip
+    momenta, links = [each.name for each in system.momentum_symbols], getattr(system, "links", ())
+    shapes: dict[str, tuple[int, ...]] = {}
+    for array in system.arrays:
+        if sum(map(math.prod, shapes.values())) < system.dimension:
+            shapes[array.name] = array.shape({})
+    return DrawnSystem(
+        interface=interface, momenta=momenta, shapes=shapes, mesh=model.mesh, links=links, lengths=system.lengths
+    )
+
+
+def check_picture(model: Model) -> None:
+    """Raise ModelFileError for mistakes in the section ``[picture]`` of a model."""
+    if model.picture:
+        shape_of_picture(drawn_system_of_model(model), model.picture, "[picture]")

@@ -1,0 +1,384 @@
+"""Sections of model files: merging, validation of keys, methods, systems with their forces, hints for unknown keys."""
+
+import os
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from itertools import chain
+from typing import Any, Final, TypeVar
+
+from scvi_codegen.common.atomic import read_text
+from scvi_codegen.common.errors import ModelFileError, ScviCodegenError, closest
+from scvi_codegen.common.validation import FORMULA, checked_count, likely_names, synonym_hint
+from scvi_codegen.interfaces.models.model import DEFAULT_METHOD
+from scvi_codegen.interfaces.models.options import (
+    ALTERNATIVE_KEYS,
+    FIELDS,
+    KEYED,
+    STEP_KEYS,
+    SWITCH,
+    alternatives,
+    options_of,
+    real,
+)
+from scvi_codegen.methods import ARGUMENTS, Method, method_from_specification, sized, specification_of
+from scvi_codegen.systems.event import Event
+from scvi_codegen.systems.first_order import FirstOrderSystem
+from scvi_codegen.systems.hamiltonian import HamiltonianSystem
+from scvi_codegen.systems.lagrangian import LagrangianSystem
+from scvi_codegen.systems.legendre.transform import lagrangian_of
+from scvi_codegen.systems.system import MechanicalSystem
+
+KEYS: Final = {
+    "system": "lagrangian hamiltonian damping dissipation constraints time_transformation inputs",
+    "field": "density space boundary discretisation",
+}
+EVENT_KEYS: Final = ("function", "direction", "terminal", "then", "where", "restitution")
+NAMED_SECTIONS: Final = ("parameters", "forces", "torques", "torques_space", "initial", "run")
+LOCATIONS: Final = {
+    **{option.key: f"'{option.key}' belongs in [{option.section}]" for option in KEYED},
+    **{key: f"'{key}' belongs in [{section}]" for section, keys in KEYS.items() for key in keys.split()},
+    **{key: f"there is a section [{key}]" for key in NAMED_SECTIONS},
+}
+"""Location of each key in a model file."""
+
+
+def key_hint(key: str, names: Iterable[str]) -> str:
+    """Return ``"; did you mean 'step'?"`` or ``"; it belongs in [run], as 'step'."``, or a full stop.
+
+    Args:
+        key: the unknown key.
+        names: known keys of its section.
+    """
+    known = list(names)
+    if here := synonym_hint(key, known):
+        return here
+    if key not in LOCATIONS and (hint := closest(key, known)) != ".":
+        return hint
+    locations = [LOCATIONS[name] for name in ([key] if key in LOCATIONS else likely_names(key)) if name in LOCATIONS]
+    return f"; {locations[0]}." if locations else "."
+
+
+Built = TypeVar("Built")
+Section = Mapping[str, Any]
+Document = Mapping[str, Section]
+
+ALTERNATIVES = ({"lagrangian", "hamiltonian"}, {"density", "hamiltonian"}, *ALTERNATIVE_KEYS)
+"""Groups of alternative keys, of which one is given."""
+INHERITED = ("degree", "quadrature", "nodes", "stages")
+"""Arguments of a method that are inherited when another method is merged over it, if that accepts them."""
+
+
+def chosen_method(document: Document, changes: Document) -> Section:
+    """Return the method of a file, or the default one, with the given changes."""
+    default: Section = DEFAULT_METHOD.specification()
+    section = {**document.get("system", {}), **changes.get("system", {})}
+    if section.get("constraints") and not section.get("eliminate_constraints"):
+        default = {"method": "svi", "degree": 6}
+    base = _split_method_name(document.get("method", default))
+    return _changed_method(base, _split_method_name(changes.get("method", {})))
+
+
+def merged_sections(below: Document, above: Document) -> dict[str, Section]:
+    """Return all sections merged; keys in ``above`` replace those in ``below`` and their alternatives."""
+    document: dict[str, Any] = dict(below)
+    for name, section in above.items():
+        if name == "events":
+            document[name] = [*below.get(name, ()), *section]
+            continue
+        replaced = {key for keys in ALTERNATIVES if not keys.isdisjoint(section) for key in keys}
+        base_section = {} if name == "method" else below.get(name, {})
+        document[name] = {key: value for key, value in base_section.items() if key not in replaced} | dict(section)
+    return document
+
+
+def _split_method_name(section: Section) -> Section:
+    """Return a method section with a name such as ``svi:6`` split into name and degree."""
+    name = section.get("method")
+    if not isinstance(name, str) or ":" not in name:
+        return section
+    spelt = in_section("[method]", lambda: specification_of(name))
+    for key, value in spelt.items():
+        if key != "method" and section.get(key, value) != value:
+            raise ModelFileError(f"[method] method = {name!r} and {key} = {section[key]!r} contradict each other")
+    return {**section, **spelt}
+
+
+def _changed_method(base: Section, changes: Section) -> Section:
+    """Return a method with some arguments changed; another method inherits common arguments."""
+    if not changes:
+        return base
+    base_section = dict(base)
+    if base_section.get("quadrature") == f"gauss-legendre:{base_section.get('degree')}":
+        del base_section["quadrature"]  # the default for its degree; another degree has another default
+    name = changes.get("method", base_section.get("method"))
+    if name != base_section.get("method"):
+        accepted = ARGUMENTS.get(name, ())
+        base_section = {key: value for key, value in base_section.items() if key in INHERITED and key in accepted}
+    for option in options_of("method"):  # a switch is named otherwise on the command line
+        if option.kind == SWITCH and option.key in changes and option.key not in ARGUMENTS.get(name, (option.key,)):
+            takers = " or ".join(other for other in ARGUMENTS if option.key in ARGUMENTS[other])
+            raise ModelFileError(f"{option.flag} is for the method {takers}, not for {name}: omit it")
+    if {"abscissae", "space"} & changes.keys():
+        base_section.pop("nodes", None)  # alternatives to nodes
+    return sized({**base_section, **changes}) if "method" in changes else {**base_section, **changes}
+
+
+def text_in(path: str | os.PathLike[str], encoding: str, name: object = None) -> str:
+    """Return the text of a file; :class:`ModelFileError` begins with its ``name``, by default the path."""
+    try:
+        return read_text(path, encoding)
+    except OSError as error:
+        raise ModelFileError(f"{name or path} cannot be read: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        problem = f"is not a text file in UTF-8: {error.reason} at byte {error.start}"
+        raise ModelFileError(f"{name or path} {problem}") from error
+
+
+def read_method(section: Section) -> Method:
+    """Return the method of the section ``[method]``."""
+    if "method" not in section:
+        check_keys(section, dict.fromkeys(["method", *chain.from_iterable(ARGUMENTS.values())]), "key", "[method]")
+    name = text_of(section, "method", "[method]")
+    if name in ARGUMENTS:
+        check_keys(section, ("method", *ARGUMENTS[name]), "key", f"[method] for {name}")
+    if not isinstance(section.get("variational", True), bool):
+        raise ModelFileError(f"[method] variational must be true or false, not {section['variational']!r}")
+    if not isinstance(section.get("abscissae", []), list | str):
+        raise ModelFileError(f"[method] abscissae must be a list of numbers or a name, not {section['abscissae']!r}")
+    return in_section("[method]", lambda: method_from_specification(section))
+
+
+def names_of(section: Section, key: str) -> list[str]:
+    """Return a list of names in ``[system]``."""
+    names = required(section, key, "[system]")
+    if not isinstance(names, list) or not all(isinstance(item, str) for item in names):
+        raise ModelFileError(f"[system] {key} must be a list of names, not {names!r}")
+    return names
+
+
+def check_one(section: Section, name: str, one: str, other: str) -> None:
+    """Raise an error if two alternative keys are both given."""
+    if one in section and other in section:
+        raise ModelFileError(f"[{name}] has both {one} and {other}: give one of them")
+
+
+def required(section: Section, key: str, where: str) -> Any:
+    """Return the value of a key."""
+    if key not in section:
+        raise ModelFileError(f"{where} lacks '{key}'")
+    return section[key]
+
+
+def text_of(section: Section, key: str, where: str) -> str:
+    """Return the text value of a key."""
+    value = required(section, key, where)
+    if not isinstance(value, str):
+        raise ModelFileError(f"{where} {key} must be text between quotes, not {value!r}")
+    return value
+
+
+def formula_of(section: Section, key: str, where: str) -> str:
+    """Return the formula value of a key, which is text or a number."""
+    if not FORMULA.accepts(required(section, key, where)):
+        raise ModelFileError(f"{where} {key} must be a formula between quotes or a number, not {section[key]!r}")
+    return str(section[key])
+
+
+def check_keys(section: Section, known: Iterable[str], kind: str, where: str = "the file") -> None:
+    """Raise an error for unknown keys."""
+    names = list(known)
+    hint = key_hint if kind in ("key", "section") else closest
+    for key in section:
+        if key not in names:
+            where_else = hint(key, names)
+            if f"belongs in {where.split(' ')[0]}" in where_else:  # a key of other methods than the present one
+                where_else = "."
+            raise ModelFileError(
+                f"unknown {kind} '{key}' in {where}{where_else} Known: {', '.join(dict.fromkeys(names))}"
+            )
+
+
+def in_section(where: str, build: Callable[[], Built]) -> Built:
+    """Return ``build()``, with errors prefixed by the location in the file."""
+    try:
+        return build()
+    except (ScviCodegenError, TypeError) as error:
+        raise ModelFileError(f"{where}: {error}") from error
+
+
+def read_run(section: Section) -> dict[str, Any]:
+    """Return the fields of a model in ``[run]``; adaptive steps without a step size."""
+    section = {key: value for key, value in section.items() if value is not None}
+    for one, other in alternatives("run"):
+        check_one(section, "run", one.key, other.key)
+    if not STEP_KEYS & section.keys() and "steps" in section:
+        raise ModelFileError("[run] has steps but no step: give the step size")
+    fields = [option for option in options_of("run") if option in FIELDS and option.key in section]
+    numbers = {option.field: option.read(section[option.key], f"[run] {option.key}") for option in fields}
+    return {**numbers, **{name: section.get(name) for name in ("precision", "device", "observe")}}
+
+
+FORMULAS = ("lagrangian", "hamiltonian", "dissipation", "damping", "constraints")
+TURNING = ("rotations", "directions", "spins")
+"""Keys of [system] that declare coordinates of another kind."""
+TORQUES = ("torques", "torques_space")
+"""Sections with three formulas by rotation, in the body frame and in the space frame."""
+REQUIRED = {
+    "field": ("name", "fields", "space", "density", "discretisation"),
+    "system": ("name", "coordinates", "lagrangian"),
+    "initial": ("q", "q_dot"),
+    "run": ("span",),
+}
+"""Required keys, or their alternatives; [field] is in the place of [system]."""
+
+
+def has_arrays(document: Document, sizes: str = r"\w") -> bool:
+    """Return whether coordinates, rotations, directions or spins are arrays, with sizes that contain a pattern."""
+    groups = [document.get("system", {}).get(key) for key in ("coordinates", *TURNING)]
+    names = chain(*(each for each in groups if isinstance(each, list | dict)))
+    return any(isinstance(name, str) and re.search(rf"\[.*{sizes}", name) for name in names)
+
+
+def is_number(value: Any) -> bool:
+    """Return whether the value of an array is one number for all entries."""
+    return not isinstance(value, str | list | dict)
+
+
+def check_complete(document: Document) -> None:
+    """Raise an error that lists all missing keys; arrays whose sizes are names are at rest by default."""
+    missing = []
+    for name, keys in REQUIRED.items():
+        for key in () if name == ("system" if "field" in document else "field") else keys:
+            choice = next((choice for choice in ALTERNATIVES if key in choice), {key})
+            if choice.isdisjoint(document.get(name, {})) and not _is_optional(document, key):
+                missing.append(f"{' or '.join(sorted(choice))} in [{name}]")
+    if missing == ["p or q_dot in [initial]"] and isinstance(read_system(document), FirstOrderSystem):
+        return
+    if missing:
+        at_rest = "p or q_dot in [initial]" in missing
+        rest = "; for a start from rest write q_dot = [0.0, ..], or --velocity 0,.." if at_rest else ""
+        raise ModelFileError(f"there is no {', no '.join(missing)}{rest}")
+
+
+def _is_optional(document: Document, key: str) -> bool:
+    """Return whether a required key may be missing: velocities of arrays and spins, coordinates beside rotations."""
+    section = document.get("system", {})
+    if key == "coordinates":
+        return not section.keys().isdisjoint(TURNING)
+    return key == "q_dot" and ("field" in document or has_arrays(document, "[A-Za-z_]") or "spins" in section)
+
+
+def check_used(document: Document, parameters: Section) -> None:
+    """Raise an error for an added parameter that no formula contains."""
+    used = words_of(document)
+    for name in parameters:
+        if name not in used:
+            raise ModelFileError(f"the system has no parameter '{name}'")
+
+
+def words_of(document: Document) -> set[str]:
+    """Return the names in all formulas of a model file, also of events, the initial state, inputs and parameters."""
+
+    def texts(value: Any) -> Iterator[str]:
+        if isinstance(value, str):
+            yield value
+        elif isinstance(value, dict | list | tuple):
+            for each in value.values() if isinstance(value, dict) else value:
+                yield from texts(each)
+
+    sections = {name: section for name, section in document.items() if name not in ("method", "run", "path", "page")}
+    for name in {"system", "field"} & sections.keys():
+        sections[name] = {key: value for key, value in sections[name].items() if key != "name"}
+    return {word for text in texts(sections) for word in re.findall(r"[A-Za-z_]\w*", text)}
+
+
+def read_events(entries: Any) -> tuple[Event, ...]:
+    """Return the events of the tables ``[[events]]``."""
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise ModelFileError(f"events must be tables, [[events]], not {entries!r}")
+    events = []
+    for entry in entries:
+        check_keys(entry, EVENT_KEYS, "key", "[[events]]")
+        direction = {"direction": -1} if "restitution" in entry else {}
+        where = f"[[events]] function = {required(entry, 'function', '[[events]]')!r}"
+        events.append(in_section(where, lambda entry=entry, direction=direction: Event(**direction | entry)))  # type: ignore[misc]
+    return tuple(events)
+
+
+def event_entry(text: str) -> dict[str, Any]:
+    """Return the table of an event on one line, ``"y; direction=-1; where=x > 1; p_y=-e*p_y"``."""
+    function, *settings = map(str.strip, text.split(";"))
+    entry: dict[str, Any] = {"function": function}
+    for setting in settings:
+        name, equals, value = map(str.strip, setting.partition("="))
+        if not equals or not value:
+            raise ModelFileError(f"'{setting}' in the event '{text}' is not of the form NAME=VALUE, as in p_y=-p_y")
+        if name in ("direction", "terminal"):
+            entry[name] = checked_count(int(value) if value.lstrip("-").isdigit() else value, name, least=-1)
+        elif name in EVENT_KEYS:
+            entry[name] = value
+        else:
+            entry.setdefault("then", {})[name] = value
+    return entry
+
+
+def read_system(document: Document, named: MechanicalSystem | None = None) -> MechanicalSystem:
+    """Return the system of a file, ``named`` if it names one, with the values of its scalar parameters."""
+    forces, values = document.get("forces", {}), _scalars(document)
+    if named is not None:
+        if forces:
+            raise ModelFileError(
+                "[forces] are not supported for a system of the catalogue or of a robot: write it out in [system]"
+            )
+        return in_section("[parameters]", lambda: named.with_parameters(**values))
+    section = document["system"]
+    check_one(section, "system", "lagrangian", "hamiltonian")
+    arguments: dict[str, Any] = {
+        "name": text_of(section, "name", "[system]"),
+        "coordinates": names_of(section, "coordinates") if "coordinates" in section else (),
+        **_turning(document),
+        "parameters": values,
+        "forces": {key: formula_of(forces, key, "[forces]") for key in forces},
+        "damping": formula_of(section, "damping", "[system]") if "damping" in section else None,
+        "inputs": names_of(section, "inputs") if "inputs" in section else (),
+        "tables": list(document.get("tables", {})),
+        "neighbours": section.get("neighbours"),
+    }
+    constraints = names_of(section, "constraints") if "constraints" in section else ()
+    if "hamiltonian" in section:
+        if "dissipation" in section:
+            raise ModelFileError(
+                "[system] has a dissipation, in velocities, and a hamiltonian: write the forces in [forces] instead"
+            )
+        arguments["hamiltonian"] = text_of(section, "hamiltonian", "[system]")
+        arguments["momenta"] = names_of(section, "momenta") if "momenta" in section else None
+        hamiltonian = in_section("[system]", lambda: HamiltonianSystem.from_text(**arguments))
+        if not constraints:
+            return hamiltonian
+        return in_section("[system]", lambda: lagrangian_of(hamiltonian, constraints=constraints))
+    if "momenta" in section:
+        raise ModelFileError(
+            "[system] has momenta and a lagrangian: momenta are names for a hamiltonian; leave them out"
+        )
+    arguments["lagrangian"] = text_of(section, "lagrangian", "[system]")
+    arguments["point_forces"] = section.get("point_forces", ())
+    arguments["dissipation"] = text_of(section, "dissipation", "[system]") if "dissipation" in section else None
+    return in_section("[system]", lambda: LagrangianSystem.from_text(**arguments, constraints=constraints))
+
+
+def _turning(document: Document) -> dict[str, Any]:
+    """Return the arguments that declare rotations, directions, spins and torques."""
+    arguments = {key: document["system"][key] for key in TURNING if key in document["system"]}
+    for key in TORQUES:
+        if document.get(key):
+            arguments[key] = {name: list(map(str, formulas)) for name, formulas in document[key].items()}
+    return arguments
+
+
+def _scalars(document: Document) -> dict[str, float]:
+    """Return the values of scalar parameters and of uniform arrays; 1 for other arrays, which are read separately."""
+    parameters = document.get("parameters", {})
+    return {
+        key: real(value, f"[parameters] {key}") if "[" not in key or is_number(value) else 1.0
+        for key, value in parameters.items()
+    }

@@ -1,0 +1,454 @@
+"""Pages that move: a model as one HTML file with its generated C, compiled to WebAssembly, and controls.
+
+:func:`page` generates the C of a model, compiles it with the functions of ``templates/page/entry.c.jinja``, and renders
+``templates/page``. The file needs no network, and evaluates no text as code.
+"""
+
+from __future__ import annotations
+
+import html
+import json
+import math
+import os
+import re
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import sympy
+
+from scvi_codegen.codegen.rendering.environment import template_environment
+from scvi_codegen.common.atomic import write_text
+from scvi_codegen.common.display.mathml import mathml_terms
+from scvi_codegen.common.errors import ArgumentError, ExpressionError, MethodError, StateError, closest
+from scvi_codegen.common.representation import summary
+from scvi_codegen.common.validation import ArgumentType, checks_arguments, keyword_hint
+from scvi_codegen.interfaces.models.model import DEFAULT_METHOD, Model
+from scvi_codegen.interfaces.models.model_files.document import document_of
+from scvi_codegen.interfaces.models.model_files.model_file import document_in, load_model
+from scvi_codegen.interfaces.models.model_files.page_section import (
+    check_page,
+    check_picture,
+    drawn_system_of_model,
+    starts_from_momenta,
+)
+from scvi_codegen.interfaces.models.packages.package import generate_package
+from scvi_codegen.interfaces.pages.webassembly import LICENCES, check_compiler, webassembly
+from scvi_codegen.interfaces.pictures.recognition import shape_of
+from scvi_codegen.interfaces.pictures.shape import DrawnSystem, shape_of_picture
+from scvi_codegen.systems.arrays.system import SYSTEM_OR_ARRAYS
+from scvi_codegen.systems.formulas.grammar import parse_expression
+from scvi_codegen.systems.formulas.rotations import Rotation, RotationNames, Spin
+from scvi_codegen.systems.formulas.symbols import input_parameters, symbol
+from scvi_codegen.version import __version__
+
+CAUSES = (
+    "",
+    "The step failed: the iteration on the stage equations did not converge. Use a smaller step size.",
+    "The step failed: a matrix is singular. Check that no mass is 0.",
+    "The step failed: a value is infinite or undefined. Use other values, or a smaller step size.",
+    "The step size fell below machine precision, as near a collision. Use other initial values.",
+    "The step failed: the iteration converged to a spurious solution. Use a smaller step size.",
+    "",
+    "The step failed: a wall is passed without an impact. Use a smaller step size.",
+    "The step failed: the changes of the state by events do not end. Use other initial values.",
+    "The initial state is behind a wall. Use other initial values.",
+    "The step failed: it has too many events. Use a smaller step size.",
+)
+"""Text of each status of the generated C, then of ``entry.c.jinja``."""
+ARRAY = re.compile(r"(\w+)\[")
+NAME = re.compile(r"[A-Za-z_]\w*\b(?!\()")
+INDENTED = re.compile(r"^[ \t]+|^[ \t]*//.*\n|^[ \t]*/\*\* .* \*/\n", re.MULTILINE)
+"""Indentation and comments of the scripts, which a page omits."""
+LONG_NUMBER = re.compile(r"\d{12}")
+"""Numbers of robots from files, with which a Lagrangian is not shown."""
+SECONDS = 30
+"""Duration of the span of a model at the speed that a page begins with, unless time is in seconds or so."""
+STEPS = 1000
+"""Default number of steps of the span, from which the speed follows, of step sizes far from seconds."""
+HEIGHT = 760
+"""Height of a page in a notebook, in pixels."""
+WHOLE = 24
+"""Number of coordinates up to which plots show each of them; of more, two nodes."""
+MODEL = ArgumentType(
+    "a Model, a system or the path of a model file",
+    lambda value: isinstance(value, Model | str | os.PathLike) or SYSTEM_OR_ARRAYS.accepts(value),
+)
+
+
+@checks_arguments(model=MODEL)
+def page(
+    model: Any,
+    *,
+    ranges: Mapping[str, tuple[float, float]] | None = None,
+    speed: float | None = None,
+    plots: Sequence[tuple[str, str]] | None = None,
+    picture: Mapping[str, Any] | None = None,
+    **motion: Any,
+) -> Page:
+    """Return a page that computes the motion of a model in the browser, with sliders and plots.
+
+    The generated C is compiled to WebAssembly by the extra ``compiler``; its first use takes a minute or two, since it
+    compiles its C library. The file of a field contains the formulas of its initial values if ``model`` is a path.
+    ``ranges``, ``speed`` and ``plots`` replace those of ``[page]`` in a model file, ``picture`` its ``[picture]``.
+
+    Args:
+        model: model, path of a model file, or system (of a field, that of its mesh); steps are fixed, or adaptive
+            with a tolerance.
+        ranges: lowest and highest value of sliders by name: of parameters, coordinates (``x``) and initial velocities
+            (``x_dot``); by default up to three times the value of a parameter.
+        speed: time of the model per second, with which the page begins; by default the span takes 30 s if it is not
+            of that order.
+        plots: names of the variables of each plot, the horizontal one first: t, energy, coordinates, momenta, and
+            conserved quantities; of arrays and fields nodes, as ``q.40``.
+        picture: what is drawn instead of what is recognised: ``points``, two or three formulas or numbers by name, in
+            coordinates, momenta, parameters, entries of rotations and t; ``rods``, ``springs`` and ``walls``, lists of
+            points; ``bodies``, points that are drawn and dragged, by default those that move; ``trails``, points whose
+            paths are drawn, by default those of the bodies.
+        motion: of a system, the arguments of :class:`Model`: ``q``, ``velocity`` or ``p``, ``h`` or ``tolerance``, and
+            also ``method`` (default SVI(8)) and others; default of ``span``: 30, or 1000 steps of
+            a size below 0.001 or above 1.
+
+    Returns:
+        The page, which a notebook displays.
+
+    Raises:
+        MethodError: without a step size or tolerance, and for inputs that are tables instead of numbers.
+        StateError: for a range of a parameter that does not contain its value, and an unknown variable of a plot.
+        ModelFileError: for an invalid model file, unknown sliders and values of the wrong form.
+        ArgumentError: for unknown arguments, and those of a motion beside a model.
+        BuildError: without the extra ``compiler``, or if compilation fails.
+    """
+    given = {"ranges": ranges, "speed": speed, "plots": plots}
+    settings = {name: value for name, value in given.items() if value is not None}
+    if picture is not None:
+        settings["picture"] = picture
+    if SYSTEM_OR_ARRAYS.accepts(model):
+        model = _model_of(model, motion)
+    elif motion:
+        raise ArgumentError(f"page() takes {', '.join(motion)} for a system alone: change them in the model")
+    if isinstance(model, Model):
+        return page_of(model, document_of(model), settings)
+    return page_of(load_model(model), document_in(model), settings)
+
+
+def _model_of(system: Any, motion: Mapping[str, Any]) -> Model:
+    """Return the model of a system with the arguments of its motion."""
+    known = [name for name in Model.__dataclass_fields__ if name not in ("system", "path", "page", "picture")]
+    for name in motion:
+        if name not in known:
+            raise ArgumentError(f"page() takes no {name!r}{keyword_hint(name, known)}")
+    if "q" not in motion:
+        raise ArgumentError(f"a page of the system {system.name} requires its initial state: give q, and velocity or p")
+    h = abs(motion.get("h") or 1.0)
+    default = {} if "steps" in motion else {"span": 30.0 if 1e-3 <= h <= 1.0 else STEPS * h}
+    return Model(**{"system": system, "method": DEFAULT_METHOD, **default, **motion})
+
+
+def page_of(model: Model, document: Mapping[str, Any], settings: Mapping[str, Any]) -> Page:
+    """Return the page of a model whose formulas are those of a document. Raises as :func:`page`.
+
+    Args:
+        model: with the settings of its file.
+        document: sections of the file.
+        settings: ranges, speed, plots and the picture, which replace those of the file.
+    """
+    settings = dict(settings)
+    model = replace(model, picture=settings.pop("picture", model.picture))
+    ranges = {**model.page.get("ranges", {}), **settings.get("ranges", {})}
+    model = replace(model, page={**model.page, **settings, "ranges": ranges})
+    model._check_double("a page")
+    _check(model, ranges)
+    check_compiler()  # before the equations are derived
+    adaptive = model.h is None or model.time_transformation is not None
+    acting = tuple(
+        each for each in model.events if each.changes_state or each.terminal
+    )  # others do not affect the motion
+    model = replace(model, events=acting)
+    result = Page(model.with_known_sizes() if adaptive or acting else model, document, adaptive=adaptive)
+    result.html  # noqa: B018  (reports errors here)
+    return result
+
+
+def _check(model: Model, ranges: Mapping[str, tuple[float, float]]) -> None:
+    """Raise an error for what a page does not have."""
+    name = model.system.name
+    for each, value in model.inputs.items():
+        if isinstance(value, tuple):
+            raise MethodError(f"a slider sets the input {each} of {name}, which is a table: give a number")
+    if model.h is None and model.tolerance is None:
+        raise MethodError(f"a page requires a step size or tolerance; {name} has neither: give [run] step or tolerance")
+    if model.h is None and model.has_time_transformation:
+        raise MethodError(f"a page requires the step size in tau of {name}, not a tolerance: give [run] step")
+    check_page(model.page, model, "page")
+    check_picture(model)
+    values = model.parameters | {each: model.inputs.get(each, 0.0) for each in getattr(model.system, "inputs", ())}
+    for parameter in ranges.keys() & values.keys():
+        (low, high), value = ranges[parameter], values[parameter]
+        if not low <= value <= high:
+            raise StateError(f"the range {low:g} .. {high:g} of {parameter} must contain its value {value:g}: widen it")
+
+
+@dataclass(frozen=True, eq=False)
+class Page:
+    """Page of a model, which a notebook displays.
+
+    Attributes:
+        model: system, method, initial state, step size, and the settings of the page.
+        document: sections of its model file.
+        adaptive: whether the step size is adaptive.
+    """
+
+    model: Model
+    document: Mapping[str, Any] = field(repr=False)
+    adaptive: bool = False
+
+    __repr__ = summary("model")
+
+    @cached_property
+    def html(self) -> str:
+        """Text of the file."""
+        model, document = self.model, self.document
+        with tempfile.TemporaryDirectory(prefix="scvi-codegen-") as temporary:
+            folder = generate_package(replace(model, page={}, picture={}), Path(temporary, "motion"))
+            interface = _interface(folder, model)
+            initial = _initial(document, [*model.mesh.points, *interface.parameters]) if model.mesh else ()
+            (folder / "page.c").write_text(_entry(folder, model, interface, initial, self.adaptive), encoding="utf-8")
+            sources = ("page.c", "motion.c", *(["motion_events.c"] if model.events else []))
+            code = webassembly(folder, sources)
+        description = _description(self, interface, initial=bool(initial))
+        text = template_environment().get_template("page/page.html.jinja").render(
+            title=html.escape(interface.system), method=html.escape(interface.title.split(": ", 1)[-1]),
+            version=__version__, licences=LICENCES, lagrangian=_lagrangian(document, model),
+            description=json.dumps(description, separators=(",", ":")).replace("<", "\\u003c"), wasm=code,
+        )  # fmt: skip
+        return INDENTED.sub("", text)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the file, atomically."""
+        write_text(path, self.html)
+
+    def _repr_html_(self) -> str:
+        title = html.escape(f"{self.model.system.name}: a page that moves")
+        return (
+            f'<iframe sandbox="allow-scripts" title="{title}" srcdoc="{html.escape(self.html)}"'
+            f' style="width: 100%; height: {HEIGHT}px; border: 0"></iframe>'
+        )
+
+
+def _interface(folder: Path, model: Model) -> SimpleNamespace:
+    """Return names, sizes and titles of a generated integrator, of either kind."""
+    data = json.loads((folder / "interface.json").read_text(encoding="utf-8"))
+    if "interface" in data:
+        return SimpleNamespace(**data["interface"], array=False)
+    scalars = {name: value for name, value in model.parameters.items() if np.ndim(value) == 0}
+    return SimpleNamespace(
+        array=True, title=data["title"], system=model.system.name, coordinates=[], momentum_names=[], rotations=[],
+        constraints=[], map_names=[], parameters=list(scalars), defaults=list(scalars.values()),
+        conserves_energy=not model.system.changes_energy,
+        sizes=data["sizes"], inputs=[], energy_parameter="",
+    )  # fmt: skip
+
+
+def _entry(folder: Path, model: Model, interface: Any, initial: Sequence[str], adaptive: bool) -> str:
+    """Return the C of the functions that the page calls."""
+    header, size = (folder / "motion.h").read_text(encoding="utf-8"), len(_flat(model.q))
+
+    def listed(word: str) -> list[str]:
+        found = re.search(rf"\*{word}\[\d+\]; /\* (.*?) \*/", header, re.DOTALL)
+        return ARRAY.findall(found[1]) if found else []
+
+    def words(name: str) -> list[str]:
+        return (folder / f"{name}.txt").read_text(encoding="utf-8").split()
+
+    numbers, tables = [repr(value) for value in _values(model, interface).values()], {}
+    if interface.array:
+        for name in listed("field"):
+            numbers += words(f"field_{name}")
+        tables = {name: words(f"table_{name}") for name in listed("table")}
+    axes = {name: np.ravel(nodes).tolist() for name, nodes in model.mesh.points.items()} if model.mesh else {}
+    return (
+        template_environment()
+        .get_template("page/entry.c.jinja")
+        .render(
+            array=interface.array, m=size, capacity=256 if size < 64 else 16, maps=len(interface.map_names),
+            values=numbers, sizes=list(interface.sizes.values()) if interface.array else (), tables=tables,
+            constraints=interface.constraints, adaptive=adaptive, initial=initial,
+            transformed=model.time_transformation is not None, max_step=model.max_step,
+            first_step=model.first_step,
+            absolute_tolerances=_absolute_tolerances(model, interface), events=model.events,
+            acting=any(each.changes_state for each in model.events), velocities=not starts_from_momenta(model),
+            level=interface.parameters.index(energy) if (energy := interface.energy_parameter) else None,
+            axes={f"at_{name}": nodes for name, nodes in axes.items()},
+            names={f"at_{name}": k for k, name in enumerate(interface.parameters)},
+        )
+    )  # fmt: skip
+
+
+def _absolute_tolerances(model: Model, interface: Any) -> list[float]:
+    """Return the absolute tolerance of each coordinate; none if all are 0."""
+    from scvi_codegen.runs.stepping.step_plan import absolute_tolerances, checked_absolute_tolerance
+
+    if model.absolute_tolerance is None:
+        return []
+    values = checked_absolute_tolerance(model.absolute_tolerance)
+    return [float(value) for value in absolute_tolerances(interface, interface.dimension, values)]
+
+
+def _values(model: Model, interface: Any) -> dict[str, float]:
+    """Return the scalar parameters by name, in order, with those that contain inputs and the energy of the state."""
+    known = model.parameters | {f"{name}_0": value for name, value in model.inputs.items()}
+    pairs = zip(interface.parameters, interface.defaults, strict=True)
+    return {name: float(known.get(name, default)) for name, default in pairs}
+
+
+def _initial(document: Mapping[str, Any], names: Sequence[str]) -> tuple[str, ...]:
+    """Return the formulas of the only field and its rate as C, or none if an initial value is no formula."""
+    known = {name: symbol(f"at_{name}") for name in names}
+    tables = [document.get("initial", {}).get(key) for key in ("q", "q_dot")]
+    formulas = [next(iter(each.values())) if isinstance(each, dict) and len(each) == 1 else each for each in tables]
+    if not all(isinstance(formula, str) for formula in formulas):
+        return ()
+    try:
+        texts = tuple(_c_text(parse_expression(str(formula), known)) for formula in formulas)
+    except ExpressionError:
+        return ()
+    return () if any("\n" in text for text in texts) else texts  # of functions that C does not have
+
+
+def _c_text(formula: sympy.Expr) -> str:
+    """Return a formula as C without the constants of math.h that are no standard C, such as ``M_PI``."""
+    constants = {number: sympy.Float(number, 17) for number in (sympy.pi, sympy.E)}
+    return str(sympy.ccode(formula.xreplace(constants), math_macros={}))
+
+
+def _lagrangian(document: Mapping[str, Any], model: Model) -> list[str]:
+    """Return the Lagrangian, density or Hamiltonian as written, as terms of MathML; none of arrays and robots."""
+    if getattr(model.system, "links", ()):
+        return []
+    source = document.get("field") or document.get("system", {})
+    text = str(source.get("density") or source.get("lagrangian") or source.get("hamiltonian") or "")
+    try:
+        density = parse_expression(text, {name: symbol(name) for name in NAME.findall(text)})
+    except ExpressionError:
+        return []
+    name = sympy.Symbol("H" if "hamiltonian" in source else "L")
+    return [] if LONG_NUMBER.search(str(density)) else list(mathml_terms(density, name))
+
+
+def _flat(state: Any) -> list[float]:
+    """Return the numbers of a state: a sequence, or arrays by name."""
+    parts = state.values() if isinstance(state, Mapping) else [state]
+    result: list[float] = np.concatenate([np.ravel(part) for part in parts]).astype(float).tolist()
+    return result
+
+
+def _rates(model: Model) -> list[float]:
+    """Return the initial velocities, or momenta: see :func:`starts_from_momenta`."""
+    given, other = (model.p, model.velocity) if starts_from_momenta(model) else (model.velocity, model.p)
+    if given is not None:
+        return _flat(given)
+    if other is None:
+        return [0.0] * model.dimension
+    model._check_double("a page")
+    stepper = model.stepper()
+    if starts_from_momenta(model):
+        return _flat(model.momenta(stepper))
+    return _flat(stepper.velocity(model.q, model.p, model.t, model.parameters))
+
+
+def _drawn_system(model: Model, interface: Any) -> DrawnSystem:
+    """Return what the recognition of a shape reads of a model; a stepper is compiled where it needs the energy."""
+
+    def energy(q: Any, p: Any) -> Any:
+        return np.asarray(model.stepper().energy(q, p, model.t, model.parameters), dtype=float)
+
+    drawn = drawn_system_of_model(model)
+    return drawn if interface.array else replace(drawn, interface=interface, energy=energy)
+
+
+def _description(shown: Page, interface: Any, *, initial: bool) -> dict[str, Any]:
+    """Return what the scripts of the page read."""
+    model, adaptive = shown.model, shown.adaptive
+    ranges = model.page.get("ranges", {})
+    q, v = _flat(model.q), _rates(model)
+    drawn = _drawn_system(model, interface)
+    shape = (shape_of_picture(drawn, model.picture) if model.picture else shape_of(drawn)).to_data()
+    parameters, inputs = [], {f"{name}_0": name for name in interface.inputs}
+    unchanged = {interface.energy_parameter, *input_parameters(interface.inputs)} - inputs.keys()
+    for place, (name, value) in enumerate(_values(model, interface).items()):
+        size = abs(value) or 1.0
+        default = (size / 20, 3 * size) if value > 0 else (-3 * size, 3 * size if value else size)
+        if name in inputs:
+            default = (-3 * size, 3 * size)
+        low, high = ranges.get(inputs.get(name, name), default)
+        each = {"name": inputs.get(name, name), "value": value, "low": low, "high": high, "place": place}
+        if name not in unchanged:
+            parameters.append(each | ({"input": True} if name in inputs else {}))
+    span = abs(float(model.end - model.t))
+    speed = model.page.get("speed", 1.0 if 0.3 < span / SECONDS < 4 else float(f"{span / SECONDS:.0e}"))
+    step = float(model.h if model.h is not None else model.tolerance)  # type: ignore[arg-type]
+    label = "Tolerance" if model.h is None else "Step size in tau" if model.has_time_transformation else "Step size"
+    limits = (
+        [math.pi, 12.0]
+        if len(shape["angles"]) == len(q)
+        else [2 * max([1.0, *(abs(x) for x in kind)]) for kind in (q, v)]
+    )
+    names = interface.coordinates or [""] * len(q)
+    rates = interface.momentum_names if starts_from_momenta(model) else [f"{name}_dot" for name in names]
+    sliders = {
+        kind: [ranges.get(name, [-limit, limit]) for name in known]
+        for kind, known, limit in zip("qv", (names, rates or names), limits, strict=True)
+    }
+    conserved = all(each.restitution == 1.0 for each in model.events if each.changes_state)
+    variables = _variables(interface, shape, len(q))
+    plots = [[_variable(name, variables) for name in reversed(pair)] for pair in model.page.get("plots", ())]
+    return {
+        "m": len(q), "q": [] if initial else q, "v": [] if initial else v, "t": float(model.t),
+        "coordinates": interface.coordinates, "rotations": _rotations(interface),
+        "momenta": interface.momentum_names, "parameters": parameters, "quantities": interface.map_names,
+        "energy": {"label": "Energy", "conserved": bool(interface.conserves_energy) and conserved}, "plots": plots,
+        "causes": CAUSES, "events": [str(each.function) for each in model.events],
+        "from_momenta": starts_from_momenta(model), "values": len(interface.parameters),
+        "initial": initial, "whole": WHOLE,
+        "step": {"adaptive": adaptive or model.has_time_transformation, "label": label, "value": step,
+                 **({"low": 1e-15, "high": 1e-4} if model.h is None else {"low": step / 20, "high": step * 8})},
+        "speed": {"value": speed, "low": speed / 50, "high": speed * 20},
+        "ranges": sliders, "shape": shape,
+    }  # fmt: skip
+
+
+def _rotations(interface: Any) -> list[dict[str, Any]]:
+    """Return the columns and the names of the angular velocity of each rotation, and the columns of each spin."""
+    return [
+        {
+            "name": each.name,
+            "columns": [interface.coordinates.index(name) for name in each.coordinates],
+            "rates": [rate.name for rate in each.rates] if isinstance(each, Rotation) else [],
+        }
+        for each in RotationNames.members_of(interface.rotations)
+        if isinstance(each, Rotation | Spin)
+    ]
+
+
+def _variables(interface: Any, shape: Mapping[str, Any], size: int) -> list[str]:
+    """Return the names of the variables of plots, as in ``plots.js``."""
+    if size <= WHOLE and interface.coordinates:
+        solids = [f"{each['name']}.{axis}" for each in shape["solids"] for axis in "xyz"]
+        names = [*interface.coordinates, *interface.momentum_names, *solids]
+    else:
+        nodes = range(size) if size <= WHOLE else (size // 4, size // 2)
+        names = [f"{kind}.{node}" for node in nodes for kind in "qp"]
+    return ["t", *names, "energy", *interface.map_names]
+
+
+def _variable(name: str, known: Sequence[str]) -> str:
+    """Return the name of a variable of plots, if it is known."""
+    if name not in known:
+        raise StateError(f"page plots: unknown variable {name!r}{closest(name, known)} Known: {', '.join(known)}")
+    return name

@@ -1,1 +1,0 @@
-"""Lowering of stage systems to programs, and the choice of a solver (:mod:`~scvi_codegen.lowering.solvers`)."""

@@ -1,1 +1,0 @@
-"""Mechanical systems: Lagrangians, Hamiltonians, expressions derived from them, conserved quantities."""

@@ -1,0 +1,558 @@
+"""Global error of an adaptive run, confirmed by runs that do not share its step sequence.
+
+A run is compared with one whose local tolerance is a thousand times smaller, so that the difference is its error, and
+whose steps end at other, irregular times, as steps that follow from the motion alone (free flight) are the same for all
+tolerances; where formulas are not smooth, they also end where these jump or have a kink. Three times the largest
+difference is the estimate. While that exceeds the wanted error, a run of smaller tolerance is judged in the same way.
+Where rounding dominates, all runs have errors of the same size, and one run with nearly the same error is not rare: the
+run is compared with two others and a factor of twelve, or with three and a factor of four, for which agreement by
+chance is equally improbable. The last runs, at round-off level, are compared with each other; what they do not confirm
+stays unconfirmed. (R. D. Skeel, Thirteen ways to estimate global error, Numer. Math. 48 (1986) 1-20; E. Hairer, S. P.
+Norsett, G. Wanner, Solving Ordinary Differential Equations I, II.4.)
+"""
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from itertools import accumulate, chain, repeat
+from operator import mul
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.codegen.native.arguments import checked_number
+from scvi_codegen.codegen.rendering.source import Interface
+from scvi_codegen.common.errors import AccuracyWarning, StateError, StepFailedError, warn
+from scvi_codegen.runs.accuracy.size import Motion, first_of_groups, momenta_of_velocities, relative, roundoff
+from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted, without_accuracy_warnings
+from scvi_codegen.runs.stepping.step_plan import Adaptive, absolute_tolerances
+
+Array = NDArray[np.float64]
+
+FIRST, RATIO = 1e-3, 1e-3
+"""First local tolerance relative to the wanted error; next tolerance, and that of a comparison, relative to a run's."""
+GAIN = 100.0
+"""Factor by which ``RATIO`` reduces the error of nearly every run."""
+ROUNDED, ROUNDED_OF_TAU, LEAST = 0.99e-12, 1e-10, 1e-17
+"""Tolerances below which rounding may dominate errors, also with steps of tau, and from which the last runs are made.
+
+Steps of tau are equal, so that many have smaller errors than the tolerance.
+"""
+FINER = 0.1
+"""Ratio of the tolerances of a run whose error rounding may dominate, of its three comparisons, and of the next run."""
+LAST = (0.0, 1e-18, 1e-19, 1e-20)
+"""Tolerances of the last runs (0: the default, round-off level), which are compared with each other."""
+ROUNDED_OF_TWO_WORDS, LEAST_OF_TWO_WORDS, LAST_OF_TWO_WORDS = 1e-26, 1e-30, (1e-30, 1e-29, 1e-28)
+"""The same with states of two words."""
+COARSER = 1e4
+"""Factor of the tolerance of a comparison that fails, for a second attempt."""
+SAFETY, SAFETY_OF_TWO, SAFETY_OF_ROUNDING = 3.0, 12.0, 4.0
+"""Factors between the largest difference and the estimate; for two and three comparisons where rounding may dominate.
+
+If the errors are independent normal numbers, those of two further runs are both within e / 12 of the error e of the run
+in 8 of 10,000 cases, and those of three within e / 4 in as many.
+"""
+PARTS_AT_KINKS, LEAST_AT_KINKS = (math.inf, 0.0913, 0.0331, 0.0127, 0.00491), 1e-13
+"""Largest steps relative to the run, one after the other, of formulas that are not smooth: free flight has the same
+steps for all tolerances, one of which may end beyond a kink. The least tolerance of these runs, unless the first one is
+smaller."""
+LEAST_STOPS, LONG, STRIDE, MOST_STOPS = 8, 64, 16, 32
+"""Of a run for comparison, numbers of times at which steps end: least; see :func:`irregular_stops`; most of others."""
+GOLDEN, MARGIN, IRREGULAR = 0.6180339887498949, 0.05, 0.8191725134
+"""Golden ratio; part of a step at its ends that is not cut; ratio of steps of tau of runs for comparison."""
+FURTHER, MANY = 1000, 100_000
+"""A run for comparison is given up after so many times the steps of the run, and so many more."""
+LEAST_SAMPLES, STEPS_PER_SAMPLE, MOST_SAMPLES, MOST_NUMBERS = 16, 16, 512, 2**22
+"""Numbers of states that are compared: least, per steps, most, and most times the number of coordinates."""
+ORDER = 10.0
+"""Power of a step of tau that a local tolerance stands for: ``RATIO`` halves the steps of a time transformation."""
+UNEVEN = 30.0
+"""Ratio of the longest to the shortest step from which on a time transformation is recommended."""
+SLIGHT = 1e-12
+"""Ratio to the largest position or momentum below which a change is no reason to compare a state."""
+TINY = math.ulp(0.0)
+"""Smallest positive number."""
+LOST = 0.1
+"""Estimate from which on runs are uncorrelated."""
+NAMES_OF_PRECISIONS = {1: "double", 2: "double-double"}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class GlobalError:
+    """Differences between a run and others with smaller steps, and the estimate of its global error.
+
+    Attributes:
+        requested: requested bound of the relative global error.
+        tolerance: local tolerance of the returned run, 0 for round-off.
+        h: step of tau of a run in transformed time, else 0.
+        t: (n,) times at which the runs were compared: at most 512 of the saved states, where the motion is fast.
+        differences: (n,) the largest difference of a position relative to the range of that coordinate over the run, or
+            of a momentum relative to its own or that of its velocity (:mod:`scvi_codegen.runs.accuracy.size`).
+        safety: factor of the estimate: 3; where rounding may dominate the error, 12 for two comparisons, 4 for three.
+        estimate: this factor times the largest difference, at least ten roundings and the tolerance; meaningless above
+            about 0.1, where runs are uncorrelated.
+        confirmed_until: last of the times up to which the factor times each difference is at most the requested error.
+        runs: number of runs.
+        precision: ``"double"`` or ``"double-double"``.
+        max_step: largest step of the returned run, limited where the formulas are not smooth.
+    """
+
+    requested: float
+    tolerance: float
+    h: float
+    t: Array
+    differences: Array
+    safety: float
+    estimate: float
+    confirmed_until: float
+    runs: int
+    precision: str = "double"
+    max_step: float = math.inf
+
+    @property
+    def confirmed(self) -> bool:
+        """Return whether the requested error is confirmed for the whole run."""
+        return self.estimate <= self.requested
+
+    @property
+    def steps(self) -> dict[str, float | None]:
+        """``h``, or ``tolerance`` (``None``: round-off) and ``max_step``, of :meth:`Stepper.integrate` for this run."""
+        if self.h:
+            return {"h": self.h}
+        limit = {} if self.max_step == math.inf else {"max_step": self.max_step}
+        return {"tolerance": self.tolerance or None, **limit}
+
+    @property
+    def digits(self) -> int:
+        """Number of confirmed decimal digits of the whole run."""
+        return max(0, math.floor(-math.log10(self.estimate))) if self.estimate < 1.0 else 0
+
+
+class Confirmed:
+    """Properties of a trajectory whose global error may have been estimated by a second run (``error=``)."""
+
+    __slots__ = ()
+    confirmation: GlobalError | None
+
+    @property
+    def global_error(self) -> float:
+        """Relative error of all states, by a second run with other steps; NaN without ``error=``."""
+        return math.nan if self.confirmation is None else self.confirmation.estimate
+
+    @property
+    def confirmed_digits(self) -> int | None:
+        """Number of decimal digits of all states that a second run confirms; ``None`` without ``error=``."""
+        return None if self.confirmation is None else self.confirmation.digits
+
+    @property
+    def confirmed_until(self) -> float:
+        """Time until which a second run confirms the error asked for; NaN without ``error=``."""
+        return math.nan if self.confirmation is None else self.confirmation.confirmed_until
+
+
+class ConfirmedEnsemble:
+    """Properties of an ensemble, the same as of :class:`Confirmed` for each of k trajectories."""
+
+    __slots__ = ()
+    confirmations: tuple[GlobalError | None, ...]
+
+    @property
+    def global_error(self) -> Array:
+        """(k,) estimated relative errors; NaN without ``error=`` and for trajectories that fail."""
+        return np.array([math.nan if each is None else each.estimate for each in self.confirmations])
+
+    @property
+    def confirmed_digits(self) -> NDArray[np.int64]:
+        """(k,) numbers of decimal digits of all states that a second run confirms; 0 where there is none."""
+        return np.array([0 if each is None else each.digits for each in self.confirmations], dtype=np.int64)
+
+    @property
+    def confirmed_until(self) -> Array:
+        """(k,) times until which a second run confirms the error asked for; NaN where there is none."""
+        return np.array([math.nan if each is None else each.confirmed_until for each in self.confirmations])
+
+
+def warn_of_unconfirmed(confirmations: Sequence[GlobalError | None]) -> None:
+    """Issue one warning for the trajectories whose requested global error is not confirmed."""
+    lost = [(j, each) for j, each in enumerate(confirmations) if each is not None and not each.confirmed]
+    if lost:
+        j, first = lost[0]
+        warn(
+            f"the global error {first.requested:g} is not confirmed for {len(lost)} of {len(confirmations)} "
+            f"trajectories; for trajectory {j} it is until t = {first.confirmed_until:.6g} only. See "
+            "confirmed_until of the result; end the runs there, or give a larger error",
+            AccuracyWarning,
+        )
+
+
+def checked_error(error: Any, others: Mapping[str, Any], stepper: Any = None) -> float:
+    """Return the requested global error; raise StateError if it is unattainable or another option sets step sizes."""
+    wanted = checked_number(error, "the global error")
+    if not 0.0 < wanted < 1.0:
+        raise StateError(f"error={wanted:g} must be between 0 and 1: it bounds the relative global error")
+    for name, value in others.items():
+        if value is not None:
+            raise StateError(
+                f"error={wanted:g} and {name}={value!r} both determine the step size: error= requires adaptive steps; "
+                f"omit {name} and give t_end"
+            )
+    if stepper is not None:
+        words = max(stepper.interface.words, 1 + (stepper._precise is not None))
+        if wanted < (least := smallest_estimate(words)):
+            remedy = ", or precision='double-double'" if words == 1 else ""
+            raise StateError(
+                f"error={wanted:g} is below {least:.1e}, the least error that {NAMES_OF_PRECISIONS[words]} arithmetic "
+                f"confirms: give a larger error{remedy}"
+            )
+    return wanted
+
+
+def smallest_estimate(words: int) -> float:
+    """Return the smallest estimate of an error of states of one or two words."""
+    return 10.0 * roundoff(words)
+
+
+def warn_of_unconfirmed_run(trajectory: Any) -> None:
+    """Issue a warning for a run whose requested global error is not confirmed."""
+    result: GlobalError = trajectory.confirmation
+    if result.confirmed or not warnings_wanted():
+        return
+    warn(
+        f"the global error {result.requested:g} is {_confirmed_part(result, float(trajectory.t[0]))}: runs with other "
+        f"steps differ by up to about {result.estimate:.1e}. {_remedy(result, float(trajectory.t[0]))}"
+        f"{_alternative(trajectory, result)}",
+        AccuracyWarning,
+    )
+
+
+def _confirmed_part(result: GlobalError, start: float) -> str:
+    if result.confirmed_until == start:
+        return "confirmed at no time"
+    return f"confirmed until t = {result.confirmed_until:.6g} only"
+
+
+def _remedy(result: GlobalError, start: float) -> str:
+    return "Give a larger error" if result.confirmed_until == start else "End the run there, or give a larger error"
+
+
+def _alternative(trajectory: Any, result: GlobalError) -> str:
+    """Return the recommendation of ends of steps at kinks, or of a time transformation for uneven steps.
+
+    The latter is for conservative motions.
+    """
+    if kinks := trajectory.stepper.interface.kinks:
+        return (
+            "; or give max_step=, a tenth of the shortest pulse or contact, or, without error=, events there "
+            f"(sc.impact, sc.Event(.., then=)): the equations are not smooth where {kinks[0]} = 0"
+        )
+    lengths = abs(trajectory.step_sizes[:-1])
+    lengths = lengths[np.isfinite(lengths)][:-1]  # t_end shortens the last step
+    adaptive = isinstance(trajectory.plan, Adaptive)
+    suitable = adaptive and trajectory.stepper.interface.conserves_energy and result.estimate < LOST
+    if not suitable or not lengths.size or lengths.max() < UNEVEN * lengths.min():
+        return ""
+    return (
+        f"; or try a time transformation (reparametrise), whose errors are often smaller in close encounters: the "
+        f"longest step is {lengths.max() / lengths.min():.0f} times the shortest"
+    )
+
+
+Attempt: TypeAlias = tuple[Any, GlobalError]
+"""Run, and the estimate of its error."""
+
+
+class Runs:
+    """Runs of one motion by tolerance, one of which is returned and confirmed by others.
+
+    Args:
+        wanted: bound of the relative global error.
+        integrate: function of ``progress`` or ``None``, and ``tolerance`` or ``h``, that makes the returned run.
+        confirming: function of the times at which steps end, of ``progress`` and of ``tolerance`` or ``h`` that makes a
+            run for comparison.
+        start, end: initial and final time.
+        step_of_tau: function that returns the largest step of tau for a tolerance, or ``None`` without it.
+        interface: of the stepper.
+        smooth: whether the equations are smooth along each step of ``confirming``.
+    """
+
+    def __init__(
+        self,
+        *,
+        wanted: float,
+        integrate: Callable[..., Any],
+        confirming: Callable[..., Any],
+        start: float,
+        end: float,
+        step_of_tau: Callable[[float], float] | None,
+        interface: Interface,
+        smooth: bool = True,
+    ) -> None:
+        self.wanted, self.integrate, self.confirming = wanted, integrate, confirming
+        self.start, self.end = start, end
+        self.words, self.interface = interface.words, interface
+        self.first, self.h, self.count, self.most = min(wanted * FIRST, 0.1), 0.0, 0, math.inf
+        self.least, self.rounded = LEAST, ROUNDED
+        self.last: tuple[float, ...] = LAST
+        self.failure: StepFailedError | None = None
+        if self.words > 1:
+            self.least, self.rounded, self.last = LEAST_OF_TWO_WORDS, ROUNDED_OF_TWO_WORDS, LAST_OF_TWO_WORDS
+        if not smooth:  # errors are as random as those of rounding
+            self.rounded = 1.0
+        if step_of_tau is not None:
+            self.rounded, self.first = ROUNDED_OF_TAU, max(self.first, LEAST)
+            self.h = step_of_tau(self.first)
+        elif self.first < self.rounded:  # the factor of the estimate is larger there
+            self.first *= FINER
+        self.parts = () if step_of_tau is not None or not interface.kinks else PARTS_AT_KINKS
+
+    @without_accuracy_warnings()
+    def confirmed_run(self) -> Any:
+        """Return the run whose global error is at most ``wanted``, or the most accurate one.
+
+        Raises:
+            StepFailedError: if the most accurate run fails.
+        """
+        trajectory, result = self._judged()
+        trajectory.confirmation = result
+        return trajectory
+
+    def _steps(self, tolerance: float, factor: float = 1.0) -> dict[str, float | None]:
+        if self.h:
+            return {"h": factor * self.h * ((tolerance or LEAST) / self.first) ** (1.0 / ORDER)}
+        return {"tolerance": tolerance or None}
+
+    def _run(self, tolerance: float, max_step: float = math.inf) -> Any:
+        self.count += 1
+        check = self._check_count if self.most < math.inf else None
+        limit = {} if max_step == math.inf else {"max_step": max_step}
+        trajectory = self.integrate(check, **self._steps(tolerance), **limit)
+        self.most = min(self.most, FURTHER * trajectory.steps + MANY)
+        return trajectory
+
+    def _other(self, tolerance: float, compared: "_Samples", number: int) -> Any:
+        """Return a run for comparison, to its last state if it fails or takes too many steps."""
+        self.count += 1
+        stops = irregular_stops(compared.steps_of_run, number)
+        try:
+            return self.confirming(stops, self._check_count, **self._steps(tolerance, IRREGULAR))
+        except StepFailedError as failure:
+            if failure.trajectory is None:
+                raise
+            return failure.trajectory
+
+    def _check_count(self, steps: int) -> None:
+        if steps > self.most:
+            raise _TooManyStepsError
+
+    def _judged(self) -> Attempt:
+        """Return the first run that is confirmed, and its estimate; otherwise the better one."""
+        attempts: list[Attempt] = []
+        for attempt in chain(self._limited() if self.parts else self._by_tolerance(), self._at_round_off()):
+            if attempt[1].confirmed:
+                return attempt
+            attempts.append(attempt)
+        if self.failure is not None and not attempts:
+            raise self.failure
+        return min(attempts, key=lambda each: each[1].estimate)
+
+    def _by_tolerance(self) -> Iterator[Attempt]:
+        """Yield runs of smaller and smaller tolerances, until errors are too large for an extrapolation."""
+        tolerance, estimate = self.first, 0.0
+        while tolerance > 2.0 * self.least and estimate < 1.0:
+            powers, (ratio, smaller) = 1, self._smaller(tolerance)
+            with self._suppressed_failure():
+                trajectory = self._run(tolerance)
+                result = self._estimated(trajectory, tolerance, smaller)
+                yield trajectory, result
+                estimate = result.estimate
+                powers = max(1, math.ceil(math.log(min(estimate, 1.0) / self.wanted, GAIN) * math.log(RATIO, ratio)))
+            tolerance = list(accumulate(repeat(ratio, powers), mul, initial=tolerance))[-1]
+
+    def _limited(self) -> Iterator[Attempt]:
+        """Yield runs of smaller and smaller largest steps."""
+        tolerance = self.first
+        for part in self.parts:
+            max_step = part * abs(self.end - self.start)
+            with self._suppressed_failure():
+                trajectory = self._run(tolerance, max_step)
+                yield trajectory, self._estimated(trajectory, tolerance, self._smaller(tolerance)[1], max_step)
+            tolerance = max(RATIO * tolerance, min(tolerance, LEAST_AT_KINKS))
+
+    def _at_round_off(self) -> Iterator[Attempt]:
+        """Yield the last runs, as long as their errors are not far above the wanted one."""
+        for tolerance in self.last:
+            with self._suppressed_failure():
+                trajectory = self._run(tolerance)
+                others = [each for each in self.last if each != tolerance]
+                result = self._estimated(trajectory, tolerance, others, last=True)
+                yield trajectory, result
+                if result.estimate > GAIN * self.wanted:
+                    return
+
+    @contextmanager
+    def _suppressed_failure(self) -> Iterator[None]:
+        """Go on after a run that fails, or takes too many steps."""
+        try:
+            yield
+        except StepFailedError as failure:
+            self.failure = failure
+        except _TooManyStepsError:
+            pass
+
+    def _smaller(self, tolerance: float) -> tuple[float, list[float]]:
+        """Return the tolerances of the runs that a run is compared with, and their ratio."""
+        ratio, count = (FINER, 3) if tolerance < self.rounded else (RATIO, 1)
+        return ratio, list(accumulate(repeat(ratio, count), mul, initial=tolerance))[1:]
+
+    def _estimated(
+        self, trajectory: Any, tolerance: float, others: list[float], max_step: float = math.inf, *, last: bool = False
+    ) -> GlobalError:
+        """Return the estimate of the error of a run by others; the last runs are compared with all of them."""
+        compared = _Samples(trajectory, self.start, self.interface)
+        safety = SAFETY if len(others) == 1 else SAFETY_OF_ROUNDING
+        floor = max(smallest_estimate(self.words), tolerance)
+        for number, each in enumerate(others if compared.end != self.start else ()):
+            if number == 2 and SAFETY_OF_TWO * compared.largest() <= self.wanted:
+                safety = SAFETY_OF_TWO
+                break
+            try:
+                complete = compared.compare(self._other(each, compared, number))
+                if last and not complete:
+                    compared.compare(self._other((each or self.least) * COARSER, compared, number))
+            except _TooManyStepsError:
+                compared.lose()
+            if not last and safety * compared.largest() > self.wanted:
+                break
+        differences, reached = compared.relative(lambda relative: np.maximum(safety * relative, floor) <= self.wanted)
+        largest = float(differences.max(initial=0.0))
+        return GlobalError(
+            requested=self.wanted,
+            tolerance=tolerance,
+            h=float(self._steps(tolerance).get("h") or 0.0),
+            max_step=max_step,
+            t=compared.t,
+            differences=differences,
+            safety=safety,
+            estimate=math.inf if math.isnan(largest) else max(safety * largest, floor),
+            confirmed_until=float(compared.t[reached - 1]) if reached else self.start,
+            runs=self.count,
+            precision=NAMES_OF_PRECISIONS[self.words],
+        )
+
+
+class _TooManyStepsError(Exception):
+    """Raised if a run for comparison takes many more steps than the run that it is compared with."""
+
+
+def irregular_stops(t: Array, number: int) -> list[float]:
+    """Return times within the steps of a run at which another ends steps, so that it does not share their sequence.
+
+    Steps that follow from the motion alone, as in free flight, are the same for all tolerances. At least
+    ``LEAST_STOPS`` steps are cut, all that are longer than a ``LONG``-th of the run, and of others every
+    ``STRIDE``-th, at fractions that are multiples of the golden ratio modulo 1.
+
+    Args:
+        t: (n,) ends of steps, or other times of the run, with the first and the last time of the run.
+        number: of the comparison; each has other times.
+    """
+    sizes = np.diff(t)
+    pieces = max(1, -(-LEAST_STOPS // max(1, len(sizes))))
+    is_cut = abs(sizes) * LONG > abs(t[-1] - t[0])
+    is_cut[number :: max(STRIDE, -(-len(sizes) // MOST_STOPS))] = True
+    k = np.repeat(np.flatnonzero(is_cut), pieces)
+    parts = (np.arange(1, len(k) + 1) * GOLDEN + number / 3.0) % 1.0
+    stops = np.unique(t[k] + (MARGIN + (1.0 - 2.0 * MARGIN) * parts) * sizes[k])
+    inner = stops[(stops != t[0]) & (stops != t[-1])]
+    return [*(inner if t[-1] > t[0] else inner[::-1]).tolist(), float(t[-1])]
+
+
+class _Samples:
+    """States of a run for comparison with others.
+
+    Attributes:
+        t, states: (k,) times, and (2, k, m) positions and momenta: the last state, and from each of equal numbers of
+            states the one where positions or momenta change fastest relative to their sizes, as an error in time has
+            the largest effect there.
+        kinetic: (k, m) momenta of velocities.
+        errors: (2, k, m) largest differences from other runs, at least the rounding errors of the states.
+        steps_of_run: (n,) initial time, and times of all saved states.
+        end: last time.
+    """
+
+    def __init__(self, trajectory: Any, start: float, interface: Interface) -> None:
+        t, states = np.asarray(trajectory.t), [trajectory.q, trajectory.p]
+        self.start, self.end, steps = start, t.item(-1), len(t) - 1
+        self.forward = math.copysign(1.0, self.end - start)
+        self.steps_of_run = t if t[0] == start else np.insert(t, 0, start)
+        m = trajectory.q.shape[1]
+        count = max(LEAST_SAMPLES, min(len(t) // STEPS_PER_SAMPLE, MOST_SAMPLES, MOST_NUMBERS // m))
+        chosen: Any = slice(None)
+        if count < steps:
+            speed = np.zeros(steps)
+            with np.errstate(all="ignore"):
+                for each in map(np.asarray, states):
+                    largest = np.abs(each).max(axis=0)
+                    unit = np.maximum(largest, SLIGHT * largest.max() or 1.0)
+                    speed = np.fmax(speed, np.abs(np.diff(each / unit, axis=0)).max(axis=1))
+                speed /= np.maximum(abs(np.diff(t)), TINY)
+            size = -(-steps // count)
+            parts = np.full((-(-steps // size), size), -1.0)
+            parts.ravel()[:steps] = speed
+            fastest = np.arange(1, steps + 1, size) + parts.argmax(axis=1)
+            chosen = [0, *fastest.tolist()]
+            chosen += [steps] if chosen[-1] < steps else []
+        self.t, self.states = t[chosen], [each[chosen] for each in states]
+        self.epsilon, self.firsts = roundoff(interface.words), first_of_groups(interface, m)
+        self.errors = self.epsilon * np.abs(np.array([np.asarray(each) for each in self.states]))
+        self.motion: Motion | None = None
+        q, p = self.states
+        self.kinetic = momenta_of_velocities(trajectory.stepper, self.t, q, p, trajectory.parameters)
+        plan = trajectory.plan
+        self.absolute: Array | float = 0.0
+        if isinstance(plan, Adaptive):
+            self.absolute = absolute_tolerances(interface, m, plan.absolute_tolerance)
+
+    def compare(self, other: Any) -> bool:
+        """Compare with another run, whose differences are infinite after its end; return whether it is complete."""
+        ahead = self.forward * (self.t - np.asarray(other.t)[-1])
+        some = ahead <= 0.0
+        differences = np.full(self.errors.shape, np.inf)
+        with suppress(StepFailedError), np.errstate(all="ignore"):  # a partial step
+            if some.any():
+                states = other._states_at(self.t[some])
+                differences[:, some] = [abs(x - y[some]) for x, y in zip(states, self.states, strict=True)]
+        np.maximum(self.errors, differences, out=self.errors)
+        self.motion = Motion(np.asarray(other.t), other.q, other.p, self.firsts, self.epsilon, self.absolute)
+        return bool(np.isfinite(differences).all())
+
+    def lose(self) -> None:
+        """Record that a run for comparison has not ended."""
+        self.errors[:, self.t != self.start] = np.inf
+
+    def largest(self) -> float:
+        """Return the largest error relative to the size of the whole motion."""
+        return float(self.relative()[0].max(initial=0.0))
+
+    def relative(self, within: Callable[[Array], NDArray[np.bool_]] | None = None) -> tuple[Array, int]:
+        """Return (k,) errors relative to the size of the motion, and up to which of them ``within`` is true.
+
+        The size of an unconfirmed run is that up to the last confirmed time, as what follows is not known.
+        """
+        if self.motion is None:  # no run for comparison was necessary, or none has ended
+            differences = np.where(np.isfinite(self.errors).all(axis=(0, 2)), 0.0, np.inf)
+            return differences, len(self.t) if np.isfinite(differences).all() else int(np.argmax(differences))
+        whole, reached = np.empty(0), len(self.t)
+        while reached:
+            errors = self.errors[:, :reached]
+            sizes = self.motion.sizes(
+                float(self.t[reached - 1]), errors.max(axis=1), self.kinetic[:reached].max(axis=0)
+            )
+            differences = relative(errors, sizes[:, None]).max(axis=(0, 2))
+            whole = whole if whole.size else differences
+            met = np.ones(reached, bool) if within is None else within(differences)
+            if met.all():
+                break
+            reached = int(np.argmin(met))
+        return whole, reached

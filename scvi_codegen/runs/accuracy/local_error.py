@@ -1,0 +1,157 @@
+"""Warnings at the end of a run: steps too large for the motion, conserved energies that change, unresolved fields."""
+
+import sys
+from typing import Any, Final
+
+import numpy as np
+
+from scvi_codegen.common.errors import AccuracyWarning, StateError, warn
+from scvi_codegen.runs.accuracy.resolution import warn_of_unresolved_fields
+from scvi_codegen.runs.accuracy.size import RESOLVED, roundoff
+from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted
+from scvi_codegen.runs.results.saved_states import SavedStates
+from scvi_codegen.runs.states.validation import Array
+from scvi_codegen.runs.stepping.integrator import Integrator
+from scvi_codegen.runs.stepping.memory import Memory
+from scvi_codegen.runs.stepping.step_plan import Adaptive, FixedSteps
+
+TOLERABLE_ERROR: Final = 1e-3
+"""Largest relative error of a step, and largest relative change of the energy of a run, without a warning."""
+
+ADAPTIVE_REMEDY: Final = ", or use adaptive steps (t_end= without h)"
+
+GROSS_ERROR: Final = 0.5
+"""Relative energy change that triggers a warning in fixed-step runs without an error estimate."""
+
+MOST_CHECKED: Final = 1000
+"""Largest number of trajectories of an ensemble whose energy is checked."""
+
+ERROR_AMPLIFIED: Final = (
+    "although every step met the tolerance: errors of steps accumulate, and close encounters amplify them. Reduce the "
+    "tolerance, or use regularised coordinates"
+)
+FIXED_STEP_REMEDY: Final = (
+    "although the system conserves it: h is too large, perhaps for a close encounter. Reduce h, or use an SVI with "
+    "adaptive steps (t_end=)"
+)
+
+
+def warn_of_inaccuracy(trajectory: SavedStates, run: Memory, *, before: float = 0.0) -> None:
+    """Issue the warnings of large steps, of energy errors and of unresolved fields for the states of a run."""
+    error = trajectory.step_error
+    if error > TOLERABLE_ERROR:
+        warn_of_large_steps(trajectory, before=before)
+    if error != error or not isinstance(trajectory.plan, FixedSteps):
+        warn_of_energy_error(trajectory, run)
+    if trajectory.stepper.interface.layout.mesh is not None:
+        warn_of_unresolved_fields(trajectory)
+
+
+def warn_of_large_steps(trajectory: SavedStates, *, before: float = 0.0, remedy: str = ADAPTIVE_REMEDY) -> None:
+    """Issue an :class:`AccuracyWarning` for the worst fixed step, unless an error ``before`` already caused one."""
+    error = trajectory.step_error
+    if not error > TOLERABLE_ERROR:
+        return
+    if isinstance(trajectory.plan, Adaptive) or before > TOLERABLE_ERROR or not warnings_wanted():
+        return
+    warn(
+        f"the step size h = {trajectory.h:g} is too large: the relative error of the step from "
+        f"t = {trajectory.worst_step_time:g} is about {error:.1e} (estimated). Reduce h{remedy}",
+        AccuracyWarning,
+    )
+
+
+def warn_of_energy_error(trajectory: SavedStates, run: Memory) -> None:
+    """Issue an :class:`AccuracyWarning` if an adaptive run does not conserve an energy that the system conserves.
+
+    Runs over arrays of run-time sizes with fixed steps and no error estimate are checked for gross errors.
+    """
+    plan, stepper = trajectory.plan, trajectory.stepper
+    limits: dict[str, Any] = {}
+    if not isinstance(plan, Adaptive):
+        if not isinstance(plan, FixedSteps) or trajectory.step_error == trajectory.step_error:
+            return
+        if not stepper.interface.layout.coordinates:
+            return
+        limits = {"tolerable": GROSS_ERROR, "why": FIXED_STEP_REMEDY}
+    if not stepper.interface.conserves_energy or stepper.changes_states or not warnings_wanted():
+        return
+    t, q, p = trajectory.t, trajectory.q, trajectory.p
+    ends = run._end_energies(t, q, p)
+    if ends is None or not abs(ends[1] - ends[0]) > 0.5 * TOLERABLE_ERROR * max(abs(ends[0]), abs(ends[1])):
+        return
+    if energies := _changed_energies(stepper, t, q, p, trajectory.parameters):
+        warn_of_energies(*energies, **limits)
+
+
+def warn_of_energy_errors(ensemble: Any, ends: Array | None = None) -> None:
+    """Issue the warning of :func:`warn_of_energy_error` for the worst of ``MOST_CHECKED`` trajectories.
+
+    ``ends``: (k, 2) energies of the first and the last state where they are known, else NaN.
+    """
+    plans, stepper = ensemble.plans, ensemble.stepper
+    if stepper.changes_states or not (plans and stepper.interface.conserves_energy and warnings_wanted()):
+        return
+    by_trajectory, stride = {}, -(-len(plans) // MOST_CHECKED)
+    chosen = np.arange(0, len(plans), stride)
+    if ends is not None:
+        first, last = np.abs(ends[chosen]).T, np.abs(np.diff(ends[chosen])[:, 0])
+        chosen = chosen[~(last <= 0.5 * TOLERABLE_ERROR * np.maximum(first[0], first[1]))]
+    for j in chosen.tolist():
+        t, q, p, _, _ = ensemble._one(j)
+        if len(t) and (energies := _changed_energies(stepper, t, q, p, ensemble.parameters[j])):
+            by_trajectory[j] = energies
+    worst = max(by_trajectory, key=lambda j: relative_energy_change(*by_trajectory[j]), default=None)
+    if worst is not None:
+        warn_of_energies(*by_trajectory[worst], where=f" of trajectory {worst}")
+
+
+def warn_of_energies(
+    first: float,
+    last: float,
+    size: float,
+    *,
+    tolerable: float = TOLERABLE_ERROR,
+    where: str = "",
+    why: str = ERROR_AMPLIFIED,
+) -> None:
+    """Issue an :class:`AccuracyWarning` if a conserved energy differs between the first and the last state.
+
+    Args:
+        first, last: energies of the first and the last state.
+        size: scale of the energy terms (largest |p.v|), for energies near zero.
+        tolerable: tolerated change relative to the largest of the three.
+        where: description of the trajectory, appended to "the energy".
+        why: probable cause and remedy.
+    """
+    if relative_energy_change(first, last, size) > tolerable and warnings_wanted():
+        warn(f"the energy{where} changed from {first:.3g} to {last:.3g} {why}", AccuracyWarning)
+
+
+def relative_energy_change(first: float, last: float, size: float) -> float:
+    """Return the relative change of an energy; 0 if it is NaN."""
+    part = abs(last - first) / max(abs(first), abs(last), size, sys.float_info.min)
+    return part if part == part else 0.0
+
+
+def _changed_energies(
+    stepper: Integrator, t: Array, q: Array, p: Array, parameters: Array
+) -> tuple[float, float, float] | None:
+    """Return the first and the last energy and the largest |p.v| if the energy changed; ``None`` otherwise.
+
+    ``None`` is also returned outside the domain of L, and at rest up to rounding, where the energy is that of rounding
+    errors. Velocities are computed only if the energies differ.
+    """
+    resolution = RESOLVED * roundoff(stepper.interface.words)
+    if (np.ptp(np.asarray(q), axis=0) <= resolution * np.abs(np.asarray(q)).max(axis=0)).all():
+        return None
+    t, q, p = (each[:: max(1, len(each) - 1)].copy() for each in (t, q, p))
+    try:
+        energies = stepper._energies_of(t, q, p, parameters)
+        first, last = float(energies[0]), float(energies[-1])
+        if not relative_energy_change(first, last, 0.0) > TOLERABLE_ERROR:
+            return None
+        sizes = np.sum(p * stepper.velocity(q, p, t, parameters), axis=1)
+    except StateError:
+        return None
+    return first, last, float(np.abs(sizes).max())

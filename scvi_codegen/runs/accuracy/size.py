@@ -1,0 +1,191 @@
+"""Size of a motion: the range of each coordinate over a run, which errors are relative to.
+
+A size that is the coordinate itself would depend on the origin. Coordinates that share a unit share their range: the
+entries of an array, the components of a rotation.
+"""
+
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.codegen.rendering.source import Interface
+from scvi_codegen.common.errors import StateError
+from scvi_codegen.runs.states.rotations import members_of
+from scvi_codegen.runs.states.validation import Array, coordinate_shapes
+
+RESOLVED = 64.0
+"""Range in roundings of the largest value from which on a coordinate moves."""
+NOISE_OF_MOMENTA = 1e4
+"""The same of momenta, relative to the largest one: those that are conserved accumulate rounding errors."""
+SAMPLES = 16
+"""Number of states whose momenta without velocity are computed."""
+UPDATE_ROUNDING = 4.0
+"""Newton updates of so many roundings of the largest value cannot be reduced."""
+
+
+def roundoff(words: int) -> float:
+    """Return the largest relative rounding error of numbers of one or two words."""
+    return float(2.0 ** (-53 * words))
+
+
+def first_of_groups(interface: Interface, dimension: int) -> NDArray[np.intp]:
+    """Return the indices of the first coordinates of groups with a common unit: coordinates, arrays, rotations."""
+    counts = [int(np.prod(shape)) for _, shape in coordinate_shapes(interface)]
+    if sum(counts) != dimension or interface.rotations:
+        counts = [1] * dimension
+    firsts = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    for member in members_of(dimension, interface.rotations):
+        columns = member.columns
+        if isinstance(columns, slice):
+            firsts = np.setdiff1d(firsts, np.arange(columns.start + 1, columns.stop))
+    return firsts.astype(np.intp)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """States of a run that its size is derived from.
+
+    Attributes:
+        t: (n,) times, in the direction of the run.
+        q, p: (n, m) positions and momenta.
+        firsts: as of :func:`first_of_groups`.
+        absolute: sizes below which errors do not matter, one number or (m,).
+        epsilon: largest relative rounding error.
+    """
+
+    t: Array
+    q: Array
+    p: Array
+    firsts: NDArray[np.intp]
+    epsilon: float
+    absolute: Array | float = 0.0
+
+    def sizes(self, until: float, errors: Array, kinetic: Array | float = 0.0) -> Array:
+        """Return (2, m) sizes of positions and momenta up to a time.
+
+        Positions: max(range, absolute); of a coordinate that is at rest, up to rounding, its largest value. Momenta:
+        the range, at least ``kinetic`` (m,), those of velocities, times the ratio of the size to the range of their
+        coordinate, or the least one. Of those that consist of rounding errors of others, by which ``errors`` (2, m) are
+        as large, both are the largest one.
+        """
+        rows = slice(max(1, np.count_nonzero(abs(self.t - self.t[0]) <= abs(until - self.t[0]))))
+        q, p = np.asarray(self.q)[rows], np.asarray(self.p)[rows]
+        ranges, largest = self._of_groups(np.ptp(q, axis=0)), self._of_groups(np.abs(q).max(axis=0))
+        momenta = self._of_groups(np.maximum(np.ptp(p, axis=0), kinetic))
+        resolution = RESOLVED * self.epsilon
+        rest = ranges <= resolution * largest
+        noise = _is_noise(ranges, errors[0], resolution)
+        sizes = np.where(noise, ranges.max(initial=0.0), np.where(rest, np.maximum(ranges, largest), ranges))
+        sizes = np.maximum(sizes, self.absolute)
+        with np.errstate(all="ignore"):
+            ratio = np.maximum(1.0, sizes / ranges)
+            least = np.fmin.reduce(ratio, initial=1.0 / self.epsilon)  # NaN: of 0 by 0
+            noise_of_p = _is_noise(momenta, errors[1], NOISE_OF_MOMENTA * resolution)
+            of_p = np.where(noise_of_p, momenta.max(initial=0.0), momenta) * np.where(rest | noise, least, ratio)
+        return np.array([sizes, of_p])
+
+    def _of_groups(self, values: Array) -> Array:
+        """Return the largest value of the group of each coordinate."""
+        counts = np.diff(self.firsts, append=len(values))
+        return np.asarray(np.repeat(np.maximum.reduceat(values, self.firsts), counts))
+
+
+def _is_noise(sizes: Array, errors: Array, resolution: float) -> NDArray[np.bool_]:
+    """Return which sizes are rounding errors of the largest one: errors are as large."""
+    return np.asarray((sizes < resolution * sizes.max(initial=0.0)) & (100.0 * errors >= sizes))
+
+
+def momenta_of_velocities(stepper: Any, t: Array, q: Array, p: Array, parameters: Array) -> Array:
+    """Return (n, m) absolute p(q, v) - p(q, 0) of ``SAMPLES`` states, 0 of the others; |p| if that is undefined.
+
+    Those without velocity, of a vector potential, depend on its gauge.
+    """
+    kinetic, rows = np.zeros(np.shape(p)), slice(None, None, -(-len(t) // SAMPLES))
+    at_rest: Any = 0.0
+    with suppress(StateError):  # Hamiltonians, inputs that are not set
+        at_rest = np.asarray(stepper.momentum(q[rows], np.zeros_like(kinetic[rows]), t[rows], parameters))
+    kinetic[rows] = np.abs(np.asarray(p[rows]) - at_rest)
+    return kinetic
+
+
+def largest_range(values: Array) -> float:
+    """Return the largest range of a column of (n, m) values."""
+    return float(np.ptp(np.asarray(values), axis=0).max(initial=0.0))
+
+
+@dataclass(frozen=True, slots=True)
+class SizeOfMotion:
+    """Sizes of a motion that was found, a path or an orbit, of which its errors are parts.
+
+    Attributes:
+        position: largest range of a coordinate.
+        momentum: largest momentum of a velocity.
+        rounding: (2,) rounding errors of positions and of momenta.
+    """
+
+    position: float
+    momentum: float
+    rounding: tuple[float, float]
+
+    @classmethod
+    def of(cls, q: Array, p: Array, at_rest: Array | float = 0.0) -> "SizeOfMotion":
+        """Return the sizes of (n, m) states; ``at_rest``: (m,) momenta without velocity, of the gauge of L."""
+        of_q, of_p = (roundoff(1) * float(np.abs(each).max(initial=0.0)) for each in (q, p))
+        return cls(largest_range(q), float(np.abs(p - at_rest).max(initial=0.0)), (of_q, of_p))
+
+    def error(self, position: float, momentum: float) -> float:
+        """Return the larger one of both errors, with those of rounding, relative to these sizes."""
+        of_q, of_p = self.rounding
+        return max((position + of_q) / (self.position or 1.0), (momentum + of_p) / (self.momentum or 1.0))
+
+
+def distances_from_mean(q: Array) -> Array:
+    """Return (..) root mean square distances of the later half of (n, .., m) positions from the mean of all.
+
+    Those of positions at rest, up to rounding, are 0: such a motion has no size.
+    """
+    q = np.asarray(q)
+    with np.errstate(all="ignore"):  # runs that failed
+        late, mean = q[len(q) // 2 :], q.mean(axis=0)
+        away = np.sqrt(np.mean(np.sum((late - mean) ** 2, axis=-1), axis=0))
+    return np.asarray(np.where(away <= _resolution(q), 0.0, away))
+
+
+def relative_to_motion(errors: Array, q: Array) -> Array:
+    """Return errors (.., k) of norms of positions relative to :func:`distances_from_mean` of (n, k, m) positions.
+
+    Those of a motion at rest are 0 up to rounding, else infinite.
+    """
+    sizes = distances_from_mean(q)
+    return relative(np.where((sizes == 0.0) & (errors <= _resolution(np.asarray(q))), 0.0, errors), sizes)
+
+
+def _resolution(q: Array) -> Array:
+    """Return (..) distances below which (n, .., m) positions do not differ, up to rounding."""
+    with np.errstate(all="ignore"):
+        return np.asarray(RESOLVED * roundoff(1) * np.sqrt(np.mean(np.sum(q**2, axis=-1), axis=0)))
+
+
+def size_for_updates(q: Array, settled: float, least: float = 0.0) -> float:
+    """Return the size of (n, m) positions of which updates below the part ``settled`` end an iteration.
+
+    It is the largest range, or ``least``, or what makes ``settled`` some roundings of the positions.
+    """
+    rounding = UPDATE_ROUNDING * roundoff(1) * float(np.abs(q).max(initial=0.0))
+    return max(largest_range(q), least, rounding / settled)
+
+
+def neighbouring(x: Array) -> Array:
+    """Return the next numbers above or below numbers other than 0, as of another rounding."""
+    x = np.asarray(x)
+    towards = np.where(np.cos(np.arange(x.size)).reshape(x.shape) > 0.0, np.inf, -np.inf)
+    return np.asarray(np.where(x == 0.0, x, np.nextafter(x, towards)))
+
+
+def relative(errors: Array, sizes: Array) -> Array:
+    """Return errors (.., m) relative to sizes; 0 for errors of 0."""
+    with np.errstate(all="ignore"):
+        return np.asarray(np.where(errors == 0.0, 0.0, errors / sizes))

@@ -1,0 +1,270 @@
+"""Compilation: from a mechanical system and a method to a stepper.
+
+    MechanicalSystem, Method
+      -> Sources   header, source and interface, derived once (:mod:`scvi_codegen.codegen.pipeline`) and cached
+      -> build     library, compiled once (:mod:`scvi_codegen.codegen.native.building`); Newton's iteration is
+                   added when a fixed point first fails (:mod:`scvi_codegen.codegen.rendering.kernels.simd`)
+      -> Stepper   step, integrate (:mod:`scvi_codegen.runs.stepper`)
+
+Each stage is a pure function of frozen data; only ``build`` touches the disk. Sources and compiled libraries are
+cached in the user's cache folder (:mod:`scvi_codegen.common.cache`). If everything is in the cache, including the
+key of a system defined by text (:mod:`scvi_codegen.systems.system`), neither SymPy nor the pipeline is imported.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from functools import cache, cached_property, partial
+from typing import TYPE_CHECKING, Any, cast
+
+from numpy.typing import ArrayLike
+
+from scvi_codegen.codegen.native.building import TUNED_FLAGS
+from scvi_codegen.codegen.native.compilers import REORDERING_FLAGS
+from scvi_codegen.codegen.rendering.source import AUTO, DOUBLE_DOUBLE, PRECISIONS, Interface, Source
+from scvi_codegen.common.cache import cached_source, key_of
+from scvi_codegen.common.errors import MethodError, SizesRequiredError
+from scvi_codegen.common.validation import TEXTS, ArgumentType, check_kind, checks_arguments
+from scvi_codegen.methods import SVI, StoermerVerlet, as_method, default_method
+from scvi_codegen.methods.method import Method
+from scvi_codegen.runs.stepper import Stepper
+from scvi_codegen.runs.stepping.compiled_method import Variants
+from scvi_codegen.systems.event import EventLike, as_events
+from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED
+from scvi_codegen.systems.system import MechanicalSystem
+
+if TYPE_CHECKING:
+    from sympy import Expr
+
+    from scvi_codegen.codegen.pipeline import Sources
+    from scvi_codegen.systems.arrays.system import ArraySystem
+    from scvi_codegen.systems.symmetry.symmetry import Symmetry
+
+SYSTEM_OR_ARRAYS = ArgumentType(
+    "a LagrangianSystem or a HamiltonianSystem", lambda value: isinstance(value, MechanicalSystem)
+)
+"""Type check of systems, also of those with arrays of run-time sizes."""
+
+
+@checks_arguments(system=SYSTEM_OR_ARRAYS, flags=TEXTS)
+def compile_stepper(
+    system: MechanicalSystem | ArraySystem,
+    method: Method | str = "svi:8",
+    *,
+    solver: str = "auto",
+    flags: tuple[str, ...] = TUNED_FLAGS,
+    prefix: str | None = None,
+    symmetries: Sequence[Symmetry] = (),
+    events: EventLike | Sequence[EventLike] | None = None,
+    time_transformation: str | Expr | None = None,
+    controller: str | None = None,
+    sizes: Mapping[str, int] | None = None,
+    tables: Mapping[str, ArrayLike] | None = None,
+    precision: str = "double",
+) -> Stepper:
+    """Derive, generate, compile and load the integrator of ``system`` by ``method``.
+
+    Args:
+        system: the mechanical system.
+        method: the discretisation, or a name as on the command line: ``"svi"``, ``"svi:6"``.
+        solver: solver of the stage equations. ``"fixed-point"`` is fast (stages are SIMD lanes) and available for
+            methods with at most 32 stages, except variational SCVI with more than 8 coordinates and SVI with fewer
+            points than its degree; ``"newton"`` is always available, also for stiff systems and large steps;
+            ``"explicit"`` requires Stoermer-Verlet or a composition and a separable system; ``"auto"`` takes explicit
+            or fixed point if available and falls back to Newton, compiled when first needed.
+        flags: flags for the C compiler; the default is tuned to this processor.
+        prefix: prefix of the C names; by default made from the names of system and method.
+        symmetries: symmetries to track in addition to those that are detected
+            (:func:`~scvi_codegen.systems.symmetry.checking.check_symmetry`).
+        events: zero crossings that every run of this stepper records, see :meth:`Stepper.integrate`.
+        time_transformation: time-rescaling function g(q, t) > 0 (g(q, p, t) of a Hamiltonian), or a name accepted by
+            :func:`~scvi_codegen.reparametrise`. Runs with h and t_end then take constant steps h in tau, dt = g dtau,
+            by the reversible controller of Hairer and Soederlind; time-dependent and forced systems are supported.
+            Momentum maps are preserved. Entries and sums of arrays are written in index notation.
+        controller: step-size controller of runs to t_end, by default ``"predictive"`` (adaptive steps), and
+            ``"reversible"`` with a time transformation; a name among ``scvi_codegen.methods.controllers.CONTROLLERS``.
+        sizes: whole numbers for the sizes of arrays, ``{"N": 8}``: the system of all entries q_0, q_1, .. is compiled,
+            which has every feature. Without them arrays have the sizes that each run gives them: neither the length of
+            the C source nor its compile time depends on the number of coordinates, and the solver is ``"fixed-point"``,
+            without fallback, or ``"newton"``, with factors of the linear part of a step (meshes, chains, Hamiltonians)
+            or Newton-GMRES with the diagonal of the Jacobian or its circulant (Fourier) average. Methods are explicit,
+            or have a fixed-point iteration over stage positions (SVI, SC, Runge-Kutta); others, and systems without
+            such loops, are compiled with the sizes of each call, once.
+        tables: with ``sizes``, index tables of shape (rows, columns) by name.
+        precision: ``"double"``; or ``"double-double"`` for states and results of 31 digits (docs/digits.md); or
+            ``"auto"``: double, and double-double for runs with ``error=`` that double does not confirm, as
+            ``run.confirmation.precision`` reports.
+
+    Raises:
+        BuildError: if there is no C compiler.
+        MethodError: if the method, the solver or another argument is not available for the system.
+    """
+    check_precision(precision, flags)
+    common: dict[str, Any] = {
+        "solver": solver,
+        "flags": flags,
+        "prefix": prefix,
+        "symmetries": symmetries,
+        "sizes": sizes,
+        "time_transformation": time_transformation,
+        "controller": controller,
+        "tables": tables,
+    }
+    compiled = partial(compile_stepper, system, method, **common)
+    if precision == AUTO:
+        if sizes is None and hasattr(system, "REQUIRES_SIZES"):
+            raise MethodError(f"precision='auto' is not available with arrays of run-time sizes: {SIZES_REQUIRED}")
+        return _in_both_precisions(compiled, events)
+    if symmetries != ():
+        from scvi_codegen.systems.symmetry.symmetry import SYMMETRIES
+
+        check_kind(SYMMETRIES, symmetries, "symmetries")
+    drawn: dict[str, Any] = {
+        "mesh": getattr(system, "mesh", None),
+        "links": () if hasattr(system, "_text") else getattr(system, "links", ()),
+    }
+    if sizes is not None or tables is not None:
+        system, time_transformation = _at_sizes(system, time_transformation, sizes or {}, tables)
+    if known_sizes := not hasattr(system, "REQUIRES_SIZES"):
+        method = as_method(method, system)
+    else:
+        if symmetries:
+            raise MethodError(f"symmetries= is unavailable for '{system.name}': {SIZES_REQUIRED}")
+        chosen, method = method, as_method(method)
+    if precision == DOUBLE_DOUBLE and not known_sizes:
+        raise MethodError("precision='double-double' is not available with arrays of run-time sizes: pass sizes={..}")
+    sources = CachedSources(system, method, solver, prefix, symmetries, time_transformation, controller, precision)
+    variants = Variants(make=sources.variant, lacking=lambda name: name == "second_derivatives" and system.damping != 0)
+    if not known_sizes:
+        source, interface, reason = sources.of_run_time_sizes()
+        rattle = system.constraints and isinstance(method, StoermerVerlet)
+        of_sizes = partial(
+            compile_stepper,
+            system,
+            SVI(1, "gauss-lobatto:2") if rattle else chosen,  # the name of RATTLE for known sizes
+            solver=solver,
+            flags=flags,
+            prefix=prefix,
+            time_transformation=time_transformation,
+            controller=controller,
+        )
+        further: dict[str, Any] = {"events": as_events(events), "of_sizes": of_sizes, "reason": reason}
+        return Stepper(source, interface, variants=variants, flags=flags, **further)
+    source, interface = sources.integrator()
+    interface = replace(interface, layout=replace(interface.layout, **drawn))
+    cast(MechanicalSystem, system).store_key()
+    if precision == DOUBLE_DOUBLE:
+        stepper = Stepper(source, interface, variants=variants, flags=flags)
+        stepper._doubles = cache(compiled)
+        return stepper.with_events(as_events(events))
+    return Stepper(source, interface, variants=variants, flags=flags, events=as_events(events))
+
+
+def second_stepper(system: MechanicalSystem) -> Callable[[], Stepper]:
+    """Return a function that compiles the stepper of second runs, by the default method, which has adaptive steps."""
+    return lambda: compile_stepper(system, default_method(system))
+
+
+def _in_both_precisions(compiled: Callable[..., Stepper], events: EventLike | Sequence[EventLike] | None) -> Stepper:
+    """Return the stepper in double of precision="auto", with that in double-double if there is one."""
+
+    @cache
+    def in_double_double() -> Stepper | None:
+        with suppress(MethodError):  # of this system or method
+            return compiled(precision=DOUBLE_DOUBLE)
+        return None
+
+    stepper = compiled(events=events)
+    stepper._precise = in_double_double
+    return stepper
+
+
+def check_precision(precision: str, flags: Sequence[str]) -> None:
+    """Raise :class:`MethodError` for an unknown precision, and for flags that would destroy it."""
+    if precision not in PRECISIONS:
+        raise MethodError(f"unknown precision {precision!r}: use {', '.join(map(repr, PRECISIONS[:-1]))} or {AUTO!r}")
+    if precision == DOUBLE_DOUBLE and (worst := [flag for flag in flags if flag in REORDERING_FLAGS]):
+        raise MethodError(
+            f"the compiler flag {worst[0]!r} reorders sums, which destroys precision='double-double': omit it "
+            "(-fno-math-errno, -fno-trapping-math and -ffp-contract=fast are harmless)"
+        )
+
+
+def _at_sizes(
+    system: Any, g: str | Expr | None, sizes: Mapping[str, int], tables: Mapping[str, ArrayLike] | None
+) -> tuple[Any, str | Expr | None]:
+    """Return a system of arrays and its time-rescaling function at known sizes."""
+    from scvi_codegen.systems.arrays.elements import formula_at_sizes
+    from scvi_codegen.systems.formulas.array_statements import is_indexed
+    from scvi_codegen.systems.rolling import unroll_sums
+
+    if isinstance(g, str) and is_indexed(g):
+        g = formula_at_sizes(system, g, sizes, tables)
+    return unroll_sums(system, sizes, tables=tables), g
+
+
+class CachedSources:
+    """C sources of one integrator and its variants, from the cache if they were derived before."""
+
+    def __init__(
+        self,
+        system: MechanicalSystem | ArraySystem,
+        method: Method,
+        solver: str,
+        prefix: str | None,
+        symmetries: Sequence[Symmetry],
+        g: str | Expr | None,
+        controller: str | None = None,
+        precision: str = "double",
+    ) -> None:
+        self.precision = precision
+        self.system, self.method, self.solver, self.prefix = system, method, solver, prefix
+        self.symmetries, self.g, self.controller = symmetries, g, controller
+        choices = (solver, prefix, tuple(symmetries), g, controller, *([precision] if precision != "double" else []))
+        self.key = (*system.key(), *method.key(), key_of(choices))
+
+    @cached_property
+    def derived(self) -> Sources:
+        """The sources that are not in the cache."""
+        from scvi_codegen.codegen.pipeline import Sources
+
+        chosen = self.solver, self.prefix, self.symmetries, self.g, self.controller, self.precision
+        return Sources(self.system, self.method, *chosen)
+
+    def integrator(self) -> tuple[Source, Interface]:
+        """Return the C source and its interface."""
+
+        def derive() -> str:
+            source, interface = self.derived.integrator()
+            return json.dumps([source.to_record(), interface.to_record()])
+
+        source, interface = json.loads(cached_source((*self.key, "integrator"), derive))
+        return Source.from_record(source), Interface.from_record(interface)
+
+    def of_run_time_sizes(self) -> tuple[Source | None, Interface, str]:
+        """Return the C source for run-time sizes, or ``None``; the interface; the reason why there is none."""
+
+        def derive() -> str:
+            try:
+                return json.dumps([self.derived.integrator()[0].to_record(), ""])
+            except SizesRequiredError as error:
+                return json.dumps([None, str(error)])
+
+        record, reason = json.loads(cached_source((*self.key, "integrator"), derive))
+        interface = self.derived.interface
+        if record:
+            return Source.from_record(record), interface, ""
+        return None, replace(interface, layout=replace(interface.layout, maps=())), reason
+
+    def variant(self, name: str) -> Source | None:
+        """Return the source of a variant (:class:`Variants`)."""
+
+        def derive() -> str:
+            source = self.derived.variant(name)
+            return "" if source is None else source.to_json()
+
+        text = cached_source((*self.key, name), derive)
+        return Source.from_json(text) if text else None

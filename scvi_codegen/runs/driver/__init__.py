@@ -1,0 +1,1 @@
+"""Loops of steps: runs, observers, singular times, segments between breakpoints of inputs."""

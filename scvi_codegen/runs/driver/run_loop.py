@@ -1,0 +1,365 @@
+"""Run loop: advance in chunks of bounded duration, and save every k-th state of a run."""
+
+import math
+import struct
+from collections.abc import Callable, Sequence
+from functools import lru_cache, partial
+from math import isfinite
+from typing import Any, cast
+
+import numpy as np
+
+from scvi_codegen.codegen.native.arguments import empty_array
+from scvi_codegen.codegen.native.capacity import room_for_states, too_many_states
+from scvi_codegen.common.errors import StepFailedError
+from scvi_codegen.common.validation import checked_count
+from scvi_codegen.runs.driver.singular_time import ProgressWatch, check_energy_surface
+from scvi_codegen.runs.states.rotations import checked_pair
+from scvi_codegen.runs.states.times import times_after
+from scvi_codegen.runs.states.validation import BINARY64, FEW, NUMBERS, SEQUENCES, Array
+from scvi_codegen.runs.states.words import block_of, from_block
+from scvi_codegen.runs.stepping.chunks import drive
+from scvi_codegen.runs.stepping.memory import FIRST_STEPS, Memory
+from scvi_codegen.runs.stepping.step_plan import Adaptive, FixedSteps, InTau, ending_at
+from scvi_codegen.runs.trajectory import Trajectory
+from scvi_codegen.systems.event import Crossings
+
+States = tuple[Any, ...]
+"""Times, positions, momenta, iterations and, of a run that sums it, the action."""
+NATIVE_DOUBLE, INT32 = struct.Struct("d"), np.dtype(np.int32)
+GROWTH = 8.0
+"""Largest ratio of successive numbers of steps of calls that save few states."""
+STEPS_TO_STOP = 64
+"""Number of steps of a call towards a stop."""
+
+
+def record(
+    memory: Memory,
+    steps: int | None,
+    *,
+    save_every: int = 1,
+    progress: Callable[[int], None] | None = None,
+    stop: Callable[[], bool] | None = None,
+    filled: int = 0,
+    status: int = 0,
+) -> Trajectory:
+    """Advance by ``steps``; save the present state and those whose step number is a multiple of ``save_every``.
+
+    Adaptive steps end at the target time, whose state is saved as well; ``steps`` may then be omitted. The run ends
+    early if ``stop``, which is called before each chunk of steps, returns true. ``filled``: states of the run that its
+    memory for short runs already contains; ``status``: of the step after them.
+
+    Raises:
+        StepFailedError: if a step fails; ``trajectory`` has the saved states, the run is left before that step.
+    """
+    count = None if steps is None and memory._h is None else checked_count(steps, "steps", least=0)
+    if type(save_every) is not int or save_every != 1:
+        save_every = checked_count(save_every, "save_every", least=1)
+    recorder = _StateRecorder(memory, save_every, count, filled)
+    try:
+        if status:
+            raise memory._failure(status)
+        if progress is None and stop is None and count is not None and count <= recorder.first_size:
+            if count and not memory.arrived:  # one chunk
+                recorder.advance(count)
+        else:
+            drive(
+                recorder.advance,
+                math.inf if count is None else count,
+                first=1 if stop else recorder.first_size,
+                growth=GROWTH if save_every > 1 else 2.0,
+                ended=lambda: memory.arrived or bool(stop and stop()),
+                progress=progress,
+            )
+    except StepFailedError as failure:
+        failure.trajectory = recorder.trajectory()
+        raise
+    trajectory = recorder.trajectory()
+    if trajectory.tau is not None:
+        memory.longest = float(np.abs(np.diff(trajectory.t)).max(initial=memory.longest))
+        check_energy_surface(trajectory, memory.longest)
+    return trajectory
+
+
+def record_with_stops(
+    memory: Memory, stops: Sequence[float], *, progress: Callable[[int], None] | None = None
+) -> Trajectory:
+    """Advance with adaptive steps that end at each of the times ``stops``, and save all states.
+
+    Raises:
+        StepFailedError: if a step fails; ``trajectory`` has the saved states, the run is left before that step.
+    """
+    recorder, first, target = _StateRecorder(memory, 1, None, 0), memory.steps, memory._plan
+    try:
+        for t_end in stops:
+            memory._call.t_end = t_end  # without the checks of a new plan
+            while memory.left_to(t_end) != 0.0:
+                recorder.advance(STEPS_TO_STOP)
+                if progress is not None:
+                    progress(memory.steps - first)
+    except StepFailedError as failure:
+        failure.trajectory = recorder.trajectory()
+        raise
+    finally:
+        memory.plan = ending_at(target, stops[-1])
+    return recorder.trajectory()
+
+
+class StateRows:
+    """Memory for the times, positions, momenta and iterations of states of a run.
+
+    Attributes:
+        states: the arrays; of a run that sums the action, also its values.
+        starts: pointers to their first rows.
+    """
+
+    def __init__(self, memory: Memory, rows: int) -> None:
+        binding, self.words = memory.stepper.binding, memory.stepper.interface.words
+        m = self.words * len(memory._q)
+        t = empty_array((rows,) if self.words == 1 else (rows, self.words))
+        q, p = empty_array((rows, m)), empty_array((rows, m))
+        actions = (np.zeros(rows),) if memory._sums_action else ()
+        self.states: States = t, q, p, np.zeros(rows, INT32), *actions
+        self.starts = *binding.pointers(t, q, p), binding.integers(self.states[3]), *binding.pointers(*actions)
+
+    def after(self, row: int) -> tuple[Any, ...]:
+        """Return pointers to a row."""
+        (t, q, p, *others), begin = self.starts, row * self.states[1].shape[1]
+        return t + self.words * row, q + begin, p + begin, *(each + row for each in others)
+
+    def first(self, count: int) -> States:
+        """Return the first rows, in the same memory; copies of numbers of two words."""
+        t, q, p, *others = (each[:count] for each in self.states)
+        return (t, q, p, *others) if self.words == 1 else (*_numbers(t, q, p), *others)
+
+    def copies(self, count: int) -> States:
+        """Return copies of the first rows."""
+        return tuple(each.copy() for each in self.first(count))
+
+
+class ShortRuns(StateRows):
+    """Memory of runs of at most ``FIRST_STEPS`` saved states, each started and recorded by one C call.
+
+    Args:
+        memory: the run, whose parameters, options and plan the call uses.
+    """
+
+    def __init__(self, memory: Memory) -> None:
+        super().__init__(memory, FIRST_STEPS + 3)
+        stepper, m = memory.stepper, len(memory._q)
+        self.interface, self._kind = stepper.interface, (0, cast("float | None", None))
+        self.shape = (m,) if m <= FEW else None  # of vectors that are checked as lists, faster than as arrays
+        self._start, self._sizes = np.empty(1 + 2 * m), np.full(FIRST_STEPS + 3, math.nan)
+        self._pack = partial(struct.Struct(f"{1 + 2 * m}d").pack_into, cast(Any, self._start), 0)
+        self.call = memory._new_call(*self.starts)
+        self.call.start, self.call.sizes = stepper.binding.pointers(self._start, self._sizes)
+        self.call.has_energies = self.interface.conserves_energy and not stepper.changes_states
+        self.integrate = stepper.binding.call("integrate", self.call)
+        self.results = stepper.binding.results(self.call)
+
+    def begin(self, t: float, q: Any, p: Any) -> None:
+        """Set the initial state; raise :class:`StateError` unless q and p are (m,) finite numbers."""
+        numbers, kind = None, type(q)
+        if kind is type(p) and self.shape is not None:
+            if kind is np.ndarray:
+                if q.shape == p.shape == self.shape and q.dtype is p.dtype is BINARY64:
+                    numbers = q.tolist() + p.tolist()
+            elif kind in SEQUENCES and (len(q),) == (len(p),) == self.shape and NUMBERS.issuperset(map(type, q + p)):
+                numbers = q + p
+        try:
+            if numbers is not None and isfinite(sum(numbers)):
+                self._pack(t, *numbers)
+                return
+        except (OverflowError, struct.error):  # of an integer above all floats
+            pass
+        self._start[0], self._start[1:] = t, np.concatenate(checked_pair(self.interface, q, p))
+
+    def recorded(self, count: int, h: float | None, save_every: int) -> tuple[States, Array]:
+        """Return copies of the first states and of the steps that follow them."""
+        if (count, h) != self._kind:
+            self._kind, self._views = (count, h), self.first(count)
+            self._sizes_of_kind = _repeated(h, count) if h is not None else self._sizes[:count]
+        (t, q, p, iterations), sizes = self._views, self._sizes_of_kind
+        if h is None:
+            sizes[-1] = math.nan
+            sizes = sizes.copy() if save_every == 1 else np.full(count, math.nan)
+        return (t.copy(), q.copy(), p.copy(), iterations.copy()), sizes
+
+
+def _numbers(t: Array, q: Array, p: Array) -> tuple[Array, Array, Array]:
+    """Return times (n, 2) and states (n, 2m) of two words as numbers, contiguous copies."""
+    return from_block(t)[:, 0].copy(), from_block(q).copy(), from_block(p).copy()
+
+
+def integrate_short(
+    run: Memory, q: Any, p: Any, t: float, steps: int | None, save_every: int, growth: int
+) -> Trajectory:
+    """Start a run that is set up at (q, p) and record it, all by one C call if it ends within ``FIRST_STEPS`` states.
+
+    ``growth``: value of ``measures_growth`` in C. Raises as :func:`record`.
+    """
+    short: ShortRuns = run._rows
+    h = run._h
+    first = FIRST_STEPS if save_every == 1 else run._first_steps(save_every)
+    size = first if steps is None else steps
+    short.begin(t, q, p)
+    short.call.measures_growth = growth
+    status = short.integrate(size, save_every)
+    error, error_t, first, last, stored, done, rejected, fallbacks = short.results()
+    if status or (steps is None and done == size):
+        return record(run, steps, save_every=save_every, filled=1 + stored, status=status)
+    if h is None:
+        run._ends = first, last
+    states, sizes = short.recorded(1 + stored, h, save_every)
+    return _trajectory(run, states, sizes, done, error, error_t, rejected, fallbacks)
+
+
+class _StateRecorder:
+    """Present state of a run, and every ``save_every``-th of the following ones, in arrays that C fills.
+
+    The number of states is known for fixed steps; for adaptive steps each chunk has arrays of its own.
+    """
+
+    def __init__(self, memory: Memory, save_every: int, steps: int | None, filled: int) -> None:
+        plan, first = memory._plan, 0 if filled else memory._memory.step
+        self.memory, self.save_every, self.first, self.filled = memory, save_every, first, filled or 1
+        self.first_size = memory._first_steps(save_every)
+        if memory._h is not None:
+            assert steps is not None  # by the caller
+            rows = (first + steps) // save_every - first // save_every + 1
+        else:
+            rows = min(FIRST_STEPS, (self.first_size if steps is None else steps) // save_every) + 3
+        kept: StateRows | None = memory._rows
+        self.rows = kept if kept is not None and rows <= len(kept.states[0]) else StateRows(memory, rows)
+        if not filled:
+            t, q, p, _, *actions = self.rows.states
+            t[0] = memory.t if self.rows.words == 1 else (memory.t, memory._memory.t_low)
+            q[0], p[0] = map(block_of, (memory._q, memory._p))
+            for each in actions:
+                each[0] = memory._memory.action
+        self.earlier: list[States] = []
+        self.bytes = 0
+        self.watch = ProgressWatch(memory.stepper, plan.t_end) if isinstance(plan, InTau) else None
+
+    def advance(self, size: int) -> int:
+        """Take ``size`` steps, fewer if the target time is reached; return their number."""
+        memory, save_every, watch = self.memory, self.save_every, self.watch
+        to_end = memory._h is None
+        before = None if watch is None else memory.t
+        if to_end and self.filled + size // save_every + 2 > len(self.rows.states[0]):
+            self.earlier.append(self._states())
+            self.bytes += sum(each.nbytes for each in self.earlier[-1])
+            if self.bytes > room_for_states():
+                self.filled = 0
+                raise too_many_states(sum(len(each[0]) for each in self.earlier), memory.steps, float(memory.t))
+            self.rows, self.filled = StateRows(memory, size // save_every + 2), 0
+        rows, filled = self.rows, self.filled
+        status = memory._advance(size, save_every, rows.after(filled))
+        report = memory._report
+        if to_end:
+            self.filled += report.stored
+        else:
+            self.filled = 1 + memory._memory.step // save_every - self.first // save_every
+        if status:
+            raise memory._failure(status)
+        steps: int = report.steps
+        if watch is not None and before is not None:
+            watch.check_progress(before, memory.t, steps, memory.steps)
+        return steps
+
+    def _states(self) -> States:
+        """Return the rows in use; copies if most are not, or if the run uses the memory again."""
+        rows, count = self.rows, self.filled
+        capacity = len(rows.states[0])
+        if rows is self.memory._rows or 2 * count <= capacity:
+            return rows.copies(count)
+        return rows.states if count == capacity and rows.words == 1 else rows.first(count)
+
+    def trajectory(self) -> Trajectory:
+        memory, states = self.memory, self._states()
+        if self.earlier:
+            states = tuple(map(np.concatenate, zip(*self.earlier, states, strict=True)))
+        if memory._h is None:
+            return trajectory_of(memory, states, _differences(states[0], whole=self.save_every == 1))
+        tau, h = None, memory._memory.h
+        if memory.stepper.interface.energy_parameter:
+            numbers = self.save_every * (self.first // self.save_every + np.arange(len(states[0])))
+            numbers[0] = self.first
+            tau = times_after(0.0, h, numbers)[0]
+        return trajectory_of(memory, states, _repeated(h, len(states[0])), tau=tau)
+
+
+def trajectory_of(
+    memory: Memory,
+    states: States,
+    step_sizes: Array,
+    *,
+    steps: int | None = None,
+    events: tuple[Crossings, ...] = (),
+    tau: Array | None = None,
+) -> Trajectory:
+    """Return a trajectory of these states with the data of the run."""
+    run, error = memory._memory, math.nan if memory._step_error is None else memory._step_error()
+    done, rejected = run.step if steps is None else steps, run.rejected if isinstance(memory._plan, Adaptive) else 0
+    error_t, fallbacks = run.error_t if error >= 0.0 else 0.0, memory.fallback_steps
+    trajectory = _trajectory(memory, states, step_sizes, done, error, error_t, rejected, fallbacks)
+    trajectory.events, trajectory.tau = events, tau
+    return trajectory
+
+
+def _trajectory(
+    memory: Memory,
+    states: States,
+    step_sizes: Array,
+    steps: int,
+    error: float,
+    error_t: float,
+    rejected: int,
+    fallbacks: int,
+) -> Trajectory:
+    """Return a trajectory without events.
+
+    Its attributes are set one by one, because a call of the class with 16 keywords takes five times as long.
+    """
+    plan, stepper = memory._plan, memory.stepper
+    trajectory = Trajectory.__new__(Trajectory)
+    t, q, p, trajectory.iterations, *actions = states
+    trajectory.actions = actions[0] if actions else None
+    if stepper.shapes is not None:
+        q, p = stepper.named(q), stepper.named(p)
+    trajectory.t, trajectory.q, trajectory.p, trajectory.step_sizes = t, q, p, step_sizes
+    trajectory.h = plan.h if isinstance(plan, FixedSteps) else first_step_size(plan, t)
+    trajectory.plan, trajectory.stepper, trajectory.options = plan, stepper, memory._options
+    trajectory.steps, trajectory.rejected_steps, trajectory.fallback_steps = steps, rejected, fallbacks
+    if error >= 0.0:
+        trajectory.step_error, trajectory.worst_step_time = error, error_t
+    else:
+        trajectory.step_error = trajectory.worst_step_time = math.nan
+    trajectory.parameters = memory._parameters.copy()
+    trajectory.events = trajectory.pieces = ()
+    trajectory.tau = trajectory.confirmation = trajectory.observed = trajectory.conserved = None
+    return trajectory
+
+
+@lru_cache(maxsize=64)
+def _repeated(value: float, count: int) -> Array:
+    """Return a read-only array of one number without memory for each; ``numpy.broadcast_to`` is ten times slower."""
+    return np.ndarray((count,), BINARY64, NATIVE_DOUBLE.pack(value), 0, (0,))
+
+
+def _differences(t: Array, *, whole: bool) -> Array:
+    """Return the steps that follow states, NaN for the last one and unless all states are saved."""
+    step_sizes = np.empty(len(t))
+    if whole:
+        np.subtract(t[1:], t[:-1], step_sizes[:-1])
+        step_sizes[-1] = math.nan
+    else:
+        step_sizes.fill(math.nan)
+    return step_sizes
+
+
+def first_step_size(plan: Adaptive | InTau, t: Array) -> float:
+    """Return the first step size between states of an adaptive run, or the direction of the run; NaN without states."""
+    if len(t) == 0:
+        return math.nan
+    return t.item(1) - t.item(0) if len(t) > 1 else plan.t_end - t.item(0)

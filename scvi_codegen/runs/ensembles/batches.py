@@ -1,0 +1,320 @@
+"""Trajectories of an ensemble that C integrates, many in one call: one after the other, or in blocks of SIMD lanes.
+
+A call takes a limited number of steps, so that Python regains control about every 20 ms; C keeps the present trajectory
+or block for the next call. The first call decides whether threads are worth starting. Trajectories that C integrates
+one after the other are bitwise equal to single runs: C starts and advances the same memory of a run.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.codegen.native.binding import Binding
+from scvi_codegen.codegen.native.capacity import TOO_MANY_STATES
+from scvi_codegen.codegen.native.options import OUTCOMES, SolverOptions
+from scvi_codegen.common.validation import checked_count
+from scvi_codegen.runs.ensembles.result import INTERRUPTED, OK
+from scvi_codegen.runs.ensembles.schedule import FixedSegments
+from scvi_codegen.runs.ensembles.thread_pool import StopCheck, run_jobs
+from scvi_codegen.runs.states.validation import Array
+from scvi_codegen.runs.states.words import Word, block_of, from_block
+from scvi_codegen.runs.stepping.chunks import drive
+from scvi_codegen.runs.stepping.integrator import Integrator
+from scvi_codegen.runs.stepping.step_plan import Adaptive, step_control
+
+FIRST_CHUNK_STEPS = 64
+"""Steps of the first call, before the speed of the steps is known."""
+CHUNK_SECONDS = 0.02
+"""Target duration of a call in seconds; bounds the delay of an interruption."""
+GROWTH = 8.0
+"""Largest ratio of successive numbers of steps of calls."""
+MOST_NUMBERS, FEWEST_ROWS = 2**16, 8
+"""Numbers in the memory for states of a call, and the fewest states."""
+NAMES = np.array([OK, *OUTCOMES, TOO_MANY_STATES, INTERRUPTED], dtype="<U32")
+"""Reasons of the end by the status of C, or of a trajectory with too many states; the last one of -1."""
+FULL = len(OUTCOMES) + 1
+"""Status of a trajectory with too many states."""
+
+
+class Rows(NamedTuple):
+    """Saved states of successive trajectories.
+
+    Attributes:
+        trajectories, first, numbers: (k,) trajectories, their first rows and their numbers of rows.
+        t, q, p, actions: one row per state; actions are empty unless runs sum them.
+    """
+
+    trajectories: NDArray[np.intp]
+    first: NDArray[np.int64]
+    numbers: NDArray[np.int64]
+    t: Array
+    q: Array
+    p: Array
+    actions: Array
+
+    def copies(self) -> Rows:
+        """Return copies, in memory of their own."""
+        return Rows(*self[:3], *(each.copy() for each in self[3:]))
+
+    def indices(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return the row and the trajectory of each state."""
+        rows = np.arange(len(self.t)) + np.repeat(self.first + self.numbers - np.cumsum(self.numbers), self.numbers)
+        return rows, np.repeat(self.trajectories, self.numbers)
+
+    def put(self, *pairs: tuple[Array | None, Array]) -> None:
+        """Store values of the states in (n, k, ..) arrays of all trajectories; ``None`` is not stored."""
+        k, row, count = (int(each[0]) for each in self[:3])
+        where: Any = slice(row, row + count), slice(k, k + len(self.first))
+        alike = (self.first == row).all() and (self.numbers == count).all()
+        where = where if alike else self.indices()
+        for whole, values in pairs:
+            if whole is not None:
+                shape = (-1, count, *values.shape[1:])
+                whole[where] = values.reshape(shape).swapaxes(0, 1) if alike else values
+
+
+class Batch:
+    """Trajectories from given states, with the same fixed steps or with adaptive steps to individual times.
+
+    Args:
+        binding, options: the compiled integrator and its solver options.
+        start: (k, m) initial positions and momenta at the time ``t``.
+        parameters: (k, number of parameters) values.
+        steps: segments of fixed steps, or (k,) final times of adaptive steps.
+        values_at: function that returns the parameters at a time of a slice of trajectories, if they change.
+
+    Attributes:
+        width: number of trajectories that C integrates at the same time.
+        status: (k,) status of C, -1 before the end of a trajectory.
+        done: (k,) numbers of completed steps.
+    """
+
+    width = 1
+
+    def __init__(
+        self,
+        binding: Binding,
+        options: SolverOptions | None,
+        start: tuple[Array, Array],
+        parameters: Array,
+        t: float,
+        steps: FixedSegments | Array,
+        values_at: Callable[[float, slice], Array] | None = None,
+    ) -> None:
+        self.binding, self.options, self.t, self.steps, self.values_at = binding, options, t, steps, values_at
+        self.q, self.p, self.parameters = (np.ascontiguousarray(block_of(each)) for each in (*start, parameters))
+        if values_at is not None:
+            self.parameters = self.parameters.copy()
+        self.status = np.full(len(self.q), -1, np.int32)
+        self.done = np.zeros(len(self.q), np.int64)
+
+    def call(self, first: int, end: int) -> Call:
+        """Return the calls for a range of trajectories."""
+        raise NotImplementedError
+
+    def completed(self) -> float:
+        """Return the number of completed trajectories, of fixed steps with the parts of the others."""
+        ended = self.status >= 0
+        if not isinstance(self.steps, FixedSegments):
+            return float(ended.sum())
+        return float(np.where(ended, 1.0, self.done / self.steps.steps.sum()).sum())
+
+    def run(self, *, progress: Callable[[float], None] | None, threads: int | None) -> None:
+        """Integrate all trajectories; ``progress`` is called with the number of completed ones and may raise.
+
+        The calling thread begins. If that takes longer than one chunk, it divides the rest among threads, in jobs of
+        about that duration.
+        """
+        if threads is not None:
+            checked_count(threads, "threads", least=1)
+        count, began = len(self.q), time.perf_counter()
+        first = self.call(0, count)
+        first.advance(until=lambda: time.perf_counter() - began > CHUNK_SECONDS)
+        if first.struct.next < count:
+            self._share(first, progress, threads)
+        elif progress is not None:
+            progress(self.completed())
+
+    def _share(self, first: Call, progress: Callable[[float], None] | None, threads: int | None) -> None:
+        """Finish the trajectories begun and the following ones in threads."""
+        count, width = len(self.q), self.width
+        begun = first.struct.end = min(int(first.struct.next) + width, count)
+        size = max(1, min(begun // width - 1, -(-(count - begun) // (16 * width))))  # like the first chunk, or 16 jobs
+        ends = [*range(begun, count, size * width), count]
+
+        def advance(job: int, check_stop: StopCheck) -> None:
+            call = self.call(ends[job - 1], ends[job]) if job else first
+            call.advance(check_stop=check_stop)
+
+        report = None if progress is None else lambda _: progress(self.completed())
+        run_jobs(len(ends), advance, progress=report, threads=threads)
+
+
+class Call:
+    """Arguments of C calls for a range of trajectories.
+
+    Args:
+        work: the trajectories.
+        first, end: the range.
+    """
+
+    def __init__(self, work: Batch, first: int, end: int) -> None:
+        self.work, binding = work, work.binding
+        struct = self.struct = binding.new("each *")
+        self.options = struct.options = binding.options(work.options)
+        struct.q, struct.p, struct.parameters = map(binding.pointer, (work.q, work.p, work.parameters))
+        if isinstance(work.steps, FixedSegments):
+            steps, save_every, h, *_ = work.steps
+            struct.segment_steps, struct.segment_every = map(binding.whole_numbers, (steps, save_every))
+            struct.segment_h, struct.segments = binding.pointer(h), len(h)
+        struct.status, struct.done = binding.integers(work.status), binding.whole_numbers(work.done)
+        struct.t, struct.next, struct.end, struct.segment = work.t, first, end, -1
+        if isinstance(work.t, Word):
+            struct.t_low = work.t.low
+        struct.pauses = work.values_at is not None
+        self.take = binding.each(struct)
+
+    def advance(self, *, check_stop: StopCheck | None = None, until: Callable[[], bool] = lambda: False) -> None:
+        """Advance the trajectories to their ends, or until ``until`` returns true; states are stored in any case."""
+
+        def take(size: int) -> int:
+            if check_stop is not None:
+                check_stop(size)
+            taken = self.take(size)
+            if self.struct.entered:
+                self.enter(self.struct.segment)
+            self.limit()
+            self.store()
+            return taken
+
+        try:
+            drive(
+                take,
+                math.inf,
+                first=FIRST_CHUNK_STEPS,
+                growth=GROWTH,
+                seconds=CHUNK_SECONDS,
+                ended=lambda: self.struct.next == self.struct.end or until(),
+            )
+        finally:
+            self.store(last=True)
+
+    def enter(self, segment: int) -> None:
+        """Set the parameters of the present trajectories in a segment."""
+        work, first = self.work, int(self.struct.next)
+        if work.values_at is not None and isinstance(work.steps, FixedSegments):
+            part = slice(first, min(first + work.width, len(work.q)))
+            work.parameters[part] = work.values_at(float(work.steps.middle[segment]), part)
+
+    def limit(self) -> None:
+        """End the present trajectory if it has too many states."""
+
+    def store(self, *, last: bool = False) -> None:
+        """Pass on the states in memory, if it is nearly full or after the last call."""
+
+
+class SuccessiveRuns(Batch):
+    """Trajectories that C integrates one after the other; arguments as of :class:`Batch`.
+
+    Args:
+        stepper: the integrator.
+        plan, save_every: of adaptive steps; the target time of the plan is not used.
+        most_states: number of states with which a trajectory ends.
+        receive: receives saved states after the initial ones, row 0, possibly from several threads; they are views.
+
+    Attributes:
+        stored: (k,) numbers of saved states without the initial one.
+        fallback_steps: (k,) numbers of steps that the iteration did not solve, but its fallback.
+        energies: (k, 2) energies at both ends of trajectories with adaptive steps, NaN where not computed.
+    """
+
+    def __init__(
+        self,
+        stepper: Integrator,
+        *arguments: Any,
+        plan: Adaptive | None = None,
+        save_every: int = 1,
+        most_states: float = math.inf,
+        receive: Callable[[Rows], None],
+    ) -> None:
+        super().__init__(stepper.binding, *arguments)
+        self.stepper = stepper
+        self.words, self.sums_action = stepper.interface.words, stepper.sums_action
+        self.conserves_energy = stepper.interface.conserves_energy and self.words == 1
+        self.plan, self.save_every, self.receive, count = plan, save_every, receive, len(self.q)
+        self.most_states = most_states
+        self.stored, self.fallback_steps = np.zeros((2, count), np.int64)
+        self.energies = np.full((count, 2), np.nan)
+
+    def call(self, first: int, end: int) -> Call:
+        """Return the calls for a range of trajectories."""
+        return _SuccessiveCall(self, first, end)
+
+    @property
+    def names(self) -> NDArray[np.str_]:
+        """(k,) reasons of the end."""
+        return NAMES[self.status]
+
+
+class _SuccessiveCall(Call):
+    """Calls with the memory of a run, and memory for states."""
+
+    work: SuccessiveRuns
+
+    def __init__(self, work: SuccessiveRuns, first: int, end: int) -> None:
+        super().__init__(work, first, end)
+        self.flushed, binding, struct = first, work.binding, self.struct
+        m = work.q.shape[1]
+        self.capacity = max(FEWEST_ROWS, MOST_NUMBERS // (2 * m + 1))
+        self.before = 0  # states of the first trajectory that were stored earlier
+        self.runs = binding.new("run *"), binding.new("report *")
+        struct.run, struct.report = self.runs
+        self.workspace = struct.workspace = binding.workspace(self.runs[0])
+        if binding.count is None:
+            self.copy = struct.before = binding.new("run *")
+        if isinstance(work.steps, FixedSegments):
+            struct.segment_end = binding.pointer(work.steps.end)
+        else:
+            assert work.plan is not None  # by the caller
+            struct.t_end, self.control = binding.pointer(work.steps), step_control(work.stepper, work.plan)
+            struct.control = self.control[0]
+            if work.conserves_energy:
+                struct.energies = binding.pointer(work.energies)
+        struct.stored, struct.fallback_steps = map(binding.whole_numbers, (work.stored, work.fallback_steps))
+        struct.coordinates, struct.parameters_each, struct.every = m, work.parameters.shape[1], work.save_every
+        struct.words, struct.capacity = work.words, self.capacity
+        self.iterations = np.empty(self.capacity, np.int32)
+        struct.iterations = binding.integers(self.iterations)
+        self.actions = np.full(self.capacity if work.sums_action else 0, np.nan)
+        struct.actions = binding.pointer(self.actions)
+        self.states = tuple(np.empty((self.capacity, numbers)) for numbers in (work.words, m, m))
+        struct.times, struct.positions, struct.momenta = binding.pointers(*self.states)
+
+    def limit(self) -> None:
+        """End the present trajectory if it has too many states."""
+        call, work = self.struct, self.work
+        if call.next < call.end and call.segment >= 0 and work.stored[call.next] > work.most_states:
+            work.status[call.next], call.segment = FULL, -1
+            call.next += 1
+
+    def store(self, *, last: bool = False) -> None:
+        """Pass on the states in memory, with their trajectories and rows."""
+        call, work, count = self.struct, self.work, int(self.struct.rows)
+        if not count or (not last and count + FEWEST_ROWS <= self.capacity):
+            return
+        each = np.arange(self.flushed, min(call.next + 1, call.end))
+        first = np.ones(len(each), np.int64)
+        first[0] += self.before
+        numbers = work.stored[each] + 1 - first
+        states = (each[:count] if work.words == 1 else from_block(each[:count]) for each in self.states)
+        t, q, p = states
+        work.receive(Rows(each, first, numbers, t[:, 0], q, p, self.actions[:count]))
+        self.flushed = int(call.next)
+        self.before = int(work.stored[self.flushed]) if self.flushed < call.end and call.segment >= 0 else 0
+        call.rows = 0

@@ -1,0 +1,686 @@
+"""Ensembles: many trajectories with common fixed steps, or each with adaptive steps of its own.
+
+With common fixed steps trajectories are SIMD lanes (:mod:`scvi_codegen.runs.ensembles.lanes`). Others are computed by
+the single integrator, so they are bitwise equal to those of :meth:`Stepper.integrate`, which computes trajectories with
+inputs, output times, changes by events or a bound of the global error. C integrates many
+trajectories in one call (:mod:`scvi_codegen.runs.ensembles.batches`), without the GIL, so threads share the work;
+results are bitwise equal for any number of threads.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from functools import cached_property, partial
+from itertools import pairwise
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from scvi_codegen.codegen.native.arguments import real_array
+from scvi_codegen.codegen.native.capacity import TOO_MANY_STATES, room_for_states, too_many_states
+from scvi_codegen.codegen.native.options import FAILURES, SolverOptions, checked_options
+from scvi_codegen.codegen.rendering.source import Source
+from scvi_codegen.common.errors import AccuracyWarning, EventError, StateError, StepFailedError, warn
+from scvi_codegen.common.validation import LARGEST_COUNT, checked_count
+from scvi_codegen.runs.accuracy.global_error import GlobalError
+from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
+from scvi_codegen.runs.driver.segments import (
+    Input,
+    breakpoints_until,
+    checked_inputs,
+    final_time,
+    first_inner_time,
+    inputs_of_slice,
+    parameters_at,
+)
+from scvi_codegen.runs.ensembles.batches import FULL, Rows, SuccessiveRuns
+from scvi_codegen.runs.ensembles.device import (
+    FEWEST_COORDINATES,
+    AdaptiveDeviceRuns,
+    DeviceEnsemble,
+    DeviceRuns,
+    PointRuns,
+    check_device,
+    on_processor,
+)
+from scvi_codegen.runs.ensembles.initial_states import (
+    checked_ensemble,
+    momenta_of_each,
+    parameters_of_each,
+    start_of_ensemble,
+)
+from scvi_codegen.runs.ensembles.lanes import CommonRuns
+from scvi_codegen.runs.ensembles.observation import EnsembleObservation
+from scvi_codegen.runs.ensembles.result import EVENT_FAILED, INTERRUPTED, OK, EnsembleTrajectory, Span
+from scvi_codegen.runs.ensembles.schedule import CommonSteps
+from scvi_codegen.runs.ensembles.thread_pool import StopCheck, run_jobs
+from scvi_codegen.runs.results.dense_output import times_of_run
+from scvi_codegen.runs.states.times import WHOLE
+from scvi_codegen.runs.states.validation import (
+    Array,
+    EnsembleParameters,
+    States,
+    check_left_to_inputs,
+    columns_of_inputs,
+    parameter_index,
+)
+from scvi_codegen.runs.states.words import check_doubles, checked_time, hashed, missing, stacked
+from scvi_codegen.runs.stepping.features import check_together, require
+from scvi_codegen.runs.stepping.step_plan import (
+    Adaptive,
+    AdaptivePlans,
+    ErrorControl,
+    Until,
+    check_max_step,
+    planned_steps,
+)
+from scvi_codegen.runs.trajectory import Trajectory
+from scvi_codegen.systems.event import Crossings, Event
+
+
+class SavedLane(NamedTuple):
+    """Saved states of one trajectory, its status, numbers of steps and of those solved by Newton's method, and events.
+
+    ``actions`` are those up to each state of runs that sum the action.
+    """
+
+    t: Array
+    q: Array
+    p: Array
+    status: str
+    steps: int
+    fallback_steps: int = 0
+    events: tuple[Crossings, ...] = ()
+    actions: Array | None = None
+
+    @classmethod
+    def of(cls, states: Trajectory, rows: Any = slice(None), status: str = OK) -> SavedLane:
+        """Return rows of the states of a single run."""
+        actions = None if states.actions is None else states.actions[rows]
+        about = status, states.steps, states.fallback_steps, states.events, actions
+        return cls(states.t[rows], states.q[rows], states.p[rows], *about)
+
+    def limited(self, most: float) -> SavedLane:
+        """Return the first and the last state alone of a trajectory with more than ``most`` states, or too many."""
+        if len(self.t) <= most and self.status != TOO_MANY_STATES:
+            return self
+        ends = slice(None, None, max(len(self.t) - 1, 1))
+        actions = None if self.actions is None else self.actions[ends]
+        return self._replace(t=self.t[ends], q=self.q[ends], p=self.p[ends], actions=actions, status=TOO_MANY_STATES)
+
+
+class Ensemble:
+    """Integration of many trajectories; arguments as of ``integrate_ensemble``.
+
+    Raises:
+        StateError: if a shape, name or number is invalid, or the stepper has a time transformation.
+
+    Attributes:
+        inputs: validated inputs.
+        start: (k, m) initial positions and momenta.
+        common: the trajectories with common steps, ``None`` with adaptive steps.
+        plans: step plan of each trajectory that is integrated by itself.
+        saved: completed trajectories of these.
+    """
+
+    def __init__(
+        self,
+        stepper: Any,
+        q: States,
+        p: States | None,
+        *,
+        inputs: Mapping[str, Any] | None = None,
+        velocity: States | None = None,
+        h: float | None = None,
+        steps: int | None = None,
+        t_end: ArrayLike | None = None,
+        tolerance: float | None = None,
+        absolute_tolerance: float | Mapping[str, float] | None = None,
+        max_step: float | None = None,
+        first_step: float | None = None,
+        save_every: int = 1,
+        t: float = 0.0,
+        t_eval: ArrayLike | None = None,
+        parameters: EnsembleParameters = None,
+        options: SolverOptions | None = None,
+        error: float | None = None,
+        device: str | None = None,
+        observe: str | None = None,
+    ) -> None:
+        interface = stepper.interface
+        control = self.control = ErrorControl(tolerance, absolute_tolerance, max_step, first_step)
+        _check_device(device, h, inputs, save_every, error=error, t_eval=t_eval)
+        _check_observe(stepper, observe, inputs=inputs, error=error, t_eval=t_eval)
+        recorded = _recorded_events(stepper, device, observe)
+        t = self.t0 = checked_time(t, interface.words)
+        steps, t_end = _steps_or_end(t, h, steps, t_end, inputs, control, t_eval, words=interface.words)
+        require(stepper, "ensembles")
+        if device is not None:
+            q, p, velocity, parameters = (on_processor(each) for each in (q, p, velocity, parameters))
+        if h is None:
+            require(stepper, "adaptive")
+        self.stepper = stepper
+        self.options, self.inputs = checked_options(options), dict[str, Input]()
+        if inputs is not None:
+            count = len(checked_ensemble(stepper, q, q)[0])
+            self.inputs = checked_inputs(interface, inputs, count)
+            check_left_to_inputs(interface, parameters)
+            inside = first_inner_time(t, float(real_array(0.0 if t_end is None else t_end, "t_end").flat[0]))
+            values = parameters_of_each(stepper, parameters, count)
+            parameters = parameters_at(stepper.parameters, values, self.inputs, inside)
+        p = momenta_of_each(stepper, q, p, velocity, t, parameters)
+        self.save_every = checked_count(save_every, "save_every", least=1)
+        words = interface.words
+        settings: dict[str, Any] = {"inputs": self.inputs, "save_every": self.save_every, "words": words}
+        fixed = None if h is None else CommonSteps(self.t0, h, steps=steps, t_end=cast(Any, t_end), **settings)
+        *start, self.parameters = start_of_ensemble(stepper, q, p, self.t0, parameters)
+        self.start = start[0], start[1]
+        if not stepper._has_energy(parameters):
+            energy = parameter_index(interface, interface.energy_parameter)
+            for values, at, momenta in zip(self.parameters, *self.start, strict=True):
+                values[energy] = stepper.energy(at, momenta, 0.0, values)
+        self.values_at = partial(parameters_at, stepper.parameters, self.parameters, self.inputs)
+        self.common: CommonRuns | DeviceRuns | None = None
+        self.observe = observe
+        self.plans: Sequence[Until | Adaptive] = ()
+        self.saved: dict[int, SavedLane] = {}
+        self.error, self.confirmations = error, list[GlobalError | None]()
+        self.t_eval: Array | None = None
+        self.ends = np.empty(0)
+        # events are recorded by single runs, which they change or end, and inputs of two words change parameters
+        of_two_words = words > 1 and fixed is not None and (bool(self.inputs) or stepper.ensemble is None)
+        self.singly = bool(recorded) or of_two_words
+        self.fixed = fixed
+        if fixed is None or self.singly:
+            self.plans = self._plans(fixed, cast(ArrayLike, t_end), control)
+            self.plans = self.plans if error is None else list(self.plans)
+            self.confirmations = [None] * (0 if error is None else len(self))
+            self.t_eval = self._output_times(fixed, t_eval)
+        if self.inputs:
+            self.parameters[:, columns_of_inputs(interface)] = 0.0
+        if fixed is not None and not self.singly:
+            kind = CommonRuns if device is None else DeviceRuns
+            observation = None if observe is None else EnsembleObservation(stepper, observe, len(self))
+            arguments = stepper, self.options, self.start, self.parameters, self.values_at, fixed, observation
+            points = None if device is None or observation is not None else self._source_of_points(fixed)
+            self.common = kind(*arguments) if points is None else PointRuns(*arguments, source=points)
+        elif observe is not None:
+            raise StateError(
+                f"observe={observe!r} requires a fixed step size: give h and steps, or observe each trajectory by "
+                "integrate"
+            )
+        self.states: list[Rows] = []
+        self.adaptive = None if device is None or self.common is not None else self._on_device()
+        self.successive = self._successive()
+        self._check_shared()
+
+    def _check_shared(self) -> None:
+        """Raise ``StateError`` for ``reproducible=False`` unless trajectories are SIMD lanes that iterate."""
+        if self.options is None or self.options.reproducible:
+            return
+        if isinstance(self.common, DeviceRuns):
+            reason = "those of a GPU are threads"
+        elif self.common is None:
+            reason = "these are integrated one after the other (adaptive steps, or changes by events)"
+        elif self.stepper.ensemble is None:
+            reason = "those of this method are integrated one after the other"
+        elif self.stepper.interface.solver == "explicit":
+            reason = "explicit steps have no iterations"
+        else:
+            return
+        raise StateError(
+            "reproducible=False (--shared, [run] reproducible = false) lets the iterations of trajectories in SIMD "
+            f"lanes end together, but {reason}: omit it"
+        )
+
+    def _source_of_points(self, fixed: CommonSteps) -> Source | None:
+        """Return the source whose points are threads of a GPU, for many coordinates and equal steps, or ``None``."""
+        if len(fixed.segments) > 1 or self.inputs or self.stepper.dimension < FEWEST_COORDINATES:
+            return None
+        return cast("Source | None", self.stepper._variants["points"])
+
+    def _successive(self) -> SuccessiveRuns | None:
+        """Return the trajectories that C integrates one after the other, ``None`` for other ensembles."""
+        stepper = self.stepper
+        if self.common is not None or self.adaptive is not None:
+            return None
+        if self.inputs or stepper.events or stepper.in_tau or not stepper.binding.reusable:
+            return None
+        ends = self.ends
+        if self.error is not None or not (self.t_eval is None or self._saves_ends(ends)):
+            return None
+        return SuccessiveRuns(
+            stepper,
+            self.options,
+            self.start,
+            self.parameters,
+            self.t0,
+            ends if self.fixed is None else self.fixed.fixed_segments(),
+            plan=self.plans[0] if isinstance(self.plans[0], Adaptive) else None,
+            save_every=self.save_every if self.t_eval is None else LARGEST_COUNT,
+            most_states=self.most_states,
+            receive=lambda states: self.states.append(states.copies()),
+        )
+
+    def _on_device(self) -> AdaptiveDeviceRuns:
+        """Return the trajectories with adaptive steps that a GPU integrates."""
+        arguments = self.stepper, self.options, self.start, self.parameters, self.t0, self.ends
+        return AdaptiveDeviceRuns(*arguments, plan=cast(Adaptive, self.plans[0]))
+
+    def _saves_ends(self, ends: Array) -> bool:
+        """Return whether the output times are the common end of all trajectories, with or without their start."""
+        times = set() if self.t_eval is None else {*self.t_eval.tolist()} - {self.t0}
+        return len(times) == 1 and bool((ends == times.pop()).all())
+
+    def _plans(self, fixed: CommonSteps | None, t_end: ArrayLike, control: ErrorControl) -> Sequence[Until | Adaptive]:
+        """Return the step plan of each trajectory; all must run forward or all backward."""
+        if fixed is not None:
+            return (Until(fixed.h, float(fixed.times(tau=False)[-1])),) * len(self)
+        ends = real_array(t_end, "t_end")
+        self.ends = np.full(len(self), ends) if not ends.ndim else ends
+        if ends.shape not in ((), (len(self),)):
+            raise StateError(f"t_end must be one time or {len(self)} times, not of shape {ends.shape}")
+        worst = int(np.argmin(np.isfinite(ends)))  # the first one that is not finite
+        plan = control.to(float(ends.flat[worst]))
+        if (ends > self.t0).any() and (ends < self.t0).any():
+            raise StateError(f"t_end lies on both sides of t = {self.t0:g}: split the ensemble into two")
+        check_max_step(
+            replace(plan, t_end=float(ends.flat[np.abs(ends).argmax()])), self.t0, self.stepper.interface.words
+        )
+        if not ends.ndim:
+            return (plan,) * len(self)
+        return AdaptivePlans(ends, plan)
+
+    def _output_times(self, fixed: CommonSteps | None, t_eval: ArrayLike | None) -> Array | None:
+        """Return the validated output times; raise ``StateError`` if inputs do not cover a run."""
+        if fixed is not None:  # terminal events end runs at times of their own; two words are saved as they are
+            events = self.stepper.events
+            own = any(event.terminal for event in events) or (fixed.words > 1 and not events)
+            return None if own else fixed.times(tau=False)
+        for plan in self.plans if self.inputs else ():
+            breakpoints_until(self.t0, plan.t_end, self.inputs)
+        if t_eval is None:
+            return None
+        check_together(t_eval=t_eval, save_every=None if self.save_every == 1 else self.save_every)
+        return times_of_run(t_eval, self.t0, float(self.ends[np.abs(self.ends - self.t0).argmax()]))
+
+    def __len__(self) -> int:
+        return len(self.start[0])
+
+    @cached_property
+    def most_states(self) -> float:
+        """Largest number of states of a trajectory: arrays of all have the size of the longest one."""
+        numbers = self.stepper.interface.words * (1 + 2 * self.stepper.dimension)  # of a state
+        return math.inf if self.t_eval is not None else room_for_states() / (8 * numbers * max(len(self), 1))
+
+    @property
+    def length(self) -> int:
+        """Final value of ``progress``: the number of common steps, or of trajectories with adaptive steps."""
+        return len(self) if self.common is None else self.common.steps.steps
+
+    def part(self, part: slice) -> dict[str, object]:
+        """Return keyword arguments that construct the ensemble of a slice of the trajectories."""
+        arguments: dict[str, object] = {
+            "q": self.start[0][part],
+            "p": self.start[1][part],
+            "inputs": inputs_of_slice(self.inputs, part) or None,
+            "save_every": self.save_every,
+            "t": self.t0,
+            "parameters": self.parameters[part],
+            "options": self.options,
+            "observe": self.observe,
+            "error": self.error,
+        }
+        if self.common is None:
+            ends = [plan.t_end for plan in self.plans[part]]
+            if self.fixed is not None:
+                return arguments | self._fixed_steps()
+            return arguments | {"t_end": ends, "t_eval": self.t_eval} | self.control.named
+        return arguments | self._fixed_steps()
+
+    def _fixed_steps(self) -> dict[str, Any]:
+        fixed = self.fixed or cast(CommonRuns, self.common).steps
+        return {"h": fixed.h} | ({"steps": fixed.steps} if fixed.t_end is None else {"t_end": fixed.t_end})
+
+    def keep(self, part: slice, trajectories: EnsembleTrajectory) -> None:
+        """Store the results of a slice that was integrated elsewhere."""
+        if self.common is None:
+            fallbacks, actions = cast(Array, trajectories.fallback_steps).tolist(), trajectories.actions
+            for k, each in enumerate(trajectories.each()):
+                events = trajectories.events[k] if trajectories.events else ()
+                sums = None if actions is None else actions[: len(each[0]), k]
+                self.saved[part.start + k] = SavedLane(*each, fallbacks[k], events, sums)
+            if self.error is not None:
+                self.confirmations[part] = trajectories.confirmations
+                cast(list[Until | Adaptive], self.plans)[part] = trajectories.plans
+            return
+        common = cast(CommonRuns, self.common)
+        common.q[:, part], common.p[:, part] = trajectories.q, trajectories.p
+        common.status[part], common.done[part] = trajectories.status, trajectories.steps
+        common.fallback_steps[part] = cast(Array, trajectories.fallback_steps)
+        if common.times is not None:
+            common.times[:, part] = trajectories.times
+        if common.actions is not None:
+            common.actions[:, part] = trajectories.actions
+        if common.observation is not None:
+            common.observation.keep(part, cast(Array, trajectories.observed))
+
+    def run(self, *, progress: Callable[[int], None] | None = None, threads: int | None = None) -> None:
+        """Integrate all trajectories with ``threads`` threads; an exception raised by ``progress`` stops them promptly.
+
+        Afterwards, also after an exception, :meth:`result` returns what was computed.
+
+        Args:
+            progress: called with the number of completed steps or trajectories, see :attr:`length`.
+            threads: number of threads, by default one per core.
+        """
+        if self.successive is not None:
+            report = None if progress is None else lambda done: progress(int(done))
+            self.successive.run(progress=report, threads=threads)
+            return
+        if (runs := self.adaptive or self.common) is not None:
+            runs.run(progress=progress, threads=threads)
+            return
+
+        def advance(j: int, check_stop: StopCheck) -> None:
+            self.saved[j] = self._trajectory(j, check_stop)
+
+        run_jobs(len(self), advance, progress=progress, threads=threads)
+
+    def _trajectory(self, j: int, check_stop: StopCheck) -> SavedLane:
+        """Return trajectory j as :meth:`Stepper.integrate` does; with ``error`` its confirmed local tolerance is kept.
+
+        One whose confirming runs fail has errors at round-off level.
+        """
+        plan, (q, p), status = self.plans[j], (each[j] for each in self.start), OK
+        of_inputs = columns_of_inputs(self.stepper.interface) if self.inputs else ()
+        values = zip(self.stepper.parameters, self.parameters[j].tolist(), strict=True)
+        arguments: dict[str, Any] = {
+            "parameters": {name: x for k, (name, x) in enumerate(values) if k not in of_inputs},
+            "inputs": inputs_of_slice(self.inputs, j) or None,
+        } | {
+            "t": self.t0,
+            "save_every": 1 if self.inputs and self.t_eval is not None else self.save_every,
+            "options": self.options,
+            "progress": partial(self._check, check_stop),
+        }
+        if self.stepper.interface.words > 1:
+            arguments["parameters"] = self.parameters[j]
+        steps: dict[str, Any] = {"t_end": plan.t_end, **self.control.named}
+        none = False
+        if self.fixed is not None:
+            steps = self._fixed_steps()
+        elif self.t_eval is not None:
+            times = self.t_eval[np.abs(self.t_eval - self.t0) <= abs(plan.t_end - self.t0)]
+            none = not times.size  # before the end; runs have at least one
+            arguments["t_eval"] = np.array([plan.t_end]) if none else times
+        integrate: Callable[..., Trajectory] = self.stepper.integrate
+        with without_accuracy_warnings():
+            if self.error is not None:
+                with suppress(StateError, StepFailedError):
+                    states = integrate(q, p, error=self.error, **steps, **arguments)
+                    self.confirmations[j], cast(list[Any], self.plans)[j] = states.confirmation, states.plan
+                    return SavedLane.of(states, slice(0 if none else None))
+            try:
+                states = integrate(q, p, **steps, **arguments)
+            except StepFailedError as failure:
+                states, status = Trajectory.before(failure), failure.status
+            except EventError as failure:
+                if failure.trajectory is None:
+                    raise
+                states, status = cast(Trajectory, failure.trajectory), EVENT_FAILED
+            except StateError:  # a sum of finite terms has overflowed
+                return self._unfinished(j)._replace(status="not finite")
+        return SavedLane.of(states, slice(0) if none else self._common_rows(states), status)
+
+    def _check(self, check_stop: StopCheck, steps: int) -> None:
+        """Raise an error if another trajectory failed, or if a run has more states than :attr:`most_states`."""
+        check_stop(steps)
+        if steps // self.save_every > self.most_states:
+            raise too_many_states(steps // self.save_every, steps, math.nan)
+
+    def _common_rows(self, states: Trajectory) -> Any:
+        """Return the rows at the common times of fixed steps: the last states there, after changes by events."""
+        if self.fixed is None or self.t_eval is None:
+            return slice(None)
+        times, common = (states.forward * np.asarray(each) for each in (states.t, self.t_eval))
+        latest = common + WHOLE * abs(self.fixed.h)
+        return np.searchsorted(times, latest[latest < times[-1] + 2 * WHOLE * abs(self.fixed.h)], side="right") - 1
+
+    def result(self) -> EnsembleTrajectory:
+        """Return the trajectories; those neither completed nor failed have the status ``"interrupted"``."""
+        if self.common is None:
+            return self._adaptive_result()
+        common, fixed = self.common, self.common.steps
+        q, p = common.states()
+        spans: tuple[Span, ...] = ()
+        if self.inputs:
+            spans = tuple((rows, slice(None), partial(self.values_at, each.middle)) for rows, each in fixed.spans())
+        return EnsembleTrajectory(
+            t=fixed.times(tau=common.times is not None),
+            times=common.times,
+            actions=common.actions,
+            fallback_steps=common.fallback_steps,
+            observed=None if common.observation is None else common.observation.result(),
+            q=q,
+            p=p,
+            status=self._status(common),
+            steps=common.done,
+            h=fixed.h,
+            parameters=self.parameters,
+            stepper=self.stepper,
+            spans=spans,
+        )
+
+    def warn_of_too_many_states(self, trajectories: EnsembleTrajectory) -> None:
+        """Issue a warning if trajectories ended because their states exceed the memory."""
+        full = np.flatnonzero(trajectories.status == TOO_MANY_STATES)
+        if not full.size:
+            return
+        j, others, (cause, remedy) = int(full[0]), len(full) - 1, FAILURES[TOO_MANY_STATES]
+        warn(
+            f"trajectory {j}{f' (and {others} more)' * (others > 0)} ended at t = {trajectories.ends[0][j]:g}, after "
+            f"{trajectories.steps[j]} steps: {cause}. The memory holds {int(self.most_states)} states of each of "
+            f"{len(self)} trajectories. {remedy}",
+            AccuracyWarning,
+        )
+
+    def device_result(self) -> DeviceEnsemble:
+        """Return the trajectories of a GPU, whose states stay in its memory."""
+        if self.adaptive is not None:
+            return DeviceEnsemble(q=self.adaptive.q, p=self.adaptive.p, _to_host=self.result, **self._adaptive_fields())
+        common = cast(DeviceRuns, self.common)
+        return DeviceEnsemble(
+            t=common.steps.times(tau=False),
+            observed=None if common.observation is None else common.observation.result(),
+            q=common.q,
+            p=common.p,
+            status=self._status(common),
+            steps=common.done,
+            h=common.steps.h,
+            parameters=self.parameters,
+            stepper=self.stepper,
+            _to_host=self.result,
+        )
+
+    def _status(self, common: CommonRuns | DeviceRuns) -> NDArray[np.str_]:
+        unfinished = common.done < common.steps.steps
+        if not unfinished.any():
+            return common.status
+        return np.where(unfinished & (common.status == OK), INTERRUPTED, common.status)
+
+    def _adaptive_fields(self) -> dict[str, Any]:
+        """Return the fields of results of a GPU with adaptive steps, but its states."""
+        runs = cast(AdaptiveDeviceRuns, self.adaptive)
+        times = np.array([np.full(len(self), self.t0), np.where(runs.status == OK, runs.t, np.nan)])
+        about = {"status": runs.status, "steps": runs.done, "h": 0.0, "plans": self.plans}
+        return {"t": np.arange(2.0), "times": times, "parameters": self.parameters, "stepper": self.stepper, **about}
+
+    def _adaptive_result(self) -> EnsembleTrajectory:
+        if self.adaptive is not None:
+            q, p = map(self.adaptive.device.copy_out, (self.adaptive.q, self.adaptive.p))
+            return EnsembleTrajectory(q=q, p=p, **self._adaptive_fields())
+        if self.successive is not None and not self.saved:
+            return self._successive_result(self.successive)
+        lanes = [(self.saved.get(j) or self._unfinished(j)).limited(self.most_states) for j in range(len(self))]
+        count = max(len(each.t) for each in lanes) if self.t_eval is None else len(self.t_eval)
+        t = np.arange(count, dtype=float) if self.t_eval is None else self.t_eval
+        words, shape = self.stepper.interface.words, (count, len(self), self.stepper.dimension)
+        times = missing((count, len(lanes)), words) if self.t_eval is None else None
+        q, p = missing(shape, words), missing(shape, words)
+        actions = np.full(shape[:2], np.nan) if self.stepper.sums_action else None
+        for j, each in enumerate(lanes):
+            row = slice(0, len(each.t))
+            q[row, j], p[row, j] = each.q, each.p
+            if actions is not None and each.actions is not None:
+                actions[row, j] = each.actions
+            if times is not None:
+                times[row, j] = each.t
+        if self.fixed is not None and not any(event.terminal for event in self.stepper.events):
+            t, times = max((each.t for each in lanes), key=len), None
+        status = np.array([each.status for each in lanes], dtype="<U32")
+        steps = np.array([each.steps for each in lanes], dtype=np.int64)
+        fallbacks = np.array([each.fallback_steps for each in lanes], dtype=np.int64)
+        whole = self._trajectories(t, times, q, p, status, steps, fallbacks)
+        return replace(whole, actions=actions, events=tuple(each.events for each in lanes))
+
+    def _successive_result(self, work: SuccessiveRuns) -> EnsembleTrajectory:
+        count, words, full = len(self), self.stepper.interface.words, work.status == FULL
+        stored = np.where(full, np.minimum(work.stored, 1), work.stored)  # the last state of those with too many
+        rows = 1 + int(stored.max())
+        index = np.full((rows, count), -1)  # of the states in the order in which C stored them; the last row is NaN
+        index[0], first = np.arange(count), count
+        for row, trajectory in (each.indices() for each in self.states):
+            place = np.where(full[trajectory], np.where(row == work.stored[trajectory], 1, rows), row)
+            wanted = place < rows
+            index[place[wanted], trajectory[wanted]] = first + np.flatnonzero(wanted)
+            first += len(row)
+
+        def ordered(name: str, first: Array) -> Array:
+            """Return the rows of all trajectories, NaN after their ends."""
+            last = missing((1, *first.shape[1:]), words if name != "actions" else 1)
+            whole = np.concatenate([first, *(getattr(each, name) for each in self.states), last])
+            return cast(Array, whole[index] if words > 1 else whole.take(index, axis=0))
+
+        q, p = ordered("q", self.start[0]), ordered("p", self.start[1])
+        if self.t_eval is None:
+            start = missing((count,), words)
+            start[:] = self.t0
+            numbers, times = np.arange(rows, dtype=float), ordered("t", start)
+            own: Array | None = times
+            if self.fixed is not None:
+                numbers, own = times[:, stored.argmax()], None
+            whole = self._trajectories(numbers, own, q, p, work.names, work.done, work.fallback_steps)
+            sums = self.stepper.sums_action
+            return replace(whole, actions=ordered("actions", np.zeros(count))) if sums else whole
+        at = np.where(self.t_eval == self.t0, 0, 1)
+        none = missing((1, *q.shape[1:]), words)  # if no trajectory reached the end
+        q, p = (np.concatenate([each, none])[at] for each in (q, p))
+        return self._trajectories(self.t_eval, None, q, p, work.names, work.done, work.fallback_steps)
+
+    def _trajectories(
+        self,
+        t: Array,
+        times: Array | None,
+        q: Array,
+        p: Array,
+        status: NDArray[np.str_],
+        steps: NDArray[np.int64],
+        fallback_steps: NDArray[np.int64],
+    ) -> EnsembleTrajectory:
+        return EnsembleTrajectory(
+            t=t,
+            times=times,
+            q=q,
+            p=p,
+            status=status,
+            steps=steps,
+            fallback_steps=fallback_steps,
+            h=self.plans[0].h if isinstance(self.plans[0], Until) else 0.0,
+            plans=() if isinstance(self.plans[0], Until) else cast(Sequence[Adaptive], self.plans),
+            confirmations=tuple(self.confirmations),
+            parameters=self.parameters,
+            stepper=self.stepper,
+            spans=tuple(self._spans(t, times)) if self.inputs else (),
+        )
+
+    def _spans(self, t: Array, times: Array | None) -> Iterator[Span]:
+        """Yield the rows of each trajectory, of states at t or its own times, in each piece of its inputs."""
+        for j, plan in enumerate(self.plans):
+            at, end_of_run = t if times is None else times[:, j], plan.t_end
+            forward = -1.0 if end_of_run < self.t0 else 1.0
+            ends = breakpoints_until(self.t0, end_of_run, self.inputs) or [end_of_run]
+            last = np.searchsorted(forward * at[np.isfinite(at)], forward * np.array(ends), side="right").tolist()
+            for (start, end), (first, until) in zip(pairwise([self.t0, *ends]), pairwise([0, *last]), strict=True):
+                yield slice(first, until), slice(j, j + 1), partial(self.values_at, (start + end) / 2)
+
+    def _unfinished(self, j: int) -> SavedLane:
+        first = slice(0, 1 if self.t_eval is None else 0)
+        return SavedLane(
+            stacked([self.t0])[first], self.start[0][[j]][first], self.start[1][[j]][first], INTERRUPTED, 0
+        )
+
+
+def _check_device(device: str | None, h: float | None, inputs: object, save_every: int, **others: Any) -> None:
+    """Raise ``StateError`` for an unknown device, and for arguments that ensembles on a GPU do not have."""
+    if device is None:
+        return
+    check_device(device)
+    check_together(device=device, **others)
+    if h is None and (inputs is not None or save_every != 1):
+        raise StateError(
+            "device='cuda' with adaptive steps saves the initial and the final states, and has no inputs: omit "
+            "save_every and inputs, give h and steps, or omit device"
+        )
+
+
+def _recorded_events(stepper: Any, device: str | None, observe: str | None) -> tuple[Event, ...]:
+    """Return the events that trajectories record, none if they are counted; raise an error where that is impossible."""
+    if device is not None:
+        require(stepper, "device")
+    recorded: tuple[Event, ...] = stepper.events if observe != "events" else ()
+    if recorded:
+        check_together(events=recorded, device=device, observe_ensemble=observe)
+        require(stepper, "ensemble_events")
+    return recorded
+
+
+def _check_observe(stepper: Any, observe: str | None, **others: Any) -> None:
+    """Raise an error for a stepper, and for arguments, with which ensembles do not observe all steps."""
+    if observe is not None:
+        check_together(observe=observe, **others)
+        require(stepper, "observe_ensemble")
+
+
+def _steps_or_end(
+    t: float,
+    h: float | None,
+    steps: int | None,
+    t_end: ArrayLike | None,
+    inputs: object,
+    control: ErrorControl,
+    t_eval: object,
+    *,
+    words: int,
+) -> tuple[int | None, ArrayLike | None]:
+    """Return the number of common steps or the final time; with adaptive steps the final time or times.
+
+    Raises:
+        StateError: for missing or contradictory arguments.
+    """
+    check_together(inputs=inputs, t_eval=t_eval)
+    if words > 1:
+        check_doubles(t_end=t_end, t_eval=t_eval)
+    if h is not None and t_eval is not None:
+        raise StateError("t_eval requires adaptive steps: give t_end without h and steps")
+    if h is not None and t_end is not None and np.ndim(t_end):
+        raise StateError("with h all trajectories have one t_end: give one number, or omit h (adaptive step size)")
+    first = None if t_end is None else float(real_array(t_end, "t_end").flat[0])
+    planned_steps.__wrapped__(h, steps, first, *control, 1, hashed(t), "", False, 1)
+    if h is None or (inputs is None and first is None):
+        return steps, t_end
+    return None, final_time(t, h, steps, first)

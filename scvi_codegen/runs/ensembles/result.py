@@ -1,0 +1,384 @@
+"""Result of an ensemble: states of many trajectories, diagnostics and files."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any, TypeAlias, cast, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.common.atomic import write_atomically
+from scvi_codegen.common.display.cards import card, grid, listed, plain, sparkline
+from scvi_codegen.common.errors import StateError
+from scvi_codegen.common.labelled_arrays import AXES, Labelled, checked_units, to_dataset
+from scvi_codegen.common.representation import one_line
+from scvi_codegen.common.validation import checks_arguments
+from scvi_codegen.runs.accuracy.global_error import ConfirmedEnsemble, GlobalError
+from scvi_codegen.runs.forwarding import Pictured
+from scvi_codegen.runs.results.descriptions import short_title
+from scvi_codegen.runs.results.export import FORMATS, LABELLED, check_format, write_whole
+from scvi_codegen.runs.results.joining import joined, relative_changes
+from scvi_codegen.runs.results.quantities import quantities
+from scvi_codegen.runs.results.saved_states import checked_row
+from scvi_codegen.runs.states.attitude_history import AttitudeHistory
+from scvi_codegen.runs.states.rotation_quantities import named_quantities
+from scvi_codegen.runs.states.validation import Array
+from scvi_codegen.runs.states.words import TwoWords, Words, check_keeps_words, missing
+from scvi_codegen.runs.stepping.integrator import Integrator
+from scvi_codegen.runs.stepping.step_plan import Adaptive, Fixed
+
+if TYPE_CHECKING:
+    import xarray
+
+    from scvi_codegen.runs.trajectory import Trajectory
+    from scvi_codegen.systems.event import Crossings
+
+OK, INTERRUPTED, EVENT_FAILED = "ok", "interrupted", "event failed"
+
+MOST_DRAWN = 64
+"""Largest number of trajectories in a picture."""
+MOST_SHOWN = 3
+"""Largest number of trajectories, and of coordinates, that a notebook shows."""
+
+Span: TypeAlias = tuple[slice, slice, Callable[[slice], Array]]
+"""Rows of states, a slice of trajectories, and a function returning the parameters of trajectories in these rows."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class EnsembleRuns:
+    """Runs of k trajectories, wherever their states are.
+
+    Attributes:
+        t: (n,) common times; tau from 0 in transformed time; row numbers if every trajectory has its own times.
+        status: (k,) ``"ok"``, or the reason of the end (``"not converged"``, ``"singular"``, ``"not finite"``,
+            ``"step size underflow"``, ``"interrupted"``, ``"too many states"`` for the memory).
+        steps: (k,) completed steps.
+        h: step size; 0 for adaptive steps.
+        parameters: (k, number of parameters) values; zeros for the parameters of inputs.
+        stepper: the compiled integrator.
+        times: (n, k) times if every trajectory has its own (transformed time, adaptive steps), else ``None``.
+        plans: step plan of each trajectory for adaptive steps, else empty.
+        observed: with ``observe=``, over the states after all steps: (2, k, 2m) smallest and largest values of (q, p)
+            (``"extremes"``), (2, k) energies (``"energy"``), or (k, number of events) changes of sign (``"events"``).
+    """
+
+    t: Array
+    status: NDArray[np.str_]
+    steps: NDArray[np.int64]
+    h: float
+    parameters: Array
+    stepper: Integrator = field(repr=False)
+    times: Array | None = None
+    plans: Sequence[Adaptive] = ()
+    observed: Array | None = field(default=None, repr=False)
+
+    def __len__(self) -> int:
+        return len(self.status)
+
+    @property
+    def ok(self) -> NDArray[np.bool_]:
+        """(k,) flags of the trajectories that reached the end."""
+        return np.asarray(self.status == OK)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictured, TwoWords):
+    """States of k trajectories, the initial state first; further attributes as of :class:`EnsembleRuns`.
+
+    Attributes:
+        q, p: (n, k, m) positions and momenta; NaN after a failure, and after the end of a shorter trajectory.
+        actions: (n, k) actions up to each state if the runs summed them (``action=True``), else ``None``.
+        fallback_steps: (k,) numbers of steps solved by Newton's method, as the iteration failed.
+        spans: with inputs, rows of states of a slice of trajectories and their parameters.
+        confirmations: with ``error=``, of each trajectory as of :class:`Trajectory`, ``None`` for one that fails; else
+            empty.
+        events: (k,) crossings of the events of each trajectory, parallel to ``stepper.events``; empty without events.
+    """
+
+    q: Array
+    p: Array
+    actions: Array | None = field(default=None, repr=False)
+    fallback_steps: NDArray[np.int64] | None = field(default=None, repr=False)
+    spans: tuple[Span, ...] = field(default=(), repr=False)
+    confirmations: tuple[GlobalError | None, ...] = field(default=(), repr=False)
+    events: tuple[tuple[Crossings, ...], ...] = field(default=(), repr=False)
+
+    @overload
+    def __getitem__(self, j: int) -> Trajectory: ...
+    @overload
+    def __getitem__(self, j: str) -> Array: ...
+    def __getitem__(self, j: int | str) -> Trajectory | Array:
+        """Return trajectory j, or the values (n, k) of a name, as of :class:`Trajectory`: ``runs["x"]``."""
+        if isinstance(j, str):
+            return self._quantity(j)
+        trajectory: type[Trajectory] = cast(Any, self.stepper)._trajectory_type
+        j = checked_row(j, len(self))
+        parts = [(good, parameters) for k, good, parameters in self._with_parameters() if k == j]
+        times, in_tau = self._times()[:, j], bool(self.stepper.interface.energy_parameter)
+        plan = self.plans[j] if self.plans else Fixed(self.h)
+        pieces = []
+        for number, (good, parameters) in enumerate(parts):
+            rows = np.insert(good, 0, good[0] - 1) if number else good  # the state at a breakpoint belongs to both
+            q, p = (self.stepper.named(each[rows, j].copy()) for each in (self.q, self.p))
+            pieces.append(
+                trajectory(
+                    t=times[rows],
+                    q=q,
+                    p=p,
+                    iterations=np.zeros(len(rows), np.int32),
+                    step_sizes=np.full(len(rows), self.h or np.nan),
+                    h=self.h,
+                    tau=self.t[rows] if in_tau else None,
+                    actions=None if self.actions is None else self.actions[rows, j],
+                    parameters=parameters,
+                    stepper=self.stepper,
+                    plan=plan,
+                    steps=int(self.steps[j]),
+                    fallback_steps=0 if self.fallback_steps is None else int(self.fallback_steps[j]),
+                )
+            )
+        whole = joined(pieces) if len(pieces) > 1 else pieces[0]
+        return replace(whole, events=self.events[j]) if self.events else whole
+
+    @property
+    def _pictured(self) -> list[Trajectory]:
+        return [self[j] for j in range(min(len(self), MOST_DRAWN))]
+
+    def __repr__(self) -> str:
+        states = f"{len(self.t)} states of each of {len(self)} trajectories, {np.count_nonzero(self.ok)} of them ok"
+        return one_line(self, short_title(self.stepper.interface), states)
+
+    def _repr_html_(self) -> str:
+        interface, counts = self.stepper.interface, Counter(self.status.tolist())
+        names = interface.coordinates[:MOST_SHOWN]
+        steps = f"{self.steps.min()} to {self.steps.max()}" if len(self) else "0"
+        facts = (
+            ("trajectories", plain(f"{len(self)}: {', '.join(f'{each} {word}' for word, each in counts.items())}")),
+            ("steps", plain(f"{steps} of {f'size {self.h:g}' if self.h else 'adaptive size'}")),
+            ("states", plain(f"{len(self.t)} of each; q and p of shape {self.q.shape}")),
+            ("coordinates", listed(interface.coordinates)),
+            ("parameters", listed(interface.parameters)),
+        )
+        rows = []
+        for j in range(min(len(self), MOST_SHOWN)):
+            q = self.q[self._reached(j), j]
+            curves = zip(names, q[:: max(1, -(-len(q) // MOST_DRAWN))].T, strict=False)
+            rows.append([plain(f"trajectory {j}"), *(sparkline(values.tolist(), name) for name, values in curves)])
+        return card(self.stepper.title, facts, grid(rows, head=("", *names)))
+
+    @property
+    def ends(self) -> tuple[Array, Array, Array]:
+        """Time, positions and momenta of the last state of each trajectory: (k,), (k, m), (k, m).
+
+        At common times, as of ``t_eval``, it is the crossing of the terminal event that ended a trajectory, before a
+        change by the event; NaN for a trajectory that reached no time and no such event.
+        """
+        reached = np.isfinite(self.q).all(axis=2).sum(axis=0)
+        last, j = reached - 1, np.arange(len(self))
+        t, q, p = self._times()[last, j], self.q[last, j], self.p[last, j]
+        t[reached == 0] = np.nan
+        for k, crossings in enumerate(self.events if self.times is None else ()):
+            for each in crossings:
+                if 0 < int(each.event.terminal) <= len(each):
+                    t[k], q[k], p[k] = each.t[-1], each.q[-1], each.p[-1]
+        return t, q, p
+
+    def each(self) -> Iterator[tuple[Array, Array, Array, str, int]]:
+        """Yield the times, positions and momenta of each trajectory, its status and its number of steps."""
+        return map(self._one, range(len(self)))
+
+    def _one(self, j: int) -> tuple[Array, Array, Array, str, int]:
+        """Return the times, positions and momenta of trajectory j, its status and its number of steps."""
+        good = self._reached(j)
+        return self._times()[good, j], self.q[good, j], self.p[good, j], str(self.status[j]), int(self.steps[j])
+
+    def _times(self) -> Array:
+        return np.broadcast_to(self.t[:, np.newaxis], self.q.shape[:2]) if self.times is None else self.times
+
+    def energy(self) -> Array:
+        """Return (n, k) energies p.v - L; NaN after a failure, and for trajectories that leave the domain of L."""
+        energies = missing(self.q.shape[:2], self.stepper.interface.words)
+        for j, good, parameters in self._with_parameters():
+            with suppress(StateError):
+                energies[good, j] = self.stepper.energy(
+                    self.q[good, j], self.p[good, j], self._times()[good, j], parameters
+                )
+        return energies
+
+    def action(self, *, cumulative: bool = False) -> Array:
+        """Return (k,) actions, or (n, k) up to each state, as of :meth:`Trajectory.action`; NaN after a failure."""
+        actions = np.full(self.q.shape[:2], np.nan) if self.actions is None else self.actions.copy()
+        for j in range(len(self)):
+            if np.isfinite(actions[self._reached(j), j]).all():
+                continue
+            actions[self._reached(j), j] = self[j].action(cumulative=True)
+        last = [np.flatnonzero(self._reached(j))[-1] for j in range(len(self))]
+        return actions if cumulative else np.where(self.ok, actions[last, np.arange(len(self))], np.nan)
+
+    def momentum_maps(self) -> Array:
+        """Return (n, k, c) values of the momentum maps ``stepper.momentum_map_names``; NaN as for :meth:`energy`."""
+        return self._momentum_maps()[0]
+
+    def momentum_errors(self) -> Array:
+        """Return (n, k, c) changes of the momentum maps since the first state, relative to their largest term."""
+
+        def bounds(wanted: NDArray[np.bool_]) -> Array:
+            found = np.zeros(wanted.shape)
+            for j, good, parameters in self._with_parameters():
+                if wanted[j].any():
+                    states = self.q[good, j], self.p[good, j], self._times()[good, j]
+                    found[j] = np.maximum(found[j], self.stepper._momentum_bounds(*states, parameters))
+            return found
+
+        return relative_changes(*self._momentum_maps(), bounds)
+
+    def _momentum_maps(self) -> tuple[Array, Array]:
+        shape = (*self.q.shape[:2], len(self.stepper.momentum_map_names))
+        values, sizes = missing(shape, self.stepper.interface.words), np.full(shape, np.nan)
+        for j, good, parameters in self._with_parameters():
+            with suppress(StateError):
+                values[good, j], sizes[good, j] = self.stepper._momentum_maps_and_sizes(
+                    self.q[good, j], self.p[good, j], self._times()[good, j], parameters
+                )
+        return values, sizes
+
+    def _with_parameters(self) -> Iterator[tuple[int, NDArray[np.intp], Array]]:
+        """Yield trajectories with the rows of their states and the parameters in these rows."""
+        for rows, some, parameters in self.spans or ((slice(None), slice(None), self.parameters.__getitem__),):
+            for j, values in zip(range(*some.indices(len(self))), parameters(some), strict=True):
+                good = np.flatnonzero(self._reached(j)[rows]) + (rows.start or 0)
+                if good.size:
+                    yield j, good, values
+
+    @checks_arguments()
+    def save(self, path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> None:
+        """Write a file in the format of its suffix, one of those of :meth:`Trajectory.save`, atomically.
+
+        CSV files have one state a line (trajectory, t, q, p), number trajectories from 0, have columns for parameters
+        that differ between trajectories, and omit states after a failure. HDF5 and Zarr files contain the variables of
+        :meth:`to_xarray`.
+
+        Raises:
+            StateError: if the suffix is unknown, or the format has no units.
+            MissingLibraryError: if h5netcdf or zarr is not installed (extra ``data``).
+        """
+        suffix, known = Path(path).suffix.lower(), checked_units(units)
+        self._check_common_times()
+        check_keeps_words(self.stepper.interface.words, path)
+        if suffix in LABELLED:
+            check_format(path)
+            write_whole(path, lambda new: LABELLED[suffix].write(self._labelled(known), new))
+            return
+        write = {".npz": self._write_npz, ".csv": self._write_csv}.get(suffix)
+        if write is None:
+            raise StateError(f"cannot save an ensemble as {str(path)!r}: use {FORMATS}")
+        if known:
+            raise StateError(f"{suffix} files cannot store units: use {', '.join(LABELLED)}, or omit units")
+        write_atomically(path, write)
+
+    def to_xarray(self, *, units: Mapping[str, str] | None = None) -> xarray.Dataset:
+        """Return a dataset of q, p, velocity, energy, momentum_map, parameters, status and steps.
+
+        Args:
+            units: as of :meth:`Trajectory.to_xarray`.
+
+        Raises:
+            StateError: if units name an unknown variable, or for states of two words.
+            MissingLibraryError: if xarray is not installed (extra ``data``).
+        """
+        self._check_common_times()
+        check_keeps_words(self.stepper.interface.words, "a dataset")
+        return to_dataset(self._labelled(checked_units(units)))
+
+    def _check_common_times(self) -> None:
+        if self.stepper.interface.energy_parameter:
+            raise StateError("ensembles in transformed time cannot be saved: their trajectories have no common times")
+
+    def _labelled(self, units: Mapping[str, str]) -> Labelled:
+        """Return the arrays with named dimensions."""
+        interface, each = self.stepper.interface, ("t", "trajectory")
+        dimensions: dict[str, tuple[str, ...]] = {"t": ("t",), "coordinate": ("coordinate",), "energy": each}
+        dimensions |= dict.fromkeys(("q", "p", "velocity"), (*each, "coordinate"))
+        dimensions |= {"status": ("trajectory",), "steps": ("trajectory",)}
+        whole: dict[str, NDArray[Any]] = {
+            "coordinate": np.array(interface.coordinates),
+            "status": self.status,
+            "steps": self.steps,
+        }
+        if interface.parameters:
+            dimensions |= {"parameter": ("parameter",), "parameters": ("trajectory", "parameter")}
+            whole |= {"parameter": np.array(interface.parameters), "parameters": self.parameters}
+        if interface.map_names:
+            dimensions |= {"symmetry": ("symmetry",), "momentum_map": (*each, "symmetry")}
+            whole["symmetry"] = np.array(interface.map_names)
+        attitudes = named_quantities(interface)
+        if attitudes:
+            dimensions |= {axis: (axis,) for axis in AXES} | {
+                item.name: (*each, *item.dimensions) for item in attitudes
+            }
+            whole |= AXES
+        states = {"t": self.t, "q": self.q, "p": self.p}
+        if self.times is not None:
+            dimensions["time"], states["time"] = each, self.times
+        return Labelled(
+            dimensions=dimensions,
+            pieces=lambda: iter([states | self._quantities()]),
+            whole=whole,
+            count=len(self.t),
+            units={name: unit for name, unit in units.items() if name in dimensions},
+            attributes={**interface.about(), "h": self.h},
+            long_names={item.name: item.long_name for item in attitudes},
+        )
+
+    def _quantities(self) -> dict[str, Array]:
+        times = np.nan_to_num(self._times())
+        result: dict[str, Array] = {}
+        for j, good, parameters in self._with_parameters():
+            part = quantities(self.stepper, parameters, times[good, j], self.q[good, j], self.p[good, j])
+            for name, values in part.items():
+                shape = (*self.q.shape[:2], *values.shape[1:])
+                result.setdefault(name, np.full(shape, np.nan))[good, j] = values
+        return result
+
+    def _reached(self, j: int) -> NDArray[np.bool_]:
+        """Return (n,) flags of the states that trajectory j reached."""
+        return np.asarray(np.isfinite(self.q[:, j]).all(axis=1), dtype=np.bool_)
+
+    def _write_npz(self, file: IO[bytes]) -> None:
+        others = {"times": self.times, "observed": self.observed}
+        optional: dict[str, Any] = {name: values for name, values in others.items() if values is not None}
+        for name in ("t", "times", "q", "p", "parameters"):
+            if isinstance(values := getattr(self, name), Words):
+                optional[f"{name}_low"] = values.low
+        np.savez(
+            file,
+            t=self.t,
+            q=self.q,
+            p=self.p,
+            status=self.status,
+            steps=self.steps,
+            h=self.h,
+            parameters=self.parameters,
+            coordinates=np.array(self.stepper.coordinates),
+            parameter_names=np.array(self.stepper.parameters, dtype=str),
+            title=self.stepper.title,
+            **optional,
+        )
+
+    def _write_csv(self, file: IO[bytes]) -> None:
+        names = self.stepper.coordinates
+        varied = [i for i, column in enumerate(self.parameters.T) if (column != column[0]).any()]
+        header = ["trajectory", *(self.stepper.parameters[i] for i in varied), "t", *names, *(f"p_{n}" for n in names)]
+        file.write((",".join(header) + "\n").encode())
+        formats = ["%d"] + ["%.17g"] * (len(header) - 1)
+        for j in range(len(self)):
+            good = self._reached(j)
+            label = np.broadcast_to([j, *self.parameters[j, varied]], (int(good.sum()), 1 + len(varied)))
+            table = np.column_stack([label, self._times()[good, j], self.q[good, j], self.p[good, j]])
+            np.savetxt(file, table, delimiter=",", fmt=formats)

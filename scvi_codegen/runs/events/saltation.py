@@ -1,0 +1,297 @@
+"""Derivatives through events that change the state: saltation matrices.
+
+The crossing of g(z, t) = 0, z = (q, p), at which z becomes R(z, t), moves by dtau = -(g_z dz + g_t dt) / rate with the
+initial data, rate = g_z X- + g_t. At a fixed time after it
+
+    dz+ = R_z (dz + X- dtau) + R_t (dt + dtau) - X+ dtau,
+
+where X- and X+ are the rates of the computed flow: the derivatives of the steps before and after the crossing with
+respect to their sizes, so that the result is the derivative of the computed run (Aizerman & Gantmacher, Q. J. Mech.
+Appl. Math. 11 (1958) 243). The impulse lambda_1 of an impact is differentiated through its energy equation. Constraints
+add the derivative of the projection P of the new state, p+ = P(q, p + lambda g_q).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.codegen.rendering.source import Interface
+from scvi_codegen.common.errors import StateError
+from scvi_codegen.runs.results.recomputation import changes_by_events, steps_after
+from scvi_codegen.runs.states.times import WHOLE
+from scvi_codegen.runs.states.validation import Array
+from scvi_codegen.runs.stepping.projection import projected
+from scvi_codegen.runs.stepping.step_plan import FixedSteps
+from scvi_codegen.systems.event import Event
+
+if TYPE_CHECKING:
+    from scvi_codegen.runs.results.saved_states import SavedStates
+    from scvi_codegen.runs.stepping.step_derivatives import Starts
+
+GRAZING = 2.0**-20
+"""Smallest rate of an event function relative to its gradient and the flow; below it rounding dominates 1/rate."""
+SMALL_STEP = 2.0**-15
+"""Fraction of a step from which the rate of the flow at a last state is computed."""
+DIFFERENCE = 2.0**-10
+"""Increment of differences of sixth order, of parameters and momenta above 1 relative to them."""
+OF_STEP = 0.25
+"""Increments of the time and of positions relative to their mean change in a step; of positions at least DIFFERENCE."""
+ADMISSIBLE = 0.5
+"""Singular values of the derivative of a projection are at least 1, or 0 for inadmissible directions."""
+WEIGHTS = np.array([1.0, -9.0, 45.0]) / 60.0
+PLACES = np.array([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])
+
+
+class Jump(NamedTuple):
+    """Linear map of the variables (q, p, parameters, t, h) at a change of the state, and the state (2m,) before it."""
+
+    matrix: Array
+    before: Array
+
+
+def jumps_within(
+    states: SavedStates, starts: Starts, numbers: NDArray[np.intp], *, all_inputs: bool
+) -> dict[int, Jump]:
+    """Return the changes of the state at the ends of consecutive steps by the index of the step's end.
+
+    Args:
+        states: saved states with the crossings of their run.
+        starts: consecutive steps.
+        numbers: (steps + 1,) indices of the saved states at their ends.
+        all_inputs: whether derivatives with respect to parameters are required.
+
+    Raises:
+        StateError: if states within steps were not saved, if several events change the state at once, if a crossing
+            grazes, or for a run backward in time.
+    """
+    changes = _changes(states, numbers)
+    rows = [(k, row) for k, row in enumerate(numbers.tolist()) if k and row in changes]
+    return {k: _jump(states, starts, k, row, *changes[row], all_inputs=all_inputs) for k, row in rows}
+
+
+def _changes(states: SavedStates, numbers: NDArray[np.intp]) -> dict[int, tuple[Event, Array]]:
+    """Return the event, of entries, and the state before it for each of ``numbers`` at which an event acted."""
+    result: dict[int, tuple[Event, Array]] = {}
+    for crossings, rows in changes_by_events(states):
+        if states.forward < 0.0:
+            raise StateError("derivatives through events that change the state require a run forward in time")
+        here = (numbers[0] < rows) & (rows <= numbers[-1])
+        each = states.stepper._events_of_entries(crossings.event) if here.any() else ()
+        entries = (crossings.element[here], crossings.q[here], crossings.p[here])
+        for row, element, q, p in zip(rows[here].tolist(), *entries, strict=True):
+            if row in result:
+                raise StateError(
+                    f"the run meets the events '{result[row][0].function}' and '{crossings.event.function}' at once at "
+                    f"t = {states.t[row]:.17g}: derivatives do not exist in a corner"
+                )
+            result[row] = each[element], np.concatenate([q, p])
+    return result
+
+
+def _jump(
+    states: SavedStates, starts: Starts, k: int, row: int, event: Event, before: Array, *, all_inputs: bool
+) -> Jump:
+    """Return the change of the state at the end of step k - 1 of ``starts``, in a row of the saved states."""
+    stepper, parameters, options = states.stepper, states.parameters, states.options
+    m, size = stepper.dimension, stepper._input_size
+    t, after = float(states.t[row]), np.concatenate([states.q[row], states.p[row]])
+
+    def products(state: Array, h: float, time: float, seeds: Array) -> Array:
+        return stepper._products(state[:m], state[m:], h, time, parameters, options, seeds)[:, : 2 * m].T
+
+    start = np.concatenate([starts.q[k - 1], starts.p[k - 1]])
+    arrival = products(start, float(starts.h[k - 1]), float(starts.t[k - 1]), np.eye(size)[-1:])[:, 0]
+    at_end = row + 1 == len(states)
+    h = SMALL_STEP * abs(states.h) if at_end else float(steps_after(states, row, row + 1)[0])
+    # 1 if the next step is the rest of a step of size h, whose variation belongs to the first part
+    partial = abs(h) < (1.0 - WHOLE) * abs(states.h) or abs(starts.h[k - 1]) < WHOLE * abs(states.h)
+    rest = float(not at_end and isinstance(states.plan, FixedSteps) and partial)
+    step = products(after, h, t, np.eye(size))
+    departure, basis = np.zeros(2 * m), np.eye(2 * m)
+    if stepper.constraints:  # tangent vectors are admissible: departure + the range of the derivative of the projection
+        onto = _projection(states, after, t, all_inputs=False)[1]
+        directions, sizes, _ = np.linalg.svd(onto[:, : 2 * m])
+        departure, basis = onto[:, -1], directions[:, sizes > ADMISSIBLE]
+    moved = step[:, -1] - step[:, -2] - step[:, : 2 * m] @ departure
+    departure = departure + basis @ np.linalg.lstsq(step[:, : 2 * m] @ basis, moved)[0]
+    values = _derivatives(stepper.known.interface, event)(before, t, parameters)
+    gradient = np.concatenate([values.gradient, np.zeros(1)])
+    rate = values.gradient[: 2 * m] @ arrival + values.gradient[-1]
+    steepest = np.linalg.norm(values.gradient[: 2 * m]) * np.linalg.norm(arrival) + abs(values.gradient[-1])
+    if not abs(rate) > GRAZING * steepest:
+        raise StateError(
+            f"the event '{event.function}' is tangent to the run at t = {t:.17g}: derivatives do not exist at a "
+            "grazing crossing"
+        )
+    if event.restitution is not None:
+        change = _impact(states, values, before, after, t, all_inputs)
+    else:
+        by = _projection(states, values.value, t, all_inputs=all_inputs)[1]
+        change = by[:, : 2 * m] @ values.map
+        change[:, 2 * m :] += by[:, 2 * m :]
+    shift = -gradient / rate
+    matrix = np.eye(size)
+    matrix[: 2 * m] = np.concatenate([change, np.zeros((2 * m, 1))], axis=1)
+    matrix[: 2 * m] += np.outer(change[:, : 2 * m] @ arrival + change[:, -1] - departure, shift)
+    matrix[: 2 * m, -1] -= rest * departure
+    matrix[-2, -1] -= rest
+    return Jump(matrix, before)
+
+
+class Values(NamedTuple):
+    """Derivatives of an event by x = (q, p, parameters, t).
+
+    Attributes:
+        gradient: (x,) of g.
+        map: (2m, x) of the new state; of an impact those of g_q, g_t and e, (m + 2, x).
+        value: (2m,) new state; of an impact (m + 2,) g_q, g_t and e.
+    """
+
+    gradient: Array
+    map: Array
+    value: Array
+
+
+@lru_cache(maxsize=64)
+def _derivatives(interface: Interface, event: Event) -> Callable[[Array, float, Array], Values]:
+    """Return a function of (q, p), t and parameters that computes the derivatives of an event."""
+    import sympy  # here: slow to import, with the modules that use it
+
+    from scvi_codegen.codegen.rendering.events import EventFormulas
+    from scvi_codegen.systems.formulas.symbols import TIME, symbol
+
+    formulas = EventFormulas(interface, (event,))
+    ((indices, values),) = formulas.changes
+    z, time = (*formulas.q, *formulas.p), symbol(TIME)
+    variables = (*z, *formulas.parameters, time)
+    new = dict(zip(indices, values, strict=True))
+    if any(index >= len(z) for index in indices) or any(
+        each.free_symbols.intersection(formulas.v) for each in (*formulas.functions, *values)
+    ):
+        raise StateError(
+            f"derivatives through the event '{event.function}' require momenta instead of velocities in its formulas"
+        )
+    mapped = [new.get(k, each) for k, each in enumerate(z)] if event.restitution is None else list(values)
+    entries = [formulas.functions[0].diff(x) for x in variables]
+    entries += [value.diff(x) for value in mapped for x in variables]
+    function = sympy.lambdify((variables,), [*entries, *mapped], cse=True)
+    count = len(variables)
+
+    def evaluate(state: Array, t: float, parameters: Array) -> Values:
+        numbers = np.array(function([*state, *parameters, t]), dtype=float)
+        rest = numbers[count : len(entries)].reshape(len(mapped), count)
+        return Values(numbers[:count], rest, numbers[len(entries) :])
+
+    return evaluate
+
+
+def _impact(states: SavedStates, values: Values, before: Array, after: Array, t: float, all_inputs: bool) -> Array:
+    """Return the (2m, x) derivative of the state after an impact by x = (q, p, parameters, t).
+
+    With n = g_q, u = p + lambda n and p1 = P(q, u), F = H(q, p1) - H(q, p) + lambda g_t - (p1 - u).v1 = 0 gives
+    lambda_x = -F_x / F_lambda; the last term is the work of moving constraints.
+    """
+    stepper, parameters = states.stepper, states.parameters
+    m, count = stepper.dimension, values.gradient.size
+    n, e, (q, p) = values.value[:m], values.value[m + 1], np.split(before, 2)
+    # P_u maps G^T mu to 0, and the change of p, lambda n + G^T mu, to lambda P_u n
+    onto = _projection(states, after, t, all_inputs=False)[1][m:, m : 2 * m]
+    impulse = float((onto @ (after - before)[m:]) @ (onto @ n) / ((onto @ n) @ (onto @ n)))
+    full = 2.0 * impulse / (1.0 + e)
+
+    def changed(impulse: float) -> tuple[Array, Array, Array]:
+        """Return P(q, p + lambda n), its derivative by x at constant lambda, and by lambda."""
+        state, by = _projection(states, np.concatenate([q, p + impulse * n]), t, all_inputs=all_inputs)
+        onto = by[m:, m : 2 * m]
+        return state[m:], by[m:] + impulse * onto @ values.map[:m], onto @ n
+
+    p1, p1_by, p1_by_impulse = changed(full)
+    v0, v1 = (np.asarray(stepper.velocity(q, each, t, parameters)) for each in (p, p1))
+    residual = full * (v1 @ values.map[:m] + values.map[m])
+    residual[m : 2 * m] += v1 - v0
+    residual += _energy_differences(states, q, (p, p1), t, all_inputs)
+    residual_by_impulse = n @ v1 + values.value[m]
+    if stepper.constraints:
+        work = (p1 - p - full * n) @ _differences(stepper.velocity, states, q, p1, t, all_inputs=all_inputs)
+        by_momentum = work[m : 2 * m].copy()
+        work[m : 2 * m] = 0.0
+        residual -= work + by_momentum @ p1_by
+        residual_by_impulse -= by_momentum @ p1_by_impulse
+    total = 0.5 * (full * values.map[m + 1] - (1.0 + e) * residual / residual_by_impulse)
+    _, by, by_impulse = changed(impulse)
+    return np.vstack([np.eye(m, count), by + np.outer(by_impulse, total)])
+
+
+def _projection(states: SavedStates, state: Array, t: float, *, all_inputs: bool) -> tuple[Array, Array]:
+    """Return the projection of a state onto the constraints, and its (2m, x) derivative; without constraints 1."""
+    stepper, parameters = states.stepper, states.parameters
+    if not stepper.constraints:
+        return state, np.eye(len(state), len(state) + len(parameters) + 1)
+
+    def onto(q: Array, p: Array, t: float, values: Array) -> Array:
+        return np.concatenate(projected(stepper, q, p, t, values)[:2])
+
+    q, p = np.split(state, 2)
+    return onto(q, p, t, parameters), _differences(onto, states, q, p, t, all_inputs=all_inputs)
+
+
+def _differences(
+    function: Callable[[Array, Array, float, Array], Array],
+    states: SavedStates,
+    q: Array,
+    p: Array,
+    t: float,
+    *,
+    all_inputs: bool,
+) -> Array:
+    """Return the (.., x) derivative of a function of q, p, t and parameters by differences of sixth order."""
+    m, parameters = len(q), states.parameters
+    x, moved = np.concatenate([q, p, parameters, [t]]), _increments(states)
+    steps = DIFFERENCE * np.maximum(1.0, np.abs(x))
+    steps[:m], steps[-1] = moved[:-1], moved[-1]
+    columns = np.zeros((len(x), len(function(q, p, t, parameters))))
+    for k in (*range(2 * m), *(range(2 * m, len(x) - 1) if all_inputs else ()), -1):
+        step, values = steps[k], np.tile(x, (len(PLACES), 1))
+        values[:, k] += step * PLACES
+        at = [np.asarray(function(y[:m], y[m : 2 * m], float(y[-1]), y[2 * m : -1])) for y in values]
+        columns[k] = _central_differences(np.stack(at, axis=-1)) / step
+    return columns.T
+
+
+def _increments(states: SavedStates) -> Array:
+    """Return the (m + 1,) increments of q and t, which do not depend on their origins, as windings of angles do."""
+    by_q, by_t = (np.abs(np.diff(each, axis=0)).mean(axis=0) for each in (np.asarray(states.q), np.asarray(states.t)))
+    return np.append(np.maximum(DIFFERENCE, OF_STEP * by_q), OF_STEP * by_t)
+
+
+def _energy_differences(states: SavedStates, q: Array, ends: tuple[Array, Array], t: float, all_inputs: bool) -> Array:
+    """Return the derivatives of H(q, p1) - H(q, p0) at fixed momenta by x = (q, p, parameters, t), 0 by p."""
+    stepper, parameters, m = states.stepper, states.parameters, len(q)
+    result = np.zeros(2 * m + len(parameters) + 1)
+    x, steps = np.append(q, t), _increments(states)
+    shifted = (x + (np.diag(steps)[:, np.newaxis] * PLACES[:, np.newaxis])).reshape(-1, m + 1)
+
+    def difference(values: Array) -> Array:
+        first, last = (
+            stepper.energy(shifted[:, :m], np.tile(p, (len(shifted), 1)), shifted[:, m], values) for p in ends
+        )
+        return np.asarray(last - first)
+
+    partials = _central_differences(difference(parameters).reshape(m + 1, -1)) / steps
+    result[:m], result[-1] = partials[:m], partials[m]
+    shifted = x[np.newaxis]
+    for k in range(len(parameters) if all_inputs else 0):
+        step = DIFFERENCE * max(1.0, abs(parameters[k]))
+        sides = [parameters + place * step * (np.arange(len(parameters)) == k) for place in PLACES]
+        result[2 * m + k] = _central_differences(np.concatenate([difference(each) for each in sides])) / step
+    return result
+
+
+def _central_differences(values: Array) -> Array:
+    """Return the sixth-order differences of values at ``PLACES``, exactly 0 if these are equal."""
+    return np.asarray((values[..., :2:-1] - values[..., :3]) @ WEIGHTS)

@@ -1,0 +1,1 @@
+"""Saved states: dense output, recomputation, export, conserved quantities."""

@@ -1,0 +1,83 @@
+"""Energy along saved states: which part of its change is an error, and what to call it.
+
+Forces, damping, constraints that do work, a function that depends on time, and impacts change the energy of the exact
+motion. Where their work W is known, the balance E - E0 - W is the error; elsewhere only the change can be shown.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from scvi_codegen.runs.results.export import Array
+
+MOST_BALANCED_STEPS, MOST_BALANCED_COORDINATES = 10_000, 12
+"""Limits for a balance that was not asked for: Newton's iteration repeats each step, in some tens of microseconds."""
+
+
+def energy_reason(stepper: Any) -> str:
+    """Return why the energy of a motion changes, so that its change is no error; empty if it is conserved."""
+    if getattr(stepper, "changes_states", False):
+        return "events change the state"
+    return str(stepper.interface.changes_energy)
+
+
+class EnergyAccount(NamedTuple):
+    """Change of the energy along saved states.
+
+    Attributes:
+        reason: why the exact energy changes; empty if it is conserved.
+        initial: energy of the first state; 0 if it is at most 1e-8 of p.v, as of a pendulum that starts horizontally.
+        change: (n,) E - E0.
+        work: (n,) work of forces and damping, and energy exchanged at events; ``None`` if unknown or none.
+    """
+
+    reason: str
+    initial: float
+    change: Array
+    work: Array | None = None
+
+    @property
+    def is_error(self) -> bool:
+        """True if :attr:`values` are errors: the energy is conserved, or its work is known."""
+        return not self.reason or self.work is not None
+
+    @property
+    def values(self) -> Array:
+        """(n,) E - E0, or E - E0 - W if the work is known."""
+        return self.change if self.work is None else self.change - self.work
+
+    @property
+    def scale(self) -> float:
+        """|E0| for errors; 1 if that is 0, and for changes."""
+        return abs(self.initial) or 1.0 if self.is_error else 1.0
+
+    @property
+    def title(self) -> str:
+        """Title of a plot of ``abs(values) / scale``."""
+        if not self.is_error:
+            return f"energy change |E - E0|: {self.reason}"
+        if self.work is not None:
+            return f"energy balance |E - E0 - W|{' / |E0|' * bool(self.initial)}"
+        return f"{'relative ' * bool(self.initial)}energy error"
+
+
+def energy_account(states: Any, *, limited: bool = False) -> EnergyAccount:
+    """Return the change of the energy along states with ``t`` and ``energy()``.
+
+    Args:
+        states: a trajectory, or a recorded run, of which the work is unknown.
+        limited: whether the work is computed only for short runs of few coordinates.
+    """
+    energy = np.asanyarray(states.energy())
+    stepper: Any = getattr(states, "stepper", None)
+    reason = "" if stepper is None else energy_reason(stepper)
+    long = limited and not (
+        0 < getattr(states, "steps", 0) <= MOST_BALANCED_STEPS and stepper.dimension <= MOST_BALANCED_COORDINATES
+    )
+    known = reason and hasattr(states, "_exchanged_energy") and not long
+    work = states._exchanged_energy(energy) if known else None
+    initial, change = float(energy[0]), energy - energy[:1]
+    if np.abs(change).max() > 1e-3 * abs(initial) and hasattr(states, "velocity"):
+        action = np.abs(np.sum(states.p * states.velocity, axis=-1)).max()
+        initial = 0.0 if abs(initial) <= 1e-8 * action else initial
+    return EnergyAccount(reason, initial, change, work)

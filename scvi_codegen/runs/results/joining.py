@@ -1,0 +1,75 @@
+"""Joining of the trajectories of consecutive segments of a run."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.runs.results.saved_states import Array
+from scvi_codegen.systems.event import Crossings
+
+Number = TypeVar("Number", bound=np.generic)
+Result = TypeVar("Result")
+
+
+def joined(pieces: Sequence[Result]) -> Result:
+    """Return the trajectory of consecutive segments of a run, each with its parameters."""
+    every: Sequence[Any] = pieces
+    first, last = every[0], every[-1]
+    states: dict[str, Any] = {
+        name: concatenated([getattr(piece, name) for piece in pieces]) for name in ("t", "q", "p", "iterations")
+    }
+    states |= {name: first.stepper.named(states[name]) for name in "qp"}
+    same = ("plan", "steps", "rejected_steps", "fallback_steps", "step_error", "worst_step_time")
+    whole: Result = replace(
+        first,
+        **states,
+        **{name: getattr(last, name) for name in same},
+        step_sizes=np.concatenate([*(piece.step_sizes[:-1] for piece in every), last.step_sizes[-1:]]),
+        actions=None,
+        events=tuple(map(joined_crossings, zip(*(piece.events for piece in every), strict=True))),
+        pieces=tuple(pieces),
+    )
+    return whole
+
+
+def concatenated(parts: Sequence[NDArray[Number]]) -> NDArray[Number]:
+    """Concatenate arrays of successive pieces; the first state of each repeats the last of the previous one."""
+    first, *others = parts
+    return np.concatenate([first, *(other[1:] for other in others)]) if others else first
+
+
+def joined_crossings(crossings: Sequence[Crossings]) -> Crossings:
+    """Concatenate the crossings of one event over all pieces."""
+    names = "t", "q", "p", "element"
+    joined = {name: np.concatenate([getattr(each, name) for each in crossings]) for name in names}
+    return Crossings(event=crossings[0].event, **joined)
+
+
+SUSPICIOUS, ROUNDING = 1e-6, 1e-10
+"""Relative change of a quantity from which on its terms may be rounding errors; the largest such change relative to its
+bound."""
+
+
+def relative_changes(values: Array, sizes: Array, bounds: Callable[[NDArray[np.bool_]], Array]) -> Array:
+    """Return changes since the first value along axis 0, relative to the largest size; NaN if sizes overflow.
+
+    If the terms of a quantity are rounding errors, as of the angular momentum of a fall along an axis, changes are
+    relative to a bound of its values.
+
+    Args:
+        values, sizes: (n, ..) values and sizes of their terms.
+        bounds: function that returns (..) bounds where a mask (..) is true.
+    """
+    with np.errstate(invalid="ignore", over="ignore"):
+        scales = np.fmax.reduce(sizes, axis=0)
+        changes: Array = values - values[0]
+        scales = np.where(scales > 0.0, scales, 1.0)
+        largest = np.fmax.reduce(np.abs(changes), axis=0).astype(float)
+        if (suspicious := largest > SUSPICIOUS * scales).any():
+            wider = bounds(suspicious)
+            scales = np.where(suspicious & (largest <= ROUNDING * wider), wider, scales)
+        changes = changes / scales
+    return np.where(np.isinf(scales), np.nan, changes)

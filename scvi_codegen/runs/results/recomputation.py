@@ -1,0 +1,137 @@
+"""Recomputation of the steps of a run from its saved states (checkpoint replay), for data that a run does not store.
+
+Newton's iteration solves the steps again, from a linear initial guess. It may converge to another root of the stage
+equations; recomputed steps that do not end in the next saved state raise an error.
+"""
+
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.common.errors import ScviCodegenError, StateError
+from scvi_codegen.runs.results.dense_output import whole_steps
+from scvi_codegen.runs.results.saved_states import ROUNDINGS, STEP_END_TOLERANCE, Array, SavedStates
+from scvi_codegen.runs.states.words import missing
+from scvi_codegen.systems.event import Crossings
+
+SAME_STEP_SIZE = 1e-9
+"""Largest relative difference of step sizes that are equal."""
+SAME_STATE = 1e-6
+"""Largest deviation of a recomputed state, relative to its largest entry; other roots are further away."""
+
+
+def work_and_impulses_until(states: SavedStates) -> Array:
+    """Return (n, 1 + k) work of the forces from the first state to each, and their impulses on the momentum maps.
+
+    Raises:
+        MethodError: if no forces act, or the method has no curve of positions.
+        StateError: if the states are not at whole steps, or recomputed steps differ.
+        StepFailedError: if Newton's iteration does not converge.
+    """
+    stepper = states.stepper
+    values = [np.zeros(1)]  # of the first state; the number of impulses of arrays is known after a step
+    step = partial(stepper.work_and_impulses, parameters=states.parameters, options=states.options)
+    ends = np.concatenate([states.q, states.p], axis=1)
+    for crossings, rows in changes_by_events(states):
+        ends[rows] = np.concatenate([crossings.q, crossings.p], axis=1)
+    spans = steps_after(states, 0, len(states) - 1).tolist()
+    for k, (start, length, span) in enumerate(
+        zip(states.t[:-1].tolist(), states.step_sizes[:-1].tolist(), spans, strict=True)
+    ):
+        count, q, p = steps_between(length, span), states.q[k], states.p[k]
+        total = values[-1]
+        for j in range(count):
+            q, p, output = step(q, p, length if count > 1 else span, start + j * length)
+            total = total + output
+        values.append(total)
+        recomputed = np.concatenate([q, p])[np.newaxis]
+        check_recomputed(states.t[k : k + 1], recomputed, ends[k + 1 : k + 2], ends[k : k + 1])
+    values[0] = np.zeros_like(values[-1])
+    return np.array(values)
+
+
+def changes_by_events(states: SavedStates) -> Iterator[tuple[Crossings, NDArray[np.intp]]]:
+    """Yield the crossings of each event that changes the state, and the rows of the states after them."""
+    t = states.forward * states.t
+    for crossings in getattr(states, "events", ()):
+        times = states.forward * crossings.t
+        here = (t[0] <= times) & (times <= t[-1])
+        rows = np.searchsorted(t, times[here])
+        chosen = crossings.chosen(here)
+        # the time of a crossing near the end of a step is that of two states: the first may be the one before it
+        after, (q, p) = np.minimum(rows + 1, len(t) - 1), (np.asarray(each) for each in (chosen.q, chosen.p))
+        apart = [np.abs(states.q[k] - q).sum(axis=1) + np.abs(states.p[k] - p).sum(axis=1) for k in (rows, after)]
+        rows = np.where((t[after] == times[here]) & (apart[0] < 0.5 * apart[1]), after, rows)
+        if crossings.event.changes_state:
+            if not np.array_equal(t[rows], times[here]):
+                raise StateError("this requires the states after changes by events: save all states (save_every=1)")
+            if np.isnan(np.asarray(chosen.q)).any():
+                raise StateError("this requires the states of crossings, which exceed 1 GiB: integrate in parts")
+            yield chosen, rows
+
+
+def steps_after(states: SavedStates, first: int, last: int) -> Array:
+    """Return the sizes of the steps from saved states to the next ones: as taken, or the differences of times.
+
+    Times are rounded; a crossing can be closer than that to the end of a step.
+    """
+    spans, lengths = np.diff(states.stepped[first : last + 1]), states.step_sizes[first:last]
+    rounding = ROUNDINGS * np.finfo(float).eps * np.abs(states.stepped[first + 1 : last + 1])
+    return np.where(np.abs(spans - lengths) < SAME_STEP_SIZE * np.abs(lengths) + rounding, lengths, spans)
+
+
+def steps_between(length: float, span: float) -> int:
+    """Return the number of steps in a span; 1 for a last, shorter step."""
+    if np.isnan(length):
+        raise StateError("this requires states at whole steps: integrate without t_eval and with save_every=1")
+    count = int(whole_steps(np.array([span]), np.array([length]), slack=STEP_END_TOLERANCE)[0])
+    if count > 1 and abs(span - count * length) > STEP_END_TOLERANCE * abs(length):
+        raise StateError("this requires states at whole steps: save all states (save_every=1)")
+    return max(1, count)
+
+
+def check_recomputed(t: Array, recomputed: Array, known: Array, before: Array) -> None:
+    """Raise :class:`StateError` for the first of n recomputed steps that converged to a spurious root.
+
+    Deviations are relative to the largest entry of a state, since entries that are 0 contain only rounding errors.
+
+    Args:
+        t: (n,) start times of the steps.
+        recomputed, known: (n, 2m) recomputed and saved states at their ends.
+        before: (n, 2m) states at their starts.
+    """
+    apart = recomputed - known
+    lengths = (np.einsum("ij,ij->i", x, x) for x in (apart, known))
+    near = np.less(known.shape[1] * next(lengths), SAME_STATE**2 * next(lengths))  # sufficient, cheaper than maxima
+    rows = np.flatnonzero(~near)
+    sizes = np.maximum(np.abs(known[rows]).max(axis=1), np.abs(before[rows]).max(axis=1))
+    deviating = rows[~(np.abs(apart[rows]).max(axis=1) <= SAME_STATE * sizes)]
+    if deviating.size:
+        raise StateError(
+            f"the steps from t = {t[deviating[0]]:g}, computed again, end in another state than in the run: the stage "
+            "equations have several solutions (use a smaller step size), or the motion is too sensitive between saved "
+            "states (use save_every=1)"
+        )
+
+
+def exchanged_energy(states: Any, energy: Array) -> Array | None:
+    """Return (n,) work of forces and energy exchanged at events; ``None`` if the states do not determine it."""
+    stepper = states.stepper
+    if stepper.interface.changes_energy and not stepper.interface.balances_energy:
+        return None
+    before = missing((len(energy),), stepper.interface.words)  # before the first event at a time
+    try:
+        for crossings, rows in changes_by_events(states):
+            for row, value in zip(
+                rows, stepper.energy(crossings.q, crossings.p, crossings.t, states.parameters), strict=True
+            ):
+                if not abs(value - energy[row - 1]) >= abs(before[row] - energy[row - 1]):  # NaN: none
+                    before[row] = value
+        exchanged = np.where(np.isfinite(before), energy - before, 0.0)
+        total: Array = np.cumsum(exchanged)
+        return total + states.work() if stepper.interface.changes_energy else total
+    except ScviCodegenError:
+        return None  # the method or the states do not determine the work, or there is no compiler

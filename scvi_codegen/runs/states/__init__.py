@@ -1,0 +1,1 @@
+"""States and times: flat and named, rotations, arrays, one word or two."""

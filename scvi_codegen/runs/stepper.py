@@ -1,0 +1,787 @@
+"""Compiled integrator for users: :class:`Integrator` with runs, trajectories and ensembles.
+
+``step`` is a pure function. A *run* (:meth:`Stepper.start`, used by :meth:`Stepper.integrate`) has memory: a predictor
+that extrapolates the previous step, and compensation terms of the state. The whole memory is one plain C struct;
+:meth:`Run.checkpoint` returns its bytes and :meth:`Stepper.from_checkpoint` continues from them bitwise equally.
+Neither SymPy nor Jinja is imported.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from contextlib import suppress
+from functools import partial, wraps
+from typing import Any, Self, TypeVar, cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from scvi_codegen.codegen.native import building
+from scvi_codegen.codegen.native.arguments import checked_number
+from scvi_codegen.codegen.native.calls import with_calls
+from scvi_codegen.codegen.native.options import SolverOptions
+from scvi_codegen.codegen.rendering.source import Source
+from scvi_codegen.common.errors import MethodError, ScviCodegenError, StateError
+from scvi_codegen.common.validation import checked_count, checks_arguments, of
+from scvi_codegen.runs.accuracy.global_error import Runs, checked_error, warn_of_unconfirmed, warn_of_unconfirmed_run
+from scvi_codegen.runs.accuracy.growth import measured_growth, warn_of_error_growth
+from scvi_codegen.runs.accuracy.local_error import warn_of_energy_errors, warn_of_inaccuracy
+from scvi_codegen.runs.accuracy.resolution import warn_of_unresolved_members
+from scvi_codegen.runs.accuracy.size import neighbouring
+from scvi_codegen.runs.accuracy.warning_switch import warn_of_failed_check
+from scvi_codegen.runs.driver.observation import Observe
+from scvi_codegen.runs.driver.run import Run
+from scvi_codegen.runs.driver.segments import InputSegments, checked_inputs, final_time
+from scvi_codegen.runs.ensembles.ensemble import Ensemble
+from scvi_codegen.runs.ensembles.result import EnsembleTrajectory
+from scvi_codegen.runs.events.refinement import WithEventsInDouble, constantly
+from scvi_codegen.runs.forwarding import SteppersAnalysis, largest_step
+from scvi_codegen.runs.results.dense_output import times_of_run
+from scvi_codegen.runs.states.rotations import homogeneous_state, is_one_state
+from scvi_codegen.runs.states.times import times_after
+from scvi_codegen.runs.states.validation import (
+    Array,
+    EnsembleParameters,
+    Parameters,
+    States,
+    coordinate_shapes,
+    flat_state,
+)
+from scvi_codegen.runs.states.words import check_doubles, checked_time, hashed
+from scvi_codegen.runs.stepping.array_interface import RunSizes, interface_of_sizes, shapes_of_call, sizes_of_run
+from scvi_codegen.runs.stepping.compiled_method import OF_KNOWN_SIZES, Variants
+from scvi_codegen.runs.stepping.features import check_together, require
+from scvi_codegen.runs.stepping.integrator import Integrator
+from scvi_codegen.runs.stepping.projection import consistent, constraint_values, multipliers, projected
+from scvi_codegen.runs.stepping.saving import read_checkpoint
+from scvi_codegen.runs.stepping.step_plan import (
+    Adaptive,
+    ErrorControl,
+    Fixed,
+    FixedSteps,
+    StepPlan,
+    Until,
+    check_max_step,
+    checked_plan,
+    planned_steps,
+)
+from scvi_codegen.runs.trajectory import Trajectory
+from scvi_codegen.systems.event import Event, EventLike
+from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED
+
+Called = TypeVar("Called", bound=Callable[..., Any])
+
+
+class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
+    """Compiled integrator of one system: :class:`Integrator` with integrations, runs, ensembles and projections."""
+
+    _trajectory_type = Trajectory
+    _precise: Callable[[], Stepper | None] | None = None
+    """Function that returns the stepper in double-double if there is one, for ``error=`` with precision="auto"."""
+
+    def _copy(self, events: tuple[Event, ...], source: Source | None = None) -> Self:
+        copy = super()._copy(events, source)
+        copy._precise, copy._doubles = self._precise, self._doubles
+        return copy
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        if self.origin is not None:
+            return (_rebuild_bound, (self.origin, self.problem, self.events))
+        variants = Variants() if self._reason else self._variants
+        made = partial(Stepper, variants=variants, flags=self.flags, events=self.events, reason=self._reason)
+        further = {} if self._doubles is None or not self.events else {"_doubles": constantly(self._doubles())}
+        return made, (self._plain, self.interface), further
+
+    @checks_arguments(StateError)
+    def integrate(
+        self,
+        q: States,
+        p: States | None = None,
+        *,
+        inputs: Mapping[str, Any] | None = None,
+        velocity: States | None = None,
+        h: float | None = None,
+        steps: int | None = None,
+        t_end: float | None = None,
+        tolerance: float | None = None,
+        absolute_tolerance: float | Mapping[str, float] | None = None,
+        max_step: float | None = None,
+        first_step: float | None = None,
+        save_every: int = 1,
+        t: float = 0.0,
+        parameters: Parameters = None,
+        options: SolverOptions | None = None,
+        progress: Callable[[int], None] | None = None,
+        t_eval: ArrayLike | None = None,
+        observe: Observe = None,
+        events: EventLike | Sequence[EventLike] | None = None,
+        error: float | None = None,
+        check_growth: bool | None = None,
+        tables: Mapping[str, ArrayLike] | None = None,
+        threads: int | None = None,
+        action: bool = False,
+    ) -> Trajectory:
+        """Integrate ``steps`` steps of h, or to t_end, and save every ``save_every``-th state and the initial one.
+
+        Args:
+            q, p: (m,) initial positions and momenta.
+            inputs: of a system with inputs, by name: ``(t, values)``, interpolated linearly; ``(t, values, kind)`` with
+                ``"constant"`` (zero-order hold), ``"linear"`` or ``"cubic"`` (SciPy's spline); a ``CubicSpline`` or
+                ``PPoly`` of degree 3 at most; or a number. Steps end at the breakpoints, which preserves the order;
+                states there are saved. Without them inputs need values among the parameters.
+            velocity: (m,) initial velocities, instead of p.
+            h: fixed step size, negative to integrate backward; step of tau in transformed time
+                (:func:`~scvi_codegen.reparametrise`).
+            steps: number of steps.
+            t_end: final time, instead of ``steps``. Without h steps are adaptive and the last ends there exactly. With
+                h (also in transformed time and with ``time_transformation``, :func:`~scvi_codegen.compile_stepper`) the
+                last step is shorter unless t_end - t is a multiple of h (within 1e-9).
+            tolerance: largest error of an adaptive step, relative to the motion of each coordinate in it; by default
+                round-off.
+            absolute_tolerance: size below which errors of a coordinate do not matter, 0 by default: the error of a
+                step is at most ``tolerance * max(motion, absolute_tolerance)``. A number, or numbers by name of
+                coordinate, array or rotation (an angle in radians).
+            max_step: largest size of an adaptive step; by default not limited.
+            first_step: size of the first adaptive step, which is reduced if its error is too large; by default
+                determined by trials.
+            save_every: steps between saved states; the state at t_end is also saved.
+            t: initial time.
+            parameters, options: as in :meth:`step`; in transformed time the energy defaults to that of (q, p).
+            progress: called with the number of completed steps.
+            t_eval: (n,) output times, sorted in the direction of the run, instead of ``save_every``; see
+                :meth:`Trajectory.at`. Not with inputs.
+            observe: function of the run that returns the data to save instead of the states, a number or an array of
+                constant shape, in ``observed`` of the trajectory; or an observer of all states
+                (:class:`~scvi_codegen.runs.driver.observation.Observer`) or its name, whose result is saved there:
+                ``"extremes"``, the smallest and largest positions and momenta. Not with inputs.
+            events: zero crossings to record in ``events`` of the trajectory; a terminal one ends the run, others may
+                change the state (:func:`~scvi_codegen.impact`), which is saved as a further state. One or several
+                :class:`~scvi_codegen.systems.event.Event` or functions of (q, v, p, t) as text or SymPy
+                expression, compiled once with the integrator. By default those of :func:`compile_stepper`.
+            error: instead of a tolerance, bound of the relative global error of all saved states up to t_end. Local
+                tolerances are reduced until a second run, with other steps and a perturbed initial state, confirms
+                the bound: ``global_error``, ``confirmed_digits`` and ``confirmed_until`` of the trajectory. If double
+                precision does not suffice (chaotic motion), an :class:`~scvi_codegen.AccuracyWarning` reports the
+                time until which the bound is confirmed.
+            check_growth: by default adaptive runs warn of exponential growth of errors: of most conservative
+                Lagrangian systems by a tangent vector along the run, of others by repeating up to 2048 steps from an
+                initial state perturbed in its last place, unless a coarse run shows that errors grow slowly.
+                ``True``: repeat all steps, and warn if the states differ by more than 1e-7 (relative); ``False``: no
+                check.
+            tables, threads: of arrays of run-time sizes: (rows, columns) whole numbers by name, (rows,) for a single
+                column; and the number of threads per step, by default one, with bitwise equal results. Threads pay off
+                if a step takes longer than some tens of microseconds; they are started by each call of C. The shapes
+                of the arrays determine the sizes, and without p and velocity the initial velocity is 0.
+            action: sum the action along the run, for :meth:`Trajectory.action`, which otherwise computes the steps
+                again. Runs with events that change the state ignore this; arrays of run-time sizes are compiled with
+                the sizes of the call.
+
+        Returns:
+            A :class:`Trajectory` of steps // save_every + 1 states, fewer if an event ended it; with inputs states
+            at breakpoints are additional, and ``pieces`` are the trajectories between them. An
+            :class:`~scvi_codegen.AccuracyWarning` reports the worst step if it is too large for the motion.
+
+        Raises:
+            StateError: if a shape, name or number is invalid, or inputs do not cover the run.
+            EventError: if an event function has an unknown symbol or is not finite.
+            StepFailedError: if a step fails; its ``trajectory`` contains the states before.
+        """
+        if type(save_every) is not int or save_every != 1:
+            save_every = checked_count(save_every, "save_every", least=1)
+        stepper, interface, segments = self._for_run(events, action=action), self.interface, None
+        if not (inputs is None and t_eval is None and observe is None and tables is None and threads is None):
+            self._check_not_of_run(tables, threads)
+            stride = None if save_every == 1 else save_every
+            check_together(inputs=inputs, t_eval=t_eval, observe=observe, save_every=stride, error=error)
+            inputs = None if inputs is None else checked_inputs(interface, inputs)
+        if interface.rotations or interface.variables:
+            q, p, velocity = homogeneous_state(interface, q, p, velocity)
+        if error is not None:
+            wanted = checked_error(error, {"h": h, "steps": steps, "tolerance": tolerance}, self)
+            start = {"velocity": velocity, "inputs": inputs, "t": t, "parameters": parameters, "options": options}
+            start |= ErrorControl(None, absolute_tolerance, max_step, first_step).named
+            saved = {"t_end": t_end, "save_every": save_every, "t_eval": t_eval}
+            return stepper._confirmed(wanted, q, p, {**start, "progress": progress}, saved)
+        t = checked_time(t, interface.words)
+        begin = 0.0 if h is None or t_end is None else hashed(t)  # one plan for all times where they do not matter
+        how = interface.time_transformation, stepper.in_tau, interface.words
+        control = tolerance, absolute_tolerance, max_step, first_step
+        schedule = h, steps, t_end, *control, save_every, begin, *how
+        try:
+            plan, count = planned_steps(*schedule)
+        except TypeError:  # of an argument that is not hashable, as an array
+            plan, count = planned_steps.__wrapped__(*schedule)
+        if max_step is not None:
+            check_max_step(plan, t, interface.words)
+        if inputs is not None:
+            plan = Fixed(plan.h) if isinstance(plan, FixedSteps) else plan  # each segment ends where the next begins
+            segments = InputSegments(stepper, inputs, parameters, t, final_time(t, h, steps, t_end))
+            parameters = segments.first
+        if p is None or velocity is not None or interface.constraints:
+            q, p = stepper._consistent_state(q, p, velocity, t, parameters)
+        fixed = isinstance(plan, FixedSteps)
+        growth = 0 if fixed and not check_growth else measured_growth(stepper, plan, check_growth)
+        times = None if t_eval is None else stepper._output_times(t_eval, t, plan, count)
+        run = Run._reused(stepper)
+        run._set_up(plan, parameters, options, q, p)
+        if segments is None:
+            trajectory = run._integrated(q, p, t, growth, count, save_every, times, progress, observe)
+        else:
+            run._begin(q, p, t, growth)
+            trajectory = segments.record(run, save_every, progress)
+        _check(run, trajectory, check_growth, segments, fixed=fixed)
+        run._release()
+        return trajectory
+
+    def _for_run(self, events: EventLike | Sequence[EventLike] | None, *, action: bool) -> Self:
+        """Return the stepper of runs with these events, ``None`` for its own, that sum the action if requested."""
+        stepper = self if events is None else self.with_events(events)
+        if action:
+            require(stepper, "action")
+            return stepper.acting
+        return stepper
+
+    def _confirmed(
+        self, error: float, q: States, p: States | None, start: dict[str, Any], saved: dict[str, Any]
+    ) -> Trajectory:
+        """Return the run to t_end whose relative global error is confirmed; runs for comparison have no events.
+
+        ``start``, ``saved``: arguments of all runs, and further ones of the run that is returned.
+        """
+        require(self, "error")
+        t, velocity, parameters = start["t"], start["velocity"], start["parameters"]
+        by_pieces = self._ending_at_kinks()
+        bare = by_pieces or self.with_events(())
+
+        def step_of_tau(tolerance: float) -> float:
+            momenta = self._initial_momenta(q, p, velocity, t, parameters) if p is None or velocity is not None else p
+            span = checked_number(saved["t_end"], "the time t_end") - t
+            return largest_step(self, q, momenta, span, tolerance, t=t, parameters=parameters, options=start["options"])
+
+        def integrate(check: Callable[[int], None] | None, **steps: Any) -> Trajectory:
+            progress = start["progress"]
+            if check is not None:
+                progress = check if progress is None else lambda count: (start["progress"](count), check(count))
+            if "max_step" in steps and "max_step" in start:
+                steps["max_step"] = min(steps["max_step"], start["max_step"])
+            return self.integrate(q, p, **{**start, "progress": progress, **saved, **steps})
+
+        def confirming(stops: Sequence[float], progress: Callable[[int], None], **steps: Any) -> Trajectory:
+            arguments = {**start, "progress": progress}
+            if self._has_tau:
+                return bare.integrate(q, p, **arguments, **steps, t_end=stops[-1])
+            return bare._recorded_with_stops(q, p, arguments, stops, steps["tolerance"])
+
+        runs = Runs(
+            wanted=error,
+            integrate=integrate,
+            confirming=confirming,
+            start=checked_number(t, "the time t"),
+            end=checked_number(saved["t_end"], "the time t_end"),
+            step_of_tau=step_of_tau if self._has_tau else None,
+            interface=self.interface,
+            smooth=by_pieces is not None or not self.interface.kinks,
+        )
+        trajectory: Trajectory = runs.confirmed_run()
+        assert trajectory.confirmation is not None  # by confirmed_run
+        if not (trajectory.confirmation.confirmed or self._has_tau) and (precise := self._in_double_double) is not None:
+            return precise._confirmed(error, q, p, start, saved)
+        warn_of_unconfirmed_run(trajectory)
+        return trajectory
+
+    def _ending_at_kinks(self) -> Stepper | None:
+        """Return a stepper whose steps end where the equations are not smooth; ``None`` without such places."""
+        interface = self.interface
+        if not interface.kinks or self._has_tau or interface.words > 1:
+            return None
+        name = interface.coordinates[0]
+        if interface.layout.coordinates:
+            array, shape = coordinate_shapes(interface)[0]
+            name = f"{array}[{', '.join('0' * len(shape))}]"
+        with suppress(ScviCodegenError):
+            stepper = self.with_events([Event(kink, then={name: name}) for kink in interface.kinks])
+            _ = stepper.binding
+            return stepper
+        return None
+
+    def _recorded_with_stops(
+        self, q: States, p: States | None, start: dict[str, Any], stops: Sequence[float], tolerance: float | None
+    ) -> Trajectory:
+        """Return a run with adaptive steps that end at each of the times ``stops``, in order, with all states.
+
+        In double its initial state is rounded differently: the next number above or below each one.
+        """
+        arguments = dict(start)
+        inputs, progress = arguments.pop("inputs"), arguments.pop("progress")
+        segments = InputSegments(self, inputs or {}, start["parameters"], start["t"], stops[-1])
+        arguments["parameters"] = segments.first
+        arguments |= {"t_end": stops[-1], "tolerance": tolerance}
+        run = self.start(q, p, **arguments)
+        if self.interface.words == 1:
+            near, momenta = neighbouring(run.q), neighbouring(run.p)
+            run._begin(*self._consistent_state(near, momenta, None, run.t, run._parameters), run.t)
+        return segments.record_with_stops(run, stops, progress)
+
+    @property
+    def _in_double_double(self) -> Stepper | None:
+        """The stepper in double-double of one with precision="auto"; ``None`` if there is none with its events."""
+        precise = None if self._precise is None or self.changes_states else self._precise()
+        return precise and precise.with_events(self.events)
+
+    @property
+    def _has_tau(self) -> bool:
+        """Return whether steps are steps of tau, by a transformed system or the reversible controller."""
+        return bool(self.in_tau or self.interface.time_transformation)
+
+    @checks_arguments(StateError)
+    def start(
+        self,
+        q: States,
+        p: States | None = None,
+        *,
+        velocity: States | None = None,
+        h: float | None = None,
+        t: float = 0.0,
+        t_end: float | None = None,
+        tolerance: float | None = None,
+        absolute_tolerance: float | Mapping[str, float] | None = None,
+        max_step: float | None = None,
+        first_step: float | None = None,
+        parameters: Parameters = None,
+        options: SolverOptions | None = None,
+        tables: Mapping[str, ArrayLike] | None = None,
+        threads: int | None = None,
+    ) -> Run:
+        """Return a run from (q, p), or q and a velocity, at t, with fixed steps h or adaptive steps to t_end.
+
+        The other arguments are those of :meth:`integrate`.
+        """
+        self._check_not_of_run(tables, threads)
+        q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
+        return self._started(
+            q,
+            p,
+            velocity,
+            self._plan(h, t_end, ErrorControl(tolerance, absolute_tolerance, max_step, first_step)),
+            t,
+            parameters,
+            options,
+        )
+
+    def _started(
+        self,
+        q: States,
+        p: States | None,
+        velocity: States | None,
+        plan: StepPlan,
+        t: float,
+        parameters: Parameters,
+        options: SolverOptions | None,
+    ) -> Run:
+        q, p = self._consistent_state(q, p, velocity, t, parameters)
+        return Run.started(self, q, p, plan=plan, t=t, parameters=parameters, options=options)
+
+    def _consistent_state(
+        self, q: States, p: States | None, velocity: States | None, t: float, parameters: Parameters
+    ) -> tuple[States, States]:
+        """Return (q, p), or q and the momenta of a velocity, on the constraints."""
+        if p is None or velocity is not None:
+            p = self._initial_momenta(q, p, velocity, t, parameters)
+        return consistent(self, q, p, t, parameters) if self.interface.constraints else (q, p)
+
+    def _run(self, q: Array, p: Array, **arguments: Any) -> Run:
+        return Run.started(self, q, p, **arguments)
+
+    def _plan(self, h: float | None, t_end: float | None, control: ErrorControl) -> StepPlan:
+        return checked_plan(h, t_end, control, self.interface.time_transformation, self.in_tau)
+
+    def _output_times(self, t_eval: ArrayLike, t: float, plan: StepPlan, steps: int | None) -> Array:
+        if self.interface.words > 1:
+            check_doubles(t_eval=t_eval)
+        if steps is None:
+            return times_of_run(t_eval, t, cast(Until, plan).t_end)
+        if self.in_tau:
+            raise StateError("t_eval requires t_end instead of steps in transformed time")
+        end = times_after(t, cast(Fixed, plan).h, checked_count(steps, "steps", least=0))[0]
+        return times_of_run(t_eval, t, float(end))
+
+    def from_checkpoint(
+        self,
+        saved: bytes,
+        *,
+        t_end: float | None = None,
+        tolerance: float | None = None,
+        absolute_tolerance: float | Mapping[str, float] | None = None,
+        max_step: float | None = None,
+        h: float | None = None,
+        parameters: Parameters = None,
+        options: SolverOptions | None = None,
+        threads: int | None = None,
+    ) -> Run:
+        """Restore a run saved by :meth:`Run.checkpoint`; it continues bitwise equally if ``t_end`` is passed again.
+
+        ``h`` is required with a time transformation and not allowed otherwise. A checkpoint contains the parameters,
+        which ``parameters`` changes, the tolerances and the largest size of adaptive steps, which are changed likewise,
+        and the tables of arrays of run-time sizes; ``threads`` is the number of threads per step.
+
+        Raises:
+            StateError: if the bytes are damaged (their checksum differs) or belong to another integrator.
+        """
+        transformed = bool(self.interface.time_transformation)
+        if h is not None and not transformed:
+            raise StateError("omit h: the saved run contains its step size")
+        control = ErrorControl(tolerance, absolute_tolerance, max_step)
+        plan = self._plan(h, t_end, control) if t_end is not None or transformed else None
+        if self._reason:
+            raise StateError(f"restore this run by with_sizes(...).from_checkpoint(saved): {self._reason}")
+        if not self.interface.layout.coordinates:
+            self._check_not_of_run(None, threads)
+        stepper: Any
+        stepper, state, known, own = read_checkpoint(
+            saved, self.origin or self, threads=threads, adaptive=t_end is not None
+        )
+        if isinstance(plan, Adaptive):
+            plan = ErrorControl(**own._asdict() | control.named).to(plan.t_end)
+        if parameters is None or isinstance(parameters, Mapping):
+            parameters = known | dict(parameters or {})
+        return Run.restored(stepper, state, parameters=parameters, options=options, plan=plan)
+
+    @checks_arguments(StateError)
+    def integrate_ensemble(
+        self,
+        q: States,
+        p: States | None = None,
+        *,
+        inputs: Mapping[str, Any] | None = None,
+        velocity: States | None = None,
+        h: float | None = None,
+        steps: int | None = None,
+        t_end: ArrayLike | None = None,
+        tolerance: float | None = None,
+        absolute_tolerance: float | Mapping[str, float] | None = None,
+        max_step: float | None = None,
+        first_step: float | None = None,
+        save_every: int = 1,
+        t: float = 0.0,
+        t_eval: ArrayLike | None = None,
+        parameters: EnsembleParameters = None,
+        options: SolverOptions | None = None,
+        progress: Callable[[int], None] | None = None,
+        threads: int | None = None,
+        error: float | None = None,
+        device: str | None = None,
+        action: bool = False,
+        observe: str | None = None,
+    ) -> EnsembleTrajectory:
+        """Run k trajectories on all cores, with common fixed steps (SIMD lanes) or with adaptive steps for each.
+
+        Args:
+            q, p: (k, m) initial positions and momenta.
+            inputs: of a system with inputs, as of :meth:`integrate`, common to all trajectories, or values of shape
+                (k, n), one row per trajectory; k constants. Fixed steps are common, end at all breakpoints and lead to
+                one t_end.
+            velocity: (k, m) initial velocities, instead of p; of arrays of run-time sizes by default 0.
+            h, steps, save_every, t, options, progress: as in :meth:`integrate`.
+            t_end: final time; with h the last step is shorter unless h divides the time. Without h and steps: final
+                time, or (k,) final times, of adaptive steps; every ``save_every``-th state and the last state of each
+                trajectory are saved, with their times in ``times``, and ``progress`` is called with the number of
+                completed trajectories.
+            tolerance, absolute_tolerance, max_step, first_step: of adaptive steps, as in :meth:`integrate`.
+            t_eval: (n,) times at which states are saved instead; NaN after the end of a trajectory.
+            parameters: values by name, one number or k each; or an array (k, number of parameters).
+            threads: number of threads, by default one per core.
+            error: as of :meth:`integrate`, a bound of the relative global error of each trajectory, with a local
+                tolerance of its own: ``global_error``, ``confirmed_digits`` and ``confirmed_until`` of the result.
+            device: ``"cuda"`` for an NVIDIA GPU, one thread a trajectory (extra ``cuda``; experimental: not yet run on
+                a device). Arrays may then be in its memory (CuPy, PyTorch, JAX). Trajectories whose steps fail are
+                continued on the processor. With adaptive steps only initial and final states are saved.
+            action: as of :meth:`integrate`.
+            observe: what to record of the states after all fixed steps, saved or not, in ``observed`` of the result:
+                ``"extremes"`` of q and p, of the ``"energy"``, or numbers of ``"events"`` of the stepper
+                (:meth:`with_events`), changes of sign between successive states. Requires SIMD lanes, no inputs.
+
+        Returns:
+            An :class:`EnsembleTrajectory`, with ``device`` a
+            :class:`~scvi_codegen.runs.ensembles.device.DeviceEnsemble`; states equal those of :meth:`integrate` to
+            round-off. A trajectory that fails has NaN after the failure and the reason in ``status``; the others are
+            unaffected.
+
+        Raises:
+            StateError: if a shape, name or number is invalid.
+            BuildError: with ``device`` if there is no GPU, or too little memory on it.
+        """
+        work = self._ensemble(
+            q,
+            p,
+            inputs=inputs,
+            velocity=velocity,
+            h=h,
+            steps=steps,
+            t_end=t_end,
+            tolerance=tolerance,
+            absolute_tolerance=absolute_tolerance,
+            max_step=max_step,
+            first_step=first_step,
+            t_eval=t_eval,
+            save_every=save_every,
+            t=t,
+            parameters=parameters,
+            options=options,
+            error=error,
+            device=device,
+            action=action,
+            observe=observe,
+        )
+        work.run(progress=progress, threads=threads)
+        if device is not None:
+            return cast("EnsembleTrajectory", work.device_result())
+        return checked_ensemble_result(work)
+
+    def _ensemble(
+        self,
+        q: States,
+        p: States | None = None,
+        *,
+        velocity: States | None = None,
+        action: bool = False,
+        **settings: Any,
+    ) -> Ensemble:
+        """Return the ensemble of :meth:`integrate_ensemble`, with the same arguments, before its first step."""
+        q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
+        if settings.get("error") is not None:
+            require(self, "error")
+            steps = {name: settings.get(name) for name in ("h", "steps", "tolerance")}
+            settings["error"] = checked_error(settings["error"], steps, self)
+        return Ensemble(self._for_run(None, action=action), q, p, velocity=velocity, **settings)
+
+    def project(
+        self,
+        q: States,
+        p: States | None = None,
+        *,
+        velocity: States | None = None,
+        t: float = 0.0,
+        parameters: Parameters = None,
+    ) -> tuple[Array, Array]:
+        """Return the nearest state (q, p) on the constraint manifold, in the metric of the mass matrix.
+
+        Without p and velocity the initial velocity is 0.
+
+        Raises:
+            MethodError: if the system has no constraints.
+            StateError: if the iteration fails, or if the constraints are linearly dependent there.
+        """
+        momenta = self._initial_momenta(
+            q, p, np.zeros(self.dimension) if p is velocity is None else velocity, t, parameters
+        )
+        q1, p1, _ = projected(self, q, momenta, t, parameters)
+        return self.named(q1), self.named(p1)
+
+    def multipliers(self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
+        """Return the Lagrange multipliers lambda of the constraint forces G^T lambda at states: (c,), or (n, c).
+
+        They satisfy d/dt L_v = L_q + f + G^T lambda with G = g_q, or g_v for a velocity constraint; for ``x**2 + y**2 =
+        l**2`` the tension of the rod is -2 l lambda. They depend on the state alone and are as accurate as the state.
+        """
+        values = multipliers(self, q, p, t, parameters)
+        return values[0] if is_one_state(self.interface, q) else values
+
+    def constraint_values(
+        self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None
+    ) -> tuple[Array, Array]:
+        """Return the constraint residuals g and their rates g_q v + g_t: (c,) each, or (n, c).
+
+        For a velocity constraint only the rate is defined; its g is 0 if it does not restrict positions.
+        """
+        g, rate = constraint_values(self, q, p, t, parameters)
+        return (g[0], rate[0]) if is_one_state(self.interface, q) else (g, rate)
+
+
+class UnavailableError(MethodError, AttributeError):
+    """Error of an attribute that requires known sizes; ``hasattr`` is false."""
+
+
+def _bound(method: Called, *, at_rest: bool = False) -> Called:
+    """Return a method of steppers of run-time sizes that binds a stepper to its arrays and calls the method of this.
+
+    It has the further argument ``tables``. The first argument is a position; ``at_rest``: without p and velocity the
+    initial velocity is 0.
+    """
+
+    @wraps(method)
+    def call(self: StepperOfRunTimeSizes, q: Any, *arguments: Any, **named: Any) -> Any:
+        return self._call_bound(method, at_rest, q, arguments, **named)
+
+    return cast(Called, call)
+
+
+class StepperOfRunTimeSizes(Stepper):
+    """Stepper of arrays whose sizes each call determines: its methods bind a stepper to the arrays of the call."""
+
+    run_time_sizes = True
+    _last: tuple[Hashable, Stepper | None] = None, None
+    _latest: tuple[Hashable, Stepper] | None = None
+
+    integrate = _bound(Stepper.integrate, at_rest=True)
+    start = _bound(Stepper.start, at_rest=True)
+    project = _bound(Stepper.project, at_rest=True)
+    integrate_ensemble = _bound(Stepper.integrate_ensemble, at_rest=True)
+    _ensemble = _bound(Stepper._ensemble, at_rest=True)
+    chaos_indicators_ensemble = _bound(Stepper.chaos_indicators_ensemble, at_rest=True)
+    multipliers, constraint_values = _bound(Stepper.multipliers), _bound(Stepper.constraint_values)
+    step, step_positions = _bound(Stepper.step), _bound(Stepper.step_positions)
+    discrete_lagrangian = _bound(Stepper.discrete_lagrangian)
+    discrete_legendre_minus = _bound(Stepper.discrete_legendre_minus)
+    discrete_legendre_plus = _bound(Stepper.discrete_legendre_plus)
+    work_and_impulses, rates = _bound(Stepper.work_and_impulses), _bound(Stepper.rates)
+    energy, momentum_maps = _bound(Stepper.energy), _bound(Stepper.momentum_maps)
+    momentum, velocity = _bound(Stepper.momentum), _bound(Stepper.velocity)
+    initial_momentum = _bound(Stepper.initial_momentum)
+    jacobian, sensitivity = _bound(Stepper.jacobian), _bound(Stepper.sensitivity)
+    jvp, vjp = _bound(Stepper.jvp), _bound(Stepper.vjp)
+
+    def _path(self, q0: Any = None, *arguments: Any, **named: Any) -> Any:
+        """Return a path; the positions that determine the sizes are q0, or of closed paths the first of ``start``."""
+        start = named.get("start")
+        if q0 is not None or start is None:
+            return self._call_bound(Stepper.path, False, q0, arguments, **named)
+        if callable(start):
+            first = start(named.get("t", 0.0))
+        else:
+            first = {name: x[0] for name, x in start.items()} if isinstance(start, Mapping) else start[0]
+        return self.bind(first, named.get("parameters"))[0].path(None, *arguments, **named)
+
+    path: Any = wraps(Stepper.path)(_path)
+
+    def _call_bound(
+        self,
+        method: Callable[..., Any],
+        at_rest: bool,
+        q: Any,
+        arguments: tuple[Any, ...],
+        *,
+        parameters: Any = None,
+        tables: Mapping[str, ArrayLike] | None = None,
+        **named: Any,
+    ) -> Any:
+        """Call a method of the stepper that is bound to the arrays of the call."""
+        if method in (Stepper.integrate_ensemble, Stepper._ensemble):
+            for argument, operation in (("device", "device"), ("observe", "observe_ensemble")):
+                if named.get(argument) is not None:
+                    require(self, operation)
+        threads = named.pop("threads", None) if method in PER_STEP else None
+        stepper = self if named.get("events") is None else self.with_events(named.pop("events"))
+        bound, state = stepper.bind(q, parameters, tables, threads)
+        if len(arguments) == 1 and arguments[0] is None:  # p=None by position
+            arguments = ()
+        if at_rest and not arguments and named.get("p") is None and named.get("velocity") is None:
+            layout = self.interface.layout
+            general = layout.momentum_formulas or (self._reason and not layout.momenta)
+            spins = any(each.startswith("spin") for each in bound.interface.rotations)
+            if not (spins or bound.interface.variables):  # their state has momenta of its own
+                positions, *_ = homogeneous_state(bound.interface, state, None, None)
+                named["velocity" if general else "p"] = np.zeros(np.shape(positions))
+        return method(bound, state, *arguments, parameters=parameters, **named)
+
+    def bind(
+        self, q: Any, parameters: Any = None, tables: Mapping[str, ArrayLike] | None = None, threads: int | None = None
+    ) -> tuple[Any, Any]:
+        """See :meth:`CompiledMethod.bind`."""
+        shapes, (last, bound) = None if tables is not None else shapes_of_call(q, parameters, threads), self._last
+        if shapes is None or shapes != last or bound is None:
+            problem = sizes_of_run(self.interface, q, parameters, tables, threads)
+            if self._reason and problem.threads > 1:
+                raise MethodError(f"omit threads: this system is compiled with the sizes of each call. {self._reason}")
+            bound = self.with_sizes(problem.sizes, tables=problem.places) if self._reason else self._bound_to(problem)
+            self._last = shapes, bound
+        if self.events:
+            bound = bound.with_events(self.events)
+        if (type(q) is np.ndarray and q.ndim == 1) or bound.interface.rotations or bound.interface.variables:
+            return bound, q
+        return bound, flat_state(bound.interface, q, "q")
+
+    def _bound_to(self, problem: RunSizes) -> Stepper:
+        """Return the stepper bound to these sizes and tables; the latest one is kept for later calls."""
+        if self._latest is None or self._latest[0] != problem.key:
+
+            def make(name: str) -> Source | None:
+                known = bound.known if name.startswith(OF_KNOWN_SIZES) else self
+                return known._variants[name]
+
+            interface = interface_of_sizes(self.interface, problem.sizes)
+            further: dict[str, Any] = {"variants": Variants(make=make), "flags": self.flags}
+            bound = Stepper(self._plain, interface, origin=self, problem=problem, **further)
+            self._latest = problem.key, bound
+        return self._latest[1]
+
+    def _load(self) -> None:
+        """Load nothing: bound steppers load the library."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name in ("binding", "dimension"):
+            raise self._unavailable(name)
+        raise AttributeError(f"'{type(self).__name__}' has no attribute '{name}'")
+
+    def _unavailable(self, name: str) -> UnavailableError:
+        return UnavailableError(f"{name} is not available for {self!r}: {SIZES_REQUIRED}")
+
+    @property
+    def dimension(self) -> int:
+        """Unavailable: it depends on the sizes."""
+        raise self._unavailable("dimension")
+
+    @property
+    def known(self) -> Self:
+        """Unavailable: a stepper of these sizes is required."""
+        raise MethodError(f"{self!r} requires sizes here: pass stepper.with_sizes(..). {SIZES_REQUIRED}")
+
+    def _compile(self) -> None:
+        if not self._reason:
+            building.load(with_calls(self.source), flags=self.flags)
+
+    @property
+    def _has_error_estimate(self) -> bool:
+        """True if the method has adaptive steps; also if that follows from the sizes."""
+        return bool(self._reason) or "_advance_to(" in self.source.header
+
+
+Stepper._of_run_time_sizes = StepperOfRunTimeSizes
+
+
+def _check(
+    run: Run, trajectory: Trajectory, check_growth: bool | None, segments: InputSegments | None, *, fixed: bool
+) -> None:
+    """Issue the accuracy warnings of a finished run, with ``segments`` of inputs."""
+    try:
+        if segments is None:
+            warn_of_inaccuracy(trajectory, run)
+        if not fixed:
+            repeat = None if segments is None else partial(segments.advance, run)
+            warn_of_error_growth(run, trajectory, check_growth, repeat)
+    except Exception as error:  # noqa: BLE001  (the run is complete)
+        warn_of_failed_check(error)
+
+
+def checked_ensemble_result(work: Ensemble) -> EnsembleTrajectory:
+    """Return the trajectories of an ensemble that was integrated; issue warnings of inaccurate ones."""
+    trajectories = work.result()
+    work.warn_of_too_many_states(trajectories)
+    try:
+        warn_of_unconfirmed(trajectories.confirmations)
+        warn_of_energy_errors(trajectories, None if work.successive is None else work.successive.energies)
+        warn_of_unresolved_members(trajectories)
+    except Exception as error:  # noqa: BLE001  (the runs are complete)
+        warn_of_failed_check(error)
+    return trajectories
+
+
+PER_STEP = (Stepper.integrate, Stepper.start)
+"""Methods whose ``threads`` are those of each step."""
+
+
+def _rebuild_bound(origin: StepperOfRunTimeSizes, problem: RunSizes, events: tuple[Event, ...]) -> Stepper:
+    return origin._bound_to(problem)._copy(events)
+
+
+STEPPER = of("a compiled stepper", Stepper)
+"""Type check of steppers."""

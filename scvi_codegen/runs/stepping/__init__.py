@@ -1,0 +1,1 @@
+"""One step: compiled methods, their memory and derivatives, projections, plans of steps."""

@@ -1,0 +1,415 @@
+"""Compiled method: generated C source, its loaded libraries and its interface."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+from typing import Any, Self, cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from scvi_codegen.codegen.native import building
+from scvi_codegen.codegen.native.binding import Binding
+from scvi_codegen.codegen.native.calls import with_calls
+from scvi_codegen.codegen.rendering.source import Interface, Source
+from scvi_codegen.common.display.cards import card, listed, plain
+from scvi_codegen.common.errors import MethodError, ScviCodegenError
+from scvi_codegen.common.representation import LONGEST, clipped
+from scvi_codegen.runs.states.validation import Array, shapes_of
+from scvi_codegen.runs.states.words import named
+from scvi_codegen.runs.stepping.array_binding import ArrayBinding, EventBinding
+from scvi_codegen.runs.stepping.array_interface import RunSizes, check_few_coordinates
+from scvi_codegen.runs.stepping.features import Support, check_features, require
+from scvi_codegen.systems.event import Event, EventLike, as_events
+
+MOST_EVENT_SETS = 16
+"""Number of event sets whose compiled integrators are cached, so that repeated calls do not parse formulas again."""
+
+
+OF_KNOWN_SIZES = ("derivatives", "second_derivatives", "changes")
+"""Beginnings of the names of variants that arrays of run-time sizes take from the stepper compiled with their sizes."""
+
+
+class Variants:
+    """C sources of the variants of a method by name, derived on first use.
+
+    The names are ``"ensemble"``, ``"fallback"`` (Newton's iteration), ``"derivatives"`` and ``"second_derivatives"`` of
+    steps, and ``"changes K"`` (ensembles with K tangent vectors).
+
+    Args:
+        sources: sources by name; ``None`` for a variant that the method lacks. Those with events by the tuple of these.
+        make: derives a source that is not among them.
+        lacking: returns whether the name is that of a variant that the method lacks, without deriving it.
+    """
+
+    def __init__(
+        self,
+        sources: Mapping[Any, Source | None] | None = None,
+        make: Callable[[str], Source | None] = lambda _: None,
+        lacking: Callable[[str], bool] = lambda _: True,
+    ) -> None:
+        self._made: dict[Any, Source | None] = dict(sources or {})
+        self._make, self._lacking = make, lacking
+
+    def __getitem__(self, name: str) -> Source | None:
+        if name not in self._made:
+            self._made[name] = self._make(name)
+        return self._made[name]
+
+    def lacks(self, name: str, *, of_sizes: bool = False) -> bool:
+        """Return whether the method lacks a variant, without deriving it; ``of_sizes``: that of other sizes."""
+        return self._made[name] is None if name in self._made and not of_sizes else self._lacking(name)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # second derivatives and tangent-vector variants are slow to derive: included only if already made
+        for name in ("ensemble", "fallback", "derivatives"):
+            _ = self[name]
+        return (Variants, (self._made,))
+
+
+class ChosenBySizes:
+    """Base class whose subclasses become ``_of_run_time_sizes`` for arrays of run-time sizes that are not bound."""
+
+    _of_run_time_sizes: type[Any] | None = None
+
+    def __new__(cls, source: Source | None, interface: Interface, *, problem: RunSizes | None = None, **_: Any) -> Self:
+        """Return an instance of the class for these sizes."""
+        chosen = cls._of_run_time_sizes if interface.layout.coordinates and problem is None else None
+        return cast(Self, object.__new__(chosen or cls))
+
+
+class CompiledMethod(ChosenBySizes):
+    """A method compiled for one system.
+
+    Attributes:
+        title: system and method, in one line.
+        coordinates, parameters: names, in order.
+        defaults: (k,) default parameter values.
+        dimension: degrees of freedom m.
+        momentum_map_names: names of the conserved quantities.
+        source: the C source it was compiled from; ``None`` of arrays that are compiled with the sizes of each call.
+        fallback: source with Newton's iteration, if the main source contains only the fixed-point iteration.
+        events: events that every run records.
+        changes_states: whether one of them changes the states of runs.
+        in_tau: whether the system is one in transformed time, whose steps are steps of tau.
+        run_time_sizes: whether the sizes of its arrays are those of each call; the stepper is bound to them, or
+            compiled with them if an integrator of run-time sizes is impossible.
+        origin, problem: of a bound stepper, the stepper of run-time sizes, and the sizes and tables; else ``None``.
+    """
+
+    run_time_sizes = False
+
+    def __init__(
+        self,
+        source: Source | None,
+        interface: Interface,
+        *,
+        variants: Variants | None = None,
+        flags: tuple[str, ...] = building.TUNED_FLAGS,
+        events: tuple[Event, ...] = (),
+        of_sizes: Callable[..., Any] | None = None,
+        reason: str = "",
+        origin: Self | None = None,
+        problem: RunSizes | None = None,
+    ) -> None:
+        self.interface, self.flags, self.events = interface, flags, events
+        self.in_tau = bool(interface.energy_parameter)
+        self.changes_states = any(event.changes_state for event in events)
+        self.origin, self.problem, self._of_sizes, self._reason = origin, problem, of_sizes, reason
+        self._variants = Variants() if variants is None else variants
+        self._event_variants: dict[tuple[Event, ...], Self] = {}
+        self._released_runs: list[Any] = []
+        self._known: dict[Hashable, Self] = {}
+        self._with_action: Self | None = None
+        self.sums_action = False  # whether runs sum the action of their steps
+        self._entries: dict[Event, tuple[Event, ...]] = {}
+        self._plain = cast(Source, source)
+        self.shapes = shapes_of(interface)
+        self.source = self._plain
+        self._load()
+
+    def _load(self) -> None:
+        interface, events = self.interface if self.origin is None else self.origin.interface, self.events
+        if interface.words > 1:
+            events = ()  # located by the integrator in double
+        if events and (known := self._variants._made.get(events)) is not None:
+            self.source = known
+        elif events:
+            from scvi_codegen.codegen.rendering.events import with_events  # here, because it imports SymPy
+
+            self.source = with_events(self._plain, interface, events)
+        library = building.load(with_calls(self.source), flags=self.flags)
+        if self.problem is not None:
+            arrays = library, interface, self.problem
+            self.binding: Binding = EventBinding(*arrays, events) if events else ArrayBinding(*arrays)
+        else:
+            self.binding = Binding(library, interface.prefix, interface.workspace, fallback=self._load_fallback)
+
+    @property
+    def acting(self) -> Self:
+        """The stepper whose runs sum the action of their steps; itself if they are computed again for it."""
+        stepper = self.known
+        if stepper._with_action is None:
+            source = stepper._variants["acting"]
+            found = stepper._with_action = stepper._copy(stepper.events, source) if source else stepper
+            found._with_action, found.sums_action = found, source is not None
+        return stepper._with_action
+
+    def _copy(self, events: tuple[Event, ...], source: Source | None = None) -> Self:
+        workspace = source.workspace if source else None
+        return type(self)(
+            source or self._plain,
+            replace(self.interface, workspace=workspace) if workspace else self.interface,
+            variants=self._variants,
+            flags=self.flags,
+            events=events,
+            of_sizes=self._of_sizes,
+            reason=self._reason,
+            origin=self.origin,
+            problem=self.problem,
+        )
+
+    def bind(
+        self, q: Any, parameters: Any = None, tables: Mapping[str, ArrayLike] | None = None, threads: int | None = None
+    ) -> tuple[Self, Any]:
+        """Return the stepper bound to the sizes and tables of these arrays, and their states as vectors.
+
+        A stepper of known sizes is returned itself, with q as it is; it has no tables and threads per step.
+
+        Raises:
+            StateError: if a name, shape or number is invalid, or an index would leave its array.
+        """
+        self._check_not_of_run(tables, threads)
+        return self, q
+
+    def _check_not_of_run(self, tables: object, threads: object) -> None:
+        """Raise :class:`MethodError` for arguments of arrays of run-time sizes."""
+        for name, value in (("tables", tables), ("threads", threads)):
+            if value is not None:
+                require(self, name)
+
+    @property
+    def known(self) -> Self:
+        """Stepper compiled with known sizes; raises as :meth:`with_sizes`, and for a stepper of run-time sizes."""
+        if self.problem is None or self.origin is None:
+            return self
+        return self.origin.with_sizes(self.problem.sizes, tables=self.problem.places)
+
+    @property
+    def _known_with_events(self) -> Self:
+        return self.known.with_events(self.events)
+
+    def _events_of_entries(self, event: Event) -> tuple[Event, ...]:
+        """Return the events of :attr:`known` that an event in index notation defines, one for each element."""
+        if event not in self._entries:
+            from scvi_codegen.codegen.rendering.events import EventFormulas  # here, because it imports SymPy
+
+            self._entries[event] = cast("tuple[Event, ...]", tuple(EventFormulas(self.known.interface, [event]).events))
+        return self._entries[event]
+
+    def with_sizes(
+        self, sizes: Mapping[str, int] | None = None, /, *, tables: Mapping[str, ArrayLike] | None = None, **named: int
+    ) -> Self:
+        """Return the stepper of arrays of run-time sizes compiled with these sizes, ``with_sizes(N=9)``, once.
+
+        It has every feature.
+
+        Raises:
+            MethodError: if a size is missing, there are more than 2000 coordinates, or the stepper was unpickled or
+                loaded from a folder and hence lacks its system.
+        """
+        values = {**(sizes or {}), **named}
+        if not self.run_time_sizes:
+            require(self, "with_sizes")
+        check_few_coordinates(self.interface, values, self._reason)
+        if self._of_sizes is None:
+            raise MethodError(f"{self!r} lacks its system: call compile_stepper(system, method, sizes={values})")
+        key = (tuple(sorted(values.items())), *((name, np.asarray(x).tobytes()) for name, x in (tables or {}).items()))
+        if key not in self._known:
+            require(self, "with_sizes")
+            self._known[key] = self._of_sizes(sizes=values, tables=dict(tables) if tables else None)
+        return self._known[key]
+
+    def named(self, values: Array) -> Array:
+        """Return (.., m) numbers of states that arrays of coordinates index by name; without arrays unchanged."""
+        return values if self.shapes is None else named(values, self.shapes)
+
+    def __repr__(self) -> str:
+        return f"<Stepper {clipped(self.title, LONGEST - 20)}>"
+
+    def _repr_html_(self) -> str:
+        interface = self.interface
+        parameters = zip(interface.parameters, interface.defaults, strict=True)
+        return card(
+            interface.title,
+            (
+                ("method", plain(", ".join(interface.notes))),
+                ("coordinates", listed(interface.coordinates)),
+                ("parameters", listed([f"{name} = {value:g}" for name, value in parameters])),
+                ("C", plain(f"{interface.prefix}.c, {len(self.source.code.splitlines())} lines")),
+            ),
+        )
+
+    @property
+    def ensemble(self) -> Source | None:
+        """C source of the ensemble variant, derived on first use; ``None`` if the method has none."""
+        return self._variants["ensemble"]
+
+    @property
+    def fallback(self) -> Source | None:
+        """C source of the fallback library with Newton's iteration, derived on first use; ``None`` if not needed."""
+        return self._variants["fallback"]
+
+    @property
+    def derivatives(self) -> Source | None:
+        """C source with the derivatives of steps, derived on first use."""
+        return self._variants["derivatives"]
+
+    @property
+    def second_derivatives(self) -> Source | None:
+        """C source with second derivatives of steps, derived on first use; ``None`` if unavailable."""
+        return self._variants["second_derivatives"]
+
+    def prepare(
+        self,
+        *,
+        tangent: bool = False,
+        second: bool = False,
+        ensemble: bool = False,
+        events: EventLike | Sequence[EventLike] | None = None,
+    ) -> None:
+        """Compile the variants that later calls would compile on first use, so that a run never waits for the compiler.
+
+        The Newton fallback of a fixed-point iteration is always compiled. Variants that the method lacks are skipped.
+
+        Args:
+            tangent: derivatives of steps, for ``jacobian``, ``tangent``, ``sensitivity``, ``pullback`` and the like.
+            second: second derivatives, for ``hessian_product``.
+            ensemble: the variant for many trajectories at once.
+            events: the formulas that later calls pass as ``events=``, all those of one call together.
+        """
+        for each in (self,) if events is None else (self, self.with_events(events)):
+            each._compile()
+        wanted = {"derivatives": tangent, "second_derivatives": second, "ensemble": ensemble}
+        for source in [self._variants[name] for name, is_wanted in wanted.items() if is_wanted]:
+            if source is not None:
+                building.load(source, flags=self.flags)
+
+    def _compile(self) -> None:
+        self.binding.set_fallback()
+
+    @cached_property
+    def tangent(self) -> Binding:
+        """Library with derivatives of steps, compiled on first use."""
+        return self._linearised("derivatives", "jacobian")
+
+    @cached_property
+    def _ensemble_binding(self) -> Binding | None:
+        """Library of trajectories in SIMD lanes, compiled on first use; ``None`` if the method has none."""
+        source = (self._variants["acting ensemble"] if self.sums_action else None) or self.ensemble
+        return None if source is None else Binding(building.load(source, flags=self.flags), source.prefix)
+
+    @cached_property
+    def _second_derivatives(self) -> Binding:
+        """Library with second derivatives of steps, compiled on first use; raises ``MethodError`` if unavailable."""
+        return self._linearised("second_derivatives", "hessian")
+
+    def _linearised(self, variant: str, operation: str) -> Binding:
+        require(self, operation)
+        source = cast(Source, self._variants[variant])
+        binding = Binding(building.load(source, flags=self.flags), source.prefix)
+        return binding.with_workspace(binding.constant("LINEARISED_WORKSPACE"))
+
+    def _load_fallback(self) -> building.Library:
+        source = self.fallback
+        if source is None:
+            raise MethodError(
+                f"the fallback source with Newton's iteration is missing for '{self.title}': recompile it"
+            )
+        return building.load(source, flags=self.flags)
+
+    @property
+    def title(self) -> str:
+        """System and method, in one line."""
+        return self.interface.title
+
+    @property
+    def coordinates(self) -> tuple[str, ...]:
+        """Coordinate names."""
+        return self.interface.coordinates
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Parameter names."""
+        return self.interface.parameters
+
+    @property
+    def defaults(self) -> Array:
+        """(k,) default parameter values."""
+        return np.array(self.interface.defaults, dtype=float)
+
+    @property
+    def constraints(self) -> tuple[str, ...]:
+        """Formulas g of the constraints g(q, t) = 0, in the order of multipliers."""
+        return self.interface.constraints
+
+    @property
+    def impulse_names(self) -> tuple[str, ...]:
+        """Names of the momentum maps of L alone that forces change, in the order of :meth:`Trajectory.impulses`."""
+        return self.known.interface.exchange_names[1:]
+
+    @property
+    def momentum_map_names(self) -> tuple[str, ...]:
+        """Names of the conserved quantities of the system: ``"angular momentum"``, ``"boost of x"``."""
+        return self.interface.map_names or tuple(each.name for each in self.interface.layout.maps)
+
+    @property
+    def dimension(self) -> int:
+        """Degrees of freedom m."""
+        return self.interface.dimension
+
+    def supports(self, feature: str, *together: str) -> Support:
+        """Return whether an operation is available for this system and method, without an attempt.
+
+        The result is true or false; its ``reason`` is the message of the error that the operation raises, with the
+        remedy, empty if the operation is available. :ref:`features` lists the names. For arrays of run-time sizes,
+        ``with_sizes(..)`` also answers what follows from the sizes, such as ``"work"``.
+
+        Args:
+            feature: name of the operation: ``"adaptive"``, ``"hessian"``, ``"fit"``.
+            together: names of further arguments of the same run: ``supports("t_eval", "inputs")``.
+
+        Raises:
+            StateError: if a name is unknown.
+        """
+        check_features(feature, *together)
+        try:
+            require(self, feature, *together)
+        except ScviCodegenError as error:
+            return Support(str(error))
+        return Support()
+
+    def with_events(self, events: EventLike | Sequence[EventLike]) -> Self:
+        """Return the integrator with these events in place of its own."""
+        wanted = as_events(events)
+        if wanted == self.events:
+            return self
+        if wanted not in self._event_variants:
+            while len(self._event_variants) >= MOST_EVENT_SETS:
+                self._event_variants.pop(next(iter(self._event_variants)), None)
+            self._event_variants[wanted] = self._copy(wanted)
+        return self._event_variants[wanted]
+
+    def _lacks(self, variant: str) -> bool:
+        """Return whether the method lacks a variant; arrays of run-time sizes take it from their system."""
+        source = self.origin or self
+        if source.run_time_sizes:
+            return source._of_sizes is None or source._variants.lacks(variant, of_sizes=True)
+        return self._variants.lacks(variant)
+
+    @property
+    def _has_error_estimate(self) -> bool:
+        """True if the method has adaptive steps for this system; also if that follows from sizes at run time."""
+        return self.binding.has("advance_to")

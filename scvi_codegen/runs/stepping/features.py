@@ -1,0 +1,256 @@
+"""Table of what goes with what: the operations of a stepper, the properties that exclude them, reasons and remedies."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from scvi_codegen.common.errors import MethodError, ScviCodegenError, StateError, closest
+from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED
+
+OPERATIONS = {
+    "adaptive": "adaptive step size (t_end without h)",
+    "error": "error=",
+    "check_growth": "check_growth=True",
+    "t_eval": "t_eval",
+    "observe": "observe",
+    "events": "events=",
+    "inputs": "inputs=",
+    "threads": "threads=",
+    "tables": "tables=",
+    "with_sizes": "with_sizes",
+    "ensembles": "integrate_ensemble",
+    "ensemble_events": "integrate_ensemble of a stepper with events",
+    "device": "device=",
+    "observe_ensemble": "integrate_ensemble(observe=)",
+    "checkpoint": "checkpoint",
+    "recording": "record_run",
+    "dense_output": "dense output",
+    "project": "project",
+    "multipliers": "multipliers",
+    "work": "work_and_impulses",
+    "discrete_lagrangian": "discrete_lagrangian",
+    "action": "action",
+    "shadow_energy": "shadow_energy",
+    "path": "path",
+    "momentum_maps": "momentum_maps",
+    "unresolved": "unresolved",
+    "jacobian": "jacobian",
+    "tangent": "tangent",
+    "pullback": "pullback",
+    "sensitivity": "sensitivity",
+    "hessian": "hessian_product",
+    "chaos": "chaos_indicators",
+    "chaos_ensemble": "chaos_indicators_ensemble",
+    "periodic_orbit": "periodic_orbit",
+    "energy": "periodic_orbit(energy=)",
+    "fit": "fit",
+    "flow": "flow of JAX, PyTorch or CasADi",
+    "advice": "--advise",
+}
+"""Names of :meth:`~scvi_codegen.Stepper.supports`, and what messages call them."""
+
+SHORT_STEPS = ("svi-1-", "svi-2-", "stoermer-verlet", "composition")
+"""Beginnings of the names of methods whose steps are short enough for the interpolation of the shadow energy."""
+PROPERTIES: dict[str, Callable[[Any], bool]] = {
+    "with a time transformation": lambda stepper: bool(stepper.interface.time_transformation),
+    "in transformed time": lambda stepper: bool(stepper.interface.energy_parameter),
+    "in transformed time of a first-order system": lambda stepper: bool(
+        stepper.interface.energy_parameter and stepper.interface.variables
+    ),
+    "for a first-order system": lambda stepper: bool(stepper.interface.variables),
+    "with events that change the state": lambda stepper: stepper.changes_states,
+    "with constraints": lambda stepper: bool(stepper.interface.constraints or stepper.interface.layout.constraints),
+    "with constraints of arrays": lambda stepper: bool(stepper.interface.layout.constraints),
+    "with constraints of arrays by a composition": lambda stepper: bool(
+        stepper.interface.layout.constraints and stepper.interface.method.startswith("composition")
+    ),
+    "without constraints": lambda stepper: not (stepper.interface.constraints or stepper.interface.layout.constraints),
+    "with the long steps of this method": lambda stepper: not stepper.interface.method.startswith(SHORT_STEPS),
+    "where the energy changes": lambda stepper: bool(stepper.interface.changes_energy),
+    "without a mesh": lambda stepper: stepper.interface.layout.mesh is None,
+    "with sizes known when compiled": lambda stepper: not stepper.run_time_sizes,
+    "with sizes known at run time": lambda stepper: stepper.run_time_sizes,
+    "with precision='double-double'": lambda stepper: stepper.interface.words > 1,
+    "without trajectories in SIMD lanes": lambda stepper: not stepper.run_time_sizes and stepper.ensemble is None,
+    "without derivatives": lambda stepper: stepper._lacks("derivatives"),
+    "without second derivatives": lambda stepper: stepper._lacks("second_derivatives"),
+    "without an error estimate": lambda stepper: not (stepper._has_error_estimate or stepper._has_tau),
+}
+"""Whether a stepper has a property."""
+
+PROPERTIES_OF_SIZES: dict[str, Callable[[Any], bool]] = {
+    "with constraints that prescribe the motion": lambda stepper: (
+        len(stepper.interface.constraints) == stepper.dimension
+    ),
+    "with forces": lambda stepper: bool(stepper.interface.exchange_names),
+    "without the work of forces": lambda stepper: not stepper.interface.exchange_names,
+    "without an action": lambda stepper: not stepper.interface.has_action,
+    "without a sum of L along steps": lambda stepper: not stepper.interface.sums_action,
+}
+"""Properties of a stepper of known sizes; one of arrays of run-time sizes has none of them."""
+
+_FIRST = "jacobian tangent pullback sensitivity"
+_DERIVATIVES = f"{_FIRST} chaos chaos_ensemble periodic_orbit fit flow"
+_CURVE = "SVI, SCVI or a Gauss method"
+_ACTIONS = "action shadow_energy path"
+_IN_DOUBLE = (
+    "check_growth device observe_ensemble work discrete_lagrangian "
+    f"chaos_ensemble periodic_orbit energy fit flow {_ACTIONS}"
+)
+_ORIGINAL = "compile the original system, with fixed steps h, or with time_transformation=... or t_end=..."
+FEATURES = {
+    (operation, property_): remedy
+    for property_, operations, remedy in (
+        (
+            "with a time transformation",
+            "ensembles device observe_ensemble chaos_ensemble periodic_orbit fit flow",
+            "this requires fixed steps h; compile the stepper without time_transformation",
+        ),
+        ("with precision='double-double'", _IN_DOUBLE, "omit it, or use precision='double'"),
+        ("with a time transformation", "check_growth", "it requires adaptive steps; omit it"),
+        ("in transformed time", "check_growth", "it requires adaptive steps; omit it"),
+        ("with a time transformation", "adaptive", "give h (constant step in tau) and t_end, and no tolerance"),
+        ("with a time transformation", "advice", "use --tolerance (local error)"),
+        ("in transformed time", "advice", "use --tolerance (local error)"),
+        ("in transformed time", "adaptive", "give h (fixed step in tau)"),
+        ("in transformed time", "inputs", "compile the original system"),
+        ("in transformed time", "device observe_ensemble chaos chaos_ensemble periodic_orbit fit flow", _ORIGINAL),
+        ("in transformed time", _ACTIONS, _ORIGINAL),
+        ("in transformed time", "ensemble_events", "integrate each trajectory, or pass stepper.with_events(())"),
+        ("with a time transformation", "shadow_energy path", "compile the stepper without time_transformation"),
+        (
+            "with the long steps of this method",
+            "shadow_energy",
+            "differences of the states are less accurate than the energy; use energy(), or SVI of degree 1 or 2, "
+            "StoermerVerlet or a Composition",
+        ),
+        ("where the energy changes", "shadow_energy", "it is not conserved; use energy()"),
+        ("with constraints", "shadow_energy", "use energy()"),
+        ("for a first-order system", _ACTIONS, "use a system whose velocities determine its momenta"),
+        ("without a sum of L along steps", _ACTIONS, f"it requires {_CURVE}"),
+        ("in transformed time", "hessian", f"use first derivatives, or {_ORIGINAL}"),
+        ("in transformed time of a first-order system", _FIRST, "use the system in physical time"),
+        ("for a first-order system", "hessian", "use first derivatives and differences of them"),
+        (
+            "with events that change the state",
+            "error device observe_ensemble check_growth hessian chaos_ensemble flow advice shadow_energy",
+            "make them terminal and restart",
+        ),
+        (
+            "with constraints",
+            "periodic_orbit fit",
+            "use independent coordinates (rods in a plane: eliminate_constraints)",
+        ),
+        ("with constraints of arrays", "threads", "omit threads; the step uses one"),
+        (
+            "with constraints of arrays by a composition",
+            f"{_FIRST} chaos chaos_ensemble hessian work discrete_lagrangian with_sizes recording",
+            "it compiles known sizes, whose constraints require an SVI; use SVI(1, 'gauss-lobatto:2'), which is RATTLE",
+        ),
+        (
+            "with constraints that prescribe the motion",
+            "chaos chaos_ensemble",
+            "leave out a constraint, or use jacobian",
+        ),
+        ("without constraints", "project multipliers", "the system has none"),
+        ("with forces", "energy", "they change the energy; omit energy"),
+        (
+            "without the work of forces",
+            "work",
+            f"it requires forces, and {_CURVE}, or Newton's StoermerVerlet; that of driven constraints follows from "
+            "run.multipliers()",
+        ),
+        ("without an action", "discrete_lagrangian", f"it requires {_CURVE}, no forces, and a second-order system"),
+        (
+            "without an error estimate",
+            "adaptive error check_growth",
+            "it requires forces at two or more stages, or velocities that vary along a step; give h and steps (fixed "
+            "step size)",
+        ),
+        (
+            "with sizes known at run time",
+            "flow device observe_ensemble",
+            f"pass stepper.with_sizes(..); {SIZES_REQUIRED}",
+        ),
+        (
+            "without trajectories in SIMD lanes",
+            "device observe_ensemble",
+            "it requires explicit steps or a fixed-point iteration, as of SVI and Gauss methods without constraints; "
+            "omit it",
+        ),
+        ("without derivatives", f"{_DERIVATIVES} {_ACTIONS}", "it was loaded without their source; compile the system"),
+        (
+            "without second derivatives",
+            "hessian",
+            "systems with damping have first derivatives only, and a pickled stepper has second derivatives only if "
+            "stepper.second_derivatives was used before pickling",
+        ),
+        ("without a mesh", "unresolved", "it requires a mesh; discretise the system from a density"),
+        ("with sizes known when compiled", "tables with_sizes", "omit it"),
+        (
+            "with sizes known when compiled",
+            "threads",
+            "threads share the steps of arrays whose sizes are known at run time only; omit threads, compile without "
+            "sizes, or compile roll_sums(system).system, whose runs take its tables and parameters",
+        ),
+        ("with save_every", "t_eval", "give either t_eval or save_every, not both"),
+        ("with inputs", "t_eval", "omit t_eval"),
+        ("with inputs", "observe", "omit observe"),
+        ("with inputs", "sensitivity chaos", "use tangent or pullback, or run.pieces"),
+        ("with t_eval", "device", "give h, steps and save_every"),
+        ("with error", "device", "give h and steps (fixed step size)"),
+        ("with events", "device observe_ensemble", "count them by observe='events', or pass stepper.with_events(())"),
+        ("with t_eval", "observe", "omit observe"),
+        ("with observe", "error dense_output", "omit observe"),
+    )
+    for operation in operations.split()
+}
+"""Remedies of the operations that a property of the stepper, or another argument of the run, excludes."""
+
+
+_EXCLUDING = {each: [property_ for operation, property_ in FEATURES if operation == each] for each, _ in FEATURES}
+
+
+@dataclass(frozen=True, slots=True)
+class Support:
+    """Answer of :meth:`~scvi_codegen.Stepper.supports`: true if the operation is available, else with the reason."""
+
+    reason: str = ""
+
+    def __bool__(self) -> bool:
+        return not self.reason
+
+
+def check_features(*names: str) -> None:
+    """Raise :class:`StateError` for a name that is not of the table."""
+    for name in names:
+        if name not in OPERATIONS:
+            raise StateError(f"unknown feature '{name}'{closest(name, OPERATIONS)} Known: {', '.join(OPERATIONS)}")
+
+
+def refusal(operation: str, property_: str, title: str = "") -> ScviCodegenError:
+    """Return the error of an operation that a property excludes, ``StateError`` for other arguments of the run."""
+    of_stepper = property_ in PROPERTIES or property_ in PROPERTIES_OF_SIZES
+    reason = f"{OPERATIONS[operation]} is not available {property_}{title and f' ({title})'}"
+    return (MethodError if of_stepper else StateError)(f"{reason}: {FEATURES[operation, property_]}")
+
+
+def check_together(**arguments: Any) -> None:
+    """Raise the refusal of an argument of a run that another one excludes; ``None``: not passed."""
+    passed = [name for name, value in arguments.items() if value is not None]
+    if len(passed) < 2:
+        return
+    for operation, property_ in FEATURES:
+        if operation in passed and property_.removeprefix("with ") in passed:
+            raise refusal(operation, property_)
+
+
+def require(stepper: Any, operation: str, *together: str) -> None:
+    """Raise the refusal of an operation of a stepper, or of one together with others, if the table has one."""
+    for property_ in _EXCLUDING.get(operation, ()):
+        if property_ in PROPERTIES_OF_SIZES:
+            applies = not stepper.run_time_sizes and PROPERTIES_OF_SIZES[property_](stepper.known)
+        else:
+            applies = PROPERTIES[property_](stepper) if property_ in PROPERTIES else property_[5:] in together
+        if applies:
+            raise refusal(operation, property_, stepper.title)

@@ -1,0 +1,304 @@
+"""States on the constraints g(q, t) = 0 of a system: residuals, projection, multipliers, initial consistency.
+
+Linearly dependent and contradictory constraints are found from the rank of the constraint Jacobian G at a state. G is
+computed from the rates G v + g_t, which are linear in v, at unit velocities. A constraint implied by others only on the
+constraint manifold (``(u - 1)**2 + y**2 = 1`` by ``x**2 + y**2 = 1`` and ``u = x + 1``) reduces the rank there but not
+at generic points.
+"""
+
+import re
+from collections.abc import Callable, Sequence
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from scvi_codegen.codegen.native.options import REASONS, STATUS
+from scvi_codegen.codegen.rendering.text import INPUT_PRECISION, LARGEST_VIOLATION, ROUNDING_UNITS
+from scvi_codegen.common.errors import AccuracyWarning, StateError, warn
+from scvi_codegen.runs.states.pairs import quotient_of
+from scvi_codegen.runs.states.rotations import checked_pair, checked_states
+from scvi_codegen.runs.states.validation import Array, Parameters, States, inputs_not_given, missing_input
+from scvi_codegen.runs.states.words import block_of, checked_time
+from scvi_codegen.runs.stepping.features import require
+from scvi_codegen.runs.stepping.integrator import Integrator
+
+MOST_SHOWN, MOST_DENSE = 4, 64
+"""Largest numbers of positions and constraints in a message, and of those whose rank is checked at run-time sizes."""
+
+
+def constraint_values(stepper: Integrator, q: States, p: States, t: ArrayLike, parameters: Parameters) -> Array:
+    """Return (2, n, c) values of g and of its rate g_q v + g_t at states."""
+    times, positions, momenta = _of_constrained(stepper, q, p, t)
+    values = np.empty((2, len(times), len(stepper.constraints)))
+    _call(stepper, "constraint_values", times, positions, momenta, parameters, *values)
+    return values
+
+
+def multipliers(stepper: Integrator, q: States, p: States, t: ArrayLike, parameters: Parameters) -> Array:
+    """Return (n, c) lambda of d/dt L_v = L_q + f + g_q^T lambda at states, in physical time t."""
+    times, positions, momenta = _of_constrained(stepper, q, p, t)
+    values = np.empty((len(times), len(stepper.constraints) * stepper.interface.words))
+    _call(stepper, "multipliers", times, positions, momenta, parameters, values)
+    values = stepper._numbers(values)
+    if stepper.interface.energy_parameter:
+        values = quotient_of(values, stepper.rates(positions, momenta, parameters)[:, np.newaxis])
+    return values
+
+
+def projected(
+    stepper: Integrator, q: States, p: States, t: float, parameters: Parameters
+) -> tuple[Array, Array, Array]:
+    """Return the nearest state on the constraints, and (2,) its relative distance in q and in p.
+
+    Distances are in the metric of the mass matrix at the projected state, hence independent of coordinate units.
+
+    Raises:
+        StateError: if the iteration fails, or if the constraints are linearly dependent there.
+    """
+    q0, p0 = checked_pair(stepper.interface, q, p)
+    _of_constrained(stepper, q0, p0, t)
+    binding, (q1, p1) = stepper.binding, np.empty((2, len(q0) * stepper.interface.words))
+    before, values = (block_of(q0), block_of(p0)), block_of(stepper._parameters(parameters))
+    at = stepper._time_argument(checked_time(t, stepper.interface.words))
+    status = binding.function("project")(at, *map(binding.pointer, (*before, values, q1, p1)), binding.workspace())
+    if status:
+        if wrong := _dependent(stepper, q0, t, parameters, nearest=True):
+            raise StateError(f"projection onto the constraints failed near q = {_shown(q0)}: {wrong}")
+        _refuse(stepper, status, q0)
+    apart = np.empty(2)
+    status = binding.function("apart")(at, *map(binding.pointer, (*before, q1, p1, values, apart)), binding.workspace())
+    if status:
+        _refuse(stepper, status, q0)
+    return stepper._numbers(q1), stepper._numbers(p1), apart
+
+
+def consistent(
+    stepper: Integrator, q: States, p: States, t: float, parameters: Parameters, *, check_rank: bool = True
+) -> tuple[Array, Array]:
+    """Return an initial state projected onto the constraints; warn unless rounding explains the distance.
+
+    Raises:
+        StateError: if the state is far from the constraints, if these are linearly dependent there
+            (``check_rank``), or if an input that occurs in a constraint is not set.
+    """
+    for name in inputs_not_given(stepper.interface, parameters):
+        if any(re.search(rf"\b{name}\b", formula) for formula in stepper.constraints):
+            raise missing_input(name)
+    q0, p0 = checked_pair(stepper.interface, q, p)
+    q1, p1, apart = projected(stepper, q0, p0, t, parameters)
+    if check_rank and (wrong := _dependent(stepper, q1, t, parameters)):
+        raise StateError(f"{wrong} (q = {_shown(q1)})")
+    moved = float(apart.max())
+    if moved <= ROUNDING_UNITS * np.finfo(float).eps ** stepper.interface.words:
+        return q0, p0
+    if moved <= INPUT_PRECISION:
+        return q1, p1
+    worst = _worst(stepper, q0, p0, t, parameters)
+    message = f"the initial state violates the constraints by {moved:.1e} (relative): {worst}"
+    if moved > LARGEST_VIOLATION:
+        raise StateError(f"{message}. Use stepper.project(q, p) for the nearest consistent state")
+    warn(f"{message}. It was projected onto the constraints", AccuracyWarning)
+    return q1, p1
+
+
+def make_consistent(stepper: Integrator, q: Array, p: Array, t: float, parameters: Array) -> None:
+    """Replace (k, m) states by those of :func:`consistent`, each with its own parameters."""
+    of_two_words = stepper.interface.words > 1  # one by one
+    for k in range(len(q) if of_two_words else 1):
+        q[k], p[k] = consistent(stepper, q[k], p[k], t, parameters[k], check_rank=k == 0)
+    if of_two_words:
+        return
+    q1, p1, apart = np.empty_like(q), np.empty_like(p), np.empty((len(q), 2))
+    stepper.binding.of_each("project", t, parameters, q, p, q1, p1, apart)
+    moved = apart.max(axis=1)
+    by_typing = (moved > ROUNDING_UNITS * np.finfo(float).eps) & (moved <= INPUT_PRECISION)
+    q[by_typing], p[by_typing] = q1[by_typing], p1[by_typing]
+    for k in np.flatnonzero(~(moved <= INPUT_PRECISION)).tolist():
+        q[k], p[k] = consistent(stepper, q[k], p[k], t, parameters[k], check_rank=False)
+
+
+def _worst(stepper: Integrator, q: Array, p: Array, t: float, parameters: Parameters) -> str:
+    """Describe the largest residual of the constraints and of their rates, omitting one that is 0 up to rounding."""
+    values = constraint_values(stepper, q, p, t, parameters)[:, 0]
+    worst = np.abs(values).argmax(axis=1)
+    largest = values[np.arange(2), worst]
+    names = [stepper.constraints[k] for k in worst]
+    from scvi_codegen.systems.formulas.rotations import RotationNames  # imports SymPy
+
+    members = RotationNames.members_of(stepper.interface.rotations)
+    velocities = {f"{x}_dot" for x in stepper.coordinates} | {x.name for member in members for x in member.rates}
+    if velocities.isdisjoint(re.findall(r"\w+", names[1])):  # a velocity constraint is a rate itself
+        names[1] = f"the rate of {names[1]}"
+    descriptions = [
+        f"{name} is {value:.3g}"
+        for name, value in zip(names, largest, strict=True)
+        if abs(value) > ROUNDING_UNITS * np.finfo(float).eps * np.abs(largest).max()
+    ]
+    return f"{' and '.join(descriptions)}, not 0"
+
+
+def check_reachable(stepper: Integrator, q: Array, p: Array, t: float, parameters: Array) -> None:
+    """Raise :class:`StateError` if new parameters move the position constraints away from the state (q, p) of a run.
+
+    Rates may jump: an impulse along the constraint gradients then changes the momenta. Positions cannot jump.
+    """
+    moved = projected(stepper, q, p, t, parameters)[2][0]
+    if moved > INPUT_PRECISION:
+        g = constraint_values(stepper, q, p, t, parameters)[0, 0]
+        k = int(np.abs(g).argmax())
+        raise StateError(
+            f"at t = {t:g} the position constraint {stepper.constraints[k]} jumps to {g[k]:.3g}: inputs and parameters "
+            "in position constraints must be continuous, as 'linear' and 'cubic' inputs are"
+        )
+
+
+def _of_constrained(stepper: Integrator, q: States, p: States, t: ArrayLike) -> tuple[Array, Array, Array]:
+    if not stepper.constraints:
+        require(stepper, "project")
+    return checked_states(stepper.interface, q, p, t)
+
+
+def _call(
+    stepper: Integrator, name: str, times: Array, q: Array, p: Array, parameters: Parameters, *results: Array
+) -> None:
+    times = times if stepper.interface.words == 1 else times[:, None]
+    arguments = *map(block_of, (times, q, p, stepper._parameters(parameters))), *results
+    status = stepper.binding.function(name)(
+        len(times), *map(stepper.binding.pointer, arguments), stepper.binding.workspace()
+    )
+    if status:
+        _refuse(stepper, status, q)
+
+
+def _dependent(stepper: Integrator, q: Array, t: float, parameters: Parameters, *, nearest: bool = False) -> str:
+    """Return the message of :func:`rank_deficiency`; "" for run-time sizes too large for dense linear algebra."""
+    if stepper.interface.layout.coordinates and max(stepper.dimension, len(stepper.constraints)) > MOST_DENSE:
+        return ""
+    massless = _massless(stepper, q, t, parameters)
+    return massless or rank_deficiency(stepper.constraints, q, _linearised(stepper, t, parameters), nearest=nearest)
+
+
+def _massless(stepper: Integrator, q: Array, t: float, parameters: Parameters) -> str:
+    """Return what is wrong with coordinates whose velocities contribute to no momentum, and the remedy, or ""."""
+    unit = np.concatenate([np.zeros((1, stepper.dimension)), np.eye(stepper.dimension)])
+    try:
+        momenta = stepper.momentum(np.tile(q, (len(unit), 1)), unit, t, parameters)
+    except StateError:
+        return ""
+    names = [name for name, p in zip(stepper.coordinates, momenta[1:], strict=True) if (p == momenta[0]).all()]
+    if not names:
+        return ""
+    listed = ", ".join(names[:MOST_SHOWN]) + ", .." * (len(names) > MOST_SHOWN)
+    return (
+        f"{listed} ha{'ve' if len(names) > 1 else 's'} no kinetic energy there, so that momenta do not determine "
+        "velocities. Where the constraints do, compile the system with a mass of 0 as the default, "
+        "system.with_parameters(m=0): then all its values are accepted"
+    )
+
+
+def singular_position(stepper: Integrator, q: Array, t: float, parameters: Array) -> str:
+    """Return a remark on a failed step from positions where the constraints are nearly dependent, or ""."""
+    if not stepper.constraints or max(stepper.dimension, len(stepper.constraints)) > MOST_DENSE:
+        return ""
+    return nearly_dependent(_linearised(stepper, t, parameters)(q)[1])
+
+
+def _linearised(stepper: Integrator, t: float, parameters: Parameters) -> Callable[[Array], tuple[Array, Array]]:
+    """Return a function that evaluates g and G by unit velocities; NaN where velocities have no momenta."""
+    unit = np.concatenate([np.zeros((1, stepper.dimension)), np.eye(stepper.dimension)])
+
+    def at(q: Array) -> tuple[Array, Array]:
+        positions = np.tile(q, (len(unit), 1))
+        try:
+            momenta = stepper.momentum(positions, unit, t, parameters)
+            g, rates = constraint_values(stepper, positions, momenta, t, parameters)
+        except StateError:
+            return np.full(len(stepper.constraints), np.nan), np.full((len(stepper.constraints), len(q)), np.nan)
+        return g[0], (rates[1:] - rates[0]).T
+
+    return at
+
+
+def _shown(q: Array) -> str:
+    return np.array2string(q, threshold=2 * MOST_SHOWN)
+
+
+def _refuse(stepper: Integrator, status: int, q: Array) -> None:
+    hint = "; check for redundant or contradictory constraints" if "singular" in STATUS[status] else ""
+    shown = ", ".join(stepper.constraints[:MOST_SHOWN]) + ", .." * (len(stepper.constraints) > MOST_SHOWN)
+    raise StateError(f"the constraints {shown} cannot be satisfied near q = {_shown(q)}: {REASONS[status]}{hint}")
+
+
+DEPENDENT = 1e-9
+"""Smallest singular value of G, with rows of length 1, below which rows count as linearly dependent."""
+NEARLY_DEPENDENT = 0.15
+"""The same for constraints at a state from which a step fails."""
+NAMED_SHARE = 1e-6
+"""Entries of a null vector above this fraction of 1 mark the constraints that are dependent."""
+CONTRADICTED = 1e-7
+"""Residual at the nearest state, relative to the size of q, above which constraints count as contradictory."""
+ITERATIONS = 30
+
+Jacobian: TypeAlias = Callable[[Array], tuple[Array, Array]]
+"""Values g and Jacobian G of the constraints at positions."""
+
+
+def _unit_rows(jacobian: Array) -> Array:
+    with np.errstate(over="ignore"):
+        sizes = np.linalg.norm(jacobian, axis=1, keepdims=True)
+    return jacobian / np.where(sizes > 0.0, sizes, 1.0)
+
+
+def dependence(jacobian: Array) -> tuple[int, NDArray[np.intp]]:
+    """Return the rank of (c, m) rows, and the (k,) indices of those that depend on each other."""
+    left, values, _ = np.linalg.svd(_unit_rows(jacobian))
+    null = left[:, np.append(values, np.zeros(len(left) - len(values))) <= DEPENDENT]
+    shares = np.abs(null).max(axis=1, initial=0.0)
+    return len(left) - null.shape[1], np.flatnonzero(shares > NAMED_SHARE)
+
+
+def nearly_dependent(jacobian: Array) -> str:
+    """Return a remark with the rank that a nearly singular Jacobian loses, or ""."""
+    values = np.linalg.svd(_unit_rows(jacobian), compute_uv=False) if np.isfinite(jacobian).all() else np.ones(1)
+    if values[-1] > NEARLY_DEPENDENT:
+        return ""
+    return (
+        f". The Jacobian of the constraints is nearly singular there (smallest singular value {values[-1]:.2g} with "
+        f"rows of length 1; rank {np.count_nonzero(values > NEARLY_DEPENDENT)} of {len(values)} where it is 0), as at "
+        "a dead point of a mechanism: fixed steps (h=, steps=) pass it if the motion does; otherwise end the run "
+        "before it, or prescribe the motion of another coordinate"
+    )
+
+
+def rank_deficiency(names: Sequence[str], q: Array, at: Jacobian, *, nearest: bool = False) -> str:
+    """Return what is wrong with constraints of deficient rank, and what to do; "" if they are independent.
+
+    Args:
+        names: formulas of the constraints.
+        q: (m,) positions.
+        at: function that returns g and G at positions.
+        nearest: first minimise the constraint residual by Gauss-Newton iteration.
+    """
+    for _ in range(ITERATIONS if nearest else 0):
+        g, jacobian = at(q)
+        if not (np.isfinite(g).all() and np.isfinite(jacobian).all()):
+            return ""
+        q = q - np.linalg.lstsq(jacobian, g, rcond=DEPENDENT)[0]
+    g, jacobian = at(q)
+    if not (np.isfinite(g).all() and np.isfinite(jacobian).all()):
+        return ""
+    rank, rows = dependence(jacobian)
+    if not len(rows):
+        return ""
+    listed = " and ".join(f"'{names[k]}'" for k in rows) if len(rows) < 5 else f"{len(rows)} of them"
+    rests = ", ".join(f"{g[k]:.3g}" for k in rows[:4])
+    if nearest and np.abs(g).max() > CONTRADICTED * max(float(np.abs(q).max()), 1e-300):
+        return (
+            f"the constraints {listed} contradict each other or cannot be reached: at the nearest positions their "
+            f"values are {rests}, not 0. Change or remove one of them"
+        )
+    return (
+        f"the constraints {listed} are linearly dependent there (rank {rank} of {len(g)}), so their multipliers are "
+        "undetermined. Remove one that follows from the others, or start from a state where they are independent"
+    )

@@ -1,0 +1,121 @@
+"""Checkpoints: a checksum, the sizes, tables and parameters of a run, and the bytes of its memory."""
+
+import hashlib
+import json
+import math
+from typing import Any
+
+import numpy as np
+
+from scvi_codegen.common.errors import ScviCodegenError, StateError
+from scvi_codegen.common.representation import clipped
+from scvi_codegen.common.validation import checked_count
+from scvi_codegen.runs.states.words import block_of, from_block
+from scvi_codegen.runs.stepping.array_interface import RunSizes, check_accesses, read_tables
+from scvi_codegen.runs.stepping.integrator import Integrator
+from scvi_codegen.runs.stepping.step_plan import Adaptive, ErrorControl, FixedSteps
+from scvi_codegen.systems.formulas.indices import MOST_THREADS
+
+MAGIC = b"scvi run 4\n"
+"""First bytes of checkpoints, before the checksum."""
+DIGEST = 32
+
+
+def sealed(body: bytes) -> bytes:
+    """Return bytes behind their checksum, for :func:`unsealed`."""
+    return MAGIC + hashlib.sha256(body).digest() + body
+
+
+def unsealed(saved: bytes) -> bytes:
+    """Return the bytes behind a checksum; raise ``StateError`` if they are damaged."""
+    if not isinstance(saved, bytes):
+        raise StateError(f"a saved run must be bytes, not {type(saved).__name__}")
+    body = saved[len(MAGIC) + DIGEST :]
+    if saved != sealed(body):
+        raise StateError(
+            f"invalid saved run: the checksum of its {len(saved)} bytes differs, so they are damaged or not of "
+            "Run.checkpoint(). Use another copy, or save the run again"
+        )
+    return body
+
+
+def checkpoint(run: Any) -> bytes:
+    """Return the bytes of a run for :func:`read_checkpoint`."""
+    stepper: Integrator = run.stepper
+    sizes, places = ({}, {}) if stepper.problem is None else (stepper.problem.sizes, stepper.problem.places)
+    header = {
+        "integrator": _integrator(stepper),
+        "sizes": sizes,
+        "unset inputs": run._unset_inputs,
+        "adaptive": not isinstance(run.plan, FixedSteps),
+        **({"control": ErrorControl.of(run.plan).named} if isinstance(run.plan, Adaptive) else {}),
+    }
+    arrays: list[Any] = [*places.values(), block_of(run.parameters)]
+    return sealed(b"".join([json.dumps(header).encode(), b"\n", *(array.tobytes() for array in arrays), run.snapshot]))
+
+
+def read_checkpoint(
+    saved: bytes, stepper: Integrator, *, threads: int | None, adaptive: bool
+) -> tuple[Integrator, bytes, dict[str, Any], ErrorControl]:
+    """Return the stepper, bound to the sizes of the run, the state, the parameters by name and the error control.
+
+    Args:
+        saved: bytes of :func:`checkpoint`.
+        stepper: of the system and method of the run; of run-time sizes, of any size.
+        threads: number of threads per step of run-time sizes.
+        adaptive: whether the run continues with adaptive steps.
+
+    Raises:
+        StateError: if the bytes are damaged or belong to another integrator or another kind of steps.
+    """
+    body = unsealed(saved)
+    try:
+        return _read(body, stepper, threads, adaptive=adaptive)
+    except StateError:
+        raise
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, MemoryError, ScviCodegenError) as error:
+        raise StateError(f"invalid saved run: {error!r}") from error
+
+
+def _read(
+    body: bytes, stepper: Integrator, threads: int | None, *, adaptive: bool
+) -> tuple[Integrator, bytes, dict[str, Any], ErrorControl]:
+    text, _, rest = body.partition(b"\n")
+    header, layout = json.loads(text), stepper.interface.layout
+    if header["integrator"] != _integrator(stepper):
+        raise StateError(f"the saved run is one of '{header['integrator']}', not of '{_integrator(stepper)}'")
+    if header["adaptive"] != adaptive:
+        raise StateError(
+            "the saved run has fixed steps: omit t_end" if adaptive else "the saved run has adaptive steps: give t_end"
+        )
+    first = 0
+    if layout.coordinates:
+        sizes = {name: checked_count(header["sizes"][name], name, least=0) for name in layout.sizes}
+        tables = {}
+        for table in layout.tables:
+            shape = table.shape(sizes)
+            tables[table.name] = np.frombuffer(rest, np.int32, math.prod(shape), first).reshape(shape)
+            first += tables[table.name].nbytes
+        places = read_tables(stepper.interface, tables)
+        check_accesses(layout, sizes, places)
+        count = checked_count(1 if threads is None else threads, "threads", least=1, most=MOST_THREADS)
+        problem = RunSizes(sizes=sizes, places=places, threads=count)
+        binding: Any = stepper  # of run-time sizes
+        stepper = binding._bound_to(problem).with_events(stepper.events)
+    values = np.frombuffer(rest, count=stepper.interface.words * len(stepper.defaults), offset=first)
+    if stepper.interface.words == 1:
+        known = stepper.parameters_by_name(values)
+    else:
+        numbers = from_block(values)
+        known = {name: numbers[k : k + 1].reshape(()) for k, name in enumerate(stepper.parameters)}
+    for name in header["unset inputs"]:
+        del known[f"{name}_0"]
+    control = ErrorControl(**header.get("control", {}))
+    control.checked()
+    return stepper, rest[first + values.nbytes :], known, control
+
+
+def _integrator(stepper: Integrator) -> str:
+    """Return the identification of saved runs: the memory of a run depends on the method and the solver."""
+    interface = stepper.interface if stepper.origin is None else stepper.origin.interface
+    return f"{interface.title}, {interface.solver}, of {clipped(', '.join(interface.coordinates), 60)}"

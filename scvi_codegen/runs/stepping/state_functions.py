@@ -1,0 +1,280 @@
+"""Functions of a state: Legendre transforms, energies, conserved quantities, rates of transformed time, parameters.
+
+All C calls release the GIL and share no state, so one integrator may be used from many threads.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from scvi_codegen.codegen.native.options import REASONS
+from scvi_codegen.common.errors import StateError
+from scvi_codegen.runs.states.pairs import product_of, quotient_of, sum_of
+from scvi_codegen.runs.states.rotations import checked_pair, checked_states, is_one_state
+from scvi_codegen.runs.states.validation import (
+    Array,
+    Parameters,
+    States,
+    checked_parameters,
+    checked_vector,
+    coordinate_shapes,
+    parameter_index,
+)
+from scvi_codegen.runs.states.words import block_of, by_name, checked_time, from_block, low_words, scalar, unnamed
+from scvi_codegen.runs.stepping.array_interface import constraint_shapes
+from scvi_codegen.runs.stepping.compiled_method import CompiledMethod
+
+PROBES = 8
+"""Number of random momenta that estimate the size of the direction of a symmetry."""
+REPORTED = 1e-3
+"""Largest relative difference between a velocity and the velocity recomputed from its momentum."""
+
+
+class StateFunctions(CompiledMethod):
+    """Compiled method with functions of a state, which do not depend on the steps."""
+
+    def _parameters_at(self, q: States, p: States, parameters: Parameters = None) -> Array:
+        """Return (k,) values in order; in transformed time the energy defaults to that of the state (q, p)."""
+        values = self._parameters(parameters)
+        if not self._has_energy(parameters):
+            q, p = checked_pair(self.interface, q, p)
+            values[parameter_index(self.interface, self.interface.energy_parameter)] = self.energy(q, p, 0.0, values)
+        return values
+
+    def _has_energy(self, parameters: Mapping[str, Any] | Sequence[Any] | Array | None) -> bool:
+        """Return whether the parameters contain the energy required by transformed time, or none is required."""
+        name = self.interface.energy_parameter
+        return not name or (parameters is not None and (not isinstance(parameters, Mapping) or name in parameters))
+
+    def rates(self, q: States, p: States, parameters: Parameters = None) -> Array:
+        """Return (n,) rates dt/dtau at (n, m) states; 1 if time is not transformed."""
+        _, positions, momenta = checked_states(self.interface, q, p, 0.0)
+        rates = np.ones((positions.size // self.dimension, self.interface.words))
+        if not self.interface.energy_parameter:
+            return rates[:, 0]
+        arrays = *map(block_of, (positions, momenta, self._parameters(parameters))), rates
+        if self.binding.function("rates")(len(rates), *map(self.binding.pointer, arrays)):
+            raise StateError("the rate dt/dtau of the time transformation must be positive at every state")
+        return self._numbers(rates)[:, 0]
+
+    def momentum(self, q: States, v: States, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
+        """Return momenta p = dL/dv at (q, v, t), the Legendre transform: (m,), or (n, m) for (n, m) states."""
+        return self._transform("momentum", q, v, t, parameters, "v")
+
+    def velocity(self, q: States, p: States, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
+        """Return velocities v with dL/dv(q, v, t) = p, the inverse Legendre transform (Newton's iteration from v = 0).
+
+        Returns:
+            (m,), or (n, m) for (n, m) states with one time or (n,) times.
+        """
+        return self.named(self._transform("velocity", q, p, t, parameters, "p"))
+
+    def _initial_momenta(
+        self, q: States, p: States | None, velocity: States | None, t: float, parameters: Parameters
+    ) -> States:
+        """Return the momenta of a state specified by p or by velocity.
+
+        Raises:
+            StateError: unless exactly one of both is passed.
+        """
+        name, values = self.momentum_or_velocity(p, velocity)
+        return values if name == "p" else self.initial_momentum(q, values, t, parameters)
+
+    def initial_momentum(self, q: States, velocity: States, t: float, parameters: Parameters) -> Array:
+        """Return the (m,) momentum of the initial state of a run.
+
+        Raises:
+            StateError: if the mass matrix is singular along the velocity, so the momentum does not determine it.
+        """
+        q, v = checked_pair(self.interface, q, velocity, "velocity")
+        p = self._transform("momentum", q, v, t, parameters, "velocity")
+        dropped = (p == 0.0) & (v != 0.0)
+        if dropped.any():
+            try:
+                back = self.velocity(q, p, t, parameters)
+            except StateError:
+                back = np.full_like(v, np.nan)
+            dropped &= ~(np.abs(back - v) <= REPORTED * np.abs(v).max())
+        if not dropped.any():
+            return p
+        i = int(np.flatnonzero(dropped)[0])
+        name = self.coordinates[i]
+        raise StateError(
+            f"the velocity {name}_dot = {v.ravel()[i]:g} at q = {np.asarray(q)} has no momentum: the mass matrix is "
+            f"singular there in the direction of '{name}', so the motion is undetermined. Start from a state where the "
+            f"kinetic energy depends on {name}_dot, or use coordinates that are regular there (Cartesian instead of "
+            "polar coordinates at the origin)"
+        )
+
+    def momentum_or_velocity(self, p: States | None, velocity: States | None) -> tuple[str, States]:
+        """Return the name and the value of the one of both that is passed.
+
+        Raises:
+            StateError: unless exactly one of both is passed.
+        """
+        if p is not None and velocity is None:
+            return "p", p
+        if velocity is not None and p is None:
+            return "velocity", velocity
+        raise StateError(f"give either p or velocity with q; got {'neither' if p is None else 'both'}")
+
+    def energy(self, q: States, p: States, t: ArrayLike = 0.0, parameters: Parameters = None) -> Any:
+        """Return the energy p.v - L: a float for (m,) states, (n,) for (n, m) with one time or (n,) times."""
+        times, positions, momenta = checked_states(self.interface, q, p, t)
+        result = self._energies_of(times, positions, momenta, self._parameters(parameters))
+        if not is_one_state(self.interface, q):
+            return result
+        return scalar(result[0])
+
+    def _energy_parts(self, q: Array, p: Array, t: Array, parameters: Array) -> Array:
+        """Return (n, 3) kinetic, potential and total energies of (n, m) states; parts of run-time sizes, else NaN."""
+        parts = np.full((len(q), 3), np.nan)
+        if self.binding.has("energy_parts"):
+            arrays = (np.ascontiguousarray(each, dtype=float) for each in (t, q, p, parameters))
+            pointers = map(self.binding.pointer, (*arrays, parts))
+            self.binding.function("energy_parts")(len(t), *pointers, self.binding.workspace())
+        else:
+            parts[:, 2] = self.energy(q, p, t, parameters)
+        return parts
+
+    def _energies_of(self, t: Array, q: Array, p: Array, parameters: Array) -> Array:
+        """Return (n,) energies of unchecked contiguous arrays of shapes (n,), (n, m), (n, m) and (k,).
+
+        Raises:
+            StateError: if a state is outside the domain of L.
+        """
+        result, binding = np.empty(len(t) * self.interface.words), self.binding
+        arrays = t if self.interface.words == 1 else block_of(t[:, None]), *map(block_of, (q, p)), result
+        at, positions, momenta, energies = binding.pointers(*arrays)
+        values, workspace = binding.pointer(block_of(parameters)), binding.workspace()
+        status = binding.function("energies")(len(t), at, positions, momenta, values, energies, workspace)
+        if status:
+            raise StateError(f"the energy of a state cannot be computed: {REASONS[status]}")
+        if self.interface.words > 1:
+            result = from_block(result.reshape(-1, 2))[:, 0]
+        if name := self.interface.energy_parameter:
+            energy = parameters[parameter_index(self.interface, name)]
+            result = sum_of(energy, quotient_of(result, self.rates(q, p, parameters)))
+        return result
+
+    def momentum_maps(self, q: States, p: States, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
+        """Return the k conserved quantities in the order of ``momentum_map_names``.
+
+        Returns:
+            (k,) for (m,) states, (n, k) for (n, m) states with one time or (n,) times.
+
+        Raises:
+            StateError: if a shape, name or number is invalid.
+        """
+        values = self._momentum_maps_and_sizes(q, p, t, parameters)[0]
+        return values[0] if is_one_state(self.interface, q) else values
+
+    def _momentum_maps_and_sizes(
+        self, q: States, p: States, t: ArrayLike = 0.0, parameters: Parameters = None
+    ) -> tuple[Array, Array]:
+        """Return (n, k) momentum maps and the root sum of squares of their terms, the scale of rounding errors."""
+        times, positions, momenta = checked_states(self.interface, q, p, t)
+        sizes = np.empty((len(times), len(self.momentum_map_names)))
+        values = np.empty((len(times), sizes.shape[1] * self.interface.words))
+        if not values.size:
+            return values, sizes
+        times = times if self.interface.words == 1 else times[:, None]
+        arrays = *map(block_of, (times, positions, momenta, self._parameters(parameters))), values, sizes
+        sizes_of = () if self.problem is None else (self.binding.workspace(),)
+        status = self.binding.function("momentum_maps")(len(times), *map(self.binding.pointer, arrays), *sizes_of)
+        if status:
+            raise StateError(f"the momentum maps of a state cannot be computed: {REASONS[status]}")
+        return self._numbers(values), sizes
+
+    def _momentum_bounds(self, q: Array, p: Array, t: Array, parameters: Parameters) -> Array:
+        """Return (k,) bounds |p| |xi| of the momentum maps p . xi at the state with the largest momenta.
+
+        |xi| is estimated by random momenta.
+        """
+        q, p, t = (np.asarray(each, dtype=float) for each in (q, p, t))
+        sizes = np.linalg.norm(p, axis=1)
+        at = int(np.argmax(sizes))
+        probes = np.random.default_rng(PROBES).normal(size=(1 + PROBES, p.shape[1]))
+        probes[0] = 0.0
+        values = self._momentum_maps_and_sizes(np.tile(q[at], (len(probes), 1)), probes, t[at], parameters)[0]
+        values = np.asarray(values, dtype=float)
+        return np.asarray(sizes[at] * np.sqrt(np.mean((values[1:] - values[0]) ** 2, axis=0)))
+
+    def _transform(
+        self, name: str, q: States, other: States, t: ArrayLike, parameters: Parameters, label: str
+    ) -> Array:
+        if is_one_state(self.interface, q):
+            at, values = checked_time(t, self.interface.words), self._parameters(parameters)
+            return self._transformed(name, at, *checked_pair(self.interface, q, other, label), values)
+        times, positions, others = checked_states(self.interface, q, other, t, second=label)
+        values, result = self._parameters(parameters), others.copy()
+        for k, (at, position, row) in enumerate(zip(times, positions, others, strict=True)):
+            result[k] = self._transformed(name, at, position, row, values)
+        return result
+
+    def _transformed(self, name: str, t: float, q: Array, other: Array, values: Array) -> Array:
+        """Transform between p and dq/dt in transformed time, on the energy surface of the state."""
+        if not self.interface.energy_parameter:
+            return self._called(name, t, q, other, values)
+        if name == "velocity":
+            values[parameter_index(self.interface, self.interface.energy_parameter)] = self.energy(q, other, t, values)
+            return quotient_of(self._called(name, t, q, other, values), self.rates(q, other, values))
+        rate = self.rates(q, np.zeros_like(q), values)
+        p = self._called(name, t, q, product_of(other, rate), values)
+        if self.rates(q, p, values) != rate:
+            raise StateError("dt/dtau depends on the momenta, so velocity does not determine them: give p")
+        return p
+
+    def _called(self, name: str, t: float, q: Array, other: Array, values: Array) -> Array:
+        if self.interface.layout.momenta:
+            other_form = "give momenta p instead of velocity" if name == "momentum" else "use the momenta p"
+            raise StateError(f"velocities are unavailable for a system defined by a Hamiltonian: {other_form}")
+        result = np.empty(len(other) * self.interface.words)
+        pointers = map(self.binding.pointer, (*map(block_of, (q, other, values)), result))
+        status = self.binding.function(name)(self._time_argument(t), *pointers, self.binding.workspace())
+        if status:
+            hint = "; if the Hamiltonian is singular in p, give p instead of velocity" if name == "momentum" else ""
+            raise StateError(f"the {name} at q = {q} and {other} cannot be computed: {REASONS[status]}{hint}")
+        return self._numbers(result)
+
+    def _time_argument(self, t: float) -> Any:
+        """Return a time as an argument of C: a number or, in double-double arithmetic, a pointer to both words."""
+        if self.interface.words == 1:
+            return float(t)
+        return self.binding.pointer(np.array([float(t), float(low_words(t))]))
+
+    def _numbers(self, block: Array) -> Array:
+        """Return the numbers of an array of C, whose low words follow the high words in double-double arithmetic."""
+        return block if self.interface.words == 1 else from_block(block)
+
+    def arrays(self, values: Array) -> dict[str, Array]:
+        """Return (.., m) positions, momenta or velocities by the names of coordinates and of arrays of known sizes.
+
+        States are accepted in the same form, ``{"x": 0.0, "q": [..]}`` of ``coordinates=["x", "q[8]"]``.
+        """
+        return by_name(unnamed(values), coordinate_shapes(self.interface))
+
+    def _vector(self, value: States, name: str) -> Array:
+        return checked_vector(self.interface, value, name)
+
+    def _parameters(self, parameters: Parameters, base: Array | None = None) -> Array:
+        """Return the (k,) parameters; those that are not passed by name are those of ``base``, or defaults."""
+        return checked_parameters(self.interface, parameters, base)
+
+    def parameters_by_name(self, values: Array) -> dict[str, Any]:
+        """Return (k,) parameters by name; those of arrays of run-time sizes as arrays."""
+        interface = self.interface if self.problem is None or self.origin is None else self.origin.interface
+        result: dict[str, Any] = dict(zip(interface.parameters, values.tolist(), strict=self.problem is None))
+        if self.problem is not None:
+            fields = [(field.name, field.shape(self.problem.sizes)) for field in interface.layout.fields]
+            result |= by_name(np.asarray(values)[len(interface.parameters) :], fields)
+        return result
+
+    def constraint_arrays(self, values: Array) -> Any:
+        """Return numbers of all constraints in the form of :attr:`Run.multipliers`."""
+        if self.problem is None:
+            return values
+        shapes = constraint_shapes(self.interface.layout, self.problem.sizes)
+        return tuple(by_name(values, enumerate(map(tuple, shapes))).values())

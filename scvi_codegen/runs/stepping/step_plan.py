@@ -1,0 +1,394 @@
+"""Step plan of a run: fixed step size, adaptive steps to a time, or constant steps in transformed time to a time."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from functools import lru_cache
+from typing import Any, NamedTuple, Self, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.codegen.native.arguments import checked_number, checked_step
+from scvi_codegen.codegen.rendering.source import Interface
+from scvi_codegen.common.errors import StateError, closest
+from scvi_codegen.common.validation import check_tolerance, checked_count
+from scvi_codegen.runs.states.times import steps_to
+from scvi_codegen.runs.states.validation import coordinate_shapes
+from scvi_codegen.runs.states.words import check_doubles
+from scvi_codegen.runs.stepping.features import FEATURES, refusal
+
+ROUNDOFF_OF_TWO_WORDS = 1e-27
+"""Error of a step in double-double arithmetic that a run without a tolerance may have."""
+LEAST_STEP = 4
+"""Least value of ``max_step`` in roundings of the largest time."""
+AbsoluteTolerance: TypeAlias = float | tuple[tuple[str, float], ...]
+"""Absolute tolerance of all coordinates, or those of some coordinates, arrays and rotations by name."""
+
+
+@dataclass(frozen=True, slots=True)
+class FixedSteps:
+    """Steps of one size; base of :class:`Fixed` and :class:`Until`.
+
+    Attributes:
+        h: step size, of tau in transformed time.
+    """
+
+    h: float
+
+
+@dataclass(frozen=True, slots=True)
+class Fixed(FixedSteps):
+    """Fixed steps, as many as a call requests."""
+
+
+@dataclass(frozen=True, slots=True)
+class Until(FixedSteps):
+    """Fixed steps to a target time, the last of which is shorter; it is not taken by the run itself.
+
+    Attributes:
+        t_end: target time.
+    """
+
+    t_end: float
+
+
+@dataclass(frozen=True, slots=True)
+class Adaptive:
+    """Adaptive steps to a target time.
+
+    The error of a step is at most ``tolerance * max(motion of the coordinate, absolute tolerance)``.
+
+    Attributes:
+        t_end: target time.
+        tolerance: admissible relative error of a step; errors below round-off count as round-off.
+        max_step: largest step size.
+        first_step: size of the first trial step; ``None`` if trials determine it.
+        absolute_tolerance: the absolute tolerances that are not 0.
+    """
+
+    t_end: float
+    tolerance: float = 0.0
+    max_step: float = math.inf
+    first_step: float | None = None
+    absolute_tolerance: AbsoluteTolerance = ()
+
+
+@dataclass(frozen=True, slots=True)
+class InTau:
+    """Steps of one size in the fictitious time of a controller, to a target time.
+
+    Attributes:
+        t_end: target time.
+        tau: step size.
+    """
+
+    t_end: float
+    tau: float
+
+
+StepPlan: TypeAlias = Fixed | Until | Adaptive | InTau
+"""Step sizes of a run and the time at which it ends."""
+
+
+def ending_at(plan: StepPlan, t_end: float) -> StepPlan:
+    """Return a step plan with another target time."""
+    return Until(plan.h, t_end) if isinstance(plan, FixedSteps) else replace(plan, t_end=t_end)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AdaptivePlans(Sequence[Adaptive]):
+    """Adaptive steps of trajectories to times of their own, made when they are read.
+
+    Attributes:
+        ends: (k,) target times.
+        plan: that of a trajectory, whose target time is replaced.
+    """
+
+    ends: NDArray[np.float64]
+    plan: Adaptive
+
+    def __len__(self) -> int:
+        return len(self.ends)
+
+    def __getitem__(self, j: Any) -> Any:
+        if isinstance(j, slice):
+            return AdaptivePlans(self.ends[j], self.plan)
+        return replace(self.plan, t_end=float(self.ends[j]))
+
+
+class ErrorControl(NamedTuple):
+    """Arguments of users for adaptive steps; ``None`` where a user omits them.
+
+    Attributes:
+        tolerance: relative error of a step.
+        absolute_tolerance: smallest size of a coordinate, relative to which errors are measured: a number, or by name.
+        max_step, first_step: largest step size; size of the first trial.
+    """
+
+    tolerance: float | None = None
+    absolute_tolerance: float | Mapping[str, float] | None = None
+    max_step: float | None = None
+    first_step: float | None = None
+
+    @property
+    def named(self) -> dict[str, Any]:
+        """The arguments that are not omitted, by name."""
+        values = {name: getattr(self, name) for name in self._fields}
+        return {name: value for name, value in values.items() if value is not None}
+
+    @classmethod
+    def of(cls, plan: Adaptive) -> Self:
+        """Return the arguments of a step plan."""
+        absolute: Any = plan.absolute_tolerance
+        return cls(
+            plan.tolerance or None,
+            (dict(absolute) or None) if isinstance(absolute, tuple) else absolute,
+            None if plan.max_step == math.inf else plan.max_step,
+            plan.first_step,
+        )
+
+    def to(self, t_end: float) -> Adaptive:
+        """Return the step plan to a target time.
+
+        Raises:
+            StateError: if a number is invalid.
+        """
+        return Adaptive(checked_number(t_end, "t_end"), **self.checked())
+
+    def checked(self) -> dict[str, Any]:
+        """Return the fields of :class:`Adaptive` without its target time."""
+        fields = self.named
+        if "tolerance" in fields:
+            check_tolerance(number := checked_number(self.tolerance, "the tolerance"))
+            fields["tolerance"] = number
+        if "absolute_tolerance" in fields:
+            fields["absolute_tolerance"] = checked_absolute_tolerance(fields["absolute_tolerance"])
+        for name in fields.keys() & {"max_step", "first_step"}:
+            if name == "max_step" and fields[name] == math.inf:
+                continue
+            fields[name] = number = checked_number(fields[name], name)
+            if not number > 0.0:
+                raise StateError(
+                    f"{name} = {number:g} must be positive: give a size, or omit it (t_end determines the direction)"
+                )
+        return fields
+
+
+def plan_to_record(plan: Adaptive | InTau) -> dict[str, Any]:
+    """Return a step plan as numbers by name for files; its first three names are those of version 0.1."""
+    if isinstance(plan, InTau):
+        return {"t_end": plan.t_end, "tolerance": 0.0, "tau": plan.tau}
+    return {"t_end": plan.t_end, "tolerance": plan.tolerance, "tau": 0.0} | ErrorControl.of(plan).named
+
+
+def plan_from_record(t_end: Any, tolerance: Any, tau: Any, **control: Any) -> Adaptive | InTau:
+    """Return the step plan of :func:`plan_to_record`.
+
+    Raises:
+        StateError, TypeError: for other names and numbers.
+    """
+    if tau:
+        if tolerance or control or not checked_number(tau, "tau") > 0.0:
+            raise StateError(f"steps of tau = {tau:g} must be positive and have no tolerance")
+        return InTau(checked_number(t_end, "t_end"), tau)
+    return ErrorControl(tolerance or None, **control).to(t_end)
+
+
+def checked_absolute_tolerance(value: Any) -> AbsoluteTolerance:
+    """Return an absolute tolerance of users; raise ``StateError`` for NaN, infinite and negative numbers."""
+    if isinstance(value, Mapping):
+        each = ((str(name), _not_negative(number, f"absolute_tolerance of {name}")) for name, number in value.items())
+        return tuple((name, number) for name, number in each if number)
+    return _not_negative(value, "absolute_tolerance") or ()
+
+
+def _not_negative(value: Any, name: str) -> float:
+    number = checked_number(value, name)
+    if number < 0.0:
+        raise StateError(
+            f"{name} = {number:g} must not be negative: give the size below which errors do not matter, or omit it"
+        )
+    return number
+
+
+def absolute_tolerances(interface: Interface, dimension: int, absolute: AbsoluteTolerance) -> NDArray[np.float64]:
+    """Return the (m,) absolute tolerances of the coordinates.
+
+    Raises:
+        StateError: if there is no coordinate, array or rotation of a name.
+    """
+    if not isinstance(absolute, tuple):
+        return np.full(dimension, absolute)
+    from scvi_codegen.runs.states.rotations import members_of  # here, because it imports runs
+
+    values, first, columns = np.zeros(dimension), 0, dict[str, Any]()
+    for name, shape in coordinate_shapes(interface):
+        end = first + math.prod(shape)
+        columns[name], first = slice(first, end), end
+    if len(interface.coordinates) == dimension:
+        columns |= {name: slice(k, k + 1) for k, name in enumerate(interface.coordinates) if name not in columns}
+    if interface.rotations:
+        members = members_of(dimension, interface.rotations)
+        ordinary = members[0].columns.start
+        names = {name: place for name, place in columns.items() if place.start < ordinary}
+        columns = names | {member.name: member.columns for member in members}
+    for name, value in absolute:
+        if name not in columns:
+            raise StateError(
+                f"absolute_tolerance: there is no coordinate, array or rotation '{name}' (= {value:g}) in "
+                f"'{interface.system}'{closest(name, [*columns])} Known: {', '.join(columns)}"
+            )
+        values[columns[name]] = value
+    return values
+
+
+def step_control(stepper: Any, plan: StepPlan) -> tuple[Any, ...]:
+    """Return the control of steps in C, NULL for fixed ones, and the numbers that it refers to.
+
+    Args:
+        stepper: :class:`~scvi_codegen.runs.stepping.integrator.Integrator` of the run.
+        plan: step plan.
+
+    Raises:
+        StateError: if there is no coordinate, array or rotation of a name, or a tolerance cannot be met.
+    """
+    binding = stepper.binding
+    match plan:
+        case InTau(tau=tau):
+            control = binding.new("step_control *")
+            control.tau = tau
+            return (control,)
+        case Adaptive():
+            if stepper.interface.words > 1:
+                _check_resolved(plan.tolerance, binding.function("smallest_tolerance")())
+            control = binding.new("step_control *")
+            control.tolerance, control.max_step = plan.tolerance, plan.max_step
+            first, absolute = binding.null, np.empty(0)
+            if plan.first_step is not None:
+                first = binding.numbers("double *")
+                first[0] = plan.first_step
+            if plan.absolute_tolerance != ():
+                absolute = absolute_tolerances(stepper.interface, stepper.dimension, plan.absolute_tolerance)
+            control.first_step, control.absolute_tolerance = first, binding.pointer(absolute)
+            return control, first, absolute
+        case _:
+            return (binding.null,)
+
+
+def check_max_step(plan: StepPlan, t: float, words: int = 1) -> None:
+    """Raise ``StateError`` if steps of the largest size do not advance the time of a run from t.
+
+    Those of less than ``LEAST_STEP`` roundings of the time vanish in it, or change by a large part. Times of two words
+    resolve all, but no run makes as many steps as the roundings of a double.
+    """
+    if not isinstance(plan, Adaptive) or plan.max_step == math.inf:
+        return
+    size = max(abs(t), abs(plan.t_end)) if words == 1 else abs(plan.t_end - t)
+    if plan.max_step < (least := LEAST_STEP * math.ldexp(float(size), -53)):
+        raise StateError(
+            f"max_step = {plan.max_step:g} is below {least:.2g}, {LEAST_STEP} roundings of the times of a run from "
+            f"t = {float(t):g} to t_end = {plan.t_end:g}: give a larger max_step, or omit it"
+        )
+
+
+def _check_resolved(tolerance: float, least: float) -> None:
+    """Raise ``StateError`` if error estimates do not resolve a tolerance, or round-off, 0, in double-double arithmetic.
+
+    The estimates are computed in double from the leading coefficient of the curve of a step. Of methods whose order is
+    lower than that of this coefficient squared, as ``sc``, it is a rounding error while the step still has an error.
+    """
+    if (tolerance or ROUNDOFF_OF_TWO_WORDS) < least:
+        wanted = f"tolerance={tolerance:g}" if tolerance else "the default tolerance, round-off,"
+        raise StateError(
+            f"{wanted} cannot be met: adaptive steps of this method resolve errors of {least:.1e} in double-double "
+            f"arithmetic. Give tolerance={least:.1e} or more, fixed steps h=, or svi, whose estimates resolve "
+            "round-off without constraints"
+        )
+
+
+def checked_plan(
+    h: float | None, t_end: float | None, control: ErrorControl, controller: str = "", in_tau: bool = False, /
+) -> StepPlan:
+    """Return the step plan of arguments of users.
+
+    Args:
+        h, t_end: step size; target time.
+        control: of adaptive steps.
+        controller: time transformation of the reversible controller, "" without one.
+        in_tau: whether the system is one in transformed time, which has fixed steps only.
+
+    Raises:
+        StateError: if a number is invalid, or they do not determine the steps.
+    """
+    if controller:
+        if h is None or t_end is None or control.named:
+            remedy = FEATURES["adaptive", "with a time transformation"]
+            raise StateError(f"the time transformation {controller} determines the step size: {remedy}")
+        tau = checked_step(h)
+        if tau < 0.0:
+            raise StateError(f"h = {h:g} must be positive with a time transformation: t_end determines the direction")
+        return InTau(checked_number(t_end, "t_end"), tau)
+    if h is None and in_tau:
+        raise refusal("adaptive", "in transformed time")
+    if h is None:
+        if t_end is None:
+            raise StateError("give either h (fixed step size) or t_end (adaptive step size); got neither")
+        return control.to(t_end)
+    if t_end is not None:
+        raise StateError("give either h (fixed step size) or t_end (adaptive step size); got both")
+    for name in control.named:
+        raise StateError(f"{name} requires adaptive steps: give t_end without h and steps")
+    return Fixed(checked_step(h))
+
+
+@lru_cache(maxsize=256, typed=True)
+def planned_steps(
+    h: float | None,
+    steps: int | None,
+    t_end: float | None,
+    tolerance: float | None,
+    absolute_tolerance: float | Mapping[str, float] | None,
+    max_step: float | None,
+    first_step: float | None,
+    save_every: int,
+    t: float | Fraction,
+    controller: str,
+    in_tau: bool,
+    words: int,
+    /,
+) -> tuple[StepPlan, int | None]:
+    """Return the plan of :meth:`Stepper.integrate` and its number of steps, ``None`` to t_end.
+
+    Args:
+        h, steps, t_end, tolerance, absolute_tolerance, max_step, first_step, save_every, t: arguments of
+            :meth:`Stepper.integrate`; t matters with h and t_end.
+        controller, in_tau: as of :func:`checked_plan`.
+        words: number of words of the states; runs in double-double end at t_end to 32 digits.
+
+    Raises:
+        StateError: if a number is invalid, or they do not determine the steps.
+    """
+    fixed = h is not None and not controller
+    control = ErrorControl(tolerance, absolute_tolerance, max_step, first_step)
+    plan = checked_plan(h, None if fixed else t_end, control, controller, in_tau)
+    if words > 1:
+        check_doubles(t_end=t_end)
+    if not isinstance(plan, FixedSteps):
+        if steps is not None:
+            raise StateError(f"adaptive steps end at t_end={plan.t_end:g}: omit steps={steps}, or give h and steps")
+        return plan, None
+    if t_end is None:  # Steps
+        if steps is None:
+            raise StateError("h requires steps or t_end (fixed step size); give t_end without h for adaptive steps")
+        return plan, checked_count(steps, "steps", least=0)
+    count = None if in_tau or steps is not None else steps_to(t, t_end, plan.h, exactly=words > 1)
+    if count is not None and count % checked_count(save_every, "save_every", least=1) == 0:
+        return plan, count
+    end = checked_number(t_end, "the time t_end")
+    if steps is not None:
+        raise StateError(f"give either steps={steps} or t_end={end:g} with h, not both")
+    if (end - checked_number(t, "the time t")) * plan.h < 0.0:
+        raise StateError(f"h = {plan.h:g} has the wrong sign for a run from t = {t:g} to t_end = {end:g}")
+    return Until(plan.h, end), None

@@ -1,1 +1,0 @@
-"""Time stepping: integrators, runs, trajectories, events, dense output, ensembles."""

@@ -1,1 +1,0 @@
-"""Runs of arrays whose sizes are known at run time."""

@@ -1,1 +1,0 @@
-"""Constraints: projection, multipliers, rank."""

@@ -1,1 +1,0 @@
-"""Runs with inputs: piecewise polynomials and the segments between their breakpoints."""

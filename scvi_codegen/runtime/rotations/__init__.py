@@ -1,1 +1,0 @@
-"""States of rotations and directions at run time."""

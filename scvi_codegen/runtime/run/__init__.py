@@ -1,1 +1,0 @@
-"""Runs: state, step plan, run loop."""

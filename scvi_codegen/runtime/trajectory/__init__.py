@@ -1,1 +1,0 @@
-"""Results of runs: saved states, dense output, derived quantities."""

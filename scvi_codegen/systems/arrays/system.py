@@ -1,0 +1,569 @@
+"""Systems of arrays: Lagrangians in index notation, of few kinds of terms (lattices, fields, N bodies).
+
+    L = sum_f sum_(e in loops of f) l_f(array entries at e, parameters, t)
+
+Only the kernels l_f are differentiated, so neither compile time nor code size depends on the number of coordinates,
+which is determined by the arrays that a run starts from; kinetic energy is then a sum of m v**2/2 with constant m that
+may differ between elements, or quadratic in the velocities of each element
+(:mod:`scvi_codegen.systems.legendre.of_arrays`). With known sizes they are systems of named coordinates
+(:mod:`scvi_codegen.systems.rolling`), without restrictions.
+
+Terms of array systems: masses, potentials, forces, and constraints.
+
+Velocities occur as m v**2/2 with a constant m that may differ between elements. Constraints g(array entries at e,
+parameters, t) = 0 hold for every element e of loops,
+
+    m q'' = F + G^T lambda,        g(q, t) = 0,        G = g_q,        hidden constraint G v + g_t = 0
+
+with a multiplier lambda for every element. Rods between nodes ``bonds[b, 0]`` and ``bonds[b, 1]`` of a net are
+``sum(k in 3, (r[bonds[b, 0], k] - r[bonds[b, 1], k])**2) = l[b]**2 for b in B``. Each constraint contains few entries,
+so G M^-1 G^T is sparse; its pattern is that of the net and is known when a run begins.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from itertools import chain
+from typing import Any, ClassVar, TypeVar
+
+import sympy
+from sympy import Add, Expr, S, Symbol
+
+from scvi_codegen.common.cache import key_of
+from scvi_codegen.common.errors import SizesRequiredError, SystemDefinitionError
+from scvi_codegen.common.representation import LONGEST, clipped
+from scvi_codegen.common.validation import of
+from scvi_codegen.systems.checks.continuity import corner_message, jump_message, jump_of
+from scvi_codegen.systems.checks.definition import warn_of_negative, warn_of_unused
+from scvi_codegen.systems.forces import check_damping
+from scvi_codegen.systems.formulas.array_statements import ArrayForce, latex_sum
+from scvi_codegen.systems.formulas.arrays import ArrayTerm, parse_array, parse_coordinate
+from scvi_codegen.systems.formulas.expressions import (
+    gradient,
+    gradient_tuple,
+    hessian,
+    kinked_root,
+    kinks_of,
+    unsupported_part,
+)
+from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED, Access, Array, Convolution, Loop, Size
+from scvi_codegen.systems.formulas.neighbours import Neighbours
+from scvi_codegen.systems.formulas.rotations import MemberArray
+from scvi_codegen.systems.formulas.symbols import DOT, check_names, input_formulas, symbol
+from scvi_codegen.systems.system import MechanicalSystem
+
+Term = TypeVar("Term", ArrayTerm, ArrayForce)
+
+
+@lru_cache(maxsize=256)
+def force_of(term: ArrayTerm, state: tuple[Array, ...]) -> ArrayForce:
+    """Return the derivatives of a term with respect to its entries of the state."""
+    moving = entries_of(term, state)
+    partials = gradient_tuple(term.formula, [slot for slot, _ in moving])
+    targets = tuple((access, partial) for (_, access), partial in zip(moving, partials, strict=True))
+    return ArrayForce(loops=term.loops, slots=term.slots, targets=targets)
+
+
+def entries_of(term: ArrayTerm | ArrayForce, arrays: Collection[Array]) -> tuple[tuple[Symbol, Access], ...]:
+    """Return the accesses of certain arrays in a term, with their symbols."""
+    return tuple(pair for pair in term.slots if pair[1].array in arrays)
+
+
+def friction(terms: Sequence[ArrayTerm], coordinates: Mapping[Array, Array]) -> tuple[ArrayForce, ...]:
+    """Return the forces -dD/dv of Rayleigh's dissipation function; ``coordinates``: by the arrays of velocities."""
+    forces = []
+    for term in terms:
+        force = force_of(term, tuple(coordinates))
+        targets = tuple((replace(access, array=coordinates[access.array]), -rate) for access, rate in force.targets)
+        if not targets:
+            raise SystemDefinitionError(
+                f"the dissipation {term} contains no velocity: Rayleigh's function defines the forces "
+                "-dD/dq_dot. Add velocities, or remove it"
+            )
+        forces.append(replace(force, targets=targets))
+    return tuple(forces)
+
+
+def friction_of(mass: ArrayForce, rate: Expr) -> ArrayForce:
+    """Return the force -rate m v of a mass."""
+    ((access, m),) = mass.targets
+    velocity = replace(access, array=Array(access.array.name + DOT, access.array.axes))
+    v = symbol(str(velocity))
+    return ArrayForce(loops=mass.loops, slots=(*mass.slots, (v, velocity)), targets=((access, -rate * m * v),))
+
+
+def masses_of(term: ArrayTerm, velocities: Mapping[str, Array]) -> tuple[ArrayForce, ...]:
+    """Return the mass contributions of a term, one per velocity."""
+    known, masses, symbols = dict(term.slots), [], velocity_symbols(term, velocities)
+    for v, derivative in zip(symbols, gradient_tuple(term.formula, symbols), strict=True):
+        mass = derivative.diff(v)
+        free = mass.free_symbols
+        slots = tuple(pair for pair in term.slots if pair[0] in free)
+        access = replace(known[v], array=velocities[known[v].array.name])
+        masses.append(ArrayForce(loops=term.loops, slots=slots, targets=((access, mass),)))
+    return tuple(masses)
+
+
+def velocity_symbols(term: ArrayTerm, velocities: Mapping[str, Array]) -> tuple[Symbol, ...]:
+    """Return the symbols of a term that denote velocities."""
+    return tuple(slot for slot, access in term.slots if access.array.name in velocities)
+
+
+@lru_cache(maxsize=256)
+def has_constant_mass(term: ArrayTerm, coordinates: tuple[Array, ...], time: Symbol) -> bool:
+    """Return whether velocities occur as m v**2/2 with a constant m."""
+    velocities = {array.name + DOT: array for array in coordinates}
+    varies = {slot for slot, access in term.slots if access.array.name in velocities or access.array in coordinates}
+    slots, known = velocity_symbols(term, velocities), dict(term.slots)
+    if any(known[v].sums for v in slots):
+        return False
+    for v, derivative in zip(slots, gradient_tuple(term.formula, slots), strict=True):
+        mass = derivative.diff(v)
+        if mass.free_symbols & (varies | {time}) or sympy.expand(derivative - mass * v) != 0:
+            return False
+    return True
+
+
+def terms_at_rest(
+    terms: Sequence[ArrayTerm], velocities: Mapping[str, Array], state: Sequence[Array], *, negative: bool, moving: bool
+) -> tuple[ArrayTerm, ...]:
+    """Return the non-zero terms at zero velocity that depend on the state, or those that do not.
+
+    Args:
+        terms: of a Lagrangian or a Hamiltonian.
+        velocities: the array of coordinates by the name of its velocities.
+        state: coordinates and momenta.
+        negative: whether to change the signs, as for -H.
+        moving: whether to return the terms that depend on the state.
+    """
+    results = []
+    for term in terms:
+        at_rest = term.formula.xreplace(dict.fromkeys(velocity_symbols(term, velocities), S.Zero))
+        free = at_rest.free_symbols
+        slots = tuple(pair for pair in term.slots if pair[0] in free)
+        if at_rest and moving == any(access.array in state for _, access in slots):
+            results.append(replace(term, formula=-at_rest if negative else at_rest, slots=slots))
+    return tuple(results)
+
+
+def constraint_text(term: ArrayTerm) -> str:
+    """Return the constraint as text."""
+    return f"{term.formula} = 0{loops_text(term.loops)}"
+
+
+def loops_text(loops: Sequence[Loop]) -> str:
+    """Return loops as the text that follows a formula, ``" for i in N"``; empty without loops."""
+    behind = {loop.behind for loop in loops}
+    return f" for {', '.join(str(loop) for loop in loops if loop.index not in behind)}" if loops else ""
+
+
+def check_constraint(term: ArrayTerm, coordinates: Sequence[Array], fields: Sequence[Array], inputs: str) -> None:
+    """Raise :class:`SystemDefinitionError` unless a constraint contains coordinates, and neither velocities nor inputs.
+
+    Args:
+        term: the constraint.
+        coordinates, fields: arrays that it may contain.
+        inputs: regular expression that matches the symbols of inputs.
+    """
+    shown = constraint_text(term)
+    if problem := unsupported_part(term.formula):
+        raise SystemDefinitionError(f"in the constraint '{shown}': {problem}")
+    if moving := {access.array for _, access in term.slots} - {*coordinates, *fields}:
+        name = min(array.name for array in moving)
+        raise SizesRequiredError(
+            f"the constraint '{shown}' contains the velocity {name}: constraints of array systems "
+            "must be holonomic (coordinates and time only)"
+        )
+    if any(access.sums for _, access in term.slots):
+        raise SizesRequiredError(f"the constraint '{shown}' contains a convolution")
+    if not entries_of(term, coordinates):
+        raise SystemDefinitionError(
+            f"the constraint '{shown}' contains no coordinate: remove it, or write the condition in terms "
+            "of the coordinates"
+        )
+    if inputs and any(re.fullmatch(inputs, each.name) for each in term.formula.free_symbols):
+        raise SystemDefinitionError(
+            f"the constraint '{shown}' depends on an input, which may be discontinuous: use a "
+            "parameter or a formula in t instead"
+        )
+
+
+def constraint_gradient(term: ArrayTerm, coordinates: Sequence[Array], time: Symbol) -> tuple[Expr, ...]:
+    """Return the row of G of one element, by its coordinates, followed by g_t."""
+    return gradient_tuple(term.formula, [*(slot for slot, _ in entries_of(term, coordinates)), time])
+
+
+def constraint_second_rate(
+    term: ArrayTerm, coordinates: Sequence[Array], time: Symbol, velocities: Sequence[Symbol]
+) -> Expr:
+    """Return d^2 g / dt^2 at zero acceleration: v^T g_qq v + 2 g_qt v + g_tt."""
+    variables = [*(slot for slot, _ in entries_of(term, coordinates)), time]
+    rates = [*velocities, S.One]
+    rate = Add(*(derivative * rates[k] for k, derivative in gradient(term.formula, variables).items()))
+    return Add(*(derivative * rates[k] for k, derivative in gradient(rate, variables).items()))
+
+
+def substituted(term: Term, rule: Mapping[Any, Expr]) -> Term:
+    """Return a term, or forces, with expressions substituted by ``rule``."""
+    if not rule:
+        return term
+    if isinstance(term, ArrayForce):
+        return replace(term, targets=tuple((access, formula.xreplace(rule)) for access, formula in term.targets))
+    return replace(term, formula=term.formula.xreplace(rule))
+
+
+def table_of(text: str) -> Array:
+    """Parse the declaration of an index table; one with a single axis gets one column."""
+    array = parse_array(text)
+    return array if len(array.axes) > 1 else replace(array, axes=(*array.axes, Size("", 1)))
+
+
+def momenta_of(
+    coordinates: Sequence[Array], names: Sequence[str] | None, lagrangian: str | None, hamiltonian: str | None
+) -> tuple[Array, ...]:
+    """Return the arrays of momenta of a Hamiltonian; none for a Lagrangian."""
+    if (lagrangian is None) == (hamiltonian is None):
+        raise SystemDefinitionError("give exactly one of lagrangian and hamiltonian")
+    if hamiltonian is None:
+        if names is not None:
+            raise SystemDefinitionError(
+                "momenta were given for a Lagrangian, which has velocities, q_dot[i]: leave them out, or "
+                "give a hamiltonian"
+            )
+        return ()
+    if names is None:
+        return tuple(Array(f"p_{array.name}", array.axes) for array in coordinates)
+    arrays = tuple(map(parse_coordinate, names))
+    if [array.axes for array in arrays] != [array.axes for array in coordinates]:
+        shown = ", ".join(map(str, coordinates))
+        raise SystemDefinitionError(
+            f"momenta must be arrays with the axes of the coordinates, {shown}, not {', '.join(names)}"
+        )
+    return arrays
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ArraySystem:
+    """Lagrangian or Hamiltonian in index notation; ``LagrangianSystem.from_text(coordinates=["q[N]"])`` returns it.
+
+    Attributes:
+        name, time, inputs, damping: see :class:`~scvi_codegen.systems.system.MechanicalSystem`.
+        coordinates: arrays of coordinates, single ones without axes; the array of the velocities of ``q`` is called
+            ``q_dot``.
+        momenta: of a Hamiltonian, arrays parallel to ``coordinates``; empty for a Lagrangian.
+        parameters, defaults: adjustable numbers and their default values.
+        fields: arrays of parameters, whose values, one per element, are passed to each run.
+        field_defaults: default value of all elements of each field.
+        tables: index tables, ``bonds[B, 2]``, passed to each run.
+        neighbours: lists of the pairs closer than a cutoff.
+        terms: of the Lagrangian or the Hamiltonian.
+        forces: generalised forces of coordinates, velocities (momenta of a Hamiltonian) and time.
+        constraints: g = 0 at every element of loops (:mod:`scvi_codegen.systems.arrays.system`).
+        rotations: rotations, directions and spins, which require known sizes.
+        definition: the arguments of ``from_text`` other than name and parameters, for model files.
+        data: values of fields and tables by name for runs that pass none.
+        mesh: of the fields of a density, their :class:`~scvi_codegen.fields.mesh.Mesh`.
+    """
+
+    name: str
+    coordinates: tuple[Array, ...]
+    momenta: tuple[Array, ...]
+    time: Symbol
+    parameters: tuple[Symbol, ...]
+    defaults: tuple[float, ...]
+    fields: tuple[Array, ...]
+    field_defaults: tuple[float, ...]
+    tables: tuple[Array, ...]
+    terms: tuple[ArrayTerm, ...]
+    neighbours: tuple[Neighbours, ...] = ()
+    forces: tuple[ArrayForce, ...] = ()
+    inputs: tuple[str, ...] = ()
+    constraints: tuple[ArrayTerm, ...] = ()
+    damping: Expr = S.Zero
+    rotations: tuple[MemberArray, ...] = ()
+    definition: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
+    data: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
+    mesh: Any = field(default=None, compare=False, repr=False)
+    REQUIRES_SIZES: ClassVar[str] = SIZES_REQUIRED
+
+    def __repr__(self) -> str:
+        shown = ", ".join(map(str, self.coordinates))
+        return clipped(f"{self.function}System(name={self.name!r}, coordinates=({shown}))", LONGEST)
+
+    def __post_init__(self) -> None:
+        self._check_names()
+        constant = {array.name for array in self.fields}
+        for term in self.terms:
+            varying = [slot for slot, access in term.slots if access.array.name not in constant]
+            if problem := unsupported_part(term.formula) or kinked_root(term.formula, [*varying, self.time]):
+                raise SystemDefinitionError(f"in the {self.function} of '{self.name}': {problem}")
+        self._check_continuity()
+        for force in self.forces:
+            for access, formula in force.targets:
+                if problem := unsupported_part(formula):
+                    raise SystemDefinitionError(f"in the force on {access} of '{self.name}': {problem}")
+        if self.constraints and self.momenta:
+            raise SystemDefinitionError(
+                f"'{self.name}' is a Hamiltonian with constraints, which are supported for Lagrangians only: write the "
+                "system by its Lagrangian"
+            )
+        used = {access.array.name for term in self.terms for _, access in term.slots}
+        for array in () if self.momenta or self.is_first_order else self.coordinates:
+            if array.name + DOT not in used:
+                entry = f"sum(i in {array.axes[0]}, {array.name}{DOT}[i]**2/2)" if array.axes else f"{array}{DOT}**2/2"
+                raise SystemDefinitionError(
+                    f"no term contains {array.name}{DOT}: add a kinetic energy for '{array.name}', such as {entry}"
+                )
+        check_damping(self.name, self.damping, self.parameters)
+
+    def _check_continuity(self) -> None:
+        """Raise :class:`SystemDefinitionError` for jumps of L or H across a surface, and for corners of constraints."""
+        constant = {array.name for array in self.fields}
+        values = dict(zip(self.parameters, self.defaults, strict=True))
+        of_energy = [] if self.neighbours else [(term, False) for term in self.terms]  # lists end at their cutoff
+        for term, first_derivatives in (*of_energy, *((term, True) for term in self.constraints)):
+            moving = [slot for slot, access in term.slots if access.array.name not in constant]
+            if jump := jump_of(term.formula, moving, values, first_derivatives=first_derivatives):
+                subject = f"the constraint '{term}'" if first_derivatives else f"the {self.function}"
+                message = corner_message if first_derivatives else jump_message
+                raise SystemDefinitionError(message(f"{subject} of '{self.name}'", *jump))
+
+    def check_run_time_sizes(self) -> None:
+        """Raise :class:`SizesRequiredError` for a system that cannot be compiled for sizes known at run time."""
+        try:
+            if self.rotations:
+                raise SizesRequiredError("rotations, directions and spins are not available for run-time sizes")
+            if self.is_first_order:
+                raise SizesRequiredError(
+                    "Lagrangians linear in the velocities are not available for arrays of run-time sizes"
+                )
+            for term in self.coupled_terms:
+                raise SizesRequiredError(
+                    f"'{term}' contains velocities in another form: arrays of run-time sizes have velocities as "
+                    "m*v**2/2 only, with a constant mass m"
+                )
+            inputs = "|".join(f"{name}_[0123t]" for name in self.inputs)
+            for term in self.constraints:
+                check_constraint(term, self.coordinates, self.fields, inputs)
+            if self.damping != 0 and self.momenta:
+                raise SizesRequiredError("damping of a Hamiltonian requires known sizes: write it as forces")
+            moving = (*self.state, *self.velocities)
+            if still := [each for each, _ in self.accesses if each.sums and each.array not in moving]:
+                raise SizesRequiredError(
+                    f"'{still[0]}' is a convolution of parameters, not of coordinates or momenta: declare its values "
+                    "as an array of parameters"
+                )
+            for array in self.coordinates:
+                if len(array.axes) > 1 and any(not axis.name for axis in array.axes[:-1]):
+                    raise SizesRequiredError(f"of the axes of {array} only the last may be a number: name the others")
+        except SizesRequiredError as error:
+            raise SizesRequiredError(f"{error}. This concerns '{self.name}': {SIZES_REQUIRED}") from error
+
+    @property
+    def sizes(self) -> tuple[str, ...]:
+        """Names of the sizes, in the order in which arrays declare them."""
+        return tuple(dict.fromkeys(chain(*(array.names for array in self.arrays))))
+
+    @property
+    def arrays(self) -> tuple[Array, ...]:
+        """Coordinates, those of rotations, momenta, fields, tables."""
+        return (*self.positions, *self.momenta, *self.fields, *self.tables)
+
+    @property
+    def positions(self) -> tuple[Array, ...]:
+        """Coordinates, and homogeneous coordinates of rotations, directions and spins."""
+        return (*self.coordinates, *(each.array for each in self.rotations))
+
+    @property
+    def state(self) -> tuple[Array, ...]:
+        """Coordinates, and the momenta of a Hamiltonian."""
+        return (*self.coordinates, *self.momenta)
+
+    @property
+    def velocities(self) -> tuple[Array, ...]:
+        """Arrays of velocities that forces depend on: all of them if any occurs, else none; none for a Hamiltonian."""
+        names = {access.array.name for force in self.applied_forces for _, access in force.slots}
+        arrays = tuple(Array(name, array.axes) for name, array in self._velocities.items())
+        return arrays if any(array.name in names for array in arrays) else ()
+
+    @property
+    def accesses(self) -> tuple[tuple[Access, tuple[Loop, ...]], ...]:
+        """Array accesses, each with its enclosing loops."""
+        slots = [(access, term.loops) for term in self.terms for _, access in term.slots]
+        slots += [(access, force.loops) for force in self.applied_forces for _, access in force.slots]
+        slots += [(access, term.loops) for term in self.constraints for _, access in term.slots]
+        return (*slots, *((access, force.loops) for force in self.applied_forces for access, _ in force.targets))
+
+    @property
+    def sums(self) -> tuple[tuple[Convolution, ...], ...]:
+        """Convolutions of the state, each once."""
+        return tuple(dict.fromkeys(access.sums for access, _ in self.accesses if access.sums))
+
+    @property
+    def changes_energy(self) -> str:
+        """Reason why energy is not conserved; empty if it is."""
+        if self.forces:
+            return "forces act"
+        if self.damping != 0:
+            return "damping takes it"
+        if any(self.time in term.formula.free_symbols for term in self.constraints):
+            return "constraints depend on time"
+        return f"the {self.function} depends on time" if self.depends_on_time else ""
+
+    @property
+    def kinks(self) -> tuple[str, ...]:
+        """Functions as text at whose zeros terms, forces or constraints are not smooth, by unit_step or rint.
+
+        None with lists of neighbours, whose pairs are too many to search.
+        """
+        if self.neighbours:
+            return ()
+        terms = [(term.loops, [term.formula]) for term in (*self.terms, *self.constraints)]
+        forces = [(force.loops, [formula for _, formula in force.targets]) for force in self.applied_forces]
+        found = {f"{zero}{loops_text(loops)}" for loops, formulas in (*terms, *forces) for zero in kinks_of(formulas)}
+        return tuple(sorted(found))
+
+    @property
+    def is_first_order(self) -> bool:
+        """True if L contains velocities, all of them linearly (:mod:`scvi_codegen.systems.first_order`)."""
+        slots = [[slot for slot, access in term.slots if access.array.name in self._velocities] for term in self.terms]
+        return any(slots) and not any(hessian(term.formula, v) for term, v in zip(self.terms, slots, strict=True))
+
+    @property
+    def coupled_terms(self) -> tuple[ArrayTerm, ...]:
+        """Terms that contain velocities other than as m v**2/2 with a constant m."""
+        coordinates = () if self.momenta else self.coordinates
+        return tuple(term for term in self.terms if not has_constant_mass(term, coordinates, self.time))
+
+    @property
+    def _plain_terms(self) -> tuple[ArrayTerm, ...]:
+        coupled = self.coupled_terms
+        return tuple(term for term in self.terms if term not in coupled)
+
+    @property
+    def masses(self) -> tuple[ArrayForce, ...]:
+        """Constant masses (second derivatives of L with respect to velocities); empty for a Hamiltonian."""
+        return tuple(chain(*(masses_of(term, self._velocities) for term in self._plain_terms)))
+
+    @property
+    def potentials(self) -> tuple[ArrayTerm, ...]:
+        """Terms of -V or -H that depend on coordinates or momenta, at zero velocity."""
+        return terms_at_rest(self._plain_terms, self._velocities, self.state, negative=bool(self.momenta), moving=True)
+
+    @property
+    def energy_offsets(self) -> tuple[ArrayTerm, ...]:
+        """Terms of -V or -H without coordinates and momenta, which change the energy but not the trajectory."""
+        return terms_at_rest(self._plain_terms, self._velocities, self.state, negative=bool(self.momenta), moving=False)
+
+    @property
+    def applied_forces(self) -> tuple[ArrayForce, ...]:
+        """The forces, and for run-time sizes those of a damping, -gamma m v for each mass m."""
+        return (*self.forces, *(friction_of(mass, self.damping) for mass in self.masses if self.damping != 0))
+
+    @property
+    def all_forces(self) -> tuple[ArrayForce, ...]:
+        """Derivatives of the terms of -V or -H with respect to the state, then the other forces."""
+        return (*(force_of(term, self.state) for term in self.potentials), *self.applied_forces)
+
+    def _repr_latex_(self) -> str:
+        return rf"$\displaystyle {self.latex}$"
+
+    @property
+    def latex(self) -> str:
+        """L or H in LaTeX."""
+        arguments = ", ".join(array.name for array in self.state)
+        shown = (latex_sum(substituted(term, self._by_name)) for term in self.terms)
+        return rf"{self.function[0]}({arguments}) = {' + '.join(shown).replace('+ -', '-')}"
+
+    @property
+    def depends_on_time(self) -> bool:
+        """True if time occurs explicitly, so that energy is not conserved."""
+        formulas = [term.formula for term in self.terms] + [f for force in self.forces for _, f in force.targets]
+        return any(self.time in formula.free_symbols for formula in formulas)
+
+    def key(self) -> tuple[str, ...]:
+        """Return the key of this system in caches, made from all of its fields but the data of runs."""
+        return (key_of(replace(self, data={}, mesh=None)),)
+
+    def __str__(self) -> str:
+        arguments = ", ".join(map(str, self.state))
+        terms = " + ".join(str(substituted(term, self._by_name)) for term in self.terms)
+        applied = "; ".join(str(substituted(force, self._by_name)) for force in self.forces)
+        constraints = "; ".join(map(constraint_text, self.constraints))
+        others = f"{f'; forces {applied}' if applied else ''}{f'; {constraints}' if constraints else ''}"
+        return f"{self.name}: {self.function[0]}({arguments}) = {terms}{others}"
+
+    @property
+    def _by_name(self) -> dict[Expr, Expr]:
+        """Names of inputs by the formulas that represent them, for display."""
+        return {formula: name for name, formula in input_formulas(self.inputs, self.time).items()}
+
+    @property
+    def function(self) -> str:
+        """Kind of the defining function: "Hamiltonian" or "Lagrangian"."""
+        return "Hamiltonian" if isinstance(self, ArrayHamiltonian) else "Lagrangian"
+
+    @property
+    def _velocities(self) -> dict[str, Array]:
+        return {} if self.momenta else {array.name + DOT: array for array in self.coordinates}
+
+    def warn_of_mistakes(self, others: Iterable[Symbol] = ()) -> None:
+        """Warn of parameters and inputs that occur in no formula and not among ``others``, and of negative masses."""
+        terms = [*self.terms, *self.constraints]
+        formulas = [term.formula for term in terms] + [f for force in self.forces for _, f in force.targets]
+        formulas.append(self.damping)
+        used = {symbol(access.array.name) for access, _ in self.accesses}.union(
+            *(f.free_symbols for f in formulas),
+            (symbol(each.coefficients.name) for sums in self.sums for each in sums),
+            others,
+        )
+        scalars = {symbol(array.name): value for array, value in zip(self.fields, self.field_defaults, strict=True)}
+        values = scalars | dict(zip(self.parameters, self.defaults, strict=True))
+        warn_of_unused(self.name, self.function, values, self.inputs, used)
+        moving = {array.name: array for array in self.momenta} or self._velocities
+        for name in moving:
+            this = {name: moving[name]}
+            kinetic = [term for term in self.terms for _ in velocity_symbols(term, this)]
+            if len(kinetic) == 1:  # masses of several loops are added where these meet
+                (mass,) = masses_of(kinetic[0], this)
+                uniform = {slot: symbol(access.array.name) for slot, access in mass.slots}
+                warn_of_negative(
+                    self.name, {f"d2{self.function[0]}/d{name}2": mass.targets[0][1].xreplace(uniform)}, values
+                )
+
+    def _check_names(self) -> None:
+        check_names(*([each.name for each in group] for group in (self.positions, self.parameters, self.momenta)))
+        known = [each.name for each in (*self.arrays, *self.parameters, *self.neighbours)]
+        known += [array.name for each in self.rotations for array in each.formulas if array.name != each.member.name]
+        for name in known:
+            if known.count(name) > 1 or name in self.sizes:
+                raise SystemDefinitionError(f"the name '{name}' is used twice: rename one")
+        for table in self.tables:
+            if len(table.axes) != 2 or not table.axes[0].name or table.axes[1].name:
+                raise SystemDefinitionError(
+                    f"the table {table} must be declared with a size and a number of columns, as bonds[B, 2]"
+                )
+
+
+class ArrayLagrangian(ArraySystem):
+    """Lagrangian of arrays whose sizes are known at run time."""
+
+    __slots__ = ()
+    ACTS_AS: ClassVar[str] = "LagrangianSystem"
+
+
+class ArrayHamiltonian(ArraySystem):
+    """Hamiltonian of arrays whose sizes are known at run time."""
+
+    __slots__ = ()
+    ACTS_AS: ClassVar[str] = "HamiltonianSystem"
+
+
+ARRAYS = of("a system with arrays whose sizes are known at run time, as coordinates=['q[N]']", ArraySystem)
+"""Type check of systems of arrays, for :func:`~scvi_codegen.common.validation.checks_arguments`."""
+
+SYSTEM_OR_ARRAYS = of("a LagrangianSystem or a HamiltonianSystem", MechanicalSystem, ArraySystem)
+"""Type check of systems, also of those with arrays of run-time sizes."""

@@ -1,0 +1,1 @@
+"""Checks of what the user states: likely mistakes, jumps and corners."""

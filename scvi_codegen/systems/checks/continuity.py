@@ -1,0 +1,128 @@
+"""Jumps of a Lagrangian or Hamiltonian, and corners of constraints, where the argument of a unit_step or rint is 0.
+
+A jump of L across a surface u(q, t) = 0 changes the momentum there (Weierstrass-Erdmann condition), and a corner of a
+constraint is an impact. Steps do neither: they would pass such a surface without any error estimate.
+
+Each surface is examined at points that Newton's method finds on it, in 60 digits: a function jumps if the difference of
+its values on both sides does not vanish with their distance. So products that are continuous, as ``unit_step(x)*x**2``
+and ``positive_part(x)``, are no jumps, and neither are surfaces of time alone: forces are then finite at all times.
+"""
+
+import random
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+import sympy
+from sympy import Expr, Symbol
+
+from scvi_codegen.common.precision import Number, mp
+from scvi_codegen.systems.formulas.expressions import Tape, jacobian, kinks_of, rint, shortened, unit_step
+
+POINTS, ATTEMPTS, ITERATIONS = 3, 24, 40
+"""Points of a surface that are examined; starts of Newton's method, and its iterations."""
+MOST_SURFACES = 64
+"""Largest number of surfaces of a function that are examined: those of arrays of known sizes are alike."""
+APART = (mp.mpf(10) ** -16, mp.mpf(10) ** -24)
+"""Distances of the two sides, relative to the coordinate."""
+VANISHING = mp.mpf(10) ** -28
+"""Size of a difference relative to the values, below which it is a rounding error."""
+
+
+def jump_of(
+    formula: Expr, moving: Iterable[Symbol], constants: Mapping[Symbol, float], *, first_derivatives: bool = False
+) -> tuple[Expr, Expr] | None:
+    """Return a function u and the term of a formula that jumps where u is 0; ``None`` if no term does.
+
+    Args:
+        formula: function of the symbols of a state, time and parameters.
+        moving: symbols that vary along a motion, without time.
+        constants: values of the parameters; others are tried for those that are 0.
+        first_derivatives: whether jumps of first derivatives count as well, which are corners of the formula.
+    """
+    variables = set(moving)
+    for surface in sorted(kinks_of([formula]), key=str)[:MOST_SURFACES]:
+        if not surface.free_symbols & variables:
+            continue
+        terms = [term for term in sympy.Add.make_args(formula) if term.has(unit_step, rint)]
+        near = [term for term in terms if kinks_of([term]) & {surface, -surface}] or [formula]
+        rest = [term for term in terms if term not in near and term.free_symbols & surface.free_symbols]
+        whole = sympy.Add(*near, *rest)
+        functions = [whole]
+        if first_derivatives:
+            functions += jacobian([whole], sorted(whole.free_symbols & variables, key=str)).values()
+        if any(_jumps(each, surface, variables, constants) for each in functions):
+            return surface, near[0]
+    return None
+
+
+def _jumps(function: Expr, surface: Expr, moving: set[Symbol], constants: Mapping[Symbol, float]) -> bool:
+    """Return whether a function jumps at one of some points of a surface."""
+    symbols = sorted(function.free_symbols | surface.free_symbols, key=str)
+    tapes = Tape([surface], symbols), Tape([function], symbols)
+    free = [k for k, symbol in enumerate(symbols) if symbol in moving and symbol in surface.free_symbols]
+    generator = random.Random(20250101)
+    examined = 0
+    for point, k in _points(tapes[0], symbols, free, constants, generator):
+        try:
+            apart = [abs(_difference(tapes[1], point, k, distance)) for distance in APART]
+            size = abs(tapes[1](_moved(point, k, APART[0]))[0])
+        except ArithmeticError:  # outside the domain of the function
+            continue
+        if apart[1] > max(apart[0] / 2, VANISHING * (1 + size)):
+            return True
+        examined += 1
+        if examined == POINTS:
+            break
+    return False
+
+
+def _points(
+    surface: Tape,
+    symbols: Sequence[Symbol],
+    free: Sequence[int],
+    constants: Mapping[Symbol, float],
+    random_: random.Random,
+) -> Iterator[tuple[list[Number], int]]:
+    """Yield points on a surface, and the coordinate that leads across it there."""
+    for _ in range(ATTEMPTS):
+        scale = 10.0 ** random_.uniform(-1.0, 2.0)
+        values = [constants.get(symbol) or scale * random_.uniform(-1.0, 1.0) for symbol in symbols]
+        point, k = [mp.mpf(value) for value in values], random_.choice(free)
+        try:
+            for _ in range(ITERATIONS):
+                value = surface(point)[0]
+                distance = APART[1] * (1 + abs(point[k]))
+                slope = (surface(_moved(point, k, APART[1]))[0] - value) / distance
+                change = value / slope
+                point[k] -= change
+                if abs(change) <= APART[1] ** 2 * (1 + abs(point[k])):
+                    yield point, k
+                    break
+        except ArithmeticError:
+            continue
+
+
+def _moved(point: Sequence[Number], k: int, distance: Number) -> list[Number]:
+    """Return a point moved along a coordinate by a relative distance."""
+    return [*point[:k], point[k] + distance * (1 + abs(point[k])), *point[k + 1 :]]
+
+
+def _difference(function: Tape, point: Sequence[Number], k: int, distance: Number) -> Number:
+    return function(_moved(point, k, distance))[0] - function(_moved(point, k, -distance))[0]
+
+
+def jump_message(subject: str, surface: Expr, term: Expr) -> str:
+    """Return the message for a term of a Lagrangian or Hamiltonian that jumps."""
+    return (
+        f"{subject} jumps where {shortened(surface)} = 0: its term {shortened(term)} is not continuous there, so the "
+        "momentum jumps too, which steps do not do. Write a continuous function, such as positive_part; put what jumps "
+        f"into forces; or use an event '{shortened(surface)}' that changes the state (impact, then=)"
+    )
+
+
+def corner_message(subject: str, surface: Expr, term: Expr) -> str:
+    """Return the message for a constraint that has a corner."""
+    return (
+        f"{subject} has a corner or a jump where {shortened(surface)} = 0, in its term {shortened(term)}: the velocity "
+        "would jump there, which steps do not do. Constraints must have continuous first derivatives: write "
+        "positive_part(..)**2 or a smooth function, or use an event with impact"
+    )

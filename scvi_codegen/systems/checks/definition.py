@@ -1,0 +1,308 @@
+"""Checks of system definitions: errors for invalid ones, warnings for those that are probably mistakes."""
+
+import random
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from functools import reduce
+
+import numpy as np
+import sympy
+from sympy import Expr, Symbol
+
+from scvi_codegen.common.errors import SystemDefinitionError, SystemDefinitionWarning, closest, warn
+from scvi_codegen.common.precision import Number, mp
+from scvi_codegen.systems.checks.continuity import corner_message, jump_message, jump_of
+from scvi_codegen.systems.constraints import constraint_jacobian, forms_of_constraints, without_coordinate
+from scvi_codegen.systems.derived_expressions import (
+    Entries,
+    forms_of,
+    null_direction,
+    row_rank,
+    sample_points,
+    singular_part,
+)
+from scvi_codegen.systems.forces import check_damping
+from scvi_codegen.systems.formulas.expressions import Tape, hessian, jacobian, kinked_root, unsupported_part
+from scvi_codegen.systems.formulas.symbols import DOT, PARTS, TIME, check_names, number, symbol
+from scvi_codegen.systems.massless import gauge_of_rates
+from scvi_codegen.systems.system import MechanicalSystem
+
+REQUIRED = "A regular Lagrangian is required: d2L/dv2 must be invertible."
+REDUNDANT = (
+    "Add the missing kinetic energy, or use fewer coordinates: as many as there are independent motions with inertia"
+)
+SAMPLES = 16
+"""Number of random positive values of the parameters at which a negative coefficient is evaluated again."""
+
+
+def warn_of_mistakes(system: MechanicalSystem, others: Iterable[Expr] = ()) -> bool:
+    """Warn of parameters and inputs that occur in no formula of a system, and of negative masses; true if any.
+
+    A mass is a diagonal entry of d2L/dv2, or of d2H/dp2. Entries that depend on coordinates or time are not examined.
+    ``others`` are formulas that use parameters of the system, too.
+    """
+    if not system.parameters:
+        return False
+    formulas = (*others, system.formula, *system.forces, *system.constraints, system.damping, *system.integrands)
+    energy = [system.clock.energy] if system.clock else []
+    function, variables = (
+        ("Hamiltonian", system.auxiliaries) if system.auxiliaries else ("Lagrangian", system.velocities)
+    )
+    used = set[Symbol](energy).union(*(formula.free_symbols for formula in formulas))
+    unused = warn_of_unused(system.name, function, system.parameters, system.inputs, used)
+    plain = system.clock.plain.formula if system.clock and system.clock.plain else system.formula
+    entries = {} if hasattr(system, "one_form") else hessian(plain, variables)
+    masses = {f"d2{function[0]}/d{v}2": entries[i, i] for i, v in enumerate(variables) if (i, i) in entries}
+    return warn_of_negative(system.name, masses, system.constants) or unused
+
+
+def warn_of_unused(
+    name: str, function: str, parameters: Iterable[Symbol], inputs: Iterable[str], used: Set[Symbol]
+) -> bool:
+    """Warn of parameters and inputs of the system ``name`` that are not among the symbols ``used``; true if any."""
+    parts = {each: {symbol(f"{each}_{part}") for part in PARTS} for each in inputs}
+    kinds = [f"input '{each}'" for each, symbols in parts.items() if not symbols & used]
+    occurring = reduce(set.union, parts.values(), set[Symbol]())
+    kinds += [f"parameter '{each}'" for each in parameters if each not in used and each not in occurring]
+    for kind in kinds:
+        where = f"the {function}, the forces and the constraints of '{name}'"
+        remedy = "remove it, unless events or a time transformation, which are not known here, contain it"
+        warn(f"{kind} does not occur in {where}: {remedy}.", SystemDefinitionWarning)
+    return bool(kinds)
+
+
+def warn_of_negative(name: str, coefficients: Mapping[str, Expr], constants: Mapping[Symbol, float]) -> bool:
+    """Warn of coefficients of the kinetic energy that are negative with the default parameters; true if any.
+
+    No warning is given where a coefficient was negative for all positive values tried: the sign is then in the formula.
+    """
+    warned = False
+    for coefficient, formula in coefficients.items():
+        occurring = sorted(formula.free_symbols & constants.keys(), key=str)
+        if not occurring or len(occurring) < len(formula.free_symbols):
+            continue
+        tape = Tape([formula], occurring)
+        value = _value(tape, [constants[each] for each in occurring])
+        if value is not None and value < 0 and any(sample >= 0 for sample in _positive_samples(tape, len(occurring))):
+            defaults = ", ".join(f"{each} = {constants[each]:g}" for each in occurring)
+            text = str(formula)
+            shown = f"{coefficient} = {text}" if len(text) <= 60 else coefficient
+            warn(
+                f"{shown} of '{name}' is {float(value):g} with the default parameters ({defaults}): a negative mass. "
+                "Check the signs of these parameters.",
+                SystemDefinitionWarning,
+            )
+            warned = True
+    return warned
+
+
+def _positive_samples(tape: Tape, count: int) -> Iterator[Number]:
+    """Yield the values of a formula at random positive values of its ``count`` symbols, always the same ones."""
+    generator = random.Random(20250101)
+    for _ in range(SAMPLES):
+        value = _value(tape, [10.0 ** generator.uniform(-2, 2) for _ in range(count)])
+        if value is not None:
+            yield value
+
+
+def _value(tape: Tape, numbers: Iterable[float]) -> Number | None:
+    try:
+        return tape([mp.mpf(number) for number in numbers])[0]
+    except ArithmeticError:
+        return None
+
+
+def check_definition(system: MechanicalSystem, role: str, arguments: Sequence[Symbol], kinds: str) -> None:
+    """Raise :class:`SystemDefinitionError` for invalid names, default values or symbols of the formulas."""
+    if not isinstance(system.name, str) or not system.name.strip():
+        raise SystemDefinitionError(f"the name of a system must be non-empty text, not {system.name!r}")
+    if any("\ud800" <= character <= "\udfff" for character in system.name):
+        raise SystemDefinitionError(
+            f"the name {system.name!r} contains an unpaired surrogate, which cannot be encoded in UTF-8: remove it"
+        )
+    for each in (*system.coordinates, *system.auxiliaries, system.time, *system.parameters):
+        if not isinstance(each, Symbol) or each != symbol(each.name):
+            raise SystemDefinitionError(f"{each!r} is not a real symbol: build systems with from_sympy or from_text")
+    if system.time.name != TIME:
+        raise SystemDefinitionError(f"time is called '{TIME}', not '{system.time}': build systems with from_sympy")
+    coordinates, parameters, momenta = (
+        [symbol.name for symbol in group] for group in (system.coordinates, system.parameters, system.auxiliaries)
+    )
+    check_names(coordinates, [*parameters, *system.inputs], momenta)
+    if len(system.defaults) != len(system.parameters):
+        raise SystemDefinitionError(
+            f"there are {len(system.parameters)} parameters, but {len(system.defaults)} default "
+            "values: give one value per parameter"
+        )
+    for parameter, value in system.constants.items():
+        number(parameter.name, value)
+    _check_symbols(system, role, arguments, kinds)
+
+
+def _check_symbols(system: MechanicalSystem, role: str, arguments: Sequence[Symbol], kinds: str) -> None:
+    if system.forces and len(system.forces) != system.dimension:
+        raise SystemDefinitionError(
+            f"there are {system.dimension} coordinates, but {len(system.forces)} forces: give one force per coordinate"
+        )
+    check_damping(system.name, system.damping, system.parameters)
+    known = [*system.coordinates, *arguments, system.time, *system.parameters]
+    named = zip(system.coordinates, system.forces, strict=False)
+    formulas = {role: system.formula, **{f"force on {q.name}": force for q, force in named}}
+    formulas |= {"damping": system.damping}
+    formulas |= {f"constraint {k}": g for k, g in enumerate(system.constraints, 1)}
+    for where, formula in formulas.items():
+        problem = unsupported_part(formula)
+        if problem:
+            raise SystemDefinitionError(f"in the {where} of '{system.name}': {problem}")
+        if problem := kinked_root(formula, [*system.coordinates, *arguments, system.time]):
+            raise SystemDefinitionError(f"in the {where} of '{system.name}': {problem}")
+        unknown = sorted(free.name for free in formula.free_symbols.difference(known))
+        if unknown:
+            hint = closest(unknown[0], [symbol.name for symbol in known])
+            raise SystemDefinitionError(
+                f"'{unknown[0]}' in the {where} is neither a coordinate, {kinds}, time nor a parameter{hint} "
+                "Give it a default value among the parameters, or list it as a coordinate"
+            )
+    _check_continuity(system, role, formulas, [*system.coordinates, *arguments])
+
+
+def _check_continuity(
+    system: MechanicalSystem, role: str, formulas: Mapping[str, Expr], moving: Sequence[Symbol]
+) -> None:
+    """Raise :class:`SystemDefinitionError` for jumps of L or H across a surface, and for corners of constraints."""
+    if not system.lengths and (jump := jump_of(formulas[role], moving, system.constants)):  # lists end at a cutoff
+        raise SystemDefinitionError(jump_message(f"the {role} of '{system.name}'", *jump))
+    for name, g in zip(system.constraint_texts if system.constraints else (), system.constraints, strict=True):
+        if corner := jump_of(g, moving, system.constants, first_derivatives=True):
+            raise SystemDefinitionError(corner_message(f"the constraint '{name}' of '{system.name}'", *corner))
+
+
+def checked_gauge(system: MechanicalSystem) -> Expr:
+    """Return the energy of the rates of constraints that L needs for a regular mass matrix, 0 if its own is regular.
+
+    Raises:
+        SystemDefinitionError: for an invalid or singular Lagrangian, or invalid constraints.
+    """
+    check_definition(system, "Lagrangian", system.velocities, "a velocity")
+    if system.constraints:
+        _check_constraints(system)
+    elif forms_of(system).inverse_mass:
+        return sympy.S.Zero
+    singular = _singular_velocities(system, system.lagrangian)
+    if singular is None:
+        return sympy.S.Zero
+    gauge, free = gauge_of_rates(system) if system.constraints else (sympy.S.Zero, ())
+    if gauge == 0 or _singular_velocities(system, system.lagrangian + gauge):
+        raise SystemDefinitionError(_singular_message(system, *singular, free))
+    return gauge
+
+
+def _singular_velocities(system: MechanicalSystem, lagrangian: Expr) -> tuple[tuple[Symbol, ...], Entries] | None:
+    """Return :func:`singular_part` of L, with an empty block for velocities that do not occur in it."""
+    if missing := tuple(velocity for velocity in system.velocities if velocity not in lagrangian.free_symbols):
+        return missing, {}
+    return singular_part(lagrangian, system.velocities, (*system.coordinates, system.time), system.constants)
+
+
+def _singular_message(
+    system: MechanicalSystem, velocities: Sequence[Symbol], block: Entries, free: Sequence[str]
+) -> str:
+    """Return the error message for velocities with a singular block of the mass matrix.
+
+    ``free``: massless coordinates that the constraints do not determine.
+    """
+    names = ", ".join(velocity.name for velocity in velocities)
+    if velocities and not block:
+        return _degenerate_message(system, velocities, free)
+    subject = f"the mass matrix d2L/dv2 of '{system.name}'"
+    if not block:
+        return (
+            f"{subject} is singular: some velocities occur only in products with too few others. "
+            f"{REQUIRED} Give each coordinate its own kinetic energy"
+        )
+    occurring = set[Symbol]().union(*(entry.free_symbols for entry in block.values()))
+    used = {parameter: value for parameter, value in system.constants.items() if parameter in occurring}
+    zero = " and ".join(parameter.name for parameter, value in used.items() if value == 0)
+    values = " with the default parameters" if used else ""
+    direction = null_direction(block, velocities)
+    motion = f": a motion with ({direction}) has no kinetic energy" if direction else ""
+    names_of_velocities = {velocity.name for velocity in velocities}
+    for each in system.rotations:
+        if not zero and names_of_velocities & {name + DOT for name in each.coordinates}:
+            return (
+                f"the inertia of the rotation '{each.name}' of '{system.name}' is singular{values}: turning about some "
+                "axis has no kinetic energy. Give all three moments of inertia positive values, or declare the axis of "
+                "a thin rod as a unit vector instead: directions=['n']"
+            )
+    remedy = f"{zero} = 0 is the default: give it a positive value" if zero else REDUNDANT
+    remedy += _undetermined(free)
+    return f"{subject} in {names} is singular at every sampled point{values}{motion}. {REQUIRED} {remedy}"
+
+
+def _degenerate_message(system: MechanicalSystem, velocities: Sequence[Symbol], free: Sequence[str]) -> str:
+    """Return the error message for coordinates whose velocities occur at most linearly in L."""
+    names = [velocity.name[: -len(DOT)] for velocity in velocities]
+    if not hessian(system.lagrangian, system.velocities):
+        every = " and ".join(velocity.name for velocity in system.velocities)
+        return (
+            f"the Lagrangian of '{system.name}' is degenerate: it is at most linear in {every} (no kinetic energy). "
+            f"{REQUIRED} Add the missing kinetic energy, such as m*{velocities[0]}**2/2"
+        )
+    occurs = velocities[0] in system.lagrangian.free_symbols
+    how = "occurs only linearly in L" if occurs else "does not occur in the Lagrangian"
+    derivative = sympy.expand(system.lagrangian.diff(symbol(names[0])))
+    multiplies = derivative.has(*system.coordinates) and not derivative.has(symbol(names[0]), *system.velocities)
+    hint = f"; if {names[0]} is a Lagrange multiplier, give constraints=['{system.text_of(derivative)}'] in its place"
+    return (
+        f"coordinate '{names[0]}' of '{system.name}' has no kinetic energy: velocity '{velocities[0]}' {how}. "
+        f"{REQUIRED} Add the missing term, such as m*{velocities[0]}**2/2{hint if multiplies else ''}; if {names[0]} "
+        "is a known function of time, make it an input or write the function out"
+        f"{_undetermined(free)}"
+    )
+
+
+def _undetermined(free: Sequence[str]) -> str:
+    """Return the remark of a message that constraints do not determine the velocities of massless coordinates."""
+    return f". The constraints leave {', '.join(free)} free where all bodies with mass rest" if free else ""
+
+
+def _check_constraints(system: MechanicalSystem) -> None:
+    """Raise :class:`SystemDefinitionError` for constraints that are dependent or nonlinear in velocities."""
+    names = system.constraint_texts
+    for name, g in zip(names, system.constraints, strict=True):
+        if g.free_symbols.isdisjoint((*system.coordinates, *system.velocities)):
+            raise SystemDefinitionError(without_coordinate(f"{name} = 0"))
+    for k, i in jacobian(list(constraint_jacobian(system).values()), system.velocities):
+        name = names[list(constraint_jacobian(system))[k][0]]
+        raise SystemDefinitionError(
+            f"the constraint '{name}' is not linear in the velocity {system.velocities[i]}: "
+            f"constraints must have the form {forms_of_constraints()}"
+        )
+    if len(names) > system.dimension:
+        raise SystemDefinitionError(
+            f"there are {len(names)} constraints, but only {system.dimension} coordinates of '{system.name}': the "
+            "mechanism is overconstrained. At most as many independent constraints as coordinates are required "
+            "(as many prescribe the motion). Leave out redundant constraints"
+        )
+    if dependent := _dependent(system):
+        raise SystemDefinitionError(
+            f"the constraint '{names[dependent]}' is redundant: it depends on the constraints before it. Remove it"
+        )
+
+
+def _dependent(system: MechanicalSystem) -> int:
+    """Return the index of the first constraint dependent on earlier ones at every sampled point, or 0."""
+    derivatives, count = constraint_jacobian(system), len(system.constraints)
+    tape, first = None, 0
+    for point in sample_points(system.coordinates, (system.time,), system.constants):
+        tape = tape or Tape(list(derivatives.values()), list(point))
+        try:
+            values = tape(list(point.values()))
+        except ArithmeticError:
+            continue
+        matrix = np.zeros((count, system.dimension))
+        for (i, j), value in zip(derivatives, values, strict=True):
+            matrix[i, j] = float(value)
+        if row_rank(matrix) == count:
+            return 0
+        first = max(first, next(k for k in range(count) if row_rank(matrix[: k + 1]) <= k))
+    return first

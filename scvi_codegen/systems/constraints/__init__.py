@@ -1,0 +1,152 @@
+"""Constraints of a system: kinds, reading, conditions, and constraint forces.
+
+d/dt L_v = L_q + f + G^T lambda with the rates G v + .. = 0 of all constraints. The index is not reduced
+(:mod:`scvi_codegen.methods.constraints`).
+"""
+
+import re
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import sympy
+from sympy import Expr, Symbol
+from sympy.core.function import AppliedUndef
+
+from scvi_codegen.common.errors import SystemDefinitionError
+from scvi_codegen.systems.constraints.holonomic import HOLONOMIC
+from scvi_codegen.systems.constraints.kind import Constrained, ConstraintKind
+from scvi_codegen.systems.constraints.nonholonomic import NONHOLONOMIC
+from scvi_codegen.systems.formulas.expressions import gradient, jacobian
+from scvi_codegen.systems.formulas.symbols import DOT, symbol
+
+CONSTRAINT_KINDS = {
+    "holonomic": HOLONOMIC,  # plain equations have its notation; conditions are those of the first kind that applies
+    "nonholonomic": NONHOLONOMIC,
+}
+"""Kinds of constraints by name."""
+
+Rate = Callable[[Expr], Expr]
+
+
+def forms_of_constraints() -> str:
+    """Return the general forms of all kinds, for messages."""
+    return ", or ".join(kind.form for kind in CONSTRAINT_KINDS.values())
+
+
+def without_coordinate(shown: str) -> str:
+    """Return the message for a constraint without coordinates."""
+    return (
+        f"the constraint '{shown}' contains no coordinate: constraints are {forms_of_constraints()}. Remove it, or "
+        "write the condition in terms of the coordinates"
+    )
+
+
+def constraint_sides(formula: Any) -> tuple[list[Any], Callable[[Sequence[Expr], Rate], Expr]]:
+    """Return the sides of a constraint, and the function that returns its expression from them.
+
+    Equations are ``left = right``, or SymPy's ``Eq``; a function on the left, ``function(f)``, denotes the kind, and
+    its argument is the first side.
+    """
+    equation = [formula.lhs, formula.rhs] if isinstance(formula, sympy.Eq) else [formula]
+    sides = formula.split("=") if isinstance(formula, str) else equation
+    if len(sides) > 2:
+        raise SystemDefinitionError(
+            f"the constraint '{formula}' has more than one '=': write one equation per constraint"
+        )
+    left = sides[0]
+    called = re.fullmatch(r"\s*(\w+)\s*\((.*)\)\s*", left, re.DOTALL) if isinstance(left, str) else None
+    function, argument = called.groups() if called else ("", left)
+    if isinstance(left, AppliedUndef) and len(left.args) == 1:
+        function, argument = left.func.__name__, left.args[0]
+    for kind in CONSTRAINT_KINDS.values():
+        if kind.function and kind.function == function:
+            return [argument, *sides[1:]], kind.expression
+    return sides, next(iter(CONSTRAINT_KINDS.values())).expression
+
+
+def constraints_of(constraints: Iterable[Any] | None, read: Callable[[Any], Expr], rate: Rate) -> tuple[Expr, ...]:
+    """Return the expression of each constraint, a formula that is 0 or an equation.
+
+    Args:
+        constraints: formulas and equations.
+        read: converts a side to an expression in canonical symbols.
+        rate: returns the time derivative of such an expression.
+
+    Raises:
+        SystemDefinitionError: for a formula of numbers.
+    """
+    result = []
+    for formula in constraints or ():
+        sides, expression = constraint_sides(formula)
+        read_sides = [read(side) for side in sides]
+        if all(side.is_number for side in read_sides):
+            raise SystemDefinitionError(without_coordinate(str(formula)))
+        result.append(expression(read_sides, rate))
+    return tuple(result)
+
+
+def kind_of(system: Constrained, expression: Expr) -> ConstraintKind:
+    """Return the kind of a constraint of a system."""
+    velocities = set(system.velocities)
+    return next(kind for kind in CONSTRAINT_KINDS.values() if kind.applies(expression, velocities))
+
+
+def constraint_multipliers(system: Constrained) -> tuple[Symbol, ...]:
+    """Return the symbols of the Lagrange multipliers lambda, one per constraint."""
+    return tuple(sympy.Symbol(f"lambda_{k}", real=True) for k in range(1, len(system.constraints) + 1))
+
+
+def position_conditions(system: Constrained) -> tuple[Expr, ...]:
+    """Return g(q, t) of each constraint, 0 for those without a condition on positions."""
+    return tuple(kind_of(system, g).position(g) for g in system.constraints)
+
+
+def velocity_conditions(system: Constrained) -> tuple[Expr, ...]:
+    """Return A v + b of each constraint, 0 for those whose condition is one on positions."""
+    return tuple(kind_of(system, g).velocity(g) for g in system.constraints)
+
+
+def constraint_rates(system: Constrained) -> tuple[Expr, ...]:
+    """Return the velocity form of each constraint: g_q v + g_t, or A v + b."""
+    return tuple(map(sympy.Add, time_derivatives(system, position_conditions(system)), velocity_conditions(system)))
+
+
+def constraints_work(system: Constrained) -> bool:
+    """Return whether constraint forces can do work: the rate of a constraint at zero velocity is not 0."""
+    at_rest = dict.fromkeys(system.velocities, sympy.S.Zero)
+    return any(rate.xreplace(at_rest) != 0 for rate in constraint_rates(system))
+
+
+def constraint_jacobian(system: Constrained) -> dict[tuple[int, int], Expr]:
+    """Return the non-zero entries of the constraint Jacobian G by (constraint, coordinate)."""
+    return jacobian(constraint_rates(system), system.velocities)
+
+
+def time_derivative(function: Expr, coordinates: Sequence[Symbol], time: Symbol) -> Expr:
+    """Return df/dt of a function of (q, t) along a trajectory, as an expression in (q, v, t); v is held constant."""
+    rates = [*(symbol(q.name + DOT) for q in coordinates), sympy.S.One]
+    return sympy.Add(*(derivative * rates[j] for j, derivative in gradient(function, (*coordinates, time)).items()))
+
+
+def rate_of_positions(function: Expr, coordinates: Sequence[Symbol], time: Symbol) -> Expr:
+    """Return df/dt as :func:`time_derivative`; raise if the function contains velocities, whose rates are unknown."""
+    if moving := sorted(function.free_symbols & {symbol(q.name + DOT) for q in coordinates}, key=str):
+        raise SystemDefinitionError(
+            f"the time derivative of {function} contains the acceleration of {moving[0]}: constraints are "
+            f"{forms_of_constraints()}"
+        )
+    return time_derivative(function, coordinates, time)
+
+
+def time_derivatives(system: Constrained, functions: Sequence[Expr]) -> tuple[Expr, ...]:
+    """Return df/dt of functions of (q, v, t), at constant v."""
+    return tuple(time_derivative(function, system.coordinates, system.time) for function in functions)
+
+
+def with_constraint_forces(system: Constrained, forces: Sequence[Expr]) -> tuple[Expr, ...]:
+    """Return the forces plus the constraint forces G^T lambda, m expressions."""
+    terms: list[list[Expr]] = [[force] for force in forces]
+    factors = constraint_multipliers(system)
+    for (k, i), derivative in constraint_jacobian(system).items():
+        terms[i].append(derivative * factors[k])
+    return tuple(sympy.Add(*row) for row in terms)

@@ -1,0 +1,249 @@
+"""Events: zero crossings of functions of the state, as specified and as detected."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from numbers import Real
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.common.errors import EventError
+from scvi_codegen.common.representation import summary
+from scvi_codegen.common.validation import checked_count
+
+if TYPE_CHECKING:
+    from sympy import Basic, Expr
+
+Array = NDArray[np.float64]
+DIRECTIONS = (-1, 0, 1)
+COMPARISON = re.compile(r"(>=|<=|>|<)")
+LOOPS = re.compile(r"\s+for\b.*", re.DOTALL)
+UNDEFINED = "the event function '{function}' is not finite in the step from t = {t:.17g}"
+UNDEFINED_CHANGE = (
+    "the state after the event '{function}' is not finite in the step from t = {t:.17g}: a formula of then= or "
+    "restitution is undefined at the state of the event; change it, or limit the event by where="
+)
+ACCUMULATED = (
+    "the crossings of the terminal event '{function}' accumulate at t = {t:.17g}: the run starts at its zero and "
+    "returns within a rounding error (Zeno behaviour, as of infinitely many bounces). End the run here, or continue "
+    "with a constraint"
+)
+
+THROUGH = (
+    "the state passes the wall '{function}' in the step from t = {t:.17g} without an impact: it started on the "
+    "wall or was at rest there, or two impacts are closer than rounding. Start before the wall, end the run before "
+    "that time, or continue with a constraint"
+)
+BEHIND = (
+    "the run starts behind the wall '{function}', which is {g:.6g} at t = {t:.17g} and must not be negative. Start in "
+    "its region, change its sign if the region is the other one, or limit the wall by where="
+)
+
+JAMMED = (
+    "the changes of the state by '{function}' do not end in the step from t = {t:.17g}: a point is jammed in a corner "
+    "that closes, constraints leave no motion away from it, or the new state crosses zero again. Check then= and where="
+)
+
+
+Formula: TypeAlias = "str | Expr | float"
+"""Formula as text or a SymPy expression, or a number."""
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Zero crossings of a function g(q, v, p, t; inputs, parameters), which may change the state.
+
+    Attributes:
+        function: g, as a formula or a SymPy expression in the coordinates, their velocities (``q_dot``), their momenta
+            (``p_q``, or the names of the Hamiltonian), time ``t``, inputs and parameters. For arrays of run-time sizes
+            ``"r[i, 0] for i in N"`` is a function for each element; its index may occur in all formulas of the event.
+        direction: 1 for crossings from negative to positive in the direction of the run, -1 for the opposite, 0 both.
+        terminal: ``True`` if the first crossing ends the run, or the number of the crossing that ends it. Simultaneous
+            crossings of other events (two walls in a corner) are recorded as well.
+        then: new values of coordinates, and of momenta or velocities, by name: ``{"p_y": "-e*p_y"}``, formulas of the
+            state at the crossing, from which the run continues.
+        where: condition of crossings, ``"x > 1"``, or several of them; other crossings are ignored.
+        restitution: of a wall g = 0 (:func:`impact`), its coefficient; instead of ``then``.
+
+    Raises:
+        EventError: if the function, the direction, or a change of the state is invalid.
+        StateError: if ``terminal`` is negative.
+    """
+
+    function: str | Expr
+    direction: int = 0
+    terminal: bool | int = False
+    then: Mapping[str | Expr, Formula] | tuple[tuple[str, Formula], ...] | None = None
+    where: str | Basic | tuple[str | Basic, ...] | None = None
+    restitution: Formula | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.function, str) and not hasattr(self.function, "free_symbols"):
+            raise EventError(f"the function of an event must be text or a SymPy expression, not {self.function!r}")
+        if self.direction not in DIRECTIONS:
+            raise EventError(f"the direction of an event must be 1, -1 or 0, not {self.direction!r}")
+        checked_count(int(self.terminal) if isinstance(self.terminal, bool) else self.terminal, "terminal", least=0)
+        if self.restitution is not None and (self.then is not None or self.direction != -1):
+            raise EventError(
+                f"the wall '{self.function}' must have direction=-1 and no then=: use impact('{self.function}', "
+                f"restitution={self.restitution!r})"
+            )
+        number = 0.0
+        with suppress(TypeError, ValueError):  # of formulas with names
+            number = float(cast(float, self.restitution))
+        if not 0.0 <= number <= 1.0:
+            raise EventError(f"the restitution of the wall '{self.function}' is {self.restitution}: give 0 to 1")
+        if isinstance(self.then, Mapping):
+            object.__setattr__(self, "then", tuple((_name(key), value) for key, value in self.then.items()))
+        if self.then is not None and (not isinstance(self.then, tuple) or not self.then):
+            raise EventError(
+                f"then= of the event '{self.function}' must be new values by name, {{'p_y': '-p_y'}}, not {self.then!r}"
+            )
+        for name, value in self.changes:
+            if not isinstance(value, str | Real) and not hasattr(value, "free_symbols"):
+                raise EventError(
+                    f"then= of the event '{self.function}' sets '{name}' to {value!r}: give one formula or number for "
+                    "each component, by its name"
+                )
+        if isinstance(self.where, list):
+            object.__setattr__(self, "where", tuple(self.where))
+        _ = self.conditions
+
+    def check_function(self, moving: Sequence[str], *, constant: bool) -> None:
+        """Raise :class:`EventError` for a constant function, and a wall that contains ``moving``, momenta or rates."""
+        if constant:
+            raise EventError(
+                f"the event function '{self.function}' is constant and never crosses zero: use a function of the "
+                "state or of time"
+            )
+        if self.restitution is not None and moving:
+            raise EventError(
+                f"the wall '{self.function}' of an impact contains '{moving[0]}': a wall is a function of "
+                "positions, time and parameters; write the change of the state with then="
+            )
+
+    @property
+    def loops(self) -> str:
+        """Loops of an event with a function for each of their elements, ``" for i in N"``; else empty."""
+        loops = LOOPS.search(self.function) if isinstance(self.function, str) else None
+        return loops[0] if loops else ""
+
+    @property
+    def changes_state(self) -> bool:
+        """Return whether crossings change the state."""
+        return self.then is not None or self.restitution is not None
+
+    @property
+    def changes(self) -> tuple[tuple[str, Formula], ...]:
+        """Names and new values of the variables that crossings set."""
+        return cast("tuple[tuple[str, Formula], ...]", self.then or ())
+
+    @property
+    def conditions(self) -> tuple[Formula, ...]:
+        """Formulas that are >= 0 where the conditions of ``where`` are satisfied."""
+        if self.where is None:
+            return ()
+        return tuple(map(_condition, self.where if isinstance(self.where, tuple) else (self.where,)))
+
+    @property
+    def table(self) -> dict[str, Any]:
+        """Table ``[[events]]`` of a model file; ``Event(**table)`` is this event, with formulas as text."""
+
+        def plain(value: Any) -> Any:
+            return [*map(str, value)] if isinstance(value, tuple) else value if isinstance(value, kinds) else str(value)
+
+        kinds = str, int, float
+        named = {name: getattr(self, name) for name in ("function", "where", "restitution", "direction", "terminal")}
+        unset = {"direction": 0, "terminal": 0}
+        table = {name: plain(value) for name, value in named.items() if value != unset.get(name)}
+        return table | ({"then": {name: plain(value) for name, value in self.changes}} if self.then else {})
+
+
+def _name(variable: Any) -> str:
+    """Return the name of a variable that an event sets, from text or SymPy."""
+    if isinstance(variable, str):
+        return variable
+    rate = getattr(variable, "expr", None)  # a derivative by time
+    name = getattr(getattr(variable if rate is None else rate, "func", None), "__name__", "")
+    return f"{name}_dot" if rate is not None else str(getattr(variable, "name", name))
+
+
+def _condition(condition: Any) -> Formula:
+    """Return the formula that is >= 0 where a condition is satisfied, ``"x > 1"`` or a SymPy relation."""
+    if isinstance(condition, str):
+        sides = COMPARISON.split(condition)
+        if len(sides) == 3 and sides[0].strip() and sides[2].strip():
+            left, right = (sides[0], sides[2]) if sides[1][0] == ">" else (sides[2], sides[0])
+            return f"({left.strip()}) - ({right.strip()})"
+    elif hasattr(condition, "gts"):
+        return cast(Formula, condition.gts - condition.lts)
+    raise EventError(f"where= must be a comparison such as 'x > 1', or several of them, not {condition!r}")
+
+
+def impact(
+    function: str | Expr,
+    restitution: Formula = 1.0,
+    *,
+    where: str | Basic | tuple[str | Basic, ...] | None = None,
+    terminal: bool | int = False,
+) -> Event:
+    """Return the event of frictionless impacts on the wall g(q, t) = 0 of the region g > 0.
+
+    The impulse is normal, p += lambda g_q. With ``restitution=1`` it conserves energy, H(p + lambda g_q) - H(p) =
+    -lambda g_t; with a coefficient e < 1 it is (1 + e)/2 of that, which is Newton's rule where the kinetic energy is
+    quadratic. A point that touches several walls is reflected by each in turn.
+
+    Args:
+        function: g, in coordinates, time and parameters; a wall that depends on time moves.
+        restitution: coefficient e, a number from 0 to 1 or a formula.
+        where, terminal: as of :class:`Event`.
+    """
+    return Event(function, direction=-1, terminal=terminal, where=where, restitution=restitution)
+
+
+EventLike: TypeAlias = "Event | str | Expr"
+"""An event, or its function."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Crossings:
+    """Crossings of one event, in the order of the run.
+
+    At each of them g has its new sign or is 0; one rounding error earlier it has the old sign. A run started from such
+    a state does not detect the same crossing again. States are those before a change by the event.
+
+    Attributes:
+        event: the event.
+        t: (k,) times.
+        q, p: (k, m) states; NaN, with an :class:`~scvi_codegen.common.errors.EventWarning`, if those of a run exceed 1
+            GiB.
+        element: (k,) numbers of the elements of its loops, 0 without loops; i for ``"q[i] for i in N"``.
+    """
+
+    event: Event
+    t: Array
+    q: Array
+    p: Array
+    element: NDArray[np.int64]
+
+    __repr__ = summary("event", "t")
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def chosen(self, which: NDArray[np.bool_]) -> Crossings:
+        """Return the crossings selected by a (k,) boolean mask."""
+        return replace(self, **{name: getattr(self, name)[which] for name in ("t", "q", "p", "element")})
+
+
+def as_events(events: EventLike | Sequence[EventLike] | None) -> tuple[Event, ...]:
+    """Return a tuple of events from one or several events or functions."""
+    if events is None:
+        return ()
+    several = events if isinstance(events, list | tuple) else (events,)
+    return tuple(event if isinstance(event, Event) else Event(event) for event in several)

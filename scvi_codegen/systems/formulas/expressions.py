@@ -1,0 +1,523 @@
+"""SymPy expressions: canonical form, check against the grammar, derivatives, evaluation in 60 digits.
+
+Derivatives are computed by forward accumulation, in which each node carries only its own non-zero partial derivatives.
+The Lagrangian of a lattice has a thousand terms and hundreds of variables, but each term depends on two or three.
+Nothing is simplified; entries that SymPy's constructors evaluate to 0 are omitted. Every distinct node is
+differentiated once, with respect to all variables, which is much faster than ``Expr.diff``, term by term.
+
+Values are computed by straight-line programs that evaluate each subexpression once.
+"""
+
+from __future__ import annotations
+
+import operator
+import random
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from functools import lru_cache
+from itertools import islice
+from typing import Any
+
+import numpy as np
+import sympy
+from sympy import Add, Expr, Function, Mul, Pow, Rational, S, Symbol, log
+from sympy.core.function import AppliedUndef
+
+from scvi_codegen.common.precision import Number, mp
+from scvi_codegen.systems.formulas.adjoints import Elimination, Gradient, gradient_by_adjoints
+from scvi_codegen.systems.formulas.intermediates import (
+    Intermediate,
+    intermediate,
+    intermediates,
+    root_of_square,
+    with_even_roots,
+)
+
+LARGEST = 1.7976931348623157e308
+"""Largest finite C double."""
+
+
+def _call(printer: Any, name: str, *arguments: Any) -> str:
+    """Return a call of a function of NumPy or mpmath, for printers of :func:`sympy.lambdify`."""
+    return f"{printer._module_format(name)}({', '.join(map(printer._print, arguments))})"
+
+
+class rint(Function):  # type: ignore[misc]  # noqa: N801  (a function of formulas, like sympy.sin)
+    """Nearest whole number, of two the even one; its derivative is 0."""
+
+    is_real = True
+
+    @classmethod
+    def eval(cls, x: Expr) -> Expr | None:
+        """Return the value at a number."""
+        return sympy.Integer(round(x.evalf(50))) if x.is_number and x.is_finite and x.is_real else None
+
+    def fdiff(self, argindex: int = 1) -> Expr:
+        """Return 0."""
+        return S.Zero
+
+    def _numpycode(self, printer: Any) -> str:
+        return _call(printer, "numpy.rint", *self.args)
+
+    _scipycode = _numpycode
+
+    def _mpmathcode(self, printer: Any) -> str:
+        return _call(printer, "mpmath.nint", *self.args)
+
+
+class unit_step(Function):  # type: ignore[misc]  # noqa: N801
+    """1 where the argument is positive, 0 where it is negative; its derivative is 0."""
+
+    is_real = True
+
+    @classmethod
+    def eval(cls, x: Expr) -> Expr | None:
+        """Return the value at a number, 1 at 0."""
+        return sympy.Integer(int(bool(x.evalf(50) >= 0))) if x.is_number and x.is_finite and x.is_real else None
+
+    def _eval_power(self, exponent: Expr) -> Expr | None:
+        return self if exponent.is_positive else 1 / self if exponent.is_negative and exponent != -1 else None
+
+    def fdiff(self, argindex: int = 1) -> Expr:
+        """Return 0."""
+        return S.Zero
+
+    def _numpycode(self, printer: Any) -> str:
+        return _call(printer, "numpy.heaviside", *self.args, S.One)
+
+    _scipycode = _numpycode
+
+    def _mpmathcode(self, printer: Any) -> str:
+        return f"({_call(printer, 'mpmath.sign', *self.args)} >= 0)"
+
+
+def kinks_of(expressions: Iterable[Expr]) -> set[Expr]:
+    """Return functions at whose zeros expressions may jump or have a kink: x of unit_step(x), cos(pi x) of rint(x)."""
+    found = {f for e in expressions for f in (e, *(each.definition for each in intermediates(e)))}
+    jumps = {part for part in parts(*found) if isinstance(part, unit_step | rint)}
+    return {each.args[0] if isinstance(each, unit_step) else sympy.cos(sympy.pi * each.args[0]) for each in jumps}
+
+
+def wrap(x: Expr, length: Expr) -> Expr:
+    """Return x - L rint(x / L), the number of smallest size that differs from x by a multiple of L."""
+    return x - length * rint(x / length)
+
+
+def positive_part(x: Expr) -> Expr:
+    """Return x where it is positive, else 0."""
+    return x * unit_step(x)
+
+
+FUNCTIONS: Mapping[str, Callable[..., Expr]] = {
+    function.__name__: function
+    for function in (
+        *(sympy.sin, sympy.cos, sympy.tan, sympy.asin, sympy.acos, sympy.atan, sympy.atan2),
+        *(sympy.sinh, sympy.cosh, sympy.tanh, sympy.asinh, sympy.acosh, sympy.atanh),
+        *(sympy.exp, sympy.log, sympy.sqrt),
+        *(rint, unit_step, wrap, positive_part),
+    )
+}
+"""Functions of the grammar by name; all take one argument, those of ``OF_TWO`` two."""
+OF_TWO = ("atan2", "wrap")
+PIECEWISE_CONSTANT: Mapping[str, tuple[Callable[[Number], Number], Callable[..., Any]]] = {
+    "rint": (mp.nint, np.rint),
+    "unit_step": (lambda x: mp.mpf(x >= 0), lambda x: np.heaviside(x, 1.0)),
+}
+"""Piecewise constant functions of mpmath and NumPy."""
+
+NAME_OF = {function: name for name, function in FUNCTIONS.items() if isinstance(function, type)}
+CONSTANTS = {"pi": S.Pi}
+
+
+def shortened(node: Any) -> str:
+    """Return the text of an expression, cut to 60 characters."""
+    text = str(node)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def parts(*expressions: sympy.Basic) -> dict[sympy.Basic, None]:
+    """Return all distinct subexpressions, beginning with the expressions themselves."""
+    result = dict.fromkeys(expressions)
+    waiting = list(expressions)
+    while waiting:
+        new = [argument for argument in waiting.pop().args if argument not in result]
+        result.update(dict.fromkeys(new))
+        waiting += new
+    return result
+
+
+def parts_of_type(kind: type, *expressions: sympy.Basic) -> set[Any]:
+    """Return the distinct subexpressions of a class."""
+    return {part for part in parts(*expressions) if isinstance(part, kind)}
+
+
+CONSTANT_VALUES = {sympy.S.Pi: mp.mpf(mp.pi), sympy.S.Exp1: mp.mpf(mp.e)}
+
+
+class Tape:
+    """Straight-line program of several expressions in the same symbols.
+
+    Args:
+        expressions: of the grammar of :mod:`~scvi_codegen.systems.formulas.grammar`.
+        symbols: all that occur in them.
+    """
+
+    def __init__(self, expressions: Sequence[sympy.Expr], symbols: Sequence[sympy.Symbol]) -> None:
+        self.symbols = tuple(symbols)
+        self._start: list[Number] = [mp.zero] * len(symbols)
+        self._places: dict[sympy.Expr, int] = {symbol: register for register, symbol in enumerate(symbols)}
+        self._steps: list[tuple[int, Callable[..., Number], tuple[int, ...]]] = []
+        for each in intermediates(*expressions):
+            self._place(each)
+        self._results = [self._place(expression) for expression in expressions]
+
+    def __call__(self, numbers: Sequence[Number]) -> list[Number]:
+        """Return the values at a point.
+
+        Raises:
+            ArithmeticError: if a value is not real or not within the range of a C double.
+        """
+        values = [*numbers, *self._start[len(numbers) :]]
+        try:
+            for register, operation, operands in self._steps:
+                values[register] = operation(*[values[operand] for operand in operands])
+        except (ValueError, TypeError, AttributeError) as error:
+            raise ArithmeticError(f"no real value: {error}") from error
+        results = [values[register] for register in self._results]
+        if not all(isinstance(value, mp.mpf) and abs(value) <= LARGEST for value in results):
+            raise ArithmeticError("a value is not a finite real number: the state is outside the domain of the formula")
+        return results
+
+    def _place(self, expression: sympy.Expr) -> int:
+        """Return the index of an expression's value, appending the operations that compute it."""
+        if expression in self._places:
+            return self._places[expression]
+        if expression.args:
+            operands = tuple(self._place(argument) for argument in expression.args)
+            operation, operands = _operation(expression, operands)
+            self._steps.append((len(self._start), operation, operands))
+            self._start.append(mp.zero)
+        else:
+            known = CONSTANT_VALUES.get(expression)
+            self._start.append(mp.mpf(int(expression.p)) / int(expression.q) if known is None else known)
+        self._places[expression] = len(self._start) - 1
+        return self._places[expression]
+
+
+def _operation(expression: sympy.Expr, operands: tuple[int, ...]) -> tuple[Callable[..., Number], tuple[int, ...]]:
+    if expression.is_Add:
+        return (operator.add if len(operands) == 2 else lambda *terms: mp.fsum(terms)), operands
+    if expression.is_Mul:
+        return (operator.mul if len(operands) == 2 else lambda *factors: mp.fprod(factors)), operands
+    if isinstance(expression, Intermediate):
+        return operator.pos, operands
+    if not expression.is_Pow:
+        name = NAME_OF[expression.func]
+        return PIECEWISE_CONSTANT[name][0] if name in PIECEWISE_CONSTANT else getattr(mp, name), operands
+    exponent = expression.exp
+    if exponent.is_Integer:
+        power = int(exponent)
+        return (lambda x: x**power), operands[:1]
+    return mp.power, operands
+
+
+def evaluate(expression: sympy.Expr, values: Mapping[sympy.Symbol, Number]) -> Number:
+    """Return the value of an expression at one point, in 60 digits.
+
+    Args:
+        expression: of the grammar.
+        values: a number for each of its symbols.
+
+    Raises:
+        ArithmeticError: if the value, or that of a subexpression, is not real or exceeds the range of a C double.
+    """
+    try:
+        return Tape(list(parts(expression)), list(values))(list(map(mp.mpf, values.values())))[0]
+    except ArithmeticError as error:
+        raise ArithmeticError(f"'{shortened(expression)}' is not a finite real number") from error
+
+
+ATTEMPTS, SAMPLES = 24, 4
+"""Numbers of random points at which formulas are evaluated at most, and at which an identity must hold."""
+NEGLIGIBLE = mp.mpf(10) ** -40
+"""Largest sum that counts as 0, relative to the sum of the absolute values of its terms."""
+
+
+def samples(expressions: Sequence[Expr]) -> Iterator[list[Number]]:
+    """Yield values in 60 digits at reproducible random points of order 1, without those where one is undefined."""
+    symbols = sorted(set().union(*(expression.free_symbols for expression in expressions)), key=str)
+    tape, generator = Tape(expressions, symbols), random.Random(20250101)
+    for _ in range(ATTEMPTS):
+        with suppress(ArithmeticError):
+            yield tape([mp.mpf(generator.uniform(0.3, 1.3)) for _ in symbols])
+
+
+def sums_to_zero(terms: Sequence[Expr]) -> bool:
+    """Return whether the sum of terms is zero at ``SAMPLES`` random points; false where it is undefined."""
+    values = list(islice(samples(terms), SAMPLES)) if Add(*terms) != 0 else [[mp.zero]] * SAMPLES
+    zeros = (abs(mp.fsum(parts)) <= NEGLIGIBLE * mp.fsum(map(abs, parts)) for parts in values)
+    return len(values) == SAMPLES and all(zeros)
+
+
+MAX_EXPONENT = 64
+MAX_EXPONENT_DENOMINATOR = 10_000
+MAX_BITS = 2048
+MAX_DIGITS = 616
+"""Maximum number of decimal digits of an integer of ``MAX_BITS`` bits."""
+MAX_PASSES = 8
+
+
+def bits(number: Expr) -> int:
+    """Return the size of a rational, the bits of its numerator or denominator; 0 for other expressions."""
+    return max(int(number.p).bit_length(), int(number.q).bit_length()) if number.is_Rational else 0
+
+
+def beyond_double(number: Expr) -> bool:
+    """Return whether a rational overflows as a C double, or underflows to 0."""
+    p, q = abs(int(number.p)), int(number.q)
+    return p > int(LARGEST) * q or (p > 0 and p << 1075 <= q)
+
+
+NODES = frozenset([Add, Mul, Pow, Intermediate, *NAME_OF])
+
+
+_SMOOTHER = {
+    "Abs": "the absolute value is not differentiable, and neither is sqrt(x**2)",
+    "sign": "the sign is not differentiable",
+    "Piecewise": "piecewise functions are not differentiable where pieces meet",
+    "Heaviside": "step functions are not differentiable",
+    "Max": "the maximum is not differentiable",
+    "Min": "the minimum is not differentiable",
+    "ImaginaryUnit": "a Lagrangian must be real",
+}
+SWITCHES = frozenset(("abs", "sign", "max", "min", "heaviside", "piecewise"))
+BY_EVENTS = (
+    ". A force or velocity that switches, an impact or a stop is an event: events=sc.impact(..), or "
+    "sc.Event(.., then={..}); see docs/events.md. For dry friction and contact that persists use Siconos or Drake"
+)
+"""Advice for functions that are not smooth."""
+
+
+def unsupported_part(expression: Expr) -> str | None:
+    """Return why an expression is outside the grammar, or ``None``; shared by parser, printer and systems.
+
+    Rejected are other functions, floating-point numbers, non-finite or non-real constants, numbers of more than
+    ``MAX_BITS`` bits and constant exponents beyond ``MAX_EXPONENT``.
+    """
+    return next(filter(None, map(_node_problem, parts(expression))), None) or _constant_problem(expression)
+
+
+def _node_problem(node: Any) -> str | None:
+    if not node.args:
+        if node.is_Symbol or node in (S.Pi, S.Exp1):
+            return None
+        if node.is_Rational and bits(node) > MAX_BITS:
+            return f"a constant exceeds {MAX_BITS} bits, more than any C double can represent"
+        if node.is_Rational:
+            return f"the constant {shortened(node)} exceeds the range of a C double" if beyond_double(node) else None
+        if node in (S.NaN, S.ComplexInfinity, S.Infinity, S.NegativeInfinity):
+            return f"a part of the formula is not finite ({node})"
+    elif node.func in NODES:
+        return exponent_problem(node.exp) if node.is_Pow else None
+    kind = type(node).__name__
+    reason = f": {_SMOOTHER[kind]}" if kind in _SMOOTHER else ""
+    known = ", ".join([*FUNCTIONS, *CONSTANTS])
+    advice = BY_EVENTS if kind.lower() in SWITCHES else ""
+    return f"{kind} ('{shortened(node)}') is not supported{reason}. Use + - * / ** and {known}{advice}"
+
+
+def kinked_root(formula: Expr, variables: Collection[Symbol]) -> str | None:
+    """Return why a formula has a kink, a root of the square of a function of variables, or ``None``."""
+    kink = root_of_square(formula, variables)
+    if kink is None:
+        return None
+    return (
+        f"Abs({shortened(kink)}), the root of its square, is not differentiable where it is 0: write "
+        f"{shortened(kink)} if it is positive{BY_EVENTS}"
+    )
+
+
+def exponent_problem(exponent: Expr) -> str | None:
+    """Return why the rational part of an exponent is too large: SymPy extracts 2**10**9 from 2**(x + 10**9)."""
+    constant = exponent.as_coeff_Add(rational=True)[0]
+    if abs(constant) <= MAX_EXPONENT and constant.q <= MAX_EXPONENT_DENOMINATOR:
+        return None
+    return (
+        f"the constant {shortened(constant)} in an exponent is not supported: it must lie between "
+        f"-{MAX_EXPONENT} and {MAX_EXPONENT}, with a denominator of at most {MAX_EXPONENT_DENOMINATOR}"
+    )
+
+
+def _constant_problem(expression: Expr) -> str | None:
+    """Return why a maximal subexpression without symbols is not a finite real number, or ``None``."""
+    pending, seen = [expression], {expression}
+    while pending:
+        node = pending.pop()
+        if not node.is_number:
+            new = [argument for argument in node.args if argument.args and argument not in seen]
+            seen.update(new)
+            pending += new
+        elif node.args:
+            try:
+                evaluate(node, {})
+            except ArithmeticError:
+                return f"the constant '{shortened(node)}' is not a finite real number"
+    return None
+
+
+def evaluated(expression: Expr, replacements: Mapping[Expr, Expr] | None = None) -> Expr:
+    """Replace parts, make floating-point numbers rational and re-evaluate all constructors until nothing changes.
+
+    SymPy leaves some nodes as no constructor would build them (``evaluate=False``, but also ``-((1/2)**x - 1)``); the
+    result equals the parsed text of the expression. A float becomes the rational of its shortest decimal form.
+    """
+    rules = dict(replacements or {})
+    for _ in range(MAX_PASSES):
+        for each in intermediates(expression):
+            _rebuilt(each, rules)
+        result = _rebuilt(expression, rules)
+        if result == expression:
+            break
+        expression, rules = result, {}
+    return expression
+
+
+def _rebuilt(expression: Expr, known: dict[Expr, Expr]) -> Expr:
+    if expression not in known:
+        known[expression] = _rebuilt_node(expression, known)
+    return known[expression]
+
+
+def _rebuilt_node(expression: Expr, known: dict[Expr, Expr]) -> Expr:
+    if expression.is_Float:
+        value = float(expression)
+        return Rational(repr(value) if expression == value else str(expression))
+    if not expression.args or isinstance(expression, (sympy.Derivative, AppliedUndef)):
+        return expression
+    arguments = [_rebuilt(argument, known) for argument in expression.args]
+    if isinstance(expression, Intermediate):
+        return intermediate(arguments[0])
+    rebuilt = expression.func(*arguments)
+    is_root = expression.is_Pow and not expression.exp.is_integer
+    return with_even_roots(rebuilt) if is_root or isinstance(expression, sympy.Abs) else rebuilt
+
+
+def gradient(expression: Expr, variables: Sequence[Symbol]) -> dict[int, Expr]:
+    """Return the non-zero first derivatives of ``expression``, by index into ``variables``, ascending.
+
+    >>> from sympy.abc import x, y, z
+    >>> gradient(x**2 * z + z, [x, y, z])
+    {0: 2*x*z, 2: x**2 + 1}
+    """
+    return dict(sorted(_accumulation(tuple(variables)).total(expression).items()))
+
+
+def gradient_tuple(expression: Expr, variables: Sequence[Symbol]) -> tuple[Expr, ...]:
+    """Return the first derivatives of ``expression`` by all variables, zeros included."""
+    derivatives = gradient(expression, variables)
+    return tuple(derivatives.get(k, S.Zero) for k in range(len(variables)))
+
+
+def jacobian(
+    expressions: Sequence[Expr] | Mapping[int, Expr], variables: Sequence[Symbol], *, symmetric: bool = False
+) -> dict[tuple[int, int], Expr]:
+    """Return the non-zero first derivatives of several expressions, by (row, column), ascending.
+
+    Args:
+        expressions: the rows, as a sequence or by index (what ``gradient`` returns).
+        variables: the columns.
+        symmetric: whether the upper triangle equals the lower one, from which it may be copied.
+
+    >>> from sympy.abc import x, y
+    >>> jacobian([x * y, y**2], [x, y])
+    {(0, 0): y, (0, 1): x, (1, 1): 2*y}
+    """
+    rows = expressions if isinstance(expressions, Mapping) else dict(enumerate(expressions))
+    return dict(sorted(_accumulation(tuple(variables)).rows(rows, symmetric=symmetric).items()))
+
+
+def hessian(expression: Expr, variables: Sequence[Symbol]) -> dict[tuple[int, int], Expr]:
+    """Return the non-zero second derivatives by (row, column), ascending; both triangles, which share their entries.
+
+    >>> from sympy.abc import x, y
+    >>> hessian(x**2 * y, [x, y])
+    {(0, 0): 2*y, (0, 1): 2*x, (1, 0): 2*x}
+    """
+    entries = jacobian(gradient(expression, variables), variables, symmetric=True)
+    upper = {(row, column): entry for (row, column), entry in entries.items() if row <= column}
+    lower = {(column, row): entry for (row, column), entry in upper.items()}
+    return dict(sorted((upper | lower).items()))
+
+
+@lru_cache(maxsize=4)
+def _accumulation(variables: tuple[Symbol, ...]) -> _Accumulation:
+    """Return the shared cache for these variables, since the derivatives of a system are requested repeatedly."""
+    return _Accumulation(variables)
+
+
+class _Accumulation:
+    """Cache of the non-zero partial derivatives of every visited node, by index of the variable."""
+
+    def __init__(self, variables: Sequence[Symbol]) -> None:
+        self.variables = frozenset(variables)
+        self.known: dict[Expr, Gradient] = {variable: {index: S.One} for index, variable in enumerate(variables)}
+        self.jacobians: dict[tuple[tuple[Expr, ...], bool], dict[tuple[int, int], Expr]] = {}
+
+    def total(self, expression: Expr) -> dict[int, Expr]:
+        """Return the derivatives with respect to variables, also by way of intermediate quantities."""
+        return gradient_by_adjoints(self.of(expression), self.of)
+
+    def rows(self, expressions: Mapping[int, Expr], *, symmetric: bool) -> dict[tuple[int, int], Expr]:
+        """Return the derivatives of several expressions, by (row, column)."""
+        if not any(isinstance(key, Intermediate) for each in expressions.values() for key in self.of(each)):
+            return {(i, j): entry for i, each in expressions.items() for j, entry in self.of(each).items()}
+        key = (*expressions.values(),), symmetric
+        if key not in self.jacobians:
+            entries = Elimination(expressions, self.of, lower=symmetric).jacobian()
+            upper = {(j, i): entry for (i, j), entry in entries.items() if i > j} if symmetric else {}
+            self.jacobians[key] = entries | upper
+        return self.jacobians[key]
+
+    def of(self, node: Expr) -> Gradient:
+        if not node.args:
+            return self.known.get(node, {})
+        derivative = self.known.get(node)
+        if derivative is None:
+            derivative = self.known[node] = self.derived(node)
+        return derivative
+
+    def derived(self, node: Expr) -> Gradient:
+        if isinstance(node, Intermediate):
+            return {node: S.One} if self.variables & node.free_symbols else {}
+        inner = [self.of(argument) for argument in node.args]
+        return _combined(
+            [
+                (factor, derivatives)
+                for position, derivatives in enumerate(inner)
+                if derivatives and (factor := _partial(node, position)) is not S.Zero
+            ]
+        )
+
+
+def _combined(pairs: Sequence[tuple[Expr, Gradient]]) -> Gradient:
+    """Return the sum of factor times gradient: the chain rule."""
+    parts: dict[int, list[Expr]] = {}
+    for factor, derivatives in pairs:
+        for index, derivative in derivatives.items():
+            parts.setdefault(index, []).append(derivative if factor is S.One else Mul(factor, derivative))
+    total = {index: Add(*terms) for index, terms in parts.items()}
+    return {index: entry for index, entry in total.items() if entry is not S.Zero}
+
+
+def _partial(node: Expr, position: int) -> Expr:
+    """Return the derivative of a node with respect to its argument in ``position``."""
+    if isinstance(node, Add):
+        return S.One
+    if isinstance(node, Mul):
+        return Mul(*node.args[:position], *node.args[position + 1 :])
+    if isinstance(node, Pow):
+        base, exponent = node.args
+        return Mul(exponent, Pow(base, exponent - 1)) if position == 0 else Mul(node, log(base))
+    if isinstance(node, Function):
+        return node.fdiff(position + 1)
+    raise TypeError(f"cannot differentiate a {type(node).__name__}")

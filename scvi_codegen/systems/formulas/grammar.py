@@ -1,0 +1,359 @@
+"""Parser for formulas: a small whitelist grammar, without ``eval`` or ``sympify``.
+
+    sum      = product (("+" | "-") product)*
+    product  = signed (("*" | "/") signed)*
+    signed   = ("+" | "-")* power
+    power    = atom ["**" ("+" | "-")* atom]
+    atom     = number | name | function "(" sum ("," sum)* ")" | "(" sum ")"
+
+Precedences are Python's. Python's ``ast`` is not used because it fails for sums of some three thousand terms (long
+lattices have more), counts columns in bytes, and loses the digits of decimals and the brackets in towers of powers.
+Every number is exact (``0.1`` is 1/10), every node is built by a SymPy constructor, and sizes are checked *before* a
+constructor could fold a constant that fills the memory.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import ClassVar, NamedTuple, NoReturn
+
+from sympy import Add, Expr, Mul, Pow, Rational, S, Symbol
+
+from scvi_codegen.common.errors import ExpressionError, SystemDefinitionError, closest
+from scvi_codegen.systems.formulas.expressions import (
+    BY_EVENTS,
+    CONSTANTS,
+    FUNCTIONS,
+    MAX_BITS,
+    MAX_DIGITS,
+    NODES,
+    OF_TWO,
+    SWITCHES,
+    beyond_double,
+    bits,
+    evaluated,
+    exponent_problem,
+    unsupported_part,
+)
+from scvi_codegen.systems.formulas.intermediates import with_even_roots
+from scvi_codegen.systems.formulas.symbols import DOT
+
+MAX_CHARACTERS = 1_000_000
+"""Length limit; parsing time grows with length times bracket depth (fifty atoms in a gas: 212 000 characters)."""
+MAX_DEPTH = 100
+
+_TOKEN = re.compile(
+    r"(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>[A-Za-z_]\w*)|(?P<operator>\*\*|[-+*/(),])", re.ASCII
+)
+
+_SPACE = re.compile(r"[ \t\r\n\f]*")
+
+_HINTS = {
+    ".": "attribute access is not part of the grammar",
+    "[": "subscripts require arrays, declared among the coordinates or parameters, as q[N] (of a rotation: R_11)",
+    "^": "powers are written x**2",
+    "=": "write the right-hand side only; comparisons, assignments and keyword arguments are not part of the grammar",
+    "<": "comparisons are not part of the grammar",
+    ">": "comparisons are not part of the grammar",
+    "'": "write the velocity of q as q_dot; strings are not part of the grammar",
+    '"': "strings are not part of the grammar",
+    "|": "write abs(x)",
+    "\\": "LaTeX is not part of the grammar: write names and functions, as theta and sin(theta)",
+    "−": "write a minus sign as -",
+    "·": "write * for a product",
+    "×": "write * for a product",
+    "²": "powers are written x**2",
+    "#": "comments are not part of the grammar",
+    "%": "the remainder % is not part of the grammar",
+    "{": "sets are not part of the grammar",
+    ":": "lambda, slices and dictionaries are not part of the grammar",
+}
+
+
+class Token(NamedTuple):
+    """Token of a formula: a number, a name, an operator or the end."""
+
+    kind: str
+    text: str
+    column: int
+
+
+def parse_expression(text: str, symbols: Mapping[str, Symbol]) -> Expr:
+    """Parse one formula.
+
+    Args:
+        text: the formula; line breaks count as spaces.
+        symbols: the names it may use, in addition to ``pi`` and the names of ``FUNCTIONS``.
+
+    Returns:
+        The SymPy expression, free of floating-point numbers.
+
+    Raises:
+        ExpressionError: for anything outside the grammar, with its column.
+
+    >>> x = Symbol("x", real=True)
+    >>> parse_expression("0.5*x**2 - cos(2*x)/3", {"x": x})
+    x**2/2 - cos(2*x)/3
+    """
+    return parsed(Parser(text, symbols))
+
+
+def parsed(parser: Parser) -> Expr:
+    """Run a parser; any failure of SymPy becomes an :class:`ExpressionError`."""
+    text = parser.text
+    try:
+        return parser.parse()
+    except ExpressionError:
+        raise
+    except RecursionError:
+        message = "the formula is nested too deeply: name a part of it, or write it as a sum"
+        raise ExpressionError(message, text, parser.column) from None
+    except (ArithmeticError, AttributeError, TypeError, ValueError) as error:
+        # SymPy's own failures, for instance in sqrt(1e-300 - 9) and asin(sin(1e300))
+        message = "SymPy cannot evaluate the constants of this formula: make them parameters"
+        raise ExpressionError(message, text, parser.column) from error
+
+
+def _is_zero(part: Expr) -> bool:
+    """Return whether a constant is 0; formulas with symbols are not tested, which SymPy would do slowly."""
+    return bool(part.is_number and part.is_zero)
+
+
+def _spellings(name: str) -> tuple[str, ...]:
+    """Return usual other spellings of a velocity; none for other names."""
+    q = name.removesuffix(DOT)
+    return () if q == name else (f"v_{q}", f"v{q}", f"{q}dot", f"d{q}", f"d{q}_dt", f"{q}_d", f"{q}_t", f"dot_{q}")
+
+
+def _tokens(text: str, pattern: re.Pattern[str]) -> list[Token]:
+    if len(text) > MAX_CHARACTERS:
+        message = f"a formula of {len(text)} characters is too long: the limit is {MAX_CHARACTERS}"
+        raise ExpressionError(message, text, 0)
+    tokens, position = [], _SPACE.match(text).end()  # type: ignore[union-attr]  # the pattern matches nothing, too
+    while position < len(text):
+        match = pattern.match(text, position)
+        if match is None:
+            character = text[position]
+            hint = _HINTS.get(character, "names are made of the letters a-z, A-Z, digits and underscores")
+            raise ExpressionError(f"unexpected character {character!r}: {hint}", text, position)
+        tokens.append(Token(str(match.lastgroup), match.group(), position))
+        position = _SPACE.match(text, match.end()).end()  # type: ignore[union-attr]  # as above
+    tokens.append(Token("end", "", len(text.rstrip())))
+    return tokens
+
+
+class Parser:
+    """Recursive-descent parser; sums and products of any length are loops, only brackets recurse.
+
+    A grammar with further kinds of atoms is a subclass with its own ``pattern`` of tokens and :meth:`name`.
+    """
+
+    pattern: ClassVar[re.Pattern[str]] = _TOKEN
+
+    def __init__(self, text: str, symbols: Mapping[str, Symbol]) -> None:
+        if not isinstance(text, str):
+            raise SystemDefinitionError(f"a formula must be text, not {text!r:.60}: write it between quotes")
+        self.text, self.symbols = text, symbols
+        self.tokens = _tokens(text, self.pattern)
+        self.position = self.depth = 0
+
+    @property
+    def column(self) -> int:
+        """Column of the next token."""
+        return self.tokens[self.position].column
+
+    def parse(self) -> Expr:
+        """Parse the whole text."""
+        result = self.sum()
+        if self.tokens[self.position].kind != "end":
+            self.refuse_leftover()
+        result = evaluated(result)
+        problem = unsupported_part(result)
+        if problem:
+            self.refuse(problem, 0)
+        return result
+
+    def refuse(self, message: str, column: int) -> NoReturn:
+        """Raise an :class:`ExpressionError` at a column."""
+        raise ExpressionError(message, self.text, column)
+
+    def refuse_leftover(self) -> NoReturn:
+        """Raise an :class:`ExpressionError` at a token that fits nowhere."""
+        kind, text, column = self.tokens[self.position]
+        if kind == "operator" and text == "**":
+            self.refuse("a tower of powers is ambiguous: write (x**y)**z or x**(y**z)", column)
+        if kind == "operator" and text in "),":
+            self.refuse(f"unexpected '{text}': there is nothing for it to close or separate", column)
+        if kind == "end":
+            self.refuse("the formula ends inside brackets: a ')' is missing", column)
+        remedy = "only the functions of the grammar can be called" if text == "(" else "write * for a product"
+        self.refuse(f"an operator is missing before '{text}': {remedy}", column)
+
+    def accept(self, *operators: str) -> Token | None:
+        """Return and consume the next token if it is one of these operators, else ``None``."""
+        token = self.tokens[self.position]
+        if token.kind != "operator" or token.text not in operators:
+            return None
+        self.position += 1
+        return token
+
+    def close(self) -> None:
+        """Consume a closing bracket."""
+        if self.accept(")") is None:
+            self.refuse_leftover()
+        self.depth -= 1
+
+    def open(self, column: int) -> None:
+        """Increase the bracket depth."""
+        self.depth += 1
+        if self.depth > MAX_DEPTH:
+            self.refuse(f"brackets are nested deeper than {MAX_DEPTH}", column)
+
+    def sum(self) -> Expr:
+        """Parse ``product (("+" | "-") product)*``."""
+        column, terms = self.column, [self.product(negative=False)]
+        while token := self.accept("+", "-"):
+            terms.append(self.product(negative=token.text == "-"))
+        return terms[0] if len(terms) == 1 else self.bounded_sum(terms, column)
+
+    def bounded_sum(self, terms: list[Expr], column: int) -> Expr:
+        """Collect like terms, watching the size of each coefficient, then build one ``Add``."""
+        coefficients: dict[Expr, Expr] = {}
+        for term in terms:
+            for part in Add.make_args(term):
+                coefficient, rest = part.as_coeff_Mul(rational=True)
+                coefficients[rest] = self.bounded(coefficients.get(rest, S.Zero) + coefficient, column)
+        return Add(*(Mul(coefficient, rest) for rest, coefficient in coefficients.items()))
+
+    def bounded(self, number: Expr, column: int) -> Expr:
+        """Return the number; raise an error if it is too long."""
+        if bits(number) > MAX_BITS:
+            self.refuse(f"a constant exceeds {MAX_BITS} bits here, more than any C double can represent", column)
+        return number
+
+    def product(self, *, negative: bool) -> Expr:
+        """Parse ``signed (("*" | "/") signed)*``."""
+        column, coefficient, factors = self.column, S.NegativeOne if negative else S.One, []
+        inverse = False
+        while True:
+            factor_column = self.column
+            sign, factor = self.signed()
+            if inverse and _is_zero(factor):
+                self.refuse("division by zero", factor_column)
+            factor = Pow(factor, -1) if inverse else factor
+            number, rest = (factor, S.One) if factor.is_Rational else (S.One, factor)
+            coefficient = self.bounded(coefficient * sign * number, factor_column)
+            if rest is not S.One:
+                factors.append(rest)
+            token = self.accept("*", "/")
+            if token is None:
+                break
+            inverse = token.text == "/"
+        result = Mul(coefficient, *factors) if coefficient is not S.One or len(factors) != 1 else factors[0]
+        self.bounded(result.as_coeff_Mul(rational=True)[0], column)
+        return result
+
+    def sign(self) -> Expr:
+        """Parse signs and return their product."""
+        sign = S.One
+        while token := self.accept("+", "-"):
+            sign = -sign if token.text == "-" else sign
+        return sign
+
+    def signed(self) -> tuple[Expr, Expr]:
+        """Parse a signed power and return sign and power."""
+        return self.sign(), self.power()
+
+    def power(self) -> Expr:
+        """Parse ``atom ["**" exponent]``."""
+        column, base = self.column, self.atom()
+        operator = self.accept("**")
+        if operator is None:
+            return base
+        exponent_column = self.column
+        exponent = self.sign() * self.atom()
+        problem = exponent_problem(exponent)
+        if problem:
+            self.refuse(problem, exponent_column)
+        if _is_zero(base) and not exponent.is_positive:
+            self.refuse("division by zero: 0 to a power that is not positive", operator.column)
+        if exponent.is_Rational and bits(base.as_coeff_Mul(rational=True)[0]) * abs(exponent) > MAX_BITS:
+            self.refuse(f"a constant exceeds {MAX_BITS} bits here, more than any C double can represent", column)
+        return self.supported(Pow(base, exponent), operator.column)
+
+    def supported(self, result: Expr, column: int) -> Expr:
+        """Return the result, with even roots in place of Abs; raise an error if it is invalid: sqrt(-1), exp(10**9)."""
+        result = with_even_roots(result)
+        if result.is_number or (result.args and result.func not in NODES) or result.is_Pow:
+            problem = unsupported_part(result)
+            if problem:
+                self.refuse(problem, column)
+        return result
+
+    def atom(self) -> Expr:
+        """Parse a number, a name, a call or a bracket."""
+        kind, text, column = self.tokens[self.position]
+        if kind == "end":
+            self.refuse(
+                "the formula ends where a value is expected" if self.position else "the formula is empty", column
+            )
+        if kind == "operator" and text != "(":
+            self.refuse(f"a value is expected, not '{text}'", column)
+        self.position += 1
+        if kind == "number":
+            return self.number(text, column)
+        if kind == "name":
+            return self.name(text, column)
+        self.open(column)
+        result = self.sum()
+        self.close()
+        return result
+
+    def number(self, text: str, column: int) -> Expr:
+        """Return the exact value of a number."""
+        following = self.tokens[self.position]
+        if following.kind == "name" and following.text in ("j", "J") and following.column == column + len(text):
+            self.refuse("complex numbers are not part of the grammar", column)
+        mantissa, _, exponent = text.lower().partition("e")
+        whole = text.isdigit()  # an integer, perhaps the numerator of a fraction, may be longer
+        if len(mantissa) > (MAX_DIGITS if whole else 320) or len(exponent) > 8 or abs(int(exponent or 0)) > 640:
+            self.refuse("this number has too many digits: the largest C double is 1.8e308", column)
+        value = Rational(text)
+        if not whole and beyond_double(value):
+            self.refuse("this number exceeds the range of a C double", column)
+        return self.bounded(value, column)
+
+    def name(self, name: str, column: int) -> Expr:
+        """Return the symbol, constant or function call of a name."""
+        if name in FUNCTIONS:
+            return self.call(name, column)
+        if self.tokens[self.position][:2] == ("operator", "("):
+            known = ", ".join(FUNCTIONS)
+            known += BY_EVENTS if name.lower() in SWITCHES else ""
+            self.refuse(f"'{name}' is not a function of the grammar{closest(name, FUNCTIONS)} Known: {known}", column)
+        value = self.symbols.get(name, CONSTANTS.get(name))
+        if value is None:
+            known = ", ".join([*self.symbols, *CONSTANTS])
+            declared = (
+                f"declare a constant as a parameter: parameters={{'{name}': 1.0}}, in files [parameters] {name} = 1.0"
+            )
+            velocity = next((each for each in self.symbols if name in _spellings(each)), "")
+            hint = f"; did you mean '{velocity}'?" if velocity else closest(name, self.symbols)
+            self.refuse(f"unknown name '{name}'{hint} Known here: {known}; {declared}", column)
+        return value
+
+    def call(self, name: str, column: int) -> Expr:
+        """Parse a function call."""
+        opening = self.accept("(")
+        if opening is None:
+            self.refuse(f"'{name}' is a function: write {name}(...)", column)
+        self.open(opening.column)
+        arguments = [self.sum()]
+        while self.accept(","):
+            arguments.append(self.sum())
+        self.close()
+        expected = 2 if name in OF_TWO else 1
+        if len(arguments) != expected:
+            self.refuse(f"{name} takes {expected} argument{'s'[: expected - 1]}, not {len(arguments)}", column)
+        return self.supported(FUNCTIONS[name](*arguments), column)

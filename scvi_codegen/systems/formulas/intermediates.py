@@ -1,0 +1,241 @@
+"""Intermediate quantities: nodes of expressions that are computed once, and never expanded into what contains them.
+
+The velocity of the tenth body of a chain is a sum of ten terms times rotations if it is written in joint coordinates,
+and that of the hundredth of a hundred; as a function of the velocity of the body before it, all have the same length.
+SymPy merges nested sums and products. An :class:`Intermediate` is opaque to it, so that an expression remains a
+straight-line program, whose length is that of its definitions, and whose derivatives are computed by adjoints
+(:func:`~scvi_codegen.systems.formulas.expressions.gradient`).
+
+SymPy traverses expressions as trees, which takes exponential time where quantities share others. Comparisons, free
+symbols and replacements of an intermediate quantity are therefore computed once per definition.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Container, Sequence
+from itertools import count
+from typing import Any
+from weakref import WeakValueDictionary
+
+from sympy import Abs, Expr, S, Symbol, sqrt
+
+from scvi_codegen.common.errors import SystemDefinitionError
+
+LONGEST_WRITTEN = 20_000
+"""Largest number of nodes of a formula that is displayed or stored as text."""
+
+_NUMBERS = count()
+_KNOWN: WeakValueDictionary[Expr, Intermediate] = WeakValueDictionary()
+
+
+class Intermediate(Expr):  # type: ignore[misc]  # SymPy is untyped
+    """Expression with the value of its definition, which SymPy neither expands nor compares term by term.
+
+    Quantities with equal definitions are one object. Numbers ascend: those in a definition precede its own.
+    """
+
+    number: int
+    inner: tuple[Intermediate, ...]
+    is_commutative = True
+    is_real = True
+
+    def __new__(cls, definition: Expr) -> Intermediate:
+        """Return the quantity with this definition."""
+        known = _KNOWN.get(definition)
+        if known is None:
+            known = Expr.__new__(cls, definition)
+            known.number = next(_NUMBERS)
+            known.inner = inner_of(definition)
+            known._free = frozenset(definition.free_symbols)
+            _KNOWN[definition] = known
+        return known
+
+    @property
+    def definition(self) -> Expr:
+        """The expression that it abbreviates."""
+        return self.args[0]
+
+    @property
+    def free_symbols(self) -> set[Symbol]:
+        """Symbols of its definition and of all quantities in it."""
+        return set(self._free)
+
+    @property
+    def is_number(self) -> bool:
+        """True if its definition is a constant."""
+        return not self._free
+
+    def _hashable_content(self) -> tuple[int]:
+        return (self.number,)
+
+    def _printed(self, printer: Any, *_: Any) -> str:
+        """Return its definition in parentheses, or its number where that is too long to read."""
+        if printer.printmethod == "_sympystr" and written_size(self) > LONGEST_WRITTEN:
+            return f"w{self.number}"
+        return f"({printer._print(self.definition)})"
+
+    _sympystr = _latex = _pythoncode = _numpycode = _scipycode = _mpmathcode = _printed
+
+    def _eval_derivative(self, symbol: Symbol) -> Expr:
+        return self.definition.diff(symbol) if symbol in self._free else S.Zero
+
+    def _xreplace(self, rule: Any) -> tuple[Expr, bool]:
+        if _LAST[0] != rule:
+            _LAST[:] = dict(rule), {}
+        replaced: dict[Intermediate, tuple[Expr, bool]] = _LAST[1]
+        for each in intermediates(self, known=replaced):
+            if each in rule:
+                replaced[each] = (rule[each], True)
+            else:
+                value, changed = each.definition._xreplace(rule)
+                replaced[each] = (intermediate(value), True) if changed else (each, False)
+        return replaced[self]
+
+
+_LAST: list[Any] = [{}, {}]
+"""The last rule of replacements, and the quantities replaced by it, which an equal rule replaces next."""
+
+
+def intermediate(expression: Expr) -> Expr:
+    """Return an expression as an intermediate quantity; symbols, numbers and multiples of them as they are.
+
+    >>> from sympy.abc import x, y
+    >>> total = intermediate(x + y)
+    >>> (2 * total + x).free_symbols == {x, y}, intermediate(x + y) is total, intermediate(-x)
+    (True, True, -x)
+    """
+    rest = expression.as_coeff_Mul()[1]
+    return expression if rest.is_Atom or isinstance(rest, Intermediate) else Intermediate(expression)
+
+
+def separated(expressions: Sequence[Expr], variables: Collection[Symbol]) -> tuple[list[Expr], dict[Expr, Symbol]]:
+    """Return expressions as functions of variables and of new symbols, and the parts that these abbreviate.
+
+    The parts are the largest ones that do not depend on the variables, and are no numbers: values that need not be
+    computed again when only the variables change.
+    """
+    known: dict[Expr, Expr] = {}
+    parts: dict[Expr, Symbol] = {}
+
+    def read(node: Expr) -> Expr:
+        if node not in known:
+            known[node] = written(node)
+        return known[node]
+
+    def written(node: Expr) -> Expr:
+        if node in variables:
+            return node
+        if node.free_symbols.isdisjoint(variables):
+            factor, part = node.as_coeff_Mul()
+            return node if part.is_number else factor * parts.setdefault(part, Symbol(f"_{len(parts)}", real=True))
+        if isinstance(node, Intermediate):
+            return intermediate(read(node.definition))
+        if not (node.is_Add or node.is_Mul):
+            return node.func(*map(read, node.args))
+        constant = [each for each in node.args if each.free_symbols.isdisjoint(variables)]
+        return node.func(read(node.func(*constant)), *(read(each) for each in node.args if each not in constant))
+
+    for each in intermediates(*expressions):
+        if not each.free_symbols.isdisjoint(variables):
+            read(each)
+    return [*map(read, expressions)], parts
+
+
+def written_out(expression: Expr) -> Expr:
+    """Return an expression without intermediate quantities, for display.
+
+    Raises:
+        SystemDefinitionError: if it is too long.
+    """
+    size = written_size(expression)
+    if size > LONGEST_WRITTEN and inner_of(expression):
+        raise SystemDefinitionError(
+            f"the formula has {size} terms and factors if its intermediate quantities are written out; at most "
+            f"{LONGEST_WRITTEN} can be displayed or stored as text. Use a smaller mechanism, or keep the file from "
+            "which the system was read"
+        )
+    rules: dict[Expr, Expr] = {}
+    for each in intermediates(expression):
+        rules[each] = each.definition.xreplace(dict(rules))
+    return with_even_roots(expression.xreplace(rules)) if rules else expression
+
+
+def with_even_roots(expression: Expr) -> Expr:
+    """Write ``Abs(u)``, which SymPy makes of even roots of powers of u, as the root of the opaque quantity u**2.
+
+    Such a root is smooth where u is not 0: for parameters u, whose values do not change along a motion.
+
+    >>> from sympy.abc import x
+    >>> a = Symbol("a", real=True)
+    >>> with_even_roots(sqrt(a**2 * (x**2 + 1)))
+    sqrt(x**2 + 1)*sqrt((a**2))
+    """
+    if not expression.has(Abs):
+        return expression
+    return expression.replace(Abs, lambda u: sqrt(intermediate(u**2)))
+
+
+def root_of_square(expression: Expr, variables: Collection[Symbol]) -> Expr | None:
+    """Return a part u of which the expression contains a root of u**2 and that depends on variables, or ``None``."""
+    waiting, seen = [expression], {expression}
+    while waiting:
+        node = waiting.pop()
+        new = [part for part in node.args if part not in seen]
+        seen.update(new)
+        waiting += new
+        if node.is_Pow and isinstance(node.base, Intermediate) and not node.exp.is_integer:
+            square = node.base.definition
+            if square.is_Pow and square.exp == 2 and not square.free_symbols.isdisjoint(variables):
+                return square.base
+    return None
+
+
+def written_size(expression: Expr) -> int:
+    """Return the number of nodes of an expression with all intermediate quantities written out."""
+    sizes: dict[Expr, int] = {}
+
+    def size(node: Expr) -> int:
+        return sizes.get(node) or 1 + sum(map(size, node.args))
+
+    for each in intermediates(expression):
+        sizes[each] = size(each.definition)
+    return size(expression)
+
+
+def distinct_nodes(expressions: Sequence[Expr]) -> int:
+    """Return the number of different nodes in expressions and in the definitions of the quantities in them."""
+    seen, pending = set(expressions), list(expressions)
+    while pending:
+        new = set(pending.pop().args) - seen
+        seen |= new
+        pending += new
+    return len(seen)
+
+
+def inner_of(expression: Expr) -> tuple[Intermediate, ...]:
+    """Return the quantities in an expression, without those in their definitions."""
+    seen, quantities, pending = {expression}, [], [expression]
+    while pending:
+        node = pending.pop()
+        if isinstance(node, Intermediate):
+            quantities.append(node)
+            continue
+        new = [argument for argument in node.args if argument.args and argument not in seen]
+        seen.update(new)
+        pending += new
+    return tuple(quantities)
+
+
+def intermediates(*expressions: Expr, known: Container[Intermediate] = ()) -> list[Intermediate]:
+    """Return all quantities in expressions and in their definitions, each after those that it depends on.
+
+    Known ones are left out, and so are those that occur in their definitions alone.
+    """
+    seen: set[Intermediate] = set()
+    pending = [node for each in expressions for node in inner_of(each)]
+    while pending:
+        node = pending.pop()
+        if node not in seen and node not in known:
+            seen.add(node)
+            pending += node.inner
+    return sorted(seen, key=lambda each: each.number)

@@ -1,0 +1,133 @@
+"""Evaluation of formulas by NumPy, also at all elements of loops, without generated code."""
+
+import math
+from collections.abc import Mapping, Sequence
+from functools import reduce
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sympy import Expr, Symbol
+
+from scvi_codegen.common.errors import StateError
+from scvi_codegen.systems.formulas.expressions import LARGEST, PIECEWISE_CONSTANT
+from scvi_codegen.systems.formulas.indices import Access, Loop, Place
+from scvi_codegen.systems.formulas.intermediates import Intermediate, intermediates
+
+MAX_ELEMENTS = 5_000_000
+"""Maximum number of elements of the loops of a term that are evaluated at once."""
+
+
+def array_value(expression: Expr, known: dict[Expr, Any]) -> Any:
+    """Return the values of an expression, with the broadcast shape of the arrays in ``known``; NaN where undefined.
+
+    Args:
+        expression: an expression.
+        known: a number or an array for each symbol; values of subexpressions are added.
+
+    >>> x = Symbol("x", real=True)
+    >>> array_value(x**2 + 1, {x: np.arange(3.0)}).tolist()
+    [1.0, 2.0, 5.0]
+    """
+    for each in intermediates(expression):
+        _known_value(each, known)
+    return _known_value(expression, known)
+
+
+def _known_value(expression: Expr, known: dict[Expr, Any]) -> Any:
+    if expression not in known:
+        known[expression] = _node_value(expression, known)
+    return known[expression]
+
+
+def _node_value(expression: Any, known: dict[Expr, Any]) -> Any:
+    if not expression.args:
+        return float(expression) if not expression.is_Rational or abs(expression) < LARGEST else np.nan
+    arguments = [_known_value(argument, known) for argument in expression.args]
+    if isinstance(expression, Intermediate):
+        return arguments[0]
+    if expression.is_Add:
+        return reduce(np.add, arguments)
+    if expression.is_Mul:
+        return reduce(np.multiply, arguments)
+    if expression.is_Pow:
+        return np.power(arguments[0], float(arguments[1]) if expression.exp.is_Number else arguments[1])
+    name = type(expression).__name__
+    if name in PIECEWISE_CONSTANT:
+        return PIECEWISE_CONSTANT[name][1](*arguments)
+    return getattr(np, f"arc{name[1:]}" if name.startswith("a") else name)(*arguments)
+
+
+def convolved(values: NDArray[Any], access: Access, arrays: Mapping[str, NDArray[Any]], sign: int = 1) -> Any:
+    """Return the convolutions of an array in an access, for ``sign`` -1 their transpose, by Fourier transforms."""
+    for each in access.sums[::sign]:
+        by = np.fft.fft(arrays[each.coefficients.name])
+        by = (np.conj(by) if sign == 1 else by).reshape(-1, *(1,) * (values.ndim - 1 - each.axis))
+        values = np.fft.ifft(by * np.fft.fft(values, axis=each.axis), axis=each.axis).real
+    return values
+
+
+class Elements:
+    """Index values of all elements of loops, as arrays.
+
+    Args:
+        loops: of a term.
+        sizes: value of each size.
+        tables: index tables by name.
+
+    Raises:
+        StateError: if there are more than ``MAX_ELEMENTS``.
+    """
+
+    def __init__(self, loops: Sequence[Loop], sizes: Mapping[str, int], tables: Mapping[str, NDArray[Any]]) -> None:
+        self.loops, self.sizes, self.tables = {loop.index: loop for loop in loops}, sizes, tables
+        pairs = {loop.behind: loop for loop in loops if loop.behind}
+        spans = [(loop, np.arange(loop.first.at(sizes), loop.end.at(sizes))) for loop in loops if not loop.behind]
+        counts = [len(span) * (len(span) - 1) // 2 if loop.index in pairs else len(span) for loop, span in spans]
+        if (total := math.prod(counts)) > MAX_ELEMENTS:
+            raise StateError(f"a sum has {total} elements, more than the {MAX_ELEMENTS} that can be evaluated by NumPy")
+        grids = np.meshgrid(*(np.arange(count) for count in counts), indexing="ij")
+        self.index: dict[str, NDArray[np.int64]] = {}
+        for (loop, span), grid in zip(spans, grids, strict=True):
+            if loop.index not in pairs:
+                self.index[loop.index] = span[grid.reshape(-1)]
+                continue
+            first, second = np.triu_indices(len(span), 1)
+            self.index[loop.index], self.index[pairs[loop.index].index] = (
+                span[each[grid.reshape(-1)]] for each in (first, second)
+            )
+
+    def of(self, access: Access) -> tuple[Any, ...]:
+        """Return the indices of an access at all elements, one array or number per axis."""
+        return tuple(self._place(place) for place in access.places)
+
+    def _place(self, subscript: Place) -> Any:
+        if subscript.table:
+            return self.tables[subscript.table][self.index[subscript.index], subscript.column]
+        if not subscript.index:
+            return subscript.base.at(self.sizes)
+        loop, moved = self.loops[subscript.index], self.index[subscript.index] + subscript.base.number
+        moved = moved - self.index[subscript.minus] if subscript.minus else moved
+        return moved % loop.end.at(self.sizes) if loop.periodic else moved
+
+    def values(
+        self,
+        formula: Expr,
+        slots: Sequence[tuple[Symbol, Access]],
+        arrays: Mapping[str, NDArray[np.float64]],
+        numbers: Mapping[Expr, float],
+    ) -> Any:
+        """Return the values of a formula at every element.
+
+        Args:
+            formula: in the symbols of slots and numbers.
+            slots: symbol and access of each array entry.
+            arrays: arrays by name.
+            numbers: values by symbol.
+        """
+        known: dict[Expr, Any] = {
+            slot: convolved(arrays[access.array.name], access, arrays)[self.of(access)] for slot, access in slots
+        }
+        entries = array_value(formula, {**known, **numbers})
+        count = next((len(values) for values in self.index.values()), 1)
+        return np.broadcast_to(entries, (count,)) if self.index else entries

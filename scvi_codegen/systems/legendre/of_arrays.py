@@ -1,0 +1,151 @@
+"""Legendre transform of arrays of run-time sizes whose kinetic energy couples the velocities of one element only.
+
+    L = sum_e l(q, v_e, t),    l = l_0 + b . v_e + v_e . C v_e/2    has    H = sum_e (p_e - b) . C^-1 (p_e - b)/2 - l_0
+
+where the velocities v_e of the elements e are disjoint, and b and C depend on positions, parameters and t: charges in a
+magnetic field, pendulums in spherical angles, masses that depend on the position.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from sympy import Add, Expr, S, Symbol
+
+from scvi_codegen.common.errors import SystemDefinitionError
+from scvi_codegen.systems.arrays.system import ArrayHamiltonian, ArraySystem
+from scvi_codegen.systems.derived_expressions import coupled_blocks
+from scvi_codegen.systems.formulas.array_statements import ArrayForce
+from scvi_codegen.systems.formulas.arrays import ArrayTerm, term_of
+from scvi_codegen.systems.formulas.expressions import gradient_tuple, hessian
+from scvi_codegen.systems.formulas.indices import Access, Array
+from scvi_codegen.systems.formulas.symbols import DOT, symbol
+from scvi_codegen.systems.legendre.transform import inverse_form
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SiteHamiltonian:
+    """Hamiltonian of a Lagrangian, with the maps between velocities and momenta.
+
+    Attributes:
+        system: the Hamiltonian.
+        momenta: L_v by entry of the arrays of momenta, in positions and velocities.
+        velocities: H_p by entry of the arrays of velocities, in positions and momenta.
+    """
+
+    system: ArrayHamiltonian
+    momenta: tuple[ArrayForce, ...]
+    velocities: tuple[ArrayForce, ...]
+
+
+def site_hamiltonian(system: ArraySystem) -> SiteHamiltonian | None:
+    """Return the Hamiltonian of a Lagrangian with terms of this form; ``None`` of others."""
+    moving = {array.name + DOT: Array(f"p_{array.name}", array.axes) for array in system.coordinates}
+    if system.momenta or system.rotations or system.constraints or system.damping != 0:
+        return None
+    if any(access.array.name in moving for force in system.forces for _, access in force.slots):
+        return None
+    groups: dict[tuple[object, ...], ArrayTerm] = {}
+    still: list[ArrayTerm] = []
+    for term in system.terms:
+        if not any(access.array.name in moving for _, access in term.slots):
+            still.append(term)
+            continue
+        site = _of_site(term, moving)
+        if site is None:
+            return None
+        known = groups.get(site.loops)
+        if known is not None:
+            site = term_of(site.loops, known.formula + site.formula, dict((*known.slots, *site.slots)))
+        groups[site.loops] = site
+    of_groups = [_transformed(group, moving) for group in groups.values()]
+    accessed = [access for group in groups.values() for _, access in group.slots if access.array.name in moving]
+    if None in of_groups or not _each_once(accessed, system.coordinates):
+        return None
+    mapped = [each for each in of_groups if each is not None]
+    hamiltonian = ArrayHamiltonian(
+        **{name: getattr(system, name) for name in COMMON},
+        momenta=tuple(moving.values()),
+        terms=(*(each[0] for each in mapped), *(replace(term, formula=-term.formula) for term in still)),
+    )
+    return SiteHamiltonian(
+        system=hamiltonian, momenta=tuple(each[1] for each in mapped), velocities=tuple(each[2] for each in mapped)
+    )
+
+
+COMMON = (
+    *("name", "coordinates", "time", "parameters", "defaults", "fields", "field_defaults", "tables"),
+    *("neighbours", "forces", "inputs"),
+)
+"""Fields that a Lagrangian and its Hamiltonian have in common."""
+
+
+def _of_site(term: ArrayTerm, moving: dict[str, Array]) -> ArrayTerm | None:
+    """Return a term with indices site0, site1, .. along the axes; ``None`` if elements share velocities."""
+    velocities = [access for _, access in term.slots if access.array.name in moving]
+    indices = {tuple(place.index for place in access.places if place.index) for access in velocities}
+    if len(indices) != 1 or any(loop.behind or not loop.is_whole for loop in term.loops):
+        return None
+    (order,) = indices
+    ends = {loop.index: loop.end for loop in term.loops}
+    for access in velocities:
+        for place, axis in zip(access.places, access.array.axes, strict=True):
+            if place.table or (place.index and (place.base.number or ends[place.index] != axis)):
+                return None
+    if set(order) != set(ends) or len(set(order)) < len(order):
+        return None
+    names = {index: f"site{k}" for k, index in enumerate(order)}
+    renamed = {
+        slot: replace(access, places=tuple(replace(p, index=names[p.index]) if p.index else p for p in access.places))
+        for slot, access in term.slots
+    }
+    rule = {slot: symbol(str(access)) for slot, access in renamed.items()}
+    loops = {loop.index: replace(loop, index=names[loop.index]) for loop in term.loops}
+    accesses = {rule[slot]: access for slot, access in renamed.items()}
+    return term_of(tuple(loops[index] for index in order), term.formula.xreplace(rule), accesses)
+
+
+def _each_once(accesses: Sequence[Access], coordinates: Sequence[Array]) -> bool:
+    """Return whether every coordinate has one velocity: of the axes that are numbers every place occurs."""
+    for array in coordinates:
+        places = [access.places for access in accesses if access.array.name == array.name + DOT]
+        numbers = {tuple(str(place) for place in each if not place.index) for each in places}
+        wanted = 1
+        for axis, place in zip(array.axes, places[0] if places else (), strict=False):
+            wanted *= 1 if place.index else axis.number if not axis.name else 0
+        if not places or len(numbers) != len(places) or len(places) != wanted:
+            return False
+    return True
+
+
+def _transformed(group: ArrayTerm, moving: dict[str, Array]) -> tuple[ArrayTerm, ArrayForce, ArrayForce] | None:
+    """Return the term of H, and the gradients of l by velocities and of H by momenta."""
+    pairs = [(slot, access) for slot, access in group.slots if access.array.name in moving]
+    v = [slot for slot, _ in pairs]
+    p_accesses = [replace(access, array=moving[access.array.name]) for _, access in pairs]
+    p = [symbol(str(access)) for access in p_accesses]
+    entries, derivatives = hessian(group.formula, v), gradient_tuple(group.formula, v)
+    if any(entry.free_symbols & set(v) for entry in entries.values()):
+        return None
+    at_rest = dict.fromkeys(v, S.Zero)
+    shifted = [each - rate.xreplace(at_rest) for each, rate in zip(p, derivatives, strict=True)]
+    blocks = coupled_blocks(entries, len(v))
+    if any(len(block) == 1 and (block[0], block[0]) not in entries for block in blocks):
+        return None
+    try:
+        energy = Add(*(inverse_form(entries, block, shifted) for block in blocks), -group.formula.xreplace(at_rest))
+    except SystemDefinitionError:  # too large a block
+        return None
+    accesses = {**dict(group.slots), **dict(zip(p, p_accesses, strict=True))}
+    return (
+        term_of(group.loops, energy, accesses),
+        _gradient(group, p_accesses, derivatives, accesses),
+        _gradient(group, [access for _, access in pairs], gradient_tuple(energy, p), accesses),
+    )
+
+
+def _gradient(
+    group: ArrayTerm, targets: Sequence[Access], formulas: Sequence[Expr], accesses: dict[Symbol, Access]
+) -> ArrayForce:
+    occurring = set().union(*(formula.free_symbols for formula in formulas))
+    slots = tuple((slot, access) for slot, access in accesses.items() if slot in occurring)
+    return ArrayForce(loops=group.loops, slots=slots, targets=tuple(zip(targets, formulas, strict=True)))

@@ -1,0 +1,203 @@
+"""XML documents of robots: elements with strict numbers, and errors that name file and element."""
+
+from __future__ import annotations
+
+import errno
+import re
+import stat
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NoReturn
+from xml.etree import ElementTree
+
+import numpy as np
+
+from scvi_codegen.common.errors import SystemDefinitionError, SystemDefinitionWarning, closest, warn
+from scvi_codegen.systems.multibody.trees.schema import Kind
+from scvi_codegen.systems.multibody.trees.tree import Vector
+
+LARGEST_FILE = 32 * 2**20
+LARGEST_NUMBER = 1e40
+"""Bound of the magnitude of numbers, whose products are finite: those of an inertia have five factors."""
+NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+NAMED = 5
+"""Number of names that a warning lists of each kind of parts."""
+
+
+@dataclass(frozen=True, slots=True)
+class Element:
+    """Element of a document.
+
+    Attributes:
+        file: path of the document, for messages.
+        node: tag, attributes and children.
+        files: paths of the documents of included nodes.
+    """
+
+    file: str
+    node: ElementTree.Element
+    files: dict[ElementTree.Element, str] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """Attribute ``name``, or the tag."""
+        return self.node.get("name", self.node.tag)
+
+    @property
+    def tag(self) -> str:
+        """Tag of the element."""
+        return self.node.tag
+
+    def text(self, key: str, default: str | None = None) -> str:
+        """Return an attribute as text; raise an error if it is missing and has no default."""
+        value = self.node.get(key, default)
+        if value is None:
+            self.refuse(f"has no attribute '{key}'")
+        return value
+
+    def choice(self, key: str, *options: str) -> str:
+        """Return an attribute that is one of the options, of which the first is the default."""
+        value = self.text(key, options[0])
+        if value not in options:
+            self.refuse(f"has {key}='{value}', which must be {' or '.join(options)}{closest(value, options)}")
+        return value
+
+    def has(self, key: str) -> bool:
+        """Return whether an attribute is present."""
+        return key in self.node.attrib
+
+    def vector(self, key: str, default: Sequence[float] | None = None, sizes: Sequence[int] = (3,)) -> Vector:
+        """Return an attribute as numbers, of which there must be one of ``sizes``."""
+        if default is not None and not self.has(key):
+            return np.array(default, float)
+        text = self.text(key)
+        values = text.split()
+        if not all(map(NUMBER.fullmatch, values)):
+            self.refuse(f"has {key}='{text}', which must be numbers")
+        numbers = np.array([*map(float, values)])
+        if len(numbers) not in sizes:
+            self.refuse(f"has {key}='{text}', which must be {' or '.join(map(str, sizes))} finite numbers")
+        if not (np.abs(numbers) < LARGEST_NUMBER).all():
+            self.refuse(f"has {key}='{text}', whose magnitude must be less than {LARGEST_NUMBER:g}")
+        return numbers
+
+    def number(self, key: str, default: float | None = None, least: float = -np.inf) -> float:
+        """Return an attribute as a number that must not be smaller than ``least``."""
+        value = float(self.vector(key, None if default is None else [default], (1,))[0])
+        if value < least:
+            self.refuse(f"has the {key} {value:g}, which must not be < {least:g}")
+        return value
+
+    def children(self, *tags: str) -> list[Element]:
+        """Return the children with one of the tags, in order; all of them without tags."""
+        nodes = (child for child in self.node if not tags or child.tag in tags)
+        return [Element(self.files.get(child, self.file), child, self.files) for child in nodes]
+
+    def child(self, tag: str) -> Element | None:
+        """Return the first child with a tag."""
+        return next(iter(self.children(tag)), None)
+
+    def unit(self, key: str, default: Sequence[float] | None = None) -> Vector:
+        """Return an attribute as a vector of length 1."""
+        vector = self.vector(key, default)
+        length = float(np.linalg.norm(vector))
+        if length == 0:
+            self.refuse(f"has {key}='{self.text(key)}', which must not be zero")
+        return vector / length
+
+    def refuse(self, problem: str) -> NoReturn:
+        """Raise an error that names the file and the element."""
+        raise SystemDefinitionError(f"{self.file}: <{self.tag}> '{self.name}' {problem}")
+
+    def walk(self, kinds: Mapping[str, Kind]) -> Iterator[tuple[Element, Kind]]:
+        """Yield this element and those inside it whose attributes are known, parents first, with their kinds.
+
+        Raises:
+            SystemDefinitionError: if an element or attribute is unknown or must not be repeated, or the element changes
+                the motion and is not read.
+        """
+        pending = [(self, kinds[self.tag])]
+        while pending:
+            element, kind = pending.pop()
+            for key in element.node.attrib:
+                if key not in kind.attributes:
+                    element.refuse(f"has the unknown attribute '{key}'{closest(key, kind.attributes)}")
+            yield element, kind
+            seen: set[str] = set()
+            inner: list[tuple[Element, Kind]] = []
+            for child in element.children():
+                name = kind.children.get(child.tag)
+                if name is None:
+                    if child.tag.startswith("{") and "xacro" in child.tag:
+                        child.refuse("is a macro: write the file that xacro makes of it")
+                    element.refuse(f"contains the unknown element <{child.tag}>{closest(child.tag, kind.children)}")
+                if name == "refused":
+                    child.refuse("changes the motion and is not read: remove it, or write out what it makes")
+                if child.tag in seen and child.tag not in kind.repeated:
+                    child.refuse(f"is the second <{child.tag}> of <{element.tag}> '{element.name}': one is allowed")
+                seen.add(child.tag)
+                if name != "unchecked":
+                    inner.append((child, kinds[name]))
+            pending += reversed(inner)
+
+    def check_neutral(self, kind: Kind) -> None:
+        """Raise an error if an attribute that changes the motion and is not read has another value than its default."""
+        for key, neutral in kind.refused.items():
+            value = self.text(key, neutral)
+            same = value == neutral or value in neutral.split()
+            if not same and NUMBER.fullmatch(neutral):
+                same = not (self.vector(key, sizes=range(100)) - float(neutral)).any()
+            if not same:
+                self.refuse(f"has {key}='{value}', which changes the motion and is not read: remove it")
+
+
+class Unread:
+    """Parts of a document that matter to users and are not read: names by kind of part."""
+
+    def __init__(self) -> None:
+        self.names: defaultdict[str, dict[str, None]] = defaultdict(dict)
+
+    def add(self, part: str, *names: str) -> None:
+        """Add parts of a kind."""
+        self.names[part] |= dict.fromkeys(names)
+
+    def warn(self, file: str) -> None:
+        """Warn of all parts at once."""
+        parts = []
+        for part, names in self.names.items():
+            more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+            parts.append(f"{part} {', '.join([*names][:NAMED])}{more}".strip())
+        if parts:
+            warn(f"{file}: the motion is computed without {'; '.join(parts)}", SystemDefinitionWarning)
+
+
+def root_of(path: Path, *tags: str) -> Element:
+    """Read a document whose outermost element must have one of the tags.
+
+    Raises:
+        SystemDefinitionError: if the file cannot be read, is no regular file or larger than 32 MiB, is no XML, declares
+            entities, or has another outermost element.
+    """
+    try:
+        if not stat.S_ISREG(path.stat().st_mode):  # a device may have no end
+            raise OSError(errno.EINVAL, "it is no regular file")
+        with path.open("rb") as file:
+            data = file.read(LARGEST_FILE + 1)
+    except (OSError, ValueError) as error:
+        raise SystemDefinitionError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    if len(data) > LARGEST_FILE:
+        raise SystemDefinitionError(f"{path} has more than {LARGEST_FILE} bytes, the most that are read")
+    if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
+        raise SystemDefinitionError(f"{path} declares a document type or entities, which are not read: remove them")
+    try:
+        node = ElementTree.fromstring(data)
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise SystemDefinitionError(f"{path} is not XML: {error}") from error
+    if node.tag not in tags:
+        other = {"robot": ": it is a URDF file, NAME.urdf", "mujoco": ": it is an MJCF file, NAME.xml"}.get(
+            node.tag, ""
+        )
+        raise SystemDefinitionError(f"{path} begins with <{node.tag}>, not with <{tags[0]}>{other}")
+    return Element(str(path), node)

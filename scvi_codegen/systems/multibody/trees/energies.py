@@ -1,0 +1,380 @@
+"""Lagrangian of a tree of rigid bodies in joint coordinates, and its kinetic energy as a function of momenta.
+
+The frame of link i has the rotation A_i into the frame of its parent p, and its origin lies at r_i there. Angular
+velocity and velocity of the origin, in the frame of the link, follow from the parent's,
+
+    w_i = A_i^T w_p + a q_dot (hinge),    v_i = A_i^T (v_p + w_p x r_i) + a q_dot (slide),
+
+the kinetic energy is the sum of m |v_i + w_i x c_i|^2/2 + w_i . I_i w_i/2, and the first moments of the subtrees are
+S_i = m_i c_i + sum over children (m_subtree r_k + A_k S_k). A free base with position x and rotation R adds, with the
+total mass M, and the first moment S of the tree and its momentum P for x_dot = 0 in the frame of the base,
+
+    T = M |x_dot|^2/2 + x_dot . R P + T(x_dot = 0),    V = -g . (M x + R S),
+
+where P_i = m_i (v_i + w_i x c_i) + sum over children A_k P_k.
+
+The components of all these vectors are intermediate quantities (:mod:`scvi_codegen.systems.formulas.intermediates`), so
+that the energies of n bodies have O(n) operations.
+
+**Momenta.** The kinetic energy as a function of coordinates and momenta follows from articulated-body inertias. From
+the leaves to the root each subtree is replaced by its articulated inertia A, a symmetric 6 x 6 matrix, and bias z,
+what it would be if its joints were free, seen from the frame of its link (angular components first). For each degree of
+freedom of a joint, along the unit vector S, with the momentum p,
+
+    D = S^T A S + armature,    e = p - S^T z,    g = A S/D,
+    A <- A - g (A S)^T,        z <- z + g e,
+
+after which A and z are added to those of the parent, in its frame. The innovations e are independent, and
+
+    T(q, p) = p^T M(q)^-1 p/2 = sum of e^2/(2 D),
+
+in O(n) operations for n bodies. The derivatives by p are M^-1 p, in which gains g and pivots D depend on q only.
+
+G. Rodriguez, A. Jain, K. Kreutz-Delgado, A spatial operator algebra for manipulator modeling and control, Int. J.
+Robotics Research 10 (1991), 371-381; R. Featherstone, Rigid Body Dynamics Algorithms, Springer 2008, chapters 3, 4, 7.
+"""
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
+from itertools import chain
+from typing import Any
+
+from sympy import Add, Expr, Matrix, Rational, S, Symbol, cos, eye, sin, zeros
+
+from scvi_codegen.common.errors import SystemDefinitionError, closest
+from scvi_codegen.systems.formulas.intermediates import intermediate
+from scvi_codegen.systems.formulas.rotations import Rotation, RotationNames
+from scvi_codegen.systems.formulas.symbols import DOT, default_momenta, symbol
+from scvi_codegen.systems.multibody.trees.tree import (
+    SINGLE,
+    DrawnLink,
+    Joint,
+    Link,
+    Vector,
+    aligned,
+    identifier,
+    named,
+    without_fixed,
+)
+from scvi_codegen.systems.reading import system_from_sympy
+
+
+class Tree:
+    """Formulas of the links of a tree, from the root to the leaves and back.
+
+    Args:
+        links: with parents before their children.
+        gravity: acceleration of gravity in the world frame.
+
+    Raises:
+        SystemDefinitionError: if nothing moves.
+    """
+
+    def __init__(self, links: Sequence[Link], gravity: Vector) -> None:
+        links = self.links = aligned(named(without_fixed(links)))
+        self.gravity = exact_vector(gravity)
+        self.joints = {link.joint.name: link.joint for link in links}
+        self.leaders = {each.name: self.leader(each) for each in self.joints.values() if each.kind in SINGLE}
+        self.masses = self.of_subtrees([exact_number(each.inertia.mass) for each in links])
+        self.weights = self.of_subtrees([exact_number(each.inertia.mass - each.inertia.lift[0]) for each in links])
+        self.moments = self.first_moments()
+
+    def coordinate(self, joint: Joint) -> tuple[Expr, Expr]:
+        """Return q and q_dot of a hinge or slide."""
+        name, factor, offset = self.leaders[joint.name]
+        return factor * symbol(name) + offset, factor * symbol(name + DOT)
+
+    def leader(self, joint: Joint) -> tuple[str, Expr, Expr]:
+        """Return the name of the joint that one follows, itself or through others, the factor, and the offset.
+
+        Raises:
+            SystemDefinitionError: if that is no hinge or slide, or the joint itself.
+        """
+        factor, offset, seen = S.One, S.Zero, [joint.name]
+        while joint.follows is not None:
+            other, *numbers = joint.follows
+            factor, offset = factor * exact_number(numbers[0]), offset + factor * exact_number(numbers[1])
+            if other in seen:
+                raise SystemDefinitionError(f"joint '{seen[0]}' follows itself: {', '.join((*seen, other))}")
+            if other not in self.joints or self.joints[other].kind not in SINGLE:
+                known = [each.name for each in self.joints.values() if each.kind in SINGLE]
+                raise SystemDefinitionError(
+                    f"joint '{joint.name}' follows '{other}', which is no moving joint{closest(other, known)}"
+                )
+            seen.append(other)
+            joint = self.joints[other]
+        return joint.name, factor, offset
+
+    def displacement(self, joint: Joint) -> Expr:
+        """Return the coordinate of a hinge or slide from the zero of the model."""
+        return self.coordinate(joint)[0] - exact_number(joint.zero)
+
+    def turned(self, joint: Joint, vector: Matrix, *, back: bool = False) -> Matrix:
+        """Return a vector turned by A, from the frame of the link to that of its parent; ``back``: by A^T."""
+        turns = [Matrix(3, 3, rotation_of(joint).entries)] if joint.kind in ("ball", "free") else []
+        if joint.kind == "hinge":
+            q = self.displacement(joint)
+            turns = [Matrix([[cos(q), -sin(q), 0], [sin(q), cos(q), 0], [0, 0, 1]])]
+        if joint.kind != "free":
+            turns.insert(0, exact_matrix(joint.pose.rotation))
+        for turn in turns if back else reversed(turns):
+            vector = as_quantities((turn.T if back else turn) * vector)
+        return vector
+
+    def origin(self, joint: Joint) -> Matrix:
+        """Return the origin of the link in the frame of its parent."""
+        at = exact_vector(joint.pose.position)
+        return at + exact_matrix(joint.pose.rotation)[:, 2] * self.displacement(joint) if joint.kind == "slide" else at
+
+    def of_subtrees(self, masses: list[Expr]) -> list[Expr]:
+        """Return the mass of each subtree from those of the links."""
+        for i in reversed(range(len(masses))):
+            if self.links[i].parent >= 0:
+                masses[self.links[i].parent] += masses[i]
+        return masses
+
+    def first_moments(self) -> list[Matrix]:
+        """Return the first moment of the weight of each subtree, in the frame of its root."""
+        moments = [
+            exact_number(each.mass) * exact_vector(each.center) - exact_vector(each.lift[1])
+            for each in (link.inertia for link in self.links)
+        ]
+        for i in reversed(range(len(self.links))):
+            parent, joint = self.links[i].parent, self.links[i].joint
+            if parent >= 0:
+                moments[parent] += self.weights[i] * self.origin(joint) + self.turned(joint, moments[i])
+                moments[parent] = as_quantities(moments[parent])
+        return moments
+
+    def kinetic_energy(self) -> Expr:
+        """Return T; bases that are free contribute as in the docstring of the module."""
+        terms: list[Expr] = []
+        turning: list[Matrix] = []
+        moving: list[Matrix] = []
+        momenta: list[Matrix] = []
+        along = Matrix([0, 0, 1])
+        for link in self.links:
+            joint = link.joint
+            outer = turning[link.parent] if link.parent >= 0 else zeros(3, 1)
+            speed = moving[link.parent] if link.parent >= 0 else zeros(3, 1)
+            w = self.turned(joint, outer, back=True)
+            v = self.turned(joint, as_quantities(speed + outer.cross(self.origin(joint))), back=True)
+            if joint.kind in SINGLE:
+                rate = self.coordinate(joint)[1]
+                if joint.kind == "hinge":
+                    w += along * rate
+                else:
+                    v += along * rate
+            else:
+                w += Matrix(rotation_of(joint).rates)
+            turning.append(as_quantities(w))
+            moving.append(as_quantities(v))
+            velocity = as_quantities(moving[-1] + turning[-1].cross(exact_vector(link.inertia.center)))
+            momenta.append(exact_number(link.inertia.mass) * velocity)
+            terms.append(velocity.dot(momenta[-1]) / 2)
+            terms.append((turning[-1].T * exact_matrix(link.inertia.matrix) * turning[-1])[0] / 2)
+            terms.append(self.quadratic(joint, joint.armature))
+        return Add(*terms, *self.free_bases(momenta))
+
+    def free_bases(self, momenta: list[Matrix]) -> Iterator[Expr]:
+        """Yield the kinetic energies of the velocities of free bases.
+
+        Args:
+            momenta: of the links, in their frames, where the bases do not move but turn.
+        """
+        for i in reversed(range(len(self.links))):
+            parent, joint = self.links[i].parent, self.links[i].joint
+            if joint.kind == "free":
+                velocity = Matrix([symbol(name + DOT) for name in position_of(joint)])
+                yield self.masses[i] * velocity.dot(velocity) / 2 + velocity.dot(self.turned(joint, momenta[i]))
+            elif parent >= 0:
+                momenta[parent] = as_quantities(momenta[parent] + self.turned(joint, momenta[i]))
+
+    def quadratic(self, joint: Joint, factor: float) -> Expr:
+        """Return factor/2 times the sum of the squared rates of a joint."""
+        if joint.kind in SINGLE:
+            rates: list[Expr] = [self.coordinate(joint)[1]]
+        else:
+            rates = [*rotation_of(joint).rates]
+            rates += [symbol(name + DOT) for name in position_of(joint)] if joint.kind == "free" else []
+        return exact_number(factor) * Add(*(rate**2 for rate in rates)) / 2
+
+    def potential_energy(self) -> Expr:
+        """Return V of gravity and springs."""
+        terms: list[Expr] = []
+        for i, link in enumerate(self.links):
+            joint = link.joint
+            if link.parent < 0:
+                position = self.origin(joint)
+                if joint.kind == "free":
+                    position = Matrix([symbol(name) for name in position_of(joint)])
+                place = self.weights[i] * position + self.turned(joint, self.moments[i])
+                terms.append(-self.gravity.dot(place))
+            if joint.stiffness:
+                terms.append(
+                    exact_number(joint.stiffness) * (self.coordinate(joint)[0] - exact_number(joint.rest)) ** 2 / 2
+                )
+        return Add(*terms)
+
+    def dissipation(self) -> Expr:
+        """Return Rayleigh's function of the damping of joints."""
+        return Add(*(self.quadratic(joint, joint.damping) for joint in self.joints.values()))
+
+    def arguments(self, actuated: Collection[str] | bool) -> dict[str, Any]:
+        """Return arguments of :meth:`LagrangianSystem.from_sympy`: coordinates, rotations, lagrangian, forces.
+
+        Args:
+            actuated: names of the joints on which an input ``tau_NAME`` acts, or ``True`` for all hinges and slides.
+
+        Raises:
+            SystemDefinitionError: if a joint does not exist.
+        """
+        singles = [each.name for each in self.joints.values() if each.kind in SINGLE and not each.follows]
+        driven = (singles if actuated else []) if isinstance(actuated, bool) else [*map(identifier, actuated)]
+        for name in driven:
+            if name not in singles:
+                raise SystemDefinitionError(f"there is no hinge or slide '{name}' to act on{closest(name, singles)}")
+        free = [joint for joint in self.joints.values() if joint.kind == "free"]
+        turning = [rotation_of(each) for each in self.joints.values() if each.kind in ("ball", "free")]
+        dissipation = self.dissipation()
+        return {
+            "coordinates": [symbol(name) for name in (*chain.from_iterable(map(position_of, free)), *singles)],
+            "rotations": {each.name: each.rate for each in turning},
+            "lagrangian": self.kinetic_energy() - self.potential_energy(),
+            "dissipation": None if dissipation == 0 else dissipation,
+            "forces": {name: symbol(f"tau_{name}") for name in driven},
+            "inputs": [f"tau_{name}" for name in driven],
+        }
+
+
+def rotation_of(joint: Joint) -> Rotation:
+    """Return the rotation of a ball joint or free body: ``R_NAME`` with the angular velocity ``omega_NAME``."""
+    return Rotation(f"R_{joint.name}", f"omega_{joint.name}")
+
+
+def position_of(joint: Joint) -> tuple[str, ...]:
+    """Return the names of the position of a free body: ``x_NAME``, ``y_NAME``, ``z_NAME``."""
+    return tuple(f"{axis}_{joint.name}" for axis in "xyz")
+
+
+def as_quantities(vector: Matrix) -> Matrix:
+    """Return a vector of intermediate quantities."""
+    return vector.applyfunc(intermediate)
+
+
+def exact_number(value: float) -> Expr:
+    """Return the rational number that a floating-point number is printed as."""
+    return S(int(value)) if value == int(value) else Rational(repr(float(value)))
+
+
+def exact_vector(values: Vector) -> Matrix:
+    """Return a vector of such numbers."""
+    return Matrix([exact_number(float(each)) for each in values])
+
+
+def exact_matrix(values: Vector) -> Matrix:
+    """Return a matrix of such numbers."""
+    return Matrix([[exact_number(float(each)) for each in row] for row in values])
+
+
+SMALLEST = 12
+"""Smallest number of degrees of freedom for which the recursion is used; below, the mass matrix is factorised."""
+
+
+def system_of_tree(
+    kind: Any,
+    name: str,
+    links: Sequence[Link],
+    gravity: Vector,
+    actuated: Collection[str] | bool,
+    constraints: Sequence[Expr] = (),
+) -> Any:
+    """Return the system of a tree, of class ``kind``; other arguments as of :class:`Tree` and its ``arguments``."""
+    tree = Tree(links, gravity)
+
+    def made(**fields: Any) -> Any:
+        members, fields = fields.get("rotations", ()), fields | {"links": tuple(map(DrawnLink.of, tree.links))}
+        if constraints or len(fields["coordinates"]) - len(members) < SMALLEST:
+            return kind(**fields)
+        return kind(**fields, dual_energy=_in_quaternions(dual_energy(tree), **fields))
+
+    arguments = tree.arguments(actuated)
+    formula = arguments.pop("lagrangian")
+    return system_from_sympy(made, "Lagrangian", formula, name=name, constraints=constraints, **arguments)
+
+
+def _in_quaternions(
+    energy: Expr, *, parameters: Sequence[Symbol], rotations: Sequence[Any] = (), reduced: Any = None, **_: Any
+) -> Expr:
+    """Return the dual energy of the Lagrangian with these fields, with the energy of the lengths of quaternions."""
+    names = RotationNames([replace(each, momentum=True) for each in rotations])
+    if energy == 0 or not names.members:
+        return energy
+    gauge = names.gauge(lambda each: names.inertia(each, reduced.lagrangian, parameters))
+    return names.in_coordinates(energy) + gauge
+
+
+def dual_energy(tree: Tree) -> Expr:
+    """Return T(q, p), with the body momenta of rotations by the names of their angular velocities; 0 if unknown.
+
+    It is unknown if a joint follows another one, or a joint moves no mass.
+    """
+    inertias, biases = [], [zeros(6, 1) for _ in tree.links]
+    for link in tree.links:
+        m, c = exact_number(link.inertia.mass), exact_vector(link.inertia.center).hat()
+        matrix = exact_matrix(link.inertia.matrix)
+        inertias.append(Matrix([[matrix - m * c * c, m * c], [-m * c, m * eye(3)]]))
+    terms: list[Expr] = []
+    for i in reversed(range(len(tree.links))):
+        parent, joint = tree.links[i].parent, tree.links[i].joint
+        inertia, bias = inertias[i], biases[i]
+        for axis, momentum in _degrees_of_freedom(tree, joint):
+            pivot = intermediate(inertia[axis, axis] + exact_number(joint.armature))
+            if joint.follows or pivot == 0:
+                return S.Zero
+            innovation = intermediate(momentum - bias[axis])
+            gain = as_quantities(inertia[:, axis] / pivot)
+            terms.append(innovation**2 / (2 * pivot))
+            inertia = as_quantities(_symmetric(inertia - gain * inertia[:, axis].T))
+            bias = as_quantities(bias + gain * innovation)
+            if gain[axis] == 1:
+                bias[axis] = momentum
+        if parent >= 0:
+            moved, pushed = _in_parent(tree, joint, inertia, bias)
+            inertias[parent] = as_quantities(_symmetric(inertias[parent] + moved))
+            biases[parent] = as_quantities(biases[parent] + pushed)
+    return Add(*terms)
+
+
+def _degrees_of_freedom(tree: Tree, joint: Joint) -> Iterator[tuple[int, Expr]]:
+    """Yield the axes of a joint, among three angular and three linear ones, with their momenta."""
+    if joint.kind in ("hinge", "slide"):
+        yield 2 if joint.kind == "hinge" else 5, symbol(*default_momenta([joint.name]))
+    else:
+        yield from enumerate(rotation_of(joint).rates)
+    if joint.kind == "free":
+        momentum = Matrix([symbol(name) for name in default_momenta(position_of(joint))])
+        yield from enumerate(tree.turned(joint, momentum, back=True), 3)
+
+
+def _in_parent(tree: Tree, joint: Joint, inertia: Matrix, bias: Matrix) -> tuple[Matrix, Matrix]:
+    arm = tree.origin(joint).hat()
+    angular, mixed, linear = (
+        _turned_twice(tree, joint, block) for block in (inertia[:3, :3], inertia[:3, 3:], inertia[3:, 3:])
+    )
+    moved = as_quantities(mixed + arm * linear)
+    angular += mixed * arm.T + arm * moved.T
+    torque, force = (tree.turned(joint, part) for part in (bias[:3, :], bias[3:, :]))
+    return Matrix([[angular, moved], [moved.T, linear]]), Matrix([torque + arm * force, force])
+
+
+def _turned_twice(tree: Tree, joint: Joint, block: Matrix) -> Matrix:
+    """Return A X A^T, where A is the rotation of a joint."""
+    for _ in range(2):
+        block = Matrix.hstack(*(tree.turned(joint, block[:, k]) for k in range(3))).T
+    return block
+
+
+def _symmetric(matrix: Matrix) -> Matrix:
+    """Return a symmetric matrix with the entries of its lower half in both."""
+    return Matrix(*matrix.shape, lambda i, j: matrix[max(i, j), min(i, j)])

@@ -1,0 +1,526 @@
+"""Reader of MJCF, the model format of MuJoCo: bodies, joints, inertias of bodies and geoms, gravity, equalities.
+
+Attributes and defaults are those of https://mujoco.readthedocs.io/en/stable/XMLreference.html;
+:mod:`scvi_codegen.systems.multibody.trees.schema` lists which are read.
+"""
+
+import re
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import combinations
+from os import PathLike
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from scvi_codegen.common.atomic import FOLDERS, is_inside
+from scvi_codegen.common.errors import closest
+from scvi_codegen.systems.formulas.rotations import matrix_of
+from scvi_codegen.systems.multibody.trees.closures import Closure, Coupling, at_reference
+from scvi_codegen.systems.multibody.trees.document import Element, Unread, root_of
+from scvi_codegen.systems.multibody.trees.schema import MJCF, TURN
+from scvi_codegen.systems.multibody.trees.tree import SINGLE, Inertia, Joint, Link, Pose, Vector, about
+
+Sizes = Vector
+
+
+def _ellipsoid(size: Sizes) -> tuple[float, Vector]:
+    squares = size**2
+    return 4 / 3 * np.pi * float(np.prod(size)), (squares.sum() - squares) / 5
+
+
+def _box(size: Sizes) -> tuple[float, Vector]:
+    squares = size**2
+    return 8 * float(np.prod(size)), (squares.sum() - squares) / 3
+
+
+def _cylinder(size: Sizes) -> tuple[float, Vector]:
+    r, half = size
+    across = r**2 / 4 + half**2 / 3
+    return 2 * np.pi * r**2 * half, np.array([across, across, r**2 / 2])
+
+
+def _capsule(size: Sizes) -> tuple[float, Vector]:
+    """Return those of a cylinder with two half spheres, whose centers lie 3 r/8 beyond its ends."""
+    r, half = size
+    tube, moments = _cylinder(size)
+    ball = 4 / 3 * np.pi * r**3
+    across = 2 / 5 * r**2 + half**2 + 3 / 4 * half * r
+    caps = np.array([across, across, 2 / 5 * r**2])
+    return tube + ball, (tube * moments + ball * caps) / (tube + ball)
+
+
+SHAPES: dict[str, tuple[int, Callable[[Sizes], tuple[float, Vector]]]] = {
+    "sphere": (1, lambda size: _ellipsoid(np.repeat(size[0], 3))),
+    "ellipsoid": (3, _ellipsoid),
+    "box": (3, _box),
+    "cylinder": (2, _cylinder),
+    "capsule": (2, _capsule),
+}
+"""By shape: the number of its sizes, and a function of these that returns the volume and the three principal moments of
+inertia by mass, about the center and the axes x, y, z. Sizes are the radius; half axes; half lengths; radius and half
+length along z, of a capsule without its caps."""
+
+
+WEIGHTLESS = ("plane", "hfield")
+ORIENTATIONS = TURN.split()
+AXES = dict(zip("xyz", np.eye(3), strict=True))
+Defaults = dict[str, dict[str, str]]
+"""Attributes by kind of element."""
+
+
+def links_of_mjcf(path: str | PathLike[str]) -> tuple[str, list[Link], Vector, list[Closure | Coupling]]:
+    """Return the name of the model, its links with parents first, the acceleration of gravity, and its equalities.
+
+    Raises:
+        SystemDefinitionError: naming file and element, if something is malformed or unknown, or changes the motion and
+            is not read.
+    """
+    root = root_of(Path(path), "mujoco")
+    _include(root)
+    _apply_defaults(root)
+    model = _MujocoModel(root)
+    closures = [*model.closures()]
+    model.unread.warn(root.file)
+    return root.text("model", Path(path).stem), model.scaled(), model.gravity, closures
+
+
+class _MujocoModel:
+    """Links of a document whose attributes are explicit."""
+
+    def __init__(self, root: Element) -> None:
+        self.root, self.unread = root, Unread()
+        self.settings, option, flags = (
+            _merged(root, tag, parts)
+            for tag, parts in (
+                ("compiler", self.inside("compiler")),
+                ("option", self.inside("option")),
+                ("flag", [flag for each in self.inside("option") for flag in each.children("flag")]),
+            )
+        )
+        self.disabled = {key for key in flags.node.attrib if flags.choice(key, "enable", "disable") == "disable"}
+        self.gravity = option.vector("gravity", (0, 0, -9.81)) * ("gravity" not in self.disabled)
+        self.turn = np.pi / 180 if self.settings.choice("angle", "degree", "radian") == "degree" else 1.0
+        self.links: list[Link] = []
+        self.compensating: list[Element] = []
+        self.carriers, self.parents = {-1: -1}, dict[int, int]()
+        """Of each body, by its link: the moving body that it is fixed to, and the one that this is connected with."""
+        self.shapes: dict[tuple[int, int, int], None] = {}
+        """Of geoms: the link, contype and conaffinity."""
+        self.places: dict[tuple[str, str], tuple[int, Pose]] = {("body", "world"): (-1, Pose())}
+        """Link and pose in it of bodies and sites, by tag and name."""
+        for world in self.inside("worldbody"):
+            self.read(world)
+        self.read_actuators()
+        self.read_tendons()
+        if self.contacts():
+            self.unread.add("contacts")
+        if self.compensating and any(link.inertia.lift[0] for link in self.links):
+            self.compensating[0].refuse("has actuatorgravcomp, which is not read where bodies have gravcomp")
+
+    def inside(self, tag: str) -> list[Element]:
+        return self.root.children(tag)
+
+    def read_tendons(self) -> None:
+        """Store the limits and dry friction of tendons."""
+        for tendon in (each for section in self.inside("tendon") for each in section.children()):
+            self.read_limits(tendon, "tendons", tendon.name)
+
+    def read(self, world: Element) -> None:
+        pending = [(world, -1, Pose())]
+        while pending:
+            element, link, at = pending.pop()
+            if element.tag == "body":
+                link, at = self.add(element, link, at @ self.pose(element)), Pose()
+                self.put(element, link, at)
+            elif element.tag == "frame":
+                at = at @ self.pose(element)
+            if element.tag != "frame":
+                for geom, _ in self.contents(element, "geom"):
+                    self.shapes[link, int(geom.number("contype", 1)), int(geom.number("conaffinity", 1))] = None
+            for site in element.children("site"):
+                self.put(site, link, at @ self.pose(site))
+            inner = (*element.children("frame"), *element.children("body"))
+            pending += [(each, link, at) for each in reversed(inner)]
+
+    def put(self, element: Element, link: int, at: Pose) -> None:
+        """Store the place of a body or site, if it has a name."""
+        key = element.tag, element.node.get("name", "")
+        if key in self.places:
+            element.refuse("is defined twice: rename one")
+        if key[1]:
+            self.places[key] = link, at
+
+    def add(self, body: Element, parent: int, pose: Pose) -> int:
+        """Add a link for each joint of a body and one that carries its inertia; return the position of the last."""
+        name = body.text("name", f"body{len(self.links)}")
+        joints = [*self.contents(body, "joint", "freejoint")]
+        above, anchor = self.carriers[parent], np.zeros(3)
+        for count, (joint, frame) in enumerate(joints):
+            free = joint.tag == "freejoint" or joint.text("type", "hinge") == "free"  # has no place in the body
+            at = np.zeros(3) if free else frame.position + frame.rotation @ joint.vector("pos", (0, 0, 0))
+            moved = pose @ Pose(at - anchor)
+            label = joint.text("name", name if count == 0 else f"{name}_{count + 1}")
+            self.links.append(Link(label, parent, self.joint(joint, label, moved, frame, parent), Inertia()))
+            parent, pose, anchor = len(self.links) - 1, Pose(), at
+        place = len(self.links)
+        self.carriers[place] = place if joints else above
+        if joints:
+            self.parents[place] = above
+        if body.choice("mocap", "false", "true") == "true":
+            self.unread.add("motion of mocap bodies", name)
+        carried = Joint(name=name, kind="fixed", pose=pose @ Pose(-anchor))
+        fixed = self.carriers[place] < 0 and not self.settings.has("settotalmass")  # to the world
+        lift = body.number("gravcomp", 0) * (not {"spring", "damper"} <= self.disabled)
+        self.links.append(Link(name, parent, carried, Inertia() if fixed else self.inertia(body).compensated(lift)))
+        return place
+
+    def contents(self, body: Element, *tags: str) -> Iterator[tuple[Element, Pose]]:
+        """Yield the children of a body with one of the tags, also in frames, with the pose of their frame."""
+        pending = [(body, Pose())]
+        while pending:
+            element, at = pending.pop()
+            if element.tag in tags:
+                yield element, at
+            elif element.tag == "frame" or element is body:
+                inner = at @ self.pose(element) if element.tag == "frame" else at
+                pending += [(child, inner) for child in reversed(element.children("frame", *tags))]
+
+    def contacts(self) -> bool:
+        """Return whether geoms of different bodies may touch, in MuJoCo's rules.
+
+        https://mujoco.readthedocs.io/en/stable/computation/index.html#selection
+        """
+        if self.disabled & {"contact", "constraint"}:
+            return False
+        sections = self.inside("contact")
+        excluded = {
+            frozenset(self.place(each, key)[0] for key in ("body1", "body2"))
+            for section in sections
+            for each in section.children("exclude")
+        }
+        near = set() if "filterparent" in self.disabled else {*self.parents.items()}
+        for (one, *types), (two, *others) in combinations(self.shapes, 2):
+            a, b = self.carriers[one], self.carriers[two]
+            filtered = a == b or (min(a, b) >= 0 and not near.isdisjoint({(a, b), (b, a)}))
+            if not filtered and (types[0] & others[1] or others[0] & types[1]) and {one, two} not in excluded:
+                return True
+        return any(section.children("pair") for section in sections)
+
+    def read_actuators(self) -> None:
+        """Add the inertias of rotors and the damping of actuators, which are those of lengths gear q, to joints."""
+        places = {link.joint.name: i for i, link in enumerate(self.links) if link.joint.kind in SINGLE}
+        for each in (actuator for section in self.inside("actuator") for actuator in section.children()):
+            self.unread.add("actuators", each.name)
+            armature, damping = (each.number(key, 0, 0) for key in ("armature", "damping"))
+            if armature or damping:
+                place = places.get(each.text("joint", each.text("jointinparent", "")))
+                if place is None:
+                    each.refuse("has armature or damping, which is read of actuators of hinges and slides only")
+                joint, factor = self.links[place].joint, each.vector("gear", (1,), range(1, 7))[0] ** 2
+                damping = joint.damping + factor * damping * ("damper" not in self.disabled)
+                joint = replace(joint, damping=damping, armature=joint.armature + factor * armature)
+                self.links[place] = replace(self.links[place], joint=joint)
+
+    def read_limits(self, element: Element, part: str, name: str) -> None:
+        limited = element.choice("limited", "auto", "true", "false")
+        low, high = element.vector("range", (0, 0), (2,))
+        if limited == "auto" and low < high and self.settings.choice("autolimits", "true", "false") == "true":
+            limited = "true"
+        if limited == "true" and not self.disabled & {"limit", "constraint"}:
+            self.unread.add(f"limits of {part}", name)
+        if element.number("frictionloss", 0, 0) and not self.disabled & {"frictionloss", "constraint"}:
+            self.unread.add(f"dry friction of {part}", name)
+
+    def closures(self) -> Iterator[Closure | Coupling]:
+        """Yield the equalities that are active; their softness is not read.
+
+        https://mujoco.readthedocs.io/en/stable/XMLreference.html#equality
+        """
+        for each in (equality for section in self.inside("equality") for equality in section.children()):
+            if each.choice("active", "true", "false") == "false" or self.disabled & {"equality", "constraint"}:
+                continue
+            if each.tag == "joint":
+                yield self.coupling(each)
+            elif each.tag in ("connect", "weld"):
+                yield self.closure(each)
+            else:
+                each.refuse("is not read: remove it or write a constraint")
+
+    def place(self, element: Element, key: str) -> tuple[int, Pose]:
+        """Return the link and the pose in it of the body or site that an attribute names."""
+        kind, name = key[:-1], element.text(key, "world" if key == "body2" else None)
+        if (kind, name) not in self.places:
+            known = [each for tag, each in self.places if tag == kind]
+            element.refuse(f"names the {kind} '{name}', which does not exist{closest(name, known)}")
+        return self.places[kind, name]
+
+    def closure(self, equality: Element) -> Closure:
+        """Return a connection or weld of two sites, or of bodies, by default as in the reference configuration."""
+        kind = "site" if equality.has("site1") else "body"
+        mixed = [key for key in ("body1", "body2", "anchor", "relpose") if equality.has(key)]
+        if mixed and kind == "site":
+            equality.refuse(f"has site1 and {mixed[0]}: sites or bodies are needed")
+        (one, at), (two, end) = (self.place(equality, f"{kind}{k}") for k in (1, 2))
+        if one == two:
+            equality.refuse("is between a body and itself")
+        turning = equality.tag == "weld"
+        if turning and equality.number("torquescale", 1) <= 0:
+            equality.refuse("has a torquescale that is not > 0: use a <connect>")
+        if kind == "body" and turning:
+            pose = equality.vector("relpose", (0, 1, 0, 0, 0, 0, 0), (7,))
+            if pose[3:].any():
+                at = Pose(pose[:3], _of_quaternion(equality, pose[3:]))
+            else:
+                at = at_reference(self.links, one).inverse @ at_reference(self.links, two)
+        elif kind == "body":
+            at = Pose(equality.vector("anchor"))
+            end = at_reference(self.links, two).inverse @ at_reference(self.links, one) @ at
+        return Closure((one, two), (at, end), turning)
+
+    def coupling(self, equality: Element) -> Coupling:
+        """Return a relation between two joints, or the fixed value of one."""
+        zeros = {each.joint.name: each.joint.zero for each in self.links}
+        joint, other = equality.text("joint1"), equality.text("joint2", "") or None
+        if joint == other:
+            equality.refuse(f"is between joint '{joint}' and itself")
+        first = equality.vector("polycoef", (0,), range(1, 6))
+        polynomial = (*first, *(0, 1, 0, 0, 0)[len(first) :])  # those that are not written keep their defaults
+        coefficients = tuple(map(float, polynomial if other else polynomial[:1]))
+        return Coupling(joint, other, coefficients, zeros.get(joint, 0.0), zeros.get(other or "", 0.0))
+
+    def joint(self, joint: Element, name: str, pose: Pose, frame: Pose, parent: int) -> Joint:
+        bare = joint.tag == "freejoint"
+        kind = "free" if bare else joint.choice("type", "hinge", "slide", "ball", "free")
+        if kind == "free" and parent >= 0:
+            joint.refuse("is free, but its body is inside another body")
+        turn = self.turn if kind == "hinge" else 1.0
+        stiffness, rest, zero = (joint.number(each, 0) for each in ("stiffness", "springref", "ref"))
+        if "spring" in self.disabled:
+            stiffness = 0.0
+        if kind in ("ball", "free") and stiffness != 0:
+            joint.refuse("has a stiffness, which is read for hinges and slides only")
+        if joint.choice("actuatorgravcomp", "false", "true") == "true":
+            self.compensating.append(joint)
+        self.read_limits(joint, "joints", name)
+        damping = joint.number("damping", 0, 0)
+        return Joint(
+            name=name,
+            kind=kind,
+            pose=pose,
+            axis=frame.rotation @ joint.unit("axis", (0, 0, 1)) if kind in SINGLE else np.zeros(3),
+            damping=0.0 if "damper" in self.disabled else damping,
+            stiffness=stiffness,
+            rest=rest * turn,
+            armature=joint.number("armature", 0, 0),
+            zero=zero * turn if kind in SINGLE else 0.0,
+        )
+
+    def inertia(self, body: Element) -> Inertia:
+        """Return the inertia of a body, by its inertial or, as ``inertiafromgeom`` says, by its geoms."""
+        rule = self.settings.choice("inertiafromgeom", "auto", "true", "false")
+        inertials = [*self.contents(body, "inertial")]
+        if len(inertials) > 1:
+            inertials[1][0].refuse("is the second of its body: one is allowed")
+        if rule == "false" or (rule == "auto" and inertials):
+            return self.inertial(inertials[0][0]).seen_from(inertials[0][1]) if inertials else Inertia()
+        total = Inertia()
+        low, high = self.settings.vector("inertiagrouprange", (0, 5), (2,))
+        for geom, frame in self.contents(body, "geom"):
+            if low <= geom.number("group", 0) <= high:
+                total += self.geom(geom).seen_from(frame)
+        return total
+
+    def inertial(self, inertial: Element) -> Inertia:
+        inertial.vector("pos")
+        if inertial.has("fullinertia"):
+            if others := [key for key in ("diaginertia", *ORIENTATIONS) if inertial.has(key)]:
+                inertial.refuse(f"has fullinertia and {others[0]}: one is needed")
+            xx, yy, zz, xy, xz, yz = inertial.vector("fullinertia", sizes=(6,))
+            matrix = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        else:
+            matrix = np.diag(inertial.vector("diaginertia", (0, 0, 0)))
+        return Inertia(inertial.number("mass", least=0), matrix=matrix).seen_from(self.pose(inertial))
+
+    def geom(self, geom: Element) -> Inertia:
+        shape = geom.text("type", "mesh" if geom.has("mesh") else "sphere")
+        density, mass = geom.number("density", 1000, 0), geom.number("mass", np.nan, 0)
+        if shape in WEIGHTLESS or mass == 0:
+            return Inertia()
+        if shape not in SHAPES or geom.has("mesh") or geom.choice("shellinertia", "false", "true") == "true":
+            geom.refuse(f"is a {shape} whose inertia is not computed: give its body an <inertial>")
+        count, volume_and_inertia = SHAPES[shape]
+        size = geom.vector("size", sizes=(1, 2, 3))
+        if geom.has("fromto"):
+            ends = geom.vector("fromto", sizes=(6,))
+            if shape == "sphere":
+                geom.refuse("has fromto, which needs a shape with an axis")
+            size = np.array([size[0]] * (count - 1) + [float(np.linalg.norm(ends[3:] - ends[:3])) / 2])
+        if len(size) < count or (size[:count] <= 0).any():
+            geom.refuse(f"is a {shape} and has size='{geom.text('size')}': {count} numbers > 0 are needed")
+        with np.errstate(all="ignore"):
+            volume, moments = volume_and_inertia(size[:count])
+        if not (0 < volume < np.inf and np.isfinite(moments).all()):
+            geom.refuse(f"has size='{geom.text('size')}', whose volume is {volume:g}: use other units of length")
+        mass = density * volume if np.isnan(mass) else mass
+        return Inertia(mass, matrix=mass * np.diag(moments)).seen_from(self.pose(geom))
+
+    def pose(self, element: Element) -> Pose:
+        if not element.has("fromto"):
+            return Pose(element.vector("pos", (0, 0, 0)), self.orientation(element))
+        if element.has("pos"):
+            element.refuse("has pos and fromto: one is needed")
+        ends = element.vector("fromto", sizes=(6,))
+        line = ends[:3] - ends[3:]
+        length = float(np.linalg.norm(line))
+        if length == 0:
+            element.refuse("has fromto, which needs two different points")
+        return Pose((ends[:3] + ends[3:]) / 2, _shortest_turn(line / length))
+
+    def orientation(self, element: Element) -> Vector:
+        """Return the rotation matrix of the one attribute of orientation that an element has."""
+        present = [each for each in ORIENTATIONS if each in element.node.attrib]
+        if len(present) > 1:
+            element.refuse(f"has {' and '.join(present)}: one orientation is needed")
+        kind = present[0] if present else ""
+        if kind == "quat":
+            return _of_quaternion(element, element.vector("quat", sizes=(4,)))
+        if kind == "axisangle":
+            *axis, angle = element.vector("axisangle", sizes=(4,))
+            length = float(np.linalg.norm(axis))
+            if length == 0:
+                element.refuse("has an axis of length 0")
+            return about(np.array(axis) / length, angle * self.turn)
+        if kind == "euler":
+            rotation = np.eye(3)
+            sequence = self.settings.text("eulerseq", "xyz")
+            if not re.fullmatch("[xyzXYZ]{3}", sequence):
+                element.refuse(f"has euler, and eulerseq='{sequence}' is not three of the letters xyzXYZ")
+            for letter, angle in zip(sequence, element.vector("euler"), strict=True):
+                turned = about(AXES[letter.lower()], angle * self.turn)
+                rotation = rotation @ turned if letter.islower() else turned @ rotation
+            return rotation
+        if kind == "xyaxes":
+            axes = element.vector("xyaxes", sizes=(6,))
+            z = np.cross(axes[:3], axes[3:])
+            if not z.any():
+                element.refuse(f"has xyaxes='{element.text('xyaxes')}', which must be two different directions")
+            x, z = axes[:3] / np.linalg.norm(axes[:3]), z / np.linalg.norm(z)
+            return np.column_stack([x, np.cross(z, x), z])
+        return _shortest_turn(element.unit("zaxis")) if kind else np.eye(3)
+
+    def scaled(self) -> list[Link]:
+        """Return the links, with inertias scaled to ``settotalmass``."""
+        total = self.settings.number("settotalmass", -1)
+        masses = sum(link.inertia.mass for link in self.links)
+        if total <= 0 or masses == 0:
+            return self.links
+        return [replace(each, inertia=each.inertia.scaled(total / masses)) for each in self.links]
+
+
+def _merged(root: Element, tag: str, parts: list[Element]) -> Element:
+    """Return one element with the attributes of several, of which the later ones win."""
+    attributes = {key: value for part in parts for key, value in part.node.attrib.items()}
+    return Element(root.file, ElementTree.Element(tag, attributes))
+
+
+def _include(root: Element) -> None:
+    """Replace ``<include>`` by the contents of the file.
+
+    Its path is relative to the folder of the main document or, where it does not exist there, of the including one.
+    """
+    read, pending = {Path(root.file).resolve()}, [root]
+    while pending:
+        outer = pending.pop()
+        nodes, children = [], deque(outer.children())
+        while children:
+            child = children.popleft()
+            if child.tag != "include":
+                nodes.append(child)
+                continue
+            name = Path(child.text("file"))
+            if name.is_absolute() or set(child.node.attrib) != {"file"} or len(child.node):
+                child.refuse(f"must have only file, a path relative to the folder of the document: '{name}'")
+            folders = [Path(each).parent for each in (root.file, child.file)]
+            path = next((each / name for each in folders if (each / name).exists()), folders[0] / name)
+            if not is_inside(folders[0], path):
+                where = "outside the folder of the main document"
+                child.refuse(f"names '{name}' {where}: copy it there, or name its folder ({FOLDERS})")
+            if path.resolve() in read:
+                child.refuse(f"names '{name}', which is included already")
+            read.add(path.resolve())
+            included = root_of(path, "mujocoinclude", "mujoco")
+            root.files.update(dict.fromkeys(included.node, included.file))
+            children.extendleft(Element(included.file, node, root.files) for node in reversed(included.node))
+        if len(nodes) != len(outer.node) or any(a.node is not b for a, b in zip(nodes, outer.node, strict=True)):
+            outer.node[:] = [each.node for each in nodes]
+        pending += nodes
+
+
+def _apply_defaults(root: Element) -> None:
+    """Give elements the attributes of their class, or of the class of the bodies around them, and check them all."""
+    elements, classes = [*root.walk(MJCF)], _classes(root)
+    of_classes = {node for section in root.children("default") for node in section.node.iter()}
+    for element, kind in elements:
+        if element.node in of_classes:
+            continue
+        inherited = element.node.get("childclass", "")
+        for child in element.node if inherited else ():
+            if child.tag in ("body", "frame") or (child.tag in MJCF and MJCF[child.tag].defaults):
+                child.attrib.setdefault("class" if MJCF[child.tag].defaults else "childclass", inherited)
+        name = inherited or element.text("class", "main")
+        if name not in classes:
+            element.refuse(f"is of the class '{name}', which does not exist{closest(name, classes)}")
+        if kind.defaults:
+            element.node.attrib.update(_over(classes[name].get(kind.defaults, {}), element.node.attrib))
+        element.check_neutral(kind)
+
+
+def _classes(root: Element) -> dict[str, Defaults]:
+    """Return the default attributes of each class, which inherits those of the class around it."""
+    classes: dict[str, Defaults] = {"main": {}}
+    for section in root.children("default"):
+        if section.text("class", "main") != "main":
+            section.refuse("is an outermost one, whose class is 'main'")
+        pending = [(section, "main")]
+        while pending:
+            element, name = pending.pop()
+            for child in element.children():
+                kind = MJCF.get(MJCF["default"].children[child.tag])
+                if kind is not None and kind.defaults:
+                    if wrong := {"class", "name"} & {*child.node.attrib}:
+                        child.refuse(f"has {min(wrong)}, which defaults do not have")
+                    classes[name] |= {kind.defaults: _over(classes[name].get(kind.defaults, {}), child.node.attrib)}
+            for child in element.children("default"):
+                if child.text("class") in classes:
+                    child.refuse(f"is the second of the class '{child.text('class')}': one is allowed")
+                classes[child.text("class")] = dict(classes[name])
+                pending.append((child, child.text("class")))
+    return classes
+
+
+def _over(defaults: dict[str, str], attributes: dict[str, str]) -> dict[str, str]:
+    """Return attributes over their defaults: one orientation replaces another, and numbers of a size the first ones."""
+    turned = any(key in attributes for key in ORIENTATIONS)
+    merged = {key: value for key, value in defaults.items() if not (turned and key in ORIENTATIONS)} | attributes
+    if "size" in defaults and "size" in attributes:
+        sizes = attributes["size"].split()
+        merged["size"] = " ".join(sizes + defaults["size"].split()[len(sizes) :])
+    return merged
+
+
+def _of_quaternion(element: Element, q: Vector) -> Vector:
+    if not q.any():
+        element.refuse("has a quaternion of length 0")
+    return np.array(matrix_of([*map(float, q / np.linalg.norm(q))]), dtype=float)
+
+
+def _shortest_turn(axis: Vector) -> Vector:
+    """Return the shortest rotation that turns the z axis into a unit vector."""
+    across = np.cross([0.0, 0.0, 1.0], axis)
+    length = float(np.linalg.norm(across))
+    if length < 1e-12:
+        return np.diag([1.0, np.sign(axis[2]), np.sign(axis[2])])
+    return about(across / length, float(np.arctan2(length, axis[2])))

@@ -1,0 +1,263 @@
+"""Tree of rigid bodies connected by joints, in numbers."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.common.errors import SystemDefinitionError
+
+Vector = NDArray[np.float64]
+
+KINDS = ("fixed", "hinge", "slide", "ball", "free")
+SINGLE = ("hinge", "slide")
+"""Kinds of joints with one coordinate."""
+ROUNDED = 1e-9
+"""Entries of rotation matrices that differ less from 0, 1 or -1 are these numbers."""
+LOST = 1e-15
+"""Entries of turned vectors and matrices that are smaller, relative to the largest one, are rounding errors."""
+ROUGH, POINT = 0.05, 1e-6
+"""Tolerance of moments of inertia that were identified or printed with few digits, relative to the largest one and, for
+bodies that are nearly points, to the mass."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """Position and rotation of a frame in another: x_outer = position + rotation x_inner."""
+
+    position: Vector = field(default_factory=lambda: np.zeros(3))
+    rotation: Vector = field(default_factory=lambda: np.eye(3))
+
+    def __matmul__(self, inner: Pose) -> Pose:
+        return Pose(self.position + self.rotation @ inner.position, self.rotation @ inner.rotation)
+
+    @property
+    def inverse(self) -> Pose:
+        """Pose of the outer frame in the inner one."""
+        return Pose(-self.rotation.T @ self.position, self.rotation.T)
+
+
+@dataclass(frozen=True, slots=True)
+class Inertia:
+    """Mass, center of mass and inertia matrix about the center of mass, in the axes of the link.
+
+    Attributes:
+        lift: mass whose weight is compensated, and its first moment.
+    """
+
+    mass: float = 0.0
+    center: Vector = field(default_factory=lambda: np.zeros(3))
+    matrix: Vector = field(default_factory=lambda: np.zeros((3, 3)))
+    lift: tuple[float, Vector] = field(default_factory=lambda: (0.0, np.zeros(3)))
+
+    def seen_from(self, pose: Pose) -> Inertia:
+        """Return the inertia in the frame in which its own frame has the given pose."""
+        turned = pose.rotation @ self.matrix @ pose.rotation.T
+        lift = self.lift[0], self.lift[0] * pose.position + pose.rotation @ self.lift[1]
+        return Inertia(self.mass, pose.position + pose.rotation @ self.center, turned, lift)
+
+    def scaled(self, factor: float) -> Inertia:
+        """Return the inertia of a body of another density."""
+        return Inertia(
+            self.mass * factor, self.center, self.matrix * factor, (self.lift[0] * factor, self.lift[1] * factor)
+        )
+
+    def compensated(self, share: float) -> Inertia:
+        """Return the inertia of a body that gravity does not act on with a share of its mass."""
+        return replace(self, lift=(share * self.mass, share * self.mass * self.center))
+
+    def __add__(self, other: Inertia) -> Inertia:
+        mass = self.mass + other.mass
+        center = (self.mass * self.center + other.mass * other.center) / mass if mass else self.center
+        lift = self.lift[0] + other.lift[0], self.lift[1] + other.lift[1]
+        return Inertia(mass, center, sum((each.about(center) for each in (self, other)), np.zeros((3, 3))), lift)
+
+    def about(self, point: Vector) -> Vector:
+        """Return the inertia matrix about a point (parallel axis theorem)."""
+        arm = self.center - point
+        return self.matrix + self.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Joint:
+    """Joint between a link and its parent.
+
+    Attributes:
+        name: its name, which is that of the coordinate.
+        kind: one of ``KINDS``.
+        pose: pose of the link in the parent's frame where the coordinate is 0.
+        axis: unit vector of a hinge or slide, in the frame of the link.
+        damping, stiffness, rest: torque or force -damping q_dot - stiffness (q - rest).
+        armature: inertia of the rotor, which adds armature q_dot^2/2 to the kinetic energy.
+        zero: value of the coordinate at ``pose``.
+        follows: name of another joint, factor and offset: q = factor q_other + offset, without a coordinate of its own.
+    """
+
+    name: str
+    kind: str
+    pose: Pose
+    axis: Vector = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    damping: float = 0.0
+    stiffness: float = 0.0
+    rest: float = 0.0
+    armature: float = 0.0
+    zero: float = 0.0
+    follows: tuple[str, float, float] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """Rigid body.
+
+    Attributes:
+        name: its name.
+        parent: position of the parent among the links of the tree, which is smaller than its own; -1 is the world.
+        joint: joint to the parent.
+        inertia: of the link and of all that is fixed to it.
+    """
+
+    name: str
+    parent: int
+    joint: Joint
+    inertia: Inertia
+
+
+@dataclass(frozen=True, slots=True)
+class DrawnLink:
+    """Geometry of a link in plain numbers, for pictures: see :class:`Link` and :class:`Joint`."""
+
+    parent: int
+    name: str
+    kind: str
+    position: tuple[float, ...]
+    rotation: tuple[tuple[float, ...], ...]
+    center: tuple[float, ...]
+    zero: float
+    follows: tuple[str, float, float] | None
+
+    @classmethod
+    def of(cls, link: Link) -> DrawnLink:
+        """Return the geometry of a link whose frame is that of its formulas, :func:`aligned`."""
+        joint, rotation = link.joint, tuple(tuple(row) for row in link.joint.pose.rotation.tolist())
+        position, center = (tuple(each.tolist()) for each in (joint.pose.position, link.inertia.center))
+        return cls(link.parent, joint.name, joint.kind, position, rotation, center, joint.zero, joint.follows)
+
+
+def without_fixed(links: Sequence[Link]) -> list[Link]:
+    """Return the links with those of fixed joints merged into their parents."""
+    moving: list[Link] = []
+    places: list[tuple[int, Pose]] = []  # of each link: the moving link that carries it, and the pose there
+    for link in links:
+        carrier, at = places[link.parent] if link.parent >= 0 else (-1, Pose())
+        pose = at @ link.joint.pose
+        if link.joint.kind == "fixed":
+            places.append((carrier, pose))
+            if carrier >= 0:
+                base = moving[carrier]
+                moving[carrier] = replace(base, inertia=base.inertia + link.inertia.seen_from(pose))
+        else:
+            if link.joint.kind == "free" and carrier >= 0:
+                raise SystemDefinitionError(
+                    f"joint '{link.joint.name}' is free, but its parent moves: remove the joint"
+                )
+            places.append((len(moving), Pose()))
+            moving.append(replace(link, parent=carrier, joint=replace(link.joint, pose=pose)))
+    if not moving:
+        raise SystemDefinitionError(
+            "no body has a joint that moves: add one, or free the base (from_urdf: floating=True, MJCF: <freejoint>)"
+        )
+    for link in moving:
+        mass, matrix = link.inertia.mass, link.inertia.matrix
+        moments = np.linalg.eigvalsh(matrix) if np.isfinite(matrix).all() else np.full(3, np.nan)
+        excess, allowed = moments[2] - moments[1] - moments[0], ROUGH * moments[2] + POINT * mass
+        if not (moments[0] >= -1e-9 * abs(moments).max() - 1e-12 * mass and excess <= allowed):
+            raise SystemDefinitionError(
+                f"link '{link.name}', with the links fixed to it, has the mass {mass:g} and the moments of inertia "
+                f"{moments}, which no body has: none is < 0 or exceeds the sum of the others; correct its <inertial>"
+            )
+    return moving
+
+
+def aligned(links: Sequence[Link]) -> list[Link]:
+    """Return the links in frames whose z axis is the axis of their hinge or slide, turned about it to make zeros.
+
+    The rotation C from the frame of a link to that of its parent at q = 0 becomes Rz(phi) Rx(alpha), as by Denavit and
+    Hartenberg's convention, and the rotation of a hinge C Rz(q), which keeps the formulas of deep trees short.
+    """
+    turned: list[Link] = []
+    turns: list[Vector] = []
+    for link in links:
+        outer = turns[link.parent] if link.parent >= 0 else np.eye(3)
+        joint = link.joint
+        turn = np.eye(3) if joint.kind not in SINGLE else _frame_along(joint.axis)
+        constant = outer.T @ joint.pose.rotation @ turn
+        if joint.kind in SINGLE:
+            along, across = constant[2, 1], constant[2, 0]
+            if np.hypot(along, across) > ROUNDED:
+                by = about(np.array([0.0, 0.0, 1.0]), float(np.arctan2(across, along)))
+                turn, constant = turn @ by, constant @ by
+        pose = Pose(without_rounding(outer.T @ joint.pose.position), rounded(constant))
+        turns.append(turn)
+        inertia = link.inertia.seen_from(Pose(rotation=turn.T))
+        center, matrix = without_rounding(inertia.center), without_rounding(inertia.matrix)
+        inertia = replace(inertia, center=center, matrix=matrix)
+        turned.append(Link(link.name, link.parent, replace(joint, pose=pose), inertia))
+    return turned
+
+
+def rounded(rotation: Vector) -> Vector:
+    """Return a rotation matrix with entries that are nearly 0, 1 or -1 replaced by these."""
+    nearest = np.round(rotation)
+    return np.where(np.abs(rotation - nearest) < ROUNDED, nearest, rotation)
+
+
+def without_rounding(values: Vector) -> Vector:
+    """Return turned values with 0 in place of entries that are rounding errors of others."""
+    return np.where(np.abs(values) < LOST * np.abs(values).max(), 0.0, values)
+
+
+def about(axis: Vector, angle: float) -> Vector:
+    """Return the rotation matrix about a unit vector (Rodrigues)."""
+    across = hat(axis)
+    rotation: Vector = np.eye(3) + np.sin(angle) * across + (1 - np.cos(angle)) * across @ across
+    return rotation
+
+
+def hat(v: Vector) -> Vector:
+    """Return the matrix of the cross product with a vector."""
+    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+
+
+def _frame_along(axis: Vector) -> Vector:
+    """Return a rotation matrix with the given third column."""
+    if abs(axis[2]) > 1 - ROUNDED:
+        return np.diag([1.0, np.sign(axis[2]), np.sign(axis[2])])
+    x = np.cross([0.0, 0.0, 1.0], axis)
+    x /= np.linalg.norm(x)
+    return np.column_stack([x, np.cross(axis, x), axis])
+
+
+def named(links: Sequence[Link]) -> list[Link]:
+    """Return the links with joints whose names are valid in formulas: other characters become ``_``.
+
+    Raises:
+        SystemDefinitionError: if two joints have one name.
+    """
+    renamed: dict[str, Link] = {}
+    for link in links:
+        joint = link.joint
+        name = identifier(joint.name)
+        if name in renamed:
+            raise SystemDefinitionError(f"two joints are called '{name}': rename one")
+        follows = joint.follows and (identifier(joint.follows[0]), *joint.follows[1:])
+        renamed[name] = replace(link, joint=replace(joint, name=name, follows=follows))
+    return [*renamed.values()]
+
+
+def identifier(name: str) -> str:
+    """Return a name with the characters that formulas do not allow replaced by ``_``."""
+    return re.sub(r"\W", "_", name, flags=re.ASCII)

@@ -1,0 +1,145 @@
+"""Forces at points of bodies: generalised forces and torques by virtual work.
+
+A force f in space at the point r(x, R, n) does the virtual work f . delta r. With delta R = R hat(delta theta), theta
+in the body frame, the generalised force on a coordinate is f . dr/dx, the torque on a rotation
+
+    tau_k = f . sum_ij dr/dR_ij (R hat(e_k))_ij,
+
+and the force on a direction f . dr/dn. For r = x + R s this is f on x and s x R^T f on R.
+
+Rotations declared by frames of ``sympy.physics.vector`` that are oriented by a quaternion.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+import sympy
+from sympy import Expr, Matrix, S, zeros
+from sympy.core.function import AppliedUndef
+
+from scvi_codegen.common.errors import SystemDefinitionError
+from scvi_codegen.systems.formulas.rotations import AXES, Direction, Homogeneous, Rotation, matrix_of, rates_matrix
+from scvi_codegen.systems.formulas.symbols import symbol
+
+KEYS = ("body", "point", "origin", "force", "frame")
+FRAMES = ("space", "body")
+
+
+def forces_at_points(
+    entries: Sequence[Mapping[str, Any]],
+    coordinates: Sequence[str],
+    members: Sequence[Homogeneous],
+    read: Callable[[Any], Expr],
+) -> Iterator[tuple[str, Matrix]]:
+    """Yield the generalised forces, by name of a coordinate, rotation or direction, of forces at points.
+
+    Args:
+        entries: mappings with ``point`` and ``force``, three formulas each; with the name of a rotation as ``body``,
+            the point is in its frame, beside ``origin``, three formulas of the position of the body, by default 0, and
+            with ``frame="body"`` the force, too.
+        coordinates: names of the ordinary coordinates.
+        members: rotations, directions and spins.
+        read: converts a formula to an expression.
+
+    Raises:
+        SystemDefinitionError: for other keys, bodies or frames, other numbers of formulas, and moving points.
+    """
+    rotations = {each.name: each for each in members if isinstance(each, Rotation)}
+    for k, entry in enumerate(entries):
+        point, force = _vectors(entry, rotations, f"point_forces[{k}]", read)
+        moving = {symbol(f"{name}_dot") for name in coordinates}.union(*(each.rates for each in members))
+        if velocities := sorted(each.name for each in point.free_symbols & moving):
+            raise SystemDefinitionError(f"the point of point_forces[{k}] depends on the velocity '{velocities[0]}'")
+        for name in coordinates:
+            yield name, Matrix([force.dot(point.diff(symbol(name)))])
+        for each in members:
+            if isinstance(each, Direction):
+                yield each.name, Matrix([force.dot(point.diff(entry)) for entry in each.entries])
+            elif isinstance(each, Rotation):
+                derivatives = Matrix(3, 3, [force.dot(point.diff(entry)) for entry in each.entries])
+                yield each.name, torque_of(Matrix(3, 3, each.entries), derivatives)
+
+
+def _vectors(
+    entry: Mapping[str, Any], rotations: Mapping[str, Rotation], where: str, read: Callable[[Any], Expr]
+) -> tuple[Matrix, Matrix]:
+    unknown = sorted(set(entry) - set(KEYS))
+    if unknown or not {"point", "force"} <= set(entry):
+        named = f"the unknown key '{unknown[0]}'" if unknown else "no point or no force"
+        raise SystemDefinitionError(f"{where} has {named}. Required: point, force; optional: body, origin, frame")
+    body, frame = entry.get("body"), entry.get("frame", "space")
+    if frame not in FRAMES or (body is None and (frame != "space" or "origin" in entry)):
+        raise SystemDefinitionError(
+            f"{where} has the frame {frame!r}{' and an origin' * ('origin' in entry)} of the body {body!r}: frames are "
+            "'space' and 'body'; origin and the frame 'body' require a body"
+        )
+    if body is not None and body not in rotations:
+        raise SystemDefinitionError(f"{where} has the body '{body}'. Rotations: {', '.join(rotations) or 'none'}")
+    point, origin, force = (
+        _three(entry.get(key), f"the {key} of {where}", read) for key in ("point", "origin", "force")
+    )
+    if body is None:
+        return point, force
+    matrix = Matrix(3, 3, rotations[body].entries)
+    return origin + matrix * point, matrix * force if frame == "body" else force
+
+
+def _three(formulas: Any, role: str, read: Callable[[Any], Expr]) -> Matrix:
+    if formulas is None:
+        return zeros(3, 1)
+    if not isinstance(formulas, Sequence) or isinstance(formulas, str) or len(formulas) != len(AXES):
+        raise SystemDefinitionError(f"{role} must have three components, not {formulas!r}")
+    return Matrix([read(each if isinstance(each, Expr) else str(each)) for each in formulas])
+
+
+def torque_of(matrix: Matrix, derivatives: Matrix) -> Matrix:
+    """Return tau_k = sum_ij D_ij (R hat(e_k))_ij, with column j of R hat(e_k) = R (e_k x e_j)."""
+    weights: Matrix = matrix.T * derivatives
+    pairs: tuple[tuple[int, int], ...] = ((2, 1), (0, 2), (1, 0))
+    return Matrix([weights[i, j] - weights[j, i] for i, j in pairs])
+
+
+def rotations_of_frames(rotations: Mapping[Any, Any] | None) -> tuple[dict[str, str], dict[Expr, Expr]]:
+    """Return rotations with their rates by name, and the rules that replace the functions of frames in formulas.
+
+    Args:
+        rotations: rate by name, or for a frame with ``B.orient_quaternion(N, ..)`` the frame N by the frame B. The
+            rotation is then called as the frame, and its rate ``omega``, or ``omega_B`` if there are several frames.
+
+    Raises:
+        SystemDefinitionError: if a frame is not oriented by a quaternion of four functions of time.
+    """
+    names: dict[str, str] = {}
+    rules: dict[Expr, Expr] = {}
+    several = sum(not isinstance(each, str) for each in rotations or {}) > 1
+    for frame, base in (rotations or {}).items():
+        if isinstance(frame, str):
+            names[frame] = base
+            continue
+        q = _quaternion(frame, base)
+        member = Rotation(frame.name, f"omega_{frame.name}" if several else "omega")
+        names[member.name] = member.rate
+        coordinates = Matrix([symbol(name) for name in member.coordinates])
+        unit = coordinates / sympy.sqrt(coordinates.dot(coordinates))
+        velocity = rates_matrix(unit) * Matrix(member.rates) / 2
+        time = q[0].args[0]
+        rules |= dict(zip(q, unit, strict=True)) | {f.diff(time): v for f, v in zip(q, velocity, strict=True)}
+        components = frame.ang_vel_in(base).to_matrix(frame)
+        rules |= {f: rate for f, rate in zip(components, member.rates, strict=True) if isinstance(f, AppliedUndef)}
+    return names, rules
+
+
+def _quaternion(frame: Any, base: Any) -> tuple[Expr, ...]:
+    """Return the functions (w, x, y, z) of a frame oriented by them: the trace of the matrix is 3 w^2 - x^2 - .."""
+    matrix = base.dcm(frame).expand()
+    functions = sorted(matrix.atoms(AppliedUndef), key=str)
+    weights = [sympy.expand(matrix.trace()), *(matrix[k, k] for k in range(3))]
+    q: list[Expr] = []
+    for k, entry in enumerate(weights):
+        q += [f for f in functions if f not in q and entry.coeff(f, 2) == (3 if k == 0 else 1)][:1]
+    if len(functions) != 4 or len(q) != 4 or any(each != 0 for each in (matrix - matrix_of(q)).expand()):
+        raise SystemDefinitionError(
+            f"the frame '{frame}' is not oriented in '{base}' by a quaternion: write {frame}.orient_quaternion({base}, "
+            "dynamicsymbols('q0:4')), or name a rotation, rotations={'R': 'omega'}"
+        )
+    return tuple(S(each) for each in q)

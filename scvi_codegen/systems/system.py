@@ -1,0 +1,366 @@
+"""Base class of systems defined by a Lagrangian or a Hamiltonian: names, parameters and one function.
+
+All later stages use one thing, a function whose stationary action gives the equations of motion:
+
+    L(q, v, t)            of a :class:`~scvi_codegen.systems.lagrangian.LagrangianSystem`, no auxiliary variables,
+    p . v - H(q, p, t)    of a :class:`~scvi_codegen.systems.hamiltonian.HamiltonianSystem`, with the momenta p as
+    auxiliary variables
+
+(Hamilton's principle, and Hamilton's principle in phase space: paper, section 1.1). Auxiliary variables are further
+unknowns at every point where the function is evaluated; the action is stationary in them, too.
+
+A new kind of system is a frozen dataclass derived from :class:`MechanicalSystem` with the properties ``lagrangian``
+and ``auxiliaries``, and ``formula``, the user's function; it validates itself on construction. Methods and lowering
+use nothing else, and expressions derived from them only through
+:func:`~scvi_codegen.systems.derived_expressions.forms_of`. Matrix-free solvers also use an equivalent Lagrangian, if
+one is known (:func:`~scvi_codegen.systems.legendre.transform.equivalent_lagrangian`).
+
+Formulas of systems defined by text are read only when they are first needed.
+An integrator that was compiled before needs no formulas, hence no SymPy: the cache contains the key of its system under
+all arguments of ``from_text``, its class and the versions of this package and of SymPy. The entry is written by
+:meth:`Deferred.store_key`, and only for text that was read without error or warning.
+"""
+
+from __future__ import annotations
+
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any, Self
+
+from scvi_codegen.common.cache import key_of, store_text, stored_text
+from scvi_codegen.common.display.cards import Html, card, listed, plain
+from scvi_codegen.common.errors import SystemDefinitionError, closest
+from scvi_codegen.common.validation import ExactNumber, of
+from scvi_codegen.systems.formulas.indices import Array
+from scvi_codegen.systems.formulas.symbols import DOT, number, symbol
+
+if TYPE_CHECKING:
+    from sympy import Expr, Symbol
+
+    from scvi_codegen.systems.formulas.rotations import Homogeneous
+
+
+class Deferred:
+    """Base of frozen dataclasses with slots: fields without a value are read from text when they are first accessed.
+
+    ``_text`` contains the arguments of ``from_text`` as JSON, and ``_key`` the key found in the cache; both are unset
+    for objects made in another way.
+    """
+
+    __slots__ = ("_key", "_text")
+    _key: str
+    _text: str
+
+    @classmethod
+    @abstractmethod
+    def _read(cls, arguments: Mapping[str, Any]) -> tuple[Any, bool]:
+        """Return the system of these arguments, and whether warnings were issued."""
+
+    @classmethod
+    def _of_text(cls, arguments: Mapping[str, Any]) -> Self:
+        """Return the system of these arguments of ``from_text``, unread if its key is in the cache."""
+        text = _text_of(cls, arguments)
+        key = None if text is None else stored_text(("system", text))
+        if key is not None:
+            system = object.__new__(cls)
+            object.__setattr__(system, "_key", key)
+        else:
+            system, warned = cls._read(arguments)
+            text = None if warned else text
+        if text is not None:
+            object.__setattr__(system, "_text", text)
+        return system
+
+    def key(self) -> tuple[str, ...]:
+        """Return the key of this system in caches, made from its type and all of its fields."""
+        return (getattr(self, "_key", None) or key_of(self),)
+
+    def store_key(self) -> None:
+        """Store the key of a system that was read from text, so that later processes need not read the text."""
+        if hasattr(self, "_text") and not hasattr(self, "_key"):
+            (key,) = self.key()
+            store_text(("system", self._text), key)
+            object.__setattr__(self, "_key", key)
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            """Read the text if ``name`` is a field; called only for attributes without a value."""
+            names = [field.name for field in fields(self)]
+            if name not in names or not hasattr(self, "_text"):
+                raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}", name=name, obj=self)
+            system, _ = self._read(json.loads(self._text)[1])
+            for each in names:
+                object.__setattr__(self, each, getattr(system, each))
+            return getattr(self, name)
+
+
+def _text_of(cls: type, arguments: Mapping[str, Any]) -> str | None:
+    """Return the class and the arguments as JSON; ``None`` for arrays, derived classes and other objects."""
+    if cls.__module__.partition(".")[0] != __name__.partition(".")[0] or are_arrays(
+        arguments["coordinates"], arguments["parameters"] or (), arguments["tables"]
+    ):
+        return None
+    if any(isinstance(value, ExactNumber) for value in (arguments["parameters"] or {}).values()):
+        return None  # JSON has one word
+    plain = {name: dict(value) if isinstance(value, Mapping) else value for name, value in arguments.items()}
+    try:
+        return json.dumps([f"{cls.__module__}.{cls.__qualname__}", plain])
+    except (TypeError, ValueError):
+        return None
+
+
+def are_arrays(*declarations: Any) -> bool:
+    """Return whether one of the coordinates, parameters or tables is an array."""
+    return any("[" in str(each) for group in declarations for each in group)
+
+
+MAX_OPERATIONS = 200
+"""Maximum number of operations of a formula shown in a notebook."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TimeTransformation:
+    """Time transformation dt = g dtau of a system that moves in fictitious time tau (:func:`reparametrise`).
+
+    Attributes:
+        rate: g = dt/dtau, a function of the coordinates (for a Hamiltonian also of the momenta).
+        energy: the parameter that is the energy of the initial state; the function of the system is then
+            rate (energy of the state - energy), zero along trajectories.
+        time_transformation: the rate as requested, by name or as text; it and ``plain`` are for model files.
+        plain: the system in physical time.
+    """
+
+    rate: Expr
+    energy: Symbol
+    time_transformation: str = field(default="", compare=False)
+    plain: MechanicalSystem | None = field(default=None, compare=False, repr=False)
+
+
+def zero() -> Expr:
+    """Return SymPy's 0, the default value of fields."""
+    from sympy import S
+
+    return S.Zero
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MechanicalSystem(Deferred, ABC):
+    """Coordinates, time and parameters with default values; subclasses add the function.
+
+    Attributes:
+        name: name of the system.
+        coordinates: the m coordinates, in order.
+        time: the symbol ``t``.
+        parameters: the symbols that stay adjustable in the compiled integrator; one may be absent from the function.
+        defaults: their default values, parallel to ``parameters``.
+        clock: time transformation, if any.
+        forces: m generalised forces in addition to the function (:mod:`scvi_codegen.systems.derived_expressions`), in
+            (q, v, t) for a Lagrangian and (q, p, t) for a Hamiltonian, or empty (:mod:`scvi_codegen.systems.forces`).
+        damping: damping rate gamma of all momenta, a formula of parameters, 0 without damping
+            (:mod:`scvi_codegen.systems.forces`).
+        inputs: names of inputs, each represented by five of the parameters
+            (:mod:`scvi_codegen.systems.formulas.symbols`).
+        constraints: expressions in (q, t), or linear in v, that are 0 along trajectories of a Lagrangian
+            (:mod:`scvi_codegen.systems.forces`).
+        arrays: declarations of the arrays of known sizes whose entries are coordinates and parameters.
+        indices: sizes and index tables of these arrays by name, for events in index notation.
+        lengths: cutoffs and periods of lists of neighbours
+            (:class:`~scvi_codegen.systems.formulas.neighbours.Neighbours`).
+        definition: the text with arrays or rotations that the system was read from, for model files; else empty.
+        rotations: rotations, directions and spins, whose coordinates follow the ordinary ones
+            (:mod:`scvi_codegen.systems.formulas.rotations`).
+    """
+
+    name: str
+    coordinates: tuple[Symbol, ...]
+    time: Symbol
+    parameters: tuple[Symbol, ...]
+    defaults: tuple[float, ...]
+    clock: TimeTransformation | None = None
+    forces: tuple[Expr, ...] = ()
+    constraints: tuple[Expr, ...] = ()
+    inputs: tuple[str, ...] = ()
+    damping: Expr = field(default_factory=zero)
+    arrays: tuple[Array, ...] = field(default=(), compare=False)
+    indices: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
+    definition: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
+    rotations: tuple[Homogeneous, ...] = ()
+    lengths: tuple[tuple[str, ...], ...] = ()
+
+    @property
+    @abstractmethod
+    def lagrangian(self) -> Expr:
+        """Function of (q, v, t) and of the auxiliary variables whose action is stationary."""
+
+    @property
+    @abstractmethod
+    def auxiliaries(self) -> tuple[Symbol, ...]:
+        """Auxiliary variables of :attr:`lagrangian`, m or none."""
+
+    @property
+    @abstractmethod
+    def formula(self) -> Expr:
+        """Function that defines the system: L or H."""
+
+    @classmethod
+    def __subclasshook__(cls, other: type) -> bool:
+        """Count systems of arrays of run-time sizes as instances of the class that they name in ``ACTS_AS``."""
+        return getattr(other, "ACTS_AS", None) == cls.__name__ or NotImplemented
+
+    @property
+    def constrained(self) -> bool:
+        """True if there are constraints; reads no formulas."""
+        return bool(json.loads(self._text)[1]["constraints"] if hasattr(self, "_key") else self.constraints)
+
+    @property
+    def dimension(self) -> int:
+        """Number m of coordinates."""
+        return len(self.coordinates)
+
+    @property
+    def velocities(self) -> tuple[Symbol, ...]:
+        """Symbols of the m velocities, parallel to ``coordinates``."""
+        return tuple(symbol(coordinate.name + DOT) for coordinate in self.coordinates)
+
+    @property
+    def momentum_symbols(self) -> tuple[Symbol, ...]:
+        """Symbols of the m momenta: for a Lagrangian ``p_`` and the coordinate, preceded by ``_`` if not unique."""
+        taken = {symbol.name for symbol in (*self.coordinates, *self.velocities, *self.parameters)}
+        return self.auxiliaries or tuple(symbol(_free(f"p_{q.name}", taken)) for q in self.coordinates)
+
+    @property
+    def _common_fields(self) -> dict[str, Any]:
+        """Fields that a Lagrangian and its Hamiltonian have in common, by name."""
+        names = "name", "coordinates", "time", "parameters", "defaults", "damping", "inputs", "rotations", "lengths"
+        return {name: getattr(self, name) for name in names}
+
+    @property
+    def replaced(self) -> dict[Symbol, Expr]:
+        """Coordinates of the original of a system in angles of rods, and their velocities, as expressions."""
+        return {}
+
+    @property
+    def constants(self) -> dict[Symbol, float]:
+        """Default values by parameter."""
+        return dict(zip(self.parameters, self.defaults, strict=True))
+
+    @property
+    def integrands(self) -> tuple[Expr, ...]:
+        """Functions integrated along the curve of each step: the rate dt/dtau of a time transformation."""
+        return (self.clock.rate,) if self.clock else ()
+
+    @property
+    def depends_on_time(self) -> bool:
+        """True if time occurs in the function, a force or a constraint, so that energy is not conserved."""
+        return any(self.time in formula.free_symbols for formula in (self.lagrangian, *self.forces, *self.constraints))
+
+    @property
+    def changes_energy(self) -> str:
+        """Reason why energy is not conserved; empty if it is."""
+        if self.forces or self.damping != 0:
+            return "forces act" if self.forces else "damping takes it"
+        if self._constraints_work():
+            return "constraints do work"
+        if self.time in self.lagrangian.free_symbols:
+            return f"{'H' if self.auxiliaries else 'L'} depends on time"
+        return ""
+
+    @property
+    def kinks(self) -> tuple[str, ...]:
+        """Functions as text at whose zeros the function, forces or constraints are not smooth, by unit_step or rint."""
+        from scvi_codegen.systems.formulas.expressions import kinks_of
+
+        return tuple(sorted(map(self.text_of, kinks_of((self.lagrangian, *self.forces, *self.constraints)))))
+
+    @property
+    def balances_energy(self) -> bool:
+        """True if the energy changes by the work of forces or damping only."""
+        acted = bool(self.forces) or self.damping != 0
+        return acted and not (self.time in self.formula.free_symbols or self._constraints_work())
+
+    def _constraints_work(self) -> bool:
+        from scvi_codegen.systems.constraints import constraints_work
+
+        return bool(self.constraints) and constraints_work(self)
+
+    def to_text(self) -> str:
+        """Return the function as text that ``from_text`` accepts, in the names of rotations and directions."""
+        return self.text_of(self._shown_formula)
+
+    @property
+    def _shown_formula(self) -> Expr:
+        reduced = getattr(self, "reduced", None)
+        return reduced.lagrangian if reduced else self.formula
+
+    def text_of(self, formula: Expr) -> str:
+        """Return a formula of the system as text, with its inputs by their names."""
+        from scvi_codegen.systems.formulas.intermediates import written_out
+        from scvi_codegen.systems.formulas.symbols import inputs_by_name
+        from scvi_codegen.systems.formulas.translation import format_expression
+
+        return format_expression(inputs_by_name(written_out(formula), self.inputs))
+
+    @property
+    def constraint_texts(self) -> tuple[str, ...]:
+        """Constraints g as text, in the names of the rotations and directions of a Lagrangian."""
+        reduced = getattr(self, "reduced", None)
+        return tuple(map(self.text_of, reduced.constraints if reduced else self.constraints))
+
+    def with_parameters(self, **values: float) -> Self:
+        """Return a copy of the system with other default values for the named parameters."""
+        names = [parameter.name for parameter in self.parameters]
+        for key in values:
+            if key not in names:
+                raise SystemDefinitionError(
+                    f"'{self.name}' has no parameter '{key}'{closest(key, names)} It has: {', '.join(names) or 'none'}"
+                )
+        changed = dict(zip(names, self.defaults, strict=True)) | values
+        return replace(self, defaults=tuple(number(key, value) for key, value in changed.items()))
+
+    def _repr_html_(self) -> str:
+        from sympy import Symbol, count_ops
+
+        from scvi_codegen.common.display.mathml import mathml_terms
+        from scvi_codegen.systems.formulas.intermediates import LONGEST_WRITTEN, written_out, written_size
+
+        letter = "H" if self.auxiliaries else "L"
+        shown = self._shown_formula
+        short = written_size(shown) <= LONGEST_WRITTEN
+        size = count_ops(shown) if short else written_size(shown)
+        formula = mathml_terms(written_out(shown), Symbol(letter)) if size <= MAX_OPERATIONS else ()
+        written = " ".join(formula) or plain(f"{letter}: {size} operations")
+        parameters = [f"{parameter.name} = {value:g}" for parameter, value in self.constants.items()]
+        return card(
+            self.name,
+            (
+                ("coordinates", listed([q.name for q in self.coordinates])),
+                *([("rotations", listed([each.declaration for each in self.rotations]))] if self.rotations else []),
+                *([("momenta", listed([p.name for p in self.auxiliaries]))] if self.auxiliaries else []),
+                ("parameters", listed(parameters)),
+                *self._force_facts(),
+            ),
+            Html(f"<div>{written}</div>"),
+        )
+
+    def _force_facts(self) -> Iterator[tuple[str, Html]]:
+        """Yield forces, damping and constraints as rows of a notebook's card."""
+        reduced = getattr(self, "reduced", None)
+        forces = reduced.forces if reduced else zip([q.name for q in self.coordinates], zip(self.forces), strict=False)
+        for name, components in forces:
+            if any(components):
+                yield f"force on {name}", plain(", ".join(map(self.text_of, components)))
+        if self.damping != 0:
+            yield "damping", plain(self.text_of(self.damping))
+        for g in self.constraint_texts:
+            yield "constraint", plain(f"{g} = 0")
+
+
+def _free(name: str, taken: set[str]) -> str:
+    return name if name not in taken else _free(f"_{name}", taken)
+
+
+SYSTEM = of("a LagrangianSystem or a HamiltonianSystem", MechanicalSystem)
+"""Type check of mechanical systems, for :func:`~scvi_codegen.common.validation.takes`."""

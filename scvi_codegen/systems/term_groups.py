@@ -1,0 +1,252 @@
+"""Groups of similar terms: terms that differ only in their coordinates, parameters and numbers.
+
+The potentials of lattices, nets and many bodies consist of such groups. A group is differentiated once, for one term,
+and evaluated in a loop. Terms are compared by their expression trees: arguments of sums and products are sorted by
+their structure without names and numbers, so that similar terms have equal keys.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from itertools import compress, groupby, repeat
+from typing import TypeVar
+
+from sympy import Add, Expr, Symbol, factor_terms
+
+from scvi_codegen.systems.formulas.expressions import gradient_tuple
+from scvi_codegen.systems.formulas.intermediates import inner_of
+from scvi_codegen.systems.formulas.symbols import symbol
+from scvi_codegen.systems.system import MechanicalSystem
+
+MIN_GROUP_SIZE = 300
+"""Minimum number of terms of a group; smaller ones are unrolled, which is short enough and shares subexpressions."""
+MAX_GROUPS = 64
+"""Maximum number of structures of terms; systems with more are not rolled."""
+
+Item = TypeVar("Item")
+
+
+@dataclass(frozen=True, slots=True)
+class TermGroup:
+    """Group of similar terms.
+
+    Attributes:
+        formula: of one term, in ``slots``, ``constants``, the symbols common to all terms, and time.
+        slots: symbols of coordinates.
+        constants: symbols of the constants that differ between terms.
+        places: indices of the coordinates in ``slots``, for each term.
+        values: numbers or parameters, for each of ``constants`` and each term.
+    """
+
+    formula: Expr
+    slots: tuple[Symbol, ...]
+    constants: tuple[Symbol, ...]
+    places: tuple[tuple[int, ...], ...]
+    values: tuple[tuple[Expr, ...], ...]
+
+    def where(self, chosen: Sequence[bool]) -> TermGroup:
+        """Return the group with only the chosen terms."""
+        indices, *values = (tuple(compress(column, chosen)) for column in (self.places, *self.values))
+        return replace(self, places=indices, values=tuple(values))
+
+    @property
+    def partials(self) -> tuple[Expr, ...]:
+        """Derivatives of the formula by ``slots``, with common factors extracted, since many share the rest."""
+        return tuple(map(factor_terms, gradient_tuple(self.formula, self.slots)))
+
+
+@dataclass(frozen=True, slots=True)
+class SplitSystem:
+    """System split into unrolled terms and term groups.
+
+    Attributes:
+        rest: the same system without the term groups.
+        term_groups: term groups of L, or of -H for a Hamiltonian.
+    """
+
+    rest: MechanicalSystem
+    term_groups: tuple[TermGroup, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class SimilarTerms:
+    """Terms of the same structure.
+
+    Attributes:
+        terms: the expressions.
+        leaves: coordinates and constants of each term, in the same order.
+    """
+
+    terms: tuple[Expr, ...]
+    leaves: tuple[_Leaves, ...]
+
+    def __len__(self) -> int:
+        return len(self.terms)
+
+    @property
+    def groups(self) -> Iterator[SimilarTerms]:
+        """Groups in which each constant is a number in all terms, or a parameter in all terms."""
+
+        def pattern(pair: tuple[Expr, _Leaves]) -> tuple[bool, ...]:
+            return tuple(constant.is_Number for constant in pair[1].constants)
+
+        pairs = zip(self.terms, self.leaves, strict=True)
+        ordered = sorted(pairs, key=lambda pair: (pattern(pair), pair[1].places))
+        for _, similar in groupby(ordered, pattern):
+            yield SimilarTerms(*zip(*similar, strict=True))
+
+    def group(self, slot: Callable[[str, int], Symbol], constant: Callable[[int], Symbol], sign: int = 1) -> TermGroup:
+        """Return the term group.
+
+        Args:
+            slot: symbol of a coordinate, by its array and its column in the table of indices.
+            constant: symbol of a constant, by its number.
+            sign: factor of the formula.
+        """
+        first, columns = self.leaves[0], list(zip(*(each.constants for each in self.leaves), strict=True))
+        varying = [k for k, column in enumerate(columns) if len(set(column)) > 1]
+        symbols = [constant(k) if k in varying else column[0] for k, column in enumerate(columns)]
+        return TermGroup(
+            formula=sign * first.substituted(self.terms[0], slot, symbols),
+            slots=tuple(slot("", k) for k in range(len(first.places))),
+            constants=tuple(symbols[k] for k in varying),
+            places=tuple(tuple(each.places) for each in self.leaves),
+            values=tuple(columns[k] for k in varying),
+        )
+
+
+@lru_cache(maxsize=16)
+def roll_terms(system: MechanicalSystem) -> SplitSystem | None:
+    """Split a system; ``None`` without large term groups, or with constraints, a clock, or intermediate quantities."""
+    terms = Add.make_args(system.formula)
+    if len(terms) < MIN_GROUP_SIZE or system.constraints or system.clock or inner_of(system.formula):
+        return None
+    moving = {*system.velocities, *system.auxiliaries}
+    known = {*system.coordinates}
+    still = [term for term in terms if known & term.free_symbols and not moving & term.free_symbols]
+    kinds = similar_terms(still, {q: ("", k) for k, q in enumerate(system.coordinates)}, system.parameters)
+    large = [kind for kind in kinds if len(kind) >= MIN_GROUP_SIZE]
+    if not large:
+        return None
+    slot, constant = (_stem(name, system.parameters) for name in ("slot", "given"))
+    groups = [
+        each.group(
+            lambda _, k: symbol(f"{slot}{k}"), lambda k: symbol(f"{constant}{k}"), -1 if system.auxiliaries else 1
+        )
+        for kind in large
+        for each in kind.groups
+    ]
+    function = "hamiltonian" if system.auxiliaries else "lagrangian"
+    gathered = {term for kind in large for term in kind.terms}
+    rest = replace(system, **{function: Add(*(term for term in terms if term not in gathered))})
+    return SplitSystem(rest, _merged(groups))
+
+
+def _merged(groups: Sequence[TermGroup]) -> tuple[TermGroup, ...]:
+    merged: dict[tuple[tuple[int, ...], ...], TermGroup] = {}
+    for group in groups:
+        other = merged.setdefault(group.places, group)
+        if other is not group:
+            constants = tuple(symbol(f"{each.name}_{len(other.constants)}") for each in group.constants)
+            merged[group.places] = replace(
+                other,
+                formula=other.formula + group.formula.xreplace(dict(zip(group.constants, constants, strict=True))),
+                constants=(*other.constants, *constants),
+                values=(*other.values, *group.values),
+            )
+    return tuple(merged.values())
+
+
+def _stem(name: str, parameters: Sequence[Symbol]) -> str:
+    stem = f"{name}_"
+    while any(parameter.name.startswith(stem) for parameter in parameters):
+        stem += "_"
+    return stem
+
+
+def similar_terms(
+    terms: Iterable[Expr],
+    indices: Mapping[Symbol, tuple[str, int]],
+    names: Iterable[Symbol],
+    first: Iterable[tuple[int, ...]] = repeat(()),
+) -> tuple[SimilarTerms, ...]:
+    """Return the terms by structure, in the order of their keys; nothing if there are more than ``MAX_GROUPS``.
+
+    Args:
+        terms: in canonical form.
+        indices: array and index of each coordinate, velocity or momentum.
+        names: parameters.
+        first: indices that precede those of each term, such as the coordinate on which a force acts.
+    """
+    kinds: dict[str, list[tuple[Expr, _Leaves]]] = {}
+    shapes, known = dict[Expr, str](), set(names)
+    for term, begun in zip(terms, first, strict=False):
+        leaves = _Leaves(indices, known, shapes, [*begun])
+        kinds.setdefault(leaves.key(term), []).append((term, leaves))
+        if len(kinds) > MAX_GROUPS:
+            return ()
+    return tuple(SimilarTerms(*zip(*similar, strict=True)) for _, similar in sorted(kinds.items()))
+
+
+@dataclass(slots=True)
+class _Leaves:
+    """Coordinates (places) and constants of a term, without repetitions, in the order in which they occur."""
+
+    arrays: Mapping[Symbol, tuple[str, int]]
+    names: set[Symbol]
+    shapes: dict[Expr, str]
+    places: list[int] = field(default_factory=list)
+    constants: list[Expr] = field(default_factory=list)
+
+    def key(self, formula: Expr) -> str:
+        if formula.is_Pow:
+            exponent = str(formula.exp) if formula.exp.is_Number else self.key(formula.exp)
+            return f"({self.key(formula.base)})**({exponent})"
+        if formula.is_Add or formula.is_Mul:
+            parts = [self.key(part) for part in sorted(formula.args, key=self.shape)]
+            return f"({(' + ' if formula.is_Add else '*').join(parts)})"
+        if formula.args:
+            return f"{formula.func.__name__}({', '.join(self.key(part) for part in formula.args)})"
+        if formula in self.arrays:
+            array, index = self.arrays[formula]
+            return f"{array}{{{_number(self.places, index)}}}"
+        return f"[{_number(self.constants, formula)}]" if self._is_constant(formula) else str(formula)
+
+    def shape(self, formula: Expr) -> str:
+        """Return the structure of a formula without numbered leaves."""
+        known = self.shapes.get(formula)
+        if known is None:
+            known = self.shapes[formula] = self._shape(formula)
+        return known
+
+    def _shape(self, formula: Expr) -> str:
+        if formula.is_Pow:
+            exponent = str(formula.exp) if formula.exp.is_Number else self.shape(formula.exp)
+            return f"({self.shape(formula.base)})**({exponent})"
+        if formula.args:
+            return f"{formula.func.__name__}({', '.join(sorted(map(self.shape, formula.args)))})"
+        if formula in self.arrays:
+            return self.arrays[formula][0]
+        return "c" if self._is_constant(formula) else str(formula)
+
+    def _is_constant(self, formula: Expr) -> bool:
+        return bool(formula.is_Number) or formula in self.names
+
+    def substituted(self, formula: Expr, slot: Callable[[str, int], Symbol], constants: Sequence[Expr]) -> Expr:
+        if formula.args:
+            fixed = formula.args[1:] if formula.is_Pow and formula.exp.is_Number else ()
+            parts = formula.args[: len(formula.args) - len(fixed)]
+            return formula.func(*(self.substituted(part, slot, constants) for part in parts), *fixed)
+        if formula in self.arrays:
+            array, index = self.arrays[formula]
+            return slot(array, self.places.index(index))
+        return constants[self.constants.index(formula)] if self._is_constant(formula) else formula
+
+
+def _number(known: list[Item], item: Item) -> int:
+    """Return the index of an item in a list, appending the item if necessary."""
+    if item not in known:
+        known.append(item)
+    return known.index(item)

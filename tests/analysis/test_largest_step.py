@@ -1,0 +1,85 @@
+"""Largest step of tau for a requested accuracy, and reports of runs that miss it."""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+import scvi_codegen as sc
+from scvi_codegen.analysis.advice.largest_step import ALLOWED, REFINEMENTS, accuracy_message, largest_step
+
+KEPLER = sc.problem("kepler").system
+START: Any = [1.9, 0.0], [0.0, (0.1 / 1.9) ** 0.5]
+"""Apocentre of an ellipse of eccentricity 0.9, period 2 pi."""
+
+
+@cache
+def stepper() -> sc.Stepper:
+    return sc.compile_stepper(sc.reparametrise(KEPLER, "frequency"), sc.SVI(8))
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 1e-12, 1e-8])
+def test_largest_step_satisfies_the_tolerance_and_a_larger_one_does_not(tolerance: float) -> None:
+    h = largest_step(stepper(), *START, 20.0, tolerance)
+    assert stepper().integrate(*START, h=h, t_end=20.0).step_error <= (tolerance or 2.0**-53)
+    try:
+        longer = stepper().integrate(*START, h=h * 2 ** (1 / REFINEMENTS), t_end=20.0).step_error
+    except sc.StepFailedError:  # the equations of a longer step are not solved
+        longer = np.inf
+    assert longer > (tolerance or 2.0**-53)
+    assert largest_step(stepper(), *START, -20.0, tolerance) == pytest.approx(-h)
+
+
+def test_largest_step_is_accurate_to_round_off_after_many_orbits() -> None:
+    """Beside Kepler's ellipse, which closes."""
+    h = largest_step(stepper(), *START, 100.0)
+    run = stepper().integrate(*START, h=h, t_end=40 * np.pi)
+    assert len(run) < 20 * 35
+    assert np.abs(run.q[-1] - START[0]).max() < 2e-11
+    assert np.ptp(run.energy()) < 1e-13
+
+
+def test_integrate_runs_in_transformed_time() -> None:
+    times = np.array([0.0, np.pi, 2 * np.pi, 8 * np.pi])
+    found = sc.solve_ivp(
+        KEPLER, (0.0, 8 * np.pi), [*START[0], *START[1]], time_transformation="frequency", t_eval=times
+    )
+    assert found.success
+    assert np.abs(found.y[:2, ::2].T - START[0]).max() < 1e-12
+    assert found.y[:2, 1] == pytest.approx([-0.1, 0.0], abs=1e-12)
+    rough = sc.solve_ivp(KEPLER, (0.0, 8 * np.pi), [*START[0], *START[1]], time_transformation="frequency", rtol=1e-6)
+    assert rough.success
+    assert 2.0**-53 < rough.trajectory.step_error < 1e-6 * ALLOWED
+    with pytest.raises(sc.StateError, match="need a system, not a compiled stepper"):
+        sc.solve_ivp(stepper(), (0.0, 1.0), [*START[0], *START[1]], h=0.1, time_transformation="frequency")
+
+
+def test_unsuitable_time_transformation_is_detected_later() -> None:
+    """Slow for hundreds of steps far out, with a rate that hardly changes; then the comet is at the sun."""
+    far = [2.0 - 1e-4, 0.0, 0.0, (1e-4 / (2.0 - 1e-4)) ** 0.5]
+    found = sc.solve_ivp(
+        KEPLER, (0.0, 6.0), far, time_transformation="1e-3*(1 + (q1**2 + q2**2)/1000)", rtol=1e-10, method=sc.SVI(8)
+    )
+    assert not found.success
+    assert found.status in (-1, -2)  # a step at the sun has no solution by halves, or too large an error
+
+
+def test_invalid_tolerances_are_reported() -> None:
+    assert accuracy_message(9e-16, 1.0, 0.0) is None
+    assert accuracy_message(float("nan"), 1.0, 0.0) is not None
+    message = accuracy_message(1e-3, 1.5, 1e-9)
+    assert message is not None
+    assert "t = 1.5" in message
+    assert "1.0e-03, but 1.0e-09 was requested" in message
+
+
+@pytest.mark.second
+def test_systems_without_a_largest_step_are_rejected() -> None:
+    for span, tolerance in ((0.0, 1e-9), (1.0, 1.0), (1.0, -1.0)):
+        with pytest.raises(sc.StateError, match=r"span = \S+ must not be 0, and tolerance"):
+            largest_step(stepper(), *START, span, tolerance)
+    verlet = sc.compile_stepper(sc.reparametrise(KEPLER, "frequency"), sc.StoermerVerlet())
+    if np.isnan(verlet.integrate(*START, h=0.1, steps=3).step_error):
+        with pytest.raises(sc.MethodError, match="no error estimate: give h"):
+            largest_step(verlet, *START, 1.0, 1e-3)

@@ -1,0 +1,108 @@
+"""Source of integrators of array systems: strict C99, formatted, of the same length for any number of coordinates."""
+
+import subprocess
+from pathlib import Path
+
+import pytest
+from either_system import either_system
+from style import check_style
+
+from scvi_codegen.codegen.lowering.control import control_of
+from scvi_codegen.codegen.lowering.program import lower
+from scvi_codegen.codegen.native.compilers import find_compiler
+from scvi_codegen.codegen.rendering.program_source import render
+from scvi_codegen.codegen.rendering.source import Source
+from scvi_codegen.methods import as_method
+
+STRICT = ["-std=c99", "-O0", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Wconversion", "-Wno-psabi", "-Werror"]
+
+FORMULAS = {
+    "bodies": (
+        ["r[N, 3]"],
+        "sum(i in N, m[i]*sum(a in 3, r_dot[i, a]**2)/2)"
+        "+ g*sum(i < j in N, m[i]*m[j]/sqrt(sum(a in 3, (r[i, a] - r[j, a])**2)))",
+    ),
+    "all forms": (
+        ["u[NX, NY]", "q[N]"],
+        "sum(i in NX periodic, j in NY, u_dot[i, j]**2/2 - u[i-1, j]*u[i+2, j]*cos(g*t)) + sum(i in N, q_dot[i]**2)"
+        "- sum(b in B, exp(k[b]*(q[bonds[b, 0]] - q[bonds[b, 1]]))) - q[0]*q[N-1]**3"
+        "- sum(i in 1..N-2, m[i]*q[i-1]*q[i+1])",
+    ),
+    "lattices": (
+        ["u[NX, NY]", "q[N, 2]"],
+        "sum(i in NX periodic, j in NY, u_dot[i, j]**2/2 - u[i, j]*u[i+2, j])"
+        "+ sum(i in N, q_dot[i, 0]**2 + q_dot[i, 1]**2)"
+        "- sum(i in N periodic, q[i-1, 0]*q[i+1, 0] + q[i, 1]**4)",
+    ),
+    "hamiltonian": (
+        ["u[NX, NY]", "q[N]"],
+        "sum(i in NX periodic, j in NY, p_u[i+1, j]*u[i, j]**2 + p_u[i, j]**2) - sum(i in N, m[i]*p_q[i]**4*q[i])",
+    ),
+    "free": (["q[N]"], "sum(i in N, q_dot[i]**2/2)"),
+    "damped": (["q[N]"], "sum(i in N, q_dot[i]**2/2) - sum(i < j in N, q[i]*q[j])"),
+}
+EXPLICIT = ("damped", "stoermer-verlet")
+"""Is refused."""
+FORCES = {"damped": {"q[i]": "-m[i]*q_dot[i]*q[i]", "q[N-1]": "cos(t)"}}
+
+
+def rendered(name: str, method: str, *, newton: bool = False) -> Source:
+    """The text of an integrator."""
+    coordinates, formula = FORMULAS[name]
+    system = either_system(
+        name=name,
+        coordinates=coordinates,
+        **{"hamiltonian" if name == "hamiltonian" else "lagrangian": formula},
+        parameters={"m[N]": 1, "k[B]": 1, "g": 2},
+        tables=["bonds[B, 2]"],
+        forces=FORCES.get(name),
+    )
+    program = lower(system, as_method(method), prefix="arrays", solver="newton" if newton else "auto")
+    control = control_of(program)
+    assert control is not None or method == "stoermer-verlet"
+    return render(program, control)
+
+
+@pytest.mark.tiers(1, 3)
+@pytest.mark.sampled(5)
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [(name, method) for name in FORMULAS for method in ("svi:4", "stoermer-verlet") if (name, method) != EXPLICIT],
+)
+def test_generated_code_is_strict_c(name: str, method: str, tmp_path: Path) -> None:
+    """No warnings, in the style of all C here, and nothing that is not declared in the header."""
+    check_strict(rendered(name, method), tmp_path)
+
+
+@pytest.mark.tiers(0, 2)
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize("name", ["bodies", "all forms", "lattices", "hamiltonian", "damped"])
+def test_newton_iteration_is_strict_c(name: str, tmp_path: Path) -> None:
+    """Newton's iteration compiles as strict C."""
+    check_strict(rendered(name, "svi:4", newton=True), tmp_path)
+
+
+def check_strict(source: Source, tmp_path: Path) -> None:
+    """Compile as a library with strict flags."""
+    for path, text in source.files.items():
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / path).write_text(text)
+    check_style(source.code)
+    check_style(source.header)
+    command = [*find_compiler(), *STRICT, "-c", "arrays.c", "-o", "arrays.o"]
+    built = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert built.returncode == 0, built.stderr
+
+
+def test_terms_of_the_first_index_are_computed_once_per_pair() -> None:
+    """Reads are before, and sums after, the loop over the second index."""
+    code = rendered("bodies", "svi:4").code
+    outer = code.index(
+        "for (long long index_i = here->of.first; index_i < here->of.end; index_i++)",
+        code.index("static void add_force_0"),
+    )
+    inner = code.index("for (long long index_j = between(index_i + 1, ", outer)
+    end = code.index("\n}\n", inner)
+    assert code[outer:inner].count("] = X[") == 3
+    assert code[inner:end].count("] = X[") == 3
+    assert code[inner:end].count("F[start_") == 6

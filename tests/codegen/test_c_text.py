@@ -1,0 +1,488 @@
+"""Properties of the C code: strict C99, C++ headers, no allocation, no globals, reproducible, no user text."""
+
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from notation import hamilton, lagrange
+from programs import needs
+from samples import QUICK_FLAGS, sample_named
+from style import check_style
+
+import scvi_codegen as sc
+from scvi_codegen.codegen.ir.program import LEAST_REUSED_UNKNOWNS
+from scvi_codegen.codegen.native.building import TUNED_FLAGS, _mathematics
+from scvi_codegen.codegen.rendering.source import Interface, Source
+from scvi_codegen.interfaces.models.systems import fput_chain
+from scvi_codegen.methods.method import Method
+from scvi_codegen.systems.system import MechanicalSystem
+
+pytestmark = [pytest.mark.long, pytest.mark.rotated]
+
+C99 = "-std=c99 -Wall -Wextra -Wpedantic -Wshadow -Wconversion -Werror".split()  # noqa: SIM905  (reads as one types it)
+CXX = "-std=c++11 -Wall -Wextra -Wpedantic -Werror".split()  # noqa: SIM905  (as above)
+
+METHODS = {
+    method.name: method
+    for method in (
+        sc.SVI(1),
+        sc.SVI(3, "gauss-lobatto:5"),
+        sc.SVI(3, "hermite-2:3"),
+        sc.SVI(2, space="trigonometric:0.3"),
+        sc.SVI(3, space="splines:2"),
+        sc.SCVI(2, abscissae="gauss"),
+        sc.SCVI(1, "gauss-legendre:2"),
+        sc.SCVI(2),
+        sc.SCVI(2, variational=False),
+        sc.SpectralCollocation(3, form="position"),
+        sc.SpectralCollocation(2, form="phase-space"),
+        sc.Gauss(2),
+        sc.RadauIIA(2),
+        sc.RadauIA(2),
+        sc.LobattoIIIA(3),
+        sc.ChebyshevLobatto(3, form="position"),
+        sc.StoermerVerlet(),
+        sc.ExplicitEuler(),
+    )
+}
+
+
+SHARES = 6
+TUNED = (sc.SVI(3), sc.Gauss(5), sc.SpectralCollocation(4), sc.SCVI(5, variational=False))
+
+
+def bare_oscillator() -> sc.LagrangianSystem:
+    return lagrange("bare oscillator", "q", "q_dot**2/2 - q**2/2")
+
+
+def driven_hamiltonian() -> sc.HamiltonianSystem:
+    return hamilton("driven Hamiltonian", "x y", "sqrt(1 + p_x**2 + k*p_x*p_y + p_y**2) + x*sin(t) + x**2*p_y", k=0.3)
+
+
+def hyperbolic() -> sc.HamiltonianSystem:
+    return sc.HamiltonianSystem.from_text(name="hyperbolic", coordinates=["q"], momenta=["p"], hamiltonian="q*p")
+
+
+@cache
+def systems() -> Mapping[str, MechanicalSystem]:
+    """Separable, coupled, with time, three coordinates, no parameters; by a Hamiltonian, last a singular one."""
+    names = ("kepler", "driven-duffing", "double-pendulum", "pumped-cart-pole", "charged-particle")
+    own = (bare_oscillator(), driven_hamiltonian(), hyperbolic())
+    return {**{name: sample_named(name).system for name in names}, **{system.name: system for system in own}}
+
+
+@cache
+def generated(method: str) -> Mapping[str, tuple[Source, Interface]]:
+    """Text of one method for all systems that it takes."""
+    found = {}
+    for name, system in systems().items():
+        with suppress(sc.MethodError):
+            found[name] = sc.generate_source(system, METHODS[method])
+    assert len(found) >= len(systems()) - 2
+    return found
+
+
+def write(sources: Sequence[Source], folder: Path) -> list[str]:
+    """Write headers and sources; the names of the sources."""
+    for source in sources:
+        (folder / f"{source.prefix}.h").write_text(source.header, encoding="utf-8")
+        (folder / f"{source.prefix}.c").write_text(source.amalgamated().code, encoding="utf-8")
+    return [f"{source.prefix}.c" for source in sources]
+
+
+def run(command: Sequence[str], folder: Path) -> str:
+    """Output of a command that must succeed without a warning.
+
+    GCC's note that its own ABI for wide vectors changed in version 4.6 is let pass: no function with one is exported.
+    """
+    result = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, timeout=600)
+    assert result.returncode == 0, f"{' '.join(command)}\n{result.stderr}"
+    assert "warning" not in result.stderr
+    return result.stdout
+
+
+def share_of(method: str, share: int) -> list[Source]:
+    """Every sixth of the texts of a method: over the shares all of them."""
+    return [source for source, _ in generated(method).values()][share::SHARES]
+
+
+@pytest.mark.tiers(0, 1)
+@pytest.mark.sampled(6)
+@pytest.mark.covering
+@pytest.mark.parametrize("share", range(SHARES))
+@pytest.mark.parametrize("method", METHODS)
+def test_code_compiles_without_warnings(method, share, tmp_path):
+    """The objects export nothing but names with the prefix, and hold no data that could be written."""
+    files = write(share_of(method, share), tmp_path)
+    run([needs("gcc"), *C99, "-O1", "-c", *files], tmp_path)
+    if sys.platform == "linux":
+        for file in files:
+            check_symbols(Path(file).stem, tmp_path)
+
+
+@pytest.mark.tiers(0, 2)
+@pytest.mark.sampled(6)
+@pytest.mark.covering
+@pytest.mark.parametrize("share", range(SHARES))
+@pytest.mark.parametrize("method", METHODS)
+def test_clang_reports_no_warnings(method, share, tmp_path):
+    compiler = needs("clang")
+    run([compiler, *C99, "-c", *write(share_of(method, share), tmp_path)], tmp_path)
+
+
+@pytest.mark.covering
+@pytest.mark.parametrize("compiler", ["gcc", "clang"])
+@pytest.mark.parametrize("solver", ["auto", "newton"])
+@pytest.mark.parametrize("name", ["kepler", "double-pendulum", "driven Hamiltonian"])
+def test_sources_for_this_machine_compile_without_warnings(name, solver, compiler, tmp_path):
+    """Sources with a fallback library and with a step density."""
+    system = systems()[name]
+    q = system.coordinates[0].name
+    time_transformation = f"1/(1 + {q}**2)"
+    stepper = sc.compile_stepper(
+        system, sc.SVI(3), solver=solver, time_transformation=time_transformation, prefix="own", flags=QUICK_FLAGS
+    )
+    texts = [stepper.source, *([stepper.fallback] if stepper.fallback else [])]
+    assert len(texts) == (2 if solver == "auto" else 1)
+    for number, text in enumerate(texts):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        run([needs(compiler), *C99, "-c", *write([text], folder)], folder)
+        variables = re.findall(r"^(\w+) [BbCc]", run([needs("nm"), "-P", f"{text.prefix}.o"], folder), re.MULTILINE)
+        assert variables == []
+        check_style(text.amalgamated().code)
+        check_style(text.header)
+
+
+def check_symbols(prefix: str, folder: Path) -> None:
+    symbols = [line.split() for line in run([needs("nm"), "-P", f"{prefix}.o"], folder).splitlines()]
+    assert [name for name, kind, *_ in symbols if kind.isupper() and kind != "U" and not name.startswith(prefix)] == []
+    assert [name for name, kind, *_ in symbols if kind in "DdBbCSsGg"] == []
+    _, line = run([needs("size"), f"{prefix}.o"], folder).splitlines()
+    assert line.split()[1:3] == ["0", "0"]  # data, bss
+
+
+@pytest.mark.tiers(1, 2)
+@pytest.mark.parametrize("method", METHODS)
+def test_code_allocates_nothing_writes_nothing_and_has_no_static_state(method):
+    for source, _ in generated(method).values():
+        text = re.sub(r"/\*.*?\*/", "", source.header + source.amalgamated().code, flags=re.DOTALL)
+        assert re.findall(r"\b(?:[mc]alloc|realloc|alloca|free|f?printf|puts|fopen|exit|abort|assert)\b", text) == []
+        assert re.findall(r"\bstatic\s+(?!const\b)(?!inline\b)[^(;]*[=;]", text) == []
+        assert re.findall(r"\b(?:errno|setjmp|volatile|register|goto)\b", text) == []
+
+
+def test_headers_compile_as_c_plus_plus(tmp_path):
+    pairs = [sc.generate_source(systems()["kepler"], method) for method in METHODS.values()]
+    files = write([source for source, _ in pairs], tmp_path)
+    uses = "".join(
+        f"  total += {s.prefix}_default_options().tolerance + {s.prefix.upper()}_WORKSPACE;\n" for s, _ in pairs
+    )
+    includes = "".join(f'#include "{source.prefix}.h"\n' for source, _ in pairs)
+    text = f"{includes}int main()\n{{\n  double total = 0.0;\n{uses}  return total > 0.0 ? 0 : 1;\n}}\n"
+    (tmp_path / "main.cpp").write_text(text)
+    run([needs("gcc"), "-std=c99", "-c", *files], tmp_path)
+    objects = [f"{Path(file).stem}.o" for file in files]
+    run([needs("g++"), *CXX, "main.cpp", *objects, "-lm", "-o", "main"], tmp_path)
+    run([str(tmp_path / "main")], tmp_path)
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.covering
+@pytest.mark.parametrize("solver", ["newton", "fixed-point"])
+@pytest.mark.parametrize("compiler", ["gcc", "clang"])
+def test_either_solver_alone_compiles_without_warnings(compiler, solver, tmp_path):
+    methods = (sc.SVI(2), sc.Gauss(3), sc.StoermerVerlet(), sc.SpectralCollocation(2), sc.SCVI(3, variational=False))
+    names = ("kepler", "driven-duffing", "pumped-cart-pole")
+    sources = [sc.generate_source(systems()[name], method, solver=solver)[0] for method in methods for name in names]
+    sources += [sc.generate_source(driven_hamiltonian(), method, solver=solver)[0] for method in methods[:3]]
+    files = write(sources, tmp_path)
+    run([needs(compiler), *C99, "-c", *files], tmp_path)
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.covering
+@pytest.mark.parametrize("name", ["double-pendulum", "driven-duffing", "driven Hamiltonian"])
+@pytest.mark.parametrize("method", TUNED, ids=lambda method: method.name)
+@pytest.mark.parametrize("compiler", ["gcc", "clang"])
+def test_tuned_builds_compile_without_warnings(compiler, method, name, tmp_path):
+    """Flags are the vector instructions of this processor, and glibc's vector functions where available."""
+    files = write([sc.generate_source(systems()[name], method)[0]], tmp_path)
+    for define, _ in _mathematics(TUNED_FLAGS):
+        run([needs(compiler), *C99, *TUNED_FLAGS, *define, "-c", *files], tmp_path)
+
+
+# Equal bytes.
+
+FINGERPRINT = """
+import hashlib
+from test_c_text import METHODS, generated
+names = "svi-1-gauss-legendre-1", "scvi-2-chebyshev-lobatto-gauss-legendre-2", "gauss-2"
+for method in names:
+    for name, (source, interface) in generated(method).items():
+        text = "".join(source.files.values()) + source.declarations + repr(interface.to_record())
+        print(method, name, hashlib.sha256(text.encode()).hexdigest())
+"""
+
+
+def test_source_is_equal_in_every_process(tmp_path):
+    """Whatever the seed of Python's hashes, on which the order of sets and of SymPy's arguments depends."""
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-c", FINGERPRINT],
+            cwd=Path(__file__).parent,
+            env={**os.environ, "PYTHONHASHSEED": str(seed), "PYTHONPATH": os.pathsep.join(sys.path)},
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        for seed in (0, 4242)
+    ]
+    first, *others = [process.communicate()[0] for process in processes]
+    assert first.count("\n") == 3 * len(systems()) - 1  # one of the methods does not take the singular Hamiltonian
+    assert others == [first] * len(others)
+
+
+def test_source_is_ascii_with_unix_line_ends_and_no_trailing_blanks():
+    for method in METHODS:
+        for source, _ in generated(method).values():
+            for text in source.files.values():
+                assert text.isascii()
+                assert "\r" not in text
+                assert "\t" not in text
+                assert re.findall(r"[ \t]+$", text, re.MULTILINE) == []
+                assert text.endswith("\n")
+
+
+# Names and titles that would break C.
+
+C_NAMES = """
+    INFINITY fabs M N B newton step double_ errno I NULL NAN memset memcpy sizeof_ main u w0 w1 h z value slope rows row
+    parameters gather scatter evaluate factorise solve report options status workspace EOF FLT_EPSILON linux unix y0 y1
+    j1 gamma HUGE_VAL M_PI size_t int8_t bool_ true false assert stdin Q P q p t0 _ i k n legendre lagrangian velocity
+""".split()  # noqa: SIM905  (a paragraph of words reads better)
+TESTED = [sc.SVI(2), sc.SCVI(2), sc.StoermerVerlet()]
+
+
+def accepted(names: Sequence[str]) -> list[str]:
+    """The names that systems may use."""
+    saved = []
+    for name in names:
+        try:
+            named_system([name])
+        except ValueError:
+            continue
+        saved.append(name)
+    return saved
+
+
+def named_system(names: Sequence[str], name: str = "oscillators") -> sc.LagrangianSystem:
+    """Coupled oscillators whose coordinates are every third of the names, whose parameters are the others."""
+    coordinates = names[::3]
+    parameters = [name for name in names if name not in coordinates]
+    kinetic = "".join(f" + {c}_dot**2/2 - sin({c})**2/3" for c in coordinates)
+    coupling = "".join(f" - {a}*{b}" for a, b in pairwise(coordinates))
+    terms = "".join(f" - {c}*{coordinates[k % len(coordinates)]}**2/2" for k, c in enumerate(parameters))
+    values = {c: 1.0 / (k + 2) for k, c in enumerate(parameters)}
+    lagrangian = f"{kinetic}{coupling}{terms}".removeprefix(" + ")
+    return sc.LagrangianSystem.from_text(name=name, coordinates=coordinates, lagrangian=lagrangian, parameters=values)
+
+
+@pytest.mark.tiers(0, 1)
+@pytest.mark.parametrize("method", TESTED, ids=lambda method: method.name)
+def test_reserved_names_of_c_are_valid_coordinates(method, tmp_path):
+    hostile = accepted(C_NAMES)
+    plain = [f"name{k}" for k in range(len(hostile))]
+    assert len(hostile) > 50
+    steppers = [
+        sc.compile_stepper(named_system(names), method, prefix="named", flags=QUICK_FLAGS) for names in (hostile, plain)
+    ]
+    m = steppers[0].dimension
+    results = [stepper.step(np.linspace(-0.5, 0.5, m), np.linspace(0.3, -0.2, m), 0.1) for stepper in steppers]
+    np.testing.assert_allclose(results[0], results[1], rtol=1e-12, atol=1e-13)
+    (file,) = write([steppers[0].source], tmp_path)
+    run([needs("gcc"), *C99, "-c", file], tmp_path)
+
+
+TITLES = [
+    "*/ #error comment",
+    "/*/ nested",
+    "back\\slash\\",
+    "two\nlines\x00",
+    "??/ trigraph ??/",
+    "%s %n {{ 7 * 7 }} $(HOME)",
+    "Ünïcode ½\u2028",
+]
+
+
+@pytest.mark.tiers(1, 2)
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize("title", TITLES)
+def test_title_cannot_end_its_comment(title, tmp_path):
+    system = named_system(["a", "b", "c"], name=title)
+    source, interface = sc.generate_source(system, sc.SVI(1))
+    assert interface.title.isprintable()
+    (file,) = write([source], tmp_path)
+    run([needs("gcc"), *C99, "-c", file], tmp_path)
+
+
+@pytest.mark.tiers(1, 3)
+@pytest.mark.sampled(3)
+@pytest.mark.parametrize("prefix", ["fabs", "errno", "NULL", "main", "newton", "step", "int", "m", "b"])
+def test_reserved_prefixes_of_c_are_valid(prefix, tmp_path):
+    source, _ = sc.generate_source(bare_oscillator(), sc.SVI(2), prefix=prefix)
+    files = write([source], tmp_path)
+    run([needs("gcc"), *C99, "-c", *files], tmp_path)
+
+
+# Sanitizers: exact workspaces, every exported function.
+
+DRIVER = """
+static int check_PREFIX(void)
+{
+  enum { m = CAPITALS_COORDINATES, k = CAPITALS_PARAMETERS, steps = 6, kept = 3 };
+  const double defaults[] = {DEFAULTS};
+  double *workspace = malloc(sizeof(double) * CAPITALS_WORKSPACE), *parameters = k ? malloc(sizeof(double) * k) : NULL;
+  double *q = malloc(sizeof(double) * m), *v = malloc(sizeof(double) * m), *p = malloc(sizeof(double) * m);
+  double *q1 = malloc(sizeof(double) * m), *p1 = malloc(sizeof(double) * m), t[kept], e[kept];
+  double *qs = malloc(sizeof(double) * kept * m), *ps = malloc(sizeof(double) * kept * m);
+  int iterations[kept], status = 0;
+  PREFIX_run run;
+  PREFIX_report report;
+  const PREFIX_options options = PREFIX_default_options();
+  for (int i = 0; i < k; i++)
+    parameters[i] = defaults[i];
+  for (int i = 0; i < m; i++) {
+    q[i] = 0.7 - 0.4 * i;
+    v[i] = 0.3 + 0.2 * i;
+  }
+  status |= PREFIX_momentum(0.1, q, v, parameters, p, workspace);
+  status |= PREFIX_velocity(0.1, q, p, parameters, v, workspace);
+  status |= PREFIX_energy(0.1, q, p, parameters, e, workspace);
+  status |= PREFIX_step(0.1, 0.05, q, p, parameters, NULL, q1, p1, NULL, workspace);
+  status |= PREFIX_step(0.15, -0.05, q1, p1, parameters, &options, q, p, &report, workspace);
+  PREFIX_start(&run, 0.1, 0.05, q, p);
+  status |= PREFIX_advance(&run, steps, steps / kept, parameters, NULL, t, qs, ps, iterations, &report, workspace);
+  status |= PREFIX_energies(kept, t, qs, ps, parameters, e, workspace);
+  LEGENDRE
+  MAPS
+  for (int i = 0; i < kept; i++)
+    status |= !(e[i] == e[i]);
+  status |= report.steps != steps;
+  free(workspace), free(parameters), free(q), free(v), free(p), free(q1), free(p1), free(qs), free(ps);
+  return status;
+}
+"""
+TO_MOMENTA = "status |= PREFIX_momentum(0.1, q, v, parameters, p, workspace);"
+LEGENDRE = """status |= PREFIX_discrete_legendre(0.1, 0.05, q, q1, parameters, NULL, p, p1, e, NULL, workspace);"""
+
+
+MAPS = """double maps[kept * COUNT], sizes[kept * COUNT];
+  status |= PREFIX_momentum_maps(kept, t, qs, ps, parameters, maps, sizes);
+  status |= PREFIX_momentum_maps(kept, t, qs, ps, parameters, maps, NULL);
+  for (int i = 0; i < kept * COUNT; i++)
+    status |= !(maps[i] == maps[i]) || !(sizes[i] >= 0.0);"""
+
+
+def driver(interfaces: Sequence[Interface]) -> str:
+    """A C program that calls everything each integrator exports."""
+    text = "#include <stdlib.h>\n#include <string.h>\n" + "".join(f'#include "{i.prefix}.h"\n' for i in interfaces)
+    for i in interfaces:
+        body = DRIVER.replace("LEGENDRE", LEGENDRE if i.has_action else "")
+        body = body.replace("MAPS", MAPS.replace("COUNT", str(len(i.map_names))) if i.map_names else "")
+        if i.system == "hyperbolic":  # velocities say nothing of momenta
+            body = body.replace(TO_MOMENTA, "memcpy(p, v, sizeof(double) * m);")
+        values = ", ".join(map(repr, i.defaults)) or "0.0"
+        text += body.replace("PREFIX", i.prefix).replace("CAPITALS", i.prefix.upper()).replace("DEFAULTS", values)
+    calls = " + ".join(f"check_{i.prefix}()" for i in interfaces)
+    return f"{text}\nint main(void)\n{{\n  return {calls};\n}}\n"
+
+
+def check_sanitized(pairs: Sequence[tuple[Source, Interface]], command: Sequence[str], folder: Path) -> None:
+    files = write([source for source, _ in pairs], folder)
+    (folder / "driver.c").write_text(driver([interface for _, interface in pairs]))
+    run([*command, "-std=c99", "-g", "-fno-sanitize-recover=all", *files, "driver.c", "-lm", "-o", "d"], folder)
+    run([str(folder / "d")], folder)
+
+
+ADDRESS = ("gcc", "-fsanitize=address,undefined", "-fsanitize=float-cast-overflow")
+MEMORY = ("clang", "-fsanitize=memory")
+
+
+def sanitizer(command: Sequence[str], folder: Path) -> None:
+    """Skip the test where the compiler, or what it links to, is not installed."""
+    needs(command[0])
+    tried = [*command, "-x", "c", "-", "-o", str(folder / "empty")]
+    if subprocess.run(
+        tried, input="int main(void) { return 0; }", text=True, capture_output=True, check=False
+    ).returncode:
+        pytest.skip(f"{' '.join(command)} links no program here")
+
+
+SANITIZED = ("svi-3", "scvi-2", "scvi-printed", "sc-3", "gauss", "stoermer")
+BRIEFLY = [name for name in METHODS if name.startswith(SANITIZED)]
+
+
+SANITIZERS = pytest.mark.parametrize(
+    "command", [ADDRESS, MEMORY], ids=["address and undefined behaviour", "uninitialised memory"]
+)
+
+
+@pytest.mark.sampled(2)
+@pytest.mark.covering
+@SANITIZERS
+@pytest.mark.parametrize("method", BRIEFLY)
+def test_method_families_pass_the_sanitizers(command, method, tmp_path):
+    sanitizer(command, tmp_path)
+    check_sanitized([generated(method)["pumped-cart-pole"]], command, tmp_path)
+
+
+@pytest.mark.tiers(0, 1)
+@pytest.mark.sampled(3)
+@pytest.mark.covering
+@SANITIZERS
+@pytest.mark.parametrize(
+    ("masses", "method"),
+    [
+        (5, sc.SVI(8)),
+        (12, sc.SVI(3, "gauss-lobatto:4")),
+        (12, sc.SCVI(2)),
+        (12, sc.Gauss(3)),
+        (9, sc.SpectralCollocation(3)),
+    ],
+)
+def test_band_solver_and_reused_factors_pass_the_sanitizers(command, masses, method, tmp_path):
+    sanitizer(command, tmp_path)
+    source, interface = sc.generate_source(fput_chain(masses), method, solver="newton")
+    assert interface.unknowns >= LEAST_REUSED_UNKNOWNS
+    run([needs(command[0]), *C99, "-c", *write([source], tmp_path)], tmp_path)
+    check_sanitized([(source, interface)], command, tmp_path)
+
+
+@pytest.mark.second
+@SANITIZERS
+def test_phase_space_iterations_pass_the_sanitizers(command, tmp_path):
+    sanitizer(command, tmp_path)
+    source, interface = sc.generate_source(driven_hamiltonian(), sc.Gauss(3), solver="fixed-point")
+    check_sanitized([(source, interface)], command, tmp_path)
+
+
+@pytest.mark.full
+@SANITIZERS
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_passes_the_sanitizers_for_every_system(command, method, tmp_path):
+    sanitizer(command, tmp_path)
+    check_sanitized(list(generated(method).values()), command, tmp_path)
+
+
+def test_every_method_has_a_unique_name():
+    assert all(isinstance(method, Method) for method in METHODS.values())
+    prefixes = [interface.prefix for method in METHODS for _, interface in generated(method).values()]
+    assert len(set(prefixes)) == len(prefixes)

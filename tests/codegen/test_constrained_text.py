@@ -1,0 +1,129 @@
+"""The C text of constrained systems: without a warning, in style, the same in 60 digits, alone with its own main."""
+
+import subprocess
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from programs import needs
+from samples import linkage
+from style import check_style
+
+import scvi_codegen as sc
+from scvi_codegen.interfaces.models.model_files.model_file import dump_model, parse_model
+from scvi_codegen.methods.exact.step import compiled_equations, derived_step
+
+pytestmark = pytest.mark.rotated
+
+STRICT = ["-std=c99", "-O0", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Wconversion", "-Werror"]
+LINKAGE = linkage()
+PENDULUM = sc.LagrangianSystem.from_text(
+    name="double pendulum",
+    coordinates=["x1", "y1", "x2", "y2"],
+    lagrangian="(x1_dot**2 + y1_dot**2 + x2_dot**2 + y2_dot**2)/2 - 9.81*(y1 + y2)",
+    constraints=["x1**2 + y1**2 = 1", "(x2 - x1)**2 + (y2 - y1)**2 = 1"],
+)
+"""For multipliers alone; RATTLE with degree 1."""
+DAMPED = sc.LagrangianSystem.from_text(
+    name="damped rod",
+    coordinates=["x", "y"],
+    lagrangian="(x_dot**2 + y_dot**2)/2 - 9.81*y",
+    constraints=["x**2 + y**2 = 1"],
+    forces={"x": "-x_dot", "y": "-y_dot"},
+)
+"""With forces at the velocities of the points."""
+BEAD = sc.LagrangianSystem.from_text(
+    name="damped bead",
+    coordinates=["r", "a"],
+    lagrangian="(r_dot**2 + r**2*a_dot**2)/2 - 9.81*r*sin(a)",
+    constraints=["r*(1 + 0.3*cos(a)) = 1"],
+    damping="0.1",
+)
+"""With masses that depend on positions."""
+NEAR = [0.0, 1.0, 1.94, 1.5]
+
+
+def lobatto(s):
+    return sc.SVI(s, f"gauss-lobatto:{s + 1}")
+
+
+@pytest.mark.parametrize("compiler", ["gcc", "clang"])
+def test_constrained_code_compiles_without_warnings(compiler, tmp_path):
+    for system, s, controlled in (
+        (LINKAGE, 3, False),
+        (LINKAGE, 3, True),
+        (PENDULUM, 1, True),
+        (PENDULUM, 4, False),
+        (DAMPED, 2, True),
+        (BEAD, 2, True),
+    ):
+        source = sc.generate_source(system, lobatto(s), controlled=controlled)[0]
+        (tmp_path / f"{source.prefix}.h").write_text(source.header)
+        (tmp_path / "all.c").write_text(source.single_file().code)
+        check_style(source.amalgamated().code)
+        found = subprocess.run([needs(compiler), *STRICT, "-c", "all.c"], cwd=tmp_path, capture_output=True, text=True)
+        assert found.returncode == 0, found.stderr
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("s", [1, 2, 3])
+def test_steps_are_those_of_the_equations_in_60_digits(s):
+    stepper = sc.compile_stepper(LINKAGE, lobatto(s))
+    q, p = stepper.project(NEAR)
+    q, p = stepper.integrate(q, p, h=0.02, steps=7).q[-1], stepper.integrate(q, p, h=0.02, steps=7).p[-1]
+    found = stepper.step(q, p, 0.05, 0.3)
+    for equations in (derived_step(LINKAGE, lobatto(s)), compiled_equations(LINKAGE, lobatto(s))):
+        exact = equations(q, p, 0.05, 0.3)
+        assert_allclose(found[0], np.array(exact.q, dtype=float), rtol=0, atol=4e-16)
+        assert_allclose(found[1], np.array(exact.p, dtype=float), rtol=0, atol=4e-15)
+
+
+@pytest.mark.quick
+def test_model_files_select_compatible_points():
+    stepper = sc.compile_stepper(LINKAGE, "svi:3")
+    q, _ = stepper.project(NEAR)
+    model = sc.Model(system=LINKAGE, method="svi:3", q=tuple(q), velocity=(0.0,) * 4, h=0.01, span=1.0)
+    assert model.method == lobatto(3)
+    assert parse_model(dump_model(model)) == model
+    text = dump_model(model).partition("[method]")[0]
+    assert parse_model(f"{text}\n[run]\nspan = 1.0\n").method == lobatto(6)
+
+
+def made_and_run(folder, q, *, precision=None, system=LINKAGE, exit_status=0):
+    """Generate a folder, build it with ``make``, run it and return the example's states and output."""
+    model = sc.Model(system=system, method="svi:3", q=tuple(q), velocity=(0.0,) * 4, h=0.05, steps=40)
+    sc.generate_package(model, folder, embedded=precision)
+    found = subprocess.run(["make", "-s", "-C", str(folder)], capture_output=True, text=True)
+    assert (found.returncode != 0) == exit_status
+    return np.array([line.split() for line in found.stdout.splitlines() if line[0] != "#"], dtype=float), found
+
+
+@pytest.mark.parametrize("precision", [None, "double", "single"])
+def test_generated_folders_project_constraints_and_equal_python(precision, tmp_path):
+    """Slightly inconsistent states are projected with a message and integrated, also with adaptive steps."""
+    near = [0.001, 1.0, 1.94, 1.5]
+    states, found = made_and_run(tmp_path / "linkage", near, precision=precision)
+    stepper = sc.compile_stepper(LINKAGE, "svi:3", solver="newton")
+    with pytest.warns(sc.AccuracyWarning, match="projected onto the constraints"):
+        run = stepper.integrate(near, [0.0] * 4, h=0.05, steps=40, save_every=2)
+    assert "violates the constraints" in found.stderr
+    assert len(states) == len(run)
+    bound = 2e-4 if precision == "single" else 2e-13
+    assert np.abs(states[:, 1:5] - run.q).max() < bound
+    assert np.abs(states[:, 5:9] - run.p).max() < 10 * bound
+    values = stepper.constraint_values(states[:, 1:5], states[:, 5:9], states[:, 0])
+    assert np.abs(values).max() < 0.1 * bound
+    if precision is None:
+        (away,) = [line for line in found.stdout.splitlines() if "adaptive steps," in line]
+        assert np.abs(np.array(away.rpartition(" end ")[2].split(), dtype=float)).max() < 1e-5
+
+
+def test_states_that_cannot_be_projected_are_rejected_in_c(tmp_path):
+    """States far off the constraints and stretched linkages with dependent constraints are rejected."""
+    states, found = made_and_run(tmp_path / "far", [0.3, 1.0, 1.94, 1.5], exit_status=1)
+    assert "violates the constraints" in found.stderr
+    stretched = LINKAGE.with_parameters(d=4.5)
+    other, also = made_and_run(tmp_path / "stretched", [1.0, 0.0, 3.0, 0.0], system=stretched, exit_status=1)
+    assert "the projection of the initial state onto the constraints failed (status 2)" in also.stderr
+    assert not len(states)
+    assert not len(other)

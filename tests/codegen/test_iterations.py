@@ -1,0 +1,122 @@
+"""Iteration counts of runs compared with recorded counts: an increase indicates an error.
+
+Steps are the same whatever leads to them: kept factors that never serve, guesses from the wrong steps, iterations that
+stop a little later than they may. The numbers are the same with and without optimisation; a few more or less are
+rounding. Where a change makes them smaller, the new ones belong here.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import pytest
+from certified_cases import case
+from samples import QUICK_FLAGS
+
+from scvi_codegen import SolverOptions, Stepper, compile_stepper, problem
+from scvi_codegen.runs.ensembles.ensemble import Ensemble
+from scvi_codegen.runs.ensembles.lanes import LaneRuns
+
+STEPS = 100
+ROUNDING = 0.02
+EXPECTED = {
+    ("kepler/svi-3", "fixed-point"): {1: 206, 8: 201, 64: 103},
+    ("cart/svi", "fixed-point"): {1: 457, 8: 299, 64: 202},
+    ("field/gauss", "fixed-point"): {1: 980, 8: 451, 64: 303},
+    ("tangle/scvi", "fixed-point"): {1: 1090, 8: 563, 64: 401},
+    ("tangle/sc", "fixed-point"): {1: 969, 8: 430, 64: 203},
+    ("cart/svi", "newton"): {1: 501, 8: 302, 64: 201},
+    ("tangle/scvi", "newton"): {1: 427, 8: 269, 64: 201},
+    ("double/svi", "newton"): {8: 369, 64: 201},
+    ("chain/svi-4", "newton"): {16: 301, 64: 201},
+}
+"""Of so many steps of the case's h, of an eighth of it, and so on."""
+ONE_ITERATION = SolverOptions(tolerance=1e300)
+CONTINUED = {"kepler/svi-3": 2, "cart/svi": 1 / 16, "field/gauss": 1 / 16, "double/sc": 1 / 16, "chain/svi-4": 1 / 2}
+"""Fractions of the case's h at which iterates are extrapolated from two steps and further iterations are needed."""
+
+
+@cache
+def stepper(name: str, solver: str) -> Stepper:
+    return compile_stepper(case(name).system, case(name).method(), solver=solver, flags=QUICK_FLAGS)
+
+
+@pytest.mark.tiers(2, 3)
+@pytest.mark.sampled(5)
+@pytest.mark.parametrize(("name", "solver"), EXPECTED)
+def test_iteration_counts_are_those_recorded(name, solver):
+    given, expected = case(name), EXPECTED[name, solver]
+    counts = [
+        int(stepper(name, solver).integrate(given.q, given.p, h=given.h / part, steps=STEPS).iterations.sum())
+        for part in expected
+    ]
+    assert counts == pytest.approx([*expected.values()], rel=ROUNDING, abs=2)
+
+
+@pytest.mark.tiers(2)
+@pytest.mark.parametrize("name", ["kepler/svi-3", "cart/svi", "field/gauss"])
+def test_lanes_use_as_many_iterations_as_single_runs(name):
+    """Lanes start from equal states; predictors from one and two steps are equally good in a block."""
+    given, own = case(name), stepper(name, "fixed-point")
+    for part in (1, 8, 64):
+        h = given.h / part
+        work = Ensemble(own, [given.q] * 8, [given.p] * 8, h=h, steps=STEPS)
+        batch = work.common.batch()
+        assert isinstance(batch, LaneRuns)
+        block = batch.call(0, batch.width)
+        block.advance()
+        run = own.integrate(given.q, given.p, h=h, steps=STEPS)
+        assert block.memory.iterations == pytest.approx(int(run.iterations.sum()), rel=ROUNDING, abs=2)
+
+
+@pytest.mark.parametrize("span", [10.0, 1e6])
+@pytest.mark.parametrize("p", [[0.3, 1.0], [0.0, 0.0]])
+def test_first_step_takes_few_trials(p, span):
+    """The search from 1e-16 of the span in factors of 16 needs 20 iterations or more; it finds the same step size."""
+    run = stepper("kepler/svi-8", "fixed-point").start([0.5, 0.1], p, t_end=span, tolerance=1e-9)
+    run.advance(1)
+    assert run.t == pytest.approx(2.0**-1.5 if p[1] else 2.0**-2.25, rel=1e-9)  # on the grid
+    assert run.iterations <= 17
+
+
+@pytest.mark.tiers(3)
+@pytest.mark.parametrize("name", CONTINUED)
+def test_predictor_from_two_steps_is_better_than_from_one(name):
+    """Compare the residual of one iteration after the first and after the third step, which use different tables."""
+    given, left = case(name), []
+    for steps in (1, 3):
+        run = stepper(name, "fixed-point").start(given.q, given.p, h=CONTINUED[name] * given.h)
+        run.advance(steps)
+        ends = [
+            stepper(name, "fixed-point").from_checkpoint(run.checkpoint(), options=options)
+            for options in (None, ONE_ITERATION)
+        ]
+        for each in ends:
+            each.advance(1)
+        left.append(max(abs(ends[0].q - ends[1].q)))
+    assert left[0] > 2.0**-48
+    assert left[1] < left[0] / 4
+
+
+def test_newton_factors_are_reused_in_the_next_short_step():
+    given = case("chain/svi-4")
+    run = stepper("chain/svi-4", "newton").start(given.q, given.p, h=given.h / 64)
+    run.advance(3)
+    assert run._memory.guess == 2
+
+
+@pytest.mark.tiers(1)
+@pytest.mark.parametrize(("name", "expected"), [("double/svi", (78, 177)), ("tangle/scvi", (20, 50))])
+def test_adaptive_steps_use_the_predictor_of_the_preceding_step(name, expected):
+    """Compare Newton steps and iteration counts with steps of equal size."""
+    given = case(name)
+    run = stepper(name, "newton").integrate(given.q, given.p, t_end=10 * given.h, tolerance=1e-6)
+    assert (len(run.t), int(run.iterations.sum())) == pytest.approx(expected, rel=ROUNDING, abs=2)
+
+
+def test_reused_factors_need_two_updates_at_convergence():
+    """Factors of another point must reduce an update once before a small update indicates convergence."""
+    own = problem("fput-chain").system
+    rest = [0.0] * own.dimension
+    run = compile_stepper(own, "svi:4", solver="newton", flags=QUICK_FLAGS).integrate(rest, rest, h=0.01, steps=5)
+    assert run.iterations[1:].tolist() == [1, 2, 2, 2, 2]

@@ -1,0 +1,131 @@
+"""Families of like terms in loops: the same motion, energy and symmetries as written out, in a short text."""
+
+from itertools import combinations, pairwise
+
+import numpy as np
+import pytest
+from notation import lagrange
+from samples import QUICK_FLAGS
+
+import scvi_codegen as sc
+from scvi_codegen import as_method, symmetries
+from scvi_codegen.codegen.pipeline import program_of
+from scvi_codegen.systems import term_groups as module
+
+FLAGS = {"flags": QUICK_FLAGS}
+
+
+def bodies(name: str, count: int, **extra: object) -> sc.LagrangianSystem:
+    """Masses as parameters but for the first, which is a number; a family of two kinds of constants."""
+    names = [f"{c}{i}" for i in range(count) for c in "xyz"]
+    masses = ["2", *(f"m{i}" for i in range(1, count))]
+    kinetic = [f"{m}*({' + '.join(f'{c}{i}_dot**2' for c in 'xyz')})/2" for i, m in enumerate(masses)]
+    pairs = [
+        f"{masses[i]}*{masses[j]}/sqrt({' + '.join(f'({c}{i} - {c}{j})**2' for c in 'xyz')})"
+        for i, j in combinations(range(count), 2)
+    ]
+    parameters = {f"m{i}": 1 + i / 7 for i in range(1, count)} | {"c": 0.1}
+    return sc.LagrangianSystem.from_text(
+        name=name, coordinates=names, lagrangian=" + ".join(kinetic + pairs), parameters=parameters, **extra
+    )
+
+
+def driven(name: str, count: int) -> sc.LagrangianSystem:
+    """Forces, damping and time dependence in addition to the term groups."""
+    forces = {"x0": "-c*x0_dot**3", "y1": "c*x1*cos(t)"}
+    return bodies(name, count, forces=forces, damping="c/5")
+
+
+def coupled(name: str, count: int) -> sc.LagrangianSystem:
+    """A kinetic energy that is no sum of squares."""
+    q = [f"q{i}" for i in range(count)]
+    kinetic = [f"{a}_dot**2" for a in q] + [f"cos({a})*{a}_dot*{b}_dot/4" for a, b in pairwise(q)]
+    springs = [f"-({b} - {a} - {k}/10)**2/2 - k*sin(t)*({b} - {a})**4" for k, (a, b) in enumerate(pairwise(q))]
+    return lagrange(name, q, " + ".join(kinetic) + " ".join(springs), k=0.3)
+
+
+def hamiltonian(name: str, count: int) -> sc.HamiltonianSystem:
+    q = [f"q{i}" for i in range(count)]
+    kinetic = " + ".join(f"sqrt(1 + p_{a}**2)*(1 + {a}**2/20)" for a in q)
+    springs = " + ".join(f"({b} - {a})**2/2 + exp({b} - {a})" for a, b in pairwise(q))
+    return sc.HamiltonianSystem.from_text(name=name, coordinates=q, hamiltonian=f"{kinetic} + {springs}")
+
+
+@pytest.fixture
+def few(monkeypatch):
+    """Families of three terms are rolled."""
+    monkeypatch.setattr(module, "MIN_GROUP_SIZE", 3)
+    module.roll_terms.cache_clear()
+    yield
+    module.roll_terms.cache_clear()
+
+
+CASES = [
+    (bodies, "svi:4"),
+    (bodies, "stoermer-verlet"),
+    (driven, "svi:3"),
+    (coupled, "svi:2"),
+    (hamiltonian, "gauss:2"),
+    (hamiltonian, "svi:3"),
+]
+
+
+@pytest.mark.tiers(0, 1)
+@pytest.mark.sampled(3)
+@pytest.mark.parametrize(("make", "method"), CASES)
+@pytest.mark.usefixtures("few")
+def test_steps_energies_and_ensembles_equal_those_of_unrolled_terms(make, method, monkeypatch):
+    system = make("rolled", 5)
+    assert module.roll_terms(system) is not None
+    rolled = sc.compile_stepper(system, method, **FLAGS)
+    assert "static const int" in rolled.source.code
+    monkeypatch.setattr(module, "MIN_GROUP_SIZE", 10**6)
+    module.roll_terms.cache_clear()
+    written = sc.compile_stepper(make("written_out", 5), method, **FLAGS)
+    q, v = np.random.default_rng(2).normal(size=(2, len(system.coordinates)))
+    start = {"q": q, "p": v}
+    one, other = (each.integrate(**start, h=0.01, steps=10) for each in (rolled, written))
+    assert np.abs(one.q - other.q).max() < 1e-13 * np.abs(q).max()
+    assert np.abs(one.p - other.p).max() < 1e-12 * np.abs(one.p).max()
+    assert np.abs(one.energy() - other.energy()).max() < 1e-12 * np.abs(one.energy()).max()
+    many, others = (each.integrate_ensemble([q, -q], [v, v], h=0.01, steps=10) for each in (rolled, written))
+    assert np.abs(many.q - others.q).max() < 1e-13 * np.abs(q).max()
+
+
+@pytest.mark.second
+@pytest.mark.usefixtures("few")
+def test_symmetries_equal_those_of_unrolled_terms(monkeypatch):
+    rolled = symmetries(bodies("rolled", 14))
+    monkeypatch.setattr(module, "MIN_GROUP_SIZE", 10**6)
+    module.roll_terms.cache_clear()
+    assert [str(each) for each in rolled] == [str(each) for each in symmetries(bodies("written_out", 14))]
+    assert len(rolled) == 9
+
+
+@pytest.mark.second
+@pytest.mark.usefixtures("few")
+def test_the_number_of_operations_in_the_text_does_not_grow_with_the_number_of_terms():
+    sizes = []
+    for count in (5, 15):
+        program = program_of(bodies(f"rolled_{count}", count), as_method("svi:2"), fallback=False)
+        (force,) = program.fixed_point.kernels
+        sizes.append([len(each.kernel.temporaries) for each in force.sums])
+        assert all(not str(result).startswith("Operation") for result in force.results)
+        assert sum(each.rows for each in force.sums) == count * (count - 1) // 2
+    assert sizes[0] == sizes[1]
+
+
+@pytest.mark.rotated
+def test_few_terms_and_constraints_remain_unrolled():
+    assert module.roll_terms(bodies("few", 5)) is None
+    rods = [f"(x{i} - x{i + 1})**2 + (y{i} - y{i + 1})**2 + (z{i} - z{i + 1})**2 = 1" for i in range(46)]
+    assert module.roll_terms(bodies("held", 47, constraints=rods)) is None
+
+
+@pytest.mark.usefixtures("few")
+def test_parameters_may_have_the_names_of_reads():
+    names = ["a", "b", "c", "d"]
+    springs = " ".join(f"- slot_0*given_0*({b} - {a})**{2}*{k + 2}" for k, (a, b) in enumerate(pairwise(names)))
+    system = lagrange("clash", names, " + ".join(f"{q}_dot**2" for q in names) + springs, slot_0=2, given_0=3)
+    (group,) = module.roll_terms(system).term_groups
+    assert {each.name for each in group.formula.free_symbols} >= {"slot_0", "given_0", "slot__0"}

@@ -1,0 +1,103 @@
+"""Two generated integrators, of named coordinates and of arrays, in one translation unit."""
+
+import re
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from golden_cells import catalogue, ring
+from programs import needs
+from samples import QUICK_FLAGS
+
+from scvi_codegen import SVI, compile_stepper, generate_source
+from scvi_codegen.codegen.native.compilers import find_compiler
+from scvi_codegen.codegen.pipeline import Sources
+from scvi_codegen.codegen.rendering.source import Source
+
+STRICT = "-std=c99 -O1 -Wall -Wextra -pedantic -Wshadow -Wconversion -Wno-psabi -Werror".split()  # noqa: SIM905
+H, STEPS, N = 0.05, 40, 8
+RUNS = """
+#include "kepler.c"
+#include "ring.c"
+#include <stdio.h>
+#include <stdlib.h>
+
+enum {{ M = 2, N = {n} }}; /* both integrators have such a name of their own */
+
+static void show(const double *x, int n)
+{{
+  for (int i = 0; i < n; i++)
+    printf("%.17g ", x[i]);
+}}
+
+int main(void)
+{{
+  static double work[KEPLER_WORKSPACE], q[M] = {{0.4, 0.1}}, p[M] = {{0.0, 2.0}}, t;
+  static kepler_run one;
+  static double all[4096] __attribute__((aligned(64))), start[2 * N];
+  const long long sizes[] = {{N}};
+  const int *const tables[] = {{NULL}};
+  ring_run *run = ring_memory(sizes, tables) <= 4096 ? ring_bind(sizes, tables, all) : NULL;
+  kepler_report of_one;
+  ring_report of_all;
+  const double parameters[] = {{1.0}}, beta[] = {{0.25}};
+  int count, status;
+  kepler_start(&one, 0.0, {h}, q, p);
+  status = kepler_advance(&one, {steps}, {steps}, parameters, NULL, &t, q, p, &count, &of_one, work);
+  for (int i = 0; i < N; i++)
+    start[i] = 0.125 * i, start[N + i] = 0.5 - 0.0625 * i;
+  ring_start(run, 0.0, {h}, start, start + N);
+  status |= ring_advance(run, {steps}, 0, beta, NULL, NULL, NULL, NULL, NULL, &of_all, NULL);
+  show(one.q, M), show(one.p, M), show(run->q, N), show(run->p, N);
+  return status;
+}}
+"""
+
+
+def written(source: Source, folder: Path) -> None:
+    for name, text in source.single_file().files.items():
+        (folder / name).write_text(text)
+
+
+@pytest.mark.rotated
+@pytest.mark.parametrize("compiler", ["gcc", "clang"])
+def test_two_integrators_in_one_translation_unit_agree_with_python(compiler, tmp_path):
+    kepler, arrays = catalogue("kepler")(), ring()
+    written(generate_source(kepler, SVI(4), prefix="kepler")[0], tmp_path)
+    written(Sources(arrays, SVI(4), prefix="ring").integrator()[0], tmp_path)
+    (tmp_path / "main.c").write_text(RUNS.format(n=N, h=H, steps=STEPS))
+    subprocess.run([needs(compiler), *STRICT, "main.c", "-lm", "-o", "main"], cwd=tmp_path, check=True)
+    done = subprocess.run([tmp_path / "main"], check=True, capture_output=True, text=True)
+    one = compile_stepper(kepler, SVI(4), flags=QUICK_FLAGS).integrate([0.4, 0.1], [0.0, 2.0], h=H, steps=STEPS)
+    q, p = 0.125 * np.arange(N), 0.5 - 0.0625 * np.arange(N)
+    run = compile_stepper(arrays, "svi:4", flags=QUICK_FLAGS).start(q, p=p, h=H)
+    run.advance(STEPS)
+    expected = np.concatenate([one.q[-1], one.p[-1], run.q["q"], run.p["q"]])
+    assert np.array(done.stdout.split(), dtype=float) == pytest.approx(expected, rel=1e-13, abs=1e-13)
+
+
+def test_no_name_or_macro_of_an_integrator_remains(tmp_path):
+    """The same program twice, under two prefixes, is the hardest case: every name occurs in both."""
+    for prefix in ("one", "two"):
+        written(generate_source(catalogue("double-pendulum")(), "svi:4", prefix=prefix)[0], tmp_path)
+    (tmp_path / "both.c").write_text('#include "one.c"\n#include "two.c"\n')
+    command = [*find_compiler(), *STRICT, "-fsyntax-only", "both.c"]
+    subprocess.run(command, cwd=tmp_path, check=True)
+    listed = subprocess.run(
+        [*find_compiler(), "-std=c99", "-E", "-dM", "both.c"], cwd=tmp_path, check=True, capture_output=True, text=True
+    ).stdout
+    empty = subprocess.run(
+        [*find_compiler(), "-std=c99", "-E", "-dM", "-include", "float.h", "-include", "limits.h", "-include", "math.h",
+         "-include", "string.h", "-x", "c", "/dev/null"], check=True, capture_output=True, text=True,
+    ).stdout  # fmt: skip
+    left = {line.split()[1].split("(")[0] for line in set(listed.splitlines()) - set(empty.splitlines())}
+    assert {name for name in left if not name.startswith(("ONE_", "TWO_"))} == set()
+
+
+def test_single_file_defines_no_macro_that_it_does_not_use():
+    code = generate_source(catalogue("kepler")(), "svi:4", prefix="one")[0].single_file().code
+    plain = re.sub(r"/\*.*?\*/", "", code, flags=re.DOTALL)
+    assert "#undef" not in plain
+    for name in re.findall(r"^#define (\w+)$", plain, re.MULTILINE):
+        assert len(re.findall(rf"\b{name}\b", plain)) > 1, name

@@ -1,0 +1,274 @@
+"""Notebook displays of systems, methods, equations, steppers and trajectories."""
+
+import re
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from browsing import UNREADABLE, VIEWS, assert_it_asks_for_nothing, opened
+from html_page import Page
+from notation import lagrange
+from samples import compile_quickly
+
+import scvi_codegen as sc
+from scvi_codegen.analysis.verification.certificate import Check, Outcome
+from scvi_codegen.common.display.cards import card, listed, plain, sparkline
+from scvi_codegen.methods.tables.number_tables import number_table
+
+METHODS = [
+    sc.SVI(3), sc.SVI(2, "hermite:2"), sc.SVI(2, space="splines:2"), sc.SCVI(3), sc.SCVI(2, abscissae="gauss"),
+    sc.SpectralCollocation(8), sc.SpectralCollocation(2, form="phase-space"), sc.Gauss(2), sc.RadauIIA(5),
+    sc.StoermerVerlet(), sc.Composition(10), sc.ExplicitEuler(),
+]  # fmt: skip
+
+
+@cache
+def falling() -> sc.LagrangianSystem:
+    return lagrange("falling", "x y", "(x_dot**2 + y_dot**2)/2 - g*y", g=9.81)
+
+
+@cache
+def trajectory() -> sc.Trajectory:
+    kepler = sc.problem("kepler")
+    stepper = compile_quickly(kepler.system, sc.SVI(2))
+    return stepper.integrate(kepler.q, stepper.momentum(kepler.q, kepler.velocity), h=0.1, steps=1000)
+
+
+@cache
+def advice() -> sc.Advice:
+    kepler = sc.problem("kepler")
+    return sc.advise(kepler.system, sc.StoermerVerlet(), kepler.q, [0.0, 1.7], 5.0, 1e-3)
+
+
+def certificate(outcome: Outcome = Outcome.SATISFIED) -> sc.Certificate:
+    check = Check(name="order", statement="it is <4>", outcome=outcome, measured=3.98, bound=3.7, remark="from 4 steps")
+    unknown = Check(name="drift", statement="none", outcome=Outcome.NOT_MEASURED, remark="no symmetry")
+    return sc.Certificate(
+        title="Kepler problem by SVI",
+        system="Kepler problem",
+        method="svi-2",
+        version="0",
+        checksum="ab" * 32,
+        flags=("-O3",),
+        q=(0.5, 0.0),
+        p=(0.0, 1.7),
+        t=0.0,
+        h=0.1,
+        parameters={"mu": 1.0},
+        checks=(check, unknown),
+        seconds=1.0,
+    )
+
+
+DISPLAYED: dict[str, Callable[[], Any]] = {
+    "lagrangian": lambda: sc.problem("double-pendulum").system,
+    "hamiltonian": lambda: sc.problem("point-vortices").system,
+    "large system": lambda: sc.problem("outer-solar-system").system,
+    "equations": lambda: sc.derive(sc.problem("planar-pendulum").system, sc.SVI(2)),
+    "radicals": lambda: sc.derive(sc.problem("kepler").system, sc.SCVI(2), radicals=True),
+    "stepper": lambda: trajectory().stepper,
+    "trajectory": trajectory,
+    "problem": lambda: sc.problem("kepler"),
+    "model": lambda: sc.Model.from_problem(sc.problem("kepler")),
+    "ensemble": lambda: trajectory().stepper.integrate_ensemble(np.eye(2), np.eye(2)[::-1], h=0.1, steps=100),
+    "model of arrays": lambda: sc.Model(
+        system=lagrange("ring", "q[N]", "sum(i in N, q_dot[i]**2/2 - q[i]**2/2)"),
+        method="svi:2",
+        q={"q": np.ones(4)},
+        h=0.1,
+        steps=3,
+    ),
+    "certificate": certificate,
+    "advice": advice,
+    "symmetry": lambda: sc.symmetries(falling())[-1],
+} | {method.name: lambda method=method: method for method in METHODS}
+
+
+@pytest.mark.tiers(5, 16)
+@pytest.mark.parametrize("name", DISPLAYED)
+def test_every_display_is_well_formed_and_short(name):
+    shown = DISPLAYED[name]()._repr_html_()
+    parsed = Page(shown)
+    assert parsed.elements[0] == ("div", {"class": "scvi-codegen", "style": "overflow-x:auto"})
+    assert parsed.all("script") == parsed.all("style") == []
+    assert len(shown) < 60_000
+
+
+class TestMethod:
+    def test_method_display_lists_its_properties(self):
+        shown = sc.SVI(3)._repr_html_()
+        assert re.search(r">order</th><td[^>]*>6</td>", shown)
+        assert re.search(r">symplectic</th><td[^>]*>yes</td>", shown)
+        assert re.search(r">symplectic</th><td[^>]*>no</td>", sc.SpectralCollocation(3)._repr_html_())
+
+    def test_coefficients_are_exact_where_they_are_short(self):
+        shown = sc.SVI(3)._repr_html_()
+        assert "<msqrt><mn>15</mn></msqrt>" in shown
+        assert "0.77459666924148338" in shown
+        assert "msqrt" not in sc.SVI(9, "gauss-legendre:9", nodes="legendre-lobatto")._repr_html_()
+
+    def test_long_table_is_abbreviated_with_a_note(self):
+        shown = sc.SVI(20)._repr_html_()
+        assert "the first 12 of 20 rows" in shown
+        assert "the first 12 of 21 rows" in shown
+
+
+class TestSystem:
+    def test_lagrangian_is_typeset(self):
+        shown = sc.problem("planar-pendulum").system.with_parameters(g=9.81)._repr_html_()
+        assert "<math" in shown
+        assert "<mi>L</mi>" in shown
+        assert "g = 9.81" in shown
+        assert "<mi>H</mi>" in sc.hamiltonian_of(sc.problem("planar-pendulum").system)._repr_html_()
+
+    def test_lagrangian_of_rotations_is_in_their_names(self):
+        text = "(omega_1**2 + omega_2**2)/2 + omega_3**2 + x_dot**2/2 - R_33*x"
+        given = {"coordinates": ["x"], "rotations": {"R": "omega"}, "lagrangian": text, "torques": {"R": ["x"] * 3}}
+        top = sc.LagrangianSystem.from_text("top", **given)
+        assert sc.LagrangianSystem.from_text("top", **given | {"lagrangian": top.to_text()}) == top
+        assert r"\omega_{1}^{2}" in top._repr_latex_()
+        assert r"\dot{x}" in top._repr_latex_()
+        assert "R_{w}" not in top._repr_latex_()
+        shown = top._repr_html_()
+        assert "rotation R omega" in shown
+        assert "force on R" in shown
+        assert "<mi>w</mi>" not in shown
+
+    def test_long_lagrangian_is_abbreviated_with_a_count(self):
+        large = sc.LagrangianSystem.from_text(
+            name="chain",
+            coordinates=[f"q{k}" for k in range(40)],
+            lagrangian=" + ".join(f"q{k}_dot**2/2 - (q{k} - q{(k + 1) % 40})**4/4" for k in range(40)),
+        )._repr_html_()
+        assert re.search(r"L: \d{3} operations", large)
+        assert ".. (40)" in large
+
+    def test_names_are_escaped(self):
+        system = sc.LagrangianSystem.from_text(name="<b>&", coordinates=["q"], lagrangian="q_dot**2/2")
+        assert "&lt;b&gt;&amp;" in system._repr_html_()
+
+
+class TestEquations:
+    def test_equations_are_typeset_with_numbers(self):
+        shown = DISPLAYED["equations"]()._repr_html_()
+        assert shown.count("(27a)") == shown.count("(27b)") == 1
+        assert "<math" in shown
+
+    def test_large_equations_are_abbreviated_in_every_form(self):
+        derived = sc.derive(sc.problem("double-pendulum").system, sc.SVI(6))
+        assert repr(derived) == "<12 equations of double pendulum by svi-6-gauss-legendre-6>"
+        assert derived._repr_latex_() is None
+        shown = derived._repr_html_()
+        assert re.search(r"\(27a\) \d+ operations", shown)
+        small = DISPLAYED["equations"]()
+        assert small._repr_latex_() == small.to_latex()
+
+
+def test_rows_of_numbers_are_numbered_as_in_the_formulas():
+    """Nodes from 0, points of a quadrature and stages from 1."""
+    tables = [number_table(part) for part in (sc.chebyshev_lobatto(2), sc.gauss_legendre(3), sc.RadauIIA(2).tableau)]
+    assert [[row[0] for row in table.rows] for table in tables] == [list("012"), list("123"), ["1", "2", "b"]]
+    assert "of order 3" in tables[2].name
+
+
+class TestTrajectory:
+    def test_trajectory_display_shows_facts_curves_and_the_energy_range(self):
+        shown = trajectory()._repr_html_()
+        assert "0 to 100, h = 0.1" in shown
+        assert "1001; q and p of shape (1001, 2)" in shown
+        assert re.search(r">iterations</th><td[^>]*>(\d+)<", shown)[1] == str(sum(trajectory().iterations))
+        energies = trajectory().energy()[::3]
+        assert f"{energies.min():.10g} to {energies.max():.10g}" in shown
+        pictures = Page(shown).all("svg")
+        assert [picture["aria-label"] for picture in pictures] == ["q1", "q2", "energy"]
+
+    def test_curves_are_thinned(self):
+        points = re.findall(r'points="([^"]*)"', trajectory()._repr_html_())
+        assert all(300 < len(line.split()) <= 400 for line in points)
+
+    def test_trajectories_without_an_energy_are_displayed(self):
+        run = trajectory()
+        broken = sc.Trajectory(
+            t=run.t,
+            q=np.zeros_like(run.q),
+            p=run.p,
+            iterations=run.iterations,
+            h=run.h,
+            step_sizes=run.step_sizes,
+            parameters=run.parameters,
+            stepper=run.stepper,
+            plan=run.plan,
+        )
+        assert 'aria-label="energy"' not in broken._repr_html_()
+
+
+class TestSymmetry:
+    def test_symmetry_display_shows_direction_gauge_and_conserved_quantity(self):
+        boost = sc.symmetries(falling())[-1]
+        assert boost.name == "boost of y"
+        shown = boost._repr_html_()
+        assert "Symmetry: boost of y" in shown
+        assert all(word in shown for word in ("conserves", "direction", "gauge"))
+
+    def test_coordinates_invariant_under_a_symmetry_are_not_listed(self):
+        first = sc.symmetries(falling())[0]
+        assert first.name == "momentum of x"
+        assert "<mi>y</mi>" not in first._repr_html_()
+
+
+class TestOutcomes:
+    def test_certificate_display_shows_checks_and_violations(self):
+        saved, broken = certificate()._repr_html_(), certificate(Outcome.VIOLATED)._repr_html_()
+        assert "all measured properties are satisfied: 1 satisfied, 1 not measured" in saved
+        assert "<strong>" not in saved
+        assert "<strong>VIOLATED</strong>" in broken
+        assert "it is &lt;4&gt;; from 4 steps" in saved
+        assert saved.count("3.98") == saved.count("3.7<") == 1
+
+    def test_advice_shows_the_step_and_its_evidence(self):
+        shown = advice()._repr_html_()
+        assert f"h = {advice().h:.6g}, {advice().steps} of them" in shown
+        assert shown.count('<th scope="row"') == 2 + len(advice().warnings) + len(advice().evidence)
+
+    def test_a_problem_shows_its_state_and_its_system(self):
+        kepler = sc.problem("kepler")
+        shown = kepler._repr_html_()
+        assert kepler.system._repr_html_() in shown
+        assert kepler.reference in shown
+
+
+def test_sparkline_spans_the_range_and_skips_non_finite_values():
+    points = [
+        tuple(map(float, pair.split(",")))
+        for pair in re.findall(r"[\d.]+,[\d.]+", sparkline([0.0, float("nan"), 2.0], ""))
+    ]
+    assert len(points) == 2
+    assert points[0][0] < points[1][0]
+    assert points[0][1] > points[1][1]
+    assert Page(sparkline([], "<none>"))
+    assert Page(sparkline([1.0, 1.0], "flat"))
+
+
+def test_cards_escape_text():
+    assert "&lt;i&gt;" in card("<i>", [("<i>", plain("<i>"))])
+    assert "<i>" not in card("<i>", [("<i>", plain("<i>"))])
+    assert listed([]) == "none"
+
+
+@pytest.mark.rotated
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize(("size", "scheme"), VIEWS)
+def test_displays_render_in_a_browser(browser, tmp_path, size, scheme):
+    displays = "\n".join(display()._repr_html_() for display in DISPLAYED.values())
+    colors = ":root{color-scheme:light dark} body{color:CanvasText;background:Canvas}"
+    head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width"><link rel="icon" href="data:,">'
+    page = f"<!DOCTYPE html><html><head>{head}<style>{colors}</style></head><body>{displays}</body></html>"
+    with opened(browser, page, tmp_path / "notebook.html", size, scheme) as view:
+        assert_it_asks_for_nothing(view)
+        assert view.evaluate("document.documentElement.scrollWidth") <= view.width
+        assert view.evaluate(UNREADABLE) == []
+        boxes = view.evaluate("[...document.querySelectorAll('polyline')].map(e => e.getBoundingClientRect().width)")
+        assert len(boxes) == 7  # of three runs, and two coordinates each of two trajectories of an ensemble
+        assert min(boxes) > 100.0

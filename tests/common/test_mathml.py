@@ -1,0 +1,198 @@
+"""MathML equals the expression, symbol by symbol, and browsers can read it."""
+
+import math
+import re
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import sympy
+from printed_formulas import mp, names, trees_of_mathml, value
+from sympy import Float, Function, Matrix, Mul, Pow, Rational, Symbol, cos, exp, pi, sin, sqrt, symbols
+
+from scvi_codegen import SCVI, SVI, Gauss, SpectralCollocation, derive, problem
+from scvi_codegen.common.display.mathml import latex_name, mathml, mathml_terms
+
+x, y, h = symbols("x y h")
+
+
+def inner(expression: sympy.Basic) -> str:
+    """The MathML of an expression within ``<math>``."""
+    return mathml(expression).removeprefix("<math>").removesuffix("</math>")
+
+
+def read(*elements: str, **values: float) -> float:
+    """The value of presentation MathML as it is printed, given the values of its names."""
+    known = {"e": mp.e, "π": mp.pi} | values
+    return float(value(trees_of_mathml(elements), known.__getitem__))
+
+
+EXPRESSIONS = [
+    -(x + y) / 2, Mul(-1, x + y, evaluate=False), x - Mul(1, x + y, evaluate=False),
+    Mul(2, Mul(3, x, evaluate=False), evaluate=False), 2 * 3**x, Rational(2, 3) * 5**y * x, (x - y) / h,
+    -(x - y) / h**2, 1 / x, -1 / x, x**-y, x**y / h, (-2) ** Symbol("n"), Rational(1, 3) ** x,
+    Rational(-1, 3) ** Symbol("n"), sqrt(3) / 6 - Rational(1, 2), 1 / sqrt(x + y),
+    (x + y) ** Rational(3, 2) + (x**2 + y**2) ** Rational(-3, 2), (x + y) ** Rational(-1, 3) * h,
+    sin(x) ** 2 * cos(x + y) ** 3 - sin(x) ** -2, sin(-x) * cos(x / 2 - y), exp(-x * y) / (1 + exp(x)), pi * x / 4,
+    x * y**2 * (x + y) ** 2 * (x - 2 * y),
+    Symbol("Q_1") ** 2 + Symbol("Q__2_x") ** -2 + Symbol("theta1") ** 2 * Symbol("q_dot") ** 2,
+    Mul(Rational(-1, 2), x + y, x - y, evaluate=False), Float("1.5e-7") * x - Float("2.25") * y + Float("-4e12"),
+    Pow(x**2, y, evaluate=False), Pow(-x, 2, evaluate=False),
+    h * (x + y + 3) * (x + 2 * y + 5) * sin(x + y + h) / 7, (x + y) * (x - y) / (h * (x + 3) * (y + 4)),
+]  # fmt: skip
+
+DERIVED = [
+    ("planar-pendulum", SVI(2), True),
+    ("planar-pendulum", SCVI(2), False),
+    ("double-pendulum", SVI(1), True),
+    ("double-pendulum", SVI(2), False),
+    ("kepler", SCVI(2), True),
+    ("duffing", SpectralCollocation(3), True),
+    ("henon-heiles", Gauss(2), False),
+]
+
+
+def check_read_back(expression: sympy.Expr, seed: int = 1) -> None:
+    """One element, and all terms, read as the expression."""
+    draws = np.random.default_rng(seed).uniform(0.5, 1.5, len(expression.free_symbols))
+    values = dict(zip(sorted(expression.free_symbols, key=str), map(float, draws), strict=True))
+    if Symbol("n") in values:
+        values[Symbol("n")] = 3.0
+    printed = {next(names(trees_of_mathml([mathml(symbol)]))): number for symbol, number in values.items()}
+    expected = float(expression.xreplace({symbol: Float(value) for symbol, value in values.items()}).evalf())
+    for elements in ([mathml(expression)], mathml_terms(expression)):
+        assert read(*elements, **printed) == pytest.approx(expected, rel=1e-10, abs=1e-12)
+
+
+@pytest.mark.parametrize("expression", EXPRESSIONS, ids=str)
+def test_mathml_evaluates_to_the_expression(expression):
+    check_read_back(expression)
+
+
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize(("name", "method", "radicals"), DERIVED, ids=lambda value: getattr(value, "name", str(value)))
+def test_derived_equations_survive_a_round_trip(name, method, radicals):
+    derived = derive(problem(name).system, method, radicals=radicals)
+    for equation in (*derived.equations, *derived.end_momentum):
+        check_read_back(equation.residual)
+
+
+GREEK = '<mi mathvariant="normal" style="font-style:italic">'
+TAU_1 = f"<msub>{GREEK}τ</mi><mn>1</mn></msub>"
+DOT = '<mo style="font-weight:bold;padding-bottom:0.12em">˙</mo></mover>'
+NAMED = {
+    "theta_1": f"<msub>{GREEK}θ</mi><mn>1</mn></msub>",
+    "theta1": f"<msub>{GREEK}θ</mi><mn>1</mn></msub>",
+    "Q__2_x": "<msubsup><mi>Q</mi><mi>x</mi><mn>2</mn></msubsup>",
+    "Q_2_x": "<msubsup><mi>Q</mi><mi>x</mi><mn>2</mn></msubsup>",
+    "Q_1": "<msup><mi>Q</mi><mn>1</mn></msup>",
+    "\\dot{q}": f'<mover accent="true"><mi>q</mi>{DOT}',
+    "\\hat{D}_1": '<msub><mover accent="true"><mi>D</mi><mo>^</mo></mover><mn>1</mn></msub>',
+    "w__'_1": "<msubsup><mi>w</mi><mn>1</mn><mo>′</mo></msubsup>",
+    "q_dot": f'<mover accent="true"><mi>q</mi>{DOT}',
+    "q1_dot_k": f'<msub><mover accent="true"><mi>q</mi>{DOT}<mrow><mn>1</mn><mo>,</mo><mi>k</mi></mrow></msub>',
+    "p_k": "<msub><mi>p</mi><mi>k</mi></msub>",
+    "q_{k+1}": "<msub><mi>q</mi><mrow><mi>k</mi><mo>+</mo><mn>1</mn></mrow></msub>",
+    "lambda_1_q1": f"<msub>{GREEK}λ</mi><mrow><mn>1</mn><mo>,</mo><msub><mi>q</mi><mn>1</mn></msub></mrow></msub>",
+    "l_1_0": f"<mrow><msub><mi>l</mi><mn>0</mn></msub><mo>(</mo>{TAU_1}<mo>)</mo></mrow>",
+    "_h": "<mi>h</mi>",
+    "a<b&c": "<mi>a&lt;b&amp;c</mi>",
+}
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_names_are_typeset(name):
+    assert inner(Symbol(name)) == NAMED[name]
+
+
+def test_names_of_tables_are_typeset():
+    assert f"<mi>l</mi>{DOT}" in inner(Symbol("dl_2_1"))
+    assert "<mi>D</mi><mo>^</mo>" in inner(Symbol("DD_1_0"))
+    assert "<msup><mi>A</mi><mn>2</mn></msup>" in inner(Symbol("aa_1_2"))
+    assert "<mi>b</mi><mi>A</mi>" in inner(Symbol("bA_2"))
+
+
+@pytest.mark.parametrize(
+    ("number", "text"),
+    [("0.1", "0.1"), ("3.0", "3.0"), ("0.33333333333333333", "0.333333"), ("1e-12", "1.0·10\N{MINUS SIGN}12")],
+)
+def test_numbers_have_sensible_digits(number, text):
+    assert "".join(ElementTree.fromstring(mathml(Float(number, 50))).itertext()) == text
+
+
+def test_a_power_of_a_symbol_with_an_upper_index_is_in_brackets():
+    assert (
+        inner(Symbol("Q_1") ** 2)
+        == "<msup><mrow><mo>(</mo><msup><mi>Q</mi><mn>1</mn></msup><mo>)</mo></mrow><mn>2</mn></msup>"
+    )
+
+
+def test_digits_of_factors_are_separated_by_a_dot():
+    assert inner(2 * 3**x) == "<mrow><mn>2</mn><mo>·</mo><msup><mn>3</mn><mi>x</mi></msup></mrow>"
+    assert "·" not in inner(2 * x)
+
+
+@pytest.mark.parametrize(
+    "expression",
+    [
+        Matrix([[1, -x], [sqrt(2) / 2, x**2 / 3]]),
+        sympy.Eq(Symbol("q_dot"), Function("L_d")(Symbol("q_0"), Symbol("q_1"))),
+        sympy.Derivative(Function("L")(x, y), x),
+        sympy.Integral(exp(-(x**2)), (x, 0, 1)),
+        sympy.Sum(Symbol("w_n"), (Symbol("n"), 1, Symbol("g"))),
+        sympy.kronecker_product(sympy.MatrixSymbol("A", 2, 2), sympy.MatrixSymbol("E", 2, 2)),
+        sympy.MatrixSymbol("A", 2, 2) * sympy.MatrixSymbol("Q", 2, 1) + sympy.MatrixSymbol("B", 2, 1),
+        sympy.I * x + sympy.oo,
+        sympy.Tuple(x, y),
+    ],
+    ids=lambda expression: type(expression).__name__,
+)
+def test_all_kinds_are_well_formed_and_without_html_entities(expression):
+    for text in (mathml(expression), *mathml_terms(expression)):
+        ElementTree.fromstring(text)
+        assert set(re.findall(r"&\w+;", text)) <= {"&lt;", "&gt;", "&amp;"}
+
+
+def test_functions_have_their_standard_names():
+    assert inner(Function("L_d")(x)).startswith("<mrow><msub><mi>L</mi><mi>d</mi></msub>")
+
+
+class TestTerms:
+    def test_a_sum_is_split_before_its_signs(self):
+        terms = mathml_terms(x - y / 2 - h * (x + y))
+        signs = [re.findall(r'^<math displaystyle="true"><mo form="(\w+)">(.)</mo>', term) for term in terms]
+        assert signs == [[("prefix", "\N{MINUS SIGN}")], [("infix", "+")], [("infix", "\N{MINUS SIGN}")]]
+
+    def test_a_product_is_one_term(self):
+        assert (
+            len(mathml_terms(x * (x + y + 111111) * (x - y + 222222) * sin(x + 333333 * y) * cos(y + 444444 * x))) == 1
+        )
+
+    def test_the_right_side_begins_with_the_equals_sign(self):
+        terms = mathml_terms(x + y, h - x)
+        assert [('<mo form="infix">=</mo>' in term) for term in terms] == [False, False, True, False]
+        assert mathml_terms(sympy.Eq(h - x, x + y)) == terms
+
+
+def test_round_trip_detects_a_wrong_sign():
+    assert read(mathml(x - y), x=2.0, y=3.0) == -1.0
+    assert read(mathml(x - y).replace("\N{MINUS SIGN}", "+"), x=2.0, y=3.0) == 5.0
+    assert math.isclose(read(mathml(sin(x) ** 2), x=2.0), math.sin(2.0) ** 2)
+
+
+@pytest.mark.parametrize(
+    ("name", "latex"),
+    [
+        ("theta_1_dot", r"\dot{\theta}_{1}"),
+        ("q1_dot_k", r"\dot{q}_{1,k}"),
+        ("Q_2_x", "Q_{x}^{2}"),
+        ("p_q1_k+1", "p_{q_{1},k+1}"),
+        ("l_1_0", r"l_{0}(\tau_{1})"),
+        ("dl_3_2", r"\dot{l}_{2}(\tau_{3})"),
+        ("DD_1_0", r"(\hat{D}\tilde{D})_{1,0}"),
+        ("aa_n_j", "(A^{2})_{n,j}"),
+        ("bA_2", "(bA)_{2}"),
+    ],
+)
+def test_latex_names_are_parsed_like_mathml_names(name, latex):
+    assert latex_name(name) == latex

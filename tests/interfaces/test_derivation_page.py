@@ -1,0 +1,331 @@
+"""The derivation page: its equations are those that are compiled, its counts are counted, and browsers set it."""
+
+import random
+import re
+import warnings
+from functools import cache
+from typing import Any, get_args
+
+import pytest
+import sympy
+from browsing import (
+    FORMULAS,
+    FRACTIONS,
+    UNREADABLE,
+    VIEWS,
+    assert_it_asks_for_nothing,
+    assert_nothing_sticks_out,
+    opened,
+)
+from commands import error_of
+from html_page import Page
+from notation import hamilton, lagrange
+from samples import driven_duffing
+from summed_equations import Evaluation
+
+import scvi_codegen as sc
+from scvi_codegen.codegen.ir.equations import IterationName
+from scvi_codegen.codegen.pipeline import program_of
+from scvi_codegen.codegen.rendering.outline import functions_of, reached
+from scvi_codegen.codegen.rendering.program_source import render
+from scvi_codegen.common.display.page import MOST_LINES, SPACE, Formula, Paragraph, formulas, operations
+from scvi_codegen.interfaces.derivation import derivation_html
+from scvi_codegen.interfaces.derivation.equations import derive
+from scvi_codegen.interfaces.derivation.notation import table_entries
+from scvi_codegen.interfaces.derivation.page.document import ITERATIONS, kernels_of
+from scvi_codegen.interfaces.derivation.page.drawings import curve_section, jacobian_pattern
+from scvi_codegen.methods.discretise import paper_equations, with_auxiliaries
+from scvi_codegen.methods.tables.number_tables import positions
+
+TILTED = """m*(1 + q**2/3)*q_dot**2/2 + a*q*q_dot*sin(t) - k*q**4/4 + q_dot**4/40"""
+METHODS = [
+    sc.SVI(3), sc.SVI(2, "gauss-lobatto:3"), sc.SVI(2, "hermite:2"), sc.SVI(2, space="splines:2"), sc.SCVI(3),
+    sc.SCVI(1), sc.SCVI(2, variational=False), sc.SCVI(2, abscissae="gauss"), sc.SpectralCollocation(3),
+    sc.SpectralCollocation(2, form="phase-space"), sc.Gauss(3), sc.LobattoIIIA(3), sc.RadauIIA(2, form="position"),
+    sc.ExplicitEuler(), sc.StoermerVerlet(),
+]  # fmt: skip
+
+
+def tilted() -> sc.LagrangianSystem:
+    """Everything a Lagrangian of one coordinate can have: a mass that varies, a magnetic term, time, a quartic term."""
+    return lagrange("tilted", "q", TILTED, m=1.3, a=0.4, k=0.7)
+
+
+def compared(system: Any, method: Any) -> list[tuple[sympy.Expr, sympy.Expr]]:
+    """Every equation in numbers, as the page has it and as ``derive`` writes it out."""
+    with warnings.catch_warnings(action="ignore", category=sc.MethodWarning):
+        derived = derive(system, method)
+    stages = with_auxiliaries(system, method.paper_form(system))
+    generator = random.Random(5)
+    unknowns = {block.name: sympy.Rational(generator.randint(10, 90), 100) for block in stages.blocks}
+    known = {
+        "q_k": sympy.Rational(2, 5),
+        "p_k": sympy.Rational(3, 7),
+        "h": sympy.Rational(1, 9),
+        "t_k": sympy.Rational(1, 3),
+    }
+    known |= {parameter.name: sympy.Rational(str(value)) for parameter, value in system.constants.items()}
+    evaluation = Evaluation(system, stages, known, unknowns)
+    numbers = dict(zip(derived.unknowns, unknowns.values(), strict=True))
+    names = {derived.state[0][0]: "q_k", derived.state[1][0]: "p_k", derived.step: "h", derived.time: "t_k"}
+    numbers |= {symbol: known[name] for symbol, name in names.items()}
+    numbers |= {parameter: known[parameter.name] for parameter in system.parameters}
+    written = [*derived.equations, *derived.end_position, *derived.end_momentum]
+    expected = [derived.numeric(equation.residual).xreplace(numbers).evalf(30) for equation in written]
+    return list(zip([*evaluation.residuals(), *evaluation.ends()], expected, strict=True))
+
+
+class TestEquations:
+    @pytest.mark.sampled(5)
+    @pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
+    def test_rolled_sums_equal_unrolled_terms(self, method):
+        assert all(abs(one - other) < 1e-18 for one, other in compared(tilted(), method))
+
+    @pytest.mark.second
+    def test_rolled_sums_of_a_composition_equal_unrolled_terms(self):
+        assert all(abs(one - other) < 1e-18 for one, other in compared(driven_duffing(), sc.Composition(8)))
+
+    @pytest.mark.parametrize(
+        "method", [sc.SVI(2), sc.SVI(2, "gauss-legendre:3"), sc.SCVI(2), sc.Gauss(2)], ids=lambda m: m.name
+    )
+    def test_rolled_sums_of_a_hamiltonian_equal_unrolled_terms(self, method):
+        system = hamilton("twisted", "q", "p**2*(1 + q**2)/2 + q**4*cos(t) + p*q/3", momenta="p")
+        assert all(abs(one - other) < 1e-18 for one, other in compared(system, method))
+
+    @pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
+    def test_one_name_denotes_one_number(self, method):
+        stages = method.paper_form(tilted())
+        values: dict[str, Any] = {}
+        for group in stages.stage_groups:
+            for part in (*group.gathers, *group.scatters):
+                for names, numbers in zip(part.table.names, part.table.entries, strict=True):
+                    for name, number in zip(names, numbers, strict=True):
+                        if name:
+                            number = number / name.factor.numerator * name.factor.denominator
+                            assert values.setdefault(name.number, number) == number
+        shown = {entry.symbol.name: entry.value for entry in table_entries(stages, method)}
+        assert values.keys() <= shown.keys()
+
+    @pytest.mark.parametrize(
+        "method", [sc.SVI(2), sc.SCVI(2), sc.SpectralCollocation(3), sc.Gauss(2)], ids=lambda m: m.name
+    )
+    def test_the_pattern_is_that_of_the_jacobian(self, method):
+        system = sc.problem("henon-heiles").system
+        assert_pattern_is_of_jacobian(system, method)
+
+    def test_pattern_with_fewer_multipliers_than_coordinates(self):
+        assert_pattern_is_of_jacobian(swing(constraints=["x**2 + y**2 - 1"]), sc.SVI(2, "gauss-lobatto:3"))
+
+
+NUMBERED = {
+    sc.SVI(3): ["25"],
+    sc.SCVI(2): ["33"],
+    sc.SpectralCollocation(2): ["18"],
+    sc.SpectralCollocation(2, form="phase-space"): ["21", "21"],
+    sc.Gauss(2): [],
+}
+
+
+@pytest.mark.parametrize("method", NUMBERED, ids=lambda method: method.name)
+def test_curves_are_drawn_to_scale_and_numbered_as_in_the_paper(method):
+    """Points are at MARGIN + c (WIDTH - 2 MARGIN), and as high as their weights."""
+    *contents, drawing = curve_section(method).contents
+    assert [each.number for each in contents if isinstance(each, Formula) and each.number] == NUMBERED[method]
+    circles = [float(x) for x in re.findall(r'<circle cx="([^"]*)"', drawing.svg)]
+    assert circles == pytest.approx([30 + 580 * float(c) for part in method.parts for c in positions(part)], abs=0.051)
+    stems = [float(y) - float(top) for y, top in re.findall(r"M[\d.]+ (\d+)V([\d.]+)", drawing.svg)]
+    weights = [float(w) for part in method.parts for w in getattr(part, "weights", ())]
+    assert stems == pytest.approx([30 * w / max(weights) for w in weights], abs=0.051)
+
+
+def assert_pattern_is_of_jacobian(system: sc.LagrangianSystem, method: Any) -> None:
+    pattern = jacobian_pattern(paper_equations(system, method), system.dimension)
+    found = {(r, c) for r, row in enumerate(pattern.rows) for c in row}
+    derived = derive(system, method)
+    assert pattern.size == len(derived.unknowns)
+    assert found == set(derived.jacobian.todok())
+
+
+def swing(**more: Any) -> sc.LagrangianSystem:
+    """A falling point with a further force."""
+    formula = "(x_dot**2 + y_dot**2)/2 - y"
+    return sc.LagrangianSystem.from_text(
+        name="swing", coordinates=["x", "y"], lagrangian=formula, parameters={"c": 0.1}, **more
+    )
+
+
+@cache
+def kepler_page(method: Any) -> str:
+    return derivation_html(sc.problem("kepler").system, method)
+
+
+class TestPage:
+    @pytest.mark.parametrize(("form", "numbers"), [("position", ["18"]), ("phase-space", ["21", "21"])])
+    def test_spectral_collocation_is_shown_in_matrix_form(self, form, numbers):
+        page = kepler_page(sc.SpectralCollocation(2, form=form))
+        part = page[page.index("In matrices") :]
+        part = part[: part.index("at the nodes.")]
+        assert re.findall(r"\((\d+)\)", part) == numbers
+        assert part.count("\u2297") == {"position": 3, "phase-space": 4}[form]
+
+    @pytest.mark.tiers(2, 5)
+    @pytest.mark.sampled(5)
+    @pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
+    def test_every_method_has_a_well_formed_self_contained_page(self, method):
+        page = derivation_html(sc.problem("planar-pendulum").system, method)
+        parsed = Page(page)
+        assert len(parsed.all("h1")) == 1
+        assert len(parsed.all("section")) == len(parsed.all("h2")) == 11
+        identifiers = [attributes["id"] for _, attributes in parsed.elements if "id" in attributes]
+        assert len(identifiers) == len(set(identifiers))
+        assert set(re.findall(r'href="#([^"]*)"', page)) <= set(identifiers)
+        assert parsed.all("script") == []
+        assert not re.search(r"https?:|@import|url\(", page)
+
+    @pytest.mark.second
+    def test_every_kernel_and_every_function_of_the_step_is_shown(self):
+        system = sc.problem("double-pendulum").system
+        program = program_of(system, sc.SVI(2), prefix="double_pendulum")
+        functions = functions_of(render(program).amalgamated().code)
+        page = derivation_html(system, sc.SVI(2))
+        shown = re.findall(r"<summary>(\w+)\(", page)
+        assert {kernel.name for kernel in kernels_of(program)} <= set(shown)
+        assert {"fixed_point", "solve", "newton", "evaluate", "add_quadrature", "double_pendulum_advance"} <= set(shown)
+        assert len(shown) == len(set(shown))
+        called = {f.name for f in reached(functions, "double_pendulum_advance") if f.comment and "lanes" not in f.name}
+        assert called <= set(shown)
+
+    def test_every_kind_of_iteration_is_explained(self):
+        assert set(ITERATIONS) == set(get_args(IterationName))
+        singular = hamilton("hyperbolic", "q", "q*p + q**2*p**2", momenta="p")
+        page = derivation_html(singular, sc.Gauss(2))
+        assert "in turn to convergence" in page
+
+    def test_operations_are_counted(self):
+        program = program_of(sc.problem("kepler").system, sc.SVI(2), prefix="kepler_problem")
+        functions = functions_of(render(program).amalgamated().code)
+        page = kepler_page(sc.SVI(2))
+        for kernel in kernels_of(program):
+            row = re.search(
+                rf'<td class="word">{kernel.name}</td>(?:<td class="number">(\d+)</td>)'
+                + r'<td class="number">(\d+)</td>' * 3,
+                page,
+            )
+            results, before, after, temporaries = map(int, row.groups())
+            body = functions[kernel.name].body
+            signs = re.findall(r"(?<=[\w\])]) [-+] |\*|/", body)
+            calls = re.findall(r"\b[a-z]\w*\(", body)
+            negatives = re.findall(r"-(?=[\w(])", body)
+            assert after == len(signs) + len(calls) + len(negatives)
+            assert temporaries == body.count("const")
+            assert results == len(re.findall(r"^  (?:value|derivative)\[", body, re.MULTILINE))
+            assert before == sum(sympy.count_ops(formula) for formula in kernel.formulas)
+
+    def test_tables_have_radicals_where_they_are_short(self):
+        page = kepler_page(sc.SVI(2))
+        assert "<msqrt><mn>3</mn></msqrt>" in page
+        assert "\N{MINUS SIGN}0.57735026918962576" in page
+
+    @pytest.mark.rotated
+    def test_equation_numbers_of_the_paper_are_shown(self):
+        page = kepler_page(sc.SCVI(2))
+        numbers = set(re.findall(r'<span class="number">\(([^)]*)\)', page))
+        assert {"2", "33", "34a, i = 1, 2", "34c", "34d", "34e", "dG/dQ", "dG/dv0"} <= numbers
+        numbers = set(re.findall(r'<span class="number">\(([^)]*)\)', kepler_page(sc.SVI(2))))
+        assert {"2", "25"} <= numbers
+        assert "26" not in numbers
+        assert "of order 4" in kepler_page(sc.Gauss(2))
+
+    def test_composition_is_shown_as_its_leapfrog_steps(self):
+        method = sc.Composition(8)
+        assert f"{len(method.fractions)} leapfrog steps of sizes" in kepler_page(method)
+
+    def test_coordinates_are_counted(self):
+        one = derivation_html(swing(), sc.SVI(1))
+        assert re.search(r"of (\d+ coordinates?),", one)[1] == "2 coordinates"
+        one = derivation_html(sc.problem("planar-pendulum").system, sc.SVI(1))
+        assert re.search(r"of (\d+ coordinates?),", one)[1] == "1 coordinate"
+
+    def test_names_are_escaped(self):
+        system = sc.LagrangianSystem.from_text(name="<b> & */ q", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2")
+        page = derivation_html(system, sc.SVI(1))
+        assert "<h1>&lt;b&gt; &amp; */ q</h1>" in page
+        Page(page)
+
+    @pytest.mark.rotated
+    def test_large_system_is_abbreviated_with_a_note(self):
+        system = sc.problem("outer-solar-system").system
+        page = derivation_html(system, sc.SVI(8))
+        assert len(page.encode()) < 1_000_000
+        Page(page)
+        assert re.search(r"The first \d of 18 equations\.", page)
+        assert "144 rows and columns" in page
+        assert "they are omitted here" in page
+        functions = functions_of(sc.generate_source(system, sc.SVI(8))[0].amalgamated().code)
+        count = sum(len(functions[f"quadrature_derivatives{end}"].text.splitlines()) for end in ("_1", "_2", ""))
+        assert count > 1000
+        assert f"/* .. {count - MOST_LINES} more lines */" in page
+
+    def test_an_index_in_a_heading_is_a_variable(self):
+        assert f"<var>j</var>{SPACE}={SPACE}0</th>" in kepler_page(sc.SVI(2))
+
+    def test_equal_derivations_give_equal_pages(self):
+        assert derivation_html(sc.problem("kepler").system, sc.SVI(2)) == kepler_page(sc.SVI(2))
+
+
+@pytest.mark.tiers(0, 3)
+@pytest.mark.parametrize(("size", "scheme"), VIEWS)
+def test_page_renders_in_a_browser(browser, tmp_path, size, scheme):
+    with opened(browser, kepler_page(sc.SCVI(2)), tmp_path / "kepler.html", size, scheme) as view:
+        assert_it_asks_for_nothing(view)
+        assert_nothing_sticks_out(view)
+        view.evaluate("document.querySelectorAll('details').forEach(pair => pair.open = true)")
+        assert_nothing_sticks_out(view)
+        boxes = view.evaluate(FORMULAS)
+        assert len(boxes) > 200
+        assert all(width > 4.0 and height > 8.0 for width, height in boxes)
+        fractions = view.evaluate(FRACTIONS)
+        assert len(fractions) > 50
+        assert all(height > 12.0 and above <= below + 0.5 for height, above, below in fractions)
+        assert view.evaluate(UNREADABLE) == []
+        sides = view.evaluate(
+            "[...document.querySelectorAll('.sides')].map(sides => [...sides.children].map(side => {"
+            " const box = side.getBoundingClientRect(); return [box.left, box.top, box.bottom]; }))"
+        )
+        assert len(sides) > 20
+        for left, right in sides:
+            extra = left[1] == right[1] and left[0] < right[0]
+            below = left[2] <= right[1] and left[0] == right[0]
+            assert extra if size == "desk" else below
+        assert view.evaluate("[...document.querySelectorAll('svg')].every(e => e.getBoundingClientRect().width > 200)")
+
+
+class TestCommand:
+    @pytest.mark.parametrize("more", [["--latex"], ["--radicals"], ["-o", "text"]])
+    def test_html_and_text_output_are_exclusive(self, more, tmp_path):
+        assert "--html excludes --latex, --radicals and -o" in error_of(
+            "derive", "kepler", "--html", tmp_path / "page.html", *more
+        )
+        assert list(tmp_path.iterdir()) == []
+
+    @pytest.mark.rotated
+    def test_missing_folder_is_named(self):
+        assert "there is no folder 'no'" in error_of("derive", "kepler", "--html", "no/page.html")
+
+
+@pytest.mark.rotated
+def test_operations_are_those_of_sympy():
+    x = sympy.Symbol("x")
+    assert operations(sympy.sin(x) ** 2 / 3 + x) == sympy.count_ops(sympy.sin(x) ** 2 / 3 + x) == 4
+
+
+@pytest.mark.rotated
+def test_omitted_terms_are_counted():
+    x = sympy.symbols("x:300")
+    short, long = Formula(x[0] + x[1]), Formula(sympy.Add(*(s**2 for s in x)))
+    left = [block.text if isinstance(block, Paragraph) else block for block in formulas([short, long, short], "row")]
+    assert left == [short, short, "1 row of more than 400 operations left out, the longest of 599."]
+    assert list(formulas([short] * 20, "row"))[-1] == Paragraph("The first 12 of 20 rows.")
+    wide = Formula(sympy.Add(*x))
+    assert list(formulas([wide] * 4, "row")) == [wide, wide, Paragraph("The first 2 of 4 rows.")]
+    assert list(formulas([wide] * 4, "row", together=2000)) == [wide] * 4

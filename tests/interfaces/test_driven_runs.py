@@ -1,0 +1,160 @@
+"""``scvi-codegen run`` of a system with inputs: its tables, its files, what it refuses, and where it stops."""
+
+import os
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import error_of, invoke, output_of
+from numpy.testing import assert_allclose
+
+from scvi_codegen import Run, compile_stepper, load_model
+from scvi_codegen.interfaces.cli.running import integrate_model
+
+MODEL = """
+[system]
+name = "pushed pendulum"
+coordinates = ["q"]
+lagrangian = "q_dot**2/2 + cos(q)"
+inputs = ["u"]
+[forces]
+q = "u"
+[inputs]
+u = { t = [0.0, 1.0, 1.55, 3.0], values = [0.0, 2.0, -1.0, 0.5] }
+[initial]
+q = [0.3]
+p = [0.1]
+[method]
+method = "svi:4"
+[run]
+step = 0.1
+span = 2.3
+"""
+
+
+@pytest.fixture(autouse=True)
+def model(here):
+    Path("pushed.toml").write_text(MODEL)
+    Path("u.csv").write_text("t,value\n0,1\n1,0\n2,0.5\n3,-1\n")
+    return load_model("pushed.toml")
+
+
+RUN = ("run", "pushed.toml")
+
+
+@pytest.mark.second
+def test_inputs_of_the_command_line_replace_those_of_the_file(model):
+    (Path("elsewhere")).mkdir()
+    Path("pushed.toml").rename("elsewhere/pushed.toml")
+    words = ["run", "elsewhere/pushed.toml", "--input", "u=u.csv:cubic", "--tolerance", "1e-13", "-o", "run.csv"]
+    invoke(*words)
+    table = ([0.0, 1.0, 2.0, 3.0], [1.0, 0.0, 0.5, -1.0], "cubic")
+    expected = compile_stepper(model.system, "svi:8").integrate(model.q, model.p, inputs={"u": table}, t_end=2.3)
+    found = np.loadtxt("run.csv", delimiter=",", skiprows=1)
+    assert_allclose(found[-1, :3], [2.3, expected.q[-1, 0], expected.p[-1, 0]], rtol=0, atol=1e-12)
+
+
+def test_constant_of_the_command_line(model):
+    output_of(*RUN, "--input", "u=-2.5e-1", "-o", "run.npz")
+    expected = compile_stepper(model.system, model.method).integrate(
+        model.q, model.p, parameters={"u_0": -0.25}, h=0.1, steps=23
+    )
+    with np.load("run.npz") as file:
+        assert_allclose(file["q"][-1], expected.q[-1], rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--input", "u"], "not of the form NAME=FILE"),
+        (["--input", "v=u.csv"], "'v' is not an input of 'pushed pendulum', whose inputs are u"),
+        (["--input", "u=u.csv:quintic"], "constant or linear or cubic"),
+        (["--input", "u=none.csv"], "none.csv: it cannot be read"),
+        (["--span", "4"], "the input 'u' covers t = 0 to 3, but the run goes from 0 to 4"),
+        (["-o", "long.run"], "-o NAME.npz"),
+        (["--advise", "1e-9"], "use --tolerance"),
+        (["--parameter", "u_0=1"], "no parameter 'u_0'"),
+    ],
+)
+def test_unsupported_options_are_rejected(words, message):
+    assert message in error_of(*RUN, *words)
+
+
+@pytest.mark.second
+def test_ensemble_of_runs_with_inputs(model):
+    Path("many.csv").write_text("q,q_dot\n0.1,0\n0.2,1\n0.3,-1\n")
+    Path("pushed.toml").write_text(MODEL.replace("cos(q)", "(1 + u)*cos(q)").replace('[forces]\nq = "u"\n', ""))
+    text = output_of(*RUN, "--ensemble", "many.csv", "-o", "many.npz")
+    model = load_model("pushed.toml")
+    stepper = compile_stepper(model.system, model.method)
+    given = {"inputs": dict(model.inputs), "h": 0.1, "t_end": 2.3}
+    expected = [stepper.integrate([q], velocity=[v], **given) for q, v in ((0.1, 0.0), (0.2, 1.0), (0.3, -1.0))]
+    with np.load("many.npz") as file:
+        assert (file["t"] == expected[0].t).all()
+        assert_allclose(file["q"], np.stack([run.q for run in expected], axis=1), rtol=0, atol=2e-15)
+    assert "3 trajectories of 24 steps of 0.1 from t = 0; 25 states saved of each" in text
+    changes = max(np.abs(run.energy() - run.energy()[0]).max() for run in expected)
+    assert f"it changed by {changes:.3g} at most" in text
+
+
+def test_runs_without_steps_and_columns_of_inputs():
+    assert "0 steps of 0.1 from t = 0 to t = 0; 1 state saved" in output_of(*RUN, "--steps", "0")
+    Path("many.csv").write_text("q,u_0\n0.1,5\n")
+    assert "'u_0' is not a coordinate" in error_of(*RUN, "--ensemble", "many.csv")
+
+
+def test_missing_input_is_reported():
+    Path("pushed.toml").write_text(MODEL.replace("[inputs]\nu = {", "[parameters]\n# {"))
+    assert "the input u is not set" in error_of(*RUN)
+    assert "final state" in output_of(*RUN, "--input", "u=u.csv")
+
+
+@pytest.mark.second
+def test_failing_step_saves_the_preceding_segments(model):
+    """Towards the end the push has no numbers left."""
+    Path("pushed.toml").write_text(MODEL.replace('q = "u"', 'q = "sqrt(u + 0.5)"'))
+    assert "states computed before were written: run.csv" in error_of(*RUN, "-o", "run.csv", status=1)
+    found = np.loadtxt("run.csv", delimiter=",", skiprows=1)
+    assert 1.0 < found[-1, 0] < 1.5
+    assert 1.0 in found[:, 0]
+
+
+def test_signal_stops_a_run_between_chunks(model, monkeypatch):
+    advance, sent = Run._advance, []
+
+    def interrupted(run, steps, save_every, arrays):
+        status = advance(run, min(steps, 2), save_every, arrays)
+        if run.t > 1.2 and not sent:
+            sent.append(os.kill(os.getpid(), signal.SIGTERM))
+        return status
+
+    monkeypatch.setattr(Run, "_advance", interrupted)
+    outcome = integrate_model(model)
+    assert outcome.interrupted
+    assert outcome.failure is None
+    assert 1.2 < outcome.trajectory.t[-1] < 2.0
+    assert outcome.trajectory.t[0] == 0.0
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("inputs", [True, False])
+def test_terminal_event_is_the_last_saved_state(model, inputs):
+    """With several segments: of inputs, or of a last step that is shorter."""
+    words = [] if inputs else ["--input", "u=1", "--span", "2.25"]
+    output_of(*RUN, *words, "--event", "q - 0.5; terminal=1", "--save-every", "7", "-o", "run.npz")
+    with np.load("run.npz") as file:
+        assert (np.diff(file["t"]) > 0.0).all()
+        assert abs(file["q"][-1] - 0.5) < 1e-13
+
+
+def test_ensemble_of_adaptive_runs_with_inputs(model):
+    text = Path("pushed.toml").read_text()
+    Path("pushed.toml").write_text(text.replace("step = 0.1", "tolerance = 1e-10"))
+    Path("grid.csv").write_text("q,p_q\n0.1,0.0\n0.2,1.0\n")
+    output_of(*RUN, "--ensemble", "grid.csv", "-o", "many.npz")
+    stepper = compile_stepper(model.system, model.method)
+    with np.load("many.npz") as file:
+        for j, (q, p) in enumerate([(0.1, 0.0), (0.2, 1.0)]):
+            one = stepper.integrate([q], [p], inputs=dict(model.inputs), t_end=2.3, tolerance=1e-10)
+            assert (file["q"][: len(one), j] == one.q).all()

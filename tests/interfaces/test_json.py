@@ -1,0 +1,220 @@
+"""``--json`` and ``--quiet``: the numbers behind the text, or neither."""
+
+import json
+import math
+import re
+from pathlib import Path
+
+import click
+import numpy as np
+import pytest
+from commands import invoke, json_of
+from scipy.special import ellipk
+
+import scvi_codegen as sc
+from scvi_codegen.analysis import verification
+from scvi_codegen.interfaces.cli import command_group, main
+from scvi_codegen.interfaces.models.model_files.model_file import dump_model, parse_model
+from scvi_codegen.methods import specification_of
+
+pytestmark = pytest.mark.usefixtures("here")
+KEPLER = ("kepler", "--step", "0.1", "--steps", "50", "--method", "svi:4")
+QUIET_COMMANDS = (
+    ("run", *KEPLER),
+    ("export", "orbit.run", "-o", "orbit.csv"),
+    ("systems",),
+    ("systems", "kepler"),
+    ("methods",),
+    ("methods", "--tableau", "gauss:2"),
+    ("cache",),
+    ("generate", "kepler", "-o", "kepler_svi"),
+    ("derive", "planar-pendulum", "--method", "svi:1"),
+    ("derive", str(Path(__file__).parents[2] / "examples" / "fput_ring.toml"), "--method", "stoermer-verlet"),
+    ("verify", "planar-pendulum", "--method", "svi:1"),
+    ("reproduce", "--list"),
+    ("doctor",),
+    ("page", "planar-pendulum", "-o", "pendulum.html"),
+    ("path", "kepler", "--from", "1,0", "--to=-0.5,0.8", "--span", "2", "--step", "0.1"),
+)
+"""Of every command one at least, after a run in the folder ``orbit.run``."""
+
+
+def test_every_command_is_tested():
+    assert {words[0] for words in QUIET_COMMANDS} == set(main.list_commands(click.Context(main)))
+
+
+@pytest.mark.tiers(2, 6)
+@pytest.mark.parametrize("words", QUIET_COMMANDS, ids=lambda words: " ".join(words[:2]).replace("/", " "))
+def test_quiet_prints_nothing_and_json_prints_one_document(words):
+    if words[0] == "page":
+        pytest.importorskip("ziglang", reason="pip install 'scvi-codegen[compiler]'")
+    invoke("run", *KEPLER, "-o", "orbit.run")
+    assert invoke(*words).stdout
+    quiet = invoke(*words, "--quiet")
+    assert (quiet.stdout, quiet.stderr) == ("", "")
+    assert json_of(*words)
+
+
+@pytest.mark.second
+def test_failed_run_reports_how_far_it_got():
+    found = json_of("run", "kepler", "--q", "1,0", "--velocity", "0,0", "--tolerance", "1e-9", "--span", "3", status=1)
+    assert "step" in found["failure"]
+    assert re.fullmatch(r"the run ended at t = 1\.1\d*, before t = 3", found["missed"])
+    assert 1.0 < found["final"]["t"] < math.pi / 8**0.5
+    far = (
+        "--q",
+        "1.97,0",
+        "--velocity",
+        "0,0.1234",
+        "--span",
+        "6",
+        "--time-transformation",
+        "1e-3*(1 + (q1**2 + q2**2)/1000)",
+    )
+    assert (
+        "use another time transformation" in json_of("run", "kepler", *far, "--tolerance", "1e-10", status=1)["missed"]
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "error"),
+    [
+        ("run keplr", 2, {"type": "SystemDefinitionError", "message": "there is no problem 'keplr'; did you mean"}),
+        ("run kepler --steps x", 2, {"type": "BadParameter", "message": "'x' is not a valid integer"}),
+        ("run kepler --nothing", 2, {"type": "NoSuchOption", "message": "--nothing"}),
+        ("rum kepler", 2, {"type": "UsageError", "message": "there is no command 'rum'; did you mean 'run'?"}),
+        (
+            "run kepler --q 1,0 --velocity 0,0 --tolerance 1e-9 --span 3",
+            1,
+            {"type": "StepFailedError", "message": "failed", "status": "", "step": 1, "t": 1.0, "residual": 1.0},
+        ),
+        ("run wrong.toml", 2, {"type": "ModelFileError", "message": "wrong.toml: ", "text": "", "column": 0}),
+    ],
+)
+def test_errors_are_entries_of_the_document(words, status, error):
+    Path("wrong.toml").write_text(
+        '[system]\nname = "a"\ncoordinates = ["x"]\nlagrangian = "x_dot**2/2 +"\n'
+        "[initial]\nq = [0]\np = [0]\n[run]\nspan = 1\n"
+    )
+    result = invoke(words, "--json", status=status)
+    found = json.loads(result.stdout)["error"]
+    assert found.keys() == error.keys() | {"exit_status"}
+    assert found["type"] == error["type"]
+    assert error["message"] in found["message"]
+    assert found["exit_status"] == status
+    assert found["message"] in result.stderr
+    assert all(type(found[name]) is type(value) for name, value in error.items())
+
+
+@pytest.mark.second
+def test_json_of_several_momentum_maps():
+    """Explicit steps do not conserve the angular momentum."""
+    Path("spiral.toml").write_text(
+        '[system]\nname = "spiral"\ncoordinates = ["z", "x", "y"]\n'
+        'lagrangian = "(x_dot**2 + y_dot**2 + z_dot**2)/2 - x**2/2 - y**2/2"\n'
+        '[method]\nmethod = "explicit-euler"\n[run]\nstep = 0.1\nsteps = 20\n'
+        "[initial]\nq = [0.1, 1.0, 0.0]\nq_dot = [0.3, 0.0, 0.7]\n"
+    )
+    found = json_of("run", "spiral.toml")["momentum_errors"]
+    assert found["momentum of z"] < 1e-15 > found["boost of z"]
+    assert found["angular momentum z"] > 0.1
+    run = sc.load_model("spiral.toml").integrate()
+    assert list(found) == list(run.stepper.momentum_map_names)
+    assert [*found.values()] == np.abs(run.momentum_errors()).max(axis=0).tolist()
+
+
+@pytest.mark.second
+def test_json_of_ensembles_with_unequal_steps():
+    """Bodies that fall to the centre in pi/sqrt(8) r**1.5."""
+    Path("grid.toml").write_text("[grid]\nq1 = [2.0, 1.0, 3.0]\n")
+    falling = ("kepler", "--velocity", "0,0", "--step", "0.05", "--steps", "80", "--method", "svi:4")
+    found = json_of("run", *falling, "--ensemble", "grid.toml")
+    stepper = sc.compile_stepper(sc.problem("kepler").system, "svi:4")
+    with pytest.raises(sc.StepFailedError) as failed:
+        stepper.integrate([1.0, 0.0], velocity=[0.0, 0.0], h=0.05, steps=80)
+    assert found["steps"] == {"least": failed.value.trajectory.steps, "most": 80}
+    assert found["steps"]["least"] == math.floor(math.pi / 8**0.5 / 0.05)
+    assert found["statuses"]["ok"] == 1
+    assert found["energy"] == pytest.approx([-1 / 2, -1.0, -1 / 3], rel=1e-15)
+
+
+def test_json_of_lists_and_model_files():
+    listed = json_of("systems")["systems"]
+    assert [entry["name"] for entry in listed] == list(sc.PROBLEMS)
+    assert listed[0]["parameters"]["m"] == 1.0
+    sections = json_of("systems", "kepler")
+    again = parse_model(invoke("systems", "kepler").stdout)
+    assert sections["initial"]["q"] == list(again.q)
+    by_name = {" ".join([entry["example"], *entry["options"]]): entry for entry in json_of("methods")["methods"]}
+    for example, entry in by_name.items():
+        specification_of(entry["example"])  # as --method reads it
+        if not entry["options"]:
+            method = sc.methods.as_method(example)
+            assert example.startswith(entry["name"])
+            assert all(entry[name] == getattr(method, name) for name in ("order", "symplectic", "symmetric"))
+        if " " in example:
+            assert json_of("derive", "kepler", "--method", *example.split())["equations"]
+    assert by_name["svi:4"]["order"] == 8
+    tableau = json_of("methods", "--tableau", "gauss:2")
+    assert tableau["b"] == [0.5, 0.5]
+    assert np.sum(tableau["A"], axis=1) == pytest.approx(tableau["c"], abs=1e-16)
+
+
+@pytest.mark.rotated
+def test_json_of_paths_is_that_of_the_model_file_and_of_the_interface():
+    words = ("--from", "0,0", "--to", "0.1,0.3", "--span", "3", "--step", "0.25", "--starts", "2", "--method", "svi:4")
+    found = json_of("path", "henon-heiles", *words, "-o", "path.npz")
+    text = invoke("systems", "henon-heiles").stdout
+    text = re.sub("(span|step) = .*", lambda line: f"{line[1]} = {3.0 if line[1] == 'span' else 0.25}", text)
+    text += "\n[path]\nfrom = [0.0, 0.0]\nto = [0.1, 0.3]\nstarts = 2\n"
+    Path("own.toml").write_text(text)
+    assert json_of("path", "own.toml", "--method", "svi:4")["paths"] == found["paths"]
+    assert parse_model(dump_model(parse_model(text))) == parse_model(text)
+    stepper = sc.compile_stepper(sc.problem("henon-heiles").system, "svi:4")
+    direct = stepper.path([0.0, 0.0], [0.1, 0.3], 3.0, steps=12)
+    assert any(abs(each["action"] - direct.action) < 1e-12 for each in found["paths"])
+    assert found["paths"] == sorted(found["paths"], key=lambda each: each["action"])
+    with np.load("path.npz") as file:
+        assert np.abs(file["q"][[0, -1]] - [[0, 0], [0.1, 0.3]]).max() < 1e-12
+        assert file["p"][0].tolist() == list(found["paths"][0]["momenta"].values())
+    closed = ("--closed=-q", "--q", "0", "--velocity", "1.5", "--span", "4", "--step", "0.2")
+    (swing,) = json_of("path", "planar-pendulum", *closed)["paths"]
+    assert swing["period"] == 8.0
+    assert 4 * ellipk((1 + swing["energy"]) / 2) == pytest.approx(8.0, abs=1e-9)
+    for wrong, status, message in (
+        (("--to", "1,2"), 2, "give those of q"),
+        ((), 2, "give the end of the path"),
+        (("--to", "1", "--closed", "true"), 2, "not both"),
+        (("--q", "1", "--to", "0.3", "--span", str(math.pi), "--step", "0.2"), 1, "no path was found"),
+    ):
+        assert message in invoke("path", "harmonic-oscillator", *wrong, status=status).output
+
+
+@pytest.mark.rotated
+def test_certificate_equals_the_saved_one():
+    found = json_of("verify", "planar-pendulum", "--method", "svi:1", "-o", "certificate.json")
+    assert found == json.loads(Path("certificate.json").read_text())
+    assert any(check["name"].startswith("identity") for check in found["checks"])
+
+
+@pytest.mark.parametrize(
+    ("run", "tolerance"),
+    [("span = 3.0\nerror = 1e-6", 0.0), ("span = 3.0\ntolerance = 1e-6", 1e-6), ("step = 0.1\nsteps = 9", None)],
+)
+def test_adaptive_steps_are_verified_at_the_tolerance_of_the_model(run, tolerance, monkeypatch):
+    """0 stands for round-off; None for a fixed step size."""
+    seen = []
+
+    def verify(*_, **arguments):
+        seen.append(arguments["tolerance"])
+        raise sc.StateError("seen")
+
+    monkeypatch.setattr(verification, "verify", verify)
+    Path("model.toml").write_text(f"[system]\ncatalogue = 'kepler'\n[method]\nmethod = 'svi:4'\n[run]\n{run}\n")
+    invoke("verify", "model.toml", status=2)
+    assert seen == [tolerance]
+
+
+def test_undefined_numbers_are_null():
+    values = {"a": math.nan, "b": [math.inf, 1.5], "c": np.array([1.0, np.nan]), "d": np.int64(3), "e": Path("x")}
+    assert command_group._plain(values) == {"a": None, "b": [None, 1.5], "c": [1.0, None], "d": 3, "e": "x"}

@@ -1,0 +1,213 @@
+"""Models whose steps the reversible controller chooses: files, the command line, ``solve_ivp`` and inputs."""
+
+import subprocess
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from commands import error_of, output_of
+from notation import lagrange
+
+import scvi_codegen as sc
+from scvi_codegen import ModelFileError, StateError, SystemDefinitionError, generate_package, load_package
+from scvi_codegen.analysis.advice.largest_step import REFINEMENTS, largest_step
+from scvi_codegen.interfaces.models.model_files.model_file import catalogue_model, dump_model, parse_model
+
+pytestmark = pytest.mark.second
+
+SHAKEN = """
+[system]
+name = "shaken comet"
+coordinates = ["x", "y"]
+lagrangian = "(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2) + x*cos(t)/100"
+time_transformation = "(x**2 + y**2)**(3/4)"
+
+[forces]
+x = "-x_dot/1000"
+
+[initial]
+q = [0.2, 0.0]
+p = [0.0, 3.0]
+
+[method]
+method = "svi:6"
+
+[run]
+step = 0.1
+controller = "reversible"
+span = 12.0
+"""
+
+
+@pytest.fixture
+def shaken(tmp_path: Path) -> Path:
+    path = tmp_path / "shaken.toml"
+    path.write_text(SHAKEN)
+    return path
+
+
+def plain(model: sc.Model) -> sc.Stepper:
+    return sc.compile_stepper(model.system, model.method)
+
+
+def test_controller_of_a_time_transformation_can_be_replaced() -> None:
+    both = {
+        "system": {"time_transformation": "frequency"},
+        "run": {"controller": "reversible", "step": 0.2, "span": 5.0},
+    }
+    reversible = catalogue_model("kepler", both)
+    symplectic = parse_model(dump_model(reversible), {"run": {"controller": "symplectic"}})
+    assert symplectic == catalogue_model("kepler", {**both, "run": {"step": 0.2, "span": 5.0}})
+    assert parse_model(dump_model(symplectic), {"run": {"controller": "reversible"}}) == reversible
+
+
+@pytest.mark.rotated
+def test_command_line_finds_the_step_in_tau(shaken: Path) -> None:
+    printed = output_of("run", str(shaken), "--tolerance", "1e-8")
+    error = float(printed.partition("largest local error: ")[2].partition(" ")[0])
+    assert 1e-12 < error < 1e-7
+    words = (
+        "--time-transformation",
+        "1e-3*(1 + (q1**2 + q2**2)/1000)",
+        "--controller",
+        "reversible",
+        "--tolerance",
+        "1e-10",
+    )
+    far = ("--q", "1.97,0", "--velocity", "0,0.1234", "--span", "6")
+    assert "use another time transformation" in error_of("run", "kepler", *far, *words, status=1)
+
+
+def test_run_continues_from_a_folder(shaken: Path, tmp_path: Path) -> None:
+    folder = str(tmp_path / "shaken.run")
+    assert "of 0.1 in tau from t = 0 to t = 12;" in output_of("run", str(shaken), "-o", folder)
+    assert "to t = 20;" in output_of("run", "--resume", folder, "--span", "20")
+    model = sc.load_model(shaken)
+    exact = plain(model).integrate(model.q, model.p, t_end=20.0)
+    assert np.abs(sc.load_run(folder)[-1:].q - exact.q[-1]).max() < 1e-9
+
+
+@pytest.mark.quick
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("tolerance", [0.0, 1e-8])
+def test_largest_step_satisfies_the_tolerance_and_a_larger_one_does_not(unit: float, tolerance: float) -> None:
+    kepler, start = sc.problem("kepler").system, ([1.9, 0.0], [0.0, (0.1 / 1.9) ** 0.5])
+    stepper = sc.compile_stepper(kepler, sc.SVI(8), time_transformation=f"{unit}*(q1**2 + q2**2)**(3/4)")
+    h = largest_step(stepper, *start, 20.0, tolerance)
+    errors = [stepper.integrate(*start, h=x, t_end=20.0).step_error for x in (h, h * 2 ** (1 / REFINEMENTS))]
+    assert errors[0] <= (tolerance or 2.0**-53) < errors[1]
+    assert largest_step(stepper, *start, -20.0, tolerance) == h
+
+
+def test_integrate_uses_the_controller(shaken: Path) -> None:
+    model = sc.load_model(shaken)
+    state: Any = [*model.q, *(model.p or ())]
+    exact = plain(model).integrate(model.q, model.p, t_end=12.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # of pilot runs, too
+        found = sc.solve_ivp(
+            model.system, (0.0, 12.0), state, time_transformation=model.time_transformation, controller="reversible"
+        )
+    assert found.success
+    assert np.abs(found.y[:2, -1] - exact.q[-1]).max() < 1e-11
+    compiled = sc.solve_ivp(model.stepper(), (0.0, -3.0), state, h=0.1, t_eval=[0.0, -1.5, -3.0])
+    earlier = plain(model).integrate(model.q, model.p, t_eval=[-1.5, -3.0], t_end=-3.0)
+    assert np.abs(compiled.y[:2, 1:].T - earlier.q).max() < 1e-9
+    for wrong in ({"controller": "reversible"}, {"time_transformation": "frequency", "controller": "pi"}):
+        with pytest.raises(SystemDefinitionError, match="controller"):
+            sc.solve_ivp(model.system, (0.0, 1.0), state, **wrong)
+    with pytest.raises(StateError, match="need a system, not a compiled stepper"):
+        sc.solve_ivp(model.stepper(), (0.0, 1.0), state, h=0.1, controller="reversible")
+
+
+def test_steps_end_at_breakpoints_of_inputs() -> None:
+    system = lagrange("pushed", "x", "x_dot**2/2 - x**4/4 + x*u", inputs="u")
+    pushes = {"u": ((0.0, 1.0, 2.5, 6.0), (0.3, -1.0, 0.5, 0.5), "constant")}
+    exact = sc.compile_stepper(system, sc.SVI(8)).integrate([1.0], [0.0], inputs=pushes, t_end=6.0).q[-1]
+    common: dict[str, Any] = {
+        "system": system,
+        "q": (1.0,),
+        "p": (0.0,),
+        "time_transformation": "1/(1 + x**2)",
+        "inputs": pushes,
+    }
+    errors = []
+    for tau in (0.4, 0.2):
+        model = sc.Model(method=sc.SVI(2), h=tau, span=6.0, **common)
+        driven = model.stepper().integrate(model.q, model.p, inputs=pushes, h=tau, t_end=6.0)
+        run = model.start(model.stepper())
+        for steps in model.segments(run):
+            run.record(steps)
+        assert np.array_equal(run.q, driven.q[-1])
+        errors.append(abs(driven.q[-1] - exact)[0])
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(4.0, abs=0.8)
+    searching = sc.Model(method=sc.SVI(2), tolerance=1e-9, span=6.0, **common)
+    with pytest.raises(ModelFileError, match="cannot be found by a pilot run"):
+        searching.start(searching.stepper())
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(
+    ("words", "printed"),
+    [
+        ("run kepler --controller reversible", "the reversible controller requires a time transformation"),
+        ("run kepler --controller pid", "'symplectic', 'predictive', 'reversible'"),
+        ("run kepler --time-transformation z --controller reversible", "no time transformation 'z'"),
+        ("run FILE --steps 10", "give span, not steps"),
+        ("run FILE --advise 1e-9", "--advise is not available with a time transformation"),
+        ("run FILE --ensemble grid.toml", "--ensemble is not available with a time transformation"),
+        ("run FILE --controller symplectic", "depends on time"),
+    ],
+)
+def test_unsupported_combinations_with_a_controller_are_reported(shaken: Path, words: str, printed: str) -> None:
+    assert printed in " ".join(error_of(*words.replace("FILE", str(shaken)).split()).split())
+
+
+def test_python_and_the_command_line_choose_the_same_step_of_tau() -> None:
+    model = parse_model(SHAKEN.replace("step = 0.1", "tolerance = 1e-9"))
+    run = model.integrate()
+    assert run.plan == model.start().plan
+    assert run.t[-1] == 12.0
+    assert run.plan.tau > 0.0
+
+
+@pytest.mark.quick
+def test_unsupported_model_fields_are_reported(shaken: Path, tmp_path: Path) -> None:
+    model = sc.load_model(shaken)
+    with pytest.raises(ModelFileError, match="reversible controller"):
+        _ = model.step_count
+    with pytest.raises(ModelFileError, match="give one"):
+        generate_package(replace(model, h=None, tolerance=1e-9), tmp_path / "none")
+    stretched = sc.reparametrise(sc.problem("kepler").system, "frequency")
+    with pytest.raises(ModelFileError, match="without a time transformation"):
+        sc.Model(
+            system=stretched, method=sc.SVI(4), q=(1, 0), p=(0, 1), h=0.1, span=3.0, time_transformation="frequency"
+        )
+    with pytest.raises(ModelFileError, match="controller must be symplectic or predictive or reversible"):
+        parse_model(SHAKEN.replace('"reversible"', '"pid"'))
+
+
+@pytest.mark.rotated
+@pytest.mark.parametrize(("solver", "embedded"), [("auto", None), ("newton", None), ("auto", "single")])
+def test_folder_contains_the_controller_in_c_and_in_python(
+    shaken: Path, tmp_path: Path, solver: str, embedded: str | None
+) -> None:
+    model = sc.load_model(shaken)
+    folder = generate_package(model, tmp_path / "by_controller", solver=solver, embedded=embedded)
+    flags = "CFLAGS=-O2 -std=c99 -Wall -Wextra -Werror -Wno-psabi -ffp-contract=off"
+    done = subprocess.run(["make", "-s", "-C", folder, "run", flags], capture_output=True, text=True, check=True)
+    *lines, last = done.stdout.splitlines()
+    states = np.array([[float(word) for word in line.split()] for line in lines if not line.startswith("#")])
+    exact = sc.compile_stepper(model.system, sc.SVI(8)).integrate(model.q, states[0, 3:5], t_end=model.covered)
+    assert states[-1, 0] == pytest.approx(model.covered)
+    assert np.abs(states[-1, 1:3] - exact.q[-1]).max() < (1e-2 if embedded else 1e-6)
+    assert 20 < int(last.split()[1]) < 10**5
+    assert "tau" in (folder / "README.md").read_text()
+    if embedded is None:
+        run = load_package(folder).integrate(model.q, states[0, 3:5], h=model.h, t_end=model.covered)
+        assert np.abs(run.q[-1] - exact.q[-1]).max() < 1e-6
+        assert sc.load_model(folder / "model.toml") == replace(model, solver=solver)

@@ -1,0 +1,163 @@
+"""Nodes: their values against NumPy, SciPy and radicals, their symmetry, and the errors of wrong arguments."""
+
+import subprocess
+import sys
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import sympy as sp
+from mpmath import MPContext
+
+import scvi_codegen as sc
+from scvi_codegen.common.precision import mp
+from scvi_codegen.methods.tables.closed_forms import exact_points
+from scvi_codegen.methods.tables.nodes import NODE_FAMILIES, nodes_by_name, to_number
+
+chebyshev_gauss, legendre_gauss, radau_left, radau_right = (
+    NODE_FAMILIES[name] for name in ("chebyshev-gauss", "legendre-gauss", "radau-left", "radau-right")
+)
+DEGREES = [1, 2, 3, 4, 5, 8, 13, 30, 47]
+FIFTY_DIGITS = mp.mpf("1e-50")
+
+
+@pytest.mark.tiers(56)
+@pytest.mark.parametrize("name", NODE_FAMILIES)
+@pytest.mark.parametrize("degree", DEGREES)
+def test_every_family_gives_ascending_points_under_its_name(name: str, degree: int) -> None:
+    nodes = nodes_by_name(name, degree)
+    assert (nodes.name, nodes.degree, len(nodes.points)) == (name, degree, degree + 1)
+    assert all(left < right for left, right in zip(nodes.points, nodes.points[1:], strict=False))
+    assert nodes.contains_ends == (name in ("chebyshev-lobatto", "legendre-lobatto", "equispaced"))
+    assert nodes.symmetric == (not name.startswith("radau"))
+    assert nodes_by_name(name, degree) is nodes
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("degree", [9, 30])
+def test_legendre_families_are_roots_to_fifty_digits_of_mpmath_polynomials(degree: int) -> None:
+    other = MPContext()
+    other.dps = 90
+    count = degree + 1
+
+    def legendre_slope(x: object) -> object:
+        return (x * other.legendre(degree, x) - other.legendre(degree - 1, x)) * degree
+
+    polynomials = [
+        (legendre_gauss(degree), lambda x: other.legendre(count, x)),
+        (sc.legendre_lobatto(degree), legendre_slope),
+        (radau_left(degree), lambda x: other.legendre(count, x) + other.legendre(degree, x)),
+        (radau_right(degree), lambda x: other.legendre(count, x) - other.legendre(degree, x)),
+    ]
+    width = other.mpf("1e-51")
+    for nodes, polynomial in polynomials:
+        for point in map(other.mpf, nodes.points):
+            if abs(point) < 1:
+                assert polynomial(point - width) * polynomial(point + width) < 0
+
+
+def test_lobatto_and_gauss_points_have_published_digits() -> None:
+    golden = legendre_gauss(9).points[-1]
+    assert abs(golden - mp.mpf("0.97390652851717172007796401208445205342826994669238211923121")) < FIFTY_DIGITS
+    assert abs(sc.legendre_lobatto(4).points[3] - mp.sqrt(mp.mpf(3) / 7)) < FIFTY_DIGITS
+
+
+@pytest.mark.parametrize(
+    ("name", "degrees"),
+    [
+        ("chebyshev-lobatto", [1, 2, 3, 4, 5, 6, 8, 10, 12]),
+        ("legendre-lobatto", [1, 2, 3, 4, 5, 6]),
+        ("equispaced", [1, 2, 7, 30]),
+        ("legendre-gauss", [1, 2, 3, 4]),
+        ("chebyshev-gauss", [1, 2, 3, 4, 5]),
+        ("radau-left", [1, 2]),
+        ("radau-right", [1, 2]),
+    ],
+)
+def test_closed_forms_are_radicals_of_the_same_value(name: str, degrees: list[int]) -> None:
+    for degree in degrees:
+        nodes = nodes_by_name(name, degree)
+        exact = exact_points(nodes)
+        assert exact is not None
+        for expression, point in zip(exact, nodes.points, strict=True):
+            assert expression.is_algebraic
+            assert not expression.has(sp.Float, sp.cos, sp.sin)
+            assert abs(mp.mpf(str(sp.N(expression, 60))) - point) < FIFTY_DIGITS
+
+
+def test_nodes_of_higher_degree_and_rounded_nodes_have_no_closed_form() -> None:
+    assert exact_points(sc.chebyshev_lobatto(7)) is None
+    assert exact_points(sc.legendre_lobatto(7)) is None
+    assert exact_points(legendre_gauss(5)) is None
+    assert exact_points(radau_left(3)) is None
+    assert exact_points(sc.Nodes(name="legendre-gauss", degree=1, points=(-(1 / 3**0.5), 1 / 3**0.5))) is None
+    assert exact_points(sc.Nodes(name="mine", degree=1, points=(mp.mpf("1e-30"), mp.pi / 4))) is None
+
+
+def test_user_defined_nodes_are_recognised() -> None:
+    assert exact_points(sc.Nodes(name="equispaced", degree=2, points=(-1, 0.25, 1))) == (-1, sp.Rational(1, 4), 1)
+    silver, half = sp.sqrt(2) - 1, sp.Rational(1, 2)
+    for points in [(-silver, half), (-sp.sqrt(half - sp.sqrt(2) / 4), silver), (sp.Rational(-12345, 678901), silver)]:
+        assert exact_points(sc.Nodes(name="mine", degree=1, points=points)) == points
+
+
+def test_numbers_of_many_kinds_are_converted() -> None:
+    third = Fraction(1, 3)
+    nodes = sc.Nodes(name="mine", degree=4, points=(-1, "-0.1", np.float64(0.25), third, sp.sqrt(2) / 2))
+    assert nodes.points[1] == -mp.mpf(1) / 10
+    assert abs(nodes.points[3] - mp.mpf(1) / 3) < FIFTY_DIGITS
+    assert abs(nodes.points[4] ** 2 - mp.mpf(1) / 2) < FIFTY_DIGITS
+    assert not nodes.symmetric
+    assert not nodes.contains_ends
+    assert to_number(0.1) == mp.mpf(0.1) != mp.mpf("0.1")
+
+
+@pytest.mark.parametrize("value", ["x", 1j, None, [1], sp.Symbol("x"), sp.I, float("nan"), float("inf")])
+def test_non_finite_and_non_real_numbers_are_rejected(value: object) -> None:
+    with pytest.raises(sc.MethodError, match="give a"):
+        to_number(value)
+
+
+@pytest.mark.parametrize("name", NODE_FAMILIES)
+@pytest.mark.parametrize(("degree", "message"), [(0, "at least 1, not 0"), (2.0, "not 2.0"), (True, "not True")])
+def test_nonpositive_and_noninteger_degrees_are_rejected(name: str, degree: object, message: str) -> None:
+    nodes_by_name(name, 2)
+    nodes_by_name(name, 1)
+    with pytest.raises(sc.MethodError, match=message):
+        nodes_by_name(name, degree)  # type: ignore[arg-type]  # the wrong type is the point
+
+
+def test_unknown_family_suggests_the_closest_and_lists_all() -> None:
+    with pytest.raises(sc.MethodError, match=r"did you mean 'chebyshev-lobatto'.*legendre-gauss"):
+        nodes_by_name("chebyshev_lobato", 3)
+
+
+@pytest.mark.parametrize(
+    ("degree", "points", "message"),
+    [
+        (2, (-1, 1), "needs 3 nodes, got 2"),
+        (2, (-1, 0, 0), "node 2 is 0.0, not greater"),
+        (2, (-1, 1, 0), "node 2 is 0.0, not greater"),
+        (1, (0, 2), "outside"),
+        (0, (0,), "at least 1"),
+    ],
+)
+def test_invalid_points_are_rejected(degree: int, points: tuple[float, ...], message: str) -> None:
+    with pytest.raises(sc.MethodError, match=message):
+        sc.Nodes(name="mine", degree=degree, points=points)
+
+
+def test_user_precision_has_no_effect_and_is_not_changed() -> None:
+    import mpmath
+
+    with mpmath.workdps(5):
+        nodes = legendre_gauss(21)
+        assert mpmath.mp.dps == 5
+    assert abs(mp.legendre(22, nodes.points[0])) < mp.mpf("1e-55")
+
+
+def test_importing_the_tables_does_not_import_sympy() -> None:
+    code = (
+        "import sys; from scvi_codegen.methods.tables import basis, quadrature, nodes; sys.exit('sympy' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,153 @@
+"""Quadrature rules: points and weights against NumPy and SciPy, orders by exact moments, closed forms, errors."""
+
+from fractions import Fraction
+
+import mpmath
+import numpy as np
+import pytest
+import sympy as sp
+
+import scvi_codegen as sc
+from scvi_codegen.common.precision import mp
+from scvi_codegen.methods.tables.closed_forms import exact_rule
+from scvi_codegen.methods.tables.quadrature import quadrature_by_name
+
+FIFTY_DIGITS = mp.mpf("1e-50")
+NEEDS_TWO = ("gauss-lobatto", "clenshaw-curtis")
+ORDERS = {
+    "gauss-legendre": lambda n: 2 * n,
+    "gauss-lobatto": lambda n: 2 * n - 2,
+    "gauss-radau-left": lambda n: 2 * n - 1,
+    "gauss-radau-right": lambda n: 2 * n - 1,
+    "clenshaw-curtis": lambda n: n + n % 2,
+    "fejer": lambda n: n + n % 2,
+}
+
+
+def names_of(counts: list[int]) -> list[str]:
+    """Return the names of all rules with these numbers of points."""
+    return [f"{family}:{n}" for family in ORDERS for n in counts if n > 1 or family not in NEEDS_TWO]
+
+
+@pytest.fixture
+def rule(name: str) -> sc.Quadrature:
+    return quadrature_by_name(name)
+
+
+def moment_error(rule: sc.Quadrature, power: int) -> mpmath.mpf:
+    exact = mp.mpf(2) / (power + 1) if power % 2 == 0 else mp.zero
+    return abs(mp.fsum(w * x**power for x, w in zip(rule.points, rule.weights, strict=True)) - exact)
+
+
+@pytest.mark.parametrize("name", names_of([1, 2, 3, 4, 5, 6, 9, 16, 31]))
+def test_the_order_is_the_first_power_that_is_not_integrated(rule: sc.Quadrature) -> None:
+    family, _, count = rule.name.partition(":")
+    assert rule.order == ORDERS[family](int(count))
+    assert all(moment_error(rule, power) < mp.mpf("1e-55") for power in range(rule.order))
+    assert moment_error(rule, rule.order) > mp.mpf("1e-25")
+
+
+@pytest.mark.parametrize("name", names_of([1, 2, 3, 7, 20]))
+def test_names_read_back_and_the_unit_interval_is_the_same_rule(rule: sc.Quadrature) -> None:
+    assert quadrature_by_name(rule.name) == rule
+    assert quadrature_by_name(rule.name) is quadrature_by_name(rule.name)
+    assert len(rule) == len(rule.points) == len(rule.weights) == int(rule.name.partition(":")[2])
+    assert all(weight > 0 for weight in rule.weights)
+    assert abs(mp.fsum(rule.unit_weights) - 1) < FIFTY_DIGITS
+    assert all(
+        0 <= c <= 1 and abs(2 * c - 1 - x) < FIFTY_DIGITS for c, x in zip(rule.abscissae, rule.points, strict=True)
+    )
+    assert rule.symmetric == ("radau" not in rule.name)
+
+
+def test_quadratures_have_fifty_published_digits() -> None:
+    rule = sc.gauss_legendre(10)
+    assert abs(rule.weights[0] - mp.mpf("0.066671344308688137593568809893331792857864834320158")) < FIFTY_DIGITS
+    assert abs(rule.points[0] + mp.mpf("0.97390652851717172007796401208445205342826994669238")) < FIFTY_DIGITS
+
+
+def test_rules_share_their_points_with_the_nodes() -> None:
+    assert sc.clenshaw_curtis(7).points == sc.chebyshev_lobatto(6).points
+    assert sc.gauss_lobatto(7).points == sc.legendre_lobatto(6).points
+
+
+@pytest.mark.parametrize("name", names_of([1, 2, 3, 4, 5, 6, 7]))
+def test_closed_forms_have_the_value_of_the_rule(rule: sc.Quadrature) -> None:
+    family = rule.name.partition(":")[0]
+    longest = {"gauss-legendre": 5, "gauss-lobatto": 7, "gauss-radau-left": 3, "gauss-radau-right": 3}.get(family, 6)
+    exact = exact_rule(rule)
+    if len(rule) > longest:
+        assert exact is None or family == "clenshaw-curtis"
+        return
+    assert exact is not None
+    for expressions, numbers in zip(exact, (rule.points, rule.weights), strict=True):
+        for expression, number in zip(expressions, numbers, strict=True):
+            assert not expression.has(sp.Float, sp.cos, sp.sin)
+            assert abs(mp.mpf(str(sp.N(expression, 60))) - number) < FIFTY_DIGITS
+
+
+def test_user_defined_rule_is_recognised_by_its_numbers() -> None:
+    third = Fraction(1, 3)
+    simpson = sc.Quadrature(name="Simpson", points=(-1, 0, 1), weights=(third, 4 * third, third))
+    assert exact_rule(simpson) == ((-1, 0, 1), (sp.Rational(1, 3), sp.Rational(4, 3), sp.Rational(1, 3)))
+    assert exact_rule(sc.Quadrature(name="gauss-legendre:1", points=(0.5,), weights=(2,))) == (
+        (sp.Rational(1, 2),),
+        (2,),
+    )
+    assert exact_rule(sc.Quadrature(name="gauss-legendre:3", points=(0.1,), weights=(2,))) is None
+
+
+def test_order_of_a_user_defined_rule_is_computed() -> None:
+    third = Fraction(1, 3)
+    simpson = sc.Quadrature(name="Simpson", points=(-1, 0, 1), weights=(third, 4 * third, third))
+    assert (simpson.order, simpson.symmetric) == (4, True)
+    x, w = np.polynomial.legendre.leggauss(12)
+    assert sc.Quadrature(name="from NumPy", points=tuple(x), weights=tuple(w)).order == 24
+    exact = sc.Quadrature(name="radicals", points=(-sp.sqrt(3) / 3, sp.sqrt(3) / 3), weights=(1, 1))
+    assert (exact.points, exact.weights, exact.order) == (sc.gauss_legendre(2).points, sc.gauss_legendre(2).weights, 4)
+    assert sc.Quadrature(name="modest", points=(-1, 0, 1), weights=(third, 4 * third, third), order=2).order == 2
+    assert not sc.Quadrature(name="lopsided", points=(-1, 1), weights=(0.5, 1.5)).symmetric
+
+
+@pytest.mark.parametrize(
+    ("points", "weights", "order", "message"),
+    [
+        ((0,), (1, 1), 0, "1 points and 2 weights"),
+        ((), (), 0, "at least one point"),
+        ((0, -1), (1, 1), 0, "not greater than the one before"),
+        ((0, 2), (1, 1), 0, "outside"),
+        ((0, 1), (0.5, 0.5), 0, "sum 1.0; scale them to sum 2"),
+        ((-1, 1), (1, 1), 4, "has order 2, not 4"),
+        ((-1, 1), (1, 1), 1.5, "must be a whole number"),
+        ((-1, 1), (1, "one"), 0, "not a real number"),
+    ],
+)
+def test_invalid_quadratures_are_rejected(points: tuple, weights: tuple, order: int, message: str) -> None:
+    with pytest.raises(sc.MethodError, match=message):
+        sc.Quadrature(name="mine", points=points, weights=weights, order=order)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("gauss-legendre", "lacks its number of points; write 'gauss-legendre:3'"),
+        ("gauss-legendre:x", "lacks its number"),
+        ("gauss-legendre:-1", "lacks its number"),
+        ("gauss-legendre:0", "at least 1, not 0"),
+        ("gauss-lobatto:1", "at least 2, not 1"),
+        ("clenshaw-curtis:1", "at least 2, not 1"),
+        ("gauss-legandre:3", "did you mean 'gauss-legendre'.*fejer"),
+        ("", "unknown quadrature"),
+    ],
+)
+def test_unknown_names_are_rejected(name: str, message: str) -> None:
+    with pytest.raises(sc.MethodError, match=message):
+        quadrature_by_name(name)
+
+
+def test_counts_and_sides_are_checked_even_after_a_cached_call() -> None:
+    sc.gauss_radau(2)
+    with pytest.raises(sc.MethodError, match=r"not 2\.0"):
+        sc.gauss_radau(2.0)  # type: ignore[arg-type]  # the wrong type is the point
+    with pytest.raises(sc.MethodError, match="'left' or 'right', got 'middle'"):
+        sc.gauss_radau(2, "middle")  # type: ignore[arg-type]  # the wrong value is the point

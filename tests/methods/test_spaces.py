@@ -1,0 +1,279 @@
+"""Curves other than polynomials, and quadratures with derivatives: exactness, order, structure, and where each wins."""
+
+import numpy as np
+import pytest
+from notation import lagrange
+
+from scvi_codegen import MethodError, MethodWarning, compile_stepper, problem
+from scvi_codegen.common.precision import mp
+from scvi_codegen.methods import SVI, method_from_specification
+from scvi_codegen.methods.tables.basis import cardinal_values
+from scvi_codegen.methods.tables.quadrature import Quadrature, gauss_legendre, hermite, quadrature_by_name
+from scvi_codegen.methods.tables.spaces import Polynomials, Splines, Trigonometric, space_by_name
+
+QUICK = ("-O1", "-ffp-contract=off")
+
+
+def stepper(system, method, **choices):
+    return compile_stepper(system, method, flags=QUICK, **choices)
+
+
+def final_error(system, method, start, *, h, steps, reference):
+    run = stepper(system, method).integrate(*start, h=h, steps=steps)
+    return np.abs(run.q[-1] - reference).max()
+
+
+# Tables.
+
+
+@pytest.mark.parametrize(
+    ("space", "degree", "curve", "derivative"),
+    [
+        (Trigonometric(0.7), 2, lambda c: mp.sin(0.7 * c), lambda c: 0.7 * mp.cos(0.7 * c)),
+        (Trigonometric(0.7), 5, lambda c: mp.cos(1.4 * c) - 1 + c, lambda c: 1 - 1.4 * mp.sin(1.4 * c)),
+        (Trigonometric(2.5, 1), 4, lambda c: c**2 + mp.sin(2.5 * c), lambda c: 2 * c + 2.5 * mp.cos(2.5 * c)),
+        (Splines(2), 3, lambda c: max(c - mp.mpf("0.5"), 0) ** 2, lambda c: 2 * max(c - mp.mpf("0.5"), 0)),
+        (Splines(breakpoints=(0.25, 0.75)), 4, lambda c: max(c - 0.75, 0) ** 3, lambda c: 3 * max(c - 0.75, 0) ** 2),
+        (Polynomials(), 3, lambda c: c**3 - c, lambda c: 3 * c**2 - 1),
+    ],
+    ids=lambda value: getattr(value, "name", ""),
+)
+def test_functions_of_the_space_are_interpolated_exactly(space, degree, curve, derivative) -> None:
+    """A curve is determined at all points by its velocities at the points of the space, to 50 digits."""
+    with mp.workdps(60):
+        points = space.points(degree, gauss_legendre(degree + 2))
+        assert len(points) == space.dimension(degree)
+        at = tuple(mp.mpf(k) / 16 for k in range(17))
+        given = [derivative(c) for c in points]
+        for lines, expected in ((space.velocities(points, at), derivative), (space.positions(points, at), curve)):
+            for line, c in zip(lines, at, strict=True):
+                assert abs(mp.fdot(line, given) - expected(c)) < mp.mpf("1e-50")
+
+
+def test_trigonometric_derivatives_along_the_curve() -> None:
+    space, points = Trigonometric(0.7), gauss_legendre(4).abscissae
+    given = [0.7 * mp.cos(0.7 * c) for c in points]
+    (line,) = space.velocities(points, (mp.mpf("0.3"),), 2)
+    assert abs(mp.fdot(line, given) + mp.mpf(0.7) ** 3 * mp.cos(mp.mpf(0.7) * mp.mpf("0.3"))) < mp.mpf("1e-15")
+
+
+def test_single_interval_is_a_polynomial() -> None:
+    points, at = Splines(1).points(4, gauss_legendre(4)), (mp.mpf("0.3"), mp.mpf("0.9"))
+    assert Splines(1).velocities(points, at) == cardinal_values(points, at)
+
+
+@pytest.mark.parametrize(
+    "name", ["polynomials", "trigonometric:0.5", "trigonometric:0.1:2", "splines:3", "splines:0.25,0.5"]
+)
+def test_names_read_back(name: str) -> None:
+    space = space_by_name(name)
+    assert space.name == name
+    method = SVI(4, space=space)
+    assert method_from_specification(method.specification()) == method
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: space_by_name("wavelets:3"), "there is no space of curves 'wavelets:3'"),
+        (lambda: space_by_name("splines:x"), "there is no space of curves"),
+        (lambda: space_by_name("trigonometric"), "there is no space of curves"),
+        (lambda: Trigonometric(0.0), "positive"),
+        (lambda: Trigonometric(-1.0), "positive"),
+        (lambda: Trigonometric(1.0, 0), "number of harmonics must be at least 1"),
+        (lambda: SVI(1, space=Trigonometric(1.0)), "1 to 0 harmonics"),
+        (lambda: SVI(3, space=Trigonometric(1.0, 2)), "1 to 1 harmonics"),
+        (lambda: SVI(2, space=Trigonometric(2000.0)), "per step is too high"),
+        (lambda: Splines(0), "number of pieces must be at least 1"),
+        (lambda: Splines(breakpoints=(0.5, 0.5)), "must ascend"),
+        (lambda: Splines(breakpoints=(0.5, 1.0)), "must ascend"),
+        (lambda: SVI(1, space="splines:2"), "degree 2 at least"),
+        (lambda: SVI(3, "hermite:3", space="splines:2"), "which are discontinuous"),
+        (lambda: SVI(3, nodes="equispaced", space="splines:2"), "leave them out"),
+        (lambda: SVI(3, space=7), "space must be a CurveSpace"),  # type: ignore[arg-type]
+    ],
+)
+def test_invalid_spaces_are_rejected(make, message: str) -> None:
+    with pytest.raises(MethodError, match=message):
+        make()
+
+
+def test_too_few_points_for_the_intervals_warn() -> None:
+    with pytest.warns(MethodWarning, match="use at least 7 points"):
+        SVI(4, "gauss-legendre:3", space="splines:2")
+
+
+# Exactness and order.
+
+
+@pytest.mark.tiers(1, 2)
+@pytest.mark.sampled(2)
+@pytest.mark.covering
+@pytest.mark.parametrize("degree", [2, 3, 4, 5])
+@pytest.mark.parametrize("turn", [0.1, 1.0, 3.0])
+def test_trigonometric_curves_are_exact_on_the_oscillator(degree: int, turn: float) -> None:
+    """Whatever the step, even of half a period: only round-off is left after 100 steps."""
+    system = problem("harmonic-oscillator").system
+    run = stepper(system, SVI(degree, space=Trigonometric(turn))).integrate([0.3], [0.8], h=turn, steps=100)
+    assert np.abs(run.q[:, 0] - 0.3 * np.cos(run.t) - 0.8 * np.sin(run.t)).max() < 5e-12
+
+
+ORDERS = (
+    (SVI(2, space="splines:2"), 4),
+    (SVI(3, space="splines:2"), 6),
+    (SVI(3, "gauss-lobatto:3", space="splines:0.3"), 4),
+    (SVI(2, "hermite:2"), 4),
+    (SVI(3, "hermite:2"), 4),
+    (SVI(3, "hermite:3"), 6),
+    (SVI(3, "hermite-2:2"), 6),
+    (SVI(4, "hermite-3:2"), 8),
+)
+
+
+@pytest.mark.tiers(0, 4)
+@pytest.mark.sampled(4)
+@pytest.mark.parametrize(("method", "order"), ORDERS, ids=lambda value: getattr(value, "name", value))
+def test_order_of_methods_on_other_spaces(method: SVI, order: int) -> None:
+    system, start = problem("planar-pendulum").system, ([1.0], [0.3])
+    fine = stepper(system, SVI(10)).integrate(*start, h=0.25, steps=16)
+    steps = (5, 10) if order == 8 else (10, 20)
+    errors = [final_error(system, method, start, h=4 / n, steps=n, reference=fine.q[-1]) for n in steps]
+    assert method.order == order
+    assert np.log2(errors[0] / errors[1]) > order - 0.45
+
+
+@pytest.mark.second
+def test_the_order_of_trigonometric_curves_whose_frequency_shrinks_with_the_step() -> None:
+    system, start = problem("planar-pendulum").system, ([1.0], [0.3])
+    fine = stepper(system, SVI(10)).integrate(*start, h=0.25, steps=16)
+    errors = [
+        final_error(system, SVI(3, space=Trigonometric(h)), start, h=h, steps=round(4 / h), reference=fine.q[-1])
+        for h in (0.4, 0.2)
+    ]
+    assert abs(np.log2(errors[0] / errors[1]) - 6) < 0.45
+
+
+STRUCTURED = (
+    SVI(3, space=Trigonometric(0.4)),
+    SVI(2, space=Trigonometric(0.4)),
+    SVI(3, space="splines:2"),
+    SVI(3, space="splines:0.3"),
+    SVI(3, "hermite:3"),
+    SVI(4, "hermite-3:2"),
+)
+
+
+@pytest.mark.tiers(2, 3)
+@pytest.mark.sampled(3)
+@pytest.mark.covering
+@pytest.mark.parametrize("method", STRUCTURED, ids=lambda method: method.name)
+@pytest.mark.parametrize("solver", ["newton", "auto"])
+def test_symplecticity_momentum_and_reversibility(method: SVI, solver: str) -> None:
+    system, h = problem("kepler").system, 0.3
+    step = stepper(system, method, solver=solver).step
+    z, width = np.array([0.3, 0.8, -1.1, 0.4]), 1e-4
+
+    def moved(x: np.ndarray) -> np.ndarray:
+        return np.concatenate(step(x[:2], x[2:], h))
+
+    columns = []
+    for unit in np.eye(4):
+        near, far = ((moved(z + k * width * unit) - moved(z - k * width * unit)) / (2 * k * width) for k in (1, 2))
+        columns.append((4 * near - far) / 3)
+    J = np.array(columns).T
+    form = np.block([[np.zeros((2, 2)), np.eye(2)], [-np.eye(2), np.zeros((2, 2))]])
+    assert np.abs(J.T @ form @ J - form).max() < 1e-10
+    end = moved(z)
+    assert abs((end[0] * end[3] - end[1] * end[2]) - (z[0] * z[3] - z[1] * z[2])) < 2e-15
+    back = np.concatenate(step(end[:2], end[2:], -h))
+    assert method.symmetric == (method.curves.name != "splines:0.3")
+    assert (np.abs(back - z).max() < 1e-14) == method.symmetric
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("method", [SVI(3, "hermite:3"), SVI(4, "hermite-2:3")], ids=lambda method: method.name)
+def test_discrete_lagrangian_includes_derivatives(method: SVI) -> None:
+    """L_d generates the step, p0 = -D1 L_d and p1 = D2 L_d by differences, and approximates the action."""
+    system, h = problem("planar-pendulum").system, 0.4
+    own = stepper(system, method)
+    q1, p1 = own.step([0.7], [0.4], h)
+
+    def action(a: float, b: float) -> float:
+        return own.discrete_lagrangian([a], [b], h)
+
+    d = 1e-4
+    assert abs((action(0.7 + d, q1[0]) - action(0.7 - d, q1[0])) / (2 * d) + 0.4) < 1e-7
+    assert abs((action(0.7, q1[0] + d) - action(0.7, q1[0] - d)) / (2 * d) - p1[0]) < 1e-7
+    fine = stepper(system, SVI(10)).discrete_lagrangian([0.7], q1, h)
+    assert abs(action(0.7, q1[0]) - fine) < 1e-8
+
+
+# Hermite quadrature.
+
+
+def test_hermite_rules_integrate_polynomials_below_their_order() -> None:
+    for n, derivatives in ((2, 1), (3, 1), (5, 1), (2, 2), (3, 2), (2, 3), (4, 3)):
+        rule = hermite(n, derivatives)
+        assert rule.symmetric
+        assert rule.conditions == n * (1 + derivatives)
+        assert rule.order >= rule.conditions
+        for degree in range(rule.order + 1):
+            values = [
+                mp.fdot(weights, [mp.ff(degree, k) * x ** max(degree - k, 0) for x in rule.points])
+                for k, weights in enumerate((rule.weights, *rule.derivative_weights))
+            ]
+            error = abs(mp.fsum(values) - (1 - (-1) ** (degree + 1)) / mp.mpf(degree + 1))
+            assert (error < mp.mpf("1e-45")) == (degree < rule.order)
+
+
+def test_hermite_rules_by_name() -> None:
+    for name in ("hermite:2", "hermite-2:3", "hermite-3:2"):
+        assert quadrature_by_name(name).name == name
+    with pytest.raises(MethodError, match="at least 2"):
+        hermite(1)
+    with pytest.raises(MethodError, match="at least 1"):
+        hermite(2, 0)
+    with pytest.raises(MethodError, match="2 points and 1 weights"):
+        Quadrature(name="own", points=(-1, 1), weights=(1, 1), derivative_weights=((1,),))
+    own = Quadrature(name="corrected trapezoid", points=(-1, 1), weights=(1, 1), derivative_weights=(("1/3", "-1/3"),))
+    assert own.order == 4
+
+
+# Where each wins.
+
+
+@pytest.mark.full
+def test_trigonometric_curves_are_more_accurate_on_a_perturbed_oscillator() -> None:
+    """Henon-Heiles at small energy, one step a radian: a thousandth of the error of polynomials of the same degree."""
+    system, start = problem("henon-heiles").system, ([0.05, 0.02], [0.03, 0.06])
+    fine = stepper(system, SVI(12)).integrate(*start, h=0.25, steps=800)
+    errors = [
+        final_error(system, method, start, h=1.0, steps=200, reference=fine.q[-1])
+        for method in (SVI(4, space=Trigonometric(1.0)), SVI(4, "gauss-legendre:10"))
+    ]
+    assert errors[0] < 1e-9 < 1e-7 < errors[1]
+
+
+@pytest.mark.full
+def test_splines_are_more_accurate_where_a_force_has_a_kink() -> None:
+    """A triangular wave drives a pendulum; its kinks lie in the middle of the steps, where the splines have theirs."""
+    system = lagrange("kinked drive", "q", "q_dot**2/2 + cos(q) + q*asin(sin(t))/5")
+    start, h = ([0.5], [0.0]), np.pi
+    fine = stepper(system, SVI(8)).integrate(*start, h=h / 16, steps=16 * 8)
+    errors = [
+        final_error(system, method, start, h=h, steps=8, reference=fine.q[-1])
+        for method in (SVI(8, space="splines:2"), SVI(15, "gauss-legendre:16"))
+    ]
+    assert errors[0] < errors[1] / 1e4
+
+
+@pytest.mark.full
+def test_hermite_is_more_accurate_with_two_points_per_step() -> None:
+    """With L at the ends of a step only, derivatives along the curve give order 8 instead of 2."""
+    system, start = problem("planar-pendulum").system, ([1.0], [0.0])
+    fine = stepper(system, SVI(12)).integrate(*start, h=0.25, steps=80)
+    errors = [
+        final_error(system, method, start, h=0.5, steps=40, reference=fine.q[-1])
+        for method in (SVI(4, "hermite-3:2"), SVI(2, "gauss-legendre:2"), SVI(2, "gauss-lobatto:2"))
+    ]
+    assert errors[0] < 1e-7 < 5e-5 < errors[1] < errors[2]

@@ -1,0 +1,139 @@
+"""C interface of arrays whose sizes are known at run time: that of named coordinates, and runs bound to sizes."""
+
+import inspect
+import re
+
+import numpy as np
+import pytest
+from samples import QUICK_FLAGS
+
+import scvi_codegen as sc
+from scvi_codegen.runs.stepper import StepperOfRunTimeSizes
+
+BOUND = {"memory", "bind", "data_at", "energy_parts", "release"}
+"""Functions of run-time sizes alone."""
+SYSTEMS = {
+    "ring": {
+        "coordinates": ["q[N]"],
+        "lagrangian": "sum(i in N, m[i]*q_dot[i]**2/2) - c*sum(i in N periodic, (q[i+1] - q[i])**2/2)",
+        "parameters": {"c": 0.5, "m[N]": 1.0},
+    },
+    "masses that depend on positions": {
+        "coordinates": ["q[N]"],
+        "lagrangian": "sum(i in N, (1 + q[i]**2)*q_dot[i]**2/2) - c*sum(i in N periodic, (q[i+1] - q[i])**2/2)",
+        "parameters": {"c": 0.5},
+    },
+    "plane": {
+        "coordinates": ["r[N, 2]"],
+        "lagrangian": "sum(i in N, sum(a in 2, r_dot[i, a]**2)/2) - c*sum(i in N, j in N, sum(a in 2, (r[i, a] "
+        "- r[j, a])**2))",
+        "parameters": {"c": 0.5},
+    },
+}
+
+
+@pytest.fixture(scope="module", params=SYSTEMS)
+def steppers(request):
+    """The integrator of any size and that of 3 elements, their states and parameters."""
+    system = sc.LagrangianSystem.from_text(name="test", **SYSTEMS[request.param])
+    any_size = sc.compile_stepper(system, "svi:2", flags=QUICK_FLAGS)
+    known = sc.compile_stepper(system, "svi:2", sizes={"N": 3}, flags=QUICK_FLAGS)
+    states = np.random.default_rng(0).standard_normal((2, 4, known.dimension))
+    shape = (3, 2) if request.param == "plane" else (3,)
+    parameters = {"c": 0.7} | ({"m": np.array([1.0, 2.0, 3.0])} if request.param == "ring" else {})
+    return any_size, known, states.reshape(2, 4, *shape), parameters
+
+
+def prototypes(header: str, prefix: str) -> dict[str, str]:
+    """Return the result and the types of the arguments of each function, without its prefix."""
+    text = re.sub(r"/\*.*?\*/", " ", header, flags=re.DOTALL)
+    found = re.findall(rf"^([\w ]+[ *]){prefix}_(\w+)\(([^)]*)\);", text, re.MULTILINE)
+    types = ((name, result, re.sub(r"\w+(,|$)", r"\1", arguments)) for result, name, arguments in found)
+    return {name: " ".join(f"{result}({of})".replace(f"{prefix}_", "").split()) for name, result, of in types}
+
+
+@pytest.mark.tiers(1, 2)
+def test_functions_have_the_prototypes_of_named_coordinates(steppers) -> None:
+    any_size, known, *_ = steppers
+    ours, theirs = (prototypes(each.source.header, each.interface.prefix) for each in (any_size, known))
+    common = ours.keys() & theirs.keys()
+    assert common >= {
+        "start",
+        "advance",
+        "advance_to",
+        "step",
+        "energy",
+        "energies",
+        "velocity",
+        "momentum",
+        "step_error",
+    }
+    maps = [each.pop("momentum_maps", "") for each in (ours, theirs)]
+    assert maps[0].replace(", double *)", ")") == maps[1]  # the sizes of a run are in its memory
+    assert {name: ours[name] for name in common - {"momentum_maps"}} == {
+        name: theirs[name] for name in common - {"momentum_maps"}
+    }
+    assert ours.keys() - common <= BOUND
+
+
+@pytest.mark.tiers(1, 2)
+def test_functions_of_states_equal_those_of_known_sizes(steppers) -> None:
+    """Of states that are not adjacent in memory, all in one call."""
+    any_size, known, (q, p), parameters = steppers
+    array = any_size.interface.coordinates[0]
+    for function in ("energy", "momentum", "velocity"):
+        ours, theirs = (
+            np.asarray(getattr(each, function)({array: q}, {array: p}, parameters=parameters))
+            for each in (any_size, known)
+        )
+        np.testing.assert_allclose(ours, theirs, rtol=1e-13, atol=1e-13)
+    if any_size.momentum_map_names:
+        flat = p.reshape(4, -1)
+        bound, states = any_size.bind({array: q}, parameters)
+        values, sizes = bound._momentum_maps_and_sizes(states, flat, 0.0, parameters)
+        assert (np.abs(values) <= sizes).all()
+        if "momentum of q" in any_size.momentum_map_names:
+            assert values[:, any_size.momentum_map_names.index("momentum of q")] == pytest.approx(flat.sum(axis=1))
+
+
+@pytest.mark.tiers(1, 2)
+def test_energies_in_the_memory_of_a_run_do_not_change_it(steppers) -> None:
+    any_size, _, (q, p), parameters = steppers
+    array = any_size.interface.coordinates[0]
+    runs = [any_size.start({array: q[0]}, {array: p[0]}, h=0.05, parameters=parameters) for _ in range(2)]
+    for run in runs:
+        run.advance(3)
+    run, other = runs
+    binding, state = run.stepper.binding, (np.array([run.t]), run._q.copy(), run._p.copy())
+    values = np.empty(1)
+    for _ in range(2):
+        pointers = [*map(binding.pointer, state), run._arguments[0], binding.pointer(values)]
+        assert binding.function("energies")(1, *pointers, binding.workspace(run._memory)) == 0
+        assert values[0] == other.energy
+    for each in runs:
+        each.advance(3)
+    assert run.snapshot == other.snapshot
+
+
+@pytest.mark.tiers(1, 2)
+def test_parameters_that_change_are_those_of_the_next_step(steppers) -> None:
+    """The masses, forces and fields of a run follow its parameters, as in a run that starts there."""
+    any_size, _, (q, p), parameters = steppers
+    array = any_size.interface.coordinates[0]
+    run = any_size.start({array: q[0]}, {array: p[0]}, h=0.05)
+    run.advance(1)
+    middle = {array: run.q[array]}, {array: run.p[array]}
+    run.update(parameters=parameters)
+    run.advance(1)
+    expected = any_size.step(*middle, 0.05, t=run.t - 0.05, parameters=parameters)
+    np.testing.assert_allclose(run.q[array], expected[0][array], rtol=1e-14, atol=1e-14)
+    np.testing.assert_allclose(run.p[array], expected[1][array], rtol=1e-13, atol=1e-13)
+
+
+def test_methods_of_states_bind_the_sizes_of_their_arrays():
+    """A new method of steppers whose first argument is a position needs a line in the class of run-time sizes."""
+    methods = {name: method for name, method in inspect.getmembers(sc.Stepper, inspect.isfunction) if name[0] != "_"}
+    positions = {"q", "q0", "q_previous"}
+    of_states = {name for name, each in methods.items() if positions & set([*inspect.signature(each).parameters][1:2])}
+    assert len(of_states) > 20
+    assert {name for name in of_states if getattr(StepperOfRunTimeSizes, name) is methods[name]} == set()

@@ -1,0 +1,442 @@
+"""Threads that share the steps of array systems: no bit depends on their number, and every term is counted once."""
+
+import os
+import signal
+import subprocess
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from programs import needs
+
+import scvi_codegen as sc
+from scvi_codegen.codegen.lowering.program import lower
+from scvi_codegen.codegen.native.compilers import find_compiler
+from scvi_codegen.codegen.pipeline import Sources
+from scvi_codegen.codegen.rendering.kernels.loop_nests import Sharing, sharing_of
+from scvi_codegen.runs.stepping.array_envelope import envelope_of
+
+RNG = np.random.default_rng(5)
+THREADS = (1, 2, 3, 5)
+BONDS = RNG.integers(0, 1500, size=(3000, 2))
+PINS = RNG.integers(0, 300, size=7)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A potential, how its terms are shared, and its forces by NumPy."""
+
+    coordinates: str
+    potential: str
+    shape: tuple[int, ...]
+    shared: Sharing
+    forces: Callable[[Any], Any]
+    given: dict[str, Any] = field(default_factory=dict)
+
+
+def scattered(*parts: tuple[Any, Any]) -> Callable[[Any], Any]:
+    """Adds up values at places that may occur more than once."""
+
+    def add(q: Any) -> Any:
+        total = np.zeros_like(q)
+        for places, values in parts:
+            np.add.at(total, places, values(q))
+        return total
+
+    return add
+
+
+def ring(q: Any) -> Any:
+    cubes = (np.roll(q, -1) - q) ** 3
+    return cubes - np.roll(cubes, 1) - np.roll(q, -3) - np.roll(q, 3)
+
+
+def plane(u: Any) -> Any:
+    cubes = (np.roll(u, -2, axis=0) - u) ** 3
+    return cubes - np.roll(cubes, 2, axis=0) - u
+
+
+def pairs(q: Any) -> Any:
+    partials = np.sin(q[:, None] - q[None, :]) / len(q)
+    return partials.sum(axis=1)
+
+
+def transposed(u: Any) -> Any:
+    return -(u.T**2) - 2 * u * u.T
+
+
+LINES, COLUMNS = BONDS.T
+CASES = {
+    "ring": Case("q[N]", "sum(i in N periodic, (q[i+1] - q[i])**4/4 + q[i-1]*q[i+2])", (9000,), Sharing.IN_TURN, ring),
+    "plane": Case(
+        "q[N, M]",
+        "sum(i in N periodic, j in M, (q[i+2, j] - q[i, j])**4/4 + q[i, j]**2/2)",
+        (90, 70),
+        Sharing.IN_TURN,
+        plane,
+    ),
+    "pairs": Case("q[N]", "sum(i < j in N, cos(q[i] - q[j])/N)", (210,), Sharing.IN_TILES, pairs),
+    "few pairs": Case("q[N]", "sum(i < j in N, cos(q[i] - q[j])/N)", (66,), Sharing.IN_TILES, pairs),
+    "net": Case(
+        "q[N]",
+        "sum(b in B, (q[bonds[b, 0]] - q[bonds[b, 1]])**4/4)",
+        (1500,),
+        Sharing.BY_PLACES,
+        scattered(
+            (LINES, lambda q: -((q[LINES] - q[COLUMNS]) ** 3)), (COLUMNS, lambda q: (q[LINES] - q[COLUMNS]) ** 3)
+        ),
+        {"tables": {"bonds": BONDS}},
+    ),
+    "pins": Case(
+        "q[N]",
+        "sum(i in N, c in P, q[i]**2*q[pins[c]]/8)",
+        (3000,),
+        Sharing.BY_PLACES,
+        scattered(
+            (slice(None), lambda q: -q * q[PINS].sum() / 4), (PINS, lambda q: np.full(len(PINS), -(q**2).sum() / 8))
+        ),
+        {"tables": {"pins": PINS}},
+    ),
+    "transposed": Case("q[N, N]", "sum(i in N, j in N, q[i, j]*q[j, i]**2)", (60, 60), Sharing.BY_PLACES, transposed),
+}
+
+
+def system_of(case: Case) -> sc.LagrangianSystem:
+    """Return a system with unit masses."""
+    axes = "i in N, j in N" if "N, N" in case.coordinates else "i in N, j in M" if "M" in case.coordinates else "i in N"
+    velocity = "q_dot[i, j]" if "j" in axes else "q_dot[i]"
+    return sc.LagrangianSystem.from_text(
+        name="shared",
+        coordinates=[case.coordinates],
+        tables=[each for each in ("bonds[B, 2]", "pins[P]") if each.split("[")[0] in case.potential],
+        lagrangian=f"sum({axes}, {velocity}**2/2) - {case.potential.replace('/N', '/size')}",
+        parameters={"size": case.shape[0]},
+    )
+
+
+@cache
+def stepper_of(name: str, method: str, solver: str = "fixed-point") -> sc.Stepper:
+    return sc.compile_stepper(system_of(CASES[name]), method, solver=solver)
+
+
+def start_of(name: str) -> Any:
+    return 0.3 * np.sin(1.0 + np.arange(np.prod(CASES[name].shape)) ** 1.3).reshape(CASES[name].shape)
+
+
+def bits(run: Any) -> tuple[Any, ...]:
+    """All that must not depend on the number of threads."""
+    states = (values.tobytes() for values in (*run.q.values(), *run.p.values()))
+    return (*states, np.sum(run.iterations), run.steps, run.rejected_steps, repr(run.step_error))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_terms_are_distributed_over_threads(name: str) -> None:
+    system = system_of(CASES[name])
+    program = lower(system, sc.as_method("svi:2"), prefix="shared")
+    assert {sharing_of(rolled) for rolled in program.loops.forces} == {CASES[name].shared}
+
+
+@pytest.mark.tiers(2, 5)
+@pytest.mark.sampled(5)
+@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize("name", CASES)
+def test_every_term_is_counted_once(name: str, threads: int) -> None:
+    """A leapfrog step compared with one by NumPy's forces."""
+    case, q, h = CASES[name], start_of(name), 1e-3
+    run = stepper_of(name, "stoermer-verlet").integrate(q, h=h, steps=1, threads=threads, **case.given)
+    there = q + h * (h / 2 * case.forces(q))
+    kick = h / 2 * (case.forces(q) + case.forces(there))
+    np.testing.assert_allclose(run.q["q"][1], there, rtol=0, atol=2e-16 * 4)
+    np.testing.assert_allclose(run.p["q"][1], kick, rtol=0, atol=2e-15 * np.abs(kick).max())
+
+
+@pytest.mark.tiers(2, 3)
+@pytest.mark.sampled(3)
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [(name, "stoermer-verlet") for name in CASES] + [(name, "svi:4") for name in ("ring", "pairs", "net")],
+)
+def test_results_do_not_depend_on_the_number_of_threads(name: str, method: str) -> None:
+    found = [
+        bits(stepper_of(name, method).integrate(start_of(name), h=0.01, steps=4, threads=threads, **CASES[name].given))
+        for threads in THREADS
+    ]
+    assert found[1:] == found[:1] * (len(THREADS) - 1)
+
+
+@pytest.mark.rotated
+def test_iterative_methods_agree_with_leapfrog() -> None:
+    """Both methods take small steps."""
+    for name in ("ring", "pairs", "net"):
+        case = CASES[name]
+        ends = [
+            stepper_of(name, method).integrate(
+                start_of(name), h=h, steps=round(0.02 / h), save_every=round(0.02 / h), threads=2, **case.given
+            )
+            for method, h in (("svi:4", 0.02), ("stoermer-verlet", 5e-5))
+        ]
+        np.testing.assert_allclose(ends[0].q["q"][-1], ends[1].q["q"][-1], rtol=0, atol=1e-9)
+
+
+@pytest.mark.rotated
+def test_newton_iteration_with_threads() -> None:
+    """The last bits of a large step from q = 0 depend on the order in which inner products are summed."""
+    stepper, start = stepper_of("ring", "svi:2", "newton"), start_of("ring")
+    found = [bits(stepper.integrate(start, h=0.2, steps=3, threads=threads)) for threads in THREADS]
+    assert found[1:] == found[:1] * (len(THREADS) - 1)
+    one, two = (
+        bits(stepper.integrate(np.zeros(2000), 3.0 * start[:2000], h=0.7, steps=1, threads=threads))
+        for threads in THREADS[:2]
+    )
+    assert one == two
+
+
+@pytest.mark.second
+def test_adaptive_steps_with_threads() -> None:
+    stepper = stepper_of("pairs", "svi:4")
+    found = [
+        bits(stepper.integrate(start_of("pairs"), t_end=3.0, tolerance=1e-9, threads=threads)) for threads in THREADS
+    ]
+    assert found[1:] == found[:1] * (len(THREADS) - 1)
+
+
+@pytest.mark.rotated
+def test_hamiltonians_and_velocity_dependent_forces_with_threads() -> None:
+    field = sc.HamiltonianSystem.from_text(
+        name="field",
+        coordinates=["q[N]"],
+        momenta=["p[N]"],
+        hamiltonian="sum(i in N periodic, ((q[i+1] - q[i])**2 + (p[i+1] - p[i])**2)/2 - (q[i]**2 + p[i]**2)**2/4)",
+    )
+    damped = sc.LagrangianSystem.from_text(
+        name="damped",
+        coordinates=["q[N]"],
+        lagrangian="sum(i in N, q_dot[i]**2/2) - sum(i in N periodic, (q[i+1] - q[i])**2/2)",
+        forces={"q[i]": "-q_dot[i]**3", "q[0]": "cos(t)"},
+    )
+    for system, method in ((field, "gauss:4"), (damped, "svi:4")):
+        stepper, q = sc.compile_stepper(system, method), np.sin(0.1 * np.arange(5000))
+        found = [bits(stepper.integrate(q, np.cos(0.2 * q), h=0.1, steps=4, threads=threads)) for threads in THREADS]
+        assert found[1:] == found[:1] * (len(THREADS) - 1)
+
+
+def test_interrupt_ends_a_run_between_steps() -> None:
+    run = stepper_of("pairs", "svi:4").start(start_of("pairs"), h=0.001, threads=3)
+
+    def interrupt(done: int) -> None:
+        if done > 2:
+            signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt):
+        run.advance(10**9, progress=interrupt)
+    stopped = run.steps
+    run.advance(2)
+    assert run.steps == stopped + 2
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked")
+def test_forked_process_has_separate_threads() -> None:
+    stepper, q = stepper_of("pairs", "svi:4"), start_of("pairs")
+    expected = bits(stepper.integrate(q, h=0.01, steps=3, threads=3))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of JAX, where another test has imported it
+        child = os.fork()
+    if child == 0:
+        os._exit(int(bits(stepper.integrate(q, h=0.01, steps=3, threads=3)) != expected))
+    assert os.waitpid(child, 0)[1] == 0
+
+
+def test_failed_step_fails_in_all_threads() -> None:
+    stepper = stepper_of("ring", "svi:4")
+    message = set()
+    for threads in THREADS:
+        with pytest.raises(sc.StepFailedError) as caught:
+            stepper.integrate(1e3 * start_of("ring"), h=1.0, steps=3, threads=threads)
+        message.add(str(caught.value))
+    assert len(message) == 1
+
+
+def test_invalid_thread_counts_are_rejected() -> None:
+    stepper, q = stepper_of("ring", "svi:4"), start_of("ring")
+    for threads in (0, -1, 65):
+        with pytest.raises(sc.StateError, match="threads"):
+            stepper.start(q, h=0.1, threads=threads)
+    rods = sc.LagrangianSystem.from_text(
+        name="rods",
+        coordinates=["r[N, 2]"],
+        lagrangian="sum(i in N, sum(a in 2, r_dot[i, a]**2)/2)",
+        constraints=["sum(a in 2, r[i, a]**2) = 1 for i in N"],
+    )
+    with pytest.raises(sc.MethodError, match="the step uses one"):
+        sc.compile_stepper(rods, "stoermer-verlet").start(np.array([[1.0, 0.0]]), h=0.1, threads=2)
+
+
+WINDOWS = """
+#include "shared.c"
+#include <stdio.h>
+static void tell(const char *what, long long size, sharing how)
+{
+  for (long long round = 0; round < how.rounds; round++)
+    for (long long k = 0; k < tasks_in(&how, round); k++) {
+      const window here = window_of(&how, round, k);
+      printf("%s %lld %lld %lld %lld %lld %lld\\n", what, size, round, here.of.first, here.of.end, here.behind.first,
+             here.behind.end);
+    }
+}
+int main(void)
+{
+  static const long long sizes[] = {1, 63, 64, 100, 191, 192, 800, 3500, 5000, 70000, 1000003};
+  for (int k = 0; k < 11; k++) {
+    tell("turn", sizes[k], alternating_blocks(3, 3 + sizes[k], 5, 1));
+    tell("wide", sizes[k], alternating_blocks(3, 3 + sizes[k], 5, 2000));
+    if (sizes[k] < 10000)
+      tell("tiles", sizes[k], pairs_of_blocks(sizes[k]));
+  }
+  return 0;
+}
+"""
+
+
+@pytest.fixture(scope="module")
+def windows(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, int], list[list[int]]]:
+    """Return rounds and windows of term groups of several sizes, as computed in C."""
+    folder = tmp_path_factory.mktemp("windows")
+    source, _ = Sources(system_of(CASES["ring"]), sc.as_method("stoermer-verlet"), prefix="shared").integrator()
+    for path, text in {**source.files, "main.c": WINDOWS}.items():
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        (folder / path).write_text(text)
+    subprocess.run([*find_compiler(), "-std=c99", "-w", "main.c", "-lm", "-o", "main"], cwd=folder, check=True)
+    found: dict[tuple[str, int], list[list[int]]] = {}
+    for line in subprocess.run(["./main"], cwd=folder, check=True, capture_output=True, text=True).stdout.splitlines():
+        what, size, *numbers = line.split()
+        found.setdefault((what, int(size)), []).append([int(number) for number in numbers])
+    return found
+
+
+def test_neighbouring_blocks_are_never_processed_concurrently(windows: dict[tuple[str, int], list[list[int]]]) -> None:
+    """Blocks of a round are disjoint, and every index is in one block."""
+    several = 0
+    for (what, size), each in windows.items():
+        if what == "tiles":
+            continue
+        assert sorted(each, key=lambda window: window[1])[0][1] == 3
+        assert sum(end - first for _, first, end, *_ in each) == size
+        for number in (0, 1):
+            blocks = sorted((first, end) for round_, first, end, *_ in each if round_ == number)
+            several += len(blocks) > 1
+            assert all(after - before >= 5 for (_, before), (after, _) in pairwise(blocks))
+    assert several >= 10
+
+
+@pytest.mark.rotated
+def test_pair_blocks_form_a_round_robin_schedule(windows: dict[tuple[str, int], list[list[int]]]) -> None:
+    most = 0
+    for (what, size), each in windows.items():
+        if what != "tiles":
+            continue
+        met = np.zeros((size, size), dtype=int)
+        for _, first, end, behind, last in each:
+            met[first:end, behind:last] += 1
+        assert np.array_equal(np.triu(met, 1), np.triu(np.ones_like(met), 1))
+        for number in {window[0] for window in each}:
+            places = [
+                place
+                for round_, first, end, behind, last in each
+                if round_ == number
+                for place in {*range(first, end), *range(behind, last)}
+            ]
+            assert len(places) == len(set(places)) == size
+            most = max(most, number)
+    assert most == 31
+
+
+RACES = """
+#include <stdlib.h>
+#include "shared.h"
+enum {{ N = {count} }};
+static const int bonds[] = {{{bonds}}}, pattern[] = {{{pattern}}};
+static double start[2 * N];
+static double t[{steps}], q[{steps} * N], p[{steps} * N];
+static int iterations[{steps}];
+int main(void)
+{{
+  const long long sizes[] = {{{sizes}}};
+  const int *const tables[] = {{{tables}0}};
+  const double parameters[] = {{N}};
+  char *const memory = calloc((size_t)shared_memory(sizes, tables) + 8, sizeof(double));
+  shared_run *run = shared_bind(sizes, tables, (double *)(void *)(memory + 63 - ((size_t)memory + 63) % 64));
+  for (int i = 0; i < N; i++)
+    start[i] = 0.3 * (i * 37 % 101) / 101.0;
+  shared_start(run, 0.0, 0.01, start, start + N);
+  run->threads = {threads};
+  return shared_advance(run, {steps}, 1, parameters, 0, t, q, p, iterations, 0, 0);
+}}
+"""
+COUNTED = """
+#include <pthread.h>
+#include <stdio.h>
+static int create(pthread_t *thread, const pthread_attr_t *attributes, void *(*go)(void *), void *given)
+{
+  putchar('.');
+  return pthread_create(thread, attributes, go, given);
+}
+#define pthread_create create
+#include "shared.c"
+"""
+
+
+def program(name: str, method: str, solver: str, folder: Path, **numbers: int) -> None:
+    """Write the source of a run with threads, and the C program that makes it."""
+    source, interface = Sources(system_of(CASES[name]), sc.as_method(method), solver, "shared").integrator()
+    for path, text in source.files.items():
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        (folder / path).write_text(text)
+    sizes, layout, envelope = {"N": CASES[name].shape[0], "B": len(BONDS)}, interface.layout, None
+    if solver == "newton":
+        envelope = envelope_of(layout, stepper_of(name, method, solver).start(start_of(name), h=0.01).stepper.problem)
+    texts = {
+        "count": sizes["N"],
+        "bonds": ", ".join(map(str, BONDS.reshape(-1))),
+        "pattern": "0" if envelope is None else ", ".join(map(str, envelope.pattern)),
+        "tables": "bonds, " * bool(layout.tables) + "pattern, " * (envelope is not None),
+        "sizes": ", ".join(str(sizes[size]) for size in layout.sizes),
+    }
+    (folder / "main.c").write_text(RACES.format(**texts, **numbers))
+
+
+@pytest.mark.second
+def test_as_many_threads_are_started_as_requested(tmp_path: Path) -> None:
+    """The caller is one of them; the largest number is that of the table of threads."""
+    (tmp_path / "counted.c").write_text(COUNTED)
+    flags = ["-std=gnu99", "-O0", "-DSCVI_THREADS", "-pthread", "-w"]
+    for threads in (1, 2, 5, 64):
+        program("ring", "stoermer-verlet", "fixed-point", tmp_path, threads=threads, steps=1)
+        command = [*find_compiler(), *flags, "main.c", "counted.c", "-lm", "-o", "main"]
+        subprocess.run(command, cwd=tmp_path, check=True)
+        done = subprocess.run([str(tmp_path / "main")], capture_output=True, text=True, check=True)
+        assert done.stdout == "." * (threads - 1)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(
+    ("name", "method", "solver"),
+    [(name, method, "fixed-point") for name in ("ring", "pairs", "net") for method in ("svi:4", "stoermer-verlet")]
+    + [("ring", "svi:4", "newton")],
+)
+def test_threads_have_no_data_races(name: str, method: str, solver: str, tmp_path: Path) -> None:
+    """The thread sanitizer is used if the compiler has it."""
+    needs("setarch")
+    program(name, method, solver, tmp_path, threads=3, steps=4)
+    flags = ["-std=c99", "-O1", "-g", "-fsanitize=thread", "-DSCVI_THREADS", "-pthread", "-Wno-psabi"]
+    command = [*find_compiler(), *flags, "main.c", "shared.c", "-lm", "-o", "main"]
+    built = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    if built.returncode:
+        pytest.skip(f"no thread sanitizer: {built.stderr[-200:]}")
+    done = subprocess.run(["setarch", "-R", "./main"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

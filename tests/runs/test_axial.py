@@ -1,0 +1,176 @@
+"""Spin of axially symmetric bodies by an exact turn, compared with the same bodies with three symbols for moments."""
+
+import numpy as np
+import pytest
+from samples import QUICK_FLAGS
+from scipy.spatial.transform import Rotation
+
+import scvi_codegen as sc
+from scvi_codegen.systems.legendre.of_rotations import hamiltonian_of_rotations
+from scvi_codegen.systems.splittings.axial import axial_turns
+
+pytestmark = pytest.mark.second
+
+KINETIC = "(A*(omega_1**2 + omega_2**2) + C*omega_3**2)/2"
+THREE = "(A*omega_1**2 + B*omega_2**2 + C*omega_3**2)/2"
+START = {"R": [0.9, 0.3, -0.2, 0.1]}
+OMEGA = {"omega": [0.4, -0.7, 6.0]}
+
+
+def body(lagrangian, **arguments):
+    given = {"parameters": {"A": 1.0, "C": 0.5, "w": 1.0}, "rotations": {"R": "omega"}} | arguments
+    return sc.LagrangianSystem.from_text("top", lagrangian=lagrangian, **given)
+
+
+def three(potential="w*R_33"):
+    return body(f"{THREE} - {potential}", parameters={"A": 1.0, "B": 1.0, "C": 0.5, "w": 1.0})
+
+
+@pytest.mark.tiers(3)
+@pytest.mark.parametrize(
+    ("lagrangian", "arguments", "axes"),
+    [
+        (f"{KINETIC} - w*R_33", {}, [2]),
+        (f"{KINETIC} - w*(R_13**2 + R_33)*sin(R_23)", {}, [2]),
+        (f"{KINETIC} - w*R_31", {}, []),
+        (f"{KINETIC} - w*(R_31**2 + R_32**2 + R_33)", {}, [2]),  # R_31^2 + R_32^2 = 1 - R_33^2
+        ("(A*omega_1**2 + C*(omega_2**2 + omega_3**2))/2 - w*R_21", {}, [0]),
+        ("(omega_1**2 + omega_2**2/4 + omega_3**2)/2 - w*R_32", {"parameters": {"w": 1.0}}, [1]),
+        ("A*(omega_1**2 + omega_2**2 + omega_3**2)/2 - w*R_33", {"parameters": {"A": 1.0, "w": 1.0}}, []),
+        (f"{KINETIC} - w*R_33", {"torques": {"R": ["-A*omega_1", "0", "0"]}}, []),
+        (f"{KINETIC} - w*R_33", {"damping": 0.1}, []),
+    ],
+)
+def test_axes_of_symmetry(lagrangian, arguments, axes):
+    system = hamiltonian_of_rotations(body(lagrangian, **arguments))
+    core, turns = axial_turns(system)
+    assert [turn.axis for turn in turns] == axes
+    assert (core is system) == (not axes)
+
+
+@pytest.mark.rotated
+@pytest.mark.parametrize("solver", ["auto", pytest.param("newton", marks=pytest.mark.full)])
+def test_a_symmetric_top_moves_as_one_with_three_moments(solver):
+    ours, other = (sc.compile_stepper(each, "svi:6", solver=solver) for each in (body(f"{KINETIC} - w*R_33"), three()))
+    run, expected = (each.integrate(START, velocity=OMEGA, h=0.1, steps=40) for each in (ours, other))
+    np.testing.assert_allclose(run.q, expected.q, rtol=0, atol=3e-10)
+    np.testing.assert_allclose(run.p, expected.p, rtol=0, atol=3e-9)
+    if solver == "auto":
+        assert run.iterations.sum() < 0.8 * expected.iterations.sum()
+    q, p = run.q[-1], run.p[-1]
+    np.testing.assert_allclose(ours.jacobian(q, p, 0.05), other.jacobian(q, p, 0.05), rtol=0, atol=1e-10)
+    momentum = run.angular_momentum()[:, 2]
+    assert abs(momentum - momentum[0]).max() < 1e-13 * abs(momentum[0])
+
+
+def test_a_predictor_turns_with_the_body():
+    """Only bodies without further coordinates have a moving frame."""
+    lagrangian = " - w*R_33 + x_dot**2/2 - x**2/2 + x*R_33/5"
+    systems = (
+        body(kinetic + lagrangian, coordinates=["x"], parameters=p)
+        for kinetic, p in ((KINETIC, {"A": 1.0, "C": 0.5, "w": 1.0}), (THREE, {"A": 1.0, "B": 1.0, "C": 0.5, "w": 1.0}))
+    )
+    ours, other = (sc.compile_stepper(each, "svi:6", flags=QUICK_FLAGS) for each in systems)
+    start, velocity = {"x": 0.3, **START}, {"x": 0.1, **OMEGA}
+    run, expected = (each.integrate(start, velocity=velocity, h=0.1, steps=40) for each in (ours, other))
+    assert "MOVING_FRAME" not in ours.source.code
+    np.testing.assert_allclose(run.q, expected.q, rtol=0, atol=3e-10)
+    assert run.iterations.sum() < 0.8 * expected.iterations.sum()
+
+
+@pytest.mark.full
+def test_steps_with_turns_backward_at_other_times_and_with_adaptive_steps():
+    ours, other = (sc.compile_stepper(each, "svi:8") for each in (body(f"{KINETIC} - w*R_33"), three()))
+    run, expected = (each.integrate(START, velocity=OMEGA, t_end=5.0, tolerance=1e-12) for each in (ours, other))
+    assert len(run.t) < 0.8 * len(expected.t)
+    np.testing.assert_allclose(run.at(3.3)[0], expected.at(3.3)[0], rtol=0, atol=1e-11)
+    there = ours.integrate(START, velocity=OMEGA, h=0.2, steps=20)
+    back = ours.integrate(there.q[-1], there.p[-1], h=-0.2, steps=20)
+    np.testing.assert_allclose(back.q[-1], there.q[0], rtol=0, atol=1e-13)
+
+
+@pytest.mark.full
+def test_energy_of_a_symmetric_top_over_many_steps():
+    stepper = sc.compile_stepper(body(f"{KINETIC} - w*R_33"), "svi:4")
+    run = stepper.integrate(START, velocity=OMEGA, h=0.1, steps=10**6, save_every=1000)
+    energies = np.array([stepper.energy(q, p) for q, p in zip(run.q, run.p, strict=True)])
+    error = abs(energies / energies[0] - 1)
+    assert error[-100:].max() < 2 * error[:100].max() + 1e-13
+
+
+PAIR = " - w*(R_33 + S_33)/2 - v*(R_13*S_13 + R_23*S_23 + R_33*S_33)**2"
+TWO = {"R": [0.9, 0.3, -0.2, 0.1], "S": [0.5, -0.1, 0.8, 0.3]}
+SPINS = {"omega": [0.4, -0.7, 3.0], "nu": [0.2, 0.9, -2.0]}
+
+
+def pair(one, other, **more):
+    energies = [f"({one}*x_1**2 + {other}*x_2**2 + C*x_3**2)/2".replace("x", rate) for rate in ("omega", "nu")]
+    return sc.LagrangianSystem.from_text(
+        "tops",
+        lagrangian=" + ".join(energies) + PAIR,
+        rotations={"R": "omega", "S": "nu"},
+        parameters={"A": 1.0, "C": 0.5, "w": 1.0, "v": 0.4, **more},
+    )
+
+
+@pytest.fixture(scope="module")
+def top():
+    """Return the stepper of the heavy top in the moving frame, which has not turned at the middle one of the points."""
+    stepper = sc.compile_stepper(body(f"{KINETIC} - w*R_33"), "svi:7", flags=QUICK_FLAGS)
+    assert "MOVING_FRAME" in stepper.source.code
+    return stepper
+
+
+@pytest.mark.full
+def test_two_tops_move_as_with_three_moments():
+    ours, other = sc.compile_stepper(pair("A", "A"), "svi:6"), sc.compile_stepper(pair("A", "B", B=1.0), "svi:6")
+    assert "MOVING_FRAME" in ours.source.code
+    assert "MOVING_FRAME" not in other.source.code
+    run, expected = (each.integrate(TWO, velocity=SPINS, h=0.1, steps=40) for each in (ours, other))
+    np.testing.assert_allclose(run.q, expected.q, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(run.p, expected.p, rtol=0, atol=1e-8)
+
+
+def test_a_reversed_run_of_20_000_steps_returns_to_its_start(top):
+    there = top.integrate(START, velocity=OMEGA, h=0.2, steps=20_000, save_every=20_000)
+    back = top.integrate(there.q[-1], there.p[-1], h=-0.2, steps=20_000, save_every=20_000)
+    np.testing.assert_allclose(back.rotation()[-1], there.rotation()[0], rtol=0, atol=1e-8)
+    np.testing.assert_allclose(back.body_momentum()[-1], there.body_momentum()[0], rtol=0, atol=1e-8)
+
+
+def test_energy_and_momenta_over_100_000_steps(top):
+    run = top.integrate(START, velocity={"omega": [0.1, 0, 10]}, h=0.5, steps=100_000, save_every=500)
+    energy, maps = run.energy(), run.momentum_maps()
+    error = abs(energy / energy[0] - 1)
+    assert error[-40:].max() < 1.2 * error[:40].max() + 1e-13
+    assert abs(maps / maps[0] - 1).max() < 3e-13
+    assert abs(np.sum(run.q**2, axis=1) / np.sum(run.q[0] ** 2) - 1).max() < 3e-13
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("h", [0.01, 3.0, pytest.param(400.0, marks=pytest.mark.quick)])
+def test_steps_without_a_potential_are_exact(top, h):
+    """The attitude is that after rotations about the angular momentum and about the axis (Routh)."""
+    run = top.integrate(START, velocity=OMEGA, h=h, steps=2, parameters={"w": 0.0})
+    momentum = np.array(OMEGA["omega"]) * [1.0, 1.0, 0.5]
+    turns = [Rotation.from_rotvec(2 * h * momentum), Rotation.from_rotvec([0, 0, 2 * h * momentum[2]])]
+    expected = run.rotation()[0] @ (turns[0] * turns[1]).as_matrix()
+    np.testing.assert_allclose(run.rotation()[-1], expected, rtol=0, atol=1e-15 * (10 + 10 * h))
+    assert run.iterations[1:].tolist() == [1, 1]  # none by Newton's method
+
+
+def test_a_top_at_rest_begins_to_fall(top):
+    start, other = {"R": [0.9, 0.3, -0.2, 0.1]}, sc.compile_stepper(three(), "svi:6", flags=QUICK_FLAGS)
+    runs = [each.integrate(start, velocity={"omega": [0, 0, 0]}, h=0.05, steps=20) for each in (top, other)]
+    np.testing.assert_allclose(runs[0].rotation(), runs[1].rotation(), rtol=0, atol=1e-11)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("method", ["svi:1", "svi:3", "gauss:2"])
+def test_steps_in_the_moving_frame_are_symplectic_and_those_of_newtons_method(method):
+    ours, newton = (sc.compile_stepper(body(f"{KINETIC} - w*R_33"), method, solver=s) for s in ("auto", "newton"))
+    run = ours.integrate(START, velocity=OMEGA, h=0.2, steps=10)
+    np.testing.assert_allclose(newton.integrate(START, velocity=OMEGA, h=0.2, steps=10).q, run.q, rtol=0, atol=1e-13)
+    tangent = ours.jacobian(run.q[-1], run.p[-1], 0.2)
+    form = np.kron([[0, 1], [-1, 0]], np.eye(4))
+    np.testing.assert_allclose(tangent.T @ form @ tangent, form, rtol=0, atol=2e-14)

@@ -1,0 +1,435 @@
+"""Ensembles on an emulated GPU: bits, failures, inputs, arrays of other libraries, the cache, and NVRTC's output.
+
+The driver runs end to end, but no launch or copy of CUDA is tested here: that requires a device.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import invoke
+from emulated_gpu import ArrayOfLibrary, EmulatedGpu
+from pages import ROOT, runnable
+from samples import pushed_pendulum, sample_named
+
+import scvi_codegen as sc
+from scvi_codegen.codegen.native import cuda
+from scvi_codegen.codegen.native.building import PORTABLE_FLAGS
+from scvi_codegen.methods import Method
+from scvi_codegen.runs.ensembles import ensemble
+from scvi_codegen.runs.ensembles.device import DeviceEnsemble
+from scvi_codegen.runs.ensembles.ensemble import Ensemble
+
+pytestmark = pytest.mark.second
+
+CASES = {
+    "kepler": "svi:8",
+    "double-pendulum": "svi:3",
+    "driven-duffing": "gauss:3",
+    "pumped-cart-pole": "svi:3",
+    "charged-particle": "radau-iia:2",
+    "henon-heiles": "sc:3",
+    "planar-pendulum": "composition:8",
+    "relativistic-particle": "lobatto-iiia:3",
+}
+"""A method for each kind of step: explicit; iterations with constant and variable masses, momenta, explicit time."""
+COUNT, PLAN = 5, {"h": 0.05, "steps": 23, "save_every": 4}
+
+
+@pytest.fixture
+def gpu(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> EmulatedGpu:
+    """Return an emulated GPU, on which ``device="cuda"`` runs."""
+    emulated = EmulatedGpu(tmp_path)
+    monkeypatch.setattr(cuda, "cuda_core", lambda: emulated)
+    monkeypatch.setattr(cuda, "compiler_version", lambda: emulated.version)
+    return emulated
+
+
+def compiled(system: str, method: Method | str) -> sc.Stepper:
+    """Return a stepper whose code has no fused multiply-add, as that of the emulated GPU."""
+    return sc.compile_stepper(sample_named(system).system, method, flags=PORTABLE_FLAGS)
+
+
+def states(system: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return (COUNT, m) positions and momenta about the generic state of a system."""
+    factors = 1.0 + 0.1 * np.random.default_rng(7).uniform(-1, 1, (COUNT, 1))
+    q, p = sample_named(system).state
+    return factors * q, factors * p
+
+
+def check_bits(stepper: sc.Stepper, q: np.ndarray, p: np.ndarray, **plan: object) -> DeviceEnsemble:
+    """Compare trajectories of the GPU with each alone in a block of SIMD lanes."""
+    runs = stepper.integrate_ensemble(q, p, device="cuda", **plan)
+    host = runs.to_host()
+    for j in range(len(q)):
+        own = {name: each[j : j + 1] for name, each in plan.get("parameters", {}).items()}  # type: ignore[attr-defined]
+        alone = stepper.integrate_ensemble(q[[j]], p[[j]], **plan | ({"parameters": own} if own else {}))
+        assert np.array_equal(host.q[:, j], alone.q[:, 0], equal_nan=True)
+        assert np.array_equal(host.p[:, j], alone.p[:, 0], equal_nan=True)
+        assert (host.status[j], host.steps[j]) == (alone.status[0], alone.steps[0])
+    assert np.array_equal(host.t, alone.t)
+    return runs
+
+
+def test_a_thread_equals_a_trajectory_alone_bit_by_bit(gpu: EmulatedGpu) -> None:
+    stepper, (q, p) = compiled("kepler", sc.SVI(4)), states("kepler")
+    runs = check_bits(stepper, q, p, **PLAN, parameters={"mu": np.linspace(0.8, 1.2, COUNT)})
+    assert repr(runs).startswith("<DeviceEnsemble of ")
+    assert np.from_dlpack(runs.q).shape == (6, COUNT, 2)
+    assert (len(runs), runs.ok.all(), runs.h, runs.t[-1]) == (COUNT, True, 0.05, runs.to_host().t[-1])
+    on_device = ArrayOfLibrary(q), ArrayOfLibrary(p)
+    again = stepper.integrate_ensemble(*on_device, device="cuda", **PLAN, parameters={"mu": ArrayOfLibrary(q[:, 0])})
+    assert np.array_equal(again.to_host().parameters[:, 0], q[:, 0])
+    assert gpu.launches == [("advance", 64)] * 2
+    still = stepper.integrate_ensemble(q, p, device="cuda", h=0.1, steps=0)
+    assert np.array_equal(still.to_host().q[0], q)
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("system", CASES)
+def test_systems_and_methods_with_lanes_have_the_same_bits(gpu: EmulatedGpu, system: str) -> None:
+    check_bits(compiled(system, CASES[system]), *states(system), **PLAN | {"t": 0.3})
+
+
+@pytest.mark.parametrize(
+    "plan", [{"h": 0.1, "t_end": 2.3, "save_every": 3}, {"h": -0.1, "t": 2.55, "t_end": 0.02}], ids=["on", "back"]
+)
+def test_inputs_change_parameters_and_step_sizes_between_launches(gpu: EmulatedGpu, plan: dict) -> None:
+    stepper = sc.compile_stepper(pushed_pendulum(), sc.SVI(3), flags=PORTABLE_FLAGS)
+    knots, generator = np.array([0.0, 0.37, 0.9, 1.41, 2.05, 2.6]), np.random.default_rng(1)
+    values, start = generator.uniform(-1, 1, (COUNT, 6)), generator.uniform(-1, 1, (2, COUNT, 1))
+    host = stepper.integrate_ensemble(*start, inputs={"u": (knots, values), "w": 0.1}, device="cuda", **plan).to_host()
+    for j in range(COUNT):
+        inputs = {"u": (knots, values[[j]]), "w": 0.1}
+        alone = stepper.integrate_ensemble(*(x[[j]] for x in start), inputs=inputs, **plan)
+        assert np.array_equal(host.q[:, j], alone.q[:, 0])
+    assert np.array_equal(host.t, alone.t)
+    assert np.isfinite(host.energy()).all()
+
+
+@pytest.mark.rotated
+@pytest.mark.filterwarnings("ignore::scvi_codegen.common.errors.AccuracyWarning")
+def test_trajectories_that_stop_are_continued_by_the_processor(gpu: EmulatedGpu) -> None:
+    e = np.array([0.1, 0.97, 0.98, 0.99, 0.5])
+    q, p = np.stack([1 - e, 0 * e], axis=1), np.stack([0 * e, np.sqrt((1 + e) / (1 - e))], axis=1)
+    runs = check_bits(compiled("kepler", sc.SVI(4)), q, p, h=0.1, steps=100, save_every=7)
+    assert runs.ok.tolist() != [True] * 5
+    assert ("replace", 64) in gpu.launches
+    assert np.isnan(np.from_dlpack(runs.p)).any()
+    runaway = compiled("runaway", sc.SVI(4))  # to infinity
+    lost = check_bits(runaway, np.array([[-1.0], [1.0]]), np.array([[-0.5], [1.0]]), h=0.05, steps=50)
+    assert lost.ok.tolist() == [True, False]
+
+
+OBSERVED = {"energy": "kepler", "extremes": "double-pendulum", "events": "planar-pendulum"}
+
+
+def check_observed(stepper: sc.Stepper, start: tuple[np.ndarray, np.ndarray], observe: str) -> None:
+    """Compare what is observed on the GPU and on the processor with states after all steps."""
+    plan = {"h": 0.05, "steps": 150}
+    runs = [stepper.integrate_ensemble(*start, **plan, device=each, observe=observe) for each in ("cuda", None)]
+    on_device, on_processor, (q, p) = runs[0].observed, runs[1].observed, (runs[1].q, runs[1].p)
+    assert np.array_equal(runs[0].to_host().observed, on_device)
+    assert np.abs(on_device - on_processor).max() < 1e-13
+    if observe == "events":
+        expected = [np.count_nonzero((x[:-1] < 0) & (x[1:] >= 0), axis=0) for x in (q[:, :, 0], p[:, :, 0])]
+        expected[1] += np.count_nonzero((p[:-1, :, 0] > 0) & (p[1:, :, 0] <= 0), axis=0)
+        assert np.array_equal(on_processor, np.stack(expected, axis=1))
+        assert (on_processor > 0).all()
+    else:
+        values = runs[1].energy() if observe == "energy" else np.concatenate([q, p], axis=2)
+        assert np.abs(on_processor - [np.nanmin(values, axis=0), np.nanmax(values, axis=0)]).max() < 1e-13
+
+
+@pytest.mark.filterwarnings("ignore::scvi_codegen.common.errors.AccuracyWarning")
+@pytest.mark.parametrize("observe", ["energy", "events", pytest.param("extremes", marks=pytest.mark.full)])
+@pytest.mark.second
+def test_values_at_all_steps_are_observed_without_saving_them(gpu: EmulatedGpu, observe: str) -> None:
+    system = OBSERVED[observe]
+    stepper = compiled(system, sc.SVI(4)).with_events(
+        [sc.Event("q", direction=1), "q_dot"] if observe == "events" else ()
+    )
+    check_observed(stepper, states(system), observe)
+
+
+@pytest.mark.second
+@pytest.mark.filterwarnings("ignore::scvi_codegen.common.errors.AccuracyWarning")
+def test_trajectories_that_leave_their_lane_are_observed(gpu: EmulatedGpu) -> None:
+    e = np.array([0.1, 0.97, 0.98, 0.99, 0.5])
+    q, p = np.stack([1 - e, 0 * e], axis=1), np.stack([0 * e, np.sqrt((1 + e) / (1 - e))], axis=1)
+    stepper, plan = compiled("kepler", sc.SVI(4)), {"h": 0.1, "steps": 100}
+    full = stepper.integrate_ensemble(q, p, **plan)
+    assert full.ok.tolist() != [True] * 5
+    values = np.concatenate([full.q, full.p], axis=2)
+    for device in (None, "cuda"):
+        seen = stepper.integrate_ensemble(q, p, **plan, save_every=7, observe="extremes", device=device)
+        assert np.abs(seen.observed - [np.nanmin(values, axis=0), np.nanmax(values, axis=0)]).max() < 1e-9
+        assert np.array_equal(seen.steps, full.steps)
+
+
+ENDS = np.array([9.0, 4.0, 6.0, 0.0, 7.5])
+
+
+@pytest.mark.tiers(0, 1)
+@pytest.mark.filterwarnings("ignore::scvi_codegen.common.errors.AccuracyWarning")
+@pytest.mark.parametrize(
+    "system",
+    [pytest.param("kepler", marks=pytest.mark.second), pytest.param("double-pendulum", marks=pytest.mark.full)],
+)
+def test_adaptive_steps_have_the_bits_of_the_processor(gpu: EmulatedGpu, system: str) -> None:
+    stepper, (q, p) = compiled(system, sc.SVI(4)), states(system)
+    plan = {"t_end": ENDS, "tolerance": 1e-9}
+    runs, alone = (stepper.integrate_ensemble(q, p, **plan, device=device) for device in ("cuda", None))
+    host = runs.to_host()
+    assert all(map(np.array_equal, host.ends, alone.ends))
+    assert np.array_equal(host.steps, alone.steps)
+    assert np.array_equal(host.times, [0.0 * ENDS, ENDS])
+    assert np.isfinite(host.energy()).all()
+    assert gpu.launches[0] == ("size", 64)
+
+
+@pytest.mark.second
+def test_adaptive_trajectories_that_fail_are_repeated_by_the_processor(gpu: EmulatedGpu, monkeypatch) -> None:
+    runaway = compiled("runaway", sc.SVI(4))  # to infinity
+    q, p = np.array([[-1.0], [1.0], [-0.5]]), np.array([[-0.5], [1.0], [-0.5]])
+    runs, alone = (
+        runaway.integrate_ensemble(q, p, t_end=4.0, tolerance=1e-9, device=x).to_host()
+        if x
+        else runaway.integrate_ensemble(q, p, t_end=4.0, tolerance=1e-9)
+        for x in ("cuda", None)
+    )
+    assert runs.status.tolist() == alone.status.tolist() != ["ok"] * 3
+    assert np.isnan(runs.q[1, 1]).all()
+    assert np.array_equal(runs.steps, alone.steps)
+    launched = len(gpu.launches)
+
+    def stop(done: int) -> None:
+        raise KeyboardInterrupt
+
+    work = Ensemble(runaway, q[[0, 2]], p[[0, 2]], t_end=40.0, tolerance=1e-12, device="cuda")
+    with pytest.raises(KeyboardInterrupt):
+        work.run(progress=stop)
+    assert set(work.result().status) <= {"interrupted", "ok"}
+    assert len(gpu.launches) == launched + 2
+
+
+@pytest.mark.second
+@pytest.mark.filterwarnings("ignore::scvi_codegen.common.errors.AccuracyWarning")
+def test_threads_that_share_a_trajectory_have_the_bits_of_integrate(gpu: EmulatedGpu, monkeypatch) -> None:
+    monkeypatch.setattr(ensemble, "FEWEST_COORDINATES", 2)
+    e = np.array([0.1, 0.99, 0.5])
+    q, p = np.stack([1 - e, 0 * e], axis=1), np.stack([0 * e, np.sqrt((1 + e) / (1 - e))], axis=1)
+    stepper, plan = compiled("kepler", sc.SVI(5)), {"h": 0.1, "steps": 80, "save_every": 20}
+    host = stepper.integrate_ensemble(q, p, **plan, device="cuda").to_host()
+    assert gpu.launches[1] == ("points", 64)
+    for j in (0, 2):
+        alone = stepper.integrate(q[j], p[j], **plan)
+        assert np.array_equal(host.q[:, j], alone.q)
+        assert np.array_equal(host.p[:, j], alone.p)
+    on_processor = stepper.integrate_ensemble(q, p, **plan)  # the second trajectory fails, or requires Newton's method
+    assert host.status.tolist() == on_processor.status.tolist()
+    assert np.array_equal(np.isnan(host.q), np.isnan(on_processor.q))
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("count", [1, pytest.param(3, marks=pytest.mark.full)])
+def test_chaos_indicators_agree_with_those_of_the_processor(gpu: EmulatedGpu, count: int) -> None:
+    stepper, (q, p) = compiled("henon-heiles", sc.SVI(4)), states("henon-heiles")
+    q[1:3] *= 30.0  # escapes, within and after the first block of steps
+    plan = {"h": -0.1, "steps": 60, "save_every": 20, "count": count}
+    ours, theirs = (stepper.chaos_indicators_ensemble(q, p, **plan, device=device) for device in ("cuda", None))
+    assert ours.status.tolist() == theirs.status.tolist() != ["ok"] * COUNT
+    for series in ("log_norms", "max_log_norms", "log_r_diagonal", "rates", "mean_rates"):
+        same = np.isclose(getattr(ours, series), getattr(theirs, series), rtol=1e-11, atol=1e-12, equal_nan=True)
+        assert same.all(), series
+    assert gpu.launches == [("advance", 64)]
+
+
+@pytest.mark.quick
+def test_interrupted_runs_have_the_states_so_far(gpu: EmulatedGpu) -> None:
+    stepper, (q, p) = compiled("kepler", sc.SVI(4)), states("kepler")
+    work = Ensemble(stepper, q, p, h=0.05, steps=200, device="cuda")
+
+    def stop(done: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        work.run(progress=stop)
+    runs, part = work.result(), stepper.integrate_ensemble(q, p, h=0.05, steps=64)
+    assert set(runs.status) == {"interrupted"}
+    assert runs.steps.tolist() == [64] * COUNT
+    assert np.abs(runs.q[:65] - part.q).max() < 1e-13
+    assert np.isnan(runs.q[65:]).all()
+
+
+def test_binaries_are_cached_by_architecture(gpu: EmulatedGpu, tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stepper, (q, p) = compiled("kepler", sc.SVI(4)), states("kepler")
+    monkeypatch.setenv("SCVI_CODEGEN_CACHE", str(tmp_path / "cache"))
+    for _ in range(2):
+        stepper.integrate_ensemble(q, p, h=0.05, steps=1, device="cuda")
+    assert gpu.compiled == ["sm_90"]
+    cuda.compiled_kernel(cuda.kernel_text(stepper.ensemble), "sm_80")
+    cuda.compiled_kernel(cuda.kernel_text(stepper.ensemble), "sm_80", fma=False)
+    assert gpu.compiled == ["sm_90", "sm_80", "sm_80"]
+
+
+def test_unavailable_arguments_are_refused(gpu: EmulatedGpu) -> None:
+    stepper, start = compiled("kepler", sc.SVI(4)), states("kepler")
+
+    def refused(message: str, kind: type[Exception] = sc.StateError, of: sc.Stepper = stepper, **arguments) -> None:
+        with pytest.raises(kind, match=message):
+            of.integrate_ensemble(*start, **{"device": "cuda", "h": 0.1, "steps": 5} | arguments)
+
+    refused("device is 'gpu': it must be 'cuda', or omitted", device="gpu")
+    refused("saves the initial and the final states.*: omit save_every", h=None, steps=None, t_end=1.0, save_every=2)
+    explicit = compiled("kepler", "composition:2")
+    refused("has no adaptive|adaptive", sc.MethodError, of=explicit, h=None, steps=None, t_end=1.0)
+    refused("not available with t_eval: give h, steps and save_every", h=None, steps=None, t_end=1.0, t_eval=[1.0])
+    refused("not available with error: give h and steps", h=None, steps=None, t_end=1.0, error=1e-6)
+    for device in (None, "cuda"):
+        refused(
+            "ensembles have no observer 'energies'.* Known: extremes, energy, events", device=device, observe="energies"
+        )
+        refused("which has none: use with_events", sc.EventError, device=device, observe="events")
+        refused("requires a fixed step size", h=None, steps=None, t_end=1.0, device=None, observe="energy")
+    for message, of in (
+        ("it must be 'cuda'", stepper),
+        ("require constant diagonal masses", compiled("kepler", sc.SCVI(2))),
+    ):
+        with pytest.raises((sc.StateError, sc.MethodError), match=message):
+            of.chaos_indicators_ensemble(*start, h=0.1, steps=5, count=1, device="cuda" if of is not stepper else "gpu")
+    lobatto = compiled("kepler", sc.SCVI(2))
+    refused(
+        "not available without trajectories in SIMD lanes", sc.MethodError, of=lobatto, device=None, observe="energy"
+    )
+    refused("not available without trajectories in SIMD lanes", sc.MethodError, of=lobatto)
+    gpu.memory = 1000
+    refused("cannot allocate .* for states of shape .*: raise save_every, or split", sc.BuildError, steps=50)
+
+
+def test_command_line_and_model_files_choose_the_device(gpu: EmulatedGpu, tmp_path) -> None:
+    (tmp_path / "angles.csv").write_text("q\n0.1\n0.7\n2.0\n")
+    words = ["run", "planar-pendulum", "--step", "0.1", "--steps", "20"]
+    ensemble = ["--ensemble", str(tmp_path / "angles.csv"), "-o", str(tmp_path / "a.npz")]
+
+    def run(*arguments: str) -> str:
+        return invoke(*arguments, status=None).output
+
+    assert " s on a GPU, " in run(*words, *ensemble, "--device", "cuda")
+    assert len(gpu.launches) == 1
+    found = np.load(tmp_path / "a.npz")["q"]
+    run(*words, *ensemble)
+    assert np.abs(np.load(tmp_path / "a.npz")["q"] - found).max() < 1e-13
+    seen = run(*words, *ensemble, "--observe", "extremes")
+    assert "  q: " in seen
+    observed, whole = np.load(tmp_path / "a.npz")["observed"], found[:, :, 0]
+    assert np.abs(observed[:, :, 0] - [whole.min(axis=0), whole.max(axis=0)]).max() < 1e-13
+    assert "is for ensembles only: give --ensemble FILE, or omit device" in run(*words, "--device", "cuda")
+    assert "reproducible = false ([run] reproducible, run --reproducible/--shared)" in run(*words, "--shared")
+    assert "at most over all steps, of trajectory" in run(*words, *ensemble, "--observe", "energy", "--shared")
+    system = sc.problem("planar-pendulum").system
+    model = sc.Model(system=system, method="svi:4", q=(0.5,), p=(0.0,), h=0.1, steps=20, device="cuda")
+    sc.save_model(model, tmp_path / "model.toml")
+    assert sc.load_model(tmp_path / "model.toml").device == "cuda"
+    with pytest.raises(sc.ModelFileError, match="is for ensembles only"):
+        model.integrate()
+    with pytest.raises(sc.ModelFileError, match="unknown device 'gpu': use 'cuda'"):
+        replace(model, device="gpu")
+
+
+@pytest.mark.second
+def test_code_of_the_page_runs(gpu: EmulatedGpu, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    page = (ROOT / "docs" / "gpu.md").read_text(encoding="utf-8")
+    monkeypatch.setitem(sys.modules, "cupy", np)
+    exec("\n".join(part.text for part in runnable(page) if part.kind == "python"), {})
+    assert capsys.readouterr().out == "True (10,)\nTrue\nTrue (10, 2)\n(6,)\n"
+
+
+@pytest.mark.quick
+def test_without_a_gpu_the_error_names_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+    class WithoutDriver:
+        @staticmethod
+        def Device() -> None:
+            raise RuntimeError("no driver")
+
+    monkeypatch.setattr(cuda, "cuda_core", lambda: WithoutDriver)
+    with pytest.raises(sc.BuildError, match=r"requires an NVIDIA GPU with its driver.*omit device"):
+        compiled("kepler", sc.SVI(4)).integrate_ensemble([1.0, 0.0], [0.0, 1.0], h=0.1, steps=5, device="cuda")
+
+
+@pytest.mark.full
+def test_nvrtc_spills_less_if_threads_share_a_trajectory() -> None:
+    pytest.importorskip("cuda.core")
+    pytest.importorskip("cuda.bindings.nvrtc")
+    stepper, spilled = sc.compile_stepper(sc.problem("outer-solar-system").system, "svi:8"), {}
+    for name in ("points", "ensemble"):
+        log = io.StringIO()
+        cuda.build(cuda.kernel_text(stepper._variants[name]), "sm_90", log=log, ptxas_options=["-v"])
+        spilled[name] = sum(map(int, re.findall(r"(\d+) bytes spill", log.getvalue())))
+    assert spilled["points"] < spilled["ensemble"] / 3
+
+
+LIMITS = {("kepler", 4): (235, 0), ("henon-heiles", 4): (216, 0), ("kepler", 8): (255, 352)}
+"""Registers and bytes of spilled loads that are accepted; those on sm_90 by NVRTC 13.5, and 3 % more."""
+
+
+@pytest.mark.second
+@pytest.mark.parametrize(("system", "degree"), [*[*LIMITS][:2], pytest.param("kepler", 8, marks=pytest.mark.full)])
+def test_nvrtc_compiles_kernels_within_registers(system: str, degree: int) -> None:
+    pytest.importorskip("cuda.core")
+    pytest.importorskip("cuda.bindings.nvrtc")
+    text = cuda.kernel_text(compiled(system, sc.SVI(degree)).ensemble)
+    for architecture in ("sm_80", "sm_90"):
+        log = io.StringIO()
+        assert cuda.build(text, architecture, log=log, ptxas_options=["-v"]).startswith(b"\x7fELF")
+        used = [int(number) for number in re.findall(r"Used (\d+) registers", log.getvalue())]
+        spilled = [int(number) for number in re.findall(r"(\d+) bytes spill loads", log.getvalue())]
+        assert (max(used), max(spilled)) <= LIMITS[system, degree]
+
+
+@pytest.mark.full
+def test_ptx_of_nvrtc_computes_the_same_growth_as_c(gpu: EmulatedGpu) -> None:
+    pytest.importorskip("cuda.core")
+    pytest.importorskip("cuda.bindings.nvrtc")
+    stepper, start = compiled("henon-heiles", sc.SVI(2)), states("henon-heiles")
+    by_c = stepper.chaos_indicators_ensemble(*start, h=0.2, steps=30, count=2, device="cuda")
+    gpu.by_nvrtc = True
+    by_ptx = stepper.chaos_indicators_ensemble(*start, h=0.2, steps=30, count=2, device="cuda")
+    assert np.array_equal(by_ptx.log_r_diagonal, by_c.log_r_diagonal)
+    assert np.array_equal(by_ptx.mean_rates, by_c.mean_rates)
+
+
+@pytest.mark.quick
+@pytest.mark.second
+@pytest.mark.parametrize(
+    ("system", "method", "plan"),
+    [
+        ("kepler", sc.SVI(4), PLAN | {"observe": "energy"}),
+        ("henon-heiles", sc.Gauss(2), PLAN),
+        pytest.param("henon-heiles", sc.SVI(2), {"t_end": ENDS, "tolerance": 1e-4}, marks=pytest.mark.full),
+        pytest.param("henon-heiles", sc.SVI(5), PLAN, marks=pytest.mark.full),
+    ],
+    ids=["observed", "fixed", "adaptive", "points"],
+)
+def test_ptx_of_nvrtc_computes_the_same_bits_as_c(
+    gpu: EmulatedGpu, monkeypatch, system: str, method: Method, plan: dict
+) -> None:
+    pytest.importorskip("cuda.core")
+    pytest.importorskip("cuda.bindings.nvrtc")
+    stepper, start = compiled(system, method), states(system)
+    monkeypatch.setattr(ensemble, "FEWEST_COORDINATES", 2)
+    gpu.estimates = True
+    by_c = stepper.integrate_ensemble(*start, **plan, device="cuda").to_host()
+    gpu.by_nvrtc = True
+    by_ptx = stepper.integrate_ensemble(*start, **plan, device="cuda").to_host()
+    assert np.array_equal(by_ptx.q, by_c.q)
+    assert np.array_equal(by_ptx.p, by_c.p)
+    assert by_c.observed is None or np.array_equal(by_ptx.observed, by_c.observed)
+    near = stepper.integrate_ensemble(*start, **plan)
+    assert np.abs(by_ptx.q[-1] - near.ends[1]).max() < 1e-13

@@ -1,0 +1,174 @@
+"""Ensembles over a cluster equal those of one machine, also when a worker is killed on the way."""
+
+import os
+import pickle
+import signal
+import sys
+import threading
+import time
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from samples import QUICK_FLAGS, pushed_pendulum
+
+import scvi_codegen as sc
+from scvi_codegen.interfaces.distributed import _slices, _stepper, integrate_ensemble
+
+COUNT = 70
+
+
+@pytest.fixture(scope="module")
+def kepler() -> sc.Stepper:
+    return sc.compile_stepper(sc.problem("kepler").system, sc.SVI(5), flags=QUICK_FLAGS)
+
+
+def states() -> tuple[np.ndarray, np.ndarray]:
+    generator = np.random.default_rng(1)
+    q = np.array([1.0, 0.0]) + 0.1 * generator.uniform(-1, 1, (COUNT, 2))
+    return q, np.array([0.0, 1.1]) + 0.1 * generator.uniform(-1, 1, (COUNT, 2))
+
+
+@pytest.fixture(scope="module")
+def distributed() -> Any:
+    with warnings.catch_warnings(action="ignore"):
+        return pytest.importorskip("distributed", reason="needs the extra 'distributed'")
+
+
+@pytest.fixture(scope="module")
+def cluster(distributed: Any) -> Iterator[Any]:
+    """Two worker processes of one thread."""
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0", silence_logs=50
+    ) as cluster:
+        yield cluster
+
+
+def test_parts_are_multiples_of_the_register_width():
+    for count, blocks in ((70, 4), (70, 100), (1, 3), (64, 8), (1000, 3)):
+        parts = list(_slices(count, blocks))
+        assert len(parts) <= blocks
+        assert [j for part in parts for j in range(count)[part]] == list(range(count))
+        assert all((part.stop - part.start) % 8 == 0 for part in parts[:-1])
+
+
+@pytest.mark.second
+class TestCluster:
+    def test_default_is_the_current_process(self, distributed: Any, kepler: sc.Stepper):
+        q, p = states()
+        mu = np.linspace(0.9, 1.1, COUNT)
+        arguments = {"h": 0.05, "steps": 100, "save_every": 30, "t": 1.0, "parameters": {"mu": mu}}
+        here = kepler.integrate_ensemble(q, p, **arguments)
+        done: list[int] = []
+        result = integrate_ensemble(kepler, q, p, **arguments, progress=done.append)
+        for name in ("t", "q", "p", "status", "steps", "parameters"):
+            assert np.array_equal(getattr(result, name), getattr(here, name))
+        assert done[-1] == COUNT
+        assert done == sorted(done)
+
+    @pytest.mark.parametrize("way", [{"h": 0.1, "t_end": 2.0}, {"t_end": np.linspace(1.0, 2.0, COUNT)}])
+    def test_ensembles_with_inputs_are_distributed(self, distributed: Any, way: dict[str, Any]):
+        stepper = sc.compile_stepper(pushed_pendulum(), sc.SVI(3))
+        knots, values = np.array([0.0, 0.7, 2.0]), np.linspace(-1.0, 1.0, 3 * COUNT).reshape(COUNT, 3)
+        given = {"inputs": {"u": (knots, values), "w": (knots, [0.0, 0.1, 0.0])}, **way}
+        q = np.linspace(0.1, 1.0, COUNT)[:, np.newaxis]
+        here = stepper.integrate_ensemble(q, 0.0 * q, **given)
+        result = integrate_ensemble(stepper, q, 0.0 * q, **given, blocks=3)
+        assert here.ok.all()
+        for found, expected in ((result.t, here.t), (result.q, here.q), (result.p, here.p), (result.steps, here.steps)):
+            assert np.array_equal(found, expected, equal_nan=True)
+        assert np.array_equal(result.energy(), here.energy(), equal_nan=True)
+
+    @pytest.mark.quick
+    def test_invalid_arguments_are_reported_before_distribution(self, kepler: sc.Stepper):
+        q, p = states()
+        for faults in ({"h": 0.0}, {"steps": -1}, {"blocks": 0}, {"parameters": {"nu": 1.0}}):
+            with pytest.raises(sc.StateError):
+                integrate_ensemble(kepler, q, p, **({"h": 0.1, "steps": 1} | faults))  # type: ignore[arg-type]
+
+    def test_failures_of_trajectories_are_returned(self, distributed: Any, cluster: Any, kepler: sc.Stepper):
+        q, p = states()
+        mu = np.where(np.arange(COUNT) == 5, 1e9, 1.0)  # the sixth falls into the centre
+        done: list[int] = []
+        way = {"address": cluster.scheduler_address, "blocks": 3, "progress": done.append}
+        result = integrate_ensemble(kepler, q, p, h=0.05, steps=50, parameters={"mu": mu}, **way)
+        assert done[-1] == COUNT
+        assert np.flatnonzero(~result.ok).tolist() == [5]
+        assert result.steps[5] < 50
+
+    @pytest.mark.rotated
+    def test_killed_worker_loses_nothing(self, distributed: Any, cluster: Any, kepler: sc.Stepper):
+        q, p = states()
+        arguments = {"h": 0.05, "steps": 15_000, "save_every": 5_000}
+        here = kepler.integrate_ensemble(q, p, **arguments)
+        pids = [worker.pid for worker in cluster.workers.values()]
+        killed: list[int] = []
+
+        def kill_one(done: int) -> None:
+            if not killed:
+                killed.append(done)
+                os.kill(pids[0], signal.SIGKILL)
+
+        result = integrate_ensemble(
+            kepler, q, p, **arguments, address=cluster.scheduler_address, blocks=9, progress=kill_one
+        )
+        assert 0 < killed[0] < COUNT
+        assert result.ok.all()
+        assert np.array_equal(result.q, here.q)
+        assert np.array_equal(result.p, here.p)
+
+    @pytest.mark.rotated
+    def test_worker_compiles_the_source_into_its_cache(self, distributed: Any, kepler: sc.Stepper, tmp_path: Path):
+        q, p = states()
+        with distributed.LocalCluster(
+            n_workers=1,
+            processes=True,
+            dashboard_address=":0",
+            silence_logs=50,
+            env={"SCVI_CODEGEN_CACHE": str(tmp_path)},
+        ) as cluster:
+            result = integrate_ensemble(kepler, q, p, h=0.05, steps=20, address=cluster.scheduler_address)
+        assert np.array_equal(result.q, kepler.integrate_ensemble(q, p, h=0.05, steps=20).q)
+        assert any(tmp_path.iterdir())
+
+    def test_no_process_remains(self, distributed: Any, kepler: sc.Stepper):
+        q, p = states()
+        counts = []
+        for _ in range(6):
+            integrate_ensemble(kepler, q, p, h=0.05, steps=20)
+            files = list(Path("/proc/self/fd").iterdir()) if sys.platform == "linux" else []
+            counts.append((threading.active_count(), len(files)))
+        left = np.subtract(counts[-1], counts[1])  # one may be about to close
+        assert max(left) < 3
+
+    def test_interrupt_cancels_remaining_parts(self, distributed: Any, cluster: Any, kepler: sc.Stepper):
+        def interrupt(done: int) -> None:
+            raise KeyboardInterrupt
+
+        q, p = states()
+        with pytest.raises(KeyboardInterrupt):
+            integrate_ensemble(
+                kepler, q, p, h=0.05, steps=10_000, address=cluster.scheduler_address, blocks=9, progress=interrupt
+            )
+        with distributed.Client(cluster.scheduler_address) as client:
+            end = time.monotonic() + 600.0
+            while any(client.processing().values()) and time.monotonic() < end:
+                time.sleep(0.05)
+            assert not any(client.processing().values())
+
+
+@pytest.mark.rotated
+def test_workers_compile_the_source_once(kepler: sc.Stepper):
+    pickled = pickle.dumps(kepler)
+    assert kepler.source.code.encode() in pickled
+    assert _stepper(pickled) is _stepper(pickled)
+
+
+@pytest.mark.rotated
+def test_missing_extra_names_what_to_install(kepler: sc.Stepper, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(ImportError, match=r"pip install 'scvi-codegen\[distributed\]'"):
+        integrate_ensemble(kepler, *states(), h=0.1, steps=1)

@@ -1,0 +1,1094 @@
+"""Double-double arithmetic: elementary functions, one step and conserved quantities against mpmath, refusals."""
+
+import ctypes
+import json
+import operator
+import pickle
+import subprocess
+from collections.abc import Callable
+from decimal import Decimal
+from fractions import Fraction
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import mpmath
+import numpy as np
+import pytest
+import sympy
+from mpmath import mp
+from notation import lagrange
+from oracle import stepper_of
+from samples import GENERIC, sample_named
+
+import scvi_codegen as sc
+from scvi_codegen.codegen.native.building import TUNED_FLAGS
+from scvi_codegen.codegen.native.compilers import REORDERING_FLAGS
+from scvi_codegen.codegen.pipeline import Sources
+from scvi_codegen.codegen.rendering.kernels.double_double import FUNCTIONS, arithmetic_headers
+from scvi_codegen.common.errors import MethodError, StateError
+from scvi_codegen.runs.ensembles.ensemble import Ensemble
+from scvi_codegen.runs.ensembles.lanes import SingleRun
+from scvi_codegen.runs.states.words import as_mpmath, split, two_words, with_low
+
+KEPLER = "m*(x_dot**2 + y_dot**2)/2 + mu/sqrt(x**2 + y**2)"
+ROOTS = ("sqrt", "inverse_root_1", "inverse_root_3", "inverse_root_5", "inverse_root_7")
+RANGES = {
+    **dict.fromkeys(ROOTS, (1e-5, 1e5)),
+    **dict.fromkeys(("asinh", "atan", "divide", "multiply", "square"), (1e-9, 1e9)),
+    **dict.fromkeys(("asin", "acos", "atanh"), (1e-9, 0.999)),
+    **dict.fromkeys(("sin", "cos", "tan"), (1e-9, 1e4)),
+    **dict.fromkeys(("sinh", "cosh", "exp"), (1e-9, 600.0)),
+    "tanh": (1e-9, 40.0),
+    "acosh": (1.0001, 1e9),
+    "atan2": (1e-9, 1e9),
+    "pow": (0.1, 10.0),
+    "log": (1e-250, 1e250),
+}
+"""Magnitudes of random arguments; of both signs where the function is defined there."""
+POSITIVE = (*ROOTS, "acosh", "pow", "log")
+OF_TWO = {"divide": operator.truediv, "multiply": operator.mul}
+MANY = 1_000_000 if find_spec("flint") else 10_000  # mpmath takes a hundred times as long
+
+
+def compiled_functions(folder: Path) -> ctypes.CDLL:
+    """Return a library of ``number_f`` and ``vector_f`` of arrays of high words, then low words."""
+    support, headers = Path(sc.__file__).parent.parent / "templates" / "support", arithmetic_headers()
+    if not support.is_dir():
+        pytest.skip("needs the templates of a checkout")
+
+    def text(name: str) -> str:
+        return headers.get(f"support/{name}") or (support / name).read_text()
+
+    names = [
+        "core/vector_width.h",
+        "core/vectors.h",
+        *(f"double_double/{name}.h" for name in ("words", "number_pairs", "vector_words")),
+    ]
+    names += [f"double_double/{name}.h" for name in ("vector_pairs", "conversions", "tables_of_functions")]
+    names += ["double_double/number_functions.h", "double_double/vector_functions.h"]
+    code = "#include <float.h>\n#include <math.h>\n#include <string.h>\n#define POINTS 8\n#define PARAMETERS 1\n"
+    code += "\n".join(line for name in names for line in text(name).split("\n") if '#include "' not in line)
+    for f in RANGES:
+        for kind, pair, step in (("number", "dd", "1"), ("vector", "ddl", "LANES")):
+            second = ", b" if f in ("pow", "atan2", "divide", "multiply") else ""
+            loads = "".join(
+                f"memcpy(&{x}.high, {x}s + i, sizeof {x}.high); memcpy(&{x}.low, {x}s + n + i, sizeof {x}.low);"
+                for x in "ab"
+            )
+            stores = "memcpy(to + i, &r.high, sizeof r.high); memcpy(to + n + i, &r.low, sizeof r.low);"
+            code += f"\nvoid {kind}_{f}(int n, const double *as, const double *bs, double *to) {{"
+            code += f"for (int i = 0; i < n; i += {step}) {{ {pair} a, b; {loads}"
+            code += f"{pair} r = {pair}_{f}(a{second}); {stores} }} }}"
+    (folder / "functions.c").write_text(code)
+    flags = [*TUNED_FLAGS, "-std=c99", "-shared", "-fPIC"]
+    subprocess.run(["cc", *flags, "functions.c", "-o", "functions.so", "-lm"], cwd=folder, check=True)
+    return ctypes.CDLL(str(folder / "functions.so"))
+
+
+def reference(f: str) -> Callable[[float, float, float, float], Any]:
+    """Return the function of (a + a_low, b + b_low) in 200 bits: balls of python-flint or, without it, mpmath."""
+    try:
+        import flint
+    except ImportError:
+        context = mpmath.MPContext()
+        context.prec, exact = 200, context.mpf
+        two = {"pow": context.power, "atan2": context.atan2, **OF_TWO}.get(f)
+        one = (lambda x: 1 / context.sqrt(x) ** int(f[-1])) if f in ROOTS[1:] else getattr(context, f, lambda x: x * x)
+    else:
+        flint.ctx.prec, exact = 200, flint.arb
+        two = {"pow": exact.__pow__, "atan2": exact.atan2, **OF_TWO}.get(f)
+        one = (lambda x: x.rsqrt() ** int(f[-1])) if f in ROOTS[1:] else getattr(exact, f, lambda x: x * x)
+    if two:
+        return lambda a, a_low, b, b_low: two(exact(a) + a_low, exact(b) + b_low)
+    return lambda a, a_low, b, b_low: one(exact(a) + a_low)
+
+
+def largest_errors(folder: Path, count: int) -> dict[str, float]:
+    """Return the largest relative error of each function, of numbers or lanes, for random arguments."""
+    library, rng, worst = compiled_functions(folder), np.random.default_rng(7), {}
+    assert {*RANGES} == {*FUNCTIONS, *ROOTS, *OF_TWO, "square"}
+
+    def pairs(low: float, high: float) -> np.ndarray:
+        values = np.exp(rng.uniform(np.log(low), np.log(high), count))
+        return np.array([values, values * rng.uniform(-1.0, 1.0, count) * 2.0**-54])
+
+    for f, (low, high) in RANGES.items():
+        x, y = pairs(low, high), pairs(0.1, 3.0)
+        for each in (x, y) if f not in POSITIVE else (y,):
+            each *= rng.choice([-1.0, 1.0], count)
+        number, lanes = results = [np.empty((2, count)) for _ in range(2)]
+        for kind, found in zip(("number", "vector"), results, strict=True):
+            pointers = (each.ctypes.data_as(ctypes.c_void_p) for each in (x, y, found))
+            getattr(library, f"{kind}_{f}")(count, *pointers)
+        exact = reference(f)
+        rows = zip(*(words.tolist() for words in (*x, *y, *number)), strict=True)
+        errors = np.array([float(exact(*arguments) - value - rest) for *arguments, value, rest in rows])
+        others = errors - ((lanes[0] - number[0]) + (lanes[1] - number[1]))
+        assert np.isfinite([errors, others]).all()
+        worst[f] = float((np.abs([errors, others]) / np.abs(number[0])).max())
+    return worst
+
+
+@pytest.mark.tiers(0, 0)
+@pytest.mark.parametrize(
+    "count", [pytest.param(1000, marks=pytest.mark.second), pytest.param(MANY, marks=pytest.mark.full)]
+)
+def test_functions(count: int, tmp_path: Path) -> None:
+    """Every function is accurate to 1e-30 for random arguments of all magnitudes, numbers and lanes."""
+    worst = largest_errors(tmp_path, count)
+    assert max(worst.values()) <= 1e-30, worst
+
+
+def test_rounding_errors_have_no_bias(tmp_path: Path) -> None:
+    """Mean errors of products and roots vanish, as those of one sign would let the energies of orbits drift."""
+    library, rng, count = compiled_functions(tmp_path), np.random.default_rng(3), 10_000
+    for f in ("square", "multiply", "divide", "sqrt", "inverse_root_1"):
+        exact = reference(f)
+        for least in (1.0, 2.0):
+            x, y = (np.array([rng.uniform(least, 2 * least, count), rng.uniform(-1, 1, count)]) for _ in range(2))
+            for each in (x, y):
+                each[1] *= least * 2.0**-53
+            found = np.empty((2, count))
+            getattr(library, f"number_{f}")(count, *(each.ctypes.data_as(ctypes.c_void_p) for each in (x, y, found)))
+            rows = zip(*(words.tolist() for words in (*x, *y, *found)), strict=True)
+            errors = np.array([float(exact(*arguments) - value - rest) for *arguments, value, rest in rows]) / found[0]
+            assert abs(errors.mean()) < 4 * errors.std() / np.sqrt(count), f
+
+
+def system(name: str) -> sc.LagrangianSystem:
+    texts = {
+        "kepler": (["x", "y"], KEPLER, {"m": 1.0, "mu": 1.0}),
+        "driven": (["q"], "q_dot**2/2 + cos(q) + q*sin(t)/3", {}),
+        "quartic": (["q"], "q_dot**2/2 - exp(q)*q**2/10 - tanh(q)/7", {}),
+    }
+    coordinates, text, parameters = texts[name]
+    return sc.LagrangianSystem.from_text(name=name, coordinates=coordinates, lagrangian=text, parameters=parameters)
+
+
+def force(name: str, q: list, t: object) -> list:
+    """Return L_q by formulas written here."""
+    if name == "kepler":
+        inverse = 1 / mp.sqrt(q[0] ** 2 + q[1] ** 2) ** 3
+        return [-inverse * x for x in q]
+    if name == "driven":
+        return [-mp.sin(q[0]) + mp.sin(t) / 3]
+    e = mp.exp(q[0])
+    return [-e * (q[0] ** 2 + 2 * q[0]) / 10 - (1 - mp.tanh(q[0]) ** 2) / 7]
+
+
+def gauss_step(name: str, q: list, v: list, t: object, h: object, stages: int) -> tuple[list, list]:
+    """Return a step of Gauss's collocation method for m = 1 in 60 digits, with Legendre polynomials."""
+    near = map(mp.mpf, np.polynomial.legendre.leggauss(stages)[0].tolist())
+    roots = [mp.findroot(lambda x: mp.legendre(stages, x), (x, x + 1e-9)) for x in near]
+    c, values = [(1 + x) / 2 for x in roots], [[mp.one, x] for x in roots]
+    for x, P in zip(roots, values, strict=True):
+        for n in range(1, stages):
+            P.append(((2 * n + 1) * x * P[n] - n * P[n - 1]) / (n + 1))
+    b = [1 / mp.fsum((2 * k + 1) * P[k] ** 2 for k in range(stages)) for P in values]
+    areas = [
+        [x, *((P[k + 1] - P[k - 1]) / (2 * (2 * k + 1)) for k in range(1, stages))]
+        for x, P in zip(c, values, strict=True)
+    ]
+    terms = [[w * (2 * k + 1) * P[k] for k in range(stages)] for w, P in zip(b, values, strict=True)]
+    a = [[mp.fdot(term, area) for term in terms] for area in areas]
+    F = [force(name, q, t) for _ in c]
+    for _ in range(80):
+        V = [[v[i] + h * mp.fdot(line, [f[i] for f in F]) for i in range(len(q))] for line in a]
+        X = [[q[i] + h * mp.fdot(line, [u[i] for u in V]) for i in range(len(q))] for line in a]
+        F = [force(name, x, t + h * node) for x, node in zip(X, c, strict=True)]
+    V = [[v[i] + h * mp.fdot(line, [f[i] for f in F]) for i in range(len(q))] for line in a]
+    q1 = [q[i] + h * mp.fdot(b, [u[i] for u in V]) for i in range(len(q))]
+    return q1, [v[i] + h * mp.fdot(b, [f[i] for f in F]) for i in range(len(q))]
+
+
+@pytest.mark.second
+@pytest.mark.parametrize(("name", "stages", "h"), [("kepler", 8, 0.125), ("driven", 6, 0.25), ("quartic", 3, 0.0625)])
+def test_step(name: str, stages: int, h: float) -> None:
+    """One step is accurate to 2e-30, from a state of two words; later ones use the predictor."""
+    stepper = sc.compile_stepper(system(name), f"svi:{stages}", precision="double-double")
+    q, v = (["0.6", "0.1"], ["0.2", "1.3"]) if name == "kepler" else (["0.7"], ["0.3"])
+    run = stepper.integrate(q, velocity=v, h=h, steps=4, t=0.5)
+    with mp.workdps(60):
+        for k in (0, 3):
+            start = [list(run.mp(part)[k]) for part in "qp"]
+            exact = gauss_step(name, *start, mp.mpf(0.5) + k * mp.mpf(h), mp.mpf(h), stages)
+            for part, values in zip("qp", exact, strict=True):
+                worst = max(abs(x - y) for x, y in zip(run.mp(part)[k + 1], values, strict=True))
+                assert worst <= 2e-30 * max(map(abs, values))
+
+
+METHODS = (
+    sc.SVI(4),
+    sc.SVI(3, "gauss-lobatto:4"),
+    sc.SCVI(3),
+    sc.SpectralCollocation(2),
+    sc.Gauss(3),
+    sc.RadauIIA(2),
+    sc.LobattoIIIA(4),
+)
+CASES = [*((name, METHODS[0]) for name in GENERIC), *(("henon-heiles", method) for method in METHODS[1:])]
+
+
+@pytest.mark.second
+@pytest.mark.parametrize(("name", "method"), CASES)
+def test_step_of_samples(name: str, method: sc.methods.Method) -> None:
+    """One step of each sample system that is accepted agrees with the oracle in 60 digits to 2e-30."""
+    sample = sample_named(name)
+    try:
+        stepper = sc.compile_stepper(sample.system, method, precision="double-double")
+    except MethodError:
+        assert name not in ("harmonic-oscillator", "planar-pendulum", "driven-duffing", "kepler", "three-bodies")
+        return
+    small = Fraction(1, 3 * 10**17)
+    q, v = ([Fraction(x) + small * (k + 1) for k, x in enumerate(each)] for each in GENERIC[name])
+    run = stepper.integrate(q, velocity=v, h=0.0625, steps=1, t=0.5)
+    with mp.workdps(60):
+        step, arguments = stepper_of(method.specification())
+        exact = step(sample.mechanics, mp.mpf(0.5), run.mp("q")[0], run.mp("p")[0], mp.mpf(0.0625), **arguments)
+        for part, values in zip("qp", exact, strict=True):
+            assert max(abs(run.mp(part)[1] - values)) <= 2e-30 * max(map(abs, values)), part
+
+
+@pytest.mark.second
+def test_near_zeros(tmp_path: Path) -> None:
+    """Near zeros sin, cos and tan of x have the relative error 1e-31 + 1e-47 |x / f(x)|."""
+    flint = pytest.importorskip("flint")
+    flint.ctx.prec, arb = 400, flint.arb
+    library, half = compiled_functions(tmp_path), arb.pi() / 2
+    multiples = np.unique(np.exp(np.random.default_rng(3).uniform(0.0, np.log(6e8), 100)).astype(int))
+    for least in (0.0, 1.0):  # x is near a zero to one and to two words
+        high = np.array([float(half * int(k)) for k in multiples])
+        low = np.array([float(half * int(k) - arb(x)) * least for k, x in zip(multiples, high, strict=True)])
+        x, found = np.concatenate([high, low]), np.empty(2 * len(high))
+        for f in ("sin", "cos", "tan"):
+            getattr(library, f"number_{f}")(
+                len(high), *(each.ctypes.data_as(ctypes.c_void_p) for each in (x, x, found))
+            )
+            for a, b, c, d in zip(high, low, *found.reshape(2, -1), strict=True):
+                exact, value = getattr(arb(a) + b, f)(), arb(c) + d
+                if abs(exact) < 1e3:
+                    assert abs(value - exact) <= 1e-31 * abs(exact) + 1e-47 * a
+
+
+@pytest.mark.rotated
+def test_conserved_quantities() -> None:
+    """Energy and angular momentum of 1000 steps stay within 1e-29, also with parameters of two words."""
+    stepper = sc.compile_stepper(system("kepler"), "svi:12", precision="double-double")
+    parameters = {"m": "0.1", "mu": Fraction(1, 10)}
+    with mp.workdps(50):
+        root = mp.sqrt(3)
+    run = stepper.integrate(["0.5", 0], velocity=["0", root], h=0.0625, steps=1000, parameters=parameters)
+    assert run.energy_error() < 1e-29
+    maps = run.mp("momentum_maps")
+    assert max(abs(x - maps[0, 0]) for x in maps[:, 0]) < 1e-29
+    with mp.workdps(40):
+        assert abs(run.mp("energy")[0] - (mp.mpf("0.1") * 3 / 2 - mp.mpf("0.2"))) < 1e-32
+        assert abs(run.mp("p")[0, 1] - root / 10) < 1e-32
+    again = stepper.integrate(run.mp("q")[500], run.mp("p")[500], h=0.0625, steps=500, parameters=parameters)
+    assert max(abs(x - y) for x, y in zip(again.mp("q")[-1], run.mp("q")[-1], strict=True)) < 1e-28
+    double = sc.compile_stepper(system("kepler"), "svi:12").integrate(
+        [0.5, 0.0], velocity=[0.0, float(mp.sqrt(3))], h=0.0625, steps=1000, parameters={"m": 0.1, "mu": 0.1}
+    )
+    assert np.abs(double.q - run.q).max() < 1e-9
+
+
+@pytest.mark.second
+@pytest.mark.parametrize(("stages", "steps", "least"), [(4, 1024, 1e-27), (8, 16, 1e-28), (12, 4, 1e-29)])
+def test_order(stages: int, steps: int, least: float) -> None:
+    """Errors of Kepler's problem fall with the order 2 s down to ``least``."""
+    stepper = sc.compile_stepper(system("kepler"), f"svi:{stages}", precision="double-double")
+    errors = []
+    with mp.workdps(50):
+        angle = mp.findroot(lambda x: x - mp.sin(x) / 5 - 2, 2)
+        exact = [mp.cos(angle) - mp.mpf(1) / 5, mp.sqrt(mp.mpf(24) / 25) * mp.sin(angle)]
+        start = {"q": ["0.8", 0], "velocity": [0, mp.sqrt(mp.mpf(3) / 2)]}
+        for n in (steps, 2 * steps):
+            run = stepper.integrate(**start, h=2.0 / n, steps=n, save_every=n)
+            errors.append(max(abs(x - y) for x, y in zip(run.mp("q")[-1], exact, strict=True)))
+        assert abs(mp.log(errors[0] / errors[1], 2) - 2 * stages) < 0.04 * stages
+    assert errors[1] < least
+
+
+@pytest.mark.second
+def test_automatic_precision() -> None:
+    """With precision="auto" a chaotic run has the error asked for in double-double, a short one in double."""
+    bodies = [(f"x{n}", f"y{n}") for n in range(3)]
+    pairs = [(bodies[i], bodies[j]) for i, j in ((0, 1), (0, 2), (1, 2))]
+    kinetic = " + ".join(f"{name}_dot**2/2" for body in bodies for name in body)
+    potential = " + ".join(f"1/sqrt(({a} - {c})**2 + ({b} - {d})**2)" for (a, b), (c, d) in pairs)
+    three = lagrange("three bodies", [x for body in bodies for x in body], f"{kinetic} + {potential}")
+    stepper = sc.compile_stepper(three, "svi:12", precision="auto")
+    start = {"q": [-0.5, 0.0, 0.5, 0.0, 0.2, 0.4], "velocity": np.zeros(6), "error": 1e-6}
+    short, long = (stepper.integrate(**start, t_end=end) for end in (2.0, 15.0))
+    assert [each.confirmation.precision for each in (short, long)] == ["double", "double-double"]
+    assert short.confirmation.confirmed
+    assert long.confirmation.confirmed
+    del start["error"]
+    other = sc.compile_stepper(three, "svi:16", precision="double-double").integrate(**start, t_end=15.0)
+    assert np.abs(other.q[-1] - long.q[-1]).max() < 1e-6
+    double = stepper.integrate(**start, t_end=15.0, check_growth=False)
+    assert np.abs(np.asarray(double.q[-1]) - np.asarray(long.q[-1])).max() > 1e-5
+
+
+@pytest.mark.second
+def test_divided_kernels() -> None:
+    """Derivatives of the forces of many coordinates, in parts, compile, and a step is accurate to 30 digits."""
+    entry = sc.problem("outer-solar-system")
+    stepper = sc.compile_stepper(entry.system, "svi:4", precision="double-double")
+    whole = stepper.integrate(entry.q, velocity=entry.velocity, h=0.5, steps=1)
+    halves = stepper.integrate(entry.q, velocity=entry.velocity, h=0.25, steps=2)
+    assert max(abs(whole.mp("q")[-1] - halves.mp("q")[-1])) < 1e-29
+
+
+@pytest.mark.second
+def test_states_by_name() -> None:
+    """States by the names of coordinates or arrays keep both words."""
+    third = Fraction(1, 3)
+    named = {"x": "0.7", "y": third}, {"x": 0, "y": "1.3"}
+    chain = lagrange("springs", "x[2]", "sum(i in 2, x_dot[i]**2/2 - x[i]**2/2)")
+    arrays = {"x": ["0.7", third]}, {"x": [0, "1.3"]}
+    for each, (q, v) in ((system("kepler"), named), (chain, arrays)):
+        stepper = sc.compile_stepper(each, "svi:4", precision="double-double")
+        run, plain = (
+            stepper.integrate(*start[:1], velocity=start[1], h=0.1, steps=2)
+            for start in ((q, v), (["0.7", third], [0, "1.3"]))
+        )
+        assert (run.mp("q") == plain.mp("q")).all()
+        assert run.q_low[0].all()
+
+
+@pytest.mark.rotated
+def test_large_steps() -> None:
+    """Corrections whose last changes are rounding errors are accepted, near pericentre with 16 steps a period."""
+    stepper = sc.compile_stepper(system("kepler"), "svi:24", precision="double-double")
+    run = stepper.integrate([0.5, 0.0], velocity=[0.0, 3.0**0.5], h=0.392699092626572, steps=12_000, save_every=100)
+    assert run.energy_error() < 3e-29
+
+
+@pytest.mark.second
+def test_energy_does_not_drift() -> None:
+    """The mean change of the energy is a random walk: tables of two words would be those of a dissipative method."""
+    springs = lagrange("springs", "x y", "(x_dot**2 + y_dot**2)/2 - x**2/2 - y**2/3")
+    stepper, steps, changes = sc.compile_stepper(springs, "svi:16", precision="double-double"), 100_000, []
+    for x, y, u, w in np.random.default_rng(1).uniform(-0.25, 0.25, (4, 4)):
+        run = stepper.integrate([x, y], velocity=[u, w], h=0.5, steps=steps, save_every=steps)
+        energy = run.energy()
+        changes.append(float(energy[-1] - energy[0]) / abs(float(energy[0])) / steps)
+    assert abs(np.mean(changes)) < 4e-35
+
+
+def test_numbers() -> None:
+    """Floats, text, fractions, mpmath numbers and long doubles become two words; other values are refused by name."""
+    with mp.workdps(50):
+        third = mp.mpf(1) / 3
+        for value in ("1/3", Fraction(1, 3), third):
+            high, low = two_words(value, "q")
+            assert high == 1 / 3
+            assert abs(mp.mpf(high) + mp.mpf(low) - third) < 1e-32
+    assert two_words(0.1, "q") == (0.1, 0.0)
+    assert two_words(10**17 + 1, "q") == (1e17, 1.0)
+    for value in (np.int8(3), np.uint32(3), np.array(3), np.float32(3), Decimal(3), sympy.Integer(3)):
+        assert two_words(value, "q") == (3.0, 0.0)
+    assert two_words(np.int64(10**17 + 1), "q") == (1e17, 1.0)
+    assert (split(np.array([1, 10**17 + 1]), "q")[1] == [0.0, 1.0]).all()
+    assert two_words(sympy.pi, "q") == (np.pi, 1.2246467991473532e-16)
+    assert two_words(np.array("1/3"), "q") == two_words("1/3", "q")
+    long = np.longdouble(1) / 3
+    high, low = two_words(long, "q")
+    assert np.longdouble(high) + np.longdouble(low) == long
+    for wrong in ("x", None, True, 1j, [1.0], "1/0"):
+        with pytest.raises(StateError, match="q must be a real number"):
+            two_words(wrong, "q")
+    for wrong in (float("inf"), "nan", "1e999999999", mp.inf):
+        with pytest.raises(StateError, match=r"q is .*: it must be finite"):
+            two_words(wrong, "q")
+
+
+def test_refusals() -> None:
+    """What double-double arithmetic does not have is refused with a remedy."""
+    kepler = system("kepler")
+    for flag in REORDERING_FLAGS:
+        with pytest.raises(MethodError, match="reorders sums"):
+            sc.compile_stepper(kepler, "svi:4", precision="double-double", flags=("-O2", flag))
+    with pytest.raises(MethodError, match="unknown precision 'quad'"):
+        sc.compile_stepper(kepler, "svi:4", precision="quad")
+    stepper = sc.compile_stepper(kepler, "svi:4", precision="double-double")
+    assert stepper.supports("adaptive")
+    assert not stepper.supports("observe_ensemble")
+    start = {"velocity": [0.0, 1.0], "h": 0.1}
+    with pytest.raises(StateError, match=r"q must have shape \(2,\)"):
+        stepper.integrate([1.0], **start, steps=3)
+    with pytest.raises(StateError, match="no parameter 'mass'"):
+        stepper.integrate([1.0, 0.0], **start, steps=3, parameters={"mass": 1.0})
+    for call, word in (
+        (lambda: stepper.integrate([1.0, 0.0], **start, steps=3, check_growth=True), "check_growth=True"),
+        (lambda: stepper.integrate_ensemble([[1.0, 0.0]], [[0.0, 1.0]], h=0.1, steps=3, device="cuda"), "device="),
+        (lambda: stepper.integrate([1.0, 0.0], **start, steps=3).action(), "action"),
+        (lambda: stepper.discrete_lagrangian([1.0, 0.0], [1.0, 0.1], 0.1), "discrete_lagrangian"),
+    ):
+        with pytest.raises(MethodError, match=f"{word} is not available with precision='double-double'"):
+            call()
+    run = stepper.integrate([1.0, 0.0], **start, steps=1)
+    with pytest.raises(StateError, match="'z'"):
+        run.mp("z")
+    with pytest.raises(StateError, match=r"NAME\.npz"):
+        run.save("a.csv")
+
+
+def exact_orbit(t: object, e: object = Fraction(1, 2)) -> list:
+    """Return the position at t > 0 on the ellipse of eccentricity e that starts at pericentre."""
+    e, mean = mp.mpf(e.numerator) / e.denominator, mp.fmod(t, 2 * mp.pi)
+    angle = mp.findroot(lambda x: x - e * mp.sin(x) - mean, mean)
+    return [mp.cos(angle) - e, mp.sqrt(1 - e**2) * mp.sin(angle)]
+
+
+@pytest.mark.second
+def test_tolerances_are_met_or_refused() -> None:
+    """Tolerances below what error estimates resolve are refused; the error of each step is below all others."""
+    kepler, start = system("kepler"), {"q": ["0.5", 0], "velocity": [0, "1.7"], "t_end": 2.0}
+    exact = sc.compile_stepper(kepler, "svi:12", precision="double-double")
+    for method, least in (("sc:5", 2.2e-20), ("svi:4", 1e-31), ("chebyshev-gauss:6", 1.7e-19)):
+        stepper = sc.compile_stepper(kepler, method, precision="double-double")
+        with pytest.raises(StateError, match=r"tolerance=1e-32 cannot be met: .* resolve errors of"):
+            stepper.integrate(**start, tolerance=1e-32)
+        if least > 1e-27:
+            with pytest.raises(StateError, match="the default tolerance, round-off, cannot be met"):
+                stepper.integrate(**start)
+            with pytest.raises(StateError, match="tolerance=1e-28 cannot be met"):
+                stepper.integrate_ensemble([start["q"]], velocity=[start["velocity"]], t_end=2.0, tolerance=1e-28)
+        tolerance = max(least, 1e-22)
+        run = stepper.integrate(**start, tolerance=tolerance)
+        for k in range(0, len(run) - 1, len(run) // 8):
+            step = exact.integrate(run.q[k], run.p[k], t=run.t[k], t_end=float(run.t[k + 1]), tolerance=1e-30)
+            assert abs(step.mp("q")[-1] - run.mp("q")[k + 1]).max() < 10 * tolerance
+
+
+@pytest.mark.second
+def test_cost_of_the_default_tolerance() -> None:
+    """Adaptive steps to round-off are at most twice as many as those of 1e-28, also from and through zero."""
+    text = "a_dot**2 + b_dot**2/2 + a_dot*b_dot*cos(a - b) + 2*cos(a) + cos(b)"
+    double = sc.LagrangianSystem.from_text(name="double", coordinates=["a", "b"], lagrangian=text)
+    driven = lagrange("driven", "x", "x_dot**2/2 - (1 + cos(t)/2)*x**2/2")
+    for each, method, start in (
+        (double, "svi:12", {"q": ["1", "0.5"], "p": ["0", "0"], "t": 0.0, "t_end": 5.0}),
+        (double, "svi:12", {"q": [0, 0], "p": ["1", "0.5"], "t": 0.0, "t_end": 5.0}),
+        (driven, "svi:12", {"q": ["1"], "p": [0], "t": "100.3", "t_end": 110.0}),
+    ):
+        stepper = sc.compile_stepper(each, method, precision="double-double")
+        few = stepper.integrate(**start, tolerance=1e-28)
+        run = stepper.start(**start)
+        run.advance(2 * few.steps)
+        assert run.t == start["t_end"], (method, start, run.steps)
+        assert abs(run.q.mp() - few.mp("q")[-1]).max() < 1e-26
+
+
+def test_dense_output_at_decimal_times() -> None:
+    """States between and at the ends of steps of 1/10, which are no multiples of it in double, are those of the motion.
+
+    x = cos t. The time left to an output time may have one word, the low one.
+    """
+    oscillator = lagrange("oscillator", "x", "x_dot**2/2 - x**2/2")
+    stepper = sc.compile_stepper(oscillator, "svi:12", precision="double-double")
+    run, (times, ends) = stepper.integrate([1], [0], h=0.1, steps=20), (np.linspace(0, 2, 21), [0.1 * 3, 0.3, 0.7, 1.9])
+    with mp.workdps(40):
+        between = stepper.integrate([1], [0], h=0.1, t_end=2.0, t_eval=times).mp("q")[:, 0]
+        for values, at in ((between, times), (run.at(ends)[0].mp()[:, 0], ends)):
+            assert max(abs(x - mp.cos(mp.mpf(float(t)))) for x, t in zip(values, at, strict=True)) < 2e-32
+        for h in (1 / 96, 1 / 3, 0.07):
+            assert abs(stepper.integrate([1], [0], h=h, t_end=2.0).mp("q")[-1][0] - mp.cos(2)) < 2e-31
+
+
+def test_every_quantity_has_both_words(tmp_path: Path) -> None:
+    """Coordinates, momenta and velocities by name, of runs, in progress, of ensembles, recordings and events."""
+    stepper = sc.compile_stepper(system("kepler"), "svi:4", precision="double-double", events=sc.Event("y - 3/5"))
+    start: dict[str, Any] = {"q": ["1/3", "0.7"], "velocity": ["0.1", "-1/7"], "t": "1/3", "parameters": {"m": "1.1"}}
+    run = stepper.integrate(**start, h=1 / 16, steps=8)
+    runs = stepper.integrate_ensemble(**start | {"q": [start["q"]], "velocity": [start["velocity"]]}, h=1 / 16, steps=8)
+    recorded = sc.record_run(stepper.start(**start, h=1 / 16), tmp_path / "a.run", steps=8)
+    now = stepper.start(**start, h=1 / 16)
+    now.advance(8)
+    with mp.workdps(40):
+        columns = {"x": ("q", 0), "p_y": ("p", 1), "y_dot": ("velocity", 1)}
+        for name, (whole, column) in columns.items():
+            values = run.mp(whole)[:, column]
+            assert any(mp.mpf(float(value)) != value for value in values)
+            for other in (run.mp(name), run[1:].mp(name), runs[0].mp(name), recorded[:].mp(name), recorded[name].mp()):
+                assert abs(other - values[-len(other) :]).max() < 1e-31, name
+            assert abs(runs.mp(name)[:, 0] - values).max() < 1e-31
+        assert abs(run.mp("x_dot")[0] - mp.mpf("0.1")) < 1e-32
+        for states in (run, runs[0], recorded):
+            t, q, p = states[8]
+            assert t.mp() == run.mp("t")[8] == now.t.mp()
+            assert abs(q.mp() - run.mp("q")[8]).max() + abs(p.mp() - run.mp("p")[8]).max() < 1e-31
+        assert now.energy.mp() == run.mp("energy")[8]
+        assert (now.velocity.mp() == run.mp("velocity")[8]).all()
+        assert (now.momentum_maps.mp() == run.mp("momentum_maps")[8]).all()
+        (crossings,), (saved,) = run.events, recorded.events
+        assert len(crossings) == 1
+        assert abs(crossings.q.mp()[0, 1] - mp.mpf(3) / 5) < 1e-31
+        assert crossings.t.mp()[0] == saved.t.mp()[0]
+        q, p = run.at(0.4)
+        again = stepper.integrate(run.q[0], run.p[0], t=run.t[0], h=1 / 16, t_end=0.4, parameters={"m": "1.1"})
+        assert abs(q.mp() - again.mp("q")[-1]).max() < 1e-30
+
+
+def test_arrays_have_both_words() -> None:
+    """Arrays of coordinates by name, and their items."""
+    text = "q_dot[0]**2/2 + q_dot[1]**2/2 + z_dot**2/2 - (q[0] - q[1])**2/2 - z**2*q[0]**2"
+    chain = sc.LagrangianSystem.from_text(name="chain", coordinates=["q[2]", "z"], lagrangian=text)
+    stepper = sc.compile_stepper(chain, "svi:2", precision="double-double")
+    run = stepper.integrate({"q": ["0.1", "1/3"], "z": "0.7"}, p={"q": ["0", "0.1"], "z": 0}, h=0.125, steps=1)
+    with mp.workdps(40):
+        q, (z, third) = run.mp("q"), (mp.mpf(7) / 10, mp.mpf(1) / 3)
+        assert abs(q[0] - [mp.mpf(1) / 10, third, z]).max() < 1e-32
+        assert abs(run.mp("z")[0] - z) + abs(run.mp("p_q")[0][1] - mp.mpf(1) / 10) < 1e-32
+        for by_name in (dict(run.q.items()), stepper.arrays(run.q), {"q": run.q["q"], "z": run.q["z"]}):
+            assert abs(by_name["q"].mp()[0][1] - third) + abs(by_name["z"].mp()[0] - z) < 1e-32
+
+
+def test_velocities_at_times_of_two_words() -> None:
+    """Momenta, velocities, energies, steps and projections of systems that depend on t use both words of t."""
+    text = "(2 + sin(t))*(x_dot**2 + y_dot**2)/2 - x**2*cos(t)/2 + t*x_dot"
+    moving = sc.LagrangianSystem.from_text(name="moving", coordinates=["x", "y"], lagrangian=text)
+    stepper = sc.compile_stepper(moving, "svi:4", precision="double-double")
+    ring = sc.LagrangianSystem.from_text(
+        name="ring",
+        coordinates=["x", "y"],
+        lagrangian="(x_dot**2 + y_dot**2)/2",
+        constraints=["x**2 + y**2 = (1 + sin(t)/4)**2"],
+    )
+    with mp.workdps(40):
+        t = 3 + mp.mpf(3) / 10**17
+        run = stepper.integrate(["1", "0"], velocity=["0.3", "0.1"], t=t, h=1 / 64, steps=1)
+        p = (2 + mp.sin(t)) * mp.mpf("0.3") + t
+        assert abs(run.mp("p")[0][0] - p) < 1e-31
+        many = stepper.integrate_ensemble([["1", "0"]], velocity=[["0.3", "0.1"]], t=t, h=1 / 64, steps=1)
+        assert abs(many.mp("p")[0][0][0] - p) < 1e-31
+        assert abs(run.mp("x_dot")[0] - mp.mpf("0.3")) < 1e-31
+        q1, p1 = stepper.step(run.q[0], run.p[0], 1 / 64, t=t)
+        assert (q1.mp() == run.mp("q")[1]).all()
+        assert (p1.mp() == run.mp("p")[1]).all()
+        radius, rate, (c, s) = 1 + mp.sin(t) / 4, mp.cos(t) / 4, (mp.mpf(3) / 5, mp.mpf(4) / 5)
+        q, v = [radius * c, radius * s], [rate * c - s, rate * s + c]
+        moved = sc.compile_stepper(ring, "svi:4", precision="double-double").project(q, v, t=t)
+        assert abs(np.array([moved[0].mp() - q, moved[1].mp() - v])).max() < 1e-31
+
+
+@pytest.mark.rotated
+def test_runs() -> None:
+    """Adaptive steps, a shorter last step, output times, dense output and restarts have both words."""
+    stepper = sc.compile_stepper(system("kepler"), "svi:12", precision="double-double")
+    with mp.workdps(50):
+        start = {"q": ["0.5", "0"], "velocity": ["0", mp.sqrt(3)]}
+
+        def error(q: object, t: float) -> float:
+            return float(max(abs(x - y) for x, y in zip(as_mpmath(q), exact_orbit(t), strict=True)))
+
+        adaptive = stepper.integrate(**start, t_end=7.0)
+        fixed = stepper.integrate(**start, h=0.07, t_end=6.01)
+        loose = stepper.integrate(**start, t_end=7.0, tolerance=1e-22)
+        assert max(error(adaptive.q[-1], 7.0), error(fixed.q[-1], 6.01), error(fixed.at(3.3)[0], 3.3)) < 1e-29
+        assert error(adaptive.at([1.1])[0][0], 1.1) < 1e-29
+        assert 1e-26 < error(loose.q[-1], 7.0) < 1e-20
+        assert len(loose) < len(adaptive)
+        for steps in ({"t_end": 7.0}, {"h": 0.07, "steps": 100}):
+            times = stepper.integrate(**start, **steps, t_eval=[0.1, 6.1])
+            assert max(error(times.q[0], 0.1), error(times.q[1], 6.1)) < 1e-29
+        run = stepper.start(**start, h=0.07)
+        run.advance(40)
+        copy = stepper.from_checkpoint(run.checkpoint())
+        part = copy.record(45)
+        assert np.array_equal(part.q_low, fixed.q_low[40:86])
+        assert np.array_equal(part.t_low, fixed.t_low[40:86])
+        part = adaptive[5:]
+        assert np.array_equal(part.q_low, adaptive.q_low[5:])
+        assert part.momentum_maps().low.any()
+        q1, p1 = stepper.step(fixed.q[3], fixed.p[3], 0.07)
+        assert max(abs(as_mpmath(q1) - as_mpmath(fixed.q[4]))) < 1e-31
+        assert fixed[3:5].mp("p").shape == (2, 2)
+        assert abs(p1 - fixed.p[4]).max() < 1e-31
+        double = sc.compile_stepper(system("kepler"), "svi:12").integrate(
+            [0.5, 0.0], velocity=[0.0, 3.0**0.5], h=0.07, steps=85
+        )
+        assert np.abs(fixed[:86].sensitivity().state - double.sensitivity().state).max() < 1e-9
+
+
+@pytest.mark.second
+def test_events() -> None:
+    """Times and states of crossings have two words: y = 0 at multiples of pi, x = 0 at a known anomaly."""
+    stepper = sc.compile_stepper(system("kepler"), "svi:12", precision="double-double")
+    with mp.workdps(50):
+        start = {"q": ["0.5", "0"], "velocity": ["0", mp.sqrt(3)]}
+        quarter = mp.pi / 3 - mp.sin(mp.pi / 3) / 2
+        for steps in ({"h": 0.0625, "steps": 110}, {"t_end": 7.0}, {"h": 0.0625, "t_end": 6.9, "save_every": 7}):
+            run = stepper.integrate(**start, **steps, events=["y", "x_dot*x - x*x_dot + x"])
+            times = run.events[0].t.mp()
+            assert max(abs(t - (k + 1) * mp.pi) for k, t in enumerate(times)) < 1e-29
+            assert len(times) == 2
+            assert abs(run.events[1].t[0].mp() - quarter) < 1e-30
+            assert abs(run.events[1].q[0, 0].mp()) < 1e-30
+        ended = stepper.integrate(**start, h=0.0625, steps=200, events=sc.Event("y", direction=-1, terminal=True))
+        assert abs(ended.t[-1].mp() - mp.pi) < 1e-30
+        assert abs(ended.q[-1, 0].mp() + 1.5) < 1e-30
+        assert abs(ended.crossings("x")[0].t[0].mp() - quarter) < 1e-30
+        with_event = stepper.with_events("x")
+        halves = with_event.start(**start, h=0.0625)
+        first = halves.record(5)
+        again = with_event.from_checkpoint(halves.checkpoint()).record(10)
+        assert len(first.events[0]) == 0
+        assert abs(again.events[0].t[0].mp() - quarter) < 1e-30
+
+
+def test_entries() -> None:
+    """Entries of arrays keep low words, in differences, as initial values and in pickles."""
+    x = with_low(np.array([1.0, 1.0, 2.0]), np.array([1e-20, 3e-20, 5e-20]))
+    assert (x - x[0])[:2].tolist() == [0.0, 3e-20 - 1e-20]
+    assert x[1] - x[0] == 3e-20 - 1e-20
+    assert x[1] - 1.0 == 3e-20
+    assert [each.low for each in x] == [1e-20, 3e-20, 5e-20]
+    assert two_words(x[2], "q") == (2.0, 5e-20)
+    assert (split([x[0], x[2]], "q")[1] == [1e-20, 5e-20]).all()
+    assert pickle.loads(pickle.dumps(x[1])).low == 3e-20
+    assert f"{x[1]:g} {json.dumps(x[1])}" == "1 1.0"
+    assert isinstance(x[1] + 1.0, float)
+    assert not hasattr(x[1] + 1.0, "low")
+    with mp.workdps(40):
+        assert x[1].mp() == mp.mpf(1) + mp.mpf(3e-20)
+
+
+@pytest.mark.second
+def test_advice() -> None:
+    """Recommended steps have the error asked for at the end, compared with the exact orbit."""
+    with mp.workdps(50):
+        start = {"q": ["0.5", "0"], "velocity": ["0", mp.sqrt(3)]}
+        for method, tolerance, degree in (("svi:12", 1e-18, False), ("svi:12", 1e-26, False), ("svi:8", 1e-24, True)):
+            advice = sc.advise(
+                system("kepler"),
+                method,
+                **start,
+                span=9.3,
+                tolerance=tolerance,
+                degree=degree,
+                precision="double-double",
+            )
+            stepper = sc.compile_stepper(system("kepler"), advice.method, precision="double-double")
+            run = stepper.integrate(**start, h=advice.h, t_end=9.3)
+            exact = exact_orbit(9.3)
+            error = mp.norm([x - y for x, y in zip(run.mp("q")[-1], exact, strict=True)]) / mp.norm(exact)
+            assert tolerance / 1000 < error < tolerance
+            assert not advice.warnings
+            assert len(run) == advice.steps + 1
+            assert degree == (advice.degree > 12)
+    with pytest.raises(MethodError, match="'double' or 'double-double', not 'auto'"):
+        sc.advise(system("kepler"), "svi:4", [1.0, 0.0], [0.0, 1.0], 1.0, 1e-9, precision="auto")
+
+
+@pytest.mark.second
+def test_advice_of_ensembles() -> None:
+    """The step is that of the trajectory with the largest error, with both words of its parameters."""
+    parts = [Fraction(1, 10), Fraction(3, 5), Fraction(3, 10)]
+    numbers = {"m": ["1/7", 1, 1], "mu": ["1/7", 1, 1]}
+    with mp.workdps(50):
+        q = [[1 - e, 0] for e in parts]
+        squares = [(1 + e) / (1 - e) for e in parts]
+        v = [[0, mp.sqrt(mp.mpf(each.numerator) / each.denominator)] for each in squares]
+        known = {"span": 9.3, "tolerance": 1e-24, "precision": "double-double"}
+        advice = sc.advise(system("kepler"), "svi:12", q, velocity=v, parameters=numbers, **known)
+        assert advice.member == 1
+        alone = sc.advise(system("kepler"), "svi:12", q[1], velocity=v[1], **known)
+        assert advice.h == pytest.approx(alone.h, rel=0.1)
+        stepper = sc.compile_stepper(system("kepler"), "svi:12", precision="double-double")
+        runs = stepper.integrate_ensemble(q, velocity=v, parameters=numbers, h=advice.h, t_end=9.3)
+        errors = [mp.norm(list(runs[j].mp("q")[-1] - exact_orbit(9.3, e))) for j, e in enumerate(parts)]
+        assert 1e-27 < max(errors) == errors[1] < 1e-24
+
+
+@pytest.mark.second
+def test_ensembles(tmp_path: Path) -> None:
+    """Trajectories of ensembles equal single runs, with adaptive steps bit for bit, and the exact orbit; in files."""
+    stepper = sc.compile_stepper(system("kepler"), "svi:12", precision="double-double")
+    with mp.workdps(50):
+        root, third = mp.sqrt(3), mp.mpf(1) / 3
+        q, v = [["0.5", "0"], [third, "0"]], [["0", root], ["0", mp.sqrt(third + 3)]]
+        parameters = {"mu": [1, "1/10"], "m": "1/7"}
+        single = [{"mu": mu, "m": "1/7"} for mu in (1, "1/10")]
+        for steps in (
+            {"h": 0.07, "t_end": 6.01, "save_every": 7},
+            {"t_end": 2.0},
+            {"t_end": 2.0, "t_eval": [0.3, 1.1]},
+        ):
+            runs = stepper.integrate_ensemble(q, velocity=v, parameters=parameters, **steps)
+            together = Ensemble(stepper, q, None, velocity=v, parameters=parameters, **steps).successive
+            assert (together is None) == ("t_eval" in steps or "h" in steps)  # integrated by one call of C
+            least = 1e-27 if "h" in steps else 0  # past a near collision
+            for j, values in enumerate(single):
+                run = stepper.integrate(q[j], velocity=v[j], parameters=values, **steps)
+                for name in ("t", "q", "p", "parameters", "energy", "momentum_maps"):
+                    expected = run.mp(name)
+                    assert abs(runs[j].mp(name) - expected).max() <= least * abs(expected).max(), (name, steps)
+                for name in ("q", "p", "energy", "momentum_maps"):
+                    assert (runs.mp(name)[: len(run), j] == runs[j].mp(name)).all()
+        ends = stepper.integrate_ensemble(q, velocity=v, h=0.07, t_end=6.01)
+        assert max(abs(x - y) for x, y in zip(ends[0].mp("q")[-1], exact_orbit(6.01), strict=True)) < 1e-29
+        again = stepper.integrate_ensemble([run.q[-1] for run in (ends[0], ends[1])], ends.p[-1], h=-0.07, steps=3)
+        assert (again[1].mp("q")[0] == ends[1].mp("q")[-1]).all()
+    assert np.array_equal(ends.p_low[-1, 1], ends[1].p_low[-1])
+    ends.save(tmp_path / "ends.npz")
+    with np.load(tmp_path / "ends.npz") as saved:
+        for name in ("t", "q", "p", "parameters"):
+            assert np.array_equal(saved[f"{name}_low"], getattr(ends, name).low)
+    with pytest.raises(StateError, match=r"NAME\.npz"):
+        ends.save(tmp_path / "ends.csv")
+    failing = stepper.integrate_ensemble([[0.5, 0], [1e-9, 0]], velocity=[[0, 1], [0, 1]], h=0.07, steps=9)
+    assert failing.status.tolist() == ["ok", "not converged"]
+    assert np.isnan(failing.q[-1, 1]).all()
+    assert failing.q[-1, 0].low.all()
+    with pytest.raises(StateError, match=r"velocity\[1, 0\] must be a real number"):
+        stepper.integrate_ensemble(q, velocity=[[0, 1], ["a", 1]], h=0.07, steps=9)
+
+
+def test_explicit_ensembles() -> None:
+    """Trajectories in SIMD lanes equal single runs, and the formulas in 50 digits, whatever their neighbours are."""
+    driven = sc.LagrangianSystem.from_text(
+        name="driven",
+        coordinates=["x", "y"],
+        parameters={"m": 1.0, "k": 1.0},
+        lagrangian="m*(x_dot**2 + 2*y_dot**2)/2 - k*cos(x - y) - x*y**2*sin(t)",
+    )
+    count, starts = 11, [[f"0.{j}1", f"-1/{j + 3}"] for j in range(11)]
+    numbers = {"m": [f"1.{j}" for j in range(count)], "k": "0.3"}
+    for method, plan in (
+        ("stoermer-verlet", {"h": -0.07, "steps": 9, "save_every": 4}),
+        ("composition:6", {"h": 0.07, "t_end": 0.7, "save_every": 3}),
+        ("composition:6", {"h": 0.07, "t_end": 0.68, "save_every": 4}),
+    ):
+        stepper = sc.compile_stepper(driven, method, precision="double-double")
+        assert Ensemble(stepper, starts, starts, **plan).common is not None
+        runs = stepper.integrate_ensemble(starts, starts, parameters=numbers, **plan)
+        for j in (0, 3, count - 1):
+            values = {"m": numbers["m"][j], "k": "0.3"}
+            alone = stepper.integrate(starts[j], starts[j], parameters=values, **plan)
+            rows = [0, -1] if plan.get("t_end") == 0.68 else slice(None)
+            for name in ("t", "q", "p", "energy"):
+                assert (runs[j].mp(name)[rows] == alone.mp(name)[rows]).all()
+    with mp.workdps(50):
+        q, p = [mp.mpf("0.31"), mp.mpf(-1) / 6], [mp.mpf("0.31"), mp.mpf(-1) / 6]
+        m, k, h = mp.mpf("1.3"), mp.mpf("0.3"), mp.mpf(-0.07)
+
+        def kick(t: object) -> None:
+            force = k * mp.sin(q[0] - q[1])
+            p[0] += h / 2 * (force - q[1] ** 2 * mp.sin(t))
+            p[1] += h / 2 * (-force - 2 * q[0] * q[1] * mp.sin(t))
+
+        for n in range(9):
+            kick(n * h)
+            q = [q[0] + h * p[0] / m, q[1] + h * p[1] / (2 * m)]
+            kick((n + 1) * h)
+        stepper = sc.compile_stepper(driven, "stoermer-verlet", precision="double-double")
+        runs = stepper.integrate_ensemble(starts, starts, parameters=numbers, h=-0.07, steps=9)
+        assert max(abs(runs.mp("q")[-1, 3] - q)) < 1e-31
+        assert max(abs(runs.mp("p")[-1, 3] - p)) < 1e-31
+        infinite = stepper.integrate_ensemble([*starts[:3], ["1e200", "1e300"]], starts[:4], h=-0.07, steps=9)
+        fewer = stepper.integrate_ensemble(starts[:3], starts[:3], h=-0.07, steps=9)
+        assert infinite.status.tolist() == ["ok", "ok", "ok", "not finite"]
+        assert (infinite.mp("q")[:, :3] == fewer.mp("q")).all()
+
+
+def lane_starts() -> tuple[dict[str, list], dict[str, object], list[dict[str, object]]]:
+    """Return 11 orbits of different eccentricities with parameters of two words, and those of each orbit."""
+    count = 11
+    start = {
+        "q": [[f"0.{9 - j % 7}1", f"-1/{j + 3}0"] for j in range(count)],
+        "velocity": [["0.01", f"1.{j}"] for j in range(count)],
+    }
+    numbers = {"m": [f"1.{j}1" for j in range(count)], "mu": "1/3"}
+    return start, numbers, [{"m": m, "mu": "1/3"} for m in numbers["m"]]
+
+
+@pytest.mark.tiers(1)
+@pytest.mark.parametrize(
+    ("method", "plan"),
+    [
+        ("svi:8", {"h": 0.03, "steps": 5, "save_every": 2}),
+        ("gauss:5", {"h": 0.02, "t_end": 0.09}),
+        ("sc:3", {"h": -0.02, "steps": 4}),
+    ],
+)
+def test_ensembles_in_lanes(method: str, plan: dict[str, float]) -> None:
+    """Trajectories in SIMD lanes agree with single runs to 4e-31."""
+    stepper = sc.compile_stepper(system("kepler"), method, precision="double-double")
+    start, numbers, single = lane_starts()
+    assert Ensemble(stepper, **start, p=None, parameters=numbers, **plan).common is not None
+    runs = stepper.integrate_ensemble(**start, parameters=numbers, **plan)
+    assert runs.status.tolist() == ["ok"] * len(single)
+    for j in (0, 6, 10):
+        alone = stepper.integrate(start["q"][j], velocity=start["velocity"][j], parameters=single[j], **plan)
+        assert (runs[j].mp("t") == alone.mp("t")).all()
+        for name in ("q", "p", "energy"):
+            expected = alone.mp(name)
+            assert abs(runs[j].mp(name) - expected).max() <= 4e-31 * abs(expected).max(), name
+
+
+def test_lanes_do_not_depend_on_their_neighbours() -> None:
+    """Trajectories whose iterations converge at different rates have equal bits in other blocks and threads."""
+    stepper = sc.compile_stepper(system("kepler"), "svi:3", precision="double-double")
+    rng, count, plan = np.random.default_rng(2), 200, {"h": 0.9, "steps": 200, "save_every": 200}
+    radius, order = rng.uniform(1.0, 9.0, count), rng.permutation(count)[:150]
+    q = np.stack([radius, 0 * radius], axis=1)
+    v = np.stack([0 * radius, rng.uniform(0.8, 1.2, count) / np.sqrt(radius)], axis=1)
+    runs = stepper.integrate_ensemble(q, velocity=v, **plan)
+    others = stepper.integrate_ensemble(q[order], velocity=v[order], threads=2, **plan)
+    assert runs.ok.all()
+    for name in ("q", "p"):
+        assert (others.mp(name) == runs.mp(name)[:, order]).all()
+
+
+def test_failing_lanes() -> None:
+    """A trajectory whose iteration fails keeps its states up to there, and the bits of its neighbours."""
+    stepper = sc.compile_stepper(system("kepler"), "svi:6", precision="double-double")
+    q, v, plan = [["0.9", "0.1"]] * 9, [["0.1", f"1.{j}"] for j in range(9)], {"h": 0.1, "steps": 12}
+    runs = stepper.integrate_ensemble(q, velocity=v, **plan)
+    v[4] = ["-0.6", "0.1"]  # towards the centre
+    failing = stepper.integrate_ensemble(q, velocity=v, **plan)
+    with pytest.raises(sc.StepFailedError) as failure:
+        stepper.integrate(q[4], velocity=v[4], **plan)
+    assert failing.status.tolist() == [*["ok"] * 4, failure.value.status, *["ok"] * 4]
+    done = failing.steps[4]
+    assert 0 < done == failure.value.step < 12
+    alone = stepper.integrate(q[4], velocity=v[4], **(plan | {"steps": done}))
+    assert abs(failing.mp("q")[: done + 1, 4] - alone.mp("q")).max() < 1e-29
+    assert np.isnan(failing.q[done + 1 :, 4]).all()
+    others = [0, 1, 2, 3, 5, 6, 7, 8]
+    assert (failing.mp("q")[:, others] == runs.mp("q")[:, others]).all()
+
+
+def test_step_in_lanes() -> None:
+    """Two steps of trajectories in SIMD lanes agree with those in 60 digits to 2e-31."""
+    stepper = sc.compile_stepper(system("kepler"), "svi:8", precision="double-double")
+    q, v = [["0.6", f"0.{j}"] for j in range(1, 10)], [["0.2", "1.3"]] * 9
+    runs = stepper.integrate_ensemble(q, velocity=v, h=0.125, steps=2)
+    with mp.workdps(60):
+        for j, k in ((0, 0), (8, 1)):
+            start = [list(runs.mp(part)[k, j]) for part in "qp"]
+            exact = gauss_step("kepler", *start, mp.zero, mp.mpf(0.125), 8)
+            for part, values in zip("qp", exact, strict=True):
+                worst = max(abs(x - y) for x, y in zip(runs.mp(part)[k + 1, j], values, strict=True))
+                assert worst <= 2e-31 * max(map(abs, values))
+
+
+@pytest.mark.parametrize(("count", "has_lanes"), [(16, True), (17, False)])
+def test_largest_systems_in_lanes(count: int, has_lanes: bool) -> None:
+    """Trajectories are SIMD lanes for up to 256 values at the points of a step."""
+    names = [f"x{j}" for j in range(count)]
+    lagrangian = "+".join(f"{x}_dot**2/2 - {x}**4" for x in names)
+    free = sc.LagrangianSystem.from_text(name="free", coordinates=names, lagrangian=lagrangian)
+    source = Sources(free, sc.SVI(16), precision="double-double").variant("ensemble")
+    assert (source is not None) == has_lanes
+
+
+def test_trajectory_that_leaves_its_lane() -> None:
+    """A trajectory that the single integrator continues ends at the final time, with the state of its lane."""
+    stepper = sc.compile_stepper(system("driven"), "svi:4", precision="double-double")
+    common = Ensemble(stepper, [["0.7"]] * 3, [["0.3"]] * 3, t=0.001, h=0.1, t_end=1.0).common
+    assert common is not None
+    common.run(progress=None, threads=1)
+    q, p = common.q.copy(), common.p.copy()
+    carries = q.low[4, 1].copy(), p.low[4, 1].copy()
+    common.q[5:, 1] = np.nan
+    SingleRun(common, 1, np.array(q[4, 1]), np.array(p[4, 1]), 4, carries).follow(lambda _: None)
+    for now, before in ((common.q, q), (common.p, p)):
+        assert abs(as_mpmath(now[:, 1]) - as_mpmath(before[:, 1])).max() < 1e-31
+    assert (q.low[-1, 1] != 0).all()
+
+
+def driven_spring(t: list[float], u: list[Fraction], end: float, kind: str) -> list:
+    """Return q and its velocity at an end for q'' + q = u with values u at t, constant or linear between."""
+    q, v = mp.mpf("0.3"), mp.mpf("0.2")
+    for start, stop, *ends in zip(t, t[1:], u, u[1:], strict=False):
+        if start < end:
+            slope = (ends[1] - ends[0]) / (Fraction(stop) - Fraction(start)) * (kind == "linear")
+            at, rate = (mp.mpf(each.numerator) / each.denominator for each in (ends[0], Fraction(slope)))
+            h = mp.mpf(min(stop, end)) - start
+            c, s, x, y = mp.cos(h), mp.sin(h), q - at, v - rate
+            q, v = x * c + y * s + at + rate * h, y * c - x * s + rate
+    return [q, v]
+
+
+def test_inputs() -> None:
+    """Inputs of two words, constant or linear between samples, or set by a controller, agree with the solution."""
+    spring = lagrange("driven spring", "q", "q_dot**2/2 - q**2/2 + u*q", inputs="u")
+    stepper = sc.compile_stepper(spring, "svi:10", precision="double-double")
+    t, u = [0.0, 1.0, 2.0, 4.0], ["0.1", "1/3", "-0.7", Fraction(1, 4)]
+    start = {"q": ["0.3"], "velocity": ["0.2"]}
+    with mp.workdps(50):
+        for kind, steps in (("linear", {"h": 0.07}), ("constant", {}), ("linear", {"tolerance": 1e-30})):
+            run = stepper.integrate(**start, **steps, t_end=3.7, inputs={"u": (t, u, kind)})
+            exact = driven_spring(t, [*map(Fraction, u)], 3.7, kind)
+            assert max(abs(run.mp(x)[-1, 0] - y) for x, y in zip("qp", exact, strict=True)) < 1e-30
+            inside = driven_spring(t, [*map(Fraction, u)], 1.3, kind)[0]
+            assert abs(as_mpmath(run.at(1.3)[0])[0] - inside) < 1e-30
+            many = stepper.integrate_ensemble(
+                [["0.3"]] * 2, velocity=[["0.2"]] * 2, **steps, t_end=3.7, inputs={"u": (t, [[0, 1, 2, 3], u], kind)}
+            )
+            assert (many[1].mp("q") == run.mp("q")).all()
+            assert (as_mpmath(many.energy()[: len(run), 1]) == run.mp("energy")).all()
+        held = stepper.start(**start, h=0.125)
+        for value in u[:3]:
+            held.set_inputs(u=value)
+            held.advance(8)
+        whole = stepper.integrate(**start, h=0.125, t_end=3.0, inputs={"u": ([0.0, 1.0, 2.0, 3.0], u, "constant")})
+        assert (as_mpmath(held.q) == whole.mp("q")[-1]).all()
+        constant = stepper.integrate(**start, h=0.125, steps=8, inputs={"u": "1/3"})
+        assert (
+            abs(constant.mp("q")[-1, 0] - driven_spring([0.0, 1.0], [Fraction(1, 3)] * 2, 1.0, "constant")[0]) < 1e-31
+        )
+    for wrong, message in (("u.csv", "not text; read a file first"), (([0, 1], ["a", 1]), "must be a real number")):
+        with pytest.raises(StateError, match=message):
+            stepper.integrate(**start, h=0.1, steps=3, inputs={"u": wrong})
+
+
+def test_global_errors_of_ensembles() -> None:
+    """The bound error= holds for each trajectory, with a local tolerance of its own."""
+    stepper = sc.compile_stepper(system("kepler"), "svi:12", precision="double-double")
+    with mp.workdps(50):
+        v = [["0", mp.sqrt(3)], ["0", "1.7"]]
+        runs = stepper.integrate_ensemble([["0.5", "0"]] * 2, velocity=v, t_end=2.0, error=1e-13)
+        assert runs.global_error.max() <= 1e-13
+        assert [each.precision for each in runs.confirmations] == ["double-double"] * 2
+        exact = exact_orbit(2.0)
+        error = max(abs(x - y) for x, y in zip(as_mpmath(runs.ends[1][0]), exact, strict=True))
+        assert 1e-28 < error < 1e-13
+    one = stepper.integrate(["0.5", "0"], velocity=v[0], t_end=2.0, error=1e-13)
+    assert (one.q_low[-1] == runs[0].q_low[-1]).all()
+
+
+@pytest.mark.parametrize("steps", [{"h": 0.07}, {"t_end": 2.0}])
+def test_recordings(steps: dict[str, float], tmp_path: Path) -> None:
+    """A recording that is interrupted and resumed has all bits of a run in memory; also checkpoints and files."""
+    stepper = sc.compile_stepper(system("kepler"), "svi:12", precision="double-double")
+    start = {"q": ["0.7", 0], "velocity": ["0", "1.3"], "t": 0.1, "parameters": {"m": "1.1", "mu": Fraction(6, 5)}}
+    count = {"steps": 40} if "h" in steps else {}
+    run = stepper.start(**start, **steps)
+    restored = stepper.from_checkpoint(run.checkpoint(), t_end=steps.get("t_end"))
+    assert (as_mpmath(restored.parameters) == as_mpmath(run.parameters)).all()
+    every = {"rows": 7, "checkpoint_steps": 5}
+    part = sc.record_run(run, tmp_path / "a.run", **every, **count, save_every=2, stop=lambda: run.steps >= 5)
+    assert not part.finished
+    assert part.steps == 5
+    whole, memory = sc.resume_run(tmp_path / "a.run"), stepper.integrate(**start, **steps, **count, save_every=2)
+    assert whole.finished
+    for name in ("t", "q", "p", "parameters", "energy", "momentum_maps"):
+        assert (whole[:].mp(name) == memory.mp(name)).all(), name
+    assert np.array_equal(whole.q[-1].low, memory.q_low[-1])
+    assert np.array_equal(whole.p[::3].low, memory.p_low[::3])
+    whole.save(tmp_path / "a.npz")
+    with np.load(tmp_path / "a.npz") as saved:
+        for name in ("t", "q", "p", "parameters"):
+            assert saved[f"{name}_low"].any() or name == "t"
+            assert np.array_equal(saved[f"{name}_low"], getattr(memory, name).low)
+    with pytest.raises(StateError, match=r"NAME\.npz"):
+        whole.save(tmp_path / "a.h5")
+
+
+def test_velocities_of_files() -> None:
+    """Files and datasets of a run whose last step is shorter have its velocities."""
+    stepper = sc.compile_stepper(system("kepler"), "svi:12", precision="double-double")
+    run = stepper.integrate(["0.5", 0], velocity=[0, "1.7"], h=0.0625, t_end=1.01)
+    derived = run.states().quantities
+    assert derived is not None
+    assert np.array_equal(derived(run.t, run.q, run.p)["velocity"], run.p)
+
+
+@pytest.mark.rotated
+def test_associative_math_is_an_error(tmp_path: Path) -> None:
+    """The C itself refuses to be compiled with reordered sums."""
+    stepper = sc.compile_stepper(system("kepler"), "svi:4", precision="double-double")
+    source = stepper.source.amalgamated()
+    (tmp_path / f"{source.prefix}.h").write_text(source.header)
+    (tmp_path / "step.c").write_text(source.code)
+    for flag, wanted in (("-ffast-math", "-fassociative-math"), ("-O1", "")):
+        command = ["cc", "-std=c99", flag, "-c", "step.c", "-o", "step.o"]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert (done.returncode != 0) == bool(wanted)
+        assert wanted in done.stderr
+
+
+@pytest.mark.second
+@pytest.mark.parametrize(("h", "t_end"), [(0.1, 20.0), (0.3, 3.0), (0.7, 2.1), (-0.3, -3.0), (0.25, 2.0), (0.15, 2.0)])
+def test_fixed_steps_end_at_the_final_time(h: float, t_end: float) -> None:
+    """y = 1 - t^2/2, and between impacts y = T s - s^2/2 with T = sqrt(2), at t_end, not at the multiple of h."""
+    ball = lagrange("ball", "y", "y_dot**2/2 - y")
+    stepper = sc.compile_stepper(ball, "svi:2", precision="double-double")
+    observed, reflected = sc.Event("y", -1), sc.Event("y", -1, then={"y_dot": "-y_dot"})
+    with mp.workdps(50):
+        t, T = mp.mpf(t_end), mp.sqrt(2)
+        s = abs(t) - (2 * mp.floor((abs(t) + T) / (2 * T)) - 1) * T
+        expected = 1 - t**2 / 2, T * s - s**2 / 2 if t > T else 1 - t**2 / 2
+        for events, y in zip((observed, reflected), expected, strict=True):
+            if t < 0 and events is reflected:
+                continue
+            for save_every in (1, 3):
+                run = stepper.integrate(["1"], ["0"], h=h, t_end=t_end, events=events, save_every=save_every)
+                assert run.mp("t")[-1] == t
+                assert abs(run.mp("q")[-1][0] - y) < 1e-30 * (1 + abs(y))
+                assert run.steps == round(t_end / h + 0.17)
+        many = stepper.integrate_ensemble([["1"]], [["0"]], h=h, t_end=t_end)
+        assert abs(many.mp("q")[-1][0][0] - expected[0]) < 1e-30 * (1 + t**2)
+
+
+@pytest.mark.rotated
+def test_times_have_two_words_or_are_refused() -> None:
+    """x = cos(a) - cos(t) - (t - a) sin(a) from rest at the origin at a = 1/10, where the size of the state is zero."""
+    system = lagrange("driven", "x", "x_dot**2/2 + x*cos(t)")
+    stepper = sc.compile_stepper(system, "svi:8", precision="double-double")
+    run = stepper.integrate([0.0], [0.0], t="0.1", h=0.125, steps=8)
+    again = stepper.integrate(run.q[3], run.p[3], t=run.t[3], h=0.125, steps=5)
+    with mp.workdps(50):
+        tenth = mp.mpf(1) / 10
+        assert abs(run.mp("q")[-1][0] - (mp.cos(tenth) - mp.cos(tenth + 1) - mp.sin(tenth))) < 1e-29
+        assert abs(again.mp("q")[-1] - run.mp("q")[-1]).max() < 1e-31
+    of_input = lagrange("driven", "x", "x_dot**2/2 + x*(cos(t) + u)", inputs="u")
+    inputs: dict[str, Any] = {"inputs": {"u": ([0.0, 0.5, 2.0], ["0", "1/3", "0"])}}
+    for driven, method, more in (
+        (system, "svi:8", {"h": 0.125, "steps": 8}),
+        (system, "svi:8", {"h": 0.125, "t_end": 1.1, "save_every": 5}),
+        (system, "svi:8", {"t_end": 1.1}),
+        (system, "svi:8", {"t_end": 1.1, "t_eval": [0.5, 1.1]}),
+        (system, "composition:6", {"h": -0.125, "t_end": -1.1}),  # SIMD lanes
+        (of_input, "svi:8", {"h": 0.125, "t_end": 1.1, **inputs}),
+    ):
+        stepper = sc.compile_stepper(driven, method, precision="double-double")
+        least = 4e-31 if method == "svi:8" and "h" in more else 0  # those in SIMD lanes have other rounding errors
+        with mp.workdps(50):
+            for t in (
+                "1/10",
+                Fraction(1, 10),
+                mp.mpf(1) / 10,
+                stepper.integrate([1], [0], t="0.1", h=1.0, steps=0).t[0],
+            ):
+                many = stepper.integrate_ensemble([[1], ["0.7"]], velocity=[[0], ["0.1"]], t=t, **more)
+                one = stepper.integrate(["0.7"], velocity=["0.1"], t="0.1", **more)
+                for name in ("t", "q", "p"):
+                    assert abs(many[1].mp(name) - one.mp(name)).max() <= least, (t, more, name)
+    for times in ({"t_end": Fraction(1, 10)}, {"t_end": 1.0, "t_eval": [Fraction(3, 10)]}):
+        with pytest.raises(StateError, match="must be doubles"):
+            stepper.integrate([0.0], [0.0], **times)
+        with pytest.raises(StateError, match="must be doubles"):
+            stepper.integrate_ensemble([[0.0]], [[0.0]], **times)
+
+
+def test_outputs_have_both_words_or_are_refused():
+    body = lagrange("body", "x", "(omega_1**2 + 2*omega_2**2 + 3*omega_3**2 + x_dot**2)/2", rotations={"R": "omega"})
+    stepper = sc.compile_stepper(body, "svi:3", precision="double-double")
+    start, moving = {"R": np.eye(3), "x": 1.0}, {"omega": [0.3, 0.8, 0.5], "x": 0.1}
+    run = stepper.integrate(start, velocity=moving, h=0.125, steps=8)
+    for name in ("x", "R_w", "q", "p", "velocity", "energy"):
+        values = run.mp(name)
+        assert max(abs(x - float(x)) for x in values[1:].ravel()) > 0.0, name
+    for name in ("R", "omega"):
+        with pytest.raises(sc.StateError, match=f"'{name}' has one word"):
+            run.mp(name)
+    for export in (run.to_dataframe, run.to_xarray):
+        with pytest.raises(sc.StateError, match="would lose the low words"):
+            export()

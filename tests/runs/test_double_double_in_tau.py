@@ -1,0 +1,251 @@
+"""Double-double steps in transformed time, against Kepler's equation and stage equations solved here in 60 digits."""
+
+import operator
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from mpmath import mp
+
+import scvi_codegen as sc
+from scvi_codegen.common.errors import MethodError
+from scvi_codegen.methods import as_method
+from scvi_codegen.methods.exact.step import derived_step
+from scvi_codegen.runs.states.pairs import product_of, quotient_of, sum_of
+from scvi_codegen.runs.states.words import as_mpmath, with_low
+
+pytestmark = pytest.mark.second
+
+KEPLER = sc.LagrangianSystem.from_text(
+    name="kepler",
+    coordinates=["x", "y"],
+    lagrangian="(x_dot**2 + y_dot**2)/2 + mu/sqrt(x**2 + y**2)",
+    parameters={"mu": 1.0},
+)
+ROD = sc.LagrangianSystem.from_text(
+    name="rod", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 - 1"]
+)
+RADIUS = "sqrt(x**2 + y**2)"
+
+
+@cache
+def stepper(method: str, g: str = "frequency", *, hamiltonian: bool = False) -> sc.Stepper:
+    system = sc.reparametrise(sc.hamiltonian_of(KEPLER) if hamiltonian else KEPLER, g)
+    return sc.compile_stepper(system, method, precision="double-double")
+
+
+@cache
+def reversible(method: str) -> sc.Stepper:
+    return sc.compile_stepper(KEPLER, method, time_transformation="frequency", precision="double-double")
+
+
+def start(e: str) -> dict[str, Any]:
+    """Return the pericentre of an orbit with semi-major axis 1."""
+    with mp.workdps(50):
+        return {"q": [1 - mp.mpf(e), 0], "velocity": [0, mp.sqrt((1 + mp.mpf(e)) / (1 - mp.mpf(e)))]}
+
+
+def largest(values: Any) -> float:
+    return float(max(map(abs, values)))
+
+
+def anomaly_error(run: Any, e: str, k: int) -> float:
+    """Return the error of Kepler's equation t = u - e sin u and of the velocity at state k."""
+    e, (x, y), (v, w) = mp.mpf(e), run.mp("q")[k], run.mp("p")[k]
+    axis, t = mp.sqrt(1 - e * e), run.mp("t")[k]
+    u = mp.atan2(y / axis, x + e)
+    u += 2 * mp.pi * mp.nint((t - (u - e * mp.sin(u))) / (2 * mp.pi))
+    rate = 1 / (1 - e * mp.cos(u))
+    return largest([u - e * mp.sin(u) - t, v + mp.sin(u) * rate, w - axis * mp.cos(u) * rate])
+
+
+def gauss_tables() -> tuple[list, list]:
+    """Return the coefficients of Gauss's method with two stages."""
+    root = mp.sqrt(3) / 6
+    quarter = mp.mpf(1) / 4
+    return [[quarter, quarter - root], [quarter + root, quarter]], [mp.mpf(1) / 2] * 2
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("hamiltonian", [False, True])
+def test_step(hamiltonian: bool) -> None:
+    """A step of K = r (H - E) and its duration, the integral of r, are those of Gauss's method in 60 digits."""
+    run = stepper("gauss:2", RADIUS, hamiltonian=hamiltonian).integrate(**start("0.9"), h=0.125, steps=3)
+    with mp.workdps(60):
+        A, b = gauss_tables()
+        h, E = mp.mpf("0.125"), run.mp("parameters")[1]
+        assert abs(E + mp.mpf(1) / 2) < 5e-31  # of 9.5 - 10
+
+        def rates(x: Any, y: Any, p: Any, w: Any) -> list:
+            r, K = mp.sqrt(x * x + y * y), (p * p + w * w) / 2 - E
+            return [r * p, r * w, -K * x / r, -K * y / r, r]  # K = r (p^2/2 - E) - 1
+
+        for k in (0, 2):
+            z = [*run.mp("q")[k], *run.mp("p")[k], run.mp("t")[k]]
+            f = [rates(*z[:4])] * 2
+            for _ in range(120):
+                f = [rates(*(z[i] + h * mp.fdot(line, [g[i] for g in f]) for i in range(4))) for line in A]
+            exact = [z[i] + h * mp.fdot(b, [g[i] for g in f]) for i in range(5)]
+            found = [*run.mp("q")[k + 1], *run.mp("p")[k + 1], run.mp("t")[k + 1]]
+            assert largest(a - c for a, c in zip(found, exact, strict=True)) < 2e-30 * largest(exact)
+
+
+@pytest.mark.second
+@pytest.mark.parametrize(
+    ("form", "method"), [("L", "svi:4"), ("K", "radau-iia:3"), ("K", "stoermer-verlet"), ("rod", "svi:3")]
+)
+def test_steps(form: str, method: str) -> None:
+    """Steps agree with the solution of the paper's equations in 60 digits, at an energy off the surface K = 0, too."""
+    plain, g, q, p = {
+        "L": (KEPLER, "frequency", [0.125, 0.0], [0.0, 4.0]),
+        "K": (sc.hamiltonian_of(KEPLER), "arclength", [0.125, 0.0], [0.0, 4.0]),
+        "rod": (ROD, "2 + y", [0.6, -0.8], [0.8, 0.6]),
+    }[form]
+    system = sc.reparametrise(plain, g)
+    each = sc.compile_stepper(system, method, precision="double-double")
+    q, p = each.project(q, p) if form == "rod" else (q, p)
+    run = each.integrate(q, p, h=0.125, steps=3, parameters={"E": -0.25})
+    known = system.with_parameters(E=-0.25)
+    derived = derived_step(known, as_method(method, known))
+    with mp.workdps(60):
+        for k in (0, 2):
+            exact = derived(*(list(run.mp(part)[k]) for part in "qp"), 0.125)
+            for part in "qp":
+                values = getattr(exact, part)
+                found = run.mp(part)[k + 1]
+                assert largest(a - b for a, b in zip(found, values, strict=True)) < 3e-31 * largest(values)
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("e", ["0.5", "0.9"])
+def test_kepler(e: str) -> None:
+    """States and times of fixed steps of tau, and a last step to t_end, satisfy Kepler's equation to 1e-28."""
+    run = stepper("svi:16").integrate(**start(e), h=0.125, t_end=7.5)
+    with mp.workdps(50):
+        assert max(anomaly_error(run, e, k) for k in range(0, len(run), 5)) < 1e-28
+        assert anomaly_error(run, e, -1) < 1e-28
+        assert run.t[-1] == 7.5
+        assert largest(run.mp("energy") + mp.mpf(1) / 2) < 1e-28
+        v = stepper("svi:16").velocity(run.q, run.p, 0.0, run.parameters)
+        assert largest((as_mpmath(v) - run.mp("p")).ravel()) < 1e-29  # dq/dt, of unit mass
+        p = stepper("svi:16").momentum(run.q[3], v[3], 0.0, run.parameters)
+        assert largest(as_mpmath(p) - run.mp("p")[3]) < 1e-29
+
+
+def test_output_times_and_events() -> None:
+    """Dense output, output times, events and thinned runs are met with both words."""
+    with mp.workdps(50):
+        each = stepper("svi:12", RADIUS)
+        run = each.integrate(**start("0.5"), h=0.125, steps=60, events="y")
+        thinned = each.integrate(**start("0.5"), h=0.125, steps=60, save_every=7)
+        times = each.integrate(**start("0.5"), h=0.125, t_end=6.5, t_eval=[0.1, 3.3])
+        for k, t in enumerate((0.1, 3.3)):
+            for states in (run, thinned):
+                q = as_mpmath(states.at([t])[0][0])
+                assert largest(q - times.mp("q")[k]) < 1e-29
+        assert np.abs(thinned.sensitivity().state[-1] - run[:57].sensitivity().state[-1]).max() < 1e-10
+        crossings = [t.mp() for t in run.events[0].t]
+        assert len(crossings) == 2
+        assert largest(t - (k + 1) * mp.pi for k, t in enumerate(crossings)) < 1e-28
+        assert largest(as_mpmath(run.events[0].q)[:, 1]) < 1e-30
+        ended = each.integrate(**start("0.5"), h=0.125, steps=60, events=sc.Event("y", -1, terminal=True))
+        assert abs(ended.mp("t")[-1] - mp.pi) < 1e-28
+        halves = each.start(**start("0.5"), h=0.125)
+        halves.advance(20)
+        again = each.from_checkpoint(halves.checkpoint()).record(40)
+        assert (again.mp("q") == run.mp("q")[20:]).all()
+        assert (again.mp("t") == run.mp("t")[20:]).all()
+
+
+def test_reversible_controller() -> None:
+    """Steps of equal tau are those of the step sizes dt = g dtau in physical time, and the last one ends at t_end."""
+    run = reversible("svi:12").integrate(**start("0.5"), h=0.25, t_end=6.5)
+    plain = sc.compile_stepper(KEPLER, "svi:12", precision="double-double")
+    with mp.workdps(50):
+        for k in (0, 5, len(run) - 2):
+            h = run.mp("t")[k + 1] - run.mp("t")[k]
+            at = {"t": run.t[k], "h": float(h), "t_end": run.t[k + 1]} if k + 2 == len(run) else {"h": float(h)}
+            one = plain.integrate(run.q[k], run.p[k], **at, **({} if "t_end" in at else {"steps": 1}))
+            assert largest(one.mp("q")[-1] - run.mp("q")[k + 1]) < 1e-31
+            assert largest(one.mp("p")[-1] - run.mp("p")[k + 1]) < 3e-31
+        assert run.t[-1] == 6.5
+        assert anomaly_error(run, "0.5", -1) < 1e-22
+    double = sc.compile_stepper(KEPLER, "svi:12", time_transformation="frequency").integrate(
+        [0.5, 0.0], velocity=[0.0, 3.0**0.5], h=0.25, t_end=6.5
+    )
+    assert len(double) == len(run)
+    assert np.abs(double.t - run.t).max() < 1e-13
+    assert np.ptp(run.step_sizes[:-2]) > 0.1
+
+
+@pytest.mark.second
+def test_order_of_the_reversible_controller() -> None:
+    """At small steps the error against Kepler's equation is round-off; constraints and forces go with it, too."""
+    with mp.workdps(50):
+        run = reversible("svi:16").integrate(**start("0.9"), h=0.0625, t_end=6.5)
+        assert anomaly_error(run, "0.9", -1) < 1e-27
+        assert run.energy_error() < 1e-28
+        swing = sc.compile_stepper(ROD, "svi:4", time_transformation="2 + y", precision="double-double")
+        held = swing.integrate(["0.6", "-0.8"], velocity=["0.8", "0.6"], h=0.125, t_end=3.0)
+        assert max(np.abs(each).max() for each in held.constraint_values()) < 1e-30
+
+
+def walk_of_energy(g: str, method: str, steps: int) -> np.ndarray:
+    """Return K = g (H - E) along six orbits, minus its mean over the first twentieth of the steps."""
+    found = []
+    for k in range(6):
+        with mp.workdps(50):
+            (r, _), (_, v) = start(str(0.9 - k / 1000)).values()
+            c, s = mp.cos(k), mp.sin(k)
+        run = stepper(method, g).integrate(
+            [r * c, r * s], velocity=[-v * s, v * c], h=0.125, steps=steps, save_every=steps // 1000
+        )
+        energy = run.energy()
+        rates = np.hypot(*run.q.T) ** (1.0 if g == RADIUS else 1.5)
+        found.append(rates * np.asarray(energy - energy[0]))
+    K = np.array(found)
+    return K - K[:, 1:51].mean(axis=1, keepdims=True)
+
+
+@pytest.mark.rotated
+@pytest.mark.parametrize(
+    ("g", "steps", "most"),
+    [
+        ("frequency", 5000, 1.2e-33),
+        pytest.param(RADIUS, 200_000, 2.5e-33, marks=pytest.mark.full),
+        pytest.param("frequency", 200_000, 1.2e-33, marks=pytest.mark.full),
+    ],
+)
+def test_energy_performs_a_random_walk(g: str, steps: int, most: float) -> None:
+    """K = 0 changes by rounding errors alone, without drift, whose root mean square grows with that of the steps."""
+    K = walk_of_energy(g, "svi:16", steps)
+    for part in (200, 1000):
+        ends = K[:, part - 20 : part].mean(axis=1)
+        assert np.sqrt((ends**2).mean()) < most * np.sqrt(part / 1000 * steps)
+
+
+@pytest.mark.quick
+def test_other_systems() -> None:
+    """Constraints and arrays of known sizes in transformed time; what it excludes stays an error with its remedy."""
+    swing = sc.compile_stepper(sc.reparametrise(ROD, "2 + y"), "svi:4", precision="double-double")
+    q, p = swing.project([0.6, -0.8], [0.8, 0.6])
+    run = swing.integrate(q, p, h=0.0625, steps=20)
+    assert max(np.abs(each).max() for each in run.constraint_values()) < 1e-30
+    assert run.energy_error() < 1e-9
+    with pytest.raises(MethodError, match=r"fixed step in tau"):
+        swing.integrate(q, p, t_end=1.0)
+
+
+@pytest.mark.quick
+def test_arithmetic() -> None:
+    """Sums, products and quotients of arrays of two words are accurate to 1e-31; of doubles they are those of NumPy."""
+    rng = np.random.default_rng(5)
+    high = rng.uniform(0.5, 2.0, (2, 100))
+    x, y = (with_low(each, each * 2.0**-54 * rng.uniform(-1, 1, 100)) for each in high)
+    with mp.workdps(50):
+        a, b = map(as_mpmath, (x, y))
+        for function, plain in ((sum_of, operator.add), (product_of, operator.mul), (quotient_of, operator.truediv)):
+            exact = plain(a, b)
+            assert largest((as_mpmath(function(x, y)) - exact) / exact) < 3e-32
+            assert (function(*high) == plain(*high)).all()

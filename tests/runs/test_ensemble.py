@@ -1,0 +1,962 @@
+"""Ensembles equal single trajectories, trajectories leave each other alone, and a run can be stopped."""
+
+from __future__ import annotations
+
+import gc
+import pickle
+import re
+import signal
+import threading
+import tracemalloc
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from commands import error_of, invoke, output_of
+from notation import hamilton, lagrange
+from numpy.testing import assert_allclose
+from samples import pushed_pendulum, sample_named, stepper_for
+from scipy.interpolate import CubicSpline
+
+import scvi_codegen as sc
+from benchmarks.cases.robots import chain
+from scvi_codegen.interfaces.models.model_files.ensemble_file import load_ensemble
+from scvi_codegen.methods import Method
+from scvi_codegen.runs.ensembles.ensemble import Ensemble
+from scvi_codegen.runs.ensembles.lanes import LaneRuns
+
+KINDS = {
+    "separable": "kepler",
+    "coupled": "double-pendulum",
+    "time-dependent": "driven-duffing",
+    "coupled and time-dependent": "pumped-cart-pole",
+    "not quadratic": "relativistic-particle",
+    "magnetic": "charged-particle",
+}
+METHODS = [sc.SVI(5), sc.Gauss(3), sc.RadauIIA(2), sc.StoermerVerlet(), sc.SCVI(3)]
+KNOTS = np.array([0.0, 0.37, 0.9, 1.41, 2.05, 2.6])
+VALUES = np.array([0.0, 1.2, -0.7, 0.4, 1.9, -1.0])
+COUNT = 11
+"""Trajectories with inputs: more than a block of lanes, and no multiple of one."""
+OWN_VALUES = VALUES * np.random.default_rng(1).uniform(0.5, 1.5, (COUNT, 1))
+DAMPING = {"c": np.random.default_rng(4).uniform(0.1, 0.3, COUNT)}
+W = ([0.0, 3.0], [0.0, 0.3])
+ECCENTRICITIES = np.array([0.0, 0.3, 0.6, 0.9])
+ENDS = [5.0, 10.0, 20.0, 15.0]
+
+
+def coupled_with_inputs() -> sc.LagrangianSystem:
+    """Return a system with position-dependent masses, whose iterations start with velocities."""
+    return sc.LagrangianSystem.from_text(
+        name="coupled",
+        coordinates=["x", "y"],
+        lagrangian="(1 + x**2/4)*x_dot**2/2 + x_dot*y_dot/3 + (1 + w/5)*y_dot**2 - x**4/4 - (x - y)**2/2",
+        parameters={"c": 0.2},
+        forces={"x": "u - c*x_dot"},
+        inputs=["u", "w"],
+    )
+
+
+RELATIVISTIC = hamilton("relativistic", "q", "sqrt(1 + p_q**2) + k*q**2/2 + cos(t)*q", k=1.0)
+FALLING = lagrange("falling", "x", "x_dot**2/2 + 1/x", forces={"x": "u"}, inputs="u")
+ROOT = lagrange("root", "q", "q_dot**2/2 + cos(q)", forces={"q": "sqrt(u)"}, inputs="u")
+OWN_SYSTEMS = {"relativistic": RELATIVISTIC, "falling": FALLING, "root": ROOT}
+WITH_INPUTS = {"pushed pendulum": pushed_pendulum, "coupled with inputs": coupled_with_inputs}
+
+
+@cache
+def stepper_of(system: str, method: Method) -> sc.Stepper:
+    if system in OWN_SYSTEMS:
+        return sc.compile_stepper(OWN_SYSTEMS[system], method)
+    if system in WITH_INPUTS:
+        solver = "newton" if isinstance(method, sc.SCVI) else "auto"  # which has no lanes
+        return sc.compile_stepper(WITH_INPUTS[system](), method, solver=solver)
+    return stepper_for("kepler" if system in ("eccentric", "into the centre") else system, method)
+
+
+def states(name: str, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """(count, m) positions and momenta about the generic state of a system."""
+    if name == "eccentric":
+        zero, e = np.zeros(4), ECCENTRICITIES
+        return np.column_stack([1 - e, zero])[:count], np.column_stack([zero, np.sqrt((1 + e) / (1 - e))])[:count]
+    if name == "into the centre":
+        q, p = states("eccentric", count)
+        return q, np.where(np.arange(count)[:, None] == 1, 0.0, p)
+    if name == "falling":
+        return np.array([[1.0], [9.0]]), np.zeros((2, 1))
+    if name == "runaway":
+        q, p = np.random.default_rng(3).uniform([[-1.2], [-0.6]], [[-0.8], [-0.4]], (count, 2, 1)).transpose(1, 0, 2)
+        q[3], p[3] = 1.0, 1.0
+        return q, p
+    if name in WITH_INPUTS or name in OWN_SYSTEMS:
+        dimension = stepper_of(name, sc.SVI(3)).dimension
+        return tuple(np.random.default_rng(2).uniform(-1, 1, (2, count, dimension)))
+    q, p = sample_named(name).state
+    generator = np.random.default_rng(7)
+    return tuple(x * (1.0 + 0.1 * generator.uniform(-1, 1, (count, len(x)))) for x in (q, p))  # type: ignore[return-value]
+
+
+def of_one(arguments: dict[str, Any], j: int) -> dict[str, Any]:
+    """The arguments of trajectory j: rows of tables of inputs, entries of parameters, constants and end times."""
+
+    def entry(value: Any) -> Any:
+        if isinstance(value, tuple):
+            t, values, *kind = value
+            return (t, values[j] if np.ndim(values) == 2 else values, *kind)
+        return value[j] if np.ndim(value) else value
+
+    own = {name: value for name, value in arguments.items() if name != "threads"}
+    for name in own.keys() & {"parameters", "inputs"}:
+        own[name] = {key: entry(value) for key, value in own[name].items()}
+    return own | ({"t_end": entry(own["t_end"])} if "t_end" in own else {})
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """An ensemble of so many states, the relative difference from single runs, 0 for the same bits, and which fails."""
+
+    system: str
+    method: Method
+    count: int
+    arguments: dict[str, Any]
+    tolerance: float = 0.0
+    failing: int | None = None
+
+    def run(self, **more: Any) -> sc.EnsembleTrajectory:
+        q, p = states(self.system, self.count)
+        return stepper_of(self.system, self.method).integrate_ensemble(q, p, **self.arguments, **more)
+
+    def check(self) -> None:
+        runs, stepper = self.run(), stepper_of(self.system, self.method)
+        assert runs.ok.tolist() == [j != self.failing for j in range(self.count)]
+        energies, errors = runs.energy(), runs.momentum_errors()
+        for j, (t, q, p, _, steps) in enumerate(runs.each()):
+            arguments = of_one(self.arguments, j)
+            if "t_eval" in arguments:
+                arguments["t_eval"] = [time for time in arguments["t_eval"] if time <= arguments["t_end"]]
+            own, status = (x[j] for x in states(self.system, self.count)), "ok"
+            try:
+                run = stepper.integrate(*own, **arguments)
+            except sc.StepFailedError as error:
+                run, status = error.trajectory, error.status
+            tolerance = self.tolerance * (1.0 if status == "ok" else 1e3)  # near a singularity errors grow
+            assert (runs.status[j], steps) == (status, run.steps)
+            assert np.array_equal(t, run.t)
+            for found, expected in ((q, run.q), (p, run.p)):
+                assert np.abs(found - expected).max() <= tolerance * np.abs(expected).max()
+            if status == "ok":
+                energy = run.energy()
+                assert_allclose(energies[: len(t), j], energy, rtol=0, atol=20 * tolerance * np.abs(energy).max())
+                assert_allclose(errors[: len(t), j], run.momentum_errors(), rtol=0, atol=20 * tolerance)
+            assert all(np.isnan(x[len(t) :, j]).all() for x in (runs.q, runs.p, energies))
+
+
+ADAPTIVE = {"t_end": ENDS, "tolerance": 1e-10}
+INPUTS = {"u": (KNOTS, OWN_VALUES), "w": W}
+CUBIC = {"u": (KNOTS, OWN_VALUES), "w": ([0.0, 1.0, 3.0], [0.0, 0.5, 0.0], "cubic")}
+SECOND_FAILS = np.outer(np.arange(COUNT) == 2, np.arange(6) == 4)
+STIFF = np.where(np.arange(9) % 4 == 1, 1e6, 1.0)
+CASES = {
+    **{
+        str(count): Case(
+            "kepler",
+            sc.SVI(5),
+            count,
+            {"h": 0.05, "steps": 40, "save_every": 3, "parameters": {"mu": np.linspace(0.8, 1.2, count)}},
+            3e-13,
+        )
+        for count in (1, 7, 8, 9, 64)
+    },
+    **{
+        f"backward {method.name}": Case("driven-duffing", method, 9, {"h": -0.02, "steps": 50, "t": 2.0}, 3e-13)
+        for method in (sc.SVI(5), sc.SCVI(3), sc.Composition.of(8))
+    },
+    "drift of momenta": Case(
+        "relativistic",
+        sc.Composition.of(4),
+        9,
+        {"h": 0.1, "t_end": 1.94, "parameters": {"k": np.linspace(1, 2, 9)}},
+        3e-14,
+    ),
+    "newton": Case(
+        "harmonic-oscillator", sc.SVI(5), 9, {"h": 0.5, "steps": 50, "save_every": 7, "parameters": {"k": STIFF}}, 1e-10
+    ),
+    **{
+        f"h = {h}, {threads} threads": Case(
+            "eccentric", sc.SVI(4), 4, {"h": h, "t_end": t_end, "threads": threads, "save_every": threads}, 1e-15
+        )
+        for h, t_end in ((0.03, 0.1), (-0.03, -0.1), (0.25, 0.1))
+        for threads in (1, 2)
+    },
+    "adaptive": Case("eccentric", sc.SVI(4), 4, ADAPTIVE),
+    "adaptive in threads": Case("eccentric", sc.SVI(4), 4, ADAPTIVE | {"save_every": 7, "threads": 3}),
+    "at times": Case("eccentric", sc.SVI(4), 4, ADAPTIVE | {"t_eval": np.linspace(0.0, 20.0, 9)}),
+    "at their ends": Case("eccentric", sc.SVI(4), 4, ADAPTIVE | {"t_eval": sorted(ENDS)}),
+    "adaptive backward": Case(
+        "eccentric", sc.SVI(4), 2, {"t_end": -3.0, "tolerance": 1e-10, "parameters": {"mu": [1.0, 1.2]}}
+    ),
+    **{
+        f"{name} constants": Case(
+            "pushed pendulum", sc.SVI(2), 3, {"inputs": {"u": np.array([0.3, -1.2, 0.3]), "w": 0.5}, **plan}, tolerance
+        )
+        for name, plan, tolerance in (("fixed", {"h": 0.1, "steps": 7}, 1e-14), ("adaptive", {"t_end": 0.7}, 1e-14))
+    },
+    "inputs": Case(
+        "coupled with inputs",
+        sc.SVI(3),
+        COUNT,
+        {"inputs": INPUTS, "parameters": DAMPING, "h": 0.05, "t_end": 2.3},
+        2e-14,
+    ),
+    "inputs without lanes": Case(
+        "pushed pendulum",
+        sc.SCVI(2),
+        COUNT,
+        {"inputs": INPUTS, "parameters": DAMPING, "h": 0.02, "t_end": 2.3, "save_every": 4},
+    ),
+    "adaptive inputs": Case(
+        "pushed pendulum",
+        sc.SVI(4),
+        COUNT,
+        {"inputs": CUBIC, "parameters": DAMPING, "t_end": np.linspace(0.2, 2.5, COUNT)},
+    ),
+    "adaptive inputs backward": Case(
+        "pushed pendulum",
+        sc.SVI(4),
+        COUNT,
+        {"inputs": CUBIC, "parameters": DAMPING, "t": 2.5, "t_end": 0.0, "tolerance": 1e-6, "save_every": 5},
+    ),
+}
+
+FAILING = {
+    **{
+        f"diverging {method.name}": Case("runaway", method, 16, {"h": 0.05, "steps": 60}, 1e-12, 3)
+        for method in (sc.SVI(5), sc.SCVI(3), sc.StoermerVerlet())
+    },
+    **{
+        f"at the start, {place}": Case(
+            "relativistic-particle",
+            sc.SVI(5),
+            7,
+            {"h": 0.05, "steps": 50, "parameters": dict.fromkeys(("m", "c", "k"), 1.0 * (np.arange(7) != place))},
+            1e-14,
+            place,
+        )
+        for place in (3, 6)
+    },
+    "adaptive": Case("into the centre", sc.SVI(4), 4, ADAPTIVE, 0.0, 1),
+    "square root": Case(
+        "root",
+        sc.SVI(3),
+        COUNT,
+        {"inputs": {"u": (KNOTS, np.where(SECOND_FAILS, -3.0, np.abs(OWN_VALUES) + 0.1))}, "h": 0.1, "t_end": 2.3},
+        1e-13,
+        2,
+    ),
+    "adaptive inputs": Case(
+        "falling", sc.SVI(4), 2, {"inputs": {"u": ([0.0, 0.5, 3.0], [0.0, 0.1, 0.1])}, "t_end": 2.5}, 0.0, 0
+    ),
+}
+"""With one trajectory that fails: between others, as the last, whose lane is filled with a copy, and in a segment."""
+
+
+@pytest.mark.tiers(0, 1)
+@pytest.mark.parametrize("name", FAILING)
+def test_a_failing_trajectory_equals_its_single_run_and_does_not_affect_others(name: str) -> None:
+    FAILING[name].check()
+
+
+@pytest.mark.tiers(5, 6)
+@pytest.mark.filterwarnings("ignore::scvi_codegen.common.errors.AccuracyWarning")
+@pytest.mark.parametrize("name", CASES)
+def test_each_trajectory_equals_the_single_run(name: str) -> None:
+    CASES[name].check()
+
+
+@pytest.mark.tiers(0, 2)
+@pytest.mark.sampled(2)
+@pytest.mark.covering
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
+def test_systems_and_methods_equal_single_runs(kind: str, method: Method) -> None:
+    """Measured 2e-14: rounding of 60 steps, magnified by the motion."""
+    Case(KINDS[kind], method, 3, {"h": 0.02, "steps": 60, "save_every": 20, "t": 0.3}, 3e-13).check()
+
+
+@pytest.mark.tiers(0, 2)
+@pytest.mark.sampled(3)
+@pytest.mark.filterwarnings("ignore::scvi_codegen.common.errors.AccuracyWarning")
+@pytest.mark.parametrize("kind", ["constant", "linear", "cubic"])
+@pytest.mark.parametrize("method", [sc.SVI(3), sc.StoermerVerlet(), sc.Gauss(2)], ids=lambda method: method.name)
+def test_trajectories_with_inputs_equal_single_runs(method: Method, kind: str) -> None:
+    assert stepper_of("pushed pendulum", method).ensemble is not None
+    common = {"inputs": {"u": (KNOTS, OWN_VALUES, kind), "w": W}, "parameters": DAMPING}
+    for plan in ({"h": 0.1, "t_end": 2.3}, {"h": -0.1, "t": 2.55, "t_end": 0.02, "save_every": 3}):
+        Case("pushed pendulum", method, COUNT, common | plan, 4e-15).check()
+
+
+@pytest.mark.second
+def test_iterations_of_coupled_systems_start_with_velocities() -> None:
+    stepper = stepper_of("coupled with inputs", sc.SVI(3))
+    assert stepper.ensemble is not None
+    assert "_NEEDS_VELOCITIES = 1" in stepper.ensemble.header
+    assert stepper_of("pushed pendulum", sc.SCVI(2)).ensemble is None
+
+
+def test_constant_inputs_are_parameters() -> None:
+    stepper, start = stepper_of("pushed pendulum", sc.SVI(3)), ([0.2], [0.1])
+    for plan in ({"h": 0.1, "steps": 7}, {"t_end": 0.7}):
+        by_input = stepper.integrate(*start, inputs={"u": -1.2, "w": 0.5}, parameters={"c": 0.1}, **plan)
+        by_name = stepper.integrate(*start, parameters={"c": 0.1, "u_0": -1.2, "w_0": 0.5}, **plan)
+        assert np.array_equal(by_input.q, by_name.q)
+
+
+@pytest.mark.second
+def test_parameters_are_named_rows_or_one_row_per_trajectory() -> None:
+    stepper = stepper_for("planar-pendulum", sc.SVI(5))
+    q, p = states("planar-pendulum", 3)
+    each = stepper.integrate_ensemble(q, p, h=0.1, steps=5, parameters={"g": [1.0, 2.0, 3.0], "l": 2.0})
+    columns = [stepper.parameters.index(name) for name in ("g", "l")]
+    assert each.parameters[:, columns].T.tolist() == [[1.0, 2.0, 3.0], [2.0] * 3]
+    again = stepper.integrate_ensemble(q, p, h=0.1, steps=5, parameters=each.parameters)
+    assert np.array_equal(again.q, each.q)
+    same = stepper.integrate_ensemble(q, p, h=0.1, steps=5, parameters=each.parameters[0])
+    assert np.array_equal(same.parameters, np.tile(each.parameters[0], (3, 1)))
+
+
+@pytest.mark.second
+def test_options_are_passed_to_the_lanes() -> None:
+    stepper = stepper_for("double-pendulum", sc.SVI(5))
+    q, p = states("double-pendulum", 8)
+    loose = stepper.integrate_ensemble(q, p, h=0.05, steps=20, options=sc.SolverOptions(tolerance=1e-4))
+    exact = stepper.integrate_ensemble(q, p, h=0.05, steps=20)
+    assert loose.ok.all()
+    assert 1e-14 < np.abs(loose.q - exact.q).max() < 1e-3
+
+
+def test_ensembles_with_few_or_no_steps() -> None:
+    stepper = stepper_for("kepler", sc.SVI(5))
+    q, p = states("kepler", 9)
+    assert stepper.integrate_ensemble(q, p, h=0.1, steps=0).q.shape == (1, 9, 2)
+    result = stepper.integrate_ensemble(q, p, h=0.1, steps=3, save_every=5)
+    assert result.q.shape == (1, 9, 2)
+    assert result.steps.tolist() == [3] * 9
+    assert len(stepper.integrate_ensemble([1.0, 0.0], [0.0, 1.0], h=0.1, steps=5)) == 1
+    shorter_last = Case("eccentric", sc.SVI(4), 4, {"h": 0.03, "t_end": 0.1, "save_every": 2}).run()
+    assert shorter_last.t.tolist() == [0.0, 0.06, 0.1]
+    assert shorter_last[0].at(0.08)[0] == pytest.approx(Case("eccentric", sc.SVI(4), 1, {"t_end": 0.08}).run().q[-1, 0])
+    still = Case("pushed pendulum", sc.SVI(3), COUNT, {"inputs": INPUTS, "h": 0.1, "t": 0.4, "t_end": 0.4}).run()
+    assert still.t.tolist() == [0.4]
+    assert still.ok.all()
+    assert still.energy().shape == (1, COUNT)
+
+
+@pytest.mark.parametrize("t_eval", [[2.0, 5.0], [0.5, 2.0, 5.0]])
+def test_ends_with_output_times_are_those_of_terminal_events(t_eval: list[float]) -> None:
+    stepper = stepper_for("kepler", sc.SVI(5)).with_events(sc.Event("q1 - 1/2", -1, terminal=True))
+    start = {"q": [[1.0, 0.0], [1.0, 0.0]], "velocity": [[0.0, 1.0], [0.0, 1.1]], "t_end": 5.0}
+    runs, alone = (stepper.integrate_ensemble(**start, t_eval=each) for each in (t_eval, None))
+    for its, expected in zip(runs.ends, alone.ends, strict=True):
+        assert np.array_equal(its, expected)
+    assert runs.ends[0][0] == pytest.approx(np.arccos(0.5), rel=1e-12)
+    stopped = stepper.integrate_ensemble(**start | {"t_end": [0.3, 5.0]}, t_eval=[0.5, 5.0])
+    assert np.isnan(stopped.ends[0]).tolist() == [True, False]
+
+
+@pytest.mark.second
+def test_results_have_target_times_and_are_pickled() -> None:
+    runs = CASES["adaptive"].run()
+    assert [plan.t_end for plan in runs.plans] == ENDS
+    assert runs.h == 0.0
+    times, q, _ = runs.ends
+    assert times.tolist() == ENDS
+    assert np.array_equal(q[2], list(runs.each())[2][1][-1])
+    driven = CASES["inputs"].run()
+    assert np.array_equal(pickle.loads(pickle.dumps(driven)).energy(), driven.energy())
+    stepper = stepper_for("kepler", sc.SVI(5))
+    again, start = pickle.loads(pickle.dumps(stepper)), states("kepler", 9)
+    first, second = (each.integrate_ensemble(*start, h=0.05, steps=20) for each in (stepper, again))
+    assert np.array_equal(first.q, second.q)
+
+
+@pytest.fixture(scope="module")
+def kepler() -> sc.Stepper:
+    return stepper_for("kepler", sc.SVI(5))
+
+
+class TestFailures:
+    @pytest.mark.second
+    def test_block_without_active_trajectories_stops(self):
+        stepper = stepper_for("relativistic-particle", sc.SVI(5))
+        q, p = states("relativistic-particle", 8)
+        nothing = dict.fromkeys(stepper.parameters, 0.0)
+        reports: list[int] = []
+
+        def report(done: int) -> None:
+            reports.append(done)
+            assert len(reports) < 100  # an empty block that went on would report for minutes
+
+        settings = {"parameters": nothing, "progress": report}
+        result = stepper.integrate_ensemble(q, p, h=0.05, steps=10**9, save_every=10**8, **settings)
+        assert set(result.steps) == {0}
+
+    def test_inactive_lanes_change_neither_bits_nor_iterations_of_others(self, kepler: sc.Stepper):
+        """Nor the predictor: a narrow orbit and undefined states beside a circular one."""
+        ends = []
+        for radius in (1.0, 1e-4, 0.0, np.nan):
+            q, p = np.tile([1.0, 0.0], (2, 1)), np.tile([0.0, 1.0], (2, 1))
+            runs = Ensemble(kepler, q, p, h=0.1, steps=20).common
+            assert runs is not None
+            batch = runs.batch()
+            assert isinstance(batch, LaneRuns)
+            block = batch.call(0, 2)
+            block.begin()
+            block.lanes("q")[0, 1:] = radius
+            block.active[1:] = 0.0
+            block.struct.end = 1  # others are not continued
+            block.advance()
+            states = runs.q[:, 0].tobytes(), runs.p[:, 0].tobytes()
+            ends.append((*states, block.memory.iterations, block.memory.guess))
+        assert len(set(ends)) == 1
+
+
+@pytest.mark.tiers(3, 4)
+@pytest.mark.filterwarnings("ignore::scvi_codegen.common.errors.AccuracyWarning")
+@pytest.mark.parametrize(
+    ("name", "method", "plan"),
+    [
+        ("kepler", sc.SVI(5), {"h": 0.3, "steps": 40}),
+        ("kepler", sc.SVI(5), {"t_end": 3.0, "tolerance": 1e-8}),
+        ("kepler", sc.Composition.of(4), {"h": 0.3, "t_end": 2.0}),
+        ("double-pendulum", sc.SVI(3), {"h": 0.1, "steps": 20}),
+        ("double-pendulum", sc.SCVI(3), {"h": 0.1, "steps": 6}),
+        ("chain", sc.SVI(2), {"h": 0.1, "steps": 20}),
+    ],
+    ids=lambda value: getattr(value, "name", value) if not isinstance(value, dict) else next(iter(value)),
+)
+def test_bits_of_trajectories_do_not_depend_on_others(
+    name: str, method: Method, plan: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In another order, in parts, in threads and calls: with different iterations, accelerated and failed steps."""
+    monkeypatch.setattr("scvi_codegen.runs.ensembles.batches.FIRST_CHUNK_STEPS", 7)  # calls end within blocks
+    generator = np.random.default_rng(4)
+    if name == "chain":  # slow iterations
+        stepper, count = sc.compile_stepper(chain(4).system, method), 136
+        q, p = generator.uniform(-1.5, 1.5, (count, 4)), generator.uniform(-0.1, 0.1, (count, 4))
+    else:
+        stepper, count = stepper_for(name, method), 136
+        q, p = (x * generator.choice([-1.0, 1.0], x.shape) for x in states(name, count))
+        q[3], p[3] = (0.0, p[3]) if name == "kepler" else (q[3], 1e4)
+    runs = stepper.integrate_ensemble(q, p, **plan, threads=1)
+    order = generator.permutation(count)
+    others = [stepper.integrate_ensemble(q[order], p[order], **plan, threads=3)]
+    others += [stepper.integrate_ensemble(q[part], p[part], **plan) for part in (slice(2, 5), slice(5, 20))]
+    for one, members in zip(others, (order, np.arange(2, 5), np.arange(5, 20)), strict=True):
+        for found, expected in ((one.q, runs.q), (one.p, runs.p)):
+            rows = min(len(found), len(expected))
+            assert found[:rows].tobytes() == expected[:rows, members].tobytes()
+        assert one.status.tolist() == runs.status[members].tolist()
+        assert one.steps.tolist() == runs.steps[members].tolist()
+
+
+def test_trajectories_that_share_the_end_of_iterations_differ_by_rounding_errors() -> None:
+    stepper, (q, p) = stepper_for("kepler", sc.SVI(5)), states("kepler", 40)
+    alone, shared = (
+        stepper.integrate_ensemble(q, p, h=0.3, steps=40, options=sc.SolverOptions(reproducible=reproducible))
+        for reproducible in (True, False)
+    )
+    assert alone.q.tobytes() == stepper.integrate_ensemble(q, p, h=0.3, steps=40).q.tobytes() != shared.q.tobytes()
+    assert np.abs(shared.q - alone.q).max() < 1e-12
+    with pytest.raises(sc.StateError, match="reproducible must be True or False"):
+        sc.SolverOptions(reproducible=1)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("method", "plan", "reason"),
+    [
+        ("svi:4", {"t_end": 1.0}, "one after the other .adaptive steps"),
+        ("stoermer-verlet", {"h": 0.1, "steps": 3}, "explicit steps have no iterations"),
+        ("scvi:2", {"h": 0.1, "steps": 3}, "those of this method are integrated one after the other"),
+    ],
+)
+def test_shared_iterations_are_refused_where_there_are_none(method: str, plan: dict[str, Any], reason: str) -> None:
+    q, p = states("kepler", 3)
+    stepper = sc.compile_stepper(sc.problem("kepler").system, method)
+    with pytest.raises(sc.StateError, match=rf"reproducible=False \(--shared.*{reason}.*: omit it"):
+        stepper.integrate_ensemble(q, p, **plan, options=sc.SolverOptions(reproducible=False))
+
+
+class TestThreadsAndInterruption:
+    def test_results_do_not_depend_on_the_number_of_threads(self, kepler: sc.Stepper):
+        q, p = states("kepler", 64)
+        q[20] = 0.0
+        one, two = (kepler.integrate_ensemble(q, p, h=0.05, steps=300, threads=threads) for threads in (1, 2))
+        assert one.q.tobytes() == two.q.tobytes()  # NaN included
+        assert one.p.tobytes() == two.p.tobytes()
+        assert one.status.tolist() == two.status.tolist()
+
+    @pytest.mark.parametrize("method", [sc.SVI(5), sc.SCVI(2)], ids=lambda method: method.name)
+    def test_progress_counts_up_to_the_end(self, method: Method):
+        stepper = stepper_for("kepler", method)
+        q, p = states("kepler", 32)
+        calls: list[int] = []
+        stepper.integrate_ensemble(q, p, h=0.05, steps=4000, save_every=4000, progress=calls.append, threads=2)
+        assert calls == sorted(calls)
+        assert calls[-1] == 4000
+
+    def test_interrupt_ends_all_threads_and_returns_completed_states(self, kepler: sc.Stepper):
+        q, p = states("kepler", 64)
+        work = Ensemble(kepler, q, p, h=0.05, steps=10**9, save_every=10**7)
+
+        def interrupt(done: int) -> None:
+            raise KeyboardInterrupt
+
+        before = set(threading.enumerate())
+        with pytest.raises(KeyboardInterrupt):
+            work.run(progress=interrupt, threads=2)
+        assert set(threading.enumerate()) == before
+        result = work.result()
+        assert set(result.status) == {"interrupted"}
+        assert 0 < result.steps.max() < 10**9
+
+    def test_error_in_a_block_is_raised(self, kepler: sc.Stepper, monkeypatch: pytest.MonkeyPatch):
+        def fail(*arguments: object, **others: object) -> None:
+            raise RuntimeError("out of order")
+
+        monkeypatch.setattr("scvi_codegen.runs.ensembles.batches.Call.advance", fail)
+        with pytest.raises(RuntimeError, match="out of order"):
+            kepler.integrate_ensemble(*states("kepler", 20), h=0.05, steps=10)
+
+    @pytest.mark.rotated
+    def test_memory_is_bounded_by_save_every(self, kepler: sc.Stepper):
+        q, p = states("kepler", 64)
+        kepler.integrate_ensemble(q, p, h=0.05, steps=1)
+        gc.collect()
+        tracemalloc.start()
+        try:
+            kepler.integrate_ensemble(q, p, h=0.05, steps=20_000, save_every=2000)
+            peak = tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+        assert peak < 1e6  # all states would take 41 MB
+
+    def test_interrupted_adaptive_runs_return_completed_states(self) -> None:
+        q, p = states("eccentric", 4)
+        work = Ensemble(stepper_of("eccentric", sc.SVI(4)), q, p, t_end=[5.0, 5.0, 5.0, 1e7], tolerance=1e-10)
+
+        def interrupt(done: int) -> None:
+            if done:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            work.run(progress=interrupt, threads=1)
+        assert work.result().status.tolist()[::3] == ["ok", "interrupted"]
+
+
+BASE: dict[str, dict[str, Any]] = {
+    "kepler": {"q": np.ones((3, 2)), "p": np.zeros((3, 2)), "h": 0.1, "steps": 5},
+    "eccentric": dict(zip("qp", states("eccentric", 4), strict=True)),
+    "pushed pendulum": {
+        "q": np.zeros((COUNT, 1)),
+        "p": np.zeros((COUNT, 1)),
+        "inputs": {"u": (KNOTS, VALUES), "w": (KNOTS, VALUES)},
+        "h": 0.1,
+        "t_end": 2.3,
+    },
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "message"),
+    [
+        ("kepler", {"q": np.ones((3, 3))}, r"q must have shape \(k, 2\), not \(3, 3\)"),
+        ("kepler", {"q": np.ones((2, 2))}, r"equal shapes, not \(2, 2\) and \(3, 2\)"),
+        ("kepler", {"q": np.ones((0, 2))}, "q must have shape"),
+        ("kepler", {"q": 1.0}, "q must have shape"),
+        ("kepler", {"p": [[1.0, 0.0], [1.0, np.nan], [0.0, 0.0]]}, r"p\[1, 1\] \(q2\) is nan"),
+        ("kepler", {"p": "fast"}, "p must be real numbers"),
+        ("kepler", {"p": [[1.0], [1.0, 2.0], [3.0]]}, "p must be real numbers"),
+        ("kepler", {"h": 0.0}, "the step size h is 0"),
+        ("kepler", {"h": np.inf}, "the step size h is inf"),
+        ("kepler", {"steps": 1.5}, "steps must be a whole number"),
+        ("kepler", {"steps": -1}, "steps must be at least 0"),
+        ("kepler", {"save_every": 0}, "save_every must be at least 1"),
+        ("kepler", {"t": "noon"}, "the time t must be real numbers"),
+        ("kepler", {"threads": -1}, "threads must be at least 1"),
+        ("kepler", {"threads": 1.5}, "threads must be a whole number"),
+        ("kepler", {"parameters": {"nu": 1.0}}, "there is no parameter 'nu'"),
+        (
+            "kepler",
+            {"parameters": {"mu": [1.0, 2.0]}},
+            r"the parameter mu must be one number or 3 numbers, not of shape \(2,\)",
+        ),
+        ("kepler", {"parameters": {"mu": "heavy"}}, "the parameter mu must be real numbers"),
+        ("kepler", {"parameters": np.ones((3, 2))}, r"parameters must have shape \(3, 1\), not \(3, 2\)"),
+        ("kepler", {"parameters": ["heavy"]}, "parameters must be real numbers"),
+        ("kepler", {"parameters": {"mu": [1.0, np.nan, 1.0]}}, "the parameter mu of trajectory 1 is nan"),
+        ("eccentric", {}, "give either h .fixed step size. or t_end"),
+        ("eccentric", {"h": 0.1, "steps": 3, "t_end": 1.0}, "give either steps=3 or t_end=1 with h"),
+        ("eccentric", {"h": 0.1, "t_end": -1.0}, "h = 0.1 has the wrong sign"),
+        ("eccentric", {"h": 0.1, "t_end": [1.0, 2.0, 3.0, 4.0]}, "with h all trajectories have one t_end"),
+        ("eccentric", {"h": 0.1, "t_end": 1.0, "t_eval": [0.5]}, "t_eval requires adaptive steps"),
+        ("eccentric", {"h": 0.1, "steps": 3, "tolerance": 1e-9}, "tolerance requires adaptive steps"),
+        ("eccentric", {"t_end": [1.0, 2.0]}, "one time or 4"),
+        ("eccentric", {"t_end": [1.0, 2.0, -1.0, 3.0]}, "split the ensemble"),
+        ("eccentric", {"t_end": 1.0, "tolerance": 2.0}, "must be positive and below 1"),
+        ("eccentric", {"t_end": 1.0, "t_eval": [0.5, 1.5]}, "outside"),
+        ("eccentric", {"t_end": 1.0, "t_eval": [0.5], "save_every": 2}, "not both"),
+        (
+            "pushed pendulum",
+            {"inputs": {"u": (KNOTS, np.tile(VALUES, (COUNT - 1, 1))), "w": (KNOTS, VALUES)}},
+            "for each of 11 trajectories",
+        ),
+        (
+            "pushed pendulum",
+            {"inputs": {"u": (KNOTS, VALUES), "w": (KNOTS, VALUES, "quintic")}},
+            "constant or linear or cubic",
+        ),
+        ("pushed pendulum", {"inputs": {"u": (KNOTS, VALUES)}}, "the input 'w' is not set"),
+        ("pushed pendulum", {"t_end": 4.0}, "covers t = 0 to 2.6"),
+        ("pushed pendulum", {"t_end": None}, "t_end"),
+        ("pushed pendulum", {"save_every": 0}, "save_every"),
+        ("pushed pendulum", {"h": 0.0}, "h"),
+        ("pushed pendulum", {"inputs": {"u": np.ones(2), "w": 0.5}}, r"the input 'u' must be a number, \(t, values\)"),
+    ],
+)
+def test_invalid_arguments_are_named(name: str, changes: dict[str, object], message: str) -> None:
+    with pytest.raises(sc.StateError, match=message):
+        stepper_of(name, sc.SVI(3)).integrate_ensemble(**BASE[name] | changes)
+
+
+class TestFiles:
+    @pytest.fixture
+    def result(self, kepler: sc.Stepper) -> sc.EnsembleTrajectory:
+        values = {"mu": [1.0, 1e9, 1.2]}  # the second falls into the centre
+        return kepler.integrate_ensemble(*states("kepler", 3), h=0.05, steps=100, save_every=10, parameters=values)
+
+    def test_npz_round_trip(self, result: sc.EnsembleTrajectory, tmp_path):
+        result.save(tmp_path / "runs.npz")
+        with np.load(tmp_path / "runs.npz") as file:
+            for name in ("t", "q", "p", "status", "steps", "h", "parameters"):
+                assert np.array_equal(file[name], getattr(result, name), equal_nan=name in "qp")
+            assert file["coordinates"].tolist() == ["q1", "q2"]
+            assert file["parameter_names"].tolist() == ["mu"]
+        assert [result[j].steps for j in range(3)] == result.steps.tolist()
+
+    def test_csv_has_long_format_and_omits_failures(self, result: sc.EnsembleTrajectory, tmp_path):
+        result.save(tmp_path / "runs.csv")
+        assert (tmp_path / "runs.csv").read_text().startswith("trajectory,mu,t,q1,q2,p_q1,p_q2\n0,1,0,")
+        table = np.loadtxt(tmp_path / "runs.csv", delimiter=",", skiprows=1)
+        for j in range(3):
+            rows = table[table[:, 0] == j]
+            assert len(rows) == result.steps[j] // 10 + 1
+            assert np.array_equal(rows[:, 3:5], result.q[: len(rows), j])
+            assert set(rows[:, 1]) == {result.parameters[j, 0]}
+
+    def test_unknown_suffixes_are_rejected(self, result: sc.EnsembleTrajectory, tmp_path):
+        with pytest.raises(sc.StateError, match=r"use \.npz, \.csv, \.h5"):
+            result.save(tmp_path / "runs.txt")
+
+
+GRID = """
+[grid]
+q1 = { from = 0.8, to = 1.2, count = 3 }
+q2_dot = [0.9, 1.0]
+mu = 1.5
+"""
+
+
+def model(**changes: object) -> sc.Model:
+    entry = sc.Model.from_problem(sc.problem("kepler"), sc.SVI(4))
+    return replace(entry, h=0.1, span=None, steps=50, save_every=10, **changes)  # type: ignore[arg-type]
+
+
+class TestEnsembleFiles:
+    def test_grid_is_a_product_and_the_model_supplies_the_rest(self, tmp_path):
+        (tmp_path / "grid.toml").write_text(GRID)
+        states = load_ensemble(tmp_path / "grid.toml", model())
+        assert len(states) == 6
+        assert states.q[:, 0].tolist() == [0.8, 0.8, 1.0, 1.0, 1.2, 1.2]
+        assert set(states.q[:, 1]) == {model().q[1]}
+        assert states.parameters.tolist() == [[1.5]] * 6
+        p = states.momenta(stepper_for("kepler", sc.SVI(4)))
+        assert p[:, 1].tolist() == [0.9, 1.0] * 3
+        assert set(p[:, 0]) == {model().velocity[0]}  # type: ignore[index]
+
+    def test_table_has_one_line_per_trajectory(self, tmp_path):
+        (tmp_path / "table.csv").write_text("mu, p_q1,q2\n\n1.0,0.5,0.1\n 2e0 ,-0.5,0.2\n")
+        states = load_ensemble(tmp_path / "table.csv", model())
+        assert states.parameters[:, 0].tolist() == [1.0, 2.0]
+        assert states.q.tolist() == [[model().q[0], 0.1], [model().q[0], 0.2]]
+        stepper = stepper_for("kepler", sc.SVI(4))
+        assert states.momenta(stepper).tolist() == [
+            [0.5, model().momenta(stepper)[1]],
+            [-0.5, model().momenta(stepper)[1]],
+        ]
+
+    def test_byte_order_mark_of_a_table_is_ignored(self, tmp_path):
+        (tmp_path / "table.csv").write_text("q1\n0.5\n", encoding="utf-8-sig")
+        assert load_ensemble(tmp_path / "table.csv", model()).q[:, 0].tolist() == [0.5]
+
+    def test_velocities_are_transformed_with_individual_parameters(self, tmp_path):
+        (tmp_path / "table.csv").write_text("q,q_dot,m\n0.1,0.5,1.0\n0.1,0.5,3.0\n")
+        pendulum = sc.Model.from_problem(sc.problem("planar-pendulum"))
+        states = load_ensemble(tmp_path / "table.csv", pendulum)
+        p = states.momenta(stepper_for("planar-pendulum", sc.SVI(4)))
+        assert p[1, 0] == 3.0 * p[0, 0]
+
+    def test_velocities_override_momenta_of_a_model_and_vice_versa(self, tmp_path):
+        stepper = stepper_for("kepler", sc.SVI(4))
+        with_momenta = model(p=(0.3, 0.7), velocity=None)
+        (tmp_path / "a.csv").write_text("q1_dot\n0.1\n")
+        assert load_ensemble(tmp_path / "a.csv", with_momenta).momenta(stepper)[0].tolist() == [0.1, 0.7]
+        (tmp_path / "b.csv").write_text("q1\n1.1\n")
+        assert load_ensemble(tmp_path / "b.csv", with_momenta).momenta(stepper)[0].tolist() == [0.3, 0.7]
+
+    @pytest.mark.parametrize(
+        ("name", "text", "message"),
+        [
+            ("a.txt", "", "a grid in a .toml file or a table in a .csv file"),
+            ("missing.toml", None, "cannot be read: No such file"),
+            ("a.toml", "grid =", "this is not TOML"),
+            ("a.toml", "[mesh]\nq1 = 1", r"must have one section, \[grid\]"),
+            ("a.toml", "[grid]", r"must have one section, \[grid\]"),
+            (
+                "a.toml",
+                "[grid]\nq3 = 1",
+                "'q3' is not a coordinate, velocity, momentum or parameter of the system. Known: q1",
+            ),
+            ("a.toml", "[grid]\nq1 = []", r"\[grid\] q1 is an empty list"),
+            ("a.toml", "[grid]\nq1 = ['x']", r"\[grid\] q1 must be a number, not 'x'"),
+            ("a.toml", "[grid]\nq1 = nan", r"\[grid\] q1 is nan: it must be a finite number"),
+            ("a.toml", "[grid]\nq1 = {from = 1, to = 2}", "must have from, to and count, not from, to"),
+            ("a.toml", "[grid]\nq1 = {from = 1, to = 2, count = 0}", "count must be at least 1, not 0"),
+            ("a.toml", "[grid]\nq1_dot = 1\np_q2 = 1", "both velocities and momenta"),
+            ("a.csv", "q1,q2\n", "a header of names and at least one line of numbers"),
+            ("a.csv", "q1,q1\n1,2", "the column 'q1' occurs twice"),
+            ("a.toml", "[grid]\nq1 = {from = 1, to = 2, count = 1000000000}", "at most 100000000, not 1000000000"),
+            (
+                "a.toml",
+                "[grid]\nq1 = {from = 1, to = 2, count = 30000}\nq2 = {from = 1, to = 2, count = 30000}",
+                "the grid has 900000000 combinations, more than the 100000000",
+            ),
+            ("a.csv", "q1,q2\n1,2\n3", "line 3 must have a number for each of 2 names, and has 1"),
+            ("a.csv", "q1,,q2\n1,2,3", "column 2 has no name in the first line"),
+            ("a.csv", "q1;q2\n1;2", "'q1;q2' is not a coordinate"),
+            ("a.csv", "q1,q2\n1,x", "line 2, q2: 'x' is not a number"),
+            ("a.csv", "q1\ninf", "line 2, q1: inf is not a finite number"),
+        ],
+    )
+    def test_invalid_entries_are_named(self, name: str, text: str | None, message: str, tmp_path):
+        if text is not None:
+            (tmp_path / name).write_text(text)
+        with pytest.raises(sc.ModelFileError, match=message) as error:
+            load_ensemble(tmp_path / name, model())
+        assert str(error.value).startswith(str(tmp_path / name))
+
+
+class TestCommandLine:
+    @pytest.fixture(autouse=True)
+    def elsewhere(self, here: Path) -> None:
+        Path("grid.toml").write_text(GRID)
+
+    @pytest.mark.parametrize("suffix", ["npz", "csv"])
+    def test_ensemble_command_prints_a_summary_and_writes_files(self, suffix: str):
+        words = f"run kepler --degree 4 --step 0.1 --steps 50 --save-every 10 --ensemble grid.toml -o runs.{suffix}"
+        text = output_of(words)
+        assert "6 trajectories of 50 steps of 0.1 from t = 0; 6 states saved of each" in text
+        assert "\n6 ok\n" in text
+        assert float(re.search(r"relative energy error: (\S+) at most, of trajectory \d", text)[1]) < 1e-3  # type: ignore[index]
+        assert f"wrote runs.{suffix}" in text
+        if suffix == "npz":
+            with np.load("runs.npz") as file:
+                assert file["q"].shape == (6, 6, 2)
+        else:
+            assert len(Path("runs.csv").read_text().splitlines()) == 37
+
+    def test_failures_are_counted_and_others_saved(self):
+        Path("table.csv").write_text("mu\n1\n1e9\n1.1\n")
+        words = "run kepler --degree 4 --step 0.05 --steps 50 --ensemble table.csv -o runs.npz"
+        text = output_of(words)
+        assert re.search(r"^2 ok, 1 not \w+$", text, re.MULTILINE)
+        assert re.search(
+            r"^  trajectory 1: step \d+ at t = \S+ failed: .*(did not converge|NaN).*$", text, re.MULTILINE
+        )
+        assert Path("runs.npz").exists()
+
+    def test_failure_of_all_trajectories_is_a_failure(self):
+        Path("table.csv").write_text("mu\n1e9\n")
+        words = "run kepler --degree 4 --step 0.05 --steps 50 --ensemble table.csv"
+        assert "every trajectory failed" in error_of(words, status=1)
+
+    @pytest.mark.parametrize(
+        ("words", "message"),
+        [
+            ("kepler --ensemble none.toml", "none.toml cannot be read"),
+            ("kepler --ensemble grid.toml --error 1e-6", "--error is not available with --ensemble"),
+            ("kepler --ensemble grid.toml -o runs.txt", "written as .npz, .csv, .h5"),
+            ("planar-pendulum --ensemble grid.toml", "'q1' is not a coordinate"),
+            (
+                "kepler --steps 1000000000000 --ensemble grid.toml",
+                "1000000000001 states of each of 6 trajectories need 6.12e+05 GB of memory: save fewer (--save-every ",
+            ),
+        ],
+    )
+    def test_mistakes_are_usage_errors(self, words: str, message: str):
+        assert message in error_of(f"run {words}")
+
+    def test_interrupted_command_saves_completed_states(self, monkeypatch: pytest.MonkeyPatch):
+        @contextmanager
+        def once_some_have_begun(steps: int) -> Iterator[Callable[[int], None]]:
+            yield lambda count: signal.raise_signal(signal.SIGINT) if count else None
+
+        monkeypatch.setattr("scvi_codegen.interfaces.cli.ensembles.progress_bar", once_some_have_begun)
+        words = "run kepler --degree 4 --step 0.05 --steps 10000000000 --save-every 1000000000 --ensemble grid.toml"
+        result = invoke(words, "-o", "runs.npz", status=130)
+        assert "0 ok, 6 interrupted" in result.stdout
+        assert "the computed states were written: runs.npz" in result.stderr
+        with np.load("runs.npz") as file:
+            assert set(file["status"]) == {"interrupted"}
+            assert file["steps"].max() > 0
+
+
+@pytest.mark.parametrize("name", ["kepler", "double-pendulum"])
+def test_absolute_tolerance_equals_that_of_single_trajectories(name):
+    """With the absolute tolerance, lanes need as many iterations and reach the same states."""
+    chosen = sc.problem(name)
+    stepper = sc.compile_stepper(chosen.system, sc.SVI(4))
+    p = stepper.momentum(chosen.q, chosen.velocity)
+    options = sc.SolverOptions(tolerance=1e-6, absolute=True)
+    single = stepper.integrate(chosen.q, p, h=0.05, steps=20, save_every=20, options=options)
+    many = stepper.integrate_ensemble([chosen.q] * 8, [p] * 8, h=0.05, steps=20, save_every=20, options=options)
+    exact = stepper.integrate(chosen.q, p, h=0.05, steps=20, save_every=20)
+    np.testing.assert_allclose(many.q[-1, 0], single.q[-1], rtol=1e-13, atol=1e-13)
+    assert not np.allclose(exact.q[-1], single.q[-1], rtol=1e-14, atol=1e-14)
+
+
+def test_velocities_use_the_inputs_at_the_start():
+    stepper = stepper_of("coupled with inputs", sc.SVI(3))
+    q, v = states("coupled with inputs", COUNT)
+    inputs = {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], np.outer(np.arange(COUNT), [1.0, 0.0]))}
+    runs = stepper.integrate_ensemble(q, velocity=v, inputs=inputs, h=0.1, t_end=0.2)
+    assert_allclose(runs.p[0, :, 1], v[:, 0] / 3 + 2 * (1 + np.arange(COUNT) / 5) * v[:, 1])
+
+
+def test_splines_of_scipy_are_accepted():
+    stepper = stepper_of("pushed pendulum", sc.SVI(3))
+    by_spline, by_values = (
+        stepper.integrate_ensemble(*states("pushed pendulum", COUNT), inputs={"u": u, "w": W}, h=0.05, steps=40)
+        for u in (CubicSpline(KNOTS, OWN_VALUES, axis=1), (KNOTS, OWN_VALUES, "cubic"))
+    )
+    assert by_values.t[-1] == 2.0
+    assert (by_values.q == by_spline.q).all()
+
+
+@pytest.mark.second
+@pytest.mark.filterwarnings("ignore::scvi_codegen.common.errors.AccuracyWarning")
+def test_lane_with_failed_iteration_continues_as_scalar_across_breakpoints():
+    """Stiff from the second piece on, where Newton's iteration alone leads on."""
+    system = lagrange("stiffening", "q", "q_dot**2/2 - (1 + u)*q**2/2 - q**4/4", inputs="u")
+    stepper, u = sc.compile_stepper(system, sc.SVI(2)), np.tile(VALUES**2, (COUNT, 1))
+    u[4, 2:] = 4000.0
+    q, p = states("pushed pendulum", COUNT)
+    runs = stepper.integrate_ensemble(q, p, inputs={"u": (KNOTS, u)}, h=0.1, t_end=2.3)
+    assert runs.ok.all()
+    run = stepper.integrate(q[4], p[4], inputs={"u": (KNOTS, u[4])}, h=0.1, t_end=2.3)
+    assert_allclose(runs.q[:, 4], run.q, rtol=0, atol=1e-11)
+    assert_allclose(runs.energy()[:, 4], run.energy(), rtol=1e-10)
+
+
+def test_threads_chunks_and_save_every_do_not_change_results():
+    stepper = stepper_of("pushed pendulum", sc.SVI(3))
+    inputs, reported = {"u": (KNOTS, OWN_VALUES), "w": ([0.0, 3.0], [0.0, 0.3])}, []
+    arguments = {"inputs": inputs, "h": 0.001, "t_end": 2.3}
+    full = stepper.integrate_ensemble(*states("pushed pendulum", COUNT), **arguments, progress=reported.append)
+    fewer = stepper.integrate_ensemble(*states("pushed pendulum", COUNT), **arguments, save_every=100, threads=1)
+    assert reported[-1] == full.steps[0]
+    rows = np.isin(full.t, fewer.t)
+    assert rows.sum() == len(fewer.t) == 24 + 3  # breakpoints that fall between hundreds of steps
+    assert (full.q[rows] == fewer.q).all()
+    assert_allclose(full.energy()[rows], fewer.energy(), rtol=0, atol=0)
+
+
+def test_files_contain_the_energies_of_each_segment(tmp_path):
+    stepper = stepper_of("pushed pendulum", sc.SVI(3))
+    w = np.outer(np.arange(COUNT), [0.0, 0.1])
+    runs = stepper.integrate_ensemble(
+        *states("pushed pendulum", COUNT), inputs={"u": (KNOTS, VALUES), "w": ([0.0, 3.0], w)}, h=0.05, t_end=2.3
+    )
+    table = runs.to_xarray()
+    rising = 1 + np.outer(runs.t, np.arange(COUNT)) / 30
+    assert_allclose(table["energy"], runs.p[:, :, 0] ** 2 / 2 - rising * np.cos(runs.q[:, :, 0]), rtol=0, atol=1e-14)
+    runs.save(tmp_path / "runs.csv")
+    assert (tmp_path / "runs.csv").read_text().splitlines()[0] == "trajectory,t,q,p_q"
+
+
+def test_ensemble_to_end_times_over_a_cluster() -> None:
+    pytest.importorskip("distributed")
+    from scvi_codegen.interfaces.distributed import integrate_ensemble
+
+    stepper, ends = stepper_of("eccentric", sc.SVI(4)), np.tile(ENDS, 4)
+    q, p = (np.tile(x, (4, 1)) for x in states("eccentric", 4))
+    here = stepper.integrate_ensemble(q, p, t_end=ends, tolerance=1e-10)
+    there = integrate_ensemble(stepper, q, p, t_end=ends, tolerance=1e-10, blocks=2)
+    for name in ("times", "q", "p", "steps"):
+        assert np.array_equal(getattr(here, name), getattr(there, name), equal_nan=True)
+
+
+def test_files_contain_individual_times(tmp_path: Path) -> None:
+    runs = CASES["adaptive"].run(save_every=5)
+    runs.save(tmp_path / "e.csv")
+    table = np.genfromtxt(tmp_path / "e.csv", delimiter=",", names=True)
+    assert [table["t"][table["trajectory"] == j].max() for j in range(4)] == ENDS
+    runs.save(tmp_path / "e.npz")
+    with np.load(tmp_path / "e.npz") as file:
+        assert np.array_equal(file["times"], runs.times, equal_nan=True)
+    pytest.importorskip("xarray")
+    dataset = runs.to_xarray()
+    assert np.array_equal(dataset.time, runs.times, equal_nan=True)
+    assert np.array_equal(np.isfinite(dataset.energy), np.isfinite(runs.times))
+
+
+def test_command_line_runs_a_grid(here: Path) -> None:
+    Path("k.toml").write_text(
+        '[system]\ncatalogue = "kepler"\n[method]\nmethod = "svi"\ndegree = 4\n[run]\ntolerance = 1e-9\nspan = 9\n'
+    )
+    Path("grid.toml").write_text("[grid]\nq1 = [0.5, 0.7]\nmu = [1.0, 1.1]\n")
+    done = invoke("run", "k.toml", "--ensemble", "grid.toml", "-o", "grid.npz")
+    assert "adaptive steps from t = 0 to t = 9" in done.output
+    assert "4 ok" in done.output
+    with np.load("grid.npz") as file:
+        assert (np.nanmax(file["times"], axis=0) == 9.0).all()
+
+
+@pytest.mark.rotated
+@pytest.mark.sampled(2)
+@pytest.mark.usefixtures("as_users_compile")
+@pytest.mark.parametrize("h", [6e-2, 1e-2, 1e-4, 2e-14])
+def test_lanes_converge_as_single_runs(h: float) -> None:
+    """Slowly, with steps repeated from another predictor, and at the level of rounding.
+
+    Changes below rounding are random, and relative to a velocity near 0 they exceed any fixed level.
+    """
+    count, steps = 32, 64
+    stepper = sc.compile_stepper(chain(4).system, "svi:2")
+    generator = np.random.default_rng(1)
+    q, v = generator.uniform(-1, 1, (count, 4)), generator.normal(size=(count, 4))
+    p = np.array([stepper.momentum(*each) for each in zip(q, v, strict=True)])
+    runs = Ensemble(stepper, q, p, h=h, steps=steps).common
+    assert runs is not None
+    batch = runs.batch()
+    assert isinstance(batch, LaneRuns)
+    batch.run(progress=None, threads=1)
+    assert (batch.status == 0).all()
+    for j in range(0, count, 5):
+        single = stepper.integrate(q[j], p[j], h=h, steps=steps)
+        np.testing.assert_allclose(runs.q[-1, j], single.q[-1], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(runs.p[-1, j], single.p[-1], rtol=0, atol=1e-11)

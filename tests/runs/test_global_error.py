@@ -1,0 +1,665 @@
+"""Global error of whole runs: the estimate bounds the true error, chaos ends what is confirmed, defaults warn."""
+
+import math
+import re
+import warnings
+from types import SimpleNamespace
+
+import mpmath
+import numpy as np
+import pytest
+from commands import error_of, json_of, output_of
+from extrapolation import Real, integrated
+from motions import MOTIONS, recorded
+from notation import lagrange
+
+import scvi_codegen as sc
+from scvi_codegen.runs.accuracy.global_error import SAFETY, SAFETY_OF_ROUNDING, SAFETY_OF_TWO, _alternative
+from scvi_codegen.runs.driver import segments
+from scvi_codegen.runs.driver.run import Run
+from scvi_codegen.runs.results import dense_output
+
+MASSES = np.array([3, 4, 5], dtype=Real)
+
+
+def burrau(t, y):
+    q, p = y[:6].reshape(3, 2), y[6:].reshape(3, 2)
+    apart = q[:, None] - q[None]
+    r = np.sqrt((apart**2).sum(-1)) + np.eye(3)
+    forces = -((MASSES[:, None] * MASSES / r**3)[..., None] * apart).sum(1)
+    return np.concatenate([(p / MASSES[:, None]).ravel(), forces.ravel()])
+
+
+def on_an_ellipse(q, p, times):
+    """Kepler's problem with mu = 1 in 40 digits, by his equation; (n, 4) states at times, from (q, p) at the first."""
+    with mpmath.workdps(40):
+        (x, y), (vx, vy) = map(mpmath.mpf, q), map(mpmath.mpf, p)
+        r = mpmath.hypot(x, y)
+        a = 1 / (2 / r - vx**2 - vy**2)
+        n, e_sin, e_cos = a ** mpmath.mpf(-1.5), (x * vx + y * vy) / mpmath.sqrt(a), 1 - r / a
+        found = []
+        for t in times:
+            mean = n * (mpmath.mpf(float(t)) - mpmath.mpf(float(times[0])))
+            g = mean  # change of the eccentric anomaly: g - e_cos sin g + e_sin (1 - cos g) = mean
+            low, high = mean - 2, mean + 2
+            for _ in range(300):
+                rest = g - e_cos * mpmath.sin(g) + e_sin * (1 - mpmath.cos(g)) - mean
+                low, high = (low, g) if rest > 0 else (g, high)
+                new = g - rest / (1 - e_cos * mpmath.cos(g) + e_sin * mpmath.sin(g))
+                new = new if low < new < high else (low + high) / 2
+                if abs(new - g) < mpmath.mpf(10) ** -38:
+                    break
+                g = new
+            f, h = 1 - a / r * (1 - mpmath.cos(g)), (mean - g + mpmath.sin(g)) / n
+            now = a * (1 - e_cos * mpmath.cos(g) + e_sin * mpmath.sin(g))
+            f_dot, h_dot = -mpmath.sqrt(a) / (now * r) * mpmath.sin(g), 1 - a / now * (1 - mpmath.cos(g))
+            state = (f * x + h * vx, f * y + h * vy, f_dot * x + h_dot * vx, f_dot * y + h_dot * vy)
+            found.append([Real(mpmath.nstr(each, 30)) for each in state])
+    return np.array(found)
+
+
+def chain(t, y):
+    """Fixed ends, unit masses, springs q + 0.3 q^3."""
+    n, k = len(y) // 2, Real(0.3)
+    d = np.diff(np.concatenate([[Real(0)], y[:n], [Real(0)]]))
+    force = d + k * d**3
+    return np.concatenate([y[n:], force[1:] - force[:-1]])
+
+
+def duffing(t, y):
+    return np.array([y[1], y[0] - y[0] ** 3 + np.cos(t) / 4 - y[1] / 8])
+
+
+def made(name, coordinates, lagrangian, **more):
+    return sc.LagrangianSystem.from_text(name=name, coordinates=coordinates, lagrangian=lagrangian, **more)
+
+
+def pythagorean():
+    pairs = ((0, 1), (1, 2), (2, 0))
+    kinetic = " + ".join(f"{int(m)}*(x{i}_dot**2 + y{i}_dot**2)/2" for i, m in enumerate(MASSES))
+    attraction = " + ".join(f"{int(MASSES[i] * MASSES[j])}/sqrt((x{i} - x{j})**2 + (y{i} - y{j})**2)" for i, j in pairs)
+    return made("pythagorean", [f"{c}{i}" for i in range(3) for c in "xy"], f"{kinetic} + {attraction}")
+
+
+PYTHAGOREAN = [1.0, 3.0, -2.0, -1.0, 1.0, -1.0], [0.0] * 6
+
+
+class Work:
+    """Iterations of the equations of steps, each of one force per stage, in runs and in dense output."""
+
+    def __init__(self, monkeypatch):
+        self.iterations = 0
+        integrate, partial_steps = Run._integrated, dense_output._take_partial_steps
+        with_stops = segments.record_with_stops
+
+        def counted_run(run, *arguments):
+            trajectory = integrate(run, *arguments)
+            self.iterations += int(trajectory.iterations.sum())
+            return trajectory
+
+        def counted_with_stops(*arguments, **named):
+            trajectory = with_stops(*arguments, **named)
+            self.iterations += int(trajectory.iterations.sum())
+            return trajectory
+
+        def counted_partial_steps(*arguments):
+            iterations = partial_steps(*arguments)
+            self.iterations += iterations
+            return iterations
+
+        monkeypatch.setattr(Run, "_integrated", counted_run)
+        monkeypatch.setattr(segments, "record_with_stops", counted_with_stops)
+        monkeypatch.setattr(dense_output, "_take_partial_steps", counted_partial_steps)
+
+    def of(self, run):
+        before, result = self.iterations, run()
+        assert self.iterations > before
+        return result, self.iterations - before
+
+
+def true_errors(name, run):
+    """Return times and the errors there, relative to the largest state of the run until then, as estimates are."""
+    t, high, low = recorded(name)
+    m, start = high.shape[1] // 2, t[0]
+    forward = math.copysign(1.0, t[-1] - start)
+    t, high, low = (each[forward * t <= forward * run.t[-1]] for each in (t, high, low))
+    worst, rows = 0.0, np.searchsorted(forward * run.t, forward * t, side="right") - 1
+    early = abs(run.t - start) <= abs(run.t[-1] - start) / 16
+    for states, found, part in zip((run.q, run.p), run.at(t), (slice(m), slice(m, None)), strict=True):
+        norms = np.linalg.norm(states, axis=1)
+        sizes = np.maximum.accumulate(np.maximum(norms, norms[early].max()))[rows] + 1e-300  # 0 at rest
+        worst = np.maximum(worst, np.linalg.norm(found - high[:, part] - low[:, part], axis=1) / sizes)
+    return t, worst
+
+
+def motion_stepper(name):
+    motion = MOTIONS[name]
+    system = made("motion", motion.coordinates.split(), motion.lagrangian, forces=motion.forces)
+    start = {"q": motion.q, "p": motion.p, "t": motion.span[0], "t_end": motion.span[1]}
+    return sc.compile_stepper(system, motion.method), start
+
+
+def check_claims(name, run, error):
+    """Return the ratio of the estimate to the true error, after checks of all that is claimed."""
+    t, true = true_errors(name, run)
+    forward = math.copysign(1.0, t[-1] - t[0])
+    assert true.max() <= run.global_error, f"{name}: the estimate for {error:g} is no bound"
+    assert true[forward * (t - run.confirmed_until) <= 0.0].max() <= error
+    assert run.confirmation.confirmed == (run.global_error <= error) == (run.confirmed_until == run.t[-1])
+    return run.global_error / true.max()
+
+
+class TestMotions:
+    """Regular and chaotic motions compared with records of 30 digits."""
+
+    @pytest.mark.second
+    @pytest.mark.parametrize("error", [1e-5, 1e-9, 1e-11])
+    @pytest.mark.parametrize("name", ["oscillator", "driven", "kepler .999"])
+    @pytest.mark.filterwarnings("ignore:the global error")
+    def test_estimates_bound_errors_of_selected_motions(self, name, error, monkeypatch):
+        stepper, start = motion_stepper(name)
+        run, work = Work(monkeypatch).of(lambda: stepper.integrate(**start, error=error))
+        assert check_claims(name, run, error) < 400.0
+        assert run.confirmation.confirmed == (name != "kepler .999" or error > 1e-7)
+        assert work < 20 * stepper.integrate(**start, check_growth=False).iterations.sum()
+
+    @pytest.mark.full
+    @pytest.mark.filterwarnings("ignore:the global error")
+    def test_a_hundred_estimates_are_bounds_close_and_cheap(self, monkeypatch):
+        """None is false, 97 % of those confirmed that three runs at round-off level attain by a factor of three."""
+        work, ratios, costs, attained = Work(monkeypatch), [], [], []
+        for name in MOTIONS:
+            stepper, start = motion_stepper(name)
+            tight = (stepper.integrate(**start, tolerance=each, check_growth=False) for each in (None, 1e-18, 1e-20))
+            least = max(true_errors(name, run)[1].max() for run in tight)
+            for error in (1e-6, 1e-9, 1e-12):
+                run, cost = work.of(lambda: stepper.integrate(**start, error=error))  # noqa: B023  (called at once)
+                plain = work.of(lambda: stepper.integrate(**start, tolerance=error, check_growth=False))  # noqa: B023
+                ratios.append(check_claims(name, run, error))
+                costs.append(cost / plain[1])
+                if least < error / 3.0:
+                    attained.append(run.confirmation.confirmed)
+        assert len(ratios) > 100 > len(attained) > 75, len(attained)
+        assert np.mean(attained) >= 0.97
+        assert np.median(ratios) < 30.0
+        assert np.median(costs) < 6.0
+
+    @pytest.mark.parametrize(("comparisons", "safety"), [(2, SAFETY_OF_TWO), (3, SAFETY_OF_ROUNDING)])
+    def test_agreement_of_rounding_errors_by_chance_is_improbable(self, comparisons, safety):
+        first, *others = np.random.default_rng(0).standard_normal((1 + comparisons, 10**6))
+        assert np.mean(safety * np.max([abs(first - each) for each in others], axis=0) < abs(first)) < 1e-3
+
+    def test_a_third_comparison_is_made_where_two_do_not_suffice(self):
+        stepper, start = motion_stepper("kepler .6")
+        found = {
+            error: stepper.integrate(**start, error=error).confirmation
+            for error in (1e-9, 1e-10, 3e-11, 1e-11, 3e-12, 1e-12)
+        }
+        assert {each.safety for each in found.values()} <= {SAFETY, SAFETY_OF_TWO, SAFETY_OF_ROUNDING}
+        assert len({each.safety for each in found.values()}) >= 2
+        for each in found.values():
+            assert each.confirmed
+            assert each.estimate == pytest.approx(each.safety * each.differences.max())
+
+    def test_runs_that_agree_by_chance_do_not_confirm_each_other(self):
+        """Rounding errors grow a thousandfold: runs with tolerances 1e-14, 1e-17 agree to 3e-15, both off by 3e-13."""
+        system = made("d", ["x"], "x_dot**2/2 + x**2/2 - x**4/4", forces={"x": "cos(t)/4 - x_dot/8"})
+        start = {"q": [0.8359375], "p": [0.54931640625], "t_end": 39.3681640625}
+        run = sc.compile_stepper(system, "svi:6").integrate(**start, error=1e-11)
+        exact = integrated(duffing, [*start["q"], *start["p"]], run.t[[0, -1]])[-1]
+        assert np.linalg.norm(exact[0] - run.q[-1]) / abs(run.q).max() <= run.global_error <= 1e-11
+
+    @pytest.mark.full
+    def test_errors_of_growing_motions_are_relative_to_their_size_by_then(self):
+        """Of q = p = exp(t); at first relative to the largest size of the first sixteenth."""
+        saddle = sc.compile_stepper(made("saddle", ["q"], "q_dot**2/2 + q**2/2"), "svi:4")
+        run = saddle.integrate([1.0], [1.0], t_end=192.0, error=1e-6)
+        found, exact = run.confirmation, np.exp(run.t)
+        early = exact[run.t <= 12.0].max()
+        off = np.maximum(abs(run.q[:, 0] - exact), abs(run.p[:, 0] - exact)) / np.maximum(exact, early)
+        off = off[np.searchsorted(run.t, found.t)]
+        assert found.differences == pytest.approx(off, rel=0.05, abs=1e-14)
+        assert (off[found.t <= 12.0] > 0).any()
+
+    def test_a_short_last_step_is_no_close_encounter(self):
+        oscillator = made("o", ["x"], "x_dot**2/2 - x**2/2")
+        stepper, lost = sc.compile_stepper(oscillator, "svi:6"), SimpleNamespace(estimate=1e-9)
+        whole = stepper.integrate([1.0], [0.0], t_end=9.0)
+        run = stepper.integrate([1.0], [0.0], t_end=whole.t[-3] + 1e-3)
+        assert run.step_sizes[-2] < 0.01 * run.step_sizes[-3]
+        assert _alternative(run, lost) == ""
+
+    @pytest.mark.rotated
+    def test_time_transformations_can_be_combined(self):
+        """Kepler's problem with e = 0.99: one is recommended, and confirms a hundredth of the error without it."""
+        name, system = "kepler .99", made("k", ["x", "y"], "(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2)")
+        stepper, start = motion_stepper(name)
+        with pytest.warns(
+            sc.AccuracyWarning, match=r"only.* or try a time transformation .* the longest step is \d+ t"
+        ):
+            run = stepper.integrate(**start, error=1e-9)
+        check_claims(name, run, 1e-9)
+        for transformed, error in (
+            (sc.compile_stepper(sc.reparametrise(system, "frequency"), "svi:8"), 1e-10),
+            (sc.compile_stepper(system, "svi:8", time_transformation="frequency"), 1e-6),
+        ):
+            run = transformed.integrate(**start, error=error)
+            assert run.confirmation.confirmed
+            check_claims(name, run, error)
+            again = transformed.integrate(**start, **run.confirmation.steps)
+            assert np.array_equal(again.q, run.q)
+
+
+class TestChaos:
+    """Burrau's problem loses thirteen digits until t = 70, a double pendulum all of them until t = 50."""
+
+    @pytest.mark.rotated
+    def test_digits_are_confirmed_until_chaos_destroys_them(self, burrau_stepper):
+        q, p = PYTHAGOREAN
+        until = {}
+        for error in (1e-6, 1e-9):
+            with pytest.warns(sc.AccuracyWarning, match=rf"global error {error:g} is confirmed until t = "):
+                run = burrau_stepper.integrate(q, p, t_end=70.0, error=error)
+            assert not run.confirmation.confirmed
+            assert run.confirmed_digits == 0
+            until[error] = run.confirmed_until
+            early = run.t <= min(run.confirmed_until, 9.0)
+            exact = integrated(burrau, [*q, *p], run.t[early][::20])
+            apart = np.abs(exact[:, :6] - run.q[early][::20]).max()
+            assert apart <= error * np.linalg.norm(q)
+        assert 5.0 < until[1e-9] < until[1e-6] < 20.0
+
+    @pytest.mark.full
+    def test_confirmed_digits_are_correct(self, burrau_stepper):
+        q, p = PYTHAGOREAN
+        run = burrau_stepper.integrate(q, p, t_end=70.0, error=1e-6)
+        saved = np.append(np.flatnonzero(run.t <= run.confirmed_until)[::10], len(run) - 1)
+        exact = integrated(burrau, [*q, *p], run.t[saved])
+        apart = np.linalg.norm(exact[:, :6] - run.q[saved], axis=1)
+        assert apart[:-1].max() <= 1e-6 * np.linalg.norm(q)
+        assert apart[-1] <= run.global_error * np.linalg.norm(run.q[-1])
+
+    @pytest.mark.second
+    @pytest.mark.parametrize("more", [{}, {"save_every": 7}, {"t_eval": np.linspace(0.0, 70.0, 50)}])
+    def test_default_run_warns_of_chaos(self, burrau_stepper, more):
+        with pytest.warns(sc.AccuracyWarning, match="errors: small perturbations of the initial state grew"):
+            burrau_stepper.integrate(*PYTHAGOREAN, t_end=70.0, **more)
+        with pytest.warns(sc.AccuracyWarning, match="a run with the initial state perturbed by 8.9e-16"):
+            burrau_stepper.integrate(*PYTHAGOREAN, t_end=70.0, **more, check_growth=True)
+
+    @pytest.mark.second
+    def test_late_encounters_are_detected_in_most_runs(self, burrau_stepper):
+        """Errors of nearby initial states grow in bursts, some of them late; all are found by repeating all steps."""
+        random, found = np.random.default_rng(1), []
+        for save_every in range(1, 13):
+            q = np.array(PYTHAGOREAN[0]) * (1.0 + 1e-3 * random.standard_normal(6))
+            arguments = {"t_end": 70.0, "save_every": save_every}
+            with warnings.catch_warnings(record=True, action="always") as heard:
+                burrau_stepper.integrate(q, PYTHAGOREAN[1], **arguments, check_growth=True)
+                count = len(heard)
+                burrau_stepper.integrate(q, PYTHAGOREAN[1], **arguments)
+            assert count > 0
+            found.append(len(heard) > count)
+        assert np.mean(found) > 0.8
+
+    @pytest.mark.filterwarnings("error")
+    def test_short_or_unchecked_runs_do_not_warn(self, burrau_stepper):
+        burrau_stepper.integrate(*PYTHAGOREAN, t_end=70.0, check_growth=False)
+        burrau_stepper.integrate(*PYTHAGOREAN, t_end=3.0)
+
+    @pytest.mark.filterwarnings("error")
+    def test_regular_motions_do_not_warn(self, kepler_stepper):
+        kepler_stepper.integrate([1.6, 0.0], [0.0, 0.5], t_end=600.0, check_growth=True)
+        kepler_stepper.integrate([1.6, 0.0], [0.0, 0.5], t_end=600.0, tolerance=1e-9)
+
+    def test_check_does_not_change_the_states(self, burrau_stepper):
+        with pytest.warns(sc.AccuracyWarning):
+            one = burrau_stepper.integrate(*PYTHAGOREAN, t_end=70.0)
+        other = burrau_stepper.integrate(*PYTHAGOREAN, t_end=70.0, check_growth=False)
+        assert np.array_equal(one.q, other.q)
+
+    @pytest.mark.second
+    def test_long_runs_are_checked_up_to_a_limit_or_completely(self):
+        """Duffing's oscillator with two wells, chaotic after t = 1000 alone; damping excludes tangent vectors."""
+        late = "(1 + tanh(t - 1000))/2"
+        wells = f"{late}*(x**2 - x**4/4 + x*cos(t)/2)"
+        system = made("late", ["x"], f"x_dot**2/2 - x**2/2 + x*cos(7*t)/100 + {wells}", damping=1e-9)
+        stepper = sc.compile_stepper(system, "svi:4")
+        with warnings.catch_warnings(action="error"):
+            run = stepper.integrate([0.1], [0.3], t_end=1300.0)
+        assert run.steps > 2048
+        with pytest.warns(sc.AccuracyWarning, match="amplifies errors"):
+            stepper.integrate([0.1], [0.3], t_end=1300.0, check_growth=True)
+
+
+@pytest.fixture(scope="module")
+def burrau_stepper():
+    return sc.compile_stepper(pythagorean(), "svi:8")
+
+
+@pytest.fixture(scope="module")
+def kepler_stepper():
+    return sc.compile_stepper(sc.problem("kepler").system, "svi:8")
+
+
+class TestWhatIsRefused:
+    @pytest.mark.parametrize(
+        ("given", "message"),
+        [
+            ({"h": 0.1, "steps": 10}, "error=1e-06 and h=0.1 both determine the step size"),
+            ({"t_end": 1.0, "tolerance": 1e-9}, "and tolerance=1e-09 both determine the step size"),
+            ({"t_end": 1.0, "error": 0.0}, "error=0 must be between 0 and 1"),
+            ({"t_end": 1.0, "error": math.nan}, "it must be finite"),
+            ({}, "t_end"),
+            ({"h": 0.1, "steps": 10, "error": None, "check_growth": True}, "requires adaptive steps"),
+        ],
+    )
+    def test_contradictory_arguments_are_rejected(self, kepler_stepper, given, message):
+        with pytest.raises(sc.StateError, match=message):
+            kepler_stepper.integrate([1.6, 0.0], [0.0, 0.5], **{"error": 1e-6, **given})
+
+
+def kepler_positions(e, t):
+    """The exact motion from the pericentre, with a semi-major axis of 1, by Kepler's equation."""
+    anomaly = t + e * np.sin(t)
+    for _ in range(50):
+        anomaly = anomaly - (anomaly - e * np.sin(anomaly) - t) / (1 - e * np.cos(anomaly))
+    return np.stack([np.cos(anomaly) - e, np.sqrt(1 - e * e) * np.sin(anomaly)], axis=-1)
+
+
+class TestEnsembles:
+    ECCENTRICITIES = np.array([0.0, 0.3, 0.6, 0.9])
+    ENDS = np.array([40.0, 30.0, 20.0, 10.0])
+
+    def _start(self):
+        e = self.ECCENTRICITIES
+        q, v = np.zeros((2, len(e), 2))
+        q[:, 0], v[:, 1] = 1 - e, np.sqrt((1 + e) / (1 - e))
+        return {"q": q, "velocity": v}
+
+    @pytest.mark.parametrize("threads", [1, 2])
+    def test_trajectories_are_those_of_single_runs_bitwise(self, kepler_stepper, threads):
+        start = self._start()
+        runs = kepler_stepper.integrate_ensemble(**start, t_end=self.ENDS, error=1e-7, threads=threads, save_every=3)
+        for j, (t, q, p, *_) in enumerate(runs.each()):
+            run = kepler_stepper.integrate(
+                start["q"][j], velocity=start["velocity"][j], t_end=self.ENDS[j], error=1e-7, save_every=3
+            )
+            assert np.array_equal(t, run.t)
+            assert np.array_equal(q, run.q)
+            assert np.array_equal(p, run.p)
+            assert runs.global_error[j] == run.global_error
+            assert runs.confirmations[j].tolerance == run.confirmation.tolerance
+
+    def test_states_at_given_times(self, kepler_stepper):
+        times = np.linspace(0.0, 40.0, 9)
+        runs = kepler_stepper.integrate_ensemble(**self._start(), t_end=self.ENDS, error=1e-8, t_eval=times)
+        for j, (t, q, *_) in enumerate(runs.each()):
+            assert t[-1] <= self.ENDS[j]
+            assert np.abs(q - kepler_positions(self.ECCENTRICITIES[j], t)).max() < 1e-7
+
+    @pytest.mark.rotated
+    def test_chaotic_and_failed_trajectories_are_named(self):
+        """One of them falls into the centre, and one is confirmed."""
+        stepper = sc.compile_stepper(
+            made("wells", ["x", "y"], "(x_dot**2 + y_dot**2)/2 - cosh(x)*cosh(y)*(x*y)**2"), "svi:8"
+        )
+        with pytest.warns(
+            sc.AccuracyWarning, match=r"confirmed for 1 of 2 trajectories; for trajectory 1 it is until"
+        ) as heard:
+            runs = stepper.integrate_ensemble(
+                [[1.0, 0.0], [1.0, 0.5]], [[0.1, 0.0], [0.3, 0.7]], t_end=150.0, error=1e-9
+            )
+        assert len(heard) == 1
+        assert runs.ok.all()
+        assert runs.global_error[0] <= 1e-9 < runs.global_error[1]
+        assert runs.confirmed_until[0] == 150.0 > runs.confirmed_until[1]
+        kepler = sc.compile_stepper(sc.problem("kepler").system, "svi:4")
+        runs = kepler.integrate_ensemble([[1.0, 0.0], [1.0, 0.0]], [[0.0, 1.0], [0.0, 0.0]], t_end=3.0, error=1e-6)
+        assert runs.status[0] == "ok" != runs.status[1]
+        assert runs.global_error[0] <= 1e-6
+        assert np.isnan([runs.global_error[1], runs.confirmed_until[1]]).all()
+        assert runs.confirmed_digits[1] == 0
+
+    def test_inputs_of_each_trajectory(self):
+        system = lagrange("pushed", "x", "x_dot**2/2 - x**2/2", inputs="u", c=0.2, forces={"x": "u - c*x_dot"})
+        stepper, t = sc.compile_stepper(system, "svi:4"), np.array([0.0, 1.0, 2.5, 6.0])
+        values = np.array([[0.0, 1.0, -1.0, 0.0], [1.0, 0.0, 0.5, 2.0]])
+        common = {"t_end": 6.0, "error": 1e-8}
+        start = [[1.0], [0.5]], [[0.0], [0.2]]
+        runs = stepper.integrate_ensemble(*start, inputs={"u": (t, values)}, parameters={"c": [0.1, 0.3]}, **common)
+        for j, (times, q, *_) in enumerate(runs.each()):
+            given = {"inputs": {"u": (t, values[j])}, "parameters": {"c": [0.1, 0.3][j]}}
+            run = stepper.integrate(start[0][j], start[1][j], **given, **common)
+            assert np.array_equal(times, run.t)
+            assert np.array_equal(q, run.q)
+            assert runs.global_error[j] == run.global_error <= 1e-8
+
+    @pytest.mark.parametrize(
+        ("more", "message"),
+        [({"h": 0.1, "steps": 3}, "h=0.1 both determine"), ({"t_end": 1.0, "tolerance": 1e-9}, "tolerance=1e-09 both")],
+    )
+    def test_contradictory_arguments_are_rejected(self, kepler_stepper, more, message):
+        with pytest.raises(sc.StateError, match=message):
+            kepler_stepper.integrate_ensemble(**self._start(), error=1e-9, **more)
+
+
+@pytest.mark.second
+class TestOtherRuns:
+    @pytest.mark.quick
+    def test_without_error_argument_nothing_is_confirmed(self, kepler_stepper):
+        run = kepler_stepper.integrate([1.6, 0.0], [0.0, 0.5], t_end=1.0)
+        assert run.confirmation is None
+        assert run.confirmed_digits is None
+        assert math.isnan(run.global_error)
+        assert math.isnan(run.confirmed_until)
+
+    def test_saved_states_and_events_are_confirmed(self, kepler_stepper):
+        start = {"q": [1.6, 0.0], "p": [0.0, 0.5]}
+        at = kepler_stepper.integrate(**start, t_end=50.0, error=1e-9, t_eval=[10.0, 30.0])
+        assert at.t.tolist() == [10.0, 30.0] == at.confirmation.t.tolist()
+        assert at.confirmed_until == 30.0
+        ended = kepler_stepper.integrate(**start, t_end=50.0, error=1e-9, events=sc.Event("q2", terminal=2))
+        assert ended.confirmed_until == ended.t[-1] < 50.0
+        exact = on_an_ellipse(start["q"], start["p"], [0.0, *ended.t[1:]])
+        assert np.abs(exact[:, :2] - ended.q).max() <= 1.6 * ended.global_error
+        saved = kepler_stepper.integrate(**start, t_end=50.0, error=1e-9, save_every=10)
+        assert len(saved) == -(-saved.steps // 10) + 1
+        assert saved.global_error <= 1e-9
+
+    def test_constraints_agree_with_an_angle(self):
+        """A pendulum held by x^2 + y^2 = 1 and one that has no other coordinate than its angle."""
+        constrained = made("h", ["x", "y"], "(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 = 1"])
+        with warnings.catch_warnings(action="error"):
+            run = sc.compile_stepper(constrained, sc.SVI(6, "gauss-lobatto:7")).integrate(
+                [1.0, 0.0], [0.0, 0.4], t_end=10.0, error=1e-8
+            )
+        exact = integrated(lambda t, y: np.array([y[1], -np.cos(y[0])]), [0.0, 0.4], run.t)[:, 0]
+        apart = np.hypot(run.q[:, 0] - np.cos(exact), run.q[:, 1] - np.sin(exact))
+        assert apart.max() <= run.global_error <= 1e-8
+
+    @pytest.mark.tiers(1)
+    @pytest.mark.parametrize("indexed", [False, True], ids=["scalar", "array"])
+    def test_confirmed_runs_with_inputs(self, indexed):
+        """x'' = -x + u with u = 1 - t/2 until t = 2, then 0, from t = 0.5: exact."""
+        table = (np.array([0.5, 2.0, 6.0]), np.array([0.75, 0.0, 0.0]))
+        if indexed:
+            system = lagrange("i", "q[N]", "sum(i in N, q_dot[i]**2/2 - q[i]**2/2 + u*q[i])", inputs="u")
+            stepper = sc.compile_stepper(system, "svi:6")
+        else:
+            stepper = sc.compile_stepper(made("i", ["q"], "q_dot**2/2 - q**2/2 + u*q", inputs=["u"]), "svi:6")
+        run = stepper.integrate([0.3], [0.1], inputs={"u": table}, t=0.5, t_end=6.0, error=1e-9)
+        q = (run.q["q"] if indexed else run.q)[:, 0]
+
+        def pushed(t):
+            """The particular solution is 1 - t/2."""
+            s = t - 0.5
+            return (0.3 - 0.75) * np.cos(s) + (0.1 + 0.5) * np.sin(s) + 1 - t / 2
+
+        at, rate = pushed(2.0), -(0.3 - 0.75) * np.sin(1.5) + 0.6 * np.cos(1.5) - 0.5
+        free = at * np.cos(run.t - 2.0) + rate * np.sin(run.t - 2.0)
+        exact = np.where(run.t <= 2.0, pushed(run.t), free)
+        assert np.abs(q - exact).max() <= run.global_error <= 1e-9
+        assert run.confirmed_until == 6.0
+
+    def test_confirmed_runs_of_arrays(self):
+        system = sc.LagrangianSystem.from_text(
+            name="chain",
+            coordinates=["q[N]"],
+            lagrangian="sum(i in N, q_dot[i]**2/2) - sum(i in N - 1, (q[i+1] - q[i])**2/2 + k*(q[i+1] - q[i])**4/4)"
+            " - q[0]**2/2 - k*q[0]**4/4 - q[N - 1]**2/2 - k*q[N - 1]**4/4",
+            parameters={"k": 0.0},
+        )
+        start = [0.5, -0.3, 0.8, 0.1]
+        stepper = sc.compile_stepper(system, "svi:6")
+        run = stepper.integrate(start, [0.0] * 4, t=2.0, t_end=12.0, parameters={"k": 0.3}, error=1e-9)
+        exact = integrated(chain, [*start, *[0.0] * 4], [2.0, *run.t[1:]])
+        size = np.linalg.norm(exact[:, :4], axis=1).max()
+        assert np.linalg.norm(exact[:, :4] - run.q["q"], axis=1).max() <= run.global_error * size
+        assert run.global_error <= 1e-9
+        with pytest.raises(sc.StateError, match="observe"):
+            stepper.integrate(start, t_end=12.0, observe=lambda run: run.energy, error=1e-9)
+
+    def test_chaotic_arrays_warn(self):
+        system = lagrange(
+            "pendulums", "q[N]", "sum(i in N, q_dot[i]**2/2 + cos(q[i])) + sum(i in N - 1, cos(q[i] - q[i + 1]))"
+        )
+        stepper = sc.compile_stepper(system, "svi:8")
+        for more in ({}, {"save_every": 5}):
+            with pytest.warns(sc.AccuracyWarning, match="amplifies errors"):
+                stepper.integrate([2.5, -1.0, 1.0], [0.5, 1.5, -0.3], t_end=300.0, **more)
+        with warnings.catch_warnings(action="error"):
+            stepper.integrate([2.5, -1.0, 1.0], [0.5, 1.5, -0.3], t_end=300.0, check_growth=False)
+            stepper.integrate([0.2, 0.1, 0.0], [0.0, 0.0, 0.0], t_end=100.0)
+
+
+class TestSolveMotion:
+    def test_unconfirmed_result_is_not_a_success(self, burrau_stepper):
+        with pytest.warns(sc.AccuracyWarning, match="confirmed until"):
+            motion = sc.solve_ivp(burrau_stepper, (0.0, 30.0), np.concatenate(PYTHAGOREAN), error=1e-9)
+        assert not motion.success
+        assert motion.status == -2
+        assert "is confirmed only until t = " in motion.message
+
+    def test_error_argument_excludes_other_step_arguments(self, kepler_stepper):
+        with pytest.raises(sc.StateError, match="error=1e-08 and rtol=1e-06 both determine the step size"):
+            sc.solve_ivp(kepler_stepper, (0.0, 1.0), [1.6, 0.0, 0.0, 0.5], error=1e-8, rtol=1e-6)
+
+
+def loaded(path):
+    with np.load(path) as file:
+        return dict(file)
+
+
+class TestCommandLine:
+    def test_text_and_json_agree_with_the_states(self, tmp_path):
+        words = ["run", "kepler", "--span", "20", "--error", "1e-9", "-o", tmp_path / "orbit.npz"]
+        printed = output_of(*words)
+        document = json_of(*words)
+        found, saved = document["global_error"], loaded(tmp_path / "orbit.npz")
+        exact = on_an_ellipse(saved["q"][0], saved["p"][0], saved["t"])
+        size = np.linalg.norm(saved["q"], axis=1).max()
+        assert f"global error: {found['estimate']:.1e} (relative) by comparison of {found['runs']} runs" in printed
+        assert np.linalg.norm(exact[:, :2] - saved["q"], axis=1).max() / size <= found["estimate"] <= 1e-9
+        assert found["digits"] == math.floor(-math.log10(found["estimate"])) >= 9
+        assert (found["requested"], found["confirmed"], found["confirmed_until"]) == (1e-9, True, saved["t"][-1])
+
+    def test_unconfirmed_result_exits_with_1(self):
+        assert re.search(
+            r"the bound 1e-09 on the global error is confirmed only until t = [\d.]+",
+            error_of("run", "double-pendulum", "--span", "40", "--error", "1e-9", status=1),
+        )
+
+    ARRAYS = (
+        '[system]\nname = "pendulums"\ncoordinates = ["q[N]"]\n'
+        'lagrangian = "sum(i in N, q_dot[i]**2/2 + cos(q[i])) + sum(i in N - 1, cos(q[i] - q[i + 1]))"\n'
+        '[method]\nmethod = "svi:8"\n[run]\nspan = {span}\nerror = 1e-8\n[initial]\nq = {q}\n'
+    )
+
+    @pytest.mark.second
+    def test_confirmed_array_runs_on_the_command_line(self, tmp_path):
+        path, output = tmp_path / "arrays.toml", tmp_path / "a.npz"
+        path.write_text(self.ARRAYS.format(span=8.0, q=[0.2, 0.1, 0.0]))
+        words = (["run", str(path), "-o", str(output), "--json"], ["run", str(path), "--error", "1e-8", "--json"])
+        found = [json_of(*each)["global_error"] for each in words]
+        model = sc.load_model(path)
+        run = model.integrate()
+        assert found[0] == found[1]
+        assert found[0]["confirmed"]
+        assert found[0]["estimate"] == run.global_error <= 1e-8
+        saved = loaded(output)
+        assert any(np.array_equal(saved[name], run.q["q"]) for name in saved)
+        path.write_text(self.ARRAYS.format(span=200.0, q=[2.5, -1.0, 1.0]))
+        assert "the bound 1e-08 on the global error is confirmed only until t = " in error_of("run", path, status=1)
+
+    @pytest.mark.parametrize(
+        ("run", "words", "message"),
+        [
+            ("error = 1e-9\ntolerance = 1e-9", [], "has both tolerance and error"),
+            ("error = 1e-9\nstep = 0.1", [], "has both step and error"),
+            ("error = 2.0", [], "between 0 and 1"),
+        ],
+    )
+    def test_invalid_files_are_rejected(self, tmp_path, run, words, message):
+        path = tmp_path / "kepler.toml"
+        path.write_text(f'[system]\ncatalogue = "kepler"\n[run]\nspan = 20.0\n{run}\n')
+        assert message in error_of("run", path, *words)
+
+    @pytest.mark.second
+    @pytest.mark.parametrize("controller", ["symplectic", "reversible"])
+    def test_error_and_time_transformation_can_be_combined(self, tmp_path, controller):
+        """In a file and by an option; the printed run is the confirmed one."""
+        path = self._kepler(tmp_path)
+        words = ["--time-transformation", "frequency", "--controller", controller, "-o", str(tmp_path / "k.npz")]
+        document = json_of("run", path, *words)
+        found, saved = document["global_error"], loaded(tmp_path / "k.npz")
+        exact = on_an_ellipse(saved["q"][0], saved["p"][0], saved["t"])
+        size = np.linalg.norm(saved["q"], axis=1).max()
+        assert found["h"] > 0.0
+        assert found["confirmed"]
+        assert np.linalg.norm(exact[:, :2] - saved["q"], axis=1).max() / size <= found["estimate"] <= 1e-9
+        motion = sc.solve_ivp(
+            sc.problem("kepler").system,
+            (0.0, 20.0),
+            np.concatenate([saved["q"][0], saved["p"][0]]),
+            error=1e-9,
+            time_transformation="frequency",
+            controller=controller,
+        )
+        assert motion.success
+        assert np.array_equal(motion.t, saved["t"])
+
+    def test_generated_folders_contain_the_error_argument(self, tmp_path):
+        model = sc.load_model(self._kepler(tmp_path))
+        folder = sc.generate_package(model, tmp_path / "orbit")
+        assert sc.load_model(folder / "model.toml").error == 1e-9
+
+    @staticmethod
+    def _kepler(folder):
+        path = folder / "kepler.toml"
+        path.write_text('[system]\ncatalogue = "kepler"\n[run]\nspan = 20.0\nerror = 1e-9\n')
+        return path
+
+    @pytest.mark.parametrize("other", ["--tolerance", "--advise"])
+    def test_step_size_arguments_are_exclusive(self, other):
+        assert "exclude each other" in error_of("run", "kepler", "--error", "1e-9", other, "1e-9")
+
+
+@pytest.mark.parametrize("power", [-660, 660])
+def test_global_errors_of_linear_systems_are_scale_invariant(power):
+    """Squares of such states overflow, or are 0."""
+    stepper = sc.compile_stepper(made("oscillator", ["q"], "q_dot**2/2 - q**2/2"), "svi:4")
+    one, other = (stepper.integrate([size], [0.0], t_end=3.0, error=1e-8) for size in (1.0, 2.0**power))
+    assert other.confirmation.confirmed
+    assert other.global_error == pytest.approx(one.global_error, rel=0.5)
+
+
+@pytest.mark.parametrize("power", [-660, 0, 660])
+def test_growth_check_of_linear_systems_is_scale_invariant(power):
+    """A saddle amplifies errors of a motion that tends to rest by exp(t), an oscillator does not."""
+    saddle = sc.compile_stepper(made("saddle", ["q"], "q_dot**2/2 + k*q**2/2", parameters={"k": 1.0}), "svi:4")
+    start = {"q": [2.0**power], "p": [-(2.0**power)], "t": 3.0, "t_end": 43.0}
+    with pytest.warns(sc.AccuracyWarning, match="amplifies errors"):
+        saddle.integrate(**start, check_growth=True)
+    with warnings.catch_warnings(action="error"):
+        saddle.integrate(**start, parameters={"k": -1.0}, check_growth=True)

@@ -1,0 +1,134 @@
+"""Derivatives by fixed-point iteration compared with those by factorisation: equal equations, two solvers."""
+
+import numpy as np
+import pytest
+from notation import lagrange
+from numpy.testing import assert_allclose
+from samples import fixed_point, tangle
+
+import scvi_codegen as sc
+from scvi_codegen.codegen.lowering import derivatives
+
+pytestmark = pytest.mark.rotated
+
+WHIRL = sc.LagrangianSystem.from_text(
+    name="whirl in a moving trap",
+    coordinates=["x", "y"],
+    lagrangian="m*x_dot**2/2 + (m + n)*y_dot**2/2 - k*(x**2 + y**4/2)*(1 + cos(w*t)/3)",
+    forces={"x": "-c*y*x", "y": "c*x + sin(t)*y"},
+    parameters={"m": 1.2, "n": 0.4, "k": 0.8, "w": 1.1, "c": 0.3},
+)
+"""Forces without a potential, masses that are parameters, time."""
+
+RUBBED = sc.LagrangianSystem.from_text(
+    name="rubbed pendulum on a cart",
+    coordinates=["x", "a"],
+    lagrangian="m*x_dot**2/2 + x_dot*a_dot*cos(a) + a_dot**2/2 - (1 + cos(t)/3)*x**2 + cos(a)",
+    forces={"x": "-r*x_dot*(1 + a**2)", "a": "r*x*x_dot - a_dot*r/2"},
+    parameters={"m": 2.0, "r": 0.4},
+)
+"""Velocity-dependent forces, so that no Jacobian is symmetric."""
+
+CASES = {
+    "whirl": (WHIRL, sc.SVI(2, "gauss-lobatto:5"), 0.2),
+    "chain": (sc.problem("fput-chain:10").system, sc.Gauss(2), 0.2),
+    "tangle": (tangle(), sc.SVI(2), 0.02),
+    "rubbed": (RUBBED, sc.SVI(5), 0.1),
+    "rubbed, several vectors of points": (RUBBED, sc.SVI(9), 0.2),
+    "whirl, several vectors of points": (WHIRL, sc.SVI(2, "gauss-lobatto:9"), 0.2),
+}
+STEPS = 70
+"""More than are solved before vectors are carried over them."""
+
+
+def numbers_of(gradient):
+    return np.concatenate([gradient.q, gradient.p, gradient.parameters, [gradient.t, gradient.h]])
+
+
+QUICK = ("whirl", "tangle", "rubbed, several vectors of points")
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize(
+    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.full) for name in CASES]
+)
+def test_iterated_derivatives_equal_those_by_factorisation(name):
+    """Forward and back, by all that is given; more directions than factors take at a time; runs kept now and then."""
+    system, method, h = CASES[name]
+    iterated, factored = (sc.compile_stepper(system, method, solver=solver) for solver in ("auto", "newton"))
+    assert "define VECTORS_BY_ITERATION" in iterated.derivatives.code
+    assert "define VECTORS_BY_ITERATION" not in factored.derivatives.code
+    random, m = np.random.default_rng(20261122), iterated.dimension
+    q = np.array([0.9, -0.4, 0.1, 0.6, -0.8, 0.2, 0.5, -0.3, 0.4, 0.7])[:m]
+    p = iterated.momentum(q, random.uniform(-0.4, 0.4, m) + (np.arange(m) == 1))
+    directions = random.normal(size=(iterated._input_size, 9))
+    partials = random.normal(size=(STEPS + 1, 2 * m, 2))
+    found = []
+    for stepper in (iterated, factored):
+        run = stepper.integrate(q, p, h=h, steps=STEPS, t=0.3)
+        some = stepper.integrate(q, p, h=h, steps=STEPS, t=0.3, save_every=35)
+        gradient, other = run.pullback(partials), some.pullback(partials[::35])
+        step = stepper.sensitivity(q, p, h, 0.3)
+        columns = (step.state, step.parameters, step.t[:, np.newaxis], step.h[:, np.newaxis])
+        found.append((np.hstack(columns), run.tangent(directions)[-1], numbers_of(gradient), numbers_of(other)))
+    for one, other in zip(*found, strict=True):
+        assert_allclose(one, other, rtol=0, atol=1e-13 * np.abs(other).max())
+
+
+def test_unconverged_steps_are_differentiated_by_factorisation():
+    """The spring is occasionally too stiff for the fixed-point iteration."""
+    spring = lagrange("spring that stiffens", "x", "x_dot**2/2 - (1 + k*sin(t/4)**8)*x**2/2", k=900.0)
+    steppers = {
+        solver: sc.compile_stepper(spring, sc.SVI(2), solver=solver) for solver in ("auto", "newton", "fixed-point")
+    }
+    runs = [steppers[solver].integrate([1.0], [0.0], h=0.25, steps=STEPS) for solver in ("auto", "newton")]
+    one, other = (run.sensitivity() for run in runs)
+    assert_allclose(one.state, other.state, rtol=0, atol=1e-12 * np.abs(other.state).max())
+    assert_allclose(one.parameters, other.parameters, rtol=0, atol=1e-12 * np.abs(other.parameters).max())
+    back = [numbers_of(run.pullback(np.ones((STEPS + 1, 2)))) for run in runs]
+    assert_allclose(*back, rtol=0, atol=1e-12 * np.abs(back[1]).max())
+    with pytest.raises(sc.StepFailedError):
+        steppers["fixed-point"].integrate([1.0], [0.0], h=0.25, steps=STEPS)
+
+
+def test_steps_beyond_the_limit_of_iterations_are_differentiated_by_factorisation():
+    """Six iterations are too few for the fixed-point iteration and enough for Newton's."""
+    quartic = lagrange("quartic", "x", "x_dot**2/2 - k*x**4/4", k=0.9)
+    few, found = sc.SolverOptions(max_iterations=6), []
+    for solver in ("auto", "newton"):
+        run = sc.compile_stepper(quartic, sc.SVI(2), solver=solver).integrate(
+            [1.0], [0.2], h=0.4, steps=20, options=few
+        )
+        one = run.sensitivity()
+        found.append((one.state, one.parameters, numbers_of(run.pullback(np.ones((21, 2))))))
+    for one, other in zip(*found, strict=True):
+        assert_allclose(one, other, rtol=0, atol=1e-13 * np.abs(other).max())
+    with pytest.raises(sc.StepFailedError):
+        sc.compile_stepper(quartic, sc.SVI(2), solver="fixed-point").integrate(
+            [1.0], [0.2], h=0.4, steps=1, options=few
+        )
+
+
+@pytest.mark.quick
+def test_large_jacobians_are_factorised(monkeypatch):
+    system = sc.problem("kepler").system
+    found = fixed_point(system, sc.SVI(2))
+    partials = derivatives.point_derivatives_of(system, found)
+    assert partials is not None
+    monkeypatch.setattr(derivatives, "MOST_DERIVATIVES", partials.count + len(partials.given.entries) - 1)
+    assert derivatives.point_derivatives_of(system, found) is None
+
+
+def test_convergence_does_not_depend_on_units_of_coordinates():
+    """A stiff coordinate, in units a million times as small or large: the same derivative, entry by entry."""
+    text = "x_dot**2/2 + {a}**2*y_dot**2/2 - (x**2 + 36*{a}**2*y**2)/2 - x**2*({a}*y) + ({a}*y)**3/3"
+    derivatives = []
+    for unit in ("1", "1000000", "1/1000000"):
+        system = lagrange("two units", "x y", text.format(a=f"({unit})"))
+        a = {"1": 1.0, "1000000": 1e6, "1/1000000": 1e-6}[unit]
+        scale = np.array([1.0, a, 1.0, 1.0 / a])
+        stepper = sc.compile_stepper(system, sc.SVI(4))
+        matrix = stepper.jacobian([0.3, 0.2 / a], [0.4, 0.1 * a], 0.2)
+        derivatives.append(scale[:, np.newaxis] * matrix / scale)
+    for other in derivatives[1:]:
+        assert_allclose(other, derivatives[0], rtol=1e-14)

@@ -1,0 +1,476 @@
+"""Runs in a folder: what is in it, how it is read, continued and exported."""
+
+import json
+import os
+import sys
+import tracemalloc
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from recorded_runs import COLUMNS, STATE, H, StopsAfter, assert_same, digests, recorded, start
+from samples import pushed_pendulum
+
+import scvi_codegen as sc
+from scvi_codegen.interfaces.models.model_files.model_file import dump_model
+from scvi_codegen.runs.driver.run_loop import record
+from scvi_codegen.runs.recording import manifest, writing
+from scvi_codegen.runs.results import export
+
+pytestmark = pytest.mark.usefixtures("here")
+
+
+class TestRecording:
+    @pytest.mark.parametrize("save_every", [1, 7, 5000])
+    def test_recorded_run_equals_the_run_in_memory(self, kepler, save_every):
+        found = recorded(kepler, 1001, save_every=save_every)
+        assert_same(found, kepler.integrate(**STATE, h=H, steps=1001, save_every=save_every))
+        assert (found.steps, found.finished, len(found)) == (1001, True, 1001 // save_every + 1)
+        assert len(list(Path("a.run").iterdir())) == 1 + -(-len(found) // 64)
+
+    def test_all_files_but_the_last_are_full(self, kepler):
+        found = recorded(kepler, 1001, rows=100)
+        assert [len(piece) for piece in found.pieces()] == [100] * 10 + [2]
+
+    @pytest.mark.tiers(0, 2)
+    @pytest.mark.sampled(3)
+    @pytest.mark.parametrize("method", [sc.SVI(4), sc.Gauss(2), sc.StoermerVerlet()], ids=lambda method: method.name)
+    @pytest.mark.parametrize("save_every", [1, 40, 400])
+    def test_interrupted_run_is_bytewise_equal(self, compiled, method, save_every):
+        stepper = compiled("kepler", method)
+        recorded(stepper, 600, save_every=save_every, folder="whole.run")
+        found, looks = recorded(stepper, 600, save_every=save_every, stop=StopsAfter(0), checkpoint_steps=31), 1
+        while not found.finished:
+            found, looks = sc.resume_run("a.run", stop=StopsAfter(looks), checkpoint_steps=37), looks + 1
+        assert looks > 3
+        assert digests("a.run") == digests("whole.run")
+
+    @pytest.mark.parametrize("save_every", [1, 7])
+    def test_steps_after_the_last_saved_state_are_recomputed(self, kepler, save_every, monkeypatch):
+        """Ctrl-C between saved states: the run and its memory are beyond the last saved state."""
+        recorded(kepler, 600, save_every=save_every, folder="whole.run")
+        left = iter([*[False] * 5, True])
+
+        def interrupted(run: sc.Run, steps: int | None = None, **settings: object) -> sc.Trajectory:
+            made = record(run, steps, **settings)
+            if next(left):
+                raise KeyboardInterrupt
+            return made
+
+        with monkeypatch.context() as patch:
+            patch.setattr(writing, "record", interrupted)
+            with pytest.raises(KeyboardInterrupt):
+                recorded(kepler, 600, save_every=save_every, checkpoint_seconds=1e9)
+        found = sc.load_run("a.run")
+        assert 0 < found.resumed().steps == found.steps < 600
+        assert sc.resume_run("a.run").finished
+        assert digests("a.run") == digests("whole.run")
+
+    def test_options_and_parameters_are_saved(self, kepler):
+        settings = {"parameters": {"mu": 1.1}, "options": sc.SolverOptions(tolerance=1e-9), "t": 3.0}
+        whole = kepler.integrate(**STATE, h=H, steps=300, **settings)
+        sc.record_run(start(kepler, **settings), "a.run", steps=300, rows=64, stop=StopsAfter(2))
+        found = sc.resume_run("a.run")
+        assert_same(found, whole)
+        assert found.manifest.options == settings["options"]
+        assert found[:3].parameters == [1.1]
+
+    def test_run_may_be_extended(self, kepler):
+        recorded(kepler, 500)
+        assert not sc.resume_run("a.run", steps=900, stop=StopsAfter(0)).finished
+        assert_same(sc.resume_run("a.run"), kepler.integrate(**STATE, h=H, steps=900))
+
+    def test_resuming_a_finished_run_changes_nothing(self, kepler):
+        recorded(kepler, 500)
+        before = digests("a.run")
+        assert sc.resume_run("a.run").finished
+        assert digests("a.run") == before
+
+    def test_checkpoints_are_written_every_n_steps(self, kepler):
+        seen = []
+        recorded(
+            kepler, 100, checkpoint_steps=25, progress=lambda done: seen.append((done, sc.load_run("a.run").steps))
+        )
+        assert {25, 50, 75, 100} <= {done for done, _ in seen}
+        assert all(written >= done - done % 25 for done, written in seen)
+
+    def test_manifest_describes_the_run(self, kepler):
+        text = dump_model(sc.Model.from_problem(sc.problem("kepler")))
+        found = recorded(kepler, 10, model=text, certificate={"symplectic": True})
+        about = json.loads(Path("a.run/manifest.json").read_text())
+        assert about["source"]["code"] == kepler.source.code.split("\n")
+        assert about["certificate"] == {"symplectic": True}
+        assert (about["model"], about["steps"], about["builds"][0]["step"]) == (text, 10, 0)
+        assert found.manifest.about()["method"] == kepler.interface.method
+
+    def test_certificate_is_accepted_as_file_or_object(self, kepler):
+        Path("c.json").write_text('{"order": 8}')
+        assert recorded(kepler, 1, certificate="c.json").manifest.certificate == {"order": 8}
+        given = SimpleNamespace(to_json=lambda: '{"order": 4}')
+        assert recorded(kepler, 1, certificate=given, folder="b.run").manifest.certificate == {"order": 4}
+        for wrong in ("none.json", {1, 2}):
+            with pytest.raises(sc.StateError, match="the certificate"):
+                recorded(kepler, 1, certificate=wrong, folder="c.run")
+
+    @pytest.mark.second
+    def test_memory_does_not_grow_with_run_length(self, kepler):
+        recorded(kepler, 10, folder="first.run")  # what is imported on the way is not counted
+        tracemalloc.start()
+        found = recorded(kepler, 100_000, rows=2000)
+        sum(len(piece) for piece in found.pieces())
+        found.save("a.npz")
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < 3.0e6 < 100_000 * (8 * 5 + 4)  # 2.0 to 2.8 MB, and less than the run's own 4.4 MB
+
+    def test_different_compiler_or_processor_is_reported_and_saved(self, kepler, monkeypatch):
+        recorded(kepler, 500, stop=StopsAfter(3))
+        step = sc.load_run("a.run").steps
+        monkeypatch.setattr(manifest, "fingerprint", lambda source, flags: "another")
+        with pytest.warns(sc.RecordingWarning, match=f"from step {step} on another build is used"):
+            sc.resume_run("a.run", steps=600)
+        with warnings.catch_warnings(action="error"):
+            found = sc.resume_run("a.run", steps=700)
+        assert [build.step for build in found.manifest.builds] == [0, step]
+
+    @pytest.mark.parametrize(
+        ("settings", "message"),
+        [
+            ({"save_every": 0}, "save_every must be at least 1"),
+            ({"steps": -1}, "steps must be at least 0"),
+            ({"rows": 0}, "rows must be at least 1"),
+            ({"checkpoint_seconds": float("nan")}, "checkpoint_seconds"),
+            ({"checkpoint_steps": 0}, "checkpoint_steps must be at least 1"),
+        ],
+        ids=str,
+    )
+    def test_invalid_numbers_are_named_before_writing(self, kepler, settings, message):
+        with pytest.raises(sc.StateError, match=message):
+            sc.record_run(start(kepler), "a.run", **{"steps": 3} | settings)
+        assert not Path("a.run").exists()
+
+    def test_active_run_is_rejected(self, kepler):
+        run = start(kepler)
+        run.record(3)
+        with pytest.raises(sc.StateError, match="at its start, but this run has 3 steps"):
+            sc.record_run(run, "a.run", steps=3)
+
+
+class TestFolders:
+    def test_a_folder_with_a_run_is_not_overwritten(self, kepler):
+        recorded(kepler, 10)
+        before = digests("a.run")
+        with pytest.raises(sc.RecordingError, match=r"already contains a run: continue it .*--resume a\.run"):
+            recorded(kepler, 10)
+        assert digests("a.run") == before
+
+    def test_foreign_folder_is_not_changed(self, kepler):
+        Path("a.run").mkdir()
+        Path("a.run/thesis.tex").touch()
+        with pytest.raises(sc.RecordingError, match="is not empty"):
+            recorded(kepler, 10)
+        assert [path.name for path in Path("a.run").iterdir()] == ["thesis.tex"]
+
+    def test_remains_of_a_killed_process_are_ignored(self, kepler):
+        Path("a.run").mkdir()
+        for name in ("states-000000.npz", ".states-000000.npz.x1y2", ".manifest.json.x1y2"):
+            Path("a.run", name).write_text("torn")
+        assert recorded(kepler, 10).finished
+        assert sorted(os.listdir("a.run")) == ["manifest.json", "states-000000.npz"]  # noqa: PTH208  (hidden ones too)
+
+    def test_folder_without_a_run_is_named(self, kepler):
+        for act in (sc.load_run, sc.resume_run):
+            with pytest.raises(sc.RecordingError, match=r"'none\.run' contains no recorded run"):
+                act("none.run")
+        with pytest.raises(sc.RecordingError, match="Nothing was recorded"):
+            recorded(kepler, 10, folder="no/such/a.run")
+
+    @pytest.mark.parametrize("damage", ["flip", "truncate", "empty", "remove", "remove last"])
+    def test_damage_is_detected(self, kepler, damage):
+        recorded(kepler, 300)
+        path = Path("a.run/states-000001.npz")
+        data = path.read_bytes()
+        if damage == "flip":
+            path.write_bytes(data[:1000] + bytes([data[1000] ^ 1]) + data[1001:])
+        elif damage == "remove last":
+            for path in Path("a.run").glob("states-*"):
+                path.unlink()
+        elif damage == "remove":
+            path.unlink()
+        else:
+            path.write_bytes(data[:500] if damage == "truncate" else b"")
+        with pytest.raises(sc.RecordingError, match=r"states-000001\.npz'|contains no states"):
+            np.asarray(sc.load_run("a.run").q)
+
+    @pytest.mark.parametrize("text", ["", "{", "[]", '{"format": 99}', '{"format": 1}'])
+    def test_a_damaged_manifest_is_named(self, kepler, text):
+        recorded(kepler, 10)
+        Path("a.run/manifest.json").write_text(text)
+        with pytest.raises(sc.RecordingError, match=r"manifest\.json' is damaged"):
+            sc.resume_run("a.run")
+
+    @pytest.mark.second
+    def test_a_flipped_bit_in_a_recording_is_rejected(self, kepler):
+        run, random = recorded(kepler, 10), np.random.default_rng(3)
+        for path in (Path("a.run/manifest.json"), Path("a.run/states-000000.npz")):
+            data = path.read_bytes()
+            for place, bit in zip(random.integers(0, len(data), 100), random.integers(0, 8, 100), strict=True):
+                path.write_bytes(data[:place] + bytes([data[place] ^ 1 << int(bit)]) + data[place + 1 :])
+                with pytest.raises(sc.RecordingError, match=r"manifest\.json|states-000000\.npz"):
+                    np.array(sc.load_run("a.run").q)
+            path.write_bytes(data)
+        assert np.array_equal(sc.load_run("a.run").q, run.q)
+
+    @pytest.mark.parametrize(
+        ("place", "value"),
+        [
+            (("source", "support", "../../outside.h"), ["int x;"]),
+            (("source", "support", "support/../../outside.h"), ["int x;"]),
+            (("source", "support", "/tmp/outside.h"), ["int x;"]),
+            (("source", "support", "support/outside.txt"), ["x"]),
+            (("source", "prefix"), "../outside"),
+            (("source", "prefix"), "a b"),
+            (("fallback", "prefix"), "../outside"),
+            (("flags",), ["-O2", "-wrapper", "touch,outside"]),
+            (("flags",), ["-fplugin=./outside.so"]),
+            (("flags",), ["-Wl,-rpath,/tmp"]),
+            (("flags",), ["-o/tmp/outside"]),
+            (("flags",), ["@outside"]),
+            (("flags",), ["-include", "outside"]),
+        ],
+    )
+    def test_manifest_cannot_reference_other_folders(self, kepler, place, value, tmp_path):
+        recorded(kepler, 10)
+        path = Path("a.run/manifest.json")
+        document = json.loads(path.read_text())
+        inner = document
+        for key in place[:-1]:
+            inner = inner[key]
+        inner[place[-1]] = value
+        del document["sha256"]
+        path.write_text(json.dumps(document, indent=1))
+        before = sorted(tmp_path.rglob("*"))
+        for act in (lambda: sc.load_run("a.run")[0:3].energy(), lambda: sc.resume_run("a.run", steps=20)):
+            with pytest.raises(sc.RecordingError, match=r"is not the name of a file|compiler flag .* is not allowed"):
+                act()
+        assert sorted(tmp_path.rglob("*")) == before
+
+    def test_a_run_with_other_flags_is_not_recorded(self, kepler, monkeypatch):
+        monkeypatch.setattr(kepler, "flags", (*kepler.flags, "-fplugin=x.so"))
+        with pytest.raises(sc.StateError, match=r"'-fplugin=x\.so' is not allowed .* SCVI_CODEGEN_CFLAGS"):
+            recorded(kepler, 10)
+
+    def test_two_processes_do_not_record_into_one_folder(self, kepler):
+        def second(done: int) -> None:
+            with pytest.raises(sc.RecordingError, match=r"another process is recording into 'a\.run'"):
+                sc.resume_run("a.run")
+
+        assert recorded(kepler, 500, progress=second).finished
+
+
+class TestReading:
+    @pytest.fixture
+    def pair(self, kepler) -> tuple[sc.RecordedRun, sc.Trajectory]:
+        return recorded(kepler, 300), kepler.integrate(**STATE, h=H, steps=300)
+
+    @pytest.mark.parametrize(
+        "index",
+        [
+            0,
+            -1,
+            64,
+            np.int64(200),
+            slice(None),
+            slice(60, 70),
+            slice(None, None, -13),
+            slice(5, 5),
+            [3, 250, 3, -1],
+            np.arange(301) % 7 == 0,
+            [],
+        ],
+        ids=str,
+    )
+    def test_columns_are_indexed_like_arrays(self, pair, index):
+        lazy, whole = pair
+        for column in COLUMNS:
+            np.testing.assert_array_equal(getattr(lazy, column)[index], getattr(whole, column)[index])
+        np.testing.assert_array_equal(lazy.q[index, 1], whole.q[index, 1])
+        np.testing.assert_array_equal(lazy.q[index, ::-1], whole.q[index, ::-1])
+
+    @pytest.mark.parametrize("index", [301, -302, [0, 301], np.ones(5, dtype=bool), [0.5], "t"], ids=str)
+    def test_rows_out_of_range_are_named(self, pair, index):
+        with pytest.raises(IndexError):
+            pair[0].q[index]
+
+    def test_columns_are_accepted_as_arrays(self, pair):
+        lazy, whole = pair
+        assert (lazy.q.shape, lazy.q.ndim, lazy.iterations.dtype, len(lazy.t)) == ((301, 2), 2, np.int32, 301)
+        assert np.abs(lazy.p).max() == np.abs(whole.p).max()
+        np.testing.assert_array_equal(list(lazy.t), whole.t)
+        dask = pytest.importorskip("dask.array")
+        blocks = dask.from_array(lazy.q, chunks=lazy.q.chunks)
+        assert blocks.numblocks == (5, 1)
+        assert blocks.sum(axis=0).compute(scheduler="sync") == pytest.approx(whole.q.sum(axis=0))
+
+    def test_slices_are_trajectories(self, pair):
+        lazy, whole = pair
+        np.testing.assert_array_equal(lazy[100:200:7].energy(), whole.energy()[100:200:7])
+        np.testing.assert_array_equal(lazy.energy(), whole.energy())
+        for number in (3, -1):
+            assert str(lazy[number]) == str(whole[number])
+        with pytest.raises(TypeError, match="must be a whole number or a slice"):
+            lazy[0.5]
+
+    @pytest.mark.rotated
+    def test_active_run_can_be_read(self, kepler):
+        lengths = []
+
+        def look(done: int) -> None:
+            lengths.append(len(np.asarray(sc.load_run("a.run").q)))
+
+        recorded(kepler, 2000, checkpoint_steps=50, progress=look)
+        assert lengths == sorted(lengths)
+        assert lengths[-1] > lengths[0]
+
+
+class TestFiles:
+    @pytest.fixture(params=["recorded", "in memory"])
+    def saved(self, request, kepler) -> tuple[sc.RecordedRun | sc.Trajectory, sc.Trajectory]:
+        whole = kepler.integrate(**STATE, h=H, steps=300)
+        return (recorded(kepler, 300, certificate={"order": 8}) if request.param == "recorded" else whole), whole
+
+    def test_npz_round_trip(self, saved):
+        given, whole = saved
+        given.save("a.npz")
+        with np.load("a.npz") as file:
+            assert_same(SimpleNamespace(**{name: file[name] for name in COLUMNS}), whole)
+            assert list(file["coordinates"]) == ["q1", "q2"]
+            assert (file["h"], file["parameters"], file["parameter_names"]) == (H, [1.0], ["mu"])
+            assert str(file["title"]) == whole.stepper.title
+            assert ("certificate" in file) == isinstance(given, sc.RecordedRun)
+
+    def test_csv_round_trip(self, saved):
+        given, whole = saved
+        given.save("a.csv")
+        columns, names = [whole.t, whole.q, whole.p, whole.iterations], "t,q1,q2,p_q1,p_q2,iterations"
+        if given is whole:  # a recording would have to be compiled
+            columns, names = [*columns, whole.velocity, whole.energy()], f"{names},q1_dot,q2_dot,energy"
+        assert Path("a.csv").read_text().splitlines()[0] == names
+        table = np.loadtxt("a.csv", delimiter=",", skiprows=1)
+        np.testing.assert_array_equal(table, np.column_stack(columns))
+
+    def test_hdf5_round_trip(self, saved):
+        h5py = pytest.importorskip("h5py")
+        given, whole = saved
+        given.save("a.h5")
+        with h5py.File("a.h5") as file:
+            assert_same(SimpleNamespace(**{name: file[name][:] for name in COLUMNS}), whole)
+            assert file.attrs["title"] == whole.stepper.title
+            assert json.loads(file.attrs["parameters"]) == {"mu": 1.0}
+            assert file["q"].dims[1][0][:].tolist() == [b"q1", b"q2"]
+            assert ("certificate" in file.attrs) == isinstance(given, sc.RecordedRun)
+
+    @pytest.mark.tiers(1)
+    def test_zarr_is_read_by_xarray(self, saved):
+        pytest.importorskip("zarr")
+        xarray = pytest.importorskip("xarray")
+        given, whole = saved
+        for _ in range(2):  # the second replaces the first
+            given.save("a.zarr")
+        dataset = xarray.open_zarr("a.zarr")
+        assert_same(SimpleNamespace(**{name: dataset[name].values for name in COLUMNS}), whole)
+        assert (dataset.q.dims, list(dataset.coordinate)) == (("t", "coordinate"), ["q1", "q2"])
+        assert dataset.attrs["method"] == whole.stepper.interface.method
+
+    @pytest.mark.tiers(2)
+    @pytest.mark.parametrize("suffix", ["h5", "hdf5", "nc"])
+    def test_hdf5_is_read_by_xarray(self, saved, suffix):
+        pytest.importorskip("h5netcdf")
+        xarray = pytest.importorskip("xarray")
+        given, whole = saved
+        given.save(f"a.{suffix}", units={"t": "day", "q": "au"})
+        with xarray.open_dataset(f"a.{suffix}") as dataset:
+            xarray.testing.assert_identical(
+                dataset.drop_attrs().load(), whole.to_xarray(units={"t": "day", "q": "au"}).drop_attrs()
+            )
+            assert dataset.velocity.attrs == {"long_name": "velocity", "units": "au day-1"}
+            assert (dataset.t.attrs["units"], dataset.p.attrs) == ("day", {"long_name": "momentum"})
+
+    def test_velocities_energies_and_momentum_maps_are_exported(self, kepler):
+        pytest.importorskip("xarray")
+        run = kepler.integrate(**STATE, h=H, steps=30)
+        dataset = run.to_xarray()
+        velocities = [kepler.velocity(q, p) for q, p in zip(run.q, run.p, strict=True)]
+        np.testing.assert_array_equal(dataset.velocity, velocities)
+        np.testing.assert_array_equal(dataset.energy, run.energy())
+        np.testing.assert_array_equal(dataset.momentum_map, run.momentum_maps())
+        assert list(dataset.symmetry.values) == list(kepler.momentum_map_names)
+
+    def test_undefined_quantities_are_nan(self, kepler):
+        pytest.importorskip("xarray")
+        run = kepler.integrate(**STATE, h=H, steps=9)
+        q = run.q.copy()
+        q[4] = 0.0
+        dataset = replace(run, q=q).to_xarray()
+        assert list(np.flatnonzero(np.isnan(dataset.energy))) == [4]
+        np.testing.assert_array_equal(np.delete(dataset.energy.values, 4), np.delete(run.energy(), 4))
+
+    @pytest.mark.parametrize(("path", "units"), [("a.csv", {"t": "s"}), ("a.h5", {"h": "s"}), ("a.h5", {"t": 1})])
+    def test_unsupported_units_are_rejected(self, kepler, path, units):
+        with pytest.raises(sc.StateError, match="units"):
+            kepler.integrate(**STATE, h=H, steps=3).save(path, units=units)
+
+    def test_tables_are_exported(self, kepler):
+        pytest.importorskip("xarray")
+        pytest.importorskip("pandas")
+        run = kepler.integrate(**STATE, h=H, steps=30)
+        dataset, frame = run.to_xarray(), run.to_dataframe()
+        np.testing.assert_array_equal(dataset.p.sel(coordinate="q2"), run.p[:, 1])
+        np.testing.assert_array_equal(frame["p_q2"], run.p[:, 1])
+        np.testing.assert_array_equal(frame.index, run.t)
+        assert dataset.attrs == frame.attrs
+        assert dataset.attrs["h"] == H
+
+    def test_missing_library_is_named_with_its_extra(self, kepler, monkeypatch):
+        run = kepler.integrate(**STATE, h=H, steps=3)
+        monkeypatch.setitem(export.LABELLED, ".h5", export.Format(export.write_hdf5, "no_such_library"))
+        monkeypatch.setitem(sys.modules, "xarray", None)
+        with pytest.raises(sc.MissingLibraryError, match=r"no_such_library, .* pip install 'scvi-codegen\[data\]'"):
+            run.save("a.h5")
+        with pytest.raises(sc.MissingLibraryError, match=r"xarray, .*scvi-codegen\[data\]"):
+            run.to_xarray()
+        assert list(Path().iterdir()) == []
+
+    def test_foreign_folder_is_not_replaced(self, kepler):
+        pytest.importorskip("zarr")
+        Path("a.zarr").mkdir()
+        with pytest.raises(sc.StateError, match="a folder with other contents"):
+            kepler.integrate(**STATE, h=H, steps=3).save("a.zarr")
+
+    def test_unfinished_file_preserves_the_old_one(self, kepler, monkeypatch):
+        run = kepler.integrate(**STATE, h=H, steps=3)
+        run.save("a.npz")
+        before = Path("a.npz").read_bytes()
+
+        def fails(states: object, path: Path) -> None:
+            path.write_text("half")
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setitem(export.WRITERS, ".npz", fails)
+        with pytest.raises(OSError, match="No space left"):
+            run.save("a.npz")
+        assert [path.name for path in Path().iterdir()] == ["a.npz"]
+        assert Path("a.npz").read_bytes() == before
+
+
+def test_missing_inputs_leave_no_folder():
+    stepper = sc.compile_stepper(pushed_pendulum(), sc.SVI(2))
+    run = stepper.start([0.3], [0.0], h=0.1)
+    with pytest.raises(sc.StateError, match=r"the input 'u' is not set.*only constant inputs"):
+        sc.record_run(run, "pushed.run", steps=4)
+    assert not Path("pushed.run").exists()
+    run.set_inputs(u=0.5, w=0.0)
+    assert len(sc.record_run(run, "pushed.run", steps=4)) == 5

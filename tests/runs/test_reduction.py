@@ -1,0 +1,217 @@
+"""Derivatives without gauge: reduced tangent maps, Lyapunov exponents, periodic orbits.
+
+Expected values: linearised Euler equations about steady rotations, periods of pendulums by elliptic integrals.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from samples import QUICK_FLAGS
+from scipy.special import ellipk
+
+import scvi_codegen as sc
+from scvi_codegen.analysis.verification.structure import structure_checks
+from scvi_codegen.analysis.verification.system_under_test import State, SystemUnderTest
+from scvi_codegen.codegen.pipeline import Sources
+from scvi_codegen.runs.states.reduction import Reduction
+
+pytestmark = pytest.mark.rotated
+
+BODY = sc.LagrangianSystem.from_text(
+    "free body", rotations={"R": "omega"}, lagrangian="(omega_1**2 + 2*omega_2**2 + 2.5*omega_3**2)/2"
+)
+MIXED = sc.LagrangianSystem.from_text(
+    "body, pendulum and mass",
+    ["x"],
+    "x_dot**2/2 - x**2/2 + (omega_1**2 + 2*omega_2**2 + omega_3**2/2)/2 - x*R_33"
+    " + (n_1_dot**2 + n_2_dot**2 + n_3_dot**2)/2 - n_3*(1 + R_13)",
+    rotations={"R": "omega"},
+    directions=["n"],
+)
+START = {"x": 0, "n": [1, 0, 0], "R": {"euler": "zxz", "angles": [0.3, 0.8, -0.4]}}
+MOVING = {"x": 1, "n": [0, 0.2, 0.1], "omega": [0.7, -0.4, 2.5]}
+SPINS = sc.HamiltonianSystem.from_text(
+    "three spins", spins=["a", "b", "c"], hamiltonian="a_1*b_1 + 2*a_2*b_2 + b_3*c_3 + b_1*c_2 + a_1/3 + c_3/2"
+)
+DIRECTIONS = {"a": [1, 0, 0], "b": [0, 0.6, 0.8], "c": [0, 0, -1]}
+
+
+def compiled(system, method):
+    return sc.compile_stepper(system, method, flags=QUICK_FLAGS)
+
+
+def symplectic_form(degrees):
+    zero, one = np.zeros((degrees, degrees)), np.eye(degrees)
+    return np.block([[zero, one], [-one, zero]])
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize(("system", "start"), [(MIXED, (START, MOVING)), (SPINS, (DIRECTIONS, None))])
+def test_the_reduced_derivative_of_a_step_is_symplectic_and_does_not_depend_on_gauge(system, start):
+    stepper = compiled(system, "svi:3")
+    run = stepper.integrate(start[0], velocity=start[1], h=0.1, steps=20)
+    reduction, m = Reduction(stepper.interface), stepper.dimension
+    inward, outward = reduction.inward(run.q, run.p), reduction.outward(run.q, run.p)
+    form = symplectic_form(reduction.size // 2)
+    np.testing.assert_allclose(outward @ inward, np.tile(np.eye(reduction.size), (21, 1, 1)), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(np.swapaxes(inward, 1, 2) @ symplectic_form(m) @ inward, [form] * 21, rtol=0, atol=1e-14)
+    step = outward[4] @ stepper.jacobian(run.q[3], run.p[3], 0.1) @ inward[3]
+    np.testing.assert_allclose(step.T @ form @ step, form, rtol=0, atol=3e-14)
+    q, p = run.q[3].copy(), run.p[3].copy()
+    if system is MIXED:
+        q[1:] *= [-2] * 4 + [3] * 3
+        p[1:] /= [-2] * 4 + [3] * 3
+    else:
+        z = (q + 1j * p) * np.exp(0.7j)
+        q, p = z.real, z.imag
+    other = reduction.outward(*stepper.step(q, p, 0.1)) @ stepper.jacobian(q, p, 0.1) @ reduction.inward(q, p)
+    np.testing.assert_allclose(other, step, rtol=0, atol=1e-14)
+    state = np.concatenate([run.q[3], run.p[3]])
+    np.testing.assert_allclose(reduction.aligned(np.concatenate([q, p]), state), state, rtol=0, atol=1e-15)
+
+
+def test_a_rotation_has_six_lyapunov_exponents_and_they_are_those_of_the_linearised_equations():
+    stepper = compiled(BODY, "svi:4")
+    unstable = np.sqrt((2 - 1) * (2.5 - 2) / (1 * 2.5))
+    run = stepper.integrate({"R": [1, 0, 0, 0]}, velocity={"omega": [0, 1, 0]}, h=0.2, steps=300)
+    exponents = run.lyapunov_exponents()
+    assert exponents.shape == (6,)
+    assert abs(exponents[0] - unstable) < 0.1
+    np.testing.assert_allclose(exponents, -exponents[::-1], rtol=0, atol=1e-13)
+    growth = np.diff(stepper.integrate({"R": [1, 0, 0, 0]}, velocity={"omega": [0, 1, 0]}, h=0.2, steps=600).fli())
+    assert growth[-100:].mean() / 0.2 == pytest.approx(unstable, rel=1e-6)
+    together = stepper.chaos_indicators_ensemble(
+        {"R": [1, 0, 0, 0]}, velocity={"omega": [[0, 1, 0], [0.1, 0.2, 1]]}, h=0.2, steps=300
+    )
+    np.testing.assert_allclose(together.lyapunov_exponents()[-1, 0], exponents, rtol=0, atol=1e-10)
+
+
+@pytest.mark.second
+def test_directions_of_changes_are_projected_and_pure_gauge_is_rejected():
+    run = compiled(BODY, "svi:2").integrate({"R": [1, 0, 0, 0]}, velocity={"omega": [0.1, 1, 0.1]}, h=0.1, steps=20)
+    gauge = np.append(run.q[0], -run.p[0])
+    change = np.random.default_rng(2).normal(size=8)
+    plain, shifted = (run.chaos_indicators(directions=each).log_norms for each in (change, change + 3 * gauge))
+    np.testing.assert_allclose(shifted, plain, rtol=0, atol=1e-12)
+    with pytest.raises(sc.StateError, match="not only the lengths of quaternions"):
+        run.chaos_indicators(directions=gauge)
+
+
+@pytest.mark.tiers(0, 1)
+@pytest.mark.parametrize("method", ["svi:4", pytest.param("scvi:4", marks=pytest.mark.full)])
+def test_a_steady_rotation_is_a_periodic_orbit_although_its_quaternion_changes_sign(method):
+    orbit = sc.periodic_orbit(
+        compiled(BODY, method), {"R": [1, 0.1, 0.2, 0]}, velocity={"omega": [0, 0, 1.01]}, period=6.2, steps=40
+    )
+    spin = orbit.run().angular_velocity()[0]
+    assert orbit.period * spin[2] == pytest.approx(2 * np.pi, abs=1e-11)
+    np.testing.assert_allclose(orbit.run().quaternion()[-1], -orbit.run().quaternion()[0], rtol=0, atol=1e-11)
+    nutation = np.cos(2 * np.pi * np.sqrt((2.5 - 1) * (2.5 - 2) / (1 * 2)))
+    np.testing.assert_allclose(sorted(orbit.stability_indices.real), [nutation, 1, 1], rtol=0, atol=1e-7)
+    assert orbit.monodromy.shape == (6, 6)
+    assert orbit.stable
+
+
+def test_unstable_orbits_are_found_by_segments_with_their_multipliers():
+    orbit = sc.periodic_orbit(
+        compiled(BODY, "svi:6"), {"R": [1, 0, 0, 0]}, velocity={"omega": [0, 1.02, 0]}, period=2 * np.pi, steps=60
+    )
+    rate = np.log(np.abs(orbit.multipliers[0])) / orbit.period
+    assert rate / orbit.run().angular_velocity()[0, 1] == pytest.approx(np.sqrt(0.5 / 2.5), rel=1e-8)
+    assert not orbit.stable
+
+
+@pytest.mark.full
+def test_orbits_of_a_rotation_a_direction_and_a_spin_have_the_periods_of_formulas():
+    amplitude = 1.2
+    period = 4 * ellipk(np.sin(amplitude / 2) ** 2)
+    body = sc.LagrangianSystem.from_text(
+        "pendulum", rotations={"R": "omega"}, lagrangian="(omega_1**2 + 1.3*omega_2**2 + omega_3**2/2)/2 + R_33"
+    )
+    orbit = sc.periodic_orbit(
+        compiled(body, "svi:6"),
+        {"R": {"axis": [1, 0.05, 0], "angle": amplitude}},
+        velocity={"omega": [0, 0.01, 0]},
+        period=1.02 * period,
+        steps=60,
+        energy=-np.cos(amplitude),
+    )
+    assert orbit.period == pytest.approx(period, abs=1e-12)
+    direction = sc.LagrangianSystem.from_text(
+        "pendulum", directions=["n"], lagrangian="(n_1_dot**2 + n_2_dot**2 + n_3_dot**2)/2 - n_3 - 0.3*n_2**2"
+    )
+    orbit = sc.periodic_orbit(
+        compiled(direction, "svi:6"),
+        {"n": [np.sin(amplitude), 0.02, -np.cos(amplitude)]},
+        velocity={"n": [-0.0002 / np.sin(amplitude), 0.01, 0]},
+        period=1.01 * period,
+        steps=40,
+        energy=-np.cos(amplitude),
+    )
+    assert orbit.period == pytest.approx(period, abs=1e-12)
+    assert orbit.monodromy.shape == (4, 4)
+    spin = sc.HamiltonianSystem.from_text("spin", spins=["a"], hamiltonian="a_3 + a_3**2/3")
+    orbit = sc.periodic_orbit(compiled(spin, "svi:4"), {"a": [0.6, 0, 0.8]}, period=4.0, steps=40)
+    assert orbit.period == pytest.approx(2 * np.pi / (1 + 2 / 3 * orbit.run().spin()[0, 2]), rel=1e-6)
+    assert orbit.monodromy.shape == (2, 2)
+
+
+def checks_of(system, start, method="svi:2", step=None):
+    stepper = compiled(system, method)
+    run = stepper.integrate(start[0], velocity=start[1], h=0.1, steps=1)
+    tested = SystemUnderTest(system, sc.as_method(method, system), stepper, None, State(run.q[0], run.p[0], 0.0, 0.1))
+    if step:
+        tested = replace(tested, stepper=step(stepper))
+    return {check.name: check for check in structure_checks(tested) if check.name in REDUCED}
+
+
+REDUCED = ("gauge invariance", "reduced symplecticity")
+
+
+class Gauged:
+    """A stepper whose momenta depend on the lengths of quaternions."""
+
+    def __init__(self, stepper):
+        self.stepper = stepper
+
+    def __getattr__(self, name):
+        return getattr(self.stepper, name)
+
+    def step(self, q, p, *arguments, **options):
+        q1, p1 = self.stepper.step(q, p, *arguments, **options)
+        return q1, p1 + 1e-11 * q * (q @ q)
+
+
+class Contracting(Gauged):
+    """A stepper that loses momentum."""
+
+    def jacobian(self, *arguments, **options):
+        jacobian = self.stepper.jacobian(*arguments, **options)
+        jacobian[len(jacobian) // 2 :] *= 1 - 1e-13
+        return jacobian
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize(("system", "start"), [(MIXED, (START, MOVING)), (SPINS, (DIRECTIONS, None))])
+def test_certificates_contain_gauge_invariance_and_reduced_symplecticity(system, start):
+    checks = checks_of(system, start)
+    assert [checks[name].outcome.name for name in REDUCED] == ["SATISFIED"] * 2
+    assert ("T*SO(3) and T*S^2" if system is MIXED else "(S^2)") in checks["reduced symplecticity"].statement
+
+
+@pytest.mark.second
+def test_violations_of_the_reduced_map_are_found():
+    checks = checks_of(BODY, ({"R": [1, 0, 0, 0]}, {"omega": [0.7, -0.4, 2.5]}), step=Contracting)
+    assert [checks[name].outcome.name for name in REDUCED] == ["VIOLATED"] * 2
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("system", [MIXED, SPINS], ids=lambda system: system.name)
+def test_derivatives_of_the_gauge_are_those_of_differences(system):
+    reduction = Reduction(Sources(system, sc.as_method("svi:1")).integrator()[1])
+    state, like = np.random.default_rng(3).normal(size=(2, 2 * system.dimension))
+    _, rows = reduction.gauge(state, like)
+    for k, unit in enumerate(np.eye(len(state))):
+        ahead, behind = (reduction.gauge(state + sign * unit, like)[0] for sign in (1, -1))
+        np.testing.assert_allclose(rows[:, k], (ahead - behind) / 2, rtol=0, atol=1e-14)

@@ -1,0 +1,552 @@
+"""Steps, runs, transforms and errors of a compiled stepper, as a user meets them."""
+
+import pickle
+from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
+
+import numpy as np
+import oracle
+import pytest
+from notation import hamilton, lagrange
+
+import scvi_codegen as sc
+from scvi_codegen.runs.states.validation import checked_parameters
+
+METHODS = (
+    sc.SVI(3),
+    sc.SCVI(3),
+    sc.SCVI(2, variational=False),
+    sc.SpectralCollocation(2),
+    sc.RadauIIA(2),
+    sc.StoermerVerlet(),
+    sc.ExplicitEuler(),
+)
+SYMMETRIC = (sc.SVI(3), sc.SVI(2, "gauss-lobatto:3"), sc.StoermerVerlet(), sc.Gauss(2))
+WITH_ACTION = (sc.SVI(2, "gauss-legendre:3"), sc.SCVI(3), sc.Gauss(2), sc.StoermerVerlet())
+each_method = pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
+each_action = pytest.mark.parametrize("method", WITH_ACTION, ids=lambda method: method.name)
+KEPLER = sc.problem("kepler")
+STATE = KEPLER.q, KEPLER.velocity
+
+
+def same(left, right):
+    """Bit for bit."""
+    return all(np.array_equal(getattr(left, name), getattr(right, name)) for name in ("t", "q", "p", "iterations"))
+
+
+@pytest.fixture
+def kepler(compiled):
+    return compiled("kepler", sc.SVI(3))
+
+
+# Steps and runs.
+
+
+@pytest.mark.tiers(1, 3)
+@each_method
+def test_run_equals_repeated_steps(sample, compiled, method):
+    stepper, (q, p) = compiled("pumped-cart-pole", method), sample("pumped-cart-pole").state
+    run = stepper.integrate(q, p, h=0.05, steps=40, t=0.3)
+    for k in range(40):
+        q, p = stepper.step(q, p, 0.05, 0.3 + k * 0.05)
+    # Forty roundings of plain steps, amplified along the trajectory; runs keep what rounding cuts off.
+    assert np.abs(run.q[-1] - q).max() < 1e-13
+    assert np.abs(run.p[-1] - p).max() < 1e-13
+
+
+def test_run_has_smaller_rounding_errors_than_repeated_steps(sample, compiled):
+    """Against the oracle: a hundred small steps of leapfrog, rounded only once at the end."""
+    case, h, count = sample("planar-pendulum"), 2.0**-7, 200
+    stepper = compiled("planar-pendulum", sc.StoermerVerlet())
+    q, p = case.state
+    exact = oracle.numbers(q), oracle.numbers(p)
+    for _ in range(count):
+        exact = oracle.leapfrog(case.mechanics, oracle.mp.zero, *exact, oracle.mp.mpf(h))
+    run = stepper.integrate(q, p, h=h, steps=count)
+    assert abs(run.q[-1] - exact[0].astype(float)) <= 2.0**-53
+    assert abs(run.p[-1] - exact[1].astype(float)) <= 2.0**-53
+
+
+def test_a_step_is_a_function_of_its_arguments(kepler):
+    first = kepler.step(*STATE, 0.1)
+    kepler.step([1.0, 1.0], [0.1, 0.2], 0.3)
+    assert np.array_equal(first, kepler.step(*STATE, 0.1))
+
+
+def test_arguments_are_not_changed(kepler):
+    q, p = np.array(STATE)
+    kepler.step(q, p, 0.1)
+    kepler.integrate(q, p, h=0.1, steps=3)
+    assert np.array_equal([q, p], STATE)
+
+
+def test_a_trajectory_begins_with_the_initial_state_and_has_float64_arrays(kepler):
+    run = kepler.integrate(*STATE, h=0.1, steps=7, t=2.0)
+    assert len(run) == 8
+    assert run.t == pytest.approx(2.0 + 0.1 * np.arange(8), abs=1e-15)
+    assert np.array_equal([run.q[0], run.p[0]], STATE)
+    assert run.q.shape == run.p.shape == (8, 2)
+    assert run.q.dtype == run.p.dtype == run.t.dtype == np.float64
+    assert run.iterations[0] == 0
+    assert (run.iterations[1:] > 0).all()
+    none = kepler.integrate(*STATE, h=0.1, steps=0)
+    assert (len(none), *none.q[0], *none.p[0]) == (1, *STATE[0], *STATE[1])
+
+
+@pytest.mark.parametrize("save_every", [1, 2, 7, 300, 1000, 5000])
+def test_save_every_selects_states_of_the_same_run(kepler, save_every):
+    """1000 steps are several calls into C: their seams must not show."""
+    dense, thin = (kepler.integrate(*STATE, h=0.05, steps=1000, save_every=e) for e in (1, save_every))
+    assert np.array_equal(thin.q, dense.q[::save_every])
+    assert np.array_equal(thin.p, dense.p[::save_every])
+    assert np.array_equal(thin.t, dense.t[::save_every])
+    assert thin.iterations.sum() == dense.iterations[: 1000 // save_every * save_every + 1].sum()
+
+
+def test_progress_receives_the_completed_steps(kepler):
+    reported = []
+    kepler.integrate(*STATE, h=0.05, steps=3000, progress=reported.append)
+    assert reported == sorted(reported)
+    assert reported[-1] == 3000
+
+
+@pytest.mark.tiers(2)
+@pytest.mark.parametrize("method", SYMMETRIC, ids=lambda method: method.name)
+def test_symmetric_method_returns_along_its_trajectory(sample, compiled, method):
+    stepper, state = compiled("pumped-cart-pole", method), sample("pumped-cart-pole").state
+    out = stepper.integrate(*state, h=0.05, steps=200, t=0.3)
+    back = stepper.integrate(out.q[-1], out.p[-1], h=-0.05, steps=200, t=out.t[-1])
+    assert back.t[-1] == pytest.approx(0.3, abs=1e-14)
+    assert np.abs(back.q[::-1] - out.q).max() < 1e-12
+    assert np.abs(back.p[::-1] - out.p).max() < 1e-12
+
+
+# Saving and restoring.
+
+
+@pytest.mark.tiers(0, 2)
+@pytest.mark.sampled(2)
+@each_method
+def test_restored_run_continues_bitwise(sample, compiled, method):
+    stepper, state = compiled("pumped-cart-pole", method), sample("pumped-cart-pole").state
+    one = stepper.start(*state, h=0.05, t=0.3)
+    one.record(123)
+    saved = one.checkpoint()
+    other = pickle.loads(pickle.dumps(stepper)).from_checkpoint(saved)
+    assert (other.t, other.steps) == (one.t, 123)
+    assert np.array_equal([other.q, other.p], [one.q, one.p])
+    assert same(one.record(200, save_every=3), other.record(200, save_every=3))
+
+
+def test_save_every_counts_from_the_start_of_the_run(kepler):
+    run = kepler.start(*STATE, h=0.05)
+    run.record(5)
+    assert run.record(10, save_every=4).t == pytest.approx(0.05 * np.array([5, 8, 12]))
+
+
+def test_checkpoints_contain_the_parameters(kepler):
+    run = kepler.start(*STATE, h=0.05, parameters={"mu": 0.9})
+    saved = run.checkpoint()
+    expected = run.record(5)
+    assert same(kepler.from_checkpoint(saved).record(5), expected)
+    assert same(kepler.from_checkpoint(saved, parameters=[0.9]).record(5), expected)
+    assert not same(kepler.from_checkpoint(saved, parameters={"mu": 1.0}).record(5), expected)
+
+
+@pytest.mark.second
+def test_checkpoints_of_other_systems_are_rejected(kepler):
+    """Their memory may have the same size."""
+    text = "a_dot**2/2 + b_dot**2/2 - (a - b)**4/4 - mu*a**2"
+    for name, coordinates in (("kepler", ["a", "b"]), ("other", [*kepler.coordinates])):
+        lagrangian = text.replace("a", coordinates[0]).replace("b", coordinates[1])
+        other = sc.LagrangianSystem.from_text(name, coordinates, lagrangian, parameters={"mu": 1.0})
+        saved = sc.compile_stepper(other, "svi:2").start([1.0, 0.5], [0.0, 0.0], h=0.1).checkpoint()
+        with pytest.raises(sc.StateError, match=r"the saved run is one of .*, not of"):
+            kepler.from_checkpoint(saved)
+
+
+def test_damaged_checkpoints_are_rejected(kepler):
+    """One bit anywhere, a missing end, or bytes of another kind."""
+    saved, random = kepler.start(*STATE, h=0.05).checkpoint(), np.random.default_rng(5)
+    places = map(int, random.integers(0, len(saved), 300))
+    damaged = [saved[:i] + bytes([saved[i] ^ 1 << int(random.integers(8))]) + saved[i + 1 :] for i in places]
+    for each in (*damaged, saved[:-1], saved + b"x", b"abc", b""):
+        with pytest.raises(sc.StateError, match=r"invalid saved run: the checksum .* save the run again"):
+            kepler.from_checkpoint(each)
+    with pytest.raises(sc.StateError, match="must be bytes, not int"):
+        kepler.from_checkpoint(3)
+    with pytest.raises(sc.StateError, match="it has 3 bytes"):
+        kepler.start(*STATE, h=0.05).rollback(b"abc")
+
+
+# Wrong arguments.
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (([1.0], [0.0, 0.0], 0.1), r"q must have shape \(2,\) for \(q1, q2\), not \(1,\)"),
+        (([1.0, 0.0], [0.0, 0.0, 0.0], 0.1), r"p must have shape"),
+        (([[1.0, 0.0]], [0.0, 0.0], 0.1), r"not \(1, 2\)"),
+        (([1.0, np.nan], [0.0, 0.0], 0.1), r"q\[1\] \(q2\) is nan"),
+        (([1.0, 0.0], [np.inf, 0.0], 0.1), r"p\[0\] \(q1\) is inf"),
+        ((np.array([1.0, 0.0]), np.array([0.0, np.nan]), 0.1), r"p\[1\] \(q2\) is nan"),
+        (("ab", [0.0, 0.0], 0.1), "q must be real numbers"),
+        (([1j, 0.0], [0.0, 0.0], 0.1), "real"),
+        (([1.0, 0.0], [0.0, 1.0], 0.0), "the step size h is 0"),
+        (([1.0, 0.0], [0.0, 1.0], np.nan), "the step size h is nan"),
+        (([1.0, 0.0], [0.0, 1.0], np.inf), "the step size h is inf"),
+        (([1.0, 0.0], [0.0, 1.0], "small"), "the step size h must be real numbers"),
+        (
+            ([1.0, 0.0], [0.0, 1.0], None),
+            "the step size h must be real numbers|give either h .fixed step size. or t_end",
+        ),
+        (([1.0, 0.0], [0.0, 1.0], 0.1, 0.0, {"muu": 1.0}), "no parameter 'muu' among mu; did you mean 'mu'"),
+        (([1.0, 0.0], [0.0, 1.0], 0.1, 0.0, {"mu": np.inf}), "the parameter mu is inf"),
+        (([1.0, 0.0], [0.0, 1.0], 0.1, 0.0, [1.0, 2.0]), r"parameters must have 1 values \(mu\), not 2"),
+        (([1.0, 0.0], [0.0, 1.0], 0.1, 0.0, {"mu": "heavy"}), "mu"),
+        (([1.0, 0.0], [0.0, 1.0], 0.1, 0.0, ["heavy"]), "parameters"),
+    ],
+)
+def test_invalid_argument_is_named(kepler, arguments, words):
+    with pytest.raises(sc.StateError, match=words):
+        kepler.step(*arguments)
+    q, p, h, *rest = arguments
+    with pytest.raises(sc.StateError, match=words):
+        kepler.integrate(q, p, h=h, steps=1, parameters=rest[1] if rest else None)
+
+
+REJECTED = [
+    (lambda stepper: stepper.integrate(*STATE, h=0.1, steps=-1), "steps must be at least 0, not -1"),
+    (lambda stepper: stepper.integrate(*STATE, h=0.1, steps=2.5), "steps must be a whole number, not 2.5"),
+    (lambda stepper: stepper.integrate(*STATE, h=0.1, steps=True), "whole number"),
+    (lambda stepper: stepper.integrate(*STATE, h=0.1, steps=3, save_every=0), "save_every must be at least 1"),
+    *((lambda stepper, t=t: stepper.step(*STATE, 0.1, t), r"\bt\b") for t in (np.nan, np.inf, "late")),
+    *(
+        (lambda stepper, t=t: stepper.integrate(*STATE, h=0.1, steps=1, t=t), r"\bt\b")
+        for t in (np.nan, np.inf, "late")
+    ),
+    *((lambda stepper, n=n: stepper.start(*STATE, h=0.1).record(n), "steps must be") for n in (-1, 2.5, True)),
+    (lambda stepper: stepper.energy(np.ones((3, 2)), np.ones((3, 2)), [0.0, 1.0]), "time"),
+    (lambda stepper: stepper.energy([[1.0, 2.0, 3.0]], [[1.0, 2.0, 3.0]]), r"states must have shape \(n, 2\)"),
+    (lambda stepper: stepper.energy([0.0, 0.0], [1.0, 0.0]), "energy of a state cannot be computed"),
+    (lambda _: sc.SolverOptions(max_iterations=2.5), "max_iterations must be a whole number"),
+    (lambda _: sc.SolverOptions(tolerance=0.0), "tolerance must be positive"),
+    (lambda _: sc.SolverOptions(max_iterations=0), "max_iterations must be at least 1"),
+]
+
+
+@pytest.mark.parametrize(("call", "message"), REJECTED)
+def test_invalid_calls_are_rejected(kepler, call, message):
+    with pytest.raises(sc.StateError, match=message):
+        call(kepler)
+
+
+def test_parameters_may_be_given_by_name_or_in_order(compiled, sample):
+    stepper, state = compiled("pumped-cart-pole", sc.SVI(3)), sample("pumped-cart-pole").state
+    values = stepper.defaults
+    values[stepper.parameters.index("k")] = 0.7
+    assert np.array_equal(stepper.step(*state, 0.1, 0.2, {"k": 0.7}), stepper.step(*state, 0.1, 0.2, values))
+    assert not np.array_equal(stepper.step(*state, 0.1, 0.2), stepper.step(*state, 0.1, 0.2, values))
+
+
+def test_defaults_cannot_be_changed_through_the_stepper(kepler):
+    kepler.defaults[:] = 7.0
+    assert kepler.defaults == [1.0]
+
+
+# Steps that fail.
+
+
+def test_step_beyond_the_domain_fails_with_a_message(compiled):
+    """Leapfrog falls into the centre, where the potential is infinite."""
+    stepper = compiled("kepler", sc.StoermerVerlet())
+    with pytest.raises(sc.StepFailedError, match=r"infinite or NaN.*undefined there") as caught:
+        stepper.step([0.0, 0.0], [1.0, 0.0], 0.1)
+    assert (caught.value.status, caught.value.step, caught.value.t) == ("not finite", 0, 0.0)
+    assert caught.value.trajectory is None
+
+
+@pytest.mark.second
+def test_a_step_without_solution_fails_with_advice(compiled):
+    """q'' = q^2 by the midpoint rule requires a root of h^2 x^2 / 2 - 2 x + 2 q + h v: none exists for this h."""
+    with pytest.raises(sc.StepFailedError, match=r"step 0 at t = 1\.5 with h = 2 failed: .*smaller step") as caught:
+        compiled("runaway", sc.SVI(1)).step([1.0], [1.0], 2.0, 1.5)
+    assert caught.value.status in ("not converged", "singular")
+    assert caught.value.residual > 0.0
+    assert caught.value.trajectory is None
+
+
+def falling(compiled):
+    """A free fall into the centre of attraction, which every method with steps of this size must fail to survive."""
+    return compiled("kepler", sc.SVI(4)), ([1.0, 0.0], [-0.5, 1e-9])
+
+
+def test_failing_run_returns_completed_states_and_ends_before_the_failing_step(compiled):
+    stepper, state = falling(compiled)
+    run = stepper.start(*state, h=0.05, options=sc.SolverOptions(max_iterations=8))
+    with pytest.raises(sc.StepFailedError) as caught:
+        run.record(400, save_every=2)
+    error, saved_states = caught.value, caught.value.trajectory
+    assert 5 < error.step < 400
+    assert error.step == run.steps
+    assert error.t == run.t == pytest.approx(0.05 * error.step)
+    assert len(saved_states) == error.step // 2 + 1
+    again = stepper.integrate(*state, h=0.05, steps=error.step, save_every=2)
+    assert np.array_equal(saved_states.q, again.q)
+    before = run.checkpoint()
+    with pytest.raises(sc.StepFailedError) as repeated:
+        run.record(1)
+    assert repeated.value.step == error.step
+    assert len(repeated.value.trajectory) == 1
+    assert run.checkpoint() == before
+
+
+def test_failed_run_continues_with_other_options(compiled):
+    state = compiled("kepler", sc.SVI(4)), STATE
+    run = state[0].start(*STATE, h=0.3, options=sc.SolverOptions(max_iterations=1))
+    with pytest.raises(sc.StepFailedError, match=r"did not converge.*larger max_iterations") as failed:
+        run.record(3)
+    assert (failed.value.step, failed.value.t) == (run.steps, run.t)
+    assert str(failed.value).startswith(
+        f"step {run.steps} at t = {run.t:.17g} with h = 0.3 failed: the iteration on the stage equations did not "
+        f"converge (last update {failed.value.residual:.3g}; "
+    )
+    assert state[0].from_checkpoint(run.checkpoint()).record(3).q[-1] == pytest.approx(
+        state[0].integrate(*STATE, h=0.3, steps=3).q[-1], abs=1e-14
+    )
+
+
+# Convergence.
+
+
+def test_relative_tolerance_does_not_depend_on_units(compiled):
+    """Lengths in units 2^30 times smaller, time unchanged: the same bits, but for the exponent."""
+    stepper, scale = compiled("kepler", sc.SVI(3)), 2.0**30
+    q, p = stepper.integrate(*STATE, h=0.1, steps=20).q, stepper.integrate(*STATE, h=0.1, steps=20).p
+    large = stepper.integrate(
+        np.multiply(scale, STATE[0]), np.multiply(scale, STATE[1]), h=0.1, steps=20, parameters={"mu": scale**3}
+    )
+    assert np.abs(large.q / scale - q).max() < 1e-14
+    assert np.abs(large.p / scale - p).max() < 1e-14
+
+
+def test_looser_tolerance_needs_fewer_iterations_and_loses_digits(kepler):
+    tight = kepler.integrate(*STATE, h=0.2, steps=50)
+    loose = kepler.integrate(*STATE, h=0.2, steps=50, options=sc.SolverOptions(tolerance=1e-4))
+    assert loose.iterations.sum() < tight.iterations.sum()
+    assert 1e-13 < np.abs(loose.q - tight.q).max() < 1e-2
+    q, _ = kepler.step(*STATE, 0.2, options=sc.SolverOptions(tolerance=1e-4))
+    assert q == pytest.approx(loose.q[1], abs=1e-15)  # but for the low words of runs
+    assert np.abs(q - tight.q[1]).max() > 1e-13
+    exact, rough = (
+        kepler.discrete_legendre_minus(STATE[0], q, 0.2, options=options)[1]
+        for options in (None, sc.SolverOptions(tolerance=0.1))
+    )
+    assert 1e-13 < np.abs(exact - rough).max() < 0.1
+
+
+def test_absolute_tolerance_bounds_the_update(kepler):
+    """Lengths in units 2^30 times smaller make the same update 2^30 times larger, and a given bound harder to meet."""
+    scale = 2.0**30
+    large = {"q": np.multiply(scale, STATE[0]), "p": np.multiply(scale, STATE[1]), "parameters": {"mu": scale**3}}
+
+    def iterations(options, q=STATE[0], p=STATE[1], parameters=None):
+        return kepler.integrate(q, p, h=0.1, steps=20, parameters=parameters, options=options).iterations.sum()
+
+    relative, absolute = (sc.SolverOptions(tolerance=1e-6, absolute=absolute) for absolute in (False, True))
+    assert iterations(relative) == iterations(relative, **large)
+    assert iterations(absolute) < iterations(absolute, **large)
+    exact = kepler.step(large["q"], large["p"], 0.1, 0.0, large["parameters"])
+    for bound in (1e3, 1e-3):
+        options = sc.SolverOptions(tolerance=bound, absolute=True)
+        found = kepler.step(large["q"], large["p"], 0.1, 0.0, large["parameters"], options=options)
+        assert np.abs(np.array(found) - exact).max() < bound
+
+
+# Legendre transforms and energy.
+
+
+@pytest.mark.tiers(3)
+@pytest.mark.parametrize("name", ["kepler", "pumped-cart-pole", "charged-particle", "relativistic-particle"])
+def test_momentum_velocity_and_energy_agree_with_the_oracle(sample, compiled, name):
+    case, stepper = sample(name), compiled(name, sc.SVI(3))
+    q, p = case.state
+    v = stepper.velocity(q, p, 0.7)
+    assert stepper.momentum(q, v, 0.7) == pytest.approx(p, abs=1e-14)
+    expected = case.mechanics.velocity(oracle.mp.mpf(0.7), oracle.numbers(q), oracle.numbers(p))
+    assert v == pytest.approx(expected.astype(float), abs=1e-14)
+    L = case.mechanics.lagrangian([oracle.mp.mpf(0.7)], oracle.numbers([q]), oracle.numbers([v]))[0]
+    assert stepper.energy(q, p, 0.7) == pytest.approx(p @ v - float(L), abs=1e-14)
+    assert isinstance(stepper.energy(q, p, 0.7), float)
+
+
+def test_velocity_is_found_where_momenta_cancel(quickly_compiled):
+    """p = v + 5 sin(q) in which the terms cancel, as of charges in magnetic fields."""
+    system = lagrange("driven pivot", "q", "q_dot**2/2 + 5.345*sin(q)*q_dot")
+    stepper = quickly_compiled(system, sc.SVI(2))
+    q = np.linspace(0.05, 3.0, 500)[:, None]
+    for p in (np.zeros_like(q), -0.0024 * q):
+        assert stepper.velocity(q, p) == pytest.approx(p - 5.345 * np.sin(q), abs=2e-15)
+
+
+@pytest.mark.second
+def test_velocity_is_undefined_beyond_the_range_of_the_momenta(compiled, sample):
+    """A momentum that no velocity below c gives in a system where there is one to find; and one given as nan."""
+    stepper = compiled("relativistic-particle", sc.SVI(3))
+    v = stepper.velocity([0.0], [3.0])
+    assert v == pytest.approx(3.0 / np.sqrt(10.0), abs=1e-12)
+    with pytest.raises(sc.StateError, match="is nan"):
+        stepper.velocity([0.0], [np.nan])
+    with pytest.raises(sc.StateError, match=r"momentum at q = .*cannot be computed"):
+        stepper.momentum([0.0], [1.5])
+
+
+def test_energies_of_many_states_equal_single_energies(sample, compiled):
+    stepper = compiled("pumped-cart-pole", sc.SVI(3))
+    run = stepper.integrate(*sample("pumped-cart-pole").state, h=0.1, steps=9)
+    each = [stepper.energy(q, p, t) for q, p, t in zip(run.q, run.p, run.t, strict=True)]
+    assert np.array_equal(run.energy(), each)
+    at_one_time = [stepper.energy(q, p, 0.3) for q, p in zip(run.q, run.p, strict=True)]
+    assert np.array_equal(stepper.energy(run.q, run.p, 0.3), at_one_time)
+    assert stepper.energy(run.q[::2], run.p[::2], run.t[::2]) == pytest.approx(each[::2], abs=0.0)
+
+
+# The discrete Lagrangian.
+
+
+@pytest.mark.tiers(0, 3)
+@pytest.mark.covering
+@each_action
+@pytest.mark.parametrize("name", ["kepler", "pumped-cart-pole"])
+def test_step_is_the_plus_transform_after_the_inverse_of_the_minus_transform(sample, compiled, name, method):
+    stepper, (q0, p0) = compiled(name, method), sample(name).state
+    q1, p1 = stepper.step(q0, p0, 0.1, 0.3)
+    minus = stepper.discrete_legendre_minus(q0, q1, 0.1, 0.3)
+    plus = stepper.discrete_legendre_plus(q0, q1, 0.1, 0.3)
+    # A change of q1 by round-off changes the momenta by (mass / h) times as much.
+    assert np.array_equal(minus[0], q0)
+    assert np.array_equal(plus[0], q1)
+    assert minus[1] == pytest.approx(p0, abs=1e-13)
+    assert plus[1] == pytest.approx(p1, abs=1e-13)
+
+
+@pytest.mark.tiers(0, 2)
+@pytest.mark.sampled(2)
+@each_action
+def test_momenta_are_derivatives_of_the_discrete_lagrangian(sample, compiled, method):
+    name = "pumped-cart-pole"
+    stepper, (q0, p0) = compiled(name, method), sample(name).state
+    q1, p1 = stepper.step(q0, p0, 0.1, 0.3)
+    width = 1e-3
+    for i, unit in enumerate(np.eye(2) * width):
+        # Fourth-order differences: truncation width^4 / h^4 times 1e-3, round-off 1e-16 / width.
+        first = [stepper.discrete_lagrangian(q0 + k * unit, q1, 0.1, 0.3) for k in (-2, -1, 1, 2)]
+        second = [stepper.discrete_lagrangian(q0, q1 + k * unit, 0.1, 0.3) for k in (-2, -1, 1, 2)]
+        weights = np.array([1, -8, 8, -1]) / (12 * width)
+        assert -weights @ first == pytest.approx(p0[i], abs=1e-9)
+        assert weights @ second == pytest.approx(p1[i], abs=1e-9)
+
+
+@pytest.mark.second
+def test_the_discrete_lagrangian_is_the_quadrature_along_the_oracles_curve(sample, compiled):
+    """The nodal curve of the oracle, whose end values give L_d by (25)."""
+    case, (c, w) = sample("pumped-cart-pole"), oracle.rule("gauss-legendre:3")
+    q, p = map(oracle.numbers, case.state)
+    nodes, h, t = oracle.points("lobatto", 3), oracle.mp.mpf(0.1), oracle.mp.mpf(0.3)
+    q1, _ = oracle.svi(case.mechanics, t, q, p, h, nodes=nodes, c=c, w=w)
+    stepper = compiled("pumped-cart-pole", sc.SVI(2, "gauss-legendre:3"))
+
+    def along(middle):
+        return oracle.action(case.mechanics, t, np.vstack([q[None], middle, q1[None]]), h, nodes, c, w)
+
+    def derivative(middle):
+        return oracle.central(lambda x: along(x[None]), middle, "1e-12")
+
+    middle = oracle.newton(derivative, (q + q1) / 2, digits=20, width="1e-9")[None]
+    found = stepper.discrete_lagrangian(q.astype(float), q1.astype(float), 0.1, 0.3)
+    assert found == pytest.approx(float(along(middle)), abs=1e-14)
+
+
+@pytest.mark.tiers(1, 2)
+@each_action
+def test_two_point_form_gives_the_same_positions(sample, compiled, method):
+    stepper, state = compiled("pumped-cart-pole", method), sample("pumped-cart-pole").state
+    run = stepper.integrate(*state, h=0.1, steps=2, t=0.3)
+    following = stepper.step_positions(run.q[0], run.q[1], 0.1, 0.3)
+    assert following == pytest.approx(run.q[2], abs=1e-13)
+
+
+@pytest.mark.parametrize(
+    "system",
+    [lagrange("L", "x", "x_dot**2 - x**4/4 + x*cos(t)"), hamilton("H", "x", "y**2/4 + x**4/4 - x*cos(t)", momenta="y")],
+    ids=["lagrangian", "hamiltonian"],
+)
+def test_the_discrete_lagrangian_of_an_explicit_step_is_the_trapezoidal_sum(system):
+    stepper = sc.compile_stepper(system, sc.StoermerVerlet())
+    x, h, t = np.array([0.7, 0.75]), 0.1, np.array([0.3, 0.4])
+    v, force = (x[1] - x[0]) / h, np.cos(t) - x**3
+    action = h / 2 * np.sum(v**2 - x**4 / 4 + x * np.cos(t))
+    assert stepper.discrete_lagrangian(x[:1], x[1:], h, t[0]) == pytest.approx(action, rel=1e-14)
+    start, end = (
+        f(x[:1], x[1:], h, t[0])[1] for f in (stepper.discrete_legendre_minus, stepper.discrete_legendre_plus)
+    )
+    assert [*start, *end] == pytest.approx([2 * v - h / 2 * force[0], 2 * v + h / 2 * force[1]], rel=1e-14)
+    assert "newton_solver" not in stepper.source.code
+
+
+def test_undefined_action_is_an_error(compiled):
+    with pytest.raises(sc.StepFailedError):
+        compiled("kepler", sc.StoermerVerlet()).discrete_lagrangian([0.0, 0.0], [1.0, 0.0], 0.1)
+
+
+def test_methods_without_a_discrete_lagrangian_are_reported(compiled):
+    for method in (sc.SpectralCollocation(2), sc.RadauIIA(2), sc.ExplicitEuler(), sc.SCVI(3, variational=False)):
+        stepper = compiled("kepler", method)
+        for call in (stepper.discrete_lagrangian, stepper.discrete_legendre_minus, stepper.step_positions):
+            with pytest.raises(sc.MethodError, match="discrete_lagrangian is not available without an action"):
+                call([1.0, 0.0], [1.0, 0.1], 0.1)
+
+
+# Threads and copies.
+
+
+def test_threads_with_different_parameters_are_independent(kepler):
+    values = [0.8 + 0.05 * k for k in range(8)]
+
+    def final(mu):
+        return kepler.integrate(*STATE, h=0.05, steps=2000, parameters={"mu": mu}).q[-1]
+
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(final, values))
+    assert np.array_equal(found, [final(mu) for mu in values])
+
+
+def test_a_stepper_shows_system_and_method(kepler):
+    assert "Kepler" in repr(kepler)
+    assert "degree 3" in repr(kepler)
+    assert kepler.dimension == 2
+
+
+@pytest.mark.tiers(0, 1)
+@pytest.mark.sampled(2)
+@pytest.mark.covering
+@pytest.mark.parametrize("name", ["double-pendulum", "relativistic-particle", "planar-pendulum", "harmonic-oscillator"])
+@pytest.mark.parametrize(
+    "method", [sc.SVI(8), sc.SVI(4, "gauss-legendre:6"), sc.SCVI(4)], ids=lambda method: method.name
+)
+def test_fixed_point_iteration_starts_from_rest(name, method):
+    """The first iteration from rest has no velocity as a scale for changes."""
+    chosen = sc.problem(name)
+    rest = np.zeros(chosen.system.dimension)
+    ends = [
+        sc.compile_stepper(chosen.system, method, solver=solver).step(chosen.q, rest, 0.05)
+        for solver in ("fixed-point", "newton")
+    ]
+    np.testing.assert_allclose(ends[0], ends[1], rtol=1e-14, atol=1e-16)
+
+
+def test_messages_name_the_first_parameters_of_many() -> None:
+    names = [f"k{i}" for i in range(8)]
+    with pytest.raises(sc.StateError, match=r"must have 8 values \(k0, k1, k2, k3, k4, k5, \.\.\.\), not 1"):
+        checked_parameters(SimpleNamespace(parameters=names, defaults=[1.0] * 8, precision=""), [2.0])  # type: ignore[arg-type]

@@ -1,0 +1,295 @@
+"""Runs in transformed time: fixed steps of tau, and everything that users give and get in time."""
+
+import pickle
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from notation import lagrange
+
+import scvi_codegen as sc
+from scvi_codegen.common.precision import mp
+from scvi_codegen.methods.exact.solution import ExactMotion
+from scvi_codegen.runs.results.time_transformation import part_of_step
+from scvi_codegen.systems.formulas.symbols import symbol
+
+KEPLER = lagrange("Kepler", "x y", "(x_dot**2 + y_dot**2)/2 + mu/sqrt(x**2 + y**2)", mu=1.0)
+ECCENTRICITY = 0.9
+START: Any = [1.0 - ECCENTRICITY, 0.0], [0.0, float(np.sqrt((1 + ECCENTRICITY) / (1 - ECCENTRICITY)))]
+METHODS = {
+    "svi": sc.SVI(8),
+    "svi, other points": sc.SVI(6, sc.gauss_lobatto(8)),
+    "three points": sc.Gauss(3),
+    "radau": sc.RadauIIA(4),
+    "lobatto": sc.LobattoIIIA(4),
+}
+FORMS = {"L": "frequency", "K": "frequency", "K, momenta": "arclength"}
+
+
+@cache
+def system_of(form: str) -> sc.LagrangianSystem | sc.HamiltonianSystem:
+    return sc.reparametrise(KEPLER if form == "L" else sc.hamiltonian_of(KEPLER), FORMS[form])
+
+
+@cache
+def stepper(form: str = "L", solver: str = "auto", method: str = "svi") -> sc.Stepper:
+    return sc.compile_stepper(system_of(form), METHODS[method], solver=solver)
+
+
+def kepler_time(q: Any) -> Any:
+    """Return the time between positions less than half an orbit apart, from Kepler's equation."""
+    axis = np.sqrt(1.0 - ECCENTRICITY**2)
+    anomaly = np.unwrap(np.arctan2(q[:, 1] / axis, q[:, 0] + ECCENTRICITY))
+    return anomaly - ECCENTRICITY * np.sin(anomaly)
+
+
+WAYS = [(form, solver) for form in FORMS for solver in ("auto", "newton")]
+
+
+@pytest.mark.tiers(0, 1)
+@pytest.mark.sampled(3)
+@pytest.mark.parametrize(("form", "solver"), WAYS)
+def test_time_satisfies_keplers_equation(form: str, solver: str) -> None:
+    run = stepper(form, solver).integrate(*START, h=0.1, steps=300)
+    assert run.t[-1] > 10.0
+    assert np.abs(kepler_time(run.q) - run.t).max() < 5e-13
+    assert np.ptp(run.energy()) < 1e-13
+    assert run.tau is not None
+    assert np.array_equal(run.tau, 0.1 * np.arange(301)) or np.abs(run.tau - 0.1 * np.arange(301)).max() < 1e-14
+
+
+@pytest.mark.tiers(0, 1)
+@pytest.mark.sampled(2)
+@pytest.mark.covering
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("form", ["L", "K"])
+def test_every_solver_gives_the_same_time(form: str, method: str) -> None:
+    runs = [stepper(form, solver, method).integrate(*START, h=0.05, steps=100) for solver in ("auto", "newton")]
+    assert np.abs(runs[0].t - runs[1].t).max() < 1e-13
+    assert np.abs(runs[0].q - runs[1].q).max() < 1e-12
+
+
+@pytest.mark.rotated
+@pytest.mark.parametrize(("form", "method"), [("L", "three points"), ("K", "radau"), ("K, momenta", "lobatto")])
+def test_order_of_the_time_is_that_of_the_method(form: str, method: str) -> None:
+    """Compare one step with the exact solution of (q, p) and t = integral of the rate, in 45 digits."""
+    made, order = stepper(form, "auto", method), METHODS[method].order
+    errors = []
+    for h in (0.4, 0.2):
+        run = made.integrate(*START, h=h, steps=1)
+        errors.append(abs(run.t[-1] - _exact_time(form, h)))
+    assert errors[0] > 1e-13
+    assert np.log2(errors[0] / errors[1]) > order + 0.5
+
+
+def _exact_time(form: str, h: float) -> float:
+    """Return the physical duration of tau = h: K = g (H + p_t) advances t."""
+    system = system_of(form)
+    if isinstance(system, sc.LagrangianSystem):
+        system = sc.hamiltonian_of(system)
+    assert system.clock is not None
+    extended = sc.HamiltonianSystem.from_sympy(
+        name="extended",
+        coordinates=[*system.coordinates, symbol("s")],
+        momenta=[*system.momenta, symbol("p_s")],
+        hamiltonian=system.hamiltonian + system.clock.rate * symbol("p_s"),
+        parameters={name.name: value for name, value in system.constants.items()},
+    )
+    q, p = START
+    level = float(stepper(form).energy(q, p))
+    motion = ExactMotion(extended, [mp.mpf(1), mp.mpf(level)])
+    return float(motion.flow([*q, 0], [*p, 0], mp.mpf(h))[0][-1])
+
+
+@pytest.mark.second
+def test_run_of_many_orbits_conserves_time_and_energy() -> None:
+    """Time is summed in two pieces: over a thousand orbits nothing but the method's phase error is left."""
+    run = stepper().integrate(*START, h=0.25, steps=30_000, save_every=1_000)
+    energies = run.energy()
+    assert np.abs(energies - energies[0]).max() < 1e-12
+    parts = [stepper().integrate(*START, h=0.25, steps=15_000)]
+    again = stepper().start(*START, h=0.25)
+    first = again.record(10_000)
+    second = again.record(5_000)
+    assert first.t[-1] == parts[0].t[10_000]
+    assert second.t[-1] == parts[0].t[-1]
+    assert run.t[15] == parts[0].t[-1]
+    increments = np.diff(parts[0].t)
+    assert abs(float(np.sum(increments, dtype=np.longdouble)) - parts[0].t[-1]) <= 2e-16 * parts[0].t[-1]
+
+
+@pytest.mark.second
+def test_energy_is_that_of_the_initial_state() -> None:
+    own = sc.compile_stepper(KEPLER, sc.SVI(4))
+    made = stepper()
+    assert made.energy(*START, parameters={"mu": 1.25}) == pytest.approx(own.energy(*START, parameters={"mu": 1.25}))
+    run = made.start(*START, h=0.1, parameters={"mu": 1.25})
+    assert run.parameters[1] == pytest.approx(own.energy(*START, parameters={"mu": 1.25}), rel=1e-14)
+    assert made.start(*START, h=0.1, parameters={"E": -0.25}).parameters[1] == -0.25
+    assert made.start(*START, h=0.1, parameters=[1.0, -0.25]).parameters[1] == -0.25
+    assert made.step(*START, 0.1)[0] == pytest.approx(made.step(*START, 0.1, parameters={"E": -0.5})[0], rel=1e-14)
+
+
+def test_velocities_are_derivatives_by_physical_time() -> None:
+    made, q, v = stepper(), [0.5, 0.25], [-0.5, 1.0]
+    assert np.array_equal(made.momentum(q, v), v) or np.abs(made.momentum(q, v) - v).max() < 1e-15
+    assert np.abs(made.velocity(q, v) - v).max() < 1e-15
+    frame = made.integrate(q, v, h=0.1, steps=3).to_dataframe()
+    assert list(frame.columns)
+    dataset = made.integrate(q, v, h=0.1, steps=3).to_xarray()
+    assert np.abs(dataset["velocity"][0] - v).max() < 1e-15
+    assert np.abs(dataset["velocity"].values - dataset["p"].values).max() < 1e-15  # of a unit mass
+
+
+@pytest.mark.tiers(1)
+@pytest.mark.parametrize("form", FORMS)
+def test_runs_end_at_a_physical_time(form: str) -> None:
+    run = stepper(form).integrate(*START, h=0.1, t_end=9.0)
+    assert run.t[-1] == 9.0
+    assert run.tau is not None
+    assert 0.0 < run.step_sizes[-2] < 0.1
+    assert run.tau[-1] - run.tau[-2] == pytest.approx(run.step_sizes[-2])
+    assert np.abs(kepler_time(run.q) - run.t).max() < 5e-13
+    back = stepper(form).integrate(run.q[-1], run.p[-1], h=-0.1, t=9.0, t_end=0.0)
+    assert back.t[-1] == 0.0
+    assert np.abs(back.q[-1] - START[0]).max() < 1e-11
+    assert len(stepper(form).integrate(*START, h=0.1, t_end=0.0)) == 2
+
+
+def test_dense_output_is_in_physical_time() -> None:
+    times = np.linspace(0.0, 9.0, 31)
+    asked = stepper().integrate(*START, h=0.1, t_end=9.0, t_eval=times)
+    assert np.array_equal(asked.t, times)
+    assert np.abs(kepler_time(asked.q[1:]) - times[1:]).max() < 1e-12
+    assert asked.tau is not None
+    for k in (7, 20):  # the part of its step at which a run to that time ends
+        ended = stepper().integrate(*START, h=0.1, t_end=float(times[k]))
+        assert ended.tau is not None
+        assert asked.tau[k] == pytest.approx(ended.tau[-1], abs=1e-12)
+    whole = stepper().integrate(*START, h=0.1, t_end=9.0)
+    assert np.array_equal(whole.at(times)[0], asked.q)
+    seldom = stepper().integrate(*START, h=0.1, t_end=9.0, save_every=7)
+    assert len(seldom) == (len(whole) - 2) // 7 + 2
+    assert np.abs(seldom.at(times)[0] - asked.q).max() < 1e-13
+    q, p = seldom.at(seldom.t[3])
+    assert np.array_equal(q, seldom.q[3])
+    assert np.array_equal(p, seldom.p[3])
+
+
+@pytest.mark.tiers(0, 1)
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("form", FORMS)
+def test_events_are_located_in_physical_time(form: str) -> None:
+    run = stepper(form).integrate(*START, h=0.1, t_end=10.0, events=["y", "t - 4", "x_dot"])
+    apsides, clock, turns = run.events
+    assert np.abs(apsides.t / np.pi - [1.0, 2.0, 3.0]).max() < 5e-13
+    assert clock.t == pytest.approx([4.0], abs=1e-14)
+    assert np.abs(turns.t - apsides.t).max() < 1e-12
+    assert np.abs(run.crossings("y")[0].t - apsides.t).max() < 1e-14
+    ended = stepper(form).integrate(*START, h=0.1, t_end=10.0, events=sc.Event("y", terminal=2))
+    assert ended.t[-1] == pytest.approx(2 * np.pi, abs=1e-12)
+    assert ended.tau is not None
+    assert 0.0 < ended.tau[-1] - ended.tau[-2] < 0.1
+
+
+@pytest.mark.full
+def test_event_functions_receive_physical_velocities() -> None:
+    """The radial speed is largest, e/sqrt(1 - e^2), at the ends of the latus rectum."""
+    functions = "(x*x_dot + y*y_dot)/sqrt(x**2 + y**2) - 2"
+    found = [stepper(form).integrate(*START, h=0.1, t_end=3.0, events=functions).events[0].t for form in FORMS]
+    assert len(found[0]) == 2
+    assert max(np.abs(found[0] - other).max() for other in found[1:]) < 1e-12
+    own = sc.compile_stepper(KEPLER, sc.SVI(8)).integrate(*START, h=0.001, steps=3000, events=functions)
+    assert np.abs(own.events[0].t - found[0]).max() < 1e-11
+
+
+def test_ensembles_have_individual_energies_and_times() -> None:
+    made = stepper()
+    q, p = np.tile(START[0], (3, 1)), np.array([START[1], [0.0, 3.0], [0.0, 4.0]])
+    many = made.integrate_ensemble(q, p, h=0.1, steps=50)
+    assert many.ok.all()
+    assert many.times is not None
+    for j in range(3):
+        alone = made.integrate(q[j], p[j], h=0.1, steps=50)
+        assert np.array_equal(many.times[:, j], alone.t)
+        assert np.array_equal(many.q[:, j], alone.q)
+        assert many.parameters[j, 1] == alone.parameters[1]
+    with pytest.raises(sc.StateError, match="no common times"):
+        many.to_xarray()
+
+
+def test_runs_are_saved_recorded_and_pickled(tmp_path: Any) -> None:
+    made = stepper()
+    run = made.start(*START, h=0.1)
+    run.record(20)
+    copy = made.from_checkpoint(run.checkpoint())
+    other = pickle.loads(pickle.dumps(run))
+    expected = run.record(20)
+    assert all(np.array_equal(x.record(20).t, expected.t) for x in (copy, other))
+    recorded = sc.record_run(made.start(*START, h=0.1), tmp_path / "run", steps=40)
+    assert np.array_equal(np.asarray(recorded.t), made.integrate(*START, h=0.1, steps=40).t)
+    assert np.array_equal(recorded[20:].tau, made.integrate(*START, h=0.1, steps=40).tau[20:])
+    seldom = sc.record_run(made.start(*START, h=0.1), tmp_path / "seldom", steps=40, save_every=4)
+    assert np.array_equal(seldom[1:].tau, made.integrate(*START, h=0.1, steps=40).tau[4::4])
+
+
+def test_levi_civita_follows_an_ellipse_that_is_almost_a_line() -> None:
+    """Through e = 1 - 1e-8: the oscillator is solved to round-off, and the time with it."""
+    plane = sc.change_coordinates(
+        sc.reparametrise(KEPLER, "sqrt(x**2 + y**2)"), {"x": "u**2 - w**2", "y": "2*u*w"}, coordinates=["u", "w"]
+    )
+    made = sc.compile_stepper(plane, sc.SVI(8))
+    e = 1.0 - 1e-8
+    q, p = [np.sqrt(1.0 + e), 0.0], [0.0, 2.0 * np.sqrt(1.0 - e)]
+    run = made.integrate(q, p, h=0.25, t_end=4 * np.pi)
+    assert np.abs(run.q[-1] - q).max() < 1e-12
+    assert run.parameters[-1] == pytest.approx(-0.5, rel=1e-13)
+
+
+@pytest.mark.second
+def test_unsupported_transformations_are_rejected() -> None:
+    made = stepper()
+    with pytest.raises(sc.StateError, match="give either steps=3 or t_end=1"):
+        made.integrate(*START, h=0.1, steps=3, t_end=1.0)
+    with pytest.raises(sc.StateError, match="h requires steps or t_end"):
+        made.integrate(*START, h=0.1)
+    with pytest.raises(sc.StateError, match="wrong sign for a run from t = 0 to t_end = -1"):
+        made.integrate(*START, h=0.1, t_end=-1.0)
+    with pytest.raises(sc.StateError, match="requires t_end instead of steps"):
+        made.integrate(*START, h=0.1, steps=10, t_eval=[0.1])
+    with pytest.raises(sc.MethodError, match="not available in transformed time: give h"):
+        made.integrate(*START, t_end=1.0)
+    with pytest.raises(sc.StateError, match="depends on the momenta"):
+        stepper("K, momenta").momentum(START[0], [0.0, 1.0])
+    with pytest.raises(sc.MethodError, match="is in transformed time: no step size is recommended"):
+        sc.advise(system_of("L"), sc.SVI(4), *START, span=10.0, tolerance=1e-9)
+    for method in (sc.SCVI(4), sc.SpectralCollocation(4)):
+        with pytest.raises(sc.MethodError, match="time transformation of 'Kepler in transformed time'"):
+            sc.compile_stepper(system_of("L"), method)
+
+
+def test_nonpositive_time_transformation_is_rejected() -> None:
+    oscillator = sc.LagrangianSystem.from_text(name="oscillator", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2")
+    made = sc.compile_stepper(sc.reparametrise(oscillator, "q"), sc.SVI(4))
+    with pytest.raises(sc.StateError, match="must be positive at every state"):
+        made.integrate([-1.0], [0.0], h=0.1, steps=3)
+    with pytest.raises(sc.StepFailedError, match="infinite or NaN"):
+        made.step([-1.0], [0.0], 0.1, parameters={"E": 0.5})
+
+
+@pytest.mark.parametrize("h", [0.05, 0.4, -0.4])
+def test_partial_step_ends_at_the_requested_time(h: float) -> None:
+    """Along an orbit on which the rate changes a hundredfold: the step of that part, taken alone, ends there."""
+    made = stepper("L", "newton")
+    run = made.integrate(*START, h=h, steps=40)
+    values = made._parameters_at(*map(np.asarray, START))
+    for k in range(0, 40, 3):
+        for share in (1e-12, 0.02, 0.5, 0.98, 1.0):
+            end = run.t[k] + share * (run.t[k + 1] - run.t[k])
+            q, p, part = part_of_step(made, run.t[k], h, end, run.q[k], run.p[k], values, None)
+            assert 0.0 < part <= 1.0
+            short = made.integrate(run.q[k], run.p[k], h=part * h, steps=1, t=run.t[k], parameters=values)
+            assert abs(short.t[1] - end) <= 6 * 2.0**-52 * max(abs(end), abs(run.t[k]), abs(end - run.t[k]))
+            assert np.array_equal(short.q[1], q)
+            assert np.array_equal(short.p[1], p)

@@ -1,0 +1,273 @@
+"""Array systems: their form, their symmetries, and their unrolled systems."""
+
+import numpy as np
+import pytest
+import sympy
+from notation import hamilton, lagrange
+
+from scvi_codegen import HamiltonianSystem, LagrangianSystem, SystemDefinitionError, unroll_sums
+from scvi_codegen.systems.arrays.reading import arrays_from_text
+from scvi_codegen.systems.arrays.symmetry import momentum_maps
+from scvi_codegen.systems.arrays.system import ArraySystem, force_of
+
+GRAVITY = "sum(i in N, m[i]*sum(a in 3, r_dot[i, a]**2)/2) + "
+DISTANCE = "sqrt(sum(a in 3, (r[i, a] - r[j, a])**2))"
+
+
+def system(coordinates: str, lagrangian: str, **extra: object) -> ArraySystem:
+    """A system of one array."""
+    return LagrangianSystem.from_text(name="system", coordinates=[coordinates], lagrangian=lagrangian, **extra)
+
+
+@pytest.mark.parametrize(
+    ("lagrangian", "message"),
+    [
+        ("sum(i in N, q[i]*q_dot[i]**2)", "velocities as m*v**2/2 only"),
+        ("sum(i in N, t*q_dot[i]**2)", "with a constant mass m"),
+        ("sum(i in N, q_dot[i]**2 + q[i]*q_dot[i])", "velocities as m*v**2/2 only"),
+        ("sum(i in 0..N-2, q_dot[i]*q_dot[i+1] + q_dot[i]**2)", "velocities as m*v**2/2 only"),
+        ("sum(i in N, q_dot[i]**4)", "with a constant mass m"),
+        ("sum(i in N, q[i]**2)", "no term contains q_dot"),
+        ("sum(i in N, q_dot[i]**2 + sqrt(q[i] - q[i] - 1))", "real"),
+    ],
+)
+def test_velocities_occur_in_one_form(lagrangian: str, message: str) -> None:
+    """The error shows the accepted form."""
+    with pytest.raises(SystemDefinitionError, match=message.replace("*", r"\*")):
+        system("q[N]", lagrangian).check_run_time_sizes()
+
+
+@pytest.mark.parametrize(
+    "extra", [{"parameters": {"q": 1}}, {"parameters": {"N": 1}}, {"parameters": {"k[N]": 1, "k": 2}}]
+)
+def test_name_has_one_meaning(extra: dict[str, dict[str, float]]) -> None:
+    """Arrays, numbers and sizes."""
+    with pytest.raises(SystemDefinitionError):
+        system("q[N]", "sum(i in N, q_dot[i]**2)", **extra)
+
+
+def test_momentum_maps_of_bodies_in_space() -> None:
+    """Three shifts and three turns of isolated bodies; a field along z leaves two and one."""
+    pairs = f"sum(i < j in N, m[i]*m[j]/{DISTANCE})"
+    free = system("r[N, 3]", GRAVITY + pairs, parameters={"m[N]": 1})
+    assert [each.name for each in momentum_maps(free)] == [
+        "momentum of r[.., 0]",
+        "momentum of r[.., 1]",
+        "momentum of r[.., 2]",
+        "angular momentum of r[.., 0], r[.., 1]",
+        "angular momentum of r[.., 0], r[.., 2]",
+        "angular momentum of r[.., 1], r[.., 2]",
+    ]
+    falling = system("r[N, 3]", f"{GRAVITY}{pairs} - sum(i in N, m[i]*r[i, 2])", parameters={"m[N]": 1})
+    assert len(momentum_maps(falling)) == 3
+
+
+def test_rotation_requires_equal_masses() -> None:
+    """Rotation mixes two components."""
+    kinetic = "sum(i in N, r_dot[i, 0]**2 + w*r_dot[i, 1]**2)"
+    round_trap = " - sum(i in N, r[i, 0]**2 + r[i, 1]**2)"
+    assert not momentum_maps(system("r[N, 2]", kinetic + round_trap, parameters={"w": 2}))
+    assert momentum_maps(system("r[N, 2]", kinetic.replace("w*", "") + round_trap))
+
+
+def test_a_chain_between_walls_has_no_momentum() -> None:
+    """One of free or joined ends has."""
+    kinetic, springs = "sum(i in N, q_dot[i]**2/2)", " - sum(i in 0..N-2, (q[i+1] - q[i])**4)"
+    assert len(momentum_maps(system("q[N]", kinetic + springs))) == 1
+    assert not momentum_maps(system("q[N]", f"{kinetic}{springs} - q[0]**2 - q[N-1]**2"))
+
+
+def test_unrolled_system_has_one_coordinate_per_element() -> None:
+    """Every element with its own coordinates, parameters and places."""
+    net = LagrangianSystem.from_text(
+        name="net",
+        coordinates=["q[N]"],
+        parameters={"k[B]": 1, "c": 2},
+        tables=["bonds[B, 2]"],
+        lagrangian="sum(i in N, q_dot[i]**2/2) - c*sum(b in B, k[b]*(q[bonds[b, 0]] - q[bonds[b, 1]])**2)",
+    )
+    found = unroll_sums(net, {"N": 3, "B": 2}, tables={"bonds": [[0, 2], [2, 1]]}, parameters={"k": [5, 7], "c": 3})
+    q, v, k = (sympy.symbols(f"{name}_:3{end}", real=True) for name, end in (("q", ""), ("q", "_dot"), ("k", "")))
+    c = sympy.Symbol("c", real=True)
+    springs = k[0] * (q[0] - q[2]) ** 2 + k[1] * (q[2] - q[1]) ** 2
+    assert sympy.expand(found.formula - sum(x**2 for x in v) / 2 + c * springs) == 0
+    assert found.constants == {c: 3.0, k[0]: 5.0, k[1]: 7.0}
+
+
+@pytest.mark.parametrize(
+    ("sizes", "extra", "message"),
+    [
+        ({}, {}, "the sizes of 'chain' are N: give exactly these"),
+        ({"N": 1}, {}, r"q\[1\] has the index \[1\], which is outside of q\[N\]"),
+        ({"N": 3}, {"parameters": {"mu": np.ones(3)}}, "has no parameter 'mu'"),
+        ({"N": 3}, {"parameters": {"m": np.ones(4)}}, r"'m' has the shape \(4,\)"),
+        ({"N": 3}, {"tables": {"x": [[1]]}}, "the tables of 'chain' are none"),
+    ],
+)
+def test_systems_that_cannot_be_unrolled_are_rejected(
+    sizes: dict[str, int], extra: dict[str, object], message: str
+) -> None:
+    """Sizes, tables and parameters are those of the system."""
+    chain = lagrange("chain", "q[N]", "sum(i in N, m[i]*q_dot[i]**2) - q[1]**2", parameters={"m[N]": 1})
+    with pytest.raises(SystemDefinitionError, match=message):
+        unroll_sums(chain, sizes, **extra)
+
+
+def test_derived_terms_are_displayed() -> None:
+    """Each read has a derivative; the formula has mathematical notation."""
+    net = system(
+        "q[N]",
+        "sum(i in N, mass[i]*q_dot[i]**2/2) - sum(b in B, cos(q[ends_of[b, 0]] - q[ends_of[b, 1]])) - q[N-1]**2"
+        "- sum(i < j in N, q[i]*q[j]) - sum(i in N periodic, q[i-1]*q[i])",
+        parameters={"mass[N]": 1},
+        tables=["ends_of[B, 2]"],
+    )
+    forces = {str(term): force_of(term, net.state).targets for term in net.potentials}
+    a, b = (sympy.Symbol(f"q[ends_of[b, {k}]]", real=True) for k in (0, 1))
+    pair = forces["sum(b in B, -cos(q[ends_of[b, 0]] - q[ends_of[b, 1]]))"]
+    assert {str(access): derivative for access, derivative in pair} == {
+        a.name: sympy.sin(a - b),
+        b.name: -sympy.sin(a - b),
+    }
+    shown = net._repr_latex_()
+    for part in (
+        r"\sum_{i=0}^{N-1} \left(\frac{\mathrm{mass}_{i} \dot{q}_{i}^{2}}{2}\right)",
+        r"\cos{\left(q_{\mathrm{ends\_of}_{b 0}} - q_{\mathrm{ends\_of}_{b 1}} \right)}",
+        r"\sum_{0 \le i < j < N} \left(- q_{i} q_{j}\right)",
+        r"\sum_{i \in \mathbb{Z}_{N}}",
+        "- q_{N-1}^{2}",
+    ):
+        assert part in shown
+
+
+def test_sympy_sums_are_read() -> None:
+    """Rings, pairs, tables, several indices and decimals, as from text."""
+    q, v, bonds, k = map(sympy.IndexedBase, ("q", "q_dot", "bonds", "k"))
+    i, j, b, N, B = sympy.symbols("i j b N B", integer=True)
+    e = sympy.Symbol("e")
+    pairs = sympy.Sum(1 / sympy.sqrt((q[i] - q[j]) ** 2 + e**2), (j, i + 1, N - 1), (i, 0, N - 2))
+    ring = sympy.Sum(sympy.cos(q[sympy.Mod(i - 1, N)] - q[i]), (i, 0, N - 1))
+    net = sympy.Sum(k[b] * (q[bonds[b, 0]] - q[bonds[b, 1]]) ** 2, (b, 0, B - 1))
+    found = LagrangianSystem.from_sympy(
+        name="system",
+        coordinates=["q[N]"],
+        parameters={"e": 1, "k[B]": 1},
+        tables=["bonds[B, 2]"],
+        lagrangian=sympy.Sum(0.5 * v[i] ** 2, (i, 0, N - 1)) - e * pairs - ring - net / 2,
+    )
+    expected = system(
+        "q[N]",
+        "sum(i in N, q_dot[i]**2/2) - e*sum(i < j in N, 1/sqrt((q[i] - q[j])**2 + e**2))"
+        "- sum(i in N periodic, cos(q[i-1] - q[i])) - sum(b in B, k[b]*(q[bonds[b, 0]] - q[bonds[b, 1]])**2)/2",
+        parameters={"e": 1, "k[B]": 1},
+        tables=["bonds[B, 2]"],
+    )
+    assert set(map(str, found.terms)) == set(map(str, expected.terms))
+
+
+@pytest.mark.parametrize(
+    ("index", "limits"),
+    [
+        ("Mod(2*i, N)", "(i, 0, N - 1)"),
+        ("Mod(i + 1, 2*N)", "(i, 0, N - 1)"),
+        ("Mod(i + 1, N)", "(i, 0, N - 2)"),
+        ("i", "(i, 0, N)"),
+        ("i", "(j, i + 1, N - 1), (i, 1, N - 2)"),
+    ],
+)
+def test_unsupported_sympy_sums_are_rejected(index: str, limits: str) -> None:
+    """Other rings, other limits, and what leaves its array."""
+    q, v = map(sympy.IndexedBase, ("q", "q_dot"))
+    i, j, N = sympy.symbols("i j N", integer=True)
+    names = {"i": i, "j": j, "N": N, "Mod": sympy.Mod}
+    place, spans = sympy.sympify(index, locals=names), sympy.sympify(f"[{limits}]", locals=names)
+    kinetic = sympy.Sum(v[i] ** 2 / 2, (i, 0, N - 1))
+    with pytest.raises(SystemDefinitionError):
+        LagrangianSystem.from_sympy(
+            name="x", coordinates=["q[N]"], lagrangian=kinetic - sympy.Sum(q[place] ** 2, *map(tuple, spans))
+        )
+
+
+def test_periodic_sympy_index_outside_a_sum_is_rejected() -> None:
+    """Mod(7, N) is no place of an array whose size is known only in a run."""
+    q, v = map(sympy.IndexedBase, ("q", "q_dot"))
+    i, N = sympy.symbols("i N", integer=True)
+    kinetic = sympy.Sum(v[i] ** 2 / 2, (i, 0, N - 1))
+    with pytest.raises(SystemDefinitionError, match=r"Mod\(7, N\) is not an index of a periodic axis"):
+        LagrangianSystem.from_sympy(name="x", coordinates=["q[N]"], lagrangian=kinetic - q[sympy.Mod(7, N)] ** 2)
+
+
+def test_momentum_maps_of_a_hamiltonian() -> None:
+    """Shifts, turns of positions with their momenta, and phases."""
+    bodies = HamiltonianSystem.from_text(
+        name="charges",
+        coordinates=["r[N, 2]"],
+        parameters={"B": 1},
+        hamiltonian="sum(i in N, (p_r[i, 0] + B*r[i, 1]/2)**2 + (p_r[i, 1] - B*r[i, 0]/2)**2)/2"
+        f"- sum(i < j in N, 1/{DISTANCE.replace('3', '2', 1)})",
+    )
+    assert [each.name for each in momentum_maps(bodies)] == ["angular momentum of r[.., 0], r[.., 1]"]
+    oscillators = hamilton("oscillators", "q[N]", "sum(i in N, (q[i]**2 + p_q[i]**2)**2)")
+    assert [each.name for each in momentum_maps(oscillators)] == ["norm of q"]
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({}, "give exactly one of lagrangian and hamiltonian"),
+        ({"lagrangian": "sum(i in N, q_dot[i]**2)", "hamiltonian": "sum(i in N, q[i])"}, "give exactly one"),
+        ({"lagrangian": "sum(i in N, q_dot[i]**2)", "momenta": ["p[N]"]}, "a Lagrangian, which has velocities"),
+        ({"hamiltonian": "sum(i in N, q[i])", "momenta": ["p[K]"]}, "momenta must be arrays"),
+        ({"hamiltonian": "sum(i in N, q[i])", "momenta": ["q[N]"]}, "'q'"),
+        ({"hamiltonian": "sum(i in N, q_dot[i]**2)"}, "'q_dot' is not an array"),
+    ],
+)
+def test_exactly_one_of_lagrangian_and_hamiltonian_is_required(given: dict[str, object], message: str) -> None:
+    """One of both, with what belongs to it."""
+    with pytest.raises(SystemDefinitionError, match=message):
+        arrays_from_text({"name": "x", "coordinates": ["q[N]"], **given})
+
+
+KINETIC = "sum(i in N, q_dot[i]**2/2)"
+
+
+def test_forces_and_conserved_quantities() -> None:
+    """Friction between neighbours leaves the momentum of a ring alone, friction against the ground does not."""
+    ring = f"{KINETIC} - sum(i in N periodic, (q[i+1] - q[i])**2)"
+    between = system("q[N]", ring, dissipation="sum(i in N periodic, (q_dot[i+1] - q_dot[i])**2)")
+    assert [each.name for each in momentum_maps(between)] == ["momentum of q"]
+    assert between.changes_energy == "forces act"
+    assert momentum_maps(system("q[N]", ring, forces={"q[i]": "-q_dot[i]"})) == ()
+    assert [array.name for array in between.velocities] == ["q_dot"]
+    assert system("q[N]", ring, forces={"q[0]": "cos(t)"}).velocities == ()
+
+
+def test_forces_are_unrolled() -> None:
+    """At every place, of every component, and at one place."""
+    found = unroll_sums(
+        system(
+            "r[N, 2]",
+            "sum(i in N, sum(a in 2, r_dot[i, a]**2))",
+            forces={"r[i, a]": "-r_dot[i, a]", "r[N-1, 0]": "cos(t)"},
+        ),
+        {"N": 2},
+    )
+    assert [str(force) for force in found.forces] == ["-r_0_0_dot", "-r_0_1_dot", "-r_1_0_dot + cos(t)", "-r_1_1_dot"]
+
+
+@pytest.mark.parametrize(
+    ("extra", "message"),
+    [
+        ({"forces": {"x[i]": "1"}}, "a force must act on coordinates"),
+        ({"forces": {"q[i]": "-q_dot[j]"}}, "'j' is not an index"),
+        ({"forces": {"q[i]": "q[i+1]"}}, "i\\+1 is N at i = N-1"),
+        ({"forces": {"q[N]": "1"}}, "is outside an axis"),
+        ({"forces": {"q[i": "1"}}, "is expected here"),
+        ({"forces": {"q": "1"}}, r"must act on entries of the array q\[N\]: write q\[i\] for all of them"),
+        ({"dissipation": "sum(i in N, q[i]**2)"}, "contains no velocity"),
+    ],
+)
+def test_invalid_forces_are_rejected(extra: dict[str, object], message: str) -> None:
+    """The parser or the checks of forces reject them."""
+    with pytest.raises(SystemDefinitionError, match=message):
+        system("q[N]", f"{KINETIC} - sum(i in N, q[i]**2)", **extra)

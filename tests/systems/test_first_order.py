@@ -1,0 +1,489 @@
+"""Lagrangians that are linear in all velocities: gauges, runs, files, certificates."""
+
+from __future__ import annotations
+
+import math
+import re
+
+import numpy as np
+import pytest
+import sympy
+from notation import lagrange
+from scipy.integrate import solve_ivp
+
+import scvi_codegen as sc
+from scvi_codegen.systems.first_order import FirstOrderSystem
+
+PARTICLE = (
+    "-(y + x**2*y + y**3/6 + x*y**2/6)/2*x_dot + (x + x**3/3 + x*y**2/2 + x**2*y/6)/2*y_dot"
+    " - (1 + cos(x)/2 + y**2 + x**4/4)"
+)
+SLAB = (
+    "-(y + y**3/6 + x**2*y/2)*x_dot/2 + (x + x*y**2/2 + x**3/6)/2*y_dot + u*z_dot - u**2/2"
+    " - mu*(1 + x**2/2 + y**2/2)*(1 + z**2/3)"
+)
+COUPLED = "(a + b*y/3)*x_dot + (b + b**3/5)*y_dot - (a**2 + b**2 + x**2 + 2*y**2 + x*b/2)/2"
+PREY = "log(y)/x/2*x_dot - log(x)/y/2*y_dot - (x + y - log(x) - 2*log(y))"
+CASES = {
+    "Lotka-Volterra": (["x", "y"], PREY, {}, [2.0, 1.0]),
+    "massless particle": (["x", "y"], PARTICLE, {}, [1.0, 0.2]),
+    "coupled": (["x", "y", "a", "b"], COUPLED, {}, [0.5, 0.3, 0.2, 0.4]),
+    "guiding centre": (["x", "y", "z", "u"], SLAB, {"mu": 0.1}, [0.5, 0.3, 0.2, 0.4]),
+}
+
+
+def system(name: str) -> FirstOrderSystem:
+    coordinates, lagrangian, parameters, _ = CASES[name]
+    return sc.LagrangianSystem.from_text(name, coordinates, lagrangian, parameters=parameters)
+
+
+def rates(name: str):
+    """Right-hand side omega^-1 dH from the text alone, without a choice of gauge."""
+    names, text, parameters, _ = CASES[name]
+    z, v = sympy.symbols(names, real=True), sympy.symbols([f"{each}_dot" for each in names], real=True)
+    lagrangian = sympy.sympify(text, locals={str(each): each for each in (*z, *v)}).subs(parameters)
+    theta = [lagrangian.diff(each) for each in v]
+    hamiltonian = -lagrangian.subs(dict.fromkeys(v, 0))
+    omega = [[theta[j].diff(z[i]) - theta[i].diff(z[j]) for j in range(len(z))] for i in range(len(z))]
+    evaluate = sympy.lambdify(z, [omega, [hamiltonian.diff(each) for each in z]])
+
+    def right(_: float, state: np.ndarray) -> np.ndarray:
+        form, gradient = evaluate(*state)
+        return np.linalg.solve(np.array(form, float), np.array(gradient, float))
+
+    return right
+
+
+METHODS = (
+    ("svi:1", 2, 40),
+    ("stoermer-verlet", 2, 40),
+    ("radau-iia:2", 3, 20),
+    ("svi:2", 4, 20),
+    ("lobatto-iiia:3", 4, 20),
+    ("svi:3", 6, 10),
+)
+"""Methods with their order and the smaller number of steps."""
+
+
+@pytest.mark.rotated
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize("name", CASES)
+def test_order_2s_against_the_equations_without_gauge(name: str) -> None:
+    start = CASES[name][3]
+    expected = solve_ivp(rates(name), (0.0, 3.0), start, method="DOP853", rtol=1e-13, atol=1e-15).y[:, -1]
+    for method, order, steps in METHODS:
+        stepper = sc.compile_stepper(system(name), method)
+        errors = [
+            np.abs(stepper.integrate(start, h=3.0 / n, steps=n).variables[-1] - expected).max()
+            for n in (steps, 2 * steps)
+        ]
+        assert math.log2(errors[0] / errors[1]) > order - 0.3 or errors[1] < 1e-11
+    adaptive = stepper.integrate(start, t_end=3.0)
+    assert np.abs(adaptive.variables[-1] - expected).max() < 1e-12
+
+
+def test_a_gauge_that_depends_on_time() -> None:
+    """theta_x = y (1 + sin(t)/2)/2 and theta_y = -x (1 + sin(t)/2)/2 require the term F_t in H."""
+    driven = sc.LagrangianSystem.from_text(
+        "driven", ["x", "y"], "(1 + sin(t)/2)*(y + y**3/3)*x_dot/2 - (1 + sin(t)/2)*x*y_dot/2 - x**2/2 - y**2/2"
+    )
+
+    def right(t: float, state: np.ndarray) -> list[float]:
+        x, y = state
+        s, rate = 1 + math.sin(t) / 2, math.cos(t) / 2
+        omega = s * (2 + y**2) / 2  # d theta_x / dy - d theta_y / dx
+        return [(y - rate * x / 2) / omega, -(x + rate * (y + y**3 / 3) / 2) / omega]
+
+    expected = solve_ivp(right, (0.0, 3.0), [1.0, 0.2], method="DOP853", rtol=1e-13, atol=1e-15).y[:, -1]
+    run = sc.compile_stepper(driven, "svi:4").integrate([1.0, 0.2], h=0.1, steps=30)
+    assert np.abs(run.variables[-1] - expected).max() < 1e-11
+
+
+def test_velocities_where_a_pivot_vanishes() -> None:
+    """The Jacobian of theta by (d, c) is regular, with a leading entry sin(t) that vanishes at t = 0 and pi."""
+    text = "a_dot*(c + c*sin(b)/5 + d*sin(t)) + b_dot*(d + a*d/10) - (a**2 + b**2 + c**2 + d**2)/2 - c*d/3"
+    stepper = sc.compile_stepper(sc.LagrangianSystem.from_text("pivot", ["d", "a", "b", "c"], text), "svi:2")
+    d, a, b, c = state = 0.5, 0.3, -0.2, 0.4
+    for t in (0.0, 1e-17, 1e-15, 0.7, math.pi):
+        transposed = [[1 + math.sin(b) / 5, 0.0], [math.sin(t), 1 + a / 10]]
+        expected = np.linalg.solve(transposed, [c + d / 3, d + c / 3])
+        run = stepper.integrate(state, h=1e-3, steps=0, t=t)
+        assert run.velocity[0] == pytest.approx(expected, rel=1e-14)
+    with pytest.raises(sc.StateError, match="singular"):
+        _ = stepper.integrate((d, -10.0, b, c), h=1e-3, steps=0).velocity
+
+
+@pytest.mark.second
+def test_one_forms_that_depend_on_time_change_the_energy() -> None:
+    """H changes by 20 %, without a warning that the motion amplifies errors; at rest in time it is conserved."""
+    for factor, conserved in (("sin(t)", False), ("1/3", True)):
+        text = f"(y + {factor}*y/2)*x_dot - (x**2 + y**2)/2"
+        stepper = sc.compile_stepper(sc.LagrangianSystem.from_text("swinging", ["x", "y"], text), "svi:4")
+        assert stepper.interface.conserves_energy == conserved
+        run = stepper.integrate([1.0, 0.2], t_end=10.0)  # warnings are errors
+        assert (abs(run.energy() / run.energy()[0] - 1).max() < 1e-12) == conserved
+
+
+@pytest.mark.second
+def test_energy_does_not_drift() -> None:
+    stepper = sc.compile_stepper(system("massless particle"), "svi:2")
+    run = stepper.integrate([1.0, 0.2], h=0.1, steps=100_000, save_every=7)
+    errors = np.abs(run.energy() - run.energy()[0])
+    assert errors[-2000:].max() < 1.01 * errors[:2000].max() < 1e-6
+
+
+@pytest.mark.second
+def test_vortices_on_a_curved_surface_agree_with_the_published_reference() -> None:
+    """GeometricProblems.jl, ``point_vortices``: ``reference_solution`` at t = 10."""
+    places = [f"(1 + x{i}**2 + y{i}**2)" for i in (1, 2)]
+    theta = " + ".join(f"g*S/2*(x{i}*y{i}_dot - y{i}*x{i}_dot)".replace("S", s) for i, s in enumerate(places, 1))
+    energy = f"g**2*{places[0]}*{places[1]}*log((x1 - x2)**2 + (y1 - y2)**2)/(2*pi)"
+    vortices = lagrange("vortices", "x1 y1 x2 y2", f"{theta} - {energy}", g=0.5)
+    run = sc.compile_stepper(vortices, "svi:8").integrate([0.5, 0.1, 0.5, -0.1], h=0.1, steps=100)
+    published = [0.18722529318641928, 0.38967432450068706, 0.38125332930294187, 0.4258020604293123]
+    assert np.abs(run.variables[-1] - published).max() < 1e-11
+    assert run.energy_error() < 1e-14
+
+
+@pytest.mark.second
+def test_lotka_volterra_in_two_dimensions_agrees_with_the_published_reference() -> None:
+    """GeometricProblems.jl, ``lotka_volterra_2d``: ``reference_solution`` at t = 100, of energy error 5.6e-11."""
+    prey = "(y + log(y)/x)*x_dot + x*y_dot + x + y - log(x) - 2*log(y)"
+    stepper = sc.compile_stepper(sc.LagrangianSystem.from_text("prey", ["x", "y"], prey), "svi:8")
+    run = stepper.integrate([2.0, 1.0], h=0.05, steps=2000)
+    assert np.abs(run.variables[-1] - [0.34520671417508214, 1.1140647339845946]).max() < 3e-10
+
+    def right(_: float, z: np.ndarray) -> list[float]:
+        return [z[0] * (2 - z[1]), z[1] * (z[0] - 1)]
+
+    expected = solve_ivp(right, (0.0, 100.0), [2.0, 1.0], method="DOP853", rtol=2.3e-14, atol=1e-16).y[:, -1]
+    assert np.abs(run.variables[-1] - expected).max() < 3e-12
+
+
+@pytest.mark.second
+def test_lotka_volterra_in_four_dimensions_agrees_with_the_published_reference() -> None:
+    """GeometricProblems.jl, ``lotka_volterra_4d``: ``reference_solution`` at t = 100; in logarithms, sheared."""
+    energy = "(exp({a}) + exp(b) + exp(c) + exp(d) - {a} - 2*b - c - d)"
+    theta = "(b + d)*{a_dot} + c*b_dot + ({a} + d)*c_dot + b*d_dot - "
+    found = r"omega\(a, b\) = -1, .* Put a \+ c in the place of a, .* omega vanishes between b and c"
+    with pytest.raises(sc.SystemDefinitionError, match=found):
+        sc.LagrangianSystem.from_text("prey", [*"abcd"], (theta + energy).format(a="a", a_dot="a_dot"))
+    moved = (theta + energy).format(a="(a + c)", a_dot="(a_dot + c_dot)")
+    stepper = sc.compile_stepper(sc.LagrangianSystem.from_text("prey", [*"abcd"], moved), "svi:8")
+    a, b, c, d = stepper.integrate([math.log(2.0), 0.0, 0.0, 0.0], h=0.05, steps=2000).variables[-1]
+    published = [1.6390462434739954, 1.3764800055785835, 0.37903204434372284, 1.4399236281802124]
+    assert np.abs(np.exp([a + c, b, c, d]) - published).max() < 1e-11
+
+
+@pytest.mark.second
+def test_a_shear_of_the_toroidal_angle() -> None:
+    """Guiding centre in the tokamak field of H. Qin, X. Guan, W. Tang, Physics of Plasmas 16 (2009) 042510."""
+    R, _, Z, u, q0, mu = z = sympy.symbols("R phi Z u q0 mu")
+    v = sympy.symbols("R_dot phi_dot Z_dot u_dot")
+    potential = [Z / (2 * R), -((R - 1) ** 2 + Z**2) / (2 * q0), -sympy.log(R) / 2]
+    field = [Z / (q0 * R), 1 / R, (1 - R) / (q0 * R)]
+    size = sympy.sqrt(Z**2 + q0**2 + (1 - R) ** 2) / (q0 * R)
+    scales = [1, R, 1, 0]
+    theta = [a + u * b * s / size for a, b, s in zip((*potential, 0), (*field, 0), scales, strict=True)]
+    hamiltonian = u**2 / 2 + mu * size
+    given = {"name": "tokamak", "coordinates": z[:4], "velocities": v, "parameters": {q0: 2**0.5, mu: 2.25e-6}}
+    lagrangian = sum(a * dot for a, dot in zip(theta, v, strict=True)) - hamiltonian
+    with pytest.raises(sc.SystemDefinitionError, match=r"Put -Z\*log\(R\)/q0 \+ phi in .* R and u"):
+        sc.LagrangianSystem.from_sympy(lagrangian=lagrangian, **given)
+    shear = Z * sympy.log(R) / q0
+    rate = shear.diff(R) * v[0] + shear.diff(Z) * v[2]
+    sheared = sc.LagrangianSystem.from_sympy(lagrangian=lagrangian.subs(v[1], v[1] - rate), **given)
+    run = sc.compile_stepper(sheared, "svi:4").integrate([1.05, 0.0, 0.0, -4.3e-4], h=400.0, steps=60)
+    assert run.momentum_errors().max() < 1e-13
+    numbers = {q0: 2**0.5, mu: 2.25e-6}
+    omega = [[theta[j].diff(z[i]) - theta[i].diff(z[j]) for j in range(4)] for i in range(4)]
+    gradient = [hamiltonian.diff(each) for each in z[:4]]
+    evaluate = sympy.lambdify(z[:4], [[[e.subs(numbers) for e in row] for row in (*omega, gradient)]])
+
+    def right(_: float, state: np.ndarray) -> np.ndarray:
+        rows = np.array(evaluate(*state)[0], float)
+        return np.linalg.solve(rows[:4], rows[4])
+
+    expected = solve_ivp(right, (0.0, 24000.0), [1.05, 0.0, 0.0, -4.3e-4], method="DOP853", rtol=1e-12, atol=1e-15)
+    end = run.variables[-1].copy()
+    end[1] -= end[2] * math.log(end[0]) / 2**0.5
+    assert np.abs(end - expected.y[:, -1]).max() < 1e-8
+
+
+def test_translations_of_vortices_conserve_their_centre() -> None:
+    strengths, pairs = {1: 1.0, 2: 2.0, 3: 0.5}, ((1, 2), (1, 3), (2, 3))
+    theta = " + ".join(f"{g}*x{i}*y{i}_dot" for i, g in strengths.items())
+    energy = " + ".join(
+        f"{strengths[i] * strengths[j]}*log((x{i} - x{j})**2 + (y{i} - y{j})**2)/(4*pi)" for i, j in pairs
+    )
+    three = lagrange("vortices", [f"{c}{i}" for i in strengths for c in "xy"], f"{theta} + {energy}")
+    stepper = sc.compile_stepper(three, "svi:3")
+    assert stepper.momentum_map_names == ("momentum of y1, y2, y3",)
+    assert stepper.interface.map_exact == (True,)
+    run = stepper.integrate([0.0, 0.0, 1.0, 0.2, 0.3, 1.2], h=0.2, steps=500)
+    centre = run.variables[:, ::2] @ list(strengths.values())
+    assert np.abs(centre - centre[0]).max() < 1e-13
+    assert run.momentum_errors().max() < 1e-13
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("size", ["3", "N"])
+def test_arrays_of_vortices(size: str) -> None:
+    pairs = f"sum(i in {size}, j in {size}, G[i]*G[j]*log((x[i] - x[j])**2 + (y[i] - y[j])**2 + 0.1))/(8*pi)"
+    cloud = sc.LagrangianSystem.from_text(
+        "vortices",
+        [f"x[{size}]", f"y[{size}]"],
+        f"sum(i in {size}, G[i]*x[i]*y_dot[i]) + {pairs}",
+        parameters={f"G[{size}]": 1.0},
+    )
+    start = {"x": [0.0, 1.0, 0.3], "y": [0.0, 0.2, 1.2]}
+    run = sc.compile_stepper(cloud, "svi:2").integrate(start, h=0.1, steps=10)
+    one = "+".join(f"x{i}*y{i}_dot" for i in range(3))
+    potential = "+".join(f"log((x{i} - x{j})**2 + (y{i} - y{j})**2 + 0.1)/(4*pi)" for i, j in ((0, 1), (0, 2), (1, 2)))
+    named = sc.LagrangianSystem.from_text("vortices", ["x0", "x1", "x2", "y0", "y1", "y2"], f"{one} + {potential}")
+    expected = sc.compile_stepper(named, "svi:2").integrate([*start["x"], *start["y"]], h=0.1, steps=10)
+    assert np.abs(run.variables - expected.variables).max() < 1e-14
+
+
+def test_canonical_one_forms_use_the_fixed_point_iteration() -> None:
+    oscillator = sc.LagrangianSystem.from_text("oscillator", ["x", "y"], "x*y_dot - x**2/2 - y**2/2")
+    assert oscillator.is_canonical
+    stepper = sc.compile_stepper(oscillator, "svi:4")
+    assert stepper.interface.solver == "fixed-point"
+    run = stepper.integrate({"x": 1.0, "y": 0.0}, h=0.1, steps=10)
+    assert run.variables[-1] == pytest.approx([math.cos(1.0), math.sin(1.0)], abs=1e-13)
+
+
+@pytest.mark.rotated
+def test_certificate_measures_the_two_form_and_the_order() -> None:
+    certificate = sc.verify(system("guiding centre"), "svi:2")
+    assert certificate.passed, str(certificate)
+    names = {check.name for check in certificate.checks}
+    assert {"stage equations", "symplecticity", "order", "reversal", "Newton's matrix"} <= names
+
+
+@pytest.mark.second
+def test_states_by_name_and_in_order() -> None:
+    stepper = sc.compile_stepper(system("guiding centre"), "svi:2")
+    start = dict(zip("xyzu", CASES["guiding centre"][3], strict=True))
+    run = stepper.integrate(start, h=0.1, steps=5)
+    assert np.array_equal(run.variables, stepper.integrate(list(start.values()), h=0.1, steps=5).variables)
+    assert np.array_equal(run.variables[0], list(start.values()))
+    assert run.to_dataframe()["u"].iloc[-1] == run.variables[-1, 3]
+    many = stepper.integrate_ensemble({**start, "x": [0.5, 0.6]}, h=0.1, steps=5)
+    assert many.variables.shape == (6, 2, 4)
+    assert np.abs(many.variables[-1, 0] - run.variables[-1]).max() < 1e-14
+    restarted = stepper.integrate(run.q[-1], run.p[-1], h=-0.1, steps=5)
+    assert np.abs(restarted.variables[-1] - run.variables[0]).max() < 1e-13
+
+
+@pytest.mark.parametrize(
+    ("start", "message"), [({"x": 1.0, "y": 1.0}, "'z' is missing"), ([1.0, 2.0], r"must have 4 values, x, y, z, u")]
+)
+def test_malformed_states(start: object, message: str) -> None:
+    with pytest.raises(sc.StateError, match=message):
+        sc.compile_stepper(system("guiding centre"), "svi:2").integrate(start, h=0.1, steps=1)
+
+
+def test_the_choice_with_the_shortest_one_form_is_used() -> None:
+    """The integral over x leaves -2*x*y for theta_y, that over y only y**2 for theta_x."""
+    short = sc.LagrangianSystem.from_text("short", ["x", "y"], "(y + y**2)*x_dot + x*y_dot - x**2 - y**2")
+    fields = short.coordinates, short.momenta, short.one_form, short.integrated, short.hamiltonian
+    x, y = short.variables
+    assert fields == ((x,), (y,), (y**2,), x * y, x**2 + y**2)
+
+
+@pytest.mark.parametrize("name", ["Lotka-Volterra", "massless particle"])
+def test_integrals_are_expanded_about_the_origins_of_the_lagrangian(name: str) -> None:
+    """A motion at 1000 takes the steps of the same one at 0, also near an equilibrium, with errors of u |q|."""
+    names, text, _, start = CASES[name]
+    text = re.sub(r"\b([xy])\b", r"(\1 - 1000)", text)
+    here, there = system(name), sc.LagrangianSystem.from_text("moved", names, text)
+    moved = dict(zip(here.variables, (z - 1000 for z in there.variables), strict=True))
+    assert there.one_form == tuple(each.xreplace(moved) for each in here.one_form)
+    steppers = [sc.compile_stepper(each, "svi:2") for each in (here, there)]
+    equilibrium = {"Lotka-Volterra": (1.0, 2.0), "massless particle": (0.0, 0.0)}[name]
+    for state in (start, np.array(equilibrium) + 1e-3):
+        ends: dict[float | None, list[np.ndarray]] = {}
+        for tolerance in (None, 1e-6):
+            runs = [
+                stepper.integrate(np.array(state) + origin, t_end=1.0, tolerance=tolerance)
+                for stepper, origin in zip(steppers, (0.0, 1000.0), strict=True)
+            ]
+            fewer, more = sorted(len(run.t) + run.rejected_steps for run in runs)
+            assert more < 1.5 * fewer + 4
+            ends[tolerance] = [runs[0].variables[-1], runs[1].variables[-1] - 1000]
+        true = ends[None][0]
+        assert np.abs(ends[None][1] - true).max() < 1e-11
+        assert np.abs(ends[1e-6][1] - true).max() < 10 * np.abs(ends[1e-6][0] - true).max()
+
+
+def test_vibrations_within_the_rounding_of_another_coordinate() -> None:
+    """y begins at 0 and moves by 1e-6, and the rounding errors of x = 1 are larger than those of y."""
+    text = "x**3*y_dot - (x - 1)**2 - y**2 - (x - 1)**4"
+    stepper = sc.compile_stepper(sc.LagrangianSystem.from_text("bowl", ["x", "y"], text), "svi:4")
+    omega = 2 / 3  # of the linear vibration about (1, 0)
+    for steps in ({"t_end": 3.0}, {"t_end": 3.0, "tolerance": 1e-6}, {"h": 0.02, "steps": 150}):
+        run = stepper.integrate([1 + 1e-6, 0.0], **steps)
+        assert len(run.t) < 160
+        vibration = 1e-6 * np.array([math.cos(3.0 * omega), math.sin(3.0 * omega)])
+        assert run.variables[-1] - [1.0, 0.0] == pytest.approx(vibration, abs=1e-11)
+
+
+def test_velocities_are_refused_and_available() -> None:
+    stepper = sc.compile_stepper(system("coupled"), "svi:2")
+    start = CASES["coupled"][3]
+    with pytest.raises(sc.StateError, match="velocities follow from the state: omit velocity"):
+        stepper.integrate(start, velocity=[1.0, 1.0], h=0.1, steps=1)
+    run = stepper.integrate(start, h=0.1, steps=1)
+    expected = rates("coupled")(0.0, np.array(start))
+    names = [*"xyab"]
+    assert run.velocity[0] == pytest.approx([expected[names.index(name)] for name in stepper.coordinates], abs=1e-15)
+
+
+@pytest.mark.second
+def test_model_files(tmp_path) -> None:
+    model = sc.Model(system=system("guiding centre"), method="svi:2", q=CASES["guiding centre"][3], h=0.1, span=1.0)
+    sc.save_model(model, tmp_path / "model.toml")
+    again = sc.load_model(tmp_path / "model.toml")
+    assert np.array_equal(again.integrate().variables, model.integrate().variables)
+    sc.generate_package(model, tmp_path / "generated")
+    package = sc.load_package(tmp_path / "generated")
+    assert np.array_equal(package.integrate(model.q, model.p, h=0.1, steps=10).variables, model.integrate().variables)
+
+
+@pytest.mark.parametrize(
+    ("coordinates", "lagrangian", "message"),
+    [
+        ("x y z", "y*x_dot + z*y_dot - x**2", "has rank 2 in 3 coordinates: 1 combination of the coordinates has no"),
+        (
+            "q1 q2 q3 q4",
+            "(q2 + q3 + q4)*q1_dot + (2*q3 + 3*q4)*q2_dot + 5*q4*q3_dot - q1**2",
+            "vanishes between no two coordinates",
+        ),
+        ("x y", "exp(-x**2*y**2)*(x*y_dot - y*x_dot) - x**2", "no integral of these components of theta was found"),
+    ],
+)
+def test_lagrangians_without_a_gauge(coordinates: str, lagrangian: str, message: str) -> None:
+    with pytest.raises(sc.SystemDefinitionError, match=message):
+        sc.LagrangianSystem.from_text("system", coordinates.split(), lagrangian)
+
+
+@pytest.mark.second
+def test_unsupported_uses_are_named() -> None:
+    with pytest.raises(sc.SystemDefinitionError, match="does not support forces: half of"):
+        sc.LagrangianSystem.from_text("system", ["x", "y"], "x*y_dot - x**2 - y**2", forces={"x": "-x_dot"})
+    particle = system("massless particle")
+    changes = {"system without impacts": sc.impact("x"), "'y_dot' is not a": sc.Event("x", then={"y_dot": "1"})}
+    for message, event in changes.items():
+        with pytest.raises(sc.EventError, match=message):
+            sc.compile_stepper(particle, "svi:1", events=event)
+    for method in ("scvi:3", "composition"):
+        with pytest.raises(sc.MethodError):
+            sc.compile_stepper(particle, method).integrate([1.0, 0.2], h=0.1, steps=1)
+    run = sc.compile_stepper(particle, "svi:2").integrate([1.0, 0.2], h=0.1, steps=2)
+    with pytest.raises(sc.MethodError, match="hessian_product is not available for a first-order system"):
+        run.hessian_product(np.ones((3, 2)), np.ones(2))
+    slow = sc.compile_stepper(sc.reparametrise(particle, "1 + x**2"), "svi:2")
+    with pytest.raises(sc.MethodError, match="jacobian is not available in transformed time of a first-order system"):
+        slow.jacobian(*particle.halves([1.0, 0.2]), 0.1)
+    with pytest.raises(sc.SystemDefinitionError, match="use reparametrise"):
+        sc.compile_stepper(particle, "svi:2", time_transformation="1 + x**2").integrate([1.0, 0.2], h=0.1, t_end=1.0)
+
+
+@pytest.mark.second
+def test_transformed_time() -> None:
+    particle = system("massless particle")
+    slow = sc.compile_stepper(sc.reparametrise(particle, "1 + x**2"), "svi:6").integrate([1.0, 0.2], h=0.05, t_end=2.0)
+    plain = sc.compile_stepper(particle, "svi:6").integrate([1.0, 0.2], h=0.05, steps=40)
+    assert slow.t[-1] == pytest.approx(2.0)
+    assert slow.variables[-1] == pytest.approx(plain.variables[-1], abs=1e-11)
+
+
+def differences(function, size: int, width: float = 1e-3) -> np.ndarray:
+    """Derivatives of a function by differences of fourth order, one column per argument."""
+    columns = []
+    for unit in width * np.eye(size):
+        near, far = (function(k * unit) - function(-k * unit) for k in (1, 2))
+        columns.append((8 * near - far) / (12 * width))
+    return np.array(columns).T
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("method", ["svi:2", "stoermer-verlet", "radau-iia:2"])
+def test_derivatives_of_steps_against_differences(method: str) -> None:
+    """The one-form and H depend on parameters and time, so that every derivative of theta occurs."""
+    driven = lagrange("driven", "x y a b", COUPLED.replace("(b + b**3/5)", "(1 + t/3)*(b + c*b**3 + c*a*y)"), c=0.2)
+    stepper = sc.compile_stepper(driven, method)
+    z, h, t = np.concatenate(driven.halves(CASES["coupled"][3])), 0.1, 0.7
+
+    def end(state: np.ndarray, moment: float = t, step: float = h, c: float = 0.2) -> np.ndarray:
+        return np.concatenate(stepper.step(state[:2], state[2:], step, moment, [c]))
+
+    exact = stepper.sensitivity(z[:2], z[2:], h, t)
+    assert np.abs(exact.state - differences(lambda d: end(z + d), 4)).max() < 1e-11
+    assert np.abs(exact.parameters - differences(lambda d: end(z, c=0.2 + d[0]), 1)).max() < 1e-11
+    assert np.abs(exact.t - differences(lambda d: end(z, moment=t + d[0]), 1)[:, 0]).max() < 1e-11
+    assert np.abs(exact.h - differences(lambda d: end(z, step=h + d[0]), 1)[:, 0]).max() < 1e-11
+    seeds = np.array([1.0, -2.0, 0.5, 3.0])
+    assert np.abs(stepper.vjp(z[:2], z[2:], h, t, cotangents=seeds) - seeds @ exact.state).max() < 1e-13
+
+
+def test_sensitivities_fits_and_chaos_indicators_of_runs() -> None:
+    centre = system("guiding centre")
+    stepper, start = sc.compile_stepper(centre, "svi:2"), CASES["guiding centre"][3]
+    run = stepper.integrate(start, h=0.1, steps=50)
+    ends = [stepper.integrate(start, h=0.1, steps=50, parameters={"mu": 0.1 + d}) for d in (1e-4, -1e-4)]
+    by_mu = [np.concatenate([each.q[-1], each.p[-1]]) for each in ends]
+    assert run.sensitivity().parameters[-1][:, 0] == pytest.approx((by_mu[0] - by_mu[1]) / 2e-4, rel=1e-6)
+    q, p = centre.halves(start)
+    found = sc.fit(
+        stepper,
+        run.t,
+        run.variables[:, :2],
+        observed=["x", "y"],
+        q=q,
+        p=p,
+        h=0.1,
+        unknown=["mu"],
+        parameters={"mu": 0.2},
+    )
+    assert found.parameters["mu"] == pytest.approx(0.1, abs=1e-8)
+    exponents = run.lyapunov_exponents()
+    assert exponents[0] > exponents[-1]
+
+
+@pytest.mark.second
+def test_periodic_orbits() -> None:
+    particle = system("massless particle")
+    orbit = sc.periodic_orbit(sc.compile_stepper(particle, "svi:4"), [0.2], [-1.0], period=11.8, steps=40)
+    run = sc.compile_stepper(particle, "svi:4").integrate(orbit.q, orbit.p, h=orbit.period / 40, steps=40)
+    assert np.abs(run.variables[-1] - run.variables[0]).max() < 1e-11
+
+
+def test_inputs(tmp_path) -> None:
+    driven = lagrange("driven", "x y", "(x + x**3)*y_dot - x**2/2 - y**2/2 - f*x - f**2*y", inputs="f")
+    times = np.linspace(0.0, 2.0, 3)
+    run = sc.compile_stepper(driven, "svi:4").integrate(
+        [0.3, 0.2], h=0.05, steps=40, inputs={"f": (times, [0.0, 1.0, 0.0])}
+    )
+
+    def right(t: float, z: np.ndarray) -> list[float]:
+        f = min(t, 2.0 - t)
+        return [-(z[1] + f**2) / (1 + 3 * z[0] ** 2), (z[0] + f) / (1 + 3 * z[0] ** 2)]
+
+    model = sc.Model(system=driven, method="svi:2", q=[0.3, 0.2], h=0.1, span=1.0)
+    sc.save_model(model, tmp_path / "driven.toml")
+    assert sc.load_model(tmp_path / "driven.toml").system == driven
+    half = solve_ivp(right, (0.0, 1.0), [0.3, 0.2], method="DOP853", rtol=1e-12, atol=1e-14).y[:, -1]
+    expected = solve_ivp(right, (1.0, 2.0), half, method="DOP853", rtol=1e-12, atol=1e-14).y[:, -1]
+    assert np.abs(run.variables[-1] - expected).max() < 1e-10
+
+
+def test_one_forms_that_contain_time_change_the_energy():
+    """Adaptive runs then issue no warning of the changed energy; warnings are errors in these tests."""
+    text = "(y + sin(t)*y/2)*x_dot - (x**2 + y**2)/2"
+    system = sc.LagrangianSystem.from_text(name="one-form", coordinates=["x", "y"], lagrangian=text)
+    assert system.changes_energy == "H depends on time"
+    run = sc.compile_stepper(system, "svi:6").integrate([0.5], [0.3], t_end=7.0)
+    assert np.ptp(run.energy()) > 0.01

@@ -1,0 +1,114 @@
+"""``wrap``, ``positive_part``, ``rint`` and ``unit_step`` in formulas: values, derivatives, C, orders."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from notation import lagrange
+from scipy.spatial import cKDTree
+
+import scvi_codegen as sc
+from scvi_codegen.common.precision import mp
+from scvi_codegen.systems.formulas.expressions import Tape, gradient
+from scvi_codegen.systems.formulas.grammar import parse_expression
+from scvi_codegen.systems.formulas.numpy_values import array_value
+from scvi_codegen.systems.formulas.symbols import symbol
+from scvi_codegen.systems.formulas.translation import format_expression
+
+X, L = symbol("x"), symbol("L")
+KNOWN = {"x": X, "L": L}
+VALUES = {
+    "wrap(x, L)": lambda x, length: x - length * np.rint(x / length),
+    "positive_part(x)": lambda x, _: np.maximum(x, 0.0),
+    "unit_step(x - 1)": lambda x, _: np.where(x >= 1.0, 1.0, 0.0),
+    "rint(3*x)": lambda x, _: np.rint(3 * x),
+}
+
+
+@pytest.mark.parametrize("text", VALUES)
+def test_values_in_60_digits_and_in_arrays(text: str) -> None:
+    points = np.array([-7.3, -1.6, -0.2, 0.4, 1.7, 12.1])
+    expression = parse_expression(text, KNOWN)
+    expected = VALUES[text](points, 3.0)
+    assert array_value(expression, {X: points, L: 3.0}) == pytest.approx(expected)
+    tape = Tape([expression], [X, L])
+    assert [float(tape([mp.mpf(x), mp.mpf(3)])[0]) for x in points] == pytest.approx(expected)
+    assert parse_expression(format_expression(expression), KNOWN) == expression
+
+
+def test_derivatives_are_those_of_the_pieces() -> None:
+    formula = parse_expression("wrap(x, L)**2 + positive_part(x)**3", KNOWN)
+    (by_x,) = gradient(formula, [X]).values()
+    points = np.array([-4.2, -0.3, 0.7, 2.2, 5.9])
+    expected = 2 * (points - 3 * np.rint(points / 3)) + 3 * np.maximum(points, 0) ** 2
+    assert array_value(by_x, {X: points, L: 3.0}) == pytest.approx(expected)
+
+
+def pair(power: int) -> sc.LagrangianSystem:
+    return lagrange(
+        "pair", "x y", f"(x_dot**2 + y_dot**2)/2 - positive_part(1 - (wrap(x - y, L)/1.2)**2)**{power}", L=3.0
+    )
+
+
+@pytest.mark.tiers(1)
+@pytest.mark.parametrize("solver", ["auto", "newton"])
+def test_particles_that_pass_through_the_box_keep_energy_and_momentum(solver: str) -> None:
+    stepper = sc.compile_stepper(pair(6), "svi:4", solver=solver)
+    run = stepper.integrate([0.1, 0.7], velocity=[0.3, 3.0], h=0.02, steps=2000)
+    assert np.ptp(run.q[:, 1] - run.q[:, 0]) > 30 * 3.0
+    assert run.energy_error() < 1e-9
+    assert run.momentum_errors().max() < 1e-13
+
+
+@pytest.mark.second
+def test_order_is_preserved_up_to_the_smoothness_at_the_cut_off() -> None:
+    """positive_part()**k has k - 1 continuous derivatives: order 4 with k = 6, no more than about 2 with k = 1."""
+
+    def order(power: int) -> float:
+        stepper = sc.compile_stepper(pair(power), "svi:2")
+        start = {"q": [0.1, 0.7], "velocity": [0.3, 3.0]}
+        exact = stepper.integrate(**start, h=3.0 / 20_000, steps=20_000).q[-1]
+        errors = [np.abs(stepper.integrate(**start, h=3.0 / n, steps=n).q[-1] - exact).max() for n in (150, 600)]
+        return math.log(errors[0] / errors[1], 4)
+
+    assert order(6) > 3.7
+    assert order(1) < 2.5
+
+
+@pytest.mark.full
+def test_certificate() -> None:
+    certificate = sc.verify(pair(6), "svi:2")
+    assert certificate.passed, str(certificate)
+
+
+def test_lists_of_neighbours_have_the_energy_of_all_pairs() -> None:
+    box, cut = 5.0, 1.5
+    apart = "sum(a in 3, wrap(r[pairs[k, 0], a] - r[pairs[k, 1], a], box)**2)"
+    gas = sc.LagrangianSystem.from_text(
+        "gas",
+        ["r[N, 3]"],
+        f"sum(i in N, sum(a in 3, r_dot[i, a]**2)/2) - sum(k in K, positive_part(1 - {apart}/{cut**2})**4)",
+        tables=["pairs[K, 2]"],
+        parameters={"box": box},
+    )
+    places = np.random.default_rng(3).uniform(-20.0, 20.0, (60, 3))
+    pairs = cKDTree(places % box, boxsize=box).query_pairs(cut, output_type="ndarray")
+    run = sc.compile_stepper(gas, "stoermer-verlet").integrate(places, h=1e-3, steps=1, tables={"pairs": pairs})
+    difference = places[:, None] - places
+    difference -= box * np.rint(difference / box)
+    square = (difference**2).sum(axis=-1)[np.triu_indices(60, 1)]
+    assert run.energy()[0] == pytest.approx((np.maximum(1 - square / cut**2, 0) ** 4).sum(), rel=1e-13)
+
+
+def test_single_precision_source_uses_functions_of_floats() -> None:
+    source, _ = sc.generate_source(pair(4), "stoermer-verlet", embedded="single")
+    text = "".join(source.files.values())
+    assert "rintf(" in text
+    assert "copysignf(" in text
+
+
+def test_wrap_takes_two_arguments() -> None:
+    with pytest.raises(sc.ExpressionError, match="wrap takes 2 arguments, not 1"):
+        parse_expression("wrap(x)", KNOWN)

@@ -1,0 +1,519 @@
+"""Robots from URDF and MJCF: energies against poses composed by hand, and errors of malformed files."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import sympy
+from scipy.spatial.transform import Rotation
+
+import scvi_codegen as sc
+from scvi_codegen.common.errors import SystemDefinitionError, SystemDefinitionWarning
+from scvi_codegen.systems.formulas.expressions import evaluate
+from scvi_codegen.systems.multibody.trees.mjcf import SHAPES
+
+ROBOTS = Path(__file__).parent / "robots"
+DELAY = 2e-4
+QUARTER = np.pi / 2
+
+Pose = tuple[Any, Any]
+Body = tuple[Pose, float, Any]
+"""Pose of the center of mass in the world, mass and inertia matrix in its frame."""
+
+
+def then(*poses: Pose) -> Pose:
+    """Poses one after another: each in the frame of the one before."""
+    place, turned = np.zeros(3), np.eye(3)
+    for position, rotation in poses:
+        place, turned = place + turned @ np.asarray(position, float), turned @ rotation
+    return place, turned
+
+
+def rpy(*angles: float) -> Any:
+    return Rotation.from_euler("xyz", angles).as_matrix()
+
+
+def about(axis: Any, angle: float) -> Any:
+    return Rotation.from_rotvec(np.asarray(axis, float) / np.linalg.norm(axis) * angle).as_matrix()
+
+
+def symmetric(xx: float, yy: float, zz: float, xy: float = 0, xz: float = 0, yz: float = 0) -> Any:
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+NOWHERE, STRAIGHT = (0, 0, 0), np.eye(3)
+
+
+def arm(state: dict[str, Any]) -> list[Body]:
+    base = state["x"], state["R"]
+    shoulder = (0.1, 0.2, 0.3), rpy(0.5, -0.3, 1.2) @ about((1, 2, -2), state["shoulder"])
+    sensor = (0, 0.1, 0.4), rpy(0.1, 0.2, 0.3)
+    slid = np.array([0, 1, 1]) / np.sqrt(2) * state["rail_1"]
+    tool = np.array([0.2, 0, 0.1]) + rpy(0, QUARTER, 0) @ slid, rpy(0, QUARTER, 0)
+    finger = (0, 0.05, 0.2), about((0, 0, -1), 0.2 - 0.5 * state["shoulder"])
+    upper = then(base, shoulder)
+    held = then(upper, sensor, tool)
+    return [
+        (then(base, ((0.1, -0.2, 0.05), rpy(0.3, 0.2, -0.4))), 2.5, symmetric(0.3, 0.4, 0.25, 0.01, -0.02, 0.03)),
+        (then(upper, ((0, 0, 0.3), STRAIGHT)), 1.2, symmetric(0.05, 0.06, 0.01)),
+        (then(upper, sensor, ((0.02, 0.03, 0), rpy(0, 0.7, 0))), 0.2, symmetric(0.001, 0.002, 0.0015)),
+        (then(held, ((0.05, 0, 0.1), STRAIGHT)), 0.7, symmetric(0.004, 0.005, 0.003, 0.001)),
+        (then(held, finger), 0.1, symmetric(0.0001, 0.0002, 0.0001)),
+    ]
+
+
+def solid(shape: str, *size: float, density: float = 500.0, mass: float | None = None) -> tuple[float, Any]:
+    volume, moments = SHAPES[shape][1](np.array(size))
+    mass = density * volume if mass is None else mass
+    return mass, mass * np.diag(moments)
+
+
+def towards(axis: Any) -> Any:
+    """Any rotation that turns the z axis into an axis; the bodies are symmetric about it."""
+    return Rotation.align_vectors([axis], [[0, 0, 1]])[0].as_matrix()
+
+
+def figure(state: dict[str, Any]) -> list[Body]:
+    degree = np.pi / 180
+    torso = state["x"], state["R"]
+    turned = Rotation.from_euler("ZYX", (10, 20, 30), degrees=True).as_matrix()
+    frame = (0, 0.2, 0.1), turned
+    socket = (0, 0.1, 0), about((1, 1, 0), 25 * degree)
+    ball = then(((0, -0.1, 0), state["ball"]), ((0, 0.1, 0), STRAIGHT))
+    hand = (
+        (0.3, 0.1, 0),
+        np.column_stack([(0, 1, 0), np.array([-1, 0, 0.2]) / np.sqrt(1.04), np.array([0.2, 0, 1]) / np.sqrt(1.04)]),
+    )
+    flexed = NOWHERE, about((0, 1, 0), state["flex"] - 15 * degree)
+    slipped = np.array([1, 0, 1]) / np.sqrt(2) * state["slip"], STRAIGHT
+    upper = then(torso, frame, socket, ball)
+    lower = then(upper, hand, flexed, slipped)
+    limb = np.array([0.3, 0.1, 0])
+    post = (2, 0, 0), Rotation.from_quat((0.1, 0.2, 0.3, 1)).as_matrix()
+    swung = then(((0, 0, 0.5), about((0, 1, 0), state["swing"] - 20 * degree)), ((0.1, 0, -0.7), STRAIGHT))
+    return [
+        (torso, *solid("box", 0.1, 0.2, 0.3)),
+        (then(torso, ((0, 0, 0.4), STRAIGHT)), *solid("sphere", 0.1, mass=2)),
+        (then(upper, (limb / 2, towards(limb))), *solid("capsule", 0.05, np.linalg.norm(limb) / 2)),
+        (then(lower, ((0, 0, 0.02), STRAIGHT)), *solid("ellipsoid", 0.05, 0.06, 0.07)),
+        (then(lower, (NOWHERE, towards((1, 1, 1)))), *solid("cylinder", 0.02, 0.04)),
+        (then(post, swung), 1.5, symmetric(0.1, 0.2, 0.15, 0.01, 0.02, -0.03)),
+    ]
+
+
+def kinetic(bodies: Callable[[dict[str, Any]], list[Body]], motion: Callable[[float], dict[str, Any]]) -> float:
+    """Kinetic energy by differences of order 4 of the poses in time."""
+    weights = {-2: 1 / 12, -1: -2 / 3, 1: 2 / 3, 2: -1 / 12}
+    at = {k: bodies(motion(k * DELAY)) for k in weights}
+    energy = 0.0
+    for i, ((_, turned), mass, inertia) in enumerate(bodies(motion(0.0))):
+        velocity = sum(w * at[k][i][0][0] for k, w in weights.items()) / DELAY
+        spin = turned.T @ sum(w * at[k][i][0][1] for k, w in weights.items()) / DELAY
+        rates = np.array([spin[2, 1] - spin[1, 2], spin[0, 2] - spin[2, 0], spin[1, 0] - spin[0, 1]]) / 2
+        energy += (mass * velocity @ velocity + rates @ inertia @ rates) / 2
+    return energy
+
+
+def value(system: Any, state: dict[str, Any], velocity: dict[str, Any]) -> float:
+    """Lagrangian at unit quaternions."""
+    values: dict[str, float] = {}
+    for name, q in state.items():
+        if name.startswith("R_"):
+            w, x, y, z = np.roll(Rotation.from_matrix(q).as_quat(), 1)
+            matrix = np.array([[-x, -y, -z], [w, -z, y], [z, w, -x], [-y, x, w]])
+            rate = matrix @ velocity["omega_" + name[2:]] / 2
+            for letter, a, b in zip("wxyz", (w, x, y, z), rate, strict=True):
+                values |= {f"{name}_{letter}": a, f"{name}_{letter}_dot": b}
+        else:
+            values |= {name: q, name + "_dot": velocity[name]}
+    return float(evaluate(system.lagrangian, {each: values[each.name] for each in system.lagrangian.free_symbols}))
+
+
+def turning(start: Any, rates: Any) -> Callable[[float], Any]:
+    return lambda t: start @ about(rates, np.linalg.norm(rates) * t)
+
+
+@pytest.mark.rotated
+@pytest.mark.parametrize("seed", [1, 2])
+def test_energies_of_urdf_are_those_of_composed_poses(seed):
+    draw = np.random.default_rng(seed)
+    joints, speeds = draw.uniform(-1, 1, 2), draw.uniform(-1, 1, 2)
+    x, v, omega = draw.uniform(-1, 1, (3, 3))
+    turn = turning(Rotation.random(rng=seed).as_matrix(), omega)
+
+    def motion(t):
+        shoulder, rail = joints + speeds * t
+        return {"x": x + v * t, "R": turn(t), "shoulder": shoulder, "rail_1": rail}
+
+    system = sc.LagrangianSystem.from_urdf(ROBOTS / "arm.urdf", floating=True)
+    potential = sum(9.81 * mass * place[2] for (place, _), mass, _ in arm(motion(0)))
+    state = dict(zip(("x_base", "y_base", "z_base", "shoulder", "rail_1"), (*x, *joints), strict=True))
+    velocity = dict(zip(state, (*v, *speeds), strict=True)) | {"omega_base": omega}
+    ours = value(system, state | {"R_base": turn(0)}, velocity)
+    assert ours == pytest.approx(kinetic(arm, motion) - potential, abs=1e-8)
+
+
+@pytest.mark.tiers(0, 1)
+@pytest.mark.parametrize(("seed", "compensated"), [(1, 0.0), (2, 0.3)])
+def test_energies_of_mjcf_are_those_of_composed_poses(seed, compensated, tmp_path):
+    draw = np.random.default_rng(seed)
+    joints, speeds = draw.uniform(-1, 1, 3), draw.uniform(-1, 1, 3)
+    x, v, omega, rates = draw.uniform(-1, 1, (4, 3))
+    turn = turning(Rotation.random(rng=seed).as_matrix(), omega)
+    roll = turning(Rotation.random(rng=seed + 10).as_matrix(), rates)
+
+    def motion(t):
+        flex, slip, swing = joints + speeds * t
+        return {"x": x + v * t, "R": turn(t), "ball": roll(t), "flex": flex, "slip": slip, "swing": swing}
+
+    file = tmp_path / "figure.xml"
+    file.write_text((ROBOTS / "figure.xml").read_text().replace('name="hand"', f'name="hand" gravcomp="{compensated}"'))
+    system = sc.LagrangianSystem.from_mjcf(file)
+    lifts = np.array([0, 0, 0, compensated, compensated, 0])  # of the two parts of the hand
+    bodies = zip(figure(motion(0)), 1 - lifts, strict=True)
+    potential = sum(weight * mass * place @ [0, -1, 9] for ((place, _), mass, _), weight in bodies)
+    springs = 3 / 2 * ((joints[0] - np.radians(10)) ** 2 + (joints[1] - 10) ** 2)
+    rotors = 0.02 / 2 * (rates @ rates + speeds[0] ** 2 + speeds[1] ** 2)
+    names = ("x_root", "y_root", "z_root", "flex", "slip", "swing")
+    state = dict(zip(names, (*x, *joints), strict=True))
+    velocity = dict(zip(state, (*v, *speeds), strict=True)) | {"omega_root": omega, "omega_arm": rates}
+    ours = value(system, state | {"R_root": turn(0), "R_arm": roll(0)}, velocity)
+    expected = kinetic(figure, motion) + rotors - potential - springs
+    assert ours == pytest.approx(expected, rel=1e-8)
+
+
+@pytest.mark.tiers(1, 4)
+@pytest.mark.parametrize("shape", SHAPES)
+def test_inertias_of_shapes_are_integrals(shape):
+    size = np.array([0.5, 0.7, 0.9][: SHAPES[shape][0]])
+    centers = (np.arange(160) + 0.5) / 160 * 2.8 - 1.4
+    x, y, z = np.meshgrid(centers, centers, centers, indexing="ij")
+    inside = {
+        "sphere": lambda: x**2 + y**2 + z**2 < size[0] ** 2,
+        "ellipsoid": lambda: (x / size[0]) ** 2 + (y / size[1]) ** 2 + (z / size[-1]) ** 2 < 1,
+        "box": lambda: (abs(x) < size[0]) & (abs(y) < size[1]) & (abs(z) < size[-1]),
+        "cylinder": lambda: (x**2 + y**2 < size[0] ** 2) & (abs(z) < size[1]),
+        "capsule": lambda: x**2 + y**2 + np.maximum(abs(z) - size[-1], 0) ** 2 < size[0] ** 2,
+    }[shape]()
+    squares = np.array([(each[inside] ** 2).mean() for each in (x, y, z)])
+    volume, moments = SHAPES[shape][1](size)
+    assert volume == pytest.approx(inside.sum() * (2.8 / 160) ** 3, rel=0.02)
+    assert moments == pytest.approx(squares.sum() - squares, rel=0.03)
+
+
+def test_damping_and_actuators_act_on_joints():
+    system = sc.LagrangianSystem.from_urdf(ROBOTS / "arm.urdf", actuated=["rail-1"], gravity=(0, 0, -1.62))
+    assert system.inputs == ("tau_rail_1",)
+    assert system.forces[0] == -system.velocities[0] / 4
+    assert sympy.Symbol("tau_rail_1_0") in {sympy.Symbol(each.name) for each in system.forces[1].free_symbols}
+
+
+@pytest.mark.rotated
+def test_runs_of_a_ball_joint_and_a_hinge_keep_energy_and_vertical_momentum():
+    stepper = sc.compile_stepper(sc.LagrangianSystem.from_mjcf(ROBOTS / "ball.xml"), "svi:3")
+    start, rates = {"R_ball": [1, 0.2, 0.1, 0], "swing": 0.4}, {"omega_ball": [0.3, 0.2, 1.0], "swing": 0.5}
+    errors = []
+    for h in (0.02, 0.01):
+        energy = stepper.integrate(start, velocity=rates, h=h, t_end=5.0).energy()
+        errors.append(np.abs(energy - energy[0]).max())
+    assert errors[1] < errors[0] / 40 < 1e-7  # order 6
+    momentum = stepper.integrate(start, velocity=rates, h=0.02, steps=250).angular_momentum("R_ball")
+    assert np.abs(momentum[:, 2] - momentum[0, 2]).max() < 1e-12
+
+
+CHANGES = {
+    "not XML": (lambda text: text[:200], "is not XML"),
+    "entities": (lambda text: text.replace("<robot", "<!DOCTYPE a [<!ENTITY b 'c'>]><robot", 1), "entities"),
+    "another element": (lambda text: text.replace("robot", "sdf"), "begins with <sdf>, not with <robot>"),
+    "missing link": (lambda text: text.replace('<child link="tool"/>', '<child link="tol"/>'), "'tol', which does not"),
+    "two parents": (lambda text: text.replace('<child link="finger"/>', '<child link="tool"/>'), "moves as well"),
+    "circle": (lambda text: text.replace('<parent link="base"/>', '<parent link="finger"/>'), "form a circle"),
+    "kind": (lambda text: text.replace('"prismatic"', '"planar"'), "is of type 'planar'"),
+    "axis": (lambda text: text.replace("1 2 -2", "0 0 0"), "must not be zero"),
+    "numbers": (lambda text: text.replace("1 2 -2", "1 2"), "3 finite numbers"),
+    "text": (lambda text: text.replace("1 2 -2", "1 2 x"), "must be numbers"),
+    "infinite": (lambda text: text.replace("1 2 -2", "1 2 inf"), "must be numbers"),
+    "negative": (
+        lambda text: text.replace('mass value="1.2"', 'mass value="-1.2"'),
+        "has the value -1.2, which must not be < 0",
+    ),
+    "negative moment": (lambda text: text.replace('ixx="0.05"', 'ixx="-0.05"'), "'upper', with the links fixed to it,"),
+    "twice": (lambda text: text.replace('link name="tool"', 'link name="base"'), "is defined twice"),
+    "no value": (lambda text: text.replace('<mass value="1.2"/>', "<mass/>"), "has no attribute 'value'"),
+    "unknown attribute": (lambda text: text.replace("damping", "dampnig"), "'dampnig'; did you mean 'damping'?"),
+    "unknown element": (lambda text: text.replace("dynamics", "dynamcs"), "<dynamcs>; did you mean 'dynamics'?"),
+    "number of Python": (lambda text: text.replace('damping="0.25"', 'damping="1_0"'), "must be numbers"),
+    "no number": (lambda text: text.replace('damping="0.25"', 'damping="nan"'), "must be numbers"),
+    "large": (lambda text: text.replace('damping="0.25"', 'damping="1e99"'), "magnitude must be less than 1e+40"),
+    "negative damping": (lambda text: text.replace('damping="0.25"', 'damping="-1"'), "damping -1, which must not be"),
+    "impossible inertia": (lambda text: text.replace('izz="0.003"', 'izz="0.3"'), "which no body has"),
+    "two axes": (lambda text: text.replace("<limit", '<axis xyz="1 0 0"/><limit'), "is the second <axis>"),
+    "no mass": (lambda text: text.replace('<mass value="1.2"/>', ""), "needs <mass> and <inertia>"),
+    "macro": (
+        lambda text: text.replace("<link", '<xacro:if xmlns:xacro="http://wiki.ros.org/xacro"/><link', 1),
+        "write the file that xacro makes",
+    ),
+    "itself": (lambda text: text.replace('mimic joint="shoulder"', 'mimic joint="grip"'), "itself: grip, grip"),
+    "circle of joints": (
+        lambda text: text.replace(
+            'effort="10" velocity="5"/>\n    <dyn', 'effort="10" velocity="5"/>\n    <mimic joint="grip"/>\n    <dyn'
+        ),
+        "'shoulder' follows itself: shoulder, grip, shoulder",
+    ),
+    "free inside": (lambda text: text.replace('"prismatic"', '"floating"'), "is free, but its parent moves"),
+    "follows": (lambda text: text.replace('mimic joint="shoulder"', 'mimic joint="sholder"'), "'sholder', which is no"),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_malformed_urdf_is_refused_by_name(change, tmp_path):
+    edit, message = CHANGES[change]
+    file = tmp_path / "arm.urdf"
+    file.write_text(edit((ROBOTS / "arm.urdf").read_text()))
+    with pytest.raises(SystemDefinitionError, match=re.escape(message)):
+        sc.LagrangianSystem.from_urdf(file)
+
+
+def test_moments_of_inertia_are_checked_with_fixed_links(tmp_path):
+    text, file = (ROBOTS / "arm.urdf").read_text(), tmp_path / "arm.urdf"
+    negative = text.replace('ixx="0.001"', 'ixx="-0.001"')  # of the sensor: its sum with that of the arm is positive
+    rounded = negative.replace('"0.0001"', '"-5.4e-20"').replace('"0.0002"', '"0"')
+    file.write_text(rounded)
+    assert rounded != negative != text
+    assert len(sc.LagrangianSystem.from_urdf(file).coordinates) == 2
+
+
+MUJOCO_CHANGES = {
+    "equality": ("</mujoco>", "<equality><weld/></equality></mujoco>", "<weld> 'weld' has no attribute 'body1'"),
+    "tendon": (
+        "</mujoco>",
+        '<tendon><fixed stiffness="1"/></tendon></mujoco>',
+        "has stiffness='1', which changes the motion",
+    ),
+    "mesh": ('type="box"', 'type="mesh"', "give its body an <inertial>"),
+    "class": ('childclass="limb"', 'childclass="lim"', "of the class 'lim'"),
+    "orientations": ('quat="1 0.1 0.2 0.3"', 'quat="1 0 0 0" euler="0 0 0"', "quat and euler"),
+    "free inside": ('type="ball"', 'type="free"', "inside another body"),
+    "replicate": ("</worldbody>", "<replicate/></worldbody>", "write out what it makes"),
+    "ball spring": (' stiffness="0"', "", "hinges and slides only"),
+    "axes": ('eulerseq="zyx"', 'eulerseq="zy"', "is not three of the letters"),
+    "name": ('name="slip"', 'name="flex"', "two joints are called 'flex'"),
+    "include": ("<option", '<include file="none.xml"/><option', "none.xml cannot be read"),
+    "include of a device": ("<option", '<include file="/dev/zero"/><option', "must have only file, a path relative to"),
+    "include of a folder": ("<option", '<include file="."/><option', "it is no regular file"),
+    "include of itself": ("<option", '<include file="figure.xml"/><option', "is included already"),
+    "unknown attribute": ('damping="0.1"', 'dampnig="0.1"', "'dampnig'; did you mean 'damping'?"),
+    "unknown element": ("<freejoint", "<freejiont", "<freejiont>; did you mean 'freejoint'?"),
+    "keyword": ('angle="degree"', 'angle="degrees"', "which must be degree or radian; did you mean 'degree'?"),
+    "number of Python": ('damping="0.1"', 'damping="1_0"', "must be numbers"),
+    "no number": ('damping="0.1"', 'damping="nan"', "must be numbers"),
+    "large": ('size="0.05"', 'size="1e200"', "magnitude must be less than 1e+40"),
+    "negative": ('damping="0.1"', 'damping="-0.1"', "damping -0.1, which must not be < 0"),
+    "impossible inertia": ('fullinertia="0.1 0.2 0.15', 'fullinertia="0.1 0.2 1.5', "which no body has"),
+    "medium": ("<option", '<option density="1.2"', "density='1.2', which changes the motion"),
+    "tendon of a class": (
+        "</mujoco>",
+        '<default><tendon damping="1"/></default><tendon><fixed/></tendon></mujoco>',
+        "has damping='1', which changes the motion",
+    ),
+    "actuator of a tendon": (
+        "</mujoco>",
+        '<actuator><motor tendon="t" armature="1"/></actuator></mujoco>',
+        "which is read of actuators of hinges and slides only",
+    ),
+    "spring and damper": (
+        'axis="0 1 0" ref="15"',
+        'axis="0 1 0" springdamper="1 1"',
+        "springdamper='1 1', which changes",
+    ),
+    "class twice": ("</default>", '</default><default class="limb"/>', "second of the class 'limb'"),
+    "places": ('fromto="', 'pos="0 0 0" fromto="', "has pos and fromto"),
+    "parallel": ('xyaxes="0 1 0 -1 0 0.2"', 'xyaxes="0 1 0 0 2 0"', "must be two different directions"),
+    "size": ('size="0.1 0.2 0.3"', 'size="0.1 0.2"', "3 numbers > 0 are needed"),
+    "sites": (
+        "</mujoco>",
+        '<equality><weld site1="a" body1="b"/></equality></mujoco>',
+        "has site1 and body1: sites or bodies are needed",
+    ),
+}
+
+
+@pytest.mark.parametrize("change", MUJOCO_CHANGES)
+def test_malformed_mjcf_is_refused_by_name(change, tmp_path):
+    old, new, message = MUJOCO_CHANGES[change]
+    text = (ROBOTS / "figure.xml").read_text()
+    file = tmp_path / "figure.xml"
+    file.write_text(text.replace(old, new, 1))
+    with pytest.raises(SystemDefinitionError, match=re.escape(message)):
+        sc.LagrangianSystem.from_mjcf(file)
+
+
+def test_included_files_are_read_and_total_masses_scaled(tmp_path):
+    text = (ROBOTS / "ball.xml").read_text()
+    body = re.search("<worldbody>.*</worldbody>", text, re.DOTALL).group()
+    (tmp_path / "body.xml").write_text(f"<mujocoinclude>{body}</mujocoinclude>")
+    (tmp_path / "all.xml").write_text(text.replace(body, '<include file="body.xml"/>'))
+    (tmp_path / "heavy.xml").write_text(text.replace("<worldbody>", '<compiler settotalmass="7"/><worldbody>'))
+    one = sc.LagrangianSystem.from_mjcf(ROBOTS / "ball.xml")
+    assert sc.LagrangianSystem.from_mjcf(tmp_path / "all.xml").lagrangian == one.lagrangian
+    heavy = sc.LagrangianSystem.from_mjcf(tmp_path / "heavy.xml")
+    state, velocity = {"R_ball": np.eye(3), "swing": 0.3}, {"omega_ball": np.array([1, 2, 3]), "swing": 0.4}
+    masses = 3.0 + 0.5
+    assert value(heavy, state, velocity) == pytest.approx(value(one, state, velocity) * 7 / masses)
+    (tmp_path / "body.xml").write_text('<mujocoinclude><include file="body.xml"/></mujocoinclude>')
+    with pytest.raises(SystemDefinitionError, match="included already"):
+        sc.LagrangianSystem.from_mjcf(tmp_path / "all.xml")
+
+
+def test_nested_includes_flags_and_groups_of_geoms_are_read(tmp_path):
+    text, file = (ROBOTS / "ball.xml").read_text(), tmp_path / "all.xml"
+    inside = re.search("<worldbody>(.*)</worldbody>", text, re.DOTALL).group(1)
+    (tmp_path / "body.xml").write_text(f"<mujocoinclude>{inside}</mujocoinclude>")
+    one = sc.LagrangianSystem.from_mjcf(ROBOTS / "ball.xml")
+    file.write_text(text.replace(inside, '<frame><include file="body.xml"/></frame>'))
+    assert sc.LagrangianSystem.from_mjcf(file).lagrangian == one.lagrangian
+    still = '<option><flag gravity="disable" spring="disable" damper="disable"/></option><worldbody>'
+    file.write_text(text.replace("<worldbody>", still))
+    free = sc.LagrangianSystem.from_mjcf(file)
+    state, at_rest = {"R_ball": np.eye(3), "swing": 0.3}, {"omega_ball": np.zeros(3), "swing": 0.0}
+    assert value(free, state, at_rest) == 0.0 != value(one, state, at_rest)
+    pin = '<mujoco><compiler {}/><worldbody><body><joint/><geom size="0.1" pos="1 0 0"/>{}</body></worldbody></mujoco>'
+    seen = []
+    for setting, geom in (("", ""), ('inertiagrouprange="0 2"', '<geom size="0.2" group="3"/>')):
+        file.write_text(pin.format(setting, geom))
+        seen.append(sc.LagrangianSystem.from_mjcf(file).lagrangian)
+    assert seen[0] == seen[1]
+    base = '<body name="base"><geom type="mesh" mesh="m"/>'  # fixed to the world
+    file.write_text(text.replace(inside, f"{base}{inside}</body>"))
+    assert sc.LagrangianSystem.from_mjcf(file).lagrangian == one.lagrangian
+    file.write_text(text.replace("<worldbody>", '<compiler boundmass="0.1"/><worldbody>'))
+    with pytest.raises(SystemDefinitionError, match="which changes the motion"):
+        sc.LagrangianSystem.from_mjcf(file)
+
+
+def test_limits_and_dry_friction_are_named_in_one_warning(tmp_path):
+    file = tmp_path / "arm.urdf"
+    text = (ROBOTS / "arm.urdf").read_text().replace("<dynamics", '<dynamics friction="0.1"')
+    file.write_text(text.replace('<limit lower="-1"', '<dynamics friction="0.2"/><limit lower="-1"'))
+    unread = "limits of joints shoulder, rail-1; dry friction of joints shoulder, rail-1$"
+    with pytest.warns(SystemDefinitionWarning, match=unread) as caught:
+        sc.LagrangianSystem.from_urdf(file)
+    assert len(caught) == 1
+    assert Path(caught[0].filename).name == "test_robots.py"
+
+
+@pytest.mark.rotated
+def test_parts_of_models_that_are_not_read_are_named_in_one_warning(tmp_path):
+    text, file = (ROBOTS / "figure.xml").read_text(), tmp_path / "figure.xml"
+    text = text.replace('name="flex"', 'name="flex" range="-90 90" frictionloss="0.1"')
+    text = text.replace("</mujoco>", '<actuator><position name="servo" joint="flex" kp="3"/></actuator></mujoco>')
+    file.write_text(text)
+    unread = "limits of joints flex; dry friction of joints flex; actuators servo; contacts$"
+    with pytest.warns(SystemDefinitionWarning, match=unread) as caught:
+        sc.LagrangianSystem.from_mjcf(file)
+    assert len(caught) == 1
+    disabled = '<flag contact="disable" limit="disable" frictionloss="disable"/></option>'
+    file.write_text(text.replace('<option gravity="0 1 -9"/>', f"<option>{disabled}"))
+    with pytest.warns(SystemDefinitionWarning, match="without actuators servo$"):
+        sc.LagrangianSystem.from_mjcf(file)
+
+
+DEFAULTS = {
+    "orientation of geoms": (
+        '<default><geom type="box" size=".1 .2 .5" quat="1 .2 .3 .4"/></default>{hinge}<geom pos="0 .3 .1"/>{end}',
+        '{hinge}<geom type="box" size=".1 .2 .5" quat="1 .2 .3 .4" pos="0 .3 .1"/>{end}',
+    ),
+    "another orientation": (
+        '<default><geom type="box" size=".1 .2 .5" quat="1 .2 .3 .4"/></default>{hinge}<geom euler="9 8 7"/>{end}',
+        '{hinge}<geom type="box" size=".1 .2 .5" euler="9 8 7"/>{end}',
+    ),
+    "first number of a size": (
+        '<default><geom type="box" size=".1 .2 .5"/></default>{hinge}<geom size=".3"/>{end}',
+        '{hinge}<geom type="box" size=".3 .2 .5"/>{end}',
+    ),
+    "second outermost default": (
+        '<default><geom type="box"/></default><default><geom size=".1 .2 .5"/></default>{hinge}<geom/>{end}',
+        '{hinge}<geom type="box" size=".1 .2 .5"/>{end}',
+    ),
+    "class of a frame": (
+        '<default><default class="a"><geom type="box" size=".1 .2 .5"/></default></default>'
+        '{hinge}<frame childclass="a"><geom/></frame>{end}',
+        '{hinge}<geom type="box" size=".1 .2 .5"/>{end}',
+    ),
+    "inertial in a frame": (
+        '{hinge}<frame pos="1 0 0"><inertial pos="0 1 0" mass="2" diaginertia="1 1 1"/></frame>{end}',
+        '{hinge}<inertial pos="1 1 0" mass="2" diaginertia="1 1 1"/>{end}',
+    ),
+    "equality": (
+        '<default><equality active="false"/></default>{hinge}<geom size="1"/>{end}'
+        '<equality><joint joint1="q"/></equality>',
+        '{hinge}<geom size="1"/>{end}',
+    ),
+    "actuators": (
+        '<default><motor armature="2"/></default>{hinge}<geom size="1"/>{end}'
+        '<actuator><motor joint="q" damping="3" gear="2"/></actuator>',
+        '<default><joint armature="8" damping="12"/></default>{hinge}<geom size="1"/>{end}',
+    ),
+    "disabled forces": (
+        '<option><flag spring="disable" damper="disable"/></option>{hinge}<geom size="1" pos="1 0 0"/>{end}',
+        '{free}<geom size="1" pos="1 0 0"/>{end}',
+    ),
+    "disabled constraints": (
+        '<option><flag constraint="disable"/></option>{hinge}<geom size="1"/>{end}'
+        '<equality><joint joint1="q"/></equality>',
+        '{hinge}<geom size="1"/>{end}',
+    ),
+}
+
+
+@pytest.mark.parametrize("case", DEFAULTS)
+def test_defaults_are_those_of_mujoco(case, tmp_path):
+    parts = {
+        "hinge": '<worldbody><body gravcomp="0.5"><joint name="q" axis="1 0 0" stiffness="1"/>',
+        "free": '<worldbody><body><joint name="q" axis="1 0 0"/>',
+        "end": "</body></worldbody>",
+    }
+    found = []
+    for text in DEFAULTS[case]:
+        file = tmp_path / "model.xml"
+        file.write_text(f"<mujoco>{text.format(**parts)}</mujoco>")
+        system = sc.LagrangianSystem.from_mjcf(file, name="model")
+        found.append((system.lagrangian, system.forces, system.constraints))
+    assert found[0] == found[1]
+
+
+def test_included_files_are_sought_in_the_folder_of_the_main_document_first(tmp_path):
+    (tmp_path / "parts").mkdir()
+    body = '<mujocoinclude><body name="{}"><joint/><geom size="0.1" pos="1 0 0"/></body></mujocoinclude>'
+    (tmp_path / "parts" / "all.xml").write_text('<mujocoinclude><include file="arm.xml"/></mujocoinclude>')
+    (tmp_path / "parts" / "arm.xml").write_text(body.format("inner"))
+    (tmp_path / "main.xml").write_text('<mujoco><worldbody><include file="parts/all.xml"/></worldbody></mujoco>')
+    assert str(sc.LagrangianSystem.from_mjcf(tmp_path / "main.xml").coordinates[0]) == "inner"
+    (tmp_path / "arm.xml").write_text(body.format("outer"))
+    assert str(sc.LagrangianSystem.from_mjcf(tmp_path / "main.xml").coordinates[0]) == "outer"
+    (tmp_path / "arm.xml").write_text(body.format("outer").replace("geom ", "goem "))
+    with pytest.raises(SystemDefinitionError, match=r"arm\.xml: <body> 'outer' contains .*; did you mean 'geom'"):
+        sc.LagrangianSystem.from_mjcf(tmp_path / "main.xml")
+
+
+def test_deep_documents_are_read(tmp_path):
+    depth, file = 1500, tmp_path / "deep.xml"
+    inside = '<joint/><geom size="0.1" pos="1 0 0"/>'
+    frames = f"{'<frame>' * depth}{inside}{'</frame>' * depth}"
+    bodies = '<body pos="0 0 0.1">' * depth
+    file.write_text(f"<mujoco><worldbody>{bodies}{frames}{'</body>' * depth}</worldbody></mujoco>")
+    assert len(sc.LagrangianSystem.from_mjcf(file).coordinates) == 1
+
+
+def test_robot_in_which_nothing_moves_is_refused(tmp_path):
+    file = tmp_path / "still.urdf"
+    file.write_text('<robot name="still"><link name="base"/></robot>')
+    with pytest.raises(SystemDefinitionError, match=r"from_urdf: floating=True, MJCF: <freejoint>"):
+        sc.LagrangianSystem.from_urdf(file)
+    with pytest.raises(SystemDefinitionError, match="no hinge or slide 'elbow'"):
+        sc.LagrangianSystem.from_urdf(ROBOTS / "arm.urdf", actuated=["elbow"])
+    with pytest.raises(SystemDefinitionError, match="cannot be read"):
+        sc.LagrangianSystem.from_urdf(tmp_path / "none.urdf")
