@@ -12,9 +12,15 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 @pytest.mark.second
 def test_the_readme_runs_from_top_to_bottom(tmp_path, monkeypatch):
-    found = [part for part in runnable(README) if part.kind == "python" or part.text.startswith(PROGRAM)]
-    assert {part.kind for part in found} == {"python", "command"}
-    run_page("README.md", found, tmp_path, monkeypatch)
+    parts = [part for part in runnable(README) if part.kind != "command" or part.text.startswith(PROGRAM)]
+    assert {part.kind for part in parts} == {"python", "output", "command"}
+    run_page("README.md", parts, tmp_path, monkeypatch)
+
+
+def test_the_readme_is_short_and_shows_code_before_claims():
+    assert README.count("\n") <= 90
+    assert README.count("](") <= 15
+    assert README.index("```python") < README.index("\n* ")
 
 
 def test_the_checks_use_the_commands_of_the_readme():

@@ -131,7 +131,7 @@ on {recorded["date"]}: {machine["processor"]}, {machine["cores"]} cores, load {m
 {table}
 {unrecorded}
 The claim does not cover other classes of problems:
-the [pages of benchmarks](performance.md) name those on which other programs are faster, and [limits](limits.md) those
+the [benchmarks](performance.md) name some on which other programs are faster, and [limits](limits.md) those
 for which they are better suited.
 """
 
