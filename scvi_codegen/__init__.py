@@ -9,10 +9,17 @@
     >>> bool(abs(run.energy() - run.energy()[0]).max() < 1e-9)
     True
 
-The rooms, in the order of the way from L to a run: ``common`` (errors, checks, files), ``systems`` (what
-the user states), ``methods`` (tables, discretisations), ``codegen`` (intermediate form, C), ``fields`` (densities on
-meshes), ``runs`` (states, steps, results), ``analysis`` (chaos, orbits, paths, estimation), ``interfaces``
-(command line, model files, packages, pictures) and ``paper`` (its reproduction). Imports go to the left.
+The rooms, in the order of the way from L to a run; imports go up:
+
+* ``common``: what every room uses: errors, checks of arguments, the cache, atomic files, displays.
+* ``systems``: what the user states: formulas, Lagrangians, Hamiltonians, constraints, bodies, events.
+* ``methods``: tables of numbers, discretisations, controllers of step sizes, reference solutions in 60 digits.
+* ``codegen``: the way to C: intermediate form, lowering, rendering of ``templates/``, compilers.
+* ``fields``: densities, meshes, semi-discretisation, conservation laws.
+* ``runs``: states, steps, runs, events, ensembles, accuracy, results, recordings; ``compile_stepper``.
+* ``analysis``: chaos, periodic orbits, paths, estimation, advice, verification.
+* ``interfaces``: command line, model files, packages, FMU, frameworks, pictures, pages, derivation.
+* ``paper``: the reproduction of the paper.
 
 Names are imported when they are first used, so code that only steps never imports SymPy.
 """
