@@ -54,6 +54,19 @@ from scvi_codegen.codegen.rendering.program_source import (
     workspace_size,
 )
 from scvi_codegen.codegen.rendering.source import DOUBLE_DOUBLE, ArrayLayout, Interface, Source
+from scvi_codegen.codegen.variants import (
+    Acting,
+    Crossings,
+    Derivatives,
+    Energies,
+    Lanes,
+    NewtonFallback,
+    Observing,
+    TangentVectors,
+    ThreadPerPoint,
+    ThreadPerTrajectory,
+    Variant,
+)
 from scvi_codegen.common.errors import MethodError, SizesRequiredError, SystemDefinitionError
 from scvi_codegen.common.validation import checks_arguments
 from scvi_codegen.methods import as_method
@@ -228,10 +241,6 @@ def describe_arrays(
         lengths=tuple(length for near in system.neighbours for length in near.lengths),
         kinks=system.kinks,
     )
-
-
-OF_ONE_WORD = ("observing", "thread", "points", "fallback")
-"""Variants that double-double arithmetic lacks."""
 
 
 class Sources:
@@ -426,11 +435,8 @@ class Sources:
         program = lower(varied, self.method, prefix=self.prefix, solver="fixed-point")
         return render_ensemble(program, tangents=count)
 
-    def observing(self, functions: str) -> Source | None:
+    def observing(self, observed: Observing) -> Source | None:
         """Return the ensemble source that observes functions of the state; ``None`` without trajectories in lanes.
-
-        Args:
-            functions: ``"extremes"`` of positions and momenta, ``"energy"``, or formulas of events, one a line.
 
         Raises:
             EventError: for an invalid formula.
@@ -440,53 +446,71 @@ class Sources:
         if render_ensemble(program) is None:
             return None
         states = *system.coordinates, *system.momentum_symbols
-        if functions == "extremes":
-            values: Sequence[Expr] = states
-        else:
-            formulas = EventFormulas(self.interface, as_events(functions.split("\n") if functions != "energy" else ()))
-            values = [
-                value.xreplace(dict(zip(formulas.p, system.momentum_symbols, strict=True)))
-                for value in formulas.functions
-            ]
-            if not values or any(value.free_symbols & {*system.velocities} for value in values):
-                values = self._at_momenta(values)
-        counts = functions not in ("extremes", "energy")
+        match observed:
+            case Crossings(functions):
+                formulas = EventFormulas(self.interface, as_events(functions))
+                momenta = dict(zip(formulas.p, system.momentum_symbols, strict=True))
+                values: Sequence[Expr] = [value.xreplace(momenta) for value in formulas.functions]
+                if any(value.free_symbols & {*system.velocities} for value in values):
+                    values = self._at_momenta(values)
+            case Energies():
+                values = [self._energy_of_states()]
+            case _:
+                values = states
+        counts = isinstance(observed, Crossings)
         return render_ensemble(program, system_kernel(system, "observed_lanes", values, u=states), counts=counts)
 
-    def _at_momenta(self, values: Sequence[Expr]) -> Sequence[Expr]:
-        """Return functions of velocities as functions of momenta; the energy if there are none."""
+    def _energy_of_states(self) -> Expr:
+        """Return the energy as a function of positions and momenta."""
         system = self.system
         try:
-            energy = energy_of_states(system)
+            return energy_of_states(system)
         except SystemDefinitionError as error:
             raise MethodError(
                 f"ensembles of '{system.name}' cannot observe velocities or energies, whose formulas are unknown "
                 f"({error}): save states, or observe functions of coordinates and momenta"
             ) from error
-        velocities = gradient_tuple(energy, system.momentum_symbols)
-        replaced = dict(zip(system.velocities, velocities, strict=True))
-        return [value.xreplace(replaced) for value in values] or [energy]
 
-    def variant(self, name: str) -> Source | None:
-        """Return the source of a variant, named as in :class:`~scvi_codegen.runs.stepping.compiled_method.Variants`."""
-        kind, _, count = name.partition(" ") if name.startswith(("changes", "observing")) else (name, "", "")
-        variants: dict[str, Callable[[], Source | None]] = {
-            "ensemble": lambda: render_ensemble(self.program()),
-            "fallback": self.fallback,
-            "acting": self.acting,
-            "acting ensemble": self.acting_ensemble,
-            "derivatives": self.tangent,
-            "second_derivatives": lambda: self.tangent(second=True),
-            "changes": lambda: self.changes(int(count)),
-            "observing": lambda: self.observing(count),
-            "points": lambda: render_points(self.program()),
-            "thread": lambda: render_thread(self.program(), control_of(self.program(), self.controller, self.system)),
-        }
-        if self.precision == DOUBLE_DOUBLE:  # derivatives are those of the step in double
-            if kind == "ensemble":
-                return render_ensemble_in_pairs(self.program(), self._corrected(self.program()))
-            return None if kind in OF_ONE_WORD else self._in_double.variant(name)
-        return None if self.of_arrays else variants[kind]()
+    def _at_momenta(self, values: Sequence[Expr]) -> Sequence[Expr]:
+        """Return functions of velocities as functions of momenta."""
+        # Hamilton's equation, v = dH/dp
+        velocities = gradient_tuple(self._energy_of_states(), self.system.momentum_symbols)
+        at_momenta = dict(zip(self.system.velocities, velocities, strict=True))
+        return [value.xreplace(at_momenta) for value in values]
+
+    def variant(self, variant: Variant) -> Source | None:
+        """Return the source of a variant; ``None`` if the method lacks it."""
+        if self.precision == DOUBLE_DOUBLE:
+            return self._variant_in_pairs(variant)
+        return None if self.of_arrays else self._variant_in_double(variant)
+
+    def _variant_in_double(self, variant: Variant) -> Source | None:
+        match variant:
+            case Lanes():
+                source = render_ensemble(self.program())
+            case NewtonFallback():
+                source = self.fallback()
+            case Derivatives(order):
+                source = self.tangent(second=order == 2)
+            case Acting(in_lanes):
+                source = self.acting_ensemble() if in_lanes else self.acting()
+            case TangentVectors(count):
+                source = self.changes(count)
+            case Observing():
+                source = self.observing(variant)
+            case ThreadPerPoint():
+                source = render_points(self.program())
+            case ThreadPerTrajectory():
+                source = render_thread(self.program(), control_of(self.program(), self.controller, self.system))
+            case _:
+                raise NotImplementedError(variant)
+        return source
+
+    def _variant_in_pairs(self, variant: Variant) -> Source | None:
+        """Return the source of a variant in double-double arithmetic; derivatives are those of the step in double."""
+        if isinstance(variant, Lanes):
+            return render_ensemble_in_pairs(self.program(), self._corrected(self.program()))
+        return None if variant.of_one_word else self._in_double.variant(variant)
 
 
 @checks_arguments(system=SYSTEM, symmetries=SYMMETRIES)

@@ -25,6 +25,7 @@ from numpy.typing import ArrayLike
 from scvi_codegen.codegen.native.building import TUNED_FLAGS
 from scvi_codegen.codegen.native.compilers import REORDERING_FLAGS
 from scvi_codegen.codegen.rendering.source import AUTO, DOUBLE_DOUBLE, PRECISIONS, Interface, Source
+from scvi_codegen.codegen.variants import Derivatives, Variant
 from scvi_codegen.common.cache import cached_source, key_of
 from scvi_codegen.common.errors import MethodError, SizesRequiredError
 from scvi_codegen.common.validation import TEXTS, ArgumentType, check_kind, checks_arguments
@@ -137,7 +138,9 @@ def compile_stepper(
     if precision == DOUBLE_DOUBLE and not known_sizes:
         raise MethodError("precision='double-double' is not available with arrays of run-time sizes: pass sizes={..}")
     sources = CachedSources(system, method, solver, prefix, symmetries, time_transformation, controller, precision)
-    variants = Variants(make=sources.variant, lacking=lambda name: name == "second_derivatives" and system.damping != 0)
+    variants = Variants(
+        make=sources.variant, lacking=lambda variant: variant == Derivatives(order=2) and system.damping != 0
+    )
     if not known_sizes:
         source, interface, reason = sources.of_run_time_sizes()
         rattle = system.constraints and isinstance(method, StoermerVerlet)
@@ -259,12 +262,12 @@ class CachedSources:
             return Source.from_record(record), interface, ""
         return None, replace(interface, layout=replace(interface.layout, maps=())), reason
 
-    def variant(self, name: str) -> Source | None:
-        """Return the source of a variant (:class:`Variants`)."""
+    def variant(self, variant: Variant) -> Source | None:
+        """Return the source of a variant; ``None`` if the method lacks it."""
 
         def derive() -> str:
-            source = self.derived.variant(name)
+            source = self.derived.variant(variant)
             return "" if source is None else source.to_json()
 
-        text = cached_source((*self.key, name), derive)
+        text = cached_source((*self.key, repr(variant)), derive)
         return Source.from_json(text) if text else None

@@ -21,6 +21,7 @@ from scvi_codegen.codegen.native.arguments import checked_number
 from scvi_codegen.codegen.native.calls import with_calls
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.codegen.rendering.source import Source
+from scvi_codegen.codegen.variants import Variant
 from scvi_codegen.common.errors import MethodError, ScviCodegenError, StateError
 from scvi_codegen.common.validation import checked_count, checks_arguments, of
 from scvi_codegen.runs.accuracy.global_error import Runs, checked_error, warn_of_unconfirmed, warn_of_unconfirmed_run
@@ -49,7 +50,7 @@ from scvi_codegen.runs.states.validation import (
 )
 from scvi_codegen.runs.states.words import check_doubles, checked_time, hashed
 from scvi_codegen.runs.stepping.array_interface import RunSizes, interface_of_sizes, shapes_of_call, sizes_of_run
-from scvi_codegen.runs.stepping.compiled_method import OF_KNOWN_SIZES, Variants
+from scvi_codegen.runs.stepping.compiled_method import Variants
 from scvi_codegen.runs.stepping.features import check_together, require
 from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.projection import consistent, constraint_values, multipliers, projected
@@ -704,9 +705,9 @@ class StepperOfRunTimeSizes(Stepper):
         """Return the stepper bound to these sizes and tables; the latest one is kept for later calls."""
         if self._latest is None or self._latest[0] != problem.key:
 
-            def make(name: str) -> Source | None:
-                known = bound.known if name.startswith(OF_KNOWN_SIZES) else self
-                return known._variants[name]
+            def make(variant: Variant) -> Source | None:
+                stepper = bound.known if variant.of_known_sizes else self
+                return stepper._variants[variant]
 
             interface = interface_of_sizes(self.interface, problem.sizes)
             further: dict[str, Any] = {"variants": Variants(make=make), "flags": self.flags}

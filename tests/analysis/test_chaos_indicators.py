@@ -11,6 +11,7 @@ from scipy.integrate import solve_ivp
 
 import scvi_codegen as sc
 from scvi_codegen.analysis.chaos.indicators import SERIES, InitialTangents
+from scvi_codegen.codegen.variants import TangentVectors
 
 pytestmark = pytest.mark.second
 
@@ -193,7 +194,7 @@ def test_ensembles_are_the_same_as_runs(galaxy):
 def by_derivatives(stepper):
     """Compute the indicators without code for lanes: each trajectory is followed separately."""
     alone = pickle.loads(pickle.dumps(stepper))
-    assert alone._variants["changes 1"] is None
+    assert alone._variants[TangentVectors(1)] is None
     return alone
 
 
@@ -233,7 +234,7 @@ def test_lanes_have_the_derivatives_of_the_steps(system, method, options):
     alone = by_derivatives(stepper)
     options = {"h": 0.1, "steps": 120, "save_every": 40} | options
     found = stepper.chaos_indicators_ensemble(*start, **options)
-    assert stepper._variants[f"changes {found.log_norms.shape[-1]}"] is not None
+    assert stepper._variants[TangentVectors(found.log_norms.shape[-1])] is not None
     same(found, alone.chaos_indicators_ensemble(*start, **options), 1e-12)
 
 

@@ -15,6 +15,7 @@ import scvi_codegen as sc
 from scvi_codegen.analysis.verification import Outcome
 from scvi_codegen.codegen.lowering.arrays import one_coordinate
 from scvi_codegen.codegen.pipeline import Sources
+from scvi_codegen.codegen.variants import Derivatives, Lanes
 from scvi_codegen.common.cache import template_folder
 from scvi_codegen.systems.arrays.system import ArraySystem
 
@@ -148,7 +149,7 @@ def headers_of(name: str) -> Iterator[str]:
         chosen = sc.as_method(method, one_coordinate(system) if isinstance(system, ArraySystem) else system)
         made = Sources(system, chosen, options.get("solver", "auto"), g=options.get("time_transformation"))
         sources.append(made.integrator()[0])
-        for kind in ("ensemble", "derivatives", *(["second_derivatives"] if name == "kepler/svi-3" else [])):
+        for kind in (Lanes(), Derivatives(), *([Derivatives(order=2)] if name == "kepler/svi-3" else [])):
             with suppress(sc.MethodError):
                 sources.append(made.variant(kind))
     for source in filter(None, sources):

@@ -12,6 +12,7 @@ from scvi_codegen.codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.codegen.ir.kernel import Kernel, RolledKernel
 from scvi_codegen.codegen.pipeline import describe, program_of
 from scvi_codegen.codegen.rendering.program_source import render, render_ensemble
+from scvi_codegen.codegen.variants import Lanes
 from scvi_codegen.interfaces.models.systems import fput_chain
 from scvi_codegen.runs.stepping.compiled_method import Variants
 
@@ -50,7 +51,7 @@ def states(system: LagrangianSystem, force: Kernel | None) -> tuple[np.ndarray, 
     stepper = Stepper(
         render(program),
         describe(program, system, method),
-        variants=Variants({"ensemble": render_ensemble(program)}),
+        variants=Variants({Lanes(): render_ensemble(program)}),
         flags=FLAGS,
     )
     q = np.sin(np.arange(1, system.dimension + 1) / 3) / 2

@@ -10,6 +10,7 @@ from style import check_style
 from scvi_codegen import SCVI, SVI, Gauss, SpectralCollocation, StoermerVerlet, problem
 from scvi_codegen.codegen.pipeline import Sources
 from scvi_codegen.codegen.rendering.program_source import with_casadi_flow, with_flow_of_rows, with_xla_flow
+from scvi_codegen.codegen.variants import Derivatives
 
 STRICT = ["-std=c99", "-O0", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Wconversion", "-Werror"]
 CASES = {
@@ -25,8 +26,8 @@ CASES = {
 }
 
 
-def source_of(name, kind="derivatives"):
-    return Sources(*CASES[name]).variant(kind)
+def source_of(name, order=1):
+    return Sources(*CASES[name]).variant(Derivatives(order))
 
 
 def compile_with(compiler, flags, source, folder):
@@ -50,7 +51,7 @@ def test_flows_compile_without_warnings(name, compiler, tmp_path):
 
 @pytest.mark.rotated
 def test_flows_of_batches_compile_without_warnings(tmp_path):
-    first, second = source_of("kepler"), source_of("kepler", "second_derivatives")
+    first, second = source_of("kepler"), source_of("kepler", order=2)
     for source in (with_flow_of_rows(first), with_flow_of_rows(second, second=True)):
         check_style(source.amalgamated().code)
         compile_with("gcc", ["-Wno-missing-prototypes"], source.amalgamated(), tmp_path)
@@ -59,7 +60,7 @@ def test_flows_of_batches_compile_without_warnings(tmp_path):
 @pytest.mark.rotated
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 def test_second_derivatives_compile_without_warnings(compiler, tmp_path):
-    source = with_casadi_flow(source_of("kepler", "second_derivatives"), 10, 5, second=True).amalgamated()
+    source = with_casadi_flow(source_of("kepler", order=2), 10, 5, second=True).amalgamated()
     check_style(source.code)
     compile_with(compiler, ["-Wno-missing-prototypes"], source, tmp_path)
 
@@ -76,6 +77,6 @@ def test_flows_compile_with_the_interface_of_xla(tmp_path):
     source = with_xla_flow(source_of("kepler"), "0").amalgamated()
     check_style(source.code)
     compile_with("gcc", flags, source, tmp_path)
-    second = with_xla_flow(source_of("kepler", "second_derivatives"), "0", second=True).amalgamated()
+    second = with_xla_flow(source_of("kepler", order=2), "0", second=True).amalgamated()
     check_style(second.code)
     compile_with("gcc", flags, second, tmp_path)

@@ -19,6 +19,7 @@ from scvi_codegen.codegen.rendering.environment import support_text
 from scvi_codegen.codegen.rendering.program_source import with_casadi_flow, with_flow_of_rows
 from scvi_codegen.codegen.rendering.source import Source
 from scvi_codegen.codegen.rendering.text import preprocessed
+from scvi_codegen.codegen.variants import Derivatives
 from scvi_codegen.common.cache import template_folder
 
 FOLDER = template_folder()
@@ -81,9 +82,9 @@ def sources() -> tuple[Source, ...]:
     ]
     made += [kepler.integrator()[0], *(Sources(system, method).integrator()[0] for system, method in pairs)]
     drift = LagrangianSystem.from_text("drift", ["x", "y"], "x**3*y_dot - x**2 - y**2")
-    made.append(Sources(drift, SVI(1)).variant("derivatives"))
-    made.append(with_casadi_flow(kepler.variant("second_derivatives"), 10, 5, second=True))
-    made.append(with_flow_of_rows(kepler.variant("derivatives")))
+    made.append(Sources(drift, SVI(1)).variant(Derivatives()))
+    made.append(with_casadi_flow(kepler.variant(Derivatives(order=2)), 10, 5, second=True))
+    made.append(with_flow_of_rows(kepler.variant(Derivatives())))
     pendulum = problem("planar-pendulum").system
     for method in (SVI(2), StoermerVerlet()):
         made.append(Sources(pendulum, method, precision="double-double").integrator()[0])

@@ -15,6 +15,7 @@ from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 from scvi_codegen import Run, Stepper, compile_stepper, problem
+from scvi_codegen.codegen.variants import TangentVectors
 from scvi_codegen.runs.stepping.step_plan import Adaptive, FixedSteps
 
 Q, P = [0.3, 0.8], [-1.1, 0.4]
@@ -61,13 +62,13 @@ def test_pickled_stepper_in_double_double_takes_the_same_steps() -> None:
 def test_pickled_stepper_is_equal(option: str) -> None:
     own = stepper(option)
     made = {
-        "changes": own._variants["changes 2"],
+        "changes": own._variants[TangentVectors(2)],
         "second_derivatives": own.second_derivatives,
     }  # which go if asked for
     for copy in (copied(own), copied(copied(own))):
         saved = ("title", "interface", "flags", "events", "source", "ensemble", "fallback", "derivatives")
         assert [name for name in saved if getattr(copy, name) != getattr(own, name)] == []
-        assert {"changes": copy._variants["changes 2"], "second_derivatives": copy.second_derivatives} == made
+        assert {"changes": copy._variants[TangentVectors(2)], "second_derivatives": copy.second_derivatives} == made
         in_tau = "time_transformation" in STEPPERS[option]
         plan: dict[str, Any] = {"h": 0.2, "t_end": 0.5} if in_tau else {"h": H, "steps": STEPS}
         runs = [each.integrate(Q, P, **plan) for each in (own, copy)]

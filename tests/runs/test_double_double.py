@@ -26,6 +26,7 @@ from scvi_codegen.codegen.native.building import TUNED_FLAGS
 from scvi_codegen.codegen.native.compilers import REORDERING_FLAGS
 from scvi_codegen.codegen.pipeline import Sources
 from scvi_codegen.codegen.rendering.kernels.double_double import FUNCTIONS, arithmetic_headers
+from scvi_codegen.codegen.variants import Lanes
 from scvi_codegen.common.errors import MethodError, StateError
 from scvi_codegen.runs.ensembles.ensemble import Ensemble
 from scvi_codegen.runs.ensembles.lanes import SingleRun
@@ -883,7 +884,7 @@ def test_largest_systems_in_lanes(count: int, has_lanes: bool) -> None:
     names = [f"x{j}" for j in range(count)]
     lagrangian = "+".join(f"{x}_dot**2/2 - {x}**4" for x in names)
     free = sc.LagrangianSystem.from_text(name="free", coordinates=names, lagrangian=lagrangian)
-    source = Sources(free, sc.SVI(16), precision="double-double").variant("ensemble")
+    source = Sources(free, sc.SVI(16), precision="double-double").variant(Lanes())
     assert (source is not None) == has_lanes
 
 

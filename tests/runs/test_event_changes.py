@@ -19,6 +19,7 @@ from scvi_codegen.analysis.verification.certificate import Outcome
 from scvi_codegen.analysis.verification.impacts import impact_checks
 from scvi_codegen.analysis.verification.system_under_test import State, SystemUnderTest
 from scvi_codegen.codegen.rendering.events import with_events
+from scvi_codegen.codegen.variants import WithEvents
 from scvi_codegen.interfaces.derivation.page.document import derivation_html
 from scvi_codegen.interfaces.models.model_files.model_file import dump_model, parse_model
 from scvi_codegen.runs.stepping.compiled_method import Variants
@@ -315,7 +316,7 @@ def test_certificates_measure_impacts(fault):
     source = with_events(plain.source, plain.interface, events)
     old, new = FAULTS[fault]
     texts = tuple((name, text.replace(old, new) if old else text) for name, text in source.beside.support)
-    faulty = {events: replace(source, beside=replace(source.beside, support=texts))}
+    faulty = {WithEvents(events): replace(source, beside=replace(source.beside, support=texts))}
     variants = Variants(faulty, plain._variants.__getitem__, plain._variants.lacks)
     stepper = sc.Stepper(plain.source, plain.interface, flags=FLAGS, events=events, variants=variants)
     start = State(np.array([0.1, 1.0]), np.array([0.2, 0.0]), 0.0, 0.05)

@@ -21,6 +21,7 @@ from scvi_codegen import HamiltonianSystem, LagrangianSystem, as_method, problem
 from scvi_codegen.codegen.native.compilers import find_compiler
 from scvi_codegen.codegen.pipeline import Sources, generate_source
 from scvi_codegen.codegen.rendering.source import Source
+from scvi_codegen.codegen.variants import Derivatives, Lanes, NewtonFallback
 from scvi_codegen.systems.arrays.system import ArraySystem
 from scvi_codegen.systems.system import MechanicalSystem
 
@@ -80,11 +81,11 @@ def single(
     sources = sources_of(found, method, name, solver, time_transformation)
     parameters = found.defaults
     if kind == "ensemble":
-        source = sources.variant("ensemble")
+        source = sources.variant(Lanes())
         return source, ensemble_driver(f"{name}_ensemble", q, p, parameters, h, steps)
     if kind in ("tangent", "second"):
         second = kind == "second"
-        source = sources.variant("second_derivatives" if second else "derivatives")
+        source = sources.variant(Derivatives(order=2 if second else 1))
         return source, tangent_driver(source.prefix, q, p, parameters, h, 4, second=second)
     if kind == "embedded":
         source = generate_source(found, as_method(method, found), prefix=name, embedded="double")[0]
@@ -94,7 +95,7 @@ def single(
         transformed = time_transformation is not None
         adaptive = {"t_end": t_end, "tolerance": tolerance, "transformed": transformed}
         return source, run_driver(name, q, p, parameters, h, steps, **adaptive)
-    source = sources.variant("fallback") or sources.integrator()[0]
+    source = sources.variant(NewtonFallback()) or sources.integrator()[0]
     return source, run_driver(name, q, p, parameters, h, steps)
 
 

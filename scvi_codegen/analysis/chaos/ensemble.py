@@ -29,6 +29,7 @@ from scvi_codegen.codegen.native.binding import Binding
 from scvi_codegen.codegen.native.cuda import constant
 from scvi_codegen.codegen.native.options import SolverOptions, checked_options
 from scvi_codegen.codegen.rendering.source import Source
+from scvi_codegen.codegen.variants import TangentVectors
 from scvi_codegen.common.errors import MethodError, StateError, StepFailedError
 from scvi_codegen.common.validation import checked_count
 from scvi_codegen.runs.accuracy.local_error import warn_of_large_steps
@@ -130,7 +131,7 @@ class ChaosIndicatorsEnsemble:
         """Return the source of an ensemble with tangent vectors, or ``None``."""
         if self.stepper.interface.constraints or self.stepper.interface.rotations:
             return None
-        return self.stepper._variants[f"changes {self.values.shape[-1]}"]
+        return self.stepper._variants[TangentVectors(self.values.shape[-1])]
 
     def _on_device(self, report: Callable[[int], None], threads: int | None) -> NDArray[np.intp]:
         """Process all trajectories on a GPU; return those that failed."""

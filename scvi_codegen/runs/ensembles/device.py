@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scvi_codegen.codegen.native.cuda import DEVICES, Device, constant, has_device_memory
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.codegen.rendering.source import POINT_THREADS, Source
+from scvi_codegen.codegen.variants import ThreadPerTrajectory
 from scvi_codegen.common.errors import MethodError, StateError
 from scvi_codegen.common.representation import one_line
 from scvi_codegen.common.validation import LARGEST_COUNT
@@ -290,7 +291,7 @@ class AdaptiveDeviceRuns:
         *,
         plan: Adaptive,
     ) -> None:
-        source = stepper._variants["thread"]
+        source = stepper._variants[ThreadPerTrajectory()]
         if source is None:
             raise MethodError(
                 f"adaptive steps on a GPU are not available for '{stepper.title}': they require a fixed-point "

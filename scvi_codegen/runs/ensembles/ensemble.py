@@ -24,6 +24,7 @@ from scvi_codegen.codegen.native.arguments import real_array
 from scvi_codegen.codegen.native.capacity import TOO_MANY_STATES, room_for_states, too_many_states
 from scvi_codegen.codegen.native.options import FAILURES, SolverOptions, checked_options
 from scvi_codegen.codegen.rendering.source import Source
+from scvi_codegen.codegen.variants import ThreadPerPoint
 from scvi_codegen.common.errors import AccuracyWarning, EventError, StateError, StepFailedError, warn
 from scvi_codegen.common.validation import LARGEST_COUNT, checked_count
 from scvi_codegen.runs.accuracy.global_error import GlobalError
@@ -241,7 +242,7 @@ class Ensemble:
         """Return the source whose points are threads of a GPU, for many coordinates and equal steps, or ``None``."""
         if len(fixed.segments) > 1 or self.inputs or self.stepper.dimension < FEWEST_COORDINATES:
             return None
-        return cast("Source | None", self.stepper._variants["points"])
+        return cast("Source | None", self.stepper._variants[ThreadPerPoint()])
 
     def _successive(self) -> SuccessiveRuns | None:
         """Return the trajectories that C integrates one after the other, ``None`` for other ensembles."""

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scvi_codegen.codegen.native import building
 from scvi_codegen.codegen.native.binding import Binding
 from scvi_codegen.codegen.native.cuda import constant
+from scvi_codegen.codegen.variants import Crossings, Energies, Extremes, Observing
 from scvi_codegen.common.errors import EventError, MethodError, StateError, closest
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepping.integrator import Integrator
@@ -54,7 +55,7 @@ class EnsembleObservation:
                 f"ensembles have no observer {name!r}{closest(str(name), OBSERVED)} Known: {', '.join(OBSERVED)}"
             )
         self.stepper, self.name = stepper, name
-        source = stepper._variants[f"observing {self._functions()}"]
+        source = stepper._variants[self._variant()]
         if source is None:
             raise MethodError(
                 f"observe={name!r} is not available in ensembles of '{stepper.title}', which was loaded without their "
@@ -64,10 +65,12 @@ class EnsembleObservation:
         self.values = np.full((5, constant(source, f"{source.prefix.upper()}_OBSERVED"), count), np.nan)
         self.values[RISES:] = 0.0
 
-    def _functions(self) -> str:
-        """Return the functions, named as in the variants of a compiled method."""
-        if self.name != "events":
-            return self.name
+    def _variant(self) -> Observing:
+        """Return the variant of the method that computes the functions."""
+        if self.name == "extremes":
+            return Extremes()
+        if self.name == "energy":
+            return Energies()
         events = self.stepper.events
         for event in events:
             if event.terminal or event.conditions or event.loops:
@@ -77,7 +80,7 @@ class EnsembleObservation:
                 )
         if not events:
             raise EventError("observe='events' counts the events of the stepper, which has none: use with_events(..)")
-        return "\n".join(str(event.function) for event in events)
+        return Crossings(tuple(str(event.function) for event in events))
 
     @cached_property
     def binding(self) -> Binding:

@@ -18,6 +18,7 @@ from scvi_codegen.codegen.native.arguments import checked_number
 from scvi_codegen.codegen.native.compilers import check_flags, compiler_title, fingerprint
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.codegen.rendering.source import Interface, Source, check_interface
+from scvi_codegen.codegen.variants import NewtonFallback
 from scvi_codegen.common.atomic import read_text, regular, sync_folder, write_atomically, write_text
 from scvi_codegen.common.errors import RecordingError
 from scvi_codegen.common.validation import checked_count
@@ -263,12 +264,12 @@ class Manifest:
 
     def stepper(self, mesh: Any = None) -> Stepper:
         """Return the integrator, compiled or loaded from the cache; ``mesh``: of the fields of a density."""
-        variants = Variants({"fallback": self.fallback})
+        variants = Variants({NewtonFallback(): self.fallback})
         interface = replace(self.interface, layout=replace(self.interface.layout, mesh=mesh))
         stepper = Stepper(self.source, interface, variants=variants, flags=self.flags, events=self.events)
         if self.double:
             source, interface, fallback = self.double
-            variants = Variants({"fallback": fallback})
+            variants = Variants({NewtonFallback(): fallback})
             stepper._doubles = constantly(Stepper(source, interface, variants=variants, flags=self.flags))
         return stepper
 

@@ -14,6 +14,7 @@ from scvi_codegen.codegen.native import building
 from scvi_codegen.codegen.native.binding import Binding
 from scvi_codegen.codegen.native.calls import with_calls
 from scvi_codegen.codegen.rendering.source import Interface, Source
+from scvi_codegen.codegen.variants import Acting, Derivatives, Lanes, NewtonFallback, Variant, WithEvents
 from scvi_codegen.common.display.cards import card, listed, plain
 from scvi_codegen.common.errors import MethodError, ScviCodegenError
 from scvi_codegen.common.representation import LONGEST, clipped
@@ -28,44 +29,43 @@ MOST_EVENT_SETS = 16
 """Number of event sets whose compiled integrators are cached, so that repeated calls do not parse formulas again."""
 
 
-OF_KNOWN_SIZES = ("derivatives", "second_derivatives", "changes")
-"""Beginnings of the names of variants that arrays of run-time sizes take from the stepper compiled with their sizes."""
-
-
 class Variants:
-    """C sources of the variants of a method by name, derived on first use.
-
-    The names are ``"ensemble"``, ``"fallback"`` (Newton's iteration), ``"derivatives"`` and ``"second_derivatives"`` of
-    steps, and ``"changes K"`` (ensembles with K tangent vectors).
+    """C sources of the variants of a method, derived on first use.
 
     Args:
-        sources: sources by name; ``None`` for a variant that the method lacks. Those with events by the tuple of these.
+        sources: sources that exist; ``None`` for a variant that the method lacks.
         make: derives a source that is not among them.
-        lacking: returns whether the name is that of a variant that the method lacks, without deriving it.
+        lacking: returns whether the method lacks a variant, without deriving it.
     """
 
     def __init__(
         self,
-        sources: Mapping[Any, Source | None] | None = None,
-        make: Callable[[str], Source | None] = lambda _: None,
-        lacking: Callable[[str], bool] = lambda _: True,
+        sources: Mapping[Variant, Source | None] | None = None,
+        make: Callable[[Variant], Source | None] = lambda _: None,
+        lacking: Callable[[Variant], bool] = lambda _: True,
     ) -> None:
-        self._made: dict[Any, Source | None] = dict(sources or {})
+        self._made: dict[Variant, Source | None] = dict(sources or {})
         self._make, self._lacking = make, lacking
 
-    def __getitem__(self, name: str) -> Source | None:
-        if name not in self._made:
-            self._made[name] = self._make(name)
-        return self._made[name]
+    def __getitem__(self, variant: Variant) -> Source | None:
+        if variant not in self._made:
+            self._made[variant] = self._make(variant)
+        return self._made[variant]
 
-    def lacks(self, name: str, *, of_sizes: bool = False) -> bool:
+    def with_events(self, events: tuple[Event, ...]) -> Source | None:
+        """Return the source with event detection, ``None`` unless it was loaded with the method."""
+        return self._made.get(WithEvents(events))
+
+    def lacks(self, variant: Variant, *, of_sizes: bool = False) -> bool:
         """Return whether the method lacks a variant, without deriving it; ``of_sizes``: that of other sizes."""
-        return self._made[name] is None if name in self._made and not of_sizes else self._lacking(name)
+        if variant in self._made and not of_sizes:
+            return self._made[variant] is None
+        return self._lacking(variant)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # second derivatives and tangent-vector variants are slow to derive: included only if already made
-        for name in ("ensemble", "fallback", "derivatives"):
-            _ = self[name]
+        for variant in (Lanes(), NewtonFallback(), Derivatives()):
+            _ = self[variant]
         return (Variants, (self._made,))
 
 
@@ -134,12 +134,8 @@ class CompiledMethod(ChosenBySizes):
         interface, events = self.interface if self.origin is None else self.origin.interface, self.events
         if interface.words > 1:
             events = ()  # located by the integrator in double
-        if events and (known := self._variants._made.get(events)) is not None:
-            self.source = known
-        elif events:
-            from scvi_codegen.codegen.rendering.events import with_events  # here, because it imports SymPy
-
-            self.source = with_events(self._plain, interface, events)
+        if events:
+            self.source = self._variants.with_events(events) or self._derived_with_events(interface, events)
         library = building.load(with_calls(self.source), flags=self.flags)
         if self.problem is not None:
             arrays = library, interface, self.problem
@@ -147,12 +143,17 @@ class CompiledMethod(ChosenBySizes):
         else:
             self.binding = Binding(library, interface.prefix, interface.workspace, fallback=self._load_fallback)
 
+    def _derived_with_events(self, interface: Interface, events: tuple[Event, ...]) -> Source:
+        from scvi_codegen.codegen.rendering.events import with_events  # here, because it imports SymPy
+
+        return with_events(self._plain, interface, events)
+
     @property
     def acting(self) -> Self:
         """The stepper whose runs sum the action of their steps; itself if they are computed again for it."""
         stepper = self.known
         if stepper._with_action is None:
-            source = stepper._variants["acting"]
+            source = stepper._variants[Acting()]
             found = stepper._with_action = stepper._copy(stepper.events, source) if source else stepper
             found._with_action, found.sums_action = found, source is not None
         return stepper._with_action
@@ -255,22 +256,22 @@ class CompiledMethod(ChosenBySizes):
     @property
     def ensemble(self) -> Source | None:
         """C source of the ensemble variant, derived on first use; ``None`` if the method has none."""
-        return self._variants["ensemble"]
+        return self._variants[Lanes()]
 
     @property
     def fallback(self) -> Source | None:
         """C source of the fallback library with Newton's iteration, derived on first use; ``None`` if not needed."""
-        return self._variants["fallback"]
+        return self._variants[NewtonFallback()]
 
     @property
     def derivatives(self) -> Source | None:
         """C source with the derivatives of steps, derived on first use."""
-        return self._variants["derivatives"]
+        return self._variants[Derivatives()]
 
     @property
     def second_derivatives(self) -> Source | None:
         """C source with second derivatives of steps, derived on first use; ``None`` if unavailable."""
-        return self._variants["second_derivatives"]
+        return self._variants[Derivatives(order=2)]
 
     def prepare(
         self,
@@ -292,9 +293,9 @@ class CompiledMethod(ChosenBySizes):
         """
         for each in (self,) if events is None else (self, self.with_events(events)):
             each._compile()
-        wanted = {"derivatives": tangent, "second_derivatives": second, "ensemble": ensemble}
-        for source in [self._variants[name] for name, is_wanted in wanted.items() if is_wanted]:
-            if source is not None:
+        requested = {Derivatives(): tangent, Derivatives(order=2): second, Lanes(): ensemble}
+        for variant in [variant for variant, is_requested in requested.items() if is_requested]:
+            if (source := self._variants[variant]) is not None:
                 building.load(source, flags=self.flags)
 
     def _compile(self) -> None:
@@ -303,20 +304,20 @@ class CompiledMethod(ChosenBySizes):
     @cached_property
     def tangent(self) -> Binding:
         """Library with derivatives of steps, compiled on first use."""
-        return self._linearised("derivatives", "jacobian")
+        return self._linearised(Derivatives(), "jacobian")
 
     @cached_property
     def _ensemble_binding(self) -> Binding | None:
         """Library of trajectories in SIMD lanes, compiled on first use; ``None`` if the method has none."""
-        source = (self._variants["acting ensemble"] if self.sums_action else None) or self.ensemble
+        source = (self._variants[Acting(in_lanes=True)] if self.sums_action else None) or self.ensemble
         return None if source is None else Binding(building.load(source, flags=self.flags), source.prefix)
 
     @cached_property
     def _second_derivatives(self) -> Binding:
         """Library with second derivatives of steps, compiled on first use; raises ``MethodError`` if unavailable."""
-        return self._linearised("second_derivatives", "hessian")
+        return self._linearised(Derivatives(order=2), "hessian")
 
-    def _linearised(self, variant: str, operation: str) -> Binding:
+    def _linearised(self, variant: Variant, operation: str) -> Binding:
         require(self, operation)
         source = cast(Source, self._variants[variant])
         binding = Binding(building.load(source, flags=self.flags), source.prefix)
@@ -402,7 +403,7 @@ class CompiledMethod(ChosenBySizes):
             self._event_variants[wanted] = self._copy(wanted)
         return self._event_variants[wanted]
 
-    def _lacks(self, variant: str) -> bool:
+    def _lacks(self, variant: Variant) -> bool:
         """Return whether the method lacks a variant; arrays of run-time sizes take it from their system."""
         source = self.origin or self
         if source.run_time_sizes:

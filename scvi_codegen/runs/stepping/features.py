@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from scvi_codegen.codegen.variants import Derivatives
 from scvi_codegen.common.errors import MethodError, ScviCodegenError, StateError, closest
 from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED
 
@@ -72,8 +73,8 @@ PROPERTIES: dict[str, Callable[[Any], bool]] = {
     "with sizes known at run time": lambda stepper: stepper.run_time_sizes,
     "with precision='double-double'": lambda stepper: stepper.interface.words > 1,
     "without trajectories in SIMD lanes": lambda stepper: not stepper.run_time_sizes and stepper.ensemble is None,
-    "without derivatives": lambda stepper: stepper._lacks("derivatives"),
-    "without second derivatives": lambda stepper: stepper._lacks("second_derivatives"),
+    "without derivatives": lambda stepper: stepper._lacks(Derivatives()),
+    "without second derivatives": lambda stepper: stepper._lacks(Derivatives(order=2)),
     "without an error estimate": lambda stepper: not (stepper._has_error_estimate or stepper._has_tau),
 }
 """Whether a stepper has a property."""

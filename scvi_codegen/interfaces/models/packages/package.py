@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING, Any
 
 from scvi_codegen.codegen.rendering.source import PREFIX, Interface, Source, check_interface
 from scvi_codegen.codegen.rendering.text import included
+from scvi_codegen.codegen.variants import WithEvents
 from scvi_codegen.common.atomic import read_text, write_text
 from scvi_codegen.common.errors import PackageError
 from scvi_codegen.common.validation import ArgumentType, checks_arguments
@@ -258,7 +259,7 @@ def load_package(folder: str | os.PathLike[str]) -> Stepper:
         raise
     except (ValueError, KeyError, TypeError) as error:
         raise damaged(target, error) from error
-    variants = Variants({events: source}) if events else None
+    variants = Variants({WithEvents(events): source}) if events else None
     return Stepper(replace(source, beside=None), interface, events=events, variants=variants)
 
 
