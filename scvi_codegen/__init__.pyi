@@ -129,8 +129,6 @@ from scvi_codegen.runs.stepping.step_derivatives import Sensitivity as Sensitivi
 from scvi_codegen.runs.trajectory import Trajectory as Trajectory
 from scvi_codegen.systems.derived_systems import change_coordinates as change_coordinates
 from scvi_codegen.systems.derived_systems import variational_system as variational_system
-from scvi_codegen.systems.elimination import EliminatedRods as EliminatedRods
-from scvi_codegen.systems.elimination import eliminate_constraints as eliminate_constraints
 from scvi_codegen.systems.event import Crossings as Crossings
 from scvi_codegen.systems.event import Event as Event
 from scvi_codegen.systems.event import impact as impact

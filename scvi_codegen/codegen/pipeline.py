@@ -179,8 +179,6 @@ def describe(
         solver=_solver_of(program),
         variables=tuple(each.name for each in getattr(system, "variables", ())),
         lengths=system.lengths,
-        originals=tuple((x.name, system.text_of(f)) for x, f in system.replaced.items()),
-        original_arrays=tuple(map(str, system.eliminated.original.arrays)) if system.replaced else (),  # type: ignore[attr-defined]
         kinks=system.kinks,
     )
 

@@ -10,7 +10,7 @@ differentiation, so the computed x and m x' are the derivatives of the computed 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import sympy
@@ -66,41 +66,18 @@ def change_coordinates(
     variables = tuple(symbol(name) for name in new)
     known = {symbol.name: symbol for symbol in (*variables, *system.parameters, system.time)}
     positions = {symbol(name): parse_expression(text, known) for name, text in old.items()}
-    return in_other_coordinates(system, positions, variables, name=f"{system.name} in {', '.join(coordinates)}")
-
-
-def in_other_coordinates(
-    system: LagrangianSystem,
-    positions: Mapping[Symbol, Expr],
-    variables: tuple[Symbol, ...],
-    *,
-    name: str,
-    lagrangian: Callable[[Mapping[Expr, Expr]], Expr] | None = None,
-    omitted: Container[int] = (),
-) -> LagrangianSystem:
-    """Return the system with coordinates replaced by expressions in the variables, which need not be as many.
-
-    Args:
-        system: in the old coordinates.
-        positions: the coordinates that are replaced, as expressions in the variables, parameters and time.
-        variables: the new coordinates, in order.
-        name: name of the new system.
-        lagrangian: returns the new Lagrangian from the replacements; by default they are substituted.
-        omitted: indices of the constraints that hold identically in the variables.
-    """
     replaced: dict[Expr, Expr] = {**positions}
     replaced |= {symbol(q.name + DOT): rate_of(f, variables, system.time) for q, f in positions.items()}
-    clock = system.clock and replace(system.clock, rate=system.clock.rate.xreplace(replaced))
     return LagrangianSystem(
-        name=name,
+        name=f"{system.name} in {', '.join(coordinates)}",
         coordinates=variables,
         time=system.time,
         parameters=system.parameters,
         defaults=system.defaults,
-        lagrangian=lagrangian(replaced) if lagrangian else system.lagrangian.xreplace(replaced),
-        clock=clock,
+        lagrangian=system.lagrangian.xreplace(replaced),
+        clock=system.clock and replace(system.clock, rate=system.clock.rate.xreplace(replaced)),
         forces=_projected(system, positions, replaced, variables),
-        constraints=tuple(g.xreplace(replaced) for k, g in enumerate(system.constraints) if k not in omitted),
+        constraints=tuple(g.xreplace(replaced) for g in system.constraints),
         inputs=system.inputs,
         damping=system.damping,
     )

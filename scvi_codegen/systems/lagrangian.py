@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -45,7 +45,6 @@ class LagrangianSystem(MechanicalSystem):
         links: of a robot from a file, the geometry of its moving links, for pictures.
         gauge: energy of the rates of constraints that determine the velocities of massless coordinates, else 0
             (:mod:`scvi_codegen.systems.massless`).
-        eliminated: of a system in angles of rods, the maps from and to the original system: :attr:`elimination`.
 
     Raises:
         SystemDefinitionError: naming the symbol at fault, if a name is invalid or used twice, L contains an unknown
@@ -58,7 +57,6 @@ class LagrangianSystem(MechanicalSystem):
     dual_energy: Expr = field(default_factory=zero)
     gauge: Expr = field(default_factory=zero, init=False, compare=False, repr=False)
     links: tuple[Any, ...] = field(default=(), compare=False, repr=False)
-    eliminated: Any = field(default=None, compare=False, repr=False)
 
     __repr__ = summary("name", "coordinates")
 
@@ -73,21 +71,6 @@ class LagrangianSystem(MechanicalSystem):
     def formula(self) -> Expr:
         """L."""
         return self.lagrangian
-
-    @property
-    def elimination(self) -> Any:
-        """:class:`EliminatedRods` of a system in angles: maps to and from the one with constraints; else ``None``."""
-        if self.eliminated is None:
-            return None
-        values = {each.name: value for each, value in self.constants.items()}
-        original = self.eliminated.original
-        own = {each.name: values[each.name] for each in original.parameters}
-        return replace(self.eliminated, original=original.with_parameters(**own))
-
-    @property
-    def replaced(self) -> dict[Symbol, Expr]:
-        """See :attr:`MechanicalSystem.replaced`."""
-        return self.eliminated.replaced if self.eliminated else {}
 
     @classmethod
     @checks_arguments(SystemDefinitionError, constraints=TEXTS)

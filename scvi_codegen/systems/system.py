@@ -238,11 +238,6 @@ class MechanicalSystem(Deferred, ABC):
         return {name: getattr(self, name) for name in names}
 
     @property
-    def replaced(self) -> dict[Symbol, Expr]:
-        """Coordinates of the original of a system in angles of rods, and their velocities, as expressions."""
-        return {}
-
-    @property
     def constants(self) -> dict[Symbol, float]:
         """Default values by parameter."""
         return dict(zip(self.parameters, self.defaults, strict=True))

@@ -153,14 +153,14 @@ def time_rescaling_function(system: MechanicalSystem, g: str | Expr, *, in_time:
     time = (system.time, *driven) if in_time else ()
     known = {symbol.name: symbol for symbol in (*system.coordinates, *system.auxiliaries, *system.parameters, *time)}
     names = RotationNames(system.rotations)
-    readable = {each.name: each for each in system.replaced} | known | names.symbols
+    readable = known | names.symbols
     if isinstance(g, Expr):
         formula = g.xreplace({free: readable[free.name] for free in g.free_symbols if free.name in readable})
     elif isinstance(g, str):
         formula = _read(system, g, readable)
     else:
         raise SystemDefinitionError(f"time_transformation must be a name, text or a SymPy expression, not {g!r}")
-    formula = names.in_coordinates(formula).xreplace(system.replaced)
+    formula = names.in_coordinates(formula)
     unknown = sorted(free.name for free in formula.free_symbols - set(known.values()))
     if unknown:
         kinds = "coordinates, momenta and parameters" if system.auxiliaries else "coordinates and parameters"

@@ -34,8 +34,6 @@ def definitions() -> Iterator[Any]:
     yield from sc.symmetries(kepler.system)
     yield sc.derive(kepler.system, sc.SVI(2))
     yield sc.roll_sums(kepler.system)
-    rod = sc.LagrangianSystem.from_text(NAME, ["x", "y"], "(x_dot**2 + y_dot**2)/2", constraints=["x**2 + y**2 = 1"])
-    yield sc.eliminate_constraints(rod).elimination
     yield sc.exact_discrete_lagrangian(kepler.system, [0.5, 0.0], [0.5, 0.1], 0.1)
     yield sc.verify(kepler.system, sc.SVI(1), [0.5, 0.0], [0.0, 1.7], h=0.1)
     yield sc.advise(kepler.system, sc.SVI(4), [0.5, 0.0], [0.0, 1.7], 1.0, 1e-6)

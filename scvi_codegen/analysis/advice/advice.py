@@ -8,31 +8,28 @@ only fitted. Methods of low order may need steps too small to try: their number 
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import takewhile
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from scvi_codegen.analysis.advice.pilot import EXPONENTIAL_POWER, Pilot, Trials, run_pilot
 from scvi_codegen.codegen.native.arguments import checked_number
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.codegen.rendering.source import DOUBLE_DOUBLE, PRECISIONS
 from scvi_codegen.common.display.cards import Html, card, grid, plain
-from scvi_codegen.common.errors import ArgumentError, MethodError, StateError, StepFailedError
+from scvi_codegen.common.errors import ArgumentError, MethodError, StateError
 from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import checks_arguments
-from scvi_codegen.methods import ARGUMENTS, SVI, Method, as_method, method_from_specification
+from scvi_codegen.methods import ARGUMENTS, Method, as_method, method_from_specification
 from scvi_codegen.methods.discretise import is_symplectic
 from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
 from scvi_codegen.runs.compiler import compile_stepper
-from scvi_codegen.runs.driver.run import Run
 from scvi_codegen.runs.states.validation import EnsembleParameters, States
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.systems.arrays.system import SYSTEM_OR_ARRAYS, ArraySystem
-from scvi_codegen.systems.elimination import eliminable_rods, eliminate_constraints
 from scvi_codegen.systems.lagrangian import LagrangianSystem
 from scvi_codegen.systems.rolling import unrolled_at
 from scvi_codegen.systems.system import MechanicalSystem
@@ -53,8 +50,6 @@ SHORT_MANTISSA = 2.0**20
 """Steps of two words have so short a mantissa that their sums are exact; a shorter last one ends at the span."""
 WORK_RATIO = 0.9
 """Ratio of work at which a smaller step is preferred to the largest admissible one."""
-MOST_RODS, STEPS, TRIALS = 16, 100, 3
-"""Largest number of rods whose angles are tried, and numbers of steps and repetitions of their timing."""
 NUMBERS, FEWEST, MOST = 2**21, 2**13, 2**18
 """Number of stage positions computed in one pilot run, and bounds of its number of steps."""
 FEWEST_TOGETHER = 2**10
@@ -188,7 +183,7 @@ def advise(
     if not 0.0 < checked_number(quantile, "quantile") <= 1.0:
         raise StateError(f"quantile must be above 0 and at most 1, not {quantile!r}")
     state = {"p": p, "velocity": velocity, "t": t, "parameters": parameters, "options": options}
-    result: list[tuple[float, Advice, Trials]] = []
+    result: list[tuple[float, Advice]] = []
     failures: list[StateError] = []
     if precision not in PRECISIONS[:2]:
         raise MethodError(f"advise requires precision='double' or 'double-double', not {precision!r}")
@@ -207,42 +202,7 @@ def advise(
         raise failures[-1]
     met = [each for each in result if each[1].expected_error <= target]
     best = min(met, key=lambda each: each[0]) if met else min(result, key=lambda each: each[1].expected_error)
-    _, advice, trials = best
-    return _with_elimination(compiled, advice, known, *trials.one(advice.member or 0))
-
-
-def _with_elimination(
-    compiled: Callable[..., Stepper], advice: Advice, system: MechanicalSystem, q: States, state: Mapping[str, Any]
-) -> Advice:
-    """Return the advice with the time of a step in the angles of rods, if the system has some and they save time."""
-    count = eliminable_rods(system)
-    if not 0 < count <= MOST_RODS:
-        return advice
-    try:
-        stepper, reduced = compiled(system, advice.method), eliminate_constraints(system)
-        values = {"t": state["t"], "parameters": state["parameters"]}
-        run = stepper.start(q, **{**state, "options": None}, h=advice.h)
-        constants = stepper.parameters_by_name(stepper._parameters(state["parameters"]))
-        angles = reduced.elimination.from_original(run.q, run.p, t=state["t"], parameters=constants)
-        degree = f"svi:{advice.degree}" if isinstance(advice.method, SVI) else advice.method
-        other = compiled(reduced, degree).start(**angles, **values, h=advice.h)
-        seconds = [min(_seconds(each) for _ in range(TRIALS)) for each in (run, other)]
-    except (MethodError, StateError, StepFailedError):
-        return advice
-    ratio = seconds[1] / seconds[0]
-    if ratio > WORK_RATIO:
-        return advice
-    words = (
-        f"{count} of its {len(system.constraints)} constraints are rods in a plane: in their angles, "
-        f"eliminate_constraints(system), a step takes {ratio:.2g} of the time."
-    )
-    return replace(advice, message=f"{advice.message} {words}")
-
-
-def _seconds(run: Run) -> float:
-    began = time.perf_counter()
-    run.advance(STEPS)
-    return time.perf_counter() - began
+    return best[1]
 
 
 def _checked_request(span: float | None, tolerance: float | None) -> tuple[float, float]:
@@ -257,9 +217,7 @@ def _checked_request(span: float | None, tolerance: float | None) -> tuple[float
     return length, target
 
 
-def _advised(
-    trials: Trials, method: Method, symplectic: bool, span: float, tolerance: float
-) -> tuple[float, Advice, Trials]:
+def _advised(trials: Trials, method: Method, symplectic: bool, span: float, tolerance: float) -> tuple[float, Advice]:
     """Return the cost of a unit of time with the recommendation for one stepper, and the recommendation."""
     points = _points(method)
     most = min(max(FEWEST, NUMBERS // (points * trials.stepper.dimension)), MOST)
@@ -278,7 +236,7 @@ def _advised(
     choice, overhead = _choose(pilot, tolerance), OVERHEAD[pilot.words]
     nearest = min(pilot.good, key=lambda k: abs(math.log(k / choice.n)))
     evaluations = (pilot.runs[nearest].iterations + overhead) * math.ceil(points / LANES) * LANES  # in full registers
-    return evaluations / pilot.step(choice.n), _advice(pilot, choice, method), trials
+    return evaluations / pilot.step(choice.n), _advice(pilot, choice, method)
 
 
 def _steppers(

@@ -22,7 +22,6 @@ from numpy.typing import ArrayLike
 from scvi_codegen.analysis.verification.certificate import Certificate, Check, Outcome, issued
 from scvi_codegen.analysis.verification.convergence import convergence_checks, identity_checks
 from scvi_codegen.analysis.verification.derivatives import derivative_checks, time_transformation_derivative_checks
-from scvi_codegen.analysis.verification.elimination import elimination_checks
 from scvi_codegen.analysis.verification.impacts import impact_checks
 from scvi_codegen.analysis.verification.roundoff import roundoff_checks
 from scvi_codegen.analysis.verification.stepping import predictor_checks, step_checks
@@ -150,7 +149,6 @@ def _certificate(
         *(time_transformation_derivative_checks(runs) if system.clock else ()),
         *convergence_checks(tested),
         *identity_checks(tested),
-        *elimination_checks(in_time, start),
         *impact_checks(tested, watched),
         largest_step(tested),
     )

@@ -105,10 +105,8 @@ class EventFormulas:
     def __init__(self, interface: Interface, events: Sequence[SearchedEvent]) -> None:
         self.interface = interface
         self._turning = RotationNames.of_states(interface.rotations, _names(interface))
-        own = _names(interface)
-        self._known, self._grammar = self._turning.symbols | own, _Grammar(interface, self._turning)
-        self._replaced = {symbol(name): self._turning.read(text, own) for name, text in interface.originals}
-        self._known |= {each.name: each for each in self._replaced}
+        self._known = self._turning.symbols | _names(interface)
+        self._grammar = _Grammar(interface, self._turning)
         elements = [self._elements(event) for event in events]
         self.elements, self.events = [*map(len, elements)], [each for element in elements for each in element]
         self.q = [symbol(name) for name in interface.coordinates]
@@ -150,9 +148,7 @@ class EventFormulas:
         if isinstance(formula, str) and grammar.arrays and is_indexed(formula):
             formula = formula_of_entries(formula, grammar.arrays, self._known, grammar.tables, grammar.rules)
         expression = self._turning.in_coordinates(_expression(formula, self._known, role, self._turning.read))
-        return cast(
-            Expr, expression.xreplace({**self._replaced, **input_formulas(self.interface.inputs, symbol(TIME))})
-        )
+        return cast(Expr, expression.xreplace(input_formulas(self.interface.inputs, symbol(TIME))))
 
     def _elements(self, event: SearchedEvent) -> list[SearchedEvent]:
         """Return the events of the elements of the loops of an event, with formulas of the entries of arrays."""
@@ -197,11 +193,6 @@ class EventFormulas:
         self._set_rates_of_rotations(new)
         indices = [named.get(name, -1) for name in new]
         for index, (name, value) in zip(indices, new.items(), strict=True):
-            if index < 0 and symbol(name) in self._replaced:
-                raise EventError(
-                    f"the event '{event.function}' sets '{name}', which follows from the angles of rods: set these or "
-                    "their velocities, use impact(..) for a wall, or integrate with constraints"
-                )
             if index < 0:
                 known = [str(x) for each in self._turning.rotations for x in (*each.rates, *each.momenta)] + [*named]
                 raise EventError(
@@ -243,11 +234,9 @@ class _Grammar:
 
 def _arrays(interface: Interface) -> list[Array]:
     """Return the arrays whose entries a function may contain: coordinates, parameters, velocities and momenta."""
-    own = [parse_coordinate(declaration) for declaration in interface.arrays]
-    arrays = [*own, *map(parse_coordinate, interface.original_arrays)]
-    positions = {*interface.coordinates, *(name for name, _ in interface.originals)}
-    moving = [Array(array.name + DOT, array.axes) for array in arrays if array.elements[0] in positions]
-    return [*arrays, *moving, *momentum_arrays(own, interface.momenta)]
+    arrays = [parse_coordinate(declaration) for declaration in interface.arrays]
+    moving = [Array(array.name + DOT, array.axes) for array in arrays if array.elements[0] in interface.coordinates]
+    return [*arrays, *moving, *momentum_arrays(arrays, interface.momenta)]
 
 
 def _names(interface: Interface) -> dict[str, Symbol]:

@@ -302,9 +302,6 @@ class Interface:
         lengths: cutoffs, skins and periods of lists of neighbours, ``("near", "cutoff", "5*s/2")``, which every run
             checks.
         precision: :data:`DOUBLE_DOUBLE`, or "" for double precision.
-        originals: of a system in angles of rods, the names of the coordinates and velocities that they replace, with
-            their formulas, ``("x", "l*sin(angle)")``.
-        original_arrays: declarations of the arrays of the original system.
         kinks: functions at whose zeros the equations are not smooth, for events.
     """
 
@@ -341,8 +338,6 @@ class Interface:
     variables: tuple[str, ...] = ()
     lengths: tuple[tuple[str, ...], ...] = ()
     precision: str = ""
-    originals: tuple[tuple[str, ...], ...] = ()
-    original_arrays: tuple[str, ...] = ()
     kinks: tuple[str, ...] = ()
 
     @property
@@ -396,8 +391,6 @@ class Interface:
             valid = False
         if not valid:
             raise ValueError(f"indices is {interface.indices!r:.60}: it must contain whole numbers")
-        if any(len(each) != 2 for each in interface.originals):
-            raise ValueError(f"originals is {interface.originals!r:.60}: it must contain names, each with a formula")
         kinds = [kind for kind, *_ in map(str.split, filter(DECLARED.fullmatch, interface.rotations))]
         if len(kinds) < len(interface.rotations) or sum(COMPONENTS[kind] for kind in kinds) > interface.dimension:
             raise ValueError(f"rotations is {interface.rotations!r:.60}: it must declare some of the coordinates")

@@ -255,10 +255,6 @@ _TABLE: dict[str, Option] = {
         *("method", NUMBERS_OR_NAME, "C1,C2,.."),
         "Abscissae in [0, 1] (collocation, scvi); scvi also: gauss, radau-iia, lobatto-iiia, ..",
     ),
-    "eliminate_constraints": Option(
-        *("system", SWITCH, ""),
-        "Integrate in the angles of rods in a plane instead of their Cartesian coordinates; loops stay constraints.",
-    ),
     "parameter": Option("parameters", ASSIGNMENTS, "NAME=VALUE", "Value of a parameter; may be repeated."),
     "inputs": Option(
         *("inputs", INPUTS, "NAME=FILE[:KIND]"),

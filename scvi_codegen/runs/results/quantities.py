@@ -27,7 +27,7 @@ def quantities(stepper: Integrator, parameters: Array, t: Array, q: Array, p: Ar
         result["momentum_map"] = np.full((len(t), len(names)), np.nan)
         maps = partial(stepper.momentum_maps, parameters=parameters)
         _fill(result["momentum_map"], rows_of_states, lambda rows: maps(q[rows], p[rows], t[rows]))
-    return result | values_by_name(stepper.interface, q, p, result["velocity"], t, parameters)
+    return result | values_by_name(stepper.interface, q, p, result["velocity"])
 
 
 def _fill(into: Array, rows: NDArray[np.intp], compute: Callable[[NDArray[np.intp]], Array]) -> None:

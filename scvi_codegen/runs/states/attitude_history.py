@@ -124,10 +124,8 @@ class AttitudeHistory:
             return unnamed(p[..., columns])
         if name.endswith(DOT) and (columns := _columns(interface, name.removesuffix(DOT))) is not None:
             return unnamed(self._velocities(q, p, None)[..., columns])
-        if interface.rotations or interface.originals:
-            times = getattr(self, "times", None)
-            velocity = self._velocities(q, p, None)
-            derived = values_by_name(interface, q, p, velocity, self.t if times is None else times, self.parameters)
+        if interface.rotations:
+            derived = values_by_name(interface, q, p, self._velocities(q, p, None))
             if name in derived:
                 return derived[name]
         if name in ("q", "p", "velocity"):  # no coordinate has this name: whole state vectors
@@ -140,7 +138,6 @@ class AttitudeHistory:
                     *shown,
                     *(f"p_{each}" for each in shown),
                     *(f"{each}{DOT}" for each in shown),
-                    *(each for each, _ in interface.originals),
                     "t",
                     "energy",
                     "q",

@@ -1,4 +1,4 @@
-"""Named quantities of rotations, directions, spins, meshes and eliminated coordinates, for tables and files."""
+"""Named quantities of rotations, directions, spins and meshes, for tables and files."""
 
 from typing import Any
 
@@ -9,7 +9,6 @@ from scvi_codegen.common.labelled_arrays import LONG_NAMES, NamedQuantity
 from scvi_codegen.runs.states.attitudes import angular_velocity, body_momentum, matrices, unit_vectors
 from scvi_codegen.runs.states.rotations import Member, members_of
 from scvi_codegen.runs.states.validation import Array
-from scvi_codegen.systems.formulas.symbols import DOT, TIME, symbol
 
 COMPLEX_STEP = 1e-30
 SPACE, BODY = (("space_axis",), ("body_axis",))
@@ -26,7 +25,6 @@ def named_quantities(interface: Interface) -> tuple[NamedQuantity, ...]:
         )
     variables = [name for name in interface.momenta if name in interface.variables]
     named = tuple(NamedQuantity(name, (), (), f"variable {name} of the state") for name in variables)
-    named += tuple(NamedQuantity(x, (), (x,), f"{x} = {text}", {}) for x, text in interface.originals)
     return named + tuple(
         each for member in members_of(interface.dimension, interface.rotations) for each in _names(member)
     )
@@ -41,13 +39,11 @@ def _free_name(name: str) -> str:
     return name if name not in LONG_NAMES else f"{name}_"
 
 
-def values_by_name(
-    interface: Interface, q: Array, p: Array, velocity: Array, t: Array, parameters: Array
-) -> dict[str, Array]:
-    """Return (.., 3) vectors and (.., 3, 3) matrices by name, of (.., m) states at times t."""
+def values_by_name(interface: Interface, q: Array, p: Array, velocity: Array) -> dict[str, Array]:
+    """Return (.., 3) vectors and (.., 3, 3) matrices by name, of (.., m) states."""
     if (mesh := _mesh(interface)) is not None:
         return {_free_name(name): values for name, values in mesh.fields_of(q, p, velocity).items()}
-    result = _originals(interface, q, velocity, t, parameters)
+    result: dict[str, Array] = {}
     if interface.variables:
         result |= {name: p[..., k] for k, name in enumerate(interface.momenta)}
     for member in members_of(interface.dimension, interface.rotations):
@@ -63,28 +59,6 @@ def values_by_name(
             values = (spins(own, momenta),)
         result |= zip((each.name for each in _names(member)), values, strict=True)
     return result
-
-
-def _originals(interface: Interface, q: Array, velocity: Array, t: Array, parameters: Array) -> dict[str, Array]:
-    """Return coordinates and velocities that angles of rods replaced (:mod:`scvi_codegen.systems.elimination`)."""
-    if not interface.originals:
-        return {}
-    from scvi_codegen.systems.formulas.grammar import parse_expression  # imported here: SymPy
-    from scvi_codegen.systems.formulas.numpy_values import array_value
-
-    shape = q.shape[:-1]
-    times = np.reshape(t, np.shape(t) + (1,) * (len(shape) - np.ndim(t)))
-    rates = [f"{name}{DOT}" for name in interface.coordinates]
-    values = zip(
-        (*interface.coordinates, *rates), np.moveaxis(np.concatenate([q, velocity], axis=-1), -1, 0), strict=True
-    )
-    numbers = zip(interface.parameters, np.moveaxis(np.asarray(parameters), -1, 0), strict=True)
-    known: dict[Any, Any] = {symbol(name): value for name, value in (*values, *numbers, (TIME, times))}
-    names = {each.name: each for each in known}
-    return {
-        name: np.array(np.broadcast_to(array_value(parse_expression(text, names), known), shape))
-        for name, text in interface.originals
-    }
 
 
 def spins(q: Array, p: Array) -> Array:

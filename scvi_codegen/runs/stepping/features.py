@@ -137,11 +137,7 @@ FEATURES = {
             "error device observe_ensemble check_growth hessian chaos_ensemble flow advice shadow_energy",
             "make them terminal and restart",
         ),
-        (
-            "with constraints",
-            "periodic_orbit fit",
-            "use independent coordinates (rods in a plane: eliminate_constraints)",
-        ),
+        ("with constraints", "periodic_orbit fit", "use coordinates without constraints, such as the angles of rods"),
         ("with constraints of arrays", "threads", "omit threads; the step uses one"),
         (
             "with constraints of arrays by a composition",

@@ -54,10 +54,6 @@ def _system_and_state(
 ) -> tuple[dict[str, Any], Mapping[str, Any], dict[str, Any]]:
     """Return the sections of the system, its parameters, and the sections of :func:`motion_of`."""
     names = [] if model.array_system else [coordinate.name for coordinate in system.coordinates]
-    if (elimination := getattr(system, "elimination", None)) is not None:
-        document = _formulas(elimination.original, [q.name for q in elimination.original.coordinates])
-        document["system"]["eliminate_constraints"] = True
-        return document, model.parameters, motion_of(model, names)
     if model.array_system and not system.definition:
         raise ModelFileError(f"'{system.name}' was not read from text: give its formula to from_text to write a file")
     motion = motion_of(model, names)

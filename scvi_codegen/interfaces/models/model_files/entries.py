@@ -19,9 +19,7 @@ from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.systems.lagrangian import LagrangianSystem
 from scvi_codegen.systems.system import MechanicalSystem
 
-CHANGES = ("time_transformation", "eliminate_constraints")
-"""Keys beside ``catalogue`` and ``robot``."""
-ROBOT_KEYS = ("robot", "name", "actuated", *CHANGES)
+ROBOT_KEYS = ("robot", "name", "actuated", "time_transformation")
 URDF_KEYS = ("floating", "gravity")
 URDF = ".urdf"
 ROBOT_FILES = (URDF, ".xml", ".mjcf")
@@ -59,7 +57,7 @@ def read_entry(section: Section, folder: str | os.PathLike[str]) -> Entry | None
         ModelFileError: for other keys than those of the entry, an unknown name and a file that is no robot.
     """
     if "catalogue" in section:
-        check_keys(section, ("catalogue", *CHANGES), "key", "[system] beside catalogue")
+        check_keys(section, ("catalogue", "time_transformation"), "key", "[system] beside catalogue")
         entry = in_section("[system]", lambda: problem(text_of(section, "catalogue", "[system]")))
         return Entry(
             entry.system, motion_of(Model.from_problem(entry), [each.name for each in entry.system.coordinates])

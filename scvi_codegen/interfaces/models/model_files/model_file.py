@@ -21,7 +21,7 @@ from scvi_codegen.common.errors import ModelFileError, SystemDefinitionWarning
 from scvi_codegen.common.toml_text import read_toml
 from scvi_codegen.common.validation import ExactNumber, checks_arguments, of
 from scvi_codegen.interfaces.models.input_tables import InputTable
-from scvi_codegen.interfaces.models.model import DEFAULT_METHOD, Model
+from scvi_codegen.interfaces.models.model import Model
 from scvi_codegen.interfaces.models.model_files.document import document_of, with_files
 from scvi_codegen.interfaces.models.model_files.entries import ROBOT_KEYS, URDF_KEYS, Entry, is_robot, read_entry
 from scvi_codegen.interfaces.models.model_files.page_section import PAGE_KEYS, PICTURE_KEYS, check_page, check_picture
@@ -46,14 +46,11 @@ from scvi_codegen.interfaces.models.model_files.sections import (
     words_of,
 )
 from scvi_codegen.interfaces.models.model_files.values import read_values
-from scvi_codegen.interfaces.models.options import OF_ADAPTIVE_STEPS, STATE, STEP_KEYS, options_of, with_exact_numbers
+from scvi_codegen.interfaces.models.options import OF_ADAPTIVE_STEPS, STEP_KEYS, options_of, with_exact_numbers
 from scvi_codegen.methods import fitted
 from scvi_codegen.methods.controllers import SYMPLECTIC, check_controller, default_controller, with_time_transformation
 from scvi_codegen.systems.checks.definition import warn_of_mistakes
-from scvi_codegen.systems.elimination import eliminate_constraints
 from scvi_codegen.systems.formulas.symbols import symbol
-from scvi_codegen.systems.lagrangian import LagrangianSystem
-from scvi_codegen.systems.system import MechanicalSystem
 from scvi_codegen.systems.time_transformation import time_rescaling_function
 
 SYSTEM_KEYS = (
@@ -209,7 +206,7 @@ def _read_model(document: Document, changes: Document, folder: str | os.PathLike
             system = read_field(document)
         else:
             system = read_system(document, entry and entry.system)
-        system, values = _read_state(document, system, folder)
+        system, values = read_values(document, system, folder)
     arrays = Model.arrays_of(system)
     method = read_method(fitted(specification, one_coordinate(arrays) if arrays else system))
     values |= {"inputs": _read_inputs(document.get("inputs", {}), folder), "solver": solver}
@@ -219,43 +216,6 @@ def _read_model(document: Document, changes: Document, folder: str | os.PathLike
     check_page(model.page, model)
     check_picture(model)
     return _with_time_transformation(model, document, specification)
-
-
-def _read_state(
-    document: Document, system: MechanicalSystem, folder: str | os.PathLike[str]
-) -> tuple[MechanicalSystem, dict[str, Any]]:
-    """Return the system, in angles if its constraints are eliminated, and the fields of a model for its state.
-
-    The initial state is in the original coordinates or, by the number or the names of its values, in the new ones.
-    """
-    switch, where = document.get("system", {}).get("eliminate_constraints", False), "[system] eliminate_constraints"
-    if not isinstance(switch, bool):
-        raise ModelFileError(f"{where} must be true or false, not {switch!r}")
-    if not switch or Model.arrays_of(system) is not None:
-        system, values = read_values(document, system, folder)
-        return _of_known_sizes(system, values, where) if switch else (system, values)
-    reduced = in_section(where, lambda: eliminate_constraints(system))
-    names, q = {each.name for each in reduced.coordinates}, document["initial"].get("q")
-    if (isinstance(q, dict) and q.keys() == names) or (isinstance(q, list) and len(q) == len(names)):
-        return read_values(document, reduced, folder)
-    _, values = read_values(document, system, folder)
-    return reduced, _in_angles(reduced, values)
-
-
-def _of_known_sizes(
-    system: MechanicalSystem, values: dict[str, Any], where: str
-) -> tuple[MechanicalSystem, dict[str, Any]]:
-    """Return the system of arrays with known sizes in angles, and the fields of a model for its state."""
-    model = Model(system=system, method=DEFAULT_METHOD, h=1.0, steps=1, **values).with_known_sizes()
-    reduced = in_section(where, lambda: eliminate_constraints(model.system))
-    state = {name: getattr(model, name) for name in STATE.values() if getattr(model, name) is not None}
-    return reduced, _in_angles(reduced, {"t": model.t, **state})
-
-
-def _in_angles(system: LagrangianSystem, values: dict[str, Any]) -> dict[str, Any]:
-    """Return the fields of a model with the state in the angles of rods."""
-    state = in_section("[initial]", partial(system.elimination.from_original, **values))
-    return {"t": values["t"], **{name: tuple(vector.tolist()) for name, vector in state.items()}}
 
 
 def _merged(document: Document, changes: Document, entry: Entry | None) -> tuple[Document, Section, str]:

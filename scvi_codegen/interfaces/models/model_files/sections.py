@@ -72,7 +72,7 @@ def chosen_method(document: Document, changes: Document) -> Section:
     """Return the method of a file, or the default one, with the given changes."""
     default: Section = DEFAULT_METHOD.specification()
     section = {**document.get("system", {}), **changes.get("system", {})}
-    if section.get("constraints") and not section.get("eliminate_constraints"):
+    if section.get("constraints"):
         default = {"method": "svi", "degree": 6}
     base = _split_method_name(document.get("method", default))
     return _changed_method(base, _split_method_name(changes.get("method", {})))
