@@ -9,6 +9,7 @@ from samples import QUICK_FLAGS
 from sympy import Function, symbols
 
 import scvi_codegen as sc
+from scvi_codegen.runs.recording.manifest import sealed_text
 
 STRING = "u_t**2/2 - u_x**2/2"
 MESHES = {
@@ -106,8 +107,8 @@ def test_recordings_contain_their_mesh(tmp_path):
     manifest = tmp_path / "run" / "manifest.json"
     key = '"hamiltonian": "'
     document = {name: value for name, value in json.loads(manifest.read_text()).items() if name != "sha256"}
-    text = json.dumps(document, indent=1)  # without a checksum, as of earlier versions
-    manifest.write_text(text.replace(key, f"{key}__import__('os').getcwd() + "))
+    text = json.dumps(document).replace(key, f"{key}__import__('os').getcwd() + ")
+    manifest.write_text(sealed_text(json.loads(text)))
     with pytest.raises(sc.RecordingError, match=r"the mesh in .* is damaged"):
         sc.load_run(tmp_path / "run").unresolved()
 

@@ -23,6 +23,7 @@ import scvi_codegen as sc
 from scvi_codegen.codegen.native import building, compilers
 from scvi_codegen.codegen.rendering.source import Source
 from scvi_codegen.interfaces.models.packages.package import generate_package
+from scvi_codegen.runs.recording.manifest import sealed_archive, sealed_text
 
 MODEL = """[system]
 name = "swing"
@@ -212,20 +213,20 @@ def test_damaged_manifests_are_rejected(recorded: Path, part: int) -> None:
     whole = path.read_text()
     document = json.loads(whole)
     del document["sha256"]
-    sealed, whole = whole, json.dumps(document, indent=1)
+    unsealed = json.dumps(document)
     count = 0
     try:
         for place in paths_of(document):
             for value in VALUES[part::PARTS]:
-                changed = json.loads(whole)
+                changed = json.loads(unsealed)
                 inner = changed
                 for key in place[:-1]:
                     inner = inner[key]
                 inner[place[-1]] = value
-                path.write_text(json.dumps(changed, indent=1))
+                path.write_text(sealed_text(changed))
                 count += refused(lambda: _read_whole(recorded)) is not None
     finally:
-        path.write_text(sealed)
+        path.write_text(whole)
     assert count > 30
 
 
@@ -321,6 +322,7 @@ def test_damaged_state_files_are_rejected(recorded: Path) -> None:
         for name in arrays_in_file:
             for value in (np.zeros(0), np.zeros(3), np.zeros((8, 3)), np.array(["x"] * 8), np.zeros(8, dtype=complex)):
                 np.savez(path, **{**arrays_in_file, name: value})
+                path.write_bytes(sealed_archive(path.read_bytes()))
                 refused(lambda: np.asarray(sc.load_run(recorded).q))
         for size in range(0, len(whole), 97):
             path.write_bytes(whole[:size])

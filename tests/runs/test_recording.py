@@ -18,6 +18,7 @@ import scvi_codegen as sc
 from scvi_codegen.interfaces.models.model_files.model_file import dump_model
 from scvi_codegen.runs.driver.run_loop import record
 from scvi_codegen.runs.recording import manifest, writing
+from scvi_codegen.runs.recording.manifest import sealed_text
 from scvi_codegen.runs.results import export
 
 pytestmark = pytest.mark.usefixtures("here")
@@ -251,7 +252,7 @@ class TestFolders:
             inner = inner[key]
         inner[place[-1]] = value
         del document["sha256"]
-        path.write_text(json.dumps(document, indent=1))
+        path.write_text(sealed_text(document))
         before = sorted(tmp_path.rglob("*"))
         for act in (lambda: sc.load_run("a.run")[0:3].energy(), lambda: sc.resume_run("a.run", steps=20)):
             with pytest.raises(sc.RecordingError, match=r"is not the name of a file|compiler flag .* is not allowed"):

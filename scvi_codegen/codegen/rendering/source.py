@@ -106,22 +106,22 @@ class Source:
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> Source:
-        """Return the source from :meth:`to_record`, also of version 0.1, which has no support headers.
+        """Return the source from :meth:`to_record`.
 
         Raises:
             ValueError: for invalid names of files, and contents that are not lists of lines.
         """
-        names = record["prefix"], *record.get("support", {})
+        names = record["prefix"], *record["support"]
         for name, pattern in zip(names, (PREFIX, *[SUPPORT] * len(names)), strict=False):
             if not (isinstance(name, str) and pattern.fullmatch(name)):
                 raise ValueError(
                     f"{name!r} is not the name of a file of an integrator: it must be a C identifier, or support/NAME.h"
                 )
-        beside = record.get("beside")
+        beside = record["beside"]
         return cls(
             prefix=record["prefix"],
             **{name: "\n".join(record[name]) for name in TEXTS},
-            support=tuple((name, "\n".join(lines)) for name, lines in record.get("support", {}).items()),
+            support=tuple((name, "\n".join(lines)) for name, lines in record["support"].items()),
             beside=cls.from_record(beside) if beside else None,
         )
 
@@ -280,20 +280,19 @@ class Interface:
         has_fallback: whether Newton's method is tried if the fixed-point iteration fails.
         map_names, map_formulas: of the momentum maps, the first integrals from symmetries.
         map_exact: whether the method is known to conserve them exactly, to round-off.
-        momentum_names: in order; none in folders of version 0.1 for a Lagrangian: see :attr:`momenta`.
+        momentum_names: in order; none of arrays of run-time sizes with a Lagrangian: see :attr:`momenta`.
         exchange_names: of work and impulses of forces in a step: energy and momentum maps; none without forces.
         constraints: formulas g of the constraints g = 0.
         inputs: names of tabulated inputs, each of which has five parameters.
         energy_parameter: of a time-transformed system, the parameter that is the energy of the initial state, else "".
         time_transformation: time-rescaling function g in dt = g dtau that determines its step sizes, or "".
-        conserves_energy: whether energy is a first integral; unknown for folders of version 0.1.
-        changes_energy: reason why it is not conserved; empty if it is, and for folders of version 0.1.
+        conserves_energy: whether energy is a first integral.
+        changes_energy: reason why it is not conserved; empty if it is.
         balances_energy: whether it changes by the work of forces or damping only.
         arrays: declarations of arrays of known sizes, first those whose entries are the coordinates in order, then
             those whose entries are parameters; none without arrays.
         indices: sizes and index tables of these arrays, ``"N = 3"``, ``"pairs = [[0, 1], [1, 2]]"``.
-        solver: of the stage equations, as in ``compile_stepper``, with or without a fallback; unknown for folders of
-            version 0.1.
+        solver: of the stage equations, as in ``compile_stepper``, with or without a fallback.
         rotations: declarations of rotations, directions and spins, ``"rotation R omega"``, ``"direction n"``, ``"spin
             s"``, in the order of their coordinates, which follow the ordinary ones.
         layout: of arrays whose sizes are known at run time; the coordinates are their names.

@@ -103,11 +103,11 @@ def write_chunk(folder: Path, number: int, chunk: Chunk) -> None:
     named = zip((*COLUMNS, "crossings"), (*chunk.piece, chunk.crossings), strict=True)
     further |= {f"{name}_low": column.low for name, column in named if isinstance(column, Words)}
     np.savez(buffer, t=t, q=q, p=p, iterations=iterations, **further)
-    write_atomically(chunk_path(folder, number), lambda file: file.write(_sealed(buffer.getvalue())))
+    write_atomically(chunk_path(folder, number), lambda file: file.write(sealed_archive(buffer.getvalue())))
     sync_folder(folder)
 
 
-def _sealed(archive: bytes) -> bytes:
+def sealed_archive(archive: bytes) -> bytes:
     """Return a ZIP archive with a comment that contains the checksum of the bytes before.
 
     The checksums of the format itself leave out names, times and attributes.
@@ -117,18 +117,16 @@ def _sealed(archive: bytes) -> bytes:
 
 
 def _unsealed(data: bytes) -> io.BytesIO:
-    """Return an archive; raise :class:`ValueError` if its checksum differs. Earlier versions wrote none."""
-    if not (data[-len(END_OF_ARCHIVE) - 18 :].startswith(END_OF_ARCHIVE) and data.endswith(NO_COMMENT)):
-        body = data[:-DIGEST]
-        if data[-DIGEST:] != hashlib.sha256(body).digest():
-            raise ValueError("its checksum differs: restore it from a copy")
+    """Return an archive; raise :class:`ValueError` if its checksum differs."""
+    if data[-DIGEST:] != hashlib.sha256(data[:-DIGEST]).digest():
+        raise ValueError("its checksum differs: restore it from a copy")
     return io.BytesIO(data)
 
 
 DIGEST = 32
 """Number of bytes of a checksum."""
-END_OF_ARCHIVE, NO_COMMENT = b"PK\x05\x06", b"\0\0"
-"""Signature of the last 22 bytes of an archive without comment, and the last of them, the length of the comment."""
+NO_COMMENT = b"\0\0"
+"""Last bytes of an archive without comment: the length of the comment."""
 
 
 def read_chunk(path: Path, interface: Interface, rows: int) -> Chunk:
@@ -168,8 +166,7 @@ def _check_shapes(chunk: Chunk, interface: Interface, rows: int) -> None:
 
 
 MANIFEST = "manifest.json"
-FORMAT, FORMAT_TO_A_TIME = 1, 2
-"""Format numbers of fixed-step runs, and of adaptive runs, which were added later."""
+FORMAT = 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -323,10 +320,10 @@ class Manifest:
     def to_json(self) -> str:
         """Return a JSON text for :meth:`from_json`, with the C code line by line."""
         document = {
-            "format": FORMAT_TO_A_TIME if self.plan else FORMAT,
+            "format": FORMAT,
             **{field: getattr(self, field) for field in PLAIN},
             "options": None if self.options is None else asdict(self.options),
-            **({"plan": plan_to_record(self.plan)} if self.plan else {}),
+            "plan": None if self.plan is None else plan_to_record(self.plan),
             "builds": [asdict(build) for build in self.builds],
             "interface": self.interface.to_record(),
             "source": self.source.to_record(),
@@ -336,25 +333,20 @@ class Manifest:
             **({"parameters_low": self.parameters_low} if self.parameters_low else {}),
             **({"double": [each and each.to_record() for each in self.double]} if self.double else {}),
         }
-        text = json.dumps(document, indent=1) + "\n"
-        return SEAL % hashlib.sha256(text.encode()).hexdigest() + text[1:]
+        return sealed_text(document)
 
     @classmethod
     def from_json(cls, text: str) -> Manifest:
         """Construct from a JSON text; raise ValueError, KeyError or TypeError if it is invalid."""
         document = json.loads(text)
-        if not isinstance(document, dict) or document.get("format") not in (FORMAT, FORMAT_TO_A_TIME):
-            raise ValueError(f"its format is neither {FORMAT} nor {FORMAT_TO_A_TIME}")
-        if not text.startswith(FIRST_LINE):  # of earlier versions, which have no checksum
-            start = SEAL % document.get("sha256")
-            body = "{" + text.removeprefix(start)
-            if not text.startswith(start) or hashlib.sha256(body.encode()).hexdigest() != document["sha256"]:
-                raise ValueError("its checksum differs: restore the file from a copy")
-        if "every" in document:  # as version 0.1 named it, in the model, too
-            document["save_every"] = document["every"]
-            document["model"] = document["model"] and re.sub(r"(?m)^every\b", "save_every", document["model"])
+        if not isinstance(document, dict) or document.get("format") != FORMAT:
+            raise ValueError(f"its format is not {FORMAT}")
+        start = SEAL % document.get("sha256")
+        body = "{" + text.removeprefix(start)
+        if not text.startswith(start) or hashlib.sha256(body.encode()).hexdigest() != document["sha256"]:
+            raise ValueError("its checksum differs: restore the file from a copy")
         plain = {field: document[field] for field in PLAIN}
-        options, plan = document["options"], document["plan"] if document["format"] == FORMAT_TO_A_TIME else None
+        options, plan = document["options"], document["plan"]
         manifest = cls(
             **plain | {field: tuple(plain[field]) for field in ("flags", "parameters")},
             options=None if options is None else SolverOptions(**options),
@@ -372,9 +364,15 @@ class Manifest:
         return manifest
 
 
-FIRST_LINE, SEAL = '{\n "format": ', '{\n "sha256": "%s",'
-"""First line of the text of a manifest, and the lines before it: the checksum of the text."""
+SEAL = '{\n "sha256": "%s",'
+"""First lines of the text of a manifest: the checksum of the others."""
 PLAIN = ("flags", "parameters", "h", "t", "save_every", "steps", "rows", "model", "certificate")
+
+
+def sealed_text(document: Mapping[str, Any]) -> str:
+    """Return the JSON text of a manifest behind its checksum."""
+    text = json.dumps(document, indent=1) + "\n"
+    return SEAL % hashlib.sha256(text.encode()).hexdigest() + text[1:]
 
 
 def _double(*records: Any) -> tuple[Source, Interface, Source | None] | tuple[()]:

@@ -27,7 +27,6 @@ from scvi_codegen.runs.states.rotation_quantities import named_quantities
 from scvi_codegen.runs.states.times import times_after
 from scvi_codegen.runs.states.words import check_keeps_words, low_words, scalar
 from scvi_codegen.runs.stepper import Stepper
-from scvi_codegen.runs.stepping.saving import MAGIC
 from scvi_codegen.runs.stepping.step_plan import Adaptive, ErrorControl, InTau
 from scvi_codegen.runs.trajectory import Trajectory
 from scvi_codegen.systems.event import Crossings
@@ -154,9 +153,6 @@ class RecordedRun(AttitudeHistory):
             BuildError: if there is no C compiler.
         """
         manifest, plan, memory = self.manifest, self.manifest.plan, self._last.memory
-        if not memory.startswith(MAGIC):  # of earlier versions, which stored no more than the memory
-            options = manifest.options
-            return Run.restored(self.stepper, memory, plan=plan, parameters=manifest.parameters, options=options)
         steps: dict[str, Any] = {}
         match plan:
             case InTau(t_end=t_end, tau=tau):

@@ -232,7 +232,7 @@ class Memory:
         memory = run._memory
         run.rollback(saved)
         vectors = map(stepper.binding.vector, (memory.q, memory.p, memory.carry_q, memory.carry_p))
-        if not np.isfinite(np.concatenate([[_time(memory), memory.h], *vectors])).all():
+        if not np.isfinite(np.concatenate([[memory.t, memory.h], *vectors])).all():
             raise StateError(f"invalid saved run: its state is not finite, h = {memory.h:g}")
         searched = dict.fromkeys(EVENT_NUMBERS, (0, len(stepper.events)))
         searched["undefined"] = (-len(stepper.events), len(stepper.events))
@@ -247,7 +247,7 @@ class Memory:
             raise StateError("the saved run has fixed steps: omit t_end")
         if not stepper._has_energy(parameters):
             raise StateError("a saved run in transformed time requires its energy: give parameters=run.parameters")
-        check_max_step(plan, _time(memory), stepper.interface.words)
+        check_max_step(plan, memory.t, stepper.interface.words)
         run._parameters[:], run._has_defaults = stepper._parameters(parameters), False
         run.plan = plan
         run._set_options(options)
@@ -291,7 +291,7 @@ class Memory:
     @property
     def t(self) -> float:
         """Time, the rounded compensated sum of all steps; both words in double-double arithmetic."""
-        t = _time(self._memory)
+        t = float(self._memory.t)
         return t if self.stepper.interface.words == 1 else word(t, self._memory.t_low)
 
     @property
@@ -610,8 +610,3 @@ class Memory:
             yield
         finally:
             self._lock.release()
-
-
-def _time(memory: Any) -> float:
-    """Return the time of a run; structs of version 0.1 store the start and the number of steps instead."""
-    return float(memory.t if hasattr(memory, "t") else memory.t0 + memory.step * memory.h)

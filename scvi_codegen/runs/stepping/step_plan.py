@@ -177,23 +177,23 @@ class ErrorControl(NamedTuple):
 
 
 def plan_to_record(plan: Adaptive | InTau) -> dict[str, Any]:
-    """Return a step plan as numbers by name for files; its first three names are those of version 0.1."""
+    """Return a step plan as numbers by name for files."""
     if isinstance(plan, InTau):
-        return {"t_end": plan.t_end, "tolerance": 0.0, "tau": plan.tau}
-    return {"t_end": plan.t_end, "tolerance": plan.tolerance, "tau": 0.0} | ErrorControl.of(plan).named
+        return {"t_end": plan.t_end, "tau": plan.tau}
+    return {"t_end": plan.t_end} | ErrorControl.of(plan).named
 
 
-def plan_from_record(t_end: Any, tolerance: Any, tau: Any, **control: Any) -> Adaptive | InTau:
+def plan_from_record(t_end: Any, tau: Any = None, **control: Any) -> Adaptive | InTau:
     """Return the step plan of :func:`plan_to_record`.
 
     Raises:
         StateError, TypeError: for other names and numbers.
     """
-    if tau:
-        if tolerance or control or not checked_number(tau, "tau") > 0.0:
+    if tau is not None:
+        if control or not checked_number(tau, "tau") > 0.0:
             raise StateError(f"steps of tau = {tau:g} must be positive and have no tolerance")
         return InTau(checked_number(t_end, "t_end"), tau)
-    return ErrorControl(tolerance or None, **control).to(t_end)
+    return ErrorControl(**control).to(t_end)
 
 
 def checked_absolute_tolerance(value: Any) -> AbsoluteTolerance:
