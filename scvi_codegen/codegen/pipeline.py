@@ -49,8 +49,6 @@ from scvi_codegen.codegen.rendering.program_source import (
     render_embedded,
     render_ensemble,
     render_ensemble_in_pairs,
-    render_points,
-    render_thread,
     workspace_size,
 )
 from scvi_codegen.codegen.rendering.source import DOUBLE_DOUBLE, ArrayLayout, Interface, Source
@@ -63,8 +61,6 @@ from scvi_codegen.codegen.variants import (
     NewtonFallback,
     Observing,
     TangentVectors,
-    ThreadPerPoint,
-    ThreadPerTrajectory,
     Variant,
 )
 from scvi_codegen.common.errors import MethodError, SizesRequiredError, SystemDefinitionError
@@ -496,10 +492,6 @@ class Sources:
                 source = self.changes(count)
             case Observing():
                 source = self.observing(variant)
-            case ThreadPerPoint():
-                source = render_points(self.program())
-            case ThreadPerTrajectory():
-                source = render_thread(self.program(), control_of(self.program(), self.controller, self.system))
             case _:
                 raise NotImplementedError(variant)
         return source

@@ -95,20 +95,6 @@ class Crossings(Observing):
 
 
 @dataclass(frozen=True, slots=True)
-class ThreadPerPoint(Variant):
-    """Equal steps on a GPU, whose threads are the points of a trajectory."""
-
-    of_one_word = True
-
-
-@dataclass(frozen=True, slots=True)
-class ThreadPerTrajectory(Variant):
-    """Adaptive steps on a GPU, whose threads are trajectories."""
-
-    of_one_word = True
-
-
-@dataclass(frozen=True, slots=True)
 class WithEvents(Variant):
     """The integrator with event detection, of a package that is loaded.
 

@@ -120,7 +120,6 @@ class SteppersAnalysis:
         options: SolverOptions | None = None,
         progress: Callable[[int], None] | None = None,
         threads: int | None = None,
-        device: str | None = None,
     ) -> ChaosIndicators:
         """Return chaos indicators of K initial states over ``steps`` steps of size h.
 
@@ -134,7 +133,6 @@ class SteppersAnalysis:
             save_every: steps between saved values; by default only the last is saved.
             t, parameters, options, threads: as of :meth:`integrate_ensemble`.
             progress: called with the number of completed trajectories.
-            device: as of :meth:`integrate_ensemble`; results are on the processor, which repeats failed trajectories.
 
         Returns:
             :class:`ChaosIndicators` of shape (n, K, k): ``megno()[-1]`` has K values. A trajectory that fails has NaN
@@ -162,7 +160,6 @@ class SteppersAnalysis:
             options=options,
             progress=progress,
             threads=threads,
-            device=device,
         )
 
 

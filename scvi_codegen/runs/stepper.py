@@ -494,8 +494,8 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
             error: as of :meth:`integrate`, a bound of the relative global error of each trajectory, with a local
                 tolerance of its own: ``global_error``, ``confirmed_digits`` and ``confirmed_until`` of the result.
             device: ``"cuda"`` for an NVIDIA GPU, one thread a trajectory (extra ``cuda``; experimental: not yet run on
-                a device). Arrays may then be in its memory (CuPy, PyTorch, JAX). Trajectories whose steps fail are
-                continued on the processor. With adaptive steps only initial and final states are saved.
+                a device), with fixed steps. Arrays may then be in its memory (CuPy, PyTorch, JAX). Trajectories whose
+                steps fail are continued on the processor.
             action: as of :meth:`integrate`.
             observe: what to record of the states after all fixed steps, saved or not, in ``observed`` of the result:
                 ``"extremes"`` of q and p, of the ``"energy"``, or numbers of ``"events"`` of the stepper

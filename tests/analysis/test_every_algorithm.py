@@ -23,7 +23,7 @@ FOLDER = template_folder() / "support"
 HEADERS = {str(path.relative_to(FOLDER)) for path in FOLDER.glob("**/*.h")}
 OTHERS = {
     **{header: "compared with 60 digits in test_double_double.py" for header in HEADERS if "double_double/" in header},
-    **{f"run/{name}.h": "in test_device.py" for name in ("thread_advance_to", "thread_points", "tangent_growth")},
+    "run/tangent_growth.h": "compared with derivatives of single steps in test_chaos_indicators.py",
     "iteration/linear_part.h": "compared with Pade's approximation of linear chains in test_linear_part.py",
     "run/event_times.h": "compared with exact times in test_events_of_time.py",
     "run/observation.h": "compared with the states of runs in test_observers.py",

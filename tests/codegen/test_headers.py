@@ -33,9 +33,7 @@ ELSEWHERE = {
     "support/run/event_times.h": "tests/runs/test_events_of_time.py",
     "support/run/inputs.h": "tests/interfaces/test_package_inputs.py",
     "support/run/observation.h": "tests/runs/test_device.py",
-    "support/run/tangent_growth.h": "tests/runs/test_device.py",
-    "support/run/thread_advance_to.h": "tests/runs/test_device.py",
-    "support/run/thread_points.h": "tests/runs/test_device.py",
+    "support/run/tangent_growth.h": "tests/analysis/test_chaos_indicators.py",
     "support/run/thread_run.h": "tests/runs/test_device.py",
 }
 """Headers that require libraries, a model, another header or a compiler for GPUs, and the tests that compile them."""

@@ -1,7 +1,6 @@
 """Emulated GPU: what the package calls of ``cuda.core``, on the processor, for tests of the driver without a device.
 
-Kernels are compiled as C99, or by NVRTC to PTX, which is translated to C; threads run one after the other, or those
-that share a trajectory together. Arguments of
+Kernels are compiled as C99, or by NVRTC to PTX, which is translated to C; threads run one after the other. Arguments of
 types that launches do not pass as 8 bytes, and writes beyond the ends of an array, are errors.
 """
 
@@ -11,7 +10,6 @@ import ctypes
 import hashlib
 import subprocess
 import tempfile
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,22 +17,12 @@ from typing import Any
 from weakref import WeakSet
 
 import numpy as np
-from ptx import ESTIMATE, EXCHANGE, ptx_of, translated
+from ptx import ESTIMATE, THREAD, ptx_of, translated
 
 HEADERS = "#include <float.h>\n#include <math.h>\n#include <stdint.h>\n#include <string.h>\n"
 PRELUDE = """#define SCVI_DEVICE
 #define KERNEL void
 #define TRAJECTORY trajectory
-#define OWN_POINT ((int)(trajectory % 8))
-#define OF_THREAD(value, j) number_of_thread(value, j)
-static inline double number_of_thread(double value, int j)
-{
-  uint64_t bits;
-  memcpy(&bits, &value, 8);
-  bits = of_thread(bits, j);
-  memcpy(&value, &bits, 8);
-  return value;
-}
 """
 WARNINGS = ("-Wall", "-Werror", "-Wno-unused-function", "-Wno-psabi", "-Wno-unused-but-set-variable")
 FLAGS = ("-std=gnu99", "-O0", "-ffp-contract=off")
@@ -95,7 +83,7 @@ class EmulatedGpu:
         if self.by_nvrtc:
             return library_of(translated(ptx_of(text, architecture)), folder, "-w", "-fno-strict-aliasing")
         estimate = f"{ESTIMATE}#define SCVI_INVERSE_ROOT device_inverse_root\n" if self.estimates else ""
-        return library_of(HEADERS + EXCHANGE + estimate + PRELUDE + text, folder, *WARNINGS)
+        return library_of(HEADERS + THREAD + estimate + PRELUDE + text, folder, *WARNINGS)
 
     def _load(self, code: bytes) -> Any:
         path = Path(tempfile.mkdtemp(dir=self.folder), "kernel.so")
@@ -110,16 +98,9 @@ class EmulatedGpu:
         function = getattr(library, name)
         function.restype = None
         passed = [KINDS[type(each)](each) for each in arguments]
-        together = 8 if name.endswith("_points") else 1  # threads that exchange values
-
-        def run(first: int) -> None:
-            number = ctypes.c_longlong.in_dll(library, "trajectory")  # of this thread of the processor
-            for thread in range(first, config.grid * config.block, together):
-                number.value = thread
-                function(*passed)
-
-        with ThreadPoolExecutor(together) as pool:
-            list(pool.map(run, range(together)))
+        number = ctypes.c_longlong.in_dll(library, "trajectory")
+        for number.value in range(config.grid * config.block):
+            function(*passed)
         for buffer in self.buffers:
             buffer.check()
 

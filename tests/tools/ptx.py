@@ -36,22 +36,7 @@ FUNCTIONS |= {
     "clz": "__builtin_clz({0})",
 }
 
-EXCHANGE = """#include <pthread.h>
-_Thread_local long long trajectory; /* number of the thread */
-static _Thread_local int turn;
-static pthread_barrier_t all_points;
-static uint64_t exchanged[2][8];
-__attribute__((constructor)) static void initialise(void) { pthread_barrier_init(&all_points, NULL, 8); }
-static uint64_t of_thread(uint64_t bits, int j)
-{
-  uint64_t *values = exchanged[turn];
-  turn = 1 - turn;
-  values[trajectory % 8] = bits;
-  pthread_barrier_wait(&all_points);
-  return values[j % 8];
-}
-"""
-"""Values of the other threads of eight that share a trajectory, which run at the same time."""
+THREAD = "long long trajectory; /* number of the thread */\n"
 HEAD = """#include <math.h>
 #include <stdint.h>
 #include <stdlib.h>
@@ -107,7 +92,7 @@ def ptx_of(text: str, architecture: str) -> str:
 def translated(ptx: str) -> str:
     """Return C with a function for each kernel; its thread is the number ``trajectory``."""
     ptx = re.sub(r"//.*", "", ptx)
-    parts = [HEAD, EXCHANGE, ESTIMATE, LIBRARY]
+    parts = [HEAD, THREAD, ESTIMATE, LIBRARY]
     for bits, name, size, values in re.findall(r"\.align \d+ \.b(\d+) (\w+)\[(\d+)\] = \{([^}]*)\}", ptx):
         parts.append(f"static const uint{bits}_t {name}[{size}] __attribute__((aligned(16))) = {{{values}}};")
     own = r"\.func[^{]*?\b__internal_\w+\s*\([^()]*\)\s*\{.*?\n\}"
@@ -188,8 +173,6 @@ def _assignment(name: str, kinds: list[str], arguments: list[str]) -> str:
         pairs = zip(elements, cells, strict=True) if name == "ld" else zip(cells, elements, strict=True)
         return " ".join(f"{one} = {other};" for one, other in pairs)
     target, *values = arguments
-    if name == "shfl":
-        return f"{_value(target.split('|')[0])} = of_thread({_value(values[0])}, {_value(values[1])});"
     half = 32 if last == "b64" else 16
     if name == "mov" and target.startswith("{"):
         low, high = (_value(each) for each in target.strip("{}").split(", "))

@@ -1,8 +1,8 @@
 """Chaos indicators of many initial states: tangent vectors propagated along each trajectory, in parallel threads.
 
-In SIMD lanes, and in the threads of a GPU, the variations are additional coordinates
-(:mod:`scvi_codegen.systems.derived_systems`) of an ensemble. After each step C replaces the tangent vectors by Q of
-their QR factorisation and sums their growth (``templates/support/run/tangent_growth.h``). Systems without variational
+In SIMD lanes the variations are additional coordinates (:mod:`scvi_codegen.systems.derived_systems`) of an ensemble.
+After each step C replaces the tangent vectors by Q of their QR factorisation and sums their growth
+(``templates/support/run/tangent_growth.h``). Systems without variational
 equations in lanes, and lanes whose step fails, are computed trajectory by trajectory. Only the indicators are stored.
 """
 
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from typing import Any, Final, cast
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,16 +26,14 @@ from scvi_codegen.analysis.chaos.indicators import (
 from scvi_codegen.codegen.native import building
 from scvi_codegen.codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.codegen.native.binding import Binding
-from scvi_codegen.codegen.native.cuda import constant
 from scvi_codegen.codegen.native.options import SolverOptions, checked_options
 from scvi_codegen.codegen.rendering.source import Source
 from scvi_codegen.codegen.variants import TangentVectors
-from scvi_codegen.common.errors import MethodError, StateError, StepFailedError
+from scvi_codegen.common.errors import StateError, StepFailedError
 from scvi_codegen.common.validation import checked_count
 from scvi_codegen.runs.accuracy.local_error import warn_of_large_steps
 from scvi_codegen.runs.driver.run_loop import record
 from scvi_codegen.runs.ensembles.batches import Batch, Call
-from scvi_codegen.runs.ensembles.device import DeviceRuns, check_device, on_processor
 from scvi_codegen.runs.ensembles.initial_states import momenta_of_each, start_of_ensemble
 from scvi_codegen.runs.ensembles.result import OK
 from scvi_codegen.runs.ensembles.schedule import CommonSteps
@@ -70,10 +68,8 @@ class ChaosIndicatorsEnsemble:
         t: float,
         parameters: EnsembleParameters,
         options: SolverOptions | None,
-        device: str | None = None,
     ) -> None:
         require(stepper, "chaos_ensemble")
-        self.device = device
         self.stepper, self.options = stepper, checked_options(options)
         self.h, steps = checked_step(h), checked_count(steps, "steps", least=1)
         self.save_every = steps if save_every is None else checked_count(save_every, "save_every", least=1)
@@ -94,9 +90,7 @@ class ChaosIndicatorsEnsemble:
         Trajectories without SIMD support, or whose SIMD steps failed, use the derivatives of single steps.
         """
         report, left = progress or (lambda _: None), np.arange(len(self.q))
-        if self.device is not None:
-            left = self._on_device(report, threads)
-        elif (source := self._source()) is not None:
+        if (source := self._source()) is not None:
             left = self._in_lanes(source, report, threads)
         if len(left):
             self.stepper.tangent  # noqa: B018  (compiled once, before threads ask for it)
@@ -111,13 +105,9 @@ class ChaosIndicatorsEnsemble:
         return ChaosIndicators.of(self.t[:: self.save_every], self.values, self.status)
 
     def _warn_of_long_steps(self) -> None:
-        """Warn of too large steps: rerun every ``CHECKED_STRIDE``-th trajectory, as SIMD steps estimate no error.
-
-        Of trajectories on a GPU at most about ``CHECKED_STRIDE`` are run.
-        """
+        """Warn of too large steps: rerun every ``CHECKED_STRIDE``-th trajectory, as SIMD steps estimate no error."""
         steps, runs = len(self.t) - 1, {}
-        stride = CHECKED_STRIDE if self.device is None else max(CHECKED_STRIDE, len(self.q) // CHECKED_STRIDE)
-        for j in range(0, len(self.q), stride):
+        for j in range(0, len(self.q), CHECKED_STRIDE):
             start = self.q[j], self.p[j]
             arguments: dict[str, Any] = {"t": self.t[0], "parameters": self.parameters[j], "options": self.options}
             memory = Memory.started(self.stepper, *start, plan=Fixed(self.h), **arguments)
@@ -133,46 +123,17 @@ class ChaosIndicatorsEnsemble:
             return None
         return self.stepper._variants[TangentVectors(self.values.shape[-1])]
 
-    def _on_device(self, report: Callable[[int], None], threads: int | None) -> NDArray[np.intp]:
-        """Process all trajectories on a GPU; return those that failed."""
-        source = self._source()
-        if source is None or constant(source, f"{source.prefix.upper()}_NEEDS_VELOCITIES"):
-            raise MethodError(
-                f"chaos indicators on a GPU are not available for '{self.stepper.title}': they require constant "
-                "diagonal masses, forces of positions and time, and SVI or collocation; omit device"
-            )
-        growth, plan, count = self._growth(source), self._plan(), len(self.q)
-        arguments = self.stepper, self.options, self._start(growth), self.parameters
-        runs = DeviceRuns(*arguments, lambda _, part: self.parameters[part], plan, record=growth)
-        runs.run(progress=lambda done: report(done * count // plan.steps), threads=threads)
-        return self._take(runs.device.copy_out(runs.q), runs.done == plan.steps)
-
     def _in_lanes(self, source: Source, report: Callable[[int], None], threads: int | None) -> NDArray[np.intp]:
         """Process all trajectories in SIMD lanes; return those that failed."""
-        growth, plan = self._growth(source), self._plan()
+        growth, steps, count = _Growth(self._first(0)), len(self.t) - 1, len(self.q)
+        plan = CommonSteps(self.t[0], self.h, steps=steps, t_end=None, inputs={}, save_every=self.save_every)
+        q, p = (np.hstack([x, np.tile(growth.frame(part), (count, 1))]) for part, x in enumerate((self.q, self.p)))
         binding = Binding(building.load(source, flags=self.stepper.flags), source.prefix)
-        arguments = binding, self.options, self._start(growth), self.parameters, plan.t0, plan.fixed_segments()
+        arguments = binding, self.options, (q, p), self.parameters, plan.t0, plan.fixed_segments()
         runs = _GrowthRuns(growth, len(plan.numbers), *arguments)
         runs.run(progress=lambda _: report(int(np.count_nonzero(runs.status == 0))), threads=threads)
-        return self._take(runs.saved, runs.status == 0)
-
-    def _growth(self, source: Source) -> _Growth:
-        return _Growth(source, self._first(0), len(self.q))
-
-    def _plan(self) -> CommonSteps:
-        steps = len(self.t) - 1
-        return CommonSteps(self.t[0], self.h, steps=steps, t_end=None, inputs={}, save_every=self.save_every)
-
-    def _start(self, growth: _Growth) -> tuple[Array, Array]:
-        """Return initial positions and momenta with those of the tangent vectors."""
-        count = len(self.q)
-        q, p = (np.hstack([x, np.tile(growth.frame(part), (count, 1))]) for part, x in enumerate((self.q, self.p)))
-        return q, p
-
-    def _take(self, saved: Array, ended: NDArray[np.bool_]) -> NDArray[np.intp]:
-        """Store (n, K, 5 k) values of the trajectories that have ended; return the others."""
-        values = saved.reshape(len(saved), len(self.q), len(SERIES), -1)
-        self.values[:, :, ended] = values.transpose(2, 0, 1, 3)[:, :, ended]
+        ended, saved = runs.status == 0, runs.saved.reshape(len(runs.saved), count, len(SERIES), -1)
+        self.values[:, :, ended] = saved.transpose(2, 0, 1, 3)[:, :, ended]
         return np.flatnonzero(~ended)
 
     def _width(self) -> int:
@@ -214,16 +175,19 @@ class ChaosIndicatorsEnsemble:
 
 
 class _Growth:
-    """Growth of the same initial tangent vectors (2m, k) of K trajectories, in SIMD lanes or threads of a GPU."""
+    """Growth of the same initial tangent vectors (2m, k) of trajectories in SIMD lanes.
 
-    def __init__(self, source: Source, tangents: Array, count: int) -> None:
-        self.source, (self.orthonormal, triangle) = source, np.linalg.qr(tangents)
+    Attributes:
+        numbers: (6 k + k^2,) initial values in the memory of a lane, of which the first 5 k are saved.
+    """
+
+    def __init__(self, tangents: Array) -> None:
+        self.orthonormal, triangle = np.linalg.qr(tangents)
         k = tangents.shape[1]
         with np.errstate(divide="ignore"):  # linearly dependent directions span zero volume
             diagonal = np.log(np.abs(np.diagonal(triangle)))
         self.numbers = np.concatenate([np.zeros(2 * k), diagonal, np.zeros(3 * k), triangle.ravel()])
-        self.rows = np.tile(self.numbers[:, np.newaxis], count)
-        self.saved: Array | None = np.tile(self.numbers[: len(SERIES) * k], (count, 1))
+        self.saved = self.numbers[: len(SERIES) * k]
 
     def frame(self, part: int) -> Array:
         """Return the (m k,) positions or momenta of the orthonormal tangent vectors, one after the other."""
@@ -240,9 +204,8 @@ class _GrowthRuns(Batch):
     def __init__(self, growth: _Growth, rows: int, *arguments: Any) -> None:
         super().__init__(*arguments)
         self.growth, self.width = growth, len(self.binding.new("block *").active)
-        first = cast(Array, growth.saved)
-        self.saved = np.full((rows, *first.shape), np.nan)
-        self.saved[0] = first
+        self.saved = np.full((rows, len(self.q), len(growth.saved)), np.nan)
+        self.saved[0] = growth.saved
 
     def call(self, first: int, end: int) -> _GrowthCall:
         """Return the calls for a range of trajectories."""
@@ -271,9 +234,5 @@ def indicators_of_ensemble(
 ) -> ChaosIndicators:
     """Return the indicators of :meth:`scvi_codegen.Stepper.chaos_indicators_ensemble`."""
     q, p, velocity = homogeneous_state(stepper.interface, q, p, velocity)
-    if settings["device"] is not None:
-        check_device(settings["device"])
-        q, p, velocity = map(on_processor, (q, p, velocity))
-        settings["parameters"] = on_processor(settings["parameters"])
     p = momenta_of_each(stepper, q, p, velocity, settings["t"], settings["parameters"])
     return ChaosIndicatorsEnsemble(stepper, q, p, **settings).run(progress=progress, threads=threads)

@@ -10,7 +10,6 @@ The support headers contain all of it: ``flow.h`` the function, ``xla_flow.h`` a
 frameworks.
 """
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, chain
@@ -29,14 +28,13 @@ from scvi_codegen.codegen.rendering.kernels.simd import (
     POINTS,
     TRAJECTORIES,
     Fallback,
-    IterationSource,
     iteration_source,
     lane_table,
     loop_functions,
     predictor_text,
     splitting_source,
 )
-from scvi_codegen.codegen.rendering.source import POINT_THREADS, ExampleInput, Interface, Source
+from scvi_codegen.codegen.rendering.source import ExampleInput, Interface, Source
 from scvi_codegen.codegen.rendering.text import (
     INPUT_PRECISION,
     LARGEST_VIOLATION,
@@ -408,13 +406,7 @@ def render_embedded(program: Program, precision: Embedded, control: Control | No
 
 def _render(prefix: str, context: Mapping[str, object], entry: str = "stepper") -> Source:
     """Return the source of entry templates from their context, with defaults for all of them."""
-    common = {
-        "prefix": prefix,
-        "target": DOUBLE,
-        "real": DOUBLE.scalar,
-        "max_iterations": MAX_ITERATIONS,
-        "on_device": False,
-    }
+    common = {"prefix": prefix, "target": DOUBLE, "real": DOUBLE.scalar, "max_iterations": MAX_ITERATIONS}
     environment, context = template_environment(), {**common, "two_words": None, "rattle_in_pairs": False, **context}
     header = entry if entry in DECLARATIONS else "stepper"
     code = environment.get_template(f"{entry}.c.jinja").render(context)
@@ -475,41 +467,6 @@ def render_ensemble(
         "fixed_point": source,
     }
     return _render(prefix, context, "ensemble")
-
-
-def render_points(program: Program) -> Source | None:
-    """Return source of fixed steps whose points are threads of a GPU; ``None`` unless there are 8, and forces alone."""
-    fixed_point = program.fixed_point
-    if not fixed_point or fixed_point.name != "separable" or fixed_point.lanes != POINT_THREADS:
-        return None
-    if program.quantities.integrals:
-        return None
-    program = replace(program, prefix=f"{program.prefix}_points", fixed_point=replace(fixed_point, linear_part=None))
-    context = _context(program, DOUBLE, None, "none")
-    text = cast(IterationSource, context["fixed_point"])
-    tables = tuple(map(_at_own_point, text.tables))
-    own = program.memory // POINT_THREADS
-    sizes = {"memory": own, "workspace": workspace_size(program) - program.memory + own}
-    return _render(
-        program.prefix, {**context, **sizes, "fixed_point": replace(text, tables=tables), "on_device": "points"}
-    )
-
-
-def _at_own_point(table: str) -> str:
-    """Return a table of vectors over points as one of numbers, which begins at the point of the thread."""
-    size = "[POINTS * POINTS]" if "[POINTS * GROUPS]" in table else "[POINTS]"
-    head, name, rest = re.split(r"lanes (\w+)\[[^]]*\]", table, maxsplit=1)
-    return f"{head}double {name}_OF_POINTS{size}{rest}\n#define {name} ({name}_OF_POINTS + OWN_POINT)"
-
-
-def render_thread(program: Program, control: Control | None) -> Source | None:
-    """Return source of adaptive steps in threads of a GPU; ``None`` unless they are by fixed-point iteration."""
-    fixed_point = program.fixed_point
-    if not (control and control.predictor and fixed_point and fixed_point.in_groups) or program.quantities.integrals:
-        return None
-    program = replace(program, prefix=f"{program.prefix}_thread", fixed_point=replace(fixed_point, linear_part=None))
-    context = _context(program, DOUBLE, replace(control, growth=None), "none")
-    return _render(program.prefix, {**context, "on_device": True})
 
 
 def render_events(search: EventSearch) -> Source:

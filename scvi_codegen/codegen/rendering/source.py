@@ -140,8 +140,6 @@ DOUBLE_DOUBLE = "double-double"
 AUTO = "auto"
 """Precision of runs with ``error=``: double where it suffices, else double-double."""
 PRECISIONS = ("double", DOUBLE_DOUBLE, AUTO)
-POINT_THREADS = 8
-"""Threads of a GPU that share a trajectory with many coordinates, one for each point of a step."""
 COMPONENTS = {"rotation": 4, "direction": 3, "spin": 2}
 """Number of homogeneous coordinates by kind."""
 NUMBER = re.compile(r"\d+(\.\d*)?", re.ASCII)

@@ -23,8 +23,6 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen.codegen.native.arguments import real_array
 from scvi_codegen.codegen.native.capacity import TOO_MANY_STATES, room_for_states, too_many_states
 from scvi_codegen.codegen.native.options import FAILURES, SolverOptions, checked_options
-from scvi_codegen.codegen.rendering.source import Source
-from scvi_codegen.codegen.variants import ThreadPerPoint
 from scvi_codegen.common.errors import AccuracyWarning, EventError, StateError, StepFailedError, warn
 from scvi_codegen.common.validation import LARGEST_COUNT, checked_count
 from scvi_codegen.runs.accuracy.global_error import GlobalError
@@ -39,15 +37,7 @@ from scvi_codegen.runs.driver.segments import (
     parameters_at,
 )
 from scvi_codegen.runs.ensembles.batches import FULL, Rows, SuccessiveRuns
-from scvi_codegen.runs.ensembles.device import (
-    FEWEST_COORDINATES,
-    AdaptiveDeviceRuns,
-    DeviceEnsemble,
-    DeviceRuns,
-    PointRuns,
-    check_device,
-    on_processor,
-)
+from scvi_codegen.runs.ensembles.device import DeviceEnsemble, DeviceRuns, check_device, on_processor
 from scvi_codegen.runs.ensembles.initial_states import (
     checked_ensemble,
     momenta_of_each,
@@ -154,7 +144,7 @@ class Ensemble:
     ) -> None:
         interface = stepper.interface
         control = self.control = ErrorControl(tolerance, absolute_tolerance, max_step, first_step)
-        _check_device(device, h, inputs, save_every, error=error, t_eval=t_eval)
+        check_device(device, h, error=error, t_eval=t_eval)
         _check_observe(stepper, observe, inputs=inputs, error=error, t_eval=t_eval)
         recorded = _recorded_events(stepper, device, observe)
         t = self.t0 = checked_time(t, interface.words)
@@ -207,15 +197,13 @@ class Ensemble:
             kind = CommonRuns if device is None else DeviceRuns
             observation = None if observe is None else EnsembleObservation(stepper, observe, len(self))
             arguments = stepper, self.options, self.start, self.parameters, self.values_at, fixed, observation
-            points = None if device is None or observation is not None else self._source_of_points(fixed)
-            self.common = kind(*arguments) if points is None else PointRuns(*arguments, source=points)
+            self.common = kind(*arguments)
         elif observe is not None:
             raise StateError(
                 f"observe={observe!r} requires a fixed step size: give h and steps, or observe each trajectory by "
                 "integrate"
             )
         self.states: list[Rows] = []
-        self.adaptive = None if device is None or self.common is not None else self._on_device()
         self.successive = self._successive()
         self._check_shared()
 
@@ -238,16 +226,10 @@ class Ensemble:
             f"lanes end together, but {reason}: omit it"
         )
 
-    def _source_of_points(self, fixed: CommonSteps) -> Source | None:
-        """Return the source whose points are threads of a GPU, for many coordinates and equal steps, or ``None``."""
-        if len(fixed.segments) > 1 or self.inputs or self.stepper.dimension < FEWEST_COORDINATES:
-            return None
-        return cast("Source | None", self.stepper._variants[ThreadPerPoint()])
-
     def _successive(self) -> SuccessiveRuns | None:
         """Return the trajectories that C integrates one after the other, ``None`` for other ensembles."""
         stepper = self.stepper
-        if self.common is not None or self.adaptive is not None:
+        if self.common is not None:
             return None
         if self.inputs or stepper.events or stepper.in_tau or not stepper.binding.reusable:
             return None
@@ -266,11 +248,6 @@ class Ensemble:
             most_states=self.most_states,
             receive=lambda states: self.states.append(states.copies()),
         )
-
-    def _on_device(self) -> AdaptiveDeviceRuns:
-        """Return the trajectories with adaptive steps that a GPU integrates."""
-        arguments = self.stepper, self.options, self.start, self.parameters, self.t0, self.ends
-        return AdaptiveDeviceRuns(*arguments, plan=cast(Adaptive, self.plans[0]))
 
     def _saves_ends(self, ends: Array) -> bool:
         """Return whether the output times are the common end of all trajectories, with or without their start."""
@@ -383,8 +360,8 @@ class Ensemble:
             report = None if progress is None else lambda done: progress(int(done))
             self.successive.run(progress=report, threads=threads)
             return
-        if (runs := self.adaptive or self.common) is not None:
-            runs.run(progress=progress, threads=threads)
+        if self.common is not None:
+            self.common.run(progress=progress, threads=threads)
             return
 
         def advance(j: int, check_stop: StopCheck) -> None:
@@ -492,8 +469,6 @@ class Ensemble:
 
     def device_result(self) -> DeviceEnsemble:
         """Return the trajectories of a GPU, whose states stay in its memory."""
-        if self.adaptive is not None:
-            return DeviceEnsemble(q=self.adaptive.q, p=self.adaptive.p, _to_host=self.result, **self._adaptive_fields())
         common = cast(DeviceRuns, self.common)
         return DeviceEnsemble(
             t=common.steps.times(tau=False),
@@ -514,17 +489,7 @@ class Ensemble:
             return common.status
         return np.where(unfinished & (common.status == OK), INTERRUPTED, common.status)
 
-    def _adaptive_fields(self) -> dict[str, Any]:
-        """Return the fields of results of a GPU with adaptive steps, but its states."""
-        runs = cast(AdaptiveDeviceRuns, self.adaptive)
-        times = np.array([np.full(len(self), self.t0), np.where(runs.status == OK, runs.t, np.nan)])
-        about = {"status": runs.status, "steps": runs.done, "h": 0.0, "plans": self.plans}
-        return {"t": np.arange(2.0), "times": times, "parameters": self.parameters, "stepper": self.stepper, **about}
-
     def _adaptive_result(self) -> EnsembleTrajectory:
-        if self.adaptive is not None:
-            q, p = map(self.adaptive.device.copy_out, (self.adaptive.q, self.adaptive.p))
-            return EnsembleTrajectory(q=q, p=p, **self._adaptive_fields())
         if self.successive is not None and not self.saved:
             return self._successive_result(self.successive)
         lanes = [(self.saved.get(j) or self._unfinished(j)).limited(self.most_states) for j in range(len(self))]
@@ -623,19 +588,6 @@ class Ensemble:
         first = slice(0, 1 if self.t_eval is None else 0)
         return SavedLane(
             stacked([self.t0])[first], self.start[0][[j]][first], self.start[1][[j]][first], INTERRUPTED, 0
-        )
-
-
-def _check_device(device: str | None, h: float | None, inputs: object, save_every: int, **others: Any) -> None:
-    """Raise ``StateError`` for an unknown device, and for arguments that ensembles on a GPU do not have."""
-    if device is None:
-        return
-    check_device(device)
-    check_together(device=device, **others)
-    if h is None and (inputs is not None or save_every != 1):
-        raise StateError(
-            "device='cuda' with adaptive steps saves the initial and the final states, and has no inputs: omit "
-            "save_every and inputs, give h and steps, or omit device"
         )
 
 

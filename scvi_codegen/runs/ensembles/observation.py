@@ -43,11 +43,8 @@ class EnsembleObservation:
 
     Attributes:
         source: of the ensemble.
-        saved: nothing is saved instead of states.
         values: (5, number of functions, k) last, least and largest values, and numbers of rises and falls through 0.
     """
-
-    saved: Array | None = None
 
     def __init__(self, stepper: Integrator, name: str, count: int) -> None:
         if name not in OBSERVED:

@@ -196,6 +196,7 @@ FEATURES = {
         ("with inputs", "sensitivity chaos", "use tangent or pullback, or run.pieces"),
         ("with t_eval", "device", "give h, steps and save_every"),
         ("with error", "device", "give h and steps (fixed step size)"),
+        ("with device", "adaptive", "give h and steps (fixed step size), or omit device"),
         ("with events", "device observe_ensemble", "count them by observe='events', or pass stepper.with_events(())"),
         ("with t_eval", "observe", "omit observe"),
         ("with observe", "error dense_output", "omit observe"),

@@ -12,9 +12,6 @@ typedef struct {
 #ifdef OBSERVED
   observation seen;
 #endif
-#ifdef TANGENTS
-  tangent_growth growth;
-#endif
 } thread_memory;
 
 /* Reads or writes numbers of a trajectory, which are `count` numbers apart in global memory. */
@@ -40,9 +37,6 @@ static inline void transfer_all(int writes, thread_memory *own, double *memory, 
 #ifdef OBSERVED
   transfer(writes, own->seen.last, 5 * OBSERVED, memory, count);
 #endif
-#ifdef TANGENTS
-  transfer(writes, own->growth.norm, (6 + TANGENTS) * TANGENTS, memory, count);
-#endif
 }
 
 /* Prepares the repetition of a failed step from the value at the beginning of the extrapolated curve, as in
@@ -61,10 +55,9 @@ static inline int starts_again(thread_memory *own, long long *guess, long long s
 #endif
 }
 
-/* Advances `count` trajectories from step number `begin`. memory: (4 + 4 M + 2 S M, count) numbers, and 5 OBSERVED or
- * (6 + TANGENTS) TANGENTS more; parameters: (count, P). Every `every` steps counted from the start states are stored in
- * rows of (count, M) numbers, or the growth of tangent vectors in rows of (count, 5 TANGENTS) numbers of q. done: the
- * numbers of completed steps. */
+/* Advances `count` trajectories from step number `begin`. memory: (4 + 4 M + 2 S M, count) numbers, and 5 OBSERVED
+ * more; parameters: (count, P). Every `every` steps counted from the start states are stored in rows of (count, M)
+ * numbers. done: the numbers of completed steps. */
 KERNEL NAME(thread_advance)(long long count, long long begin, long long steps, long long every, double h,
     double tolerance, long long max_iterations, long long absolute, double *memory, const double *parameters, double *q,
     double *p, long long *done)
@@ -87,12 +80,8 @@ KERNEL NAME(thread_advance)(long long count, long long begin, long long steps, l
     values[i] = parameters[k * P + i];
   for (int i = 0; i < 2 * M; i++)
     dq[i] = dp[i] = 0.0;
-#ifdef TANGENTS
-  q += k * 5 * TANGENTS;
-#else
   q += k * M;
   p += k * M;
-#endif
   step.t = own.head[0];
   guess = (long long)own.head[2];
   prepare_iteration(&step, &data);
@@ -121,13 +110,6 @@ KERNEL NAME(thread_advance)(long long count, long long begin, long long steps, l
 #ifdef OBSERVED
     observe(&own.seen, &own.now, step.t, values, &active);
 #endif
-#ifdef TANGENTS
-    add_growth(&own.growth, &own.now, past, (double)(n + 1) * fabs(h), fabs(h));
-    if ((n + 1) % every == 0) {
-      store_growth(&own.growth, (double)(n + 1) * fabs(h), 1, q);
-      q += count * 5 * TANGENTS;
-    }
-#else
     if ((n + 1) % every == 0) {
       for (int i = 0; i < M; i++) {
         q[i] = own.now.q[i];
@@ -136,7 +118,6 @@ KERNEL NAME(thread_advance)(long long count, long long begin, long long steps, l
       q += count * M;
       p += count * M;
     }
-#endif
   }
   done[k] = n;
   own.head[0] = step.t;
