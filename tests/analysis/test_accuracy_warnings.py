@@ -382,9 +382,3 @@ def _report_of_wrong(stepper: sc.Stepper, judge: sc.Stepper, q: np.ndarray, p: n
     size = np.linalg.norm([np.abs(q) + np.abs(one.q[-1] - q), p])
     off = np.linalg.norm([one.q[-1] - exact.q[-1], one.p[-1] - exact.p[-1]]) / size
     return bool(one.step_error > 1e-3) if off > 1e-2 else None
-
-
-@pytest.mark.parametrize("other", [{"h": 0.1}, {"rtol": 1e-9}, {"time_transformation": "frequency"}])
-def test_confirmed_end_requires_default_steps(other):
-    with pytest.raises(sc.StateError, match="give one"):
-        sc.solve_ivp(sc.problem("kepler").system, (0.0, 5.0), [1.0, 0.0, 0.0, 1.0], tolerance=1e-6, **other)

@@ -372,27 +372,6 @@ def test_regular_and_chaotic_planets_agree_with_rebound():
             assert min(found, known.megno()) > 6.0
 
 
-@pytest.mark.quick
-def test_invalid_arguments_are_rejected(galaxy):
-    run = galaxy.integrate(*REGULAR, h=0.2, steps=4)
-    with pytest.raises(sc.StateError, match="a run of at least one step"):
-        galaxy.integrate(*REGULAR, h=0.2, steps=0).lyapunov_exponents()
-    with pytest.raises(sc.StateError, match="whole steps"):
-        galaxy.integrate(*REGULAR, h=0.2, steps=4, t_eval=[0.1, 0.3]).megno()
-    with pytest.raises(sc.StateError, match="count must be at most 4, not 5"):
-        run.chaos_indicators(5)
-    with pytest.raises(sc.StateError, match=r"shape \(4,\) or \(4, k\)"):
-        run.chaos_indicators(directions=[1.0, 2.0])
-    with pytest.raises(sc.StateError, match="give either count or directions"):
-        run.chaos_indicators(1, directions=[1.0, 0.0, 0.0, 0.0])
-    with pytest.raises(sc.StateError, match="finite and not 0"):
-        run.chaos_indicators(directions=np.zeros(4))
-    with pytest.raises(sc.StateError, match="k = 3 exceeds the number of tangent vectors, 2"):
-        run.chaos_indicators(2).gali(3)
-    with pytest.raises(sc.StateError, match="must be a multiple of save_every=3"):
-        galaxy.chaos_indicators_ensemble([REGULAR[0]], [REGULAR[1]], h=0.2, steps=10, save_every=3)
-
-
 def test_too_long_steps_in_an_ensemble_are_reported():
     kepler = sc.compile_stepper(sc.problem("kepler").system, sc.SVI(4))
     starts = [[1.0, 0.0], [0.1, 0.0]], [[0.0, 1.0], [0.0, 19.0**0.5]]

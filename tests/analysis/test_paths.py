@@ -387,20 +387,10 @@ def test_closed_path_at_rest_is_reported(oscillator):
     assert not oscillator.path([1.0], [0.3], 2.0, steps=10).at_rest
 
 
-def test_refusals_name_the_remedy(kepler, oscillator):
+def test_refusals_name_the_remedy(kepler):
     for call, error, words in (
-        (lambda: kepler.path([1, 0], [0, 1]), StateError, "give T"),
-        (lambda: kepler.path([1, 0], None, 1.0), StateError, "both positions"),
-        (lambda: kepler.path([1, 0], [0, 1], 0.0), StateError, "must not be 0"),
-        (lambda: kepler.path([1, 0], [0, 1], 1.0, start=np.zeros((4, 2))), StateError, "must have shape"),
-        (lambda: kepler.path(T=1.0, closed=True), StateError, "require start"),
         (lambda: kepler.path(T=1.0, closed=["x", "x"], start=np.ones((33, 2))), StateError, "each coordinate once"),
         (lambda: kepler.path(T=1.0, closed=np.ones((2, 2)), start=np.ones((33, 2))), StateError, "orthogonal"),
-        (
-            lambda: driven().path([0.1], [0.3], 1.0, energy=1.0, inputs={"u": 1.0}),
-            MethodError,
-            "which change the energy",
-        ),
         (
             lambda: compiled(["x", "y"], "(x_dot**2 + y_dot**2)/2 - x**2/2 - y", "svi:3", damping="1/10").path(
                 T=6.0, closed=True, energy=1.0, start=np.ones((33, 2))
@@ -408,8 +398,6 @@ def test_refusals_name_the_remedy(kepler, oscillator):
             MethodError,
             "damping takes it",
         ),
-        (lambda: oscillator.path([1.0], [0.3], np.pi, steps=20), PathError, "no path was found"),
-        (lambda: sc.compile_stepper(KEPLER, "radau-iia:2").path([1, 0], [0, 1], 1.0), MethodError, "sum of L"),
     ):
         with pytest.raises(error, match=words):
             call()

@@ -125,11 +125,6 @@ def test_dead_points_are_named_with_the_rank(span):
         stepper.integrate([0.0, 2.5], velocity=[0.0, 1.0], t=2.3, h=0.01, steps=1)
 
 
-def test_overconstrained_systems_are_rejected():
-    with pytest.raises(sc.SystemDefinitionError, match=r"3 constraints, but only 2 coordinates.*overconstrained"):
-        sc.LagrangianSystem.from_text(**SLIDER, constraints=["x = t", "angle = t", "x = 3"])
-
-
 @pytest.mark.second
 def test_impacts_are_impossible():
     stepper = sc.compile_stepper(linkage(), "svi:1")

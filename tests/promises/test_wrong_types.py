@@ -160,11 +160,6 @@ def test_parameters_of_wrong_type_are_rejected(given, run):
         run.stepper.integrate(Q, P, h=0.1, steps=1, parameters=given)
 
 
-def test_list_of_names_is_required_for_parameters():
-    with pytest.raises(ScviCodegenError, match=r"coordinates must be a list of names, as \['x', 'y'\], not 'x'"):
-        sc.LagrangianSystem.from_text(name="x", coordinates="x", lagrangian="x_dot**2/2")  # type: ignore[arg-type]
-
-
 def test_checked_functions_retain_their_signature():
     @checks_arguments(name=TEXT)
     def greet(name: str, times: int = 1) -> str:

@@ -120,51 +120,6 @@ def test_energies_are_drawn() -> None:
     assert line.get_ydata()[1:] == pytest.approx(abs(run.energy() / run.energy()[0] - 1)[1:], abs=1e-15)
 
 
-@pytest.mark.tiers(10)
-@pytest.mark.parametrize(
-    ("q", "given", "message"),
-    [
-        (np.zeros((3, 3)), {}, "'bonds' is missing in tables"),
-        (np.zeros((3, 3)), {"tables": {"bonds": [[0, 3]]}}, r"runs from 3 to 3, but r\[N, 3\] has N = 3 entries"),
-        (np.zeros((3, 3)), {"tables": {"bonds": [[0, -1]]}}, "not -1 to 0"),
-        (np.zeros((3, 3)), {"tables": {"bonds": [[0.0, 1.0]]}}, "must be whole numbers"),
-        (np.zeros((3, 3)), {"tables": {"bonds": [0, 1]}}, r"not \(2,\)"),
-        (np.zeros((3, 2)), {"tables": {"bonds": [[0, 1]]}}, r"must have the shape of r\[N, 3\], not \(3, 2\)"),
-        (np.full((3, 3), np.nan), {"tables": {"bonds": [[0, 1]]}}, r"is not at the index \[0, 0\]"),
-        (
-            np.zeros((3, 3)),
-            {"tables": {"bonds": [[0, 1]]}, "parameters": {"k": [1, 2]}},
-            "B must be the same in all arrays: it is 2 in k",
-        ),
-        (np.zeros((3, 3)), {"tables": {"bonds": [[0, 1]]}, "parameters": {"kk": 1}}, "did you mean 'k'"),
-        (np.zeros((3, 3)), {"tables": {"bonds": [[0, 1]]}, "parameters": {"k": np.inf}}, "must be finite"),
-        (
-            np.zeros((3, 3)),
-            {"tables": {"bonds": [[0, 1]]}, "velocity": np.zeros((2, 3))},
-            r"velocity must have shape \(9,\)",
-        ),
-        (
-            np.zeros((3, 3)),
-            {"tables": {"bonds": [[0, 1]]}, "parameters": {"k": [[1.0]]}},
-            r"'k' must have the shape .*, not \(1, 1\)",
-        ),
-        (np.zeros((3, 3)), {"tables": {"bonds": [[0, 1]]}, "h": 0.0}, "the step size h is 0"),
-        ({"x": np.zeros((3, 3))}, {"tables": {"bonds": [[0, 1]]}}, "there is no 'x' in positions"),
-    ],
-)
-def test_incompatible_arrays_are_rejected(q: Any, given: dict[str, Any], message: str) -> None:
-    """Arrays are checked before the run."""
-    net = sc.LagrangianSystem.from_text(
-        name="net",
-        coordinates=["r[N, 3]"],
-        parameters={"k[B]": 1},
-        tables=["bonds[B, 2]"],
-        lagrangian="sum(i in N, sum(a in 3, r_dot[i, a]**2)/2) - sum(b in B, k[b]*r[bonds[b, 0], 0]*r[bonds[b, 1], 1])",
-    )
-    with pytest.raises(sc.StateError, match=message):
-        sc.compile_stepper(net, "svi:2").start(q, **{"h": 0.1, **given})
-
-
 @pytest.mark.second
 def test_failures_of_array_runs() -> None:
     """A too large step fails and the preceding states are saved; a coordinate without mass is reported."""

@@ -233,25 +233,6 @@ def test_discontinuous_constraint_parameters_are_rejected(stepper):
     assert residuals(run)[0] < 1e-15
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("g = 1", "no coordinate"),
-        ("sum(i in N, r[i, 0]) = 1", "contain a sum over a whole array"),
-        ("r[i, 0] = 1 for i in N for i in N", "one 'for'"),
-        ("r[i, 0] = 1 for i in M", "not the size of an array"),
-        ("r[i, 0] = 1 for i in N x", "the end is expected"),
-    ],
-)
-def test_invalid_constraints_are_rejected(text, message):
-    def compiled():
-        system = lagrange("x", ["r[N, 2]"], "sum(i in N, sum(a in 2, r_dot[i, a]**2)/2)", g=1, constraints=[text])
-        return sc.compile_stepper(system, "stoermer-verlet")
-
-    with pytest.raises(sc.SystemDefinitionError, match=message):
-        compiled()
-
-
 @pytest.mark.parametrize("method", ["svi:2", "gauss:2", sc.StoermerVerlet("drift-kick-drift")])
 def test_methods_without_constraint_support_are_rejected(method):
     with pytest.raises(sc.MethodError, match="RATTLE"):

@@ -78,20 +78,6 @@ def test_the_only_array_needs_no_name():
     assert (stepper.arrays(run.q)["r"][0] == start).all()
 
 
-@pytest.mark.parametrize(
-    ("q", "message"),
-    [
-        ({"x": 1.0}, "'q' is missing in q"),
-        ({"x": 1.0, "q": np.zeros(4)}, r"q: 'q' must have the shape \(5,\), not \(4,\)"),
-        ({"x": 1.0, "q": np.zeros(5), "u": 0}, "there is no 'u' in q"),
-        ({"x": [1.0, 2.0], "q": np.zeros(5)}, "different numbers of states"),
-    ],
-)
-def test_invalid_states_are_rejected(known, q, message):
-    with pytest.raises(sc.StateError, match=message):
-        known.integrate(q, np.zeros(6), h=0.1, steps=1)
-
-
 @pytest.mark.tiers(1)
 @pytest.mark.parametrize(
     ("extra", "method", "message"),

@@ -73,16 +73,6 @@ def test_arrays_of_rotations_move_as_by_names(tmp_path):
         stepper.start(q | {"R": QUATERNIONS, "n": UNIT}, velocity={"omega": OMEGA[:2]}, h=0.05)
 
 
-def test_torque_on_an_array_without_an_index_is_refused():
-    with pytest.raises(sc.SystemDefinitionError, match=r"write the torque on each of them as 'R\[i\]'"):
-        sc.LagrangianSystem.from_text(
-            "bodies",
-            lagrangian="sum(i in 3, omega_1[i]**2 + omega_2[i]**2 + omega_3[i]**2)",
-            rotations={"R[3]": "omega"},
-            torques={"R": ["1", "0", "0"]},
-        )
-
-
 @pytest.mark.second
 def test_model_file_with_an_array_of_rotations(tmp_path):
     path = tmp_path / "bodies.toml"

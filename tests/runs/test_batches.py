@@ -189,13 +189,6 @@ def test_initial_states_of_two_kinds_equal_those_of_single_runs() -> None:
         one.integrate_ensemble(np.vstack([q, [[3.0, 4.0]]]), np.zeros((COUNT + 1, 2)), h=0.05, steps=1)
 
 
-def test_a_velocity_without_momentum_is_refused() -> None:
-    polar = lagrange("polar", "r phi", "r_dot**2/2 + r**2*phi_dot**2/2 - r**2/2")
-    one = sc.compile_stepper(polar, "svi:4")
-    with pytest.raises(sc.StateError, match=r"phi_dot = 1 at q = .* has no momentum"):
-        one.integrate_ensemble([[1.0, 0.0], [0.0, 0.0]], velocity=[[0.0, 1.0], [0.0, 1.0]], h=0.05, steps=1)
-
-
 def test_energies_that_change_are_reported_for_the_worst_trajectory() -> None:
     one, (q, p) = stepper("kepler"), states("kepler")
     q[3], p[3] = (1e-3, 0.0), (0.0, 44.5)  # eccentricity .98: a loose tolerance loses the energy

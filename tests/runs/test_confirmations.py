@@ -339,14 +339,6 @@ def test_switched_forces_are_not_falsely_confirmed():
     assert confirmed >= 18
 
 
-@pytest.mark.parametrize("error", [1e-15, 1e-30])
-def test_bounds_below_round_off_are_refused(error):
-    stepper = stepper_of("oscillator", "svi:4")
-    for integrate, q in ((stepper.integrate, [1.0]), (stepper.integrate_ensemble, [[1.0], [0.5]])):
-        with pytest.raises(sc.StateError, match=rf"error={error:g} is below 1.1e-15, the least error that double"):
-            integrate(q, velocity=q, t_end=1.0, error=error)
-
-
 @pytest.mark.parametrize("offset", [0.0, 1e6])
 def test_errors_are_relative_to_the_range_of_each_coordinate(offset):
     """A small oscillation beside a large one has its own size; far from the origin positions are rounded."""

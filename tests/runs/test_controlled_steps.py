@@ -183,13 +183,6 @@ def test_equilibria_and_free_particles_need_few_steps():
     assert len(free.integrate([3.0], [1.0], t=5.0, t_end=5.0)) == 1
 
 
-@pytest.mark.parametrize("method", [sc.StoermerVerlet(), sc.SVI(4, space="trigonometric:0.5")])
-def test_methods_without_a_polynomial_curve_are_reported(method):
-    stepper = sc.compile_stepper(sc.problem("kepler").system, method)
-    with pytest.raises(sc.MethodError, match=r"without an error estimate .* requires"):
-        stepper.integrate([1.0, 0.0], [0.0, 1.0], t_end=1.0)
-
-
 MASSES = {
     "relativistic": ({"coordinates": ["x"], "lagrangian": "-sqrt(1 - x_dot**2) - x**4/4"}, sc.LagrangianSystem),
     "coupled": (
@@ -470,33 +463,6 @@ class TestStepsOfHLeadToAnEnd:
         found = sign * np.concatenate([each.t for each in run.events])
         assert np.abs(found - [np.pi / 3.0, 1.95, 1.99]).max() < 1e-9
         assert run.t[-1] == sign * found[-1]
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({}, "give either h .fixed step size. or t_end"),
-        ({"steps": 3}, "give either h .fixed step size. or t_end"),
-        ({"h": 0.1}, "h requires steps or t_end"),
-        ({"h": 0.1, "t_end": -1.0}, "wrong sign for a run from t = 0 to t_end = -1"),
-        ({"h": 0.1, "t_end": 1.0, "steps": 3}, "give either steps=3 or t_end=1"),
-        ({"h": 0.1, "t_end": 1.0, "tolerance": 1e-3}, "tolerance requires adaptive steps"),
-        ({"h": 0.1, "steps": 3, "tolerance": 1e-9}, "tolerance requires adaptive steps"),
-        ({"h": 1e-12, "t_end": 1.0}, r"requires 1e\+12 steps .*: give a larger h"),
-        ({"t_end": 1.0, "steps": 3}, "omit steps"),
-        ({"t_end": math.nan}, "t_end is nan"),
-        (
-            {"t_end": 1.0, "tolerance": 0.0},
-            "positive and below 1 .*, not 0: leave it out for errors at round-off level",
-        ),
-        ({"t_end": 1.0, "tolerance": 2.0}, "and below 1 .*, not 2: leave it out for errors at round-off level"),
-        ({"t_end": 1.0, "save_every": 0}, "save_every"),
-    ],
-)
-@pytest.mark.parametrize("name", ["q", "q[0]"])
-def test_invalid_steps_and_ends_are_rejected(oscillators, name, given, message):
-    with pytest.raises(sc.StateError, match=message):
-        oscillators[name].integrate([1.0], [0.0], **given)
 
 
 @pytest.mark.second

@@ -183,29 +183,10 @@ def test_backward_and_recorded_runs(tmp_path):
     assert np.array_equal(sc.resume_run(tmp_path / "run", t_end=5.0)[:].q[:-1], whole.q[: len(back.q) - 1])
 
 
-@pytest.mark.parametrize(
-    ("call", "words"),
-    [
-        (lambda s: s.integrate(*START, h=0.1, steps=10), "and t_end"),
-        (lambda s: s.integrate(*START, t_end=1.0), "and t_end"),
-        (lambda s: s.integrate(*START, h=0.1, t_end=1.0, tolerance=1e-9), "and t_end"),
-        (lambda s: s.integrate(*START, h=-0.1, t_end=1.0), "positive"),
-        (lambda s: s.integrate(*START, h=0.1, steps=10, t_end=1.0), "omit steps"),
-        (
-            lambda s: s.integrate_ensemble([START[0]], [START[1]], h=0.1, t_end=1.0),
-            "integrate_ensemble is not available with a time transformation",
-        ),
-        (lambda s: s.from_checkpoint(s.start(*START, h=0.1, t_end=1.0).checkpoint(), t_end=1.0), "and t_end"),
-    ],
-)
-def test_missing_arguments_are_reported(call, words):
-    with pytest.raises((sc.StateError, sc.MethodError), match=words):
-        call(kepler(sc.SVI(2)))
-
-
-def test_invalid_time_transformation_is_reported():
-    with pytest.raises(sc.SystemDefinitionError, match="unknown name 'z'"):
-        kepler(sc.SVI(2), "z**2").integrate(*START, h=0.1, t_end=1.0)
+def test_checkpoints_require_the_step_size():
+    stepper = kepler(sc.SVI(2))
+    with pytest.raises(sc.StateError, match="and t_end"):
+        stepper.from_checkpoint(stepper.start(*START, h=0.1, t_end=1.0).checkpoint(), t_end=1.0)
 
 
 def test_too_long_steps_for_the_time_transformation_are_rejected():

@@ -822,57 +822,14 @@ def test_grazing_impacts_are_found(point, depth):
 # Messages.
 
 
-@pytest.mark.tiers(11, 13)
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda: sc.Event("y", then={"p_z": "1"}), "'p_z' is not a coordinate.*did you mean 'p_y'"),
-        (lambda: sc.Event("y", then={"g": "2*g"}), "'g' is not a coordinate"),
-        (lambda: sc.Event("y", then={"p_y": "1", "y_dot": "1"}), "sets momenta and velocities"),
-        (lambda: sc.Event("y", then={}), "must be new values by name"),
-        (lambda: sc.Event("y", then={"n": ["0", "1"]}), "one formula or number for each component"),
-        (lambda: sc.Event("y", then={"p_y": sympy.Symbol("z")}), "'z' in the value 'z' of 'p_y'"),
-        (lambda: sc.impact("y - p_y"), "contains 'p_y'"),
-        (lambda: sc.impact("y", 1.2), "restitution of the wall 'y' is 1.2"),
-        (lambda: sc.impact("y", "1.2"), "restitution of the wall 'y' is 1.2"),
-        (lambda: sc.Event("y", restitution=1.0), "use impact"),
-        (lambda: sc.Event("y", where="y"), "must be a comparison"),
-        (lambda: sc.impact("y", 0.0), "passes the wall 'y'"),
-        (lambda: sc.Event("y", then={"p_y": "p_y"}, where="y > 1 - 1"), None),
-        (lambda: sc.Event("y", -1, then={"p_y": "log(y - 1)"}), "not finite"),
-        (lambda: sc.impact("q[0] - q_dot[1]"), "contains 'q_dot'"),
-        (lambda: sc.impact("3"), "constant and never crosses zero"),
-        (lambda: sc.Event("q[0]", then={"m": "1"}), "'m' is not an entry of a coordinate"),
-        (lambda: sc.Event("q[0]", then={"sum(i in N, q[i])": "1"}), "is not an entry of a coordinate"),
-        (lambda: sc.Event("q[0]", then={"q_dot[0]": "1", "p_q[1]": "1"}), "sets momenta and velocities"),
-        (lambda: sc.Event("q[0] - 1/4", then={"p_q[0]": "log(q[0] - 9)"}), "not finite"),
-        (lambda: sc.impact("q[i+1] for i in N"), "q\\[i\\+1\\]"),
-        (lambda: sc.impact("sum(k in N, q[k]) - q[i] for i in N"), "a sum within a sum must have whole numbers"),
-        (lambda: sc.Event("q[i] for i in N", then={"q[i] + 1": "0"}), "is not an entry of a coordinate"),
-        (lambda: sc.impact("q[0]", where="q[i] > 0"), "'i' is not an index"),
-    ],
-)
-def test_errors_name_the_symbol_and_the_remedy(ball, make, words):
-    def run(events):
-        if "q" not in str(events.function):
-            return ball.integrate([1.0], [0.0], h=0.1, steps=30, events=events)
-        q = np.exp(-(((np.arange(8) - 3.0) / 2.0) ** 2))
-        return sc.compile_stepper(CHAIN, "svi:4", flags=FLAGS).integrate(
-            q, velocity=0 * q, h=0.25, steps=40, events=events
-        )
-
-    if words is None:
-        run(make())
-        return
-    with pytest.raises(sc.EventError, match=words):
-        run(make())
+def test_values_of_unknown_symbols_are_refused(ball):
+    with pytest.raises(sc.EventError, match="'z' in the value 'z' of 'p_y'"):
+        ball.integrate([1.0], [0.0], h=0.1, steps=30, events=sc.Event("y", then={"p_y": sympy.Symbol("z")}))
+    ball.integrate([1.0], [0.0], h=0.1, steps=30, events=sc.Event("y", then={"p_y": "p_y"}, where="y > 1 - 1"))
 
 
 @pytest.mark.quick
 def test_unsupported_combinations_are_refused(ball):
-    for formula in ("abs(y)", "sign(y)", "max(y, 0)", "Heaviside(y)"):
-        with pytest.raises(sc.SystemDefinitionError, match=r"sc\.impact\(\.\.\), or sc\.Event"):
-            sc.LagrangianSystem.from_text(name="stop", coordinates=["y"], lagrangian=f"y_dot**2/2 - {formula}")
     pendulum = sc.problem("planar-pendulum").system
     with pytest.raises(sc.EventError, match="in transformed time, where the energy is the constant"):
         sc.compile_stepper(sc.reparametrise(pendulum, "1 + q**2"), "svi:4", events=sc.Event("q", then={"p_q": "-p_q"}))

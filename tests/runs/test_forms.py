@@ -88,10 +88,6 @@ def test_forms_that_do_not_exist_are_named():
     spin = sc.HamiltonianSystem.from_text("spin", spins=["a"], hamiltonian="a_3 + a_3**2/3")
     with pytest.raises(sc.SystemDefinitionError, match=r"rotations or spins \('a'\)"):
         sc.lagrangian_of(spin)
-    with pytest.raises(
-        sc.SystemDefinitionError, match=r"inertia of the rotation 'R' .* thin rod .* directions=\['n'\]"
-    ):
-        sc.LagrangianSystem.from_text("rod", rotations={"R": "omega"}, lagrangian="(omega_1**2 + omega_2**2)/2 - R_33")
 
 
 def test_a_parameter_named_as_an_entry_of_a_rotation_is_refused():

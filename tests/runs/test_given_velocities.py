@@ -81,10 +81,6 @@ def test_ensembles_accept_velocities_with_individual_parameters():
     runs = stepper.integrate_ensemble(q, velocity=v, parameters={name: [2.5, 0.8]}, **settings)
     for j, value in enumerate((2.5, 0.8)):
         assert runs.p[0, j] == pytest.approx(stepper.momentum(q[j], v[j], 0.7, {name: value}), rel=1e-15)
-    with pytest.raises(sc.StateError, match="give either p or velocity"):
-        stepper.integrate_ensemble(q, **settings)
-    with pytest.raises(sc.StateError, match=r"equal shapes, not \(2, 2\) and \(1, 2\)"):
-        stepper.integrate_ensemble(q, velocity=V, **settings)
 
 
 def test_solve_ivp_accepts_velocities_and_scipy_arguments():
@@ -112,16 +108,6 @@ def test_velocities_and_momenta_of_many_states():
     assert p.shape == (3, 2)
     assert p[1] == pytest.approx(stepper.momentum(q[1], v[1], t[1]), rel=1e-15)
     assert stepper.velocity(q, p, t) == pytest.approx(v, rel=1e-14, abs=1e-15)
-
-
-def test_exactly_one_of_momenta_and_velocities_is_required():
-    stepper = pendulum_on_cart()
-    with pytest.raises(sc.StateError, match="give either p or velocity"):
-        stepper.integrate(Q, h=0.1, steps=1)
-    with pytest.raises(sc.StateError, match="got both"):
-        stepper.integrate(Q, V, velocity=V, h=0.1, steps=1)
-    with pytest.raises(sc.StateError, match="velocity must have shape"):
-        stepper.integrate(Q, velocity=[1.0], h=0.1, steps=1)
 
 
 @pytest.mark.parametrize(

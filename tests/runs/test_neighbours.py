@@ -275,36 +275,7 @@ def test_a_list_in_sympy() -> None:
     assert "sum(i < j in near, -exp(-(q[i] - q[j])**2)*unit_step(4 - (q[i] - q[j])**2))" in map(str, system.terms)
 
 
-@pytest.mark.parametrize(
-    ("near", "message"),
-    [
-        ({"of": "r"}, "must have the keys of and cutoff"),
-        ({"of": "r", "cutoff": 1, "radius": 2}, "may have box and skin"),
-        ({"of": "s", "cutoff": 1}, "'s', which is not an array of positions"),
-        ({"of": "x", "cutoff": 1}, "'x', which is not an array of positions"),
-        ({"of": "r", "cutoff": 1, "box": [1, 2]}, "one length, or one per component"),
-        ({"of": "r", "cutoff": -1}, "must be positive"),
-        ({"of": "r", "cutoff": "r"}, "'r'"),
-    ],
-)
-def test_lists_that_are_refused(near: Any, message: str) -> None:
-    with pytest.raises((sc.SystemDefinitionError, sc.ExpressionError), match=message):
-        sc.LagrangianSystem.from_text(
-            name="gas",
-            coordinates=["x", "r[N, 3]"],
-            neighbours={"near": near},
-            lagrangian=f"x_dot**2 + {KINETIC} - sum(i < j in near, (r[i, 0] - r[j, 0])**2)",
-        )
-
-
-def test_a_list_of_another_name_and_of_no_pairs() -> None:
-    with pytest.raises(sc.ExpressionError, match="near"):
-        sc.LagrangianSystem.from_text(
-            name="gas",
-            coordinates=["r[N, 3]"],
-            neighbours={"near": {"of": "r", "cutoff": 1}},
-            lagrangian=f"{KINETIC} - sum(i < j in nears, r[i, 0]*r[j, 0])",
-        )
+def test_states_have_three_components() -> None:
     with pytest.raises(sc.StateError, match="3"):
         stepper().integrate(np.zeros((4, 2)), h=0.1, steps=1)
 

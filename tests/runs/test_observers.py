@@ -83,12 +83,6 @@ def test_energy_errors_of_observed_runs_are_those_of_saved_ones(stepper):
     assert np.array_equal(run.velocity, ends)
 
 
-@pytest.mark.parametrize(("observe", "message"), [("extreme", "did you mean 'extremes'"), (3, "function of the run")])
-def test_unknown_observers_are_rejected(stepper, observe, message):
-    with pytest.raises(sc.StateError, match=message):
-        stepper.integrate(**STATE, steps=3, observe=observe)
-
-
 PLANS = {"fixed": {"h": 0.01, "steps": 50_000_000}, "adaptive": {"t_end": 1e8}}
 
 

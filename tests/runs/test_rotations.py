@@ -84,59 +84,6 @@ def test_initial_velocities_and_momenta_are_those_of_either_frame():
         np.testing.assert_allclose(end, ends[0], rtol=0, atol=1e-14)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"rotations": {"R": "omega"}, "lagrangian": "rotate_4(R, 1, 0, 0)"}, "rotate_4' is not a function"),
-        ({"rotations": {"R": "omega"}, "lagrangian": "rotate_1(S, 1, 0, 0)"}, "needs a rotation first, not 'S'"),
-        ({"rotations": {"R": "omega"}, "lagrangian": "rotate_1(R, 1, 0)"}, "three components, not 2"),
-        ({"rotations": {"R": "omega", "S": "omega"}, "lagrangian": "omega_1**2"}, "'omega_1' has two meanings"),
-        ({"rotations": ["R"], "lagrangian": "omega_1**2"}, r"rotations must be a mapping .* \{'R': 'omega'\}"),
-        ({"rotations": {"R": "omega"}, "lagrangian": "omega**2"}, "'omega' is not a scalar: write .* as omega_1"),
-        ({"rotations": {"R": "omega"}, "lagrangian": "omega_1**2 - R"}, "'R' is not a scalar: write .* as R_11"),
-        (
-            {"rotations": {"R": "omega"}, "lagrangian": "rotate(R, 0, 0, 1)"},
-            "'rotate' is not a function: known are rotate_1",
-        ),
-        (
-            {"rotations": {"R": "omega"}, "lagrangian": "R_33", "parameters": {"R_33": 1}},
-            "'R_33' is the name of both an entry of a rotation, direction or spin and parameter 'R_33'",
-        ),
-        (
-            {"rotations": {"R": "omega"}, "lagrangian": "R_33", "coordinates": ["R_w"]},
-            "'R_w' is the name of both an entry of a rotation, direction or spin and coordinate 'R_w'",
-        ),
-        (
-            {"rotations": {"R": "omega"}, "lagrangian": "omega_1**2", "forces": {"R": "1"}},
-            r"force on 'R', which is not a coordinate: write torques=\{'R': \[..\]\}",
-        ),
-        ({"rotations": {"R": "omega"}, "lagrangian": "omega_1**2", "torques": {"Q": ["1", "0", "0"]}}, "torque on 'Q'"),
-        ({"rotations": {"R": "omega"}, "lagrangian": "omega_1**2", "torques": {"R": ["1"]}}, "three components"),
-    ],
-)
-def test_wrong_rotations_are_rejected_by_name(arguments, message):
-    with pytest.raises((sc.SystemDefinitionError, sc.ExpressionError), match=message):
-        sc.LagrangianSystem.from_text("top", **arguments)
-
-
-@pytest.mark.parametrize(
-    ("q", "velocity", "message"),
-    [
-        ({"Q": [1, 0, 0, 0]}, {"omega": OMEGA}, "no 'Q' in q"),
-        ({}, {"omega": OMEGA}, "'R' is missing in q"),
-        ({"R": [1, 0, 0, 0]}, {}, "'omega' is missing in velocity"),
-        ({"R": [1, 0, 0, 0]}, {"omega": [1, 2]}, "three finite components"),
-        ({"R": [1, 0, 0, 0]}, {"omega": [1, np.nan, 2]}, "'omega' must have three finite components"),
-        ({"R": [1, 0, 0, 0]}, {"omega": OMEGA, "omega_space": OMEGA}, "both 'omega' and 'omega_space'"),
-        ([1, 0, 0], {"omega": OMEGA}, "require q by name"),
-        ({"R": [1, 0, 0, 0]}, {"R": [1, 2, 3]}, "no 'R' in velocity"),
-    ],
-)
-def test_wrong_states_are_rejected_by_name(q, velocity, message):
-    with pytest.raises(sc.StateError, match=message):
-        compiled(TOP, "svi:4").integrate(q, velocity=velocity, h=0.1, steps=2)
-
-
 def test_events_can_set_rates_of_rotations_according_to_the_message():
     event = sc.Event("R_33", then={"omega_4": "0"})
     with pytest.raises(sc.EventError, match="An event can set: omega_1, omega_2, omega_3, p_R_1, p_R_2, p_R_3, "):
@@ -250,27 +197,6 @@ def test_a_system_in_sympy_is_that_in_text():
 
 
 DIRECTED = ("spherical", ["q"], "(q_dot**2 + n_1_dot**2 + n_2_dot**2 + n_3_dot**2 - q**2)/2 - n_3*q")
-
-
-@pytest.mark.second
-@pytest.mark.parametrize(
-    ("state", "message"),
-    [
-        (
-            {"velocity": {"q": 0, "n": [0, 0.1, 0.3]}},
-            r"velocity: 'n' = \[0\.0, 0\.1, 0\.3\] is not tangent .* is 0\.3\.",
-        ),
-        ({"p": {"q": 0, "n": [0, 0, 1e-200]}}, r"p: 'n' .* not tangent .* give an orthogonal vector"),
-        ({"q": {"q": 0, "n": [0, 0, np.nan]}}, "the direction 'n' must be finite"),
-        ({"q": {"q": 0, "n": [0, 0, 0]}}, "the direction 'n' must not be zero"),
-        ({"q": {"q": 0, "n": [0, 1]}}, "the direction 'n' must have three components"),
-    ],
-)
-def test_states_of_directions_that_are_refused(state, message):
-    stepper = sc.compile_stepper(sc.LagrangianSystem.from_text(*DIRECTED, directions=["n"]), "svi:1")
-    rest = {"velocity": {"q": 0, "n": [0.0, 0, 0]}} if "p" not in state else {}
-    with pytest.raises(sc.StateError, match=message):
-        stepper.integrate(**{"q": {"q": 0, "n": [0, 0, 1]}, **rest, **state}, h=0.1, steps=1)
 
 
 @pytest.mark.second

@@ -92,46 +92,6 @@ def test_first_step_is_the_one_requested() -> None:
     assert_allclose(far.q[-1], [np.cos(5.0), np.sin(5.0)], atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"max_step": 0.0}, "max_step = 0 must be positive"),
-        ({"max_step": np.nan}, "max_step is nan"),
-        ({"first_step": -0.1}, r"first_step = -0\.1 must be positive"),
-        ({"absolute_tolerance": -1e-9}, "absolute_tolerance = -1e-09 must not be negative"),
-        ({"absolute_tolerance": {"x": np.nan}}, "absolute_tolerance of x is nan"),
-        ({"absolute_tolerance": {"x": 1e-9, "z": 1.0}}, r"no coordinate, array or rotation 'z' .*Known: x, y"),
-        ({"absolute_tolerance": [1e-9, 1e-9]}, "absolute_tolerance must be a real number"),
-    ],
-)
-def test_invalid_options_of_adaptive_steps_are_refused(arguments: dict[str, Any], message: str) -> None:
-    for start in (kepler().integrate, kepler().start):
-        with pytest.raises(sc.StateError, match=message):
-            start(Q, velocity=V, t_end=1.0, **arguments)
-    with pytest.raises(sc.StateError, match=message):
-        kepler().integrate_ensemble([Q], velocity=[V], t_end=1.0, **arguments)
-
-
-@pytest.mark.parametrize(("t", "t_end", "max_step"), [(1000.0, 1005.0, 1e-18), (0.0, -5.0, 1e-15), (5.0, 0.0, 1e-15)])
-def test_largest_steps_that_times_do_not_resolve_are_refused(t: float, t_end: float, max_step: float) -> None:
-    arguments: dict[str, Any] = {"t": t, "t_end": t_end, "max_step": max_step}
-    message = f"max_step = {max_step:g} is below .* larger max_step, or omit it"
-    for start in (kepler().integrate, kepler().start):
-        with pytest.raises(sc.StateError, match=message):
-            start(Q, velocity=V, **arguments)
-    with pytest.raises(sc.StateError, match=message):
-        kepler().integrate(Q, velocity=V, error=1e-6, **arguments)
-    for ends in (t_end, [0.5 * (t + t_end), t_end]):
-        with pytest.raises(sc.StateError, match=message):
-            kepler().integrate_ensemble([Q, Q], velocity=[V, V], **arguments | {"t_end": ends})
-
-
-@pytest.mark.parametrize("name", ["max_step", "first_step", "absolute_tolerance"])
-def test_fixed_steps_have_no_options_of_adaptive_ones(name: str) -> None:
-    with pytest.raises(sc.StateError, match=f"{name} requires adaptive steps"):
-        kepler().integrate(Q, velocity=V, h=0.1, steps=3, **{name: 0.1})
-
-
 def test_absolute_tolerances_by_name_of_coordinate_array_and_rotation() -> None:
     interface = kepler().interface
     assert absolute_tolerances(interface, 2, 0.5).tolist() == [0.5, 0.5]

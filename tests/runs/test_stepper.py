@@ -182,66 +182,6 @@ def test_damaged_checkpoints_are_rejected(kepler):
 # Wrong arguments.
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (([1.0], [0.0, 0.0], 0.1), r"q must have shape \(2,\) for \(q1, q2\), not \(1,\)"),
-        (([1.0, 0.0], [0.0, 0.0, 0.0], 0.1), r"p must have shape"),
-        (([[1.0, 0.0]], [0.0, 0.0], 0.1), r"not \(1, 2\)"),
-        (([1.0, np.nan], [0.0, 0.0], 0.1), r"q\[1\] \(q2\) is nan"),
-        (([1.0, 0.0], [np.inf, 0.0], 0.1), r"p\[0\] \(q1\) is inf"),
-        ((np.array([1.0, 0.0]), np.array([0.0, np.nan]), 0.1), r"p\[1\] \(q2\) is nan"),
-        (("ab", [0.0, 0.0], 0.1), "q must be real numbers"),
-        (([1j, 0.0], [0.0, 0.0], 0.1), "real"),
-        (([1.0, 0.0], [0.0, 1.0], 0.0), "the step size h is 0"),
-        (([1.0, 0.0], [0.0, 1.0], np.nan), "the step size h is nan"),
-        (([1.0, 0.0], [0.0, 1.0], np.inf), "the step size h is inf"),
-        (([1.0, 0.0], [0.0, 1.0], "small"), "the step size h must be real numbers"),
-        (
-            ([1.0, 0.0], [0.0, 1.0], None),
-            "the step size h must be real numbers|give either h .fixed step size. or t_end",
-        ),
-        (([1.0, 0.0], [0.0, 1.0], 0.1, 0.0, {"muu": 1.0}), "no parameter 'muu' among mu; did you mean 'mu'"),
-        (([1.0, 0.0], [0.0, 1.0], 0.1, 0.0, {"mu": np.inf}), "the parameter mu is inf"),
-        (([1.0, 0.0], [0.0, 1.0], 0.1, 0.0, [1.0, 2.0]), r"parameters must have 1 values \(mu\), not 2"),
-        (([1.0, 0.0], [0.0, 1.0], 0.1, 0.0, {"mu": "heavy"}), "mu"),
-        (([1.0, 0.0], [0.0, 1.0], 0.1, 0.0, ["heavy"]), "parameters"),
-    ],
-)
-def test_invalid_argument_is_named(kepler, arguments, words):
-    with pytest.raises(sc.StateError, match=words):
-        kepler.step(*arguments)
-    q, p, h, *rest = arguments
-    with pytest.raises(sc.StateError, match=words):
-        kepler.integrate(q, p, h=h, steps=1, parameters=rest[1] if rest else None)
-
-
-REJECTED = [
-    (lambda stepper: stepper.integrate(*STATE, h=0.1, steps=-1), "steps must be at least 0, not -1"),
-    (lambda stepper: stepper.integrate(*STATE, h=0.1, steps=2.5), "steps must be a whole number, not 2.5"),
-    (lambda stepper: stepper.integrate(*STATE, h=0.1, steps=True), "whole number"),
-    (lambda stepper: stepper.integrate(*STATE, h=0.1, steps=3, save_every=0), "save_every must be at least 1"),
-    *((lambda stepper, t=t: stepper.step(*STATE, 0.1, t), r"\bt\b") for t in (np.nan, np.inf, "late")),
-    *(
-        (lambda stepper, t=t: stepper.integrate(*STATE, h=0.1, steps=1, t=t), r"\bt\b")
-        for t in (np.nan, np.inf, "late")
-    ),
-    *((lambda stepper, n=n: stepper.start(*STATE, h=0.1).record(n), "steps must be") for n in (-1, 2.5, True)),
-    (lambda stepper: stepper.energy(np.ones((3, 2)), np.ones((3, 2)), [0.0, 1.0]), "time"),
-    (lambda stepper: stepper.energy([[1.0, 2.0, 3.0]], [[1.0, 2.0, 3.0]]), r"states must have shape \(n, 2\)"),
-    (lambda stepper: stepper.energy([0.0, 0.0], [1.0, 0.0]), "energy of a state cannot be computed"),
-    (lambda _: sc.SolverOptions(max_iterations=2.5), "max_iterations must be a whole number"),
-    (lambda _: sc.SolverOptions(tolerance=0.0), "tolerance must be positive"),
-    (lambda _: sc.SolverOptions(max_iterations=0), "max_iterations must be at least 1"),
-]
-
-
-@pytest.mark.parametrize(("call", "message"), REJECTED)
-def test_invalid_calls_are_rejected(kepler, call, message):
-    with pytest.raises(sc.StateError, match=message):
-        call(kepler)
-
-
 def test_parameters_may_be_given_by_name_or_in_order(compiled, sample):
     stepper, state = compiled("pumped-cart-pole", sc.SVI(3)), sample("pumped-cart-pole").state
     values = stepper.defaults

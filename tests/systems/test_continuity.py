@@ -54,25 +54,6 @@ def test_forces_and_coefficients_of_space_may_jump() -> None:
     sc.LagrangianSystem.from_text("string", ["u[N]"], string, parameters={"x[N]": 1.0})
 
 
-def test_jumps_of_hamiltonians_and_arrays() -> None:
-    with pytest.raises(sc.SystemDefinitionError, match="the Hamiltonian of 'h' jumps where x = 0"):
-        sc.HamiltonianSystem.from_text("h", ["x"], "p_x**2/2 + unit_step(x)")
-    with pytest.raises(sc.SystemDefinitionError, match=r"jumps where u\[i\] = 0"):
-        sc.LagrangianSystem.from_text("a", ["u[N]"], "sum(i in N, u_dot[i]**2/2 - unit_step(u[i]))")
-
-
-@pytest.mark.parametrize("text", ["y - positive_part(x)", "y - unit_step(x)", "y_dot - unit_step(x)*x_dot"])
-def test_corners_of_constraints_are_refused(text: str) -> None:
-    with pytest.raises(sc.SystemDefinitionError, match="has a corner or a jump where x = 0"):
-        sc.LagrangianSystem.from_text("ramp", ["x", "y"], FALL, constraints=[text])
-
-
-def test_corners_of_constraints_of_arrays_are_refused() -> None:
-    text, corner = "sum(i in N, sum(a in 2, q_dot[i, a]**2)/2)", "q[i, 1] - positive_part(q[i, 0]) for i in N"
-    with pytest.raises(sc.SystemDefinitionError, match=r"has a corner or a jump where q\[i, 0\] = 0"):
-        sc.LagrangianSystem.from_text("ramps", ["q[N, 2]"], text, constraints=[corner])
-
-
 @pytest.mark.parametrize("text", ["y - positive_part(x)**2", "y - positive_part(t - 1)"])
 def test_smooth_constraints_and_those_of_time_are_not(text: str) -> None:
     sc.LagrangianSystem.from_text("ramp", ["x", "y"], FALL, constraints=[text])

@@ -281,12 +281,6 @@ def test_evaluation_agrees_with_sympy(expression: sympy.Expr) -> None:
     assert abs(mp.mpf(str(sympy.re(expected))) - value) <= mp.mpf("1e-20") * max(1, abs(value))
 
 
-@pytest.mark.parametrize("name", ["v_x", "vx", "xdot", "dx", "x_t"])
-def test_other_spellings_of_velocities_get_a_suggestion(name: str) -> None:
-    with pytest.raises(ExpressionError, match=f"unknown name '{name}'; did you mean 'x_dot'"):
-        parse_expression(f"{name}**2/2", {each: sympy.Symbol(each, real=True) for each in ("x", "y", "x_dot", "y_dot")})
-
-
 ROOTS = ["sqrt(a**2*(1 + x**2))", "(a**2/(x**2 + 1))**(3/2)", "(a**4*(1 + x**2))**(1/4)", "sqrt((a - b)**2)*x**2"]
 """Even roots of squares of parameters, which may be negative."""
 
@@ -309,14 +303,6 @@ def test_even_roots_of_parameters_are_smooth_formulas(potential: str) -> None:
         assert derivative.is_finite
 
 
-@pytest.mark.parametrize("kink", ["sqrt(x**2)", "sqrt(a**2*x**2)", "sqrt(x_dot**2)", "sqrt(sin(t)**2)*x"])
-def test_even_roots_of_variables_are_refused(kink: str) -> None:
-    with pytest.raises(SystemDefinitionError, match=r"Abs\(.*\), the root of its square, is not differentiable"):
-        sc.LagrangianSystem.from_text("kink", ["x"], f"a*x_dot**2/2 - {kink}", parameters={"a": 2.0})
-
-
-def test_even_roots_of_entries_of_arrays_are_refused() -> None:
-    with pytest.raises(SystemDefinitionError, match=r"Abs\(x\[i\]\), the root of its square"):
-        sc.LagrangianSystem.from_text("kink", ["x[N]"], "sum(i in N, x_dot[i]**2/2 - sqrt(x[i]**2))")
+def test_even_roots_of_positive_entries_of_arrays_are_not_refused() -> None:
     smooth = "sum(i in N, m[i]*x_dot[i]**2/2 - sqrt(m[i]**2*(1 + x[i]**2)))"
     sc.LagrangianSystem.from_text("smooth", ["x[N]"], smooth, parameters={"m[N]": 1.0})

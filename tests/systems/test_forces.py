@@ -43,21 +43,6 @@ def test_sympy_input_equals_text_input():
     assert own == driven(forces={"x": "-c*x", "y": "-c*y_dot**3"})
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"forces": {"z": "1"}}, "force on 'z', which is not a coordinate"),
-        ({"forces": {"x": "1 +"}}, "column"),
-        ({"forces": {"x": "k*x"}}, "'k'"),
-        ({"forces": "x"}, "mapping from names"),
-        ({"dissipation": "c*x**2"}, "contains no velocity"),
-    ],
-)
-def test_unsuitable_forces_are_named(given, message):
-    with pytest.raises(sc.SystemDefinitionError, match=message):
-        driven(**given)
-
-
 def test_legendre_transform_and_its_inverse():
     system = driven(forces={"x": "-c*x_dot", "y": "F*cos(w*t)"})
     other = sc.hamiltonian_of(system)

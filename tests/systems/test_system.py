@@ -221,11 +221,6 @@ def test_text_errors_carry_the_column() -> None:
     assert caught.value.column == 13
 
 
-def test_coordinates_in_one_string_are_rejected() -> None:
-    with pytest.raises(SystemDefinitionError, match="list of names"):
-        LagrangianSystem.from_text(name="system", coordinates="xy", lagrangian="x_dot**2")
-
-
 @pytest.mark.parametrize("keyword", sorted(C_KEYWORDS))
 def test_keywords_of_c_are_rejected_in_sympy_input(keyword: str) -> None:
     with pytest.raises(SystemDefinitionError, match=f"'{keyword}' is a keyword of C"):

@@ -7,7 +7,6 @@ import sympy
 from notation import lagrange
 
 import scvi_codegen as sc
-from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.common.precision import mp
 from scvi_codegen.methods.exact.solution import ExactMotion, numbers
 from scvi_codegen.systems.derived_expressions import sample_points
@@ -122,42 +121,3 @@ def test_levi_civita_s_coordinates_make_an_oscillator() -> None:
 def test_energy_parameter_has_an_unused_name() -> None:
     system = lagrange("beam", "q", "q_dot**2/2 - E*q**4", E=1.0)
     assert sc.reparametrise(system, "1/(1 + q**2)").clock.energy.name == "E_0"
-
-
-TWICE = sc.reparametrise(KEPLER, "frequency")
-DRIVEN = sc.LagrangianSystem.from_text(name="driven", coordinates=["q"], lagrangian="q_dot**2/2 + q*cos(t)")
-FREE = sc.LagrangianSystem.from_text(name="free", coordinates=["q"], lagrangian="q_dot**2/2 - q")
-REFUSED = {
-    "twice": (TWICE, "x", "has a time transformation already"),
-    "driven": (DRIVEN, "q", "'driven' depends on time"),
-    "constant": (KEPLER, "m*mu", "constant"),
-    "velocity": (KEPLER, "1/sqrt(1 + x_dot**2)", "x_dot"),
-    "unknown": (KEPLER, "sqrt(x**2 + z**2)", "z"),
-    "misspelt": (KEPLER, "frequenzy", "no time transformation 'frequenzy'.*'frequency'"),
-    "no text": (KEPLER, 3, "not 3"),
-    "masses": (CHARGED, "frequency", "requires constant masses, one per coordinate"),
-    "uniform": (FREE, "frequency", "forces of 'free' do not depend on the position"),
-    "no distance": (FREE, "distance", "no distance in a denominator"),
-    "momenta": (KEPLER, "arclength", "hamiltonian_of"),
-}
-
-
-@pytest.mark.parametrize("name", REFUSED)
-def test_systems_without_a_time_transformation_are_rejected(name: str) -> None:
-    system, g, message = REFUSED[name]
-    with pytest.raises(SystemDefinitionError, match=message):
-        sc.reparametrise(system, g)
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ({"z": "u"}, ["u"], "no coordinate 'z'"),
-        ({"x": "u + w"}, ["u", "w"], "1 coordinates are replaced by 2"),
-        ({"x": "u + q"}, ["u"], "q"),
-        ({"x": "u + y", "y": "u + y"}, ["u", "w"], "y"),
-    ],
-)
-def test_invalid_coordinate_changes_are_rejected(old: dict[str, str], new: list[str], message: str) -> None:
-    with pytest.raises(SystemDefinitionError, match=message):
-        sc.change_coordinates(KEPLER, old, coordinates=new)
