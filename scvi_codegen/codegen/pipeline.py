@@ -161,7 +161,7 @@ def describe(
         map_exact=tuple(each.exact for each in program.quantities.momentum_maps),
         has_fallback=uses_fallback_library or (program.newton and program.fixed_point is not None),
         momentum_names=tuple(momentum.name for momentum in system.momentum_symbols),
-        time_transformation="" if g is None else str(g),
+        time_transformation=None if g is None else str(g),
         exchange_names=program.quantities.work_and_impulses,
         constraints=program.constraints.formulas if program.constraints else (),
         inputs=system.inputs,
@@ -171,7 +171,7 @@ def describe(
         arrays=_arrays_of(system),
         indices=tuple(f"{name} = {value}" for name, value in system.indices.items()),
         rotations=tuple(each.declaration for each in system.rotations),
-        energy_parameter=system.clock.energy.name if system.clock else "",
+        energy_parameter=system.clock.energy.name if system.clock else None,
         solver=_solver_of(program),
         variables=tuple(each.name for each in getattr(system, "variables", ())),
         lengths=system.lengths,
@@ -320,7 +320,7 @@ class Sources:
         interface = describe(
             self.program(), self.system, self.method, uses_fallback_library=self.uses_fallback_library, g=self.g
         )
-        return replace(interface, precision="" if self.precision == "double" else self.precision)
+        return replace(interface, words=2 if self.precision == DOUBLE_DOUBLE else 1)
 
     def integrator(self, *, controlled: bool = True) -> tuple[Source, Interface]:
         """Return the C source and its interface.

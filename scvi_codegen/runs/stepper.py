@@ -332,7 +332,7 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
     @property
     def _has_tau(self) -> bool:
         """Return whether steps are steps of tau, by a transformed system or the reversible controller."""
-        return bool(self.in_tau or self.interface.time_transformation)
+        return self.in_tau or self.interface.time_transformation is not None
 
     @checks_arguments(StateError)
     def start(
@@ -428,7 +428,7 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         Raises:
             StateError: if the bytes are damaged (their checksum differs) or belong to another integrator.
         """
-        transformed = bool(self.interface.time_transformation)
+        transformed = self.interface.time_transformation is not None
         if h is not None and not transformed:
             raise StateError("omit h: the saved run contains its step size")
         control = ErrorControl(tolerance, absolute_tolerance, max_step)

@@ -135,7 +135,7 @@ class TimeTransformation:
 
     rate: Expr
     energy: Symbol
-    time_transformation: str = field(default="", compare=False)
+    time_transformation: str | None = field(default=None, compare=False)
     plain: MechanicalSystem | None = field(default=None, compare=False, repr=False)
 
 

@@ -45,7 +45,7 @@ class Midpoint:
     defaults = MappingProxyType[str, float]({})
     flags = ("-O2",)
     interface = SimpleNamespace(
-        **dict.fromkeys(("rotations", "map_names", "inputs", "time_transformation"), ()), title="", has_fallback=False
+        title="", rotations=(), map_names=(), inputs=(), has_fallback=False, time_transformation=None
     )
     source = SimpleNamespace(files={"a.h": "1", "a.c": "2"})
     _input_size = 4
@@ -169,7 +169,7 @@ def test_the_worst_of_several_is_reported(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 TURNING = {"rotations": ("rotation R omega", "direction n", "spin s", "spin u")}
-IN_TAU, DENSITY = {"energy_parameter": "E"}, {"time_transformation": "q**2"}
+IN_TAU, DENSITY = {"in_tau": True}, {"time_transformation": "q**2"}
 SYMMETRIC, LEFT = "svi:2", "radau-iia:2"
 KINDS: list[tuple[Any, str, Any, dict[str, Any], str]] = [
     (structure_checks, SYMMETRIC, OSCILLATOR, {}, "symplecticity, reversal, L"),
@@ -216,8 +216,8 @@ def test_each_kind_of_system_has_its_checks(
         yield information(name, statement, None)
 
     monkeypatch.setitem(checks.__globals__, "checked", named)
-    names = {"map_names": ("L", "E"), "map_exact": (True, False), "rotations": (), "energy_parameter": ""}
-    interface = SimpleNamespace(**{**names, "time_transformation": ""} | changes)
+    names = {"map_names": ("L", "E"), "map_exact": (True, False), "rotations": (), "in_tau": False}
+    interface = SimpleNamespace(**{**names, "time_transformation": None} | changes)
     stepper, chosen = SimpleNamespace(interface=interface, changes_states=True), sc.as_method(method, system)
     tested = SimpleNamespace(system=system, method=chosen, stepper=stepper, scales=lambda _: None, initial=None)
     runs = SimpleNamespace(tested=tested, stepper=stepper)

@@ -308,7 +308,7 @@ def test_damaged_interfaces_of_packages_are_rejected(text: str, part: int, tmp_p
 def _use(folder: Path) -> None:
     stepper = sc.load_package(folder)
     q = np.linspace(0.3, 1.2, stepper.dimension)
-    run = stepper.integrate(q, 0 * q, h=0.01, steps=2, parameters=None if stepper.interface.energy_parameter else {})
+    run = stepper.integrate(q, 0 * q, h=0.01, steps=2, parameters=None if stepper.in_tau else {})
     run.save(folder / "a.csv")
     assert (repr(stepper), repr(run), run.energy(), stepper.momentum_maps(q, q)) is not None
 

@@ -58,7 +58,7 @@ def largest_step(
     if length == 0.0 or not 0.0 <= wanted < 1.0:
         raise StateError(f"span = {length:g} must not be 0, and tolerance = {wanted:g} must be in [0, 1)")
     check_inputs_given(stepper.interface, parameters)
-    reversible, end = bool(stepper.interface.time_transformation), t + length
+    reversible, end = stepper.interface.time_transformation is not None, t + length
     start = partial(stepper.start, q, p, t=t, t_end=end if reversible else None, options=options)
     first = abs(length) if reversible else length
     known = start(h=first, parameters=parameters).parameters

@@ -72,7 +72,7 @@ class Trials:
         self.stepper, self.quantile, self.state = stepper, quantile, {**state, "velocity": None}
         interface, t, parameters = stepper.interface, state["t"], state["parameters"]
         q, p, velocity = homogeneous_state(interface, q, state["p"], state["velocity"])
-        self.together = np.ndim(flat_state(interface, split(q, "q")[0] if interface.precision else q, "q")) == 2
+        self.together = np.ndim(flat_state(interface, split(q, "q")[0] if interface.words > 1 else q, "q")) == 2
         if self.together:
             momenta = momenta_of_each(stepper, q, p, velocity, t, parameters)
             self.q, self.p, self.state["parameters"] = start_of_ensemble(stepper, q, momenta, t, parameters)
@@ -86,7 +86,7 @@ class Trials:
         if not self.together:
             return self.q, self.state
         values = self.state["parameters"][j]
-        parameters = values if self.stepper.interface.precision else self.stepper.parameters_by_name(values)
+        parameters = values if self.stepper.interface.words > 1 else self.stepper.parameters_by_name(values)
         return self.q[j], {**self.state, "p": self.p[j], "parameters": parameters}
 
     def integrate(self, q: Array, *, h: float, steps: int, save_every: int) -> Any:

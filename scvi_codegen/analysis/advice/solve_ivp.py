@@ -235,7 +235,7 @@ def _plan(
             error = request.rtol or 0.0
             h = largest_step(stepper, q, p, end - start, error, **along)
             missed = lambda run: accuracy_message(run.step_error, run.worst_step_time, error) or ""  # noqa: E731
-        sign = 1.0 if stepper.interface.time_transformation else end - start
+        sign = end - start if stepper.interface.time_transformation is None else 1.0
         return {"h": math.copysign(checked_step(h), sign), "t_end": end}, missed
     if h is None:
         adaptive = request.tolerance is not None or stepper.binding.has("advance_to")

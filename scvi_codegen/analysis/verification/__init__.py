@@ -133,7 +133,7 @@ def _certificate(
 ) -> Certificate:
     flags, watched, stepper = stepper.flags, stepper, stepper.with_events(())
     steps, single = stepper, at_fixed_energy(system, stepper.energy(start.q, start.p, start.t))
-    if single is not system or stepper.interface.time_transformation:
+    if single is not system or stepper.interface.time_transformation is not None:
         steps = compile_stepper(single, method, solver=solver, flags=flags)
     tested = SystemUnderTest(single, method, steps, _newton(single, method, steps, solver, flags), start)
     paced = steps is not stepper or tolerance is not None

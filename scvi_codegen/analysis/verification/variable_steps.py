@@ -107,7 +107,7 @@ def at_fixed_energy(system: MechanicalSystem, energy: float) -> MechanicalSystem
 def variable_step_checks(runs: VariableSteps) -> Iterator[Check]:
     """Yield all checks of this module."""
     for name, statement, measure in (
-        _time_transformation_checks(runs) if runs.stepper.interface.energy_parameter else _adaptive_checks(runs)
+        _time_transformation_checks(runs) if runs.stepper.interface.in_tau else _adaptive_checks(runs)
     ):
         yield from checked(name, statement, partial(measure, runs))
 
@@ -122,7 +122,7 @@ def _time_transformation_checks(runs: VariableSteps) -> Iterator[tuple[str, str,
 
 def _adaptive_checks(runs: VariableSteps) -> Iterator[tuple[str, str, Any]]:
     yield "adaptive steps", "each equals a single step of the same size", _equal_single_steps
-    if runs.stepper.interface.time_transformation:
+    if runs.stepper.interface.time_transformation is not None:
         yield (
             "step density",
             "halving tau reduces the deviation from dt = g dtau at least 2.5-fold",
@@ -190,7 +190,7 @@ def _there_and_back(runs: VariableSteps) -> Finding:
 def _adaptive_run(runs: VariableSteps, part: float = 1.0) -> Trajectory:
     first = runs.tested.states[0]
     end = first.t + SPAN * first.h
-    if runs.stepper.interface.time_transformation:
+    if runs.stepper.interface.time_transformation is not None:
         return runs.run(h=part * runs.tau, t_end=end)
     return runs.run(t_end=end, tolerance=runs.tolerance or None)
 

@@ -126,7 +126,7 @@ class EventFormulas:
             for condition in event.conditions
         ]
         self.changes = [self._changes(*each) for each in zip(self.events, self.functions, strict=True)]
-        if interface.energy_parameter and any(event.changes_state for event in events):
+        if interface.in_tau and any(event.changes_state for event in events):
             raise EventError(
                 "events that change the state are impossible in transformed time, where the energy is the constant "
                 f"'{interface.energy_parameter}': compile the original system with time_transformation=.., or use "
@@ -292,7 +292,7 @@ def _search(interface: Interface, events: tuple[SearchedEvent, ...], header: str
     search = EventSearch(
         prefix=interface.prefix,
         dimension=interface.dimension,
-        transformed=bool(interface.energy_parameter),
+        transformed=interface.in_tau,
         constrained=bool(interface.constraints or interface.layout.constraints),
         nodes=lower_vector(to_unit(points)),
         coefficients=lower_matrix(coefficients),

@@ -24,6 +24,7 @@ SUPPORT = re.compile(r"support/(?:\w+/)?\w+\.h", re.ASCII)
 """Names of files, which are written into a folder and must not lead out of it."""
 KINDS: dict[str, Callable[[Any], bool]] = {
     "str": lambda value: isinstance(value, str),
+    "str | None": lambda value: value is None or isinstance(value, str),
     "int": lambda value: type(value) is int and 0 <= value < 2**40,
     "bool": lambda value: isinstance(value, bool),
     "tuple[str, ...]": lambda value: isinstance(value, tuple) and all(isinstance(each, str) for each in value),
@@ -203,7 +204,7 @@ def _check_names(source: Source, interface: Interface) -> None:
     if not set(interface.inputs) <= first:
         raise ValueError(f"the inputs {interface.inputs} must each have a first parameter NAME_0")
     parameter, functions = interface.energy_parameter, f"{source.prefix}_rates(" in source.header
-    if functions != bool(parameter) or not {parameter} <= {"", *interface.parameters}:
+    if functions != interface.in_tau or not {parameter} <= {None, *interface.parameters}:
         raise ValueError(f"energy_parameter: {parameter!r} must be a parameter of systems in transformed time")
     if interface.variables and not len(interface.variables) == 2 * len(interface.momentum_names):
         raise ValueError(f"variables: {interface.variables} must be the coordinates and momenta")
@@ -282,8 +283,8 @@ class Interface:
         exchange_names: of work and impulses of forces in a step: energy and momentum maps; none without forces.
         constraints: formulas g of the constraints g = 0.
         inputs: names of tabulated inputs, each of which has five parameters.
-        energy_parameter: of a time-transformed system, the parameter that is the energy of the initial state, else "".
-        time_transformation: time-rescaling function g in dt = g dtau that determines its step sizes, or "".
+        energy_parameter: of a time-transformed system, the parameter that is the energy of the initial state.
+        time_transformation: time-rescaling function g in dt = g dtau that determines its step sizes.
         conserves_energy: whether energy is a first integral.
         changes_energy: reason why it is not conserved; empty if it is.
         balances_energy: whether it changes by the work of forces or damping only.
@@ -298,7 +299,7 @@ class Interface:
             and half of which take the place of momenta; else none.
         lengths: cutoffs, skins and periods of lists of neighbours, ``("near", "cutoff", "5*s/2")``, which every run
             checks.
-        precision: :data:`DOUBLE_DOUBLE`, or "" for double precision.
+        words: number of doubles of each number of a state, 2 in double-double arithmetic.
         kinks: functions at whose zeros the equations are not smooth, for events.
     """
 
@@ -319,8 +320,8 @@ class Interface:
     map_exact: tuple[bool, ...] = ()
     momentum_names: tuple[str, ...] = ()
     has_fallback: bool = False
-    energy_parameter: str = ""
-    time_transformation: str = ""
+    energy_parameter: str | None = None
+    time_transformation: str | None = None
     exchange_names: tuple[str, ...] = ()
     constraints: tuple[str, ...] = ()
     inputs: tuple[str, ...] = ()
@@ -334,13 +335,19 @@ class Interface:
     layout: ArrayLayout = ArrayLayout()
     variables: tuple[str, ...] = ()
     lengths: tuple[tuple[str, ...], ...] = ()
-    precision: str = ""
+    words: int = 1
     kinks: tuple[str, ...] = ()
 
     @property
-    def words(self) -> int:
-        """Number of doubles of each number of a state: 2 in double-double arithmetic."""
-        return 2 if self.precision == DOUBLE_DOUBLE else 1
+    def in_tau(self) -> bool:
+        """Whether the system is one in transformed time, whose steps are steps of tau."""
+        return self.energy_parameter is not None
+
+    @property
+    def energy_index(self) -> int:
+        """Index of :attr:`energy_parameter` of transformed time among the parameters."""
+        assert self.energy_parameter is not None
+        return self.parameters.index(self.energy_parameter)
 
     @property
     def dimension(self) -> int:
@@ -382,6 +389,8 @@ class Interface:
             if each.name in arguments and not KINDS[str(each.type)](arguments[each.name]):
                 raise ValueError(f"{each.name} is {arguments[each.name]!r:.60}: it must be of type {each.type}")
         interface = cls(**arguments)
+        if interface.words not in (1, 2):
+            raise ValueError(f"words is {interface.words}: it must be 1 or, in double-double arithmetic, 2")
         try:
             valid = all(isinstance(value, int | list) for value in interface.index_values.values())
         except RecursionError:

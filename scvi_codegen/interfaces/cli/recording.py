@@ -162,7 +162,7 @@ class Recording:
         manifest, further = recorded.manifest, dict[str, Any]()
         if manifest.plan and span is not None:
             further["t_end"] = manifest.t + math.copysign(span, manifest.plan.t_end - manifest.t)
-        elif span is not None and manifest.interface.energy_parameter:
+        elif span is not None and manifest.interface.in_tau:
             raise click.UsageError(
                 "a recorded run in transformed time needs a number of steps: give --steps, not --span"
             )
@@ -212,7 +212,7 @@ def describe_progress(recorded: RecordedRun) -> str:
         progress_text += "" if recorded.finished else f" (of {manifest.plan.t_end:g})"
     else:
         far = "all" if recorded.finished else f"of {manifest.steps}"
-        if manifest.interface.energy_parameter:
+        if manifest.interface.in_tau:
             done, t = f"{done} in tau", float(recorded.t[-1])
         progress_text = f"{done} ({far}) of {manifest.h:g} from t = {manifest.t:g} to t = {t:g}"
     continuation = f"{counted(len(recorded), 'state')} saved in '{recorded.folder}'"

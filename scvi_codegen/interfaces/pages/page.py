@@ -251,7 +251,7 @@ def _interface(folder: Path, model: Model) -> SimpleNamespace:
         array=True, title=data["title"], system=model.system.name, coordinates=[], momentum_names=[], rotations=[],
         constraints=[], map_names=[], parameters=list(scalars), defaults=list(scalars.values()),
         conserves_energy=not model.system.changes_energy,
-        sizes=data["sizes"], inputs=[], energy_parameter="",
+        sizes=data["sizes"], inputs=[], energy_parameter=None,
     )  # fmt: skip
 
 
@@ -283,7 +283,7 @@ def _entry(folder: Path, model: Model, interface: Any, initial: Sequence[str], a
             first_step=model.first_step,
             absolute_tolerances=_absolute_tolerances(model, interface), events=model.events,
             acting=any(each.changes_state for each in model.events), velocities=not starts_from_momenta(model),
-            level=interface.parameters.index(energy) if (energy := interface.energy_parameter) else None,
+            level=None if (energy := interface.energy_parameter) is None else interface.parameters.index(energy),
             axes={f"at_{name}": nodes for name, nodes in axes.items()},
             names={f"at_{name}": k for k, name in enumerate(interface.parameters)},
         )

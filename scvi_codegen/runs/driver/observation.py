@@ -349,7 +349,7 @@ class Observation:
             self.run.rollback(before)
             whole -= 1
             part = record(self.run, whole)
-        in_words = self.run.stepper.interface.words > 1 and not self.run.stepper.interface.time_transformation
+        in_words = self.run.stepper.interface.words > 1 and self.run.stepper.interface.time_transformation is None
         if whole and in_words and 0.0 < abs(self.run.left_to(self.end)) <= WHOLE * abs(self.run.h):
             self.run.rollback(before)  # the last step is longer than h by its rounding error
             whole -= 1
@@ -431,6 +431,6 @@ class Observation:
         self, t: Array, q: Array, p: Array, iterations: NDArray[np.int32], lengths: Array, stepped: Array
     ) -> Trajectory:
         crossings = self.search.crossings() if self.search is not None else ()
-        tau = stepped if self.run.stepper.interface.energy_parameter else None
+        tau = stepped if self.run.stepper.in_tau else None
         steps = self.run.steps + (self.partial_steps if self.arrived else 0)
         return trajectory_of(self.run, (t, q, p, iterations), lengths, steps=steps, events=crossings, tau=tau)

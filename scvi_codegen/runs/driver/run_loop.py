@@ -282,7 +282,7 @@ class _StateRecorder:
         if memory._h is None:
             return trajectory_of(memory, states, _differences(states[0], whole=self.save_every == 1))
         tau, h = None, memory._memory.h
-        if memory.stepper.interface.energy_parameter:
+        if memory.stepper.in_tau:
             numbers = self.save_every * (self.first // self.save_every + np.arange(len(states[0])))
             numbers[0] = self.first
             tau = times_after(0.0, h, numbers)[0]

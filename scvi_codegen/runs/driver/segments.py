@@ -75,7 +75,7 @@ def checked_inputs(
     Raises:
         StateError: if a name is no input, an input is missing, or data define no function of time.
     """
-    if interface.energy_parameter and argument is not None:
+    if interface.in_tau and argument is not None:
         raise refusal("inputs", "in transformed time")
     names, argument = interface.inputs, dict(argument or {})
     for name in argument:

@@ -56,7 +56,7 @@ def check_energy_surface(states: Trajectory, longest: float) -> None:
     if not len(short):
         return
     stepper = states.stepper
-    energy = states.parameters[stepper.parameters.index(stepper.interface.energy_parameter)]
+    energy = states.parameters[stepper.interface.energy_index]
     arguments = states.q[short], states.p[short], states.t[short], states.parameters
     moving = np.abs((states.p[short] * stepper.velocity(*arguments)).sum(axis=1))
     energies = stepper.energy(*arguments)

@@ -57,7 +57,6 @@ from scvi_codegen.runs.states.validation import (
     States,
     check_left_to_inputs,
     columns_of_inputs,
-    parameter_index,
 )
 from scvi_codegen.runs.states.words import check_doubles, checked_time, hashed, missing, stacked
 from scvi_codegen.runs.stepping.features import check_together, require
@@ -171,7 +170,7 @@ class Ensemble:
         *start, self.parameters = start_of_ensemble(stepper, q, p, self.t0, parameters)
         self.start = start[0], start[1]
         if not stepper._has_energy(parameters):
-            energy = parameter_index(interface, interface.energy_parameter)
+            energy = interface.energy_index
             for values, at, momenta in zip(self.parameters, *self.start, strict=True):
                 values[energy] = stepper.energy(at, momenta, 0.0, values)
         self.values_at = partial(parameters_at, stepper.parameters, self.parameters, self.inputs)
@@ -633,7 +632,7 @@ def _steps_or_end(
     if h is not None and t_end is not None and np.ndim(t_end):
         raise StateError("with h all trajectories have one t_end: give one number, or omit h (adaptive step size)")
     first = None if t_end is None else float(real_array(t_end, "t_end").flat[0])
-    planned_steps.__wrapped__(h, steps, first, *control, 1, hashed(t), "", False, 1)
+    planned_steps.__wrapped__(h, steps, first, *control, 1, hashed(t), None, False, 1)
     if h is None or (inputs is None and first is None):
         return steps, t_end
     return None, final_time(t, h, steps, first)

@@ -42,7 +42,7 @@ def momenta_of_each(
         raise StateError(f"q and velocity must have equal shapes, not {positions.shape} and {velocities.shape}")
     values = parameters_of_each(stepper, parameters, len(positions))
     interface = stepper.interface
-    if interface.words > 1 or interface.energy_parameter or interface.layout.momenta:
+    if interface.words > 1 or interface.in_tau or interface.layout.momenta:
         states = zip(positions, velocities, values, strict=True)
         return stacked([stepper.initial_momentum(position, v, t, value) for position, v, value in states])
     momenta = np.empty_like(positions)
@@ -69,7 +69,7 @@ def start_of_ensemble(
 
 def _states(stepper: Integrator, value: States, name: str) -> Array:
     """Return a validated (k, m) array of finite numbers."""
-    value, low = split(value, name) if stepper.interface.precision else (value, None)
+    value, low = split(value, name) if stepper.interface.words > 1 else (value, None)
     array = real_array(flat_state(stepper.interface, value, name), name)
     if array.ndim == 1:
         array = array[np.newaxis]
@@ -89,7 +89,7 @@ def _states(stepper: Integrator, value: States, name: str) -> Array:
 def parameters_of_each(stepper: Integrator, argument: EnsembleParameters, count: int) -> Array:
     """Return (k, number of parameters) values: defaults overridden by name (one or k numbers each) or by an array."""
     defaults = np.asarray(stepper.defaults, dtype=float)
-    if stepper.interface.precision:
+    if stepper.interface.words > 1:
         parts = zip(split(argument, "parameters"), (defaults, np.zeros_like(defaults)), strict=True)
         high, low = (_parameters_of_each(stepper, part, count, default) for part, default in parts)
         values: Array = with_low(high, low)

@@ -77,7 +77,7 @@ class CommonRuns:
         self.actions = np.full(shape[:2], np.nan) if self.stepper.sums_action else None
         if self.actions is not None:
             self.actions[0] = 0.0
-        self.times = np.full(shape[:2], np.nan) if self.stepper.interface.energy_parameter else None
+        self.times = np.full(shape[:2], np.nan) if self.stepper.in_tau else None
         if self.times is not None:
             self.times[0] = self.steps.t0
         self.status, self.done = np.full(len(self), OK, dtype="<U32"), np.zeros(len(self), dtype=np.int64)

@@ -120,7 +120,7 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
         trajectory: type[Trajectory] = cast(Any, self.stepper)._trajectory_type
         j = checked_row(j, len(self))
         parts = [(good, parameters) for k, good, parameters in self._with_parameters() if k == j]
-        times, in_tau = self._times()[:, j], bool(self.stepper.interface.energy_parameter)
+        times, in_tau = self._times()[:, j], self.stepper.in_tau
         plan = self.plans[j] if self.plans else Fixed(self.h)
         pieces = []
         for number, (good, parameters) in enumerate(parts):
@@ -297,7 +297,7 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
         return to_dataset(self._labelled(checked_units(units)))
 
     def _check_common_times(self) -> None:
-        if self.stepper.interface.energy_parameter:
+        if self.stepper.in_tau:
             raise StateError("ensembles in transformed time cannot be saved: their trajectories have no common times")
 
     def _labelled(self, units: Mapping[str, str]) -> Labelled:

@@ -279,7 +279,7 @@ class RecordedRun(AttitudeHistory):
         t, q, p, iterations = piece
         manifest, run = self.manifest, self._checkpointed_run
         taken = manifest.save_every * rows
-        transformed = bool(manifest.interface.energy_parameter)
+        transformed = manifest.interface.in_tau
         tau = times_after(0.0, manifest.h, taken)[0] if transformed else None
         lengths, low, high = self._lengths(t, rows), t.min(initial=np.inf), t.max(initial=-np.inf)
         events = tuple(each.chosen((each.t >= low) & (each.t <= high)) for each in self.events)

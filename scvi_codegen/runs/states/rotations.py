@@ -89,7 +89,7 @@ def homogeneous_state(interface: Interface, q: Any, p: Any, velocity: Any) -> tu
 
 
 def _homogeneous_state_of_two_words(interface: Interface, q: Any, p: Any, velocity: Any) -> tuple[Any, Any, Any]:
-    doubles = replace(interface, precision="")
+    doubles = replace(interface, words=1)
     if interface.variables:
         if p is not None or velocity is not None:
             return homogeneous_state(doubles, q, p, velocity)
@@ -131,7 +131,7 @@ def flat_states(interface: Interface, q: States, other: States | None, name: str
 
 def checked_pair(interface: Interface, q: States, other: States, name: str = "p") -> tuple[Array, Array]:
     """Return finite, contiguous (m,) copies of positions and momenta (or what ``name`` names), also by name."""
-    if not interface.precision and (isinstance(q, Mapping) or isinstance(other, Mapping)):
+    if interface.words == 1 and (isinstance(q, Mapping) or isinstance(other, Mapping)):
         q, other = flat_states(interface, q, other, name)
     return checked_vector(interface, q, "q"), checked_vector(interface, other, name)
 
@@ -140,9 +140,9 @@ def checked_states(
     interface: Interface, q: States, p: States, t: ArrayLike, *, second: str = "p"
 ) -> tuple[Array, Array, Array]:
     """Return (n,) times and contiguous (n, m) positions and momenta (or what ``second`` names) of one or n states."""
-    if interface.precision:
+    if interface.words > 1:
         words = [split(each, name) for each, name in ((q, "q"), (p, second), (t, "the time t"))]
-        doubles = replace(interface, precision="")
+        doubles = replace(interface, words=1)
         high, low = (checked_states(doubles, *each, second=second) for each in zip(*words, strict=True))
         times, positions, momenta = map(with_low, high, low)
         return times, positions, momenta
@@ -166,7 +166,7 @@ def checked_states(
 
 def is_one_state(interface: Interface, q: States) -> bool:
     """Return whether these are the positions of one state, not of several."""
-    if interface.precision:
+    if interface.words > 1:
         q = split(q, "q")[0]
     plain = not isinstance(q, Mapping) and real_array(q, "q").ndim == 1
     return plain or real_array(flat_states(interface, q, None, "p")[0], "q").ndim == 1

@@ -155,9 +155,9 @@ def _short_vector(value: Any, count: int) -> Array | None:
 
 def checked_vector(interface: Interface, value: States, name: str) -> Array:
     """Return a finite, contiguous (m,) copy; for one coordinate a number suffices."""
-    if interface.precision:
+    if interface.words > 1:
         value, low = split(value, name)
-        high = checked_vector(replace(interface, precision=""), value, name)
+        high = checked_vector(replace(interface, words=1), value, name)
         words: Array = with_low(high, np.asarray(flat_state(interface, low, name), dtype=float).reshape(high.shape))
         return words
     if (vector := _short_vector(value, len(interface.coordinates))) is not None:
@@ -176,9 +176,9 @@ def checked_vector(interface: Interface, value: States, name: str) -> Array:
 
 def checked_parameters(interface: Interface, parameters: Parameters, base: Array | None = None) -> Array:
     """Return the (k,) parameter values in order; by default those of ``base``, or the defaults."""
-    if interface.precision:
+    if interface.words > 1:
         parameters, low = split(parameters, "parameters")
-        doubles = replace(interface, precision="")
+        doubles = replace(interface, words=1)
         high = checked_parameters(doubles, parameters, base if base is None else np.asarray(base))
         before = np.zeros(high.shape) if base is None else low_words(base)
         words: Array = with_low(high, checked_parameters(replace(doubles, lengths=()), low, before))

@@ -115,7 +115,7 @@ class CompiledMethod(ChosenBySizes):
         problem: RunSizes | None = None,
     ) -> None:
         self.interface, self.flags, self.events = interface, flags, events
-        self.in_tau = bool(interface.energy_parameter)
+        self.in_tau = interface.in_tau
         self.changes_states = any(event.changes_state for event in events)
         self.origin, self.problem, self._of_sizes, self._reason = origin, problem, of_sizes, reason
         self._variants = Variants() if variants is None else variants

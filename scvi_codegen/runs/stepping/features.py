@@ -53,11 +53,9 @@ OPERATIONS = {
 SHORT_STEPS = ("svi-1-", "svi-2-", "stoermer-verlet", "composition")
 """Beginnings of the names of methods whose steps are short enough for the interpolation of the shadow energy."""
 PROPERTIES: dict[str, Callable[[Any], bool]] = {
-    "with a time transformation": lambda stepper: bool(stepper.interface.time_transformation),
-    "in transformed time": lambda stepper: bool(stepper.interface.energy_parameter),
-    "in transformed time of a first-order system": lambda stepper: bool(
-        stepper.interface.energy_parameter and stepper.interface.variables
-    ),
+    "with a time transformation": lambda stepper: stepper.interface.time_transformation is not None,
+    "in transformed time": lambda stepper: stepper.in_tau,
+    "in transformed time of a first-order system": lambda stepper: bool(stepper.in_tau and stepper.interface.variables),
     "for a first-order system": lambda stepper: bool(stepper.interface.variables),
     "with events that change the state": lambda stepper: stepper.changes_states,
     "with constraints": lambda stepper: bool(stepper.interface.constraints or stepper.interface.layout.constraints),

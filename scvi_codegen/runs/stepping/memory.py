@@ -204,7 +204,7 @@ class Memory:
             self._parameters[:] = stepper._parameters_at(q, p, parameters)
             self._check_masses()
             self._unset_inputs = inputs_not_given(interface, parameters)
-            self._has_defaults = parameters is None and not interface.energy_parameter
+            self._has_defaults = parameters is None and not stepper.in_tau
         if plan is not self._plan:
             self.plan = plan
         if options is not self._options:

@@ -41,7 +41,7 @@ def multipliers(stepper: Integrator, q: States, p: States, t: ArrayLike, paramet
     values = np.empty((len(times), len(stepper.constraints) * stepper.interface.words))
     _call(stepper, "multipliers", times, positions, momenta, parameters, values)
     values = stepper._numbers(values)
-    if stepper.interface.energy_parameter:
+    if stepper.in_tau:
         values = quotient_of(values, stepper.rates(positions, momenta, parameters)[:, np.newaxis])
     return values
 

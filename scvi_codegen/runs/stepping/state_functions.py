@@ -20,7 +20,6 @@ from scvi_codegen.runs.states.validation import (
     checked_parameters,
     checked_vector,
     coordinate_shapes,
-    parameter_index,
 )
 from scvi_codegen.runs.states.words import block_of, by_name, checked_time, from_block, low_words, scalar, unnamed
 from scvi_codegen.runs.stepping.array_interface import constraint_shapes
@@ -40,19 +39,19 @@ class StateFunctions(CompiledMethod):
         values = self._parameters(parameters)
         if not self._has_energy(parameters):
             q, p = checked_pair(self.interface, q, p)
-            values[parameter_index(self.interface, self.interface.energy_parameter)] = self.energy(q, p, 0.0, values)
+            values[self.interface.energy_index] = self.energy(q, p, 0.0, values)
         return values
 
     def _has_energy(self, parameters: Mapping[str, Any] | Sequence[Any] | Array | None) -> bool:
         """Return whether the parameters contain the energy required by transformed time, or none is required."""
         name = self.interface.energy_parameter
-        return not name or (parameters is not None and (not isinstance(parameters, Mapping) or name in parameters))
+        return name is None or (parameters is not None and (not isinstance(parameters, Mapping) or name in parameters))
 
     def rates(self, q: States, p: States, parameters: Parameters = None) -> Array:
         """Return (n,) rates dt/dtau at (n, m) states; 1 if time is not transformed."""
         _, positions, momenta = checked_states(self.interface, q, p, 0.0)
         rates = np.ones((positions.size // self.dimension, self.interface.words))
-        if not self.interface.energy_parameter:
+        if not self.in_tau:
             return rates[:, 0]
         arrays = *map(block_of, (positions, momenta, self._parameters(parameters))), rates
         if self.binding.function("rates")(len(rates), *map(self.binding.pointer, arrays)):
@@ -154,8 +153,8 @@ class StateFunctions(CompiledMethod):
             raise StateError(f"the energy of a state cannot be computed: {REASONS[status]}")
         if self.interface.words > 1:
             result = from_block(result.reshape(-1, 2))[:, 0]
-        if name := self.interface.energy_parameter:
-            energy = parameters[parameter_index(self.interface, name)]
+        if self.in_tau:
+            energy = parameters[self.interface.energy_index]
             result = sum_of(energy, quotient_of(result, self.rates(q, p, parameters)))
         return result
 
@@ -216,10 +215,10 @@ class StateFunctions(CompiledMethod):
 
     def _transformed(self, name: str, t: float, q: Array, other: Array, values: Array) -> Array:
         """Transform between p and dq/dt in transformed time, on the energy surface of the state."""
-        if not self.interface.energy_parameter:
+        if not self.in_tau:
             return self._called(name, t, q, other, values)
         if name == "velocity":
-            values[parameter_index(self.interface, self.interface.energy_parameter)] = self.energy(q, other, t, values)
+            values[self.interface.energy_index] = self.energy(q, other, t, values)
             return quotient_of(self._called(name, t, q, other, values), self.rates(q, other, values))
         rate = self.rates(q, np.zeros_like(q), values)
         p = self._called(name, t, q, product_of(other, rate), values)

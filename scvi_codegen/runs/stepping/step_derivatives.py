@@ -101,13 +101,13 @@ class LinearisedMethod(StateFunctions):
     @property
     def _output_indices(self) -> NDArray[np.intp]:
         """Indices of the outputs among the variables: (q, p), and in transformed time also t."""
-        clock = [self._input_size - 2] if self.interface.energy_parameter else []
+        clock = [self._input_size - 2] if self.in_tau else []
         return np.array([*range(2 * self.dimension), *clock], dtype=np.intp)
 
     @property
     def _energy_index(self) -> int:
         """Index of the energy parameter of transformed time among the variables."""
-        return 2 * self.dimension + self.parameters.index(self.interface.energy_parameter)
+        return 2 * self.dimension + self.interface.energy_index
 
     def _energy_gradient(self, q: Array, p: Array, parameters: Array) -> Array:
         """Return the (variables,) gradient of the energy of a state by all variables; 0 if time is not transformed.
@@ -116,7 +116,7 @@ class LinearisedMethod(StateFunctions):
             StateError: if the gradient is undefined.
         """
         gradient, name = np.zeros(self._input_size), self.interface.energy_parameter
-        if not name:
+        if name is None:
             return gradient
         others = dict(zip(self.parameters, parameters.tolist(), strict=True))
         del others[name]

@@ -309,23 +309,28 @@ def _check_resolved(tolerance: float, least: float) -> None:
 
 
 def checked_plan(
-    h: float | None, t_end: float | None, control: ErrorControl, controller: str = "", in_tau: bool = False, /
+    h: float | None,
+    t_end: float | None,
+    control: ErrorControl,
+    time_transformation: str | None = None,
+    in_tau: bool = False,
+    /,
 ) -> StepPlan:
     """Return the step plan of arguments of users.
 
     Args:
         h, t_end: step size; target time.
         control: of adaptive steps.
-        controller: time transformation of the reversible controller, "" without one.
+        time_transformation: of the reversible controller, if there is one.
         in_tau: whether the system is one in transformed time, which has fixed steps only.
 
     Raises:
         StateError: if a number is invalid, or they do not determine the steps.
     """
-    if controller:
+    if time_transformation is not None:
         if h is None or t_end is None or control.named:
             remedy = FEATURES["adaptive", "with a time transformation"]
-            raise StateError(f"the time transformation {controller} determines the step size: {remedy}")
+            raise StateError(f"the time transformation {time_transformation} determines the step size: {remedy}")
         tau = checked_step(h)
         if tau < 0.0:
             raise StateError(f"h = {h:g} must be positive with a time transformation: t_end determines the direction")
@@ -354,7 +359,7 @@ def planned_steps(
     first_step: float | None,
     save_every: int,
     t: float | Fraction,
-    controller: str,
+    time_transformation: str | None,
     in_tau: bool,
     words: int,
     /,
@@ -364,15 +369,15 @@ def planned_steps(
     Args:
         h, steps, t_end, tolerance, absolute_tolerance, max_step, first_step, save_every, t: arguments of
             :meth:`Stepper.integrate`; t matters with h and t_end.
-        controller, in_tau: as of :func:`checked_plan`.
+        time_transformation, in_tau: as of :func:`checked_plan`.
         words: number of words of the states; runs in double-double end at t_end to 32 digits.
 
     Raises:
         StateError: if a number is invalid, or they do not determine the steps.
     """
-    fixed = h is not None and not controller
+    fixed = h is not None and time_transformation is None
     control = ErrorControl(tolerance, absolute_tolerance, max_step, first_step)
-    plan = checked_plan(h, None if fixed else t_end, control, controller, in_tau)
+    plan = checked_plan(h, None if fixed else t_end, control, time_transformation, in_tau)
     if words > 1:
         check_doubles(t_end=t_end)
     if not isinstance(plan, FixedSteps):
