@@ -345,9 +345,9 @@ class TestHonesty:
 class TestEnsembles:
     ECCENTRICITIES = (0.1, 0.6, 0.3, 0.2)
 
-    def advised(self, quantile: float = 1.0) -> Advice:
+    def advised(self) -> Advice:
         q, p = map(np.array, zip(*map(kepler_start, self.ECCENTRICITIES), strict=True))
-        return advise(problem("kepler").system, SVI(6), q, p, 100.0, 1e-8, quantile=quantile)
+        return advise(problem("kepler").system, SVI(6), q, p, 100.0, 1e-8)
 
     def test_step_is_that_of_the_worst_trajectory(self):
         """The errors of all trajectories, against the exact solution, are within the tolerance."""
@@ -371,12 +371,6 @@ class TestEnsembles:
         alone = advise(system, SVI(8), q[advice.member], p[advice.member], 5000.0, 1e-8)
         assert advice.steps == pytest.approx(alone.steps, rel=0.25)
 
-    def test_quantile_leaves_out_the_worst_trajectories(self):
-        advice = self.advised(0.7)
-        assert advice.member == 2
-        assert "has the error that 0.7 of them do not exceed." in advice.message
-        assert advice.steps < 0.6 * self.advised().steps
-
     def test_parameters_of_each_trajectory_count(self):
         """Oscillators of frequencies 1 and 5: the step is that of the second."""
         system, states = lagrange("oscillator", "q", "q_dot**2/2 - k*q**2/2", k=1.0), ([[1.0], [1.0]], [[0.0], [0.0]])
@@ -386,15 +380,11 @@ class TestEnsembles:
         assert advice.steps == pytest.approx(alone.steps, rel=0.1)
 
     @pytest.mark.second
-    def test_failing_trajectory_counts_unless_the_quantile_excludes_it(self):
+    def test_failing_trajectory_counts(self):
         system = lagrange("runaway", "q", "q_dot**2/2 + a*q**3/3 - q**2/2", a=1.0)
         states, given = ([[0.1], [1.0], [0.2]], [[0.0], [1.0], [0.0]]), {"a": [0.0, 1.0, 0.0]}
         with pytest.raises(StateError, match="may end in a singularity"):
             advise(system, Gauss(2), *states, 10.0, 1e-6, parameters=given)
-        advice = advise(system, Gauss(2), *states, 10.0, 1e-6, parameters=given, quantile=0.6)
-        assert advice.member in (0, 2)
-        with pytest.raises(StateError, match=r"quantile must be above 0 and at most 1, not 1\.5"):
-            advise(system, Gauss(2), *states, 10.0, 1e-6, quantile=1.5)
 
 
 class TestCommandLine:

@@ -132,7 +132,6 @@ def advise(
     solver: str = "auto",
     options: SolverOptions | None = None,
     precision: str = "double",
-    quantile: float = 1.0,
 ) -> Advice:
     """Recommend the largest fixed step size with which positions at the end of a run meet a tolerance.
 
@@ -160,7 +159,6 @@ def advise(
         solver, options: solver of the stage equations, as of ``compile_stepper``, and options of the run.
         precision: ``"double-double"`` for tolerances below 1e-12, as of ``compile_stepper``; the last step of a run
             to ``t + span`` is then shorter.
-        quantile: part of the trajectories of an ensemble whose errors must meet the tolerance; 1: all of them.
 
     Returns:
         The recommendation, reproducible. It has warnings if the tolerance cannot be met (round-off, chaos), or if that
@@ -180,8 +178,6 @@ def advise(
             f"'{known.name}' is in transformed time: no step size is recommended; use largest_step or try h"
         )
     length, target = _checked_request(span, tolerance)
-    if not 0.0 < checked_number(quantile, "quantile") <= 1.0:
-        raise StateError(f"quantile must be above 0 and at most 1, not {quantile!r}")
     state = {"p": p, "velocity": velocity, "t": t, "parameters": parameters, "options": options}
     result: list[tuple[float, Advice]] = []
     failures: list[StateError] = []
@@ -191,7 +187,7 @@ def advise(
     for candidate in _candidates(method, 1 + (precision == DOUBLE_DOUBLE)) if degree else [method]:
         for stepper in _steppers(compiled, known, candidate, solver):
             try:
-                trials = Trials(stepper, q, state, quantile)
+                trials = Trials(stepper, q, state)
                 result.append(_advised(trials, candidate, is_symplectic(candidate, known), length, target))
             except StateError as failure:
                 failures.append(failure)
@@ -231,7 +227,6 @@ def _advised(trials: Trials, method: Method, symplectic: bool, span: float, tole
         target_error=tolerance / SAFETY,
         most=most,
         words=trials.stepper.interface.words,
-        quantile=trials.quantile,
     )
     choice, overhead = _choose(pilot, tolerance), OVERHEAD[pilot.words]
     nearest = min(pilot.good, key=lambda k: abs(math.log(k / choice.n)))
@@ -382,9 +377,7 @@ def _sentences(
         growth = "exponentially" if pilot.rate else f"like t^{pilot.growth:.1f}"
         yield f"The pilot runs covered {pilot.length:.4g} of {pilot.span:.4g}, where errors grew {growth}."
     if member is not None:
-        part = f"the error that {pilot.quantile:g} of them do not exceed"
-        which = "the largest error" if pilot.quantile == 1.0 else part
-        yield f"Of {pilot.count} trajectories, number {member} (from 0) has {which}."
+        yield f"Of {pilot.count} trajectories, number {member} (from 0) has the largest error."
     if not choice.tried:
         yield f"So small a step was not tried: the error is extrapolated by order {pilot.order}."
     failing = [n for n, leg in pilot.runs.items() if leg.failure]

@@ -64,12 +64,11 @@ class Trials:
     Attributes:
         q, p: (m,) positions and momenta, or (k, m) of an ensemble.
         together: whether they are those of an ensemble.
-        quantile: part of its trajectories that must succeed.
         count: number of trajectories.
     """
 
-    def __init__(self, stepper: Stepper, q: States, state: Mapping[str, Any], quantile: float) -> None:
-        self.stepper, self.quantile, self.state = stepper, quantile, {**state, "velocity": None}
+    def __init__(self, stepper: Stepper, q: States, state: Mapping[str, Any]) -> None:
+        self.stepper, self.state = stepper, {**state, "velocity": None}
         interface, t, parameters = stepper.interface, state["t"], state["parameters"]
         q, p, velocity = homogeneous_state(interface, q, state["p"], state["velocity"])
         self.together = np.ndim(flat_state(interface, split(q, "q")[0] if interface.words > 1 else q, "q")) == 2
@@ -81,30 +80,28 @@ class Trials:
             self.q, self.p = start.q, start.p
         self.state["p"], self.count = self.p, len(self.q) if self.together else 1
 
-    def one(self, j: int) -> tuple[Array, dict[str, Any]]:
-        """Return the positions of trajectory j, and the other arguments of its run."""
-        if not self.together:
-            return self.q, self.state
-        values = self.state["parameters"][j]
+    def _first(self) -> tuple[Array, dict[str, Any]]:
+        """Return the positions of the first trajectory of an ensemble, and the other arguments of its run."""
+        values = self.state["parameters"][0]
         parameters = values if self.stepper.interface.words > 1 else self.stepper.parameters_by_name(values)
-        return self.q[j], {**self.state, "p": self.p[j], "parameters": parameters}
+        return self.q[0], {**self.state, "p": self.p[0], "parameters": parameters}
 
     def integrate(self, q: Array, *, h: float, steps: int, save_every: int) -> Any:
         """Integrate as :meth:`Stepper.integrate`, an ensemble in one call; iterations are those of one trajectory.
 
         Raises:
-            StepFailedError: if more trajectories fail than the quantile allows.
+            StepFailedError: if a trajectory fails.
         """
         plan: dict[str, Any] = {"h": h, "steps": steps, "save_every": save_every}
         if not self.together:
             return self.stepper.integrate(q, **self.state, **plan)
         runs = self.stepper.integrate_ensemble(q, **self.state, **plan)
         failed, counted = np.flatnonzero(~runs.ok), min(steps, COUNTED)
-        if len(failed) > len(q) - math.ceil(self.quantile * len(q)):
+        if len(failed):
             status, step = str(runs.status[failed[0]]), int(runs.steps[failed[0]])
             message = f"trajectory {failed[0]} failed: {status}"
             raise StepFailedError(message, status=status, step=step, t=float(runs.ends[0][failed[0]]), residual=0.0)
-        q_of_one, state = self.one(int(np.argmax(runs.ok)))
+        q_of_one, state = self._first()
         alone = self.stepper.integrate(q_of_one, **state, h=h, steps=counted, save_every=counted)
         return _Together(runs, alone.iterations.sum() * (steps / counted))
 
@@ -127,11 +124,8 @@ class _Together(NamedTuple):
 
     @property
     def velocity(self) -> Array:
-        """(n, k, m) velocities; NaN of trajectories that failed."""
-        velocity = np.full(self.q.shape, np.nan)
-        for j in np.flatnonzero(self.runs.ok).tolist():
-            velocity[:, j] = self.runs[j].velocity
-        return velocity
+        """(n, k, m) velocities."""
+        return np.stack([self.runs[j].velocity for j in range(self.q.shape[1])], axis=1)
 
 
 class PilotRun(NamedTuple):
@@ -153,7 +147,6 @@ def run_pilot(
     target_error: float,
     most: int,
     words: int = 1,
-    quantile: float = 1.0,
 ) -> Pilot:
     """Return pilot runs over the longest part of the span that can be resolved, with steps down to the error bound.
 
@@ -167,7 +160,6 @@ def run_pilot(
         target_error: error bound at the end of the span.
         most: largest number of steps of a run.
         words: number of doubles of each number of a state.
-        quantile: part of the trajectories whose errors must be within the bound.
 
     Raises:
         StateError: if the motion is at rest.
@@ -175,7 +167,7 @@ def run_pilot(
     """
     pilot, first = None, 1
     for cuts in range(MAX_SHORTENINGS, -1, -1):
-        longer = Pilot(integrate, method, q, span, span / SHORTENING**cuts, symplectic, words, quantile)
+        longer = Pilot(integrate, method, q, span, span / SHORTENING**cuts, symplectic, words)
         longer.resolve(first, most // SEARCH)
         if not longer.resolved:
             break
@@ -189,8 +181,8 @@ def run_pilot(
         )
     if not pilot.whole:
         pilot.rates = pilot.divergence_rates(most // SEARCH)
-    if (count := pilot.count_at_rest) > pilot._rank(pilot.count):
-        which = f"{count} of {pilot.count} trajectories are" if pilot.count > 1 else "the motion is"
+    if pilot.at_rest:
+        which = f"all {pilot.count} trajectories are" if pilot.count > 1 else "the motion is"
         raise StateError(
             f"{which} at rest over t = {pilot.length:.3g}: errors relative to its size are undefined; give an "
             "initial state that moves, or choose h below the shortest period"
@@ -214,11 +206,10 @@ class Pilot:
         length: float,
         symplectic: bool,
         words: int = 1,
-        quantile: float = 1.0,
     ) -> None:
         self.integrate, self.q, self.span, self.length = integrate, q, span, length
         self.count = len(q) if q.ndim == 2 else 1
-        self.rates, self.quantile = np.zeros(self.count), quantile
+        self.rates = np.zeros(self.count)
         self.samples, self._errors_of = SAMPLES, dict[tuple[int, int], Array]()
         while self.samples > FEWEST_SAMPLES and self.samples * q.size > MOST_NUMBERS:
             self.samples //= 2
@@ -276,19 +267,18 @@ class Pilot:
         return float(np.median([_power(self._errors(n)) for n in self._halved()[:3]]))
 
     @property
-    def count_at_rest(self) -> int:
-        """Number of trajectories at rest, of which no error says anything about a step size."""
-        return int(np.count_nonzero(distances_from_mean(self.runs[self.good[-1]].q) == 0.0))
+    def at_rest(self) -> bool:
+        """True if all trajectories are at rest, where errors relative to the motion are undefined."""
+        return not distances_from_mean(self.runs[self.good[-1]].q).any()
 
     @property
     def rate(self) -> float:
         """Exponential growth rate of errors, 0 if they do not grow exponentially."""
-        return self._worst(self.rates)
+        return _largest(self.rates)
 
     def member(self, n: int) -> int:
         """Return the index of the trajectory that determines the error of the run with n steps."""
-        errors = self._errors_at_end(n)
-        return int(np.argsort(errors, kind="stable")[self._rank(len(errors))])
+        return int(np.argmax(self._errors_at_end(n)))
 
     @property
     def floor_at_end(self) -> float:
@@ -358,11 +348,11 @@ class Pilot:
 
     def error(self, n: int) -> float:
         """Return the expected error at the end of the span of the run with n steps; infinite if it failed."""
-        return self._worst(self._errors_at_end(n)) if n in self.compared else math.inf
+        return _largest(self._errors_at_end(n)) if n in self.compared else math.inf
 
     def final_quarter_error(self, n: int) -> float:
         """Return the root-mean-square error of the run with n steps in the last quarter of the pilot run."""
-        return self._worst(self._final_quarter(n))
+        return _largest(self._final_quarter(n))
 
     def _final_quarter(self, n: int) -> Array:
         """Return the (k,) root-mean-square errors in the last quarter of the pilot run."""
@@ -377,22 +367,13 @@ class Pilot:
         # Fit error(t) = a t + b t^2 to the mean errors of two windows; symplectic methods: b = 0.
         early, late = _windows(errors)
         ratio = self.span / self.length
-        with np.errstate(invalid="ignore"):  # infinite errors of trajectories that failed
+        with np.errstate(invalid="ignore"):  # differences of infinite errors
             quadratic = np.maximum(0.0, (late / LATE - early / EARLY) / (LATE - EARLY))
             regular = np.maximum(0.0, late / LATE - quadratic * LATE) * ratio + quadratic * ratio**2
         if self.symplectic and self.growth < NEARLY_LINEAR:
             regular = late * ratio / LATE
         exploded = _exploded(self._final_quarter(n), self.rates, self.span - self.length)
         return np.asarray(np.where(self.rates > 0.0, exploded, regular))
-
-    def _rank(self, count: int) -> int:
-        """Return the rank of the error, among those of the trajectories, that decides."""
-        return math.ceil(self.quantile * count) - 1
-
-    def _worst(self, values: Array) -> float:
-        """Return the value that decides: the largest, or the quantile of the values of all trajectories."""
-        rank = self._rank(len(values))
-        return float(np.partition(np.where(np.isnan(values), math.inf, values), rank)[rank])
 
     def _halved(self) -> list[int]:
         """Return the runs obtained by halving whose errors are small."""
@@ -401,7 +382,7 @@ class Pilot:
     def _errors(self, n: int) -> Array:
         """Return (samples, k) errors of a run relative to the finest run, by Richardson extrapolation.
 
-        Those of trajectories that failed are infinite.
+        Those that overflow are infinite.
         """
         finest = self.good[-1]
         if (known := self._errors_of.get((n, finest))) is not None:
@@ -414,6 +395,11 @@ class Pilot:
         errors = errors / (1.0 - (n / finest) ** self.order)
         self._errors_of[n, finest] = errors = np.where(np.isfinite(errors), errors, math.inf)
         return errors
+
+
+def _largest(values: Array) -> float:
+    """Return the largest value; infinity if one is NaN."""
+    return float(np.where(np.isnan(values), math.inf, values).max())
 
 
 def _at_equal_times(trajectory: Any, length: float) -> Array:
