@@ -40,8 +40,3 @@ def test_damped_waves_in_one_legendre_interval():
     run = stepper.integrate({"u": sin(pi * x)}, velocity={"u": 0 * x}, h=0.01, steps=100)
     exact = sin(pi * x) * exp(-0.2) * (cos(w) + 0.2 / w * sin(w))
     assert run.q["u"][-1] == pytest.approx(exact, abs=1e-11)
-
-
-def test_hamiltonian_densities_have_no_dissipation():
-    with pytest.raises(sc.SystemDefinitionError, match="no dissipation="):
-        sc.FieldSystem.from_text("h", ["a"], {"x": (0, 1)}, hamiltonian="a*b", momenta=["b"], dissipation="a_t**2")

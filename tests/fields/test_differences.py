@@ -158,16 +158,3 @@ def test_points_and_hamiltonian_densities_have_ends():
     a = sin(pi * mesh.points["x"])
     run = sc.compile_stepper(mesh.system, "svi:2", flags=QUICK_FLAGS).integrate({"a": a}, h=5e-4, steps=200)
     assert np.abs(run.q["a"][-1] - a * cos(pi**2 / 2 * 0.1)).max() < 2e-5
-
-
-@pytest.mark.parametrize(
-    ("density", "method", "options", "message"),
-    [
-        ("u_t**2/2 - u_xx**2/2", "finite-differences", {"order": 4, "points": 40}, "'x' has ends: use \"spectral-el"),
-        (WAVES, "finite-differences", {"order": 8, "points": 20}, "number of points of 'x' must be at least 24|24"),
-        (WAVES, "fourier", {"points": 20}, '\'x\' has ends: use "spectral-elements" or "finite-differences"'),
-    ],
-)
-def test_axes_with_ends_are_refused_by_name(density, method, options, message):
-    with pytest.raises(sc.SystemDefinitionError, match=message):
-        line((0, 0), density).discretise(method, **options)

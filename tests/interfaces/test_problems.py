@@ -165,25 +165,6 @@ def test_states_have_the_properties_in_their_titles() -> None:
     assert np.sqrt(1 - gamma**-2) == pytest.approx(0.87, abs=0.005)
 
 
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("kepplr", "did you mean 'kepler'"),
-        ("", "Known: harmonic-oscillator, "),
-        ("kepler:3", "only fput-chain"),
-        ("fput-chain:", "whole number"),
-        ("fput-chain:x", "whole number"),
-        ("fput-chain:-3", "whole number"),
-        ("fput-chain:²", "whole number"),
-        ("fput-chain:0", "1 to 1024"),
-        ("fput-chain:5000", "1 to 1024"),
-    ],
-)
-def test_unknown_names_are_rejected(name: str, message: str) -> None:
-    with pytest.raises(SystemDefinitionError, match=message):
-        problem(name)
-
-
 def test_invalid_sizes_and_states_are_rejected() -> None:
     for size in (True, 2.0, -1):
         with pytest.raises(SystemDefinitionError, match="masses"):

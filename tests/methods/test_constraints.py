@@ -598,16 +598,6 @@ def test_constraints_from_sympy_and_lagranges_method():
     assert one.constraints == rod().with_parameters(m=2.0).constraints
 
 
-@pytest.mark.parametrize(
-    "method",
-    [sc.SVI(2), sc.Gauss(2), sc.SCVI(2), sc.StoermerVerlet(), sc.SVI(2, "gauss-lobatto:4")],
-    ids=lambda one: one.name,
-)
-def test_methods_without_constraint_support_are_rejected(method):
-    with pytest.raises(sc.MethodError, match=r"SVI\(4, 'gauss-lobatto:5'\)"):
-        sc.compile_stepper(rod(), method)
-
-
 @pytest.mark.rotated
 def test_time_transformation_preserves_constraints_and_orders():
     """A bead on a circle past a centre; multipliers are forces in the time as it is."""

@@ -127,26 +127,6 @@ def test_nonpositive_and_noninteger_degrees_are_rejected(name: str, degree: obje
         nodes_by_name(name, degree)  # type: ignore[arg-type]  # the wrong type is the point
 
 
-def test_unknown_family_suggests_the_closest_and_lists_all() -> None:
-    with pytest.raises(sc.MethodError, match=r"did you mean 'chebyshev-lobatto'.*legendre-gauss"):
-        nodes_by_name("chebyshev_lobato", 3)
-
-
-@pytest.mark.parametrize(
-    ("degree", "points", "message"),
-    [
-        (2, (-1, 1), "needs 3 nodes, got 2"),
-        (2, (-1, 0, 0), "node 2 is 0.0, not greater"),
-        (2, (-1, 1, 0), "node 2 is 0.0, not greater"),
-        (1, (0, 2), "outside"),
-        (0, (0,), "at least 1"),
-    ],
-)
-def test_invalid_points_are_rejected(degree: int, points: tuple[float, ...], message: str) -> None:
-    with pytest.raises(sc.MethodError, match=message):
-        sc.Nodes(name="mine", degree=degree, points=points)
-
-
 def test_user_precision_has_no_effect_and_is_not_changed() -> None:
     import mpmath
 

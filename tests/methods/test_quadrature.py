@@ -109,42 +109,6 @@ def test_order_of_a_user_defined_rule_is_computed() -> None:
     assert not sc.Quadrature(name="lopsided", points=(-1, 1), weights=(0.5, 1.5)).symmetric
 
 
-@pytest.mark.parametrize(
-    ("points", "weights", "order", "message"),
-    [
-        ((0,), (1, 1), 0, "1 points and 2 weights"),
-        ((), (), 0, "at least one point"),
-        ((0, -1), (1, 1), 0, "not greater than the one before"),
-        ((0, 2), (1, 1), 0, "outside"),
-        ((0, 1), (0.5, 0.5), 0, "sum 1.0; scale them to sum 2"),
-        ((-1, 1), (1, 1), 4, "has order 2, not 4"),
-        ((-1, 1), (1, 1), 1.5, "must be a whole number"),
-        ((-1, 1), (1, "one"), 0, "not a real number"),
-    ],
-)
-def test_invalid_quadratures_are_rejected(points: tuple, weights: tuple, order: int, message: str) -> None:
-    with pytest.raises(sc.MethodError, match=message):
-        sc.Quadrature(name="mine", points=points, weights=weights, order=order)
-
-
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("gauss-legendre", "lacks its number of points; write 'gauss-legendre:3'"),
-        ("gauss-legendre:x", "lacks its number"),
-        ("gauss-legendre:-1", "lacks its number"),
-        ("gauss-legendre:0", "at least 1, not 0"),
-        ("gauss-lobatto:1", "at least 2, not 1"),
-        ("clenshaw-curtis:1", "at least 2, not 1"),
-        ("gauss-legandre:3", "did you mean 'gauss-legendre'.*fejer"),
-        ("", "unknown quadrature"),
-    ],
-)
-def test_unknown_names_are_rejected(name: str, message: str) -> None:
-    with pytest.raises(sc.MethodError, match=message):
-        quadrature_by_name(name)
-
-
 def test_counts_and_sides_are_checked_even_after_a_cached_call() -> None:
     sc.gauss_radau(2)
     with pytest.raises(sc.MethodError, match=r"not 2\.0"):

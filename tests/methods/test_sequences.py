@@ -5,7 +5,7 @@ import pytest
 from notation import hamilton, lagrange
 from samples import QUICK_FLAGS
 
-from scvi_codegen import HamiltonianSystem, MethodError, StepFailedError, compile_stepper, problem
+from scvi_codegen import HamiltonianSystem, MethodError, StepFailedError, compile_stepper
 from scvi_codegen.methods import SVI, Composition, StoermerVerlet, method_from_specification
 
 DRIFTS_FIRST = "drift-kick-drift"
@@ -98,16 +98,6 @@ def test_logarithmic_hamiltonian_preserves_the_ellipse():
     assert np.abs(radius - e * run.q[:, 0] - (1 - e * e)).max() < 1e-11
     assert np.diff(run.q[:, 2]).min() > 0.0
     assert run.q[-1, 2] > 10 * np.pi
-
-
-def test_nonseparable_hamiltonians_are_rejected():
-    with pytest.raises(MethodError, match="requires a separable system"):
-        compiled(problem("double-pendulum").system, StoermerVerlet(DRIFTS_FIRST))
-    timed = HamiltonianSystem.from_text(name="timed", coordinates=["x"], hamiltonian="p_x**4*cos(t) + p_x**2 + x**2")
-    with pytest.raises(MethodError, match="requires a separable system"):
-        compiled(timed, Composition(8))
-    with pytest.raises(MethodError, match="'kick-drift-kick' or 'drift-kick-drift', not 'kick'"):
-        StoermerVerlet("kick")
 
 
 def test_drift_first_sequences_have_no_discrete_lagrangian():

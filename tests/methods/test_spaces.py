@@ -72,32 +72,6 @@ def test_names_read_back(name: str) -> None:
     assert method_from_specification(method.specification()) == method
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: space_by_name("wavelets:3"), "there is no space of curves 'wavelets:3'"),
-        (lambda: space_by_name("splines:x"), "there is no space of curves"),
-        (lambda: space_by_name("trigonometric"), "there is no space of curves"),
-        (lambda: Trigonometric(0.0), "positive"),
-        (lambda: Trigonometric(-1.0), "positive"),
-        (lambda: Trigonometric(1.0, 0), "number of harmonics must be at least 1"),
-        (lambda: SVI(1, space=Trigonometric(1.0)), "1 to 0 harmonics"),
-        (lambda: SVI(3, space=Trigonometric(1.0, 2)), "1 to 1 harmonics"),
-        (lambda: SVI(2, space=Trigonometric(2000.0)), "per step is too high"),
-        (lambda: Splines(0), "number of pieces must be at least 1"),
-        (lambda: Splines(breakpoints=(0.5, 0.5)), "must ascend"),
-        (lambda: Splines(breakpoints=(0.5, 1.0)), "must ascend"),
-        (lambda: SVI(1, space="splines:2"), "degree 2 at least"),
-        (lambda: SVI(3, "hermite:3", space="splines:2"), "which are discontinuous"),
-        (lambda: SVI(3, nodes="equispaced", space="splines:2"), "leave them out"),
-        (lambda: SVI(3, space=7), "space must be a CurveSpace"),  # type: ignore[arg-type]
-    ],
-)
-def test_invalid_spaces_are_rejected(make, message: str) -> None:
-    with pytest.raises(MethodError, match=message):
-        make()
-
-
 def test_too_few_points_for_the_intervals_warn() -> None:
     with pytest.warns(MethodWarning, match="use at least 7 points"):
         SVI(4, "gauss-legendre:3", space="splines:2")

@@ -10,7 +10,6 @@ import oracle
 import pytest
 from notation import lagrange
 
-from scvi_codegen.common.errors import MethodError
 from scvi_codegen.methods import (
     SCVI,
     SVI,
@@ -176,21 +175,6 @@ def test_svi_of_degree_one_with_one_gauss_point_is_the_midpoint_rule(sample, com
     middle = [oracle.numbers([T + H / 2]), oracle.numbers([(q + q1) / 2]), oracle.numbers([(q1 - q) / H])]
     assert distance(case.mechanics.momentum(*middle)[0].astype(float), (p + p1) / 2) < ROUND_OFF
     assert distance(case.mechanics.force(*middle)[0].astype(float), (p1 - p) / H) < 10 * ROUND_OFF  # divided by H
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"abscissae": "gauss", "nodes": "chebyshev-lobatto"}, "not both"),
-        ({"abscissae": "gauss", "variational": False}, "requires nodes at both ends"),
-        ({"abscissae": "radau-ia"}, "there are no abscissae called 'radau-ia'"),
-        ({"abscissae": [0.2, 0.8]}, "a curve of degree 3 requires 3 abscissae, not 2"),
-        ({"abscissae": [0.2, 0.2, 0.8]}, "not greater than the one before"),
-    ],
-)
-def test_invalid_abscissae_are_rejected(arguments, message):
-    with pytest.raises(MethodError, match=message):
-        SCVI(3, **arguments)
 
 
 def with_gauge(name, order):

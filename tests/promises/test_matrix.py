@@ -1,5 +1,7 @@
 """Every quantity, in systems and situations in which nothing is a default: a table, and a property for each column."""
 
+import zlib
+
 import pytest
 from matrix_properties import PROPERTIES, SITUATIONS, Case
 from matrix_systems import PROBLEMS
@@ -13,18 +15,6 @@ CASES = [
     for name, (_, applies) in PROPERTIES.items()
     if applies(Case(problem, method, situation))
 ]
-KINDS = [(x, y.kind) for x in PROPERTIES for y in PROBLEMS]
-STEPPERS = [(x.name, k) for x in PROBLEMS for k in range(len(x.methods))]
-INDICES = [
-    (
-        ("property of a kind", KINDS.index((name, case.kind))),
-        ("situation", [*SITUATIONS].index(case.situation)),
-        ("stepper", STEPPERS.index((case.problem.name, case.method))),
-    )
-    for name, case in CASES
-]
-QUICK = cover(INDICES)
-"""Each property of each kind of run, each situation and each stepper, in few combinations; the full tier has all."""
 
 
 def identity(name: str, case: Case) -> str:
@@ -33,15 +23,24 @@ def identity(name: str, case: Case) -> str:
     return f"{name}-{case.problem.name}-{word}-{solver}-{case.situation}"
 
 
-@pytest.mark.rotated
-@pytest.mark.sampled(14)
-@pytest.mark.parametrize(
-    ("name", "case"),
-    [
-        pytest.param(name, case, id=identity(name, case), marks=[] if index in QUICK else pytest.mark.full)
-        for (name, case), index in zip(CASES, INDICES, strict=True)
-    ],
-)
+def sample() -> list[tuple[str, Case]]:
+    """Cases with each property of each kind of run, each situation and each system, then the others by hash."""
+    kinds, names = [(name, problem.kind) for name in PROPERTIES for problem in PROBLEMS], [x.name for x in PROBLEMS]
+    combinations = {
+        (
+            ("property of a kind", kinds.index((name, case.kind))),
+            ("situation", [*SITUATIONS].index(case.situation)),
+            ("system", names.index(case.problem.name)),
+        ): (name, case)
+        for name, case in reversed(CASES)
+    }
+    first = [combinations[x] for x in sorted(cover(sorted(combinations)))]
+    others = [case for case in CASES if case not in first]
+    return first + sorted(others, key=lambda case: zlib.crc32(identity(*case).encode()))
+
+
+@pytest.mark.tiers(60, 360)
+@pytest.mark.parametrize(("name", "case"), [pytest.param(*case, id=identity(*case)) for case in sample()])
 def test_quantities_are_those_of_independent_code(name: str, case: Case) -> None:
     check, _ = PROPERTIES[name]
     check(case)

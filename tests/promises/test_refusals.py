@@ -46,12 +46,15 @@ def subject(description: str) -> Any:
     of = json.loads(description)
     if isinstance(of, str) or "system" not in of:
         return system_of(of)
-    method = method_from_specification(of["method"]) if isinstance(of["method"], dict) else of["method"]
-    return sc.compile_stepper(**of | {"system": system_of(of["system"]), "method": method})
+    return sc.compile_stepper(
+        system_of(of["system"]), **{name: value(name, x) for name, x in of.items() if name != "system"}
+    )
 
 
 def value(name: str, x: Any) -> Any:
-    """Return an argument as the package takes it: events from their arguments, tables of inputs as tuples."""
+    """Return an argument as the package takes it: methods and events are made, tables of inputs are tuples."""
+    if name == "method" and isinstance(x, dict):
+        return method_from_specification(x)
     if name == "events" and isinstance(x, dict):
         return sc.impact(**x["impact"]) if "impact" in x else sc.Event(**x)
     if name == "inputs" and isinstance(x, dict):

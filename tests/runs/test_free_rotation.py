@@ -146,24 +146,3 @@ def test_products_of_inertia_do_not_change_the_motion(moments):
     tangent = turned.stepper.jacobian(turned.q[7], turned.p[7], 0.1)
     form = np.block([[np.zeros((n, n)), np.eye(n)], [-np.eye(n), np.zeros((n, n))]])
     np.testing.assert_allclose(tangent.T @ form @ tangent, form, rtol=0, atol=1e-13)
-
-
-@pytest.mark.parametrize(
-    ("lagrangian", "reason"),
-    [
-        ("(omega_1**2 + omega_2**2 + omega_3**2)/2 + k*omega_1*omega_2", "write them as numbers"),
-        ("(omega_1**2 + omega_2**2 + omega_3**2 + x_dot**2)/2 + x_dot*omega_1/4", "couples angular velocities"),
-        ("(omega_1**2 + omega_2**2 + omega_3**2)/2 + R_13*omega_1", "not a quadratic form"),
-        ("(omega_1**2 + omega_2**2 + (2 + x**2)*omega_3**2)/2", "masses that vary"),
-    ],
-)
-def test_other_kinetic_energies_are_refused_with_the_reason(lagrangian, reason):
-    system = sc.LagrangianSystem.from_text(
-        "other",
-        ["x"],
-        lagrangian + " + x_dot**2/2",
-        rotations={"R": "omega"},
-        parameters={"k": 0.25} if "k" in lagrangian else {},
-    )
-    with pytest.raises(sc.MethodError, match=reason):
-        compiled(system, "composition:8")
