@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial, wraps
+from math import isfinite
 from typing import Any, Self, TypeVar, cast
 
 import numpy as np
@@ -55,6 +56,7 @@ from scvi_codegen.runs.stepping.features import check_together, require
 from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.projection import consistent, constraint_values, multipliers, projected
 from scvi_codegen.runs.stepping.saving import read_checkpoint
+from scvi_codegen.runs.stepping.state_functions import neither_or_both
 from scvi_codegen.runs.stepping.step_plan import (
     Adaptive,
     ErrorControl,
@@ -203,7 +205,7 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
             start |= ErrorControl(None, absolute_tolerance, max_step, first_step).named
             saved = {"t_end": t_end, "save_every": save_every, "t_eval": t_eval}
             return stepper._confirmed(wanted, q, p, {**start, "progress": progress}, saved)
-        t = checked_time(t, interface.words)
+        t = t if type(t) is float and isfinite(t) else checked_time(t, interface.words)
         begin = 0.0 if h is None or t_end is None else hashed(t)  # one plan for all times where they do not matter
         how = interface.time_transformation, stepper.in_tau, interface.words
         control = tolerance, absolute_tolerance, max_step, first_step
@@ -219,16 +221,16 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
             segments = InputSegments(stepper, inputs, parameters, t, final_time(t, h, steps, t_end))
             parameters = segments.first
         if p is None or velocity is not None or interface.constraints:
-            q, p = stepper._consistent_state(q, p, velocity, t, parameters)
+            q, p, velocity = stepper._initial_state(q, p, velocity, t, parameters, converted=inputs is not None)
         fixed = isinstance(plan, FixedSteps)
         growth = 0 if fixed and not check_growth else measured_growth(stepper, plan, check_growth)
         times = None if t_eval is None else stepper._output_times(t_eval, t, plan, count)
         run = Run._reused(stepper)
         run._set_up(plan, parameters, options, q, p)
         if segments is None:
-            trajectory = run._integrated(q, p, t, growth, count, save_every, times, progress, observe)
+            trajectory = run._integrated(q, p, velocity, t, growth, count, save_every, times, progress, observe)
         else:
-            run._begin(q, p, t, growth)
+            run._begin(q, cast(States, p), t, growth)
             trajectory = segments.record(run, save_every, progress)
         _check(run, trajectory, check_growth, segments, fixed=fixed)
         run._release()
@@ -255,7 +257,7 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         bare = by_pieces or self.with_events(())
 
         def step_of_tau(tolerance: float) -> float:
-            momenta = self._initial_momenta(q, p, velocity, t, parameters) if p is None or velocity is not None else p
+            momenta = self._initial_momenta(q, p, velocity, t, parameters)
             span = checked_number(saved["t_end"], "the time t_end") - t
             return largest_step(self, q, momenta, span, tolerance, t=t, parameters=parameters, options=start["options"])
 
@@ -386,9 +388,18 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         self, q: States, p: States | None, velocity: States | None, t: float, parameters: Parameters
     ) -> tuple[States, States]:
         """Return (q, p), or q and the momenta of a velocity, on the constraints."""
-        if p is None or velocity is not None:
-            p = self._initial_momenta(q, p, velocity, t, parameters)
+        p = self._initial_momenta(q, p, velocity, t, parameters)
         return consistent(self, q, p, t, parameters) if self.interface.constraints else (q, p)
+
+    def _initial_state(
+        self, q: States, p: States | None, velocity: States | None, t: float, parameters: Parameters, *, converted: bool
+    ) -> tuple[States, States | None, States | None]:
+        """Return (q, p, None) on the constraints, or (q, None, velocity) if the run converts the velocity itself."""
+        if (p is None) == (velocity is None):
+            raise neither_or_both(p)
+        if converted or self.in_tau or self.interface.constraints or self.interface.layout.coordinates:
+            return *self._consistent_state(q, p, velocity, t, parameters), None
+        return q, p, velocity
 
     def _run(self, q: Array, p: Array, **arguments: Any) -> Run:
         return Run.started(self, q, p, **arguments)

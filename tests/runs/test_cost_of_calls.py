@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 from itertools import chain
 
 import numpy as np
 import pytest
 from counting import TooMuchWorkError, at_most
+from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 from scvi_codegen.runs.driver import run as runs
@@ -24,7 +26,7 @@ def stepper():
 
 
 @pytest.mark.parametrize("convert", [list, tuple, np.array])
-@pytest.mark.parametrize(("plan", "calls"), [(FIXED, 42), (ADAPTIVE, 72)])
+@pytest.mark.parametrize(("plan", "calls"), [(FIXED, 40), (ADAPTIVE, 62)])
 def test_a_call_takes_few_function_calls(stepper, convert, plan, calls):
     """The limit is a tenth above the present number, and does not depend on the machine."""
     q, p = convert(Q.tolist()), convert(P.tolist())
@@ -33,6 +35,46 @@ def test_a_call_takes_few_function_calls(stepper, convert, plan, calls):
         stepper.integrate(q, p, **plan)
     with pytest.raises(TooMuchWorkError), at_most(calls // 2):
         stepper.integrate(q, p, **plan)
+
+
+@pytest.mark.parametrize("momenta", ["p", "velocity"])
+def test_a_call_visits_few_functions_of_few_files(stepper, momenta):
+    arguments = {momenta: P} | ADAPTIVE
+    stepper.integrate(Q, **arguments)
+    visited = set()
+
+    def visit(frame, event, _):
+        if event == "call":
+            visited.add((frame.f_code.co_filename, frame.f_code.co_firstlineno))
+
+    sys.setprofile(visit)
+    try:
+        stepper.integrate(Q, **arguments)
+    finally:
+        sys.setprofile(None)
+    assert len(visited) <= 25
+    assert len({file for file, _ in visited}) <= 8
+
+
+@pytest.mark.parametrize("plan", [FIXED, ADAPTIVE, {"t_end": 9.0, "t_eval": [1.0]}])
+@pytest.mark.parametrize("convert", [list, np.array, dict])
+def test_velocities_start_the_run_of_their_momenta(plan, convert):
+    """The mass matrix depends on the position, and one momentum is 0 although its velocity is not."""
+    system = sc.LagrangianSystem.from_text("m", ["x", "y"], "(1 + x**2)*x_dot**2/2 + x_dot*y_dot + y_dot**2 - x**2")
+    stepper = sc.compile_stepper(system, "svi:4", flags=QUICK_FLAGS)
+    for velocity in ([0.5, 0.25], [0.5, -0.625], [0.0, 0.0]):
+        q, v = [0.5, 1.0], velocity
+        p = stepper.momentum(q, v)
+        if convert is dict:
+            q, v = ({"x": a, "y": b} for a, b in (q, v))
+        else:
+            q, v = convert(q), convert(v)
+        assert numbers(stepper.integrate(q, velocity=v, **plan)) == numbers(stepper.integrate([0.5, 1.0], p, **plan))
+    with pytest.raises(sc.StateError, match="velocity"):
+        stepper.integrate([0.5, 1.0], velocity=[np.inf, 0.0], **plan)
+    polar = sc.LagrangianSystem.from_text("polar", ["r", "phi"], "(r_dot**2 + r**2*phi_dot**2)/2 - r**2")
+    with pytest.raises(sc.StateError, match=r"phi_dot = 1 at q = \[0. 1.\] has no momentum"):
+        sc.compile_stepper(polar, "svi:4", flags=QUICK_FLAGS).integrate([0.0, 1.0], velocity=[0.0, 1.0], **plan)
 
 
 def test_one_step_of_a_run_takes_few_function_calls(stepper):

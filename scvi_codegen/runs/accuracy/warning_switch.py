@@ -7,6 +7,8 @@ from contextvars import ContextVar
 from scvi_codegen.common.errors import AccuracyWarning, warn
 
 _warnings_enabled: ContextVar[bool] = ContextVar("accuracy warnings are wanted", default=True)
+warnings_wanted = _warnings_enabled.get
+"""Function that returns whether accuracy warnings are wanted: not inside :func:`without_accuracy_warnings`."""
 
 
 @contextmanager
@@ -29,8 +31,3 @@ def warn_of_failed_check(error: Exception) -> None:
         raise error
     message = f"the accuracy of the run was not checked ({type(error).__name__}: {error}); its states are complete"
     warn(message, AccuracyWarning)
-
-
-def warnings_wanted() -> bool:
-    """Return whether accuracy warnings are wanted: not inside :func:`without_accuracy_warnings`."""
-    return _warnings_enabled.get()

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import numpy as np
 
@@ -112,7 +112,8 @@ class Run(Memory, AttitudeHistory):
     def _integrated(
         self,
         q: States,
-        p: States,
+        p: States | None,
+        velocity: States | None,
         t: float,
         growth: int,
         steps: int | None,
@@ -121,14 +122,19 @@ class Run(Memory, AttitudeHistory):
         progress: Callable[[int], None] | None,
         observe: Observe,
     ) -> Trajectory:
-        """Start a run that is set up at (q, p) and record it as :meth:`_recorded`, a short one by one C call."""
+        """Start a run that is set up and record it as :meth:`_recorded`, a short one by one C call.
+
+        The initial state is (q, p), or q and a velocity; the other is ``None``.
+        """
         plan, stores_all = self._plan, times is None and observe is None and progress is None
         most = FIRST_STEPS if save_every == 1 else self._first_steps(save_every)
         fits = steps is None if self._h is None else steps is not None and steps <= most
         special = self._has_tau or self._unset_inputs or self.stepper.events or self._rows is None
         if fits and stores_all and not special and (isinstance(plan, Fixed) or t != plan.t_end):
-            return integrate_short(self, q, p, t, steps, save_every, growth)
-        self._begin(q, p, t, growth)
+            return integrate_short(self, q, p, velocity, t, steps, save_every, growth)
+        if velocity is not None:
+            p = self.stepper.initial_momentum(q, velocity, t, self._parameters)
+        self._begin(q, cast(States, p), t, growth)
         return self._recorded(steps, save_every, times, progress, observe)
 
     @property

@@ -156,9 +156,14 @@ class ShortRuns(StateRows):
         self.call.has_energies = self.interface.conserves_energy and not stepper.changes_states
         self.integrate = stepper.binding.call("integrate", self.call)
         self.results = stepper.binding.results(self.call)
+        self._stepper, self._parameters = stepper, memory._parameters
+        self._state, self._momenta = (self._start[1 : 1 + m], self._start[1 + m :]), np.empty(m)
+        q, velocity, p = stepper.binding.pointers(*self._state, self._momenta)
+        self._pointers = q, velocity, memory._arguments[0], p, memory._workspace
+        self._momentum = stepper.binding.function("momentum")
 
-    def begin(self, t: float, q: Any, p: Any) -> None:
-        """Set the initial state; raise :class:`StateError` unless q and p are (m,) finite numbers."""
+    def begin(self, t: float, q: Any, p: Any, name: str = "p") -> None:
+        """Set the initial state; raise :class:`StateError` unless q and p, or what it is, are (m,) finite numbers."""
         numbers, kind = None, type(q)
         if kind is type(p) and self.shape is not None:
             if kind is np.ndarray:
@@ -172,7 +177,16 @@ class ShortRuns(StateRows):
                 return
         except (OverflowError, struct.error):  # of an integer above all floats
             pass
-        self._start[0], self._start[1:] = t, np.concatenate(checked_pair(self.interface, q, p))
+        self._start[0], self._start[1:] = t, np.concatenate(checked_pair(self.interface, q, p, name))
+
+    def begin_by_velocity(self, t: float, q: Any, velocity: Any) -> None:
+        """Set the initial state (q, dL/dv); raises as :meth:`begin` and :meth:`Integrator.initial_momentum`."""
+        self.begin(t, q, velocity, "velocity")
+        (positions, values), momenta = self._state, self._momenta
+        status = self._momentum(t, *self._pointers)
+        if status or {*values[momenta == 0.0].tolist()} - {0.0}:  # perhaps the velocity has no momentum
+            momenta = self._stepper.initial_momentum(positions, values, t, self._parameters)
+        values[:] = momenta
 
     def recorded(self, count: int, h: float | None, save_every: int) -> tuple[States, Array]:
         """Return copies of the first states and of the steps that follow them."""
@@ -192,17 +206,23 @@ def _numbers(t: Array, q: Array, p: Array) -> tuple[Array, Array, Array]:
 
 
 def integrate_short(
-    run: Memory, q: Any, p: Any, t: float, steps: int | None, save_every: int, growth: int
+    run: Memory, q: Any, p: Any, velocity: Any, t: float, steps: int | None, save_every: int, growth: int
 ) -> Trajectory:
-    """Start a run that is set up at (q, p) and record it, all by one C call if it ends within ``FIRST_STEPS`` states.
+    """Start a run that is set up and record it, all by one C call if it ends within ``FIRST_STEPS`` states.
 
-    ``growth``: value of ``measures_growth`` in C. Raises as :func:`record`.
+    The initial state is (q, p), or q and a velocity; the other is ``None``. Raises as :func:`record`.
+
+    Args:
+        growth: value of ``measures_growth`` in C.
     """
     short: ShortRuns = run._rows
     h = run._h
     first = FIRST_STEPS if save_every == 1 else run._first_steps(save_every)
     size = first if steps is None else steps
-    short.begin(t, q, p)
+    if velocity is None:
+        short.begin(t, q, p)
+    else:
+        short.begin_by_velocity(t, q, velocity)
     short.call.measures_growth = growth
     status = short.integrate(size, save_every)
     error, error_t, first, last, stored, done, rejected, fallbacks = short.results()

@@ -1,6 +1,7 @@
 """Validation of the initial states and parameters of ensembles."""
 
 from collections.abc import Mapping
+from typing import cast
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from scvi_codegen.runs.states.validation import (
 from scvi_codegen.runs.states.words import checked_time, split, stacked, with_low
 from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.projection import make_consistent
+from scvi_codegen.runs.stepping.state_functions import neither_or_both
 
 
 def checked_ensemble(stepper: Integrator, q: States, p: States) -> tuple[Array, Array]:
@@ -32,12 +34,13 @@ def momenta_of_each(
     stepper: Integrator, q: States, p: States | None, velocity: States | None, t: float, parameters: EnsembleParameters
 ) -> States:
     """Return the momenta of states specified by p or by velocity, each with its own parameters."""
-    name, argument = stepper.momentum_or_velocity(p, velocity)
-    if name == "p":
-        return argument
+    if (p is None) == (velocity is None):
+        raise neither_or_both(p)
+    if velocity is None:
+        return cast(States, p)
     t = checked_time(t, stepper.interface.words)
     positions = _states(stepper, q, "q")
-    velocities = _states(stepper, argument, name)
+    velocities = _states(stepper, velocity, "velocity")
     if positions.shape != velocities.shape:
         raise StateError(f"q and velocity must have equal shapes, not {positions.shape} and {velocities.shape}")
     values = parameters_of_each(stepper, parameters, len(positions))

@@ -196,9 +196,9 @@ class Memory:
             self._memory.measures_growth = growth
 
     def _set_up(
-        self, plan: StepPlan, parameters: Parameters, options: SolverOptions | None, q: States, p: States
+        self, plan: StepPlan, parameters: Parameters, options: SolverOptions | None, q: States, p: States | None
     ) -> None:
-        """Set what holds for all steps of a run that starts at (q, p)."""
+        """Set what holds for all steps of a run that starts at (q, p); p is required in transformed time only."""
         if parameters is not None or not self._has_defaults:
             stepper, interface = self.stepper, self.stepper.interface
             self._parameters[:] = stepper._parameters_at(q, p, parameters)

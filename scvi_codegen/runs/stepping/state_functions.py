@@ -4,7 +4,7 @@ All C calls release the GIL and share no state, so one integrator may be used fr
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,14 +31,19 @@ REPORTED = 1e-3
 """Largest relative difference between a velocity and the velocity recomputed from its momentum."""
 
 
+def neither_or_both(p: States | None) -> StateError:
+    """Return the error for a state with neither momenta nor velocities, or with both."""
+    return StateError(f"give either p or velocity with q; got {'neither' if p is None else 'both'}")
+
+
 class StateFunctions(CompiledMethod):
     """Compiled method with functions of a state, which do not depend on the steps."""
 
-    def _parameters_at(self, q: States, p: States, parameters: Parameters = None) -> Array:
+    def _parameters_at(self, q: States, p: States | None, parameters: Parameters = None) -> Array:
         """Return (k,) values in order; in transformed time the energy defaults to that of the state (q, p)."""
         values = self._parameters(parameters)
         if not self._has_energy(parameters):
-            q, p = checked_pair(self.interface, q, p)
+            q, p = checked_pair(self.interface, q, cast(States, p))
             values[self.interface.energy_index] = self.energy(q, p, 0.0, values)
         return values
 
@@ -78,8 +83,11 @@ class StateFunctions(CompiledMethod):
         Raises:
             StateError: unless exactly one of both is passed.
         """
-        name, values = self.momentum_or_velocity(p, velocity)
-        return values if name == "p" else self.initial_momentum(q, values, t, parameters)
+        if velocity is None and p is not None:
+            return p
+        if velocity is None or p is not None:
+            raise neither_or_both(p)
+        return self.initial_momentum(q, velocity, t, parameters)
 
     def initial_momentum(self, q: States, velocity: States, t: float, parameters: Parameters) -> Array:
         """Return the (m,) momentum of the initial state of a run.
@@ -88,7 +96,7 @@ class StateFunctions(CompiledMethod):
             StateError: if the mass matrix is singular along the velocity, so the momentum does not determine it.
         """
         q, v = checked_pair(self.interface, q, velocity, "velocity")
-        p = self._transform("momentum", q, v, t, parameters, "velocity")
+        p = self._transformed("momentum", checked_time(t, self.interface.words), q, v, self._parameters(parameters))
         dropped = (p == 0.0) & (v != 0.0)
         if dropped.any():
             try:
@@ -106,18 +114,6 @@ class StateFunctions(CompiledMethod):
             f"kinetic energy depends on {name}_dot, or use coordinates that are regular there (Cartesian instead of "
             "polar coordinates at the origin)"
         )
-
-    def momentum_or_velocity(self, p: States | None, velocity: States | None) -> tuple[str, States]:
-        """Return the name and the value of the one of both that is passed.
-
-        Raises:
-            StateError: unless exactly one of both is passed.
-        """
-        if p is not None and velocity is None:
-            return "p", p
-        if velocity is not None and p is None:
-            return "velocity", velocity
-        raise StateError(f"give either p or velocity with q; got {'neither' if p is None else 'both'}")
 
     def energy(self, q: States, p: States, t: ArrayLike = 0.0, parameters: Parameters = None) -> Any:
         """Return the energy p.v - L: a float for (m,) states, (n,) for (n, m) with one time or (n,) times."""
