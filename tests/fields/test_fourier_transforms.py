@@ -175,9 +175,6 @@ def test_densities_not_quadratic_in_derivatives_by_transforms_equal_those_by_mat
 def test_differences_of_indices_are_those_of_pairs():
     unrolled = sc.unroll_sums(RING, {"N": 3})
     assert {str(each) for each in unrolled.parameters} == {"k", "c_0", "c_1", "c_2"}
-    for sums in ("sum(i in N, j in N, c[j-i]*q[i]*q[j])", "sum(i < j in N, c[i-j]*q[i]*q[j])"):
-        with pytest.raises(sc.ExpressionError, match="must be the difference of a pair"):
-            lagrange("ring", "q[N]", f"sum(i in N, q_dot[i]**2) - {sums}", parameters={"c[N]": 1.0})
 
 
 def test_derivatives_by_transforms_or_matrices_are_chosen_by_size():

@@ -113,13 +113,6 @@ def test_recordings_contain_their_mesh(tmp_path):
         sc.load_run(tmp_path / "run").unresolved()
 
 
-def test_systems_without_a_mesh_report_no_resolution():
-    chain = sc.LagrangianSystem.from_text("c", ["q[N]"], "sum(i in N, q_dot[i]**2/2 - q[i]**2/2)")
-    run = sc.compile_stepper(chain, "svi:2", flags=QUICK_FLAGS).integrate(np.ones(3), h=0.1, steps=2)
-    with pytest.raises(sc.MethodError, match="requires a mesh"):
-        run.unresolved()
-
-
 @pytest.mark.tiers(1)
 @pytest.mark.parametrize("method", ["stoermer-verlet", "composition:8"])
 def test_explicit_steps_are_stable_up_to_the_largest_step(method):

@@ -183,14 +183,6 @@ def test_invalid_nonholonomic_constraints_are_rejected():
     assert_allclose(q, [0.0, 0.0, 0.5], rtol=0, atol=0.0)
 
 
-@pytest.mark.second
-def test_violated_velocity_constraints_of_rotations_are_named_without_a_rate():
-    text, constraints = "omega_1**2 + omega_2**2 + 2*omega_3**2 - R_33", ["omega_3 = 0.2"]
-    system = sc.LagrangianSystem.from_text("top", lagrangian=text, rotations={"R": "omega"}, constraints=constraints)
-    with pytest.raises(sc.StateError, match=r"\(relative\): omega_3 - 1/5 is 0.8, not 0"):
-        sc.compile_stepper(system, "svi:2").start({"R": [1, 0, 0, 0]}, velocity={"omega": [0, 0.3, 1]}, h=0.1)
-
-
 def test_derivation_shows_nonholonomic_constraints():
     text = sc.derive(sleigh(), lobatto(1)).to_text()
     assert "0 = x_dot*sin(a) - y_dot*cos(a)" in text

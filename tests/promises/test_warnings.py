@@ -44,11 +44,3 @@ def test_warning_points_to_the_calling_line(act):
 def test_start_off_its_constraints_warns_with_the_violation(q, velocity, reported):
     with pytest.warns(sc.AccuracyWarning, match=reported):
         sc.compile_stepper(ROD, "svi:2").start(q, velocity=velocity, h=0.01)
-
-
-def test_velocity_constraint_violation_is_a_rate():
-    blade = lagrange(
-        "blade", "x y a", "(x_dot**2 + y_dot**2 + a_dot**2)/2", constraints=["x_dot*sin(a) - y_dot*cos(a)"]
-    )
-    with pytest.raises(sc.StateError, match=r"x_dot\*sin\(a\) - y_dot\*cos\(a\) is -1, not 0"):
-        sc.compile_stepper(blade, "svi:2").start([0.0, 0.0, 0.0], velocity=[0.0, 1.0, 0.0], h=0.1)

@@ -55,28 +55,6 @@ def test_angular_velocity_in_the_body_frame_moves_the_matrix():
     np.testing.assert_allclose(body_momentum(q, momenta_of_body(q, omega)), omega, rtol=0, atol=1e-14)
 
 
-@pytest.mark.parametrize(
-    ("value", "message"),
-    [
-        ([0, 0, 0, 0], "must be finite and not zero"),
-        ([1, 2, 3], r"a quaternion \(w, x, y, z\), a rotation matrix"),
-        (2 * np.eye(3), "differs from the identity by 3.0e"),
-        (-np.eye(3), "its determinant is -1"),
-        ({"euler": "zz", "angles": [1, 2]}, "Euler angles of 'R' are invalid"),
-        ({"axis": [0, 0, 0], "angle": 1}, "not all zero"),
-        ({"axis": [0, np.nan, 0], "angle": 1}, "the axis of 'R' must be finite"),
-        ({"angle": 1}, "has the keys angle"),
-        ({"euler": "zxz", "angles": [0, np.nan, 0]}, "quaternion of 'R' must be finite"),
-        ({"axis": [0, 0, 1], "angle": np.inf}, "the angle a finite number"),
-        ({"quaternion": [0, 0, 0, 1], "order": ["x"]}, "order of the quaternion of 'R' must be 'wxyz' or 'xyzw'"),
-        ({"axis": [0, 0, 1], "angle": "much"}, "R"),
-    ],
-)
-def test_values_that_are_no_rotation_are_rejected_by_name(value, message):
-    with pytest.raises(sc.StateError, match=message):
-        quaternions(value, "R")
-
-
 @pytest.mark.parametrize("size", [1e-200, 1e200])
 def test_the_length_of_an_initial_quaternion_neither_overflows_nor_underflows(size):
     np.testing.assert_allclose(quaternions(size * np.ones(4), "R"), 0.5 * np.ones(4), rtol=1e-15)

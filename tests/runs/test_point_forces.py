@@ -99,22 +99,6 @@ def test_points_of_systems_without_rotations():
     assert sympy.simplify(sympy.sympify(str(system.forces[0])) - by_hand) == 0
 
 
-@pytest.mark.parametrize(
-    ("entry", "message"),
-    [
-        ({"point": ["0", "0", "1"]}, "no point or no force"),
-        ({"point": ["0", "0", "1"], "force": ["0", "0", "1"], "boby": "R"}, "unknown key 'boby'"),
-        ({"point": ["0", "0", "1"], "force": ["0", "0", "1"], "body": "Q"}, "the body 'Q'. Rotations: R"),
-        ({"point": ["0", "1"], "force": ["0", "0", "1"]}, "the point of point_forces\\[0\\] must have three"),
-        ({"point": ["x_dot", "0", "1"], "force": ["0", "0", "1"]}, "depends on the velocity 'x_dot'"),
-        ({"point": ["x", "0", "1"], "force": ["0", "0", "1"], "frame": "body"}, "require a body"),
-    ],
-)
-def test_wrong_entries_are_refused_by_name(entry, message):
-    with pytest.raises(sc.SystemDefinitionError, match=message):
-        end_of(point_forces=[entry])
-
-
 @pytest.mark.second
 def test_model_files_contain_forces_at_points():
     text = """

@@ -107,8 +107,3 @@ def test_single_precision_source_uses_functions_of_floats() -> None:
     text = "".join(source.files.values())
     assert "rintf(" in text
     assert "copysignf(" in text
-
-
-def test_wrap_takes_two_arguments() -> None:
-    with pytest.raises(sc.ExpressionError, match="wrap takes 2 arguments, not 1"):
-        parse_expression("wrap(x)", KNOWN)

@@ -64,10 +64,3 @@ def test_tangents_by_iteration_are_the_derivative_of_the_computed_flow(method):
     assert_allclose(found, tangent, rtol=0, atol=1e-11 * np.abs(tangent).max())
     omega = np.kron([[0, 1], [-1, 0]], np.eye(2))
     assert np.abs(found.T @ omega @ found - omega).max() < 1e-14 * np.abs(found).max() ** 2
-
-
-def test_systems_without_variational_equations_are_rejected():
-    with pytest.raises(
-        sc.SystemDefinitionError, match=r"variational equations of 'double pendulum' cannot.*run.tangent"
-    ):
-        sc.variational_system(sc.problem("double-pendulum").system, 2)
