@@ -8,14 +8,13 @@ large angles abort.
 from __future__ import annotations
 
 import re
-import struct
 
 import pytest
 
 from scvi_codegen.codegen.native import cuda
 
 TYPES = {f"{kind}{bits}": f"uint{bits}_t" for kind in "bu" for bits in (8, 16, 32, 64)}
-TYPES |= {f"s{bits}": f"int{bits}_t" for bits in (16, 32, 64)} | {"f64": "double", "f32": "float", "pred": "int"}
+TYPES |= {f"s{bits}": f"int{bits}_t" for bits in (16, 32, 64)} | {"f64": "double", "pred": "int"}
 WIDER = {"u16": "uint32_t", "s16": "int32_t", "u32": "uint64_t", "s32": "int64_t"}
 SIGNS = {"add": "+", "sub": "-", "mul": "*", "and": "&", "or": "|", "xor": "^", "shl": "<<", "shr": ">>"}
 SIGNS |= {"rem": "%", "div": "/"}
@@ -30,10 +29,7 @@ FUNCTIONS |= {
     "max": "({0} > {1} ? {0} : {1})",
     "selp": "({2} ? {0} : {1})",
     "not": "~{0}",
-    "prmt": "permuted({0}, {1}, {2})",
-    "bfi": "inserted({0}, {1}, {2}, {3})",
     "copysign": "copysign({1}, {0})",
-    "clz": "__builtin_clz({0})",
 }
 
 THREAD = "long long trajectory; /* number of the thread */\n"
@@ -42,18 +38,6 @@ HEAD = """#include <math.h>
 #include <stdlib.h>
 #include <string.h>
 static inline double of_bits(uint64_t bits) { double x; memcpy(&x, &bits, 8); return x; }
-static inline uint64_t inserted(uint64_t bits, uint64_t into, uint32_t first, uint32_t count)
-{
-  const uint64_t mask = (count < 64 ? (1ULL << count) - 1 : ~0ULL) << first;
-  return (into & ~mask) | (bits << first & mask);
-}
-static inline uint32_t permuted(uint32_t low, uint32_t high, uint32_t selected)
-{
-  uint32_t bytes = 0;
-  for (int i = 0; i < 4; i++)
-    bytes |= (uint32_t)(((uint64_t)high << 32 | low) >> 8 * (selected >> 4 * i & 7) & 255) << 8 * i;
-  return bytes;
-}
 """
 ESTIMATE = """static inline double device_inverse_root(double x)
 {
@@ -184,8 +168,6 @@ def _assignment(name: str, kinds: list[str], arguments: list[str]) -> str:
         return f"double w = {_value(values[0])}; memcpy(&{_value(target)}, &w, 8);"
     if name == "mov" and last == "b64" and target.startswith(("%fd", "%d")):
         return f"uint64_t w = {_value(values[0])}; memcpy(&{_value(target)}, &w, 8);"
-    if name == "mov" and last == "b32" and "%f" in target + values[0]:
-        return f"memcpy(&{_value(target)}, &{_value(values[0])}, 4);"
     return f"{_value(target)} = {_expression(name, kinds, [*map(_value, values)])};"
 
 
@@ -197,7 +179,7 @@ def _expression(name: str, kinds: list[str], x: list[str]) -> str:
         rounding = {"rni": "nearbyint", "rzi": "trunc"}.get(kinds[0], "")
         return f"({TYPES[kinds[-2]]}){rounding}(({kind})({x[0]}))"
     if name == "setp":
-        return _comparison(kinds[0], *(each if last in ("f64", "f32") else f"({kind})({each})" for each in x))
+        return _comparison(kinds[0], *(each if last == "f64" else f"({kind})({each})" for each in x))
     if last[0] in "su" and (text := _integer(name, kinds, x)):
         return text
     if name in SIGNS:
@@ -215,8 +197,6 @@ def _integer(name: str, kinds: list[str], x: list[str]) -> str:
     if "wide" in kinds:
         product = f"({WIDER[last]}){each[0]} * ({WIDER[last]}){each[1]}"
         return product + (f" + {x[2]}" if name == "mad" else "")
-    if name == "mul" and "hi" in kinds:
-        return f"((__int128){each[0]} * {each[1]}) >> {last[1:]}"
     if name == "mad":
         return f"{each[0]} * {each[1]} + {each[2]}"
     if name == "abs":
@@ -236,6 +216,4 @@ def _value(word: str) -> str:
     word = word.strip()
     if word.startswith("0d"):
         return f"of_bits(0x{word[2:]}ULL)"
-    if word.startswith("0f"):
-        return repr(struct.unpack(">f", bytes.fromhex(word[2:]))[0])
     return SPECIAL.get(word, word.removeprefix("%")) if word.startswith("%") else word
