@@ -63,7 +63,7 @@ def test_lanes_use_as_many_iterations_as_single_runs(name):
         work = Ensemble(own, [given.q] * 8, [given.p] * 8, h=h, steps=STEPS)
         batch = work.common.batch()
         assert isinstance(batch, LaneRuns)
-        block = batch.call(0, batch.width)
+        block = batch.part(0, batch.width)
         block.advance()
         run = own.integrate(given.q, given.p, h=h, steps=STEPS)
         assert block.memory.iterations == pytest.approx(int(run.iterations.sum()), rel=ROUNDING, abs=2)

@@ -414,7 +414,7 @@ class TestFailures:
             assert runs is not None
             batch = runs.batch()
             assert isinstance(batch, LaneRuns)
-            block = batch.call(0, 2)
+            block = batch.part(0, 2)
             block.begin()
             block.lanes("q")[0, 1:] = radius
             block.active[1:] = 0.0
@@ -528,7 +528,7 @@ class TestThreadsAndInterruption:
         def fail(*arguments: object, **others: object) -> None:
             raise RuntimeError("out of order")
 
-        monkeypatch.setattr("scvi_codegen.runs.ensembles.batches.Call.advance", fail)
+        monkeypatch.setattr("scvi_codegen.runs.ensembles.batches.Batch.advance", fail)
         with pytest.raises(RuntimeError, match="out of order"):
             kepler.integrate_ensemble(*states("kepler", 20), h=0.05, steps=10)
 

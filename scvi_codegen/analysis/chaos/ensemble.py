@@ -33,8 +33,8 @@ from scvi_codegen.common.errors import StateError, StepFailedError
 from scvi_codegen.common.validation import checked_count
 from scvi_codegen.runs.accuracy.local_error import warn_of_large_steps
 from scvi_codegen.runs.driver.run_loop import record
-from scvi_codegen.runs.ensembles.batches import Batch, Call
 from scvi_codegen.runs.ensembles.initial_states import momenta_of_each, start_of_ensemble
+from scvi_codegen.runs.ensembles.lanes import LaneRuns
 from scvi_codegen.runs.ensembles.result import OK
 from scvi_codegen.runs.ensembles.schedule import CommonSteps
 from scvi_codegen.runs.ensembles.thread_pool import StopCheck, run_jobs
@@ -125,14 +125,22 @@ class ChaosIndicatorsEnsemble:
 
     def _in_lanes(self, source: Source, report: Callable[[int], None], threads: int | None) -> NDArray[np.intp]:
         """Process all trajectories in SIMD lanes; return those that failed."""
-        growth, steps, count = _Growth(self._first(0)), len(self.t) - 1, len(self.q)
+        count, steps, tangents = len(self.q), len(self.t) - 1, self._first(0)
+        orthonormal, triangle = np.linalg.qr(tangents)
+        frames = (np.tile(half.T.ravel(), (count, 1)) for half in np.split(orthonormal, 2))  # one vector after another
+        start = tuple(np.hstack(pair) for pair in zip((self.q, self.p), frames, strict=True))
+        with np.errstate(divide="ignore"):  # linearly dependent directions span zero volume
+            diagonal = np.log(np.abs(np.diagonal(triangle)))
+        k = tangents.shape[1]
+        growth = np.concatenate([np.zeros(2 * k), diagonal, np.zeros(3 * k), triangle.ravel()])  # of tangent_growth.h
         plan = CommonSteps(self.t[0], self.h, steps=steps, t_end=None, inputs={}, save_every=self.save_every)
-        q, p = (np.hstack([x, np.tile(growth.frame(part), (count, 1))]) for part, x in enumerate((self.q, self.p)))
+        saved = np.full((len(plan.numbers), count, len(SERIES), k), np.nan)
+        saved[0] = growth[: len(SERIES) * k].reshape(len(SERIES), k)
         binding = Binding(building.load(source, flags=self.stepper.flags), source.prefix)
-        arguments = binding, self.options, (q, p), self.parameters, plan.t0, plan.fixed_segments()
-        runs = _GrowthRuns(growth, len(plan.numbers), *arguments)
+        arguments = binding, self.options, start, self.parameters, plan.t0, plan.fixed_segments()
+        runs = LaneRuns(*arguments, fields={"positions": saved, "growth": growth})
         runs.run(progress=lambda _: report(int(np.count_nonzero(runs.status == 0))), threads=threads)
-        ended, saved = runs.status == 0, runs.saved.reshape(len(runs.saved), count, len(SERIES), -1)
+        ended = runs.status == 0
         self.values[:, :, ended] = saved.transpose(2, 0, 1, 3)[:, :, ended]
         return np.flatnonzero(~ended)
 
@@ -172,54 +180,6 @@ class ChaosIndicatorsEnsemble:
         except StepFailedError as failure:
             self.status[j] = failure.status
         self.values[:, :, j] = np.nan if propagation is None else propagation.growth.values
-
-
-class _Growth:
-    """Growth of the same initial tangent vectors (2m, k) of trajectories in SIMD lanes.
-
-    Attributes:
-        numbers: (6 k + k^2,) initial values in the memory of a lane, of which the first 5 k are saved.
-    """
-
-    def __init__(self, tangents: Array) -> None:
-        self.orthonormal, triangle = np.linalg.qr(tangents)
-        k = tangents.shape[1]
-        with np.errstate(divide="ignore"):  # linearly dependent directions span zero volume
-            diagonal = np.log(np.abs(np.diagonal(triangle)))
-        self.numbers = np.concatenate([np.zeros(2 * k), diagonal, np.zeros(3 * k), triangle.ravel()])
-        self.saved = self.numbers[: len(SERIES) * k]
-
-    def frame(self, part: int) -> Array:
-        """Return the (m k,) positions or momenta of the orthonormal tangent vectors, one after the other."""
-        return np.split(self.orthonormal, 2)[part].T.ravel()
-
-
-class _GrowthRuns(Batch):
-    """Trajectories in SIMD lanes whose growth of tangent vectors is saved; further arguments as of :class:`Batch`.
-
-    Attributes:
-        saved: (rows, K, 5 k) values, NaN where not reached.
-    """
-
-    def __init__(self, growth: _Growth, rows: int, *arguments: Any) -> None:
-        super().__init__(*arguments)
-        self.growth, self.width = growth, len(self.binding.new("block *").active)
-        self.saved = np.full((rows, len(self.q), len(growth.saved)), np.nan)
-        self.saved[0] = growth.saved
-
-    def call(self, first: int, end: int) -> _GrowthCall:
-        """Return the calls for a range of trajectories."""
-        return _GrowthCall(self, first, end)
-
-
-class _GrowthCall(Call):
-    """Calls with the memory of a block."""
-
-    def __init__(self, work: _GrowthRuns, first: int, end: int) -> None:
-        super().__init__(work, first, end)
-        self.memory = self.struct.block = work.binding.new("block *")
-        self.struct.positions, self.struct.growth = work.binding.pointers(work.saved, work.growth.numbers)
-        self.struct.trajectories = len(work.q)
 
 
 def indicators_of_ensemble(

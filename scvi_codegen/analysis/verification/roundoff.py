@@ -172,7 +172,7 @@ def _lanes(tested: SystemUnderTest, starts: list[State], steps: int, carry: Arra
     assert isinstance(work, CommonRuns)
     batch = work.batch()
     assert isinstance(batch, LaneRuns)
-    block = batch.call(0, min(batch.width, len(starts)))
+    block = batch.part(0, min(batch.width, len(starts)))
     block.begin()
     block.lanes("carry_q")[:] = carry[:m, None]
     block.lanes("carry_p")[:] = carry[m:, None]

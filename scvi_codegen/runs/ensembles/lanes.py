@@ -7,7 +7,7 @@ lanes are unaffected.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -18,15 +18,7 @@ from scvi_codegen.codegen.native.binding import Binding
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.errors import StateError, StepFailedError
 from scvi_codegen.runs.driver.run_loop import record
-from scvi_codegen.runs.ensembles.batches import (
-    CHUNK_SECONDS,
-    FIRST_CHUNK_STEPS,
-    GROWTH,
-    Batch,
-    Call,
-    Rows,
-    SuccessiveRuns,
-)
+from scvi_codegen.runs.ensembles.batches import CHUNK_SECONDS, FIRST_CHUNK_STEPS, GROWTH, Batch, Rows, SuccessiveRuns
 from scvi_codegen.runs.ensembles.observation import EnsembleObservation
 from scvi_codegen.runs.ensembles.result import OK
 from scvi_codegen.runs.ensembles.schedule import CommonSteps, FixedSegments
@@ -118,7 +110,14 @@ class CommonRuns:
         start = self.options, self.start, self.parameters, self.steps.t0
         steps, values_at = self.steps.fixed_segments(), self.values_at if self.steps.has_inputs else None
         if binding is not None:
-            return LaneRuns(self, binding, *start, steps, values_at)
+            fields = {"positions": self.blocks[0], "momenta": self.blocks[1], "actions": self.actions}
+            if self.stepper.interface.words > 1:
+                fields["segment_end"] = steps.end
+            if self.observation is not None:
+                fields["observed"] = self.observation.values
+            lanes = LaneRuns(binding, *start, steps, values_at, fields=fields, common=self)
+            self.done = lanes.done
+            return lanes
         if not self.stepper.binding.reusable or (values_at is not None and self.stepper.interface.constraints):
             return None
         return SuccessiveRuns(self.stepper, *start, steps, values_at, receive=self._store)
@@ -131,47 +130,37 @@ class LaneRuns(Batch):
     """Trajectories in SIMD lanes, many blocks in a call; further arguments as of :class:`Batch`.
 
     Args:
-        common: the trajectories, whose arrays C fills.
-    """
-
-    def __init__(self, common: CommonRuns, binding: Binding, *arguments: Any) -> None:
-        super().__init__(binding, *arguments)
-        self.common, self.width = common, len(binding.new("block *").active)
-        common.done = self.done
-
-    def call(self, first: int, end: int) -> LaneCall:
-        """Return the calls for a range of trajectories."""
-        return LaneCall(self, first, end)
-
-
-class LaneCall(Call):
-    """Calls with the memory of a block.
+        fields: further arrays of the C structure by name, such as ``positions``, which C fills; ``None``: not used.
+        common: the trajectories whose failed lanes single runs continue; if ``None``, they are left.
 
     Attributes:
-        memory, active: the block, and a view of the flags of its active lanes.
+        memory, active: of a part, the block, and a view of the flags of its active lanes.
         left: single runs that continue the failed lanes of blocks that have ended.
     """
 
-    def __init__(self, work: LaneRuns, first: int, end: int) -> None:
-        super().__init__(work, first, end)
-        self.common, self.left, binding, struct = work.common, list[SingleRun](), work.binding, self.struct
-        self.needs_velocities = bool(binding.constant("NEEDS_VELOCITIES"))
-        self.memory = struct.block = binding.new("block *")
-        self.active = np.frombuffer(binding.buffer(self.memory.active), dtype=np.float64)
+    def __init__(
+        self, binding: Binding, *arguments: Any, fields: Mapping[str, Array | None], common: CommonRuns | None = None
+    ) -> None:
+        super().__init__(binding, *arguments)
+        self.fields, self.common, self.width = fields, common, len(binding.new("block *").active)
+        self.needs_velocities = common is not None and bool(binding.constant("NEEDS_VELOCITIES"))
+
+    def prepare(self, first: int, end: int) -> None:
+        """Set the C structure of a part, with the memory of a block."""
+        super().prepare(first, end)
+        self.left = list[SingleRun]()
+        self.memory = self.struct.block = self.binding.new("block *")
+        self.active = np.frombuffer(self.binding.buffer(self.memory.active), dtype=np.float64)
         self.active[:] = 1.0
-        struct.positions, struct.momenta = map(binding.pointer, self.common.blocks)
-        if self.common.stepper.interface.words > 1:
-            struct.segment_end = binding.pointer(cast(FixedSegments, work.steps).end)
-        if self.common.actions is not None:
-            struct.actions = binding.pointer(self.common.actions)
-        if self.common.observation is not None:
-            struct.observed = binding.pointer(self.common.observation.values)
-        struct.trajectories, struct.pauses = len(self.common), struct.pauses or self.needs_velocities
+        for name, values in self.fields.items():
+            if values is not None:
+                setattr(self.struct, name, self.binding.pointer(values))
+        self.struct.trajectories, self.struct.pauses = len(self.q), self.struct.pauses or self.needs_velocities
 
     def lanes(self, name: str) -> Array:
         """Return a (m, lanes) view of a field of the block, (2 S, m, lanes) of ``memory``."""
-        field = np.frombuffer(self.work.binding.buffer(getattr(self.memory, name)), dtype=np.float64)
-        values = field.reshape(-1, self.common.stepper.dimension, len(self.active))
+        field = np.frombuffer(self.binding.buffer(getattr(self.memory, name)), dtype=np.float64)
+        values = field.reshape(-1, len(self.memory.q), len(self.active))
         return values if len(values) > 1 else values[0]
 
     def begin(self) -> None:
@@ -192,19 +181,21 @@ class LaneCall(Call):
         Lanes without velocities are deactivated.
         """
         super().enter(segment)
-        h = cast(FixedSegments, self.work.steps).h
-        if not self.needs_velocities or (segment and h[segment] == h[segment - 1]):
+        h, common = cast(FixedSegments, self.steps).h, self.common
+        if common is None or not self.needs_velocities or (segment and h[segment] == h[segment - 1]):
             return
         at_points, q, p, t = (*map(self.lanes, ("memory", "q", "p")), float(self.memory.t))
         for lane in np.flatnonzero(self.active > 0.0).tolist():
             try:
-                values = self.work.parameters[self.struct.next + lane]
-                at_points[:, :, lane] = self.common.stepper.velocity(q[:, lane], p[:, lane], t, values)
+                values = self.parameters[self.struct.next + lane]
+                at_points[:, :, lane] = common.stepper.velocity(q[:, lane], p[:, lane], t, values)
             except StateError:
                 self.active[lane] = 0.0
 
     def store(self, *, last: bool = False) -> None:
         """Remove the states after the failed steps of a block, and continue its failed lanes if it has ended."""
+        if self.common is None:
+            return
         common, ended, width = self.common, self.struct.segment < 0, len(self.active)
         first = (int(self.struct.next) - ended) // width * width
         for lane in np.flatnonzero(self.active[: self.struct.end - first] == 0.0).tolist():
