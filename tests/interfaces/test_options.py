@@ -31,7 +31,6 @@ RUNS = {
     "save_every": 2,
     "solver_tolerance": 1e-12,
     "max_iterations": 30,
-    "reproducible": False,
     "threads": 2,
     "action": True,
     "q": [0.5],
@@ -130,7 +129,6 @@ OCCURRENCES = {
     "save_every": {"interfaces/cli/recording.py", "interfaces/cli/running.py", "interfaces/models/packages/example.py"},
     "solver_tolerance": set(),
     "max_iterations": set(),
-    "reproducible": {"interfaces/models/time_span.py"},
     "threads": {"interfaces/models/model.py"},
     "action": {
         "interfaces/models/time_span.py",

@@ -464,33 +464,6 @@ def test_bits_of_trajectories_do_not_depend_on_others(
         assert one.steps.tolist() == runs.steps[members].tolist()
 
 
-def test_trajectories_that_share_the_end_of_iterations_differ_by_rounding_errors() -> None:
-    stepper, (q, p) = stepper_for("kepler", sc.SVI(5)), states("kepler", 40)
-    alone, shared = (
-        stepper.integrate_ensemble(q, p, h=0.3, steps=40, options=sc.SolverOptions(reproducible=reproducible))
-        for reproducible in (True, False)
-    )
-    assert alone.q.tobytes() == stepper.integrate_ensemble(q, p, h=0.3, steps=40).q.tobytes() != shared.q.tobytes()
-    assert np.abs(shared.q - alone.q).max() < 1e-12
-    with pytest.raises(sc.StateError, match="reproducible must be True or False"):
-        sc.SolverOptions(reproducible=1)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    ("method", "plan", "reason"),
-    [
-        ("svi:4", {"t_end": 1.0}, "one after the other .adaptive steps"),
-        ("stoermer-verlet", {"h": 0.1, "steps": 3}, "explicit steps have no iterations"),
-        ("scvi:2", {"h": 0.1, "steps": 3}, "those of this method are integrated one after the other"),
-    ],
-)
-def test_shared_iterations_are_refused_where_there_are_none(method: str, plan: dict[str, Any], reason: str) -> None:
-    q, p = states("kepler", 3)
-    stepper = sc.compile_stepper(sc.problem("kepler").system, method)
-    with pytest.raises(sc.StateError, match=rf"reproducible=False \(--shared.*{reason}.*: omit it"):
-        stepper.integrate_ensemble(q, p, **plan, options=sc.SolverOptions(reproducible=False))
-
-
 class TestThreadsAndInterruption:
     def test_results_do_not_depend_on_the_number_of_threads(self, kepler: sc.Stepper):
         q, p = states("kepler", 64)

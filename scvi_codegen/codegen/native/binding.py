@@ -235,8 +235,6 @@ class Binding:
         chosen = self._ffi.new(f"{self._prefix}_options *")
         chosen.tolerance, chosen.max_iterations = options.tolerance, options.max_iterations
         chosen.absolute = options.absolute
-        if hasattr(chosen, "shared"):  # of ensembles
-            chosen.shared = not options.reproducible
         return chosen
 
 

@@ -70,21 +70,17 @@ class SolverOptions:
         tolerance: size of the last update relative to the state (default: round-off), or absolute.
         max_iterations: after which a step fails.
         absolute: compare the update itself, the paper's rule ``max(|dQ|, |dP|) < TOL``.
-        reproducible: of ensembles in SIMD lanes; ``False``: the trajectories of a block have one predictor and iterate
-            until all have converged, which is up to 10 % faster, but their last bits depend on each other.
     """
 
     tolerance: float = TOLERANCE
     max_iterations: int = MAX_ITERATIONS
     absolute: bool = False
-    reproducible: bool = True
 
     def __post_init__(self) -> None:
         if not checked_number(self.tolerance, "the tolerance") > 0.0:
             raise StateError(f"the tolerance must be positive, not {self.tolerance!r}")
-        for name in ("absolute", "reproducible"):
-            if not isinstance(value := getattr(self, name), bool):
-                raise StateError(f"{name} must be True or False, not {value!r}")
+        if not isinstance(self.absolute, bool):
+            raise StateError(f"absolute must be True or False, not {self.absolute!r}")
         checked_count(self.max_iterations, "max_iterations", least=1, most=MOST_ITERATIONS)
 
 

@@ -215,13 +215,6 @@ class RunOptions:
         solver_option="max_iterations",
         common=False,
     )
-    reproducible: bool | None = run_option(
-        *("run", SWITCH, ""),
-        "With --ensemble: the bits of a trajectory do not depend on others [reproducible]; shared: up to 10 % faster.",
-        flag="--reproducible/--shared",
-        solver_option="reproducible",
-        common=False,
-    )
     threads: int | None = run_option(
         *("run", COUNT, "N", "Worker threads per step of an array model [1]."),
         least=1,

@@ -105,7 +105,7 @@ class TimeSpan(RunOptions):
 
     def _check_alone(self) -> None:
         """Raise an error for a single run with an option of ensembles."""
-        for name in ("device", "observe", "reproducible"):
+        for name in ("device", "observe"):
             if (value := getattr(self, name)) is not None:
                 flag = next(option.flag for option in options_of("run") if option.field == name)
                 shown = str(value).lower() if isinstance(value, bool) else repr(value)

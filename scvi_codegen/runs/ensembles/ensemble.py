@@ -204,26 +204,6 @@ class Ensemble:
             )
         self.states: list[Rows] = []
         self.successive = self._successive()
-        self._check_shared()
-
-    def _check_shared(self) -> None:
-        """Raise ``StateError`` for ``reproducible=False`` unless trajectories are SIMD lanes that iterate."""
-        if self.options is None or self.options.reproducible:
-            return
-        if isinstance(self.common, DeviceRuns):
-            reason = "those of a GPU are threads"
-        elif self.common is None:
-            reason = "these are integrated one after the other (adaptive steps, or changes by events)"
-        elif self.stepper.ensemble is None:
-            reason = "those of this method are integrated one after the other"
-        elif self.stepper.interface.solver == "explicit":
-            reason = "explicit steps have no iterations"
-        else:
-            return
-        raise StateError(
-            "reproducible=False (--shared, [run] reproducible = false) lets the iterations of trajectories in SIMD "
-            f"lanes end together, but {reason}: omit it"
-        )
 
     def _successive(self) -> SuccessiveRuns | None:
         """Return the trajectories that C integrates one after the other, ``None`` for other ensembles."""

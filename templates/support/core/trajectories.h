@@ -185,10 +185,9 @@ enum {
 typedef NAME(options) solver_options;
 typedef NAME(block) block_memory;
 
-/* Which trajectories the iteration still serves, whether they share its end, and the number of iterations. */
+/* Which trajectories the iteration still serves, and the number of iterations. */
 typedef struct {
   double *active;
-  int shared;
   long long iterations;
 } solver_report;
 

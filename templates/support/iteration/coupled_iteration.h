@@ -159,7 +159,7 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
         for (int i = 0; i < M; i++)
           z[n][i] += amplification(&now) * r[n][i];
 #ifndef POINTS
-    if (converge_early(&now, report))
+    if (converge_early(&now))
       keep_early(step, data, value, z, r, &now, stored);
 #endif
   }

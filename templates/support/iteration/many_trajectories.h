@@ -241,9 +241,9 @@ static inline lanes amplification(const progress *now)
 }
 
 /* Returns 1 if the values of trajectories have to be stored, which have converged before others. */
-static inline int converge_early(const progress *now, const solver_report *report)
+static inline int converge_early(const progress *now)
 {
-  return now->pending && now->converged > now->stored_count && !report->shared;
+  return now->pending && now->converged > now->stored_count;
 }
 
 /* Stores the values of the trajectories that have converged. */
@@ -293,5 +293,5 @@ static inline long long next_guess(long long steps, const progress *now, const s
   long long two = 0;
   for (int j = 0; j < LANES; j++)
     two += first.lane[j] < GOOD_GUESS || !(report->active[j] > 0.0) ? 2LL << j : 0;
-  return steps > 0 && (!report->shared || two == TWO_STEPS - 1) ? 1 | two : 1;
+  return steps > 0 ? 1 | two : 1;
 }

@@ -593,7 +593,7 @@ HOT int iterate(const step_data *step, const iteration_data *data, history past,
       measure_by_largest(stagnant(&now), inverse_size);
 #endif
 #ifndef POINTS
-    if (converge_early(&now, report)) {
+    if (converge_early(&now)) {
       store_early(&now, F[0], stored[0]);
       mark_stored(&now);
     }

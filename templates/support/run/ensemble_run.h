@@ -205,7 +205,7 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
   const solver_options standard = {.tolerance = TOLERANCE, .max_iterations = MAX_ITERATIONS};
   state now;
   iteration_data data;
-  solver_report report = {.active = block->active, .shared = options ? options->shared : 0};
+  solver_report report = {.active = block->active};
   lanes parameters[P + 1], memory[2][S][M];
 #ifndef EXPLICIT_STEPS
   first_results stored_results;
