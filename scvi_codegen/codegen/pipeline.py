@@ -513,17 +513,17 @@ def generate_source(
     symmetries: Sequence[Symmetry] = (),
     events: EventLike | Sequence[EventLike] | None = None,
     embedded: Embedded | None = None,
-    amalgamate: bool = False,
     controlled: bool = False,
     time_transformation: str | Expr | None = None,
     controller: str | None = None,
 ) -> tuple[Source, Interface]:
     """Return the C source of an integrator and its interface; other arguments as of :func:`compile_stepper`.
 
+    The source has support headers beside it; ``source.single_file()`` includes them.
+
     Args:
         embedded: precision, ``"double"`` or ``"single"``, of source for a microcontroller. Its solver is explicit or
             Newton, which needs half the stack of the SIMD fixed-point iteration without vector registers.
-        amalgamate: include the support headers in the source; always done for a microcontroller.
         controlled: use adaptive steps, if the method has an error estimate.
         time_transformation: use constant steps in tau instead, dt = g dtau, by the reversible controller.
         controller: step-size controller, as of :func:`compile_stepper`.
@@ -548,4 +548,4 @@ def generate_source(
     source = render_embedded(program, embedded, control) if embedded else render(program, control)
     interface = describe(program, system, method, g=g)
     complete = with_events(source, interface, searched) if searched else source
-    return (complete.single_file() if amalgamate or embedded else complete), interface
+    return (complete.single_file() if embedded else complete), interface

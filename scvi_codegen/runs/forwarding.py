@@ -43,7 +43,6 @@ class SteppersAnalysis:
         *,
         steps: int = 32,
         start: ArrayOrFunction = None,
-        homotopy: bool = True,
         revolutions: int | None = None,
         energy: float | None = None,
         closed: Any = None,
@@ -63,10 +62,10 @@ class SteppersAnalysis:
             q0, q1: (m,) positions at t and t + T.
             T: duration, negative for a path backward in time.
             steps: number of steps. A method of degree 4 to 8 needs about one to four in the shortest period over 2 pi.
-            start: positions to start from: (steps + 1, m), or a function of time; by default the straight line.
-            homotopy: if the straight line leads to no path, continue the path of duration T/16 to T. This finds the
-                direct one, without revolutions. If that fails, starts around the centre of a rotational symmetry (both
-                ways) and ten curves at random follow.
+            start: positions to start from: (steps + 1, m), or a function of time; by default the straight line. If that
+                leads to no path, the path of duration T/16 is continued to T, which finds the direct one, without
+                revolutions. If that fails, starts around the centre of a rotational symmetry (both ways) and ten curves
+                at random follow.
             revolutions: start from a curve around the centre of a rotational symmetry: 0 for the shorter way from q0
                 to q1, n for n more revolutions, negative for the other way around, from -1.
             energy: at the start, of closed paths the mean of all nodes; the duration is then unknown, T an estimate.
@@ -93,7 +92,6 @@ class SteppersAnalysis:
             T,
             steps=steps,
             start=start,
-            homotopy=homotopy,
             revolutions=revolutions,
             energy=energy,
             closed=closed,

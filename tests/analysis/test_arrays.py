@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from commands import output_of
 from either_system import either_system
-from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 from scvi_codegen.analysis.verification.arrays import small_start
@@ -78,7 +77,7 @@ def certificate(name: str, method: str) -> sc.Certificate:
     """Return the certificate of one of the systems."""
     given, start = SYSTEMS[name]
     system = either_system(name=name, **given)
-    return sc.verify(system, method, **start, flags=QUICK_FLAGS)
+    return sc.verify(system, method, **start)
 
 
 @pytest.mark.full

@@ -158,7 +158,7 @@ def test_constrained_systems_are_certified(name: str) -> None:
 def test_inputs_are_certified_between_breakpoints() -> None:
     system, stepper = pushed_pendulum(), sc.compile_stepper(pushed_pendulum(), sc.SVI(2), flags=QUICK_FLAGS)
     for given in ({}, {"q": [0.6], "p": [-0.3], "stepper": stepper}):
-        certificate = sc.verify(system, sc.SVI(2), flags=QUICK_FLAGS, **given)
+        certificate = sc.verify(system, sc.SVI(2), **given)
         assert certificate.passed, certificate.to_text()
         assert not certificate.not_measured
 
@@ -168,7 +168,7 @@ def test_inputs_are_certified_between_breakpoints() -> None:
 
 def pendulum_certificate(**changes: object) -> sc.Certificate:
     system = sc.problem("planar-pendulum").system
-    return sc.verify(system, sc.SVI(2), [0.7], [0.9], h=0.2, flags=QUICK_FLAGS, **changes)
+    return sc.verify(system, sc.SVI(2), [0.7], [0.9], h=0.2, **changes)
 
 
 def test_a_certificate_is_text_json_and_a_verdict(tmp_path: Path) -> None:
@@ -198,18 +198,18 @@ def test_rounding_of_growing_motions_is_no_drift(method: str) -> None:
 
 
 def test_missing_state_is_generated() -> None:
-    certificate = sc.verify(sc.problem("planar-pendulum").system, sc.Gauss(2), flags=QUICK_FLAGS, solver="newton")
+    certificate = sc.verify(sc.problem("planar-pendulum").system, sc.Gauss(2), solver="newton")
     assert certificate.passed
     assert certificate.h > 0
     with pytest.raises(sc.StateError, match="give both, or neither"):
-        sc.verify(sc.problem("planar-pendulum").system, sc.Gauss(2), [0.1], flags=QUICK_FLAGS)
+        sc.verify(sc.problem("planar-pendulum").system, sc.Gauss(2), [0.1])
 
 
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", [sc.SVI(2), sc.Gauss(2)], ids=lambda method: method.name)
 def test_inputs_are_certified_at_small_values(method) -> None:
     """Nobody gives any: their parts are moved off 0 as all parameters are."""
-    certificate = sc.verify(pushed_pendulum(), method, flags=QUICK_FLAGS)
+    certificate = sc.verify(pushed_pendulum(), method)
     assert certificate.passed, certificate.to_text()
     assert len(certificate.checks) > 15
 

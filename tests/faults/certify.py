@@ -13,7 +13,7 @@ def certify(names: list[str]) -> None:
     for name in names:
         own = case(name)
         try:
-            certificate = verify(own.system, own.method(), own.q, own.p, h=own.h, flags=QUICK_FLAGS)
+            certificate = verify(own.system, own.method(), own.q, own.p, h=own.h)
         except (BuildError, SyntaxError, NameError) as error:
             print(f"{type(error).__name__}: {' '.join(str(error).split())[:120]}")
             sys.exit(3)

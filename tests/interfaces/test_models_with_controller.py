@@ -197,7 +197,7 @@ def test_folder_contains_the_controller_in_c_and_in_python(
     shaken: Path, tmp_path: Path, solver: str, embedded: str | None
 ) -> None:
     model = sc.load_model(shaken)
-    folder = generate_package(model, tmp_path / "by_controller", solver=solver, embedded=embedded)
+    folder = generate_package(replace(model, solver=solver), tmp_path / "by_controller", embedded=embedded)
     flags = "CFLAGS=-O2 -std=c99 -Wall -Wextra -Werror -Wno-psabi -ffp-contract=off"
     done = subprocess.run(["make", "-s", "-C", folder, "run", flags], capture_output=True, text=True, check=True)
     *lines, last = done.stdout.splitlines()

@@ -116,7 +116,7 @@ def test_c_program_falls_back_to_newton_where_the_fixed_point_fails(h, solver, r
         forces={"x": "-0.1*x_dot", "y": "cos(t) - 0.1*y_dot"},
     )
     model = sc.Model(system=system, method="svi:2", q=(1.0, 0.5), velocity=(0.0, 0.0), h=h, steps=20)
-    folder = sc.generate_package(model, tmp_path / "springs_svi", solver=solver)
+    folder = sc.generate_package(replace(model, solver=solver), tmp_path / "springs_svi")
     command = ["make", "-s", "-C", str(folder), "run", f"CFLAGS={STRICT}"]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     if reported:

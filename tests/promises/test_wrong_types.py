@@ -40,10 +40,10 @@ MODEL = sc.Model.from_problem(ENTRY)
 
 PLAIN: dict[str, dict[str, Any]] = {
     "compile_stepper": {"system": SYSTEM, "method": "svi:2", "flags": QUICK_FLAGS} | COMPILED,
-    "generate_source": {"system": SYSTEM, "method": "svi:2", "amalgamate": False} | COMPILED,
+    "generate_source": {"system": SYSTEM, "method": "svi:2"} | COMPILED,
     "derive": {"system": SYSTEM, "method": "svi:1", "radicals": False},
     "advise": {"system": SYSTEM, "method": "svi:2", **STATE, "span": 1.0, "tolerance": 0.1, "degree": False, "t": 0.0},
-    "verify": {"system": SYSTEM, "method": "svi:1", **STATE, "h": 0.1, "t": 0.0, "stepper": None, "flags": ()},
+    "verify": {"system": SYSTEM, "method": "svi:1", **STATE, "h": 0.1, "t": 0.0, "stepper": None},
     "symmetries": {"system": SYSTEM},
     "check_symmetry": {"system": SYSTEM, "direction": ["-q2", "q1"], "gauge": None, "name": "x"},
     "hamiltonian_of": {"system": SYSTEM, "momenta": None},
@@ -57,8 +57,8 @@ PLAIN: dict[str, dict[str, Any]] = {
     "load_model": {"path": "no such file"},
     "save_model": {"model": MODEL, "path": "no such folder/file"},
     "load_package": {"folder": "no such folder"},
-    "generate_package": {"model": MODEL, "folder": "no such/folder", "solver": "auto", "force": False},
-    "generate_fmu": {"model": MODEL, "path": "no such/one.fmu", "solver": "auto", "force": False},
+    "generate_package": {"model": MODEL, "folder": "no such/folder", "force": False},
+    "generate_fmu": {"model": MODEL, "path": "no such/one.fmu", "force": False},
     "load_run": {"folder": "no such folder"},
     "resume_run": {"folder": "no such folder"},
     "SVI": {"degree": 2, "quadrature": None, "nodes": None, "space": None},

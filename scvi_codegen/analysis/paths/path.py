@@ -173,7 +173,6 @@ def path_of(
     *,
     steps: int,
     start: ArrayOrFunction,
-    homotopy: bool,
     revolutions: int | None,
     energy: float | None,
     closed: Any,
@@ -224,7 +223,7 @@ def path_of(
             for curve in _around(intervals, ends, nodes, revolutions)
         ]
     else:
-        attempts = _attempts(intervals, ends, nodes, duration, homotopy=homotopy and nodes is None)
+        attempts = _attempts(intervals, ends, nodes, duration)
     found, comparison, dropped = _first_motion(attempts)
     if wanted is not None:
         found = solver.AtEnergy(found.intervals, wanted, states).solved(found.q, found.iterations)
@@ -328,11 +327,9 @@ def _first_motion(attempts: Sequence[Attempt]) -> tuple[solver.Solution, Discret
     )
 
 
-def _attempts(
-    intervals: Intervals, ends: Sequence[Array], nodes: Array | None, duration: float, *, homotopy: bool
-) -> list[Attempt]:
-    """Return functions that search a path from a start or the straight line, and with ``homotopy`` in other ways."""
-    count = len(intervals.h)
+def _attempts(intervals: Intervals, ends: Sequence[Array], nodes: Array | None, duration: float) -> list[Attempt]:
+    """Return functions that search a path from a start, or from the straight line and in other ways."""
+    count, in_other_ways = len(intervals.h), nodes is None
     if nodes is None:
         nodes = _line(ends, count)
     elif len(nodes) != count + 1:
@@ -341,11 +338,11 @@ def _attempts(
     if isinstance(intervals, ReducedIntervals):
         nodes[1:] = [intervals.on_manifold(each, k, ends[0]) for k, each in enumerate(nodes[1:], 1)]
     attempts: list[Attempt] = [partial(solver.solved, intervals, nodes)]
-    if homotopy:
+    if in_other_ways:
         attempts.append(partial(solver.continued, intervals, nodes, duration))
     if not intervals.stepper.interface.exchange_names:  # many coordinates: quicker than the continuation
         attempts.insert(1 if intervals.sparse else len(attempts), partial(solver.descended, intervals, nodes))
-    if homotopy and not intervals.sparse:
+    if in_other_ways and not intervals.sparse:
         around = _curves_around(intervals, nodes, 0, -1)
         attempts.extend(partial(solver.continued_from_motion, intervals, curve, duration) for curve in around)
         at_random = islice(curves_at_random(nodes), RANDOM_STARTS)

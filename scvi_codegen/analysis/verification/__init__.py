@@ -13,7 +13,7 @@ States and parameters are perturbed slightly, so that no symmetry and no mass of
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -29,9 +29,8 @@ from scvi_codegen.analysis.verification.structure import largest_step, structure
 from scvi_codegen.analysis.verification.system_under_test import State, SystemUnderTest
 from scvi_codegen.analysis.verification.variable_steps import VariableSteps, at_fixed_energy, variable_step_checks
 from scvi_codegen.codegen.native.arguments import checked_number, checked_step
-from scvi_codegen.codegen.native.building import TUNED_FLAGS
 from scvi_codegen.common.errors import StateError, StepFailedError
-from scvi_codegen.common.validation import TEXTS, checks_arguments
+from scvi_codegen.common.validation import checks_arguments
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.discretise import discretised_form
 from scvi_codegen.methods.method import Method
@@ -52,7 +51,7 @@ LONGEST, HALVINGS, PART = 1.0, 40, 0.1
 """Largest step tried, number of halvings, and the largest change of the state per step relative to its size."""
 
 
-@checks_arguments(system=SYSTEM_OR_ARRAYS, stepper=STEPPER, flags=TEXTS)
+@checks_arguments(system=SYSTEM_OR_ARRAYS, stepper=STEPPER)
 @without_accuracy_warnings()
 def verify(
     system: MechanicalSystem | ArraySystem,
@@ -65,7 +64,6 @@ def verify(
     stepper: Stepper | None = None,
     tolerance: float | None = None,
     solver: str = "auto",
-    flags: Sequence[str] = TUNED_FLAGS,
     velocity: ArrayLike | Mapping[str, ArrayLike] | None = None,
     parameters: Mapping[str, ArrayLike] | None = None,
     tables: Mapping[str, ArrayLike] | None = None,
@@ -83,7 +81,7 @@ def verify(
         stepper: stepper under test, for example from ``load_package``; by default compiled now. For a stepper with a
             time-rescaling function (:func:`~scvi_codegen.compile_stepper`) its adaptive steps are measured, too.
         tolerance: also measure runs with adaptive step size and this relative local error; 0: round-off.
-        solver, flags: as for ``compile_stepper``.
+        solver: as for ``compile_stepper``.
         velocity, parameters, tables: only for arrays of run-time sizes, which also need q and h (fields on a mesh do
             not), as of :meth:`Stepper.integrate`: properties are measured on a few indices of the arrays first, then at
             full size; the state of the certificate is that of the few indices.
@@ -103,7 +101,7 @@ def verify(
             verify_arrays,  # imported here: it imports modules of this package
         )
 
-        more |= {"stepper": stepper, "tolerance": tolerance, "flags": flags, "of_known_sizes": verify}
+        more |= {"stepper": stepper, "tolerance": tolerance, "of_known_sizes": verify}
         return verify_arrays(system, method, q, p, h=h, t=t, **more)
     for name, value in more.items():
         if value is not None:
@@ -115,8 +113,7 @@ def verify(
     t, h = checked_number(t, "the time t"), None if h is None else checked_step(h)
     began, method = time.perf_counter(), as_method(method, system)
     system = discretised_form(system, method)
-    flags = tuple(flags if stepper is None else stepper.flags)
-    stepper = stepper or compile_stepper(system, method, solver=solver, flags=flags)
+    stepper = stepper or compile_stepper(system, method, solver=solver)
     start = _initial_state(system, stepper, q, p, h, t)
     return _certificate(system, method, stepper, start, began, solver=solver, tolerance=tolerance)
 

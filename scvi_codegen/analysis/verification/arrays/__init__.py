@@ -6,7 +6,7 @@ compared with NumPy, and conserved quantities are measured along a run.
 """
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any, cast
@@ -50,7 +50,6 @@ def verify_arrays(
     t: float,
     stepper: Stepper | None,
     tolerance: float | None,
-    flags: Sequence[str],
     of_known_sizes: Callable[..., Certificate],
     **arrays_of_run: Any,
 ) -> Certificate:
@@ -67,14 +66,14 @@ def verify_arrays(
         raise StateError(f"stepper must be one of run-time sizes, not {stepper!r}: compile it without sizes")
     began = time.perf_counter()
     chosen = as_method(method, one_coordinate(system))
-    watched = stepper or compile_stepper(system, chosen, flags=tuple(flags))
+    watched = stepper or compile_stepper(system, chosen)
     stepper = watched.with_events(())
     run = stepper.start(q, p, h=h, t=t, **arrays_of_run)
     arrays = read_arrays(stepper.interface, q, arrays_of_run["parameters"], arrays_of_run["tables"])
     parameters = dict(zip(stepper.interface.parameters, arrays.numbers, strict=True))
     if stepper.source is None or system.coupled_terms or tolerance is not None or system.constraints:
         known = unroll_sums(system, arrays.sizes, tables=arrays.places, parameters={**parameters, **arrays.fields})
-        options: dict[str, Any] = {"h": run.h, "t": run.t, "tolerance": tolerance, "flags": flags}
+        options: dict[str, Any] = {"h": run.h, "t": run.t, "tolerance": tolerance}
         if watched.events:
             options["stepper"] = compile_stepper(known, chosen, flags=watched.flags, events=watched.events)
         if system.constraints and isinstance(chosen, StoermerVerlet):

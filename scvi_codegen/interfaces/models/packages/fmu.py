@@ -170,15 +170,9 @@ SUFFIXES = {"darwin": ".dylib", "windows": ".dll"}
 """File suffixes of libraries other than .so."""
 
 
-@checks_arguments(model=MODEL, flags=TEXTS, platforms=TEXTS)
+@checks_arguments(model=MODEL, platforms=TEXTS)
 def generate_fmu(
-    model: Model,
-    path: str | os.PathLike[str],
-    *,
-    solver: str = "auto",
-    flags: tuple[str, ...] = PORTABLE_FLAGS,
-    platforms: tuple[str, ...] = (),
-    force: bool = False,
+    model: Model, path: str | os.PathLike[str], *, platforms: tuple[str, ...] = (), force: bool = False
 ) -> Path:
     """Write a model as an FMU 3.0 for co-simulation: a library for this machine, and the sources for others.
 
@@ -189,8 +183,6 @@ def generate_fmu(
     Args:
         model: system, method, initial state, and the step size. Arrays have the sizes of the model.
         path: target file, ``<name>.fmu``; the name is the prefix of the C names.
-        solver: of the stage equations, as for ``compile_stepper``; by default that of the model.
-        flags: for the C compiler; by default those with bitwise equal results on all processors of a kind.
         platforms: further platforms of libraries, as FMI names them: ``x86_64-windows``, ``aarch64-darwin``, ..
         force: overwrite a file that is not an FMU.
 
@@ -210,11 +202,11 @@ def generate_fmu(
     _check(platforms)
     if not force:
         _refuse_to_lose(target)
-    model = (model if solver == "auto" else replace(model, solver=solver)).with_known_sizes()
+    model = model.with_known_sizes()
     source, texts = _texts(model, prefix)
-    libraries = {_library_path(_this_platform(), prefix): load(source, flags=flags).path.read_bytes()}
+    libraries = {_library_path(_this_platform(), prefix): load(source, flags=PORTABLE_FLAGS).path.read_bytes()}
     for name in sorted({*platforms} - {_this_platform()}):
-        libraries[_library_path(name, prefix)] = library_for(name, source, flags=flags)
+        libraries[_library_path(name, prefix)] = library_for(name, source, flags=PORTABLE_FLAGS)
     try:
         write_atomically(target, lambda file: _write(texts | libraries, file))
     except OSError as error:

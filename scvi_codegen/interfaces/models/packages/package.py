@@ -199,7 +199,6 @@ def generate_package(
     model: Model,
     folder: str | os.PathLike[str],
     *,
-    solver: str = "auto",
     force: bool = False,
     embedded: Embedded | None = None,
     single_file: bool = False,
@@ -212,7 +211,6 @@ def generate_package(
         model: system, method, and the initial state and step size of the example. The code for arrays of run-time
             sizes is for run-time sizes, unless steps are adaptive.
         folder: target; its name becomes the prefix of the C names and the name of the Python package.
-        solver: of the stage equations, as for ``compile_stepper``; by default that of the model.
         force: overwrite files of the same names that were edited or not generated.
         embedded: the precision, ``"double"`` or ``"single"``, of C for a microcontroller, without a Python package;
             arrays have the sizes of the model.
@@ -228,7 +226,6 @@ def generate_package(
     """
     target = Path(folder)
     prefix = prefix_of(target)
-    model = model if solver == "auto" else replace(model, solver=solver)
     of_run_time_sizes = model.array_system is not None and model.h is not None and not embedded and not model.events
     write = _texts_of_arrays if of_run_time_sizes else _texts
     write_folder(target, write(model, prefix, embedded, single_file=single_file), force=force)
