@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from functools import cache
 from typing import Any
 
@@ -132,6 +134,19 @@ def test_a_step_that_requests_newtons_method_is_repeated_with_it() -> None:
     for j, (_, q, *_) in enumerate(work.result().each()):
         run = one.integrate([1.0], [0.0], t_end=end, tolerance=1e-3, parameters={"k": k[j]})
         assert q.tobytes() == run.q.tobytes()
+
+
+@pytest.mark.parametrize("plan", [{"h": 0.1, "steps": 5}, {"t_end": 0.5, "tolerance": 1e-6}])
+def test_ensembles_are_released_without_the_garbage_collector(plan: dict[str, Any]) -> None:
+    work = Ensemble(stepper("kepler"), *states("kepler"), **plan)
+    work.run()
+    released = weakref.ref(work)
+    gc.disable()
+    try:
+        del work
+        assert released() is None
+    finally:
+        gc.enable()
 
 
 @pytest.mark.parametrize(("name", "plan"), [("kepler", "own ends"), ("rod", "fixed")])

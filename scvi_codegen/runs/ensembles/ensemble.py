@@ -225,7 +225,7 @@ class Ensemble:
             plan=self.plans[0] if isinstance(self.plans[0], Adaptive) else None,
             save_every=self.save_every if self.t_eval is None else LARGEST_COUNT,
             most_states=self.most_states,
-            receive=lambda states: self.states.append(states.copies()),
+            receive=partial(_append_copies, self.states),  # without self, so that no cycle keeps the memory
         )
 
     def _saves_ends(self, ends: Array) -> bool:
@@ -568,6 +568,10 @@ class Ensemble:
         return SavedLane(
             stacked([self.t0])[first], self.start[0][[j]][first], self.start[1][[j]][first], INTERRUPTED, 0
         )
+
+
+def _append_copies(stored: list[Rows], states: Rows) -> None:
+    stored.append(states.copies())
 
 
 def _recorded_events(stepper: Any, device: str | None, observe: str | None) -> tuple[Event, ...]:
