@@ -2,14 +2,13 @@
 
 A table ``["stepper.integrate".StateError.kepler]`` states what is called, the class of its errors, and on what. Calls:
 ``system`` makes the subject with other arguments; ``stepper.``, ``system.`` are methods of the subject; ``sc.`` is a
-function of the package, with the subject as first argument unless that is ``none``; ``file`` reads the subject as a
-model file, in which a row replaces one text by another. Of several calls each is made, those of ensembles with one
-trajectory. A row, ``"words" = { arguments }``, has the words of the error in their order, with `` .. `` for what is
-between them; several arguments with the same error are a list. Methods of the result follow as
-``then = { name = { arguments } }``. ``with`` has what the rows of a table share; ``second`` is the second tier.
+function of the package, with the subject as first argument unless that is ``none``. Of several calls each is made,
+those of ensembles with one trajectory. A row, ``"words" = { arguments }``, has the words of the error in their order,
+with `` .. `` for what is between them; several arguments with the same error are a list. Methods of the result follow
+as ``then = { name = { arguments } }``. ``with`` has what the rows of a table share; ``second`` is the second tier.
 
-``[subjects]`` are systems, as arguments of ``from_text``; steppers, as a ``system`` with arguments of
-``compile_stepper``; and texts of model files. Other names are those of the catalogue.
+``[subjects]`` are systems, as arguments of ``from_text``, and steppers, as a ``system`` with arguments of
+``compile_stepper``. Other names are those of the catalogue.
 """
 
 import json
@@ -22,7 +21,6 @@ from typing import Any
 import pytest
 
 import scvi_codegen as sc
-from scvi_codegen.interfaces.models.model_files.model_file import parse_model
 from scvi_codegen.methods import method_from_specification
 
 FOLDER = Path(__file__).parent.parent / "refusals"
@@ -65,13 +63,10 @@ def value(name: str, x: Any) -> Any:
 
 
 def call(name: str, of: Any, arguments: dict[str, Any]) -> None:
+    """Call a function by its name on a subject, and the methods of its result that ``then`` names."""
     kind, _, function = name.partition(".")
     first = {name: value(name, x) for name, x in arguments.items() if name != "then"}
-    if kind == "file":
-        ((old, new),) = arguments.items()
-        assert old in of
-        result = parse_model(of.replace(old, new, 1))
-    elif name == "system":
+    if name == "system":
         result = system_of(of | first)
     elif kind == "sc":
         result = getattr(sc, function)(*[] if of == "none" else [subject(json.dumps(of))], **first)
