@@ -239,7 +239,6 @@ class TestChoices:
                 "--advise is not available with a time transformation",
             ),
             ("kepler --checkpoint 5", "--checkpoint requires a run recorded in a folder (-o NAME.run)"),
-            ("kepler -o orbit.npz --checkpoint-steps 5", "--checkpoint-steps requires a run recorded in a folder"),
             (
                 "kepler --time-transformation distance --step 0.1 --span 1 -o orbit.run",
                 "a recorded run in transformed time needs a number of steps",

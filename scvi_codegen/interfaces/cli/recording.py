@@ -30,12 +30,7 @@ from scvi_codegen.runs.stepping.step_plan import FixedSteps, InTau
 SUFFIX = ".run"
 MAX_STATES = 10_000
 """Largest number of states used to summarise what was conserved."""
-WITH_RESUME = {
-    "resume",
-    "checkpoint",
-    "checkpoint_steps",
-    *(each.name for each in OPTIONS if each.determines == DURATION),
-}
+WITH_RESUME = {"resume", "checkpoint", *(each.name for each in OPTIONS if each.determines == DURATION)}
 """Options that are allowed with ``--resume``."""
 
 
@@ -119,17 +114,15 @@ class Recording:
 
     Attributes:
         seconds: seconds between checkpoints; ``None`` for the default.
-        steps: steps between checkpoints; ``None`` for no such limit.
         certificate: path of a JSON file to store with the run, or ``None``.
     """
 
     seconds: float | None
-    steps: int | None
     certificate: str | None
 
     def check(self, recorded: bool) -> None:
         """Reject options that have no effect on a run in memory."""
-        options = {"--checkpoint": self.seconds, "--checkpoint-steps": self.steps, "--certificate": self.certificate}
+        options = {"--checkpoint": self.seconds, "--certificate": self.certificate}
         for name, value in options.items():
             if value is not None and not recorded:
                 raise click.UsageError(f"{name} requires a run recorded in a folder (-o NAME{SUFFIX})")
@@ -177,8 +170,8 @@ class Recording:
         self, act: Any, *arguments: Any, first: int, steps: int | None, **settings: Any
     ) -> RecordedOutcome:
         """Record or resume with a progress bar; SIGINT and SIGTERM end the run at a checkpoint."""
-        checkpoint_interval = {"checkpoint_seconds": self.seconds, "checkpoint_steps": self.steps}
-        settings |= {name: value for name, value in checkpoint_interval.items() if value is not None}
+        if self.seconds is not None:
+            settings["checkpoint_seconds"] = self.seconds
         folder, failure, began = arguments[-1], None, time.perf_counter()
         with interruptions() as caught, progress_bar(0 if steps is None else steps - first) as show_progress:
             try:

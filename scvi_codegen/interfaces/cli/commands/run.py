@@ -114,7 +114,6 @@ ERRORS = {option.name: option for option in OWN if option.determines == STEP_SIZ
 @click.option(
     "--checkpoint", type=float, metavar="SECONDS", help="Longest time between checkpoints of a run in a folder [10]."
 )
-@click.option("--checkpoint-steps", type=int, metavar="N", help="Most steps between checkpoints.")
 @click.option("--certificate", type=click.Path(), metavar="FILE", help="JSON file to store in the folder.")
 @click.option("--plot", type=click.Path(), metavar="FILE", help="Plot (.png, .svg, .pdf) or film (.gif, .html, .mp4).")
 @click.option(
@@ -126,14 +125,13 @@ def run(
     output: str | None,
     resume: str | None,
     checkpoint: float | None,
-    checkpoint_steps: int | None,
     certificate: str | None,
     plot: str | None,
     ensemble: str | None,
     **choices: Any,
 ) -> None:
     """Integrate MODEL; the help text is ``ABOUT``."""
-    recording = Recording(seconds=checkpoint, steps=checkpoint_steps, certificate=certificate)
+    recording = Recording(seconds=checkpoint, certificate=certificate)
     if resume is not None:
         check_resumed(click.get_current_context())
         _finish_recording(recording.resume(resume, steps=choices["steps"], span=choices["span"]))
