@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from decimal import Context, Decimal
 from inspect import Parameter, signature
 from pathlib import Path
-from typing import Any, Self, TypeVar, cast
+from typing import Any, ClassVar, Self, TypeVar, cast
 
 import numpy as np
 
@@ -142,12 +142,23 @@ class ArgumentType:
     accepts: Callable[[Any], bool]
 
 
+class OfRunTimeSizes:
+    """Base of types that count as instances of another type, but lack features that require known sizes.
+
+    Attributes:
+        REQUIRES_SIZES: explanation and remedy.
+    """
+
+    __slots__ = ()
+    REQUIRES_SIZES: ClassVar[str]
+
+
 def of(words: str, *types: type) -> ArgumentType:
-    """Return the check for an instance of one of the types; a type with ``REQUIRES_SIZES`` must be named itself."""
+    """Return the check for an instance of one of the types; :class:`OfRunTimeSizes` must derive from one of them."""
 
     def accepts(value: Any) -> bool:
-        full = not hasattr(type(value), "REQUIRES_SIZES") or any(each in type(value).__mro__ for each in types)
-        return full and isinstance(value, types)
+        derived = not isinstance(value, OfRunTimeSizes) or not {*types}.isdisjoint(type(value).__mro__)
+        return derived and isinstance(value, types)
 
     return ArgumentType(words, accepts)
 
@@ -220,9 +231,8 @@ def check_kind(kind: ArgumentType, value: Any, name: str, error: type[ScviCodege
 
 
 def _check_sizes(kind: ArgumentType, value: Any, function: str, error: type[ScviCodegenError]) -> None:
-    reason = getattr(type(value), "REQUIRES_SIZES", "")
-    if reason and not kind.accepts(value):
-        raise error(f"{function}() is not available for {value!r:.60}: {reason}")
+    if isinstance(value, OfRunTimeSizes) and not kind.accepts(value):
+        raise error(f"{function}() is not available for {value!r:.60}: {value.REQUIRES_SIZES}")
 
 
 def checks_arguments(
@@ -240,7 +250,7 @@ def checks_arguments(
     scvi_codegen.common.errors.ArgumentError: name must be text, not 3
 
     A keyword that the function does not have raises an error with a suggestion. A type that lacks features explains it
-    by its attribute ``REQUIRES_SIZES``.
+    as a :class:`OfRunTimeSizes`.
     """
 
     def decorate(function: Called) -> Called:

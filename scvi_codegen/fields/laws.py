@@ -338,7 +338,7 @@ class FieldHistory:
             StateError: if the run has no dense output.
             StepFailedError: if a partial step fails.
         """
-        if not hasattr(self.run, "at") or self.run.pieces:
+        if not self.run._has_dense_output or self.run.pieces:
             raise StateError("recordings and runs with inputs have none here")
         count = len(self.t)
         steps = np.arange(WINDOW) - np.where(np.arange(count) == 0, 0, WINDOW // 2)[:, np.newaxis]

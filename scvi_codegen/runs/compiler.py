@@ -28,7 +28,7 @@ from scvi_codegen.codegen.rendering.source import AUTO, DOUBLE_DOUBLE, PRECISION
 from scvi_codegen.codegen.variants import Derivatives, Variant
 from scvi_codegen.common.cache import cached_source, key_of
 from scvi_codegen.common.errors import MethodError, SizesRequiredError
-from scvi_codegen.common.validation import TEXTS, ArgumentType, check_kind, checks_arguments
+from scvi_codegen.common.validation import TEXTS, ArgumentType, OfRunTimeSizes, check_kind, checks_arguments
 from scvi_codegen.methods import SVI, StoermerVerlet, as_method, default_method
 from scvi_codegen.methods.method import Method
 from scvi_codegen.runs.stepper import Stepper
@@ -116,20 +116,17 @@ def compile_stepper(
     }
     compiled = partial(compile_stepper, system, method, **common)
     if precision == AUTO:
-        if sizes is None and hasattr(system, "REQUIRES_SIZES"):
+        if sizes is None and isinstance(system, OfRunTimeSizes):
             raise MethodError(f"precision='auto' is not available with arrays of run-time sizes: {SIZES_REQUIRED}")
         return _in_both_precisions(compiled, events)
     if symmetries != ():
         from scvi_codegen.systems.symmetry.symmetry import SYMMETRIES
 
         check_kind(SYMMETRIES, symmetries, "symmetries")
-    drawn: dict[str, Any] = {
-        "mesh": getattr(system, "mesh", None),
-        "links": () if hasattr(system, "_text") else getattr(system, "links", ()),
-    }
+    drawn: dict[str, Any] = {"mesh": system.mesh, "links": system.drawn_links}
     if sizes is not None or tables is not None:
         system, time_transformation = _at_sizes(system, time_transformation, sizes or {}, tables)
-    if known_sizes := not hasattr(system, "REQUIRES_SIZES"):
+    if known_sizes := not isinstance(system, OfRunTimeSizes):
         method = as_method(method, system)
     else:
         if symmetries:

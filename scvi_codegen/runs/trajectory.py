@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Literal, Self, cast, overload
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, cast, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -94,6 +94,7 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
     conserved: Array | None = field(default=None, repr=False)
     actions: Array | None = field(default=None, repr=False)
     pieces: tuple[Self, ...] = field(default=(), repr=False)
+    _has_dense_output: ClassVar[bool] = True
 
     def __repr__(self) -> str:
         if self.pieces:

@@ -144,7 +144,7 @@ class Forms:
 
         Empty also if theta = y: such a system is Hamiltonian in the usual sense.
         """
-        return () if getattr(self.system, "is_canonical", True) else self.momentum
+        return () if self.system.is_canonical else self.momentum
 
     @cached_property
     def legendre(self) -> tuple[Expr, ...]:

@@ -103,6 +103,11 @@ class FirstOrderSystem(HamiltonianSystem):
         return {each.name: values[each] for each in self.variables}
 
     @property
+    def is_first_order(self) -> bool:
+        """True."""
+        return True
+
+    @property
     def is_canonical(self) -> bool:
         """True if theta_x = y, so that the system is an ordinary Hamiltonian one."""
         return self.one_form == self.momenta

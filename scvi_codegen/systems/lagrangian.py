@@ -68,6 +68,11 @@ class LagrangianSystem(MechanicalSystem):
     auxiliaries = ()
 
     @property
+    def drawn_links(self) -> tuple[Any, ...]:
+        """Links of a robot from a file, for pictures; those that were read from text have none."""
+        return self.links if self._text is None else ()
+
+    @property
     def formula(self) -> Expr:
         """L."""
         return self.lagrangian

@@ -45,13 +45,13 @@ if TYPE_CHECKING:
 class Deferred:
     """Base of frozen dataclasses with slots: fields without a value are read from text when they are first accessed.
 
-    ``_text`` contains the arguments of ``from_text`` as JSON, and ``_key`` the key found in the cache; both are unset
-    for objects made in another way.
+    ``_text`` contains the arguments of ``from_text`` as JSON, and ``_key`` the key found in the cache; both are
+    ``None`` for objects made in another way.
     """
 
     __slots__ = ("_key", "_text")
-    _key: str
-    _text: str
+    _key: str | None
+    _text: str | None
 
     @classmethod
     @abstractmethod
@@ -75,11 +75,11 @@ class Deferred:
 
     def key(self) -> tuple[str, ...]:
         """Return the key of this system in caches, made from its type and all of its fields."""
-        return (getattr(self, "_key", None) or key_of(self),)
+        return (self._key or key_of(self),)
 
     def store_key(self) -> None:
         """Store the key of a system that was read from text, so that later processes need not read the text."""
-        if hasattr(self, "_text") and not hasattr(self, "_key"):
+        if self._text is not None and self._key is None:
             (key,) = self.key()
             store_text(("system", self._text), key)
             object.__setattr__(self, "_key", key)
@@ -88,8 +88,10 @@ class Deferred:
 
         def __getattr__(self, name: str) -> Any:
             """Read the text if ``name`` is a field; called only for attributes without a value."""
+            if name in Deferred.__slots__:
+                return None
             names = [field.name for field in fields(self)]
-            if name not in names or not hasattr(self, "_text"):
+            if name not in names or self._text is None:
                 raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}", name=name, obj=self)
             system, _ = self._read(json.loads(self._text)[1])
             for each in names:
@@ -213,7 +215,27 @@ class MechanicalSystem(Deferred, ABC):
     @property
     def constrained(self) -> bool:
         """True if there are constraints; reads no formulas."""
-        return bool(json.loads(self._text)[1]["constraints"] if hasattr(self, "_key") else self.constraints)
+        return bool(self.constraints if self._text is None else json.loads(self._text)[1]["constraints"])
+
+    @property
+    def is_first_order(self) -> bool:
+        """True if the function is linear in the velocities, so that half of the variables are momenta."""
+        return False
+
+    @property
+    def is_canonical(self) -> bool:
+        """False if the momenta of a first-order system are functions of its variables."""
+        return True
+
+    @property
+    def mesh(self) -> Any:
+        """Mesh of the fields of a density; ``None`` for other systems."""
+        return None
+
+    @property
+    def drawn_links(self) -> tuple[Any, ...]:
+        """Links of a robot from a file, for pictures; reads no formulas."""
+        return ()
 
     @property
     def dimension(self) -> int:

@@ -167,8 +167,12 @@ class ManyCoordinates(Intervals):
     """
 
     sparse = True
+    colours: Array | None = None  # groups of columns without common rows
 
-    def _set_pattern(self, q: Array) -> None:
+    def _pattern(self, q: Array) -> Array:
+        """Set the pattern of the entries at the first positions, and return the groups of its columns."""
+        if self.colours is not None:
+            return self.colours
         from scipy.sparse import csc_matrix
 
         m, k = self.dimension, len(self.h) // 2
@@ -189,18 +193,18 @@ class ManyCoordinates(Intervals):
             colours[j] = next(c for c in range(m) if c not in taken)
         self.rows, self.columns = (np.asarray(each) for each in np.nonzero(pattern))
         self.colours = colours
+        return colours
 
     def linearised(self, q: Array) -> Linearised:
         """See :meth:`Intervals.linearised`."""
-        if not hasattr(self, "colours"):
-            self._set_pattern(q)
-        m, groups = self.dimension, int(self.colours.max()) + 1
+        colours = self._pattern(q)
+        m, groups = self.dimension, int(colours.max()) + 1
         variations = np.zeros((2 * groups + 1, 2 * m + 1))
-        variations[self.colours, np.arange(m)] = variations[groups + self.colours, m + np.arange(m)] = 1.0
+        variations[colours, np.arange(m)] = variations[groups + colours, m + np.arange(m)] = 1.0
         variations[-1, -1] = 1.0
         values, derivatives = self._called(q, variations)
-        chosen = self.colours[self.columns]
-        entries = [derivatives[:, side * groups + chosen, p * m + self.rows] for p in (0, 1) for side in (0, 1)]
+        of_columns = colours[self.columns]
+        entries = [derivatives[:, side * groups + of_columns, p * m + self.rows] for p in (0, 1) for side in (0, 1)]
         by_h = derivatives[:, -1].reshape(-1, 2, m).transpose(1, 0, 2)
         return Linearised(values.p0, values.p1, values.actions, values.residual, np.array(entries), by_h)
 

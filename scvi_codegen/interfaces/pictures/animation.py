@@ -32,6 +32,7 @@ from scvi_codegen.interfaces.pictures.canvas import (
 )
 from scvi_codegen.interfaces.pictures.recognition import shape_of
 from scvi_codegen.interfaces.pictures.shape import DrawnSystem, MovingShape, shape_of_picture
+from scvi_codegen.runs.stepping.step_plan import FixedSteps
 
 if TYPE_CHECKING:
     from matplotlib.animation import FuncAnimation
@@ -176,7 +177,7 @@ class Film:
         longest = max(motions, key=lambda each: abs(float(each.t[-1] - each.t[0])))
         common = all(len(each.t) == len(longest.t) and (each.t == longest.t).all() for each in motions)
         plans = [getattr(each, "plan", None) for each in motions]
-        if common and all(plan is None or hasattr(plan, "h") for plan in plans):
+        if common and all(plan is None or isinstance(plan, FixedSteps) for plan in plans):
             return tuple(motions)
         count = max(1, round(self.seconds * FRAMES_PER_SECOND) - 1) * STATES_PER_FRAME + 1
         times = np.linspace(longest.t[0], longest.t[-1], count)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scvi_codegen.common.atomic import write_atomically
 from scvi_codegen.common.errors import PlotError, StateError, StepFailedError
 from scvi_codegen.common.validation import ArgumentType
+from scvi_codegen.runs.stepping.step_plan import FixedSteps
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -218,7 +219,7 @@ MOST_NUMBERS = 4_000_000
 def smooth(motion: Any) -> Any:
     """Return a trajectory of adaptive steps with states between its saved ones, by dense output; others as they are."""
     plan, n = getattr(motion, "plan", None), len(motion.t)
-    if plan is None or (hasattr(plan, "h") and motion.tau is None) or motion.observed is not None or n < 2:
+    if plan is None or (isinstance(plan, FixedSteps) and motion.tau is None) or motion.observed is not None or n < 2:
         return motion
     parts = min(64, SMOOTH // (n - 1), MOST_NUMBERS // motion.q.size)
     return (

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -33,6 +33,7 @@ class AttitudeHistory:
     """
 
     __slots__ = ()
+    _has_dense_output: ClassVar[bool] = False  # whether there is a method ``at``
 
     if TYPE_CHECKING:
         q: Any
@@ -151,7 +152,7 @@ class AttitudeHistory:
     def _states(self, t: ArrayLike | None) -> tuple[Array, Array]:
         if t is None:
             return unnamed(self.q[:]), unnamed(self.p[:])  # of recordings, which are read on access
-        if not hasattr(self, "at"):
+        if not self._has_dense_output:
             raise StateError("recordings, ensembles and runs in progress have no dense output: omit t")
         q, p = self.at(t)
         return q, p

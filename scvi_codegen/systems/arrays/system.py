@@ -35,7 +35,7 @@ from sympy import Add, Expr, S, Symbol
 from scvi_codegen.common.cache import key_of
 from scvi_codegen.common.errors import SizesRequiredError, SystemDefinitionError
 from scvi_codegen.common.representation import LONGEST, clipped
-from scvi_codegen.common.validation import of
+from scvi_codegen.common.validation import OfRunTimeSizes, of
 from scvi_codegen.systems.checks.continuity import corner_message, jump_message, jump_of
 from scvi_codegen.systems.checks.definition import warn_of_negative, warn_of_unused
 from scvi_codegen.systems.forces import check_damping
@@ -246,7 +246,7 @@ def momenta_of(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ArraySystem:
+class ArraySystem(OfRunTimeSizes):
     """Lagrangian or Hamiltonian in index notation; ``LagrangianSystem.from_text(coordinates=["q[N]"])`` returns it.
 
     Attributes:
@@ -288,6 +288,7 @@ class ArraySystem:
     data: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
     mesh: Any = field(default=None, compare=False, repr=False)
     REQUIRES_SIZES: ClassVar[str] = SIZES_REQUIRED
+    drawn_links: ClassVar[tuple[Any, ...]] = ()
 
     def __repr__(self) -> str:
         shown = ", ".join(map(str, self.coordinates))

@@ -77,7 +77,7 @@ def _words(part: Part) -> str:
     count = len(positions(part))
     if isinstance(part, Quadrature):
         return f"{count} quadrature point{'s' * (count > 1)} ({part.name})"
-    kind = "stage" if hasattr(part, "b") else "node"
+    kind = "stage" if isinstance(part, Tableau) else "node"
     return f"{count} {kind}{'s' * (count > 1)} ({part.name})"
 
 

@@ -175,7 +175,7 @@ def _written(model: Model, stem: str | None) -> dict[str, str]:
         if again == model:
             return {f"{stem}.toml": text, **files}
         part = "method" if again.method != model.method else "system" if again.system != model.system else "state"
-    if part == "system" and hasattr(model.system, "links") and model.system.links:
+    if part == "system" and model.system.drawn_links:
         raise ModelFileError(
             f"the formulas of the robot {model.system.name} cannot be written to a file: write [system] robot = FILE"
         )
