@@ -140,3 +140,36 @@ def test_adaptive_steps_hang_at_rest_and_nearly_so(method, constraint):
         exact = x * np.cos(3 * frequency) + v / frequency * np.sin(3 * frequency)
         assert abs(run.q[-1, 0] - exact) <= 3e-15 + 1e-9 * (x + v)
         assert run.steps < 200
+
+
+def test_newtons_method_hangs_at_rest_at_the_origin():
+    """Positions and terms of the constraint vanish; reactions are rounded as the weight that they cancel."""
+    rod = lagrange("rod", ["x", "y"], "(x_dot**2 + y_dot**2)/2 - 9.81*y", constraints=["x**2 + y**2 = 2*y"])
+    stepper = sc.compile_stepper(rod, "svi:4", solver="newton")
+    for steps in ({"h": 0.05, "steps": 5}, {"t_end": 3.0}, {"t_end": 3.0, "tolerance": 1e-6}):
+        hanging = stepper.integrate([0.0, 0.0], velocity=[0.0, 0.0], **steps)
+        assert np.abs(hanging.q).max() <= 2**-52
+        assert hanging.steps <= 5
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("precision", ["double", "double-double"])
+def test_states_near_zero_violate_constraints_relative_to_their_terms(precision):
+    """A rod whose length is rounded to a double is consistent in every unit, however near its end is to the origin."""
+    parameters = {"a": 1.0, "b": 1.0, "l": 2.0**0.5}
+    system = lagrange(
+        "rod",
+        ["x", "y"],
+        "(x_dot**2 + y_dot**2)/2",
+        constraints=["(x - a)**2 + (y - b)**2 = l**2"],
+        parameters=parameters,
+    )
+    stepper = sc.compile_stepper(system, "svi:4", precision=precision)
+    for unit in (1e-6, 1.0, 1e6):
+        a, b = 0.3 * unit, 0.7 * unit
+        values = {"a": a, "b": b, "l": np.hypot(a, b)}
+        for x in (0.0, 1e-12 * unit):
+            run = stepper.integrate([x, 0.0], [0.0, 0.0], h=0.1, steps=2, parameters=values)
+            assert np.abs(np.asarray(run.q[-1], float) - [x, 0.0]).max() <= 1e-11 * unit
+        with pytest.raises(sc.StateError, match="violates the constraints by"):
+            stepper.integrate([0.1 * unit, 0.0], [0.0, 0.0], h=0.1, steps=2, parameters=values)

@@ -124,12 +124,11 @@ static SELDOM void add_constraint_sizes(real t, const real *q, const real *param
   }
 }
 
-/* Displacement of the heaviest body by reactions in the last solved step of a run, h^2 |G^T lambda| / M: at rest they
- * cancel the other forces, whose rounding remains, where positions and terms of constraints may vanish. Reactions on
- * light bodies cancel each other, too. */
-static SELDOM real displacement_by_reactions(const step_data *step)
+/* Displacement of the heaviest body by the reactions lambda among unknowns z, h^2 |G^T lambda| / M, 0 without unknowns:
+ * at rest they cancel the other forces, whose rounding remains, where positions and terms of constraints may vanish.
+ * Reactions on light bodies cancel each other, too. */
+static SELDOM real displacement_by_reactions(const step_data *step, const real *z)
 {
-  const real *z = step->motion_of ? step->motion_of->memory : NULL;
   real u[2 * M] = {0}, p[M], mass[MASS_ENTRIES], g[CONSTRAINTS], derivative[CONSTRAINT_ENTRIES], force[M] = {0};
   real heaviest = 0;
   if (!z)
@@ -148,12 +147,18 @@ static SELDOM real displacement_by_reactions(const step_data *step)
   return heaviest > 0 ? step->h * step->h * largest_of(force) / heaviest : 0;
 }
 
+/* Unknowns of the last solved step of a run. */
+static inline const real *last_unknowns(const step_data *step)
+{
+  return step->motion_of ? step->motion_of->memory : NULL;
+}
+
 /* Largest size of positions that round as the constraints and reactions do, whatever the positions are. */
 static SELDOM real size_by_constraints(const step_data *step)
 {
   real size[M] = {0};
   add_constraint_sizes(step->t, step->q0, step->parameters, saddle_in(step->scratch), size);
-  return largest_of(size) + displacement_by_reactions(step);
+  return largest_of(size) + displacement_by_reactions(step, last_unknowns(step));
 }
 
 /* Largest displacement that changes one constraint by the size of its terms, and that by reactions: relative to it
@@ -169,7 +174,7 @@ static SELDOM real length_of_constraints(const step_data *step)
   for (int k = 0; k < CONSTRAINTS; k++)
     if (steepest[k] > 0)
       length = larger(length, rounding[k] / steepest[k]);
-  return length + displacement_by_reactions(step);
+  return length + displacement_by_reactions(step, last_unknowns(step));
 }
 
 /* Sum of squares of g; infinite if g is not finite. */

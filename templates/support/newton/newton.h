@@ -140,12 +140,17 @@ static int linearise(const step_data *step, newton_data *data, const band *shape
   return factorise(data->factors, shape, data->pivot);
 }
 
-/* Adds displacements whose rounding errors are those of what they depend on, above that of the positions: of g, and of
- * the velocities v(q, y) of a first-order system, |h| |dv/du| |u| for u = (q, y). There updates stagnate. */
-static SELDOM void add_sizes_of_arguments(const step_data *step, real *size)
+/* Adds displacements whose rounding errors are those of what they depend on, above that of the positions: of g, of
+ * reactions among the unknowns z, and of the velocities v(q, y) of a first-order system, |h| |dv/du| |u| for u = (q, y).
+ * There updates stagnate. */
+static SELDOM void add_sizes_of_arguments(const step_data *step, const real *z, real *size)
 {
+  (void)z;
 #ifdef CONSTRAINED
+  const real by_reactions = displacement_by_reactions(step, z);
   add_constraint_sizes(step->t, step->q0, step->parameters, saddle_in(step->scratch), size);
+  for (int i = 0; i < M; i++)
+    size[i] += by_reactions;
 #elif defined(FIRST_ORDER_SYSTEM) && !defined(DOUBLE_DOUBLE) /* whose error estimates resolve these */
   const real part = MATH(sqrt)(REAL_EPSILON);
   real u[2 * M], v[M], moved[M];
@@ -201,7 +206,7 @@ static int newton(const step_data *step, newton_data *data, const real *q1, real
       }
       slow += moved.relative >= STOPPED_SHRINKING * last;
       if (slow == STAGNATIONS)
-        add_sizes_of_arguments(step, added);
+        add_sizes_of_arguments(step, data->z, added);
       last = moved.relative;
     }
     if (k >= least(options->max_iterations, MOST_ITERATIONS))
