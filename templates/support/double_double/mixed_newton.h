@@ -103,7 +103,7 @@ static int refine_unknowns(const step_data *step, double *memory, double t_low, 
     last = change;
     if (stagnates && !widened) { /* above the rounding of positions */
       widened = 1;
-      add_sizes_of_arguments(step, size_q);
+      add_sizes_of_arguments(step, data->z, size_q);
       for (int i = 0; i < M; i++)
         inverse_size[i] = 1.0 / (size_q[i] + 1e-3 * largest + DBL_MIN);
       last = 0.0;

@@ -141,8 +141,8 @@ static int linearise(const step_data *step, newton_data *data, const band *shape
 }
 
 /* Adds displacements whose rounding errors are those of what they depend on, above that of the positions: of g, of
- * reactions among the unknowns z, and of the velocities v(q, y) of a first-order system, |h| |dv/du| |u| for u = (q, y).
- * There updates stagnate. */
+ * reactions among the unknowns z, and of the velocities v(q, y) of a first-order system, |h| |dv/du| |u| for
+ * u = (q, y). There updates stagnate. */
 static SELDOM void add_sizes_of_arguments(const step_data *step, const real *z, real *size)
 {
   (void)z;
