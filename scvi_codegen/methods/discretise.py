@@ -24,6 +24,7 @@ from scvi_codegen.methods.stage_system import Block, Gather, Row, Scatter, Stage
 from scvi_codegen.methods.tables.basis import identity_matrix, next_step
 from scvi_codegen.systems.constraints import velocity_conditions
 from scvi_codegen.systems.derived_expressions import auxiliary_multipliers, forms_of
+from scvi_codegen.systems.first_order import FirstOrderSystem
 from scvi_codegen.systems.formulas.expressions import gradient_tuple
 from scvi_codegen.systems.formulas.intermediates import intermediate
 from scvi_codegen.systems.hamiltonian import HamiltonianSystem
@@ -240,13 +241,18 @@ def is_conformally_symplectic(method: Method, system: MechanicalSystem) -> bool:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Group:
-    """Group of m unknowns per point of one stage group: symbols, equations, and the matrix of their predictor."""
+    """Group of m unknowns per point of one stage group: symbols, equations, and the matrix of their predictor.
+
+    The equations are multiplied by h^power. Those of first-order systems then have units that contain that of time like
+    those of the momenta theta, so that pivots do not depend on it.
+    """
 
     stage_group: int
     name: str
     momenta: bool
     symbols: tuple[sympy.Symbol, ...]
     results: tuple[sympy.Expr, ...]
+    power: int
     guess: Matrix
 
 
@@ -288,7 +294,10 @@ def _groups(system: MechanicalSystem, f: int, stage_group: StageGroup) -> Iterat
             name = BLOCK_NAMES[stage_group.name] if momenta else "nu"
             scalar = stage_group.scalar
             results = forms_of(system).constitutive if scalar is None else gradient_tuple(scalar, symbols)
-            yield _Group(stage_group=f, name=name, momenta=momenta, symbols=symbols, results=results, guess=guess)
+            power = int(isinstance(system, FirstOrderSystem))
+            yield _Group(
+                stage_group=f, name=name, momenta=momenta, symbols=symbols, results=results, power=power, guess=guess
+            )
 
 
 def _extended(
@@ -303,7 +312,8 @@ def _extended(
     for g in numbers:
         selection = Table.named("", [[int(column == (g, n)) for column in added] for n in range(points)])
         gathers.append(Gather(arguments=groups[g].symbols, table=Table.joined(known, selection), power=-1))
-        scatters.append(Scatter(results=groups[g].results, table=Table.joined(before, selection, last), power=0))
+        table = Table.joined(before, selection, last)
+        scatters.append(Scatter(results=groups[g].results, table=table, power=groups[g].power))
     return replace(stage_group, gathers=tuple(gathers), scatters=tuple(scatters))
 
 

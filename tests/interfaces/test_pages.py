@@ -425,7 +425,7 @@ def test_every_motion_of_the_site_moves_within_its_size(browser, tmp_path):
 
 def script(name: str, *beginnings: str) -> str:
     """Return the lines of a script of pages that begin so, with the lines of functions."""
-    text = (Path(pages.__file__).parents[2] / "templates" / "page" / name).read_text(encoding="utf-8")
+    text = (Path(pages.__file__).parents[3] / "templates" / "page" / name).read_text(encoding="utf-8")
     ends = ["^}$" if each.startswith("function") else ";$" for each in beginnings]
     patterns = [rf"^{re.escape(each)}.*?{end}" for each, end in zip(beginnings, ends, strict=True)]
     found = [re.search(pattern, text, re.MULTILINE | re.DOTALL) for pattern in patterns]

@@ -134,6 +134,7 @@ def test_adaptive_steps_hang_at_rest_and_nearly_so(method, constraint):
     hanging = stepper.integrate([0.0, bottom], velocity=[0.0, 0.0], t_end=3.0)
     assert hanging.steps <= 3
     assert np.abs(hanging.q - [0.0, bottom]).max() <= 8 * 2**-52
+    assert stepper.integrate([0.0, bottom], velocity=[0.0, 0.0], h=0.05, steps=5).step_error < 1e-9
     for x, v in ((1e-9, 0.0), (0.0, 1e-9), (0.0, 1e-5)):
         run = stepper.integrate([x, bottom + x**2 / 2], velocity=[v, 0.0], t_end=3.0, check_growth=False)
         frequency = np.sqrt(9.81)

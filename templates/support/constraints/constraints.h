@@ -17,7 +17,7 @@
 #define SETTLED_UPDATE REAL(1e-9)
 /* relative to the state: accepted size of the last update where rounding prevents a smaller residual */
 #define ACCEPTED_UPDATE REAL(1e-6)
-#define ROUNDED_UPDATE (1024 * REAL_EPSILON) /* near q = 0 or at rest, where a relative distance is undefined */
+#define ROUNDED_UPDATE (1024 * REAL_EPSILON) /* at rest, where a relative distance is undefined */
 #define ROUNDED_RESIDUAL (4 * REAL_EPSILON) /* times the rounding size of g: residuals that an update does not reduce */
 
 /* Factors of the saddle-point matrix [L_vv, G^T; G, 0] of a state, and a right-hand side. */
@@ -242,6 +242,18 @@ static void times_mass(const real *mass, const real *x, real *y)
     y[MASS_ENTRY[e][0]] += mass[e] * x[MASS_ENTRY[e][1]];
 }
 
+/* Squared norm, in the metric of the mass matrix, of displacements by which constraints change by the sizes of their
+ * terms: a distance of positions that may be 0 is relative to this. */
+static real square_by_constraints(real t, const real *q, const real *parameters, const real *mass, saddle *at)
+{
+  real size[M] = {0}, dual[M], square = 0;
+  add_constraint_sizes(t, q, parameters, at, size);
+  times_mass(mass, size, dual);
+  for (int i = 0; i < M; i++)
+    square += size[i] * dual[i];
+  return MATH(fabs)(square);
+}
+
 #ifndef DOUBLE_DOUBLE
 /* Projects p onto the cotangent space of the constraints. */
 static int project_momentum(real t, const real *q, real *p, const real *parameters, saddle *at, real *workspace)
@@ -284,8 +296,9 @@ int NAME(project)(real t, const real *q0, const real *p0, const real *parameters
   return OK;
 }
 
-/* Distance of x[0] and x[1] relative to the larger norm, in the metric for which y is the dual vector of x. */
-static real part_of(real (*x)[M], real (*y)[M])
+/* Distance of x[0] and x[1] relative to the larger norm, or to that whose square is `least`, in the metric for which y
+ * is the dual vector of x. */
+static real part_of(real (*x)[M], real (*y)[M], real least)
 {
   real apart = 0, one = 0, other = 0;
   for (int i = 0; i < M; i++) {
@@ -293,7 +306,7 @@ static real part_of(real (*x)[M], real (*y)[M])
     one += x[0][i] * y[0][i];
     other += x[1][i] * y[1][i];
   }
-  one = larger(MATH(fabs)(one), MATH(fabs)(other));
+  one = larger(larger(MATH(fabs)(one), MATH(fabs)(other)), least);
   return one > 0 ? MATH(sqrt)(MATH(fabs)(apart) / one) : 0;
 }
 
@@ -319,19 +332,15 @@ int NAME(apart)(real t, const real *q0, const real *p0, const real *q1, const re
   }
   memcpy(x[0], p0, sizeof x[0]);
   memcpy(x[1], p1, sizeof x[1]);
-  apart[1] = part_of(x, y);
+  apart[1] = part_of(x, y, 0);
   legendre(u, t, parameters, p, mass);
   memcpy(x[0], q0, sizeof x[0]);
   memcpy(x[1], q1, sizeof x[1]);
   times_mass(mass, x[0], y[0]);
   times_mass(mass, x[1], y[1]);
-  apart[0] = part_of(x, y);
-  for (int i = 0; i < M; i++) {
-    p[i] = q1[i] - q0[i];
+  apart[0] = part_of(x, y, square_by_constraints(t, q1, parameters, mass, saddle_in(workspace)));
+  for (int i = 0; i < M; i++)
     velocity[i] -= u[M + i];
-  }
-  if (largest_of(p) <= ROUNDED_UPDATE && apart[0] > ACCEPTED_UPDATE)
-    apart[0] = ACCEPTED_UPDATE;
   if (largest_of(velocity) <= ROUNDED_UPDATE && apart[1] > ACCEPTED_UPDATE)
     apart[1] = ACCEPTED_UPDATE;
   return all_finite(apart, 2) ? OK : NOT_FINITE;

@@ -177,7 +177,9 @@ int NAME(apart)(const double *time, const double *q0, const double *p0, const do
   times_mass(mass, d, e);
   times_mass(mass, q0, v);
   times_mass(mass, q1, other);
-  apart[0] = relative_size(d, e, larger(product_of_vectors(q0, v), product_of_vectors(q1, other)));
+  apart[0] = relative_size(d, e,
+      larger(larger(product_of_vectors(q0, v), product_of_vectors(q1, other)),
+          square_by_constraints(t, q1, parameters, mass, saddle_in(workspace))));
   return all_finite(apart, 2) ? OK : NOT_FINITE;
 }
 
