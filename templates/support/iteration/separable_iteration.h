@@ -555,7 +555,7 @@ HOT int iterate(const step_data *step, const iteration_data *data, history past,
 #ifdef ARRAYS
   const section own = own_part(step);
   step_points w = points_in(step, data, past);
-  w.former = VELOCITIES ? NULL : past.before;
+  w.former = VELOCITIES || implicit ? NULL : past.before;
   w.earlier = dq;
 #else
   const section own = {0, M};
@@ -627,6 +627,8 @@ HOT int iterate(const step_data *step, const iteration_data *data, history past,
     if (w.former)
       weigh_remainder(stiffness, step->h, &remainder);
   }
+  if (!w.former)
+    memset(&remainder, 0, sizeof remainder);
   if (rough)
     find_rough_increments(&w, dq, dp);
   else
