@@ -16,6 +16,7 @@ from scvi_codegen.interfaces.models.model_files.model_file import dump_model, pa
 from scvi_codegen.runs.stepping.step_plan import (
     Adaptive,
     ErrorControl,
+    Fixed,
     InTau,
     absolute_tolerances,
     plan_from_record,
@@ -138,7 +139,9 @@ def test_continued_runs_keep_their_options(tmp_path: Path) -> None:
     assert longest(finished.t) == LARGEST
 
 
-@pytest.mark.parametrize("plan", [InTau(3.0, 0.1), Adaptive(2.0), Adaptive(2.0, 1e-9, 0.1, 0.01, (("x", 1e-3),))])
+@pytest.mark.parametrize(
+    "plan", [Fixed(-0.1), InTau(3.0, 0.1), Adaptive(2.0), Adaptive(2.0, 1e-9, 0.1, 0.01, (("x", 1e-3),))]
+)
 def test_records_of_step_plans(plan: Adaptive | InTau) -> None:
     assert plan_from_record(**json.loads(json.dumps(plan_to_record(plan)))) == plan
 

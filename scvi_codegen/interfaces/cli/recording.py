@@ -25,7 +25,7 @@ from scvi_codegen.interfaces.models.time_span import whole_steps_in
 from scvi_codegen.runs.driver.run import Run
 from scvi_codegen.runs.recording import RecordedRun, load_run, record_run, resume_run
 from scvi_codegen.runs.results import export
-from scvi_codegen.runs.stepping.step_plan import FixedSteps, InTau
+from scvi_codegen.runs.stepping.step_plan import Adaptive, Fixed, FixedSteps, InTau
 
 SUFFIX = ".run"
 MAX_STATES = 10_000
@@ -153,14 +153,17 @@ class Recording:
         check_exclusive({"steps": steps, "span": span})
         recorded = load_run(folder)
         manifest, further = recorded.manifest, dict[str, Any]()
-        if manifest.plan and span is not None:
-            further["t_end"] = manifest.t + math.copysign(span, manifest.plan.t_end - manifest.t)
-        elif span is not None and manifest.interface.in_tau:
-            raise click.UsageError(
-                "a recorded run in transformed time needs a number of steps: give --steps, not --span"
-            )
-        elif span is not None:
-            steps = whole_steps_in(span, manifest.h, manifest.t)
+        match manifest.plan:
+            case _ if span is None:
+                pass
+            case Adaptive(t_end=t_end) | InTau(t_end=t_end):
+                further["t_end"] = manifest.t + math.copysign(span, t_end - manifest.t)
+            case Fixed(h):
+                if manifest.interface.in_tau:
+                    raise click.UsageError(
+                        "a recorded run in transformed time needs a number of steps: give --steps, not --span"
+                    )
+                steps = whole_steps_in(span, h, manifest.t)
         plan = manifest.steps if steps is None else steps
         if manifest.model is not None and (system := parse_model(manifest.model).array_system):
             further["mesh"] = system.mesh
@@ -198,15 +201,16 @@ class Recording:
 def describe_progress(recorded: RecordedRun) -> str:
     """Return two lines: the integrator of a run in a folder, and its progress."""
     manifest = recorded.manifest
-    done, t = counted(recorded.steps, "step"), manifest.t + recorded.steps * manifest.h
-    if manifest.plan:
+    done = counted(recorded.steps, "step")
+    if not isinstance(manifest.plan, Fixed):
         how = f"of {manifest.plan.tau:g} in tau" if isinstance(manifest.plan, InTau) else "of adaptive size"
         progress_text = f"{done} {how} from t = {manifest.t:g} to t = {recorded.t[-1]:g}"
         progress_text += "" if recorded.finished else f" (of {manifest.plan.t_end:g})"
     else:
+        h, t = manifest.plan.h, manifest.t + recorded.steps * manifest.plan.h
         far = "all" if recorded.finished else f"of {manifest.steps}"
         if manifest.interface.in_tau:
             done, t = f"{done} in tau", float(recorded.t[-1])
-        progress_text = f"{done} ({far}) of {manifest.h:g} from t = {manifest.t:g} to t = {t:g}"
+        progress_text = f"{done} ({far}) of {h:g} from t = {manifest.t:g} to t = {t:g}"
     continuation = f"{counted(len(recorded), 'state')} saved in '{recorded.folder}'"
     return f"{' '.join(manifest.interface.title.split())}\n{progress_text}; {continuation}"

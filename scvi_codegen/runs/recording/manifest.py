@@ -29,7 +29,7 @@ from scvi_codegen.runs.states.words import Words, low_words, missing, with_low
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.stepping.compiled_method import Variants
 from scvi_codegen.runs.stepping.integrator import Integrator
-from scvi_codegen.runs.stepping.step_plan import Adaptive, InTau, plan_from_record, plan_to_record
+from scvi_codegen.runs.stepping.step_plan import Adaptive, Fixed, InTau, plan_from_record, plan_to_record
 from scvi_codegen.systems.event import Event
 from scvi_codegen.version import __version__
 
@@ -207,11 +207,10 @@ class Manifest:
         double: source, interface and fallback in double, which locate the events of double-double runs, else empty.
         parameters, parameters_low: values in the order of ``interface.parameters``; low words in double-double
             arithmetic.
-        h: step size, 0 for adaptive steps.
         t: initial time.
         save_every: steps between saved states.
         steps: requested number of steps, ``None`` for adaptive steps.
-        plan: step plan of adaptive steps, else ``None``.
+        plan: step plan.
         rows: states in a full file.
         model: text of the model file, if there is one.
         certificate: verification report as JSON, if there is one.
@@ -225,11 +224,10 @@ class Manifest:
     flags: tuple[str, ...]
     options: SolverOptions | None
     parameters: tuple[float, ...]
-    h: float
     t: float
     save_every: int
     steps: int | None
-    plan: Adaptive | InTau | None = None
+    plan: Fixed | Adaptive | InTau
     rows: int
     model: str | None
     certificate: Any
@@ -305,8 +303,7 @@ class Manifest:
         for name, least in {"save_every": 1, "rows": 1, "steps": 0}.items():
             if (count := getattr(self, name)) is not None or name != "steps":
                 checked_count(count, name, least=least)
-        for name in ("h", "t"):
-            checked_number(getattr(self, name), name)
+        checked_number(self.t, "t")
         if len(self.parameters) != len(self.interface.parameters):
             raise ValueError(f"{len(self.parameters)} parameters where {len(self.interface.parameters)} are wanted")
         if len(self.parameters_low) != (self.interface.words - 1) * len(self.parameters):
@@ -314,8 +311,8 @@ class Manifest:
         for values in (self.parameters, self.parameters_low) if self.parameters_low else (self.parameters,):
             for name, value in zip(self.interface.parameters, values, strict=True):
                 checked_number(value, name)
-        if (self.plan is None) == (self.steps is None) or (self.plan is None) == (self.h == 0.0):
-            raise ValueError("give h (fixed steps) or a target time")
+        if isinstance(self.plan, Fixed) == (self.steps is None):
+            raise ValueError("give a number of fixed steps, or a target time")
 
     def to_json(self) -> str:
         """Return a JSON text for :meth:`from_json`, with the C code line by line."""
@@ -323,7 +320,7 @@ class Manifest:
             "format": FORMAT,
             **{field: getattr(self, field) for field in PLAIN},
             "options": None if self.options is None else asdict(self.options),
-            "plan": None if self.plan is None else plan_to_record(self.plan),
+            "plan": plan_to_record(self.plan),
             "builds": [asdict(build) for build in self.builds],
             "interface": self.interface.to_record(),
             "source": self.source.to_record(),
@@ -350,7 +347,7 @@ class Manifest:
         manifest = cls(
             **plain | {field: tuple(plain[field]) for field in ("flags", "parameters")},
             options=None if options is None else SolverOptions(**options),
-            plan=None if plan is None else plan_from_record(**plan),
+            plan=plan_from_record(**plan),
             builds=tuple(Build(**build) for build in document["builds"]),
             interface=Interface.from_record(document["interface"]),
             source=Source.from_record(document["source"]),
@@ -366,7 +363,7 @@ class Manifest:
 
 SEAL = '{\n "sha256": "%s",'
 """First lines of the text of a manifest: the checksum of the others."""
-PLAIN = ("flags", "parameters", "h", "t", "save_every", "steps", "rows", "model", "certificate")
+PLAIN = ("flags", "parameters", "t", "save_every", "steps", "rows", "model", "certificate")
 
 
 def sealed_text(document: Mapping[str, Any]) -> str:

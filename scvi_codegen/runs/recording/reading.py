@@ -27,7 +27,7 @@ from scvi_codegen.runs.states.rotation_quantities import named_quantities
 from scvi_codegen.runs.states.times import times_after
 from scvi_codegen.runs.states.words import check_keeps_words, low_words, scalar
 from scvi_codegen.runs.stepper import Stepper
-from scvi_codegen.runs.stepping.step_plan import Adaptive, ErrorControl, InTau
+from scvi_codegen.runs.stepping.step_plan import Adaptive, ErrorControl, Fixed, InTau
 from scvi_codegen.runs.trajectory import Trajectory
 from scvi_codegen.systems.event import Crossings
 
@@ -78,7 +78,10 @@ class RecordedRun(AttitudeHistory):
 
     def __repr__(self) -> str:
         plan = self.manifest.plan
-        end = f"t = {self.t[-1]:g} of {plan.t_end:g}" if plan else f"step {self.steps} of {self.manifest.steps}"
+        if isinstance(plan, Fixed):
+            end = f"step {self.steps} of {self.manifest.steps}"
+        else:
+            end = f"t = {self.t[-1]:g} of {plan.t_end:g}"
         return clipped(f"<RecordedRun '{self.folder}': {len(self)} states, {end}>", LONGEST)
 
     @overload
@@ -124,7 +127,10 @@ class RecordedRun(AttitudeHistory):
     def finished(self) -> bool:
         """Return whether the run has reached its end."""
         plan, steps = self.manifest.plan, self.manifest.steps
-        arrived = bool(plan and self.t[-1] == plan.t_end) if steps is None else self.steps >= steps
+        if isinstance(plan, Fixed):
+            arrived = steps is not None and self.steps >= steps
+        else:
+            arrived = bool(self.t[-1] == plan.t_end)
         return arrived or (bool(self.manifest.events) and self._checkpointed_run.ended)
 
     @cached_property
@@ -144,7 +150,7 @@ class RecordedRun(AttitudeHistory):
     def h(self) -> float:
         """Step size; for adaptive steps as of :class:`Trajectory`."""
         plan = self.manifest.plan
-        return first_step_size(plan, self.t[:2]) if plan else self.manifest.h
+        return plan.h if isinstance(plan, Fixed) else first_step_size(plan, self.t[:2])
 
     def resumed(self) -> Run:
         """Return the run at its last checkpoint, to continue in memory; :func:`resume_run` continues in the folder.
@@ -279,8 +285,8 @@ class RecordedRun(AttitudeHistory):
         t, q, p, iterations = piece
         manifest, run = self.manifest, self._checkpointed_run
         taken = manifest.save_every * rows
-        transformed = manifest.interface.in_tau
-        tau = times_after(0.0, manifest.h, taken)[0] if transformed else None
+        in_tau = manifest.interface.in_tau and isinstance(manifest.plan, Fixed)
+        tau = times_after(0.0, self.h, taken)[0] if in_tau else None
         lengths, low, high = self._lengths(t, rows), t.min(initial=np.inf), t.max(initial=-np.inf)
         events = tuple(each.chosen((each.t >= low) & (each.t <= high)) for each in self.events)
         trajectory = trajectory_of(run, (t, q, p, iterations), lengths, tau=tau, events=events)
@@ -289,9 +295,9 @@ class RecordedRun(AttitudeHistory):
 
     def _lengths(self, t: Array, rows: NDArray[np.int64]) -> Array:
         """Return (n,) sizes of the steps after the states; NaN for steps with states that are not saved."""
-        if self.manifest.plan is None:
+        if isinstance(self.manifest.plan, Fixed):
             changes = any(event.changes_state for event in self.manifest.events)
-            return np.broadcast_to(np.nan if changes else self.manifest.h, t.shape)
+            return np.broadcast_to(np.nan if changes else self.manifest.plan.h, t.shape)
         sizes = np.where((np.diff(rows) == 1) & (self.manifest.save_every == 1), np.diff(t), np.nan)
         return np.append(sizes, np.nan)[: len(t)]
 

@@ -45,7 +45,7 @@ from scvi_codegen.runs.results.export import Piece, chunk_rows
 from scvi_codegen.runs.states.words import low_words
 from scvi_codegen.runs.stepping.chunks import drive
 from scvi_codegen.runs.stepping.features import require
-from scvi_codegen.runs.stepping.step_plan import FixedSteps, StepPlan
+from scvi_codegen.runs.stepping.step_plan import Fixed, FixedSteps, StepPlan
 from scvi_codegen.runs.trajectory import Trajectory
 
 LOCK = ".lock"
@@ -112,11 +112,10 @@ def record_run(
         parameters=tuple(map(float, run.parameters)),
         parameters_low=tuple(low_words(run.parameters).tolist()) if run.stepper.interface.words > 1 else (),
         double=_double(run.stepper),
-        h=run.h,
         t=run.t,
         save_every=checked_count(save_every, "save_every", least=1),
         steps=_checked_steps(run, steps),
-        plan=None if isinstance(run.plan, FixedSteps) else run.plan,
+        plan=Fixed(run.h) if isinstance(run.plan, FixedSteps) else run.plan,
         rows=chunk_rows(run.stepper.dimension * run.stepper.interface.words)
         if rows is None
         else checked_count(rows, "rows", least=1),
@@ -380,6 +379,7 @@ def _extended(manifest: Manifest, run: Run, steps: int | None, t_end: float | No
         wanted = manifest.steps if steps is None else steps
         return replace(manifest, steps=checked_count(wanted, "steps", least=0)), run.plan
     _checked_steps(run, steps)
+    assert not isinstance(manifest.plan, Fixed)  # as that of the run
     plan = run.plan if t_end is None else replace(run.plan, t_end=checked_number(t_end, "t_end"))
     if (plan.t_end - run.t) * (run.plan.t_end - manifest.t) < 0.0:
         raise StateError(f"the run is at t = {run.t:g}, already beyond t_end = {plan.t_end:g}: give a later t_end")

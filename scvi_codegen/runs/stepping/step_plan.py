@@ -176,19 +176,26 @@ class ErrorControl(NamedTuple):
         return fields
 
 
-def plan_to_record(plan: Adaptive | InTau) -> dict[str, Any]:
+def plan_to_record(plan: Fixed | Adaptive | InTau) -> dict[str, Any]:
     """Return a step plan as numbers by name for files."""
+    if isinstance(plan, Fixed):
+        return {"h": plan.h}
     if isinstance(plan, InTau):
         return {"t_end": plan.t_end, "tau": plan.tau}
     return {"t_end": plan.t_end} | ErrorControl.of(plan).named
 
 
-def plan_from_record(t_end: Any, tau: Any = None, **control: Any) -> Adaptive | InTau:
+def plan_from_record(*, h: Any = None, tau: Any = None, **control: Any) -> Fixed | Adaptive | InTau:
     """Return the step plan of :func:`plan_to_record`.
 
     Raises:
         StateError, TypeError: for other names and numbers.
     """
+    if h is not None:
+        if control or tau is not None:
+            raise StateError("steps of one size have neither a target time nor a tolerance")
+        return Fixed(checked_step(h))
+    t_end = control.pop("t_end", None)
     if tau is not None:
         if control or not checked_number(tau, "tau") > 0.0:
             raise StateError(f"steps of tau = {tau:g} must be positive and have no tolerance")
