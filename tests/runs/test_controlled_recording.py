@@ -122,6 +122,6 @@ def test_the_command_line_runs_records_and_resumes_it(kepler):
 def test_run_beyond_the_memory_ends_with_advice(monkeypatch):
     Path("k.toml").write_text(MODEL)
     monkeypatch.setattr(capacity, "usable_memory", lambda: 8000.0)
-    error = error_of("run", "k.toml")
-    assert "save fewer (--save-every" in error
+    error = error_of("run", "k.toml", status=1)
+    assert "fill the memory. Save fewer of them (t_eval, save_every)" in error
     assert "-o NAME.run" in error

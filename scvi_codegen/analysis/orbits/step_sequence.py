@@ -16,6 +16,7 @@ from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepper import Stepper
 
+LEAST_STEPS = 8
 FINER = 2.6
 """Factor between the numbers of steps of a sequence and of the finer one that confirms it; no whole number, so that
 both have no inner end in common."""
@@ -51,7 +52,8 @@ class StepSequence:
     ) -> StepSequence:
         """Return the sequence of adaptive steps along a guess, half a period forward and half a period backward.
 
-        Both halves stay closer to the orbit than a whole period in one direction. Runs with events that change the
+        Both halves stay closer to the orbit than a whole period in one direction. Steps are no longer than an eighth of
+        the period: their ends show the sizes of positions and momenta. Runs with events that change the
         state go forward only, and their steps end at no event, whose time varies with the start.
 
         Args:
@@ -66,6 +68,7 @@ class StepSequence:
                 *np.split(start, 2),
                 t_end=t + duration,
                 tolerance=tolerance or None,
+                max_step=period / LEAST_STEPS,
                 t=t,
                 parameters=parameters,
                 options=options,
