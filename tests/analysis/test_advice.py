@@ -316,8 +316,8 @@ class TestHonesty:
         assert "was not tried: the error is extrapolated by order 1" in advice.message
         assert advice.steps > 10**6
 
-    @pytest.mark.parametrize(("q", "p"), [([0.0], [0.0]), ([0.3], [0.0]), ([0.0], [1e-3])])
-    def test_equilibria_and_turning_points_give_correct_advice(self, q: list[float], p: list[float]):
+    @pytest.mark.parametrize(("q", "p"), [([0.3], [0.0]), ([0.0], [1e-3])])
+    def test_turning_points_give_correct_advice(self, q: list[float], p: list[float]):
         advice = advise(pendulum(), SVI(6), q, p, 100.0, 1e-9)
         assert advice.warnings == ()
         stepper = compile_stepper(pendulum(), SVI(6))

@@ -702,11 +702,20 @@ class _OrbitSearch:
         return np.asarray(units[:, np.newaxis] * projection / units)
 
     def _integral_gradients(self, state: Array, t: float, sizes: Array) -> Array:
-        """Return (r, 2m) gradients of the energy and the momentum maps by finite differences, for directions only."""
-        size, widths = len(state), DIFFERENCE_INCREMENT * sizes
-        states = np.vstack([state + np.diag(widths), state - np.diag(widths)])
-        values = self._integrals(states, np.full(2 * size, t))
-        return np.asarray((values[:size] - values[size:]).T / (2.0 * widths))
+        """Return (r, 2m) gradients of the energy and the momentum maps by finite differences, for directions only.
+
+        Differences of small motions, of which a few digits remain beside the energy itself, are of the size of the
+        motion.
+        """
+        size = len(state)
+        for widths in (DIFFERENCE_INCREMENT * sizes, sizes):
+            states = np.vstack([state + np.diag(widths), state - np.diag(widths)])
+            values = self._integrals(states, np.full(2 * size, t))
+            differences = values[:size] - values[size:]
+            rounding = roundoff(1) * np.abs(values).max(axis=0)
+            if (CONSERVED * np.abs(differences).max(axis=0) >= rounding).all():
+                break
+        return np.asarray(differences.T / (2.0 * widths))
 
     def _integrals(self, states: Array, t: Array) -> Array:
         """Return (n, r) values of the energy and the momentum maps of states."""
