@@ -252,7 +252,7 @@ def test_paths_between_attitudes_are_their_runs():
         assert path.index == 0
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_closed_paths_of_constraints_rotations_inputs_and_arrays():
     rod = compiled(["x", "y"], "(x_dot**2 + y_dot**2)/2 - y", "svi:4", constraints=["x**2 + y**2 - 1"])
 
@@ -440,7 +440,7 @@ def test_figure_eight_has_its_published_energy_and_multipliers():
     assert np.abs(phases - [0.29809253, 0.00842272]).max() < 1e-7  # Simo 2002
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.parametrize(
     ("n", "curve", "q", "v"),
     [
@@ -485,7 +485,7 @@ SIMO = {
 }
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_choreographies_of_four_bodies_are_those_of_sixteen_published_digits():
     """Simo 2000; digits of W. Christian, Open Source Physics, ch. 9."""
     names = [f"{axis}{i}" for i in range(4) for axis in "xy"]
@@ -518,7 +518,7 @@ def path_symmetry(n, stepper, q, v):
     return [f"{axis}{i}" for i in follow for axis in "xy"]
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_wall_of_a_chain_of_double_wells_is_a_line_of_constant_tension():
     sites = 64
     chain = compiled(

@@ -292,7 +292,7 @@ def test_standing_waves_of_an_ensemble_converge_at_known_sizes():
     for shift in (0.0, 0.3):
         waves = np.cos(phase + shift) * np.arange(1, 9)[:, None]
         runs = Ensemble(stepper, waves, 0 * waves, h=0.5, steps=20).common
-        block = runs.batch().call(0, 8)
+        block = runs.batch().part(0, 8)
         block.advance()
         counts.append(block.memory.iterations / 20)
     assert counts[0] <= 1.1 * counts[1] + 0.2

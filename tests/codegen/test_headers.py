@@ -130,7 +130,7 @@ def uncompiled(folder: Path, source: Source, headers: list[str]) -> dict[str, st
     return {header: done.stderr for name, header in names.items() if done.returncode and name in done.stderr}
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_every_header_compiles_alone(tmp_path):
     """Behind one of the first three sources that use it."""
     left = {header: "no source uses it" for header in HEADERS if header not in ELSEWHERE}

@@ -43,7 +43,7 @@ def run_with(lagrangian: str, coordinates: list[str], **parameters: float) -> sc
     return compile_quickly(system, sc.SVI(2)).integrate([0.5] * m, [0.2] * m, h=0.01, steps=5)
 
 
-ROBOTS = Path(__file__).parent.parent / "mechanics" / "robots"
+ROBOTS = Path(__file__).parent.parent / "systems" / "robots"
 
 
 @pytest.mark.sampled(1)

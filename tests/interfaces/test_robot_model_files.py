@@ -54,7 +54,7 @@ def test_a_table_by_name_changes_a_part_of_the_state_and_a_list_all_of_it():
     assert (solar.q[0], solar.q[1:]) == (0.1, sc.problem("outer-solar-system").q[1:])
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_urdf_has_inputs_and_a_floating_base():
     text = '[system]\nrobot = "arm.urdf"\nfloating = true\nactuated = true\ngravity = [0, 0, -1.6]\n'
     with pytest.warns(sc.SystemDefinitionWarning, match="limits of joints"):

@@ -166,14 +166,14 @@ def shapes():
     yield model, shape_of_picture(drawn_system_of_model(model), {"points": points})
     top = sc.load_model(MOTIONS / "lagrange_top.toml")
     for name in ("figure.xml", "ball.xml"):
-        system = sc.LagrangianSystem.from_mjcf(ROOT / "tests" / "mechanics" / "robots" / name)
+        system = sc.LagrangianSystem.from_mjcf(ROOT / "tests" / "systems" / "robots" / name)
         q = [0.4 + 0.1 * k for k in range(system.dimension)]
         robot = sc.Model(system=system, method="svi:2", q=q, velocity=[0.0] * len(q), h=0.1, steps=1)
         yield robot, shape_of(drawn_system_of_model(robot))
     yield top, shape_of(drawn_system_of_model(top))
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_pages_and_films_have_the_same_points():
     node = needs("node")
     text = (ROOT / "templates" / "page" / "drawing.js").read_text(encoding="utf-8")

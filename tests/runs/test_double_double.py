@@ -367,7 +367,7 @@ def test_large_steps() -> None:
     assert run.energy_error() < 3e-29
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 def test_energy_does_not_drift() -> None:
     """The mean change of the energy is a random walk: tables of two words would be those of a dissipative method."""
     springs = lagrange("springs", "x y", "(x_dot**2 + y_dot**2)/2 - x**2/2 - y**2/3")

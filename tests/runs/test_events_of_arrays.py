@@ -186,7 +186,7 @@ def test_states_of_crossings_have_a_limit_of_memory(gas, monkeypatch):
         assert len(each) > 0
         assert np.abs(places - wall).max() < 1e-14
     monkeypatch.setattr(detection, "MOST_BYTES", 10_000)
-    with pytest.warns(sc.errors.EventWarning, match="are not kept: run.events has times and elements"):
+    with pytest.warns(sc.EventWarning, match="are not kept: run.events has times and elements"):
         run = gas.integrate(*start[:1], **start[1], **plan)
     assert np.abs(run.q["r"][-1] - folded(r, v, 0.04)).max() < 1e-14
     assert [each.element.tolist() for each in run.events] == [each.element.tolist() for each in saved.events]

@@ -83,7 +83,7 @@ def largest_errors(name: str) -> list[float]:
     return found
 
 
-@pytest.mark.second
+@pytest.mark.rotated
 @pytest.mark.filterwarnings("ignore::scvi_codegen.common.errors.AccuracyWarning")
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_local_errors_are_below_the_tolerance(name: str) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from notation import lagrange
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "runtime"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "runs"))
 
 from test_error_growth import CHAOTIC, REGULAR, TOLERANCES, reports, stepper_of
 
