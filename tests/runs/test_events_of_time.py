@@ -35,12 +35,16 @@ def test_every_kick_is_found(then: dict[str, str] | None, steps: dict[str, Any])
         ("t - 7", [7.0]),
         ("cos(pi*(t - 1/2)/10)", np.arange(5.5, 97.5, 10.0)),
         ("rint(t - 3)", [2.5]),
-        ("(t - 1)*(t - 2)*(t - 3)", [1.0, 2.0, 3.0]),
         ("sin(t**2/100)", np.sqrt(100 * np.pi * np.arange(1, 31))),
     ],
 )
 def test_zeros_of_other_functions(function: str, zeros: Any) -> None:
     assert_allclose(times(function, KICK, t_end=97.5).events[0].t, zeros, rtol=1e-14)
+
+
+def test_zeros_of_polynomials_are_found_along_steps() -> None:
+    run = times("(t - 1)*(t - 2)*(t - 3)", KICK, t_end=97.5)
+    assert_allclose(run.events[0].t, [1.0, 2.0, 3.0], rtol=1e-12)
 
 
 def test_backward_terminal_and_continued_runs() -> None:

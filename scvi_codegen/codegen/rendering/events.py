@@ -328,12 +328,12 @@ def _search(interface: Interface, events: tuple[SearchedEvent, ...], header: str
 def _kind_in_time(g: Expr, moving: Iterable[Symbol]) -> int:
     """Return 1 for a function of time alone, 2 for one that is affine in time, else 0.
 
-    Polynomials of degree 4 and higher are searched along each step, which misses few pairs of close roots.
+    Polynomials that are not affine are searched along each step, which misses few pairs of close roots.
     """
     time = symbol(TIME)
     if time not in g.free_symbols or not g.free_symbols.isdisjoint(moving):
         return 0
-    if g.is_polynomial(time) and sympy.degree(g, time) > 3:
+    if g.is_polynomial(time) and sympy.degree(g, time) > 1:
         return 0
     return 1 if g.has(rint, unit_step) or time in sympy.diff(g, time).free_symbols else 2
 
