@@ -605,10 +605,10 @@ HOT int iterate(const step_data *step, const iteration_data *data, history past,
   status = outcome(&now, report);
   if (status != OK)
     return status;
-  measures = !any_positive(magnitude(stiffness));
-  if (measures && !has_remainder(&now, options))
+  const int unmeasured = !any_positive(magnitude(stiffness));
+  if (unmeasured && !has_remainder(&now, options))
     w.former = NULL;
-  measures = measures && w.former;
+  measures = unmeasured && w.former;
   if (implicit)
     refine_forces(&w);
   else {
