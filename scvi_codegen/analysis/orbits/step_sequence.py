@@ -17,6 +17,7 @@ from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepper import Stepper
 
 LEAST_STEPS = 8
+"""Least number of steps of a search in a period: two may end at turning points only."""
 FINER = 2.6
 """Factor between the numbers of steps of a sequence and of the finer one that confirms it; no whole number, so that
 both have no inner end in common."""

@@ -195,7 +195,8 @@ def path_of(
     intervals = kind(stepper, times, h, _parameters_of_steps(stepper, parameters, inputs, times + h / 2.0), options)
     arguments = {"parameters": parameters, "options": options, **({"inputs": inputs} if inputs is not None else {})}
     nodes = _given_nodes(stepper.interface, start, begin, duration, count)
-    values, wanted = intervals.parameters, None if energy is None else checked_number(energy, "energy")
+    values = intervals.parameters
+    start_energy = None if energy is None else checked_number(energy, "energy")
 
     def states(q: Array, p: Array) -> tuple[Array, Array]:
         at = np.full(len(q), begin)
@@ -207,15 +208,15 @@ def path_of(
         intervals.range_of_start = largest_range(nodes)
         M, forced = _symmetry(stepper.interface, closed), bool(stepper.interface.exchange_names)
         minimised = not (forced or isinstance(intervals, ReducedIntervals))
-        found = solver.closed(
-            intervals, nodes[:count], M, minimise=minimised, symmetric=not forced, energy=wanted, states=states
+        solution = solver.closed(
+            intervals, nodes[:count], M, minimise=minimised, symmetric=not forced, energy=start_energy, states=states
         )
-        closed_path = _described(stepper, found, begin, arguments, _checked(found), M=M)
+        closed_path = _described(stepper, solution, begin, arguments, _checked(solution), M=M)
         _warn_at_rest(closed_path, duration)
         return closed_path
     if q0 is None or q1 is None:
         raise StateError("path: give both positions q0 and q1, or closed= and start=")
-    ends = [stepper._vector(_positions(stepper.interface, each, name), name) for each, name in ((q0, "q0"), (q1, "q1"))]
+    ends = [stepper._vector(_positions(stepper.interface, q, name), name) for q, name in ((q0, "q0"), (q1, "q1"))]
     intervals.range_of_start = largest_range(np.array(ends) if nodes is None else nodes)
     if revolutions is not None:
         attempts: list[Attempt] = [
@@ -224,11 +225,11 @@ def path_of(
         ]
     else:
         attempts = _attempts(intervals, ends, nodes, duration)
-    found, comparison, dropped = _first_motion(attempts)
-    if wanted is not None:
-        found = solver.AtEnergy(found.intervals, wanted, states).solved(found.q, found.iterations)
-        comparison = _checked(found)
-    return _described(stepper, found, begin, arguments, comparison, dropped=dropped)
+    solution, comparison, dropped = _first_motion(attempts)
+    if start_energy is not None:
+        solution = solver.AtEnergy(solution.intervals, start_energy, states).solved(solution.q, solution.iterations)
+        comparison = _checked(solution)
+    return _described(stepper, solution, begin, arguments, comparison, dropped=dropped)
 
 
 def different_paths(
