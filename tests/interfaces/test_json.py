@@ -160,6 +160,17 @@ def test_json_of_lists_and_model_files():
     assert np.sum(tableau["A"], axis=1) == pytest.approx(tableau["c"], abs=1e-16)
 
 
+def test_json_of_a_derivation_has_its_formulas():
+    derived, found = sc.derive(sc.problem("kepler").system, "scvi:3"), json_of("derive", "kepler", "--method", "scvi:3")
+    residuals = [[str(each.residual) for each in part] for part in (derived.equations, derived.end_position)]
+    assert [each["residual"] for each in found["equations"]] == residuals[0]
+    assert found["end"]["q"] == residuals[1]
+    assert found["end"]["p"] == [str(each.residual) for each in derived.end_momentum]
+    assert found["unknowns"] == [symbol.name for symbol in derived.unknowns]
+    assert found["initial_guess"] == {symbol.name: str(value) for symbol, value in derived.initial_guess.items()}
+    assert found["entries"] == {entry.symbol.name: float(entry.value) for entry in derived.entries}
+
+
 @pytest.mark.rotated
 def test_json_of_paths_is_that_of_the_model_file_and_of_the_interface():
     words = ("--from", "0,0", "--to", "0.1,0.3", "--span", "3", "--step", "0.25", "--starts", "2", "--method", "svi:4")

@@ -17,6 +17,10 @@ from commands import json_of, output_of
 from notation import lagrange
 
 import scvi_codegen as sc
+from scvi_codegen.analysis.advice.tolerance_check import Known
+from scvi_codegen.codegen.rendering.source import Interface
+from scvi_codegen.interfaces.cli.reports import in_known_digits
+from scvi_codegen.interfaces.cli.running import final_state
 
 Array = Any
 M, K, C, G = 1.75, 0.625, 0.375, 1.25
@@ -672,7 +676,15 @@ def test_every_field_and_line_of_an_array_system_is_correct(here):
 
 
 def test_numbers_without_a_right_digit_are_not_printed():
-    from scvi_codegen.interfaces.cli.reports import in_known_digits
-
     assert in_known_digits(6.1, 8.0) == " no digit (error 8)"
     assert in_known_digits(6.1, 0.01) == " 6.1"
+
+
+def test_positions_and_momenta_are_printed_with_their_correct_digits():
+    known = Known(q=np.array([1e-3, 1e-9]), p=np.array([1e-9, 1e-3]), tenfold=np.inf)
+    interface = Interface(
+        prefix="two", title="", system="", method="", coordinates=("x", "y"), parameters=(), defaults=()
+    )
+    lines = list(final_state(interface, np.array([1 / 3, 2 / 3]), np.array([1 / 7, 1 / 9]), known))
+    digits = [[len(text) for text in re.findall(r"0\.(\d*[1-9])", line)] for line in lines[1:]]
+    assert digits[0][0] == digits[1][1] < digits[0][1] == digits[1][0]

@@ -1,11 +1,6 @@
 """The table of run options agrees with the fields of models, the flags of commands, model files and their page."""
 
-import ast
-import io
-import re
-import tokenize
 from dataclasses import fields, replace
-from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -16,7 +11,7 @@ from scvi_codegen.interfaces.cli.commands.derive import derive
 from scvi_codegen.interfaces.cli.commands.path import path
 from scvi_codegen.interfaces.cli.commands.run import run
 from scvi_codegen.interfaces.models.model_files.model_file import dump_model, parse_model
-from scvi_codegen.interfaces.models.options import FIELDS, OPTIONS, RUN_FIELDS, alternatives, options_of
+from scvi_codegen.interfaces.models.options import FIELDS, OPTIONS, alternatives, options_of
 
 PAGE = (Path(scvi_codegen.__file__).parents[1] / "docs" / "model_files.md").read_text(encoding="utf-8")
 RUNS = {
@@ -95,77 +90,10 @@ def test_flags_of_commands_are_those_of_the_table():
     assert not {option.name for option in OPTIONS if not option.common} & {each.name for each in derive.params}
 
 
-def test_page_of_model_files_names_every_key_of_runs():
-    written = [option.key for option in FIELDS if re.search(rf"\b{option.key} = ", PAGE)]
-    assert written == [option.key for option in FIELDS]
-
-
 def test_page_of_model_files_has_the_table_of_options():
     rows = [f"| `{each.key}` | `{each.flag}` | {each.help} |" for each in options_of("run")]
     table = "\n".join(["| key of `[run]` | flag | meaning |", "| --- | --- | --- |", *rows])
     assert f"\n\n{table}\n\n" in PAGE
-
-
-OCCURRENCES = {
-    "tolerance": {
-        *(
-            "interfaces/cli/commands/run.py",
-            "interfaces/cli/step_selection.py",
-            "interfaces/cli/json_documents.py",
-            "interfaces/cli/commands/verify.py",
-        ),
-        *("interfaces/models/model.py", "interfaces/models/packages/example.py", "interfaces/models/time_span.py"),
-    },
-    "absolute_tolerance": {"interfaces/models/packages/package.py"},
-    "max_step": {"interfaces/models/packages/example.py", "interfaces/cli/step_selection.py"},
-    "first_step": {"interfaces/models/packages/example.py"},
-    "error": {
-        "interfaces/cli/command_group.py",
-        "interfaces/cli/commands/run.py",
-        "interfaces/cli/commands/path.py",
-        "interfaces/cli/step_selection.py",
-        "interfaces/models/model.py",
-    },
-    "save_every": {"interfaces/cli/recording.py", "interfaces/cli/running.py", "interfaces/models/packages/example.py"},
-    "solver_tolerance": set(),
-    "max_iterations": set(),
-    "threads": {"interfaces/models/model.py"},
-    "action": {
-        "interfaces/models/time_span.py",
-        "interfaces/cli/commands/cache.py",
-        "interfaces/cli/commands/path.py",
-        "interfaces/cli/running.py",
-        "interfaces/cli/json_documents.py",
-        "interfaces/models/model.py",
-    },
-}
-"""Files of models and commands beside the table in which an option is read: those that act on its value."""
-
-
-def words_of(path):
-    """Return the attributes and whole strings in a Python file."""
-    tokens = list(tokenize.generate_tokens(io.StringIO(path.read_text(encoding="utf-8")).readline))
-    attributes = {word.string for dot, word in pairwise(tokens) if dot.string == "."}
-    return attributes | {ast.literal_eval(each.string) for each in tokens if re.match("['\"]", each.string)}
-
-
-def test_an_option_occurs_in_the_table_and_where_its_value_acts():
-    package = Path(scvi_codegen.__file__).parent
-    paths = [
-        path
-        for name in ("cli", "models")
-        for path in (package / "interfaces" / name).rglob("*.py")
-        if path.name != "options.py"
-    ]
-    words = {path.relative_to(package).as_posix(): words_of(path) for path in paths}
-    for option in RUN_FIELDS:
-        if option.field in OCCURRENCES:
-            found = {path for path, own in words.items() if option.field in own}
-            assert found <= OCCURRENCES[option.field] | {
-                "interfaces/models/model_files/model_file.py",
-                "interfaces/cli/supervision.py",
-            }
-    assert {option.field for option in RUN_FIELDS} - OCCURRENCES.keys() == {"t", "h", "span", "steps"}
 
 
 @pytest.mark.parametrize("key", ["solver_tolerance", "max_iterations"])
@@ -198,11 +126,3 @@ def test_iterations_of_a_model_are_limited():
     with pytest.raises(StepFailedError, match="did not converge"):
         parse_model(text).integrate()
     assert parse_model(text.replace("max_iterations = 1", "max_iterations = 200")).integrate().steps == 2
-
-
-def test_options_of_commands_have_the_order_of_the_table():
-    for command in (run, derive):
-        names = [each.name for each in command.params]
-        assert [name for name in names if name in {each.name for each in OPTIONS}] == [
-            each.name for each in OPTIONS if each.name in names
-        ]

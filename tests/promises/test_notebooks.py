@@ -42,24 +42,6 @@ def test_notebooks_are_saved_without_outputs(path):
     assert sum("alt" in cell["metadata"] for cell in code) >= 2
 
 
-def test_every_notebook_has_a_page_on_the_site():
-    folder = ROOT / "docs" / "notebooks"
-    pages = {page.stem: page.read_text(encoding="utf-8") for page in folder.glob("*.md")}
-    index = pages.pop("index")
-    assert {page.stem for page in NOTEBOOKS} == {*pages}
-    for name, page in pages.items():
-        assert notebooks.DIRECTIVE.fullmatch(page)[1] == f"../../examples/notebooks/{name}.ipynb"
-        assert f"\n{name}\n" in index
-
-
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=by_name)
-def test_links_of_notebooks_have_targets(path):
-    text = "".join("".join(cell["source"]) for cell in notebooks.cells(path) if cell["cell_type"] == "markdown")
-    targets = re.findall(r"\]\(([^)#\s]+)", text)
-    assert targets
-    assert [target for target in targets if not (path.parent / target).exists()] == []
-
-
 def test_results_are_below_their_cells(tmp_path):
     drawn = "import matplotlib.pyplot as plt\nplt.plot([0, 1]);"
     path = saved(tmp_path / "one.ipynb", "x = 2\nprint(x)\nx + 1", drawn, "x;")
