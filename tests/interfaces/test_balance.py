@@ -39,15 +39,6 @@ def printed(model, *words):
     return output_of("run", "model.toml", *words)
 
 
-def test_damping_and_inputs_have_a_work_balance():
-    damped = MODEL.replace("lagrangian", "damping = 0.1\nlagrangian").replace('[forces]\nx = "-x_dot/10"\n', "")
-    assert "energy: damping takes it" in (text := printed(damped))
-    assert "energy balance |E - E0 - W|" in text
-    driven = MODEL.replace("-x_dot/10", "u").replace("coordinates", 'inputs = ["u"]\ncoordinates')
-    inputs = "[inputs]\nu = { t = [0.0, 3.0, 7.0], values = [0.0, 1.0, 0.0] }\n"
-    assert "energy balance |E - E0 - W|" in printed(driven + inputs)
-
-
 @pytest.mark.tiers(0, 2)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize(

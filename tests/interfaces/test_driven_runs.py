@@ -55,15 +55,6 @@ def test_inputs_of_the_command_line_replace_those_of_the_file(model):
     assert_allclose(found[-1, :3], [2.3, expected.q[-1, 0], expected.p[-1, 0]], rtol=0, atol=1e-12)
 
 
-def test_constant_of_the_command_line(model):
-    output_of(*RUN, "--input", "u=-2.5e-1", "-o", "run.npz")
-    expected = compile_stepper(model.system, model.method).integrate(
-        model.q, model.p, parameters={"u_0": -0.25}, h=0.1, steps=23
-    )
-    with np.load("run.npz") as file:
-        assert_allclose(file["q"][-1], expected.q[-1], rtol=0, atol=1e-14)
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [

@@ -4,7 +4,7 @@ import pickle
 import re
 import subprocess
 import sys
-from functools import cache, partial
+from functools import cache
 
 import numpy as np
 import pumped_leapfrog as pumped
@@ -59,44 +59,9 @@ def leapfrog(x):
     return jnp.concatenate([jnp.stack([q, p])[:, None], found.T], axis=1)
 
 
-def by_c(x, save_every=1):
-    flow = sc.jax_flow(driven(sc.StoermerVerlet()), steps=STEPS, save_every=save_every)
-    q, p = flow(x[:1], x[1:2], parameters=x[2:6], t=x[6], h=x[7])
-    return jnp.concatenate([q, p], axis=-1).T
-
-
 def given():
     assert driven(sc.StoermerVerlet()).parameters == tuple(sorted(SPECIAL))
     return jnp.array([Q, P, *SPECIAL.values(), 0.2, H])
-
-
-def test_values_are_those_of_leapfrog_and_of_integrate():
-    assert_allclose(by_c(given()), leapfrog(given()), atol=1e-12)
-    run = kepler().integrate([0.5, 0.0], [0.0, 1.7], h=H, steps=40, save_every=8, parameters={"mu": 1.1})
-    start = jnp.array([0.5, 0.0]), jnp.array([0.0, 1.7])
-    q, p = sc.jax_flow(kepler(), steps=40, save_every=8)(*start, h=H, parameters={"mu": 1.1})
-    assert_allclose(q, run.q, rtol=0, atol=1e-13)
-    assert_allclose(p, run.p, rtol=0, atol=1e-13)
-    q, p = sc.jax_flow(kepler(), steps=40)(*start, h=H, parameters=jnp.array([1.1]))
-    assert_allclose(q, run.q[-1], rtol=0, atol=1e-13)
-
-
-@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
-@pytest.mark.parametrize("save_every", [1, 50])
-def test_derivatives_by_all_arguments_are_those_of_leapfrog(derivative, save_every):
-    found = derivative(partial(by_c, save_every=save_every))(given())
-    expected = jax.jacfwd(leapfrog)(given())[:, ::save_every]
-    assert_allclose(found, expected, rtol=0, atol=1e-12 * float(abs(expected).max()))
-
-
-def test_derivatives_of_a_harmonic_oscillator_are_closed_form():
-    system = lagrange("oscillator", "x", "x_dot**2/2 - w**2*x**2/2", w=1.3)
-    flow = sc.jax_flow(sc.compile_stepper(system, sc.SVI(6), flags=QUICK_FLAGS), steps=70)
-    end = jax.value_and_grad(lambda w, h: flow(jnp.ones(1), jnp.zeros(1), parameters={"w": w}, h=h)[0][0], (0, 1))
-    value, partials = end(1.3, H)
-    time = 70 * H
-    assert_allclose(value, np.cos(1.3 * time), atol=1e-13)
-    assert_allclose(partials, [-time * np.sin(1.3 * time), -70 * 1.3 * np.sin(1.3 * time)], rtol=1e-11)
 
 
 def test_transformations_apply_in_any_order():

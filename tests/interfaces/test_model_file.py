@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pages import BLOCK, ROOT
 
 from scvi_codegen.common.errors import ExpressionError, MethodWarning, ModelFileError, SystemDefinitionError
 from scvi_codegen.interfaces.models.model import Model
@@ -61,13 +60,6 @@ def test_model_file_is_read():
     assert model.method == SVI(3)
     assert (model.q, model.p, model.velocity, model.t) == ((0.5,), None, (0.0,), 1.5)
     assert (model.h, model.span, model.steps, model.save_every, model.step_count) == (0.25, 10.0, None, 4, 40)
-
-
-def test_the_layouts_of_the_page_are_read():
-    page = (ROOT / "docs/model_files.md").read_text(encoding="utf-8")
-    models = [parse_model(text) for _, language, text in BLOCK.findall(page) if language == "toml"]
-    assert [model.method for model in models] == [SVI(8)] * 3
-    assert [model.array_system is None for model in models] == [True, False, False]
 
 
 def test_vectors_may_be_tables_by_coordinate():

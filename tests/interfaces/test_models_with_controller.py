@@ -1,6 +1,5 @@
 """Models whose steps the reversible controller chooses: files, the command line, ``solve_ivp`` and inputs."""
 
-import subprocess
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +11,7 @@ from commands import error_of, output_of
 from notation import lagrange
 
 import scvi_codegen as sc
-from scvi_codegen import ModelFileError, StateError, SystemDefinitionError, generate_package, load_package
+from scvi_codegen import ModelFileError, StateError, SystemDefinitionError, generate_package
 from scvi_codegen.analysis.advice.largest_step import REFINEMENTS, largest_step
 from scvi_codegen.interfaces.models.model_files.model_file import catalogue_model, dump_model, parse_model
 
@@ -189,25 +188,3 @@ def test_unsupported_model_fields_are_reported(shaken: Path, tmp_path: Path) -> 
         )
     with pytest.raises(ModelFileError, match="controller must be symplectic or predictive or reversible"):
         parse_model(SHAKEN.replace('"reversible"', '"pid"'))
-
-
-@pytest.mark.rotated
-@pytest.mark.parametrize(("solver", "embedded"), [("auto", None), ("newton", None), ("auto", "single")])
-def test_folder_contains_the_controller_in_c_and_in_python(
-    shaken: Path, tmp_path: Path, solver: str, embedded: str | None
-) -> None:
-    model = sc.load_model(shaken)
-    folder = generate_package(replace(model, solver=solver), tmp_path / "by_controller", embedded=embedded)
-    flags = "CFLAGS=-O2 -std=c99 -Wall -Wextra -Werror -Wno-psabi -ffp-contract=off"
-    done = subprocess.run(["make", "-s", "-C", folder, "run", flags], capture_output=True, text=True, check=True)
-    *lines, last = done.stdout.splitlines()
-    states = np.array([[float(word) for word in line.split()] for line in lines if not line.startswith("#")])
-    exact = sc.compile_stepper(model.system, sc.SVI(8)).integrate(model.q, states[0, 3:5], t_end=model.covered)
-    assert states[-1, 0] == pytest.approx(model.covered)
-    assert np.abs(states[-1, 1:3] - exact.q[-1]).max() < (1e-2 if embedded else 1e-6)
-    assert 20 < int(last.split()[1]) < 10**5
-    assert "tau" in (folder / "README.md").read_text()
-    if embedded is None:
-        run = load_package(folder).integrate(model.q, states[0, 3:5], h=model.h, t_end=model.covered)
-        assert np.abs(run.q[-1] - exact.q[-1]).max() < 1e-6
-        assert sc.load_model(folder / "model.toml") == replace(model, solver=solver)

@@ -110,16 +110,6 @@ def _tables(stepper, inputs):
     return table, saved
 
 
-@pytest.mark.rotated
-def test_inputs_without_data_are_zero(model, tmp_path):
-    folder = generate_package(replace(model, inputs={}), tmp_path / "still")
-    states, _ = states_printed(folder)
-    run = compile_stepper(model.system, model.method).integrate(
-        model.q, states[0, 2:3], h=0.03, steps=round(2.3 / 0.03), parameters={"c": 0.2, "u_0": 0.0, "w_0": 0.0}
-    )
-    assert (np.isin(states[:, 0], run.t)).all()
-
-
 @pytest.mark.tiers(1)
 @pytest.mark.parametrize("precision", ["double", "single"])
 def test_inputs_on_a_microcontroller(model, precision, tmp_path):

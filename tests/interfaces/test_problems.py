@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import sympy
 from counting import at_most
-from sympy import Symbol, cos, sin
+from sympy import Symbol
 
 from scvi_codegen import HamiltonianSystem, LagrangianSystem, SystemDefinitionError
 from scvi_codegen.interfaces.models.problems import PROBLEMS, Problem, problem
@@ -76,15 +76,6 @@ def test_double_pendulum_in_the_textbook_form() -> None:
         * (da**2 * l1 * (m1 + m2) + g * (m1 + m2) * np.cos(a) + db**2 * l2 * m2 * np.cos(difference))
     ) / (l2 * bottom)  # fmt: skip
     assert accelerations(system, values) == pytest.approx([first, second], rel=1e-12)
-
-
-def test_spherical_pendulum_is_a_particle_on_a_sphere() -> None:
-    theta, phi, dtheta, dphi = sympy.symbols("theta phi theta_dot phi_dot", real=True)
-    place = sympy.Matrix([sin(theta) * cos(phi), sin(theta) * sin(phi), -cos(theta)])
-    velocity = place.diff(theta) * dtheta + place.diff(phi) * dphi
-    m, l, g = sympy.symbols("m l g", real=True)  # noqa: E741  (the length of the pendulum)
-    expected = m * l**2 * velocity.dot(velocity) / 2 - m * g * l * place[2]
-    assert sympy.simplify(problem("spherical-pendulum").system.lagrangian - expected) == 0
 
 
 @pytest.mark.second

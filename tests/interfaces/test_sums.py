@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from commands import error_of, invoke, json_of, output_of
 
-from scvi_codegen import SVI, LagrangianSystem, StateError, compile_stepper, load_model, load_package
+from scvi_codegen import StateError
 from scvi_codegen.analysis import verification
 from scvi_codegen.codegen.native.compilers import find_compiler
 from scvi_codegen.methods.method import Method
@@ -179,29 +179,6 @@ def test_generate_for_an_array_system(ring: str) -> None:
 
 
 @pytest.mark.full
-def test_newton_for_an_array_system(ring: str) -> None:
-    """Newton is selected by the option or the model; the generated folder retains it."""
-    by_option, iterations = (json_of("run", ring, *words) for words in (NEWTON, ()))
-    Path("stiff.toml").write_text(RING.replace('"svi:4"', '"svi:4"\nsolver = "newton"'))
-    by_model, iterated = (json_of("run", "stiff.toml", "--solver", solver) for solver in ("auto", "fixed-point"))
-    assert (by_model["final"], by_model["iterations"]) == (by_option["final"], by_option["iterations"])
-    assert (iterated["final"], iterated["iterations"]) == (iterations["final"], iterations["iterations"])
-    assert by_model["iterations"] != iterated["iterations"]
-    invoke("generate", ring, "-o", "ring_newton", *NEWTON, "--degree", "2")
-    model = load_model("ring_newton/model.toml")
-    assert (model.solver, model.method.name) == ("newton", SVI(2).name)
-    run = model.start(load_package("ring_newton"))
-    assert run.stepper.interface.solver == "newton"
-    run.advance(20)
-    expected = json_of("run", ring, *NEWTON, "--degree", "2")
-    assert (run.q["q"].tolist(), run.iterations) == (expected["final"]["q"]["q"], expected["iterations"])
-    subprocess.run(["make", "-s", "run"], cwd="ring_newton", check=True, capture_output=True)
-    assert np.loadtxt("ring_newton/end.txt")[:8] == pytest.approx(run.q["q"], abs=1e-14)
-    invoke("verify", "ring_newton")
-    assert "are those it was generated with" in error_of("verify", "ring_newton", "--solver", "fixed-point")
-
-
-@pytest.mark.full
 def test_folder_is_verified_with_its_own_files(ring: str, tmp_path: Path) -> None:
     """Also with arrays from files, which are elsewhere later; a fault in its C is found."""
     np.save("start.npy", np.sin(np.arange(8.0)))
@@ -218,26 +195,3 @@ def test_folder_is_verified_with_its_own_files(ring: str, tmp_path: Path) -> Non
     assert "parameters[0]" in code
     Path("ring_svi/ring_svi.c").write_text(code.replace("shift_i_plus_1]", "shift_i_plus_1 - 1]"))
     invoke("verify", "ring_svi", status=1)
-
-
-@pytest.mark.tiers(1)
-@pytest.mark.parametrize("axes", ["q[N]", "q[N, 2]", "q[N, M]"])
-def test_pictures_of_an_array_system(axes: str, tmp_path: Path) -> None:
-    """Line in time, bodies in space, and a plane."""
-    pytest.importorskip("matplotlib")
-    from scvi_codegen.interfaces.pictures.arrays import plot_arrays
-
-    shape = {"q[N]": (3, 4), "q[N, 2]": (3, 4, 2), "q[N, M]": (3, 4, 5)}[axes]
-    values = np.arange(np.prod(shape), dtype=float).reshape(shape)
-    axes_of = axes[2:-1].split(", ")
-    kinetic = {1: "sum(i in N, q_dot[i]**2)", 2: f"sum(i in N, j in {axes_of[-1]}, q_dot[i, j]**2)"}[len(axes_of)]
-    free = LagrangianSystem.from_text("free", [axes], f"{kinetic}/2")
-    run = compile_stepper(free, "stoermer-verlet").integrate(values[0], h=1.0, steps=2)
-    run.q[:] = values.reshape(3, -1)
-    ax = plot_arrays(run, tmp_path / "picture.png")
-    assert (tmp_path / "picture.png").stat().st_size > 1000
-    if axes == "q[N, 2]":
-        assert ax.get_lines()[1].get_xdata().tolist() == values[-1, :, 0].tolist()
-    else:
-        drawn = values if axes == "q[N]" else values[-1].T
-        assert np.array_equal(ax.collections[0].get_array(), drawn)
