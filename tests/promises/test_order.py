@@ -55,7 +55,7 @@ SPECIAL = (
     *(sc.SCVI(s, rule, abscissae=at) for s in (2, 3) for rule in DERIVATIVES for at in PLACES),
     sc.SCVI(1, "hermite:2"),
     *(sc.SVI(s, space="splines:2") for s in (2, 3, 4)),
-    sc.SVI(2, "gauss-lobatto:3", space="splines:0.3"),
+    sc.SVI(2, "gauss-lobatto:3", space="splines:2"),
 )
 METHODS = (
     *SPECIAL[1::4], *(sc.SVI(s, f"gauss-legendre:{g}") for s in (1, 2, 3, 4, 5) for g in (s, s + 1)),

@@ -68,7 +68,7 @@ PLAIN: dict[str, dict[str, Any]] = {
     "CollocationRK": {"abscissae": [0, 1], "form": "position"},
     "RungeKutta": {"tableau": sc.Gauss(2).tableau, "form": "position"},
     "Composition": {"composition_order": 2},
-    "Splines": {"pieces": 2, "breakpoints": ()},
+    "Splines": {"pieces": 2},
     "SolverOptions": {"tolerance": 1e-9, "max_iterations": 5, "absolute": False},
     "Event": {"function": "q1", "direction": 0, "terminal": False},
     "Model": {"system": SYSTEM, "method": "svi", **STATE, "h": 0.1, "steps": 3, "save_every": 1, "t": 0.0},

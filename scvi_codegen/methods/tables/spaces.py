@@ -15,7 +15,7 @@ from itertools import pairwise
 
 from scvi_codegen.common.errors import MethodError
 from scvi_codegen.common.precision import DIGITS, Matrix, Number, Vector, mp
-from scvi_codegen.common.validation import NUMBERS, check_kind, checked_count
+from scvi_codegen.common.validation import checked_count
 from scvi_codegen.methods.tables.basis import (
     cardinal_integrals,
     cardinal_values,
@@ -233,36 +233,23 @@ class Splines(CurveSpace):
 
     Args:
         pieces: number of pieces of equal length, 2 by default.
-        breakpoints: in (0, 1), ascending, instead of equal pieces.
     """
 
     pieces: int = 2
-    breakpoints: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         pieces = checked_count(self.pieces, "the number of pieces", least=1, most=MOST_POINTS, error=MethodError)
-        check_kind(NUMBERS, self.breakpoints, "breakpoints", MethodError)
-        inner = tuple(float(to_number(x)) for x in self.breakpoints)
-        if any(not a < b for a, b in pairwise((0.0, *inner, 1.0))):
-            raise MethodError(f"breakpoints must ascend between 0 and 1, not {', '.join(map(str, inner))}")
-        object.__setattr__(self, "breakpoints", inner)
-        object.__setattr__(self, "pieces", len(inner) + 1 if inner else pieces)
+        object.__setattr__(self, "pieces", pieces)
 
     @property
     def name(self) -> str:
-        """Name ``splines:<pieces>``, or ``splines:<breakpoint>,..``."""
-        return f"splines:{','.join(map(repr, self.breakpoints)) or self.pieces}"
-
-    @property
-    def symmetric(self) -> bool:
-        """True if the breakpoints are symmetric."""
-        return all(a + b == 1.0 for a, b in zip(self.breakpoints, reversed(self.breakpoints), strict=True))
+        """Name ``splines:<pieces>``."""
+        return f"splines:{self.pieces}"
 
     @property
     def ends(self) -> list[tuple[Number, Number]]:
         """Start and end of each piece."""
-        inner = self.breakpoints or tuple(mp.mpf(k) / self.pieces for k in range(1, self.pieces))
-        return list(pairwise((mp.zero, *map(mp.mpf, inner), mp.one)))
+        return list(pairwise(mp.mpf(k) / self.pieces for k in range(self.pieces + 1)))
 
     def dimension(self, degree: int) -> int:
         """Return the dimension of the velocities, which are continuous and of one degree less."""
@@ -338,28 +325,25 @@ def _composite(rule: Quadrature, ends: tuple[tuple[Number, Number], ...]) -> Qua
 
 
 def space_by_name(name: str) -> CurveSpace:
-    """Return the space ``"polynomials"``, ``"trigonometric:0.5"``, ``"trigonometric:0.5:1"``, ``"splines:2"`` or
-    ``"splines:0.25,0.5"``.
+    """Return the space ``"polynomials"``, ``"trigonometric:0.5"``, ``"trigonometric:0.5:1"`` or ``"splines:2"``.
 
     Raises:
         MethodError: for any other text.
-    """  # noqa: D205  (a list of examples does not fit a line)
-    family, _, rest = name.partition(":")
-    words = rest.split(":") if family == "trigonometric" else rest.split(",")
+    """
+    family, *words = name.split(":")
     try:
-        if family == "polynomials" and not rest:
-            return Polynomials()
-        if family == "trigonometric" and len(words) <= 2:
-            return Trigonometric(float(words[0]), *map(int, words[1:]))
-        if family == "splines":
-            whole = rest.isascii() and rest.isdigit()
-            return Splines(int(rest)) if whole else Splines(breakpoints=tuple(map(float, words)))
+        match family, len(words):
+            case "polynomials", 0:
+                return Polynomials()
+            case "trigonometric", 1 | 2:
+                return Trigonometric(float(words[0]), *map(int, words[1:]))
+            case "splines", 1 if words[0].isascii() and words[0].isdigit():
+                return Splines(int(words[0]))
     except MethodError:
         raise
     except ValueError:
         pass
     raise MethodError(
         f"there is no space of curves {name!r}: write polynomials, "
-        "trigonometric:FREQUENCY[:HARMONICS] with radians per step, or splines:PIECES or "
-        "splines:BREAKPOINT,.."
+        "trigonometric:FREQUENCY[:HARMONICS] with radians per step, or splines:PIECES"
     )

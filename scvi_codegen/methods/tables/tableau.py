@@ -5,7 +5,8 @@ integrators". Order, symplecticity, symmetry and A-stability are computed from A
 *Geometric Numerical Integration*, 2nd ed. 2006, here GNI; Hairer & Wanner, *Solving Ordinary Differential Equations
 II*, 2nd ed. 1996, here HW).
 
-A-stability is tested by Routh's criterion and Sturm's theorem; coefficients below 1e-30 of their scale count as zero.
+A-stability is tested by Routh's criterion and the roots of a polynomial; coefficients below 1e-30 of their scale count
+as zero.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
 from itertools import count as count_from
-from itertools import pairwise, zip_longest
+from itertools import pairwise
 from typing import Any, TypeAlias
 
 from scvi_codegen.common.errors import MethodError
@@ -33,6 +34,8 @@ from scvi_codegen.methods.tables.nodes import (
 from scvi_codegen.methods.tables.quadrature import gauss_legendre, gauss_lobatto, gauss_radau, split_name
 
 ZERO_TOLERANCE = mp.mpf("1e-30")
+ROOT_DIGITS, ROOT_TOLERANCE = 20, mp.mpf("1e-6")
+"""Digits of roots, and the relative distance of equal ones, which may be multiple."""
 
 Polynomial: TypeAlias = list[Number]
 """Coefficients in ascending powers; the last is not zero, and the zero polynomial is empty."""
@@ -66,45 +69,31 @@ def trimmed(coefficients: Iterable[Number], scales: Iterable[Number]) -> Polynom
     return trimmed_values
 
 
-def divided(dividend: Polynomial, divisor: Polynomial) -> tuple[Polynomial, Polynomial]:
-    """Return quotient and remainder; coefficients below 1e-30 of their scale are zero."""
-    rest, quotient = list(dividend), [mp.zero] * max(0, len(dividend) - len(divisor) + 1)
-    for k in reversed(range(len(quotient))):
-        quotient[k] = rest.pop() / divisor[-1]
-        for j, value in enumerate(divisor[:-1]):
-            rest[k + j] -= quotient[k] * value
-    scale = size(dividend) + size(quotient) * size(divisor)
-    return trimmed(quotient, [size(quotient)] * len(quotient)), trimmed(rest, [scale] * len(rest))
-
-
 def size(polynomial: Sequence[Number]) -> Number:
     """Return the largest coefficient in absolute value."""
     return max(map(abs, polynomial), default=mp.zero)
 
 
-def scaled(polynomial: Polynomial) -> Polynomial:
-    """Return the polynomial divided by its size, a positive number."""
-    return [value / size(polynomial) for value in polynomial]
+def roots(polynomial: Polynomial) -> list[Number]:
+    """Return the complex roots to 20 digits, roots of multiplicity k to 60 / k, by the method of Durand and Kerner."""
+    with mp.workdps(ROOT_DIGITS):
+        return list(mp.polyroots(polynomial[::-1], maxsteps=2000, extraprec=600)) if len(polynomial) > 1 else []
 
 
-def common_factor(left: Polynomial, right: Polynomial) -> Polynomial:
-    """Return a greatest common divisor, by Euclid's algorithm."""
-    while right:
-        left, right = right, divided(scaled(left), scaled(right))[1]
-    return scaled(left)
-
-
-def derivative(polynomial: Polynomial) -> Polynomial:
-    """Return the derivative."""
-    return [k * value for k, value in enumerate(polynomial)][1:]
-
-
-def reduced(P: Sequence[Number], Q: Sequence[Number]) -> tuple[Polynomial, Polynomial]:
-    """Return P and Q without common factors, in the variable z / rho that gives Q balanced coefficients."""
-    rho = abs(Q[0] / Q[-1]) ** (mp.one / max(1, len(Q) - 1))
-    numerator, denominator = ([value * rho**k for k, value in enumerate(polynomial)] for polynomial in (P, Q))
-    factor = common_factor(denominator, numerator)
-    return divided(numerator, factor)[0], divided(denominator, factor)[0]
+def has_poles_right(P: Polynomial, Q: Polynomial) -> bool:
+    """Return whether all poles of P / Q have positive real parts; a root of Q that is a root of P is no pole."""
+    if has_roots_right(Q):
+        return True
+    left = [pole for pole in roots(Q) if pole.real <= ROOT_TOLERANCE * abs(pole)]
+    magnitudes = [abs(value) for value in P]
+    at_poles = [(abs(mp.polyval(P[::-1], pole)), mp.polyval(magnitudes[::-1], abs(pole))) for pole in left]
+    zeros = roots(P) if all(value <= ROOT_TOLERANCE * terms for value, terms in at_poles) else []
+    for pole in left:
+        nearest = min(zeros, key=lambda zero: abs(zero - pole), default=mp.inf)
+        if abs(nearest - pole) > ROOT_TOLERANCE * abs(pole):
+            return False
+        zeros.remove(nearest)
+    return True
 
 
 def has_roots_right(polynomial: Polynomial) -> bool:
@@ -146,44 +135,20 @@ def modulus_gap(Q: Polynomial, P: Polynomial) -> Polynomial:
 
 
 def is_nonnegative(polynomial: Polynomial) -> bool:
-    """Return whether the polynomial is nonnegative for x >= 0: positive at 0 and no root of odd multiplicity."""
+    """Return whether the polynomial is nonnegative for x >= 0: its sign at a point between each two of its roots.
+
+    Values below 1e-30 of the sum of the absolute values of its terms, as between the parts of a double root that
+    rounding separates, count as zero.
+    """
     if all(value >= 0 for value in polynomial):
         return True
-    lowest = next(k for k, value in enumerate(polynomial) if value != 0)
-    rest = polynomial[lowest:]
-    return bool(rest[0] > 0) and not any(map(positive_roots, odd_factors(rest)))
-
-
-def odd_factors(polynomial: Polynomial) -> list[Polynomial]:
-    """Return the square-free factors of odd multiplicity (Yun's algorithm)."""
-    rate = derivative(polynomial)
-    repeated = common_factor(polynomial, rate)
-    rest, other = divided(polynomial, repeated)[0], divided(rate, repeated)[0]
-    odd: list[Polynomial] = []
-    for multiplicity in range(1, len(polynomial) + 1):
-        if len(rest) <= 1:
-            return odd
-        pairs = list(zip_longest(other, derivative(rest), fillvalue=mp.zero))
-        gap = trimmed([a - b for a, b in pairs], [abs(a) + abs(b) for a, b in pairs])
-        factor = common_factor(rest, gap)
-        if multiplicity % 2 == 1:
-            odd.append(factor)
-        rest, other = divided(rest, factor)[0], divided(gap, factor)[0]
-    raise ArithmeticError("60 digits do not separate the roots of this polynomial")
-
-
-def positive_roots(polynomial: Polynomial) -> int:
-    """Return the number of distinct roots x > 0 (Sturm's theorem); 0 is no root."""
-    chain = [scaled(polynomial), derivative(polynomial)]
-    while chain[-1]:
-        remainder = divided(scaled(chain[-2]), scaled(chain[-1]))[1]
-        chain.append([-value for value in remainder])
-    return sign_changes(p[0] for p in chain[:-1]) - sign_changes(p[-1] for p in chain[:-1])
-
-
-def sign_changes(values: Iterable[Number]) -> int:
-    """Return the number of sign changes, ignoring zeros."""
-    return sum(1 for left, right in pairwise([value for value in values if value != 0]) if left * right < 0)
+    positive = sorted(root.real for root in roots(polynomial) if root.real > 0)
+    ends = [mp.zero, *positive, 3 * positive[-1] if positive else mp.one]
+    for x in ((left + right) / 2 for left, right in pairwise(ends)):
+        terms = [value * x**k for k, value in enumerate(polynomial)]
+        if mp.fsum(terms) < -ZERO_TOLERANCE * mp.fsum(map(abs, terms)):
+            return False
+    return True
 
 
 CONDITION_TOLERANCE = mp.mpf("1e-45")
@@ -249,13 +214,13 @@ class Tableau:
     def is_a_stable(self) -> bool:
         """True if |R(z)| <= 1 for every z in the left half plane.
 
-        By the maximum principle this holds when, common factors cancelled, R = P / Q has its poles in the open right
-        half plane (Routh's criterion) and |Q(iy)|^2 - |P(iy)|^2, a polynomial in y^2, is never negative (Sturm's
-        theorem; HW, section IV.3). Coefficients below 1e-30 of their scale count as zero, so that |R(iy)| = 1 is
-        recognised, where the polynomial is zero and sampled values would be round-off.
+        By the maximum principle this holds when R = P / Q has its poles in the open right half plane (Routh's
+        criterion) and |Q(iy)|^2 - |P(iy)|^2, a polynomial in y^2, is never negative (HW, section IV.3). Coefficients
+        below 1e-30 of their scale count as zero, so that |R(iy)| = 1 is recognised, where the polynomial is zero and
+        sampled values would be round-off.
         """
-        P, Q = reduced(*self.stability_function())
-        return has_roots_right(Q) and is_nonnegative(modulus_gap(Q, P))
+        P, Q = map(list, self.stability_function())
+        return has_poles_right(P, Q) and is_nonnegative(modulus_gap(Q, P))
 
     def stability_function(self) -> tuple[Vector, Vector]:
         """Return numerator and denominator of R(z) in ascending powers of z, trailing zeros dropped.
