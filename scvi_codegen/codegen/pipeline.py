@@ -245,7 +245,7 @@ class Sources:
 
     def __init__(
         self,
-        system: MechanicalSystem | ArraySystem,
+        system: MechanicalSystem,
         method: Method,
         solver: str = "auto",
         prefix: str | None = None,

@@ -154,11 +154,11 @@ class OfRunTimeSizes:
 
 
 def of(words: str, *types: type) -> ArgumentType:
-    """Return the check for an instance of one of the types; :class:`OfRunTimeSizes` must derive from one of them."""
+    """Return the check for an instance of one of the types, for :class:`OfRunTimeSizes` of one that derives from it."""
+    of_run_time_sizes = tuple(each for each in types if issubclass(each, OfRunTimeSizes))
 
     def accepts(value: Any) -> bool:
-        derived = not isinstance(value, OfRunTimeSizes) or not {*types}.isdisjoint(type(value).__mro__)
-        return derived and isinstance(value, types)
+        return isinstance(value, of_run_time_sizes if isinstance(value, OfRunTimeSizes) else types)
 
     return ArgumentType(words, accepts)
 

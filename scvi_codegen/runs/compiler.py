@@ -18,7 +18,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache, cached_property, partial
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 from numpy.typing import ArrayLike
 
@@ -28,31 +28,25 @@ from scvi_codegen.codegen.rendering.source import AUTO, DOUBLE_DOUBLE, PRECISION
 from scvi_codegen.codegen.variants import Derivatives, Variant
 from scvi_codegen.common.cache import cached_source, key_of
 from scvi_codegen.common.errors import MethodError, SizesRequiredError
-from scvi_codegen.common.validation import TEXTS, ArgumentType, OfRunTimeSizes, check_kind, checks_arguments
+from scvi_codegen.common.validation import TEXTS, OfRunTimeSizes, check_kind, checks_arguments
 from scvi_codegen.methods import SVI, StoermerVerlet, as_method, default_method
 from scvi_codegen.methods.method import Method
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.stepping.compiled_method import Variants
 from scvi_codegen.systems.event import EventLike, as_events
 from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED
-from scvi_codegen.systems.system import MechanicalSystem
+from scvi_codegen.systems.system import SYSTEM_OR_ARRAYS, MechanicalSystem
 
 if TYPE_CHECKING:
     from sympy import Expr
 
     from scvi_codegen.codegen.pipeline import Sources
-    from scvi_codegen.systems.arrays.system import ArraySystem
     from scvi_codegen.systems.symmetry.symmetry import Symmetry
-
-SYSTEM_OR_ARRAYS = ArgumentType(
-    "a LagrangianSystem or a HamiltonianSystem", lambda value: isinstance(value, MechanicalSystem)
-)
-"""Type check of systems, also of those with arrays of run-time sizes."""
 
 
 @checks_arguments(system=SYSTEM_OR_ARRAYS, flags=TEXTS)
 def compile_stepper(
-    system: MechanicalSystem | ArraySystem,
+    system: MechanicalSystem,
     method: Method | str = "svi:8",
     *,
     solver: str = "auto",
@@ -155,7 +149,7 @@ def compile_stepper(
         return Stepper(source, interface, variants=variants, flags=flags, **further)
     source, interface = sources.integrator()
     interface = replace(interface, layout=replace(interface.layout, **drawn))
-    cast(MechanicalSystem, system).store_key()
+    system.store_key()
     if precision == DOUBLE_DOUBLE:
         stepper = Stepper(source, interface, variants=variants, flags=flags)
         stepper._doubles = cache(compiled)
@@ -211,7 +205,7 @@ class CachedSources:
 
     def __init__(
         self,
-        system: MechanicalSystem | ArraySystem,
+        system: MechanicalSystem,
         method: Method,
         solver: str,
         prefix: str | None,

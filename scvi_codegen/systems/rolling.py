@@ -187,9 +187,7 @@ class _Rolled:
             yield self.accesses[slot].array, np.array([float(defaults.get(each, each)) for each in column])
 
 
-def unrolled_at(
-    system: ArraySystem | MechanicalSystem, q: Mapping[str, Any] | Any, parameters: Any = None
-) -> tuple[Any, Any]:
+def unrolled_at(system: MechanicalSystem, q: Mapping[str, Any] | Any, parameters: Any = None) -> tuple[Any, Any]:
     """Return the system with the sizes and the array parameters of a call, and the other parameters.
 
     Of several states, whose arrays have one more axis, all have the sizes of the first; parameters of each are others.
@@ -221,7 +219,7 @@ def _states_axes(array: Array, values: Any) -> int:
 
 @checks_arguments(SystemDefinitionError, system=ARRAYS)
 def unroll_sums(
-    system: ArraySystem | MechanicalSystem,
+    system: MechanicalSystem,
     sizes: Mapping[str, int],
     *,
     tables: Mapping[str, ArrayLike] | None = None,

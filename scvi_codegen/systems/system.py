@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING, Any, Self
 from scvi_codegen.common.cache import key_of, store_text, stored_text
 from scvi_codegen.common.display.cards import Html, card, listed, plain
 from scvi_codegen.common.errors import SystemDefinitionError, closest
-from scvi_codegen.common.validation import ExactNumber, of
+from scvi_codegen.common.validation import ArgumentType, ExactNumber, of
 from scvi_codegen.systems.formulas.indices import Array
 from scvi_codegen.systems.formulas.symbols import DOT, number, symbol
 
@@ -54,9 +54,9 @@ class Deferred:
     _text: str | None
 
     @classmethod
-    @abstractmethod
     def _read(cls, arguments: Mapping[str, Any]) -> tuple[Any, bool]:
         """Return the system of these arguments, and whether warnings were issued."""
+        raise NotImplementedError
 
     @classmethod
     def _of_text(cls, arguments: Mapping[str, Any]) -> Self:
@@ -209,7 +209,7 @@ class MechanicalSystem(Deferred, ABC):
 
     @classmethod
     def __subclasshook__(cls, other: type) -> bool:
-        """Count systems of arrays of run-time sizes as instances of the class that they name in ``ACTS_AS``."""
+        """Count systems of arrays of run-time sizes as instances of the class that they name in ``ACTS_AS``, too."""
         return getattr(other, "ACTS_AS", None) == cls.__name__ or NotImplemented
 
     @property
@@ -380,4 +380,7 @@ def _free(name: str, taken: set[str]) -> str:
 
 
 SYSTEM = of("a LagrangianSystem or a HamiltonianSystem", MechanicalSystem)
-"""Type check of mechanical systems, for :func:`~scvi_codegen.common.validation.takes`."""
+"""Type check of mechanical systems of known sizes, for :func:`~scvi_codegen.common.validation.checks_arguments`."""
+
+SYSTEM_OR_ARRAYS = ArgumentType(SYSTEM.words, lambda value: isinstance(value, MechanicalSystem))
+"""Type check of systems, also of those with arrays of run-time sizes."""

@@ -29,10 +29,9 @@ from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
 from scvi_codegen.runs.compiler import compile_stepper
 from scvi_codegen.runs.states.validation import EnsembleParameters, States
 from scvi_codegen.runs.stepper import Stepper
-from scvi_codegen.systems.arrays.system import SYSTEM_OR_ARRAYS, ArraySystem
 from scvi_codegen.systems.lagrangian import LagrangianSystem
 from scvi_codegen.systems.rolling import unrolled_at
-from scvi_codegen.systems.system import MechanicalSystem
+from scvi_codegen.systems.system import SYSTEM_OR_ARRAYS, MechanicalSystem
 
 DEGREES = {1: (2, 4, 6, 8, 10, 12), 2: (8, 12, 16, 20, 24, 32)}
 """Degrees, or numbers of stages, among which ``advise`` chooses, by the number of words of the states."""
@@ -118,7 +117,7 @@ class Advice:
 @checks_arguments(system=SYSTEM_OR_ARRAYS)
 @without_accuracy_warnings()
 def advise(
-    system: MechanicalSystem | ArraySystem,
+    system: MechanicalSystem,
     method: Method | str,
     q: States,
     p: States | None = None,

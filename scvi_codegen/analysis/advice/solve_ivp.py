@@ -18,7 +18,7 @@ from scvi_codegen.codegen.native.arguments import checked_number, checked_step, 
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.errors import StateError, StepFailedError
 from scvi_codegen.common.representation import summary
-from scvi_codegen.common.validation import checks_arguments, of
+from scvi_codegen.common.validation import ArgumentType, checks_arguments
 from scvi_codegen.methods import Method, as_method, default_method
 from scvi_codegen.methods.controllers import SYMPLECTIC, with_time_transformation
 from scvi_codegen.runs.accuracy.global_error import checked_error
@@ -29,7 +29,6 @@ from scvi_codegen.runs.states.validation import Array, States
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.stepping.step_plan import ErrorControl
 from scvi_codegen.runs.trajectory import Trajectory
-from scvi_codegen.systems.arrays.system import ArraySystem
 from scvi_codegen.systems.event import EventLike
 from scvi_codegen.systems.rolling import unrolled_at
 from scvi_codegen.systems.system import MechanicalSystem
@@ -74,12 +73,15 @@ class OdeResult:
         return self.status >= 0
 
 
-KINDS = "a system or its stepper (for a function f(t, y) use scipy.integrate.solve_ivp, see docs/limits.md)"
+SYSTEM_OR_STEPPER = ArgumentType(
+    "a system or its stepper (for a function f(t, y) use scipy.integrate.solve_ivp, see docs/limits.md)",
+    lambda value: isinstance(value, MechanicalSystem | Stepper),
+)
 
 
-@checks_arguments(system=of(KINDS, MechanicalSystem, ArraySystem, Stepper))
+@checks_arguments(system=SYSTEM_OR_STEPPER)
 def solve_ivp(
-    system: MechanicalSystem | ArraySystem | Stepper,
+    system: MechanicalSystem | Stepper,
     t_span: Sequence[float],
     y0: States,
     *,

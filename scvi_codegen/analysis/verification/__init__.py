@@ -39,8 +39,8 @@ from scvi_codegen.runs.compiler import compile_stepper
 from scvi_codegen.runs.states.rotations import checked_pair
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepper import STEPPER, Stepper
-from scvi_codegen.systems.arrays.system import SYSTEM_OR_ARRAYS, ArraySystem
-from scvi_codegen.systems.system import MechanicalSystem
+from scvi_codegen.systems.arrays.system import ArraySystem
+from scvi_codegen.systems.system import SYSTEM_OR_ARRAYS, MechanicalSystem
 
 __all__ = ["Certificate", "Check", "Outcome", "verify"]
 
@@ -54,7 +54,7 @@ LONGEST, HALVINGS, PART = 1.0, 40, 0.1
 @checks_arguments(system=SYSTEM_OR_ARRAYS, stepper=STEPPER)
 @without_accuracy_warnings()
 def verify(
-    system: MechanicalSystem | ArraySystem,
+    system: MechanicalSystem,
     method: Method | str,
     q: ArrayLike | Mapping[str, ArrayLike] | None = None,
     p: ArrayLike | Mapping[str, ArrayLike] | None = None,

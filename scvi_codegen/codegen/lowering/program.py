@@ -144,7 +144,7 @@ SOLVERS = ("auto", "explicit", "fixed-point", "newton")
 
 
 def lower(
-    system: MechanicalSystem | ArraySystem,
+    system: MechanicalSystem,
     method: Method,
     *,
     prefix: str,
@@ -209,7 +209,7 @@ def lower(
     )
 
 
-def _layout(system: MechanicalSystem | ArraySystem) -> Layout:
+def _layout(system: MechanicalSystem) -> Layout:
     numbers = {"parameters": tuple(each.name for each in system.parameters), "defaults": system.defaults}
     if isinstance(system, ArraySystem):
         kinds = ("coordinates", "momenta", "velocities", "sums", "fields", "tables", "sizes")

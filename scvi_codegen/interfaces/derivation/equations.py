@@ -42,14 +42,14 @@ from scvi_codegen.methods import as_method
 from scvi_codegen.methods.discretise import discretised_form, in_moving_frame, paper_equations
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import Block, EntryName, Row, StageGroup, StageSystem, Table
-from scvi_codegen.systems.arrays.system import SYSTEM_OR_ARRAYS, ArraySystem
+from scvi_codegen.systems.arrays.system import ArraySystem
 from scvi_codegen.systems.first_order import FirstOrderSystem
 from scvi_codegen.systems.formulas.expressions import jacobian
 from scvi_codegen.systems.formulas.intermediates import inner_of, written_out
 from scvi_codegen.systems.formulas.translation import format_expression
 from scvi_codegen.systems.splittings.axial import axial_turns
 from scvi_codegen.systems.symmetry.symmetry import Symmetry, symmetries
-from scvi_codegen.systems.system import MechanicalSystem
+from scvi_codegen.systems.system import SYSTEM_OR_ARRAYS, MechanicalSystem
 
 if TYPE_CHECKING:
     from scvi_codegen.interfaces.derivation.arrays import ArrayStepEquations
@@ -173,12 +173,14 @@ class StepEquations:
 
 
 @overload
-def derive(system: ArraySystem, method: Method | str, *, radicals: bool = False) -> ArrayStepEquations: ...
+def derive(  # type: ignore[overload-overlap]
+    system: ArraySystem, method: Method | str, *, radicals: bool = False
+) -> ArrayStepEquations: ...
 @overload
 def derive(system: MechanicalSystem, method: Method | str, *, radicals: bool = False) -> StepEquations: ...
 @checks_arguments(system=SYSTEM_OR_ARRAYS)
 def derive(
-    system: MechanicalSystem | ArraySystem, method: Method | str, *, radicals: bool = False
+    system: MechanicalSystem, method: Method | str, *, radicals: bool = False
 ) -> StepEquations | ArrayStepEquations:
     """Return the closed form of one step in the notation of the paper; of run-time sizes its kernels and loops.
 

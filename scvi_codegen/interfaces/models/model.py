@@ -28,11 +28,11 @@ from scvi_codegen.interfaces.models.problems import Problem
 from scvi_codegen.interfaces.models.time_span import TimeSpan, check_length
 from scvi_codegen.methods import Method, as_method
 from scvi_codegen.methods.galerkin import SVI
-from scvi_codegen.systems.arrays.system import SYSTEM_OR_ARRAYS, ArraySystem
+from scvi_codegen.systems.arrays.system import ArraySystem
 from scvi_codegen.systems.first_order import FirstOrderSystem
 from scvi_codegen.systems.formulas.symbols import input_parameters
 from scvi_codegen.systems.rolling import unroll_sums
-from scvi_codegen.systems.system import MechanicalSystem
+from scvi_codegen.systems.system import SYSTEM_OR_ARRAYS, MechanicalSystem
 
 if TYPE_CHECKING:
     from scvi_codegen.codegen.native.options import SolverOptions
@@ -111,8 +111,8 @@ class Model(TimeSpan):
             *([("events", listed([each.function for each in self.events]))] if self.events else []),
             *([("inputs, arrays", listed(list(named)))] if named else []),
         )
-        shown = Html(self.system._repr_html_()) if self.array_system is None else plain(repr(self.system))
-        return card(self.system.name, facts, shown)
+        formula = self.system._repr_html_()
+        return card(self.system.name, facts, Html(formula) if formula else plain(repr(self.system)))
 
     def __post_init__(self) -> None:
         check_kind(SYSTEM_OR_ARRAYS, self.system, "system", ModelFileError)

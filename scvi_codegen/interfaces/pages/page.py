@@ -41,10 +41,10 @@ from scvi_codegen.interfaces.models.packages.package import generate_package
 from scvi_codegen.interfaces.pages.webassembly import LICENCES, check_compiler, webassembly
 from scvi_codegen.interfaces.pictures.recognition import shape_of
 from scvi_codegen.interfaces.pictures.shape import DrawnSystem, shape_of_picture
-from scvi_codegen.systems.arrays.system import SYSTEM_OR_ARRAYS
 from scvi_codegen.systems.formulas.grammar import parse_expression
 from scvi_codegen.systems.formulas.rotations import Rotation, RotationNames, Spin
 from scvi_codegen.systems.formulas.symbols import input_parameters, symbol
+from scvi_codegen.systems.system import SYSTEM_OR_ARRAYS
 from scvi_codegen.version import __version__
 
 CAUSES = (

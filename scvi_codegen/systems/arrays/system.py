@@ -27,7 +27,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import chain
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, NoReturn, TypeVar
 
 import sympy
 from sympy import Add, Expr, S, Symbol
@@ -246,15 +246,15 @@ def momenta_of(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ArraySystem(OfRunTimeSizes):
+class ArraySystem(OfRunTimeSizes, MechanicalSystem):
     """Lagrangian or Hamiltonian in index notation; ``LagrangianSystem.from_text(coordinates=["q[N]"])`` returns it.
 
     Attributes:
-        name, time, inputs, damping: see :class:`~scvi_codegen.systems.system.MechanicalSystem`.
+        name, time, parameters, defaults, inputs, damping: see
+            :class:`~scvi_codegen.systems.system.MechanicalSystem`.
         coordinates: arrays of coordinates, single ones without axes; the array of the velocities of ``q`` is called
             ``q_dot``.
         momenta: of a Hamiltonian, arrays parallel to ``coordinates``; empty for a Lagrangian.
-        parameters, defaults: adjustable numbers and their default values.
         fields: arrays of parameters, whose values, one per element, are passed to each run.
         field_defaults: default value of all elements of each field.
         tables: index tables, ``bonds[B, 2]``, passed to each run.
@@ -263,38 +263,36 @@ class ArraySystem(OfRunTimeSizes):
         forces: generalised forces of coordinates, velocities (momenta of a Hamiltonian) and time.
         constraints: g = 0 at every element of loops (:mod:`scvi_codegen.systems.arrays.system`).
         rotations: rotations, directions and spins, which require known sizes.
+        arrays: coordinates, those of rotations, momenta, fields, tables.
         definition: the arguments of ``from_text`` other than name and parameters, for model files.
         data: values of fields and tables by name for runs that pass none.
         mesh: of the fields of a density, their :class:`~scvi_codegen.fields.mesh.Mesh`.
     """
 
-    name: str
     coordinates: tuple[Array, ...]
     momenta: tuple[Array, ...]
-    time: Symbol
-    parameters: tuple[Symbol, ...]
-    defaults: tuple[float, ...]
     fields: tuple[Array, ...]
     field_defaults: tuple[float, ...]
     tables: tuple[Array, ...]
     terms: tuple[ArrayTerm, ...]
     neighbours: tuple[Neighbours, ...] = ()
     forces: tuple[ArrayForce, ...] = ()
-    inputs: tuple[str, ...] = ()
     constraints: tuple[ArrayTerm, ...] = ()
-    damping: Expr = S.Zero
-    rotations: tuple[MemberArray, ...] = ()
-    definition: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
+    rotations: tuple[MemberArray, ...] = ()  # type: ignore[assignment]  # each stands for many
+    arrays: tuple[Array, ...] = field(init=False, compare=False, repr=False)
+    lengths: tuple[tuple[str, ...], ...] = field(init=False, compare=False, repr=False)
     data: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
     mesh: Any = field(default=None, compare=False, repr=False)
     REQUIRES_SIZES: ClassVar[str] = SIZES_REQUIRED
-    drawn_links: ClassVar[tuple[Any, ...]] = ()
 
     def __repr__(self) -> str:
         shown = ", ".join(map(str, self.coordinates))
         return clipped(f"{self.function}System(name={self.name!r}, coordinates=({shown}))", LONGEST)
 
     def __post_init__(self) -> None:
+        arrays = (*self.positions, *self.momenta, *self.fields, *self.tables)
+        object.__setattr__(self, "arrays", arrays)
+        object.__setattr__(self, "lengths", tuple(length for near in self.neighbours for length in near.lengths))
         self._check_names()
         constant = {array.name for array in self.fields}
         for term in self.terms:
@@ -369,9 +367,16 @@ class ArraySystem(OfRunTimeSizes):
         return tuple(dict.fromkeys(chain(*(array.names for array in self.arrays))))
 
     @property
-    def arrays(self) -> tuple[Array, ...]:
-        """Coordinates, those of rotations, momenta, fields, tables."""
-        return (*self.positions, *self.momenta, *self.fields, *self.tables)
+    def auxiliaries(self) -> tuple[Array, ...]:
+        """Momenta."""
+        return self.momenta
+
+    @property
+    def lagrangian(self) -> NoReturn:
+        """Unavailable: it is a sum over all elements."""
+        raise SizesRequiredError(f"'{self.name}' has no formula but those of its terms: {SIZES_REQUIRED}")
+
+    formula = lagrangian
 
     @property
     def positions(self) -> tuple[Array, ...]:
@@ -469,6 +474,9 @@ class ArraySystem(OfRunTimeSizes):
         """Derivatives of the terms of -V or -H with respect to the state, then the other forces."""
         return (*(force_of(term, self.state) for term in self.potentials), *self.applied_forces)
 
+    def _repr_html_(self) -> None:  # type: ignore[override]
+        """Leave notebooks to :meth:`_repr_latex_`."""
+
     def _repr_latex_(self) -> str:
         return rf"$\displaystyle {self.latex}$"
 
@@ -565,6 +573,3 @@ class ArrayHamiltonian(ArraySystem):
 
 ARRAYS = of("a system with arrays whose sizes are known at run time, as coordinates=['q[N]']", ArraySystem)
 """Type check of systems of arrays, for :func:`~scvi_codegen.common.validation.checks_arguments`."""
-
-SYSTEM_OR_ARRAYS = of("a LagrangianSystem or a HamiltonianSystem", MechanicalSystem, ArraySystem)
-"""Type check of systems, also of those with arrays of run-time sizes."""

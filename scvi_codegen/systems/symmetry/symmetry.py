@@ -47,7 +47,7 @@ from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import checks_arguments, several
 from scvi_codegen.systems.arrays.symmetry import momentum_maps
-from scvi_codegen.systems.arrays.system import SYSTEM_OR_ARRAYS, ArraySystem
+from scvi_codegen.systems.arrays.system import ArraySystem
 from scvi_codegen.systems.derived_expressions import forms_of
 from scvi_codegen.systems.first_order import FirstOrderSystem, translations
 from scvi_codegen.systems.formulas.expressions import gradient_tuple
@@ -71,7 +71,7 @@ from scvi_codegen.systems.symmetry.invariants import (
     rotation_columns,
 )
 from scvi_codegen.systems.symmetry.sampling import Rates, rates_of, terms_among_few_bodies
-from scvi_codegen.systems.system import MechanicalSystem
+from scvi_codegen.systems.system import SYSTEM_OR_ARRAYS, MechanicalSystem
 from scvi_codegen.systems.term_groups import roll_terms
 
 MAX_SEARCHED_COORDINATES = 12
@@ -157,12 +157,12 @@ SYMMETRIES = several("a list of symmetries", Symmetry)
 
 
 @overload
-def symmetries(system: ArraySystem) -> tuple[ArrayMap, ...]: ...
+def symmetries(system: ArraySystem) -> tuple[ArrayMap, ...]: ...  # type: ignore[overload-overlap]
 @overload
 def symmetries(system: MechanicalSystem) -> tuple[Symmetry, ...]: ...
 @checks_arguments(system=SYSTEM_OR_ARRAYS)
 @lru_cache(maxsize=64)
-def symmetries(system: MechanicalSystem | ArraySystem) -> tuple[Symmetry, ...] | tuple[ArrayMap, ...]:
+def symmetries(system: MechanicalSystem) -> tuple[Symmetry, ...] | tuple[ArrayMap, ...]:
     """Return the affine symmetries of a system, a basis with short momentum maps: translations, rotations, boosts, ..
 
     They are affine in q and t for a Lagrangian, in (q, p) and t for a Hamiltonian. Those of arrays of run-time sizes
