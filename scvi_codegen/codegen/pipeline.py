@@ -20,7 +20,7 @@ as CasADi expressions.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from typing import Any
@@ -28,12 +28,13 @@ from typing import Any
 from sympy import Expr
 
 from scvi_codegen.codegen.ir.derivatives import PointDerivatives
+from scvi_codegen.codegen.ir.equations import Control
 from scvi_codegen.codegen.ir.program import Program
-from scvi_codegen.codegen.lowering.arrays import check_solver as check_solver_of_arrays
+from scvi_codegen.codegen.lowering.arrays import check_solver
 from scvi_codegen.codegen.lowering.control import control_of, error_growth_of
 from scvi_codegen.codegen.lowering.derivatives import correction_of, derivatives_of
 from scvi_codegen.codegen.lowering.loops import transforms, with_sums
-from scvi_codegen.codegen.lowering.program import lower, summing_splitting
+from scvi_codegen.codegen.lowering.program import lower, lower_arrays, summing_splitting
 from scvi_codegen.codegen.lowering.solvers.points import summing_action
 from scvi_codegen.codegen.lowering.stage_groups import system_kernel
 from scvi_codegen.codegen.native.announcements import announced
@@ -71,7 +72,6 @@ from scvi_codegen.methods.discretise import discretise, discretised_form
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import tables_in_two_words
 from scvi_codegen.systems.arrays.symmetry import momentum_maps
-from scvi_codegen.systems.arrays.system import ArraySystem
 from scvi_codegen.systems.derived_expressions import forms_of
 from scvi_codegen.systems.derived_systems import with_tangent_vectors
 from scvi_codegen.systems.event import EventLike, as_events
@@ -143,15 +143,13 @@ def describe(
     g: str | Expr | None = None,
 ) -> Interface:
     """Return the interface of a program; ``uses_fallback_library``: a separate library has Newton's iteration."""
-    return Interface(
+    return _interface(
+        system,
+        method,
         prefix=program.prefix,
         title=program.title,
         notes=program.notes,
-        system=system.name,
-        method=method.name,
         coordinates=program.layout.names,
-        parameters=program.layout.parameters,
-        defaults=program.layout.defaults,
         unknowns=program.equations.unknowns,
         workspace=workspace_size(program) + uses_fallback_library,
         has_action=program.action or (uses_fallback_library and program.equations.acts),
@@ -164,18 +162,30 @@ def describe(
         time_transformation=None if g is None else str(g),
         exchange_names=program.quantities.work_and_impulses,
         constraints=program.constraints.formulas if program.constraints else (),
-        inputs=system.inputs,
         conserves_energy=not system.changes_energy and not system.inputs,
-        changes_energy=system.changes_energy or "inputs act" * bool(system.inputs),
-        balances_energy=system.balances_energy,
         arrays=_arrays_of(system),
         indices=tuple(f"{name} = {value}" for name, value in system.indices.items()),
         rotations=tuple(each.declaration for each in system.rotations),
         energy_parameter=system.clock.energy.name if system.clock else None,
         solver=_solver_of(program),
         variables=tuple(each.name for each in getattr(system, "variables", ())),
+    )
+
+
+def _interface(system: MechanicalSystem, method: Method, **of_kind: Any) -> Interface:
+    """Return the interface of an integrator; ``of_kind``: what named coordinates and arrays have each in their way."""
+    inputs_act = "inputs act" if system.inputs else ""
+    return Interface(
+        system=system.name,
+        method=method.name,
+        parameters=tuple(parameter.name for parameter in system.parameters),
+        defaults=system.defaults,
+        inputs=system.inputs,
+        changes_energy=system.changes_energy or inputs_act,
+        balances_energy=system.balances_energy,
         lengths=system.lengths,
         kinks=system.kinks,
+        **of_kind,
     )
 
 
@@ -194,54 +204,8 @@ def _solver_of(program: Program) -> str:
     return "rattle" if program.rattle else "fixed-point" if program.fixed_point else "newton"
 
 
-def describe_arrays(
-    system: ArraySystem, method: Method, *, prefix: str, solver: str, sites: SiteHamiltonian | None
-) -> Interface:
-    """Return the interface of an integrator of arrays whose sizes are known at run time."""
-    layout = ArrayLayout(
-        sizes=system.sizes,
-        coordinates=system.positions,
-        momenta=system.momenta,
-        fields=system.fields,
-        tables=system.tables,
-        field_defaults=system.field_defaults,
-        maps=momentum_maps(system),
-        accesses=system.accesses,
-        depends_on_time=system.depends_on_time,
-        constraints=tuple(term.loops for term in system.constraints),
-        continued=not (method.fractions or system.constraints),
-        momentum_formulas=sites.momenta if sites else (),
-        velocity_formulas=sites.velocities if sites else (),
-        couplings=(*system.potentials, *system.applied_forces) if solver == "newton" else (),
-        symmetric=not (system.momenta or system.velocities),
-        data=system.data,
-        neighbours=tuple(near.name for near in system.neighbours),
-        mesh=system.mesh,
-    )
-    return Interface(
-        prefix=prefix,
-        title=f"{system.name}: {method.title}",
-        system=system.name,
-        method=method.name,
-        coordinates=tuple(array.name for array in system.positions),
-        parameters=tuple(parameter.name for parameter in system.parameters),
-        defaults=system.defaults,
-        inputs=system.inputs,
-        conserves_energy=not (system.momenta or system.changes_energy or system.inputs),
-        changes_energy=system.changes_energy or "inputs act" * bool(system.inputs),
-        balances_energy=(bool(system.forces) or system.damping != 0) and not system.depends_on_time,
-        solver="rattle" if system.constraints else solver,
-        layout=layout,
-        lengths=tuple(length for near in system.neighbours for length in near.lengths),
-        kinks=system.kinks,
-    )
-
-
 class Sources:
-    """C sources of one integrator and its variants; the equations are derived on first use.
-
-    Those of arrays whose sizes are known at run time consist of loops over the arrays and have no variants.
-    """
+    """C sources of one integrator and its variants; the equations are derived on first use."""
 
     def __init__(
         self,
@@ -256,38 +220,22 @@ class Sources:
     ) -> None:
         self.method, self.solver, self.g, self.precision = method, solver, g, precision
         self._arguments = system, method, solver, prefix, symmetries, g, controller
+        self.symmetries = symmetries
         self.controller = controller_named(controller, in_tau=g is not None)
         self.prefix = c_identifier(prefix or f"{system.name}_{method.name}")
         self._programs: dict[bool, Program] = {}
-        self.system: Any
-        self.sites: SiteHamiltonian | None = None
-        self._derived: Callable[..., Program]
-        self.of_arrays = isinstance(system, ArraySystem)
-        if isinstance(system, ArraySystem):
-            self.system, self._derived = system, self._program_of_arrays
-            self.solver = "fixed-point" if solver == "auto" else solver
-            check_solver_of_arrays(self.solver)
-            if system.coupled_terms and g is None and self.solver == "fixed-point":
-                self.sites = site_hamiltonian(system)
-        else:
-            self.system = form = discretised_form(system, method)
-            derive = lower_unrolled if precision == DOUBLE_DOUBLE else program_of
-            self._derived = partial(derive, form, method, prefix=self.prefix, symmetries=symmetries)
+        self.system: Any = self._form_of(system)
 
-    def _program_of_arrays(self, **_: bool) -> Program:
-        """Return the program of arrays; raise :class:`SizesRequiredError` if there is none for run-time sizes."""
-        system = self.sites.system if self.sites else self.system
-        system.check_run_time_sizes()
-        try:
-            if self.g is not None:
-                raise SizesRequiredError("time_transformation is not available for arrays of run-time sizes")
-            program = lower(system, self.method, prefix=self.prefix, solver=self.solver)
-        except SizesRequiredError as error:
-            raise SizesRequiredError(f"{error}. This concerns '{self.system.name}': {SIZES_REQUIRED}") from error
-        layout = self.interface.layout
-        functions: dict[str, Any] = transforms(self.sites) if self.sites else {}
-        loops = replace(program.loops, maps=layout.maps, continued=layout.continued, **functions)
-        return replace(program, loops=loops)
+    def _form_of(self, system: MechanicalSystem) -> MechanicalSystem:
+        """Return the system in the form that the method discretises."""
+        return discretised_form(system, self.method)
+
+    def _derived(self, *, solver: str, fallback: bool = True) -> Program:
+        """Return the lowered program; ``fallback``: with Newton's iteration as a fallback."""
+        derive = lower_unrolled if self.precision == DOUBLE_DOUBLE else program_of
+        return derive(
+            self.system, self.method, prefix=self.prefix, symmetries=self.symmetries, solver=solver, fallback=fallback
+        )
 
     @cached_property
     def _in_double(self) -> Sources:
@@ -315,8 +263,6 @@ class Sources:
     @cached_property
     def interface(self) -> Interface:
         """Interface of the generated library."""
-        if self.of_arrays:
-            return describe_arrays(self.system, self.method, prefix=self.prefix, solver=self.solver, sites=self.sites)
         interface = describe(
             self.program(), self.system, self.method, uses_fallback_library=self.uses_fallback_library, g=self.g
         )
@@ -334,10 +280,14 @@ class Sources:
             control = control_of(program, self.controller, self.system, self.g) if controlled else None
             return render_double_double(program, correction, control), self.interface
         control = control_of(program, self.controller, self.system, self.g)
-        if control and controlled and not (self.of_arrays or control.density):
-            control = replace(control, growth=error_growth_of(self.system, program))
+        if control and controlled and not control.density:
+            control = self._with_growth(control)
         fallback: Fallback | None = "external" if self.uses_fallback_library else None
         return render(program, control if controlled else None, fallback=fallback), self.interface
+
+    def _with_growth(self, control: Control) -> Control:
+        """Return the control with the growth of errors along runs, where it is computed."""
+        return replace(control, growth=error_growth_of(self.system, self.program()))
 
     def _correction(self, program: Program) -> PointDerivatives | None:
         """Return the kernels for the correction of a fixed-point iteration to two words, if it has one."""
@@ -355,9 +305,7 @@ class Sources:
     def _check_double_double(self) -> None:
         """Raise :class:`MethodError` if the system or the method has no steps in double-double arithmetic."""
         reason = ""
-        if self.of_arrays:
-            reason = "arrays have sizes known at run time: pass sizes={..}"
-        elif self.solver == "fixed-point" and not self._corrected(self.program()):
+        if self.solver == "fixed-point" and not self._corrected(self.program()):
             reason = (
                 f"solver={self.solver!r} requires constant diagonal masses and forces of position and time: omit it"
             )
@@ -409,7 +357,7 @@ class Sources:
             return None
         control = control_of(self.program(), self.controller, self.system, None)
         if control:
-            control = replace(control, growth=error_growth_of(self.system, self.program()))
+            control = self._with_growth(control)
         return render(program, control, fallback="external" if self.uses_fallback_library else None)
 
     def acting_ensemble(self) -> Source | None:
@@ -476,9 +424,6 @@ class Sources:
         """Return the source of a variant; ``None`` if the method lacks it."""
         if self.precision == DOUBLE_DOUBLE:
             return self._variant_in_pairs(variant)
-        return None if self.of_arrays else self._variant_in_double(variant)
-
-    def _variant_in_double(self, variant: Variant) -> Source | None:
         match variant:
             case Lanes():
                 source = render_ensemble(self.program())
@@ -501,6 +446,80 @@ class Sources:
         if isinstance(variant, Lanes):
             return render_ensemble_in_pairs(self.program(), self._corrected(self.program()))
         return None if variant.of_one_word else self._in_double.variant(variant)
+
+
+class ArraySources(Sources):
+    """C source of an integrator of arrays whose sizes are known at run time: loops over the arrays, without variants.
+
+    Other systems of velocities than m v**2/2 are integrated by their Hamiltonian, if its terms are those of elements.
+    """
+
+    def _form_of(self, system: MechanicalSystem) -> MechanicalSystem:
+        self.solver = "fixed-point" if self.solver == "auto" else self.solver
+        check_solver(self.solver)
+        return system
+
+    @cached_property
+    def sites(self) -> SiteHamiltonian | None:
+        """Hamiltonian by which the system is integrated, of a Lagrangian with other velocities than m v**2/2."""
+        by_momenta = self.g is None and self.solver == "fixed-point" and self.system.coupled_terms
+        return site_hamiltonian(self.system) if by_momenta else None
+
+    def _derived(self, **_: Any) -> Program:
+        """Return the lowered program; raise :class:`SizesRequiredError` if there is none for run-time sizes."""
+        system = self.sites.system if self.sites else self.system
+        system.check_run_time_sizes()
+        try:
+            if self.g is not None:
+                raise SizesRequiredError("time_transformation is not available for arrays of run-time sizes")
+            program = lower_arrays(system, self.method, prefix=self.prefix, solver=self.solver)
+        except SizesRequiredError as error:
+            raise SizesRequiredError(f"{error}. This concerns '{self.system.name}': {SIZES_REQUIRED}") from error
+        layout = self.interface.layout
+        functions: dict[str, Any] = transforms(self.sites) if self.sites else {}
+        loops = replace(program.loops, maps=layout.maps, continued=layout.continued, **functions)
+        return replace(program, loops=loops)
+
+    @cached_property
+    def interface(self) -> Interface:
+        """Interface of the generated library."""
+        system, sites = self.system, self.sites
+        layout = ArrayLayout(
+            sizes=system.sizes,
+            coordinates=system.positions,
+            momenta=system.momenta,
+            fields=system.fields,
+            tables=system.tables,
+            field_defaults=system.field_defaults,
+            maps=momentum_maps(system),
+            accesses=system.accesses,
+            depends_on_time=system.depends_on_time,
+            constraints=tuple(term.loops for term in system.constraints),
+            continued=not (self.method.fractions or system.constraints),
+            momentum_formulas=sites.momenta if sites else (),
+            velocity_formulas=sites.velocities if sites else (),
+            couplings=(*system.potentials, *system.applied_forces) if self.solver == "newton" else (),
+            symmetric=not (system.momenta or system.velocities),
+            data=system.data,
+            neighbours=tuple(near.name for near in system.neighbours),
+            mesh=system.mesh,
+        )
+        return _interface(
+            system,
+            self.method,
+            prefix=self.prefix,
+            title=f"{system.name}: {self.method.title}",
+            coordinates=tuple(array.name for array in system.positions),
+            conserves_energy=not (system.momenta or system.changes_energy or system.inputs),
+            solver="rattle" if system.constraints else self.solver,
+            layout=layout,
+        )
+
+    def _with_growth(self, control: Control) -> Control:
+        return control
+
+    def variant(self, variant: Variant) -> None:
+        """Return ``None``: variants are those of known sizes."""
 
 
 @checks_arguments(system=SYSTEM, symmetries=SYMMETRIES)

@@ -33,7 +33,7 @@ from scvi_codegen.methods import SVI, StoermerVerlet, as_method, default_method
 from scvi_codegen.methods.method import Method
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.stepping.compiled_method import Variants
-from scvi_codegen.systems.event import EventLike, as_events
+from scvi_codegen.systems.event import Event, EventLike, as_events
 from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED
 from scvi_codegen.systems.system import SYSTEM_OR_ARRAYS, MechanicalSystem
 
@@ -102,16 +102,13 @@ def compile_stepper(
         "solver": solver,
         "flags": flags,
         "prefix": prefix,
-        "symmetries": symmetries,
-        "sizes": sizes,
         "time_transformation": time_transformation,
         "controller": controller,
-        "tables": tables,
     }
-    compiled = partial(compile_stepper, system, method, **common)
+    if isinstance(system, OfRunTimeSizes) and sizes is None and tables is None:
+        return _compile_arrays(system, method, symmetries, as_events(events), precision, common)
+    compiled = partial(compile_stepper, system, method, symmetries=symmetries, sizes=sizes, tables=tables, **common)
     if precision == AUTO:
-        if sizes is None and isinstance(system, OfRunTimeSizes):
-            raise MethodError(f"precision='auto' is not available with arrays of run-time sizes: {SIZES_REQUIRED}")
         return _in_both_precisions(compiled, events)
     if symmetries != ():
         from scvi_codegen.systems.symmetry.symmetry import SYMMETRIES
@@ -120,41 +117,43 @@ def compile_stepper(
     drawn: dict[str, Any] = {"mesh": system.mesh, "links": system.drawn_links}
     if sizes is not None or tables is not None:
         system, time_transformation = _at_sizes(system, time_transformation, sizes or {}, tables)
-    if known_sizes := not isinstance(system, OfRunTimeSizes):
-        method = as_method(method, system)
-    else:
-        if symmetries:
-            raise MethodError(f"symmetries= is unavailable for '{system.name}': {SIZES_REQUIRED}")
-        chosen, method = method, as_method(method)
-    if precision == DOUBLE_DOUBLE and not known_sizes:
-        raise MethodError("precision='double-double' is not available with arrays of run-time sizes: pass sizes={..}")
+    method = as_method(method, system)
     sources = CachedSources(system, method, solver, prefix, symmetries, time_transformation, controller, precision)
-    variants = Variants(
-        make=sources.variant, lacking=lambda variant: variant == Derivatives(order=2) and system.damping != 0
-    )
-    if not known_sizes:
-        source, interface, reason = sources.of_run_time_sizes()
-        rattle = system.constraints and isinstance(method, StoermerVerlet)
-        of_sizes = partial(
-            compile_stepper,
-            system,
-            SVI(1, "gauss-lobatto:2") if rattle else chosen,  # the name of RATTLE for known sizes
-            solver=solver,
-            flags=flags,
-            prefix=prefix,
-            time_transformation=time_transformation,
-            controller=controller,
-        )
-        further: dict[str, Any] = {"events": as_events(events), "of_sizes": of_sizes, "reason": reason}
-        return Stepper(source, interface, variants=variants, flags=flags, **further)
     source, interface = sources.integrator()
     interface = replace(interface, layout=replace(interface.layout, **drawn))
     system.store_key()
+    stepper = partial(Stepper, source, interface, variants=sources.variants, flags=flags)
     if precision == DOUBLE_DOUBLE:
-        stepper = Stepper(source, interface, variants=variants, flags=flags)
-        stepper._doubles = cache(compiled)
-        return stepper.with_events(as_events(events))
-    return Stepper(source, interface, variants=variants, flags=flags, events=as_events(events))
+        of_two_words = stepper()
+        of_two_words._doubles = cache(compiled)
+        return of_two_words.with_events(as_events(events))
+    return stepper(events=as_events(events))
+
+
+def _compile_arrays(
+    system: MechanicalSystem,
+    method: Method | str,
+    symmetries: Sequence[Symmetry],
+    events: tuple[Event, ...],
+    precision: str,
+    common: Mapping[str, Any],
+) -> Stepper:
+    """Return the stepper of arrays whose sizes each run determines; ``common``: further arguments."""
+    if precision == AUTO:
+        raise MethodError(f"precision='auto' is not available with arrays of run-time sizes: {SIZES_REQUIRED}")
+    if symmetries:
+        raise MethodError(f"symmetries= is unavailable for '{system.name}': {SIZES_REQUIRED}")
+    if precision == DOUBLE_DOUBLE:
+        raise MethodError("precision='double-double' is not available with arrays of run-time sizes: pass sizes={..}")
+    discretisation = as_method(method)
+    solver, prefix, g, controller = (common[name] for name in ("solver", "prefix", "time_transformation", "controller"))
+    sources = CachedArraySources(system, discretisation, solver, prefix, (), g, controller)
+    source, interface, reason = sources.of_run_time_sizes()
+    if system.constraints and isinstance(discretisation, StoermerVerlet):
+        method = SVI(1, "gauss-lobatto:2")  # the name of RATTLE for known sizes
+    of_sizes = partial(compile_stepper, system, method, **common)
+    arguments: dict[str, Any] = {"variants": sources.variants, "flags": common["flags"], "events": events}
+    return Stepper(source, interface, **arguments, of_sizes=of_sizes, reason=reason)
 
 
 def second_stepper(system: MechanicalSystem) -> Callable[[], Stepper]:
@@ -228,6 +227,12 @@ class CachedSources:
         chosen = self.solver, self.prefix, self.symmetries, self.g, self.controller, self.precision
         return Sources(self.system, self.method, *chosen)
 
+    @property
+    def variants(self) -> Variants:
+        """The variants of the source."""
+        damped = self.system.damping != 0
+        return Variants(make=self.variant, lacking=lambda variant: damped and variant == Derivatives(order=2))
+
     def integrator(self) -> tuple[Source, Interface]:
         """Return the C source and its interface."""
 
@@ -237,6 +242,27 @@ class CachedSources:
 
         source, interface = json.loads(cached_source((*self.key, "integrator"), derive))
         return Source.from_record(source), Interface.from_record(interface)
+
+    def variant(self, variant: Variant) -> Source | None:
+        """Return the source of a variant; ``None`` if the method lacks it."""
+
+        def derive() -> str:
+            source = self.derived.variant(variant)
+            return "" if source is None else source.to_json()
+
+        text = cached_source((*self.key, repr(variant)), derive)
+        return Source.from_json(text) if text else None
+
+
+class CachedArraySources(CachedSources):
+    """C source of an integrator of arrays of run-time sizes, from the cache if it was derived before."""
+
+    @cached_property
+    def derived(self) -> Sources:
+        """The source that is not in the cache, and its interface."""
+        from scvi_codegen.codegen.pipeline import ArraySources
+
+        return ArraySources(self.system, self.method, self.solver, self.prefix, (), self.g, self.controller)
 
     def of_run_time_sizes(self) -> tuple[Source | None, Interface, str]:
         """Return the C source for run-time sizes, or ``None``; the interface; the reason why there is none."""
@@ -252,13 +278,3 @@ class CachedSources:
         if record:
             return Source.from_record(record), interface, ""
         return None, replace(interface, layout=replace(interface.layout, maps=())), reason
-
-    def variant(self, variant: Variant) -> Source | None:
-        """Return the source of a variant; ``None`` if the method lacks it."""
-
-        def derive() -> str:
-            source = self.derived.variant(variant)
-            return "" if source is None else source.to_json()
-
-        text = cached_source((*self.key, repr(variant)), derive)
-        return Source.from_json(text) if text else None

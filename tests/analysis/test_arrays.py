@@ -134,7 +134,7 @@ QUICK = ("a ring that closes one place off",)
 def test_planted_faults_find_their_source_lines(name: str, method: str) -> None:
     """Rewritten source would otherwise disable its planted faults, noticed only by the full tier."""
     system = either_system(name=name, **SYSTEMS[name][0])
-    code = pipeline.Sources(system, sc.as_method(method)).integrator()[0].amalgamated().code
+    code = pipeline.ArraySources(system, sc.as_method(method)).integrator()[0].amalgamated().code
     here = {what: fault[2] for what, fault in FAULTS.items() if fault[:2] == (name, method)}
     assert [what for what, pattern in here.items() if not re.search(pattern, code)] == []
 
@@ -190,7 +190,7 @@ def test_model_file_is_verified(tmp_path: Path) -> None:
 def test_small_systems_are_cut_out_where_the_motion_is_largest(place: int) -> None:
     """By positions and by momenta, and at both ends of an array."""
     system = either_system(name="ring", **SYSTEMS["ring"][0])
-    interface = pipeline.Sources(system, sc.as_method("svi:2")).integrator()[1]
+    interface = pipeline.ArraySources(system, sc.as_method("svi:2")).integrator()[1]
     still, moving = np.full(50, 0.1), np.where(np.arange(50) == place, -3.0, 0.1)
     for q, p in ((moving, still), (still, moving)):
         start = WholeStart(

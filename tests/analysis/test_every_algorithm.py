@@ -14,7 +14,7 @@ from samples import QUICK_FLAGS
 import scvi_codegen as sc
 from scvi_codegen.analysis.verification import Outcome
 from scvi_codegen.codegen.lowering.arrays import one_coordinate
-from scvi_codegen.codegen.pipeline import Sources
+from scvi_codegen.codegen.pipeline import ArraySources, Sources
 from scvi_codegen.codegen.variants import Derivatives, Lanes
 from scvi_codegen.common.cache import template_folder
 from scvi_codegen.systems.arrays.system import ArraySystem
@@ -146,8 +146,10 @@ def headers_of(name: str) -> Iterator[str]:
     if "events" in options:
         sources += sc.compile_stepper(system, method, flags=QUICK_FLAGS, **options).source.sources
     else:
-        chosen = sc.as_method(method, one_coordinate(system) if isinstance(system, ArraySystem) else system)
-        made = Sources(system, chosen, options.get("solver", "auto"), g=options.get("time_transformation"))
+        of_arrays = isinstance(system, ArraySystem)
+        chosen = sc.as_method(method, one_coordinate(system) if of_arrays else system)
+        kind_of_sources = ArraySources if of_arrays else Sources
+        made = kind_of_sources(system, chosen, options.get("solver", "auto"), g=options.get("time_transformation"))
         sources.append(made.integrator()[0])
         for kind in (Lanes(), Derivatives(), *([Derivatives(order=2)] if name == "kepler/svi-3" else [])):
             with suppress(sc.MethodError):

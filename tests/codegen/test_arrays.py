@@ -8,7 +8,7 @@ from either_system import either_system
 from style import check_style
 
 from scvi_codegen.codegen.lowering.control import control_of
-from scvi_codegen.codegen.lowering.program import lower
+from scvi_codegen.codegen.lowering.program import lower_arrays
 from scvi_codegen.codegen.native.compilers import find_compiler
 from scvi_codegen.codegen.rendering.program_source import render
 from scvi_codegen.codegen.rendering.source import Source
@@ -57,7 +57,7 @@ def rendered(name: str, method: str, *, newton: bool = False) -> Source:
         tables=["bonds[B, 2]"],
         forces=FORCES.get(name),
     )
-    program = lower(system, as_method(method), prefix="arrays", solver="newton" if newton else "auto")
+    program = lower_arrays(system, as_method(method), prefix="arrays", solver="newton" if newton else "fixed-point")
     control = control_of(program)
     assert control is not None or method == "stoermer-verlet"
     return render(program, control)

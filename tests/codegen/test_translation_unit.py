@@ -12,7 +12,7 @@ from samples import QUICK_FLAGS
 
 from scvi_codegen import SVI, compile_stepper, generate_source
 from scvi_codegen.codegen.native.compilers import find_compiler
-from scvi_codegen.codegen.pipeline import Sources
+from scvi_codegen.codegen.pipeline import ArraySources
 from scvi_codegen.codegen.rendering.source import Source
 
 STRICT = "-std=c99 -O1 -Wall -Wextra -pedantic -Wshadow -Wconversion -Wno-psabi -Werror".split()  # noqa: SIM905
@@ -65,7 +65,7 @@ def written(source: Source, folder: Path) -> None:
 def test_two_integrators_in_one_translation_unit_agree_with_python(compiler, tmp_path):
     kepler, arrays = catalogue("kepler")(), ring()
     written(generate_source(kepler, SVI(4), prefix="kepler")[0], tmp_path)
-    written(Sources(arrays, SVI(4), prefix="ring").integrator()[0], tmp_path)
+    written(ArraySources(arrays, SVI(4), prefix="ring").integrator()[0], tmp_path)
     (tmp_path / "main.c").write_text(RUNS.format(n=N, h=H, steps=STEPS))
     subprocess.run([needs(compiler), *STRICT, "main.c", "-lm", "-o", "main"], cwd=tmp_path, check=True)
     done = subprocess.run([tmp_path / "main"], check=True, capture_output=True, text=True)

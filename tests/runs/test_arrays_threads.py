@@ -16,9 +16,9 @@ import pytest
 from programs import needs
 
 import scvi_codegen as sc
-from scvi_codegen.codegen.lowering.program import lower
+from scvi_codegen.codegen.lowering.program import lower_arrays
 from scvi_codegen.codegen.native.compilers import find_compiler
-from scvi_codegen.codegen.pipeline import Sources
+from scvi_codegen.codegen.pipeline import ArraySources
 from scvi_codegen.codegen.rendering.kernels.loop_nests import Sharing, sharing_of
 from scvi_codegen.runs.stepping.array_envelope import envelope_of
 
@@ -138,7 +138,7 @@ def bits(run: Any) -> tuple[Any, ...]:
 @pytest.mark.parametrize("name", CASES)
 def test_terms_are_distributed_over_threads(name: str) -> None:
     system = system_of(CASES[name])
-    program = lower(system, sc.as_method("svi:2"), prefix="shared")
+    program = lower_arrays(system, sc.as_method("svi:2"), prefix="shared")
     assert {sharing_of(rolled) for rolled in program.loops.forces} == {CASES[name].shared}
 
 
@@ -307,7 +307,7 @@ int main(void)
 def windows(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, int], list[list[int]]]:
     """Return rounds and windows of term groups of several sizes, as computed in C."""
     folder = tmp_path_factory.mktemp("windows")
-    source, _ = Sources(system_of(CASES["ring"]), sc.as_method("stoermer-verlet"), prefix="shared").integrator()
+    source, _ = ArraySources(system_of(CASES["ring"]), sc.as_method("stoermer-verlet"), prefix="shared").integrator()
     for path, text in {**source.files, "main.c": WINDOWS}.items():
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
         (folder / path).write_text(text)
@@ -393,7 +393,7 @@ static int create(pthread_t *thread, const pthread_attr_t *attributes, void *(*g
 
 def program(name: str, method: str, solver: str, folder: Path, **numbers: int) -> None:
     """Write the source of a run with threads, and the C program that makes it."""
-    source, interface = Sources(system_of(CASES[name]), sc.as_method(method), solver, "shared").integrator()
+    source, interface = ArraySources(system_of(CASES[name]), sc.as_method(method), solver, "shared").integrator()
     for path, text in source.files.items():
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
         (folder / path).write_text(text)

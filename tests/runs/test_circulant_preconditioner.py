@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import scvi_codegen as sc
-from scvi_codegen.codegen.lowering.program import lower
+from scvi_codegen.codegen.lowering.program import lower_arrays
 from scvi_codegen.runs.stepping import array_envelope as envelope
 
 pytestmark = pytest.mark.second
@@ -175,7 +175,7 @@ def test_systems_with_a_circulant_preconditioner(term, reach):
         tables=["bonds[B, 2]"],
         lagrangian=f"sum(i in N, sum(a in 2, u_dot[i, a]**2/2)) - {term}",
     )
-    assert lower(system, sc.as_method("svi:2"), prefix="some", solver="newton").loops.reach == reach
+    assert lower_arrays(system, sc.as_method("svi:2"), prefix="some", solver="newton").loops.reach == reach
 
 
 @pytest.mark.quick
@@ -189,4 +189,4 @@ def test_circulant_preconditioner_requires_lattices_only(coordinates, reach):
             reach
         ],
     )
-    assert lower(system, sc.as_method("svi:2"), prefix="some", solver="newton").loops.reach == reach
+    assert lower_arrays(system, sc.as_method("svi:2"), prefix="some", solver="newton").loops.reach == reach

@@ -19,7 +19,7 @@ from notation import hamilton, lagrange
 
 from scvi_codegen import HamiltonianSystem, LagrangianSystem, as_method, problem, reparametrise
 from scvi_codegen.codegen.native.compilers import find_compiler
-from scvi_codegen.codegen.pipeline import Sources, generate_source
+from scvi_codegen.codegen.pipeline import ArraySources, Sources, generate_source
 from scvi_codegen.codegen.rendering.source import Source
 from scvi_codegen.codegen.variants import Derivatives, Lanes, NewtonFallback
 from scvi_codegen.systems.arrays.system import ArraySystem
@@ -116,7 +116,7 @@ def arrays(
 ) -> Made:
     """A run of a system with array coordinates."""
     found = system()
-    sources = Sources(found, as_method(method), solver, name)
+    sources = ArraySources(found, as_method(method), solver, name)
     main = arrays_driver(
         name,
         sizes,

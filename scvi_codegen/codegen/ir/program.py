@@ -81,8 +81,8 @@ class Layout(ArrayDeclarations):
         sums: convolutions of the state, coordinates, momenta or velocities.
         parameters, defaults: names and default values of the numbers.
         inputs: index of the first of the five parameters of each tabulated input, by name.
-        coupled: first and end of the named coordinates of each array of known sizes whose neighbouring elements forces
-            couple.
+        whole: first and end of the named coordinates of each array of known sizes.
+        coupled: the same of those whose neighbouring elements forces couple.
     """
 
     velocities: tuple[Array, ...] = ()
@@ -90,6 +90,7 @@ class Layout(ArrayDeclarations):
     parameters: tuple[str, ...] = ()
     defaults: tuple[float, ...] = ()
     inputs: tuple[tuple[str, int], ...] = ()
+    whole: tuple[tuple[int, int], ...] = ()
     coupled: tuple[tuple[int, int], ...] = ()
 
     @property

@@ -20,7 +20,7 @@ the end. (Nystroem methods: Hairer, Norsett & Wanner, Solving ODEs I, sec. II.14
 
 import math
 import operator
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from sympy import Expr
@@ -118,17 +118,8 @@ def control_of(
         mantissas=MANTISSAS,
         predictor=predictor_of(program.fixed_point) if program.fixed_point else None,
         stage_growth=2.0 ** (stage_curve.power / LEVELS_PER_BINADE) if stage_curve else 0.0,
-        arrays=() if system is None or program.of_arrays else tuple(_ranges_of_arrays(system)),
+        arrays=program.layout.whole,
     )
-
-
-def _ranges_of_arrays(system: MechanicalSystem) -> Iterator[tuple[int, int]]:
-    """Yield first and end of the coordinates that are the entries of an array of known size."""
-    names = [q.name for q in system.coordinates]
-    for elements in (array.elements for array in system.arrays if array.axes):
-        first = names.index(elements[0]) if elements[0] in names else len(names)
-        if names[first : first + len(elements)] == [*elements]:
-            yield first, first + len(elements)
 
 
 def predictor_of(fixed_point: FixedPointIteration) -> AdaptivePredictor:

@@ -6,9 +6,9 @@ matrix: on positions, on velocities, or on momenta and velocities
 (:mod:`~scvi_codegen.codegen.lowering.solvers.curves`).
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
+from typing import Any
 
 import sympy
 
@@ -155,11 +155,8 @@ def lower(
 ) -> Program:
     """Return the program of one step of ``method`` for ``system``; exported C names begin with ``prefix``.
 
-    Systems of arrays of run-time sizes have constant masses, so that the tables of a method are the same for every
-    coordinate: those of a system of one coordinate serve all.
-
     Args:
-        system, method: the system, of named coordinates or of arrays, and the method.
+        system, method: the system of named coordinates, and the method.
         prefix: a C identifier.
         solver: as in :func:`~scvi_codegen.compile_stepper`.
         symmetries: whose momentum maps are included.
@@ -169,36 +166,26 @@ def lower(
     Raises:
         MethodError: if the solver is not available for the method and the system.
     """
-    arrays = system if isinstance(system, ArraySystem) else None
-    one = one_coordinate(system) if isinstance(system, ArraySystem) else system
-    stages, velocities = discretise(one, method), bool(arrays and arrays.velocities)
-    explicit = arrays or solver in ("auto", "explicit")
-    splitting = splitting_of(one, method) if explicit and not (system.constraints or one.integrands) else None
-    iterated = not system.constraints if arrays else lanes and solver in ("auto", "fixed-point")
-    fixed_point = iteration_of(one, stages, velocities=velocities) if iterated and splitting is None else None
-    program = partial(
-        Program,
-        prefix=prefix,
-        title=comment_text(f"{system.name}: {method.title}"),
-        notes=_notes(method, one, forced=bool(arrays and arrays.applied_forces)),
-        order=method.order or len(stages.blocks),
-        layout=_layout(system),
-        fixed_point=fixed_point,
-        splitting=splitting,
-    )
-    if isinstance(system, ArraySystem):
-        loops = rolled_terms(system, constrained_steps(system, stages, method), newton=solver == "newton")
-        if loops.products and fixed_point and fixed_point.matrix:
-            loops = replace(loops, shifts=shift_tables(fixed_point.matrix, fixed_point.lanes))
-        check_solver_of_arrays(system, method, solver, splitting or loops.constrained or fixed_point, loops)
-        return program(loops=loops, polynomial_curves=bool(fixed_point and (fixed_point.points > 1 or not velocities)))
+    stages, explicit = discretise(system, method), solver in ("auto", "explicit")
+    splitting = splitting_of(system, method) if explicit and not system.integrands else None
+    iterated = lanes and solver in ("auto", "fixed-point") and splitting is None
+    fixed_point = iteration_of(system, stages) if iterated else None
     check_solver(solver, method, SOLVERS, found=splitting if solver == "explicit" else fixed_point)
     alone = fixed_point is not None and not fallback and not system.integrands
     newton = solver in ("auto", "newton") and splitting is None and not alone
     polynomial = method.exactness.curve != 0
-    curve = newton and polynomial and splitting is None
-    equations = _equations(system, method, stages, newton=newton, curve=curve)
-    return program(
+    equations = _equations(system, method, stages, newton=newton, curve=newton and polynomial)
+    return Program(
+        **_heading(system, method, stages, prefix, geometry=_geometry(method, system)),
+        layout=Layout(
+            coordinates=tuple(Array(q.name, ()) for q in system.coordinates),
+            inputs=tuple((name, system.parameters.index(symbol(f"{name}_0"))) for name in system.inputs),
+            whole=tuple(_ranges_of((array for array in system.arrays if array.axes), system)),
+            coupled=tuple(_ranges_of((array for array in system.arrays if array.is_field), system)),
+            **_numbers_of(system),
+        ),
+        fixed_point=fixed_point,
+        splitting=splitting,
         newton=newton,
         polynomial_curves=polynomial,
         equations=equations,
@@ -209,22 +196,63 @@ def lower(
     )
 
 
-def _layout(system: MechanicalSystem) -> Layout:
-    numbers = {"parameters": tuple(each.name for each in system.parameters), "defaults": system.defaults}
-    if isinstance(system, ArraySystem):
-        kinds = ("coordinates", "momenta", "velocities", "sums", "fields", "tables", "sizes")
-        return Layout(**{kind: getattr(system, kind) for kind in kinds}, **numbers)
-    return Layout(
-        coordinates=tuple(Array(q.name, ()) for q in system.coordinates),
-        inputs=tuple((name, system.parameters.index(symbol(f"{name}_0"))) for name in system.inputs),
-        coupled=tuple(_coupled_coordinates(system)),
-        **numbers,
+def lower_arrays(system: ArraySystem, method: Method, *, prefix: str, solver: str = "fixed-point") -> Program:
+    """Return the program of one step of a system of arrays of run-time sizes, with its terms in loops.
+
+    Their masses are constant, so that the tables of a method are the same for every coordinate: those of a system of
+    one coordinate serve all. Arguments and errors are those of :func:`lower`.
+    """
+    one = one_coordinate(system)
+    stages, velocities = discretise(one, method), bool(system.velocities)
+    constrained = constrained_steps(system, stages, method)
+    splitting = None if constrained else splitting_of(one, method)
+    iterated = constrained is None and splitting is None
+    fixed_point = iteration_of(one, stages, velocities=velocities) if iterated else None
+    loops = rolled_terms(system, constrained, newton=solver == "newton")
+    if loops.products and fixed_point and fixed_point.matrix:
+        loops = replace(loops, shifts=shift_tables(fixed_point.matrix, fixed_point.lanes))
+    check_solver_of_arrays(system, method, solver, splitting or constrained or fixed_point, loops)
+    arrays = ("coordinates", "momenta", "velocities", "sums", "fields", "tables", "sizes")
+    geometry = "not symplectic" if system.applied_forces else _geometry(method, one)
+    return Program(
+        **_heading(system, method, stages, prefix, geometry=geometry),
+        layout=Layout(**{kind: getattr(system, kind) for kind in arrays}, **_numbers_of(system)),
+        fixed_point=fixed_point,
+        splitting=splitting,
+        loops=loops,
+        polynomial_curves=bool(fixed_point and (fixed_point.points > 1 or not velocities)),
     )
 
 
-def _coupled_coordinates(system: MechanicalSystem) -> Iterator[tuple[int, int]]:
-    names = [each.name for each in system.coordinates]
-    for elements in (array.elements for array in system.arrays if array.is_field):
+def _heading(
+    system: MechanicalSystem, method: Method, stages: StageSystem, prefix: str, *, geometry: str
+) -> dict[str, Any]:
+    """Return the names of a program, and what is known of its method, also for the header's comment."""
+    order = "no order claimed" if method.order is None else f"order {method.order}"
+    return {
+        "prefix": prefix,
+        "title": comment_text(f"{system.name}: {method.title}"),
+        "notes": (order, geometry, "symmetric" if method.symmetric else "not symmetric"),
+        "order": method.order or len(stages.blocks),
+    }
+
+
+def _geometry(method: Method, system: MechanicalSystem) -> str:
+    """Return which structure steps preserve."""
+    if is_symplectic(method, system):
+        return "symplectic"
+    return "conformally symplectic" if is_conformally_symplectic(method, system) else "not symplectic"
+
+
+def _numbers_of(system: MechanicalSystem) -> dict[str, Any]:
+    """Return names and default values of the parameters that are numbers."""
+    return {"parameters": tuple(each.name for each in system.parameters), "defaults": system.defaults}
+
+
+def _ranges_of(arrays: Iterable[Array], system: MechanicalSystem) -> Iterator[tuple[int, int]]:
+    """Yield first and end of the coordinates that are the entries of an array of known size."""
+    names = [q.name for q in system.coordinates]
+    for elements in (array.elements for array in arrays):
         first = names.index(elements[0]) if elements[0] in names else len(names)
         if names[first : first + len(elements)] == [*elements]:
             yield first, first + len(elements)
@@ -403,15 +431,6 @@ def _momentum_kernel(system: MechanicalSystem, symmetries: Sequence[Symmetry]) -
         u=(*symmetries[0].coordinates, *symmetries[0].momenta),
         purpose="Momentum maps at u = (q, p), then the sums of the squares of their terms.",
     )
-
-
-def _notes(method: Method, system: MechanicalSystem, *, forced: bool) -> tuple[str, ...]:
-    """Return the lines of the header's comment: order, symplecticity, symmetry; ``forced``: with further forces."""
-    order = "no order claimed" if method.order is None else f"order {method.order}"
-    geometry = "symplectic" if is_symplectic(method, system) else "conformally symplectic"
-    if forced or not is_conformally_symplectic(method, system):
-        geometry = "not symplectic"
-    return order, geometry, "symmetric" if method.symmetric else "not symmetric"
 
 
 def _required_extrapolation(stages: StageSystem, columns: Sequence[int]) -> Matrix:

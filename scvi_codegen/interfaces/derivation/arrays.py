@@ -8,7 +8,7 @@ from sympy import latex
 from scvi_codegen.codegen.ir.equations import FixedPointIteration, Splitting
 from scvi_codegen.codegen.ir.kernel import Number
 from scvi_codegen.codegen.ir.program import Program
-from scvi_codegen.codegen.lowering.program import lower
+from scvi_codegen.codegen.lowering.program import lower_arrays
 from scvi_codegen.common.representation import LONGEST, clipped
 from scvi_codegen.methods.method import Method
 from scvi_codegen.systems.arrays.symmetry import momentum_maps
@@ -40,7 +40,7 @@ class ArrayStepEquations:
             MethodError: for a method without fixed-point iteration, and a system that requires known sizes.
         """
         self.system.check_run_time_sizes()
-        return lower(self.system, self.method, prefix="derived")
+        return lower_arrays(self.system, self.method, prefix="derived")
 
     def to_text(self) -> str:
         """Return plain text."""

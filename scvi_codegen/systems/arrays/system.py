@@ -488,6 +488,11 @@ class ArraySystem(OfRunTimeSizes, MechanicalSystem):
         return rf"{self.function[0]}({arguments}) = {' + '.join(shown).replace('+ -', '-')}"
 
     @property
+    def balances_energy(self) -> bool:
+        """True if the energy changes by the work of forces or damping only."""
+        return (bool(self.forces) or self.damping != 0) and not self.depends_on_time
+
+    @property
     def depends_on_time(self) -> bool:
         """True if time occurs explicitly, so that energy is not conserved."""
         formulas = [term.formula for term in self.terms] + [f for force in self.forces for _, f in force.targets]

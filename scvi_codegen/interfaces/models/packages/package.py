@@ -262,13 +262,13 @@ def load_package(folder: str | os.PathLike[str]) -> Stepper:
 
 def _stepper_of_arrays(folder: Path) -> Stepper:
     """Return the stepper of a folder with arrays whose sizes are known at run time; its model has their layout."""
-    from scvi_codegen.codegen.pipeline import Sources
+    from scvi_codegen.codegen.pipeline import ArraySources
     from scvi_codegen.interfaces.models.model_files.model_file import load_model
 
     model, prefix = load_model(folder / MODEL_FILE), prefix_of(folder)
     if model.array_system is None:
         raise damaged(folder, KeyError("interface"))
-    interface = Sources(model.array_system, model.method, model.solver, prefix).interface
+    interface = ArraySources(model.array_system, model.method, model.solver, prefix).interface
     return Stepper(source_in(folder, prefix), interface)
 
 
@@ -324,13 +324,14 @@ def _example(model: Model, interface: Interface, *, controlled: bool) -> Any:
 
 
 def _texts_of_arrays(model: Model, prefix: str, embedded: Embedded | None, *, single_file: bool) -> dict[str, str]:
-    from scvi_codegen.codegen.pipeline import Sources
+    from scvi_codegen.codegen.pipeline import ArraySources
     from scvi_codegen.codegen.rendering.program_source import render_example
     from scvi_codegen.interfaces.models.model_files.model_file import model_texts
     from scvi_codegen.interfaces.models.packages.example import array_example_of, package_template
 
     assert model.array_system is not None  # by the caller
-    source, interface = Sources(model.array_system, model.method, model.solver, prefix).integrator(controlled=False)
+    sources = ArraySources(model.array_system, model.method, model.solver, prefix)
+    source, interface = sources.integrator(controlled=False)
     scalars = {name: value for name, value in dict(model.parameters or {}).items() if name in interface.parameters}
     checked_parameters(interface, scalars)  # C does not check cutoffs and boxes; fields are checked with the sizes
     example, arrays = array_example_of(model, interface)
