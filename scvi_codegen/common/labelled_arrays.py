@@ -160,7 +160,8 @@ def write_hdf5(labelled: Labelled, path: Path) -> None:
         file.dimensions = labelled.sizes()
         for name, dimensions in labelled.dimensions.items():
             whole = labelled.whole.get(name)
-            kind = _kind(name) if whole is None else texts if whole.dtype.kind == "U" else whole.dtype
+            kind = _kind(name) if whole is None else whole.dtype
+            kind = texts if kind.kind == "U" else kind
             variable = file.create_variable(name, dimensions, kind)
             variable.attrs.update(labelled.about(name))
             if whole is not None:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from scvi_codegen.common.errors import MethodError
 from scvi_codegen.common.precision import Vector, mp
-from scvi_codegen.common.representation import summary
+from scvi_codegen.common.representation import counted, summary
 from scvi_codegen.common.toml_text import package_table
 from scvi_codegen.common.validation import checked_count
 from scvi_codegen.methods.method import Exactness, Method, Specification
@@ -49,7 +49,7 @@ class _Leapfrogs(Method):
             raise MethodError(f"sequence must be '{KICK_DRIFT_KICK}' or '{DRIFT_KICK_DRIFT}', not {self.sequence!r}")
 
     @property
-    def _named_sequence(self) -> Specification:
+    def _named_sequence(self) -> dict[str, str]:
         """Entry of the specification for the sequence; empty for the default."""
         return {} if self.sequence == KICK_DRIFT_KICK else {"sequence": self.sequence}
 
@@ -121,13 +121,13 @@ class Composition(_Leapfrogs):
     @property
     def name(self) -> str:
         """Name ``composition-<order>[-<sequence>]``."""
-        return f"composition-{self.composition_order}{f'-{self.sequence}' * self.drifts_first}"
+        return "-".join(["composition", str(self.composition_order), *self._named_sequence.values()])
 
     @property
     def title(self) -> str:
         """Display title."""
         stages = len(self.fractions)
-        return f"Composition of {stages} Stoermer-Verlet step{'s' * (stages > 1)}, order {self.composition_order}"
+        return f"Composition of {counted(stages, 'Stoermer-Verlet step')}, order {self.composition_order}"
 
     def specification(self) -> Specification:
         """See :meth:`Method.specification`."""
@@ -154,7 +154,7 @@ class StoermerVerlet(_Leapfrogs):
     @property
     def name(self) -> str:
         """Name ``stoermer-verlet[-<sequence>]``."""
-        return f"stoermer-verlet{f'-{self.sequence}' * self.drifts_first}"
+        return "-".join(["stoermer-verlet", *self._named_sequence.values()])
 
     @property
     def title(self) -> str:

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from scvi_codegen.common.errors import MethodError
-from scvi_codegen.common.representation import summary
+from scvi_codegen.common.representation import counted, summary
 from scvi_codegen.common.validation import NUMBERS, check_kind, checks_arguments, of
 from scvi_codegen.methods.method import Exactness, Method, NodalMethod, Specification, degree_count, resolve_nodes
 from scvi_codegen.methods.tables import tableau as tableaux
@@ -92,8 +92,7 @@ class RungeKutta(TableauMethod):
     @property
     def title(self) -> str:
         """Display title."""
-        stages = len(self.tableau.b)
-        return f"Runge-Kutta {self.tableau.name}, {stages} stage{'s' * (stages > 1)}, {self.form} form"
+        return f"Runge-Kutta {self.tableau.name}, {counted(self.tableau.stages, 'stage')}, {self.form} form"
 
     @property
     def exactness(self) -> Exactness:

@@ -111,7 +111,7 @@ class Forms:
         and not used. Constant rotations of bodies are orthogonal only to round-off, and so is the agreement.
         """
         system, momenta = self.system, self.system.momentum_symbols
-        energy = getattr(system, "dual_energy", sympy.S.Zero)
+        energy = system.dual_energy
         if energy == 0 or system.constraints or system.damping != 0 or system.clock:
             return None
         velocities = gradient_tuple(energy, momenta)
@@ -159,7 +159,7 @@ class Forms:
     @cached_property
     def regular_legendre(self) -> tuple[Expr, ...]:
         """Legendre transform with the gauge energy, by which it is invertible: (H + gauge)_p, or (L + gauge)_v."""
-        energy = getattr(self.system, "gauge", sympy.S.Zero)
+        energy = self.system.gauge
         if energy == 0:
             return self.legendre
         gauge = gradient_tuple(energy, self.legendre_arguments[self.system.dimension :])

@@ -155,9 +155,10 @@ class Event:
         """Table ``[[events]]`` of a model file; ``Event(**table)`` is this event, with formulas as text."""
 
         def plain(value: Any) -> Any:
-            return [*map(str, value)] if isinstance(value, tuple) else value if isinstance(value, kinds) else str(value)
+            if isinstance(value, tuple):
+                return [*map(str, value)]
+            return value if isinstance(value, str | int | float) else str(value)
 
-        kinds = str, int, float
         named = {name: getattr(self, name) for name in ("function", "where", "restitution", "direction", "terminal")}
         unset = {"direction": 0, "terminal": 0}
         table = {name: plain(value) for name, value in named.items() if value != unset.get(name)}
@@ -168,9 +169,12 @@ def _name(variable: Any) -> str:
     """Return the name of a variable that an event sets, from text or SymPy."""
     if isinstance(variable, str):
         return variable
-    rate = getattr(variable, "expr", None)  # a derivative by time
-    name = getattr(getattr(variable if rate is None else rate, "func", None), "__name__", "")
-    return f"{name}_dot" if rate is not None else str(getattr(variable, "name", name))
+    from sympy import Derivative
+    from sympy.core.function import AppliedUndef
+
+    if isinstance(variable, Derivative):
+        return f"{_name(variable.expr)}_dot"
+    return str(variable.name if isinstance(variable, AppliedUndef) else variable)
 
 
 def _condition(condition: Any) -> Formula:

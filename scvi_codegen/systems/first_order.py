@@ -27,7 +27,7 @@ import sympy
 from sympy import Expr, Symbol
 
 from scvi_codegen.common.errors import SystemDefinitionError
-from scvi_codegen.common.representation import summary
+from scvi_codegen.common.representation import counted, summary
 from scvi_codegen.systems.formulas.expressions import SAMPLES, hessian, samples, sums_to_zero
 from scvi_codegen.systems.formulas.intermediates import written_out
 from scvi_codegen.systems.formulas.symbols import DOT, inputs_by_name, symbol
@@ -206,12 +206,12 @@ class OneForm:
     def check(self) -> None:
         """Raise :class:`SystemDefinitionError` unless omega is regular."""
         n, rank = len(self.coordinates), self.rank()
+        missing = f"{counted(n - rank, 'combination')} of the coordinates {'has' if n - rank == 1 else 'have'}"
         if rank < n:
             raise SystemDefinitionError(
                 f"the Lagrangian of '{self.name}' is linear in the velocities, and its two-form d theta has rank "
-                f"{rank} in {n} coordinates: {n - rank} combination{'s' * (n - rank > 1)} of the coordinates "
-                f"ha{'ve' if n - rank > 1 else 's'} no equation of motion. A regular two-form is required. Eliminate "
-                "conserved combinations (Casimirs), or add the missing kinetic energy, such as "
+                f"{rank} in {n} coordinates: {missing} no equation of motion. A regular two-form is required. "
+                "Eliminate conserved combinations (Casimirs), or add the missing kinetic energy, such as "
                 f"m*{self.velocities[0]}**2/2"
             )
 
@@ -372,10 +372,11 @@ def _refusal(form: OneForm, refused: Sequence[Sequence[int]]) -> str:
         )
         if pivot.free_symbols & {*z} and pivot.count_ops() < MOST_SHOWN:
             remedy += f". This is valid as long as {format_expression(pivot)} is not 0 along the trajectory"
+    where = f"only between {pairs}" if pairs else "between no two coordinates"
+    others = f": {', '.join(shown[:3])}" if shown else ""
     return (
         f"{start}{half} coordinates are required between which the two-form omega = d theta vanishes; it vanishes "
-        f"{'only between ' + pairs if pairs else 'between no two coordinates'}{': ' * bool(shown)}"
-        f"{', '.join(shown[:3])}. {remedy}"
+        f"{where}{others}. {remedy}"
     )
 
 

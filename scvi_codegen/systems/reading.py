@@ -128,7 +128,7 @@ def _system(
         defaults=tuple(number(each, value) for each, value in values.items()),
         **others,
     )
-    return system, warn_of_mistakes(system, getattr(system, "one_form", ()))
+    return system, warn_of_mistakes(system)
 
 
 def system_from_sympy(

@@ -39,7 +39,7 @@ from scvi_codegen.systems.formulas.symbols import DOT, number, symbol
 if TYPE_CHECKING:
     from sympy import Expr, Symbol
 
-    from scvi_codegen.systems.formulas.rotations import Homogeneous
+    from scvi_codegen.systems.formulas.rotations import Homogeneous, Reduced
 
 
 class Deferred:
@@ -213,6 +213,21 @@ class MechanicalSystem(Deferred, ABC):
         return getattr(other, "ACTS_AS", None) == cls.__name__ or NotImplemented
 
     @property
+    def reduced(self) -> Reduced | None:
+        """Formulas of a Lagrangian in the names of rotations and directions; ``None`` without these."""
+        return None
+
+    @property
+    def gauge(self) -> Expr:
+        """Energy that is 0 on the states considered and makes the Legendre transform regular."""
+        return zero()
+
+    @property
+    def dual_energy(self) -> Expr:
+        """Kinetic energy of a Lagrangian in coordinates and momenta, 0 if it is not known."""
+        return zero()
+
+    @property
     def constrained(self) -> bool:
         """True if there are constraints; reads no formulas."""
         return bool(self.constraints if self._text is None else json.loads(self._text)[1]["constraints"])
@@ -309,8 +324,7 @@ class MechanicalSystem(Deferred, ABC):
 
     @property
     def _shown_formula(self) -> Expr:
-        reduced = getattr(self, "reduced", None)
-        return reduced.lagrangian if reduced else self.formula
+        return self.reduced.lagrangian if self.reduced else self.formula
 
     def text_of(self, formula: Expr) -> str:
         """Return a formula of the system as text, with its inputs by their names."""
@@ -323,8 +337,7 @@ class MechanicalSystem(Deferred, ABC):
     @property
     def constraint_texts(self) -> tuple[str, ...]:
         """Constraints g as text, in the names of the rotations and directions of a Lagrangian."""
-        reduced = getattr(self, "reduced", None)
-        return tuple(map(self.text_of, reduced.constraints if reduced else self.constraints))
+        return tuple(map(self.text_of, self.reduced.constraints if self.reduced else self.constraints))
 
     def with_parameters(self, **values: float) -> Self:
         """Return a copy of the system with other default values for the named parameters."""
@@ -364,8 +377,8 @@ class MechanicalSystem(Deferred, ABC):
 
     def _force_facts(self) -> Iterator[tuple[str, Html]]:
         """Yield forces, damping and constraints as rows of a notebook's card."""
-        reduced = getattr(self, "reduced", None)
-        forces = reduced.forces if reduced else zip([q.name for q in self.coordinates], zip(self.forces), strict=False)
+        by_coordinate = zip([q.name for q in self.coordinates], zip(self.forces), strict=False)
+        forces = self.reduced.forces if self.reduced else by_coordinate
         for name, components in forces:
             if any(components):
                 yield f"force on {name}", plain(", ".join(map(self.text_of, components)))

@@ -167,9 +167,9 @@ def _missed_in_two_words(trajectory: Trajectory, tolerance: float) -> str:
     late = np.asarray(second.velocity[-1]) * float(second.t[-1] - trajectory.t[-1])
     difference = np.asarray(np.linalg.norm(second.q[-1] - trajectory.q[-1] - late))
     error = float(relative_to_motion(difference, trajectory.q))
-    return f"the tolerance {tolerance:g} is missed: a second run differs by {error:.1e} at the end; {REMEDY}" * (
-        error > SECOND_MARGIN * tolerance
-    )
+    if error <= SECOND_MARGIN * tolerance:
+        return ""
+    return f"the tolerance {tolerance:g} is missed: a second run differs by {error:.1e} at the end; {REMEDY}"
 
 
 def _worst_step(trajectory: Trajectory, tolerance: float) -> str:

@@ -271,7 +271,9 @@ class _Model:
         m = measurements.stepper.dimension
         scaled, jacobian = chain.scaled(x), chain.jacobian(x)
         free = len(scaled) - int((~at_bound[:count]).sum())
-        noise = 1.0 if known_noise else float(np.sqrt(scaled @ scaled / free)) if free else np.nan
+        noise = float(np.sqrt(scaled @ scaled / free)) if free else np.nan
+        if known_noise:
+            noise = 1.0
         inverse = np.linalg.pinv(jacobian[:, ~at_bound])
         covariance = np.full((len(x), len(x)), np.nan)
         covariance[np.ix_(~at_bound, ~at_bound)] = noise**2 * inverse @ inverse.T

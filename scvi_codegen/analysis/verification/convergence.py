@@ -167,13 +167,15 @@ def _error(tested: SystemUnderTest, method: Method, state: State, h: Number) -> 
 
 def _rate_in_degree(tested: SystemUnderTest) -> Finding | None:
     specification = tested.method.specification()
-    key = "degree" if "degree" in specification else "stages" if "stages" in specification else None
+    key = next((name for name in ("degree", "stages") if name in specification), None)
     if key is None or "abscissae" in specification or tested.method.order is None:
         return None
     size = int(str(specification[key]))
-    less, more = (_of_size(specification, key, size + change) for change in (-2, 2))
-    pair = (less, tested.method) if less else (tested.method, more) if more else None
-    if pair is None:
+    if less := _of_size(specification, key, size - 2):
+        pair = less, tested.method
+    elif more := _of_size(specification, key, size + 2):
+        pair = tested.method, more
+    else:
         raise StateError("no method of a neighbouring degree exists with this quadrature")
     h, (coarse, fine) = _errors_of(tested, pair)
     remark = f"{pair[0].name}: {float(coarse):.1e}, {pair[1].name}: {float(fine):.1e}, h = {float(h):.3g}"

@@ -227,7 +227,7 @@ def constrained_steps(system: ArraySystem, stages: StageSystem, method: Method) 
 def _parts(stages: StageSystem, method: Method) -> Vector:
     """Return the fractions of h of the RATTLE steps of which a step is composed."""
     shape = stages.shape
-    if method.fractions and not getattr(method, "drifts_first", False):
+    if method.fractions and not method.drifts_first:
         return method.fractions
     if isinstance(shape, Velocities) and shape.variational and shape.abscissae == (0, 1) and len(shape.blocks) == 1:
         return (mp.one,)

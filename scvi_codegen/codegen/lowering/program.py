@@ -296,8 +296,13 @@ def _quantities(
     system: MechanicalSystem, method: Method, stages: StageSystem, symmetries: Sequence[Symmetry]
 ) -> Quantities:
     """Return the functions of the state that a run evaluates or integrates."""
-    name, purpose = ("hamiltonian", "H at u = (q, p).") if system.auxiliaries else ("lagrangian", "L at u = (q, v).")
     forms, integrates = forms_of(system), any(group.in_action for group in stages.stage_groups)
+    name, purpose = "lagrangian", "L at u = (q, v)."
+    legendre = f"Momenta L_v {'' if forms.inverse_mass else 'and mass matrix L_vv '}at u = (q, v)."
+    if system.auxiliaries:
+        name, purpose, legendre = "hamiltonian", "H at u = (q, p).", "H_p and H_pp at u = (q, p)."
+    if forms.one_form:
+        legendre = "Momenta theta and their derivatives by y at u = (q, y)."
     return Quantities(
         legendre=system_kernel(
             system,
@@ -305,11 +310,7 @@ def _quantities(
             forms.regular_legendre,
             u=forms.legendre_arguments,
             partials=forms.legendre_jacobian.values(),
-            purpose="Momenta theta and their derivatives by y at u = (q, y)."
-            if forms.one_form
-            else "H_p and H_pp at u = (q, p)."
-            if system.auxiliaries
-            else f"Momenta L_v {'' if forms.inverse_mass else 'and mass matrix L_vv '}at u = (q, v).",
+            purpose=legendre,
         ),
         inverse_legendre=_inverse_legendre_kernel(system),
         mass_entries=tuple(forms.legendre_jacobian),

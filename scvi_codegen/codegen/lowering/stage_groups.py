@@ -285,15 +285,16 @@ def _integrand(system: MechanicalSystem, group: StageGroup, u: str) -> Kernel | 
         rates = [*(each.rate for each in rates_of_forces), group.scalar]
         purpose = f"Power and impulse rates of the forces, and L, at {u}."
         return system_kernel(system, "exchanges", rates, u=group.arguments, purpose=purpose)
-    k = group.scalar_power
-    rate = f"d{f'^{k}' * (k > 1)}L/dt{f'^{k}' * (k > 1)}"
-    return system_kernel(
-        system,
-        "lagrangian" if group.name == "quadrature" else f"{group.name}_action",
-        (group.scalar,),
-        u=group.arguments,
-        purpose=f"{rate if k else 'p . v - H' if system.auxiliaries else 'L'} at {u}.",
-    )
+    name = "lagrangian" if group.name == "quadrature" else f"{group.name}_action"
+    purpose = f"{_integrand_text(system, group.scalar_power)} at {u}."
+    return system_kernel(system, name, (group.scalar,), u=group.arguments, purpose=purpose)
+
+
+def _integrand_text(system: MechanicalSystem, order: int) -> str:
+    """Return L, or its time derivative of an order, as in formulas."""
+    if order == 0:
+        return "p . v - H" if system.auxiliaries else "L"
+    return "dL/dt" if order == 1 else f"d^{order}L/dt^{order}"
 
 
 def argument_name(system: MechanicalSystem, gather: Gather) -> str:

@@ -213,8 +213,8 @@ class Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no 
             shape = DOT if name.accent.endswith("dot") else {}
             letter = self.element("mover", letter, self.element("mo", ACCENTS[name.accent], **shape), accent="true")
         scripts = [self._indices(part) for part in (name.below, name.above) if part]
-        tag = "msubsup" if len(scripts) == 2 else "msup" if name.above else "msub"
-        return self.element(tag, letter, *scripts) if scripts else letter
+        tags = {(True, True): "msubsup", (False, True): "msup", (True, False): "msub"}
+        return self.element(tags[bool(name.below), bool(name.above)], letter, *scripts) if scripts else letter
 
     def _indices(self, parts: Sequence[str]) -> Element:
         """Return indices with commas between them; ``k+1`` is a sum, ``q1`` has its own index."""

@@ -76,8 +76,7 @@ class ExactMotion:
 
     @cached_property
     def _regular_expressions(self) -> list[sympy.Expr]:
-        gauge = getattr(self.system, "gauge", sympy.S.Zero)
-        return [f + gauge.diff(x) for f, x in zip(self._momentum_expressions, self.second, strict=True)]
+        return [f + self.system.gauge.diff(x) for f, x in zip(self._momentum_expressions, self.second, strict=True)]
 
     @cached_property
     def _curvature(self) -> list[list[sympy.Expr]]:

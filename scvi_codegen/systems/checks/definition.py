@@ -42,7 +42,7 @@ def warn_of_mistakes(system: MechanicalSystem, others: Iterable[Expr] = ()) -> b
     """
     if not system.parameters:
         return False
-    formulas = (*others, system.formula, *system.forces, *system.constraints, system.damping, *system.integrands)
+    formulas = (*others, system.lagrangian, *system.forces, *system.constraints, system.damping, *system.integrands)
     energy = [system.clock.energy] if system.clock else []
     function, variables = (
         ("Hamiltonian", system.auxiliaries) if system.auxiliaries else ("Lagrangian", system.velocities)

@@ -76,7 +76,9 @@ class unit_step(Function):  # type: ignore[misc]  # noqa: N801
         return sympy.Integer(int(bool(x.evalf(50) >= 0))) if x.is_number and x.is_finite and x.is_real else None
 
     def _eval_power(self, exponent: Expr) -> Expr | None:
-        return self if exponent.is_positive else 1 / self if exponent.is_negative and exponent != -1 else None
+        if exponent.is_positive:
+            return self
+        return 1 / self if exponent.is_negative and exponent != -1 else None
 
     def fdiff(self, argindex: int = 1) -> Expr:
         """Return 0."""

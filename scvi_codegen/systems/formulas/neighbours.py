@@ -53,7 +53,7 @@ class Neighbours:
 
     def inside(self, one: str, other: str) -> str:
         """Return the formula that is 1 for points of two indices closer than the cutoff, else 0."""
-        entry = f"{self.array.name}[{{}}{', {}' * (len(self.array.axes) > 1)}]"
+        entry = f"{self.array.name}[{{}}, {{}}]" if len(self.array.axes) > 1 else f"{self.array.name}[{{}}]"
         apart = [f"{entry.format(one, k)} - {entry.format(other, k)}" for k in range(self.components)]
         apart = [f"wrap({x}, {period})" for x, period in zip(apart, self.box, strict=True)] if self.box else apart
         return f"unit_step(({self.cutoff})**2 - ({' + '.join(f'({x})**2' for x in apart)}))"

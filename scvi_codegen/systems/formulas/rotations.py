@@ -67,7 +67,7 @@ class Rotation:
     @property
     def declaration(self) -> str:
         """Kind and names in one line."""
-        return f"rotation {self.name} {self.rate}{' momentum' * self.momentum}"
+        return f"rotation {self.name} {self.rate} momentum" if self.momentum else f"rotation {self.name} {self.rate}"
 
     @property
     def description(self) -> str:

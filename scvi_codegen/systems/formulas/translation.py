@@ -182,7 +182,7 @@ def _sum_text(expression: Expr) -> str:
 
 def _product_text(expression: Expr) -> str:
     coefficient, rest = expression.as_coeff_Mul(rational=True)
-    factors = [] if rest is S.One else rest.as_ordered_factors() if rest.is_Mul else [rest]
+    factors = [factor for factor in rest.as_ordered_factors() if factor is not S.One]
     below = [factor for factor in factors if factor.is_Pow and factor.exp.is_Rational and factor.exp < 0]
     above = [_power_text(factor) for factor in factors if factor not in below]
     divisors = [_power_text(Pow(factor.base, -factor.exp)) for factor in below]

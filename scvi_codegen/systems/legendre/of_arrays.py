@@ -6,6 +6,7 @@ where the velocities v_e of the elements e are disjoint, and b and C depend on p
 magnetic field, pendulums in spherical angles, masses that depend on the position.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -109,10 +110,10 @@ def _each_once(accesses: Sequence[Access], coordinates: Sequence[Array]) -> bool
     for array in coordinates:
         places = [access.places for access in accesses if access.array.name == array.name + DOT]
         numbers = {tuple(str(place) for place in each if not place.index) for each in places}
-        wanted = 1
-        for axis, place in zip(array.axes, places[0] if places else (), strict=False):
-            wanted *= 1 if place.index else axis.number if not axis.name else 0
-        if not places or len(numbers) != len(places) or len(places) != wanted:
+        if not places or len(numbers) != len(places):
+            return False
+        fixed = [axis for axis, place in zip(array.axes, places[0], strict=False) if not place.index]
+        if any(axis.name for axis in fixed) or len(places) != math.prod(axis.number for axis in fixed):
             return False
     return True
 

@@ -69,8 +69,9 @@ def _vectors(
         raise SystemDefinitionError(f"{where} has {named}. Required: point, force; optional: body, origin, frame")
     body, frame = entry.get("body"), entry.get("frame", "space")
     if frame not in FRAMES or (body is None and (frame != "space" or "origin" in entry)):
+        origin = " and an origin" if "origin" in entry else ""
         raise SystemDefinitionError(
-            f"{where} has the frame {frame!r}{' and an origin' * ('origin' in entry)} of the body {body!r}: frames are "
+            f"{where} has the frame {frame!r}{origin} of the body {body!r}: frames are "
             "'space' and 'body'; origin and the frame 'body' require a body"
         )
     if body is not None and body not in rotations:

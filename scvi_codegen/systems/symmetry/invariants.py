@@ -421,8 +421,8 @@ def bodies_of(system: MechanicalSystem) -> tuple[Body, ...]:
 
 def planes_of(rigid: Sequence[Body]) -> list[tuple[int, int]]:
     """Return pairs of axes of right-handed rotations: about x, y, z, or the one of the plane."""
-    size = len(rigid[0].columns) if rigid else 0
-    return [(1, 2), (2, 0), (0, 1)] if size == 3 else [(0, 1)] if size == 2 else []
+    planes = {2: [(0, 1)], 3: [(1, 2), (2, 0), (0, 1)]}
+    return planes.get(len(rigid[0].columns), []) if rigid else []
 
 
 def turn(m: int, rigid: Sequence[Body], plane: tuple[int, int]) -> dict[Monomial, int]:
@@ -534,7 +534,8 @@ def _turning_name(system: MechanicalSystem, turning: Terms) -> tuple[str, int]:
     q = [coordinate.name for coordinate in system.coordinates]
     touched = sorted({i % m for a in turning for i in a.factors})
     scaled = [a.factors[0] == a.factors[1] - m for a in turning]
-    kind = "scaling" if all(scaled) else "linear symmetry" if any(scaled) else "angular momentum"
+    kind = "linear symmetry" if any(scaled) else "angular momentum"
+    kind = "scaling" if all(scaled) else kind
     return f"{kind} of {', '.join(_shown([q[i] for i in touched]))}", 1
 
 

@@ -230,7 +230,9 @@ class Tree:
             SystemDefinitionError: if a joint does not exist.
         """
         singles = [each.name for each in self.joints.values() if each.kind in SINGLE and not each.follows]
-        driven = (singles if actuated else []) if isinstance(actuated, bool) else [*map(identifier, actuated)]
+        if isinstance(actuated, bool):
+            actuated = singles if actuated else []
+        driven = [*map(identifier, actuated)]
         for name in driven:
             if name not in singles:
                 raise SystemDefinitionError(f"there is no hinge or slide '{name}' to act on{closest(name, singles)}")
