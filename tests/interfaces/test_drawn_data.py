@@ -11,6 +11,8 @@ from matplotlib import pyplot
 import scvi_codegen as sc
 from scvi_codegen.interfaces.pictures.arrays import plot_arrays
 from scvi_codegen.interfaces.pictures.conserved import ResidualPlot, plot_momentum_maps
+from scvi_codegen.runs.states.words import named
+from scvi_codegen.runs.stepping.step_plan import Fixed
 
 T = np.linspace(0.0, 2.0, 41)
 
@@ -21,6 +23,16 @@ def _closed() -> Iterator[None]:
     pyplot.close("all")
 
 
+class Sines(sc.Trajectory):
+    """Trajectory without a compiled integrator, with an energy 2 - 1e-9 t and two momentum maps."""
+
+    def energy(self) -> Any:
+        return 2.0 - 1e-9 * T
+
+    def momentum_errors(self) -> Any:
+        return 1e-9 * np.stack([-T, T**2], 1)
+
+
 def motion(names: str, links: tuple[Any, ...] = ()) -> Any:
     """Return a trajectory whose coordinates are sines of t, and whose momenta are sines of 2 t."""
     interface = SimpleNamespace(system="S", title="S by M", map_names=("a", "b"), changes_energy="", rotations=())
@@ -28,10 +40,8 @@ def motion(names: str, links: tuple[Any, ...] = ()) -> Any:
     interface.arrays = interface.lengths = interface.parameters = ()
     interface.layout = SimpleNamespace(links=links, mesh=None, coordinates=())
     q, p = (np.sin(T[:, np.newaxis] * rate + 1.7 * np.arange(len(names.split()))) for rate in (1.0, 2.0))
-    stepper = SimpleNamespace(interface=interface)
-    made = SimpleNamespace(t=T, q=q, p=p, stepper=stepper, observed=None, parameters=())
-    made.energy, made.momentum_errors = (lambda: 2.0 - 1e-9 * T), (lambda: 1e-9 * np.stack([-T, T**2], 1))
-    return made
+    sizes: Any = {"step_sizes": np.full(41, 0.05), "h": 0.05, "plan": Fixed(0.05), "iterations": np.zeros(41, np.int32)}
+    return Sines(t=T, q=q, p=p, stepper=SimpleNamespace(interface=interface), parameters=np.zeros(0), **sizes)
 
 
 PANELS: dict[str, tuple[str, list[str]]] = {
@@ -75,7 +85,7 @@ def test_other_drawings_have_the_values_of_their_arrays() -> None:
     assert (panel.get_xlabel(), panel.get_ylabel(), panel.get_title()) == ("t", "coordinate", "q over time")
     for shape, labels in (((5,), ("index", "t", "")), ((3, 4), ("first index", "second index", "t = 2"))):
         values = np.arange(41.0 * np.prod(shape)).reshape(41, *shape)
-        run.q, run.stepper.arrays = SimpleNamespace(shapes=()), lambda _, values=values: {"u": values}
+        run.q, run.stepper.arrays = named(run.q, ()), lambda _, values=values: {"u": values}
         drawn = plot_arrays(run)
         assert (drawn.get_xlabel(), drawn.get_ylabel(), drawn.get_title()) == labels
         assert np.array_equal(drawn.collections[0].get_array(), values if len(shape) == 1 else values[-1].T)

@@ -21,7 +21,6 @@ from scvi_codegen.common.validation import REAL, checks_arguments
 from scvi_codegen.interfaces.pictures.canvas import (
     MOTIONS,
     Array,
-    DrawnMotion,
     Motions,
     at_times,
     check_plot_path,
@@ -33,13 +32,14 @@ from scvi_codegen.interfaces.pictures.canvas import (
 from scvi_codegen.interfaces.pictures.recognition import shape_of
 from scvi_codegen.interfaces.pictures.shape import DrawnSystem, MovingShape, shape_of_picture
 from scvi_codegen.runs.stepping.step_plan import FixedSteps
+from scvi_codegen.runs.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.animation import FuncAnimation
     from matplotlib.axes import Axes
 
 
-def drawn_system_of(motion: DrawnMotion) -> DrawnSystem:
+def drawn_system_of(motion: Trajectory) -> DrawnSystem:
     """Return what the recognition of a shape reads of a trajectory."""
     stepper: Any = motion.stepper
     q: Any = motion.q
@@ -68,7 +68,7 @@ class _Positions(MovingShape):
 
 
 def drawn_shape(
-    motion: DrawnMotion, positions: Callable[[Array], Array] | None = None, picture: Mapping[str, Any] | None = None
+    motion: Trajectory, positions: Callable[[Array], Array] | None = None, picture: Mapping[str, Any] | None = None
 ) -> MovingShape:
     """Return the shape of a trajectory: that of a function or a picture if one is given, else recognised.
 
@@ -87,7 +87,7 @@ def drawn_shape(
     return _Positions(function=positions, dimension=tried[2], points=[[0]] * tried[1], marks=marks, trails=numbers)
 
 
-def positions_of(shape: MovingShape, motion: DrawnMotion) -> Array:
+def positions_of(shape: MovingShape, motion: Trajectory) -> Array:
     """Return the points (n, k, d) of a shape in the states of a trajectory."""
     return shape.positions(motion.t, np.asarray(motion.q), np.asarray(motion.p), motion.parameters)
 
@@ -171,13 +171,12 @@ class Film:
     __repr__ = summary("seconds", "trajectory")
 
     @cached_property
-    def shown(self) -> tuple[DrawnMotion, ...]:
+    def shown(self) -> tuple[Trajectory, ...]:
         """Trajectories with the states that are drawn: all, or those of dense output at common times."""
         motions = several(self.trajectory)
         longest = max(motions, key=lambda each: abs(float(each.t[-1] - each.t[0])))
         common = all(len(each.t) == len(longest.t) and (each.t == longest.t).all() for each in motions)
-        plans = [getattr(each, "plan", None) for each in motions]
-        if common and all(plan is None or isinstance(plan, FixedSteps) for plan in plans):
+        if common and all(isinstance(each.plan, FixedSteps) for each in motions):
             return tuple(motions)
         count = max(1, round(self.seconds * FRAMES_PER_SECOND) - 1) * STATES_PER_FRAME + 1
         times = np.linspace(longest.t[0], longest.t[-1], count)
@@ -298,7 +297,7 @@ class _Scene:
     """Axes with marks and trails, which show one state of each trajectory at a time."""
 
     def __init__(
-        self, figure: Any, motions: Sequence[DrawnMotion], shapes: Sequence[MovingShape], report: Callable[[], None]
+        self, figure: Any, motions: Sequence[Trajectory], shapes: Sequence[MovingShape], report: Callable[[], None]
     ) -> None:
         self.motion, self.report, shape = motions[0], report, shapes[0]
         parts = [positions_of(each, motion) for each, motion in zip(shapes, motions, strict=True)]

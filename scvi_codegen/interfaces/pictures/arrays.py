@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from scvi_codegen.common.errors import StateError, closest
 from scvi_codegen.common.validation import CANVAS, ArgumentType, checks_arguments
 from scvi_codegen.interfaces.pictures.canvas import color, panel, plain
+from scvi_codegen.runs.states.words import NamedState
+from scvi_codegen.runs.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -19,16 +21,18 @@ IN_SPACE = (2, 3)
 """Lengths of the last axis of arrays of positions in space."""
 
 
-ARRAYS = ArgumentType("a trajectory of arrays", lambda value: hasattr(getattr(value, "q", None), "shapes"))
+ARRAYS = ArgumentType(
+    "a trajectory of arrays", lambda value: isinstance(value, Trajectory) and isinstance(value.q, NamedState)
+)
 
 
-def mesh_of(motion: Any) -> Any:
+def mesh_of(motion: Trajectory) -> Any:
     """Return the mesh of the fields of a trajectory, or ``None`` if they are not discretised from a density."""
     layout = motion.stepper.interface.layout
     return None if layout is None else layout.mesh
 
 
-def array_values(motion: Any, name: str | None) -> tuple[str, NDArray[np.float64]]:
+def array_values(motion: Trajectory, name: str | None) -> tuple[str, NDArray[np.float64]]:
     """Return name and values (n, ..) of an array or of a field on a mesh, by default the first.
 
     Raises:
@@ -44,7 +48,7 @@ def array_values(motion: Any, name: str | None) -> tuple[str, NDArray[np.float64
 
 @checks_arguments(trajectory=ARRAYS, ax=CANVAS)
 def plot_arrays(
-    trajectory: Any,
+    trajectory: Trajectory,
     path: str | os.PathLike[str] | None = None,
     *,
     array: str | None = None,
@@ -112,7 +116,11 @@ def _draw_positions(drawn: Axes, values: NDArray[np.float64], name: str) -> None
 
 @checks_arguments(trajectory=ARRAYS, ax=CANVAS)
 def plot_spectrum(
-    trajectory: Any, path: str | os.PathLike[str] | None = None, *, field: str | None = None, ax: Axes | None = None
+    trajectory: Trajectory,
+    path: str | os.PathLike[str] | None = None,
+    *,
+    field: str | None = None,
+    ax: Axes | None = None,
 ) -> Axes:
     """Draw the spectrum of a field on a mesh in the first and last state: squared amplitudes of the modes of each axis.
 

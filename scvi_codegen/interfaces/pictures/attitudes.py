@@ -9,17 +9,8 @@ import numpy as np
 
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.common.validation import CANVAS, WHOLE, checks_arguments
-from scvi_codegen.interfaces.pictures.canvas import (
-    MOTIONS,
-    Array,
-    DrawnMotion,
-    Motions,
-    color,
-    panel,
-    plain,
-    several,
-    smooth,
-)
+from scvi_codegen.interfaces.pictures.canvas import MOTIONS, Array, Motions, color, panel, plain, several, smooth
+from scvi_codegen.runs.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,7 +18,7 @@ if TYPE_CHECKING:
 CIRCLE = np.linspace(0.0, 2 * np.pi, 73)
 
 
-def unit_vectors(motion: DrawnMotion, axis: int = 3) -> dict[str, Array]:
+def unit_vectors(motion: Trajectory, axis: int = 3) -> dict[str, Array]:
     """Return (n, 3) unit vectors in space by label: a body axis of each rotation, each direction and spin."""
     result: dict[str, Array] = {}
     for kind, name, *_ in map(str.split, motion.stepper.interface.rotations):
@@ -85,7 +76,7 @@ def plot_attitude(
     return drawn
 
 
-def draw_unit_vectors(axes: Axes, motion: DrawnMotion, plane: tuple[int, int], which: int | None = None) -> None:
+def draw_unit_vectors(axes: Axes, motion: Trajectory, plane: tuple[int, int], which: int | None = None) -> None:
     """Draw the projections of body axes, directions and spins to a plane of space, in the unit circle."""
     axes.plot(np.cos(CIRCLE), np.sin(CIRCLE), color="0.7", linewidth=0.6)
     for number, (label, curve) in enumerate(unit_vectors(motion).items()):

@@ -1,7 +1,4 @@
-"""Figures, axes and files of plots, in one style, and the interface of trajectories that can be plotted.
-
-Trajectories are :class:`scvi_codegen.Trajectory` and runs read from files.
-"""
+"""Figures, axes and files of plots, in one style, and the trajectories that can be plotted."""
 
 from __future__ import annotations
 
@@ -11,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar
+from typing import IO, TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +16,9 @@ from numpy.typing import NDArray
 from scvi_codegen.common.atomic import write_atomically
 from scvi_codegen.common.errors import PlotError, StateError, StepFailedError
 from scvi_codegen.common.validation import ArgumentType
+from scvi_codegen.runs.recording import RecordedRun
 from scvi_codegen.runs.stepping.step_plan import FixedSteps
+from scvi_codegen.runs.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -129,85 +128,31 @@ def plain(text: str) -> str:
     return text.replace("$", r"\$")
 
 
-Drawn = TypeVar("Drawn")
-
 Array: TypeAlias = NDArray[np.float64]
-
-
-class EnergyHistory(Protocol):
-    """Times and energies: of a :class:`DrawnMotion` or an array system."""
-
-    @property
-    def t(self) -> Array: ...  # noqa: D102
-    def energy(self) -> Array: ...  # noqa: D102
-
-
-class Mover(Protocol):
-    """Stepper of a trajectory, as far as plots need it."""
-
-    @property
-    def interface(self) -> Interface:
-        """Names of coordinates, parameters and momentum maps."""
-
-    @property
-    def events(self) -> Sequence[Any]:
-        """Event functions whose zero crossings were located."""
-
-    def energy(self, q: Array, p: Array, t: Any, parameters: Any) -> Any:
-        """Return (n,) energies of (n, m) states."""
-
-
-class DrawnMotion(Protocol):
-    """States of a trajectory: t (n,), q (n, m), p (n, m), with step size h and parameters."""
-
-    @property
-    def t(self) -> Array: ...  # noqa: D102
-    @property
-    def q(self) -> Array: ...  # noqa: D102
-    @property
-    def p(self) -> Array: ...  # noqa: D102
-    @property
-    def h(self) -> float: ...  # noqa: D102
-    @property
-    def parameters(self) -> Array: ...  # noqa: D102
-    @property
-    def events(self) -> Sequence[Any]: ...  # noqa: D102
-    @property
-    def stepper(self) -> Mover: ...  # noqa: D102
-    def energy(self) -> Array: ...  # noqa: D102
-    def momentum_errors(self) -> Array: ...  # noqa: D102
-    def rotation(self, name: str) -> Array: ...  # noqa: D102
-    def direction(self, name: str) -> Array: ...  # noqa: D102
-    def spin(self, name: str) -> Array: ...  # noqa: D102
-
-
-Motions: TypeAlias = DrawnMotion | Sequence[DrawnMotion]
+Motions: TypeAlias = Trajectory | RecordedRun | Sequence[Trajectory | RecordedRun]
 """One trajectory, or several of the same system."""
 
-MOTION = ArgumentType("a trajectory", lambda value: hasattr(value, "stepper") and hasattr(value, "q"))
+
+def _is_motion(value: Any) -> bool:
+    return isinstance(value, Trajectory | RecordedRun)
 
 
-def _one_or_several(kind: ArgumentType) -> ArgumentType:
-    return ArgumentType(
-        f"{kind.words} or a list of them",
-        lambda value: kind.accepts(value) or (isinstance(value, Sequence) and all(map(kind.accepts, value))),
-    )
+MOTIONS = ArgumentType(
+    "a trajectory or a list of them",
+    lambda value: _is_motion(value) or (isinstance(value, Sequence) and all(map(_is_motion, value))),
+)
 
 
-MOTIONS = _one_or_several(MOTION)
-HISTORIES = _one_or_several(ArgumentType(MOTION.words, lambda value: hasattr(value, "t") and hasattr(value, "energy")))
-
-
-def several(motions: Drawn | Sequence[Drawn]) -> Sequence[Drawn]:
-    """Return one or several trajectories as a sequence.
+def several(motions: Motions) -> list[Trajectory]:
+    """Return one or several trajectories as a list, those recorded in folders with all their states in memory.
 
     Raises:
         StateError: if there is none.
     """
-    result = motions if isinstance(motions, Sequence) else [motions]
-    if not result:
+    members = motions if isinstance(motions, Sequence) else [motions]
+    if not members:
         raise StateError("there is no trajectory to draw")
-    return result
+    return [each[:] if isinstance(each, RecordedRun) else each for each in members]
 
 
 SMOOTH = 2000
@@ -216,29 +161,31 @@ MOST_NUMBERS = 4_000_000
 """Largest number of coordinates of all points of such a curve."""
 
 
-def smooth(motion: Any) -> Any:
+def smooth(motion: Trajectory) -> Trajectory:
     """Return a trajectory of adaptive steps with states between its saved ones, by dense output; others as they are."""
-    plan, n = getattr(motion, "plan", None), len(motion.t)
-    if plan is None or (isinstance(plan, FixedSteps) and motion.tau is None) or motion.observed is not None or n < 2:
+    n, equidistant = len(motion.t), isinstance(motion.plan, FixedSteps) and motion.tau is None
+    if equidistant or motion.observed is not None or n < 2:
         return motion
     parts = min(64, SMOOTH // (n - 1), MOST_NUMBERS // motion.q.size)
-    return (
-        motion
-        if parts < 2
-        else at_times(motion, np.interp(np.arange(n * parts - parts + 1) / parts, range(n), motion.t))
-    )
+    if parts < 2:
+        return motion
+    return at_times(motion, np.interp(np.arange(n * parts - parts + 1) / parts, range(n), motion.t))
 
 
-def at_times(motion: Any, times: Array) -> Any:
+def at_times(motion: Trajectory, times: Array) -> Trajectory:
     """Return a trajectory with the states at times, by dense output, else the saved states before them."""
     inside = np.clip(times, *sorted((motion.t[0], motion.t[-1])))
     try:
         q, p = motion.at(inside)
-    except (AttributeError, StateError, StepFailedError):  # a recording, or states within steps
+    except (StateError, StepFailedError):  # a recording, or states within steps
         ahead = np.sign(motion.t[-1] - motion.t[0])
         rows = np.searchsorted(ahead * motion.t, ahead * inside, side="right") - 1
         q, p = (motion.stepper.named(np.asarray(each)[rows]) for each in (motion.q, motion.p))
-    unknown = {"iterations": np.zeros(len(q), np.int32), "step_sizes": np.full(len(q), np.nan), "tau": None}
+    unknown: dict[str, Any] = {
+        "iterations": np.zeros(len(q), np.int32),
+        "step_sizes": np.full(len(q), np.nan),
+        "tau": None,
+    }
     return replace(motion, t=times, q=q, p=p, **unknown, pieces=(), observed=None, conserved=None)
 
 

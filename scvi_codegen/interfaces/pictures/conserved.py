@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -11,18 +10,9 @@ import numpy as np
 
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.common.validation import CANVAS, checks_arguments
-from scvi_codegen.interfaces.pictures.canvas import (
-    HISTORIES,
-    MOTIONS,
-    Array,
-    EnergyHistory,
-    Motions,
-    color,
-    panel,
-    plain,
-    several,
-)
+from scvi_codegen.interfaces.pictures.canvas import MOTIONS, Array, Motions, color, panel, plain, several
 from scvi_codegen.runs.results.energy import energy_account
+from scvi_codegen.runs.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -62,13 +52,8 @@ LOWEST = 1e-16
 """Error drawn on a logarithmic axis if all are 0."""
 
 
-@checks_arguments(trajectories=HISTORIES, ax=CANVAS)
-def plot_energy(
-    trajectories: EnergyHistory | Sequence[EnergyHistory],
-    path: str | os.PathLike[str] | None = None,
-    *,
-    ax: Axes | None = None,
-) -> Axes:
+@checks_arguments(trajectories=MOTIONS, ax=CANVAS)
+def plot_energy(trajectories: Motions, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None) -> Axes:
     """Draw the energy error ``|H - H_0| / |H_0|`` over time (absolute if H_0 = 0), a colour a trajectory.
 
     Where forces, damping or impacts change the energy it is that of the balance E - E0 - W, if W is known; otherwise
@@ -117,7 +102,7 @@ def plot_momentum_maps(
     return drawn
 
 
-def draw_energy_error(axes: Axes, motion: EnergyHistory) -> None:
+def draw_energy_error(axes: Axes, motion: Trajectory) -> None:
     """Draw the energy error, balance or change of one trajectory, with the title."""
     account = energy_account(motion, limited=True)
     _draw_error(axes, motion.t, np.abs(account.values) / account.scale, 0)

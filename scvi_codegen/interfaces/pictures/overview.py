@@ -26,7 +26,6 @@ from scvi_codegen.interfaces.pictures.canvas import (
     COLORS,
     MOTIONS,
     Array,
-    DrawnMotion,
     Motions,
     check_plot_path,
     color,
@@ -40,6 +39,7 @@ from scvi_codegen.interfaces.pictures.canvas import (
     style,
 )
 from scvi_codegen.interfaces.pictures.conserved import plot_energy, plot_momentum_maps
+from scvi_codegen.runs.trajectory import Trajectory
 from scvi_codegen.systems.symmetry.sampling import AXES, bodies
 
 if TYPE_CHECKING:
@@ -49,12 +49,12 @@ POSES = 6
 """Number of poses in a plot."""
 
 
-def links_of(motion: DrawnMotion) -> Any:
+def links_of(motion: Trajectory) -> Any:
     """Return the links of the robot that moves, with parents before children; none if it is not read from a file."""
     return motion.stepper.interface.layout.links
 
 
-def draw_robot(axes: Any, motion: DrawnMotion, number: int = 0) -> None:
+def draw_robot(axes: Any, motion: Trajectory, number: int = 0) -> None:
     """Draw the links at equidistant times, the last pose in full colour, and the paths of the tips."""
     shape = drawn_shape(motion)
     seen = positions_of(shape, motion)[..., slice(None) if axes.name == "3d" else [0, 2]]
@@ -149,7 +149,7 @@ def plot_section(
     return drawn
 
 
-def _axes_of_section(motion: DrawnMotion, event: int) -> tuple[str, str]:
+def _axes_of_section(motion: Trajectory, event: int) -> tuple[str, str]:
     """Return the first coordinate that an event does not contain, and its momentum."""
     interface, events = motion.stepper.interface, motion.stepper.events
     function = str(events[event].function) if -len(events) <= event < len(events) else ""
@@ -158,7 +158,7 @@ def _axes_of_section(motion: DrawnMotion, event: int) -> tuple[str, str]:
     return (free or [(interface.coordinates[0], interface.momenta[0])])[0]
 
 
-def _at_crossings(motion: DrawnMotion, name: str, event: int) -> Array:
+def _at_crossings(motion: Trajectory, name: str, event: int) -> Array:
     """Return (k,) values of a coordinate or momentum at the crossings of an event."""
     if not -len(motion.events) <= event < len(motion.events):
         raise StateError(
@@ -274,11 +274,11 @@ def plot_phase(
     return drawn
 
 
-def _projection(motion: DrawnMotion) -> str | None:
+def _projection(motion: Trajectory) -> str | None:
     return "3d" if links_of(motion) else None
 
 
-def path_panels(motion: DrawnMotion) -> int:
+def path_panels(motion: Trajectory) -> int:
     """Return the number of panels of a path: two for rotations, motion in space and three to six coordinates."""
     coordinates = motion.stepper.interface.coordinates
     if links_of(motion):
@@ -290,7 +290,7 @@ def path_panels(motion: DrawnMotion) -> int:
     return 2 if spatial or (not result and 3 <= len(coordinates) <= MAX_CURVES) else 1
 
 
-def draw_paths(panels: Sequence[Axes], motions: Sequence[DrawnMotion]) -> None:
+def draw_paths(panels: Sequence[Axes], motions: Sequence[Trajectory]) -> None:
     """Draw the paths into the panels.
 
     One coordinate is drawn in the phase plane, bodies by their orbits, robots by their links, rotations by body axes, a
@@ -301,7 +301,7 @@ def draw_paths(panels: Sequence[Axes], motions: Sequence[DrawnMotion]) -> None:
             _draw_path(panels, smooth(motion), number if len(motions) > 1 else None)
 
 
-def _draw_path(panels: Sequence[Axes], motion: DrawnMotion, which: int | None) -> None:
+def _draw_path(panels: Sequence[Axes], motion: Trajectory, which: int | None) -> None:
     """Draw one path, in one colour if it is one of several (``which``)."""
     coordinates = motion.stepper.interface.coordinates
     result, m, first = bodies(coordinates), len(coordinates), which or 0
@@ -328,7 +328,7 @@ def _draw_path(panels: Sequence[Axes], motion: DrawnMotion, which: int | None) -
         _draw_image(panels[0], motion)
 
 
-def _draw_plane(axes: Axes, motion: DrawnMotion, plane: tuple[int, int], number: int) -> None:
+def _draw_plane(axes: Axes, motion: Trajectory, plane: tuple[int, int], number: int) -> None:
     x, y = (motion.q[:, index] for index in plane)
     _draw_curve(axes, x, y, color(number))
     names = [motion.stepper.interface.coordinates[index] for index in plane]
@@ -354,7 +354,7 @@ def _extent(values: Array) -> float:
     return float(np.ptp(values)) if len(values) else 0.0
 
 
-def _draw_image(axes: Axes, motion: DrawnMotion) -> None:
+def _draw_image(axes: Axes, motion: Trajectory) -> None:
     """Draw many coordinates as an image: one row each, colour for the value."""
     every = max(1, len(motion.t) // 2000)
     t, values = motion.t[::every], motion.q[::every].T
