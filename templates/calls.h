@@ -1,6 +1,6 @@
 /* Runs whose arguments and results are one struct. Requires: NAME, STATUS, calls_declarations.h; HAS_ADVANCE_TO,
- * HAS_ACTIONS, HAS_MEASURES_GROWTH, HAS_STEP_ERROR, HAS_REJECTED, HAS_H_LOW and HAS_SET_FALLBACK where the source has these. Functions
- * are called by volatile pointers: not inlined, so that the bits of steps do not depend on these callers. */
+ * HAS_PROJECT, HAS_SET_FALLBACK, and HAS_ and the optional fields of a run where the source has these. Functions are
+ * called by volatile pointers: not inlined, so that the bits of steps do not depend on these callers. */
 
 static int NAME(call_store)(const NAME(call) *c, long long row, long long steps, long long every)
 {
@@ -37,10 +37,8 @@ int NAME(call_integrate)(NAME(call) *c, long long steps, long long every)
   int status = NAME(call_store)(c, 1, steps, every);
   c->steps = c->report->steps;
   c->stored = c->steps / every;
-#ifdef HAS_STEP_ERROR
   c->error = NAME(step_error)(c->run);
   c->error_t = c->run->error_t;
-#endif
 #ifdef HAS_ADVANCE_TO
   c->stored = c->control ? c->report->stored : c->stored;
 #endif
@@ -170,7 +168,7 @@ long long NAME(call_each)(NAME(each) *c, long long steps)
   return taken;
 }
 
-#if defined(HAS_MOMENTUM) && !defined(DOUBLE_DOUBLE)
+#ifndef HAS_H_LOW
 /* Momenta of states with velocities v and parameters of their own; returns the number of states before a failure. */
 long long NAME(call_momenta)(long long count, double t, long long m, long long parameters_each, const double *q,
     const double *v, const double *parameters, double *p, double *workspace)
@@ -182,7 +180,7 @@ long long NAME(call_momenta)(long long count, double t, long long m, long long p
 }
 #endif
 
-#if defined(HAS_PROJECT) && !defined(DOUBLE_DOUBLE)
+#if defined(HAS_PROJECT) && !defined(HAS_H_LOW)
 /* Projections (q1, p1) of states with parameters of their own, and their distances, NaN after a failure. */
 void NAME(call_project)(long long count, double t, long long m, long long parameters_each, const double *q,
     const double *p, const double *parameters, double *q1, double *p1, double *apart, double *workspace)

@@ -754,7 +754,7 @@ class StepperOfRunTimeSizes(Stepper):
     @property
     def _has_error_estimate(self) -> bool:
         """True if the method has adaptive steps; also if that follows from the sizes."""
-        return bool(self._reason) or "_advance_to(" in self.source.header
+        return bool(self._reason) or "advance_to" in self.source.contents.functions
 
 
 Stepper._of_run_time_sizes = StepperOfRunTimeSizes

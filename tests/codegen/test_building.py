@@ -15,7 +15,7 @@ import pytest
 from programs import needs
 
 from scvi_codegen.codegen.native import building, compilers
-from scvi_codegen.codegen.rendering.source import TEXTS, Source
+from scvi_codegen.codegen.rendering.source import TEXTS, Contents, Source
 from scvi_codegen.common.errors import BuildError, ScviCodegenError
 
 FAST = ("-O0",)
@@ -193,9 +193,10 @@ def test_cache_key_contains_every_part_of_the_source():
         replace(whole, support=(("support/a.h", "/* b */"),)),
         replace(whole, support=(("support/b.h", "/* a */"),)),
         replace(whole, beside=None),
+        replace(whole, contents=Contents(divided=True)),
         replace(whole, beside=source("double tiny_answer(void)\n{\n  return 43.0;\n}\n")),
     ]
-    assert {field.name for field in fields(Source)} == {"prefix", *TEXTS, "support", "beside"}
+    assert {field.name for field in fields(Source)} == {"prefix", *TEXTS, "support", "beside", "contents"}
     names = [building.fingerprint(each, flags=FAST) for each in (whole, *changed)]
     assert len(set(names)) == len(names)
 

@@ -299,8 +299,17 @@ def test_damaged_interfaces_of_packages_are_rejected(text: str, part: int, tmp_p
             path.write_text(json.dumps(record | {"interface": interface | {key: new}}))
             count += refused(lambda: _use(folder)) is not None
     assert count > 60
-    declarations = [line for k, line in enumerate(record["declarations"]) if k != len(record["declarations"]) // 2]
-    for other in ('{"format": ' + "[" * 99999, json.dumps(record | {"declarations": declarations})):
+    source = record["source"]
+    declarations = [line for k, line in enumerate(source["declarations"]) if k != len(source["declarations"]) // 2]
+    contents = source["contents"]
+    damaged_sources = (
+        {"declarations": declarations},
+        {"support": ["../../secret.h"]},
+        {"contents": contents | {"workspace": contents["workspace"] - 1}},
+        {"contents": contents | {"coordinates": -1}},
+    )
+    damaged_records = [json.dumps(record | {"source": source | each}) for each in damaged_sources]
+    for other in ('{"format": ' + "[" * 99999, *damaged_records):
         path.write_text(other)
         assert isinstance(refused(lambda: sc.load_package(folder)), sc.PackageError)
 

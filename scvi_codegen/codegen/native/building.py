@@ -239,7 +239,7 @@ def _work(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...]) -> 
 def _compile(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], folder: Path) -> dict[str, Any]:
     """Compile the parts concurrently, one process each; link them, write the binding and return the manifest."""
     source.write(folder)
-    is_divided = any("#define DIVIDED_KERNELS" in each.code for each in source.sources)
+    is_divided = any(each.contents.divided for each in source.sources)
     cut = DIVIDED_FLAGS if is_divided and _takes_flags(compiler, DIVIDED_FLAGS) else ()
     threads = THREADS if any(THREADS_HEADER in each.files for each in source.sources) else ()
     wanted = [*threads, *words_of(FLAGS_VARIABLE)]

@@ -15,24 +15,19 @@ from scvi_codegen.common.cache import template_folder
 
 RESULTS, FIRST_RESULT = Struct("=4d4q"), "error"
 """Format of the last fields of the struct (``calls_declarations.h``), and the first of them."""
-OPTIONAL = (
-    *("actions", "advance_to", "measures_growth", "step_error", "rejected", "set_fallback", "fallback_steps"),
-    *("momentum", "project", "h_low"),
-)
-"""Names that not all sources declare, HAS_.. in ``calls.h``."""
+OPTIONAL_FUNCTIONS = frozenset(("advance_to", "set_fallback", "project"))
+"""Functions that not all integrators have, HAS_.. in ``calls.h`` like the optional fields of a run."""
 
 
 def with_calls(source: Source) -> Source:
     """Return a source of runs with the functions of calls; others unchanged."""
-    prefix = source.prefix
-    names = {*re.findall(r"\w+", re.sub(r"/\*.*?\*/", "", source.declarations, flags=re.DOTALL))}
-    if f"{prefix}_advance" not in names:
+    if "advance" not in source.contents.functions:
         return source
     declarations, functions = (
-        re.sub(r"NAME\((\w+)\)", rf"{prefix}_\1", _text(name)) for name in ("calls_declarations", "calls")
+        re.sub(r"NAME\((\w+)\)", rf"{source.prefix}_\1", _text(name)) for name in ("calls_declarations", "calls")
     )
-    present = [name for name in OPTIONAL if {name, f"{prefix}_{name}"} & names]
-    switches = "".join(f"#define HAS_{name.upper()}\n" for name in present)
+    present = [name for name in source.contents.functions if name in OPTIONAL_FUNCTIONS]
+    switches = "".join(f"#define HAS_{name.upper()}\n" for name in (*present, *source.contents.run_fields))
     return replace(
         source,
         code=f"{source.code}\n{switches}{declarations}\n{functions}",

@@ -44,13 +44,6 @@ def kernel_text(source: Source) -> str:
     return SYSTEM_INCLUDE.sub("", text)
 
 
-def constant(source: Source, name: str) -> int:
-    """Return an enumeration constant of an ensemble source."""
-    match = re.search(rf"\b{name} = (\d+)\b", source.declarations + source.code)
-    assert match is not None  # written by the templates
-    return int(match[1])
-
-
 def compiled_kernel(text: str, architecture: str, **options: Any) -> bytes:
     """Return the binary (cubin) for an architecture such as ``"sm_90"``, from the cache or compiled now.
 

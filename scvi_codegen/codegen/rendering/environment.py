@@ -11,13 +11,7 @@ from scvi_codegen.codegen.ir.kernel import Kernel, Number
 from scvi_codegen.codegen.rendering.kernels.double_double import pair_kernel_text
 from scvi_codegen.codegen.rendering.kernels.functions import kernel_text, lane_kernel_text, lane_mass_text, power_of_h
 from scvi_codegen.codegen.rendering.kernels.printer import print_number
-from scvi_codegen.codegen.rendering.text import (
-    table,
-    wrapped,
-    wrapped_comment,
-    wrapped_comment_lines,
-    wrapped_prototypes,
-)
+from scvi_codegen.codegen.rendering.text import table, wrapped, wrapped_comment, wrapped_comment_lines
 from scvi_codegen.common.cache import template_folder
 
 Rows: TypeAlias = Sequence[Sequence[Number]]
@@ -91,7 +85,6 @@ FILTERS: dict[str, Callable[..., object]] = {
     "wrapped": wrapped,
     "wrapped_comment": wrapped_comment,
     "wrapped_comment_lines": wrapped_comment_lines,
-    "wrapped_prototypes": wrapped_prototypes,
 }
 
 

@@ -88,7 +88,8 @@ def with_events(source: Source, interface: Interface, events: tuple[SearchedEven
         ExpressionError: for text outside the grammar, with its column.
         EventError: naming the invalid symbol or function, or what events that change the state do not support.
     """
-    return replace(source, beside=render_events(_search(interface, events, source.header)))
+    controlled = "advance_to" in source.contents.functions
+    return replace(source, beside=render_events(_search(interface, events, controlled=controlled)))
 
 
 class EventFormulas:
@@ -284,8 +285,8 @@ def _translated(function: Expr, role: str) -> Expr:
         raise EventError(f"in the {role}: {error}") from error
 
 
-def _search(interface: Interface, events: tuple[SearchedEvent, ...], header: str) -> EventSearch:
-    """Return the search: Chebyshev points of the second kind, inverse Vandermonde matrix; ``header`` of the steps."""
+def _search(interface: Interface, events: tuple[SearchedEvent, ...], *, controlled: bool) -> EventSearch:
+    """Return the search: Chebyshev points of the second kind, inverse Vandermonde matrix."""
     points = chebyshev_lobatto(DEGREE).points
     inverse = mp.matrix([[x**k for k in range(DEGREE + 1)] for x in points]) ** -1
     coefficients = tuple(tuple(inverse[k, j] for j in range(DEGREE + 1)) for k in range(DEGREE + 1))
@@ -300,7 +301,7 @@ def _search(interface: Interface, events: tuple[SearchedEvent, ...], header: str
         guarded=tuple(number for number, event in enumerate(events) for _ in event.conditions),
         impacts=tuple(int(event.restitution is not None) for event in events),
         conditional=tuple(int(bool(event.conditions)) for event in events),
-        controlled="_advance_to(" in header,
+        controlled=controlled,
     )
     if interface.layout.coordinates:
         arrays, changed = array_events(interface, events), (0,) * any(event.changes_state for event in events)

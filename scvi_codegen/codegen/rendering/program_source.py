@@ -10,7 +10,7 @@ The support headers contain all of it: ``flow.h`` the function, ``xla_flow.h`` a
 frameworks.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, chain
 from typing import Any, Literal, TypeAlias, cast, get_args
@@ -20,6 +20,7 @@ from scvi_codegen.codegen.ir.equations import Control, FixedPointIteration, Iter
 from scvi_codegen.codegen.ir.kernel import Kernel, Number, is_divided
 from scvi_codegen.codegen.ir.program import Program
 from scvi_codegen.codegen.rendering.environment import support_text, template_environment
+from scvi_codegen.codegen.rendering.header import HeaderRecord
 from scvi_codegen.codegen.rendering.kernels.double_double import arithmetic_headers, uses_functions
 from scvi_codegen.codegen.rendering.kernels.functions import unrolled_equations
 from scvi_codegen.codegen.rendering.kernels.loops import loop_context
@@ -34,7 +35,7 @@ from scvi_codegen.codegen.rendering.kernels.simd import (
     predictor_text,
     splitting_source,
 )
-from scvi_codegen.codegen.rendering.source import ExampleInput, Interface, Source
+from scvi_codegen.codegen.rendering.source import Contents, ExampleInput, Interface, Source
 from scvi_codegen.codegen.rendering.text import (
     INPUT_PRECISION,
     LARGEST_VIOLATION,
@@ -409,15 +410,47 @@ def _render(prefix: str, context: Mapping[str, object], entry: str = "stepper") 
     common = {"prefix": prefix, "target": DOUBLE, "real": DOUBLE.scalar, "max_iterations": MAX_ITERATIONS}
     environment, context = template_environment(), {**common, "two_words": None, "rattle_in_pairs": False, **context}
     header = entry if entry in DECLARATIONS else "stepper"
+    record = HeaderRecord(cast(str, context["prefix"]), cast(str, context["real"]))
+    recorded = context | {"prototype": record.prototype, "optional": record.optional}
+    declarations = environment.get_template(DECLARATIONS[header]).render(recorded)
     code = environment.get_template(f"{entry}.c.jinja").render(context)
     headers = cast("Mapping[str, str]", context.get("own_headers", {}))
     return Source(
         prefix=prefix,
-        header=environment.get_template(f"{header}.h.jinja").render(context),
+        header=environment.get_template(f"{header}.h.jinja").render(context | {"declarations": declarations}),
         code=code,
-        declarations=environment.get_template(DECLARATIONS[header]).render(context),
+        declarations=declarations,
         support=included(code, lambda name: headers.get(name) or support_text(name)),
+        contents=Contents(
+            functions=tuple(record.functions),
+            run_fields=tuple(record.run_fields),
+            divided=bool(context["cut"]),
+            **CONTENTS[entry](context),
+        ),
     )
+
+
+def _contents_of_step(context: Mapping[str, Any]) -> dict[str, int]:
+    """Return the sizes of an integrator of named coordinates."""
+    program: Program = context["program"]
+    return {
+        "coordinates": program.dimension,
+        "parameters": len(program.layout.parameters),
+        "unknowns": program.equations.unknowns,
+        "workspace": context["workspace"],
+        "maps": len(program.quantities.momentum_maps),
+        "constraints": program.constraints.count if program.constraints else 0,
+        "sums": program.sums,
+    }
+
+
+CONTENTS: dict[str, Callable[[Mapping[str, Any]], dict[str, int]]] = {
+    "stepper": _contents_of_step,
+    "arrays": lambda context: {},
+    "events": lambda context: {},
+    "ensemble": lambda context: {name: int(context[name]) for name in ("points", "observed", "needs_velocities")},
+}
+"""Sizes for callers of the C of an entry template, from its context."""
 
 
 def _control_context(program: Program, control: Control | None) -> dict[str, object]:

@@ -36,6 +36,49 @@ KINDS: dict[str, Callable[[Any], bool]] = {
 """Checks of values read from JSON against the annotations of :class:`Interface`."""
 
 
+def _checked(cls: type, record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return arguments of a dataclass from JSON; raise :class:`ValueError` for a value of another type."""
+    arguments: dict[str, Any] = {key: _as_tuples(value) for key, value in record.items()}
+    for each in fields(cls):
+        if each.name in arguments and not KINDS[str(each.type)](arguments[each.name]):
+            raise ValueError(f"{each.name} is {arguments[each.name]!r:.60}: it must be of type {each.type}")
+    return arguments
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Contents:
+    """What the C of a source offers its callers, recorded where it is rendered; numbers are 0 for what it lacks.
+
+    Attributes:
+        functions: exported functions, without the prefix.
+        run_fields: fields of the struct of a run that not every integrator has.
+        divided: whether kernels are divided into functions.
+        coordinates, parameters, unknowns, maps, constraints, sums: numbers of an integrator of named coordinates.
+        workspace: doubles per call; 0 for arrays of run-time sizes.
+        points, observed, needs_velocities: points of a step, observed functions and whether the memory of a block
+            initially contains velocities, of an ensemble.
+    """
+
+    functions: tuple[str, ...] = ()
+    run_fields: tuple[str, ...] = ()
+    divided: bool = False
+    coordinates: int = 0
+    parameters: int = 0
+    unknowns: int = 0
+    workspace: int = 0
+    maps: int = 0
+    constraints: int = 0
+    sums: int = 0
+    points: int = 0
+    observed: int = 0
+    needs_velocities: int = 0
+
+    @classmethod
+    def from_record(cls, record: Mapping[str, Any]) -> Contents:
+        """Return the contents from plain data; raises ValueError and TypeError for other fields and types."""
+        return cls(**_checked(cls, record))
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Source:
     """C source of an integrator.
@@ -46,6 +89,7 @@ class Source:
         declarations: the header's inner part.
         support: names and contents of the headers that the code includes, in order.
         beside: a further header and source that call this one: the search for zero crossings, or FMI.
+        contents: functions and sizes, for callers.
     """
 
     prefix: str
@@ -54,18 +98,13 @@ class Source:
     declarations: str
     support: tuple[tuple[str, str], ...] = ()
     beside: Source | None = None
+    contents: Contents = Contents()
 
     @property
     def files(self) -> dict[str, str]:
         """File contents by file name, ``/`` between folders."""
         files = {f"{self.prefix}.h": self.header, f"{self.prefix}.c": self.code, **dict(self.support)}
         return files | (self.beside.files if self.beside else {})
-
-    @property
-    def workspace(self) -> int:
-        """Doubles of workspace per call, 0 for arrays of run-time sizes."""
-        found = re.search(r"_WORKSPACE (\d+)$", self.header, re.MULTILINE)
-        return int(found[1]) if found else 0
 
     def write(self, folder: Path) -> None:
         """Write all files into a folder."""
@@ -103,6 +142,7 @@ class Source:
             **{name: getattr(self, name).split("\n") for name in TEXTS},
             "support": {name: text.split("\n") for name, text in self.support},
             "beside": self.beside.to_record() if self.beside else None,
+            "contents": asdict(self.contents),
         }
 
     @classmethod
@@ -124,6 +164,7 @@ class Source:
             **{name: "\n".join(record[name]) for name in TEXTS},
             support=tuple((name, "\n".join(lines)) for name, lines in record["support"].items()),
             beside=cls.from_record(beside) if beside else None,
+            contents=Contents.from_record(record["contents"]),
         )
 
     def to_json(self) -> str:
@@ -162,19 +203,22 @@ def _is_number(value: Any) -> bool:
 
 def check_interface(source: Source, interface: Interface) -> None:
     """Raise :class:`ValueError` if an interface has other sizes than the C source, which determine those of arrays."""
+    contents = source.contents
     sizes = {
-        "COORDINATES": interface.dimension,
-        "PARAMETERS": len(interface.parameters),
-        "UNKNOWNS": interface.unknowns,
-        "WORKSPACE": interface.workspace,
+        "COORDINATES": (interface.dimension, contents.coordinates),
+        "PARAMETERS": (len(interface.parameters), contents.parameters),
+        "UNKNOWNS": (interface.unknowns, contents.unknowns),
+        "WORKSPACE": (interface.workspace, contents.workspace),
+        "MAPS": (len(interface.map_names), contents.maps),
+        "CONSTRAINTS": (len(interface.constraints), contents.constraints),
     }
-    for name, size in sizes.items():
-        _compare(name, size, re.search(rf"^#define {source.prefix.upper()}_{name} (\d+)$", source.header, re.MULTILINE))
-    for name, size in {"MAPS": len(interface.map_names), "CONSTRAINTS": len(interface.constraints)}.items():
-        _compare(name, size, re.search(rf"^  (?:\w+_)?{name} = (\d+),", source.code, re.MULTILINE))
-    sums = re.search(r"^  (?:\w+_)?SUMS = (\d+),", source.code, re.MULTILINE)
-    if interface.exchange_names and sums:
-        _compare("SUMS", len(interface.exchange_names) + 1, sums)
+    if interface.exchange_names and contents.sums:
+        sizes["SUMS"] = (len(interface.exchange_names) + 1, contents.sums)
+    for name, (described, compiled) in sizes.items():
+        if described != compiled:
+            raise ValueError(
+                f"{name} is {described} in the interface and {compiled} in the C source: they must be equal"
+            )
     lengths: dict[str, tuple[object, object]] = {"prefix": (interface.prefix, source.prefix)}
     lengths["defaults"] = (len(interface.defaults), len(interface.parameters))
     lengths["momentum_names"] = (len(interface.momentum_names), interface.dimension if interface.momentum_names else 0)
@@ -203,17 +247,11 @@ def _check_names(source: Source, interface: Interface) -> None:
     first = {name[:-2] for name in interface.parameters if name.endswith("_0")}
     if not set(interface.inputs) <= first:
         raise ValueError(f"the inputs {interface.inputs} must each have a first parameter NAME_0")
-    parameter, functions = interface.energy_parameter, f"{source.prefix}_rates(" in source.header
-    if functions != interface.in_tau or not {parameter} <= {None, *interface.parameters}:
+    parameter = interface.energy_parameter
+    if ("rates" in source.contents.functions) != interface.in_tau or not {parameter} <= {None, *interface.parameters}:
         raise ValueError(f"energy_parameter: {parameter!r} must be a parameter of systems in transformed time")
     if interface.variables and not len(interface.variables) == 2 * len(interface.momentum_names):
         raise ValueError(f"variables: {interface.variables} must be the coordinates and momenta")
-
-
-def _compare(name: str, size: int, match: re.Match[str] | None) -> None:
-    wanted = int(match[1]) if match else 0
-    if size != wanted:
-        raise ValueError(f"{name} is {size} in the interface and {wanted} in the C source: they must be equal")
 
 
 class ExampleInput(NamedTuple):
@@ -384,11 +422,7 @@ class Interface:
         Raises:
             ValueError, TypeError: for other fields, and values of other types.
         """
-        arguments: dict[str, Any] = {key: _as_tuples(value) for key, value in record.items()}
-        for each in fields(cls):
-            if each.name in arguments and not KINDS[str(each.type)](arguments[each.name]):
-                raise ValueError(f"{each.name} is {arguments[each.name]!r:.60}: it must be of type {each.type}")
-        interface = cls(**arguments)
+        interface = cls(**_checked(cls, record))
         if interface.words not in (1, 2):
             raise ValueError(f"words is {interface.words}: it must be 1 or, in double-double arithmetic, 2")
         try:

@@ -36,7 +36,6 @@ WIDTH = 120
 CONTINUATION = 4
 OPERATOR = re.compile(r" ([-+*/=]) ")
 SHORT_SUM = re.compile(r"(?<=[-+*/] )\([^(),]{1,50}\)")
-PROTOTYPE = re.compile(r"^\w+ \w+\([^;{]*\);$", re.MULTILINE)
 
 
 def table(declaration: str, rows: Sequence[str] | Sequence[Sequence[str]], *, braces: bool = True) -> str:
@@ -81,11 +80,6 @@ def wrapped_comment_lines(text: str) -> str:
     """Return a comment of several lines, with lines that are too long broken."""
     lines = (_lines(line, "", " * ") if len(line) > WIDTH else [line] for line in text.split("\n"))
     return "\n".join(part for parts in lines for part in parts)
-
-
-def wrapped_prototypes(text: str) -> str:
-    """Return the source with every prototype that is too long broken between arguments."""
-    return PROTOTYPE.sub(lambda match: wrapped_prototype(" ".join(match[0].split())), text)
 
 
 def wrapped_prototype(prototype: str) -> str:

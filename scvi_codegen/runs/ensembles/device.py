@@ -14,7 +14,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.codegen.native.cuda import DEVICES, Device, constant, has_device_memory
+from scvi_codegen.codegen.native.cuda import DEVICES, Device, has_device_memory
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.codegen.rendering.source import Source
 from scvi_codegen.common.errors import StateError
@@ -75,8 +75,8 @@ class DeviceRuns:
         self.values_at, self.observation, self.device = values_at, observation, Device()
         source = cast(Source, stepper.ensemble if observation is None else observation.source)
         self.launch = self.device.kernels(source)
-        self.points = constant(source, "S")
-        self.needs_velocities = bool(constant(source, f"{source.prefix.upper()}_NEEDS_VELOCITIES"))
+        self.points = source.contents.points
+        self.needs_velocities = bool(source.contents.needs_velocities)
         count, self.m = map(int, start[0].shape)
         self.count, device = count, self.device
         self.q, self.p = (device.empty((len(steps.numbers), *each.shape)) for each in start)

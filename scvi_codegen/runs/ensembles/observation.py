@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from scvi_codegen.codegen.native import building
 from scvi_codegen.codegen.native.binding import Binding
-from scvi_codegen.codegen.native.cuda import constant
 from scvi_codegen.codegen.variants import Crossings, Energies, Extremes, Observing
 from scvi_codegen.common.errors import EventError, MethodError, StateError, closest
 from scvi_codegen.runs.states.validation import Array
@@ -59,7 +58,7 @@ class EnsembleObservation:
                 "source: compile the system, or omit observe and save states"
             )
         self.source = source
-        self.values = np.full((5, constant(source, f"{source.prefix.upper()}_OBSERVED"), count), np.nan)
+        self.values = np.full((5, source.contents.observed, count), np.nan)
         self.values[RISES:] = 0.0
 
     def _variant(self) -> Observing:

@@ -159,7 +159,7 @@ class CompiledMethod(ChosenBySizes):
         return stepper._with_action
 
     def _copy(self, events: tuple[Event, ...], source: Source | None = None) -> Self:
-        workspace = source.workspace if source else None
+        workspace = source.contents.workspace if source else None
         return type(self)(
             source or self._plain,
             replace(self.interface, workspace=workspace) if workspace else self.interface,

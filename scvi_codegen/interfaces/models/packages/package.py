@@ -23,12 +23,11 @@ import os
 import re
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from scvi_codegen.codegen.rendering.source import PREFIX, Interface, Source, check_interface
-from scvi_codegen.codegen.rendering.text import included
+from scvi_codegen.codegen.rendering.source import PREFIX, SUPPORT, Contents, Interface, Source, check_interface
 from scvi_codegen.codegen.variants import WithEvents
 from scvi_codegen.common.atomic import read_text, write_text
 from scvi_codegen.common.errors import PackageError
@@ -142,8 +141,10 @@ def source_in(folder: Path, prefix: str) -> Source:
         raise damaged(folder, ValueError(f"{prefix!r} is not a prefix of C names"))
     try:
         record = read_record(folder)
-        beside = _source(folder, f"{prefix}_events", record["event_declarations"]) if "events" in record else None
-        return replace(_source(folder, prefix, record["declarations"]), beside=beside)
+        source = _source(folder, prefix, record["source"])
+        if "events" not in record:
+            return source
+        return replace(source, beside=_source(folder, f"{prefix}_events", record["event_source"]))
     except OSError as error:
         raise PackageError(f"{folder} is not a generated package: {error.filename}: {error.strerror}") from error
     except PackageError:
@@ -152,12 +153,31 @@ def source_in(folder: Path, prefix: str) -> Source:
         raise damaged(folder, error) from error
 
 
-def _source(folder: Path, prefix: str, declarations: Sequence[str]) -> Source:
+def _record_of(source: Source) -> dict[str, Any]:
+    """Return what ``interface.json`` contains of a source, for :func:`_source`."""
+    return {
+        "declarations": source.declarations.split("\n"),
+        "support": [name for name, _ in source.support],
+        "contents": asdict(source.contents),
+    }
+
+
+def _source(folder: Path, prefix: str, record: Mapping[str, Any]) -> Source:
     header, code = (read_text(folder / f"{prefix}.{kind}", "utf-8") for kind in "hc")
-    support = included(code, lambda name: read_text(folder / name, "utf-8"))
-    if (text := "\n".join(declarations)) not in header:  # cffi would call other functions than those of the code
+    declarations = "\n".join(record["declarations"])
+    if declarations not in header:  # cffi would call other functions than those of the code
         raise ValueError(f"the declarations are not those of {prefix}.h")
-    return Source(prefix=prefix, header=header, code=code, declarations=text, support=support)
+    for name in record["support"]:
+        if not SUPPORT.fullmatch(name):
+            raise ValueError(f"{name!r} is not the name of a support header")
+    return Source(
+        prefix=prefix,
+        header=header,
+        code=code,
+        declarations=declarations,
+        support=tuple((name, read_text(folder / name, "utf-8")) for name in record["support"]),
+        contents=Contents.from_record(record["contents"]),
+    )
 
 
 def damaged(folder: Path, error: Exception) -> PackageError:
@@ -189,7 +209,6 @@ def prefix_of(folder: Path, kind: str = "folder", suffix: str = "") -> str:
 __all__ = ["CERTIFICATE_FILE", "MODEL", "MODEL_FILE", "generate_package", "load_package"]
 
 MODEL_FILE = "model.toml"
-ADVANCE_TO = "_advance_to("
 """Declaration in the header of an integrator with adaptive steps."""
 MODEL = ArgumentType("a Model", lambda value: hasattr(value, "system") and hasattr(value, "method"))
 
@@ -294,18 +313,17 @@ def _texts(model: Model, prefix: str, embedded: Embedded | None, *, single_file:
     checked_parameters(interface, model.parameters)  # C does not check cutoffs and boxes
     source = source.single_file() if single_file else source.specialised()
     texts = source.files
-    texts |= render_example(
-        interface, _example(model, interface, controlled=ADVANCE_TO in source.header), embedded or "double"
-    )
+    controlled = "advance_to" in source.contents.functions
+    texts |= render_example(interface, _example(model, interface, controlled=controlled), embedded or "double")
     texts |= written
     texts["README.md"] = readme_text(
-        interface, model.events, with_model=bool(written), embedded=embedded, controlled=ADVANCE_TO in source.header
+        interface, model.events, with_model=bool(written), embedded=embedded, controlled=controlled
     )
     if not embedded:
         texts["__init__.py"] = package_template("__init__.py")
-    described: dict[str, Any] = {"interface": interface.to_record(), "declarations": source.declarations.split("\n")}
+    described: dict[str, Any] = {"interface": interface.to_record(), "source": _record_of(source)}
     if source.beside is not None:
-        described["event_declarations"] = source.beside.declarations.split("\n")
+        described["event_source"] = _record_of(source.beside)
         described["events"] = [event.table for event in model.events]
     return {**texts, INTERFACE_FILE: record_text(texts, **described)}
 
@@ -340,5 +358,5 @@ def _texts_of_arrays(model: Model, prefix: str, embedded: Embedded | None, *, si
     texts = {**source.files, **render_example(interface, example), **lines}
     if described := model_texts(model):
         texts |= {**described, "__init__.py": package_template("__init__.py")}
-    about = {"title": interface.title, "sizes": model.sizes, "declarations": source.declarations.split("\n")}
+    about = {"title": interface.title, "sizes": model.sizes, "source": _record_of(source)}
     return {**texts, INTERFACE_FILE: record_text(texts, **about)}
