@@ -102,7 +102,8 @@ static long long coordinates_of(const problem *given)
 
 static void field_lengths(const problem *given, long long *length)
 {
-  (void)given, (void)length;
+  (void)given;
+  (void)length;
 }
 
 static int compute_inverse_masses(const problem *given, double *inverse_mass)
@@ -159,9 +160,8 @@ static void add_force_0(const problem *given, const lanes *restrict X, times t, 
 static sharing share_force_0(const run_memory *run, const problem *given, long long n)
 {
   const long long size_N = given->size[0];
-  (void)run;
   (void)given;
-  (void)n;
+  (void)run, (void)n;
   return alternating_blocks(0, size_N, 1, 1);
 }
 
@@ -211,9 +211,9 @@ static void describe_maps(const problem *given, momentum_map *all)
 {
   const long long size_N = given->size[0];
   const long long start_q = 0;
-  const momentum_map each[MAPS] = {
+  (void)given;
+  const momentum_map each[] = {
       {start_q, start_q + size_N, 1, 0, 0, TRANSLATION},
   };
-  (void)given;
   memcpy(all, each, sizeof each);
 }

@@ -120,6 +120,22 @@ def starts_text(layout: Layout, text: str) -> Iterator[str]:
         sizes.append(product_text(array))
 
 
+def function_of_sizes(layout: Layout, head: str, lines: Sequence[str]) -> str:
+    """Return a function of a problem, with declarations of the sizes and offsets that occur in its statements."""
+    text = "\n".join(lines)
+    starts = list(starts_text(layout, text))
+    sizes = sizes_text(layout, "\n".join([text, *starts]))
+    body = "\n".join(f"  {line}" for line in (*sizes, *starts, "(void)given;", *lines))
+    return f"{head}\n{{\n{body}\n}}"
+
+
+def describing_function(layout: Layout, name: str, kind: str, initialisers: Sequence[str]) -> str:
+    """Return a function that stores structures of this kind, such as descriptions of arrays."""
+    listed = (f"    {each}," for each in initialisers)
+    lines = [f"const {kind} each[] = {{", *listed, "};", "memcpy(all, each, sizeof each);"]
+    return function_of_sizes(layout, f"static void describe_{name}(const problem *given, {kind} *all)", lines)
+
+
 class Nest:
     """Loops of a kernel, with arguments and parameters assigned in the outermost loop in which they are known.
 

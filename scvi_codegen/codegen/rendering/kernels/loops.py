@@ -8,7 +8,7 @@ from typing import Any
 
 from scvi_codegen.codegen.ir.equations import ConstrainedSteps
 from scvi_codegen.codegen.ir.kernel import Kernel, RolledKernel, is_divided
-from scvi_codegen.codegen.ir.program import Program, RolledTerms
+from scvi_codegen.codegen.ir.program import Program
 from scvi_codegen.codegen.rendering.kernels.functions import kernel_text
 from scvi_codegen.codegen.rendering.kernels.loop_nests import (
     DIRECTION,
@@ -16,12 +16,12 @@ from scvi_codegen.codegen.rendering.kernels.loop_nests import (
     Sharing,
     count_text,
     counter,
+    describing_function,
+    function_of_sizes,
     product_text,
     sharing_of,
     sharing_text,
     size_text,
-    sizes_text,
-    starts_text,
 )
 from scvi_codegen.codegen.rendering.kernels.printer import DOUBLE, inverse_roots
 from scvi_codegen.codegen.rendering.kernels.simd import POINTS, iteration_source, loop_functions
@@ -46,8 +46,8 @@ STEP_VECTORS = 14
 def loop_context(program: Program) -> dict[str, Any]:
     """Return the template's context for the program of a system of arrays."""
     loops, constrained, pairs = program.loops, program.loops.constrained, _circulants(program)
-    sums, fixed_point = _convolutions(program), program.fixed_point
-    starts, lengths = [*starts_text(program.layout, " ".join(sums))], [*map(product_text, program.layout.fields)]
+    sums, fixed_point, layout = _convolutions(program), program.fixed_point, program.layout
+    lengths = [*map(product_text, layout.fields)]
     terms = [(each, each.scalar) for each in loops.forces if each.scalar]
     terms += [(each, each.kernel) for each in loops.constants]
     scalars = [each.kernel for each in loops.masses] + [scalar for _, scalar in terms]
@@ -65,8 +65,8 @@ def loop_context(program: Program) -> dict[str, Any]:
         "masses": [_mass_text(program, each) for each in loops.masses],
         "lists": [(name, _list_text(program, count, lengths)) for name, count, lengths in loops.neighbours],
         "circulants": {each.kernel.name: _circulant_text(program, each) for each in pairs},
-        "sums": sums,
-        "names_of_sums": [*sizes_text(program.layout, " ".join([*sums, *starts])), *starts],
+        "sums": len(sums),
+        "convolutions": describing_function(layout, "convolutions", "convolution", sums),
         "summed": [each.kernel.name for each in loops.applied if _has_sums(each)],
         "plans": len(_plans(program)),
         "most_stages": max((len(_stages(each)) for each in program.layout.sums), default=0),
@@ -76,34 +76,49 @@ def loop_context(program: Program) -> dict[str, Any]:
         "scalar_kernels": [kernel_text(kernel, DOUBLE) for kernel in scalars],
         "inverse_roots": inverse_roots(scalars),
         "vector_functions": _vector_functions(program),
-        "coordinates": " + ".join(map(product_text, program.layout.coordinates)),
+        "coordinates": function_of_sizes(
+            layout,
+            "static long long coordinates_of(const problem *given)",
+            [f"return {' + '.join(map(product_text, layout.coordinates))};"],
+        ),
         "fixed_point": fixed_point
         and iteration_source(fixed_point, POINTS, kernels=[each.kernel for each in loops.applied]),
         "work": _step_work(program) + _transform_work(program),
         "continued": loops.continued,
         "site_functions": [_site_text(program, each) for each in (*loops.velocities, *loops.momenta)],
-        "field_lengths": lengths,
-        "field_sizes": [*sizes_text(program.layout, " ".join(lengths))],
-        **_map_context(program),
+        "field_lengths": function_of_sizes(
+            layout,
+            "static void field_lengths(const problem *given, long long *length)",
+            [*(f"length[{k}] = {length};" for k, length in enumerate(lengths)), "(void)length;"],
+        ),
+        "maps": describing_function(layout, "maps", "momentum_map", [*_map_texts(program)]),
         "hot": "static",
         "waves": _lattice_context(program) if _on_lattices(program) else None,
-        "arrays": [(product_text(each), _is_field(each, loops)) for each in program.layout.coordinates],
+        "arrays": function_of_sizes(
+            layout,
+            "static inline void describe_coordinate_arrays(const problem *given, coordinate_array *all)",
+            ["long long end = 0;", *_appended_arrays(program)],
+        ),
         **_constraint_context(program, constrained),
     }
 
 
-def _map_context(program: Program) -> dict[str, Any]:
-    """Return the initialisers of the descriptions of momentum maps in C (templates/support/arrays/array_states.h)."""
+def _appended_arrays(program: Program) -> Iterator[str]:
+    """Yield the statements that describe the arrays of coordinates."""
+    for k, array in enumerate(program.layout.coordinates):
+        is_field = any(couples_elements(array, each.reads, each.given) for each in program.loops.applied)
+        yield f"end = append_array(&all[{k}], end, {product_text(array)}, {int(is_field)});"
+
+
+def _map_texts(program: Program) -> Iterator[str]:
+    """Yield the initialisers of the descriptions of momentum maps (templates/support/arrays/array_states.h)."""
     arrays = {array.name: array for array in program.layout.coordinates}
-    texts = []
     for each in program.loops.maps:
         array, whole = arrays[each.array], each.component is None
         kind = "PHASE" if each.phase else "TRANSLATION" if each.other is None else "ROTATION"
         components, numbers = (1 if whole else array.axes[-1].number, f"{each.component or 0}, {each.other or 0}")
         start = f"start_{array.name}"
-        texts.append(f"{{{start}, {start} + {product_text(array)}, {components}, {numbers}, {kind}}}")
-    starts = list(starts_text(program.layout, " ".join(texts)))
-    return {"maps": texts, "map_sizes": [*sizes_text(program.layout, " ".join([*texts, *starts])), *starts]}
+        yield f"{{{start}, {start} + {product_text(array)}, {components}, {numbers}, {kind}}}"
 
 
 def _site_text(program: Program, rolled: RolledKernel) -> str:
@@ -265,11 +280,9 @@ def _list_text(program: Program, components: int, lengths: RolledKernel) -> str:
 
 def _sharing_text(program: Program, rolled: RolledKernel) -> str:
     """Return a function that describes how threads share a term group."""
-    how = sharing_text(rolled)
-    known = [*sizes_text(program.layout, how), *(f"(void){name};" for name in ("run", "given", "n"))]
     head = f"static sharing share_{rolled.kernel.name}(const run_memory *run, const problem *given, long long n)"
-    lines = "\n".join(f"  {line}" for line in [*known, f"return {how};"])
-    return f"/* Its rounds of tasks. */\n{head}\n{{\n{lines}\n}}"
+    lines = ["(void)run, (void)n;", f"return {sharing_text(rolled)};"]
+    return f"/* Its rounds of tasks. */\n{function_of_sizes(program.layout, head, lines)}"
 
 
 def _function(
@@ -323,9 +336,11 @@ def _constraint_context(program: Program, held: ConstrainedSteps | None) -> dict
         "functions": [text for pair in pairs for text in _constraint_texts(program, *pair)],
         "conditions": [each.kernel.name for each in held.conditions],
         "curvatures": [each.kernel.name for each in held.curvatures],
-        "sizes": list(sizes_text(program.layout, " ".join(counts))),
-        "count": " + ".join(counts),
-        "entries": " + ".join(entries),
+        "counts": function_of_sizes(
+            program.layout,
+            "static void count_constraints(const problem *given, run_memory *run)",
+            [f"run->constraints = {' + '.join(counts)};", f"run->entries = {' + '.join(entries)};"],
+        ),
     }
     return {"held": context, "part_ends": list(accumulate(held.parts))}
 
@@ -354,10 +369,6 @@ def _constraint_texts(program: Program, condition: RolledKernel, curvature: Roll
     yield _function(program, bare, f"place_{name}", [now], lines, values=0, source="")
 
 
-def _is_field(array: Array, loops: RolledTerms) -> int:
-    return int(any(couples_elements(array, each.reads, each.given) for each in loops.applied))
-
-
 def _on_lattices(program: Program) -> bool:
     """Return whether Newton's method has the Fourier preconditioner: places in stencils, or circulant matrices."""
     alike = all(array.is_lattice for array in program.layout.coordinates) and not program.layout.tables
@@ -365,20 +376,18 @@ def _on_lattices(program: Program) -> bool:
 
 
 def _lattice_context(program: Program) -> dict[str, Any]:
-    before: list[str] = []
-    lines: list[str] = []
-    for array in program.layout.coordinates:
+    arrays, lattices = program.layout.coordinates, []
+    for array in arrays:
         sizes = ", ".join(size_text(axis) for axis in array.axes if axis.name)
-        first = " + ".join(before) or "0"
-        lines.append(
-            f"{{.first = {first}, .components = {_components(array)}, .size = {{{sizes}}}, .axes = {_axes(array)}}}"
+        lattices.append(
+            f"{{.first = start_{array.name}, .components = {_components(array)}, .size = {{{sizes}}}, "
+            f".axes = {_axes(array)}}}"
         )
-        before.append(product_text(array))
     return {
-        "lattices": lines,
-        "axes": max(map(_axes, program.layout.coordinates)),
-        "components": sum(map(_components, program.layout.coordinates)),
-        "sizes": list(sizes_text(program.layout, " ".join(lines))),
+        "lattices": len(arrays),
+        "axes": max(map(_axes, arrays)),
+        "components": sum(map(_components, arrays)),
+        "describing": describing_function(program.layout, "lattices", "lattice", lattices),
     }
 
 
