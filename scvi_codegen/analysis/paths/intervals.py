@@ -7,6 +7,7 @@ of the step before it and p0 of the step after it; without forces it is the grad
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 from typing import Any
@@ -266,8 +267,9 @@ class ReducedIntervals(Intervals):
         """See :meth:`Intervals.moved`; the positions are projected onto the manifold."""
         result = q.copy()
         first = len(q) - 1 - len(y)
-        for k, each in enumerate(y, first):
-            result[k] = self.on_manifold(q[k] + self._bases[k] @ each if np.any(each) else q[k], k, q[0])
+        for k, components in enumerate(y, first):
+            moved = q[k] + self._bases[k] @ components if np.any(components) else q[k]
+            result[k] = self.on_manifold(moved, k, q[0])
         return result
 
     def on_manifold(self, q: Array, k: int, like: Array) -> Array:
@@ -312,53 +314,55 @@ class ReducedIntervals(Intervals):
 
     def linearised(self, q: Array) -> Linearised:
         """See :meth:`Intervals.linearised`."""
-        count, m = len(self.h), self.dimension
+        count = len(self.h)
         times = [*self.t.tolist(), float(self.t[-1] + self.h[-1])]
-        own = [self._parameters_of(min(k, count - 1)) for k in range(count + 1)]
-        like: list[Any] = self._bases or [None] * (count + 1)
-        self._bases = bases = [self._basis(q[k], times[k], own[k], like[k]) for k in range(count + 1)]
+        parameters = [self._parameters_of(min(k, count - 1)) for k in range(count + 1)]
+        before: Sequence[Array | None] = self._bases or [None] * (count + 1)
+        self._bases = bases = [self._basis(q[k], times[k], parameters[k], before[k]) for k in range(count + 1)]
         if self.symmetry is not None:
             bases[count] = self.symmetry @ bases[0]
-        d, by_h = bases[0].shape[1], np.empty((2, count, bases[0].shape[1]))
-        p0, p1, actions, blocks = (
-            np.empty((count, m)),
-            np.empty((count, m)),
-            np.zeros(count),
-            np.empty((4, count, d, d)),
-        )
-        for k in range(count):
-            Z0, Z1 = bases[k], bases[k + 1]
-            W = self._from_velocities(q[k], Z0, times[k], own[k])
-            drift = np.zeros(m) if self.members else self.stepper.momentum(q[k], np.zeros(m), times[k], own[k])
-            u, h = Z0.T @ (q[k + 1] - q[k]) / self.h[k], float(self.h[k])
-            if self.members:
-                u = self._covector(q[k], Z0, (q[k + 1] - q[k]) / h, times[k], own[k])
-            step = {"h": h, "t": times[k], "parameters": own[k]}
-            allowed = CONVERGED * size_for_updates(q, CONVERGED)
-            for _ in range(MOST_ITERATIONS):
-                p0[k] = drift + W @ u
-                reached, p1[k] = self.stepper.step(q[k], p0[k], options=self.options, **step)
-                J = self.stepper.jacobian(q[k], p0[k], **step)
-                missed = Z1.T @ (reached - q[k + 1])
-                B = Z1.T @ J[:m, m:] @ W
-                try:
-                    correction = np.linalg.solve(B, missed)
-                except np.linalg.LinAlgError as error:
-                    raise PathError(f"no step leads from node {k} to the next") from error
-                u = u - correction
-                if np.abs(missed).max() <= allowed:
-                    break
-            else:
-                raise PathError(f"no step from node {k} to the next was found")
-            A, C, D = Z1.T @ J[:m, :m] @ Z0, Z1.T @ J[m:, :m] @ Z0, Z1.T @ J[m:, m:] @ W
-            inverse = np.linalg.inv(B)
-            blocks[0, k], blocks[1, k] = -Z0.T @ W @ inverse @ A, Z0.T @ W @ inverse
-            blocks[2, k], blocks[3, k] = C - D @ inverse @ A, D @ inverse
-            by_h[:, k] = self._by_h(q[k], p0[k], step, (Z0, Z1, W), D, inverse)
-            if self.stepper.interface.sums_action:
-                actions[k] = self._action(q[k], p0[k], step)
-        residual = np.array([bases[k].T @ (p1[k - 1] - p0[k]) for k in range(1, count)]).reshape(count - 1, d)
-        return Linearised(p0, p1, actions, residual, blocks, by_h)
+        allowed = CONVERGED * size_for_updates(q, CONVERGED)
+        steps = [self._interval(k, q[k], q[k + 1], times[k], parameters[k], allowed) for k in range(count)]
+        p0, p1, actions, blocks, by_h = map(np.array, zip(*steps, strict=True))
+        residual = np.array([bases[k].T @ (p1[k - 1] - p0[k]) for k in range(1, count)])
+        residual = residual.reshape(count - 1, bases[0].shape[1])
+        return Linearised(p0, p1, actions, residual, blocks.swapaxes(0, 1), by_h.swapaxes(0, 1))
+
+    def _interval(
+        self, k: int, q0: Array, q1: Array, t: float, parameters: Array, allowed: float
+    ) -> tuple[Array, Array, float, list[Array], tuple[Array, Array]]:
+        """Return p0, p1, the action, and the derivatives of both by q0 and q1, and by h, of the step from q0 to q1.
+
+        With B = Z_1^T (dq1/dp0) W, dq1 = A dy0 + B du and dp1 = C dy0 + D du in the bases of the tangent spaces:
+        du = B^-1 (dy1 - A dy0) of a step between fixed ends.
+        """
+        m, h = self.dimension, float(self.h[k])
+        Z0, Z1 = self._bases[k], self._bases[k + 1]
+        W = self._from_velocities(q0, Z0, t, parameters)
+        step = {"h": h, "t": t, "parameters": parameters}
+        if self.members:
+            at_rest, u = np.zeros(m), self._covector(q0, Z0, (q1 - q0) / h, t, parameters)
+        else:
+            at_rest, u = self.stepper.momentum(q0, np.zeros(m), t, parameters), Z0.T @ (q1 - q0) / h
+        for _ in range(MOST_ITERATIONS):
+            p0 = at_rest + W @ u
+            end, p1 = self.stepper.step(q0, p0, options=self.options, **step)
+            J = self.stepper.jacobian(q0, p0, **step)
+            miss = Z1.T @ (end - q1)
+            B = Z1.T @ J[:m, m:] @ W
+            try:
+                u = u - np.linalg.solve(B, miss)
+            except np.linalg.LinAlgError as error:
+                raise PathError(f"no step leads from node {k} to the next") from error
+            if np.abs(miss).max() <= allowed:
+                break
+        else:
+            raise PathError(f"no step from node {k} to the next was found")
+        A, C, D = Z1.T @ J[:m, :m] @ Z0, Z1.T @ J[m:, :m] @ Z0, Z1.T @ J[m:, m:] @ W
+        inverse = np.linalg.inv(B)
+        blocks = [-Z0.T @ W @ inverse @ A, Z0.T @ W @ inverse, C - D @ inverse @ A, D @ inverse]
+        action = self._action(q0, p0, step) if self.stepper.interface.sums_action else 0.0
+        return p0, p1, action, blocks, self._by_h(q0, p0, step, (Z0, Z1, W), D, inverse)
 
     def _by_h(
         self, q: Array, p: Array, step: dict[str, Any], bases: tuple[Array, Array, Array], D: Array, inverse: Array

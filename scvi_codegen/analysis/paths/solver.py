@@ -119,12 +119,10 @@ def newton(
         damping = min(1.0, 2.0 * damping)
         while True:
             trial = move(q, damping * correction)
-            try:
+            with suppress(*UNSOLVED):
                 simplified = float(np.abs(factors.solve(evaluate(trial, False)[1])).max())
                 if simplified < (1.0 - damping / 4.0) * size:
                     break
-            except UNSOLVED:
-                pass
             damping /= 2.0
             if damping < LEAST_STEP:
                 raise PathError("Newton's method made no progress")
@@ -156,20 +154,21 @@ def continued(intervals: Intervals, q: Array, duration: float, first: float | No
 
     By default this is a sixteenth, where the straight line is nearly exact.
     """
-    now, growth = duration / FIRST_PART if first is None else first, MOST_GROWTH
-    found = solved(intervals.lasting(now), q)
-    total = found.iterations
-    while abs(math.log(now / duration)) > 1e-12:
-        next_one = now * growth ** math.copysign(1.0, math.log(duration / now))
-        next_one = duration if abs(math.log(now / duration)) <= math.log(growth) else next_one
+    reached, growth = duration / FIRST_PART if first is None else first, MOST_GROWTH
+    solution = solved(intervals.lasting(reached), q)
+    total = solution.iterations
+    while abs(math.log(reached / duration)) > 1e-12:
+        trial = duration
+        if abs(math.log(reached / duration)) > math.log(growth):
+            trial = reached * growth ** math.copysign(1.0, math.log(duration / reached))
         try:
-            found = solved(intervals.lasting(next_one), found.q, CONTINUED_ITERATIONS)
-            total, now, growth = total + found.iterations, next_one, min(MOST_GROWTH, growth**1.5)
+            solution = solved(intervals.lasting(trial), solution.q, CONTINUED_ITERATIONS)
+            total, reached, growth = total + solution.iterations, trial, min(MOST_GROWTH, growth**1.5)
         except UNSOLVED as error:
             growth **= 0.5
             if growth < LEAST_GROWTH:
-                raise PathError(f"continuation in the duration ended at {now:g} of {duration:g}") from error
-    return Solution(found.q, found.intervals, found.at, found.factors, total)
+                raise PathError(f"continuation in the duration ended at {reached:g} of {duration:g}") from error
+    return replace(solution, iterations=total)
 
 
 def continued_from_motion(intervals: Intervals, q: Array, duration: float) -> Solution:
@@ -216,8 +215,8 @@ def descended(intervals: Intervals, q: Array) -> Solution:
         q, at, shift = trial, there, shift / 4.0
         if _relative(intervals, q, correction) <= NEAR:
             break
-    found = solved(intervals, q)
-    return Solution(found.q, intervals, found.at, found.factors, iterations + found.iterations)
+    solution = solved(intervals, q)
+    return replace(solution, iterations=iterations + solution.iterations)
 
 
 class AtEnergy:
@@ -273,7 +272,7 @@ class AtEnergy:
         """Return the factors of the bordered matrix."""
         intervals, (start, end) = self.intervals, at.by_h / len(at.p0)
         velocities = [intervals.tangent(k, np.asarray(v)) for k, v in enumerate(self.velocities)]
-        corner = -float(np.mean([v @ each for v, each in zip(velocities, start, strict=False)]))
+        corner = -float(np.mean([v @ by_h for v, by_h in zip(velocities, start, strict=False)]))
         border = end[:-1] - start[1:]
         if self.M is not None:
             M = intervals.basis_map(self.M)
@@ -322,23 +321,19 @@ def closed(
         with suppress(*UNSOLVED):
             return AtEnergy(intervals, energy, states, M).solved(q)
 
+    def factorise(at: Linearised) -> Closed:
+        return Closed(at, intervals.basis_map(M), symmetric=symmetric)
+
     def relative(nodes: Array, correction: Array) -> float:
         return _relative(intervals, whole(nodes), correction)
 
     at, r = evaluate(q, True)
-    if minimise and relative(q, Closed(at, intervals.basis_map(M), symmetric=symmetric).solve(r)) >= NEAR_CLOSED:
+    if minimise and relative(q, factorise(at).solve(r)) >= NEAR_CLOSED:
         q = _minimised(evaluate, q)
-    found, at, factors, iterations = newton(
-        evaluate,
-        lambda at: Closed(at, intervals.basis_map(M), symmetric=symmetric),
-        moved,
-        relative,
-        q,
-        MOST_ITERATIONS,
-    )
+    q, at, factors, iterations = newton(evaluate, factorise, moved, relative, q, MOST_ITERATIONS)
     if energy is not None:
-        return AtEnergy(intervals, energy, states, M).solved(found, iterations)
-    return Solution(whole(found), intervals, at, factors, iterations)
+        return AtEnergy(intervals, energy, states, M).solved(q, iterations)
+    return Solution(whole(q), intervals, at, factors, iterations)
 
 
 def _minimised(evaluate: Callable[[Array, bool], tuple[Linearised, Array]], q: Array) -> Array:
