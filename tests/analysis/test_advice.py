@@ -15,7 +15,7 @@ from notation import lagrange
 from outer_planets import GRAVITY, MASSES, POSITIONS, VELOCITIES
 
 from scvi_codegen import Advice, LagrangianSystem, MethodError, StateError, advise, compile_stepper, problem
-from scvi_codegen.analysis.advice.advice import _advice, _choose, _warnings
+from scvi_codegen.analysis.advice.advice import _advice, _choose
 from scvi_codegen.analysis.advice.pilot import run_pilot
 from scvi_codegen.common.errors import StepFailedError, UnresolvedError
 from scvi_codegen.interfaces.cli.step_selection import _text
@@ -102,21 +102,6 @@ def test_numbers_of_advice_are_those_of_an_error_in_closed_form(span: float) -> 
     words = f"{advice.steps} steps of {advice.h:.6g} by {StoermerVerlet().name}, for an expected error of "
     assert advice.message.startswith(f"{words}{advice.expected_error:.1g}. The pilot runs covered ")
     assert advice.message.endswith("The method is symplectic only at this fixed step size.")
-
-
-def test_warnings_name_their_numbers() -> None:
-    """From 100 units of time with an error of 1e-10, four decades take four times the time of tenfold growth."""
-    pilot = SimpleNamespace(length=100.0, whole=False, growth=3.0, final_quarter_error=lambda _: 1e-10)
-    chaos = "neighbouring trajectories diverge tenfold every 5 units of time (chaos), "
-    for tenfold, floor, words in (
-        (5.0, 1e-9, [f"{chaos}at an uncertain rate later"]),
-        (5.0, 1e-3, [f"the tolerance cannot be met: {chaos}so round-off alone exceeds it",
-                     "the recommended step meets it for about 120 units of time"]),
-        (math.inf, 6e-7, ["round-off alone causes an error of about 6e-07 at the end, for any step size"]),
-        (math.inf, 1e-9, ["errors grew like t^3.0 in the pilot runs, a rate that may not continue"]),
-    ):  # fmt: skip
-        pilot.rate, pilot.floor_at_end = math.log(10.0) / tenfold, floor
-        assert [*_warnings(pilot, 1e-6, 8)] == words
 
 
 class TestAchievedErrors:

@@ -7,7 +7,6 @@ from scipy.special import ellipk
 
 import scvi_codegen as sc
 from scvi_codegen.analysis.paths import solver
-from scvi_codegen.analysis.paths.equations import condensed_hessian
 from scvi_codegen.analysis.paths.intervals import Intervals, ManyCoordinates
 from scvi_codegen.common.errors import MethodError, PathError, StateError
 
@@ -162,7 +161,6 @@ def test_error_of_a_path_depends_neither_on_the_origin_nor_on_the_gauge(amplitud
     assert not path.at_rest
 
 
-@pytest.mark.quick
 def test_indices_of_indefinite_kinetic_energy_are_refused():
     stepper = compiled(["x", "y"], "(x_dot**2 - y_dot**2)/2 - (x**2 - y**2)/2 + x*y/10")
     path = stepper.path([1.0, 0.0], [0.3, 0.2], 2.0, steps=12)
@@ -328,27 +326,6 @@ def test_sparse_derivatives_of_a_lattice_are_those_of_all_columns():
     assert some.blocks.shape[-1] < 12 * 12
 
 
-def test_condensation_of_one_inner_node_is_elimination(oscillator):
-    path = oscillator.path([1.0], [0.3], 1.0, steps=2)
-    h, c, s = 1.0, np.cos(1.0), np.sin(1.0)
-    assert np.allclose(path.hessian, np.array([[c, -1], [-1, c]]) / s, atol=1e-6)
-    assert h == path.t[-1]
-    assert condensed_hessian(path.solution.at, path.solution.factors).shape == (2, 2)
-
-
-@pytest.mark.second
-def test_closed_path_with_another_coordinate_than_time():
-    """Periodic orbit of the pendulum of period 8: the amplitude of its elliptic integral."""
-    pendulum = compiled(["a"], "a_dot**2/2 + cos(a)", "svi:6")
-    path = pendulum.path(T=4.0, steps=12, closed=["-a"], start=lambda t: [np.sin(np.pi * t / 4)])
-    run = path.run()
-    assert path.repetitions == 2
-    assert path.period == 8.0
-    m = (1 + run.energy()[0]) / 2  # sin^2 of half the amplitude
-    assert abs(4 * ellipk(m) - 8.0) < 1e-8
-    assert np.abs(run.q[-1] - run.q[0]).max() < 1e-9
-
-
 @pytest.mark.parametrize(
     ("arguments", "closed", "start", "energy", "m", "zero_modes"),
     [
@@ -418,13 +395,6 @@ def choreography(n, curve, steps, method):
     return stepper, path, float(stepper.energy(path.q[0], path.p[0]))
 
 
-@pytest.mark.rotated
-def test_lagrange_triangle_has_the_energy_of_its_closed_form():
-    _, path, energy = choreography(3, lambda a: [0.9 * np.cos(a), 0.7 * np.sin(a)], 12, "svi:6")
-    assert abs(energy + 1.5 / 3 ** (1 / 3)) < 1e-10
-    assert np.abs(np.hypot(path.q[:, ::2], path.q[:, 1::2]) - 3 ** (-1 / 6)).max() < 1e-9
-
-
 @pytest.mark.second
 def test_figure_eight_has_its_published_energy_and_multipliers():
     stepper, path, energy = choreography(3, lambda a: [1.1 * np.sin(a), 0.4 * np.sin(2 * a)], 16, "svi:6")
@@ -438,38 +408,6 @@ def test_figure_eight_has_its_published_energy_and_multipliers():
     orbit = sc.periodic_orbit(stepper, path.q[0], path.p[0], period=path.period, steps=192, fixed_period=True)
     phases = np.sort(np.angle(orbit.multipliers) / (2 * np.pi))[::-1][:2]
     assert np.abs(phases - [0.29809253, 0.00842272]).max() < 1e-7  # Simo 2002
-
-
-@pytest.mark.rotated
-@pytest.mark.parametrize(
-    ("n", "curve", "q", "v"),
-    [
-        (
-            4,
-            lambda a: [1.4 * np.cos(a), 0.4 * np.sin(3 * a) - 0.25 * np.sin(a)],
-            [1.382857, 0, 0, 0.157030, -1.382857, 0, 0, -0.157030],
-            [0, 0.584873, 1.871935, 0, 0, -0.584873, -1.871935, 0],
-        ),
-        (
-            5,
-            lambda a: [1.7 * np.cos(a), -0.35 * np.sin(4 * a)],
-            [1.657666, 0, 0.439775, -0.169717, -1.268608, -0.267651, -1.268608, 0.267651, 0.439775, 0.169717],
-            [0, -0.593786, 1.822785, 0.128248, 1.271564, 0.168645, -1.271564, 0.168645, -1.822785, 0.128248],
-        ),
-    ],
-    ids=["Gerver's super-eight", "chain of five"],
-)
-def test_choreographies_have_their_published_size_and_energy(n, curve, q, v):
-    stepper, path, energy = choreography(n, curve, 12 * n, "svi:6")
-    assert abs(energy - float(stepper.energy(q, v))) < 1e-5
-    run = path.run()
-    radii = np.hypot(run.q[:, ::2], run.q[:, 1::2])
-    assert abs(radii.max() - np.hypot(q[0], q[1])) < 2e-3
-    again = stepper.path(
-        T=2 * np.pi / n, steps=24, closed=path_symmetry(n, stepper, q, v), start=started(stepper, n, q, v)
-    )
-    assert np.abs(again.q[0] - q).max() < 2e-6  # six digits
-    assert np.abs(again.p[0] - v).max() < 3e-6
 
 
 SIMO = {
@@ -504,18 +442,6 @@ def test_choreographies_of_four_bodies_are_those_of_sixteen_published_digits():
         assert np.abs(orbit.q - q).max() < 1e-9
         assert not orbit.stable
         assert abs(sizes[0] * sizes[-1] - 1) < 1e-4  # reciprocal pairs
-
-
-def started(stepper, n, q, v):
-    return stepper.integrate(q, v, h=2 * np.pi / n / 24, steps=24).q
-
-
-def path_symmetry(n, stepper, q, v):
-    """Return the names of the bodies that follow each other after a part of the period."""
-    after = started(stepper, n, q, v)[-1].reshape(n, 2)
-    before = np.reshape(q, (n, 2))
-    follow = [int(np.argmin(np.abs(before - each).sum(axis=1))) for each in after]
-    return [f"{axis}{i}" for i in follow for axis in "xy"]
 
 
 @pytest.mark.rotated

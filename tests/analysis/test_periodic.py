@@ -90,6 +90,7 @@ BUTTERFLY = [-1.0, 0.0, 1.0, 0.0, 0.0, 0.0], (0.3068934205, 0.1255065670), 6.234
 Lett. 110 (2013) 114301."""
 
 
+@pytest.mark.second
 def test_an_accurate_guess_stays_accurate():
     """The butterfly, whose published digits close to 1e-10; 4000 equal steps move its period by 3e-5."""
     names = ["x1", "y1", "x2", "y2", "x3", "y3"]
@@ -181,6 +182,7 @@ def test_pendulum_period_is_the_elliptic_integral():
     assert over.period == pytest.approx(2 * 2 / 2.5 * ellipk((2 / 2.5) ** 2), rel=1e-11)
 
 
+@pytest.mark.second
 def test_adaptive_steps_reach_the_bound(galaxy, restricted):
     """Periods by K(k), a published halo orbit, and an orbit of Henon-Heiles by equal steps."""
     pendulum = sc.compile_stepper(sc.problem("planar-pendulum").system, sc.SVI(8))

@@ -2,7 +2,6 @@
 
 import importlib.util
 import json
-import multiprocessing
 import os
 import shutil
 import subprocess
@@ -122,15 +121,6 @@ def test_second_load_in_one_process_does_no_io(cache):
     shutil.rmtree(cache)
     assert building.load(source(), flags=FAST) is first
     assert not cache.exists()
-
-
-@pytest.mark.parametrize(
-    "changed", [{"flags": ("-O1",)}, {"source": source("double tiny_answer(void)\n{\n  return 43.0;\n}\n")}], ids=str
-)
-def test_different_source_or_flag_is_a_different_entry(changed, cache):
-    answer()
-    building.load(**{"source": source(), "flags": FAST, **changed})
-    assert len(entries(cache)) == 2
 
 
 def compiler_reporting(tmp_path: Path, version: str, name: str = "own-cc") -> str:
@@ -342,42 +332,9 @@ def test_missing_writable_folder_is_reported(tmp_path, monkeypatch):
         answer()
 
 
-def test_a_relative_cache_folder_works(here, monkeypatch):
-    monkeypatch.setenv(building.CACHE_VARIABLE, "beside")
-    assert answer() == 42.0
-
-
 def test_a_cache_folder_with_spaces_and_quotes_works(tmp_path, monkeypatch):
     monkeypatch.setenv(building.CACHE_VARIABLE, str(tmp_path / 'it\'s a "folder" of mine'))
     assert answer() == 42.0
-
-
-def race(cache: str, barrier=None) -> float:
-    """One process of several that want the same library at once."""
-    building.os.environ[building.CACHE_VARIABLE] = cache
-    building._loaded.clear()
-    if barrier is not None:
-        barrier.wait()
-    return answer()
-
-
-def racer(cache: str, barrier, results) -> None:
-    results.put(race(cache, barrier))
-
-
-@pytest.mark.rotated
-def test_concurrent_builds_into_an_empty_cache_give_one_entry(cache):
-    context = multiprocessing.get_context("spawn")
-    barrier, results = context.Barrier(6), context.Queue()
-    processes = [context.Process(target=racer, args=(str(cache), barrier, results)) for _ in range(6)]
-    for process in processes:
-        process.start()
-    assert [results.get(timeout=600) for _ in processes] == [42.0] * 6
-    for process in processes:
-        process.join(timeout=600)
-        assert process.exitcode == 0
-    (entry,) = entries(cache)
-    assert building._is_intact(entry)
 
 
 # Compilers.

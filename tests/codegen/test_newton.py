@@ -94,17 +94,6 @@ class TestReusedFactors:
     def test_runs_reuse_enough_factors(self, method):
         assert chain(method).interface.unknowns >= LEAST_REUSED_UNKNOWNS
 
-    def test_run_split_into_calls_is_bitwise_equal(self, method):
-        q, p = state()
-        expected = chain(method).integrate(q, p, h=0.15, steps=60)
-        run = chain(method).start(q, p, h=0.15)
-        for chunk in (1, 1, 2, 7, 20, 29):
-            last = run.record(chunk)
-            run = chain(method).from_checkpoint(run.checkpoint())
-        assert np.array_equal(last.q[-1], expected.q[-1])
-        assert np.array_equal(last.p[-1], expected.p[-1])
-        assert last.iterations[-1] == expected.iterations[-1]
-
     @pytest.mark.tiers(1)
     def test_run_with_time_dependent_springs_split_anywhere_is_bitwise_equal(self, method):
         """Factors are made again where and when they were made: with all that their matrix depends on."""

@@ -1,13 +1,9 @@
 """Equations written out are those with tables, to the bit where the compiler fuses nothing, and those of the paper."""
 
 import math
-import re
-from pathlib import Path
 
-import numpy as np
 import pytest
 from notation import hamilton
-from tiers import first_of_each
 
 from scvi_codegen import SCVI, SVI, Gauss, StoermerVerlet, compile_stepper, generate_source, problem
 from scvi_codegen.codegen.native.building import PORTABLE_FLAGS
@@ -18,7 +14,6 @@ PENDULUM = problem("planar-pendulum").system
 
 pytestmark = pytest.mark.usefixtures("as_users_compile")
 
-GENERATED = Path(__file__).parents[2] / "generated" / "two_point_pendulum.c"
 TWO_POINTS = SCVI(1, "gauss-legendre:2")
 HAMILTONIAN = hamilton("pendulum", "x", "y**2*(1 + x**2/5)/2 - cos(x)", momenta="y")
 CASES = {
@@ -56,16 +51,6 @@ def test_unrolled_and_tabulated_methods_are_equal(case, monkeypatch):
     assert (ours.p == theirs.p).all()
 
 
-@pytest.mark.tiers(0, 1)
-@pytest.mark.parametrize("case", first_of_each(CASES, lambda case: type(CASES[case][0])))
-def test_unrolled_and_tabulated_methods_agree_to_round_off_with_fma(case, monkeypatch):
-    m = CASES[case][0].dimension
-    q, p = [0.9, 0.4][:m], [0.3, 0.8][:m]
-    ours, theirs = (each.integrate(q, p, h=0.05, steps=100) for each in both(case, monkeypatch, {}))
-    assert np.abs(ours.q - theirs.q).max() < 1e-12
-    assert np.abs(ours.p - theirs.p).max() < 1e-12
-
-
 def test_example_of_the_paper_is_solved():
     """Equation (37) and (34e), with the numbers that the paper prints, at the states of the compiled step."""
     h, q0, p0 = 0.1, 0.5, 0.2
@@ -75,17 +60,3 @@ def test_example_of_the_paper_is_solved():
     first, second = math.sin(near * q0 + far * q1), math.sin(far * q0 + near * q1)
     assert -q1 / h + q0 / h - h / 2 * (near * first + far * second) + p0 == pytest.approx(0, abs=1e-14)
     assert (q1 - q0) / h - h / 2 * (far * first + near * second) == pytest.approx(p1, abs=1e-14)
-
-
-def test_smallest_file_contains_the_equations():
-    text = " ".join(GENERATED.read_text().split())
-    near, far = r"0\.78867513459481\d+", r"0\.21132486540518\d+"
-    assert re.search(
-        rf"\(34d\).*?rows\[0\] = step->p0\[0\] \+ {near} \* \(0\.5 \* h \* value\[0\]\) \+ {far} \* "
-        r"\(0\.5 \* h \* value\[2\]\) - 0\.5 \* value\[1\] - 0\.5 \* value\[3\];",
-        text,
-    )
-    assert re.search(r"\(34e\).*?rows\[1\] = 0\.5 \* h \* value\[0\] \+ 0\.5 \* h \* value\[2\];", text)
-    assert re.search(r"\(34c\)", text)
-    assert "GATHER" not in text
-    assert "SCATTER" not in text

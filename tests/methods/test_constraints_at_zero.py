@@ -125,6 +125,7 @@ def test_adaptive_steps_from_rest_do_not_resolve_rounding(tolerance):
     assert np.abs(run.q[-1] - exact).max() < 1e-3 * (tolerance or 1e-9)
 
 
+@pytest.mark.tiers(3)
 @pytest.mark.parametrize("method", METHODS[1:], ids=str)
 @pytest.mark.parametrize("constraint", ["x**2 + (y + 1)**2 = 1", "x**2 + (y - 1)**2 = 1", "x**2 + y**2 = 2*y"])
 def test_adaptive_steps_hang_at_rest_and_nearly_so(method, constraint):

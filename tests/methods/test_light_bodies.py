@@ -7,11 +7,12 @@ from notation import lagrange
 import scvi_codegen as sc
 
 MASSES = (1.0, 1e-2, 1e-4, 1e-5, 3e-7, 1e-9)
+DEGREES = ["svi:4", pytest.param("svi:8", marks=pytest.mark.second)]
 START = 1.0
 POSITION = [np.sin(START) / 2, -np.cos(START) / 2, START, np.sin(START), -np.cos(START)]
 
 
-@pytest.fixture(scope="module", params=["svi:4", "svi:8"])
+@pytest.fixture(scope="module", params=DEGREES)
 def pendulum(request):
     """The steppers of rod and bob of both solvers."""
     return tuple(sc.compile_stepper(rod_and_bob(), request.param, solver=solver) for solver in ("auto", "newton"))
@@ -56,7 +57,7 @@ def test_masses_of_zero_that_nothing_replaces_are_refused_by_name(pendulum):
         pendulum[0].integrate(POSITION, [0.0] * 5, parameters={"m": 0.0, "M": 1.0}, h=0.005, steps=10)
 
 
-@pytest.fixture(scope="module", params=["svi:4", "svi:8"])
+@pytest.fixture(scope="module", params=DEGREES)
 def massless(request):
     """The same pendulum, whose rod has the mass 0 by default."""
     return sc.compile_stepper(rod_and_bob().with_parameters(m=0.0), request.param)
@@ -101,6 +102,7 @@ def test_ensembles_with_masses_of_zero_agree_with_single_runs(massless):
         assert np.array_equal(ensemble.q[-1, k], run.q[-1])
 
 
+@pytest.mark.second
 def test_a_bob_on_two_massless_rods_falls_freely():
     """A joint without mass transmits no force; the steps are those of a joint of 1e-9 of the mass."""
     joints = lagrange(
@@ -125,6 +127,7 @@ def test_a_bob_on_two_massless_rods_falls_freely():
     assert -np.cos(moved["a"][-1]) == pytest.approx(run.q[-1, 1], abs=1e-14)
 
 
+@pytest.mark.second
 def test_a_massless_rod_in_two_words():
     precise = sc.compile_stepper(rod_and_bob().with_parameters(m=0.0), "svi:4", precision="double-double")
     run = precise.integrate(POSITION, [0.0] * 5, h=0.01, steps=5)
@@ -154,6 +157,7 @@ def test_ensembles_of_mass_ratios_agree_with_single_runs(pendulum):
         assert np.array_equal(ensemble.q[-1, k], run.q[-1])
 
 
+@pytest.mark.second
 def test_a_light_pinned_slider_is_no_light_body():
     """Its coordinate y = 0 has no size, forces and reactions cancel there, but no other coordinate is lost by it."""
     slider = lagrange(

@@ -1,4 +1,4 @@
-"""Nodes: their values against NumPy, SciPy and radicals, their symmetry, and the errors of wrong arguments."""
+"""Nodes: names, symmetry, closed forms, wrong arguments; their numbers are proved in ``test_proofs.py``."""
 
 import subprocess
 import sys
@@ -7,7 +7,6 @@ from fractions import Fraction
 import numpy as np
 import pytest
 import sympy as sp
-from mpmath import MPContext
 
 import scvi_codegen as sc
 from scvi_codegen.common.precision import mp
@@ -31,35 +30,6 @@ def test_every_family_gives_ascending_points_under_its_name(name: str, degree: i
     assert nodes.contains_ends == (name in ("chebyshev-lobatto", "legendre-lobatto", "equispaced"))
     assert nodes.symmetric == (not name.startswith("radau"))
     assert nodes_by_name(name, degree) is nodes
-
-
-@pytest.mark.second
-@pytest.mark.parametrize("degree", [9, 30])
-def test_legendre_families_are_roots_to_fifty_digits_of_mpmath_polynomials(degree: int) -> None:
-    other = MPContext()
-    other.dps = 90
-    count = degree + 1
-
-    def legendre_slope(x: object) -> object:
-        return (x * other.legendre(degree, x) - other.legendre(degree - 1, x)) * degree
-
-    polynomials = [
-        (legendre_gauss(degree), lambda x: other.legendre(count, x)),
-        (sc.legendre_lobatto(degree), legendre_slope),
-        (radau_left(degree), lambda x: other.legendre(count, x) + other.legendre(degree, x)),
-        (radau_right(degree), lambda x: other.legendre(count, x) - other.legendre(degree, x)),
-    ]
-    width = other.mpf("1e-51")
-    for nodes, polynomial in polynomials:
-        for point in map(other.mpf, nodes.points):
-            if abs(point) < 1:
-                assert polynomial(point - width) * polynomial(point + width) < 0
-
-
-def test_lobatto_and_gauss_points_have_published_digits() -> None:
-    golden = legendre_gauss(9).points[-1]
-    assert abs(golden - mp.mpf("0.97390652851717172007796401208445205342826994669238211923121")) < FIFTY_DIGITS
-    assert abs(sc.legendre_lobatto(4).points[3] - mp.sqrt(mp.mpf(3) / 7)) < FIFTY_DIGITS
 
 
 @pytest.mark.parametrize(

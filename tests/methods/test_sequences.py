@@ -88,18 +88,6 @@ def test_the_map_is_symplectic_and_symmetric():
     assert np.abs(step(step(state), -0.3, 0.3) - state).max() < 1e-15
 
 
-def test_logarithmic_hamiltonian_preserves_the_ellipse():
-    """Mikkola & Tanikawa, Preto & Tremaine: second order in time, while the orbit is exact."""
-    system = hamilton("logarithmic", "x y s", "log((u**2 + v**2)/2 + b) + log(x**2 + y**2)/2", momenta="u v b")
-    e = 0.999
-    q, p = np.array([1 + e, 0.0, 0.0]), np.array([0.0, np.sqrt((1 - e) / (1 + e)), 0.5])
-    run = compiled(system, StoermerVerlet(DRIFTS_FIRST)).integrate(q, p, h=0.1, steps=2000)
-    radius = np.hypot(*run.q[:, :2].T)
-    assert np.abs(radius - e * run.q[:, 0] - (1 - e * e)).max() < 1e-11
-    assert np.diff(run.q[:, 2]).min() > 0.0
-    assert run.q[-1, 2] > 10 * np.pi
-
-
 def test_drift_first_sequences_have_no_discrete_lagrangian():
     stepper = compiled(DUFFING, StoermerVerlet(DRIFTS_FIRST))
     with pytest.raises(MethodError, match="discrete_lagrangian is not available without an action"):

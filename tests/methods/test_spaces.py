@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from notation import lagrange
 
 from scvi_codegen import MethodError, MethodWarning, compile_stepper, problem
 from scvi_codegen.common.precision import mp
@@ -88,30 +87,6 @@ def test_trigonometric_curves_are_exact_on_the_oscillator(degree: int, turn: flo
     system = problem("harmonic-oscillator").system
     run = stepper(system, SVI(degree, space=Trigonometric(turn))).integrate([0.3], [0.8], h=turn, steps=100)
     assert np.abs(run.q[:, 0] - 0.3 * np.cos(run.t) - 0.8 * np.sin(run.t)).max() < 5e-12
-
-
-ORDERS = (
-    (SVI(2, space="splines:2"), 4),
-    (SVI(3, space="splines:2"), 6),
-    (SVI(3, "gauss-lobatto:3", space="splines:2"), 4),
-    (SVI(2, "hermite:2"), 4),
-    (SVI(3, "hermite:2"), 4),
-    (SVI(3, "hermite:3"), 6),
-    (SVI(3, "hermite-2:2"), 6),
-    (SVI(4, "hermite-3:2"), 8),
-)
-
-
-@pytest.mark.tiers(0, 4)
-@pytest.mark.sampled(4)
-@pytest.mark.parametrize(("method", "order"), ORDERS, ids=lambda value: getattr(value, "name", value))
-def test_order_of_methods_on_other_spaces(method: SVI, order: int) -> None:
-    system, start = problem("planar-pendulum").system, ([1.0], [0.3])
-    fine = stepper(system, SVI(10)).integrate(*start, h=0.25, steps=16)
-    steps = (5, 10) if order == 8 else (10, 20)
-    errors = [final_error(system, method, start, h=4 / n, steps=n, reference=fine.q[-1]) for n in steps]
-    assert method.order == order
-    assert np.log2(errors[0] / errors[1]) > order - 0.45
 
 
 @pytest.mark.second
@@ -212,40 +187,3 @@ def test_hermite_rules_by_name() -> None:
 
 
 # Where each wins.
-
-
-@pytest.mark.full
-def test_trigonometric_curves_are_more_accurate_on_a_perturbed_oscillator() -> None:
-    """Henon-Heiles at small energy, one step a radian: a thousandth of the error of polynomials of the same degree."""
-    system, start = problem("henon-heiles").system, ([0.05, 0.02], [0.03, 0.06])
-    fine = stepper(system, SVI(12)).integrate(*start, h=0.25, steps=800)
-    errors = [
-        final_error(system, method, start, h=1.0, steps=200, reference=fine.q[-1])
-        for method in (SVI(4, space=Trigonometric(1.0)), SVI(4, "gauss-legendre:10"))
-    ]
-    assert errors[0] < 1e-9 < 1e-7 < errors[1]
-
-
-@pytest.mark.full
-def test_splines_are_more_accurate_where_a_force_has_a_kink() -> None:
-    """A triangular wave drives a pendulum; its kinks lie in the middle of the steps, where the splines have theirs."""
-    system = lagrange("kinked drive", "q", "q_dot**2/2 + cos(q) + q*asin(sin(t))/5")
-    start, h = ([0.5], [0.0]), np.pi
-    fine = stepper(system, SVI(8)).integrate(*start, h=h / 16, steps=16 * 8)
-    errors = [
-        final_error(system, method, start, h=h, steps=8, reference=fine.q[-1])
-        for method in (SVI(8, space="splines:2"), SVI(15, "gauss-legendre:16"))
-    ]
-    assert errors[0] < errors[1] / 1e4
-
-
-@pytest.mark.full
-def test_hermite_is_more_accurate_with_two_points_per_step() -> None:
-    """With L at the ends of a step only, derivatives along the curve give order 8 instead of 2."""
-    system, start = problem("planar-pendulum").system, ([1.0], [0.0])
-    fine = stepper(system, SVI(12)).integrate(*start, h=0.25, steps=80)
-    errors = [
-        final_error(system, method, start, h=0.5, steps=40, reference=fine.q[-1])
-        for method in (SVI(4, "hermite-3:2"), SVI(2, "gauss-legendre:2"), SVI(2, "gauss-lobatto:2"))
-    ]
-    assert errors[0] < 1e-7 < 5e-5 < errors[1] < errors[2]

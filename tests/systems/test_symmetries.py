@@ -150,6 +150,7 @@ def test_magnetic_fields_have_gauges():
     assert found["momentum of x"].direction == (1, 0, 0)
 
 
+@pytest.mark.tiers(1)
 @pytest.mark.parametrize("axes", ["xy", "xyz"])
 @pytest.mark.parametrize("gravity", [False, True])
 def test_three_bodies_have_the_full_galilean_group(axes, gravity):
@@ -394,24 +395,6 @@ def test_symmetry_of_another_system_or_with_a_used_name_is_rejected():
 # Compiled, tracked, shown.
 
 
-@pytest.mark.second
-def test_values_agree_with_the_formulas(quickly_compiled):
-    system = magnetic()
-    stepper = quickly_compiled(system, sc.SVI(2))
-    generator = np.random.default_rng(1)
-    q, p, t = generator.uniform(-1, 1, (5, 3)), generator.uniform(-1, 1, (5, 3)), generator.uniform(-1, 1, 5)
-    values = stepper.momentum_maps(q, p, t, {"m": 2.5})
-    assert values.shape == (5, 5)
-    assert stepper.momentum_map_names == tuple(symmetry.name for symmetry in symmetries(system))
-    constants = system.with_parameters(m=2.5).constants
-    for k, symmetry in enumerate(symmetries(system)):
-        for n in range(5):
-            at = dict(zip((*symmetry.coordinates, *symmetry.momenta), (*q[n], *p[n]), strict=True))
-            exact = symmetry.momentum_map.subs(at | {symmetry.time: t[n]} | constants)
-            assert values[n, k] == pytest.approx(float(exact), rel=1e-13)
-    assert np.array_equal(stepper.momentum_maps(q[0], p[0], t[0], {"m": 2.5}), values[0])
-
-
 def test_without_symmetries_no_code_is_generated(quickly_compiled):
     entry = sc.problem("henon-heiles")
     stepper = quickly_compiled(entry.system, sc.SVI(2))
@@ -500,13 +483,6 @@ def test_supplied_generator_is_tracked(quickly_compiled):
     assert 0 < np.abs(run.momentum_errors()[:, 1]).max() < 1e-11
 
 
-def test_headers_list_conserved_quantities():
-    source, interface = sc.generate_source(magnetic(), sc.RadauIIA(2))
-    assert " *   momentum of x = p_x - B*e*y - E*e*t\n" in source.header
-    assert " *   boost of z = m*z - p_z*t (not guaranteed by this method)\n" in source.header
-    assert interface.map_formulas[0] == "p_x - B*e*y - E*e*t"
-
-
 def test_free_hamiltonians_without_lagrangian():
     system = sc.HamiltonianSystem.from_text(name="shear", coordinates=["q"], hamiltonian="p_q*c", parameters={"c": 2.0})
     assert set(formulas(system).values()) >= {"p_q"}
@@ -542,26 +518,6 @@ def test_no_claims_for_one_forms_with_velocity_dependent_forces():
     own = Gauge(**{each.name: getattr(plain, each.name) for each in fields(plain) if each.init})
     assert symmetries(plain) != ()
     assert symmetries(own) == ()
-
-
-def test_the_lagrangian_changes_by_the_rate_of_the_gauge():
-    """Noether's condition xi . L_q + xi' . L_v = df/dt, and J = p . xi - f, from the definition."""
-    system = lagrange("falling pair", "x y", "(3*x_dot**2 + 2*y_dot**2)/2 - (x - y)**2/2 - g*(3*x + 2*y)", g=2.0)
-    q, v, t = system.coordinates, system.velocities, system.time
-    found = symmetries(system)
-    assert any(each.gauge != 0 for each in found)
-
-    def rate(f):
-        return f.diff(t) + sum(f.diff(x) * u for x, u in zip(q, v, strict=True))
-
-    for each in found:
-        change = sum(
-            xi * system.lagrangian.diff(x) + rate(xi) * system.lagrangian.diff(u)
-            for xi, x, u in zip(each.direction, q, v, strict=True)
-        )
-        assert sympy.expand(change - rate(each.gauge)) == 0
-        carried = sum(p * xi for p, xi in zip(each.momenta, each.direction, strict=True))
-        assert sympy.expand(each.momentum_map - carried + each.gauge) == 0
 
 
 def test_momentum_map_of_rounding_errors_is_compared_with_its_bound():
