@@ -111,7 +111,7 @@ def default_method(system: MechanicalSystem) -> Method:
 
 def fitted(specification: Specification, system: MechanicalSystem | None) -> Specification:
     """Add the default quadrature of an SVI for constraints: Gauss-Lobatto points, one more than the degree."""
-    wants = system is not None and system.constrained and specification.get("method") == "svi"
+    wants = system is not None and system.constrained_at_nodes and specification.get("method") == "svi"
     if not wants or "quadrature" in specification or "degree" not in specification:
         return specification
     return {**specification, "quadrature": f"gauss-lobatto:{int(str(specification['degree'])) + 1}"}

@@ -145,7 +145,7 @@ def _compile_arrays(
         raise MethodError(f"symmetries= is unavailable for '{system.name}': {SIZES_REQUIRED}")
     if precision == DOUBLE_DOUBLE:
         raise MethodError("precision='double-double' is not available with arrays of run-time sizes: pass sizes={..}")
-    discretisation = as_method(method)
+    discretisation = as_method(method, system)
     solver, prefix, g, controller = (common[name] for name in ("solver", "prefix", "time_transformation", "controller"))
     sources = CachedArraySources(system, discretisation, solver, prefix, (), g, controller)
     source, interface, reason = sources.of_run_time_sizes()

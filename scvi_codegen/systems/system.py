@@ -228,8 +228,8 @@ class MechanicalSystem(Deferred, ABC):
         return zero()
 
     @property
-    def constrained(self) -> bool:
-        """True if there are constraints; reads no formulas."""
+    def constrained_at_nodes(self) -> bool:
+        """True if there are constraints, which an SVI imposes at its nodes; reads no formulas."""
         return bool(self.constraints if self._text is None else json.loads(self._text)[1]["constraints"])
 
     @property
@@ -241,6 +241,11 @@ class MechanicalSystem(Deferred, ABC):
     def is_canonical(self) -> bool:
         """False if the momenta of a first-order system are functions of its variables."""
         return True
+
+    @property
+    def sizes(self) -> tuple[str, ...]:
+        """Names of the sizes of arrays that each run determines; none of named coordinates."""
+        return ()
 
     @property
     def mesh(self) -> Any:

@@ -179,7 +179,7 @@ def test_unread_system_equals_one_that_is_read(made):
     for name in ("coordinates", "lagrangian", "defaults"):  # slots without a value
         with pytest.raises(AttributeError):
             object.__getattribute__(unread, name)
-    assert not unread.constrained
+    assert not unread.constrained_at_nodes
     again = pickle.loads(pickle.dumps(unread))
     assert unread == first == again == copy.copy(unread) == replace(unread)
     assert hash(unread) == hash(first)

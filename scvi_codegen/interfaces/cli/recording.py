@@ -165,8 +165,8 @@ class Recording:
                     )
                 steps = whole_steps_in(span, h, manifest.t)
         plan = manifest.steps if steps is None else steps
-        if manifest.model is not None and (system := parse_model(manifest.model).array_system):
-            further["mesh"] = system.mesh
+        if manifest.model is not None:
+            further["mesh"] = parse_model(manifest.model).system.mesh
         return self._with_progress(resume_run, Path(folder), first=recorded.steps, steps=plan, **further)
 
     def _with_progress(

@@ -195,7 +195,7 @@ def derive(
         from scvi_codegen.systems.legendre.of_arrays import site_hamiltonian
 
         sites = site_hamiltonian(system) if system.coupled_terms else None
-        return ArrayStepEquations(sites.system if sites else system, as_method(method))
+        return ArrayStepEquations(sites.system if sites else system, as_method(method, system))
     method = as_method(method, system)
     system = discretised_form(system, method)
     if inner_of(system.formula):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from scvi_codegen.codegen.lowering.arrays import check_solver, one_coordinate
+from scvi_codegen.codegen.lowering.arrays import check_solver
 from scvi_codegen.common.display.cards import Html, card, listed, plain
 from scvi_codegen.common.errors import ModelFileError, StateError
 from scvi_codegen.common.representation import summary
@@ -116,28 +116,19 @@ class Model(TimeSpan):
 
     def __post_init__(self) -> None:
         check_kind(SYSTEM_OR_ARRAYS, self.system, "system", ModelFileError)
-        arrays = self.array_system
-        if arrays is not None and self.mesh is None:
-            object.__setattr__(self, "mesh", arrays.mesh)
+        if self.mesh is None:
+            object.__setattr__(self, "mesh", self.system.mesh)
         object.__setattr__(self, "page", _with_lists(self.page))
         object.__setattr__(self, "path", {key: checked_path_value(key, each) for key, each in self.path.items()})
         object.__setattr__(self, "picture", _with_lists(self.picture))
-        object.__setattr__(self, "method", as_method(self.method, one_coordinate(arrays) if arrays else self.system))
+        object.__setattr__(self, "method", as_method(self.method, self.system))
         if isinstance(self.system, FirstOrderSystem) and self.p is self.velocity is None:
             for name, half in zip(("q", "p"), self.system.halves(self.q), strict=True):
                 object.__setattr__(self, name, half)
-        if arrays is None:
-            self._take_attitudes()
-            check_alternatives(self, VELOCITY)
-            if self.threads is not None:
-                raise ModelFileError(
-                    "threads require arrays whose sizes are names, coordinates = ['q[N]']: omit threads (--threads)"
-                )
-            for name in STATE.values():
-                if (vector := getattr(self, name)) is not None:
-                    object.__setattr__(self, name, self._vector(name, vector))
-        else:
+        if (arrays := self.array_system) is not None:
             self._take_arrays(arrays)
+        else:
+            self._take_vectors()
         if self.time_transformation is not None and (self.system.clock is not None or self.span is None):
             raise ModelFileError(
                 f"the reversible controller of the time transformation {self.time_transformation} requires a time "
@@ -148,6 +139,18 @@ class Model(TimeSpan):
             from scvi_codegen.interfaces.models.input_tables import checked_tables  # not needed for reading a model
 
             object.__setattr__(self, "inputs", checked_tables(self.system, self.inputs))
+
+    def _take_vectors(self) -> None:
+        """Check the fields of a model of named coordinates, whose state becomes numbers in order."""
+        self._take_attitudes()
+        check_alternatives(self, VELOCITY)
+        if self.threads is not None:
+            raise ModelFileError(
+                "threads require arrays whose sizes are names, coordinates = ['q[N]']: omit threads (--threads)"
+            )
+        for name in STATE.values():
+            if (vector := getattr(self, name)) is not None:
+                object.__setattr__(self, name, self._vector(name, vector))
 
     def _take_attitudes(self) -> None:
         """Replace a state by name of rotations, directions and spins by that of all coordinates."""
@@ -202,21 +205,16 @@ class Model(TimeSpan):
     @property
     def array_system(self) -> ArraySystem | None:
         """The system if it has arrays whose sizes are known at run time only, else ``None``."""
-        return self.arrays_of(self.system)
-
-    @staticmethod
-    def arrays_of(system: Any) -> ArraySystem | None:
-        """Return a system if it has arrays whose sizes are known at run time only, else ``None``."""
-        return system if isinstance(system, ArraySystem) else None
+        return self.system if isinstance(self.system, ArraySystem) else None
 
     @property
     def sizes(self) -> dict[str, int]:
         """Array sizes known at run time, by name; empty for a system of named coordinates."""
-        if (system := self.array_system) is None:
+        if not self.system.sizes:
             return {}
         of_rotations = {name: each.as_quat() for name, each in self.q.items() if hasattr(each, "as_quat")}
         known = {**self.q, **self.fields, **self.tables, **of_rotations}
-        arrays = [array for array in system.arrays if array.name in known]
+        arrays = [array for array in self.system.arrays if array.name in known]
         axes = [(array, np.shape(known[array.name])) for array in arrays]
         return {size.name: length for array, shape in axes for size, length in zip(array.axes, shape) if size.name}  # noqa: B905
 
@@ -255,12 +253,12 @@ class Model(TimeSpan):
     @property
     def in_transformed_time(self) -> bool:
         """True if the system moves in fictitious time tau."""
-        return self.array_system is None and self.system.clock is not None
+        return self.system.clock is not None
 
     @property
     def parameters(self) -> dict[str, Any]:
         """Parameters by name: the system's defaults, without the energy of a transformation and inputs; and fields."""
-        clock = None if self.array_system else self.system.clock
+        clock = self.system.clock
         others = {clock.energy.name if clock else "", *input_parameters(self.system.inputs)}
         constants = zip(self.system.parameters, self.system.defaults, strict=True)
         return {**{symbol.name: value for symbol, value in constants if symbol.name not in others}, **self.fields}

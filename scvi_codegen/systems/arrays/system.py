@@ -367,6 +367,11 @@ class ArraySystem(OfRunTimeSizes, MechanicalSystem):
         return tuple(dict.fromkeys(chain(*(array.names for array in self.arrays))))
 
     @property
+    def constrained_at_nodes(self) -> bool:
+        """False: steps of arrays with constraints are those of RATTLE."""
+        return False
+
+    @property
     def auxiliaries(self) -> tuple[Array, ...]:
         """Momenta."""
         return self.momenta
@@ -544,9 +549,8 @@ class ArraySystem(OfRunTimeSizes, MechanicalSystem):
             if len(kinetic) == 1:  # masses of several loops are added where these meet
                 (mass,) = masses_of(kinetic[0], this)
                 uniform = {slot: symbol(access.array.name) for slot, access in mass.slots}
-                warn_of_negative(
-                    self.name, {f"d2{self.function[0]}/d{name}2": mass.targets[0][1].xreplace(uniform)}, values
-                )
+                second = {f"d2{self.function[0]}/d{name}2": mass.targets[0][1].xreplace(uniform)}
+                warn_of_negative(self.name, second, values)
 
     def _check_names(self) -> None:
         check_names(*([each.name for each in group] for group in (self.positions, self.parameters, self.momenta)))

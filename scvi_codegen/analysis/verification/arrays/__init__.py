@@ -21,7 +21,6 @@ from scvi_codegen.analysis.verification.impacts import impact_checks
 from scvi_codegen.analysis.verification.stepping import step_checks
 from scvi_codegen.analysis.verification.structure import structure_checks
 from scvi_codegen.analysis.verification.system_under_test import State, SystemUnderTest
-from scvi_codegen.codegen.lowering.arrays import one_coordinate
 from scvi_codegen.codegen.rendering.source import Interface
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.methods import SVI, StoermerVerlet, as_method
@@ -65,7 +64,7 @@ def verify_arrays(
     if stepper is not None and not stepper.run_time_sizes:
         raise StateError(f"stepper must be one of run-time sizes, not {stepper!r}: compile it without sizes")
     began = time.perf_counter()
-    chosen = as_method(method, one_coordinate(system))
+    chosen = as_method(method, system)
     watched = stepper or compile_stepper(system, chosen)
     stepper = watched.with_events(())
     run = stepper.start(q, p, h=h, t=t, **arrays_of_run)

@@ -52,8 +52,8 @@ def derive(model_name: str, latex: bool, radicals: bool, output: str | None, htm
         return
     equations = derive_equations(model.system, model.method, radicals=radicals)
     text = equations.to_latex() if latex else equations.to_text()
-    if not latex and model.array_system is not None and model.array_system.mesh is not None:
-        text = f"{derivation_of(model.array_system.mesh.field_system, model.array_system).to_text()}\n{text}"
+    if not latex and (mesh := model.system.mesh) is not None:
+        text = f"{derivation_of(mesh.field_system, model.system).to_text()}\n{text}"
     if not latex and model.events:
         text += f"\n{events_text(model.events, model.system)}\n"
     formulas = _formulas(equations) if isinstance(equations, StepEquations) else {}

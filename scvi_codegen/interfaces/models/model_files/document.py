@@ -26,7 +26,7 @@ LONG_ARRAY = 1000
 
 def document_of(model: Model, *, as_arrays: bool = True) -> dict[str, Any]:
     """Return all sections, in the order of a file; ``as_arrays``: with the arrays that the system was read with."""
-    clock = None if model.array_system else model.system.clock
+    clock = model.system.clock
     system = clock.plain if clock and clock.plain else model.system
     document, parameters, motion = _system_and_state(model, system, as_arrays=as_arrays)
     if g := clock.time_transformation if clock else model.time_transformation:
@@ -53,18 +53,18 @@ def _system_and_state(
     model: Model, system: MechanicalSystem, *, as_arrays: bool
 ) -> tuple[dict[str, Any], Mapping[str, Any], dict[str, Any]]:
     """Return the sections of the system, its parameters, and the sections of :func:`motion_of`."""
-    names = [] if model.array_system else [coordinate.name for coordinate in system.coordinates]
-    if model.array_system and not system.definition:
+    names = [coordinate.name for coordinate in system.coordinates]
+    if system.sizes and not system.definition:
         raise ModelFileError(f"'{system.name}' was not read from text: give its formula to from_text to write a file")
     motion = motion_of(model, names)
     if isinstance(system, FirstOrderSystem):
         state = {"t": model.t, "q": system.joined(model.q, model.p)}
         return _definition(system), model.parameters, motion | {"initial": state}
-    if system.definition and not model.array_system and system.rotations:
+    if system.definition and system.rotations and not system.sizes:
         return _of_rotations(system), model.parameters, motion
     if as_arrays and system.definition:
         state = {"t": model.t, **_state_by_array(model, names)}
-        if model.array_system is not None and (mesh := model.array_system.mesh) is not None:
+        if (mesh := system.mesh) is not None:
             numbers = {name: value for name, value in model.parameters.items() if name not in model.fields}
             return {"field": mesh.to_section()}, numbers, motion | {"initial": state}
         return _definition(system), _declared_parameters(model), motion | {"initial": state}

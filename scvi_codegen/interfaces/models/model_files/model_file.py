@@ -14,7 +14,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from scvi_codegen.codegen.lowering.arrays import one_coordinate
 from scvi_codegen.codegen.rendering.source import DOUBLE_DOUBLE
 from scvi_codegen.common.atomic import naming_folders, write_text
 from scvi_codegen.common.errors import ModelFileError, SystemDefinitionWarning
@@ -165,7 +164,7 @@ def _written(model: Model, stem: str | None) -> dict[str, str]:
     import tomli_w  # imported here: not needed for reading
 
     part = "system"
-    for as_arrays in (True, False) if model.array_system is None else (True,):  # a derived system has another form
+    for as_arrays in (True,) if model.system.sizes else (True, False):  # a derived system has another form
         document = in_section("[system]", partial(document_of, model, as_arrays=as_arrays))
         shortened, files = (document, {}) if stem is None else with_files(document, stem)
         text = tomli_w.dumps(shortened, multiline_strings=True)
@@ -207,8 +206,7 @@ def _read_model(document: Document, changes: Document, folder: str | os.PathLike
         else:
             system = read_system(document, entry and entry.system)
         system, values = read_values(document, system, folder)
-    arrays = Model.arrays_of(system)
-    method = read_method(fitted(specification, one_coordinate(arrays) if arrays else system))
+    method = read_method(fitted(specification, system))
     values |= {"inputs": _read_inputs(document.get("inputs", {}), folder), "solver": solver}
     events = read_events(document.get("events", []))
     values |= {name: document.get(name, {}) for name in ("path", "page", "picture")} | read_run(document["run"])
@@ -250,14 +248,14 @@ def _with_time_transformation(model: Model, document: Document, specification: S
         system, g = in_section(where, lambda: with_time_transformation(model.system, g, controller))
         default = default_controller(in_tau=g is not None)
         controller = None if controller in (SYMPLECTIC, default) else controller
-        method = model.method if model.array_system else read_method(fitted(specification, system))
+        method = read_method(fitted(specification, system))
         model = replace(model, system=system, method=method, time_transformation=g, controller=controller)
     others = map(symbol, words_of(document))
+    rescaling = [] if g is None else [time_rescaling_function(model.system, g, in_time=True)]
     if model.array_system is not None:
         model.array_system.warn_of_mistakes(others)
-        return model
-    rescaling = [] if g is None else [time_rescaling_function(model.system, g, in_time=True)]
-    warn_of_mistakes(model.system, (*others, *rescaling))
+    else:
+        warn_of_mistakes(model.system, (*others, *rescaling))
     return model
 
 

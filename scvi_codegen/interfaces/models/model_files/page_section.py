@@ -71,10 +71,9 @@ def drawn_system_of_model(model: Model) -> DrawnSystem:
     system, scalars = model.system, [name for name, value in model.parameters.items() if np.ndim(value) == 0]
     if model.array_system is not None:
         interface = SimpleNamespace(coordinates=[], parameters=scalars, rotations=[], constraints=[], map_names=[])
-        lengths = [length for each in model.array_system.neighbours for length in each.lengths]
         sized = {name: np.shape(values) for name, values in model.q.items()}
         return DrawnSystem(
-            interface=interface, momenta=[], shapes=sized, mesh=model.mesh, lengths=lengths, tables=model.tables
+            interface=interface, momenta=[], shapes=sized, mesh=model.mesh, lengths=system.lengths, tables=model.tables
         )
     interface = SimpleNamespace(
         coordinates=[each.name for each in system.coordinates], parameters=[each.name for each in system.parameters],
