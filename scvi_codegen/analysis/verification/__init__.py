@@ -128,16 +128,16 @@ def _certificate(
     solver: str,
     tolerance: float | None,
 ) -> Certificate:
-    flags, watched, stepper = stepper.flags, stepper, stepper.with_events(())
+    flags, with_events, stepper = stepper.flags, stepper, stepper.with_events(())
     steps, single = stepper, at_fixed_energy(system, stepper.energy(start.q, start.p, start.t))
     if single is not system or stepper.interface.time_transformation is not None:
         steps = compile_stepper(single, method, solver=solver, flags=flags)
     tested = SystemUnderTest(single, method, steps, _newton(single, method, steps, solver, flags), start)
-    paced = steps is not stepper or tolerance is not None
+    variable = steps is not stepper or tolerance is not None
     in_time = system.clock.plain if system.clock and system.clock.plain else system
     runs = VariableSteps(tested, stepper, in_time, system, tolerance)
     checks = (
-        *(variable_step_checks(runs) if paced else ()),
+        *(variable_step_checks(runs) if variable else ()),
         *step_checks(tested),
         *predictor_checks(tested),
         *(() if system.constraints else roundoff_checks(tested)),
@@ -146,7 +146,7 @@ def _certificate(
         *(time_transformation_derivative_checks(runs) if system.clock else ()),
         *convergence_checks(tested),
         *identity_checks(tested),
-        *impact_checks(tested, watched),
+        *impact_checks(tested, with_events),
         largest_step(tested),
     )
     parameters = {name.name: value for name, value in single.constants.items()}

@@ -74,7 +74,7 @@ def _solves(tested: SystemUnderTest, stepper: Stepper) -> Finding:
     for index, state in enumerate(tested.states):
         expected = tested.solved(index)
         try:
-            worst = max(worst, _distance(tested, state, tested.ends(state, stepper), expected))
+            worst = max(worst, tested.in_roundings(tested.ends(state, stepper) - _joined(expected), state))
         except StepFailedError as failure:
             raise ViolationError(f"the equations have a solution, but {failure}") from failure
     return Finding(worst, ROUNDINGS, "in units of rounding, 2 states")
@@ -84,19 +84,13 @@ def _agree(tested: SystemUnderTest) -> Finding | None:
     """Compare the stepper under test with Newton's method; applies to large systems, too."""
     if tested.newton is None or tested.newton is tested.stepper:
         return None
-    worst = 0.0
-    for _, state, rounding in tested.roundings():
-        change = np.abs(tested.ends(state) - tested.ends(state, tested.newton))
-        worst = max(worst, float(np.max(change / rounding)))
+    differences = (tested.ends(state) - tested.ends(state, tested.newton) for state in tested.states)
+    worst = max(map(tested.in_roundings, differences, tested.states))
     return Finding(worst, ROUNDINGS, "in units of rounding, 2 states")
 
 
-def _distance(tested: SystemUnderTest, state: State, end: Array, expected: SolvedStep) -> float:
-    """Return the largest difference from the step in 60 digits, in units of rounding."""
-    return float(np.max(np.abs(end - _joined(expected).astype(float)) / tested.rounding(state)))
-
-
 def _joined(step: SolvedStep) -> Numbers:
+    """Return the end (q, p) of a step in 60 digits."""
     return np.array([*step.q, *step.p], dtype=object)
 
 
@@ -137,9 +131,8 @@ def _fallback(tested: SystemUnderTest) -> Finding | None:
             if iterations <= most + 1:  # the iterations converged
                 break
             expected = tested.derived()(state.q, state.p, state.h, state.t)
-            return Finding(
-                _distance(tested, state, end, expected), ROUNDINGS, f"in units of rounding, h = {state.h:.3g}"
-            )
+            distance = tested.in_roundings(end - _joined(expected), state)
+            return Finding(distance, ROUNDINGS, f"in units of rounding, h = {state.h:.3g}")
     raise StateError("the fallback was not reached: the fixed-point iteration converges as fast as Newton's method")
 
 
@@ -165,13 +158,11 @@ def _run(tested: SystemUnderTest) -> Finding:
 
 
 def _run_of(tested: SystemUnderTest, stepper: Stepper) -> float:
-    first, worst = tested.states[0], 0.0
+    first, z = tested.states[0], np.concatenate
     run = stepper.integrate(first.q, first.p, h=first.h, steps=RUN_STEPS, t=first.t, parameters=tested.parameters)
-    for k in SAMPLED_STEPS:
-        state = State(run.q[k], run.p[k], float(run.t[k]), first.h)
-        change = np.abs(tested.ends(state) - np.concatenate([run.q[k + 1], run.p[k + 1]]))
-        worst = max(worst, float(np.max(change / tested.rounding(state))))
-    return worst
+    starts = [State(run.q[k], run.p[k], float(run.t[k]), first.h) for k in SAMPLED_STEPS]
+    ends = [z([run.q[k + 1], run.p[k + 1]]) for k in SAMPLED_STEPS]
+    return max(tested.in_roundings(tested.ends(start) - end, start) for start, end in zip(starts, ends, strict=True))
 
 
 def _action(tested: SystemUnderTest) -> Finding | None:

@@ -82,13 +82,16 @@ def _symplecticity(tested: SystemUnderTest) -> Finding:
     return worst
 
 
+def _normalised_states(tested: SystemUnderTest, reduction: Reduction) -> list[State]:
+    return [State(*reduction.normalised(state.q, state.p), state.t, state.h) for state in tested.states]
+
+
 def _reduced_symplecticity(tested: SystemUnderTest) -> Finding:
     """Return the largest defect of the symplectic form in canonical coordinates of the reduced space."""
     reduction, worst = Reduction(tested.stepper.interface), 0.0
     half = reduction.size // 2
     form = np.kron([[0.0, 1.0], [-1.0, 0.0]], np.eye(half))
-    for each in tested.states:
-        state = State(*reduction.normalised(each.q, each.p), each.t, each.h)
+    for state in _normalised_states(tested, reduction):
         derivative = tested.stepper.jacobian(state.q, state.p, state.h, state.t, tested.parameters)
         step = reduction.outward(*tested.step(state)) @ derivative @ reduction.inward(state.q, state.p)
         units = EPSILON * (np.abs(step.T) @ np.abs(form) @ np.abs(step)).max()
@@ -98,14 +101,13 @@ def _reduced_symplecticity(tested: SystemUnderTest) -> Finding:
 
 def _gauge_invariance(tested: SystemUnderTest) -> Finding:
     reduction, worst = Reduction(tested.stepper.interface), 0.0
-    for each in tested.states:
-        state = State(*reduction.normalised(each.q, each.p), each.t, each.h)
+    for state in _normalised_states(tested, reduction):
         z = state.q + 1j * state.p
         for member in reduction.members:
             part = z[member.columns]
             z[member.columns] = part * PHASE if member.kind == "spin" else part.real * LENGTH + 1j * part.imag / LENGTH
         other, end = tested.ends(State(z.real, z.imag, state.t, state.h)), tested.ends(state)
-        worst = max(worst, float(np.max(np.abs(reduction.aligned(other, end) - end) / tested.rounding(state))))
+        worst = max(worst, tested.in_roundings(reduction.aligned(other, end) - end, state))
     return Finding(worst, ROUNDINGS, "in units of rounding, 2 states")
 
 
@@ -132,8 +134,8 @@ def _constraints(tested: SystemUnderTest) -> Finding:
         units = EPSILON * np.maximum(np.abs(state.z), tested.scales(state))
         partials = np.abs(tested.constraint_derivatives(state, units / EPSILON)).sum(axis=1) + _by_time(tested, state)
         values = np.abs(np.concatenate(stepper.constraint_values(state.q, state.p, state.t, parameters)))
-        message = partials > 0.0  # a constraint on velocities has no position residual
-        worst = max(worst, float(np.max(values[message] / (EPSILON * partials[message]))))
+        varying = partials > 0.0  # a constraint on velocities has no position residual
+        worst = max(worst, float(np.max(values[varying] / (EPSILON * partials[varying]))))
     return Finding(worst, ROUNDINGS, f"in units of rounding, steps of {first.h:g}")
 
 
@@ -161,9 +163,9 @@ def _multipliers(tested: SystemUnderTest) -> Finding:
 
 def _reversal(tested: SystemUnderTest) -> Finding:
     worst = 0.0
-    for _, state, rounding in tested.roundings():
+    for state in tested.states:
         q, p = tested.step(state)
-        back = State(q, p, state.t + state.h, -state.h)
+        back, rounding = State(q, p, state.t + state.h, -state.h), tested.rounding(state)
         around = tested.linearised(back)
         noise = tested.rounding(back) + (rounding if around is None else around.propagated(rounding))
         worst = max(worst, float(np.max(np.abs(tested.ends(back) - state.z) / noise)))

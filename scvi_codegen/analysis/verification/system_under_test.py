@@ -1,6 +1,6 @@
 """System under test: the stepper, a stepper with Newton's method alone, generic states, and rounding of a step."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -341,10 +341,9 @@ class SystemUnderTest:
             self._solved[index] = derived(*known)
         return self._solved[index]
 
-    def roundings(self) -> Iterator[tuple[int, State, Array]]:
-        """Yield each state with its index and rounding error."""
-        for index, state in enumerate(self.states):
-            yield index, state, self.rounding(state)
+    def in_roundings(self, difference: Array, state: State) -> float:
+        """Return the largest entry of a (2m,) difference of ends of a step, in units of rounding of this step."""
+        return float(np.max(np.abs(difference) / self.rounding(state)))
 
 
 def _rms(values: Array) -> float:

@@ -139,12 +139,13 @@ def _adaptive_checks(runs: VariableSteps) -> Iterator[tuple[str, str, Any]]:
 
 
 def _at_their_energy(runs: VariableSteps) -> Finding:
-    worst = 0.0
-    for _, state, rounding in runs.tested.roundings():
-        result = runs.stepper.step(state.q, state.p, state.h, state.t, runs.parameters)
-        expected = runs.tested.stepper.step(state.q, state.p, state.h, state.t, runs.at_energy(state))
-        worst = max(worst, float(np.max(np.abs(np.concatenate(result) - np.concatenate(expected)) / rounding)))
-    return Finding(worst, ROUNDINGS, "in units of rounding, 2 states")
+    deviations = []
+    for state in runs.tested.states:
+        start = state.q, state.p, state.h, state.t
+        end = np.concatenate(runs.stepper.step(*start, runs.parameters))
+        expected = np.concatenate(runs.tested.stepper.step(*start, runs.at_energy(state)))
+        deviations.append(runs.tested.in_roundings(end - expected, state))
+    return Finding(max(deviations), ROUNDINGS, "in units of rounding, 2 states")
 
 
 def _in_time(runs: VariableSteps) -> Finding:
@@ -182,9 +183,9 @@ def _there_and_back(runs: VariableSteps) -> Finding:
     how: dict[str, Any] = {"steps": THERE_AND_BACK, "save_every": THERE_AND_BACK, "parameters": runs.at_energy(first)}
     there = runs.stepper.integrate(first.q, first.p, h=first.h, t=first.t, **how)
     back = runs.stepper.integrate(there.q[-1], there.p[-1], h=-first.h, t=float(there.t[-1]), **how)
-    change = np.abs(np.concatenate([back.q[-1], back.p[-1]]) - first.z) / runs.tested.rounding(first)
+    change = runs.tested.in_roundings(np.concatenate([back.q[-1], back.p[-1]]) - first.z, first)
     late = abs(float(back.t[-1]) - first.t) / (EPSILON * (abs(float(there.t[-1])) + abs(first.t)))
-    return Finding(max(float(change.max()), late) / THERE_AND_BACK, ROUNDINGS, "in units of rounding per step")
+    return Finding(max(change, late) / THERE_AND_BACK, ROUNDINGS, "in units of rounding per step")
 
 
 def _adaptive_run(runs: VariableSteps, part: float = 1.0) -> Trajectory:
@@ -226,8 +227,8 @@ def _density_deviation(runs: VariableSteps, run: Trajectory, tau: float) -> floa
     tape, g = Tape([rate], symbols), []
     for q, p, t in zip(run.q, run.p, run.t, strict=True):
         g += tape([*numbers(q), *numbers(p if system.auxiliaries else ()), mp.mpf(float(t)), *parameters])
-    wanted = tau * (np.array(g[1:-1], dtype=float) + np.array(g[:-2], dtype=float)) / 2
-    return float(np.max(np.abs(np.diff(run.t)[:-1] / wanted - 1)))
+    tau_g = tau * (np.array(g[1:-1], dtype=float) + np.array(g[:-2], dtype=float)) / 2
+    return float(np.max(np.abs(np.diff(run.t)[:-1] / tau_g - 1)))
 
 
 def _reversed(runs: VariableSteps) -> Finding:
@@ -237,8 +238,8 @@ def _reversed(runs: VariableSteps) -> Finding:
     run.record()
     back = runs.stepper.from_checkpoint(run.checkpoint(), h=runs.tau, t_end=first.t, parameters=runs.parameters)
     back.record()
-    change = np.abs(np.concatenate([back.q, back.p]) - first.z) / runs.tested.rounding(first)
-    return Finding(float(change.max()) / run.steps, ROUNDINGS, f"in units of rounding per step, {run.steps} steps")
+    change = runs.tested.in_roundings(np.concatenate([back.q, back.p]) - first.z, first)
+    return Finding(change / run.steps, ROUNDINGS, f"in units of rounding per step, {run.steps} steps")
 
 
 def _within_tolerance(runs: VariableSteps) -> Finding:
