@@ -16,13 +16,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import sympy
 
 from scvi_codegen.codegen.rendering.environment import template_environment
+from scvi_codegen.codegen.rendering.source import Interface, Source
 from scvi_codegen.common.atomic import write_text
 from scvi_codegen.common.display.mathml import mathml_terms
 from scvi_codegen.common.errors import ArgumentError, ExpressionError, MethodError, StateError, closest
@@ -37,10 +37,12 @@ from scvi_codegen.interfaces.models.model_files.page_section import (
     drawn_system_of_model,
     starts_from_momenta,
 )
-from scvi_codegen.interfaces.models.packages.package import generate_package
+from scvi_codegen.interfaces.models.packages.example import absolute_tolerances_of, check_example
+from scvi_codegen.interfaces.models.packages.package import integrator_of
 from scvi_codegen.interfaces.pages.webassembly import LICENCES, check_compiler, webassembly
 from scvi_codegen.interfaces.pictures.recognition import shape_of
 from scvi_codegen.interfaces.pictures.shape import DrawnSystem, shape_of_picture
+from scvi_codegen.runs.stepping.array_interface import read_arrays
 from scvi_codegen.systems.formulas.grammar import parse_expression
 from scvi_codegen.systems.formulas.rotations import Rotation, RotationNames, Spin
 from scvi_codegen.systems.formulas.symbols import input_parameters, symbol
@@ -61,7 +63,8 @@ CAUSES = (
     "The step failed: it has too many events. Use a smaller step size.",
 )
 """Text of each status of the generated C, then of ``entry.c.jinja``."""
-ARRAY = re.compile(r"(\w+)\[")
+PREFIX = "motion"
+"""Prefix of the C names, as in ``entry.c.jinja``."""
 NAME = re.compile(r"[A-Za-z_]\w*\b(?!\()")
 INDENTED = re.compile(r"^[ \t]+|^[ \t]*//.*\n|^[ \t]*/\*\* .* \*/\n", re.MULTILINE)
 """Indentation and comments of the scripts, which a page omits."""
@@ -214,13 +217,15 @@ class Page:
     def html(self) -> str:
         """Text of the file."""
         model, document = self.model, self.document
+        source, interface = _integrator(model)
+        initial = _initial(document, [*model.mesh.points, *interface.parameters]) if model.mesh else ()
         with tempfile.TemporaryDirectory(prefix="scvi-codegen-") as temporary:
-            folder = generate_package(replace(model, page={}, picture={}), Path(temporary, "motion"))
-            interface = _interface(folder, model)
-            initial = _initial(document, [*model.mesh.points, *interface.parameters]) if model.mesh else ()
-            (folder / "page.c").write_text(_entry(folder, model, interface, initial, self.adaptive), encoding="utf-8")
-            sources = ("page.c", "motion.c", *(["motion_events.c"] if model.events else []))
-            code = webassembly(folder, sources)
+            folder = Path(temporary)
+            source.write(folder)
+            (folder / "page.c").write_text(_entry(model, interface, initial, self.adaptive), encoding="utf-8")
+            code = webassembly(folder, ("page.c", *(f"{each.prefix}.c" for each in source.sources)))
+        if model.array_system is not None:  # entries have no names
+            interface = replace(interface, coordinates=(), conserves_energy=not model.array_system.changes_energy)
         description = _description(self, interface, initial=bool(initial))
         text = template_environment().get_template("page/page.html.jinja").render(
             title=html.escape(interface.system), method=html.escape(interface.title.split(": ", 1)[-1]),
@@ -241,66 +246,45 @@ class Page:
         )
 
 
-def _interface(folder: Path, model: Model) -> SimpleNamespace:
-    """Return names, sizes and titles of a generated integrator, of either kind."""
-    data = json.loads((folder / "interface.json").read_text(encoding="utf-8"))
-    if "interface" in data:
-        return SimpleNamespace(**data["interface"], array=False)
-    scalars = {name: value for name, value in model.parameters.items() if np.ndim(value) == 0}
-    return SimpleNamespace(
-        array=True, title=data["title"], system=model.system.name, coordinates=[], momentum_names=[], rotations=[],
-        constraints=[], map_names=[], parameters=list(scalars), defaults=list(scalars.values()),
-        conserves_energy=not model.system.changes_energy,
-        sizes=data["sizes"], inputs=[], energy_parameter=None,
-    )  # fmt: skip
+def _integrator(model: Model) -> tuple[Source, Interface]:
+    """Return the C of the integrator, and its interface; of arrays without conserved quantities."""
+    source, interface = integrator_of(model, PREFIX)
+    source = source.specialised()
+    check_example(model, controlled="advance_to" in source.contents.functions)
+    if model.array_system is not None:
+        interface = replace(interface, momentum_names=(), map_names=(), constraints=())
+    return source, interface
 
 
-def _entry(folder: Path, model: Model, interface: Any, initial: Sequence[str], adaptive: bool) -> str:
+def _entry(model: Model, interface: Interface, initial: Sequence[str], adaptive: bool) -> str:
     """Return the C of the functions that the page calls."""
-    header, size = (folder / "motion.h").read_text(encoding="utf-8"), len(_flat(model.q))
-
-    def listed(word: str) -> list[str]:
-        found = re.search(rf"\*{word}\[\d+\]; /\* (.*?) \*/", header, re.DOTALL)
-        return ARRAY.findall(found[1]) if found else []
-
-    def words(name: str) -> list[str]:
-        return (folder / f"{name}.txt").read_text(encoding="utf-8").split()
-
-    numbers, tables = [repr(value) for value in _values(model, interface).values()], {}
-    if interface.array:
-        for name in listed("field"):
-            numbers += words(f"field_{name}")
-        tables = {name: words(f"table_{name}") for name in listed("table")}
+    size = len(_flat(model.q))
+    numbers, sizes, tables = [*_values(model, interface).values()], list[int](), dict[str, list[int]]()
+    if model.array_system is not None:
+        arrays = read_arrays(interface, model.q, model.fields, model.tables)
+        sizes = [arrays.sizes[name] for name in interface.layout.sizes]
+        numbers += [x for values in arrays.fields.values() for x in values.ravel().tolist()]
+        tables = {name: places.ravel().tolist() for name, places in arrays.places.items()}
     axes = {name: np.ravel(nodes).tolist() for name, nodes in model.mesh.points.items()} if model.mesh else {}
     return (
         template_environment()
         .get_template("page/entry.c.jinja")
         .render(
-            array=interface.array, m=size, capacity=256 if size < 64 else 16, maps=len(interface.map_names),
-            values=numbers, sizes=list(interface.sizes.values()) if interface.array else (), tables=tables,
+            array=model.array_system is not None, m=size, capacity=256 if size < 64 else 16,
+            maps=len(interface.map_names), values=map(repr, numbers), sizes=sizes, tables=tables,
             constraints=interface.constraints, adaptive=adaptive, initial=initial,
             transformed=model.time_transformation is not None, max_step=model.max_step,
             first_step=model.first_step,
-            absolute_tolerances=_absolute_tolerances(model, interface), events=model.events,
+            absolute_tolerances=absolute_tolerances_of(model, interface), events=model.events,
             acting=any(each.changes_state for each in model.events), velocities=not starts_from_momenta(model),
-            level=None if (energy := interface.energy_parameter) is None else interface.parameters.index(energy),
+            level=interface.energy_index if interface.in_tau else None,
             axes={f"at_{name}": nodes for name, nodes in axes.items()},
             names={f"at_{name}": k for k, name in enumerate(interface.parameters)},
         )
     )  # fmt: skip
 
 
-def _absolute_tolerances(model: Model, interface: Any) -> list[float]:
-    """Return the absolute tolerance of each coordinate; none if all are 0."""
-    from scvi_codegen.runs.stepping.step_plan import absolute_tolerances, checked_absolute_tolerance
-
-    if model.absolute_tolerance is None:
-        return []
-    values = checked_absolute_tolerance(model.absolute_tolerance)
-    return [float(value) for value in absolute_tolerances(interface, interface.dimension, values)]
-
-
-def _values(model: Model, interface: Any) -> dict[str, float]:
+def _values(model: Model, interface: Interface) -> dict[str, float]:
     """Return the scalar parameters by name, in order, with those that contain inputs and the energy of the state."""
     known = model.parameters | {f"{name}_0": value for name, value in model.inputs.items()}
     pairs = zip(interface.parameters, interface.defaults, strict=True)
@@ -362,17 +346,17 @@ def _rates(model: Model) -> list[float]:
     return _flat(stepper.velocity(model.q, model.p, model.t, model.parameters))
 
 
-def _drawn_system(model: Model, interface: Any) -> DrawnSystem:
+def _drawn_system(model: Model, interface: Interface) -> DrawnSystem:
     """Return what the recognition of a shape reads of a model; a stepper is compiled where it needs the energy."""
 
     def energy(q: Any, p: Any) -> Any:
         return np.asarray(model.stepper().energy(q, p, model.t, model.parameters), dtype=float)
 
     drawn = drawn_system_of_model(model)
-    return drawn if interface.array else replace(drawn, interface=interface, energy=energy)
+    return drawn if model.array_system is not None else replace(drawn, interface=interface, energy=energy)
 
 
-def _description(shown: Page, interface: Any, *, initial: bool) -> dict[str, Any]:
+def _description(shown: Page, interface: Interface, *, initial: bool) -> dict[str, Any]:
     """Return what the scripts of the page read."""
     model, adaptive = shown.model, shown.adaptive
     ranges = model.page.get("ranges", {})
@@ -423,7 +407,7 @@ def _description(shown: Page, interface: Any, *, initial: bool) -> dict[str, Any
     }  # fmt: skip
 
 
-def _rotations(interface: Any) -> list[dict[str, Any]]:
+def _rotations(interface: Interface) -> list[dict[str, Any]]:
     """Return the columns and the names of the angular velocity of each rotation, and the columns of each spin."""
     return [
         {
@@ -436,7 +420,7 @@ def _rotations(interface: Any) -> list[dict[str, Any]]:
     ]
 
 
-def _variables(interface: Any, shape: Mapping[str, Any], size: int) -> list[str]:
+def _variables(interface: Interface, shape: Mapping[str, Any], size: int) -> list[str]:
     """Return the names of the variables of plots, as in ``plots.js``."""
     if size <= WHOLE and interface.coordinates:
         solids = [f"{each['name']}.{axis}" for each in shape["solids"] for axis in "xyz"]

@@ -17,6 +17,7 @@ from scvi_codegen.interfaces.models.model import Model
 from scvi_codegen.interfaces.models.options import RUN_FIELDS
 from scvi_codegen.runs.stepping.array_interface import read_arrays, read_state, table_limits
 from scvi_codegen.runs.stepping.features import refusal
+from scvi_codegen.runs.stepping.step_plan import absolute_tolerances, checked_absolute_tolerance
 from scvi_codegen.systems.derived_expressions import forms_of
 from scvi_codegen.systems.event import Event
 from scvi_codegen.systems.formulas.expressions import evaluate
@@ -50,16 +51,24 @@ COMPARED = 1e-9
 """Tolerance of adaptive steps shown next to an example with a fixed step size."""
 
 
-def example_of(model: Model, *, controlled: bool) -> ExampleRun:
-    """Return the example run: the whole run of the model with twenty states after the first at most."""
+def check_example(model: Model, *, controlled: bool) -> None:
+    """Raise an error for a model whose example cannot be derived; warn of options without effect in programs.
+
+    ``controlled``: whether the C code has adaptive steps.
+    """
     _check_options(model)
-    clock = model.system.clock
-    if model.h is None and (clock or model.time_transformation is not None):
+    if model.h is None and model.has_time_transformation:
         raise ModelFileError(
             "a step size in tau cannot be found for a tolerance without compiling: give one (--step, [run] step)"
         )
     if model.h is None and not controlled:
         raise refusal("adaptive", "without an error estimate", f"{model.method.name}, --step, [run] step")
+
+
+def example_of(model: Model, interface: Interface, *, controlled: bool) -> ExampleRun:
+    """Return the example run: the whole run of the model with twenty states after the first at most."""
+    check_example(model, controlled=controlled)
+    clock = model.system.clock
     inputs_by_name = model.all_inputs() if model.inputs else {}
     inputs, parameters = tables_of_example(
         model.system, inputs_by_name, (model.t, model.end if inputs_by_name else model.t)
@@ -85,6 +94,7 @@ def example_of(model: Model, *, controlled: bool) -> ExampleRun:
         tolerance=tolerance,
         max_step=model.max_step,
         first_step=model.first_step,
+        absolute_tolerances=absolute_tolerances_of(model, interface),
         controlled=controlled,
         save_every=save_every,
         outputs=outputs,
@@ -94,6 +104,14 @@ def example_of(model: Model, *, controlled: bool) -> ExampleRun:
         end=model.end if inputs else 0.0,
         events=model.events,
     )
+
+
+def absolute_tolerances_of(model: Model, interface: Interface) -> tuple[float, ...]:
+    """Return the absolute tolerance of each coordinate; none if all are 0."""
+    if model.absolute_tolerance is None:
+        return ()
+    values = checked_absolute_tolerance(model.absolute_tolerance)
+    return tuple(absolute_tolerances(interface, interface.dimension, values).tolist())
 
 
 def _check_options(model: Model) -> None:

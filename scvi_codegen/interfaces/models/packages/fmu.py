@@ -228,7 +228,7 @@ def _texts(model: Model, prefix: str) -> tuple[Source, dict[str, bytes]]:
         model.system, model.method, solver=model.solver, prefix=prefix, events=events or None
     )
     by_velocity = model.velocity is not None
-    start = _start(model)
+    start = _start(model, interface)
     indices = tuple(interface.parameters.index(f"{name}_{PARTS[0]}") for name in interface.inputs)
     made_from = "\0".join([__version__, source.to_json(), repr(interface.to_record()), repr(start)])
     token = f"{{{uuid.uuid5(uuid.NAMESPACE_URL, made_from)}}}"
@@ -244,7 +244,7 @@ def _texts(model: Model, prefix: str) -> tuple[Source, dict[str, bytes]]:
     return source, {name: text.encode() for name, text in texts.items()}
 
 
-def _start(model: Model) -> ExampleRun:
+def _start(model: Model, interface: Interface) -> ExampleRun:
     """Return the initial state, with velocities or momenta as in the model, and the step size."""
     if any(event.terminal for event in model.events) and not any(event.changes_state for event in model.events):
         raise ModelFileError("events of an FMU must change the state: omit terminal ones, and stop in the importer")
@@ -255,7 +255,7 @@ def _start(model: Model) -> ExampleRun:
         )
     if model.h < 0:
         raise ModelFileError(f"the step size of an FMU must be positive, not {model.h:g}")
-    start = example_of(replace(model, inputs={}), controlled=False)
+    start = example_of(replace(model, inputs={}), interface, controlled=False)
     return start if model.velocity is None else replace(start, p=model.velocity)
 
 

@@ -209,8 +209,15 @@ def prefix_of(folder: Path, kind: str = "folder", suffix: str = "") -> str:
 __all__ = ["CERTIFICATE_FILE", "MODEL", "MODEL_FILE", "generate_package", "load_package"]
 
 MODEL_FILE = "model.toml"
-"""Declaration in the header of an integrator with adaptive steps."""
-MODEL = ArgumentType("a Model", lambda value: hasattr(value, "system") and hasattr(value, "method"))
+
+
+def _is_model(value: object) -> bool:
+    from scvi_codegen.interfaces.models.model import Model  # imported here: it imports SymPy
+
+    return isinstance(value, Model)
+
+
+MODEL = ArgumentType("a Model", _is_model)
 
 
 @checks_arguments(model=MODEL)
@@ -292,29 +299,17 @@ def _stepper_of_arrays(folder: Path) -> Stepper:
 
 
 def _texts(model: Model, prefix: str, embedded: Embedded | None, *, single_file: bool) -> dict[str, str]:
-    from scvi_codegen.codegen.pipeline import generate_source
     from scvi_codegen.codegen.rendering.program_source import render_example
     from scvi_codegen.interfaces.models.model_files.model_file import model_texts
-    from scvi_codegen.interfaces.models.packages.example import package_template, readme_text
+    from scvi_codegen.interfaces.models.packages.example import example_of, package_template, readme_text
 
     written = model_texts(model if model.events else model.with_known_sizes())  # events may contain loops over arrays
     model = model.with_known_sizes()
-    source, interface = generate_source(
-        model.system,
-        model.method,
-        solver=model.solver,
-        prefix=prefix,
-        events=model.events,
-        embedded=embedded,
-        controlled=not embedded or model.h is None,
-        time_transformation=model.time_transformation,
-        controller=model.controller,
-    )
-    checked_parameters(interface, model.parameters)  # C does not check cutoffs and boxes
+    source, interface = integrator_of(model, prefix, embedded=embedded)
     source = source.single_file() if single_file else source.specialised()
-    texts = source.files
     controlled = "advance_to" in source.contents.functions
-    texts |= render_example(interface, _example(model, interface, controlled=controlled), embedded or "double")
+    texts = source.files
+    texts |= render_example(interface, example_of(model, interface, controlled=controlled), embedded or "double")
     texts |= written
     texts["README.md"] = readme_text(
         interface, model.events, with_model=bool(written), embedded=embedded, controlled=controlled
@@ -328,30 +323,36 @@ def _texts(model: Model, prefix: str, embedded: Embedded | None, *, single_file:
     return {**texts, INTERFACE_FILE: record_text(texts, **described)}
 
 
-def _example(model: Model, interface: Interface, *, controlled: bool) -> Any:
-    """Return the run of ``main.c``, with the absolute tolerance of each coordinate."""
-    from scvi_codegen.interfaces.models.packages.example import example_of
-    from scvi_codegen.runs.stepping.step_plan import absolute_tolerances, checked_absolute_tolerance
+def integrator_of(model: Model, prefix: str, *, embedded: Embedded | None = None) -> tuple[Source, Interface]:
+    """Return the C code of a model and its interface; of arrays whose sizes are known at run time for all sizes."""
+    from scvi_codegen.codegen.pipeline import ArraySources, generate_source
 
-    example = example_of(model, controlled=controlled)
-    if model.absolute_tolerance is None:
-        return example
-    values = checked_absolute_tolerance(model.absolute_tolerance)
-    each = absolute_tolerances(interface, interface.dimension, values)
-    return replace(example, absolute_tolerances=tuple(each.tolist()))
+    if model.array_system is not None:
+        sources = ArraySources(model.array_system, model.method, model.solver, prefix)
+        source, interface = sources.integrator(controlled=False)
+    else:
+        source, interface = generate_source(
+            model.system,
+            model.method,
+            solver=model.solver,
+            prefix=prefix,
+            events=model.events,
+            embedded=embedded,
+            controlled=not embedded or model.h is None,
+            time_transformation=model.time_transformation,
+            controller=model.controller,
+        )
+    scalars = {name: value for name, value in model.parameters.items() if name in interface.parameters}
+    checked_parameters(interface, scalars)  # C does not check cutoffs and boxes; fields are checked with the sizes
+    return source, interface
 
 
 def _texts_of_arrays(model: Model, prefix: str, embedded: Embedded | None, *, single_file: bool) -> dict[str, str]:
-    from scvi_codegen.codegen.pipeline import ArraySources
     from scvi_codegen.codegen.rendering.program_source import render_example
     from scvi_codegen.interfaces.models.model_files.model_file import model_texts
     from scvi_codegen.interfaces.models.packages.example import array_example_of, package_template
 
-    assert model.array_system is not None  # by the caller
-    sources = ArraySources(model.array_system, model.method, model.solver, prefix)
-    source, interface = sources.integrator(controlled=False)
-    scalars = {name: value for name, value in dict(model.parameters or {}).items() if name in interface.parameters}
-    checked_parameters(interface, scalars)  # C does not check cutoffs and boxes; fields are checked with the sizes
+    source, interface = integrator_of(model, prefix)
     example, arrays = array_example_of(model, interface)
     lines = {f"{name}.txt": "".join(f"{x!r}\n" for x in each.reshape(-1).tolist()) for name, each in arrays.items()}
     source = source.single_file() if single_file else source.specialised()
