@@ -50,6 +50,7 @@ from scvi_codegen.codegen.rendering.program_source import (
     render_embedded,
     render_ensemble,
     render_ensemble_in_pairs,
+    workspace_in_pairs,
     workspace_size,
 )
 from scvi_codegen.codegen.rendering.source import DOUBLE_DOUBLE, ArrayLayout, Interface, Source
@@ -263,10 +264,14 @@ class Sources:
     @cached_property
     def interface(self) -> Interface:
         """Interface of the generated library."""
+        program = self.program()
         interface = describe(
-            self.program(), self.system, self.method, uses_fallback_library=self.uses_fallback_library, g=self.g
+            program, self.system, self.method, uses_fallback_library=self.uses_fallback_library, g=self.g
         )
-        return replace(interface, words=2 if self.precision == DOUBLE_DOUBLE else 1)
+        if self.precision != DOUBLE_DOUBLE:
+            return interface
+        size = workspace_in_pairs(program) if in_pairs(program) else interface.workspace
+        return replace(interface, words=2, workspace=size)
 
     def integrator(self, *, controlled: bool = True) -> tuple[Source, Interface]:
         """Return the C source and its interface.

@@ -284,6 +284,16 @@ def in_pairs(program: Program) -> bool:
     return program.splitting is not None and program.splitting.by_masses
 
 
+def memory_in_pairs(program: Program) -> int:
+    """Return the doubles of memory of explicit steps in pairs: inverse masses, last force."""
+    return 4 * program.dimension + 1
+
+
+def workspace_in_pairs(program: Program) -> int:
+    """Return the doubles of workspace of explicit steps in pairs."""
+    return workspace_size(program) - program.memory + memory_in_pairs(program)
+
+
 def _render_explicit(program: Program) -> Source:
     """Return the source of explicit steps in pairs."""
     quantities, split = program.quantities, program.splitting
@@ -292,8 +302,7 @@ def _render_explicit(program: Program) -> Source:
     kernels = split.drift, split.force, *states
     context = _context(program, DOUBLE, None)
     words = {"derivatives": 0, "of_numbers": kernels, "of_vectors": (), "functions": uses_functions(kernels)}
-    memory = 4 * program.dimension + 1  # inverse masses, last force
-    sizes = {"memory": memory, "workspace": workspace_size(program) + memory - program.memory}
+    sizes = {"memory": memory_in_pairs(program), "workspace": workspace_in_pairs(program)}
     return _render(program.prefix, context | sizes | {"two_words": words, "own_headers": arithmetic_headers()})
 
 

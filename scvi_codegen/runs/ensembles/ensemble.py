@@ -485,13 +485,22 @@ class Ensemble:
                 actions[row, j] = each.actions
             if times is not None:
                 times[row, j] = each.t
-        if self.fixed is not None and not any(event.terminal for event in self.stepper.events):
+        if self.fixed is not None and self.stepper.in_tau:
+            t = self._fictitious_times(self.fixed, count)
+        elif self.fixed is not None and not any(event.terminal for event in self.stepper.events):
             t, times = max((each.t for each in lanes), key=len), None
         status = np.array([each.status for each in lanes], dtype="<U32")
         steps = np.array([each.steps for each in lanes], dtype=np.int64)
         fallbacks = np.array([each.fallback_steps for each in lanes], dtype=np.int64)
         whole = self._trajectories(t, times, q, p, status, steps, fallbacks)
         return replace(whole, actions=actions, events=tuple(each.events for each in lanes))
+
+    def _fictitious_times(self, fixed: CommonSteps, count: int) -> Array:
+        """Return tau of saved states, equal in all trajectories; NaN after the last common one, where t_end is in t."""
+        tau = fixed.times(tau=True)[:count]
+        rows = missing((count,), fixed.words)
+        rows[: len(tau)] = tau
+        return rows
 
     def _successive_result(self, work: SuccessiveRuns) -> EnsembleTrajectory:
         count, words, full = len(self), self.stepper.interface.words, work.status == FULL
@@ -517,7 +526,9 @@ class Ensemble:
             start[:] = self.t0
             numbers, times = np.arange(rows, dtype=float), ordered("t", start)
             own: Array | None = times
-            if self.fixed is not None:
+            if self.fixed is not None and self.stepper.in_tau:
+                numbers = self._fictitious_times(self.fixed, rows)
+            elif self.fixed is not None:
                 numbers, own = times[:, stored.argmax()], None
             whole = self._trajectories(numbers, own, q, p, work.names, work.done, work.fallback_steps)
             sums = self.stepper.sums_action
