@@ -3,9 +3,11 @@
 import zlib
 
 import pytest
-from matrix_properties import PROPERTIES, SITUATIONS, Case
-from matrix_systems import PROBLEMS
 from tiers import cover
+
+from tests.motions.motions import PROBLEMS
+from tests.motions.properties import PROPERTIES
+from tests.motions.situations import SITUATIONS, Case
 
 CASES = [
     (name, Case(problem, method, situation))
@@ -18,9 +20,9 @@ CASES = [
 
 
 def identity(name: str, case: Case) -> str:
-    method, solver, _ = case.problem.methods[case.method]
-    word = method if isinstance(method, str) else ":".join(map(str, list(method.values())[:2]))
-    return f"{name}-{case.problem.name}-{word}-{solver}-{case.situation}"
+    scheme = case.scheme
+    method = scheme.method if isinstance(scheme.method, str) else ":".join(map(str, list(scheme.method.values())[:2]))
+    return f"{name}-{case.problem.name}-{method}-{scheme.solver}-{scheme.precision}-{case.situation}"
 
 
 def sample() -> list[tuple[str, Case]]:

@@ -1,4 +1,4 @@
-"""Systems of the property matrix, in which nothing is a default, and their motion by independent code.
+"""Motions of the table, in which nothing is a default, and the same motions by independent code.
 
 A system is text. The package compiles it; :class:`Truth` reads the same text with SymPy, forms the equations of motion
 in its own way (momenta, mass matrix, multipliers by index reduction) and integrates them with DOP853.
@@ -6,10 +6,11 @@ in its own way (momenta, mass matrix, multipliers by index reduction) and integr
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import sympy
@@ -22,14 +23,46 @@ STOP = "stop"
 """The parameter after which a force is the root of a negative number; by default far away."""
 
 
+class Scheme(NamedTuple):
+    """A method with the solver of its equations, and the error of states that is allowed for this motion."""
+
+    method: Any
+    solver: str
+    error: float
+    precision: str = "double"
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Another origin and other units: x = x'/length + origin, and L' = energy L."""
+
+    origin: float
+    length: float
+    energy: float
+
+    def formula(self, text: str, names: list[str]) -> str:
+        """Return a formula of x, x_dot and p of the chart for one of those at home."""
+
+        def at_home(match: re.Match[str]) -> str:
+            name, part, entry = match[1], match[2] or "", match[3] or ""
+            if part:
+                return f"({name}{part}{entry}/{self.length!r})"
+            return f"({name}{entry}/{self.length!r} + {self.origin!r})"
+
+        return re.sub(rf"\b({'|'.join(names)})(_dot)?\b(\[[^\]]*\])?", at_home, text)
+
+    def scaled(self, text: str, factor: float, names: list[str]) -> str:
+        return f"{factor!r}*({self.formula(text, names)})"
+
+
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A system as text, a state, and what its table of solvers is.
+    """A system as text, a state, and its schemes.
 
     Attributes:
         own: parameters of a run that are no defaults.
         x: initial velocities, or momenta where a Hamiltonian is given.
-        methods: name and solver, with the error of states that is allowed; nine points are several vectors.
+        methods: schemes; nine points are several vectors.
         event: a function that crosses zero.
         maps: momentum maps by formula, in the order of the stepper.
         impulses: momentum maps of L alone, p . xi by the formulas of xi.
@@ -41,7 +74,7 @@ class Problem:
     q: tuple[float, ...]
     x: tuple[float, ...]
     own: Mapping[str, float]
-    methods: tuple[tuple[Any, str, float], ...]
+    methods: tuple[Scheme, ...]
     event: str
     text: Mapping[str, Any]
     maps: tuple[str, ...] = ()
@@ -66,6 +99,52 @@ class Problem:
     @property
     def coordinates(self) -> list[str]:
         return list(self.text["coordinates"])
+
+    def charted(self, chart: Chart) -> Problem:
+        """Return the same motion with another origin and other units; of L alone, without constants of motion."""
+
+        def text(names: list[str], home: Mapping[str, Any]) -> dict[str, Any]:
+            power = chart.energy / chart.length
+            formulas = {"lagrangian": chart.scaled(home["lagrangian"], chart.energy, names)}
+            formulas["constraints"] = [chart.formula(g, names) for g in home.get("constraints", ())]
+            formulas["forces"] = {x: chart.scaled(f, power, names) for x, f in home.get("forces", {}).items()}
+            return {**home, **{name: formula for name, formula in formulas.items() if formula}}
+
+        return replace(
+            self,
+            name=f"{self.name} elsewhere",
+            q=tuple(chart.length * (x - chart.origin) for x in self.q),
+            x=tuple(chart.length * v for v in self.x),
+            event=chart.formula(self.event, self.coordinates),
+            text=text(self.coordinates, self.text),
+            array=self.array and text(["q"], self.array),
+        )
+
+    def of_known_size(self) -> Problem:
+        """Return an array whose size is a number in its text: its states are rows, as those of named coordinates."""
+        size = str(len(self.q))
+
+        def sized(text: Any) -> Any:
+            if isinstance(text, Mapping):
+                return {sized(name): sized(value) for name, value in text.items()}
+            if isinstance(text, list):
+                return [sized(value) for value in text]
+            if not isinstance(text, str):
+                return text
+            return re.sub(r"\b([mq])(\d)(_dot)?\b", r"\1_\2\3", re.sub(r"\bN\b", size, text))
+
+        schemes = [scheme._replace(solver="auto") for scheme in self.methods]
+        return replace(
+            self,
+            name=f"{self.name} of known size",
+            own=sized(self.own),
+            event=sized(self.event),
+            text=sized(self.text),
+            array=sized(self.array),
+            methods=(*schemes, Scheme("svi:4", "auto", HIGH, "double-double")),
+            fields={},
+            kind="plain",
+        )
 
     def values(self, own: bool) -> dict[str, float]:
         """Parameters by name, of this problem's own or by default."""
@@ -226,13 +305,18 @@ CHAIN_VALUES = {"k": 1.0, "b": 0.1, "a": 0.2, "c": 0.1, "e": 0.01, STOP: 100.0}
 MASSES, OTHER_MASSES = (1.0, 1.0, 1.0, 1.0), (1.3, 0.7, 2.1, 0.9)
 HIGH, LOW = 3e-8, 3e-3
 
-PROBLEMS: tuple[Problem, ...] = (
+AT_HOME: tuple[Problem, ...] = (
     Problem(
         name="pair",
         q=(0.3, -0.4),
         x=(0.5, -0.2),
         own={"m": 1.7, "n": 0.6, "k": 2.3, "l": 0.8, "c": 0.4, "e": 0.05, "d": 0.3},
-        methods=(("svi:4", "fixed-point", HIGH), ("svi:3", "newton", HIGH), ("gauss:4", "auto", HIGH)),
+        methods=(
+            Scheme("svi:4", "fixed-point", HIGH),
+            Scheme("svi:3", "newton", HIGH),
+            Scheme("gauss:4", "auto", HIGH),
+            Scheme("svi:8", "auto", HIGH, "double-double"),
+        ),
         event="x - y - l - t/50",
         text={
             "coordinates": ["x", "y"],
@@ -248,7 +332,7 @@ PROBLEMS: tuple[Problem, ...] = (
         q=(0.2, 0.9),
         x=(0.4, -0.7),
         own={"M": 2.7, "m": 0.6, "l": 1.1, "a": 0.35, "w": 1.2, "c": 0.3},
-        methods=(("svi:4", "fixed-point", HIGH), ("scvi:5", "newton", HIGH), ("sc:7", "auto", HIGH)),
+        methods=(Scheme("svi:4", "fixed-point", HIGH), Scheme("scvi:5", "newton", HIGH), Scheme("sc:7", "auto", HIGH)),
         event="th - x*m - 0.3",
         text={
             "coordinates": ["x", "th"],
@@ -266,10 +350,11 @@ PROBLEMS: tuple[Problem, ...] = (
         x=(0.2, 0.6),
         own={"m": 1.7, "n": 0.6, "k": 2.3, "a": 0.4, "w": 1.2, "e": 0.3},
         methods=(
-            ({"method": "composition", "order": 8}, "auto", HIGH),
-            ("stoermer-verlet", "explicit", LOW),
-            ("stoermer-verlet", "newton", LOW),
-            ("svi:4", "auto", HIGH),
+            Scheme({"method": "composition", "order": 8}, "auto", HIGH),
+            Scheme("stoermer-verlet", "explicit", LOW),
+            Scheme("stoermer-verlet", "newton", LOW),
+            Scheme("svi:4", "auto", HIGH),
+            Scheme({"method": "composition", "order": 8}, "auto", HIGH, "double-double"),
         ),
         event="x_dot + k*y/9",
         text={
@@ -285,7 +370,7 @@ PROBLEMS: tuple[Problem, ...] = (
         q=(0.7, -0.3),
         x=(0.2, 0.6),
         own={"m": 1.7, "n": 0.6, "k": 1900.0, "a": 0.3, "c": 0.2, "e": 0.1},
-        methods=(("svi:8", "auto", 1e-6), ("gauss:8", "auto", 1e-6)),
+        methods=(Scheme("svi:8", "auto", 1e-6), Scheme("gauss:8", "auto", 1e-6)),
         event="y - x/2 - t/90",
         text={
             "coordinates": ["x", "y"],
@@ -302,7 +387,7 @@ PROBLEMS: tuple[Problem, ...] = (
         q=(0.3, 0.8),
         x=(-0.5, 0.4),
         own={"m": 2.3, "g": 3.1},
-        methods=(("svi:5", "auto", HIGH),),
+        methods=(Scheme("svi:5", "auto", HIGH), Scheme("svi:5", "auto", HIGH, "double-double")),
         event="(x - 0.3)**2 - 0.01",
         text={
             "coordinates": ["x", "y"],
@@ -322,7 +407,11 @@ PROBLEMS: tuple[Problem, ...] = (
         q=(0.6, 0.2),
         x=(-0.3, 0.5),
         own={"m": 1.4, "c": 0.7, "r": 0.9},
-        methods=(("svi:4", "fixed-point", HIGH), ("gauss:4", "newton", HIGH)),
+        methods=(
+            Scheme("svi:4", "fixed-point", HIGH),
+            Scheme("gauss:4", "newton", HIGH),
+            Scheme("svi:8", "auto", HIGH, "double-double"),
+        ),
         event="x - z/m",
         text={
             "coordinates": ["x", "z"],
@@ -336,7 +425,11 @@ PROBLEMS: tuple[Problem, ...] = (
         q=(0.6, -0.2),
         x=(-0.3, 0.4),
         own={"l": 1.1, "a": 0.35, "w": 1.2, "c": 0.3, "g": 2.3},
-        methods=(("gauss:9", "fixed-point", HIGH), ("sc:7", "newton", HIGH)),
+        methods=(
+            Scheme("gauss:9", "fixed-point", HIGH),
+            Scheme("sc:7", "newton", HIGH),
+            Scheme("gauss:9", "auto", HIGH, "double-double"),
+        ),
         event="q - s*l/5",
         text={
             "coordinates": ["q", "s"],
@@ -353,7 +446,11 @@ PROBLEMS: tuple[Problem, ...] = (
         q=(0.8, 0.1),
         x=(0.1, 1.2),
         own={"m": 1.6, "u": 1.3},
-        methods=(("svi:5", "auto", HIGH), ("gauss:5", "newton", HIGH)),
+        methods=(
+            Scheme("svi:5", "auto", HIGH),
+            Scheme("gauss:5", "newton", HIGH),
+            Scheme("svi:8", "auto", HIGH, "double-double"),
+        ),
         event="x - y*m/3",
         text={
             "coordinates": ["x", "y"],
@@ -369,7 +466,11 @@ PROBLEMS: tuple[Problem, ...] = (
         q=(0.8, 0.1),
         x=(0.1, 1.1),
         own={"m": 1.6, "u": 1.3, "c": 0.1, "a": 0.2},
-        methods=(("svi:5", "auto", HIGH), ("gauss:5", "newton", HIGH)),
+        methods=(
+            Scheme("svi:5", "auto", HIGH),
+            Scheme("gauss:5", "newton", HIGH),
+            Scheme("svi:5", "auto", HIGH, "double-double"),
+        ),
         event="x - y*m/3",
         text={
             "coordinates": ["x", "y"],
@@ -388,8 +489,9 @@ PROBLEMS: tuple[Problem, ...] = (
         x=(0.4, 0.3, 0.7, 0.7),
         own={"m": 1.3, "g": 2.1, "c": 0.3},
         methods=(
-            ({"method": "svi", "degree": 1, "quadrature": "gauss-lobatto:2"}, "auto", 2e-2),
-            ("svi:5", "auto", 1e-7),
+            Scheme({"method": "svi", "degree": 1, "quadrature": "gauss-lobatto:2"}, "auto", 2e-2),
+            Scheme("svi:5", "auto", 1e-7),
+            Scheme("svi:5", "auto", 1e-7, "double-double"),
         ),
         event="x1 - x2/3 - g/30",
         text={
@@ -406,7 +508,11 @@ PROBLEMS: tuple[Problem, ...] = (
         q=(0.6, -0.1),
         x=(-0.3, 0.2),
         own={"c": 0.5, "m": 1.6},
-        methods=(("svi:4", "fixed-point", HIGH), ("gauss:4", "newton", HIGH)),
+        methods=(
+            Scheme("svi:4", "fixed-point", HIGH),
+            Scheme("gauss:4", "newton", HIGH),
+            Scheme("svi:8", "auto", HIGH, "double-double"),
+        ),
         event="q - s*m/4",
         text={
             "coordinates": ["q", "s"],
@@ -424,7 +530,7 @@ PROBLEMS: tuple[Problem, ...] = (
         q=(0.3, -0.2, 0.5, 0.1),
         x=(0.1, 0.4, -0.3, 0.2),
         own={"k": 1.6, "b": 0.3, "a": 0.5, "c": 0.2, "e": 0.05, **{f"m{i}": x for i, x in enumerate(OTHER_MASSES)}},
-        methods=(("svi:4", "fixed-point", HIGH), ("gauss:9", "fixed-point", HIGH)),
+        methods=(Scheme("svi:4", "fixed-point", HIGH), Scheme("gauss:9", "fixed-point", HIGH)),
         event="q0 - q2*k/4",
         text={
             "coordinates": [f"q{i}" for i in range(CHAIN)],
@@ -448,9 +554,9 @@ PROBLEMS: tuple[Problem, ...] = (
         x=(0.1, 0.4, -0.3),
         own={"k": 1.6, "a": 0.5, "e": 0.3, **{f"m{i}": x for i, x in enumerate(OTHER_MASSES[:3])}},
         methods=(
-            ({"method": "composition", "order": 8}, "fixed-point", HIGH),
-            ("stoermer-verlet", "fixed-point", LOW),
-            ("svi:4", "newton", HIGH),
+            Scheme({"method": "composition", "order": 8}, "fixed-point", HIGH),
+            Scheme("stoermer-verlet", "fixed-point", LOW),
+            Scheme("svi:4", "newton", HIGH),
         ),
         event="q0 - q2*k/4",
         text={
@@ -471,4 +577,19 @@ PROBLEMS: tuple[Problem, ...] = (
         kind="array",
         h=0.03,
     ),
+)
+
+ELSEWHERE = Chart(origin=2.0, length=1e3, energy=1e6)
+"""Millimetres from an origin two metres away: momenta in units that are a thousand times smaller, too."""
+
+
+def named(name: str) -> Problem:
+    return next(problem for problem in AT_HOME if problem.name == name)
+
+
+PROBLEMS = (
+    *AT_HOME,
+    *(named(name).charted(ELSEWHERE) for name in ("pair", "cart", "springs", "damped", "rods", "pushed", "array")),
+    named("array").of_known_size(),
+    named("array without friction").of_known_size(),
 )
