@@ -1,9 +1,8 @@
 """Systems read from text or from SymPy expressions: the fields of Lagrangian and Hamiltonian systems."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-import sympy
 from sympy import Expr, Symbol
 
 from scvi_codegen.common.errors import SystemDefinitionError
@@ -34,6 +33,8 @@ Read = Callable[[Any], Expr]
 TURNING = ("rotations", "directions", "spins")
 TORQUES = ("torques", "torques_space")
 """Arguments of ``from_text`` of systems with rotations."""
+NAMES_AT_POINTS = ("body", "frame")
+"""Entries of a force at a point that are names."""
 
 
 def system_from_text(cls: Any, arguments: Mapping[str, Any]) -> tuple[Any, bool]:
@@ -171,28 +172,15 @@ def system_from_sympy(
         return sympy_expression(value, role).xreplace(of_frames)
 
     formula = expression_of(formula, function)
-    applied = {q: _components(f, f"force on {q}", expression_of) for q, f in (forces or {}).items()}
-    torques, torques_space = (
-        {str(key): _components(f, f"torque on {key}", expression_of) for key, f in (turning.get(each) or {}).items()}
-        for each in TORQUES
-    )
-    friction = None if dissipation is None else expression_of(dissipation, "dissipation")
-    points = [
-        {
-            k: _components(f, f"{k} of point_forces", expression_of) if k not in ("body", "frame") else str(f)
-            for k, f in each.items()
-        }
-        for each in turning.get("point_forces") or ()
-    ]
-    acted = [f for each in (applied, torques, torques_space, *points) for f in each.values() if not isinstance(f, str)]
-    rate = damping_rate(damping, lambda each: sympy_expression(each, "damping"))
-    conditions = [expression_of(g, "constraint") for each in constraints or () for g in constraint_sides(each)[0]]
-    input_names = tuple(name_of_key(each) for each in inputs)
+    rate = damping_rate(damping, lambda value: sympy_expression(value, "damping"))
+    acting = _forces_of(expression_of, forces, dissipation, turning)
+    sides = [side for condition in constraints or () for side in constraint_sides(condition)[0]]
+    input_names = tuple(map(name_of_key, inputs))
     constants = with_inputs(_named_parameters(parameters), input_names)
     translation = Translation(
         formula,
         coordinates,
-        (*sympy.flatten(acted), *(() if friction is None else (friction,)), rate, *conditions),
+        (*_expressions_in(acting), rate, *(expression_of(side, "constraint") for side in sides)),
         velocities=velocities,
         momenta=momenta or (),
         time=time,
@@ -202,21 +190,13 @@ def system_from_sympy(
     driven = input_formulas(input_names, symbol(TIME))
 
     def reader(role: str) -> Read:
-        return lambda each: translation.apply(expression_of(each, role), role).xreplace(driven)
+        return lambda value: translation.apply(expression_of(value, role), role).xreplace(driven)
 
     ordinary = [q.name for q in translation.coordinates]
     if names.members:
         check_names(ordinary, tuple(constants), (), (*names.coordinates, *names.symbols))
-    formulas = {
-        function.lower(): formula,
-        "forces": {name_of_key(translation.rules.get(q, q)): f for q, f in applied.items()},
-        "torques": torques,
-        "torques_space": torques_space,
-        "dissipation": friction,
-        "point_forces": points,
-        "constraints": constraints,
-        "damping": rate,
-    }
+    by_name = {name_of_key(translation.rules.get(q, q)): force for q, force in acting["forces"].items()}
+    formulas = {**acting, function.lower(): formula, "forces": by_name, "constraints": constraints, "damping": rate}
     return _system(
         cls,
         names,
@@ -229,6 +209,42 @@ def system_from_sympy(
         values=dict(zip((each.name for each in translation.parameters), constants.values(), strict=True)),
         inputs=input_names,
     )[0]
+
+
+def _forces_of(
+    expression_of: Callable[[Any, str], Expr],
+    forces: Mapping[Any, Any] | None,
+    dissipation: Any,
+    turning: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Return forces, torques, forces at points and dissipation by the names of their arguments, as expressions."""
+
+    def by_key(values: Mapping[Any, Any] | None, role: str) -> dict[Any, Any]:
+        return {key: _components(force, f"{role} {key}", expression_of) for key, force in (values or {}).items()}
+
+    def at_point(values: Mapping[str, Any]) -> dict[str, Any]:
+        return {
+            key: str(value) if key in NAMES_AT_POINTS else _components(value, f"{key} of point_forces", expression_of)
+            for key, value in values.items()
+        }
+
+    return {
+        "forces": by_key(forces, "force on"),
+        **{kind: {str(key): tau for key, tau in by_key(turning.get(kind), "torque on").items()} for kind in TORQUES},
+        "point_forces": [at_point(values) for values in turning.get("point_forces") or ()],
+        "dissipation": None if dissipation is None else expression_of(dissipation, "dissipation"),
+    }
+
+
+def _expressions_in(formulas: Any) -> Iterator[Expr]:
+    """Yield the expressions in nested mappings and sequences; texts and ``None`` are none."""
+    if isinstance(formulas, Expr):
+        yield formulas
+    elif isinstance(formulas, Mapping):
+        yield from _expressions_in(list(formulas.values()))
+    elif isinstance(formulas, list | tuple):
+        for part in formulas:
+            yield from _expressions_in(part)
 
 
 def _components(force: Any, role: str, read: Callable[[Any, str], Expr]) -> Any:
