@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commands import invoke
 from notation import lagrange
 from samples import QUICK_FLAGS
 
@@ -151,34 +150,6 @@ def test_special_values_are_rejected_or_handled(name: str, here: Path) -> None:
         except Exception as error:  # noqa: BLE001  (all of them are shown together)
             failed.append(f"{value!r:.40}: {error!r:.200}")
     assert failed == []
-
-
-CSV = [
-    "", "u", "t,u", "t,u\n", "t,u\n0,1", "t,u\n0,1\n0,2", "t,u\n0,1\n1", "t,u\n0,x\n1,2", "t,t\n0,1\n1,2",
-    ",u\n0,1\n1,2", "t,u\n0,1_0\n1,2", "t,u\n0,\u0661\n1,2", "t,u\n0,nan\n1,2", "t,u\n0,1e999\n1,2",
-    't,u\n0,"1\n1,2', "\ufefft,u\n0,1\n9,2", "t,u\n0," + "1" * 200_000 + "\n1,2", "t;u\n0;1\n1;2",
-    "t,u\n0,1\n1,2\0", "t,v\n0,1\n9,2", "t,u,v\n0,1,2\n9,1,2", "\x00\x01", "q1,q2\n1_0,2", "q1,q2\n\u0661,2",
-    "q1\n" + "1" * 200_000,
-]  # fmt: skip
-
-
-def test_undamaged_model_is_accepted(tmp_path: Path) -> None:
-    """Or the tests below test nothing."""
-    (tmp_path / "u.csv").write_text("t,u\n0,0\n10,1\n")
-    for inputs in ("{ t = [0.0, 10.0], values = [0.0, 1.0] }", '{ file = "u.csv" }'):
-        text = MODEL.replace("{ t = [0.0, 10.0], values = [0.0, 1.0] }", inputs)
-        (tmp_path / "model.toml").write_text(text)
-        assert sc.load_model(tmp_path / "model.toml").all_inputs()
-
-
-@pytest.mark.parametrize("number", range(len(CSV)))
-def test_damaged_csv_tables_are_rejected(number: int, here: Path) -> None:
-    """Tables are inputs, index tables and ensembles of the command line."""
-    Path("u.csv").write_text(CSV[number])
-    Path("model.toml").write_text(MODEL.replace("{ t = [0.0, 10.0], values = [0.0, 1.0] }", '{ file = "u.csv" }'))
-    refused(lambda: sc.load_model("model.toml").all_inputs())
-    result = invoke("run", "kepler", "--step", "0.1", "--steps", "2", "--ensemble", "u.csv", status=None)
-    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
 
 
 def paths_of(document: Any, place: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:

@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Callable
 from fractions import Fraction
+from functools import partial
 from random import Random
 from typing import Any
 
@@ -72,6 +73,7 @@ WRONG: dict[str, Callable[[np.ndarray], Any]] = {
     "None": lambda x: None,
     "a hole": lambda x: [None, *x[1:]],
     "nan": lambda x: [np.nan, *x[1:]],
+    "nan in an array": lambda x: np.array([*x[:-1], np.nan]),
     "infinity": lambda x: [*x[:-1], -np.inf],
     "beyond double": lambda x: [10**400, *x[1:]],
     "beyond double, as long double": lambda x: x.astype(np.longdouble) * np.longdouble("1e4000"),
@@ -87,29 +89,25 @@ WRONG: dict[str, Callable[[np.ndarray], Any]] = {
 }
 
 
-def calls(stepper: sc.Stepper) -> dict[str, Callable[[Any, Any], Any]]:
-    """Everything that takes a state, as a function of the two vectors; the result as one array."""
-    return {
-        "step": lambda q, p: np.hstack(stepper.step(q, p, 0.125)),
-        "integrate": lambda q, p: stepper.integrate(q, p, h=0.125, steps=3).q,
-        "momentum": lambda q, p: stepper.momentum(q, p),
-        "velocity": lambda q, p: stepper.velocity(q, p),
-        "energy": lambda q, p: np.array(stepper.energy(q, p)),
-        "action": lambda q, p: np.array(stepper.discrete_lagrangian(q, p, 0.5)),
-    }
+CALLS: dict[str, Callable[..., Any]] = {
+    "step": lambda stepper, q, p: np.hstack(stepper.step(q, p, 0.125)),
+    "integrate": lambda stepper, q, p: stepper.integrate(q, p, h=0.125, steps=3).q,
+    "energy": lambda stepper, q, p: np.array(stepper.energy(q, p)),
+}
+"""Functions of a state."""
 
 
 @pytest.mark.filterwarnings("ignore:overflow encountered:RuntimeWarning", "ignore:the matrix subclass")
-@pytest.mark.parametrize("name", ["step", "integrate", "momentum", "velocity", "energy", "action"])
+@pytest.mark.parametrize("name", CALLS)
 def test_states_in_any_container_are_accepted_and_others_rejected(name, kepler):
-    call = calls(kepler)[name]
+    call = partial(CALLS[name], kepler)
     expected = call(Q, P)
     for dress in CLEAN.values():
         assert np.array_equal(call(dress(Q), P), expected)
         assert np.array_equal(call(Q, dress(P)), expected)
     for what, spoil in WRONG.items():
         for q, p in ((spoil(Q), P), (Q, spoil(P))):
-            with pytest.raises(REFUSED), guarded():
+            with pytest.raises(sc.StateError), guarded():
                 pytest.fail(f"{what} gave {call(q, p)}")
 
 
@@ -128,71 +126,6 @@ def test_ensembles_in_any_container_are_accepted_and_others_rejected(kepler):
     masked = np.ma.array(q, mask=q > 2)
     with pytest.raises(sc.StateError, match="masked"):
         final(masked, p)
-
-
-NUMBERS: dict[str, Any] = {
-    "nan": np.nan,
-    "infinity": -np.inf,
-    "text": "0.1",
-    "None": None,
-    "complex": 0.1 + 0j,
-    "numpy complex": np.complex128(1),
-    "list": [0.1],
-    "one-element array": np.array([0.1]),
-    "masked": np.ma.masked,
-    "huge": 10**400,
-    "a date": np.datetime64(1, "s"),
-}
-
-
-@pytest.mark.filterwarnings("ignore:Warning. converting a masked element:UserWarning")
-@pytest.mark.parametrize("what", NUMBERS)
-def test_real_numbers_are_required(what, kepler):
-    value = NUMBERS[what]
-    for call in (
-        lambda: kepler.step(Q, P, value),
-        lambda: kepler.step(Q, P, 0.1, t=value),
-        lambda: kepler.step(Q, P, 0.1, parameters={"mu": value}),
-        lambda: kepler.step(Q, P, 0.1, parameters=[[value]]),
-        lambda: kepler.start(Q, P, h=value),
-        lambda: kepler.integrate(Q, P, h=0.1, steps=value),
-        lambda: kepler.integrate(Q, P, h=0.1, steps=4, save_every=value),
-        lambda: kepler.integrate_ensemble([Q], [P], h=value, steps=1),
-        lambda: sc.SolverOptions(tolerance=value),
-        lambda: sc.SolverOptions(max_iterations=value),
-        lambda: sc.SolverOptions(absolute=value),
-    ):
-        with pytest.raises(sc.StateError), guarded():
-            call()
-
-
-@pytest.mark.parametrize(
-    "call",
-    [
-        lambda s: s.step(Q, P, 0.0),
-        lambda s: s.step(Q, P, -0.0),
-        lambda s: s.step(Q, P, 0.1, parameters=np.ma.array([1.0], mask=[True])),
-        lambda s: s.step(Q, P, 0.1, parameters=np.array([1j])),
-        lambda s: s.step(Q, P, 0.1, parameters={1: 1.0}),
-        lambda s: s.step(Q, P, 0.1, parameters={"\x00": 1.0}),
-        lambda s: s.step(Q, P, 0.1, parameters=[]),
-        lambda s: s.step(Q, P, 0.1, options=1),
-        lambda s: s.integrate_ensemble([Q], [P], h=0.1, steps=1, options="x"),
-        lambda s: s.integrate(Q, P, h=0.1, steps=2**53),
-        lambda s: s.integrate(Q, P, h=0.1, steps=2**50),
-        lambda s: s.integrate(Q, P, h=0.1, steps=4, save_every=2**63),
-        lambda s: s.integrate_ensemble([Q], [P], h=0.1, steps=2**50),
-        lambda s: s.integrate_ensemble([Q], [P], h=0.1, steps=2**52, threads=-1),
-        lambda s: s.energy([Q, Q], [P, P], [0.0, np.nan]),
-        lambda s: s.energy([Q, [np.nan, 1.0]], [P, P]),
-        lambda s: s.from_checkpoint("x" * 232),
-        lambda s: s.from_checkpoint(None),
-        lambda s: s.from_checkpoint(b""),
-    ],
-)
-def test_wrong_types_are_rejected_by_name(call, kepler):
-    with pytest.raises(sc.StateError), guarded():
-        call(kepler)
 
 
 @pytest.mark.parametrize("method", [sc.SVI(3), sc.StoermerVerlet()], ids=lambda method: method.name)

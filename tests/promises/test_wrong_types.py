@@ -10,7 +10,7 @@ from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 from scvi_codegen.common.errors import ScviCodegenError
-from scvi_codegen.common.validation import TEXT, checks_arguments
+from scvi_codegen.common.validation import TEXT, checks_arguments, hints, keyword_hint
 
 WRONG = (object(), b"bytes", 1j)
 """No argument of any public function may be one of these."""
@@ -171,3 +171,24 @@ def test_checked_functions_retain_their_signature():
         greet(3)  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="missing 1 required"):
         greet()  # type: ignore[call-arg]
+
+
+def test_no_synonym_hides_a_keyword():
+    """A known keyword is never reported as a synonym, and every suggested location exists."""
+    assert keyword_hint("q", ["y0"]) == "; did you mean 'y0'?"
+    assert keyword_hint("n", ["mass"]).startswith(": pass the number to run.advance(n)")
+    assert not [here for here, elsewhere in hints()["synonyms"].items() if {*here.split()} & {*elsewhere.split()}]
+    for name in ("integrate", "integrate_ensemble", "momentum"):
+        assert hasattr(sc.Stepper, name)
+        assert any(f".{name}" in place for place in hints()["explanations"].values())
+
+
+def test_system_accepts_positional_arguments_and_scalar_states():
+    for kind, formula in ((sc.LagrangianSystem, "q_dot**2/2 + cos(q)"), (sc.HamiltonianSystem, "p_q**2/2 - cos(q)")):
+        by_name = {"lagrangian": formula} if kind is sc.LagrangianSystem else {"hamiltonian": formula}
+        assert kind.from_text("swing", ["q"], formula) == kind.from_text(name="swing", coordinates=["q"], **by_name)
+    assert sc.LagrangianSystem.from_text("chain", ["q[N]"], "sum(a in N, q_dot[a]**2/2)").name == "chain"
+    swing = samples.compile_quickly(sc.problem("planar-pendulum").system, sc.SVI(2))
+    plan = {"h": 0.1, "steps": 3}
+    assert swing.integrate(1.0, 0.5, **plan).q.tolist() == swing.integrate([1.0], [0.5], **plan).q.tolist()
+    assert swing.energy(1.0, 0.5) == swing.energy([1.0], [0.5])
