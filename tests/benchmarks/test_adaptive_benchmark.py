@@ -8,7 +8,7 @@ import pytest
 import benchmarks as bench
 from benchmarks.cases import references
 from benchmarks.cases.adaptive import ADAPTIVE_CASES, adaptive_case
-from benchmarks.cases.references import equal_steps, field_of, reference, states_after
+from benchmarks.cases.references import reference
 from benchmarks.contenders.ours import adaptive_contenders
 from scvi_codegen.codegen.native import building
 from scvi_codegen.common.errors import StateError
@@ -21,13 +21,6 @@ def own_cache(tmp_path_factory, monkeypatch):
     monkeypatch.setenv(building.CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "adaptive-cache"))
 
 
-def test_every_case_has_eight_states_of_one_energy_scale():
-    for name in ADAPTIVE_CASES:
-        chosen = adaptive_case(name)
-        assert chosen.name == f"adaptive:{name}"
-        assert chosen.q.shape == chosen.velocity.shape == (8, chosen.dimension)
-
-
 @pytest.mark.tiers(0, 1)
 @pytest.mark.sampled(1)
 @needs_extended
@@ -37,19 +30,6 @@ def test_keplers_reference_returns_after_a_period(e):
     found = reference(chosen)
     assert np.abs(found.positions - chosen.q).max() < 1e-14 / (1.0 - e)  # the period of rounded states
     assert found.accuracy < 1e-15
-
-
-@pytest.mark.full
-@needs_extended
-def test_references_on_selected_steps_equal_those_on_uniform_steps():
-    chosen = replace(adaptive_case("double-pendulum"), span=3.0)
-    found = reference(chosen)
-    assert found.accuracy < 1e-17
-    start = np.concatenate([chosen.q, chosen.velocity], axis=1).astype(np.longdouble)
-    equal = states_after(field_of(chosen), start, equal_steps(chosen.span, 1.0 / 64.0))
-    assert np.abs(equal[:, :2] - found.positions).max() < 1e-17
-    split = states_after(field_of(chosen), start, np.longdouble([0.0625, 0.03125, 0.03125] + 46 * [0.0625]))
-    assert np.abs(split - equal).max() < 1e-12
 
 
 def test_steps_of_a_reference_are_the_shortest_of_its_runs():
@@ -87,10 +67,3 @@ def test_all_modes_run_and_agree():
     for each in tight:
         assert np.abs(each.prepare(3)() - exact.positions[3]).max() < 1e-12
     assert all(f"adaptive:{name}" in bench.SECTIONS for name in ADAPTIVE_CASES)
-
-
-@pytest.mark.full
-def test_the_reference_of_the_pythagorean_problem_passes_its_encounters():
-    chosen = adaptive_case("pythagorean")
-    one = replace(chosen, q=chosen.q[:1], velocity=chosen.velocity[:1])
-    assert reference(one).accuracy < 1e-4

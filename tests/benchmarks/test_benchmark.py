@@ -24,8 +24,7 @@ from benchmarks.cases.forced import driven_pendulum
 from benchmarks.cases.references import Reference, equal_steps, gauss_tables, reference, rms_error, states_after
 from benchmarks.cases.rods import rods
 from benchmarks.cases.suites import SUITE_CASES, SUITE_ENDS, suite_case
-from benchmarks.contenders import ours, peers
-from benchmarks.contenders.ours import our_ensembles
+from benchmarks.contenders import peers
 from benchmarks.contenders.tracing import rates_text
 from benchmarks.report import FLOOR, Contender, Point, ResultTable, common_error, frontier, time_at
 from benchmarks.tables import drift_row, fitted_rate
@@ -93,24 +92,6 @@ class TestCases:
         stepper = compile_stepper(chosen.system, "svi:8")
         run = stepper.integrate(chosen.q[0], velocity=chosen.velocity[0], t_end=chosen.span, check_growth=False)
         assert rms_error(run.q[-1:], SUITE_ENDS["heyoka:three-bodies"](chosen, None)) < 4e-9
-
-    def test_the_formulation_in_momenta_agrees_with_the_one_in_velocities(self):
-        chosen = unforced.case("relativistic-particle")
-        plain, momenta = chosen.formulations
-        q, v = 0.3, 0.6
-        p = v / math.sqrt(1 - v * v)
-        q_rate, p_rate = momenta.rates([q, p], chosen.parameters, math)
-        acceleration = plain.rates([q, v], chosen.parameters, math)[1]
-        assert q_rate == pytest.approx(v, rel=1e-15)
-        assert p_rate == pytest.approx(acceleration * (1 - v * v) ** -1.5, rel=1e-14)
-        assert not chosen.velocity.any()
-
-    @pytest.mark.second
-    def test_every_case_has_eight_different_states(self):
-        for name in unforced.CASES:
-            chosen = unforced.case(name)
-            assert chosen.q.shape == chosen.velocity.shape == (unforced.STATES, chosen.dimension)
-            assert len(np.unique(chosen.q, axis=0)) == unforced.STATES
 
     def test_unknown_names_are_rejected(self):
         with pytest.raises(SystemDefinitionError, match=r"did you mean 'duffing'"):
@@ -215,21 +196,6 @@ class TestReference:
         with pytest.raises(BaseException, match="again"):
             reference(short("planar-pendulum", 6.0))
 
-    @pytest.mark.full
-    def test_rounded_momenta_have_a_separate_reference(self):
-        chosen = short("outer-solar-system", 1024.0)
-        momenta = chosen.velocity * np.repeat(chosen.bodies.masses, 3)
-        moved = reference(chosen, momenta)
-        assert 0 < np.abs(moved.positions - reference(chosen).positions).max() < 1e-14
-
-    @pytest.mark.full
-    def test_ensemble_converges_to_the_reference(self, monkeypatch):
-        monkeypatch.setattr(ours, "advised_counts", lambda *_, quick: {100: 1e-12})
-        chosen = short("kepler:0.2", 50.0)
-        (ensemble,) = our_ensembles(chosen)
-        assert ensemble.trajectories == len(chosen.q)
-        assert rms_error(ensemble.prepare(0)(), reference(chosen)) < 1e-12
-
 
 class TestCurves:
     def test_interpolates_log_time_against_log_error(self):
@@ -311,24 +277,6 @@ class TestReport:
         assert "broken h=1: ArithmeticError: no" in text
         (line,) = (line.split() for line in text.splitlines() if line.startswith("  broken  "))
         assert line[:3] == ["broken", "failed", "-"]
-
-    def test_json_schema(self):
-        table = ResultTable(
-            name="t", title="", columns={"a": ".1f", "b": ""}, rows=({"a": math.nan}, {"a": 1.0, "b": "x"})
-        )
-        whole = bench.Report(machine=bench.machine(), results=(self.result, table))
-        data = json.loads(json.dumps(whole.data(), allow_nan=False))
-        assert set(data) == {"schema", "machine", "cases", "tables", "interrupted"}
-        assert {"processor", "compiler", "flags", "versions"} <= set(data["machine"])
-        (found,) = data["cases"]
-        assert set(found) == {"name", "span", "dimension", "reference_accuracy", "skipped", "measurements", "rows"}
-        fields = {
-            "method", "setting", "options", "compile_seconds", "seconds", "fastest", "error", "repeats", "failure",
-        }  # fmt: skip
-        assert all(set(entry) == fields for entry in found["measurements"])
-        assert found["measurements"][4]["seconds"] is None
-        assert data["tables"][0]["rows"] == [{"a": None}, {"a": 1.0, "b": "x"}]
-        assert "  a    b\n  -    -\n  1.0  x" in table.text()
 
 
 class TestMeasuring:
@@ -426,38 +374,8 @@ class TestCommand:
         bench.benchmark(output=str(path))
         assert measured == [("one", []), ("two", ["one"]), ("three", ["one", "two"])]
 
-    def test_benchmark_command_draws_a_picture(self, tmp_path):
-        pytest.importorskip("matplotlib")
-        from benchmarks.plots import plot_curves
-
-        plot_curves([TestReport.result, TestReport.result], tmp_path / "curves.svg")
-        text = (tmp_path / "curves.svg").read_text()
-        assert "time of a trajectory, ms" in text
-        assert text.count("heyoka fast_math") == 1
-
-    @pytest.mark.tiers(1, 2)
-    @pytest.mark.parametrize("panels", [1, 2, 4])
-    def test_all_names_are_in_the_picture(self, panels):
-        names = "scvi-codegen controlled, scvi-codegen fixed, scvi-codegen transformed, heyoka, heyoka fast_math, "
-        names += "heyoka.lagrangian, rebound IAS15"
-        pytest.importorskip("matplotlib")
-        from benchmarks.plots import draw_curves
-
-        found = TestReport.result
-        many = [replace(each, method=name) for name in names.split(", ") for each in found.measurements]
-        figure = draw_curves([replace(found, measurements=many)] * panels)
-        figure.draw_without_rendering()
-        legend, whole = figure.legends[0].get_window_extent(), figure.bbox
-        assert whole.x0 <= legend.x0 < legend.x1 <= whole.x1
-        assert whole.y0 <= legend.y0 < legend.y1 <= whole.y1
-
 
 class TestDrift:
-    def test_slope_of_a_line_is_exact(self):
-        derivative, error = fitted_rate(np.linspace(0.0, 3e-12, 2001))
-        assert derivative == pytest.approx(3e-12)
-        assert error < 1e-20
-
     def test_slope_of_a_random_walk_is_within_its_error(self):
         random = np.random.default_rng(5)
         walks = [fitted_rate(np.cumsum(random.standard_normal(2001))) for _ in range(300)]
@@ -469,26 +387,6 @@ class TestDrift:
 
 
 class TestTables:
-    @pytest.mark.full
-    @needs_extended
-    def test_forced_problems_are_measured_at_their_errors(self, monkeypatch):
-        monkeypatch.setattr(ours, "QUICK_TOLERANCES", (1e-6,))
-        for name, count in (("forced:double-pendulum", 1),):
-            plan = bench.Plan(peers=("scipy",), repeats=1, quick=True)
-            found = [each for each in bench.SECTIONS[name](plan, lambda text: None).measurements if not each.failure]
-            own = [each for each in found if each.method.startswith("scvi-codegen")]
-            assert len(own) == count
-            assert all(each.error < 1e-4 and each.seconds > 0.0 for each in own)
-            assert max(each.error for each in found if each not in own) < 1e-10
-
-    @pytest.mark.full
-    def test_mechanisms_are_measured_at_equal_error(self):
-        plan = bench.Plan(quick=True, repeats=1, peers=("lambdify",))
-        result = bench.SECTIONS["mechanisms:2"](plan, lambda text: None)
-        assert result.methods() == ["scvi-codegen svi:4", "lambdify DOP853"]
-        assert max(each.error for each in result.measurements) < 1e-6
-        assert min(each.seconds for each in result.measurements) > 0.0
-
     @pytest.mark.rotated
     def test_start_up_time_is_measured(self):
         cold, cached = tables.run_first_steps(bench.Plan(repeats=1, quick=True), lambda text: None).rows
@@ -509,10 +407,6 @@ class TestTables:
 
 
 class TestCommandLine:
-    def test_the_help_names_every_section(self):
-        text = CliRunner().invoke(command.main, ["--help"]).stdout
-        assert {name.split(":")[0] for name in bench.SECTIONS} <= set(re.findall(r"[\w-]+", text))
-
     def test_documented_commands_are_accepted(self):
         words = r"python -m benchmarks(\s[^`]*|)`"
         pages = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "docs").rglob("*.md"))
@@ -521,16 +415,6 @@ class TestCommandLine:
         for line in lines:
             context = command.main.make_context("benchmarks", line.split())
             assert all(bench._sections(name) for name in context.params["sections"])
-
-    def test_results_as_text_as_a_document_and_as_nothing(self, monkeypatch):
-        table = ResultTable(name="nothing", title="no times", columns={"a": ""}, rows=({"a": "b"},))
-        monkeypatch.setattr(bench, "SECTIONS", {"nothing": lambda plan, report: table})
-        text, document, quiet = (
-            CliRunner().invoke(command.main, ["nothing", *more]) for more in ([], ["--json"], ["--quiet"])
-        )
-        assert "no times" in text.stdout
-        assert json.loads(document.stdout)["tables"][0]["name"] == "nothing"
-        assert (quiet.exit_code, quiet.stdout, quiet.stderr) == (0, "", "")
 
     @pytest.mark.parametrize("words", [["drif"], ["drift", "--peers", "heyoca"], ["drift", "--plot", "a/b.png"]])
     def test_errors_are_messages(self, words):

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import benchmarks as bench
 from benchmarks.cases.references import reference, rms_error
 from benchmarks.cases.rotations import ROTATIONS, tumbling
 from benchmarks.contenders.engines import mujoco_contenders
@@ -39,13 +38,3 @@ def test_bodies_tumble_in_mujoco_as_in_the_equations():
     contender = next(each for each in mujoco_contenders(chosen, quick=True) if each.setting == "h=0.01")
     assert contender.trajectories == 3
     assert rms_error(contender.prepare(0)()(), reference(chosen)) < 1e-4
-
-
-@pytest.mark.rotated
-def test_bodies_are_measured_without_peers():
-    result = bench.SECTIONS["rotations:bodies"](bench.Plan(quick=True, peers=(), repeats=1), lambda text: None)
-    assert result.methods() == [
-        "scvi-codegen runs",
-        *(f"scvi-codegen ensemble {name}" for name in ("svi:8", "composition:8")),
-    ]
-    assert min(each.error for each in result.measurements) < 1e-8

@@ -8,9 +8,9 @@ import pytest
 import benchmarks as bench
 from benchmarks import sections
 from benchmarks.cases.fields import FIELDS, our_fields
-from benchmarks.cases.large import atoms, bodies, field, ring
-from benchmarks.cases.robots import chain, four_bar, quadruped
-from benchmarks.contenders import arrays, engines, pdes, peers
+from benchmarks.cases.large import atoms, field, ring
+from benchmarks.cases.robots import chain, four_bar
+from benchmarks.contenders import arrays, engines, pdes
 from benchmarks.contenders.ours import fixed_contenders
 from scvi_codegen.methods import Composition
 
@@ -49,25 +49,6 @@ def test_openmm_makes_the_steps_of_leapfrog(name):
     assert np.abs(found - crystal.q[0]).max() > 0.1
 
 
-@pytest.mark.full
-def test_rebound_converges_to_the_same_state():
-    pytest.importorskip("rebound", reason="needs the extra 'bench'")
-    each = bodies(10, 0.5)
-    theirs = end(next(peers.PEERS["rebound"].contenders(each, True)))
-    assert np.abs(ours(each, "svi:8", 32) - theirs).max() < 1e-14
-
-
-@pytest.mark.full
-def test_array_systems_are_measured_at_equal_error():
-    plan = bench.Plan(quick=True, repeats=1, peers=("hand",))
-    result = bench.run_race(
-        lambda plan: sections._halved(lambda: ring(32, 40.0), sections.EXPLICIT, sections.EXACT, plan), plan, quiet
-    )
-    assert result.reference_accuracy < 1e-13
-    assert {"leapfrog by hand", "scvi-codegen svi:8"} <= set(result.methods())
-    assert min(each.error for each in result.measurements) < 1e-12
-
-
 @pytest.mark.rotated
 @pytest.mark.parametrize("make", [lambda: chain(2), four_bar], ids=["chain", "four-bar"])
 def test_multibody_systems_are_measured_without_peers(make):
@@ -88,19 +69,6 @@ def test_chains_move_in_engines_as_here(name, setting):
     assert np.abs(found - ours(robot, "svi:4", 200)).max() < 2e-6
 
 
-@pytest.mark.second
-def test_closed_loops_in_mujoco_are_soft_unless_stiff():
-    pytest.importorskip("mujoco", reason="extra bench")
-    linkage = four_bar()
-    exact = ours(linkage, "svi:4", 400)
-    soft, stiff = (
-        np.abs(end(each) - exact).max()
-        for each in engines.mujoco_contenders(linkage, quick=True)
-        if each.setting == "h=0.01" and "RK4" in each.method
-    )
-    assert stiff < 0.1 * soft < 0.1
-
-
 def test_instability_of_mujoco_is_reported_and_leaves_no_file(monkeypatch, here):
     """MuJoCo would write its warnings into the working folder."""
     pytest.importorskip("mujoco", reason="extra bench")
@@ -109,16 +77,6 @@ def test_instability_of_mujoco_is_reported_and_leaves_no_file(monkeypatch, here)
     with pytest.raises(ArithmeticError, match="unstable"):
         end(next(engines.mujoco_contenders(robot, quick=True)))
     assert not list(here.iterdir())
-
-
-@pytest.mark.full
-def test_coordinates_of_a_free_base_are_those_of_mujoco():
-    mujoco = pytest.importorskip("mujoco", reason="extra bench")
-    animal = quadruped()
-    places = engines.coordinate_places(mujoco.MjModel.from_xml_string(animal.mjcf), animal)
-    assert sorted(places[0]) == list(range(animal.dimension))
-    assert sorted(places[1]) == list(range(animal.dimension - 1))
-    assert animal.q[0][places[0]][3] == 1.0
 
 
 @pytest.mark.parametrize("name", FIELDS)

@@ -168,18 +168,6 @@ print(run.q[-1].tobytes().hex(), run.p[-1].tobytes().hex())
 """
 
 
-@pytest.mark.full
-def test_concurrent_processes_derive_compile_and_run(folder):
-    names = ("kepler", "planar-pendulum", "henon-heiles", "double-pendulum")
-    command = [sys.executable, "-W", "error", "-c", COMPILING]
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    results = at_once([subprocess.Popen([*command, names[i % 4]], **pipes) for i in range(PROCESSES)])
-    assert [error for _, error in results] == [""] * PROCESSES
-    assert [len({result for result, _ in results[i::4]}) for i in range(4)] == [1] * 4
-    info = sc.cache_info()
-    assert (info.integrators, info.texts) == (4, 8)  # the key of each system is cached beside its source
-
-
 # Steppers and runs that travel.
 
 
@@ -218,13 +206,6 @@ def test_copies_of_steppers_runs_and_trajectories_are_equal(kepler, duplicate, t
     np.testing.assert_array_equal(duplicate(trajectory).energy(), trajectory.energy())
     recorded: RecordedRun = duplicate(record_run(kepler.start(*STATE, h=0.05), tmp_path / "a.run", steps=10))
     np.testing.assert_array_equal(recorded.q[:], trajectory.q)
-
-
-def test_copy_of_a_run_is_independent(kepler):
-    run = kepler.start(*STATE, h=0.05)
-    other = copy.deepcopy(run)
-    run.record(50)
-    assert (run.steps, other.steps) == (50, 0)
 
 
 def test_threads_share_a_stepper(kepler, finals):
@@ -266,11 +247,3 @@ def test_joblib_runs_steppers(kepler, finals, backend):
     joblib = pytest.importorskip("joblib")
     work = [joblib.delayed(final)(kepler, p) for p in MOMENTA[:6]]
     assert joblib.Parallel(n_jobs=2, backend=backend)(work) == finals[:6]
-
-
-@pytest.mark.second
-@pytest.mark.parametrize("scheduler", ["threads", "processes"])
-def test_dask_runs_steppers(kepler, finals, scheduler):
-    dask = pytest.importorskip("dask")
-    work = [dask.delayed(final)(kepler, p) for p in MOMENTA[:6]]
-    assert list(dask.compute(*work, scheduler=scheduler, num_workers=2)) == finals[:6]

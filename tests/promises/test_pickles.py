@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import pickle
 from collections.abc import Callable
 from functools import cache
@@ -41,12 +40,6 @@ def stepper(option: str) -> Stepper:
 
 def copied(original: Any) -> Any:
     return pickle.loads(pickle.dumps(original))
-
-
-def test_every_option_of_a_stepper_is_in_the_table() -> None:
-    signature = inspect.signature(compile_stepper)
-    options = {name for name, each in signature.parameters.items() if each.kind is each.KEYWORD_ONLY}
-    assert options - {"sizes", "tables", "precision"} == set(STEPPERS) - {""}  # these two replace the system
 
 
 def test_pickled_stepper_in_double_double_takes_the_same_steps() -> None:
@@ -104,10 +97,6 @@ RUNS: dict[str, dict[str, Any]] = {
     "velocity": {"h": H, "velocity": P},
 }
 """By the argument of ``start`` that it is about."""
-
-
-def test_every_argument_of_a_run_is_in_the_table() -> None:
-    assert set(inspect.signature(Stepper.start).parameters) - {"self", "q", "p", "tables", "threads"} == set(RUNS)
 
 
 @pytest.mark.parametrize("argument", RUNS)
