@@ -187,28 +187,6 @@ span = 1.0
 """
 
 
-@pytest.mark.rotated
-def test_long_arrays_are_written_to_tables(tmp_path: Path) -> None:
-    """Files beside a saved model, and in a generated folder, whose stepper is loaded with them."""
-    text = (
-        DRIVEN.replace('inputs = ["u"]\n', "").partition("[forces]")[0].replace("q_dot[i]**2/2", "m[i]*q_dot[i]**2/2")
-    )
-    path = tmp_path / "ring.toml"
-    path.write_text(
-        f'{text}[parameters]\n"m[N]" = "1 + i/N"\n[initial]\nq = "sin(i/7)/3"\n[run]\nstep = 0.1\nsteps = 2\n'
-    )
-    model = sc.load_model(path, {"sizes": {"N": 12_000}, "method": {"method": "svi:2"}})
-    sc.save_model(model, tmp_path / "again.toml")
-    assert (tmp_path / "again.toml").stat().st_size < 1000
-    assert (tmp_path / "again_q.csv").stat().st_size > 200_000
-    assert sc.load_model(tmp_path / "again.toml") == model
-    folder = sc.generate_package(model, tmp_path / "ring_svi")
-    assert sc.load_model(folder / "model.toml") == model
-    run = model.start(sc.load_package(folder))
-    run.advance(2)
-    assert np.array_equal(run.q["q"], model.integrate().q["q"][-1])
-
-
 @pytest.mark.second
 def test_models_of_arrays_have_inputs(tmp_path: Path) -> None:
     """The mean moves as the exact integral of the force; known sizes give the same states."""

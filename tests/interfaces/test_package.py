@@ -164,29 +164,6 @@ def test_every_kind_of_folder_is_built_without_a_warning(words, tmp_path):
     assert (result.returncode, result.stderr) == (0, "")
 
 
-@pytest.mark.second
-@pytest.mark.parametrize(("steps", "lines"), [(7, 8), (20, 21), (39, 21), (41, 15)])
-def test_examples_print_at_most_twenty_states_up_to_the_end(steps, lines, tmp_path):
-    """41 steps: 13 states of 3 steps each, and one of 2."""
-    needs("make", "cc")
-    events = (sc.Event("q1"),) if steps == 41 else ()
-    model = replace(model_of("kepler", h=0.01, span=None, steps=steps, method=sc.SVI(2)), events=events)
-    folder = sc.generate_package(model, tmp_path / "orbit")
-    command = ["make", "-s", "-C", str(folder), "run", f"CFLAGS={STRICT} -O0"]
-    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
-    times = [float(line.split()[0]) for line in printed if line[0] != "#"]
-    assert len(times) == lines
-    assert times[0] == 0
-    assert times[-1] == pytest.approx(0.01 * steps, rel=1e-15)
-    assert np.diff(times[:-1]) == pytest.approx(times[1], rel=1e-12)
-
-
-def test_large_workspaces_are_not_on_the_stack(tmp_path):
-    text = (sc.generate_package(model_of("kepler"), tmp_path / "kepler_svi") / "main.c").read_text()
-    assert "static double workspace[" in text
-    assert "static kepler_svi_run run;" in text
-
-
 @pytest.mark.rotated
 def test_user_names_do_not_occur_in_the_program(tmp_path):
     base = model_of("planar-pendulum", method=sc.SVI(1))
@@ -234,13 +211,6 @@ def test_unsuitable_folder_names_are_rejected_with_a_suggestion(pendulum, tmp_pa
     with pytest.raises(sc.PackageError, match=f"'{hint}'"):
         sc.generate_package(pendulum, tmp_path / name)
     assert not (tmp_path / name).exists()
-
-
-def test_dot_is_the_current_folder(pendulum, tmp_path, monkeypatch):
-    (tmp_path / "here").mkdir()
-    monkeypatch.chdir(tmp_path / "here")
-    sc.generate_package(pendulum, ".")
-    assert (tmp_path / "here" / "here.c").is_file()
 
 
 def test_unwritable_folders_are_named(pendulum, tmp_path):

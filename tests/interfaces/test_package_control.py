@@ -33,13 +33,6 @@ def exact_end(model: sc.Model) -> np.ndarray:
 
 
 @pytest.mark.rotated
-def test_step_example_compares_adaptive_steps_with_the_step(model, tmp_path):
-    lines = output(generate_package(replace(model, h=0.01, tolerance=None), tmp_path / "fixed"))
-    assert "adaptive steps" in lines[-1]
-    assert max(abs(float(word)) for word in lines[-1].split()[-2:]) < 1e-5
-
-
-@pytest.mark.rotated
 @pytest.mark.parametrize(("precision", "error"), [("double", 1e-6), ("single", 1e-2)])
 def test_microcontroller_code_has_adaptive_steps_if_requested(model, tmp_path, precision, error):
     folder = generate_package(replace(model, tolerance=1e-5), tmp_path / "board", embedded=precision)

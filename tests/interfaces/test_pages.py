@@ -5,10 +5,8 @@ import gzip
 import html
 import importlib.util
 import json
-import platform
 import re
 import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -20,7 +18,6 @@ from programs import needs
 import scvi_codegen as sc
 from scvi_codegen.codegen.native.building import PORTABLE_FLAGS
 from scvi_codegen.interfaces.pages import page as pages
-from scvi_codegen.interfaces.pages.webassembly import FLAGS
 
 MOTIONS = Path(__file__).parents[2] / "docs" / "motions"
 OSCILLATOR = """[system]
@@ -360,48 +357,6 @@ def test_the_webassembly_computes_the_bits_of_python_within_200_kilobytes(tmp_pa
     assert np.array_equal(state["p"], run.p[-1])
     assert state["energy"] == run.energy()[-1]
     assert state["stored"] == len(run.t) - 1
-
-
-NATIVE = """
-#include <stdio.h>
-double *memory_of(int);
-int start(double, double), advance(int, int);
-int main(void)
-{
-  static const double q[] = {Q}, v[] = {V};
-  enum { SIZE = sizeof q / sizeof *q };
-  for (int i = 0; i < SIZE; i++)
-    memory_of(1)[i] = q[i], memory_of(3)[i] = v[i];
-  for (int k = start(0, H) || advance(STEPS, STEPS) ? 3 : 1; k < 3; k++)
-    for (int i = 0; i < SIZE; i++)
-      printf("%a ", memory_of(k)[i]);
-}
-"""
-
-
-@pytest.mark.full
-def test_the_webassembly_computes_the_bits_of_a_native_build_with_the_same_library(monkeypatch):
-    """The functions of the C library are those of musl in both; products of the native build are fused."""
-    path, compiled, states = MOTIONS / "double_pendulum.toml", pages.webassembly, []
-    model = sc.load_model(path)
-    values = {"Q": str(model.q)[1:-1], "V": str(model.velocity)[1:-1], "H": str(model.h), "STEPS": "200"}
-
-    def also_native(folder, sources):
-        text = re.sub(r"\b(Q|V|H|STEPS)\b", lambda name: values[name[0]], NATIVE)
-        (folder / "native.c").write_text(text, encoding="utf-8")
-        flags = [flag for flag in FLAGS[3:] if flag not in ("-msimd128", "-s")]
-        compiler = [sys.executable, "-m", "ziglang", "cc", "-target", "x86_64-linux-musl", "-mcpu=x86_64_v3", *flags]
-        subprocess.run([*compiler, "-w", *sources, "native.c", "-lm", "-o", "native"], cwd=folder, check=True)
-        states.append(subprocess.run([folder / "native"], capture_output=True, text=True, check=True).stdout)
-        (folder / "native.c").unlink()
-        return compiled(folder, sources)
-
-    pytest.importorskip("ziglang", reason="pages are compiled by the extra compiler")
-    if (sys.platform, platform.machine()) != ("linux", "x86_64"):
-        pytest.skip("the native build is for Linux on x86-64")
-    monkeypatch.setattr(pages, "webassembly", also_native)
-    state = computed(sc.page(path).html, 200)
-    assert [float.fromhex(word) for word in states[0].split()] == state["q"] + state["p"]
 
 
 @pytest.mark.full

@@ -76,12 +76,6 @@ def test_adaptive_run_of_an_array_system(ring: str, monkeypatch: pytest.MonkeyPa
     assert last[1:9] == pytest.approx(expected, abs=1e-7)
 
 
-@pytest.mark.full
-def test_adaptive_steps_of_an_array_system_are_verified(ring: str) -> None:
-    Path("own.toml").write_text(RING.replace("step = 0.1\nsteps = 20", "tolerance = 1e-9\nspan = 2.0"))
-    invoke("verify", "own.toml", "--size", "N=3")
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [

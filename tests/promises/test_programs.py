@@ -1,7 +1,6 @@
 """Tests call the programs that the README requires, and others only where they declare them."""
 
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -9,7 +8,6 @@ from pathlib import Path
 import pytest
 from programs import UndeclaredProgramError, needs
 
-TESTS = Path(__file__).parents[1]
 PROGRAM = "optional-program"
 
 
@@ -46,11 +44,3 @@ def test_required_and_declared_programs_are_called(tmp_path: Path) -> None:
 def test_missing_program_skips_the_test_by_name() -> None:
     with pytest.raises(pytest.skip.Exception, match="needs the program no-such-program"):
         needs("no-such-program")
-
-
-def test_programs_are_looked_up_in_one_module() -> None:
-    """A test that asks ``shutil.which`` by itself would be skipped without the name of the program."""
-    exempt = {"tools/programs.py", "tools/browsing.py", "faults/mutate.py", "promises/test_programs.py"}
-    files = [path for path in TESTS.rglob("*.py") if path.relative_to(TESTS).as_posix() not in exempt]
-    found = [path.name for path in files if re.search(r"which\((?!.*path=)", path.read_text(encoding="utf-8"))]
-    assert found == []
