@@ -19,7 +19,7 @@ from scvi_codegen.interfaces.cli.reports import duration
 from scvi_codegen.interfaces.cli.running import conserved, event_counts, final_state
 from scvi_codegen.interfaces.cli.supervision import interruptions, progress_bar
 from scvi_codegen.interfaces.models.model import Model
-from scvi_codegen.interfaces.models.model_files.model_file import dump_model, parse_model
+from scvi_codegen.interfaces.models.model_files.model_file import dump_model
 from scvi_codegen.interfaces.models.options import DURATION, OPTIONS
 from scvi_codegen.interfaces.models.time_span import whole_steps_in
 from scvi_codegen.runs.driver.run import Run
@@ -165,8 +165,6 @@ class Recording:
                     )
                 steps = whole_steps_in(span, h, manifest.t)
         plan = manifest.steps if steps is None else steps
-        if manifest.model is not None:
-            further["mesh"] = parse_model(manifest.model).system.mesh
         return self._with_progress(resume_run, Path(folder), first=recorded.steps, steps=plan, **further)
 
     def _with_progress(
