@@ -1,4 +1,4 @@
-"""Formulas as they are printed, read back into trees: MathML of pages, LaTeX, and their evaluation.
+"""Formulas as they are printed, read back into trees: MathML of pages, and their evaluation.
 
 A tree is a tuple whose first entry is its kind. Names are text: letter, accent, lower and upper indices, so that
 ``l'_1`` is l with a dot and index 1, and ``Q_x^2`` has x below and 2 above. A reader knows nothing of the package: what
@@ -188,95 +188,6 @@ class _Parser:
             found.append(self.sum())
         assert self.take() == ")"
         return found
-
-
-# LaTeX, as SymPy writes sums and products of what the package names.
-
-LATEX = re.compile(
-    r"\s+|\\left|\\right|\\frac|\\sqrt|\\(?:dot|ddot|hat|tilde)(?![a-z])|\\cdot|\\times|\\[a-zA-Z]+|[a-zA-Z]+|\d+(?:\.\d+)?|."
-)
-GREEK = {
-    "alpha": "α", "beta": "β", "gamma": "γ", "delta": "δ", "epsilon": "ε", "theta": "θ", "lambda": "λ", "mu": "μ",
-    "nu": "ν", "ProductD": "D^D~", "ProductA": "A2", "ProductbA": "bA", "pi": "π", "phi": "φ", "omega": "ω", "tau": "τ",
-}  # fmt: skip
-LATEX_ACCENTS = {"\\dot": "'", "\\ddot": "''", "\\hat": "hat", "\\tilde": "tilde"}
-
-
-def tree_of_latex(text: str) -> Tree:
-    """A formula, or an equation with ``&=``."""
-    text = re.sub(r"\((?:\\hat\{D\}\\tilde\{(D)\}|(A)\^\{2\}|(bA))\)_", _product_name, text)
-    pieces = [piece for piece in LATEX.findall(text) if piece.strip() and piece not in ("\\left", "\\right", "&")]
-    return _Parser(list(_Latex(pieces).tokens())).all()
-
-
-def _product_name(match: re.Match[str]) -> str:
-    return rf"\Product{match[1] or match[2] or match[3]}_"
-
-
-class _Latex:
-    """LaTeX as the tokens of the parser."""
-
-    def __init__(self, pieces: list[str]) -> None:
-        self.pieces = pieces
-
-    def group(self) -> list[str]:
-        """The pieces of the next argument."""
-        if self.pieces[0] != "{":
-            return [self.pieces.pop(0)]
-        depth = 0
-        for place, piece in enumerate(self.pieces):
-            depth += (piece == "{") - (piece == "}")
-            if not depth:
-                found, self.pieces = self.pieces[1:place], self.pieces[place + 1 :]
-                return found
-        raise AssertionError(f"no end of {self.pieces}")
-
-    def tree(self) -> Tree:
-        return _Parser(list(_Latex(self.group()).tokens())).all()
-
-    def tokens(self) -> Iterator[Any]:
-        while self.pieces:
-            yield from self.token(self.pieces.pop(0))
-
-    def token(self, piece: str) -> Iterator[Any]:
-        name = piece.removeprefix("\\")
-        if piece == "\\frac":
-            yield ("/", self.tree(), self.tree())
-        elif piece == "\\sqrt":
-            yield ("^", self.tree(), ("number", "1/2"))
-        elif piece == "{":
-            self.pieces.insert(0, piece)
-            inner = _Latex(self.group())
-            yield from ["(", *inner.tokens(), ")"]
-        elif piece in ("\\cdot", "\\times"):
-            yield "*"
-        elif piece == "^":
-            yield ("power", self.tree())
-        elif name in FUNCTIONS or name == "log":
-            power = self.tree() if self.pieces[:1] == ["^"] and self.pieces.pop(0) else None
-            yield ("function", name, power)
-        elif piece in LATEX_ACCENTS or piece[0] == "\\" or piece.isalpha():
-            letter = "".join(self.group()) if piece in LATEX_ACCENTS else piece
-            letter = letter.removeprefix("\\")
-            name = self.name(GREEK.get(letter, letter) + LATEX_ACCENTS.get(piece, ""))
-            yield name
-            if self.pieces[:1] == ["("] and name[1].rstrip("'") != "l":
-                yield "*"
-        elif piece[0].isdigit():
-            yield ("number", piece)
-        else:
-            yield piece
-
-    def name(self, letter: str) -> Tree:
-        below = _plain_latex(self.group()) if self.pieces[:1] == ["_"] and self.pieces.pop(0) else ""
-        if letter.rstrip("'") in RAISED and self.pieces[:1] == ["^"]:
-            self.pieces.pop(0)
-            return _name(letter, "", below, "".join(self.group()))
-        return _name(letter, "", below)
-
-
-def _plain_latex(pieces: list[str]) -> str:
-    return "".join(GREEK.get(piece.removeprefix("\\"), piece) for piece in pieces if piece not in "{}_")
 
 
 # Evaluation.
