@@ -118,8 +118,8 @@ class TestShapes:
         assert not is_pendulum(run_with(lagrangian, coordinates))
 
     def test_chains_are_drawn_next_to_each_other(self):
-        (places,) = positions(run_of("fput-chain", 2), [np.arange(8.0)])
-        assert np.array_equal(places, np.stack([np.arange(1.0, 9.0), np.arange(8.0)], axis=1))
+        (places,) = positions(run_of("fput-chain:3", 2), [np.arange(3.0)])
+        assert np.array_equal(places, np.stack([np.arange(1.0, 4.0), np.arange(3.0)], axis=1))
 
     def test_one_coordinate_uses_its_phase_plane_and_two_their_plane(self):
         oscillator, kepler = run_of("harmonic-oscillator"), run_of("kepler")

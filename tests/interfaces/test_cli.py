@@ -271,14 +271,6 @@ class TestRun:
             shutil.rmtree("b.run")
 
     @pytest.mark.second
-    def test_solver_can_be_selected(self):
-        for solver in ("newton", "fixed-point"):
-            assert "a step" in output_of("run", "kepler", "--span", "5", "--solver", solver)
-        output_of("generate", "kepler", "-o", "kepler_newton", "--solver", "newton")
-        assert "lanes" not in Path("kepler_newton/kepler_newton.c").read_text()
-        assert "'newton', 'explicit'" in error_of("run", "kepler", "--solver", "guess")
-        assert "not explicit for this system" in error_of("run", "kepler", "--solver", "explicit")
-
     def test_step_of_an_ensemble_is_advised_for_all_of_its_states(self):
         Path("g.toml").write_text("[grid]\nq1 = [0.9, 0.5]\n")
         words = ("run", "kepler", "--q", "1,0", "--velocity", "0,1", "--span", "20", "--method", "svi:6")
@@ -341,11 +333,6 @@ class TestRun:
         t = arrays("o.npz")["t"]
         assert f"the {len(t)} states of the run up to t = {t[-1]:g} fill the memory" in message
         assert f"the {len(t)} states computed before were written: o.npz" in message
-
-    @pytest.mark.second
-    def test_draws_a_picture(self):
-        assert "wrote orbit.svg" in output_of("run", "kepler", "--steps", "50", "--plot", "orbit.svg")
-        assert Path("orbit.svg").read_text().startswith("<?xml")
 
     @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
     def test_interrupted_run_saves_computed_states(self, number, monkeypatch):
@@ -432,14 +419,6 @@ class TestInstalledCommand:
         assert result.stderr == ""
 
 
-class TestGenerate:
-    def test_edited_files_require_force(self):
-        output_of("generate", "planar-pendulum", "-o", "pendulum_svi")
-        Path("pendulum_svi/main.c").write_text("int main(void) { return 0; }\n")
-        assert "--force" in error_of("generate", "planar-pendulum", "-o", "pendulum_svi")
-        output_of("generate", "planar-pendulum", "-o", "pendulum_svi", "--force")
-
-
 class TestDerive:
     words = ("derive", "planar-pendulum", "--degree", "2")
 
@@ -447,9 +426,6 @@ class TestDerive:
         result = invoke(*self.words, "--latex", "-o", "step.tex")
         assert (result.exit_code, result.stdout) == (0, "")
         assert r"\tag{27a}" in Path("step.tex").read_text()
-
-    def test_missing_folder_is_reported(self):
-        assert "there is no folder 'no'" in error_of(*self.words, "-o", "no/step.tex")
 
 
 class TestListings:

@@ -26,12 +26,16 @@ u = {{ file = "{file}" }}
 [initial]
 q = [1.0]
 q_dot = [0.0]
+[method]
+method = "svi:1"
 [run]
 step = 0.1
 steps = 5
 """
 ROBOT = """[system]
 robot = "{file}"
+[method]
+method = "svi:1"
 [run]
 step = 0.01
 steps = 5
@@ -44,6 +48,8 @@ lagrangian = "sum(i in N, x_dot[i]**2/2 - m[i]*x[i]**2/2)"
 "m[N]" = {{ file = "{file}" }}
 [initial.q]
 x = [0.1, 0.2]
+[method]
+method = "svi:1"
 [run]
 step = 0.1
 steps = 5

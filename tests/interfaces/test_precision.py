@@ -76,6 +76,7 @@ def test_other_options_and_commands_are_refused(spring: Path, words: list[str], 
     assert sorted(path.name for path in spring.parent.iterdir()) == ["spring.toml"]
 
 
+@pytest.mark.second
 def test_advice(spring: Path) -> None:
     """The step that --advise recommends has the error asked for at the end of the span, to which the last one leads."""
     spring.write_text(TEXT.replace("step = 0.125\nsteps = 16\n", "span = 1.3\n"))

@@ -168,13 +168,6 @@ class TestPage:
         assert "2.10\N{NO-BREAK SPACE}×\N{NO-BREAK SPACE}10<sup>\N{MINUS SIGN}9</sup>" in page
         assert "Q<sup>1</sup>" in page
 
-    def test_tables_show_the_selected_columns(self, page):
-        assert '<td class="word">SVI</td>' in page
-        assert '<td class="number">500</td>' in page
-        assert '<td class="number">\N{EN DASH}</td>' in page
-        assert "series" not in page
-        assert '<td class="number">0.50</td>' in page
-
     def test_verdicts_are_summarised(self, page, results):
         assert [text for _, text in tally([result.verdict for result in results.values()])] == [
             "2 hold in part",
@@ -182,13 +175,6 @@ class TestPage:
         ]
         assert page.count('<span class="verdict partly">') == 5
         assert "The equations of one step</span>" in page
-
-    def test_single_result_is_a_separate_page(self, results):
-        parsed = Page(text := report_html([results["section-3.1"]]))
-        assert len(parsed.all("h1")) == 1
-        assert parsed.all("h2") == []
-        assert "All results" not in text
-        assert "<title>The equations of one step</title>" in text
 
 
 @pytest.fixture

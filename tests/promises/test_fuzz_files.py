@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
+from io import BytesIO
 from pathlib import Path
 from random import Random
 from tempfile import mkdtemp
@@ -169,6 +170,26 @@ def read_package(folder: Path) -> Any:
         return sc.load_package(folder)
 
 
+def saved(write: Callable[..., None], *values: Any, **arrays: Any) -> bytes:
+    """Return the file that a function of NumPy writes."""
+    write(file := BytesIO(), *values, **arrays)
+    return file.getvalue()
+
+
+@cache
+def models() -> dict[str, Kind]:
+    """Valid model files."""
+    tables = {"u.csv": b"t,u\n0,0\n5,1\n10,1.5\n", "v.npz": saved(np.savez, t=[0.0, 10.0], v=[0.0, 1.0])}
+    return {
+        "inputs": Kind({"model.toml": PUSHED.encode(), **tables}, read_inputs),
+        "arrays": model(NET, bonds_csv=b"a,b\n0,1\n1,2\n", m_npy=saved(np.save, [1.0, 2.0, 3.0])),
+        "named entries": model(ENTRIES),
+        "rotations": model(BODY),
+        "field": model(FIELD),
+        "periodic field": model(PERIODIC),
+    }
+
+
 @cache
 def kinds() -> dict[str, Kind]:
     """Valid documents of every kind."""
@@ -180,8 +201,6 @@ def kinds() -> dict[str, Kind]:
     package = generate_package(made, folder / "ring")
     packed = files_in(package)
     chain = sc.compile_stepper(load_written(folder, CHAIN).array_system, "svi:2", flags=QUICK_FLAGS)
-    np.savez(folder / "v.npz", t=[0.0, 10.0], v=[0.0, 1.0])
-    np.save(folder / "m.npy", [1.0, 2.0, 3.0])
     kepler = sc.Model.from_problem(sc.problem("kepler"))
     names = [q.name for q in kepler.system.coordinates]
     grid = f"[grid]\n{names[0]} = {{ from = 0.1, to = 0.5, count = 3 }}\n{names[1]} = [0.1, 0.2]\n"
@@ -189,19 +208,7 @@ def kinds() -> dict[str, Kind]:
     run.advance(3)
     checkpoint = run.checkpoint()
     return {
-        "inputs": Kind(
-            {
-                "model.toml": PUSHED.encode(),
-                "u.csv": b"t,u\n0,0\n5,1\n10,1.5\n",
-                "v.npz": (folder / "v.npz").read_bytes(),
-            },
-            read_inputs,
-        ),
-        "arrays": model(NET, bonds_csv=b"a,b\n0,1\n1,2\n", m_npy=(folder / "m.npy").read_bytes()),
-        "named entries": model(ENTRIES),
-        "rotations": model(BODY),
-        "field": model(FIELD),
-        "periodic field": model(PERIODIC),
+        **models(),
         **{f"corpus {k}": model(text) for k, text in enumerate(seeds("models")) if "[grid]" not in text},
         "grid": Kind({"grid.toml": grid.encode()}, lambda folder: load_ensemble(folder / "grid.toml", kepler)),
         "ensemble": Kind(
@@ -326,7 +333,7 @@ TOO_LARGE = {
 @pytest.mark.parametrize("old", TOO_LARGE)
 def test_values_out_of_range_are_rejected(old: str, tmp_path: Path) -> None:
     chosen, new, message = TOO_LARGE[old]
-    files = {**kinds()[chosen].files}
+    files = {**models()[chosen].files}
     files["model.toml"] = files["model.toml"].replace(old.encode(), new.encode())
     for name, data in files.items():
         (tmp_path / name).write_bytes(data)

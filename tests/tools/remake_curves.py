@@ -2,7 +2,6 @@
 
 python -m benchmarks precision:kepler:0.5 .. -o report.json
 python tests/tools/remake_curves.py [report.json]
-python tests/tools/remake_curves.py --degrees    (the table of the fastest degrees and peers, as Markdown)
 
 Cases of a report replace those recorded before; each has its own date and machine. Times are minima.
 """
@@ -14,12 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.plots import label_times
-from benchmarks.report import OURS, Point, frontier, time_at
+from benchmarks.report import OURS, Point, frontier
 from scvi_codegen.interfaces.pictures.canvas import COLORS, save, style
 
 ROOT = Path(__file__).resolve().parents[2]
 RECORD, PICTURE = ROOT / "benchmarks" / "curves.json", ROOT / "docs" / "work_precision.svg"
-ERRORS = (1e-3, 1e-6, 1e-9, 1e-12)
 COLUMNS, PANEL = 3, (3.4, 2.7)
 MAIN = f"{OURS} svi:8"
 SLOWEST = 100.0
@@ -81,35 +79,9 @@ def draw(record: dict[str, Any]) -> Any:
     return figure
 
 
-def degrees(record: dict[str, Any]) -> str:
-    """Return a table of the fastest degree, the time of SVI(8) relative to it and that of peers relative to SVI(8)."""
-    lines = [f"| problem | {' | '.join(f'{error:.0e}' for error in ERRORS)} |", "| --- " * (len(ERRORS) + 1) + "|"]
-    for name, case in record.items():
-        cells = []
-        for error in ERRORS:
-            times = {
-                method: time
-                for method, curve in case["curves"].items()
-                if (time := time_at(points_of(curve), error, floor=1e-16))
-            }
-            ours = {method: time for method, time in times.items() if method.startswith(f"{OURS} svi:")}
-            peers = [time for method, time in times.items() if not method.startswith(OURS)]
-            if MAIN not in ours:
-                cells.append("")
-                continue
-            best = min(ours, key=lambda method: ours[method])
-            ratio = f"{min(peers) / ours[MAIN]:.2g}" if peers else "-"
-            cells.append(f"{best.split(':')[1]}, {ours[MAIN] / ours[best]:.2f}, {ratio}")
-        lines.append(f"| {title_of(name)} | {' | '.join(cells)} |")
-    return "\n".join(lines)
-
-
 def main() -> None:
-    """Record a report, if one is named, and draw the record; or print the table of degrees."""
+    """Record a report, if one is named, and draw the record."""
     record = json.loads(RECORD.read_text(encoding="utf-8")) if RECORD.exists() else {}
-    if sys.argv[1:] == ["--degrees"]:
-        print(degrees(record))
-        return
     for path in sys.argv[1:]:
         report = json.loads(Path(path).read_text(encoding="utf-8"))
         record |= {case["name"]: recorded_case(case, report["machine"]) for case in report["cases"]}
