@@ -23,7 +23,7 @@ from scvi_codegen.common.errors import StateError
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.method import Method
 from scvi_codegen.runs.compiler import compile_stepper
-from scvi_codegen.runs.states.rotations import homogeneous_state, members_of
+from scvi_codegen.runs.states.rotations import members_of
 from scvi_codegen.runs.stepper import Stepper
 
 TOLERANCES = (1e-4, 1e-5, 1e-6, 1e-8, 1e-9, 1e-10, 3e-11, 1e-11, 3e-12, 1e-12, 5e-13, 3e-13, 2e-13, 1e-13)
@@ -169,7 +169,7 @@ def momenta_of(stepper: Stepper, case: Case) -> Array:
     for k, member in enumerate(members):
         q[member.name] = case.q[:, member.columns]
         velocity[member.rate] = case.velocity[:, ordinary + 3 * k : ordinary + 3 * k + 3]
-    positions, _, velocities = homogeneous_state(stepper.interface, q, None, velocity)
+    positions, _, velocities = stepper._states.start(q, None, velocity)
     return stepper.momentum(positions, velocities) if members else stepper.momentum(*case.states)
 
 

@@ -39,7 +39,6 @@ from scvi_codegen.runs.ensembles.result import EnsembleTrajectory
 from scvi_codegen.runs.events.refinement import WithEventsInDouble, constantly
 from scvi_codegen.runs.forwarding import SteppersAnalysis, largest_step
 from scvi_codegen.runs.results.dense_output import times_of_run
-from scvi_codegen.runs.states.rotations import homogeneous_state, is_one_state
 from scvi_codegen.runs.states.times import times_after
 from scvi_codegen.runs.states.validation import (
     Array,
@@ -49,7 +48,7 @@ from scvi_codegen.runs.states.validation import (
     coordinate_shapes,
     flat_state,
 )
-from scvi_codegen.runs.states.words import check_doubles, checked_time, hashed
+from scvi_codegen.runs.states.words import check_doubles, hashed
 from scvi_codegen.runs.stepping.array_interface import RunSizes, interface_of_sizes, shapes_of_call, sizes_of_run
 from scvi_codegen.runs.stepping.compiled_method import Variants
 from scvi_codegen.runs.stepping.features import check_together, require
@@ -198,14 +197,14 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
             check_together(inputs=inputs, t_eval=t_eval, observe=observe, save_every=stride, error=error)
             inputs = None if inputs is None else checked_inputs(interface, inputs)
         if interface.rotations or interface.variables:
-            q, p, velocity = homogeneous_state(interface, q, p, velocity)
+            q, p, velocity = self._states.start(q, p, velocity)
         if error is not None:
             wanted = checked_error(error, {"h": h, "steps": steps, "tolerance": tolerance}, self)
             start = {"velocity": velocity, "inputs": inputs, "t": t, "parameters": parameters, "options": options}
             start |= ErrorControl(None, absolute_tolerance, max_step, first_step).named
             saved = {"t_end": t_end, "save_every": save_every, "t_eval": t_eval}
             return stepper._confirmed(wanted, q, p, {**start, "progress": progress}, saved)
-        t = t if type(t) is float and isfinite(t) else checked_time(t, interface.words)
+        t = t if type(t) is float and isfinite(t) else self._states.time(t)
         begin = 0.0 if h is None or t_end is None else hashed(t)  # one plan for all times where they do not matter
         how = interface.time_transformation, stepper.in_tau, interface.words
         control = tolerance, absolute_tolerance, max_step, first_step
@@ -360,7 +359,7 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         The other arguments are those of :meth:`integrate`.
         """
         self._check_not_of_run(tables, threads)
-        q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
+        q, p, velocity = self._states.start(q, p, velocity)
         return self._started(
             q,
             p,
@@ -559,7 +558,7 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         **settings: Any,
     ) -> Ensemble:
         """Return the ensemble of :meth:`integrate_ensemble`, with the same arguments, before its first step."""
-        q, p, velocity = homogeneous_state(self.interface, q, p, velocity)
+        q, p, velocity = self._states.start(q, p, velocity)
         if settings.get("error") is not None:
             require(self, "error")
             steps = {name: settings.get(name) for name in ("h", "steps", "tolerance")}
@@ -596,7 +595,7 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         l**2`` the tension of the rod is -2 l lambda. They depend on the state alone and are as accurate as the state.
         """
         values = multipliers(self, q, p, t, parameters)
-        return values[0] if is_one_state(self.interface, q) else values
+        return values[0] if self._states.is_one(q) else values
 
     def constraint_values(
         self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None
@@ -606,7 +605,7 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         For a velocity constraint only the rate is defined; its g is 0 if it does not restrict positions.
         """
         g, rate = constraint_values(self, q, p, t, parameters)
-        return (g[0], rate[0]) if is_one_state(self.interface, q) else (g, rate)
+        return (g[0], rate[0]) if self._states.is_one(q) else (g, rate)
 
 
 class UnavailableError(MethodError, AttributeError):
@@ -691,7 +690,7 @@ class StepperOfRunTimeSizes(Stepper):
             general = layout.momentum_formulas or (self._reason and not layout.momenta)
             spins = any(each.startswith("spin") for each in bound.interface.rotations)
             if not (spins or bound.interface.variables):  # their state has momenta of its own
-                positions, *_ = homogeneous_state(bound.interface, state, None, None)
+                positions, *_ = bound._states.start(state, None, None)
                 named["velocity" if general else "p"] = np.zeros(np.shape(positions))
         return method(bound, state, *arguments, parameters=parameters, **named)
 

@@ -36,7 +36,7 @@ from scvi_codegen.runs.results.saved_states import Array, checked_row
 from scvi_codegen.runs.states.attitude_history import AttitudeHistory
 from scvi_codegen.runs.states.rotation_quantities import named_quantities
 from scvi_codegen.runs.states.validation import columns_of_inputs
-from scvi_codegen.runs.states.words import TwoWords, Words, check_keeps_words, low_words, missing, scalar
+from scvi_codegen.runs.states.words import TwoWords, Words, check_keeps_words, low_words, scalar
 from scvi_codegen.runs.stepping.features import refusal, require
 from scvi_codegen.runs.stepping.projection import constraint_values, multipliers
 from scvi_codegen.runs.stepping.step_plan import FixedSteps
@@ -403,7 +403,7 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
         if not self.pieces:
             return states_at(self, times)
         flat = within(times, self.t[0], self.t[-1])
-        q, p = (missing((len(flat), self.stepper.dimension), self.stepper.interface.words) for _ in range(2))
+        q, p = (self.stepper._states.missing((len(flat), self.stepper.dimension)) for _ in range(2))
         forward = self.pieces[0].forward
         ends = forward * np.array([piece.t[-1] for piece in self.pieces])
         number = np.minimum(np.searchsorted(ends, forward * flat), len(ends) - 1)

@@ -27,9 +27,8 @@ from scvi_codegen.methods import Method
 from scvi_codegen.runs.accuracy.size import distances_from_mean, relative, relative_to_motion
 from scvi_codegen.runs.ensembles.initial_states import momenta_of_each, start_of_ensemble
 from scvi_codegen.runs.ensembles.result import EnsembleTrajectory
-from scvi_codegen.runs.states.rotations import homogeneous_state
-from scvi_codegen.runs.states.validation import Array, States, flat_state
-from scvi_codegen.runs.states.words import low_words, split, with_low
+from scvi_codegen.runs.states.validation import Array, States
+from scvi_codegen.runs.states.words import low_words, with_low
 from scvi_codegen.runs.stepper import Stepper
 
 Integrate = Callable[..., Any]
@@ -69,9 +68,9 @@ class Trials:
 
     def __init__(self, stepper: Stepper, q: States, state: Mapping[str, Any]) -> None:
         self.stepper, self.state = stepper, {**state, "velocity": None}
-        interface, t, parameters = stepper.interface, state["t"], state["parameters"]
-        q, p, velocity = homogeneous_state(interface, q, state["p"], state["velocity"])
-        self.together = np.ndim(flat_state(interface, split(q, "q")[0] if interface.words > 1 else q, "q")) == 2
+        t, parameters = state["t"], state["parameters"]
+        q, p, velocity = stepper._states.start(q, state["p"], state["velocity"])
+        self.together = stepper._states.axes(q) == 2
         if self.together:
             momenta = momenta_of_each(stepper, q, p, velocity, t, parameters)
             self.q, self.p, self.state["parameters"] = start_of_ensemble(stepper, q, momenta, t, parameters)

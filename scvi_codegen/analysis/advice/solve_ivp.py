@@ -24,7 +24,6 @@ from scvi_codegen.methods.controllers import SYMPLECTIC, with_time_transformatio
 from scvi_codegen.runs.accuracy.global_error import checked_error
 from scvi_codegen.runs.compiler import compile_stepper, second_stepper
 from scvi_codegen.runs.results.dense_output import times_of_run
-from scvi_codegen.runs.states.rotations import homogeneous_state
 from scvi_codegen.runs.states.validation import Array, States
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.stepping.step_plan import ErrorControl
@@ -158,7 +157,7 @@ def solve_ivp(
     else:
         known, parameters = unrolled_at(system, q, parameters)
     stepper, uncompiled = _stepper(known, method, (time_transformation, controller), request)
-    q, p0, velocity = homogeneous_state(stepper.interface, q, p0, velocity)
+    q, p0, velocity = stepper._states.start(q, p0, velocity)
     if p0 is None and velocity is None:
         raise StateError("y0 contains positions by name: give velocity, too, or numbers for positions and momenta")
     control = _error_control(stepper, request, atol, max_step, first_step)

@@ -38,7 +38,6 @@ from scvi_codegen.runs.ensembles.lanes import LaneRuns
 from scvi_codegen.runs.ensembles.result import OK
 from scvi_codegen.runs.ensembles.schedule import CommonSteps
 from scvi_codegen.runs.ensembles.thread_pool import StopCheck, run_jobs
-from scvi_codegen.runs.states.rotations import homogeneous_state
 from scvi_codegen.runs.states.times import times_after
 from scvi_codegen.runs.states.validation import Array, EnsembleParameters, States
 from scvi_codegen.runs.stepping.features import require
@@ -193,6 +192,6 @@ def indicators_of_ensemble(
     **settings: Any,
 ) -> ChaosIndicators:
     """Return the indicators of :meth:`scvi_codegen.Stepper.chaos_indicators_ensemble`."""
-    q, p, velocity = homogeneous_state(stepper.interface, q, p, velocity)
+    q, p, velocity = stepper._states.start(q, p, velocity)
     p = momenta_of_each(stepper, q, p, velocity, settings["t"], settings["parameters"])
     return ChaosIndicatorsEnsemble(stepper, q, p, **settings).run(progress=progress, threads=threads)

@@ -21,7 +21,6 @@ from scvi_codegen.common.errors import AccuracyWarning, FitError, StateError, St
 from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import checked_count, checks_arguments
 from scvi_codegen.runs.driver.segments import checked_inputs
-from scvi_codegen.runs.states.rotations import checked_pair, homogeneous_state
 from scvi_codegen.runs.states.validation import Array, columns_of_inputs
 from scvi_codegen.runs.stepper import STEPPER, Stepper
 
@@ -153,7 +152,7 @@ def fit(
         StepFailedError: if a step of the initial guess fails.
     """
     stepper = stepper.bind(q, parameters)[0]._known_with_events
-    q, p, velocity = homogeneous_state(stepper.interface, q, p, velocity)
+    q, p, velocity = stepper._states.start(q, p, velocity)
     measurements = Measurements.checked(
         stepper, t, measured, observed, deviations, start, h, checked_inputs(stepper.interface, inputs)
     )
@@ -244,7 +243,7 @@ class _Model:
         unknown_indices = [2 * m + stepper.parameters.index(name) for name in wanted]
         names = (*wanted, *state_names(stepper)) if fit_initial_state else tuple(wanted)
         unknown_indices += range(2 * m) if fit_initial_state else ()
-        known = np.concatenate([*checked_pair(stepper.interface, q, momenta), values])
+        known = np.concatenate([*stepper._states.pair(q, momenta), values])
         return cls(measurements, names, np.array(unknown_indices, dtype=np.intp), known)
 
     @property

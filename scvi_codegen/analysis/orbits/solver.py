@@ -45,9 +45,8 @@ from scvi_codegen.common.validation import checked_count, checks_arguments
 from scvi_codegen.runs.accuracy.size import RESOLVED, SizeOfMotion, roundoff
 from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted, without_accuracy_warnings
 from scvi_codegen.runs.states.reduction import Reduction
-from scvi_codegen.runs.states.rotations import checked_pair, homogeneous_state
 from scvi_codegen.runs.states.times import steps_within
-from scvi_codegen.runs.states.validation import Array, Parameters, check_inputs_given, checked_vector
+from scvi_codegen.runs.states.validation import Array, Parameters, check_inputs_given
 from scvi_codegen.runs.stepper import STEPPER, Stepper
 from scvi_codegen.runs.stepping.features import require
 from scvi_codegen.runs.stepping.step_plan import Fixed
@@ -267,7 +266,7 @@ def periodic_orbit(
         StepFailedError: if a step from the initial guess fails.
     """
     stepper = stepper.bind(q, parameters)[0]._known_with_events
-    q, p, velocity = homogeneous_state(stepper.interface, q, p, velocity)
+    q, p, velocity = stepper._states.start(q, p, velocity)
     interface, names = stepper.interface, state_names(stepper)
     require(stepper, "periodic_orbit")
     check_inputs_given(interface, parameters)
@@ -290,7 +289,7 @@ def periodic_orbit(
             raise StateError(f"fixed names '{name}', which is no coordinate or momentum{closest(name, names)}")
     t, values = checked_number(t, "the time t"), stepper._parameters(parameters)
     momenta = stepper._initial_momenta(q, p, velocity, t, values)
-    start = np.concatenate(checked_pair(stepper.interface, q, momenta))
+    start = np.concatenate(stepper._states.pair(q, momenta))
     search = _OrbitSearch(
         stepper=stepper,
         at_rest=_momenta_at_rest(stepper, start[: stepper.dimension], t, values),
@@ -299,7 +298,7 @@ def periodic_orbit(
         sequence=None if adaptive else StepSequence.equal(_count_of_steps(period, steps, h)),
         fixed_indices=(*map(names.index, dict.fromkeys(fixed)), *([-1] if fixed_period else [])),
         energy=None if energy is None else checked_number(energy, "the energy"),
-        gain=np.zeros(stepper.dimension) if gain is None else checked_vector(interface, gain, "gain"),
+        gain=np.zeros(stepper.dimension) if gain is None else stepper._states.vector(gain, "gain"),
         t=t,
         parameters=values,
         options=options,

@@ -23,8 +23,8 @@ from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import checked_count
 from scvi_codegen.runs.accuracy.size import largest_range, size_for_updates
 from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted
-from scvi_codegen.runs.states.rotations import flat_states
-from scvi_codegen.runs.states.validation import Array, Parameters, States, columns_of_inputs, flat_state
+from scvi_codegen.runs.states.layout import StateLayout
+from scvi_codegen.runs.states.validation import Array, Parameters, States, columns_of_inputs
 from scvi_codegen.runs.stepping.features import require
 
 if TYPE_CHECKING:
@@ -194,7 +194,7 @@ def path_of(
     times = begin + np.arange(count) * h
     intervals = kind(stepper, times, h, _parameters_of_steps(stepper, parameters, inputs, times + h / 2.0), options)
     arguments = {"parameters": parameters, "options": options, **({"inputs": inputs} if inputs is not None else {})}
-    nodes = _given_nodes(stepper.interface, start, begin, duration, count)
+    nodes = _given_nodes(stepper._states, start, begin, duration, count)
     values = intervals.parameters
     start_energy = None if energy is None else checked_number(energy, "energy")
 
@@ -216,7 +216,7 @@ def path_of(
         return closed_path
     if q0 is None or q1 is None:
         raise StateError("path: give both positions q0 and q1, or closed= and start=")
-    ends = [stepper._vector(_positions(stepper.interface, q, name), name) for q, name in ((q0, "q0"), (q1, "q1"))]
+    ends = [stepper._vector(stepper._states.positions(q, name), name) for q, name in ((q0, "q0"), (q1, "q1"))]
     intervals.range_of_start = largest_range(np.array(ends) if nodes is None else nodes)
     if revolutions is not None:
         attempts: list[Attempt] = [
@@ -246,7 +246,7 @@ def different_paths(
         PathError: if no path is found.
     """
     paths, reason = list[Path](), None
-    ends = [real_array(_positions(stepper.interface, each, "the ends"), "the ends") for each in (q0, q1)]
+    ends = [real_array(stepper._states.positions(end, "the ends"), "the ends") for end in (q0, q1)]
     line = _line(ends, arguments["steps"])
     tried: list[dict[str, Any]] = [{}]
     if revolutions is not None:
@@ -266,13 +266,6 @@ def different_paths(
             f"{reason} ({len(tried) - 1} further starts were tried)" if tried[1:] else str(reason)
         ) from reason
     return sorted(paths, key=lambda each: each.action)
-
-
-def _positions(interface: Any, values: Any, name: str) -> Any:
-    """Return positions by name, also attitudes, as (.., m) numbers, and other values as they are."""
-    if interface.rotations and isinstance(values, Mapping):
-        return flat_states(interface, values, None, "p")[0]
-    return flat_state(interface, values, name)
 
 
 def _kind_of_intervals(stepper: Any, *, closed: bool, energy: bool) -> type[Intervals]:
@@ -465,17 +458,17 @@ def _parameters_of_steps(stepper: Any, parameters: Parameters, inputs: Mapping[s
     return values
 
 
-def _given_nodes(interface: Any, start: Any, t: float, duration: float, count: int) -> Array | None:
+def _given_nodes(states: StateLayout, start: Any, t: float, duration: float, count: int) -> Array | None:
     """Return the nodes of a start, an array or a function of time; ``None`` without one."""
     if start is None:
         return None
     if callable(start):
         call: Callable[[float], Any] = start
-        start = [_positions(interface, call(t + duration * k / count), "start") for k in range(count + 1)]
-    nodes = real_array(_positions(interface, start, "start"), "start")
-    if nodes.ndim != 2 or nodes.shape[1] != interface.dimension or len(nodes) not in (count, count + 1):
+        start = [states.positions(call(t + duration * k / count), "start") for k in range(count + 1)]
+    nodes = real_array(states.positions(start, "start"), "start")
+    if nodes.ndim != 2 or nodes.shape[1] != states.dimension or len(nodes) not in (count, count + 1):
         raise StateError(
-            f"start must have shape ({count + 1}, {interface.dimension}), a position at each of steps + 1 times, not "
+            f"start must have shape ({count + 1}, {states.dimension}), a position at each of steps + 1 times, not "
             f"{nodes.shape}"
         )
     if not np.isfinite(nodes).all():

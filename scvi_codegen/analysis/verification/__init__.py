@@ -36,7 +36,6 @@ from scvi_codegen.methods.discretise import discretised_form
 from scvi_codegen.methods.method import Method
 from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
 from scvi_codegen.runs.compiler import compile_stepper
-from scvi_codegen.runs.states.rotations import checked_pair
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepper import STEPPER, Stepper
 from scvi_codegen.systems.arrays.system import ArraySystem
@@ -171,7 +170,7 @@ def _initial_state(system: MechanicalSystem, stepper: Stepper, q: Any, p: Any, h
         raise StateError("only one of q and p was passed: give both, or neither")
     if q is None or p is None:
         return _random_state(system, stepper, h, t)
-    position, momentum = checked_pair(stepper.interface, q, p)
+    position, momentum = stepper._states.pair(q, p)
     if system.constraints:
         position, momentum = stepper.project(position, momentum, t=t)
     return State(position, momentum, t, h if h else _step(stepper, position, momentum, t))

@@ -14,7 +14,6 @@ from scvi_codegen.codegen.native.capacity import room_for_states, too_many_state
 from scvi_codegen.common.errors import StepFailedError
 from scvi_codegen.common.validation import checked_count
 from scvi_codegen.runs.driver.singular_time import ProgressWatch, check_energy_surface
-from scvi_codegen.runs.states.rotations import checked_pair
 from scvi_codegen.runs.states.times import times_after
 from scvi_codegen.runs.states.validation import BINARY64, FEW, NUMBERS, SEQUENCES, Array
 from scvi_codegen.runs.states.words import block_of, from_block
@@ -147,13 +146,13 @@ class ShortRuns(StateRows):
     def __init__(self, memory: Memory) -> None:
         super().__init__(memory, FIRST_STEPS + 3)
         stepper, m = memory.stepper, len(memory._q)
-        self.interface, self._kind = stepper.interface, (0, cast("float | None", None))
+        self._states, self._kind = stepper._states, (0, cast("float | None", None))
         self.shape = (m,) if m <= FEW else None  # of vectors that are checked as lists, faster than as arrays
         self._start, self._sizes = np.empty(1 + 2 * m), np.full(FIRST_STEPS + 3, math.nan)
         self._pack = partial(struct.Struct(f"{1 + 2 * m}d").pack_into, cast(Any, self._start), 0)
         self.call = memory._new_call(*self.starts)
         self.call.start, self.call.sizes = stepper.binding.pointers(self._start, self._sizes)
-        self.call.has_energies = self.interface.conserves_energy and not stepper.changes_states
+        self.call.has_energies = stepper.interface.conserves_energy and not stepper.changes_states
         self.integrate = stepper.binding.call("integrate", self.call)
         self.results = stepper.binding.results(self.call)
         self._stepper, self._parameters = stepper, memory._parameters
@@ -177,7 +176,7 @@ class ShortRuns(StateRows):
                 return
         except (OverflowError, struct.error):  # of an integer above all floats
             pass
-        self._start[0], self._start[1:] = t, np.concatenate(checked_pair(self.interface, q, p, name))
+        self._start[0], self._start[1:] = t, np.concatenate(self._states.pair(q, p, name))
 
     def begin_by_velocity(self, t: float, q: Any, velocity: Any) -> None:
         """Set the initial state (q, dL/dv); raises as :meth:`begin` and :meth:`Integrator.initial_momentum`."""

@@ -38,12 +38,7 @@ from scvi_codegen.runs.driver.segments import (
 )
 from scvi_codegen.runs.ensembles.batches import FULL, Rows, SuccessiveRuns
 from scvi_codegen.runs.ensembles.device import DeviceEnsemble, DeviceRuns, check_device, on_processor
-from scvi_codegen.runs.ensembles.initial_states import (
-    checked_ensemble,
-    momenta_of_each,
-    parameters_of_each,
-    start_of_ensemble,
-)
+from scvi_codegen.runs.ensembles.initial_states import momenta_of_each, start_of_ensemble
 from scvi_codegen.runs.ensembles.lanes import CommonRuns
 from scvi_codegen.runs.ensembles.observation import EnsembleObservation
 from scvi_codegen.runs.ensembles.result import EVENT_FAILED, INTERRUPTED, OK, EnsembleTrajectory, Span
@@ -58,7 +53,7 @@ from scvi_codegen.runs.states.validation import (
     check_left_to_inputs,
     columns_of_inputs,
 )
-from scvi_codegen.runs.states.words import check_doubles, checked_time, hashed, missing, stacked
+from scvi_codegen.runs.states.words import check_doubles, hashed, stacked
 from scvi_codegen.runs.stepping.features import check_together, require
 from scvi_codegen.runs.stepping.step_plan import (
     Adaptive,
@@ -146,7 +141,7 @@ class Ensemble:
         check_device(device, h, error=error, t_eval=t_eval)
         _check_observe(stepper, observe, inputs=inputs, error=error, t_eval=t_eval)
         recorded = _recorded_events(stepper, device, observe)
-        t = self.t0 = checked_time(t, interface.words)
+        t = self.t0 = stepper._states.time(t)
         steps, t_end = _steps_or_end(t, h, steps, t_end, inputs, control, t_eval, words=interface.words)
         require(stepper, "ensembles")
         if device is not None:
@@ -156,11 +151,11 @@ class Ensemble:
         self.stepper = stepper
         self.options, self.inputs = checked_options(options), dict[str, Input]()
         if inputs is not None:
-            count = len(checked_ensemble(stepper, q, q)[0])
+            count = len(stepper._states.members(q, "q"))
             self.inputs = checked_inputs(interface, inputs, count)
             check_left_to_inputs(interface, parameters)
             inside = first_inner_time(t, float(real_array(0.0 if t_end is None else t_end, "t_end").flat[0]))
-            values = parameters_of_each(stepper, parameters, count)
+            values = stepper._states.parameters_of_each(parameters, count)
             parameters = parameters_at(stepper.parameters, values, self.inputs, inside)
         p = momenta_of_each(stepper, q, p, velocity, t, parameters)
         self.save_every = checked_count(save_every, "save_every", least=1)
@@ -474,9 +469,9 @@ class Ensemble:
         lanes = [(self.saved.get(j) or self._unfinished(j)).limited(self.most_states) for j in range(len(self))]
         count = max(len(each.t) for each in lanes) if self.t_eval is None else len(self.t_eval)
         t = np.arange(count, dtype=float) if self.t_eval is None else self.t_eval
-        words, shape = self.stepper.interface.words, (count, len(self), self.stepper.dimension)
-        times = missing((count, len(lanes)), words) if self.t_eval is None else None
-        q, p = missing(shape, words), missing(shape, words)
+        missing, shape = self.stepper._states.missing, (count, len(self), self.stepper.dimension)
+        times = missing((count, len(lanes))) if self.t_eval is None else None
+        q, p = missing(shape), missing(shape)
         actions = np.full(shape[:2], np.nan) if self.stepper.sums_action else None
         for j, each in enumerate(lanes):
             row = slice(0, len(each.t))
@@ -498,12 +493,12 @@ class Ensemble:
     def _fictitious_times(self, fixed: CommonSteps, count: int) -> Array:
         """Return tau of saved states, equal in all trajectories; NaN after the last common one, where t_end is in t."""
         tau = fixed.times(tau=True)[:count]
-        rows = missing((count,), fixed.words)
+        rows = self.stepper._states.missing((count,))
         rows[: len(tau)] = tau
         return rows
 
     def _successive_result(self, work: SuccessiveRuns) -> EnsembleTrajectory:
-        count, words, full = len(self), self.stepper.interface.words, work.status == FULL
+        count, layout, full = len(self), self.stepper._states, work.status == FULL
         stored = np.where(full, np.minimum(work.stored, 1), work.stored)  # the last state of those with too many
         rows = 1 + int(stored.max())
         index = np.full((rows, count), -1)  # of the states in the order in which C stored them; the last row is NaN
@@ -516,13 +511,14 @@ class Ensemble:
 
         def ordered(name: str, first: Array) -> Array:
             """Return the rows of all trajectories, NaN after their ends."""
-            last = missing((1, *first.shape[1:]), words if name != "actions" else 1)
+            shape = 1, *first.shape[1:]
+            last = np.full(shape, np.nan) if name == "actions" else layout.missing(shape)
             whole = np.concatenate([first, *(getattr(each, name) for each in self.states), last])
-            return cast(Array, whole[index] if words > 1 else whole.take(index, axis=0))
+            return cast(Array, whole[index] if layout.words > 1 else whole.take(index, axis=0))
 
         q, p = ordered("q", self.start[0]), ordered("p", self.start[1])
         if self.t_eval is None:
-            start = missing((count,), words)
+            start = layout.missing((count,))
             start[:] = self.t0
             numbers, times = np.arange(rows, dtype=float), ordered("t", start)
             own: Array | None = times
@@ -534,7 +530,7 @@ class Ensemble:
             sums = self.stepper.sums_action
             return replace(whole, actions=ordered("actions", np.zeros(count))) if sums else whole
         at = np.where(self.t_eval == self.t0, 0, 1)
-        none = missing((1, *q.shape[1:]), words)  # if no trajectory reached the end
+        none = layout.missing((1, *q.shape[1:]))  # if no trajectory reached the end
         q, p = (np.concatenate([each, none])[at] for each in (q, p))
         return self._trajectories(self.t_eval, None, q, p, work.names, work.done, work.fallback_steps)
 

@@ -29,7 +29,7 @@ from scvi_codegen.runs.results.saved_states import checked_row
 from scvi_codegen.runs.states.attitude_history import AttitudeHistory
 from scvi_codegen.runs.states.rotation_quantities import named_quantities
 from scvi_codegen.runs.states.validation import Array
-from scvi_codegen.runs.states.words import TwoWords, Words, check_keeps_words, missing
+from scvi_codegen.runs.states.words import TwoWords, Words, check_keeps_words
 from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.step_plan import Adaptive, Fixed
 
@@ -203,7 +203,7 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
 
     def energy(self) -> Array:
         """Return (n, k) energies p.v - L; NaN after a failure, and for trajectories that leave the domain of L."""
-        energies = missing(self.q.shape[:2], self.stepper.interface.words)
+        energies = self.stepper._states.missing(self.q.shape[:2])
         for j, good, parameters in self._with_parameters():
             with suppress(StateError):
                 energies[good, j] = self.stepper.energy(
@@ -240,7 +240,7 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
 
     def _momentum_maps(self) -> tuple[Array, Array]:
         shape = (*self.q.shape[:2], len(self.stepper.momentum_map_names))
-        values, sizes = missing(shape, self.stepper.interface.words), np.full(shape, np.nan)
+        values, sizes = self.stepper._states.missing(shape), np.full(shape, np.nan)
         for j, good, parameters in self._with_parameters():
             with suppress(StateError):
                 values[good, j], sizes[good, j] = self.stepper._momentum_maps_and_sizes(

@@ -24,7 +24,7 @@ from scvi_codegen.runs.events.detection import CrossingSearch
 from scvi_codegen.runs.events.functions import EventFunctions
 from scvi_codegen.runs.results.dense_output import stepped_to
 from scvi_codegen.runs.states.times import WHOLE
-from scvi_codegen.runs.states.words import Word, block_of, fraction_of, missing, stacked, with_low, word_of
+from scvi_codegen.runs.states.words import Word, block_of, fraction_of, stacked, with_low, word_of
 from scvi_codegen.runs.stepping.memory import Memory
 from scvi_codegen.runs.stepping.step_plan import Fixed, FixedSteps, Until
 from scvi_codegen.systems.event import Crossings, Event
@@ -232,13 +232,13 @@ class RefinedSearch(CrossingSearch):
 
     def crossings(self) -> tuple[Crossings, ...]:
         """Return the crossings by event, with times and states of two words."""
-        named, found = self.precise.named, []
+        states, found = self.precise._states, []
         for number, event in enumerate(self.stepper.events):
             mine = [each for each in self.refined if each.function == number]
-            none = missing((0,), 2), *(missing((0, self.precise.dimension), 2) for _ in range(2))
+            none = states.missing((0,)), *(states.missing((0, states.dimension)) for _ in range(2))
             t, q, p = (stacked([each[k] for each in mine]) for k in (1, 2, 3)) if mine else none
             elements = np.array([each.element for each in mine], dtype=np.int64)
-            found.append(Crossings(event=event, t=t, q=named(q), p=named(p), element=elements))
+            found.append(Crossings(event=event, t=t, q=states.named(q), p=states.named(p), element=elements))
         return tuple(found)
 
 

@@ -25,7 +25,8 @@ from scvi_codegen.common.validation import checked_count
 from scvi_codegen.runs.driver.run import Run
 from scvi_codegen.runs.events.refinement import constantly
 from scvi_codegen.runs.results.export import COLUMNS, Piece, loaded
-from scvi_codegen.runs.states.words import Words, low_words, missing, with_low
+from scvi_codegen.runs.states.layout import layout_of
+from scvi_codegen.runs.states.words import Words, low_words, with_low
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.stepping.compiled_method import Variants
 from scvi_codegen.runs.stepping.integrator import Integrator
@@ -61,13 +62,14 @@ class Chunk:
 
 def no_states(interface: Interface) -> Piece:
     """Return an empty piece of states, with low words in double-double arithmetic."""
-    t, vectors = missing((0,), interface.words), missing((0, interface.dimension), interface.words)
+    layout = layout_of(interface)
+    t, vectors = layout.missing((0,)), layout.missing((0, interface.dimension))
     return t, vectors, vectors, np.empty(0, dtype=np.int32)
 
 
 def no_crossings(interface: Interface) -> NDArray[np.float64]:
     """Return an empty array of crossings."""
-    none: NDArray[np.float64] = missing((0, 2 + 2 * interface.dimension), interface.words)
+    none: NDArray[np.float64] = layout_of(interface).missing((0, 2 + 2 * interface.dimension))
     return none
 
 

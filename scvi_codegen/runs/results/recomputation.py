@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from scvi_codegen.common.errors import ScviCodegenError, StateError
 from scvi_codegen.runs.results.dense_output import whole_steps
 from scvi_codegen.runs.results.saved_states import ROUNDINGS, STEP_END_TOLERANCE, Array, SavedStates
-from scvi_codegen.runs.states.words import missing
 from scvi_codegen.systems.event import Crossings
 
 SAME_STEP_SIZE = 1e-9
@@ -122,7 +121,7 @@ def exchanged_energy(states: Any, energy: Array) -> Array | None:
     stepper = states.stepper
     if stepper.interface.changes_energy and not stepper.interface.balances_energy:
         return None
-    before = missing((len(energy),), stepper.interface.words)  # before the first event at a time
+    before = stepper._states.missing((len(energy),))  # before the first event at a time
     try:
         for crossings, rows in changes_by_events(states):
             for row, value in zip(

@@ -21,7 +21,7 @@ from scvi_codegen.runs.states.attitudes import (
 from scvi_codegen.runs.states.rotation_quantities import spins, values_by_name
 from scvi_codegen.runs.states.rotations import Member, members_of
 from scvi_codegen.runs.states.validation import Array, coordinate_shapes, shapes_of
-from scvi_codegen.runs.states.words import missing, unnamed
+from scvi_codegen.runs.states.words import unnamed
 from scvi_codegen.systems.formulas.symbols import DOT
 
 
@@ -165,7 +165,7 @@ class AttitudeHistory:
             if self.pieces:
                 raise StateError("angular velocities between the states of a run with inputs are not available: omit t")
             return unnamed(self.stepper.velocity(q, p, t, self.parameters))
-        velocities = missing(q.shape, self.stepper.interface.words)
+        velocities: Array = self.stepper._states.missing(q.shape)
         for k, (times, own, momenta, *_) in enumerate(self.each()):
             velocities[: len(times), k] = self.stepper.velocity(own, momenta, times, self.parameters[k])
         return velocities

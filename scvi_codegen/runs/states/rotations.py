@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import math
-import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import chain
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from scvi_codegen.codegen.native.arguments import real_array
-from scvi_codegen.codegen.rendering.source import COMPONENTS, Interface
+from scvi_codegen.codegen.rendering.source import COMPONENTS
 from scvi_codegen.common.errors import StateError, closest
 from scvi_codegen.runs.states.attitudes import (
     matrices,
@@ -22,8 +18,8 @@ from scvi_codegen.runs.states.attitudes import (
     scaled_vectors,
     velocities_of_body,
 )
-from scvi_codegen.runs.states.validation import Array, States, checked_vector, coordinate_shapes, flat_state, shapes_of
-from scvi_codegen.runs.states.words import Shapes, split, with_low
+from scvi_codegen.runs.states.validation import Array
+from scvi_codegen.runs.states.words import Shapes
 
 if TYPE_CHECKING:
     from scvi_codegen.systems.system import MechanicalSystem
@@ -66,147 +62,6 @@ def members_of(dimension: int, declarations: Sequence[str]) -> tuple[Member, ...
         members.append(Member(kind, name, rate[0] if rate else "", columns, momentum=len(rate) > 1))
         first += COMPONENTS[kind]
     return tuple(members)
-
-
-def homogeneous_state(interface: Interface, q: Any, p: Any, velocity: Any) -> tuple[Any, Any, Any]:
-    """Return (q, p, velocity) with states by name as (.., m) numbers, and numbers as they are; see :func:`state_of`.
-
-    In double-double arithmetic ordinary coordinates and the variables of first-order systems have both words;
-    rotations, directions and spins by name are doubles.
-    """
-    if interface.words > 1:
-        return _homogeneous_state_of_two_words(interface, q, p, velocity)
-    if interface.variables:
-        return _first_order_state(interface, q, p, velocity)
-    by_name = [each for each in (q, p, velocity) if isinstance(each, Mapping)]
-    if not by_name or not interface.rotations:
-        return q, p, velocity
-    members = members_of(interface.dimension, interface.rotations)
-    homogeneous = interface.coordinates[members[0].columns.start :]
-    if not any(each.keys().isdisjoint(homogeneous) for each in by_name):
-        return q, p, velocity
-    return state_of(interface.coordinates, members, q, p, velocity, shapes_of(interface) or ())
-
-
-def _homogeneous_state_of_two_words(interface: Interface, q: Any, p: Any, velocity: Any) -> tuple[Any, Any, Any]:
-    doubles = replace(interface, words=1)
-    if interface.variables:
-        if p is not None or velocity is not None:
-            return homogeneous_state(doubles, q, p, velocity)
-        halves = (homogeneous_state(doubles, words, None, None)[:2] for words in split(q, "the state"))
-        q, p = map(with_low, *halves)
-        return q, p, None
-    if not (interface.rotations and any(isinstance(each, Mapping) for each in (q, p, velocity))):
-        return q, p, velocity
-    ordinary, first = dict[str, tuple[slice, tuple[int, ...]]](), 0
-    for name, shape in coordinate_shapes(interface):
-        if first < members_of(interface.dimension, interface.rotations)[0].columns.start:
-            ordinary[name] = slice(first, first + math.prod(shape)), shape
-        first += math.prod(shape)
-    high, low = list[Any](), list[dict[str, Array]]()
-    for label, values in (("q", q), ("p", p), ("velocity", velocity)):
-        by_name = values if isinstance(values, Mapping) else {}
-        words = {name: split(value, f"{label}: '{name}'") for name, value in by_name.items() if name in ordinary}
-        low.append({name: part for name, (_, part) in words.items()})
-        high.append({**by_name, **{name: part for name, (part, _) in words.items()}} if by_name else values)
-    results = []
-    for values, parts in zip(homogeneous_state(doubles, *high), low, strict=True):
-        if parts:
-            rest = np.zeros(values.shape)
-            for name, part in parts.items():
-                columns, shape = ordinary[name]
-                rest[..., columns] = part.reshape(*part.shape[: part.ndim - len(shape)], math.prod(shape))
-            values = with_low(np.array(values), rest)
-        results.append(values)
-    return results[0], results[1], results[2]
-
-
-def flat_states(interface: Interface, q: States, other: States | None, name: str) -> tuple[Any, Any]:
-    """Return positions, and the momenta (``name`` is ``"p"``) or velocities, by name as (.., m) numbers in order."""
-    if interface.rotations and (isinstance(q, Mapping) or isinstance(other, Mapping)):
-        q, *moving = homogeneous_state(interface, q, *((other, None) if name == "p" else (None, other)))
-        other = moving[name != "p"]
-    return flat_state(interface, q, "q"), None if other is None else flat_state(interface, other, name)
-
-
-def checked_pair(interface: Interface, q: States, other: States, name: str = "p") -> tuple[Array, Array]:
-    """Return finite, contiguous (m,) copies of positions and momenta (or what ``name`` names), also by name."""
-    if interface.words == 1 and (isinstance(q, Mapping) or isinstance(other, Mapping)):
-        q, other = flat_states(interface, q, other, name)
-    return checked_vector(interface, q, "q"), checked_vector(interface, other, name)
-
-
-def checked_states(
-    interface: Interface, q: States, p: States, t: ArrayLike, *, second: str = "p"
-) -> tuple[Array, Array, Array]:
-    """Return (n,) times and contiguous (n, m) positions and momenta (or what ``second`` names) of one or n states."""
-    if interface.words > 1:
-        words = [split(each, name) for each, name in ((q, "q"), (p, second), (t, "the time t"))]
-        doubles = replace(interface, words=1)
-        high, low = (checked_states(doubles, *each, second=second) for each in zip(*words, strict=True))
-        times, positions, momenta = map(with_low, high, low)
-        return times, positions, momenta
-    q, p = flat = flat_states(interface, q, p, second)
-    positions, momenta = (real_array(each, name) for each, name in zip(flat, ("q", second), strict=True))
-    if positions.ndim <= 1:
-        positions, momenta = checked_pair(interface, q, p, second)
-    elif positions.ndim != 2 or positions.shape != momenta.shape or positions.shape[1] != interface.dimension:
-        raise StateError(
-            f"states must have shape (n, {interface.dimension}), not q {positions.shape} and {second} {momenta.shape}"
-        )
-    count = positions.size // interface.dimension
-    times = real_array(t, "the time t")
-    if not np.isfinite(times).all():
-        raise StateError("the time t must be finite")
-    if times.shape not in ((), (count,)):
-        raise StateError(f"the time t must be one number or {count}, one for each state, not of shape {times.shape}")
-    times = np.ascontiguousarray(np.broadcast_to(times, (count,)))
-    return times, np.ascontiguousarray(positions), np.ascontiguousarray(momenta)
-
-
-def is_one_state(interface: Interface, q: States) -> bool:
-    """Return whether these are the positions of one state, not of several."""
-    if interface.words > 1:
-        q = split(q, "q")[0]
-    plain = not isinstance(q, Mapping) and real_array(q, "q").ndim == 1
-    return plain or real_array(flat_states(interface, q, None, "p")[0], "q").ndim == 1
-
-
-def _first_order_state(interface: Interface, z: Any, p: Any, velocity: Any) -> tuple[Any, Any, None]:
-    """Return the halves of the values z of all variables of a first-order system, or (q, p) as they are."""
-    if velocity is not None:
-        raise StateError(
-            f"'{interface.system}' is a first-order system, whose velocities follow from the state: omit velocity"
-        )
-    names = interface.variables
-    if p is not None:
-        return z, p, None
-    if isinstance(z, Mapping):
-        z = dict(chain.from_iterable(_entries(names, name, value) for name, value in z.items()))
-        _check(z, names, "the state")
-        values = _joined([_column(z, name, "the state") for name in names])
-    else:
-        values = real_array(z, "the state")
-        if not values.ndim or values.shape[-1] != len(names):
-            raise StateError(
-                f"the state of '{interface.system}' must have {len(names)} values, {', '.join(names)}, not the shape "
-                f"{values.shape}"
-            )
-    halves = interface.coordinates, interface.momenta
-    q, rest = (values[..., [names.index(name) for name in half]] for half in halves)
-    return q, rest, None
-
-
-def _entries(names: Sequence[str], name: str, value: Any) -> list[tuple[str, Any]]:
-    """Return the names and values of the entries ``x_0``, ``x_1`` of an array ``x`` of variables."""
-    entries = [each for each in names if name not in names and re.fullmatch(rf"{re.escape(name)}(_\d+)+", each)]
-    if not entries:
-        return [(name, value)]
-    array, axes = real_array(value, name), entries[0].removeprefix(name).count("_")
-    outer = array.shape[: max(0, array.ndim - axes)]
-    if array.size != len(entries) * int(np.prod(outer, dtype=int)):
-        raise StateError(f"'{name}' must have {len(entries)} values, not the shape {array.shape}")
-    return list(zip(entries, np.moveaxis(array.reshape(*outer, len(entries)), -1, 0), strict=True))
 
 
 def _by_entry(shapes: Shapes, members: Sequence[Member], values: Any) -> Any:
@@ -260,10 +115,10 @@ def state_of(
     q, p, velocity = (_by_entry(shapes, members, each) for each in (q, p, velocity))
     ordinary = coordinates[: members[0].columns.start]
     if isinstance(q, Mapping):
-        _check(q, [*ordinary, *(member.name for member in members)], "q")
-        parts = [_column(q, name, "q") for name in ordinary]
+        check_names(q, [*ordinary, *(member.name for member in members)], "q")
+        parts = [column(q, name, "q") for name in ordinary]
         attitudes = {member.name: _coordinates(member, q) for member in members}
-        state = _joined([*parts, *(attitudes[member.name][0] for member in members)])
+        state = joined_columns([*parts, *(attitudes[member.name][0] for member in members)])
     else:
         state = real_array(q, "q")
         if not state.ndim or state.shape[-1] != len(coordinates) or any(member.kind == "spin" for member in members):
@@ -278,10 +133,10 @@ def state_of(
         p = {}
     if isinstance(velocity, Mapping):
         state, velocity = np.broadcast_arrays(
-            state, _joined(_moving(ordinary, members, velocity, attitudes, "velocity"))
+            state, joined_columns(_moving(ordinary, members, velocity, attitudes, "velocity"))
         )
     if isinstance(p, Mapping):
-        state, p = np.broadcast_arrays(state, _joined(_moving(ordinary, members, p, attitudes, "p")))
+        state, p = np.broadcast_arrays(state, joined_columns(_moving(ordinary, members, p, attitudes, "p")))
     return state, p, velocity
 
 
@@ -331,8 +186,8 @@ def _moving(
     named = {m.name for m in members if m.kind == "rotation" and (m.momentum or argument == "velocity")}
     names = {m.name: m.rate if m.name in named else m.name for m in members}
     known = [*ordinary, *(names[m.name] for m in members if m.kind != "spin")]
-    _check(values, known, argument, also=[f"{names[m.name]}_space" for m in members if m.kind == "rotation"])
-    parts = [_column(values, name, argument) for name in ordinary]
+    check_names(values, known, argument, also=[f"{names[m.name]}_space" for m in members if m.kind == "rotation"])
+    parts = [column(values, name, argument) for name in ordinary]
     for member in members:
         q, p = attitudes[member.name]
         name = names[member.name]
@@ -358,7 +213,8 @@ def _moving(
     return parts
 
 
-def _check(values: Mapping[str, Any], known: Sequence[str], argument: str, also: Sequence[str] = ()) -> None:
+def check_names(values: Mapping[str, Any], known: Sequence[str], argument: str, also: Sequence[str] = ()) -> None:
+    """Raise :class:`StateError` for names that are unknown, missing or, with ``_space``, twice there."""
     for name in values:
         if name not in known and name not in also:
             raise StateError(
@@ -371,10 +227,12 @@ def _check(values: Mapping[str, Any], known: Sequence[str], argument: str, also:
             raise StateError(both if count else f"'{name}' is missing in {argument}")
 
 
-def _column(values: Mapping[str, Any], name: str, argument: str) -> Array:
+def column(values: Mapping[str, Any], name: str, argument: str) -> Array:
+    """Return numbers by name as (.., 1) columns."""
     return real_array(values[name], f"{argument}: '{name}'")[..., None]
 
 
-def _joined(parts: Sequence[Array]) -> Array:
+def joined_columns(parts: Sequence[Array]) -> Array:
+    """Return the columns of all parts beside each other, of as many states as the longest."""
     shape = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
     return np.concatenate([np.broadcast_to(part, (*shape, part.shape[-1])) for part in parts], axis=-1)

@@ -4,7 +4,6 @@ import difflib
 import math
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -14,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen.codegen.native.arguments import checked_number, real_array
 from scvi_codegen.codegen.rendering.source import NAME_IN_FORMULA, NUMBER, Interface
 from scvi_codegen.common.errors import StateError, closest
-from scvi_codegen.runs.states.words import Shapes, low_words, split, with_low
+from scvi_codegen.runs.states.words import Shapes
 
 Array = NDArray[np.float64]
 
@@ -138,7 +137,7 @@ EnsembleParameters = Mapping[str, ArrayLike] | Sequence[Any] | Array | None
 """Parameters of trajectories: values by name, of all or of each; or rows."""
 
 
-def _short_vector(value: Any, count: int) -> Array | None:
+def short_vector(value: Any, count: int) -> Array | None:
     """Return a copy of a short vector of finite numbers, faster than by NumPy's functions; else ``None``."""
     kind = type(value)
     try:
@@ -153,36 +152,8 @@ def _short_vector(value: Any, count: int) -> Array | None:
     return None
 
 
-def checked_vector(interface: Interface, value: States, name: str) -> Array:
-    """Return a finite, contiguous (m,) copy; for one coordinate a number suffices."""
-    if interface.words > 1:
-        value, low = split(value, name)
-        high = checked_vector(replace(interface, words=1), value, name)
-        words: Array = with_low(high, np.asarray(flat_state(interface, low, name), dtype=float).reshape(high.shape))
-        return words
-    if (vector := _short_vector(value, len(interface.coordinates))) is not None:
-        return vector
-    array, coordinates = real_array(flat_state(interface, value, name), name), interface.coordinates
-    if array.ndim == 0 and interface.dimension == 1:
-        array = array.reshape(1)
-    if array.shape != (interface.dimension,):
-        names = ", ".join(coordinates[:6]) + (", ..." if interface.dimension > 6 else "")
-        raise StateError(f"{name} must have shape ({interface.dimension},) for ({names}), not {array.shape}")
-    if not np.isfinite(array).all():
-        worst = int(np.flatnonzero(~np.isfinite(array))[0])
-        raise StateError(f"{name}[{worst}] ({coordinates[worst]}) is {array[worst]}: it must be finite")
-    return array
-
-
-def checked_parameters(interface: Interface, parameters: Parameters, base: Array | None = None) -> Array:
+def parameter_values(interface: Interface, parameters: Parameters, base: Array | None = None) -> Array:
     """Return the (k,) parameter values in order; by default those of ``base``, or the defaults."""
-    if interface.words > 1:
-        parameters, low = split(parameters, "parameters")
-        doubles = replace(interface, words=1)
-        high = checked_parameters(doubles, parameters, base if base is None else np.asarray(base))
-        before = np.zeros(high.shape) if base is None else low_words(base)
-        words: Array = with_low(high, checked_parameters(replace(doubles, lengths=()), low, before))
-        return words
     names, values = interface.parameters, np.array(interface.defaults if base is None else base, dtype=float)
     if isinstance(parameters, Mapping):
         for name, where, value in parameter_columns(interface, parameters):
@@ -198,7 +169,31 @@ def checked_parameters(interface: Interface, parameters: Parameters, base: Array
     if not np.isfinite(values).all():
         worst = int(np.flatnonzero(~np.isfinite(values))[0])
         raise StateError(f"the parameter {names[worst]} is {values[worst]}: it must be finite")
-    check_lengths(interface, values)
+    return values
+
+
+def parameters_of_each(interface: Interface, argument: EnsembleParameters, count: int, defaults: Array) -> Array:
+    """Return (k, number of parameters) values: defaults replaced by name, one or k numbers each, or by an array."""
+    names = interface.parameters
+    values = np.empty((count, len(defaults)))
+    values[:] = defaults
+    if isinstance(argument, Mapping):
+        for name, where, value in parameter_columns(interface, argument):
+            column = real_array(value, f"the parameter {name}")
+            outer = column.shape[:-1] if isinstance(where, slice) else column.shape
+            if outer not in ((), (count,)):
+                raise StateError(
+                    f"the parameter {name} must be one number or {count} numbers, not of shape {column.shape}"
+                )
+            values[:, where] = column
+    elif argument is not None:
+        array = real_array(argument, "parameters")
+        if array.shape not in ((len(names),), (count, len(names))):
+            raise StateError(f"parameters must have shape ({count}, {len(names)}), not {array.shape}")
+        values[:] = array
+    if not np.isfinite(values).all():
+        j, i = (int(index[0]) for index in np.nonzero(~np.isfinite(values)))
+        raise StateError(f"the parameter {names[i]} of trajectory {j} is {values[j, i]}: it must be finite")
     return values
 
 

@@ -14,7 +14,6 @@ from typing import Any, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.codegen.native.arguments import checked_number
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.common.validation import ExactNumber
 
@@ -206,12 +205,6 @@ def stacked(rows: Sequence[Any]) -> Array:
     return with_low(high, low_words([*rows])) if isinstance(rows[0], Words | Word) else high
 
 
-def missing(shape: tuple[int, ...], words: int) -> Array:
-    """Return an array of NaN for numbers of one or two words."""
-    high = np.full(shape, np.nan)
-    return high if words == 1 else with_low(high, np.zeros(shape))
-
-
 def from_block(block: Array) -> Words:
     """Return numbers (.., m) from (.., 2m) high words and low words, in the same memory."""
     m = block.shape[-1] // 2
@@ -291,13 +284,6 @@ def two_words(value: Any, name: str) -> tuple[float, float]:
     if not (np.isfinite(high) and np.isfinite(low)):
         raise StateError(f"{name} is {value}: it must be finite")
     return high, low
-
-
-def checked_time(t: Any, words: int) -> float:
-    """Return a finite time; of runs in two words both of them."""
-    if words == 1 or type(t) is float:
-        return checked_number(t, "the time t")
-    return word(*two_words(t, "the time t"))
 
 
 def hashed(t: float) -> float | Fraction:

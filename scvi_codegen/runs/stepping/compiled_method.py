@@ -18,8 +18,8 @@ from scvi_codegen.codegen.variants import Acting, Derivatives, Lanes, NewtonFall
 from scvi_codegen.common.display.cards import card, listed, plain
 from scvi_codegen.common.errors import MethodError, ScviCodegenError
 from scvi_codegen.common.representation import LONGEST, clipped
-from scvi_codegen.runs.states.validation import Array, shapes_of
-from scvi_codegen.runs.states.words import named
+from scvi_codegen.runs.states.layout import layout_of
+from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepping.array_binding import ArrayBinding, EventBinding
 from scvi_codegen.runs.stepping.array_interface import RunSizes, check_few_coordinates
 from scvi_codegen.runs.stepping.features import Support, check_features, require
@@ -126,7 +126,8 @@ class CompiledMethod(ChosenBySizes):
         self.sums_action = False  # whether runs sum the action of their steps
         self._entries: dict[Event, tuple[Event, ...]] = {}
         self._plain = cast(Source, source)
-        self.shapes = shapes_of(interface)
+        self._states = layout_of(interface)
+        self.shapes = self._states.shapes
         self.source = self._plain
         self._load()
 
@@ -235,7 +236,7 @@ class CompiledMethod(ChosenBySizes):
 
     def named(self, values: Array) -> Array:
         """Return (.., m) numbers of states that arrays of coordinates index by name; without arrays unchanged."""
-        return values if self.shapes is None else named(values, self.shapes)
+        return self._states.named(values)
 
     def __repr__(self) -> str:
         return f"<Stepper {clipped(self.title, LONGEST - 20)}>"

@@ -9,9 +9,7 @@ from numpy.typing import ArrayLike
 from scvi_codegen.codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.codegen.native.binding import Binding
 from scvi_codegen.codegen.native.options import SolverOptions, step_failure
-from scvi_codegen.runs.states.rotations import checked_pair
 from scvi_codegen.runs.states.validation import Array, Parameters, States, check_inputs_given
-from scvi_codegen.runs.states.words import block_of, checked_time
 from scvi_codegen.runs.stepping.features import require
 from scvi_codegen.runs.stepping.step_derivatives import LinearisedMethod
 
@@ -46,13 +44,13 @@ class Integrator(LinearisedMethod):
             StateError: if a shape or name is invalid, or a number is not finite.
             StepFailedError: if the stage equations cannot be solved.
         """
-        q0, p0 = checked_pair(self.interface, q, p)
+        q0, p0 = self._states.pair(q, p)
         check_inputs_given(self.interface, parameters)
-        arrays = [*map(block_of, (q0, p0, self._parameters_at(q0, p0, parameters)))]
+        arrays = [*map(self._states.block, (q0, p0, self._parameters_at(q0, p0, parameters)))]
         q1, p1 = np.empty_like(arrays[0]), np.empty_like(arrays[1])
-        t = checked_time(t, self.interface.words)
+        t = self._states.time(t)
         self._solve(self.binding, "step", self._time_argument(t), h, arrays, options, (q1, p1))
-        return self.named(self._numbers(q1)), self.named(self._numbers(p1))
+        return self.named(self._states.numbers(q1)), self.named(self._states.numbers(p1))
 
     def _solve(
         self,
@@ -147,7 +145,7 @@ class Integrator(LinearisedMethod):
         if not self.interface.exchange_names:
             require(self, "work")
         check_inputs_given(self.interface, parameters)
-        state = *checked_pair(self.interface, q, p), self._parameters(parameters)
+        state = *self._states.pair(q, p), self._parameters(parameters)
         q1, p1, values = *np.empty((2, self.dimension)), np.empty(len(self.interface.exchange_names) + 1)
         name = "work_and_impulses"
         t = checked_number(t, "the time t")

@@ -13,11 +13,10 @@ from typing import Any, Self, TypeVar, cast
 
 import numpy as np
 
-from scvi_codegen.codegen.native.arguments import checked_number, checked_step
+from scvi_codegen.codegen.native.arguments import checked_step
 from scvi_codegen.codegen.native.options import SolverOptions, checked_options, step_failure
 from scvi_codegen.common.errors import StateError, StepFailedError
 from scvi_codegen.common.validation import LARGEST_COUNT, checked_count
-from scvi_codegen.runs.states.rotations import checked_pair
 from scvi_codegen.runs.states.validation import (
     Array,
     Parameters,
@@ -27,7 +26,7 @@ from scvi_codegen.runs.states.validation import (
     no_input,
     parameter_index,
 )
-from scvi_codegen.runs.states.words import Word, block_of, checked_time, low_words, stacked, two_words, with_low, word
+from scvi_codegen.runs.states.words import Word, Words, stacked, with_low, word
 from scvi_codegen.runs.stepping.chunks import drive
 from scvi_codegen.runs.stepping.features import require
 from scvi_codegen.runs.stepping.integrator import Integrator
@@ -119,7 +118,7 @@ class Memory:
             carries = (binding.vector(each)[: stepper.dimension] for each in (memory.carry_q, memory.carry_p))
             self._q, self._p = (with_low(high, low) for high, low in zip((self._q, self._p), carries, strict=True))
             values = np.concatenate([values, np.zeros(len(values))])
-            self._parameters = stepper._numbers(values)
+            self._parameters = stepper._states.numbers(values)
         self._longest_first = max(FIRST_STEPS, min(LONGEST_FIRST, FIRST_NUMBERS // len(self._q)))
         self._arguments = binding.pointer(values), binding.null
         self._control = binding.null  # of steps in C that are not fixed
@@ -182,12 +181,13 @@ class Memory:
     ) -> None:
         """Start at (q, p) and t; nothing of an earlier run remains."""
         self._set_up(plan, parameters, options, q, p)
-        self._begin(q, p, checked_time(t, self.stepper.interface.words))
+        self._begin(q, p, self.stepper._states.time(t))
 
     def _begin(self, q: States, p: States, t: float, growth: int = 0) -> None:
         """Start at (q, p) and t after :meth:`_set_up`; ``growth``: value of ``measures_growth`` in C."""
         check_max_step(self._plan, t, self.stepper.interface.words)
-        q, p = map(block_of, checked_pair(self.stepper.interface, q, p))
+        states = self.stepper._states
+        q, p = map(states.block, states.pair(q, p))
         self._starts_at_origin = not (np.any(q) or np.any(p))
         self._start_function(t, 0.0 if self._h is None else self._h, *self.stepper.binding.pointers(q, p))
         if isinstance(t, Word):
@@ -351,12 +351,10 @@ class Memory:
         for name, value in inputs.items():
             if name not in self._inputs:
                 raise no_input(name, self._inputs)
-            if self.stepper.interface.words > 1:
-                high, low = two_words(value, f"the input {name}")
-                low_words(values)[self._inputs[name]] = low, 0.0, 0.0, 0.0, 0.0
-            else:
-                high = checked_number(value, f"the input {name}")
+            high, low = self.stepper._states.number(value, f"the input {name}")
             np.asarray(values)[self._inputs[name]] = high, 0.0, 0.0, 0.0, 0.0
+            if isinstance(values, Words):
+                values.low[self._inputs[name]] = low, 0.0, 0.0, 0.0, 0.0
         self._set_parameters(values)
         if self._unset_inputs:
             self._unset_inputs = tuple(name for name in self._unset_inputs if name not in inputs)
@@ -498,8 +496,8 @@ class Memory:
         iterations = binding.pointer(np.empty(steps, dtype=np.int32))
         if status := self._advance(steps, 1, (*map(binding.pointer, (t, q, p)), iterations)):
             raise self._failure(status)
-        numbers = self.stepper._numbers
-        return numbers(t)[:, 0], numbers(q), numbers(p)
+        states = self.stepper._states
+        return states.times(t), states.numbers(q), states.numbers(p)
 
     def _run_to_target(self) -> None:
         """Advance to the target time without saving intermediate states."""

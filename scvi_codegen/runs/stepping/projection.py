@@ -17,9 +17,7 @@ from scvi_codegen.codegen.native.options import REASONS, STATUS
 from scvi_codegen.codegen.rendering.text import INPUT_PRECISION, LARGEST_VIOLATION, ROUNDING_UNITS
 from scvi_codegen.common.errors import AccuracyWarning, StateError, warn
 from scvi_codegen.runs.states.pairs import quotient_of
-from scvi_codegen.runs.states.rotations import checked_pair, checked_states
 from scvi_codegen.runs.states.validation import Array, Parameters, States, inputs_not_given, missing_input
-from scvi_codegen.runs.states.words import block_of, checked_time
 from scvi_codegen.runs.stepping.features import require
 from scvi_codegen.runs.stepping.integrator import Integrator
 
@@ -40,7 +38,7 @@ def multipliers(stepper: Integrator, q: States, p: States, t: ArrayLike, paramet
     times, positions, momenta = _of_constrained(stepper, q, p, t)
     values = np.empty((len(times), len(stepper.constraints) * stepper.interface.words))
     _call(stepper, "multipliers", times, positions, momenta, parameters, values)
-    values = stepper._numbers(values)
+    values = stepper._states.numbers(values)
     if stepper.in_tau:
         values = quotient_of(values, stepper.rates(positions, momenta, parameters)[:, np.newaxis])
     return values
@@ -56,11 +54,12 @@ def projected(
     Raises:
         StateError: if the iteration fails, or if the constraints are linearly dependent there.
     """
-    q0, p0 = checked_pair(stepper.interface, q, p)
+    q0, p0 = stepper._states.pair(q, p)
     _of_constrained(stepper, q0, p0, t)
     binding, (q1, p1) = stepper.binding, np.empty((2, len(q0) * stepper.interface.words))
-    before, values = (block_of(q0), block_of(p0)), block_of(stepper._parameters(parameters))
-    at = stepper._time_argument(checked_time(t, stepper.interface.words))
+    block = stepper._states.block
+    before, values = (block(q0), block(p0)), block(stepper._parameters(parameters))
+    at = stepper._time_argument(stepper._states.time(t))
     status = binding.function("project")(at, *map(binding.pointer, (*before, values, q1, p1)), binding.workspace())
     if status:
         if wrong := _dependent(stepper, q0, t, parameters, nearest=True):
@@ -70,7 +69,7 @@ def projected(
     status = binding.function("apart")(at, *map(binding.pointer, (*before, q1, p1, values, apart)), binding.workspace())
     if status:
         _refuse(stepper, status, q0)
-    return stepper._numbers(q1), stepper._numbers(p1), apart
+    return stepper._states.numbers(q1), stepper._states.numbers(p1), apart
 
 
 def consistent(
@@ -85,7 +84,7 @@ def consistent(
     for name in inputs_not_given(stepper.interface, parameters):
         if any(re.search(rf"\b{name}\b", formula) for formula in stepper.constraints):
             raise missing_input(name)
-    q0, p0 = checked_pair(stepper.interface, q, p)
+    q0, p0 = stepper._states.pair(q, p)
     q1, p1, apart = projected(stepper, q0, p0, t, parameters)
     if check_rank and (wrong := _dependent(stepper, q1, t, parameters)):
         raise StateError(f"{wrong} (q = {_shown(q1)})")
@@ -156,14 +155,14 @@ def check_reachable(stepper: Integrator, q: Array, p: Array, t: float, parameter
 def _of_constrained(stepper: Integrator, q: States, p: States, t: ArrayLike) -> tuple[Array, Array, Array]:
     if not stepper.constraints:
         require(stepper, "project")
-    return checked_states(stepper.interface, q, p, t)
+    return stepper._states.rows(q, p, t)
 
 
 def _call(
     stepper: Integrator, name: str, times: Array, q: Array, p: Array, parameters: Parameters, *results: Array
 ) -> None:
-    times = times if stepper.interface.words == 1 else times[:, None]
-    arguments = *map(block_of, (times, q, p, stepper._parameters(parameters))), *results
+    layout, numbers = stepper._states, (q, p, stepper._parameters(parameters))
+    arguments = layout.times_block(times), *map(layout.block, numbers), *results
     status = stepper.binding.function(name)(
         len(times), *map(stepper.binding.pointer, arguments), stepper.binding.workspace()
     )

@@ -12,16 +12,8 @@ from numpy.typing import ArrayLike
 from scvi_codegen.codegen.native.options import REASONS
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.runs.states.pairs import product_of, quotient_of, sum_of
-from scvi_codegen.runs.states.rotations import checked_pair, checked_states, is_one_state
-from scvi_codegen.runs.states.validation import (
-    Array,
-    Parameters,
-    States,
-    checked_parameters,
-    checked_vector,
-    coordinate_shapes,
-)
-from scvi_codegen.runs.states.words import block_of, by_name, checked_time, from_block, low_words, scalar, unnamed
+from scvi_codegen.runs.states.validation import Array, Parameters, States, coordinate_shapes
+from scvi_codegen.runs.states.words import by_name, low_words, scalar, unnamed
 from scvi_codegen.runs.stepping.array_interface import constraint_shapes
 from scvi_codegen.runs.stepping.compiled_method import CompiledMethod
 
@@ -43,7 +35,7 @@ class StateFunctions(CompiledMethod):
         """Return (k,) values in order; in transformed time the energy defaults to that of the state (q, p)."""
         values = self._parameters(parameters)
         if not self._has_energy(parameters):
-            q, p = checked_pair(self.interface, q, cast(States, p))
+            q, p = self._states.pair(q, cast(States, p))
             values[self.interface.energy_index] = self.energy(q, p, 0.0, values)
         return values
 
@@ -54,14 +46,14 @@ class StateFunctions(CompiledMethod):
 
     def rates(self, q: States, p: States, parameters: Parameters = None) -> Array:
         """Return (n,) rates dt/dtau at (n, m) states; 1 if time is not transformed."""
-        _, positions, momenta = checked_states(self.interface, q, p, 0.0)
+        _, positions, momenta = self._states.rows(q, p, 0.0)
         rates = np.ones((positions.size // self.dimension, self.interface.words))
         if not self.in_tau:
             return rates[:, 0]
-        arrays = *map(block_of, (positions, momenta, self._parameters(parameters))), rates
+        arrays = *map(self._states.block, (positions, momenta, self._parameters(parameters))), rates
         if self.binding.function("rates")(len(rates), *map(self.binding.pointer, arrays)):
             raise StateError("the rate dt/dtau of the time transformation must be positive at every state")
-        return self._numbers(rates)[:, 0]
+        return self._states.numbers(rates)[:, 0]
 
     def momentum(self, q: States, v: States, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
         """Return momenta p = dL/dv at (q, v, t), the Legendre transform: (m,), or (n, m) for (n, m) states."""
@@ -95,8 +87,8 @@ class StateFunctions(CompiledMethod):
         Raises:
             StateError: if the mass matrix is singular along the velocity, so the momentum does not determine it.
         """
-        q, v = checked_pair(self.interface, q, velocity, "velocity")
-        p = self._transformed("momentum", checked_time(t, self.interface.words), q, v, self._parameters(parameters))
+        q, v = self._states.pair(q, velocity, "velocity")
+        p = self._transformed("momentum", self._states.time(t), q, v, self._parameters(parameters))
         dropped = (p == 0.0) & (v != 0.0)
         if dropped.any():
             try:
@@ -117,9 +109,9 @@ class StateFunctions(CompiledMethod):
 
     def energy(self, q: States, p: States, t: ArrayLike = 0.0, parameters: Parameters = None) -> Any:
         """Return the energy p.v - L: a float for (m,) states, (n,) for (n, m) with one time or (n,) times."""
-        times, positions, momenta = checked_states(self.interface, q, p, t)
+        times, positions, momenta = self._states.rows(q, p, t)
         result = self._energies_of(times, positions, momenta, self._parameters(parameters))
-        if not is_one_state(self.interface, q):
+        if not self._states.is_one(q):
             return result
         return scalar(result[0])
 
@@ -141,14 +133,14 @@ class StateFunctions(CompiledMethod):
             StateError: if a state is outside the domain of L.
         """
         result, binding = np.empty(len(t) * self.interface.words), self.binding
-        arrays = t if self.interface.words == 1 else block_of(t[:, None]), *map(block_of, (q, p)), result
+        states = self._states
+        arrays = states.times_block(t), *map(states.block, (q, p)), result
         at, positions, momenta, energies = binding.pointers(*arrays)
-        values, workspace = binding.pointer(block_of(parameters)), binding.workspace()
+        values, workspace = binding.pointer(states.block(parameters)), binding.workspace()
         status = binding.function("energies")(len(t), at, positions, momenta, values, energies, workspace)
         if status:
             raise StateError(f"the energy of a state cannot be computed: {REASONS[status]}")
-        if self.interface.words > 1:
-            result = from_block(result.reshape(-1, 2))[:, 0]
+        result = states.times(result)
         if self.in_tau:
             energy = parameters[self.interface.energy_index]
             result = sum_of(energy, quotient_of(result, self.rates(q, p, parameters)))
@@ -164,24 +156,24 @@ class StateFunctions(CompiledMethod):
             StateError: if a shape, name or number is invalid.
         """
         values = self._momentum_maps_and_sizes(q, p, t, parameters)[0]
-        return values[0] if is_one_state(self.interface, q) else values
+        return values[0] if self._states.is_one(q) else values
 
     def _momentum_maps_and_sizes(
         self, q: States, p: States, t: ArrayLike = 0.0, parameters: Parameters = None
     ) -> tuple[Array, Array]:
         """Return (n, k) momentum maps and the root sum of squares of their terms, the scale of rounding errors."""
-        times, positions, momenta = checked_states(self.interface, q, p, t)
+        times, positions, momenta = self._states.rows(q, p, t)
         sizes = np.empty((len(times), len(self.momentum_map_names)))
         values = np.empty((len(times), sizes.shape[1] * self.interface.words))
         if not values.size:
             return values, sizes
-        times = times if self.interface.words == 1 else times[:, None]
-        arrays = *map(block_of, (times, positions, momenta, self._parameters(parameters))), values, sizes
+        layout, numbers = self._states, (positions, momenta, self._parameters(parameters))
+        arrays = layout.times_block(times), *map(layout.block, numbers), values, sizes
         sizes_of = () if self.problem is None else (self.binding.workspace(),)
         status = self.binding.function("momentum_maps")(len(times), *map(self.binding.pointer, arrays), *sizes_of)
         if status:
             raise StateError(f"the momentum maps of a state cannot be computed: {REASONS[status]}")
-        return self._numbers(values), sizes
+        return self._states.numbers(values), sizes
 
     def _momentum_bounds(self, q: Array, p: Array, t: Array, parameters: Parameters) -> Array:
         """Return (k,) bounds |p| |xi| of the momentum maps p . xi at the state with the largest momenta.
@@ -200,10 +192,10 @@ class StateFunctions(CompiledMethod):
     def _transform(
         self, name: str, q: States, other: States, t: ArrayLike, parameters: Parameters, label: str
     ) -> Array:
-        if is_one_state(self.interface, q):
-            at, values = checked_time(t, self.interface.words), self._parameters(parameters)
-            return self._transformed(name, at, *checked_pair(self.interface, q, other, label), values)
-        times, positions, others = checked_states(self.interface, q, other, t, second=label)
+        if self._states.is_one(q):
+            at, values = self._states.time(t), self._parameters(parameters)
+            return self._transformed(name, at, *self._states.pair(q, other, label), values)
+        times, positions, others = self._states.rows(q, other, t, name=label)
         values, result = self._parameters(parameters), others.copy()
         for k, (at, position, row) in enumerate(zip(times, positions, others, strict=True)):
             result[k] = self._transformed(name, at, position, row, values)
@@ -227,22 +219,18 @@ class StateFunctions(CompiledMethod):
             other_form = "give momenta p instead of velocity" if name == "momentum" else "use the momenta p"
             raise StateError(f"velocities are unavailable for a system defined by a Hamiltonian: {other_form}")
         result = np.empty(len(other) * self.interface.words)
-        pointers = map(self.binding.pointer, (*map(block_of, (q, other, values)), result))
+        pointers = map(self.binding.pointer, (*map(self._states.block, (q, other, values)), result))
         status = self.binding.function(name)(self._time_argument(t), *pointers, self.binding.workspace())
         if status:
             hint = "; if the Hamiltonian is singular in p, give p instead of velocity" if name == "momentum" else ""
             raise StateError(f"the {name} at q = {q} and {other} cannot be computed: {REASONS[status]}{hint}")
-        return self._numbers(result)
+        return self._states.numbers(result)
 
     def _time_argument(self, t: float) -> Any:
         """Return a time as an argument of C: a number or, in double-double arithmetic, a pointer to both words."""
         if self.interface.words == 1:
             return float(t)
         return self.binding.pointer(np.array([float(t), float(low_words(t))]))
-
-    def _numbers(self, block: Array) -> Array:
-        """Return the numbers of an array of C, whose low words follow the high words in double-double arithmetic."""
-        return block if self.interface.words == 1 else from_block(block)
 
     def arrays(self, values: Array) -> dict[str, Array]:
         """Return (.., m) positions, momenta or velocities by the names of coordinates and of arrays of known sizes.
@@ -252,11 +240,11 @@ class StateFunctions(CompiledMethod):
         return by_name(unnamed(values), coordinate_shapes(self.interface))
 
     def _vector(self, value: States, name: str) -> Array:
-        return checked_vector(self.interface, value, name)
+        return self._states.vector(value, name)
 
     def _parameters(self, parameters: Parameters, base: Array | None = None) -> Array:
         """Return the (k,) parameters; those that are not passed by name are those of ``base``, or defaults."""
-        return checked_parameters(self.interface, parameters, base)
+        return self._states.parameters(parameters, base)
 
     def parameters_by_name(self, values: Array) -> dict[str, Any]:
         """Return (k,) parameters by name; those of arrays of run-time sizes as arrays."""

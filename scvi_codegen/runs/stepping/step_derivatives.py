@@ -16,7 +16,6 @@ from scvi_codegen.codegen.native.arguments import checked_number, checked_step, 
 from scvi_codegen.codegen.native.options import REASONS, SolverOptions, step_failure
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.common.representation import summary
-from scvi_codegen.runs.states.rotations import checked_pair
 from scvi_codegen.runs.states.validation import Array, Parameters, check_inputs_given
 from scvi_codegen.runs.stepping.state_functions import StateFunctions
 
@@ -238,7 +237,7 @@ class LinearisedMethod(StateFunctions):
         Entries of the vectors that are left out are 0. In transformed time an energy that is not given depends on the
         initial state.
         """
-        q0, p0 = checked_pair(self.interface, q, p)
+        q0, p0 = self._states.pair(q, p)
         starts = Starts.chain(q0, p0, np.array([checked_number(t, "the time t")]), np.array([checked_step(h)]))
         check_inputs_given(self.interface, parameters)
         values = self._parameters_at(q0, p0, parameters)

@@ -32,7 +32,7 @@ from scvi_codegen.codegen.variants import WithEvents
 from scvi_codegen.common.atomic import read_text, write_text
 from scvi_codegen.common.errors import PackageError
 from scvi_codegen.common.validation import ArgumentType, checks_arguments
-from scvi_codegen.runs.states.validation import checked_parameters
+from scvi_codegen.runs.states.layout import layout_of
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.stepping.compiled_method import Variants
 from scvi_codegen.systems.event import Event
@@ -343,7 +343,7 @@ def integrator_of(model: Model, prefix: str, *, embedded: Embedded | None = None
             controller=model.controller,
         )
     scalars = {name: value for name, value in model.parameters.items() if name in interface.parameters}
-    checked_parameters(interface, scalars)  # C does not check cutoffs and boxes; fields are checked with the sizes
+    layout_of(interface).parameters(scalars)  # C does not check cutoffs and boxes; fields are checked with the sizes
     return source, interface
 
 
