@@ -140,8 +140,7 @@ class PeriodicOrbit:
     @property
     def symplectic_error(self) -> float:
         """Symplecticity defect of the monodromy matrix, relative to its squared norm."""
-        product = _inverse(self.monodromy) @ self.monodromy - np.eye(len(self.monodromy))
-        return float(np.abs(product).max() / max(1.0, np.linalg.norm(self.monodromy, 2) ** 2))
+        return _symplectic_error(self.monodromy)
 
     @cached_property
     def stability_indices(self) -> NDArray[np.complex128]:
@@ -157,11 +156,11 @@ class PeriodicOrbit:
             raise MethodError(
                 f"stability indices are undefined: steps of '{self.stepper.title}' are not symplectic; use multipliers"
             )
-        left = list(np.linalg.eigvals(self.monodromy + _inverse(self.monodromy)).astype(complex) / 2.0)
+        means = list(np.linalg.eigvals(self.monodromy + _inverse(self.monodromy)).astype(complex) / 2.0)
         indices = []
-        while left:
-            one = left.pop(int(np.argmax(np.abs(left))))
-            indices.append((one + left.pop(int(np.argmin(np.abs(np.array(left) - one))))) / 2.0)
+        while means:  # each index occurs twice
+            largest = means.pop(int(np.argmax(np.abs(means))))
+            indices.append((largest + means.pop(int(np.argmin(np.abs(np.array(means) - largest))))) / 2.0)
         return np.array(indices)
 
     @property
@@ -177,6 +176,12 @@ def _inverse(matrix: Array) -> Array:
     m = len(matrix) // 2
     a, b, c, d = matrix[:m, :m], matrix[:m, m:], matrix[m:, :m], matrix[m:, m:]
     return np.block([[d.T, -b.T], [-c.T, a.T]])
+
+
+def _symplectic_error(monodromy: Array) -> float:
+    """Return the largest entry of M^-1 M - 1 with the inverse of a symplectic matrix, relative to |M|^2."""
+    defect = _inverse(monodromy) @ monodromy - np.eye(len(monodromy))
+    return float(np.abs(defect).max() / max(1.0, np.linalg.norm(monodromy, 2) ** 2))
 
 
 MOST_ITERATIONS, MOST_HALVINGS = 50, 12
@@ -381,8 +386,8 @@ class _OrbitSearch:
         far: list[PeriodicOrbit] = []
         attempts = [(self, False), (self, True)]
         if self.energy is None and not set(self.fixed_indices) - {-1}:
-            held = replace(self, fixed_indices=(*self.fixed_indices, *range(self.stepper.dimension)))
-            attempts += [(held, False), (held, True)]
+            at_positions = replace(self, fixed_indices=(*self.fixed_indices, *range(self.stepper.dimension)))
+            attempts += [(at_positions, False), (at_positions, True)]
         for search, smoothed in attempts:
             try:
                 iterated = search._iterated(*search._by_segments(guess, smoothed=smoothed))
@@ -394,7 +399,7 @@ class _OrbitSearch:
                 failures.append(failure)
         if far:
             return far[0]
-        raise next((each for each in failures if isinstance(each, OrbitError)), failures[0])
+        raise next((failure for failure in failures if isinstance(failure, OrbitError)), failures[0])
 
     @property
     def _steps(self) -> StepSequence:
@@ -405,8 +410,7 @@ class _OrbitSearch:
     def _described(self, z: Array, equations: _ClosingEquations, iterations: int, *, guess: Array) -> PeriodicOrbit:
         """Return the orbit at the end of the iteration, after all checks; raise OrbitError if there is none."""
         m, motion = self.stepper.dimension, equations.motion
-        sizes = equations.sizes
-        reduced = self._reduced(sizes)
+        sizes, reduced = equations.sizes, self._reduced(equations.sizes)
         rounding = RESOLVED * roundoff(1) * float((np.abs(z[:-1]) / sizes).max())
         scaled_norm = float(np.linalg.norm(equations.monodromy / reduced[:, np.newaxis] * reduced, 2))
         allowed = (CLOSED + rounding) * max(1.0, scaled_norm)
@@ -418,27 +422,9 @@ class _OrbitSearch:
                 "amplitude, fixed=['x', ..], or the period, fixed_period=True, or take more steps"
             )
         self._check_energy(equations, allowed)
-        ranges, far = (each.reshape(2, m).max(axis=1) for each in (np.ptp(motion.states, axis=0), abs(z - guess)[:-1]))
-        if (ranges < EQUILIBRIUM_MOTION * far).any() or ranges[0] <= RESOLVED * roundoff(1) * np.abs(z[:m]).max():
-            raise OrbitError(
-                f"the iteration converged to an equilibrium, q = {_listed(z[:m])}, p = {_listed(z[m:-1])}: fix an "
-                "amplitude, fixed=['x', ..], or give a better initial guess"
-            )
+        self._check_motion(z, motion, guess)
         if motion.by_time.any():
-            period = float(z[-1])
-            if -1 not in self.fixed_indices:
-                raise MethodError(
-                    f"'{self.stepper.interface.system}' depends on time: give the period of this dependence as period, "
-                    "with fixed_period=True"
-                )
-            later = replace(self, t=self.t + period)._closing(z)
-            apart = np.abs(later.motion.states[-1] - equations.motion.states[-1]) / sizes
-            away = max(float(apart.max()), later.relative_error)
-            if not away <= allowed:
-                raise OrbitError(
-                    f"the orbit from t = {self.t:g} does not close in the next period (error {away:.1e}): "
-                    f"'{self.stepper.interface.system}' is not periodic in time with the period {period:.10g}"
-                )
+            self._check_next_period(z, equations, allowed)
         return PeriodicOrbit(
             q=z[:m],
             p=z[m:-1],
@@ -455,6 +441,35 @@ class _OrbitSearch:
             stepper=self.stepper,
             options=self.options,
         )
+
+    def _check_motion(self, z: Array, motion: _Segment, guess: Array) -> None:
+        """Raise :class:`OrbitError` if a closed orbit is an equilibrium, by the ranges of its positions and momenta."""
+        m = self.stepper.dimension
+        ranges, distances = (
+            sizes.reshape(2, m).max(axis=1) for sizes in (np.ptp(motion.states, axis=0), abs(z - guess)[:-1])
+        )
+        rounding = RESOLVED * roundoff(1) * np.abs(z[:m]).max()
+        if (ranges < EQUILIBRIUM_MOTION * distances).any() or ranges[0] <= rounding:
+            raise OrbitError(
+                f"the iteration converged to an equilibrium, q = {_listed(z[:m])}, p = {_listed(z[m:-1])}: fix an "
+                "amplitude, fixed=['x', ..], or give a better initial guess"
+            )
+
+    def _check_next_period(self, z: Array, equations: _ClosingEquations, allowed: float) -> None:
+        """Raise an error if the period of a time-dependent system is free, or the orbit does not close again."""
+        system, period = self.stepper.interface.system, float(z[-1])
+        if -1 not in self.fixed_indices:
+            raise MethodError(
+                f"'{system}' depends on time: give the period of this dependence as period, with fixed_period=True"
+            )
+        later = replace(self, t=self.t + period)._closing(z)
+        apart = np.abs(later.motion.states[-1] - equations.motion.states[-1]) / equations.sizes
+        error = max(float(apart.max()), later.relative_error)
+        if not error <= allowed:
+            raise OrbitError(
+                f"the orbit from t = {self.t:g} does not close in the next period (error {error:.1e}): '{system}' is "
+                f"not periodic in time with the period {period:.10g}"
+            )
 
     def _by_segments(self, guess: Array, *, smoothed: bool) -> tuple[Array, _ClosingEquations, int]:
         """Improve a guess by multiple shooting where tangent vectors grow along it; one segment needs no improvement.
@@ -473,7 +488,7 @@ class _OrbitSearch:
         else:
             forward = self._segment(start, steps, 0, half, guess[-1])
             backward = self._segment(start, steps.reversed, 0, count - half, -guess[-1])
-            forth, back = (self._leaving(each) @ each.monodromy @ inward for each in (forward, backward))
+            forth, back = (self._leaving(half) @ half.monodromy @ inward for half in (forward, backward))
             later, monodromy = backward.states, np.asarray(np.linalg.solve(back.T, forth.T).T)
         growth = float(np.abs(np.linalg.eigvals(monodromy)).max())
         if growth <= EASY:
@@ -585,8 +600,8 @@ class _OrbitSearch:
     def _sizes_of(self, states: Array) -> Array:
         """Return the (2m,) sizes of positions and momenta along states, at least their rounding errors."""
         size = self._size_of(states)
-        of_q, of_p = (RESOLVED * each or LEAST_SIZE for each in size.rounding)
-        return np.repeat([max(size.position, of_q), max(size.momentum, of_p)], self.stepper.dimension)
+        least = (RESOLVED * rounding or LEAST_SIZE for rounding in size.rounding)
+        return np.repeat(list(map(max, (size.position, size.momentum), least)), self.stepper.dimension)
 
     def _closing(self, z: Array) -> _ClosingEquations:
         """Integrate one period and return the residuals with their derivatives; ``z`` has the start of each segment."""
@@ -729,8 +744,7 @@ def _listed(values: Array) -> str:
 
 def _trivial_error(monodromy: Array) -> float:
     """Return the deviation from 1 of the stability index nearest to 1, of other matrices of the multiplier."""
-    product = _inverse(monodromy) @ monodromy - np.eye(len(monodromy))
-    if float(np.abs(product).max()) > SYMPLECTIC * max(1.0, float(np.linalg.norm(monodromy, 2)) ** 2):
+    if _symplectic_error(monodromy) > SYMPLECTIC:
         return float(np.abs(np.linalg.eigvals(monodromy) - 1.0).min())
     return float(np.abs(np.linalg.eigvals(monodromy + _inverse(monodromy)) / 2.0 - 1.0).min())
 

@@ -295,7 +295,7 @@ class ReducedIntervals(Intervals):
 
     def on_manifold_all(self, q: Array) -> Array:
         """See :meth:`Intervals.on_manifold_all`."""
-        return np.array([self.on_manifold(each, k, q[0]) for k, each in enumerate(q)])
+        return np.array([self.on_manifold(position, k, q[0]) for k, position in enumerate(q)])
 
     def basis_map(self, M: Array) -> Array:
         """See :meth:`Intervals.basis_map`; the last basis is M times the first one."""

@@ -276,7 +276,7 @@ def _kind_of_intervals(stepper: Any, *, closed: bool, energy: bool) -> type[Inte
         raise MethodError(
             "path is not available with nonholonomic constraints: two positions determine no motion; use integrate"
         )
-    if any(each.startswith("spin") for each in interface.rotations):
+    if any(rotation.startswith("spin") for rotation in interface.rotations):
         raise MethodError("path is not available for spins: their direction determines the motion; use integrate")
     if energy and interface.inputs:
         raise MethodError(
@@ -329,8 +329,7 @@ def _attempts(intervals: Intervals, ends: Sequence[Array], nodes: Array | None, 
     elif len(nodes) != count + 1:
         raise StateError(f"start must have {count + 1} rows, one for each node, not {len(nodes)}")
     nodes[0], nodes[-1] = ends
-    if isinstance(intervals, ReducedIntervals):
-        nodes[1:] = [intervals.on_manifold(each, k, ends[0]) for k, each in enumerate(nodes[1:], 1)]
+    nodes[1:] = intervals.on_manifold_all(nodes)[1:]
     attempts: list[Attempt] = [partial(solver.solved, intervals, nodes)]
     if in_other_ways:
         attempts.append(partial(solver.continued, intervals, nodes, duration))
@@ -365,9 +364,8 @@ def _around(intervals: Intervals, ends: Sequence[Array], start: Array | None, re
 def _curves_around(intervals: Intervals, line: Array, *revolutions: int) -> list[Array]:
     at = float(intervals.t[0]), intervals.parameters_at_start
     curves = [curve for turns in revolutions for curve in curves_around(intervals.stepper, line, *at, turns)]
-    if isinstance(intervals, ReducedIntervals):
-        for curve in curves:
-            curve[1:-1] = [intervals.on_manifold(each, k, curve[0]) for k, each in enumerate(curve[1:-1], 1)]
+    for curve in curves:
+        curve[1:-1] = intervals.on_manifold_all(curve)[1:-1]
     return curves
 
 
@@ -395,8 +393,7 @@ def _checked(found: solver.Solution) -> Discretisation:
 
 def _from(intervals: Intervals, start: Array) -> solver.Solution:
     """Return the path near a start, whose inner nodes are moved to the manifold."""
-    if isinstance(intervals, ReducedIntervals):
-        start[1:-1] = [intervals.on_manifold(each, k, start[0]) for k, each in enumerate(start[1:-1], 1)]
+    start[1:-1] = intervals.on_manifold_all(start)[1:-1]
     return solver.solved(intervals, start, FEW_ITERATIONS)
 
 

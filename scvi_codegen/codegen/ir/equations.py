@@ -16,21 +16,12 @@ from scvi_codegen.codegen.ir.kernel import Kernel, Number, NumberTable, RolledKe
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class GatherLoop:
-    """Loop for arguments of a kernel: ``u[offset + i] = (q0[i] +) h^power sum_b table[n][b] z[b][first + i]``."""
+class TableLoop:
+    """Loop around a kernel that gathers its arguments or scatters its results at all points n.
 
-    name: str
-    first: int
-    sites: int
-    offset: int
-    from_state: bool
-    power: int
-    table: NumberTable
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ScatterLoop:
-    """Loop for results: ``rows[r][first + i] += weight_n h^power table[n][r] value[offset + i]``; p1 is last."""
+    Arguments are ``u[offset + i] = (q0[i] +) h^power sum_b table[n][b] z[b][first + i]``; results are added to rows,
+    ``rows[r][first + i] += weight_n h^power table[n][r] value[offset + i]``, of which p1 is the last.
+    """
 
     name: str
     first: int
@@ -38,6 +29,7 @@ class ScatterLoop:
     offset: int
     power: int
     table: NumberTable
+    from_state: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,8 +58,8 @@ class LoweredStageGroup:
     arguments: tuple[str, ...]
     abscissae: tuple[Number, ...]
     weights: tuple[Number, ...]
-    gathers: tuple[GatherLoop, ...]
-    scatters: tuple[ScatterLoop, ...]
+    gathers: tuple[TableLoop, ...]
+    scatters: tuple[TableLoop, ...]
     value: Kernel
     derivative: Kernel
     blocks: tuple[DerivativeBlock, ...]

@@ -14,7 +14,7 @@ import sympy
 from sympy import Expr, Symbol
 
 from scvi_codegen.codegen.ir.arithmetic import lower_kernel
-from scvi_codegen.codegen.ir.equations import DerivativeBlock, GatherLoop, LoweredStageGroup, ScatterLoop
+from scvi_codegen.codegen.ir.equations import DerivativeBlock, LoweredStageGroup, TableLoop
 from scvi_codegen.codegen.ir.kernel import Kernel, RolledKernel, lower_matrix, lower_vector
 from scvi_codegen.common.errors import MethodError
 from scvi_codegen.common.precision import mp
@@ -361,10 +361,10 @@ def _check_symmetry(group: StageGroup, entries: Mapping[tuple[int, int], sympy.E
             )
 
 
-def _gather_loop(group: StageGroup, index: int, sites: UnknownLayout) -> GatherLoop:
+def _gather_loop(group: StageGroup, index: int, sites: UnknownLayout) -> TableLoop:
     gather = group.gathers[index]
     size = _block_size(gather, sites)
-    return GatherLoop(
+    return TableLoop(
         name=f"{group.name}_gather_{index}",
         first=sites.first[size],
         sites=len(gather.arguments),
@@ -375,10 +375,10 @@ def _gather_loop(group: StageGroup, index: int, sites: UnknownLayout) -> GatherL
     )
 
 
-def _scatter_loop(group: StageGroup, index: int, sites: UnknownLayout) -> ScatterLoop:
+def _scatter_loop(group: StageGroup, index: int, sites: UnknownLayout) -> TableLoop:
     scatter = group.scatters[index]
     size = _row_size(scatter, sites)
-    return ScatterLoop(
+    return TableLoop(
         name=f"{group.name}_scatter_{index}",
         first=sites.first[size],
         sites=len(scatter.results),
