@@ -89,17 +89,14 @@ NO_UNROLL_FLAGS = ("--param=max-completely-peel-times=4",)
 Unrolled they become scalar code (leapfrog of 8 masses: 1.5 times the time). The lanes of ensembles must be unrolled.
 """
 
-UNROLLED_HEADERS = frozenset({"support/newton/newton_solver.h", "support/iteration/shooting_iteration.h"})
-"""Headers of steps of one trajectory that are a tenth slower if their short loops are not unrolled."""
-
-POINTS_HEADER, SEPARATE_FLAGS = "support/constraints/point_lanes.h", ("-fno-builtin-sin", "-fno-builtin-cos")
-"""Header of sources with kernels in loops over points, and flags of gcc for them.
+SEPARATE_FLAGS = ("-fno-builtin-sin", "-fno-builtin-cos")
+"""Flags of gcc for kernels in loops over points.
 
 Otherwise gcc replaces sine and cosine of an argument by one call, of which there is no vector version.
 """
 
-THREADS_HEADER, THREADS = "support/arrays/arrays.h", ("-DSCVI_THREADS", "-pthread")
-"""Header of sources whose steps threads may share, and the flags for them."""
+THREADS = ("-DSCVI_THREADS", "-pthread")
+"""Flags for sources whose steps threads may share."""
 
 COMPILE_SECONDS = 600
 NOT_RUN = (126, 127)
@@ -241,7 +238,7 @@ def _compile(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], 
     source.write(folder)
     is_divided = any(each.contents.divided for each in source.sources)
     cut = DIVIDED_FLAGS if is_divided and _takes_flags(compiler, DIVIDED_FLAGS) else ()
-    threads = THREADS if any(THREADS_HEADER in each.files for each in source.sources) else ()
+    threads = THREADS if any(each.contents.threads for each in source.sources) else ()
     wanted = [*threads, *words_of(FLAGS_VARIABLE)]
     parts = {each.prefix: _passes(each, flags, cut) for each in source.sources}
     commands: dict[str, list[str]] = {}
@@ -342,8 +339,8 @@ def _passes(part: Source, flags: tuple[str, ...], cut: tuple[str, ...]) -> tuple
     """Return further flags of gcc for a source, with -O3."""
     if "-O3" not in flags:
         return ()
-    rolled = NO_UNROLL_FLAGS if "support/run/run.h" in part.files and UNROLLED_HEADERS.isdisjoint(part.files) else ()
-    return (*cut, *rolled, *(SEPARATE_FLAGS if POINTS_HEADER in part.files else ()))
+    rolled = NO_UNROLL_FLAGS if part.contents.rolled else ()
+    return (*cut, *rolled, *(SEPARATE_FLAGS if part.contents.points_in_loops else ()))
 
 
 def _mathematics(flags: tuple[str, ...]) -> list[tuple[list[str], list[str]]]:

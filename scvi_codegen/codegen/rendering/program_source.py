@@ -35,14 +35,9 @@ from scvi_codegen.codegen.rendering.kernels.simd import (
     predictor_text,
     splitting_source,
 )
+from scvi_codegen.codegen.rendering.preprocessor import included
 from scvi_codegen.codegen.rendering.source import Contents, ExampleInput, Interface, Source
-from scvi_codegen.codegen.rendering.text import (
-    INPUT_PRECISION,
-    LARGEST_VIOLATION,
-    MAX_ITERATIONS,
-    ROUNDING_UNITS,
-    included,
-)
+from scvi_codegen.codegen.rendering.text import INPUT_PRECISION, LARGEST_VIOLATION, MAX_ITERATIONS, ROUNDING_UNITS
 
 Embedded: TypeAlias = Literal["double", "single"]
 """Precision of C source for a microcontroller."""
@@ -61,6 +56,8 @@ DECLARATIONS = {
 
 OF_THREE_WORDS = ("DRIFT", "PRODUCT", "POINT_END_POSITION", "POINT_END_MOMENTUM")
 """Tables of a separable iteration in double-double arithmetic, by their names in C."""
+SHOOTING = "shooting_iteration"
+"""Part of an iteration that is a tenth slower, like Newton's method, if its short loops are not unrolled."""
 LARGEST_INLINED = 150
 """Largest number of operations of the kernels of an iteration that is inlined into the loop over steps.
 
@@ -439,10 +436,14 @@ def _render(prefix: str, context: Mapping[str, object], entry: str = "stepper") 
     )
 
 
-def _contents_of_step(context: Mapping[str, Any]) -> dict[str, int]:
-    """Return the sizes of an integrator of named coordinates."""
+def _contents_of_step(context: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the sizes of an integrator of named coordinates, and which loops it has."""
     program: Program = context["program"]
+    by_newton = program.newton and not program.splitting
+    shooting = program.fixed_point is not None and SHOOTING in program.fixed_point.parts
     return {
+        "rolled": not (by_newton or shooting),
+        "points_in_loops": program.rattle is not None,
         "coordinates": program.dimension,
         "parameters": len(program.layout.parameters),
         "unknowns": program.equations.unknowns,
@@ -453,13 +454,13 @@ def _contents_of_step(context: Mapping[str, Any]) -> dict[str, int]:
     }
 
 
-CONTENTS: dict[str, Callable[[Mapping[str, Any]], dict[str, int]]] = {
+CONTENTS: dict[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
     "stepper": _contents_of_step,
-    "arrays": lambda context: {},
+    "arrays": lambda context: {"threads": True},
     "events": lambda context: {},
     "ensemble": lambda context: {name: int(context[name]) for name in ("points", "observed", "needs_velocities")},
 }
-"""Sizes for callers of the C of an entry template, from its context."""
+"""Contents of the C of an entry template, from its context."""
 
 
 def _control_context(program: Program, control: Control | None) -> dict[str, object]:

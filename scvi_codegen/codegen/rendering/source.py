@@ -14,7 +14,8 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from scvi_codegen.codegen.rendering.text import preprocessed, specialised, with_own_names
+from scvi_codegen.codegen.rendering.own_names import with_own_names
+from scvi_codegen.codegen.rendering.preprocessor import preprocessed, specialised
 from scvi_codegen.systems.formulas.indices import Access, ArrayDeclarations, ArrayMap, Loop
 from scvi_codegen.version import __version__
 
@@ -53,6 +54,9 @@ class Contents:
         functions: exported functions, without the prefix.
         run_fields: fields of the struct of a run that not every integrator has.
         divided: whether kernels are divided into functions.
+        rolled: whether short loops over coordinates must not be unrolled.
+        points_in_loops: whether kernels are in loops over the points of a step.
+        threads: whether threads may share its steps.
         coordinates, parameters, unknowns, maps, constraints, sums: numbers of an integrator of named coordinates.
         workspace: doubles per call; 0 for arrays of run-time sizes.
         points, observed, needs_velocities: points of a step, observed functions and whether the memory of a block
@@ -62,6 +66,9 @@ class Contents:
     functions: tuple[str, ...] = ()
     run_fields: tuple[str, ...] = ()
     divided: bool = False
+    rolled: bool = False
+    points_in_loops: bool = False
+    threads: bool = False
     coordinates: int = 0
     parameters: int = 0
     unknowns: int = 0
@@ -119,11 +126,18 @@ class Source:
 
     def specialised(self) -> Source:
         """Return the source with support headers for it alone, without alternatives that it does not use."""
-        return replace(self, support=tuple(specialised(self.code, dict(self.support).__getitem__).items()))
+        support = specialised(self.code, dict(self.support).__getitem__)
+        return replace(self, support=support, beside=self.beside and self.beside.with_used_headers())
+
+    def with_used_headers(self) -> Source:
+        """Return the source without support headers that it includes under conditions that do not hold."""
+        used = {name for name, _ in specialised(self.code, dict(self.support).__getitem__)}
+        support = tuple((name, text) for name, text in self.support if name in used)
+        return replace(self, support=support, beside=self.beside and self.beside.with_used_headers())
 
     def amalgamated(self) -> Source:
         """Return the source as one file: support headers inserted, without alternatives that it does not use."""
-        code, _ = preprocessed(self.code, dict(self.support).__getitem__)
+        code = preprocessed(self.code, dict(self.support).__getitem__)
         beside = self.beside.amalgamated() if self.beside else None
         return replace(self, code=code, support=(), beside=beside)
 

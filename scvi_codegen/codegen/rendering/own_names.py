@@ -1,0 +1,106 @@
+"""Names at file scope with the integrator's prefix, so that one translation unit can include several single files.
+
+C has no other means to hide macros, types and enumerators of an included file. This is not a C parser: it relies on the
+layout of the templates, where a declaration at file scope begins in the first column.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import pairwise
+
+from scvi_codegen.codegen.rendering.text import CONTINUATION, WIDTH
+
+IGNORED = re.compile(r'/\*(?:[^*]|\*(?!/))*\*/|"(?:\\.|[^"\\])*"|^#(?:.*\\\n)*.*$', re.MULTILINE)
+MACRO = re.compile(r"^#define (?P<name>\w+)(?:\((?P<parameters>[^)]*)\))?(?P<body>(?:.*\\\n)*.*)$", re.MULTILINE)
+ATTRIBUTE = re.compile(r"__attribute__\(\((?:[^()]|\([^()]*\))*\)\)")
+FUNCTION = re.compile(r"[\w\s*]*?(\w+)\s*\(")
+DECLARED = re.compile(r"(\w+)\s*(?:\[[^=]*\])?\s*;?\s*$")
+EXPORTED = re.compile(r"\b(NAME|STATUS)\((\w+)\)")
+PREFIXING = re.compile(r"^#define (NAME|STATUS)\(word\) (\w+)##word.*\n", re.MULTILINE)
+TOKEN = re.compile(r'/\*(?:[^*]|\*(?!/))*\*/|"(?:\\.|[^"\\])*"|#include .*|\bFMI\(\w+\)|\b[A-Za-z_]\w*')
+BREAK = re.compile(r'(?:[^" ]|"(?:\\.|[^"\\])*")+ ')
+
+
+def with_own_names(code: str, prefix: str, header: str) -> str:
+    """Return a source whose macros and names at file scope begin with the prefix of the integrator.
+
+    Args:
+        code: of one file, without include guards.
+        prefix: of its own names; exported ones may have another, of the integrator that it belongs to.
+        header: included by the code; its names are retained.
+    """
+    prefixes = dict(PREFIXING.findall(code))
+    code = EXPORTED.sub(lambda match: prefixes[match[1]] + match[2], PREFIXING.sub("", code))
+    taken = set(TOKEN.findall(header + code))
+    names = {}
+    for name in (*(match["name"] for match in MACRO.finditer(code)), *_names(code)):
+        if not name.lower().startswith(f"{prefix.lower()}_"):
+            upper, local = (prefix.upper(), "LOCAL") if name.isupper() else (prefix, "local")
+            names[name] = f"{upper}_{name}" if f"{upper}_{name}" not in taken else f"{upper}_{local}_{name}"
+    renamed = TOKEN.sub(lambda match: names.get(match[0], match[0]), code)
+    return "\n".join(_broken(renamed.split("\n")))
+
+
+def _broken(lines: Sequence[str]) -> Iterator[str]:
+    """Yield lines, those that are too long broken between words of code or of its comment."""
+    for before, line in pairwise(["", *lines]):
+        indent = " " * (len(line) - len(line.lstrip()) + CONTINUATION)
+        end = " \\" if line.startswith("#") or before.endswith("\\") else ""
+        while len(line) > WIDTH:
+            words = BREAK.finditer(line.removesuffix(" */"))
+            ends = [match.end() for match in words if len(indent) < match.end() < WIDTH]
+            if not ends:
+                break
+            first, line = line[: ends[-1] - 1], line[ends[-1] :]
+            commented = first.rfind("/*") > first.rfind("*/")
+            yield first + ("" if commented else end)
+            line = f"{indent}{' * ' if commented else ''}{line}"
+        yield line
+
+
+def _names(code: str) -> Iterator[str]:
+    """Yield names with internal linkage, types and enumerators in order."""
+    makers = {
+        match["name"]: ([each.strip() for each in match["parameters"].split(",")], names)
+        for match in MACRO.finditer(code)
+        if match["parameters"] and (names := re.findall(r"\bstatic\b[\w ]*?(\w+##\w+)\(", match["body"]))
+    }
+    local = {match["name"] for match in MACRO.finditer(code) if not match["parameters"] and "static" in match["body"]}
+    for text in _declarations(ATTRIBUTE.sub("", IGNORED.sub("", code))):
+        head, _, rest = re.sub(r" = .*", "", text, flags=re.DOTALL).partition("{")
+        words = head.split()
+        if (maker := makers.get(head.partition("(")[0])) is not None:
+            yield from _made(*maker, head)
+        elif words[0] == "enum":
+            yield from re.findall(r"(?:^|,)\s*(\w+)", text[text.index("{") + 1 :])
+        elif words[0] in ("typedef", "struct"):
+            yield from re.findall(r"^(?:typedef )?(?:struct|union) (\w+)\s*$", head.strip())
+            if head.endswith(");"):
+                yield re.findall(r"(\w+)\)?\s*\(", head)[0]
+            elif words[0] == "typedef":
+                declared = (rest.rpartition("}")[2] or head).split(",")
+                yield from (name for each in declared for name in DECLARED.findall(each))
+        elif "static" in words or words[0] in local:
+            yield (FUNCTION.match(head) or DECLARED.search(head) or [""])[1]
+
+
+def _declarations(text: str) -> Iterator[str]:
+    """Yield the declarations and definitions at file scope."""
+    depth, lines = 0, list[str]()
+    for line in text.split("\n"):
+        if lines or line[:1].isidentifier():
+            lines.append(line.rstrip())
+            depth += line.count("{") - line.count("}")
+            if depth == 0 and lines[-1].endswith((";", "}")):
+                yield "\n".join(lines)
+                lines = []
+
+
+def _made(parameters: Iterable[str], names: Iterable[str], head: str) -> Iterator[str]:
+    """Yield the names of functions that a macro defines, and those parts of them that the macro contains."""
+    arguments = dict(zip(parameters, re.split(r"[(),]", head)[1:], strict=False))
+    for name in names:
+        yield from [part for part in name.split("##") if part not in arguments]
+        yield "".join(arguments.get(part, part).strip() for part in name.split("##"))

@@ -1,0 +1,209 @@
+"""Support headers as one integrator uses them: without alternatives and macros that belong to others.
+
+Sources are compiled from the headers as they are. Packages, single files, kernels for GPUs and pages of derivations are
+read by people, and the preprocessor of a C compiler cannot make them: it also removes comments, names of constants and
+conditions on the compiler and the processor, which only the reader's compiler can decide. Here conditions on names that
+begin with ``_`` or ``SCVI_`` remain, as do those on macros that are defined under such a condition.
+"""
+
+from __future__ import annotations
+
+import posixpath
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+Read = Callable[[str], str]
+"""Function that returns the text of a support header by its name, ``support/...``."""
+
+DIRECTIVE = re.compile(r"#(?P<word>ifdef|ifndef|if|elif|else|endif|define|undef|include|error)\b *(?P<rest>.*)$")
+DEFINED = re.compile(r"(?P<negated>!)?defined\((?P<macro>\w+)\)")
+INCLUDED = re.compile(r'^#include "(?P<name>(?:support/(?:\w+/)?|\.\./\w+/)?\w+\.h)"', re.MULTILINE)
+SWITCH = re.compile(r"#define (?P<macro>\w+)(?: /\*.*\*/)?")
+MACRO_NAME = re.compile(r"\w+")
+COMMENT = re.compile(r" *(?://.*|/\*.*)$")
+COMMENTS = re.compile(r"/\*.*?\*/", re.DOTALL)
+
+
+def _directive(line: str) -> tuple[str, str]:
+    """Return the word of a directive and the rest of its line without a comment; empty words for other lines."""
+    match = DIRECTIVE.match(line)
+    return (match["word"], COMMENT.sub("", match["rest"])) if match else ("", "")
+
+
+def _support_name(line: str, folder: str) -> str | None:
+    """Return the name of the support header that a line of a file in a folder includes, or ``None``."""
+    match = INCLUDED.match(line)
+    if match is None or (not folder and not match["name"].startswith("support/")):
+        return None
+    return posixpath.normpath(posixpath.join(folder, match["name"]))
+
+
+def included(code: str, read: Read) -> tuple[tuple[str, str], ...]:
+    """Return names and texts of the support headers that a source includes under any condition, in order."""
+    texts: dict[str, str] = {}
+
+    def visit(text: str, folder: str) -> None:
+        for match in INCLUDED.finditer(text):
+            name = _support_name(match[0], folder)
+            if name is not None and name not in texts:
+                texts[name] = read(name)
+                visit(texts[name], posixpath.dirname(name))
+
+    visit(code, "")
+    return tuple(texts.items())
+
+
+@dataclass
+class _Macros:
+    """Macros after the lines so far.
+
+    Attributes:
+        defined: names of those that are defined.
+        uncertain: names of those that are defined under conditions that remain.
+        failed: whether the lines end the compilation by ``#error``.
+    """
+
+    defined: set[str] = field(default_factory=set)
+    uncertain: set[str] = field(default_factory=set)
+    failed: bool = False
+
+    def copy(self) -> _Macros:
+        return _Macros({*self.defined}, {*self.uncertain})
+
+    def resumed(self, branch: _Macros | None) -> _Macros:
+        """Return the macros where a branch begins whose condition remained before, when it ended with others."""
+        certain = self.uncertain & branch.defined if branch else set()
+        return _Macros(self.defined | certain, self.uncertain - certain)
+
+    def holds(self, line: str) -> bool | None:
+        """Return whether the condition of a line holds; ``None`` if unknown, as for comparisons of numbers."""
+        word, condition = _directive(line)
+        if word == "else":
+            return True
+        match = DEFINED.fullmatch(condition if word in ("if", "elif") else f"defined({condition})")
+        if match is None or match["macro"] in self.uncertain or match["macro"].startswith(("_", "SCVI_")):
+            return None
+        return (match["macro"] in self.defined) != (word == "ifndef" or bool(match["negated"]))
+
+
+def _joined(ends: Sequence[_Macros]) -> _Macros:
+    """Return the macros after alternatives of which any was compiled that does not fail."""
+    compiled = [end for end in ends if not end.failed] or ends[:1]
+    defined = set.intersection(*(end.defined for end in compiled))
+    mentioned = set.union(*(end.defined | end.uncertain for end in compiled))
+    return _Macros(defined, mentioned - defined, compiled[0].failed)
+
+
+@dataclass
+class _Alternative:
+    """Line of ``#if``, ``#elif`` or ``#else``, and the block below it."""
+
+    line: str
+    block: _Block
+
+
+_Block = list["str | list[_Alternative]"]
+"""Lines, and conditions with their alternatives."""
+
+
+def _parsed(lines: Iterator[str]) -> tuple[_Block, str]:
+    """Return a block, and the line of ``#elif``, ``#else`` or ``#endif`` that ends it; nothing at the end of a file."""
+    block: _Block = []
+    for line in lines:
+        word = _directive(line)[0]
+        if word in ("elif", "else", "endif"):
+            return block, line
+        if word not in ("if", "ifdef", "ifndef"):
+            block.append(line)
+            continue
+        alternatives, end = list[_Alternative](), line
+        while _directive(end)[0] not in ("endif", ""):
+            body, following = _parsed(lines)
+            alternatives.append(_Alternative(end, body))
+            end = following
+        block.append(alternatives)
+    return block, ""
+
+
+class _Preprocessor:
+    """Lines that remain of a source and of the headers that it includes.
+
+    Attributes:
+        visits: name and lines of each text in order: those of the source, then of a header each time it is included.
+    """
+
+    def __init__(self, code: str, read: Read) -> None:
+        self._read, self._macros, self._ends = read, _Macros(), dict[str, _Macros]()
+        self.visits: list[tuple[str, list[str]]] = []
+        self.lines = list(self._visit("", code))
+
+    def _visit(self, name: str, text: str) -> Iterator[str]:
+        """Yield the lines of a text with headers inserted."""
+        self.visits.append((name, []))
+        yield from self._block(_parsed(iter(text.split("\n")))[0], *self.visits[-1])
+
+    def _block(self, block: _Block, name: str, own: list[str]) -> Iterator[str]:
+        for part in block:
+            if not isinstance(part, str):
+                yield from self._conditional(part, name, own)
+                continue
+            word, rest = _directive(part)
+            if word in ("define", "undef"):
+                macro = MACRO_NAME.findall(rest)[0]
+                self._macros.uncertain.discard(macro)
+                (self._macros.defined.add if word == "define" else self._macros.defined.discard)(macro)
+            self._macros.failed |= word == "error"
+            own.append(part)
+            header = _support_name(part, posixpath.dirname(name))
+            if header is None:
+                yield part
+            else:
+                yield from self._visit(header, self._read(header).removesuffix("\n"))
+
+    def _conditional(self, alternatives: Sequence[_Alternative], name: str, own: list[str]) -> Iterator[str]:
+        before, ends, holds = self._macros, list[_Macros](), None
+        for alternative in alternatives:
+            holds = before.holds(alternative.line)
+            if holds is False:
+                continue
+            if holds and not ends:
+                yield from self._block(alternative.block, name, own)
+                return
+            line = "#else" if holds else alternative.line
+            if not ends and alternative is not alternatives[0]:
+                line = f"#if {_directive(line)[1]}"
+            own.append(line)
+            yield line
+            self._macros = before.copy() if ends else before.resumed(self._ends.get(line))
+            yield from self._block(alternative.block, name, own)
+            if not ends:
+                self._ends[line] = self._macros
+            ends.append(self._macros)
+            if holds:
+                break
+        if ends:
+            own.append("#endif")
+            yield "#endif"
+            self._macros = _joined(ends if holds else [*ends, before])
+
+
+def specialised(code: str, read: Read) -> tuple[tuple[str, str], ...]:
+    """Return the support headers that a source includes, in order, without alternatives that it does not use."""
+    texts: dict[str, str] = {}
+    for name, lines in _Preprocessor(code, read).visits[1:]:
+        if any(lines):
+            guard = read(name).partition("\n")[0]
+            guarded = [guard, *lines, "#endif", ""] if guard.startswith("#ifndef ") else [*lines, ""]
+            text = re.sub(r"\n{3,}", "\n\n", "\n".join(guarded))
+            texts[name] = text if texts.setdefault(name, text) == text else read(name)
+    return tuple(texts.items())
+
+
+def preprocessed(code: str, read: Read) -> str:
+    """Return a source with support headers inserted, without known conditions and macros that nothing uses."""
+    lines = _Preprocessor(code, read).lines
+    rest = COMMENTS.sub("", "\n".join(line for line in lines if not SWITCH.fullmatch(line)))
+    used = set(re.findall(r"\w+", rest))
+    kept = [line for line in lines if not ((switch := SWITCH.fullmatch(line)) and switch["macro"] not in used)]
+    return re.sub(r"\n{3,}", "\n\n", "\n".join(kept).rstrip() + "\n")
