@@ -420,8 +420,8 @@ class Assembly:
             for k in index:
                 entries = entries[k]
             return rational(entries)
-        name = f"weights_{axis}" if order is None else f"D{order if order > 1 else ''}_{axis}"
-        values = np.array([list(map(float, row)) for row in entries] if order else list(map(float, entries)))
+        name = {None: "weights", 1: "D"}.get(order, f"D{order}") + f"_{axis}"
+        values = np.array(entries, dtype=float)
         return self.value(name, sizes_of(values), self.used.get(name, ((), values))[1], *index)
 
     def quadrature_weight(self, axis: str, cells: Cells, k: Slot) -> Expr:

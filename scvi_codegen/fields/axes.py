@@ -593,14 +593,11 @@ def _end_cells(name: str, rows: Array, weights: Array, fixed: tuple[bool, bool])
         value = np.zeros(rows.shape[1])
         value[near] = lagrange(distance[near])
         for end, prescribed in enumerate(fixed):
-            places = [
-                end
-                if prescribed and i == 0
-                else fixed_place(i - prescribed)
-                if end == 0
-                else fixed_place(prescribed - i - 1, f"N{name}")
-                for i in range(rows.shape[1])
-            ]
+            at_left = [fixed_place(i - prescribed) for i in range(rows.shape[1])]
+            at_right = [fixed_place(prescribed - i - 1, f"N{name}") for i in range(rows.shape[1])]
+            places: list[Place | int] = [*(at_right if end else at_left)]
+            if prescribed:
+                places[0] = end
             operators = tuple((tuple(map(mp.mpf, each)),) for each in (value, -row if end else row))
             index = fixed_place(c) if end == 0 else fixed_place(-c - 1, f"E{name}")
             result.append(Cells(None, index, tuple(places), operators=operators, weight=float(weights[c])))

@@ -430,7 +430,8 @@ class FieldDerivation:
             yield from (f"  {line}" for line in text.split("\n"))
         divergence = " + ".join(f"d/d{axis} J{axis}" for axis in self.field_system.space)
         heading = f", d/d{TIME} J{TIME} + {divergence} = 0" if self.laws else ": none found"
-        yield f"\nconservation laws{heading}{', the density is damped' * (self.field_system.dissipation != 0)}"
+        damped = "" if self.field_system.dissipation == 0 else ", the density is damped"
+        yield f"\nconservation laws{heading}{damped}"
         for law in self.laws:
             yield f"  {law.name}: {law.symmetry}"
             yield f"    J{TIME} = {_written(law.density)}"

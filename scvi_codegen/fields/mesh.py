@@ -68,11 +68,12 @@ class Mesh:
     def to_section(self) -> dict[str, Any]:
         """Return the section ``[field]`` of a model file: the density as text, and its discretisation."""
         density = self.field_system
+
+        def end_text(end: Any) -> Any:
+            return NATURAL if end == NATURAL else {name: array_text(value) for name, value in end.items()}
+
         boundary = {
-            axis: ends
-            if ends == PERIODIC
-            else [end if end == NATURAL else {each: array_text(x) for each, x in end.items()} for end in ends]
-            for axis, ends in density.boundary.items()
+            axis: PERIODIC if ends == PERIODIC else [*map(end_text, ends)] for axis, ends in density.boundary.items()
         }
         section: dict[str, Any] = {"name": density.name, "fields": [*density.fields]}
         section |= {"momenta": [*density.momenta]} if density.momenta else {}

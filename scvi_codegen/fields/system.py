@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from inspect import signature
 from math import isfinite
@@ -301,7 +301,7 @@ def _check_derivative(name: str, field: str, axes: Sequence[str], parameters: Ma
 
 
 def _bounds(axis: str, ends: Any) -> tuple[float, float]:
-    if isinstance(ends, str) or not hasattr(ends, "__len__") or len(ends) != 2:
+    if isinstance(ends, str) or not isinstance(ends, Collection) or len(ends) != 2:
         raise SystemDefinitionError(f"the axis '{axis}' needs a lower and an upper bound, not {ends!r}")
     lower, upper = (float(parse_expression(str(each), {})) for each in ends)
     if not (isfinite(lower) and isfinite(upper) and lower < upper):
@@ -318,7 +318,7 @@ def _boundary(axis: str, boundary: Any, fields: Sequence[str], known: Mapping[st
     """Return ``"periodic"``, or for each end ``"natural"`` or the prescribed value by field."""
     if boundary in (PERIODIC, NATURAL):
         return PERIODIC if boundary == PERIODIC else (NATURAL, NATURAL)
-    if isinstance(boundary, str) or not hasattr(boundary, "__len__") or len(boundary) != 2:
+    if isinstance(boundary, str) or not isinstance(boundary, Collection) or len(boundary) != 2:
         raise SystemDefinitionError(
             f'the boundary of \'{axis}\' must be "periodic" or two ends, each "natural" or a value, not {boundary!r}'
         )

@@ -366,8 +366,8 @@ def figure(name: str, title: str, setting: RunSetting, views: Sequence[View], ch
     def run(_: Mapping[str, Result]) -> Result:
         runs = {key: setting.run(key) for key in setting.schemes}
         panels = tuple(panel for view in views for panel in view(runs))
-        size, columns = ((7.0, 4.2), 1) if len(panels) == 1 else ((4.0, 3.8), 2 if len(panels) in (2, 4) else 3)
-        picture = Picture(panels=panels, columns=columns, size=size)
+        columns = {1: 1, 2: 2, 4: 2}.get(len(panels), 3)
+        picture = Picture(panels=panels, columns=columns, size=(7.0, 4.2) if len(panels) == 1 else (4.0, 3.8))
         return Result(
             setting=setting.sentences,
             checks=tuple(compared(claim, " ".join(test.split()), runs) for claim, test in tests),

@@ -222,7 +222,7 @@ def tell(text: str = "", /, *, nl: bool = True, **numbers: Any) -> None:
 
 def _plain(value: Any) -> Any:
     """Return a value in the types of JSON: NaN and infinity as ``None``, arrays as lists, paths as strings."""
-    if hasattr(value, "tolist"):
+    if hasattr(value, "tolist"):  # of NumPy, which is not imported here
         value = value.tolist()
     if isinstance(value, Mapping):
         return {str(key): _plain(each) for key, each in value.items()}

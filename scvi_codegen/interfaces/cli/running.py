@@ -208,7 +208,7 @@ def worst_step(trajectory: Trajectory) -> Iterator[str]:
     else:
         too_long = error > TOLERABLE_ERROR
         size = f"{error:.1e} (relative, estimated), step {begun}" if error else "below rounding (estimated)"
-        yield f"largest local error: {size}{': too large' * too_long}"
+        yield f"largest local error: {size}{': too large' if too_long else ''}"
         if too_long:
             warn(
                 f"the step {begun} is too large: its estimated relative error is {error:.1e}; use a smaller --step or "

@@ -48,6 +48,7 @@ def model_with_global_error(model: Model, error: float) -> tuple[Model, GlobalEr
     local += "" if result.max_step == math.inf else f" and steps of at most {result.max_step:.3g}"
     local = f"step of tau of {result.h:.6g}" if result.h else local
     in_words = result.precision == DOUBLE_DOUBLE
+    local += f" in {DOUBLE_DOUBLE}" if in_words else ""
     numbers = {
         "requested": error,
         "estimate": result.estimate,
@@ -62,7 +63,7 @@ def model_with_global_error(model: Model, error: float) -> tuple[Model, GlobalEr
     }
     tell(
         f"global error: {result.estimate:.1e} (relative) by comparison of {result.runs} runs; the bound {error:g} "
-        f"is confirmed until t = {result.confirmed_until:g}, with a {local}{f' in {DOUBLE_DOUBLE}' * in_words}",
+        f"is confirmed until t = {result.confirmed_until:g}, with a {local}",
         global_error=numbers,
     )
     if result.h:

@@ -25,7 +25,7 @@ import sympy
 
 from scvi_codegen.common.display.cards import card, listed, plain
 from scvi_codegen.common.precision import Number
-from scvi_codegen.common.representation import LONGEST, clipped
+from scvi_codegen.common.representation import LONGEST, clipped, counted
 from scvi_codegen.common.validation import checks_arguments
 from scvi_codegen.interfaces.derivation.notation import (
     LARGEST_DENOMINATOR,
@@ -153,8 +153,8 @@ class StepEquations:
             yield f"  {symmetry}{'' if guaranteed else '  (not guaranteed by this method)'}"
 
     def __repr__(self) -> str:
-        count = len(self.equations)
-        return clipped(f"<{count} equation{'s' * (count > 1)} of {self.system.name} by {self.method.name}>", LONGEST)
+        count = counted(len(self.equations), "equation")
+        return clipped(f"<{count} of {self.system.name} by {self.method.name}>", LONGEST)
 
     def _repr_latex_(self) -> str | None:
         """Return the LaTeX of all equations, nothing if a notebook could not show them."""

@@ -198,7 +198,8 @@ def _read(name: str, folder: str | os.PathLike[str], file: str) -> tuple[tuple[f
     try:
         table = readers[path.suffix.lower()](inside(folder, file))
     except OSError as error:
-        remedy = f", or name it on the command line: --input {name}={file}" * (error.errno == errno.EACCES)
+        denied = error.errno == errno.EACCES
+        remedy = f", or name it on the command line: --input {name}={file}" if denied else ""
         raise ModelFileError(f"it cannot be read: {error.strerror or error}{remedy}") from error
     t = _column(table, TIME)
     others = [each for each in table.columns if each != TIME]

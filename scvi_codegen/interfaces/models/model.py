@@ -478,6 +478,6 @@ def _equal(one: Any, other: Any) -> bool:
     """Return whether two values are equal, arrays and mappings of arrays by their entries."""
     if isinstance(one, Mapping) and isinstance(other, Mapping):
         return one.keys() == other.keys() and all(_equal(each, other[name]) for name, each in one.items())
-    if hasattr(one, "shape") or hasattr(other, "shape"):
+    if isinstance(one, np.ndarray) or isinstance(other, np.ndarray):
         return np.array_equal(one, other)
     return bool(one == other)

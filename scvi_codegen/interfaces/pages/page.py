@@ -148,9 +148,11 @@ def _model_of(system: Any, motion: Mapping[str, Any]) -> Model:
             raise ArgumentError(f"page() takes no {name!r}{keyword_hint(name, known)}")
     if "q" not in motion:
         raise ArgumentError(f"a page of the system {system.name} requires its initial state: give q, and velocity or p")
-    h = abs(motion.get("h") or 1.0)
-    default = {} if "steps" in motion else {"span": 30.0 if 1e-3 <= h <= 1.0 else STEPS * h}
-    return Model(**{"system": system, "method": DEFAULT_METHOD, **default, **motion})
+    arguments: dict[str, Any] = {"system": system, "method": DEFAULT_METHOD, **motion}
+    if "steps" not in motion:
+        h = abs(motion.get("h") or 1.0)
+        arguments.setdefault("span", float(SECONDS) if 1e-3 <= h <= 1.0 else STEPS * h)
+    return Model(**arguments)
 
 
 def page_of(model: Model, document: Mapping[str, Any], settings: Mapping[str, Any]) -> Page:
@@ -363,31 +365,16 @@ def _description(shown: Page, interface: Interface, *, initial: bool) -> dict[st
     q, v = _flat(model.q), _rates(model)
     drawn = _drawn_system(model, interface)
     shape = (shape_of_picture(drawn, model.picture) if model.picture else shape_of(drawn)).to_data()
-    parameters, inputs = [], {f"{name}_0": name for name in interface.inputs}
-    unchanged = {interface.energy_parameter, *input_parameters(interface.inputs)} - inputs.keys()
-    for place, (name, value) in enumerate(_values(model, interface).items()):
-        size = abs(value) or 1.0
-        default = (size / 20, 3 * size) if value > 0 else (-3 * size, 3 * size if value else size)
-        if name in inputs:
-            default = (-3 * size, 3 * size)
-        low, high = ranges.get(inputs.get(name, name), default)
-        each = {"name": inputs.get(name, name), "value": value, "low": low, "high": high, "place": place}
-        if name not in unchanged:
-            parameters.append(each | ({"input": True} if name in inputs else {}))
     span = abs(float(model.end - model.t))
     speed = model.page.get("speed", 1.0 if 0.3 < span / SECONDS < 4 else float(f"{span / SECONDS:.0e}"))
-    step = float(model.h if model.h is not None else model.tolerance)  # type: ignore[arg-type]
-    label = "Tolerance" if model.h is None else "Step size in tau" if model.has_time_transformation else "Step size"
-    limits = (
-        [math.pi, 12.0]
-        if len(shape["angles"]) == len(q)
-        else [2 * max([1.0, *(abs(x) for x in kind)]) for kind in (q, v)]
-    )
+    limits = [2 * max([1.0, *map(abs, numbers)]) for numbers in (q, v)]
+    if len(shape["angles"]) == len(q):
+        limits = [math.pi, 12.0]
     names = interface.coordinates or [""] * len(q)
     rates = interface.momentum_names if starts_from_momenta(model) else [f"{name}_dot" for name in names]
     sliders = {
-        kind: [ranges.get(name, [-limit, limit]) for name in known]
-        for kind, known, limit in zip("qv", (names, rates or names), limits, strict=True)
+        kind: [ranges.get(name, [-limit, limit]) for name in names_of_kind]
+        for kind, names_of_kind, limit in zip("qv", (names, rates or names), limits, strict=True)
     }
     conserved = all(each.restitution == 1.0 for each in model.events if each.changes_state)
     variables = _variables(interface, shape, len(q))
@@ -395,16 +382,42 @@ def _description(shown: Page, interface: Interface, *, initial: bool) -> dict[st
     return {
         "m": len(q), "q": [] if initial else q, "v": [] if initial else v, "t": float(model.t),
         "coordinates": interface.coordinates, "rotations": _rotations(interface),
-        "momenta": interface.momentum_names, "parameters": parameters, "quantities": interface.map_names,
+        "momenta": interface.momentum_names, "parameters": _parameter_sliders(model, interface),
+        "quantities": interface.map_names,
         "energy": {"label": "Energy", "conserved": bool(interface.conserves_energy) and conserved}, "plots": plots,
         "causes": CAUSES, "events": [str(each.function) for each in model.events],
         "from_momenta": starts_from_momenta(model), "values": len(interface.parameters),
         "initial": initial, "whole": WHOLE,
-        "step": {"adaptive": adaptive or model.has_time_transformation, "label": label, "value": step,
-                 **({"low": 1e-15, "high": 1e-4} if model.h is None else {"low": step / 20, "high": step * 8})},
+        "step": {"adaptive": adaptive or model.has_time_transformation, **_step_slider(model)},
         "speed": {"value": speed, "low": speed / 50, "high": speed * 20},
         "ranges": sliders, "shape": shape,
     }  # fmt: skip
+
+
+def _parameter_sliders(model: Model, interface: Interface) -> list[dict[str, Any]]:
+    """Return name, value, range and index of each parameter that a slider sets; an input is its first coefficient."""
+    inputs, ranges = {f"{name}_0": name for name in interface.inputs}, model.page.get("ranges", {})
+    unchanged = {interface.energy_parameter, *input_parameters(interface.inputs)} - inputs.keys()
+    sliders: list[dict[str, Any]] = []
+    for index, (name, value) in enumerate(_values(model, interface).items()):
+        if name in unchanged:
+            continue
+        size, shown = abs(value) or 1.0, inputs.get(name, name)
+        low, high = -3 * size, 3 * size if value or name in inputs else size
+        if value > 0 and name not in inputs:
+            low = size / 20
+        low, high = ranges.get(shown, (low, high))
+        slider = {"name": shown, "value": value, "low": low, "high": high, "place": index}
+        sliders.append(slider | {"input": True} if name in inputs else slider)
+    return sliders
+
+
+def _step_slider(model: Model) -> dict[str, Any]:
+    """Return label, value and range of the slider of the step size, or of the tolerance of adaptive steps."""
+    if model.h is None:
+        return {"label": "Tolerance", "value": model.tolerance, "low": 1e-15, "high": 1e-4}
+    step, label = float(model.h), "Step size in tau" if model.has_time_transformation else "Step size"
+    return {"label": label, "value": step, "low": step / 20, "high": step * 8}
 
 
 def _rotations(interface: Interface) -> list[dict[str, Any]]:

@@ -329,19 +329,21 @@ class _Scene:
         nothing: list[list[float]] = [[]] * self.points.shape[2]
         bodies = [mark["points"][0] for mark in shape.marks if mark["kind"] in ("body", "bob")]
         for k, point in enumerate(shape.trails):
-            drawn = color((bodies.index(point) if point in bodies else k) if which is None else which)
-            line = self.axes.plot(*nothing, color=drawn, linewidth=1.0, alpha=0.5)[0]
+            own = bodies.index(point) if point in bodies else k
+            colour = color(own if which is None else which)
+            line = self.axes.plot(*nothing, color=colour, linewidth=1.0, alpha=0.5)[0]
             self.trails.append((first + point, line))
         count = 0
         for mark in _marks_of(shape):
-            kind, name = mark["kind"], mark.get("name", "") if which is None else ""
-            neutral = kind in ("rod", "wall", "spring", "pivot", "bonds") and which is None
-            drawn = "0.35" if neutral else color(mark.get("color", count) if which is None else which)
+            kind, name, colour = mark["kind"], "", color(which or 0)
+            if which is None:
+                name, colour = mark.get("name", ""), color(mark.get("color", count))
+                colour = "0.35" if kind in ("rod", "wall", "spring", "pivot", "bonds") else colour
             count += kind in ("body", "bob")
             form = "-" if kind in WIDTHS else "o"
             form = "o-" if kind == "link" or mark.get("dots") else form
             size = {"markersize": SIZES.get(kind, 3 if kind in WIDTHS else 5), "linewidth": WIDTHS.get(kind, 0.0)}
-            line = self.axes.plot(*nothing, form, color=drawn, label=name, **size)[0]
+            line = self.axes.plot(*nothing, form, color=colour, label=name, **size)[0]
             self.marks.append((kind, [first + k for k in mark["points"]], line))
 
     def show(self, frame: int) -> list[Any]:

@@ -80,8 +80,9 @@ def draw_unit_vectors(axes: Axes, motion: Trajectory, plane: tuple[int, int], wh
     """Draw the projections of body axes, directions and spins to a plane of space, in the unit circle."""
     axes.plot(np.cos(CIRCLE), np.sin(CIRCLE), color="0.7", linewidth=0.6)
     for number, (label, curve) in enumerate(unit_vectors(motion).items()):
-        drawn, shown = (number, plain(label)) if which is None else (which, None if which else plain(label))
-        axes.plot(*curve[:, plane].T, color=color(drawn), linewidth=0.8, label=shown)
+        colour, shown = (number, label) if which is None else (which, label)
+        legend = None if which else plain(shown)  # of the first trajectory alone
+        axes.plot(*curve[:, plane].T, color=color(colour), linewidth=0.8, label=legend)
     axes.set(xlabel="xyz"[plane[0]], ylabel="xyz"[plane[1]], title="body axes")
     axes.legend(fontsize=8)
     axes.set_aspect("equal")

@@ -240,10 +240,11 @@ def shape_of_picture(drawn: DrawnSystem, picture: Mapping[str, Any], where: str 
     moving = [name for name, each in zip(names, formulas, strict=True) if any(x.free_symbols & state for x in each)]
     marks: list[dict[str, Any]] = []
     for key in MARKS[:3]:
+        more = "" if key == "springs" else ", or more"
         for ends in _listed(picture, key, where):
             marks.append({"kind": key[:-1], "points": _numbers(ends, names, f"{where} {key}")})
             if len(marks[-1]["points"]) < 2 or (key == "springs" and len(marks[-1]["points"]) > 2):
-                raise ModelFileError(f"{where} {key}: {ends!r} must be two points{', or more' * (key != 'springs')}")
+                raise ModelFileError(f"{where} {key}: {ends!r} must be two points{more}")
     fixed = {k for mark in marks for k in mark["points"] if mark["kind"] == "wall"}
     free = [name for k, name in enumerate(names) if name in moving and k not in fixed]
     shown = _numbers(_listed(picture, "bodies", where, free), names, f"{where} bodies")

@@ -120,7 +120,7 @@ def _yes_or_not(holds: bool) -> str:
 
 
 def _decimals(row: Any) -> Any:
-    return [float(_decimal(x)) for x in row] if hasattr(row, "__len__") else float(_decimal(row))
+    return [float(_decimal(x)) for x in row] if isinstance(row, Sequence) else float(_decimal(row))
 
 
 def _decimal(value: object) -> str:

@@ -190,7 +190,8 @@ def _check_words(model: Model, options: dict[str, Any]) -> None:
     for flag, value in options.items() if model.in_double_double else ():
         kept = flag == "-o" and value is not None and (is_run_folder(value) or Path(value).suffix.lower() == ".npz")
         if value is not None and not kept:
-            model._check_double(f"{flag} {value}{' (write a file NAME.npz)' * (flag == '-o')}")
+            remedy = " (write a file NAME.npz)" if flag == "-o" else ""
+            model._check_double(f"{flag} {value}{remedy}")
 
 
 def _check_confirmed(confirmation: GlobalError | None) -> None:

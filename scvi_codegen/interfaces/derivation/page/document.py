@@ -28,6 +28,7 @@ from scvi_codegen.common.display.page import (
     page_template,
     style_sheet,
 )
+from scvi_codegen.common.representation import counted
 from scvi_codegen.interfaces.derivation.equations import StepEquations, derive
 from scvi_codegen.interfaces.derivation.notation import events_text, table_entries
 from scvi_codegen.interfaces.derivation.page.drawings import curve_section, jacobian_section, tables_section
@@ -47,7 +48,7 @@ def system_section(system: MechanicalSystem) -> Section:
     """Return the section on the Lagrangian or the Hamiltonian, coordinates and parameters."""
     names = ", ".join(q.name for q in system.coordinates)
     letter, title = ("H", "Hamiltonian") if system.auxiliaries else ("L", "Lagrangian")
-    count = f"{system.dimension} coordinate{'s' * (system.dimension > 1)}"
+    count = counted(system.dimension, "coordinate")
     time = " and time" if system.depends_on_time else ""
     contents: list[Content] = [
         Paragraph(f"The {title} of {count}, {names}{time}:"),

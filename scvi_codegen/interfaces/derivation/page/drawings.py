@@ -12,6 +12,7 @@ from sympy import Function, Identity, KroneckerProduct, MatrixSymbol, Symbol
 from scvi_codegen.codegen.ir.program import Program
 from scvi_codegen.common.display.page import Cell, Content, Drawing, Formula, Paragraph, Section, TableBlock, formulas
 from scvi_codegen.common.precision import Vector
+from scvi_codegen.common.representation import counted
 from scvi_codegen.interfaces.derivation.equations import StepEquations
 from scvi_codegen.interfaces.derivation.notation import TableEntry
 from scvi_codegen.methods import SCVI, SVI, Composition, Method, RungeKutta, SpectralCollocation, StoermerVerlet
@@ -37,8 +38,9 @@ def step_drawing(method: Method) -> Drawing | None:
     ends = _text(MARGIN, height - 8, f"t{INDEX}", "start") + _text(
         WIDTH - MARGIN, height - 8, f't{INDEX}<tspan dy="-4"> + h</tspan>', "end"
     )
-    weighted = any(isinstance(part, Quadrature) for part in method.parts)
-    caption = f"The step from t_k to t_k + h{', quadrature points as high as their weights' * weighted}."
+    caption = "The step from t_k to t_k + h."
+    if any(isinstance(part, Quadrature) for part in method.parts):
+        caption = "The step from t_k to t_k + h, quadrature points as high as their weights."
     svg = (
         f'<svg viewBox="0 0 {WIDTH} {height}" role="img" aria-label="{escape(caption)}" style="--width: {WIDTH}px">'
         f"{''.join(rows)}{ends}</svg>"
@@ -76,9 +78,8 @@ def _stems(part: Part) -> list[float | None]:
 def _words(part: Part) -> str:
     count = len(positions(part))
     if isinstance(part, Quadrature):
-        return f"{count} quadrature point{'s' * (count > 1)} ({part.name})"
-    kind = "stage" if isinstance(part, Tableau) else "node"
-    return f"{count} {kind}{'s' * (count > 1)} ({part.name})"
+        return f"{counted(count, 'quadrature point')} ({part.name})"
+    return f"{counted(count, 'stage' if isinstance(part, Tableau) else 'node')} ({part.name})"
 
 
 def _text(x: float, y: float, text: str, anchor: str) -> str:
@@ -201,10 +202,9 @@ def _(method: StoermerVerlet) -> Iterator[Content]:
 
 @_curve.register
 def _(method: Composition) -> Iterator[Content]:
-    count = len(method.fractions)
     yield Paragraph(
-        f"{count} leapfrog step{'s' * (count > 1)} of sizes gamma_j h one after the other: kicks by forces and "
-        "drifts with constant velocity in turn."
+        f"{counted(len(method.fractions), 'leapfrog step')} of sizes gamma_j h one after the other: kicks by forces "
+        "and drifts with constant velocity in turn."
     )
 
 

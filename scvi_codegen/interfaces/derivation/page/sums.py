@@ -70,7 +70,7 @@ def scalar_name(group: StageGroup) -> str:
     """Return L, its k-th time derivative along the curve, or S."""
     if group.name == "node":
         return "S"
-    return "L" if not group.scalar_power else "L_dot" if group.scalar_power == 1 else f"L_d{group.scalar_power}"
+    return {0: "L", 1: "L_dot"}.get(group.scalar_power, f"L_d{group.scalar_power}")
 
 
 def meaning(group: StageGroup) -> str:
@@ -176,7 +176,7 @@ def row_formulas(system: MechanicalSystem, stages: StageSystem) -> Iterator[tupl
             continue
         number = re.sub(r"(?<=_)\d+$", RUNNING_ROW, row.number)
         last = members[-1][1].base
-        bounds = f"{RUNNING_ROW} = {first.base}, {'.., ' * (len(members) > 2)}{last}"
+        bounds = f"{RUNNING_ROW} = {first.base}, {'.., ' if len(members) > 2 else ''}{last}"
         yield row, Formula(first.summed(RUNNING_ROW), sympy.S.Zero, f"{number}, {bounds}")
 
 
@@ -320,7 +320,9 @@ class _Line:
 
         def placed(index: int | None) -> object:
             shift = self._shift(index)
-            return index if shift is None or value == self.base else value if shift == 0 else f"{value}{shift:+d}"
+            if shift is None or value == self.base:
+                return index
+            return f"{value}{shift:+d}" if shift else value
 
         momentum = self.momentum
         factor = momentum.entry(placed(momentum.index)) if isinstance(momentum, Column) else momentum

@@ -173,7 +173,8 @@ def _written(model: Model, stem: str | None) -> dict[str, str]:
             again = _read_model(document, {}) if files else parse_model(text)
         if again == model:
             return {f"{stem}.toml": text, **files}
-        part = "method" if again.method != model.method else "system" if again.system != model.system else "state"
+        differing = [name for name in ("method", "system") if getattr(again, name) != getattr(model, name)]
+        part = next(iter(differing), "state")
     if part == "system" and model.system.drawn_links:
         raise ModelFileError(
             f"the formulas of the robot {model.system.name} cannot be written to a file: write [system] robot = FILE"

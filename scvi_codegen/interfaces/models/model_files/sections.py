@@ -247,8 +247,9 @@ def is_number(value: Any) -> bool:
 def check_complete(document: Document) -> None:
     """Raise an error that lists all missing keys; arrays whose sizes are names are at rest by default."""
     missing = []
+    replaced = "system" if "field" in document else "field"
     for name, keys in REQUIRED.items():
-        for key in () if name == ("system" if "field" in document else "field") else keys:
+        for key in () if name == replaced else keys:
             choice = next((choice for choice in ALTERNATIVES if key in choice), {key})
             if choice.isdisjoint(document.get(name, {})) and not _is_optional(document, key):
                 missing.append(f"{' or '.join(sorted(choice))} in [{name}]")
