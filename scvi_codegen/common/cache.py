@@ -68,8 +68,8 @@ _uncounted: dict[tuple[Path, int], float] = {}
 
 def cache_folder() -> Path:
     """Return the cache folder: ``$SCVI_CODEGEN_CACHE``, else the user's cache folder."""
-    chosen = os.environ.get(CACHE_VARIABLE)
-    return Path(chosen) if chosen else platformdirs.user_cache_path("scvi-codegen")
+    setting = os.environ.get(CACHE_VARIABLE)
+    return Path(setting) if setting else platformdirs.user_cache_path("scvi-codegen")
 
 
 def trusted_folder() -> Path | None:

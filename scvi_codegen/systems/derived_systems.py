@@ -64,8 +64,8 @@ def change_coordinates(
             "coordinates must be equal"
         )
     variables = tuple(symbol(name) for name in new)
-    known = {symbol.name: symbol for symbol in (*variables, *system.parameters, system.time)}
-    positions = {symbol(name): parse_expression(text, known) for name, text in old.items()}
+    symbols = {symbol.name: symbol for symbol in (*variables, *system.parameters, system.time)}
+    positions = {symbol(name): parse_expression(text, symbols) for name, text in old.items()}
     replaced: dict[Expr, Expr] = {**positions}
     replaced |= {symbol(q.name + DOT): rate_of(f, variables, system.time) for q, f in positions.items()}
     return LagrangianSystem(

@@ -179,20 +179,20 @@ class OneForm:
         matrices = [np.array(values, dtype=float).reshape(n, n) for values in islice(samples(entries), SAMPLES)]
         return max((int(np.linalg.matrix_rank(m, tol=RANK_TOLERANCE * np.abs(m).max())) for m in matrices), default=0)
 
-    def choices(self, chosen: tuple[int, ...] = (), first: int = 0) -> Iterator[tuple[int, ...]]:
+    def choices(self, auxiliary: tuple[int, ...] = (), first: int = 0) -> Iterator[tuple[int, ...]]:
         """Yield the choices of half of the coordinates between which omega vanishes."""
         n = len(self.coordinates)
-        if 2 * len(chosen) == n:
-            yield chosen
+        if 2 * len(auxiliary) == n:
+            yield auxiliary
             return
         for j in range(first, n):
-            if all((i, j) in self.vanishing for i in chosen):
-                yield from self.choices((*chosen, j), j + 1)
+            if all((i, j) in self.vanishing for i in auxiliary):
+                yield from self.choices((*auxiliary, j), j + 1)
 
-    def integral(self, chosen: Sequence[int]) -> Expr | None:
+    def integral(self, auxiliary: Sequence[int]) -> Expr | None:
         """Return F with F_y = theta_y, or ``None`` if no closed form is found."""
         total: Expr = sympy.S.Zero
-        for j in chosen:
+        for j in auxiliary:
             rest = sympy.expand(self.theta[j] - total.diff(self.coordinates[j]))
             if rest == 0:
                 continue
@@ -200,7 +200,7 @@ class OneForm:
             if part.has(sympy.Integral, sympy.Piecewise):
                 return None
             total += part
-        remaining = [self.theta[j] - total.diff(self.coordinates[j]) for j in chosen]
+        remaining = [self.theta[j] - total.diff(self.coordinates[j]) for j in auxiliary]
         return total if all(map(self.is_zero, remaining)) else None
 
     def check(self) -> None:
@@ -285,30 +285,30 @@ def first_order_form(form: OneForm) -> dict[str, Any]:
     refused: list[tuple[int, ...]] = []
     z, n = form.coordinates, len(form.coordinates)
     placed = form.at(expressions := places(form))
-    if not any(placed.integral(chosen) is not None for chosen in islice(placed.choices(), MOST_CHOICES)):
+    if not any(placed.integral(auxiliary) is not None for auxiliary in islice(placed.choices(), MOST_CHOICES)):
         placed = form.at(expressions := {symbol: symbol for symbol in z})
-    for chosen, _ in zip(placed.choices(), range(MOST_CHOICES), strict=False):
-        integral = placed.integral(chosen)
+    for auxiliary, _ in zip(placed.choices(), range(MOST_CHOICES), strict=False):
+        integral = placed.integral(auxiliary)
         if integral is None:
-            refused.append(chosen)
+            refused.append(auxiliary)
             continue
-        rest = [i for i in range(n) if i not in chosen]
+        rest = [i for i in range(n) if i not in auxiliary]
         theta = tuple(
             sympy.expand(placed.theta[i] - integral.diff(z[i])) if integral else placed.theta[i] for i in rest
         )
-        candidates.append((int(sympy.count_ops(theta)), chosen, integral, theta))
+        candidates.append((int(sympy.count_ops(theta)), auxiliary, integral, theta))
         if integral == 0:
             break
     if not candidates:
         raise SystemDefinitionError(_refusal(form, refused))
-    _, chosen, integral, theta = min(candidates, key=lambda each: each[:2])
+    _, auxiliary, integral, theta = min(candidates, key=lambda each: each[:2])
     integral = integral.xreplace(expressions)
-    rest = [i for i in range(n) if i not in chosen]
+    rest = [i for i in range(n) if i not in auxiliary]
     theta = tuple(
         expressions[z[i]].diff(z[i]) * component.xreplace(expressions) if integral else form.theta[i]
         for i, component in zip(rest, theta, strict=True)
     )
-    y = tuple(z[i] for i in chosen)
+    y = tuple(z[i] for i in auxiliary)
     order = sorted(range(len(y)), key=lambda k: theta.index(y[k])) if set(theta) == set(y) else range(len(y))
     return {
         "coordinates": tuple(z[i] for i in rest),
@@ -339,9 +339,9 @@ def shear(form: OneForm) -> tuple[Symbol, Expr, tuple[str, ...], Expr] | None:
             continue
         rate = v[s] - sympy.Add(*(g.diff(q) * dot for q, dot in zip(z, v, strict=True)))
         sheared = replace(form, lagrangian=form.lagrangian.subs({z[s]: z[s] - g, v[s]: rate}, simultaneous=True))
-        for chosen in sheared.choices():
-            if sheared.integral(chosen) is not None:
-                return z[s], g, tuple(z[i].name for i in chosen), form.omega(s, u)
+        for auxiliary in sheared.choices():
+            if sheared.integral(auxiliary) is not None:
+                return z[s], g, tuple(z[i].name for i in auxiliary), form.omega(s, u)
     return None
 
 
@@ -349,7 +349,7 @@ def _refusal(form: OneForm, refused: Sequence[Sequence[int]]) -> str:
     z, half = form.coordinates, len(form.coordinates) // 2
     start = f"the Lagrangian of '{form.name}' is linear in the velocities, theta . v - H. "
     if refused:
-        sets = " or ".join("(" + ", ".join(z[j].name for j in chosen) + ")" for chosen in refused)
+        sets = " or ".join("(" + ", ".join(z[j].name for j in auxiliary) + ")" for auxiliary in refused)
         return (
             f"{start}The two-form d theta vanishes between {sets}, but no integral of these components of theta was "
             "found in closed form. Subtract a time derivative from L by hand, so that the velocities of these "
@@ -365,10 +365,10 @@ def _refusal(form: OneForm, refused: Sequence[Sequence[int]]) -> str:
     sheared = shear(form)
     remedy = "Use other coordinates, such as flux coordinates of a magnetic field, or canonical ones"
     if sheared:
-        s, g, chosen, pivot = sheared
+        s, g, auxiliary, pivot = sheared
         remedy = (
             f"Put {format_expression(s - g)} in the place of {s}, and its time derivative in that of {s}_dot: then "
-            f"omega vanishes between {' and '.join(chosen)}"
+            f"omega vanishes between {' and '.join(auxiliary)}"
         )
         if pivot.free_symbols & {*z} and pivot.count_ops() < MOST_SHOWN:
             remedy += f". This is valid as long as {format_expression(pivot)} is not 0 along the trajectory"

@@ -46,9 +46,9 @@ class TermGroup:
     places: tuple[tuple[int, ...], ...]
     values: tuple[tuple[Expr, ...], ...]
 
-    def where(self, chosen: Sequence[bool]) -> TermGroup:
+    def where(self, mask: Sequence[bool]) -> TermGroup:
         """Return the group with only the chosen terms."""
-        indices, *values = (tuple(compress(column, chosen)) for column in (self.places, *self.values))
+        indices, *values = (tuple(compress(column, mask)) for column in (self.places, *self.values))
         return replace(self, places=indices, values=tuple(values))
 
     @property
@@ -124,8 +124,8 @@ def roll_terms(system: MechanicalSystem) -> SplitSystem | None:
     if len(terms) < MIN_GROUP_SIZE or system.constraints or system.clock or inner_of(system.formula):
         return None
     moving = {*system.velocities, *system.auxiliaries}
-    known = {*system.coordinates}
-    still = [term for term in terms if known & term.free_symbols and not moving & term.free_symbols]
+    positions = {*system.coordinates}
+    still = [term for term in terms if positions & term.free_symbols and not moving & term.free_symbols]
     kinds = similar_terms(still, {q: ("", k) for k, q in enumerate(system.coordinates)}, system.parameters)
     large = [kind for kind in kinds if len(kind) >= MIN_GROUP_SIZE]
     if not large:
@@ -181,9 +181,9 @@ def similar_terms(
         first: indices that precede those of each term, such as the coordinate on which a force acts.
     """
     kinds: dict[str, list[tuple[Expr, _Leaves]]] = {}
-    shapes, known = dict[Expr, str](), set(names)
+    shapes, constants = dict[Expr, str](), set(names)
     for term, begun in zip(terms, first, strict=False):
-        leaves = _Leaves(indices, known, shapes, [*begun])
+        leaves = _Leaves(indices, constants, shapes, [*begun])
         kinds.setdefault(leaves.key(term), []).append((term, leaves))
         if len(kinds) > MAX_GROUPS:
             return ()
@@ -216,10 +216,10 @@ class _Leaves:
 
     def shape(self, formula: Expr) -> str:
         """Return the structure of a formula without numbered leaves."""
-        known = self.shapes.get(formula)
-        if known is None:
-            known = self.shapes[formula] = self._shape(formula)
-        return known
+        written = self.shapes.get(formula)
+        if written is None:
+            written = self.shapes[formula] = self._shape(formula)
+        return written
 
     def _shape(self, formula: Expr) -> str:
         if formula.is_Pow:
@@ -245,8 +245,8 @@ class _Leaves:
         return constants[self.constants.index(formula)] if self._is_constant(formula) else formula
 
 
-def _number(known: list[Item], item: Item) -> int:
+def _number(items: list[Item], item: Item) -> int:
     """Return the index of an item in a list, appending the item if necessary."""
-    if item not in known:
-        known.append(item)
-    return known.index(item)
+    if item not in items:
+        items.append(item)
+    return items.index(item)

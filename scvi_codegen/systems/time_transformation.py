@@ -151,9 +151,9 @@ def time_rescaling_function(system: MechanicalSystem, g: str | Expr, *, in_time:
         return TIME_RESCALINGS[g](system)
     driven = input_formulas(system.inputs, system.time) if in_time else {}
     time = (system.time, *driven) if in_time else ()
-    known = {symbol.name: symbol for symbol in (*system.coordinates, *system.auxiliaries, *system.parameters, *time)}
+    symbols = {symbol.name: symbol for symbol in (*system.coordinates, *system.auxiliaries, *system.parameters, *time)}
     names = RotationNames(system.rotations)
-    readable = known | names.symbols
+    readable = symbols | names.symbols
     if isinstance(g, Expr):
         formula = g.xreplace({free: readable[free.name] for free in g.free_symbols if free.name in readable})
     elif isinstance(g, str):
@@ -161,7 +161,7 @@ def time_rescaling_function(system: MechanicalSystem, g: str | Expr, *, in_time:
     else:
         raise SystemDefinitionError(f"time_transformation must be a name, text or a SymPy expression, not {g!r}")
     formula = names.in_coordinates(formula)
-    unknown = sorted(free.name for free in formula.free_symbols - set(known.values()))
+    unknown = sorted(free.name for free in formula.free_symbols - set(symbols.values()))
     if unknown:
         kinds = "coordinates, momenta and parameters" if system.auxiliaries else "coordinates and parameters"
         raise SystemDefinitionError(
@@ -175,12 +175,12 @@ def time_rescaling_function(system: MechanicalSystem, g: str | Expr, *, in_time:
     return formula.xreplace(driven)
 
 
-def _read(system: MechanicalSystem, text: str, known: Mapping[str, Symbol]) -> Expr:
+def _read(system: MechanicalSystem, text: str, symbols: Mapping[str, Symbol]) -> Expr:
     if is_indexed(text) and system.arrays:
         momenta = momentum_arrays(system.arrays, (each.name for each in system.auxiliaries))
-        return formula_of_entries(text, (*system.arrays, *momenta), known)
+        return formula_of_entries(text, (*system.arrays, *momenta), symbols)
     try:
-        return parse_expression(text, known)
+        return parse_expression(text, symbols)
     except SystemDefinitionError as error:
         if text.isidentifier():
             raise SystemDefinitionError(

@@ -54,16 +54,16 @@ def largest_step(
         StateError: if a number is out of range, an input is not set, or no step is small enough.
         MethodError: if the method has no error estimate.
     """
-    length, wanted = checked_number(span, "the span"), checked_number(tolerance, "the tolerance")
-    if length == 0.0 or not 0.0 <= wanted < 1.0:
-        raise StateError(f"span = {length:g} must not be 0, and tolerance = {wanted:g} must be in [0, 1)")
+    length, bound = checked_number(span, "the span"), checked_number(tolerance, "the tolerance")
+    if length == 0.0 or not 0.0 <= bound < 1.0:
+        raise StateError(f"span = {length:g} must not be 0, and tolerance = {bound:g} must be in [0, 1)")
     check_inputs_given(stepper.interface, parameters)
     reversible, end = stepper.interface.time_transformation is not None, t + length
     start = partial(stepper.start, q, p, t=t, t_end=end if reversible else None, options=options)
     first = abs(length) if reversible else length
-    known = start(h=first, parameters=parameters).parameters
-    rate = float(stepper.rates(q, p, known)[0])
-    return _longest(lambda h: _pilot(start(h=h, parameters=known), end), first / rate, wanted or ROUND_OFF)
+    values = start(h=first, parameters=parameters).parameters
+    rate = float(stepper.rates(q, p, values)[0])
+    return _longest(lambda h: _pilot(start(h=h, parameters=values), end), first / rate, bound or ROUND_OFF)
 
 
 def _longest(pilot: Callable[[float], tuple[float, int]], h: float, allowed: float) -> float:

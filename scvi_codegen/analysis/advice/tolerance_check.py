@@ -69,8 +69,8 @@ def known_digits(
         if steps > most:
             raise _TooLongError
 
-    chosen = np.unique(np.linspace(0, len(trajectory) - 1, SAMPLES).astype(int))
-    times = trajectory.t[chosen]
+    compared = np.unique(np.linspace(0, len(trajectory) - 1, SAMPLES).astype(int))
+    times = trajectory.t[compared]
     nudged = trajectory.q[0] * (1.0 + PERTURBATION * np.cos(np.arange(trajectory.q.shape[1])))
     span: dict[str, Any] = {"t": float(times[0]), "t_end": float(times[-1])}
     arguments = {**span, "parameters": trajectory.parameters, "progress": count}
@@ -84,7 +84,7 @@ def known_digits(
     except (ScviCodegenError, _TooLongError):
         return None
     positions = q
-    q, p = np.abs(q - trajectory.q[chosen]), np.abs(p - trajectory.p[chosen])
+    q, p = np.abs(q - trajectory.q[compared]), np.abs(p - trajectory.p[compared])
     tenfold = _tenfold(relative_to_motion(np.linalg.norm(q, axis=1), positions), abs(float(times[-1] - times[0])))
     return Known(q=_final_error(q), p=_final_error(p), tenfold=tenfold)
 

@@ -51,14 +51,14 @@ class Chain:
 
     Attributes:
         parts: measurements of each segment.
-        known: (2m + parameters,) values; those of the unknowns are overwritten.
+        prior: (2m + parameters,) values of the initial guess; those of the unknowns are overwritten.
         unknown_indices: (k,) indices of the unknowns in (q, p, parameters).
         sizes: (2m,) sizes of state entries.
         jump: jump relative to ``sizes`` that weighs as much as a residual of ``unit``.
     """
 
     parts: tuple[Measurements, ...]
-    known: Array
+    prior: Array
     unknown_indices: NDArray[np.intp]
     sizes: Array
     jump: float = TIGHT
@@ -72,7 +72,7 @@ class Chain:
 
     def values(self, x: Array) -> Array:
         """Return (2m + parameters,) initial state and parameters."""
-        values = self.known.copy()
+        values = self.prior.copy()
         values[self.unknown_indices] = x[: len(self.unknown_indices)]
         return values
 
@@ -107,7 +107,7 @@ class Chain:
 
     def typical_unknowns(self, x: Array) -> Array:
         """Return (unknowns,) typical sizes; 0 for parameters whose initial guess is 0."""
-        guess, sizes = self.known[self.unknown_indices], np.zeros(len(self.known))
+        guess, sizes = self.prior[self.unknown_indices], np.zeros(len(self.prior))
         sizes[: self.state] = self.sizes
         typical = np.where(guess != 0.0, np.maximum(np.abs(guess), np.abs(x[: len(guess)])), 0.0)
         first = np.maximum(typical, sizes[self.unknown_indices])
@@ -141,8 +141,8 @@ class Chain:
         if not stepper.interface.rotations or size - 1 not in self.unknown_indices:
             return np.zeros(0), np.zeros((0, len(x)))
         weight = GAUGE / min(float(part.deviations.min()) for part in self.parts)
-        values, rows = Reduction(stepper.interface).gauge(self.values(x)[:size], self.known[:size])
-        by_all = np.zeros((len(values), len(self.known)))
+        values, rows = Reduction(stepper.interface).gauge(self.values(x)[:size], self.prior[:size])
+        by_all = np.zeros((len(values), len(self.prior)))
         by_all[:, :size] = rows
         jacobian = np.zeros((len(values), len(x)))
         jacobian[:, : len(self.unknown_indices)] = by_all[:, self.unknown_indices]
@@ -170,7 +170,7 @@ class Chain:
         return computed, jacobian, end, partials_at_end
 
 
-def _node_states_from_measurements(whole: Measurements, parts: Sequence[Measurements], known: Array) -> Array:
+def _node_states_from_measurements(whole: Measurements, parts: Sequence[Measurements], prior: Array) -> Array:
     """Return (parts - 1, 2m) guesses of node states by parabolas through neighbouring measurements.
 
     Unless all coordinates are measured the guesses are from the trajectory of the initial guess.
@@ -178,21 +178,21 @@ def _node_states_from_measurements(whole: Measurements, parts: Sequence[Measurem
     m = whole.stepper.dimension
     order = [np.flatnonzero(whole.columns == k) for k in range(m)]
     if not all(len(each) for each in order):
-        return _node_states_from_guess(parts, known)
+        return _node_states_from_guess(parts, prior)
     states = []
     for part in parts[1:]:
-        values = parameters_at(whole.stepper.parameters, known[2 * m :], whole.inputs, part.start)
+        values = parameters_at(whole.stepper.parameters, prior[2 * m :], whole.inputs, part.start)
         parabolas = [_parabola(whole, int(each[0]), part.start) for each in order]
         q, v = np.array(parabolas).T
         states.append(np.concatenate([q, whole.stepper.momentum(q, v, part.start, values)]))
     return np.array(states).reshape(-1, 2 * m)
 
 
-def _node_states_from_guess(parts: Sequence[Measurements], known: Array) -> Array:
+def _node_states_from_guess(parts: Sequence[Measurements], prior: Array) -> Array:
     size = 2 * parts[0].stepper.dimension
-    state, states = known[:size], []
+    state, states = prior[:size], []
     for part in parts[:-1]:
-        state = part.motion(state, np.zeros((0, part.stepper._input_size)), known[size:])[2]
+        state = part.motion(state, np.zeros((0, part.stepper._input_size)), prior[size:])[2]
         states.append(state)
     return np.array(states).reshape(-1, size)
 
@@ -206,20 +206,20 @@ def _parabola(whole: Measurements, column: int, t: float) -> tuple[float, float]
     return float(coefficients[0]), float(np.append(coefficients, 0.0)[1])
 
 
-def chained(whole: Measurements, known: Array, unknown_indices: NDArray[np.intp], count: int) -> tuple[Chain, Array]:
+def chained(whole: Measurements, prior: Array, unknown_indices: NDArray[np.intp], count: int) -> tuple[Chain, Array]:
     """Return a chain of ``count`` segments, and an initial guess of all unknowns."""
     parts = whole.cut(count) if count > 1 else (whole,)
-    nodes = _node_states_from_measurements(whole, parts, known)
-    sizes = _sizes(parts, known, nodes)
-    return Chain(parts, known, unknown_indices, sizes), np.concatenate([known[unknown_indices], nodes.ravel()])
+    nodes = _node_states_from_measurements(whole, parts, prior)
+    sizes = _sizes(parts, prior, nodes)
+    return Chain(parts, prior, unknown_indices, sizes), np.concatenate([prior[unknown_indices], nodes.ravel()])
 
 
-def _sizes(parts: Sequence[Measurements], known: Array, nodes: Array) -> Array:
+def _sizes(parts: Sequence[Measurements], prior: Array, nodes: Array) -> Array:
     """Return (2m,) ranges of the state entries over the nodes; constant entries get the largest range of their kind."""
     size = nodes.shape[1]
-    states = np.concatenate([known[np.newaxis, :size], nodes])
+    states = np.concatenate([prior[np.newaxis, :size], nodes])
     if len(states) == 1:
-        end = parts[0].motion(known[:size], np.zeros((0, parts[0].stepper._input_size)), known[size:])[2]
+        end = parts[0].motion(prior[:size], np.zeros((0, parts[0].stepper._input_size)), prior[size:])[2]
         states = np.stack([states[0], end])
     kinds = np.ptp(states, axis=0).reshape(2, -1)
     largest = kinds.max(axis=1, keepdims=True)
@@ -262,18 +262,18 @@ def _bounded_update(
     low, high = limits
     update, at_bound = np.zeros(jacobian.shape[1]), np.zeros(jacobian.shape[1], dtype=bool)
     for _ in range(BOUNDED + 3 * int(np.isfinite(np.concatenate(limits)).sum())):
-        wanted, multipliers = update.copy(), np.zeros(len(residuals) - rows)
+        target, multipliers = update.copy(), np.zeros(len(residuals) - rows)
         rest = residuals + jacobian[:, at_bound] @ update[at_bound]
-        wanted[~at_bound], multipliers = _equality_constrained_update(jacobian[:, ~at_bound], rest, rows)
-        beyond, limit = (wanted < low) | (wanted > high), np.where(wanted < low, low, high)
+        target[~at_bound], multipliers = _equality_constrained_update(jacobian[:, ~at_bound], rest, rows)
+        beyond, limit = (target < low) | (target > high), np.where(target < low, low, high)
         if beyond.any():
             parts = np.full(len(update), np.inf)
-            parts[beyond] = (limit - update)[beyond] / (wanted - update)[beyond]
+            parts[beyond] = (limit - update)[beyond] / (target - update)[beyond]
             first = int(np.argmin(parts))
-            update = np.clip(update + parts[first] * (wanted - update), low, high)
+            update = np.clip(update + parts[first] * (target - update), low, high)
             update[first], at_bound[first] = limit[first], True
             continue
-        update = wanted
+        update = target
         predicted = residuals[:rows] + jacobian[:rows] @ update
         uphill = jacobian[:rows].T @ predicted - jacobian[rows:].T @ multipliers
         inward = np.where(at_bound, np.where(update <= low, -uphill, uphill), 0.0)

@@ -252,15 +252,15 @@ def different_paths(
     if revolutions is not None:
         tried += [{"revolutions": turns} for turns in range(-1 - revolutions, 1 + revolutions)]
     tried += [{"start": start} for start in islice(curves_at_random(line), starts)]
-    for choice in tried:
+    for start_arguments in tried:
         try:
-            found = stepper.path(q0, q1, T, **choice, **arguments)
+            path = stepper.path(q0, q1, T, **start_arguments, **arguments)
         except PathError as error:
             reason = reason or error
             continue
-        known = (np.abs(each.q - found.q).max() + abs(each.t[-1] - found.t[-1]) for each in paths)
-        if all(distance > SAME_PATH * size_for_updates(found.q, SAME_PATH) for distance in known):
-            paths.append(found)
+        distances = (np.abs(each.q - path.q).max() + abs(each.t[-1] - path.t[-1]) for each in paths)
+        if all(distance > SAME_PATH * size_for_updates(path.q, SAME_PATH) for distance in distances):
+            paths.append(path)
     if not paths:
         raise PathError(
             f"{reason} ({len(tried) - 1} further starts were tried)" if tried[1:] else str(reason)
@@ -307,10 +307,10 @@ def _first_motion(attempts: Sequence[Attempt]) -> tuple[solver.Solution, Discret
     reasons, dropped = [], 0
     for attempt in attempts:
         try:
-            found = attempt()
-            comparison = discretisation_of(found)
+            solution = attempt()
+            comparison = discretisation_of(solution)
             if comparison.is_motion:
-                return found, comparison, dropped
+                return solution, comparison, dropped
             dropped += 1
         except solver.UNSOLVED as error:
             reasons.append(str(error))
@@ -379,9 +379,9 @@ def _warn_at_rest(path: Path, duration: float) -> None:
         )
 
 
-def _checked(found: solver.Solution) -> Discretisation:
+def _checked(solution: solver.Solution) -> Discretisation:
     """Return the discretisation error of a stationary point; raise PathError if it is no motion."""
-    comparison = discretisation_of(found)
+    comparison = discretisation_of(solution)
     if not comparison.is_motion:
         raise PathError(
             "the stationary point of the discrete action that was found is no motion of the system: finer steps leave "
@@ -399,7 +399,7 @@ def _from(intervals: Intervals, start: Array) -> solver.Solution:
 
 def _described(
     stepper: Any,
-    found: solver.Solution,
+    solution: solver.Solution,
     begin: float,
     arguments: Mapping[str, Any],
     comparison: Discretisation,
@@ -407,13 +407,13 @@ def _described(
     M: Array | None = None,
     dropped: int = 0,
 ) -> Path:
-    at, intervals, forced = found.at, found.intervals, bool(stepper.interface.exchange_names)
+    at, intervals, forced = solution.at, solution.intervals, bool(stepper.interface.exchange_names)
     count = len(intervals.h)
     t = begin + intervals.h[0] * np.arange(count + 1)
     zero_modes, repetitions = 0, 1
     if M is not None:
         repetitions = _order(M)
-        zero_modes = 0 if forced else int((~found.factors.kept).sum())
+        zero_modes = 0 if forced else int((~solution.factors.kept).sum())
     if comparison.error > TOLERABLE_ERROR and warnings_wanted():
         warn(
             f"the discretisation error of the path is about {comparison.error:.1e} (relative): take more steps than "
@@ -423,19 +423,19 @@ def _described(
     jumps = at.residual if M is None else at.p1[:-1] - at.p0[1:]
     return Path(
         t=t,
-        q=stepper.named(found.q),
-        p=stepper.named(found.momenta),
+        q=stepper.named(solution.q),
+        p=stepper.named(solution.momenta),
         action=float(np.sum(at.actions)),
         error=comparison.error,
         energy_change=comparison.energy_change,
         dropped=dropped,
-        residual=float(np.abs(jumps).max(initial=0.0)) / (found.size.momentum or 1.0),
-        iterations=found.iterations,
+        residual=float(np.abs(jumps).max(initial=0.0)) / (solution.size.momentum or 1.0),
+        iterations=solution.iterations,
         stepper=stepper,
         repetitions=repetitions,
         zero_modes=zero_modes,
         arguments=arguments,
-        solution=found,
+        solution=solution,
     )
 
 
@@ -447,11 +447,11 @@ def _parameters_of_steps(stepper: Any, parameters: Parameters, inputs: Mapping[s
     if inputs is None:
         check_inputs_given(stepper.interface, parameters)
         return np.ascontiguousarray(stepper._parameters(parameters))
-    known = checked_inputs(stepper.interface, inputs)
+    functions = checked_inputs(stepper.interface, inputs)
     values = np.tile(stepper._parameters(parameters), (len(times), 1))
     columns = columns_of_inputs(stepper.interface)
     for k, time in enumerate(times.tolist()):
-        values[k, columns] = np.concatenate([known[name].parameters(time) for name in stepper.interface.inputs])
+        values[k, columns] = np.concatenate([functions[name].parameters(time) for name in stepper.interface.inputs])
     return values
 
 

@@ -31,7 +31,7 @@ def check_solver_of_arrays(
     system: ArraySystem,
     method: Method,
     solver: str,
-    chosen: Splitting | ConstrainedSteps | FixedPointIteration | None,
+    resolved: Splitting | ConstrainedSteps | FixedPointIteration | None,
     loops: RolledTerms,
 ) -> None:
     """Raise :class:`MethodError` for a method and a solver that are not available for an array system.
@@ -39,12 +39,12 @@ def check_solver_of_arrays(
     Raises:
         SizesRequiredError: if they are available for known sizes.
     """
-    if isinstance(chosen, Splitting) and system.velocities:
+    if isinstance(resolved, Splitting) and system.velocities:
         raise MethodError(
             f"{method.name} does not support velocity-dependent forces of array systems: use an SVI or a "
             "Runge-Kutta method"
         )
-    iterated = isinstance(chosen, FixedPointIteration) and chosen.name in ("separable", "Hamiltonian")
+    iterated = isinstance(resolved, FixedPointIteration) and resolved.name in ("separable", "Hamiltonian")
     if solver == "newton" and (system.neighbours or not (loops.shifts and iterated)):
         raise SizesRequiredError(
             "Newton's method for array systems requires forces that are not constant, no constraints, no lists of "
@@ -52,7 +52,7 @@ def check_solver_of_arrays(
             "forces of velocities one with the same table for positions and momenta, as SVI and Gauss): leave out "
             "solver='newton'"
         )
-    if not (iterated or isinstance(chosen, Splitting | ConstrainedSteps)):
+    if not (iterated or isinstance(resolved, Splitting | ConstrainedSteps)):
         explicit = "" if system.momenta else ", Stoermer-Verlet or a composition"
         raise SizesRequiredError(
             f"{method.name} is not supported for array systems: use an SVI, a Runge-Kutta method of at "

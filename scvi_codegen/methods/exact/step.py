@@ -53,7 +53,7 @@ class SolvedStep:
 
 
 @dataclass(frozen=True, slots=True)
-class _Known:
+class _Start:
     q: Numbers
     p: Numbers
     h: Number
@@ -93,10 +93,10 @@ class DerivedStep:
         result.motion = self.motion.with_parameters(parameters)
         return result
 
-    def _known(self, q: Any, p: Any, h: Any, t: Any) -> _Known:
+    def _start_of(self, q: Any, p: Any, h: Any, t: Any) -> _Start:
         """Return the initial state of a step, with doubles converted exactly."""
         q, p, h, t = numbers(q), numbers(p), mp.mpf(h), mp.mpf(t)
-        return _Known(q, p, h, t, self.motion.momenta(q, p, t))
+        return _Start(q, p, h, t, self.motion.momenta(q, p, t))
 
     @property
     def unknowns(self) -> int:
@@ -105,8 +105,8 @@ class DerivedStep:
 
     def seconds(self, q: Any, p: Any, h: Any, t: Any = 0) -> float:
         """Estimate the time of solving a step from that of evaluating its equations."""
-        known, began = self._known(q, p, h, t), time.perf_counter()
-        self._rows(self._straight(known), known)
+        start, began = self._start_of(q, p, h, t), time.perf_counter()
+        self._rows(self._straight(start), start)
         return EVALUATIONS * (time.perf_counter() - began)
 
     def __call__(self, q: Any, p: Any, h: Any, t: Any = 0) -> SolvedStep:
@@ -115,35 +115,35 @@ class DerivedStep:
         Raises:
             StateError: if Newton's iteration does not converge.
         """
-        known = self._known(q, p, h, t)
+        start = self._start_of(q, p, h, t)
 
         def linearised(z: Numbers) -> Solve:
-            inverse = self._inverse(self._matrix(z, known, float), known)
+            inverse = self._inverse(self._matrix(z, start, float), start)
             return lambda rows: inverse @ rows
 
         try:
             z = newton(
-                lambda z: self._rows(z, known)[: self.unknowns], linearised, self._straight(known), DIGITS, stale=STEADY
+                lambda z: self._rows(z, start)[: self.unknowns], linearised, self._straight(start), DIGITS, stale=STEADY
             )
-            return self._end(z, self._rows(z, known), known)
+            return self._end(z, self._rows(z, start), start)
         except NotConvergedError as failure:
-            where = f"with h = {mp.nstr(known.h, 6)}"
+            where = f"with h = {mp.nstr(start.h, 6)}"
             raise StateError(f"Newton's iteration for the derived equations failed {where}: {failure}") from failure
         except ArithmeticError as failure:
             leaves = "an iterate of the derived equations is outside the domain of the formula"
-            raise StateError(f"{leaves} with h = {mp.nstr(known.h, 6)}") from failure
+            raise StateError(f"{leaves} with h = {mp.nstr(start.h, 6)}") from failure
 
     def first_update(self, q: Any, p: Any, h: Any, t: Any = 0) -> SolvedStep:
         """Return the result of one Newton update from the straight line, with the matrix from finite differences."""
-        known = self._known(q, p, h, t)
-        z = self._straight(known)
-        matrix, rows = self._matrix(z, known, mp.mpf), self._rows(z, known)[: self.unknowns]
-        inverse = self._inverse(matrix, known)
+        start = self._start_of(q, p, h, t)
+        z = self._straight(start)
+        matrix, rows = self._matrix(z, start, mp.mpf), self._rows(z, start)[: self.unknowns]
+        inverse = self._inverse(matrix, start)
         update = inverse @ rows
         for _ in range(REFINEMENTS):
             update = update + inverse @ (rows - matrix @ update)
         z = z - update
-        return self._end(z, self._rows(z, known), known)
+        return self._end(z, self._rows(z, start), start)
 
     def duration(self, solved: SolvedStep, q: Any, p: Any, h: Any) -> Number:
         """Return the physical time of a step: the integral of dt/dtau along its curve by the method's quadrature.
@@ -154,13 +154,13 @@ class DerivedStep:
         shape = self.stages.shape
         if self.rate is None or not isinstance(shape, Velocities):
             raise StateError(f"'{self.system.name}' has no time transformation")
-        known = self._known(q, p, h, 0)
+        start = self._start_of(q, p, h, 0)
         group, z = self.stages.stage_groups[0], np.array(solved.unknowns, dtype=object)
         rates = [
-            self.rate(self._point(group, n, arguments, known))[0]
-            for n, arguments in enumerate(self._arguments(0, z, known))
+            self.rate(self._point(group, n, arguments, start))[0]
+            for n, arguments in enumerate(self._arguments(0, z, start))
         ]
-        return known.h * mp.fdot(shape.weights, rates)
+        return start.h * mp.fdot(shape.weights, rates)
 
     def action_gradient(self, solved: SolvedStep, q: Any, p: Any, h: Any, t: Any = 0) -> tuple[Numbers, Numbers] | None:
         """Return the (m,) and (unknowns,) central differences of the generating function by q0 and the unknowns.
@@ -169,11 +169,11 @@ class DerivedStep:
         """
         if None in self.scalars:
             return None
-        known = self._known(q, p, h, t)
-        joined, m = np.array([*known.q, *solved.unknowns], dtype=object), self.system.dimension
+        start = self._start_of(q, p, h, t)
+        joined, m = np.array([*start.q, *solved.unknowns], dtype=object), self.system.dimension
 
         def action(values: Numbers) -> Number:
-            return self._action(values[m:], replace(known, q=values[:m]))
+            return self._action(values[m:], replace(start, q=values[:m]))
 
         derivatives = np.empty_like(joined)
         for k in range(len(joined)):
@@ -186,18 +186,18 @@ class DerivedStep:
             derivatives[k] = (ends[0] - ends[1]) / (2 * width)
         return derivatives[:m], derivatives[m:]
 
-    def _action(self, z: Numbers, known: _Known) -> Number:
+    def _action(self, z: Numbers, start: _Start) -> Number:
         total = mp.zero
         for f, group in enumerate(self.stages.stage_groups):
-            arguments = self._arguments(f, z, known)
+            arguments = self._arguments(f, z, start)
             scale = mp.mpf(group.scatters[0].scale.numerator) / group.scatters[0].scale.denominator
             scale /= mp.mpf(group.gathers[0].scale.numerator) / group.gathers[0].scale.denominator
             for n, weight in enumerate(group.weights):
                 scalar = self.scalars[f]
                 assert scalar is not None  # checked above
-                (value,) = scalar(self._point(group, n, arguments[n], known))
-                grown = self._damping_factor(group.abscissae[n], known)
-                total += self._row_scale(f, n) * scale * weight * grown * known.h ** (1 + group.scalar_power) * value
+                (value,) = scalar(self._point(group, n, arguments[n], start))
+                grown = self._damping_factor(group.abscissae[n], start)
+                total += self._row_scale(f, n) * scale * weight * grown * start.h ** (1 + group.scalar_power) * value
         return total
 
     def _row_scale(self, f: int, n: int) -> Number:
@@ -211,94 +211,94 @@ class DerivedStep:
             return mp.one
         return numbers(self.stages.end_position.entries[0])[row + 1] / self.momenta[row]
 
-    def _straight(self, known: _Known) -> Numbers:
+    def _straight(self, start: _Start) -> Numbers:
         """Return the (unknowns,) initial guess: straight line with the initial velocity, 0 for other block sizes."""
-        v = self.motion.velocity(known.q, known.p, known.t)
-        return np.concatenate(straight(self.stages, known.q, v, known.p, known.h, mp.mpf))
+        v = self.motion.velocity(start.q, start.p, start.t)
+        return np.concatenate(straight(self.stages, start.q, v, start.p, start.h, mp.mpf))
 
-    def _arguments(self, f: int, z: Numbers, known: _Known) -> Numbers:
+    def _arguments(self, f: int, z: Numbers, start: _Start) -> Numbers:
         """Return the (points, arguments) of the kernel of a stage group."""
         parts = []
         for gather, table in zip(self.stages.stage_groups[f].gathers, self.gathers[f], strict=True):
-            factor = mp.mpf(gather.scale.numerator) / gather.scale.denominator * known.h**gather.power
-            parts.append(np.array([self._gathered(line, len(gather.arguments), z, known) * factor for line in table]))
+            factor = mp.mpf(gather.scale.numerator) / gather.scale.denominator * start.h**gather.power
+            parts.append(np.array([self._gathered(line, len(gather.arguments), z, start) * factor for line in table]))
         return np.concatenate(parts, axis=1)
 
-    def _gathered(self, line: Numbers, size: int, z: Numbers, known: _Known) -> Numbers:
+    def _gathered(self, line: Numbers, size: int, z: Numbers, start: _Start) -> Numbers:
         """Return the (size,) sum of q0 and the blocks with the coefficients of a table row."""
-        total = known.q * line[0] if line[0] else numbers([0] * size)
+        total = start.q * line[0] if line[0] else numbers([0] * size)
         for b in np.flatnonzero(line[1:]):
-            total = total + z[self.blocks[b]] * (line[b + 1] * known.h ** self.stages.blocks[b].power)
+            total = total + z[self.blocks[b]] * (line[b + 1] * start.h ** self.stages.blocks[b].power)
         return total
 
-    def _point(self, group: StageGroup, n: int, arguments: Numbers, known: _Known) -> list[Number]:
-        time, middle = (known.t + c * known.h for c in (group.abscissae[n], mp.mpf("0.5")))
+    def _point(self, group: StageGroup, n: int, arguments: Numbers, start: _Start) -> list[Number]:
+        time, middle = (start.t + c * start.h for c in (group.abscissae[n], mp.mpf("0.5")))
         return [*arguments, time, *self.motion.parameters, middle]
 
-    def _kernel(self, f: int, n: int, arguments: Numbers, known: _Known) -> Numbers:
-        return np.array(self.kernels[f](self._point(self.stages.stage_groups[f], n, arguments, known)), dtype=object)
+    def _kernel(self, f: int, n: int, arguments: Numbers, start: _Start) -> Numbers:
+        return np.array(self.kernels[f](self._point(self.stages.stage_groups[f], n, arguments, start)), dtype=object)
 
-    def _factor(self, group: StageGroup, s: int, n: int, r: Any, known: _Known) -> Number:
+    def _factor(self, group: StageGroup, s: int, n: int, r: Any, start: _Start) -> Number:
         scatter = group.scatters[s]
         scale = mp.mpf(scatter.scale.numerator) / scatter.scale.denominator
-        grown = self._damping_factor(group.abscissae[n], known)
-        return scale * group.weights[n] * grown * known.h ** (scatter.power + self.powers[r])
+        grown = self._damping_factor(group.abscissae[n], start)
+        return scale * group.weights[n] * grown * start.h ** (scatter.power + self.powers[r])
 
-    def _damping_factor(self, c: Number, known: _Known) -> Number:
+    def _damping_factor(self, c: Number, start: _Start) -> Number:
         """Return the factor e^(gamma c h) of a weight at the point c of the step, where gamma is the damping rate."""
         (rate,) = self.damping(self.motion.parameters)
-        return mp.exp(rate * c * known.h)
+        return mp.exp(rate * c * start.h)
 
-    def _rows(self, z: Numbers, known: _Known) -> Numbers:
+    def _rows(self, z: Numbers, start: _Start) -> Numbers:
         """Return the residuals of the equations, followed by p1."""
         m = self.system.dimension
-        starts = [
-            known.momenta * x if row.stop - row.start == m else numbers([0] * (row.stop - row.start))
+        first_terms = [
+            start.momenta * x if row.stop - row.start == m else numbers([0] * (row.stop - row.start))
             for row, x in zip(self.rows, self.momenta, strict=True)
         ]
-        rows = np.concatenate(starts)
+        rows = np.concatenate(first_terms)
         for f, group in enumerate(self.stages.stage_groups):
-            arguments = self._arguments(f, z, known)
+            arguments = self._arguments(f, z, start)
             for n in range(len(group.abscissae)):
-                values = self._kernel(f, n, arguments[n], known)
+                values = self._kernel(f, n, arguments[n], start)
                 for s, (table, results) in enumerate(zip(self.scatters[f], self.results[f], strict=True)):
                     for r in np.flatnonzero(table[n]):
-                        rows[self.rows[r]] += values[results] * (self._factor(group, s, n, r, known) * table[n, r])
+                        rows[self.rows[r]] += values[results] * (self._factor(group, s, n, r, start) * table[n, r])
         return rows
 
-    def _matrix(self, z: Numbers, known: _Known, number: Callable[[Number], Any]) -> Numbers:
+    def _matrix(self, z: Numbers, start: _Start, number: Callable[[Number], Any]) -> Numbers:
         """Return the derivatives of the rows with respect to the unknowns; those of the kernels by differences.
 
         ``number``: ``float``, which suffices for Newton's iteration, or ``mp.mpf``.
         """
         kind: Any = float if number is float else object
         matrix: Numbers = np.zeros((self.unknowns, self.unknowns), dtype=kind)
-        powers = [known.h**block.power for block in self.stages.blocks]
+        powers = [start.h**block.power for block in self.stages.blocks]
         for f, group in enumerate(self.stages.stage_groups):
-            arguments = self._arguments(f, z, known)
+            arguments = self._arguments(f, z, start)
             for n in range(len(group.abscissae)):
-                derivatives: Numbers = self._kernel_jacobian(f, n, arguments[n], known).astype(kind)
+                derivatives: Numbers = self._kernel_jacobian(f, n, arguments[n], start).astype(kind)
                 for s, rows in enumerate(self.scatters[f]):
                     for g, gather in enumerate(group.gathers):
                         derivative = derivatives[self.results[f][s], self.arguments[f][g]]
-                        moved = mp.mpf(gather.scale.numerator) / gather.scale.denominator * known.h**gather.power
+                        moved = mp.mpf(gather.scale.numerator) / gather.scale.denominator * start.h**gather.power
                         for r in np.flatnonzero(rows[n, :-1]):
-                            factor = self._factor(group, s, n, r, known) * rows[n, r] * moved
+                            factor = self._factor(group, s, n, r, start) * rows[n, r] * moved
                             for b in np.flatnonzero(self.gathers[f][g][n, 1:]):
                                 entry = factor * self.gathers[f][g][n, b + 1] * powers[b]
                                 matrix[self.rows[r], self.blocks[b]] += derivative * number(entry)
         return matrix
 
-    def _kernel_jacobian(self, f: int, n: int, arguments: Numbers, known: _Known) -> Numbers:
-        values = self._kernel(f, n, arguments, known)
+    def _kernel_jacobian(self, f: int, n: int, arguments: Numbers, start: _Start) -> Numbers:
+        values = self._kernel(f, n, arguments, start)
         derivatives = numbers(np.zeros((len(values), len(arguments))))
         for i in range(len(arguments)):
             moved, width = arguments.copy(), WIDTH * max(1, abs(arguments[i]))
             moved[i] += width
-            derivatives[:, i] = (self._kernel(f, n, moved, known) - values) / width
+            derivatives[:, i] = (self._kernel(f, n, moved, start) - values) / width
         return derivatives
 
-    def _inverse(self, exact: Numbers, known: _Known) -> Numbers:
+    def _inverse(self, exact: Numbers, start: _Start) -> Numbers:
         """Return the inverse in double precision, with rows and columns scaled to size 1; later updates correct it."""
         rows = np.array([1 / (max(map(abs, line)) or mp.one) for line in exact], dtype=object)
         exact = rows[:, None] * exact
@@ -306,14 +306,14 @@ class DerivedStep:
         try:
             inverse = np.linalg.inv((exact * columns).astype(float)).astype(object)
         except np.linalg.LinAlgError as error:
-            raise StateError(f"the derived equations are singular with h = {float(known.h):g}") from error
+            raise StateError(f"the derived equations are singular with h = {float(start.h):g}") from error
         result: Numbers = columns[:, None] * inverse * rows
         return result
 
-    def _end(self, z: Numbers, rows: Numbers, known: _Known) -> SolvedStep:
-        q = self._gathered(numbers(self.stages.end_position.entries[0]), self.system.dimension, z, known)
-        momenta = rows[self.rows[-1]] / self._damping_factor(mp.one, known)
-        p = self.motion.variables(q, momenta, known.t + known.h, known.p)
+    def _end(self, z: Numbers, rows: Numbers, start: _Start) -> SolvedStep:
+        q = self._gathered(numbers(self.stages.end_position.entries[0]), self.system.dimension, z, start)
+        momenta = rows[self.rows[-1]] / self._damping_factor(mp.one, start)
+        p = self.motion.variables(q, momenta, start.t + start.h, start.p)
         return SolvedStep(unknowns=tuple(z), q=tuple(q), p=tuple(p), momenta=tuple(momenta))
 
 

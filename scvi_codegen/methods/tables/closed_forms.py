@@ -61,8 +61,8 @@ def rational_or_quadratic(value: Number) -> Any:
 
 def exact_numbers(values: Vector) -> Expressions | None:
     """Return the exact form of every number, or None at the first that has none."""
-    found = tuple(takewhile(lambda exact: exact is not None, map(exact_number, values)))
-    return found if len(found) == len(values) else None
+    root = tuple(takewhile(lambda exact: exact is not None, map(exact_number, values)))
+    return root if len(root) == len(values) else None
 
 
 def exact_points(nodes: Nodes) -> Expressions | None:

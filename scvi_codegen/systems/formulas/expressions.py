@@ -95,8 +95,8 @@ class unit_step(Function):  # type: ignore[misc]  # noqa: N801
 
 def kinks_of(expressions: Iterable[Expr]) -> set[Expr]:
     """Return functions at whose zeros expressions may jump or have a kink: x of unit_step(x), cos(pi x) of rint(x)."""
-    found = {f for e in expressions for f in (e, *(each.definition for each in intermediates(e)))}
-    jumps = {part for part in parts(*found) if isinstance(part, unit_step | rint)}
+    formulas = {f for e in expressions for f in (e, *(each.definition for each in intermediates(e)))}
+    jumps = {part for part in parts(*formulas) if isinstance(part, unit_step | rint)}
     return {each.args[0] if isinstance(each, unit_step) else sympy.cos(sympy.pi * each.args[0]) for each in jumps}
 
 
@@ -200,8 +200,8 @@ class Tape:
             self._steps.append((len(self._start), operation, operands))
             self._start.append(mp.zero)
         else:
-            known = CONSTANT_VALUES.get(expression)
-            self._start.append(mp.mpf(int(expression.p)) / int(expression.q) if known is None else known)
+            constant = CONSTANT_VALUES.get(expression)
+            self._start.append(mp.mpf(int(expression.p)) / int(expression.q) if constant is None else constant)
         self._places[expression] = len(self._start) - 1
         return self._places[expression]
 
@@ -384,19 +384,19 @@ def evaluated(expression: Expr, replacements: Mapping[Expr, Expr] | None = None)
     return expression
 
 
-def _rebuilt(expression: Expr, known: dict[Expr, Expr]) -> Expr:
-    if expression not in known:
-        known[expression] = _rebuilt_node(expression, known)
-    return known[expression]
+def _rebuilt(expression: Expr, replacements: dict[Expr, Expr]) -> Expr:
+    if expression not in replacements:
+        replacements[expression] = _rebuilt_node(expression, replacements)
+    return replacements[expression]
 
 
-def _rebuilt_node(expression: Expr, known: dict[Expr, Expr]) -> Expr:
+def _rebuilt_node(expression: Expr, replacements: dict[Expr, Expr]) -> Expr:
     if expression.is_Float:
         value = float(expression)
         return Rational(repr(value) if expression == value else str(expression))
     if not expression.args or isinstance(expression, (sympy.Derivative, AppliedUndef)):
         return expression
-    arguments = [_rebuilt(argument, known) for argument in expression.args]
+    arguments = [_rebuilt(argument, replacements) for argument in expression.args]
     if isinstance(expression, Intermediate):
         return intermediate(arguments[0])
     rebuilt = expression.func(*arguments)
@@ -462,7 +462,7 @@ class _Accumulation:
 
     def __init__(self, variables: Sequence[Symbol]) -> None:
         self.variables = frozenset(variables)
-        self.known: dict[Expr, Gradient] = {variable: {index: S.One} for index, variable in enumerate(variables)}
+        self.gradients: dict[Expr, Gradient] = {variable: {index: S.One} for index, variable in enumerate(variables)}
         self.jacobians: dict[tuple[tuple[Expr, ...], bool], dict[tuple[int, int], Expr]] = {}
 
     def total(self, expression: Expr) -> dict[int, Expr]:
@@ -482,10 +482,10 @@ class _Accumulation:
 
     def of(self, node: Expr) -> Gradient:
         if not node.args:
-            return self.known.get(node, {})
-        derivative = self.known.get(node)
+            return self.gradients.get(node, {})
+        derivative = self.gradients.get(node)
         if derivative is None:
-            derivative = self.known[node] = self.derived(node)
+            derivative = self.gradients[node] = self.derived(node)
         return derivative
 
     def derived(self, node: Expr) -> Gradient:

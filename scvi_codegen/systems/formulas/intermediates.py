@@ -41,14 +41,14 @@ class Intermediate(Expr):  # type: ignore[misc]  # SymPy is untyped
 
     def __new__(cls, definition: Expr) -> Intermediate:
         """Return the quantity with this definition."""
-        known = _KNOWN.get(definition)
-        if known is None:
-            known = Expr.__new__(cls, definition)
-            known.number = next(_NUMBERS)
-            known.inner = inner_of(definition)
-            known._free = frozenset(definition.free_symbols)
-            _KNOWN[definition] = known
-        return known
+        quantity = _KNOWN.get(definition)
+        if quantity is None:
+            quantity = Expr.__new__(cls, definition)
+            quantity.number = next(_NUMBERS)
+            quantity.inner = inner_of(definition)
+            quantity._free = frozenset(definition.free_symbols)
+            _KNOWN[definition] = quantity
+        return quantity
 
     @property
     def definition(self) -> Expr:
@@ -114,13 +114,13 @@ def separated(expressions: Sequence[Expr], variables: Collection[Symbol]) -> tup
     The parts are the largest ones that do not depend on the variables, and are no numbers: values that need not be
     computed again when only the variables change.
     """
-    known: dict[Expr, Expr] = {}
+    rebuilt: dict[Expr, Expr] = {}
     parts: dict[Expr, Symbol] = {}
 
     def read(node: Expr) -> Expr:
-        if node not in known:
-            known[node] = written(node)
-        return known[node]
+        if node not in rebuilt:
+            rebuilt[node] = written(node)
+        return rebuilt[node]
 
     def written(node: Expr) -> Expr:
         if node in variables:

@@ -18,32 +18,32 @@ MAX_ELEMENTS = 5_000_000
 """Maximum number of elements of the loops of a term that are evaluated at once."""
 
 
-def array_value(expression: Expr, known: dict[Expr, Any]) -> Any:
-    """Return the values of an expression, with the broadcast shape of the arrays in ``known``; NaN where undefined.
+def array_value(expression: Expr, values: dict[Expr, Any]) -> Any:
+    """Return the values of an expression, with the broadcast shape of the arrays in ``values``; NaN where undefined.
 
     Args:
         expression: an expression.
-        known: a number or an array for each symbol; values of subexpressions are added.
+        values: a number or an array for each symbol; values of subexpressions are added.
 
     >>> x = Symbol("x", real=True)
     >>> array_value(x**2 + 1, {x: np.arange(3.0)}).tolist()
     [1.0, 2.0, 5.0]
     """
     for each in intermediates(expression):
-        _known_value(each, known)
-    return _known_value(expression, known)
+        _value_in(each, values)
+    return _value_in(expression, values)
 
 
-def _known_value(expression: Expr, known: dict[Expr, Any]) -> Any:
-    if expression not in known:
-        known[expression] = _node_value(expression, known)
-    return known[expression]
+def _value_in(expression: Expr, values: dict[Expr, Any]) -> Any:
+    if expression not in values:
+        values[expression] = _node_value(expression, values)
+    return values[expression]
 
 
-def _node_value(expression: Any, known: dict[Expr, Any]) -> Any:
+def _node_value(expression: Any, values: dict[Expr, Any]) -> Any:
     if not expression.args:
         return float(expression) if not expression.is_Rational or abs(expression) < LARGEST else np.nan
-    arguments = [_known_value(argument, known) for argument in expression.args]
+    arguments = [_value_in(argument, values) for argument in expression.args]
     if isinstance(expression, Intermediate):
         return arguments[0]
     if expression.is_Add:
@@ -125,9 +125,9 @@ class Elements:
             arrays: arrays by name.
             numbers: values by symbol.
         """
-        known: dict[Expr, Any] = {
+        entries_by_slot: dict[Expr, Any] = {
             slot: convolved(arrays[access.array.name], access, arrays)[self.of(access)] for slot, access in slots
         }
-        entries = array_value(formula, {**known, **numbers})
+        entries = array_value(formula, {**entries_by_slot, **numbers})
         count = next((len(values) for values in self.index.values()), 1)
         return np.broadcast_to(entries, (count,)) if self.index else entries

@@ -96,8 +96,8 @@ def conserved(
     spaces = [space for space in computed if space is not None and space.shape == (len(rows), len(support))]
     if len(spaces) < len(computed):
         return []
-    known = search.with_values(factors)
-    recognised = [_recognised_row(np.array(spaces)[:, k], support, known, fractions) for k in range(len(rows))]
+    factor_values = search.with_values(factors)
+    recognised = [_recognised_row(np.array(spaces)[:, k], support, factor_values, fractions) for k in range(len(rows))]
     return [
         {c: coefficient.xreplace(motion.numbers) for c, coefficient in row.items()}
         for row in recognised
@@ -116,35 +116,35 @@ class _Search:
     def __init__(self, motion: Rates, columns: Sequence[Column]) -> None:
         self.motion, self.columns = motion, columns
         self.partials: dict[int, dict[int, Expr]] = {}
-        self.drawn: dict[Symbol, Array] = {}
+        self.parameters_at: dict[Symbol, Array] = {}
 
-    def null_spaces(self, chosen: Sequence[int], count: int) -> list[Array | None]:
+    def null_spaces(self, selected: Sequence[int], count: int) -> list[Array | None]:
         """Return null spaces of the chosen columns for ``count`` values of the parameters, of shape (d, columns) each.
 
         ``None`` where the system is undefined at too many points. Parameters have the signs of their default values and
         are of size 1, or are near the default values where the system is undefined there.
         """
         for near in (False, True):
-            self.drawn = drawn_parameters(self.motion.constants, count, near=near)
-            together = max(1, AT_ONCE // (2 * (len(chosen) + MORE_POINTS)))
+            self.parameters_at = drawn_parameters(self.motion.constants, count, near=near)
+            together = max(1, AT_ONCE // (2 * (len(selected) + MORE_POINTS)))
             spaces = [
                 space
                 for first in range(0, count, together)
-                for space in self._null_spaces(chosen, slice(first, first + together))
+                for space in self._null_spaces(selected, slice(first, first + together))
             ]
             if all(space is not None for space in spaces):
                 break
         return spaces
 
-    def _null_spaces(self, chosen: Sequence[int], part: slice) -> Iterator[Array | None]:
+    def _null_spaces(self, selected: Sequence[int], part: slice) -> Iterator[Array | None]:
         """Yield null spaces for a part of the drawn parameter values."""
-        size = len(chosen) + MORE_POINTS
+        size = len(selected) + MORE_POINTS
         points = 2 * size  # more than needed, since the system may be undefined at some of them
-        parameters = {parameter: np.repeat(values[part], points) for parameter, values in self.drawn.items()}
+        parameters = {parameter: np.repeat(values[part], points) for parameter, values in self.parameters_at.items()}
         count = max([len(values) // points for values in parameters.values()], default=1)
         with np.errstate(all="ignore"):
             sample = self.motion.arrays(parameters, count * points)
-            terms = [self.terms(c, sample) for c in chosen]
+            terms = [self.terms(c, sample) for c in selected]
             rates = np.array([np.sum(summands, axis=0) for summands in terms]).T
             sizes = np.array([np.abs(summands).max(axis=0) for summands in terms]).T
         for own_rates, own_sizes in zip(np.split(rates, count), np.split(sizes, count), strict=True):
@@ -167,9 +167,9 @@ class _Search:
 
     def with_values(self, factors: Sequence[Expr]) -> list[tuple[Expr, Array]]:
         """Return factors with their values at the drawn parameters, without those that are 0 or undefined there."""
-        known: dict[Any, Any] = dict(self.drawn)
+        at_parameters: dict[Any, Any] = dict(self.parameters_at)
         with np.errstate(all="ignore"):
-            evaluated = [(factor, np.asarray(array_value(factor, known), dtype=float)) for factor in factors]
+            evaluated = [(factor, np.asarray(array_value(factor, at_parameters), dtype=float)) for factor in factors]
         return [(factor, values) for factor, values in evaluated if np.isfinite(values).all() and values.all()]
 
     def verified(self, row: Mapping[int, Expr]) -> bool:
@@ -458,14 +458,14 @@ def independent(candidates: Sequence[Terms], first: Sequence[Terms] = (), trivia
 
     ``candidates`` and ``first`` span the products that they have; ``first``, unless empty, has all linear ones.
     """
-    chosen = list(first) or [terms for terms in candidates if _is_linear(terms)]
-    linear = [terms for terms in chosen if _is_linear(terms)]
-    known = [*chosen, *(_product(a, b) for a, b in combinations_with_replacement(linear, 2)), *trivial]
-    rank = _rank(known)
+    basis = list(first) or [terms for terms in candidates if _is_linear(terms)]
+    linear = [terms for terms in basis if _is_linear(terms)]
+    spanned = [*basis, *(_product(a, b) for a, b in combinations_with_replacement(linear, 2)), *trivial]
+    rank = _rank(spanned)
     for terms in sorted((terms for terms in candidates if not _is_linear(terms)), key=len):
-        if _rank([*known, terms]) > rank:
-            chosen, known, rank = [*chosen, terms], [*known, terms], rank + 1
-    return chosen
+        if _rank([*spanned, terms]) > rank:
+            basis, spanned, rank = [*basis, terms], [*spanned, terms], rank + 1
+    return basis
 
 
 def _is_linear(terms: Terms) -> bool:
@@ -474,8 +474,8 @@ def _is_linear(terms: Terms) -> bool:
 
 def _product(a: Terms, b: Terms) -> Terms:
     product: dict[Monomial, Expr] = {}
-    for (one, x), (other, y) in itertools.product(a.items(), b.items()):
-        both = Monomial(one.power + other.power, tuple(sorted(one.factors + other.factors)))
+    for (left, x), (right, y) in itertools.product(a.items(), b.items()):
+        both = Monomial(left.power + right.power, tuple(sorted(left.factors + right.factors)))
         product[both] = product.get(both, sympy.S.Zero) + x * y
     return product
 
@@ -515,10 +515,10 @@ def name_of(system: MechanicalSystem, terms: Terms) -> tuple[str, Expr | int]:
 
 def _rotation_name(system: MechanicalSystem, terms: Terms) -> tuple[str, Expr] | None:
     """Return the name of an angular momentum of all or one of the rotations and bodies, and the factor for it."""
-    for name, known in {**total_angular_momentum(system), **rotation_columns(system)}.items():
-        first, value = next(iter(known.items()))
+    for name, named_terms in {**total_angular_momentum(system), **rotation_columns(system)}.items():
+        first, value = next(iter(named_terms.items()))
         factor = terms.get(first, sympy.S.Zero) / value
-        if factor != 0 and terms == {monomial: factor * x for monomial, x in known.items()}:
+        if factor != 0 and terms == {monomial: factor * x for monomial, x in named_terms.items()}:
             return name, 1 / factor
     return None
 

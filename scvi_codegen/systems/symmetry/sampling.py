@@ -80,47 +80,47 @@ FEW = 12
 def terms_among_few_bodies(term_groups: Sequence[TermGroup], bodies: Sequence[Body]) -> tuple[TermGroup, ...]:
     """Return the terms among the first few bodies: what the system conserves, so does this system of few bodies."""
     body_of = {index: number for number, body in enumerate(bodies) for index in body.columns}
-    chosen = dict[int, None]()
+    nearest = dict[int, None]()
     for term_group in term_groups:
-        met = dict.fromkeys(body_of.get(index, -1 - index) for row in term_group.places for index in row)
-        chosen |= dict.fromkeys(list(met)[:FEW])
+        occurring = dict.fromkeys(body_of.get(index, -1 - index) for row in term_group.places for index in row)
+        nearest |= dict.fromkeys(list(occurring)[:FEW])
     return tuple(
-        term_group.where([all(body_of.get(index, -1 - index) in chosen for index in row) for row in term_group.places])
+        term_group.where([all(body_of.get(index, -1 - index) in nearest for index in row) for row in term_group.places])
         for term_group in term_groups
     )
 
 
 def array_forces(
-    term_groups: Sequence[TermGroup], coordinates: Sequence[Symbol], known: Mapping[Any, Any], count: int
+    term_groups: Sequence[TermGroup], coordinates: Sequence[Symbol], at_points: Mapping[Any, Any], count: int
 ) -> Sequence[Any]:
-    """Return the force on each coordinate at ``count`` points; ``known`` has coordinates, parameters and time there."""
+    """Return the force on each coordinate at ``count`` points; ``at_points`` has coordinates, parameters and time there."""
     if not term_groups:
         return [0.0] * len(coordinates)
-    q, force = np.array([known[each] for each in coordinates]), np.zeros((len(coordinates), count))
+    q, force = np.array([at_points[each] for each in coordinates]), np.zeros((len(coordinates), count))
     for term_group in term_groups:
-        indices, values = np.array(term_group.places, dtype=int).reshape(-1, len(term_group.slots)), dict(known)
+        indices, values = np.array(term_group.places, dtype=int).reshape(-1, len(term_group.slots)), dict(at_points)
         values |= {slot: q[indices[:, k]] for k, slot in enumerate(term_group.slots)}
         for symbol, column in zip(term_group.constants, term_group.values, strict=True):
-            values[symbol] = np.array([known[x] if x in known else np.full(count, float(x)) for x in column])
+            values[symbol] = np.array([at_points[x] if x in at_points else np.full(count, float(x)) for x in column])
         for k, derivative in enumerate(term_group.partials):
             np.add.at(force, indices[:, k], array_value(derivative, values) + np.zeros((len(indices), count)))
     return list(force)
 
 
 def exact_forces(
-    term_groups: Sequence[TermGroup], coordinates: Sequence[Symbol], known: Mapping[Any, Number]
+    term_groups: Sequence[TermGroup], coordinates: Sequence[Symbol], at_points: Mapping[Any, Number]
 ) -> list[Number]:
     """Return the force on each coordinate at one point, in 60 digits."""
     force: list[Number] = [mp.zero] * len(coordinates)
     for term_group in term_groups:
-        shared_symbols = [symbol for symbol in known if symbol not in coordinates]
+        shared_symbols = [symbol for symbol in at_points if symbol not in coordinates]
         tape = Tape(term_group.partials, (*term_group.slots, *term_group.constants, *shared_symbols))
-        shared, numbers = [known[symbol] for symbol in shared_symbols], dict[Expr, Number]()
+        shared, numbers = [at_points[symbol] for symbol in shared_symbols], dict[Expr, Number]()
         for row, *constants in zip(term_group.places, *term_group.values, strict=True):
             for x in constants:
-                numbers.setdefault(x, known[x] if x in known else evaluate(x, {}))
+                numbers.setdefault(x, at_points[x] if x in at_points else evaluate(x, {}))
             derivatives = tape(
-                [*(known[coordinates[index]] for index in row), *(numbers[x] for x in constants), *shared]
+                [*(at_points[coordinates[index]] for index in row), *(numbers[x] for x in constants), *shared]
             )
             for index, force_term in zip(row, derivatives, strict=True):
                 force[index] += force_term
@@ -186,8 +186,8 @@ class Rates:
     @property
     def closed(self) -> bool:
         """True if the rates contain only arguments, time and constants, so that they have values at a point."""
-        known = {*self.arguments, self.time, *self.constants}
-        return all(formula.free_symbols <= known for formula in (*self.transformed, *self.forces))
+        variables = {*self.arguments, self.time, *self.constants}
+        return all(formula.free_symbols <= variables for formula in (*self.transformed, *self.forces))
 
     def arrays(self, parameters: Mapping[Symbol, Array], count: int) -> Sample:
         """Sample ``count`` points; NaN where the system is undefined. Parameters: one number, or one per point."""
@@ -216,9 +216,9 @@ class Rates:
                 size = 1.5 if k < len(self.momenta) else SPREADS[attempt % len(SPREADS)]
                 values[argument] = mp.mpf(size * generator.uniform(-1.0, 1.0))
             try:
-                known = dict(zip(moved, tape([values[x] for x in tape.symbols]), strict=True))
+                computed = dict(zip(moved, tape([values[x] for x in tape.symbols]), strict=True))
                 group_forces = exact_forces(self.term_groups, self.arguments[: len(self.momenta)], values)
-                points = self._sample(values, functools.partial(_known_or_evaluated, known, values), group_forces)
+                points = self._sample(values, functools.partial(_value_of, computed, values), group_forces)
             except ArithmeticError:
                 continue
             count -= 1
@@ -254,9 +254,9 @@ def drawn_parameters(constants: Mapping[Symbol, float], count: int, *, near: boo
     return {x: math.copysign(1.0, value) * generator.uniform(0.6, 1.7, count) for x, value in constants.items()}
 
 
-def _known_or_evaluated(known: Mapping[Expr, Number], values: Mapping[Symbol, Number], expression: Expr) -> Number:
-    if expression in known:
-        return known[expression]
+def _value_of(computed: Mapping[Expr, Number], values: Mapping[Symbol, Number], expression: Expr) -> Number:
+    if expression in computed:
+        return computed[expression]
     return evaluate(expression, {x: values[x] for x in expression.free_symbols})
 
 

@@ -64,25 +64,25 @@ def verify_arrays(
     if stepper is not None and not stepper.run_time_sizes:
         raise StateError(f"stepper must be one of run-time sizes, not {stepper!r}: compile it without sizes")
     began = time.perf_counter()
-    chosen = as_method(method, system)
-    watched = stepper or compile_stepper(system, chosen)
-    stepper = watched.with_events(())
+    resolved = as_method(method, system)
+    with_events = stepper or compile_stepper(system, resolved)
+    stepper = with_events.with_events(())
     run = stepper.start(q, p, h=h, t=t, **arrays_of_run)
     arrays = read_arrays(stepper.interface, q, arrays_of_run["parameters"], arrays_of_run["tables"])
     parameters = dict(zip(stepper.interface.parameters, arrays.numbers, strict=True))
     if stepper.source is None or system.coupled_terms or tolerance is not None or system.constraints:
-        known = unroll_sums(system, arrays.sizes, tables=arrays.places, parameters={**parameters, **arrays.fields})
+        unrolled = unroll_sums(system, arrays.sizes, tables=arrays.places, parameters={**parameters, **arrays.fields})
         options: dict[str, Any] = {"h": run.h, "t": run.t, "tolerance": tolerance}
-        if watched.events:
-            options["stepper"] = compile_stepper(known, chosen, flags=watched.flags, events=watched.events)
-        if system.constraints and isinstance(chosen, StoermerVerlet):
-            chosen = SVI(1, "gauss-lobatto:2")  # RATTLE under its name for known sizes
-        certificate = of_known_sizes(known, chosen, run.q, run.p, **options)
+        if with_events.events:
+            options["stepper"] = compile_stepper(unrolled, resolved, flags=with_events.flags, events=with_events.events)
+        if system.constraints and isinstance(resolved, StoermerVerlet):
+            resolved = SVI(1, "gauss-lobatto:2")  # RATTLE under its name for known sizes
+        certificate = of_known_sizes(unrolled, resolved, run.q, run.p, **options)
         if stepper.source is None:
             return certificate
-        loops = SystemUnderTest(known, chosen, _bound(stepper, arrays), None, State(run.q, run.p, run.t, run.h))
+        loops = SystemUnderTest(unrolled, resolved, _bound(stepper, arrays), None, State(run.q, run.p, run.t, run.h))
         return replace(certificate, checks=(*_unrolled_checks(loops), *certificate.checks))
-    start = WholeStart(system, chosen, stepper, arrays, run.stepper.arrays(run.p), run.h, run.t)
+    start = WholeStart(system, resolved, stepper, arrays, run.stepper.arrays(run.p), run.h, run.t)
     tested = _subject(start)
     checks = (
         *_unrolled_checks(tested),
@@ -90,32 +90,32 @@ def verify_arrays(
         *structure_checks(tested),
         *convergence_checks(tested),
         *whole_checks(start),
-        *_impact_checks(start, watched.bind(arrays.state, arrays_of_run["parameters"], arrays.places)[0]),
+        *_impact_checks(start, with_events.bind(arrays.state, arrays_of_run["parameters"], arrays.places)[0]),
     )
     return issued(
         stepper,
         tested.initial,
         began=began,
         system=system.name,
-        method=chosen.name,
+        method=resolved.name,
         parameters=parameters,
         checks=checks,
     )
 
 
-def _impact_checks(start: WholeStart, watched: Stepper) -> Iterator[Check]:
+def _impact_checks(start: WholeStart, with_events: Stepper) -> Iterator[Check]:
     """Yield the checks of events that change the state, which are compared with formulas of all coordinates."""
-    if not watched.changes_states:
+    if not with_events.changes_states:
         return
-    if watched.dimension > MOST_COORDINATES:
+    if with_events.dimension > MOST_COORDINATES:
         yield information("impacts", f"measured for at most {MOST_COORDINATES} coordinates: give fewer", None)
         return
     arrays = start.arrays
-    known = unroll_sums(start.system, arrays.sizes, tables=arrays.places, parameters=start.parameters)
+    unrolled = unroll_sums(start.system, arrays.sizes, tables=arrays.places, parameters=start.parameters)
     q, p = (np.concatenate([values.reshape(-1) for values in state.values()]) for state in (arrays.state, start.p))
-    tested = SystemUnderTest(known, start.method, watched, None, State(q, p, start.t, start.h))
+    tested = SystemUnderTest(unrolled, start.method, with_events, None, State(q, p, start.t, start.h))
     numbers = np.concatenate([arrays.numbers, *(values.reshape(-1) for values in arrays.fields.values())])
-    yield from impact_checks(tested, watched, numbers)
+    yield from impact_checks(tested, with_events, numbers)
 
 
 def _state_of_fields(mesh: Any, method: Method | str, h: float | None) -> tuple[Any, Any, float]:
@@ -174,19 +174,19 @@ def small_start(start: WholeStart) -> WholeStart:
     interface, arrays, result = start.stepper.interface, start.arrays, None
     for window, rows in CUT_SIZES:
         tables = {table.axes[0].name for table in interface.layout.tables}
-        chosen = {name: np.arange(min(arrays.sizes[name], rows)) for name in tables}
+        indices = {name: np.arange(min(arrays.sizes[name], rows)) for name in tables}
         for name in interface.layout.sizes:
-            if name in chosen:
+            if name in indices:
                 continue
             used = [
-                arrays.places[table][chosen[row], column]
+                arrays.places[table][indices[row], column]
                 for table, row, column, size in _columns(interface)
                 if size == name
             ]
-            known = np.unique(np.concatenate([*used, np.empty(0, dtype=np.int64)]))
-            others = np.setdiff1d(_around(start, name, window), known)
-            chosen[name] = np.union1d(known, others[: max(0, window - len(known))])
-        small = _cut(start, chosen)
+            in_tables = np.unique(np.concatenate([*used, np.empty(0, dtype=np.int64)]))
+            further = np.setdiff1d(_around(start, name, window), in_tables)
+            indices[name] = np.union1d(in_tables, further[: max(0, window - len(in_tables))])
+        small = _cut(start, indices)
         try:
             check_accesses(interface.layout, small.arrays.sizes, small.arrays.places)
         except StateError:

@@ -170,7 +170,7 @@ def eigenvectors(matrix: NumberTable) -> tuple[list[Any], Any]:
     The largest component of an eigenvector is 1. (``mp.eig`` takes ten times as long.)
     """
     values, vectors = np.linalg.eig(np.array(matrix, dtype=float))
-    exact, found, columns = mp.matrix(matrix), [], []
+    exact, eigenvalues, columns = mp.matrix(matrix), [], []
     for value, vector in zip(values, vectors.T, strict=True):
         if value.imag < 0:  # the conjugate of another one
             continue
@@ -181,9 +181,9 @@ def eigenvectors(matrix: NumberTable) -> tuple[list[Any], Any]:
                 y = mp.lu_solve(exact - mu * mp.eye(len(values)), x)
                 mu, x = mu + 1 / y[largest], y / y[largest]
         pairs = [(mu, x)] if value.imag == 0 else [(mu, x), (mp.conj(mu), x.apply(mp.conj))]
-        found += [each for each, _ in pairs]
+        eigenvalues += [each for each, _ in pairs]
         columns += [list(each) for _, each in pairs]
-    return found, mp.matrix(columns).T
+    return eigenvalues, mp.matrix(columns).T
 
 
 def predictor_tables_of(
