@@ -138,6 +138,7 @@ static void add_force_0(const problem *given, const lanes *restrict X, times t, 
   lanes value[2];
   double parameters[1] = {0};
   parameters[0] = given->parameters[0];
+  (void)given, (void)here;
   for (long long begin = here->of.first, end; begin < here->of.end; begin = end) {
     end = here->of.end - begin > CHUNK ? begin + CHUNK : here->of.end;
     const long long shift_i_plus_1 = around(begin, 1, size_N, &end);

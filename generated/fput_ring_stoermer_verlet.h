@@ -90,7 +90,8 @@ fput_ring_stoermer_verlet_options fput_ring_stoermer_verlet_default_options(void
  * _memory returns the length in doubles of the memory of a run, -1 if there is none; _bind makes the run in this
  * memory, which begins at a multiple of 64 bytes. The tables, in row-major order, are the caller's. */
 long long fput_ring_stoermer_verlet_memory(const long long *sizes, const int *const *tables);
-fput_ring_stoermer_verlet_run *fput_ring_stoermer_verlet_bind(const long long *sizes, const int *const *tables, double *memory);
+fput_ring_stoermer_verlet_run *fput_ring_stoermer_verlet_bind(const long long *sizes, const int *const *tables,
+    double *memory);
 
 /* Below, `parameters` are followed by the fields, in row-major order.
  * A workspace is the memory of a run of the same sizes and tables, whose state is lost unless stated otherwise. A mass

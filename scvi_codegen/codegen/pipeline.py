@@ -489,25 +489,19 @@ class ArraySources(Sources):
     def interface(self) -> Interface:
         """Interface of the generated library."""
         system, sites = self.system, self.sites
+        arrays = ("sizes", "momenta", "fields", "field_defaults", "tables", "accesses")
+        declared = {name: getattr(system, name) for name in (*arrays, "depends_on_time", "data", "mesh")}
         layout = ArrayLayout(
-            sizes=system.sizes,
+            **declared,
             coordinates=system.positions,
-            momenta=system.momenta,
-            fields=system.fields,
-            tables=system.tables,
-            field_defaults=system.field_defaults,
             maps=momentum_maps(system),
-            accesses=system.accesses,
-            depends_on_time=system.depends_on_time,
             constraints=tuple(term.loops for term in system.constraints),
             continued=not (self.method.fractions or system.constraints),
             momentum_formulas=sites.momenta if sites else (),
             velocity_formulas=sites.velocities if sites else (),
             couplings=(*system.potentials, *system.applied_forces) if self.solver == "newton" else (),
             symmetric=not (system.momenta or system.velocities),
-            data=system.data,
             neighbours=tuple(near.name for near in system.neighbours),
-            mesh=system.mesh,
         )
         return _interface(
             system,

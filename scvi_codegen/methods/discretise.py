@@ -22,7 +22,6 @@ from scvi_codegen.methods.constraints import with_constraints
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import Block, Gather, Row, Scatter, StageGroup, StageSystem, Table, Velocities
 from scvi_codegen.methods.tables.basis import identity_matrix, next_step
-from scvi_codegen.systems.arrays.system import ArraySystem
 from scvi_codegen.systems.constraints import velocity_conditions
 from scvi_codegen.systems.derived_expressions import auxiliary_multipliers, forms_of
 from scvi_codegen.systems.first_order import FirstOrderSystem
@@ -236,9 +235,7 @@ def is_symplectic(method: Method, system: MechanicalSystem) -> bool:
 
 def is_conformally_symplectic(method: Method, system: MechanicalSystem) -> bool:
     """Return whether the steps multiply dq ^ dp by exp(-gamma h), where gamma is the damping rate."""
-    of_known_sizes = not isinstance(system, ArraySystem)  # whose constraints are counted
-    prescribed = of_known_sizes and 0 < len(system.constraints) == system.dimension
-    return method.symplectic and not (system.forces or prescribed or any(velocity_conditions(system)))
+    return method.symplectic and not (system.forces or system.is_prescribed or any(velocity_conditions(system)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -233,6 +233,11 @@ class MechanicalSystem(Deferred, ABC):
         return bool(self.constraints if self._text is None else json.loads(self._text)[1]["constraints"])
 
     @property
+    def is_prescribed(self) -> bool:
+        """True if there are as many constraints as coordinates, which then prescribe the motion."""
+        return 0 < len(self.constraints) == self.dimension
+
+    @property
     def is_first_order(self) -> bool:
         """True if the function is linear in the velocities, so that half of the variables are momenta."""
         return False

@@ -321,7 +321,7 @@ class ArraySystem(OfRunTimeSizes, MechanicalSystem):
     def _check_continuity(self) -> None:
         """Raise :class:`SystemDefinitionError` for jumps of L or H across a surface, and for corners of constraints."""
         constant = {array.name for array in self.fields}
-        values = dict(zip(self.parameters, self.defaults, strict=True))
+        values = self.constants
         of_energy = [] if self.neighbours else [(term, False) for term in self.terms]  # lists end at their cutoff
         for term, first_derivatives in (*of_energy, *((term, True) for term in self.constraints)):
             moving = [slot for slot, access in term.slots if access.array.name not in constant]
@@ -369,6 +369,11 @@ class ArraySystem(OfRunTimeSizes, MechanicalSystem):
     @property
     def constrained_at_nodes(self) -> bool:
         """False: steps of arrays with constraints are those of RATTLE."""
+        return False
+
+    @property
+    def is_prescribed(self) -> bool:
+        """False: a constraint of arrays stands for one of every element, whose number each run determines."""
         return False
 
     @property
@@ -540,7 +545,7 @@ class ArraySystem(OfRunTimeSizes, MechanicalSystem):
             others,
         )
         scalars = {symbol(array.name): value for array, value in zip(self.fields, self.field_defaults, strict=True)}
-        values = scalars | dict(zip(self.parameters, self.defaults, strict=True))
+        values = scalars | self.constants
         warn_of_unused(self.name, self.function, values, self.inputs, used)
         moving = {array.name: array for array in self.momenta} or self._velocities
         for name in moving:

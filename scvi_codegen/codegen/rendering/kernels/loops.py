@@ -225,11 +225,9 @@ def _force_text(program: Program, rolled: RolledKernel) -> str:
     arguments += ["const window *here", *(["const images *sums"] if _has_sums(rolled) else [])]
     if sharing is Sharing.BY_PLACES:
         zero.append("const int whole = here->whole;")
-    unused = ["(void)here;"] if sharing is Sharing.ALONE else []
-    values, name = f"lanes value[{len(rolled.writes)}]", f"static void add_{rolled.kernel.name}"
-    text = nest.function(name, arguments, [*unused, *zero, *lines], values=values)
-    if text.count("given") == 1:  # among the arguments
-        text = nest.function(name, arguments, ["(void)given;", *unused, *zero, *lines], values=values)
+    body = ["(void)given, (void)here;", *zero, *lines]
+    head, values = f"static void add_{rolled.kernel.name}", f"lanes value[{len(rolled.writes)}]"
+    text = nest.function(head, arguments, body, values=values)
     return f"{text}\n\n{_sharing_text(program, rolled)}"
 
 

@@ -9,7 +9,7 @@ import os
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias, cast
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,21 +67,20 @@ def read_values(
     Raises:
         ModelFileError: naming the key at fault.
     """
-    section, any_system = document["initial"], cast(Any, system)
+    section = document["initial"]
     check_one(section, "initial", "p", "q_dot")
     time = {"t": float(real(section.get("t", 0.0), "[initial] t"))}
     entries = _parameter_entries(document.get("parameters", {}), system)
-    if isinstance(any_system, ArraySystem):
-        if any_system.rotations:
-            name = any_system.rotations[0].member.name
-            raise ModelFileError(f"sizes of arrays of rotations, directions and spins must be numbers, as '{name}[3]'")
-        if any_system.mesh is not None:
-            from scvi_codegen.interfaces.models.model_files.field_section import (
-                fields_at_points,  # not needed for other systems
-            )
+    if isinstance(system, ArraySystem):
+        return system, _values_of_arrays(document, system, entries, folder) | time
+    changed, vectors = _values_of_coordinates(section, system, entries, folder)
+    return (system.with_parameters(**changed) if changed else system), {**vectors, **time}
 
-            document = {**document, "initial": fields_at_points(section, any_system)}
-        return system, _values_of_arrays(document, any_system, entries, folder) | time
+
+def _values_of_coordinates(
+    section: Section, system: MechanicalSystem, entries: dict[Key, ArrayValue], folder: str | os.PathLike[str]
+) -> tuple[dict[str, float], dict[str, Any]]:
+    """Return the values of the entries of arrays of parameters, and the state; ``entries`` are those of parameters."""
     names = [coordinate.name for coordinate in system.coordinates]
     section = _by_coordinate(section, system)
     known = [array for array in system.arrays if array.axes and set(array.elements) <= set(names)]
@@ -91,7 +90,8 @@ def read_values(
         for each in known if isinstance(value, dict) else ():
             if each.name in value:
                 entries[key, each.name] = ArrayValue(each, value[each.name], where + each.name)
-    read = _read_arrays(entries, {}, folder, {each.name: x for each, x in system.constants.items()})
+    numbers = {parameter.name: value for parameter, value in system.constants.items()}
+    read = _read_arrays(entries, {}, folder, numbers)
     elements = {
         key: dict(zip(entries[key].array.elements, values.reshape(-1).tolist(), strict=True))
         for key, values in read.items()
@@ -104,7 +104,7 @@ def read_values(
         for key, name in STATE.items()
         if key in section
     }
-    return (system.with_parameters(**changed) if changed else system), {**vectors, **time}
+    return changed, vectors
 
 
 def _by_coordinate(section: Section, system: MechanicalSystem) -> Section:
@@ -130,6 +130,15 @@ def _values_of_arrays(
     document: Document, system: ArraySystem, entries: dict[Key, ArrayValue], folder: str | os.PathLike[str]
 ) -> dict[str, Any]:
     """Return the fields of a model with arrays whose sizes are names; ``entries`` are those of parameters."""
+    if system.rotations:
+        name = system.rotations[0].member.name
+        raise ModelFileError(f"sizes of arrays of rotations, directions and spins must be numbers, as '{name}[3]'")
+    if system.mesh is not None:
+        from scvi_codegen.interfaces.models.model_files.field_section import (
+            fields_at_points,  # not needed for other systems
+        )
+
+        document = {**document, "initial": fields_at_points(document["initial"], system)}
     for key, value in document.get("tables", {}).items():
         table = in_section("[tables]", partial(parse_array, key))
         entries["tables", table.name] = ArrayValue(table, value, f"[tables] {table.name}")
@@ -138,7 +147,7 @@ def _values_of_arrays(
     check_keys(sizes, system.sizes, "size", "[sizes]")
     for name, value in sizes.items():
         checked_count(value, f"[sizes] {name}", least=1, error=ModelFileError)
-    numbers = {each.name: value for each, value in zip(system.parameters, system.defaults, strict=True)}
+    numbers = {parameter.name: value for parameter, value in system.constants.items()}
     read = _read_arrays(entries, sizes, folder, numbers)
     groups: dict[str, dict[str, Any]] = {}
     for (group, name), values in read.items():
