@@ -218,7 +218,6 @@ class TestCommandLine:
             ("run --resume none.run --step 0.1", "--step is not allowed with --resume", 2),
             ("run kepler -o a.run --plot a.png", "--plot is not available for a run recorded in a folder", 2),
             ("run kepler -o a.npz --checkpoint 3", "--checkpoint requires a run recorded in a folder", 2),
-            ("run kepler -o a.run --certificate none.json", "the certificate 'none.json' cannot be read", 2),
             ("run kepler -o no/a.run", "'no/a.run' cannot be written", 1),
             ("export none.run", "contains no recorded run", 1),
             ("export none.run -o a.xls", "not as 'a.xls'", 2),

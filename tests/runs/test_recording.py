@@ -100,21 +100,11 @@ class TestRecording:
 
     def test_manifest_describes_the_run(self, kepler):
         text = dump_model(sc.Model.from_problem(sc.problem("kepler")))
-        found = recorded(kepler, 10, model=text, certificate={"symplectic": True})
+        found = recorded(kepler, 10, model=text)
         about = json.loads(Path("a.run/manifest.json").read_text())
         assert about["source"]["code"] == kepler.source.code.split("\n")
-        assert about["certificate"] == {"symplectic": True}
         assert (about["model"], about["steps"], about["builds"][0]["step"]) == (text, 10, 0)
         assert found.manifest.about()["method"] == kepler.interface.method
-
-    def test_certificate_is_accepted_as_file_or_object(self, kepler):
-        Path("c.json").write_text('{"order": 8}')
-        assert recorded(kepler, 1, certificate="c.json").manifest.certificate == {"order": 8}
-        given = SimpleNamespace(to_json=lambda: '{"order": 4}')
-        assert recorded(kepler, 1, certificate=given, folder="b.run").manifest.certificate == {"order": 4}
-        for wrong in ("none.json", {1, 2}):
-            with pytest.raises(sc.StateError, match="the certificate"):
-                recorded(kepler, 1, certificate=wrong, folder="c.run")
 
     @pytest.mark.second
     def test_memory_does_not_grow_with_run_length(self, kepler):
@@ -341,7 +331,7 @@ class TestFiles:
     @pytest.fixture(params=["recorded", "in memory"])
     def saved(self, request, kepler) -> tuple[sc.RecordedRun | sc.Trajectory, sc.Trajectory]:
         whole = kepler.integrate(**STATE, h=H, steps=300)
-        return (recorded(kepler, 300, certificate={"order": 8}) if request.param == "recorded" else whole), whole
+        return (recorded(kepler, 300) if request.param == "recorded" else whole), whole
 
     def test_npz_round_trip(self, saved):
         given, whole = saved
@@ -351,7 +341,6 @@ class TestFiles:
             assert list(file["coordinates"]) == ["q1", "q2"]
             assert (file["h"], file["parameters"], file["parameter_names"]) == (H, [1.0], ["mu"])
             assert str(file["title"]) == whole.stepper.title
-            assert ("certificate" in file) == isinstance(given, sc.RecordedRun)
 
     def test_csv_round_trip(self, saved):
         given, whole = saved
@@ -372,7 +361,6 @@ class TestFiles:
             assert file.attrs["title"] == whole.stepper.title
             assert json.loads(file.attrs["parameters"]) == {"mu": 1.0}
             assert file["q"].dims[1][0][:].tolist() == [b"q1", b"q2"]
-            assert ("certificate" in file.attrs) == isinstance(given, sc.RecordedRun)
 
     @pytest.mark.tiers(1)
     def test_zarr_is_read_by_xarray(self, saved):

@@ -4,8 +4,10 @@ import math
 import os
 import shlex
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -108,92 +110,63 @@ class RecordedOutcome:
         return f"{states}; continue with: scvi-codegen run --resume {shlex.quote(str(folder))}"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Recording:
-    """Checkpoint interval and certificate of a run in a folder.
+def record_model(model: Model, folder: str, seconds: float | None) -> RecordedOutcome:
+    """Integrate a model into a folder until its end, a failure or a signal; raises as :func:`record_run`.
 
-    Attributes:
-        seconds: seconds between checkpoints; ``None`` for the default.
-        certificate: path of a JSON file to store with the run, or ``None``.
+    ``seconds`` between checkpoints, ``None`` for the default.
     """
+    text = None
+    with suppress(ModelFileError):
+        text = dump_model(model)
+    if model.system.clock is not None and model.ends_at_time:
+        raise click.UsageError("a recorded run in transformed time needs a number of steps: give --step and --steps")
+    run, target = model.start(), Path(folder)
+    steps = model.whole_step_count() if isinstance(run.plan, FixedSteps) else None
+    record = partial(record_run, run, target, save_every=model.save_every, model=text)
+    return _with_progress(record, target, first=0, steps=steps, seconds=seconds)
 
-    seconds: float | None
-    certificate: str | None
 
-    def check(self, recorded: bool) -> None:
-        """Reject options that have no effect on a run in memory."""
-        options = {"--checkpoint": self.seconds, "--certificate": self.certificate}
-        for name, value in options.items():
-            if value is not None and not recorded:
-                raise click.UsageError(f"{name} requires a run recorded in a folder (-o NAME{SUFFIX})")
-
-    def record(self, model: Model, folder: str) -> RecordedOutcome:
-        """Integrate a model into a folder until its end, a failure or a signal; raises as :func:`record_run`."""
-        text = None
-        with suppress(ModelFileError):
-            text = dump_model(model)
-        if model.system.clock is not None and model.ends_at_time:
-            raise click.UsageError(
-                "a recorded run in transformed time needs a number of steps: give --step and --steps"
-            )
-        run = model.start()
-        return self._with_progress(
-            record_run,
-            run,
-            Path(folder),
-            first=0,
-            steps=model.whole_step_count() if isinstance(run.plan, FixedSteps) else None,
-            save_every=model.save_every,
-            model=text,
-            certificate=self.certificate,
-        )
-
-    def resume(self, folder: str, *, steps: int | None, span: float | None) -> RecordedOutcome:
-        """Continue the run in a folder; raises as :func:`resume_run`."""
-        check_exclusive({"steps": steps, "span": span})
-        recorded = load_run(folder)
-        manifest, further = recorded.manifest, dict[str, Any]()
-        match manifest.plan:
-            case _ if span is None:
-                pass
-            case Adaptive(t_end=t_end) | InTau(t_end=t_end):
-                further["t_end"] = manifest.t + math.copysign(span, t_end - manifest.t)
-            case Fixed(h):
-                if manifest.interface.in_tau:
-                    raise click.UsageError(
-                        "a recorded run in transformed time needs a number of steps: give --steps, not --span"
-                    )
-                steps = whole_steps_in(span, h, manifest.t)
-        plan = manifest.steps if steps is None else steps
-        return self._with_progress(resume_run, Path(folder), first=recorded.steps, steps=plan, **further)
-
-    def _with_progress(
-        self, act: Any, *arguments: Any, first: int, steps: int | None, **settings: Any
-    ) -> RecordedOutcome:
-        """Record or resume with a progress bar; SIGINT and SIGTERM end the run at a checkpoint."""
-        if self.seconds is not None:
-            settings["checkpoint_seconds"] = self.seconds
-        folder, failure, began = arguments[-1], None, time.perf_counter()
-        with interruptions() as caught, progress_bar(0 if steps is None else steps - first) as show_progress:
-            try:
-                act(
-                    *arguments,
-                    steps=steps,
-                    progress=lambda done: show_progress(done - first),
-                    stop=lambda: bool(caught),
-                    **settings,
+def resume_folder(folder: str, *, steps: int | None, span: float | None, seconds: float | None) -> RecordedOutcome:
+    """Continue the run in a folder; raises as :func:`resume_run`."""
+    check_exclusive({"steps": steps, "span": span})
+    recorded = load_run(folder)
+    manifest, further = recorded.manifest, dict[str, Any]()
+    match manifest.plan:
+        case _ if span is None:
+            pass
+        case Adaptive(t_end=t_end) | InTau(t_end=t_end):
+            further["t_end"] = manifest.t + math.copysign(span, t_end - manifest.t)
+        case Fixed(h):
+            if manifest.interface.in_tau:
+                raise click.UsageError(
+                    "a recorded run in transformed time needs a number of steps: give --steps, not --span"
                 )
-            except StepFailedError as error:
-                failure = error
-        recorded = load_run(folder)
-        return RecordedOutcome(
-            recorded=recorded,
-            run=recorded.resumed(),
-            first=first,
-            seconds=time.perf_counter() - began,
-            failure=failure,
-            interrupted=bool(caught) and not recorded.finished,
-        )
+            steps = whole_steps_in(span, h, manifest.t)
+    steps, target = manifest.steps if steps is None else steps, Path(folder)
+    resume = partial(resume_run, target, **further)
+    return _with_progress(resume, target, first=recorded.steps, steps=steps, seconds=seconds)
+
+
+def _with_progress(
+    write: Callable[..., RecordedRun], folder: Path, *, first: int, steps: int | None, seconds: float | None
+) -> RecordedOutcome:
+    """Record or resume with a progress bar; SIGINT and SIGTERM end the run at a checkpoint."""
+    write = write if seconds is None else partial(write, checkpoint_seconds=seconds)
+    failure, began = None, time.perf_counter()
+    with interruptions() as caught, progress_bar(0 if steps is None else steps - first) as show_progress:
+        try:
+            write(steps=steps, progress=lambda done: show_progress(done - first), stop=lambda: bool(caught))
+        except StepFailedError as error:
+            failure = error
+    recorded = load_run(folder)
+    return RecordedOutcome(
+        recorded=recorded,
+        run=recorded.resumed(),
+        first=first,
+        seconds=time.perf_counter() - began,
+        failure=failure,
+        interrupted=bool(caught) and not recorded.finished,
+    )
 
 
 def describe_progress(recorded: RecordedRun) -> str:

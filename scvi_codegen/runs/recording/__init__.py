@@ -1,7 +1,7 @@
 """Recording of long runs in a folder: checkpoints, restart and reading, bitwise reproducible.
 
     kepler.run/
-      manifest.json       the run: C source, flags, parameters, model, certificate; builds that computed the states
+      manifest.json       the run: C source, flags, parameters, model; builds that computed the states
       states-000000.npz   the first r states: t, q, p, iterations; and the run's memory after its last step
       states-000001.npz   the next r states, ...
 

@@ -215,7 +215,6 @@ class Manifest:
         plan: step plan.
         rows: states in a full file.
         model: text of the model file, if there is one.
-        certificate: verification report as JSON, if there is one.
         builds: the build at the start, then each that continued the run.
         events: events of the run, which the source does not contain.
         mesh: density and mesh of fields as texts and numbers (``Mesh.to_section``), with the values of its parameters.
@@ -232,7 +231,6 @@ class Manifest:
     plan: Fixed | Adaptive | InTau
     rows: int
     model: str | None
-    certificate: Any
     builds: tuple[Build, ...]
     fallback: Source | None = None
     events: tuple[Event, ...] = ()
@@ -284,8 +282,6 @@ class Manifest:
         texts = self.interface.about() | {"version": self.builds[0].version}
         if self.model is not None:
             texts["model"] = self.model
-        if self.certificate is not None:
-            texts["certificate"] = json.dumps(self.certificate)
         return texts
 
     def check(self) -> None:
@@ -365,7 +361,7 @@ class Manifest:
 
 SEAL = '{\n "sha256": "%s",'
 """First lines of the text of a manifest: the checksum of the others."""
-PLAIN = ("flags", "parameters", "t", "save_every", "steps", "rows", "model", "certificate")
+PLAIN = ("flags", "parameters", "t", "save_every", "steps", "rows", "model")
 
 
 def sealed_text(document: Mapping[str, Any]) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import shlex
@@ -65,7 +64,6 @@ def record_run(
     checkpoint_steps: int | None = None,
     rows: int | None = None,
     model: str | None = None,
-    certificate: Any = None,
     progress: Callable[[int], None] | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> RecordedRun:
@@ -82,8 +80,6 @@ def record_run(
         checkpoint_steps: write a checkpoint also after every multiple of this number of steps.
         rows: states per file, by default about 16 MiB.
         model: text of a model file (:func:`dump_model`) to store with the states.
-        certificate: verification report of the integrator: JSON data, an object with a method ``to_json``, or the
-            path of a JSON file.
         progress: called with the number of completed steps.
         stop: called regularly; the run ends if it returns true, after a checkpoint.
 
@@ -120,7 +116,6 @@ def record_run(
         if rows is None
         else checked_count(rows, "rows", least=1),
         model=model,
-        certificate=_certificate(certificate),
         builds=(Build.of(run.stepper, 0),),
         mesh=_mesh(run),
     )
@@ -398,18 +393,6 @@ def _checked_checkpoints(seconds: float, steps: int | None) -> tuple[float, int 
     if not seconds >= 0.0:
         raise StateError(f"checkpoint_seconds must be at least 0, not {seconds!r}")
     return seconds, None if steps is None else checked_count(steps, "checkpoint_steps", least=1)
-
-
-def _certificate(argument: Any) -> Any:
-    if isinstance(argument, str | os.PathLike):
-        try:
-            return json.loads(Path(argument).read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise StateError(f"the certificate '{argument}' cannot be read as JSON: {error}") from error
-    try:
-        return json.loads(argument.to_json() if hasattr(argument, "to_json") else json.dumps(argument))
-    except (TypeError, ValueError) as error:
-        raise StateError(f"the certificate is not JSON data: {error}") from error
 
 
 def _prepare(folder: Path) -> None:

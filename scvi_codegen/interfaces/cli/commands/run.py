@@ -20,7 +20,15 @@ from scvi_codegen.interfaces.cli.command_group import (
 from scvi_codegen.interfaces.cli.ensembles import energy_balance, ensemble_summary, integrate_states
 from scvi_codegen.interfaces.cli.json_documents import ensemble_numbers, outcome_numbers, run_numbers
 from scvi_codegen.interfaces.cli.model_options import check_flag, model_arguments, read_model, with_known_sizes
-from scvi_codegen.interfaces.cli.recording import RecordedOutcome, Recording, check_format, check_resumed, is_run_folder
+from scvi_codegen.interfaces.cli.recording import (
+    SUFFIX,
+    RecordedOutcome,
+    check_format,
+    check_resumed,
+    is_run_folder,
+    record_model,
+    resume_folder,
+)
 from scvi_codegen.interfaces.cli.reports import known_account
 from scvi_codegen.interfaces.cli.running import RunOutcome, integrate_model, known_at_end, summary
 from scvi_codegen.interfaces.cli.step_selection import (
@@ -114,7 +122,6 @@ ERRORS = {option.name: option for option in OWN if option.determines == STEP_SIZ
 @click.option(
     "--checkpoint", type=float, metavar="SECONDS", help="Longest time between checkpoints of a run in a folder [10]."
 )
-@click.option("--certificate", type=click.Path(), metavar="FILE", help="JSON file to store in the folder.")
 @click.option("--plot", type=click.Path(), metavar="FILE", help="Plot (.png, .svg, .pdf) or film (.gif, .html, .mp4).")
 @click.option(
     "--ensemble", type=click.Path(), metavar="FILE", help="Many initial states: a grid (.toml) or a table (.csv)."
@@ -125,22 +132,19 @@ def run(
     output: str | None,
     resume: str | None,
     checkpoint: float | None,
-    certificate: str | None,
     plot: str | None,
     ensemble: str | None,
     **choices: Any,
 ) -> None:
     """Integrate MODEL; the help text is ``ABOUT``."""
-    recording = Recording(seconds=checkpoint, certificate=certificate)
     if resume is not None:
         check_resumed(click.get_current_context())
-        _finish_recording(recording.resume(resume, steps=choices["steps"], span=choices["span"]))
+        _finish_recording(resume_folder(resume, steps=choices["steps"], span=choices["span"], seconds=checkpoint))
         return
     if model_name is None:
         raise click.UsageError("Missing argument 'MODEL', or --resume FOLDER.")
     recorded = output is not None and is_run_folder(output)
-    recording.check(recorded)
-    _check_outputs(output, plot, ensemble)
+    _check_outputs(output, plot, ensemble, checkpoint)
     wanted = {name: choices.pop(name) for name in ERRORS}
     _check_combination(choices, plot=plot, ensemble=ensemble, wanted=wanted, folder=output if recorded else None)
     is_controlled = any(choices.get(name) is not None for name in OF_ADAPTIVE_STEPS)
@@ -170,7 +174,7 @@ def run(
         _run_ensemble(replace(states, model=model), (output, plot), advised=wanted["advise"], member=member)
         return
     if output is not None and recorded:
-        _finish_recording(recording.record(model, output))
+        _finish_recording(record_model(model, output, checkpoint))
     else:
         _run_one(model, output, plot, advised=wanted["advise"])
     _check_confirmed(confirmation)
@@ -221,8 +225,10 @@ def _with_steps(
     return model, None, 0
 
 
-def _check_outputs(output: str | None, plot: str | None, ensemble: str | None) -> None:
+def _check_outputs(output: str | None, plot: str | None, ensemble: str | None, checkpoint: float | None) -> None:
     """Check before a long run that its files can be written."""
+    if checkpoint is not None and not (output is not None and is_run_folder(output)):
+        raise click.UsageError(f"--checkpoint requires a run recorded in a folder (-o NAME{SUFFIX})")
     if output is not None and not (ensemble is None and is_run_folder(output)):
         check_format(output, ensemble=ensemble is not None)
         check_writable(Path(output), "'-o'")
