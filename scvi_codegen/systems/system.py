@@ -9,6 +9,9 @@ All later stages use one thing, a function whose stationary action gives the equ
 (Hamilton's principle, and Hamilton's principle in phase space: paper, section 1.1). Auxiliary variables are further
 unknowns at every point where the function is evaluated; the action is stationary in them, too.
 
+Arrays whose sizes each run determines (:class:`~scvi_codegen.systems.arrays.system.ArraySystem`) answer the same
+questions, with an array in place of the coordinates that are its entries; they have no formula as a whole.
+
 A new kind of system is a frozen dataclass derived from :class:`MechanicalSystem` with the properties ``lagrangian``
 and ``auxiliaries``, and ``formula``, the user's function; it validates itself on construction. Methods and lowering
 use nothing else, and expressions derived from them only through

@@ -5,9 +5,11 @@ import sympy
 from notation import hamilton
 
 from scvi_codegen import HamiltonianSystem, LagrangianSystem, SystemDefinitionError, unroll_sums
+from scvi_codegen.common.errors import SizesRequiredError
 from scvi_codegen.systems.arrays.reading import arrays_from_text
 from scvi_codegen.systems.arrays.symmetry import momentum_maps
 from scvi_codegen.systems.arrays.system import ArraySystem, force_of
+from scvi_codegen.systems.system import MechanicalSystem
 
 GRAVITY = "sum(i in N, m[i]*sum(a in 3, r_dot[i, a]**2)/2) + "
 DISTANCE = "sqrt(sum(a in 3, (r[i, a] - r[j, a])**2))"
@@ -16,6 +18,20 @@ DISTANCE = "sqrt(sum(a in 3, (r[i, a] - r[j, a])**2))"
 def system(coordinates: str, lagrangian: str, **extra: object) -> ArraySystem:
     """A system of one array."""
     return LagrangianSystem.from_text(name="system", coordinates=[coordinates], lagrangian=lagrangian, **extra)
+
+
+def test_array_systems_answer_as_systems_of_named_coordinates() -> None:
+    """An array is one coordinate, a list of neighbours has lengths, and there is no formula of all elements."""
+    near = {"near": {"of": "r", "cutoff": "c", "skin": 0.5}}
+    pairs = GRAVITY + f"sum(i < j in near, {DISTANCE})"
+    bodies = system("r[N, 3]", pairs, parameters={"c": 2, "m[N]": 1}, neighbours=near, constraints=["r[0, 0] = 1"])
+    assert isinstance(bodies, MechanicalSystem)
+    assert (bodies.sizes, [*map(str, bodies.arrays)]) == (("N",), ["r[N, 3]", "m[N]"])
+    assert [name for name, *_ in bodies.lengths] == ["near"] * len(bodies.lengths) != []
+    assert bodies.with_parameters(c=3).constants == {sympy.Symbol("c", real=True): 3.0}
+    assert (bodies.clock, bodies.is_prescribed, bodies.constrained_at_nodes) == (None, False, False)
+    with pytest.raises(SizesRequiredError, match="no formula but those of its terms"):
+        _ = bodies.formula
 
 
 def test_momentum_maps_of_bodies_in_space() -> None:

@@ -192,7 +192,7 @@ def _check(model: Model, ranges: Mapping[str, tuple[float, float]]) -> None:
         raise MethodError(f"a page requires the step size in tau of {name}, not a tolerance: give [run] step")
     check_page(model.page, model, "page")
     check_picture(model)
-    values = model.parameters | {each: model.inputs.get(each, 0.0) for each in getattr(model.system, "inputs", ())}
+    values = model.parameters | {each: model.inputs.get(each, 0.0) for each in model.system.inputs}
     for parameter in ranges.keys() & values.keys():
         (low, high), value = ranges[parameter], values[parameter]
         if not low <= value <= high:
@@ -315,7 +315,7 @@ def _c_text(formula: sympy.Expr) -> str:
 
 def _lagrangian(document: Mapping[str, Any], model: Model) -> list[str]:
     """Return the Lagrangian, density or Hamiltonian as written, as terms of MathML; none of arrays and robots."""
-    if getattr(model.system, "links", ()):
+    if model.system.drawn_links:
         return []
     source = document.get("field") or document.get("system", {})
     text = str(source.get("density") or source.get("lagrangian") or source.get("hamiltonian") or "")

@@ -29,7 +29,7 @@ def starts_from_momenta(model: Model) -> bool:
 def slider_names(model: Model) -> list[str]:
     """Return the names of sliders: scalar parameters, inputs, coordinates without rotations, velocities or momenta."""
     names = [name for name, value in model.parameters.items() if np.ndim(value) == 0]
-    names += getattr(model.system, "inputs", ())
+    names += model.system.inputs
     if model.array_system is not None or model.mesh is not None:
         return names
     turning = {name for each in model.system.rotations for name in each.coordinates}
@@ -79,7 +79,7 @@ def drawn_system_of_model(model: Model) -> DrawnSystem:
         coordinates=[each.name for each in system.coordinates], parameters=[each.name for each in system.parameters],
         rotations=[each.declaration for each in system.rotations], constraints=[], map_names=[],
     )  # fmt: skip
-    momenta, links = [each.name for each in system.momentum_symbols], getattr(system, "links", ())
+    momenta, links = [momentum.name for momentum in system.momentum_symbols], system.drawn_links
     shapes: dict[str, tuple[int, ...]] = {}
     for array in system.arrays:
         if sum(map(math.prod, shapes.values())) < system.dimension:
