@@ -127,8 +127,8 @@ class SVI(NodalMethod):
 
     @property
     def symmetric(self) -> bool:
-        """True if both the quadrature and the space of curves are symmetric."""
-        return self.rule.symmetric and self.curves.symmetric
+        """True if the quadrature is symmetric, as all spaces of curves are."""
+        return self.rule.symmetric
 
     @property
     def needs_regular(self) -> bool:

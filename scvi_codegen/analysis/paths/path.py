@@ -203,14 +203,8 @@ def path_of(
         return np.asarray(stepper.energy(q, p, at, values)), np.asarray(stepper.velocity(q, p, at, values))
 
     if closed is not None:
-        if nodes is None:
-            raise StateError("closed paths require start=: an array (steps + 1, m), or a function of time")
-        intervals.range_of_start = largest_range(nodes)
-        M, forced = _symmetry(stepper.interface, closed), bool(stepper.interface.exchange_names)
-        minimised = not (forced or isinstance(intervals, ReducedIntervals))
-        solution = solver.closed(
-            intervals, nodes[:count], M, minimise=minimised, symmetric=not forced, energy=start_energy, states=states
-        )
+        M = _symmetry(stepper.interface, closed)
+        solution = _closed_solution(intervals, nodes, M, start_energy, states)
         closed_path = _described(stepper, solution, begin, arguments, _checked(solution), M=M)
         _warn_at_rest(closed_path, duration)
         return closed_path
@@ -230,6 +224,20 @@ def path_of(
         solution = solver.AtEnergy(solution.intervals, start_energy, states).solved(solution.q, solution.iterations)
         comparison = _checked(solution)
     return _described(stepper, solution, begin, arguments, comparison, dropped=dropped)
+
+
+def _closed_solution(
+    intervals: Intervals, nodes: Array | None, M: Array, energy: float | None, states: solver.States
+) -> solver.Solution:
+    """Return the closed path q(T) = M q(0) near the nodes of a start."""
+    if nodes is None:
+        raise StateError("closed paths require start=: an array (steps + 1, m), or a function of time")
+    intervals.range_of_start = largest_range(nodes)
+    forced = bool(intervals.stepper.interface.exchange_names)
+    minimised = not (forced or isinstance(intervals, ReducedIntervals))
+    return solver.closed(
+        intervals, nodes[: len(intervals.h)], M, minimise=minimised, symmetric=not forced, energy=energy, states=states
+    )
 
 
 def different_paths(

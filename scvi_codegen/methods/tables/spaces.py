@@ -43,11 +43,6 @@ class CurveSpace(ABC):
         """Name that :func:`space_by_name` accepts."""
 
     @property
-    def symmetric(self) -> bool:
-        """True if the time reversal of a curve belongs to the space."""
-        return True
-
-    @property
     def nodal(self) -> bool:
         """True if values at nodes determine a curve, as for polynomials."""
         return False

@@ -103,19 +103,19 @@ class Rotation:
         if self.momentum:
             rates = Matrix(self.body_momentum(momenta_of(self.coordinates)))
         else:
-            rates = 2 * rates_matrix(q).T * v / Add(*(each**2 for each in q))
-        matrix = matrix_of(q) / Add(*(each**2 for each in q))
+            rates = 2 * rates_matrix(q).T * v / _product(q, q)
+        matrix = matrix_of(q) / _product(q, q)
         return dict(zip((*self.entries, *self.rates), (*matrix, *rates), strict=True))
 
     def scaling(self) -> Expr:
         """Return the rate of the scaling of the quaternion, 2 q . q_dot/|q|^2."""
         q, v = _vectors(self.coordinates)
-        return 2 * Add(*(a * b for a, b in zip(q, v, strict=True))) / Add(*(each**2 for each in q))
+        return 2 * _product(q, v) / _product(q, q)
 
     def forces(self, torque: Sequence[Expr]) -> tuple[Expr, ...]:
         """Return the four generalised forces 2 E(q) tau/|q|^2 of a torque in the body frame."""
         q, _ = _vectors(self.coordinates)
-        return tuple(2 * rates_matrix(q) * Matrix(torque) / Add(*(each**2 for each in q)))
+        return tuple(2 * rates_matrix(q) * Matrix(torque) / _product(q, q))
 
     def body_momentum(self, p: Sequence[Symbol]) -> tuple[Expr, ...]:
         """Return the angular momentum in the body frame, E(q)^T p/2."""
@@ -161,21 +161,20 @@ class Direction(_Vector):
     def values(self) -> dict[Symbol, Expr]:
         """Return the unit vector and its velocity by symbol, as functions of the vector and its velocity."""
         r, v = _vectors(self.coordinates)
-        n = r / sympy.sqrt(Add(*(each**2 for each in r)))
+        n = r / sympy.sqrt(_product(r, r))
         return dict(zip(self.entries, n, strict=True)) | dict(zip(self.rates, self.forces(v), strict=True))
 
     def scaling(self) -> Expr:
         """Return the rate of the scaling of the vector, r . r_dot/|r|^2."""
         r, v = _vectors(self.coordinates)
-        return Add(*(a * b for a, b in zip(r, v, strict=True))) / Add(*(each**2 for each in r))
+        return _product(r, v) / _product(r, r)
 
     def forces(self, force: Sequence[Expr]) -> tuple[Expr, ...]:
         """Return the three generalised forces (f - n (n . f))/|r| of a force on the unit vector."""
         r, _ = _vectors(self.coordinates)
-        length = sympy.sqrt(Add(*(each**2 for each in r)))
+        length = sympy.sqrt(_product(r, r))
         n = r / length
-        along = Add(*(a * b for a, b in zip(n, force, strict=True)))
-        return tuple((Matrix(force) - n * along) / length)
+        return tuple((Matrix(force) - n * _product(n, force)) / length)
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,6 +237,11 @@ def rates_matrix(q: Sequence[Expr]) -> Matrix:
     return Matrix([[-x, -y, -z], [w, -z, y], [z, w, -x], [-y, x, w]])
 
 
+def _product(a: Sequence[Expr], b: Sequence[Expr]) -> Expr:
+    """Return a . b."""
+    return Add(*(x * y for x, y in zip(a, b, strict=True)))
+
+
 def _vectors(names: Sequence[str]) -> tuple[Matrix, Matrix]:
     return Matrix([symbol(name) for name in names]), Matrix([symbol(name + DOT) for name in names])
 
@@ -276,10 +280,10 @@ class RotationNames:
         self.members = tuple(members)
         self.values: dict[Symbol, Expr] = {}
         for member in self.members:
-            for each, value in member.values().items():
-                if each in self.values:
-                    raise SystemDefinitionError(f"'{each}' has two meanings among rotations and directions: rename one")
-                self.values[each] = value
+            for name, value in member.values().items():
+                if name in self.values:
+                    raise SystemDefinitionError(f"'{name}' has two meanings among rotations and directions: rename one")
+                self.values[name] = value
 
     @classmethod
     def declared(
@@ -302,9 +306,9 @@ class RotationNames:
     def of_states(cls, declarations: Sequence[str], taken: Collection[str]) -> RotationNames:
         """Return the names in formulas of states, with body momenta of names that are not taken."""
         names = cls(cls.members_of(declarations))
-        for each in names.rotations:
-            momenta = each.body_momentum(momenta_of(each.coordinates))
-            names.values |= {name: p for name, p in zip(each.momenta, momenta, strict=True) if name.name not in taken}
+        for rotation in names.rotations:
+            pairs = zip(rotation.momenta, rotation.body_momentum(momenta_of(rotation.coordinates)), strict=True)
+            names.values |= {name: momentum for name, momentum in pairs if name.name not in taken}
         return names
 
     @staticmethod
@@ -343,11 +347,9 @@ class RotationNames:
 
     def gauge(self, inertia: Callable[[Rotation], Expr] = lambda _: S.One) -> Expr:
         """Return the energy (q . p)^2/(8 I0) of the scalings of quaternions, which is zero for q . p = 0."""
-        along = [
-            Add(*(symbol(q) * p for q, p in zip(member.coordinates, momenta_of(member.coordinates), strict=True)))
-            for member in self.rotations
-        ]
-        return Add(*(each**2 / (8 * inertia(member)) for member, each in zip(self.rotations, along, strict=True)))
+        pairs = ((tuple(map(symbol, each.coordinates)), momenta_of(each.coordinates)) for each in self.rotations)
+        along = [_product(q, p) for q, p in pairs]
+        return Add(*(q_p**2 / (8 * inertia(each)) for each, q_p in zip(self.rotations, along, strict=True)))
 
     def inertia(self, member: Homogeneous, reduced: Expr, parameters: Sequence[Symbol]) -> Expr:
         """Return I0 of a member: the mean of the diagonal of l's Hessian in its rates if that is constant, else 1."""

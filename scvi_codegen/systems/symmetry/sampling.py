@@ -93,7 +93,7 @@ def terms_among_few_bodies(term_groups: Sequence[TermGroup], bodies: Sequence[Bo
 def array_forces(
     term_groups: Sequence[TermGroup], coordinates: Sequence[Symbol], at_points: Mapping[Any, Any], count: int
 ) -> Sequence[Any]:
-    """Return the force on each coordinate at ``count`` points; ``at_points`` has coordinates, parameters and time there."""
+    """Return the force on each coordinate at ``count`` points; ``at_points``: positions, parameters and time there."""
     if not term_groups:
         return [0.0] * len(coordinates)
     q, force = np.array([at_points[each] for each in coordinates]), np.zeros((len(coordinates), count))
