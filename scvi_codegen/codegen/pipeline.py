@@ -175,7 +175,7 @@ def describe(
 
 def _interface(system: MechanicalSystem, method: Method, **of_kind: Any) -> Interface:
     """Return the interface of an integrator; ``of_kind``: what named coordinates and arrays have each in their way."""
-    inputs_act = "inputs act" if system.inputs else ""
+    inputs_act = "inputs act" if system.inputs else None
     return Interface(
         system=system.name,
         method=method.name,

@@ -264,17 +264,17 @@ class CachedArraySources(CachedSources):
 
         return ArraySources(self.system, self.method, self.solver, self.prefix, (), self.g, self.controller)
 
-    def of_run_time_sizes(self) -> tuple[Source | None, Interface, str]:
+    def of_run_time_sizes(self) -> tuple[Source | None, Interface, str | None]:
         """Return the C source for run-time sizes, or ``None``; the interface; the reason why there is none."""
 
         def derive() -> str:
             try:
-                return json.dumps([self.derived.integrator()[0].to_record(), ""])
+                return json.dumps([self.derived.integrator()[0].to_record(), None])
             except SizesRequiredError as error:
                 return json.dumps([None, str(error)])
 
         record, reason = json.loads(cached_source((*self.key, "integrator"), derive))
         interface = self.derived.interface
         if record:
-            return Source.from_record(record), interface, ""
+            return Source.from_record(record), interface, None
         return None, replace(interface, layout=replace(interface.layout, maps=())), reason

@@ -89,7 +89,7 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
     def __reduce__(self) -> tuple[Any, ...]:
         if self.origin is not None:
             return (_rebuild_bound, (self.origin, self.problem, self.events))
-        variants = Variants() if self._reason else self._variants
+        variants = self._variants if self._reason is None else Variants()
         made = partial(Stepper, variants=variants, flags=self.flags, events=self.events, reason=self._reason)
         further = {} if self._doubles is None or not self.events else {"_doubles": constantly(self._doubles())}
         return made, (self._plain, self.interface), further
@@ -443,7 +443,7 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
             raise StateError("omit h: the saved run contains its step size")
         control = ErrorControl(tolerance, absolute_tolerance, max_step)
         plan = self._plan(h, t_end, control) if t_end is not None or transformed else None
-        if self._reason:
+        if self._reason is not None:
             raise StateError(f"restore this run by with_sizes(...).from_checkpoint(saved): {self._reason}")
         if not self.interface.layout.coordinates:
             self._check_not_of_run(None, threads)
@@ -687,7 +687,7 @@ class StepperOfRunTimeSizes(Stepper):
             arguments = ()
         if at_rest and not arguments and named.get("p") is None and named.get("velocity") is None:
             layout = self.interface.layout
-            general = layout.momentum_formulas or (self._reason and not layout.momenta)
+            general = layout.momentum_formulas or (self._reason is not None and not layout.momenta)
             spins = any(each.startswith("spin") for each in bound.interface.rotations)
             if not (spins or bound.interface.variables):  # their state has momenta of its own
                 positions, *_ = bound._states.start(state, None, None)
@@ -701,9 +701,12 @@ class StepperOfRunTimeSizes(Stepper):
         shapes, (last, bound) = None if tables is not None else shapes_of_call(q, parameters, threads), self._last
         if shapes is None or shapes != last or bound is None:
             problem = sizes_of_run(self.interface, q, parameters, tables, threads)
-            if self._reason and problem.threads > 1:
+            if self._reason is None:
+                bound = self._bound_to(problem)
+            elif problem.threads > 1:
                 raise MethodError(f"omit threads: this system is compiled with the sizes of each call. {self._reason}")
-            bound = self.with_sizes(problem.sizes, tables=problem.places) if self._reason else self._bound_to(problem)
+            else:
+                bound = self.with_sizes(problem.sizes, tables=problem.places)
             self._last = shapes, bound
         if self.events:
             bound = bound.with_events(self.events)
@@ -747,13 +750,13 @@ class StepperOfRunTimeSizes(Stepper):
         raise MethodError(f"{self!r} requires sizes here: pass stepper.with_sizes(..). {SIZES_REQUIRED}")
 
     def _compile(self) -> None:
-        if not self._reason:
+        if self._reason is None:
             building.load(with_calls(self.source), flags=self.flags)
 
     @property
     def _has_error_estimate(self) -> bool:
         """True if the method has adaptive steps; also if that follows from the sizes."""
-        return bool(self._reason) or "advance_to" in self.source.contents.functions
+        return self._reason is not None or "advance_to" in self.source.contents.functions
 
 
 Stepper._of_run_time_sizes = StepperOfRunTimeSizes

@@ -303,15 +303,15 @@ class MechanicalSystem(Deferred, ABC):
         return any(self.time in formula.free_symbols for formula in (self.lagrangian, *self.forces, *self.constraints))
 
     @property
-    def changes_energy(self) -> str:
-        """Reason why energy is not conserved; empty if it is."""
+    def changes_energy(self) -> str | None:
+        """Reason why energy is not conserved; ``None`` if it is."""
         if self.forces or self.damping != 0:
             return "forces act" if self.forces else "damping takes it"
         if self._constraints_work():
             return "constraints do work"
         if self.time in self.lagrangian.free_symbols:
             return f"{'H' if self.auxiliaries else 'L'} depends on time"
-        return ""
+        return None
 
     @property
     def kinks(self) -> tuple[str, ...]:

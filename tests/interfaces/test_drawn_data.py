@@ -35,13 +35,20 @@ class Sines(sc.Trajectory):
 
 def motion(names: str, links: tuple[Any, ...] = ()) -> Any:
     """Return a trajectory whose coordinates are sines of t, and whose momenta are sines of 2 t."""
-    interface = SimpleNamespace(system="S", title="S by M", map_names=("a", "b"), changes_energy="", rotations=())
+    interface = SimpleNamespace(system="S", title="S by M", map_names=("a", "b"), changes_energy=None, rotations=())
     interface.coordinates, interface.momenta = (tuple(f"{p}{each}" for each in names.split()) for p in ("", "p_"))
     interface.arrays = interface.lengths = interface.parameters = ()
     interface.layout = SimpleNamespace(links=links, mesh=None, coordinates=())
     q, p = (np.sin(T[:, np.newaxis] * rate + 1.7 * np.arange(len(names.split()))) for rate in (1.0, 2.0))
     sizes: Any = {"step_sizes": np.full(41, 0.05), "h": 0.05, "plan": Fixed(0.05), "iterations": np.zeros(41, np.int32)}
-    return Sines(t=T, q=q, p=p, stepper=SimpleNamespace(interface=interface), parameters=np.zeros(0), **sizes)
+    return Sines(
+        t=T,
+        q=q,
+        p=p,
+        stepper=SimpleNamespace(interface=interface, changes_states=False),
+        parameters=np.zeros(0),
+        **sizes,
+    )
 
 
 PANELS: dict[str, tuple[str, list[str]]] = {

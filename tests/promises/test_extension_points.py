@@ -244,7 +244,7 @@ except SystemDefinitionError as refusal:
     print("the acceleration of x_dot: constraints are" in str(refusal), "rate(f(q, t)) = b(q, t)" in str(refusal))
 """
     lines = run(extended, script).splitlines()
-    assert lines == ["True True True True", "constraints do work | ", "True True", "True True"]
+    assert lines == ["True True True True", "constraints do work | None", "True True", "True True"]
 
 
 def test_documented_format_writes_trajectories_and_ensembles(extended: Path) -> None:

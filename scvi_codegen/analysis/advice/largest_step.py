@@ -91,7 +91,7 @@ def _longest(pilot: Callable[[float], tuple[float, int]], h: float, allowed: flo
 def _pilot(run: Run, end: float) -> tuple[float, int]:
     """Return the largest error of the first steps of a run, infinite if one fails, and their number."""
     error, done, fixed = 0.0, 0, isinstance(run.plan, FixedSteps)
-    while done < PILOT_STEPS and not run.arrived and not (fixed and (end - run.t) * run.h <= 0.0):
+    while done < PILOT_STEPS and not run.arrived and not (fixed and (end - run.t) * run._step_size <= 0.0):
         size = max(1, done)
         try:
             error = run.record(size, save_every=size).step_error

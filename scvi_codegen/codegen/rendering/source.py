@@ -338,7 +338,7 @@ class Interface:
         energy_parameter: of a time-transformed system, the parameter that is the energy of the initial state.
         time_transformation: time-rescaling function g in dt = g dtau that determines its step sizes.
         conserves_energy: whether energy is a first integral.
-        changes_energy: reason why it is not conserved; empty if it is.
+        changes_energy: reason why it is not conserved; ``None`` if it is.
         balances_energy: whether it changes by the work of forces or damping only.
         arrays: declarations of arrays of known sizes, first those whose entries are the coordinates in order, then
             those whose entries are parameters; none without arrays.
@@ -378,7 +378,7 @@ class Interface:
     constraints: tuple[str, ...] = ()
     inputs: tuple[str, ...] = ()
     conserves_energy: bool = False
-    changes_energy: str = ""
+    changes_energy: str | None = None
     balances_energy: bool = False
     solver: str = ""
     arrays: tuple[str, ...] = ()

@@ -24,7 +24,7 @@ def _step_size(model: Model, run: Any) -> float | None:
     """Return the fixed step size, or step of tau; ``None`` for adaptive steps."""
     match run.plan:
         case FixedSteps():
-            return model.h or run.h
+            return run.h if model.h is None else model.h
         case InTau(tau=tau):
             return tau
     return None

@@ -63,7 +63,7 @@ class RunOutcome:
         last step the run is left before that.
         """
         run, saved = self.run, self.trajectory
-        inside = saved.t[-1] != run.t and (saved.t[-1] - run.t) * run.h > 0.0
+        inside = saved.t[-1] != run.t and (saved.t[-1] - run.t) * run._step_size > 0.0
         return (float(saved.t[-1]), saved.q[-1], saved.p[-1]) if inside else (run.t, run.q, run.p)
 
 

@@ -270,7 +270,7 @@ class Model(TimeSpan):
         self.all_inputs()
         run = self.start(stepper)
         if self.in_transformed_time:
-            return run.h
+            return run._step_size
         run.advance(1)
         return run.t - self.t
 

@@ -96,7 +96,7 @@ def warn_of_error_growth(
         if grown >= LEAST_GROWTH and 2.0 * excess >= EXPONENT:
             _Repetition(run, states, advance_until).confirm(grown)
         return
-    if requested or run.steps * DECADES_PER_STEP >= _thresholds(plan.tolerance)[2]:
+    if requested or run.steps * DECADES_PER_STEP >= _thresholds(plan.admissible_error)[2]:
         _Repetition(run, states, advance_until).warn(requested=bool(requested))
 
 
@@ -117,7 +117,8 @@ def measured_growth(stepper: Integrator, plan: StepPlan, requested: bool | None)
     double = stepper.interface.words == 1 and not stepper.changes_states
     if requested is not None or not isinstance(plan, Adaptive) or not double or not warnings_wanted():
         return 0
-    return 1 + (plan.tolerance > ROUNDOFF) + (plan.tolerance > LOOSE_TOLERANCE)
+    tolerance = plan.tolerance
+    return 1 if tolerance is None else 1 + (tolerance > ROUNDOFF) + (tolerance > LOOSE_TOLERANCE)
 
 
 def _warn_of_amplification(what: str, difference: float, t: float) -> None:
@@ -142,7 +143,7 @@ class _Repetition:
 
     def __init__(self, run: Memory, states: SavedStates, advance_until: Callable[[float], None] | None) -> None:
         self.run, self.states, self.advance_until = run, states, advance_until or self._to
-        self.steps, self.tolerance = run.steps, self._plan().tolerance
+        self.steps, self.tolerance = run.steps, self._plan().admissible_error
         self.nudge, self.tolerable, self.decades = _thresholds(self.tolerance)
         self.reached, self.quarter = 0, 0.0
         self.firsts = first_of_groups(run.stepper.interface, len(run._q))

@@ -314,7 +314,7 @@ class Observation:
             part = record(self.run, size)
         except StepFailedError as error:
             part, failure = Trajectory.before(error), error
-        if self.end is not None and (part.t[-1] - self.end) * self.run.h >= 0.0:
+        if self.end is not None and (part.t[-1] - self.end) * self.run._step_size >= 0.0:
             self.run.rollback(before)
             part, failure = self._arrived(part, before), None
         if self.search is not None:
@@ -343,14 +343,16 @@ class Observation:
         """Return the chunk up to the final time, with a shorter last step; the run is left before that step."""
         assert self.end is not None
         self.arrived = True
-        whole = int(np.count_nonzero((self.end - part.t) * self.run.h >= 0.0)) - 1
+        whole = int(np.count_nonzero((self.end - part.t) * self.run._step_size >= 0.0)) - 1
         part = record(self.run, whole)
-        while self.run.left_to(self.end) * self.run.h < 0.0:  # rounded times tie: the previous step is the last one
+        while (
+            self.run.left_to(self.end) * self.run._step_size < 0.0
+        ):  # rounded times tie: the previous step is the last one
             self.run.rollback(before)
             whole -= 1
             part = record(self.run, whole)
         in_words = self.run.stepper.interface.words > 1 and self.run.stepper.interface.time_transformation is None
-        if whole and in_words and 0.0 < abs(self.run.left_to(self.end)) <= WHOLE * abs(self.run.h):
+        if whole and in_words and 0.0 < abs(self.run.left_to(self.end)) <= WHOLE * abs(self.run._step_size):
             self.run.rollback(before)  # the last step is longer than h by its rounding error
             whole -= 1
             part = record(self.run, whole)
@@ -359,7 +361,7 @@ class Observation:
         lengths[-1] = self.run.left_to(self.end) if tau is None else tau - part.stepped[-1]
         # The partial step starts from the state alone, not from the run: the memory of a run holds predictors for steps
         # of size h, and its state stays at the last whole step.
-        self.partial_steps = int(abs(lengths[-1]) > WHOLE * abs(self.run.h))
+        self.partial_steps = int(abs(lengths[-1]) > WHOLE * abs(self.run._step_size))
         if tau is None and lengths[-1] != 0.0:
             run = self.run
             if isinstance(q, Words):
@@ -377,8 +379,10 @@ class Observation:
         if part.tau is None or (left := run.left_to(t)) == 0.0:
             return part.q[-1], part.p[-1], None if part.tau is None else float(part.tau[-1])
         span = left if run.stepper.interface.words == 1 else fraction_of(t) - run._exact_time
-        q, p, x = part_of_step(run.stepper, 0.0, run.h, span, part.q[-1], part.p[-1], run.parameters, run.options)
-        return q, p, float(part.tau[-1]) + x * run.h
+        q, p, x = part_of_step(
+            run.stepper, 0.0, run._step_size, span, part.q[-1], part.p[-1], run.parameters, run.options
+        )
+        return q, p, float(part.tau[-1]) + x * run._step_size
 
     def _with_state(
         self, part: Trajectory, lengths: Array, t: float, q: Array, p: Array, tau: float | None

@@ -320,7 +320,9 @@ def prepared_segments(
         The number of steps of the segment; ``None`` for adaptive steps to the target time of the run.
     """
     if isinstance(run.plan, FixedSteps):
-        for segment in planned_segments(run._times[0], t_end, run.h, inputs, words=run.stepper.interface.words):
+        for segment in planned_segments(
+            run._times[0], t_end, run._step_size, inputs, words=run.stepper.interface.words
+        ):
             run.update(parameters=values(segment.middle), h=segment.h)
             if run.stepper.interface.words > 1 and segment.end is not None:
                 run._step_to(segment.end)
@@ -387,7 +389,7 @@ def with_final_state(piece: Trajectory, run: Run) -> Trajectory:
         q=np.concatenate([piece.q, run.q[None]]),
         p=np.concatenate([piece.p, run.p[None]]),
         iterations=np.append(piece.iterations, np.int32(iterations)),
-        step_sizes=np.append(piece.step_sizes, run.h),
+        step_sizes=np.append(piece.step_sizes, run._step_size),
     )
 
 

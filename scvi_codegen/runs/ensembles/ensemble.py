@@ -493,7 +493,7 @@ class Ensemble:
     def _fictitious_times(self, fixed: CommonSteps, count: int) -> Array:
         """Return tau of saved states, equal in all trajectories; NaN after the last common one, where t_end is in t."""
         tau = fixed.times(tau=True)[:count]
-        rows = self.stepper._states.missing((count,))
+        rows: Array = self.stepper._states.missing((count,))
         rows[: len(tau)] = tau
         return rows
 

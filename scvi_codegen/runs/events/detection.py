@@ -113,11 +113,11 @@ class CrossingSearch:
         status = advance(*arguments, *states, binding.whole_numbers(numbers[1:]), *to)
         self._record(crossings, int(filled[0]))
         report, count = run._report, int(run._report.stored) + 1
-        failure = self._failure(status, report, number + int(report.steps), run.h) if status else None
+        failure = self._failure(status, report, number + int(report.steps), run._step_size) if status else None
         if not (failure or self.ended or report.steps == size or run.arrived):
             self._capacity *= 2  # too small for the crossings of a step
         t, q, p, lengths = (each[:count] for each in rows)
-        sizes = np.append(lengths[1:], run.h or np.nan)
+        sizes = np.append(lengths[1:], np.nan if run.h is None else run.h)
         return (t, q, p, iterations[:count]), sizes, numbers[:count], failure
 
     def _record(self, crossings: Any, count: int) -> None:

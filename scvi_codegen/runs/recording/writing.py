@@ -111,7 +111,7 @@ def record_run(
         t=run.t,
         save_every=checked_count(save_every, "save_every", least=1),
         steps=_checked_steps(run, steps),
-        plan=Fixed(run.h) if isinstance(run.plan, FixedSteps) else run.plan,
+        plan=Fixed(run._step_size) if isinstance(run.plan, FixedSteps) else run.plan,
         rows=chunk_rows(run.stepper.dimension * run.stepper.interface.words)
         if rows is None
         else checked_count(rows, "rows", least=1),
@@ -370,7 +370,7 @@ def _checked_steps(run: Run, steps: int | None) -> int | None:
 def _extended(manifest: Manifest, run: Run, steps: int | None, t_end: float | None) -> tuple[Manifest, StepPlan]:
     if isinstance(run.plan, FixedSteps):
         if t_end is not None:
-            raise StateError(f"the run has fixed steps h = {run.h:g}: give steps instead of t_end")
+            raise StateError(f"the run has fixed steps h = {run._step_size:g}: give steps instead of t_end")
         wanted = manifest.steps if steps is None else steps
         return replace(manifest, steps=checked_count(wanted, "steps", least=0)), run.plan
     _checked_steps(run, steps)

@@ -13,7 +13,7 @@ One state takes 0.65 microseconds there, four times as long as a step of the run
 """
 
 from fractions import Fraction
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -120,7 +120,9 @@ def stepped_to(
 ) -> tuple[Array, Array]:
     """Return the state after one step from (1,) time t of two words to ``end``, whose size has two words as well."""
     if states.stepper.in_tau:
-        return part_of_step(states.stepper, t[0], states.h, end, q, p, states.parameters, states.options)[:2]
+        return part_of_step(states.stepper, t[0], cast(float, states.h), end, q, p, states.parameters, states.options)[
+            :2
+        ]
     settings: dict[str, Any] = {"parameters": states.parameters, "options": states.options}
     run = Memory.started(
         states.stepper, q, p, plan=Fixed(float(end - Fraction(float(t[0])))), t=float(t[0]), **settings

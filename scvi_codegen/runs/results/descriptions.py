@@ -12,7 +12,7 @@ def describe_run(run: Memory) -> str:
     interface, unset = run.stepper.interface, ", ".join(run._unset_inputs)
     plan = "" if isinstance(run.plan, FixedSteps) else f", t_end = {run.plan.t_end:g}"
     solved = f", solver {interface.solver}" if interface.solver else ""
-    steps = f"{run.steps} steps{describe_step_size(run.h, run.plan, tau=interface.in_tau)}"
+    steps = f"{run.steps} steps{describe_step_size(run._step_size, run.plan, tau=interface.in_tau)}"
     waits = f", inputs not set: {unset}" if unset else ""
     return one_line(run, short_title(interface), f"t = {run.t:g} after {steps}{plan}{solved}{waits}")
 

@@ -14,24 +14,23 @@ MOST_BALANCED_STEPS, MOST_BALANCED_COORDINATES = 10_000, 12
 """Limits for a balance that was not asked for: Newton's iteration repeats each step, in some tens of microseconds."""
 
 
-def energy_reason(stepper: Any) -> str:
-    """Return why the energy of a motion changes, so that its change is no error; empty if it is conserved."""
-    if getattr(stepper, "changes_states", False):
-        return "events change the state"
-    return str(stepper.interface.changes_energy)
+def energy_reason(stepper: Any) -> str | None:
+    """Return why the energy of a motion changes, so that its change is no error; ``None`` if it is conserved."""
+    reason: str | None = "events change the state" if stepper.changes_states else stepper.interface.changes_energy
+    return reason
 
 
 class EnergyAccount(NamedTuple):
     """Change of the energy along saved states.
 
     Attributes:
-        reason: why the exact energy changes; empty if it is conserved.
+        reason: why the exact energy changes; ``None`` if it is conserved.
         initial: energy of the first state; 0 if it is at most 1e-8 of p.v, as of a pendulum that starts horizontally.
         change: (n,) E - E0.
         work: (n,) work of forces and damping, and energy exchanged at events; ``None`` if unknown or none.
     """
 
-    reason: str
+    reason: str | None
     initial: float
     change: Array
     work: Array | None = None
@@ -39,7 +38,7 @@ class EnergyAccount(NamedTuple):
     @property
     def is_error(self) -> bool:
         """True if :attr:`values` are errors: the energy is conserved, or its work is known."""
-        return not self.reason or self.work is not None
+        return self.reason is None or self.work is not None
 
     @property
     def values(self) -> Array:
@@ -70,11 +69,11 @@ def energy_account(states: Any, *, limited: bool = False) -> EnergyAccount:
     """
     energy = np.asanyarray(states.energy())
     stepper: Any = getattr(states, "stepper", None)
-    reason = "" if stepper is None else energy_reason(stepper)
+    reason = None if stepper is None else energy_reason(stepper)
     long = limited and not (
         0 < getattr(states, "steps", 0) <= MOST_BALANCED_STEPS and stepper.dimension <= MOST_BALANCED_COORDINATES
     )
-    known = reason and hasattr(states, "_exchanged_energy") and not long
+    known = reason is not None and hasattr(states, "_exchanged_energy") and not long
     work = states._exchanged_energy(energy) if known else None
     initial, change = float(energy[0]), energy - energy[:1]
     if np.abs(change).max() > 1e-3 * abs(initial) and hasattr(states, "velocity"):

@@ -312,18 +312,19 @@ def _homogeneous(interface: Interface, q: Any) -> Any:
     return {**q, **{name: np.zeros((*shape, len(arrays[name].letters))) for name, shape in shapes.items()}}
 
 
-def check_few_coordinates(interface: Interface, sizes: Mapping[str, int], reason: str) -> None:
+def check_few_coordinates(interface: Interface, sizes: Mapping[str, int], reason: str | None) -> None:
     """Raise :class:`MethodError` unless all sizes are known and there are few coordinates."""
     if missing := [name for name in interface.layout.sizes if name not in sizes]:
         raise MethodError(f"the size {missing[0]} is missing: give with_sizes({missing[0]}=...)")
     count = sum(int(np.prod(array.shape(sizes))) for array in interface.layout.coordinates)
-    of_mesh = reason and interface.layout.mesh and interface.solver == "newton"
+    of_mesh = reason is not None and interface.layout.mesh is not None and interface.solver == "newton"
     most = MOST_OF_MESH if of_mesh else MOST_COORDINATES
     if count > most:
+        remark = "" if reason is None else f". {reason}"
         raise MethodError(
             f"{count} coordinates are too many to compile with known sizes, which this requires: at most "
             f"{most}. Reduce the sizes; derivatives of larger systems are differences of runs"
-            f"{'. ' * bool(reason)}{reason}"
+            f"{remark}"
         )
 
 

@@ -110,7 +110,7 @@ class CompiledMethod(ChosenBySizes):
         flags: tuple[str, ...] = building.TUNED_FLAGS,
         events: tuple[Event, ...] = (),
         of_sizes: Callable[..., Any] | None = None,
-        reason: str = "",
+        reason: str | None = None,
         origin: Self | None = None,
         problem: RunSizes | None = None,
     ) -> None:

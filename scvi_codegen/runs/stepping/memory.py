@@ -274,8 +274,13 @@ class Memory:
                 call.t_end = plan.t_end
 
     @property
-    def h(self) -> float:
-        """Step size, 0 for adaptive steps."""
+    def h(self) -> float | None:
+        """Step size; ``None`` for adaptive steps and steps of tau."""
+        return None if self._h is None else float(self._memory.h)
+
+    @property
+    def _step_size(self) -> float:
+        """Size of the next one of fixed steps; in C 0 for others."""
         return float(self._memory.h)
 
     @property
@@ -479,7 +484,7 @@ class Memory:
     def _failure(self, status: int) -> StepFailedError:
         remark = singular_position(self.stepper, self._q, self.t, self._parameters)
         failures = self.stepper.binding.failures
-        return step_failure(status, self._report, step=self.steps, h=self.h, remark=remark, failures=failures)
+        return step_failure(status, self._report, step=self.steps, h=self._step_size, remark=remark, failures=failures)
 
     def _taken(self, steps: int) -> int:
         if self._unset_inputs and steps:

@@ -62,17 +62,22 @@ class Adaptive:
 
     Attributes:
         t_end: target time.
-        tolerance: admissible relative error of a step; errors below round-off count as round-off.
+        tolerance: admissible relative error of a step; ``None`` for round-off.
         max_step: largest step size.
         first_step: size of the first trial step; ``None`` if trials determine it.
         absolute_tolerance: the absolute tolerances that are not 0.
     """
 
     t_end: float
-    tolerance: float = 0.0
+    tolerance: float | None = None
     max_step: float = math.inf
     first_step: float | None = None
     absolute_tolerance: AbsoluteTolerance = ()
+
+    @property
+    def admissible_error(self) -> float:
+        """Admissible relative error of a step in C, where errors below round-off count as round-off."""
+        return 0.0 if self.tolerance is None else self.tolerance
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +148,7 @@ class ErrorControl(NamedTuple):
         """Return the arguments of a step plan."""
         absolute: Any = plan.absolute_tolerance
         return cls(
-            plan.tolerance or None,
+            plan.tolerance,
             (dict(absolute) or None) if isinstance(absolute, tuple) else absolute,
             None if plan.max_step == math.inf else plan.max_step,
             plan.first_step,
@@ -271,7 +276,7 @@ def step_control(stepper: Any, plan: StepPlan) -> tuple[Any, ...]:
             if stepper.interface.words > 1:
                 _check_resolved(plan.tolerance, binding.function("smallest_tolerance")())
             control = binding.new("step_control *")
-            control.tolerance, control.max_step = plan.tolerance, plan.max_step
+            control.tolerance, control.max_step = plan.admissible_error, plan.max_step
             first, absolute = binding.null, np.empty(0)
             if plan.first_step is not None:
                 first = binding.numbers("double *")
@@ -300,16 +305,18 @@ def check_max_step(plan: StepPlan, t: float, words: int = 1) -> None:
         )
 
 
-def _check_resolved(tolerance: float, least: float) -> None:
-    """Raise ``StateError`` if error estimates do not resolve a tolerance, or round-off, 0, in double-double arithmetic.
+def _check_resolved(tolerance: float | None, least: float) -> None:
+    """Raise ``StateError`` if error estimates do not resolve a tolerance, or round-off, in double-double arithmetic.
 
     The estimates are computed in double from the leading coefficient of the curve of a step. Of methods whose order is
     lower than that of this coefficient squared, as ``sc``, it is a rounding error while the step still has an error.
     """
-    if (tolerance or ROUNDOFF_OF_TWO_WORDS) < least:
-        wanted = f"tolerance={tolerance:g}" if tolerance else "the default tolerance, round-off,"
+    required, label = ROUNDOFF_OF_TWO_WORDS, "the default tolerance, round-off,"
+    if tolerance is not None:
+        required, label = tolerance, f"tolerance={tolerance:g}"
+    if required < least:
         raise StateError(
-            f"{wanted} cannot be met: adaptive steps of this method resolve errors of {least:.1e} in double-double "
+            f"{label} cannot be met: adaptive steps of this method resolve errors of {least:.1e} in double-double "
             f"arithmetic. Give tolerance={least:.1e} or more, fixed steps h=, or svi, whose estimates resolve "
             "round-off without constraints"
         )

@@ -419,15 +419,15 @@ class ArraySystem(OfRunTimeSizes, MechanicalSystem):
         return tuple(dict.fromkeys(access.sums for access, _ in self.accesses if access.sums))
 
     @property
-    def changes_energy(self) -> str:
-        """Reason why energy is not conserved; empty if it is."""
+    def changes_energy(self) -> str | None:
+        """Reason why energy is not conserved; ``None`` if it is."""
         if self.forces:
             return "forces act"
         if self.damping != 0:
             return "damping takes it"
         if any(self.time in term.formula.free_symbols for term in self.constraints):
             return "constraints depend on time"
-        return f"the {self.function} depends on time" if self.depends_on_time else ""
+        return f"the {self.function} depends on time" if self.depends_on_time else None
 
     @property
     def kinks(self) -> tuple[str, ...]:

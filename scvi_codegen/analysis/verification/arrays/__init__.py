@@ -72,7 +72,7 @@ def verify_arrays(
     parameters = dict(zip(stepper.interface.parameters, arrays.numbers, strict=True))
     if stepper.source is None or system.coupled_terms or tolerance is not None or system.constraints:
         unrolled = unroll_sums(system, arrays.sizes, tables=arrays.places, parameters={**parameters, **arrays.fields})
-        options: dict[str, Any] = {"h": run.h, "t": run.t, "tolerance": tolerance}
+        options: dict[str, Any] = {"h": run._step_size, "t": run.t, "tolerance": tolerance}
         if with_events.events:
             options["stepper"] = compile_stepper(unrolled, resolved, flags=with_events.flags, events=with_events.events)
         if system.constraints and isinstance(resolved, StoermerVerlet):
@@ -80,9 +80,11 @@ def verify_arrays(
         certificate = of_known_sizes(unrolled, resolved, run.q, run.p, **options)
         if stepper.source is None:
             return certificate
-        loops = SystemUnderTest(unrolled, resolved, _bound(stepper, arrays), None, State(run.q, run.p, run.t, run.h))
+        loops = SystemUnderTest(
+            unrolled, resolved, _bound(stepper, arrays), None, State(run.q, run.p, run.t, run._step_size)
+        )
         return replace(certificate, checks=(*_unrolled_checks(loops), *certificate.checks))
-    start = WholeStart(system, resolved, stepper, arrays, run.stepper.arrays(run.p), run.h, run.t)
+    start = WholeStart(system, resolved, stepper, arrays, run.stepper.arrays(run.p), run._step_size, run.t)
     tested = _subject(start)
     checks = (
         *_unrolled_checks(tested),

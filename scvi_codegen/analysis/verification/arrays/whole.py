@@ -101,7 +101,7 @@ def _rates(start: WholeStart) -> Finding:
         )
         unit = EPSILON * (size + noise / PERTURBATION) or 1.0
         for name, exact in derivatives.items():
-            rate = ((after[name] - before[name]) + low[name]) / run.h
+            rate = ((after[name] - before[name]) + low[name]) / run._step_size
             worst = max(worst, float(np.abs(rate - exact).max(initial=0.0)) / unit)
     return Finding(worst, ROUNDINGS, "in units of rounding")
 
@@ -173,16 +173,18 @@ def _reversal(start: WholeStart) -> Finding:
     run = start.run()
     run.advance(1)
     q1, p1 = run.stepper.arrays(run.q), run.stepper.arrays(run.p)
-    back = start.begin(q1, p1, -run.h, run.t)
+    back = start.begin(q1, p1, -run._step_size, run.t)
     back.advance(1)
     q2, p2 = back.stepper.arrays(back.q), back.stepper.arrays(back.p)
     masses = {} if start.system.momenta else _masses(start)
     inverse = {name: 1.0 / masses[name] if masses else np.ones(()) for name in start.p}
     lengths = [np.abs(each) for each in (*start.arrays.state.values(), *q1.values())]
-    lengths += [np.abs(run.h * p * inverse[name]) for state in (start.p, p1) for name, p in state.items()]
+    lengths += [np.abs(run._step_size * p * inverse[name]) for state in (start.p, p1) for name, p in state.items()]
     size = max(float(each.max(initial=0.0)) for each in lengths) or 1.0
     difference = [np.abs(q2[name] - q).max(initial=0.0) for name, q in start.arrays.state.items()]
-    difference += [np.abs(run.h * inverse[name] * (p2[name] - p)).max(initial=0.0) for name, p in start.p.items()]
+    difference += [
+        np.abs(run._step_size * inverse[name] * (p2[name] - p)).max(initial=0.0) for name, p in start.p.items()
+    ]
     return Finding(float(max(difference)) / size, ROUNDINGS * EPSILON, "relative to the largest coordinate")
 
 
@@ -198,7 +200,7 @@ def _long_run(start: WholeStart, sizes: str) -> Iterator[Check]:
         statement, remark = f"at {sizes} energy and momentum maps", str(failure)
         yield Check(name="conserved", statement=statement, outcome=Outcome.NOT_MEASURED, remark=remark)
         return
-    walk, where = ROUNDINGS * EPSILON * float(np.sqrt(steps)), f"{steps} steps of {run.h:g}"
+    walk, where = ROUNDINGS * EPSILON * float(np.sqrt(steps)), f"{steps} steps of {run._step_size:g}"
     change = abs(run.energy - before[2]) / (abs(before[0]) + abs(before[1]) or 1.0)
     if not start.system.changes_energy:
         if start.method.symplectic and run.step_error < RESOLVED:
