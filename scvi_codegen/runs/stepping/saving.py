@@ -103,11 +103,7 @@ def _read(
         binding: Any = stepper  # of run-time sizes
         stepper = binding._bound_to(problem).with_events(stepper.events)
     values = np.frombuffer(rest, count=stepper.interface.words * len(stepper.defaults), offset=first)
-    if stepper.interface.words == 1:
-        known = stepper.parameters_by_name(values)
-    else:
-        numbers = from_block(values)
-        known = {name: numbers[k : k + 1].reshape(()) for k, name in enumerate(stepper.parameters)}
+    known = stepper.parameters_by_name(values if stepper.interface.words == 1 else from_block(values))
     for name in header["unset inputs"]:
         del known[f"{name}_0"]
     control = ErrorControl(**header.get("control", {}))

@@ -247,9 +247,10 @@ class StateFunctions(CompiledMethod):
         return self._states.parameters(parameters, base)
 
     def parameters_by_name(self, values: Array) -> dict[str, Any]:
-        """Return (k,) parameters by name; those of arrays of run-time sizes as arrays."""
+        """Return (k,) parameters of one or two words by name; those of arrays of run-time sizes as arrays."""
         interface = self.interface if self.problem is None or self.origin is None else self.origin.interface
-        result: dict[str, Any] = dict(zip(interface.parameters, values.tolist(), strict=self.problem is None))
+        numbers = list(values) if interface.words > 1 else values.tolist()
+        result: dict[str, Any] = dict(zip(interface.parameters, numbers, strict=self.problem is None))
         if self.problem is not None:
             fields = [(field.name, field.shape(self.problem.sizes)) for field in interface.layout.fields]
             result |= by_name(np.asarray(values)[len(interface.parameters) :], fields)
