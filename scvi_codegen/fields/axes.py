@@ -60,7 +60,7 @@ class Cells:
         loop: over them; ``None`` for a single cell.
         index: index of the cell.
         places: of the points that a cell uses; a whole number is the end, 0 or 1, whose value is prescribed.
-        table: name of the table whose row contains all of these points, else "".
+        table: name of the table whose row contains all of these points, if there is one.
         interior: whether the ends of elements have no weight, because they are edges.
         edge: whether it is an end of two elements, whose points follow each other.
         operators: in place of those of the axis.
@@ -70,7 +70,7 @@ class Cells:
     loop: Loop | None
     index: Place
     places: tuple[Place | int, ...]
-    table: str = ""
+    table: str | None = None
     interior: bool = False
     edge: bool = False
     operators: tuple[Matrix, ...] = ()

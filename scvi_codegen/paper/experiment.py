@@ -215,7 +215,7 @@ class Panel:
         log: logarithmic axes: ``""``, ``"x"``, ``"y"`` or ``"xy"``.
         equal: True for equal scales of both axes.
         window: (lowest, highest) of both axes, or ``None``.
-        floor: errors below it are round-off and shaded; 0 for none.
+        floor: errors below it are round-off and shaded, if there is such a level.
     """
 
     title: str
@@ -225,7 +225,7 @@ class Panel:
     log: str = ""
     equal: bool = False
     window: tuple[float, float] | None = None
-    floor: float = 0.0
+    floor: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -296,7 +296,7 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
         axes.set_yscale("log")
     elif not panel.equal:
         axes.ticklabel_format(useOffset=False)
-    if panel.floor:
+    if panel.floor is not None:
         bottom, top = axes.get_ylim()
         axes.set_ylim(max(bottom, panel.floor / 100), min(top, 10.0))
         axes.axhspan(panel.floor / 1e9, panel.floor, color=COLORS["exact"], alpha=0.15, linewidth=0)

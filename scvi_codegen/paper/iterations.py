@@ -75,8 +75,10 @@ def attraction(q: Array) -> Array:
     return result
 
 
-def picard_step(equations: Equations, q: Array, p: Array, h: float, tolerance: float) -> tuple[Array, Array, int]:
-    """Return (q, p) after a step, and the number of iterations until max |dQ| < tolerance; 0 without convergence."""
+def picard_step(
+    equations: Equations, q: Array, p: Array, h: float, tolerance: float
+) -> tuple[Array, Array, int] | None:
+    """Return (q, p) after a step, and the number of iterations until max |dQ| < tolerance, if they converge."""
     line = q + h * np.outer(equations.c, p)
     positions = np.tile(q, (len(line), 1))
     for count in range(1, SECTION_3.max_iterations + 1):
@@ -88,7 +90,7 @@ def picard_step(equations: Equations, q: Array, p: Array, h: float, tolerance: f
             return positions[-1], p + h * (equations.momentum @ forces), count
         if not np.isfinite(size):
             break
-    return q, p, 0
+    return None
 
 
 class Count(NamedTuple):
@@ -128,9 +130,9 @@ def picard_counts(number: int, beyond: int = 1, tolerance: float = SECTION_3.tol
 def _picard_count(e: float, key: Key, beyond: int, tolerance: float) -> Count:
     (h, n, scheme), (q, p), counts, energy = key, map(np.array, perihelion(e)), list[int](), 0.0
     for _ in range(round(SPAN / h)):
-        q, p, count = picard_step(equations_of(scheme, n - beyond, n), q, p, h, tolerance)
-        if not count:
+        if (converged := picard_step(equations_of(scheme, n - beyond, n), q, p, h, tolerance)) is None:
             return Count(None, None)
+        q, p, count = converged
         counts.append(count)
         energy = max(energy, float(abs(p @ p - 2.0 / np.hypot(*q) + 1.0)))
     return Count(max(counts), sum(counts), energy)

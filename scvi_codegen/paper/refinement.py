@@ -108,7 +108,7 @@ class ErrorCurve(NamedTuple):
     """Errors of one scheme over N, or of one scheme and N over h.
 
     Attributes:
-        case, what, scheme, n: problem, quantity, scheme, and N (0 over N).
+        case, what, scheme, n: problem, quantity, scheme, and N, which curves over N have not.
         x, errors: N or h, and errors.
         law: fitted line, ``None`` if there is no error but round-off.
     """
@@ -116,7 +116,7 @@ class ErrorCurve(NamedTuple):
     case: StepCase
     what: str
     scheme: str
-    n: int
+    n: int | None
     x: Array
     errors: Array
     law: Law | None
@@ -160,11 +160,11 @@ class Study:
             each
             for quantity in self.quantities
             for case in self.cases
-            for n in (LEGEND if not self.degrees else (0,))
+            for n in ((None,) if self.degrees else LEGEND)
             for each in (self._curve(case, quantity, scheme, n) for scheme in SCHEMES)
         ]
 
-    def _curve(self, case: StepCase, quantity: str, scheme: str, n: int) -> ErrorCurve:
+    def _curve(self, case: StepCase, quantity: str, scheme: str, n: int | None) -> ErrorCurve:
         counts = [n] if n else [degree + case.beyond for degree in self.degrees[scheme]]
         errors = np.array([step_errors(case, scheme, k, h)[quantity] for k in counts for h in self.steps])
         x = np.array(self.steps if n else counts, dtype=float)
@@ -227,7 +227,7 @@ def refinement(name: str, title: str, study: Study) -> Experiment:
         picture = Picture(panels=tuple(_panels(study, curves)), columns=len(study.cases), size=(4.5, 4.0))
         none, rows = (None, None), list[tuple[Cell, ...]]()
         for c in curves:
-            rows.append((c.case.title, c.scheme, c.n or None, c.what, *(c.law or none), *(study.printed(c) or none)))
+            rows.append((c.case.title, c.scheme, c.n, c.what, *(c.law or none), *(study.printed(c) or none)))
         table = TableBlock(columns=COLUMNS, rows=tuple(rows), formats=dict.fromkeys(COLUMNS[4:], ".2g"))
         return Result(
             setting=study.sentences,
@@ -316,7 +316,7 @@ def _step_checks(study: Study, curves: Sequence[ErrorCurve]) -> Iterator[Compari
 
 def _panels(study: Study, curves: Sequence[ErrorCurve]) -> Iterator[Panel]:
     """Yield a panel for each quantity and case; the paper's lines are dotted."""
-    looks = {0: ("o", "-"), **dict(zip(LEGEND, (("o", "-"), ("s", "--"), ("D", "-.")), strict=True))}
+    looks = dict(zip((None, *LEGEND), (("o", "-"), ("o", "-"), ("s", "--"), ("D", "-.")), strict=True))
     for quantity, case in product(study.quantities, study.cases):
         series = []
         for c in (c for c in curves if c.what == quantity and c.case is case):

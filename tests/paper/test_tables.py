@@ -50,7 +50,7 @@ def test_picard_iteration_converges_to_the_compiled_step(degree):
 
 def test_diverging_picard_iteration_is_reported():
     q, v = map(np.array, perihelion(0.2))
-    assert iterations.picard_step(iterations.equations_of("SVI", 1, 2), q, v, 5.0, 1e-14)[2] == 0
+    assert iterations.picard_step(iterations.equations_of("SVI", 1, 2), q, v, 5.0, 1e-14) is None
 
 
 @pytest.mark.full

@@ -105,10 +105,10 @@ def test_file_size_limit_is_reported_with_the_state_of_the_run(kepler):
 
 @pytest.fixture
 def small_disk(tmp_path) -> Iterator[Path]:
-    """A disk of 400 kB, where one can be made."""
+    """A disk of 1 MB, where one can be made: more than a manifest with its C source."""
     folder = tmp_path / "disk"
     folder.mkdir()
-    command = ["mount", "-t", "tmpfs", "-o", "size=600k", "tmpfs", str(folder)]
+    command = ["mount", "-t", "tmpfs", "-o", "size=1M", "tmpfs", str(folder)]
     needs("mount", "umount")
     if subprocess.run(command, capture_output=True, check=False).returncode:
         pytest.skip("no disk can be mounted here")

@@ -77,7 +77,7 @@ def casadi_flow(stepper: Stepper, *, steps: int, save_every: int | None = None, 
     sizes = (m, m, len(stepper.parameters), 1, 1)
     arguments = [ca.MX.sym(word, size) for word, size in zip(FLOW_ARGUMENTS, sizes, strict=True)]
     states = ca.external(name, str(library.path))(ca.vertcat(*arguments))
-    states = states if flow.save_every else states[:, -1]
+    states = states[:, -1] if flow.save_every is None else states
     result = [states[:m, :], states[m:, :]]
     missing = float("nan")
     defaults = [missing, missing, missing if stepper.parameters else 0.0, 0.0, missing]

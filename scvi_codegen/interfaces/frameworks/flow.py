@@ -33,12 +33,13 @@ class Flow:
     Attributes:
         stepper: compiled stepper.
         steps: number of steps.
-        save_every: steps between saved states, the first of which is the initial one; 0 to return only the final state.
+        save_every: steps between saved states, the first of which is the initial one; by default only the final state
+            is saved.
     """
 
     stepper: Stepper
     steps: int
-    save_every: int
+    save_every: int | None
 
     @classmethod
     def checked(cls, stepper: Stepper, steps: int, save_every: int | None) -> Self:
@@ -51,8 +52,7 @@ class Flow:
         require(stepper, "flow")
         stepper = stepper.known
         steps = checked_count(steps, "steps", least=1)
-        save_every = 0 if save_every is None else checked_count(save_every, "save_every", least=1)
-        if save_every and steps % save_every:
+        if save_every is not None and steps % (save_every := checked_count(save_every, "save_every", least=1)):
             raise StateError(
                 f"steps = {steps} must be a multiple of save_every = {save_every}, so that the final state is saved"
             )
@@ -67,7 +67,7 @@ class Flow:
     @property
     def spacing(self) -> int:
         """Steps between saved states in C, which always saves the final one."""
-        return self.save_every or self.steps
+        return self.steps if self.save_every is None else self.save_every
 
     @property
     def saved_states(self) -> int:
@@ -147,7 +147,7 @@ class ArrayFlow(Flow):
         )
         ends = [self._number(t, "t"), self._number(h, "h")]
         result = self._along(self._concatenated(self._vector(q, m, "q"), self._vector(p, m, "p"), *arguments, *ends))
-        result = result if self.save_every else result[..., -1, :]
+        result = result[..., -1, :] if self.save_every is None else result
         return result[..., :m], result[..., m:]
 
     def _number(self, value: Any, name: str) -> Any:

@@ -168,29 +168,30 @@ def _attraction(system: LagrangianSystem) -> tuple[int, float, list[float]]:
         at = [system.coordinates, system.velocities]
         formula = sympy.lambdify(at, system.lagrangian.subs(system.constants), "numpy")
         for axes in (3, 2):
-            if system.dimension % axes == 0 and system.dimension > axes:
-                G, masses = _fitted(formula, system.dimension, axes)
-                if G > 0.0:
-                    return axes, G, masses.tolist()
+            several = system.dimension % axes == 0 and system.dimension > axes
+            if several and (gravity := _fitted(formula, system.dimension, axes)) is not None:
+                G, masses = gravity
+                return axes, G, masses.tolist()
     raise SystemDefinitionError(
         f"'{system.name}' is not a system of bodies with Newtonian gravity in Cartesian coordinates, one body after "
         "the other"
     )
 
 
-def _fitted(formula: Callable[[Array, Array], float], m: int, axes: int) -> tuple[float, Array]:
-    """Return G and the masses, fitted to L at random states and tested at others; G = 0 if L has another form."""
+def _fitted(formula: Callable[[Array, Array], float], m: int, axes: int) -> tuple[float, Array] | None:
+    """Return G and the masses, fitted to L at random states and tested at others; ``None`` if L has another form."""
+    # L = sum m_i v_i^2/2 + G sum m_i m_j/r_ij: masses from L at unit velocities, G from L at rest
     positions, motions = np.random.default_rng(1).normal(size=(2, 4, m))
     rest = np.zeros(m)
     masses = np.array([2.0 * (formula(positions[0], v) - formula(positions[0], rest)) for v in np.eye(m)[::axes]])
     if not np.all(masses > 0.0):
-        return 0.0, masses
+        return None
     shapes = np.array([_inverse_distances(q.reshape(-1, axes), masses) for q in positions])
     G = formula(positions[0], rest) / shapes[0]
     kinetic = 0.5 * motions**2 @ np.repeat(masses, axes)
-    result = [[formula(q, rest), formula(q, v)] for q, v in zip(positions, motions, strict=True)]
-    agrees = np.allclose(result, np.transpose([G * shapes, kinetic + G * shapes]), rtol=RELATIVE_TOLERANCE, atol=0.0)
-    return float(G) if agrees else 0.0, masses
+    values = [[formula(q, rest), formula(q, v)] for q, v in zip(positions, motions, strict=True)]
+    agrees = np.allclose(values, np.transpose([G * shapes, kinetic + G * shapes]), rtol=RELATIVE_TOLERANCE, atol=0.0)
+    return (float(G), masses) if agrees and G > 0.0 else None
 
 
 def _inverse_distances(positions: Array, masses: Array) -> float:
