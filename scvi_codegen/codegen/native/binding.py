@@ -232,10 +232,10 @@ class Binding:
         """Return the C struct, NULL for the defaults."""
         if options is None or checked_options(options) is None:
             return self.null
-        chosen = self._ffi.new(f"{self._prefix}_options *")
-        chosen.tolerance, chosen.max_iterations = options.tolerance, options.max_iterations
-        chosen.absolute = options.absolute
-        return chosen
+        struct = self.new("options *")
+        struct.tolerance, struct.max_iterations = options.tolerance, options.max_iterations
+        struct.absolute = options.absolute
+        return struct
 
 
 def _format(kind: Any) -> tuple[Any, tuple[int, ...]]:

@@ -120,12 +120,12 @@ def find_compiler() -> tuple[str, ...]:
     Raises:
         BuildError: if there is none.
     """
-    chosen = os.environ.get("CC")
-    if chosen:
+    setting = os.environ.get("CC")
+    if setting:
         command = words_of("CC")
         if not command or shutil.which(command[0]) is None:
             raise BuildError(
-                f"the compiler in the environment variable CC ({chosen!r}) was not found: correct or unset CC"
+                f"the compiler in the environment variable CC ({setting!r}) was not found: correct or unset CC"
             )
         return command
     for name in ("cc", "gcc", "clang"):

@@ -51,13 +51,13 @@ def compiled_kernel(text: str, architecture: str, **options: Any) -> bytes:
         MissingLibraryError: without the extra ``cuda``.
         BuildError: if NVRTC rejects the text.
     """
-    chosen = {**OPTIONS, **options}
+    settings = {**OPTIONS, **options}
 
     def compiled() -> str:
         with announced(f"compiling {text.count(chr(10)):,} lines of CUDA C++ for {architecture}"):
             return base64.b64encode(build(text, architecture, **options)).decode("ascii")
 
-    key = ("cubin", text, repr(sorted(chosen.items())), compiler_version(), architecture)
+    key = ("cubin", text, repr(sorted(settings.items())), compiler_version(), architecture)
     return base64.b64decode(cached_source(key, compiled))
 
 

@@ -49,7 +49,7 @@ def functions_of(code: str) -> dict[str, Function]:
     return {name: _function(match, matches) for name, match in matches.items()}
 
 
-def _function(match: re.Match[str], known: Mapping[str, re.Match[str]]) -> Function:
+def _function(match: re.Match[str], matches: Mapping[str, re.Match[str]]) -> Function:
     called = dict.fromkeys(re.findall(r"\b(\w+)\(", match["body"]))
     return Function(
         name=match["name"],
@@ -61,7 +61,7 @@ def _function(match: re.Match[str], known: Mapping[str, re.Match[str]]) -> Funct
         comment=" ".join((match["comment"] or "").replace("\n *", " ").split()),
         body=match["body"],
         text=match["text"],
-        calls=tuple(name for name in called if name in known and name != match["name"]),
+        calls=tuple(name for name in called if name in matches and name != match["name"]),
     )
 
 

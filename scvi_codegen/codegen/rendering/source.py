@@ -28,8 +28,8 @@ KINDS: dict[str, Callable[[Any], bool]] = {
     "str | None": lambda value: value is None or isinstance(value, str),
     "int": lambda value: type(value) is int and 0 <= value < 2**40,
     "bool": lambda value: isinstance(value, bool),
-    "tuple[str, ...]": lambda value: isinstance(value, tuple) and all(isinstance(each, str) for each in value),
-    "tuple[bool, ...]": lambda value: isinstance(value, tuple) and all(isinstance(each, bool) for each in value),
+    "tuple[str, ...]": lambda value: isinstance(value, tuple) and all(isinstance(entry, str) for entry in value),
+    "tuple[bool, ...]": lambda value: isinstance(value, tuple) and all(isinstance(entry, bool) for entry in value),
     "tuple[float, ...]": lambda value: isinstance(value, tuple) and all(map(_is_number, value)),
     "tuple[tuple[str, ...], ...]": lambda value: isinstance(value, tuple) and all(map(KINDS["tuple[str, ...]"], value)),
     "ArrayLayout": lambda value: False,
@@ -40,9 +40,10 @@ KINDS: dict[str, Callable[[Any], bool]] = {
 def _checked(cls: type, record: Mapping[str, Any]) -> dict[str, Any]:
     """Return arguments of a dataclass from JSON; raise :class:`ValueError` for a value of another type."""
     arguments: dict[str, Any] = {key: _as_tuples(value) for key, value in record.items()}
-    for each in fields(cls):
-        if each.name in arguments and not KINDS[str(each.type)](arguments[each.name]):
-            raise ValueError(f"{each.name} is {arguments[each.name]!r:.60}: it must be of type {each.type}")
+    for attribute in fields(cls):
+        name, kind = attribute.name, str(attribute.type)
+        if name in arguments and not KINDS[kind](arguments[name]):
+            raise ValueError(f"{name} is {arguments[name]!r:.60}: it must be of type {kind}")
     return arguments
 
 
@@ -206,9 +207,9 @@ DECLARED = re.compile(r"rotation [A-Za-z]\w* [A-Za-z]\w*( momentum)?|(direction|
 
 def _as_tuples(value: Any) -> Any:
     """Return a value of JSON with tuples in place of lists, and of lists in them."""
-    return (
-        tuple(tuple(each) if isinstance(each, list) else each for each in value) if isinstance(value, list) else value
-    )
+    if not isinstance(value, list):
+        return value
+    return tuple(tuple(entry) if isinstance(entry, list) else entry for entry in value)
 
 
 def _is_number(value: Any) -> bool:
@@ -237,9 +238,9 @@ def check_interface(source: Source, interface: Interface) -> None:
     lengths["defaults"] = (len(interface.defaults), len(interface.parameters))
     lengths["momentum_names"] = (len(interface.momentum_names), interface.dimension if interface.momentum_names else 0)
     lengths["map_formulas"] = (len(interface.map_formulas), len(interface.map_names))
-    for name, (length, wanted) in lengths.items():
-        if length != wanted:
-            raise ValueError(f"{name}: the interface has {length}; {wanted} is required")
+    for name, (length, required) in lengths.items():
+        if length != required:
+            raise ValueError(f"{name}: the interface has {length}; {required} is required")
     _check_lengths(interface)
     _check_names(source, interface)
 
@@ -247,13 +248,16 @@ def check_interface(source: Source, interface: Interface) -> None:
 def _check_lengths(interface: Interface) -> None:
     """Raise :class:`ValueError` if the lengths of neighbours are not those of lists with a cutoff, in parameters."""
     with_cutoff: set[str] = set()
-    for each in interface.lengths:
-        with_cutoff |= {each[0]} if each[1:2] == ("cutoff",) else set()
-        if len(each) != 3 or each[0] not in with_cutoff or each[1] not in ("cutoff", "skin", "box"):
-            raise ValueError(f"lengths: {each!r} must be neighbours, cutoff, skin or box, and a formula, cutoffs first")
-        unknown = {*NAME_IN_FORMULA.findall(each[2])} - {*interface.parameters, "pi"}
-        if unknown or not (NUMBER.fullmatch(each[2]) or re.search("[A-Za-z]", each[2])):
-            raise ValueError(f"lengths: {each[2]!r} must be a formula of the parameters {interface.parameters}")
+    for length in interface.lengths:
+        with_cutoff |= {length[0]} if length[1:2] == ("cutoff",) else set()
+        if len(length) != 3 or length[0] not in with_cutoff or length[1] not in ("cutoff", "skin", "box"):
+            raise ValueError(
+                f"lengths: {length!r} must be neighbours, cutoff, skin or box, and a formula, cutoffs first"
+            )
+        formula = length[2]
+        unknown = {*NAME_IN_FORMULA.findall(formula)} - {*interface.parameters, "pi"}
+        if unknown or not (NUMBER.fullmatch(formula) or re.search("[A-Za-z]", formula)):
+            raise ValueError(f"lengths: {formula!r} must be a formula of the parameters {interface.parameters}")
 
 
 def _check_names(source: Source, interface: Interface) -> None:
@@ -409,7 +413,7 @@ class Interface:
     @property
     def index_values(self) -> dict[str, Any]:
         """:attr:`indices` by name: whole numbers, and rows of whole numbers."""
-        return {name: json.loads(value) for name, value in (each.split(" = ") for each in self.indices)}
+        return {name: json.loads(value) for name, value in (declaration.split(" = ") for declaration in self.indices)}
 
     def about(self) -> dict[str, str]:
         """Return title, system, method, and version of this package, to accompany every computed number."""

@@ -6,7 +6,6 @@ costs an operation for each product, and pays off in kernels of few operations, 
 """
 
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -28,36 +27,36 @@ class _Product(NamedTuple):
 def with_factors_in_roots(kernel: Kernel) -> Kernel:
     """Return the kernel with products of a root as ``inverse_root_k_times(x, factor)``, if they are few."""
     rewritten = _Rewriting(kernel).kernel()
-    roots = [each for each in _operations(kernel) if each.operator.startswith(INVERSE_ROOT)]
-    made = [each for each in _operations(rewritten) if each.operator.startswith(INVERSE_ROOT)]
-    products = Counter(each.operator.endswith(TIMES) for each in made)
+    roots = _roots(kernel)
+    products = Counter(root.operator.endswith(TIMES) for root in _roots(rewritten))
     few = 0 < len(roots) <= MOST_ROOTS and not products[False] and products[True] <= MOST_PRODUCTS
     return rewritten if few and not kernel.sums else kernel
 
 
-def _operations(kernel: Kernel) -> Iterator[Operation]:
-    every = subexpressions(*kernel.temporaries, *kernel.results)
-    return (each for each in every if isinstance(each, Operation))
+def _roots(kernel: Kernel) -> list[Operation]:
+    """Return the inverse roots of a kernel, with or without a factor."""
+    operations = (x for x in subexpressions(*kernel.temporaries, *kernel.results) if isinstance(x, Operation))
+    return [operation for operation in operations if operation.operator.startswith(INVERSE_ROOT)]
 
 
 class _Rewriting:
     """Kernel whose temporaries that are products with a root are parts of the products that use them."""
 
     def __init__(self, kernel: Kernel) -> None:
-        self.given = kernel
+        self.original = kernel
         self.temporaries: list[Expression] = []
         self.loads: dict[int, Expression] = {}
         self.products: dict[int, _Product] = {}
 
     def kernel(self) -> Kernel:
-        for k, expression in enumerate(self.given.temporaries):
+        for k, expression in enumerate(self.original.temporaries):
             product = self.product(expression)
             if product is None:
                 self.loads[k] = self.temporary(self.rewritten(expression))
             else:
                 self.products[k] = product
-        results = tuple(self.rewritten(each) for each in self.given.results)
-        return replace(self.given, temporaries=tuple(self.temporaries), results=results)
+        results = tuple(map(self.rewritten, self.original.results))
+        return replace(self.original, temporaries=tuple(self.temporaries), results=results)
 
     def temporary(self, expression: Expression) -> Expression:
         """Return a load of a new temporary."""
@@ -77,15 +76,16 @@ class _Rewriting:
             )
         if expression.operator not in ("neg", "*"):
             return None
-        found = [self.product(each) for each in expression.operands]
-        roots = [each for each in found if each is not None]
-        if len(roots) != 1:
+        products = [(operand, self.product(operand)) for operand in expression.operands]
+        with_root = [product for _, product in products if product is not None]
+        if len(with_root) != 1:
             return None
-        others = [self.rewritten(each) for each, root in zip(expression.operands, found, strict=True) if root is None]
-        one = roots[0]
-        if expression.operator == "neg":
-            return one._replace(factor=Operation("neg", (one.factor or Constant(1),)))
-        return one._replace(factor=Operation("*", (one.factor, others[0])) if one.factor else others[0])
+        product, factor = with_root[0], with_root[0].factor
+        if expression.operator == "neg":  # -(r f) = r (-f)
+            return product._replace(factor=Operation("neg", (factor or Constant(1),)))
+        other = next(self.rewritten(operand) for operand, within in products if within is None)
+        # (r f) g = r (f g)
+        return product._replace(factor=Operation("*", (factor, other)) if factor else other)
 
     def rewritten(self, expression: Expression) -> Expression:
         product = self.product(expression)
