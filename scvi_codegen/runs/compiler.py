@@ -31,7 +31,7 @@ from scvi_codegen.common.errors import MethodError, SizesRequiredError
 from scvi_codegen.common.validation import TEXTS, OfRunTimeSizes, check_kind, checks_arguments
 from scvi_codegen.methods import SVI, StoermerVerlet, as_method, default_method
 from scvi_codegen.methods.method import Method
-from scvi_codegen.runs.stepper import Stepper
+from scvi_codegen.runs.stepper import Stepper, StepperOfRunTimeSizes
 from scvi_codegen.runs.stepping.compiled_method import Variants
 from scvi_codegen.systems.event import Event, EventLike, as_events
 from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED
@@ -153,7 +153,7 @@ def _compile_arrays(
         method = SVI(1, "gauss-lobatto:2")  # the name of RATTLE for known sizes
     of_sizes = partial(compile_stepper, system, method, **common)
     arguments: dict[str, Any] = {"variants": sources.variants, "flags": common["flags"], "events": events}
-    return Stepper(source, interface, **arguments, of_sizes=of_sizes, reason=reason)
+    return StepperOfRunTimeSizes(source, interface, **arguments, of_sizes=of_sizes, reason=reason)
 
 
 def second_stepper(system: MechanicalSystem) -> Callable[[], Stepper]:

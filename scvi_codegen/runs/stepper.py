@@ -90,7 +90,7 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         if self.origin is not None:
             return (_rebuild_bound, (self.origin, self.problem, self.events))
         variants = self._variants if self._reason is None else Variants()
-        made = partial(Stepper, variants=variants, flags=self.flags, events=self.events, reason=self._reason)
+        made = partial(type(self), variants=variants, flags=self.flags, events=self.events, reason=self._reason)
         further = {} if self._doubles is None or not self.events else {"_doubles": constantly(self._doubles())}
         return made, (self._plain, self.interface), further
 
@@ -757,9 +757,6 @@ class StepperOfRunTimeSizes(Stepper):
     def _has_error_estimate(self) -> bool:
         """True if the method has adaptive steps; also if that follows from the sizes."""
         return self._reason is not None or "advance_to" in self.source.contents.functions
-
-
-Stepper._of_run_time_sizes = StepperOfRunTimeSizes
 
 
 def _check(

@@ -63,7 +63,7 @@ def stepper_of(method="svi:2", *, g=None, tau=None, events=None, precision="doub
 
 def loaded(stepper):
     """Return a stepper from its C source alone."""
-    return sc.Stepper(stepper.source, stepper.interface, flags=QUICK_FLAGS)
+    return type(stepper)(stepper.source, stepper.interface, flags=QUICK_FLAGS)
 
 
 FIRST_ORDER = {"coordinates": ["q", "r"], "lagrangian": "q*r_dot - (q**2 + r**2)/2"}

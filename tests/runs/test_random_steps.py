@@ -184,7 +184,7 @@ def test_comparison_with_half_steps_does_not_change_an_array_run(solver, steps):
         assert headers != source.support
         return dataclasses.replace(source, support=headers)
 
-    all_of_them = sc.Stepper(comparing(few.source), few.interface, flags=few.flags)
+    all_of_them = type(few)(comparing(few.source), few.interface, flags=few.flags)
     start = np.random.default_rng(1).normal(size=1100)
     wanted = few.integrate(start, **steps)
     assert wanted.steps > 5

@@ -69,18 +69,7 @@ class Variants:
         return (Variants, (self._made,))
 
 
-class ChosenBySizes:
-    """Base class whose subclasses become ``_of_run_time_sizes`` for arrays of run-time sizes that are not bound."""
-
-    _of_run_time_sizes: type[Any] | None = None
-
-    def __new__(cls, source: Source | None, interface: Interface, *, problem: RunSizes | None = None, **_: Any) -> Self:
-        """Return an instance of the class for these sizes."""
-        chosen = cls._of_run_time_sizes if interface.layout.coordinates and problem is None else None
-        return cast(Self, object.__new__(chosen or cls))
-
-
-class CompiledMethod(ChosenBySizes):
+class CompiledMethod:
     """A method compiled for one system.
 
     Attributes:

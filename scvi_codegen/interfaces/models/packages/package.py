@@ -33,7 +33,7 @@ from scvi_codegen.common.atomic import read_text, write_text
 from scvi_codegen.common.errors import PackageError
 from scvi_codegen.common.validation import ArgumentType, checks_arguments
 from scvi_codegen.runs.states.layout import layout_of
-from scvi_codegen.runs.stepper import Stepper
+from scvi_codegen.runs.stepper import Stepper, StepperOfRunTimeSizes
 from scvi_codegen.runs.stepping.compiled_method import Variants
 from scvi_codegen.systems.event import Event
 
@@ -295,7 +295,7 @@ def _stepper_of_arrays(folder: Path) -> Stepper:
     if model.array_system is None:
         raise damaged(folder, KeyError("interface"))
     interface = ArraySources(model.array_system, model.method, model.solver, prefix).interface
-    return Stepper(source_in(folder, prefix), interface)
+    return StepperOfRunTimeSizes(source_in(folder, prefix), interface)
 
 
 def _texts(model: Model, prefix: str, embedded: Embedded | None, *, single_file: bool) -> dict[str, str]:
