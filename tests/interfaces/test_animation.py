@@ -1,7 +1,6 @@
 """Animations: what moves is found, frames are states at equal times, files are whole."""
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -72,9 +71,9 @@ def test_links_are_where_mujoco_has_them(name):
         else:
             values[joint] = at[0]
     names, turning = [q.name for q in system.coordinates], [each.declaration for each in system.rotations]
-    interface = SimpleNamespace(coordinates=names, parameters=(), rotations=turning)
+    momenta = [f"p_{name}" for name in names]
     shape = shape_of(
-        DrawnSystem(interface=interface, momenta=[f"p_{name}" for name in names], shapes={}, links=system.links)
+        DrawnSystem(coordinates=names, momenta=momenta, parameters=(), rotations=turning, shapes={}, links=system.links)
     )
     q = np.array([[values[name] for name in names]])
     points = shape.positions(np.zeros(1), q, q, ())[0]

@@ -355,7 +355,10 @@ def _drawn_system(model: Model, interface: Interface) -> DrawnSystem:
         return np.asarray(model.stepper().energy(q, p, model.t, model.parameters), dtype=float)
 
     drawn = drawn_system_of_model(model)
-    return drawn if model.array_system is not None else replace(drawn, interface=interface, energy=energy)
+    if model.array_system is not None:
+        return drawn
+    names = {name: getattr(interface, name) for name in ("coordinates", "parameters", "rotations")}
+    return replace(drawn, **names, constraints=interface.constraints, map_names=interface.map_names, energy=energy)
 
 
 def _description(shown: Page, interface: Interface, *, initial: bool) -> dict[str, Any]:

@@ -30,7 +30,7 @@ from scvi_codegen.interfaces.pictures.canvas import (
     style,
 )
 from scvi_codegen.interfaces.pictures.recognition import shape_of
-from scvi_codegen.interfaces.pictures.shape import DrawnSystem, MovingShape, shape_of_picture
+from scvi_codegen.interfaces.pictures.shape import DrawnSystem, MovingShape, entry_names, shape_of_picture
 from scvi_codegen.runs.stepping.step_plan import FixedSteps
 from scvi_codegen.runs.trajectory import Trajectory
 
@@ -51,7 +51,9 @@ def drawn_system_of(motion: Trajectory) -> DrawnSystem:
         return np.asarray(stepper.energy(q, p, motion.t[0], motion.parameters), dtype=float)
 
     return DrawnSystem(
-        interface=interface, momenta=interface.momenta, shapes=shapes, energy=None if layout.coordinates else energy,
+        coordinates=interface.coordinates or entry_names(shapes), momenta=interface.momenta,
+        parameters=interface.parameters, rotations=interface.rotations, constraints=interface.constraints,
+        map_names=interface.map_names, shapes=shapes, energy=None if layout.coordinates else energy,
         mesh=layout.mesh, links=layout.links, lengths=interface.lengths,
         tables=stepper.binding.sizes.places if layout.coordinates else {},
     )  # fmt: skip

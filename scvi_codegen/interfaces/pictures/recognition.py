@@ -43,7 +43,7 @@ def shape_of(drawn: DrawnSystem) -> MovingShape:
         return _robot(drawn)
     if drawn.mesh is not None and len(drawn.mesh.axes) < 3:
         return graph_of(drawn.nodes, drawn.mesh.field_system.fields)
-    if drawn.interface.rotations:
+    if drawn.rotations:
         return _solids(drawn)
     if found := bodies(names) or bodies([*names, *drawn.momenta]):
         return _bodies(drawn, found)
@@ -79,7 +79,7 @@ def _particles(drawn: DrawnSystem, shape: tuple[int, ...]) -> MovingShape:
     bonds = np.asarray(drawn.tables.get("bonds", ()))
     if bonds.ndim == 2 and bonds.shape[1] == 2 and bonds.size and bonds.max() < count:
         marks.insert(0, {"kind": "bonds", "points": bonds.ravel().tolist()})
-    program, known = PointProgram(drawn.names), {name: symbol(name) for name in drawn.interface.parameters}
+    program, known = PointProgram(drawn.names), {name: symbol(name) for name in drawn.parameters}
     periods = [parse_expression(text, known) for _, kind, text in drawn.lengths if kind == "box"]
     box = program.point(periods[:dimension])
     return MovingShape(dimension=dimension, points=points, program=program.entries, marks=marks, box=box)
@@ -107,7 +107,7 @@ def _rods(
     rods: list[dict[str, Any]] = []
     known = {name: symbol(name) for name in drawn.names}
     names = [[drawn.names[1 + column] for column in body.columns] for body in found]
-    for text in drawn.interface.constraints:
+    for text in drawn.constraints:
         try:
             constraint = parse_expression(text, known)
         except ExpressionError:
@@ -193,7 +193,7 @@ def _curvilinear(drawn: DrawnSystem) -> MovingShape | None:
     """Return a body at its position if the kinetic energy is that of a particle in curvilinear coordinates."""
     if drawn.energy is None:
         return None
-    m = len(drawn.interface.coordinates)
+    m = len(drawn.coordinates)
     states = np.array([[0.7, 0.9, 0.4], [1.1, 0.5, 1.3], [0.6, 1.2, 2.0]])[:, :m]
     pairs = [a + b for a, b in combinations(np.eye(m), 2)]
     try:
@@ -212,7 +212,7 @@ def _curvilinear(drawn: DrawnSystem) -> MovingShape | None:
 
 def _orbit(drawn: DrawnSystem, kind: str) -> MovingShape:
     """Return a body in curvilinear coordinates; in a uniform field of gravity, down is down."""
-    names = drawn.interface.coordinates
+    names = drawn.coordinates
     a, b, *more = map(symbol, names)
     sin, cos = sympy.sin, sympy.cos
     link: list[dict[str, Any]] = [{"kind": "pivot", "points": [0]}]
@@ -259,8 +259,8 @@ def _solids(drawn: DrawnSystem) -> MovingShape:
 
     They are at (x, y, z), else several rotations, and members of arrays, are side by side.
     """
-    interface, program = drawn.interface, PointProgram(drawn.names)
-    members = RotationNames.members_of(interface.rotations)
+    program = PointProgram(drawn.names)
+    members = RotationNames.members_of(drawn.rotations)
     moving = all(name in drawn.coordinates for name in "xyz")
     apart = SPACING if not moving and (drawn.shapes or isinstance(members[-1], Rotation)) else 0
     points: list[list[int]] = []
@@ -273,7 +273,7 @@ def _solids(drawn: DrawnSystem) -> MovingShape:
         if isinstance(member, Rotation):
             matrix = Matrix(3, 3, [values[each] for each in member.entries])
             points += [program.point(centre + matrix[:, axis]) for axis in range(3)]
-            symmetric = f"body momentum 3 of {member.name}" in interface.map_names
+            symmetric = f"body momentum 3 of {member.name}" in drawn.map_names
             kind = "top" if symmetric else "box"
             marks.append({"kind": kind, "points": [place, first, first + 1, first + 2], "color": number})
             marks.append({"kind": "body", "points": [first + 2], "mass": 0.1, "color": number + 1})
@@ -294,7 +294,7 @@ def _robot(drawn: DrawnSystem) -> MovingShape:
     A_i = A_p C_i R(q_i), its origin is o_p + A_p r_i.
     """
     links, joints = drawn.links, {link.name: link for link in drawn.links}
-    members = {each.name: each for each in RotationNames.members_of(drawn.interface.rotations)}
+    members = {each.name: each for each in RotationNames.members_of(drawn.rotations)}
     origins: list[Matrix] = []
     turns: list[Matrix] = []
     for link in links:

@@ -141,8 +141,8 @@ class DrawnSystem:
     """System whose states are drawn, from a trajectory or a model.
 
     Attributes:
-        interface: names of coordinates and parameters, rotations, constraints and maps.
-        momenta: names of the momenta.
+        coordinates, momenta, parameters: names; coordinates of arrays are those of their entries.
+        rotations, constraints, map_names: as of :class:`~scvi_codegen.codegen.rendering.source.Interface`.
         shapes: shapes of the arrays whose entries are the coordinates, in order; none of named coordinates.
         energy: energies (n,) of states q and p (n, m); ``None`` of arrays whose sizes are known at run time.
         mesh: of fields of a density.
@@ -151,11 +151,15 @@ class DrawnSystem:
         tables: index tables by name.
     """
 
-    interface: Any
+    coordinates: Sequence[str]
     momenta: Sequence[str]
+    parameters: Sequence[str]
     shapes: Mapping[str, tuple[int, ...]]
     energy: Callable[[Values, Values], Values] | None = None
     mesh: Any = None
+    rotations: Sequence[str] = ()
+    constraints: Sequence[str] = ()
+    map_names: Sequence[str] = ()
     links: Sequence[Any] = ()
     lengths: Sequence[Sequence[str]] = ()
     tables: Mapping[str, Any] = field(default_factory=dict)
@@ -165,31 +169,27 @@ class DrawnSystem:
         """Nodes of the mesh by axis."""
         return {axis.name: axis.points.tolist() for axis in self.mesh.axes}
 
-    @property
-    def coordinates(self) -> list[str]:
-        """Names of the coordinates, ``q_0_1`` of the entries of arrays."""
-        if self.interface.coordinates:
-            return [*self.interface.coordinates]
-        return [
-            "_".join(map(str, (name, *index))) for name, shape in self.shapes.items() for index in np.ndindex(*shape)
-        ]
-
     @cached_property
     def names(self) -> list[str]:
         """Names of the registers of a state."""
         names = self.coordinates
         momenta = [f"p_{name}" for name in names] if self.shapes else self.momenta
-        return [TIME, *names, *momenta, *self.interface.parameters]
+        return [TIME, *names, *momenta, *self.parameters]
 
     def parameter(self, starts: Sequence[str], number: Any) -> str | float:
         """Return the name of the parameter of a body, m1 or m_1 or m; 1 if there is none."""
         names = [f"{start}{end}" for end in (number, f"_{number}", "") for start in starts]
-        return next((name for name in names if name in self.interface.parameters), 1.0)
+        return next((name for name in names if name in self.parameters), 1.0)
 
     def potential(self, *states: Any) -> Values:
         """Return energies at rest."""
         q = np.array(states, dtype=float)
         return self.energy(q, np.zeros_like(q)) if self.energy else np.zeros(len(q))
+
+
+def entry_names(shapes: Mapping[str, tuple[int, ...]]) -> list[str]:
+    """Return the names of the entries of arrays, ``q_0_1``."""
+    return ["_".join(map(str, (name, *index))) for name, shape in shapes.items() for index in np.ndindex(*shape)]
 
 
 def graph_of(axes: Mapping[str, Any], fields: Sequence[str], *, dots: bool = False) -> MovingShape:
@@ -236,7 +236,7 @@ def shape_of_picture(drawn: DrawnSystem, picture: Mapping[str, Any], where: str 
     formulas = [_components(reader, each, f"{where} points {name}") for name, each in points.items()]
     if len({*map(len, formulas)}) > 1:
         raise ModelFileError(f"{where} points must all have two components, in the plane, or all three, in space")
-    state = {symbol(each) for each in drawn.names[: len(drawn.names) - len(drawn.interface.parameters)]}
+    state = {symbol(each) for each in drawn.names[: len(drawn.names) - len(drawn.parameters)]}
     moving = [name for name, each in zip(names, formulas, strict=True) if any(x.free_symbols & state for x in each)]
     marks: list[dict[str, Any]] = []
     for key in MARKS[:3]:
@@ -291,7 +291,7 @@ def _chosen_fields(drawn: DrawnSystem, names: Sequence[Any], where: str) -> Movi
 
 def _reader(drawn: DrawnSystem) -> Callable[[str], Expr]:
     """Return a function that parses formulas in the names of a state."""
-    names = RotationNames.of_states(drawn.interface.rotations, drawn.names)
+    names = RotationNames.of_states(drawn.rotations, drawn.names)
     moving = {symbol(f"{each}{DOT}") for each in names.coordinates}
     turning = {each.name: each for each, value in names.values.items() if not value.free_symbols & moving}
     known = turning | {name: symbol(name) for name in drawn.names}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ from scvi_codegen.common.errors import ModelFileError
 from scvi_codegen.interfaces.models.model import Model
 from scvi_codegen.interfaces.models.model_files.sections import Section, check_keys
 from scvi_codegen.interfaces.models.options import real
-from scvi_codegen.interfaces.pictures.shape import MARKS, DrawnSystem, shape_of_picture
+from scvi_codegen.interfaces.pictures.shape import MARKS, DrawnSystem, entry_names, shape_of_picture
 from scvi_codegen.systems.hamiltonian import HamiltonianSystem
 
 PAGE_KEYS = ("ranges", "speed", "plots")
@@ -68,24 +67,31 @@ def check_page(section: Section, model: Model, where: str = "[page]") -> None:
 
 def drawn_system_of_model(model: Model) -> DrawnSystem:
     """Return what formulas of a picture may use of a model: names of coordinates, momenta, parameters and rotations."""
-    system, scalars = model.system, [name for name, value in model.parameters.items() if np.ndim(value) == 0]
+    system = model.system
     if model.array_system is not None:
-        interface = SimpleNamespace(coordinates=[], parameters=scalars, rotations=[], constraints=[], map_names=[])
-        sized = {name: np.shape(values) for name, values in model.q.items()}
+        shapes = {name: np.shape(values) for name, values in model.q.items()}
         return DrawnSystem(
-            interface=interface, momenta=[], shapes=sized, mesh=model.mesh, lengths=system.lengths, tables=model.tables
+            coordinates=entry_names(shapes),
+            momenta=[],
+            parameters=[name for name, value in model.parameters.items() if np.ndim(value) == 0],
+            shapes=shapes,
+            mesh=model.mesh,
+            lengths=system.lengths,
+            tables=model.tables,
         )
-    interface = SimpleNamespace(
-        coordinates=[each.name for each in system.coordinates], parameters=[each.name for each in system.parameters],
-        rotations=[each.declaration for each in system.rotations], constraints=[], map_names=[],
-    )  # fmt: skip
-    momenta, links = [momentum.name for momentum in system.momentum_symbols], system.drawn_links
-    shapes: dict[str, tuple[int, ...]] = {}
+    shapes = {}
     for array in system.arrays:
         if sum(map(math.prod, shapes.values())) < system.dimension:
             shapes[array.name] = array.shape({})
     return DrawnSystem(
-        interface=interface, momenta=momenta, shapes=shapes, mesh=model.mesh, links=links, lengths=system.lengths
+        coordinates=[coordinate.name for coordinate in system.coordinates],
+        momenta=[momentum.name for momentum in system.momentum_symbols],
+        parameters=[parameter.name for parameter in system.parameters],
+        rotations=[rotation.declaration for rotation in system.rotations],
+        shapes=shapes,
+        mesh=model.mesh,
+        links=system.drawn_links,
+        lengths=system.lengths,
     )
 
 
