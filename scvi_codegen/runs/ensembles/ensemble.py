@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import pairwise
 from typing import Any, NamedTuple, cast
@@ -64,7 +64,7 @@ from scvi_codegen.runs.stepping.step_plan import (
     planned_steps,
 )
 from scvi_codegen.runs.trajectory import Trajectory
-from scvi_codegen.systems.event import Crossings, Event
+from scvi_codegen.systems.event import Crossings
 
 
 class SavedLane(NamedTuple):
@@ -98,8 +98,76 @@ class SavedLane(NamedTuple):
         return self._replace(t=self.t[ends], q=self.q[ends], p=self.p[ends], actions=actions, status=TOO_MANY_STATES)
 
 
+@dataclass(slots=True, kw_only=True)
+class EnsembleSettings:
+    """Arguments of ``integrate_ensemble`` but the initial state, for one stepper."""
+
+    inputs: Mapping[str, Any] | None = None
+    h: float | None = None
+    steps: int | None = None
+    t_end: ArrayLike | None = None
+    tolerance: float | None = None
+    absolute_tolerance: float | Mapping[str, float] | None = None
+    max_step: float | None = None
+    first_step: float | None = None
+    save_every: int = 1
+    t: float = 0.0
+    t_eval: ArrayLike | None = None
+    parameters: EnsembleParameters = None
+    options: SolverOptions | None = None
+    error: float | None = None
+    device: str | None = None
+    observe: str | None = None
+
+    @property
+    def control(self) -> ErrorControl:
+        """Arguments of adaptive steps."""
+        return ErrorControl(self.tolerance, self.absolute_tolerance, self.max_step, self.first_step)
+
+    def check(self, stepper: Any) -> None:
+        """Raise an error for arguments that exclude each other, or that the stepper excludes."""
+        check_device(self.device, self.h, error=self.error, t_eval=self.t_eval)
+        if self.observe is not None:
+            check_together(observe=self.observe, inputs=self.inputs, error=self.error, t_eval=self.t_eval)
+            require(stepper, "observe_ensemble")
+        if self.device is not None:
+            require(stepper, "device")
+        if self.records_events(stepper):
+            check_together(events=stepper.events, device=self.device, observe_ensemble=self.observe)
+            require(stepper, "ensemble_events")
+
+    def records_events(self, stepper: Any) -> bool:
+        """Return whether trajectories record the events of the stepper, which may be counted instead."""
+        return bool(stepper.events) and self.observe != "events"
+
+    def steps_or_end(self, t: float, words: int) -> tuple[int | None, ArrayLike | None]:
+        """Return the number of common steps or the final time; with adaptive steps the final time or times.
+
+        Raises:
+            StateError: for missing or contradictory arguments.
+        """
+        h, t_end = self.h, self.t_end
+        check_together(inputs=self.inputs, t_eval=self.t_eval)
+        if words > 1:
+            check_doubles(t_end=t_end, t_eval=self.t_eval)
+        if h is not None and self.t_eval is not None:
+            raise StateError("t_eval requires adaptive steps: give t_end without h and steps")
+        if h is not None and t_end is not None and np.ndim(t_end):
+            raise StateError("with h all trajectories have one t_end: give one number, or omit h (adaptive step size)")
+        first = None if t_end is None else float(real_array(t_end, "t_end").flat[0])
+        planned_steps.__wrapped__(h, self.steps, first, *self.control, 1, hashed(t), None, False, 1)
+        if h is None or (self.inputs is None and first is None):
+            return self.steps, t_end
+        return None, final_time(t, h, self.steps, first)
+
+
 class Ensemble:
-    """Integration of many trajectories; arguments as of ``integrate_ensemble``.
+    """Integration of many trajectories.
+
+    Args:
+        stepper: the compiled integrator.
+        q, p, velocity: (k, m) initial state, of which p or the velocity is ``None``.
+        settings: other arguments of ``integrate_ensemble``, see :class:`EnsembleSettings`.
 
     Raises:
         StateError: if a shape, name or number is invalid, or the stepper has a time transformation.
@@ -113,92 +181,85 @@ class Ensemble:
     """
 
     def __init__(
-        self,
-        stepper: Any,
-        q: States,
-        p: States | None,
-        *,
-        inputs: Mapping[str, Any] | None = None,
-        velocity: States | None = None,
-        h: float | None = None,
-        steps: int | None = None,
-        t_end: ArrayLike | None = None,
-        tolerance: float | None = None,
-        absolute_tolerance: float | Mapping[str, float] | None = None,
-        max_step: float | None = None,
-        first_step: float | None = None,
-        save_every: int = 1,
-        t: float = 0.0,
-        t_eval: ArrayLike | None = None,
-        parameters: EnsembleParameters = None,
-        options: SolverOptions | None = None,
-        error: float | None = None,
-        device: str | None = None,
-        observe: str | None = None,
+        self, stepper: Any, q: States, p: States | None, *, velocity: States | None = None, **settings: Any
     ) -> None:
-        interface = stepper.interface
-        control = self.control = ErrorControl(tolerance, absolute_tolerance, max_step, first_step)
-        check_device(device, h, error=error, t_eval=t_eval)
-        _check_observe(stepper, observe, inputs=inputs, error=error, t_eval=t_eval)
-        recorded = _recorded_events(stepper, device, observe)
-        t = self.t0 = stepper._states.time(t)
-        steps, t_end = _steps_or_end(t, h, steps, t_end, inputs, control, t_eval, words=interface.words)
+        asked = EnsembleSettings(**settings)
+        asked.check(stepper)
+        self.stepper, self.control, self.observe, self.error = stepper, asked.control, asked.observe, asked.error
+        self.t0 = stepper._states.time(asked.t)
+        steps, t_end = asked.steps_or_end(self.t0, stepper._states.words)
         require(stepper, "ensembles")
-        if device is not None:
-            q, p, velocity, parameters = (on_processor(each) for each in (q, p, velocity, parameters))
-        if h is None:
+        parameters = asked.parameters
+        if asked.device is not None:
+            q, p, velocity, parameters = (on_processor(part) for part in (q, p, velocity, parameters))
+        if asked.h is None:
             require(stepper, "adaptive")
-        self.stepper = stepper
-        self.options, self.inputs = checked_options(options), dict[str, Input]()
-        if inputs is not None:
-            count = len(stepper._states.members(q, "q"))
-            self.inputs = checked_inputs(interface, inputs, count)
-            check_left_to_inputs(interface, parameters)
-            inside = first_inner_time(t, float(real_array(0.0 if t_end is None else t_end, "t_end").flat[0]))
-            values = stepper._states.parameters_of_each(parameters, count)
-            parameters = parameters_at(stepper.parameters, values, self.inputs, inside)
-        p = momenta_of_each(stepper, q, p, velocity, t, parameters)
-        self.save_every = checked_count(save_every, "save_every", least=1)
-        words = interface.words
-        settings: dict[str, Any] = {"inputs": self.inputs, "save_every": self.save_every, "words": words}
-        fixed = None if h is None else CommonSteps(self.t0, h, steps=steps, t_end=cast(Any, t_end), **settings)
-        *start, self.parameters = start_of_ensemble(stepper, q, p, self.t0, parameters)
-        self.start = start[0], start[1]
-        if not stepper._has_energy(parameters):
-            energy = interface.energy_index
-            for values, at, momenta in zip(self.parameters, *self.start, strict=True):
-                values[energy] = stepper.energy(at, momenta, 0.0, values)
+        self.options, self.inputs = checked_options(asked.options), dict[str, Input]()
+        if asked.inputs is not None:
+            parameters = self._with_inputs(asked.inputs, len(stepper._states.members(q, "q")), parameters, t_end)
+        momenta = momenta_of_each(stepper, q, p, velocity, self.t0, parameters)
+        self.save_every = checked_count(asked.save_every, "save_every", least=1)
+        self.fixed = None if asked.h is None else self._common_steps(asked.h, steps, cast(Any, t_end))
+        self._begin(q, momenta, parameters)
         self.values_at = partial(parameters_at, stepper.parameters, self.parameters, self.inputs)
         self.common: CommonRuns | DeviceRuns | None = None
-        self.observe = observe
         self.plans: Sequence[Until | Adaptive] = ()
         self.saved: dict[int, SavedLane] = {}
-        self.error, self.confirmations = error, list[GlobalError | None]()
+        self.confirmations = list[GlobalError | None]()
         self.t_eval: Array | None = None
         self.ends = np.empty(0)
-        # events are recorded by single runs, which they change or end, and inputs of two words change parameters
-        of_two_words = words > 1 and fixed is not None and (bool(self.inputs) or stepper.ensemble is None)
-        self.singly = bool(recorded) or of_two_words
-        self.fixed = fixed
-        if fixed is None or self.singly:
-            self.plans = self._plans(fixed, cast(ArrayLike, t_end), control)
-            self.plans = self.plans if error is None else list(self.plans)
-            self.confirmations = [None] * (0 if error is None else len(self))
-            self.t_eval = self._output_times(fixed, t_eval)
+        self.singly = asked.records_events(stepper) or self._changes_two_words()
+        if self.fixed is None or self.singly:
+            self.plans = self._plans(self.fixed, cast(ArrayLike, t_end), self.control)
+            self.plans = self.plans if self.error is None else list(self.plans)
+            self.confirmations = [None] * (0 if self.error is None else len(self))
+            self.t_eval = self._output_times(self.fixed, asked.t_eval)
         if self.inputs:
-            self.parameters[:, columns_of_inputs(interface)] = 0.0
-        if fixed is not None and not self.singly:
-            kind = CommonRuns if device is None else DeviceRuns
-            observation = None if observe is None else EnsembleObservation(stepper, observe, len(self))
-            arguments = stepper, self.options, self.start, self.parameters, self.values_at, fixed, observation
+            self.parameters[:, columns_of_inputs(stepper.interface)] = 0.0
+        if self.fixed is not None and not self.singly:
+            kind = CommonRuns if asked.device is None else DeviceRuns
+            observation = None if self.observe is None else EnsembleObservation(stepper, self.observe, len(self))
+            arguments = stepper, self.options, self.start, self.parameters, self.values_at, self.fixed, observation
             self.common = kind(*arguments)
-        elif observe is not None:
+        elif self.observe is not None:
             raise StateError(
-                f"observe={observe!r} requires a fixed step size: give h and steps, or observe each trajectory by "
+                f"observe={self.observe!r} requires a fixed step size: give h and steps, or observe each trajectory by "
                 "integrate"
             )
         self.states: list[Rows] = []
         self.successive = self._successive()
+
+    def _with_inputs(self, inputs: Mapping[str, Any], count: int, parameters: Any, t_end: Any) -> Array:
+        """Set the inputs; return the (k, number of parameters) values at the start, those of inputs included."""
+        stepper = self.stepper
+        self.inputs = checked_inputs(stepper.interface, inputs, count)
+        check_left_to_inputs(stepper.interface, parameters)
+        inside = first_inner_time(self.t0, float(real_array(0.0 if t_end is None else t_end, "t_end").flat[0]))
+        values = stepper._states.parameters_of_each(parameters, count)
+        return parameters_at(stepper.parameters, values, self.inputs, inside)
+
+    def _common_steps(self, h: float, steps: int | None, t_end: float | None) -> CommonSteps:
+        """Return the fixed steps of all trajectories."""
+        words = self.stepper._states.words
+        return CommonSteps(
+            self.t0, h, steps=steps, t_end=t_end, inputs=self.inputs, save_every=self.save_every, words=words
+        )
+
+    def _begin(self, q: States, p: States, parameters: EnsembleParameters) -> None:
+        """Set the initial states and parameters; in transformed time the energies are those of the states."""
+        stepper = self.stepper
+        *start, self.parameters = start_of_ensemble(stepper, q, p, self.t0, parameters)
+        self.start = start[0], start[1]
+        if not stepper._has_energy(parameters):
+            energy = stepper.interface.energy_index
+            for values, position, momentum in zip(self.parameters, *self.start, strict=True):
+                values[energy] = stepper.energy(position, momentum, 0.0, values)
+
+    def _changes_two_words(self) -> bool:
+        """Return whether fixed steps in two words are those of single runs: with inputs, and without SIMD lanes."""
+        stepper = self.stepper
+        fixed_in_two_words = self.fixed is not None and stepper._states.words > 1
+        return fixed_in_two_words and (bool(self.inputs) or stepper.ensemble is None)
 
     def _successive(self) -> SuccessiveRuns | None:
         """Return the trajectories that C integrates one after the other, ``None`` for other ensembles."""
@@ -579,51 +640,3 @@ class Ensemble:
 
 def _append_copies(stored: list[Rows], states: Rows) -> None:
     stored.append(states.copies())
-
-
-def _recorded_events(stepper: Any, device: str | None, observe: str | None) -> tuple[Event, ...]:
-    """Return the events that trajectories record, none if they are counted; raise an error where that is impossible."""
-    if device is not None:
-        require(stepper, "device")
-    recorded: tuple[Event, ...] = stepper.events if observe != "events" else ()
-    if recorded:
-        check_together(events=recorded, device=device, observe_ensemble=observe)
-        require(stepper, "ensemble_events")
-    return recorded
-
-
-def _check_observe(stepper: Any, observe: str | None, **others: Any) -> None:
-    """Raise an error for a stepper, and for arguments, with which ensembles do not observe all steps."""
-    if observe is not None:
-        check_together(observe=observe, **others)
-        require(stepper, "observe_ensemble")
-
-
-def _steps_or_end(
-    t: float,
-    h: float | None,
-    steps: int | None,
-    t_end: ArrayLike | None,
-    inputs: object,
-    control: ErrorControl,
-    t_eval: object,
-    *,
-    words: int,
-) -> tuple[int | None, ArrayLike | None]:
-    """Return the number of common steps or the final time; with adaptive steps the final time or times.
-
-    Raises:
-        StateError: for missing or contradictory arguments.
-    """
-    check_together(inputs=inputs, t_eval=t_eval)
-    if words > 1:
-        check_doubles(t_end=t_end, t_eval=t_eval)
-    if h is not None and t_eval is not None:
-        raise StateError("t_eval requires adaptive steps: give t_end without h and steps")
-    if h is not None and t_end is not None and np.ndim(t_end):
-        raise StateError("with h all trajectories have one t_end: give one number, or omit h (adaptive step size)")
-    first = None if t_end is None else float(real_array(t_end, "t_end").flat[0])
-    planned_steps.__wrapped__(h, steps, first, *control, 1, hashed(t), None, False, 1)
-    if h is None or (inputs is None and first is None):
-        return steps, t_end
-    return None, final_time(t, h, steps, first)
