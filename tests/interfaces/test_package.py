@@ -29,6 +29,12 @@ def model_of(name: str, **changes: object) -> sc.Model:
     return replace(sc.Model.from_problem(sc.problem(name)), **changes)
 
 
+def printed_by(folder: Path, flags: str = STRICT) -> list[str]:
+    """Return the lines that the program of a folder prints."""
+    command = ["make", "-s", "-C", str(folder), "run", f"CFLAGS={flags}"]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+
+
 @pytest.fixture
 def pendulum() -> sc.Model:
     return model_of("planar-pendulum", method=sc.SVI(3))
@@ -50,12 +56,8 @@ def test_a_single_file_computes_the_same_bits(tmp_path):
     single = sc.generate_package(pendulum, tmp_path / "single" / "pendulum_svi", single_file=True)
     assert sorted(path.name for path in single.glob("*.[ch]")) == ["main.c", "pendulum_svi.c", "pendulum_svi.h"]
     assert not (single / "support").exists()
-    strict = "CFLAGS=-O1 -ffp-contract=off -std=c11 -Wall -Wextra -Wpedantic -Werror"
-    printed = [
-        subprocess.run(["make", "-s", "-C", folder, strict], capture_output=True, text=True, check=True).stdout
-        for folder in (many, single)
-    ]
-    assert len(printed[0].splitlines()) > 20
+    printed = [printed_by(folder, f"{STRICT} -ffp-contract=off") for folder in (many, single)]
+    assert len(printed[0]) > 20
     assert printed[0] == printed[1]
     assert sc.load_package(single).step([0.5], [0.0], 0.1) == sc.load_package(many).step([0.5], [0.0], 0.1)
 
@@ -117,14 +119,12 @@ def test_c_program_falls_back_to_newton_where_the_fixed_point_fails(h, solver, r
     )
     model = sc.Model(system=system, method="svi:2", q=(1.0, 0.5), velocity=(0.0, 0.0), h=h, steps=20)
     folder = sc.generate_package(replace(model, solver=solver), tmp_path / "springs_svi")
-    command = ["make", "-s", "-C", str(folder), "run", f"CFLAGS={STRICT}"]
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
     if reported:
-        assert result.returncode != 0
-        assert reported in result.stderr
+        with pytest.raises(subprocess.CalledProcessError) as failed:
+            printed_by(folder)
+        assert reported in failed.value.stderr
         return
-    assert result.returncode == 0
-    table = np.array([line.split() for line in result.stdout.splitlines() if line[0] != "#"], dtype=float)
+    table = np.array([line.split() for line in printed_by(folder) if line[0] != "#"], dtype=float)
     run = sc.compile_stepper(system, "svi:2", solver="newton").integrate(
         model.q, velocity=model.velocity, h=h, steps=20
     )
@@ -169,8 +169,7 @@ def test_user_names_do_not_occur_in_the_program(tmp_path):
     base = model_of("planar-pendulum", method=sc.SVI(1))
     model = replace(base, system=replace(base.system, name='*/ #error " ? \\\n """ evil'))
     folder = sc.generate_package(model, tmp_path / "pendulum_svi")
-    command = ["make", "-s", "-C", str(folder), "run", f"CFLAGS={STRICT}"]
-    assert subprocess.run(command, capture_output=True, text=True, check=False).returncode == 0
+    assert printed_by(folder)
     subprocess.run([sys.executable, "-c", "import pendulum_svi"], cwd=tmp_path, check=True)
 
 
@@ -278,3 +277,25 @@ def test_foreign_folders_are_named(pendulum, tmp_path):
     Path(folder / "pendulum_svi.h").unlink()
     with pytest.raises(sc.PackageError, match=r"pendulum_svi\.h"):
         sc.load_package(folder)
+
+
+@pytest.mark.rotated
+@pytest.mark.parametrize(("precision", "error"), [("double", 1e-4), ("single", 1.0)])
+def test_microcontroller_code_has_adaptive_steps_if_requested(tmp_path, precision, error):
+    model = model_of("kepler", method=sc.SVI(4), h=None, tolerance=1e-5, span=10.0)
+    folder = sc.generate_package(model, tmp_path / "board", embedded=precision)
+    flags = "-O1 -std=c99 -Wall -Wextra -Werror -Wno-psabi"
+    own = ["-Wdouble-promotion"] if precision == "single" else []
+    subprocess.run(["cc", "-c", *flags.split(), *own, "-ffreestanding", "board.c"], cwd=folder, check=True)
+    lines = printed_by(folder, flags)
+    exact = sc.compile_stepper(model.system, sc.SVI(8)).integrate(model.q, velocity=model.velocity, t_end=10.0).q[-1]
+    assert np.abs(np.array(lines[-2].split()[1:3], dtype=float) - exact).max() < error
+    fixed = sc.generate_package(replace(model, h=0.1, tolerance=None), tmp_path / "fixed", embedded=precision)
+    assert "advance_to" not in (fixed / "fixed.c").read_text()
+
+
+def test_method_without_adaptive_steps_is_reported(tmp_path):
+    model = model_of("kepler", method=sc.StoermerVerlet(), h=None, tolerance=1e-9)
+    with pytest.raises(sc.MethodError, match="give h and steps"):
+        sc.generate_package(model, tmp_path / "verlet")
+    assert not (tmp_path / "verlet").exists()
