@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import sympy
-from certified_cases import CASES, Case, case
+from certified_cases import Case, case
 from commands import invoke
 from samples import QUICK_FLAGS, pushed_pendulum
 
@@ -130,31 +130,6 @@ def test_planted_fault_leaves_no_trace_in_the_process() -> None:
     assert certified(case(FAULTS[fault][0])).passed
 
 
-@pytest.mark.tiers(0, 0)
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(each, marks=getattr(pytest.mark, "second" if "composition" in each else "full")) for each in CASES],
-)
-def test_unmodified_systems_pass(name: str) -> None:
-    certificate = certified(CASES[name])
-    assert certificate.passed, certificate.to_text()
-    assert "stage equations" in {check.name for check in certificate.checks if check.outcome is Outcome.SATISFIED}
-
-
-@pytest.mark.sampled(1)
-@pytest.mark.parametrize(
-    "name", ["wire/lobatto-svi", "sleigh/lobatto-svi", pytest.param("linkage/lobatto-svi", marks=pytest.mark.full)]
-)
-def test_constrained_systems_are_certified(name: str) -> None:
-    """Against the motion that index reduction gives in 60 digits, along the constrained phase space."""
-    certificate = certified(CASES[name])
-    assert certificate.passed, certificate.to_text()
-    assert not certificate.not_measured
-    saved = {check.name for check in certificate.checks if check.outcome is Outcome.SATISFIED}
-    assert {"stage equations", "constraints", "multipliers", "reversal", "order"} <= saved
-    assert ("symplecticity" in saved) == name.startswith("wire")
-
-
 def test_inputs_are_certified_between_breakpoints() -> None:
     system, stepper = pushed_pendulum(), sc.compile_stepper(pushed_pendulum(), sc.SVI(2), flags=QUICK_FLAGS)
     for given in ({}, {"q": [0.6], "p": [-0.3], "stepper": stepper}):
@@ -264,14 +239,6 @@ def violated(error: Exception) -> Finding:
 
 
 # What it measures with.
-
-
-@pytest.mark.quick
-def test_exact_solution_is_exact() -> None:
-    oscillator = sc.problem("harmonic-oscillator").system
-    q, p = exact_motion(oscillator).flow([1.0], [0.0], 2)
-    assert abs(q[0] - mp.cos(2)) < mp.mpf("1e-43")
-    assert abs(p[0] + mp.sin(2)) < mp.mpf("1e-43")
 
 
 @pytest.mark.quick

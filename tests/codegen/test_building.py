@@ -443,11 +443,6 @@ def test_rejected_source_adds_nothing_to_the_cache(cache):
     assert entries(cache) == []
 
 
-def test_build_prints_nothing(capfd):
-    answer()
-    assert capfd.readouterr() == ("", "")
-
-
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 def test_gcc_only_passes_are_not_given_to_other_compilers(compiler, monkeypatch):
     """Large systems are split into functions; clang rejects unknown options."""

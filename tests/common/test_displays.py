@@ -204,34 +204,7 @@ class TestTrajectory:
         assert 'aria-label="energy"' not in broken._repr_html_()
 
 
-class TestSymmetry:
-    def test_symmetry_display_shows_direction_gauge_and_conserved_quantity(self):
-        boost = sc.symmetries(falling())[-1]
-        assert boost.name == "boost of y"
-        shown = boost._repr_html_()
-        assert "Symmetry: boost of y" in shown
-        assert all(word in shown for word in ("conserves", "direction", "gauge"))
-
-    def test_coordinates_invariant_under_a_symmetry_are_not_listed(self):
-        first = sc.symmetries(falling())[0]
-        assert first.name == "momentum of x"
-        assert "<mi>y</mi>" not in first._repr_html_()
-
-
 class TestOutcomes:
-    def test_certificate_display_shows_checks_and_violations(self):
-        saved, broken = certificate()._repr_html_(), certificate(Outcome.VIOLATED)._repr_html_()
-        assert "all measured properties are satisfied: 1 satisfied, 1 not measured" in saved
-        assert "<strong>" not in saved
-        assert "<strong>VIOLATED</strong>" in broken
-        assert "it is &lt;4&gt;; from 4 steps" in saved
-        assert saved.count("3.98") == saved.count("3.7<") == 1
-
-    def test_advice_shows_the_step_and_its_evidence(self):
-        shown = advice()._repr_html_()
-        assert f"h = {advice().h:.6g}, {advice().steps} of them" in shown
-        assert shown.count('<th scope="row"') == 2 + len(advice().warnings) + len(advice().evidence)
-
     def test_a_problem_shows_its_state_and_its_system(self):
         kepler = sc.problem("kepler")
         shown = kepler._repr_html_()

@@ -137,18 +137,6 @@ def test_member_forces_of_a_bridge_equal_the_method_of_joints():
     assert_allclose(pulls[0, top], -moment / JOINTS.HEIGHT, rtol=0, atol=1e-10)
 
 
-@pytest.mark.rotated
-def test_bridge_oscillates_as_a_pendulum():
-    """Rods of equal length do not rotate the bridge; all joints move on the same circle."""
-    mechanism = JOINTS.bridge(0.3)
-    run = ran(mechanism, 100)
-    f = reduced("r**2*u0_dot**2/2 + g*r*cos(u0)", [0.3], [0.0], run.t, r=JOINTS.HANGER)[:, 0]
-    moved = JOINTS.HANGER * np.column_stack([np.sin(f), 1.0 - np.cos(f)])
-    assert_allclose(
-        run.q.reshape(len(run), -1, 2) - JOINTS.PLACES, moved[:, np.newaxis].repeat(9, axis=1), rtol=0, atol=1e-9
-    )
-
-
 def test_state_with_zero_coordinates_is_projected():
     """Updates far below the rounding of other coordinates still change g."""
     hook = JOINTS.bent_pendulum()

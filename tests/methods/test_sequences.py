@@ -56,7 +56,7 @@ def test_a_step_is_a_leapfrog_step(sequence, make):
 @pytest.mark.sampled(4)
 @pytest.mark.parametrize("system", [RELATIVISTIC, DUFFING], ids=["hamiltonian", "lagrangian"])
 @pytest.mark.parametrize("sequence", ["kick-drift-kick", DRIFTS_FIRST])
-@pytest.mark.parametrize("make", [StoermerVerlet, lambda sequence: Composition(8, sequence)], ids=["verlet", "eight"])
+@pytest.mark.parametrize("make", [StoermerVerlet, lambda sequence: Composition(10, sequence)], ids=["verlet", "ten"])
 def test_explicit_steps_solve_the_equations(system, sequence, make):
     m = system.dimension
     q, p = np.array([0.7, -0.4])[:m], np.array([1.2, 0.3])[:m]
@@ -104,3 +104,12 @@ def test_step_fails_where_the_velocity_is_nan():
 def test_specification_contains_the_sequence(method):
     assert method_from_specification(method.specification()) == method
     assert method.name.endswith(DRIFTS_FIRST) == method.drifts_first
+
+
+def test_momenta_at_rest_are_not_velocities():
+    """L + 3 v has the same motion, and momenta that are larger by 3; leapfrog steps of p / m would be others."""
+    plain, shifted = (lagrange("o", "q", f"q_dot**2/2 - q**4/4{more}") for more in ("", " + 3*q_dot"))
+    q, p = compiled(plain, StoermerVerlet()).step([0.7], [0.4], 0.1)
+    np.testing.assert_allclose(compiled(shifted, StoermerVerlet()).step([0.7], [3.4], 0.1), [q, p + 3], rtol=1e-14)
+    with pytest.raises(MethodError, match="separable"):
+        compiled(shifted, Composition(8))

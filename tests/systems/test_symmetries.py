@@ -456,19 +456,6 @@ def test_unclaimed_conservation_may_be_violated(quickly_compiled, name, method, 
     assert errors[k] > 100 * ROUNDOFF
 
 
-def test_supplied_symmetry_is_tracked(quickly_compiled):
-    entry = sc.problem("cart-pole")
-    centre = sc.check_symmetry(entry.system, ["t", 0], gauge="(M + m)*x + m*l*sin(theta)", name="centre of mass")
-    plain = quickly_compiled(entry.system, sc.SVI(2))
-    stepper = sc.compile_stepper(entry.system, sc.SVI(2), flags=plain.flags, symmetries=[centre])
-    assert stepper.momentum_map_names == ("momentum of x", "centre of mass")
-    run = stepper.integrate(entry.q, stepper.momentum(entry.q, [0.3, 0.1]), h=0.05, steps=200)
-    errors = np.abs(run.momentum_errors()).max(axis=0)
-    assert errors[0] < ROUNDOFF
-    assert 1e-12 < errors[1] < 1e-5  # the quadrature of cos(theta) theta_dot is not exact
-    assert plain.momentum_map_names == ("momentum of x",)
-
-
 def test_supplied_generator_is_tracked(quickly_compiled):
     entry = sc.problem("kepler")
     lenz = sc.check_symmetry(
