@@ -52,7 +52,7 @@ class Contents:
     """What the C of a source offers its callers, recorded where it is rendered; numbers are 0 for what it lacks.
 
     Attributes:
-        functions: exported functions, without the prefix.
+        functions: functions that its header declares, without the prefix.
         run_fields: fields of the struct of a run that not every integrator has.
         divided: whether kernels are divided into functions.
         rolled: whether short loops over coordinates must not be unrolled.
