@@ -125,28 +125,6 @@ def test_steps_of_more_than_16_points_agree_with_the_oracle(sample, compiled, na
     assert relative(stepper.jacobian(q, p, H, T), np.subtract(after, before).T / 2e-5) < 1e-8
 
 
-@pytest.mark.tiers(1, 2)
-@pytest.mark.covering
-@pytest.mark.parametrize(
-    "method", [sc.SVI(2, "gauss-legendre:3"), sc.SCVI(3), sc.RadauIIA(2)], ids=lambda method: method.name
-)
-@pytest.mark.parametrize(("h", "t"), [(-0.11, 0.37), (0.02, -5.5), (-0.2, 100.0)])
-def test_backward_steps_and_large_times_agree_with_the_oracle(sample, compiled, method, h, t):
-    check(sample, compiled, "pumped-cart-pole", method, h=h, t=t)
-
-
-@pytest.mark.tiers(1, 1)
-@pytest.mark.parametrize("method", [sc.SVI(2, "gauss-legendre:3"), sc.SCVI(3)], ids=lambda method: method.name)
-def test_parameters_of_a_step_agree_with_the_oracle(sample, compiled, method):
-    case, changed = sample("pumped-cart-pole"), {"a": 0.35, "m": 1.3, "k": -0.2}
-    mechanics = oracle.Mechanics(case.system, changed)
-    q, p = case.state
-    expected = oracle.oracle_step(mechanics, method.specification(), q, p, H, T)
-    stepper = compiled("pumped-cart-pole", method)
-    assert relative(stepper.step(q, p, H, T, changed), np.array(expected)) < TOLERANCE
-    assert relative(stepper.step(q, p, H, T), np.array(expected)) > 1e-3
-
-
 @pytest.mark.parametrize("name", ["planar-pendulum", "kepler", "driven-duffing"])
 def test_verlet_is_the_leapfrog_of_separable_systems(sample, compiled, name):
     case = sample(name)

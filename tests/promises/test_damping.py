@@ -73,20 +73,6 @@ def test_linear_steps_contract_area_exactly(method):
         assert np.linalg.det(columns) == pytest.approx(np.exp(-0.3 * 0.2), rel=5e-16)
 
 
-@pytest.mark.second
-@pytest.mark.parametrize("h", [0.1, 0.8])
-def test_curved_steps_contract_area_exactly(h):
-    """Check the compiled derivative for every step size; two backward steps return to the start."""
-    stepper = sc.compile_stepper(damped(), sc.SVI(2))
-    J = stepper.integrate([0.3, -0.4], [0.5, 0.7], h=h, steps=1).sensitivity().state[-1]
-    omega = np.kron([[0, 1], [-1, 0]], np.eye(2))
-    assert np.abs(J.T @ omega @ J - np.exp(-GAMMA * h) * omega).max() < 4e-15
-    q, p = stepper.step([0.3, -0.4], [0.5, 0.7], h)
-    q, p = stepper.step(q, p, -h, h)
-    assert np.abs(q - [0.3, -0.4]).max() < 2e-15
-    assert np.abs(p - [0.5, 0.7]).max() < 2e-15
-
-
 def rates(t, z):
     x, y, v, w = z
     mass = np.array([[1 + x**2, 1 / 3], [1 / 3, 1.0]])

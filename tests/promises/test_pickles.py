@@ -42,13 +42,6 @@ def copied(original: Any) -> Any:
     return pickle.loads(pickle.dumps(original))
 
 
-def test_pickled_stepper_in_double_double_takes_the_same_steps() -> None:
-    own = compile_stepper(KEPLER, "svi:3", flags=QUICK_FLAGS, precision="double-double")
-    runs = [each.integrate([1.0, 0.0], [0.0, 1.1], h=0.1, steps=3) for each in (own, copied(own))]
-    for name in ("q", "q_low", "p", "p_low"):
-        assert np.array_equal(*(getattr(run, name) for run in runs))
-
-
 @pytest.mark.tiers(2, 3)
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize("option", STEPPERS)

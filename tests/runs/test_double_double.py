@@ -796,41 +796,6 @@ def test_explicit_ensembles() -> None:
         assert (infinite.mp("q")[:, :3] == fewer.mp("q")).all()
 
 
-def lane_starts() -> tuple[dict[str, list], dict[str, object], list[dict[str, object]]]:
-    """Return 11 orbits of different eccentricities with parameters of two words, and those of each orbit."""
-    count = 11
-    start = {
-        "q": [[f"0.{9 - j % 7}1", f"-1/{j + 3}0"] for j in range(count)],
-        "velocity": [["0.01", f"1.{j}"] for j in range(count)],
-    }
-    numbers = {"m": [f"1.{j}1" for j in range(count)], "mu": "1/3"}
-    return start, numbers, [{"m": m, "mu": "1/3"} for m in numbers["m"]]
-
-
-@pytest.mark.tiers(1)
-@pytest.mark.parametrize(
-    ("method", "plan"),
-    [
-        ("svi:8", {"h": 0.03, "steps": 5, "save_every": 2}),
-        ("gauss:5", {"h": 0.02, "t_end": 0.09}),
-        ("sc:3", {"h": -0.02, "steps": 4}),
-    ],
-)
-def test_ensembles_in_lanes(method: str, plan: dict[str, float]) -> None:
-    """Trajectories in SIMD lanes agree with single runs to 4e-31."""
-    stepper = sc.compile_stepper(system("kepler"), method, precision="double-double")
-    start, numbers, single = lane_starts()
-    assert Ensemble(stepper, **start, p=None, parameters=numbers, **plan).common is not None
-    runs = stepper.integrate_ensemble(**start, parameters=numbers, **plan)
-    assert runs.status.tolist() == ["ok"] * len(single)
-    for j in (0, 6, 10):
-        alone = stepper.integrate(start["q"][j], velocity=start["velocity"][j], parameters=single[j], **plan)
-        assert (runs[j].mp("t") == alone.mp("t")).all()
-        for name in ("q", "p", "energy"):
-            expected = alone.mp(name)
-            assert abs(runs[j].mp(name) - expected).max() <= 4e-31 * abs(expected).max(), name
-
-
 def test_lanes_do_not_depend_on_their_neighbours() -> None:
     """Trajectories whose iterations converge at different rates have equal bits in other blocks and threads."""
     stepper = sc.compile_stepper(system("kepler"), "svi:3", precision="double-double")

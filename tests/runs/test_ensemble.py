@@ -30,15 +30,6 @@ from scvi_codegen.methods import Method
 from scvi_codegen.runs.ensembles.ensemble import Ensemble
 from scvi_codegen.runs.ensembles.lanes import LaneRuns
 
-KINDS = {
-    "separable": "kepler",
-    "coupled": "double-pendulum",
-    "time-dependent": "driven-duffing",
-    "coupled and time-dependent": "pumped-cart-pole",
-    "not quadratic": "relativistic-particle",
-    "magnetic": "charged-particle",
-}
-METHODS = [sc.SVI(5), sc.Gauss(3), sc.RadauIIA(2), sc.StoermerVerlet(), sc.SCVI(3)]
 KNOTS = np.array([0.0, 0.37, 0.9, 1.41, 2.05, 2.6])
 VALUES = np.array([0.0, 1.2, -0.7, 0.4, 1.9, -1.0])
 COUNT = 11
@@ -162,20 +153,6 @@ CUBIC = {"u": (KNOTS, OWN_VALUES), "w": ([0.0, 1.0, 3.0], [0.0, 0.5, 0.0], "cubi
 SECOND_FAILS = np.outer(np.arange(COUNT) == 2, np.arange(6) == 4)
 STIFF = np.where(np.arange(9) % 4 == 1, 1e6, 1.0)
 CASES = {
-    **{
-        str(count): Case(
-            "kepler",
-            sc.SVI(5),
-            count,
-            {"h": 0.05, "steps": 40, "save_every": 3, "parameters": {"mu": np.linspace(0.8, 1.2, count)}},
-            3e-13,
-        )
-        for count in (1, 7, 8, 9, 64)
-    },
-    **{
-        f"backward {method.name}": Case("driven-duffing", method, 9, {"h": -0.02, "steps": 50, "t": 2.0}, 3e-13)
-        for method in (sc.SVI(5), sc.SCVI(3), sc.Composition.of(8))
-    },
     "drift of momenta": Case(
         "relativistic",
         sc.Composition.of(4),
@@ -276,28 +253,6 @@ def test_a_failing_trajectory_equals_its_single_run_and_does_not_affect_others(n
 @pytest.mark.parametrize("name", CASES)
 def test_each_trajectory_equals_the_single_run(name: str) -> None:
     CASES[name].check()
-
-
-@pytest.mark.tiers(0, 2)
-@pytest.mark.sampled(2)
-@pytest.mark.covering
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
-def test_systems_and_methods_equal_single_runs(kind: str, method: Method) -> None:
-    """Measured 2e-14: rounding of 60 steps, magnified by the motion."""
-    Case(KINDS[kind], method, 3, {"h": 0.02, "steps": 60, "save_every": 20, "t": 0.3}, 3e-13).check()
-
-
-@pytest.mark.tiers(0, 2)
-@pytest.mark.sampled(3)
-@pytest.mark.filterwarnings("ignore::scvi_codegen.common.errors.AccuracyWarning")
-@pytest.mark.parametrize("kind", ["constant", "linear", "cubic"])
-@pytest.mark.parametrize("method", [sc.SVI(3), sc.StoermerVerlet(), sc.Gauss(2)], ids=lambda method: method.name)
-def test_trajectories_with_inputs_equal_single_runs(method: Method, kind: str) -> None:
-    assert stepper_of("pushed pendulum", method).ensemble is not None
-    common = {"inputs": {"u": (KNOTS, OWN_VALUES, kind), "w": W}, "parameters": DAMPING}
-    for plan in ({"h": 0.1, "t_end": 2.3}, {"h": -0.1, "t": 2.55, "t_end": 0.02, "save_every": 3}):
-        Case("pushed pendulum", method, COUNT, common | plan, 4e-15).check()
 
 
 @pytest.mark.second
@@ -465,14 +420,6 @@ def test_bits_of_trajectories_do_not_depend_on_others(
 
 
 class TestThreadsAndInterruption:
-    def test_results_do_not_depend_on_the_number_of_threads(self, kepler: sc.Stepper):
-        q, p = states("kepler", 64)
-        q[20] = 0.0
-        one, two = (kepler.integrate_ensemble(q, p, h=0.05, steps=300, threads=threads) for threads in (1, 2))
-        assert one.q.tobytes() == two.q.tobytes()  # NaN included
-        assert one.p.tobytes() == two.p.tobytes()
-        assert one.status.tolist() == two.status.tolist()
-
     @pytest.mark.parametrize("method", [sc.SVI(5), sc.SCVI(2)], ids=lambda method: method.name)
     def test_progress_counts_up_to_the_end(self, method: Method):
         stepper = stepper_for("kepler", method)

@@ -98,13 +98,6 @@ def test_times_converge_with_the_order_of_the_method_and_energy_stays(method):
     assert all(at <= 1.5 * along for at, along in energies)
 
 
-def test_states_at_crossings_are_those_of_the_dense_output(kepler):
-    run = kepler.integrate(**at_perihelion(0.4), h=0.25, steps=100, events="q1 - q2")
-    q, p = run.at(run.events[0].t)
-    assert np.abs(q - run.events[0].q).max() < 1e-13
-    assert np.abs(p - run.events[0].p).max() < 1e-13
-
-
 # None missed.
 
 
@@ -286,12 +279,6 @@ def test_crossings_are_found_afterwards_up_to_the_terminal_event(kepler):
     again = run.crossings(["q1", "q2 + q1/9"])
     for found, expected in zip(again, run.events, strict=True):
         assert np.abs(found.t - expected.t).max() < 1e-13
-
-
-def test_events_with_explicit_time_and_parameters(compiled):
-    duffing = compiled("driven-duffing", sc.SVI(4))
-    run = duffing.integrate([0.6], [-0.3], h=0.1, steps=100, t=3.0, events="sin(omega*t)", parameters={"omega": 2.0})
-    assert np.abs(run.events[0].t - math.pi / 2 * np.arange(2, 9)).max() < 1e-13
 
 
 @pytest.mark.rotated

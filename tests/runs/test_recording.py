@@ -70,15 +70,6 @@ class TestRecording:
         assert sc.resume_run("a.run").finished
         assert digests("a.run") == digests("whole.run")
 
-    def test_options_and_parameters_are_saved(self, kepler):
-        settings = {"parameters": {"mu": 1.1}, "options": sc.SolverOptions(tolerance=1e-9), "t": 3.0}
-        whole = kepler.integrate(**STATE, h=H, steps=300, **settings)
-        sc.record_run(start(kepler, **settings), "a.run", steps=300, rows=64, stop=StopsAfter(2))
-        found = sc.resume_run("a.run")
-        assert_same(found, whole)
-        assert found.manifest.options == settings["options"]
-        assert found[:3].parameters == [1.1]
-
     def test_run_may_be_extended(self, kepler):
         recorded(kepler, 500)
         assert not sc.resume_run("a.run", steps=900, stop=StopsAfter(0)).finished
@@ -388,16 +379,6 @@ class TestFiles:
             assert dataset.velocity.attrs == {"long_name": "velocity", "units": "au day-1"}
             assert (dataset.t.attrs["units"], dataset.p.attrs) == ("day", {"long_name": "momentum"})
 
-    def test_velocities_energies_and_momentum_maps_are_exported(self, kepler):
-        pytest.importorskip("xarray")
-        run = kepler.integrate(**STATE, h=H, steps=30)
-        dataset = run.to_xarray()
-        velocities = [kepler.velocity(q, p) for q, p in zip(run.q, run.p, strict=True)]
-        np.testing.assert_array_equal(dataset.velocity, velocities)
-        np.testing.assert_array_equal(dataset.energy, run.energy())
-        np.testing.assert_array_equal(dataset.momentum_map, run.momentum_maps())
-        assert list(dataset.symmetry.values) == list(kepler.momentum_map_names)
-
     def test_undefined_quantities_are_nan(self, kepler):
         pytest.importorskip("xarray")
         run = kepler.integrate(**STATE, h=H, steps=9)
@@ -411,17 +392,6 @@ class TestFiles:
     def test_unsupported_units_are_rejected(self, kepler, path, units):
         with pytest.raises(sc.StateError, match="units"):
             kepler.integrate(**STATE, h=H, steps=3).save(path, units=units)
-
-    def test_tables_are_exported(self, kepler):
-        pytest.importorskip("xarray")
-        pytest.importorskip("pandas")
-        run = kepler.integrate(**STATE, h=H, steps=30)
-        dataset, frame = run.to_xarray(), run.to_dataframe()
-        np.testing.assert_array_equal(dataset.p.sel(coordinate="q2"), run.p[:, 1])
-        np.testing.assert_array_equal(frame["p_q2"], run.p[:, 1])
-        np.testing.assert_array_equal(frame.index, run.t)
-        assert dataset.attrs == frame.attrs
-        assert dataset.attrs["h"] == H
 
     def test_missing_library_is_named_with_its_extra(self, kepler, monkeypatch):
         run = kepler.integrate(**STATE, h=H, steps=3)

@@ -1,6 +1,5 @@
 """Steps, runs, transforms and errors of a compiled stepper, as a user meets them."""
 
-import pickle
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
@@ -21,7 +20,6 @@ METHODS = (
     sc.StoermerVerlet(),
     sc.ExplicitEuler(),
 )
-SYMMETRIC = (sc.SVI(3), sc.SVI(2, "gauss-lobatto:3"), sc.StoermerVerlet(), sc.Gauss(2))
 WITH_ACTION = (sc.SVI(2, "gauss-legendre:3"), sc.SCVI(3), sc.Gauss(2), sc.StoermerVerlet())
 each_method = pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
 each_action = pytest.mark.parametrize("method", WITH_ACTION, ids=lambda method: method.name)
@@ -110,32 +108,7 @@ def test_progress_receives_the_completed_steps(kepler):
     assert reported[-1] == 3000
 
 
-@pytest.mark.tiers(2)
-@pytest.mark.parametrize("method", SYMMETRIC, ids=lambda method: method.name)
-def test_symmetric_method_returns_along_its_trajectory(sample, compiled, method):
-    stepper, state = compiled("pumped-cart-pole", method), sample("pumped-cart-pole").state
-    out = stepper.integrate(*state, h=0.05, steps=200, t=0.3)
-    back = stepper.integrate(out.q[-1], out.p[-1], h=-0.05, steps=200, t=out.t[-1])
-    assert back.t[-1] == pytest.approx(0.3, abs=1e-14)
-    assert np.abs(back.q[::-1] - out.q).max() < 1e-12
-    assert np.abs(back.p[::-1] - out.p).max() < 1e-12
-
-
 # Saving and restoring.
-
-
-@pytest.mark.tiers(0, 2)
-@pytest.mark.sampled(2)
-@each_method
-def test_restored_run_continues_bitwise(sample, compiled, method):
-    stepper, state = compiled("pumped-cart-pole", method), sample("pumped-cart-pole").state
-    one = stepper.start(*state, h=0.05, t=0.3)
-    one.record(123)
-    saved = one.checkpoint()
-    other = pickle.loads(pickle.dumps(stepper)).from_checkpoint(saved)
-    assert (other.t, other.steps) == (one.t, 123)
-    assert np.array_equal([other.q, other.p], [one.q, one.p])
-    assert same(one.record(200, save_every=3), other.record(200, save_every=3))
 
 
 def test_save_every_counts_from_the_start_of_the_run(kepler):
@@ -305,20 +278,6 @@ def test_absolute_tolerance_bounds_the_update(kepler):
 
 
 # Legendre transforms and energy.
-
-
-@pytest.mark.tiers(3)
-@pytest.mark.parametrize("name", ["kepler", "pumped-cart-pole", "charged-particle", "relativistic-particle"])
-def test_momentum_velocity_and_energy_agree_with_the_oracle(sample, compiled, name):
-    case, stepper = sample(name), compiled(name, sc.SVI(3))
-    q, p = case.state
-    v = stepper.velocity(q, p, 0.7)
-    assert stepper.momentum(q, v, 0.7) == pytest.approx(p, abs=1e-14)
-    expected = case.mechanics.velocity(oracle.mp.mpf(0.7), oracle.numbers(q), oracle.numbers(p))
-    assert v == pytest.approx(expected.astype(float), abs=1e-14)
-    L = case.mechanics.lagrangian([oracle.mp.mpf(0.7)], oracle.numbers([q]), oracle.numbers([v]))[0]
-    assert stepper.energy(q, p, 0.7) == pytest.approx(p @ v - float(L), abs=1e-14)
-    assert isinstance(stepper.energy(q, p, 0.7), float)
 
 
 def test_velocity_is_found_where_momenta_cancel(quickly_compiled):

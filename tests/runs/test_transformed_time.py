@@ -1,6 +1,5 @@
 """Runs in transformed time: fixed steps of tau, and everything that users give and get in time."""
 
-import pickle
 from functools import cache
 from typing import Any
 
@@ -57,17 +56,6 @@ def test_time_satisfies_keplers_equation(form: str, solver: str) -> None:
     assert np.ptp(run.energy()) < 1e-13
     assert run.tau is not None
     assert np.array_equal(run.tau, 0.1 * np.arange(301)) or np.abs(run.tau - 0.1 * np.arange(301)).max() < 1e-14
-
-
-@pytest.mark.tiers(0, 1)
-@pytest.mark.sampled(2)
-@pytest.mark.covering
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("form", ["L", "K"])
-def test_every_solver_gives_the_same_time(form: str, method: str) -> None:
-    runs = [stepper(form, solver, method).integrate(*START, h=0.05, steps=100) for solver in ("auto", "newton")]
-    assert np.abs(runs[0].t - runs[1].t).max() < 1e-13
-    assert np.abs(runs[0].q - runs[1].q).max() < 1e-12
 
 
 @pytest.mark.rotated
@@ -131,17 +119,6 @@ def test_energy_is_that_of_the_initial_state() -> None:
     assert made.step(*START, 0.1)[0] == pytest.approx(made.step(*START, 0.1, parameters={"E": -0.5})[0], rel=1e-14)
 
 
-def test_velocities_are_derivatives_by_physical_time() -> None:
-    made, q, v = stepper(), [0.5, 0.25], [-0.5, 1.0]
-    assert np.array_equal(made.momentum(q, v), v) or np.abs(made.momentum(q, v) - v).max() < 1e-15
-    assert np.abs(made.velocity(q, v) - v).max() < 1e-15
-    frame = made.integrate(q, v, h=0.1, steps=3).to_dataframe()
-    assert list(frame.columns)
-    dataset = made.integrate(q, v, h=0.1, steps=3).to_xarray()
-    assert np.abs(dataset["velocity"][0] - v).max() < 1e-15
-    assert np.abs(dataset["velocity"].values - dataset["p"].values).max() < 1e-15  # of a unit mass
-
-
 @pytest.mark.tiers(1)
 @pytest.mark.parametrize("form", FORMS)
 def test_runs_end_at_a_physical_time(form: str) -> None:
@@ -155,26 +132,6 @@ def test_runs_end_at_a_physical_time(form: str) -> None:
     assert back.t[-1] == 0.0
     assert np.abs(back.q[-1] - START[0]).max() < 1e-11
     assert len(stepper(form).integrate(*START, h=0.1, t_end=0.0)) == 2
-
-
-def test_dense_output_is_in_physical_time() -> None:
-    times = np.linspace(0.0, 9.0, 31)
-    asked = stepper().integrate(*START, h=0.1, t_end=9.0, t_eval=times)
-    assert np.array_equal(asked.t, times)
-    assert np.abs(kepler_time(asked.q[1:]) - times[1:]).max() < 1e-12
-    assert asked.tau is not None
-    for k in (7, 20):  # the part of its step at which a run to that time ends
-        ended = stepper().integrate(*START, h=0.1, t_end=float(times[k]))
-        assert ended.tau is not None
-        assert asked.tau[k] == pytest.approx(ended.tau[-1], abs=1e-12)
-    whole = stepper().integrate(*START, h=0.1, t_end=9.0)
-    assert np.array_equal(whole.at(times)[0], asked.q)
-    seldom = stepper().integrate(*START, h=0.1, t_end=9.0, save_every=7)
-    assert len(seldom) == (len(whole) - 2) // 7 + 2
-    assert np.abs(seldom.at(times)[0] - asked.q).max() < 1e-13
-    q, p = seldom.at(seldom.t[3])
-    assert np.array_equal(q, seldom.q[3])
-    assert np.array_equal(p, seldom.p[3])
 
 
 @pytest.mark.tiers(0, 1)
@@ -202,36 +159,6 @@ def test_event_functions_receive_physical_velocities() -> None:
     assert max(np.abs(found[0] - other).max() for other in found[1:]) < 1e-12
     own = sc.compile_stepper(KEPLER, sc.SVI(8)).integrate(*START, h=0.001, steps=3000, events=functions)
     assert np.abs(own.events[0].t - found[0]).max() < 1e-11
-
-
-def test_ensembles_have_individual_energies_and_times() -> None:
-    made = stepper()
-    q, p = np.tile(START[0], (3, 1)), np.array([START[1], [0.0, 3.0], [0.0, 4.0]])
-    many = made.integrate_ensemble(q, p, h=0.1, steps=50)
-    assert many.ok.all()
-    assert many.times is not None
-    for j in range(3):
-        alone = made.integrate(q[j], p[j], h=0.1, steps=50)
-        assert np.array_equal(many.times[:, j], alone.t)
-        assert np.array_equal(many.q[:, j], alone.q)
-        assert many.parameters[j, 1] == alone.parameters[1]
-    with pytest.raises(sc.StateError, match="no common times"):
-        many.to_xarray()
-
-
-def test_runs_are_saved_recorded_and_pickled(tmp_path: Any) -> None:
-    made = stepper()
-    run = made.start(*START, h=0.1)
-    run.record(20)
-    copy = made.from_checkpoint(run.checkpoint())
-    other = pickle.loads(pickle.dumps(run))
-    expected = run.record(20)
-    assert all(np.array_equal(x.record(20).t, expected.t) for x in (copy, other))
-    recorded = sc.record_run(made.start(*START, h=0.1), tmp_path / "run", steps=40)
-    assert np.array_equal(np.asarray(recorded.t), made.integrate(*START, h=0.1, steps=40).t)
-    assert np.array_equal(recorded[20:].tau, made.integrate(*START, h=0.1, steps=40).tau[20:])
-    seldom = sc.record_run(made.start(*START, h=0.1), tmp_path / "seldom", steps=40, save_every=4)
-    assert np.array_equal(seldom[1:].tau, made.integrate(*START, h=0.1, steps=40).tau[4::4])
 
 
 def test_levi_civita_follows_an_ellipse_that_is_almost_a_line() -> None:

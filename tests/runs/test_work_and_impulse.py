@@ -41,33 +41,6 @@ def test_shooting_has_a_work_balance_of_the_order_of_its_curve(thrown):
     assert np.log2(coarse[1] / fine[1]) > 2.8
 
 
-@pytest.mark.rotated
-def test_work_balance_of_hamiltonians_iterations_and_parameters(thrown):
-    """The balance of H is equal; fixed-point steps use the fallback; parameters and time are those of the run."""
-    hamiltonian = sc.HamiltonianSystem.from_text(
-        name="thrown",
-        hamiltonian="(p_x**2 + p_y**2)/2 - k/sqrt(x**2 + y**2)",
-        coordinates=["x", "y"],
-        parameters={"k": 1.0, "c": 0.05, "w": 0.1},
-        forces={"x": "-c*p_x*sqrt(p_x**2 + p_y**2) + w*cos(3*t)", "y": "-c*p_y*sqrt(p_x**2 + p_y**2)"},
-    )
-    values = {"c": 0.2, "w": 0.4}
-    found = []
-    for system in (thrown, hamiltonian):
-        run = sc.compile_stepper(system, sc.SVI(3)).integrate(
-            [1.0, 0.0], [0.0, 1.1], h=0.02, steps=60, t=0.7, parameters=values
-        )
-        found.append((run.work(), run.impulses()))
-    assert np.abs(found[0][0] - found[1][0]).max() < 1e-12
-    assert np.abs(found[0][1] - found[1][1]).max() < 1e-12
-    t, v = run.t, run.velocity
-    speed = np.hypot(*v.T)
-    power = -0.2 * speed**3 + 0.4 * np.cos(3 * t) * v[:, 0]
-    weights = np.full(len(t), 2.0)
-    weights[1:-1:2], weights[[0, -1]] = 4.0, 1.0
-    assert run.work()[-1] == pytest.approx(float(weights @ power) * 0.02 / 3.0, abs=1e-7)  # Simpson's rule
-
-
 def test_work_balance_with_dense_output_and_adaptive_steps(thrown):
     stepper = sc.compile_stepper(thrown, sc.SVI(4))
     start = ([1.0, 0.0], [0.0, 1.1])
