@@ -28,7 +28,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -333,26 +333,10 @@ class SpectralElements(Axis):
         quadrature = np.outer(half, np.array([float(each) for each in rule.weights]))
         np.add.at(masses, places.ravel(), quadrature.ravel())
         inner = breaks[:-1, None] + half[:, None] * (1.0 + (1.0 - INWARD) * (offsets - 1.0))
-        sided = OneSided(cells=inner, points=np.zeros((2, count)), weights=np.zeros((2, count)))
-        sided.points[:, places[:, :-1]], sided.points[0, places[:, -1]] = inner[:, :-1], inner[:, -1]
-        sided.weights[0, places[:, 1:]], sided.weights[1, places[:, 0]] = quadrature[:, 1:], quadrature[:, 0]
         left, right = fixed or (False, False)
         if count <= left + right:
             raise SystemDefinitionError(f"'{name}' has no points between its prescribed ends: use more elements")
         inside = slice(int(left), count - int(right))
-        size, index, nodes = f"E{name}", f"e{name}", f"nodes_{name}"
-        kinds = []
-        if elements > left + right:
-            every = tuple(Place(index=index, table=nodes, column=b) for b in range(p + 1))
-            kinds.append(Cells(span(index, size, int(left), int(right)), Place(index=index), every, nodes))
-        if elements == 1 and left and right:
-            kinds = [Cells(None, fixed_place(0), (0, *(fixed_place(b) for b in range(p - 1)), 1))]
-        else:
-            if left:
-                kinds.append(Cells(None, fixed_place(0), (0, *(fixed_place(b) for b in range(p)))))
-            if right:
-                last = tuple(fixed_place(b - p, f"N{name}") for b in range(p))
-                kinds.append(Cells(None, fixed_place(-1, size), (*last, 1)))
         table = np.clip(places - int(left), 0, count - int(left) - int(right) - 1)
         matrix = np.array([[float(x) for x in row] for row in derivative])
         roots = np.sqrt(np.array([float(each) for each in rule.weights]))
@@ -367,8 +351,8 @@ class SpectralElements(Axis):
             operators=(identity_matrix(p + 1), derivative, matrix_product(derivative, derivative)),
             stiffness=(largest, largest**2),
             edges=_edges(name, places, (local, inner), (rule.weights, derivative), fixed, clamped),
-            one_sided=replace(sided, points=sided.points[:, inside], weights=sided.weights[:, inside]),
-            cells=tuple(kinds),
+            one_sided=_one_sided(inner, quadrature, places, inside),
+            cells=_element_cells(name, elements, p, left=left, right=right),
             jacobians=half,
             cell_points=local,
             table=table,
@@ -398,6 +382,32 @@ class SpectralElements(Axis):
         local = self.in_elements(values, -1).reshape(*values.shape[:-1], *self.table.shape)
         modes = np.einsum("ab,...eb->...ea", to_modes, local)[..., 1:] ** 2
         return np.asarray(modes / (np.arange(1, len(points)) + 0.5))
+
+
+def _element_cells(name: str, elements: int, degree: int, *, left: bool, right: bool) -> tuple[Cells, ...]:
+    """Return the kinds of elements: those whose values are all unknown, and those at prescribed ends of the axis."""
+    size, index, nodes = f"E{name}", f"e{name}", f"nodes_{name}"
+    if elements == 1 and left and right:
+        inside = (fixed_place(b) for b in range(degree - 1))
+        return (Cells(None, fixed_place(0), (0, *inside, 1)),)
+    kinds = []
+    if elements > left + right:
+        unknown = tuple(Place(index=index, table=nodes, column=b) for b in range(degree + 1))
+        kinds.append(Cells(span(index, size, int(left), int(right)), Place(index=index), unknown, nodes))
+    if left:
+        kinds.append(Cells(None, fixed_place(0), (0, *(fixed_place(b) for b in range(degree)))))
+    if right:
+        last = (fixed_place(b - degree, f"N{name}") for b in range(degree))
+        kinds.append(Cells(None, fixed_place(-1, size), (*last, 1)))
+    return tuple(kinds)
+
+
+def _one_sided(inner: Array, quadrature: Array, places: NDArray[np.int64], inside: slice) -> OneSided:
+    """Return the coordinates ``inner`` (E, p + 1) and weights of elements by point, on both sides of ends."""
+    points, weights = np.zeros((2, 2, places.max() + 1))
+    points[:, places[:, :-1]], points[0, places[:, -1]] = inner[:, :-1], inner[:, -1]
+    weights[0, places[:, 1:]], weights[1, places[:, 0]] = quadrature[:, 1:], quadrature[:, 0]
+    return OneSided(cells=inner, points=points[:, inside], weights=weights[:, inside])
 
 
 def _breaks(axis: str, start: float, end: float, elements: Any, places: Sequence[float]) -> Any:

@@ -146,8 +146,8 @@ class Mesh:
         return np.max(parts, axis=0)[()]
 
     def derive(self) -> FieldDerivation:
-        """Return the equations and conservation laws of the density, with the semi-discrete L and its energy."""
-        return derivation_of(self.field_system, getattr(self, "system", None))
+        """Return the equations and conservation laws of the density."""
+        return derivation_of(self.field_system)
 
     def local_laws(self, run: Any, *names: str) -> dict[str, LocalLaw]:
         """Return density, flux and residual of the conservation laws of the density along a run, by name.
@@ -270,6 +270,10 @@ class MeshSystem(Mesh):
     system: Any
 
     __repr__ = summary("system")
+
+    def derive(self) -> FieldDerivation:
+        """Return the equations and conservation laws of the density, with the semi-discrete L and its energy."""
+        return derivation_of(self.field_system, self.system)
 
 
 def _plain(value: Any) -> Any:
