@@ -70,7 +70,8 @@ def compile_stepper(
             points than its degree; ``"newton"`` is always available, also for stiff systems and large steps;
             ``"explicit"`` requires Stoermer-Verlet or a composition and a separable system; ``"auto"`` takes explicit
             or fixed point if available and falls back to Newton, compiled when first needed.
-        flags: flags for the C compiler; the default is tuned to this processor.
+        flags: flags for the C compiler; the default is tuned to this processor. The variable ``SCVI_CODEGEN_CFLAGS``
+            adds flags to these, so that it cannot replace them by those that give the same bits on every machine.
         prefix: prefix of the C names; by default made from the names of system and method.
         symmetries: symmetries to track in addition to those that are detected
             (:func:`~scvi_codegen.systems.symmetry.checking.check_symmetry`).
@@ -114,13 +115,13 @@ def compile_stepper(
         from scvi_codegen.systems.symmetry.symmetry import SYMMETRIES
 
         check_kind(SYMMETRIES, symmetries, "symmetries")
-    drawn: dict[str, Any] = {"mesh": system.mesh, "links": system.drawn_links}
+    shape: dict[str, Any] = {"mesh": system.mesh, "links": system.drawn_links}
     if sizes is not None or tables is not None:
         system, time_transformation = _at_sizes(system, time_transformation, sizes or {}, tables)
     method = as_method(method, system)
     sources = CachedSources(system, method, solver, prefix, symmetries, time_transformation, controller, precision)
     source, interface = sources.integrator()
-    interface = replace(interface, layout=replace(interface.layout, **drawn))
+    interface = replace(interface, layout=replace(interface.layout, **shape))
     system.store_key()
     stepper = partial(Stepper, source, interface, variants=sources.variants, flags=flags)
     if precision == DOUBLE_DOUBLE:

@@ -18,6 +18,7 @@ from typing import cast
 import numpy as np
 
 from scvi_codegen.common.errors import AccuracyWarning, StateError, StepFailedError, warn
+from scvi_codegen.common.representation import counted
 from scvi_codegen.runs.accuracy.size import (
     Motion,
     first_of_groups,
@@ -123,7 +124,7 @@ def measured_growth(stepper: Integrator, plan: StepPlan, requested: bool | None)
 
 def _warn_of_amplification(what: str, difference: float, t: float) -> None:
     digits = min(max(0, math.floor(-math.log10(difference))) if difference > 0.0 else DIGITS, DIGITS)
-    left = f"about {digits} digit{'s' * (digits != 1)}" if digits else "no digit"
+    left = f"about {counted(digits, 'digit')}" if digits else "no digit"
     warn(
         f"the motion amplifies errors: {what}, which leaves {left} at t = {t:g} (estimated). Use error= to find the "
         "time until which digits are confirmed, or check_growth=False to skip this check",

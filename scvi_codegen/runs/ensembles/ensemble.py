@@ -495,8 +495,9 @@ class Ensemble:
         if not full.size:
             return
         j, others, (cause, remedy) = int(full[0]), len(full) - 1, FAILURES[TOO_MANY_STATES]
+        more = f" (and {others} more)" if others else ""
         warn(
-            f"trajectory {j}{f' (and {others} more)' * (others > 0)} ended at t = {trajectories.ends[0][j]:g}, after "
+            f"trajectory {j}{more} ended at t = {trajectories.ends[0][j]:g}, after "
             f"{trajectories.steps[j]} steps: {cause}. The memory holds {int(self.most_states)} states of each of "
             f"{len(self)} trajectories. {remedy}",
             AccuracyWarning,

@@ -31,5 +31,5 @@ def short_title(interface: Interface) -> str:
 def describe_step_size(h: float, plan: StepPlan, *, tau: bool) -> str:
     """Describe the step size of a run."""
     if isinstance(plan, FixedSteps):
-        return f" of {h:g}{' in tau' * tau}"
+        return f" of {h:g} in tau" if tau else f" of {h:g}"
     return f" of {plan.tau:g} in tau" if isinstance(plan, InTau) else " of adaptive size"

@@ -56,8 +56,8 @@ class EnergyAccount(NamedTuple):
         if not self.is_error:
             return f"energy change |E - E0|: {self.reason}"
         if self.work is not None:
-            return f"energy balance |E - E0 - W|{' / |E0|' * bool(self.initial)}"
-        return f"{'relative ' * bool(self.initial)}energy error"
+            return "energy balance |E - E0 - W| / |E0|" if self.initial else "energy balance |E - E0 - W|"
+        return "relative energy error" if self.initial else "energy error"
 
 
 def energy_account(states: Any, *, limited: bool = False) -> EnergyAccount:

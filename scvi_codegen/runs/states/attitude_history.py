@@ -183,7 +183,7 @@ class AttitudeHistory:
         if name is None and len(members) == 1:
             return members[0]
         if name not in names:
-            reason = f"there is no {kind}" + f" '{name}'" * (name is not None)
+            reason = f"there is no {kind}" if name is None else f"there is no {kind} '{name}'"
             reason = f"there are {len(names)} of them: name one" if names and name is None else reason
             hint = closest(str(name), names) if name is not None else "."
             raise StateError(f"{reason}{hint} The system has: {', '.join(names) or f'no {kind}'}")

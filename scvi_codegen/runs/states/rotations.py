@@ -86,7 +86,8 @@ def _by_entry(shapes: Shapes, members: Sequence[Member], values: Any) -> Any:
         last = int(base in kinds)
         outer = array.ndim - last - len(axes[base])
         if outer < 0 or array.shape[outer : array.ndim - last] != axes[base]:
-            raise StateError(f"'{name}' must have the shape {axes[base]}{' of vectors' * last}, not {array.shape}")
+            of_vectors = " of vectors" if base in kinds else ""
+            raise StateError(f"'{name}' must have the shape {axes[base]}{of_vectors}, not {array.shape}")
         for index in np.ndindex(*axes[base]):
             suffix = "".join(f"_{k}" for k in index) + name.removeprefix(base)
             entries[base + suffix] = array[(slice(None),) * outer + index]

@@ -170,6 +170,12 @@ def _call(
         _refuse(stepper, status, q)
 
 
+def _first_names(names: Sequence[str]) -> str:
+    """Return the first names as text, with dots for the others."""
+    shown = ", ".join(names[:MOST_SHOWN])
+    return f"{shown}, .." if len(names) > MOST_SHOWN else shown
+
+
 def _dependent(stepper: Integrator, q: Array, t: float, parameters: Parameters, *, nearest: bool = False) -> str:
     """Return the message of :func:`rank_deficiency`; "" for run-time sizes too large for dense linear algebra."""
     if stepper.interface.layout.coordinates and max(stepper.dimension, len(stepper.constraints)) > MOST_DENSE:
@@ -188,7 +194,7 @@ def _massless(stepper: Integrator, q: Array, t: float, parameters: Parameters) -
     names = [name for name, p in zip(stepper.coordinates, momenta[1:], strict=True) if (p == momenta[0]).all()]
     if not names:
         return ""
-    listed = ", ".join(names[:MOST_SHOWN]) + ", .." * (len(names) > MOST_SHOWN)
+    listed = _first_names(names)
     return (
         f"{listed} ha{'ve' if len(names) > 1 else 's'} no kinetic energy there, so that momenta do not determine "
         "velocities. Where the constraints do, compile the system with a mass of 0 as the default, "
@@ -225,7 +231,7 @@ def _shown(q: Array) -> str:
 
 def _refuse(stepper: Integrator, status: int, q: Array) -> None:
     hint = "; check for redundant or contradictory constraints" if "singular" in STATUS[status] else ""
-    shown = ", ".join(stepper.constraints[:MOST_SHOWN]) + ", .." * (len(stepper.constraints) > MOST_SHOWN)
+    shown = _first_names(stepper.constraints)
     raise StateError(f"the constraints {shown} cannot be satisfied near q = {_shown(q)}: {REASONS[status]}{hint}")
 
 
