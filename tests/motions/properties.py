@@ -247,6 +247,8 @@ def ensembles(case: Case) -> None:
     ways: list[dict[str, Any]] = [{"h": case.h, "steps": STEPS}]
     if case.kind in ("plain", "driven") and _estimates_errors(case) and not case.two_words:
         ways.append({"t_end": ends, "tolerance": 1e-11})
+    if case.kind == "slowed":
+        ways.append({"h": case.h, "t_end": float(ends[0])})
     for way in ways:
         runs = ensemble_of(case, others, save_every=case.setting.save_every, **way)
         assert runs.ok.all()
@@ -270,7 +272,7 @@ def ensembles(case: Case) -> None:
 
 def _equals_single_run(case: Case, runs: Any, j: int, values: Any, way: Any, rows: Any) -> None:
     """Raise where a trajectory differs from the run of its start alone: by no bit at adaptive steps."""
-    own = {**way, "t_end": way["t_end"][j]} if "t_end" in way else way
+    own = {**way, "t_end": float(np.broadcast_to(way["t_end"], len(runs))[j])} if "t_end" in way else way
     alone = case.integrate(q=runs.q[0, j], parameters=case.parameters(values), **own)
     assert len(alone.t) == len(rows)
     rounding = 0.0 if "t_end" in way else (1e-28 if case.two_words else 1e-11 if case.problem.falls_back else 1e-12)

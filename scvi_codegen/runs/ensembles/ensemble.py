@@ -45,7 +45,7 @@ from scvi_codegen.runs.ensembles.result import EVENT_FAILED, INTERRUPTED, OK, En
 from scvi_codegen.runs.ensembles.schedule import CommonSteps
 from scvi_codegen.runs.ensembles.thread_pool import StopCheck, run_jobs
 from scvi_codegen.runs.results.dense_output import times_of_run
-from scvi_codegen.runs.states.times import WHOLE
+from scvi_codegen.runs.states.times import WHOLE, times_after
 from scvi_codegen.runs.states.validation import (
     Array,
     EnsembleParameters,
@@ -53,7 +53,7 @@ from scvi_codegen.runs.states.validation import (
     check_left_to_inputs,
     columns_of_inputs,
 )
-from scvi_codegen.runs.states.words import check_doubles, hashed, stacked
+from scvi_codegen.runs.states.words import check_doubles, hashed, stacked, with_low
 from scvi_codegen.runs.stepping.features import check_together, require
 from scvi_codegen.runs.stepping.step_plan import (
     Adaptive,
@@ -208,7 +208,8 @@ class Ensemble:
         self.confirmations = list[GlobalError | None]()
         self.t_eval: Array | None = None
         self.ends = np.empty(0)
-        self.singly = asked.records_events(stepper) or self._changes_two_words()
+        ends_in_time = self.fixed is not None and self.fixed.t_end is not None and stepper.in_tau  # after own steps
+        self.singly = asked.records_events(stepper) or self._changes_two_words() or ends_in_time
         if self.fixed is None or self.singly:
             self.plans = self._plans(self.fixed, cast(ArrayLike, t_end), self.control)
             self.plans = self.plans if self.error is None else list(self.plans)
@@ -312,7 +313,7 @@ class Ensemble:
         """Return the validated output times; raise ``StateError`` if inputs do not cover a run."""
         if fixed is not None:  # terminal events end runs at times of their own; two words are saved as they are
             events = self.stepper.events
-            own = any(event.terminal for event in events) or (fixed.words > 1 and not events)
+            own = self.stepper.in_tau or any(event.terminal for event in events) or (fixed.words > 1 and not events)
             return None if own else fixed.times(tau=False)
         for plan in self.plans if self.inputs else ():
             breakpoints_until(self.t0, plan.t_end, self.inputs)
@@ -543,7 +544,7 @@ class Ensemble:
             if times is not None:
                 times[row, j] = each.t
         if self.fixed is not None and self.stepper.in_tau:
-            t = self._fictitious_times(self.fixed, count)
+            t = self._fictitious_times(self.fixed, cast(Array, times))
         elif self.fixed is not None and not any(event.terminal for event in self.stepper.events):
             t, times = max((each.t for each in lanes), key=len), None
         status = np.array([each.status for each in lanes], dtype="<U32")
@@ -552,12 +553,14 @@ class Ensemble:
         whole = self._trajectories(t, times, q, p, status, steps, fallbacks)
         return replace(whole, actions=actions, events=tuple(each.events for each in lanes))
 
-    def _fictitious_times(self, fixed: CommonSteps, count: int) -> Array:
-        """Return tau of saved states, equal in all trajectories; NaN after the last common one, where t_end is in t."""
-        tau = fixed.times(tau=True)[:count]
-        rows: Array = self.stepper._states.missing((count,))
-        rows[: len(tau)] = tau
-        return rows
+    def _fictitious_times(self, fixed: CommonSteps, times: Array) -> Array:
+        """Return tau of states at (n, k) times; NaN where a trajectory is at its t_end, within a step of tau."""
+        count = len(times)
+        numbers = fixed.save_every * np.arange(count) if fixed.t_end is not None else fixed.numbers[:count]
+        high, low = times_after(0.0, fixed.h, numbers)
+        if fixed.t_end is not None:
+            high[np.isfinite(np.asarray(times)).sum(axis=0) - 1] = np.nan
+        return high if fixed.words == 1 else with_low(high, low)
 
     def _successive_result(self, work: SuccessiveRuns) -> EnsembleTrajectory:
         count, layout, full = len(self), self.stepper._states, work.status == FULL
@@ -585,7 +588,7 @@ class Ensemble:
             numbers, times = np.arange(rows, dtype=float), ordered("t", start)
             own: Array | None = times
             if self.fixed is not None and self.stepper.in_tau:
-                numbers = self._fictitious_times(self.fixed, rows)
+                numbers = self._fictitious_times(self.fixed, times)
             elif self.fixed is not None:
                 numbers, own = times[:, stored.argmax()], None
             whole = self._trajectories(numbers, own, q, p, work.names, work.done, work.fallback_steps)

@@ -55,7 +55,8 @@ class EnsembleRuns:
     """Runs of k trajectories, wherever their states are.
 
     Attributes:
-        t: (n,) common times; tau from 0 in transformed time; row numbers if every trajectory has its own times.
+        t: (n,) common times; in transformed time tau from 0, NaN where a trajectory is at its t_end; row numbers if
+            every trajectory has its own times.
         status: (k,) ``"ok"``, or the reason of the end (``"not converged"``, ``"singular"``, ``"not finite"``,
             ``"step size underflow"``, ``"interrupted"``, ``"too many states"`` for the memory).
         steps: (k,) completed steps.
