@@ -22,7 +22,6 @@ from scvi_codegen.methods.constraints import with_constraints
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import Block, Gather, Row, Scatter, StageGroup, StageSystem, Table, Velocities
 from scvi_codegen.methods.tables.basis import identity_matrix, next_step
-from scvi_codegen.systems.constraints import velocity_conditions
 from scvi_codegen.systems.derived_expressions import auxiliary_multipliers, forms_of
 from scvi_codegen.systems.first_order import FirstOrderSystem
 from scvi_codegen.systems.formulas.expressions import gradient_tuple
@@ -235,7 +234,7 @@ def is_symplectic(method: Method, system: MechanicalSystem) -> bool:
 
 def is_conformally_symplectic(method: Method, system: MechanicalSystem) -> bool:
     """Return whether the steps multiply dq ^ dp by exp(-gamma h), where gamma is the damping rate."""
-    return method.symplectic and not (system.forces or system.is_prescribed or any(velocity_conditions(system)))
+    return method.symplectic and not (system.forces or system.is_prescribed or system.is_rolling)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -241,6 +241,13 @@ class MechanicalSystem(Deferred, ABC):
         return 0 < len(self.constraints) == self.dimension
 
     @property
+    def is_rolling(self) -> bool:
+        """True if a constraint is a condition on velocities that does not follow from one on positions."""
+        from scvi_codegen.systems.constraints import velocity_conditions  # imported here: it imports SymPy
+
+        return any(velocity_conditions(self))
+
+    @property
     def is_first_order(self) -> bool:
         """True if the function is linear in the velocities, so that half of the variables are momenta."""
         return False

@@ -35,7 +35,6 @@ from sympy import Expr, Symbol
 
 from scvi_codegen.common.errors import SystemDefinitionError, closest
 from scvi_codegen.common.validation import checks_arguments
-from scvi_codegen.systems.constraints import velocity_conditions
 from scvi_codegen.systems.derived_expressions import forms_of
 from scvi_codegen.systems.formulas.array_statements import formula_of_entries, is_indexed, momentum_arrays
 from scvi_codegen.systems.formulas.expressions import gradient, hessian
@@ -93,7 +92,7 @@ def reparametrise(system: MechanicalSystem, time_transformation: str | Expr) -> 
             f"{cause} on '{system.name}', so its energy is not conserved, which the symplectic time "
             f"transformation requires. Use adaptive steps (t_end=...), or {REVERSIBLE}"
         )
-    if any(velocity_conditions(system)):
+    if system.is_rolling:
         raise SystemDefinitionError(
             f"'{system.name}' has nonholonomic constraints, which a symplectic time transformation "
             f"does not support. Use adaptive steps (t_end=...), or {REVERSIBLE}"

@@ -4,6 +4,7 @@ import subprocess
 
 import numpy as np
 import pytest
+from commands import invoke
 from notation import lagrange
 from scipy.optimize import minimize
 
@@ -201,6 +202,7 @@ def test_model_files_and_generated_programs_have_constraints(tmp_path):
     (tmp_path / "chain.toml").write_text(MODEL)
     model = sc.load_model(tmp_path / "chain.toml")
     run = model.integrate()
+    assert "order 2, symplectic, symmetric" in invoke("run", tmp_path / "chain.toml").stdout
     folder = sc.generate_package(model, tmp_path / "chain_c")
     made = subprocess.run(["make", "run"], cwd=folder, capture_output=True, text=True, check=True)
     assert "warning" not in made.stderr

@@ -377,6 +377,11 @@ class ArraySystem(OfRunTimeSizes, MechanicalSystem):
         return False
 
     @property
+    def is_rolling(self) -> bool:
+        """False: constraints of arrays contain no velocities."""
+        return False
+
+    @property
     def auxiliaries(self) -> tuple[Array, ...]:
         """Momenta."""
         return self.momenta
