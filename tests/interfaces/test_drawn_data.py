@@ -96,6 +96,11 @@ def test_other_drawings_have_the_values_of_their_arrays() -> None:
         drawn = plot_arrays(run)
         assert (drawn.get_xlabel(), drawn.get_ylabel(), drawn.get_title()) == labels
         assert np.array_equal(drawn.collections[0].get_array(), values if len(shape) == 1 else values[-1].T)
+    run.stepper.arrays = lambda _: {"x": T**2, "u": values[:, 0], "v": values}
+    assert np.array_equal(plot_arrays(run).collections[0].get_array(), values[:, 0])
+    carriage = plot_arrays(run, array="x")
+    assert np.array_equal(carriage.lines[0].get_xydata(), np.stack([T, T**2], 1))
+    assert (carriage.get_xlabel(), carriage.get_ylabel()) == ("t", "x")
     residuals = ResidualPlot(T, np.stack([T, -T], 1), np.array([0.1, 0.3]), ("u", "v"))()
     assert [(line.get_label(), line.get_ydata()[-1]) for line in residuals.lines[:2]] == [("u", 2.0), ("v", -2.0)]
     bands = [patch.get_extents().transformed(residuals.transData.inverted()) for patch in residuals.patches]

@@ -33,14 +33,14 @@ def mesh_of(motion: Trajectory) -> Any:
 
 
 def array_values(motion: Trajectory, name: str | None) -> tuple[str, NDArray[np.float64]]:
-    """Return name and values (n, ..) of an array or of a field on a mesh, by default the first.
+    """Return name and values (n, ..) of an array or of a field on a mesh, by default the first one with an index.
 
     Raises:
         StateError: for an unknown name.
     """
     mesh = mesh_of(motion)
     arrays = mesh.fields_of(np.asarray(motion.q), np.asarray(motion.p)) if mesh else motion.stepper.arrays(motion.q)
-    chosen = next(iter(arrays)) if name is None else name
+    chosen = max(arrays, key=lambda each: arrays[each].ndim > 1) if name is None else name
     if chosen not in arrays:
         raise StateError(f"there is no array '{chosen}'{closest(chosen, arrays)} Known: {', '.join(arrays)}")
     return chosen, arrays[chosen]
@@ -59,12 +59,13 @@ def plot_arrays(
 
     An array with one index, ``q[N]``, is an image over index and time; ``r[N, 2]`` or ``r[N, 3]`` are the first and
     last positions in space, in their first two components; any other array with two indices, ``u[NX, NY]``, is an image
-    of one state. Fields on a mesh are drawn over the coordinates of its points.
+    of one state; a coordinate without an index is a curve over time. Fields on a mesh are drawn over the coordinates of
+    its points.
 
     Args:
         trajectory: result of :meth:`Stepper.integrate`.
         path, ax: as of :func:`~scvi_codegen.interfaces.pictures.overview.plot_motion`.
-        array: name of the array or field; by default the first.
+        array: name of the array or field; by default the first one with an index.
         state: index of the state drawn of two indices.
 
     Raises:
@@ -92,6 +93,9 @@ def plot_arrays(
         elif values.ndim == 3:
             _draw_picture(drawn, points, values[state].T, name)
             drawn.set(xlabel=labels[0], ylabel=labels[1], title=f"t = {trajectory.t[state]:g}")
+        elif values.ndim == 1:
+            drawn.plot(trajectory.t, values)
+            drawn.set(xlabel="t", ylabel=plain(name))
         else:
             _draw_picture(drawn, [points[0], trajectory.t], values, name)
             drawn.set(xlabel=labels[0], ylabel="t")
