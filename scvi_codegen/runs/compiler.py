@@ -106,15 +106,15 @@ def compile_stepper(
         "time_transformation": time_transformation,
         "controller": controller,
     }
+    if symmetries != ():
+        from scvi_codegen.systems.symmetry.symmetry import SYMMETRIES
+
+        check_kind(SYMMETRIES, symmetries, "symmetries")
     if isinstance(system, OfRunTimeSizes) and sizes is None and tables is None:
         return _compile_arrays(system, method, symmetries, as_events(events), precision, common)
     compiled = partial(compile_stepper, system, method, symmetries=symmetries, sizes=sizes, tables=tables, **common)
     if precision == AUTO:
         return _in_both_precisions(compiled, events)
-    if symmetries != ():
-        from scvi_codegen.systems.symmetry.symmetry import SYMMETRIES
-
-        check_kind(SYMMETRIES, symmetries, "symmetries")
     shape: dict[str, Any] = {"mesh": system.mesh, "links": system.drawn_links}
     if sizes is not None or tables is not None:
         system, time_transformation = _at_sizes(system, time_transformation, sizes or {}, tables)

@@ -232,7 +232,7 @@ class FirstOrderLayout(StateLayout):
         if isinstance(q, Mapping):
             entries = dict(chain.from_iterable(self._entries(name, values) for name, values in q.items()))
             check_names(entries, variables, "the state")
-            z = joined_columns([column(entries, name, "the state") for name in variables])
+            z = joined_columns({name: column(entries, name, "the state") for name in variables}, "the state")
         else:
             z = real_array(q, "the state")
             if not z.ndim or z.shape[-1] != len(variables):

@@ -18,7 +18,7 @@ from scvi_codegen.runs.states.attitudes import (
     scaled_vectors,
     velocities_of_body,
 )
-from scvi_codegen.runs.states.validation import Array
+from scvi_codegen.runs.states.validation import Array, common_shape
 from scvi_codegen.runs.states.words import Shapes
 
 if TYPE_CHECKING:
@@ -117,9 +117,9 @@ def state_of(
     ordinary = coordinates[: members[0].columns.start]
     if isinstance(q, Mapping):
         check_names(q, [*ordinary, *(member.name for member in members)], "q")
-        parts = [column(q, name, "q") for name in ordinary]
         attitudes = {member.name: _coordinates(member, q) for member in members}
-        state = joined_columns([*parts, *(attitudes[member.name][0] for member in members)])
+        parts = {name: column(q, name, "q") for name in ordinary}
+        state = joined_columns(parts | {name: coordinates for name, (coordinates, _) in attitudes.items()}, "q")
     else:
         state = real_array(q, "q")
         if not state.ndim or state.shape[-1] != len(coordinates) or any(member.kind == "spin" for member in members):
@@ -133,11 +133,11 @@ def state_of(
     if p is None and velocity is None and not ordinary and all(member.kind == "spin" for member in members):
         p = {}
     if isinstance(velocity, Mapping):
-        state, velocity = np.broadcast_arrays(
-            state, joined_columns(_moving(ordinary, members, velocity, attitudes, "velocity"))
-        )
+        parts = _moving(ordinary, members, velocity, attitudes, "velocity", state.shape[:-1])
+        state, velocity = np.broadcast_arrays(state, joined_columns(parts, "velocity"))
     if isinstance(p, Mapping):
-        state, p = np.broadcast_arrays(state, joined_columns(_moving(ordinary, members, p, attitudes, "p")))
+        parts = _moving(ordinary, members, p, attitudes, "p", state.shape[:-1])
+        state, p = np.broadcast_arrays(state, joined_columns(parts, "p"))
     return state, p, velocity
 
 
@@ -182,23 +182,27 @@ def _moving(
     values: Mapping[str, Any],
     attitudes: Mapping[str, tuple[Array, Array]],
     argument: str,
-) -> list[Array]:
-    """Return the parts of momenta or velocities."""
+    states: tuple[int, ...],
+) -> dict[str, Array]:
+    """Return the parts of momenta or velocities by name, for positions of this shape."""
     named = {m.name for m in members if m.kind == "rotation" and (m.momentum or argument == "velocity")}
     names = {m.name: m.rate if m.name in named else m.name for m in members}
     known = [*ordinary, *(names[m.name] for m in members if m.kind != "spin")]
     check_names(values, known, argument, also=[f"{names[m.name]}_space" for m in members if m.kind == "rotation"])
-    parts = [column(values, name, argument) for name in ordinary]
+    parts = {name: column(values, name, argument) for name in ordinary}
+    for name, rates in parts.items():
+        common_shape({"q": states, f"{argument}: '{name}'": rates.shape[:-1]})
     for member in members:
         q, p = attitudes[member.name]
         name = names[member.name]
         if member.kind == "spin":
-            parts.append(p)
+            parts[name] = p
             continue
         in_space = member.kind == "rotation" and f"{name}_space" in values
         vector = real_array(values[f"{name}_space" if in_space else name], f"{argument}: '{name}'")
         if not vector.ndim or vector.shape[-1] != 3 or not np.isfinite(vector).all():
             raise StateError(f"{argument}: '{name}' must have three finite components, not {vector.tolist()}")
+        common_shape({"q": states, f"{argument}: '{name}'": vector.shape[:-1]})
         if member.kind == "direction":
             radial = (q * vector).sum(axis=-1, keepdims=True)
             if not (np.abs(radial) <= TANGENT * np.abs(vector).max(axis=-1, keepdims=True)).all():
@@ -206,11 +210,11 @@ def _moving(
                     f"{argument}: '{name}' = {vector.tolist()} is not tangent to the unit sphere: its component "
                     f"along it is {np.abs(radial).max():.3g}. The length is constant: give an orthogonal vector"
                 )
-            parts.append(np.asarray(vector - q * radial))
+            parts[name] = np.asarray(vector - q * radial)
             continue
         body = np.einsum("...ji,...j->...i", matrices(q), vector) if in_space else vector
         q, body = np.broadcast_arrays(q, np.concatenate([body, body[..., :1]], axis=-1))
-        parts.append((velocities_of_body if argument == "velocity" else momenta_of_body)(q, body[..., :3]))
+        parts[name] = (velocities_of_body if argument == "velocity" else momenta_of_body)(q, body[..., :3])
     return parts
 
 
@@ -233,7 +237,7 @@ def column(values: Mapping[str, Any], name: str, argument: str) -> Array:
     return real_array(values[name], f"{argument}: '{name}'")[..., None]
 
 
-def joined_columns(parts: Sequence[Array]) -> Array:
-    """Return the columns of all parts beside each other, of as many states as the longest."""
-    shape = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
-    return np.concatenate([np.broadcast_to(part, (*shape, part.shape[-1])) for part in parts], axis=-1)
+def joined_columns(parts: Mapping[str, Array], argument: str) -> Array:
+    """Return the columns of all parts by name beside each other, of as many states as the longest."""
+    shape = common_shape({f"{argument}: '{name}'": part.shape[:-1] for name, part in parts.items()})
+    return np.concatenate([np.broadcast_to(part, (*shape, part.shape[-1])) for part in parts.values()], axis=-1)

@@ -5,6 +5,7 @@ import math
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import lru_cache
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen.codegen.native.arguments import checked_number, real_array
 from scvi_codegen.codegen.rendering.source import NAME_IN_FORMULA, NUMBER, Interface
 from scvi_codegen.common.errors import StateError, closest
+from scvi_codegen.common.representation import counted
 from scvi_codegen.runs.states.words import Shapes
 
 Array = NDArray[np.float64]
@@ -81,6 +83,29 @@ def shapes_of(interface: Interface) -> Shapes | None:
     return coordinate_shapes(interface) if interface.arrays else None
 
 
+def common_shape(shapes: Mapping[str, tuple[int, ...]]) -> tuple[int, ...]:
+    """Return the shape of the states that all parts by name describe; a part of one state is that of all states.
+
+    Raises:
+        StateError: naming two parts of different numbers of states.
+    """
+    try:
+        return np.broadcast_shapes(*shapes.values())
+    except ValueError:
+        pairs = combinations(shapes, 2)
+        first, second = next(pair for pair in pairs if not _agree(*(shapes[name] for name in pair)))
+        raise _different_states(shapes, first, second, ", or one for all") from None
+
+
+def _agree(first: tuple[int, ...], second: tuple[int, ...]) -> bool:
+    return all(m == n or 1 in (m, n) for m, n in zip(reversed(first), reversed(second), strict=False))
+
+
+def _different_states(shapes: Mapping[str, tuple[int, ...]], first: str, second: str, remedy: str = "") -> StateError:
+    has, other = (counted(math.prod(shapes[name]), "state") for name in (first, second))
+    return StateError(f"{first} has {has} and {second} {other}: give as many of each{remedy}")
+
+
 def _joined(arrays: Sequence[tuple[str, tuple[int, ...]]], by_name: Mapping[str, Any], label: str) -> Array:
     check_named(by_name, [name for name, _ in arrays], label)
     parts = []
@@ -89,8 +114,10 @@ def _joined(arrays: Sequence[tuple[str, tuple[int, ...]]], by_name: Mapping[str,
         if part.shape[max(0, part.ndim - len(shape)) :] != shape:
             raise StateError(f"{label}: '{name}' must have the shape {shape}, not {part.shape}")
         parts.append(part.reshape(*part.shape[: part.ndim - len(shape)], math.prod(shape)))
-    if len({part.shape[:-1] for part in parts}) > 1:
-        raise StateError(f"{label}: the arrays have different numbers of states")
+    shapes = {f"{label}: '{name}'": part.shape[:-1] for (name, _), part in zip(arrays, parts, strict=True)}
+    if len({*shapes.values()}) > 1:
+        first, *others = shapes
+        raise _different_states(shapes, first, next(name for name in others if shapes[name] != shapes[first]))
     return np.concatenate(parts, axis=-1)
 
 
