@@ -311,6 +311,18 @@ def test_ensembles_with_few_or_no_steps() -> None:
     assert still.energy().shape == (1, COUNT)
 
 
+def test_rows_after_the_end_of_all_trajectories_keep_their_times() -> None:
+    """Impacts that accumulate end each trajectory before t_end, with NaN after its end."""
+    ball = sc.LagrangianSystem.from_text(name="ball", coordinates=["y"], lagrangian="y_dot**2/2 - y")
+    bouncing = sc.compile_stepper(ball, "svi:2", events=sc.impact("y", restitution="0.5"))
+    with pytest.warns(sc.EventWarning, match="accumulate"):
+        runs = bouncing.integrate_ensemble([[0.1], [0.2]], [[0.0], [0.0]], h=0.1, t_end=3.0)
+    assert_allclose(runs.t, np.arange(31) / 10, atol=1e-15)
+    assert runs.q.shape == (31, 2, 1)
+    assert np.isnan(runs.q[-1]).all()
+    assert (runs.ends[0] < 2.0).all()
+
+
 @pytest.mark.parametrize("t_eval", [[2.0, 5.0], [0.5, 2.0, 5.0]])
 def test_ends_with_output_times_are_those_of_terminal_events(t_eval: list[float]) -> None:
     stepper = stepper_for("kepler", sc.SVI(5)).with_events(sc.Event("q1 - 1/2", -1, terminal=True))

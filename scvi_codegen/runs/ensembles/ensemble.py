@@ -546,7 +546,8 @@ class Ensemble:
         if self.fixed is not None and self.stepper.in_tau:
             t = self._fictitious_times(self.fixed, cast(Array, times))
         elif self.fixed is not None and not any(event.terminal for event in self.stepper.events):
-            t, times = max((each.t for each in lanes), key=len), None
+            longest, times = max((each.t for each in lanes), key=len), None
+            t = longest if len(longest) == count else t  # all may end before t_end
         status = np.array([each.status for each in lanes], dtype="<U32")
         steps = np.array([each.steps for each in lanes], dtype=np.int64)
         fallbacks = np.array([each.fallback_steps for each in lanes], dtype=np.int64)
