@@ -88,7 +88,8 @@ def first_state(interface: Interface, argument: Any) -> Any:
     if values is None or (array := real_array(values, "positions")).ndim <= len(first.axes) or not len(array):
         return argument
     if isinstance(argument, Mapping):
-        return {name: real_array(each, "q")[0] for name, each in argument.items()}
+        arrays = {name: real_array(each, f"q: '{name}'") for name, each in argument.items()}
+        return {name: each[0] if each.ndim and len(each) else each for name, each in arrays.items()}
     return real_array(argument, "q")[0]
 
 
