@@ -10,7 +10,7 @@ from golden_cells import catalogue, ring
 from programs import needs
 from samples import QUICK_FLAGS
 
-from scvi_codegen import SVI, compile_stepper, generate_source
+from scvi_codegen import SVI, LagrangianSystem, compile_stepper, generate_source
 from scvi_codegen.codegen.native.compilers import find_compiler
 from scvi_codegen.codegen.pipeline import ArraySources
 from scvi_codegen.codegen.rendering.source import Source
@@ -101,3 +101,17 @@ def test_single_file_defines_no_macro_that_it_does_not_use():
     assert "#undef" not in plain
     for name in re.findall(r"^#define (\w+)$", plain, re.MULTILINE):
         assert len(re.findall(rf"\b{name}\b", plain)) > 1, name
+
+
+@pytest.mark.parametrize("name", ["first order", "constraints"])
+def test_every_function_of_a_single_file_is_used(name, tmp_path):
+    """Systems without momenta of given velocities, and steps with constraints but without error estimates."""
+    coordinates, lagrangian, options = {
+        "first order": (["x", "y"], "log(y)/x*x_dot/2 - log(x)/y*y_dot/2 - (x + y - log(x) - log(y))", {}),
+        "constraints": (["x", "y"], "(x_dot**2 + y_dot**2)/2 - y", {"embedded": "double"}),
+    }[name]
+    conditions = {"constraints": ["x**2 + y**2 = 1"]} if options else {}
+    system = LagrangianSystem.from_text(name=name, coordinates=coordinates, lagrangian=lagrangian, **conditions)
+    method = SVI(2, "gauss-lobatto:3" if options else "gauss-legendre:2")
+    written(generate_source(system, method, prefix="one", **options)[0].single_file(), tmp_path)
+    subprocess.run([*find_compiler(), *STRICT, "-c", "one.c"], cwd=tmp_path, check=True)

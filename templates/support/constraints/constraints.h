@@ -147,6 +147,7 @@ static SELDOM real displacement_by_reactions(const step_data *step, const real *
   return heaviest > 0 ? step->h * step->h * largest_of(force) / heaviest : 0;
 }
 
+#ifndef BARE_STEPS
 /* Unknowns of the last solved step of a run. */
 static inline const real *last_unknowns(const step_data *step)
 {
@@ -176,6 +177,7 @@ static SELDOM real length_of_constraints(const step_data *step)
       length = larger(length, rounding[k] / steepest[k]);
   return length + displacement_by_reactions(step, last_unknowns(step));
 }
+#endif
 
 /* Sum of squares of g; infinite if g is not finite. */
 static real misfit(real t, const real *q, const real *parameters, real *g)
