@@ -182,7 +182,8 @@ def _source(folder: Path, prefix: str, record: Mapping[str, Any]) -> Source:
 
 def damaged(folder: Path, error: Exception) -> PackageError:
     """Return the error for a folder whose record does not fit its C code."""
-    return PackageError(f"{folder / INTERFACE_FILE} is damaged ({error!r}): generate the folder again")
+    where = f"{folder / INTERFACE_FILE} is damaged or of another version of this package"
+    return PackageError(f"{where} ({error!r}): generate the folder again")
 
 
 def prefix_of(folder: Path, kind: str = "folder", suffix: str = "") -> str:
@@ -198,7 +199,7 @@ def prefix_of(folder: Path, kind: str = "folder", suffix: str = "") -> str:
     if name != cleaned:
         raise PackageError(
             f"the name of the {kind} must be a prefix of C names and a name of a Python package; "
-            f"'{name}' is not (lower-case letters, digits and underscores, at most {LONGEST_PREFIX}): "
+            f"'{name}' is not (2 to {LONGEST_PREFIX} lower-case letters, digits and underscores, no header of C): "
             f"use '{cleaned}{suffix}'{', or give --fmu' if name.endswith('.fmu') else ''}"
         )
     if keyword.iskeyword(name) or name in sys.stdlib_module_names or name in OTHER_NAMES:
