@@ -191,7 +191,7 @@ def headers_of(name: str) -> Iterator[str]:
             with suppress(sc.MethodError):
                 sources.append(made.variant(kind))
     for source in filter(None, sources):
-        yield from (header.removeprefix("support/") for header, _ in source.support)
+        yield from (header.removeprefix("support/") for header, _ in source.specialised().support)
 
 
 @pytest.mark.second

@@ -11,7 +11,6 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -48,8 +47,8 @@ LOADING = """
 import json, sys, time
 from pathlib import Path
 from scvi_codegen.codegen.native import building
-from scvi_codegen.codegen.rendering.source import (Source)
-sources = [Source(**fields) for fields in json.loads(Path(sys.argv[1]).read_text())]
+from scvi_codegen.codegen.rendering.source import Source
+sources = [Source.from_record(record) for record in json.loads(Path(sys.argv[1]).read_text())]
 print("ready", flush=True)
 sys.stdin.readline()
 for number in map(int, sys.argv[2:]):
@@ -62,7 +61,7 @@ def loading(folder: Path, *numbers: int, **environment: str) -> subprocess.Popen
     """A process that loads these sources, one after the other, once it is given a line."""
     path = folder.parent / "sources.json"
     if not path.exists():  # which the processes before this one may be reading
-        path.write_text(json.dumps([asdict(source(number)) for number in range(8)]))
+        path.write_text(json.dumps([source(number).to_record() for number in range(8)]))
     return subprocess.Popen(
         [sys.executable, "-W", "error", "-c", LOADING, str(path), *map(str, numbers)],
         env=os.environ | environment,

@@ -43,6 +43,7 @@ def test_notebooks_are_saved_without_outputs(path):
 
 
 def test_results_are_below_their_cells(tmp_path):
+    pytest.importorskip("matplotlib.pyplot").close("all")  # of other tests in this process
     drawn = "import matplotlib.pyplot as plt\nplt.plot([0, 1]);"
     path = saved(tmp_path / "one.ipynb", "x = 2\nprint(x)\nx + 1", drawn, "x;")
     results = notebooks.execute(path)

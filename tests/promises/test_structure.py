@@ -52,7 +52,6 @@ FINITE_DIFFERENCES = 2e-12
 METHODS = (
     *(sc.SVI(s) for s in (1, 2, 3)),
     sc.SVI(4, "gauss-lobatto:5"),
-    sc.SCVI(5),
     sc.SVI(2, "gauss-lobatto:3"),
     sc.SVI(2, "gauss-radau-right:2"),
     sc.SVI(2, "gauss-radau-left:3"),

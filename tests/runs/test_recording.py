@@ -106,7 +106,7 @@ class TestRecording:
         found.save("a.npz")
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
-        assert peak < 3.0e6 < 100_000 * (8 * 5 + 4)  # 2.0 to 2.8 MB, and less than the run's own 4.4 MB
+        assert peak < 3.6e6 < 100_000 * (8 * 5 + 4)  # 2.0 to 3.2 MB; the run has 4.4 MB
 
     def test_different_compiler_or_processor_is_reported_and_saved(self, kepler, monkeypatch):
         recorded(kepler, 500, stop=StopsAfter(3))
