@@ -21,17 +21,18 @@ from scvi_codegen.common.validation import checks_arguments
 from scvi_codegen.runs.accuracy.global_error import Confirmed, GlobalError
 from scvi_codegen.runs.accuracy.local_error import TOLERABLE_ERROR
 from scvi_codegen.runs.accuracy.resolution import unresolved_parts
+from scvi_codegen.runs.accuracy.size import relative
 from scvi_codegen.runs.derivatives.actions import actions_until, compensated_sums, shadow_energy
 from scvi_codegen.runs.derivatives.trajectory_derivatives import TrajectoryDerivatives
 from scvi_codegen.runs.events.refinement import crossings_of
 from scvi_codegen.runs.forwarding import ChaosOfRun, Pictured
-from scvi_codegen.runs.results.dense_output import checked_times, states_at, within
+from scvi_codegen.runs.results.dense_output import states_at, times_of_words, within
 from scvi_codegen.runs.results.descriptions import describe_states, describe_step_size
 from scvi_codegen.runs.results.energy import energy_account
 from scvi_codegen.runs.results.export import States, to_dataframe, write_states
 from scvi_codegen.runs.results.joining import Number, concatenated, joined, joined_crossings, relative_changes
 from scvi_codegen.runs.results.quantities import quantities
-from scvi_codegen.runs.results.recomputation import exchanged_energy, work_and_impulses_until
+from scvi_codegen.runs.results.recomputation import work_and_impulses_until
 from scvi_codegen.runs.results.saved_states import Array, checked_row
 from scvi_codegen.runs.states.attitude_history import AttitudeHistory
 from scvi_codegen.runs.states.rotation_quantities import named_quantities
@@ -196,10 +197,6 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
             return self.conserved[:, :3]
         return self._joined(lambda piece: piece.stepper._energy_parts(piece.q, piece.p, piece.t, piece.parameters))
 
-    def _exchanged_energy(self, energy: Array) -> Array | None:
-        """Return (n,) work of forces and energy exchanged at events; ``None`` if the states do not determine it."""
-        return exchanged_energy(self, energy)
-
     def energy_error(self) -> float:
         """Return the largest error of the energy, relative to the largest sum of its absolute parts if known.
 
@@ -217,10 +214,10 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
                 "without time, and at impacts all states (save_every=1)"
             )
         energies, parts = np.abs(self.energies), np.isfinite(self.energies[0, 0])
-        size = float(np.max(energies[:, :2].sum(axis=1) if parts else energies[:, 2]))
-        if not parts and size < 1e-8 * (action := float(np.abs(np.sum(self.p * self.velocity, axis=-1)).max())):
+        size = np.max(energies[:, :2].sum(axis=1) if parts else energies[:, 2])
+        if not parts and size < 1e-8 * (action := np.abs(np.sum(self.p * self.velocity, axis=-1)).max()):
             size = action
-        return float(np.max(np.abs(account.values))) / (size or 1.0)
+        return float(relative(np.max(np.abs(account.values)), size))
 
     @property
     def t_low(self) -> Array:
@@ -395,8 +392,9 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
             StateError: if a time is outside the trajectory, or this was made with ``t_eval``.
         """
         self._check_saved()
-        times, shape = checked_times(t, "t"), (*np.shape(t), self.stepper.dimension)
-        q, p = self._states_at(times.ravel())
+        times = times_of_words(t, self.stepper.interface.words)
+        shape = *times.shape, self.stepper.dimension
+        q, p = self._states_at(times.reshape(-1))
         return self.stepper.named(q.reshape(shape)), self.stepper.named(p.reshape(shape))
 
     def _states_at(self, times: Array) -> tuple[Array, Array]:

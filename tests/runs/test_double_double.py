@@ -929,6 +929,26 @@ def test_global_errors_of_ensembles() -> None:
     assert (one.q_low[-1] == runs[0].q_low[-1]).all()
 
 
+@pytest.mark.parametrize("kind", ["fixed", "tau", "inputs", "events"])
+def test_dense_output_at_the_times_of_states_is_these_states(kind: str) -> None:
+    """Times have low words, which dense output takes as well: in arrays, in lists and alone."""
+    more: dict[str, Any] = {"forces": {"q": "u"}, "inputs": ["u"]} if kind == "inputs" else {}
+    system = sc.LagrangianSystem.from_text("pendulum", ["q"], "q_dot**2/2 + cos(q)", **more)
+    system = sc.reparametrise(system, "1/(1 + q**2)") if kind == "tau" else system
+    stepper = sc.compile_stepper(system, "svi:4", precision="double-double")
+    arguments: dict[str, Any] = {"inputs": {"u": ([0.0, 0.35, 2.0], [0.0, 0.1, 0.3])}} if kind == "inputs" else {}
+    arguments |= {"events": [sc.impact("0.55 - q", 0.5)]} if kind == "events" else {}
+    run = stepper.integrate(["0.5"], ["0.2"], h=0.1, steps=12, **arguments)
+    assert run.t_low.any()
+    last = slice(None) if kind != "events" else np.flatnonzero(np.diff(run.t, prepend=-1.0))  # of equal times
+    q, p = run.at(run.t)
+    assert not (q - run.q)[last].any()
+    assert not (p - run.p)[last].any()
+    assert not (run.at([run.t[3], run.t[4]])[0] - run.q[3:5]).any()
+    assert not (run.at(run.t[3])[0] - run.q[3]).any()
+    assert (run.at(float(run.t[3]))[0] - run.q[3]).any()
+
+
 @pytest.mark.parametrize("steps", [{"h": 0.07}, {"t_end": 2.0}])
 def test_recordings(steps: dict[str, float], tmp_path: Path) -> None:
     """A recording that is interrupted and resumed has all bits of a run in memory; also checkpoints and files."""

@@ -160,7 +160,8 @@ def _energy_report(result: EnsembleTrajectory, balance: float | None) -> str:
     if not np.isfinite(changes).any():
         return "energy: not finite in any state"
     state, worst = (int(index) for index in np.unravel_index(np.nanargmax(changes), changes.shape))
-    if relative and changes[state, worst] > LARGE_ERROR and not energy_account(result[worst], limited=True).initial:
+    is_large = relative and changes[state, worst] > LARGE_ERROR
+    if is_large and energy_account(result[worst], limited=True).initial is None:
         relative, changes = False, np.abs(energies - energies[0])  # an energy that is a rounding error of its terms
         state, worst = (int(index) for index in np.unravel_index(np.nanargmax(changes), changes.shape))
     if reason:

@@ -71,7 +71,7 @@ def energy_report(trajectory: Trajectory, account: EnergyAccount | None = None) 
             return changed
         return f"{changed}; energy balance |E - E0 - W| {np.abs(account.values).max():.1e} at most"
     drift = f"drift {_drift(trajectory.t, account.values / account.scale):+.1e} over the run"
-    return f"{account.title}: {largest:.2e} at most, {drift}{_verdict(largest) if account.initial else ''}"
+    return f"{account.title}: {largest:.2e} at most, {drift}{'' if account.initial is None else _verdict(largest)}"
 
 
 def _verdict(error: float) -> str:

@@ -44,9 +44,9 @@ def model_with_global_error(model: Model, error: float) -> tuple[Model, GlobalEr
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AccuracyWarning)  # reported in the line printed below
         result = wanted.confirmed(wanted.stepper())
-    local = f"local tolerance of {result.tolerance:.1e}" if result.tolerance else "local tolerance of round-off"
+    local = f"local tolerance of {'round-off' if result.tolerance is None else f'{result.tolerance:.1e}'}"
     local += "" if result.max_step == math.inf else f" and steps of at most {result.max_step:.3g}"
-    local = f"step of tau of {result.h:.6g}" if result.h else local
+    local = local if result.h is None else f"step of tau of {result.h:.6g}"
     in_words = result.precision == DOUBLE_DOUBLE
     local += f" in {DOUBLE_DOUBLE}" if in_words else ""
     numbers = {
@@ -66,7 +66,7 @@ def model_with_global_error(model: Model, error: float) -> tuple[Model, GlobalEr
         f"is confirmed until t = {result.confirmed_until:g}, with a {local}",
         global_error=numbers,
     )
-    if result.h:
+    if result.h is not None:
         signed = math.copysign(result.h, wanted.covered)
         fixed: dict[str, Any] = dict.fromkeys(OF_ADAPTIVE_STEPS)
         return replace(wanted, h=signed, **fixed, span=abs(wanted.covered), error=None), result

@@ -42,8 +42,8 @@ Steps of tau are equal, so that many have smaller errors than the tolerance.
 """
 FINER = 0.1
 """Ratio of the tolerances of a run whose error rounding may dominate, of its three comparisons, and of the next run."""
-LAST = (0.0, 1e-18, 1e-19, 1e-20)
-"""Tolerances of the last runs (0: the default, round-off level), which are compared with each other."""
+LAST = (None, 1e-18, 1e-19, 1e-20)
+"""Tolerances of the last runs (``None``: the default, round-off level), which are compared with each other."""
 ROUNDED_OF_TWO_WORDS, LEAST_OF_TWO_WORDS, LAST_OF_TWO_WORDS = 1e-26, 1e-30, (1e-30, 1e-29, 1e-28)
 """The same with states of two words."""
 COARSER = 1e4
@@ -85,8 +85,8 @@ class GlobalError:
 
     Attributes:
         requested: requested bound of the relative global error.
-        tolerance: local tolerance of the returned run, 0 for round-off.
-        h: step of tau of a run in transformed time, else 0.
+        tolerance: local tolerance of the returned run; ``None`` for round-off.
+        h: step of tau of a run in transformed time, else ``None``.
         t: (n,) times at which the runs were compared: at most 512 of the saved states, where the motion is fast.
         differences: (n,) the largest difference of a position relative to the range of that coordinate over the run, or
             of a momentum relative to its own or that of its velocity (:mod:`scvi_codegen.runs.accuracy.size`).
@@ -100,8 +100,8 @@ class GlobalError:
     """
 
     requested: float
-    tolerance: float
-    h: float
+    tolerance: float | None
+    h: float | None
     t: Array
     differences: Array
     safety: float
@@ -119,10 +119,10 @@ class GlobalError:
     @property
     def steps(self) -> dict[str, float | None]:
         """``h``, or ``tolerance`` (``None``: round-off) and ``max_step``, of :meth:`Stepper.integrate` for this run."""
-        if self.h:
+        if self.h is not None:
             return {"h": self.h}
         limit = {} if self.max_step == math.inf else {"max_step": self.max_step}
-        return {"tolerance": self.tolerance or None, **limit}
+        return {"tolerance": self.tolerance, **limit}
 
     @property
     def digits(self) -> int:
@@ -292,9 +292,10 @@ class Runs:
         self.wanted, self.integrate, self.confirming = wanted, integrate, confirming
         self.start, self.end = start, end
         self.words, self.interface = interface.words, interface
-        self.first, self.h, self.count, self.most = min(wanted * FIRST, 0.1), 0.0, 0, math.inf
+        self.first, self.count, self.most = min(wanted * FIRST, 0.1), 0, math.inf
+        self.h: float | None = None
         self.least, self.rounded = LEAST, ROUNDED
-        self.last: tuple[float, ...] = LAST
+        self.last: tuple[float | None, ...] = LAST
         self.failure: StepFailedError | None = None
         if self.words > 1:
             self.least, self.rounded, self.last = LEAST_OF_TWO_WORDS, ROUNDED_OF_TWO_WORDS, LAST_OF_TWO_WORDS
@@ -318,12 +319,13 @@ class Runs:
         trajectory.confirmation = result
         return trajectory
 
-    def _steps(self, tolerance: float, factor: float = 1.0) -> dict[str, float | None]:
-        if self.h:
-            return {"h": factor * self.h * ((tolerance or LEAST) / self.first) ** (1.0 / ORDER)}
-        return {"tolerance": tolerance or None}
+    def _steps(self, tolerance: float | None, factor: float = 1.0) -> dict[str, float | None]:
+        if self.h is None:
+            return {"tolerance": tolerance}
+        ratio = (LEAST if tolerance is None else tolerance) / self.first
+        return {"h": factor * self.h * ratio ** (1.0 / ORDER)}
 
-    def _run(self, tolerance: float, max_step: float = math.inf) -> Any:
+    def _run(self, tolerance: float | None, max_step: float = math.inf) -> Any:
         self.count += 1
         check = self._check_count if self.most < math.inf else None
         limit = {} if max_step == math.inf else {"max_step": max_step}
@@ -331,7 +333,7 @@ class Runs:
         self.most = min(self.most, FURTHER * trajectory.steps + MANY)
         return trajectory
 
-    def _other(self, tolerance: float, compared: "_Samples", number: int) -> Any:
+    def _other(self, tolerance: float | None, compared: "_Samples", number: int) -> Any:
         """Return a run for comparison, to its last state if it fails or takes too many steps."""
         self.count += 1
         stops = irregular_stops(compared.steps_of_run, number)
@@ -385,7 +387,7 @@ class Runs:
         for tolerance in self.last:
             with self._suppressed_failure():
                 trajectory = self._run(tolerance)
-                others = [each for each in self.last if each != tolerance]
+                others = [other for other in self.last if other != tolerance]
                 result = self._estimated(trajectory, tolerance, others, last=True)
                 yield trajectory, result
                 if result.estimate > GAIN * self.wanted:
@@ -407,20 +409,27 @@ class Runs:
         return ratio, list(accumulate(repeat(ratio, count), mul, initial=tolerance))[1:]
 
     def _estimated(
-        self, trajectory: Any, tolerance: float, others: list[float], max_step: float = math.inf, *, last: bool = False
+        self,
+        trajectory: Any,
+        tolerance: float | None,
+        others: Sequence[float | None],
+        max_step: float = math.inf,
+        *,
+        last: bool = False,
     ) -> GlobalError:
         """Return the estimate of the error of a run by others; the last runs are compared with all of them."""
         compared = _Samples(trajectory, self.start, self.interface)
         safety = SAFETY if len(others) == 1 else SAFETY_OF_ROUNDING
-        floor = max(smallest_estimate(self.words), tolerance)
-        for number, each in enumerate(others if compared.end != self.start else ()):
+        floor = max(smallest_estimate(self.words), 0.0 if tolerance is None else tolerance)
+        for number, other in enumerate(others if compared.end != self.start else ()):
             if number == 2 and SAFETY_OF_TWO * compared.largest() <= self.wanted:
                 safety = SAFETY_OF_TWO
                 break
             try:
-                complete = compared.compare(self._other(each, compared, number))
+                complete = compared.compare(self._other(other, compared, number))
                 if last and not complete:
-                    compared.compare(self._other((each or self.least) * COARSER, compared, number))
+                    coarser = COARSER * (self.least if other is None else other)
+                    compared.compare(self._other(coarser, compared, number))
             except _TooManyStepsError:
                 compared.lose()
             if not last and safety * compared.largest() > self.wanted:
@@ -430,7 +439,7 @@ class Runs:
         return GlobalError(
             requested=self.wanted,
             tolerance=tolerance,
-            h=float(self._steps(tolerance).get("h") or 0.0),
+            h=self._steps(tolerance).get("h"),
             max_step=max_step,
             t=compared.t,
             differences=differences,

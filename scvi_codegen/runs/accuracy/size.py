@@ -137,9 +137,13 @@ class SizeOfMotion:
         return cls(largest_range(q), float(np.abs(p - at_rest).max(initial=0.0)), (of_q, of_p))
 
     def error(self, position: float, momentum: float) -> float:
-        """Return the larger one of both errors, with those of rounding, relative to these sizes."""
-        of_q, of_p = self.rounding
-        return max((position + of_q) / (self.position or 1.0), (momentum + of_p) / (self.momentum or 1.0))
+        """Return the larger one of both errors, with those of rounding, relative to these sizes.
+
+        Those of a motion at rest, which has no size, are relative to its largest position and momentum.
+        """
+        rounding, sizes = np.array(self.rounding), np.array([self.position, self.momentum])
+        sizes = np.where(sizes > 0.0, sizes, rounding / roundoff(1))
+        return float(relative(np.array([position, momentum]) + rounding, sizes).max())
 
 
 def distances_from_mean(q: Array) -> Array:
@@ -186,6 +190,6 @@ def neighbouring(x: Array) -> Array:
 
 
 def relative(errors: Array, sizes: Array) -> Array:
-    """Return errors (.., m) relative to sizes; 0 for errors of 0."""
+    """Return errors (.., m) relative to sizes; 0 for errors of 0, infinite for others of sizes of 0."""
     with np.errstate(all="ignore"):
         return np.asarray(np.where(errors == 0.0, 0.0, errors / sizes))

@@ -23,7 +23,7 @@ from scvi_codegen.codegen.native.options import step_failure
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.runs.results.saved_states import ROUNDINGS, SavedStates
 from scvi_codegen.runs.results.time_transformation import part_of_step, states_in_transformed_time
-from scvi_codegen.runs.states.words import Words, low_words
+from scvi_codegen.runs.states.words import Words, fraction_of, low_words, split, with_low
 from scvi_codegen.runs.stepping.memory import Memory
 from scvi_codegen.runs.stepping.step_plan import Fixed, FixedSteps, StepPlan, ending_at
 
@@ -79,7 +79,7 @@ def _integrate_to_each(
     """Integrate from each saved state to the times before the next one, with adaptive steps or events."""
     q, p = states.q[left], states.p[left]
     stepper: Any = states.stepper
-    between = np.flatnonzero(times != states.t[left])
+    between = np.flatnonzero(times - states.t[left])
     between = between[np.lexsort((states.forward * times[between], left[between]))]
     for rows in np.split(between, np.flatnonzero(np.diff(left[between])) + 1) if between.size else ():
         to_last = ending_at(plan, float(times[rows[-1]]))
@@ -124,11 +124,11 @@ def stepped_to(
             :2
         ]
     settings: dict[str, Any] = {"parameters": states.parameters, "options": states.options}
-    run = Memory.started(
-        states.stepper, q, p, plan=Fixed(float(end - Fraction(float(t[0])))), t=float(t[0]), **settings
-    )
+    target = fraction_of(end)
+    h = float(target - Fraction(float(t[0])))
+    run = Memory.started(states.stepper, q, p, plan=Fixed(h), t=float(t[0]), **settings)
     run._memory.t_low = low_words(t)[0]
-    run._step_to(end)
+    run._step_to(target)
     run.advance(1)
     return run.q, run.p
 
@@ -139,6 +139,15 @@ def checked_times(t: ArrayLike, name: str) -> Array:
     if not np.isfinite(times).all():
         checked_number(float(times[~np.isfinite(times)][0]), f"a value in {name}")
     return times
+
+
+def times_of_words(t: ArrayLike, words: int) -> Array:
+    """Return a copy of finite times of any shape; those of runs of two words have both."""
+    if words == 1:
+        return checked_times(t, "t")
+    high, low = split(t, "t")
+    both: Array = with_low(checked_times(high, "t"), low)
+    return both
 
 
 def times_of_run(t_eval: ArrayLike, t: float, t_end: float) -> Array:
@@ -162,7 +171,10 @@ def within(times: Array, first: float, last: float) -> Array:
     outside = times[(times < low - slack) | (times > high + slack)]
     if outside.size:
         raise StateError(f"t = {outside[0]:.17g} is outside the trajectory from t = {first:.17g} to {last:.17g}")
-    return np.clip(times, low, high)
+    inside: Array = np.clip(times, low, high)
+    if isinstance(times, Words):
+        return with_low(inside, np.where(inside == times, times.low, 0.0))  # type: ignore[no-any-return]
+    return inside
 
 
 def step_sizes_at(states: SavedStates, times: Array) -> Array:

@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from scvi_codegen.runs.results.export import Array
+from scvi_codegen.runs.results.recomputation import exchanged_energy
+from scvi_codegen.runs.results.saved_states import SavedStates
 
 MOST_BALANCED_STEPS, MOST_BALANCED_COORDINATES = 10_000, 12
 """Limits for a balance that was not asked for: Newton's iteration repeats each step, in some tens of microseconds."""
@@ -25,13 +27,14 @@ class EnergyAccount(NamedTuple):
 
     Attributes:
         reason: why the exact energy changes; ``None`` if it is conserved.
-        initial: energy of the first state; 0 if it is at most 1e-8 of p.v, as of a pendulum that starts horizontally.
+        initial: energy E0 of the first state; ``None`` if it is at most 1e-8 of p.v, as of a pendulum that starts
+            horizontally, so that errors are not relative to it.
         change: (n,) E - E0.
         work: (n,) work of forces and damping, and energy exchanged at events; ``None`` if unknown or none.
     """
 
     reason: str | None
-    initial: float
+    initial: float | None
     change: Array
     work: Array | None = None
 
@@ -47,8 +50,8 @@ class EnergyAccount(NamedTuple):
 
     @property
     def scale(self) -> float:
-        """|E0| for errors; 1 if that is 0, and for changes."""
-        return abs(self.initial) or 1.0 if self.is_error else 1.0
+        """|E0| for errors that are relative to it; 1 for others, and for changes."""
+        return 1.0 if self.initial is None or not self.is_error else abs(self.initial)
 
     @property
     def title(self) -> str:
@@ -56,8 +59,8 @@ class EnergyAccount(NamedTuple):
         if not self.is_error:
             return f"energy change |E - E0|: {self.reason}"
         if self.work is not None:
-            return "energy balance |E - E0 - W| / |E0|" if self.initial else "energy balance |E - E0 - W|"
-        return "relative energy error" if self.initial else "energy error"
+            return f"energy balance |E - E0 - W|{'' if self.initial is None else ' / |E0|'}"
+        return "energy error" if self.initial is None else "relative energy error"
 
 
 def energy_account(states: Any, *, limited: bool = False) -> EnergyAccount:
@@ -67,16 +70,14 @@ def energy_account(states: Any, *, limited: bool = False) -> EnergyAccount:
         states: a trajectory, or a recorded run, of which the work is unknown.
         limited: whether the work is computed only for short runs of few coordinates.
     """
-    energy = np.asanyarray(states.energy())
-    stepper: Any = getattr(states, "stepper", None)
-    reason = None if stepper is None else energy_reason(stepper)
-    long = limited and not (
-        0 < getattr(states, "steps", 0) <= MOST_BALANCED_STEPS and stepper.dimension <= MOST_BALANCED_COORDINATES
-    )
-    known = reason is not None and hasattr(states, "_exchanged_energy") and not long
-    work = states._exchanged_energy(energy) if known else None
+    energy, stepper = np.asanyarray(states.energy()), states.stepper
+    reason, work = energy_reason(stepper), None
+    is_short = 0 < states.steps <= MOST_BALANCED_STEPS and stepper.dimension <= MOST_BALANCED_COORDINATES
+    if reason is not None and isinstance(states, SavedStates) and (is_short or not limited):
+        work = exchanged_energy(states, energy)
     initial, change = float(energy[0]), energy - energy[:1]
-    if np.abs(change).max() > 1e-3 * abs(initial) and hasattr(states, "velocity"):
-        action = np.abs(np.sum(states.p * states.velocity, axis=-1)).max()
-        initial = 0.0 if abs(initial) <= 1e-8 * action else initial
-    return EnergyAccount(reason, initial, change, work)
+    is_size = initial != 0.0
+    if is_size and np.abs(change).max() > 1e-3 * abs(initial):
+        action = np.abs(np.sum(states.p * states.velocity, axis=-1)).max()  # p.v, twice the kinetic energy
+        is_size = abs(initial) > 1e-8 * action
+    return EnergyAccount(reason, initial if is_size else None, change, work)
