@@ -385,7 +385,7 @@ def key_of(value: Any) -> str:
     if hasattr(value, "_mpf_"):
         return f"mpf{value._mpf_}"
     if isinstance(value, Mapping):
-        return f"{{{', '.join(f'{key_of(name)}: {key_of(each)}' for name, each in value.items())}}}"
+        return f"{{{', '.join(f'{key_of(name)}: {key_of(item)}' for name, item in value.items())}}}"
     if isinstance(value, tuple | list):
         return f"({', '.join(map(key_of, value))})"
     if isinstance(value, float):

@@ -10,9 +10,9 @@ from typing import Any
 PACKAGE = __name__.partition(".")[0]
 
 
-def closest(name: str, known: Iterable[str]) -> str:
+def closest(name: str, candidates: Iterable[str]) -> str:
     """Return ``"; did you mean 'x'?"`` for the known name nearest to ``name``, or a full stop if none is near."""
-    matches = difflib.get_close_matches(name, list(known), n=1)
+    matches = difflib.get_close_matches(name, list(candidates), n=1)
     return f"; did you mean '{matches[0]}'?" if matches else "."
 
 

@@ -36,7 +36,7 @@ class _ThreadedContext(MPContext):  # type: ignore[misc]
     """Context of mpmath whose precision is thread-local instead of global."""
 
     _own = _ThreadLocalPrecision()
-    _prec_rounding = property(lambda self: self._own, lambda self, given: None)
+    _prec_rounding = property(lambda self: self._own, lambda self, pair: None)
     _prec = property(lambda self: self._own.pair[0], lambda self, bits: None)  # mpmath sets the pair as well
     _dps = property(lambda self: prec_to_dps(self._own.pair[0]), lambda self, digits: None)
 

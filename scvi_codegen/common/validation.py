@@ -72,25 +72,25 @@ def likely_names(word: str) -> Iterator[str]:
             yield from here.split()
 
 
-def synonym_hint(word: str, known: Collection[str]) -> str:
+def synonym_hint(word: str, keywords: Collection[str]) -> str:
     """Return ``"; did you mean 'h'?"`` if a known word has the same meaning, else an empty string."""
-    return next((f"; did you mean '{meant}'?" for meant in likely_names(word) if meant in known), "")
+    return next((f"; did you mean '{meant}'?" for meant in likely_names(word) if meant in keywords), "")
 
 
-def keyword_hint(name: str, known: Collection[str]) -> str:
+def keyword_hint(name: str, keywords: Collection[str]) -> str:
     """Return ``"; did you mean 'h'?"``, or ``": "`` and an explanation, or the list of keywords.
 
     Args:
         name: a keyword that the function does not have.
-        known: keywords that it has.
+        keywords: those that it has.
     """
-    if here := synonym_hint(name, known):
+    if here := synonym_hint(name, keywords):
         return here
     for word in (name, *likely_names(name)):
-        if word in hints()["explanations"] and word not in known:
+        if word in hints()["explanations"] and word not in keywords:
             return f": {hints()['explanations'][word]}"
-    hint = closest(name, known)
-    return f": it takes {', '.join(known)}" if hint == "." else hint
+    hint = closest(name, keywords)
+    return f": it takes {', '.join(keywords)}" if hint == "." else hint
 
 
 LARGEST_COUNT = 2**53 - 1
@@ -155,7 +155,7 @@ class OfRunTimeSizes:
 
 def of(words: str, *types: type) -> ArgumentType:
     """Return the check for an instance of one of the types, for :class:`OfRunTimeSizes` of one that derives from it."""
-    of_run_time_sizes = tuple(each for each in types if issubclass(each, OfRunTimeSizes))
+    of_run_time_sizes = tuple(kind for kind in types if issubclass(kind, OfRunTimeSizes))
 
     def accepts(value: Any) -> bool:
         return isinstance(value, of_run_time_sizes if isinstance(value, OfRunTimeSizes) else types)
@@ -185,7 +185,10 @@ REAL = of("a number", numbers.Real)
 PATH = of("a path", str, os.PathLike)
 TABLES = ArgumentType(
     "a list of declarations, as ['bonds[B, 2]'], or a mapping from them to arrays",
-    lambda value: (_is_sequence(value) or isinstance(value, Mapping)) and all(isinstance(each, str) for each in value),
+    lambda value: (
+        (_is_sequence(value) or isinstance(value, Mapping))
+        and all(isinstance(declaration, str) for declaration in value)
+    ),
 )
 MAPPING = ArgumentType(
     "a mapping from names, as {'k': 2.0}",
@@ -256,24 +259,24 @@ def checks_arguments(
     def decorate(function: Called) -> Called:
         parameters = signature(function).parameters
         names = tuple(parameters)
-        known = dict.fromkeys(name for name in names if name not in ("self", "cls"))
-        open_ended = any(each.kind is Parameter.VAR_KEYWORD for each in parameters.values())
+        keyword_names = dict.fromkeys(name for name in names if name not in ("self", "cls"))
+        open_ended = any(parameter.kind is Parameter.VAR_KEYWORD for parameter in parameters.values())
         optional = {name for name in names if parameters[name].default is None}
         annotated = {name: kind for name in names if (kind := kind_of(parameters[name].annotation))}
         checks = annotated | kinds
         positions = [
             (names.index(name) if name in names else MOST_ARGUMENTS, name, kind) for name, kind in checks.items()
         ]
-        unchecked = frozenset(known).difference(checks)
+        unchecked = frozenset(keyword_names).difference(checks)
         first = min((position for position, _, _ in positions), default=MOST_ARGUMENTS)
 
         @functools.wraps(function)
         def checked(*arguments: Any, **keywords: Any) -> Any:
             if len(arguments) <= first and unchecked.issuperset(keywords):
                 return function(*arguments, **keywords)
-            if not (open_ended or keywords.keys() <= known.keys()):
-                name = next(name for name in keywords if name not in known)
-                raise ArgumentError(f"{function.__qualname__}() takes no {name!r}{keyword_hint(name, known)}")
+            if not (open_ended or keywords.keys() <= keyword_names.keys()):
+                name = next(name for name in keywords if name not in keyword_names)
+                raise ArgumentError(f"{function.__qualname__}() takes no {name!r}{keyword_hint(name, keyword_names)}")
             for position, name, kind in positions:
                 if position < len(arguments) or name in keywords:
                     value = arguments[position] if position < len(arguments) else keywords[name]

@@ -17,6 +17,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import sympy
+from numpy.typing import NDArray
 from sympy import Add, Expr, Float, Rational, Symbol
 
 from scvi_codegen.common.errors import SystemDefinitionError
@@ -66,8 +67,8 @@ class Assembly:
     def result(self, discretisation: Mapping[str, Any]) -> MeshSystem:
         """Return the semi-discrete system of the density on the tensor product of the axes."""
         system = self.system
-        coordinates = (*(Array(each, self.sizes) for each in system.fields), *(Array(x, ()) for x in system.scalars))
-        momenta = tuple(Array(each, self.sizes) for each in system.momenta)
+        coordinates = (*(Array(field, self.sizes) for field in system.fields), *(Array(x, ()) for x in system.scalars))
+        momenta = tuple(Array(momentum, self.sizes) for momentum in system.momenta)
         function = "hamiltonian" if momenta else "lagrangian"
         summed = [*self.kinetic(), *self.in_space(), *self.at_places()]
         texts: dict[str, Any] = {"coordinates": [*map(str, coordinates)], "momenta": [*map(str, momenta)]}
@@ -75,28 +76,14 @@ class Assembly:
         forces: list[ArrayForce] = []
         if system.dissipation != 0:
             damped = self.over_points(system.dissipation, lambda part: [self.at_points(part, system.rates)])
-            velocities = {Array(each.name + DOT, each.axes): each for each in coordinates}
+            velocities = {Array(coordinate.name + DOT, coordinate.axes): coordinate for coordinate in coordinates}
             forces += friction(self.terms([damped]), velocities)
             texts["dissipation"] = text_of(damped)
         terms = self.terms(summed)
-        tables = {f"nodes_{name}": axis.table for name, axis in self.axes.items() if axis.table is not None}
-        tables |= {f"edges_{name}": axis.edges.table for name, axis in self.axes.items() if axis.edges is not None}
-        used = {place.table for access in self.accesses.values() for place in access.places}
-        tables = {name: table for name, table in tables.items() if name in used}
-        declared = {
-            name: Array(name, (Size(f"{'F' if name.startswith('edges') else 'E'}{name[6:]}"), Size("", table.shape[1])))
-            for name, table in tables.items()
-        }
-        texts |= {"tables": [*map(str, declared.values())]}
-        grids = np.meshgrid(*(axis.points for axis in self.axes.values()), indexing="ij")
-        masses = np.meshgrid(*(axis.weights for axis in self.axes.values()), indexing="ij")
-        mesh: dict[str, Any] = {
-            "field_system": system,
-            "axes": tuple(self.axes.values()),
-            "points": dict(zip(self.axes, grids, strict=True)),
-            "weights": np.prod(masses, axis=0),
-            "discretisation": discretisation,
-        }
+        tables = self.tables()
+        texts |= {"tables": [*map(str, tables)]}
+        mesh = self.mesh(discretisation)
+        values = {name: entries for name, (_, entries) in self.used.items()}
         assembled = (ArrayHamiltonian if momenta else ArrayLagrangian)(
             name=system.name,
             coordinates=coordinates,
@@ -106,15 +93,40 @@ class Assembly:
             defaults=system.defaults,
             fields=tuple(Array(name, sizes) for name, (sizes, _) in self.used.items()),
             field_defaults=(1.0,) * len(self.used),
-            tables=tuple(declared.values()),
+            tables=tuple(tables),
             terms=terms,
             forces=tuple(forces),
             definition={key: text for key, text in texts.items() if text},
-            data={name: values for name, (_, values) in self.used.items()} | tables,
+            data=values | {table.name: rows for table, rows in tables.items()},
             mesh=Mesh(**mesh),
         )
         assembled.warn_of_mistakes()
         return MeshSystem(system=assembled, **mesh)
+
+    def tables(self) -> dict[Array, NDArray[np.int64]]:
+        """Return the tables of points by cell and by edge that the terms use, with their entries."""
+        used = {place.table for access in self.accesses.values() for place in access.places}
+        tables = {}
+        for name, axis in self.axes.items():
+            if axis.table is not None and f"nodes_{name}" in used:
+                tables[Array(f"nodes_{name}", (Size(f"E{name}"), Size("", axis.table.shape[1])))] = axis.table
+        for name, axis in self.axes.items():
+            if axis.edges is not None and f"edges_{name}" in used:
+                entries = axis.edges.table
+                tables[Array(f"edges_{name}", (Size(f"F{name}"), Size("", entries.shape[1])))] = entries
+        return tables
+
+    def mesh(self, discretisation: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the attributes of the :class:`Mesh`: weights are products of those of the axes."""
+        grids = np.meshgrid(*(axis.points for axis in self.axes.values()), indexing="ij")
+        weights = np.meshgrid(*(axis.weights for axis in self.axes.values()), indexing="ij")
+        return {
+            "field_system": self.system,
+            "axes": tuple(self.axes.values()),
+            "points": dict(zip(self.axes, grids, strict=True)),
+            "weights": np.prod(weights, axis=0),
+            "discretisation": discretisation,
+        }
 
     def terms(self, summed: Sequence[Summed]) -> tuple[ArrayTerm, ...]:
         """Return one term for each tuple of loops, with all sums over the points of a cell carried out."""
@@ -125,7 +137,7 @@ class Assembly:
 
     def entry(self, name: str, sizes: tuple[Size, ...], places: Sequence[Place | Slot], *sums: Convolution) -> Symbol:
         """Return the symbol of an entry of an array, or of convolutions of it."""
-        indices = (each if isinstance(each, Place) else place_of(each) for each in places)
+        indices = (place if isinstance(place, Place) else place_of(place) for place in places)
         access = Access(array=Array(name, sizes), places=tuple(indices), sums=sums)
         slot = symbol(str(access))
         self.accesses[slot] = access
@@ -150,33 +162,35 @@ class Assembly:
         entry = self.entry(name, self.sizes, [*places.values()], *sums)
         if name not in self.system.momenta:
             return entry
-        inverse = [
+        inverse_weights = [
             self.common(f"per_weight_{axis}", f"N{axis}", 1 / self.axes[axis].weights, place)
             for axis, place in places.items()
         ]
-        return reduce(mul, [*inverse, entry])
+        return reduce(mul, [*inverse_weights, entry])
 
     def at_points(self, formula: Expr, rates: Sequence[Symbol] = ()) -> Expr:
         """Return a formula of fields, their velocities and places at a point."""
         velocities = {rate: self.entry(f"{rate.name[:-2]}{DOT}", self.sizes, [*self.here.values()]) for rate in rates}
-        fields = {symbol(each): self.at(each, self.here) for each in self.names_in(formula, self.system.variables)}
+        fields = {
+            symbol(variable): self.at(variable, self.here) for variable in self.names_in(formula, self.system.variables)
+        }
         places = {symbol(axis): self.coordinate(axis) for axis in self.names_in(formula, self.axes)}
         return formula.xreplace(velocities | fields | places)
 
     def names_in(self, formula: Expr, names: Iterable[str]) -> list[str]:
         """Return the names that a formula contains."""
-        return [each for each in names if symbol(each) in formula.free_symbols]
+        return [name for name in names if symbol(name) in formula.free_symbols]
 
     def coordinate(self, axis: str) -> Expr:
         """Return the coordinate of a point along an axis."""
         return self.value(f"{axis}_points", (Size(f"N{axis}"),), self.axes[axis].points, self.here[axis])
 
     def kinetic(self) -> Iterator[Summed]:
-        """Yield the kinetic energy of each field."""
+        """Yield the kinetic energy of each field: the density is m u_t^2/2 with m = d^2 L/du_t^2."""
         if self.system.momenta:
             return
-        for each, rate in zip(self.system.fields, self.system.rates, strict=True):
-            velocity = self.entry(each + DOT, self.sizes, [*self.here.values()])
+        for field, rate in zip(self.system.fields, self.system.rates, strict=True):
+            velocity = self.entry(field + DOT, self.sizes, [*self.here.values()])
 
             def energy(mass: Expr, velocity: Symbol = velocity) -> list[Expr]:
                 return [self.at_points(mass), velocity**2, Rational(1, 2)]
@@ -186,21 +200,23 @@ class Assembly:
     def at_places(self) -> Iterator[Summed]:
         """Yield the point Lagrangians."""
         for place, formula in self.system.point_lagrangians:
+            # u(x, y) = sum_ij l_i(x) l_j(y) u_ij with the interpolation coefficients l of the axes.
             rows = [self.axes[axis].interpolation(coordinate).items() for axis, coordinate in place.items()]
             points = [([k for k, _ in row], math.prod(x for _, x in row)) for row in itertools.product(*rows)]
             values: dict[Symbol, Expr] = {}
-            for each in self.system.scalars:
-                values |= {symbol(each): self.entry(each, (), ())}
-                values |= {symbol(f"{each}_{TIME}"): self.entry(each + DOT, (), ())}
-            for each in self.system.fields:
-                if (rate := symbol(f"{each}_{TIME}")) in formula.free_symbols and len(points) > 1:
+            for scalar in self.system.scalars:
+                values |= {symbol(scalar): self.entry(scalar, (), ())}
+                values |= {symbol(f"{scalar}_{TIME}"): self.entry(scalar + DOT, (), ())}
+            for field in self.system.fields:
+                if (rate := symbol(f"{field}_{TIME}")) in formula.free_symbols and len(points) > 1:
                     raise SystemDefinitionError(
-                        f"the point Lagrangian at {place_text(place)} contains {each}_{TIME}, but no point of the mesh "
-                        'is there: choose points= such that one is, or "spectral-elements", whose elements end there'
+                        f"the point Lagrangian at {place_text(place)} contains {field}_{TIME}, but no point of the "
+                        'mesh is there: choose points= such that one is, or "spectral-elements", whose elements '
+                        "end there"
                     )
-                values[rate] = self.entry(each + DOT, self.sizes, points[0][0])
-                values[symbol(each)] = Add(*(rational(x) * self.entry(each, self.sizes, k) for k, x in points))
-            rates = [symbol(f"{each}_{TIME}") for each in (*self.system.fields, *self.system.scalars)]
+                values[rate] = self.entry(field + DOT, self.sizes, points[0][0])
+                values[symbol(field)] = Add(*(rational(x) * self.entry(field, self.sizes, k) for k, x in points))
+            rates = [symbol(f"{coordinate}_{TIME}") for coordinate in (*self.system.fields, *self.system.scalars)]
             rest = formula.xreplace(dict.fromkeys(rates, sympy.S.Zero))
             yield from (((), part.xreplace(values)) for part in (sympy.expand(formula - rest), rest) if part != 0)
 
@@ -238,12 +254,12 @@ class Assembly:
         derivatives = self.system.derivatives
         groups: dict[tuple[str, ...], Expr] = {}
         for term in Add.make_args(sympy.expand_mul(self.system.potential)):
-            names = {each.name for each in term.free_symbols}
+            names = {factor.name for factor in term.free_symbols}
             along = {axis for name, (_, orders) in derivatives.items() if name in names for axis in orders}
             key = tuple(axis for axis in self.axes if axis in along)
             groups[key] = groups.get(key, sympy.S.Zero) + term
         for key, term in groups.items():
-            if not term.free_symbols & {symbol(each) for each in (*self.system.variables, *derivatives)}:
+            if not term.free_symbols & {symbol(variable) for variable in (*self.system.variables, *derivatives)}:
                 continue
             if any(self.axes[axis].pairs for axis in key):
                 yield from self.over_pairs(term)
@@ -254,8 +270,9 @@ class Assembly:
 
     def over_pairs(self, term: Expr) -> Iterator[Summed]:
         """Yield the terms of Fourier axes: sums over pairs of points of quadratic terms, then those of derivatives."""
+        # int u_x^2/2 dx = sum_(i<j) K_ij (u_i - u_j)^2/2 (see Axis.pairs).
         rest = term
-        for name, (each, orders) in self.system.derivatives.items():
+        for name, (field, orders) in self.system.derivatives.items():
             factor = term.diff(symbol(name), 2)
             if factor == 0 or len(orders) > 1 or factor.free_symbols - set(self.system.parameters):
                 continue
@@ -266,7 +283,7 @@ class Assembly:
             others = [a for a in self.axes if a != axis]
             loops = (*(span(f"i{a}", f"N{a}") for a in others), span(i, f"N{axis}"))
             matrix = self.value(f"pairs{order}_{axis}", (Size(f"N{axis}"),) * values.ndim, values, *pair)
-            difference = self.at(each, self.here) - self.at(each, self.here | {axis: Place(index=j)})
+            difference = self.at(field, self.here) - self.at(field, self.here | {axis: Place(index=j)})
             factors = [factor, *map(self.weight, others), matrix, difference**2, Rational(1, 2)]
             yield (*loops, replace(span(j, f"N{axis}"), behind=i)), reduce(mul, factors)
         if sympy.expand(rest) != 0:
@@ -276,7 +293,7 @@ class Assembly:
             }
             yield self.over_points(rest, lambda part: [self.at_points(part).xreplace(derivatives)])
 
-    def fourier_derivative(self, term: Expr, each: str, orders: Mapping[str, int]) -> Expr:
+    def fourier_derivative(self, term: Expr, field: str, orders: Mapping[str, int]) -> Expr:
         """Return a Fourier derivative of a field at a point, by convolutions or dense matrices."""
         sums, dense = [], {}
         for position, axis in enumerate(self.axes):
@@ -296,7 +313,7 @@ class Assembly:
 
         def value(places: Mapping[str, Place], left: Sequence[str]) -> Expr:
             if not left:
-                return self.at(each, places, *sums)
+                return self.at(field, places, *sums)
             *others, axis = left
             name, size = f"derivatives{orders[axis]}_{axis}", Size("", len(dense[axis]))
 
@@ -312,12 +329,14 @@ class Assembly:
         """Yield the sums over cells of the axes of the derivatives, and over the points of the other axes."""
         others = [axis for axis in self.axes if axis not in key]
         for cells in itertools.product(*(self.kinds(axis, term) for axis in key)):
-            chosen = dict(zip(key, cells, strict=True))
-            loops = (*(each.loop for each in cells if each.loop), *(span(f"i{axis}", f"N{axis}") for axis in others))
-            factors = [factor for axis, each in chosen.items() for factor in self.size(axis, each)]
+            cells_along = dict(zip(key, cells, strict=True))
+            loops = (*(kind.loop for kind in cells if kind.loop), *(span(f"i{axis}", f"N{axis}") for axis in others))
+            factors = [factor for axis, kind in cells_along.items() for factor in self.size(axis, kind)]
 
-            def in_cells(part: Expr, chosen: Mapping[str, Cells] = chosen, factors: Any = factors) -> list[Expr]:
-                return [*factors, self.quadrature(chosen, others, part, {})]
+            def in_cells(
+                part: Expr, cells_along: Mapping[str, Cells] = cells_along, factors: Any = factors
+            ) -> list[Expr]:
+                return [*factors, self.quadrature(cells_along, others, part, {})]
 
             yield loops, self.weighted(term, others, in_cells)
 
@@ -327,7 +346,7 @@ class Assembly:
         second = [name for name in self.names_in(term, derivatives) if derivatives[name][1].get(axis) == 2]
         if discretised.edges is None or not second:
             return [*discretised.cells]
-        return [*(replace(each, interior=True) for each in discretised.cells), *discretised.edges.cells]
+        return [*(replace(cells, interior=True) for cells in discretised.cells), *discretised.edges.cells]
 
     def size(self, axis: str, cells: Cells) -> list[Expr]:
         """Return the factors of the Jacobian of a cell, or of the weight of an edge."""
@@ -342,42 +361,49 @@ class Assembly:
         return f"N{axis}" if self.axes[axis].table is None and self.axes[axis].periodic else f"E{axis}"
 
     def quadrature(
-        self, chosen: Mapping[str, Cells], others: Sequence[str], term: Expr, node: Mapping[str, Slot]
+        self, cells_along: Mapping[str, Cells], others: Sequence[str], term: Expr, node: Mapping[str, Slot]
     ) -> Expr:
         """Return the weighted sum of a term over the quadrature points of a cell.
 
         Args:
-            chosen: kind of cells by axis.
+            cells_along: kind of cells by axis.
             others: the other axes.
             term: of the density.
             node: index of the quadrature point along the axes that are summed already.
         """
-        if left := [axis for axis in chosen if axis not in node]:
-            axis, cells = left[0], chosen[left[0]]
+        if left := [axis for axis in cells_along if axis not in node]:
+            axis, cells = left[0], cells_along[left[0]]
             count = 1 if cells.edge else len(self.axes[axis].quadrature)
 
             def part(k: Slot) -> Expr:
-                return self.quadrature(chosen, others, term, {**node, axis: k})
+                return self.quadrature(cells_along, others, term, {**node, axis: k})
 
             return total(f"a{axis}", count, part) if cells.table else Add(*map(part, range(count)))
         system = self.system
-        for axis in [axis for axis in node if chosen[axis].edge]:
-            term = self.at_jumps(axis, chosen[axis], term)
-        values = {symbol(each): self.combined(each, {}, chosen, node) for each in self.names_in(term, system.variables)}
+        for axis in [axis for axis in node if cells_along[axis].edge]:
+            term = self.at_jumps(axis, cells_along[axis], term)
+        values = {
+            symbol(variable): self.combined(variable, {}, cells_along, node)
+            for variable in self.names_in(term, system.variables)
+        }
         for name in self.names_in(term, system.derivatives):
-            each, orders = system.derivatives[name]
-            values[symbol(name)] = self.derivative(each, orders, chosen, node)
-        weights = [self.quadrature_weight(axis, chosen[axis], k) for axis, k in node.items() if not chosen[axis].edge]
+            field, orders = system.derivatives[name]
+            values[symbol(name)] = self.derivative(field, orders, cells_along, node)
+        weights = [
+            self.quadrature_weight(axis, cells_along[axis], k) for axis, k in node.items() if not cells_along[axis].edge
+        ]
         jumps = self.system.jumps_in(term)
         inner = {
-            symbol(axis): self.in_cells(axis, chosen[axis], node[axis], inside=True)
+            symbol(axis): self.in_cells(axis, cells_along[axis], node[axis], inside=True)
             for axis in node
-            if self.axes[axis].one_sided and not chosen[axis].edge and any(self.names_in(f, [axis]) for f in jumps)
+            if self.axes[axis].one_sided and not cells_along[axis].edge and any(self.names_in(f, [axis]) for f in jumps)
         }
         term = term.xreplace({jump: jump.xreplace(inner) for jump in jumps}) if inner else term
         for axis in self.names_in(term, [*others, *node]):
             inside = axis in node
-            values[symbol(axis)] = self.in_cells(axis, chosen[axis], node[axis]) if inside else self.coordinate(axis)
+            values[symbol(axis)] = (
+                self.in_cells(axis, cells_along[axis], node[axis]) if inside else self.coordinate(axis)
+            )
         return reduce(mul, [*weights, term.xreplace(values)])
 
     def at_jumps(self, axis: str, cells: Cells, term: Expr) -> Expr:
@@ -445,42 +471,42 @@ class Assembly:
         return Add(*sides)
 
     def derivative(
-        self, each: str, orders: Mapping[str, int], chosen: Mapping[str, Cells], node: Mapping[str, Slot]
+        self, field: str, orders: Mapping[str, int], cells_along: Mapping[str, Cells], node: Mapping[str, Slot]
     ) -> Expr:
         """Return a derivative of a field at a quadrature point of a cell."""
         factor = sympy.S.One
         for axis, order in orders.items():
-            if not chosen[axis].edge:
+            if not cells_along[axis].edge:
                 inverse = 1 / self.axes[axis].jacobians
-                factor *= self.common(f"inverse_{axis}", self.extent(axis), inverse, chosen[axis].index) ** order
-        value = self.combined(each, orders, chosen, node)
+                factor *= self.common(f"inverse_{axis}", self.extent(axis), inverse, cells_along[axis].index) ** order
+        value = self.combined(field, orders, cells_along, node)
         return value.scaled(factor) if isinstance(value, InnerSum) and factor.is_number else factor * value
 
     def combined(
         self,
-        each: str,
+        field: str,
         orders: Mapping[str, int],
-        chosen: Mapping[str, Cells],
+        cells_along: Mapping[str, Cells],
         node: Mapping[str, Slot],
         slots: Mapping[str, Slot] | None = None,
     ) -> Expr:
         """Return sums over the points of a cell of coefficients times the values of a field.
 
         Args:
-            each: the field.
+            field: its name.
             orders: order of the derivative by axis; along others values are interpolated.
-            chosen, node: kind of cells and index of the quadrature point by axis.
+            cells_along, node: kind of cells and index of the quadrature point by axis.
             slots: index of the point within the cell along the axes that are summed already.
         """
         slots = slots or {}
-        left = [axis for axis in chosen if axis not in slots]
+        left = [axis for axis in cells_along if axis not in slots]
         if not left:
-            return self.in_cell(each, chosen, slots)
+            return self.in_cell(field, cells_along, slots)
         axis = left[0]
-        cells, order = chosen[axis], orders.get(axis, 0)
+        cells, order = cells_along[axis], orders.get(axis, 0)
 
         def inner(slot: Slot) -> Expr:
-            return self.combined(each, orders, chosen, node, {**slots, axis: slot})
+            return self.combined(field, orders, cells_along, node, {**slots, axis: slot})
 
         def summand(slot: Slot) -> Expr:
             return self.coefficient(order, axis, (node[axis], slot), cells) * inner(slot)
@@ -492,18 +518,18 @@ class Assembly:
             return inner(node[axis])
         return total(f"b{axis}", count, summand) if cells.table else Add(*map(summand, range(count)))
 
-    def in_cell(self, each: str, chosen: Mapping[str, Cells], slots: Mapping[str, Slot]) -> Expr:
+    def in_cell(self, field: str, cells_along: Mapping[str, Cells], slots: Mapping[str, Slot]) -> Expr:
         """Return a field at a point of a cell, or its prescribed value at an end."""
         places = {**self.here}
-        for axis, cells in chosen.items():
+        for axis, cells in cells_along.items():
             if cells.table:
                 places[axis] = Place(index=cells.index.index, table=cells.table, column=slots[axis])
             elif isinstance(place := cells.places[slots[axis]], Place):
                 places[axis] = place
             else:
-                prescribed: Expr = self.system.boundary[axis][place][each]
+                prescribed: Expr = self.system.boundary[axis][place][field]
                 return prescribed
-        return self.at(each, places)
+        return self.at(field, places)
 
 
 def total(index: str, count: int, summand: Callable[[Slot], Expr]) -> Expr:
@@ -527,6 +553,8 @@ def text_of(summed: Summed) -> str:
     numbers = {x: Float(x, 25) for x in formula.atoms(Rational) if x.q > SHOWN_DENOMINATOR}
     behind = {loop.behind for loop in loops}
     text = array_text(formula.xreplace(numbers))
-    return (
-        f"sum({', '.join(str(loop) for loop in loops if loop.index not in behind)}, {text})" if loops else f"({text})"
-    )
+    if not loops:
+        return f"({text})"
+    # An index that others begin behind, i < j, is printed with these.
+    ranges = ", ".join(str(loop) for loop in loops if loop.index not in behind)
+    return f"sum({ranges}, {text})"

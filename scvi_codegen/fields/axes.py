@@ -265,8 +265,9 @@ def point_count_of(axis: str, points: int, *, least: int, most: int = 10**9) -> 
 
 def lagrange(distance: Array) -> Array:
     """Return the coefficients of the polynomial interpolant at a place with these distances from the points."""
+    # l_k = prod_(j != k) (x - x_j)/(x_k - x_j) (Lagrange).
     others = [(x, np.delete(distance, k)) for k, x in enumerate(distance)]
-    return np.array([np.prod(each / (each - x)) for x, each in others])
+    return np.array([np.prod(rest / (rest - x)) for x, rest in others])
 
 
 def same(values: Sequence[float] | Array) -> float | None:
@@ -322,45 +323,45 @@ class SpectralElements(Axis):
         derivative = differentiation_matrix(rule.points)
         half = np.diff(breaks) / 2
         elements = len(half)
-        offsets = np.array([float(1 + each) for each in rule.points])
+        offsets = np.array([float(1 + point) for point in rule.points])
         local = breaks[:-1, None] + half[:, None] * offsets
-        places = np.arange(elements)[:, None] * p + np.arange(p + 1)
+        inner = breaks[:-1, None] + half[:, None] * (1.0 + (1.0 - INWARD) * (offsets - 1.0))
         count = elements * p + (fixed is not None)
-        places %= count
+        left, right = map(int, fixed or (False, False))
+        if count <= left + right:
+            raise SystemDefinitionError(f"'{name}' has no points between its prescribed ends: use more elements")
+        # The last point of an element is the first of the next, on a periodic axis that of the first element.
+        places = (np.arange(elements)[:, None] * p + np.arange(p + 1)) % count
+        unknown = slice(left, count - right)
+        table = np.clip(places - left, 0, count - left - right - 1)
         points, masses = np.zeros(count), np.zeros(count)
         points[places[:, ::-1]] = local[:, ::-1]
         points[places[0, 0]] = breaks[0]  # not the end of a periodic axis
-        quadrature = np.outer(half, np.array([float(each) for each in rule.weights]))
+        weights = np.array([float(weight) for weight in rule.weights])
+        quadrature = np.outer(half, weights)
         np.add.at(masses, places.ravel(), quadrature.ravel())
-        inner = breaks[:-1, None] + half[:, None] * (1.0 + (1.0 - INWARD) * (offsets - 1.0))
-        left, right = fixed or (False, False)
-        if count <= left + right:
-            raise SystemDefinitionError(f"'{name}' has no points between its prescribed ends: use more elements")
-        inside = slice(int(left), count - int(right))
-        table = np.clip(places - int(left), 0, count - int(left) - int(right) - 1)
         matrix = np.array([[float(x) for x in row] for row in derivative])
-        roots = np.sqrt(np.array([float(each) for each in rule.weights]))
-        largest = float(np.linalg.norm(roots[:, None] * matrix / roots, 2)) ** 2 / float(half.min()) ** 2
+        largest = _largest_stiffness(matrix, weights) / float(half.min()) ** 2
         return cls(
             name=name,
-            points=points[inside],
-            weights=masses[inside],
+            points=points[unknown],
+            weights=masses[unknown],
             length=float(breaks[-1] - breaks[0]),
             periodic=fixed is None,
             quadrature=rule.weights,
             operators=(identity_matrix(p + 1), derivative, matrix_product(derivative, derivative)),
             stiffness=(largest, largest**2),
-            edges=_edges(name, places, (local, inner), (rule.weights, derivative), fixed, clamped),
-            one_sided=_one_sided(inner, quadrature, places, inside),
+            edges=_edges(name, places, (local, inner), (weights, matrix), fixed, clamped),
+            one_sided=_one_sided(inner, quadrature, places, unknown),
             cells=_element_cells(name, elements, p, left=left, right=right),
             jacobians=half,
             cell_points=local,
             table=table,
             closed=ClosedPoints(
                 points=local.ravel(),
-                weights=np.outer(half, [float(each) for each in rule.weights]).ravel(),
+                weights=quadrature.ravel(),
                 positions=table.ravel(),
-                inside=((places >= int(left)) & (places < count - int(right))).ravel(),
+                inside=((places >= left) & (places < count - right)).ravel(),
                 neighbours=np.arange(places.size).reshape(places.shape).repeat(p + 1, axis=0),
                 rates=np.vstack([matrix / length for length in half]),
             ),
@@ -384,8 +385,14 @@ class SpectralElements(Axis):
         return np.asarray(modes / (np.arange(1, len(points)) + 0.5))
 
 
-def _element_cells(name: str, elements: int, degree: int, *, left: bool, right: bool) -> tuple[Cells, ...]:
-    """Return the kinds of elements: those whose values are all unknown, and those at prescribed ends of the axis."""
+def _largest_stiffness(derivative: Array, weights: Array) -> float:
+    """Return the largest eigenvalue of D^T W D relative to W, the squared norm of W^(1/2) D W^(-1/2)."""
+    roots = np.sqrt(weights)
+    return float(np.linalg.norm(roots[:, None] * derivative / roots, 2)) ** 2
+
+
+def _element_cells(name: str, elements: int, degree: int, *, left: int, right: int) -> tuple[Cells, ...]:
+    """Return the kinds of elements: those whose values are all unknown, and those at prescribed ends, 0 or 1 each."""
     size, index, nodes = f"E{name}", f"e{name}", f"nodes_{name}"
     if elements == 1 and left and right:
         inside = (fixed_place(b) for b in range(degree - 1))
@@ -393,7 +400,7 @@ def _element_cells(name: str, elements: int, degree: int, *, left: bool, right: 
     kinds = []
     if elements > left + right:
         unknown = tuple(Place(index=index, table=nodes, column=b) for b in range(degree + 1))
-        kinds.append(Cells(span(index, size, int(left), int(right)), Place(index=index), unknown, nodes))
+        kinds.append(Cells(span(index, size, left, right), Place(index=index), unknown, nodes))
     if left:
         kinds.append(Cells(None, fixed_place(0), (0, *(fixed_place(b) for b in range(degree)))))
     if right:
@@ -435,17 +442,16 @@ def _edges(
     name: str,
     places: NDArray[np.int64],
     coordinates: tuple[Array, Array],
-    rule: tuple[Vector, Matrix],
+    rule: tuple[Array, Array],
     fixed: tuple[bool, bool] | None,
     clamped: tuple[bool, bool],
 ) -> Edges:
     """Return the ends of elements.
 
-    ``places`` and ``coordinates``, (E, p + 1), are those of the points, and coordinates slightly inside of elements.
+    ``places`` and ``coordinates``, (E, p + 1), are those of the points, and coordinates slightly inside of elements;
+    ``rule`` are the weights of an element of half length 1 and its derivative.
     """
-    local, inner = coordinates
-    weights = np.array([float(each) for each in rule[0]])
-    derivative = np.array([[float(x) for x in row] for row in rule[1]])
+    (local, inner), (weights, derivative) = coordinates, rule
     elements, size, half = len(places), places.shape[1], np.ptp(local, axis=1) / 2
     last, (left, right) = int(places.max()), fixed or (False, False)
     ends = np.arange(1 - clamped[0], elements + (fixed is None or clamped[1]))
@@ -458,7 +464,8 @@ def _edges(
     shares = np.where(present, half[sides] * weights[0], 0.0)
     whole = shares.sum(1, keepdims=True)
     by_end = ((table == 0) & left, (table == last) & right)
-    prescribed, (lower, upper) = by_end[0] | by_end[1], (int(each.any(1).sum()) for each in by_end)
+    prescribed = by_end[0] | by_end[1]
+    lower, upper = (int(at_end.any(1).sum()) for at_end in by_end)
     index = f"f{name}"
     slots = tuple(Place(index=index, table=f"edges_{name}", column=b) for b in range(2 * size))
     loop = span(index, f"F{name}", lower, upper)
@@ -501,8 +508,8 @@ class FiniteDifferences(Axis):
             points: their number, ends included.
         """
         second = any(
-            orders.get(name) == 2 and symbol(each) in system.density.free_symbols
-            for each, (_, orders) in system.derivatives.items()
+            orders.get(name) == 2 and symbol(derivative) in system.density.free_symbols
+            for derivative, (_, orders) in system.derivatives.items()
         )
         bounds, fixed = system.space[name], held_ends(system.boundary[name])
         if isinstance(order, bool) or order not in (2, 4, 6, 8):
@@ -514,6 +521,7 @@ class FiniteDifferences(Axis):
             )
         count, index = point_count_of(name, points, least=(2 if fixed is None else 3) * order), f"e{name}"
         cell_count = count - (fixed is not None)
+        # u, u_x and u_xx at midpoints of cells from 2 m points, by Taylor's formula.
         m, h = order // 2 + second, (bounds[1] - bounds[0]) / cell_count
         nodes: Array = bounds[0] + h * np.arange(count, dtype=np.float64)
         rows = _coefficients([mp.mpf(2 * k + 1) / 2 for k in range(-m, m)], 2 + second)
@@ -563,9 +571,10 @@ class FiniteDifferences(Axis):
 
 def _coefficients(offsets: Sequence[Number], count: int) -> list[Vector]:
     """Return the coefficients of derivatives of order 0, 1, .. at 0 of the interpolant of values at offsets."""
+    # sum_i c_i x_i^r = k! [r = k]: exact for all polynomials up to the degree of the interpolant.
     powers = mp.matrix([[x**r for x in offsets] for r in range(len(offsets))])
     moments = ([mp.factorial(k) * (r == k) for r in range(len(offsets))] for k in range(count))
-    return [tuple(mp.lu_solve(powers, mp.matrix(each))) for each in moments]
+    return [tuple(mp.lu_solve(powers, mp.matrix(moment))) for moment in moments]
 
 
 def _end_rows(row: Array) -> tuple[Array, Array, Array, float]:
@@ -577,6 +586,7 @@ def _end_rows(row: Array) -> tuple[Array, Array, Array, float]:
         interior[c, c - m + 1 : c + m + 1] = row
     unknown, blocks, right = size * width, [], []
     x, y = np.arange(width + 0.0), np.arange(4 * width) + 0.5
+    # The equations of Q = W D, W and M for k = 0 .. m of the module's docstring.
     for k in range(m + 1):
         rates = k * x ** max(k - 1, 0), k * y[:size] ** max(k - 1, 0)
         blocks.append([np.kron(np.eye(size), x**k), -np.diag(rates[1]), np.zeros((size, width))])
@@ -608,7 +618,7 @@ def _end_cells(name: str, rows: Array, weights: Array, fixed: tuple[bool, bool])
             places: list[Place | int] = [*(at_right if end else at_left)]
             if prescribed:
                 places[0] = end
-            operators = tuple((tuple(map(mp.mpf, each)),) for each in (value, -row if end else row))
+            operators = tuple((tuple(map(mp.mpf, coefficients)),) for coefficients in (value, -row if end else row))
             index = fixed_place(c) if end == 0 else fixed_place(-c - 1, f"E{name}")
             result.append(Cells(None, index, tuple(places), operators=operators, weight=float(weights[c])))
     return result
@@ -665,18 +675,17 @@ class Fourier(Axis):
         distance = np.abs(np.arange(1 if transformed else count)[:, None] - np.arange(count))
         angle = np.pi * np.arange(1, (count + 1) // 2) / count
         signs = np.where(np.arange(1, (count + 1) // 2) % 2, np.pi, -np.pi) / (end - start)
-        half = signs / (
-            np.sin(angle) if count % 2 else np.tan(angle)
-        )  # Trefethen, Spectral Methods in MATLAB, chapter 3
+        # (-1)^j pi/L / sin(pi j/n), of even n / tan(..) (L. N. Trefethen, Spectral Methods in MATLAB, 2000, chapter 3).
+        half = signs / (np.sin(angle) if count % 2 else np.tan(angle))
         spectra = (np.fft.ifft(k.astype(np.longdouble) ** (2 * power)).real * h for power in (1, 2))
-        rows = [each.astype(np.float64) for each in spectra]
+        rows = [spectrum.astype(np.float64) for spectrum in spectra]
         matrices = (-row[np.minimum(distance, count - distance)] for row in rows)
         return cls(
             name=name,
             points=start + h * np.arange(count, dtype=np.float64),
             weights=np.full(count, h),
             length=end - start,
-            pairs=tuple(each[0] if transformed else each for each in matrices),
+            pairs=tuple(matrix[0] if transformed else matrix for matrix in matrices),
             rates=np.concatenate([[0.0], half, np.zeros(1 - count % 2), -half[::-1]]),
             stiffness=tuple(float(np.abs(k).max()) ** (2 * power) for power in (1, 2)),
         )

@@ -65,8 +65,8 @@ class Density:
                     f"the density of '{self.name}' contains {rates[i]}*{rates[j]}: velocities are supported as "
                     "m*u_t**2/2 only, with m a function of position and parameters"
                 )
-            known = {symbol(axis) for axis in self.space} | set(self.parameters)
-            if wrong := sorted(map(str, entry.free_symbols - known)):
+            allowed = {symbol(axis) for axis in self.space} | set(self.parameters)
+            if wrong := sorted(map(str, entry.free_symbols - allowed)):
                 raise SystemDefinitionError(
                     f"the density of '{self.name}' contains {rates[i]}**2 with a factor that depends on {wrong[0]}; "
                     "it may depend on position and parameters only"
@@ -88,8 +88,8 @@ class Density:
         """Return the functions of a formula that jump at places: ``unit_step`` and ``rint`` of axes and parameters."""
         places = {symbol(axis) for axis in self.space}
         moving = {*map(symbol, (*self.variables, *self.scalars, *self.derivatives, TIME)), *self.rates}
-        jumps = [each for each in formula.atoms(unit_step, rint) if each.free_symbols & places]
-        return [each for each in jumps if not each.free_symbols & moving]
+        jumps = [jump for jump in formula.atoms(unit_step, rint) if jump.free_symbols & places]
+        return [jump for jump in jumps if not jump.free_symbols & moving]
 
     def second_derivatives(self, formula: Expr, axis: str) -> list[Symbol]:
         """Return the second derivatives along an axis whose coefficients in a formula jump along it."""
@@ -97,13 +97,13 @@ class Density:
         return [
             name
             for name in names
-            if any(symbol(axis) in each.free_symbols for each in self.jumps_in(formula.diff(name, 2)))
+            if any(symbol(axis) in jump.free_symbols for jump in self.jumps_in(formula.diff(name, 2)))
         ]
 
     @property
     def rates(self) -> tuple[Symbol, ...]:
         """Symbols of the derivatives of the fields in time."""
-        return tuple(symbol(f"{each}_{TIME}") for each in self.fields)
+        return tuple(symbol(f"{field}_{TIME}") for field in self.fields)
 
     @property
     def derivatives(self) -> dict[str, tuple[str, dict[str, int]]]:
@@ -131,8 +131,8 @@ def derivatives_of(fields: Sequence[str], axes: Sequence[str]) -> dict[str, tupl
     """Return field and order by axis of the derivatives in space of order one and two."""
     orders: dict[str, dict[str, int]] = {axis: {axis: 1} for axis in axes}
     orders |= {axis * 2: {axis: 2} for axis in axes}
-    orders |= {one + two: {one: 1, two: 1} for one, two in combinations(axes, 2)}
-    return {f"{each}_{name}": (each, order) for each in fields for name, order in orders.items()}
+    orders |= {first + second: {first: 1, second: 1} for first, second in combinations(axes, 2)}
+    return {f"{field}_{name}": (field, order) for field in fields for name, order in orders.items()}
 
 
 def place_text(place: Mapping[str, float]) -> str:

@@ -63,18 +63,20 @@ class Variations:
 
     def __init__(self, system: Density) -> None:
         places = [symbol(axis) for axis in (*system.space, TIME)]
-        rates = {f"{each}_{TIME}": (each, {TIME: 1}) for each in system.variables}
+        rates = {f"{variable}_{TIME}": (variable, {TIME: 1}) for variable in system.variables}
         derivatives = {**rates, **system.derivatives}
         self.system = system
-        self.functions: dict[str, Expr] = {each: Function(each)(*places) for each in system.variables}
-        self.values = {symbol(each): function for each, function in self.functions.items()}
-        for name, (each, orders) in derivatives.items():
-            self.values[symbol(name)] = derivative(self.functions[each], orders)
+        self.functions: dict[str, Expr] = {variable: Function(variable)(*places) for variable in system.variables}
+        self.values = {symbol(variable): function for variable, function in self.functions.items()}
+        for name, (variable, orders) in derivatives.items():
+            self.values[symbol(name)] = derivative(self.functions[variable], orders)
         pairs = zip(system.fields, system.momenta, strict=False)
         products = Add(*(symbol(p) * symbol(f"{u}_{TIME}") for u, p in pairs))
         self.formula: Expr = products - system.density if system.momenta else system.density
         self.lagrangian = self.along(self.formula)
-        self.used = {name: each for name, each in derivatives.items() if symbol(name) in self.formula.free_symbols}
+        self.used = {
+            name: variable for name, variable in derivatives.items() if symbol(name) in self.formula.free_symbols
+        }
 
     def along(self, formula: Expr) -> Expr:
         """Return a formula in symbols ``u``, ``u_x`` as one in functions of space and time."""
@@ -87,19 +89,21 @@ class Variations:
     @cached_property
     def equations(self) -> dict[str, Expr]:
         """Highest derivative in time of each field, u_tt or of a Hamiltonian density u_t, in derivatives in space."""
+        # dL/du - D_x L_(u_x) + D_xx L_(u_xx) = D_t L_(u_t).
         system, forces = self.system, {}
-        for each in system.variables:
-            terms = [self.partial(each)]
+        for variable in system.variables:
+            terms = [self.partial(variable)]
             for name, (field, orders) in self.used.items():
-                if field == each and TIME not in orders:
+                if field == variable and TIME not in orders:
                     sign = (-1) ** sum(orders.values())
                     terms.append(sign * derivative(self.partial(name), orders))
-            forces[each] = Add(*terms).doit()
+            forces[variable] = Add(*terms).doit()
         if not system.momenta:
-            masses = {each: self.along(system.density.diff(symbol(f"{each}_{TIME}"), 2)) for each in system.fields}
-            return {each: shorter(forces[each] / masses[each]) for each in system.fields}
+            masses = {field: self.along(system.density.diff(symbol(f"{field}_{TIME}"), 2)) for field in system.fields}
+            return {field: shorter(forces[field] / masses[field]) for field in system.fields}
         pairs = [*zip(system.fields, system.momenta, strict=True)]
-        rates = {u: u_t for u, p in pairs for u_t in [sympy.expand(self.values[symbol(f"{u}_{TIME}")] - forces[p])]}
+        # L = p u_t - H: the variation by p is u_t - dH/dp, that by u is -dH/du = p_t.
+        rates = {u: sympy.expand(self.values[symbol(f"{u}_{TIME}")] - forces[p]) for u, p in pairs}
         return rates | {p: sympy.expand(forces[u]) for u, p in pairs}
 
     def laws(self) -> tuple[ConservationLaw, ...]:
@@ -111,20 +115,23 @@ class Variations:
         return tuple(laws.values())
 
     def _is_symmetry(self, variation: Variation, divergence: Mapping[str, Expr]) -> bool:
-        terms = [self.partial(each) * change for each, change in variation.items()]
-        for name, (each, orders) in self.used.items():
-            terms.append(self.partial(name) * derivative(variation[each], orders))
+        terms = [self.partial(variable) * change for variable, change in variation.items()]
+        for name, (variable, orders) in self.used.items():
+            terms.append(self.partial(name) * derivative(variation[variable], orders))
         terms += [-part.diff(symbol(axis)) for axis, part in divergence.items()]
         return vanishes(Add(*terms).doit())
 
     def _law(self, name: str, symmetry: str, variation: Variation, divergence: Mapping[str, Expr]) -> ConservationLaw:
         current = {axis: -divergence.get(axis, S.Zero) for axis in (TIME, *self.system.space)}
-        for derived, (each, orders) in self.used.items():
-            along = [axis for axis, order in orders.items() for _ in range(order)]
-            change, factor = variation[each], self.partial(derived)
-            current[along[0]] += factor * (change.diff(symbol(along[1])) if len(along) == 2 else change)
-            if len(along) == 2:
-                current[along[1]] -= factor.diff(symbol(along[0])) * change
+        for derived, (variable, orders) in self.used.items():
+            # L_(u_i) Q to J^i; of u_ij L_(u_ij) D_j Q to J^i and -D_i L_(u_ij) Q to J^j.
+            axis, *second = (axis for axis, order in orders.items() for _ in range(order))
+            change, factor = variation[variable], self.partial(derived)
+            if not second:
+                current[axis] += factor * change
+                continue
+            current[axis] += factor * change.diff(symbol(second[0]))
+            current[second[0]] -= factor.diff(symbol(axis)) * change
         rates = {self.values[symbol(f"{u}_{TIME}")]: self.equations[u] for u in self.system.variables}
         reduced = {}
         for axis, part in current.items():
@@ -136,7 +143,7 @@ class Variations:
         """Yield name, description, Q by field and K by axis of transformations that may be symmetries."""
         yield "energy", f"translation in {TIME}", self._rates(TIME), {TIME: self.lagrangian}
         for axis in self.system.space:
-            backward = {each: -rate for each, rate in self._rates(axis).items()}
+            backward = {variable: -rate for variable, rate in self._rates(axis).items()}
             yield f"momentum_{axis}", f"translation in {axis}", backward, {axis: -self.lagrangian}
         variables, fields, momenta = self.system.variables, self.system.fields, self.system.momenta
         pairs = [*zip(fields, momenta, strict=True)] if momenta else [*combinations(fields, 2)]
@@ -145,21 +152,21 @@ class Variations:
             yield f"charge{suffix}", f"rotation of ({pair[0]}, {pair[1]})", *self._rotated([pair], S.One)
         if momenta and len(pairs) > 1:
             yield "charge", "rotation of all pairs", *self._rotated(pairs, S.One)
-        for each in fields:
-            shifted: Variation = {other: S.One if other == each else S.Zero for other in variables}
-            yield f"shift_{each}" if len(variables) > 1 else "shift", f"shift of {each}", shifted, {}
+        for field in fields:
+            shifted: Variation = {other: S.One if other == field else S.Zero for other in variables}
+            yield f"shift_{field}" if len(variables) > 1 else "shift", f"shift of {field}", shifted, {}
         yield from self._boosts(pairs)
 
     def _rates(self, axis: str) -> Variation:
-        return {each: function.diff(symbol(axis)) for each, function in self.functions.items()}
+        return {variable: function.diff(symbol(axis)) for variable, function in self.functions.items()}
 
     def _rotated(self, pairs: list[tuple[str, str]], angle: Expr) -> tuple[Variation, dict[str, Expr]]:
         """Return the rotation of pairs (a, b) by an angle that may depend on space, and its K."""
         variation: Variation = dict.fromkeys(self.functions, S.Zero)
         part = S.Zero
-        for one, two in pairs:
-            a, b = self.functions[one], self.functions[two]
-            variation |= {one: angle * b, two: -angle * a}
+        for first, second in pairs:
+            a, b = self.functions[first], self.functions[second]
+            variation |= {first: angle * b, second: -angle * a}
             part += angle * (b**2 - a**2) / 2 if self.system.momenta else S.Zero
         return variation, {TIME: part}
 
@@ -173,25 +180,25 @@ class Variations:
                 continue
             if self.system.momenta:
                 variation, divergence = self._rotated(pairs, -x / (2 * stiffness))
-                moved = {each: variation[each] - time * along[each] for each in variation}
+                moved = {variable: variation[variable] - time * along[variable] for variable in variation}
                 products = Add(*(self.functions[u] * self.functions[p] for u, p in pairs))
                 divergence |= {axis: -time * self.lagrangian - products / 2}
                 yield f"boost_{axis}", f"Galilei transformation along {axis}", moved, divergence
             else:
                 squared = -stiffness / self.system.density.diff(symbol(f"{first}_{TIME}"), 2)
                 rates = self._rates(TIME)
-                moved = {each: x * rates[each] + squared * time * along[each] for each in rates}
+                moved = {variable: x * rates[variable] + squared * time * along[variable] for variable in rates}
                 divergence = {TIME: x * self.lagrangian, axis: squared * time * self.lagrangian}
                 yield f"boost_{axis}", f"Lorentz transformation along {axis}", moved, divergence
 
 
 def chosen_laws(system: Density, names: Collection[str]) -> list[ConservationLaw]:
     """Return the conservation laws of these names, all without names."""
-    known = {law.name: law for law in Variations(system).laws()}
+    laws = {law.name: law for law in Variations(system).laws()}
     for name in names:
-        if name not in known:
-            raise StateError(f"there is no conservation law '{name}'{closest(name, known)} Known: {', '.join(known)}")
-    return [known[name] for name in names or known]
+        if name not in laws:
+            raise StateError(f"there is no conservation law '{name}'{closest(name, laws)} Known: {', '.join(laws)}")
+    return [laws[name] for name in names or laws]
 
 
 def derivative(formula: Expr, orders: Mapping[str, int]) -> Expr:
@@ -214,14 +221,14 @@ def vanishes(formula: Expr) -> bool:
 def names_of(formula: Expr) -> dict[Expr, Symbol]:
     """Return the symbols ``u``, ``u_x``, ``u_tx`` of the functions and derivatives in a formula."""
     symbols: dict[Expr, Symbol] = {}
-    for each in formula.atoms(Derivative, AppliedUndef):
-        if isinstance(each, Derivative):
+    for function in formula.atoms(Derivative, AppliedUndef):
+        if isinstance(function, Derivative):
             orders = "".join(
-                str(axis) * order for axis, order in sorted(each.variable_count, key=lambda v: str(v[0]) != TIME)
+                str(axis) * order for axis, order in sorted(function.variable_count, key=lambda v: str(v[0]) != TIME)
             )
-            symbols[each] = symbol(f"{each.expr.func}_{orders}")
+            symbols[function] = symbol(f"{function.expr.func}_{orders}")
         else:
-            symbols[each] = symbol(str(each.func))
+            symbols[function] = symbol(str(function.func))
     return symbols
 
 
@@ -290,7 +297,7 @@ def _rate(history: FieldHistory, law: ConservationLaw, density: Array) -> Array:
             )
         return rate
     values = between.values(law.density).reshape(*times.shape, *density.shape[1:])
-    return np.array([_derivative(*each) for each in zip(times, values, history.t, strict=True)])
+    return np.array([_derivative(*window) for window in zip(times, values, history.t, strict=True)])
 
 
 def time_derivative(t: Array, values: Array, most: int = WINDOW) -> Array:
@@ -300,15 +307,17 @@ def time_derivative(t: Array, values: Array, most: int = WINDOW) -> Array:
     width = min(most, count)
     firsts = [min(max(k - width // 2, 0), count - width) for k in range(count)]
     windows = [slice(first, first + width) for first in firsts]
-    return np.array([_derivative(t[each], values[each], time) for each, time in zip(windows, t, strict=True)])
+    return np.array([_derivative(t[window], values[window], time) for window, time in zip(windows, t, strict=True)])
 
 
 def _derivative(t: Array, values: Array, time: float) -> Array:
     """Return the derivative at a time of the polynomial through values (k, ..) at times (k,)."""
+    # Weights w with sum_i w_i (t_i - time)^r = [r = 1]: exact for all polynomials of degree k - 1.
     distance = t - time
-    scaled = distance / np.abs(distance).max()
+    largest = np.abs(distance).max()
+    scaled = distance / largest
     moments = np.zeros(len(t))
-    moments[1] = 1 / np.abs(distance).max()
+    moments[1] = 1 / largest
     weights = np.linalg.solve(np.vander(scaled, increasing=True).T, moments)
     return np.asarray(np.tensordot(weights, values, 1))
 
@@ -324,7 +333,7 @@ class FieldHistory:
         velocity = None if self.system.momenta else np.asarray(run.velocity)
         self.fields: dict[str, Array] = mesh.fields_of(np.asarray(run.q), np.asarray(run.p), velocity)
         by_name = run.stepper.parameters_by_name(run.parameters)
-        self.known: dict[Expr, Any] = {each: by_name[str(each)] for each in self.system.parameters}
+        self.known: dict[Expr, Any] = {parameter: by_name[str(parameter)] for parameter in self.system.parameters}
         self.axes: dict[str, tuple[int, Axis]] = {axis.name: (k + 1, axis) for k, axis in enumerate(mesh.axes)}
         coordinates = {TIME: self.t} | {axis.name: (axis.closed or axis).points for axis in mesh.axes}
         self.known |= zip(map(symbol, coordinates), np.ix_(*coordinates.values()), strict=True)
@@ -354,13 +363,15 @@ class FieldHistory:
     def values(self, formula: Expr) -> Array:
         """Return a formula in functions and their derivatives."""
         names = names_of(formula)
-        known = {name: self._function(each) for each, name in names.items()} | self.known
-        return np.broadcast_to(sympy.lambdify([*known], formula.xreplace(names), "numpy")(*known.values()), self.shape)
+        arguments = {name: self._function(function) for function, name in names.items()} | self.known
+        return np.broadcast_to(
+            sympy.lambdify([*arguments], formula.xreplace(names), "numpy")(*arguments.values()), self.shape
+        )
 
-    def _function(self, each: Any) -> Array:
+    def _function(self, function: Any) -> Array:
         """Return a field, or a derivative of it of order one in time and any order in space."""
-        orders = {str(axis): int(order) for axis, order in getattr(each, "variable_count", ())}
-        name, rate = str(getattr(each, "expr", each).func), orders.pop(TIME, 0)
+        orders = {str(axis): int(order) for axis, order in getattr(function, "variable_count", ())}
+        name, rate = str(getattr(function, "expr", function).func), orders.pop(TIME, 0)
         values = self.fields[f"{name}_{TIME}" if rate else name]
         for along, axis in self.axes.values():
             values = axis.in_elements(values, along, self._at_ends(axis.name, name, rate, values.ndim))
@@ -423,8 +434,8 @@ class FieldDerivation:
             yield f"  at {place_text(place)}: {format_expression(formula)}"
         yield ""
         yield f"{title} equations"
-        for each in self.equations.values():
-            yield f"  {_written(each.lhs)} = {_written(each.rhs)}"
+        for equation in self.equations.values():
+            yield f"  {_written(equation.lhs)} = {_written(equation.rhs)}"
         for name, text in self.semidiscrete.items():
             yield f"\n{name}"
             yield from (f"  {line}" for line in text.split("\n"))
@@ -443,12 +454,12 @@ def derivation_of(system: Density, assembled: Any = None) -> FieldDerivation:
     variations = Variations(system)
     order = 1 if system.momenta else 2
     equations = {
-        each: Eq(variations.functions[each].diff(symbol(TIME), order), formula)
-        for each, formula in variations.equations.items()
+        variable: Eq(variations.functions[variable].diff(symbol(TIME), order), formula)
+        for variable, formula in variations.equations.items()
     }
-    for each, rate in zip(system.fields, system.rates, strict=True) if system.dissipation != 0 else ():
+    for field, rate in zip(system.fields, system.rates, strict=True) if system.dissipation != 0 else ():
         force = variations.along(system.dissipation.diff(rate) / system.density.diff(rate, 2))
-        equations[each] = Eq(equations[each].lhs, sympy.expand(equations[each].rhs - force))
+        equations[field] = Eq(equations[field].lhs, sympy.expand(equations[field].rhs - force))
     return FieldDerivation(
         field_system=system,
         equations=equations,
@@ -463,9 +474,10 @@ def _semidiscrete(assembled: Any) -> dict[str, str]:
         return {"semi-discrete Hamiltonian": assembled.definition["hamiltonian"]}
     text = assembled.definition["lagrangian"]
     terms = text.split("\n+ ")
-    kinetic = [each for each in terms if "_dot" in each]
-    others = [each for each in terms if each not in kinetic]
-    energy = "\n+ ".join(kinetic) + "".join(f"\n- {each}" for each in others)
+    kinetic = [term for term in terms if "_dot" in term]
+    others = [term for term in terms if term not in kinetic]
+    # E = T + V for L = T - V.
+    energy = "\n+ ".join(kinetic) + "".join(f"\n- {term}" for term in others)
     return {"semi-discrete Lagrangian": text, "semi-discrete energy": energy}
 
 

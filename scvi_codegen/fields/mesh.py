@@ -63,7 +63,7 @@ class Mesh:
         result = split(q, system.fields)
         if system.momenta:
             return result | {name: values / self.weights for name, values in split(p, system.momenta).items()}
-        return result if velocity is None else result | split(velocity, [str(each) for each in system.rates])
+        return result if velocity is None else result | split(velocity, [str(rate) for rate in system.rates])
 
     def to_section(self) -> dict[str, Any]:
         """Return the section ``[field]`` of a model file: the density as text, and its discretisation."""
@@ -112,8 +112,8 @@ class Mesh:
                 f"'{self.field_system.name}' prescribes values other than 0 at an end of {axis}: give them by "
                 "ends=(lower, upper), None for an end without prescribed values"
             )
-        known = [None if end is None else np.asarray(end, dtype=float) for end in ends or (None, None)]
-        return self.axes[position].differentiated(self._at_points(values), position - len(self.axes), known)
+        prescribed = [None if end is None else np.asarray(end, dtype=float) for end in ends or (None, None)]
+        return self.axes[position].differentiated(self._at_points(values), position - len(self.axes), prescribed)
 
     def _prescribed(self, axis: str) -> list[sympy.Expr]:
         """Return the values of fields that are prescribed at the ends of an axis."""
@@ -131,14 +131,14 @@ class Mesh:
         count, parts = len(self.axes), []
         size = np.abs(array).max(tuple(range(-count, 0)), keepdims=True)
         array = array / np.where(size > 0, size, 1.0)
-        for k, each in enumerate(self.axes):
+        for k, axis in enumerate(self.axes):
             others = tuple(range(-count, -1))
-            modes = each.modes(np.moveaxis(array, k - count, -1))
-            closed = each.closed
-            if (
-                closed and each.table is not None and any(value != 0 for value in self._prescribed(each.name))
-            ):  # not known here
-                modes[..., ~closed.inside.reshape(each.table.shape).all(axis=1), :] = 0
+            modes = axis.modes(np.moveaxis(array, k - count, -1))
+            closed = axis.closed
+            prescribed = any(value != 0 for value in self._prescribed(axis.name))
+            # Elements at an end whose prescribed value is not known here do not count.
+            if prescribed and closed and axis.table is not None:
+                modes[..., ~closed.inside.reshape(axis.table.shape).all(axis=1), :] = 0
             highest = modes[..., -max(1, modes.shape[-1] // 6) :].sum(-1).sum(others)
             every = modes.sum(-1).sum(others)
             largest = every.max(-1)
@@ -183,12 +183,12 @@ class Mesh:
             parameters: values of parameters that differ from the defaults.
         """
         system = self.field_system
-        known = dict(zip(map(str, system.parameters), system.defaults, strict=True))
+        defaults = dict(zip(map(str, system.parameters), system.defaults, strict=True))
         for name in parameters:
-            if name not in known:
-                raise StateError(f"'{system.name}' has no parameter '{name}'{closest(name, known)}")
-        values = {symbol(name): value for name, value in {**known, **parameters}.items()} | {symbol(TIME): 0.0}
-        at_rest = {symbol(each): 0 for each in (*system.variables, *system.derivatives)}
+            if name not in defaults:
+                raise StateError(f"'{system.name}' has no parameter '{name}'{closest(name, defaults)}")
+        values = {symbol(name): value for name, value in {**defaults, **parameters}.items()} | {symbol(TIME): 0.0}
+        at_rest = {symbol(variable): 0 for variable in (*system.variables, *system.derivatives)}
         places = [symbol(axis) for axis in self.points]
 
         def largest(formula: sympy.Expr) -> float:
@@ -196,34 +196,35 @@ class Mesh:
             return float(np.max(np.abs(evaluated(*self.points.values()))))
 
         by_name = {axis.name: axis for axis in self.axes}
-        total = {each: largest(system.density.diff(symbol(each), 2)) for each in system.variables}
-        for name, (each, orders) in system.derivatives.items():
+        total = {variable: largest(system.density.diff(symbol(variable), 2)) for variable in system.variables}
+        for name, (variable, orders) in system.derivatives.items():
             if symbol(name) in system.density.free_symbols:
                 powers = [by_name[axis].stiffness[order - 1] for axis, order in orders.items()]
-                total[each] += largest(system.density.diff(symbol(name), 2)) * float(np.prod(powers))
+                total[variable] += largest(system.density.diff(symbol(name), 2)) * float(np.prod(powers))
+        # omega^2 = H_uu H_pp of an oscillator H(u, p), and L_uu/m of L = m u_t^2/2 - V(u).
         if system.momenta:
             pairs = zip(system.fields, system.momenta, strict=True)
-            return max(float(np.sqrt(total[one] * total[two])) for one, two in pairs)
+            return max(float(np.sqrt(total[u] * total[p])) for u, p in pairs)
         masses = [1 / largest(1 / system.density.diff(rate, 2)) for rate in system.rates]
-        squared = max(total[each] / mass for each, mass in zip(system.fields, masses, strict=True))
+        squared = max(total[field] / mass for field, mass in zip(system.fields, masses, strict=True))
         return float(np.sqrt(squared + self._point_terms(dict(zip(system.fields, masses, strict=True)), values)))
 
     def _point_terms(self, densities: Mapping[str, float], values: Mapping[Any, float]) -> float:
         """Return the sum of second derivatives of point Lagrangians by coordinates, relative to their masses."""
         system = self.field_system
-        rest = {symbol(each): 0 for each in (*system.fields, *system.scalars)} | dict(values)
+        rest = {symbol(coordinate): 0 for coordinate in (*system.fields, *system.scalars)} | dict(values)
 
         def second(formula: sympy.Expr, name: str) -> float:
             return float(formula.diff(symbol(name), 2).xreplace(rest))
 
         every = [formula for _, formula in system.point_lagrangians]
-        inverse = {each: 1 / sum(second(part, f"{each}_{TIME}") for part in every) for each in system.scalars}
+        inverse = {scalar: 1 / sum(second(part, f"{scalar}_{TIME}") for part in every) for scalar in system.scalars}
         total = 0.0
         for place, formula in system.point_lagrangians:
             rows = [(axis, axis.interpolation(place[axis.name])) for axis in self.axes]
             share = float(np.prod([sum(x * x / axis.weights[k] for k, x in row.items()) for axis, row in rows]))
-            inverse |= {each: share / mass for each, mass in densities.items()}
-            total += sum(factor * abs(second(formula, each)) for each, factor in inverse.items())
+            inverse |= {field: share / mass for field, mass in densities.items()}
+            total += sum(factor * abs(second(formula, coordinate)) for coordinate, factor in inverse.items())
         return total
 
     def largest_step(self, method: Method | str, **parameters: float) -> float:
@@ -236,8 +237,8 @@ class Mesh:
             method: the method in time, or its name.
             parameters: as of :meth:`highest_frequency`.
         """
-        one = one_coordinate(cast(Any, self.field_system))
-        program = program_of(one, as_method(method, one))
+        oscillator = one_coordinate(cast(Any, self.field_system))
+        program = program_of(oscillator, as_method(method, oscillator))
         if program.splitting:
             phase = _stability_limit(program.splitting.kicks, program.splitting.drifts)
         else:
@@ -252,7 +253,7 @@ class Mesh:
         return array
 
     def _position(self, axis: str) -> int:
-        names = [each.name for each in self.axes]
+        names = [discretised.name for discretised in self.axes]
         if axis not in names:
             raise StateError(f"there is no axis '{axis}'{closest(axis, names)}")
         return names.index(axis)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence, Sized
 from dataclasses import dataclass, replace
 from inspect import signature
 from math import isfinite
@@ -90,48 +90,33 @@ class FieldSystem(Density):
         text = density if hamiltonian is None else hamiltonian
         if text is None or (density is not None and hamiltonian is not None):
             raise SystemDefinitionError("give exactly one of density and hamiltonian")
-        first_order = hamiltonian is not None
-        names, axes = ("|".join(map(re.escape, each)) for each in ((*fields, *momenta), (*space, TIME)))
-        for match in re.finditer(rf"\b({names})_((?:{axes})+)\b", text):
-            _check_derivative(match[0], match[1], [*space], parameters or {})
-        values = {key: number(key, value) for key, value in (parameters or {}).items()}
-        if not 1 <= len(space) <= MOST_AXES:
-            raise SystemDefinitionError(f"space has {len(space)} axes; one to three are supported")
-        if len(momenta) != len(fields) * first_order:
-            raise SystemDefinitionError(
-                f"there are {len(fields)} fields and {len(momenta)} momenta: a Hamiltonian density needs one momentum "
-                "by field, a Lagrangian density none"
-            )
         variables = (*fields, *momenta)
-        rates = [] if first_order else [f"{each}_{TIME}" for each in fields]
+        _check_derivatives(text, variables, space, parameters or {})
+        values = {key: number(key, value) for key, value in (parameters or {}).items()}
+        _check_counts(space, fields, momenta, first_order=hamiltonian is not None)
+        rates = [f"{field}_{TIME}" for field in fields if hamiltonian is None]
         derivatives = [*rates, *derivatives_of(variables, [*space])]
         check_names(variables, (*values, *space, *derivatives), ())
-        known = {each: symbol(each) for each in (*variables, *derivatives, *space, TIME, *values)}
-        kinds = dict(boundary or {})
-        for axis in kinds:
-            if axis not in space:
-                raise SystemDefinitionError(f"there is no axis '{axis}', as in boundary. Axes: {', '.join(space)}")
-        prescribed = {each: known[each] for each in (TIME, *values)}
-        natural = (NATURAL, NATURAL)
+        symbols = {key: symbol(key) for key in (*variables, *derivatives, *space, TIME, *values)}
         system = cls(
             name=name,
             fields=tuple(fields),
             momenta=tuple(momenta),
             space={axis: _bounds(axis, ends) for axis, ends in space.items()},
-            boundary={axis: _boundary(axis, kinds.get(axis, natural), variables, prescribed) for axis in space},
-            parameters=tuple(known[key] for key in values),
+            boundary=_boundaries(boundary or {}, space, variables, {key: symbols[key] for key in (TIME, *values)}),
+            parameters=tuple(symbols[key] for key in values),
             defaults=tuple(values.values()),
-            density=parse_expression(text, known),
+            density=parse_expression(text, symbols),
         )
         for key, value in (("dissipation", dissipation), ("point_lagrangians", point_lagrangians)):
-            if first_order and value:
+            if hamiltonian is not None and value:
                 raise SystemDefinitionError(f"'{name}' has a Hamiltonian density, which has no {key}=: omit it")
         if dissipation is not None:
-            known = {each.name: each for each in (*system.rates, *map(symbol, space), *system.parameters)}
-            system = replace(system, dissipation=parse_expression(dissipation, known))
+            symbols = {variable.name: variable for variable in (*system.rates, *map(symbol, space), *system.parameters)}
+            system = replace(system, dissipation=parse_expression(dissipation, symbols))
         check_names((*fields, *scalars), (*map(str, system.parameters), *system.derivatives, *space), ())
-        places = tuple(_at_place(system, scalars, each) for each in point_lagrangians)
-        return replace(system, scalars=tuple(scalars), point_lagrangians=places)
+        at_places = tuple(_at_place(system, scalars, entry) for entry in point_lagrangians)
+        return replace(system, scalars=tuple(scalars), point_lagrangians=at_places)
 
     @classmethod
     @checks_arguments(SystemDefinitionError)
@@ -172,24 +157,26 @@ class FieldSystem(Density):
                 raise SystemDefinitionError(f"{function} must be a function of '{min(missing)}'")
 
         def text(formula: Any) -> str | None:
-            values: dict[Expr, Expr] = {each: symbol(str(each.func)) for each in (*fields, *momenta, *scalars)}
-            for each in () if formula is None else formula.atoms(sympy.Derivative):
-                orders = {str(axis): int(order) for axis, order in each.variable_count}
+            if formula is None:
+                return None
+            names: dict[Expr, Expr] = {u: symbol(str(u.func)) for u in (*fields, *momenta, *scalars)}
+            for derivative in formula.atoms(sympy.Derivative):
+                orders = {str(axis): int(order) for axis, order in derivative.variable_count}
                 letters = "".join(axis * orders.get(axis, 0) for axis in (*space, TIME))
-                values[each] = symbol(f"{each.expr.func}_{letters}")
-            return None if formula is None else array_text(formula.xreplace(values))
+                names[derivative] = symbol(f"{derivative.expr.func}_{letters}")
+            return array_text(formula.xreplace(names))
 
         return cls.from_text(
             name,
-            [str(each.func) for each in fields],
+            [str(function.func) for function in fields],
             space,
             text(density),
             hamiltonian=text(hamiltonian),
-            momenta=[str(each.func) for each in momenta],
+            momenta=[str(function.func) for function in momenta],
             boundary=boundary,
             parameters=parameters,
             dissipation=text(dissipation),
-            scalars=[str(each.func) for each in scalars],
+            scalars=[str(function.func) for function in scalars],
             point_lagrangians=[
                 {key: text(entry) if key == "lagrangian" else entry for key, entry in place.items()}
                 for place in point_lagrangians
@@ -245,23 +232,23 @@ class FieldSystem(Density):
                 density.
         """
         if not isinstance(method, str) or method not in DISCRETISATIONS:
-            known = ", ".join(DISCRETISATIONS)
-            raise SystemDefinitionError(f"there is no discretisation '{method}'; possible: {known}")
-        _, _, *needed = signature(DISCRETISATIONS[method]).parameters.values()
+            methods = ", ".join(DISCRETISATIONS)
+            raise SystemDefinitionError(f"there is no discretisation '{method}'; possible: {methods}")
+        _, _, *accepted = signature(DISCRETISATIONS[method]).parameters.values()
+        names = [option.name for option in accepted]
         for name in options:
-            if name not in {each.name for each in needed}:
-                known = " and ".join(each.name for each in needed)
-                raise SystemDefinitionError(f"'{method}' has no option '{name}'; it has {known}")
+            if name not in names:
+                raise SystemDefinitionError(f"'{method}' has no option '{name}'; it has {' and '.join(names)}")
         axes = {}
         for axis in self.space:
-            chosen = {}
-            for each in needed:
-                value = options.get(each.name)
+            values = {}
+            for option in accepted:
+                value = options.get(option.name)
                 value = value.get(axis) if isinstance(value, Mapping) else value
-                if value is None and each.default is each.empty:
-                    raise SystemDefinitionError(f"'{method}' needs {each.name}= for the axis '{axis}'")
-                chosen[each.name] = value
-            axes[axis] = DISCRETISATIONS[method](self, axis, **chosen)
+                if value is None and option.default is option.empty:
+                    raise SystemDefinitionError(f"'{method}' needs {option.name}= for the axis '{axis}'")
+                values[option.name] = value
+            axes[axis] = DISCRETISATIONS[method](self, axis, **values)
         if not all(axis.pairs for axis in axes.values()):
             self._check_canonical_pairs(method)
         warn_of_jumps(self, axes)
@@ -284,6 +271,27 @@ class FieldSystem(Density):
                     )
 
 
+def _check_derivatives(
+    text: str, variables: Sequence[str], space: Iterable[str], parameters: Mapping[str, float]
+) -> None:
+    """Raise an error if a text contains a derivative of a field that densities cannot contain."""
+    fields, letters = ("|".join(map(re.escape, names)) for names in (variables, (*space, TIME)))
+    for match in re.finditer(rf"\b({fields})_((?:{letters})+)\b", text):
+        _check_derivative(match[0], match[1], [*space], parameters)
+
+
+def _check_counts(space: Sized, fields: Sized, momenta: Sized, *, first_order: bool) -> None:
+    """Raise an error for a number of axes or momenta that densities cannot have."""
+    if not 1 <= len(space) <= MOST_AXES:
+        raise SystemDefinitionError(f"space has {len(space)} axes; one to three are supported")
+    required = len(fields) if first_order else 0
+    if len(momenta) != required:
+        raise SystemDefinitionError(
+            f"there are {len(fields)} fields and {len(momenta)} momenta: a Hamiltonian density needs one momentum "
+            "by field, a Lagrangian density none"
+        )
+
+
 def _check_derivative(name: str, field: str, axes: Sequence[str], parameters: Mapping[str, float]) -> None:
     """Raise an error for a derivative of a field that densities cannot contain."""
     if name in {*derivatives_of([field], axes), f"{field}_{TIME}", *parameters}:
@@ -303,7 +311,7 @@ def _check_derivative(name: str, field: str, axes: Sequence[str], parameters: Ma
 def _bounds(axis: str, ends: Any) -> tuple[float, float]:
     if isinstance(ends, str) or not isinstance(ends, Collection) or len(ends) != 2:
         raise SystemDefinitionError(f"the axis '{axis}' needs a lower and an upper bound, not {ends!r}")
-    lower, upper = (float(parse_expression(str(each), {})) for each in ends)
+    lower, upper = (float(parse_expression(str(end), {})) for end in ends)
     if not (isfinite(lower) and isfinite(upper) and lower < upper):
         raise SystemDefinitionError(f"the bounds of the axis '{axis}' must be finite and ascending, not {ends!r}")
     if not SHORTEST_AXIS <= upper - lower <= LONGEST_AXIS:
@@ -314,7 +322,17 @@ def _bounds(axis: str, ends: Any) -> tuple[float, float]:
     return lower, upper
 
 
-def _boundary(axis: str, boundary: Any, fields: Sequence[str], known: Mapping[str, Symbol]) -> Any:
+def _boundaries(
+    boundary: Mapping[str, Any], space: Iterable[str], fields: Sequence[str], symbols: Mapping[str, Symbol]
+) -> dict[str, Any]:
+    """Return the boundary of each axis; by default both ends are natural."""
+    for axis in boundary:
+        if axis not in space:
+            raise SystemDefinitionError(f"there is no axis '{axis}', as in boundary. Axes: {', '.join(space)}")
+    return {axis: _boundary(axis, boundary.get(axis, NATURAL), fields, symbols) for axis in space}
+
+
+def _boundary(axis: str, boundary: Any, fields: Sequence[str], symbols: Mapping[str, Symbol]) -> Any:
     """Return ``"periodic"``, or for each end ``"natural"`` or the prescribed value by field."""
     if boundary in (PERIODIC, NATURAL):
         return PERIODIC if boundary == PERIODIC else (NATURAL, NATURAL)
@@ -327,12 +345,14 @@ def _boundary(axis: str, boundary: Any, fields: Sequence[str], known: Mapping[st
         if end == NATURAL:
             ends.append(NATURAL)
             continue
-        gradients = [f"{each}_{axis}" for each in fields]
+        gradients = [f"{field}_{axis}" for field in fields]
         values = dict(end) if isinstance(end, Mapping) else dict.fromkeys(fields, end)
         values = dict.fromkeys((*fields, *gradients), 0) if end == CLAMPED else values
-        if set(values) not in ({*fields}, {*fields, *gradients}) or any(values.get(each, 0) != 0 for each in gradients):
+        if set(values) not in ({*fields}, {*fields, *gradients}) or any(
+            values.get(gradient, 0) != 0 for gradient in gradients
+        ):
             raise SystemDefinitionError(f"an end of '{axis}' has values of {sorted(values)}, not of {sorted(fields)}")
-        ends.append({each: parse_expression(str(value), known) for each, value in values.items()})
+        ends.append({name: parse_expression(str(value), symbols) for name, value in values.items()})
     return tuple(ends)
 
 
@@ -350,9 +370,9 @@ def _at_place(system: Density, scalars: Sequence[str], entry: Any) -> tuple[Mapp
                 f"the point Lagrangian at {axis} = {place[axis]:g} is outside of the axis, {start:g} to {end:g}: "
                 "give a place inside"
             )
-    rates = [f"{each}_{TIME}" for each in (*system.fields, *scalars)]
+    rates = [f"{coordinate}_{TIME}" for coordinate in (*system.fields, *scalars)]
     names = (*system.fields, *scalars, *rates, TIME, *map(str, system.parameters))
-    return place, parse_expression(str(entry["lagrangian"]), {each: symbol(each) for each in names})
+    return place, parse_expression(str(entry["lagrangian"]), {name: symbol(name) for name in names})
 
 
 DISCRETISATIONS: Mapping[str, Callable[..., Axis]] = {

@@ -155,8 +155,8 @@ def size_of(name: str) -> str | None:
 
 def _check_name(name: object) -> None:
     if name not in METHODS:
-        known = [each for each, words in CALLED.items() if name in words.split()]
-        hint = f"; did you mean {known[0]!r}?" if known else closest(str(name), METHODS)
+        meant = [method for method, words in CALLED.items() if name in words.split()]
+        hint = f"; did you mean {meant[0]!r}?" if meant else closest(str(name), METHODS)
         raise MethodError(f"there is no method {name!r}{hint} Known: {', '.join(METHODS)}")
 
 

@@ -157,8 +157,8 @@ def nodal_collocation(system: MechanicalSystem, nodes: Nodes) -> StageSystem:
         Table.joined(Table.identity(size), Table.constant(size, 2)),
         Scatter(results=forms_of(system).momentum, table=Table.joined(none, last), power=0),
     )
-    one, others, zero = Table.constant(1, 1, 1), Table.constant(1, size), Table.constant(1, 1)
-    curve, minus = (Table.joined(one, others, zero), Table.joined(zero, others, one)), Table.constant(1, 1, -1)
+    unit, others, zero = Table.constant(1, 1, 1), Table.constant(1, size), Table.constant(1, 1)
+    curve, minus = (Table.joined(unit, others, zero), Table.joined(zero, others, unit)), Table.constant(1, 1, -1)
     return StageSystem(
         blocks=nodal_blocks(nodes),
         rows=(
@@ -166,7 +166,7 @@ def nodal_collocation(system: MechanicalSystem, nodes: Nodes) -> StageSystem:
             Row(number="p0", kind="Legendre", momentum=mp.one),
         ),
         stage_groups=(group, single_point(system, "start", mp.zero, curve, Table.joined(others, minus, zero))),
-        end_position=Table.joined(others, one, zero),
+        end_position=Table.joined(others, unit, zero),
         end_momentum=mp.zero,
         end_numbers=("15", "p1"),
     )

@@ -112,14 +112,14 @@ def _with_multipliers(system: MechanicalSystem, group: StageGroup) -> StageGroup
     assert group.scalar is not None
     points, factors = len(group.abscissae), constraint_multipliers(system)
     columns, rows = len(group.gathers[0].table.entries[0]), len(group.scatters[0].table.entries[0]) - 1
-    none, one = Table.constant(points, 1 + points), Table.constant(points, 1)
+    none, zero = Table.constant(points, 1 + points), Table.constant(points, 1)
     gathers = [replace(gather, table=Table.joined(gather.table, none)) for gather in group.gathers]
-    table = Table.joined(Table.constant(points, columns), one, Table.identity(points))
+    table = Table.joined(Table.constant(points, columns), zero, Table.identity(points))
     gathers.append(Gather(arguments=factors, table=table, power=-1))
     scatters = [replace(scatter, table=_with_end(scatter.table, rows, points)) for scatter in group.scatters]
     scatters[0] = replace(scatters[0], results=with_constraint_forces(system, scatters[0].results))
     conditions = [[int(row == n - 1) for row in range(points)] for n in range(points)]
-    conditions_table = Table.joined(Table.constant(points, rows), one, Table.named("", conditions), one)
+    conditions_table = Table.joined(Table.constant(points, rows), zero, Table.named("", conditions), zero)
     positions = position_conditions(system)
     if any(positions):
         scatters.append(Scatter(results=positions, table=conditions_table, power=-1, scale=scatters[0].scale))
@@ -201,16 +201,16 @@ def _end(system: MechanicalSystem, stages: StageSystem, points: int) -> StageGro
 def _extrapolation(stages: StageSystem, abscissae: Vector) -> Matrix:
     """Return the predictor by polynomials through multipliers, and velocities with the final one, of higher order."""
     blocks = stages.shape.blocks if isinstance(stages.shape, Velocities) else ()
-    size, points, known = len(stages.blocks), len(abscissae), (*blocks, mp.one)
-    if len(set(known)) <= size:
+    size, points, nodes = len(stages.blocks), len(abscissae), (*blocks, mp.one)
+    if len(set(nodes)) <= size:
         lines = [(*line, *(mp.zero,) * (1 + points)) for line in stages.extrapolation or ()]
         lines.append((*(mp.zero,) * size, mp.one, *(mp.zero,) * points))
     else:
-        lines = [(*line, *(mp.zero,) * points) for line in _ahead(known)]
+        lines = [(*line, *(mp.zero,) * points) for line in _ahead(nodes)]
     lines += [(*(mp.zero,) * (size + 1), *line) for line in _ahead(abscissae)]
     return tuple(lines)
 
 
-def _ahead(known: Vector) -> Matrix:
+def _ahead(points: Vector) -> Matrix:
     """Return the extrapolation from values at points of a step to the same points of the next step."""
-    return cardinal_values([2 * c - 1 for c in known], [2 * c + 1 for c in known])
+    return cardinal_values([2 * c - 1 for c in points], [2 * c + 1 for c in points])

@@ -143,8 +143,8 @@ def _framed(system: MechanicalSystem, stages: StageSystem, turns: Sequence[Turn]
     *others, momenta, (force, momentum, rate) = *group.gathers, group.scatters
     tau = [c - mp.mpf(1) / 2 for c in group.abscissae]
     timed, back = (
-        Table.named("tau", [[t * x for x in line] for t, line in zip(tau, each.table.entries, strict=True)])
-        for each in (momenta, rate)
+        Table.named("tau", [[t * x for x in line] for t, line in zip(tau, scaled.table.entries, strict=True)])
+        for scaled in (momenta, rate)
     )
     rates = replace(rate, results=system.velocities), Scatter(results=velocity, table=back, power=1)
     framed = replace(
@@ -154,7 +154,7 @@ def _framed(system: MechanicalSystem, stages: StageSystem, turns: Sequence[Turn]
         scalar=None,
         in_action=False,
     )
-    still = (replace(each, straight=(mp.zero,) * 2) if each.moves else each for each in stages.blocks)
+    still = (replace(block, straight=(mp.zero,) * 2) if block.moves else block for block in stages.blocks)
     return replace(stages, blocks=tuple(still), stage_groups=(framed,))
 
 
@@ -172,17 +172,17 @@ def _rotated(
     size, u, v = len(stages.rows), _symbols("turn", system), _symbols("change", system)
     moved, pushed = rotated(turns, system.coordinates, u, *rotations)
     name, others = "start" if first else "spin", Table.constant(1, size)
-    one, minus, none = Table.constant(1, 1, 1), Table.constant(1, 1, -1), Table.constant(1, 1)
+    unit, minus, none = Table.constant(1, 1, 1), Table.constant(1, 1, -1), Table.constant(1, 1)
     end, momentum = Table.joined(stages.end_position, none, none), stages.end_momentum
-    before, into = end, Table.joined(others, none, none, one)
-    groups = [each.widened(2) if first else _reaching(each, size) for each in stages.stage_groups]
+    before, into = end, Table.joined(others, none, none, unit)
+    groups = [stage_group.widened(2) if first else _reaching(stage_group, size) for stage_group in stages.stage_groups]
     if first:
         columns = [*range(size + 1), 0, -1]
         groups = [
             replace(x, gathers=tuple(replace(y, table=y.table.columns(columns)) for y in x.gathers)) for x in groups
         ]
         into = Table.named("", [(*(row.momentum for row in stages.rows), mp.zero, mp.zero, momentum)])
-        before, end, momentum = Table.joined(one, others, none, none), end.columns(columns), mp.one
+        before, end, momentum = Table.joined(unit, others, none, none), end.columns(columns), mp.one
     change = tuple(a - b for a, b in zip(moved, v, strict=True))
     tables = Table.joined(others, minus, none, none), into, Table.joined(others, none, minus, none)
     group = StageGroup(
@@ -190,12 +190,12 @@ def _rotated(
         abscissae=(mp.mpf(not first),),
         gathers=(
             Gather(arguments=system.coordinates, table=before, power=0),
-            Gather(arguments=u, table=Table.joined(none, others, none, one), power=0),
-            Gather(arguments=v, table=Table.joined(none, others, one, none), power=0),
+            Gather(arguments=u, table=Table.joined(none, others, none, unit), power=0),
+            Gather(arguments=v, table=Table.joined(none, others, unit, none), power=0),
         ),
         scatters=tuple(
-            Scatter(results=each, table=table, power=-1)
-            for each, table in zip((change, pushed, u), tables, strict=True)
+            Scatter(results=result, table=table, power=-1)
+            for result, table in zip((change, pushed, u), tables, strict=True)
         ),
         computes="Changes of q and u = h p by rotations of bodies, less v, and u",
     )
@@ -206,7 +206,7 @@ def _rotated(
         blocks=(*stages.blocks, still, replace(still, letter="P", momentum=1, moves=False)),
         rows=(*stages.rows, Row(number=f"V_{name}", kind="stage", momentum=mp.zero), last),
         stage_groups=(*groups, group),
-        end_position=end if first else Table.joined(stages.end_position, one, none),
+        end_position=end if first else Table.joined(stages.end_position, unit, none),
         extrapolation=stages.extrapolation and _diagonal([stages.extrapolation, identity_matrix(2)]),
     )
 
@@ -214,7 +214,9 @@ def _rotated(
 def _reaching(group: StageGroup, size: int) -> StageGroup:
     """Return a stage group that adds to the momentum before the turns what it adds to p1."""
     wide, order = group.widened(2), [*range(size + 1), -1, -1]
-    return replace(wide, scatters=tuple(replace(each, table=each.table.columns(order)) for each in wide.scatters))
+    return replace(
+        wide, scatters=tuple(replace(scatter, table=scatter.table.columns(order)) for scatter in wide.scatters)
+    )
 
 
 def check_regular(method: Method, system: MechanicalSystem) -> None:
@@ -305,11 +307,11 @@ def _extended(
     points, rows = len(stage_group.abscissae), len(stage_group.scatters[0].table.entries[0]) - 1
     wide = stage_group.widened(len(added))
     gathers, scatters = [*wide.gathers], [*wide.scatters]
-    known = Table.constant(points, len(stage_group.gathers[0].table.entries[0]))
+    former = Table.constant(points, len(stage_group.gathers[0].table.entries[0]))
     before, last = Table.constant(points, rows), Table.constant(points, 1)
     for g in numbers:
         selection = Table.named("", [[int(column == (g, n)) for column in added] for n in range(points)])
-        gathers.append(Gather(arguments=groups[g].symbols, table=Table.joined(known, selection), power=-1))
+        gathers.append(Gather(arguments=groups[g].symbols, table=Table.joined(former, selection), power=-1))
         table = Table.joined(before, selection, last)
         scatters.append(Scatter(results=groups[g].results, table=table, power=groups[g].power))
     return replace(stage_group, gathers=tuple(gathers), scatters=tuple(scatters))

@@ -85,7 +85,7 @@ def _rotating_group(split: KineticSplitting, moving: Vector) -> StageGroup:
 
 def _kick_group(split: KineticSplitting, kicks: Vector, drifts: Vector) -> StageGroup:
     """Return L_q at the positions before, between and after the drifts, added to all later velocities (kicks)."""
-    points, moving = ([k for k, x in enumerate(each) if x] for each in (kicks, drifts))
+    points, moving = ([k for k, x in enumerate(coefficients) if x] for coefficients in (kicks, drifts))
     drifted = tuple(tuple(drifts[k] if k < n else mp.zero for k in moving) for n in points)
     before = tuple(tuple(int(n <= k) for k in moving) for n in points)
     every = Table.constant(len(points), 1, 1)

@@ -204,8 +204,8 @@ def resolve_quadrature(quadrature: Quadrature | str | None, degree: int) -> Quad
 
 def resolve_space(space: CurveSpace | str | None) -> CurveSpace:
     """Return a space of trial curves from an object or a name; by default polynomials."""
-    chosen = Polynomials() if space is None else space
-    return _resolved(chosen, CurveSpace, space_by_name, "space must be a", "splines:2")  # type: ignore[type-abstract]
+    curve_space = Polynomials() if space is None else space
+    return _resolved(curve_space, CurveSpace, space_by_name, "space must be a", "splines:2")  # type: ignore[type-abstract]
 
 
 def resolve_nodes(nodes: Nodes | str | None, degree: int) -> Nodes:

@@ -253,9 +253,9 @@ class StageGroup(StagePoints):
     def widened(self, count: int) -> StageGroup:
         """Return the group with columns of 0 for ``count`` further blocks, and for as many rows before that of p1."""
         none, before = Table.constant(len(self.abscissae), count), range(len(self.scatters[0].table.entries[0]) - 1)
-        gathers = (replace(each, table=Table.joined(each.table, none)) for each in self.gathers)
+        gathers = (replace(gather, table=Table.joined(gather.table, none)) for gather in self.gathers)
         tables = (Table.joined(x.table.columns(before), none, x.table.columns([-1])) for x in self.scatters)
-        scatters = (replace(each, table=table) for each, table in zip(self.scatters, tables, strict=True))
+        scatters = (replace(scatter, table=table) for scatter, table in zip(self.scatters, tables, strict=True))
         return replace(self, gathers=tuple(gathers), scatters=tuple(scatters))
 
 

@@ -29,7 +29,7 @@ SYMPLECTIC = "symplectic"
 
 def default_controller(*, in_tau: bool) -> str:
     """Return the name of the default controller of adaptive steps, or of steps in tau."""
-    return next(name for name, each in CONTROLLERS.items() if each.in_tau == in_tau)
+    return next(name for name, controller in CONTROLLERS.items() if controller.in_tau == in_tau)
 
 
 def controller_named(name: str | None, *, in_tau: bool) -> Controller:
@@ -40,8 +40,8 @@ def controller_named(name: str | None, *, in_tau: bool) -> Controller:
     """
     name = default_controller(in_tau=in_tau) if name is None else name
     if name not in CONTROLLERS:
-        known = ", ".join(CONTROLLERS)
-        raise MethodError(f"there is no controller '{name}'{closest(name, CONTROLLERS)} Known: {known}")
+        names = ", ".join(CONTROLLERS)
+        raise MethodError(f"there is no controller '{name}'{closest(name, CONTROLLERS)} Known: {names}")
     if CONTROLLERS[name].in_tau != in_tau:
         remedy = "omit time_transformation" if in_tau else 'give time_transformation="frequency", or a formula'
         raise MethodError(f"the controller '{name}' is {'one of adaptive steps' if in_tau else 'one of tau'}: {remedy}")

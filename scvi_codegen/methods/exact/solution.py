@@ -310,8 +310,8 @@ class FirstOrderMotion(ExactMotion):
     def _theta(self) -> Tape:
         """Return theta, and its derivatives by q and by y, row by row; then by t."""
         theta, q, y = self.system.one_form, self.system.coordinates, self.system.momenta
-        derivatives = [each.diff(x) for x in (*q, *y) for each in theta]
-        return Tape([*theta, *derivatives, *(each.diff(self.system.time) for each in theta)], self.symbols)
+        derivatives = [component.diff(x) for x in (*q, *y) for component in theta]
+        return Tape([*theta, *derivatives, *(component.diff(self.system.time) for component in theta)], self.symbols)
 
     def _one_form(self, q: Numbers, y: Numbers, t: Number) -> tuple[Numbers, Numbers, Numbers, Numbers]:
         """Return theta (m,), d theta_i / d q_j and d theta_i / d y_j (m, m), d theta / dt (m,)."""
