@@ -162,7 +162,6 @@ except ModelFileError as error:
     assert others == ["None", "True", "[run] absolute must be true or false, not 1"]
 
 
-@pytest.mark.second
 def test_documented_controller_determines_adaptive_steps(extended: Path) -> None:
     """It is as accurate as the default one, in steps of its own; arrays, models and checkpoints have it as well."""
     script = """
@@ -202,7 +201,6 @@ print(shown.exit_code, f"{model.integrate().steps} steps of adaptive size" in sh
     assert lines == ["True True", "True True", "True", "True True", "elementary True", "0 True"]
 
 
-@pytest.mark.second
 def test_documented_constraint_prescribes_rates(extended: Path) -> None:
     """A winch agrees with the pendulum of known length, read in each way, as do rods of their initial lengths."""
     script = """
@@ -268,7 +266,6 @@ print(".json" in next(each.help for each in command.params if each.name == "outp
     assert lines == ["s t coordinate True", "s t trajectory coordinate True", "True"]
 
 
-@pytest.mark.second
 def test_documented_discretisation_solves_a_wave(extended: Path) -> None:
     """Errors after one period of a string fall with the degree; points and weights are those of Clenshaw-Curtis."""
     script = """

@@ -158,14 +158,12 @@ def test_no_folder_imports_itself_indirectly():
     assert circle(folders()) == []
 
 
-@pytest.mark.rotated
 def test_the_package_imports_nothing_else_of_the_checkout():
     folders = {path.name for path in PACKAGE.parent.iterdir() if path.is_dir()} - {PACKAGE.name}
     assert {"benchmarks", "tests", "examples"} <= folders
     assert {name for imported in names().values() for name in imported if name.split(".")[0] in folders} == set()
 
 
-@pytest.mark.rotated
 def test_no_module_imports_itself_indirectly():
     assert circle(downwards()) == []
 
@@ -174,7 +172,6 @@ def test_circular_import_is_detected():
     assert circle({"a": {"b"}, "b": {"c"}, "c": {"a", "d"}})
 
 
-@pytest.mark.second
 def test_third_party_libraries_are_imported_by_assigned_packages_only():
     users = {(name.split(".")[0], room_of(m)) for m, imported in names().items() for name in imported}
     assert {(name, room) for name, room in users if room not in OWNERS.get(name, room).split()} == set()
@@ -183,7 +180,6 @@ def test_third_party_libraries_are_imported_by_assigned_packages_only():
 POSIX = {"fcntl", "grp", "posix", "pty", "pwd", "resource", "termios"}
 
 
-@pytest.mark.second
 def test_modules_specific_to_one_kind_of_system_are_not_imported():
     assert [m for m, imported in names().items() if POSIX & {name.split(".")[0] for name in imported}] == []
 

@@ -69,7 +69,7 @@ SECOND = ("crane", "first_steps")
 @pytest.mark.parametrize(
     "path",
     [
-        pytest.param(path, marks=pytest.mark.second if path.stem in SECOND else pytest.mark.full, id=path.stem)
+        pytest.param(path, marks=pytest.mark.rotated if path.stem in SECOND else pytest.mark.full, id=path.stem)
         for path in NOTEBOOKS
     ],
 )
