@@ -257,10 +257,10 @@ def test_constrained_arrays_are_certified_as_rattle(monkeypatch: pytest.MonkeyPa
     stepper = SimpleNamespace(run_time_sizes=True, start=lambda *_, **__: run, interface=interface, source=None)
     stepper.events, stepper.with_events = (), lambda _: stepper
     monkeypatch.setattr(arrays, "read_arrays", lambda *_: sizes)
-    arguments: dict[str, Any] = {"tolerance": None, "flags": (), "parameters": None, "tables": None}
-    arguments["of_known_sizes"] = lambda system, *known, **how: (system.dimension, *known, how["h"], how["t"])
-    swings = golden_cells.swings()
-    result = arrays.verify_arrays(swings, "stoermer-verlet", 0, 0, h=1, t=1, stepper=stepper, **arguments)
+    arguments: dict[str, Any] = {"tolerance": None, "parameters": None, "tables": None}
+    arguments["of_known_sizes"] = lambda system, *state, **how: (system.dimension, *state, how["h"], how["t"])
+    swings, method = golden_cells.swings(), sc.StoermerVerlet()
+    result = arrays.verify_arrays(swings, method, stepper, (0, 0, 1, 1), 0.0, **arguments)
     assert result == (4, sc.SVI(1, "gauss-lobatto:2"), "q", "p", 0.1, 0.5)
 
 

@@ -169,12 +169,11 @@ def advise(
         MethodError: if the degree is to be chosen for a method that has none, or time is transformed.
         BuildError: without a C compiler.
     """
-    known: MechanicalSystem
-    known, parameters = unrolled_at(system, q, parameters)
-    method = as_method(method, known)
-    if known.clock is not None:
+    system, parameters = unrolled_at(system, q, parameters)
+    method = as_method(method, system)
+    if system.clock is not None:
         raise MethodError(
-            f"'{known.name}' is in transformed time: no step size is recommended; use largest_step or try h"
+            f"'{system.name}' is in transformed time: no step size is recommended; use largest_step or try h"
         )
     length, target = _checked_request(span, tolerance)
     state = {"p": p, "velocity": velocity, "t": t, "parameters": parameters, "options": options}
@@ -184,10 +183,10 @@ def advise(
         raise MethodError(f"advise requires precision='double' or 'double-double', not {precision!r}")
     compiled = partial(compile_stepper, precision=precision)
     for candidate in _candidates(method, 1 + (precision == DOUBLE_DOUBLE)) if degree else [method]:
-        for stepper in _steppers(compiled, known, candidate, solver):
+        for stepper in _steppers(compiled, system, candidate, solver):
             try:
                 trials = Trials(stepper, q, state)
-                result.append(_advised(trials, candidate, is_symplectic(candidate, known), length, target))
+                result.append(_advised(trials, candidate, is_symplectic(candidate, system), length, target))
             except StateError as failure:
                 failures.append(failure)
                 continue
@@ -195,9 +194,10 @@ def advise(
                 break
     if not result:
         raise failures[-1]
-    met = [each for each in result if each[1].expected_error <= target]
-    best = min(met, key=lambda each: each[0]) if met else min(result, key=lambda each: each[1].expected_error)
-    return best[1]
+    accurate = [(cost, advice) for cost, advice in result if advice.expected_error <= target]
+    if accurate:
+        return min(accurate, key=lambda pair: pair[0])[1]
+    return min((advice for _, advice in result), key=lambda advice: advice.expected_error)
 
 
 def _checked_request(span: float | None, tolerance: float | None) -> tuple[float, float]:

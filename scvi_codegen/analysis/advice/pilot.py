@@ -330,13 +330,13 @@ class Pilot:
             return np.asarray(self.integrate(q, h=h, steps=steps, save_every=1).q[1:].reshape(steps, self.count, -1))
 
         try:
-            one = run(self.q)
-            sizes = distances_from_mean(one)
+            reference = run(self.q)
+            sizes = distances_from_mean(reference)
             shifts = nudges * sizes[:, np.newaxis] / math.sqrt(self.q.shape[-1])
-            other = run(self.q + shifts.reshape(self.q.shape))
+            shifted = run(self.q + shifts.reshape(self.q.shape))
         except StepFailedError:
             return np.zeros(self.count)
-        differences = relative(np.linalg.norm(other - one, axis=-1), sizes)
+        differences = relative(np.linalg.norm(shifted - reference, axis=-1), sizes)
         rates = np.zeros(self.count)
         for j, difference in enumerate(differences.T):
             near = difference[: int(np.argmax(difference > RESOLVED)) or steps]
@@ -384,8 +384,8 @@ class Pilot:
         Those that overflow are infinite.
         """
         finest = self.good[-1]
-        if (known := self._errors_of.get((n, finest))) is not None:
-            return known
+        if (n, finest) in self._errors_of:
+            return self._errors_of[n, finest]
         reference, positions = self.runs[finest].q, self.runs[n].q
         count = math.gcd(len(reference), len(positions))
         both = [q[len(q) // count - 1 :: len(q) // count] for q in (reference, positions)]
@@ -409,7 +409,7 @@ def _at_equal_times(trajectory: Any, length: float) -> Array:
     t, n, velocity = trajectory.t, len(trajectory.t) - 1, np.asarray(trajectory.velocity)
     words = zip(np.asarray(t).tolist(), low_words(t).tolist(), strict=True)
     exact = (Fraction(high) + Fraction(low) - Fraction(float(t[0])) for high, low in words)
-    late = np.array([float(each - k * Fraction(length) / n) for k, each in enumerate(exact)])
+    late = np.array([float(time - k * Fraction(length) / n) for k, time in enumerate(exact)])
     moved = late.reshape(-1, *[1] * (velocity.ndim - 1)) * velocity
     result: Array = with_low(np.asarray(trajectory.q), low_words(trajectory.q) - moved)
     return result

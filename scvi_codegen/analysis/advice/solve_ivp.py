@@ -151,12 +151,11 @@ def solve_ivp(
     if error is not None:
         checked_error(error, {"h": h, "tolerance": tolerance, "rtol": rtol})
     request = _StepRequest(h, rtol, tolerance, error)
-    known: MechanicalSystem | Stepper
     if isinstance(system, Stepper):
-        known = system.bind(q, parameters)[0]
+        system = system.bind(q, parameters)[0]
     else:
-        known, parameters = unrolled_at(system, q, parameters)
-    stepper, uncompiled = _stepper(known, method, (time_transformation, controller), request)
+        system, parameters = unrolled_at(system, q, parameters)
+    stepper, uncompiled = _stepper(system, method, (time_transformation, controller), request)
     q, p0, velocity = stepper._states.start(q, p0, velocity)
     if p0 is None and velocity is None:
         raise StateError("y0 contains positions by name: give velocity, too, or numbers for positions and momenta")
@@ -167,14 +166,19 @@ def solve_ivp(
     settings = {**steps, **control.named, **along, "events": events}
     try:
         trajectory = stepper.integrate(q, p, **settings, t_eval=None if dense_output else requested_times)
-        status, message = REACHED, "The end of the span was reached."
-        if shortfall := missed(trajectory):
-            status, message = MISSED, shortfall
-        elif trajectory.ended_by is not None:
-            status, message = EVENT, f"The terminal event '{trajectory.ended_by.function}' occurred."
-    except StepFailedError as error:
-        trajectory, status, message = Trajectory.before(error), FAILED, str(error)
+        status, message = _outcome(trajectory, missed(trajectory))
+    except StepFailedError as failure:
+        trajectory, status, message = Trajectory.before(failure), FAILED, str(failure)
     return _motion(trajectory, requested_times if dense_output else None, dense_output, status, message)
+
+
+def _outcome(trajectory: Trajectory, shortfall: str) -> tuple[int, str]:
+    """Return status and message of a run; ``shortfall``: why it misses its tolerance."""
+    if shortfall:
+        return MISSED, shortfall
+    if trajectory.ended_by is not None:
+        return EVENT, f"The terminal event '{trajectory.ended_by.function}' occurred."
+    return REACHED, "The end of the span was reached."
 
 
 class _StepRequest(NamedTuple):
@@ -202,9 +206,9 @@ def _stepper(
         )
     if not isinstance(system, Stepper):
         system, g = with_time_transformation(system, *transformation)
-        chosen = default_method(system) if method is None else as_method(method, system)
+        method = default_method(system) if method is None else as_method(method, system)
         controller = None if transformation[1] == SYMPLECTIC else transformation[1]
-        return compile_stepper(system, chosen, time_transformation=g, controller=controller), (system, chosen)
+        return compile_stepper(system, method, time_transformation=g, controller=controller), (system, method)
     if method is not None or transformation != (None, None) or request.tolerance is not None:
         raise StateError(
             "method, time_transformation, controller and tolerance need a system, not a compiled stepper: omit them, "

@@ -126,7 +126,7 @@ REMEDY = "use adaptive step size (t_end, --tolerance)"
 
 
 def missed_tolerance(
-    second: Callable[[], Stepper], trajectory: Trajectory, tolerance: float, known: Known | None = None
+    second: Callable[[], Stepper], trajectory: Trajectory, tolerance: float, final_error: Known | None = None
 ) -> str:
     """Return why the error at the end of a run exceeds ``tolerance``; ``""`` if there is no evidence for it.
 
@@ -138,16 +138,16 @@ def missed_tolerance(
         second: function that returns a stepper of the same system with adaptive steps, for a second run.
         trajectory: run whose states are all at the ends of steps.
         tolerance: error |q - q_exact| / |q - mean q| for which the step size was recommended.
-        known: error estimate from a second run.
+        final_error: error estimate from a second run.
     """
     if isinstance(trajectory.q, Words):
         return _missed_in_two_words(trajectory, tolerance)
     doubt = _worst_step(trajectory, tolerance) or _lost_energy(trajectory, tolerance)
-    if known is None and doubt:
-        known = known_digits(second, trajectory, most=SECOND_RUN + 4 * trajectory.steps)
-    if known is None or known.chaotic:
+    if final_error is None and doubt:
+        final_error = known_digits(second, trajectory, most=SECOND_RUN + 4 * trajectory.steps)
+    if final_error is None or final_error.chaotic:
         return f"{doubt}; {REMEDY}" if doubt else ""
-    error = float(relative_to_motion(np.asarray(np.linalg.norm(known.q)), trajectory.q))
+    error = float(relative_to_motion(np.asarray(np.linalg.norm(final_error.q)), trajectory.q))
     if error <= SECOND_MARGIN * tolerance + SECOND_RUN_ERROR:
         return ""
     message = doubt or f"the tolerance {tolerance:g} is missed"

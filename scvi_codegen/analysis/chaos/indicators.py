@@ -224,8 +224,8 @@ class InitialTangents:
         reduction = Reduction(stepper.interface) if stepper.interface.rotations else None
         if directions is None:
             most = reduction.size if reduction else size
-            wanted = None if count is None else checked_count(count, "count", least=1, most=most)
-            return cls(stepper, wanted, None, reduction)
+            count = None if count is None else checked_count(count, "count", least=1, most=most)
+            return cls(stepper, count, None, reduction)
         array = real_array(directions, "directions")
         columns = array[:, np.newaxis] if array.ndim == 1 else array
         if columns.ndim != 2 or len(columns) != size or not 0 < columns.shape[1] <= size:

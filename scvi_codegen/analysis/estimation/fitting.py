@@ -159,7 +159,7 @@ def fit(
     model = _Model.checked(measurements, q, p, velocity, parameters, unknown, fit_initial_state=fit_initial_state)
     if measurements.used.sum() < len(model.names):
         raise FitError(f"{int(measurements.used.sum())} measurements do not determine {len(model.names)} unknowns")
-    chain, x = chained(measurements, model.known, model.unknown_indices, checked_count(segments, "segments", least=1))
+    chain, x = chained(measurements, model.prior, model.unknown_indices, checked_count(segments, "segments", least=1))
     chain, x, at_bound, evaluations = _solved(model, chain, x, bounds or {})
     fitted = model.fit(chain, x, at_bound, evaluations, known_noise=deviations is not None)
     if message := _step_size_warning(chain, fitted, x, ~at_bound):
@@ -196,13 +196,13 @@ class _Model:
     Attributes:
         names, guess: (k,) names and initial guesses of the unknowns.
         unknown_indices: (k,) indices of the unknowns in (q, p, parameters).
-        known: (2m + parameters,) values; those of the unknowns are overwritten.
+        prior: (2m + parameters,) values of the initial guess; those of the unknowns are overwritten.
     """
 
     measurements: Measurements
     names: tuple[str, ...]
     unknown_indices: NDArray[np.intp]
-    known: Array
+    prior: Array
 
     @classmethod
     def checked(
@@ -220,8 +220,8 @@ class _Model:
         stepper, m = measurements.stepper, measurements.stepper.dimension
         inputs = columns_of_inputs(stepper.interface)
         estimable = [name for k, name in enumerate(stepper.parameters) if k not in inputs]
-        wanted = tuple(estimable) if unknown is None else distinct(unknown, "unknown")
-        for name in wanted:
+        estimated = tuple(estimable) if unknown is None else distinct(unknown, "unknown")
+        for name in estimated:
             if name not in estimable:
                 raise StateError(f"there is no parameter '{name}' to estimate{closest(name, estimable)}")
         if p is None and not fit_initial_state:
@@ -229,7 +229,7 @@ class _Model:
                 "velocity does not determine the initial momenta before the parameters are known: give p, or "
                 "fit_initial_state=True"
             )
-        if not wanted and not fit_initial_state:
+        if not estimated and not fit_initial_state:
             raise StateError(
                 "nothing to estimate: unknown is empty and fit_initial_state=False. Name parameters in unknown=[...]"
             )
@@ -240,15 +240,17 @@ class _Model:
             )
         values = stepper._parameters(parameters)
         momenta = stepper._initial_momenta(q, p, velocity, measurements.start, values)
-        unknown_indices = [2 * m + stepper.parameters.index(name) for name in wanted]
-        names = (*wanted, *state_names(stepper)) if fit_initial_state else tuple(wanted)
-        unknown_indices += range(2 * m) if fit_initial_state else ()
-        known = np.concatenate([*stepper._states.pair(q, momenta), values])
-        return cls(measurements, names, np.array(unknown_indices, dtype=np.intp), known)
+        unknown_indices = [2 * m + stepper.parameters.index(name) for name in estimated]
+        names = estimated
+        if fit_initial_state:
+            names = (*estimated, *state_names(stepper))
+            unknown_indices += range(2 * m)
+        prior = np.concatenate([*stepper._states.pair(q, momenta), values])
+        return cls(measurements, names, np.array(unknown_indices, dtype=np.intp), prior)
 
     @property
     def guess(self) -> Array:
-        return self.known[self.unknown_indices]
+        return self.prior[self.unknown_indices]
 
     def bounded(self, argument: Mapping[str, tuple[float, float]]) -> Limits:
         """Return (k,) lower and (k,) upper bounds of all unknowns; infinite for no bound."""

@@ -69,8 +69,10 @@ class Measurements:
             raise StateError("a value in measured is infinite: use NaN for missing measurements")
         values = values[:, np.newaxis] if values.ndim == 1 and len(names) == 1 else values
         if values.shape != (len(times), len(names)):
-            wanted = f"({len(times)}, {len(names)}) for {', '.join(names)}"
-            raise StateError(f"measured must have shape {wanted}, not {values.shape}; observed=[..] names its columns")
+            required = f"({len(times)}, {len(names)}) for {', '.join(names)}"
+            raise StateError(
+                f"measured must have shape {required}, not {values.shape}; observed=[..] names its columns"
+            )
         sizes = np.ones(len(names)) if deviations is None else real_array(deviations, "deviations")
         if sizes.shape not in ((), (len(names),)) or not ((sizes > 0.0) & np.isfinite(sizes)).all():
             raise StateError(f"deviations must be a positive number, or one for each of {', '.join(names)}")

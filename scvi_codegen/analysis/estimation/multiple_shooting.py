@@ -176,13 +176,13 @@ def _node_states_from_measurements(whole: Measurements, parts: Sequence[Measurem
     Unless all coordinates are measured the guesses are from the trajectory of the initial guess.
     """
     m = whole.stepper.dimension
-    order = [np.flatnonzero(whole.columns == k) for k in range(m)]
-    if not all(len(each) for each in order):
+    measured_columns = [np.flatnonzero(whole.columns == k) for k in range(m)]
+    if not all(len(columns) for columns in measured_columns):
         return _node_states_from_guess(parts, prior)
     states = []
     for part in parts[1:]:
         values = parameters_at(whole.stepper.parameters, prior[2 * m :], whole.inputs, part.start)
-        parabolas = [_parabola(whole, int(each[0]), part.start) for each in order]
+        parabolas = [_parabola(whole, int(columns[0]), part.start) for columns in measured_columns]
         q, v = np.array(parabolas).T
         states.append(np.concatenate([q, whole.stepper.momentum(q, v, part.start, values)]))
     return np.array(states).reshape(-1, 2 * m)
@@ -238,7 +238,7 @@ def joined(chain: Chain, x: Array, limits: Limits) -> tuple[Array, NDArray[np.bo
         residuals, jacobian = whole.evaluated(x)
         rows = len(residuals) - whole.jumps.size
         update, multipliers, at_bound = _bounded_update(jacobian, residuals, rows, (low - x, high - x))
-        moved, size = (float(np.linalg.norm(each)) for each in (jacobian[:rows] @ update, residuals[:rows]))
+        moved, size = float(np.linalg.norm(jacobian[:rows] @ update)), float(np.linalg.norm(residuals[:rows]))
         jump, moved = float(np.abs(residuals[rows:]).max()), moved / max(size, rounding / SETTLED)
         if jump < JOINED and moved <= SETTLED:
             return x, at_bound, iteration

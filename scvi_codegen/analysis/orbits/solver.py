@@ -279,14 +279,10 @@ def periodic_orbit(
         require(stepper, "energy")
     if (period := checked_number(period, "the period")) <= 0.0:
         raise StateError(f"the period must be positive, not {period:g}")
-    if steps is not None and h is not None:
-        raise StateError(
-            "give the number of steps per period (steps=200), or the largest step size (h=0.05), or neither for "
-            f"adaptive steps; periodic_orbit got both, steps={steps} and h={h}"
-        )
-    if adaptive := steps is None and h is None:
+    sequence = _equal_steps(period, steps, h)
+    if sequence is None:
         require(stepper, "adaptive")
-    bound = ERROR if adaptive else ERROR_OF_EQUAL_STEPS
+    bound = ERROR if sequence is None else ERROR_OF_EQUAL_STEPS
     if error is not None and not 0.0 < (bound := checked_number(error, "error")) < 1.0:
         raise StateError(f"error must be between 0 and 1, a bound of the relative discretisation error, not {bound:g}")
     for name in fixed:
@@ -300,7 +296,7 @@ def periodic_orbit(
         at_rest=_momenta_at_rest(stepper, start[: stepper.dimension], t, values),
         reduction=Reduction(interface),
         period=period,
-        sequence=None if adaptive else StepSequence.equal(_count_of_steps(period, steps, h)),
+        sequence=sequence,
         fixed_indices=(*map(names.index, dict.fromkeys(fixed)), *([-1] if fixed_period else [])),
         energy=None if energy is None else checked_number(energy, "the energy"),
         gain=np.zeros(stepper.dimension) if gain is None else stepper._states.vector(gain, "gain"),
@@ -317,8 +313,16 @@ def _momenta_at_rest(stepper: Stepper, q: Array, t: float, parameters: Array) ->
     return np.zeros_like(q)
 
 
-def _count_of_steps(period: float, steps: int | None, h: float | None) -> int:
-    return checked_count(steps, "steps", least=1) if h is None else int(steps_within(period, checked_step(h)))
+def _equal_steps(period: float, steps: int | None, h: float | None) -> StepSequence | None:
+    """Return the equal steps of a period, by their number or their largest size; ``None`` for adaptive steps."""
+    if steps is not None and h is not None:
+        raise StateError(
+            "give the number of steps per period (steps=200), or the largest step size (h=0.05), or neither for "
+            f"adaptive steps; periodic_orbit got both, steps={steps} and h={h}"
+        )
+    if steps is not None:
+        return StepSequence.equal(checked_count(steps, "steps", least=1))
+    return None if h is None else StepSequence.equal(int(steps_within(period, checked_step(h))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -630,18 +634,18 @@ class _OrbitSearch:
             rows[k, :, k * size : (k + 1) * size] = leaving @ segment.monodromy
             rows[k, :, after * size : (after + 1) * size] -= outward
             rows[k, :, -1] = leaving @ segment.by_period
-        error, relative_error = (float(np.abs(each).max()) for each in (defects, defects / self._reduced(sizes)))
+        error, relative_error = float(np.abs(defects).max()), float(np.abs(defects / self._reduced(sizes)).max())
         monodromy = leaving @ segments[-1].monodromy @ self.reduction.inward(*np.split(starts[-1], 2))
         rows[-1], defects[-1] = left @ rows[-1], left @ defects[-1]
-        partials, wanted = rows.reshape(defects.size, -1), defects.ravel()
+        partials, residuals = rows.reshape(defects.size, -1), defects.ravel()
         if self.energy is not None:
             first = starts[0]
             energy = self.stepper.energy(first[: size // 2], first[size // 2 :], self.t, self.parameters)
-            wanted = np.append(wanted, energy - self.energy)
+            residuals = np.append(residuals, energy - self.energy)
             row = np.zeros(len(z))
             row[:size] = gradients[0][0]
             partials = np.vstack([partials, row])
-        return _ClosingEquations(segments, monodromy, error, relative_error, sizes, wanted, partials, left)
+        return _ClosingEquations(segments, monodromy, error, relative_error, sizes, residuals, partials, left)
 
     def _leaving(self, segment: _Segment) -> Array:
         """Return the matrix from changes of (q, p) at the end of a segment to the reduced tangent space."""

@@ -78,8 +78,8 @@ def _error(solution: Solution) -> float:
         intervals.products(own, nodes[:-1]) + intervals.products(before, ends),
         intervals.products(other, nodes[:-1]) + intervals.products(after, ends) + kicked,
     ]
-    position, momentum = (OF_FINER * float(np.abs(each).max(initial=0.0)) for each in (nodes, impulses))
-    return solution.size.error(position, momentum)
+    position, momentum = (float(np.abs(changes).max(initial=0.0)) for changes in (nodes, impulses))
+    return solution.size.error(OF_FINER * position, OF_FINER * momentum)
 
 
 def _energy_change(solution: Solution) -> float:

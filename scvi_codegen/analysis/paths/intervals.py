@@ -177,13 +177,11 @@ class ManyCoordinates(Intervals):
         from scipy.sparse import csc_matrix
 
         m, k = self.dimension, len(self.h) // 2
-        one = Intervals(
-            self.stepper, self.t[k : k + 1], self.h[k : k + 1], np.atleast_2d(self.parameters)[-1], self.options
-        )
+        parameters = np.atleast_2d(self.parameters)[-1]
+        middle_step = Intervals(self.stepper, self.t[k : k + 1], self.h[k : k + 1], parameters, self.options)
         size = float(np.ptp(q)) or 1.0
-        noise = 1e-2 * size * np.random.default_rng(0).standard_normal((2, m)) * [[1.0], [1.0]]
-        noise[1] = noise[0]
-        blocks = np.abs(one.linearised(q[k : k + 2] + noise).blocks[:, 0])
+        noise = 1e-2 * size * np.random.default_rng(0).standard_normal(m)
+        blocks = np.abs(middle_step.linearised(q[k : k + 2] + noise).blocks[:, 0])
         pattern = np.logical_or.reduce(blocks > PROBED * blocks.max(axis=(1, 2), keepdims=True))
         pattern |= pattern.T
         conflicts = csc_matrix(pattern, dtype=np.int32)
@@ -192,7 +190,7 @@ class ManyCoordinates(Intervals):
         for j in range(m):
             taken = set(colours[conflicts.indices[conflicts.indptr[j] : conflicts.indptr[j + 1]]].tolist())
             colours[j] = next(c for c in range(m) if c not in taken)
-        self.rows, self.columns = (np.asarray(each) for each in np.nonzero(pattern))
+        self.rows, self.columns = np.nonzero(pattern)
         self.colours = colours
         return colours
 

@@ -184,24 +184,15 @@ def path_of(
     """Return the path of :meth:`scvi_codegen.Stepper.path`."""
     require(stepper, "path")
     count = checked_count(steps, "steps", least=2)
-    if T is None:
-        raise StateError("path: give T, the duration of the path (with energy= an estimate of it)")
-    duration, begin = checked_number(T, "the duration T"), checked_number(t, "the time t")
-    if duration == 0:
-        raise StateError("path: T must not be 0")
+    duration, begin = _checked_duration(T), checked_number(t, "the time t")
     kind = _kind_of_intervals(stepper, closed=closed is not None, energy=energy is not None)
     h = np.full(count, duration / count)
     times = begin + np.arange(count) * h
     intervals = kind(stepper, times, h, _parameters_of_steps(stepper, parameters, inputs, times + h / 2.0), options)
     arguments = {"parameters": parameters, "options": options, **({"inputs": inputs} if inputs is not None else {})}
-    nodes = _given_nodes(stepper._states, start, begin, duration, count)
-    values = intervals.parameters
+    nodes = _nodes_of_start(stepper._states, start, begin, duration, count)
     start_energy = None if energy is None else checked_number(energy, "energy")
-
-    def states(q: Array, p: Array) -> tuple[Array, Array]:
-        at = np.full(len(q), begin)
-        return np.asarray(stepper.energy(q, p, at, values)), np.asarray(stepper.velocity(q, p, at, values))
-
+    states = partial(_energies_and_velocities, stepper, begin, intervals.parameters)
     if closed is not None:
         M = _symmetry(stepper.interface, closed)
         solution = _closed_solution(intervals, nodes, M, start_energy, states)
@@ -224,6 +215,21 @@ def path_of(
         solution = solver.AtEnergy(solution.intervals, start_energy, states).solved(solution.q, solution.iterations)
         comparison = _checked(solution)
     return _described(stepper, solution, begin, arguments, comparison, dropped=dropped)
+
+
+def _checked_duration(T: float | None) -> float:
+    if T is None:
+        raise StateError("path: give T, the duration of the path (with energy= an estimate of it)")
+    duration = checked_number(T, "the duration T")
+    if duration == 0:
+        raise StateError("path: T must not be 0")
+    return duration
+
+
+def _energies_and_velocities(stepper: Any, begin: float, parameters: Array, q: Array, p: Array) -> tuple[Array, Array]:
+    """Return (n,) energies and (n, m) velocities of states at the time at which a path begins."""
+    t = np.full(len(q), begin)
+    return np.asarray(stepper.energy(q, p, t, parameters)), np.asarray(stepper.velocity(q, p, t, parameters))
 
 
 def _closed_solution(
@@ -266,14 +272,14 @@ def different_paths(
         except PathError as error:
             reason = reason or error
             continue
-        distances = (np.abs(each.q - path.q).max() + abs(each.t[-1] - path.t[-1]) for each in paths)
+        distances = (np.abs(other.q - path.q).max() + abs(other.t[-1] - path.t[-1]) for other in paths)
         if all(distance > SAME_PATH * size_for_updates(path.q, SAME_PATH) for distance in distances):
             paths.append(path)
     if not paths:
         raise PathError(
             f"{reason} ({len(tried) - 1} further starts were tried)" if tried[1:] else str(reason)
         ) from reason
-    return sorted(paths, key=lambda each: each.action)
+    return sorted(paths, key=lambda path: path.action)
 
 
 def _kind_of_intervals(stepper: Any, *, closed: bool, energy: bool) -> type[Intervals]:
@@ -463,7 +469,7 @@ def _parameters_of_steps(stepper: Any, parameters: Parameters, inputs: Mapping[s
     return values
 
 
-def _given_nodes(states: StateLayout, start: Any, t: float, duration: float, count: int) -> Array | None:
+def _nodes_of_start(states: StateLayout, start: Any, t: float, duration: float, count: int) -> Array | None:
     """Return the nodes of a start, an array or a function of time; ``None`` without one."""
     if start is None:
         return None
@@ -487,18 +493,18 @@ def _symmetry(interface: Any, closed: Any) -> Array:
     if closed is True:
         return np.eye(m)
     if isinstance(closed, str):
-        closed = [each.strip() for each in closed.split(",")]
+        closed = [name.strip() for name in closed.split(",")]
     entries: Sequence[Any] = list(closed) if isinstance(closed, list | tuple) else []
-    if entries and all(isinstance(each, str) for each in entries):
+    if entries and all(isinstance(entry, str) for entry in entries):
         M = np.zeros((m, m))
         elements = str.maketrans({"[": "_", "]": "", ",": "_", " ": ""})  # u[0, 1] is the coordinate u_0_1
-        plain = [each.removeprefix("-").translate(elements) for each in entries]
+        plain = [entry.removeprefix("-").translate(elements) for entry in entries]
         if sorted(plain) != sorted(names):
             raise StateError(
                 f"closed must contain each coordinate once, {', '.join(names)}, possibly with a sign: not {entries}"
             )
-        for row, (each, name) in enumerate(zip(entries, plain, strict=True)):
-            M[row, names.index(name)] = -1.0 if each.startswith("-") else 1.0
+        for row, (entry, name) in enumerate(zip(entries, plain, strict=True)):
+            M[row, names.index(name)] = -1.0 if entry.startswith("-") else 1.0
         return M
     M = real_array(closed, "closed")
     if M.shape != (m, m) or np.abs(M @ M.T - np.eye(m)).max(initial=0.0) > SAME_MATRIX:

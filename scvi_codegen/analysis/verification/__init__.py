@@ -14,11 +14,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from typing import Any
+from functools import partial
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from scvi_codegen.analysis.verification.arrays import state_of_fields, verify_arrays
 from scvi_codegen.analysis.verification.certificate import Certificate, Check, Outcome, issued
 from scvi_codegen.analysis.verification.convergence import convergence_checks, identity_checks
 from scvi_codegen.analysis.verification.derivatives import derivative_checks, time_transformation_derivative_checks
@@ -94,27 +96,40 @@ def verify(
         MethodError: if the method does not apply to the system, or has no such solver.
         StateError: if only one of q and p is passed, or no state is found.
     """
-    more: dict[str, Any] = {"velocity": velocity, "parameters": parameters, "tables": tables}
-    if isinstance(system, ArraySystem):
-        from scvi_codegen.analysis.verification.arrays import (
-            verify_arrays,  # imported here: it imports modules of this package
-        )
-
-        more |= {"stepper": stepper, "tolerance": tolerance, "of_known_sizes": verify}
-        return verify_arrays(system, method, q, p, h=h, t=t, **more)
-    for name, value in more.items():
-        if value is not None:
-            raise StateError(
-                f"{name} is for arrays of run-time sizes: give p, and parameters as defaults of the system"
-            )
-    if stepper is not None and stepper.run_time_sizes:
-        raise StateError(f"{stepper!r} is for arrays of run-time sizes, but the sizes of '{system.name}' are known")
+    of_run: dict[str, Any] = {"velocity": velocity, "parameters": parameters, "tables": tables}
+    if isinstance(system, ArraySystem) and system.mesh is not None and q is None and p is None:
+        q, p, h = state_of_fields(system.mesh, method, h)
+    _check_arguments(system, stepper, q, h, of_run)
     t, h = checked_number(t, "the time t"), None if h is None else checked_step(h)
     began, method = time.perf_counter(), as_method(method, system)
+    if isinstance(system, ArraySystem):
+        stepper = stepper or compile_stepper(system, method, solver=solver)
+        of_known_sizes = partial(verify, solver=solver, tolerance=tolerance)
+        of_run |= {"of_known_sizes": of_known_sizes, "tolerance": tolerance}
+        return verify_arrays(system, method, stepper, (q, p, cast(float, h), t), began, **of_run)
     system = discretised_form(system, method)
     stepper = stepper or compile_stepper(system, method, solver=solver)
     start = _initial_state(system, stepper, q, p, h, t)
     return _certificate(system, method, stepper, start, began, solver=solver, tolerance=tolerance)
+
+
+def _check_arguments(
+    system: MechanicalSystem, stepper: Stepper | None, q: Any, h: float | None, of_run: Mapping[str, Any]
+) -> None:
+    """Raise :class:`StateError` for arguments that named coordinates lack or arrays require, and the other way."""
+    of_arrays = isinstance(system, ArraySystem)
+    if of_arrays and (q is None or h is None):
+        raise StateError(f"verify requires q and h for arrays of '{system.name}': their shapes determine the sizes")
+    for name, value in of_run.items():
+        if value is not None and not of_arrays:
+            raise StateError(
+                f"{name} is for arrays of run-time sizes: give p, and parameters as defaults of the system"
+            )
+    if stepper is None or stepper.run_time_sizes == of_arrays:
+        return
+    if of_arrays:
+        raise StateError(f"stepper must be one of run-time sizes, not {stepper!r}: compile it without sizes")
+    raise StateError(f"{stepper!r} is for arrays of run-time sizes, but the sizes of '{system.name}' are known")
 
 
 def _certificate(

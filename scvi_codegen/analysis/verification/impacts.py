@@ -1,7 +1,7 @@
 """Checks of events that change the state, on a run of the compiled integrator that meets them."""
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, NamedTuple, cast
 
@@ -16,6 +16,7 @@ from scvi_codegen.methods.discretise import is_symplectic
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepper import Stepper
 from scvi_codegen.runs.trajectory import Trajectory
+from scvi_codegen.systems.event import Crossings
 from scvi_codegen.systems.formulas.symbols import TIME, symbol
 
 STEPS, ROUND_OFF, ROUNDINGS = 2000, 64.0 * EPSILON, 16.0
@@ -73,72 +74,106 @@ def _surfaces(tested: SystemUnderTest, stepper: Stepper, parameters: Any, crossi
         warnings.simplefilter("ignore", EventWarning)  # a run of this length may end where impacts accumulate
         run = stepper.integrate(start.q, start.p, h=start.h, steps=STEPS, t=start.t, parameters=parameters)
     crossings.extend((run, _changes(run)))
-    return Finding(max(each.residual for each in crossings[1]), ROUND_OFF, f"{len(crossings[1])} changes")
+    return Finding(max(change.residual for change in crossings[1]), ROUND_OFF, f"{len(crossings[1])} changes")
 
 
 def _changes(run: Trajectory) -> list[Change]:
     """Return the changes of the state that are a step away from other events."""
-    entries = [
-        (each, k, event) for each in run.events for k, event in enumerate(run.stepper._events_of_entries(each.event))
-    ]
-    of_entries = [each.chosen(each.element == k) for each, k, _ in entries]
-    formulas, changes = EventFormulas(run.stepper.interface, [each[2] for each in entries]), list[Change]()
-    known = (*formulas.q, *formulas.p, *formulas.v, symbol(TIME), *formulas.parameters)
-    times = np.concatenate([[run.t[0]], *(each.t for each in run.events)])
-    for crossings, g, (_, values) in zip(of_entries, formulas.functions, formulas.changes, strict=True):
-        e = sympy.nan if crossings.event.restitution is None else values[-1]
-        function = sympy.lambdify(known, [g, e, *(g.diff(each) for each in (*formulas.q, symbol(TIME)))])
+    times = np.concatenate([[run.t[0]], *(crossings.t for crossings in run.events)])
+    changes = list[Change]()
+    for crossings, function in _event_functions(run):
+        if not crossings.event.changes_state:
+            continue
         for t, q, p in zip(crossings.t, np.asarray(crossings.q), np.asarray(crossings.p), strict=True):
-            if crossings.event.changes_state and np.count_nonzero(np.abs(times - t) < 1.5 * abs(run.h)) == 1:
-                row, v = int(np.searchsorted(run.t, t, side="right")) - 1, run.stepper.velocity(q, p, t)
-
-                def evaluated(at: Array, p: Array = p, v: Array = v, function: Any = function) -> Array:
-                    return np.array(function(*at[:-1], *p, *v, at[-1], *run.parameters), dtype=float)
-
-                here = np.append(q, t)
-                value, restitution, *normal = evaluated(here)
-                moved = (evaluated(here + width) for width in np.diag(WIDTH * here))
-                rounding = sum((np.abs(each[2:] - normal) for each in moved), WIDTH * np.abs(normal)) * EPSILON / WIDTH
-                size = np.abs(normal) @ np.append(np.abs(q) + np.abs(v * run.h), abs(t) + abs(run.h))
-                after = np.asarray(run.q)[row], np.asarray(run.p)[row]
-                changes.append(Change(t, abs(value) / size, np.array(normal), rounding, restitution, (q, p), after))
+            if np.count_nonzero(np.abs(times - t) < 1.5 * abs(run.h)) == 1:
+                changes.append(_change_at(run, function, t, q, p))
     if not changes:
         raise StateError(f"no event alone changes the state within {STEPS} steps: give another state or step size")
     return changes
 
 
-def _impacts(run: Trajectory, changes: list[Change]) -> Finding | None:
-    """Return the largest violation of the equations of an impact, or change of a map that the wall respects.
+def _event_functions(run: Trajectory) -> Iterator[tuple[Crossings, Callable[..., list[float]]]]:
+    """Yield the crossings of each scalar event, and [g, e, g_q, g_t] as a function of (q, p, v, t, parameters)."""
+    scalar_events = [
+        (crossings.chosen(crossings.element == k), event)
+        for crossings in run.events
+        for k, event in enumerate(run.stepper._events_of_entries(crossings.event))
+    ]
+    formulas = EventFormulas(run.stepper.interface, [event for _, event in scalar_events])
+    arguments = (*formulas.q, *formulas.p, *formulas.v, symbol(TIME), *formulas.parameters)
+    for (crossings, _), g, (_, values) in zip(scalar_events, formulas.functions, formulas.changes, strict=True):
+        restitution = sympy.nan if crossings.event.restitution is None else values[-1]
+        gradient = [g.diff(variable) for variable in (*formulas.q, symbol(TIME))]
+        yield crossings, sympy.lambdify(arguments, [g, restitution, *gradient])
 
-    Each is in units of its change by one rounding of the momenta before and after, of the normal, of the approach speed
+
+def _change_at(run: Trajectory, function: Callable[..., list[float]], t: float, q: Array, p: Array) -> Change:
+    """Return the change of the state at time t; ``function`` as of :func:`_event_functions`."""
+    v = run.stepper.velocity(q, p, t)
+
+    def evaluated(point: Array) -> Array:
+        return np.array(function(*point[:-1], *p, *v, point[-1], *run.parameters), dtype=float)
+
+    point = np.append(q, t)
+    g, restitution, *normal = evaluated(point)
+    moved_normals = [evaluated(point + shift)[2:] for shift in np.diag(WIDTH * point)]
+    moved = sum((np.abs(moved_normal - normal) for moved_normal in moved_normals), WIDTH * np.abs(normal))
+    size = np.abs(normal) @ np.append(np.abs(q) + np.abs(v * run.h), abs(t) + abs(run.h))
+    row = int(np.searchsorted(run.t, t, side="right")) - 1
+    after = np.asarray(run.q)[row], np.asarray(run.p)[row]
+    return Change(t, abs(g) / size, np.array(normal), moved * EPSILON / WIDTH, restitution, (q, p), after)
+
+
+def _impacts(run: Trajectory, changes: list[Change]) -> Finding | None:
+    """Return the largest violation of the equations of an impact, or change of a map that the wall respects."""
+    impacts = [change for change in changes if change.restitution >= 0.0]
+    errors = [error for impact in impacts for error in _impact_errors(run, impact)]
+    return Finding(max(errors), ROUNDINGS, f"in units of rounding, {len(impacts)} impacts") if errors else None
+
+
+def _impact_errors(run: Trajectory, impact: Change) -> tuple[float, float, float]:
+    """Return the errors of the energy, of the momenta, and of the maps that the wall respects, in units of rounding.
+
+    A unit is the change by one rounding of the momenta before and after, of the normal, of the approach speed
     v . n + g_t, from which lambda is computed, and of the terms of the energy and of the maps.
     """
-    stepper, at, worst = run.stepper, run.parameters, list[float]()
-    for t, _, normal, rounding, e, (q, p), after in (each for each in changes if each.restitution >= 0.0):
-        n, n_rounding, jump = normal[:-1], rounding[:-1], after[1] - p
-        size, jump_rounding = np.abs(n), EPSILON * (np.abs(p) + np.abs(after[1]))
-        part, square = 0.5 * (1.0 + e), n @ n
-        impulse = jump @ n / square / part
-        elastic, pushed = p + impulse * n, abs(impulse) * size
-        energies, speeds = ([f(q, x, t, at) for x in (p, elastic)] for f in (stepper.energy, stepper.velocity))
-        speed, other = np.abs(speeds[0]), np.abs(speeds[1])
-        turned = n_rounding @ size / square
-        approach = EPSILON * (size @ speed + abs(normal[-1])) + n_rounding @ speed + rounding[-1]
-        of_impulse = (jump_rounding @ size + np.abs(jump) @ n_rounding) / square / part + 2.0 * abs(impulse) * turned
-        of_impulse += EPSILON * abs(impulse) + abs(impulse) * approach / (abs(n @ (speeds[1] - speeds[0])) or 1.0)
-        of_energy = EPSILON * (np.abs(p) @ speed + np.abs(elastic) @ other + sum(map(abs, energies)))
-        of_energy += abs(speeds[1] @ n + normal[-1]) * of_impulse + abs(impulse) * (n_rounding @ other + rounding[-1])
-        worst.append(abs(energies[1] - energies[0] + impulse * normal[-1]) / of_energy)
-        along = jump_rounding + part * (of_impulse * size + abs(impulse) * n_rounding)
-        worst.append(float((np.abs(jump - part * impulse * n) / along).max()))
-        (first, map_sizes), *others = (
-            stepper._momentum_maps_and_sizes(q[np.newaxis], x[np.newaxis], t, at) for x in (p, elastic, after[1])
-        )
-        changed = [np.abs(maps - first)[0] for maps, _ in others]
-        of_maps = (EPSILON * (map_sizes + others[0][1]))[0] + (along + EPSILON * pushed).max() * (1.0 + np.abs(q).max())
-        respected = changed[0] <= ROUNDINGS * of_maps
-        worst.append(float((changed[1] / of_maps)[respected].max(initial=0.0)))
-    return Finding(float(max(worst)), ROUNDINGS, f"in units of rounding, {len(worst) // 3} impacts") if worst else None
+    stepper, parameters, t = run.stepper, run.parameters, impact.t
+    (q, p), p_after = impact.before, impact.after[1]
+    n, g_t, n_rounding, g_t_rounding = impact.normal[:-1], impact.normal[-1], impact.rounding[:-1], impact.rounding[-1]
+    size, square = np.abs(n), n @ n
+    # p_after = p + (1 + e)/2 lambda n, with lambda of the elastic impact: H(p + lambda n) - H(p) = -lambda g_t.
+    part, jump = 0.5 * (1.0 + impact.restitution), p_after - p
+    impulse = jump @ n / square / part
+    elastic = p + impulse * n
+    energies = [stepper.energy(q, momenta, t, parameters) for momenta in (p, elastic)]
+    velocities = [stepper.velocity(q, momenta, t, parameters) for momenta in (p, elastic)]
+    speed, elastic_speed = np.abs(velocities[0]), np.abs(velocities[1])
+
+    jump_rounding = EPSILON * (np.abs(p) + np.abs(p_after))
+    approach = EPSILON * (size @ speed + abs(g_t)) + n_rounding @ speed + g_t_rounding
+    impulse_rounding = (jump_rounding @ size + np.abs(jump) @ n_rounding) / square / part
+    impulse_rounding += 2.0 * abs(impulse) * (n_rounding @ size / square) + EPSILON * abs(impulse)
+    impulse_rounding += abs(impulse) * approach / (abs(n @ (velocities[1] - velocities[0])) or 1.0)
+    energy_rounding = EPSILON * (np.abs(p) @ speed + np.abs(elastic) @ elastic_speed + sum(map(abs, energies)))
+    energy_rounding += abs(velocities[1] @ n + g_t) * impulse_rounding
+    energy_rounding += abs(impulse) * (n_rounding @ elastic_speed + g_t_rounding)
+    momentum_rounding = jump_rounding + part * (impulse_rounding * size + abs(impulse) * n_rounding)
+
+    energy_error = float(abs(energies[1] - energies[0] + impulse * g_t) / energy_rounding)
+    momentum_error = float((np.abs(jump - part * impulse * n) / momentum_rounding).max())
+    (maps, map_sizes), (elastic_maps, elastic_sizes), (maps_after, _) = (
+        stepper._momentum_maps_and_sizes(q[np.newaxis], momenta[np.newaxis], t, parameters)
+        for momenta in (p, elastic, p_after)
+    )
+    map_rounding = (momentum_rounding + EPSILON * abs(impulse) * size).max() * (1.0 + np.abs(q).max())
+    map_rounding = map_rounding + (EPSILON * (map_sizes + elastic_sizes))[0]
+    respected = np.abs(elastic_maps - maps)[0] <= ROUNDINGS * map_rounding
+    map_errors = np.abs(maps_after - maps)[0] / map_rounding
+    return energy_error, momentum_error, float(map_errors[respected].max(initial=0.0))
+
+
+def _elastic(changes: list[Change]) -> list[Change]:
+    return [change for change in changes if change.restitution == 1.0]
 
 
 def _across(run: Trajectory, change: Change, h: float) -> tuple[Array, Any]:
@@ -160,7 +195,7 @@ def _saltation(scales: Array, run: Trajectory, changes: list[Change]) -> Finding
 def _reversal(run: Trajectory, changes: list[Change]) -> Finding | None:
     """Return the defect of steps with elastic impacts and back, in units of one rounding of state, time and step."""
     worst = list[float]()
-    for change in [each for each in changes if each.restitution == 1.0][:REVERSED]:
+    for change in _elastic(changes)[:REVERSED]:
         start, step = _across(run, change, run.h)
         there, stepper = step(start), cast(Stepper, run.stepper)
         end, t = np.hstack([there.q[-1], there.p[-1]]), there.t[-1]
@@ -174,10 +209,12 @@ def _reversal(run: Trajectory, changes: list[Change]) -> Finding | None:
 
 
 def _symplecticity(run: Trajectory, changes: list[Change]) -> Finding | None:
-    elastic, defects = [each for each in changes if each.restitution == 1.0], []
+    elastic, defects = _elastic(changes), []
+    if not elastic:
+        return None
     form = np.kron([[0.0, 1.0], [-1.0, 0.0]], np.eye(run.stepper.dimension))
-    for h in (run.h, run.h / DIVISOR) if elastic else ():
+    for h in (run.h, run.h / DIVISOR):
         start, step = _across(run, elastic[0], h)
         matrix = step(start).tangent()[-1]
         defects.append(float(np.abs(matrix.T @ form @ matrix - form).max() / np.abs(matrix).max() ** 2))
-    return Finding(defects[1], max(defects[0] / LEAST_REDUCTION, NOISE), "step / 8") if elastic else None
+    return Finding(defects[1], max(defects[0] / LEAST_REDUCTION, NOISE), "step / 8")

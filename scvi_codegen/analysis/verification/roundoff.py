@@ -252,7 +252,8 @@ def _walks(tested: SystemUnderTest, run: Callable[[Array, Array, int], tuple[Arr
         before, sizes = invariant(starts[:, :m], starts[:, m:], initial.t)
         after, last_sizes = invariant(*end, initial.t + steps * initial.h)
         changes, grown = (after - before) / sizes, last_sizes / sizes
-        changes, grown = (each[np.isfinite(changes) & np.isfinite(grown)] for each in (changes, grown))
+        finite = np.isfinite(changes) & np.isfinite(grown)
+        changes, grown = changes[finite], grown[finite]
         if len(changes) < RUNS // 2:
             raise StateError(f"{name}: runs of {steps} steps failed")
         # Rounding of terms that grow alike in all runs, such as g t^2/2 of a falling body, has the same sign in all.

@@ -258,11 +258,11 @@ def predictor_checks(tested: SystemUnderTest) -> Iterator[Check]:
 
 def _predictor(tested: SystemUnderTest) -> Finding | None:
     framed = in_moving_frame(tested.system, tested.method)  # whose fixed-point iteration has no predictor
-    result = [_worst(tested, stepper) for stepper in (tested.steppers[1:] if framed else tested.steppers)]
-    seen = [each for each in result if each is not None]
-    if not seen:
+    steppers = tested.steppers[1:] if framed else tested.steppers
+    ratios = [ratio for ratio in (_worst(tested, stepper) for stepper in steppers) if ratio is not None]
+    if not ratios:
         return None
-    worst, h = max(seen)
+    worst, h = max(ratios)
     return Finding(worst, LARGEST_RATIO, f"ratio of the errors, h = {h:.3g}")
 
 
@@ -288,7 +288,7 @@ def _errors_left(tested: SystemUnderTest, stepper: Stepper, h: float, steps: int
         stepper.start(here.q, here.p, h=h, t=here.t, parameters=parameters, options=ANY_UPDATE),
         stepper.from_checkpoint(saved, parameters=parameters, options=ANY_UPDATE),
     )
-    for each in runs:
-        each.advance(1)
-    solved, line, guess = (np.concatenate([each.q, each.p]) / tested.scales(here) for each in runs)
+    for run in runs:
+        run.advance(1)
+    solved, line, guess = (np.concatenate([run.q, run.p]) / tested.scales(here) for run in runs)
     return float(np.max(np.abs(line - solved))), float(np.max(np.abs(guess - solved)))

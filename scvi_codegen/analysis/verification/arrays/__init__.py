@@ -5,7 +5,6 @@ equations in 60 digits, its exact motion and its compiled steps, none of which h
 compared with NumPy, and conserved quantities are measured along a run.
 """
 
-import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
@@ -23,7 +22,7 @@ from scvi_codegen.analysis.verification.structure import structure_checks
 from scvi_codegen.analysis.verification.system_under_test import State, SystemUnderTest
 from scvi_codegen.codegen.rendering.source import Interface
 from scvi_codegen.common.errors import StateError
-from scvi_codegen.methods import SVI, StoermerVerlet, as_method
+from scvi_codegen.methods import SVI, StoermerVerlet
 from scvi_codegen.methods.method import Method
 from scvi_codegen.runs.compiler import compile_stepper
 from scvi_codegen.runs.stepper import Stepper, StepperOfRunTimeSizes
@@ -32,109 +31,103 @@ from scvi_codegen.systems.arrays.system import ArraySystem
 from scvi_codegen.systems.formulas.indices import Array
 from scvi_codegen.systems.rolling import unroll_sums
 
-__all__ = ["verify_arrays"]
+__all__ = ["state_of_fields", "verify_arrays"]
 
 SMALL_STEPS, MOST_COORDINATES = 40, 64
 ROUNDINGS = 16.0 * SMALL_STEPS
 """Bound on the deviation after ``SMALL_STEPS`` steps, in units of rounding."""
 
 
+def state_of_fields(mesh: Any, method: Method | str, h: float | None) -> tuple[Any, Any, float]:
+    """Return random fields at the points of a mesh, their momenta, and a step size at which iterations converge."""
+    random, fields = np.random.default_rng(0), mesh.field_system.fields
+    q, rates = ({field: random.uniform(-0.5, 0.5, mesh.weights.shape) for field in fields} for _ in "qp")
+    q |= dict.fromkeys(mesh.field_system.scalars, np.array(0.1))
+    p = {field: mesh.weights * rate for field, rate in rates.items()}
+    return q, p, h or min(mesh.largest_step(method) / 4, 0.05)
+
+
 def verify_arrays(
     system: ArraySystem,
-    method: Method | str,
-    q: Any,
-    p: Any,
+    method: Method,
+    with_events: Stepper,
+    state: tuple[Any, Any, float, float],
+    began: float,
     *,
-    h: float | None,
-    t: float,
-    stepper: Stepper | None,
-    tolerance: float | None,
     of_known_sizes: Callable[..., Certificate],
+    tolerance: float | None,
     **arrays_of_run: Any,
 ) -> Certificate:
-    """Return the certificate of arrays of run-time sizes; arguments as of ``of_known_sizes``, which is ``verify``.
+    """Return the certificate of arrays of run-time sizes at a state (q, p, h, t).
 
     Properties are measured on a few indices of the arrays first, then at full size; adaptive steps, constraints, and
-    systems without an integrator for arrays of run-time sizes with known sizes only.
+    systems without an integrator for arrays of run-time sizes with known sizes only, by ``of_known_sizes``: ``verify``
+    with this tolerance.
     """
-    if q is None and p is None and system.mesh is not None:
-        q, p, h = _state_of_fields(system.mesh, method, h)
-    if q is None or h is None:
-        raise StateError(f"verify requires q and h for arrays of '{system.name}': their shapes determine the sizes")
-    if stepper is not None and not stepper.run_time_sizes:
-        raise StateError(f"stepper must be one of run-time sizes, not {stepper!r}: compile it without sizes")
-    began = time.perf_counter()
-    resolved = as_method(method, system)
-    with_events = stepper or compile_stepper(system, resolved)
+    q, p, h, t = state
     stepper = with_events.with_events(())
     run = stepper.start(q, p, h=h, t=t, **arrays_of_run)
     arrays = read_arrays(stepper.interface, q, arrays_of_run["parameters"], arrays_of_run["tables"])
-    parameters = dict(zip(stepper.interface.parameters, arrays.numbers, strict=True))
     if stepper.source is None or system.coupled_terms or tolerance is not None or system.constraints:
-        unrolled = unroll_sums(system, arrays.sizes, tables=arrays.places, parameters={**parameters, **arrays.fields})
-        options: dict[str, Any] = {"h": run._step_size, "t": run.t, "tolerance": tolerance}
-        if with_events.events:
-            options["stepper"] = compile_stepper(unrolled, resolved, flags=with_events.flags, events=with_events.events)
-        if system.constraints and isinstance(resolved, StoermerVerlet):
-            resolved = SVI(1, "gauss-lobatto:2")  # RATTLE under its name for known sizes
-        certificate = of_known_sizes(unrolled, resolved, run.q, run.p, **options)
-        if stepper.source is None:
-            return certificate
-        loops = SystemUnderTest(
-            unrolled, resolved, _bound(stepper, arrays), None, State(run.q, run.p, run.t, run._step_size)
-        )
-        return replace(certificate, checks=(*_unrolled_checks(loops), *certificate.checks))
-    start = WholeStart(system, resolved, stepper, arrays, run.stepper.arrays(run.p), run._step_size, run.t)
-    tested = _subject(start)
+        initial = State(run.q, run.p, run.t, run._step_size)
+        return _at_known_sizes(system, method, with_events, arrays, initial, of_known_sizes)
+    start = WholeStart(system, method, stepper, arrays, run.stepper.arrays(run.p), run._step_size, run.t)
+    tested = _subject(small_start(start))
     checks = (
         *_unrolled_checks(tested),
         *step_checks(tested),
         *structure_checks(tested),
         *convergence_checks(tested),
         *whole_checks(start),
-        *_impact_checks(start, with_events.bind(arrays.state, arrays_of_run["parameters"], arrays.places)[0]),
+        *_impact_checks(start, with_events),
     )
-    return issued(
-        stepper,
-        tested.initial,
-        began=began,
-        system=system.name,
-        method=resolved.name,
-        parameters=parameters,
-        checks=checks,
-    )
+    parameters = dict(zip(stepper.interface.parameters, arrays.numbers, strict=True))
+    names = {"system": system.name, "method": method.name}
+    return issued(stepper, tested.initial, began=began, **names, parameters=parameters, checks=checks)
+
+
+def _at_known_sizes(
+    system: ArraySystem,
+    method: Method,
+    with_events: Stepper,
+    arrays: RunArrays,
+    initial: State,
+    of_known_sizes: Callable[..., Certificate],
+) -> Certificate:
+    """Return the certificate of the unrolled system, with the check that loops equal it if there are loops."""
+    parameters = {**dict(zip(with_events.interface.parameters, arrays.numbers, strict=True)), **arrays.fields}
+    unrolled = unroll_sums(system, arrays.sizes, tables=arrays.places, parameters=parameters)
+    stepper = None
+    if with_events.events:
+        stepper = compile_stepper(unrolled, method, flags=with_events.flags, events=with_events.events)
+    if system.constraints and isinstance(method, StoermerVerlet):
+        method = SVI(1, "gauss-lobatto:2")  # RATTLE under its name for known sizes
+    certificate = of_known_sizes(unrolled, method, initial.q, initial.p, h=initial.h, t=initial.t, stepper=stepper)
+    if with_events.source is None:
+        return certificate
+    loops = SystemUnderTest(unrolled, method, _bound(with_events.with_events(()), arrays), None, initial)
+    return replace(certificate, checks=(*_unrolled_checks(loops), *certificate.checks))
 
 
 def _impact_checks(start: WholeStart, with_events: Stepper) -> Iterator[Check]:
     """Yield the checks of events that change the state, which are compared with formulas of all coordinates."""
-    if not with_events.changes_states:
+    arrays = start.arrays
+    stepper = with_events.bind(arrays.state, start.parameters, arrays.places)[0]
+    if not stepper.changes_states:
         return
-    if with_events.dimension > MOST_COORDINATES:
+    if stepper.dimension > MOST_COORDINATES:
         yield information("impacts", f"measured for at most {MOST_COORDINATES} coordinates: give fewer", None)
         return
-    arrays = start.arrays
-    unrolled = unroll_sums(start.system, arrays.sizes, tables=arrays.places, parameters=start.parameters)
-    q, p = (np.concatenate([values.reshape(-1) for values in state.values()]) for state in (arrays.state, start.p))
-    tested = SystemUnderTest(unrolled, start.method, with_events, None, State(q, p, start.t, start.h))
     numbers = np.concatenate([arrays.numbers, *(values.reshape(-1) for values in arrays.fields.values())])
-    yield from impact_checks(tested, with_events, numbers)
-
-
-def _state_of_fields(mesh: Any, method: Method | str, h: float | None) -> tuple[Any, Any, float]:
-    """Return random fields at the points of a mesh, their momenta, and a step size at which iterations converge."""
-    random = np.random.default_rng(0)
-    q, p = ({each: random.uniform(-0.5, 0.5, mesh.weights.shape) for each in mesh.field_system.fields} for _ in "qp")
-    q |= dict.fromkeys(mesh.field_system.scalars, np.array(0.1))
-    return q, {each: mesh.weights * values for each, values in p.items()}, h or min(mesh.largest_step(method) / 4, 0.05)
+    yield from impact_checks(replace(_subject(start), stepper=stepper), stepper, numbers)
 
 
 def _subject(start: WholeStart) -> SystemUnderTest:
-    """Return the loops on a few indices as an integrator of the unrolled system."""
-    small = small_start(start)
-    arrays = small.arrays
-    written = unroll_sums(start.system, arrays.sizes, tables=arrays.places, parameters=small.parameters)
-    q, p = (np.concatenate([values.reshape(-1) for values in state.values()]) for state in (arrays.state, small.p))
-    return SystemUnderTest(written, start.method, _bound(start.stepper, arrays), None, State(q, p, start.t, start.h))
+    """Return the loops at the sizes of ``start`` as an integrator of the unrolled system."""
+    arrays = start.arrays
+    unrolled = unroll_sums(start.system, arrays.sizes, tables=arrays.places, parameters=start.parameters)
+    q, p = (np.concatenate([values.reshape(-1) for values in part.values()]) for part in (arrays.state, start.p))
+    return SystemUnderTest(unrolled, start.method, _bound(start.stepper, arrays), None, State(q, p, start.t, start.h))
 
 
 def _bound(stepper: Stepper, arrays: RunArrays) -> Stepper:
@@ -154,7 +147,7 @@ def _compared_with_unrolled(tested: SystemUnderTest) -> Finding:
     first = tested.states[0]
     other = compile_stepper(tested.system, tested.method, flags=tested.stepper.flags)
     run: dict[str, Any] = {"h": first.h, "t": first.t, "steps": SMALL_STEPS, "parameters": tested.parameters}
-    rolled, expected = (each.integrate(first.q, first.p, **run) for each in (tested.stepper, other))
+    rolled, expected = (stepper.integrate(first.q, first.p, **run) for stepper in (tested.stepper, other))
     difference = np.abs(np.concatenate([rolled.q - expected.q, rolled.p - expected.p], axis=1)) / tested.rounding(first)
     return Finding(float(difference.max()), ROUNDINGS, "in units of rounding of a step")
 

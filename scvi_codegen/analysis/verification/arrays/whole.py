@@ -1,6 +1,6 @@
 """Checks of array systems at full size: rates against NumPy, reversibility and conserved quantities."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -95,15 +95,18 @@ def _rates(start: WholeStart) -> Finding:
     ends = ((start.arrays.state, named(run.q)), (start.p, named(run.p)))
     lows = map(named, run._compensation)
     for (before, after), low, derivatives, others in zip(ends, lows, expected, nudged, strict=True):
-        size = max((float(np.abs(each).max(initial=0.0)) for each in derivatives.values()), default=0.0)
-        noise = max(
-            (float(np.abs(each - others[name]).max(initial=0.0)) for name, each in derivatives.items()), default=0.0
-        )
+        size = _largest(derivatives.values())
+        noise = _largest(derivative - others[name] for name, derivative in derivatives.items())
         unit = EPSILON * (size + noise / PERTURBATION) or 1.0
         for name, exact in derivatives.items():
             rate = ((after[name] - before[name]) + low[name]) / run._step_size
-            worst = max(worst, float(np.abs(rate - exact).max(initial=0.0)) / unit)
+            worst = max(worst, _largest([rate - exact]) / unit)
     return Finding(worst, ROUNDINGS, "in units of rounding")
+
+
+def _largest(arrays: Iterable[Numbers]) -> float:
+    """Return the largest absolute value of the entries of arrays, 0 without entries."""
+    return max((float(np.abs(array).max(initial=0.0)) for array in arrays), default=0.0)
 
 
 def _perturbed(start: WholeStart) -> WholeStart:
@@ -155,10 +158,10 @@ def _energies(start: WholeStart) -> Finding:
     kinetic = sum(float(np.sum(start.p[name] ** 2 / mass)) / 2 for name, mass in masses.items())
     terms = (*system.potentials, *system.energy_offsets)
     values = [_values(start, start.elements(term.loops), term.formula, term.slots) for term in terms]
-    potential = -sum(float(np.sum(each)) for each in values)
-    size = kinetic + sum(float(np.sum(np.abs(each))) for each in values)
+    potential = -sum(float(np.sum(term_values)) for term_values in values)
+    size = kinetic + sum(float(np.sum(np.abs(term_values))) for term_values in values)
     wrong = abs(run.energies[0] - kinetic) + abs(run.energies[1] - potential)
-    count = sum(np.size(each) for each in values) + 1
+    count = sum(np.size(term_values) for term_values in values) + 1
     return Finding(wrong / (size or 1.0), ROUNDINGS * EPSILON * float(np.log2(count) + 1), "relative to its terms")
 
 
@@ -176,16 +179,14 @@ def _reversal(start: WholeStart) -> Finding:
     back = start.begin(q1, p1, -run._step_size, run.t)
     back.advance(1)
     q2, p2 = back.stepper.arrays(back.q), back.stepper.arrays(back.p)
-    masses = {} if start.system.momenta else _masses(start)
-    inverse = {name: 1.0 / masses[name] if masses else np.ones(()) for name in start.p}
-    lengths = [np.abs(each) for each in (*start.arrays.state.values(), *q1.values())]
-    lengths += [np.abs(run._step_size * p * inverse[name]) for state in (start.p, p1) for name, p in state.items()]
-    size = max(float(each.max(initial=0.0)) for each in lengths) or 1.0
-    difference = [np.abs(q2[name] - q).max(initial=0.0) for name, q in start.arrays.state.items()]
-    difference += [
-        np.abs(run._step_size * inverse[name] * (p2[name] - p)).max(initial=0.0) for name, p in start.p.items()
-    ]
-    return Finding(float(max(difference)) / size, ROUNDINGS * EPSILON, "relative to the largest coordinate")
+    masses = dict.fromkeys(start.p, np.ones(())) if start.system.momenta else _masses(start)
+    to_length = {name: run._step_size * (1.0 / mass) for name, mass in masses.items()}  # h / m
+    lengths = [*start.arrays.state.values(), *q1.values()]
+    lengths += [p * to_length[name] for momenta in (start.p, p1) for name, p in momenta.items()]
+    differences = [q2[name] - q for name, q in start.arrays.state.items()]
+    differences += [to_length[name] * (p2[name] - p) for name, p in start.p.items()]
+    error = _largest(differences) / (_largest(lengths) or 1.0)
+    return Finding(error, ROUNDINGS * EPSILON, "relative to the largest coordinate")
 
 
 def _long_run(start: WholeStart, sizes: str) -> Iterator[Check]:
