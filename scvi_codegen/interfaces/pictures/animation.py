@@ -79,8 +79,8 @@ def drawn_shape(
         ModelFileError: for mistakes in ``picture``.
     """
     if positions is None:
-        drawn = drawn_system_of(motion)
-        return shape_of(drawn) if picture is None else shape_of_picture(drawn, picture)
+        system = drawn_system_of(motion)
+        return shape_of(system) if picture is None else shape_of_picture(system, picture)
     tried = np.shape(positions(motion.q[:1]))
     if len(tried) != 3 or tried[0] != 1 or tried[2] not in (2, 3):
         raise StateError(f"positions(q) must have shape (n, k, 2) or (n, k, 3); for n = 1 it has {tried}")
@@ -176,18 +176,18 @@ class Film:
     def shown(self) -> tuple[Trajectory, ...]:
         """Trajectories with the states that are drawn: all, or those of dense output at common times."""
         motions = several(self.trajectory)
-        longest = max(motions, key=lambda each: abs(float(each.t[-1] - each.t[0])))
-        common = all(len(each.t) == len(longest.t) and (each.t == longest.t).all() for each in motions)
-        if common and all(isinstance(each.plan, FixedSteps) for each in motions):
+        longest = max(motions, key=lambda motion: abs(float(motion.t[-1] - motion.t[0])))
+        common = all(len(motion.t) == len(longest.t) and (motion.t == longest.t).all() for motion in motions)
+        if common and all(isinstance(motion.plan, FixedSteps) for motion in motions):
             return tuple(motions)
         count = max(1, round(self.seconds * FRAMES_PER_SECOND) - 1) * STATES_PER_FRAME + 1
         times = np.linspace(longest.t[0], longest.t[-1], count)
-        return tuple(at_times(each, times) for each in motions)
+        return tuple(at_times(motion, times) for motion in motions)
 
     @cached_property
     def shapes(self) -> tuple[MovingShape, ...]:
         """Points and marks that represent the states of each trajectory."""
-        return tuple(drawn_shape(each, self.positions, self.picture) for each in self.shown)
+        return tuple(drawn_shape(motion, self.positions, self.picture) for motion in self.shown)
 
     @cached_property
     def frames(self) -> Any:
@@ -302,7 +302,7 @@ class _Scene:
         self, figure: Any, motions: Sequence[Trajectory], shapes: Sequence[MovingShape], report: Callable[[], None]
     ) -> None:
         self.motion, self.report, shape = motions[0], report, shapes[0]
-        parts = [positions_of(each, motion) for each, motion in zip(shapes, motions, strict=True)]
+        parts = [positions_of(member, motion) for member, motion in zip(shapes, motions, strict=True)]
         self.points = np.concatenate(parts, axis=1)
         dimension = self.points.shape[2]
         self.axes: Axes = figure.add_subplot(projection="3d" if dimension == 3 else None)

@@ -40,10 +40,11 @@ def array_values(motion: Trajectory, name: str | None) -> tuple[str, NDArray[np.
     """
     mesh = mesh_of(motion)
     arrays = mesh.fields_of(np.asarray(motion.q), np.asarray(motion.p)) if mesh else motion.stepper.arrays(motion.q)
-    chosen = max(arrays, key=lambda each: arrays[each].ndim > 1) if name is None else name
-    if chosen not in arrays:
-        raise StateError(f"there is no array '{chosen}'{closest(chosen, arrays)} Known: {', '.join(arrays)}")
-    return chosen, arrays[chosen]
+    if name is None:
+        name = max(arrays, key=lambda array: arrays[array].ndim > 1)
+    if name not in arrays:
+        raise StateError(f"there is no array '{name}'{closest(name, arrays)} Known: {', '.join(arrays)}")
+    return name, arrays[name]
 
 
 @checks_arguments(trajectory=ARRAYS, ax=CANVAS)
@@ -86,36 +87,36 @@ def plot_arrays(
     points = [np.arange(size) for size in values.shape[1:]]
     if mesh:
         labels, points = [axis.name for axis in mesh.axes], [axis.points for axis in mesh.axes]
-    with panel(path, ax) as drawn:
-        drawn.grid(visible=False)
+    with panel(path, ax) as panel_axes:
+        panel_axes.grid(visible=False)
         if values.ndim == 3 and values.shape[2] in IN_SPACE and not mesh:
-            _draw_positions(drawn, values, name)
+            _draw_positions(panel_axes, values, name)
         elif values.ndim == 3:
-            _draw_picture(drawn, points, values[state].T, name)
-            drawn.set(xlabel=labels[0], ylabel=labels[1], title=f"t = {trajectory.t[state]:g}")
+            _draw_picture(panel_axes, points, values[state].T, name)
+            panel_axes.set(xlabel=labels[0], ylabel=labels[1], title=f"t = {trajectory.t[state]:g}")
         elif values.ndim == 1:
-            drawn.plot(trajectory.t, values)
-            drawn.set(xlabel="t", ylabel=plain(name))
+            panel_axes.plot(trajectory.t, values)
+            panel_axes.set(xlabel="t", ylabel=plain(name))
         else:
-            _draw_picture(drawn, [points[0], trajectory.t], values, name)
-            drawn.set(xlabel=labels[0], ylabel="t")
-    return drawn
+            _draw_picture(panel_axes, [points[0], trajectory.t], values, name)
+            panel_axes.set(xlabel=labels[0], ylabel="t")
+    return panel_axes
 
 
-def _draw_picture(drawn: Axes, points: Any, values: NDArray[np.float64], name: str) -> None:
+def _draw_picture(axes: Axes, points: Any, values: NDArray[np.float64], name: str) -> None:
     """Draw an image with a colour scale that is symmetric about 0."""
     largest = float(np.abs(values).max()) or 1.0
     limits: dict[str, Any] = {"cmap": "RdBu_r", "vmin": -largest, "vmax": largest}
-    image = drawn.pcolormesh(*points, values, shading="nearest", rasterized=True, **limits)
-    drawn.figure.colorbar(image, ax=drawn, label=plain(name))
+    image = axes.pcolormesh(*points, values, shading="nearest", rasterized=True, **limits)
+    axes.figure.colorbar(image, ax=axes, label=plain(name))
 
 
-def _draw_positions(drawn: Axes, values: NDArray[np.float64], name: str) -> None:
+def _draw_positions(axes: Axes, values: NDArray[np.float64], name: str) -> None:
     for number, (state, label) in enumerate(((values[0], "start"), (values[-1], "end"))):
-        drawn.plot(state[:, 0], state[:, 1], ".", color=color(number), markersize=3, label=label)
-    drawn.set_aspect("equal", adjustable="datalim")
-    drawn.set(xlabel=plain(f"{name}[.., 0]"), ylabel=plain(f"{name}[.., 1]"))
-    drawn.legend()
+        axes.plot(state[:, 0], state[:, 1], ".", color=color(number), markersize=3, label=label)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set(xlabel=plain(f"{name}[.., 0]"), ylabel=plain(f"{name}[.., 1]"))
+    axes.legend()
 
 
 @checks_arguments(trajectory=ARRAYS, ax=CANVAS)
@@ -134,14 +135,14 @@ def plot_spectrum(
     if (mesh := mesh_of(trajectory)) is None:
         raise StateError("the system is not discretised from a density: a spectrum needs a mesh")
     name, values = array_values(trajectory, field)
-    with panel(path, ax) as drawn:
+    with panel(path, ax) as panel_axes:
         for k, axis in enumerate(mesh.axes):
             modes = axis.modes(np.moveaxis(values[[0, -1]], k + 1, -1)).max(axis=-2)
             for row, line in ((0, ":"), (-1, "-")):
                 spectrum = modes[row].reshape(-1, modes.shape[-1]).max(axis=0)
                 spectrum = np.fmax(spectrum, spectrum[spectrum > 0.0].min(initial=spectrum.max() or 1.0) / 2)
                 label = f"{axis.name}, t = {trajectory.t[row]:g}"
-                drawn.semilogy(np.arange(1, len(spectrum) + 1), spectrum, line, color=color(k), label=label)
-        drawn.set(xlabel="number of the mode", ylabel=plain(f"squared amplitude of {name}"))
-        drawn.legend()
-    return drawn
+                panel_axes.semilogy(np.arange(1, len(spectrum) + 1), spectrum, line, color=color(k), label=label)
+        panel_axes.set(xlabel="number of the mode", ylabel=plain(f"squared amplitude of {name}"))
+        panel_axes.legend()
+    return panel_axes

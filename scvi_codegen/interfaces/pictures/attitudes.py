@@ -57,23 +57,23 @@ def plot_attitude(
         raise StateError(f"'{system}' has no rotation, direction or spin to draw")
     curves = [curve for motion in motions for curve in unit_vectors(smooth(motion), axis).items()]
     names = len(curves) // len(motions)
-    with panel(path, ax, (4.8, 4.8), "3d") as drawn:
+    with panel(path, ax, (4.8, 4.8), "3d") as panel_axes:
         for latitude in np.deg2rad(np.arange(-60, 90, 30)):
             radius, height = np.cos(latitude), np.full(len(CIRCLE), np.sin(latitude))
-            drawn.plot(radius * np.cos(CIRCLE), radius * np.sin(CIRCLE), height, color="0.85", linewidth=0.5)
+            panel_axes.plot(radius * np.cos(CIRCLE), radius * np.sin(CIRCLE), height, color="0.85", linewidth=0.5)
         for longitude in np.deg2rad(np.arange(0, 180, 30)):
             across = np.cos(CIRCLE)
-            drawn.plot(
+            panel_axes.plot(
                 across * np.cos(longitude), across * np.sin(longitude), np.sin(CIRCLE), color="0.85", linewidth=0.5
             )
         for number, (label, curve) in enumerate(curves):
             shown = plain(label) if number < names else None
-            drawn.plot(*curve.T, color=color(number), linewidth=0.9, label=shown)
-            drawn.plot(*curve[-1:].T, "o", color=color(number), markersize=4)
-        drawn.set(xlabel="x", ylabel="y", zlabel="z", title=plain(system))
-        drawn.set_aspect("equal")
-        drawn.legend(loc="upper right", fontsize=8)
-    return drawn
+            panel_axes.plot(*curve.T, color=color(number), linewidth=0.9, label=shown)
+            panel_axes.plot(*curve[-1:].T, "o", color=color(number), markersize=4)
+        panel_axes.set(xlabel="x", ylabel="y", zlabel="z", title=plain(system))
+        panel_axes.set_aspect("equal")
+        panel_axes.legend(loc="upper right", fontsize=8)
+    return panel_axes
 
 
 def draw_unit_vectors(axes: Axes, motion: Trajectory, plane: tuple[int, int], which: int | None = None) -> None:

@@ -51,8 +51,8 @@ def check_plot_path(path: str | os.PathLike[str], suffixes: tuple[str, ...] = PI
         PlotError: without matplotlib.
     """
     if Path(path).suffix.lower() not in suffixes:
-        known = f"{', '.join(suffixes[:-1])} or {suffixes[-1]}"
-        raise StateError(f"a picture is saved as {known}, not as {str(path)!r}")
+        formats = f"{', '.join(suffixes[:-1])} or {suffixes[-1]}"
+        raise StateError(f"a picture is saved as {formats}, not as {str(path)!r}")
     _check_matplotlib()
 
 
@@ -62,10 +62,10 @@ def _check_matplotlib() -> None:
     try:
         importlib.import_module("matplotlib")
     except ValueError as error:  # of a backend that does not exist
-        chosen = os.environ.get("MPLBACKEND", "")
+        backend = os.environ.get("MPLBACKEND", "")
         raise PlotError(
-            f"matplotlib cannot be imported ({error}): unset the environment variable MPLBACKEND={chosen!r}, or set it "
-            "to 'agg'"
+            f"matplotlib cannot be imported ({error}): unset the environment variable MPLBACKEND={backend!r}, or set "
+            "it to 'agg'"
         ) from error
 
 
@@ -100,10 +100,10 @@ def panel(
     if path is not None:
         check_plot_path(path)
     with style():
-        drawn = new_figure(path, size).add_subplot(projection=projection) if ax is None else ax
-        yield drawn
+        axes = new_figure(path, size).add_subplot(projection=projection) if ax is None else ax
+        yield axes
         if path is not None:
-            save(drawn.get_figure(root=True), path)
+            save(axes.get_figure(root=True), path)
 
 
 def save(figure: Any, path: str | os.PathLike[str]) -> None:
@@ -152,7 +152,7 @@ def several(motions: Motions) -> list[Trajectory]:
     members = motions if isinstance(motions, Sequence) else [motions]
     if not members:
         raise StateError("there is no trajectory to draw")
-    return [each[:] if isinstance(each, RecordedRun) else each for each in members]
+    return [motion[:] if isinstance(motion, RecordedRun) else motion for motion in members]
 
 
 SMOOTH = 2000
@@ -180,7 +180,7 @@ def at_times(motion: Trajectory, times: Array) -> Trajectory:
     except (StateError, StepFailedError):  # a recording, or states within steps
         ahead = np.sign(motion.t[-1] - motion.t[0])
         rows = np.searchsorted(ahead * motion.t, ahead * inside, side="right") - 1
-        q, p = (motion.stepper.named(np.asarray(each)[rows]) for each in (motion.q, motion.p))
+        q, p = (motion.stepper.named(np.asarray(states)[rows]) for states in (motion.q, motion.p))
     unknown: dict[str, Any] = {
         "iterations": np.zeros(len(q), np.int32),
         "step_sizes": np.full(len(q), np.nan),

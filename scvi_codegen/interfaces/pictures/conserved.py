@@ -36,15 +36,15 @@ class ResidualPlot:
 
     def __call__(self, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None) -> Axes:
         """Draw on the axes ``ax`` or on new ones; write a .png, .svg or .pdf if a path is passed."""
-        with panel(path, ax) as drawn:
+        with panel(path, ax) as axes:
             curves = zip(self.names, self.residuals.T, self.deviations, strict=True)
             for number, (name, column, deviation) in enumerate(curves):
-                drawn.plot(self.t, column, ".", markersize=4, color=color(number), label=plain(name))
-                drawn.axhspan(-2.0 * deviation, 2.0 * deviation, color=color(number), alpha=0.1, linewidth=0)
-            drawn.axhline(0.0, color="black", linewidth=0.6)
-            drawn.set(xlabel="t", title="measured minus computed; bands of two standard deviations")
-            drawn.legend(loc="best", fontsize=8)
-        return drawn
+                axes.plot(self.t, column, ".", markersize=4, color=color(number), label=plain(name))
+                axes.axhspan(-2.0 * deviation, 2.0 * deviation, color=color(number), alpha=0.1, linewidth=0)
+            axes.axhline(0.0, color="black", linewidth=0.6)
+            axes.set(xlabel="t", title="measured minus computed; bands of two standard deviations")
+            axes.legend(loc="best", fontsize=8)
+        return axes
 
 
 BINS = 600
@@ -66,12 +66,12 @@ def plot_energy(trajectories: Motions, path: str | os.PathLike[str] | None = Non
     Raises:
         StateError, PlotError: as :func:`~scvi_codegen.interfaces.pictures.overview.plot_motion`.
     """
-    with panel(path, ax) as drawn:
-        draw_energy_error(drawn, several(trajectories)[0])
+    with panel(path, ax) as axes:
+        draw_energy_error(axes, several(trajectories)[0])
         for number, motion in enumerate(several(trajectories)[1:], 1):
             account = energy_account(motion, limited=True)
-            _draw_error(drawn, motion.t, np.abs(account.values) / account.scale, number)
-    return drawn
+            _draw_error(axes, motion.t, np.abs(account.values) / account.scale, number)
+    return axes
 
 
 @checks_arguments(trajectory=MOTIONS, ax=CANVAS)
@@ -92,14 +92,14 @@ def plot_momentum_maps(
     interface = motions[0].stepper.interface
     if not interface.map_names:
         raise StateError(f"'{interface.system}' has no known symmetry, and therefore no momentum maps")
-    with panel(path, ax) as drawn:
+    with panel(path, ax) as axes:
         for which, motion in enumerate(motions):
             errors = np.abs(motion.momentum_errors())
             for number, name in enumerate(interface.map_names):
-                _draw_error(drawn, motion.t, errors[:, number], number, None if which else name)
-        drawn.set(xlabel="t", title="relative change of momentum maps")
-        drawn.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3, fontsize=8)
-    return drawn
+                _draw_error(axes, motion.t, errors[:, number], number, None if which else name)
+        axes.set(xlabel="t", title="relative change of momentum maps")
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3, fontsize=8)
+    return axes
 
 
 def draw_energy_error(axes: Axes, motion: Trajectory) -> None:
@@ -114,8 +114,8 @@ def _draw_error(axes: Axes, t: Array, error: Array, number: int, label: str | No
     times, largest = largest_in_bins(t, error)
     axes.plot(times, largest, color=color(number), linewidth=0.9, label=label)
     axes.set_yscale("log")
-    drawn = np.concatenate([np.asarray(line.get_ydata(), dtype=float) for line in axes.get_lines()])
-    positive = drawn[np.isfinite(drawn) & (drawn > 0.0)]
+    errors = np.concatenate([np.asarray(line.get_ydata(), dtype=float) for line in axes.get_lines()])
+    positive = errors[np.isfinite(errors) & (errors > 0.0)]
     positive = positive if positive.size else np.array([LOWEST])
     low = 10.0 ** np.floor(np.log10(positive.min()) - 0.3)
     axes.set_ylim(low, max(10.0 ** np.ceil(np.log10(positive.max()) + 0.3), 10.0 * low))

@@ -100,8 +100,8 @@ def plot_trajectory(trajectory: Motions, path: str | os.PathLike[str] | None = N
         named = len(bodies(interface.coordinates))
         if 1 < named <= len(COLORS) and len(motions) == 1:
             figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=named)
-        for each in axes:
-            each.locator_params(axis="x", nbins=5)
+        for panel_axes in axes:
+            panel_axes.locator_params(axis="x", nbins=5)
         figure.suptitle(plain(interface.title), fontsize=11)
         if path is not None:
             save(figure, path)
@@ -141,12 +141,12 @@ def plot_section(
     size = 2.0 if sum(len(x) for x, _ in points) > FEW_POINTS else 4.0
     stepper = result[0].stepper
     cut = stepper.events[event]
-    with panel(path, ax, (5.6, 5.2)) as drawn:
+    with panel(path, ax, (5.6, 5.2)) as panel_axes:
         for number, (x, y) in enumerate(points):
-            drawn.plot(x, y, ".", color=color(number), markersize=size, markeredgewidth=0.0)
-        drawn.set(xlabel=axes[0], ylabel=axes[1])
-        drawn.set_title(plain(f"{stepper.interface.system}: {cut.function} = 0{DIRECTION_TEXT[cut.direction]}"))
-    return drawn
+            panel_axes.plot(x, y, ".", color=color(number), markersize=size, markeredgewidth=0.0)
+        panel_axes.set(xlabel=axes[0], ylabel=axes[1])
+        panel_axes.set_title(plain(f"{stepper.interface.system}: {cut.function} = 0{DIRECTION_TEXT[cut.direction]}"))
+    return panel_axes
 
 
 def _axes_of_section(motion: Trajectory, event: int) -> tuple[str, str]:
@@ -240,9 +240,9 @@ def plot_motion(trajectory: Motions, path: str | os.PathLike[str] | None = None,
         PlotError: without matplotlib.
     """
     motions = several(trajectory)
-    with panel(path, ax, projection=_projection(motions[0])) as drawn:
-        draw_paths([drawn], motions)
-    return drawn
+    with panel(path, ax, projection=_projection(motions[0])) as panel_axes:
+        draw_paths([panel_axes], motions)
+    return panel_axes
 
 
 @checks_arguments(trajectories=MOTIONS, ax=CANVAS, axes=NAMES)
@@ -267,11 +267,11 @@ def plot_phase(
     interface = result[0].stepper.interface
     names = axes or (interface.coordinates[0], interface.momenta[0])
     curves = [[column(interface, smooth(motion), name) for name in names] for motion in result]
-    with panel(path, ax) as drawn:
+    with panel(path, ax) as panel_axes:
         for number, (x, y) in enumerate(curves):
-            _draw_curve(drawn, x, y, color(number))
-        drawn.set(xlabel=names[0], ylabel=names[1], title=plain(f"{interface.system}: phase plane"))
-    return drawn
+            _draw_curve(panel_axes, x, y, color(number))
+        panel_axes.set(xlabel=names[0], ylabel=names[1], title=plain(f"{interface.system}: phase plane"))
+    return panel_axes
 
 
 def _projection(motion: Trajectory) -> str | None:
@@ -308,22 +308,22 @@ def _draw_path(panels: Sequence[Axes], motion: Trajectory, which: int | None) ->
     if links_of(motion):
         draw_robot(panels[0], motion, first)
     elif motion.stepper.interface.rotations:
-        for drawn, plane in zip(panels, combinations(range(3), 2), strict=False):
-            draw_unit_vectors(drawn, motion, plane, which)
+        for axes, plane in zip(panels, combinations(range(3), 2), strict=False):
+            draw_unit_vectors(axes, motion, plane, which)
     elif m == 1:
         interface = motion.stepper.interface
         _draw_curve(panels[0], motion.q[:, 0], motion.p[:, 0], color(first))
         panels[0].set(xlabel=interface.coordinates[0], ylabel=interface.momenta[0], title="phase plane")
     elif result:
-        for drawn, plane in zip(panels, combinations(range(3), 2), strict=False):
+        for axes, plane in zip(panels, combinations(range(3), 2), strict=False):
             for number, body in enumerate(result):
                 x, y = (motion.q[:, body.columns[index]] for index in plane)
-                _draw_curve(drawn, x, y, color(number if which is None else which), body.name or None)
-            drawn.set(xlabel=AXES[plane[0]], ylabel=AXES[plane[1]], title="orbits" if len(result) > 1 else "orbit")
-            drawn.set_aspect("equal", adjustable="datalim")
+                _draw_curve(axes, x, y, color(number if which is None else which), body.name or None)
+            axes.set(xlabel=AXES[plane[0]], ylabel=AXES[plane[1]], title="orbits" if len(result) > 1 else "orbit")
+            axes.set_aspect("equal", adjustable="datalim")
     elif m <= MAX_CURVES:
-        for drawn, plane in zip(panels, combinations(range(m), 2), strict=False):
-            _draw_plane(drawn, motion, plane, first)
+        for axes, plane in zip(panels, combinations(range(m), 2), strict=False):
+            _draw_plane(axes, motion, plane, first)
     else:
         _draw_image(panels[0], motion)
 

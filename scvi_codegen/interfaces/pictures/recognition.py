@@ -32,68 +32,68 @@ DOTS = 100
 """Number of nodes up to which those of a chain are drawn as dots."""
 
 
-def shape_of(drawn: DrawnSystem) -> MovingShape:
+def shape_of(system: DrawnSystem) -> MovingShape:
     """Return the shape of a system: links, bodies by names, pendulums and curvilinear coordinates by energy, a chain.
 
     Without any of these, one coordinate is drawn in the phase plane, two in their plane.
     """
-    names = drawn.coordinates
+    names = system.coordinates
     m = len(names)
-    if drawn.links:
-        return _robot(drawn)
-    if drawn.mesh is not None and len(drawn.mesh.axes) < 3:
-        return graph_of(drawn.nodes, drawn.mesh.field_system.fields)
-    if drawn.rotations:
-        return _solids(drawn)
-    if found := bodies(names) or bodies([*names, *drawn.momenta]):
-        return _bodies(drawn, found)
-    if (sign := hanging(drawn)) is not None:
-        return _pendulum(drawn, sign)
-    if drawn.shapes and (shape := _of_arrays(drawn)):
+    if system.links:
+        return _robot(system)
+    if system.mesh is not None and len(system.mesh.axes) < 3:
+        return graph_of(system.nodes, system.mesh.field_system.fields)
+    if system.rotations:
+        return _solids(system)
+    if body_columns := bodies(names) or bodies([*names, *system.momenta]):
+        return _bodies(system, body_columns)
+    if (sign := hanging(system)) is not None:
+        return _pendulum(system, sign)
+    if system.shapes and (shape := _of_arrays(system)):
         return shape
-    if m in EMBEDDINGS and (shape := _curvilinear(drawn)):
+    if m in EMBEDDINGS and (shape := _curvilinear(system)):
         return shape
     if m <= 2:
-        labels = (*names, *drawn.momenta)[:2]
+        labels = (*names, *system.momenta)[:2]
         marks = [{"kind": "body", "points": [0]}]
         return MovingShape(points=[[1, 2]], marks=marks, trails=[0], movable=[0], labels=labels, equal=m == 2)
     return graph_of({"number of the coordinate": range(1, m + 1)}, ["q"], dots=True)
 
 
-def _of_arrays(drawn: DrawnSystem) -> MovingShape | None:
+def _of_arrays(system: DrawnSystem) -> MovingShape | None:
     """Return the shape of the first array: particles r[N, 2] or r[N, 3], a chain q[N], a lattice u[N, M]."""
-    (name, shape), *_ = drawn.shapes.items()
+    (name, shape), *_ = system.shapes.items()
     if len(shape) == 2 and shape[1] in (2, 3):
-        return _particles(drawn, shape)
+        return _particles(system, shape)
     if len(shape) not in (1, 2):
         return None
     axes = {letter: range(size) for letter, size in zip("ij", shape, strict=False)}
     return graph_of(axes, [name], dots=math.prod(shape) <= DOTS)
 
 
-def _particles(drawn: DrawnSystem, shape: tuple[int, ...]) -> MovingShape:
+def _particles(system: DrawnSystem, shape: tuple[int, ...]) -> MovingShape:
     """Return a point for each row of an array of positions, in their periodic box, and lines of a table ``bonds``."""
     count, dimension = shape
     points = (1 + np.arange(count * dimension).reshape(shape)).tolist()
     marks: list[dict[str, Any]] = [{"kind": "particles", "points": list(range(count))}]
-    bonds = np.asarray(drawn.tables.get("bonds", ()))
+    bonds = np.asarray(system.tables.get("bonds", ()))
     if bonds.ndim == 2 and bonds.shape[1] == 2 and bonds.size and bonds.max() < count:
         marks.insert(0, {"kind": "bonds", "points": bonds.ravel().tolist()})
-    program, known = PointProgram(drawn.names), {name: symbol(name) for name in drawn.parameters}
-    periods = [parse_expression(text, known) for _, kind, text in drawn.lengths if kind == "box"]
+    program, parameters = PointProgram(system.names), {name: symbol(name) for name in system.parameters}
+    periods = [parse_expression(text, parameters) for _, kind, text in system.lengths if kind == "box"]
     box = program.point(periods[:dimension])
     return MovingShape(dimension=dimension, points=points, program=program.entries, marks=marks, box=box)
 
 
-def _bodies(drawn: DrawnSystem, found: Sequence[Any]) -> MovingShape:
+def _bodies(system: DrawnSystem, members: Sequence[Any]) -> MovingShape:
     """Return a point for each body, and rods of constraints on distances."""
     marks = [
-        {"kind": "body", "points": [k], "mass": drawn.parameter(("m",), body.name), "name": body.name}
-        for k, body in enumerate(found)
+        {"kind": "body", "points": [k], "mass": system.parameter(("m",), body.name), "name": body.name}
+        for k, body in enumerate(members)
     ]
-    program, numbers = PointProgram(drawn.names), list(range(len(found)))
-    points = [[1 + column for column in body.columns] for body in found]
-    rods = _rods(drawn, found, points, program)
+    program, numbers = PointProgram(system.names), list(range(len(members)))
+    points = [[1 + column for column in body.columns] for body in members]
+    rods = _rods(system, members, points, program)
     return MovingShape(
         dimension=len(points[0]), points=points, program=program.entries, marks=rods + marks, trails=numbers,
         movable=numbers,
@@ -101,23 +101,23 @@ def _bodies(drawn: DrawnSystem, found: Sequence[Any]) -> MovingShape:
 
 
 def _rods(
-    drawn: DrawnSystem, found: Sequence[Any], points: list[list[int]], program: PointProgram
+    system: DrawnSystem, members: Sequence[Any], points: list[list[int]], program: PointProgram
 ) -> list[dict[str, Any]]:
     """Return rods of constraints on the distance of two bodies, or of one from a fixed point, which is added."""
     rods: list[dict[str, Any]] = []
-    known = {name: symbol(name) for name in drawn.names}
-    names = [[drawn.names[1 + column] for column in body.columns] for body in found]
-    for text in drawn.constraints:
+    symbols = {name: symbol(name) for name in system.names}
+    names = [[system.names[1 + column] for column in body.columns] for body in members]
+    for text in system.constraints:
         try:
-            constraint = parse_expression(text, known)
+            constraint = parse_expression(text, symbols)
         except ExpressionError:
             continue
-        used = {each.name for each in constraint.free_symbols}
-        ends = [k for k, each in enumerate(names) if used & {*each}]
+        used = {variable.name for variable in constraint.free_symbols}
+        ends = [k for k, coordinates in enumerate(names) if used & {*coordinates}]
         if len(ends) == 2:
             rods.append({"kind": "rod", "points": ends})
         elif len(ends) == 1:
-            place = [known[name] for name in names[ends[0]]]
+            place = [symbols[name] for name in names[ends[0]]]
             centre: Any = sympy.solve([constraint.diff(x) for x in place], place)
             values: list[Any] = [centre.get(x) if isinstance(centre, dict) else None for x in place]
             if all(value is not None and (value.is_Symbol or value.is_number) for value in values):
@@ -127,21 +127,21 @@ def _rods(
     return rods
 
 
-def _pendulum(drawn: DrawnSystem, sign: float) -> MovingShape:
+def _pendulum(system: DrawnSystem, sign: float) -> MovingShape:
     """Return a chain of rods, each hanging from (sign 1) or standing on (-1) the end of the previous one."""
-    names, program = drawn.coordinates, PointProgram(drawn.names)
+    names, program = system.coordinates, PointProgram(system.names)
     numbers = numbers_of(names) or ("",) * len(names)
     ends: list[Any] = [(sympy.S.Zero, sympy.S.Zero)]
     marks: list[dict[str, Any]] = [{"kind": "pivot", "points": [0]}]
     for k, (name, number) in enumerate(zip(names, numbers, strict=True), 1):
-        length, q = _formula(drawn.parameter(LENGTHS, number)), symbol(name)
+        length, q = _formula(system.parameter(LENGTHS, number)), symbol(name)
         x, y = ends[-1]
         ends.append((intermediate(x + length * sympy.sin(q)), intermediate(y - sign * length * sympy.cos(q))))
-        marks.append({"kind": "bob", "points": [k], "mass": drawn.parameter(("m",), number)})
+        marks.append({"kind": "bob", "points": [k], "mass": system.parameter(("m",), number)})
     numbered = list(range(1, len(ends)))
     rod = {"kind": "rod", "points": [0, *numbered]}
     return MovingShape(
-        points=[program.point(each) for each in ends], program=program.entries, marks=[rod, *marks],
+        points=[program.point(end) for end in ends], program=program.entries, marks=[rod, *marks],
         trails=numbered[-1:], movable=numbered, angles=range(len(names)),
     )  # fmt: skip
 
@@ -151,21 +151,21 @@ def _formula(value: str | float) -> Expr:
     return symbol(value) if isinstance(value, str) else sympy.Float(value)
 
 
-def hanging(drawn: DrawnSystem) -> float | None:
+def hanging(system: DrawnSystem) -> float | None:
     """Return 1 if the coordinates are angles of pendulums that hang at 0, -1 if upright there, else ``None``."""
     # V = sum a_i (1 - cos q_i), all a_i of one sign; T of two neighbouring momenta is not the sum of that of each.
-    names = drawn.coordinates
+    names = system.coordinates
     m = len(names)
-    if drawn.energy is None or m > MAX_RODS or (m > 1 and numbers_of(names) is None):
+    if system.energy is None or m > MAX_RODS or (m > 1 and numbers_of(names) is None):
         return None
     generic = GENERIC[0] + GENERIC[1] * np.arange(m)
     try:
-        at_rest = drawn.potential(np.zeros(m), *math.pi * np.eye(m), generic)
+        at_rest = system.potential(np.zeros(m), *math.pi * np.eye(m), generic)
         a = (at_rest[1:-1] - at_rest[0]) / 2
         expected = at_rest[0] + a @ (1.0 - np.cos(generic))
         alone, both = np.eye(m), np.eye(m)[:-1] + np.eye(m)[1:]
-        kinetic = drawn.energy(np.zeros_like(alone), alone) - at_rest[0]
-        coupled = drawn.energy(np.zeros_like(both), both) - at_rest[0] - kinetic[:-1] - kinetic[1:]
+        kinetic = system.energy(np.zeros_like(alone), alone) - at_rest[0]
+        coupled = system.energy(np.zeros_like(both), both) - at_rest[0] - kinetic[:-1] - kinetic[1:]
     except StateError:
         return None
     close = math.isclose(at_rest[-1], expected, rel_tol=0.0, abs_tol=1e-9 * float(np.abs(a).max()))
@@ -189,37 +189,37 @@ EMBEDDINGS: Mapping[int, Mapping[str, Callable[..., tuple[Any, ...]]]] = {
 """Diagonals of the metrics of polar coordinates of the plane, and spherical and cylindrical ones, by their number."""
 
 
-def _curvilinear(drawn: DrawnSystem) -> MovingShape | None:
+def _curvilinear(system: DrawnSystem) -> MovingShape | None:
     """Return a body at its position if the kinetic energy is that of a particle in curvilinear coordinates."""
-    if drawn.energy is None:
+    if system.energy is None:
         return None
-    m = len(drawn.coordinates)
+    m = len(system.coordinates)
     states = np.array([[0.7, 0.9, 0.4], [1.1, 0.5, 1.3], [0.6, 1.2, 2.0]])[:, :m]
     pairs = [a + b for a, b in combinations(np.eye(m), 2)]
     try:
-        rest = drawn.potential(*states)
-        alone = np.array([drawn.energy(states, np.tile(e, (3, 1))) - rest for e in np.eye(m)])
-        both = np.array([drawn.energy(states, np.tile(e, (3, 1))) - rest for e in pairs])
+        rest = system.potential(*states)
+        alone = np.array([system.energy(states, np.tile(e, (3, 1))) - rest for e in np.eye(m)])
+        both = np.array([system.energy(states, np.tile(e, (3, 1))) - rest for e in pairs])
     except StateError:
         return None
     sums = np.array([alone[i] + alone[j] for i, j in combinations(range(m), 2)])
     for kind, metric in EMBEDDINGS[m].items():
         scaled = alone * [np.broadcast_to(g, 3) for g in metric(*states.T)]
         if scaled[0, 0] > 0 and np.allclose(scaled, scaled[0, 0], rtol=1e-9) and np.allclose(both, sums, rtol=1e-9):
-            return _orbit(drawn, kind)
+            return _orbit(system, kind)
     return None
 
 
-def _orbit(drawn: DrawnSystem, kind: str) -> MovingShape:
+def _orbit(system: DrawnSystem, kind: str) -> MovingShape:
     """Return a body in curvilinear coordinates; in a uniform field of gravity, down is down."""
-    names = drawn.coordinates
+    names = system.coordinates
     a, b, *more = map(symbol, names)
     sin, cos = sympy.sin, sympy.cos
     link: list[dict[str, Any]] = [{"kind": "pivot", "points": [0]}]
     angles = [1]
     if kind == "sphere":
-        length = _formula(drawn.parameter(LENGTHS, ""))
-        up = 1 if _difference(drawn, [0.0, 0.0], [math.pi, 0.0]) > 0 else -1
+        length = _formula(system.parameter(LENGTHS, ""))
+        up = 1 if _difference(system, [0.0, 0.0], [math.pi, 0.0]) > 0 else -1
         place = [length * sin(a) * cos(b), length * sin(a) * sin(b), up * length * cos(a)]
         link.insert(0, {"kind": "rod", "points": [0, 1]})
     elif kind == "space":
@@ -228,7 +228,7 @@ def _orbit(drawn: DrawnSystem, kind: str) -> MovingShape:
         place = [a * cos(b), a * sin(b), more[0]]
     else:
         across, along = (
-            [_difference(drawn, [r, turn], [r, turn - math.pi]) for r in (1.0, 2.0)] for turn in (math.pi, math.pi / 2)
+            [_difference(system, [r, turn], [r, turn - math.pi]) for r in (1.0, 2.0)] for turn in (math.pi, math.pi / 2)
         )
         uniform = np.allclose([across[1], along[1]], [2 * across[0], 2 * along[0]], rtol=1e-9, atol=1e-12)
         if uniform and abs(across[0]) > 1e-9:  # the angle is measured from the vertical
@@ -236,33 +236,33 @@ def _orbit(drawn: DrawnSystem, kind: str) -> MovingShape:
             link.insert(0, {"kind": "spring", "points": [0, 1]})
         else:
             place = [a * cos(b), (-1 if uniform and along[0] < 0 else 1) * a * sin(b)]
-    program = PointProgram(drawn.names)
+    program = PointProgram(system.names)
     points = [program.point([0] * len(place)), program.point(place)]
-    marks = [*link, {"kind": "body", "points": [1], "mass": drawn.parameter(("m",), "")}]
+    marks = [*link, {"kind": "body", "points": [1], "mass": system.parameter(("m",), "")}]
     return MovingShape(
         dimension=len(place), points=points, program=program.entries, marks=marks, trails=[1], movable=[1],
         angles=angles,
     )  # fmt: skip
 
 
-def _difference(drawn: DrawnSystem, upper: Sequence[float], lower: Sequence[float]) -> float:
+def _difference(system: DrawnSystem, upper: Sequence[float], lower: Sequence[float]) -> float:
     """Return the potential energy at one state minus that at another; 0 if it is undefined."""
     try:
-        one, other = drawn.potential(upper, lower)
+        upper_energy, lower_energy = system.potential(upper, lower)
     except StateError:
         return 0.0
-    return float(one - other)
+    return float(upper_energy - lower_energy)
 
 
-def _solids(drawn: DrawnSystem) -> MovingShape:
+def _solids(system: DrawnSystem) -> MovingShape:
     """Return a box for each rotation (a top if it is symmetric), an arrow for each direction and spin.
 
     They are at (x, y, z), else several rotations, and members of arrays, are side by side.
     """
-    program = PointProgram(drawn.names)
-    members = RotationNames.members_of(drawn.rotations)
-    moving = all(name in drawn.coordinates for name in "xyz")
-    apart = SPACING if not moving and (drawn.shapes or isinstance(members[-1], Rotation)) else 0
+    program = PointProgram(system.names)
+    members = RotationNames.members_of(system.rotations)
+    moving = all(name in system.coordinates for name in "xyz")
+    apart = SPACING if not moving and (system.shapes or isinstance(members[-1], Rotation)) else 0
     points: list[list[int]] = []
     marks: list[dict[str, Any]] = []
     solids, trails = [], []
@@ -271,15 +271,15 @@ def _solids(drawn: DrawnSystem) -> MovingShape:
         points.append(program.point(centre))
         values, place, first = member.values(), len(points) - 1, len(points)
         if isinstance(member, Rotation):
-            matrix = Matrix(3, 3, [values[each] for each in member.entries])
+            matrix = Matrix(3, 3, [values[entry] for entry in member.entries])
             points += [program.point(centre + matrix[:, axis]) for axis in range(3)]
-            symmetric = f"body momentum 3 of {member.name}" in drawn.map_names
+            symmetric = f"body momentum 3 of {member.name}" in system.map_names
             kind = "top" if symmetric else "box"
             marks.append({"kind": kind, "points": [place, first, first + 1, first + 2], "color": number})
             marks.append({"kind": "body", "points": [first + 2], "mass": 0.1, "color": number + 1})
         else:
-            vector = Matrix([values[each] for each in member.entries])
-            length = intermediate(sympy.sqrt(sympy.Add(*(each**2 for each in vector))))
+            vector = Matrix([values[entry] for entry in member.entries])
+            length = intermediate(sympy.sqrt(sympy.Add(*(component**2 for component in vector))))
             points.append(program.point(centre + vector / length))
             marks.append({"kind": "arrow", "points": [place, first], "color": number})
         trails.append(len(points) - 1)
@@ -287,14 +287,14 @@ def _solids(drawn: DrawnSystem) -> MovingShape:
     return MovingShape(dimension=3, points=points, program=program.entries, marks=marks, trails=trails, solids=solids)
 
 
-def _robot(drawn: DrawnSystem) -> MovingShape:
+def _robot(system: DrawnSystem) -> MovingShape:
     """Return the links of a robot, from the origin of each frame to those of its children.
 
     A link without children ends at twice the distance of its center of mass. The rotation of link i into the world is
     A_i = A_p C_i R(q_i), its origin is o_p + A_p r_i.
     """
-    links, joints = drawn.links, {link.name: link for link in drawn.links}
-    members = {each.name: each for each in RotationNames.members_of(drawn.rotations)}
+    links, joints = system.links, {link.name: link for link in system.links}
+    members = {member.name: member for member in RotationNames.members_of(system.rotations)}
     origins: list[Matrix] = []
     turns: list[Matrix] = []
     for link in links:
@@ -304,7 +304,7 @@ def _robot(drawn: DrawnSystem) -> MovingShape:
             turn = turns[link.parent] * turn
         origins.append(origin.applyfunc(intermediate))
         turns.append(turn.applyfunc(intermediate))
-    program = PointProgram(drawn.names)
+    program = PointProgram(system.names)
     points = [program.point(origin) for origin in origins]
     based = [i for i, link in enumerate(links) if link.parent < 0 and link.kind != "free" and any(origins[i])]
     marks, tips = [], []
@@ -312,12 +312,12 @@ def _robot(drawn: DrawnSystem) -> MovingShape:
         points.append(program.point([0, 0, 0]))
         marks = [{"kind": "link", "points": [len(links), i], "color": -1} for i in based]
     for i, (link, origin, turn) in enumerate(zip(links, origins, turns, strict=True)):
-        children = [k for k, each in enumerate(links) if each.parent == i]
+        children = [k for k, child in enumerate(links) if child.parent == i]
         if not children:
             tips.append(len(points))
             points.append(program.point(origin + 2 * turn * Matrix(link.center)))
         marks += [{"kind": "link", "points": [i, end], "color": i} for end in children or tips[-1:]]
-    base = 0 if links[0].kind == "free" and all(each.parent >= 0 for each in links[1:]) else None
+    base = 0 if links[0].kind == "free" and all(link.parent >= 0 for link in links[1:]) else None
     return MovingShape(
         dimension=3, points=points, program=program.entries, marks=marks, trails=tips, movable=tips, followed=base
     )
@@ -329,12 +329,10 @@ def _placed(link: Any, joints: Mapping[str, Any], members: Mapping[str, Any]) ->
     if link.kind in ("free", "ball"):
         member = members[f"R_{link.name}"]
         values = member.values()
-        turn = Matrix(3, 3, [values[each] for each in member.entries])
-        return (
-            (Matrix([symbol(f"{axis}_{link.name}") for axis in "xyz"]), turn)
-            if link.kind == "free"
-            else (position, constant * turn)
-        )
+        turn = Matrix(3, 3, [values[entry] for entry in member.entries])
+        if link.kind == "free":
+            return Matrix([symbol(f"{axis}_{link.name}") for axis in "xyz"]), turn
+        return position, constant * turn
     moved = _displacement(link, joints) - link.zero
     if link.kind == "slide":
         return position + moved * constant[:, 2], constant

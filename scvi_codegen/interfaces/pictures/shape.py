@@ -83,18 +83,18 @@ class MovingShape:
 
     def to_data(self) -> dict[str, Any]:
         """Return the attributes that differ from their defaults, for JSON."""
-        given = {
+        attributes = {
             name: list(value) if isinstance(value, range | tuple) else value for name, value in asdict(self).items()
         }
-        return {name: value for name, value in given.items() if isinstance(value, list | int) or value}
+        return {name: value for name, value in attributes.items() if isinstance(value, list | int) or value}
 
     def positions(self, t: Any, q: Values, p: Values, parameters: Any) -> Values:
         """Return the points (n, k, d) of states with t (n,), q and p (n, m), and parameters."""
         if self.mesh is not None:
-            nodes, drawn = np.meshgrid(*self.mesh["axes"].values(), indexing="ij"), self.mesh["fields"][0]
-            begin, end = drawn["columns"]
-            grids = [np.broadcast_to(np.ravel(each), (len(q), end - begin)) for each in nodes]
-            values = np.concatenate([q, p], axis=1)[:, begin:end] / drawn.get("weights", 1.0)
+            nodes, field = np.meshgrid(*self.mesh["axes"].values(), indexing="ij"), self.mesh["fields"][0]
+            begin, end = field["columns"]
+            grids = [np.broadcast_to(np.ravel(coordinates), (len(q), end - begin)) for coordinates in nodes]
+            values = np.concatenate([q, p], axis=1)[:, begin:end] / field.get("weights", 1.0)
             return np.stack([*grids, values], axis=2)
         registers = [t, *np.transpose(q), *np.transpose(p), *parameters]
         for entry in self.program:
@@ -119,10 +119,10 @@ class PointProgram:
 
     def point(self, components: Sequence[Any]) -> list[int]:
         """Return the registers of a point, whose components are expressions or numbers."""
-        formulas = [sympy.sympify(each) for each in components]
-        for each in intermediates(*formulas):
-            self._place(each)
-        return [self._place(each) for each in formulas]
+        formulas = [sympy.sympify(component) for component in components]
+        for intermediate in intermediates(*formulas):
+            self._place(intermediate)
+        return [self._place(formula) for formula in formulas]
 
     def _place(self, formula: Any) -> int:
         if formula not in self.places:
@@ -194,7 +194,7 @@ def entry_names(shapes: Mapping[str, tuple[int, ...]]) -> list[str]:
 
 def graph_of(axes: Mapping[str, Any], fields: Sequence[str], *, dots: bool = False) -> MovingShape:
     """Return the graphs of fields over the nodes of their axes."""
-    nodes = {name: [float(x) for x in each] for name, each in axes.items()}
+    nodes = {name: [float(x) for x in points] for name, points in axes.items()}
     size = math.prod(map(len, nodes.values()))
     columns = [{"name": name, "columns": [k * size, (k + 1) * size]} for k, name in enumerate(fields)]
     labels = (*nodes, fields[0])
@@ -203,7 +203,7 @@ def graph_of(axes: Mapping[str, Any], fields: Sequence[str], *, dots: bool = Fal
     )
 
 
-def shape_of_picture(drawn: DrawnSystem, picture: Mapping[str, Any], where: str = "picture") -> MovingShape:
+def shape_of_picture(system: DrawnSystem, picture: Mapping[str, Any], where: str = "picture") -> MovingShape:
     """Return the shape that a user describes by formulas.
 
     Args:
@@ -219,11 +219,11 @@ def shape_of_picture(drawn: DrawnSystem, picture: Mapping[str, Any], where: str 
         ModelFileError: for unknown keys and points, and formulas that are wrong.
     """
     if isinstance(picture, Mapping) and "fields" in picture:
-        if drawn.mesh is None or len(picture) > 1:
+        if system.mesh is None or len(picture) > 1:
             raise ModelFileError(
                 f"{where}: fields chooses what is drawn of a field on a mesh, without other keys: omit it"
             )
-        return _chosen_fields(drawn, _listed(picture, "fields", where), f"{where} fields")
+        return _chosen_fields(system, _listed(picture, "fields", where), f"{where} fields")
     if not isinstance(picture, Mapping) or not isinstance(picture.get("points"), Mapping) or not picture["points"]:
         raise ModelFileError(
             f'{where} must have points, {{ bob = ["l*sin(q)", "-l*cos(q)"] }}, not {picture!r:.60}: give points'
@@ -231,13 +231,13 @@ def shape_of_picture(drawn: DrawnSystem, picture: Mapping[str, Any], where: str 
     for key in picture:
         if key not in ("points", *MARKS):
             raise ModelFileError(f"{where}: unknown key {key!r}{closest(key, MARKS)} Known: points, {', '.join(MARKS)}")
-    reader, program, points = _reader(drawn), PointProgram(drawn.names), _single_points(picture["points"], where)
+    reader, program, points = _reader(system), PointProgram(system.names), _single_points(picture["points"], where)
     names = [*points]
-    formulas = [_components(reader, each, f"{where} points {name}") for name, each in points.items()]
+    formulas = [_components(reader, components, f"{where} points {name}") for name, components in points.items()]
     if len({*map(len, formulas)}) > 1:
         raise ModelFileError(f"{where} points must all have two components, in the plane, or all three, in space")
-    state = {symbol(each) for each in drawn.names[: len(drawn.names) - len(drawn.parameters)]}
-    moving = [name for name, each in zip(names, formulas, strict=True) if any(x.free_symbols & state for x in each)]
+    state = {symbol(name) for name in system.names[: len(system.names) - len(system.parameters)]}
+    moving = [name for name, point in zip(names, formulas, strict=True) if any(x.free_symbols & state for x in point)]
     marks: list[dict[str, Any]] = []
     for key in MARKS[:3]:
         more = "" if key == "springs" else ", or more"
@@ -250,10 +250,10 @@ def shape_of_picture(drawn: DrawnSystem, picture: Mapping[str, Any], where: str 
     shown = _numbers(_listed(picture, "bodies", where, free), names, f"{where} bodies")
     pivots = {mark["points"][0] for mark in marks if mark["kind"] != "wall" and names[mark["points"][0]] not in moving}
     marks += [{"kind": "pivot", "points": [k]} for k in sorted(pivots - {*shown})]
-    marks += [{"kind": "body", "points": [k], "mass": drawn.parameter(("m",), names[k])} for k in shown]
+    marks += [{"kind": "body", "points": [k], "mass": system.parameter(("m",), names[k])} for k in shown]
     trails = _numbers(_listed(picture, "trails", where, [names[k] for k in shown]), names, f"{where} trails")
     return MovingShape(
-        dimension=len(formulas[0]), points=[program.point(each) for each in formulas], program=program.entries,
+        dimension=len(formulas[0]), points=[program.point(point) for point in formulas], program=program.entries,
         marks=marks, trails=trails, movable=[k for k in shown if names[k] in moving],
     )  # fmt: skip
 
@@ -276,31 +276,31 @@ def _single_points(points: Mapping[str, Any], where: str) -> dict[str, Any]:
     return result
 
 
-def _chosen_fields(drawn: DrawnSystem, names: Sequence[Any], where: str) -> MovingShape:
+def _chosen_fields(system: DrawnSystem, names: Sequence[Any], where: str) -> MovingShape:
     """Return the graphs of fields and momenta by name; momenta of nodes are divided by the weights of the nodes."""
-    fields = drawn.mesh.field_system.fields
-    known = [*fields, *drawn.mesh.field_system.momenta]
-    numbers = _numbers(names, known, where)
-    if not numbers or len(drawn.nodes) > 2:
-        raise ModelFileError(f"{where} must name fields on one or two axes, {known}, not {names!r}")
-    graph = graph_of(drawn.nodes, known)
-    weights, mesh = np.ravel(drawn.mesh.weights).tolist(), dict(graph.mesh or {})
+    fields = system.mesh.field_system.fields
+    choices = [*fields, *system.mesh.field_system.momenta]
+    numbers = _numbers(names, choices, where)
+    if not numbers or len(system.nodes) > 2:
+        raise ModelFileError(f"{where} must name fields on one or two axes, {choices}, not {names!r}")
+    graph = graph_of(system.nodes, choices)
+    weights, mesh = np.ravel(system.mesh.weights).tolist(), dict(graph.mesh or {})
     mesh["fields"] = [mesh["fields"][k] | ({"weights": weights} if k >= len(fields) else {}) for k in numbers]
-    return replace(graph, labels=(*drawn.nodes, known[numbers[0]]), mesh=mesh)
+    return replace(graph, labels=(*system.nodes, choices[numbers[0]]), mesh=mesh)
 
 
-def _reader(drawn: DrawnSystem) -> Callable[[str], Expr]:
+def _reader(system: DrawnSystem) -> Callable[[str], Expr]:
     """Return a function that parses formulas in the names of a state."""
-    names = RotationNames.of_states(drawn.rotations, drawn.names)
-    moving = {symbol(f"{each}{DOT}") for each in names.coordinates}
-    turning = {each.name: each for each, value in names.values.items() if not value.free_symbols & moving}
-    known = turning | {name: symbol(name) for name in drawn.names}
-    arrays = [Array(name, tuple(Size("", n) for n in shape)) for name, shape in drawn.shapes.items()]
+    names = RotationNames.of_states(system.rotations, system.names)
+    velocities = {symbol(f"{name}{DOT}") for name in names.coordinates}
+    turning = {entry.name: entry for entry, value in names.values.items() if not value.free_symbols & velocities}
+    symbols = turning | {name: symbol(name) for name in system.names}
+    arrays = [Array(name, tuple(Size("", n) for n in shape)) for name, shape in system.shapes.items()]
 
     def read(text: str) -> Expr:
-        if drawn.shapes and is_indexed(text):
-            return formula_of_entries(text, arrays, known)
-        return names.in_coordinates(names.read(text, known))
+        if system.shapes and is_indexed(text):
+            return formula_of_entries(text, arrays, symbols)
+        return names.in_coordinates(names.read(text, symbols))
 
     return read
 
@@ -310,11 +310,11 @@ def _components(read: Callable[[str], Expr], formulas: Any, where: str) -> list[
     if not isinstance(formulas, list | tuple) or len(formulas) not in (2, 3):
         raise ModelFileError(f'{where} must be two or three formulas or numbers, ["x", "y"], not {formulas!r}')
     result = []
-    for each in formulas:
-        if isinstance(each, bool) or not isinstance(each, str | int | float):
-            raise ModelFileError(f"{where}: {each!r} must be a formula or a number")
+    for component in formulas:
+        if isinstance(component, bool) or not isinstance(component, str | int | float):
+            raise ModelFileError(f"{where}: {component!r} must be a formula or a number")
         try:
-            result.append(read(str(each)))
+            result.append(read(str(component)))
         except (ExpressionError, SystemDefinitionError) as error:
             raise ModelFileError(f"{where}: {error}") from error
     return result
@@ -328,16 +328,18 @@ def _listed(picture: Mapping[str, Any], key: str, where: str, default: Sequence[
     return value
 
 
-def _numbers(names: Any, known: Sequence[str], where: str) -> list[int]:
+def _numbers(names: Any, choices: Sequence[str], where: str) -> list[int]:
     """Return the numbers of points by name."""
     if not isinstance(names, list | tuple):
-        raise ModelFileError(f"{where} must be lists of points, [[{', '.join(map(repr, known[:2]))}]], not {names!r}")
+        raise ModelFileError(f"{where} must be lists of points, [[{', '.join(map(repr, choices[:2]))}]], not {names!r}")
     numbers: dict[Any, list[int]] = {}
-    for k, name in enumerate(known):
+    for k, name in enumerate(choices):
         numbers.setdefault(name, []).append(k)
         if name.endswith("]"):
             numbers.setdefault(name.partition("[")[0], []).append(k)
     for name in names:
         if not isinstance(name, str) or name not in numbers:
-            raise ModelFileError(f"{where}: there is no {name!r}{closest(str(name), known)} Known: {', '.join(known)}")
+            raise ModelFileError(
+                f"{where}: there is no {name!r}{closest(str(name), choices)} Known: {', '.join(choices)}"
+            )
     return [k for name in names for k in numbers[name]]
