@@ -137,7 +137,7 @@ def with_tangent_vectors(system: LagrangianSystem, count: int) -> LagrangianSyst
     if not forms.separable or system.constraints or system.clock:
         return None
     word = "change"
-    while any(f"_{word}" in each.name for each in (*system.coordinates, *system.parameters)):
+    while any(f"_{word}" in variable.name for variable in (*system.coordinates, *system.parameters)):
         word += "s"
     lagrangian, forces = [system.lagrangian], [*(system.forces or [sympy.S.Zero] * system.dimension)]
     coordinates = [*system.coordinates]

@@ -86,21 +86,21 @@ class FirstOrderSystem(HamiltonianSystem):
         Raises:
             SystemDefinitionError: if a variable is missing or unknown.
         """
-        names = [each.name for each in self.variables]
+        names = [variable.name for variable in self.variables]
         by_key = dict(values) if isinstance(values, Mapping) else dict(enumerate(values))
         if set(by_key) != set(names) and list(by_key) != list(range(len(names))):
             raise SystemDefinitionError(
                 f"the state of '{self.name}' must have the values of {', '.join(names)}, by name or in this order, not "
                 f"{by_key}"
             )
-        known = by_key if isinstance(values, Mapping) else dict(zip(names, by_key.values(), strict=True))
-        q, y = ([known[each.name] for each in half] for half in (self.coordinates, self.momenta))
+        by_name = by_key if isinstance(values, Mapping) else dict(zip(names, by_key.values(), strict=True))
+        q, y = ([by_name[variable.name] for variable in half] for half in (self.coordinates, self.momenta))
         return tuple(q), tuple(y)
 
     def joined(self, q: Sequence[float], y: Sequence[float]) -> dict[str, float]:
         """Return the values of all variables by name, in the order of the user."""
         values = dict(zip((*self.coordinates, *self.momenta), (*q, *y), strict=True))
-        return {each.name: values[each] for each in self.variables}
+        return {variable.name: values[variable] for variable in self.variables}
 
     @property
     def is_first_order(self) -> bool:
@@ -236,7 +236,7 @@ def first_order_system(fields: Mapping[str, Any]) -> FirstOrderSystem | None:
                 f"m*{velocities[0]}**2/2"
             )
     form = OneForm(name, lagrangian, coordinates, velocities, fields["time"])
-    common = {each: fields[each] for each in ("name", "time", "parameters", "defaults", "inputs") if each in fields}
+    common = {key: fields[key] for key in ("name", "time", "parameters", "defaults", "inputs") if key in fields}
     inputs = fields.get("inputs", ())
     shown = format_expression(inputs_by_name(written_out(lagrangian), inputs))
     text = {"coordinates": [q.name for q in coordinates], "lagrangian": shown, **({"inputs": inputs} if inputs else {})}
@@ -301,7 +301,7 @@ def first_order_form(form: OneForm) -> dict[str, Any]:
             break
     if not candidates:
         raise SystemDefinitionError(_refusal(form, refused))
-    _, auxiliary, integral, theta = min(candidates, key=lambda each: each[:2])
+    _, auxiliary, integral, theta = min(candidates, key=lambda candidate: candidate[:2])
     integral = integral.xreplace(expressions)
     rest = [i for i in range(n) if i not in auxiliary]
     theta = tuple(
@@ -360,7 +360,9 @@ def _refusal(form: OneForm, refused: Sequence[Sequence[int]]) -> str:
         (z[i], z[j]): form.omega(i, j) for i, j in combinations(range(len(z)), 2) if (i, j) not in form.vanishing
     }
     shown = [
-        f"omega{pair} = {format_expression(each)}" for pair, each in entries.items() if each.count_ops() < MOST_SHOWN
+        f"omega{pair} = {format_expression(component)}"
+        for pair, component in entries.items()
+        if component.count_ops() < MOST_SHOWN
     ]
     sheared = shear(form)
     remedy = "Use other coordinates, such as flux coordinates of a magnetic field, or canonical ones"
@@ -384,7 +386,7 @@ def translations(system: FirstOrderSystem) -> list[tuple[int, ...]]:
     """Return sets of coordinates whose common translation leaves L unchanged: single ones, and ``x1, x2, ..``."""
     force = [system.lagrangian.diff(q) for q in system.coordinates]
     form = OneForm(system.name, system.lagrangian, (*system.coordinates, *system.momenta), (), system.time)
-    cyclic = [i for i, each in enumerate(force) if each == 0]
+    cyclic = [i for i, derivative in enumerate(force) if derivative == 0]
     groups: dict[str, list[int]] = {}
     for i, q in enumerate(system.coordinates):
         if i not in cyclic:

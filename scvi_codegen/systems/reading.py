@@ -42,11 +42,11 @@ def system_from_text(cls: Any, arguments: Mapping[str, Any]) -> tuple[Any, bool]
 
     Systems of arrays of run-time sizes are returned as they are, others with their entries as coordinates.
     """
-    ordinary, parameters, inputs = (arguments[each] for each in ("coordinates", "parameters", "inputs"))
+    ordinary, parameters, inputs = (arguments[key] for key in ("coordinates", "parameters", "inputs"))
     of_momenta = "momenta" in arguments
-    turning = [arguments.get(each) for each in TURNING]
+    turning = [arguments.get(key) for key in TURNING]
     declared = (parameters, arguments["tables"], *turning)
-    if are_arrays(ordinary, *(each or () for each in declared)) or arguments.get("neighbours"):
+    if are_arrays(ordinary, *(declarations or () for declarations in declared)) or arguments.get("neighbours"):
         if arguments.get("point_forces"):
             raise SystemDefinitionError("point_forces of arrays are not supported: give torques and forces by index")
         return _of_arrays(cls, arrays_from_text(arguments)), True
@@ -57,7 +57,7 @@ def system_from_text(cls: Any, arguments: Mapping[str, Any]) -> tuple[Any, bool]
     values = with_inputs(parameters or {}, inputs)
     check_names(ordinary, (*values, *inputs), momenta, (*names.coordinates, *names.symbols))
     velocities = () if of_momenta else tuple(coordinate + DOT for coordinate in coordinates)
-    symbols = {each: symbol(each) for each in (*coordinates, *velocities, *momenta, TIME, *values, *inputs)}
+    symbols = {key: symbol(key) for key in (*coordinates, *velocities, *momenta, TIME, *values, *inputs)}
     symbols |= names.symbols
     driven = input_formulas(inputs, symbols[TIME])
 
@@ -107,7 +107,7 @@ def _system(
     """
     read, members, time = reader("forces"), names.members, symbol(TIME)
     at_points = forces_at_points(formulas.get("point_forces") or (), coordinates, members, read)
-    applied, torques, torques_space = (formulas.get(each) for each in ("forces", *TORQUES))
+    applied, torques, torques_space = (formulas.get(key) for key in ("forces", *TORQUES))
     forces = names.forces_by_name(
         coordinates, read, applied, torques, torques_space, formulas.get("dissipation"), at_points
     )
@@ -126,7 +126,7 @@ def _system(
         damping=damping_rate(formulas.get("damping"), reader("damping")),
         time=time,
         parameters=parameters,
-        defaults=tuple(number(each, value) for each, value in values.items()),
+        defaults=tuple(number(parameter, value) for parameter, value in values.items()),
         **others,
     )
     return system, warn_of_mistakes(system)
@@ -157,19 +157,17 @@ def system_from_sympy(
     Other arguments are those of ``cls.from_sympy``; ``turning`` are those of ``TURNING`` and ``TORQUES``.
     """
     turning["rotations"], of_frames = rotations_of_frames(turning.get("rotations"))
-    names = RotationNames.declared(*(turning.get(each) for each in TURNING), momentum=momenta is not None)
-    if function == "Lagrangian" and are_arrays(each for each in coordinates if isinstance(each, str)):
-        others = (velocities, forces, dissipation, damping, constraints, inputs, *turning.values())
-        if any(others):
-            raise SystemDefinitionError(
-                "from_sympy reads Lagrangian, parameters, tables and neighbours of a system with arrays: give the rest "
-                "as text to from_text"
-            )
+    names = RotationNames.declared(*(turning.get(key) for key in TURNING), momentum=momenta is not None)
+    if function == "Lagrangian" and are_arrays(q for q in coordinates if isinstance(q, str)):
+        _check_no_others(velocities, forces, dissipation, damping, constraints, inputs, *turning.values())
         declared = {"coordinates": list(coordinates), "parameters": parameters, "tables": tables}
         return _of_arrays(cls, arrays_from_sympy(formula, name=name, neighbours=neighbours, **declared))
 
     def expression_of(value: Any, role: str) -> Expr:
         return sympy_expression(value, role).xreplace(of_frames)
+
+    def reader(role: str) -> Read:
+        return lambda value: translation.apply(expression_of(value, role), role).xreplace(driven)
 
     formula = expression_of(formula, function)
     rate = damping_rate(damping, lambda value: sympy_expression(value, "damping"))
@@ -188,10 +186,6 @@ def system_from_sympy(
         inputs=input_names,
     )
     driven = input_formulas(input_names, symbol(TIME))
-
-    def reader(role: str) -> Read:
-        return lambda value: translation.apply(expression_of(value, role), role).xreplace(driven)
-
     ordinary = [q.name for q in translation.coordinates]
     if names.members:
         check_names(ordinary, tuple(constants), (), (*names.coordinates, *names.symbols))
@@ -206,9 +200,18 @@ def system_from_sympy(
         name=name,
         coordinates=ordinary,
         momenta=(*(p.name for p in translation.momenta), *default_momenta(names.coordinates)),
-        values=dict(zip((each.name for each in translation.parameters), constants.values(), strict=True)),
+        values=dict(zip(map(str, translation.parameters), constants.values(), strict=True)),
         inputs=input_names,
     )[0]
+
+
+def _check_no_others(*others: Any) -> None:
+    """Raise an error if one of these arguments is given beside arrays."""
+    if any(others):
+        raise SystemDefinitionError(
+            "from_sympy reads Lagrangian, parameters, tables and neighbours of a system with arrays: give the rest "
+            "as text to from_text"
+        )
 
 
 def _forces_of(

@@ -72,9 +72,9 @@ def roll_sums(system: MechanicalSystem) -> RolledSums:
     mark, inputs = _mark({*map(str, system.constants), *system.inputs}), input_formulas(system.inputs, system.time)
     q, q_dot, p = (Array(f"{name}", (Size(f"N{mark}"),)) for name in (f"q{mark}", f"q{mark}{DOT}", f"p{mark}"))
     pairs = ((q, system.coordinates), (q_dot, system.velocities), (p, system.auxiliaries))
-    indices = {each: (array.name, k) for array, symbols in pairs for k, each in enumerate(symbols)}
+    indices = {variable: (array.name, k) for array, symbols in pairs for k, variable in enumerate(symbols)}
     named = {formula: name for name, formula in inputs.items()}
-    function, *forces = (each.xreplace(named) for each in (system.formula, *system.forces))
+    function, *forces = (formula.xreplace(named) for formula in (system.formula, *system.forces))
     applied = [(term, (k,)) for k, force in enumerate(forces) if force != 0 for term in Add.make_args(force)]
     defaults = _defaults(system, (function, *forces))
     kinds = similar_terms(Add.make_args(function), indices, defaults)
@@ -86,10 +86,11 @@ def roll_sums(system: MechanicalSystem) -> RolledSums:
         )
     arrays = {"": q, **{array.name: array for array, _ in pairs}}
     parts = [_Rolled.of(kind, f"{mark}{k}", f"b{mark}", arrays) for k, kind in enumerate((*kinds, *force_kinds))]
-    terms = [each.term(inputs) for each in parts]
-    used = {name for each in parts for name in each.group.formula.free_symbols}
-    numbers = with_inputs({each.name: value for each, value in defaults.items() if each in used}, system.inputs)
-    fields = {array: values for each in parts for array, values in each.fields(defaults)}
+    used = {name for part in parts for name in part.group.formula.free_symbols}
+    numbers = with_inputs(
+        {parameter.name: value for parameter, value in defaults.items() if parameter in used}, system.inputs
+    )
+    fields = {array: values for part in parts for array, values in part.fields(defaults)}
     kind = ArrayHamiltonian if system.auxiliaries else ArrayLagrangian
     rolled = kind(
         name=system.name,
@@ -100,18 +101,13 @@ def roll_sums(system: MechanicalSystem) -> RolledSums:
         defaults=tuple(numbers.values()),
         fields=tuple(fields),
         field_defaults=(1.0,) * len(fields),
-        tables=tuple(each.table for each in parts),
-        terms=tuple(terms[: len(kinds)]),
-        forces=tuple(
-            ArrayForce(
-                loops=term.loops, slots=term.slots, targets=((each.accesses[each.group.slots[0]], term.formula),)
-            )
-            for each, term in zip(parts[len(kinds) :], terms[len(kinds) :], strict=True)
-        ),
+        tables=tuple(part.table for part in parts),
+        terms=tuple(part.term(inputs) for part in parts[: len(kinds)]),
+        forces=tuple(part.force(inputs) for part in parts[len(kinds) :]),
         inputs=system.inputs,
     )
     rolled.check_run_time_sizes()
-    tables = {each.table.name: each.places for each in parts}
+    tables = {part.table.name: part.places for part in parts}
     return RolledSums(rolled, tables, {array.name: values for array, values in fields.items()})
 
 
@@ -174,6 +170,12 @@ class _Rolled:
         """Return the sum over the rows, with the formulas of inputs."""
         return term_of((self.loop,), self.group.formula.xreplace(inputs), self.accesses)
 
+    def force(self, inputs: Mapping[Symbol, Expr]) -> ArrayForce:
+        """Return the forces on the coordinates of the first column."""
+        term = self.term(inputs)
+        target = self.accesses[self.group.slots[0]]
+        return ArrayForce(loops=term.loops, slots=term.slots, targets=((target, term.formula),))
+
     @property
     def places(self) -> NDArray[np.int32]:
         """Values of the index table."""
@@ -184,7 +186,7 @@ class _Rolled:
     def fields(self, defaults: Mapping[Symbol, float]) -> Iterator[tuple[Array, NDArray[np.float64]]]:
         """Yield the arrays of constants with their values."""
         for slot, column in zip(self.group.constants, self.group.values, strict=True):
-            yield self.accesses[slot].array, np.array([float(defaults.get(each, each)) for each in column])
+            yield self.accesses[slot].array, np.array([float(defaults.get(constant, constant)) for constant in column])
 
 
 def unrolled_at(system: MechanicalSystem, q: Mapping[str, Any] | Any, parameters: Any = None) -> tuple[Any, Any]:
@@ -197,8 +199,13 @@ def unrolled_at(system: MechanicalSystem, q: Mapping[str, Any] | Any, parameters
     if parameters is not None and not isinstance(parameters, Mapping):
         raise SystemDefinitionError("parameters of arrays of run-time sizes must be given by name")
     state = q if isinstance(q, Mapping) else {system.coordinates[0].name: q}
-    known, others = {each.name: each for each in system.arrays}, dict(parameters or {})
-    declared = [(known[name], each[name]) for each in (state, others) for name in each if name in known]
+    arrays_by_name, others = {array.name: array for array in system.arrays}, dict(parameters or {})
+    declared = [
+        (arrays_by_name[name], values_by_name[name])
+        for values_by_name in (state, others)
+        for name in values_by_name
+        if name in arrays_by_name
+    ]
     sizes = {
         axis.name: length
         for array, values in declared

@@ -97,8 +97,8 @@ class Deferred:
             if name not in names or self._text is None:
                 raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}", name=name, obj=self)
             system, _ = self._read(json.loads(self._text)[1])
-            for each in names:
-                object.__setattr__(self, each, getattr(system, each))
+            for field_name in names:
+                object.__setattr__(self, field_name, getattr(system, field_name))
             return getattr(self, name)
 
 
@@ -119,7 +119,7 @@ def _text_of(cls: type, arguments: Mapping[str, Any]) -> str | None:
 
 def are_arrays(*declarations: Any) -> bool:
     """Return whether one of the coordinates, parameters or tables is an array."""
-    return any("[" in str(each) for group in declarations for each in group)
+    return any("[" in str(declaration) for group in declarations for declaration in group)
 
 
 MAX_OPERATIONS = 200
@@ -382,12 +382,13 @@ class MechanicalSystem(Deferred, ABC):
         size = count_ops(shown) if short else written_size(shown)
         formula = mathml_terms(written_out(shown), Symbol(letter)) if size <= MAX_OPERATIONS else ()
         written = " ".join(formula) or plain(f"{letter}: {size} operations")
+        rotations = [rotation.declaration for rotation in self.rotations]
         parameters = [f"{parameter.name} = {value:g}" for parameter, value in self.constants.items()]
         return card(
             self.name,
             (
                 ("coordinates", listed([q.name for q in self.coordinates])),
-                *([("rotations", listed([each.declaration for each in self.rotations]))] if self.rotations else []),
+                *([("rotations", listed(rotations))] if rotations else []),
                 *([("momenta", listed([p.name for p in self.auxiliaries]))] if self.auxiliaries else []),
                 ("parameters", listed(parameters)),
                 *self._force_facts(),

@@ -105,14 +105,14 @@ class SimilarTerms:
             constant: symbol of a constant, by its number.
             sign: factor of the formula.
         """
-        first, columns = self.leaves[0], list(zip(*(each.constants for each in self.leaves), strict=True))
+        first, columns = self.leaves[0], list(zip(*(leaf.constants for leaf in self.leaves), strict=True))
         varying = [k for k, column in enumerate(columns) if len(set(column)) > 1]
         symbols = [constant(k) if k in varying else column[0] for k, column in enumerate(columns)]
         return TermGroup(
             formula=sign * first.substituted(self.terms[0], slot, symbols),
             slots=tuple(slot("", k) for k in range(len(first.places))),
             constants=tuple(symbols[k] for k in varying),
-            places=tuple(tuple(each.places) for each in self.leaves),
+            places=tuple(tuple(leaf.places) for leaf in self.leaves),
             values=tuple(columns[k] for k in varying),
         )
 
@@ -132,11 +132,11 @@ def roll_terms(system: MechanicalSystem) -> SplitSystem | None:
         return None
     slot, constant = (_stem(name, system.parameters) for name in ("slot", "given"))
     groups = [
-        each.group(
+        similar.group(
             lambda _, k: symbol(f"{slot}{k}"), lambda k: symbol(f"{constant}{k}"), -1 if system.auxiliaries else 1
         )
         for kind in large
-        for each in kind.groups
+        for similar in kind.groups
     ]
     function = "hamiltonian" if system.auxiliaries else "lagrangian"
     gathered = {term for kind in large for term in kind.terms}
@@ -149,7 +149,7 @@ def _merged(groups: Sequence[TermGroup]) -> tuple[TermGroup, ...]:
     for group in groups:
         other = merged.setdefault(group.places, group)
         if other is not group:
-            constants = tuple(symbol(f"{each.name}_{len(other.constants)}") for each in group.constants)
+            constants = tuple(symbol(f"{constant.name}_{len(other.constants)}") for constant in group.constants)
             merged[group.places] = replace(
                 other,
                 formula=other.formula + group.formula.xreplace(dict(zip(group.constants, constants, strict=True))),

@@ -77,6 +77,34 @@ def reparametrise(system: MechanicalSystem, time_transformation: str | Expr) -> 
     >>> sympy.simplify(reparametrise(kepler, "r").lagrangian - expected.lagrangian)
     0
     """
+    _check_transformable(system)
+    taken = {symbol.name for symbol in (*system.coordinates, *system.auxiliaries, *system.parameters)}
+    energy_symbol = symbol(next(name for name in ENERGY_NAMES if name not in taken))
+    rate = time_rescaling_function(system, time_transformation)
+    named = replace(
+        system,
+        name=f"{system.name} in transformed time",
+        parameters=(*system.parameters, energy_symbol),
+        defaults=(*system.defaults, 0.0),
+        clock=TimeTransformation(
+            rate=rate,
+            energy=energy_symbol,
+            time_transformation=time_transformation
+            if isinstance(time_transformation, str)
+            else format_expression(rate),
+            plain=system,
+        ),
+    )
+    # g (H - E) in tau has the motions of H with energy E in t; g (L(q, v/g) + E) is its Lagrangian.
+    if isinstance(named, HamiltonianSystem):
+        return replace(named, hamiltonian=_distributed(rate, named.hamiltonian - energy_symbol))
+    assert isinstance(named, LagrangianSystem)
+    slowed = named.lagrangian.xreplace({v: v / rate for v in named.velocities})
+    return replace(named, lagrangian=_distributed(rate, slowed + energy_symbol))
+
+
+def _check_transformable(system: MechanicalSystem) -> None:
+    """Raise an error for a system whose energy is not conserved, or whose steps in tau are not supported."""
     if system.clock is not None:
         raise SystemDefinitionError(
             f"'{system.name}' has a time transformation already, dt = {system.clock.rate} dtau: apply only one"
@@ -97,28 +125,6 @@ def reparametrise(system: MechanicalSystem, time_transformation: str | Expr) -> 
             f"'{system.name}' has nonholonomic constraints, which a symplectic time transformation "
             f"does not support. Use adaptive steps (t_end=...), or {REVERSIBLE}"
         )
-    taken = {symbol.name for symbol in (*system.coordinates, *system.auxiliaries, *system.parameters)}
-    energy_symbol = symbol(next(name for name in ENERGY_NAMES if name not in taken))
-    rate = time_rescaling_function(system, time_transformation)
-    named = replace(
-        system,
-        name=f"{system.name} in transformed time",
-        parameters=(*system.parameters, energy_symbol),
-        defaults=(*system.defaults, 0.0),
-        clock=TimeTransformation(
-            rate=rate,
-            energy=energy_symbol,
-            time_transformation=time_transformation
-            if isinstance(time_transformation, str)
-            else format_expression(rate),
-            plain=system,
-        ),
-    )
-    if isinstance(named, HamiltonianSystem):
-        return replace(named, hamiltonian=_distributed(rate, named.hamiltonian - energy_symbol))
-    assert isinstance(named, LagrangianSystem)
-    slowed = named.lagrangian.xreplace({v: v / rate for v in named.velocities})
-    return replace(named, lagrangian=_distributed(rate, slowed + energy_symbol))
 
 
 def _distributed(factor: Expr, total: Expr) -> Expr:
@@ -176,7 +182,7 @@ def time_rescaling_function(system: MechanicalSystem, g: str | Expr, *, in_time:
 
 def _read(system: MechanicalSystem, text: str, symbols: Mapping[str, Symbol]) -> Expr:
     if is_indexed(text) and system.arrays:
-        momenta = momentum_arrays(system.arrays, (each.name for each in system.auxiliaries))
+        momenta = momentum_arrays(system.arrays, (momentum.name for momentum in system.auxiliaries))
         return formula_of_entries(text, (*system.arrays, *momenta), symbols)
     try:
         return parse_expression(text, symbols)

@@ -49,7 +49,7 @@ def jump_of(
         functions = [whole]
         if first_derivatives:
             functions += jacobian([whole], sorted(whole.free_symbols & variables, key=str)).values()
-        if any(_jumps(each, surface, variables, constants) for each in functions):
+        if any(_jumps(function, surface, variables, constants) for function in functions):
             return surface, near[0]
     return None
 

@@ -59,10 +59,12 @@ def warn_of_unused(
     name: str, function: str, parameters: Iterable[Symbol], inputs: Iterable[str], used: Set[Symbol]
 ) -> bool:
     """Warn of parameters and inputs of the system ``name`` that are not among the symbols ``used``; true if any."""
-    parts = {each: {symbol(f"{each}_{part}") for part in PARTS} for each in inputs}
-    kinds = [f"input '{each}'" for each, symbols in parts.items() if not symbols & used]
+    parts = {input_name: {symbol(f"{input_name}_{part}") for part in PARTS} for input_name in inputs}
+    kinds = [f"input '{input_name}'" for input_name, symbols in parts.items() if not symbols & used]
     occurring = reduce(set.union, parts.values(), set[Symbol]())
-    kinds += [f"parameter '{each}'" for each in parameters if each not in used and each not in occurring]
+    kinds += [
+        f"parameter '{parameter}'" for parameter in parameters if parameter not in used and parameter not in occurring
+    ]
     for kind in kinds:
         where = f"the {function}, the forces and the constraints of '{name}'"
         remedy = "remove it, unless events or a time transformation, which are not known here, contain it"
@@ -81,9 +83,9 @@ def warn_of_negative(name: str, coefficients: Mapping[str, Expr], constants: Map
         if not occurring or len(occurring) < len(formula.free_symbols):
             continue
         tape = Tape([formula], occurring)
-        value = _value(tape, [constants[each] for each in occurring])
+        value = _value(tape, [constants[parameter] for parameter in occurring])
         if value is not None and value < 0 and any(sample >= 0 for sample in _positive_samples(tape, len(occurring))):
-            defaults = ", ".join(f"{each} = {constants[each]:g}" for each in occurring)
+            defaults = ", ".join(f"{parameter} = {constants[parameter]:g}" for parameter in occurring)
             text = str(formula)
             shown = f"{coefficient} = {text}" if len(text) <= 60 else coefficient
             warn(
@@ -119,9 +121,11 @@ def check_definition(system: MechanicalSystem, role: str, arguments: Sequence[Sy
         raise SystemDefinitionError(
             f"the name {system.name!r} contains an unpaired surrogate, which cannot be encoded in UTF-8: remove it"
         )
-    for each in (*system.coordinates, *system.auxiliaries, system.time, *system.parameters):
-        if not isinstance(each, Symbol) or each != symbol(each.name):
-            raise SystemDefinitionError(f"{each!r} is not a real symbol: build systems with from_sympy or from_text")
+    for variable in (*system.coordinates, *system.auxiliaries, system.time, *system.parameters):
+        if not isinstance(variable, Symbol) or variable != symbol(variable.name):
+            raise SystemDefinitionError(
+                f"{variable!r} is not a real symbol: build systems with from_sympy or from_text"
+            )
     if system.time.name != TIME:
         raise SystemDefinitionError(f"time is called '{TIME}', not '{system.time}': build systems with from_sympy")
     coordinates, parameters, momenta = (
@@ -144,7 +148,7 @@ def _check_symbols(system: MechanicalSystem, role: str, arguments: Sequence[Symb
             f"there are {system.dimension} coordinates, but {len(system.forces)} forces: give one force per coordinate"
         )
     check_damping(system.name, system.damping, system.parameters)
-    known = [*system.coordinates, *arguments, system.time, *system.parameters]
+    declared = [*system.coordinates, *arguments, system.time, *system.parameters]
     named = zip(system.coordinates, system.forces, strict=False)
     formulas = {role: system.formula, **{f"force on {q.name}": force for q, force in named}}
     formulas |= {"damping": system.damping}
@@ -155,9 +159,9 @@ def _check_symbols(system: MechanicalSystem, role: str, arguments: Sequence[Symb
             raise SystemDefinitionError(f"in the {where} of '{system.name}': {problem}")
         if problem := kinked_root(formula, [*system.coordinates, *arguments, system.time]):
             raise SystemDefinitionError(f"in the {where} of '{system.name}': {problem}")
-        unknown = sorted(free.name for free in formula.free_symbols.difference(known))
+        unknown = sorted(free.name for free in formula.free_symbols.difference(declared))
         if unknown:
-            hint = closest(unknown[0], [symbol.name for symbol in known])
+            hint = closest(unknown[0], [symbol.name for symbol in declared])
             raise SystemDefinitionError(
                 f"'{unknown[0]}' in the {where} is neither a coordinate, {kinds}, time nor a parameter{hint} "
                 "Give it a default value among the parameters, or list it as a coordinate"
@@ -226,12 +230,12 @@ def _singular_message(
     direction = null_direction(block, velocities)
     motion = f": a motion with ({direction}) has no kinetic energy" if direction else ""
     names_of_velocities = {velocity.name for velocity in velocities}
-    for each in system.rotations:
-        if not zero and names_of_velocities & {name + DOT for name in each.coordinates}:
+    for rotation in system.rotations:
+        if not zero and names_of_velocities & {name + DOT for name in rotation.coordinates}:
             return (
-                f"the inertia of the rotation '{each.name}' of '{system.name}' is singular{values}: turning about some "
-                "axis has no kinetic energy. Give all three moments of inertia positive values, or declare the axis of "
-                "a thin rod as a unit vector instead: directions=['n']"
+                f"the inertia of the rotation '{rotation.name}' of '{system.name}' is singular{values}: turning about "
+                "some axis has no kinetic energy. Give all three moments of inertia positive values, or declare the "
+                "axis of a thin rod as a unit vector instead: directions=['n']"
             )
     remedy = f"{zero} = 0 is the default: give it a positive value" if zero else REDUNDANT
     remedy += _undetermined(free)

@@ -66,7 +66,7 @@ class Elimination:
                         pending.append((key, key.definition))
                     self.users.setdefault(key, {})[user] = None
         self.last: dict[int | Intermediate, int] = {row: row for row in rows}
-        ordered = sorted(self.users, key=lambda each: each.number)
+        ordered = sorted(self.users, key=lambda quantity: quantity.number)
         for node in reversed(ordered):
             self.last[node] = max(self.last[user] for user in self.users[node])
         first: dict[Intermediate, int] = {}
@@ -82,8 +82,8 @@ class Elimination:
             entry = heappop(queue)
             node = entry[-1]
             if node in self.users and entry == self._rank(node):
-                for each in self._eliminate(node):
-                    heappush(queue, self._rank(each))
+                for changed in self._eliminate(node):
+                    heappush(queue, self._rank(changed))
         entries = {(row, key): Add(*terms) for row in self.rows for key, terms in self.parts[row].items()}
         return {place: entry for place, entry in entries.items() if entry is not S.Zero}
 
@@ -102,7 +102,7 @@ class Elimination:
                 self.parts[user].setdefault(key, []).append(Mul(entry, derivative))
                 if isinstance(key, Intermediate):
                     self.users[key][user] = None
-        known = [key for key in inputs if isinstance(key, Intermediate)]
-        for key in known:
+        quantities = [key for key in inputs if isinstance(key, Intermediate)]
+        for key in quantities:
             self.users[key].pop(node, None)
-        return [*known, *(user for user in users if isinstance(user, Intermediate))]
+        return [*quantities, *(user for user in users if isinstance(user, Intermediate))]

@@ -78,7 +78,7 @@ def parse_constraint(
     sides, combination = split(equation)
     if len(sides) > 2 or len(behind) > 1:
         raise ExpressionError("a constraint may contain one '=' and one 'for'", text, 0)
-    loops = tuple(chain(*(_Loops(each, symbols, arrays, tables).read() for each in behind)))
+    loops = tuple(chain(*(_Loops(clause, symbols, arrays, tables).read() for clause in behind)))
     parsers = [ArrayParser(side, symbols, arrays, tables) for side in sides]
     for parser in parsers:
         parser.in_scope = {loop.index: loop for loop in loops}
@@ -92,18 +92,17 @@ def parse_constraint(
     rates = {symbol("t"): S.One, **{slot: symbol(str(access)) for slot, access in pairs.items()}}
 
     def rate(formula: Expr) -> Expr:
-        if others := [
-            accesses[each]
-            for each in formula.free_symbols & set(accesses)
-            if accesses[each].array not in (velocities or {})
-        ]:
+        occurring = [accesses[slot] for slot in formula.free_symbols & set(accesses)]
+        others = [access for access in occurring if access.array not in (velocities or {})]
+        if others:
             raise ExpressionError(
                 f"the time derivative of {others[0]} is not available in constraints of arrays", text, 0
             )
         derivatives = gradient(formula, tuple(rates))
         return Add(*(derivative * [*rates.values()][k] for k, derivative in derivatives.items()))
 
-    return term_of(loops, combination(formulas, rate), accesses | {symbol(str(each)): each for each in pairs.values()})
+    accesses_of_rates = {symbol(str(access)): access for access in pairs.values()}
+    return term_of(loops, combination(formulas, rate), accesses | accesses_of_rates)
 
 
 class _Loops(ArrayParser):
@@ -186,8 +185,8 @@ class _Target(ArrayParser):
     def read(self) -> dict[str, Size]:
         token = self.take_name("an array of coordinates")
         if token.text not in self.arrays:
-            known = ", ".join(map(str, self.arrays.values()))
-            self.refuse(f"a force must act on coordinates, {known}, not on '{token.text}'", token.column)
+            coordinates = ", ".join(map(str, self.arrays.values()))
+            self.refuse(f"a force must act on coordinates, {coordinates}, not on '{token.text}'", token.column)
         array, bounds = self.arrays[token.text], dict[str, Size]()
         for number, axis in enumerate(array.axes):
             if not self.accept("," if number else "["):
@@ -251,9 +250,10 @@ def _sum(loop: Loop) -> str:
 def latex_entry(access: Access) -> str:
     """Return an array entry with subscripts, with the summation signs of its convolutions."""
     name, places, before = access.array.name, [*map(_place_text, access.places)], ""
-    for each in reversed(access.sums):
-        before += rf"\sum_{{{each.index}}} {_letter(each.coefficients.name)}_{{{each.index}-{places[each.axis]}}} "
-        places[each.axis] = each.index
+    for convolution in reversed(access.sums):
+        j, place = convolution.index, places[convolution.axis]
+        before += rf"\sum_{{{j}}} {_letter(convolution.coefficients.name)}_{{{j}-{place}}} "
+        places[convolution.axis] = j
     letter = rf"\dot{{{_letter(name.removesuffix(DOT))}}}" if name.endswith(DOT) else _letter(name)
     entry = f"{letter}_{{{', '.join(places)}}}"
     return rf"\left({before}{entry}\right)" if before else entry
@@ -291,7 +291,7 @@ class _Printer(StrPrinter):  # type: ignore[misc]  # SymPy has no types
 
     def _print_Sum(self, expression: Sum) -> str:
         wrapped = dict(map(_wrapped, expression.function.atoms(Mod)))
-        for index in (each for entry in expression.function.atoms(Indexed) for each in entry.indices):
+        for index in (place for entry in expression.function.atoms(Indexed) for place in entry.indices):
             if index.is_Add and index.free_symbols & set(wrapped):
                 raise SystemDefinitionError(
                     f"{index} leaves a periodic axis: write Mod({index}, ..), as in its other indices"
@@ -313,7 +313,7 @@ class _Printer(StrPrinter):  # type: ignore[misc]  # SymPy has no types
 def _wrapped(expression: Mod) -> tuple[Symbol, Expr]:
     """Return the index in a periodic expression Mod(i + k, N), and the period."""
     index, length = expression.args
-    indices = [each for each in index.free_symbols if each not in length.free_symbols]
+    indices = [variable for variable in index.free_symbols if variable not in length.free_symbols]
     if len(indices) != 1 or not (index - indices[0]).is_Integer:
         raise SystemDefinitionError(f"{expression} is not an index of a periodic axis: write Mod(i + 1, N)")
     return indices[0], length
@@ -445,10 +445,10 @@ class EntryRules:
         """Return the symbol of an array entry, or the sum of a convolution."""
         periods = {loop.index: loop.end.at(self.sizes) for loop in loops if loop.periodic}
         try:
-            indices = tuple(_place(each, at, periods, self.sizes, self.tables) for each in access.places)
+            indices = tuple(_place(place, at, periods, self.sizes, self.tables) for place in access.places)
         except IndexError as error:
             raise SystemDefinitionError(f"{access} at {dict(at)}: {error}") from error
-        if any(not 0 <= each < length for each, length in zip(indices, access.array.shape(self.sizes), strict=True)):
+        if any(not 0 <= index < length for index, length in zip(indices, access.array.shape(self.sizes), strict=True)):
             raise SystemDefinitionError(
                 f"{access} has the index {list(indices)}, which is outside of {access.array}, at {dict(at)}"
             )

@@ -210,9 +210,9 @@ class ArrayParser(_Indices):
         neighbours: Sequence[Neighbours] = (),
     ) -> None:
         super().__init__(text, symbols)
-        self.arrays, self.tables = ({each.name: each for each in group} for group in (arrays, tables))
+        self.arrays, self.tables = ({array.name: array for array in group} for group in (arrays, tables))
         self.sizes = {name for array in (*arrays, *tables) for name in array.names}
-        self.neighbours = {each.name: each for each in neighbours}
+        self.neighbours = {pairs.name: pairs for pairs in neighbours}
         self.in_scope: dict[str, Bound] = {}
         self.nested = 1
         self.convolved: Loop | None = None
@@ -230,11 +230,12 @@ class ArrayParser(_Indices):
         if name in self.tables:
             self.refuse(f"'{name}' is an index table, whose entries are indices: write q[{name}[.., 0]]", column)
         if self.peek().text == "[":
-            known = ", ".join(map(str, self.arrays.values())) or "none"
+            declared_arrays = ", ".join(map(str, self.arrays.values())) or "none"
             declared = f"{name}[{', '.join(self.axes_here())}]"
             self.refuse(
-                f"'{name}' is not an array{closest(name, self.arrays)} Arrays: {known}; declare an array of constants "
-                f"as a parameter: parameters={{'{declared}': 1.0}}, in files [parameters] \"{declared}\" = 1.0",
+                f"'{name}' is not an array{closest(name, self.arrays)} Arrays: {declared_arrays}; declare an array of "
+                f"constants as a parameter: parameters={{'{declared}': 1.0}}, in files [parameters] "
+                f'"{declared}" = 1.0',
                 column,
             )
         if name in self.in_scope or name in self.sizes:
@@ -351,9 +352,9 @@ class ArrayParser(_Indices):
         span = (size, self.size() + 1) if self.accept("..") else (Size("", 0), size)
         for end in span:
             if end.name and end.name not in self.sizes:
-                known = ", ".join(sorted({*self.sizes, *self.neighbours})) or "none"
+                sizes = ", ".join(sorted({*self.sizes, *self.neighbours})) or "none"
                 self.refuse(
-                    f"'{end.name}' is not the size of an array{closest(end.name, self.sizes)} Sizes: {known}", column
+                    f"'{end.name}' is not the size of an array{closest(end.name, self.sizes)} Sizes: {sizes}", column
                 )
         periodic = self.peek().text == "periodic"
         self.position += periodic
@@ -391,13 +392,14 @@ class ArrayParser(_Indices):
         matrix = {f"{j}{k}": self.arrays.get(f"{token.text}_{j}{k}") for j in "123" for k in "123"}
         first = matrix["11"]
         if first is None:
-            known = ", ".join(each.removesuffix("_11") for each in self.arrays if each.endswith("_11")) or "none"
-            self.refuse(f"{name} needs a rotation first, not '{token.text}'. Rotations: {known}", token.column)
+            names = [array.removesuffix("_11") for array in self.arrays if array.endswith("_11")]
+            rotations = ", ".join(names) or "none"
+            self.refuse(f"{name} needs a rotation first, not '{token.text}'. Rotations: {rotations}", token.column)
         places = self.brackets(first, token.column) if first.axes else ()
         terms = []
-        for each in "123":
+        for axis in "123":
             self.expect(",")
-            array = matrix[each + name[-1] if name.startswith("un") else name[-1] + each]
+            array = matrix[axis + name[-1] if name.startswith("un") else name[-1] + axis]
             assert array is not None  # rotations have all nine entries
             terms.append(self.slot(Access(array=array, places=places)) * self.sum())
         self.close()
@@ -436,9 +438,9 @@ class ArrayParser(_Indices):
             return Place(base=self.size())
         bound = self.in_scope.get(token.text)
         if bound is None:
-            known = ", ".join(self.in_scope) or "none here"
+            indices = ", ".join(self.in_scope) or "none here"
             message = (
-                f"'{token.text}' is not an index{closest(token.text, self.in_scope)} Indices: {known}. An "
+                f"'{token.text}' is not an index{closest(token.text, self.in_scope)} Indices: {indices}. An "
                 "array is accessed by"
             )
             self.refuse(f"{message} a whole number, N-1, i, i+1 or an entry of a table, bonds[b, 0]", token.column)

@@ -95,9 +95,9 @@ class unit_step(Function):  # type: ignore[misc]  # noqa: N801
 
 def kinks_of(expressions: Iterable[Expr]) -> set[Expr]:
     """Return functions at whose zeros expressions may jump or have a kink: x of unit_step(x), cos(pi x) of rint(x)."""
-    formulas = {f for e in expressions for f in (e, *(each.definition for each in intermediates(e)))}
+    formulas = {f for e in expressions for f in (e, *(quantity.definition for quantity in intermediates(e)))}
     jumps = {part for part in parts(*formulas) if isinstance(part, unit_step | rint)}
-    return {each.args[0] if isinstance(each, unit_step) else sympy.cos(sympy.pi * each.args[0]) for each in jumps}
+    return {jump.args[0] if isinstance(jump, unit_step) else sympy.cos(sympy.pi * jump.args[0]) for jump in jumps}
 
 
 def wrap(x: Expr, length: Expr) -> Expr:
@@ -169,8 +169,8 @@ class Tape:
         self._start: list[Number] = [mp.zero] * len(symbols)
         self._places: dict[sympy.Expr, int] = {symbol: register for register, symbol in enumerate(symbols)}
         self._steps: list[tuple[int, Callable[..., Number], tuple[int, ...]]] = []
-        for each in intermediates(*expressions):
-            self._place(each)
+        for quantity in intermediates(*expressions):
+            self._place(quantity)
         self._results = [self._place(expression) for expression in expressions]
 
     def __call__(self, numbers: Sequence[Number]) -> list[Number]:
@@ -323,9 +323,9 @@ def _node_problem(node: Any) -> str | None:
         return exponent_problem(node.exp) if node.is_Pow else None
     kind = type(node).__name__
     reason = f": {_SMOOTHER[kind]}" if kind in _SMOOTHER else ""
-    known = ", ".join([*FUNCTIONS, *CONSTANTS])
+    names = ", ".join([*FUNCTIONS, *CONSTANTS])
     advice = BY_EVENTS if kind.lower() in SWITCHES else ""
-    return f"{kind} ('{shortened(node)}') is not supported{reason}. Use + - * / ** and {known}{advice}"
+    return f"{kind} ('{shortened(node)}') is not supported{reason}. Use + - * / ** and {names}{advice}"
 
 
 def kinked_root(formula: Expr, variables: Collection[Symbol]) -> str | None:
@@ -375,8 +375,8 @@ def evaluated(expression: Expr, replacements: Mapping[Expr, Expr] | None = None)
     """
     rules = dict(replacements or {})
     for _ in range(MAX_PASSES):
-        for each in intermediates(expression):
-            _rebuilt(each, rules)
+        for quantity in intermediates(expression):
+            _rebuilt(quantity, rules)
         result = _rebuilt(expression, rules)
         if result == expression:
             break
@@ -471,8 +471,8 @@ class _Accumulation:
 
     def rows(self, expressions: Mapping[int, Expr], *, symmetric: bool) -> dict[tuple[int, int], Expr]:
         """Return the derivatives of several expressions, by (row, column)."""
-        if not any(isinstance(key, Intermediate) for each in expressions.values() for key in self.of(each)):
-            return {(i, j): entry for i, each in expressions.items() for j, entry in self.of(each).items()}
+        if not any(isinstance(key, Intermediate) for expression in expressions.values() for key in self.of(expression)):
+            return {(i, j): entry for i, expression in expressions.items() for j, entry in self.of(expression).items()}
         key = (*expressions.values(),), symmetric
         if key not in self.jacobians:
             entries = Elimination(expressions, self.of, lower=symmetric).jacobian()

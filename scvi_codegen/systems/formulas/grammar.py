@@ -329,18 +329,18 @@ class Parser:
         if name in FUNCTIONS:
             return self.call(name, column)
         if self.tokens[self.position][:2] == ("operator", "("):
-            known = ", ".join(FUNCTIONS)
-            known += BY_EVENTS if name.lower() in SWITCHES else ""
-            self.refuse(f"'{name}' is not a function of the grammar{closest(name, FUNCTIONS)} Known: {known}", column)
+            names = ", ".join(FUNCTIONS)
+            names += BY_EVENTS if name.lower() in SWITCHES else ""
+            self.refuse(f"'{name}' is not a function of the grammar{closest(name, FUNCTIONS)} Known: {names}", column)
         value = self.symbols.get(name, CONSTANTS.get(name))
         if value is None:
-            known = ", ".join([*self.symbols, *CONSTANTS])
+            names = ", ".join([*self.symbols, *CONSTANTS])
             declared = (
                 f"declare a constant as a parameter: parameters={{'{name}': 1.0}}, in files [parameters] {name} = 1.0"
             )
-            velocity = next((each for each in self.symbols if name in _spellings(each)), "")
+            velocity = next((symbol for symbol in self.symbols if name in _spellings(symbol)), "")
             hint = f"; did you mean '{velocity}'?" if velocity else closest(name, self.symbols)
-            self.refuse(f"unknown name '{name}'{hint} Known here: {known}; {declared}", column)
+            self.refuse(f"unknown name '{name}'{hint} Known here: {names}; {declared}", column)
         return value
 
     def call(self, name: str, column: int) -> Expr:

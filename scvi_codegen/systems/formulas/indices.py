@@ -216,14 +216,14 @@ class Access:
     @property
     def indices(self) -> frozenset[str]:
         """Loop indices that occur in the access."""
-        return frozenset(index for each in self.places for index in (each.index, each.minus) if index)
+        return frozenset(index for place in self.places for index in (place.index, place.minus) if index)
 
     def __str__(self) -> str:
         places, before = [*map(str, self.places)], ""
-        for each in reversed(self.sums):
-            (size,), place = each.coefficients.axes, places[each.axis]
-            before += f"sum({each.index} in {size}, {each.coefficients.name}[{each.index}-{place}]*"
-            places[each.axis] = each.index
+        for convolution in reversed(self.sums):
+            (size,), place, j = convolution.coefficients.axes, places[convolution.axis], convolution.index
+            before += f"sum({j} in {size}, {convolution.coefficients.name}[{j}-{place}]*"
+            places[convolution.axis] = j
         entry = f"{self.array.name}[{', '.join(places)}]" if places else self.array.name
         return before + entry + ")" * len(self.sums)
 
@@ -232,16 +232,16 @@ def couples_elements(array: Array, reads: Iterable[Access], coefficients: Iterab
     """Return whether a term couples elements of an array: at offsets, by rows of a table, or by a matrix c[i, j]."""
     coefficients = [*coefficients]
     return any(
-        all(_are_coupled(a, b, coefficients) for a, b in zip(one.places, other.places, strict=True))
-        and any(a != b and a.index for a, b in zip(one.places, other.places, strict=True))
-        for one, other in combinations([read for read in reads if read.array == array], 2)
+        all(_are_coupled(a, b, coefficients) for a, b in zip(first.places, other.places, strict=True))
+        and any(a != b and a.index for a, b in zip(first.places, other.places, strict=True))
+        for first, other in combinations([read for read in reads if read.array == array], 2)
     )
 
 
 def _are_coupled(a: Place, b: Place, coefficients: Iterable[Access]) -> bool:
     if a.index == b.index:
         return not (a.minus or b.minus)
-    return any({a.index, b.index} <= each.indices for each in coefficients)
+    return any({a.index, b.index} <= coefficient.indices for coefficient in coefficients)
 
 
 @dataclass(frozen=True, slots=True)

@@ -83,12 +83,12 @@ class Intermediate(Expr):  # type: ignore[misc]  # SymPy is untyped
         if _LAST[0] != rule:
             _LAST[:] = dict(rule), {}
         replaced: dict[Intermediate, tuple[Expr, bool]] = _LAST[1]
-        for each in intermediates(self, known=replaced):
-            if each in rule:
-                replaced[each] = (rule[each], True)
+        for quantity in intermediates(self, without=replaced):
+            if quantity in rule:
+                replaced[quantity] = (rule[quantity], True)
             else:
-                value, changed = each.definition._xreplace(rule)
-                replaced[each] = (intermediate(value), True) if changed else (each, False)
+                value, changed = quantity.definition._xreplace(rule)
+                replaced[quantity] = (intermediate(value), True) if changed else (quantity, False)
         return replaced[self]
 
 
@@ -132,12 +132,14 @@ def separated(expressions: Sequence[Expr], variables: Collection[Symbol]) -> tup
             return intermediate(read(node.definition))
         if not (node.is_Add or node.is_Mul):
             return node.func(*map(read, node.args))
-        constant = [each for each in node.args if each.free_symbols.isdisjoint(variables)]
-        return node.func(read(node.func(*constant)), *(read(each) for each in node.args if each not in constant))
+        constant = [argument for argument in node.args if argument.free_symbols.isdisjoint(variables)]
+        return node.func(
+            read(node.func(*constant)), *(read(argument) for argument in node.args if argument not in constant)
+        )
 
-    for each in intermediates(*expressions):
-        if not each.free_symbols.isdisjoint(variables):
-            read(each)
+    for quantity in intermediates(*expressions):
+        if not quantity.free_symbols.isdisjoint(variables):
+            read(quantity)
     return [*map(read, expressions)], parts
 
 
@@ -155,8 +157,8 @@ def written_out(expression: Expr) -> Expr:
             "which the system was read"
         )
     rules: dict[Expr, Expr] = {}
-    for each in intermediates(expression):
-        rules[each] = each.definition.xreplace(dict(rules))
+    for quantity in intermediates(expression):
+        rules[quantity] = quantity.definition.xreplace(dict(rules))
     return with_even_roots(expression.xreplace(rules)) if rules else expression
 
 
@@ -197,8 +199,8 @@ def written_size(expression: Expr) -> int:
     def size(node: Expr) -> int:
         return sizes.get(node) or 1 + sum(map(size, node.args))
 
-    for each in intermediates(expression):
-        sizes[each] = size(each.definition)
+    for quantity in intermediates(expression):
+        sizes[quantity] = size(quantity.definition)
     return size(expression)
 
 
@@ -226,16 +228,16 @@ def inner_of(expression: Expr) -> tuple[Intermediate, ...]:
     return tuple(quantities)
 
 
-def intermediates(*expressions: Expr, known: Container[Intermediate] = ()) -> list[Intermediate]:
+def intermediates(*expressions: Expr, without: Container[Intermediate] = ()) -> list[Intermediate]:
     """Return all quantities in expressions and in their definitions, each after those that it depends on.
 
-    Known ones are left out, and so are those that occur in their definitions alone.
+    Those of ``without`` are left out, and so are those that occur in their definitions alone.
     """
     seen: set[Intermediate] = set()
-    pending = [node for each in expressions for node in inner_of(each)]
+    pending = [node for expression in expressions for node in inner_of(expression)]
     while pending:
         node = pending.pop()
-        if node not in seen and node not in known:
+        if node not in seen and node not in without:
             seen.add(node)
             pending += node.inner
-    return sorted(seen, key=lambda each: each.number)
+    return sorted(seen, key=lambda quantity: quantity.number)

@@ -51,10 +51,10 @@ class Neighbours:
         named = [("cutoff", self.cutoff), ("skin", self.skin), *(("box", period) for period in self.box)]
         return tuple((self.name, kind, format_expression(length)) for kind, length in named)
 
-    def inside(self, one: str, other: str) -> str:
+    def inside(self, first: str, other: str) -> str:
         """Return the formula that is 1 for points of two indices closer than the cutoff, else 0."""
         entry = f"{self.array.name}[{{}}, {{}}]" if len(self.array.axes) > 1 else f"{self.array.name}[{{}}]"
-        apart = [f"{entry.format(one, k)} - {entry.format(other, k)}" for k in range(self.components)]
+        apart = [f"{entry.format(first, k)} - {entry.format(other, k)}" for k in range(self.components)]
         apart = [f"wrap({x}, {period})" for x, period in zip(apart, self.box, strict=True)] if self.box else apart
         return f"unit_step(({self.cutoff})**2 - ({' + '.join(f'({x})**2' for x in apart)}))"
 

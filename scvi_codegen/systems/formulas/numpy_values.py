@@ -29,8 +29,8 @@ def array_value(expression: Expr, values: dict[Expr, Any]) -> Any:
     >>> array_value(x**2 + 1, {x: np.arange(3.0)}).tolist()
     [1.0, 2.0, 5.0]
     """
-    for each in intermediates(expression):
-        _value_in(each, values)
+    for quantity in intermediates(expression):
+        _value_in(quantity, values)
     return _value_in(expression, values)
 
 
@@ -60,10 +60,10 @@ def _node_value(expression: Any, values: dict[Expr, Any]) -> Any:
 
 def convolved(values: NDArray[Any], access: Access, arrays: Mapping[str, NDArray[Any]], sign: int = 1) -> Any:
     """Return the convolutions of an array in an access, for ``sign`` -1 their transpose, by Fourier transforms."""
-    for each in access.sums[::sign]:
-        by = np.fft.fft(arrays[each.coefficients.name])
-        by = (np.conj(by) if sign == 1 else by).reshape(-1, *(1,) * (values.ndim - 1 - each.axis))
-        values = np.fft.ifft(by * np.fft.fft(values, axis=each.axis), axis=each.axis).real
+    for convolution in access.sums[::sign]:
+        by = np.fft.fft(arrays[convolution.coefficients.name])
+        by = (np.conj(by) if sign == 1 else by).reshape(-1, *(1,) * (values.ndim - 1 - convolution.axis))
+        values = np.fft.ifft(by * np.fft.fft(values, axis=convolution.axis), axis=convolution.axis).real
     return values
 
 
@@ -94,7 +94,7 @@ class Elements:
                 continue
             first, second = np.triu_indices(len(span), 1)
             self.index[loop.index], self.index[pairs[loop.index].index] = (
-                span[each[grid.reshape(-1)]] for each in (first, second)
+                span[indices[grid.reshape(-1)]] for indices in (first, second)
             )
 
     def of(self, access: Access) -> tuple[Any, ...]:

@@ -156,7 +156,7 @@ class Direction(_Vector):
     @property
     def rates(self) -> tuple[Symbol, ...]:
         """Symbols of the velocity of the unit vector in formulas."""
-        return tuple(symbol(each.name + DOT) for each in self.entries)
+        return tuple(symbol(entry.name + DOT) for entry in self.entries)
 
     def values(self) -> dict[Symbol, Expr]:
         """Return the unit vector and its velocity by symbol, as functions of the vector and its velocity."""
@@ -335,7 +335,7 @@ class RotationNames:
     @property
     def symbols(self) -> dict[str, Symbol]:
         """Symbols of formulas by name."""
-        return {each.name: each for each in self.values}
+        return {value.name: value for value in self.values}
 
     def read(self, text: str, symbols: Mapping[str, Symbol]) -> Expr:
         """Parse a formula, in which ``rotate_k(R, a, b, c)`` is the k-th component of R (a, b, c)."""
@@ -347,9 +347,11 @@ class RotationNames:
 
     def gauge(self, inertia: Callable[[Rotation], Expr] = lambda _: S.One) -> Expr:
         """Return the energy (q . p)^2/(8 I0) of the scalings of quaternions, which is zero for q . p = 0."""
-        pairs = ((tuple(map(symbol, each.coordinates)), momenta_of(each.coordinates)) for each in self.rotations)
+        pairs = (
+            (tuple(map(symbol, rotation.coordinates)), momenta_of(rotation.coordinates)) for rotation in self.rotations
+        )
         along = [_product(q, p) for q, p in pairs]
-        return Add(*(q_p**2 / (8 * inertia(each)) for each, q_p in zip(self.rotations, along, strict=True)))
+        return Add(*(q_p**2 / (8 * inertia(rotation)) for rotation, q_p in zip(self.rotations, along, strict=True)))
 
     def inertia(self, member: Homogeneous, reduced: Expr, parameters: Sequence[Symbol]) -> Expr:
         """Return I0 of a member: the mean of the diagonal of l's Hessian in its rates if that is constant, else 1."""
@@ -359,8 +361,8 @@ class RotationNames:
 
     def lagrangian(self, reduced: Expr, parameters: Sequence[Symbol]) -> Expr:
         """Return l plus the scaling terms, as a function of the homogeneous coordinates and their velocities."""
-        members = [each for each in self.members if not isinstance(each, Spin)]
-        terms = [self.inertia(each, reduced, parameters) * each.scaling() ** 2 / 2 for each in members]
+        members = [member for member in self.members if not isinstance(member, Spin)]
+        terms = [self.inertia(member, reduced, parameters) * member.scaling() ** 2 / 2 for member in members]
         return Add(self.in_coordinates(reduced), *terms)
 
     def forces_by_name(
@@ -388,17 +390,17 @@ class RotationNames:
         def add(name: str, force: Iterable[Expr]) -> None:
             total[name] = tuple(map(Add, total[name], force)) if name in total else tuple(force)
 
-        for kind, where, by_name, known in (
+        for kind, where, by_name, targets in (
             ("force", "coordinate", forces, moved),
             ("torque", "rotation", torques, [*rotating]),
             ("torque", "rotation", torques_space, [*rotating]),
         ):
             for name, formulas in ((name_of_key(key), value) for key, value in (by_name or {}).items()):
-                if name not in known:
-                    hint = f": write torques={{'{name}': [..]}}." if name in rotating else closest(name, known)
+                if name not in targets:
+                    hint = f": write torques={{'{name}': [..]}}." if name in rotating else closest(name, targets)
                     raise SystemDefinitionError(
                         f"there is a {kind} on '{name}', which is not a {where}{hint} "
-                        f"{where.capitalize()}s: {', '.join(known) or 'none'}"
+                        f"{where.capitalize()}s: {', '.join(targets) or 'none'}"
                     )
                 single = isinstance(formulas, str) or not isinstance(formulas, Sequence)
                 force = [*map(read, [formulas] if single else formulas)]
@@ -473,7 +475,7 @@ class _RotatingParser(Parser):
         self.rotations = rotations
 
     def name(self, name: str, column: int) -> Expr:
-        entries = [each for each in (f"{name}_11", f"{name}_1") if each in self.symbols and name not in self.symbols]
+        entries = [entry for entry in (f"{name}_11", f"{name}_1") if entry in self.symbols and name not in self.symbols]
         if entries:
             self.refuse(f"'{name}' is not a scalar: write one of its components, as {entries[0]}", column)
         if name not in ROTATING and name.removeprefix("un").startswith("rotate"):
@@ -486,8 +488,8 @@ class _RotatingParser(Parser):
         self.open(opening.column)
         kind, rotation, place = self.tokens[self.position]
         if kind != "name" or rotation not in self.rotations:
-            known = ", ".join(self.rotations)
-            self.refuse(f"{name} needs a rotation first, not '{rotation}'. Rotations: {known}", place)
+            rotations = ", ".join(self.rotations)
+            self.refuse(f"{name} needs a rotation first, not '{rotation}'. Rotations: {rotations}", place)
         self.position += 1
         vector: list[Expr] = []
         while self.accept(","):
@@ -521,12 +523,12 @@ class MemberArray:
     @property
     def formulas(self) -> tuple[Array, ...]:
         """Arrays that occur in formulas: matrix or vector, and rates."""
-        return tuple(Array(each.name, self.axes) for each in _symbols(self.member))
+        return tuple(Array(entry.name, self.axes) for entry in _symbols(self.member))
 
     @property
     def rates(self) -> tuple[Array, ...]:
         """Arrays of the rates."""
-        return tuple(Array(each.name, self.axes) for each in self.member.rates)
+        return tuple(Array(rate.name, self.axes) for rate in self.member.rates)
 
     def torques(self, *, in_space: bool = False) -> tuple[Array, ...]:
         """Return the arrays of the components of torques, or of forces on directions, which occur in no formula."""
@@ -545,11 +547,14 @@ class MemberArray:
     def names(self, sizes: Mapping[str, int]) -> dict[str, NDArray[np.str_]]:
         """Return the names of the entries of :attr:`formulas` and of both kinds of torques."""
         names: dict[str, dict[tuple[int, ...], str]] = {}
-        for index, each in self.entries(sizes):
-            for array, name in zip(_all_names(self.member), _all_names(each), strict=True):
+        for index, member in self.entries(sizes):
+            for array, name in zip(_all_names(self.member), _all_names(member), strict=True):
                 names.setdefault(array, {})[index] = name
         shape = tuple(axis.at(sizes) for axis in self.axes)
-        return {array: np.array(list(each.values()), dtype=np.str_).reshape(shape) for array, each in names.items()}
+        return {
+            array: np.array(list(entry_names.values()), dtype=np.str_).reshape(shape)
+            for array, entry_names in names.items()
+        }
 
 
 def member_arrays(
@@ -588,7 +593,7 @@ def entries_in_formulas(
                 member = replace(member, rate=member.rate.removesuffix(first))
             turning = MemberArray(replace(member, name=array.name), array.axes[:-1])
             names = turning.names(sizes)
-            entries |= {each: names[each.name] for each in turning.formulas}
+            entries |= {component: names[component.name] for component in turning.formulas}
     return entries
 
 
@@ -597,15 +602,15 @@ def torque_components(
 ) -> Iterator[tuple[str, str, tuple[Array, ...]]]:
     """Yield target, formula and arrays of each component of a torque on ``R[i]``, or of a force on ``n[i]``."""
     name, bracket, place = target.partition("[")
-    known = {each.member.name: each for each in members}
-    if name not in known or isinstance(formulas, str) or len(formulas) != len(AXES):
+    by_name = {member.member.name: member for member in members}
+    if name not in by_name or isinstance(formulas, str) or len(formulas) != len(AXES):
         raise SystemDefinitionError(
             f"the torque on '{target}' must have three components and act on a rotation or a direction"
-            f"{closest(name, known)}"
+            f"{closest(name, by_name)}"
         )
-    if known[name].axes and not bracket:
+    if by_name[name].axes and not bracket:
         raise SystemDefinitionError(f"'{name}' is an array: write the torque on each of them as '{name}[i]'")
-    arrays = known[name].torques(in_space=in_space)
+    arrays = by_name[name].torques(in_space=in_space)
     for array, formula in zip(arrays, formulas, strict=True):
         yield f"{array.name}{bracket}{place}", formula, arrays
 
@@ -625,4 +630,4 @@ def _symbols(member: Homogeneous) -> tuple[Symbol, ...]:
 
 def _all_names(member: Homogeneous) -> tuple[str, ...]:
     torques = (_torque_names(member, in_space=in_space) for in_space in (False, True))
-    return (*(each.name for each in _symbols(member)), *(name for names in torques for name in names))
+    return (*(entry.name for entry in _symbols(member)), *(name for names in torques for name in names))

@@ -64,7 +64,7 @@ class Translation:
     ) -> None:
         self.rules: dict[Expr, Expr] = {}
         free = expression.free_symbols.union(*(other.free_symbols for other in others))
-        self.free = sorted(free, key=lambda each: str(each.name))
+        self.free = sorted(free, key=lambda variable: str(variable.name))
         self.user_time = self._time(coordinates, time, parameters)
         if self.user_time is not None:
             self._add(self.user_time, TIME)

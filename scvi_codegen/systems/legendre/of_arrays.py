@@ -54,23 +54,22 @@ def site_hamiltonian(system: ArraySystem) -> SiteHamiltonian | None:
         site = _of_site(term, moving)
         if site is None:
             return None
-        known = groups.get(site.loops)
-        if known is not None:
-            site = term_of(site.loops, known.formula + site.formula, dict((*known.slots, *site.slots)))
+        former = groups.get(site.loops)
+        if former is not None:
+            site = term_of(site.loops, former.formula + site.formula, dict((*former.slots, *site.slots)))
         groups[site.loops] = site
     of_groups = [_transformed(group, moving) for group in groups.values()]
     accessed = [access for group in groups.values() for _, access in group.slots if access.array.name in moving]
     if None in of_groups or not _each_once(accessed, system.coordinates):
         return None
-    mapped = [each for each in of_groups if each is not None]
+    transformed = [parts for parts in of_groups if parts is not None]
+    energies, momenta, velocities = zip(*transformed, strict=True) if transformed else ((), (), ())
     hamiltonian = ArrayHamiltonian(
         **{name: getattr(system, name) for name in COMMON},
         momenta=tuple(moving.values()),
-        terms=(*(each[0] for each in mapped), *(replace(term, formula=-term.formula) for term in still)),
+        terms=(*energies, *(replace(term, formula=-term.formula) for term in still)),
     )
-    return SiteHamiltonian(
-        system=hamiltonian, momenta=tuple(each[1] for each in mapped), velocities=tuple(each[2] for each in mapped)
-    )
+    return SiteHamiltonian(system=hamiltonian, momenta=tuple(momenta), velocities=tuple(velocities))
 
 
 COMMON = (
@@ -109,7 +108,7 @@ def _each_once(accesses: Sequence[Access], coordinates: Sequence[Array]) -> bool
     """Return whether every coordinate has one velocity: of the axes that are numbers every place occurs."""
     for array in coordinates:
         places = [access.places for access in accesses if access.array.name == array.name + DOT]
-        numbers = {tuple(str(place) for place in each if not place.index) for each in places}
+        numbers = {tuple(str(place) for place in entry_places if not place.index) for entry_places in places}
         if not places or len(numbers) != len(places):
             return False
         fixed = [axis for axis, place in zip(array.axes, places[0], strict=False) if not place.index]
@@ -128,7 +127,7 @@ def _transformed(group: ArrayTerm, moving: dict[str, Array]) -> tuple[ArrayTerm,
     if any(entry.free_symbols & set(v) for entry in entries.values()):
         return None
     at_rest = dict.fromkeys(v, S.Zero)
-    shifted = [each - rate.xreplace(at_rest) for each, rate in zip(p, derivatives, strict=True)]
+    shifted = [momentum - rate.xreplace(at_rest) for momentum, rate in zip(p, derivatives, strict=True)]
     blocks = coupled_blocks(entries, len(v))
     if any(len(block) == 1 and (block[0], block[0]) not in entries for block in blocks):
         return None

@@ -33,7 +33,10 @@ def hamiltonian_of_rotations(system: LagrangianSystem) -> HamiltonianSystem | No
     if reduced is None or system.constraints or len(names.rotations) < len(names.members):
         return None
     ordinary = [q for q in system.coordinates if q.name not in names.coordinates]
-    u = (*(symbol(f"{q.name}_dot") for q in ordinary), *(rate for each in names.rotations for rate in each.rates))
+    u = (
+        *(symbol(f"{q.name}_dot") for q in ordinary),
+        *(rate for rotation in names.rotations for rate in rotation.rates),
+    )
     inverse = _inverse_of_constant(hessian(reduced.lagrangian, u), len(u), set(system.parameters))
     if inverse is None:
         return None
@@ -41,8 +44,8 @@ def hamiltonian_of_rotations(system: LagrangianSystem) -> HamiltonianSystem | No
     at_rest = dict.fromkeys(u, S.Zero)
     linear = gradient_tuple(reduced.lagrangian, u)
     mu = [momenta[q] for q in ordinary]
-    for each in names.rotations:
-        mu += each.body_momentum(tuple(momenta[symbol(name)] for name in each.coordinates))
+    for rotation in names.rotations:
+        mu += rotation.body_momentum(tuple(momenta[symbol(name)] for name in rotation.coordinates))
     rest = Matrix([m - rate.xreplace(at_rest) for m, rate in zip(mu, linear, strict=True)])
     velocity = dict(zip(u, inverse * rest, strict=True))
     products = [rest[i] * rest[j] * inverse[i, j] / 2 for i in range(len(u)) for j in range(len(u))]
@@ -51,12 +54,12 @@ def hamiltonian_of_rotations(system: LagrangianSystem) -> HamiltonianSystem | No
     def in_phase_space(formula: Expr) -> Expr:
         return names.in_coordinates(formula.xreplace(velocity))
 
-    applied = tuple((name, tuple(map(in_phase_space, each))) for name, each in reduced.forces)
+    applied = tuple((name, tuple(map(in_phase_space, components))) for name, components in reduced.forces)
     return HamiltonianSystem(
         **system._common_fields,
         momenta=tuple(momenta.values()),
         hamiltonian=in_phase_space(energy),
-        gauge=names.gauge(lambda each: names.inertia(each, reduced.lagrangian, system.parameters)),
+        gauge=names.gauge(lambda rotation: names.inertia(rotation, reduced.lagrangian, system.parameters)),
         forces=names.forces(applied, [q.name for q in system.coordinates]),
     )
 

@@ -200,12 +200,12 @@ def lagrangian_of(system: HamiltonianSystem, *, constraints: Sequence[str] = ())
     lagrangian = _lagrangian_of(system)
     if not constraints:
         return lagrangian
-    known = {x.name: x for x in (*system.coordinates, *lagrangian.velocities, system.time, *system.parameters)}
-    known |= {name: symbol(name) for name in system.inputs}
+    symbols = {x.name: x for x in (*system.coordinates, *lagrangian.velocities, system.time, *system.parameters)}
+    symbols |= {name: symbol(name) for name in system.inputs}
     driven = input_formulas(system.inputs, system.time)
     expressions = constraints_of(
         constraints,
-        lambda g: parse_expression(g, known).xreplace(driven),
+        lambda g: parse_expression(g, symbols).xreplace(driven),
         lambda g: rate_of_positions(g, system.coordinates, system.time),
     )
     return replace(lagrangian, constraints=expressions)
@@ -214,7 +214,7 @@ def lagrangian_of(system: HamiltonianSystem, *, constraints: Sequence[str] = ())
 @lru_cache(maxsize=64)
 def _lagrangian_of(system: HamiltonianSystem) -> LagrangianSystem:
     if system.rotations:
-        named = ", ".join(f"'{each.name}'" for each in system.rotations)
+        named = ", ".join(f"'{rotation.name}'" for rotation in system.rotations)
         raise SystemDefinitionError(
             f"'{system.name}' has rotations or spins ({named}), and its Hamiltonian is singular in their momenta: "
             "write the Lagrangian with rotations=.., or use the Hamiltonian"

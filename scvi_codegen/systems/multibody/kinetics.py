@@ -136,7 +136,7 @@ def _motions(body: Any, frame: ReferenceFrame, variables: Variables) -> Iterator
     mass = variables.read(body.mass) * sympy.eye(3)
     yield BodyMotion(_components(body, body.masscenter.vel(frame), frame, variables), mass, (sympy.S.Zero,) * 3)
     if hasattr(body, "central_inertia"):
-        frames = {basis for _, *vectors in body.central_inertia.args for each in vectors for _, basis in each.args}
+        frames = {basis for _, *vectors in body.central_inertia.args for vector in vectors for _, basis in vector.args}
         axes = frames.pop() if len(frames) == 1 else body.frame  # of round bodies another one
         inertia = body.central_inertia.to_matrix(axes).applyfunc(variables.read)
         rates = _components(body, body.frame.ang_vel_in(frame), axes, variables)

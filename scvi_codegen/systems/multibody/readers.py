@@ -85,24 +85,25 @@ class Multibody:
         energy, forces = self._dynamics(variables)
         write = variables.write
         torques = {
-            each.name: list(map(write, forces[len(variables.x) + 3 * k :][:3])) for k, each in enumerate(self.rotations)
+            rotation.name: list(map(write, forces[len(variables.x) + 3 * k :][:3]))
+            for k, rotation in enumerate(self.rotations)
         }
         return {
             "lagrangian": write(energy) - self.potential,
             "coordinates": list(self.coordinates),
-            "rotations": {each.name: each.rate for each in self.rotations},
+            "rotations": {rotation.name: rotation.rate for rotation in self.rotations},
             "torques": {name: torque for name, torque in torques.items() if any(torque)},
             "forces": {q: write(f) for q, f in zip(self.coordinates, forces, strict=False) if f != 0},
-            "constraints": [*self.configuration, *(write(variables.read(each)) for each in rolling)],
+            "constraints": [*self.configuration, *(write(variables.read(condition)) for condition in rolling)],
         }
 
     def _beyond_configuration(self, variables: Variables) -> list[Expr]:
         """Return the velocity constraints, in plain symbols, that kinematics and configuration do not imply."""
         velocity = list(map(variables.read, self.velocity))
-        known = [*map(variables.read, self.kinematics)]
-        known += [variables.rate(variables.read(g)) for g in self.configuration]
-        chosen = independent_of(known, velocity, (*variables.v, *variables.u)) if velocity else ()
-        return [velocity[k] for k in chosen]
+        implied = [*map(variables.read, self.kinematics)]
+        implied += [variables.rate(variables.read(g)) for g in self.configuration]
+        independent = independent_of(implied, velocity, (*variables.v, *variables.u)) if velocity else ()
+        return [velocity[k] for k in independent]
 
     def _with_ignored(self, speeds: Sequence[Expr]) -> Multibody:
         """Return the system with a coordinate, its time integral, added for each speed that nothing depends on."""
@@ -214,9 +215,9 @@ def of_system(system: System) -> Multibody:
     """
     by_kane = isinstance(system.eom_method, KanesMethod)
     system, rotations = with_rotations(system)
-    springs = [each for each in system.actuators if rotations and isinstance(each, LinearSpring)]
-    groups = [tuple(each.to_loads()) for each in system.actuators if each not in springs]
-    stored = (each.stiffness * (each.pathway.length - each.equilibrium_length) ** 2 / 2 for each in springs)
+    springs = [actuator for actuator in system.actuators if rotations and isinstance(actuator, LinearSpring)]
+    groups = [tuple(actuator.to_loads()) for actuator in system.actuators if actuator not in springs]
+    stored = (spring.stiffness * (spring.pathway.length - spring.equilibrium_length) ** 2 / 2 for spring in springs)
     energies = () if by_kane else (body.potential_energy for body in system.bodies)
     return Multibody(
         frame=system.frame,

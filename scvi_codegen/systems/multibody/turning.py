@@ -29,21 +29,21 @@ def with_rotations(system: System) -> tuple[System, tuple[Rotation, ...]]:
     A spherical joint keeps its angles if other formulas contain them or their speeds: loads, constraints, kinematic
     equations, potential energies, other frames, and velocities that are not the rates of positions.
     """
-    names = {each.name for each in system.joints if isinstance(each, SphericalJoint) and each._amounts is None}
+    names = {joint.name for joint in system.joints if isinstance(joint, SphericalJoint) and joint._amounts is None}
     while True:
         turned: Any = copy.deepcopy(system, {id(system.eom_method): system.eom_method})
-        joints = [each for each in turned.joints if each.name in names]
-        owners = {f: each.name for each in joints for f in (*each.coordinates, *each.speeds)}
+        joints = [joint for joint in turned.joints if joint.name in names]
+        owners = {f: joint.name for joint in joints for f in (*joint.coordinates, *joint.speeds)}
         in_angles = {owners[f] for f in _built_in(turned, owners)}
-        rotations = [_turn(each.child_interframe, each.parent_interframe, each.name) for each in joints]
-        kinematics = {each for joint in joints for each in joint.kdes}
+        rotations = [_turn(joint.child_interframe, joint.parent_interframe, joint.name) for joint in joints]
+        kinematics = {equation for joint in joints for equation in joint.kdes}
         for key in ("q_ind", "q_dep", "u_ind", "u_dep", "kdes"):
-            setattr(turned, key, [each for each in getattr(turned, key) if each not in {*owners, *kinematics}])
+            setattr(turned, key, [entry for entry in getattr(turned, key) if entry not in {*owners, *kinematics}])
         rotations += _freed(turned)
         for frame in _connected([turned.frame], "_dcm_dict"):
             frame._dcm_cache = dict(frame._dcm_dict)  # private: products of matrices, which contain the angles
         _forget(turned, owners)
-        in_angles |= {name for f, name in owners.items() if any(each.has(f) for each in _formulas(turned))}
+        in_angles |= {name for f, name in owners.items() if any(formula.has(f) for formula in _formulas(turned))}
         if not in_angles:
             return turned, tuple(rotations)
         names -= in_angles
@@ -61,10 +61,10 @@ def _turn(frame: ReferenceFrame, base: ReferenceFrame, name: str) -> Rotation:
 def _freed(system: Any) -> Iterator[Rotation]:
     """Give positions and rotations to the rigid bodies that are not connected, of a joint the parent first."""
     children = [joint.child for joint in system.joints]
-    for body in sorted(system.bodies, key=lambda each: each in children):
+    for body in sorted(system.bodies, key=children.__contains__):
         located = body.masscenter in _connected([system.fixed_point], "_pos_dict")
-        known = located or system.frame in body.masscenter._vel_dict
-        if known or not isinstance(body, RigidBody) or body.frame in _connected([system.frame], "_ang_vel_dict"):
+        moving = located or system.frame in body.masscenter._vel_dict
+        if moving or not isinstance(body, RigidBody) or body.frame in _connected([system.frame], "_ang_vel_dict"):
             continue
         place = dynamicsymbols(" ".join(f"{axis}_{identifier(body.name)}" for axis in "xyz"))
         system.add_coordinates(*place)
@@ -77,13 +77,13 @@ def _freed(system: Any) -> Iterator[Rotation]:
 def _connected(first: Iterable[Any], relation: str) -> list[Any]:
     """Return frames or points and all that are oriented or located relative to them."""
     connected = list(first)
-    for each in connected:
-        connected += [other for other in getattr(each, relation) if other not in connected]
+    for reference in connected:
+        connected += [other for other in getattr(reference, relation) if other not in connected]
     return connected
 
 
 def _points(system: Any) -> list[Any]:
-    return _connected([system.fixed_point, *(each.masscenter for each in system.bodies)], "_pos_dict")
+    return _connected([system.fixed_point, *(body.masscenter for body in system.bodies)], "_pos_dict")
 
 
 def _forget(system: Any, functions: Collection[Expr]) -> list[tuple[Any, Any, Any]]:
@@ -92,7 +92,7 @@ def _forget(system: Any, functions: Collection[Expr]) -> list[tuple[Any, Any, An
         (point, frame, velocity)
         for point in _points(system)
         for frame, velocity in point._vel_dict.items()
-        if any(each.has(*functions) for each in _components(velocity))
+        if any(component.has(*functions) for component in _components(velocity))
     ]
     for point, frame, _ in removed:
         del point._vel_dict[frame]
@@ -104,7 +104,7 @@ def _built_in(system: Any, functions: Mapping[Expr, str]) -> set[Expr]:
     if not functions:
         return set()
     time, occurring = dynamicsymbols._t, set()
-    speeds = {q.diff(time): u for each in system.joints for q, u in zip(each.coordinates, each.speeds, strict=True)}
+    speeds = {q.diff(time): u for joint in system.joints for q, u in zip(joint.coordinates, joint.speeds, strict=True)}
     variables = Variables(tuple(system.q), time, tuple(system.u))
     for point, frame, velocity in _forget(system, functions):
         try:
@@ -112,7 +112,7 @@ def _built_in(system: Any, functions: Mapping[Expr, str]) -> set[Expr]:
         except ValueError:
             excess = Matrix([1])
         if not are_zero(map(variables.read, excess)):
-            occurring |= {f for f in functions if any(each.has(f) for each in _components(velocity))}
+            occurring |= {f for f in functions if any(component.has(f) for component in _components(velocity))}
     return occurring
 
 
@@ -124,9 +124,9 @@ def _components(vector: Any) -> Iterator[Expr]:
 
 def _formulas(system: Any) -> Iterator[Expr]:
     """Yield the formulas of a system: kinematics, constraints, energies, loads, orientations and positions."""
-    energies = (sympify(each.potential_energy) for each in system.bodies)
+    energies = (sympify(body.potential_energy) for body in system.bodies)
     yield from (*system.kdes, *system.holonomic_constraints, *system.velocity_constraints, *energies)
-    loads = [*system.loads, *(load for each in system.actuators for load in each.to_loads())]
+    loads = [*system.loads, *(load for actuator in system.actuators for load in actuator.to_loads())]
     for _, vector in loads:
         yield from _components(vector)
     for frame in _connected([system.frame], "_dcm_dict"):

@@ -59,8 +59,8 @@ class Variables:
         self._plain: dict[Expr, Expr] = {function: symbol for symbol, function in self._written.items()}
         self._plain |= dict.fromkeys(auxiliary, sympy.S.Zero)
         self.rotations = tuple(rotations)
-        self.entries = tuple(entry for each in rotations for entry in each.entries)
-        self.rates = (*self.v, *(rate for each in rotations for rate in each.rates))
+        self.entries = tuple(entry for rotation in rotations for entry in rotation.entries)
+        self.rates = (*self.v, *(rate for rotation in rotations for rate in rotation.rates))
 
     @property
     def other_functions(self) -> tuple[Symbol, ...]:
@@ -101,8 +101,8 @@ class Variables:
     def _torques(self, derivatives: Sequence[Expr]) -> list[Expr]:
         """Return derivatives about the axes of rotations from those with respect to their entries."""
         torques: list[Expr] = []
-        for k, each in enumerate(self.rotations):
-            torques += torque_of(Matrix(3, 3, each.entries), Matrix(3, 3, derivatives[9 * k : 9 * k + 9]))
+        for k, rotation in enumerate(self.rotations):
+            torques += torque_of(Matrix(3, 3, rotation.entries), Matrix(3, 3, derivatives[9 * k : 9 * k + 9]))
         return torques
 
     def projected(self, forces: Sequence[Expr]) -> tuple[Expr, ...]:
@@ -135,7 +135,7 @@ def solved_for_speeds(equations: Sequence[Expr], variables: Variables) -> dict[S
             u[j]: value for j, value in zip(unknowns, part, strict=True) if not value.has(sympy.nan, sympy.zoo)
         }
     if len(solution) == len(u):
-        return {each: solution[each] for each in u}
+        return {speed: solution[speed] for speed in u}
     names = ", ".join(str(variables.write(u)) for u in variables.u)
     raise SystemDefinitionError(
         f"the kinematic equations cannot be solved for the generalised speeds {names}: they must be an invertible "
@@ -143,19 +143,19 @@ def solved_for_speeds(equations: Sequence[Expr], variables: Variables) -> dict[S
     )
 
 
-def independent_of(known: Sequence[Expr], asked: Sequence[Expr], rates: Sequence[Symbol]) -> tuple[int, ...]:
+def independent_of(earlier: Sequence[Expr], asked: Sequence[Expr], rates: Sequence[Symbol]) -> tuple[int, ...]:
     """Return the indices of ``asked`` expressions that are independent of earlier ones, by ranks at a point.
 
     Args:
-        known, asked: linear in the rates.
+        earlier, asked: linear in the rates.
         rates: velocities and speeds.
 
     Raises:
         SystemDefinitionError: if they have no value at any of the sampled points.
     """
-    rows = _values((*known, *asked), rates)
-    basis, independent = rows[: len(known)], []
-    for k, row in enumerate(rows[len(known) :]):
+    rows = _values((*earlier, *asked), rates)
+    basis, independent = rows[: len(earlier)], []
+    for k, row in enumerate(rows[len(earlier) :]):
         more = np.vstack([basis, row])
         if row_rank(more) > row_rank(basis):
             independent.append(k)

@@ -44,20 +44,20 @@ def forces_at_points(
     Raises:
         SystemDefinitionError: for other keys, bodies or frames, other numbers of formulas, and moving points.
     """
-    rotations = {each.name: each for each in members if isinstance(each, Rotation)}
+    rotations = {member.name: member for member in members if isinstance(member, Rotation)}
     for k, entry in enumerate(entries):
         point, force = _vectors(entry, rotations, f"point_forces[{k}]", read)
-        moving = {symbol(f"{name}_dot") for name in coordinates}.union(*(each.rates for each in members))
-        if velocities := sorted(each.name for each in point.free_symbols & moving):
+        moving = {symbol(f"{name}_dot") for name in coordinates}.union(*(member.rates for member in members))
+        if velocities := sorted(variable.name for variable in point.free_symbols & moving):
             raise SystemDefinitionError(f"the point of point_forces[{k}] depends on the velocity '{velocities[0]}'")
         for name in coordinates:
             yield name, Matrix([force.dot(point.diff(symbol(name)))])
-        for each in members:
-            if isinstance(each, Direction):
-                yield each.name, Matrix([force.dot(point.diff(entry)) for entry in each.entries])
-            elif isinstance(each, Rotation):
-                derivatives = Matrix(3, 3, [force.dot(point.diff(entry)) for entry in each.entries])
-                yield each.name, torque_of(Matrix(3, 3, each.entries), derivatives)
+        for member in members:
+            if isinstance(member, Direction):
+                yield member.name, Matrix([force.dot(point.diff(entry)) for entry in member.entries])
+            elif isinstance(member, Rotation):
+                derivatives = Matrix(3, 3, [force.dot(point.diff(entry)) for entry in member.entries])
+                yield member.name, torque_of(Matrix(3, 3, member.entries), derivatives)
 
 
 def _vectors(
@@ -90,7 +90,7 @@ def _three(formulas: Any, role: str, read: Callable[[Any], Expr]) -> Matrix:
         return zeros(3, 1)
     if not isinstance(formulas, Sequence) or isinstance(formulas, str) or len(formulas) != len(AXES):
         raise SystemDefinitionError(f"{role} must have three components, not {formulas!r}")
-    return Matrix([read(each if isinstance(each, Expr) else str(each)) for each in formulas])
+    return Matrix([read(formula if isinstance(formula, Expr) else str(formula)) for formula in formulas])
 
 
 def torque_of(matrix: Matrix, derivatives: Matrix) -> Matrix:
@@ -112,7 +112,7 @@ def rotations_of_frames(rotations: Mapping[Any, Any] | None) -> tuple[dict[str, 
     """
     names: dict[str, str] = {}
     rules: dict[Expr, Expr] = {}
-    several = sum(not isinstance(each, str) for each in rotations or {}) > 1
+    several = sum(not isinstance(frame, str) for frame in rotations or {}) > 1
     for frame, base in (rotations or {}).items():
         if isinstance(frame, str):
             names[frame] = base
@@ -138,9 +138,9 @@ def _quaternion(frame: Any, base: Any) -> tuple[Expr, ...]:
     q: list[Expr] = []
     for k, entry in enumerate(weights):
         q += [f for f in functions if f not in q and entry.coeff(f, 2) == (3 if k == 0 else 1)][:1]
-    if len(functions) != 4 or len(q) != 4 or any(each != 0 for each in (matrix - matrix_of(q)).expand()):
+    if len(functions) != 4 or len(q) != 4 or any(entry != 0 for entry in (matrix - matrix_of(q)).expand()):
         raise SystemDefinitionError(
             f"the frame '{frame}' is not oriented in '{base}' by a quaternion: write {frame}.orient_quaternion({base}, "
             "dynamicsymbols('q0:4')), or name a rotation, rotations={'R': 'omega'}"
         )
-    return tuple(S(each) for each in q)
+    return tuple(S(function) for function in q)

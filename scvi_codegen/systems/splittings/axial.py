@@ -92,7 +92,7 @@ def axial_turns(system: MechanicalSystem) -> tuple[MechanicalSystem, tuple[Turn,
     if not isinstance(system, HamiltonianSystem) or not (turns := tuple(sorted(_turns(system), key=lambda x: x.first))):
         return system, ()
     spin = (turn.kappa * turn.momentum(system.coordinates, system.momenta)[turn.axis] ** 2 / 2 for turn in turns)
-    removed = (-expand(each, power_base=False, multinomial=False) for each in spin)
+    removed = (-expand(energy, power_base=False, multinomial=False) for energy in spin)
     return replace(system, hamiltonian=Add(system.hamiltonian, *removed)), turns
 
 
@@ -125,14 +125,16 @@ def _turns(system: HamiltonianSystem) -> Iterator[Turn]:
     bound = system.damping != 0 or any(system.forces) or system.clock or system.arrays
     if bound or system.hamiltonian.atoms(AppliedUndef):
         return
-    for member in (each for each in system.rotations if isinstance(each, Rotation)):
+    for member in system.rotations:
+        if not isinstance(member, Rotation):
+            continue
         first = system.coordinates.index(symbol(member.coordinates[0]))
         p = system.momenta[first + 1 : first + 4]
         upright = dict(zip(system.coordinates[first : first + 4], (S.One, *(S.Zero,) * 3), strict=True))
         inverse = [expand(4 * system.hamiltonian.xreplace(upright).diff(x, 2)) for x in p]
         for axis in range(3):
-            one, other = (inverse[i] for i in range(3) if i != axis)
-            turn = Turn(first, axis, expand(inverse[axis] - one), one)
+            transverse, other = (inverse[i] for i in range(3) if i != axis)
+            turn = Turn(first, axis, expand(inverse[axis] - transverse), transverse)
             constant = turn.kappa != 0 and turn.kappa.free_symbols <= set(system.parameters)
-            if one == other and constant and turn.is_symmetry(system):
+            if transverse == other and constant and turn.is_symmetry(system):
                 yield turn

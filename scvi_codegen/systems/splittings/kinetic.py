@@ -74,7 +74,7 @@ class KineticSplitting:
             else:
                 offsets = {j: outer, k: inner}
                 g = _elliptic_turn(j, [intermediate(common + offsets.get(n, S.Zero)) for n in range(3)], momentum)
-            vector = [intermediate(each) for each in axes * Matrix(g.args[1:])]
+            vector = [intermediate(component) for component in axes * Matrix(g.args[1:])]
             real, size = intermediate(g.a), intermediate(sqrt(SMALLEST + g.a**2))
             less = intermediate(real - size - Add(*(x**2 for x in vector)) / (1 + size))
             moved[quaternion], turned[quaternion] = (list((x * Quaternion(less, *vector)).args) for x in pair)
@@ -88,25 +88,30 @@ def exponential(half: Sequence[Expr]) -> Quaternion:
 
 
 def _elliptic_turn(m: int, a: Sequence[Expr], momentum: Sequence[Expr]) -> Quaternion:
-    """Return g of a body with the inverse moments a, of which a_m is between the others, for t Pi."""
+    """Return g of a body with the inverse moments a, of which a_m is between the others, for t Pi.
+
+    sigma = sn/sqrt(A) with the modulus k^2 = B/A, so that cn^2 = 1 - A sigma^2, dn^2 = 1 - B sigma^2, sigma' = cn dn.
+    """
     left, right = (m + 2) % 3, (m + 1) % 3
     x, y, z = (momentum[axis] for axis in (left, m, right))
     ls, ms, lm = (intermediate(a[i] - a[j]) for i, j in ((left, right), (m, right), (left, m)))
     norm = intermediate(sqrt(Add(SMALLEST, x**2, y**2, z**2)))
     U = intermediate(ls * x**2 + ms * y**2)
-    A, B, N = (intermediate(each) for each in (lm * U, ms * (ls * z**2 + lm * y**2), ms * U))
+    A, B, N = (intermediate(invariant) for invariant in (lm * U, ms * (ls * z**2 + lm * y**2), ms * U))
     Q, step = intermediate(N * ls * norm), S.One / 2 ** (DOUBLINGS + 1)
-    p, q, r = (intermediate(each) for each in ((A + B) * step**2, A * B * step**4, N * step**2))
+    p, q, r = (intermediate(coefficient) for coefficient in ((A + B) * step**2, A * B * step**4, N * step**2))
+    # Taylor series of sigma and sigma' at the argument 2^-(DOUBLINGS + 1), and of the integral of the third kind.
     series = (S.One, -p, p**2 + 12 * q, -(p**3) - 132 * p * q)
     sigma = intermediate(step * Add(*(c / f for c, f in zip(series, (1, 6, 120, 5040), strict=True))))
     rate = intermediate(Add(*(c / f for c, f in zip(series, (1, 2, 24, 720), strict=True))))
     second = 2 * p**2 / 45 + q / 5 + 2 * p * r / 3 + r**2
     phases = [2**DOUBLINGS * Q * step**3 * (S.One / 3 - (p / 3 + r) / 5 + second / 7)]
+    # sn 2u = 2 sn cn dn/(1 - k^2 sn^4), and cn 2u, dn 2u likewise (Abramowitz-Stegun 16.18).
     for doubling in reversed(range(DOUBLINGS)):
         square = intermediate(sigma**2)
         product = intermediate(A * B * square**2)
         over = intermediate(1 / (1 - product))
-        cn, dn = (intermediate((1 + product - 2 * each * square) * over) for each in (A, B))
+        cn, dn = (intermediate((1 + product - 2 * factor * square) * over) for factor in (A, B))
         sigma, rate = intermediate(2 * sigma * rate * over), intermediate(cn * dn)
         phase = atan2(Q * square * sigma, 1 + N * (sigma**2 - square * rate))
         phases.append(2**doubling * intermediate(phase))
@@ -117,9 +122,9 @@ def _elliptic_turn(m: int, a: Sequence[Expr], momentum: Sequence[Expr]) -> Quate
     parts[1 + left] = (sine * rate + C * ls * sigma) * (x * dn - ms * sigma * cn * y * z)
     parts[1 + m] = (sine * dn + C * ms * sigma * cn) * (y * rate + ls * sigma * x * z)
     parts[1 + right] = sine * (1 + N * sigma**2) * (z * cn - lm * sigma * dn * x * y)
-    parts = [intermediate(each) for each in parts]
-    size = intermediate(sqrt(Add(*(each**2 for each in parts))))
-    return Quaternion(*(each / size for each in parts))
+    parts = [intermediate(part) for part in parts]
+    size = intermediate(sqrt(Add(*(part**2 for part in parts))))
+    return Quaternion(*(part / size for part in parts))
 
 
 @lru_cache(maxsize=64)
@@ -129,7 +134,7 @@ def kinetic_splitting(system: MechanicalSystem) -> KineticSplitting | str:
     if twin is not None and forms_of(twin).separable:
         return KineticSplitting(twin, forms_of(twin).force)
     forms, members, q, p = forms_of(system), system.rotations, system.coordinates, system.auxiliaries
-    bound = members and (system.constraints or not all(isinstance(each, Rotation) for each in members))
+    bound = members and (system.constraints or not all(isinstance(member, Rotation) for member in members))
     if not p or forms.one_form or system.damping != 0 or bound:
         return "there are constraints, damping, directions or spins, or masses that vary"
     places = [q.index(symbol(member.coordinates[0])) for member in members]
@@ -137,21 +142,21 @@ def kinetic_splitting(system: MechanicalSystem) -> KineticSplitting | str:
     for k in places:  # conj(q) p = (q . p, 2 Pi)
         values[k : k + 4] = (Quaternion(*q[k : k + 4]).conjugate() * Quaternion(*p[k : k + 4])).args
     upright: dict[Expr, Expr] = {q[i]: S(int(i in places)) for i in turning}
-    velocity = [expand(each.xreplace(upright)) if members else each for each in forms.legendre]
+    velocity = [expand(rate.xreplace(upright)) if members else rate for rate in forms.legendre]
     if jacobian(velocity, (*q, system.time)):
         return "the kinetic energy has coefficients that depend on coordinates or time"
     bodies = [_body(k, velocity[k : k + 4], p[k + 1 : k + 4], system) for k in places]
-    if reasons := [each for each in bodies if isinstance(each, str)]:
+    if reasons := [body for body in bodies if isinstance(body, str)]:
         return reasons[0]
     at_rest = dict.fromkeys(p, S.Zero)
     if members:
         energy = Add(*(v * x / 2 for v, x in zip(velocity, p, strict=True))).xreplace(dict(zip(p, values, strict=True)))
         if expand(system.formula - system.formula.xreplace(at_rest) - energy) != 0:
             return "the kinetic energy is not a quadratic form in the momenta with constant coefficients"
-    force = [each.xreplace(at_rest) for each in forms.force] if members else forms.force
+    force = [component.xreplace(at_rest) for component in forms.force] if members else forms.force
     if jacobian(system.forces if members else force, (*system.velocities, *p)):
         return "there are forces or torques that depend on velocities"
-    ordinary = tuple(S.Zero if i in turning else each for i, each in enumerate(velocity))
+    ordinary = tuple(S.Zero if i in turning else rate for i, rate in enumerate(velocity))
     return KineticSplitting(system, tuple(force), ordinary, *map(tuple, zip(*bodies, strict=True)))
 
 
@@ -172,7 +177,7 @@ def _body(first: int, v: Sequence[Expr], p: Sequence[Expr], system: MechanicalSy
 
 def _axes(first: int, inverse: Sequence[Expr], system: MechanicalSystem) -> tuple[tuple[int, ...], tuple[Expr, ...]]:
     """Return (first, i, j, k) and the rates of a body; inverse moments of i and j are the closest, j is the middle."""
-    defaults = [float(each.xreplace(system.constants)) for each in inverse]
+    defaults = [float(moment.xreplace(system.constants)) for moment in inverse]
     gaps = {axes: [abs(defaults[a] - defaults[b]) for a, b in pairwise(axes)] for axes in permutations(range(3))}
     i, j, k = min(gaps, key=gaps.__getitem__)
     return (first, i, j, k), (inverse[i], inverse[j] - inverse[i], inverse[k] - inverse[i])

@@ -172,20 +172,20 @@ def _expression(system: MechanicalSystem, value: Expr | str, role: str = "compon
     """Return a function of coordinates, time and parameters (generators: also momenta) from text or SymPy."""
     generates = role == "generator"
     momenta = system.momentum_symbols if generates else ()
-    known = {x.name: x for x in (*system.coordinates, *momenta, system.time, *system.parameters)}
+    symbols = {x.name: x for x in (*system.coordinates, *momenta, system.time, *system.parameters)}
     if isinstance(value, str):
-        return parse_expression(value, known)
+        return parse_expression(value, symbols)
     expression = sympy.sympify(value) if isinstance(value, int | float) else value
     if not isinstance(expression, Expr):
         raise SystemDefinitionError(f"a {role} must be text or a SymPy expression, not {value!r}")
-    unknown = sorted(free.name for free in expression.free_symbols if free.name not in known)
+    unknown = sorted(free.name for free in expression.free_symbols if free.name not in symbols)
     if unknown:
         kinds = "coordinate, momentum, time or parameter" if generates else "coordinate, time or parameter"
         rest = "" if generates else " Directions and gauges depend on nothing else; a generator may on momenta"
         raise SystemDefinitionError(
-            f"'{unknown[0]}' is not a {kinds} of '{system.name}'{closest(unknown[0], known)}{rest}"
+            f"'{unknown[0]}' is not a {kinds} of '{system.name}'{closest(unknown[0], symbols)}{rest}"
         )
-    expression = evaluated(expression, {free: known[free.name] for free in expression.free_symbols})
+    expression = evaluated(expression, {free: symbols[free.name] for free in expression.free_symbols})
     problem = unsupported_part(expression)
     if problem:
         raise SystemDefinitionError(f"in a {role}: {problem}")

@@ -378,7 +378,8 @@ def _quaternion_column(m: int, indices: Sequence[int], axis: int, sign: int) -> 
 
 def total_angular_momentum(system: MechanicalSystem) -> dict[str, Terms]:
     """Return the angular momentum of all bodies, rotations and directions about each axis of space, by name."""
-    columns, turning = rotation_columns(system), {name for each in system.rotations for name in each.coordinates}
+    columns = rotation_columns(system)
+    turning = {name for rotation in system.rotations for name in rotation.coordinates}
     ordinary = [i for i, q in enumerate(system.coordinates) if q.name not in turning]
     alone = [Body(name="", columns=tuple(ordinary))]
     rest = ["" if q.name in turning else q.name for q in system.coordinates]

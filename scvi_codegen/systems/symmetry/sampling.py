@@ -96,7 +96,7 @@ def array_forces(
     """Return the force on each coordinate at ``count`` points; ``at_points``: positions, parameters and time there."""
     if not term_groups:
         return [0.0] * len(coordinates)
-    q, force = np.array([at_points[each] for each in coordinates]), np.zeros((len(coordinates), count))
+    q, force = np.array([at_points[coordinate] for coordinate in coordinates]), np.zeros((len(coordinates), count))
     for term_group in term_groups:
         indices, values = np.array(term_group.places, dtype=int).reshape(-1, len(term_group.slots)), dict(at_points)
         values |= {slot: q[indices[:, k]] for k, slot in enumerate(term_group.slots)}
@@ -229,8 +229,8 @@ class Rates:
         """Points in 60 digits, empty if the system is defined nowhere; one suffices for term groups."""
         count = 1 if self.term_groups else VERIFIED_AT
         for near in (False, True):
-            drawn = drawn_parameters(self.constants, 1, near=near)
-            points = list(self.points({x: mp.mpf(float(value[0])) for x, value in drawn.items()}, count))
+            parameters = drawn_parameters(self.constants, 1, near=near)
+            points = list(self.points({x: mp.mpf(float(value[0])) for x, value in parameters.items()}, count))
             if points:
                 return points
         return []

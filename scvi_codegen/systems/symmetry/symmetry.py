@@ -231,7 +231,7 @@ def _of_rotations(system: MechanicalSystem) -> list[Terms]:
     motion = rates_of(system)
     if not motion.closed:
         return []
-    m, turning = system.dimension, {name for each in system.rotations for name in each.coordinates}
+    m, turning = system.dimension, {name for member in system.rotations for name in member.coordinates}
     ordinary = [i for i, q in enumerate(system.coordinates) if q.name not in turning]
     if len(ordinary) > MAX_SEARCHED_COORDINATES:  # the position of a base; joints have other forces
         ordinary = [i for i in ordinary if motion.forces[i].free_symbols.isdisjoint(motion.arguments)]
@@ -251,10 +251,10 @@ def _rigid(system: MechanicalSystem) -> list[Terms]:
         return _combined(*_conserved_by(system, rates_of(system), columns))
     motion = rates_of(parts.rest, parts.term_groups)
     of_few = replace(motion, term_groups=terms_among_few_bodies(parts.term_groups, bodies_of(system)))
-    rows, known = _conserved_by(parts.rest, of_few, columns)
-    if not all(confirmed(motion, known, row) for row in rows):
-        rows, known = _conserved_by(parts.rest, motion, columns)
-    return _combined(rows, known)
+    rows, conserved_columns = _conserved_by(parts.rest, of_few, columns)
+    if not all(confirmed(motion, conserved_columns, row) for row in rows):
+        rows, conserved_columns = _conserved_by(parts.rest, motion, columns)
+    return _combined(rows, conserved_columns)
 
 
 def _conserved_by(

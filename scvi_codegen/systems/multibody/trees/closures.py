@@ -62,13 +62,13 @@ def conditions_of(links: Sequence[Link], closures: Iterable[Closure | Coupling])
         SystemDefinitionError: if a joint does not exist or has no coordinate of its own.
     """
     conditions = [intermediate(g) for closure in closures for g in _conditions(links, closure)]
-    turning = [rotation_of(each.joint) for each in links if each.joint.kind in ("ball", "free")]
+    turning = [rotation_of(link.joint) for link in links if link.joint.kind in ("ball", "free")]
     in_coordinates = RotationNames(turning).in_coordinates
     rates: dict[Expr, Dummy] = {}
     rows = []
     for g in map(in_coordinates, conditions):
         q = sorted(g.free_symbols, key=str)
-        rates |= {each: Dummy() for each in q if each not in rates}
+        rates |= {coordinate: Dummy() for coordinate in q if coordinate not in rates}
         rows.append(Add(*(derivative * rates[q[j]] for j, derivative in gradient(g, q).items())))
     return [conditions[k] for k in independent_of((), rows, tuple(rates.values()))] if rows else []
 
@@ -88,7 +88,7 @@ def _conditions(links: Sequence[Link], closure: Closure | Coupling) -> Iterator[
 
 
 def _coordinate(links: Sequence[Link], name: str) -> Expr:
-    joints = {each.joint.name: each.joint for each in links if each.joint.kind in SINGLE}
+    joints = {link.joint.name: link.joint for link in links if link.joint.kind in SINGLE}
     if name not in joints:
         raise SystemDefinitionError(f"an equality names '{name}', which is no hinge or slide{closest(name, joints)}")
     return symbol(identifier(name))

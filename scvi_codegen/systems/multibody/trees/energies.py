@@ -74,9 +74,9 @@ class Tree:
         links = self.links = aligned(named(without_fixed(links)))
         self.gravity = exact_vector(gravity)
         self.joints = {link.joint.name: link.joint for link in links}
-        self.leaders = {each.name: self.leader(each) for each in self.joints.values() if each.kind in SINGLE}
-        self.masses = self.of_subtrees([exact_number(each.inertia.mass) for each in links])
-        self.weights = self.of_subtrees([exact_number(each.inertia.mass - each.inertia.lift[0]) for each in links])
+        self.leaders = {joint.name: self.leader(joint) for joint in self.joints.values() if joint.kind in SINGLE}
+        self.masses = self.of_subtrees([exact_number(link.inertia.mass) for link in links])
+        self.weights = self.of_subtrees([exact_number(link.inertia.mass - link.inertia.lift[0]) for link in links])
         self.moments = self.first_moments()
 
     def coordinate(self, joint: Joint) -> tuple[Expr, Expr]:
@@ -97,9 +97,9 @@ class Tree:
             if other in seen:
                 raise SystemDefinitionError(f"joint '{seen[0]}' follows itself: {', '.join((*seen, other))}")
             if other not in self.joints or self.joints[other].kind not in SINGLE:
-                known = [each.name for each in self.joints.values() if each.kind in SINGLE]
+                moving = [candidate.name for candidate in self.joints.values() if candidate.kind in SINGLE]
                 raise SystemDefinitionError(
-                    f"joint '{joint.name}' follows '{other}', which is no moving joint{closest(other, known)}"
+                    f"joint '{joint.name}' follows '{other}', which is no moving joint{closest(other, moving)}"
                 )
             seen.append(other)
             joint = self.joints[other]
@@ -136,8 +136,8 @@ class Tree:
     def first_moments(self) -> list[Matrix]:
         """Return the first moment of the weight of each subtree, in the frame of its root."""
         moments = [
-            exact_number(each.mass) * exact_vector(each.center) - exact_vector(each.lift[1])
-            for each in (link.inertia for link in self.links)
+            exact_number(inertia.mass) * exact_vector(inertia.center) - exact_vector(inertia.lift[1])
+            for inertia in (link.inertia for link in self.links)
         ]
         for i in reversed(range(len(self.links))):
             parent, joint = self.links[i].parent, self.links[i].joint
@@ -229,7 +229,7 @@ class Tree:
         Raises:
             SystemDefinitionError: if a joint does not exist.
         """
-        singles = [each.name for each in self.joints.values() if each.kind in SINGLE and not each.follows]
+        singles = [joint.name for joint in self.joints.values() if joint.kind in SINGLE and not joint.follows]
         if isinstance(actuated, bool):
             actuated = singles if actuated else []
         driven = [*map(identifier, actuated)]
@@ -237,11 +237,11 @@ class Tree:
             if name not in singles:
                 raise SystemDefinitionError(f"there is no hinge or slide '{name}' to act on{closest(name, singles)}")
         free = [joint for joint in self.joints.values() if joint.kind == "free"]
-        turning = [rotation_of(each) for each in self.joints.values() if each.kind in ("ball", "free")]
+        turning = [rotation_of(joint) for joint in self.joints.values() if joint.kind in ("ball", "free")]
         dissipation = self.dissipation()
         return {
             "coordinates": [symbol(name) for name in (*chain.from_iterable(map(position_of, free)), *singles)],
-            "rotations": {each.name: each.rate for each in turning},
+            "rotations": {rotation.name: rotation.rate for rotation in turning},
             "lagrangian": self.kinetic_energy() - self.potential_energy(),
             "dissipation": None if dissipation == 0 else dissipation,
             "forces": {name: symbol(f"tau_{name}") for name in driven},
@@ -271,12 +271,12 @@ def exact_number(value: float) -> Expr:
 
 def exact_vector(values: Vector) -> Matrix:
     """Return a vector of such numbers."""
-    return Matrix([exact_number(float(each)) for each in values])
+    return Matrix([exact_number(float(component)) for component in values])
 
 
 def exact_matrix(values: Vector) -> Matrix:
     """Return a matrix of such numbers."""
-    return Matrix([[exact_number(float(each)) for each in row] for row in values])
+    return Matrix([[exact_number(float(entry)) for entry in row] for row in values])
 
 
 SMALLEST = 12
@@ -309,10 +309,10 @@ def _in_quaternions(
     energy: Expr, *, parameters: Sequence[Symbol], rotations: Sequence[Any] = (), reduced: Any = None, **_: Any
 ) -> Expr:
     """Return the dual energy of the Lagrangian with these fields, with the energy of the lengths of quaternions."""
-    names = RotationNames([replace(each, momentum=True) for each in rotations])
+    names = RotationNames([replace(rotation, momentum=True) for rotation in rotations])
     if energy == 0 or not names.members:
         return energy
-    gauge = names.gauge(lambda each: names.inertia(each, reduced.lagrangian, parameters))
+    gauge = names.gauge(lambda rotation: names.inertia(rotation, reduced.lagrangian, parameters))
     return names.in_coordinates(energy) + gauge
 
 

@@ -97,7 +97,7 @@ class _MujocoModel:
             for tag, parts in (
                 ("compiler", self.inside("compiler")),
                 ("option", self.inside("option")),
-                ("flag", [flag for each in self.inside("option") for flag in each.children("flag")]),
+                ("flag", [flag for element in self.inside("option") for flag in element.children("flag")]),
             )
         )
         self.disabled = {key for key in flags.node.attrib if flags.choice(key, "enable", "disable") == "disable"}
@@ -123,9 +123,14 @@ class _MujocoModel:
     def inside(self, tag: str) -> list[Element]:
         return self.root.children(tag)
 
+    def entries(self, section: str) -> Iterator[Element]:
+        """Yield the elements in all sections of a name."""
+        for element in self.inside(section):
+            yield from element.children()
+
     def read_tendons(self) -> None:
         """Store the limits and dry friction of tendons."""
-        for tendon in (each for section in self.inside("tendon") for each in section.children()):
+        for tendon in self.entries("tendon"):
             self.read_limits(tendon, "tendons", tendon.name)
 
     def read(self, world: Element) -> None:
@@ -143,7 +148,7 @@ class _MujocoModel:
             for site in element.children("site"):
                 self.put(site, link, at @ self.pose(site))
             inner = (*element.children("frame"), *element.children("body"))
-            pending += [(each, link, at) for each in reversed(inner)]
+            pending += [(child, link, at) for child in reversed(inner)]
 
     def put(self, element: Element, link: int, at: Pose) -> None:
         """Store the place of a body or site, if it has a name."""
@@ -197,29 +202,29 @@ class _MujocoModel:
             return False
         sections = self.inside("contact")
         excluded = {
-            frozenset(self.place(each, key)[0] for key in ("body1", "body2"))
+            frozenset(self.place(exclusion, key)[0] for key in ("body1", "body2"))
             for section in sections
-            for each in section.children("exclude")
+            for exclusion in section.children("exclude")
         }
         near = set() if "filterparent" in self.disabled else {*self.parents.items()}
-        for (one, *types), (two, *others) in combinations(self.shapes, 2):
-            a, b = self.carriers[one], self.carriers[two]
+        for (first, *types), (second, *others) in combinations(self.shapes, 2):
+            a, b = self.carriers[first], self.carriers[second]
             filtered = a == b or (min(a, b) >= 0 and not near.isdisjoint({(a, b), (b, a)}))
-            if not filtered and (types[0] & others[1] or others[0] & types[1]) and {one, two} not in excluded:
+            if not filtered and (types[0] & others[1] or others[0] & types[1]) and {first, second} not in excluded:
                 return True
         return any(section.children("pair") for section in sections)
 
     def read_actuators(self) -> None:
         """Add the inertias of rotors and the damping of actuators, which are those of lengths gear q, to joints."""
         places = {link.joint.name: i for i, link in enumerate(self.links) if link.joint.kind in SINGLE}
-        for each in (actuator for section in self.inside("actuator") for actuator in section.children()):
-            self.unread.add("actuators", each.name)
-            armature, damping = (each.number(key, 0, 0) for key in ("armature", "damping"))
+        for actuator in self.entries("actuator"):
+            self.unread.add("actuators", actuator.name)
+            armature, damping = (actuator.number(key, 0, 0) for key in ("armature", "damping"))
             if armature or damping:
-                place = places.get(each.text("joint", each.text("jointinparent", "")))
+                place = places.get(actuator.text("joint", actuator.text("jointinparent", "")))
                 if place is None:
-                    each.refuse("has armature or damping, which is read of actuators of hinges and slides only")
-                joint, factor = self.links[place].joint, each.vector("gear", (1,), range(1, 7))[0] ** 2
+                    actuator.refuse("has armature or damping, which is read of actuators of hinges and slides only")
+                joint, factor = self.links[place].joint, actuator.vector("gear", (1,), range(1, 7))[0] ** 2
                 damping = joint.damping + factor * damping * ("damper" not in self.disabled)
                 joint = replace(joint, damping=damping, armature=joint.armature + factor * armature)
                 self.links[place] = replace(self.links[place], joint=joint)
@@ -239,22 +244,22 @@ class _MujocoModel:
 
         https://mujoco.readthedocs.io/en/stable/XMLreference.html#equality
         """
-        for each in (equality for section in self.inside("equality") for equality in section.children()):
-            if each.choice("active", "true", "false") == "false" or self.disabled & {"equality", "constraint"}:
+        for equality in self.entries("equality"):
+            if equality.choice("active", "true", "false") == "false" or self.disabled & {"equality", "constraint"}:
                 continue
-            if each.tag == "joint":
-                yield self.coupling(each)
-            elif each.tag in ("connect", "weld"):
-                yield self.closure(each)
+            if equality.tag == "joint":
+                yield self.coupling(equality)
+            elif equality.tag in ("connect", "weld"):
+                yield self.closure(equality)
             else:
-                each.refuse("is not read: remove it or write a constraint")
+                equality.refuse("is not read: remove it or write a constraint")
 
     def place(self, element: Element, key: str) -> tuple[int, Pose]:
         """Return the link and the pose in it of the body or site that an attribute names."""
         kind, name = key[:-1], element.text(key, "world" if key == "body2" else None)
         if (kind, name) not in self.places:
-            known = [each for tag, each in self.places if tag == kind]
-            element.refuse(f"names the {kind} '{name}', which does not exist{closest(name, known)}")
+            names = [other for tag, other in self.places if tag == kind]
+            element.refuse(f"names the {kind} '{name}', which does not exist{closest(name, names)}")
         return self.places[kind, name]
 
     def closure(self, equality: Element) -> Closure:
@@ -263,8 +268,8 @@ class _MujocoModel:
         mixed = [key for key in ("body1", "body2", "anchor", "relpose") if equality.has(key)]
         if mixed and kind == "site":
             equality.refuse(f"has site1 and {mixed[0]}: sites or bodies are needed")
-        (one, at), (two, end) = (self.place(equality, f"{kind}{k}") for k in (1, 2))
-        if one == two:
+        (first, at), (second, end) = (self.place(equality, f"{kind}{k}") for k in (1, 2))
+        if first == second:
             equality.refuse("is between a body and itself")
         turning = equality.tag == "weld"
         if turning and equality.number("torquescale", 1) <= 0:
@@ -274,15 +279,15 @@ class _MujocoModel:
             if pose[3:].any():
                 at = Pose(pose[:3], _of_quaternion(equality, pose[3:]))
             else:
-                at = at_reference(self.links, one).inverse @ at_reference(self.links, two)
+                at = at_reference(self.links, first).inverse @ at_reference(self.links, second)
         elif kind == "body":
             at = Pose(equality.vector("anchor"))
-            end = at_reference(self.links, two).inverse @ at_reference(self.links, one) @ at
-        return Closure((one, two), (at, end), turning)
+            end = at_reference(self.links, second).inverse @ at_reference(self.links, first) @ at
+        return Closure((first, second), (at, end), turning)
 
     def coupling(self, equality: Element) -> Coupling:
         """Return a relation between two joints, or the fixed value of one."""
-        zeros = {each.joint.name: each.joint.zero for each in self.links}
+        zeros = {link.joint.name: link.joint.zero for link in self.links}
         joint, other = equality.text("joint1"), equality.text("joint2", "") or None
         if joint == other:
             equality.refuse(f"is between joint '{joint}' and itself")
@@ -297,7 +302,7 @@ class _MujocoModel:
         if kind == "free" and parent >= 0:
             joint.refuse("is free, but its body is inside another body")
         turn = self.turn if kind == "hinge" else 1.0
-        stiffness, rest, zero = (joint.number(each, 0) for each in ("stiffness", "springref", "ref"))
+        stiffness, rest, zero = (joint.number(key, 0) for key in ("stiffness", "springref", "ref"))
         if "spring" in self.disabled:
             stiffness = 0.0
         if kind in ("ball", "free") and stiffness != 0:
@@ -381,7 +386,7 @@ class _MujocoModel:
 
     def orientation(self, element: Element) -> Vector:
         """Return the rotation matrix of the one attribute of orientation that an element has."""
-        present = [each for each in ORIENTATIONS if each in element.node.attrib]
+        present = [attribute for attribute in ORIENTATIONS if attribute in element.node.attrib]
         if len(present) > 1:
             element.refuse(f"has {' and '.join(present)}: one orientation is needed")
         kind = present[0] if present else ""
@@ -417,7 +422,7 @@ class _MujocoModel:
         masses = sum(link.inertia.mass for link in self.links)
         if total <= 0 or masses == 0:
             return self.links
-        return [replace(each, inertia=each.inertia.scaled(total / masses)) for each in self.links]
+        return [replace(link, inertia=link.inertia.scaled(total / masses)) for link in self.links]
 
 
 def _merged(root: Element, tag: str, parts: list[Element]) -> Element:
@@ -443,8 +448,8 @@ def _include(root: Element) -> None:
             name = Path(child.text("file"))
             if name.is_absolute() or set(child.node.attrib) != {"file"} or len(child.node):
                 child.refuse(f"must have only file, a path relative to the folder of the document: '{name}'")
-            folders = [Path(each).parent for each in (root.file, child.file)]
-            path = next((each / name for each in folders if (each / name).exists()), folders[0] / name)
+            folders = [Path(file).parent for file in (root.file, child.file)]
+            path = next((folder / name for folder in folders if (folder / name).exists()), folders[0] / name)
             if not is_inside(folders[0], path):
                 where = "outside the folder of the main document"
                 child.refuse(f"names '{name}' {where}: copy it there, or name its folder ({FOLDERS})")
@@ -455,7 +460,7 @@ def _include(root: Element) -> None:
             root.files.update(dict.fromkeys(included.node, included.file))
             children.extendleft(Element(included.file, node, root.files) for node in reversed(included.node))
         if len(nodes) != len(outer.node) or any(a.node is not b for a, b in zip(nodes, outer.node, strict=True)):
-            outer.node[:] = [each.node for each in nodes]
+            outer.node[:] = [element.node for element in nodes]
         pending += nodes
 
 

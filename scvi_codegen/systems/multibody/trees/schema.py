@@ -31,7 +31,7 @@ class Kind:
     ) -> None:
         self.refused, self.defaults = refused or {}, defaults
         self.attributes = {*read.split(), *ignored.split(), *self.refused}
-        parsed = [re.fullmatch(r"(\w+)(?:=(\w+))?([*~!]?)", each).groups() for each in children.split()]  # type: ignore[union-attr]
+        parsed = [re.fullmatch(r"(\w+)(?:=(\w+))?([*~!]?)", child).groups() for child in children.split()]  # type: ignore[union-attr]
         self.children = {tag: {"~": "unchecked", "!": "refused"}.get(mark, kind or tag) for tag, kind, mark in parsed}
         self.repeated = {tag for tag, _, mark in parsed if mark}
 
@@ -84,7 +84,7 @@ MJCF = {
     "default": Kind(
         "class",
         children="default* joint geom site equality=any_equality tendon=spatial mesh~ texture~ material~ "
-        f"camera~ light~ pair~ {' '.join(f'{each}=actuated' for each in ACTUATORS.split())}",
+        f"camera~ light~ pair~ {' '.join(f'{tag}=actuated' for tag in ACTUATORS.split())}",
     ),
     "worldbody": Kind(children=BODIES),
     "body": Kind(f"name childclass pos {TURN} gravcomp mocap", "fuse simple sleep user", None, f"{BODIES} {JOINTS}"),
@@ -120,7 +120,7 @@ MJCF = {
     "tendon": Kind(children="spatial* fixed*"),
     "spatial": TENDON,
     "fixed": TENDON,
-    "actuator": Kind(children=" ".join(f"{each}=actuated*" for each in ACTUATORS.split())),
+    "actuator": Kind(children=" ".join(f"{tag}=actuated*" for tag in ACTUATORS.split())),
     "actuated": Kind(
         "name class joint jointinparent gear armature damping",
         "actdim actearly actlimited actrange area bias biasprm biastype body cogging controller cranklength cranksite "

@@ -74,7 +74,7 @@ class Inertia:
         mass = self.mass + other.mass
         center = (self.mass * self.center + other.mass * other.center) / mass if mass else self.center
         lift = self.lift[0] + other.lift[0], self.lift[1] + other.lift[1]
-        return Inertia(mass, center, sum((each.about(center) for each in (self, other)), np.zeros((3, 3))), lift)
+        return Inertia(mass, center, sum((part.about(center) for part in (self, other)), np.zeros((3, 3))), lift)
 
     def about(self, point: Vector) -> Vector:
         """Return the inertia matrix about a point (parallel axis theorem)."""
@@ -143,7 +143,7 @@ class DrawnLink:
     def of(cls, link: Link) -> DrawnLink:
         """Return the geometry of a link whose frame is that of its formulas, :func:`aligned`."""
         joint, rotation = link.joint, tuple(tuple(row) for row in link.joint.pose.rotation.tolist())
-        position, center = (tuple(each.tolist()) for each in (joint.pose.position, link.inertia.center))
+        position, center = (tuple(vector.tolist()) for vector in (joint.pose.position, link.inertia.center))
         return cls(link.parent, joint.name, joint.kind, position, rotation, center, joint.zero, joint.follows)
 
 

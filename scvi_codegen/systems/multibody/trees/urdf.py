@@ -83,11 +83,11 @@ def _unread(robot: Element) -> Unread:
 
 def _by_name(robot: Element, tag: str) -> dict[str, Element]:
     elements: dict[str, Element] = {}
-    for each in robot.children(tag):
-        name = each.text("name")
+    for element in robot.children(tag):
+        name = element.text("name")
         if name in elements:
-            each.refuse("is defined twice")
-        elements[name] = each
+            element.refuse("is defined twice")
+        elements[name] = element
     return elements
 
 
@@ -102,7 +102,7 @@ def _joint(joint: Element) -> Joint:
     kind = joint.text("type")
     if kind not in KINDS:
         joint.refuse(f"is of type '{kind}', which is not read; possible: {', '.join(KINDS)}")
-    axis, dynamics, mimic = (joint.child(each) for each in ("axis", "dynamics", "mimic"))
+    axis, dynamics, mimic = (joint.child(tag) for tag in ("axis", "dynamics", "mimic"))
     single = KINDS[kind] in SINGLE
     follows = None
     if mimic is not None and kind != "fixed":
@@ -126,7 +126,7 @@ def _inertia(link: Element) -> Inertia:
     mass, inertia = inertial.child("mass"), inertial.child("inertia")
     if mass is None or inertia is None:
         link.refuse("has an <inertial>, which needs <mass> and <inertia>")
-    xx, xy, xz, yy, yz, zz = (inertia.number(f"i{each}") for each in ("xx", "xy", "xz", "yy", "yz", "zz"))
+    xx, xy, xz, yy, yz, zz = (inertia.number(f"i{indices}") for indices in ("xx", "xy", "xz", "yy", "yz", "zz"))
     matrix = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     return Inertia(mass.number("value", least=0), matrix=matrix).seen_from(_pose(inertial))
 
