@@ -112,7 +112,7 @@ class Commands(click.Group):
     def invoke(self, ctx: click.Context) -> Any:
         """Run a command; convert errors into messages and exit statuses, with ``--json`` also into a document."""
         if "--json" in ctx.args:  # before arguments are read, whose errors it contains
-            _begin_report(ctx, None, wanted=True)
+            _begin_report(ctx, None, as_json=True)
         try:
             with errors_as_messages():
                 return super().invoke(ctx)
@@ -127,7 +127,7 @@ def _described(error: click.ClickException) -> dict[str, Any]:
     fields: dict[str, Any] = {}
     cause = error.__cause__
     while cause is not None:
-        fields = {name: each for name, each in vars(cause).items() if isinstance(each, str | int | float)} | fields
+        fields = {name: value for name, value in vars(cause).items() if isinstance(value, str | int | float)} | fields
         cause = cause.__cause__
     kind = type(error.__cause__ or error).__name__
     return {"type": kind, "message": error.format_message(), "exit_status": error.exit_code} | fields
@@ -180,8 +180,8 @@ def reporting(command: Command) -> Command:
     return quiet(as_json(command))
 
 
-def _begin_report(context: click.Context, parameter: click.Parameter | None, wanted: bool) -> None:
-    if not wanted or REPORT in context.meta:
+def _begin_report(context: click.Context, parameter: click.Parameter | None, as_json: bool) -> None:
+    if not as_json or REPORT in context.meta:
         return
     report: dict[str, Any] = {}
     context.meta[REPORT] = report
@@ -193,9 +193,9 @@ def _begin_report(context: click.Context, parameter: click.Parameter | None, wan
     context.call_on_close(print_report)
 
 
-def _be_quiet(context: click.Context, parameter: click.Parameter, wanted: bool) -> None:
-    context.meta[QUIET] = wanted
-    if wanted:
+def _be_quiet(context: click.Context, parameter: click.Parameter, quiet: bool) -> None:
+    context.meta[QUIET] = quiet
+    if quiet:
         context.with_resource(announce_to(lambda _: None))
 
 
@@ -225,9 +225,9 @@ def _plain(value: Any) -> Any:
     if hasattr(value, "tolist"):  # of NumPy, which is not imported here
         value = value.tolist()
     if isinstance(value, Mapping):
-        return {str(key): _plain(each) for key, each in value.items()}
+        return {str(key): _plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(each) for each in value]
+        return [_plain(entry) for entry in value]
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return str(value) if isinstance(value, Path) else value

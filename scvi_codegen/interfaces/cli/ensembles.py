@@ -111,8 +111,8 @@ def _extremes(result: EnsembleTrajectory) -> Iterator[str]:
         return
     interface = result.stepper.interface
     least, largest = np.nanmin(result.observed[0], axis=0), np.nanmax(result.observed[1], axis=0)
-    for name, one, other in zip((*interface.coordinates, *interface.momenta), least, largest, strict=True):
-        yield f"  {name}: {one:.6g} to {other:.6g} over all steps"
+    for name, lowest, highest in zip((*interface.coordinates, *interface.momenta), least, largest, strict=True):
+        yield f"  {name}: {lowest:.6g} to {highest:.6g} over all steps"
 
 
 def _describe_steps(model: Model, result: EnsembleTrajectory) -> str:

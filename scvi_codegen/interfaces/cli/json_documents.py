@@ -31,7 +31,7 @@ def _step_size(model: Model, run: Any) -> float | None:
 
 
 def run_numbers(
-    model: Model, outcome: RunOutcome, known: Known | None, account: EnergyAccount | None = None
+    model: Model, outcome: RunOutcome, final_error: Known | None, account: EnergyAccount | None = None
 ) -> dict[str, Any]:
     """Return the numbers of a run in memory."""
     run, trajectory = outcome.run, outcome.trajectory
@@ -55,8 +55,10 @@ def run_numbers(
         "step_error": trajectory.step_error,
         "worst_step_time": trajectory.worst_step_time,
         "final": {"t": t, "q": _named(model, q), "p": _named(model, p), **_low_words(model, q, p)},
-        "final_error": None if known is None else {"q": _named(model, known.q), "p": _named(model, known.p)},
-        "chaotic": None if known is None else known.chaotic,
+        "final_error": None
+        if final_error is None
+        else {"q": _named(model, final_error.q), "p": _named(model, final_error.p)},
+        "chaotic": None if final_error is None else final_error.chaotic,
         "failure": failure_text(outcome),
         "missed": outcome.missed or _missed_end(outcome, t, f"t = {model.t + model.covered:g}"),
     }
@@ -64,9 +66,9 @@ def run_numbers(
 
 def _low_words(model: Model, q: Any, p: Any) -> dict[str, Any]:
     """Return the low words of a state in double-double arithmetic."""
-    return (
-        {"q_low": _named(model, low_words(q)), "p_low": _named(model, low_words(p))} if model.in_double_double else {}
-    )
+    if not model.in_double_double:
+        return {}
+    return {"q_low": _named(model, low_words(q)), "p_low": _named(model, low_words(p))}
 
 
 def failure_text(outcome: RunOutcome | RecordedOutcome) -> str | None:
@@ -101,7 +103,7 @@ def recorded_numbers(recorded: RecordedRun) -> dict[str, Any]:
             "t": float(recorded.t[-1]),
             "q": _by_name(interface.coordinates, recorded.q[-1]),
             "p": _by_name(interface.coordinates, recorded.p[-1]),
-            **{f"{name}_low": _by_name(interface.coordinates, each[-1].low) for name, each in words},
+            **{f"{name}_low": _by_name(interface.coordinates, states[-1].low) for name, states in words},
         },
         "finished": recorded.finished,
     }

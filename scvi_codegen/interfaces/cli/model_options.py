@@ -145,7 +145,7 @@ def complete_method(context: click.Context, parameter: click.Parameter, incomple
     """Offer names of methods for shell completion; after a colon with degree, number of stages or order."""
     name, colon, _ = incomplete.partition(":")
     offered = [f"{name}:{number}" for number in OFFERED_SIZES] if colon and size_of(name) else METHODS
-    return [CompletionItem(one) for one in offered if one.startswith(incomplete)]
+    return [CompletionItem(text) for text in offered if text.startswith(incomplete)]
 
 
 def complete_model(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:

@@ -32,7 +32,7 @@ from scvi_codegen.runs.stepping.step_plan import Adaptive, Fixed, FixedSteps, In
 SUFFIX = ".run"
 MAX_STATES = 10_000
 """Largest number of states used to summarise what was conserved."""
-WITH_RESUME = {"resume", "checkpoint", *(each.name for each in OPTIONS if each.determines == DURATION)}
+WITH_RESUME = {"resume", "checkpoint", *(option.name for option in OPTIONS if option.determines == DURATION)}
 """Options that are allowed with ``--resume``."""
 
 
@@ -54,8 +54,8 @@ def check_format(output: str, *, ensemble: bool) -> None:
 def check_resumed(context: click.Context) -> None:
     """Reject options that would change the run that ``--resume`` continues."""
     for name in context.params:
-        chosen = context.get_parameter_source(name) is not click.core.ParameterSource.DEFAULT
-        if chosen and name not in WITH_RESUME:
+        passed = context.get_parameter_source(name) is not click.core.ParameterSource.DEFAULT
+        if passed and name not in WITH_RESUME:
             word = "MODEL" if name == "model_name" else f"--{name.replace('_', '-')}"
             raise click.UsageError(
                 f"{word} is not allowed with --resume: the folder defines the run; only --steps or --span may extend it"

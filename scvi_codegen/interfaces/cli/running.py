@@ -111,7 +111,7 @@ def integrate_model(model: Model) -> RunOutcome:
     )
 
 
-def summary(model: Model, outcome: RunOutcome, known: Known | None, account: EnergyAccount | None = None) -> str:
+def summary(model: Model, outcome: RunOutcome, final_error: Known | None, account: EnergyAccount | None = None) -> str:
     """Return a summary of a run in a few lines; shorter if no step was completed."""
     run, trajectory, method, arrays = outcome.run, outcome.trajectory, model.method, model.array_system
     order = "no order claimed" if method.order is None else f"order {method.order}"
@@ -131,14 +131,14 @@ def summary(model: Model, outcome: RunOutcome, known: Known | None, account: Ene
             lines.append(f"action: {trajectory.action():.15g}")
         lines += worst_step(trajectory)
     return "\n".join(
-        [*lines, *event_counts(trajectory.events), *final_state(run.stepper.interface, *outcome.end[1:], known)]
+        [*lines, *event_counts(trajectory.events), *final_state(run.stepper.interface, *outcome.end[1:], final_error)]
     )
 
 
 def event_counts(events: Iterable[Crossings]) -> Iterator[str]:
     """Yield a line for each event with its number of crossings."""
-    for each in events:
-        yield f"event {each.event.function}: {counted(len(each), 'crossing')}"
+    for crossings in events:
+        yield f"event {crossings.event.function}: {counted(len(crossings), 'crossing')}"
 
 
 def _geometry(model: Model, run: Run) -> str:
@@ -175,10 +175,10 @@ def describe_step_size(model: Model, run: Run) -> str:
 
 
 def _speed(outcome: RunOutcome, model: Model) -> str:
-    each, trajectory = outcome.seconds / outcome.trajectory.steps, outcome.trajectory
-    text = f"{outcome.seconds:.3g} s, {duration(each)} a step"
+    seconds, trajectory = outcome.seconds / outcome.trajectory.steps, outcome.trajectory
+    text = f"{outcome.seconds:.3g} s, {duration(seconds)} a step"
     if model.array_system is not None:
-        text += f", {duration(each / model.dimension)} a step and coordinate"
+        text += f", {duration(seconds / model.dimension)} a step and coordinate"
     saved = trajectory.t[-1] == outcome.end[0]  # else iterations are known up to the last saved state
     watched = outcome.run.steps if saved else (len(trajectory) - 1) * model.save_every
     text += f", {int(np.sum(trajectory.iterations)) / watched:.2f} iterations a step" if watched else ""
@@ -217,7 +217,9 @@ def worst_step(trajectory: Trajectory) -> Iterator[str]:
             )
 
 
-def final_state(interface: Interface, positions: Array, momenta: Array, known: Known | None = None) -> Iterator[str]:
+def final_state(
+    interface: Interface, positions: Array, momenta: Array, final_error: Known | None = None
+) -> Iterator[str]:
     """Yield lines with the final coordinates and momenta, in the digits that are known to be right."""
     names, columns = interface.coordinates, interface.momentum_columns
     shown, column = names[:SHOWN_COORDINATES], max(map(len, columns[:SHOWN_COORDINATES]))
@@ -227,20 +229,18 @@ def final_state(interface: Interface, positions: Array, momenta: Array, known: K
         for name, q, other, p in zip(shown, as_text(positions), columns, as_text(momenta), strict=False):
             yield f"  {name:{width}} = {q:40} {other:{column}} = {p}"
         return
-    yield f"final state ({_how_known(known)})"
+    yield f"final state ({_how_known(final_error)})"
     for i, (name, other, q, p) in enumerate(zip(shown, columns, positions, momenta, strict=False)):
-        known_q, known_p = (known.q[i], known.p[i]) if known else (0.0, 0.0)
-        yield f"  {name:{width}} = {in_known_digits(q, known_q):24} {other:{column}} = {in_known_digits(p, known_p)}"
+        error_q, error_p = (final_error.q[i], final_error.p[i]) if final_error else (0.0, 0.0)
+        yield f"  {name:{width}} = {in_known_digits(q, error_q):24} {other:{column}} = {in_known_digits(p, error_p)}"
     if len(names) > SHOWN_COORDINATES:
         yield f"  and {len(names) - SHOWN_COORDINATES} more coordinates"
 
 
-def _how_known(known: Known | None) -> str:
-    if known is None:
+def _how_known(final_error: Known | None) -> str:
+    if final_error is None:
         return "accuracy unknown: no second run to compare with"
     message = "in the digits confirmed by a second run"
-    return (
-        f"{message}; chaotic: neighbouring trajectories diverge tenfold every {known.tenfold:.2g}"
-        if known.chaotic
-        else message
-    )
+    if final_error.chaotic:
+        message += f"; chaotic: neighbouring trajectories diverge tenfold every {final_error.tenfold:.2g}"
+    return message

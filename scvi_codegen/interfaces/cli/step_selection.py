@@ -40,10 +40,10 @@ def model_with_global_error(model: Model, error: float) -> tuple[Model, GlobalEr
     The estimate compares runs with different steps and is printed. Steps of one tolerance are reproducible to the last
     bit, so that the run that follows is the one whose error was estimated.
     """
-    wanted = model._with_step_size(error=error)
+    bounded = model._with_step_size(error=error)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AccuracyWarning)  # reported in the line printed below
-        result = wanted.confirmed(wanted.stepper())
+        result = bounded.confirmed(bounded.stepper())
     local = f"local tolerance of {'round-off' if result.tolerance is None else f'{result.tolerance:.1e}'}"
     local += "" if result.max_step == math.inf else f" and steps of at most {result.max_step:.3g}"
     local = local if result.h is None else f"step of tau of {result.h:.6g}"
@@ -67,12 +67,12 @@ def model_with_global_error(model: Model, error: float) -> tuple[Model, GlobalEr
         global_error=numbers,
     )
     if result.h is not None:
-        signed = math.copysign(result.h, wanted.covered)
+        signed = math.copysign(result.h, bounded.covered)
         fixed: dict[str, Any] = dict.fromkeys(OF_ADAPTIVE_STEPS)
-        return replace(wanted, h=signed, **fixed, span=abs(wanted.covered), error=None), result
-    precision = DOUBLE_DOUBLE if in_words else wanted.precision
+        return replace(bounded, h=signed, **fixed, span=abs(bounded.covered), error=None), result
+    precision = DOUBLE_DOUBLE if in_words else bounded.precision
     steps: dict[str, Any] = dict(result.steps)
-    return replace(wanted, **steps, error=None, precision=precision), result
+    return replace(bounded, **steps, error=None, precision=precision), result
 
 
 def model_with_advised_step(

@@ -19,8 +19,8 @@ def check_memory(model: Model, trajectories: int = 1) -> None:
     """Reject a run of a known number of steps whose saved states do not fit into memory; others end with them."""
     steps = 0 if model.ends_at_time else model.step_count
     saved = steps // model.save_every + 1
-    each = 16 * model.dimension * trajectories + 12  # q and p of each; time and iterations
-    room = room_for_states() / each
+    bytes_of_state = 16 * model.dimension * trajectories + 12  # q and p of each; time and iterations
+    room = room_for_states() / bytes_of_state
     if saved <= room:
         return
     states, remedies = f"{saved} states", list[str]()
@@ -30,7 +30,7 @@ def check_memory(model: Model, trajectories: int = 1) -> None:
         remedies.append("record the run in a folder (-o NAME.run)")
     else:
         states += f" of each of {trajectories} trajectories"
-    needed = f"{COPIES * each * saved / 1e9:.3g} GB of memory"
+    needed = f"{COPIES * bytes_of_state * saved / 1e9:.3g} GB of memory"
     raise StateError(f"{states} need {needed}: {' or '.join(remedies or ['reduce the number of steps'])}")
 
 

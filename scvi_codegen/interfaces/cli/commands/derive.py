@@ -64,10 +64,12 @@ def _formulas(equations: StepEquations) -> dict[str, Any]:
     """Return the document of ``--json``: formulas as text, equations as residuals, the new state in order."""
     return {
         "unknowns": [symbol.name for symbol in equations.unknowns],
-        "equations": [{"number": each.number, "residual": str(each.residual)} for each in equations.equations],
+        "equations": [
+            {"number": equation.number, "residual": str(equation.residual)} for equation in equations.equations
+        ],
         "end": {
-            "q": [str(each.residual) for each in equations.end_position],
-            "p": [str(each.residual) for each in equations.end_momentum],
+            "q": [str(equation.residual) for equation in equations.end_position],
+            "p": [str(equation.residual) for equation in equations.end_momentum],
         },
         "initial_guess": {symbol.name: str(value) for symbol, value in equations.initial_guess.items()},
         "entries": {entry.symbol.name: float(entry.value) for entry in equations.entries},

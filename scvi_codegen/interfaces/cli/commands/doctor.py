@@ -71,7 +71,7 @@ def run_checks() -> Iterator[CheckResult]:
     yield _packages("", "libraries")
     yield from _compilation()
     yield _cache()
-    for extra in dict.fromkeys(wanted["extra"] for wanted in _described(PACKAGE)):
+    for extra in dict.fromkeys(requirement["extra"] for requirement in _described(PACKAGE)):
         if extra:
             yield _packages(extra, f"extra {extra}")
     yield _gpu()
@@ -96,11 +96,11 @@ def _cores() -> str:
 
 def _requirements(package: str, extra: str) -> Iterator[dict[str, str]]:
     """Yield the requirements of an extra of an installed package ("": the unconditional ones), recursively."""
-    for wanted in _described(package):
-        if wanted["extra"] == extra:
-            yield wanted
-            if wanted["own"]:
-                yield from _requirements(wanted["name"], wanted["own"])
+    for requirement in _described(package):
+        if requirement["extra"] == extra:
+            yield requirement
+            if requirement["own"]:
+                yield from _requirements(requirement["name"], requirement["own"])
 
 
 def _described(package: str) -> list[dict[str, str]]:
@@ -114,15 +114,15 @@ def _described(package: str) -> list[dict[str, str]]:
 
 def _packages(extra: str, name: str) -> CheckResult:
     present, absent = [], []
-    for wanted in _requirements(PACKAGE, extra):
+    for requirement in _requirements(PACKAGE, extra):
         try:
-            installed = version(wanted["name"])
+            installed = version(requirement["name"])
         except PackageNotFoundError:
-            absent.append(wanted["name"])
+            absent.append(requirement["name"])
             continue
-        present.append(f"{wanted['name']} {installed}")
-        if _numbers(installed) < _numbers(wanted["least"]):
-            absent.append(f"{wanted['name']} >= {wanted['least']}")
+        present.append(f"{requirement['name']} {installed}")
+        if _numbers(installed) < _numbers(requirement["least"]):
+            absent.append(f"{requirement['name']} >= {requirement['least']}")
     if not absent:
         return CheckResult(name, OK, ", ".join(present))
     remedy = f"missing {', '.join(absent)}: pip install '{PACKAGE}{f'[{extra}]' if extra else ''}'"
@@ -145,8 +145,8 @@ def _compilation() -> Iterator[CheckResult]:
     bundled = from_wheel(command) and not os.environ.get("CC")
     reason = " (extra compiler: the PATH has no cc, gcc or clang)" if bundled else ""
     yield CheckResult("compiler", OK, f"{' '.join(command)}: {title}{reason}")
-    chosen = [flags, f"({FLAGS_VARIABLE})"] if (flags := os.environ.get(FLAGS_VARIABLE, "")) else []
-    yield CheckResult("flags", OK, " ".join([*TUNED_FLAGS, *chosen]))
+    further = [flags, f"({FLAGS_VARIABLE})"] if (flags := os.environ.get(FLAGS_VARIABLE, "")) else []
+    yield CheckResult("flags", OK, " ".join([*TUNED_FLAGS, *further]))
     with tempfile.TemporaryDirectory(prefix="scvi-codegen-doctor-", ignore_cleanup_errors=True) as folder:
         trial = _trial(Path(folder))
         yield trial

@@ -55,10 +55,10 @@ def path(model_name: str, output: str | None, plot: str | None, **choices: Any) 
         check_writable(FilePath(plot), "'--plot'")
         check_plot_path(plot, PICTURES)
     model = with_known_sizes(read_model(model_name, choices), "path")
-    found = _paths(model)
-    title = f"{model.system.name}\n{model.method.title}; {counted(len(found), 'path')}"
-    tell("\n".join([title, *map(_described, found)]), **_numbers(model, found))
-    trajectory = _trajectory(found[0]) if output or plot else None
+    paths = _paths(model)
+    title = f"{model.system.name}\n{model.method.title}; {counted(len(paths), 'path')}"
+    tell("\n".join([title, *map(_described, paths)]), **_numbers(model, paths))
+    trajectory = _trajectory(paths[0]) if output or plot else None
     for target, write in ((output, "save"), (plot, "plot")):
         if target is not None:
             getattr(trajectory, write)(target)
@@ -69,25 +69,25 @@ def path(model_name: str, output: str | None, plot: str | None, **choices: Any) 
 
 def _paths(model: Model) -> list[Path]:
     """Return the paths of a model, that of least action first."""
-    wanted = dict(model.path)
+    settings = dict(model.path)
     if model.h is None:
         raise ModelFileError("a path has steps of one size: give a step size (--step, [run] step)")
-    closed = wanted.get("closed")
-    if (closed is None) == ("to" not in wanted):
+    closed = settings.get("closed")
+    if (closed is None) == ("to" not in settings):
         raise ModelFileError("give the end of the path (--to, [path] to) or closed (--closed, [path] closed), not both")
     for key in ("from", "to"):
-        if len(wanted.get(key, model.q)) != model.dimension:
-            names = ", ".join(str(each) for each in model.system.coordinates)
-            raise ModelFileError(f"[path] {key} has {len(wanted[key])} numbers: give those of {names}")
+        if len(settings.get(key, model.q)) != model.dimension:
+            names = ", ".join(str(coordinate) for coordinate in model.system.coordinates)
+            raise ModelFileError(f"[path] {key} has {len(settings[key])} numbers: give those of {names}")
     steps, stepper = max(2, math.ceil(model.covered / abs(model.h) * (1.0 - 1e-9))), model.stepper()
     arguments: dict[str, Any] = {"steps": steps, "t": model.t, "parameters": model.parameters}
-    arguments |= {"options": model.solver_options, "energy": wanted.get("energy")}
+    arguments |= {"options": model.solver_options, "energy": settings.get("energy")}
     if model.system.inputs:
         arguments["inputs"] = model.all_inputs()
     span = math.copysign(model.covered, model.h)
     if closed is None:
-        q0, q1 = wanted.get("from", model.q), wanted["to"]
-        arguments |= {"starts": wanted.get("starts", 0), "revolutions": wanted.get("revolutions")}
+        q0, q1 = settings.get("from", model.q), settings["to"]
+        arguments |= {"starts": settings.get("starts", 0), "revolutions": settings.get("revolutions")}
         return different_paths(stepper, q0, q1, span, **arguments)
     near = model.integrate()
     start = near.at(np.linspace(near.t[0], near.t[-1], steps + 1))[0]
@@ -95,52 +95,52 @@ def _paths(model: Model) -> list[Path]:
     return [stepper.path(T=span, start=np.asarray(start), closed=symmetry, **arguments)]
 
 
-def _described(found: Path) -> str:
-    p, names = np.asarray(found.p)[0], found.stepper.interface.momentum_columns
-    number, times = _indices(found)
+def _described(path: Path) -> str:
+    p, names = np.asarray(path.p)[0], path.stepper.interface.momentum_columns
+    number, times = _indices(path)
     index = "" if number is None else f", Morse index {number}"
     conjugate = "".join(f"\n  conjugate time between {low:g} and {high:g}" for low, high in times)
     dropped = "\n  stationary points of the discrete action that are no motions, dropped: "
     shown = ", ".join(f"{name} = {x:.12g}" for name, x in list(zip(names, p, strict=True))[:MOST_SHOWN])
-    period = f", period {found.period:.12g}" if found.solution.intervals.symmetry is not None else ""
+    period = f", period {path.period:.12g}" if path.solution.intervals.symmetry is not None else ""
     return (
-        f"action {found.action:.12g}{index}; duration {found.t[-1] - found.t[0]:.12g}{period}; largest jump of the "
-        f"momentum {found.residual:.1e}, discretisation error {found.error:.1e} (relative){conjugate}"
-        f"{f'{dropped}{found.dropped}' if found.dropped else ''}\n  {shown}"
+        f"action {path.action:.12g}{index}; duration {path.t[-1] - path.t[0]:.12g}{period}; largest jump of the "
+        f"momentum {path.residual:.1e}, discretisation error {path.error:.1e} (relative){conjugate}"
+        f"{f'{dropped}{path.dropped}' if path.dropped else ''}\n  {shown}"
     )
 
 
-def _indices(found: Path) -> tuple[int | None, Any]:
+def _indices(path: Path) -> tuple[int | None, Any]:
     """Return the Morse index and the conjugate times, ``None`` and none where they are undefined."""
     with suppress(MethodError):
-        return found.index, found.conjugate_times
+        return path.index, path.conjugate_times
     return None, np.empty((0, 2))
 
 
-def _numbers(model: Model, found: list[Path]) -> dict[str, Any]:
-    names, columns = model.system.coordinates, found[0].stepper.interface.momentum_columns
+def _numbers(model: Model, paths: list[Path]) -> dict[str, Any]:
+    names, columns = model.system.coordinates, paths[0].stepper.interface.momentum_columns
 
-    def numbers(each: Path) -> dict[str, Any]:
-        q, p = np.asarray(each.q), np.asarray(each.p)
+    def numbers(path: Path) -> dict[str, Any]:
+        q, p = np.asarray(path.q), np.asarray(path.p)
         return {
             **{
-                name: getattr(each, name)
+                name: getattr(path, name)
                 for name in ("action", "residual", "error", "energy_change", "at_rest", "iterations", "dropped")
             },
-            **dict(zip(("index", "conjugate_times"), _indices(each), strict=True)),
-            "duration": float(each.t[-1] - each.t[0]),
-            "period": each.period if each.solution.intervals.symmetry is not None else None,
-            "energy": float(each.stepper.energy(q[0], p[0], model.t, each.solution.intervals.parameters_at_start)),
+            **dict(zip(("index", "conjugate_times"), _indices(path), strict=True)),
+            "duration": float(path.t[-1] - path.t[0]),
+            "period": path.period if path.solution.intervals.symmetry is not None else None,
+            "energy": float(path.stepper.energy(q[0], p[0], model.t, path.solution.intervals.parameters_at_start)),
             "start": {str(name): float(x) for name, x in zip(names, q[0], strict=True)},
             "end": {str(name): float(x) for name, x in zip(names, q[-1], strict=True)},
             "momenta": {name: float(x) for name, x in zip(columns, p[0], strict=True)},
         }
 
     about = {"system": model.system.name, "method": model.method.name, "run": model._run_section()}
-    return {**about, "paths": [numbers(each) for each in found]}
+    return {**about, "paths": [numbers(path) for path in paths]}
 
 
-def _trajectory(found: Path) -> Trajectory:
+def _trajectory(path: Path) -> Trajectory:
     """Return the states of a path as a trajectory, of a closed one over its period."""
-    run = found.run()
-    return run if len(run) != len(found.t) else replace(run, q=found.q, p=found.p)
+    run = path.run()
+    return run if len(run) != len(path.t) else replace(run, q=path.q, p=path.p)

@@ -145,10 +145,10 @@ def run(
         raise click.UsageError("Missing argument 'MODEL', or --resume FOLDER.")
     recorded = output is not None and is_run_folder(output)
     _check_outputs(output, plot, ensemble, checkpoint)
-    wanted = {name: choices.pop(name) for name in ERRORS}
-    _check_combination(choices, plot=plot, ensemble=ensemble, wanted=wanted, folder=output if recorded else None)
+    requested = {name: choices.pop(name) for name in ERRORS}
+    _check_combination(choices, plot=plot, ensemble=ensemble, requested=requested, folder=output if recorded else None)
     is_controlled = any(choices.get(name) is not None for name in OF_ADAPTIVE_STEPS)
-    errors = {name: wanted[name] for name in ("tolerance", "error") if wanted[name] is not None}
+    errors = {name: requested[name] for name in ("tolerance", "error") if requested[name] is not None}
     model = read_model(model_name, choices, errors if is_controlled else None)
     _check_words(model, {"-o": output})
     if model.precision in (DOUBLE_DOUBLE, AUTO):
@@ -159,24 +159,24 @@ def run(
         model._check_alone()
     for option, needed in (
         ("--ensemble", ensemble is not None),
-        ("--advise", wanted["advise"] is not None),
+        ("--advise", requested["advise"] is not None),
         (f"-o {output}", recorded),
     ):
         model = with_known_sizes(model, option) if needed else model
-    if model.system.inputs and wanted["advise"] is not None:
+    if model.system.inputs and requested["advise"] is not None:
         check_flag(ERRORS["advise"], WITH_INPUTS)
     if model.system.inputs and recorded:
         raise click.UsageError("a run with inputs cannot be recorded in a folder: write it to a file (-o NAME.npz)")
     states = None if ensemble is None else load_ensemble(ensemble, model)
-    model, confirmation, member = _with_steps(model, wanted, states)
+    model, confirmation, member = _with_steps(model, requested, states)
     _check_words(model, {"-o": output})  # with precision = "auto"
     if states is not None:
-        _run_ensemble(replace(states, model=model), (output, plot), advised=wanted["advise"], member=member)
+        _run_ensemble(replace(states, model=model), (output, plot), advised=requested["advise"], member=member)
         return
     if output is not None and recorded:
         _finish_recording(record_model(model, output, checkpoint))
     else:
-        _run_one(model, output, plot, advised=wanted["advise"])
+        _run_one(model, output, plot, advised=requested["advise"])
     _check_confirmed(confirmation)
 
 
@@ -202,26 +202,32 @@ def _check_confirmed(confirmation: GlobalError | None) -> None:
     """End with exit status 1 if a global error bound was requested and is not confirmed."""
     if confirmation is not None and not confirmation.confirmed:
         end = confirmation.confirmed_until
-        unconfirmed = f"the bound {confirmation.requested:g} on the global error is confirmed only until t = {end:g}"
-        tell(missed=unconfirmed)
-        raise CommandFailure(unconfirmed, FAILURE)
+        _fail_for(f"the bound {confirmation.requested:g} on the global error is confirmed only until t = {end:g}")
+
+
+def _fail_for(missed: str, where: str = "") -> None:
+    """End with exit status 1 if a run misses an error bound; ``missed``: how, or ""."""
+    if missed:
+        tell(missed=missed)
+        raise CommandFailure(f"{where}{missed}", FAILURE)
 
 
 def _with_steps(
-    model: Model, wanted: dict[str, float | None], states: EnsembleStates | None
+    model: Model, requested: dict[str, float | None], states: EnsembleStates | None
 ) -> tuple[Model, GlobalError | None, int]:
     """Return the model with the steps that one of the requested errors determines, and the estimated global error.
 
     The third value is the index of the trajectory that determines the step of an ensemble.
     """
-    tolerance, error, advise = wanted["tolerance"], wanted["error"], wanted["advise"]
+    tolerance, error, advise = requested["tolerance"], requested["error"], requested["advise"]
     if tolerance is not None:
         return model_with_adaptive_steps(model, tolerance), None, 0
     if advise is not None:
         model, advice = model_with_advised_step(model, advise, states)
         return model, None, advice.member or 0
-    if (wanted_error := model.error if error is None else error) is not None:
-        return *model_with_global_error(model, wanted_error), 0
+    bound = model.error if error is None else error
+    if bound is not None:
+        return *model_with_global_error(model, bound), 0
     return model, None, 0
 
 
@@ -242,12 +248,12 @@ def _check_combination(
     *,
     plot: str | None,
     ensemble: str | None,
-    wanted: dict[str, float | None],
+    requested: dict[str, float | None],
     folder: str | None,
 ) -> None:
     if folder is not None and plot is not None:
         raise click.UsageError("--plot is not available for a run recorded in a folder: it needs the states in memory")
-    arguments = [name for name, value in wanted.items() if value is not None]
+    arguments = [name for name, value in requested.items() if value is not None]
     if len(arguments) > 1:
         raise click.UsageError(
             f"--{arguments[0]} and --{arguments[1]} exclude each other: each determines the step size; give one"
@@ -261,9 +267,9 @@ def _check_combination(
 
 def _run_one(model: Model, output: str | None, plot: str | None, *, advised: float | None) -> None:
     outcome = integrate_model(model)
-    known = known_at_end(model, outcome)
+    final_error = known_at_end(model, outcome)
     account = known_account(outcome.trajectory)
-    tell(summary(model, outcome, known, account), **run_numbers(model, outcome, known, account))
+    tell(summary(model, outcome, final_error, account), **run_numbers(model, outcome, final_error, account))
     result = outcome.trajectory
     draw = result.plot if model.array_system is None else result.plot.field
     written = _write_outputs(model, result, output, plot, draw=draw)
@@ -276,12 +282,8 @@ def _run_one(model: Model, output: str | None, plot: str | None, *, advised: flo
         raise CommandFailure(f"{outcome.missed}\n{_kept(outcome, written)}", FAILURE)
     for path in written:
         tell(f"wrote {path}")
-    missed = ""
     if advised is not None:
-        missed = missed_tolerance(second_stepper(model.system), outcome.trajectory, advised, known)
-    if missed:
-        tell(missed=missed)
-        raise CommandFailure(missed, FAILURE)
+        _fail_for(missed_tolerance(second_stepper(model.system), outcome.trajectory, advised, final_error))
 
 
 def _finish_recording(outcome: RecordedOutcome) -> None:
@@ -302,9 +304,8 @@ def _run_ensemble(
     balance = energy_balance(outcome.result)
     tell(ensemble_summary(model, outcome, balance), **ensemble_numbers(model, outcome, balance))
     written = _write_outputs(model, outcome.result, *outputs, draw=outcome.result.plot)
-    continuation = (
-        f"the computed states were {'written: ' + ' and '.join(written) if written else 'not written to a file (-o)'}"
-    )
+    stored = f"written: {' and '.join(written)}" if written else "not written to a file (-o)"
+    continuation = f"the computed states were {stored}"
     if outcome.interrupted:
         raise CommandFailure(
             f"interrupted after {outcome.result.steps.mean():.0f} steps on average\n{continuation}", INTERRUPTED
@@ -313,12 +314,9 @@ def _run_ensemble(
         raise CommandFailure(f"every trajectory failed\n{continuation}", FAILURE)
     for path in written:
         tell(f"wrote {path}", written=written)
-    if advised is not None:
-        second, good = second_stepper(model.system), outcome.result.ok[member]
-        missed = missed_tolerance(second, outcome.result[member], advised) if good else ""
-        if missed:
-            tell(missed=missed)
-            raise CommandFailure(f"trajectory {member}: {missed}", FAILURE)
+    if advised is not None and outcome.result.ok[member]:
+        missed = missed_tolerance(second_stepper(model.system), outcome.result[member], advised)
+        _fail_for(missed, f"trajectory {member}: ")
 
 
 def _write_outputs(model: Model, result: Any, output: str | None, plot: str | None, *, draw: Any) -> list[str]:
