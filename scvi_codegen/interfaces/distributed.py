@@ -65,19 +65,19 @@ def integrate_ensemble(
     """
     _check_arguments(stepper, arguments)
     work = stepper._ensemble(q, p, **arguments)
-    wanted = None if blocks is None else checked_count(blocks, "blocks", least=1)
+    blocks = None if blocks is None else checked_count(blocks, "blocks", least=1)
     with _client(address) as client:
-        count = wanted or BLOCKS_A_THREAD * sum(client.ncores().values())
+        count = blocks or BLOCKS_A_THREAD * sum(client.ncores().values())
         _gather(client, work, list(_slices(len(work), count)), progress)
     return checked_ensemble_result(work)
 
 
 def _check_arguments(stepper: Stepper, arguments: dict[str, Any]) -> None:
     """Raise ``StateError`` for arguments that ensembles, or those of a cluster, do not have."""
-    known = signature(type(stepper).integrate_ensemble).parameters
+    accepted = signature(type(stepper).integrate_ensemble).parameters
     for name, value in arguments.items():
-        if name not in known:
-            raise StateError(f"integrate_ensemble has no argument '{name}'{closest(name, known)}")
+        if name not in accepted:
+            raise StateError(f"integrate_ensemble has no argument '{name}'{closest(name, accepted)}")
         if name in OF_THIS_MACHINE and value is not None:
             raise StateError(f"{name}= is not available on a cluster, whose {OF_THIS_MACHINE[name]}: omit it")
     if arguments.get("error") is not None and stepper._precise is not None:

@@ -131,17 +131,17 @@ def tables_of_example(
 ) -> tuple[tuple[ExampleInput, ...], tuple[float, ...]]:
     """Return the tables of all inputs (or none) for C, and all parameters at the start of a run over that time span."""
     whole = min(span), max(span) + 1.0  # of the only piece of a constant
-    chosen = {name: inputs[name] for name in system.inputs if inputs}
-    data = {
-        name: input_of(name, each if isinstance(each, tuple) else (whole, (each, each)))
-        for name, each in chosen.items()
-    }
+    functions = {}
+    for name in system.inputs if inputs else ():
+        table = inputs[name]
+        functions[name] = input_of(name, table if isinstance(table, tuple) else (whole, (table, table)))
     tables = tuple(
-        ExampleInput(name, tuple(each.breakpoints.tolist()), tuple(map(tuple, each.pieces[:, :POWERS].tolist())))
-        for name, each in data.items()
+        ExampleInput(name, tuple(spline.breakpoints.tolist()), tuple(map(tuple, spline.pieces[:, :POWERS].tolist())))
+        for name, spline in functions.items()
     )
     names = [parameter.name for parameter in system.parameters]
-    return tables, tuple(parameters_at(names, np.array(system.defaults), data, first_inner_time(*span)).tolist())
+    values = parameters_at(names, np.array(system.defaults), functions, first_inner_time(*span))
+    return tables, tuple(values.tolist())
 
 
 TIME, VALUE = "t", "value"
@@ -202,8 +202,8 @@ def _read(name: str, folder: str | os.PathLike[str], file: str) -> tuple[tuple[f
         remedy = f", or name it on the command line: --input {name}={file}" if denied else ""
         raise ModelFileError(f"it cannot be read: {error.strerror or error}{remedy}") from error
     t = _column(table, TIME)
-    others = [each for each in table.columns if each != TIME]
-    column = next((each for each in (name, VALUE) if each in others), None)
+    others = [column_name for column_name in table.columns if column_name != TIME]
+    column = next((column_name for column_name in (name, VALUE) if column_name in others), None)
     if column is None and len(others) != 1:
         raise ModelFileError(f"there is no column {name} or {VALUE} among {', '.join(table.columns)}")
     late = np.flatnonzero(np.diff(t) <= 0.0)

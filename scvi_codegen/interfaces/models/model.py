@@ -108,7 +108,7 @@ class Model(TimeSpan):
             ("method", plain(self.method.title)),
             *((name, _vector(values)) for name, values in state),
             ("run", listed([f"{name} = {value}" for name, value in self._run_section().items()])),
-            *([("events", listed([each.function for each in self.events]))] if self.events else []),
+            *([("events", listed([event.function for event in self.events]))] if self.events else []),
             *([("inputs, arrays", listed(list(named)))] if named else []),
         )
         formula = self.system._repr_html_()
@@ -119,7 +119,7 @@ class Model(TimeSpan):
         if self.mesh is None:
             object.__setattr__(self, "mesh", self.system.mesh)
         object.__setattr__(self, "page", _with_lists(self.page))
-        object.__setattr__(self, "path", {key: checked_path_value(key, each) for key, each in self.path.items()})
+        object.__setattr__(self, "path", {key: checked_path_value(key, value) for key, value in self.path.items()})
         object.__setattr__(self, "picture", _with_lists(self.picture))
         object.__setattr__(self, "method", as_method(self.method, self.system))
         if isinstance(self.system, FirstOrderSystem) and self.p is self.velocity is None:
@@ -176,14 +176,14 @@ class Model(TimeSpan):
                 "a time transformation requires known array sizes: use that of the model with_known_sizes()"
             )
         for name, declared in (("fields", arrays.fields), ("tables", arrays.tables)):
-            default = {each.name: arrays.data[each.name] for each in declared if each.name in arrays.data}
+            default = {array.name: arrays.data[array.name] for array in declared if array.name in arrays.data}
             object.__setattr__(self, name, default | dict(getattr(self, name)))
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Model):
             return NotImplemented
         return all(
-            _equal(getattr(self, each.name), getattr(other, each.name)) for each in fields_of(self) if each.compare
+            _equal(getattr(self, entry.name), getattr(other, entry.name)) for entry in fields_of(self) if entry.compare
         )
 
     def __hash__(self) -> int:
@@ -212,10 +212,10 @@ class Model(TimeSpan):
         """Array sizes known at run time, by name; empty for a system of named coordinates."""
         if not self.system.sizes:
             return {}
-        of_rotations = {name: each.as_quat() for name, each in self.q.items() if hasattr(each, "as_quat")}
-        known = {**self.q, **self.fields, **self.tables, **of_rotations}
-        arrays = [array for array in self.system.arrays if array.name in known]
-        axes = [(array, np.shape(known[array.name])) for array in arrays]
+        of_rotations = {name: attitude.as_quat() for name, attitude in self.q.items() if hasattr(attitude, "as_quat")}
+        values = {**self.q, **self.fields, **self.tables, **of_rotations}
+        arrays = [array for array in self.system.arrays if array.name in values]
+        axes = [(array, np.shape(values[array.name])) for array in arrays]
         return {size.name: length for array, shape in axes for size, length in zip(array.axes, shape) if size.name}  # noqa: B905
 
     @property
@@ -230,15 +230,16 @@ class Model(TimeSpan):
         """
         if (system := self.array_system) is None:
             return self
-        known = unroll_sums(system, self.sizes, tables=self.tables, parameters=self.fields)
-        vectors = {name: getattr(self, name) for name in STATE.values() if getattr(self, name) is not None}
+        unrolled = unroll_sums(system, self.sizes, tables=self.tables, parameters=self.fields)
+        state = {name: getattr(self, name) for name in STATE.values() if getattr(self, name) is not None}
         if not system.rotations:
-            order = [array.name for array in system.coordinates]
-            vectors = {key: [x for name in order for x in np.ravel(each[name])] for key, each in vectors.items()}
-        if len(vectors) == 1 and not any(each.declaration.startswith("spin") for each in known.rotations):
-            vectors["p" if known.auxiliaries else "velocity"] = (0.0,) * known.dimension
-        changed: dict[str, Any] = {"fields": {}, "tables": {}, **vectors}
-        return replace(self, system=known, mesh=system.mesh, **changed)
+            names = [array.name for array in system.coordinates]
+            state = {key: [x for name in names for x in np.ravel(arrays[name])] for key, arrays in state.items()}
+        has_spins = any(rotation.declaration.startswith("spin") for rotation in unrolled.rotations)
+        if len(state) == 1 and not has_spins:  # at rest
+            state["p" if unrolled.auxiliaries else "velocity"] = (0.0,) * unrolled.dimension
+        changed: dict[str, Any] = {"fields": {}, "tables": {}, **state}
+        return replace(self, system=unrolled, mesh=system.mesh, **changed)
 
     @property
     def ends_at_time(self) -> bool:
@@ -470,14 +471,14 @@ def _vector(values: Any) -> Html:
 def _with_lists(value: Any) -> Any:
     """Return a value with lists for tuples, as in model files."""
     if isinstance(value, Mapping):
-        return {name: _with_lists(each) for name, each in value.items()}
-    return [_with_lists(each) for each in value] if isinstance(value, list | tuple) else value
+        return {name: _with_lists(entry) for name, entry in value.items()}
+    return [_with_lists(entry) for entry in value] if isinstance(value, list | tuple) else value
 
 
-def _equal(one: Any, other: Any) -> bool:
+def _equal(first: Any, second: Any) -> bool:
     """Return whether two values are equal, arrays and mappings of arrays by their entries."""
-    if isinstance(one, Mapping) and isinstance(other, Mapping):
-        return one.keys() == other.keys() and all(_equal(each, other[name]) for name, each in one.items())
-    if isinstance(one, np.ndarray) or isinstance(other, np.ndarray):
-        return np.array_equal(one, other)
-    return bool(one == other)
+    if isinstance(first, Mapping) and isinstance(second, Mapping):
+        return first.keys() == second.keys() and all(_equal(first[name], second[name]) for name in first)
+    if isinstance(first, np.ndarray) or isinstance(second, np.ndarray):
+        return np.array_equal(first, second)
+    return bool(first == second)

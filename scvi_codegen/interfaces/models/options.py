@@ -180,7 +180,7 @@ class RunOptions:
         *("run", CHOICE, ""),
         "Step-size controller. With --time-transformation: symplectic (default; energy must be conserved), or "
         "reversible (any system); without it "
-        + ", ".join(f"{name}: {each.summary}" for name, each in CONTROLLERS.items() if not each.in_tau)
+        + ", ".join(f"{name}: {kind.summary}" for name, kind in CONTROLLERS.items() if not kind.in_tau)
         + ".",
         choices=(SYMPLECTIC, *CONTROLLERS),
     )
@@ -269,7 +269,7 @@ _TABLE: dict[str, Option] = {
         brief="velocity (q_dot)",
         determines=VELOCITY,
     ),
-    **{each.name: each.metadata["option"] for each in fields(RunOptions)},
+    **{entry.name: entry.metadata["option"] for entry in fields(RunOptions)},
     "advise": Option(
         *("", NUMBER, "X"),
         "Choose a fixed step size for this relative error of the positions at the end (of all trajectories).",
@@ -335,10 +335,10 @@ def checked_path_value(key: str, value: Any) -> Any:
     if options[key].kind == NUMBERS:
         if not isinstance(value, list | tuple):
             raise ModelFileError(f"{where} must be a list of numbers, not {value!r}")
-        return [real(each, where) for each in value]
+        return [real(entry, where) for entry in value]
     if options[key].kind != TEXT:
         return options[key].read(value, where)
-    names = isinstance(value, list | tuple) and all(isinstance(each, str) for each in value)
+    names = isinstance(value, list | tuple) and all(isinstance(entry, str) for entry in value)
     if value is not True and not names and not isinstance(value, str):
         raise ModelFileError(f"{where} must be true or a list of coordinates with signs, not {value!r}")
     return list(value) if names else value
@@ -346,9 +346,10 @@ def checked_path_value(key: str, value: Any) -> Any:
 
 def alternatives(*sections: str) -> Iterator[tuple[Option, Option]]:
     """Yield the pairs of options of these sections of which at most one is given."""
-    for one, other in combinations(OPTIONS, 2):
-        if one.determines and one.determines == other.determines and {one.section, other.section} <= {*sections}:
-            yield one, other
+    options = [option for option in OPTIONS if option.determines and option.section in sections]
+    for option, alternative in combinations(options, 2):
+        if option.determines == alternative.determines:
+            yield option, alternative
 
 
 def excluded(names: Collection[str], *sections: str) -> Iterator[tuple[Option, Option]]:
@@ -391,9 +392,9 @@ def real(value: Any, where: str) -> float:
 def with_exact_numbers(value: Any, *, exact: bool = True) -> Any:
     """Return a number, or a list or table of numbers, with text and fractions as exact numbers, or all as doubles."""
     if isinstance(value, dict):
-        return {key: with_exact_numbers(each, exact=exact) for key, each in value.items()}
+        return {key: with_exact_numbers(entry, exact=exact) for key, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [with_exact_numbers(each, exact=exact) for each in value]
+        return [with_exact_numbers(entry, exact=exact) for entry in value]
     if not exact:
         return float(value) if isinstance(value, ExactNumber) else value
     numeral = isinstance(value, str) and NUMERAL.fullmatch(value)

@@ -49,8 +49,8 @@ def outer_solar_system() -> LagrangianSystem:
     """
     kinetic = " + ".join(f"m_{body}*({' + '.join(f'{body}_{axis}_dot**2' for axis in 'xyz')})/2" for body in _MASSES)
     attraction = "".join(
-        f" + G*m_{one}*m_{two}/sqrt({' + '.join(f'({one}_{axis} - {two}_{axis})**2' for axis in 'xyz')})"
-        for one, two in combinations(_MASSES, 2)
+        f" + G*m_{first}*m_{second}/sqrt({' + '.join(f'({first}_{axis} - {second}_{axis})**2' for axis in 'xyz')})"
+        for first, second in combinations(_MASSES, 2)
     )
     return LagrangianSystem.from_text(
         name="outer solar system",

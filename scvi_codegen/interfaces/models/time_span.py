@@ -63,9 +63,9 @@ class TimeSpan(RunOptions):
         for option in RUN_FIELDS:
             if (value := getattr(self, option.field)) is not None:
                 object.__setattr__(self, option.field, option.checked(value))
-        for name, known in (("precision", PRECISIONS), ("device", DEVICES), ("observe", OBSERVED[:2])):
-            if (value := getattr(self, name)) not in (None, *known):
-                raise ModelFileError(f"unknown {name} {value!r}: use {' or '.join(map(repr, known))}")
+        for name, choices in (("precision", PRECISIONS), ("device", DEVICES), ("observe", OBSERVED[:2])):
+            if (value := getattr(self, name)) not in (None, *choices):
+                raise ModelFileError(f"unknown {name} {value!r}: use {' or '.join(map(repr, choices))}")
         if self.h is not None and (control := self._control):
             name, value = next(iter(control.items()))
             raise ModelFileError(
@@ -128,19 +128,19 @@ class TimeSpan(RunOptions):
         values = {name: getattr(self, name) for name in OF_ADAPTIVE_STEPS}
         return {name: value for name, value in values.items() if value is not None}
 
-    def _with_step_size(self, *, steps: int | None = None, **chosen: Any) -> Self:
+    def _with_step_size(self, *, steps: int | None = None, **settings: Any) -> Self:
         """Return the model whose step size another option determines, over the same time span or ``steps`` steps."""
         others = {option.field: None for option in OPTIONS if option.determines == STEP_SIZE and option.section}
-        if chosen.get("h") is not None:
+        if settings.get("h") is not None:
             others |= dict.fromkeys(self._control)
-        return replace(self, **{**others, **chosen, "steps": steps, "span": None if steps else self.covered})
+        return replace(self, **{**others, **settings, "steps": steps, "span": None if steps else self.covered})
 
     @property
     def solver_options(self) -> SolverOptions | None:
         """Convergence criterion of the solver; ``None`` for the default one."""
         values = {option.solver_option: getattr(self, option.field) for option in RUN_FIELDS if option.solver_option}
-        chosen = {name: value for name, value in values.items() if value is not None}
-        return SolverOptions(**chosen) if chosen else None
+        values = {name: value for name, value in values.items() if value is not None}
+        return SolverOptions(**values) if values else None
 
     @property
     def ends_at_time(self) -> bool:

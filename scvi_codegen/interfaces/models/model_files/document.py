@@ -40,13 +40,10 @@ def document_of(model: Model, *, as_arrays: bool = True) -> dict[str, Any]:
     if parameters:
         document["parameters"] = parameters
     if model.tables and "field" not in document:
-        declared = {each.partition("[")[0]: each for each in system.definition.get("tables", ())}
+        declared = {table.partition("[")[0]: table for table in system.definition.get("tables", ())}
         document["tables"] = {declared[name]: np.asarray(rows).tolist() for name, rows in model.tables.items()}
-    return {
-        **document,
-        **motion,
-        **{name: each for name in ("path", "page", "picture") if (each := getattr(model, name))},
-    }
+    further = {name: getattr(model, name) for name in ("path", "page", "picture") if getattr(model, name)}
+    return {**document, **motion, **further}
 
 
 def _system_and_state(
@@ -132,8 +129,8 @@ def _state_by_array(model: Model, names: Sequence[str]) -> dict[str, Any]:
     """Return positions, and velocities or momenta, by the name of their array."""
     state = {key: getattr(model, name) for key, name in STATE.items() if getattr(model, name) is not None}
     if model.array_system is not None:
-        by_array = {key: {name: _list(each) for name, each in arrays.items()} for key, arrays in state.items()}
-        return {key: each if len(each) > 1 else next(iter(each.values())) for key, each in by_array.items()}
+        lists = {key: {name: _list(values) for name, values in arrays.items()} for key, arrays in state.items()}
+        return {key: arrays if len(arrays) > 1 else next(iter(arrays.values())) for key, arrays in lists.items()}
     arrays = [array for array in model.system.arrays if set(array.elements) <= set(names)]
     by_name = {key: dict(zip(names, values, strict=True)) for key, values in state.items()}
     return {key: {array.name: _entries(array, values) for array in arrays} for key, values in by_name.items()}
@@ -185,7 +182,7 @@ def with_files(document: Mapping[str, Any], stem: str) -> tuple[dict[str, Any], 
 
     def shortened(name: str, value: Any) -> Any:
         if isinstance(value, dict):
-            return {key: shortened(f"{name}_{key.partition('[')[0]}", each) for key, each in value.items()}
+            return {key: shortened(f"{name}_{key.partition('[')[0]}", entry) for key, entry in value.items()}
         if not isinstance(value, list) or np.size(value) <= LONG_ARRAY or np.ndim(value) > 2:
             return value
         rows = np.reshape(value, (len(value), -1)).tolist()

@@ -170,10 +170,10 @@ def _exact_axis(value: Any, where: str) -> Array:
 
 def _check_names(model: Model, names: Sequence[str]) -> None:
     coordinates, velocities, momenta = _names_of(model)
-    known = [*coordinates, *velocities, *momenta, *model.parameters]
+    possible = [*coordinates, *velocities, *momenta, *model.parameters]
     for name in names:
-        if name not in known:
-            hint = f"{closest(name, known)} Known: {', '.join(known[:12])}"
+        if name not in possible:
+            hint = f"{closest(name, possible)} Known: {', '.join(possible[:12])}"
             raise ModelFileError(f"'{name}' is not a coordinate, velocity, momentum or parameter of the system{hint}")
     if not set(names).isdisjoint(velocities) and not set(names).isdisjoint(momenta):
         raise ModelFileError("there are both velocities and momenta: give one or the other")

@@ -39,14 +39,14 @@ class Entry(NamedTuple):
         default = self.motion["initial"]
         changed = {key: initial[key] for key in STATE if key in initial and initial[key] is not default.get(key)}
         tables = {
-            key: default[key] | each for key, each in changed.items() if isinstance(each, dict) and key in default
+            key: default[key] | value for key, value in changed.items() if isinstance(value, dict) and key in default
         }
-        if self.system.rotations and any(isinstance(each, list) for each in changed.values()):
+        if self.system.rotations and any(isinstance(value, list) for value in changed.values()):
             from scvi_codegen.runs.states.rotations import state_by_name  # not needed for other systems
 
             rest = state_by_name(self.system, default["q"], None, default["q_dot"])
-            vectors = {key: each.tolist() for key, each in zip(STATE, rest, strict=True) if each is not None}
-            tables |= {key: each for key, each in vectors.items() if initial.get(key) is default[key]}
+            vectors = {key: vector.tolist() for key, vector in zip(STATE, rest, strict=True) if vector is not None}
+            tables |= {key: vector for key, vector in vectors.items() if initial.get(key) is default[key]}
         return {**initial, **tables}
 
 
@@ -59,9 +59,8 @@ def read_entry(section: Section, folder: str | os.PathLike[str]) -> Entry | None
     if "catalogue" in section:
         check_keys(section, ("catalogue", "time_transformation"), "key", "[system] beside catalogue")
         entry = in_section("[system]", lambda: problem(text_of(section, "catalogue", "[system]")))
-        return Entry(
-            entry.system, motion_of(Model.from_problem(entry), [each.name for each in entry.system.coordinates])
-        )
+        names = [coordinate.name for coordinate in entry.system.coordinates]
+        return Entry(entry.system, motion_of(Model.from_problem(entry), names))
     return _robot(section, Path(folder)) if "robot" in section else None
 
 
@@ -90,13 +89,13 @@ def _robot(section: Section, folder: Path) -> Entry:
     rates: dict[str, Any] = {}
     for link in system.links:
         if link.kind == "free":
-            q |= {f"{axis}_{link.name}": each for axis, each in zip("xyz", link.position, strict=True)}
+            q |= {f"{axis}_{link.name}": x for axis, x in zip("xyz", link.position, strict=True)}
             rates |= {f"{axis}_{link.name}": 0.0 for axis in "xyz"}
         if link.kind in ("free", "ball"):
-            turned = [list(row) for row in link.rotation]
-            q[f"R_{link.name}"] = (
-                [1.0, 0.0, 0.0, 0.0] if link.kind == "ball" or turned == np.eye(3).tolist() else turned
-            )
+            attitude: Any = [list(row) for row in link.rotation]
+            if link.kind == "ball" or attitude == np.eye(3).tolist():
+                attitude = [1.0, 0.0, 0.0, 0.0]
+            q[f"R_{link.name}"] = attitude
             rates[f"omega_{link.name}"] = [0.0, 0.0, 0.0]
         elif link.follows is None:
             q[link.name], rates[link.name] = link.zero, 0.0

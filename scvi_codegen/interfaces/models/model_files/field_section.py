@@ -41,19 +41,23 @@ def fields_at_points(section: Section, system: Any) -> Section:
     mesh: Mesh = system.mesh
     density, state = mesh.field_system, dict(section)
     names = {TIME: real(section.get(TIME, 0.0), "[initial] t"), **mesh.points}
-    names |= {each.name: value for each, value in zip(system.parameters, system.defaults, strict=True)}
+    names |= {parameter.name: value for parameter, value in zip(system.parameters, system.defaults, strict=True)}
     for key in {"q", "p", "q_dot"} & section.keys():
         value = section[key]
         if not isinstance(value, dict) or "file" in value:
             value = {density.fields[0]: value}
-        known = [each.name for each in system.coordinates]
-        check_keys(value, [*known, *density.momenta] if key == "q" else known, "field", f"[initial] {key}")
-        state[key] = {name: _values(each, f"[initial] {key}, {name}", mesh, names) for name, each in value.items()}
+        variables = [coordinate.name for coordinate in system.coordinates]
+        if key == "q":
+            variables += density.momenta
+        check_keys(value, variables, "field", f"[initial] {key}")
+        state[key] = {
+            name: _values(formula, f"[initial] {key}, {name}", mesh, names) for name, formula in value.items()
+        }
         state[key] |= {name: float(np.ravel(state[key][name])[0]) for name in {*density.scalars} & value.keys()}
-    for momentum, each in zip(density.momenta, density.fields, strict=bool(density.momenta)):
+    for momentum, field in zip(density.momenta, density.fields, strict=bool(density.momenta)):
         if momentum in state.get("q", {}):
             values = in_section(f"[initial] q, {momentum}", lambda: mesh.weights * state["q"].pop(momentum))  # noqa: B023
-            state["p"] = {**state.get("p", {}), each: values.tolist()}
+            state["p"] = {**state.get("p", {}), field: values.tolist()}
     return state
 
 

@@ -137,8 +137,8 @@ def parse_model(text: str, changes: Document | None = None, *, folder: str | os.
     for name, content in document.items():
         if not isinstance(content, dict) and name != "events":
             raise ModelFileError(f"'{name}' must be a section, [{name}], not {content!r}")
-    for name, known in KEYS.items():
-        check_keys(document.get(name, {}), known, "key", f"[{name}]")
+    for name, keys in KEYS.items():
+        check_keys(document.get(name, {}), keys, "key", f"[{name}]")
     return _read_model(document, changes or {}, folder)
 
 

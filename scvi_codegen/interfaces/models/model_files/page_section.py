@@ -31,8 +31,8 @@ def slider_names(model: Model) -> list[str]:
     names += model.system.inputs
     if model.array_system is not None or model.mesh is not None:
         return names
-    turning = {name for each in model.system.rotations for name in each.coordinates}
-    free = [each.name for each in model.system.coordinates if each.name not in turning]
+    turning = {name for rotation in model.system.rotations for name in rotation.coordinates}
+    free = [coordinate.name for coordinate in model.system.coordinates if coordinate.name not in turning]
     if starts_from_momenta(model):
         momenta = getattr(model.system, "momenta", None) or [f"p_{name}" for name in free]
         return [*names, *free, *map(str, momenta)]
@@ -54,15 +54,18 @@ def check_page(section: Section, model: Model, where: str = "[page]") -> None:
         place = f"{where} ranges {name}"
         if not isinstance(limits, list | tuple) or len(limits) != 2:
             raise ModelFileError(f"{place} must be two numbers, [lowest, highest], not {limits!r}")
-        low, high = (real(each, place) for each in limits)
+        low, high = (real(limit, place) for limit in limits)
         if not low < high:
             raise ModelFileError(f"{place} is {low:g} .. {high:g}: the first number must be less than the second")
     if real(section.get("speed", 1.0), f"{where} speed") <= 0:
         raise ModelFileError(f"{where} speed is {section['speed']:g}: it must be positive")
     plots: Any = section.get("plots", [])
-    pairs = isinstance(plots, list | tuple) and all(isinstance(each, list | tuple) and len(each) == 2 for each in plots)
-    if not pairs or not all(isinstance(name, str) for each in plots for name in each):
+    if not isinstance(plots, list | tuple) or not all(map(_is_pair_of_names, plots)):
         raise ModelFileError(f'{where} plots must be pairs of names, [["t", "energy"]], not {plots!r}')
+
+
+def _is_pair_of_names(plot: Any) -> bool:
+    return isinstance(plot, list | tuple) and len(plot) == 2 and all(isinstance(name, str) for name in plot)
 
 
 def drawn_system_of_model(model: Model) -> DrawnSystem:

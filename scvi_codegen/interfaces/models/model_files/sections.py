@@ -49,10 +49,10 @@ def key_hint(key: str, names: Iterable[str]) -> str:
         key: the unknown key.
         names: known keys of its section.
     """
-    known = list(names)
-    if here := synonym_hint(key, known):
+    names = list(names)
+    if here := synonym_hint(key, names):
         return here
-    if key not in LOCATIONS and (hint := closest(key, known)) != ".":
+    if key not in LOCATIONS and (hint := closest(key, names)) != ".":
         return hint
     locations = [LOCATIONS[name] for name in ([key] if key in LOCATIONS else likely_names(key)) if name in LOCATIONS]
     return f"; {locations[0]}." if locations else "."
@@ -156,10 +156,10 @@ def names_of(section: Section, key: str) -> list[str]:
     return names
 
 
-def check_one(section: Section, name: str, one: str, other: str) -> None:
+def check_one(section: Section, name: str, key: str, alternative: str) -> None:
     """Raise an error if two alternative keys are both given."""
-    if one in section and other in section:
-        raise ModelFileError(f"[{name}] has both {one} and {other}: give one of them")
+    if key in section and alternative in section:
+        raise ModelFileError(f"[{name}] has both {key} and {alternative}: give one of them")
 
 
 def required(section: Section, key: str, where: str) -> Any:
@@ -184,9 +184,9 @@ def formula_of(section: Section, key: str, where: str) -> str:
     return str(section[key])
 
 
-def check_keys(section: Section, known: Iterable[str], kind: str, where: str = "the file") -> None:
+def check_keys(section: Section, names: Iterable[str], kind: str, where: str = "the file") -> None:
     """Raise an error for unknown keys."""
-    names = list(known)
+    names = list(names)
     hint = key_hint if kind in ("key", "section") else closest
     for key in section:
         if key not in names:
@@ -209,8 +209,8 @@ def in_section(where: str, build: Callable[[], Built]) -> Built:
 def read_run(section: Section) -> dict[str, Any]:
     """Return the fields of a model in ``[run]``; adaptive steps without a step size."""
     section = {key: value for key, value in section.items() if value is not None}
-    for one, other in alternatives("run"):
-        check_one(section, "run", one.key, other.key)
+    for option, alternative in alternatives("run"):
+        check_one(section, "run", option.key, alternative.key)
     if not STEP_KEYS & section.keys() and "steps" in section:
         raise ModelFileError("[run] has steps but no step: give the step size")
     fields = [option for option in options_of("run") if option in FIELDS and option.key in section]
@@ -235,7 +235,7 @@ REQUIRED = {
 def has_arrays(document: Document, sizes: str = r"\w") -> bool:
     """Return whether coordinates, rotations, directions or spins are arrays, with sizes that contain a pattern."""
     groups = [document.get("system", {}).get(key) for key in ("coordinates", *TURNING)]
-    names = chain(*(each for each in groups if isinstance(each, list | dict)))
+    names = chain(*(group for group in groups if isinstance(group, list | dict)))
     return any(isinstance(name, str) and re.search(rf"\[.*{sizes}", name) for name in names)
 
 
@@ -284,8 +284,8 @@ def words_of(document: Document) -> set[str]:
         if isinstance(value, str):
             yield value
         elif isinstance(value, dict | list | tuple):
-            for each in value.values() if isinstance(value, dict) else value:
-                yield from texts(each)
+            for entry in value.values() if isinstance(value, dict) else value:
+                yield from texts(entry)
 
     sections = {name: section for name, section in document.items() if name not in ("method", "run", "path", "page")}
     for name in {"system", "field"} & sections.keys():

@@ -83,13 +83,13 @@ def _values_of_coordinates(
     """Return the values of the entries of arrays of parameters, and the state; ``entries`` are those of parameters."""
     names = [coordinate.name for coordinate in system.coordinates]
     section = _by_coordinate(section, system)
-    known = [array for array in system.arrays if array.axes and set(array.elements) <= set(names)]
+    coordinate_arrays = [array for array in system.arrays if array.axes and set(array.elements) <= set(names)]
     for key in STATE:
         value: Any = section.get(key)
         where = f"[initial] {key}, "
-        for each in known if isinstance(value, dict) else ():
-            if each.name in value:
-                entries[key, each.name] = ArrayValue(each, value[each.name], where + each.name)
+        for array in coordinate_arrays if isinstance(value, dict) else ():
+            if array.name in value:
+                entries[key, array.name] = ArrayValue(array, value[array.name], where + array.name)
     numbers = {parameter.name: value for parameter, value in system.constants.items()}
     read = _read_arrays(entries, {}, folder, numbers)
     elements = {
@@ -223,7 +223,7 @@ def _read_vector(
     """Return the vector of a list, or of a table by coordinate; ``elements`` are the entries of arrays by name."""
     where = f"[initial] {key}"
     if isinstance(value, dict):
-        value = {name: each for name, each in value.items() if name not in elements}
+        value = {name: entry for name, entry in value.items() if name not in elements}
         for of_array in elements.values():
             value |= of_array
         check_keys(value, names, "coordinate", where)
@@ -297,9 +297,9 @@ def _filled(value: Any, shape: tuple[int, ...], where: str, names: Mapping[str, 
     except ExpressionError as error:
         raise ModelFileError(f"{where}: {error}") from error
     coordinates = zip(indices, np.indices(shape, dtype=float, sparse=True), strict=True)
-    known: dict[Expr, Any] = {symbol(name): number for name, number in (*names.items(), *coordinates)}
+    arguments: dict[Expr, Any] = {symbol(name): number for name, number in (*names.items(), *coordinates)}
     with np.errstate(all="ignore"):
-        return np.array(np.broadcast_to(array_value(formula, known), shape), dtype=float)
+        return np.array(np.broadcast_to(array_value(formula, arguments), shape), dtype=float)
 
 
 def _from_list(value: list[Any], where: str) -> Numbers:
@@ -312,15 +312,15 @@ def _from_list(value: list[Any], where: str) -> Numbers:
 
 def _from_file(array: Array, value: Mapping[str, Any], where: str, folder: Path) -> Numbers:
     check_keys(value, FILE_KEYS, "key", where)
-    name, wanted = value.get("file"), value.get("array", array.name)
-    if not isinstance(name, str) or not isinstance(wanted, str):
+    name, array_name = value.get("file"), value.get("array", array.name)
+    if not isinstance(name, str) or not isinstance(array_name, str):
         raise ModelFileError(f'{where} must be a file, {{ file = "{array.name}.npy" }}, with text between quotes')
     readers = {".npy": _read_numpy, ".npz": _read_numpy, ".csv": _read_csv}
     reader = readers.get(Path(name).suffix.lower())
     if reader is None:
         raise ModelFileError(f"{where}: {name}: arrays must be in {', '.join(readers)} files")
     try:
-        return reader(inside(folder, name), wanted, array)
+        return reader(inside(folder, name), array_name, array)
     except OSError as error:
         raise ModelFileError(f"{where}: {name}: it cannot be read: {error.strerror or error}") from error
     except ValueError as error:
@@ -332,10 +332,11 @@ def _read_numpy(path: Path, name: str, array: Array) -> Numbers:
     with loaded(path) as arrays:
         if path.suffix.lower() == ".npy":
             return real_array(arrays, name)
-        chosen = name if name in arrays or len(arrays) != 1 else arrays.files[0]
-        if chosen not in arrays:
+        if name not in arrays and len(arrays) == 1:
+            name = arrays.files[0]
+        if name not in arrays:
             raise ModelFileError(f"there is no array {name} among {', '.join(arrays)}")
-        return real_array(arrays[chosen], chosen)
+        return real_array(arrays[name], name)
 
 
 def _read_csv(path: Path, name: str, array: Array) -> Numbers:

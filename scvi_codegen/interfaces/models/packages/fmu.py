@@ -88,13 +88,14 @@ def model_description(
     end = start.t + start.span
     SubElement(root, "DefaultExperiment", startTime=repr(start.t), stopTime=repr(end), stepSize=repr(start.h))
     variables = list(enumerate(_variables(interface, start, by_velocity=by_velocity)))
-    SubElement(root, "ModelVariables").extend(_element(index, one) for index, one in variables if one.description)
+    exported = [(index, variable) for index, variable in variables if variable.description]
+    SubElement(root, "ModelVariables").extend(_element(index, variable) for index, variable in exported)
     structure = SubElement(root, "ModelStructure")
-    outputs = [(str(index), one) for index, one in variables if one.causality == "output"]
+    outputs = [(str(index), variable) for index, variable in variables if variable.causality == "output"]
     for reference, _ in outputs:
         SubElement(structure, "Output", valueReference=reference)
-    for reference, one in outputs:
-        if one.start is None:
+    for reference, variable in outputs:
+        if variable.start is None:
             SubElement(structure, "InitialUnknown", valueReference=reference)
     return _text(root)
 
@@ -146,14 +147,18 @@ def _free(name: str, taken: set[str]) -> str:
     return name
 
 
-def _element(reference: int, one: Variable) -> Element:
-    start_attributes = {} if one.start is None else {"start": repr(one.start)}
-    if one.causality == "output":
-        start_attributes["initial"] = "calculated" if one.start is None else "exact"
-    attributes = {"name": one.name, "valueReference": str(reference), "causality": one.causality}
-    return Element(
-        "Float64", attributes | {"variability": one.variability, "description": one.description} | start_attributes
-    )
+def _element(reference: int, variable: Variable) -> Element:
+    start_attributes = {} if variable.start is None else {"start": repr(variable.start)}
+    if variable.causality == "output":
+        start_attributes["initial"] = "calculated" if variable.start is None else "exact"
+    attributes = {
+        "name": variable.name,
+        "valueReference": str(reference),
+        "causality": variable.causality,
+        "variability": variable.variability,
+        "description": variable.description,
+    }
+    return Element("Float64", attributes | start_attributes)
 
 
 def _text(root: Element) -> str:
@@ -238,7 +243,7 @@ def _texts(model: Model, prefix: str) -> tuple[Source, dict[str, bytes]]:
     texts = {
         DESCRIPTION: model_description(interface, start, by_velocity=by_velocity, token=token, has_events=bool(events)),
         **{f"sources/{name}": text for name, text in source.files.items()},
-        "sources/buildDescription.xml": build_description(prefix, [f"{each.prefix}.c" for each in source.sources]),
+        "sources/buildDescription.xml": build_description(prefix, [f"{part.prefix}.c" for part in source.sources]),
         **{f"resources/{name}": text for name, text in model_texts(model).items()},
     }
     return source, {name: text.encode() for name, text in texts.items()}
