@@ -15,6 +15,7 @@ import pytest
 from notation import hamilton, lagrange
 from programs import needs
 from samples import QUICK_FLAGS, sample_named
+from strict_c import STRICT, check_strict, run, write
 from style import check_style
 
 import scvi_codegen as sc
@@ -27,8 +28,7 @@ from scvi_codegen.systems.system import MechanicalSystem
 
 pytestmark = [pytest.mark.long, pytest.mark.rotated]
 
-C99 = "-std=c99 -Wall -Wextra -Wpedantic -Wshadow -Wconversion -Werror".split()  # noqa: SIM905  (reads as one types it)
-CXX = "-std=c++11 -Wall -Wextra -Wpedantic -Werror".split()  # noqa: SIM905  (as above)
+CXX = "-std=c++11 -Wall -Wextra -Wpedantic -Werror".split()  # noqa: SIM905  (as one types it)
 
 METHODS = {
     method.name: method
@@ -90,25 +90,6 @@ def generated(method: str) -> Mapping[str, tuple[Source, Interface]]:
     return found
 
 
-def write(sources: Sequence[Source], folder: Path) -> list[str]:
-    """Write headers and sources; the names of the sources."""
-    for source in sources:
-        (folder / f"{source.prefix}.h").write_text(source.header, encoding="utf-8")
-        (folder / f"{source.prefix}.c").write_text(source.amalgamated().code, encoding="utf-8")
-    return [f"{source.prefix}.c" for source in sources]
-
-
-def run(command: Sequence[str], folder: Path) -> str:
-    """Output of a command that must succeed without a warning.
-
-    GCC's note that its own ABI for wide vectors changed in version 4.6 is let pass: no function with one is exported.
-    """
-    result = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, timeout=600)
-    assert result.returncode == 0, f"{' '.join(command)}\n{result.stderr}"
-    assert "warning" not in result.stderr
-    return result.stdout
-
-
 def share_of(method: str, share: int) -> list[Source]:
     """Every sixth of the texts of a method: over the shares all of them."""
     return [source for source, _ in generated(method).values()][share::SHARES]
@@ -122,7 +103,7 @@ def share_of(method: str, share: int) -> list[Source]:
 def test_code_compiles_without_warnings(method, share, tmp_path):
     """The objects export nothing but names with the prefix, and hold no data that could be written."""
     files = write(share_of(method, share), tmp_path)
-    run([needs("gcc"), *C99, "-O1", "-c", *files], tmp_path)
+    run([needs("gcc"), *STRICT, "-O1", "-c", *files], tmp_path)
     if sys.platform == "linux":
         for file in files:
             check_symbols(Path(file).stem, tmp_path)
@@ -135,7 +116,7 @@ def test_code_compiles_without_warnings(method, share, tmp_path):
 @pytest.mark.parametrize("method", METHODS)
 def test_clang_reports_no_warnings(method, share, tmp_path):
     compiler = needs("clang")
-    run([compiler, *C99, "-c", *write(share_of(method, share), tmp_path)], tmp_path)
+    run([compiler, *STRICT, "-c", *write(share_of(method, share), tmp_path)], tmp_path)
 
 
 @pytest.mark.covering
@@ -155,11 +136,10 @@ def test_sources_for_this_machine_compile_without_warnings(name, solver, compile
     for number, text in enumerate(texts):
         folder = tmp_path / str(number)
         folder.mkdir()
-        run([needs(compiler), *C99, "-c", *write([text], folder)], folder)
+        check_strict(text, folder, compiler=compiler)
+        check_style(text.header)
         variables = re.findall(r"^(\w+) [BbCc]", run([needs("nm"), "-P", f"{text.prefix}.o"], folder), re.MULTILINE)
         assert variables == []
-        check_style(text.amalgamated().code)
-        check_style(text.header)
 
 
 def check_symbols(prefix: str, folder: Path) -> None:
@@ -205,7 +185,7 @@ def test_either_solver_alone_compiles_without_warnings(compiler, solver, tmp_pat
     sources = [sc.generate_source(systems()[name], method, solver=solver)[0] for method in methods for name in names]
     sources += [sc.generate_source(driven_hamiltonian(), method, solver=solver)[0] for method in methods[:3]]
     files = write(sources, tmp_path)
-    run([needs(compiler), *C99, "-c", *files], tmp_path)
+    run([needs(compiler), *STRICT, "-c", *files], tmp_path)
 
 
 @pytest.mark.sampled(1)
@@ -217,7 +197,7 @@ def test_tuned_builds_compile_without_warnings(compiler, method, name, tmp_path)
     """Flags are the vector instructions of this processor, and glibc's vector functions where available."""
     files = write([sc.generate_source(systems()[name], method)[0]], tmp_path)
     for define, _ in _mathematics(TUNED_FLAGS):
-        run([needs(compiler), *C99, *TUNED_FLAGS, *define, "-c", *files], tmp_path)
+        run([needs(compiler), *STRICT, *TUNED_FLAGS, *define, "-c", *files], tmp_path)
 
 
 # Equal bytes.
@@ -308,7 +288,7 @@ def test_reserved_names_of_c_are_valid_coordinates(method, tmp_path):
     results = [stepper.step(np.linspace(-0.5, 0.5, m), np.linspace(0.3, -0.2, m), 0.1) for stepper in steppers]
     np.testing.assert_allclose(results[0], results[1], rtol=1e-12, atol=1e-13)
     (file,) = write([steppers[0].source], tmp_path)
-    run([needs("gcc"), *C99, "-c", file], tmp_path)
+    run([needs("gcc"), *STRICT, "-c", file], tmp_path)
 
 
 TITLES = [
@@ -330,7 +310,7 @@ def test_title_cannot_end_its_comment(title, tmp_path):
     source, interface = sc.generate_source(system, sc.SVI(1))
     assert interface.title.isprintable()
     (file,) = write([source], tmp_path)
-    run([needs("gcc"), *C99, "-c", file], tmp_path)
+    run([needs("gcc"), *STRICT, "-c", file], tmp_path)
 
 
 @pytest.mark.tiers(1, 3)
@@ -339,7 +319,7 @@ def test_title_cannot_end_its_comment(title, tmp_path):
 def test_reserved_prefixes_of_c_are_valid(prefix, tmp_path):
     source, _ = sc.generate_source(bare_oscillator(), sc.SVI(2), prefix=prefix)
     files = write([source], tmp_path)
-    run([needs("gcc"), *C99, "-c", *files], tmp_path)
+    run([needs("gcc"), *STRICT, "-c", *files], tmp_path)
 
 
 # Sanitizers: exact workspaces, every exported function.
@@ -462,7 +442,7 @@ def test_band_solver_and_reused_factors_pass_the_sanitizers(command, masses, met
     sanitizer(command, tmp_path)
     source, interface = sc.generate_source(fput_chain(masses), method, solver="newton")
     assert interface.unknowns >= LEAST_REUSED_UNKNOWNS
-    run([needs(command[0]), *C99, "-c", *write([source], tmp_path)], tmp_path)
+    run([needs(command[0]), *STRICT, "-c", *write([source], tmp_path)], tmp_path)
     check_sanitized([(source, interface)], command, tmp_path)
 
 

@@ -5,9 +5,8 @@ import subprocess
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from programs import needs
 from samples import linkage
-from style import check_style
+from strict_c import check_strict
 
 import scvi_codegen as sc
 from scvi_codegen.interfaces.models.model_files.model_file import dump_model, parse_model
@@ -15,7 +14,6 @@ from scvi_codegen.methods.exact.step import compiled_equations, derived_step
 
 pytestmark = pytest.mark.rotated
 
-STRICT = ["-std=c99", "-O0", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Wconversion", "-Werror"]
 LINKAGE = linkage()
 PENDULUM = sc.LagrangianSystem.from_text(
     name="double pendulum",
@@ -58,11 +56,7 @@ def test_constrained_code_compiles_without_warnings(compiler, tmp_path):
         (BEAD, 2, True),
     ):
         source = sc.generate_source(system, lobatto(s), controlled=controlled)[0]
-        (tmp_path / f"{source.prefix}.h").write_text(source.header)
-        (tmp_path / "all.c").write_text(source.single_file().code)
-        check_style(source.amalgamated().code)
-        found = subprocess.run([needs(compiler), *STRICT, "-c", "all.c"], cwd=tmp_path, capture_output=True, text=True)
-        assert found.returncode == 0, found.stderr
+        check_strict(source, tmp_path, compiler=compiler)
 
 
 @pytest.mark.second

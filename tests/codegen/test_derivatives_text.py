@@ -1,11 +1,8 @@
 """The C text of derivatives: without a warning, in style, of loops over tables and of what is written out."""
 
-import subprocess
-
 import pytest
-from programs import needs
 from samples import damped_pendulum, linkage, pumped_cart_pole, pushed_pendulum, two_rods
-from style import check_style
+from strict_c import check_strict
 
 from scvi_codegen import SCVI, SVI, Gauss, hamiltonian_of, problem, reparametrise
 from scvi_codegen.codegen.lowering.derivatives import derivatives_of
@@ -13,7 +10,6 @@ from scvi_codegen.codegen.pipeline import program_of
 from scvi_codegen.codegen.rendering.program_source import render_derivatives
 from scvi_codegen.methods.discretise import discretise
 
-STRICT = ["-std=c99", "-O0", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Wconversion", "-Werror"]
 CASES = {
     "linkage": (linkage(), SVI(2, "gauss-lobatto:3")),
     "cart": (pumped_cart_pole(), SVI(1)),
@@ -41,11 +37,4 @@ def test_derivatives_compile_without_warnings(name, second, compiler, tmp_path):
         pytest.skip("there are no second derivatives in transformed time")
     program = program_of(system, method, solver="auto" if name.startswith("iterated") else "newton")
     derivatives = derivatives_of(system, discretise(system, method), program, second=second)
-    source = render_derivatives(derivatives).amalgamated()
-    (tmp_path / f"{source.prefix}.h").write_text(source.header)
-    (tmp_path / "all.c").write_text(source.code)
-    check_style(source.code)
-    found = subprocess.run(
-        [needs(compiler), *STRICT, "-c", "all.c"], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
-    assert found.returncode == 0, found.stderr
+    check_strict(render_derivatives(derivatives), tmp_path, compiler=compiler)

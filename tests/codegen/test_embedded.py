@@ -1,7 +1,6 @@
 """C for microcontrollers: builds for ARM Cortex-M without a warning, runs under QEMU to the numbers of the host."""
 
 import re
-import subprocess
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -12,6 +11,7 @@ from commands import output_of
 from notation import lagrange
 from programs import needs
 from samples import sample_named, stepper_for
+from strict_c import STRICT, run, write
 
 import scvi_codegen as sc
 from scvi_codegen.codegen.ir.arithmetic import FUNCTIONS
@@ -22,7 +22,7 @@ from scvi_codegen.methods.method import Method
 
 HERE = Path(__file__).parent / "embedded"
 CROSS, QEMU = "arm-none-eabi-gcc", "qemu-system-arm"
-STRICT = "-std=c99 -Wall -Wextra -Wpedantic -Wshadow -Wconversion -Werror -ffp-contract=off".split()  # noqa: SIM905
+EXACT = (*STRICT, "-ffp-contract=off")
 PURE_SINGLE = ("-Wdouble-promotion", "-Wfloat-conversion", "-Wunsuffixed-float-constants")
 KINDS = {"double": np.float64, "single": np.float32}
 H, STEPS = 0.0625, 50
@@ -51,12 +51,6 @@ CASES: dict[str, tuple[str, Method]] = {
     "shooting": ("planar-pendulum", sc.SCVI(3)),
     "driven": ("driven-duffing", sc.SVI(2)),
 }
-
-
-def run(command: list[str], folder: Path) -> str:
-    result = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, timeout=120)
-    assert result.returncode == 0, f"{' '.join(command)}\n{result.stdout[-2000:]}{result.stderr}"
-    return result.stdout
 
 
 @cache
@@ -100,7 +94,7 @@ def states(output: str, precision: Embedded) -> tuple[np.ndarray, np.ndarray]:
 def on_host(case: str, precision: Embedded, folder: Path) -> tuple[np.ndarray, np.ndarray]:
     needs("gcc")
     files = write_case(case, precision, folder)
-    run(["gcc", "-O2", *STRICT, f"-I{HERE}", "-I.", *files, "-lm", "-o", "host"], folder)
+    run(["gcc", "-O2", *EXACT, f"-I{HERE}", "-I.", *files, "-lm", "-o", "host"], folder)
     return states(run(["./host"], folder), precision)
 
 
@@ -108,7 +102,7 @@ def on_board(case: str, board: Board, folder: Path) -> tuple[np.ndarray, np.ndar
     needs(CROSS, QEMU, "arm-none-eabi-nm", "arm-none-eabi-size")
     files = write_case(case, board.precision, folder)
     pure = PURE_SINGLE if board.precision == "single" else ()
-    common = [CROSS, "-mthumb", *board.flags, "-O2", *STRICT, "-ffreestanding", f"-I{HERE}", "-I."]
+    common = [CROSS, "-mthumb", *board.flags, "-O2", *EXACT, "-ffreestanding", f"-I{HERE}", "-I."]
     run([*common, *pure, "-Wvla", "-Wstack-usage=512", "-c", "integrator.c"], folder)
     check_needs(folder)
     linked = ["-nostartfiles", "--specs=nosys.specs", f"-T{HERE / 'mps2.ld'}", "-Wl,--gc-sections"]
@@ -183,7 +177,7 @@ def test_iteration_limit_is_fixed_at_compile_time(bound, tmp_path):
     write_case("kepler", "double", tmp_path)
     (tmp_path / "count.c").write_text(COUNTING)
     define = f"-DINTEGRATOR_MAX_ITERATIONS={bound}"
-    run(["gcc", *STRICT, define, "integrator.c", "count.c", "-lm", "-o", "count"], tmp_path)
+    run(["gcc", *EXACT, define, "integrator.c", "count.c", "-lm", "-o", "count"], tmp_path)
     assert run(["./count"], tmp_path).split() == ["1", str(bound)]
 
 
@@ -273,10 +267,8 @@ def test_all_methods_compile_in_either_precision(tmp_path):
     for prefix, method in methods.items():
         for precision in EMBEDDED:
             source, _ = sc.generate_source(sample_named("cart-pole").system, method, prefix=prefix, embedded=precision)
-            (tmp_path / f"{prefix}.h").write_text(source.header)
-            (tmp_path / f"{prefix}.c").write_text(source.code)
             pure = PURE_SINGLE if precision == "single" else ()
-            run(["gcc", *STRICT, *pure, "-c", f"{prefix}.c"], tmp_path)
+            run(["gcc", *EXACT, *pure, "-c", *write([source], tmp_path)], tmp_path)
 
 
 EVENTS_MAIN = """
@@ -315,15 +307,16 @@ def test_impacts_without_allocation(tmp_path):
     assert set(source.files) == {"hit.h", "hit.c", "hit_events.h", "hit_events.c"}
     source.write(tmp_path)
     (tmp_path / "main.c").write_text(EVENTS_MAIN)
-    command = ["gcc", *STRICT, "-O1", "hit.c", "hit_events.c", "main.c", "-o", "hit", "-lm"]
-    subprocess.run(command, cwd=tmp_path, check=True)
+    run(["gcc", *EXACT, "-O1", "hit.c", "hit_events.c", "main.c", "-o", "hit", "-lm"], tmp_path)
     code = "".join(text for name, text in source.files.items() if name.endswith(".c"))
     assert not re.search(r"\b[mc]alloc\b|\balloca\b", code)
-    printed = subprocess.run([tmp_path / "hit"], capture_output=True, text=True, check=True).stdout
+    printed = run(["./hit"], tmp_path)
     found = np.array([line.split() for line in printed.splitlines()], dtype=float)
-    run = sc.compile_stepper(ball, sc.SVI(2)).integrate([1.0], [0.0], h=0.1, t_end=8.0, events=sc.impact("y", 0.8))
-    assert len(found) == len(run.events[0]) == 4
-    assert np.abs(found[:, 0] - run.events[0].t).max() < 1e-13
-    assert np.abs(found[:, 1] - run.events[0].p[:, 0]).max() < 1e-13
+    trajectory = sc.compile_stepper(ball, sc.SVI(2)).integrate(
+        [1.0], [0.0], h=0.1, t_end=8.0, events=sc.impact("y", 0.8)
+    )
+    assert len(found) == len(trajectory.events[0]) == 4
+    assert np.abs(found[:, 0] - trajectory.events[0].t).max() < 1e-13
+    assert np.abs(found[:, 1] - trajectory.events[0].p[:, 0]).max() < 1e-13
     with pytest.raises(sc.MethodError, match="events require double precision"):
         sc.generate_source(ball, sc.SVI(2), events=sc.impact("y"), embedded="single")

@@ -1,7 +1,6 @@
 """Two generated integrators, of named coordinates and of arrays, in one translation unit."""
 
 import re
-import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -9,13 +8,13 @@ import pytest
 from golden_cells import catalogue, ring
 from programs import needs
 from samples import QUICK_FLAGS
+from strict_c import STRICT, run
 
 from scvi_codegen import SVI, LagrangianSystem, compile_stepper, generate_source
 from scvi_codegen.codegen.native.compilers import find_compiler
 from scvi_codegen.codegen.pipeline import ArraySources
 from scvi_codegen.codegen.rendering.source import Source
 
-STRICT = "-std=c99 -O1 -Wall -Wextra -pedantic -Wshadow -Wconversion -Wno-psabi -Werror".split()  # noqa: SIM905
 H, STEPS, N = 0.05, 40, 8
 RUNS = """
 #include "kepler.c"
@@ -67,14 +66,14 @@ def test_two_integrators_in_one_translation_unit_agree_with_python(compiler, tmp
     written(generate_source(kepler, SVI(4), prefix="kepler")[0], tmp_path)
     written(ArraySources(arrays, SVI(4), prefix="ring").integrator()[0], tmp_path)
     (tmp_path / "main.c").write_text(RUNS.format(n=N, h=H, steps=STEPS))
-    subprocess.run([needs(compiler), *STRICT, "main.c", "-lm", "-o", "main"], cwd=tmp_path, check=True)
-    done = subprocess.run([tmp_path / "main"], check=True, capture_output=True, text=True)
+    run([needs(compiler), *STRICT, "-Wno-psabi", "main.c", "-lm", "-o", "main"], tmp_path)
+    printed = run(["./main"], tmp_path)
     one = compile_stepper(kepler, SVI(4), flags=QUICK_FLAGS).integrate([0.4, 0.1], [0.0, 2.0], h=H, steps=STEPS)
     q, p = 0.125 * np.arange(N), 0.5 - 0.0625 * np.arange(N)
-    run = compile_stepper(arrays, "svi:4", flags=QUICK_FLAGS).start(q, p=p, h=H)
-    run.advance(STEPS)
-    expected = np.concatenate([one.q[-1], one.p[-1], run.q["q"], run.p["q"]])
-    assert np.array(done.stdout.split(), dtype=float) == pytest.approx(expected, rel=1e-13, abs=1e-13)
+    many = compile_stepper(arrays, "svi:4", flags=QUICK_FLAGS).start(q, p=p, h=H)
+    many.advance(STEPS)
+    expected = np.concatenate([one.q[-1], one.p[-1], many.q["q"], many.p["q"]])
+    assert np.array(printed.split(), dtype=float) == pytest.approx(expected, rel=1e-13, abs=1e-13)
 
 
 def test_no_name_or_macro_of_an_integrator_remains(tmp_path):
@@ -82,15 +81,12 @@ def test_no_name_or_macro_of_an_integrator_remains(tmp_path):
     for prefix in ("one", "two"):
         written(generate_source(catalogue("double-pendulum")(), "svi:4", prefix=prefix)[0], tmp_path)
     (tmp_path / "both.c").write_text('#include "one.c"\n#include "two.c"\n')
-    command = [*find_compiler(), *STRICT, "-fsyntax-only", "both.c"]
-    subprocess.run(command, cwd=tmp_path, check=True)
-    listed = subprocess.run(
-        [*find_compiler(), "-std=c99", "-E", "-dM", "both.c"], cwd=tmp_path, check=True, capture_output=True, text=True
-    ).stdout
-    empty = subprocess.run(
-        [*find_compiler(), "-std=c99", "-E", "-dM", "-include", "float.h", "-include", "limits.h", "-include", "math.h",
-         "-include", "string.h", "-x", "c", "/dev/null"], check=True, capture_output=True, text=True,
-    ).stdout  # fmt: skip
+    run([*find_compiler(), *STRICT, "-Wno-psabi", "-fsyntax-only", "both.c"], tmp_path)
+    macros = [*find_compiler(), "-std=c99", "-E", "-dM"]
+    (tmp_path / "empty.c").write_text(
+        "".join(f"#include <{name}.h>\n" for name in ("float", "limits", "math", "string"))
+    )
+    listed, empty = (run([*macros, name], tmp_path) for name in ("both.c", "empty.c"))
     left = {line.split()[1].split("(")[0] for line in set(listed.splitlines()) - set(empty.splitlines())}
     assert {name for name in left if not name.startswith(("ONE_", "TWO_"))} == set()
 
@@ -114,4 +110,4 @@ def test_every_function_of_a_single_file_is_used(name, tmp_path):
     system = LagrangianSystem.from_text(name=name, coordinates=coordinates, lagrangian=lagrangian, **conditions)
     method = SVI(2, "gauss-lobatto:3" if options else "gauss-legendre:2")
     written(generate_source(system, method, prefix="one", **options)[0].single_file(), tmp_path)
-    subprocess.run([*find_compiler(), *STRICT, "-c", "one.c"], cwd=tmp_path, check=True)
+    run([*find_compiler(), *STRICT, "-Wno-psabi", "-c", "one.c"], tmp_path)
