@@ -70,17 +70,11 @@ typedef struct {
   void *thread_barrier; /* barrier of the threads, during a call */
   double t, t_low, h; /* here the state begins */
   long long step, guess, turn; /* completed; steps that the predictor uses; which part of work is the last */
-  long long iterations; /* since the last stored state */
-  double error, error_t; /* largest error estimate of a step so far, and the time of that step */
   double largest_v[1], largest_a[1]; /* velocities and accelerations so far, for the size of errors */
   double largest_dq[1], largest_bend[1]; /* displacements by a step and by its curvature so far */
+  long long iterations; /* since the last stored state */
+  double error, error_t; /* largest error estimate of a step so far, and the time of that step */
   double largest_motion; /* by a step, relative to which the error is measured, with fixed steps */
-  double error_before; /* error estimate of the last step, converted to the next step size; 0 before the first */
-  double path; /* sum of the largest displacements of the steps so far */
-  long long grid_level, change, change_before, rejected, direction; /* step-size level, its last changes */
-  long long steps_to_compare; /* coming steps that are compared with two of half their size */
-  long long failed, avoiding; /* level at which the iteration failed; next steps below it (< 0: those by Newton) */
-  long long many, suspended; /* iterations that reduced the step size; next steps in which they do not */
 } fput_ring_stoermer_verlet_run;
 
 /* Tolerance 2.220446049250313e-16 (relative), at most 50 iterations. */

@@ -29,7 +29,7 @@ from sympy import Expr
 
 from scvi_codegen.codegen.ir.derivatives import PointDerivatives
 from scvi_codegen.codegen.ir.equations import Control
-from scvi_codegen.codegen.ir.program import Program
+from scvi_codegen.codegen.ir.program import ArrayProgram, Program
 from scvi_codegen.codegen.lowering.arrays import check_solver
 from scvi_codegen.codegen.lowering.control import control_of, error_growth_of
 from scvi_codegen.codegen.lowering.derivatives import correction_of, derivatives_of
@@ -45,6 +45,7 @@ from scvi_codegen.codegen.rendering.program_source import (
     Embedded,
     in_pairs,
     render,
+    render_arrays,
     render_derivatives,
     render_double_double,
     render_embedded,
@@ -470,7 +471,14 @@ class ArraySources(Sources):
         by_momenta = self.g is None and self.solver == "fixed-point" and self.system.coupled_terms
         return site_hamiltonian(self.system) if by_momenta else None
 
-    def _derived(self, **_: Any) -> Program:
+    def integrator(self, *, controlled: bool = True) -> tuple[Source, Interface]:
+        """Return the C source and its interface; arguments as of :meth:`Sources.integrator`."""
+        program = self.program()
+        assert isinstance(program, ArrayProgram)
+        control = control_of(program, self.controller, self.system, self.g) if controlled else None
+        return render_arrays(program, control), self.interface
+
+    def _derived(self, **_: Any) -> ArrayProgram:
         """Return the lowered program; raise :class:`SizesRequiredError` if there is none for run-time sizes."""
         system = self.sites.system if self.sites else self.system
         system.check_run_time_sizes()
@@ -513,9 +521,6 @@ class ArraySources(Sources):
             solver="rattle" if system.constraints else self.solver,
             layout=layout,
         )
-
-    def _with_growth(self, control: Control) -> Control:
-        return control
 
     def variant(self, variant: Variant) -> None:
         """Return ``None``: variants are those of known sizes."""

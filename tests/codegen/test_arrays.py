@@ -10,7 +10,7 @@ from style import check_style
 from scvi_codegen.codegen.lowering.control import control_of
 from scvi_codegen.codegen.lowering.program import lower_arrays
 from scvi_codegen.codegen.native.compilers import find_compiler
-from scvi_codegen.codegen.rendering.program_source import render
+from scvi_codegen.codegen.rendering.program_source import render_arrays
 from scvi_codegen.codegen.rendering.source import Source
 from scvi_codegen.methods import as_method
 
@@ -58,7 +58,7 @@ def rendered(name: str, method: str, *, newton: bool = False) -> Source:
     program = lower_arrays(system, as_method(method), prefix="arrays", solver="newton" if newton else "fixed-point")
     control = control_of(program)
     assert control is not None or method == "stoermer-verlet"
-    return render(program, control)
+    return render_arrays(program, control)
 
 
 @pytest.mark.tiers(1, 3)

@@ -227,8 +227,7 @@ class Program:
         notes: lines for the header's comment: order, symmetry, symplecticity.
         order: of the method; the number of its points if none is claimed.
         layout: arrays and parameters.
-        fixed_point: the fixed-point iteration tried first, or ``None``; of a system of arrays that of one coordinate,
-            whose tables serve all.
+        fixed_point: the fixed-point iteration tried first, or ``None``.
         splitting: the explicit sequence that replaces iterations, or ``None``.
         newton: whether Newton's method for the stage equations is included.
         polynomial_curves: whether the leading coefficient of a curve is an error estimate.
@@ -238,7 +237,6 @@ class Program:
         damping: the rate of a uniform damping, if there is one.
         summed: whether the action is summed also where it is no function of both ends of a step.
         acts_along: whether runs sum the action of their steps.
-        loops: of a system of arrays.
     """
 
     prefix: str
@@ -257,7 +255,6 @@ class Program:
     damping: Kernel | None = None
     summed: bool = False
     acts_along: bool = False
-    loops: RolledTerms = RolledTerms()
 
     @property
     def dimension(self) -> int:
@@ -265,9 +262,9 @@ class Program:
         return len(self.layout.coordinates)
 
     @property
-    def of_arrays(self) -> bool:
-        """True for a system of arrays."""
-        return bool(self.loops.forces or self.loops.masses)
+    def momentum_maps(self) -> tuple[MomentumMap | ArrayMap, ...]:
+        """First integrals from symmetries."""
+        return self.quantities.momentum_maps
 
     @property
     def error_power(self) -> int:
@@ -385,3 +382,24 @@ class Program:
         """Return the size of a matrix with ``blocks`` unknowns per site: its band with fill-in, or all of it."""
         rows, reach = sites * blocks, (self.equations.bandwidth + 1) * blocks - 1
         return rows * min(rows, 3 * reach + 1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ArrayProgram(Program):
+    """Integrator of a system of arrays of run-time sizes; its fixed-point iteration, of one coordinate, serves all.
+
+    Attributes:
+        loops: the terms of the system.
+    """
+
+    loops: RolledTerms
+
+    @property
+    def momentum_maps(self) -> tuple[MomentumMap | ArrayMap, ...]:
+        """First integrals from symmetries."""
+        return self.loops.maps
+
+    @property
+    def action(self) -> bool:
+        """False: there are no discrete Lagrangians of arrays."""
+        return False

@@ -16,6 +16,7 @@ from scvi_codegen.codegen.ir.equations import FixedPointIteration, Splitting
 from scvi_codegen.codegen.ir.kernel import Kernel, lower_matrix, lower_vector
 from scvi_codegen.codegen.ir.program import (
     FEW_UNKNOWNS,
+    ArrayProgram,
     Integrals,
     Layout,
     MomentumMap,
@@ -196,7 +197,7 @@ def lower(
     )
 
 
-def lower_arrays(system: ArraySystem, method: Method, *, prefix: str, solver: str = "fixed-point") -> Program:
+def lower_arrays(system: ArraySystem, method: Method, *, prefix: str, solver: str = "fixed-point") -> ArrayProgram:
     """Return the program of one step of a system of arrays of run-time sizes, with its terms in loops.
 
     Their masses are constant, so that the tables of a method are the same for every coordinate: those of a system of
@@ -208,13 +209,15 @@ def lower_arrays(system: ArraySystem, method: Method, *, prefix: str, solver: st
     splitting = None if constrained else splitting_of(one, method)
     iterated = constrained is None and splitting is None
     fixed_point = iteration_of(one, stages, velocities=velocities) if iterated else None
+    if fixed_point:
+        fixed_point = replace(fixed_point, constant_mass=None)  # each coordinate has its own
     loops = rolled_terms(system, constrained, newton=solver == "newton")
     if loops.products and fixed_point and fixed_point.matrix:
         loops = replace(loops, shifts=shift_tables(fixed_point.matrix, fixed_point.lanes))
     check_solver_of_arrays(system, method, solver, splitting or constrained or fixed_point, loops)
     arrays = ("coordinates", "momenta", "velocities", "sums", "fields", "tables", "sizes")
     geometry = "not symplectic" if system.applied_forces else _geometry(method, one)
-    return Program(
+    return ArrayProgram(
         **_heading(system, method, stages, prefix, geometry=geometry),
         layout=Layout(**{kind: getattr(system, kind) for kind in arrays}, **_numbers_of(system)),
         fixed_point=fixed_point,

@@ -35,7 +35,7 @@ from scvi_codegen.codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.codegen.ir.kernel import Kernel, RolledKernel, lower_matrix, lower_vector
 from scvi_codegen.codegen.ir.program import Layout
 from scvi_codegen.codegen.rendering.kernels.loop_nests import Nest, count_text, size_text
-from scvi_codegen.codegen.rendering.program_source import EventSearch, render_events
+from scvi_codegen.codegen.rendering.program_source import ArrayEventSearch, EventSearch, render_events
 from scvi_codegen.codegen.rendering.source import Interface, Source
 from scvi_codegen.common.errors import EventError, ScviCodegenError, SystemDefinitionError, closest
 from scvi_codegen.common.precision import mp
@@ -290,39 +290,48 @@ def _search(interface: Interface, events: tuple[SearchedEvent, ...], *, controll
     points = chebyshev_lobatto(DEGREE).points
     inverse = mp.matrix([[x**k for k in range(DEGREE + 1)] for x in points]) ** -1
     coefficients = tuple(tuple(inverse[k, j] for j in range(DEGREE + 1)) for k in range(DEGREE + 1))
-    search = EventSearch(
-        prefix=interface.prefix,
-        dimension=interface.dimension,
-        transformed=interface.in_tau,
-        constrained=bool(interface.constraints or interface.layout.constraints),
-        nodes=lower_vector(to_unit(points)),
-        coefficients=lower_matrix(coefficients),
-        doubts=(0.5 ** (DEGREE - 2), 0.5 ** (DEGREE - 1)),
-        guarded=tuple(number for number, event in enumerate(events) for _ in event.conditions),
-        impacts=tuple(int(event.restitution is not None) for event in events),
-        conditional=tuple(int(bool(event.conditions)) for event in events),
-        controlled=controlled,
-    )
+    common: dict[str, Any] = {
+        "prefix": interface.prefix,
+        "dimension": interface.dimension,
+        "transformed": interface.in_tau,
+        "constrained": bool(interface.constraints or interface.layout.constraints),
+        "nodes": lower_vector(to_unit(points)),
+        "coefficients": lower_matrix(coefficients),
+        "doubts": (0.5 ** (DEGREE - 2), 0.5 ** (DEGREE - 1)),
+        "impacts": tuple(int(event.restitution is not None) for event in events),
+        "conditional": tuple(int(bool(event.conditions)) for event in events),
+        "controlled": controlled,
+        "changes_states": any(event.changes_state for event in events),
+    }
     if interface.layout.coordinates:
-        arrays, changed = array_events(interface, events), (0,) * any(event.changes_state for event in events)
-        known: dict[str, Any] = {"kernels": tuple(arrays.kernels), "changed": changed, "timed": arrays.timed}
-        return replace(search, dimension=0, arrays=arrays, uses_velocity=arrays.uses_velocity, **known)
+        arrays = array_events(interface, events)
+        return ArrayEventSearch(
+            **common,
+            arrays=arrays,
+            kernels=tuple(arrays.kernels),
+            timed=arrays.timed,
+            guarded=tuple(number for number, event in enumerate(events) for _ in event.conditions),
+            uses_velocity=arrays.uses_velocity,
+        )
     formulas = EventFormulas(interface, events)
-    guards = [guard for _, guard in formulas.guards]
-    values = [value for _, each in formulas.changes for value in each]
-    timed = [0 if search.transformed else _kind_in_time(g, formulas.arguments) for g in formulas.functions]
+    timed = [0 if interface.in_tau else _kind_in_time(g, formulas.arguments) for g in formulas.functions]
     rates = [turn_rate(g) if kind else sympy.Integer(0) for g, kind in zip(formulas.functions, timed, strict=True)]
-    every = {"event_functions": formulas.functions, "event_guards": guards, "event_changes": values}
-    every |= {"event_rates": rates} if any(timed) else {}
-    return replace(
-        search,
+    formulas_of_kernel = {
+        "event_functions": formulas.functions,
+        "event_guards": [guard for _, guard in formulas.guards],
+        "event_changes": [value for _, values in formulas.changes for value in values],
+        "event_rates": rates if any(timed) else [],
+    }
+    variables = {symbol for values in formulas_of_kernel.values() for value in values for symbol in value.free_symbols}
+    return EventSearch(
+        **common,
         elements=tuple(formulas.elements),
         timed=tuple(timed[first] for first in (0, *accumulate(formulas.elements[:-1]))),
         guarded=tuple(number for number, _ in formulas.guards),
-        kernels=tuple(formulas.kernel(name, each) for name, each in every.items() if each),
-        uses_velocity=any(value.free_symbols.intersection(formulas.v) for each in every.values() for value in each),
+        kernels=tuple(formulas.kernel(name, values) for name, values in formulas_of_kernel.items() if values),
+        uses_velocity=not variables.isdisjoint(formulas.v),
         changed=tuple(index for indices, _ in formulas.changes for index in indices),
-        first_values=(0, *accumulate(len(each) for _, each in formulas.changes)),
+        first_values=(0, *accumulate(len(values) for _, values in formulas.changes)),
     )
 
 

@@ -13,12 +13,12 @@ frameworks.
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, chain
-from typing import Any, Literal, TypeAlias, cast, get_args
+from typing import Any, ClassVar, Literal, TypeAlias, cast, get_args
 
 from scvi_codegen.codegen.ir.derivatives import Derivatives, PointDerivatives
 from scvi_codegen.codegen.ir.equations import Control, FixedPointIteration, IterationTable, Rattle, StoredValues
 from scvi_codegen.codegen.ir.kernel import Kernel, Number, is_divided
-from scvi_codegen.codegen.ir.program import Program
+from scvi_codegen.codegen.ir.program import ArrayProgram, Program
 from scvi_codegen.codegen.rendering.environment import support_text, template_environment
 from scvi_codegen.codegen.rendering.header import HeaderRecord
 from scvi_codegen.codegen.rendering.kernels.double_double import arithmetic_headers, uses_functions
@@ -48,8 +48,10 @@ TARGETS: dict[Embedded, Target] = {"double": DOUBLE, "single": SINGLE}
 
 DECLARATIONS = {
     "stepper": "parts/declarations.h.jinja",
+    "arrays": "parts/array_declarations.h.jinja",
     "ensemble": "parts/ensemble_declarations.h.jinja",
     "events": "parts/events_declarations.h.jinja",
+    "array_events": "parts/array_events_declarations.h.jinja",
 }
 """Inner part of a header by the name of its template."""
 
@@ -138,25 +140,25 @@ class EventSearch:
     """Data of the search for zeros of functions of the state.
 
     Attributes:
-        prefix, dimension: of the integrator; 0 for arrays of run-time sizes.
+        prefix, dimension: of the integrator.
         transformed: whether time is, so that the integrator's velocities are dq/dtau.
         constrained: whether states satisfy constraints, also after changes.
         nodes: (d + 1,) fractions of a part of a step at which they are evaluated.
         coefficients: (d + 1, d + 1) from values there to coefficients of powers of x in [-1, 1].
         doubts: factors of the last two coefficients in the error estimate.
         timed: for each event 1 if its function is one of time alone, 2 if it is affine, else 0.
-        guarded: index of the function of each condition of crossings; of arrays of run-time sizes of its event.
+        guarded: index of the function of each condition of crossings.
         impacts: 1 for each event that is the wall of an impact, else 0.
         conditional: 1 for each event with conditions, else 0.
         controlled: whether the integrator has adaptive steps.
+        changes_states: whether crossings change the state of a run.
         kernels: the functions at u = (q, p, v); conditions; values of variables that crossings change, gradient and
-            restitution of impacts. Of arrays of run-time sizes those of their functions.
+            restitution of impacts.
         uses_velocity: whether v occurs in the formulas.
         changed: index among (q, p, v) of the variable of each value of the changes.
         first_values: index of the first value of each function, and the number of values.
-        elements: number of functions of each event at known sizes, one for each element of its loops.
-        arrays: :class:`~scvi_codegen.codegen.rendering.events.ArrayEvents` at run-time sizes, without kernels of all
-            functions.
+        elements: number of functions of each event, one for each element of its loops.
+        ENTRY: name of the entry templates.
     """
 
     prefix: str
@@ -166,17 +168,18 @@ class EventSearch:
     nodes: tuple[float, ...]
     coefficients: tuple[tuple[float, ...], ...]
     doubts: tuple[float, float]
-    timed: tuple[int, ...] = ()
+    timed: tuple[int, ...]
     guarded: tuple[int, ...]
     impacts: tuple[int, ...]
     conditional: tuple[int, ...]
     controlled: bool
-    kernels: tuple[Kernel, ...] = ()
-    uses_velocity: bool = False
+    changes_states: bool
+    kernels: tuple[Kernel, ...]
+    uses_velocity: bool
     changed: tuple[int, ...] = ()
     first_values: tuple[int, ...] = ()
     elements: tuple[int, ...] = ()
-    arrays: Any = None
+    ENTRY: ClassVar[str] = "events"
 
     @property
     def first_functions(self) -> list[int]:
@@ -189,14 +192,29 @@ class EventSearch:
         return [event for event, count in enumerate(self.elements) for _ in range(count)]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ArrayEventSearch(EventSearch):
+    """Search for zeros of functions of arrays of run-time sizes, with the index of its event for each condition.
+
+    Attributes:
+        arrays: :class:`~scvi_codegen.codegen.rendering.events.ArrayEvents`, whose functions have the kernels.
+    """
+
+    arrays: Any
+    ENTRY = "array_events"
+
+
 def render(program: Program, control: Control | None = None, *, fallback: Fallback | None = None) -> Source:
     """Return header and source of a program; with control, with adaptive steps. Equal programs give equal bytes.
 
     If the fixed-point iteration fails, Newton's method is the fallback if the program has it, unless another is named.
     """
-    if program.of_arrays:
-        return _render(program.prefix, loop_context(program) | _control_context(program, control), "arrays")
     return _render(program.prefix, _context(program, DOUBLE, control, fallback))
+
+
+def render_arrays(program: ArrayProgram, control: Control | None) -> Source:
+    """Return the source of a program of arrays of run-time sizes; control as of :func:`render`."""
+    return _render(program.prefix, loop_context(program) | _control_context(program, control), "arrays")
 
 
 def render_derivatives(derivatives: Derivatives) -> Source:
@@ -414,16 +432,16 @@ def render_embedded(program: Program, precision: Embedded, control: Control | No
 def _render(prefix: str, context: Mapping[str, object], entry: str = "stepper") -> Source:
     """Return the source of entry templates from their context, with defaults for all of them."""
     common = {"prefix": prefix, "target": DOUBLE, "real": DOUBLE.scalar, "max_iterations": MAX_ITERATIONS}
-    environment, context = template_environment(), {**common, "two_words": None, "rattle_in_pairs": False, **context}
-    header = entry if entry in DECLARATIONS else "stepper"
+    absent = {"two_words": None, "rattle_in_pairs": False, "derivatives": None, "fallback": "none", "embedded": False}
+    environment, context = template_environment(), {**common, **absent, **context}
     record = HeaderRecord(cast(str, context["prefix"]), cast(str, context["real"]))
     recorded = context | {"prototype": record.prototype, "optional": record.optional}
-    declarations = environment.get_template(DECLARATIONS[header]).render(recorded)
+    declarations = environment.get_template(DECLARATIONS[entry]).render(recorded)
     code = environment.get_template(f"{entry}.c.jinja").render(context)
     headers = cast("Mapping[str, str]", context.get("own_headers", {}))
     return Source(
         prefix=prefix,
-        header=environment.get_template(f"{header}.h.jinja").render(context | {"declarations": declarations}),
+        header=environment.get_template(f"{entry}.h.jinja").render(context | {"declarations": declarations}),
         code=code,
         declarations=declarations,
         support=included(code, lambda name: headers.get(name) or support_text(name)),
@@ -458,6 +476,7 @@ CONTENTS: dict[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
     "stepper": _contents_of_step,
     "arrays": lambda context: {"threads": True},
     "events": lambda context: {},
+    "array_events": lambda context: {},
     "ensemble": lambda context: {name: int(context[name]) for name in ("points", "observed", "needs_velocities")},
 }
 """Contents of the C of an entry template, from its context."""
@@ -520,7 +539,7 @@ def render_events(search: EventSearch) -> Source:
         "cut": is_divided(search.kernels),
         "inverse_roots": inverse_roots(search.kernels),
     }
-    return _render(f"{search.prefix}_events", context, "events")
+    return _render(f"{search.prefix}_events", context, search.ENTRY)
 
 
 def render_example(interface: Interface, start: ExampleRun, precision: Embedded = "double") -> dict[str, str]:
@@ -595,8 +614,7 @@ def _context(
         "scratch": scratch_size(program) + (fallback == "external"),
         "jacobian": jacobian_size(program),
         "most_iterations": "INT_MAX",
-        "embedded": False,
-        "derivatives": None,
+        "held": program.constraints,
         "unrolled_equations": unrolled_equations(program, target),
         "vector_functions": loop_functions(_kernels_of_points(program)),
         "fallback": fallback,

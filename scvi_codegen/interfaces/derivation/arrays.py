@@ -7,7 +7,7 @@ from sympy import latex
 
 from scvi_codegen.codegen.ir.equations import FixedPointIteration, Splitting
 from scvi_codegen.codegen.ir.kernel import Number
-from scvi_codegen.codegen.ir.program import Program
+from scvi_codegen.codegen.ir.program import ArrayProgram
 from scvi_codegen.codegen.lowering.program import lower_arrays
 from scvi_codegen.common.representation import LONGEST, clipped
 from scvi_codegen.methods.method import Method
@@ -33,7 +33,7 @@ class ArrayStepEquations:
         return clipped(f"<equations of {self.system.name} by {self.method.name}>", LONGEST)
 
     @property
-    def program(self) -> Program:
+    def program(self) -> ArrayProgram:
         """Lowered program.
 
         Raises:
@@ -86,7 +86,7 @@ def _latex(system: ArraySystem) -> Iterator[str]:
             yield rf"\[ {latex_sums(term)} \; {by}: \quad {latex(derivative, symbol_names=entries)} \]"
 
 
-def _step(program: Program, method: Method) -> Iterator[str]:
+def _step(program: ArrayProgram, method: Method) -> Iterator[str]:
     yield f"A step of h by {method.title}, from q, p to q', p', the same for every coordinate"
     if program.loops.constrained:
         yield "(m its mass, F the force on it, G the Jacobian of the constraints g, q, p going on from part to part):"

@@ -8,7 +8,7 @@ from typing import Any
 
 from scvi_codegen.codegen.ir.equations import ConstrainedSteps
 from scvi_codegen.codegen.ir.kernel import Kernel, RolledKernel, is_divided
-from scvi_codegen.codegen.ir.program import Program
+from scvi_codegen.codegen.ir.program import ArrayProgram
 from scvi_codegen.codegen.rendering.kernels.functions import kernel_text
 from scvi_codegen.codegen.rendering.kernels.loop_nests import (
     DIRECTION,
@@ -43,7 +43,7 @@ STEP_VECTORS = 14
 """Further vectors: inverse sizes, half steps, increments of a step (templates/support/arrays/work_arrays.h)."""
 
 
-def loop_context(program: Program) -> dict[str, Any]:
+def loop_context(program: ArrayProgram) -> dict[str, Any]:
     """Return the template's context for the program of a system of arrays."""
     loops, constrained, pairs = program.loops, program.loops.constrained, _circulants(program)
     sums, fixed_point, layout = _convolutions(program), program.fixed_point, program.layout
@@ -103,14 +103,14 @@ def loop_context(program: Program) -> dict[str, Any]:
     }
 
 
-def _appended_arrays(program: Program) -> Iterator[str]:
+def _appended_arrays(program: ArrayProgram) -> Iterator[str]:
     """Yield the statements that describe the arrays of coordinates."""
     for k, array in enumerate(program.layout.coordinates):
         is_field = any(couples_elements(array, each.reads, each.given) for each in program.loops.applied)
         yield f"end = append_array(&all[{k}], end, {product_text(array)}, {int(is_field)});"
 
 
-def _map_texts(program: Program) -> Iterator[str]:
+def _map_texts(program: ArrayProgram) -> Iterator[str]:
     """Yield the initialisers of the descriptions of momentum maps (templates/support/arrays/array_states.h)."""
     arrays = {array.name: array for array in program.layout.coordinates}
     for each in program.loops.maps:
@@ -121,7 +121,7 @@ def _map_texts(program: Program) -> Iterator[str]:
         yield f"{{{start}, {start} + {product_text(array)}, {components}, {numbers}, {kind}}}"
 
 
-def _site_text(program: Program, rolled: RolledKernel) -> str:
+def _site_text(program: ArrayProgram, rolled: RolledKernel) -> str:
     """Return a function that computes velocities or momenta of the elements of a term, from the joined state."""
     place_of, name = Nest(program.layout, rolled, "", "").place_of, rolled.kernel.name
     stored = [f"result[{place_of(access)}] = value[{k}];" for k, access in enumerate(rolled.writes)]
@@ -130,7 +130,7 @@ def _site_text(program: Program, rolled: RolledKernel) -> str:
     return _function(program, rolled, f"find_{name}", arguments, lines, values=len(stored))
 
 
-def _circulants(program: Program) -> list[RolledKernel]:
+def _circulants(program: ArrayProgram) -> list[RolledKernel]:
     """Return the terms whose forces, or products with a direction, are products with circulant matrices."""
     return [each for each in program.loops.applied if each.circulant is not None]
 
@@ -145,13 +145,13 @@ def _stages(sums: Sequence[Convolution]) -> list[tuple[int, str, int]]:
     return [(*stage, len([*group])) for stage, group in alike]
 
 
-def _plans(program: Program) -> list[tuple[str, int]]:
+def _plans(program: ArrayProgram) -> list[tuple[str, int]]:
     """Return the arrays of coefficients and powers of all circulant matrices; of sums over pairs the power is 0."""
     pairs = [(each.given[0].array.name, 0) for each in _circulants(program)]
     return [*dict.fromkeys([*pairs, *(stage[1:] for sums in program.layout.sums for stage in _stages(sums))])]
 
 
-def _convolutions(program: Program) -> list[str]:
+def _convolutions(program: ArrayProgram) -> list[str]:
     """Return the convolutions of each array in C: their number, whether forces are derivatives by them, stages."""
     kernels = program.loops.applied
     reads, writes = (
@@ -166,7 +166,7 @@ def _convolutions(program: Program) -> list[str]:
     return texts
 
 
-def _transform_work(program: Program) -> int:
+def _transform_work(program: ArrayProgram) -> int:
     """Return the number of doubles per coordinate of Fourier transforms."""
     lanes, plans = program.fixed_point.lanes if program.fixed_point else 1, len(_plans(program))
     states = 2 if program.layout.momenta or program.layout.velocities else 1
@@ -175,7 +175,7 @@ def _transform_work(program: Program) -> int:
     return vectors * lanes + TRANSFORM_ALIGNMENT + PLAN_VECTORS * plans if plans else 0
 
 
-def _step_work(program: Program) -> int:
+def _step_work(program: ArrayProgram) -> int:
     """Return the number of doubles per coordinate that the method uses."""
     if program.fixed_point is None:
         return CONSTRAINED_VECTORS + bool(program.layout.velocities) if program.loops.constrained else EXPLICIT_VECTORS
@@ -188,12 +188,12 @@ def _step_work(program: Program) -> int:
     return (iteration + linear) * program.fixed_point.lanes + waves + STEP_VECTORS
 
 
-def _vector_functions(program: Program) -> list[str]:
+def _vector_functions(program: ArrayProgram) -> list[str]:
     """Return the functions of the vector library that occur in the forces of an explicit method."""
     return loop_functions([each.kernel for each in program.loops.forces] if program.fixed_point is None else [])
 
 
-def _force_text(program: Program, rolled: RolledKernel) -> str:
+def _force_text(program: ArrayProgram, rolled: RolledKernel) -> str:
     """Return a function that adds to the forces; for an explicit method, with a factor."""
     explicit = program.fixed_point is None
     chunked, sharing = explicit and bool(rolled.loops), sharing_of(rolled)
@@ -231,7 +231,7 @@ def _force_text(program: Program, rolled: RolledKernel) -> str:
     return f"{text}\n\n{_sharing_text(program, rolled)}"
 
 
-def _circulant_text(program: Program, rolled: RolledKernel) -> str:
+def _circulant_text(program: ArrayProgram, rolled: RolledKernel) -> str:
     """Return functions that describe the circulant matrix of a term and return its factor, and that add its energy."""
     nest, name, scalar = Nest(program.layout, rolled, "lanes", "X"), rolled.kernel.name, rolled.scalar
     matrix = _matrix_of_pairs(program, rolled)
@@ -248,13 +248,13 @@ def _circulant_text(program: Program, rolled: RolledKernel) -> str:
     return f"{force}\n\n{_energy_text(program, rolled, scalar, before=[unit])}" if scalar else force
 
 
-def _matrix_of_pairs(program: Program, rolled: RolledKernel) -> str:
+def _matrix_of_pairs(program: ArrayProgram, rolled: RolledKernel) -> str:
     """Return the description of the circulant matrix of a sum over pairs in C."""
     array, name = rolled.reads[0].array, rolled.given[0].array.name
     return f"(circulant){_circulant_matrix(program, array, rolled.circulant or 0, name, 0)}"
 
 
-def _circulant_matrix(program: Program, array: Array, axis: int, coefficients: str, power: int) -> str:
+def _circulant_matrix(program: ArrayProgram, array: Array, axis: int, coefficients: str, power: int) -> str:
     """Return the initialiser of the description of a circulant matrix in C."""
     outer, inner = (product_text(replace(array, axes=axes)) for axes in (array.axes[:axis], array.axes[axis + 1 :]))
     plan, size = _plans(program).index((coefficients, power)), size_text(array.axes[axis])
@@ -262,7 +262,7 @@ def _circulant_matrix(program: Program, array: Array, axis: int, coefficients: s
     return f"{{start_{array.name}, {outer}, {size}, {inner}, given->field[{field}], {power}, {plan}}}"
 
 
-def _list_text(program: Program, components: int, lengths: RolledKernel) -> str:
+def _list_text(program: ArrayProgram, components: int, lengths: RolledKernel) -> str:
     """Return a function that describes the points of a list of neighbours."""
     nest = Nest(program.layout, lengths, "double", "")
     start, name = nest.place_of(lengths.writes[0]), lengths.kernel.name
@@ -276,7 +276,7 @@ def _list_text(program: Program, components: int, lengths: RolledKernel) -> str:
     return f"{kernel_text(lengths.kernel, DOUBLE)}\n\n{text}"
 
 
-def _sharing_text(program: Program, rolled: RolledKernel) -> str:
+def _sharing_text(program: ArrayProgram, rolled: RolledKernel) -> str:
     """Return a function that describes how threads share a term group."""
     head = f"static sharing share_{rolled.kernel.name}(const run_memory *run, const problem *given, long long n)"
     lines = ["(void)run, (void)n;", f"return {sharing_text(rolled)};"]
@@ -284,7 +284,7 @@ def _sharing_text(program: Program, rolled: RolledKernel) -> str:
 
 
 def _function(
-    program: Program,
+    program: ArrayProgram,
     rolled: RolledKernel,
     name: str,
     arguments: Sequence[str],
@@ -302,7 +302,7 @@ def _function(
 
 
 def _energy_text(
-    program: Program, rolled: RolledKernel, kernel: Kernel, *, declared: bool = False, before: Sequence[str] = ()
+    program: ArrayProgram, rolled: RolledKernel, kernel: Kernel, *, declared: bool = False, before: Sequence[str] = ()
 ) -> str:
     """Return a function that sums the terms; ``before``: for the factor of a circulant matrix, at u = (1, 0)."""
     arguments = ["const double *q", "double t", "compensated *total"]
@@ -318,13 +318,13 @@ def _energy_text(
     return _function(program, rolled, f"sum_{kernel.name}", arguments, lines, source="q", before=before)
 
 
-def _mass_text(program: Program, rolled: RolledKernel) -> str:
+def _mass_text(program: ArrayProgram, rolled: RolledKernel) -> str:
     name, place = rolled.kernel.name, Nest(program.layout, rolled, "", "").place_of(rolled.writes[0])
     lines = [f"{name}(NULL, 0.0, parameters, value);", f"mass[{place}] += value[0];"]
     return _function(program, rolled, f"add_{name}", ["double *mass"], lines, source="")
 
 
-def _constraint_context(program: Program, held: ConstrainedSteps | None) -> dict[str, Any]:
+def _constraint_context(program: ArrayProgram, held: ConstrainedSteps | None) -> dict[str, Any]:
     if held is None:
         return {"held": None}
     counts = [count_text(each.loops) for each in held.conditions]
@@ -343,7 +343,7 @@ def _constraint_context(program: Program, held: ConstrainedSteps | None) -> dict
     return {"held": context, "part_ends": list(accumulate(held.parts))}
 
 
-def _constraint_texts(program: Program, condition: RolledKernel, curvature: RolledKernel) -> Iterator[str]:
+def _constraint_texts(program: ArrayProgram, condition: RolledKernel, curvature: RolledKernel) -> Iterator[str]:
     """Yield functions of a constraint: g, g_t and derivatives; second derivatives; indices of its coordinates."""
     name, count = condition.kernel.name, len(condition.reads)
     X, now = "const double *restrict X", "condition *now"
@@ -367,13 +367,13 @@ def _constraint_texts(program: Program, condition: RolledKernel, curvature: Roll
     yield _function(program, bare, f"place_{name}", [now], lines, values=0, source="")
 
 
-def _on_lattices(program: Program) -> bool:
+def _on_lattices(program: ArrayProgram) -> bool:
     """Return whether Newton's method has the Fourier preconditioner: places in stencils, or circulant matrices."""
     alike = all(array.is_lattice for array in program.layout.coordinates) and not program.layout.tables
     return bool(program.loops.reach or (program.loops.diagonals and _plans(program) and alike))
 
 
-def _lattice_context(program: Program) -> dict[str, Any]:
+def _lattice_context(program: ArrayProgram) -> dict[str, Any]:
     arrays, lattices = program.layout.coordinates, []
     for array in arrays:
         sizes = ", ".join(size_text(axis) for axis in array.axes if axis.name)
