@@ -10,5 +10,5 @@ ORDER = """
     correction claims
 """
 MODULES = (runs, refinement, iterations, correction, experiment)
-_BY_NAME = {each.name: each for module in MODULES for each in module.EXPERIMENTS}
+_BY_NAME = {entry.name: entry for module in MODULES for entry in module.EXPERIMENTS}
 EXPERIMENTS = {name: _BY_NAME[name] for name in ORDER.split()}

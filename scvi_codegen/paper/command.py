@@ -102,7 +102,7 @@ class Reproduction:
         """Return the document of ``--json``."""
         return {
             "results": [
-                {"name": each.name, "title": each.title, "verdict": each.verdict.value} for each in self.results
+                {"name": result.name, "title": result.title, "verdict": result.verdict.value} for result in self.results
             ],
             "failures": {failure.name: failure.message for failure in self.failures},
             "written": self.files,
@@ -118,7 +118,7 @@ class Reproduction:
 def experiments_titles(names: Sequence[str] = (EVERYTHING,), *, module: str = CATALOGUE) -> dict[str, str]:
     """Return the titles of the experiments to run, by name."""
     experiments = catalogue(module)
-    return {name: experiments[name].title for name in _chosen(names, experiments)}
+    return {name: experiments[name].title for name in _in_order(names, experiments)}
 
 
 def experiments_table(titles: Mapping[str, str]) -> str:
@@ -141,14 +141,14 @@ def reproduce_experiments(
     Each result is a line passed to ``report``. Ctrl-C ends the run; files written before remain.
     """
     experiments = catalogue(module)
-    chosen = _chosen(names, experiments)
+    ordered = _in_order(names, experiments)
     check_plot_path(folder / "picture.svg")
     folder.mkdir(parents=True, exist_ok=True)
-    done, width = Reproduction(), max(map(len, chosen), default=0)
+    done, width = Reproduction(), max(map(len, ordered), default=0)
     try:
         with (
-            _progress(len(chosen), report) as (show, report_above),
-            closing(run_experiments(chosen, jobs, module=module, watch=show)) as outcomes,
+            _progress(len(ordered), report) as (show, report_above),
+            closing(run_experiments(ordered, jobs, module=module, watch=show)) as outcomes,
         ):
             for outcome in outcomes:
                 report_above(f"{outcome.name:{width}}  {_add(done, outcome, folder)}")
@@ -160,7 +160,7 @@ def reproduce_experiments(
     return done
 
 
-def _chosen(names: Sequence[str], experiments: Mapping[str, Experiment]) -> list[str]:
+def _in_order(names: Sequence[str], experiments: Mapping[str, Experiment]) -> list[str]:
     return with_needs(list(experiments) if EVERYTHING in names else names, experiments)
 
 

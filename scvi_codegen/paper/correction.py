@@ -71,7 +71,7 @@ def two_points_agree() -> bool:
     """Return True if the printed (34d), (34e) with two points equal (27a), (27c) of SVI, derivatives of L_d."""
     methods = SCVI(1, "gauss-legendre:2", variational=False), SVI(1, "gauss-legendre:2")
     pairs = zip(*(derive(problem("planar-pendulum").system, method).idel_equations for method in methods), strict=True)
-    return all(sympy.expand(one.residual - other.residual) == 0 for one, other in pairs)
+    return all(sympy.expand(scvi.residual - svi.residual) == 0 for scvi, svi in pairs)
 
 
 def _bound(points: int, gauss: int) -> int:
@@ -81,8 +81,8 @@ def _bound(points: int, gauss: int) -> int:
 
 def _form_checks(form: str, results: Mapping[tuple[int, int], Structure]) -> tuple[Comparison, Comparison]:
     several = [structure for (points, _), structure in results.items() if points > 2]
-    defects, momenta = [each.defect for each in several], [abs(each.momentum) for each in several]
-    orders = ", ".join(f"{each.order:.1f} ({_bound(*row)})" for row, each in results.items())
+    defects, momenta = [structure.defect for structure in several], [abs(structure.momentum) for structure in several]
+    orders = ", ".join(f"{structure.order:.1f} ({_bound(*row)})" for row, structure in results.items())
     return (
         comparison(
             f"SCVI is symplectic and momentum-preserving ({form}).",
@@ -94,7 +94,7 @@ def _form_checks(form: str, results: Mapping[tuple[int, int], Structure]) -> tup
         comparison(
             f"The order is at least min(p, q), Theorem 4.1 ({form}).",
             f"With 2, 3, 4, 5, 6, 7, 9 points, min(p, q) in parentheses: {orders}.",
-            all(each.order > _bound(*row) - 0.3 for row, each in results.items()),
+            all(structure.order > _bound(*row) - 0.3 for row, structure in results.items()),
             bears_on="order",
         ),
     )
@@ -104,7 +104,7 @@ def _correction(_: Mapping[str, Result]) -> Result:
     results = {form: {row: measured(*row, variational=form == "in full") for row in ROWS} for form in FORMS}
     printed, full = ({k: s for (k, _), s in results[form].items() if 2 < k <= SETTLED} for form in FORMS)
     as_derived = all(abs(printed[k].order - (k - 2)) < 0.3 and abs(full[k].order - 2 * (k - 1)) < 0.3 for k in full)
-    orders = ["".join(f"{s.order:.1f}, " for s in each.values()).rstrip(", ") for each in (printed, full)]
+    orders = [", ".join(f"{structure.order:.1f}" for structure in form.values()) for form in (printed, full)]
     two, agree = results["as printed"][2, 2], two_points_agree()
     rows = [(*row, *(v for form in FORMS for v in results[form][row]), _bound(*row)) for row in ROWS]
     columns = ("points", "Gauss points", *(f"{n}, {form}" for form in FORMS for n in Structure._fields), "min(p, q)")

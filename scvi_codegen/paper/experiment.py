@@ -262,8 +262,8 @@ def draw(picture: Picture, kind: str) -> bytes:
         figure = Figure(figsize=(picture.width, rows * picture.size[1]))
         figure.set_layout_engine("constrained")
         axes = list(np.ravel(figure.subplots(rows, picture.columns, squeeze=False)))
-        for each, panel in zip(axes, picture.panels, strict=False):
-            _draw_panel(each, panel)
+        for panel_axes, panel in zip(axes, picture.panels, strict=False):
+            _draw_panel(panel_axes, panel)
         for unused in axes[len(picture.panels) :]:
             unused.axis("off")
         write_figure(figure, file, kind)

@@ -156,12 +156,10 @@ class Study:
 
     def curves(self) -> list[ErrorCurve]:
         """Return all curves, those of SVI and SC in turn."""
+        numbers = (None,) if self.degrees else LEGEND
         return [
-            each
-            for quantity in self.quantities
-            for case in self.cases
-            for n in ((None,) if self.degrees else LEGEND)
-            for each in (self._curve(case, quantity, scheme, n) for scheme in SCHEMES)
+            self._curve(case, quantity, scheme, n)
+            for quantity, case, n, scheme in product(self.quantities, self.cases, numbers, SCHEMES)
         ]
 
     def _curve(self, case: StepCase, quantity: str, scheme: str, n: int | None) -> ErrorCurve:
@@ -268,12 +266,12 @@ def _point_checks(study: Study, curves: Sequence[ErrorCurve]) -> Iterator[Compar
         *straight,
         bears_on="geometric",
     )
-    drawn = [(c, line) for c in curves if (line := study.printed(c))]
+    pairs = [(c, line) for c in curves if (line := study.printed(c))]
     off = {
-        case: float(np.median(np.concatenate([factors(c.x, c.errors, line) for c, line in drawn if c.case is case])))
+        case: float(np.median(np.concatenate([factors(c.x, c.errors, line) for c, line in pairs if c.case is case])))
         for case in study.cases
     }
-    bases = [f"{c.law.base:.2g} for {line.base:g} ({c.scheme} {c.what}, {c.case.title})" for c, line in drawn if c.law]
+    bases = [f"{c.law.base:.2g} for {line.base:g} ({c.scheme} {c.what}, {c.case.title})" for c, line in pairs if c.law]
     yield comparison(
         "The lines c b^N run along the errors.",
         "The typical factor between an error and its line is "
@@ -382,7 +380,8 @@ def _study(name: str, **changes: Any) -> Study:
     """Return a study of the file, with some of its entries changed."""
     table = {"steps": STEPS.get(name), **_TABLES["studies"][name], **changes}
     lines = {(scheme, q): Law(*law) for scheme, laws in table.pop("lines", {}).items() for q, law in laws.items()}
-    powers = {q: {int(power): x for power, x in each.items()} for q, each in table.pop("powers", {}).items()}
+    constants = table.pop("powers", {})
+    powers = {q: {int(power): x for power, x in by_power.items()} for q, by_power in constants.items()}
     table |= {key: tuple(table[key]) for key in ("sentences", "quantities", "steps")}
     return Study(**table | {"cases": tuple(CASES[title] for title in table["cases"]), "lines": lines, "powers": powers})
 

@@ -91,15 +91,17 @@ def run_experiments(
         StateError: for an unknown name.
     """
     experiments = catalogue(module)
-    chosen = [experiments[name] for name in with_needs(names, experiments)]
-    count = min(workers or os.cpu_count() or 1, len(chosen))
-    return _run(chosen, count, module, watch)
+    ordered = [experiments[name] for name in with_needs(names, experiments)]
+    count = min(workers or os.cpu_count() or 1, len(ordered))
+    return _run(ordered, count, module, watch)
 
 
-def _run(chosen: Sequence[Experiment], count: int, module: str, watch: Watch) -> Generator[Outcome, None, None]:
-    results, alone = dict[str, Result](), [each for each in chosen if not each.needs]
-    first = _in_processes(alone, count, module, watch) if count > 1 else _in_this_process(alone, {}, watch)
-    for outcomes in (first, _in_this_process([each for each in chosen if each.needs], results, watch)):
+def _run(experiments: Sequence[Experiment], count: int, module: str, watch: Watch) -> Generator[Outcome, None, None]:
+    results = dict[str, Result]()
+    independent = [experiment for experiment in experiments if not experiment.needs]
+    dependent = [experiment for experiment in experiments if experiment.needs]
+    first = _in_processes(independent, count, module, watch) if count > 1 else _in_this_process(independent, {}, watch)
+    for outcomes in (first, _in_this_process(dependent, results, watch)):
         with closing(outcomes):
             for outcome in outcomes:
                 if isinstance(outcome, Result):
@@ -167,7 +169,7 @@ def _in_processes(
     experiments: Sequence[Experiment], count: int, module: str, watch: Watch
 ) -> Generator[Outcome, None, None]:
     """Run each experiment in a process of its own, at most ``count`` at a time."""
-    context, pending = multiprocessing.get_context("spawn"), deque(each.name for each in experiments)
+    context, pending = multiprocessing.get_context("spawn"), deque(experiment.name for experiment in experiments)
     running = dict[Any, tuple[str, SpawnProcess]]()
     try:
         while pending or running:

@@ -380,11 +380,11 @@ def figure(name: str, title: str, setting: RunSetting, views: Sequence[View], ch
 
 def measured_table(runs: Runs, measures: Sequence[str]) -> TableBlock:
     """Return a row for each run with the values of some attributes."""
-    headings = [MEASURES[each].heading for each in measures]
+    headings = [MEASURES[name].heading for name in measures]
     return TableBlock(
         columns=("method", "h", "steps", *headings),
-        rows=tuple((r.label, r.h, r.steps, *(getattr(r, each) for each in measures)) for r in runs.values()),
-        formats={"h": ".4g"} | {heading: MEASURES[each].form for heading, each in zip(headings, measures, strict=True)},
+        rows=tuple((r.label, r.h, r.steps, *(getattr(r, name) for name in measures)) for r in runs.values()),
+        formats={"h": ".4g"} | {MEASURES[name].heading: MEASURES[name].form for name in measures},
     )
 
 
@@ -405,7 +405,7 @@ def plane(
         window: range of both axes.
         more: text after the label in the title.
     """
-    drawn = slice(*(int(bound) if bound else None for bound in part.split(":")))
+    drawn_states = slice(*(int(bound) if bound else None for bound in part.split(":")))
 
     def curves(run: MeasuredRun, states: slice) -> list[tuple[ArrayLike, ArrayLike]]:
         q, p = run.q[states], run.p[states]
@@ -413,7 +413,7 @@ def plane(
 
     def view(runs: Runs) -> Iterable[Panel]:
         for run in (runs[key] for key in keys or runs):
-            dots = [_series(run, *xy, marker=".", line="", label="") for xy in curves(run, drawn)]
+            dots = [_series(run, *xy, marker=".", line="", label="") for xy in curves(run, drawn_states)]
             exact = [_series(run.setting.reference, *xy, label="") for xy in curves(run.setting.reference, slice(None))]
             xlabel, ylabel = ("q", "p") if kind == "phase" else ("$q_1$", "$q_2$")
             curves_and_dots, title = (*exact, *dots), f"{run.label}{more}"
@@ -435,11 +435,11 @@ def over_time(*keys: str, quantity: str, title: str = "", periods: bool = False,
     unit, lines = PERIOD if periods else 1.0, ("-", ":", "--")
 
     def view(runs: Runs) -> Iterable[Panel]:
-        series, drawn = [], list[str]()
+        series, colors = [], list[str]()
         for run in (runs[key] for key in keys or runs):
-            drawn.append(run.scheme.color)
+            colors.append(run.scheme.color)
             points = (run.t / unit, getattr(run, quantity))
-            line = lines[(drawn.count(run.scheme.color) - 1) % len(lines)]
+            line = lines[(colors.count(run.scheme.color) - 1) % len(lines)]
             series.append(_series(run, *(largest_in_bins(*points) if error else points), line=line))
         name = MEASURES[quantity].heading
         ylabel = f"|{name}|, largest in each interval" if error else name
@@ -478,8 +478,8 @@ def _figure(
     name: str, title: str, setting: str, views: Sequence[dict[str, Any]], checks: str, span: float | None = None
 ) -> Experiment:
     """Return the figure of a table of the file; ``span`` if it differs from that of the setting."""
-    chosen = SETTINGS[setting] if span is None else replace(SETTINGS[setting], span=span)
-    return figure(name, title, chosen, [_view(**view) for view in views], checks)
+    run_setting = SETTINGS[setting] if span is None else replace(SETTINGS[setting], span=span)
+    return figure(name, title, run_setting, [_view(**view) for view in views], checks)
 
 
 def _view(draw: str, runs: Sequence[str] = (), **how: Any) -> View:

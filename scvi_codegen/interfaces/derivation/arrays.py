@@ -73,7 +73,7 @@ def _text(system: ArraySystem) -> Iterator[str]:
         pushed = force_of(term, system.coordinates).targets
         yield from (f"    on {access}: lambda*({derivative})" for access, derivative in pushed)
     energy = () if system.changes_energy else ("energy",)
-    conserved = (*energy, *(each.name for each in momentum_maps(system)))
+    conserved = (*energy, *(symmetry.name for symmetry in momentum_maps(system)))
     yield f"Conserved: {', '.join(conserved) or 'nothing that is known'}"
 
 

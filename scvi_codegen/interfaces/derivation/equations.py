@@ -131,7 +131,7 @@ class StepEquations:
     def _heading(self) -> Iterator[str]:
         q, p = self.state
         yield f"{self.system.name}: {self.method.title}"
-        yield from (each.description for each in (*self.system.rotations, *axial_turns(self.system)[1]))
+        yield from (rotation.description for rotation in (*self.system.rotations, *axial_turns(self.system)[1]))
         if in_moving_frame(self.system, self.method):
             yield from (MOVING_FRAME, FREE_ROTATION)
         yield f"{'H' if self.system.auxiliaries else 'L'} = {formula_text(self.system.formula)}"

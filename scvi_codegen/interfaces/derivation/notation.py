@@ -231,14 +231,14 @@ def events_text(events: Iterable[Event], system: MechanicalSystem) -> str:
 
 def _lines(event: Event, system: MechanicalSystem) -> Iterator[str]:
     conditions = event.where if isinstance(event.where, tuple) else (event.where,)
-    yield f"  g = {event.function} = 0" + "".join(f", {each}" for each in conditions if each is not None)
+    yield f"  g = {event.function} = 0" + "".join(f", {condition}" for condition in conditions if condition is not None)
     yield from (f"    {name} := {value}" for name, value in event.changes)
     if event.restitution is None:
         return
     yield f"    {IMPULSE}"
     names = [*map(str, system.coordinates)]
-    known = {name: symbol(name) for name in (*names, *map(str, system.parameters), TIME)}
+    symbols = {name: symbol(name) for name in (*names, *map(str, system.parameters), TIME)}
     with suppress(ExpressionError):  # entries of arrays, components of rotations
-        g = parse_expression(str(event.function), known)
-        yield f"    n = ({', '.join(str(g.diff(known[name])) for name in names)}), g_t = {g.diff(known[TIME])}"
+        g = parse_expression(str(event.function), symbols)
+        yield f"    n = ({', '.join(str(g.diff(symbols[name])) for name in names)}), g_t = {g.diff(symbols[TIME])}"
     yield f"    e = {event.restitution}"

@@ -110,7 +110,7 @@ class EndConditions:
         """
         forms, system = forms_of(self.system), self.system
         conditions = forms.constitutive or tuple(map(sympy.Add, system.momentum_symbols, (-p for p in forms.momentum)))
-        if any(each.free_symbols - {*self.symbols} for each in conditions):
+        if any(condition.free_symbols - {*self.symbols} for condition in conditions):
             raise MethodError("momenta depend on an input and would jump with it: use inputs only in forces")
         return self._function(conditions)
 
@@ -121,10 +121,11 @@ class EndConditions:
         Raises:
             MethodError: if they contain an input.
         """
-        result = [each for each in (*position_conditions(self.system), *constraint_rates(self.system)) if each != 0]
-        if any(each.free_symbols - {*self.symbols} for each in result):
+        conditions = (*position_conditions(self.system), *constraint_rates(self.system))
+        residuals = [condition for condition in conditions if condition != 0]
+        if any(residual.free_symbols - {*self.symbols} for residual in residuals):
             raise MethodError("a constraint depends on an input and would jump with it: use inputs only in forces")
-        return self._function(result)
+        return self._function(residuals)
 
     def momentum(self, q: Any, v: Any, t: Any, parameters: Any) -> Any:
         """Return the momentum of a velocity: exact if H is quadratic in p, otherwise an initial guess."""
@@ -162,8 +163,8 @@ def own_parameters(system: MechanicalSystem) -> Mapping[Symbol, float]:
 
 def read(texts: Sequence[str], symbols: Sequence[Symbol]) -> list[Expr]:
     """Return formulas as expressions in symbols; raises ExpressionError for one outside the grammar."""
-    known = {each.name: each for each in symbols}
-    return [parse_expression(text, known) for text in texts]
+    names = {variable.name: variable for variable in symbols}
+    return [parse_expression(text, names) for text in texts]
 
 
 def numeric(ca: Any, expressions: Sequence[Expr], symbols: Sequence[Symbol]) -> Callable[..., list[Any]]:
@@ -239,7 +240,7 @@ def _solved(ca: Any, ends: EndConditions, stages: StageSystem, step: Any) -> Any
     symbols = dict(zip(ARGUMENTS, step.sx_in(), strict=True))
     unknowns = symbols.pop("stages")
     equations = {"x": unknowns, "p": ca.veccat(*symbols.values()), "g": step(**symbols, stages=unknowns)["residual"]}
-    symbols_of = {name: ca.MX.sym(name, *each.shape) for name, each in symbols.items()}
+    symbols_of = {name: ca.MX.sym(name, *argument.shape) for name, argument in symbols.items()}
     q, p, t, h, parameters = (symbols_of[name] for name in ("q", "p", "t", "h", "parameters"))
     guess = ca.veccat(*straight(stages, q, ends.velocity(q, p, t, parameters), p, h))
     solution = ca.rootfinder("stages", "newton", equations)(guess, ca.veccat(*symbols_of.values()))
@@ -293,15 +294,15 @@ class _StageExpressions:
         """Return values at the points of the quadrature, and weights; MethodError without quadrature along a curve."""
         system = self.system
         groups = [group for group in self.stages.stage_groups if group.in_action]
-        known = {*system.coordinates, *system.velocities}
-        if not groups or any(group.scalar_power or not known <= {*group.arguments} for group in groups):
+        curve_variables = {*system.coordinates, *system.velocities}
+        if not groups or any(group.scalar_power or not curve_variables <= {*group.arguments} for group in groups):
             raise MethodError(
                 "this method has no quadrature along its curve, so formulas cannot be integrated: use an SVI, SCVI or "
                 "Gauss method"
             )
         inputs_constant = tuple(symbol(name) for name in system.inputs)
         around = (system.time, *own_parameters(system), *inputs_constant)
-        formulas = read(texts, (*known, *system.auxiliaries, *around))
+        formulas = read(texts, (*curve_variables, *system.auxiliaries, *around))
         columns, weights = [], []
         for group in groups:
             values = numeric(self.ca, formulas, (*group.arguments, *around))

@@ -50,16 +50,16 @@ def _linear_batched(primitive: Callable[[], Primitive]) -> Callable[..., tuple[A
     """Return a batching rule: each element has its own trajectory, or all share one and are stacked."""
 
     def batched(arguments: Sequence[Any], axes: Sequence[Any], **static: Any) -> tuple[Any, int]:
-        count = next(each.shape[axis] for each, axis in zip(arguments, axes, strict=True) if axis is not None)
+        count = next(array.shape[axis] for array, axis in zip(arguments, axes, strict=True) if axis is not None)
         axis_index = arguments[0].ndim - 1 if axes[0] is None else 0
         x = arguments[0] if axes[0] is None else jnp.moveaxis(arguments[0], axes[0], 0)
         aligned = [
-            _repeated(each, count, axis_index) if axis is None else jnp.moveaxis(each, axis, axis_index)
-            for each, axis in zip(arguments[1:], axes[1:], strict=True)
+            _repeated(array, count, axis_index) if axis is None else jnp.moveaxis(array, axis, axis_index)
+            for array, axis in zip(arguments[1:], axes[1:], strict=True)
         ]
         if axes[0] is not None:
             return primitive().bind(x, *aligned, **static), 0
-        stacked = [each.reshape(*each.shape[:axis_index], -1, *each.shape[axis_index + 2 :]) for each in aligned]
+        stacked = [array.reshape(*array.shape[:axis_index], -1, *array.shape[axis_index + 2 :]) for array in aligned]
         result = primitive().bind(x, *stacked, **static)
         return result.reshape(*aligned[0].shape[: axis_index + 2], *result.shape[axis_index + 1 :]), axis_index
 

@@ -55,19 +55,19 @@ class NonlinearProgram:
         program = {"x": self.x, "f": self.cost, "g": self.residual}
         solver = self.ca.nlpsol("program", "ipopt", program, {**QUIET, **options})
         limits = {name: self.limits.get(name, (-np.inf, np.inf)) for name in self.unknowns}
-        low, high = (self._vector({name: each[side] for name, each in limits.items()}) for side in (0, 1))
-        least, largest = (
-            np.concatenate([np.full(each[0].numel(), each[side]) for each in self.constraints]) for side in (1, 2)
-        )
+        low = self._vector({name: low for name, (low, _) in limits.items()})
+        high = self._vector({name: high for name, (_, high) in limits.items()})
+        least = np.concatenate([np.full(g.numel(), least) for g, least, _ in self.constraints])
+        largest = np.concatenate([np.full(g.numel(), largest) for g, _, largest in self.constraints])
         result = solver(x0=self._vector(first), lbx=low, ubx=high, lbg=least, ubg=largest)
         return result, solver.stats()
 
     def split(self, vector: Any) -> dict[str, Array]:
         """Return the values of the unknowns by name, each in its shape."""
         flat, result, begin = np.asarray(vector).ravel(), {}, 0
-        for name, each in self.unknowns.items():
-            result[name] = flat[begin : begin + each.numel()].reshape(each.shape, order="F")
-            begin += each.numel()
+        for name, symbol in self.unknowns.items():
+            result[name] = flat[begin : begin + symbol.numel()].reshape(symbol.shape, order="F")
+            begin += symbol.numel()
         return result
 
     @cached_property
@@ -81,7 +81,7 @@ class NonlinearProgram:
         return self.ca.veccat(*(expression for expression, _, _ in self.constraints))
 
     def _vector(self, values: Mapping[str, Any]) -> Array:
-        parts = [np.broadcast_to(values[name], each.shape).ravel("F") for name, each in self.unknowns.items()]
+        parts = [np.broadcast_to(values[name], symbol.shape).ravel("F") for name, symbol in self.unknowns.items()]
         return np.concatenate(parts)
 
 
@@ -246,8 +246,8 @@ class Task:
     def _between_ends(self, name: str) -> list[float]:
         """Return the values of a coordinate at both ends as the conditions determine them, or 0."""
         limits = [interval(name, side[name]) for side in (self.start, self.end) if name in side]
-        known = [sum(limit) / 2 for limit in limits if np.isfinite(limit).all()]
-        return known if len(known) == 2 else (known or [0.0]) * 2
+        values = [sum(limit) / 2 for limit in limits if np.isfinite(limit).all()]
+        return values if len(values) == 2 else (values or [0.0]) * 2
 
     def motion(self, program: NonlinearProgram, result: Any, stats: Mapping[str, Any]) -> ControlledMotion:
         """Return the solution, with the multipliers of the step equations as costates."""
@@ -262,7 +262,7 @@ class Task:
             q=states[:m].T,
             p=states[m:].T,
             coefficients=dict(zip(self.system.inputs, inputs, strict=True)),
-            coordinates=tuple(each.name for each in self.system.coordinates),
+            coordinates=tuple(coordinate.name for coordinate in self.system.coordinates),
             cost=float(result["f"]),
             costates=costate_values,
             iterations=int(stats["iter_count"]),
@@ -291,11 +291,11 @@ def interval(name: str, value: Any) -> tuple[float, float]:
     return least, largest
 
 
-def check_known(values: Mapping[str, Any], known: Sequence[str], kind: str) -> None:
+def check_known(values: Mapping[str, Any], names: Sequence[str], kind: str) -> None:
     """Raise :class:`StateError` for a name that is not known."""
     for name in values:
-        if name not in known:
-            raise StateError(f"there is no {kind} '{name}'{closest(name, known)} There are: {', '.join(known)}")
+        if name not in names:
+            raise StateError(f"there is no {kind} '{name}'{closest(name, names)} There are: {', '.join(names)}")
 
 
 def _resampled(name: str, values: Any, times: Array) -> Array:
@@ -391,7 +391,7 @@ def optimal_control(
     return motion
 
 
-def _parameter_values(system: MechanicalSystem, chosen: Mapping[str, float]) -> Array:
+def _parameter_values(system: MechanicalSystem, changed: Mapping[str, float]) -> Array:
     values = {name.name: value for name, value in own_parameters(system).items()}
-    check_known(chosen, tuple(values), "parameter")
-    return np.array([checked_number(value, name) for name, value in {**values, **chosen}.items()])
+    check_known(changed, tuple(values), "parameter")
+    return np.array([checked_number(value, name) for name, value in {**values, **changed}.items()])

@@ -162,9 +162,9 @@ def _padded(value: ArrayLike, name: str, bodies: int, axes: int) -> Array:
 
 def _attraction(system: LagrangianSystem) -> tuple[int, float, list[float]]:
     """Return the number of axes of a body, G and the masses; raise SystemDefinitionError for other Lagrangians."""
-    known = {*system.coordinates, *system.velocities, *system.constants}
+    symbols = {*system.coordinates, *system.velocities, *system.constants}
     forced = system.forces or system.inputs or system.constraints
-    if not forced and system.lagrangian.free_symbols <= known:
+    if not forced and system.lagrangian.free_symbols <= symbols:
         at = [system.coordinates, system.velocities]
         formula = sympy.lambdify(at, system.lagrangian.subs(system.constants), "numpy")
         for axes in (3, 2):

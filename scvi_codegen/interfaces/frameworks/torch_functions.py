@@ -24,10 +24,10 @@ def _call(
     binding: Any, name: str, flow: FlowOfRows, counts: Sequence[int], x: Any, arguments: Sequence[Any], shape: Any
 ) -> Any:
     result = torch.empty(shape, dtype=torch.float64)
-    arrays = [each.detach().contiguous() for each in (x, *arguments)]
+    arrays = [tensor.detach().contiguous() for tensor in (x, *arguments)]
     report, rows = binding.new("report *"), x[..., 0].numel()
     part, count = counts[:-1], counts[-1]
-    pointers = [binding.pointer(each.numpy()) for each in (*arrays, result)]
+    pointers = [binding.pointer(tensor.numpy()) for tensor in (*arrays, result)]
     if rows and result.numel():
         status = binding.function(name)(*part, flow.steps, flow.spacing, count, rows, *pointers, report)
         if status == NO_MEMORY:
@@ -83,14 +83,14 @@ def _mapped(function: Callable[[], Any]) -> Any:
         axis_index = x.ndim - 1 if axes[0] is None else 0
         x = x if axes[0] is None else x.movedim(axes[0], 0)
         along = [
-            each.unsqueeze(axis_index).expand(*each.shape[:axis_index], info.batch_size, *each.shape[axis_index:])
+            tensor.unsqueeze(axis_index).expand(*tensor.shape[:axis_index], info.batch_size, *tensor.shape[axis_index:])
             if axis is None
-            else each.movedim(axis, axis_index)
-            for each, axis in zip(arguments, axes[1:], strict=False)
+            else tensor.movedim(axis, axis_index)
+            for tensor, axis in zip(arguments, axes[1:], strict=False)
         ]
         if axes[0] is not None:
             return function().apply(x, *along, flow), 0
-        stacked = [each.flatten(axis_index, axis_index + 1) for each in along]
+        stacked = [tensor.flatten(axis_index, axis_index + 1) for tensor in along]
         result = function().apply(x, *stacked, flow)
         return result.unflatten(axis_index, along[0].shape[axis_index : axis_index + 2]), axis_index
 

@@ -127,10 +127,8 @@ def page(
         ArgumentError: for unknown arguments, and those of a motion beside a model.
         BuildError: without the extra ``compiler``, or if compilation fails.
     """
-    given = {"ranges": ranges, "speed": speed, "plots": plots}
-    settings = {name: value for name, value in given.items() if value is not None}
-    if picture is not None:
-        settings["picture"] = picture
+    arguments = {"ranges": ranges, "speed": speed, "plots": plots, "picture": picture}
+    settings = {name: value for name, value in arguments.items() if value is not None}
     if SYSTEM_OR_ARRAYS.accepts(model):
         model = _model_of(model, motion)
     elif motion:
@@ -142,10 +140,10 @@ def page(
 
 def _model_of(system: Any, motion: Mapping[str, Any]) -> Model:
     """Return the model of a system with the arguments of its motion."""
-    known = [name for name in Model.__dataclass_fields__ if name not in ("system", "path", "page", "picture")]
+    accepted = [name for name in Model.__dataclass_fields__ if name not in ("system", "path", "page", "picture")]
     for name in motion:
-        if name not in known:
-            raise ArgumentError(f"page() takes no {name!r}{keyword_hint(name, known)}")
+        if name not in accepted:
+            raise ArgumentError(f"page() takes no {name!r}{keyword_hint(name, accepted)}")
     if "q" not in motion:
         raise ArgumentError(f"a page of the system {system.name} requires its initial state: give q, and velocity or p")
     arguments: dict[str, Any] = {"system": system, "method": DEFAULT_METHOD, **motion}
@@ -171,10 +169,8 @@ def page_of(model: Model, document: Mapping[str, Any], settings: Mapping[str, An
     _check(model, ranges)
     check_compiler()  # before the equations are derived
     adaptive = model.h is None or model.time_transformation is not None
-    acting = tuple(
-        each for each in model.events if each.changes_state or each.terminal
-    )  # others do not affect the motion
-    model = replace(model, events=acting)
+    acting = tuple(event for event in model.events if event.changes_state or event.terminal)
+    model = replace(model, events=acting)  # others do not affect the motion
     result = Page(model.with_known_sizes() if adaptive or acting else model, document, adaptive=adaptive)
     result.html  # noqa: B018  (reports errors here)
     return result
@@ -183,16 +179,16 @@ def page_of(model: Model, document: Mapping[str, Any], settings: Mapping[str, An
 def _check(model: Model, ranges: Mapping[str, tuple[float, float]]) -> None:
     """Raise an error for what a page does not have."""
     name = model.system.name
-    for each, value in model.inputs.items():
+    for input_name, value in model.inputs.items():
         if isinstance(value, tuple):
-            raise MethodError(f"a slider sets the input {each} of {name}, which is a table: give a number")
+            raise MethodError(f"a slider sets the input {input_name} of {name}, which is a table: give a number")
     if model.h is None and model.tolerance is None:
         raise MethodError(f"a page requires a step size or tolerance; {name} has neither: give [run] step or tolerance")
     if model.h is None and model.has_time_transformation:
         raise MethodError(f"a page requires the step size in tau of {name}, not a tolerance: give [run] step")
     check_page(model.page, model, "page")
     check_picture(model)
-    values = model.parameters | {each: model.inputs.get(each, 0.0) for each in model.system.inputs}
+    values = model.parameters | {input_name: model.inputs.get(input_name, 0.0) for input_name in model.system.inputs}
     for parameter in ranges.keys() & values.keys():
         (low, high), value = ranges[parameter], values[parameter]
         if not low <= value <= high:
@@ -225,7 +221,7 @@ class Page:
             folder = Path(temporary)
             source.write(folder)
             (folder / "page.c").write_text(_entry(model, interface, initial, self.adaptive), encoding="utf-8")
-            code = webassembly(folder, ("page.c", *(f"{each.prefix}.c" for each in source.sources)))
+            code = webassembly(folder, ("page.c", *(f"{part.prefix}.c" for part in source.sources)))
         if model.array_system is not None:  # entries have no names
             interface = replace(interface, coordinates=(), conserves_energy=not model.array_system.changes_energy)
         description = _description(self, interface, initial=bool(initial))
@@ -278,7 +274,7 @@ def _entry(model: Model, interface: Interface, initial: Sequence[str], adaptive:
             transformed=model.time_transformation is not None, max_step=model.max_step,
             first_step=model.first_step,
             absolute_tolerances=absolute_tolerances_of(model, interface), events=model.events,
-            acting=any(each.changes_state for each in model.events), velocities=not starts_from_momenta(model),
+            acting=any(event.changes_state for event in model.events), velocities=not starts_from_momenta(model),
             level=interface.energy_index if interface.in_tau else None,
             axes={f"at_{name}": nodes for name, nodes in axes.items()},
             names={f"at_{name}": k for k, name in enumerate(interface.parameters)},
@@ -288,20 +284,22 @@ def _entry(model: Model, interface: Interface, initial: Sequence[str], adaptive:
 
 def _values(model: Model, interface: Interface) -> dict[str, float]:
     """Return the scalar parameters by name, in order, with those that contain inputs and the energy of the state."""
-    known = model.parameters | {f"{name}_0": value for name, value in model.inputs.items()}
+    values = model.parameters | {f"{name}_0": value for name, value in model.inputs.items()}
     pairs = zip(interface.parameters, interface.defaults, strict=True)
-    return {name: float(known.get(name, default)) for name, default in pairs}
+    return {name: float(values.get(name, default)) for name, default in pairs}
 
 
 def _initial(document: Mapping[str, Any], names: Sequence[str]) -> tuple[str, ...]:
     """Return the formulas of the only field and its rate as C, or none if an initial value is no formula."""
-    known = {name: symbol(f"at_{name}") for name in names}
+    symbols = {name: symbol(f"at_{name}") for name in names}
     tables = [document.get("initial", {}).get(key) for key in ("q", "q_dot")]
-    formulas = [next(iter(each.values())) if isinstance(each, dict) and len(each) == 1 else each for each in tables]
+    formulas = [
+        next(iter(table.values())) if isinstance(table, dict) and len(table) == 1 else table for table in tables
+    ]
     if not all(isinstance(formula, str) for formula in formulas):
         return ()
     try:
-        texts = tuple(_c_text(parse_expression(str(formula), known)) for formula in formulas)
+        texts = tuple(_c_text(parse_expression(str(formula), symbols)) for formula in formulas)
     except ExpressionError:
         return ()
     return () if any("\n" in text for text in texts) else texts  # of functions that C does not have
@@ -336,14 +334,15 @@ def _flat(state: Any) -> list[float]:
 
 def _rates(model: Model) -> list[float]:
     """Return the initial velocities, or momenta: see :func:`starts_from_momenta`."""
-    given, other = (model.p, model.velocity) if starts_from_momenta(model) else (model.velocity, model.p)
-    if given is not None:
-        return _flat(given)
-    if other is None:
+    from_momenta = starts_from_momenta(model)
+    rates = model.p if from_momenta else model.velocity
+    if rates is not None:
+        return _flat(rates)
+    if model.p is None and model.velocity is None:
         return [0.0] * model.dimension
     model._check_double("a page")
     stepper = model.stepper()
-    if starts_from_momenta(model):
+    if from_momenta:
         return _flat(model.momenta(stepper))
     return _flat(stepper.velocity(model.q, model.p, model.t, model.parameters))
 
@@ -354,11 +353,11 @@ def _drawn_system(model: Model, interface: Interface) -> DrawnSystem:
     def energy(q: Any, p: Any) -> Any:
         return np.asarray(model.stepper().energy(q, p, model.t, model.parameters), dtype=float)
 
-    drawn = drawn_system_of_model(model)
+    system = drawn_system_of_model(model)
     if model.array_system is not None:
-        return drawn
+        return system
     names = {name: getattr(interface, name) for name in ("coordinates", "parameters", "rotations")}
-    return replace(drawn, **names, constraints=interface.constraints, map_names=interface.map_names, energy=energy)
+    return replace(system, **names, constraints=interface.constraints, map_names=interface.map_names, energy=energy)
 
 
 def _description(shown: Page, interface: Interface, *, initial: bool) -> dict[str, Any]:
@@ -366,8 +365,8 @@ def _description(shown: Page, interface: Interface, *, initial: bool) -> dict[st
     model, adaptive = shown.model, shown.adaptive
     ranges = model.page.get("ranges", {})
     q, v = _flat(model.q), _rates(model)
-    drawn = _drawn_system(model, interface)
-    shape = (shape_of_picture(drawn, model.picture) if model.picture else shape_of(drawn)).to_data()
+    system = _drawn_system(model, interface)
+    shape = (shape_of_picture(system, model.picture) if model.picture else shape_of(system)).to_data()
     span = abs(float(model.end - model.t))
     speed = model.page.get("speed", 1.0 if 0.3 < span / SECONDS < 4 else float(f"{span / SECONDS:.0e}"))
     limits = [2 * max([1.0, *map(abs, numbers)]) for numbers in (q, v)]
@@ -379,7 +378,7 @@ def _description(shown: Page, interface: Interface, *, initial: bool) -> dict[st
         kind: [ranges.get(name, [-limit, limit]) for name in names_of_kind]
         for kind, names_of_kind, limit in zip("qv", (names, rates or names), limits, strict=True)
     }
-    conserved = all(each.restitution == 1.0 for each in model.events if each.changes_state)
+    conserved = all(event.restitution == 1.0 for event in model.events if event.changes_state)
     variables = _variables(interface, shape, len(q))
     plots = [[_variable(name, variables) for name in reversed(pair)] for pair in model.page.get("plots", ())]
     return {
@@ -388,7 +387,7 @@ def _description(shown: Page, interface: Interface, *, initial: bool) -> dict[st
         "momenta": interface.momentum_names, "parameters": _parameter_sliders(model, interface),
         "quantities": interface.map_names,
         "energy": {"label": "Energy", "conserved": bool(interface.conserves_energy) and conserved}, "plots": plots,
-        "causes": CAUSES, "events": [str(each.function) for each in model.events],
+        "causes": CAUSES, "events": [str(event.function) for event in model.events],
         "from_momenta": starts_from_momenta(model), "values": len(interface.parameters),
         "initial": initial, "whole": WHOLE,
         "step": {"adaptive": adaptive or model.has_time_transformation, **_step_slider(model)},
@@ -427,19 +426,19 @@ def _rotations(interface: Interface) -> list[dict[str, Any]]:
     """Return the columns and the names of the angular velocity of each rotation, and the columns of each spin."""
     return [
         {
-            "name": each.name,
-            "columns": [interface.coordinates.index(name) for name in each.coordinates],
-            "rates": [rate.name for rate in each.rates] if isinstance(each, Rotation) else [],
+            "name": member.name,
+            "columns": [interface.coordinates.index(name) for name in member.coordinates],
+            "rates": [rate.name for rate in member.rates] if isinstance(member, Rotation) else [],
         }
-        for each in RotationNames.members_of(interface.rotations)
-        if isinstance(each, Rotation | Spin)
+        for member in RotationNames.members_of(interface.rotations)
+        if isinstance(member, Rotation | Spin)
     ]
 
 
 def _variables(interface: Interface, shape: Mapping[str, Any], size: int) -> list[str]:
     """Return the names of the variables of plots, as in ``plots.js``."""
     if size <= WHOLE and interface.coordinates:
-        solids = [f"{each['name']}.{axis}" for each in shape["solids"] for axis in "xyz"]
+        solids = [f"{solid['name']}.{axis}" for solid in shape["solids"] for axis in "xyz"]
         names = [*interface.coordinates, *interface.momentum_names, *solids]
     else:
         nodes = range(size) if size <= WHOLE else (size // 4, size // 2)
@@ -447,8 +446,10 @@ def _variables(interface: Interface, shape: Mapping[str, Any], size: int) -> lis
     return ["t", *names, "energy", *interface.map_names]
 
 
-def _variable(name: str, known: Sequence[str]) -> str:
+def _variable(name: str, variables: Sequence[str]) -> str:
     """Return the name of a variable of plots, if it is known."""
-    if name not in known:
-        raise StateError(f"page plots: unknown variable {name!r}{closest(name, known)} Known: {', '.join(known)}")
+    if name not in variables:
+        raise StateError(
+            f"page plots: unknown variable {name!r}{closest(name, variables)} Known: {', '.join(variables)}"
+        )
     return name

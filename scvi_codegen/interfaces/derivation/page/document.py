@@ -193,7 +193,9 @@ def component_equations_section(derived: StepEquations | None) -> Section:
     ]
     for _, group in groupby(derived.equations, key=lambda equation: equation.kind):
         contents += formulas(
-            [Formula(each.residual, sympy.S.Zero, each.number) for each in group], "equation", together=MOST_OPERATIONS
+            [Formula(equation.residual, sympy.S.Zero, equation.number) for equation in group],
+            "equation",
+            together=MOST_OPERATIONS,
         )
     q, p = derived.state
     ends = zip((*q, *p), (*derived.end_position, *derived.end_momentum), strict=True)
@@ -219,8 +221,8 @@ def _unknowns(system: MechanicalSystem, stages: StageSystem) -> str:
         names.append(", ".join(members if len(members) < 4 else (members[0], "..", members[-1])))
     sizes = [system.dimension if block.size is None else block.size for block in stages.blocks]
     size = sum(sizes)
-    each = f", each of them {sizes[0]} numbers" if sizes[0] > 1 and len(set(sizes)) == 1 else ""
-    return f"Unknown are {', '.join(names)}{each}: {size} in all. Known are q_k, p_k, t_k and h."
+    components = f", each of them {sizes[0]} numbers" if sizes[0] > 1 and len(set(sizes)) == 1 else ""
+    return f"Unknown are {', '.join(names)}{components}: {size} in all. Known are q_k, p_k, t_k and h."
 
 
 def _place(group: StageGroup) -> str:

@@ -60,8 +60,8 @@ def result_symbol(system: MechanicalSystem, group: StageGroup, scatter: Scatter,
         return Symbol(f"g_dot_{suffix}")
     if group.scalar is None:
         forms = forms_of(system)
-        known = {forms.force: "L_q", forms.momentum: "L_v", forms.euler_lagrange: "E", forms.constitutive: "L_p"}
-        return Symbol(f"{known[scatter.results]}_{suffix}")
+        letters = {forms.force: "L_q", forms.momentum: "L_v", forms.euler_lagrange: "E", forms.constitutive: "L_p"}
+        return Symbol(f"{letters[scatter.results]}_{suffix}")
     name = argument_name(system, group.gathers[group.scatters.index(scatter)])
     return Symbol(f"E_{suffix}" if name == "lambda" else f"{scalar_name(group)}_{name}_{suffix}")
 
