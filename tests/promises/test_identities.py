@@ -10,6 +10,7 @@ import oracle
 import pytest
 from notation import lagrange
 
+from scvi_codegen import hamiltonian_of
 from scvi_codegen.methods import (
     SCVI,
     SVI,
@@ -214,3 +215,15 @@ def test_a_total_derivative_moves_momenta_only_if_the_quadrature_is_exact_for_it
     q2, p2 = shifted.step(q, p + gradient(q, T), h, T)
     difference = distance((q2, p2 - gradient(q2, T + h)), (q1, p1))
     assert difference < 1e-13 if exact else difference > 1e-9
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(
+    "method", [SVI(3), Gauss(3), SpectralCollocation(4, form="phase-space")], ids=lambda method: method.name
+)
+def test_hamiltonian_with_forces_has_the_same_step(sample, quickly_compiled, method):
+    case = sample("radial-friction")
+    steps = [
+        quickly_compiled(system, method).step(*case.state, 0.1) for system in (case.system, hamiltonian_of(case.system))
+    ]
+    np.testing.assert_allclose(*steps, rtol=3e-15)

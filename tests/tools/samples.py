@@ -175,6 +175,41 @@ def three_bodies() -> LagrangianSystem:
     )
 
 
+def forced_cart_pole() -> LagrangianSystem:
+    """A motor on the cart, friction in the joint, drag by the square of the cart's speed."""
+    return LagrangianSystem.from_text(
+        name="cart and pole with a motor",
+        coordinates=["x", "theta"],
+        lagrangian="(M + m)*x_dot**2/2 + m*l*x_dot*theta_dot*cos(theta) + m*l**2*theta_dot**2/2 + m*g*l*cos(theta)",
+        parameters={"M": 2.0, "m": 1.0, "l": 0.8, "g": 3.0, "b": 0.3, "c": 0.4, "F": 1.5, "w": 1.7},
+        forces={"x": "F*sin(w*t) - b*x_dot**3 - b*x*theta_dot"},
+        dissipation="c*theta_dot**2*(1 + x**2)/2",
+    )
+
+
+def radial_friction() -> LagrangianSystem:
+    """Friction along the radius, a mass that depends on place: no torque."""
+    drag = "-c*{0}*(x*x_dot + y*y_dot)*(1 + x_dot**2 + y_dot**2)/(x**2 + y**2)"
+    return LagrangianSystem.from_text(
+        name="radial friction",
+        coordinates=["x", "y"],
+        lagrangian="(x_dot**2 + y_dot**2)*(1 + x**2 + y**2)/2 + 1/sqrt(x**2 + y**2)",
+        parameters={"c": 0.3},
+        forces={"x": drag.format("x"), "y": drag.format("y")},
+    )
+
+
+def damped_pair() -> LagrangianSystem:
+    """Two coupled coordinates with uniform damping, a mass that depends on place, and time."""
+    return LagrangianSystem.from_text(
+        name="damped",
+        coordinates=["x", "y"],
+        lagrangian="(1 + x**2)*x_dot**2/2 + y_dot**2/2 + x_dot*y_dot/3 + cos(x) - y**2*x/4 + y*cos(2*t)/5",
+        parameters={"c": 0.4, "m": 0.9},
+        damping="c*m",
+    )
+
+
 def runaway() -> LagrangianSystem:
     """q'' = q^2."""
     return LagrangianSystem.from_text(name="runaway", coordinates=["q"], lagrangian="q_dot**2/2 + q**3/3")
@@ -183,6 +218,9 @@ def runaway() -> LagrangianSystem:
 OWN_SYSTEMS: dict[str, Callable[[], LagrangianSystem]] = {
     "driven-duffing": driven_duffing,
     "pumped-cart-pole": pumped_cart_pole,
+    "forced-cart-pole": forced_cart_pole,
+    "radial-friction": radial_friction,
+    "damped-pair": damped_pair,
     "three-bodies": three_bodies,
     "runaway": runaway,
 }
@@ -196,6 +234,9 @@ GENERIC = {
     "double-pendulum": ((0.9, -0.6), (0.5, 1.2)),
     "cart-pole": ((0.2, 0.9), (0.4, -0.7)),
     "pumped-cart-pole": ((0.2, 0.9), (0.4, -0.7)),
+    "forced-cart-pole": ((0.3, 1.1), (0.5, -0.4)),
+    "radial-friction": ((1.0, 0.1), (0.3, 0.8)),
+    "damped-pair": ((0.3, -0.4), (0.5, 0.7)),
     "henon-heiles": ((0.1, -0.2), (0.3, 0.25)),
     "spherical-pendulum": ((0.9, 0.3), (0.4, 1.3)),
     "charged-particle": ((0.2, -0.1, 0.3), (1.0, 0.4, 0.1)),
