@@ -256,7 +256,7 @@ def ensembles(case: Case) -> None:
         data = runs.to_xarray() if not (case.two_words or case.kind == "slowed" or "t_end" in way) else None
         for j in sorted({0, count // 3, count - 1}):
             rows = np.flatnonzero(np.isfinite(runs.q[:, j, 0]))
-            t = runs.t if runs.times is None else runs.times[rows, j]
+            t = runs.t if runs.t.ndim == 1 else runs.t[rows, j]
             motion = case.motion(others[j], state=(tuple(runs.q[0, j]), case.problem.x))
             near(runs.q[rows, j], motion.q(t), 10 * case.error)
             near(runs.p[rows, j], motion.p(t), 10 * case.error)

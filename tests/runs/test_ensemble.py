@@ -323,6 +323,32 @@ def test_rows_after_the_end_of_all_trajectories_keep_their_times() -> None:
     assert (runs.ends[0] < 2.0).all()
 
 
+def test_rows_in_transformed_time_keep_their_tau() -> None:
+    """Each trajectory reaches t_end within a step of its own; those that leave x > 0 fail, one in its first step."""
+    system = sc.LagrangianSystem.from_text(name="root", coordinates=["x"], lagrangian="x_dot**2/2 - x**(5/2)")
+    stepper, h = sc.compile_stepper(sc.reparametrise(system, "1/(1 + x**2)"), "svi:3"), 0.1
+    q, p = [[1.0], [2.0], [1e-3], [1.0]], [[0.0], [0.0], [-5.0], [-2.0]]
+    runs = stepper.integrate_ensemble(q, p, h=h, t_end=0.7)
+    assert runs.ok.tolist() == [True, True, False, False]
+    assert runs.tau is not None
+    for j in range(4):
+        try:
+            alone = stepper.integrate(q[j], p[j], h=h, t_end=0.7)
+        except sc.StepFailedError as failure:
+            alone = failure.trajectory
+        rows, run = len(alone), runs[j]
+        assert np.array_equal(run.tau, alone.tau)
+        assert np.array_equal(run.t, alone.t)
+        assert_allclose(runs.tau[: rows - 1, j], h * np.arange(rows - 1), atol=1e-15)
+        assert np.isnan(runs.tau[rows:, j]).all()
+    assert len(runs[2]) == 1 < len(runs[3]) < len(runs[0]) < len(runs[1])
+    assert_allclose(runs.ends[0][:2], 0.7, rtol=1e-14)
+    assert 0.0 < np.diff(runs[0].tau)[-1] < h  # the last step ends at t_end
+    by_steps = stepper.integrate_ensemble(q[:2], p[:2], h=h, steps=4)
+    assert_allclose(by_steps.tau, h * np.arange(5), atol=1e-15)
+    assert np.array_equal(by_steps.t, by_steps.times)
+
+
 @pytest.mark.parametrize("t_eval", [[2.0, 5.0], [0.5, 2.0, 5.0]])
 def test_ends_with_output_times_are_those_of_terminal_events(t_eval: list[float]) -> None:
     stepper = stepper_for("kepler", sc.SVI(5)).with_events(sc.Event("q1 - 1/2", -1, terminal=True))
@@ -339,7 +365,7 @@ def test_ends_with_output_times_are_those_of_terminal_events(t_eval: list[float]
 def test_results_have_target_times_and_are_pickled() -> None:
     runs = CASES["adaptive"].run()
     assert [plan.t_end for plan in runs.plans] == ENDS
-    assert runs.h == 0.0
+    assert runs.h is None
     times, q, _ = runs.ends
     assert times.tolist() == ENDS
     assert np.array_equal(q[2], list(runs.each())[2][1][-1])
@@ -774,7 +800,7 @@ def test_files_contain_individual_times(tmp_path: Path) -> None:
     assert [table["t"][table["trajectory"] == j].max() for j in range(4)] == ENDS
     runs.save(tmp_path / "e.npz")
     with np.load(tmp_path / "e.npz") as file:
-        assert np.array_equal(file["times"], runs.times, equal_nan=True)
+        assert np.array_equal(file["t"], runs.t, equal_nan=True)
     pytest.importorskip("xarray")
     dataset = runs.to_xarray()
     assert np.array_equal(dataset.time, runs.times, equal_nan=True)
@@ -790,7 +816,7 @@ def test_command_line_runs_a_grid(here: Path) -> None:
     assert "adaptive steps from t = 0 to t = 9" in done.output
     assert "4 ok" in done.output
     with np.load("grid.npz") as file:
-        assert (np.nanmax(file["times"], axis=0) == 9.0).all()
+        assert (np.nanmax(file["t"], axis=0) == 9.0).all()
 
 
 @pytest.mark.rotated

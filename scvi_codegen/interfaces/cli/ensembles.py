@@ -126,8 +126,8 @@ def _describe_steps(model: Model, result: EnsembleTrajectory) -> str:
 def _failures(result: EnsembleTrajectory) -> Iterator[str]:
     lost = np.flatnonzero(~result.ok & (result.status != "interrupted"))
     for j in lost[:SHOWN_FAILURES]:
-        own = result.plans or result.spans or result.times is not None
-        t = result.ends[0][j] if own else result.t[0] + result.steps[j] * result.h
+        equal = result.h is not None and not result.spans and result.t.ndim == 1
+        t = result.t[0] + result.steps[j] * result.h if equal else result.ends[0][j]
         status = str(result.status[j])
         why = FAILURES[status][0] if status in FAILURES else status
         failed = f"step {result.steps[j]} at t = {t:g} failed"

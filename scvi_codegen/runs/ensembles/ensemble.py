@@ -45,7 +45,7 @@ from scvi_codegen.runs.ensembles.result import EVENT_FAILED, INTERRUPTED, OK, En
 from scvi_codegen.runs.ensembles.schedule import CommonSteps
 from scvi_codegen.runs.ensembles.thread_pool import StopCheck, run_jobs
 from scvi_codegen.runs.results.dense_output import times_of_run
-from scvi_codegen.runs.states.times import WHOLE, times_after
+from scvi_codegen.runs.states.times import WHOLE
 from scvi_codegen.runs.states.validation import (
     Array,
     EnsembleParameters,
@@ -53,7 +53,7 @@ from scvi_codegen.runs.states.validation import (
     check_left_to_inputs,
     columns_of_inputs,
 )
-from scvi_codegen.runs.states.words import check_doubles, hashed, stacked, with_low
+from scvi_codegen.runs.states.words import check_doubles, hashed, stacked
 from scvi_codegen.runs.stepping.features import check_together, require
 from scvi_codegen.runs.stepping.step_plan import (
     Adaptive,
@@ -70,7 +70,7 @@ from scvi_codegen.systems.event import Crossings
 class SavedLane(NamedTuple):
     """Saved states of one trajectory, its status, numbers of steps and of those solved by Newton's method, and events.
 
-    ``actions`` are those up to each state of runs that sum the action.
+    ``actions`` are those up to each state of runs that sum the action, ``tau`` its values in transformed time.
     """
 
     t: Array
@@ -81,12 +81,14 @@ class SavedLane(NamedTuple):
     fallback_steps: int = 0
     events: tuple[Crossings, ...] = ()
     actions: Array | None = None
+    tau: Array | None = None
 
     @classmethod
     def of(cls, states: Trajectory, rows: Any = slice(None), status: str = OK) -> SavedLane:
         """Return rows of the states of a single run."""
         actions = None if states.actions is None else states.actions[rows]
-        about = status, states.steps, states.fallback_steps, states.events, actions
+        tau = None if states.tau is None else states.tau[rows]
+        about = status, states.steps, states.fallback_steps, states.events, actions, tau
         return cls(states.t[rows], states.q[rows], states.p[rows], *about)
 
     def limited(self, most: float) -> SavedLane:
@@ -94,8 +96,9 @@ class SavedLane(NamedTuple):
         if len(self.t) <= most and self.status != TOO_MANY_STATES:
             return self
         ends = slice(None, None, max(len(self.t) - 1, 1))
-        actions = None if self.actions is None else self.actions[ends]
-        return self._replace(t=self.t[ends], q=self.q[ends], p=self.p[ends], actions=actions, status=TOO_MANY_STATES)
+        actions, tau = (None if values is None else values[ends] for values in (self.actions, self.tau))
+        about = self.steps, self.fallback_steps, self.events, actions, tau
+        return SavedLane(self.t[ends], self.q[ends], self.p[ends], TOO_MANY_STATES, *about)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -366,8 +369,10 @@ class Ensemble:
             fallbacks, actions = cast(Array, trajectories.fallback_steps).tolist(), trajectories.actions
             for k, each in enumerate(trajectories.each()):
                 events = trajectories.events[k] if trajectories.events else ()
-                sums = None if actions is None else actions[: len(each[0]), k]
-                self.saved[part.start + k] = SavedLane(*each, fallbacks[k], events, sums)
+                count = len(each[0])
+                sums = None if actions is None else actions[:count, k]
+                tau = None if trajectories.tau is None else trajectories.tau[:count, k]
+                self.saved[part.start + k] = SavedLane(*each, fallbacks[k], events, sums, tau)
             if self.error is not None:
                 self.confirmations[part] = trajectories.confirmations
                 cast(list[Until | Adaptive], self.plans)[part] = trajectories.plans
@@ -377,7 +382,7 @@ class Ensemble:
         common.status[part], common.done[part] = trajectories.status, trajectories.steps
         common.fallback_steps[part] = cast(Array, trajectories.fallback_steps)
         if common.times is not None:
-            common.times[:, part] = trajectories.times
+            common.times[:, part] = trajectories.t
         if common.actions is not None:
             common.actions[:, part] = trajectories.actions
         if common.observation is not None:
@@ -475,8 +480,8 @@ class Ensemble:
         if self.inputs:
             spans = tuple((rows, slice(None), partial(self.values_at, each.middle)) for rows, each in fixed.spans())
         return EnsembleTrajectory(
-            t=fixed.times(tau=common.times is not None),
-            times=common.times,
+            t=fixed.times(tau=False) if common.times is None else common.times,
+            tau=None if common.times is None else fixed.times(tau=True),
             actions=common.actions,
             fallback_steps=common.fallback_steps,
             observed=None if common.observation is None else common.observation.result(),
@@ -531,37 +536,31 @@ class Ensemble:
             return self._successive_result(self.successive)
         lanes = [(self.saved.get(j) or self._unfinished(j)).limited(self.most_states) for j in range(len(self))]
         count = max(len(each.t) for each in lanes) if self.t_eval is None else len(self.t_eval)
-        t = np.arange(count, dtype=float) if self.t_eval is None else self.t_eval
         missing, shape = self.stepper._states.missing, (count, len(self), self.stepper.dimension)
-        times = missing((count, len(lanes))) if self.t_eval is None else None
-        q, p = missing(shape), missing(shape)
+        times, q, p = missing(shape[:2]), missing(shape), missing(shape)
+        tau = np.full(shape[:2], np.nan) if self.stepper.in_tau else None
         actions = np.full(shape[:2], np.nan) if self.stepper.sums_action else None
         for j, each in enumerate(lanes):
             row = slice(0, len(each.t))
-            q[row, j], p[row, j] = each.q, each.p
+            times[row, j], q[row, j], p[row, j] = each.t, each.q, each.p
+            if tau is not None:
+                tau[row, j] = 0.0 if each.tau is None else each.tau
             if actions is not None and each.actions is not None:
                 actions[row, j] = each.actions
-            if times is not None:
-                times[row, j] = each.t
-        if self.fixed is not None and self.stepper.in_tau:
-            t = self._fictitious_times(self.fixed, cast(Array, times))
-        elif self.fixed is not None and not any(event.terminal for event in self.stepper.events):
-            longest, times = max((each.t for each in lanes), key=len), None
-            t = longest if len(longest) == count else t  # all may end before t_end
         status = np.array([each.status for each in lanes], dtype="<U32")
         steps = np.array([each.steps for each in lanes], dtype=np.int64)
         fallbacks = np.array([each.fallback_steps for each in lanes], dtype=np.int64)
-        whole = self._trajectories(t, times, q, p, status, steps, fallbacks)
-        return replace(whole, actions=actions, events=tuple(each.events for each in lanes))
+        whole = self._trajectories(self._common_times(times), q, p, status, steps, fallbacks)
+        return replace(whole, tau=tau, actions=actions, events=tuple(each.events for each in lanes))
 
-    def _fictitious_times(self, fixed: CommonSteps, times: Array) -> Array:
-        """Return tau of states at (n, k) times; NaN where a trajectory is at its t_end, within a step of tau."""
-        count = len(times)
-        numbers = fixed.save_every * np.arange(count) if fixed.t_end is not None else fixed.numbers[:count]
-        high, low = times_after(0.0, fixed.h, numbers)
-        if fixed.t_end is not None:
-            high[np.isfinite(np.asarray(times)).sum(axis=0) - 1] = np.nan
-        return high if fixed.words == 1 else with_low(high, low)
+    def _common_times(self, times: Array) -> Array:
+        """Return the (n,) times of all trajectories where they are common, else the (n, k) times of each."""
+        common = self.fixed is not None and not self.stepper.in_tau
+        if common and not any(event.terminal for event in self.stepper.events):
+            complete = np.flatnonzero(np.isfinite(np.asarray(times)).all(axis=0))
+            if complete.size:  # all may end before t_end
+                return times[:, complete[0]]
+        return times if self.t_eval is None else self.t_eval
 
     def _successive_result(self, work: SuccessiveRuns) -> EnsembleTrajectory:
         count, layout, full = len(self), self.stepper._states, work.status == FULL
@@ -586,24 +585,18 @@ class Ensemble:
         if self.t_eval is None:
             start = layout.missing((count,))
             start[:] = self.t0
-            numbers, times = np.arange(rows, dtype=float), ordered("t", start)
-            own: Array | None = times
-            if self.fixed is not None and self.stepper.in_tau:
-                numbers = self._fictitious_times(self.fixed, times)
-            elif self.fixed is not None:
-                numbers, own = times[:, stored.argmax()], None
-            whole = self._trajectories(numbers, own, q, p, work.names, work.done, work.fallback_steps)
+            times = self._common_times(ordered("t", start))
+            whole = self._trajectories(times, q, p, work.names, work.done, work.fallback_steps)
             sums = self.stepper.sums_action
             return replace(whole, actions=ordered("actions", np.zeros(count))) if sums else whole
         at = np.where(self.t_eval == self.t0, 0, 1)
         none = layout.missing((1, *q.shape[1:]))  # if no trajectory reached the end
         q, p = (np.concatenate([each, none])[at] for each in (q, p))
-        return self._trajectories(self.t_eval, None, q, p, work.names, work.done, work.fallback_steps)
+        return self._trajectories(self.t_eval, q, p, work.names, work.done, work.fallback_steps)
 
     def _trajectories(
         self,
         t: Array,
-        times: Array | None,
         q: Array,
         p: Array,
         status: NDArray[np.str_],
@@ -612,24 +605,23 @@ class Ensemble:
     ) -> EnsembleTrajectory:
         return EnsembleTrajectory(
             t=t,
-            times=times,
             q=q,
             p=p,
             status=status,
             steps=steps,
             fallback_steps=fallback_steps,
-            h=self.plans[0].h if isinstance(self.plans[0], Until) else 0.0,
+            h=self.plans[0].h if isinstance(self.plans[0], Until) else None,
             plans=() if isinstance(self.plans[0], Until) else cast(Sequence[Adaptive], self.plans),
             confirmations=tuple(self.confirmations),
             parameters=self.parameters,
             stepper=self.stepper,
-            spans=tuple(self._spans(t, times)) if self.inputs else (),
+            spans=tuple(self._spans(t)) if self.inputs else (),
         )
 
-    def _spans(self, t: Array, times: Array | None) -> Iterator[Span]:
-        """Yield the rows of each trajectory, of states at t or its own times, in each piece of its inputs."""
+    def _spans(self, t: Array) -> Iterator[Span]:
+        """Yield the rows of each trajectory, of states at the times t, in each piece of its inputs."""
         for j, plan in enumerate(self.plans):
-            at, end_of_run = t if times is None else times[:, j], plan.t_end
+            at, end_of_run = t if t.ndim == 1 else t[:, j], plan.t_end
             forward = -1.0 if end_of_run < self.t0 else 1.0
             ends = breakpoints_until(self.t0, end_of_run, self.inputs) or [end_of_run]
             last = np.searchsorted(forward * at[np.isfinite(at)], forward * np.array(ends), side="right").tolist()

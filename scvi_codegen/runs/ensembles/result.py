@@ -55,15 +55,15 @@ class EnsembleRuns:
     """Runs of k trajectories, wherever their states are.
 
     Attributes:
-        t: (n,) common times; in transformed time tau from 0, NaN where a trajectory is at its t_end; row numbers if
-            every trajectory has its own times.
+        t: times of the states: (n,) if all trajectories have the same, else (n, k), as with adaptive steps, terminal
+            events and in transformed time; NaN after the end of a trajectory.
         status: (k,) ``"ok"``, or the reason of the end (``"not converged"``, ``"singular"``, ``"not finite"``,
             ``"step size underflow"``, ``"interrupted"``, ``"too many states"`` for the memory).
         steps: (k,) completed steps.
-        h: step size; 0 for adaptive steps.
+        h: step size, ``None`` for adaptive steps.
         parameters: (k, number of parameters) values; zeros for the parameters of inputs.
         stepper: the compiled integrator.
-        times: (n, k) times if every trajectory has its own (transformed time, adaptive steps), else ``None``.
+        tau: in transformed time its values from 0, (n,) or with ``t_end`` (n, k), else ``None``.
         plans: step plan of each trajectory for adaptive steps, else empty.
         observed: with ``observe=``, over the states after all steps: (2, k, 2m) smallest and largest values of (q, p)
             (``"extremes"``), (2, k) energies (``"energy"``), or (k, number of events) changes of sign (``"events"``).
@@ -72,15 +72,20 @@ class EnsembleRuns:
     t: Array
     status: NDArray[np.str_]
     steps: NDArray[np.int64]
-    h: float
+    h: float | None
     parameters: Array
     stepper: Integrator = field(repr=False)
-    times: Array | None = None
+    tau: Array | None = None
     plans: Sequence[Adaptive] = ()
     observed: Array | None = field(default=None, repr=False)
 
     def __len__(self) -> int:
         return len(self.status)
+
+    @property
+    def times(self) -> Array:
+        """(n, k) times of the states of each trajectory."""
+        return self.t if self.t.ndim == 2 else np.broadcast_to(self.t[:, np.newaxis], (len(self.t), len(self)))
 
     @property
     def ok(self) -> NDArray[np.bool_]:
@@ -121,8 +126,10 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
         trajectory: type[Trajectory] = cast(Any, self.stepper)._trajectory_type
         j = checked_row(j, len(self))
         parts = [(good, parameters) for k, good, parameters in self._with_parameters() if k == j]
-        times, in_tau = self._times()[:, j], self.stepper.in_tau
-        plan = self.plans[j] if self.plans else Fixed(self.h)
+        times, tau = self.times[:, j], self.tau
+        if tau is not None and tau.ndim == 2:
+            tau = tau[:, j]
+        plan, h = (self.plans[j], np.nan) if self.h is None else (Fixed(self.h), self.h)
         pieces = []
         for number, (good, parameters) in enumerate(parts):
             rows = np.insert(good, 0, good[0] - 1) if number else good  # the state at a breakpoint belongs to both
@@ -133,9 +140,9 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
                     q=q,
                     p=p,
                     iterations=np.zeros(len(rows), np.int32),
-                    step_sizes=np.full(len(rows), self.h or np.nan),
-                    h=self.h,
-                    tau=self.t[rows] if in_tau else None,
+                    step_sizes=np.full(len(rows), h),
+                    h=h,
+                    tau=None if tau is None else tau[rows],
                     actions=None if self.actions is None else self.actions[rows, j],
                     parameters=parameters,
                     stepper=self.stepper,
@@ -159,9 +166,10 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
         interface, counts = self.stepper.interface, Counter(self.status.tolist())
         names = interface.coordinates[:MOST_SHOWN]
         steps = f"{self.steps.min()} to {self.steps.max()}" if len(self) else "0"
+        size = "adaptive size" if self.h is None else f"size {self.h:g}"
         facts = (
             ("trajectories", plain(f"{len(self)}: {', '.join(f'{each} {word}' for word, each in counts.items())}")),
-            ("steps", plain(f"{steps} of {f'size {self.h:g}' if self.h else 'adaptive size'}")),
+            ("steps", plain(f"{steps} of {size}")),
             ("states", plain(f"{len(self.t)} of each; q and p of shape {self.q.shape}")),
             ("coordinates", listed(interface.coordinates)),
             ("parameters", listed(interface.parameters)),
@@ -182,9 +190,9 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
         """
         reached = np.isfinite(self.q).all(axis=2).sum(axis=0)
         last, j = reached - 1, np.arange(len(self))
-        t, q, p = self._times()[last, j], self.q[last, j], self.p[last, j]
+        t, q, p = self.times[last, j], self.q[last, j], self.p[last, j]
         t[reached == 0] = np.nan
-        for k, crossings in enumerate(self.events if self.times is None else ()):
+        for k, crossings in enumerate(self.events if self.t.ndim == 1 else ()):
             for each in crossings:
                 if 0 < int(each.event.terminal) <= len(each):
                     t[k], q[k], p[k] = each.t[-1], each.q[-1], each.p[-1]
@@ -197,10 +205,7 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
     def _one(self, j: int) -> tuple[Array, Array, Array, str, int]:
         """Return the times, positions and momenta of trajectory j, its status and its number of steps."""
         good = self._reached(j)
-        return self._times()[good, j], self.q[good, j], self.p[good, j], str(self.status[j]), int(self.steps[j])
-
-    def _times(self) -> Array:
-        return np.broadcast_to(self.t[:, np.newaxis], self.q.shape[:2]) if self.times is None else self.times
+        return self.times[good, j], self.q[good, j], self.p[good, j], str(self.status[j]), int(self.steps[j])
 
     def energy(self) -> Array:
         """Return (n, k) energies p.v - L; NaN after a failure, and for trajectories that leave the domain of L."""
@@ -208,7 +213,7 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
         for j, good, parameters in self._with_parameters():
             with suppress(StateError):
                 energies[good, j] = self.stepper.energy(
-                    self.q[good, j], self.p[good, j], self._times()[good, j], parameters
+                    self.q[good, j], self.p[good, j], self.times[good, j], parameters
                 )
         return energies
 
@@ -233,7 +238,7 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
             found = np.zeros(wanted.shape)
             for j, good, parameters in self._with_parameters():
                 if wanted[j].any():
-                    states = self.q[good, j], self.p[good, j], self._times()[good, j]
+                    states = self.q[good, j], self.p[good, j], self.times[good, j]
                     found[j] = np.maximum(found[j], self.stepper._momentum_bounds(*states, parameters))
             return found
 
@@ -245,7 +250,7 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
         for j, good, parameters in self._with_parameters():
             with suppress(StateError):
                 values[good, j], sizes[good, j] = self.stepper._momentum_maps_and_sizes(
-                    self.q[good, j], self.p[good, j], self._times()[good, j], parameters
+                    self.q[good, j], self.p[good, j], self.times[good, j], parameters
                 )
         return values, sizes
 
@@ -304,7 +309,8 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
     def _labelled(self, units: Mapping[str, str]) -> Labelled:
         """Return the arrays with named dimensions."""
         interface, each = self.stepper.interface, ("t", "trajectory")
-        dimensions: dict[str, tuple[str, ...]] = {"t": ("t",), "coordinate": ("coordinate",), "energy": each}
+        time = {"t": ("t",)} if self.t.ndim == 1 else {"time": each}
+        dimensions: dict[str, tuple[str, ...]] = {**time, "coordinate": ("coordinate",), "energy": each}
         dimensions |= dict.fromkeys(("q", "p", "velocity"), (*each, "coordinate"))
         dimensions |= {"status": ("trajectory",), "steps": ("trajectory",)}
         whole: dict[str, NDArray[Any]] = {
@@ -324,21 +330,19 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
                 item.name: (*each, *item.dimensions) for item in attitudes
             }
             whole |= AXES
-        states = {"t": self.t, "q": self.q, "p": self.p}
-        if self.times is not None:
-            dimensions["time"], states["time"] = each, self.times
+        states = {"t": self.t, "time": self.t, "q": self.q, "p": self.p}
         return Labelled(
             dimensions=dimensions,
             pieces=lambda: iter([states | self._quantities()]),
             whole=whole,
             count=len(self.t),
             units={name: unit for name, unit in units.items() if name in dimensions},
-            attributes={**interface.about(), "h": self.h},
+            attributes=interface.about() | ({} if self.h is None else {"h": self.h}),
             long_names={item.name: item.long_name for item in attitudes},
         )
 
     def _quantities(self) -> dict[str, Array]:
-        times = np.nan_to_num(self._times())
+        times = np.nan_to_num(self.times)
         result: dict[str, Array] = {}
         for j, good, parameters in self._with_parameters():
             part = quantities(self.stepper, parameters, times[good, j], self.q[good, j], self.p[good, j])
@@ -352,9 +356,9 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
         return np.asarray(np.isfinite(self.q[:, j]).all(axis=1), dtype=np.bool_)
 
     def _write_npz(self, file: IO[bytes]) -> None:
-        others = {"times": self.times, "observed": self.observed}
+        others = {"observed": self.observed, "h": self.h}
         optional: dict[str, Any] = {name: values for name, values in others.items() if values is not None}
-        for name in ("t", "times", "q", "p", "parameters"):
+        for name in ("t", "q", "p", "parameters"):
             if isinstance(values := getattr(self, name), Words):
                 optional[f"{name}_low"] = values.low
         np.savez(
@@ -364,7 +368,6 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
             p=self.p,
             status=self.status,
             steps=self.steps,
-            h=self.h,
             parameters=self.parameters,
             coordinates=np.array(self.stepper.coordinates),
             parameter_names=np.array(self.stepper.parameters, dtype=str),
@@ -381,5 +384,5 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
         for j in range(len(self)):
             good = self._reached(j)
             label = np.broadcast_to([j, *self.parameters[j, varied]], (int(good.sum()), 1 + len(varied)))
-            table = np.column_stack([label, self._times()[good, j], self.q[good, j], self.p[good, j]])
+            table = np.column_stack([label, self.times[good, j], self.q[good, j], self.p[good, j]])
             np.savetxt(file, table, delimiter=",", fmt=formats)
