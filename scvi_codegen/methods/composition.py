@@ -20,7 +20,6 @@ from scvi_codegen.common.representation import counted, summary
 from scvi_codegen.common.toml_text import package_table
 from scvi_codegen.common.validation import checked_count
 from scvi_codegen.methods.method import Exactness, Method, Specification
-from scvi_codegen.methods.tables.basis import extrapolation, identity_matrix
 from scvi_codegen.methods.tables.tableau import lobatto_iiia
 from scvi_codegen.systems.system import MechanicalSystem
 
@@ -173,18 +172,9 @@ class StoermerVerlet(_Leapfrogs):
 
     def stage_system(self, system: MechanicalSystem) -> StageSystem:
         """Return the pair by its generating function, unknowns V_1, V_2; explicit sequences as leapfrog equations."""
-        from scvi_codegen.methods.galerkin_stages import galerkin_system
+        from scvi_codegen.methods.galerkin_stages import symplectic_system
         from scvi_codegen.systems.splittings.kinetic import kinetic_splitting
 
         if self.drifts_first or (system.rotations and not isinstance(kinetic_splitting(system), str)):
             return _Leapfrogs.stage_system(self, system)
-        tableau = lobatto_iiia(2)
-        return galerkin_system(
-            system,
-            abscissae=tableau.c,
-            weights=tableau.b,
-            position=tableau.A,
-            velocity=identity_matrix(2),
-            end_position=tableau.b,
-            extrapolation=extrapolation(tableau.c, 1),
-        )
+        return symplectic_system(system, lobatto_iiia(2))

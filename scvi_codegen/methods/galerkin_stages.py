@@ -90,6 +90,19 @@ def galerkin_system(
     )
 
 
+def symplectic_system(system: MechanicalSystem, tableau: Tableau) -> StageSystem:
+    """Return the stage equations of a symplectic tableau by its generating function; unknowns are stage velocities."""
+    return galerkin_system(
+        system,
+        abscissae=tableau.c,
+        weights=tableau.b,
+        position=tableau.A,
+        velocity=identity_matrix(len(tableau.b)),
+        end_position=tableau.b,
+        extrapolation=next_step(tableau.c),
+    )
+
+
 def action_groups(
     system: MechanicalSystem, abscissae: Vector, weights: Matrix, gathers: tuple[Gather, ...]
 ) -> tuple[ScalarStageGroup, ...]:

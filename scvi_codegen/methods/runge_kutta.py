@@ -24,7 +24,6 @@ from scvi_codegen.common.representation import counted, summary
 from scvi_codegen.common.validation import NUMBERS, check_kind, checks_arguments, of
 from scvi_codegen.methods.method import Exactness, Method, NodalMethod, Specification, degree_count, resolve_nodes
 from scvi_codegen.methods.tables import tableau as tableaux
-from scvi_codegen.methods.tables.basis import identity_matrix, next_step
 from scvi_codegen.methods.tables.nodes import Nodes
 from scvi_codegen.methods.tables.tableau import Tableau
 from scvi_codegen.systems.system import MechanicalSystem
@@ -120,24 +119,9 @@ class RungeKutta(TableauMethod):
 
     def stage_system(self, system: MechanicalSystem) -> StageSystem:
         """Return stage equations: from a generating function for symplectic tableaux, otherwise (22)."""
-        from scvi_codegen.methods.acceleration_stages import position_system
-        from scvi_codegen.methods.galerkin_stages import galerkin_system, phase_space_system
+        from scvi_codegen.methods.galerkin_stages import symplectic_system
 
-        tableau = self.tableau
-        if self.form == "position":
-            return position_system(system, tableau)
-        if not self.symplectic:
-            return phase_space_system(system, tableau)
-        size = len(tableau.b)
-        return galerkin_system(
-            system,
-            abscissae=tableau.c,
-            weights=tableau.b,
-            position=tableau.A,
-            velocity=identity_matrix(size),
-            end_position=tableau.b,
-            extrapolation=next_step(tableau.c),
-        )
+        return symplectic_system(system, self.tableau) if self.symplectic else self.paper_form(system)
 
     def paper_form(self, system: MechanicalSystem) -> StageSystem:
         """Return the stage equations (22)-(23)."""

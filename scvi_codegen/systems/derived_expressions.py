@@ -23,7 +23,7 @@ from sympy import Expr, Matrix, Symbol
 from sympy.utilities.iterables import connected_components
 
 from scvi_codegen.common.precision import Number, mp
-from scvi_codegen.systems.formulas.expressions import Tape, gradient_tuple, hessian, jacobian
+from scvi_codegen.systems.formulas.expressions import NEGLIGIBLE, Tape, dot, gradient_tuple, hessian, jacobian
 from scvi_codegen.systems.formulas.intermediates import separated
 from scvi_codegen.systems.system import MechanicalSystem
 
@@ -179,8 +179,7 @@ class Forms:
         """Energy L_v . v - L, or H for a Hamiltonian; conserved if it does not depend on time."""
         if self.system.auxiliaries:
             return self.system.formula
-        products = [p * v for p, v in zip(self.momentum, self.system.velocities, strict=True)]
-        return sympy.Add(*products, -self.system.lagrangian)
+        return dot(self.momentum, self.system.velocities) - self.system.lagrangian
 
     @cached_property
     def euler_lagrange(self) -> tuple[Expr, ...]:
@@ -309,7 +308,6 @@ def _along(expressions: Sequence[Expr], variables: Sequence[Symbol], direction: 
     return tuple(sympy.Add(*row) for row in terms)
 
 
-NEGLIGIBLE = mp.mpf(10) ** -40
 DEPENDENT = 1e-10
 """Rank tolerance, relative to the largest singular value of the normalised rows."""
 LARGEST_NULL_SPACE = 8

@@ -18,6 +18,7 @@ from sympy import Expr, Symbol
 
 from scvi_codegen.common.errors import SystemDefinitionError, closest
 from scvi_codegen.common.validation import checked_count, checks_arguments, of
+from scvi_codegen.systems.constraints import time_derivative
 from scvi_codegen.systems.derived_expressions import forms_of
 from scvi_codegen.systems.formulas.expressions import gradient, jacobian
 from scvi_codegen.systems.formulas.grammar import parse_expression
@@ -67,7 +68,7 @@ def change_coordinates(
     symbols = {symbol.name: symbol for symbol in (*variables, *system.parameters, system.time)}
     positions = {symbol(name): parse_expression(text, symbols) for name, text in old.items()}
     replaced: dict[Expr, Expr] = {**positions}
-    replaced |= {symbol(q.name + DOT): rate_of(f, variables, system.time) for q, f in positions.items()}
+    replaced |= {symbol(q.name + DOT): time_derivative(f, variables, system.time) for q, f in positions.items()}
     return LagrangianSystem(
         name=f"{system.name} in {', '.join(coordinates)}",
         coordinates=variables,
@@ -92,13 +93,6 @@ def _projected(
         for i, derivative in gradient(positions.get(q, q), new).items():
             forces[i] += derivative * force.xreplace(replaced)
     return tuple(forces)
-
-
-def rate_of(position: Expr, variables: tuple[Symbol, ...], time: Symbol) -> Expr:
-    """Return the time derivative of ``position`` along a curve of the new coordinates."""
-    derivatives = gradient(position, (*variables, time))
-    rates = (*(symbol(variable.name + DOT) for variable in variables), sympy.S.One)
-    return sympy.Add(*(derivative * rates[i] for i, derivative in derivatives.items()))
 
 
 @checks_arguments(system=SYSTEM)

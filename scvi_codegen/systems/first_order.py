@@ -28,7 +28,7 @@ from sympy import Expr, Symbol
 
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.common.representation import counted, summary
-from scvi_codegen.systems.formulas.expressions import SAMPLES, hessian, samples, sums_to_zero
+from scvi_codegen.systems.formulas.expressions import SAMPLES, dot, hessian, samples, sums_to_zero
 from scvi_codegen.systems.formulas.intermediates import written_out
 from scvi_codegen.systems.formulas.symbols import DOT, inputs_by_name, symbol
 from scvi_codegen.systems.formulas.translation import format_expression
@@ -77,8 +77,7 @@ class FirstOrderSystem(HamiltonianSystem):
     @property
     def lagrangian(self) -> Expr:
         """Integrand theta_x . v - H of Hamilton's principle."""
-        products = [theta * v for theta, v in zip(self.one_form, self.velocities, strict=True)]
-        return sympy.Add(*products, -self.hamiltonian)
+        return dot(self.one_form, self.velocities) - self.hamiltonian
 
     def halves(self, values: Mapping[str, float] | Sequence[float]) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Return the values of ``coordinates`` and of ``momenta``, from values by name or in the order of the user.
@@ -337,7 +336,7 @@ def shear(form: OneForm) -> tuple[Symbol, Expr, tuple[str, ...], Expr] | None:
         g = sympy.integrate(ratio.xreplace({z[u]: sympy.S.One, z[s]: sympy.S.One}), z[k], manual=True)
         if g.has(sympy.Integral, sympy.Piecewise):
             continue
-        rate = v[s] - sympy.Add(*(g.diff(q) * dot for q, dot in zip(z, v, strict=True)))
+        rate = v[s] - dot([g.diff(q) for q in z], v)
         sheared = replace(form, lagrangian=form.lagrangian.subs({z[s]: z[s] - g, v[s]: rate}, simultaneous=True))
         for auxiliary in sheared.choices():
             if sheared.integral(auxiliary) is not None:

@@ -142,10 +142,9 @@ class HamiltonianSystem(MechanicalSystem):
     @property
     def lagrangian(self) -> Expr:
         """Integrand p . v - H of Hamilton's principle in phase space."""
-        from sympy import Add
+        from scvi_codegen.systems.formulas.expressions import dot
 
-        products = [p * v for p, v in zip(self.momenta, self.velocities, strict=True)]
-        return Add(*products, -self.hamiltonian)
+        return dot(self.momenta, self.velocities) - self.hamiltonian
 
     @property
     def auxiliaries(self) -> tuple[Symbol, ...]:

@@ -68,7 +68,7 @@ from scvi_codegen.methods.tables.basis import (
 from scvi_codegen.methods.tables.quadrature import gauss_legendre
 from scvi_codegen.systems.derived_expressions import accelerations, forms_of
 from scvi_codegen.systems.formulas.expressions import gradient_tuple, jacobian
-from scvi_codegen.systems.formulas.intermediates import distinct_nodes
+from scvi_codegen.systems.formulas.intermediates import parts
 from scvi_codegen.systems.lagrangian import LagrangianSystem
 from scvi_codegen.systems.legendre.transform import equivalent_lagrangian
 from scvi_codegen.systems.system import MechanicalSystem
@@ -266,7 +266,7 @@ def _coupled_growth(system: LagrangianSystem) -> tuple[Kernel, Kernel, Kernel | 
     """Return kernels of L_vv dq'' = -E_q dq - E_v dq', E(q, v, a) the Euler-Lagrange residual, unless too large."""
     forms, of = forms_of(system), (*system.coordinates, *system.velocities)
     residual = [-each for each in forms.euler_lagrange]
-    if distinct_nodes(residual) > MOST_OPERATIONS:
+    if len(parts(*residual)) > MOST_OPERATIONS:
         return None
     entries = jacobian(residual, of) or NOTHING
     different = tuple(dict.fromkeys(entries.values()))

@@ -172,11 +172,11 @@ def formulas(all_formulas: Sequence[Formula], noun: str, *, together: int = MOST
 
 def lines(text: str) -> Code:
     """Return C source, truncated if it is long."""
-    all_formulas = text.splitlines()
-    if len(all_formulas) <= MOST_LINES:
+    source_lines = text.splitlines()
+    if len(source_lines) <= MOST_LINES:
         return Code(text)
-    shown = "\n".join(all_formulas[:MOST_LINES])
-    return Code(f"{shown}\n/* .. {len(all_formulas) - MOST_LINES} more lines */")
+    shown = "\n".join(source_lines[:MOST_LINES])
+    return Code(f"{shown}\n/* .. {len(source_lines) - MOST_LINES} more lines */")
 
 
 FORMAT = ".3g"

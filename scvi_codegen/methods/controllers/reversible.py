@@ -10,7 +10,7 @@ from sympy import Expr
 
 from scvi_codegen.methods.controllers.controller import Controller
 from scvi_codegen.systems.derived_expressions import forms_of
-from scvi_codegen.systems.formulas.expressions import gradient
+from scvi_codegen.systems.formulas.expressions import derivative_along
 from scvi_codegen.systems.system import MechanicalSystem
 from scvi_codegen.systems.time_transformation import time_rescaling_function
 
@@ -30,8 +30,7 @@ def density_and_growth(system: MechanicalSystem, g: str | Expr) -> tuple[Expr, .
     if system.auxiliaries:
         rates |= dict(zip(system.auxiliaries, forms.momentum_rate, strict=True))
     rates[system.time] = sympy.S.One
-    variables = list(rates)
-    change = sympy.Add(*(derivative * rates[variables[i]] for i, derivative in gradient(rate, variables).items()))
+    change = derivative_along(rate, list(rates), list(rates.values()))
     return 1 / rate, -change / rate
 
 

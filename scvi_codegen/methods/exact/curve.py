@@ -166,6 +166,7 @@ class Curve:
 
     def _residual_jacobians(self) -> tuple[Floats, Floats]:
         """Return the derivatives of all residuals with respect to z (square) and to v0."""
+        # Q = q0 + h c v0 + h A^2 z, V = v0 + A z, a = z/h.
         by_q, by_v, by_a = np.array([self.motion.residual_jacobian(*point) for point in self._points()]).swapaxes(0, 1)
         h, A, c = float(self.h), self.grid.matrix, self.grid.abscissae.astype(float)
         blocks = np.einsum("ij,iab->iajb", A, by_v) + h * np.einsum("ij,iab->iajb", A @ A, by_q)
@@ -176,6 +177,7 @@ class Curve:
 
     def _bordered(self) -> Solve:
         """Return a solver for (v0, z) that eliminates z; its Schur complement is dq1/dv0, the Jacobi field."""
+        # [1, b A; E_v0, E_z] (dv0, dz): dz = E_z^-1 (r - E_v0 dv0), (1 - b A E_z^-1 E_v0) dv0 = r_0 - b A E_z^-1 r.
         by_z, by_v0 = self._residual_jacobians()
         m = len(self.position)
         inverted = inverse(by_z)

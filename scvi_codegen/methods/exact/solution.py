@@ -203,6 +203,7 @@ class ExactMotion:
         q, p, t = numbers(q), numbers(p), mp.mpf(t)
         if not self.system.constraints:
             return q, p
+        # Newton's method with the saddle-point matrix: M dq = G^T lambda, G dq = -g; then likewise for velocities.
         m, still = len(q), numbers(np.zeros(len(q)))
         v = self.velocity(q, p, t)
         for _ in range(MAX_PROJECTIONS):
@@ -278,6 +279,7 @@ class ExactMotion:
     def _extrapolated(self, start: Numbers, h: Number, t: Number) -> Numbers | None:
         """Return the Aitken-Neville extrapolation in (h / n)^2 for n = 2, 4, 6, ..; ``None`` without convergence."""
         row: list[Numbers] = []
+        # T_(k,j+1) = T_kj + (T_kj - T_(k-1,j))/((n_k/n_(k-j))^2 - 1).
         for k in range(1, MAX_COLUMNS + 1):
             new = [self._midpoints(start, h, t, 2 * k)]
             for j, old in enumerate(row, 1):
@@ -288,6 +290,7 @@ class ExactMotion:
         return None
 
     def _midpoints(self, start: Numbers, h: Number, t: Number, n: int) -> Numbers:
+        # y_1 = y_0 + w f(y_0), y_(j+1) = y_(j-1) + 2 w f(y_j): its error is a series in w^2 for even n (Gragg).
         width = h / n
         before: Numbers = start
         now: Numbers = start + self._rates(start, t) * width

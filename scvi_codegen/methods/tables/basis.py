@@ -210,6 +210,7 @@ def least_squares(
 
     ``dot`` is the scalar product of the numbers, here of any precision.
     """
+    # pi_(k+1)(x) = (x - <x pi_k, pi_k>/|pi_k|^2) pi_k(x) - |pi_k|^2/|pi_(k-1)|^2 pi_(k-1)(x).
     count, everywhere = len(points), [*points, *targets]
     rows: list[list[Number]] = [[0] * count for _ in targets]
     before, here, norm_before = [0] * len(everywhere), [1] * len(everywhere), math.inf

@@ -16,7 +16,7 @@ from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.systems.constraints.holonomic import HOLONOMIC
 from scvi_codegen.systems.constraints.kind import Constrained, ConstraintKind
 from scvi_codegen.systems.constraints.nonholonomic import NONHOLONOMIC
-from scvi_codegen.systems.formulas.expressions import gradient, jacobian
+from scvi_codegen.systems.formulas.expressions import derivative_along, jacobian
 from scvi_codegen.systems.formulas.symbols import DOT, symbol
 
 CONSTRAINT_KINDS = {
@@ -125,7 +125,7 @@ def constraint_jacobian(system: Constrained) -> dict[tuple[int, int], Expr]:
 def time_derivative(function: Expr, coordinates: Sequence[Symbol], time: Symbol) -> Expr:
     """Return df/dt of a function of (q, t) along a trajectory, as an expression in (q, v, t); v is held constant."""
     rates = [*(symbol(q.name + DOT) for q in coordinates), sympy.S.One]
-    return sympy.Add(*(derivative * rates[j] for j, derivative in gradient(function, (*coordinates, time)).items()))
+    return derivative_along(function, (*coordinates, time), rates)
 
 
 def rate_of_positions(function: Expr, coordinates: Sequence[Symbol], time: Symbol) -> Expr:

@@ -33,7 +33,7 @@ from sympy.printing.str import StrPrinter
 
 from scvi_codegen.common.errors import ExpressionError, SystemDefinitionError
 from scvi_codegen.systems.formulas.arrays import ArrayParser, ArrayTerm, Bound, term_of
-from scvi_codegen.systems.formulas.expressions import gradient
+from scvi_codegen.systems.formulas.expressions import derivative_along
 from scvi_codegen.systems.formulas.grammar import parsed
 from scvi_codegen.systems.formulas.indices import Access, Array, Loop, Place, Size
 from scvi_codegen.systems.formulas.symbols import DOT, symbol
@@ -98,8 +98,7 @@ def parse_constraint(
             raise ExpressionError(
                 f"the time derivative of {others[0]} is not available in constraints of arrays", text, 0
             )
-        derivatives = gradient(formula, tuple(rates))
-        return Add(*(derivative * [*rates.values()][k] for k, derivative in derivatives.items()))
+        return derivative_along(formula, tuple(rates), tuple(rates.values()))
 
     accesses_of_rates = {symbol(str(access)): access for access in pairs.values()}
     return term_of(loops, combination(formulas, rate), accesses | accesses_of_rates)

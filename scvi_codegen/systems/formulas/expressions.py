@@ -29,6 +29,7 @@ from scvi_codegen.systems.formulas.intermediates import (
     Intermediate,
     intermediate,
     intermediates,
+    parts,
     root_of_square,
     with_even_roots,
 )
@@ -137,17 +138,6 @@ def shortened(node: Any) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def parts(*expressions: sympy.Basic) -> dict[sympy.Basic, None]:
-    """Return all distinct subexpressions, beginning with the expressions themselves."""
-    result = dict.fromkeys(expressions)
-    waiting = list(expressions)
-    while waiting:
-        new = [argument for argument in waiting.pop().args if argument not in result]
-        result.update(dict.fromkeys(new))
-        waiting += new
-    return result
-
-
 def parts_of_type(kind: type, *expressions: sympy.Basic) -> set[Any]:
     """Return the distinct subexpressions of a class."""
     return {part for part in parts(*expressions) if isinstance(part, kind)}
@@ -252,6 +242,11 @@ def samples(expressions: Sequence[Expr]) -> Iterator[list[Number]]:
     for _ in range(ATTEMPTS):
         with suppress(ArithmeticError):
             yield tape([mp.mpf(generator.uniform(0.3, 1.3)) for _ in symbols])
+
+
+def cancel(terms: Sequence[Number]) -> bool:
+    """Return whether the sum of numbers is 0 to 40 digits, relative to their sizes or to 1."""
+    return bool(abs(mp.fsum(terms)) <= NEGLIGIBLE * (1 + mp.fsum(map(abs, terms))))
 
 
 def sums_to_zero(terms: Sequence[Expr]) -> bool:
@@ -418,6 +413,16 @@ def gradient_tuple(expression: Expr, variables: Sequence[Symbol]) -> tuple[Expr,
     """Return the first derivatives of ``expression`` by all variables, zeros included."""
     derivatives = gradient(expression, variables)
     return tuple(derivatives.get(k, S.Zero) for k in range(len(variables)))
+
+
+def derivative_along(expression: Expr, variables: Sequence[Symbol], direction: Sequence[Expr]) -> Expr:
+    """Return the derivative along a direction; along the rates of the variables it is that in time."""
+    return Add(*(derivative * direction[i] for i, derivative in gradient(expression, variables).items()))
+
+
+def dot(a: Sequence[Expr], b: Sequence[Expr]) -> Expr:
+    """Return the scalar product a . b."""
+    return Add(*(x * y for x, y in zip(a, b, strict=True)))
 
 
 def jacobian(

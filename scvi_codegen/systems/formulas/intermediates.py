@@ -17,7 +17,7 @@ from itertools import count
 from typing import Any
 from weakref import WeakValueDictionary
 
-from sympy import Abs, Expr, S, Symbol, sqrt
+from sympy import Abs, Basic, Expr, S, Symbol, sqrt
 
 from scvi_codegen.common.errors import SystemDefinitionError
 
@@ -162,6 +162,17 @@ def written_out(expression: Expr) -> Expr:
     return with_even_roots(expression.xreplace(rules)) if rules else expression
 
 
+def parts(*expressions: Basic) -> dict[Any, None]:
+    """Return all distinct subexpressions, beginning with the expressions themselves, and definitions of quantities."""
+    result = dict.fromkeys(expressions)
+    waiting = list(expressions)
+    while waiting:
+        new = [argument for argument in waiting.pop().args if argument not in result]
+        result.update(dict.fromkeys(new))
+        waiting += new
+    return result
+
+
 def with_even_roots(expression: Expr) -> Expr:
     """Write ``Abs(u)``, which SymPy makes of even roots of powers of u, as the root of the opaque quantity u**2.
 
@@ -179,12 +190,7 @@ def with_even_roots(expression: Expr) -> Expr:
 
 def root_of_square(expression: Expr, variables: Collection[Symbol]) -> Expr | None:
     """Return a part u of which the expression contains a root of u**2 and that depends on variables, or ``None``."""
-    waiting, seen = [expression], {expression}
-    while waiting:
-        node = waiting.pop()
-        new = [part for part in node.args if part not in seen]
-        seen.update(new)
-        waiting += new
+    for node in parts(expression):
         if node.is_Pow and isinstance(node.base, Intermediate) and not node.exp.is_integer:
             square = node.base.definition
             if square.is_Pow and square.exp == 2 and not square.free_symbols.isdisjoint(variables):
@@ -202,16 +208,6 @@ def written_size(expression: Expr) -> int:
     for quantity in intermediates(expression):
         sizes[quantity] = size(quantity.definition)
     return size(expression)
-
-
-def distinct_nodes(expressions: Sequence[Expr]) -> int:
-    """Return the number of different nodes in expressions and in the definitions of the quantities in them."""
-    seen, pending = set(expressions), list(expressions)
-    while pending:
-        new = set(pending.pop().args) - seen
-        seen |= new
-        pending += new
-    return len(seen)
 
 
 def inner_of(expression: Expr) -> tuple[Intermediate, ...]:

@@ -42,7 +42,7 @@ from sympy import Add, Expr, Matrix, S, Symbol
 
 from scvi_codegen.common.errors import SystemDefinitionError, closest
 from scvi_codegen.systems.formulas.arrays import ROTATING, parse_coordinate
-from scvi_codegen.systems.formulas.expressions import gradient, hessian
+from scvi_codegen.systems.formulas.expressions import dot, gradient, hessian
 from scvi_codegen.systems.formulas.grammar import Parser, parsed
 from scvi_codegen.systems.formulas.indices import Array, Size
 from scvi_codegen.systems.formulas.symbols import DOT, check_name, name_of_key, symbol
@@ -103,19 +103,19 @@ class Rotation:
         if self.momentum:
             rates = Matrix(self.body_momentum(momenta_of(self.coordinates)))
         else:
-            rates = 2 * rates_matrix(q).T * v / _product(q, q)
-        matrix = matrix_of(q) / _product(q, q)
+            rates = 2 * rates_matrix(q).T * v / dot(q, q)
+        matrix = matrix_of(q) / dot(q, q)
         return dict(zip((*self.entries, *self.rates), (*matrix, *rates), strict=True))
 
     def scaling(self) -> Expr:
         """Return the rate of the scaling of the quaternion, 2 q . q_dot/|q|^2."""
         q, v = _vectors(self.coordinates)
-        return 2 * _product(q, v) / _product(q, q)
+        return 2 * dot(q, v) / dot(q, q)
 
     def forces(self, torque: Sequence[Expr]) -> tuple[Expr, ...]:
         """Return the four generalised forces 2 E(q) tau/|q|^2 of a torque in the body frame."""
         q, _ = _vectors(self.coordinates)
-        return tuple(2 * rates_matrix(q) * Matrix(torque) / _product(q, q))
+        return tuple(2 * rates_matrix(q) * Matrix(torque) / dot(q, q))
 
     def body_momentum(self, p: Sequence[Symbol]) -> tuple[Expr, ...]:
         """Return the angular momentum in the body frame, E(q)^T p/2."""
@@ -161,20 +161,20 @@ class Direction(_Vector):
     def values(self) -> dict[Symbol, Expr]:
         """Return the unit vector and its velocity by symbol, as functions of the vector and its velocity."""
         r, v = _vectors(self.coordinates)
-        n = r / sympy.sqrt(_product(r, r))
+        n = r / sympy.sqrt(dot(r, r))
         return dict(zip(self.entries, n, strict=True)) | dict(zip(self.rates, self.forces(v), strict=True))
 
     def scaling(self) -> Expr:
         """Return the rate of the scaling of the vector, r . r_dot/|r|^2."""
         r, v = _vectors(self.coordinates)
-        return _product(r, v) / _product(r, r)
+        return dot(r, v) / dot(r, r)
 
     def forces(self, force: Sequence[Expr]) -> tuple[Expr, ...]:
         """Return the three generalised forces (f - n (n . f))/|r| of a force on the unit vector."""
         r, _ = _vectors(self.coordinates)
-        length = sympy.sqrt(_product(r, r))
+        length = sympy.sqrt(dot(r, r))
         n = r / length
-        return tuple((Matrix(force) - n * _product(n, force)) / length)
+        return tuple((Matrix(force) - n * dot(n, force)) / length)
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,11 +235,6 @@ def rates_matrix(q: Sequence[Expr]) -> Matrix:
     """Return the 4 x 3 matrix E(q) with q_dot = E(q) omega/2 for |q_dot . q| = 0; E^T E = |q|^2, E^T q = 0."""
     w, x, y, z = q
     return Matrix([[-x, -y, -z], [w, -z, y], [z, w, -x], [-y, x, w]])
-
-
-def _product(a: Sequence[Expr], b: Sequence[Expr]) -> Expr:
-    """Return a . b."""
-    return Add(*(x * y for x, y in zip(a, b, strict=True)))
 
 
 def _vectors(names: Sequence[str]) -> tuple[Matrix, Matrix]:
@@ -350,7 +345,7 @@ class RotationNames:
         pairs = (
             (tuple(map(symbol, rotation.coordinates)), momenta_of(rotation.coordinates)) for rotation in self.rotations
         )
-        along = [_product(q, p) for q, p in pairs]
+        along = [dot(q, p) for q, p in pairs]
         return Add(*(q_p**2 / (8 * inertia(rotation)) for rotation, q_p in zip(self.rotations, along, strict=True)))
 
     def inertia(self, member: Homogeneous, reduced: Expr, parameters: Sequence[Symbol]) -> Expr:

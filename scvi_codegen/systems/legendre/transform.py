@@ -17,7 +17,7 @@ from scvi_codegen.common.precision import mp
 from scvi_codegen.common.validation import TEXTS, checks_arguments, of
 from scvi_codegen.systems.constraints import constraints_of, rate_of_positions
 from scvi_codegen.systems.derived_expressions import coupled_blocks, forms_of, sample_points
-from scvi_codegen.systems.formulas.expressions import evaluate, gradient, gradient_tuple, hessian, unsupported_part
+from scvi_codegen.systems.formulas.expressions import dot, evaluate, gradient, gradient_tuple, hessian, unsupported_part
 from scvi_codegen.systems.formulas.grammar import parse_expression
 from scvi_codegen.systems.formulas.symbols import default_momenta, input_formulas, symbol
 from scvi_codegen.systems.hamiltonian import HamiltonianSystem
@@ -67,8 +67,7 @@ def energy_of_states(system: MechanicalSystem) -> Expr:
     if forms.inverse_mass is None:
         return legendre_dual(system, system.velocities, momenta)
     velocities = forms.inverse_mass.velocities
-    products = sympy.Add(*(p * v for p, v in zip(momenta, velocities, strict=True)))
-    return products - system.lagrangian.xreplace(dict(zip(system.velocities, velocities, strict=True)))
+    return dot(momenta, velocities) - system.lagrangian.xreplace(dict(zip(system.velocities, velocities, strict=True)))
 
 
 def positive_parameters(system: MechanicalSystem) -> dict[Symbol, Symbol]:

@@ -19,14 +19,20 @@ from scvi_codegen.common.precision import mp
 from scvi_codegen.common.validation import checks_arguments
 from scvi_codegen.systems.constraints import with_constraint_forces
 from scvi_codegen.systems.derived_expressions import forms_of
-from scvi_codegen.systems.formulas.expressions import evaluated, gradient, gradient_tuple, unsupported_part
+from scvi_codegen.systems.formulas.expressions import (
+    cancel,
+    derivative_along,
+    dot,
+    evaluated,
+    gradient,
+    gradient_tuple,
+    unsupported_part,
+)
 from scvi_codegen.systems.formulas.grammar import parse_expression
 from scvi_codegen.systems.symmetry.invariants import combined, conserved, gauge_columns, polynomial_in
 from scvi_codegen.systems.symmetry.sampling import Sample, rates_of
 from scvi_codegen.systems.symmetry.symmetry import MAX_SEARCHED_COORDINATES, Symmetry
 from scvi_codegen.systems.system import SYSTEM, MechanicalSystem
-
-NEGLIGIBLE = mp.mpf(10) ** -40
 
 
 def integrated(system: MechanicalSystem, change: Expr) -> Expr | None:
@@ -35,9 +41,7 @@ def integrated(system: MechanicalSystem, change: Expr) -> Expr | None:
     derivatives = [change.diff(v).xreplace(rest) for v in system.velocities]
     s = Symbol("s", positive=True)
     along = {q: s * q for q in system.coordinates}
-    work = sympy.Add(
-        *(q * derivative.xreplace(along) for q, derivative in zip(system.coordinates, derivatives, strict=True))
-    )
+    work = dot(system.coordinates, [derivative.xreplace(along) for derivative in derivatives])
     origin = change.xreplace(rest | dict.fromkeys(system.coordinates, sympy.S.Zero))
     signed = {x: sympy.Dummy(positive=True) for x in (*system.coordinates, *system.parameters)}
     primitive = manualintegrate(sympy.expand(work.xreplace(signed)), s)
@@ -52,14 +56,12 @@ def is_total_derivative(system: MechanicalSystem, change: Expr, points: Iterable
     derivatives = [change.diff(velocity) for velocity in v]
     conditions = [derivative.diff(velocity) for derivative in derivatives for velocity in v]
     for derivative, position in zip(derivatives, q, strict=True):
-        moved = (derivative.diff(x) * rate for x, rate in zip((*q, t), (*v, sympy.S.One), strict=True))
-        conditions.append(sympy.Add(*moved, -change.diff(position)))
+        conditions.append(derivative_along(derivative, (*q, t), (*v, sympy.S.One)) - change.diff(position))
     decided = None
     for sample in points:
         decided = True
         for condition in conditions:
-            terms = [sample.value(term) for term in sympy.Add.make_args(condition)]
-            if abs(mp.fsum(terms)) > NEGLIGIBLE * (1 + mp.fsum(map(abs, terms))):
+            if not cancel([sample.value(term) for term in sympy.Add.make_args(condition)]):
                 return False
     return decided
 
@@ -111,7 +113,7 @@ def check_symmetry(
     xi = tuple(_expression(system, component) for component in direction)
     f = None if gauge is None else _expression(system, gauge, "gauge")
     p, q, t = system.momentum_symbols, system.coordinates, system.time
-    product = sympy.Add(*(a * b for a, b in zip(p, xi, strict=True)), -(f or 0))
+    product = dot(p, xi) - (f or 0)
     quadratic = system.dimension <= MAX_SEARCHED_COORDINATES
     gauges = list(gauge_columns(system.dimension, quadratic=quadratic)) if f is None else []
     rows = [row for row in conserved(system, rates_of(system), [product, *gauges]) if 0 in row]
@@ -137,17 +139,16 @@ def _generated(system: MechanicalSystem, G: Expr, name: str) -> Symmetry:
     motion = rates_of(system)
     q, p, t = system.coordinates, system.momentum_symbols, system.time
     if not conserved(system, motion, [G]):
-        derivatives = gradient(G, (*q, *p, t))
         velocities = motion.transformed if motion.hamiltonian else motion.arguments[len(q) : 2 * len(q)]
         moved = (*velocities, *motion.forces, sympy.S.One)
-        rate = sympy.Add(*(derivative * moved[i] for i, derivative in derivatives.items())).xreplace(motion.numbers)
+        rate = derivative_along(G, (*q, *p, t), moved).xreplace(motion.numbers)
         rate = rate if motion.hamiltonian else rate.xreplace(dict(zip(p, motion.transformed, strict=True)))
         raise SystemDefinitionError(
             f"{G} does not generate a symmetry of '{system.name}': its rate of change, {{G, H}} + "
             f"G_t, is {_cut(rate)}, not 0"
         )
     direction = gradient_tuple(G, p)
-    gauge = sympy.Add(*(a * b for a, b in zip(p, direction, strict=True)), -G)
+    gauge = dot(p, direction) - G
     return Symmetry(name=name, coordinates=q, momenta=p, time=t, direction=direction, gauge=gauge, momentum_map=G)
 
 
@@ -156,7 +157,7 @@ def _integrated_gauge(system: MechanicalSystem, xi: Sequence[Expr]) -> Expr:
     change, motion = _change(system, xi), rates_of(system)
     f = integrated(system, change)
     if f is not None:
-        product = sympy.Add(*(a * b for a, b in zip(system.momentum_symbols, xi, strict=True)), -f)
+        product = dot(system.momentum_symbols, xi) - f
         if conserved(system, motion, [product]):
             return f
     parameters = {x: mp.mpf(value) for x, value in motion.constants.items()}
@@ -219,12 +220,10 @@ def _change(system: MechanicalSystem, xi: Sequence[Expr]) -> Expr:
     terms = [sign * derivative * xi[i] for i, derivative in gradient(system.formula, system.coordinates).items()]
     applied = system.forces or (sympy.S.Zero,) * system.dimension
     forces = with_constraint_forces(system, [f - system.damping * x for f, x in zip(applied, p, strict=True)])
-    terms += [force * component for force, component in zip(forces, xi, strict=True)]
-    return sympy.Add(*terms, *(momentum * _rate(system, component) for momentum, component in zip(p, xi, strict=True)))
+    return sympy.Add(*terms, dot(forces, xi), dot(p, [_rate(system, component) for component in xi]))
 
 
 def _rate(system: MechanicalSystem, f: Expr) -> Expr:
     """Return f_t + f_q . v, where v = H_p for a Hamiltonian."""
     v = forms_of(system).legendre if system.auxiliaries else system.velocities
-    derivatives = gradient(f, (*system.coordinates, system.time))
-    return sympy.Add(*(derivative * (*v, sympy.S.One)[i] for i, derivative in derivatives.items()))
+    return derivative_along(f, (*system.coordinates, system.time), (*v, sympy.S.One))

@@ -26,9 +26,9 @@ import sympy
 from numpy.typing import NDArray
 from sympy import Expr, Symbol, prime
 
-from scvi_codegen.common.precision import mp
 from scvi_codegen.systems.derived_expressions import forms_of
-from scvi_codegen.systems.formulas.expressions import gradient, parts
+from scvi_codegen.systems.formulas.expressions import cancel, gradient
+from scvi_codegen.systems.formulas.intermediates import parts
 from scvi_codegen.systems.formulas.numpy_values import array_value
 from scvi_codegen.systems.formulas.rotations import Spin
 from scvi_codegen.systems.symmetry.sampling import AXES, Body, Rates, Sample, bodies, drawn_parameters
@@ -52,7 +52,6 @@ MORE_POINTS = 12
 """Number of sampled points in excess of the number of columns."""
 MORE_PARAMETERS = 4
 """Number of sampled parameter values in excess of the number of factors of a coefficient."""
-NEGLIGIBLE = mp.mpf(10) ** -40
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,13 +178,14 @@ class _Search:
                 terms = [sample.value(x) * term for c, x in row.items() for term in self.terms(c, sample)]
             except ArithmeticError:  # a root of a parameter that may be negative
                 return False
-            if abs(mp.fsum(terms)) > NEGLIGIBLE * (1 + mp.fsum(map(abs, terms))):
+            if not cancel(terms):
                 return False
         return bool(self.motion.verifying)
 
 
 def _null_space(matrix: Array, sizes: Array) -> Array:
     """Return the null space in reduced row echelon form; rows and columns are scaled by ``sizes`` of terms."""
+    # Rows to size 1, then columns to root mean square 1: the null space of M D is D^-1 that of M.
     heights = sizes.max(axis=1, keepdims=True)
     heights = np.where(heights > 0.0, heights, 1.0)
     widths = np.sqrt(((sizes / heights) ** 2).mean(axis=0))

@@ -22,7 +22,8 @@ from sympy import Expr, Symbol
 from scvi_codegen.common.precision import Number, mp
 from scvi_codegen.systems.constraints import constraint_multipliers, with_constraint_forces
 from scvi_codegen.systems.derived_expressions import forms_of
-from scvi_codegen.systems.formulas.expressions import LARGEST, Tape, evaluate, parts
+from scvi_codegen.systems.formulas.expressions import LARGEST, Tape, evaluate
+from scvi_codegen.systems.formulas.intermediates import parts
 from scvi_codegen.systems.formulas.numpy_values import array_value
 from scvi_codegen.systems.system import MechanicalSystem
 from scvi_codegen.systems.term_groups import TermGroup

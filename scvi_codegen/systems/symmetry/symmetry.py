@@ -50,7 +50,7 @@ from scvi_codegen.systems.arrays.symmetry import momentum_maps
 from scvi_codegen.systems.arrays.system import ArraySystem
 from scvi_codegen.systems.derived_expressions import forms_of
 from scvi_codegen.systems.first_order import FirstOrderSystem, translations
-from scvi_codegen.systems.formulas.expressions import gradient_tuple
+from scvi_codegen.systems.formulas.expressions import dot, gradient_tuple
 from scvi_codegen.systems.formulas.indices import ArrayMap
 from scvi_codegen.systems.hamiltonian import HamiltonianSystem
 from scvi_codegen.systems.symmetry.invariants import (
@@ -376,5 +376,5 @@ def work_rates(system: MechanicalSystem) -> tuple[WorkRate, ...]:
 
 def _along(system: MechanicalSystem, direction: tuple[Expr, ...]) -> Expr:
     forces = system.forces or (sympy.S.Zero,) * system.dimension
-    applied = (f - system.damping * p for f, p in zip(forces, forms_of(system).momentum, strict=True))
-    return sympy.Add(*(f * xi for f, xi in zip(applied, direction, strict=True)))
+    applied = [f - system.damping * p for f, p in zip(forces, forms_of(system).momentum, strict=True)]
+    return dot(applied, direction)

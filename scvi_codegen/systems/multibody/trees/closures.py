@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from sympy import Add, Dummy, Expr, Matrix, cos, eye, sin
 
 from scvi_codegen.common.errors import SystemDefinitionError, closest
-from scvi_codegen.systems.formulas.expressions import gradient
+from scvi_codegen.systems.formulas.expressions import derivative_along
 from scvi_codegen.systems.formulas.intermediates import intermediate
 from scvi_codegen.systems.formulas.rotations import RotationNames
 from scvi_codegen.systems.formulas.symbols import symbol
@@ -67,9 +67,9 @@ def conditions_of(links: Sequence[Link], closures: Iterable[Closure | Coupling])
     rates: dict[Expr, Dummy] = {}
     rows = []
     for g in map(in_coordinates, conditions):
-        q = sorted(g.free_symbols, key=str)
-        rates |= {coordinate: Dummy() for coordinate in q if coordinate not in rates}
-        rows.append(Add(*(derivative * rates[q[j]] for j, derivative in gradient(g, q).items())))
+        coordinates = sorted(g.free_symbols, key=str)
+        rates |= {q: Dummy() for q in coordinates if q not in rates}
+        rows.append(derivative_along(g, coordinates, [rates[q] for q in coordinates]))
     return [conditions[k] for k in independent_of((), rows, tuple(rates.values()))] if rows else []
 
 
