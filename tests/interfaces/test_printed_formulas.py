@@ -17,14 +17,18 @@ import pytest
 import sympy
 from derivation_page import Entry, PrintedPage, PrintedTable, read_page
 from oracle import points
-from printed_formulas import FUNCTIONS, mp, names, value
+from printed_formulas import FUNCTIONS, mp, names, trees_of_mathml, value
 
 import scvi_codegen as sc
 from scvi_codegen.codegen.pipeline import program_of
+from scvi_codegen.common.display.mathml import mathml_terms
 from scvi_codegen.interfaces.derivation import derivation_html
 from scvi_codegen.interfaces.derivation.equations import derive
 from scvi_codegen.methods.discretise import discretise, paper_equations
 from scvi_codegen.methods.stage_system import EntryName
+from scvi_codegen.methods.tables.number_tables import Part
+from scvi_codegen.methods.tables.quadrature import Quadrature
+from scvi_codegen.methods.tables.tableau import Tableau
 
 T, H, TIME = mp.mpf("1e-40"), 0.125, 0.375
 Q, P = (0.625, -0.4375), (0.3125, 0.875)
@@ -535,70 +539,18 @@ def kronecker(method: Any, entry: Entry, index: int) -> bool:
     return bool(np.max(np.abs(one - other)) < mp.mpf("1e-12"))
 
 
-def paper_numbers(name: str, x: Any = None) -> dict[str, Any]:
-    """Return the values of names in equations written by components."""
-    case = CASES[name][0]
-    step, solved = solution(name, "stages")
-    q, p, h, t = start_of(case)
-    found: dict[str, Any] = {"h": mp.mpf(h), "t_k": mp.mpf(t)} | {k: mp.mpf(x) for k, x in PARAMETERS.items()}
-    found |= step.tables
-    for key, array in step.unknowns(solved if x is None else x).items():
-        parts = case.coordinates if len(array) == len(case.coordinates) else [str(k + 1) for k in range(len(array))]
-        for part, number in zip(parts, array, strict=True):
-            letter, sign, index = re.fullmatch(r"(.*?)([_^])(\d+)", key).groups()
-            own = part if len(array) > 1 else ""
-            found[f"{letter}_{own}^{index}".replace("_^", "^") if sign == "^" else f"{key}{',' * bool(own)}{own}"] = (
-                number
-            )
-    several = len(case.coordinates) > 1
-    for coordinate, position, momentum, speed in zip(case.coordinates, q, p, velocity_of(case, q, p, t), strict=True):
-        found |= {f"{coordinate}_k": mp.mpf(position), f"{coordinate}'_k": speed}
-        found[f"p_{coordinate},k" if several else "p_k"] = mp.mpf(momentum)
-    for group in step.stages.stage_groups:  # times of points, by the names of their abscissae
-        letter = "d" if group.name == "quadrature" else "c"
-        found |= {f"{letter}_{n}": of_package(c) for n, c in enumerate(group.abscissae, 1) if c not in (0, 1)}
-    return found
-
-
-def of_written_out(name: str, entry: Entry, index: int) -> bool:
-    """Equations vanish on the step, values at its end are those of the C, and guesses are on the straight line."""
-    case, method, _ = made(name)
-    _, left, right = entry.tree
-    known = paper_numbers(name)
-    found = value(right, known.__getitem__)
-    if left == ("number", "0"):
-        return abs(found) < mp.mpf("1e-38")
-    if left[2].endswith("k+1"):
-        ends = dict(
-            zip("qp", solution(name, "stages")[0].end(solution(name, "stages")[1], *start_of(case)), strict=True)
-        )
-        momentum = left[1] == "p"
-        own = left[2].split(",")[0] if momentum else left[1]
-        place = case.coordinates.index(own) if own in case.coordinates else 0
-        return close(found, ends["p" if momentum else "q"][place])
-    letter, below, above = left[1:]
-    part = next((x for x in case.coordinates if x in below.split(",")), case.coordinates[0])
-    place = case.coordinates.index(part)
-    q, speed, momentum = start_of(case)[0][place], known[f"{part}'_k"], start_of(case)[1][place]
-    if letter == "Q":
-        straight = q + H * of_package(method.node_set.abscissae[int(above)]) * speed
-        return close(found, straight)
-    return close(found, {"V": speed, "v": speed, "P": momentum, "p": momentum}.get(letter, mp.zero))
+def of_components(name: str, entry: Entry, index: int) -> bool:
+    """What is written out is what :func:`derive` returns, whose text is evaluated below."""
+    equations = derived(name)
+    values = [e.residual for e in (*equations.equations, *equations.end_position, *equations.end_momentum)]
+    right = [*values, *equations.initial_guess.values()][index]
+    return entry.tree[2] == trees_of_mathml(mathml_terms(right))
 
 
 def of_jacobian(name: str, entry: Entry, index: int) -> bool:
-    """Entries are the derivatives of the printed equations."""
-    row, column = (int(k) for k in entry.tree[1][2].split(","))
-    equations = [
-        e.tree[2] for e in made(name)[2].entries if e.section == "written-out" and e.tree[1] == ("number", "0")
-    ]
-    x, width = solution(name, "stages")[1] + mp.mpf("0.1"), mp.mpf("1e-25")
-    moved = [x.copy(), x.copy()]
-    moved[0][column - 1] += width
-    moved[1][column - 1] -= width
-    ahead, behind = (value(equations[row - 1], paper_numbers(name, y).__getitem__) for y in moved)
-    found = value(entry.tree[2], paper_numbers(name, x).__getitem__)
-    return bool(abs(found - (ahead - behind) / (2 * width)) < mp.mpf("1e-30"))
+    """Entries are the derivatives of the equations."""
+    row, column = (int(k) - 1 for k in entry.tree[1][2].split(","))
+    return entry.tree[2] == trees_of_mathml(mathml_terms(derived(name).jacobian[row, column]))
 
 
 STATEMENT = re.compile(r"(?:const (?:double|lanes|real) )?(\w+(?:\[\d+\])?) = ([^;]*);")
@@ -743,7 +695,7 @@ CHECKS: dict[str, Callable[[str, Entry, int], bool]] = {
     "curve": of_curve,
     "stages": lambda name, entry, index: True,  # solved as they stand, above
     "idel": lambda name, entry, index: True,
-    "written-out": of_written_out,
+    "written-out": of_components,
     "jacobian": of_jacobian,
     "kernels": of_kernels,
     "functions": of_functions,
@@ -774,59 +726,44 @@ def cell_number(cell: Any) -> Any:
     return value(cell, lambda name: None) if isinstance(cell, tuple) else mp.mpf(cell)
 
 
-def check_table(name: str, table: PrintedTable) -> None:  # noqa: C901
-    """Cells are in 17 digits what the equations have, or exact."""
-    method, caption = CASES[name][1], table.caption
-    if caption.startswith("Nodes: "):
-        expected = 2 * points(re.match(r"Nodes: ([\w-]+),", caption)[1], len(table.rows)) - 1
-        cells = [cell_number(row[1]) for row in table.rows]
-        assert all(abs(x - mp.mpf(y)) < mp.mpf("1e-16") for x, y in zip(cells, expected, strict=True))
-    elif caption.startswith("Quadrature: "):
-        order = int(re.search(r"of order (\d+)", caption)[1])
-        last = 2 if table.columns[2] == "point" else 1  # radicals, then their decimals
-        rows = [[cell_number(x) for x in row[1:]] for row in table.rows]
-        assert all(abs(row[0] - row[last - 1]) < mp.mpf("1e-16") for row in rows)
-        for k in range(order):  # what is integrated exactly; of piecewise rules the order is that of their pieces
-            total = sum(row[last] * row[0] ** k for row in rows)
-            total += sum(row[last + 1] * k * row[0] ** max(k - 1, 0) for row in rows if len(row) > last + 1)
-            assert abs(total - mp.mpf(2 * (k % 2 == 0)) / (k + 1)) < mp.mpf("1e-15"), (caption, k)
-    elif caption.startswith("Runge-Kutta tableau: "):
-        rows = [[cell_number(x) if x else None for x in row[1:]] for row in table.rows if row[0] != "b"]
-        weights = [cell_number(x) for x in next(row for row in table.rows if row[0] == "b")[2:]]
-        for row in rows:
-            assert abs(sum(row[1:]) - row[0]) < mp.mpf("1e-15")
-        size = len(weights)
-        for k in range(1, size + 1):
-            assert abs(sum(b * row[0] ** (k - 1) for b, row in zip(weights, rows, strict=True)) - mp.one / k) < mp.mpf(
-                "1e-15"
-            )
-        for row in rows if "explicit" not in method.name else []:  # collocation: C(s)
-            for k in range(1, size + 1):
-                found = sum(a * other[0] ** (k - 1) for a, other in zip(row[1:], rows, strict=True))
-                assert abs(found - row[0] ** k / k) < mp.mpf("1e-15")
+def check_part(table: PrintedTable, part: Part) -> None:
+    """Cells are in 17 digits the numbers of nodes, of a quadrature or of a tableau, or exact."""
+    if isinstance(part, Tableau):
+        rows = [*((c, *line) for c, line in zip(part.c, part.A, strict=True)), part.b]
     else:
-        prefix = next(prefix for begin, prefix in CAPTIONS.items() if caption.startswith(begin))
-        known = dict(solution(name, "stages")[0].tables)
-        for row in table.rows:
-            for column, cell in zip(table.columns[1:], row[1:], strict=True):
-                index = column.partition("= ")[2] if "=" in column else ""
-                if cell != "":
-                    own = printed("_".join(filter(None, [prefix, row[0], index])))
-                    assert abs(cell_number(cell) - known[own]) < mp.mpf("2e-17") * max(1, abs(known[own])) * 10, own
+        columns = {"node": part.points, "point": part.points}
+        if isinstance(part, Quadrature):
+            columns["weight"] = part.weights
+            columns |= {f"weight of derivative {k}": x for k, x in enumerate(part.derivative_weights, 1)}
+        rows = list(zip(*(columns[heading] for heading in table.columns[1:]), strict=True))
+    for row, numbers_of_row in zip(table.rows, rows, strict=True):
+        cells = [cell_number(cell) for cell in row[1:] if cell != ""]
+        assert all(abs(x - of_package(y)) < mp.mpf("1e-16") for x, y in zip(cells, numbers_of_row, strict=True))
+
+
+def check_entries(name: str, table: PrintedTable) -> None:
+    """Cells are in 17 digits the numbers of the equations, or exact."""
+    prefix = next(prefix for begin, prefix in CAPTIONS.items() if table.caption.startswith(begin))
+    known = dict(solution(name, "stages")[0].tables)
+    for row in table.rows:
+        for column, cell in zip(table.columns[1:], row[1:], strict=True):
+            index = column.partition("= ")[2] if "=" in column else ""
+            if cell != "":
+                own = printed("_".join(filter(None, [prefix, row[0], index])))
+                assert abs(cell_number(cell) - known[own]) < mp.mpf("2e-17") * max(1, abs(known[own])) * 10, own
 
 
 @pytest.mark.tiers(1, 1)
 @pytest.mark.parametrize("name", NAMES)
 def test_tables_have_the_numbers_of_the_equations(name):
-    tables = made(name)[2].tables
-    for table in tables:
-        if table.section == "system":
-            assert {row[0][1]: float(row[1]) for row in table.rows} == PARAMETERS
-        elif table.section == "tables":
-            check_table(name, table)
-        else:
-            assert table.caption == "Operations of the kernels"  # counted in test_derivation_page.py
-    assert any(table.section == "tables" for table in tables)
+    (parameters, *tables, operations), parts = made(name)[2].tables, CASES[name][1].parts
+    assert {row[0][1]: float(row[1]) for row in parameters.rows} == PARAMETERS
+    assert operations.caption == "Operations of the kernels"  # counted in test_derivation_page.py
+    assert tables
+    for table, part in zip(tables, parts, strict=False):
+        check_part(table, part)
+    for table in tables[len(parts) :]:
+        check_entries(name, table)
 
 
 @cache
@@ -865,10 +802,21 @@ def test_text_is_the_same_equations(name):
                 assert abs(found - next(ends)) < mp.mpf("1e-38"), line
             else:
                 assert part == "first guess", line
-                printed_guess = next(v for k, v in derived(name).initial_guess.items() if k.name == label)
-                assert found == of_python(str(printed_guess), numbers_of)  # compared with the line in the page's test
+                assert close(found, on_the_straight_line(name, label)), line
     assert next(ends, None) is None
     assert parts["equations"] == len(x)
+
+
+def on_the_straight_line(name: str, label: str) -> Any:
+    """Return an unknown for uniform motion."""
+    case, method = CASES[name]
+    letter, *indices = label.split("_")
+    place = case.coordinates.index(indices[-1]) if indices[-1] in case.coordinates else 0
+    q, p, h, t = start_of(case)
+    speed = velocity_of(case, q, p, t)[place]
+    if letter == "Q":
+        return q[place] + h * of_package(method.node_set.abscissae[int(indices[0])]) * speed
+    return {"V": speed, "v": speed, "P": mp.mpf(p[place])}.get(letter, mp.zero)
 
 
 def of_python(text: str, scope: Mapping[str, Any]) -> Any:
@@ -878,19 +826,24 @@ def of_python(text: str, scope: Mapping[str, Any]) -> Any:
 
 def plain_numbers(name: str) -> dict[str, Any]:
     """Return numbers by the names of SymPy symbols."""
-    case, known = CASES[name][0], paper_numbers(name)
+    case = CASES[name][0]
     step, x = solution(name, "stages")
-    found: dict[str, Any] = {k: known[k] for k in (*PARAMETERS, "h", "t_k")}
+    q, p, h, t = start_of(case)
+    found: dict[str, Any] = {"h": mp.mpf(h), "t_k": mp.mpf(t)} | {k: mp.mpf(x) for k, x in PARAMETERS.items()}
     begin = 0
     for block, size in zip(step.stages.blocks, step.sizes, strict=True):
         parts = case.coordinates if block.size is None else [str(k + 1) for k in range(size)]
         for k, part in enumerate(parts):
             found[f"{block.name}_{part}" if len(parts) > 1 else block.name] = x[begin + k]
         begin += size
-    for coordinate in case.coordinates:
-        momentum = f"p_{coordinate}_k" if len(case.coordinates) > 1 else "p_k"
-        found |= {f"{coordinate}_k": known[f"{coordinate}_k"], f"{coordinate}_dot_k": known[f"{coordinate}'_k"]}
-        found[momentum] = known[momentum.replace("_k", ",k") if momentum != "p_k" else "p_k"]
-    for entry in derived(name).entries:
-        found[entry.symbol.name] = known[printed(entry.symbol.name)]
-    return found
+    for coordinate, position, momentum, speed in zip(case.coordinates, q, p, velocity_of(case, q, p, t), strict=True):
+        found |= {f"{coordinate}_k": mp.mpf(position), f"{coordinate}_dot_k": speed}
+        found[f"p_{coordinate}_k" if len(case.coordinates) > 1 else "p_k"] = mp.mpf(momentum)
+    for group in step.stages.stage_groups:  # times of points, by the names of their abscissae
+        letter = "d" if group.name == "quadrature" else "c"
+        found |= {f"{letter}_{n}": of_package(c) for n, c in enumerate(group.abscissae, 1) if c not in (0, 1)}
+    return found | {
+        entry.symbol.name: step.tables[printed(entry.symbol.name)]
+        for entry in derived(name).entries
+        if entry.symbol.name not in found
+    }
