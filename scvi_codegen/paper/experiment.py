@@ -142,11 +142,13 @@ EVIDENCE = ("figure-1", *(f"figure-{k}" for k in range(3, 31)), "table-8", "tabl
 
 def claims(results: Mapping[str, Result]) -> Result:
     """Return a row for each claim, with the checks that decide it."""
-    checks, rows = [(name, check) for name in EVIDENCE if name in results for check in results[name].checks], []
+    checks = [(name, check) for name in EVIDENCE if name in results for check in results[name].checks]
+    rows = []
     for key, claim in CLAIMS.items():
-        evidence = [(name, check) for name, check in checks if key in check.bears_on]
-        counted = {verdict: [name for name, check in evidence if check.verdict is verdict] for verdict in Verdict}
-        parts = [f"{len(n)} {verdict.value} ({', '.join(dict.fromkeys(n))})" for verdict, n in counted.items() if n]
+        evidence, parts = [(name, check) for name, check in checks if key in check.bears_on], []
+        for verdict in Verdict:
+            if names := [name for name, check in evidence if check.verdict is verdict]:
+                parts.append(f"{len(names)} {verdict.value} ({', '.join(dict.fromkeys(names))})")
         measured = f"Of {len(evidence)} checks: {'; '.join(parts)}." if parts else "No check bears on it."
         rows.append(Comparison(claim=claim, measured=measured, verdict=common_verdict(check for _, check in evidence)))
     missing = ", ".join(name for name in EVIDENCE if name not in results)

@@ -79,10 +79,12 @@ def picard_step(
     equations: Equations, q: Array, p: Array, h: float, tolerance: float
 ) -> tuple[Array, Array, int] | None:
     """Return (q, p) after a step, and the number of iterations until max |dQ| < tolerance, if they converge."""
+    # Q = q0 + h c v0 + h^2 B f(E Q), from the constant guess Q = q0.
     line = q + h * np.outer(equations.c, p)
     positions = np.tile(q, (len(line), 1))
     for count in range(1, SECTION_3.max_iterations + 1):
-        updated = line + h**2 * (equations.solution @ attraction(equations.at @ np.vstack([q, positions])))
+        forces = attraction(equations.at @ np.vstack([q, positions]))
+        updated = line + h**2 * (equations.solution @ forces)
         size = np.abs(updated - positions).max()
         positions = updated
         if size < tolerance:
@@ -128,14 +130,17 @@ def picard_counts(number: int, beyond: int = 1, tolerance: float = SECTION_3.tol
 
 
 def _picard_count(e: float, key: Key, beyond: int, tolerance: float) -> Count:
-    (h, n, scheme), (q, p), counts, energy = key, map(np.array, perihelion(e)), list[int](), 0.0
+    h, n, scheme = key
+    q, p = map(np.array, perihelion(e))
+    equations, counts, energy_error = equations_of(scheme, n - beyond, n), list[int](), 0.0
     for _ in range(round(SPAN / h)):
-        if (converged := picard_step(equations_of(scheme, n - beyond, n), q, p, h, tolerance)) is None:
+        end = picard_step(equations, q, p, h, tolerance)
+        if end is None:
             return Count(None, None)
-        q, p, count = converged
+        q, p, count = end
         counts.append(count)
-        energy = max(energy, float(abs(p @ p - 2.0 / np.hypot(*q) + 1.0)))
-    return Count(max(counts), sum(counts), energy)
+        energy_error = max(energy_error, float(abs(p @ p - 2.0 / np.hypot(*q) + 1.0)))  # relative to -1/2
+    return Count(max(counts), sum(counts), energy_error)
 
 
 def differing(result: Counts, printed: Counts) -> list[Key]:
@@ -162,9 +167,10 @@ def _table(number: int, _: Mapping[str, Result]) -> Result:
 
 def _dashes(number: int, printed: Counts) -> Comparison:
     """Return the check of convergence: where the iteration fails, and where the table has a dash."""
-    ours, by_degree = picard_counts(number), picard_counts(number, 0)
-    wrong, cells = differing(ours, printed), len(printed)
-    ratio = statistics.median(a.total / b.total for key, b in printed.items() if (a := ours[key]).total and b.total)
+    by_points, by_degree = picard_counts(number), picard_counts(number, 0)
+    wrong, cells = differing(by_points, printed), len(printed)
+    totals = [(by_points[key].total, count.total) for key, count in printed.items()]
+    ratio = statistics.median(measured / paper for measured, paper in totals if measured and paper)
     return comparison(
         "The iteration converges where the table has numbers, and nowhere else.",
         f"Picard iteration agrees in {cells - len(wrong)} of {cells} cells with N points and in "

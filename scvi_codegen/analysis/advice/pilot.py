@@ -7,8 +7,7 @@ quadratic in time, or exponential if two runs from neighbouring states diverge e
 
 Error means |q - q_exact| / |q - mean q| with Euclidean norms over all coordinates; the latter is the root mean square
 over the later half of the pilot run, which does not depend on the origin. Several initial states are integrated
-together, as an ensemble: each has its own error, growth and size, and the largest error counts, or the one that a
-stated part of the trajectories does not exceed.
+together, as an ensemble: each has its own error, growth and size, and the largest error counts.
 """
 
 from __future__ import annotations

@@ -482,33 +482,38 @@ class _OrbitSearch:
         *Introduction to Numerical Analysis*, 7.3.5). The first nodes are those of half a period forward and half a
         period backward from the guess: an error of the guess grows by the square root of the growth in a period.
         """
-        steps, start = self._steps, guess[:-1]
-        half, count = steps.middle, len(steps)
-        inward = self.reduction.inward(*np.split(start, 2))
-        if self.stepper.changes_states:  # derivatives through events require runs forward in time
-            forward = self._segment(start, steps, 0, count, guess[-1])
-            monodromy = self._leaving(forward) @ forward.monodromy @ inward
-            later = self._states_before(start, guess[-1])
-        else:
-            forward = self._segment(start, steps, 0, half, guess[-1])
-            backward = self._segment(start, steps.reversed, 0, count - half, -guess[-1])
-            forth, back = (self._leaving(half) @ half.monodromy @ inward for half in (forward, backward))
-            later, monodromy = backward.states, np.asarray(np.linalg.solve(back.T, forth.T).T)
+        start, count = guess[:-1], len(self._steps)
+        earlier, later, monodromy = self._halves(start, float(guess[-1]))
         growth = float(np.abs(np.linalg.eigvals(monodromy)).max())
         if growth <= EASY:
             return guess, self._closing(guess), 0
-        segments = min(2 * int(np.ceil(np.log(growth) / np.log(GROWTH) / 2.0)) * (1 + smoothed), count)
-        later = later + np.append(self.gain, np.zeros(len(self.gain)))
-        path = np.vstack([start, forward.states[: count - len(later)], later[-2::-1]])
+        pairs = int(np.ceil(np.log(growth) / np.log(GROWTH) / 2.0))
+        segments = min((4 if smoothed else 2) * pairs, count)
+        middle = count - len(later)
+        path = np.vstack([start, earlier[:middle], later[-2::-1]])
         if smoothed and len(later) > 1:  # distributes the jump in the middle, quadratically in time
-            middle = count - len(later)
-            jump = later[-1] - forward.states[middle - 1]
-            share = np.minimum(np.arange(len(path)) / middle, (count - np.arange(len(path))) / len(later))
-            path += np.outer(np.where(np.arange(len(path)) <= middle, 0.5, -0.5) * share**2, jump)
+            k = np.arange(len(path))
+            share = np.minimum(k / middle, (count - k) / len(later))
+            path += np.outer(np.where(k <= middle, 0.5, -0.5) * share**2, later[-1] - earlier[middle - 1])
         nodes = np.append(path[self._bounds(segments)[:-1]], guess[-1])
         z, _, iterations = self._iterated(nodes, self._closing(nodes), 0)
         nearer = np.append(z[: len(start)], z[-1])
         return nearer, self._closing(nearer), iterations
+
+    def _halves(self, start: Array, period: float) -> tuple[Array, Array, Array]:
+        """Return the states forward and backward from a start, the latter a period later, and the monodromy matrix."""
+        steps = self._steps
+        half, count = steps.middle, len(steps)
+        inward = self.reduction.inward(*np.split(start, 2))
+        if self.stepper.changes_states:  # derivatives through events require runs forward in time
+            forward = self._segment(start, steps, 0, count, period)
+            later, monodromy = self._states_before(start, period), self._leaving(forward) @ forward.monodromy @ inward
+        else:
+            forward = self._segment(start, steps, 0, half, period)
+            backward = self._segment(start, steps.reversed, 0, count - half, -period)
+            forth, back = (self._leaving(part) @ part.monodromy @ inward for part in (forward, backward))
+            later, monodromy = backward.states, np.asarray(np.linalg.solve(back.T, forth.T).T)  # forth back^-1
+        return forward.states, later + np.append(self.gain, np.zeros(len(self.gain))), monodromy
 
     def _states_before(self, start: Array, period: float) -> Array:
         """Return the states before a state, in equal steps back over half a period, of impacts that can be undone."""

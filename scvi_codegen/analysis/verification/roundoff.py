@@ -295,17 +295,9 @@ def _drift_of_lanes(tested: SystemUnderTest) -> Finding | None:
         return None
 
     def run(q: Array, p: Array, steps: int) -> tuple[Array, Array]:
-        initial = tested.initial
-        runs = tested.stepper.integrate_ensemble(
-            q,
-            p,
-            h=initial.h,
-            steps=steps,
-            save_every=steps,
-            t=initial.t,
-            parameters=tested.parameters,
-            options=TO_CONVERGENCE,
-        )
+        plan: dict[str, Any] = {"h": tested.initial.h, "t": tested.initial.t, "steps": steps, "save_every": steps}
+        plan |= {"parameters": tested.parameters, "options": TO_CONVERGENCE}
+        runs = tested.stepper.integrate_ensemble(q, p, **plan)
         return runs.q[-1], runs.p[-1]
 
     return _largest_student(_walks(tested, run))
