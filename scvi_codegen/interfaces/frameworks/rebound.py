@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from scvi_codegen.codegen.native.arguments import checked_number, real_array
 from scvi_codegen.common.errors import StateError, SystemDefinitionError, imported
 from scvi_codegen.common.validation import checks_arguments, of
+from scvi_codegen.interfaces.models.systems import gravitating_bodies
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.systems.lagrangian import LagrangianSystem
 
@@ -56,18 +57,9 @@ def from_rebound(simulation: Any) -> GravitatingBodies:
     _check_plain(simulation)
     particles = simulation.particles[: simulation.N]
     masses = [particle.m for particle in particles]
-    names = range(len(masses))
-    kinetic = " + ".join(f"m{i}*({' + '.join(f'{axis}{i}_dot**2' for axis in AXES)})/2" for i in names)
-    attraction = "".join(
-        f" + G*m{i}*m{j}/sqrt({' + '.join(f'({axis}{i} - {axis}{j})**2' for axis in AXES)})"
-        for i, j in combinations(names, 2)
-    )
-    system = LagrangianSystem.from_text(
-        name=f"{len(masses)} bodies",
-        coordinates=[f"{axis}{i}" for i in names for axis in AXES],
-        lagrangian=kinetic + attraction,
-        parameters={"G": simulation.G} | {f"m{i}": mass for i, mass in enumerate(masses)},
-    )
+    positions = {f"m{i}": [f"{axis}{i}" for axis in AXES] for i in range(len(masses))}
+    parameters = {"G": simulation.G, **dict(zip(positions, masses, strict=True))}
+    system = gravitating_bodies(f"{len(masses)} bodies", positions, parameters)
     q = np.array([[particle.x, particle.y, particle.z] for particle in particles]).ravel()
     velocity = np.array([[particle.vx, particle.vy, particle.vz] for particle in particles]).ravel()
     units = {kind: name for kind, name in simulation.units.items() if name}

@@ -1,6 +1,7 @@
 """Mechanical systems of the literature; every physical constant is a parameter."""
 
-from itertools import combinations, pairwise
+from collections.abc import Mapping, Sequence
+from itertools import chain, combinations, pairwise
 
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.systems.hamiltonian import HamiltonianSystem
@@ -47,16 +48,23 @@ def outer_solar_system() -> LagrangianSystem:
     Lengths in astronomical units, time in days, masses in solar masses: Hairer, Lubich and Wanner, Geometric Numerical
     Integration, section I.2.4.
     """
-    kinetic = " + ".join(f"m_{body}*({' + '.join(f'{body}_{axis}_dot**2' for axis in 'xyz')})/2" for body in _MASSES)
-    attraction = "".join(
-        f" + G*m_{first}*m_{second}/sqrt({' + '.join(f'({first}_{axis} - {second}_{axis})**2' for axis in 'xyz')})"
-        for first, second in combinations(_MASSES, 2)
-    )
+    positions = {f"m_{body}": [f"{body}_{axis}" for axis in "xyz"] for body in _MASSES}
+    masses = {f"m_{body}": mass for body, mass in _MASSES.items()}
+    return gravitating_bodies("outer solar system", positions, {"G": 2.95912208286e-4} | masses)
+
+
+def gravitating_bodies(
+    name: str, positions: Mapping[str, Sequence[str]], parameters: Mapping[str, float]
+) -> LagrangianSystem:
+    """Return bodies with L = sum m v^2/2 + sum over pairs G m m'/r; ``positions``: Cartesian coordinates by mass."""
+    kinetic = " + ".join(f"{m}*({' + '.join(f'{x}_dot**2' for x in place)})/2" for m, place in positions.items())
+    attraction = ""
+    for (m, place), (m_other, other) in combinations(positions.items(), 2):
+        square = " + ".join(f"({x} - {y})**2" for x, y in zip(place, other, strict=True))
+        attraction += f" + G*{m}*{m_other}/sqrt({square})"
+    coordinates = list(chain.from_iterable(positions.values()))
     return LagrangianSystem.from_text(
-        name="outer solar system",
-        coordinates=[f"{body}_{axis}" for body in _MASSES for axis in "xyz"],
-        lagrangian=kinetic + attraction,
-        parameters={"G": 2.95912208286e-4} | {f"m_{body}": mass for body, mass in _MASSES.items()},
+        name=name, coordinates=coordinates, lagrangian=kinetic + attraction, parameters=parameters
     )
 
 

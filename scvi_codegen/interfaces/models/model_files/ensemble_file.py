@@ -121,7 +121,7 @@ def load_ensemble(path: str | os.PathLike[str], model: Model) -> EnsembleStates:
     suffix = Path(path).suffix.lower()
     if suffix not in readers:
         raise ModelFileError(f"{path}: an ensemble must be a grid in a .toml file or a table in a .csv file")
-    text = text_in(path, "utf-8-sig")
+    text = text_in(path)
     try:
         columns = readers[suffix](text, partial(_check_names, model))
     except ModelFileError as error:

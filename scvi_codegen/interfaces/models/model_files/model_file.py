@@ -85,7 +85,7 @@ def load_model(
     if folders := [*folders]:
         with naming_folders(folders):
             return load_model(path, changes)
-    text, folder = "" if is_robot(path) else text_in(path, "utf-8-sig"), Path(path).parent
+    text, folder = "" if is_robot(path) else text_in(path), Path(path).parent
     try:
         if is_robot(path):
             return _read_model(document_in(path), changes or {}, folder)
@@ -98,7 +98,7 @@ def load_model(
 
 def document_in(path: str | os.PathLike[str]) -> Document:
     """Return the sections of a model file or a robot's file."""
-    return {"system": {"robot": Path(path).name}} if is_robot(path) else read_toml(text_in(path, "utf-8-sig"))
+    return {"system": {"robot": Path(path).name}} if is_robot(path) else read_toml(text_in(path))
 
 
 @checks_arguments(model=of("a Model", Model))
@@ -152,10 +152,10 @@ def dump_model(model: Model) -> str:
     return next(iter(_written(model, None).values()))
 
 
-def model_texts(model: Model, stem: str = "model") -> dict[str, str]:
+def model_texts(model: Model) -> dict[str, str]:
     """Return the model file and the CSV files of its long arrays, by file name; none if it cannot be represented."""
     with suppress(ModelFileError):
-        return _written(model, stem)
+        return _written(model, "model")
     return {}
 
 

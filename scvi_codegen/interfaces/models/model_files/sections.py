@@ -123,15 +123,15 @@ def _changed_method(base: Section, changes: Section) -> Section:
     return sized({**base_section, **changes}) if "method" in changes else {**base_section, **changes}
 
 
-def text_in(path: str | os.PathLike[str], encoding: str, name: object = None) -> str:
-    """Return the text of a file; :class:`ModelFileError` begins with its ``name``, by default the path."""
+def text_in(path: str | os.PathLike[str]) -> str:
+    """Return the text of a file in UTF-8; :class:`ModelFileError` begins with its path."""
     try:
-        return read_text(path, encoding)
+        return read_text(path, "utf-8-sig")
     except OSError as error:
-        raise ModelFileError(f"{name or path} cannot be read: {error.strerror or error}") from error
+        raise ModelFileError(f"{path} cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
         problem = f"is not a text file in UTF-8: {error.reason} at byte {error.start}"
-        raise ModelFileError(f"{name or path} {problem}") from error
+        raise ModelFileError(f"{path} {problem}") from error
 
 
 def read_method(section: Section) -> Method:
