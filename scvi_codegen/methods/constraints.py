@@ -136,8 +136,8 @@ def _with_multipliers(system: MechanicalSystem, group: StageGroup) -> StageGroup
 
 def _velocity_conditions(system: MechanicalSystem, stages: StageSystem, group: StageGroup) -> tuple[StageGroup, ...]:
     """Return the nonholonomic constraints at s Gauss points; empty if there are none."""
-    conditions_table, size, rows = velocity_conditions(system), len(stages.blocks), len(stages.rows)
-    if not any(conditions_table):
+    conditions, size, rows = velocity_conditions(system), len(stages.blocks), len(stages.rows)
+    if not any(conditions):
         return ()
     points, gauss = len(group.abscissae), gauss_legendre(size)
     between = cardinal_values([2 * c - 1 for c in group.abscissae], gauss.points)
@@ -147,14 +147,13 @@ def _velocity_conditions(system: MechanicalSystem, stages: StageSystem, group: S
         )
         for gather, name in zip(group.gathers, ("A", "L"), strict=True)
     ]
-    conditions = [[int(row == n) for row in range(size)] for n in range(size)]
-    table = Table.joined(Table.constant(size, rows + 1), Table.named("", conditions), Table.constant(size, 2))
+    table = Table.joined(Table.constant(size, rows + 1), Table.identity(size), Table.constant(size, 2))
     return (
         StageGroup(
             name="rolling",
             abscissae=gauss.abscissae,
             gathers=tuple(gathers),
-            scatters=(Scatter(results=conditions_table, table=table, power=0),),
+            scatters=(Scatter(results=conditions, table=table, power=0),),
             computes="Velocity constraints",
         ),
     )

@@ -12,9 +12,11 @@ systems. The regularity of the mass matrix d2L/dv2, or of d2H/dp2, is tested in 
 
 import random
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import tee
+from typing import Any
 
 import numpy as np
 import sympy
@@ -319,8 +321,21 @@ def row_rank(matrix: NDArray[np.float64]) -> int:
     """Return the rank of a matrix of shape (n, m) after its rows are scaled to unit length."""
     if not matrix.size:
         return 0
+    return int(np.linalg.matrix_rank(unit_rows(matrix), tol=DEPENDENT))
+
+
+def unit_rows(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a matrix with its rows scaled to length 1, unless they are 0."""
     sizes = np.linalg.norm(matrix, axis=1, keepdims=True)
-    return int(np.linalg.matrix_rank(matrix / np.where(sizes > 0.0, sizes, 1.0), tol=DEPENDENT))
+    return np.asarray(matrix / np.where(sizes > 0.0, sizes, 1.0))
+
+
+def dense(places: Iterable[tuple[int, int]], values: Iterable[Any], shape: tuple[int, int]) -> NDArray[np.float64]:
+    """Return the matrix of double precision with these entries, 0 elsewhere."""
+    matrix = np.zeros(shape)
+    for place, value in zip(places, values, strict=True):
+        matrix[place] = float(value)
+    return matrix
 
 
 def singular_part(
@@ -362,15 +377,10 @@ def _is_singular(entries: Entries, size: int, points: Iterable[dict[Symbol, Numb
     """Return whether a block is singular at every point where it has values, of which there is at least one."""
     if size == 1 and entries[0, 0].is_Rational:
         return False
-    evaluated, tape = False, None
-    for point in points:
-        tape = tape or Tape(list(entries.values()), list(point))
-        try:
-            matrix = dict(zip(entries, tape(list(point.values())), strict=True))
-        except ArithmeticError:
-            continue
+    evaluated = False
+    for values in values_at(points, list(entries.values())):
         evaluated = True
-        if _regular(matrix, size):
+        if _regular(dict(zip(entries, values, strict=True)), size):
             return False
     return evaluated
 
@@ -397,6 +407,15 @@ def sample_points(
     for own_scale in (0.1, 1e-3, 1.0):
         for scale in (1.0, 0.5, 10.0):
             yield fixed | spread(others, scale) | spread(variables, own_scale)
+
+
+def values_at(points: Iterable[dict[Symbol, Number]], expressions: Sequence[Expr]) -> Iterator[list[Number]]:
+    """Yield the values of expressions at the points at which they are defined."""
+    tape = None
+    for point in points:
+        tape = tape or Tape(expressions, list(point))
+        with suppress(ArithmeticError):
+            yield tape(list(point.values()))
 
 
 def _structural_rank(entries: Entries, size: int) -> int:

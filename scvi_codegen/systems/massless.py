@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from sympy import Expr
 
 from scvi_codegen.systems.constraints import constraint_jacobian, constraint_rates
-from scvi_codegen.systems.derived_expressions import DEPENDENT, Entries, sample_points
-from scvi_codegen.systems.formulas.expressions import Tape, hessian
+from scvi_codegen.systems.derived_expressions import DEPENDENT, dense, sample_points, unit_rows, values_at
+from scvi_codegen.systems.formulas.expressions import hessian
 from scvi_codegen.systems.system import MechanicalSystem
 
 Array: TypeAlias = NDArray[np.float64]
@@ -40,29 +40,16 @@ def gauge_of_rates(system: MechanicalSystem) -> tuple[Expr, tuple[str, ...]]:
     rates = constraint_rates(system)
     diagonal = [entry for (i, j), entry in mass.items() if i == j]
     constant = [entry for entry in diagonal if entry.free_symbols <= set(system.parameters)]
-    tape, m = None, system.dimension
-    for point in sample_points(system.velocities, (*system.coordinates, system.time), system.constants):
-        tape = tape or Tape([*mass.values(), *jacobian.values()], list(point))
-        try:
-            values = list(map(float, tape(list(point.values()))))
-        except ArithmeticError:
-            continue
-        motions = _null_space(_unit_rows(mass, values[: len(mass)], (m, m)))
-        hindered = _unit_rows(jacobian, values[len(mass) :], (len(rates), m)) @ motions
+    m = system.dimension
+    points = sample_points(system.velocities, (*system.coordinates, system.time), system.constants)
+    for values in values_at(points, [*mass.values(), *jacobian.values()]):
+        motions = _null_space(unit_rows(dense(mass, values[: len(mass)], (m, m))))
+        hindered = unit_rows(dense(jacobian, values[len(mass) :], (len(rates), m))) @ motions
         used = [rate for rate, row in zip(rates, hindered, strict=True) if np.abs(row).max(initial=0.0) > SHARE]
         moving = np.abs(motions @ _null_space(hindered)).max(axis=1, initial=0.0) > SHARE
         free = tuple(q.name for q, moves in zip(system.coordinates, moving, strict=True) if moves)
         return sympy.Add(*(constant or diagonal)) / 2 * sympy.Add(*(rate**2 for rate in used)), free
     return sympy.S.Zero, ()
-
-
-def _unit_rows(entries: Entries, values: list[float], shape: tuple[int, int]) -> Array:
-    """Return the dense matrix of entries with these values, its rows scaled to length 1 unless they are 0."""
-    matrix = np.zeros(shape)
-    for place, value in zip(entries, values, strict=True):
-        matrix[place] = value
-    sizes = np.linalg.norm(matrix, axis=1, keepdims=True)
-    return matrix / np.where(sizes > 0.0, sizes, 1.0)
 
 
 def _null_space(matrix: Array) -> Array:

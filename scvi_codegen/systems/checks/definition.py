@@ -4,7 +4,6 @@ import random
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from functools import reduce
 
-import numpy as np
 import sympy
 from sympy import Expr, Symbol
 
@@ -14,11 +13,13 @@ from scvi_codegen.systems.checks.continuity import corner_message, jump_message,
 from scvi_codegen.systems.constraints import constraint_jacobian, forms_of_constraints, without_coordinate
 from scvi_codegen.systems.derived_expressions import (
     Entries,
+    dense,
     forms_of,
     null_direction,
     row_rank,
     sample_points,
     singular_part,
+    values_at,
 )
 from scvi_codegen.systems.forces import check_damping
 from scvi_codegen.systems.formulas.expressions import Tape, hessian, jacobian, kinked_root, unsupported_part
@@ -296,16 +297,10 @@ def _check_constraints(system: MechanicalSystem) -> None:
 def _dependent(system: MechanicalSystem) -> int:
     """Return the index of the first constraint dependent on earlier ones at every sampled point, or 0."""
     derivatives, count = constraint_jacobian(system), len(system.constraints)
-    tape, first = None, 0
-    for point in sample_points(system.coordinates, (system.time,), system.constants):
-        tape = tape or Tape(list(derivatives.values()), list(point))
-        try:
-            values = tape(list(point.values()))
-        except ArithmeticError:
-            continue
-        matrix = np.zeros((count, system.dimension))
-        for (i, j), value in zip(derivatives, values, strict=True):
-            matrix[i, j] = float(value)
+    first = 0
+    points = sample_points(system.coordinates, (system.time,), system.constants)
+    for values in values_at(points, list(derivatives.values())):
+        matrix = dense(derivatives, values, (count, system.dimension))
         if row_rank(matrix) == count:
             return 0
         first = max(first, next(k for k in range(count) if row_rank(matrix[: k + 1]) <= k))

@@ -13,7 +13,7 @@ from sympy import Dummy, Expr, Matrix, Symbol
 from sympy.core.function import AppliedUndef
 
 from scvi_codegen.common.errors import SystemDefinitionError
-from scvi_codegen.systems.derived_expressions import coupled_blocks, inverse_by_minors, row_rank
+from scvi_codegen.systems.derived_expressions import coupled_blocks, dense, inverse_by_minors, row_rank
 from scvi_codegen.systems.formulas.expressions import evaluated, gradient, jacobian, samples, unsupported_part
 from scvi_codegen.systems.formulas.rotations import Rotation
 from scvi_codegen.systems.rotations.points import torque_of
@@ -171,10 +171,7 @@ def _values(expressions: Sequence[Expr], rates: Sequence[Symbol]) -> NDArray[np.
     if problem := next(filter(None, map(unsupported_part, entries.values())), None):
         raise SystemDefinitionError(f"in the constraints: {problem}")
     for values in samples([*entries.values()]):
-        matrix = np.zeros((len(expressions), len(rates) + 1))
-        for position, value in zip(entries, values, strict=True):
-            matrix[position] = float(value)
-        return matrix
+        return dense(entries, values, (len(expressions), len(rates) + 1))
     raise SystemDefinitionError(
         "the constraints have no finite value at any of the sampled points: check their domains"
     )
