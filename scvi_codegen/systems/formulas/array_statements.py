@@ -35,7 +35,7 @@ from scvi_codegen.common.errors import ExpressionError, SystemDefinitionError
 from scvi_codegen.systems.formulas.arrays import ArrayParser, ArrayTerm, Bound, term_of
 from scvi_codegen.systems.formulas.expressions import derivative_along
 from scvi_codegen.systems.formulas.grammar import parsed
-from scvi_codegen.systems.formulas.indices import Access, Array, Loop, Place, Size
+from scvi_codegen.systems.formulas.indices import Access, Array, Loop, Place, Size, elements, periods_of
 from scvi_codegen.systems.formulas.symbols import DOT, symbol
 
 _FOR = re.compile(r"\bfor\b")
@@ -402,17 +402,6 @@ def entry_names(array: Array, sizes: Mapping[str, int]) -> NDArray[np.str_]:
     return np.array(known_array(array, sizes).elements, dtype=np.str_).reshape(array.shape(sizes))
 
 
-def _elements(loops: Sequence[Loop], sizes: Mapping[str, int]) -> Iterator[Elements]:
-    if not loops:
-        yield {}
-        return
-    last = loops[-1]
-    for outer in _elements(loops[:-1], sizes):
-        first = outer[last.behind] + 1 if last.behind else last.first.at(sizes)
-        for k in range(first, last.end.at(sizes)):
-            yield {**outer, last.index: k}
-
-
 @dataclass(frozen=True, slots=True)
 class EntryRules:
     """Substitution of array accesses by symbols, at given values of the indices.
@@ -428,7 +417,7 @@ class EntryRules:
 
     def rules(self, term: ArrayTerm | ArrayForce) -> Iterator[tuple[Elements, dict[Symbol, Expr]]]:
         """Yield the values of the indices with the symbol that replaces each access."""
-        for at in _elements(term.loops, self.sizes):
+        for at in elements(term.loops, self.sizes):
             yield at, {slot: self.entry(access, at, term.loops) for slot, access in term.slots}
 
     def forces(self, forces: Sequence[ArrayForce]) -> dict[Symbol, list[Expr]]:
@@ -442,9 +431,9 @@ class EntryRules:
 
     def entry(self, access: Access, at: Elements, loops: Sequence[Loop]) -> Expr:
         """Return the symbol of an array entry, or the sum of a convolution."""
-        periods = {loop.index: loop.end.at(self.sizes) for loop in loops if loop.periodic}
+        periods = periods_of(loops, self.sizes)
         try:
-            indices = tuple(_place(place, at, periods, self.sizes, self.tables) for place in access.places)
+            indices = tuple(int(place.at(at, self.sizes, self.tables, periods)) for place in access.places)
         except IndexError as error:
             raise SystemDefinitionError(f"{access} at {dict(at)}: {error}") from error
         if any(not 0 <= index < length for index, length in zip(indices, access.array.shape(self.sizes), strict=True)):
@@ -465,12 +454,3 @@ class EntryRules:
         if name in self.names:
             return symbol(str(self.names[name][indices]))
         return symbol(str(self.names[name.removesuffix(DOT)][indices]) + DOT)
-
-
-def _place(subscript: Place, at: Elements, periods: Mapping[str, int], sizes: Mapping[str, int], tables: Tables) -> int:
-    if subscript.table:
-        return int(tables[subscript.table][at[subscript.index], subscript.column])
-    if not subscript.index:
-        return subscript.base.at(sizes)
-    k = at[subscript.index] + subscript.base.number - (at[subscript.minus] if subscript.minus else 0)
-    return k % periods[subscript.index] if subscript.index in periods else k

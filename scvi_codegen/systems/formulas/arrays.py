@@ -16,7 +16,7 @@ from sympy import Add, Expr, S, Symbol
 
 from scvi_codegen.common.errors import ExpressionError, SystemDefinitionError, closest
 from scvi_codegen.systems.formulas.grammar import Parser, Token, parsed
-from scvi_codegen.systems.formulas.indices import Access, Array, Loop, Place, Size
+from scvi_codegen.systems.formulas.indices import Access, Array, Loop, Place, Size, elements
 from scvi_codegen.systems.formulas.neighbours import NESTED, Neighbours, convolution_of
 from scvi_codegen.systems.formulas.symbols import check_name, symbol
 
@@ -322,17 +322,10 @@ class ArrayParser(_Indices):
         if self.nested > MAX_NESTED_TERMS:
             message = f"nested sums over whole numbers may have at most {MAX_NESTED_TERMS} terms, not {self.nested}"
             self.refuse(f"{message}: use a named size of an array instead of the number", column)
-        rows: list[dict[str, int]] = [{}]
-        for loop in loops:
-            rows = [
-                {**row, loop.index: k}
-                for row in rows
-                for k in range(row[loop.behind] + 1 if loop.behind else loop.first.number, loop.end.number)
-            ]
         start, formulas = self.position, []
-        for row in rows:
+        for element in elements(loops, {}):
             self.position = start
-            self.in_scope |= row
+            self.in_scope |= element
             formulas.append(self.sum() * self.inside(loops))
         self.end_of_sum(loops)
         self.nested //= count

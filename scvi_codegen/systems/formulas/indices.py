@@ -19,10 +19,13 @@ derivatives are taken with respect to these symbols.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations, product
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from scvi_codegen.common.errors import SystemDefinitionError
 
@@ -182,6 +185,23 @@ class Place:
     column: int = 0
     minus: str = ""
 
+    def at(
+        self,
+        index: Mapping[str, Any],
+        sizes: Mapping[str, int],
+        tables: Mapping[str, NDArray[np.int64]],
+        periods: Mapping[str, int],
+    ) -> Any:
+        """Return the position at values of the indices, numbers or arrays; ``periods`` are those of periodic loops."""
+        if self.table:
+            return tables[self.table][index[self.index], self.column]
+        if not self.index:
+            return self.base.at(sizes)
+        position = index[self.index] + self.base.number
+        if self.minus:
+            position = position - index[self.minus]
+        return position % periods[self.index] if self.index in periods else position
+
     def __str__(self) -> str:
         if self.table:
             return f"{self.table}[{self.index}, {self.column}]"
@@ -226,6 +246,23 @@ class Access:
             places[convolution.axis] = j
         entry = f"{self.array.name}[{', '.join(places)}]" if places else self.array.name
         return before + entry + ")" * len(self.sums)
+
+
+def periods_of(loops: Iterable[Loop], sizes: Mapping[str, int]) -> dict[str, int]:
+    """Return the period of each index of a periodic loop."""
+    return {loop.index: loop.end.at(sizes) for loop in loops if loop.periodic}
+
+
+def elements(loops: Sequence[Loop], sizes: Mapping[str, int]) -> Iterator[dict[str, int]]:
+    """Yield the values of the indices of loops, the last one running fastest."""
+    if not loops:
+        yield {}
+        return
+    last = loops[-1]
+    for outer in elements(loops[:-1], sizes):
+        first = outer[last.behind] + 1 if last.behind else last.first.at(sizes)
+        for k in range(first, last.end.at(sizes)):
+            yield {**outer, last.index: k}
 
 
 def couples_elements(array: Array, reads: Iterable[Access], coefficients: Iterable[Access]) -> bool:

@@ -11,7 +11,7 @@ from sympy import Expr, Symbol
 
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.systems.formulas.expressions import LARGEST, PIECEWISE_CONSTANT
-from scvi_codegen.systems.formulas.indices import Access, Loop, Place
+from scvi_codegen.systems.formulas.indices import Access, Loop, periods_of
 from scvi_codegen.systems.formulas.intermediates import Intermediate, intermediates
 
 MAX_ELEMENTS = 5_000_000
@@ -80,7 +80,7 @@ class Elements:
     """
 
     def __init__(self, loops: Sequence[Loop], sizes: Mapping[str, int], tables: Mapping[str, NDArray[Any]]) -> None:
-        self.loops, self.sizes, self.tables = {loop.index: loop for loop in loops}, sizes, tables
+        self.sizes, self.tables, self.periods = sizes, tables, periods_of(loops, sizes)
         pairs = {loop.behind: loop for loop in loops if loop.behind}
         spans = [(loop, np.arange(loop.first.at(sizes), loop.end.at(sizes))) for loop in loops if not loop.behind]
         counts = [len(span) * (len(span) - 1) // 2 if loop.index in pairs else len(span) for loop, span in spans]
@@ -99,16 +99,7 @@ class Elements:
 
     def of(self, access: Access) -> tuple[Any, ...]:
         """Return the indices of an access at all elements, one array or number per axis."""
-        return tuple(self._place(place) for place in access.places)
-
-    def _place(self, subscript: Place) -> Any:
-        if subscript.table:
-            return self.tables[subscript.table][self.index[subscript.index], subscript.column]
-        if not subscript.index:
-            return subscript.base.at(self.sizes)
-        loop, moved = self.loops[subscript.index], self.index[subscript.index] + subscript.base.number
-        moved = moved - self.index[subscript.minus] if subscript.minus else moved
-        return moved % loop.end.at(self.sizes) if loop.periodic else moved
+        return tuple(place.at(self.index, self.sizes, self.tables, self.periods) for place in access.places)
 
     def values(
         self,
