@@ -106,6 +106,7 @@ def test_constant_masses_update_velocities_and_forces_at_the_same_iterate(system
         assert close(stepper.step(q0, p0, H, T, options=ONE_ITERATION), expected)
 
 
+@pytest.mark.second
 def test_many_coordinates_do_not_request_the_jacobian():
     """The Jacobian has the square of their number of entries; masses of the chain of nine depend on positions."""
     names = [f"a{k}" for k in range(9)]

@@ -98,6 +98,7 @@ def test_predictor_from_two_steps_is_better_than_from_one(name):
     assert left[1] < left[0] / 4
 
 
+@pytest.mark.second
 def test_newton_factors_are_reused_in_the_next_short_step():
     given = case("chain/svi-4")
     run = stepper("chain/svi-4", "newton").start(given.q, given.p, h=given.h / 64)

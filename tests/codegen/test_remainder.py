@@ -86,6 +86,7 @@ def test_the_energy_of_an_oscillator_does_not_drift(method, angle):
 
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize(("method", "angle"), [("svi:4", 0.6), ("svi:8", 2.5)])
+@pytest.mark.second
 def test_the_energy_of_a_lattice_does_not_drift(method, angle):
     assert slope(RING, method, [*np.sin(np.pi * 14 / 16 * (np.arange(16) + 0.5))], angle) <= LARGEST_SLOPE
 

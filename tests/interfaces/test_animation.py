@@ -213,6 +213,7 @@ class TestFilm:
         assert "<script" in (tmp_path / "film.html").read_text(encoding="utf-8")
         assert sorted(file.name for file in tmp_path.iterdir()) == ["film.gif", "film.html"]
 
+    @pytest.mark.second
     def test_positions_may_be_supplied(self):
         run = run_of("spherical-pendulum", 3)
 

@@ -92,6 +92,7 @@ def test_solver_is_read_from_the_file(net: Path) -> None:
     assert sc.load_model(net.with_name("again.toml")).solver == "newton"
 
 
+@pytest.mark.second
 def test_newton_that_requires_known_sizes_runs_with_those_of_the_model(net: Path) -> None:
     """Its states are those of the other solver; C for arrays of run-time sizes is refused."""
     net.write_text(net.read_text().replace('"svi:2"', '"stoermer-verlet"', 1))
@@ -239,6 +240,7 @@ def test_model_files_with_arrays_of_known_sizes(tmp_path: Path) -> None:
         sc.load_model(path)
 
 
+@pytest.mark.second
 def test_tolerance_selects_adaptive_steps(net: Path) -> None:
     """A tolerance, or a missing step, selects adaptive steps; an overriding step replaces it."""
     given = {"tolerance": 1e-6, "span": -3.0}

@@ -119,6 +119,7 @@ def test_unused_cache_is_named(tmp_path, monkeypatch):
 
 
 @pytest.mark.usefixtures("without_trial")
+@pytest.mark.second
 def test_extras_are_listed_with_missing_packages(monkeypatch):
     extras = tomllib.loads(PROJECT.read_text())["project"]["optional-dependencies"]
     before = findings()

@@ -191,6 +191,7 @@ def test_communication_steps_of_any_length_are_divided_equally(fmu):
     assert_allclose(one.get("t"), 1.001, rtol=1e-15)
 
 
+@pytest.mark.second
 def test_million_rounded_communication_points_are_reached(fmu):
     """An importer adds its step to its time; both drift apart by rounding, and no error comes of it."""
     one, t = Slave(fmu), 0.5

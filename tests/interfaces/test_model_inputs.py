@@ -160,6 +160,7 @@ def test_invalid_entry_is_reported(entry, message):
         parse_model(MODEL.replace('{ file = "tables/u.csv", kind = "cubic" }', entry))
 
 
+@pytest.mark.second
 def test_names_that_are_not_inputs_are_rejected():
     with pytest.raises(ModelFileError, match="'v' is not an input of 'pushed pendulum', whose inputs are u, w"):
         parse_model(

@@ -156,6 +156,7 @@ def ellipse() -> sc.Trajectory:
 
 
 class TestAdaptiveSteps:
+    @pytest.mark.second
     def test_curves_are_dense_output(self, ellipse):
         for axes in (ellipse.plot.motion(), ellipse.plot.phase(axes=("q1", "q2"))):
             x, y = axes.lines[0].get_xydata().T
@@ -163,6 +164,7 @@ class TestAdaptiveSteps:
             middle = np.hypot((x[1:] + x[:-1]) / 2 + 0.5, (y[1:] + y[:-1]) / 2 / 0.75**0.5)
             assert abs(middle - 1.0).max() < 2e-2  # the ellipse a = 1, e = 1/2, within the tolerance
 
+    @pytest.mark.second
     def test_images_have_cells_of_the_lengths_of_the_steps(self):
         chain = trajectory_of("fput-chain:12", 3)
         run = replace(chain, t=chain.t**2)

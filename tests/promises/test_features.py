@@ -31,8 +31,7 @@ def test_table_lists_the_features_that_are_tested():
     assert {cell for row in TABLE.values() for cell in row.values()} == {"yes", "no"}
 
 
-@pytest.mark.quick
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [KINDS[0], *(pytest.param(kind, marks=pytest.mark.second) for kind in KINDS[1:])])
 @pytest.mark.parametrize("feature", FEATURES)
 def test_features_work_or_are_refused_with_a_reason(feature, kind, kinds, tmp_path):
     of = kinds[kind]

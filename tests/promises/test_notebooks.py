@@ -65,7 +65,6 @@ SECOND = ("crane", "first_steps")
 """Notebooks that the second tier executes; the site and the full tier execute all."""
 
 
-@pytest.mark.tiers(0, 0)
 @pytest.mark.parametrize(
     "path",
     [
