@@ -56,14 +56,14 @@ static void force_0(const double *u, double t, const double *parameters, double 
 }
 
 /* mass of q[i] */
-static void add_mass_0(const problem *given, double *mass)
+static void add_mass_0(const problem *arrays, double *mass)
 {
-  const long long size_N = given->size[0];
+  const long long size_N = arrays->size[0];
   const long long start_q = 0;
   double value[1];
   double parameters[1] = {0};
-  parameters[0] = given->parameters[0];
-  (void)given;
+  parameters[0] = arrays->parameters[0];
+  (void)arrays;
   for (long long index_i = 0; index_i < size_N; index_i++) {
     mass_0(NULL, 0.0, parameters, value);
     mass[start_q + index_i] += value[0];
@@ -71,15 +71,15 @@ static void add_mass_0(const problem *given, double *mass)
 }
 
 /* sum(i in N periodic, -beta*(q[i+1] - q[i])**4/4 - (q[i+1] - q[i])**2/2) */
-static void sum_term_0(const problem *given, const double *q, double t, compensated *total)
+static void sum_term_0(const problem *arrays, const double *q, double t, compensated *total)
 {
-  const long long size_N = given->size[0];
+  const long long size_N = arrays->size[0];
   const long long start_q = 0;
   double u[2];
   double value[1];
   double parameters[1] = {0};
-  parameters[0] = given->parameters[0];
-  (void)given;
+  parameters[0] = arrays->parameters[0];
+  (void)arrays;
   for (long long begin = 0, end; begin < size_N; begin = end) {
     end = size_N;
     const long long shift_i_plus_1 = around(begin, 1, size_N, &end);
@@ -93,32 +93,32 @@ static void sum_term_0(const problem *given, const double *q, double t, compensa
 }
 
 /* Number of coordinates, and the numbers of entries of the fields. */
-static long long coordinates_of(const problem *given)
+static long long coordinates_of(const problem *arrays)
 {
-  const long long size_N = given->size[0];
-  (void)given;
+  const long long size_N = arrays->size[0];
+  (void)arrays;
   return size_N;
 }
 
-static void field_lengths(const problem *given, long long *length)
+static void field_lengths(const problem *arrays, long long *length)
 {
-  (void)given;
+  (void)arrays;
   (void)length;
 }
 
-static int compute_inverse_masses(const problem *given, double *inverse_mass)
+static int compute_inverse_masses(const problem *arrays, double *inverse_mass)
 {
-  memset(inverse_mass, 0, sizeof(double) * (size_t)coordinates_of(given));
-  add_mass_0(given, inverse_mass);
-  return invert_masses(inverse_mass, coordinates_of(given));
+  memset(inverse_mass, 0, sizeof(double) * (size_t)coordinates_of(arrays));
+  add_mass_0(arrays, inverse_mass);
+  return invert_masses(inverse_mass, coordinates_of(arrays));
 }
 
-static void state_energies(const problem *given, double t, const double *q, const double *p, const double *inverse_mass,
-    double *energies)
+static void state_energies(const problem *arrays, double t, const double *q, const double *p,
+    const double *inverse_mass, double *energies)
 {
   compensated kinetic = {0.0, 0.0}, terms = {0.0, 0.0};
-  add_kinetic_energy(&kinetic, p, inverse_mass, coordinates_of(given));
-  sum_term_0(given, q, t, &terms);
+  add_kinetic_energy(&kinetic, p, inverse_mass, coordinates_of(arrays));
+  sum_term_0(arrays, q, t, &terms);
   (void)t, (void)q;
   energies[0] = kinetic.sum + kinetic.rest;
   energies[1] = -(terms.sum + terms.rest);
@@ -129,16 +129,16 @@ typedef double lanes, times; /* one point at a time */
 enum { CHUNK = 512 }; /* values computed before any is added */
 
 /* sum(i in N periodic, -beta*(q[i+1] - q[i])**4/4 - (q[i+1] - q[i])**2/2) */
-static void add_force_0(const problem *given, const lanes *restrict X, times t, double by, lanes *restrict F,
+static void add_force_0(const problem *arrays, const lanes *restrict X, times t, double by, lanes *restrict F,
     const window *here)
 {
-  const long long size_N = given->size[0];
+  const long long size_N = arrays->size[0];
   const long long start_q = 0;
   lanes u[2];
   lanes value[2];
   double parameters[1] = {0};
-  parameters[0] = given->parameters[0];
-  (void)given, (void)here;
+  parameters[0] = arrays->parameters[0];
+  (void)arrays, (void)here;
   for (long long begin = here->of.first, end; begin < here->of.end; begin = end) {
     end = here->of.end - begin > CHUNK ? begin + CHUNK : here->of.end;
     const long long shift_i_plus_1 = around(begin, 1, size_N, &end);
@@ -158,26 +158,26 @@ static void add_force_0(const problem *given, const lanes *restrict X, times t, 
 }
 
 /* Its rounds of tasks. */
-static sharing share_force_0(const run_memory *run, const problem *given, long long n)
+static sharing share_force_0(const run_memory *run, const problem *arrays, long long n)
 {
-  const long long size_N = given->size[0];
-  (void)given;
+  const long long size_N = arrays->size[0];
+  (void)arrays;
   (void)run, (void)n;
   return alternating_blocks(0, size_N, 1, 1);
 }
 
 /* F += by times the forces at X. */
-static void add_forces(const run_memory *run, const problem *given, const double *X, double t, double by, double *F)
+static void add_forces(const run_memory *run, const problem *arrays, const double *X, double t, double by, double *F)
 {
-  const long long n = coordinates_of(given);
+  const long long n = coordinates_of(arrays);
   sharing how;
   wait_at_barrier(run);
-  how = share_force_0(run, given, n);
+  how = share_force_0(run, arrays, n);
   for (long long round = 0; round < how.rounds; round++) {
     const section tasks = share_of(run, tasks_in(&how, round));
     for (long long k = tasks.first; k < tasks.end; k++) {
       const window here = window_of(&how, round, k);
-      add_force_0(given, X, t, by, F, &here);
+      add_force_0(arrays, X, t, by, F, &here);
     }
     wait_at_barrier(run);
   }
@@ -192,11 +192,11 @@ static const double KICK_ABSCISSA[2] = {0.0, 1.0};
 #include "support/arrays/array_splitting.h"
 
 /* Returns 1 if there is enough work for more than one thread. */
-static inline int is_worth_sharing(const run_memory *run, const problem *given)
+static inline int is_worth_sharing(const run_memory *run, const problem *arrays)
 {
-  const long long n = coordinates_of(given);
+  const long long n = coordinates_of(arrays);
   int shared = blocks_of(n) > 1;
-  shared |= share_force_0(run, given, n).blocks > 1;
+  shared |= share_force_0(run, arrays, n).blocks > 1;
   (void)run;
   return shared;
 }
@@ -208,13 +208,13 @@ static inline int is_worth_sharing(const run_memory *run, const problem *given)
 enum { MAPS = 1 };
 #include "support/arrays/array_states.h"
 
-static void describe_maps(const problem *given, momentum_map *all)
+static void describe_maps(const problem *arrays, momentum_map *all)
 {
-  const long long size_N = given->size[0];
+  const long long size_N = arrays->size[0];
   const long long start_q = 0;
-  (void)given;
-  const momentum_map each[] = {
+  (void)arrays;
+  const momentum_map described[] = {
       {start_q, start_q + size_N, 1, 0, 0, TRANSLATION},
   };
-  memcpy(all, each, sizeof each);
+  memcpy(all, described, sizeof described);
 }

@@ -184,7 +184,7 @@ class RolledKernel:
         loops: outermost first.
         reads: entries (coordinates; for forces, velocities too) that are the kernel's arguments u.
         writes: entries that each value is added to; for a potential the reads.
-        given: other entries: the last parameters of the kernel or, if they are constants, its last arguments.
+        constants: other entries: the last parameters of the kernel or, if they are constants, its last arguments.
         text: the formula.
         scalar: of a potential: L itself.
         along: number of reads, the last ones, that belong to a direction instead of the state.
@@ -197,7 +197,7 @@ class RolledKernel:
     loops: tuple[Loop, ...]
     reads: tuple[Access, ...]
     writes: tuple[Access, ...]
-    given: tuple[Access, ...]
+    constants: tuple[Access, ...]
     text: str = ""
     scalar: Kernel | None = None
     along: int = 0
@@ -210,15 +210,15 @@ class RolledKernel:
         cls,
         kernel: Kernel,
         table: tuple[tuple[int, ...], ...],
-        given: tuple[tuple[Constant | Load, ...], ...] = (),
+        constants: tuple[tuple[Constant | Load, ...], ...] = (),
         targets: tuple[tuple[int, ...], ...] = (),
     ) -> RolledKernel:
-        """Return the loop over constant rows e: value[targets[e][a]] += kernel_a(u[table[e][..]], given[..][e]).
+        """Return the loop over constant rows e: value[targets[e][a]] += kernel_a(u[table[e][..]], constants[..][e]).
 
         Args:
             kernel: a function of as many arguments as indices and constants in a row.
             table: (rows, slots) indices of arguments of the kernel that contains the loop.
-            given: (constants, rows) numbers or parameters.
+            constants: (constants, rows) numbers or parameters.
             targets: (rows, values) indices of its values; by default the table.
         """
         end = Size("", len(table))
@@ -228,13 +228,13 @@ class RolledKernel:
             places = (Place(index="e", table=table, column=k) for k in range(count))
             return tuple(Access(array=Array(array, (Size(""),)), places=(place,)) for place in places)
 
-        columns = {f"given_{k}": column for k, column in enumerate(given)}
+        columns = {f"constant_{k}": column for k, column in enumerate(constants)}
         return cls(
             kernel=kernel,
             loops=(Loop(index="e", first=Size(""), end=end),),
             reads=entries("u", "places", len(table[0])),
             writes=entries("value", written, kernel.values),
-            given=tuple(Access(array=Array(name, (end,)), places=(Place(index="e"),)) for name in columns),
+            constants=tuple(Access(array=Array(name, (end,)), places=(Place(index="e"),)) for name in columns),
             tables=(("places", table), *((("targets", targets),) if targets else ())),
             columns=tuple(columns.items()),
         )

@@ -115,7 +115,7 @@ def rolled_kernel(
         loops=term.loops,
         reads=accesses * (2 if along else 1),
         writes=accesses if targets is None else tuple(targets),
-        given=tuple(access for _, access in constants),
+        constants=tuple(access for _, access in constants),
         text=comment_text(text),
         along=len(along),
     )

@@ -360,7 +360,7 @@ def turn_rate(g: Expr) -> Expr:
 
 
 Slots: TypeAlias = Sequence[tuple[Any, Access]]
-ARGUMENTS = ("const problem *given", "const event_point *at", "const section *in", "event_entries *to")
+ARGUMENTS = ("const problem *arrays", "const event_point *at", "const section *in", "event_entries *to")
 NEXT = "to->value[to->count]"
 
 
@@ -469,17 +469,17 @@ class ArrayEvents:
             loops=term.loops,
             reads=tuple(access for _, access in moving),
             writes=(),
-            given=tuple(access for _, access in constants),
+            constants=tuple(access for _, access in constants),
             text=f"Adds {name.replace('_', ' ')}.",
         )
         nest = _Entries(self, rolled, within=within)
         places = [nest.place_of(access) for _, access in to]
         inner = [f"{name}(u, at->t, parameters, value);"] * bool(values) + [line.format(*places) for line in lines]
-        body = ["(void)given, (void)at, (void)in, (void)to;", *nest.text(innermost=inner)]
+        body = ["(void)arrays, (void)at, (void)in, (void)to;", *nest.text(innermost=inner)]
         declared = f"double value[{len(values)}]" if values else ""
         self.kernels += [rolled.kernel] * bool(values)
         self.functions.append(nest.function(f"static void add_{name}", ARGUMENTS, body, values=declared))
-        return f"add_{name}(given, at, in, to);"
+        return f"add_{name}(arrays, at, in, to);"
 
     def _value(self, name: str, formula: Any, event: SearchedEvent, to: str = NEXT) -> list[str]:
         """Return statements that compute a formula at one element; a ``NEXT`` value is counted."""

@@ -72,7 +72,7 @@ static double improve(const step_data *step, half_state *of, const solver_option
   coordinate_array array[COORDINATE_ARRAYS];
   double change;
   sums all;
-  describe_coordinate_arrays(step->given, array);
+  describe_coordinate_arrays(step->arrays, array);
   begin_blocks(&all, step);
   EACH_BLOCK (all) {
     lanes total = lanes_of(0.0), increment[GROUPS], scaled[GROUPS];

@@ -33,10 +33,10 @@ static long long doubles_of(long long count, size_t size)
 }
 
 /* Number of parameters and of the entries of all fields. */
-static long long parameters_of(const problem *given)
+static long long parameters_of(const problem *arrays)
 {
   long long length[FIELDS + 1], count = SCALARS;
-  field_lengths(given, length);
+  field_lengths(arrays, length);
   for (int k = 0; k < FIELDS; k++)
     count += length[k];
   return count;

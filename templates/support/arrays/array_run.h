@@ -11,7 +11,7 @@
 /* The job of all threads, with the same arguments. */
 typedef struct job {
   int (*go)(run_memory *run, const struct job *way, solver_report *report);
-  const problem *given;
+  const problem *arrays;
   const solver_options *options;
   double t_end;
   const step_control *control; /* of adaptive steps; NULL: fixed steps */
@@ -47,7 +47,7 @@ static int run_workers(run_memory *run, const job *way, solver_report *report)
   long long threads = 1;
   barrier place = {0};
   int status;
-  if (wanted < 2 || !is_worth_sharing(run, way->given))
+  if (wanted < 2 || !is_worth_sharing(run, way->arrays))
     return way->go(run, way, report);
   run->thread_barrier = &place;
   run->part = 0;
@@ -96,12 +96,12 @@ static void store_state(run_memory *run, const job *way, solver_report *report, 
 
 static int take_steps(run_memory *run, const job *way, solver_report *report)
 {
-  const work_arrays work = bind_work_arrays(run, coordinates_of(way->given));
+  const work_arrays work = bind_work_arrays(run, coordinates_of(way->arrays));
   while (report->steps < way->steps) {
     const long long before = report->iterations;
     int status;
     report->t = run->t;
-    status = perform_step(run, way->given, &work, way->options, report);
+    status = perform_step(run, way->arrays, &work, way->options, report);
     if (status != OK)
       return status;
     add_compensated(&run->t, &run->t_low, run->h, 0.0);
@@ -126,7 +126,7 @@ static int perform(run_memory *run, job way, const double *parameters, const sol
   status = use_parameters(run, parameters);
   if (status != OK)
     return status;
-  way.given = &run->data;
+  way.arrays = &run->data;
   way.options = options || way.control ? options : &standard;
 #ifdef CONSTRAINTS_OF_ARRAYS
   if (run->is_changed)

@@ -51,7 +51,7 @@ static int ends_with_a_kick(void)
 }
 
 /* Kicks the momenta of this thread; stores forces that the next step can reuse. */
-static void kick_by(const run_memory *run, const problem *given, const work_arrays *work, int k, section own)
+static void kick_by(const run_memory *run, const problem *arrays, const work_arrays *work, int k, section own)
 {
   const double by = run->h * KICK[k], t = run->t + KICK_ABSCISSA[k] * run->h;
   const long long size = own.end - own.first;
@@ -59,14 +59,14 @@ static void kick_by(const run_memory *run, const problem *given, const work_arra
     add_to(work->dp + own.first, work->F + own.first, by, size);
   else if (k == LEAPS - 1 && ends_with_a_kick()) {
     memset(work->F + own.first, 0, sizeof(double) * (size_t)size);
-    add_forces(run, given, work->X, t, 1.0, work->F);
+    add_forces(run, arrays, work->X, t, 1.0, work->F);
     add_to(work->dp + own.first, work->F + own.first, by, size);
   } else
-    add_forces(run, given, work->X, t, by, work->dp);
+    add_forces(run, arrays, work->X, t, by, work->dp);
 }
 
 /* Performs a step. The increments start with the compensation terms of the state. */
-static int perform_step(run_memory *run, const problem *given, const work_arrays *work, const solver_options *options,
+static int perform_step(run_memory *run, const problem *arrays, const work_arrays *work, const solver_options *options,
     solver_report *report)
 {
   const section own = mine(run, work->n);
@@ -77,7 +77,7 @@ static int perform_step(run_memory *run, const problem *given, const work_arrays
   drift_by(0.0, run->inverse_mass, run->p, work->dp, run->q, work->dq, work->X, own);
   for (int k = 0; k < LEAPS; k++) {
     if (KICK[k] != 0.0)
-      kick_by(run, given, work, k, own);
+      kick_by(run, arrays, work, k, own);
     if (DRIFT[k] != 0.0)
       drift_by(run->h * DRIFT[k], run->inverse_mass, run->p, work->dp, run->q, work->dq, work->X, own);
   }

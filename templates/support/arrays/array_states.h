@@ -56,13 +56,13 @@ static int energies_of(long long count, const double *t, const double *q, const 
   run_memory *run = run_in(workspace);
   const long long n = coordinates_of(&run->data);
   const int status = use_parameters(run, parameters);
-  problem given = run->data;
+  problem arrays = run->data;
   if (status != OK)
     return status;
 #ifdef LISTS
   neighbours list[LISTS] = {{0}}; /* those of a run determine the order of its sums */
   for (int k = 0; k < LISTS; k++)
-    *list_of(&given, k) = &list[k];
+    *list_of(&arrays, k) = &list[k];
 #endif
   for (long long k = 0; k < count; k++) {
     const double *at = q + k * n, *moving = p + k * n;
@@ -71,7 +71,7 @@ static int energies_of(long long count, const double *t, const double *q, const 
     at = joined(run, at, moving);
     moving = at + n;
 #endif
-    state_energies(&given, t[k], at, moving, run->inverse_mass, all);
+    state_energies(&arrays, t[k], at, moving, run->inverse_mass, all);
 #ifdef SITE_TRANSFORM
     all[0] = all[1] = NAN; /* the terms of H are no parts of the energy */
 #endif
@@ -116,7 +116,7 @@ enum { TRANSLATION,
   ROTATION,
   PHASE };
 
-static void describe_maps(const problem *given, momentum_map *all);
+static void describe_maps(const problem *arrays, momentum_map *all);
 
 static void add_map(const momentum_map *of, const double *q, const double *p, double *map, double *size)
 {

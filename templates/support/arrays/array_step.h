@@ -4,7 +4,7 @@
 /* Runs of array systems whose steps are solved by iteration. Requires: prepare and solve of a solver,
  * observed_error.h. */
 
-static step_data step_of(const run_memory *run, const problem *given, const work_arrays *work)
+static step_data step_of(const run_memory *run, const problem *arrays, const work_arrays *work)
 {
   const step_data step = {.t = run->t,
       .h = run->h,
@@ -13,7 +13,7 @@ static step_data step_of(const run_memory *run, const problem *given, const work
       .carry_q = run->carry_q,
       .carry_p = run->carry_p,
       .run = run,
-      .given = given,
+      .arrays = arrays,
       .work = work,
       .n = work->n};
   return step;
@@ -31,10 +31,10 @@ static void continue_steps(run_memory *run, const step_data *step, const double 
 }
 
 /* Performs a step of the same size as the previous one. */
-static int perform_step(run_memory *run, const problem *given, const work_arrays *work, const solver_options *options,
+static int perform_step(run_memory *run, const problem *arrays, const work_arrays *work, const solver_options *options,
     solver_report *report)
 {
-  step_data step = step_of(run, given, work);
+  step_data step = step_of(run, arrays, work);
   array_motion motion = {{0.0}, {0.0}};
   solver_data data;
   int status;

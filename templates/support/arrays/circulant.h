@@ -57,9 +57,9 @@ static transforms transforms_in(const run_memory *run, double *memory, long long
   return of;
 }
 
-static transforms transforms_of(const run_memory *run, const problem *given)
+static transforms transforms_of(const run_memory *run, const problem *arrays)
 {
-  const long long count = coordinates_of(given);
+  const long long count = coordinates_of(arrays);
   return transforms_in(run, run->work + (WORK - TRANSFORM_WORK) * count, count);
 }
 
@@ -358,11 +358,11 @@ static void multiply_by_plan(const transforms *in, const circulant *by, const pl
 
 #ifdef CIRCULANT_MODES
 /* Replaces the values of all places of a lattice by their mean, of each component; groups of F are n numbers apart. */
-static void average_places(const run_memory *run, const problem *given, lanes *F, long long n)
+static void average_places(const run_memory *run, const problem *arrays, lanes *F, long long n)
 {
-  const long long half = coordinates_of(given);
+  const long long half = coordinates_of(arrays);
   lattice all[LATTICES];
-  describe_lattices(given, all);
+  describe_lattices(arrays, all);
   for (const lattice *one = all; one < all + LATTICES && (!run->thread_barrier || run->part == 0); one++)
     for (long long k = 0; k < GROUPS * STATES * one->components; k++) {
       const long long places = positions_of(one), count = one->components;

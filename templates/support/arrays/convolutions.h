@@ -18,7 +18,7 @@ typedef struct {
   circulant stages[MOST_STAGES];
 } convolution;
 
-static void describe_convolutions(const problem *given, convolution *all);
+static void describe_convolutions(const problem *arrays, convolution *all);
 
 /* The values of a state are vector 0, derivatives vector 1, values of a direction vector 2. */
 static lanes *sums_at(const transforms *in, int vector, int group)
@@ -40,11 +40,11 @@ static void multiply_by_circulant(const transforms *in, const circulant *by, dou
 }
 
 /* Computes all convolutions of x, whose groups are `apart` numbers apart, for a vector. */
-static void find_sums(const transforms *in, const problem *given, int vector, const lanes *x, long long apart)
+static void find_sums(const transforms *in, const problem *arrays, int vector, const lanes *x, long long apart)
 {
   const long long length = STATES * in->count;
   convolution all[CONVOLUTIONS];
-  describe_convolutions(given, all);
+  describe_convolutions(arrays, all);
   for (const convolution *one = all; one < all + CONVOLUTIONS; one++) {
     lanes *into = sums_at(in, vector, 0) + one->number * length;
     for (int k = 0; k < one->count; k++)
@@ -63,12 +63,12 @@ static void clear_transposed(const transforms *in)
 }
 
 /* Adds the transposed convolutions of the derivatives to F, whose groups are n numbers apart. */
-static void add_transposed(const transforms *in, const problem *given, lanes *F, long long n)
+static void add_transposed(const transforms *in, const problem *arrays, lanes *F, long long n)
 {
   const long long length = STATES * in->count;
   lanes factor[GROUPS];
   convolution all[CONVOLUTIONS];
-  describe_convolutions(given, all);
+  describe_convolutions(arrays, all);
   for (int group = 0; group < GROUPS; group++)
     factor[group] = lanes_of(1.0);
   for (const convolution *one = all; one < all + CONVOLUTIONS; one++) {
@@ -81,11 +81,11 @@ static void add_transposed(const transforms *in, const problem *given, lanes *F,
 
 #ifdef DIAGONALS
 /* Adds the diagonal of C^T D C to F, for each C of mean squares of its entries times the derivatives D. */
-static void add_diagonals(const transforms *in, const problem *given, lanes *F, long long n)
+static void add_diagonals(const transforms *in, const problem *arrays, lanes *F, long long n)
 {
   const long long length = STATES * in->count;
   convolution all[CONVOLUTIONS];
-  describe_convolutions(given, all);
+  describe_convolutions(arrays, all);
   for (const convolution *one = all; one < all + CONVOLUTIONS; one++) {
     const circulant *by = one->stages;
     const section own = share_of(in->run, by->outer * by->size * by->inner);
@@ -109,13 +109,13 @@ static void add_diagonals(const transforms *in, const problem *given, lanes *F, 
 
 #ifdef CIRCULANT_MODES
 /* Adds the eigenvalues |L_k|^2 times the mean derivative D of C^T D C to F, for each C. */
-static void add_modes(const transforms *in, const problem *given, lanes *F, long long n)
+static void add_modes(const transforms *in, const problem *arrays, lanes *F, long long n)
 {
   const long long length = STATES * in->count;
   convolution all[CONVOLUTIONS];
-  describe_convolutions(given, all);
+  describe_convolutions(arrays, all);
   for (int kind = 0; kind < KINDS; kind++)
-    average_places(in->run, given, sums_at(in, 1, 0) + kind * length, KINDS * length);
+    average_places(in->run, arrays, sums_at(in, 1, 0) + kind * length, KINDS * length);
   for (const convolution *one = all; one < all + CONVOLUTIONS; one++) {
     const circulant *by = one->stages;
     const section own = share_of(in->run, by->outer * by->size * by->inner);
@@ -138,9 +138,9 @@ static void add_modes(const transforms *in, const problem *given, lanes *F, long
 #endif
 
 /* Returns all convolutions of a single state in new memory, NULL without memory. */
-static double *sums_of_state(const problem *given, const double *q)
+static double *sums_of_state(const problem *arrays, const double *q)
 {
-  const long long count = coordinates_of(given), length = STATES * count;
+  const long long count = coordinates_of(arrays), length = STATES * count;
   const run_memory alone = {0};
   double *memory = calloc((size_t)(TRANSFORM_WORK * count + ALIGNMENT), sizeof(double));
   double *state = malloc(sizeof(double) * (size_t)(length * (GROUPS * WIDTH + KINDS) + ALIGNMENT));
@@ -151,7 +151,7 @@ static double *sums_of_state(const problem *given, const double *q)
     for (int group = 0; group < GROUPS; group++)
       for (long long i = 0; i < length; i++)
         x[group * length + i] = lanes_of(q[i]);
-    find_sums(&in, given, 0, x, length);
+    find_sums(&in, arrays, 0, x, length);
     for (long long i = 0; i < KINDS * length; i++)
       values[i] = *(const double *)&sums_at(&in, 0, 0)[i];
   } else {

@@ -23,7 +23,7 @@ typedef struct {
   long long start, count;
   int components;
   double lengths[LENGTHS];
-} points;
+} point_list;
 
 /* Cells in row-major order; points sorted by cell: point order[k] has the components x[axis][k]. */
 typedef struct {
@@ -33,7 +33,7 @@ typedef struct {
 } cells;
 
 /* Returns the largest distance of points from the positions `at`; X has `width` positions per coordinate and group. */
-static double farthest(const points *of, const double *at, const double *X, long long groups, long long apart,
+static double farthest(const point_list *of, const double *at, const double *X, long long groups, long long apart,
     long long width)
 {
   double largest = 0.0;
@@ -51,7 +51,7 @@ static double farthest(const points *of, const double *at, const double *X, long
 }
 
 /* Cells of width `reach` or more, about one per point at most; without a period cells are repeated. */
-static long long divide_box(const points *of, double reach, cells *in)
+static long long divide_box(const point_list *of, double reach, cells *in)
 {
   const double most = 1.0 + pow((double)of->count, 1.0 / of->components);
   long long total = 1;
@@ -68,7 +68,7 @@ static long long divide_box(const points *of, double reach, cells *in)
   return total;
 }
 
-static long long cell_of(const cells *in, const points *of, const double *x)
+static long long cell_of(const cells *in, const point_list *of, const double *x)
 {
   long long cell = 0;
   for (int k = 0; k < AXES_OF_CELLS; k++) {
@@ -83,7 +83,7 @@ static long long cell_of(const cells *in, const points *of, const double *x)
 }
 
 /* Sorts points by cell. */
-static void sort_points(cells *in, const points *of, const double *x, long long total)
+static void sort_points(cells *in, const point_list *of, const double *x, long long total)
 {
   for (long long i = 0; i < of->count; i++)
     in->first[cell_of(in, of, x + i * of->components) + 1]++;
@@ -98,7 +98,7 @@ static void sort_points(cells *in, const points *of, const double *x, long long 
 }
 
 /* Appends the points of a cell before point i that are closer to it than `reach`; returns their new number. */
-static long long append(const cells *in, const points *of, long long cell, int i, const double *x, double reach,
+static long long append(const cells *in, const point_list *of, long long cell, int i, const double *x, double reach,
     long long total, int *found, long long count)
 {
   enum { PART = 64 };
@@ -135,43 +135,43 @@ static int reserve(int **indices, long long *capacity, long long size)
   return 1;
 }
 
-/* Appends the smaller neighbours of point i from its cell and the adjacent ones; returns 0 without memory. */
-static int find_smaller(neighbours *list, const points *of, const cells *in, int i, const double *x, double reach,
+/* Appends the neighbours j < i of point i from its cell and the adjacent ones; returns 0 without memory. */
+static int find_lower(neighbours *list, const point_list *of, const cells *in, int i, const double *x, double reach,
     long long total, long long *count)
 {
   const long long cell = cell_of(in, of, x), *size = in->size;
   const long long at[AXES_OF_CELLS] = {cell / size[2] / size[1], cell / size[2] % size[1], cell % size[2]};
-  if (!reserve(&list->smaller, &list->capacity_smaller, *count + of->count))
+  if (!reserve(&list->lower, &list->capacity_lower, *count + of->count))
     return 0;
   for (long long a = size[0] > 1 ? -1 : 0; a <= (size[0] > 1); a++)
     for (long long b = size[1] > 1 ? -1 : 0; b <= (size[1] > 1); b++)
       for (long long c = size[2] > 1 ? -1 : 0; c <= (size[2] > 1); c++) {
         const long long row = wrapped_index(at[0] + a, size[0]) * size[1] + wrapped_index(at[1] + b, size[1]);
-        *count = append(in, of, row * size[2] + wrapped_index(at[2] + c, size[2]), i, x, reach, total, list->smaller,
+        *count = append(in, of, row * size[2] + wrapped_index(at[2] + c, size[2]), i, x, reach, total, list->lower,
             *count);
       }
   return 1;
 }
 
 /* Makes the rows (i; its neighbours j > i) from rows (j; its neighbours i < j), which leaves j in ascending order. */
-static int transpose(neighbours *list, const points *of, const long long *begin)
+static int transpose(neighbours *list, const point_list *of, const long long *begin)
 {
   const long long count = of->count, pairs = begin[count];
   if (!reserve(&list->others, &list->capacity, pairs + 1))
     return 0;
   memset(list->first, 0, sizeof(long long) * (size_t)(count + 2));
   for (long long k = 0; k < pairs; k++)
-    list->first[list->smaller[k] + 2]++;
+    list->first[list->lower[k] + 2]++;
   for (long long i = 0; i < count; i++)
     list->first[i + 2] += list->first[i + 1];
   for (long long j = 0; j < count; j++)
     for (long long k = begin[j]; k < begin[j + 1]; k++)
-      list->others[list->first[list->smaller[k] + 1]++] = (int)j;
+      list->others[list->first[list->lower[k] + 1]++] = (int)j;
   return 1;
 }
 
 /* Makes the list of all pairs closer than `reach`; returns 0 without memory. */
-static int make_list(neighbours *list, const points *of, const double *x, double reach)
+static int make_list(neighbours *list, const point_list *of, const double *x, double reach)
 {
   const long long count = of->count;
   cells in = {0};
@@ -185,7 +185,7 @@ static int make_list(neighbours *list, const points *of, const double *x, double
       in.x[axis] = memory + axis * count;
     sort_points(&in, of, x, total);
     for (long long j = 0; j < count && done; j++) {
-      done = find_smaller(list, of, &in, (int)j, x + j * of->components, reach, total, &pairs);
+      done = find_lower(list, of, &in, (int)j, x + j * of->components, reach, total, &pairs);
       begin[j + 1] = pairs;
     }
     done = done && transpose(list, of, begin);
@@ -196,7 +196,7 @@ static int make_list(neighbours *list, const points *of, const double *x, double
 
 /* Makes a list again if it may lack a pair closer than the cutoff at the positions X; the new one is of the positions
  * q, with a larger skin if X are far from there. A list that cannot be made is empty, and marked as failed. */
-static void update_list(neighbours *list, const points *of, const double *q, const double *X, long long groups,
+static void update_list(neighbours *list, const point_list *of, const double *q, const double *X, long long groups,
     long long apart, long long width)
 {
   const double cutoff = of->lengths[CUTOFF], skin = of->lengths[SKIN], half = 0.499; /* < 1/2 for rounding */
@@ -245,6 +245,6 @@ static inline section row_of(const neighbours *list, long long i, const window *
 
 static void release(neighbours *list)
 {
-  free(list->at), free(list->first), free(list->others), free(list->smaller);
+  free(list->at), free(list->first), free(list->others), free(list->lower);
   memset(list, 0, sizeof *list);
 }

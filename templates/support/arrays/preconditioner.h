@@ -18,7 +18,7 @@ static int find_lattices(const linear_system *of, lattice *all)
 {
   double *next = of->work->roots;
   int sound = 1;
-  describe_lattices(of->step->given, all);
+  describe_lattices(of->step->arrays, all);
   for (lattice *one = all; one < all + LATTICES; one++)
     for (int a = 0; a < one->axes; a++) {
       const long long size = one->size[a];

@@ -29,7 +29,7 @@ static work_arrays bind_work_arrays(const run_memory *run, long long n)
 /* Data shared by the substeps. */
 typedef struct {
   run_memory *run;
-  const problem *given;
+  const problem *arrays;
   const work_arrays *work;
   constraint_system held;
   long long n;
@@ -37,10 +37,10 @@ typedef struct {
   solver_report *report;
 } constrained_run;
 
-static inline constrained_run constrained_run_of(run_memory *run, const problem *given, const work_arrays *work,
+static inline constrained_run constrained_run_of(run_memory *run, const problem *arrays, const work_arrays *work,
     const solver_options *options, solver_report *report)
 {
-  const constrained_run of = {run, given, work, constraint_arrays(run, work->n), work->n, options, report};
+  const constrained_run of = {run, arrays, work, constraint_arrays(run, work->n), work->n, options, report};
   return of;
 }
 
@@ -67,14 +67,14 @@ static void find_forces(const constrained_run *of, const double *X, const double
   (void)dp;
 #endif
   memset(F, 0, sizeof(double) * (size_t)of->n);
-  add_forces(of->run, of->given, X, t, 1.0, F);
+  add_forces(of->run, of->arrays, X, t, 1.0, F);
 }
 
 /* Computes forces, constraint derivatives and their matrix at the state. */
 static int begin(const constrained_run *of)
 {
   find_forces(of, of->run->q, NULL, of->run->t, of->work->F);
-  evaluate_constraints(of->given, of->run->q, of->run->t, of->held.g, of->held.rate, of->held.derivative);
+  evaluate_constraints(of->arrays, of->run->q, of->run->t, of->held.g, of->held.rate, of->held.derivative);
   return assemble(&of->held, of->run->inverse_mass) ? OK : SINGULAR;
 }
 
@@ -128,11 +128,11 @@ static int solve_positions(const constrained_run *of, double h, double t, double
   const work_arrays *work = of->work;
   progress now = before_iterations();
   compute_constraint_forces(held, held->lambda, work->R, of->n);
-  for (int k = 0;; k++) {
+  for (int iteration = 0;; iteration++) {
     int status;
     double moved;
     *size = trial_increments(of, h);
-    evaluate_constraints(of->given, work->Y, t, held->g, held->rate, held->next);
+    evaluate_constraints(of->arrays, work->Y, t, held->g, held->rate, held->next);
     for (long long k = 0; k < held->count; k++)
       held->right[k] = -2.0 / (h * h) * held->g[k];
     if (now.status || !held->is_exact)
@@ -145,7 +145,7 @@ static int solve_positions(const constrained_run *of, double h, double t, double
     add_to(held->lambda, held->change, 1.0, held->count);
     compute_constraint_forces(held, held->change, work->F, of->n);
     moved = h * h / 2 * (h * h / 2) * push(work->R, work->F, 1.0, of->run->inverse_mass, of->n);
-    take_change(&now, relative_change(moved, of->options->absolute ? 1.0 : *size), of->options, k, of->report);
+    take_change(&now, relative_change(moved, of->options->absolute ? 1.0 : *size), of->options, iteration, of->report);
   }
 }
 
@@ -232,10 +232,10 @@ static int constrained_substep(const constrained_run *of, double h, double t)
 
 /* Performs a step. The increments start with the compensation terms of the state; a failed step leaves the state
  * unchanged and discards the predictor. */
-static int perform_step(run_memory *run, const problem *given, const work_arrays *work, const solver_options *options,
+static int perform_step(run_memory *run, const problem *arrays, const work_arrays *work, const solver_options *options,
     solver_report *report)
 {
-  const constrained_run of = constrained_run_of(run, given, work, options, report);
+  const constrained_run of = constrained_run_of(run, arrays, work, options, report);
   const long long n = work->n;
   int status = OK;
   run->error = NAN;

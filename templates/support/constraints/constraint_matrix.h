@@ -77,12 +77,12 @@ static long long find_row(const pattern *of, int k, long long pairs)
 /* Computes the pattern of the constraints of a run; returns the number of pairs. */
 static long long find_pairs(run_memory *run)
 {
-  const problem *given = &run->data;
-  const long long n = coordinates_of(given), count = run->constraints;
+  const problem *arrays = &run->data;
+  const long long n = coordinates_of(arrays), count = run->constraints;
   const pattern of = pattern_of(run, n);
   condition now = {.first = of.first, .place = of.place};
   long long pairs = 0;
-  list_coordinates(given, &now);
+  list_coordinates(arrays, &now);
   of.first[count] = (int)now.entries;
   list_entries(&of, count, now.entries, n);
   for (long long k = 0; k < count; k++)

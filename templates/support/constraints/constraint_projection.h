@@ -17,7 +17,7 @@ static int project_positions(const constrained_run *of)
   for (int k = 0;; k++) {
     double moved = 0.0, size = 0.0;
     int status;
-    evaluate_constraints(of->given, work->Y, run->t, held->g, held->rate, held->derivative);
+    evaluate_constraints(of->arrays, work->Y, run->t, held->g, held->rate, held->derivative);
     if (!assemble(held, run->inverse_mass))
       return SINGULAR;
     compute_constraint_forces(held, held->lambda, work->R, of->n);

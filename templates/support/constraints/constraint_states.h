@@ -72,10 +72,10 @@ static void values_of_run(run_memory *run, double *g, double *rate)
  * changed. */
 static int multipliers_of_run(run_memory *run, double *lambda)
 {
-  const problem *given = &run->data;
+  const problem *arrays = &run->data;
   solver_report report = {0};
-  const work_arrays work = bind_work_arrays(run, coordinates_of(given));
-  const constrained_run of = constrained_run_of(run, given, &work, NULL, &report);
+  const work_arrays work = bind_work_arrays(run, coordinates_of(arrays));
+  const constrained_run of = constrained_run_of(run, arrays, &work, NULL, &report);
   const constraint_system *held = &of.held;
   double *F = of.work->D, *pulled = of.work->Y;
   int status = run->guess ? OK : begin(&of);
@@ -84,7 +84,7 @@ static int multipliers_of_run(run_memory *run, double *lambda)
   find_forces(&of, run->q, NULL, run->t, F);
   for (long long i = 0; i < of.n; i++)
     pulled[i] = run->inverse_mass[i] * run->p[i];
-  compute_second_derivatives(given, run->q, pulled, run->t, held->g);
+  compute_second_derivatives(arrays, run->q, pulled, run->t, held->g);
   memset(lambda, 0, sizeof(double) * (size_t)held->count);
   for (int round = 0; status == OK && round < REFINEMENTS; round++) {
     compute_constraint_forces(held, lambda, of.work->R, of.n);

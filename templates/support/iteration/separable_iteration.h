@@ -367,7 +367,7 @@ static inline void measure_points(const step_points *w, const solver_options *op
   const double resolved = part_of_position(options);
   double largest = 0.0;
   sums all;
-  describe_coordinate_arrays(w->step->given, array);
+  describe_coordinate_arrays(w->step->arrays, array);
   begin_blocks(&all, w->step);
   EACH_BLOCK (all) {
     double values[COORDINATE_ARRAYS] = {0.0};

@@ -837,9 +837,9 @@ static int take_trials(run_memory *run, const job *way, solver_report *report)
   solver_options standard = NAME(default_options)();
   const solver_options *options = way->options ? way->options : &standard;
   trial now = {.at = {run->t, run->t_low, run->q, run->p, run->carry_q, run->carry_p}, .t_end = way->t_end};
-  const work_arrays work = bind_work_arrays(run, coordinates_of(way->given));
+  const work_arrays work = bind_work_arrays(run, coordinates_of(way->arrays));
   array_motion motion = {{0.0}, {0.0}};
-  now.step = step_of(run, way->given, &work);
+  now.step = step_of(run, way->arrays, &work);
   now.step.h = 0.0;
   now.step.motion = &motion;
   now.dq = work.dq, now.dp = work.dp;

@@ -46,7 +46,7 @@ def sizes_text(layout: Layout, text: str) -> Iterator[str]:
     """Yield declarations of the sizes that occur in a source."""
     for k, name in enumerate(layout.sizes):
         if re.search(rf"\bsize_{name}\b", text):
-            yield f"const long long size_{name} = given->size[{k}];"
+            yield f"const long long size_{name} = arrays->size[{k}];"
 
 
 class Sharing(Enum):
@@ -125,15 +125,15 @@ def function_of_sizes(layout: Layout, head: str, lines: Sequence[str]) -> str:
     text = "\n".join(lines)
     starts = list(starts_text(layout, text))
     sizes = sizes_text(layout, "\n".join([text, *starts]))
-    body = "\n".join(f"  {line}" for line in (*sizes, *starts, "(void)given;", *lines))
+    body = "\n".join(f"  {line}" for line in (*sizes, *starts, "(void)arrays;", *lines))
     return f"{head}\n{{\n{body}\n}}"
 
 
 def describing_function(layout: Layout, name: str, kind: str, initialisers: Sequence[str]) -> str:
     """Return a function that stores structures of this kind, such as descriptions of arrays."""
     listed = (f"    {each}," for each in initialisers)
-    lines = [f"const {kind} each[] = {{", *listed, "};", "memcpy(all, each, sizeof each);"]
-    return function_of_sizes(layout, f"static void describe_{name}(const problem *given, {kind} *all)", lines)
+    lines = [f"const {kind} described[] = {{", *listed, "};", "memcpy(all, described, sizeof described);"]
+    return function_of_sizes(layout, f"static void describe_{name}(const problem *arrays, {kind} *all)", lines)
 
 
 class Nest:
@@ -225,7 +225,7 @@ class Nest:
     def _parts(self, loop: Loop, inner: Sequence[str], behind: Sequence[Sequence[str]]) -> list[str]:
         """Return the innermost loop, divided into parts if necessary."""
         first, end = self._span(loop)
-        accesses = (*self.rolled.reads, *self.rolled.writes, *self.rolled.given)
+        accesses = (*self.rolled.reads, *self.rolled.writes, *self.rolled.constants)
         places = [place for access in accesses for place in access.places]
         moved = {place.base.number for place in places if place.index == loop.index and not place.table}
         offsets = sorted(moved - {0}) if loop.periodic else []
@@ -308,7 +308,7 @@ class Nest:
         for k, slot in enumerate(self.rolled.reads):
             if self.depth_of(slot) == depth_of and self.source:
                 yield self.read(k, slot)
-        for k, access in enumerate(self.rolled.given):
+        for k, access in enumerate(self.rolled.constants):
             if self.depth_of(access) == depth_of:
                 yield self.constant(k, access)
 
@@ -353,9 +353,9 @@ class Nest:
         elif self.source:
             known += [f"const {self.scalar} u[1] = {{0}};", f"(void){self.source};"]
         if values:
-            count = max(1, self.scalars + len(self.rolled.given))
+            count = max(1, self.scalars + len(self.rolled.constants))
             known += [f"{values};", f"double parameters[{count}] = {{0}};"]
-            known += [f"parameters[{k}] = given->parameters[{k}];" for k in range(self.scalars)]
+            known += [f"parameters[{k}] = arrays->parameters[{k}];" for k in range(self.scalars)]
         body = [*sizes_text(self.layout, "\n".join([*known, *lines])), *known, *lines]
         text = "\n".join(wrapped(line.strip(), indent=2 + len(line) - len(line.lstrip())) for line in body)
         whole = (argument.replace(" ", "\0") for argument in arguments)
@@ -367,7 +367,7 @@ class Nest:
         for kind, arrays, number in (("field", self.layout.fields, "double"), ("table", self.layout.tables, "int")):
             for k, array in enumerate(arrays):
                 if f"{kind}_{array.name}[" in text:
-                    yield f"const {number} *{kind}_{array.name} = given->{kind}[{k}];"
+                    yield f"const {number} *{kind}_{array.name} = arrays->{kind}[{k}];"
         if "image[" in text and self.scalar == "lanes":
             yield "const lanes *image = sums->values;"
             yield "const long long length = sums->length;"
@@ -377,7 +377,7 @@ class Nest:
             yield "lanes *transposed = sums->transposed;"
         for loop in self.rolled.loops:
             if loop.near:
-                yield f"const neighbours *near_{loop.near} = given->near_{loop.near};"
+                yield f"const neighbours *near_{loop.near} = arrays->near_{loop.near};"
 
 
 def counter(loop: Loop) -> str:

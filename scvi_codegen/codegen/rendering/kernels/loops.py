@@ -78,7 +78,7 @@ def loop_context(program: ArrayProgram) -> dict[str, Any]:
         "vector_functions": _vector_functions(program),
         "coordinates": function_of_sizes(
             layout,
-            "static long long coordinates_of(const problem *given)",
+            "static long long coordinates_of(const problem *arrays)",
             [f"return {' + '.join(map(product_text, layout.coordinates))};"],
         ),
         "fixed_point": fixed_point
@@ -88,7 +88,7 @@ def loop_context(program: ArrayProgram) -> dict[str, Any]:
         "site_functions": [_site_text(program, each) for each in (*loops.velocities, *loops.momenta)],
         "field_lengths": function_of_sizes(
             layout,
-            "static void field_lengths(const problem *given, long long *length)",
+            "static void field_lengths(const problem *arrays, long long *length)",
             [*(f"length[{k}] = {length};" for k, length in enumerate(lengths)), "(void)length;"],
         ),
         "maps": describing_function(layout, "maps", "momentum_map", [*_map_texts(program)]),
@@ -96,7 +96,7 @@ def loop_context(program: ArrayProgram) -> dict[str, Any]:
         "waves": _lattice_context(program) if _on_lattices(program) else None,
         "arrays": function_of_sizes(
             layout,
-            "static inline void describe_coordinate_arrays(const problem *given, coordinate_array *all)",
+            "static inline void describe_coordinate_arrays(const problem *arrays, coordinate_array *all)",
             ["long long end = 0;", *_appended_arrays(program)],
         ),
         **_constraint_context(program, constrained),
@@ -106,7 +106,7 @@ def loop_context(program: ArrayProgram) -> dict[str, Any]:
 def _appended_arrays(program: ArrayProgram) -> Iterator[str]:
     """Yield the statements that describe the arrays of coordinates."""
     for k, array in enumerate(program.layout.coordinates):
-        is_field = any(couples_elements(array, each.reads, each.given) for each in program.loops.applied)
+        is_field = any(couples_elements(array, each.reads, each.constants) for each in program.loops.applied)
         yield f"end = append_array(&all[{k}], end, {product_text(array)}, {int(is_field)});"
 
 
@@ -147,7 +147,7 @@ def _stages(sums: Sequence[Convolution]) -> list[tuple[int, str, int]]:
 
 def _plans(program: ArrayProgram) -> list[tuple[str, int]]:
     """Return the arrays of coefficients and powers of all circulant matrices; of sums over pairs the power is 0."""
-    pairs = [(each.given[0].array.name, 0) for each in _circulants(program)]
+    pairs = [(each.constants[0].array.name, 0) for each in _circulants(program)]
     return [*dict.fromkeys([*pairs, *(stage[1:] for sums in program.layout.sums for stage in _stages(sums))])]
 
 
@@ -221,11 +221,18 @@ def _force_text(program: ArrayProgram, rolled: RolledKernel) -> str:
     zero = [] if all(inner) else ["const lanes zero = {0};"]
     factor = ["double by"] if explicit else []
     direction = [f"const lanes *{DIRECTION}"] if rolled.along else []
-    arguments = ["const problem *given", "const lanes *restrict X", "times t", *direction, *factor, "lanes *restrict F"]
+    arguments = [
+        "const problem *arrays",
+        "const lanes *restrict X",
+        "times t",
+        *direction,
+        *factor,
+        "lanes *restrict F",
+    ]
     arguments += ["const window *here", *(["const images *sums"] if _has_sums(rolled) else [])]
     if sharing is Sharing.BY_PLACES:
         zero.append("const int whole = here->whole;")
-    body = ["(void)given, (void)here;", *zero, *lines]
+    body = ["(void)arrays, (void)here;", *zero, *lines]
     head, values = f"static void add_{rolled.kernel.name}", f"lanes value[{len(rolled.writes)}]"
     text = nest.function(head, arguments, body, values=values)
     return f"{text}\n\n{_sharing_text(program, rolled)}"
@@ -243,14 +250,14 @@ def _circulant_text(program: ArrayProgram, rolled: RolledKernel) -> str:
         f"{name}(u, t, parameters, value);",
         "return value[0];",
     ]
-    arguments = ["const problem *given", "times t", "circulant *matrix"]
+    arguments = ["const problem *arrays", "times t", "circulant *matrix"]
     force = nest.function(f"static lanes describe_{name}", arguments, lines, values="lanes value[2]")
     return f"{force}\n\n{_energy_text(program, rolled, scalar, before=[unit])}" if scalar else force
 
 
 def _matrix_of_pairs(program: ArrayProgram, rolled: RolledKernel) -> str:
     """Return the description of the circulant matrix of a sum over pairs in C."""
-    array, name = rolled.reads[0].array, rolled.given[0].array.name
+    array, name = rolled.reads[0].array, rolled.constants[0].array.name
     return f"(circulant){_circulant_matrix(program, array, rolled.circulant or 0, name, 0)}"
 
 
@@ -259,7 +266,7 @@ def _circulant_matrix(program: ArrayProgram, array: Array, axis: int, coefficien
     outer, inner = (product_text(replace(array, axes=axes)) for axes in (array.axes[:axis], array.axes[axis + 1 :]))
     plan, size = _plans(program).index((coefficients, power)), size_text(array.axes[axis])
     field = [each.name for each in program.layout.fields].index(coefficients)
-    return f"{{start_{array.name}, {outer}, {size}, {inner}, given->field[{field}], {power}, {plan}}}"
+    return f"{{start_{array.name}, {outer}, {size}, {inner}, arrays->field[{field}], {power}, {plan}}}"
 
 
 def _list_text(program: ArrayProgram, components: int, lengths: RolledKernel) -> str:
@@ -267,18 +274,18 @@ def _list_text(program: ArrayProgram, components: int, lengths: RolledKernel) ->
     nest = Nest(program.layout, lengths, "double", "")
     start, name = nest.place_of(lengths.writes[0]), lengths.kernel.name
     lines = [
-        f"{name}(NULL, 0.0, given->parameters, of->lengths);",
+        f"{name}(NULL, 0.0, arrays->parameters, of->lengths);",
         f"of->start = {start};",
         f"of->count = {size_text(lengths.writes[0].array.axes[0])};",
         f"of->components = {components};",
     ]
-    text = nest.function(f"static void describe_{name}", ["const problem *given", "points *of"], lines)
+    text = nest.function(f"static void describe_{name}", ["const problem *arrays", "point_list *of"], lines)
     return f"{kernel_text(lengths.kernel, DOUBLE)}\n\n{text}"
 
 
 def _sharing_text(program: ArrayProgram, rolled: RolledKernel) -> str:
     """Return a function that describes how threads share a term group."""
-    head = f"static sharing share_{rolled.kernel.name}(const run_memory *run, const problem *given, long long n)"
+    head = f"static sharing share_{rolled.kernel.name}(const run_memory *run, const problem *arrays, long long n)"
     lines = ["(void)run, (void)n;", f"return {sharing_text(rolled)};"]
     return f"/* Its rounds of tasks. */\n{function_of_sizes(program.layout, head, lines)}"
 
@@ -296,9 +303,9 @@ def _function(
 ) -> str:
     """Return a function of numbers with the same statements for every element, and others before."""
     nest = Nest(program.layout, rolled, "double", source)
-    text = ["(void)given;", *before, *nest.text(innermost=lines)]
+    text = ["(void)arrays;", *before, *nest.text(innermost=lines)]
     declared = f"double value[{values}]" if values else ""
-    return nest.function(f"static void {name}", ["const problem *given", *arguments], text, values=declared)
+    return nest.function(f"static void {name}", ["const problem *arrays", *arguments], text, values=declared)
 
 
 def _energy_text(
@@ -309,7 +316,7 @@ def _energy_text(
     arguments += ["const double *image", "long long length"] if _has_sums(rolled) else []
     call = f"{kernel.name}(u, t, parameters, value);"
     if declared:
-        return f"static void sum_{kernel.name}(const problem *given, {', '.join(arguments)});"
+        return f"static void sum_{kernel.name}(const problem *arrays, {', '.join(arguments)});"
     if before:
         matrix = _matrix_of_pairs(program, rolled)
         added = "if (add_energy(&matrix, q, value[0], total))"
@@ -336,7 +343,7 @@ def _constraint_context(program: ArrayProgram, held: ConstrainedSteps | None) ->
         "curvatures": [each.kernel.name for each in held.curvatures],
         "counts": function_of_sizes(
             program.layout,
-            "static void count_constraints(const problem *given, run_memory *run)",
+            "static void count_constraints(const problem *arrays, run_memory *run)",
             [f"run->constraints = {' + '.join(counts)};", f"run->entries = {' + '.join(entries)};"],
         ),
     }
@@ -358,7 +365,7 @@ def _constraint_texts(program: ArrayProgram, condition: RolledKernel, curvature:
     lines = [f"{second}(u, t, parameters, value);", "now->g[now->count++] = value[0];"]
     arguments = [X, f"const double *restrict {DIRECTION}", "double t", now]
     yield _function(program, curvature, f"find_{second}", arguments, lines)
-    bare = replace(condition, reads=(), given=())
+    bare = replace(condition, reads=(), constants=())
     places = map(Nest(program.layout, bare, "", "").place_of, condition.writes)
     lines = [
         "now->first[now->count++] = (int)now->entries;",
