@@ -34,22 +34,25 @@ class Scheme(NamedTuple):
 
 @dataclass(frozen=True)
 class Chart:
-    """Another origin and other units: x = x'/length + origin, and L' = energy L."""
+    """Another origin and other units: x = x'/length + origin, t = t'/time, and L' = energy L."""
 
     origin: float
     length: float
+    time: float
     energy: float
 
     def formula(self, text: str, names: list[str]) -> str:
-        """Return a formula of x, x_dot and p of the chart for one of those at home."""
+        """Return a formula of x, x_dot and t of the chart for one of those at home."""
 
         def at_home(match: re.Match[str]) -> str:
             name, part, entry = match[1], match[2] or "", match[3] or ""
+            if name in ("t", STOP):
+                return f"({name}/{self.time!r})"
             if part:
-                return f"({name}{part}{entry}/{self.length!r})"
+                return f"({name}{part}{entry}*{self.time / self.length!r})"
             return f"({name}{entry}/{self.length!r} + {self.origin!r})"
 
-        return re.sub(rf"\b({'|'.join(names)})(_dot)?\b(\[[^\]]*\])?", at_home, text)
+        return re.sub(rf"\b({'|'.join(names)}|t|{STOP})(_dot)?\b(\[[^\]]*\])?", at_home, text)
 
     def scaled(self, text: str, factor: float, names: list[str]) -> str:
         return f"{factor!r}*({self.formula(text, names)})"
@@ -107,6 +110,7 @@ class Problem:
             power = chart.energy / chart.length
             formulas = {"lagrangian": chart.scaled(home["lagrangian"], chart.energy, names)}
             formulas["constraints"] = [chart.formula(g, names) for g in home.get("constraints", ())]
+            formulas["damping"] = home.get("damping") and chart.scaled(home["damping"], 1.0 / chart.time, names)
             formulas["forces"] = {x: chart.scaled(f, power, names) for x, f in home.get("forces", {}).items()}
             return {**home, **{name: formula for name, formula in formulas.items() if formula}}
 
@@ -114,10 +118,12 @@ class Problem:
             self,
             name=f"{self.name} elsewhere",
             q=tuple(chart.length * (x - chart.origin) for x in self.q),
-            x=tuple(chart.length * v for v in self.x),
+            x=tuple(chart.length / chart.time * v for v in self.x),
+            h=chart.time * self.h,
             event=chart.formula(self.event, self.coordinates),
             text=text(self.coordinates, self.text),
             array=self.array and text(["q"], self.array),
+            inputs={u: tuple(c / chart.time**k for k, c in enumerate(cubic)) for u, cubic in self.inputs.items()},
         )
 
     def of_known_size(self) -> Problem:
@@ -290,20 +296,41 @@ def truth_of(problem: Problem) -> Truth:
     return Truth(problem)
 
 
-def _chain(count: int) -> tuple[str, dict[str, str]]:
-    """L and the forces of a chain with masses m0, m1, .. written out."""
-    kinetic = "+".join(f"m{i}*q{i}_dot**2/2" for i in range(count))
-    springs = "+".join(f"k*(q{i + 1}-q{i})**2/2 + b*(q{i + 1}-q{i})**4/4" for i in range(count - 1))
-    own = "+".join(f"(1 + a*cos(t))*q{i}**2/2" for i in range(count))
-    forces = {f"q{i}": f"-c*q{i}_dot*m{i} + sin(2*t)/3 + e*sqrt({STOP} - t)" for i in range(count)}
-    return f"{kinetic} - ({springs}) - ({own})", forces
-
-
-CHAIN = 4
-CHAIN_L, CHAIN_FORCES = _chain(CHAIN)
-CHAIN_VALUES = {"k": 1.0, "b": 0.1, "a": 0.2, "c": 0.1, "e": 0.01, STOP: 100.0}
-MASSES, OTHER_MASSES = (1.0, 1.0, 1.0, 1.0), (1.3, 0.7, 2.1, 0.9)
 HIGH, LOW = 3e-8, 3e-3
+
+
+def chain(name: str, own: Mapping[str, float], masses: tuple[float, ...], b: float, force: str, **more: Any) -> Problem:
+    """Return a chain of unlike masses, as an array and written out, with springs k x^2/2 + b x^4/4 and forces of i."""
+    count = len(masses)
+    parameters = {**dict.fromkeys(own, 0.1), "k": 1.0, "a": 0.2}
+    parameters |= {STOP: 100.0} if STOP in force else {}
+    kinetic = "+".join(f"m{i}*q{i}_dot**2/2 - (1 + a*cos(t))*q{i}**2/2" for i in range(count))
+    springs = "+".join(f"k*(q{i + 1}-q{i})**2/2 + {b}*(q{i + 1}-q{i})**4/4" for i in range(count - 1))
+    entry = re.compile(r"\b([mq])(_dot)?\[i\]")
+    return Problem(
+        name=name,
+        q=(0.3, -0.2, 0.5, 0.1)[:count],
+        x=(0.1, 0.4, -0.3, 0.2)[:count],
+        own={**own, **{f"m{i}": mass for i, mass in enumerate(masses)}},
+        event="q0 - q2*k/4",
+        text={
+            "coordinates": [f"q{i}" for i in range(count)],
+            "parameters": {**parameters, **{f"m{i}": 1.0 for i in range(count)}},
+            "lagrangian": f"{kinetic} - ({springs})",
+            "forces": {f"q{i}": entry.sub(rf"\g<1>{i}\g<2>", force) for i in range(count)},
+        },
+        array={
+            "coordinates": ["q[N]"],
+            "parameters": {**parameters, "m[N]": 1.0},
+            "lagrangian": f"""sum(i in N, m[i]*q_dot[i]**2/2 - (1 + a*cos(t))*q[i]**2/2)
+                - sum(i in 0..N-2, k*(q[i+1] - q[i])**2/2 + {b}*(q[i+1] - q[i])**4/4)""",
+            "forces": {"q[i]": force},
+        },
+        fields={"m": masses},
+        kind="array",
+        **more,
+    )
+
 
 AT_HOME: tuple[Problem, ...] = (
     Problem(
@@ -315,6 +342,8 @@ AT_HOME: tuple[Problem, ...] = (
             Scheme("svi:4", "fixed-point", HIGH),
             Scheme("svi:3", "newton", HIGH),
             Scheme("gauss:4", "auto", HIGH),
+            Scheme("radau-iia:4", "auto", HIGH),
+            Scheme("explicit-euler", "auto", 0.1),
             Scheme("svi:8", "auto", HIGH, "double-double"),
         ),
         event="x - y - l - t/50",
@@ -525,62 +554,31 @@ AT_HOME: tuple[Problem, ...] = (
         work=True,
         kind="driven",
     ),
-    Problem(
+    chain(
         name="array",
-        q=(0.3, -0.2, 0.5, 0.1),
-        x=(0.1, 0.4, -0.3, 0.2),
-        own={"k": 1.6, "b": 0.3, "a": 0.5, "c": 0.2, "e": 0.05, **{f"m{i}": x for i, x in enumerate(OTHER_MASSES)}},
+        own={"k": 1.6, "a": 0.5, "c": 0.2, "e": 0.05},
+        masses=(1.3, 0.7, 2.1, 0.9),
+        b=0.3,
+        force=f"-c*q_dot[i]*m[i] + sin(2*t)/3 + e*sqrt({STOP} - t)",
         methods=(Scheme("svi:4", "fixed-point", HIGH), Scheme("gauss:9", "fixed-point", HIGH)),
-        event="q0 - q2*k/4",
-        text={
-            "coordinates": [f"q{i}" for i in range(CHAIN)],
-            "lagrangian": CHAIN_L,
-            "parameters": {**CHAIN_VALUES, **{f"m{i}": x for i, x in enumerate(MASSES)}},
-            "forces": CHAIN_FORCES,
-        },
-        array={
-            "coordinates": ["q[N]"],
-            "parameters": {**CHAIN_VALUES, "m[N]": 1.0},
-            "lagrangian": """sum(i in N, m[i]*q_dot[i]**2/2 - (1 + a*cos(t))*q[i]**2/2)
-                - sum(i in 0..N-2, k*(q[i+1] - q[i])**2/2 + b*(q[i+1] - q[i])**4/4)""",
-            "forces": {"q[i]": f"-c*q_dot[i]*m[i] + sin(2*t)/3 + e*sqrt({STOP} - t)"},
-        },
-        fields={"m": OTHER_MASSES},
-        kind="array",
     ),
-    Problem(
+    chain(
         name="array without friction",
-        q=(0.3, -0.2, 0.5),
-        x=(0.1, 0.4, -0.3),
-        own={"k": 1.6, "a": 0.5, "e": 0.3, **{f"m{i}": x for i, x in enumerate(OTHER_MASSES[:3])}},
+        own={"k": 1.6, "a": 0.5, "e": 0.3},
+        masses=(1.3, 0.7, 2.1),
+        b=1.0,
+        force="e*sin(2*t - q[i])",
         methods=(
             Scheme({"method": "composition", "order": 8}, "fixed-point", HIGH),
             Scheme("stoermer-verlet", "fixed-point", LOW),
             Scheme("svi:4", "newton", HIGH),
         ),
-        event="q0 - q2*k/4",
-        text={
-            "coordinates": ["q0", "q1", "q2"],
-            "lagrangian": "+".join(f"m{i}*q{i}_dot**2/2 - (1 + a*cos(t))*q{i}**2/2" for i in range(3))
-            + "".join(f" - k*(q{i + 1} - q{i})**2/2 - (q{i + 1} - q{i})**4/4" for i in range(2)),
-            "parameters": {"k": 1.0, "a": 0.2, "e": 0.1, "m0": 1.0, "m1": 1.0, "m2": 1.0},
-            "forces": {f"q{i}": f"e*sin(2*t - q{i})" for i in range(3)},
-        },
-        array={
-            "coordinates": ["q[N]"],
-            "parameters": {"k": 1.0, "a": 0.2, "e": 0.1, "m[N]": 1.0},
-            "forces": {"q[i]": "e*sin(2*t - q[i])"},
-            "lagrangian": """sum(i in N, m[i]*q_dot[i]**2/2 - (1 + a*cos(t))*q[i]**2/2)
-                - sum(i in 0..N-2, k*(q[i+1] - q[i])**2/2 + (q[i+1] - q[i])**4/4)""",
-        },
-        fields={"m": OTHER_MASSES[:3]},
-        kind="array",
         h=0.03,
     ),
 )
 
-ELSEWHERE = Chart(origin=2.0, length=1e3, energy=1e6)
-"""Millimetres from an origin two metres away: momenta in units that are a thousand times smaller, too."""
+ELSEWHERE = Chart(origin=2.0, length=1e3, time=10.0, energy=1e6)
+"""Millimetres from an origin two metres away, and tenths of seconds."""
 
 
 def named(name: str) -> Problem:

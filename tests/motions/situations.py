@@ -179,6 +179,10 @@ class Case:
         plan = {"t_end": self.setting.t + self.span} if self.kind == "reversible" else {}
         return self.stepper.start(np.array(self.problem.q), **self.moving(), **self.common(h=self.h, **plan, **more))
 
+    def start_adaptive(self, **plan: Any) -> Any:
+        """A run by adaptive steps to be advanced."""
+        return self.stepper.start(np.array(self.problem.q), **self.moving(), **self.common(**plan))
+
     def from_checkpoint(self, run: Any, saved: bytes) -> Any:
         """The run again, in a stepper that was pickled."""
         stepper = pickle.loads(pickle.dumps(self.stepper))

@@ -133,31 +133,6 @@ def test_kepler(e: str) -> None:
         assert largest(as_mpmath(p) - run.mp("p")[3]) < 1e-29
 
 
-def test_output_times_and_events() -> None:
-    """Dense output, output times, events and thinned runs are met with both words."""
-    with mp.workdps(50):
-        each = stepper("svi:12", RADIUS)
-        run = each.integrate(**start("0.5"), h=0.125, steps=60, events="y")
-        thinned = each.integrate(**start("0.5"), h=0.125, steps=60, save_every=7)
-        times = each.integrate(**start("0.5"), h=0.125, t_end=6.5, t_eval=[0.1, 3.3])
-        for k, t in enumerate((0.1, 3.3)):
-            for states in (run, thinned):
-                q = as_mpmath(states.at([t])[0][0])
-                assert largest(q - times.mp("q")[k]) < 1e-29
-        assert np.abs(thinned.sensitivity().state[-1] - run[:57].sensitivity().state[-1]).max() < 1e-10
-        crossings = [t.mp() for t in run.events[0].t]
-        assert len(crossings) == 2
-        assert largest(t - (k + 1) * mp.pi for k, t in enumerate(crossings)) < 1e-28
-        assert largest(as_mpmath(run.events[0].q)[:, 1]) < 1e-30
-        ended = each.integrate(**start("0.5"), h=0.125, steps=60, events=sc.Event("y", -1, terminal=True))
-        assert abs(ended.mp("t")[-1] - mp.pi) < 1e-28
-        halves = each.start(**start("0.5"), h=0.125)
-        halves.advance(20)
-        again = each.from_checkpoint(halves.checkpoint()).record(40)
-        assert (again.mp("q") == run.mp("q")[20:]).all()
-        assert (again.mp("t") == run.mp("t")[20:]).all()
-
-
 def test_reversible_controller() -> None:
     """Steps of equal tau are those of the step sizes dt = g dtau in physical time, and the last one ends at t_end."""
     run = reversible("svi:12").integrate(**start("0.5"), h=0.25, t_end=6.5)
