@@ -69,24 +69,23 @@ def known_digits(
         if steps > most:
             raise _TooLongError
 
-    compared = np.unique(np.linspace(0, len(trajectory) - 1, SAMPLES).astype(int))
-    times = trajectory.t[compared]
-    nudged = trajectory.q[0] * (1.0 + PERTURBATION * np.cos(np.arange(trajectory.q.shape[1])))
-    span: dict[str, Any] = {"t": float(times[0]), "t_end": float(times[-1])}
-    arguments = {**span, "parameters": trajectory.parameters, "progress": count}
+    rows = np.unique(np.linspace(0, len(trajectory) - 1, SAMPLES).astype(int))
+    times = trajectory.t[rows]
+    first, last = float(times[0]), float(times[-1])
+    start = trajectory.q[0] * (1.0 + PERTURBATION * np.cos(np.arange(trajectory.q.shape[1]))), trajectory.p[0]
+    arguments: dict[str, Any] = {"t": first, "t_end": last, "parameters": trajectory.parameters, "progress": count}
     try:
         stepper = second()
         if stepper.interface.inputs:
-            q, p = stepper.integrate(nudged, trajectory.p[0], inputs=inputs or {}, **arguments).at(times)
+            q, p = stepper.integrate(*start, inputs=inputs or {}, **arguments).at(times)
         else:
-            repeated = stepper.integrate(nudged, trajectory.p[0], t_eval=times, **arguments)
+            repeated = stepper.integrate(*start, t_eval=times, **arguments)
             q, p = repeated.q, repeated.p
     except (ScviCodegenError, _TooLongError):
         return None
-    positions = q
-    q, p = np.abs(q - trajectory.q[compared]), np.abs(p - trajectory.p[compared])
-    tenfold = _tenfold(relative_to_motion(np.linalg.norm(q, axis=1), positions), abs(float(times[-1] - times[0])))
-    return Known(q=_final_error(q), p=_final_error(p), tenfold=tenfold)
+    q_errors, p_errors = np.abs(q - trajectory.q[rows]), np.abs(p - trajectory.p[rows])
+    distances = relative_to_motion(np.linalg.norm(q_errors, axis=1), q)
+    return Known(q=_final_error(q_errors), p=_final_error(p_errors), tenfold=_tenfold(distances, abs(last - first)))
 
 
 def _final_error(difference: Array) -> Array:

@@ -362,8 +362,9 @@ def _check_determined(names: Sequence[str], jacobian: Array, sizes: Array, at_bo
 
 def _as_known(names: Sequence[str]) -> str:
     """Return advice on treating an unknown as known."""
+    unknown = "one of them" if len(names) > 1 else names[0] or "them"
     return (
-        f"Treat {names[0] or 'them' if len(names) == 1 else 'one of them'} as known: name only the parameters to "
+        f"Treat {unknown} as known: name only the parameters to "
         "estimate in unknown=[...] (by default all) and give values of the others in parameters={...}; "
         "fit_initial_state=False fixes the initial state (with p)"
     )

@@ -107,12 +107,9 @@ class PeriodicOrbit:
 
     def run(self, *, save_every: int = 1) -> Trajectory:
         """Return the trajectory of one period, every ``save_every``-th state; of adaptive steps a new adaptive run."""
-        adaptive = self.sequence.tolerance is not None
-        steps: dict[str, Any] = (
-            {"t_end": self.t + self.period, "tolerance": self.sequence.tolerance or None}
-            if adaptive
-            else {"h": self.period / self.steps, "steps": self.steps}
-        )
+        steps: dict[str, Any] = {"h": self.period / self.steps, "steps": self.steps}
+        if self.sequence.tolerance is not None:
+            steps = {"t_end": self.t + self.period, "tolerance": self.sequence.tolerance or None}
         return self.stepper.integrate(
             self.q, self.p, **steps, save_every=save_every, t=self.t, parameters=self.parameters, options=self.options
         )

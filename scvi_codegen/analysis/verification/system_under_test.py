@@ -129,13 +129,10 @@ class SystemUnderTest:
     @cached_property
     def parameters(self) -> dict[str, float]:
         """Values slightly off the defaults, if steps succeed: equal masses would hide interchanged ones."""
-        moved = {
-            name.name: value * (1 + PARAMETER_PERTURBATION * np.sin(k + 1.0))
-            if value
-            else PARAMETER_PERTURBATION * np.cos(k + 1.0)
-            for k, (name, value) in enumerate(self.system.constants.items())
-        }
-        at_zero = {name: float(moved[name] if value else 0.0) for name, value in self._defaults.items()}
+        moved = {}
+        for k, (name, value) in enumerate(self._defaults.items(), 1):
+            moved[name] = value * (1 + PARAMETER_PERTURBATION * np.sin(k)) or PARAMETER_PERTURBATION * np.cos(k)
+        at_zero = {name: moved[name] if value else 0.0 for name, value in self._defaults.items()}
         for values in (moved, at_zero):
             if self._works(values):
                 return {name: float(value) for name, value in values.items()}

@@ -38,6 +38,7 @@ def run_numbers(
     t, q, p = outcome.end
     iterations = int(np.sum(trajectory.iterations)) + run.iterations
     arrays = {"sizes": model.sizes, "tolerance": model.allowed_error, "iterations": iterations}
+    errors = final_error and {"q": _named(model, final_error.q), "p": _named(model, final_error.p)}
     return {
         **_about(model),
         **(arrays if model.array_system else {}),
@@ -55,9 +56,7 @@ def run_numbers(
         "step_error": trajectory.step_error,
         "worst_step_time": trajectory.worst_step_time,
         "final": {"t": t, "q": _named(model, q), "p": _named(model, p), **_low_words(model, q, p)},
-        "final_error": None
-        if final_error is None
-        else {"q": _named(model, final_error.q), "p": _named(model, final_error.p)},
+        "final_error": errors,
         "chaotic": None if final_error is None else final_error.chaotic,
         "failure": failure_text(outcome),
         "missed": outcome.missed or _missed_end(outcome, t, f"t = {model.t + model.covered:g}"),

@@ -345,6 +345,7 @@ class _StageExpressions:
 
     def _input_parts(self, c: float) -> list[list[Any]]:
         """Return the coefficients of each input in powers of the time since the point c."""
+        # u(c + x) = sum_k x^k C(d, k) sum_j B_j^(d-k)(c) D^k b_j, D the forward difference of coefficients b.
         degree, differences, columns = self.inputs.shape[1] - 1, self.inputs, []
         for power in range(HIGHEST + 1):
             left, values = degree - power, self.ca.SX.zeros(self.inputs.shape[0], 1)

@@ -140,11 +140,10 @@ class ArrayFlow(Flow):
         """
         m, values = self.stepper.dimension, self.parameter_values(parameters)
         count = len(self.stepper.parameters)
-        arguments = (
-            [self._number(value, "a parameter") for value in values]
-            if isinstance(values, list)
-            else [self._vector(values, count, "parameters")]
-        )
+        if isinstance(values, list):
+            arguments = [self._number(value, "a parameter") for value in values]
+        else:
+            arguments = [self._vector(values, count, "parameters")]
         ends = [self._number(t, "t"), self._number(h, "h")]
         result = self._along(self._concatenated(self._vector(q, m, "q"), self._vector(p, m, "p"), *arguments, *ends))
         result = result[..., -1, :] if self.save_every is None else result

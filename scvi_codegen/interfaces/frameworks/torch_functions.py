@@ -82,12 +82,13 @@ def _mapped(function: Callable[[], Any]) -> Any:
         *arguments, flow = rest
         axis_index = x.ndim - 1 if axes[0] is None else 0
         x = x if axes[0] is None else x.movedim(axes[0], 0)
-        along = [
-            tensor.unsqueeze(axis_index).expand(*tensor.shape[:axis_index], info.batch_size, *tensor.shape[axis_index:])
-            if axis is None
-            else tensor.movedim(axis, axis_index)
-            for tensor, axis in zip(arguments, axes[1:], strict=False)
-        ]
+        along = []
+        for tensor, axis in zip(arguments, axes[1:], strict=False):
+            if axis is None:
+                shape = (*tensor.shape[:axis_index], info.batch_size, *tensor.shape[axis_index:])
+                along.append(tensor.unsqueeze(axis_index).expand(shape))
+            else:
+                along.append(tensor.movedim(axis, axis_index))
         if axes[0] is not None:
             return function().apply(x, *along, flow), 0
         stacked = [tensor.flatten(axis_index, axis_index + 1) for tensor in along]

@@ -132,9 +132,10 @@ def tables_of_example(
     """Return the tables of all inputs (or none) for C, and all parameters at the start of a run over that time span."""
     whole = min(span), max(span) + 1.0  # of the only piece of a constant
     functions = {}
-    for name in system.inputs if inputs else ():
-        table = inputs[name]
-        functions[name] = input_of(name, table if isinstance(table, tuple) else (whole, (table, table)))
+    for name in system.inputs:
+        if inputs:
+            table = inputs[name]
+            functions[name] = input_of(name, table if isinstance(table, tuple) else (whole, (table, table)))
     tables = tuple(
         ExampleInput(name, tuple(spline.breakpoints.tolist()), tuple(map(tuple, spline.pieces[:, :POWERS].tolist())))
         for name, spline in functions.items()

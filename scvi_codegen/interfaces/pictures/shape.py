@@ -91,11 +91,7 @@ class MovingShape:
     def positions(self, t: Any, q: Values, p: Values, parameters: Any) -> Values:
         """Return the points (n, k, d) of states with t (n,), q and p (n, m), and parameters."""
         if self.mesh is not None:
-            nodes, field = np.meshgrid(*self.mesh["axes"].values(), indexing="ij"), self.mesh["fields"][0]
-            begin, end = field["columns"]
-            grids = [np.broadcast_to(np.ravel(coordinates), (len(q), end - begin)) for coordinates in nodes]
-            values = np.concatenate([q, p], axis=1)[:, begin:end] / field.get("weights", 1.0)
-            return np.stack([*grids, values], axis=2)
+            return _points_of_mesh(self.mesh, q, p)
         registers = [t, *np.transpose(q), *np.transpose(p), *parameters]
         for entry in self.program:
             if isinstance(entry, float):
@@ -107,6 +103,15 @@ class MovingShape:
         components = [[np.broadcast_to(registers[k], len(q)) for k in point] for point in self.points]
         result: Values = np.transpose(np.array(components, dtype=float), (2, 0, 1))
         return np.mod(result, [float(registers[k]) for k in self.box]) if self.box else result
+
+
+def _points_of_mesh(mesh: Mapping[str, Any], q: Values, p: Values) -> Values:
+    """Return the nodes of a mesh with the values of its first field there, (n, nodes, axes + 1)."""
+    nodes, field = np.meshgrid(*mesh["axes"].values(), indexing="ij"), mesh["fields"][0]
+    begin, end = field["columns"]
+    grids = [np.broadcast_to(np.ravel(coordinates), (len(q), end - begin)) for coordinates in nodes]
+    values = np.concatenate([q, p], axis=1)[:, begin:end] / field.get("weights", 1.0)
+    return np.stack([*grids, values], axis=2)
 
 
 class PointProgram:

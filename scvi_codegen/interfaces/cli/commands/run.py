@@ -150,7 +150,7 @@ def run(
     is_controlled = any(choices.get(name) is not None for name in OF_ADAPTIVE_STEPS)
     errors = {name: requested[name] for name in ("tolerance", "error") if requested[name] is not None}
     model = read_model(model_name, choices, errors if is_controlled else None)
-    _check_words(model, {"-o": output})
+    _check_output_of_words(model, output)
     if model.precision in (DOUBLE_DOUBLE, AUTO):
         model = model.with_known_sizes()
     if ensemble is not None:
@@ -169,7 +169,7 @@ def run(
         raise click.UsageError("a run with inputs cannot be recorded in a folder: write it to a file (-o NAME.npz)")
     states = None if ensemble is None else load_ensemble(ensemble, model)
     model, confirmation, member = _with_steps(model, requested, states)
-    _check_words(model, {"-o": output})  # with precision = "auto"
+    _check_output_of_words(model, output)  # with precision = "auto"
     if states is not None:
         _run_ensemble(replace(states, model=model), (output, plot), advised=requested["advise"], member=member)
         return
@@ -189,13 +189,10 @@ def _check_ensemble(model: Model) -> None:
     check_available(model, IN_ENSEMBLE)
 
 
-def _check_words(model: Model, options: dict[str, Any]) -> None:
-    """Reject options that states of two words do not have, if those of the model have two."""
-    for flag, value in options.items() if model.in_double_double else ():
-        kept = flag == "-o" and value is not None and (is_run_folder(value) or Path(value).suffix.lower() == ".npz")
-        if value is not None and not kept:
-            remedy = " (write a file NAME.npz)" if flag == "-o" else ""
-            model._check_double(f"{flag} {value}{remedy}")
+def _check_output_of_words(model: Model, output: str | None) -> None:
+    """Reject outputs that cannot hold states of two words, if those of the model have two."""
+    if output is not None and not is_run_folder(output) and Path(output).suffix.lower() != ".npz":
+        model._check_double(f"-o {output} (write a file NAME.npz)")
 
 
 def _check_confirmed(confirmation: GlobalError | None) -> None:
@@ -258,8 +255,8 @@ def _check_combination(
         raise click.UsageError(
             f"--{arguments[0]} and --{arguments[1]} exclude each other: each determines the step size; give one"
         )
-    for name in ("step", "steps") if arguments else ():
-        if choices[name] is not None:
+    for name in ("step", "steps"):
+        if arguments and choices[name] is not None:
             raise click.UsageError(f"--{arguments[0]} determines the step size: omit --{name} (--span is the duration)")
     if ensemble is not None and arguments:
         check_flag(ERRORS[arguments[0]], IN_ENSEMBLE)

@@ -146,12 +146,12 @@ def stage_section(system: MechanicalSystem, stages: StageSystem) -> Section:
 def idel_section(system: MechanicalSystem, stages: StageSystem) -> Section:
     """Return the section on the implicit discrete Euler-Lagrange equations (5) and the end of the step."""
     rows = list(_rows(system, stages, {"IDEL"}))
-    text = (
-        "The equations that relate the momenta p_k and p_(k+1) to the curve, (5): p_k is known, p_(k+1) "
-        "follows from the last one."
-        if rows
-        else "The end of the step:"
-    )
+    text = "The end of the step:"
+    if rows:
+        text = (
+            "The equations that relate the momenta p_k and p_(k+1) to the curve, (5): p_k is known, p_(k+1) "
+            "follows from the last one."
+        )
     return Section(
         name="idel",
         title="Implicit discrete Euler-Lagrange equations",

@@ -54,7 +54,8 @@ def key_hint(key: str, names: Iterable[str]) -> str:
         return here
     if key not in LOCATIONS and (hint := closest(key, names)) != ".":
         return hint
-    locations = [LOCATIONS[name] for name in ([key] if key in LOCATIONS else likely_names(key)) if name in LOCATIONS]
+    likely = [key] if key in LOCATIONS else likely_names(key)
+    locations = [LOCATIONS[name] for name in likely if name in LOCATIONS]
     return f"; {locations[0]}." if locations else "."
 
 

@@ -87,8 +87,8 @@ def _values_of_coordinates(
     for key in STATE:
         value: Any = section.get(key)
         where = f"[initial] {key}, "
-        for array in coordinate_arrays if isinstance(value, dict) else ():
-            if array.name in value:
+        for array in coordinate_arrays:
+            if isinstance(value, dict) and array.name in value:
                 entries[key, array.name] = ArrayValue(array, value[array.name], where + array.name)
     numbers = {parameter.name: value for parameter, value in system.constants.items()}
     read = _read_arrays(entries, {}, folder, numbers)
