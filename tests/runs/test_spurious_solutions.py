@@ -60,3 +60,13 @@ def test_unresolved_vibrations_are_no_spurious_solutions(solver: str) -> None:
         [1.0, 1.001], velocity=[0.0, 0.0], h=0.05, steps=500
     )
     assert np.ptp(run.energy()) < 1e-3
+
+
+def test_explicit_stages_have_no_spurious_solutions() -> None:
+    """A step of Euler's method from rest does not move, its halves do: q1 = q + h v, then v1 = v + h a."""
+    stepper, q, h, steps = sc.compile_stepper(PENDULUM, "explicit-euler"), np.array([0.3, 0.7]), 1e-3, 500
+    with pytest.warns(sc.AccuracyWarning):
+        run = stepper.integrate(q, [0.0, 0.0], h=h, steps=steps)
+    np.testing.assert_array_equal(run.q[1], q)
+    reference = sc.compile_stepper(PENDULUM, "svi:8").integrate(q, [0.0, 0.0], h=h, steps=steps)
+    np.testing.assert_allclose(run.q[-1], reference.q[-1], rtol=0.0, atol=5.0 * h)

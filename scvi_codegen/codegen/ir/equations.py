@@ -338,6 +338,12 @@ class FixedPointIteration:
         table = next(each for each in self.own_tables if each.name == name)
         return table.numbers if table.is_matrix else (table.numbers,)
 
+    @property
+    def is_explicit(self) -> bool:
+        """Whether points do not depend on the values there, so that the stage equations have one solution."""
+        tables = [table.numbers for table in self.own_tables if table.name in ("POSITION", "MOMENTUM")]
+        return bool(tables) and all(number == 0 for rows in tables for row in rows for number in row)
+
     def with_forces(self, forces: tuple[RolledKernel, ...]) -> FixedPointIteration | None:
         """Return the iteration with further forces L_q of positions; ``None`` if these also enter otherwise."""
         added = (each.with_sums(forces) if each.name in self.forces else each for each in self.kernels)
