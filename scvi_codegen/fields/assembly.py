@@ -312,6 +312,7 @@ class Assembly:
                 dense[axis] = np.linalg.matrix_power(discretised.differentiated(np.eye(count), 0), order)
 
         def value(places: Mapping[str, Place], left: Sequence[str]) -> Expr:
+            """Return the sums over the axes that are left, the last one outermost."""
             if not left:
                 return self.at(field, places, *sums)
             *others, axis = left

@@ -625,6 +625,7 @@ def _end_cells(name: str, rows: Array, weights: Array, fixed: tuple[bool, bool])
 
 
 def _closed(points: Array, masses: Array, order: int, inner: slice) -> ClosedPoints:
+    """Return all points of equidistant ones with ends; derivatives by the nearest ``order`` + 1 points."""
     count = len(points)
     first = np.clip(np.arange(count) - order // 2, 0, count - order - 1)
     neighbours: NDArray[np.int64] = first[:, None] + np.arange(order + 1)

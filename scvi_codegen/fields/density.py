@@ -57,6 +57,7 @@ class Density:
             self._check_regular()
 
     def _check_regular(self) -> None:
+        """Raise an error unless the kinetic part is a sum of m u_t^2/2 with m > 0 of position and parameters."""
         rates = self.rates
         masses = hessian(self.density, rates)
         for (i, j), entry in masses.items():

@@ -122,6 +122,7 @@ class Variations:
         return vanishes(Add(*terms).doit())
 
     def _law(self, name: str, symmetry: str, variation: Variation, divergence: Mapping[str, Expr]) -> ConservationLaw:
+        """Return the conservation law of a symmetry; rates of a Hamiltonian density are replaced by its equations."""
         current = {axis: -divergence.get(axis, S.Zero) for axis in (TIME, *self.system.space)}
         for derived, (variable, orders) in self.used.items():
             # L_(u_i) Q to J^i; of u_ij L_(u_ij) D_j Q to J^i and -D_i L_(u_ij) Q to J^j.

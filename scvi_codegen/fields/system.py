@@ -309,6 +309,7 @@ def _check_derivative(name: str, field: str, axes: Sequence[str], parameters: Ma
 
 
 def _bounds(axis: str, ends: Any) -> tuple[float, float]:
+    """Return the lower and upper bound of an axis."""
     if isinstance(ends, str) or not isinstance(ends, Collection) or len(ends) != 2:
         raise SystemDefinitionError(f"the axis '{axis}' needs a lower and an upper bound, not {ends!r}")
     lower, upper = (float(parse_expression(str(end), {})) for end in ends)

@@ -83,6 +83,7 @@ def with_constraints(system: MechanicalSystem, stages: StageSystem, name: str) -
 
 
 def _check_points(system: MechanicalSystem, stages: StageSystem, name: str) -> None:
+    """Raise an error unless the first stage group has s + 1 points, both ends of the step among them."""
     group, s = stages.stage_groups[0], len(stages.blocks)
     ends = (group.abscissae[0], group.abscissae[-1]) == (0, 1)
     if any(velocity_conditions(system)) and ends and not _is_polynomial(group):

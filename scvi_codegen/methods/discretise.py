@@ -171,6 +171,7 @@ def _rotated(
     """
     size, u, v = len(stages.rows), _symbols("turn", system), _symbols("change", system)
     moved, pushed = rotated(turns, system.coordinates, u, *rotations)
+    # Columns of gathers are those of q0, of the unknowns, of V and of P; columns of scatters of the rows, V, P and p1.
     name, others = "start" if first else "spin", Table.constant(1, size)
     unit, minus, none = Table.constant(1, 1, 1), Table.constant(1, 1, -1), Table.constant(1, 1)
     end, momentum = Table.joined(stages.end_position, none, none), stages.end_momentum

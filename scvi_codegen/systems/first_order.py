@@ -345,6 +345,7 @@ def shear(form: OneForm) -> tuple[Symbol, Expr, tuple[str, ...], Expr] | None:
 
 
 def _refusal(form: OneForm, refused: Sequence[Sequence[int]]) -> str:
+    """Return the message for a two-form without a suitable half of the coordinates, with a shear if one serves."""
     z, half = form.coordinates, len(form.coordinates) // 2
     start = f"the Lagrangian of '{form.name}' is linear in the velocities, theta . v - H. "
     if refused:

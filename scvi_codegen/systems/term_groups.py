@@ -145,6 +145,7 @@ def roll_terms(system: MechanicalSystem) -> SplitSystem | None:
 
 
 def _merged(groups: Sequence[TermGroup]) -> tuple[TermGroup, ...]:
+    """Return groups with the same places as one, the sum of their formulas."""
     merged: dict[tuple[tuple[int, ...], ...], TermGroup] = {}
     for group in groups:
         other = merged.setdefault(group.places, group)
@@ -201,6 +202,7 @@ class _Leaves:
     constants: list[Expr] = field(default_factory=list)
 
     def key(self, formula: Expr) -> str:
+        """Return the structure of a formula with numbered leaves, which are collected."""
         if formula.is_Pow:
             exponent = str(formula.exp) if formula.exp.is_Number else self.key(formula.exp)
             return f"({self.key(formula.base)})**({exponent})"

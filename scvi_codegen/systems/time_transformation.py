@@ -181,6 +181,7 @@ def time_rescaling_function(system: MechanicalSystem, g: str | Expr, *, in_time:
 
 
 def _read(system: MechanicalSystem, text: str, symbols: Mapping[str, Symbol]) -> Expr:
+    """Return the expression of a text, with entries of arrays in index notation."""
     if is_indexed(text) and system.arrays:
         momenta = momentum_arrays(system.arrays, (momentum.name for momentum in system.auxiliaries))
         return formula_of_entries(text, (*system.arrays, *momenta), symbols)

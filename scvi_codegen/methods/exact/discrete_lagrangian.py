@@ -228,6 +228,7 @@ def _number(value: Any, name: str) -> Number:
 
 
 def _parameter_values(system: LagrangianSystem, parameters: Values) -> dict[str, Number]:
+    """Return the value of each parameter by name; those of inputs must be set."""
     names = [parameter.name for parameter in system.parameters]
     if parameters is None or isinstance(parameters, Mapping):
         by_name = dict(zip(names, system.defaults, strict=True)) | dict(parameters or {})

@@ -187,6 +187,7 @@ class DerivedStep:
         return derivatives[:m], derivatives[m:]
 
     def _action(self, z: Numbers, start: _Start) -> Number:
+        """Return the generating function, the sum over points of weight, e^(gamma c h) and scalar."""
         total = mp.zero
         for f, group in enumerate(self.stages.stage_groups):
             arguments = self._arguments(f, z, start)

@@ -112,13 +112,16 @@ def has_roots_right(polynomial: Polynomial) -> bool:
 
 def squared_modulus(polynomial: Sequence[Number]) -> list[Number]:
     """Return |F(iy)|^2 in ascending powers of x = y^2: even(-x)^2 + x odd(-x)^2."""
-    signed = [value if k % 4 < 2 else -value for k, value in enumerate(polynomial)]
-    result = [mp.zero] * len(signed)
-    for i, left in enumerate(signed):
-        for j, right in enumerate(signed):
-            if (i - j) % 2 == 0:
-                result[(i + j) // 2] += left * right
-    return result
+    return even_products([value if k % 4 < 2 else -value for k, value in enumerate(polynomial)])
+
+
+def even_products(values: Sequence[Number]) -> list[Number]:
+    """Return the sums of a_i a_j with i + j = 2 k, by k."""
+    sums = [mp.zero] * len(values)
+    for i, left in enumerate(values):
+        for j in range(i % 2, len(values), 2):
+            sums[(i + j) // 2] += left * values[j]
+    return sums
 
 
 def modulus_gap(Q: Polynomial, P: Polynomial) -> Polynomial:
@@ -126,12 +129,8 @@ def modulus_gap(Q: Polynomial, P: Polynomial) -> Polynomial:
     length = max(len(P), len(Q))
     padded = [[*polynomial, *[mp.zero] * (length - len(polynomial))] for polynomial in (Q, P)]
     gap = [left - right for left, right in zip(*map(squared_modulus, padded), strict=True)]
-    scales = [mp.zero] * length
-    for polynomial in padded:
-        for i, left in enumerate(polynomial):
-            for j, right in enumerate(polynomial):
-                scales[(i + j) // 2] += abs(left * right)
-    return trimmed(gap, scales)
+    sizes = [even_products([abs(value) for value in polynomial]) for polynomial in padded]
+    return trimmed(gap, map(sum, zip(*sizes, strict=True)))
 
 
 def is_nonnegative(polynomial: Polynomial) -> bool:

@@ -144,6 +144,7 @@ def check_definition(system: MechanicalSystem, role: str, arguments: Sequence[Sy
 
 
 def _check_symbols(system: MechanicalSystem, role: str, arguments: Sequence[Symbol], kinds: str) -> None:
+    """Raise an error for formulas outside the grammar, with unknown symbols, or with jumps."""
     if system.forces and len(system.forces) != system.dimension:
         raise SystemDefinitionError(
             f"there are {system.dimension} coordinates, but {len(system.forces)} forces: give one force per coordinate"

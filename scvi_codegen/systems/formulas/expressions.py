@@ -197,6 +197,7 @@ class Tape:
 
 
 def _operation(expression: sympy.Expr, operands: tuple[int, ...]) -> tuple[Callable[..., Number], tuple[int, ...]]:
+    """Return the function of mpmath for a node, and the registers of its operands."""
     if expression.is_Add:
         return (operator.add if len(operands) == 2 else lambda *terms: mp.fsum(terms)), operands
     if expression.is_Mul:
@@ -305,6 +306,7 @@ def unsupported_part(expression: Expr) -> str | None:
 
 
 def _node_problem(node: Any) -> str | None:
+    """Return why a node itself is outside the grammar, or ``None``."""
     if not node.args:
         if node.is_Symbol or node in (S.Pi, S.Exp1):
             return None
@@ -386,6 +388,7 @@ def _rebuilt(expression: Expr, replacements: dict[Expr, Expr]) -> Expr:
 
 
 def _rebuilt_node(expression: Expr, replacements: dict[Expr, Expr]) -> Expr:
+    """Return a node made again from its rebuilt arguments."""
     if expression.is_Float:
         value = float(expression)
         return Rational(repr(value) if expression == value else str(expression))

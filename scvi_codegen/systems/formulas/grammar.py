@@ -127,6 +127,7 @@ def _spellings(name: str) -> tuple[str, ...]:
 
 
 def _tokens(text: str, pattern: re.Pattern[str]) -> list[Token]:
+    """Return the tokens of a text, an end token last."""
     if len(text) > MAX_CHARACTERS:
         message = f"a formula of {len(text)} characters is too long: the limit is {MAX_CHARACTERS}"
         raise ExpressionError(message, text, 0)

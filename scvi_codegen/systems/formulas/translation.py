@@ -100,6 +100,7 @@ class Translation:
         return result
 
     def _add(self, source: Expr, name: str) -> Symbol:
+        """Map a symbol, function or derivative of the user to the canonical symbol of a name."""
         target = symbol(name)
         if self.rules.get(source, target) != target:
             raise SystemDefinitionError(f"'{source}' is used both as '{self.rules[source]}' and as '{name}'")
@@ -132,6 +133,7 @@ class Translation:
         return self._add(coordinate, identifier(coordinate.name))
 
     def _velocity(self, coordinate: Expr, velocity: Expr | None) -> None:
+        """Map the velocity of a coordinate: its derivative, the one given, or the symbol ``q_dot``."""
         name = self.rules[coordinate].name + DOT
         if isinstance(coordinate, AppliedUndef):
             self.rules[sympy.Derivative(coordinate, self.user_time)] = symbol(name)
@@ -181,6 +183,7 @@ def _sum_text(expression: Expr) -> str:
 
 
 def _product_text(expression: Expr) -> str:
+    """Return a product with its divisors after a slash."""
     coefficient, rest = expression.as_coeff_Mul(rational=True)
     factors = [factor for factor in rest.as_ordered_factors() if factor is not S.One]
     below = [factor for factor in factors if factor.is_Pow and factor.exp.is_Rational and factor.exp < 0]

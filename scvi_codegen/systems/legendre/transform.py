@@ -129,6 +129,7 @@ def _roots(expression: Expr, x: Symbol) -> list[Expr]:
 
 
 def _is_inverse(system: MechanicalSystem, root: Expr, derivative: Expr, x: Symbol, y: Symbol) -> bool:
+    """Return whether x = root(y) at y = derivative(x), at all random points where both are defined."""
     tried = 0
     for point in sample_points([x], (*system.coordinates, system.time), system.constants):
         try:

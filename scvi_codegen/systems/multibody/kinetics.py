@@ -144,6 +144,7 @@ def _motions(body: Any, frame: ReferenceFrame, variables: Variables) -> Iterator
 
 
 def _components(subject: Any, vector: Any, frame: ReferenceFrame, variables: Variables) -> tuple[Expr, ...]:
+    """Return the components of a velocity in a frame, which must be functions of the variables."""
     components = tuple(variables.read(component) for component in vector.to_matrix(frame))
     for symbol in variables.other_functions:
         if any(component.has(symbol) for component in components):

@@ -63,6 +63,7 @@ def forces_at_points(
 def _vectors(
     entry: Mapping[str, Any], rotations: Mapping[str, Rotation], where: str, read: Callable[[Any], Expr]
 ) -> tuple[Matrix, Matrix]:
+    """Return a point and the force on it in the space frame, from an entry of ``point_forces``."""
     unknown = sorted(set(entry) - set(KEYS))
     if unknown or not {"point", "force"} <= set(entry):
         named = f"the unknown key '{unknown[0]}'" if unknown else "no point or no force"

@@ -122,6 +122,7 @@ def rotated(
 
 
 def _turns(system: HamiltonianSystem) -> Iterator[Turn]:
+    """Yield the turns of bodies with two equal moments of inertia, about the axis of the third."""
     bound = system.damping != 0 or any(system.forces) or system.clock or system.arrays
     if bound or system.hamiltonian.atoms(AppliedUndef):
         return

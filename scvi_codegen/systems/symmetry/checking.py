@@ -136,6 +136,7 @@ def check_symmetry(
 
 
 def _generated(system: MechanicalSystem, G: Expr, name: str) -> Symmetry:
+    """Return the symmetry of a generator G: {G, H} + G_t = 0, direction G_p, gauge p . G_p - G."""
     motion = rates_of(system)
     q, p, t = system.coordinates, system.momentum_symbols, system.time
     if not conserved(system, motion, [G]):

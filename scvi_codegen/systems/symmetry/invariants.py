@@ -525,6 +525,7 @@ def _rotation_name(system: MechanicalSystem, terms: Terms) -> tuple[str, Expr] |
 
 
 def _turning_name(system: MechanicalSystem, turning: Terms) -> tuple[str, int]:
+    """Return ``angular momentum z`` of all bodies, or the kind of a linear map with its coordinates."""
     m, bodies = system.dimension, bodies_of(system)
     for plane in planes_of(bodies):
         rotation = turn(m, bodies, plane)

@@ -211,6 +211,7 @@ def all_symmetries(system: MechanicalSystem, additional: Sequence[Symmetry]) -> 
 
 
 def _found(system: MechanicalSystem) -> list[Terms]:
+    """Return the momentum maps of the ansatz that suits the system."""
     if system.rotations:
         return _of_rotations(system)
     if system.dimension > MAX_SEARCHED_COORDINATES:

@@ -134,6 +134,7 @@ class _MujocoModel:
             self.read_limits(tendon, "tendons", tendon.name)
 
     def read(self, world: Element) -> None:
+        """Add links, places and shapes of a world body and of all bodies in it, parents first."""
         pending = [(world, -1, Pose())]
         while pending:
             element, link, at = pending.pop()
@@ -297,6 +298,7 @@ class _MujocoModel:
         return Coupling(joint, other, coefficients, zeros.get(joint, 0.0), zeros.get(other or "", 0.0))
 
     def joint(self, joint: Element, name: str, pose: Pose, frame: Pose, parent: int) -> Joint:
+        """Return a joint of a link, whose pose is that in its parent."""
         bare = joint.tag == "freejoint"
         kind = "free" if bare else joint.choice("type", "hinge", "slide", "ball", "free")
         if kind == "free" and parent >= 0:
@@ -350,6 +352,7 @@ class _MujocoModel:
         return Inertia(inertial.number("mass", least=0), matrix=matrix).seen_from(self.pose(inertial))
 
     def geom(self, geom: Element) -> Inertia:
+        """Return the inertia of a geom of uniform density."""
         shape = geom.text("type", "mesh" if geom.has("mesh") else "sphere")
         density, mass = geom.number("density", 1000, 0), geom.number("mass", np.nan, 0)
         if shape in WEIGHTLESS or mass == 0:
@@ -373,6 +376,7 @@ class _MujocoModel:
         return Inertia(mass, matrix=mass * np.diag(moments)).seen_from(self.pose(geom))
 
     def pose(self, element: Element) -> Pose:
+        """Return the pose of an element in its parent, by position and orientation or by ``fromto``."""
         if not element.has("fromto"):
             return Pose(element.vector("pos", (0, 0, 0)), self.orientation(element))
         if element.has("pos"):
