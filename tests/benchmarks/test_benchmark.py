@@ -29,7 +29,6 @@ from benchmarks.contenders.tracing import rates_text
 from benchmarks.report import FLOOR, Contender, Point, ResultTable, common_error, frontier, time_at
 from benchmarks.tables import drift_row, fitted_rate
 from scvi_codegen import SVI, StateError, SystemDefinitionError, compile_stepper
-from scvi_codegen.codegen.native import building
 
 ROOT = Path(bench.__file__).parents[1]
 EXTENDED = np.finfo(np.longdouble).eps < 1e-18
@@ -42,16 +41,6 @@ def points(*pairs):
 
 def short(name, span):
     return replace(unforced.case(name), span=span)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    return tmp_path_factory.mktemp("cache")
-
-
-@pytest.fixture(autouse=True)
-def own_cache(folder, monkeypatch):
-    monkeypatch.setenv(building.CACHE_VARIABLE, str(folder))
 
 
 MOVED = (

@@ -6,16 +6,10 @@ import pytest
 from benchmarks.cases.published import black_hole_momentum, published_case
 from benchmarks.cases.unforced import Formulation, case
 from benchmarks.contenders.irkgl16 import STAGES, Port, is_second_order, tables
-from scvi_codegen.codegen.native import building
 
 EXTENDED = np.longdouble
 needs_extended = pytest.mark.skipif(np.finfo(EXTENDED).eps > 1e-18, reason="long double is no wider than double here")
 pytestmark = pytest.mark.second
-
-
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path_factory, monkeypatch):
-    monkeypatch.setenv(building.CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "irkgl16-cache"))
 
 
 def test_coefficients_are_symplectic_in_doubles_and_extrapolate_polynomials():

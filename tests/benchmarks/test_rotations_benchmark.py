@@ -9,15 +9,9 @@ from benchmarks.cases.references import reference, rms_error
 from benchmarks.cases.rotations import ROTATIONS, tumbling
 from benchmarks.contenders.engines import mujoco_contenders
 from benchmarks.contenders.ours import momenta_of
-from scvi_codegen.codegen.native import building
 from scvi_codegen.runs.compiler import compile_stepper
 
 pytestmark = pytest.mark.skipif(np.finfo(np.longdouble).eps > 1e-18, reason="long double is no wider than double")
-
-
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path_factory, monkeypatch):
-    monkeypatch.setenv(building.CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "rotations-cache"))
 
 
 @pytest.mark.tiers(0, 1)

@@ -1,5 +1,6 @@
-"""The C entry points of flows, called as frameworks call them, without these: the time, parameters and pieces of steps.
+"""The C entry points of flows, called as frameworks call them, without these: failures, second derivatives, wrappers.
 
+States and first derivatives of rows are properties of the table of motions (``tests/motions``).
 The system depends on time, t and the parameters differ from their defaults, and the steps fill several pieces.
 """
 
@@ -24,30 +25,6 @@ WAYS = {"rtol": 0, "atol": 2e-12}
 @cache
 def flow():
     return FlowOfRows.checked(compiled(), STEPS, EVERY)
-
-
-def called(binding, name, head, arrays, shape):
-    """Call a function whose arguments are numbers, arrays, what is found and a report."""
-    found, pointers = np.zeros(shape), [binding.pointer(np.ascontiguousarray(array, dtype=float)) for array in arrays]
-    status = binding.function(name)(*head, *pointers, binding.pointer(found), binding.new("report *"))
-    assert status == 0
-    return found
-
-
-@pytest.mark.second
-def test_values_of_batches():
-    found = called(flow().library, "flow_rows", (0, STEPS, EVERY, 0, 2), [ROWS, ROWS], (2, SAVED, 4))
-    assert_allclose(found, [states(row) for row in ROWS], **WAYS)
-
-
-def test_forward_and_adjoint_derivatives_of_batches():
-    changes = np.tile(np.eye(SIZE), (2, 1, 1))
-    exact = np.array([partials(row) for row in ROWS])
-    pushed = called(flow().library, "flow_rows", (1, STEPS, EVERY, SIZE, 2), [ROWS, changes], (2, SIZE, SAVED, 4))
-    assert_allclose(pushed, np.moveaxis(exact, -1, 1), rtol=1e-11, atol=1e-11)
-    one = np.tile(weights(), (2, 1, 1, 1))
-    pulled = called(flow().library, "flow_rows", (2, STEPS, EVERY, 1, 2), [ROWS, one], (2, 1, SIZE))
-    assert_allclose(pulled[:, 0], np.tensordot(exact, weights(), ((1, 2), (0, 1))), rtol=1e-11, atol=1e-11)
 
 
 OVERFLOWS = np.array([[1e300, 0.0, 1e300, 0.0, 1.0, -30.0, 0.0, 1.0, 0.5, 0.4]])
@@ -83,9 +60,9 @@ def test_failed_steps_are_reported_with_their_number_and_time(part):
 @pytest.mark.second
 def test_second_derivatives_of_batches():
     same, changes = np.tile(weights(), (2, SIZE, 1, 1)), np.tile(np.eye(SIZE), (2, 1, 1))
-    found = called(
-        flow().second_library, "hessian_rows", (STEPS, EVERY, SIZE, 2), [ROWS, same, changes], (2, SIZE, SIZE)
-    )
+    found, library = np.zeros((2, SIZE, SIZE)), flow().second_library
+    pointers = [library.pointer(array) for array in (ROWS, same, changes, found)]
+    assert library.function("hessian_rows")(STEPS, EVERY, SIZE, 2, *pointers, library.new("report *")) == 0
     exact = np.array([hessian(row) for row in ROWS])
     assert_allclose(found, exact, rtol=0, atol=1e-7 * abs(exact).max())
 
