@@ -9,8 +9,8 @@ Neither SymPy nor Jinja is imported.
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from contextlib import suppress
-from functools import partial, wraps
+from dataclasses import replace
+from functools import cached_property, lru_cache, partial, wraps
 from math import isfinite
 from typing import Any, Self, TypeVar, cast
 
@@ -23,31 +23,26 @@ from scvi_codegen.codegen.native.calls import with_calls
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.codegen.rendering.source import Source
 from scvi_codegen.codegen.variants import Variant
-from scvi_codegen.common.errors import MethodError, ScviCodegenError, StateError
+from scvi_codegen.common.errors import MethodError, StateError
 from scvi_codegen.common.validation import checked_count, checks_arguments, of
 from scvi_codegen.runs.accuracy.global_error import Runs, checked_error, warn_of_unconfirmed, warn_of_unconfirmed_run
 from scvi_codegen.runs.accuracy.growth import measured_growth, warn_of_error_growth
 from scvi_codegen.runs.accuracy.local_error import warn_of_energy_errors, warn_of_inaccuracy
 from scvi_codegen.runs.accuracy.resolution import warn_of_unresolved_members
-from scvi_codegen.runs.accuracy.size import neighbouring
 from scvi_codegen.runs.accuracy.warning_switch import warn_of_failed_check
+from scvi_codegen.runs.driver.bounded_motion import BoundedMotion
 from scvi_codegen.runs.driver.observation import Observe
 from scvi_codegen.runs.driver.run import Run
 from scvi_codegen.runs.driver.segments import InputSegments, checked_inputs, final_time
 from scvi_codegen.runs.ensembles.ensemble import Ensemble
 from scvi_codegen.runs.ensembles.result import EnsembleTrajectory
 from scvi_codegen.runs.events.refinement import WithEventsInDouble, constantly
-from scvi_codegen.runs.forwarding import SteppersAnalysis, largest_step
+from scvi_codegen.runs.forwarding import SteppersAnalysis
 from scvi_codegen.runs.results.dense_output import times_of_run
+from scvi_codegen.runs.results.output import ALL_STATES, Output
+from scvi_codegen.runs.states.layout import InitialData
 from scvi_codegen.runs.states.times import times_after
-from scvi_codegen.runs.states.validation import (
-    Array,
-    EnsembleParameters,
-    Parameters,
-    States,
-    coordinate_shapes,
-    flat_state,
-)
+from scvi_codegen.runs.states.validation import Array, EnsembleParameters, Parameters, States, flat_state
 from scvi_codegen.runs.states.words import check_doubles, hashed
 from scvi_codegen.runs.stepping.array_interface import RunSizes, interface_of_sizes, shapes_of_call, sizes_of_run
 from scvi_codegen.runs.stepping.compiled_method import Variants
@@ -61,6 +56,7 @@ from scvi_codegen.runs.stepping.step_plan import (
     ErrorControl,
     Fixed,
     FixedSteps,
+    KindOfSteps,
     StepPlan,
     Until,
     check_max_step,
@@ -190,7 +186,8 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         """
         if type(save_every) is not int or save_every != 1:
             save_every = checked_count(save_every, "save_every", least=1)
-        stepper, interface, segments = self._for_run(events, action=action), self.interface, None
+        stepper = self if events is None and not action else self._for_run(events, action=action)
+        interface = self.interface
         if not (inputs is None and t_eval is None and observe is None and tables is None and threads is None):
             self._check_not_of_run(tables, threads)
             stride = None if save_every == 1 else save_every
@@ -199,40 +196,71 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         if interface.rotations or interface.variables:
             q, p, velocity = self._states.start(q, p, velocity)
         if error is not None:
-            wanted = checked_error(error, {"h": h, "steps": steps, "tolerance": tolerance}, self)
-            start = {"velocity": velocity, "inputs": inputs, "t": t, "parameters": parameters, "options": options}
-            start |= ErrorControl(None, absolute_tolerance, max_step, first_step).named
-            saved = {"t_end": t_end, "save_every": save_every, "t_eval": t_eval}
-            return stepper._confirmed(wanted, q, p, {**start, "progress": progress}, saved)
+            require(stepper, "error")
+            motion = BoundedMotion(
+                stepper=stepper,
+                error=checked_error(error, {"h": h, "steps": steps, "tolerance": tolerance}, self),
+                initial=InitialData(q, p, velocity, t, parameters, options),
+                end=checked_number(t_end, "the time t_end"),
+                control=ErrorControl(None, absolute_tolerance, max_step, first_step),
+                inputs=inputs,
+                output={"save_every": save_every, "t_eval": t_eval},
+                progress=progress,
+            )
+            return stepper._bounded(motion)
         t = t if type(t) is float and isfinite(t) else self._states.time(t)
         begin = 0.0 if h is None or t_end is None else hashed(t)  # one plan for all times where they do not matter
-        how = interface.time_transformation, stepper.in_tau, interface.words
-        control = tolerance, absolute_tolerance, max_step, first_step
-        schedule = h, steps, t_end, *control, save_every, begin, *how
+        schedule = h, steps, t_end, tolerance, absolute_tolerance, max_step, first_step, save_every, begin
         try:
-            plan, count = planned_steps(*schedule)
+            plan, count = stepper._planned(*schedule)
         except TypeError:  # of an argument that is not hashable, as an array
-            plan, count = planned_steps.__wrapped__(*schedule)
+            plan, count = stepper._planned.__wrapped__(*schedule)
         if max_step is not None:
             check_max_step(plan, t, interface.words)
+        segments, output = None, ALL_STATES
         if inputs is not None:
-            plan = Fixed(plan.h) if isinstance(plan, FixedSteps) else plan  # each segment ends where the next begins
             segments = InputSegments(stepper, inputs, parameters, t, final_time(t, h, steps, t_end))
-            parameters = segments.first
-        if p is None or velocity is not None or interface.constraints:
-            q, p, velocity = stepper._initial_state(q, p, velocity, t, parameters, converted=inputs is not None)
+            plan, parameters = segments.plan(plan), segments.first
+        if not (save_every == 1 and t_eval is None and observe is None and progress is None):
+            times = None if t_eval is None else stepper._output_times(t_eval, t, plan, count)
+            output = Output(save_every, times, observe, progress)
+        initial = tuple.__new__(InitialData, (q, p, velocity, t, parameters, options))  # without a call of Python
+        return stepper._integrated(initial, plan, count, output, segments, check_growth)
+
+    def _integrated(
+        self,
+        initial: InitialData,
+        plan: StepPlan,
+        steps: int | None,
+        output: Output,
+        segments: InputSegments | None,
+        check_growth: bool | None,
+    ) -> Trajectory:
+        """Return a run of validated steps, ``None`` to the target time, with its warnings; ``segments``: of inputs."""
+        if initial.p is None or initial.velocity is not None or self.interface.constraints:
+            initial = self._validated(initial, converted=segments is not None)
         fixed = isinstance(plan, FixedSteps)
-        growth = 0 if fixed and not check_growth else measured_growth(stepper, plan, check_growth)
-        times = None if t_eval is None else stepper._output_times(t_eval, t, plan, count)
-        run = Run._reused(stepper)
-        run._set_up(plan, parameters, options, q, p)
+        growth = 0 if fixed and not check_growth else measured_growth(self, plan, check_growth)
+        try:
+            run: Run = self._released_runs.pop()
+        except IndexError:  # all are in use
+            run = Run._reusable(self)
+        run._set_up(plan, initial)
         if segments is None:
-            trajectory = run._integrated(q, p, velocity, t, growth, count, save_every, times, progress, observe)
+            trajectory = run._integrated(initial, growth, steps, output)
         else:
-            run._begin(q, cast(States, p), t, growth)
-            trajectory = segments.record(run, save_every, progress)
-        _check(run, trajectory, check_growth, segments, fixed=fixed)
-        run._release()
+            run._start_from(initial, growth)
+            trajectory = segments.record(run, output.save_every, output.progress)
+        try:
+            if segments is None:
+                warn_of_inaccuracy(trajectory, run)
+            if not fixed:
+                repeat = None if segments is None else partial(segments.advance, run)
+                warn_of_error_growth(run, trajectory, check_growth, repeat)
+        except Exception as failure:  # noqa: BLE001  (the run is complete)
+            warn_of_failed_check(failure)
+        if run._rows is not None:  # large memory is freed instead
+            self._released_runs.append(run)
         return trajectory
 
     def _for_run(self, events: EventLike | Sequence[EventLike] | None, *, action: bool) -> Self:
@@ -243,86 +271,14 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
             return stepper.acting
         return stepper
 
-    def _confirmed(
-        self, error: float, q: States, p: States | None, start: dict[str, Any], saved: dict[str, Any]
-    ) -> Trajectory:
-        """Return the run to t_end whose relative global error is confirmed; runs for comparison have no events.
-
-        ``start``, ``saved``: arguments of all runs, and further ones of the run that is returned.
-        """
-        require(self, "error")
-        t, velocity, parameters = start["t"], start["velocity"], start["parameters"]
-        by_pieces = self._ending_at_kinks()
-        bare = by_pieces or self.with_events(())
-
-        def step_of_tau(tolerance: float) -> float:
-            momenta = self._initial_momenta(q, p, velocity, t, parameters)
-            span = checked_number(saved["t_end"], "the time t_end") - t
-            return largest_step(self, q, momenta, span, tolerance, t=t, parameters=parameters, options=start["options"])
-
-        def integrate(check: Callable[[int], None] | None, **steps: Any) -> Trajectory:
-            progress = start["progress"]
-            if check is not None:
-                progress = check if progress is None else lambda count: (start["progress"](count), check(count))
-            if "max_step" in steps and "max_step" in start:
-                steps["max_step"] = min(steps["max_step"], start["max_step"])
-            return self.integrate(q, p, **{**start, "progress": progress, **saved, **steps})
-
-        def confirming(stops: Sequence[float], progress: Callable[[int], None], **steps: Any) -> Trajectory:
-            arguments = {**start, "progress": progress}
-            if self._has_tau:
-                return bare.integrate(q, p, **arguments, **steps, t_end=stops[-1])
-            return bare._recorded_with_stops(q, p, arguments, stops, steps["tolerance"])
-
-        runs = Runs(
-            wanted=error,
-            integrate=integrate,
-            confirming=confirming,
-            start=checked_number(t, "the time t"),
-            end=checked_number(saved["t_end"], "the time t_end"),
-            step_of_tau=step_of_tau if self._has_tau else None,
-            interface=self.interface,
-            smooth=by_pieces is not None or not self.interface.kinks,
-        )
-        trajectory: Trajectory = runs.confirmed_run()
+    def _bounded(self, motion: BoundedMotion) -> Trajectory:
+        """Return the run whose relative global error is confirmed to be bounded, in double-double if double fails."""
+        trajectory: Trajectory = Runs(motion).confirmed_run()
         assert trajectory.confirmation is not None  # by confirmed_run
         if not (trajectory.confirmation.confirmed or self._has_tau) and (precise := self._in_double_double) is not None:
-            return precise._confirmed(error, q, p, start, saved)
+            return precise._bounded(replace(motion, stepper=precise))
         warn_of_unconfirmed_run(trajectory)
         return trajectory
-
-    def _ending_at_kinks(self) -> Stepper | None:
-        """Return a stepper whose steps end where the equations are not smooth; ``None`` without such places."""
-        interface = self.interface
-        if not interface.kinks or self._has_tau or interface.words > 1:
-            return None
-        name = interface.coordinates[0]
-        if interface.layout.coordinates:
-            array, shape = coordinate_shapes(interface)[0]
-            name = f"{array}[{', '.join('0' * len(shape))}]"
-        with suppress(ScviCodegenError):
-            stepper = self.with_events([Event(kink, then={name: name}) for kink in interface.kinks])
-            _ = stepper.binding
-            return stepper
-        return None
-
-    def _recorded_with_stops(
-        self, q: States, p: States | None, start: dict[str, Any], stops: Sequence[float], tolerance: float | None
-    ) -> Trajectory:
-        """Return a run with adaptive steps that end at each of the times ``stops``, in order, with all states.
-
-        In double its initial state is rounded differently: the next number above or below each one.
-        """
-        arguments = dict(start)
-        inputs, progress = arguments.pop("inputs"), arguments.pop("progress")
-        segments = InputSegments(self, inputs or {}, start["parameters"], start["t"], stops[-1])
-        arguments["parameters"] = segments.first
-        arguments |= {"t_end": stops[-1], "tolerance": tolerance}
-        run = self.start(q, p, **arguments)
-        if self.interface.words == 1:
-            near, momenta = neighbouring(run.q), neighbouring(run.p)
-            run._begin(*self._consistent_state(near, momenta, None, run.t, run._parameters), run.t)
-        return segments.record_with_stops(run, stops, progress)
 
     @property
     def _in_double_double(self) -> Stepper | None:
@@ -359,52 +315,44 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         The other arguments are those of :meth:`integrate`.
         """
         self._check_not_of_run(tables, threads)
-        q, p, velocity = self._states.start(q, p, velocity)
-        return self._started(
-            q,
-            p,
-            velocity,
-            self._plan(h, t_end, ErrorControl(tolerance, absolute_tolerance, max_step, first_step)),
-            t,
-            parameters,
-            options,
-        )
+        initial = InitialData(*self._states.start(q, p, velocity), t, parameters, options)
+        control = ErrorControl(tolerance, absolute_tolerance, max_step, first_step)
+        return self._started(initial, self._plan(h, t_end, control))
 
-    def _started(
-        self,
-        q: States,
-        p: States | None,
-        velocity: States | None,
-        plan: StepPlan,
-        t: float,
-        parameters: Parameters,
-        options: SolverOptions | None,
-    ) -> Run:
-        q, p = self._consistent_state(q, p, velocity, t, parameters)
+    def _started(self, initial: InitialData, plan: StepPlan) -> Run:
+        """Return a run at its start, on the constraints."""
+        (q, p), (*_, t, parameters, options) = self._consistent_state(initial), initial
         return Run.started(self, q, p, plan=plan, t=t, parameters=parameters, options=options)
 
-    def _consistent_state(
-        self, q: States, p: States | None, velocity: States | None, t: float, parameters: Parameters
-    ) -> tuple[States, States]:
+    def _consistent_state(self, initial: InitialData) -> tuple[States, States]:
         """Return (q, p), or q and the momenta of a velocity, on the constraints."""
+        q, p, velocity, t, parameters, _ = initial
         p = self._initial_momenta(q, p, velocity, t, parameters)
         return consistent(self, q, p, t, parameters) if self.interface.constraints else (q, p)
 
-    def _initial_state(
-        self, q: States, p: States | None, velocity: States | None, t: float, parameters: Parameters, *, converted: bool
-    ) -> tuple[States, States | None, States | None]:
-        """Return (q, p, None) on the constraints, or (q, None, velocity) if the run converts the velocity itself."""
-        if (p is None) == (velocity is None):
-            raise neither_or_both(p)
+    def _validated(self, initial: InitialData, *, converted: bool) -> InitialData:
+        """Return initial data with momenta, on the constraints; or with a velocity that the run itself converts."""
+        if (initial.p is None) == (initial.velocity is None):
+            raise neither_or_both(initial.p)
         if converted or self.in_tau or self.interface.constraints or self.interface.layout.coordinates:
-            return *self._consistent_state(q, p, velocity, t, parameters), None
-        return q, p, velocity
+            q, p = self._consistent_state(initial)
+            return initial._replace(q=q, p=p, velocity=None)
+        return initial
 
     def _run(self, q: Array, p: Array, **arguments: Any) -> Run:
         return Run.started(self, q, p, **arguments)
 
     def _plan(self, h: float | None, t_end: float | None, control: ErrorControl) -> StepPlan:
-        return checked_plan(h, t_end, control, self.interface.time_transformation, self.in_tau)
+        return checked_plan(self._kind_of_steps, h, t_end, control)
+
+    @property
+    def _kind_of_steps(self) -> KindOfSteps:
+        return KindOfSteps(self.interface.time_transformation, self.in_tau, self.interface.words)
+
+    @cached_property
+    def _planned(self) -> Any:
+        """Function of the arguments of :func:`planned_steps`, with the plans that it returned before."""
+        return lru_cache(maxsize=64, typed=True)(partial(planned_steps, self._kind_of_steps))
 
     def _output_times(self, t_eval: ArrayLike, t: float, plan: StepPlan, steps: int | None) -> Array:
         if self.interface.words > 1:
@@ -757,20 +705,6 @@ class StepperOfRunTimeSizes(Stepper):
     def _has_error_estimate(self) -> bool:
         """True if the method has adaptive steps; also if that follows from the sizes."""
         return self._reason is not None or "advance_to" in self.source.contents.functions
-
-
-def _check(
-    run: Run, trajectory: Trajectory, check_growth: bool | None, segments: InputSegments | None, *, fixed: bool
-) -> None:
-    """Issue the accuracy warnings of a finished run, with ``segments`` of inputs."""
-    try:
-        if segments is None:
-            warn_of_inaccuracy(trajectory, run)
-        if not fixed:
-            repeat = None if segments is None else partial(segments.advance, run)
-            warn_of_error_growth(run, trajectory, check_growth, repeat)
-    except Exception as error:  # noqa: BLE001  (the run is complete)
-        warn_of_failed_check(error)
 
 
 def checked_ensemble_result(work: Ensemble) -> EnsembleTrajectory:

@@ -8,6 +8,7 @@ from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.errors import EventError
 from scvi_codegen.runs.derivatives.gradients import forward
 from scvi_codegen.runs.results.recomputation import SAME_STEP_SIZE
+from scvi_codegen.runs.states.layout import InitialData
 from scvi_codegen.runs.states.times import times_after
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepper import Stepper
@@ -59,7 +60,8 @@ def tangents_along(
         length, start = float(h[first]), states[first]
         if size_variations is not None:
             tangents = np.concatenate([tangents[:, :-1], size_variations[first][:, np.newaxis]], axis=1)
-        run = stepper._started(start[:m], start[m:], None, Fixed(length), float(t[first]), parameters, options)
+        initial = InitialData(start[:m], start[m:], None, float(t[first]), parameters, options)
+        run = stepper._started(initial, Fixed(length))
         trajectory = run._recorded(last - first)
         ends = times_after(float(t[first]), length, np.arange(1, last - first + 1))[0]
         if trajectory.t[-1] < ends[-1] - 0.5 * length:

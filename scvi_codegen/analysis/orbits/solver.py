@@ -44,6 +44,7 @@ from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import checked_count, checks_arguments
 from scvi_codegen.runs.accuracy.size import RESOLVED, SizeOfMotion, roundoff
 from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted, without_accuracy_warnings
+from scvi_codegen.runs.states.layout import InitialData
 from scvi_codegen.runs.states.reduction import Reduction
 from scvi_codegen.runs.states.times import steps_within
 from scvi_codegen.runs.states.validation import Array, Parameters, check_inputs_given
@@ -517,7 +518,8 @@ class _OrbitSearch:
         count = len(self._steps)
         plan, steps, (q, p) = Fixed(-period / count), count - count // 2, np.split(start, 2)
         if self._steps.tolerance is None and not any(event.changes for event in self.stepper.events):
-            run = self.stepper._started(q, p, None, plan, self.t, self.parameters, self.options)
+            initial = InitialData(q, p, None, self.t, self.parameters, self.options)
+            run = self.stepper._started(initial, plan)
             with suppress(EventError, StepFailedError):
                 motion, ends = run._recorded(steps), self.t + plan.h * np.arange(1, steps + 1)
                 rows = np.searchsorted(-motion.t, -ends + 0.5**30 * period, side="right") - 1

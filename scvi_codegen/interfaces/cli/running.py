@@ -23,6 +23,7 @@ from scvi_codegen.runs.compiler import second_stepper
 from scvi_codegen.runs.driver.run import Run
 from scvi_codegen.runs.driver.segments import record_segments
 from scvi_codegen.runs.results.energy import EnergyAccount
+from scvi_codegen.runs.results.output import Output
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.states.words import Words, as_text
 from scvi_codegen.runs.stepping.step_plan import Adaptive, FixedSteps, InTau
@@ -88,7 +89,7 @@ def integrate_model(model: Model) -> RunOutcome:
             stopped = bool(caught)
             return stopped
 
-        recorded = partial(run._recorded, save_every=model.save_every, progress=look, stop=stop)
+        recorded = partial(run._recorded, output=Output(model.save_every, progress=look), stop=stop)
         segments = model.segments(run)
         try:
             if model.system.inputs:

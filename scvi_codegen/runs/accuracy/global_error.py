@@ -267,50 +267,33 @@ class Runs:
     """Runs of one motion by tolerance, one of which is returned and confirmed by others.
 
     Args:
-        wanted: bound of the relative global error.
-        integrate: function of ``progress`` or ``None``, and ``tolerance`` or ``h``, that makes the returned run.
-        confirming: function of the times at which steps end, of ``progress`` and of ``tolerance`` or ``h`` that makes a
-            run for comparison.
-        start, end: initial and final time.
-        step_of_tau: function that returns the largest step of tau for a tolerance, or ``None`` without it.
-        interface: of the stepper.
-        smooth: whether the equations are smooth along each step of ``confirming``.
+        motion: makes the runs (:class:`~scvi_codegen.runs.driver.bounded_motion.BoundedMotion`).
     """
 
-    def __init__(
-        self,
-        *,
-        wanted: float,
-        integrate: Callable[..., Any],
-        confirming: Callable[..., Any],
-        start: float,
-        end: float,
-        step_of_tau: Callable[[float], float] | None,
-        interface: Interface,
-        smooth: bool = True,
-    ) -> None:
-        self.wanted, self.integrate, self.confirming = wanted, integrate, confirming
-        self.start, self.end = start, end
-        self.words, self.interface = interface.words, interface
-        self.first, self.count, self.most = min(wanted * FIRST, 0.1), 0, math.inf
+    def __init__(self, motion: Any) -> None:
+        self.motion, self.requested, self.interface = motion, motion.error, motion.stepper.interface
+        self.start: float = checked_number(motion.initial.t, "the time t")
+        self.words: int = self.interface.words
+        self.first, self.count, self.most = min(self.requested * FIRST, 0.1), 0, math.inf
         self.h: float | None = None
         self.least, self.rounded = LEAST, ROUNDED
         self.last: tuple[float | None, ...] = LAST
         self.failure: StepFailedError | None = None
         if self.words > 1:
             self.least, self.rounded, self.last = LEAST_OF_TWO_WORDS, ROUNDED_OF_TWO_WORDS, LAST_OF_TWO_WORDS
-        if not smooth:  # errors are as random as those of rounding
+        if not motion.smooth:  # errors are as random as those of rounding
             self.rounded = 1.0
-        if step_of_tau is not None:
+        has_tau = motion.stepper._has_tau
+        if has_tau:
             self.rounded, self.first = ROUNDED_OF_TAU, max(self.first, LEAST)
-            self.h = step_of_tau(self.first)
+            self.h = motion.step_of_tau(self.first)
         elif self.first < self.rounded:  # the factor of the estimate is larger there
             self.first *= FINER
-        self.parts = () if step_of_tau is not None or not interface.kinks else PARTS_AT_KINKS
+        self.parts = () if has_tau or not self.interface.kinks else PARTS_AT_KINKS
 
     @without_accuracy_warnings()
     def confirmed_run(self) -> Any:
-        """Return the run whose global error is at most ``wanted``, or the most accurate one.
+        """Return the run whose global error is at most ``requested``, or the most accurate one.
 
         Raises:
             StepFailedError: if the most accurate run fails.
@@ -329,7 +312,7 @@ class Runs:
         self.count += 1
         check = self._check_count if self.most < math.inf else None
         limit = {} if max_step == math.inf else {"max_step": max_step}
-        trajectory = self.integrate(check, **self._steps(tolerance), **limit)
+        trajectory = self.motion.run(check, **self._steps(tolerance), **limit)
         self.most = min(self.most, FURTHER * trajectory.steps + MANY)
         return trajectory
 
@@ -338,7 +321,7 @@ class Runs:
         self.count += 1
         stops = irregular_stops(compared.steps_of_run, number)
         try:
-            return self.confirming(stops, self._check_count, **self._steps(tolerance, IRREGULAR))
+            return self.motion.compared_run(stops, self._check_count, **self._steps(tolerance, IRREGULAR))
         except StepFailedError as failure:
             if failure.trajectory is None:
                 raise
@@ -369,14 +352,14 @@ class Runs:
                 result = self._estimated(trajectory, tolerance, smaller)
                 yield trajectory, result
                 estimate = result.estimate
-                powers = max(1, math.ceil(math.log(min(estimate, 1.0) / self.wanted, GAIN) * math.log(RATIO, ratio)))
+                powers = max(1, math.ceil(math.log(min(estimate, 1.0) / self.requested, GAIN) * math.log(RATIO, ratio)))
             tolerance = list(accumulate(repeat(ratio, powers), mul, initial=tolerance))[-1]
 
     def _limited(self) -> Iterator[Attempt]:
         """Yield runs of smaller and smaller largest steps."""
         tolerance = self.first
         for part in self.parts:
-            max_step = part * abs(self.end - self.start)
+            max_step = part * abs(self.motion.end - self.start)
             with self._suppressed_failure():
                 trajectory = self._run(tolerance, max_step)
                 yield trajectory, self._estimated(trajectory, tolerance, self._smaller(tolerance)[1], max_step)
@@ -390,7 +373,7 @@ class Runs:
                 others = [other for other in self.last if other != tolerance]
                 result = self._estimated(trajectory, tolerance, others, last=True)
                 yield trajectory, result
-                if result.estimate > GAIN * self.wanted:
+                if result.estimate > GAIN * self.requested:
                     return
 
     @contextmanager
@@ -422,7 +405,7 @@ class Runs:
         safety = SAFETY if len(others) == 1 else SAFETY_OF_ROUNDING
         floor = max(smallest_estimate(self.words), 0.0 if tolerance is None else tolerance)
         for number, other in enumerate(others if compared.end != self.start else ()):
-            if number == 2 and SAFETY_OF_TWO * compared.largest() <= self.wanted:
+            if number == 2 and SAFETY_OF_TWO * compared.largest() <= self.requested:
                 safety = SAFETY_OF_TWO
                 break
             try:
@@ -432,12 +415,12 @@ class Runs:
                     compared.compare(self._other(coarser, compared, number))
             except _TooManyStepsError:
                 compared.lose()
-            if not last and safety * compared.largest() > self.wanted:
+            if not last and safety * compared.largest() > self.requested:
                 break
-        differences, reached = compared.relative(lambda relative: np.maximum(safety * relative, floor) <= self.wanted)
+        differences, reached = compared.relative(lambda errors: np.maximum(safety * errors, floor) <= self.requested)
         largest = float(differences.max(initial=0.0))
         return GlobalError(
-            requested=self.wanted,
+            requested=self.requested,
             tolerance=tolerance,
             h=self._steps(tolerance).get("h"),
             max_step=max_step,

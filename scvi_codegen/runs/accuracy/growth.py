@@ -87,7 +87,7 @@ def warn_of_error_growth(
         advance_until: function that advances the run to a time; by default adaptive steps to that time.
     """
     plan = run._plan
-    if not isinstance(plan, Adaptive) or requested is False or len(states.t) < 2 or not warnings_wanted():
+    if requested is False or not isinstance(plan, Adaptive) or len(states.t) < 2 or not warnings_wanted():
         return
     if run.stepper.changes_states or run.stepper.interface.words > 1:
         return

@@ -67,13 +67,11 @@ def warn_of_energy_error(trajectory: SavedStates, run: Memory) -> None:
     Runs over arrays of run-time sizes with fixed steps and no error estimate are checked for gross errors.
     """
     plan, stepper = trajectory.plan, trajectory.stepper
-    limits: dict[str, Any] = {}
-    if not isinstance(plan, Adaptive):
-        if not isinstance(plan, FixedSteps) or trajectory.step_error == trajectory.step_error:
+    is_adaptive = isinstance(plan, Adaptive)
+    if not is_adaptive:
+        has_estimate = trajectory.step_error == trajectory.step_error
+        if not isinstance(plan, FixedSteps) or has_estimate or not stepper.interface.layout.coordinates:
             return
-        if not stepper.interface.layout.coordinates:
-            return
-        limits = {"tolerable": GROSS_ERROR, "why": FIXED_STEP_REMEDY}
     if not stepper.interface.conserves_energy or stepper.changes_states or not warnings_wanted():
         return
     t, q, p = trajectory.t, trajectory.q, trajectory.p
@@ -81,7 +79,10 @@ def warn_of_energy_error(trajectory: SavedStates, run: Memory) -> None:
     if ends is None or not abs(ends[1] - ends[0]) > 0.5 * TOLERABLE_ERROR * max(abs(ends[0]), abs(ends[1])):
         return
     if energies := _changed_energies(stepper, t, q, p, trajectory.parameters):
-        warn_of_energies(*energies, **limits)
+        if is_adaptive:
+            warn_of_energies(*energies)
+        else:
+            warn_of_energies(*energies, tolerable=GROSS_ERROR, why=FIXED_STEP_REMEDY)
 
 
 def warn_of_energy_errors(ensemble: Any, ends: Array | None = None) -> None:

@@ -22,6 +22,7 @@ from scvi_codegen.runs.driver.run_loop import record, trajectory_of
 from scvi_codegen.runs.driver.singular_time import ProgressWatch
 from scvi_codegen.runs.events.refinement import search_of
 from scvi_codegen.runs.results.dense_output import states_and_steps_at, step_sizes_at, stepped_to
+from scvi_codegen.runs.results.output import Output
 from scvi_codegen.runs.results.time_transformation import part_of_step
 from scvi_codegen.runs.states.times import WHOLE
 from scvi_codegen.runs.states.validation import Array
@@ -205,24 +206,25 @@ class Observed(Saver):
         return {"q": q, "p": p, "observed": np.array(observed), "conserved": np.array(self.conserved)}
 
 
-def saver_of(observe: Any, times: Array | None, save_every: int) -> Saver:
-    """Return the saver of a run with output times or an observer: its name, an observer or a function of the run.
+def saver_of(output: Output) -> Saver:
+    """Return the observer that saves the states of an output, or calls its observer.
 
     Raises:
         StateError: for another observer.
     """
-    if times is not None:
-        return AtTimes(times)
+    observe = output.observe
+    if output.times is not None:
+        return AtTimes(output.times)
     if observe is None:
-        return Saver(save_every)
+        return Saver(output.save_every)
     if isinstance(observe, str):
         if observe not in OBSERVERS:
-            known = ", ".join(OBSERVERS)
-            raise StateError(f"there is no observer '{observe}'{closest(observe, OBSERVERS)} Known: {known}")
+            names = ", ".join(OBSERVERS)
+            raise StateError(f"there is no observer '{observe}'{closest(observe, OBSERVERS)} Known: {names}")
         observe = OBSERVERS[observe]()
     if not (isinstance(observe, Observer) or callable(observe)):
         raise StateError(f"observe must be a function of the run, an observer or its name, not {observe!r}")
-    return Observed(observe, save_every)
+    return Observed(observe, output.save_every)
 
 
 CHUNK_NUMBERS = 2**18

@@ -10,10 +10,12 @@ from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.common.validation import LARGEST_COUNT
 from scvi_codegen.runs.accuracy.local_error import warn_of_inaccuracy
 from scvi_codegen.runs.accuracy.warning_switch import warn_of_failed_check
-from scvi_codegen.runs.driver.observation import Observation, Observe, Saver, saver_of
-from scvi_codegen.runs.driver.run_loop import ShortRuns, integrate_short, record
+from scvi_codegen.runs.driver.observation import Observation, Saver, saver_of
+from scvi_codegen.runs.driver.run_loop import ShortRuns, plain_trajectory, record
 from scvi_codegen.runs.results.descriptions import describe_run
+from scvi_codegen.runs.results.output import ALL_STATES, Output
 from scvi_codegen.runs.states.attitude_history import AttitudeHistory
+from scvi_codegen.runs.states.layout import InitialData
 from scvi_codegen.runs.states.validation import Array, Parameters, States
 from scvi_codegen.runs.states.words import scalar
 from scvi_codegen.runs.stepping.integrator import Integrator
@@ -37,30 +39,22 @@ class Run(Memory, AttitudeHistory):
         return describe_run(self)
 
     @classmethod
-    def _reused(cls, stepper: Integrator) -> Self:
-        """Return a released run of the stepper, to be started, or a new one if all are in use."""
-        try:
-            run: Self = stepper._released_runs.pop()
-        except IndexError:
-            run, binding = cls(stepper), stepper.binding
-            size = binding._workspace + FIRST_STEPS * len(run._q)
-            is_plain = binding.reusable and not run._sums_action and stepper.interface.words == 1
-            if is_plain and size <= MOST_KEPT:
-                run._rows = ShortRuns(run)
+    def _reusable(cls, stepper: Integrator) -> Self:
+        """Return a run to be started that has memory for short runs, if later calls may use it again."""
+        run, binding = cls(stepper), stepper.binding
+        size = binding._workspace + FIRST_STEPS * len(run._q)
+        is_plain = binding.reusable and not run._sums_action and stepper.interface.words == 1
+        if is_plain and size <= MOST_KEPT:
+            run._rows = ShortRuns(run)
         return run
 
-    def _release(self) -> None:
-        """Let :meth:`_reused` return this run; the caller drops it. Large memory is freed instead."""
-        if self._rows is not None:
-            self.stepper._released_runs.append(self)
-
     def __reduce__(self) -> tuple[Any, ...]:
-        known = self.stepper.parameters_by_name(self._parameters)
+        parameters = self.stepper.parameters_by_name(self._parameters)
         for name in self._unset_inputs:
-            del known[f"{name}_0"]
+            del parameters[f"{name}_0"]
         with self.alone():
             saved = self.snapshot
-        return (_restored, (self.stepper, saved, known, self._options, self.plan, self.longest))
+        return (_restored, (self.stepper, saved, parameters, self._options, self.plan, self.longest))
 
     @alone
     def record(
@@ -78,7 +72,7 @@ class Run(Memory, AttitudeHistory):
             EventError: if an event function is not finite.
         """
         before = 0.0 if self._leaving else self.step_error
-        trajectory = self._recorded(steps, save_every=save_every, progress=progress)
+        trajectory = self._recorded(steps, Output(save_every, progress=progress))
         try:
             warn_of_inaccuracy(trajectory, self, before=math.inf if self._leaving else before)
         except Exception as error:  # noqa: BLE001  (the run is complete)
@@ -93,49 +87,51 @@ class Run(Memory, AttitudeHistory):
             Observation(self, Saver(LARGEST_COUNT)).advance(steps, progress, stop)
 
     def _recorded(
-        self,
-        steps: int | None,
-        save_every: int = 1,
-        times: Array | None = None,
-        progress: Callable[[int], None] | None = None,
-        observe: Observe = None,
-        stop: Callable[[], bool] | None = None,
+        self, steps: int | None, output: Output = ALL_STATES, stop: Callable[[], bool] | None = None
     ) -> Trajectory:
-        """Return the states as :meth:`record` does, or those at ``times``, without its warnings and its lock."""
-        plan = self._plan
-        if self.stepper.events or times is not None or observe is not None or isinstance(plan, Until):
-            return Observation(self, saver_of(observe, times, save_every)).advance(
-                steps, progress, stop or (lambda: False)
-            )
-        return record(self, steps, save_every=save_every, progress=progress, stop=stop)
+        """Return the states as :meth:`record` does, without its warnings and its lock."""
+        is_observed = output.times is not None or output.observe is not None
+        if self.stepper.events or is_observed or isinstance(self._plan, Until):
+            return Observation(self, saver_of(output)).advance(steps, output.progress, stop or (lambda: False))
+        return record(self, steps, save_every=output.save_every, progress=output.progress, stop=stop)
 
-    def _integrated(
-        self,
-        q: States,
-        p: States | None,
-        velocity: States | None,
-        t: float,
-        growth: int,
-        steps: int | None,
-        save_every: int,
-        times: Array | None,
-        progress: Callable[[int], None] | None,
-        observe: Observe,
-    ) -> Trajectory:
-        """Start a run that is set up and record it as :meth:`_recorded`, a short one by one C call.
+    def _integrated(self, initial: InitialData, growth: int, steps: int | None, output: Output) -> Trajectory:
+        """Start a run that is set up and record it: by one C call if it ends within ``FIRST_STEPS`` saved states.
 
-        The initial state is (q, p), or q and a velocity; the other is ``None``.
+        Args:
+            growth: value of ``measures_growth`` in C.
+            initial, steps, output: as of :meth:`_recorded`.
         """
-        plan, stores_all = self._plan, times is None and observe is None and progress is None
+        plan, h, save_every, short = self._plan, self._h, output.save_every, self._rows
         most = FIRST_STEPS if save_every == 1 else self._first_steps(save_every)
-        fits = steps is None if self._h is None else steps is not None and steps <= most
-        special = self._has_tau or self._unset_inputs or self.stepper.events or self._rows is None
-        if fits and stores_all and not special and (isinstance(plan, Fixed) or t != plan.t_end):
-            return integrate_short(self, q, p, velocity, t, steps, save_every, growth)
+        fits = steps is None if h is None else steps is not None and steps <= most
+        special = short is None or self._has_tau or self._unset_inputs or self.stepper.events
+        is_plain = output is ALL_STATES or output.has_states_alone
+        if special or not (fits and is_plain and (isinstance(plan, Fixed) or initial.t != plan.t_end)):
+            self._start_from(initial, growth)
+            return self._recorded(steps, output)
+        q, p, velocity, t, _, _ = initial
+        if velocity is None:
+            short.begin(t, q, p)
+        else:
+            short.begin_by_velocity(t, q, velocity)
+        short.call.measures_growth = growth
+        size = most if steps is None else steps
+        status = short.integrate(size, save_every)
+        error, error_t, first, last, stored, done, rejected, fallbacks = short.results()
+        if status or (steps is None and done == size):
+            return record(self, steps, save_every=save_every, filled=1 + stored, status=status)
+        if h is None:
+            self._ends = first, last
+        states, sizes = short.recorded(1 + stored, h, save_every)
+        return plain_trajectory(self, states, sizes, done, error, error_t, rejected, fallbacks)
+
+    def _start_from(self, initial: InitialData, growth: int) -> None:
+        """Start a run that is set up, at the momenta of the velocity if that is passed."""
+        q, p, velocity, t, *_ = initial
         if velocity is not None:
             p = self.stepper.initial_momentum(q, velocity, t, self._parameters)
         self._begin(q, cast(States, p), t, growth)
-        return self._recorded(steps, save_every, times, progress, observe)
 
     @property
     def velocity(self) -> Array:

@@ -204,35 +204,6 @@ def _numbers(t: Array, q: Array, p: Array) -> tuple[Array, Array, Array]:
     return from_block(t)[:, 0].copy(), from_block(q).copy(), from_block(p).copy()
 
 
-def integrate_short(
-    run: Memory, q: Any, p: Any, velocity: Any, t: float, steps: int | None, save_every: int, growth: int
-) -> Trajectory:
-    """Start a run that is set up and record it, all by one C call if it ends within ``FIRST_STEPS`` states.
-
-    The initial state is (q, p), or q and a velocity; the other is ``None``. Raises as :func:`record`.
-
-    Args:
-        growth: value of ``measures_growth`` in C.
-    """
-    short: ShortRuns = run._rows
-    h = run._h
-    first = FIRST_STEPS if save_every == 1 else run._first_steps(save_every)
-    size = first if steps is None else steps
-    if velocity is None:
-        short.begin(t, q, p)
-    else:
-        short.begin_by_velocity(t, q, velocity)
-    short.call.measures_growth = growth
-    status = short.integrate(size, save_every)
-    error, error_t, first, last, stored, done, rejected, fallbacks = short.results()
-    if status or (steps is None and done == size):
-        return record(run, steps, save_every=save_every, filled=1 + stored, status=status)
-    if h is None:
-        run._ends = first, last
-    states, sizes = short.recorded(1 + stored, h, save_every)
-    return _trajectory(run, states, sizes, done, error, error_t, rejected, fallbacks)
-
-
 class _StateRecorder:
     """Present state of a run, and every ``save_every``-th of the following ones, in arrays that C fills.
 
@@ -321,12 +292,12 @@ def trajectory_of(
     run, error = memory._memory, math.nan if memory._step_error is None else memory._step_error()
     done, rejected = run.step if steps is None else steps, run.rejected if isinstance(memory._plan, Adaptive) else 0
     error_t, fallbacks = run.error_t if error >= 0.0 else 0.0, memory.fallback_steps
-    trajectory = _trajectory(memory, states, step_sizes, done, error, error_t, rejected, fallbacks)
+    trajectory = plain_trajectory(memory, states, step_sizes, done, error, error_t, rejected, fallbacks)
     trajectory.events, trajectory.tau = events, tau
     return trajectory
 
 
-def _trajectory(
+def plain_trajectory(
     memory: Memory,
     states: States,
     step_sizes: Array,
@@ -379,6 +350,7 @@ def _differences(t: Array, *, whole: bool) -> Array:
 
 def first_step_size(plan: Adaptive | InTau, t: Array) -> float:
     """Return the first step size between states of an adaptive run, or the direction of the run; NaN without states."""
-    if len(t) == 0:
-        return math.nan
-    return t.item(1) - t.item(0) if len(t) > 1 else plan.t_end - t.item(0)
+    count = len(t)
+    if count > 1:
+        return t.item(1) - t.item(0)
+    return plan.t_end - t.item(0) if count else math.nan

@@ -23,13 +23,14 @@ from scvi_codegen.runs.accuracy.resolution import warn_of_unresolved_fields
 from scvi_codegen.runs.driver.run_loop import record_with_stops
 from scvi_codegen.runs.results.dense_output import checked_times
 from scvi_codegen.runs.results.joining import joined
+from scvi_codegen.runs.results.output import Output
 from scvi_codegen.runs.states.pairs import exact_product
 from scvi_codegen.runs.states.times import times_after
 from scvi_codegen.runs.states.validation import Array, check_left_to_inputs, no_input
 from scvi_codegen.runs.states.words import low_words, split, with_low
 from scvi_codegen.runs.stepping.features import refusal
 from scvi_codegen.runs.stepping.memory import Memory
-from scvi_codegen.runs.stepping.step_plan import Adaptive, FixedSteps, ending_at
+from scvi_codegen.runs.stepping.step_plan import Adaptive, Fixed, FixedSteps, StepPlan, ending_at
 from scvi_codegen.runs.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -277,6 +278,10 @@ class InputSegments:
         self.inputs, self.t_end, self.values = inputs, t_end, parameters_of(stepper, parameters, inputs)
         self.first = self.values(first_inner_time(t, t_end))
 
+    def plan(self, plan: StepPlan) -> StepPlan:
+        """Return the step plan of the run; fixed steps have no end, as each segment ends where the next begins."""
+        return Fixed(plan.h) if isinstance(plan, FixedSteps) else plan
+
     def record(self, run: Run, save_every: int, progress: Callable[[int], None] | None) -> Trajectory:
         """Integrate segment by segment; states at breakpoints are saved as well."""
         first, run._watch = run.steps, None
@@ -296,7 +301,7 @@ class InputSegments:
             ends = [*(t for t in stops if min(start, end) < t < max(start, end)), end]
             if not run.stepper.events:
                 return record_with_stops(run, ends, progress=progress)
-            return record_segments(run, prepared_ends(ends), partial(run._recorded, progress=progress))
+            return record_segments(run, prepared_ends(ends), partial(run._recorded, output=Output(progress=progress)))
 
         def prepared_ends(ends: Sequence[float]) -> Iterator[None]:
             for end in ends:

@@ -59,6 +59,7 @@ from scvi_codegen.runs.stepping.step_plan import (
     Adaptive,
     AdaptivePlans,
     ErrorControl,
+    KindOfSteps,
     Until,
     check_max_step,
     planned_steps,
@@ -158,7 +159,7 @@ class EnsembleSettings:
         if h is not None and t_end is not None and np.ndim(t_end):
             raise StateError("with h all trajectories have one t_end: give one number, or omit h (adaptive step size)")
         first = None if t_end is None else float(real_array(t_end, "t_end").flat[0])
-        planned_steps.__wrapped__(h, self.steps, first, *self.control, 1, hashed(t), None, False, 1)
+        planned_steps(KindOfSteps(), h, self.steps, first, *self.control, 1, hashed(t))
         if h is None or (self.inputs is None and first is None):
             return self.steps, t_end
         return None, final_time(t, h, self.steps, first)

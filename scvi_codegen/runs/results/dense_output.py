@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen.codegen.native.arguments import checked_number, real_array
 from scvi_codegen.codegen.native.options import step_failure
 from scvi_codegen.common.errors import StateError
+from scvi_codegen.runs.results.output import Output
 from scvi_codegen.runs.results.saved_states import ROUNDINGS, SavedStates
 from scvi_codegen.runs.results.time_transformation import part_of_step, states_in_transformed_time
 from scvi_codegen.runs.states.words import Words, fraction_of, low_words, split, with_low
@@ -85,8 +86,7 @@ def _integrate_to_each(
         to_last = ending_at(plan, float(times[rows[-1]]))
         settings = {"t": states.t[left[rows[0]]], "parameters": states.parameters, "options": states.options}
         run = stepper._run(q[rows[0]], p[rows[0]], plan=to_last, **settings)
-        run._memory.t_low = low_words(states.t)[left[rows[0]]]
-        reached = run._recorded(None, times=times[rows])
+        reached = run._recorded(None, Output(times=times[rows]))
         q[rows], p[rows] = reached.q, reached.p
     return q, p
 

@@ -5,19 +5,16 @@ from __future__ import annotations
 import math
 import operator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.codegen.native.options import SolverOptions
-from scvi_codegen.runs.states.words import Words
+from scvi_codegen.runs.states.words import scalar
 from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.memory import Memory
 from scvi_codegen.runs.stepping.step_plan import Fixed, StepPlan
-
-if TYPE_CHECKING:
-    pass
 
 Array = NDArray[np.float64]
 ROUNDINGS, STEP_END_TOLERANCE = 4.0, 1e-6
@@ -83,7 +80,4 @@ class SavedStates:
     def _restarted(self, k: int, h: float) -> Memory:
         """Return a run from saved state k with fixed steps h."""
         settings: dict[str, Any] = {"parameters": self.parameters, "options": self.options}
-        run = Memory.started(self.stepper, self.q[k], self.p[k], plan=Fixed(h), t=float(self.t[k]), **settings)
-        if isinstance(self.t, Words):
-            run._memory.t_low = self.t.low[k]
-        return run
+        return Memory.started(self.stepper, self.q[k], self.p[k], plan=Fixed(h), t=scalar(self.t[k]), **settings)

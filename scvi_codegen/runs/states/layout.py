@@ -15,12 +15,13 @@ import re
 from collections.abc import Mapping
 from dataclasses import replace
 from itertools import chain
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from scvi_codegen.codegen.native.arguments import checked_number, real_array
+from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.codegen.rendering.source import Interface
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.runs.states.rotations import check_names, column, joined_columns, members_of, state_of
@@ -41,6 +42,23 @@ from scvi_codegen.runs.states.words import block_of, from_block, low_words, name
 
 Start = tuple[Any, Any, Any]
 """Positions, momenta and velocities of a state, of which one of the last two is ``None``."""
+
+
+class InitialData(NamedTuple):
+    """Initial state of a run, and what holds for all of its steps.
+
+    Attributes:
+        q, p, velocity: positions, and momenta or velocities; the other is ``None``.
+        t: time.
+        parameters, options: of the steps.
+    """
+
+    q: States
+    p: States | None
+    velocity: States | None
+    t: float
+    parameters: Parameters
+    options: SolverOptions | None
 
 
 class StateLayout:

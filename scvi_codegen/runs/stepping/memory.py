@@ -17,6 +17,7 @@ from scvi_codegen.codegen.native.arguments import checked_step
 from scvi_codegen.codegen.native.options import SolverOptions, checked_options, step_failure
 from scvi_codegen.common.errors import StateError, StepFailedError
 from scvi_codegen.common.validation import LARGEST_COUNT, checked_count
+from scvi_codegen.runs.states.layout import InitialData
 from scvi_codegen.runs.states.validation import (
     Array,
     Parameters,
@@ -180,8 +181,9 @@ class Memory:
         options: SolverOptions | None = None,
     ) -> None:
         """Start at (q, p) and t; nothing of an earlier run remains."""
-        self._set_up(plan, parameters, options, q, p)
-        self._begin(q, p, self.stepper._states.time(t))
+        initial = InitialData(q, p, None, self.stepper._states.time(t), parameters, options)
+        self._set_up(plan, initial)
+        self._begin(q, p, initial.t)
 
     def _begin(self, q: States, p: States, t: float, growth: int = 0) -> None:
         """Start at (q, p) and t after :meth:`_set_up`; ``growth``: value of ``measures_growth`` in C."""
@@ -195,10 +197,9 @@ class Memory:
         if growth and self._can_measure_growth:
             self._memory.measures_growth = growth
 
-    def _set_up(
-        self, plan: StepPlan, parameters: Parameters, options: SolverOptions | None, q: States, p: States | None
-    ) -> None:
-        """Set what holds for all steps of a run that starts at (q, p); p is required in transformed time only."""
+    def _set_up(self, plan: StepPlan, initial: InitialData) -> None:
+        """Set what holds for all steps of a run; momenta are required in transformed time only."""
+        q, p, _, _, parameters, options = initial
         if parameters is not None or not self._has_defaults:
             stepper, interface = self.stepper, self.stepper.interface
             self._parameters[:] = stepper._parameters_at(q, p, parameters)

@@ -4,7 +4,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from functools import lru_cache
 from typing import Any, NamedTuple, Self, TypeAlias
 
 import numpy as np
@@ -121,6 +120,20 @@ class AdaptivePlans(Sequence[Adaptive]):
         if isinstance(j, slice):
             return AdaptivePlans(self.ends[j], self.plan)
         return replace(self.plan, t_end=float(self.ends[j]))
+
+
+class KindOfSteps(NamedTuple):
+    """Kind of the steps of a stepper.
+
+    Attributes:
+        time_transformation: of the reversible controller, if there is one.
+        in_tau: whether the system is one in transformed time, which has fixed steps only.
+        words: number of words of the states.
+    """
+
+    time_transformation: str | None = None
+    in_tau: bool = False
+    words: int = 1
 
 
 class ErrorControl(NamedTuple):
@@ -322,34 +335,26 @@ def _check_resolved(tolerance: float | None, least: float) -> None:
         )
 
 
-def checked_plan(
-    h: float | None,
-    t_end: float | None,
-    control: ErrorControl,
-    time_transformation: str | None = None,
-    in_tau: bool = False,
-    /,
-) -> StepPlan:
+def checked_plan(kind: KindOfSteps, h: float | None, t_end: float | None, control: ErrorControl) -> StepPlan:
     """Return the step plan of arguments of users.
 
     Args:
+        kind: of the stepper.
         h, t_end: step size; target time.
         control: of adaptive steps.
-        time_transformation: of the reversible controller, if there is one.
-        in_tau: whether the system is one in transformed time, which has fixed steps only.
 
     Raises:
         StateError: if a number is invalid, or they do not determine the steps.
     """
-    if time_transformation is not None:
+    if kind.time_transformation is not None:
         if h is None or t_end is None or control.named:
             remedy = FEATURES["adaptive", "with a time transformation"]
-            raise StateError(f"the time transformation {time_transformation} determines the step size: {remedy}")
+            raise StateError(f"the time transformation {kind.time_transformation} determines the step size: {remedy}")
         tau = checked_step(h)
         if tau < 0.0:
             raise StateError(f"h = {h:g} must be positive with a time transformation: t_end determines the direction")
         return InTau(checked_number(t_end, "t_end"), tau)
-    if h is None and in_tau:
+    if h is None and kind.in_tau:
         raise refusal("adaptive", "in transformed time")
     if h is None:
         if t_end is None:
@@ -362,8 +367,8 @@ def checked_plan(
     return Fixed(checked_step(h))
 
 
-@lru_cache(maxsize=256, typed=True)
 def planned_steps(
+    kind: KindOfSteps,
     h: float | None,
     steps: int | None,
     t_end: float | None,
@@ -373,26 +378,22 @@ def planned_steps(
     first_step: float | None,
     save_every: int,
     t: float | Fraction,
-    time_transformation: str | None,
-    in_tau: bool,
-    words: int,
     /,
 ) -> tuple[StepPlan, int | None]:
     """Return the plan of :meth:`Stepper.integrate` and its number of steps, ``None`` to t_end.
 
     Args:
+        kind: of the stepper; runs in double-double end at t_end to 32 digits.
         h, steps, t_end, tolerance, absolute_tolerance, max_step, first_step, save_every, t: arguments of
             :meth:`Stepper.integrate`; t matters with h and t_end.
-        time_transformation, in_tau: as of :func:`checked_plan`.
-        words: number of words of the states; runs in double-double end at t_end to 32 digits.
 
     Raises:
         StateError: if a number is invalid, or they do not determine the steps.
     """
-    fixed = h is not None and time_transformation is None
+    fixed = h is not None and kind.time_transformation is None
     control = ErrorControl(tolerance, absolute_tolerance, max_step, first_step)
-    plan = checked_plan(h, None if fixed else t_end, control, time_transformation, in_tau)
-    if words > 1:
+    plan = checked_plan(kind, h, None if fixed else t_end, control)
+    if kind.words > 1:
         check_doubles(t_end=t_end)
     if not isinstance(plan, FixedSteps):
         if steps is not None:
@@ -402,7 +403,7 @@ def planned_steps(
         if steps is None:
             raise StateError("h requires steps or t_end (fixed step size); give t_end without h for adaptive steps")
         return plan, checked_count(steps, "steps", least=0)
-    count = None if in_tau or steps is not None else steps_to(t, t_end, plan.h, exactly=words > 1)
+    count = None if kind.in_tau or steps is not None else steps_to(t, t_end, plan.h, exactly=kind.words > 1)
     if count is not None and count % checked_count(save_every, "save_every", least=1) == 0:
         return plan, count
     end = checked_number(t_end, "the time t_end")
