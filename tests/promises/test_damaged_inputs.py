@@ -272,12 +272,14 @@ def test_damaged_interfaces_of_packages_are_rejected(text: str, part: int, tmp_p
     assert count > 60
     source = record["source"]
     declarations = [line for k, line in enumerate(source["declarations"]) if k != len(source["declarations"]) // 2]
-    contents = source["contents"]
+    contents, sizes = source["contents"], source["contents"]["sizes"]
     damaged_sources = (
         {"declarations": declarations},
         {"support": ["../../secret.h"]},
-        {"contents": contents | {"workspace": contents["workspace"] - 1}},
-        {"contents": contents | {"coordinates": -1}},
+        {"contents": contents | {"sizes": sizes | {"workspace": sizes["workspace"] - 1}}},
+        {"contents": contents | {"sizes": sizes | {"coordinates": -1}}},
+        {"contents": contents | {"sizes": None}},
+        {"contents": contents | {"lanes": {"points": 1}}},
     )
     damaged_records = [json.dumps(record | {"source": source | each}) for each in damaged_sources]
     for other in ('{"format": ' + "[" * 99999, *damaged_records):

@@ -11,7 +11,7 @@ frameworks.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import accumulate, chain
 from typing import Any, ClassVar, Literal, TypeAlias, cast, get_args
 
@@ -36,7 +36,7 @@ from scvi_codegen.codegen.rendering.kernels.simd import (
     splitting_source,
 )
 from scvi_codegen.codegen.rendering.preprocessor import included
-from scvi_codegen.codegen.rendering.source import Contents, ExampleInput, Interface, Source
+from scvi_codegen.codegen.rendering.source import Contents, ExampleInput, Interface, LaneContents, Sizes, Source
 from scvi_codegen.codegen.rendering.text import INPUT_PRECISION, LARGEST_VIOLATION, MAX_ITERATIONS, ROUNDING_UNITS
 
 Embedded: TypeAlias = Literal["double", "single"]
@@ -462,14 +462,21 @@ def _contents_of_step(context: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "rolled": not (by_newton or shooting),
         "points_in_loops": program.rattle is not None,
-        "coordinates": program.dimension,
-        "parameters": len(program.layout.parameters),
-        "unknowns": program.equations.unknowns,
-        "workspace": context["workspace"],
-        "maps": len(program.quantities.momentum_maps),
-        "constraints": program.constraints.count if program.constraints else 0,
-        "sums": program.sums,
+        "sizes": Sizes(
+            coordinates=program.dimension,
+            parameters=len(program.layout.parameters),
+            unknowns=program.equations.unknowns,
+            workspace=context["workspace"],
+            maps=len(program.momentum_maps),
+            constraints=program.constraints.count if program.constraints else 0,
+            sums=program.sums,
+        ),
     }
+
+
+def _contents_of_lanes(context: Mapping[str, Any]) -> dict[str, Any]:
+    names = [attribute.name for attribute in fields(LaneContents)]
+    return {"lanes": LaneContents(**{name: context[name] for name in names})}
 
 
 CONTENTS: dict[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
@@ -477,7 +484,7 @@ CONTENTS: dict[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
     "arrays": lambda context: {"threads": True},
     "events": lambda context: {},
     "array_events": lambda context: {},
-    "ensemble": lambda context: {name: int(context[name]) for name in ("points", "observed", "needs_velocities")},
+    "ensemble": _contents_of_lanes,
 }
 """Contents of the C of an entry template, from its context."""
 

@@ -33,8 +33,10 @@ KINDS: dict[str, Callable[[Any], bool]] = {
     "tuple[float, ...]": lambda value: isinstance(value, tuple) and all(map(_is_number, value)),
     "tuple[tuple[str, ...], ...]": lambda value: isinstance(value, tuple) and all(map(KINDS["tuple[str, ...]"], value)),
     "ArrayLayout": lambda value: False,
+    "Sizes | None": lambda value: value is None or isinstance(value, Sizes),
+    "LaneContents | None": lambda value: value is None or isinstance(value, LaneContents),
 }
-"""Checks of values read from JSON against the annotations of :class:`Interface`."""
+"""Checks of values read from JSON against the annotations of :class:`Interface` and :class:`Contents`."""
 
 
 def _checked(cls: type, record: Mapping[str, Any]) -> dict[str, Any]:
@@ -48,8 +50,30 @@ def _checked(cls: type, record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Sizes:
+    """Numbers of an integrator of named coordinates; ``workspace``: doubles per call."""
+
+    coordinates: int
+    parameters: int
+    unknowns: int
+    workspace: int
+    maps: int
+    constraints: int
+    sums: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LaneContents:
+    """Points of a step and functions observed of trajectories in lanes; whether blocks initially contain velocities."""
+
+    points: int
+    observed: int
+    needs_velocities: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Contents:
-    """What the C of a source offers its callers, recorded where it is rendered; numbers are 0 for what it lacks.
+    """What the C of a source offers its callers, recorded where it is rendered.
 
     Attributes:
         functions: functions that its header declares, without the prefix.
@@ -58,10 +82,8 @@ class Contents:
         rolled: whether short loops over coordinates must not be unrolled.
         points_in_loops: whether kernels are in loops over the points of a step.
         threads: whether threads may share its steps.
-        coordinates, parameters, unknowns, maps, constraints, sums: numbers of an integrator of named coordinates.
-        workspace: doubles per call; 0 for arrays of run-time sizes.
-        points, observed, needs_velocities: points of a step, observed functions and whether the memory of a block
-            initially contains velocities, of an ensemble.
+        sizes: of an integrator of named coordinates, else ``None``.
+        lanes: of trajectories in SIMD lanes, else ``None``.
     """
 
     functions: tuple[str, ...] = ()
@@ -70,21 +92,16 @@ class Contents:
     rolled: bool = False
     points_in_loops: bool = False
     threads: bool = False
-    coordinates: int = 0
-    parameters: int = 0
-    unknowns: int = 0
-    workspace: int = 0
-    maps: int = 0
-    constraints: int = 0
-    sums: int = 0
-    points: int = 0
-    observed: int = 0
-    needs_velocities: int = 0
+    sizes: Sizes | None = None
+    lanes: LaneContents | None = None
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> Contents:
         """Return the contents from plain data; raises ValueError and TypeError for other fields and types."""
-        return cls(**_checked(cls, record))
+        sizes, lanes = record["sizes"], record["lanes"]
+        kinds = {"sizes": sizes and Sizes(**_checked(Sizes, sizes))}
+        kinds["lanes"] = lanes and LaneContents(**_checked(LaneContents, lanes))
+        return cls(**_checked(cls, {**record, **kinds}))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -218,17 +235,19 @@ def _is_number(value: Any) -> bool:
 
 def check_interface(source: Source, interface: Interface) -> None:
     """Raise :class:`ValueError` if an interface has other sizes than the C source, which determine those of arrays."""
-    contents = source.contents
+    of_source = source.contents.sizes
+    if of_source is None:
+        raise ValueError("contents: the source must be that of an integrator of named coordinates, with its sizes")
     sizes = {
-        "COORDINATES": (interface.dimension, contents.coordinates),
-        "PARAMETERS": (len(interface.parameters), contents.parameters),
-        "UNKNOWNS": (interface.unknowns, contents.unknowns),
-        "WORKSPACE": (interface.workspace, contents.workspace),
-        "MAPS": (len(interface.map_names), contents.maps),
-        "CONSTRAINTS": (len(interface.constraints), contents.constraints),
+        "COORDINATES": (interface.dimension, of_source.coordinates),
+        "PARAMETERS": (len(interface.parameters), of_source.parameters),
+        "UNKNOWNS": (interface.unknowns, of_source.unknowns),
+        "WORKSPACE": (interface.workspace, of_source.workspace),
+        "MAPS": (len(interface.map_names), of_source.maps),
+        "CONSTRAINTS": (len(interface.constraints), of_source.constraints),
     }
-    if interface.exchange_names and contents.sums:
-        sizes["SUMS"] = (len(interface.exchange_names) + 1, contents.sums)
+    if interface.exchange_names and of_source.sums:
+        sizes["SUMS"] = (len(interface.exchange_names) + 1, of_source.sums)
     for name, (described, compiled) in sizes.items():
         if described != compiled:
             raise ValueError(

@@ -75,8 +75,9 @@ class DeviceRuns:
         self.values_at, self.observation, self.device = values_at, observation, Device()
         source = cast(Source, stepper.ensemble if observation is None else observation.source)
         self.launch = self.device.kernels(source)
-        self.points = source.contents.points
-        self.needs_velocities = bool(source.contents.needs_velocities)
+        lanes = source.contents.lanes
+        assert lanes is not None  # of an ensemble
+        self.points, self.needs_velocities = lanes.points, lanes.needs_velocities
         count, self.m = map(int, start[0].shape)
         self.count, device = count, self.device
         self.q, self.p = (device.empty((len(steps.numbers), *each.shape)) for each in start)

@@ -58,7 +58,9 @@ class EnsembleObservation:
                 "source: compile the system, or omit observe and save states"
             )
         self.source = source
-        self.values = np.full((5, source.contents.observed, count), np.nan)
+        lanes = source.contents.lanes
+        assert lanes is not None  # of an ensemble
+        self.values = np.full((5, lanes.observed, count), np.nan)
         self.values[RISES:] = 0.0
 
     def _variant(self) -> Observing:

@@ -149,10 +149,10 @@ class CompiledMethod:
         return stepper._with_action
 
     def _copy(self, events: tuple[Event, ...], source: Source | None = None) -> Self:
-        workspace = source.contents.workspace if source else None
+        sizes = source.contents.sizes if source else None
         return type(self)(
             source or self._plain,
-            replace(self.interface, workspace=workspace) if workspace else self.interface,
+            replace(self.interface, workspace=sizes.workspace) if sizes else self.interface,
             variants=self._variants,
             flags=self.flags,
             events=events,
