@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import sympy
 
+from scvi_codegen.analysis.verification.system_under_test import canonical_form
 from scvi_codegen.common.display.page import TableBlock
 from scvi_codegen.interfaces.derivation.equations import derive
 from scvi_codegen.interfaces.models.problems import problem
@@ -53,7 +54,7 @@ def structure_of(method: Method) -> Structure:
     smallest = sorted(ends)[-3:]
     order, _ = np.polyfit(np.log([SPAN / n for n in smallest]), np.log([ends[n] for n in smallest]), 1)
     run = _run(method, STEP_SIZE)
-    jacobian, omega = run.stepper.jacobian(*STATE, h=STEP_SIZE), np.kron([[0, 1], [-1, 0]], np.eye(2))
+    jacobian, omega = run.stepper.jacobian(*STATE, h=STEP_SIZE), canonical_form(2)
     return Structure(largest(jacobian.T @ omega @ jacobian - omega), float(run.momentum_error[1]), float(order))
 
 

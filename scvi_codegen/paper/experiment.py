@@ -145,10 +145,9 @@ def claims(results: Mapping[str, Result]) -> Result:
     checks = [(name, check) for name in EVIDENCE if name in results for check in results[name].checks]
     rows = []
     for key, claim in CLAIMS.items():
-        evidence, parts = [(name, check) for name, check in checks if key in check.bears_on], []
-        for verdict in Verdict:
-            if names := [name for name, check in evidence if check.verdict is verdict]:
-                parts.append(f"{len(names)} {verdict.value} ({', '.join(dict.fromkeys(names))})")
+        evidence = [(name, check) for name, check in checks if key in check.bears_on]
+        names = {verdict: [name for name, check in evidence if check.verdict is verdict] for verdict in Verdict}
+        parts = [f"{len(of)} {verdict.value} ({', '.join(dict.fromkeys(of))})" for verdict, of in names.items() if of]
         measured = f"Of {len(evidence)} checks: {'; '.join(parts)}." if parts else "No check bears on it."
         rows.append(Comparison(claim=claim, measured=measured, verdict=common_verdict(check for _, check in evidence)))
     missing = ", ".join(name for name in EVIDENCE if name not in results)

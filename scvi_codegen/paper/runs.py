@@ -211,7 +211,9 @@ def _enclosed_area(q: Array, p: Array) -> float:
 
 def _ellipse_change(r: MeasuredRun) -> float:
     """Return the mean area pi a b of the osculating ellipse over the last three periods over the first, less 1."""
-    areas, count = np.pi * np.abs(r.momenta) * (-2.0 * r.energies) ** -1.5, round(3.0 * PERIOD / r.h)
+    # pi a b with a = -1/(2 E) and b = |M| / sqrt(-2 E)
+    areas = np.pi * np.abs(r.momenta) * (-2.0 * r.energies) ** -1.5
+    count = round(3.0 * PERIOD / r.h)
     return float(areas[-count:].mean() / areas[:count].mean()) - 1.0
 
 
@@ -257,6 +259,7 @@ def exact_kepler(q: ArrayLike, p: ArrayLike, t: ArrayLike) -> tuple[Array, Array
     x = mean.copy()
     for _ in range(60):  # Newton's iterations
         x -= (x - inward * np.sin(x) + sigma * (1 - np.cos(x)) - mean) / (1 - inward * np.cos(x) + sigma * np.sin(x))
+    # Lagrange's coefficients: q(t) = f q_0 + g v_0 (Danby, Fundamentals of Celestial Mechanics, ch. 6).
     r = a * (1 - inward * np.cos(x) + sigma * np.sin(x))
     f, g = 1 - a / r0 * (1 - np.cos(x)), times - a**1.5 * (x - np.sin(x))
     f_dot, g_dot = -math.sqrt(a) / (r * r0) * np.sin(x), 1 - a / r * (1 - np.cos(x))

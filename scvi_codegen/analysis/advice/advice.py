@@ -182,7 +182,8 @@ def advise(
     if precision not in PRECISIONS[:2]:
         raise MethodError(f"advise requires precision='double' or 'double-double', not {precision!r}")
     compiled = partial(compile_stepper, precision=precision)
-    for candidate in _candidates(method, 1 + (precision == DOUBLE_DOUBLE)) if degree else [method]:
+    candidates = _candidates(method, 2 if precision == DOUBLE_DOUBLE else 1) if degree else [method]
+    for candidate in candidates:
         for stepper in _steppers(compiled, system, candidate, solver):
             try:
                 trials = Trials(stepper, q, state)

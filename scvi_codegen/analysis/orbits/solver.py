@@ -171,6 +171,7 @@ class PeriodicOrbit:
 
 
 def _inverse(matrix: Array) -> Array:
+    """Return the inverse -Omega M^T Omega of a symplectic matrix M."""
     m = len(matrix) // 2
     a, b, c, d = matrix[:m, :m], matrix[:m, m:], matrix[m:, :m], matrix[m:, m:]
     return np.block([[d.T, -b.T], [-c.T, a.T]])
@@ -516,7 +517,8 @@ class _OrbitSearch:
     def _states_before(self, start: Array, period: float) -> Array:
         """Return the states before a state, in equal steps back over half a period, of impacts that can be undone."""
         count = len(self._steps)
-        plan, steps, (q, p) = Fixed(-period / count), count - count // 2, np.split(start, 2)
+        plan, steps = Fixed(-period / count), count - count // 2
+        q, p = np.split(start, 2)
         if self._steps.tolerance is None and not any(event.changes for event in self.stepper.events):
             initial = InitialData(q, p, None, self.t, self.parameters, self.options)
             run = self.stepper._started(initial, plan)
@@ -792,7 +794,8 @@ def _warn_of_distance(orbit: PeriodicOrbit, guess: Array) -> None:
 
 def _is_near(orbit: PeriodicOrbit, guess: Array, states: Array) -> bool:
     """Return whether an orbit with (n, 2m) states is near the guess, by the distance of the guess from its middle."""
-    away, middle = np.concatenate([orbit.q, orbit.p]) - guess[:-1], (states.max(axis=0) + states.min(axis=0)) / 2.0
+    away = np.concatenate([orbit.q, orbit.p]) - guess[:-1]
+    middle = (states.max(axis=0) + states.min(axis=0)) / 2.0
     near = np.abs(away).max() <= FAR * np.abs(guess[:-1] - middle).max()
     return bool(1 / FAR < orbit.period / guess[-1] < FAR and near)
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.analysis.verification.certificate import Check, Finding, checked
-from scvi_codegen.analysis.verification.system_under_test import State, SystemUnderTest
+from scvi_codegen.analysis.verification.system_under_test import State, SystemUnderTest, canonical_form
 from scvi_codegen.analysis.verification.variable_steps import VariableSteps
 from scvi_codegen.common.errors import MethodError
 from scvi_codegen.common.precision import Number, mp
@@ -115,7 +115,8 @@ def _map_in_tau(runs: VariableSteps) -> _Map:
         result = step(q, p, h)
         return np.array([*result.q, *result.p, arguments[-2] + step.duration(result, q, p, h)], dtype=object)
 
-    values, scales = np.array(list(runs.at_energy(state).values())), np.append(tested.scales(state), state.h)
+    values = np.array(list(runs.at_energy(state).values()))
+    scales = np.append(tested.scales(state), state.h)
     return _Map(runs.stepper, state, values, scales, np.asarray(runs.stepper._output_indices), end)
 
 
@@ -232,7 +233,7 @@ def _symplecticity(runs: VariableSteps) -> Finding:
     state = runs.tested.states[0]
     parameters, scales, m = runs.at_energy(state), runs.tested.scales(state), len(state.q)
     J = runs.stepper.jacobian(state.q, state.p, state.h, state.t, parameters) * scales / scales[:, np.newaxis]
-    omega = np.kron([[0, 1], [-1, 0]], np.eye(m)) * np.outer(scales, scales)
+    omega = canonical_form(m) * np.outer(scales, scales)
     areas = np.tile(scales[:m] * scales[m:], 2)
     largest = float(np.abs(J).max()) ** 2
     defect = float((np.abs(J.T @ omega @ J - omega) / np.sqrt(np.outer(areas, areas))).max())

@@ -9,7 +9,7 @@ import numpy as np
 import sympy
 
 from scvi_codegen.analysis.verification.certificate import Check, Finding, checked
-from scvi_codegen.analysis.verification.system_under_test import EPSILON, SystemUnderTest, linearised
+from scvi_codegen.analysis.verification.system_under_test import EPSILON, SystemUnderTest, canonical_form, linearised
 from scvi_codegen.codegen.rendering.events import EventFormulas
 from scvi_codegen.common.errors import EventWarning, StateError
 from scvi_codegen.methods.discretise import is_symplectic
@@ -139,7 +139,8 @@ def _impact_errors(run: Trajectory, impact: Change) -> tuple[float, float, float
     """
     stepper, parameters, t = run.stepper, run.parameters, impact.t
     (q, p), p_after = impact.before, impact.after[1]
-    n, g_t, n_rounding, g_t_rounding = impact.normal[:-1], impact.normal[-1], impact.rounding[:-1], impact.rounding[-1]
+    n, g_t = impact.normal[:-1], impact.normal[-1]
+    n_rounding, g_t_rounding = impact.rounding[:-1], impact.rounding[-1]
     size, square = np.abs(n), n @ n
     # p_after = p + (1 + e)/2 lambda n, with lambda of the elastic impact: H(p + lambda n) - H(p) = -lambda g_t.
     part, jump = 0.5 * (1.0 + impact.restitution), p_after - p
@@ -212,7 +213,7 @@ def _symplecticity(run: Trajectory, changes: list[Change]) -> Finding | None:
     elastic, defects = _elastic(changes), []
     if not elastic:
         return None
-    form = np.kron([[0.0, 1.0], [-1.0, 0.0]], np.eye(run.stepper.dimension))
+    form = canonical_form(run.stepper.dimension)
     for h in (run.h, run.h / DIVISOR):
         start, step = _across(run, elastic[0], h)
         matrix = step(start).tangent()[-1]

@@ -129,7 +129,8 @@ def _low_words(tested: SystemUnderTest) -> Finding | None:
     ways = ((state, COMPENSATED_STEPS, carry), (joined, COMPENSATED_STEPS, rest))
     (end, low), (other, other_low) = (_advanced(tested, tested.stepper, *way) for way in ways)
     scales = tested.scales(state)
-    difference, moved = np.abs((end - other) + (low - other_low)) / scales, np.abs(end - state.z) / scales
+    difference = np.abs((end - other) + (low - other_low)) / scales
+    moved = np.abs(end - state.z) / scales
     return Finding(
         float(difference.max() / (LARGE_COMPENSATION * moved.max())),
         MAX_LOSS,

@@ -158,11 +158,13 @@ def _run(tested: SystemUnderTest) -> Finding:
 
 
 def _run_of(tested: SystemUnderTest, stepper: Stepper) -> float:
-    first, z = tested.states[0], np.concatenate
+    first, worst = tested.states[0], 0.0
     run = stepper.integrate(first.q, first.p, h=first.h, steps=RUN_STEPS, t=first.t, parameters=tested.parameters)
-    starts = [State(run.q[k], run.p[k], float(run.t[k]), first.h) for k in SAMPLED_STEPS]
-    ends = [z([run.q[k + 1], run.p[k + 1]]) for k in SAMPLED_STEPS]
-    return max(tested.in_roundings(tested.ends(start) - end, start) for start, end in zip(starts, ends, strict=True))
+    for k in SAMPLED_STEPS:
+        start = State(run.q[k], run.p[k], float(run.t[k]), first.h)
+        end = np.concatenate([run.q[k + 1], run.p[k + 1]])
+        worst = max(worst, tested.in_roundings(tested.ends(start) - end, start))
+    return worst
 
 
 def _action(tested: SystemUnderTest) -> Finding | None:

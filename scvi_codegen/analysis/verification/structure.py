@@ -7,7 +7,13 @@ from functools import partial
 import numpy as np
 
 from scvi_codegen.analysis.verification.certificate import Check, Finding, checked, information
-from scvi_codegen.analysis.verification.system_under_test import EPSILON, Jacobian, State, SystemUnderTest
+from scvi_codegen.analysis.verification.system_under_test import (
+    EPSILON,
+    Jacobian,
+    State,
+    SystemUnderTest,
+    canonical_form,
+)
 from scvi_codegen.common.errors import StateError, StepFailedError
 from scvi_codegen.common.precision import mp
 from scvi_codegen.methods.discretise import is_conformally_symplectic, is_symplectic
@@ -89,8 +95,7 @@ def _normalised_states(tested: SystemUnderTest, reduction: Reduction) -> list[St
 def _reduced_symplecticity(tested: SystemUnderTest) -> Finding:
     """Return the largest defect of the symplectic form in canonical coordinates of the reduced space."""
     reduction, worst = Reduction(tested.stepper.interface), 0.0
-    half = reduction.size // 2
-    form = np.kron([[0.0, 1.0], [-1.0, 0.0]], np.eye(half))
+    form = canonical_form(reduction.size // 2)
     for state in _normalised_states(tested, reduction):
         derivative = tested.stepper.jacobian(state.q, state.p, state.h, state.t, tested.parameters)
         step = reduction.outward(*tested.step(state)) @ derivative @ reduction.inward(state.q, state.p)

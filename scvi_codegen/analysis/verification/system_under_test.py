@@ -69,6 +69,11 @@ def _differences(step: Map, state: Array, scales: Array, width: float) -> Array:
     return np.asarray(np.array(columns).T)
 
 
+def canonical_form(m: int) -> Array:
+    """Return the (2m, 2m) matrix Omega = [[0, 1], [-1, 0]] of the canonical symplectic form."""
+    return np.asarray(np.kron([[0.0, 1.0], [-1.0, 0.0]], np.eye(m)), dtype=float)
+
+
 EPSILON = 2.0**-52
 WIDTH = 1e-5
 """Width of differences of constraints, relative to the state."""

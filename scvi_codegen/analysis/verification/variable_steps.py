@@ -106,9 +106,8 @@ def at_fixed_energy(system: MechanicalSystem, energy: float) -> MechanicalSystem
 
 def variable_step_checks(runs: VariableSteps) -> Iterator[Check]:
     """Yield all checks of this module."""
-    for name, statement, measure in (
-        _time_transformation_checks(runs) if runs.stepper.interface.in_tau else _adaptive_checks(runs)
-    ):
+    checks = _time_transformation_checks if runs.stepper.interface.in_tau else _adaptive_checks
+    for name, statement, measure in checks(runs):
         yield from checked(name, statement, partial(measure, runs))
 
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from scvi_codegen.common.errors import ModelFileError, StepFailedError
 from scvi_codegen.common.representation import counted
+from scvi_codegen.interfaces.cli.command_group import check_writable
 from scvi_codegen.interfaces.cli.model_options import check_exclusive
 from scvi_codegen.interfaces.cli.reports import duration
 from scvi_codegen.interfaces.cli.running import conserved, event_counts, final_state
@@ -41,14 +42,15 @@ def is_run_folder(output: str) -> bool:
     return output.endswith(("/", os.sep)) or Path(output).suffix.lower() == SUFFIX
 
 
-def check_format(output: str, *, ensemble: bool) -> None:
-    """Check that a file format exists and that its library is installed."""
+def check_output(output: str, *, ensemble: bool = False) -> None:
+    """Check that a file format exists, that its library is installed and that the file can be written."""
     if Path(output).suffix.lower() not in export.WRITERS:
         formats = f"an ensemble is written as {export.FORMATS}"
         if not ensemble:
             formats = f"a trajectory is written as {export.FORMATS} or into a folder {SUFFIX}"
         raise click.BadParameter(f"{formats}, not as '{output}'", param_hint="'-o'")
     export.check_format(output)
+    check_writable(Path(output), "'-o'")
 
 
 def check_resumed(context: click.Context) -> None:

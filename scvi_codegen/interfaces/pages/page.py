@@ -257,7 +257,8 @@ def _integrator(model: Model) -> tuple[Source, Interface]:
 def _entry(model: Model, interface: Interface, initial: Sequence[str], adaptive: bool) -> str:
     """Return the C of the functions that the page calls."""
     size = len(_flat(model.q))
-    numbers, sizes, tables = [*_values(model, interface).values()], list[int](), dict[str, list[int]]()
+    numbers = [*_values(model, interface).values()]
+    sizes, tables = list[int](), dict[str, list[int]]()
     if model.array_system is not None:
         arrays = read_arrays(interface, model.q, model.fields, model.tables)
         sizes = [arrays.sizes[name] for name in interface.layout.sizes]

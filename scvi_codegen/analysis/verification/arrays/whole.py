@@ -201,7 +201,8 @@ def _long_run(start: WholeStart, sizes: str) -> Iterator[Check]:
         statement, remark = f"at {sizes} energy and momentum maps", str(failure)
         yield Check(name="conserved", statement=statement, outcome=Outcome.NOT_MEASURED, remark=remark)
         return
-    walk, where = ROUNDINGS * EPSILON * float(np.sqrt(steps)), f"{steps} steps of {run._step_size:g}"
+    walk = ROUNDINGS * EPSILON * float(np.sqrt(steps))
+    where = f"{steps} steps of {run._step_size:g}"
     change = abs(run.energy - before[2]) / (abs(before[0]) + abs(before[1]) or 1.0)
     if not start.system.changes_energy:
         if start.method.symplectic and run.step_error < RESOLVED:
@@ -218,9 +219,9 @@ def _long_run(start: WholeStart, sizes: str) -> Iterator[Check]:
 
 def _map_sizes(start: WholeStart) -> float:
     """Return a size of the terms of momentum maps: momenta, and momenta times positions."""
-    p = np.concatenate([np.abs(values).reshape(-1) for values in start.p.values()])
-    q = np.concatenate([np.abs(values).reshape(-1) for values in start.arrays.state.values()])
-    moved = start.run()
-    moved.advance(1)
-    p = p + np.concatenate([np.abs(values).reshape(-1) for values in moved.stepper.arrays(moved.p).values()])
-    return float(np.sum(p) + np.sum(p * q) + np.sum(p**2 + q**2) * bool(start.system.momenta))
+    run = start.run()
+    q, p = np.abs(run.q), np.abs(run.p)
+    run.advance(1)
+    p = p + np.abs(run.p)
+    size = float(np.sum(p) + np.sum(p * q))
+    return size + float(np.sum(p**2 + q**2)) if start.system.momenta else size

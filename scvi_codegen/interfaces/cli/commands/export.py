@@ -1,12 +1,10 @@
 """Command ``scvi-codegen export``: write the states of a run in a folder to one file."""
 
-from pathlib import Path
-
 import click
 
-from scvi_codegen.interfaces.cli.command_group import check_writable, reporting, tell
+from scvi_codegen.interfaces.cli.command_group import reporting, tell
 from scvi_codegen.interfaces.cli.json_documents import recorded_numbers
-from scvi_codegen.interfaces.cli.recording import check_format, describe_progress
+from scvi_codegen.interfaces.cli.recording import check_output, describe_progress
 from scvi_codegen.runs.recording import load_run
 from scvi_codegen.runs.results.export import FORMATS
 
@@ -26,8 +24,7 @@ def export(folder: str, output: str | None) -> None:
       scvi-codegen export long.run -o long.csv
     """
     if output is not None:
-        check_format(output, ensemble=False)
-        check_writable(Path(output), "'-o'")
+        check_output(output)
     recorded = load_run(folder)
     tell(describe_progress(recorded), **recorded_numbers(recorded))
     if output is not None:

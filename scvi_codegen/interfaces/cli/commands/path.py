@@ -14,7 +14,7 @@ from scvi_codegen.common.errors import MethodError, ModelFileError
 from scvi_codegen.common.representation import counted
 from scvi_codegen.interfaces.cli.command_group import check_writable, reporting, tell
 from scvi_codegen.interfaces.cli.model_options import model_arguments, read_model, with_known_sizes
-from scvi_codegen.interfaces.cli.recording import check_format
+from scvi_codegen.interfaces.cli.recording import check_output
 from scvi_codegen.interfaces.models.model import Model
 from scvi_codegen.interfaces.models.options import options_of
 from scvi_codegen.interfaces.pictures.canvas import PICTURES, check_plot_path
@@ -49,8 +49,7 @@ def path(model_name: str, output: str | None, plot: str | None, **choices: Any) 
       scvi-codegen path planar-pendulum --closed=-q --q 0 --velocity 1.5 --span 4 --step 0.2
     """
     if output is not None:
-        check_format(output, ensemble=False)
-        check_writable(FilePath(output), "'-o'")
+        check_output(output)
     if plot is not None:
         check_writable(FilePath(plot), "'--plot'")
         check_plot_path(plot, PICTURES)

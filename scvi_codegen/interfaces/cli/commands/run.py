@@ -23,7 +23,7 @@ from scvi_codegen.interfaces.cli.model_options import check_flag, model_argument
 from scvi_codegen.interfaces.cli.recording import (
     SUFFIX,
     RecordedOutcome,
-    check_format,
+    check_output,
     check_resumed,
     is_run_folder,
     record_model,
@@ -233,8 +233,7 @@ def _check_outputs(output: str | None, plot: str | None, ensemble: str | None, c
     if checkpoint is not None and not (output is not None and is_run_folder(output)):
         raise click.UsageError(f"--checkpoint requires a run recorded in a folder (-o NAME{SUFFIX})")
     if output is not None and not (ensemble is None and is_run_folder(output)):
-        check_format(output, ensemble=ensemble is not None)
-        check_writable(Path(output), "'-o'")
+        check_output(output, ensemble=ensemble is not None)
     if plot is not None:
         check_writable(Path(plot), "'--plot'")
         check_plot_path(plot, PICTURES + FILMS)
