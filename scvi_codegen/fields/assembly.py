@@ -297,7 +297,9 @@ class Assembly:
         """Return a Fourier derivative of a field at a point, by convolutions or dense matrices."""
         sums, dense = [], {}
         for position, axis in enumerate(self.axes):
-            order, discretised, count = orders.get(axis, 0), self.axes[axis], len(self.axes[axis].points)
+            order = orders.get(axis, 0)
+            discretised = self.axes[axis]
+            count = len(self.axes[axis].points)
             if order and discretised.pairs[0].ndim == 1:
                 array = Array(f"derivative_{axis}", (Size(f"N{axis}"),))
                 self.used[array.name] = (array.axes, discretised.rates)

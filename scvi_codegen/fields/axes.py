@@ -378,6 +378,7 @@ class SpectralElements(Axis):
     def modes(self, values: Array) -> Array:
         """See :meth:`Axis.modes`: Legendre polynomials on each element."""
         assert self.table is not None
+        # u = sum_k c_k P_k on an element, and the integral of P_k^2 is 2/(2 k + 1) = 1/(k + 1/2).
         points = np.array([float(x) for x in self.reference])
         to_modes = np.linalg.inv(np.polynomial.legendre.legvander(points, len(points) - 1))
         local = self.in_elements(values, -1).reshape(*values.shape[:-1], *self.table.shape)
@@ -519,7 +520,8 @@ class FiniteDifferences(Axis):
                 f"'finite-differences' of second derivatives need a periodic axis, and '{name}' has ends: use "
                 '"spectral-elements"'
             )
-        count, index = point_count_of(name, points, least=(2 if fixed is None else 3) * order), f"e{name}"
+        count = point_count_of(name, points, least=(2 if fixed is None else 3) * order)
+        index = f"e{name}"
         cell_count = count - (fixed is not None)
         # u, u_x and u_xx at midpoints of cells from 2 m points, by Taylor's formula.
         m, h = order // 2 + second, (bounds[1] - bounds[0]) / cell_count

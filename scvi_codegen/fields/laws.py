@@ -146,7 +146,9 @@ class Variations:
         for axis in self.system.space:
             backward = {variable: -rate for variable, rate in self._rates(axis).items()}
             yield f"momentum_{axis}", f"translation in {axis}", backward, {axis: -self.lagrangian}
-        variables, fields, momenta = self.system.variables, self.system.fields, self.system.momenta
+        variables = self.system.variables
+        fields = self.system.fields
+        momenta = self.system.momenta
         pairs = [*zip(fields, momenta, strict=True)] if momenta else [*combinations(fields, 2)]
         for pair in pairs:
             suffix = f"_{pair[0]}_{pair[1]}" if len(variables) > 2 else ""

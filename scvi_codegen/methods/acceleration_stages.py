@@ -149,7 +149,8 @@ def single_point(
 def nodal_collocation(system: MechanicalSystem, nodes: Nodes) -> StageSystem:
     """Return (18) as printed: unknowns Q^1 .. Q^s and v0; v0 from p0, p1 from v1 = V_s by the Legendre transform."""
     size = nodes.degree
-    none, last = Table.constant(size, size + 1), Table.named("", [[int(n == size - 1)] for n in range(size)])
+    none = Table.constant(size, size + 1)
+    last = Table.named("", [[int(n == size - 1)] for n in range(size)])
     group = residual_group(
         system,
         nodes.abscissae[1:],
@@ -158,7 +159,8 @@ def nodal_collocation(system: MechanicalSystem, nodes: Nodes) -> StageSystem:
         Scatter(results=forms_of(system).momentum, table=Table.joined(none, last), power=0),
     )
     unit, others, zero = Table.constant(1, 1, 1), Table.constant(1, size), Table.constant(1, 1)
-    curve, minus = (Table.joined(unit, others, zero), Table.joined(zero, others, unit)), Table.constant(1, 1, -1)
+    curve = (Table.joined(unit, others, zero), Table.joined(zero, others, unit))
+    minus = Table.constant(1, 1, -1)
     return StageSystem(
         blocks=nodal_blocks(nodes),
         rows=(

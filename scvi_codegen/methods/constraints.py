@@ -112,7 +112,8 @@ def _with_multipliers(system: MechanicalSystem, group: StageGroup) -> StageGroup
     """Return the quadrature with multipliers: L + lambda . g in place of L, and g itself in rows of its own."""
     assert group.scalar is not None
     points, factors = len(group.abscissae), constraint_multipliers(system)
-    columns, rows = len(group.gathers[0].table.entries[0]), len(group.scatters[0].table.entries[0]) - 1
+    columns = len(group.gathers[0].table.entries[0])
+    rows = len(group.scatters[0].table.entries[0]) - 1
     none, zero = Table.constant(points, 1 + points), Table.constant(points, 1)
     gathers = [replace(gather, table=Table.joined(gather.table, none)) for gather in group.gathers]
     table = Table.joined(Table.constant(points, columns), zero, Table.identity(points))

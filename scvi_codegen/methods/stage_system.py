@@ -252,7 +252,8 @@ class StageGroup(StagePoints):
 
     def widened(self, count: int) -> StageGroup:
         """Return the group with columns of 0 for ``count`` further blocks, and for as many rows before that of p1."""
-        none, before = Table.constant(len(self.abscissae), count), range(len(self.scatters[0].table.entries[0]) - 1)
+        none = Table.constant(len(self.abscissae), count)
+        before = range(len(self.scatters[0].table.entries[0]) - 1)
         gathers = (replace(gather, table=Table.joined(gather.table, none)) for gather in self.gathers)
         tables = (Table.joined(x.table.columns(before), none, x.table.columns([-1])) for x in self.scatters)
         scatters = (replace(scatter, table=table) for scatter, table in zip(self.scatters, tables, strict=True))

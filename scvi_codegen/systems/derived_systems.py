@@ -133,7 +133,8 @@ def with_tangent_vectors(system: LagrangianSystem, count: int) -> LagrangianSyst
     word = "change"
     while any(f"_{word}" in variable.name for variable in (*system.coordinates, *system.parameters)):
         word += "s"
-    lagrangian, forces = [system.lagrangian], [*(system.forces or [sympy.S.Zero] * system.dimension)]
+    lagrangian = [system.lagrangian]
+    forces = [*(system.forces or [sympy.S.Zero] * system.dimension)]
     coordinates = [*system.coordinates]
     for j in range(count):
         names = [f"{q.name}_{word}_{j + 1}" for q in system.coordinates]

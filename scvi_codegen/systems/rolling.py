@@ -69,7 +69,8 @@ def roll_sums(system: MechanicalSystem) -> RolledSums:
     chain: L(q[N]) = sum(b in B0, c0_1[b]*(-q[at0[b, 0]] + q[at0[b, 1]])**2) + sum(b in B1, q_dot[at1[b, 0]]**2/2)
     """
     _check_supported(system)
-    mark, inputs = _mark({*map(str, system.constants), *system.inputs}), input_formulas(system.inputs, system.time)
+    mark = _mark({*map(str, system.constants), *system.inputs})
+    inputs = input_formulas(system.inputs, system.time)
     q, q_dot, p = (Array(f"{name}", (Size(f"N{mark}"),)) for name in (f"q{mark}", f"q{mark}{DOT}", f"p{mark}"))
     pairs = ((q, system.coordinates), (q_dot, system.velocities), (p, system.auxiliaries))
     indices = {variable: (array.name, k) for array, symbols in pairs for k, variable in enumerate(symbols)}
@@ -199,7 +200,8 @@ def unrolled_at(system: MechanicalSystem, q: Mapping[str, Any] | Any, parameters
     if parameters is not None and not isinstance(parameters, Mapping):
         raise SystemDefinitionError("parameters of arrays of run-time sizes must be given by name")
     state = q if isinstance(q, Mapping) else {system.coordinates[0].name: q}
-    arrays_by_name, others = {array.name: array for array in system.arrays}, dict(parameters or {})
+    arrays_by_name = {array.name: array for array in system.arrays}
+    others = dict(parameters or {})
     declared = [
         (arrays_by_name[name], values_by_name[name])
         for values_by_name in (state, others)

@@ -105,7 +105,8 @@ class SimilarTerms:
             constant: symbol of a constant, by its number.
             sign: factor of the formula.
         """
-        first, columns = self.leaves[0], list(zip(*(leaf.constants for leaf in self.leaves), strict=True))
+        first = self.leaves[0]
+        columns = list(zip(*(leaf.constants for leaf in self.leaves), strict=True))
         varying = [k for k, column in enumerate(columns) if len(set(column)) > 1]
         symbols = [constant(k) if k in varying else column[0] for k, column in enumerate(columns)]
         return TermGroup(

@@ -197,7 +197,8 @@ class _Problem:
                     break
                 if error <= mp.mpf(10) ** -self.digits:
                     return _step(fine, error)
-                coarse, reason = fine, f"{points} points in each of {pieces} pieces give only {mp.nstr(error, 2)}"
+                coarse = fine
+                reason = f"{points} points in each of {pieces} pieces give only {mp.nstr(error, 2)}"
         raise StateError(f"{complaint} ({reason})")
 
 

@@ -195,7 +195,9 @@ class ExactMotion:
 
     def _constraint_terms(self, q: Numbers, v: Numbers, t: Number) -> tuple[Numbers, Numbers]:
         """Return the (c, m) constraint Jacobian; (3, c) d/dt of the rates at constant v, constraints, rates."""
-        m, count, values = len(q), len(self.system.constraints), self._values(self._constraint_tape, q, v, t)
+        m = len(q)
+        count = len(self.system.constraints)
+        values = self._values(self._constraint_tape, q, v, t)
         return values[: count * m].reshape(count, m), values[count * m :].reshape(3, count)
 
     def met(self, q: Any, p: Any, t: Any = 0) -> tuple[Numbers, Numbers]:
@@ -207,9 +209,11 @@ class ExactMotion:
         m, still = len(q), numbers(np.zeros(len(q)))
         v = self.velocity(q, p, t)
         for _ in range(MAX_PROJECTIONS):
-            mass, (derivatives, (_, g, _)) = self._mass_and_applied(q, v, t)[0], self._constraint_terms(q, v, t)
+            mass = self._mass_and_applied(q, v, t)[0]
+            derivatives, (_, g, _) = self._constraint_terms(q, v, t)
             q = q + solved(_saddle(mass, derivatives), np.concatenate([still, -g]))[:m]
-        mass, (derivatives, (_, _, rate)) = self._mass_and_applied(q, v, t)[0], self._constraint_terms(q, v, t)
+        mass = self._mass_and_applied(q, v, t)[0]
+        derivatives, (_, _, rate) = self._constraint_terms(q, v, t)
         v = v + solved(_saddle(mass, derivatives), np.concatenate([still, -rate]))[:m]
         return q, self.momentum(q, v, t)
 

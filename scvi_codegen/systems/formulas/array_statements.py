@@ -442,7 +442,8 @@ class EntryRules:
             )
         if access.sums:
             *inner, last = access.sums
-            by, count = self.names[last.coefficients.name], access.array.shape(self.sizes)[last.axis]
+            by = self.names[last.coefficients.name]
+            count = access.array.shape(self.sizes)[last.axis]
             terms = []
             for k in range(count):
                 places = [*access.places]

@@ -241,7 +241,9 @@ class Access:
     def __str__(self) -> str:
         places, before = [*map(str, self.places)], ""
         for convolution in reversed(self.sums):
-            (size,), place, j = convolution.coefficients.axes, places[convolution.axis], convolution.index
+            (size,) = convolution.coefficients.axes
+            place = places[convolution.axis]
+            j = convolution.index
             before += f"sum({j} in {size}, {convolution.coefficients.name}[{j}-{place}]*"
             places[convolution.axis] = j
         entry = f"{self.array.name}[{', '.join(places)}]" if places else self.array.name

@@ -579,7 +579,8 @@ def entries_in_formulas(
 
     The values are the names of their entries, ``R_0_11``, ...
     """
-    by_name, entries = {member.name: member for member in members}, dict[Array, NDArray[np.str_]]()
+    by_name = {member.name: member for member in members}
+    entries = dict[Array, NDArray[np.str_]]()
     for array in arrays:
         first = "_0" * (len(array.axes) - 1)
         member = by_name.get(array.name + first)

@@ -127,7 +127,8 @@ def solved_for_speeds(equations: Sequence[Expr], variables: Variables) -> dict[S
     matrix, right = rows.jacobian(u), -rows.xreplace(dict.fromkeys(u, sympy.S.Zero))
     solution: dict[Symbol, Expr] = {}
     for block in coupled_blocks({(i, len(u) + j): entry for (i, j), entry in matrix.todok().items()}, 2 * len(u)):
-        lines, unknowns = [i for i in block if i < len(u)], [j - len(u) for j in block if j >= len(u)]
+        lines = [i for i in block if i < len(u)]
+        unknowns = [j - len(u) for j in block if j >= len(u)]
         if matrix.has(*u) or len(lines) != len(unknowns) or (len(lines) > MOST_COUPLED and matrix.free_symbols):
             break
         part = inverse_by_minors(matrix.extract(lines, unknowns)) * right.extract(lines, [0])

@@ -133,7 +133,10 @@ def kinetic_splitting(system: MechanicalSystem) -> KineticSplitting | str:
     twin = equivalent_lagrangian(system)
     if twin is not None and forms_of(twin).separable:
         return KineticSplitting(twin, forms_of(twin).force)
-    forms, members, q, p = forms_of(system), system.rotations, system.coordinates, system.auxiliaries
+    forms = forms_of(system)
+    members = system.rotations
+    q = system.coordinates
+    p = system.auxiliaries
     bound = members and (system.constraints or not all(isinstance(member, Rotation) for member in members))
     if not p or forms.one_form or system.damping != 0 or bound:
         return "there are constraints, damping, directions or spins, or masses that vary"

@@ -97,9 +97,11 @@ def array_forces(
     """Return the force on each coordinate at ``count`` points; ``at_points``: positions, parameters and time there."""
     if not term_groups:
         return [0.0] * len(coordinates)
-    q, force = np.array([at_points[coordinate] for coordinate in coordinates]), np.zeros((len(coordinates), count))
+    q = np.array([at_points[coordinate] for coordinate in coordinates])
+    force = np.zeros((len(coordinates), count))
     for term_group in term_groups:
-        indices, values = np.array(term_group.places, dtype=int).reshape(-1, len(term_group.slots)), dict(at_points)
+        indices = np.array(term_group.places, dtype=int).reshape(-1, len(term_group.slots))
+        values = dict(at_points)
         values |= {slot: q[indices[:, k]] for k, slot in enumerate(term_group.slots)}
         for symbol, column in zip(term_group.constants, term_group.values, strict=True):
             values[symbol] = np.array([at_points[x] if x in at_points else np.full(count, float(x)) for x in column])

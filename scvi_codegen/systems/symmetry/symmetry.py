@@ -117,11 +117,8 @@ class Symmetry:
 
     def _repr_html_(self) -> str:
         moved = [*zip(self.coordinates, self.direction, strict=True)]
-        if (
-            not set()
-            .union(self.gauge.free_symbols, *(xi.free_symbols for xi in self.direction))
-            .isdisjoint(self.momenta)
-        ):
+        occurring = self.gauge.free_symbols.union(*(xi.free_symbols for xi in self.direction))
+        if not occurring.isdisjoint(self.momenta):
             derivatives = gradient_tuple(self.momentum_map, self.coordinates)
             moved += [(p, -rate) for p, rate in zip(self.momenta, derivatives, strict=True)]
         changes = [f"{mathml(Symbol('delta'))}{mathml(x)} = {mathml(xi)}" for x, xi in moved if xi != 0]
@@ -232,7 +229,8 @@ def _of_rotations(system: MechanicalSystem) -> list[Terms]:
     motion = rates_of(system)
     if not motion.closed:
         return []
-    m, turning = system.dimension, {name for member in system.rotations for name in member.coordinates}
+    m = system.dimension
+    turning = {name for member in system.rotations for name in member.coordinates}
     ordinary = [i for i, q in enumerate(system.coordinates) if q.name not in turning]
     if len(ordinary) > MAX_SEARCHED_COORDINATES:  # the position of a base; joints have other forces
         ordinary = [i for i in ordinary if motion.forces[i].free_symbols.isdisjoint(motion.arguments)]

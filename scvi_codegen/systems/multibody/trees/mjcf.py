@@ -225,7 +225,8 @@ class _MujocoModel:
                 place = places.get(actuator.text("joint", actuator.text("jointinparent", "")))
                 if place is None:
                     actuator.refuse("has armature or damping, which is read of actuators of hinges and slides only")
-                joint, factor = self.links[place].joint, actuator.vector("gear", (1,), range(1, 7))[0] ** 2
+                joint = self.links[place].joint
+                factor = actuator.vector("gear", (1,), range(1, 7))[0] ** 2
                 damping = joint.damping + factor * damping * ("damper" not in self.disabled)
                 joint = replace(joint, damping=damping, armature=joint.armature + factor * armature)
                 self.links[place] = replace(self.links[place], joint=joint)

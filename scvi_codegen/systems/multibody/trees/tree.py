@@ -142,7 +142,8 @@ class DrawnLink:
     @classmethod
     def of(cls, link: Link) -> DrawnLink:
         """Return the geometry of a link whose frame is that of its formulas, :func:`aligned`."""
-        joint, rotation = link.joint, tuple(tuple(row) for row in link.joint.pose.rotation.tolist())
+        joint = link.joint
+        rotation = tuple(tuple(row) for row in link.joint.pose.rotation.tolist())
         position, center = (tuple(vector.tolist()) for vector in (joint.pose.position, link.inertia.center))
         return cls(link.parent, joint.name, joint.kind, position, rotation, center, joint.zero, joint.follows)
 
