@@ -131,6 +131,9 @@ def slices(case: Case) -> None:
     for rows in (len(run), slice(4, 4), slice(None, None, -1)):
         with pytest.raises(IndexError, match=r"out of range|must be ascending"):
             run[rows]
+    if case.kind == "driven":
+        with pytest.raises(IndexError, match="stride, or slice"):
+            run[0:5:2]
     for name in case.problem.coordinates if case.problem.array is None else ():
         assert np.array_equal(run[f"p_{name}"], run.p[:, case.problem.coordinates.index(name)])
     with pytest.raises(StateError, match="there is no quantity 'none_such' of the states"):
@@ -143,6 +146,7 @@ def work_and_impulses(case: Case) -> None:
     wanted = case.truth.work_and_impulses(run.t)
     near(run.work(), wanted[:, 0], 1e-6)
     near(run.impulses(), wanted[:, 1:], 1e-6)
+    near(run[3:-2].work(), run.work()[3:-2] - run.work()[3], 1e-13)
     for xi, impulse in zip(case.problem.impulses, run.impulses().T, strict=True):
         values = dict(zip(case.problem.coordinates, run.q.T, strict=True))
         J = sum(p * eval(formula, {}, values) for p, formula in zip(run.p.T, xi, strict=True))

@@ -114,16 +114,6 @@ def test_small_coordinate_next_to_a_large_one():
     assert run.q[-1, 1] == pytest.approx(1e-14 * math.cos(math.sqrt(3) * 10.0), abs=1e-21)
 
 
-def test_runs_in_parts_have_equal_bits():
-    stepper = compiled(PENDULUM, ["a"], "svi:4")
-    whole, parts = (stepper.start([1.0], [0.0], t_end=20.0, tolerance=1e-9) for _ in range(2))
-    whole.advance(10**6)
-    while not parts.arrived:
-        parts.advance(7)
-        parts = stepper.from_checkpoint(parts.checkpoint(), t_end=20.0, tolerance=1e-9)
-    assert (whole.steps, whole.q.tobytes()) == (parts.steps, parts.q.tobytes())
-
-
 def test_absolute_tolerance_of_a_coordinate_takes_fewer_steps():
     stepper = compiled("(x_dot**2 + z_dot**2)/2 - x**2/2 - 300*z**2/2", ["x", "z"])
     own, other = (

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import error_of, output_of
-from recorded_runs import STATE, StopsAfter, assert_same, digests, recorded
+from recorded_runs import STATE, recorded
 
 import scvi_codegen as sc
 from scvi_codegen.codegen.native import capacity
@@ -29,31 +29,6 @@ span = {END}
 def controlled(stepper: sc.Stepper, folder: str, t_end: float = END, **settings: object):
     run = stepper.start(**STATE, t_end=t_end, tolerance=TOLERANCE)
     return sc.record_run(run, folder, **{"rows": 64} | settings)
-
-
-@pytest.mark.parametrize("save_every", [1, 7, 5000])
-def test_recording_equals_the_run_in_memory(kepler, save_every):
-    found, run = (
-        controlled(kepler, "a.run", save_every=save_every),
-        kepler.integrate(**STATE, t_end=END, tolerance=TOLERANCE),
-    )
-    assert_same(found, kepler.integrate(**STATE, t_end=END, tolerance=TOLERANCE, save_every=save_every))
-    assert found.finished
-    assert found.steps == run.steps > 300
-    assert [len(piece) for piece in found.pieces()][:-1] == [64] * ((len(found) - 1) // 64)
-
-
-@pytest.mark.tiers(1)
-@pytest.mark.parametrize("save_every", [1, 9])
-def test_interrupted_recording_is_bytewise_equal(kepler, save_every):
-    whole = controlled(kepler, "whole.run", save_every=save_every)
-    found, looks = controlled(kepler, "a.run", save_every=save_every, stop=StopsAfter(0), checkpoint_steps=31), 1
-    while not found.finished:
-        assert found.t[-1] < END
-        found, looks = sc.resume_run("a.run", stop=StopsAfter(looks), checkpoint_steps=37), looks + 1
-    assert looks > 3
-    assert found.steps == whole.steps
-    assert digests("a.run") == digests("whole.run")
 
 
 def test_slice_is_a_trajectory_with_dense_output(kepler):

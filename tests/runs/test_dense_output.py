@@ -38,23 +38,6 @@ def kepler() -> sc.Stepper:
 
 @pytest.mark.tiers(1, 4)
 @each_method
-def test_dense_output_has_the_order_of_the_method(method):
-    stepper = sc.compile_stepper(sc.problem("kepler").system, method, flags=FLAGS)
-    counts = (40, 80) if stepper.interface.method != "euler" else (400, 800)
-    between, saved = [], []
-    for n in counts:
-        run = stepper.integrate(**START, h=2 * math.pi / n, steps=n)
-        t = np.linspace(0, run.t[-1], 501)
-        between.append(np.abs(run.at(t)[0] - ellipse(t)).max())
-        saved.append(np.abs(run.q - ellipse(run.t)).max())
-    expected = method.order if method.order is not None else 1
-    assert between[1] > 1e-13
-    assert math.log2(between[0] / between[1]) == pytest.approx(expected, abs=0.6)
-    assert between[1] < 1.3 * saved[1]
-
-
-@pytest.mark.tiers(1, 4)
-@each_method
 @pytest.mark.parametrize("h", [0.1, -0.1])
 def test_dense_output_is_continuous_at_saved_states(compiled, sample, method, h):
     q, p = sample("driven-duffing").state
@@ -66,20 +49,6 @@ def test_dense_output_is_continuous_at_saved_states(compiled, sample, method, h)
         saved = run.q[1 : 1 + len(near)], run.p[1 : 1 + len(near)]
         for value, state in zip(run.at(near), saved, strict=True):
             assert np.abs(value - state).max() < 1e-14
-
-
-def test_dense_output_for_any_order_shape_and_save_interval(kepler):
-    every_one = kepler.integrate(**START, h=0.1, steps=100)
-    t = np.random.default_rng(3).uniform(0.0, 10.0, 400)
-    q, p = every_one.at(t)
-    assert q.shape == p.shape == (400, 2)
-    single = [every_one.at(time) for time in t[:20]]
-    assert np.array_equal([state[0] for state in single], q[:20])
-    assert single[0][0].shape == (2,)
-    for save_every in (7, 100):
-        few = kepler.integrate(**START, h=0.1, steps=100, save_every=save_every)
-        inside = t <= few.t[-1]
-        assert np.abs(few.at(t[inside])[0] - q[inside]).max() < 1e-13
 
 
 def test_options_of_the_run_apply_to_dense_output(kepler):

@@ -148,15 +148,6 @@ def test_invariants_are_conserved_over_long_times():
 
 
 @pytest.mark.second
-@pytest.mark.parametrize("degree", [1, 2, 3])
-def test_the_order_is_that_of_the_method(degree):
-    exact = sc.compile_stepper(DRIVEN, sc.SVI(8), flags=QUICK_FLAGS).integrate([1.0], [0.0], t_end=4.0).q[-1]
-    stepper = sc.compile_stepper(DRIVEN, sc.SVI(degree), time_transformation="1/(1 + x**2)", flags=QUICK_FLAGS)
-    errors = [abs(stepper.integrate([1.0], [0.0], h=tau, t_end=4.0).q[-1] - exact)[0] for tau in (0.2, 0.1)]
-    assert np.log2(errors[0] / errors[1]) == pytest.approx(2 * degree, abs=0.35)
-
-
-@pytest.mark.second
 def test_dense_output_events_and_continuation_with_step_density():
     stepper = kepler(sc.SVI(8), events="q1*q1_dot + q2*q2_dot")
     run = stepper.integrate(*START, h=0.2, t_end=3 * PERIOD)
@@ -170,17 +161,6 @@ def test_dense_output_events_and_continuation_with_step_density():
     restored = stepper.from_checkpoint(pieces.checkpoint(), h=0.2, t_end=3 * PERIOD)
     for each in (pieces, again, restored):
         assert np.array_equal(each.record().q[-1], run.q[-1])
-
-
-@pytest.mark.second
-def test_backward_and_recorded_runs(tmp_path):
-    stepper = kepler(sc.SVI(6))
-    back = stepper.integrate(START[0], -START[1], h=0.1, t_end=5.0)
-    other = stepper.integrate(*START, h=0.1, t=5.0, t_end=0.0)
-    assert np.abs(back.q - other.q).max() < 1e-13
-    sc.record_run(stepper.start(*START, h=0.1, t_end=5.0), tmp_path / "run")
-    whole = stepper.integrate(*START, h=0.1, t_end=9.0)
-    assert np.array_equal(sc.resume_run(tmp_path / "run", t_end=5.0)[:].q[:-1], whole.q[: len(back.q) - 1])
 
 
 def test_checkpoints_require_the_step_size():

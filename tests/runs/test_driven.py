@@ -63,19 +63,6 @@ def test_order_is_preserved_across_breakpoints(pendulum, kind, exact, method):
     assert errors[1] < 1e-12 or np.log(errors[0] / errors[1]) / np.log(5.0) > method.order - 0.4
 
 
-def test_adaptive_steps_and_dense_output_with_inputs(pendulum):
-    stepper, expected = sc.compile_stepper(pendulum, sc.SVI(6)), reference(sloped, lambda t, _: 0.1 * t, 2.3)
-    inputs = {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], [0.0, 0.3])}
-    run = stepper.integrate([0.3], velocity=[0.1], inputs=inputs, t_end=2.3)
-    assert_allclose([run.q[-1, 0], run.velocity[-1, 0]], expected, rtol=0, atol=3e-13)
-    q, p = run.at([0.2, 1.0, 2.3])
-    assert_allclose(q[0], reference(sloped, lambda t, _: 0.1 * t, 0.2)[0], rtol=0, atol=3e-13)
-    assert_allclose(q[1], reference(sloped, lambda t, _: 0.1 * t, 1.0)[0], rtol=0, atol=3e-13)
-    assert_allclose((q[2], p[2]), (run.q[-1], run.p[-1]), rtol=0, atol=1e-15)
-    back = stepper.integrate(run.q[-1], run.p[-1], inputs=inputs, t=2.3, t_end=0.0)
-    assert_allclose(back.q[-1], [0.3], rtol=0, atol=1e-12)
-
-
 def test_sampled_controller_continues_bitwise(pendulum):
     """Between samples an input is held; the same from a saved run, and by the parameters themselves."""
     stepper = sc.compile_stepper(pendulum, sc.SVI(3))
@@ -314,28 +301,6 @@ def test_step_of_a_run_with_inputs_uses_the_first_segment(pendulum):
         run = stepper.integrate([0.3], [0.1], inputs=inputs, h=h, t_end=2.3)
         assert run.h == run.t[1] - run.t[0] == min(h, KNOTS[1])
     assert stepper.integrate([0.3], [0.1], inputs=inputs, h=0.1, t_end=0.3).h == 0.1
-
-
-def test_slices_of_runs_with_inputs(pendulum):
-    """Every slice of a run with inputs is the same states, energies and work, across breakpoints and at them."""
-    run = sc.compile_stepper(pendulum, "svi:2").integrate(
-        [0.3], velocity=[0.1], inputs=dict.fromkeys(pendulum.inputs, (KNOTS, VALUES)), h=0.2, t_end=2.6
-    )
-    count, work = len(run), run.work()
-    for first in range(count):
-        for end in range(first + 1, count + 1):
-            part = run[first:end]
-            assert np.array_equal(part.t, run.t[first:end])
-            assert np.array_equal(part.q, run.q[first:end])
-            assert np.array_equal(part.p, run.p[first:end])
-    part = run[3:-2]
-    assert np.array_equal(part.energy(), run.energy()[3:-2])
-    assert_allclose(part.work(), work[3:-2] - work[3], rtol=0, atol=1e-14)
-    t, q, p = run[-1]
-    assert (t, *q, *p) == (run.t[-1], *run.q[-1], *run.p[-1])
-    for rows in (count, slice(4, 4), slice(None, None, -1), slice(0, 5, 2)):
-        with pytest.raises(IndexError, match=r"out of range|must be ascending|stride, or slice"):
-            run[rows]
 
 
 @pytest.mark.rotated

@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from notation import hamilton, lagrange
 from programs import needs
-from scipy.special import ellipk
 from sympy.physics.mechanics import dynamicsymbols
 
 import scvi_codegen as sc
@@ -68,34 +67,6 @@ def crossings_in_one_step(function: str, h: float = 1.0) -> np.ndarray:
 
 
 # Exact times.
-
-
-@pytest.mark.rotated
-def test_the_period_of_the_pendulum_is_an_elliptic_integral(pendulum):
-    amplitude, rate = 2.5, math.sqrt(9.81)
-    parameters = {"m": 1.0, "l": 1.0, "g": 9.81}
-    run = pendulum.integrate([amplitude], [0.0], h=0.1, steps=1000, parameters=parameters, events=sc.Event("q", -1))
-    period = 4 * ellipk(math.sin(amplitude / 2) ** 2) / rate
-    expected = period * (0.25 + np.arange(len(run.events[0])))
-    assert len(expected) == math.floor(100.0 / period + 0.75)
-    assert np.abs(run.events[0].t - expected).max() < 2e-12
-    assert np.abs(run.events[0].q).max() < 1e-14
-
-
-@pytest.mark.tiers(0, 1)
-@each_method
-def test_times_converge_with_the_order_of_the_method_and_energy_stays(method):
-    stepper = compiled_plainly(sc.problem("kepler").system, method)
-    errors, energies = [], []
-    for n in (64, 128) if method.order < 8 else (40, 80):
-        run = stepper.integrate(**at_perihelion(0.3), h=2 * math.pi / n, steps=n, events=["q2"])
-        found = run.events[0]
-        energy = stepper.energy(found.q, found.p)
-        errors.append(abs(found.t[0] - math.pi))
-        energies.append((np.abs(energy + 0.5).max(), np.abs(run.energy() + 0.5).max()))
-    assert errors[1] > 1e-13
-    assert math.log2(errors[0] / errors[1]) == pytest.approx(method.order, abs=0.5)
-    assert all(at <= 1.5 * along for at, along in energies)
 
 
 # None missed.
@@ -202,18 +173,6 @@ def test_more_crossings_than_the_buffer_of_one_call(pendulum):
 
 
 # Directions, ends, restarts.
-
-
-def test_directions_are_those_of_the_run(pendulum):
-    events = [sc.Event("q", 1), sc.Event("q", -1), sc.Event("q")]
-    run = pendulum.integrate([0.5], [0.0], h=0.1, steps=400, events=events)
-    rising, falling, both = run.events
-    assert (rising.p > 0).all()
-    assert (falling.p < 0).all()
-    assert np.array_equal(np.sort(np.concatenate([rising.t, falling.t])), both.t)
-    back = pendulum.integrate(run.q[-1], run.p[-1], h=-0.1, steps=400, t=run.t[-1], events=events)
-    assert np.abs(back.events[2].t[::-1] - both.t).max() < 1e-11
-    assert (back.events[0].p < 0).all()  # rises as the run goes
 
 
 @pytest.mark.parametrize("save_every", [1, 7, 1000])

@@ -80,18 +80,9 @@ MOTIONS = {
     ),
     "damped": Motion(damped_pendulum(), sc.SVI(2), (1.0, 1.0, 0.0, 0.0), {"h": 0.1, "steps": 12}),
 }
-SITUATIONS = {
-    "all": {},
-    "sparse": {"save_every": 12},
-    "backward": {"h": -0.07},
-    "adaptive": {"h": None, "steps": None, "t_end": 4.0},
-}
-VARYING_STEPS = ("data", "reversible")
-"""Their last steps are shorter, and they have one direction."""
-CASES = [
-    *((name, each) for each in SITUATIONS for name in MOTIONS if each == "all" or name not in VARYING_STEPS),
-    ("data", "sparse"),
-]
+ADAPTIVE = {"h": None, "steps": None, "t_end": 4.0}
+CASES = [("driven", ADAPTIVE), ("data", {}), ("data", {"save_every": 12}), ("reversible", {})]
+"""Runs with steps of different sizes; the others are in the table of motions."""
 
 
 def states_of(run):
@@ -127,9 +118,9 @@ def differences(function, x, width=1e-4):
 
 
 @pytest.mark.tiers(1, 2)
-@pytest.mark.parametrize(("name", "situation"), CASES)
-def test_derivatives_of_runs_are_products_of_those_of_steps(name, situation):
-    motion, changes = MOTIONS[name], SITUATIONS[situation]
+@pytest.mark.parametrize(("name", "changes"), CASES)
+def test_derivatives_of_runs_are_products_of_those_of_steps(name, changes):
+    motion = MOTIONS[name]
     run, whole = motion.run(**changes), motion.run(**changes | {"save_every": 1})
     size, found = 2 * motion.stepper.dimension, derivatives_of(run)
     product = np.eye(size, found.shape[2])
@@ -149,31 +140,30 @@ def test_derivatives_of_runs_are_products_of_those_of_steps(name, situation):
     assert_close(run.tangent(direction)[-1], found[-1, :, :size] @ direction, 1e-11)
 
 
-@pytest.mark.parametrize(("name", "situation"), CASES)
-def test_gradients_are_the_transpose_of_sensitivities(name, situation):
-    run = MOTIONS[name].run(**SITUATIONS[situation])
+@pytest.mark.parametrize(("name", "changes"), CASES)
+def test_gradients_are_the_transpose_of_sensitivities(name, changes):
+    run = MOTIONS[name].run(**changes)
     whole, seeds = derivatives_of(run), np.random.default_rng(1).normal(size=(len(run), 2 * run.q.shape[1], 3))
     gradient = run.pullback(seeds)
     found = stacked(gradient)[: whole.shape[2]]
     assert_close(found, np.einsum("nic,nij->jc", seeds, whole), 1e-10)
     assert_close(stacked(run.pullback(seeds[:, :, 0]))[: whole.shape[2]], found[:, 0], 1e-12)
-    assert (gradient.h is None) == (situation == "adaptive" or name in VARYING_STEPS)
+    assert gradient.h is None
 
 
 @pytest.mark.second
-@pytest.mark.parametrize("situation", ["all", "sparse", "backward"])
-def test_hessians_are_derivatives_of_gradients(situation):
+def test_hessians_are_derivatives_of_gradients():
     """F = sum w . x + x . C x/2 of all states; more directions than pass through a step at once."""
-    motion, changes = MOTIONS["driven"], SITUATIONS[situation]
-    x = np.array([0.4, -0.8, *motion.stepper.defaults, 0.3, changes.get("h", 0.07)])
-    rng, run = np.random.default_rng(2), motion.run(x, **changes)
+    motion = MOTIONS["driven"]
+    x = np.array([0.4, -0.8, *motion.stepper.defaults, 0.3, 0.07])
+    rng, run = np.random.default_rng(2), motion.run(x)
     w, C = rng.normal(size=(len(run), 2)), rng.normal(size=(len(run), 2, 2))
     C = C + C.transpose(0, 2, 1)
 
     def partials(run):
         return w + np.einsum("nij,nj->ni", C, states_of(run))
 
-    expected = differences(lambda y: stacked(motion.run(y, **changes).pullback(partials(motion.run(y, **changes)))), x)
+    expected = differences(lambda y: stacked(motion.run(y).pullback(partials(motion.run(y)))), x)
     product = run.hessian_product(partials(run), np.eye(len(x)), C)
     found = np.vstack([product.q, product.p, product.parameters, product.t, product.h])
     assert_close(found, expected, 1e-7)
@@ -185,7 +175,7 @@ def test_hessians_are_derivatives_of_gradients(situation):
 
 
 def test_hessians_of_adaptive_runs_are_symmetric():
-    run = MOTIONS["driven"].run(**SITUATIONS["adaptive"])
+    run = MOTIONS["driven"].run(**ADAPTIVE)
     directions = np.eye(7)[:, :6]  # the step sizes are constant
     product = run.hessian_product(np.ones((len(run), 2)), directions, np.tile(np.eye(2), (len(run), 1, 1)))
     found = np.vstack([product.q, product.p, product.parameters, product.t])
@@ -216,17 +206,6 @@ def test_derivatives_by_data_and_named_parameters():
     product = run.hessian_product(w, directions)
     assert_close(stacked(product)[rows], differences(gradient, start), 1e-7)
     assert product.inputs["u"].shape == (4, 4, 4)
-
-
-@pytest.mark.second
-def test_long_runs_are_taken_in_segments():
-    whole, sparse = (MOTIONS["driven"].run(steps=2500, save_every=n) for n in (1, 500))
-    w, C = np.zeros((2501, 2)), np.zeros((2501, 2, 2))
-    w[::500], C[::500] = np.random.default_rng(2).normal(size=(6, 2)), np.eye(2)
-    assert_close(stacked(sparse.pullback(w[::500])), stacked(whole.pullback(w)), 1e-9)
-    assert_close(derivatives_of(sparse), derivatives_of(whole)[::500], 1e-9)
-    found, expected = (r.hessian_product(w[::n], [1.0, 0.5], C[::n]) for r, n in ((sparse, 500), (whole, 1)))
-    assert_close(stacked(found), stacked(expected), 1e-8)
 
 
 @pytest.mark.second

@@ -58,7 +58,7 @@ def states_and_steps_at(states: SavedStates, times: Array) -> tuple[Array, Array
     if fixed:  # adaptive steps are all saved here
         _check_on_grid(states)
         whole = whole_steps(times - t, np.nan_to_num(states.step_sizes[left], nan=np.inf))
-        between = np.flatnonzero(whole)
+        between = np.flatnonzero(whole > 0)  # a time of one word may be before the first state by a rounding
         saved, run = -1, None
         for k in between[np.lexsort((whole[between], left[between]))]:
             if run is None or left[k] != saved:
