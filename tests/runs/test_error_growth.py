@@ -309,11 +309,15 @@ def test_a_regular_motion_in_a_magnetic_field_is_not_reported_far_from_the_origi
 
 
 @pytest.mark.parametrize("tolerance", [1e-9, 1e-12])
-@pytest.mark.parametrize("angle", [1e-8, 1e-7])
-def test_small_motions_on_a_rod_are_not_reported(angle, tolerance):
-    """Height and vertical momentum are of second order in the angle, and their differences are rounding."""
-    rod = lagrange("rod", "x y", "(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 = 1"])
-    start = [np.sin(angle), -np.cos(angle)], [0.0, 0.0]
+@pytest.mark.parametrize(("angle", "unit"), [(1e-8, 1.0), (1e-7, 1.0), (1e-7, 2.0**-10)])
+def test_small_motions_on_a_rod_are_not_reported(angle, unit, tolerance):
+    """Height and vertical momentum are of second order in the angle, and their differences are rounding.
+
+    ``unit``: of x.
+    """
+    u, v = f"({unit!r}*x)", f"({unit!r}*x_dot)"
+    rod = lagrange("rod", "x y", f"({v}**2 + y_dot**2)/2 - y", constraints=[f"{u}**2 + y**2 = 1"])
+    start = [np.sin(angle) / unit, -np.cos(angle)], [0.0, 0.0]
     assert not reports(sc.compile_stepper(rod, "svi:2"), *start, 20.0, tolerance=tolerance)
 
 

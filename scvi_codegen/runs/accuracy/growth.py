@@ -33,7 +33,7 @@ from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepping.features import require
 from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.memory import Memory
-from scvi_codegen.runs.stepping.projection import projected
+from scvi_codegen.runs.stepping.projection import projected, roots_of_masses
 from scvi_codegen.runs.stepping.step_plan import Adaptive, StepPlan
 
 MOST_STEPS, MOST_NUMBERS = 2048, 2**18
@@ -263,14 +263,17 @@ class _Repetition:
         """Return the largest difference at a state relative to the size of the motion up to there.
 
         What rounding leaves open, as of the height of a pendulum that moves by 1e-13 of its length, is no growth. Nor
-        are k local errors of the largest momentum in one that is tied to it by constraints.
+        are k local errors of the largest momentum in one that is tied to it by constraints, unless they are reported:
+        |dp_i| / sqrt(M_ii) <= min(k nudge, tolerable) max_j |p_j| / sqrt(M_jj), which has no units.
         """
         states, rows = self.states, slice(k + 1)
         q, p = np.asarray(states.q)[rows], np.asarray(states.p)[rows]
         errors = np.abs(np.array([self.run._q - q[-1], self.run._p - p[-1]]))
         no_growth = NUDGE * np.array([np.abs(q).max(axis=0), np.abs(p).max(axis=0)])
         if self.run.stepper.interface.constraints:
-            no_growth[1] = np.maximum(no_growth[1], k * self.nudge * np.abs(p).max())
+            roots = roots_of_masses(self.run.stepper, q[-1], float(states.t[k]), states.parameters)
+            largest = (np.abs(p) / roots).max()
+            no_growth[1] = np.maximum(no_growth[1], min(k * self.nudge, self.tolerable) * largest * roots)
         errors = np.where(errors <= no_growth, 0.0, errors)
         motion = Motion(states.t[rows], q, p, self.firsts, roundoff(1))
         kinetic = momenta_of_velocities(self.run.stepper, states.t[rows], q, p, states.parameters).max(axis=0)

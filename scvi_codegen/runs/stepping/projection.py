@@ -8,6 +8,7 @@ at generic points.
 
 import re
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import TypeAlias
 
 import numpy as np
@@ -186,9 +187,8 @@ def _dependent(stepper: Integrator, q: Array, t: float, parameters: Parameters, 
 
 def _massless(stepper: Integrator, q: Array, t: float, parameters: Parameters) -> str:
     """Return what is wrong with coordinates whose velocities contribute to no momentum, and the remedy, or ""."""
-    unit = np.concatenate([np.zeros((1, stepper.dimension)), np.eye(stepper.dimension)])
     try:
-        momenta = stepper.momentum(np.tile(q, (len(unit), 1)), unit, t, parameters)
+        _, momenta = _at_unit_velocities(stepper, q, t, parameters)
     except StateError:
         return ""
     names = [name for name, p in zip(stepper.coordinates, momenta[1:], strict=True) if (p == momenta[0]).all()]
@@ -202,6 +202,31 @@ def _massless(stepper: Integrator, q: Array, t: float, parameters: Parameters) -
     )
 
 
+def _at_unit_velocities(stepper: Integrator, q: Array, t: float, parameters: Parameters) -> tuple[Array, Array]:
+    """Return (1 + m, m) equal positions and the momenta there of no velocity and of a unit velocity of each coordinate.
+
+    Raises:
+        StateError: where velocities have no momenta.
+    """
+    unit = np.concatenate([np.zeros((1, stepper.dimension)), np.eye(stepper.dimension)])
+    positions = np.tile(q, (len(unit), 1))
+    return positions, stepper.momentum(positions, unit, t, parameters)
+
+
+def roots_of_masses(stepper: Integrator, q: Array, t: float, parameters: Parameters) -> Array:
+    """Return (m,) roots of the masses M_ii = dp_i/dv_i: p_i / sqrt(M_ii) have one unit, the root of that of energies.
+
+    They are 1 where they are undefined, and of more than ``MOST_DENSE`` coordinates.
+    """
+    roots = np.ones(stepper.dimension)
+    if stepper.dimension <= MOST_DENSE:
+        with suppress(StateError):
+            _, momenta = _at_unit_velocities(stepper, q, t, parameters)
+            masses = np.diagonal(momenta[1:] - momenta[0])
+            np.sqrt(masses, out=roots, where=masses > 0.0)
+    return roots
+
+
 def singular_position(stepper: Integrator, q: Array, t: float, parameters: Array) -> str:
     """Return a remark on a failed step from positions where the constraints are nearly dependent, or ""."""
     if not stepper.constraints or max(stepper.dimension, len(stepper.constraints)) > MOST_DENSE:
@@ -211,12 +236,10 @@ def singular_position(stepper: Integrator, q: Array, t: float, parameters: Array
 
 def _linearised(stepper: Integrator, t: float, parameters: Parameters) -> Callable[[Array], tuple[Array, Array]]:
     """Return a function that evaluates g and G by unit velocities; NaN where velocities have no momenta."""
-    unit = np.concatenate([np.zeros((1, stepper.dimension)), np.eye(stepper.dimension)])
 
     def at(q: Array) -> tuple[Array, Array]:
-        positions = np.tile(q, (len(unit), 1))
         try:
-            momenta = stepper.momentum(positions, unit, t, parameters)
+            positions, momenta = _at_unit_velocities(stepper, q, t, parameters)
             g, rates = constraint_values(stepper, positions, momenta, t, parameters)
         except StateError:
             return np.full(len(stepper.constraints), np.nan), np.full((len(stepper.constraints), len(q)), np.nan)
