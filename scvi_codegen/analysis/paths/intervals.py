@@ -107,24 +107,25 @@ class Intervals:
         return Linearised(values.p0, values.p1, values.actions, values.residual, by.reshape(4, count, m, m), by_h)
 
     def _called(self, q: Array, variations: Array) -> tuple[Linearised, Array]:
-        binding, m, count = self.binding, self.dimension, len(self.h)
+        """Return momenta, actions and residuals, and their (N, variations, 2m) derivatives along variations."""
+        m, count, pointer = self.dimension, len(self.h), self.binding.pointer
         q = np.ascontiguousarray(q)
         p0, p1 = np.empty((2, count, m))
         actions, derivatives = np.empty(count), np.empty((count, len(variations), 2 * m))
-        report = binding.new("report *")
-        status = binding.function("steps_between")(
-            count,
-            *map(binding.pointer, (self.t, self.h, q[:-1], np.ascontiguousarray(q[1:]), self.parameters)),
-            self.parameters.shape[1] if self.parameters.ndim == 2 else 0,
-            binding.options(self.options),
-            len(variations),
-            *map(binding.pointer, (variations, p0, p1, actions, derivatives)),
-            report,
-            binding.workspace(),
-        )
-        if status:
-            raise step_failure(status, report, step=int(report.steps), h=float(self.h[report.steps]))
+        results = map(pointer, (variations, p0, p1, actions, derivatives))
+        ends = (q[:-1], np.ascontiguousarray(q[1:]))
+        self._solve("steps_between", self.t, self.h, ends, (len(variations), *results))
         return Linearised(p0, p1, actions, p1[:-1] - p0[1:]), derivatives
+
+    def _solve(self, function: str, t: Array, h: Array, ends: tuple[Array, Array], results: tuple[Any, ...]) -> None:
+        """Call a function of the C code for all steps; raise StepFailedError if one of them fails."""
+        binding, report = self.binding, self.binding.new("report *")
+        stride = self.parameters.shape[1] if self.parameters.ndim == 2 else 0
+        arguments = map(binding.pointer, (t, h, *ends, self.parameters))
+        options = binding.options(self.options)
+        status = binding.function(function)(len(h), *arguments, stride, options, *results, report, binding.workspace())
+        if status:
+            raise step_failure(status, report, step=int(report.steps), h=float(h[report.steps]))
 
     def refined(self, q: Array, p0: Array, count: int) -> tuple[Array, Array]:
         """Return the (N, m) positions and momenta at the ends of all intervals from their starts, in ``count`` steps.
@@ -139,20 +140,9 @@ class Intervals:
 
     def _stepped(self, t: Array, h: Array, q: Array, p: Array) -> tuple[Array, Array]:
         """Return the ends of one step of each interval."""
-        binding, count = self.binding, len(h)
         q1, p1 = np.empty((2, *q.shape))
-        report = binding.new("report *")
-        status = binding.function("actions")(
-            count,
-            *map(binding.pointer, (t, h, q, p, self.parameters)),
-            self.parameters.shape[1] if self.parameters.ndim == 2 else 0,
-            binding.options(self.options),
-            *map(binding.pointer, (q1, p1, np.empty(count))),
-            report,
-            binding.workspace(),
-        )
-        if status:
-            raise step_failure(status, report, step=int(report.steps), h=float(h[report.steps]))
+        actions = np.empty(len(h))
+        self._solve("actions", t, h, (q, p), tuple(map(self.binding.pointer, (q1, p1, actions))))
         return q1, p1
 
     def products(self, blocks: Any, vectors: Array) -> Array:
