@@ -56,23 +56,6 @@ def test_step_size_of_another_time_is_not_reused(model: sc.Model) -> None:
         dump_model(sc.Model(system=changed, method=sc.SVI(4), q=(1.0, 0.0), p=(0.0, 1.0), h=0.1, steps=3))
 
 
-def test_command_line_finds_a_step_and_reports_unsuitable_steps() -> None:
-    printed = output_of("run", "kepler", "--time-transformation", "frequency", "--span", "50", "--tolerance", "1e-8")
-    error = float(printed.partition("largest local error: ")[2].partition(" ")[0])
-    assert 1e-12 < error < 1e-7
-    far = (
-        "--q",
-        "1.9999,0",
-        "--velocity",
-        "0,0.00707",
-        "--span",
-        "6",
-        "--time-transformation",
-        "1e-3*(1 + (q1**2 + q2**2)/1000)",
-    )
-    assert "Error" in error_of("run", "kepler", *far, "--tolerance", "1e-10", status=1)
-
-
 @pytest.mark.tiers(3)
 @pytest.mark.parametrize("run", [{"tolerance": 1e-8}, {"tolerance": 1e-8, "span": -5.0}, {"step": 0.1}])
 @pytest.mark.parametrize("system", [{}, {"time_transformation": "frequency"}], ids=["t", "tau"])

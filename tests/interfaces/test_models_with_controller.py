@@ -63,21 +63,25 @@ def test_controller_of_a_time_transformation_can_be_replaced() -> None:
     assert parse_model(dump_model(symplectic), {"run": {"controller": "reversible"}}) == reversible
 
 
+FAR = (
+    "run kepler --q 1.97,0 --velocity 0,0.1234 --span 6 --tolerance 1e-10"
+    " --time-transformation 1e-3*(1+(q1**2+q2**2)/1000) --controller"
+)
+"""A transformation that does not resolve the close encounter of an orbit."""
+
+
 @pytest.mark.rotated
-def test_command_line_finds_the_step_in_tau(shaken: Path) -> None:
-    printed = output_of("run", str(shaken), "--tolerance", "1e-8")
+@pytest.mark.parametrize("words", ["FILE", "kepler --time-transformation frequency --span 50"])
+def test_command_line_finds_the_step_in_tau(shaken: Path, words: str) -> None:
+    printed = output_of(f"run {words.replace('FILE', str(shaken))} --tolerance 1e-8")
     error = float(printed.partition("largest local error: ")[2].partition(" ")[0])
     assert 1e-12 < error < 1e-7
-    words = (
-        "--time-transformation",
-        "1e-3*(1 + (q1**2 + q2**2)/1000)",
-        "--controller",
-        "reversible",
-        "--tolerance",
-        "1e-10",
-    )
-    far = ("--q", "1.97,0", "--velocity", "0,0.1234", "--span", "6")
-    assert "use another time transformation" in error_of("run", "kepler", *far, *words, status=1)
+
+
+@pytest.mark.rotated
+@pytest.mark.parametrize("controller", ["symplectic", "reversible"])
+def test_unsuitable_time_transformation_is_reported(controller: str) -> None:
+    assert "use another time transformation" in error_of(f"{FAR} {controller}", status=1)
 
 
 def test_run_continues_from_a_folder(shaken: Path, tmp_path: Path) -> None:
