@@ -11,7 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from programs import needs
+from programs import needs, script
 
 from scvi_codegen.codegen.native import building, compilers
 from scvi_codegen.codegen.rendering.source import TEXTS, Contents, Source
@@ -125,10 +125,7 @@ def test_second_load_in_one_process_does_no_io(cache):
 
 def compiler_reporting(tmp_path: Path, version: str, name: str = "own-cc") -> str:
     """Return a compiler that only reports a version."""
-    script = tmp_path / name
-    script.write_text(f"#!/bin/sh\necho '{version}'\n")
-    script.chmod(0o755)
-    return str(script)
+    return script(tmp_path / name, f"#!/bin/sh\necho '{version}'\n")
 
 
 def other_compiler(tmp_path, monkeypatch):
@@ -360,10 +357,7 @@ def test_output_of_a_failing_cc_is_shown(monkeypatch):
 
 
 def test_cc_that_cannot_run_is_named(tmp_path, monkeypatch):
-    script = tmp_path / "broken-cc"
-    script.write_text("#!/no/such/interpreter\n")
-    script.chmod(0o755)
-    monkeypatch.setenv("CC", str(script))
+    monkeypatch.setenv("CC", script(tmp_path / "broken-cc", "#!/no/such/interpreter\n"))
     with pytest.raises(BuildError, match="broken-cc"):
         answer()
 
@@ -403,10 +397,7 @@ exec cc "$@"
 
 
 def test_missing_vector_functions_are_replaced_by_scalar_ones(tmp_path, monkeypatch):
-    script = tmp_path / "plain-cc"
-    script.write_text(WITHOUT_VECTOR_FUNCTIONS)
-    script.chmod(0o755)
-    monkeypatch.setenv("CC", str(script))
+    monkeypatch.setenv("CC", script(tmp_path / "plain-cc", WITHOUT_VECTOR_FUNCTIONS))
     commands = compiler_runs(monkeypatch)
     assert building.load(source(), flags=building.TUNED_FLAGS).lib.tiny_answer() == 42.0
     assert "-lmvec" not in commands[-1]
@@ -420,10 +411,7 @@ case "$last" in *.so) echo "for another machine" > "$last" ;; esac
 
 
 def test_cross_compiler_is_named(tmp_path, monkeypatch):
-    script = tmp_path / "cross-cc"
-    script.write_text(CROSS_COMPILER)
-    script.chmod(0o755)
-    monkeypatch.setenv("CC", str(script))
+    monkeypatch.setenv("CC", script(tmp_path / "cross-cc", CROSS_COMPILER))
     with pytest.raises(BuildError, match="cross-cc' cannot be loaded on this machine"):
         answer()
 

@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from programs import script
 
 from scvi_codegen.codegen.native import announcements, building
 from scvi_codegen.codegen.native.building import PORTABLE_FLAGS
@@ -35,12 +36,10 @@ building.load(Source(prefix="tiny", header="", code="", declarations=""))
 @pytest.fixture
 def slow_compiler(tmp_path, monkeypatch) -> Path:
     """Two words, so that it is asked for no version."""
-    script = tmp_path / "slow-cc"
-    script.write_text(SLOW_COMPILER.format(folder=tmp_path))
-    script.chmod(0o755)
-    monkeypatch.setenv("CC", str(script))
+    compiler = tmp_path / "slow-cc"
+    monkeypatch.setenv("CC", script(compiler, SLOW_COMPILER.format(folder=tmp_path)))
     monkeypatch.setenv("SCVI_CODEGEN_CACHE", str(tmp_path / "cache"))
-    return script
+    return compiler
 
 
 def child_of(script: Path) -> int:
@@ -118,11 +117,8 @@ exit 1
 
 
 def test_files_are_compiled_concurrently(tmp_path, monkeypatch):
-    script, folder = tmp_path / "meeting-cc", tmp_path / "met"
-    folder.mkdir()
-    script.write_text(MEETING_COMPILER.format(folder=folder))
-    script.chmod(0o755)
-    monkeypatch.setenv("CC", str(script))
+    (folder := tmp_path / "met").mkdir()
+    monkeypatch.setenv("CC", script(tmp_path / "meeting-cc", MEETING_COMPILER.format(folder=folder)))
     monkeypatch.setenv("SCVI_CODEGEN_CACHE", str(tmp_path / "cache"))
     library = building.load(replace(part("first"), beside=part("second")), flags=PORTABLE_FLAGS).lib
     assert library.first() == library.second() == 2

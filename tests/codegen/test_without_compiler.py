@@ -10,7 +10,7 @@ import sysconfig
 from pathlib import Path
 
 import pytest
-from programs import needs
+from programs import needs, script
 
 from scvi_codegen.codegen.native import building
 from scvi_codegen.codegen.rendering.source import Source
@@ -87,10 +87,8 @@ exec {compiler} -MD -MF {folder}/$$.d "$@"
 
 def test_no_header_of_python_is_read(tmp_path, monkeypatch):
     """The compiler opens no header of Python and receives no path to them."""
-    script = tmp_path / "watched-cc"
-    script.write_text(WATCHED.format(folder=tmp_path, compiler=needs("cc")))
-    script.chmod(0o755)
-    monkeypatch.setenv("CC", str(script))
+    compiler = script(tmp_path / "watched-cc", WATCHED.format(folder=tmp_path, compiler=needs("cc")))
+    monkeypatch.setenv("CC", compiler)
     monkeypatch.setenv(building.CACHE_VARIABLE, str(tmp_path / "cache"))
     code = "#include <math.h>\nint tiny(void);\nint tiny(void)\n{\n  return (int)floor(7.5);\n}\n"
     source = Source(prefix="tiny", header="", code=code, declarations="int tiny(void);\n")

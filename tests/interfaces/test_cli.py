@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from click.shell_completion import ShellComplete
 from commands import error_of, invoke, output_of
+from programs import script
 
 from scvi_codegen import Model, compile_stepper, problem
 from scvi_codegen.interfaces.cli import ABOUT, main
@@ -392,9 +393,7 @@ class TestRun:
 @pytest.mark.skipif(COMMAND is None, reason="the command is not installed beside this Python")
 class TestInstalledCommand:
     def test_ctrl_c_while_it_compiles_is_one_line(self, tmp_path, monkeypatch):
-        compiler = tmp_path / "slow-cc"
-        compiler.write_text("#!/bin/sh\ntouch started\nexec sleep 3600\n")
-        compiler.chmod(0o755)
+        compiler = script(tmp_path / "slow-cc", "#!/bin/sh\ntouch started\nexec sleep 3600\n")
         monkeypatch.setenv("CC", f"{compiler} {tmp_path}")  # two words: its file is not its version
         monkeypatch.setenv("SCVI_CODEGEN_CACHE", str(tmp_path / "cache"))
         process = subprocess.Popen(

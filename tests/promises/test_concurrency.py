@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from programs import script
 
 import scvi_codegen as sc
 from scvi_codegen import SVI, RecordedRun, Stepper, record_run
@@ -44,10 +45,11 @@ def folder(tmp_path, monkeypatch) -> Path:
 # Processes that share a cache.
 
 LOADING = """
-import json, sys, time
+import json, logging, sys
 from pathlib import Path
 from scvi_codegen.codegen.native import building
 from scvi_codegen.codegen.rendering.source import Source
+logging.getLogger("scvi_codegen").setLevel(logging.WARNING)  # slow compilations are not announced
 sources = [Source.from_record(record) for record in json.loads(Path(sys.argv[1]).read_text())]
 print("ready", flush=True)
 sys.stdin.readline()
@@ -125,11 +127,9 @@ exec cc "$@"
 
 def killed(folder: Path, seconds: float, generator: random.Random) -> None:
     """Load a source in a process that is killed while it compiles."""
-    script, mark = folder.parent / "slow-cc", folder.parent / "compiling"
-    script.write_text(SLOW_COMPILER)
-    script.chmod(0o755)
+    compiler, mark = script(folder.parent / "slow-cc", SLOW_COMPILER), folder.parent / "compiling"
     mark.unlink(missing_ok=True)
-    with loading(folder, 0, CC=str(script), COMPILING=str(mark), SECONDS_TO_WAIT=str(seconds)) as process:
+    with loading(folder, 0, CC=compiler, COMPILING=str(mark), SECONDS_TO_WAIT=str(seconds)) as process:
         assert process.stdin is not None
         process.stdin.write("\n")
         process.stdin.flush()

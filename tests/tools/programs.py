@@ -45,6 +45,13 @@ def needs(*names: str) -> str:
     return str(shutil.which(names[0]))
 
 
+def script(path: Path, text: str) -> str:
+    """Write a program, and return its path as text."""
+    path.write_text(text)
+    path.chmod(0o755)
+    return str(path)
+
+
 def forget() -> None:
     """Forget what the previous test declared."""
     _declared.clear()
