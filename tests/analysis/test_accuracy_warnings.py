@@ -40,7 +40,7 @@ class TestLongSteps:
             going.record(10)
         assert going.record(5).step_error > 1e-3  # and raises no warning
 
-    @pytest.mark.tiers(1)
+    @pytest.mark.second
     @pytest.mark.filterwarnings("error")
     @pytest.mark.parametrize(("name", "h"), [("cart-pole", 0.02), ("charged-particle", 0.1)])
     def test_coordinate_that_hardly_moves_from_0_does_not_warn(self, name, h):
@@ -53,7 +53,7 @@ class TestLongSteps:
         true = np.abs(run.q[k + 1] - better).max() / np.abs(better).max()
         assert true / 10 < run.step_error < 1e-3
 
-    @pytest.mark.tiers(1, 3)
+    @pytest.mark.tiers(0, 3)
     @pytest.mark.sampled(3)
     @pytest.mark.filterwarnings("error")
     @pytest.mark.parametrize("method", ["svi:1", "svi:2", "scvi:2", "svi:3"])
@@ -64,6 +64,7 @@ class TestLongSteps:
         assert np.abs(run.q[:, 0] - run.t * np.sin(run.t) / 2).max() < 0.1  # of 9
         assert 0.0 < run.step_error < 3e-4
 
+    @pytest.mark.second
     @pytest.mark.filterwarnings("error")
     @pytest.mark.parametrize("method", ["svi:1", "svi:2"])
     def test_rest_at_the_origin_during_a_run_does_not_warn(self, method):
@@ -73,6 +74,7 @@ class TestLongSteps:
         )
         assert np.abs(run.q[:, 0] - (3 * np.sin(run.t) - np.sin(3 * run.t)) / 8).max() < 0.1
 
+    @pytest.mark.second
     @pytest.mark.filterwarnings("error")
     def test_late_or_stepwise_push_does_not_warn(self):
         constrained = lagrange("held", "x", "x_dot**2/2 - x**2/2 + u*x", inputs="u")
@@ -84,7 +86,7 @@ class TestLongSteps:
             going.record(1)
         assert 0.0 < going.step_error < 1e-3
 
-    @pytest.mark.tiers(1, 2)
+    @pytest.mark.tiers(0, 2)
     @pytest.mark.sampled(2)
     @pytest.mark.parametrize("method", ["svi:1", "svi:2", "svi:3", "svi:4"])
     def test_impulse_misjudged_by_the_first_step_warns(self, method):
@@ -94,6 +96,7 @@ class TestLongSteps:
             run = sc.compile_stepper(blow, method).integrate([0.0], [0.0], h=0.1, steps=200)
         assert abs(run.p[-1, 0] / (0.03 * math.sqrt(math.pi) / 2) - 1.0) > 1e-3
 
+    @pytest.mark.second
     @pytest.mark.parametrize("steps", [3, 30])
     def test_growth_from_the_origin_with_too_long_steps_warns(self, steps):
         unstable = sc.LagrangianSystem.from_text(name="unstable", coordinates=["x"], lagrangian="x_dot**2/2 + x**2/2")

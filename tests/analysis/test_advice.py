@@ -211,6 +211,7 @@ class TestDegree:
             (pytest.approx(row.h, rel=1e-5), "1 s") for row in advice.evidence if math.isfinite(row.error)
         ]
 
+    @pytest.mark.second
     def test_methods_without_a_degree(self):
         assert advise(pendulum(), StoermerVerlet(), [1.5], [0.0], 20.0, 1e-3).degree is None
         with pytest.raises(MethodError, match="stoermer-verlet has no degree or number of stages to choose"):
@@ -334,6 +335,7 @@ class TestEnsembles:
         q, p = map(np.array, zip(*map(kepler_start, self.ECCENTRICITIES), strict=True))
         return advise(problem("kepler").system, SVI(6), q, p, 100.0, 1e-8)
 
+    @pytest.mark.second
     def test_step_is_that_of_the_worst_trajectory(self):
         """The errors of all trajectories, against the exact solution, are within the tolerance."""
         advice, system = self.advised(), problem("kepler").system
@@ -356,6 +358,7 @@ class TestEnsembles:
         alone = advise(system, SVI(8), q[advice.member], p[advice.member], 5000.0, 1e-8)
         assert advice.steps == pytest.approx(alone.steps, rel=0.25)
 
+    @pytest.mark.second
     def test_parameters_of_each_trajectory_count(self):
         """Oscillators of frequencies 1 and 5: the step is that of the second."""
         system, states = lagrange("oscillator", "q", "q_dot**2/2 - k*q**2/2", k=1.0), ([[1.0], [1.0]], [[0.0], [0.0]])
@@ -405,6 +408,7 @@ def test_symplecticity_is_not_claimed_under_forces():
     assert "symplectic" not in advise(damped, SVI(4), [0.5], [0.0], 5.0, 1e-6).message
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("origin", "amplitude"), [(1000.0, 1.0), (0.0, 1e-9)])
 def test_recommended_steps_depend_neither_on_the_origin_nor_on_the_amplitude(origin, amplitude):
     text = "x_dot**2/2 - (x - c)**2/2 - (x - c)**4/(4*a**2)"

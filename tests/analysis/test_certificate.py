@@ -293,7 +293,7 @@ def test_model_file_and_its_generated_folder_are_verified(tmp_path: Path) -> Non
     assert command(str(folder), "--degree", "3")[0] == 2
 
 
-@pytest.mark.quick
+@pytest.mark.second
 def test_certificate_reports_slow_checks_and_their_duration(quickly_compiled, monkeypatch, capsys):
     entry = sc.problem("harmonic-oscillator")
     message: list[str] = []

@@ -108,7 +108,6 @@ def test_a_path_through_a_singularity_is_dropped(kepler):
         kepler.path([1.0, 0.0], [-1.5, 0.0], T, steps=44, start=line)
 
 
-@pytest.mark.quick
 def test_starts_go_around_a_centre(kepler):
     """Angles are those of the run of the path; the times of flight are those of Kepler's equation."""
     angle = np.arctan2(0.8, -0.5)

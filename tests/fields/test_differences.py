@@ -132,6 +132,7 @@ def test_products_of_a_field_and_its_derivative_converge():
     assert np.log2(errors[0] / errors[1]) > 1.8
 
 
+@pytest.mark.second
 def test_spectrum_and_derivative_of_a_line_with_ends():
     mesh = line((0, "natural")).discretise("finite-differences", order=8, points=65)
     x = mesh.points["x"]

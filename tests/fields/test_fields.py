@@ -17,6 +17,7 @@ PLANE = {"x": (0, "2*pi"), "y": (0, "2*pi")}
 PERIODIC = dict.fromkeys(PLANE, "periodic")
 
 
+@pytest.mark.second
 def test_momentum_of_waves_is_conserved_by_fourier():
     field = sc.FieldSystem.from_text(
         "Klein-Gordon", ["u"], {"x": (0, "2*pi")}, "u_t**2/2 - u_x**2/2 - u**2/2", boundary={"x": "periodic"}

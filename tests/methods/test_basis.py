@@ -64,6 +64,7 @@ def test_tables_reproduce_polynomials_on_any_points(
             assert abs(ours - number(theirs)) < FIFTY_DIGITS * scale
 
 
+@pytest.mark.second
 @settings(max_examples=30, deadline=None)
 @given(points=st.lists(rationals, min_size=2, max_size=7, unique=True), shift=rationals, data=st.data())
 def test_least_squares_extrapolation_is_the_normal_equations(

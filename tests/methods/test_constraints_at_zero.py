@@ -44,7 +44,7 @@ def reference():
     ).sol
 
 
-@pytest.mark.tiers(3)
+@pytest.mark.second
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_a_closed_loop_starts_from_rest_at_zero_at_any_step(method, reference):
     stepper = sc.compile_stepper(linkage(a="1"), method)
@@ -86,7 +86,7 @@ def test_a_closed_loop_at_an_equilibrium_stays_there(method):
         assert run.fallback_steps == 0
 
 
-@pytest.mark.tiers(3)
+@pytest.mark.second
 @pytest.mark.parametrize("pivot", [(0.0, 0.0), (0.0, 1.0), (0.0, 100.0), (0.0, -1e3)], ids=str)
 def test_a_pendulum_hangs_and_swings_from_any_pivot(pivot):
     """Initial states that are exact, or nearly so, are accepted as they are, wherever the origin is."""
@@ -106,6 +106,7 @@ def test_a_pendulum_hangs_and_swings_from_any_pivot(pivot):
         assert run.fallback_steps == 0
 
 
+@pytest.mark.second
 def test_projection_ends_at_rounding_near_the_origin():
     stepper = sc.compile_stepper(linkage(), "svi:4")
     for q in ([1e-9, -2e-10, 3e-9], [1e-3, 0.0, 0.0], [1e-16, 0.0, 0.0], [0.1, -0.1, 0.05]):

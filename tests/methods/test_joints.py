@@ -137,6 +137,7 @@ def test_member_forces_of_a_bridge_equal_the_method_of_joints():
     assert_allclose(pulls[0, top], -moment / JOINTS.HEIGHT, rtol=0, atol=1e-10)
 
 
+@pytest.mark.second
 def test_state_with_zero_coordinates_is_projected():
     """Updates far below the rounding of other coordinates still change g."""
     hook = JOINTS.bent_pendulum()

@@ -84,6 +84,7 @@ def test_the_same_system_from_sympy_and_from_files(tmp_path):
     assert_allclose(run.multipliers(), -run.q, rtol=0, atol=1e-13)
 
 
+@pytest.mark.second
 def test_prescribed_velocities():
     lagrangian = "J*a_dot**2/2 + m*x_dot**2/2"
     cart = lagrange("cart", "a x", lagrangian, J=1, m=2, constraints=["x_dot = t", "a = x"])

@@ -33,7 +33,7 @@ def by_accelerations(t, state):
     return [vx, vy, w, *found[:3]]
 
 
-@pytest.mark.tiers(1, 2)
+@pytest.mark.tiers(0, 2)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize(("s", "steps"), [(1, 20), (2, 10), (3, 10), (4, 5)])
 def test_the_order_is_2s_and_the_step_is_symmetric(s, steps):

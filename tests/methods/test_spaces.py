@@ -77,7 +77,7 @@ def test_too_few_points_for_the_intervals_warn() -> None:
 # Exactness and order.
 
 
-@pytest.mark.tiers(1, 2)
+@pytest.mark.tiers(0, 2)
 @pytest.mark.sampled(2)
 @pytest.mark.covering
 @pytest.mark.parametrize("degree", [2, 3, 4, 5])

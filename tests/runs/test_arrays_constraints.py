@@ -112,6 +112,7 @@ def test_cloth_conserves_rod_lengths_and_energy():
     assert np.abs(run.q["r"] - q).max() > 0.1  # it moved
 
 
+@pytest.mark.second
 def test_compositions_have_their_order_and_satisfy_constraints():
     stepper = sc.compile_stepper(net(), "composition:8")
     q, data = chain(3)

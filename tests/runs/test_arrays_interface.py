@@ -52,7 +52,7 @@ def prototypes(header: str, prefix: str) -> dict[str, str]:
     return {name: " ".join(f"{result}({of})".replace(f"{prefix}_", "").split()) for name, result, of in types}
 
 
-@pytest.mark.tiers(1, 2)
+@pytest.mark.tiers(0, 2)
 def test_functions_have_the_prototypes_of_named_coordinates(steppers) -> None:
     any_size, known, *_ = steppers
     ours, theirs = (prototypes(each.source.header, each.interface.prefix) for each in (any_size, known))

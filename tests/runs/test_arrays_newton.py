@@ -71,7 +71,7 @@ def test_newton_of_explicit_methods_is_compiled_with_the_sizes_of_the_call():
     assert ends[0] == pytest.approx(ends[1], abs=1e-13)
 
 
-@pytest.mark.tiers(1)
+@pytest.mark.second
 @pytest.mark.parametrize("solver", ["auto", "newton"])
 def test_methods_without_a_basis_of_eigenvectors_are_compiled_with_known_sizes(solver):
     """The matrix of these steps has the double eigenvalue 0 with one eigenvector."""

@@ -54,6 +54,7 @@ def test_literal_sizes_are_sizes_given_to_compile_stepper(known):
     assert (run.q == known.integrate(Q0, velocity=np.zeros(6), **GIVEN).q).all()
 
 
+@pytest.mark.second
 def test_the_only_array_needs_no_name():
     atoms = lagrange("atoms", ["r[2, 3]"], "sum(i in 2, k in 3, r_dot[i, k]**2/2 - r[i, k]**2/2)")
     stepper = sc.compile_stepper(atoms, "svi:4")
@@ -63,7 +64,7 @@ def test_the_only_array_needs_no_name():
     assert (stepper.arrays(run.q)["r"][0] == start).all()
 
 
-@pytest.mark.tiers(1)
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("extra", "method", "message"),
     [

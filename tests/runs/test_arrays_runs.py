@@ -180,6 +180,7 @@ def test_parameters_affect_the_first_kick_of_an_explicit_method():
         assert np.abs(run.q["q"] - other.q["q"]).max() < 1e-15
 
 
+@pytest.mark.second
 def test_error_estimate_survives_a_zero_of_one_coefficient() -> None:
     """One quartic oscillator, whose highest coefficient vanishes now and then: no step changes the energy by more."""
     system = lagrange("quartic", "x[N]", "sum(i in N, x_dot[i]**2/2 - x[i]**4/4)")

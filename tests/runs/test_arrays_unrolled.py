@@ -425,6 +425,7 @@ def test_known_sizes_names_and_ensembles():
     assert known.jacobian(motion.q, rest, 0.1).shape == (12, 12)
 
 
+@pytest.mark.second
 def test_velocities_of_hamiltonians_are_unavailable():
     motion = MOTIONS["waves"]
     stepper = motion.stepper("gauss:3")

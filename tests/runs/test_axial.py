@@ -147,7 +147,6 @@ def test_energy_and_momenta_over_100_000_steps(top):
     assert abs(np.sum(run.q**2, axis=1) / np.sum(run.q[0] ** 2) - 1).max() < 3e-13
 
 
-@pytest.mark.quick
 @pytest.mark.parametrize("h", [0.01, 3.0, pytest.param(400.0, marks=pytest.mark.quick)])
 def test_steps_without_a_potential_are_exact(top, h):
     """The attitude is that after rotations about the angular momentum and about the axis (Routh)."""

@@ -204,6 +204,7 @@ def test_initial_states_of_two_kinds_equal_those_of_single_runs() -> None:
         one.integrate_ensemble(np.vstack([q, [[3.0, 4.0]]]), np.zeros((COUNT + 1, 2)), h=0.05, steps=1)
 
 
+@pytest.mark.second
 def test_energies_that_change_are_reported_for_the_worst_trajectory() -> None:
     one, (q, p) = stepper("kepler"), states("kepler")
     q[3], p[3] = (1e-3, 0.0), (0.0, 44.5)  # eccentricity .98: a loose tolerance loses the energy

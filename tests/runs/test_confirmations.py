@@ -289,7 +289,7 @@ def check(found: Counter, least: float) -> None:
     assert total["confirmed"] >= least * sum(total.values()), found
 
 
-@pytest.mark.tiers(2, 4)
+@pytest.mark.tiers(0, 4)
 @pytest.mark.parametrize("kind", [*SMOOTH, *NOT_SMOOTH])
 def test_no_error_is_confirmed_but_wrong(kind):
     """Three cases of each kind; most smooth ones are confirmed."""
@@ -326,6 +326,7 @@ def test_an_unconfirmed_motion_with_kinks_has_the_remedies_for_these():
     assert "time transformation" not in str(caught[0].message)
 
 
+@pytest.mark.second
 def test_switched_forces_are_not_falsely_confirmed():
     """x'' = 1 from t = a on: 30 times a, each confirmed run is right; those that are not are reported."""
     stepper, confirmed = stepper_of("motor", "svi:4"), 0
@@ -358,6 +359,7 @@ def test_a_coordinate_that_does_not_move_is_confirmed():
     assert run.confirmation.confirmed
 
 
+@pytest.mark.second
 @pytest.mark.filterwarnings("error")
 def test_rest_is_confirmed_and_its_energy_is_that_of_rounding():
     body = sc.LagrangianSystem.from_text(
@@ -372,6 +374,7 @@ def test_rest_is_confirmed_and_its_energy_is_that_of_rounding():
     spring.integrate([np.nextafter(1000.0, 2000.0)], velocity=[0.0], t_end=20.0)
 
 
+@pytest.mark.second
 def test_two_words_confirm_more_digits():
     system = lagrange("oscillator", "x", "x_dot**2/2 - x**2/2")
     stepper = sc.compile_stepper(system, "svi:12", precision="double-double")
@@ -397,6 +400,7 @@ def test_a_run_for_comparison_has_other_steps():
     assert len(irregular_stops(np.array([0.0, 1.0]), 0)) == LEAST_STOPS + 1
 
 
+@pytest.mark.second
 def test_steps_of_a_confirmed_run_with_kinks_reproduce_it(tmp_path):
     """In Python, of models and on the command line: the tolerance and the largest step."""
     stepper = stepper_of("motor", "svi:4")
@@ -422,6 +426,7 @@ def test_steps_of_a_confirmed_run_with_kinks_reproduce_it(tmp_path):
         assert np.array_equal(file["q"], run.q)
 
 
+@pytest.mark.second
 def test_kinks_of_arrays_are_found():
     """Two balls on a stiff floor: the second one is at the height of the test above."""
     system = lagrange("floor", "y[N]", "sum(i in N, y_dot[i]**2/2 - 9.8*y[i] - 1e5*positive_part(-y[i])**2)")
@@ -442,6 +447,7 @@ def confirmed(system, q, p, method="svi:6", **arguments):
 class TestSizes:
     """Motions beside larger ones, far from the origin and in encounters."""
 
+    @pytest.mark.second
     def test_a_tiny_motion_next_to_a_large_one_has_its_own_size(self):
         run = confirmed(
             ("x z", "(x_dot**2 + z_dot**2)/2 - x**2/2 - z**2"), [1.0, 1e-14], [0.0, 0.0], t_end=5.0, error=1e-8
@@ -484,6 +490,7 @@ class TestSizes:
         assert confirmed(system, *start, t_end=5.0, error=1e-6, absolute_tolerance=1.0).confirmation.confirmed
 
 
+@pytest.mark.second
 def test_a_comparison_that_is_given_up_confirms_nothing(monkeypatch):
     """Runs for comparison that take too many steps."""
     monkeypatch.setattr(global_error, "MANY", -(10**6))

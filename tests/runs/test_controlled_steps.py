@@ -265,6 +265,7 @@ def test_initial_step_size_is_found_for_zero_velocity(method):
     assert np.abs(found.q[-1] - known.q[-1]).max() < 1e-13
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("tolerance", [1e-8, 1e-12])
 def test_degree_two_error_estimate_uses_the_change_of_force(tolerance):
     """At rest the force is initially constant: q = 2 asin(k cd(t, k)) (Whittaker, Analytical Dynamics, 44)."""
@@ -277,6 +278,7 @@ def test_degree_two_error_estimate_uses_the_change_of_force(tolerance):
     assert errors.max() < (len(run) - 1) * tolerance
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("method", ["svi:2", "svi:8"])
 def test_forces_beyond_the_degree_at_the_start(method):
     """Each step from rest at the origin has a large error relative to itself, however short."""
@@ -296,7 +298,7 @@ def test_a_singular_time_inside_a_run_is_resolved_or_its_error_reported():
         assert error < 10.0 * run.step_error <= 1e3 * wanted, tolerance
 
 
-@pytest.mark.tiers(2, 3)
+@pytest.mark.tiers(0, 3)
 @pytest.mark.parametrize("method", ["svi:4", "svi:8"])
 @pytest.mark.parametrize("force", ["1/(t - a)", "x/(t - a)", "1/(t - a)**2"])
 def test_a_pole_in_time_ends_a_run(method, force):
@@ -313,6 +315,7 @@ def test_a_pole_in_time_ends_a_run(method, force):
     assert passed <= 1
 
 
+@pytest.mark.second
 def test_first_step_is_found_without_larger_ones_at_which_the_iteration_diverges():
     """Released at 1.5 rad; steps beyond 1.5 send the angle to 1e16, where cosines take a hundred times as long."""
     atwood = lagrange("atwood", "r s", "2*r_dot**2 + r**2*s_dot**2/2 - r*(3 - cos(s))")
@@ -321,6 +324,7 @@ def test_first_step_is_found_without_larger_ones_at_which_the_iteration_diverges
     assert run.rejected_steps < 14
 
 
+@pytest.mark.second
 def test_step_that_ends_within_a_millionth_of_t_end_ends_there():
     system = sc.LagrangianSystem.from_text(name="unit", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2")
     stepper = sc.compile_stepper(system, "svi:4", flags=("-O0",))
@@ -403,6 +407,7 @@ class TestStepsOfHLeadToAnEnd:
     def positions(run):
         return (run.q if isinstance(run.q, np.ndarray) else run.q["q"])[:, 0]
 
+    @pytest.mark.second
     def test_integer_number_of_steps_is_exact(self, oscillators, name, sign):
         run = oscillators[name].integrate([1.0], [0.0], h=sign * 0.1, t_end=sign * 2.0)
         same = oscillators[name].integrate([1.0], [0.0], h=sign * 0.1, steps=20)
@@ -469,6 +474,7 @@ def test_known_sizes_take_the_adaptive_steps_of_arrays_at_the_nodes_of_a_wave(so
     np.testing.assert_allclose(run.q[-1], other.q[-1], atol=1e-8)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("solver", ["auto", "newton"])
 def test_free_fall_of_linked_bodies_from_rest_at_the_origin_takes_few_steps(solver):
     """The angle rests but for rounding errors of z, which the masses couple to it."""

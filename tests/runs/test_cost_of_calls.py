@@ -56,6 +56,7 @@ def test_a_call_visits_few_functions_of_few_files(stepper, momenta):
     assert len({file for file, _ in visited}) <= 8
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("plan", [FIXED, ADAPTIVE, {"t_end": 9.0, "t_eval": [1.0]}])
 @pytest.mark.parametrize("convert", [list, np.array, dict])
 def test_velocities_start_the_run_of_their_momenta(plan, convert):

@@ -36,7 +36,7 @@ def kepler() -> sc.Stepper:
 # Order, continuity, ends.
 
 
-@pytest.mark.tiers(1, 4)
+@pytest.mark.tiers(0, 4)
 @each_method
 @pytest.mark.parametrize("h", [0.1, -0.1])
 def test_dense_output_is_continuous_at_saved_states(compiled, sample, method, h):

@@ -88,7 +88,7 @@ def test_step_density_may_depend_on_time_or_momenta(name):
     assert np.abs(np.column_stack([run.t, run.q, run.p])[1:-1] - expected).max() < 1e-12
 
 
-@pytest.mark.tiers(1)
+@pytest.mark.second
 @pytest.mark.parametrize("system", [KEPLER, sc.hamiltonian_of(KEPLER)], ids=["lagrangian", "hamiltonian"])
 def test_reversed_run_returns_on_its_own_steps(system):
     stepper = sc.compile_stepper(system, sc.SVI(4), time_transformation="frequency", flags=QUICK_FLAGS)
@@ -123,6 +123,7 @@ def test_steps_that_end_at_a_time_advance_the_density_partially():
     assert off_the_time_transformation(piece) < 2e-3
 
 
+@pytest.mark.second
 def test_time_transformations_of_runs_with_inputs():
     """Steps of tau are positive, and their number is not prescribed."""
     system = sc.LagrangianSystem.from_text(name="u", coordinates=["x"], lagrangian="x_dot**2/2 + u*x", inputs=["u"])
@@ -176,6 +177,7 @@ def test_too_long_steps_for_the_time_transformation_are_rejected():
         kepler(sc.SVI(2)).integrate(*START, h=50.0, t_end=PERIOD)
 
 
+@pytest.mark.second
 def test_momenta_not_determined_by_velocities_are_supported():
     vortices = hamilton("q p", "x", "x**2*y**2/2 + x**2/2 + y**2/2", momenta="y")
     run = sc.compile_stepper(

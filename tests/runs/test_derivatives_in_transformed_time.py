@@ -172,6 +172,7 @@ WAYS = {
 }
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("way", WAYS)
 def test_gradients_are_the_transpose_of_derivatives(way):
     """Functions of states, and of states and times."""
@@ -206,6 +207,7 @@ def test_run_that_ends_at_a_step_ends_at_its_time():
     assert_allclose(still.tangent(), np.stack([np.eye(4)] * 2))
 
 
+@pytest.mark.second
 def test_derivatives_at_an_end_time_agree_with_fixed_steps_of_time():
     """The flow of the motion itself, to the error of both: a period later all but the phase returns."""
     period, made = 2 * np.pi, sc.compile_stepper(sc.reparametrise(KEPLER, "distance"), sc.SVI(8), flags=QUICK_FLAGS)

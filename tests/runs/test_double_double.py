@@ -141,6 +141,7 @@ def test_functions(count: int, tmp_path: Path) -> None:
     assert max(worst.values()) <= 1e-30, worst
 
 
+@pytest.mark.second
 def test_rounding_errors_have_no_bias(tmp_path: Path) -> None:
     """Mean errors of products and roots vanish, as those of one sign would let the energies of orbits drift."""
     library, rng, count = compiled_functions(tmp_path), np.random.default_rng(3), 10_000
@@ -389,6 +390,7 @@ def test_numbers() -> None:
             two_words(wrong, "q")
 
 
+@pytest.mark.second
 def test_refusals() -> None:
     """What double-double arithmetic does not have is refused with a remedy."""
     kepler = system("kepler")
@@ -483,6 +485,7 @@ def test_dense_output_at_decimal_times() -> None:
             assert abs(stepper.integrate([1], [0], h=h, t_end=2.0).mp("q")[-1][0] - mp.cos(2)) < 2e-31
 
 
+@pytest.mark.second
 def test_every_quantity_has_both_words(tmp_path: Path) -> None:
     """Coordinates, momenta and velocities by name, of runs, in progress, of ensembles, recordings and events."""
     stepper = sc.compile_stepper(system("kepler"), "svi:4", precision="double-double", events=sc.Event("y - 3/5"))
@@ -531,6 +534,7 @@ def test_arrays_have_both_words() -> None:
             assert abs(by_name["q"].mp()[0][1] - third) + abs(by_name["z"].mp()[0] - z) < 1e-32
 
 
+@pytest.mark.second
 def test_velocities_at_times_of_two_words() -> None:
     """Momenta, velocities, energies, steps and projections of systems that depend on t use both words of t."""
     text = "(2 + sin(t))*(x_dot**2 + y_dot**2)/2 - x**2*cos(t)/2 + t*x_dot"
@@ -651,6 +655,7 @@ def test_ensembles(tmp_path: Path) -> None:
         stepper.integrate_ensemble(q, velocity=[[0, 1], ["a", 1]], h=0.07, steps=9)
 
 
+@pytest.mark.second
 def test_explicit_ensembles() -> None:
     """Trajectories in SIMD lanes equal the formulas in 50 digits, whatever their neighbours are."""
     driven = sc.LagrangianSystem.from_text(
@@ -684,6 +689,7 @@ def test_explicit_ensembles() -> None:
         assert (infinite.mp("q")[:, :3] == fewer.mp("q")).all()
 
 
+@pytest.mark.second
 def test_lanes_do_not_depend_on_their_neighbours() -> None:
     """Trajectories whose iterations converge at different rates have equal bits in other blocks and threads."""
     stepper = sc.compile_stepper(system("kepler"), "svi:3", precision="double-double")
@@ -698,6 +704,7 @@ def test_lanes_do_not_depend_on_their_neighbours() -> None:
         assert (others.mp(name) == runs.mp(name)[:, order]).all()
 
 
+@pytest.mark.second
 def test_failing_lanes() -> None:
     """A trajectory whose iteration fails keeps its states up to there, and the bits of its neighbours."""
     stepper = sc.compile_stepper(system("kepler"), "svi:6", precision="double-double")
@@ -727,6 +734,7 @@ def test_largest_systems_in_lanes(count: int, has_lanes: bool) -> None:
     assert (source is not None) == has_lanes
 
 
+@pytest.mark.second
 def test_trajectory_that_leaves_its_lane() -> None:
     """A trajectory that the single integrator continues ends at the final time, with the state of its lane."""
     stepper = sc.compile_stepper(system("driven"), "svi:4", precision="double-double")
@@ -755,6 +763,7 @@ def driven_spring(t: list[float], u: list[Fraction], end: float, kind: str) -> l
     return [q, v]
 
 
+@pytest.mark.second
 def test_inputs() -> None:
     """Inputs of two words, constant or linear between samples, or set by a controller, agree with the solution."""
     spring = lagrange("driven spring", "q", "q_dot**2/2 - q**2/2 + u*q", inputs="u")

@@ -57,6 +57,7 @@ def end_of_ball(times: list, end: Any, kick: Any) -> tuple[list, list]:
     return found, list(moved(end))
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("steps", [{"h": 0.125, "t_end": 4.1}, {"t_end": 4.1, "tolerance": 1e-28}])
 def test_ball(steps: dict[str, float]) -> None:
     """Times of impacts on a curved, moving floor with restitution, and the states after them, have both words."""
@@ -126,6 +127,7 @@ def test_return() -> None:
         assert largest(each - intervals[0] for each in intervals) < 1e-29
 
 
+@pytest.mark.second
 def test_edge() -> None:
     """Inelastic impacts on two walls alternate, to 31 digits, and leave the velocity along their edge, (1, 1, 1).
 
@@ -154,6 +156,7 @@ def test_edge() -> None:
     )
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("steps", [{"h": 0.125}, {"t_end": 4.0}])
 def test_recordings(steps: dict[str, float], tmp_path: Path) -> None:
     """Recorded, resumed and pickled runs have the crossings of runs in memory, in both words."""
@@ -214,6 +217,7 @@ def test_constraints() -> None:
         assert max(np.abs(each).max() for each in run.constraint_values()) < 1e-30
 
 
+@pytest.mark.second
 def test_corner() -> None:
     """In a corner both walls act: the velocity is reversed."""
     free = sc.LagrangianSystem.from_text(name="free", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2")
@@ -235,6 +239,7 @@ def test_derivatives() -> None:
     assert np.abs(run.sensitivity().state - double.sensitivity().state).max() < 1e-10
 
 
+@pytest.mark.second
 def test_reversible_controller() -> None:
     """Impacts in runs of equal steps of tau: those of adaptive runs."""
     g = {"time_transformation": "1/(1 + y**2/4)"}

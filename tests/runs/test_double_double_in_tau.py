@@ -67,7 +67,6 @@ def gauss_tables() -> tuple[list, list]:
     return [[quarter, quarter - root], [quarter + root, quarter]], [mp.mpf(1) / 2] * 2
 
 
-@pytest.mark.quick
 @pytest.mark.parametrize("hamiltonian", [False, True])
 def test_step(hamiltonian: bool) -> None:
     """A step of K = r (H - E) and its duration, the integral of r, are those of Gauss's method in 60 digits."""

@@ -139,7 +139,6 @@ def test_first_order() -> None:
         assert abs(v.mp()[0] + mp.sin(x) / (1 + 2 * (x * x + y * y))) < 1e-31
 
 
-@pytest.mark.quick
 def test_numbers_of_first_order_states() -> None:
     """Values of variables in order or by name, and coordinates beside a rotation, have both words."""
     text = "(1 + x**2 + y**2)*(x*y_dot - y*x_dot)/2 - cos(x) - sin(y)"
@@ -237,7 +236,6 @@ def test_rod_and_angle() -> None:
         assert abs(force.mp()[0] + m * (rate**2 + mp.cos(a)) / 2) < 1e-30
 
 
-@pytest.mark.quick
 def test_initial_states() -> None:
     """A state that violates the constraints is projected to 32 digits, and one that satisfies them is not moved."""
     stepper = compiled("rod", "svi:1")
@@ -315,7 +313,6 @@ def test_velocities_by_iteration(degree: int) -> None:
                 assert abs(runs[0].mp(name) - runs[1].mp(name)).max() < 1e-30
 
 
-@pytest.mark.quick
 def test_newton_after_the_iteration() -> None:
     """Steps whose iteration fails are those of Newton's method, in two words."""
     stiff = sc.LagrangianSystem.from_text(name="stiff", coordinates=["a", "b"], lagrangian=STIFF)

@@ -63,6 +63,7 @@ def test_order_is_preserved_across_breakpoints(pendulum, kind, exact, method):
     assert errors[1] < 1e-12 or np.log(errors[0] / errors[1]) / np.log(5.0) > method.order - 0.4
 
 
+@pytest.mark.second
 def test_sampled_controller_continues_bitwise(pendulum):
     """Between samples an input is held; the same from a saved run, and by the parameters themselves."""
     stepper = sc.compile_stepper(pendulum, sc.SVI(3))
@@ -90,6 +91,7 @@ def test_sampled_controller_continues_bitwise(pendulum):
             run.set_inputs(u=0.1)
 
 
+@pytest.mark.second
 def test_inputs_from_sympy_and_scipy():
     q, v, u = sympy.symbols("q q_dot u")
     system = sc.LagrangianSystem.from_sympy(
@@ -149,6 +151,7 @@ def test_files_contain_energies_with_the_inputs_of_their_times(pendulum, tmp_pat
     assert run.worst_step_time in run.t
 
 
+@pytest.mark.second
 def test_momentum_maps_with_inputs():
     """A push inside of a pair leaves its momentum alone."""
     pair = lagrange("pair", "x y", "x_dot**2/2 + y_dot**2 - (x - y - u)**2/2", inputs="u")
@@ -272,6 +275,7 @@ def test_inputs_survive_changes_of_coordinates_and_formulation(pendulum):
     assert_allclose(2.0 * found.q, expected.q, rtol=0, atol=1e-13)
 
 
+@pytest.mark.second
 def test_inputs_of_a_hamiltonian(pendulum):
     """Text and SymPy input, in H and in forces, equal the Lagrangian formulation."""
     data = {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], [0.0, 0.3])}

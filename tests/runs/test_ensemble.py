@@ -397,7 +397,7 @@ class TestFailures:
         assert len(set(ends)) == 1
 
 
-@pytest.mark.tiers(3, 4)
+@pytest.mark.tiers(0, 4)
 @pytest.mark.filterwarnings("ignore::scvi_codegen.common.errors.AccuracyWarning")
 @pytest.mark.parametrize(
     ("name", "method", "plan"),
@@ -437,6 +437,7 @@ def test_bits_of_trajectories_do_not_depend_on_others(
 
 
 class TestThreadsAndInterruption:
+    @pytest.mark.second
     @pytest.mark.parametrize("method", [sc.SVI(5), sc.SCVI(2)], ids=lambda method: method.name)
     def test_progress_counts_up_to_the_end(self, method: Method):
         stepper = stepper_for("kepler", method)
@@ -747,6 +748,7 @@ def test_threads_chunks_and_save_every_do_not_change_results():
     assert_allclose(full.energy()[rows], fewer.energy(), rtol=0, atol=0)
 
 
+@pytest.mark.second
 def test_files_contain_the_energies_of_each_segment(tmp_path):
     stepper = stepper_of("pushed pendulum", sc.SVI(3))
     w = np.outer(np.arange(COUNT), [0.0, 0.1])

@@ -40,6 +40,7 @@ def test_files_are_read_by_xarray(xarray, ensemble, tmp_path, name):
         assert dataset.attrs["method"] == ensemble.stepper.interface.method
 
 
+@pytest.mark.second
 def test_dataset_contains_derived_quantities(ensemble):
     dataset = ensemble.to_xarray()
     assert dataset.q.dims == ("t", "trajectory", "coordinate")

@@ -327,6 +327,7 @@ def test_growth_of_coordinates_near_a_pole_is_not_reported():
         stepper_of(SPHERICAL).integrate([2.0, 0.0], velocity=[0.0, 1e-7], t_end=50.0)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("q", "t_end"), [([2.5, -2.0], 30.0), ([2.5, -2.0], 40.0), ([2.4, -2.0], 40.0)])
 def test_reported_growth_has_the_number_of_digits_left(q, t_end):
     """Compare the number with the difference from a method of another order: three double pendulums, 5 to 9 digits."""

@@ -199,7 +199,6 @@ def test_run_ends_before_the_step_of_the_terminal_event(pendulum):
     assert run.record(400).t.tolist() == [first.t[-2], first.t[-1]]
 
 
-@pytest.mark.quick
 def test_run_from_a_crossing_does_not_repeat_it(pendulum):
     q, p, t, found = [0.5], [0.0], 0.0, []
     whole = pendulum.integrate(q, p, h=0.1, steps=400, events="q").events[0].t

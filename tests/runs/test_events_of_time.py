@@ -21,6 +21,7 @@ def times(function: str, then: dict[str, str] | None = None, **steps: Any) -> An
     return free().integrate([0.0], [0.0], events=[sc.Event(function, then=then)], check_growth=False, **steps)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("then", [KICK, None])
 @pytest.mark.parametrize("steps", [{"t_end": 500.5}, {"h": 10.0, "steps": 50}, {"h": 0.7, "steps": 715}])
 def test_every_kick_is_found(then: dict[str, str] | None, steps: dict[str, Any]) -> None:
@@ -68,6 +69,7 @@ def test_coincident_events_and_ensembles() -> None:
     assert [runs[j].p[-1, 0] for j in range(2)] == [50.0, 50.5]
 
 
+@pytest.mark.second
 def test_arrays() -> None:
     chain = sc.LagrangianSystem.from_text("chain", ["u[N]"], "sum(i in N, u_dot[i]**2/2)")
     state = {"q": {"u": [1.0, 2.0]}, "velocity": {"u": [0.0, 0.0]}}

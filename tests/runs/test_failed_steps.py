@@ -24,7 +24,7 @@ def stepper(kind: str, method: str):
     return sc.compile_stepper(system, method, solver=ARRAY[method])
 
 
-@pytest.mark.tiers(1, 4)
+@pytest.mark.tiers(0, 4)
 @pytest.mark.sampled(9)
 @pytest.mark.parametrize("sign", [1, -1], ids=["forward", "backward"])
 @pytest.mark.parametrize(

@@ -57,6 +57,7 @@ def test_velocity_with_zero_momentum_is_accepted():
     assert run.p.tolist() == [0.0, 0.0]
 
 
+@pytest.mark.second
 def test_velocities_of_nonlinear_momenta_are_found_to_round_off():
     """Newton's iteration for L_v = p, where one that ends early is seen only when it ends between two squares."""
     system = sc.LagrangianSystem.from_text(

@@ -302,6 +302,7 @@ class TestChaos:
             found.append(len(heard) > count)
         assert np.mean(found) > 0.8
 
+    @pytest.mark.second
     @pytest.mark.filterwarnings("error")
     def test_short_or_unchecked_runs_do_not_warn(self, burrau_stepper):
         burrau_stepper.integrate(*PYTHAGOREAN, t_end=70.0, check_growth=False)
@@ -312,6 +313,7 @@ class TestChaos:
         kepler_stepper.integrate([1.6, 0.0], [0.0, 0.5], t_end=600.0, check_growth=True)
         kepler_stepper.integrate([1.6, 0.0], [0.0, 0.5], t_end=600.0, tolerance=1e-9)
 
+    @pytest.mark.second
     def test_check_does_not_change_the_states(self, burrau_stepper):
         with pytest.warns(sc.AccuracyWarning):
             one = burrau_stepper.integrate(*PYTHAGOREAN, t_end=70.0)
@@ -564,6 +566,7 @@ class TestCommandLine:
         assert found["digits"] == math.floor(-math.log10(found["estimate"])) >= 9
         assert (found["requested"], found["confirmed"], found["confirmed_until"]) == (1e-9, True, saved["t"][-1])
 
+    @pytest.mark.second
     def test_unconfirmed_result_exits_with_1(self):
         assert re.search(
             r"the bound 1e-09 on the global error is confirmed only until t = [\d.]+",

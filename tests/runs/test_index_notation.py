@@ -35,6 +35,7 @@ def test_time_transformation_equals_that_of_the_entries(ring):
     np.testing.assert_allclose(run.t, same.t, rtol=0, atol=1e-14)
 
 
+@pytest.mark.second
 def test_time_transformation_by_an_index_table():
     net = sc.LagrangianSystem.from_text(
         name="net",

@@ -178,7 +178,7 @@ def test_ensemble_states_are_within_a_rounding_of_exact_sums(name: str) -> None:
             assert abs(exact(*(q * MASSES)) - begun_at - first * 64 * k * Fraction(H)) <= most_q * 1.01
 
 
-@pytest.mark.tiers(1, 1)
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("name", ["rattle", "lobatto"])
 def test_constraints_hold_for_the_sum_of_high_and_low_words(name: str) -> None:
     """A thousandth of the state as its low word: that sum, and not the high word, meets the constraint after a step."""
@@ -211,6 +211,7 @@ def test_last_step_ends_at_the_sum_of_both_words_of_time(lengths: str, sign: flo
         assert abs(run.p[-1, 0] + np.sin(passed)) < 1e-12
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("lengths", ["tolerance", "inputs"])
 def test_times_are_sums_of_all_steps(lengths: str) -> None:
     """Adaptive steps, the last of which ends at t_end, and segments between breakpoints."""
@@ -236,6 +237,7 @@ def tables(code: str) -> dict[str, list[float]]:
     return {name: [float(x) for x in re.findall(r"-?\d[\w.+-]*", text)] for name, text in found}
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("text", ["svi", "gauss", "ensemble", "array"])
 def test_coefficients_and_their_low_words_are_exact(text: str) -> None:
     """For Gauss-Legendre points, compare c, A^2, b A and b of the tableau in 50 digits."""

@@ -53,6 +53,7 @@ steps = 20
 """
 
 
+@pytest.mark.second
 def test_a_file_with_rotations_runs_as_the_system_built_in_python():
     model = parse_model(TOP)
     system = sc.LagrangianSystem.from_text(

@@ -521,6 +521,7 @@ def test_states_by_name_are_projected_and_constraints_are_reported_as_written():
         stepper.integrate(start, {"x": 0, "y": 0, "R": [1, 1, 1]}, h=0.1, steps=1)
 
 
+@pytest.mark.second
 def test_a_bound_of_the_global_error_is_confirmed_for_attitudes():
     motion = MOTIONS["heavy top"]
     stepper = sc.compile_stepper(motion.system, "svi:6", flags=QUICK_FLAGS)

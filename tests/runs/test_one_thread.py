@@ -77,6 +77,7 @@ def check_refused(run: Any) -> None:
             enter()
 
 
+@pytest.mark.second
 def test_recorded_scalar_run_belongs_to_one_thread(stepper: sc.Stepper) -> None:
     run = stepper.start([1.0], [0.0], h=0.1)
     with Holder(run, lambda wait: run.record(10, progress=lambda _: wait())):
@@ -109,6 +110,7 @@ def test_owner_thread_may_reenter_a_run(stepper: sc.Stepper) -> None:
     assert saved[-1] == run.checkpoint()
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("kind", ["scalar", "arrays"])
 def test_steps_of_racing_threads_are_all_counted(kind: str, stepper: sc.Stepper, arrays: sc.Stepper) -> None:
     """A thread either makes its steps or is refused."""

@@ -287,6 +287,7 @@ class TestReading:
         with pytest.raises(IndexError):
             pair[0].q[index]
 
+    @pytest.mark.second
     def test_columns_are_accepted_as_arrays(self, pair):
         lazy, whole = pair
         assert (lazy.q.shape, lazy.q.ndim, lazy.iterations.dtype, len(lazy.t)) == ((301, 2), 2, np.int32, 301)

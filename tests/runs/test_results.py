@@ -67,7 +67,6 @@ def test_datasets_have_vectors_with_named_axes(stepper, run):
         np.testing.assert_allclose(together[name].isel(trajectory=1), data[name], rtol=0, atol=1e-13)
 
 
-@pytest.mark.quick
 def test_spins_and_body_momenta_of_a_hamiltonian_are_named():
     pytest.importorskip("pandas")
     system = sc.HamiltonianSystem.from_text(

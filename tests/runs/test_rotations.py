@@ -37,6 +37,7 @@ def test_methods_with_as_many_points_as_degree_take_the_hamiltonian():
     assert forms == {"svi:3": True, "gauss:2": True, "scvi:3": False, "sc:3": False, "stoermer-verlet": True}
 
 
+@pytest.mark.second
 def test_the_quaternion_is_continuous_where_its_sign_is_not_that_of_the_attitude():
     run = compiled(TOP, "svi:4").integrate({"R": ATTITUDE}, velocity={"omega": OMEGA}, h=0.1, steps=400)
     q = run.quaternion()

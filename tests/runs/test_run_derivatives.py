@@ -281,6 +281,7 @@ def moved(run):
     return replace(run, q=run.q + (np.arange(61) == 30)[:, np.newaxis] * 1e-3)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("name", "call", "error", "message"), REJECTED)
 def test_arguments_of_derivatives_are_checked(name, call, error, message):
     with pytest.raises(error, match=message):

@@ -27,6 +27,7 @@ def test_display_of_a_run_and_its_saved_states(stepper):
     assert repr(many).startswith("<EnsembleTrajectory of free, svi-2-gauss-legend..; 4 states of each of 2 ")
 
 
+@pytest.mark.second
 def test_display_of_adaptive_steps(stepper):
     run = stepper.start([1.0], [0.0], t_end=2.0)
     run.advance(1)
@@ -62,6 +63,7 @@ def test_display_names_missing_inputs():
     assert repr(driven).endswith("11 states from t = 0 to 1, 10 steps, breakpoints between: 1>")
 
 
+@pytest.mark.second
 def test_display_of_array_runs():
     chain = lagrange("chain", "q[N]", "sum(i in N, q_dot[i]**2/2 - q[i]**2/2)", forces={"q[0]": "u"}, inputs="u")
     run = sc.compile_stepper(chain, "svi:2").start(np.zeros(5), h=0.1)

@@ -51,6 +51,7 @@ def test_published_jump_of_the_midpoint_rule_is_refused() -> None:
     assert stepper.integrate(q, p, h=0.05, steps=1).step_error > 0.0
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("solver", ["auto", "newton"])
 def test_unresolved_vibrations_are_no_spurious_solutions(solver: str) -> None:
     system = sc.LagrangianSystem.from_text(

@@ -62,6 +62,7 @@ def longest(t: Any) -> float:
     return float(np.abs(np.diff(t)).max())
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("method", "solver"), [("svi:4", "auto"), ("gauss:2", "auto"), ("svi:4", "newton")])
 def test_no_step_is_longer_than_the_largest(method: str, solver: str) -> None:
     run = kepler(method, solver).integrate(Q, velocity=V, **LIMITED)
@@ -71,6 +72,7 @@ def test_no_step_is_longer_than_the_largest(method: str, solver: str) -> None:
     assert longest(back.t) == LARGEST
 
 
+@pytest.mark.second
 def test_largest_step_of_arrays_ensembles_events_and_continued_runs() -> None:
     q, v = np.linspace(0.5, 1.0, 6), np.zeros(6)
     assert longest(chain().integrate({"u": q}, velocity={"u": v}, **LIMITED).t) == LARGEST
@@ -107,7 +109,7 @@ def test_absolute_tolerances_by_name_of_coordinate_array_and_rotation() -> None:
     assert values.tolist() == [0.2, *[0.1] * (stepper.dimension - 1)]
 
 
-@pytest.mark.tiers(1)
+@pytest.mark.second
 @pytest.mark.parametrize(("method", "solver"), [("svi:4", "auto"), ("svi:4", "newton")])
 def test_coordinate_that_hardly_moves_does_not_determine_the_steps(method: str, solver: str) -> None:
     text = "(x_dot**2 + y_dot**2 + z_dot**2)/2 + 1/sqrt(x**2 + y**2) - 50*z**2"
@@ -146,6 +148,7 @@ def test_records_of_step_plans(plan: Adaptive | InTau) -> None:
     assert plan_from_record(**json.loads(json.dumps(plan_to_record(plan)))) == plan
 
 
+@pytest.mark.second
 def test_model_files_and_command_line(tmp_path: Path) -> None:
     model = parse_model(MODEL)
     assert (model.max_step, model.absolute_tolerance) == (0.1, {"y": 1e-6})

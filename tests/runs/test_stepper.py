@@ -40,7 +40,7 @@ def kepler(compiled):
 # Steps and runs.
 
 
-@pytest.mark.tiers(1, 3)
+@pytest.mark.tiers(0, 3)
 @each_method
 def test_run_equals_repeated_steps(sample, compiled, method):
     stepper, (q, p) = compiled("pumped-cart-pole", method), sample("pumped-cart-pole").state
@@ -280,6 +280,7 @@ def test_absolute_tolerance_bounds_the_update(kepler):
 # Legendre transforms and energy.
 
 
+@pytest.mark.second
 def test_velocity_is_found_where_momenta_cancel(quickly_compiled):
     """p = v + 5 sin(q) in which the terms cancel, as of charges in magnetic fields."""
     system = lagrange("driven pivot", "q", "q_dot**2/2 + 5.345*sin(q)*q_dot")
@@ -367,7 +368,7 @@ def test_the_discrete_lagrangian_is_the_quadrature_along_the_oracles_curve(sampl
     assert found == pytest.approx(float(along(middle)), abs=1e-14)
 
 
-@pytest.mark.tiers(1, 2)
+@pytest.mark.tiers(0, 2)
 @each_action
 def test_two_point_form_gives_the_same_positions(sample, compiled, method):
     stepper, state = compiled("pumped-cart-pole", method), sample("pumped-cart-pole").state

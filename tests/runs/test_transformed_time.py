@@ -161,6 +161,7 @@ def test_event_functions_receive_physical_velocities() -> None:
     assert np.abs(own.events[0].t - found[0]).max() < 1e-11
 
 
+@pytest.mark.second
 def test_levi_civita_follows_an_ellipse_that_is_almost_a_line() -> None:
     """Through e = 1 - 1e-8: the oscillator is solved to round-off, and the time with it."""
     plane = sc.change_coordinates(
@@ -182,6 +183,7 @@ def test_unsupported_transformations_are_rejected() -> None:
         sc.advise(system_of("L"), sc.SVI(4), *START, span=10.0, tolerance=1e-9)
 
 
+@pytest.mark.second
 def test_nonpositive_time_transformation_is_rejected() -> None:
     oscillator = sc.LagrangianSystem.from_text(name="oscillator", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2")
     made = sc.compile_stepper(sc.reparametrise(oscillator, "q"), sc.SVI(4))

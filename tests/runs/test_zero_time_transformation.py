@@ -47,6 +47,7 @@ def test_close_encounters_do_not_stop_a_run(time_transformation):
     assert run.t[-1] == 7.0
 
 
+@pytest.mark.second
 def test_energy_is_checked_after_a_single_short_step():
     stretched = sc.compile_stepper(sc.reparametrise(KEPLER, "q1**2 + q2**2"), sc.SVI(2))
     run = stretched.integrate([1.0, 0.0], [0.0, 1.0], h=0.1, steps=5)

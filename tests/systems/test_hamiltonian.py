@@ -224,6 +224,7 @@ def vortex_rates(state: np.ndarray, strength: np.ndarray) -> np.ndarray:
     return np.concatenate([u, strength * v])
 
 
+@pytest.mark.second
 def test_point_vortices_agree_with_gauss_by_hand() -> None:
     entry = sc.problem("point-vortices")
     strength = np.array(entry.system.defaults)
