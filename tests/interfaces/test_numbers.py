@@ -1,7 +1,7 @@
 """Every number that ``run`` prints, and every field of its JSON, compared with the same run in Python.
 
 The command gets its options as flags, the model in Python as keys of the file. That the quantities of a run are right
-is tested by ``promises/test_matrix.py``. A field or a line without a check fails.
+is tested by ``tests/motions``. A field or a line without a check fails.
 """
 
 import math
