@@ -241,11 +241,14 @@ def _superiority(study: Study, curves: Sequence[ErrorCurve]) -> Comparison:
     """Return the check of conclusion (ii) where the error of SC is resolved and above round-off."""
     lost, count = [], 0
     for svi, sc in zip(curves[::2], curves[1::2], strict=True):
-        theirs, name = dict(zip(sc.x.tolist(), sc.errors.tolist(), strict=True)), "h" if svi.n else "N"
+        by_sc, name = dict(zip(sc.x.tolist(), sc.errors.tolist(), strict=True)), "h" if svi.n else "N"
         for x, error in zip(svi.x.tolist(), svi.errors.tolist(), strict=True):
-            if svi.case.judged and math.isfinite(error) and ROUNDOFF_LEVEL < theirs.get(x, 0.0) < study.resolved:
+            if not svi.case.judged or not math.isfinite(error):
+                continue
+            if ROUNDOFF_LEVEL < by_sc.get(x, 0.0) < study.resolved:
                 count += 1
-                lost += [f"{svi.what}, {svi.case.title}, {name} = {x:.2g}"] * (error >= theirs[x])
+                if error >= by_sc[x]:
+                    lost.append(f"{svi.what}, {svi.case.title}, {name} = {x:.2g}")
     return comparison(
         "SVI is more accurate than SC with the same number of points and the same step.",
         f"The error of SVI is the smaller one in {count - len(lost)} of {count} comparisons; not: "

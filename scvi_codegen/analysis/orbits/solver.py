@@ -635,7 +635,8 @@ class _OrbitSearch:
             after = (k + 1) % count
             leaving, outward = self._leaving(segment), self.reduction.outward(*np.split(starts[after], 2))
             end = segment.states[-1].copy()
-            end[: size // 2] -= self.gain * (after == 0)
+            if after == 0:
+                end[: size // 2] -= self.gain
             defects[k] = outward @ (self.reduction.aligned(end, starts[after]) - starts[after])
             rows[k, :, k * size : (k + 1) * size] = leaving @ segment.monodromy
             rows[k, :, after * size : (after + 1) * size] -= outward

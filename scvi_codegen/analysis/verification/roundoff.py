@@ -144,12 +144,13 @@ def _ensemble(tested: SystemUnderTest) -> Finding | None:
         return None
     first, worst = tested.states[0], 0.0
     scales = tested.scales(first)
-    for h, steps, unit in (
-        (first.h, COMPENSATED_STEPS, ROUNDINGS * (tested.rounding(first) + LARGE_IN_LANES**2 * scales)),
-        (first.h * SHORT, SHORT_STEPS, LOST * SHORT_STEPS * SHORT * scales),
+    large = LARGE_IN_LANES / LARGE_COMPENSATION * _large_compensation(first, scales)
+    rounding = ROUNDINGS * (tested.rounding(first) + LARGE_IN_LANES**2 * scales)
+    for h, steps, carry, unit in (
+        (first.h, COMPENSATED_STEPS, large, rounding),
+        (first.h * SHORT, SHORT_STEPS, np.zeros_like(large), LOST * SHORT_STEPS * SHORT * scales),
     ):
         state = State(first.q, first.p, first.t, h)
-        carry = LARGE_IN_LANES / LARGE_COMPENSATION * _large_compensation(state, scales) * (h == first.h)
         starts = [_perturbed(state, scales, lane) for lane in range(LANES)]
         result = _lanes(tested, starts, steps, carry)
         for start, (end, low) in zip(starts, result, strict=False):  # a block may have fewer lanes

@@ -359,7 +359,8 @@ def _draw_image(axes: Axes, motion: Trajectory) -> None:
     every = max(1, len(motion.t) // 2000)
     t, values = motion.t[::every], motion.q[::every].T
     largest = float(np.abs(values).max()) or 1.0
-    edges = np.concatenate([t[:1], (t[1:] + t[:-1]) / 2, t[-1:] + (len(t) == 1)])
+    last = t[-1:] if len(t) > 1 else t + 1
+    edges = np.concatenate([t[:1], (t[1:] + t[:-1]) / 2, last])
     rows = np.arange(len(values) + 1) + 0.5
     image = axes.pcolormesh(edges, rows, values, cmap="RdBu_r", vmin=-largest, vmax=largest, rasterized=True)
     axes.grid(visible=False)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -212,7 +212,7 @@ def shape_of_picture(system: DrawnSystem, picture: Mapping[str, Any], where: str
     """Return the shape that a user describes by formulas.
 
     Args:
-        drawn: system with the names that the formulas may use.
+        system: system with the names that the formulas may use.
         picture: ``points``, two or three formulas or numbers by name, in coordinates, momenta, entries of rotations,
             parameters and t, by ``p[k in 12]`` of ``p[0]`` to ``p[11]``, all of which ``p`` names; ``rods``,
             ``springs`` and ``walls``, lists of names of points; ``bodies`` and ``trails``, names of points, by default
@@ -236,20 +236,15 @@ def shape_of_picture(system: DrawnSystem, picture: Mapping[str, Any], where: str
     for key in picture:
         if key not in ("points", *MARKS):
             raise ModelFileError(f"{where}: unknown key {key!r}{closest(key, MARKS)} Known: points, {', '.join(MARKS)}")
-    reader, program, points = _reader(system), PointProgram(system.names), _single_points(picture["points"], where)
+    reader, program = _reader(system), PointProgram(system.names)
+    points = _single_points(picture["points"], where)
     names = [*points]
     formulas = [_components(reader, components, f"{where} points {name}") for name, components in points.items()]
     if len({*map(len, formulas)}) > 1:
         raise ModelFileError(f"{where} points must all have two components, in the plane, or all three, in space")
     state = {symbol(name) for name in system.names[: len(system.names) - len(system.parameters)]}
     moving = [name for name, point in zip(names, formulas, strict=True) if any(x.free_symbols & state for x in point)]
-    marks: list[dict[str, Any]] = []
-    for key in MARKS[:3]:
-        more = "" if key == "springs" else ", or more"
-        for ends in _listed(picture, key, where):
-            marks.append({"kind": key[:-1], "points": _numbers(ends, names, f"{where} {key}")})
-            if len(marks[-1]["points"]) < 2 or (key == "springs" and len(marks[-1]["points"]) > 2):
-                raise ModelFileError(f"{where} {key}: {ends!r} must be two points{more}")
+    marks = list(_lines_of_picture(picture, names, where))
     fixed = {k for mark in marks for k in mark["points"] if mark["kind"] == "wall"}
     free = [name for k, name in enumerate(names) if name in moving and k not in fixed]
     shown = _numbers(_listed(picture, "bodies", where, free), names, f"{where} bodies")
@@ -261,6 +256,17 @@ def shape_of_picture(system: DrawnSystem, picture: Mapping[str, Any], where: str
         dimension=len(formulas[0]), points=[program.point(point) for point in formulas], program=program.entries,
         marks=marks, trails=trails, movable=[k for k in shown if names[k] in moving],
     )  # fmt: skip
+
+
+def _lines_of_picture(picture: Mapping[str, Any], names: Sequence[str], where: str) -> Iterator[dict[str, Any]]:
+    """Yield the walls, rods and springs of a picture."""
+    for key in MARKS[:3]:
+        for ends in _listed(picture, key, where):
+            points = _numbers(ends, names, f"{where} {key}")
+            if len(points) < 2 or (key == "springs" and len(points) > 2):
+                more = "" if key == "springs" else ", or more"
+                raise ModelFileError(f"{where} {key}: {ends!r} must be two points{more}")
+            yield {"kind": key[:-1], "points": points}
 
 
 def _single_points(points: Mapping[str, Any], where: str) -> dict[str, Any]:

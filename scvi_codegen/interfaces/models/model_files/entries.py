@@ -77,7 +77,8 @@ def _robot(section: Section, folder: Path) -> Entry:
     except OSError as error:
         raise ModelFileError(f"[system] robot = '{name}' cannot be read: {error.strerror}") from error
     urdf = path.suffix.lower() == URDF
-    check_keys(section, (*ROBOT_KEYS, *URDF_KEYS * urdf), "key", f"[system] beside robot = {path.name!r}")
+    keys = (*ROBOT_KEYS, *URDF_KEYS) if urdf else ROBOT_KEYS
+    check_keys(section, keys, "key", f"[system] beside robot = {path.name!r}")
     arguments: dict[str, Any] = {key: section[key] for key in ("name", "actuated", *URDF_KEYS) if key in section}
     if not isinstance(arguments.get("floating", False), bool):
         raise ModelFileError(f"[system] floating must be true or false, not {arguments['floating']!r}")
@@ -85,6 +86,12 @@ def _robot(section: Section, folder: Path) -> Entry:
         text_of(section, "name", "[system]")
     read: Any = LagrangianSystem.from_urdf if urdf else LagrangianSystem.from_mjcf
     system = in_section("[system] robot", lambda: read(path, **arguments))
+    run = {"span": SPAN, "step": STEP}
+    return Entry(system, {"initial": _at_rest(system), "method": METHOD.specification(), "run": run})
+
+
+def _at_rest(system: LagrangianSystem) -> dict[str, dict[str, Any]]:
+    """Return the positions and velocities, by name, of a robot at rest in its reference configuration."""
     q: dict[str, Any] = {}
     rates: dict[str, Any] = {}
     for link in system.links:
@@ -99,9 +106,4 @@ def _robot(section: Section, folder: Path) -> Entry:
             rates[f"omega_{link.name}"] = [0.0, 0.0, 0.0]
         elif link.follows is None:
             q[link.name], rates[link.name] = link.zero, 0.0
-    motion = {
-        "initial": {"q": q, "q_dot": rates},
-        "method": METHOD.specification(),
-        "run": {"span": SPAN, "step": STEP},
-    }
-    return Entry(system, motion)
+    return {"q": q, "q_dot": rates}
