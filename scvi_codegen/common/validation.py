@@ -185,10 +185,7 @@ REAL = of("a number", numbers.Real)
 PATH = of("a path", str, os.PathLike)
 TABLES = ArgumentType(
     "a list of declarations, as ['bonds[B, 2]'], or a mapping from them to arrays",
-    lambda value: (
-        (_is_sequence(value) or isinstance(value, Mapping))
-        and all(isinstance(declaration, str) for declaration in value)
-    ),
+    lambda value: (_is_sequence(value) or isinstance(value, Mapping)) and all(isinstance(text, str) for text in value),
 )
 MAPPING = ArgumentType(
     "a mapping from names, as {'k': 2.0}",

@@ -106,15 +106,13 @@ class Assembly:
     def tables(self) -> dict[Array, NDArray[np.int64]]:
         """Return the tables of points by cell and by edge that the terms use, with their entries."""
         used = {place.table for access in self.accesses.values() for place in access.places}
-        tables = {}
-        for name, axis in self.axes.items():
-            if axis.table is not None and f"nodes_{name}" in used:
-                tables[Array(f"nodes_{name}", (Size(f"E{name}"), Size("", axis.table.shape[1])))] = axis.table
-        for name, axis in self.axes.items():
-            if axis.edges is not None and f"edges_{name}" in used:
-                entries = axis.edges.table
-                tables[Array(f"edges_{name}", (Size(f"F{name}"), Size("", entries.shape[1])))] = entries
-        return tables
+        tables = [(f"nodes_{x}", f"E{x}", axis.table) for x, axis in self.axes.items()]
+        tables += [(f"edges_{x}", f"F{x}", axis.edges.table) for x, axis in self.axes.items() if axis.edges]
+        return {
+            Array(name, (Size(rows), Size("", entries.shape[1]))): entries
+            for name, rows, entries in tables
+            if name in used and entries is not None
+        }
 
     def mesh(self, discretisation: Mapping[str, Any]) -> dict[str, Any]:
         """Return the attributes of the :class:`Mesh`: weights are products of those of the axes."""
@@ -171,9 +169,7 @@ class Assembly:
     def at_points(self, formula: Expr, rates: Sequence[Symbol] = ()) -> Expr:
         """Return a formula of fields, their velocities and places at a point."""
         velocities = {rate: self.entry(f"{rate.name[:-2]}{DOT}", self.sizes, [*self.here.values()]) for rate in rates}
-        fields = {
-            symbol(variable): self.at(variable, self.here) for variable in self.names_in(formula, self.system.variables)
-        }
+        fields = {symbol(u): self.at(u, self.here) for u in self.names_in(formula, self.system.variables)}
         places = {symbol(axis): self.coordinate(axis) for axis in self.names_in(formula, self.axes)}
         return formula.xreplace(velocities | fields | places)
 
@@ -332,14 +328,12 @@ class Assembly:
         """Yield the sums over cells of the axes of the derivatives, and over the points of the other axes."""
         others = [axis for axis in self.axes if axis not in key]
         for cells in itertools.product(*(self.kinds(axis, term) for axis in key)):
-            cells_along = dict(zip(key, cells, strict=True))
+            cells_of = dict(zip(key, cells, strict=True))
             loops = (*(kind.loop for kind in cells if kind.loop), *(span(f"i{axis}", f"N{axis}") for axis in others))
-            factors = [factor for axis, kind in cells_along.items() for factor in self.size(axis, kind)]
+            factors = [factor for axis, kind in cells_of.items() for factor in self.size(axis, kind)]
 
-            def in_cells(
-                part: Expr, cells_along: Mapping[str, Cells] = cells_along, factors: Any = factors
-            ) -> list[Expr]:
-                return [*factors, self.quadrature(cells_along, others, part, {})]
+            def in_cells(part: Expr, cells_of: Mapping[str, Cells] = cells_of, factors: Any = factors) -> list[Expr]:
+                return [*factors, self.quadrature(cells_of, others, part, {})]
 
             yield loops, self.weighted(term, others, in_cells)
 
@@ -364,49 +358,44 @@ class Assembly:
         return f"N{axis}" if self.axes[axis].table is None and self.axes[axis].periodic else f"E{axis}"
 
     def quadrature(
-        self, cells_along: Mapping[str, Cells], others: Sequence[str], term: Expr, node: Mapping[str, Slot]
+        self, cells_of: Mapping[str, Cells], others: Sequence[str], term: Expr, node: Mapping[str, Slot]
     ) -> Expr:
         """Return the weighted sum of a term over the quadrature points of a cell.
 
         Args:
-            cells_along: kind of cells by axis.
+            cells_of: kind of cells by axis.
             others: the other axes.
             term: of the density.
             node: index of the quadrature point along the axes that are summed already.
         """
-        if left := [axis for axis in cells_along if axis not in node]:
-            axis, cells = left[0], cells_along[left[0]]
+        if left := [axis for axis in cells_of if axis not in node]:
+            axis, cells = left[0], cells_of[left[0]]
             count = 1 if cells.edge else len(self.axes[axis].quadrature)
 
             def part(k: Slot) -> Expr:
-                return self.quadrature(cells_along, others, term, {**node, axis: k})
+                return self.quadrature(cells_of, others, term, {**node, axis: k})
 
             return total(f"a{axis}", count, part) if cells.table else Add(*map(part, range(count)))
         system = self.system
-        for axis in [axis for axis in node if cells_along[axis].edge]:
-            term = self.at_jumps(axis, cells_along[axis], term)
-        values = {
-            symbol(variable): self.combined(variable, {}, cells_along, node)
-            for variable in self.names_in(term, system.variables)
-        }
+        for axis in [axis for axis in node if cells_of[axis].edge]:
+            term = self.at_jumps(axis, cells_of[axis], term)
+        values = {symbol(u): self.combined(u, {}, cells_of, node) for u in self.names_in(term, system.variables)}
         for name in self.names_in(term, system.derivatives):
             field, orders = system.derivatives[name]
-            values[symbol(name)] = self.derivative(field, orders, cells_along, node)
+            values[symbol(name)] = self.derivative(field, orders, cells_of, node)
         weights = [
-            self.quadrature_weight(axis, cells_along[axis], k) for axis, k in node.items() if not cells_along[axis].edge
+            self.quadrature_weight(axis, cells_of[axis], k) for axis, k in node.items() if not cells_of[axis].edge
         ]
         jumps = self.system.jumps_in(term)
         inner = {
-            symbol(axis): self.in_cells(axis, cells_along[axis], node[axis], inside=True)
+            symbol(axis): self.in_cells(axis, cells_of[axis], node[axis], inside=True)
             for axis in node
-            if self.axes[axis].one_sided and not cells_along[axis].edge and any(self.names_in(f, [axis]) for f in jumps)
+            if self.axes[axis].one_sided and not cells_of[axis].edge and any(self.names_in(f, [axis]) for f in jumps)
         }
         term = term.xreplace({jump: jump.xreplace(inner) for jump in jumps}) if inner else term
         for axis in self.names_in(term, [*others, *node]):
             inside = axis in node
-            values[symbol(axis)] = (
-                self.in_cells(axis, cells_along[axis], node[axis]) if inside else self.coordinate(axis)
-            )
+            values[symbol(axis)] = self.in_cells(axis, cells_of[axis], node[axis]) if inside else self.coordinate(axis)
         return reduce(mul, [*weights, term.xreplace(values)])
 
     def at_jumps(self, axis: str, cells: Cells, term: Expr) -> Expr:
@@ -474,22 +463,22 @@ class Assembly:
         return Add(*sides)
 
     def derivative(
-        self, field: str, orders: Mapping[str, int], cells_along: Mapping[str, Cells], node: Mapping[str, Slot]
+        self, field: str, orders: Mapping[str, int], cells_of: Mapping[str, Cells], node: Mapping[str, Slot]
     ) -> Expr:
         """Return a derivative of a field at a quadrature point of a cell."""
         factor = sympy.S.One
         for axis, order in orders.items():
-            if not cells_along[axis].edge:
+            if not cells_of[axis].edge:
                 inverse = 1 / self.axes[axis].jacobians
-                factor *= self.common(f"inverse_{axis}", self.extent(axis), inverse, cells_along[axis].index) ** order
-        value = self.combined(field, orders, cells_along, node)
+                factor *= self.common(f"inverse_{axis}", self.extent(axis), inverse, cells_of[axis].index) ** order
+        value = self.combined(field, orders, cells_of, node)
         return value.scaled(factor) if isinstance(value, InnerSum) and factor.is_number else factor * value
 
     def combined(
         self,
         field: str,
         orders: Mapping[str, int],
-        cells_along: Mapping[str, Cells],
+        cells_of: Mapping[str, Cells],
         node: Mapping[str, Slot],
         slots: Mapping[str, Slot] | None = None,
     ) -> Expr:
@@ -498,18 +487,18 @@ class Assembly:
         Args:
             field: its name.
             orders: order of the derivative by axis; along others values are interpolated.
-            cells_along, node: kind of cells and index of the quadrature point by axis.
+            cells_of, node: kind of cells and index of the quadrature point by axis.
             slots: index of the point within the cell along the axes that are summed already.
         """
         slots = slots or {}
-        left = [axis for axis in cells_along if axis not in slots]
+        left = [axis for axis in cells_of if axis not in slots]
         if not left:
-            return self.in_cell(field, cells_along, slots)
+            return self.in_cell(field, cells_of, slots)
         axis = left[0]
-        cells, order = cells_along[axis], orders.get(axis, 0)
+        cells, order = cells_of[axis], orders.get(axis, 0)
 
         def inner(slot: Slot) -> Expr:
-            return self.combined(field, orders, cells_along, node, {**slots, axis: slot})
+            return self.combined(field, orders, cells_of, node, {**slots, axis: slot})
 
         def summand(slot: Slot) -> Expr:
             return self.coefficient(order, axis, (node[axis], slot), cells) * inner(slot)
@@ -521,10 +510,10 @@ class Assembly:
             return inner(node[axis])
         return total(f"b{axis}", count, summand) if cells.table else Add(*map(summand, range(count)))
 
-    def in_cell(self, field: str, cells_along: Mapping[str, Cells], slots: Mapping[str, Slot]) -> Expr:
+    def in_cell(self, field: str, cells_of: Mapping[str, Cells], slots: Mapping[str, Slot]) -> Expr:
         """Return a field at a point of a cell, or its prescribed value at an end."""
         places = {**self.here}
-        for axis, cells in cells_along.items():
+        for axis, cells in cells_of.items():
             if cells.table:
                 places[axis] = Place(index=cells.index.index, table=cells.table, column=slots[axis])
             elif isinstance(place := cells.places[slots[axis]], Place):

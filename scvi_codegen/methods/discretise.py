@@ -215,9 +215,8 @@ def _rotated(
 def _reaching(group: StageGroup, size: int) -> StageGroup:
     """Return a stage group that adds to the momentum before the turns what it adds to p1."""
     wide, order = group.widened(2), [*range(size + 1), -1, -1]
-    return replace(
-        wide, scatters=tuple(replace(scatter, table=scatter.table.columns(order)) for scatter in wide.scatters)
-    )
+    scatters = (replace(scatter, table=scatter.table.columns(order)) for scatter in wide.scatters)
+    return replace(wide, scatters=tuple(scatters))
 
 
 def check_regular(method: Method, system: MechanicalSystem) -> None:

@@ -360,9 +360,7 @@ def _refusal(form: OneForm, refused: Sequence[Sequence[int]]) -> str:
         (z[i], z[j]): form.omega(i, j) for i, j in combinations(range(len(z)), 2) if (i, j) not in form.vanishing
     }
     shown = [
-        f"omega{pair} = {format_expression(component)}"
-        for pair, component in entries.items()
-        if component.count_ops() < MOST_SHOWN
+        f"omega{pair} = {format_expression(entry)}" for pair, entry in entries.items() if entry.count_ops() < MOST_SHOWN
     ]
     sheared = shear(form)
     remedy = "Use other coordinates, such as flux coordinates of a magnetic field, or canonical ones"

@@ -88,9 +88,8 @@ def roll_sums(system: MechanicalSystem) -> RolledSums:
     arrays = {"": q, **{array.name: array for array, _ in pairs}}
     parts = [_Rolled.of(kind, f"{mark}{k}", f"b{mark}", arrays) for k, kind in enumerate((*kinds, *force_kinds))]
     used = {name for part in parts for name in part.group.formula.free_symbols}
-    numbers = with_inputs(
-        {parameter.name: value for parameter, value in defaults.items() if parameter in used}, system.inputs
-    )
+    constants = {parameter.name: value for parameter, value in defaults.items() if parameter in used}
+    numbers = with_inputs(constants, system.inputs)
     fields = {array: values for part in parts for array, values in part.fields(defaults)}
     kind = ArrayHamiltonian if system.auxiliaries else ArrayLagrangian
     rolled = kind(
@@ -202,12 +201,8 @@ def unrolled_at(system: MechanicalSystem, q: Mapping[str, Any] | Any, parameters
     state = q if isinstance(q, Mapping) else {system.coordinates[0].name: q}
     arrays_by_name = {array.name: array for array in system.arrays}
     others = dict(parameters or {})
-    declared = [
-        (arrays_by_name[name], values_by_name[name])
-        for values_by_name in (state, others)
-        for name in values_by_name
-        if name in arrays_by_name
-    ]
+    arguments = (*state.items(), *others.items())
+    declared = [(arrays_by_name[name], values) for name, values in arguments if name in arrays_by_name]
     sizes = {
         axis.name: length
         for array, values in declared

@@ -63,9 +63,7 @@ def warn_of_unused(
     parts = {input_name: {symbol(f"{input_name}_{part}") for part in PARTS} for input_name in inputs}
     kinds = [f"input '{input_name}'" for input_name, symbols in parts.items() if not symbols & used]
     occurring = reduce(set.union, parts.values(), set[Symbol]())
-    kinds += [
-        f"parameter '{parameter}'" for parameter in parameters if parameter not in used and parameter not in occurring
-    ]
+    kinds += [f"parameter '{parameter}'" for parameter in parameters if parameter not in used | occurring]
     for kind in kinds:
         where = f"the {function}, the forces and the constraints of '{name}'"
         remedy = "remove it, unless events or a time transformation, which are not known here, contain it"

@@ -132,10 +132,8 @@ def separated(expressions: Sequence[Expr], variables: Collection[Symbol]) -> tup
             return intermediate(read(node.definition))
         if not (node.is_Add or node.is_Mul):
             return node.func(*map(read, node.args))
-        constant = [argument for argument in node.args if argument.free_symbols.isdisjoint(variables)]
-        return node.func(
-            read(node.func(*constant)), *(read(argument) for argument in node.args if argument not in constant)
-        )
+        constant = [part for part in node.args if part.free_symbols.isdisjoint(variables)]
+        return node.func(read(node.func(*constant)), *(read(part) for part in node.args if part not in constant))
 
     for quantity in intermediates(*expressions):
         if not quantity.free_symbols.isdisjoint(variables):

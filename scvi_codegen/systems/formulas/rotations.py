@@ -342,10 +342,8 @@ class RotationNames:
 
     def gauge(self, inertia: Callable[[Rotation], Expr] = lambda _: S.One) -> Expr:
         """Return the energy (q . p)^2/(8 I0) of the scalings of quaternions, which is zero for q . p = 0."""
-        pairs = (
-            (tuple(map(symbol, rotation.coordinates)), momenta_of(rotation.coordinates)) for rotation in self.rotations
-        )
-        along = [dot(q, p) for q, p in pairs]
+        names = [rotation.coordinates for rotation in self.rotations]
+        along = [dot([*map(symbol, q)], momenta_of(q)) for q in names]
         return Add(*(q_p**2 / (8 * inertia(rotation)) for rotation, q_p in zip(self.rotations, along, strict=True)))
 
     def inertia(self, member: Homogeneous, reduced: Expr, parameters: Sequence[Symbol]) -> Expr:
@@ -546,10 +544,7 @@ class MemberArray:
             for array, name in zip(_all_names(self.member), _all_names(member), strict=True):
                 names.setdefault(array, {})[index] = name
         shape = tuple(axis.at(sizes) for axis in self.axes)
-        return {
-            array: np.array(list(entry_names.values()), dtype=np.str_).reshape(shape)
-            for array, entry_names in names.items()
-        }
+        return {array: np.array([*texts.values()], dtype=np.str_).reshape(shape) for array, texts in names.items()}
 
 
 def member_arrays(

@@ -33,10 +33,8 @@ def hamiltonian_of_rotations(system: LagrangianSystem) -> HamiltonianSystem | No
     if reduced is None or system.constraints or len(names.rotations) < len(names.members):
         return None
     ordinary = [q for q in system.coordinates if q.name not in names.coordinates]
-    u = (
-        *(symbol(f"{q.name}_dot") for q in ordinary),
-        *(rate for rotation in names.rotations for rate in rotation.rates),
-    )
+    rates = (rate for rotation in names.rotations for rate in rotation.rates)
+    u = (*(symbol(f"{q.name}_dot") for q in ordinary), *rates)
     inverse = _inverse_of_constant(hessian(reduced.lagrangian, u), len(u), set(system.parameters))
     if inverse is None:
         return None
