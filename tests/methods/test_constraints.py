@@ -59,21 +59,6 @@ def swung():
     return float(run.q[-1, 0]), float(run.velocity[-1, 0])
 
 
-@pytest.mark.tiers(0, 1)
-@pytest.mark.sampled(2)
-@pytest.mark.parametrize("s", [1, 2, 3, 4])
-def test_order_is_2s_and_constraints_hold_to_rounding(s, swung):
-    stepper, errors = sc.compile_stepper(rod(), lobatto(s)), []
-    for steps in (12, 24):
-        run = stepper.integrate(on_circle(1.3), [0.0, 0.0], h=1.2 / steps, steps=steps)
-        exact_p = 2.0 * 1.5 * swung[1] * np.array([np.cos(swung[0]), np.sin(swung[0])])
-        errors.append(max(np.abs(run.q[-1] - on_circle(swung[0])).max(), np.abs(run.p[-1] - exact_p).max()))
-        g, rate = run.constraint_values()
-        assert np.abs(g).max() < 2e-15
-        assert np.abs(rate).max() < 4e-14
-    assert np.log2(errors[0] / errors[1]) == pytest.approx(2 * s, abs=0.25)
-
-
 def test_degree_1_is_rattle():
     """RATTLE written down for the rod: two kicks, a drift, and multipliers that two quadratic equations give."""
     stepper, h, m, l2 = sc.compile_stepper(rod(), lobatto(1)), 0.05, 2.0, 2.25

@@ -299,13 +299,22 @@ def truth_of(problem: Problem) -> Truth:
 HIGH, LOW = 3e-8, 3e-3
 
 
-def chain(name: str, own: Mapping[str, float], masses: tuple[float, ...], b: float, force: str, **more: Any) -> Problem:
+def chain(
+    name: str,
+    own: Mapping[str, float],
+    masses: tuple[float, ...],
+    b: float,
+    force: str,
+    damping: str | None = None,
+    **more: Any,
+) -> Problem:
     """Return a chain of unlike masses, as an array and written out, with springs k x^2/2 + b x^4/4 and forces of i."""
     count = len(masses)
     parameters = {**dict.fromkeys(own, 0.1), "k": 1.0, "a": 0.2}
     parameters |= {STOP: 100.0} if STOP in force else {}
     kinetic = "+".join(f"m{i}*q{i}_dot**2/2 - (1 + a*cos(t))*q{i}**2/2" for i in range(count))
     springs = "+".join(f"k*(q{i + 1}-q{i})**2/2 + {b}*(q{i + 1}-q{i})**4/4" for i in range(count - 1))
+    damped = {} if damping is None else {"damping": damping}
     entry = re.compile(r"\b([mq])(_dot)?\[i\]")
     return Problem(
         name=name,
@@ -318,6 +327,7 @@ def chain(name: str, own: Mapping[str, float], masses: tuple[float, ...], b: flo
             "parameters": {**parameters, **{f"m{i}": 1.0 for i in range(count)}},
             "lagrangian": f"{kinetic} - ({springs})",
             "forces": {f"q{i}": entry.sub(rf"\g<1>{i}\g<2>", force) for i in range(count)},
+            **damped,
         },
         array={
             "coordinates": ["q[N]"],
@@ -325,6 +335,7 @@ def chain(name: str, own: Mapping[str, float], masses: tuple[float, ...], b: flo
             "lagrangian": f"""sum(i in N, m[i]*q_dot[i]**2/2 - (1 + a*cos(t))*q[i]**2/2)
                 - sum(i in 0..N-2, k*(q[i+1] - q[i])**2/2 + {b}*(q[i+1] - q[i])**4/4)""",
             "forces": {"q[i]": force},
+            **damped,
         },
         fields={"m": masses},
         kind="array",
@@ -560,6 +571,7 @@ AT_HOME: tuple[Problem, ...] = (
         masses=(1.3, 0.7, 2.1, 0.9),
         b=0.3,
         force=f"-c*q_dot[i]*m[i] + sin(2*t)/3 + e*sqrt({STOP} - t)",
+        damping="a*c",
         methods=(Scheme("svi:4", "fixed-point", HIGH), Scheme("gauss:9", "fixed-point", HIGH)),
     ),
     chain(

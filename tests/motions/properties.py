@@ -709,7 +709,7 @@ PROPERTIES: dict[str, tuple[Property, Callable[[Case], bool]]] = {
     "reversal": (reversal, lambda case: case.kind not in ("slowed", "reversible", "driven") and _is_symmetric(case)),
     "symplecticity": (symplecticity, lambda case: _is_free(case) and _is_symplectic(case) and not case.two_words),
     "two_words": (two_words, lambda case: case.two_words),
-    "derivatives": (derivatives, _is_free),
+    "derivatives": (derivatives, lambda case: _is_free(case) or case.kind == "slowed"),
     "hessians": (hessians, lambda case: _is_free(case) and "damping" not in case.problem.text and not case.two_words),
     "flows": (flows, lambda case: case.kind == "plain" and not case.two_words),
     "reactions": (reactions, lambda case: bool(case.problem.text.get("constraints"))),

@@ -115,21 +115,6 @@ def test_energies_in_the_memory_of_a_run_do_not_change_it(steppers) -> None:
     assert run.snapshot == other.snapshot
 
 
-@pytest.mark.tiers(1, 2)
-def test_parameters_that_change_are_those_of_the_next_step(steppers) -> None:
-    """The masses, forces and fields of a run follow its parameters, as in a run that starts there."""
-    any_size, _, (q, p), parameters = steppers
-    array = any_size.interface.coordinates[0]
-    run = any_size.start({array: q[0]}, {array: p[0]}, h=0.05)
-    run.advance(1)
-    middle = {array: run.q[array]}, {array: run.p[array]}
-    run.update(parameters=parameters)
-    run.advance(1)
-    expected = any_size.step(*middle, 0.05, t=run.t - 0.05, parameters=parameters)
-    np.testing.assert_allclose(run.q[array], expected[0][array], rtol=1e-14, atol=1e-14)
-    np.testing.assert_allclose(run.p[array], expected[1][array], rtol=1e-13, atol=1e-13)
-
-
 def test_methods_of_states_bind_the_sizes_of_their_arrays():
     """A new method of steppers whose first argument is a position needs a line in the class of run-time sizes."""
     methods = {name: method for name, method in inspect.getmembers(sc.Stepper, inspect.isfunction) if name[0] != "_"}

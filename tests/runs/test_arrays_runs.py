@@ -166,20 +166,6 @@ class TestInputs:
         assert driven.depends_on_time
 
 
-def test_parameters_affect_the_first_kick_of_an_explicit_method():
-    """Whose force is kept from the step before, which had another value of one of the parameters."""
-    spring = lagrange("spring", "q[N]", "sum(i in N, q_dot[i]**2/2 - k*q[i]**2/2 - c*q[i]**4/4)", k=1, c=1)
-    stepper = sc.compile_stepper(spring, "stoermer-verlet")
-    for name in ("k", "c"):
-        run = stepper.start([1.0, 0.5], h=0.1)
-        run.advance(3)
-        run.update(parameters={name: 5.0})
-        other = stepper.start(run.q, run.p, h=0.1, parameters={name: 5.0})
-        for each in (run, other):
-            each.advance(1)
-        assert np.abs(run.q["q"] - other.q["q"]).max() < 1e-15
-
-
 @pytest.mark.second
 def test_error_estimate_survives_a_zero_of_one_coefficient() -> None:
     """One quartic oscillator, whose highest coefficient vanishes now and then: no step changes the energy by more."""

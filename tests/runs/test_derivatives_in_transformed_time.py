@@ -208,20 +208,6 @@ def test_run_that_ends_at_a_step_ends_at_its_time():
 
 
 @pytest.mark.second
-def test_derivatives_at_an_end_time_agree_with_fixed_steps_of_time():
-    """The flow of the motion itself, to the error of both: a period later all but the phase returns."""
-    period, made = 2 * np.pi, sc.compile_stepper(sc.reparametrise(KEPLER, "distance"), sc.SVI(8), flags=QUICK_FLAGS)
-    q, p = [0.2, 0.0], [0.0, 3.0]
-    ended = made.integrate(q, p, h=0.1, t_end=period).tangent()[-1]
-    own = (
-        sc.compile_stepper(KEPLER, sc.SVI(8), flags=QUICK_FLAGS)
-        .integrate(q, p, h=period / 512, steps=512)
-        .tangent()[-1]
-    )
-    assert_allclose(ended, own, rtol=0, atol=1e-8 * np.abs(own).max())
-
-
-@pytest.mark.second
 def test_derivatives_of_a_rod_in_transformed_time():
     """With a constraint, compare with the transpose and with differences of steps."""
     rod = lagrange("rod", "x y", "(x_dot**2 + y_dot**2)/2 - g*y", g=1.0, constraints=["x**2 + y**2 - 1"])

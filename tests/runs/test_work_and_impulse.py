@@ -17,30 +17,6 @@ def thrown():
     return lagrange("thrown", "x y", "(x_dot**2 + y_dot**2)/2 + k/sqrt(x**2 + y**2)", k=1.0, c=0.05, w=0.1, forces=DRAG)
 
 
-def balance(stepper, h, span=2.0, **options):
-    run = stepper.integrate([1.0, 0.0], [0.0, 1.1], h=h, steps=round(span / h), **options)
-    energy, work = run.energy(), run.work()
-    angular = run.q[:, 0] * run.p[:, 1] - run.q[:, 1] * run.p[:, 0]
-    return np.abs(energy - energy[0] - work).max(), np.abs(angular - angular[0] - run.impulses()[:, 0]).max()
-
-
-@pytest.mark.tiers(1)
-@pytest.mark.parametrize("method", [sc.SVI(2), sc.Gauss(3), sc.StoermerVerlet()], ids=lambda method: method.name)
-def test_impulses_are_exact_and_work_is_of_the_order_of_the_method(thrown, method):
-    stepper = sc.compile_stepper(thrown, method, solver="newton")
-    assert stepper.impulse_names == ("angular momentum",)
-    coarse, fine = balance(stepper, 0.05), balance(stepper, 0.025)
-    assert max(coarse[1], fine[1]) < 2e-14
-    assert np.log2(coarse[0] / fine[0]) > method.order - 0.4
-
-
-def test_shooting_has_a_work_balance_of_the_order_of_its_curve(thrown):
-    stepper = sc.compile_stepper(thrown, sc.SCVI(2))
-    coarse, fine = balance(stepper, 0.1), balance(stepper, 0.05)
-    assert np.log2(coarse[0] / fine[0]) > 2.8
-    assert np.log2(coarse[1] / fine[1]) > 2.8
-
-
 def test_work_balance_with_dense_output_and_adaptive_steps(thrown):
     stepper = sc.compile_stepper(thrown, sc.SVI(4))
     start = ([1.0, 0.0], [0.0, 1.1])
