@@ -53,8 +53,8 @@ DEEPEST_EXPRESSION = 24
 class _Graph:
     """Hash-consed arithmetic: ``nodes[k]`` is a leaf or (operator, operand ids)."""
 
-    def __init__(self, loads: Mapping[sympy.Symbol, Load], given: Sequence[sympy.Symbol], *, paired: bool) -> None:
-        self.loads, self.given, self.paired = loads, set(given), paired
+    def __init__(self, loads: Mapping[sympy.Symbol, Load], parameters: Sequence[sympy.Symbol], *, paired: bool) -> None:
+        self.loads, self.parameters, self.paired = loads, set(parameters), paired
         self.nodes: list[Constant | Load | tuple[str, tuple[int, ...]]] = []
         self._ids: dict[Constant | Load | tuple[str, tuple[int, ...]], int] = {}
         self._read: dict[sympy.Expr, int] = {}
@@ -79,11 +79,11 @@ class _Graph:
 
     def is_constant(self, expression: sympy.Basic) -> bool:
         """Return whether no symbol occurs; unlike ``free_symbols``, every subexpression is examined once."""
-        known = self._constant.get(expression)
-        if known is None:
-            known = not expression.is_Symbol and all(map(self.is_constant, expression.args))
-            self._constant[expression] = known
-        return known
+        is_constant = self._constant.get(expression)
+        if is_constant is None:
+            is_constant = not expression.is_Symbol and all(map(self.is_constant, expression.args))
+            self._constant[expression] = is_constant
+        return is_constant
 
     def _build(self, expression: sympy.Expr) -> int:
         if isinstance(expression, sympy.Symbol):
@@ -247,7 +247,7 @@ class _Graph:
         if self.is_constant(factor):
             return (0, self.read(factor))
         if isinstance(factor, sympy.Symbol):
-            return (1 if factor in self.given else 3, self.read(factor))
+            return (1 if factor in self.parameters else 3, self.read(factor))
         return (2, self.read(factor))
 
 
@@ -273,8 +273,8 @@ def lower_kernel(
     loads |= {symbol: Load("parameters", i) for i, symbol in enumerate(parameters)}
     loads[time] = Load("t", -1)
     graph = _Graph(loads, (*parameters, *arguments[len(arguments) - constants :]), paired=paired)
-    for each in intermediates(*values, *partials):
-        graph.read(each)
+    for expression in intermediates(*values, *partials):
+        graph.read(expression)
     roots = [graph.read(expression) for expression in (*values, *partials)]
     if of_rounding:
         roots = [graph.rounding_error(root) for root in roots]

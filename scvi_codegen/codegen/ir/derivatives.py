@@ -44,7 +44,7 @@ class PointDerivatives:
         partials: derivatives at the points, each distinct value once, after ``beside`` other values; on lanes.
         products: at u = (vectors, these) the matrix times the vectors, and its transpose; the same for a symmetric
             matrix.
-        given: derivatives of forces, then momenta, with respect to parameters and time, on lanes.
+        by_inputs: derivatives of forces, then momenta, with respect to parameters and time, on lanes.
         masses: derivatives of constant masses with respect to parameters, if any.
         steps: number of steps that are solved before vectors are propagated over them.
         unknowns: (B, points) table from the displacements at the points, divided by h, or from the velocities there, to
@@ -55,7 +55,7 @@ class PointDerivatives:
     partials: Kernel
     beside: int
     products: tuple[Kernel, Kernel]
-    given: InputDerivatives
+    by_inputs: InputDerivatives
     masses: InputDerivatives | None = None
     steps: int = 32
     unknowns: NumberTable = ()
@@ -73,7 +73,7 @@ class Derivatives:
 
     Attributes:
         program: solved by Newton's method.
-        by_given: one per stage group.
+        by_inputs: one per stage group.
         curvatures: second derivatives, one per stage group, or none if only first derivatives are requested. For
             results phi of y = (u, parameters, time): at (u, multipliers mu of phi, variations dy) the derivative of the
             gradient of mu . phi along dy; ``None`` if phi is linear.
@@ -85,7 +85,7 @@ class Derivatives:
     """
 
     program: Program
-    by_given: tuple[InputDerivatives, ...]
+    by_inputs: tuple[InputDerivatives, ...]
     curvatures: tuple[Kernel | None, ...] = ()
     damping: InputDerivatives | None = None
     clock: TimeDerivatives | None = None
@@ -96,31 +96,34 @@ class Derivatives:
     @property
     def stage_groups(self) -> tuple[tuple[LoweredStageGroup, InputDerivatives, Kernel | None], ...]:
         """Stage groups with the derivatives of their kernels, and second derivatives, if requested and nonzero."""
-        curvatures = self.curvatures or (None,) * len(self.by_given)
-        return tuple(zip(self.program.equations.stage_groups, self.by_given, curvatures, strict=True))
+        curvatures = self.curvatures or (None,) * len(self.by_inputs)
+        return tuple(zip(self.program.equations.stage_groups, self.by_inputs, curvatures, strict=True))
 
     @property
     def kernels(self) -> tuple[Kernel, ...]:
         """Kernels that the program lacks."""
-        given: tuple[InputDerivatives, ...] = (*self.by_given, *(each for each in (self.damping, self.momenta) if each))
+        masses = self.iterated.masses if self.iterated else None
+        partials = (*self.by_inputs, self.damping, self.momenta, masses)
+        first = (derivatives.kernel for derivatives in partials if derivatives)
         clock = (self.clock.kernel, self.clock.level) if self.clock else ()
-        given += (self.iterated.masses,) if self.iterated and self.iterated.masses else ()
-        return tuple(each for each in (*(partials.kernel for partials in given), *self.curvatures, *clock) if each)
+        return tuple(kernel for kernel in (*first, *self.curvatures, *clock) if kernel)
 
     @property
     def lane_kernels(self) -> tuple[Kernel, ...]:
         """Kernels on lanes that its fixed-point iteration lacks."""
-        kernels = (self.iterated.partials, self.iterated.given.kernel, *self.iterated.products) if self.iterated else ()
+        kernels = (
+            (self.iterated.partials, self.iterated.by_inputs.kernel, *self.iterated.products) if self.iterated else ()
+        )
         return tuple(dict.fromkeys(kernel for kernel in kernels if kernel))
 
     @property
     def curvature(self) -> tuple[int, int]:
         """Largest numbers of arguments and of values of a kernel of second derivatives; 0 and 0 without any."""
-        kernels = [each for each in self.curvatures if each]
+        kernels = [kernel for kernel in self.curvatures if kernel]
         return max((k.arguments for k in kernels), default=0), max((k.values for k in kernels), default=0)
 
     @property
-    def given(self) -> int:
+    def inputs(self) -> int:
         """Number of inputs of a step: q0, p0, parameters, t and h."""
         return 2 * self.program.dimension + len(self.program.layout.parameters) + 2
 
@@ -139,10 +142,10 @@ class Derivatives:
             * (
                 group.derivative.arguments
                 + len(group.derivative.results)
-                + len(given.entries)
+                + len(by_inputs.entries)
                 + damped * group.derivative.values
             )
-            for group, given, _ in self.stage_groups
+            for group, by_inputs, _ in self.stage_groups
         )
 
     @property
@@ -158,14 +161,14 @@ class Derivatives:
         """Doubles besides those of a step: derivatives; vectors of inputs, of unknowns (twice), of rows and points."""
         program = self.program
         wide = (
-            self.given
+            self.inputs
             + program.equations.unknowns
             + 2 * program.equations.sites * (program.equations.blocks + 1)
             + self.at_points
         )
         wide += bool(self.damping)  # vectors of gamma h
         if self.curvatures:
-            wide += 4 * self.given + 2 * program.equations.unknowns + 3 * self.at_points
+            wide += 4 * self.inputs + 2 * program.equations.unknowns + 3 * self.at_points
         return self.partials + wide * self.lanes + self.places
 
     @property
@@ -181,5 +184,5 @@ class Derivatives:
     @property
     def places(self) -> int:
         """Largest number of arguments of all points of a stage group, if second derivatives are requested."""
-        wanted = self.program.equations.stage_groups if self.curvatures else ()
-        return max((group.points * group.derivative.arguments for group in wanted), default=0)
+        groups = self.program.equations.stage_groups if self.curvatures else ()
+        return max((group.points * group.derivative.arguments for group in groups), default=0)

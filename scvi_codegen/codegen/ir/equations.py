@@ -335,7 +335,7 @@ class FixedPointIteration:
 
     def numbers(self, name: str) -> NumberTable:
         """Return the numbers of a table, those of a vector as the only row."""
-        table = next(each for each in self.own_tables if each.name == name)
+        table = next(table for table in self.own_tables if table.name == name)
         return table.numbers if table.is_matrix else (table.numbers,)
 
     @property
@@ -346,8 +346,8 @@ class FixedPointIteration:
 
     def with_forces(self, forces: tuple[RolledKernel, ...]) -> FixedPointIteration | None:
         """Return the iteration with further forces L_q of positions; ``None`` if these also enter otherwise."""
-        added = (each.with_sums(forces) if each.name in self.forces else each for each in self.kernels)
-        return replace(self, kernels=tuple(added)) if self.forces else None
+        kernels = (kernel.with_sums(forces) if kernel.name in self.forces else kernel for kernel in self.kernels)
+        return replace(self, kernels=tuple(kernels)) if self.forces else None
 
     @property
     def error_power(self) -> int:
@@ -408,7 +408,7 @@ class Splitting:
     @property
     def kernels(self) -> tuple[Kernel, ...]:
         """Kernels of kicks and drifts."""
-        return tuple(each for each in (self.force, self.drift, self.turning, self.at_rest) if each)
+        return tuple(kernel for kernel in (self.force, self.drift, self.turning, self.at_rest) if kernel)
 
     @property
     def acts(self) -> bool:

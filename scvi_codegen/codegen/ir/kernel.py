@@ -126,13 +126,16 @@ class Kernel:
 
     def with_sums(self, sums: tuple[RolledKernel, ...]) -> Kernel:
         """Return the kernel with further loops, whose kernels are called after it."""
-        named = (replace(each, kernel=replace(each.kernel, name=f"{self.name}_{each.kernel.name}")) for each in sums)
+        names = (f"{self.name}_{rolled.kernel.name}" for rolled in sums)
+        named = (
+            replace(rolled, kernel=replace(rolled.kernel, name=name)) for rolled, name in zip(sums, names, strict=True)
+        )
         return replace(self, sums=(*self.sums, *named))
 
     @property
     def functions(self) -> tuple[Kernel, ...]:
         """The kernel and those of its loops."""
-        return (self, *(each.kernel for each in self.sums))
+        return (self, *(rolled.kernel for rolled in self.sums))
 
     @property
     def uses_time(self) -> bool:
@@ -145,17 +148,18 @@ class Kernel:
             return True
         if array == "derivative":
             return len(self.results) > self.values
-        if any(each.kernel.uses(array) for each in self.sums):
+        if any(rolled.kernel.uses(array) for rolled in self.sums):
             return True
-        return any(load.source == array for each in (*self.temporaries, *self.results) for load in loads(each))
+        expressions = (*self.temporaries, *self.results)
+        return any(load.source == array for expression in expressions for load in loads(expression))
 
     def operation_counts(self) -> dict[str, int]:
         """Return the number of operations by name, in alphabetical order."""
-        every = subexpressions(*self.temporaries, *self.results)
-        counts = Counter(each.operator for each in every if isinstance(each, Operation))
-        for each in self.sums:
-            for operator, count in (*each.kernel.operation_counts().items(), ("+", each.kernel.values)):
-                counts[operator] += count * each.rows
+        expressions = subexpressions(*self.temporaries, *self.results)
+        counts = Counter(operation.operator for operation in expressions if isinstance(operation, Operation))
+        for rolled in self.sums:
+            for operator, count in (*rolled.kernel.operation_counts().items(), ("+", rolled.kernel.values)):
+                counts[operator] += count * rolled.rows
         return dict(sorted(counts.items()))
 
     def statements(self) -> Iterator[tuple[str, int, Expression]]:
@@ -249,21 +253,15 @@ def subexpressions(*expressions: Expression) -> Iterator[Expression]:
     """Yield every expression, with its subexpressions."""
     pending = list(expressions)
     while pending:
-        each = pending.pop()
-        yield each
-        if isinstance(each, Operation):
-            pending.extend(each.operands)
+        expression = pending.pop()
+        yield expression
+        if isinstance(expression, Operation):
+            pending.extend(expression.operands)
 
 
 def loads(expression: Expression) -> Iterator[Load]:
-    """Yield the loads of an expression."""
-    pending = [expression]
-    while pending:
-        each = pending.pop()
-        if isinstance(each, Load):
-            yield each
-        elif isinstance(each, Operation):
-            pending.extend(each.operands)
+    """Return the loads of an expression."""
+    return (part for part in subexpressions(expression) if isinstance(part, Load))
 
 
 LARGEST_PART = 1000
@@ -325,12 +323,12 @@ def parts(kernel: Kernel) -> tuple[Part, ...]:
 
 def is_divided(kernels: Iterable[Kernel]) -> bool:
     """Return whether one of the kernels, or a term of its loops, is divided into several functions."""
-    return any(len(parts(each)) > 1 for kernel in kernels for each in kernel.functions)
+    return any(len(parts(function)) > 1 for kernel in kernels for function in kernel.functions)
 
 
 def _parts_of_equal_size(statements: Sequence[Statement]) -> Iterator[tuple[Statement, ...]]:
     """Yield consecutive statements with about equal numbers of operations."""
-    sizes = [sum(isinstance(x, Operation) for x in subexpressions(each)) for _, _, each in statements]
+    sizes = [sum(isinstance(x, Operation) for x in subexpressions(result)) for _, _, result in statements]
     whole = sum(sizes)
     count = max(1, -(-whole // LARGEST_PART))
     n, total, begin = 1, 0, 0

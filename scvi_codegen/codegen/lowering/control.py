@@ -230,7 +230,7 @@ def error_growth_of(system: MechanicalSystem, program: Program) -> ErrorGrowth |
         IterationTable("TANGENT_END", pad_vector(cardinal_integrals(points, (mp.one,), mp.zero)[0], lanes)),
         IterationTable("VELOCITY_RATE", pad_matrix(differentiation_matrix(points), lanes)),
     )
-    of_roundoff, of_tolerance = (_tangent_scheme(points, each, lanes) for each in which)
+    of_roundoff, of_tolerance = (_tangent_scheme(points, nodes, lanes) for nodes in which)
     return ErrorGrowth(
         partials=_with_common_roots(partials),
         product=product,
@@ -248,7 +248,7 @@ def _tangent_scheme(points: Vector, which: tuple[int, ...], lanes: int) -> Tange
         which=which,
         nodes=lower_vector(nodes),
         position=_explicit(nodes, _twice_integrated),
-        velocity=_explicit(nodes, lambda known, at: cardinal_integrals(known, at, mp.zero)),
+        velocity=_explicit(nodes, lambda before, at: cardinal_integrals(before, at, mp.zero)),
         expected=lower_vector(cardinal_values((mp.zero, *nodes[:-1]), nodes[-1:])[0]),
         end_position=lower_vector(_twice_integrated(nodes, (mp.one,))[0]),
         end_velocity=lower_vector(cardinal_integrals(nodes, (mp.one,), mp.zero)[0]),
@@ -265,7 +265,7 @@ def _separable_growth(system: LagrangianSystem) -> tuple[Kernel, Kernel, None]:
 def _coupled_growth(system: LagrangianSystem) -> tuple[Kernel, Kernel, Kernel | None] | None:
     """Return kernels of L_vv dq'' = -E_q dq - E_v dq', E(q, v, a) the Euler-Lagrange residual, unless too large."""
     forms, of = forms_of(system), (*system.coordinates, *system.velocities)
-    residual = [-each for each in forms.euler_lagrange]
+    residual = [-equation for equation in forms.euler_lagrange]
     if len(parts(*residual)) > MOST_OPERATIONS:
         return None
     entries = jacobian(residual, of) or NOTHING

@@ -37,7 +37,7 @@ def derivatives_of(
     )
     return Derivatives(
         program=program,
-        by_given=inputs,
+        by_inputs=inputs,
         curvatures=tuple(_curvature(system, group) for group in stages.stage_groups) if second else (),
         damping=_input_derivatives(system, "damping", (stages.damping,), ()) if program.damping else None,
         clock=_time_derivatives(system, stages.stage_groups[0].arguments) if system.clock else None,
@@ -138,7 +138,7 @@ def point_derivatives_of(system: MechanicalSystem, fixed_point: FixedPointIterat
     """Return the kernels for a system whose steps are solved by the iteration; ``None`` if unsupported or too large."""
     twin, make = equivalent_lagrangian(system), MAKERS.get(fixed_point.derivatives_part)
     iteration = make(twin) if twin and make else None
-    return iteration if iteration and iteration.count + len(iteration.given.entries) <= MOST_DERIVATIVES else None
+    return iteration if iteration and iteration.count + len(iteration.by_inputs.entries) <= MOST_DERIVATIVES else None
 
 
 def correction_of(system: MechanicalSystem, fixed_point: FixedPointIteration) -> PointDerivatives | None:
@@ -195,7 +195,7 @@ def _separable(system: LagrangianSystem) -> PointDerivatives:
         partials=partials,
         beside=0,
         products=products,
-        given=_at_points_by_inputs(system, forms.force, system.coordinates),
+        by_inputs=_at_points_by_inputs(system, forms.force, system.coordinates),
         masses=InputDerivatives(entries=tuple(masses), kernel=kernel) if masses else None,
     )
 
@@ -231,7 +231,7 @@ def _coupled(system: LagrangianSystem) -> PointDerivatives:
         partials=at_points,
         beside=m,
         products=_products(system, partials, different, size=2 * m),
-        given=_at_points_by_inputs(system, (*forms.force, *forms.momentum), arguments),
+        by_inputs=_at_points_by_inputs(system, (*forms.force, *forms.momentum), arguments),
     )
 
 

@@ -52,7 +52,7 @@ def rolled_terms(system: ArraySystem, constrained: ConstrainedSteps | None, *, n
         products=products,
         diagonals=diagonals,
         reach=reach_of(system.coordinates, diagonals),
-        neighbours=tuple(_list(system, each) for each in system.neighbours),
+        neighbours=tuple(_list(system, near) for near in system.neighbours),
     )
 
 
@@ -115,13 +115,14 @@ def _parts(system: ArraySystem, term: ArrayTerm) -> Iterator[tuple[ArrayTerm, in
     accesses, rest = dict(term.slots), term.formula
     coefficients = [slot for slot, access in term.slots if len(access.places) == 1 and access.places[0].minus]
     for c, (x, y) in product(coefficients, combinations(entries_of(term, system.state), 2)):
-        one, two, factor = x[1], y[1], term.formula.diff(c, x[0], x[0])
-        axes = [k for k, places in enumerate(zip(one.places, two.places, strict=False)) if places[0] != places[1]]
-        alike = one.array == two.array and not (one.sums or two.sums)
-        covered = alike and {*one.places, *two.places} == {*whole} and len(whole) == len(term.loops)
-        sizes = tuple(whole.get(place) for place in one.places)
-        if covered and len(axes) == 1 and sizes == one.array.axes and factor and not factor.free_symbols & {*accesses}:
-            part = factor * c * (x[0] - y[0]) ** 2 / 2
+        (x_i, at_i), (x_j, at_j) = x, y
+        factor = term.formula.diff(c, x_i, x_i)
+        axes = [k for k, places in enumerate(zip(at_i.places, at_j.places, strict=False)) if places[0] != places[1]]
+        alike = at_i.array == at_j.array and not (at_i.sums or at_j.sums)
+        covered = alike and {*at_i.places, *at_j.places} == {*whole} and len(whole) == len(term.loops)
+        sizes = tuple(whole.get(place) for place in at_i.places)
+        if covered and len(axes) == 1 and sizes == at_i.array.axes and factor and not factor.free_symbols & {*accesses}:
+            part = factor * c * (x_i - x_j) ** 2 / 2
             rest -= part
             yield term_of(term.loops, part, accesses), axes[0]
     if rest is term.formula:
@@ -241,7 +242,8 @@ def reach_of(arrays: Iterable[Array], term_groups: Iterable[RolledKernel]) -> in
         0 if no places are coupled, if an array is no lattice, or if a term group couples places by a table, all pairs
         or a convolution.
     """
-    if not all(array.is_lattice for array in arrays) or any(each.sums for one in term_groups for each in one.reads):
+    convolved = any(access.sums for rolled in term_groups for access in rolled.reads)
+    if convolved or not all(array.is_lattice for array in arrays):
         return 0
     pairs = [
         (target, slot)
@@ -258,6 +260,6 @@ def reach_of(arrays: Iterable[Array], term_groups: Iterable[RolledKernel]) -> in
     return max(_distance(*pair) for pair in pairs) if distant else 0
 
 
-def _distance(one: Access, other: Access) -> int:
-    pairs = zip(one.places, other.places, strict=False)
+def _distance(target: Access, slot: Access) -> int:
+    pairs = zip(target.places, slot.places, strict=False)
     return max((abs(a.base.number - b.base.number) for a, b in pairs if a.index), default=0)

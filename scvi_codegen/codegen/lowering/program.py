@@ -92,14 +92,14 @@ def iteration_of(
 
 
 def check_solver(
-    solver: str, method: Method, names: Sequence[str], *, found: FixedPointIteration | Splitting | None
+    solver: str, method: Method, names: Sequence[str], *, iteration: FixedPointIteration | Splitting | None
 ) -> None:
     """Raise :class:`MethodError` for an unknown solver, or one that this method and system do not have."""
     if solver not in names:
         raise MethodError(f"unknown solver {solver!r}: use one of {', '.join(names)}")
-    if solver == "explicit" and found is None:
+    if solver == "explicit" and iteration is None:
         raise MethodError(f"{method.name} is not explicit for this system: use solver='auto'")
-    if solver == "fixed-point" and found is None:
+    if solver == "fixed-point" and iteration is None:
         raise MethodError(
             f"{method.name} has no fixed-point iteration for this system: use solver='auto' or 'newton', "
             "or at most 32 points (an SVI: at least as many as its degree; a variational SCVI: at most 8 coordinates)"
@@ -111,7 +111,7 @@ def splitting_of(system: MechanicalSystem, method: Method) -> Splitting | None:
     if not method.fractions or system.constraints or isinstance(split := kinetic_splitting(system), str):
         return None
     moved, (kicks, drifts) = split.system, kicks_and_drifts(method, split)
-    turned = any(not each.is_diagonal() for each in split.axes)
+    turned = any(not axes.is_diagonal() for axes in split.axes)
     turning = system_kernel(moved, "turning", sum(split.rates, ()), u=(), purpose="a_i, a_j - a_i, a_k - a_i.")
     if split.velocity:
         drift = system_kernel(moved, "drift_velocity", split.velocity, u=moved.auxiliaries, purpose="H_p at u = p.")
@@ -126,7 +126,7 @@ def splitting_of(system: MechanicalSystem, method: Method) -> Splitting | None:
         by_masses=not split.velocity,
         bodies=tuple((first, *axes) for first, _, *axes in split.bodies),
         turning=turning if split.bodies else None,
-        principal=lower_matrix(tuple(tuple(map(mp.mpf, map(str, each))) for each in split.axes if turned)),
+        principal=lower_matrix(tuple(tuple(map(mp.mpf, map(str, axes))) for axes in split.axes if turned)),
     )
 
 
@@ -171,7 +171,7 @@ def lower(
     splitting = splitting_of(system, method) if explicit and not system.integrands else None
     iterated = lanes and solver in ("auto", "fixed-point") and splitting is None
     fixed_point = iteration_of(system, stages) if iterated else None
-    check_solver(solver, method, SOLVERS, found=splitting if solver == "explicit" else fixed_point)
+    check_solver(solver, method, SOLVERS, iteration=splitting if solver == "explicit" else fixed_point)
     alone = fixed_point is not None and not fallback and not system.integrands
     newton = solver in ("auto", "newton") and splitting is None and not alone
     polynomial = method.exactness.curve != 0
@@ -203,12 +203,12 @@ def lower_arrays(system: ArraySystem, method: Method, *, prefix: str, solver: st
     Their masses are constant, so that the tables of a method are the same for every coordinate: those of a system of
     one coordinate serve all. Arguments and errors are those of :func:`lower`.
     """
-    one = one_coordinate(system)
-    stages, velocities = discretise(one, method), bool(system.velocities)
+    of_tables = one_coordinate(system)
+    stages, velocities = discretise(of_tables, method), bool(system.velocities)
     constrained = constrained_steps(system, stages, method)
-    splitting = None if constrained else splitting_of(one, method)
+    splitting = None if constrained else splitting_of(of_tables, method)
     iterated = constrained is None and splitting is None
-    fixed_point = iteration_of(one, stages, velocities=velocities) if iterated else None
+    fixed_point = iteration_of(of_tables, stages, velocities=velocities) if iterated else None
     if fixed_point:
         fixed_point = replace(fixed_point, constant_mass=None)  # each coordinate has its own
     loops = rolled_terms(system, constrained, newton=solver == "newton")
@@ -216,7 +216,7 @@ def lower_arrays(system: ArraySystem, method: Method, *, prefix: str, solver: st
         loops = replace(loops, shifts=shift_tables(fixed_point.matrix, fixed_point.lanes))
     check_solver_of_arrays(system, method, solver, splitting or constrained or fixed_point, loops)
     arrays = ("coordinates", "momenta", "velocities", "sums", "fields", "tables", "sizes")
-    geometry = "not symplectic" if system.applied_forces else _geometry(method, one)
+    geometry = "not symplectic" if system.applied_forces else _geometry(method, of_tables)
     return ArrayProgram(
         **_heading(system, method, stages, prefix, geometry=geometry),
         layout=Layout(**{kind: getattr(system, kind) for kind in arrays}, **_numbers_of(system)),
@@ -249,7 +249,7 @@ def _geometry(method: Method, system: MechanicalSystem) -> str:
 
 def _numbers_of(system: MechanicalSystem) -> dict[str, Any]:
     """Return names and default values of the parameters that are numbers."""
-    return {"parameters": tuple(each.name for each in system.parameters), "defaults": system.defaults}
+    return {"parameters": tuple(parameter.name for parameter in system.parameters), "defaults": system.defaults}
 
 
 def _ranges_of(arrays: Iterable[Array], system: MechanicalSystem) -> Iterator[tuple[int, int]]:
@@ -319,11 +319,11 @@ def _quantities(
         mass_entries=tuple(forms.legendre_jacobian),
         energy=system_kernel(system, name, (system.formula,), u=forms.legendre_arguments, purpose=purpose),
         hamiltonian=bool(system.auxiliaries),
-        momentum_maps=tuple(_momentum_map(each, method) for each in symmetries),
+        momentum_maps=tuple(_momentum_map(symmetry, method) for symmetry in symmetries),
         momentum_kernel=_momentum_kernel(system, symmetries),
         first_order_rates=_rates_of_first_order(system),
         integrals=_integrals(system, method, stages),
-        work_and_impulses=tuple(each.name for each in work_rates(system)) if integrates else (),
+        work_and_impulses=tuple(rate.name for rate in work_rates(system)) if integrates else (),
         integrates=integrates,
     )
 
@@ -336,8 +336,8 @@ def _momentum_map(symmetry: Symmetry, method: Method) -> MomentumMap:
 def _numbers(system: MechanicalSystem, method: Method, count: int) -> tuple[str, str, str]:
     """Return the paper's equation numbers of the last ``count`` rows, of q1 and of p1."""
     paper = method.paper_form(system)
-    known = dict.fromkeys(row.number for row in paper.rows[-count:] if row.number[:1].isdigit())
-    rows = ", ".join(f"({number})" for number in known)
+    numbers = dict.fromkeys(row.number for row in paper.rows[-count:] if row.number[:1].isdigit())
+    rows = ", ".join(f"({number})" for number in numbers)
     q1, p1 = (f"({number})" if number[:1].isdigit() else "" for number in paper.end_numbers)
     return rows, q1, p1
 

@@ -282,7 +282,7 @@ def _integrand(system: MechanicalSystem, group: StageGroup, u: str) -> Kernel | 
     """Return the kernel that is summed along the curve: work and impulses of forces, then the action."""
     assert group.scalar is not None
     if rates_of_forces := work_rates(system):
-        rates = [*(each.rate for each in rates_of_forces), group.scalar]
+        rates = [*(work.rate for work in rates_of_forces), group.scalar]
         purpose = f"Power and impulse rates of the forces, and L, at {u}."
         return system_kernel(system, "exchanges", rates, u=group.arguments, purpose=purpose)
     name = "lagrangian" if group.name == "quadrature" else f"{group.name}_action"

@@ -60,19 +60,21 @@ def unrolled_fields(
 
 def _is_field(system: ArraySystem, array: Array) -> bool:
     """Return whether a term couples neighbouring elements of an array."""
-    accesses = [[access for _, access in term.slots] for term in system.terms]
-    return any(
-        couples_elements(array, each, [access for access in each if access.array not in system.positions])
-        for each in accesses
-    )
+    for term in system.terms:
+        accesses = [access for _, access in term.slots]
+        if couples_elements(array, accesses, [access for access in accesses if access.array not in system.positions]):
+            return True
+    return False
 
 
 def formula_at_sizes(
     system: ArraySystem, text: str, sizes: Mapping[str, int], tables: Mapping[str, ArrayLike] | None
 ) -> Expr:
     """Return a formula of coordinates, momenta, parameters and time in index notation as one of their entries."""
-    arrays = (*system.state, *system.fields, *(array for each in system.rotations for array in each.formulas))
-    symbols = {each.name: each for each in (*system.parameters, system.time, *map(symbol, system.inputs))}
+    of_rotations = (array for rotation in system.rotations for array in rotation.formulas)
+    arrays = (*system.state, *system.fields, *of_rotations)
+    variables = (*system.parameters, system.time, *map(symbol, system.inputs))
+    symbols = {variable.name: variable for variable in variables}
     return formula_of_entries(text, arrays, symbols, system.tables, _rules(system, sizes, tables))
 
 
@@ -83,23 +85,24 @@ def _rules(system: ArraySystem, sizes: Mapping[str, int], tables: Mapping[str, A
     columns = {name: array[:, None] if array.ndim == 1 else array for name, array in arrays.items()}
     rows = {table.axes[0].name: len(columns[table.name]) for table in system.tables if table.name in columns}
     sizes = {**rows, **sizes}
-    for known, named, kind in (
+    for declared, values, kind in (
         (system.sizes, sizes, "size"),
         ([table.name for table in system.tables], columns, "table"),
     ):
-        if set(known) != set(named):
+        if set(declared) != set(values):
             raise SystemDefinitionError(
-                f"the {kind}s of '{system.name}' are {', '.join(known) or 'none'}: give exactly these"
+                f"the {kind}s of '{system.name}' are {', '.join(declared) or 'none'}: give exactly these"
             )
     names = {array.name: entry_names(array, sizes) for array in (*system.state, *system.fields)}
-    for turning in system.rotations:
-        names |= turning.names(sizes)
+    for rotation in system.rotations:
+        names |= rotation.names(sizes)
     return EntryRules(sizes, columns, names)
 
 
 def _formulas(system: ArraySystem, written: EntryRules, constants: Sequence[Symbol]) -> dict[str, Any]:
     """Return the coordinates and momenta, and the fields that are formulas of them."""
-    turning = RotationNames([member for each in system.rotations for _, member in each.entries(written.sizes)])
+    members = (member for rotation in system.rotations for _, member in rotation.entries(written.sizes))
+    turning = RotationNames([*members])
     coordinates, momenta = (
         tuple(symbol(str(name)) for array in arrays for name in written.names[array.name].flat)
         for arrays in (system.coordinates, system.momenta)
@@ -111,9 +114,8 @@ def _formulas(system: ArraySystem, written: EntryRules, constants: Sequence[Symb
     )
     total = {q: Add(*formulas) for q, formulas in written.forces(system.forces).items()}
     forces = _forces_by_name(turning, total)
-    fields = turning.fields(
-        system.function.lower(), Add(*summands), forces, constraints, [each.name for each in coordinates], constants
-    )
+    names = [coordinate.name for coordinate in coordinates]
+    fields = turning.fields(system.function.lower(), Add(*summands), forces, constraints, names, constants)
     if system.function == "Hamiltonian":
         fields["momenta"] = (*momenta, *momenta_of(turning.coordinates))
     return {"coordinates": coordinates, **fields}
@@ -124,7 +126,7 @@ def _forces_by_name(turning: RotationNames, total: dict[Symbol, Expr]) -> Forces
     total, by_name = dict(total), list[tuple[str, tuple[Expr, ...]]]()
     for member in turning.members:
         body, space = (
-            Matrix([total.pop(each, S.Zero) for each in torque_symbols(member, in_space=in_space)])
+            Matrix([total.pop(component, S.Zero) for component in torque_symbols(member, in_space=in_space)])
             for in_space in (False, True)
         )
         if space != space * 0:

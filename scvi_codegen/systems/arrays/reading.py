@@ -1,11 +1,10 @@
 """Systems of arrays read from text or from SymPy expressions."""
 
-from collections.abc import Mapping
-from itertools import chain
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
-from sympy import Expr
+from sympy import Expr, Symbol
 
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.systems.arrays.system import (
@@ -19,12 +18,12 @@ from scvi_codegen.systems.arrays.system import (
 )
 from scvi_codegen.systems.constraints import constraint_sides
 from scvi_codegen.systems.forces import damping_rate
-from scvi_codegen.systems.formulas.array_statements import array_text, parse_constraint, parse_force
+from scvi_codegen.systems.formulas.array_statements import ArrayForce, array_text, parse_constraint, parse_force
 from scvi_codegen.systems.formulas.arrays import parse_array, parse_coordinate, parse_sums
 from scvi_codegen.systems.formulas.grammar import parse_expression
 from scvi_codegen.systems.formulas.indices import Array
 from scvi_codegen.systems.formulas.neighbours import parse_neighbours
-from scvi_codegen.systems.formulas.rotations import member_arrays, torque_components
+from scvi_codegen.systems.formulas.rotations import MemberArray, member_arrays, torque_components
 from scvi_codegen.systems.formulas.symbols import DOT, TIME, input_formulas, number, symbol, with_inputs
 
 LISTED = ("coordinates", "directions", "spins", "momenta", "constraints", "inputs", "tables", "point_forces")
@@ -34,6 +33,14 @@ DEFINING = (
     *("damping", "constraints", "inputs", "tables", "neighbours", "forces", "torques", "torques_space", "point_forces"),
 )
 """Arguments that define a system, in the order of model files."""
+
+
+class Names(NamedTuple):
+    """Arrays, single symbols by name and index tables that formulas of a system may contain."""
+
+    arrays: tuple[Array, ...]
+    symbols: dict[str, Symbol]
+    tables: tuple[Array, ...]
 
 
 def definition_of(arguments: Mapping[str, Any]) -> dict[str, Any]:
@@ -52,72 +59,83 @@ def arrays_from_text(arguments: Mapping[str, Any]) -> ArraySystem:
     """
     lagrangian, hamiltonian = arguments.get("lagrangian"), arguments.get("hamiltonian")
     inputs, parameters, tables = (arguments.get(key) or () for key in ("inputs", "parameters", "tables"))
-    arrays = tuple(map(parse_coordinate, arguments["coordinates"]))
-    conjugate = momenta_of(arrays, arguments.get("momenta"), lagrangian, hamiltonian)
-    index_tables = tuple(map(table_of, tables))
-    entries = dict(parameters)
-    data = {key: value for key, value in entries.items() if "[" in key and np.ndim(value)}
-    numbers = {key: 1.0 if key in data else number(key, value) for key, value in entries.items()}
+    coordinates = tuple(map(parse_coordinate, arguments["coordinates"]))
+    momenta = momenta_of(coordinates, arguments.get("momenta"), lagrangian, hamiltonian)
+    velocities = () if momenta else tuple(Array(array.name + DOT, array.axes) for array in coordinates)
+    shapes = (arguments.get(key) for key in ("rotations", "directions", "spins"))
+    rotations = member_arrays(*shapes, momentum=hamiltonian is not None)
+    data, numbers = _values(dict(parameters))
     data |= tables if isinstance(tables, Mapping) else {}
     values = with_inputs(numbers, inputs)
     fields = {key: parse_array(key) for key in values if "[" in key}
     scalars = {key: value for key, value in values.items() if key not in fields}
-    velocities = () if conjugate else tuple(Array(array.name + DOT, array.axes) for array in arrays)
-    text = str(lagrangian if hamiltonian is None else hamiltonian)
-    known = {key: symbol(key) for key in (*scalars, *inputs, TIME)}
-    driven = input_formulas(inputs, symbol(TIME))
-    lists = parse_neighbours(arguments.get("neighbours") or {}, arrays, {key: known[key] for key in scalars})
-    turning = member_arrays(
-        *(arguments.get(key) for key in ("rotations", "directions", "spins")), momentum=hamiltonian is not None
+    names = Names(
+        arrays=(
+            *(*coordinates, *momenta, *velocities, *fields.values()),
+            *(array for rotation in rotations for array in rotation.formulas),
+        ),
+        symbols={key: symbol(key) for key in (*scalars, *inputs, TIME)},
+        tables=tuple(map(table_of, tables)),
     )
-    turned = [array for each in turning for array in each.formulas]
-    everything = (*arrays, *conjugate, *velocities, *fields.values(), *turned)
-    forces = arguments.get("forces") or {}
-    targets = [(*pair, arrays) for pair in forces.items() if isinstance(pair[1], str)]
-    vectors = {target: force for target, force in forces.items() if not isinstance(force, str)}
-    torques, torques_space = (arguments.get(key) or {} for key in ("torques", "torques_space"))
-    for by_name, in_space in (({**vectors, **torques}, False), (torques_space, True)):
-        for target, torque in by_name.items():
-            targets += torque_components(turning, target, torque, in_space=in_space)
-    applied = [parse_force(target, force, on, (*everything, *on), known, index_tables) for target, force, on in targets]
+    lengths = {key: names.symbols[key] for key in scalars}
+    neighbours = parse_neighbours(arguments.get("neighbours") or {}, coordinates, lengths)
+    forces = [*_forces(arguments, coordinates, rotations, names)]
     if (dissipation := arguments.get("dissipation")) is not None:
-        moving = dict(zip(velocities, arrays, strict=False))
-        for each in turning:
-            moving |= zip(each.rates, each.torques(), strict=False)
-        applied.append(friction(parse_sums(dissipation, everything, known, index_tables, lists), moving))
+        rates = dict(zip(velocities, coordinates, strict=False))
+        for rotation in rotations:
+            rates |= zip(rotation.rates, rotation.torques(), strict=False)
+        forces += friction(parse_sums(dissipation, *names, neighbours), rates)
+    terms = parse_sums(str(lagrangian if hamiltonian is None else hamiltonian), *names, neighbours)
+    of_inputs = input_formulas(inputs, names.symbols[TIME])
+    constant_or_moving = dict.fromkeys(fields.values()) | dict(zip(coordinates, velocities, strict=False))
+    constraints = [
+        parse_constraint(constraint, *names, split=constraint_sides, velocities=constant_or_moving)
+        for constraint in arguments.get("constraints") or ()
+    ]
     kind = ArrayLagrangian if hamiltonian is None else ArrayHamiltonian
     system = kind(
         name=arguments["name"],
-        coordinates=arrays,
-        momenta=conjugate,
-        time=symbol(TIME),
-        parameters=tuple(known[key] for key in scalars),
+        coordinates=coordinates,
+        momenta=momenta,
+        time=names.symbols[TIME],
+        parameters=tuple(names.symbols[key] for key in scalars),
         defaults=tuple(scalars.values()),
         fields=tuple(fields.values()),
         field_defaults=tuple(values[key] for key in fields),
-        tables=index_tables,
-        neighbours=lists,
-        terms=tuple(substituted(term, driven) for term in parse_sums(text, everything, known, index_tables, lists)),
-        forces=tuple(substituted(force, driven) for force in chain(*applied)),
+        tables=names.tables,
+        neighbours=neighbours,
+        terms=tuple(substituted(term, of_inputs) for term in terms),
+        forces=tuple(substituted(force, of_inputs) for force in forces),
         inputs=tuple(inputs),
-        constraints=tuple(
-            parse_constraint(
-                each,
-                everything,
-                known,
-                index_tables,
-                split=constraint_sides,
-                velocities={**dict.fromkeys(fields.values()), **dict(zip(arrays, velocities, strict=False))},
-            )
-            for each in arguments.get("constraints") or ()
-        ),
-        damping=damping_rate(arguments.get("damping"), lambda formula: parse_expression(str(formula), known)),
-        rotations=turning,
+        constraints=tuple(constraints),
+        damping=damping_rate(arguments.get("damping"), lambda formula: parse_expression(str(formula), names.symbols)),
+        rotations=rotations,
         definition=definition_of(arguments),
         data={parse_array(key).name: value for key, value in data.items()},
     )
     system.warn_of_mistakes()
     return system
+
+
+def _values(parameters: dict[str, Any]) -> tuple[dict[str, Any], dict[str, float]]:
+    """Return the arrays of values of fields, by name, and the numbers that are defaults, 1 for these."""
+    data = {key: value for key, value in parameters.items() if "[" in key and np.ndim(value)}
+    return data, {key: 1.0 if key in data else number(key, value) for key, value in parameters.items()}
+
+
+def _forces(
+    arguments: Mapping[str, Any], coordinates: tuple[Array, ...], rotations: Sequence[MemberArray], names: Names
+) -> Iterator[ArrayForce]:
+    """Yield generalised forces on coordinates, and torques on rotations with the forces that are vectors."""
+    forces = arguments.get("forces") or {}
+    components = [(target, force, coordinates) for target, force in forces.items() if isinstance(force, str)]
+    vectors = {target: force for target, force in forces.items() if not isinstance(force, str)}
+    torques, torques_in_space = (arguments.get(key) or {} for key in ("torques", "torques_space"))
+    for torque_of, in_space in (({**vectors, **torques}, False), (torques_in_space, True)):
+        for target, torque in torque_of.items():
+            components += torque_components(rotations, target, torque, in_space=in_space)
+    for target, force, arrays in components:
+        yield from parse_force(target, force, arrays, (*names.arrays, *arrays), names.symbols, names.tables)
 
 
 def arrays_from_sympy(lagrangian: Any, **arguments: Any) -> ArraySystem:

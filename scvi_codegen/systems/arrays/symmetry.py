@@ -29,7 +29,7 @@ def momentum_maps(system: ArraySystem) -> tuple[ArrayMap, ...]:
         return ()  # nonholonomic
     if system.coupled_terms and system.damping != 0:
         return ()
-    return tuple(each for array in system.coordinates for each in _maps(system, array))
+    return tuple(momentum_map for array in system.coordinates for momentum_map in _maps(system, array))
 
 
 def _forces(system: ArraySystem) -> Iterator[ArrayForce]:
@@ -44,13 +44,13 @@ def _maps(system: ArraySystem, array: Array) -> Iterator[ArrayMap]:
     last, forces = array.axes[-1] if array.axes else Size("", 0), list(_forces(system))
     components: Sequence[int | None] = range(last.number) if array.axes and not last.name else [None]
     for component in components:
-        if all(sums_to_zero(_shift(each, array, component)) for each in forces):
+        if all(sums_to_zero(_shift(force, array, component)) for force in forces):
             yield ArrayMap(array.name, component)
-    if system.momenta and all(sums_to_zero(_phase(system, each, array)) for each in forces):
+    if system.momenta and all(sums_to_zero(_phase(system, force, array)) for force in forces):
         yield ArrayMap(array.name, None, phase=True)
     if not last.name and last.number <= MAX_ROTATED_COMPONENTS:
         for a, b in combinations(range(last.number), 2):
-            turned = all(sums_to_zero(_turn(system, each, array, (a, b))) for each in forces)
+            turned = all(sums_to_zero(_turn(system, force, array, (a, b))) for force in forces)
             if turned and _same_masses(system, array, a, b):
                 yield ArrayMap(array.name, a, b)
 
@@ -70,8 +70,8 @@ def _shift(force: ArrayForce, array: Array, component: int | None) -> list[Expr]
 def _turn(system: ArraySystem, force: ArrayForce, array: Array, plane: tuple[int, int]) -> list[Expr]:
     """Return the terms of sum x_a dl/dx_b - x_b dl/dx_a, for the array and its momenta."""
     (a, b), arrays = plane, [array, *_conjugate(system, array)]
-    one, two = Place(base=Size("", a)), Place(base=Size("", b))
-    pairs = [((x, to), (x, by), sign) for x in arrays for to, by, sign in ((two, one, 1), (one, two, -1))]
+    at_a, at_b = Place(base=Size("", a)), Place(base=Size("", b))
+    pairs = [((x, to), (x, by), sign) for x in arrays for to, by, sign in ((at_b, at_a, 1), (at_a, at_b, -1))]
     return _rotated_terms(force, pairs)
 
 

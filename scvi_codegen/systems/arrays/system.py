@@ -97,12 +97,12 @@ def friction_of(mass: ArrayForce, rate: Expr) -> ArrayForce:
 
 def masses_of(term: ArrayTerm, velocities: Mapping[str, Array]) -> tuple[ArrayForce, ...]:
     """Return the mass contributions of a term, one per velocity."""
-    known, masses, symbols = dict(term.slots), [], velocity_symbols(term, velocities)
+    accesses, masses, symbols = dict(term.slots), [], velocity_symbols(term, velocities)
     for v, derivative in zip(symbols, gradient_tuple(term.formula, symbols), strict=True):
-        mass = derivative.diff(v)
+        mass = derivative.diff(v)  # d^2 L / dv^2
         free = mass.free_symbols
         slots = tuple(pair for pair in term.slots if pair[0] in free)
-        access = replace(known[v], array=velocities[known[v].array.name])
+        access = replace(accesses[v], array=velocities[accesses[v].array.name])
         masses.append(ArrayForce(loops=term.loops, slots=slots, targets=((access, mass),)))
     return tuple(masses)
 
@@ -117,8 +117,8 @@ def has_constant_mass(term: ArrayTerm, coordinates: tuple[Array, ...], time: Sym
     """Return whether velocities occur as m v**2/2 with a constant m."""
     velocities = {array.name + DOT: array for array in coordinates}
     varies = {slot for slot, access in term.slots if access.array.name in velocities or access.array in coordinates}
-    slots, known = velocity_symbols(term, velocities), dict(term.slots)
-    if any(known[v].sums for v in slots):
+    slots, accesses = velocity_symbols(term, velocities), dict(term.slots)
+    if any(accesses[v].sums for v in slots):
         return False
     for v, derivative in zip(slots, gradient_tuple(term.formula, slots), strict=True):
         mass = derivative.diff(v)
@@ -184,7 +184,7 @@ def check_constraint(term: ArrayTerm, coordinates: Sequence[Array], fields: Sequ
             f"the constraint '{shown}' contains no coordinate: remove it, or write the condition in terms "
             "of the coordinates"
         )
-    if inputs and any(re.fullmatch(inputs, each.name) for each in term.formula.free_symbols):
+    if inputs and any(re.fullmatch(inputs, variable.name) for variable in term.formula.free_symbols):
         raise SystemDefinitionError(
             f"the constraint '{shown}' depends on an input, which may be discontinuous: use a "
             "parameter or a formula in t instead"
@@ -350,7 +350,7 @@ class ArraySystem(OfRunTimeSizes, MechanicalSystem):
             if self.damping != 0 and self.momenta:
                 raise SizesRequiredError("damping of a Hamiltonian requires known sizes: write it as forces")
             moving = (*self.state, *self.velocities)
-            if still := [each for each, _ in self.accesses if each.sums and each.array not in moving]:
+            if still := [access for access, _ in self.accesses if access.sums and access.array not in moving]:
                 raise SizesRequiredError(
                     f"'{still[0]}' is a convolution of parameters, not of coordinates or momenta: declare its values "
                     "as an array of parameters"
@@ -396,7 +396,7 @@ class ArraySystem(OfRunTimeSizes, MechanicalSystem):
     @property
     def positions(self) -> tuple[Array, ...]:
         """Coordinates, and homogeneous coordinates of rotations, directions and spins."""
-        return (*self.coordinates, *(each.array for each in self.rotations))
+        return (*self.coordinates, *(rotation.array for rotation in self.rotations))
 
     @property
     def state(self) -> tuple[Array, ...]:
@@ -444,8 +444,8 @@ class ArraySystem(OfRunTimeSizes, MechanicalSystem):
             return ()
         terms = [(term.loops, [term.formula]) for term in (*self.terms, *self.constraints)]
         forces = [(force.loops, [formula for _, formula in force.targets]) for force in self.applied_forces]
-        found = {f"{zero}{loops_text(loops)}" for loops, formulas in (*terms, *forces) for zero in kinks_of(formulas)}
-        return tuple(sorted(found))
+        zeros = ((zero, loops) for loops, formulas in (*terms, *forces) for zero in kinks_of(formulas))
+        return tuple(sorted({f"{zero}{loops_text(loops)}" for zero, loops in zeros}))
 
     @property
     def is_first_order(self) -> bool:
@@ -546,7 +546,7 @@ class ArraySystem(OfRunTimeSizes, MechanicalSystem):
         formulas.append(self.damping)
         used = {symbol(access.array.name) for access, _ in self.accesses}.union(
             *(f.free_symbols for f in formulas),
-            (symbol(each.coefficients.name) for sums in self.sums for each in sums),
+            (symbol(convolution.coefficients.name) for sums in self.sums for convolution in sums),
             others,
         )
         scalars = {symbol(array.name): value for array, value in zip(self.fields, self.field_defaults, strict=True)}
@@ -563,11 +563,13 @@ class ArraySystem(OfRunTimeSizes, MechanicalSystem):
                 warn_of_negative(self.name, second, values)
 
     def _check_names(self) -> None:
-        check_names(*([each.name for each in group] for group in (self.positions, self.parameters, self.momenta)))
-        known = [each.name for each in (*self.arrays, *self.parameters, *self.neighbours)]
-        known += [array.name for each in self.rotations for array in each.formulas if array.name != each.member.name]
-        for name in known:
-            if known.count(name) > 1 or name in self.sizes:
+        variables = self.positions, self.parameters, self.momenta
+        check_names(*([variable.name for variable in kind] for kind in variables))
+        names = [declared.name for declared in (*self.arrays, *self.parameters, *self.neighbours)]
+        for rotation in self.rotations:
+            names += [array.name for array in rotation.formulas if array.name != rotation.member.name]
+        for name in names:
+            if names.count(name) > 1 or name in self.sizes:
                 raise SystemDefinitionError(f"the name '{name}' is used twice: rename one")
         for table in self.tables:
             if len(table.axes) != 2 or not table.axes[0].name or table.axes[1].name:

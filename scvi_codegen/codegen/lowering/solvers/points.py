@@ -227,7 +227,7 @@ def _point_iteration(
             *map(IterationTable, names, padded),
             IterationTable("POINT_END_POSITION", pad_vector(over(tables.end_position, position_weights), lanes)),
             IterationTable("POINT_END_MOMENTUM", pad_vector(over(tables.end_momentum, momentum_weights), lanes)),
-            *(IterationTable(each, pad_matrix(table, lanes)) for each, table in extra if table),
+            *(IterationTable(name, pad_matrix(table, lanes)) for name, table in extra if table),
         ),
         guess=predictor_tables_of(tables.blocks, lanes, degree=resolved_degree(tables)),
         kernels=tuple(kernel for kernel in kernels if kernel),
@@ -246,7 +246,9 @@ def hamiltonian_iteration(problem: StepProblem) -> FixedPointIteration | None:
     if lanes > MOST_LANES:
         return None
     arguments, turning = forms.legendre_arguments, bool(system.rotations)
-    joint = turning and lanes > 2 and sum(len(each.coordinates) for each in system.rotations) == system.dimension
+    joint = (
+        turning and lanes > 2 and sum(len(rotation.coordinates) for rotation in system.rotations) == system.dimension
+    )
     kernel, potential = partial(system_kernel, system, u=arguments, paired=turning), frame_potential(problem.system)
     in_space = (
         kernel("velocity_lanes", forms.legendre, purpose="H_p at all points, u = (q, p)."),
@@ -275,8 +277,10 @@ def hamiltonian_iteration(problem: StepProblem) -> FixedPointIteration | None:
 def _frame_kernel(system: MechanicalSystem, turns: Sequence[Turn], potential: Expr) -> Kernel:
     """Return the kernel of the gradient of the potential and of the factors of angles, as a function of q and |q|^2."""
     q, squares = system.coordinates, [Symbol(f"square_{k}", real=True) for k in range(len(turns))]
-    sums = {Add(*(x**2 for x in q[4 * k : 4 * k + 4])): each for k, each in enumerate(squares)}
-    values = [each.xreplace(sums) for each in gradient_tuple(potential, q)] + [turn.rate / 4 for turn in turns]
+    sums = {Add(*(x**2 for x in q[4 * k : 4 * k + 4])): square for k, square in enumerate(squares)}
+    values = [derivative.xreplace(sums) for derivative in gradient_tuple(potential, q)] + [
+        turn.rate / 4 for turn in turns
+    ]
     purpose = "V_q and 1/(4 A) at all points, u = (q, |q|^2 of each body)."
     return system_kernel(system, "frame_lanes", values, u=(*q, *squares), paired=True, purpose=purpose)
 
@@ -323,9 +327,9 @@ def summing_action(
     return replace(fixed_point, own_tables=own, kernels=(*fixed_point.kernels, kernel))
 
 
-def _nearly_equal(one: Matrix, other: Matrix) -> bool:
+def _nearly_equal(a: Matrix, b: Matrix) -> bool:
     """Return whether two tables of a method are equal up to rounding: those of an SVI are rounded to be adjoint."""
-    return all(abs(x - y) < EPSILON for x, y in zip(chain(*one), chain(*other), strict=True))
+    return all(abs(x - y) < EPSILON for x, y in zip(chain(*a), chain(*b), strict=True))
 
 
 EPSILON = 1e-14

@@ -109,7 +109,9 @@ def remainder_tables(product: Matrix, end_position: Vector, end_momentum: Vector
         all_of = P.dot(adjugate) >> REMAINDER_BITS
         for table, weights in zip(rows, (end_position, end_momentum), strict=True):
             columns = (zip(weights, all_of[:, n], strict=True) for n in range(points))
-            table.append(tuple(-mp.ldexp(mp.fsum(b * int(x) for b, x in each), -REMAINDER_BITS) for each in columns))
+            table.append(
+                tuple(-mp.ldexp(mp.fsum(b * int(x) for b, x in column), -REMAINDER_BITS) for column in columns)
+            )
         determinant.append(int(np.trace(all_of)) // k)
         adjugate = np.diag([determinant[-1]] * points) - all_of
     fastest = float(np.abs(np.linalg.eigvals(np.array(product, dtype=float))).max())
@@ -175,14 +177,14 @@ def eigenvectors(matrix: NumberTable) -> tuple[list[Any], Any]:
         if value.imag < 0:  # the conjugate of another one
             continue
         largest = int(np.argmax(abs(vector)))
-        mu, x = mp.mpmathify(value), mp.matrix([mp.mpmathify(each / vector[largest]) for each in vector])
+        mu, x = mp.mpmathify(value), mp.matrix([mp.mpmathify(entry / vector[largest]) for entry in vector])
         for _ in range(NEWTON_STEPS):
             with contextlib.suppress(ZeroDivisionError):  # mu is an eigenvalue
                 y = mp.lu_solve(exact - mu * mp.eye(len(values)), x)
                 mu, x = mu + 1 / y[largest], y / y[largest]
         pairs = [(mu, x)] if value.imag == 0 else [(mu, x), (mp.conj(mu), x.apply(mp.conj))]
-        eigenvalues += [each for each, _ in pairs]
-        columns += [list(each) for _, each in pairs]
+        eigenvalues += [eigenvalue for eigenvalue, _ in pairs]
+        columns += [list(eigenvector) for _, eigenvector in pairs]
     return eigenvalues, mp.matrix(columns).T
 
 
