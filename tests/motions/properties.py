@@ -9,6 +9,7 @@ import pickle
 import subprocess
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -232,17 +233,14 @@ def failure(case: Case) -> None:
 def ensemble_of(case: Case, parameters: list[dict[str, Any]], **more: Any) -> Any:
     """A trajectory for each set of parameters, each from a state of its own."""
     count = len(parameters)
-    each = {name: np.array([own[name] for own in parameters]) for name in parameters[0]}
-    shifts = (
-        1e-2 * np.arange(count)[:, np.newaxis] if not case.problem.text.get("constraints") else np.zeros((count, 1))
-    )
-    q = np.array(case.problem.q) + shifts
+    columns = {name: np.array([own[name] for own in parameters]) for name in parameters[0]}
+    shift = 0.0 if case.problem.text.get("constraints") else 1e-2
+    q = np.array(case.problem.q) + shift * np.arange(count)[:, np.newaxis]
     moving = {name: np.tile(values, (count, 1)) for name, values in case.moving().items()}
-    call, given = case.stepper.integrate_ensemble, {**case.common(), **moving, "parameters": each, **more}
+    arguments = {**case.common(), **moving, "parameters": columns, **more}
     if case.kind == "driven":
-        data = case.problem.data(case.setting.t, case.setting.t + 2 * case.span)
-        call, given["inputs"] = case.stepper.integrate_ensemble, data
-    return call(q, **given)
+        arguments.setdefault("inputs", case.problem.data(case.setting.t, case.setting.t + 2 * case.span))
+    return case.stepper.integrate_ensemble(q, **arguments)
 
 
 def _others(case: Case, count: int) -> list[dict[str, float]]:
@@ -280,6 +278,21 @@ def ensembles(case: Case) -> None:
             if case.kind != "slowed" and "t_end" not in way:
                 assert t[0] == case.setting.t
             _equals_single_run(case, runs, j, others[j], way, rows)
+    if case.kind == "driven":
+        _constant_inputs(case, others)
+
+
+def _constant_inputs(case: Case, others: list[dict[str, float]]) -> None:
+    """States of trajectories with constant inputs of their own."""
+    inputs = {name: 0.3 - 0.02 * np.arange(len(others)) * k for k, name in enumerate(case.problem.inputs, 1)}
+    for plan in ({"h": case.h, "steps": STEPS}, {"t_end": case.setting.t + case.span, "tolerance": 1e-11}):
+        runs = ensemble_of(case, others, inputs=inputs, **plan)
+        for j in {0, len(others) - 1}:
+            constant = replace(case.problem, inputs={name: (values[j],) for name, values in inputs.items()})
+            times = runs.t if runs.times is None else runs.times[np.isfinite(runs.times[:, j]), j]
+            motion = truth_of(constant).motion(times[0], times[-1], runs.q[0, j], case.problem.x, others[j])
+            near(runs.q[: len(times), j], motion.q(times), 10 * case.error)
+            near(runs.p[: len(times), j], motion.p(times), 10 * case.error)
 
 
 def _equals_single_run(case: Case, runs: Any, j: int, values: Any, way: Any, rows: Any) -> None:

@@ -162,12 +162,6 @@ CASES = {
     "adaptive": Case("eccentric", sc.SVI(4), 4, ADAPTIVE),
     "at times": Case("eccentric", sc.SVI(4), 4, ADAPTIVE | {"t_eval": np.linspace(0.0, 20.0, 9)}),
     "at their ends": Case("eccentric", sc.SVI(4), 4, ADAPTIVE | {"t_eval": sorted(ENDS)}),
-    **{
-        f"{name} constants": Case(
-            "pushed pendulum", sc.SVI(2), 3, {"inputs": {"u": np.array([0.3, -1.2, 0.3]), "w": 0.5}, **plan}, tolerance
-        )
-        for name, plan, tolerance in (("fixed", {"h": 0.1, "steps": 7}, 1e-14), ("adaptive", {"t_end": 0.7}, 1e-14))
-    },
     "inputs": Case(
         "coupled with inputs",
         sc.SVI(3),
