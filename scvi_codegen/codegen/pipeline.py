@@ -145,6 +145,7 @@ def describe(
     g: str | Expr | None = None,
 ) -> Interface:
     """Return the interface of a program; ``uses_fallback_library``: a separate library has Newton's iteration."""
+    maps = program.quantities.momentum_maps
     return _interface(
         system,
         method,
@@ -156,9 +157,9 @@ def describe(
         workspace=workspace_size(program) + uses_fallback_library,
         has_action=program.action or (uses_fallback_library and program.equations.acts),
         sums_action=program.quantities.integrates,
-        map_names=tuple(each.name for each in program.quantities.momentum_maps),
-        map_formulas=tuple(each.formula for each in program.quantities.momentum_maps),
-        map_exact=tuple(each.exact for each in program.quantities.momentum_maps),
+        map_names=tuple(conserved.name for conserved in maps),
+        map_formulas=tuple(conserved.formula for conserved in maps),
+        map_exact=tuple(conserved.exact for conserved in maps),
         has_fallback=uses_fallback_library or (program.newton and program.fixed_point is not None),
         momentum_names=tuple(momentum.name for momentum in system.momentum_symbols),
         time_transformation=None if g is None else str(g),
@@ -167,10 +168,10 @@ def describe(
         conserves_energy=not system.changes_energy and not system.inputs,
         arrays=_arrays_of(system),
         indices=tuple(f"{name} = {value}" for name, value in system.indices.items()),
-        rotations=tuple(each.declaration for each in system.rotations),
+        rotations=tuple(rotation.declaration for rotation in system.rotations),
         energy_parameter=system.clock.energy.name if system.clock else None,
         solver=_solver_of(program),
-        variables=tuple(each.name for each in getattr(system, "variables", ())),
+        variables=tuple(variable.name for variable in getattr(system, "variables", ())),
     )
 
 
@@ -193,11 +194,11 @@ def _interface(system: MechanicalSystem, method: Method, **of_kind: Any) -> Inte
 
 def _arrays_of(system: MechanicalSystem) -> tuple[str, ...]:
     """Return the declarations of the arrays whose entries are all of the coordinates, or parameters."""
-    names = [each.name for each in (*system.coordinates, *system.parameters)]
-    known = [array for array in system.arrays if set(array.elements) <= set(names)]
-    listed = [name for array in known for name in array.elements]
+    names = [variable.name for variable in (*system.coordinates, *system.parameters)]
+    complete = [array for array in system.arrays if set(array.elements) <= set(names)]
+    listed = [name for array in complete for name in array.elements]
     whole = listed[: system.dimension] == names[: system.dimension]
-    return tuple(str(array) for array in known if array.axes or whole) if whole else ()
+    return tuple(str(array) for array in complete if array.axes or whole) if whole else ()
 
 
 def _solver_of(program: Program) -> str:
@@ -351,10 +352,11 @@ class Sources:
             return replace(program, splitting=summing_splitting(program.splitting, self.system), acts_along=True)
         if program.fixed_point is None:
             return replace(program, summed=True, acts_along=True)
-        found = summing_action(program.fixed_point, self.system, discretise(self.system, self.method).shape)
-        if found is None or not self.uses_fallback_library:
+        shape = discretise(self.system, self.method).shape
+        with_action = summing_action(program.fixed_point, self.system, shape)
+        if with_action is None or not self.uses_fallback_library:
             return None
-        return replace(program, fixed_point=found, acts_along=True)
+        return replace(program, fixed_point=with_action, acts_along=True)
 
     def acting(self) -> Source | None:
         """Return the source of runs that sum the action of their steps, or ``None``."""
@@ -566,8 +568,8 @@ def generate_source(
         raise MethodError("events require double precision, in which they are located: use embedded='double'")
     program = program_of(system, method, solver=solver, prefix=prefix, symmetries=symmetries, lanes=embedded is None)
     g = time_transformation
-    chosen = controller_named(controller, in_tau=g is not None)
-    control = control_of(program, chosen, system, g) if controlled or g is not None else None
+    of_steps = controller_named(controller, in_tau=g is not None)
+    control = control_of(program, of_steps, system, g) if controlled or g is not None else None
     source = render_embedded(program, embedded, control) if embedded else render(program, control)
     interface = describe(program, system, method, g=g)
     complete = with_events(source, interface, searched) if searched else source

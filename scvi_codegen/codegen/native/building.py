@@ -236,21 +236,21 @@ def _work(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...]) -> 
 def _compile(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], folder: Path) -> dict[str, Any]:
     """Compile the parts concurrently, one process each; link them, write the binding and return the manifest."""
     source.write(folder)
-    is_divided = any(each.contents.divided for each in source.sources)
+    is_divided = any(part.contents.divided for part in source.sources)
     cut = DIVIDED_FLAGS if is_divided and _takes_flags(compiler, DIVIDED_FLAGS) else ()
-    threads = THREADS if any(each.contents.threads for each in source.sources) else ()
-    wanted = [*threads, *words_of(FLAGS_VARIABLE)]
-    parts = {each.prefix: _passes(each, flags, cut) for each in source.sources}
+    threads = THREADS if any(part.contents.threads for part in source.sources) else ()
+    further = [*threads, *words_of(FLAGS_VARIABLE)]
+    parts = {part.prefix: _passes(part, flags, cut) for part in source.sources}
     commands: dict[str, list[str]] = {}
-    objects = ["-shared", *wanted, *(f"{name}.o" for name in parts)]
+    objects = ["-shared", *further, *(f"{name}.o" for name in parts)]
     for define, libraries in _mathematics(flags):
         with ExitStack() as ended:
             for name, passes in parts.items():
-                command = [*compiler, "-fPIC", "-std=c99", *flags, *passes, *define, *wanted, "-c", f"{name}.c"]
+                command = [*compiler, "-fPIC", "-std=c99", *flags, *passes, *define, *further, "-c", f"{name}.c"]
                 if name != source.prefix or not source.beside or not _copy_object(source, command, flags, folder):
                     ended.enter_context(_finished([*command, f"-I{folder}"], folder))
                     commands[name] = command
-            _write_binding(_declarations(source, [*compiler, *flags, *wanted], folder), folder)
+            _write_binding(_declarations(source, [*compiler, *flags, *further], folder), folder)
         try:
             run_compiler([*compiler, *objects, *libraries, "-o", _library(folder).name], folder)
             break
@@ -297,7 +297,7 @@ def _copy_object(source: Source, command: list[str], flags: tuple[str, ...], fol
 
 def _declarations(source: Source, command: list[str], folder: Path) -> str:
     """Return the declarations for cffi; those that depend on the processor are preprocessed by the compiler."""
-    text = "".join(each.declarations for each in source.sources)
+    text = "".join(part.declarations for part in source.sources)
     if not DIRECTIVE.search(text):
         return text
     declarations_file, preprocessed = folder / DECLARATIONS, folder / f"{DECLARATIONS}.i"
@@ -399,7 +399,7 @@ def library_for(platform: str, source: Source, *, flags: tuple[str, ...]) -> byt
     with tempfile.TemporaryDirectory(prefix="scvi-codegen-") as name:
         folder, library = Path(name), "library"
         source.write(folder)
-        texts = [f"{each.prefix}.c" for each in source.sources]
+        texts = [f"{part.prefix}.c" for part in source.sources]
         command = [sys.executable, "-m", "ziglang", "cc", "-target", TARGETS[platform], "-shared", "-fPIC", "-s"]
         with announced(f"compiling for {platform}, slowest the first time"):
             run_compiler([*command, "-std=c99", "-I.", *flags, *texts, "-lm", "-o", library], folder)

@@ -210,7 +210,7 @@ def fingerprint(source: Source, *, flags: tuple[str, ...]) -> str:
     # whether any flag selects the instructions of this processor (-march, -mcpu, -mtune)
     tuned = "=native" in " ".join((*compiler, *flags, os.environ.get(FLAGS_VARIABLE, "")))
     parts = [
-        json.dumps([each.to_record() for each in source.sources]),
+        json.dumps([part.to_record() for part in source.sources]),
         json.dumps(compiler),
         compiler_version(compiler),
         json.dumps(flags),
@@ -235,5 +235,5 @@ def _processor() -> str:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
         return f"{platform.machine()} {platform.processor()}"
-    wanted = ("model name", "flags", "Features", "CPU part")
-    return "\n".join(sorted({line for line in lines if line.startswith(wanted)}))
+    names = ("model name", "flags", "Features", "CPU part")
+    return "\n".join(sorted({line for line in lines if line.startswith(names)}))

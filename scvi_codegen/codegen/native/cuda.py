@@ -110,14 +110,14 @@ class Device:
         """Return a function that runs a kernel of a source: its name, the number of threads, and its arguments."""
         code = compiled_kernel(kernel_text(source), self.architecture)
         loaded = self.core.ObjectCode.from_cubin(code)
-        known: dict[str, Any] = {}
+        by_name: dict[str, Any] = {}
 
         def run(name: str, threads: int, *arguments: Any) -> None:
-            if name not in known:
-                known[name] = loaded.get_kernel(f"{source.prefix}_{name}")
+            if name not in by_name:
+                by_name[name] = loaded.get_kernel(f"{source.prefix}_{name}")
             blocks = -(-threads // THREADS_PER_BLOCK)
             config = self.core.LaunchConfig(grid=blocks, block=THREADS_PER_BLOCK)
-            self.core.launch(self.stream, config, known[name], *map(self._argument, arguments))
+            self.core.launch(self.stream, config, by_name[name], *map(self._argument, arguments))
             self.stream.sync()
 
         return run

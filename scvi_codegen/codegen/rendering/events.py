@@ -109,7 +109,8 @@ class EventFormulas:
         self._known = self._turning.symbols | _names(interface)
         self._grammar = _Grammar(interface, self._turning)
         elements = [self._elements(event) for event in events]
-        self.elements, self.events = [*map(len, elements)], [each for element in elements for each in element]
+        self.elements = [*map(len, elements)]
+        self.events = [element for of_event in elements for element in of_event]
         self.q = [symbol(name) for name in interface.coordinates]
         self.v = [symbol(name + DOT) for name in interface.coordinates]
         self.parameters = tuple(symbol(name) for name in interface.parameters)
@@ -126,7 +127,7 @@ class EventFormulas:
             for number, event in enumerate(self.events)
             for condition in event.conditions
         ]
-        self.changes = [self._changes(*each) for each in zip(self.events, self.functions, strict=True)]
+        self.changes = [self._changes(event, g) for event, g in zip(self.events, self.functions, strict=True)]
         if interface.in_tau and any(event.changes_state for event in events):
             raise EventError(
                 "events that change the state are impossible in transformed time, where the energy is the constant "
@@ -166,14 +167,14 @@ class EventFormulas:
 
         functions = formulas(event.function)
         changes = [(formulas(name), formulas(value)) for name, value in event.changes]
-        conditions = [formulas(each) for each in event.conditions]
+        conditions = [formulas(condition) for condition in event.conditions]
         restitutions = None if event.restitution is None else formulas(event.restitution)
         return [
             replace(
                 cast(Any, event),
                 function=function,
                 then={str(names[k]): values[k] for names, values in changes} or None,
-                where=tuple(cast(Any, each[k]) >= 0 for each in conditions) or None,
+                where=tuple(cast(Any, of_elements[k]) >= 0 for of_elements in conditions) or None,
                 restitution=restitutions and restitutions[k],
             )
             for k, function in enumerate(functions)
@@ -181,12 +182,12 @@ class EventFormulas:
 
     def _changes(self, event: SearchedEvent, g: Expr) -> tuple[list[int], list[Expr]]:
         if event.restitution is not None:
-            gradient = [sympy.diff(g, each) for each in (*self.q, symbol(TIME))]
+            gradient = [sympy.diff(g, variable) for variable in (*self.q, symbol(TIME))]  # g_q, g_t
             restitution = self._read(event.restitution, f"restitution '{event.restitution}'")
             return [*range(len(self.q)), 0, 0], [*gradient, restitution]
         settable = (*self.q, *self.p) if self.interface.variables else self.arguments
-        variables = {each: k for k, each in enumerate(settable)}
-        named = {name: variables[each] for name, each in self._known.items() if each in variables}
+        places = {variable: k for k, variable in enumerate(settable)}
+        named = {name: places[variable] for name, variable in self._known.items() if variable in places}
         new = {
             str(self._read(name, "then=")) if "[" in name else name: self._read(value, f"value '{value}' of '{name}'")
             for name, value in event.changes
@@ -195,10 +196,12 @@ class EventFormulas:
         indices = [named.get(name, -1) for name in new]
         for index, (name, value) in zip(indices, new.items(), strict=True):
             if index < 0:
-                known = [str(x) for each in self._turning.rotations for x in (*each.rates, *each.momenta)] + [*named]
+                rotations = self._turning.rotations
+                names = [str(rate) for rotation in rotations for rate in (*rotation.rates, *rotation.momenta)]
+                names += named
                 raise EventError(
                     f"then={{'{name}': '{value}'}} of the event '{event.function}': '{name}' is not a coordinate, a "
-                    f"momentum or a velocity{closest(name, known)} An event can set: {', '.join(known)}"
+                    f"momentum or a velocity{closest(name, names)} An event can set: {', '.join(names)}"
                 )
         if {index // len(self.q) for index in indices} >= {1, 2}:
             raise EventError(f"the event '{event.function}' sets momenta and velocities: set one or the other")
@@ -208,9 +211,9 @@ class EventFormulas:
         """Replace new angular velocities or momenta of rotations by the derivatives or momenta of quaternions."""
         for member in self._turning.rotations:
             for symbols in dict.fromkeys((member.rates, member.momenta)):
-                if set(new).isdisjoint(each.name for each in symbols):
+                if set(new).isdisjoint(rate.name for rate in symbols):
                     continue
-                values = [new.pop(each.name, self._turning.values[each]) for each in symbols]
+                values = [new.pop(rate.name, self._turning.values[rate]) for rate in symbols]
                 p = member.forces(values)  # p = 2 E(q) m / |q|^2 of the angular momentum m, q_dot = |q|^2 p / 4
                 size = sympy.Add(*(symbol(name) ** 2 for name in member.coordinates))
                 for name, value in zip(member.coordinates, p, strict=True):
@@ -228,7 +231,7 @@ class _Grammar:
         arrays = _arrays(interface)
         of_rotations = entries_in_formulas(arrays, turning.members, {})
         names = {array: entry_names(array, {}) for array in arrays if not array.name.endswith(DOT)} | of_rotations
-        self.rules = EntryRules(sizes, tables, {array.name: each for array, each in names.items()})
+        self.rules = EntryRules(sizes, tables, {array.name: entries for array, entries in names.items()})
         self.arrays = [*arrays, *of_rotations, *([Array("", tuple(map(Size, sizes)))] if sizes else ())]
         self.tables = [Array(name, tuple(Size("", n) for n in table.shape)) for name, table in tables.items()]
 
@@ -356,7 +359,7 @@ def turn_rate(g: Expr) -> Expr:
     """Return the sum of the squares of the turns per time of the sines, cosines, tangents and rint in a function."""
     time = symbol(TIME)
     turning = sorted(g.atoms(*TURNS), key=str)
-    return sympy.Add(*((sympy.diff(each.args[0], time) / TURNS[each.func]) ** 2 for each in turning))
+    return sympy.Add(*((sympy.diff(f.args[0], time) / TURNS[f.func]) ** 2 for f in turning))
 
 
 Slots: TypeAlias = Sequence[tuple[Any, Access]]
@@ -419,12 +422,12 @@ class ArrayEvents:
         self.symbols = {name: symbol(name) for name in (TIME, *interface.parameters)}
         self.moving = {
             array.name: (k, layout.coordinates[j].name)
-            for k, each in enumerate(vectors)
-            for j, array in enumerate(each)
+            for k, arrays in enumerate(vectors)
+            for j, array in enumerate(arrays)
         }
         self.uses_velocity, self.functions, self.kernels = False, list[str](), list[Kernel]()
         self.events = [self._event(k, event) for k, event in enumerate(events)]
-        self.timed = tuple(each["timed"] for each in self.events)
+        self.timed = tuple(event["timed"] for event in self.events)
 
     def terms(self, formula: Any, event: SearchedEvent) -> tuple[ArrayTerm, ...]:
         """Return the terms of a formula of an event; in the loops of the event, one term for each of their elements.
@@ -432,15 +435,16 @@ class ArrayEvents:
         Raises:
             EventError: if the formula is invalid.
         """
-        text, known = str(formula), ([*self.positions, *self.rates], self.symbols, self.layout.tables)
+        text, names = str(formula), ([*self.positions, *self.rates], self.symbols, self.layout.tables)
         try:
             if event.loops:
-                each = parse_constraint(text if formula is event.function else text + event.loops, *known)
-            terms = (each,) if event.loops else parse_sums(text, *known)
+                terms = [parse_constraint(text if formula is event.function else text + event.loops, *names)]
+            else:
+                terms = [*parse_sums(text, *names)]
         except ScviCodegenError as error:
             raise EventError(f"the formula '{formula}' of the event '{event.function}': {error}") from error
         self._accesses += [(access, term.loops) for term in terms for _, access in term.slots]
-        return terms
+        return tuple(terms)
 
     def _function(
         self, name: str, term: Any, values: Sequence[Expr], lines: Iterable[str], to: Slots = (), *, within: bool
@@ -484,8 +488,8 @@ class ArrayEvents:
     def _value(self, name: str, formula: Any, event: SearchedEvent, to: str = NEXT) -> list[str]:
         """Return statements that compute a formula at one element; a ``NEXT`` value is counted."""
         lines, within = [f"{to} = 0.0;"], bool(event.loops)
-        for j, each in enumerate(self.terms(formula, event)):
-            lines.append(self._function(f"{name}_{j}", each, [each.formula], [f"{to} += value[0];"], within=within))
+        for j, term in enumerate(self.terms(formula, event)):
+            lines.append(self._function(f"{name}_{j}", term, [term.formula], [f"{to} += value[0];"], within=within))
         return [*lines, "to->count++;"] if to == NEXT else lines
 
     def _event(self, k: int, event: SearchedEvent) -> dict[str, Any]:
@@ -500,9 +504,9 @@ class ArrayEvents:
             functions = [self._function(f"event_{k}", terms[0], [terms[0].formula], [line], within=True)]
         else:
             functions = self._value(f"event_{k}", event.function, event)
-        conditions = [
-            line for j, each in enumerate(event.conditions) for line in self._value(f"condition_{k}_{j}", each, event)
-        ]
+        conditions = list[str]()
+        for j, condition in enumerate(event.conditions):
+            conditions += self._value(f"condition_{k}_{j}", condition, event)
         changes, entries = self._wall(k, event, terms) if event.restitution is not None else self._map(k, event)
         timed, rates = self._in_time(k, event, terms)
         ranges = [(size_text(loop.first), size_text(loop.end), int(bool(loop.behind))) for loop in loops]

@@ -63,7 +63,7 @@ def _broken(lines: Sequence[str]) -> Iterator[str]:
 def _names(code: str) -> Iterator[str]:
     """Yield names with internal linkage, types and enumerators in order."""
     makers = {
-        match["name"]: ([each.strip() for each in match["parameters"].split(",")], names)
+        match["name"]: ([parameter.strip() for parameter in match["parameters"].split(",")], names)
         for match in MACRO.finditer(code)
         if match["parameters"] and (names := re.findall(r"\bstatic\b[\w ]*?(\w+##\w+)\(", match["body"]))
     }
@@ -81,7 +81,7 @@ def _names(code: str) -> Iterator[str]:
                 yield re.findall(r"(\w+)\)?\s*\(", head)[0]
             elif words[0] == "typedef":
                 declared = (rest.rpartition("}")[2] or head).split(",")
-                yield from (name for each in declared for name in DECLARED.findall(each))
+                yield from (name for declarator in declared for name in DECLARED.findall(declarator))
         elif "static" in words or words[0] in local:
             yield (FUNCTION.match(head) or DECLARED.search(head) or [""])[1]
 

@@ -262,7 +262,6 @@ def render_double_double(
             "meaning": POINTS,
             "functions": uses_functions((*numbers, *vectors)),
         },
-        "own_headers": {**arithmetic_headers(), **cast("Mapping[str, str]", context["own_headers"])},
     }
     return _render(program.prefix, context)
 
@@ -271,8 +270,10 @@ def _in_three_words(program: Program) -> Program:
     """Return a program of a separable iteration whose tables have the low words that steps in pairs use."""
     fixed_point = program.fixed_point
     assert fixed_point is not None  # by the caller
-    tables = [replace(each, in_two_parts=not each.is_matrix or each.in_two_parts) for each in fixed_point.own_tables]
-    tables += [_lowest_words(each) for each in tables if each.name in OF_THREE_WORDS]
+    tables = [
+        replace(table, in_two_parts=not table.is_matrix or table.in_two_parts) for table in fixed_point.own_tables
+    ]
+    tables += [_lowest_words(table) for table in tables if table.name in OF_THREE_WORDS]
     return replace(program, fixed_point=replace(fixed_point, own_tables=tuple(tables), linear_part=None))
 
 
@@ -318,7 +319,7 @@ def _render_explicit(program: Program) -> Source:
     context = _context(program, DOUBLE, None)
     words = {"derivatives": 0, "of_numbers": kernels, "of_vectors": (), "functions": uses_functions(kernels)}
     sizes = {"memory": memory_in_pairs(program), "workspace": workspace_in_pairs(program)}
-    return _render(program.prefix, context | sizes | {"two_words": words, "own_headers": arithmetic_headers()})
+    return _render(program.prefix, context | sizes | {"two_words": words})
 
 
 def render_ensemble_in_pairs(program: Program, derivatives: PointDerivatives | None) -> Source | None:
@@ -359,7 +360,6 @@ def render_ensemble_in_pairs(program: Program, derivatives: PointDerivatives | N
             "meaning": TRAJECTORIES,
             "functions": uses_functions(kernels),
         },
-        "own_headers": arithmetic_headers(),
     }
     return _render(f"{program.prefix}_ensemble", context, "ensemble")
 
@@ -387,10 +387,10 @@ def _render_mixed_newton(program: Program, correction: PointDerivatives | None, 
     if rattle and constraints and rattle.points > 1 and plain and _of_forces_alone(rattle):
         kernels = *kernels, *rattle.kernels
         of_points = *rattle.kernels, replace(constraints.kernel, values=len(constraints.kernel.results))
-        vectors = tuple(replace(each, name=f"{each.name}_of_points") for each in of_points)
+        vectors = tuple(replace(kernel, name=f"{kernel.name}_of_points") for kernel in of_points)
     in_pairs, lanes = vectors != (), tuple[Kernel, ...]()
     if correction and program.fixed_point:
-        own = tuple(replace(each, in_two_parts=True) for each in program.fixed_point.own_tables)
+        own = tuple(replace(table, in_two_parts=True) for table in program.fixed_point.own_tables)
         program = replace(program, fixed_point=replace(program.fixed_point, own_tables=own))
         vectors, lanes = correction.in_pairs, (correction.partials, correction.products[0])
     context = _context(program, DOUBLE, control)
@@ -406,7 +406,6 @@ def _render_mixed_newton(program: Program, correction: PointDerivatives | None, 
             "meaning": POINTS,
             "functions": bool(program.damping) or uses_functions((*kernels, *vectors)),
         },
-        "own_headers": {**arithmetic_headers(), **cast("Mapping[str, str]", context["own_headers"])},
     }
     return _render(program.prefix, context)
 
@@ -438,7 +437,9 @@ def _render(prefix: str, context: Mapping[str, object], entry: str = "stepper") 
     recorded = context | {"prototype": record.prototype, "optional": record.optional}
     declarations = environment.get_template(DECLARATIONS[entry]).render(recorded)
     code = environment.get_template(f"{entry}.c.jinja").render(context)
-    headers = cast("Mapping[str, str]", context.get("own_headers", {}))
+    headers = dict(cast("Mapping[str, str]", context.get("own_headers", {})))
+    if context["two_words"]:
+        headers |= arithmetic_headers()
     return Source(
         prefix=prefix,
         header=environment.get_template(f"{entry}.h.jinja").render(context | {"declarations": declarations}),
@@ -495,7 +496,7 @@ def _control_context(program: Program, control: Control | None) -> dict[str, obj
     if not (control and control.predictor and program.fixed_point):
         return {"control": control, "own_headers": {}}
     text, tables = predictor_text(control.predictor), control.growth.tables if control.growth else ()
-    growth_tables = [lane_table(each.name, each.numbers) for each in tables]
+    growth_tables = [lane_table(table.name, table.numbers) for table in tables]
     return {"control": control, "own_headers": {name: text}, "growth_tables": growth_tables}
 
 
@@ -553,8 +554,8 @@ def render_example(interface: Interface, start: ExampleRun, precision: Embedded 
     """Return ``main.c`` and ``Makefile`` that run the integrator with nothing but a C compiler."""
     target = TARGETS[precision]
     target.check((*start.q, *start.p, *start.parameters, start.t, start.h or start.span))
-    for each in start.inputs:
-        target.check((*each.breakpoints, *chain(*each.coefficients)))
+    for of_input in start.inputs:
+        target.check((*of_input.breakpoints, *chain(*of_input.coefficients)))
     context = {
         "interface": interface,
         "prefix": interface.prefix,

@@ -82,24 +82,26 @@ class _PairPrinter:
             return _Printed(f"dd_of({high}, {low})", "dd") if float(low) else _Printed(high, "word")
         if isinstance(expression, Load):
             return self._load(expression)
-        operands = [self.printed(each) for each in expression.operands]
-        result = "ddl" if any(each.kind == "ddl" for each in operands) else "dd"
+        operands = [self.printed(operand) for operand in expression.operands]
+        result = "ddl" if any(operand.kind == "ddl" for operand in operands) else "dd"
         if expression.operator == "*":
             return self._product(expression, operands, result)
         name, added = OPERATORS.get(expression.operator, expression.operator), expression.operator in SUMS
         form = "settled" if not added else operands[0].form if name == "negative" else "sum"
-        texts = (each.as_pair(result, summed=added) for each in operands)
+        texts = (operand.as_pair(result, summed=added) for operand in operands)
         return _Printed(f"{result}_{name}({', '.join(texts)})", result, form)
 
     def _product(self, expression: Operation, operands: list[_Printed], kind: str) -> _Printed:
         """Return a product, whose low word is settled if those of its factors are not."""
-        factors = {each.form for each in operands}
+        factors = {operand.form for operand in operands}
         names, form = (SETTLED_PRODUCTS, "settled") if "product" in factors else (PRODUCTS, "product")
         if len(set(expression.operands)) == 1:
             return _Printed(f"{kind}_{names[0]}({operands[0].as_pair(kind)})", kind, form)
-        word, pair = sorted(operands, key=lambda each: each.kind != "word")
+        word, pair = sorted(operands, key=lambda operand: operand.kind != "word")
         if word.kind != "word":
-            return _Printed(f"{kind}_{names[2]}({', '.join(each.as_pair(kind) for each in operands)})", kind, form)
+            return _Printed(
+                f"{kind}_{names[2]}({', '.join(operand.as_pair(kind) for operand in operands)})", kind, form
+            )
         exact = math.frexp(abs(float(word.text)))[0] == 0.5  # a power of two
         name, form = ("times_power", pair.form) if exact else (names[1], form)
         number = word.text if kind == "dd" else f"lanes_of({word.text})"
@@ -138,7 +140,7 @@ def pair_kernel_text(kernel: Kernel, lanes: Lanes | None = None) -> str:
     parameters = "lanes" if printer.kind_of("parameters") == "ddl" else "double"
     arguments = f"const {kind} *u, {printer.kind_of('t')} t, const {parameters} *parameters, {kind} *value"
     unused = ", ".join(f"(void){name}" for name in ("u", "t", "parameters") if not kernel.uses(name))
-    body = "\n".join(wrapped(each) for each in ([f"{unused};"] if unused else []) + statements)
+    body = "\n".join(wrapped(statement) for statement in ([f"{unused};"] if unused else []) + statements)
     purpose = wrapped_comment(f"{kernel.purpose} In pairs.".strip())
     head = wrapped_prototype(f"static inline void {kernel.name}_pairs({arguments})")
     return f"{purpose}\n{head}\n{{\n  /* clang-format off */\n{body}\n  /* clang-format on */\n}}"

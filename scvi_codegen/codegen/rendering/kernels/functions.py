@@ -78,10 +78,10 @@ class _Statements:
     def __init__(self, program: Program, target: Target) -> None:
         self.program, self.target = program, target
         stage_groups = program.equations.stage_groups
-        self.u = list(accumulate((each.points * each.value.arguments for each in stage_groups), initial=0))
-        self.value = list(accumulate((each.points * each.value.values for each in stage_groups), initial=0))
-        self.partials = [len(each.derivative.results) - each.derivative.values for each in stage_groups]
-        counts = (each.points * count for each, count in zip(stage_groups, self.partials, strict=True))
+        self.u = list(accumulate((group.points * group.value.arguments for group in stage_groups), initial=0))
+        self.value = list(accumulate((group.points * group.value.values for group in stage_groups), initial=0))
+        self.partials = [len(group.derivative.results) - group.derivative.values for group in stage_groups]
+        counts = (group.points * count for group, count in zip(stage_groups, self.partials, strict=True))
         self.derivative = list(accumulate(counts, initial=0))
 
     def written(self, entries: dict[tuple[int, int, int, int], list[list[Term]]]) -> UnrolledEquations:
@@ -296,8 +296,8 @@ def _tables(each: RolledKernel, target: Target) -> Iterator[str]:
         lines = [list(map(str, row)) for row in rows]
         yield table(f"static const int {_named(each, name)}[{len(rows)}][{len(rows[0])}]", lines)
     for name, column in each.columns:
-        numbers = [target.number(one.value) for one in column if isinstance(one, Constant)]
-        places = [str(one.index) for one in column if isinstance(one, Load)]
+        numbers = [target.number(entry.value) for entry in column if isinstance(entry, Constant)]
+        places = [str(entry.index) for entry in column if isinstance(entry, Load)]
         kind = target.scalar if numbers else "int"
         yield table(f"static const {kind} {_named(each, name)}[{len(column)}]", numbers or places)
 

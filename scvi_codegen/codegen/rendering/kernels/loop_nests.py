@@ -98,7 +98,7 @@ def _width(targets: Sequence[Access], indices: Collection[str]) -> int:
     for target in targets:
         place = target.places[_common_axes(targets, indices)[target.array.name]]
         offsets.setdefault(target.array.name, []).append(place.base.number)
-    return max((max(each) - min(each) for each in offsets.values()), default=0)
+    return max((max(distances) - min(distances) for distances in offsets.values()), default=0)
 
 
 DIRECTION = "V"
@@ -131,7 +131,7 @@ def function_of_sizes(layout: Layout, head: str, lines: Sequence[str]) -> str:
 
 def describing_function(layout: Layout, name: str, kind: str, initialisers: Sequence[str]) -> str:
     """Return a function that stores structures of this kind, such as descriptions of arrays."""
-    listed = (f"    {each}," for each in initialisers)
+    listed = (f"    {initialiser}," for initialiser in initialisers)
     lines = [f"const {kind} described[] = {{", *listed, "};", "memcpy(all, described, sizeof described);"]
     return function_of_sizes(layout, f"static void describe_{name}(const problem *arrays, {kind} *all)", lines)
 
@@ -239,8 +239,9 @@ class Nest:
         if self.chunked:
             lines += [*self._part_passed_over(loop), f"lanes values[{len(self.rolled.writes)}][CHUNK];"]
         lines += _loop(loop, "begin", "end", inner)
-        for each in [[line for lines in behind for line in lines]] if loop.near else behind:
-            lines += _loop(loop, "begin", "end", each)
+        together = [[line for of_target in behind for line in of_target]]
+        for statements in together if loop.near else behind:
+            lines += _loop(loop, "begin", "end", statements)
         return [
             f"for (long long begin = {first}, end; begin < {end}; begin = end) {{",
             *(f"  {line}" for line in lines),
@@ -284,8 +285,8 @@ class Nest:
 
     def _passed_over(self) -> list[str]:
         """Return the lines that skip an element that adds to nothing in a task."""
-        wanted = [f"within(here,\0place_{k})" for k in range(len(self.rolled.writes))]
-        past = [f"if (!(whole || {' || '.join(wanted)}))", "  continue;"]
+        tests = [f"within(here,\0place_{k})" for k in range(len(self.rolled.writes))]
+        past = [f"if (!(whole || {' || '.join(tests)}))", "  continue;"]
         return past if self.sharing is Sharing.BY_PLACES and not self.chunked else []
 
     def _part_passed_over(self, loop: Loop) -> list[str]:
@@ -347,16 +348,16 @@ class Nest:
 
     def function(self, head: str, arguments: Sequence[str], lines: Sequence[str], *, values: str = "") -> str:
         """Return the loops as a function; without values no kernel is evaluated."""
-        known = [*self._arrays("\n".join(lines))]
+        declared = [*self._arrays("\n".join(lines))]
         if self.source and self.rolled.reads:
-            known.append(f"{self.scalar} u[{len(self.rolled.reads)}];")
+            declared.append(f"{self.scalar} u[{len(self.rolled.reads)}];")
         elif self.source:
-            known += [f"const {self.scalar} u[1] = {{0}};", f"(void){self.source};"]
+            declared += [f"const {self.scalar} u[1] = {{0}};", f"(void){self.source};"]
         if values:
             count = max(1, self.scalars + len(self.rolled.constants))
-            known += [f"{values};", f"double parameters[{count}] = {{0}};"]
-            known += [f"parameters[{k}] = arrays->parameters[{k}];" for k in range(self.scalars)]
-        body = [*sizes_text(self.layout, "\n".join([*known, *lines])), *known, *lines]
+            declared += [f"{values};", f"double parameters[{count}] = {{0}};"]
+            declared += [f"parameters[{k}] = arrays->parameters[{k}];" for k in range(self.scalars)]
+        body = [*sizes_text(self.layout, "\n".join([*declared, *lines])), *declared, *lines]
         text = "\n".join(wrapped(line.strip(), indent=2 + len(line) - len(line.lstrip())) for line in body)
         whole = (argument.replace(" ", "\0") for argument in arguments)
         signature = wrapped(f"{head}({', '.join(whole)})", indent=0)

@@ -48,31 +48,31 @@ def loop_context(program: ArrayProgram) -> dict[str, Any]:
     loops, constrained, pairs = program.loops, program.loops.constrained, _circulants(program)
     sums, fixed_point, layout = _convolutions(program), program.fixed_point, program.layout
     lengths = [*map(product_text, layout.fields)]
-    terms = [(each, each.scalar) for each in loops.forces if each.scalar]
-    terms += [(each, each.kernel) for each in loops.constants]
-    scalars = [each.kernel for each in loops.masses] + [scalar for _, scalar in terms]
+    terms = [(rolled, rolled.scalar) for rolled in loops.forces if rolled.scalar]
+    terms += [(rolled, rolled.kernel) for rolled in loops.constants]
+    scalars = [rolled.kernel for rolled in loops.masses] + [scalar for _, scalar in terms]
     if fixed_point is None:
-        scalars += [each.kernel for each in loops.forces]
+        scalars += [rolled.kernel for rolled in loops.forces]
     if constrained:
-        scalars += [each.kernel for each in (*constrained.conditions, *constrained.curvatures)]
-    scalars += [each.kernel for each in (*loops.velocities, *loops.momenta)]
+        scalars += [rolled.kernel for rolled in (*constrained.conditions, *constrained.curvatures)]
+    scalars += [rolled.kernel for rolled in (*loops.velocities, *loops.momenta)]
     return {
         "program": program,
         "most_threads": 1 if constrained else MOST_THREADS,
-        "cut": is_divided((*scalars, *(each.kernel for each in loops.applied))),
-        "forces": [_force_text(program, each) for each in loops.applied],
-        "energies": [_energy_text(program, each, scalar, declared=each in pairs) for each, scalar in terms],
-        "masses": [_mass_text(program, each) for each in loops.masses],
+        "cut": is_divided((*scalars, *(rolled.kernel for rolled in loops.applied))),
+        "forces": [_force_text(program, rolled) for rolled in loops.applied],
+        "energies": [_energy_text(program, rolled, scalar, declared=rolled in pairs) for rolled, scalar in terms],
+        "masses": [_mass_text(program, rolled) for rolled in loops.masses],
         "lists": [(name, _list_text(program, count, lengths)) for name, count, lengths in loops.neighbours],
-        "circulants": {each.kernel.name: _circulant_text(program, each) for each in pairs},
+        "circulants": {rolled.kernel.name: _circulant_text(program, rolled) for rolled in pairs},
         "sums": len(sums),
         "convolutions": describing_function(layout, "convolutions", "convolution", sums),
-        "summed": [each.kernel.name for each in loops.applied if _has_sums(each)],
+        "summed": [rolled.kernel.name for rolled in loops.applied if _has_sums(rolled)],
         "plans": len(_plans(program)),
-        "most_stages": max((len(_stages(each)) for each in program.layout.sums), default=0),
-        "force_names": [each.kernel.name for each in loops.forces],
-        "energy_names": [(scalar.name, _has_sums(each)) for each, scalar in terms],
-        "mass_names": [each.kernel.name for each in loops.masses],
+        "most_stages": max((len(_stages(convolutions)) for convolutions in program.layout.sums), default=0),
+        "force_names": [rolled.kernel.name for rolled in loops.forces],
+        "energy_names": [(scalar.name, _has_sums(rolled)) for rolled, scalar in terms],
+        "mass_names": [rolled.kernel.name for rolled in loops.masses],
         "scalar_kernels": [kernel_text(kernel, DOUBLE) for kernel in scalars],
         "inverse_roots": inverse_roots(scalars),
         "vector_functions": _vector_functions(program),
@@ -82,10 +82,10 @@ def loop_context(program: ArrayProgram) -> dict[str, Any]:
             [f"return {' + '.join(map(product_text, layout.coordinates))};"],
         ),
         "fixed_point": fixed_point
-        and iteration_source(fixed_point, POINTS, kernels=[each.kernel for each in loops.applied]),
+        and iteration_source(fixed_point, POINTS, kernels=[rolled.kernel for rolled in loops.applied]),
         "work": _step_work(program) + _transform_work(program),
         "continued": loops.continued,
-        "site_functions": [_site_text(program, each) for each in (*loops.velocities, *loops.momenta)],
+        "site_functions": [_site_text(program, rolled) for rolled in (*loops.velocities, *loops.momenta)],
         "field_lengths": function_of_sizes(
             layout,
             "static void field_lengths(const problem *arrays, long long *length)",
@@ -106,18 +106,20 @@ def loop_context(program: ArrayProgram) -> dict[str, Any]:
 def _appended_arrays(program: ArrayProgram) -> Iterator[str]:
     """Yield the statements that describe the arrays of coordinates."""
     for k, array in enumerate(program.layout.coordinates):
-        is_field = any(couples_elements(array, each.reads, each.constants) for each in program.loops.applied)
+        is_field = any(couples_elements(array, rolled.reads, rolled.constants) for rolled in program.loops.applied)
         yield f"end = append_array(&all[{k}], end, {product_text(array)}, {int(is_field)});"
 
 
 def _map_texts(program: ArrayProgram) -> Iterator[str]:
     """Yield the initialisers of the descriptions of momentum maps (templates/support/arrays/array_states.h)."""
     arrays = {array.name: array for array in program.layout.coordinates}
-    for each in program.loops.maps:
-        array, whole = arrays[each.array], each.component is None
-        kind = "PHASE" if each.phase else "TRANSLATION" if each.other is None else "ROTATION"
-        components, numbers = (1 if whole else array.axes[-1].number, f"{each.component or 0}, {each.other or 0}")
-        start = f"start_{array.name}"
+    for conserved in program.loops.maps:
+        array, component, other = arrays[conserved.array], conserved.component, conserved.other
+        kind = "TRANSLATION" if other is None else "ROTATION"
+        if conserved.phase:
+            kind = "PHASE"
+        components = 1 if component is None else array.axes[-1].number
+        numbers, start = f"{component or 0}, {other or 0}", f"start_{array.name}"
         yield f"{{{start}, {start} + {product_text(array)}, {components}, {numbers}, {kind}}}"
 
 
@@ -132,22 +134,22 @@ def _site_text(program: ArrayProgram, rolled: RolledKernel) -> str:
 
 def _circulants(program: ArrayProgram) -> list[RolledKernel]:
     """Return the terms whose forces, or products with a direction, are products with circulant matrices."""
-    return [each for each in program.loops.applied if each.circulant is not None]
+    return [rolled for rolled in program.loops.applied if rolled.circulant is not None]
 
 
 def _has_sums(rolled: RolledKernel) -> bool:
-    return any(each.sums for each in rolled.reads)
+    return any(access.sums for access in rolled.reads)
 
 
 def _stages(sums: Sequence[Convolution]) -> list[tuple[int, str, int]]:
     """Return the axis, the array of coefficients and the power of each circulant matrix of convolutions in turn."""
-    alike = groupby(sums, key=lambda each: (each.axis, each.coefficients.name))
+    alike = groupby(sums, key=lambda convolution: (convolution.axis, convolution.coefficients.name))
     return [(*stage, len([*group])) for stage, group in alike]
 
 
 def _plans(program: ArrayProgram) -> list[tuple[str, int]]:
     """Return the arrays of coefficients and powers of all circulant matrices; of sums over pairs the power is 0."""
-    pairs = [(each.constants[0].array.name, 0) for each in _circulants(program)]
+    pairs = [(rolled.constants[0].array.name, 0) for rolled in _circulants(program)]
     return [*dict.fromkeys([*pairs, *(stage[1:] for sums in program.layout.sums for stage in _stages(sums))])]
 
 
@@ -155,7 +157,9 @@ def _convolutions(program: ArrayProgram) -> list[str]:
     """Return the convolutions of each array in C: their number, whether forces are derivatives by them, stages."""
     kernels = program.loops.applied
     reads, writes = (
-        dict.fromkeys((each.sums, each.array) for one in kernels for each in getattr(one, kind) if each.sums)
+        dict.fromkeys(
+            (access.sums, access.array) for rolled in kernels for access in getattr(rolled, kind) if access.sums
+        )
         for kind in ("reads", "writes")
     )
     texts = []
@@ -170,8 +174,8 @@ def _transform_work(program: ArrayProgram) -> int:
     """Return the number of doubles per coordinate of Fourier transforms."""
     lanes, plans = program.fixed_point.lanes if program.fixed_point else 1, len(_plans(program))
     states = 2 if program.layout.momenta or program.layout.velocities else 1
-    each = 3 if program.loops.products else 2  # values, derivatives by them, and values along a direction
-    vectors = TRANSFORM_VECTORS + states * each * len(program.layout.sums)
+    kinds = 3 if program.loops.products else 2  # values, derivatives by them, and values along a direction
+    vectors = TRANSFORM_VECTORS + states * kinds * len(program.layout.sums)
     return vectors * lanes + TRANSFORM_ALIGNMENT + PLAN_VECTORS * plans if plans else 0
 
 
@@ -190,7 +194,7 @@ def _step_work(program: ArrayProgram) -> int:
 
 def _vector_functions(program: ArrayProgram) -> list[str]:
     """Return the functions of the vector library that occur in the forces of an explicit method."""
-    return loop_functions([each.kernel for each in program.loops.forces] if program.fixed_point is None else [])
+    return loop_functions([rolled.kernel for rolled in program.loops.forces] if program.fixed_point is None else [])
 
 
 def _force_text(program: ArrayProgram, rolled: RolledKernel) -> str:
@@ -265,7 +269,7 @@ def _circulant_matrix(program: ArrayProgram, array: Array, axis: int, coefficien
     """Return the initialiser of the description of a circulant matrix in C."""
     outer, inner = (product_text(replace(array, axes=axes)) for axes in (array.axes[:axis], array.axes[axis + 1 :]))
     plan, size = _plans(program).index((coefficients, power)), size_text(array.axes[axis])
-    field = [each.name for each in program.layout.fields].index(coefficients)
+    field = [array.name for array in program.layout.fields].index(coefficients)
     return f"{{start_{array.name}, {outer}, {size}, {inner}, arrays->field[{field}], {power}, {plan}}}"
 
 
@@ -334,13 +338,13 @@ def _mass_text(program: ArrayProgram, rolled: RolledKernel) -> str:
 def _constraint_context(program: ArrayProgram, held: ConstrainedSteps | None) -> dict[str, Any]:
     if held is None:
         return {"held": None}
-    counts = [count_text(each.loops) for each in held.conditions]
-    entries = [f"{count} * {len(each.reads)}" for count, each in zip(counts, held.conditions, strict=True)]
+    counts = [count_text(condition.loops) for condition in held.conditions]
+    entries = [f"{count} * {len(condition.reads)}" for count, condition in zip(counts, held.conditions, strict=True)]
     pairs = zip(held.conditions, held.curvatures, strict=True)
     context = {
         "functions": [text for pair in pairs for text in _constraint_texts(program, *pair)],
-        "conditions": [each.kernel.name for each in held.conditions],
-        "curvatures": [each.kernel.name for each in held.curvatures],
+        "conditions": [condition.kernel.name for condition in held.conditions],
+        "curvatures": [curvature.kernel.name for curvature in held.curvatures],
         "counts": function_of_sizes(
             program.layout,
             "static void count_constraints(const problem *arrays, run_memory *run)",

@@ -135,7 +135,7 @@ def print_expression(expression: Expression, target: Target = DOUBLE, context: i
     if operator == "neg":
         text = f"-{print_expression(operands[0], target, level + 1)}"
     else:
-        left, right = (print_expression(each, target, level + k) for k, each in enumerate(operands))
+        left, right = (print_expression(operand, target, level + k) for k, operand in enumerate(operands))
         text = f"{left} {operator} {right}"
     return f"({text})" if level < context else text
 
@@ -169,12 +169,13 @@ def constants(kernel: Kernel) -> Iterator[Number]:
 
 
 def _every_part(kernel: Kernel) -> Iterator[Part]:
-    return (part for each in kernel.functions for part in parts(each))
+    return (part for function in kernel.functions for part in parts(function))
 
 
-def _functions(part: Part, wanted: Callable[[Expression], bool]) -> set[str]:
+def _functions(part: Part, counts: Callable[[Expression], bool]) -> set[str]:
+    """Return the functions that occur in the operations that count."""
     operations = (expression for expression in _expressions(part) if isinstance(expression, Operation))
-    return {each.operator for each in operations if each.operator not in PRECEDENCE and wanted(each)}
+    return {operation.operator for operation in operations if counts(operation)} - PRECEDENCE.keys()
 
 
 def _expressions(part: Part) -> Iterator[Expression]:

@@ -134,7 +134,7 @@ def iteration_source(
     mass = fixed_point.constant_mass
     damping = None if meaning.are_points else fixed_point.damping
     applied = (*kernels, *((mass,) if mass and not meaning.are_points else ()), *((damping,) if damping else ()))
-    functions = {name.removesuffix(TIMES) for each in applied for name in lane_functions(each, meaning.sources)}
+    functions = {name.removesuffix(TIMES) for kernel in applied for name in lane_functions(kernel, meaning.sources)}
     solver = ("iteration/iteration_solver",) if meaning.are_points else ()
     parts = (f"iteration/{name}" for name in fixed_point.parts)
     return IterationSource(
@@ -162,7 +162,7 @@ def iteration_source(
 def splitting_source(split: Splitting, observed: Kernel | None = None) -> IterationSource:
     """Return the template data of explicit steps of many trajectories, which are lanes."""
     kernels = (split.force, *(() if split.by_masses else (split.drift,)), *((observed,) if observed else ()))
-    functions = {name for each in (*kernels, split.drift) for name in lane_functions(each, TRAJECTORIES.sources)}
+    functions = {name for kernel in (*kernels, split.drift) for name in lane_functions(kernel, TRAJECTORIES.sources)}
     sizes = {"LEAPS": str(len(split.kicks)), "EXPLICIT_STEPS": "1", "SPLITTING": "static inline"}
     tables = (("KICK", split.kicks), ("DRIFT", split.drifts), ("KICK_ABSCISSA", split.abscissae))
     return IterationSource(
