@@ -182,8 +182,8 @@ def advise(
     if precision not in PRECISIONS[:2]:
         raise MethodError(f"advise requires precision='double' or 'double-double', not {precision!r}")
     compiled = partial(compile_stepper, precision=precision)
-    candidates = _candidates(method, 2 if precision == DOUBLE_DOUBLE else 1) if degree else [method]
-    for candidate in candidates:
+    words = 2 if precision == DOUBLE_DOUBLE else 1
+    for candidate in _candidates(method, words) if degree else [method]:
         for stepper in _steppers(compiled, system, candidate, solver):
             try:
                 trials = Trials(stepper, q, state)
