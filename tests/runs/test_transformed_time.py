@@ -202,7 +202,7 @@ def test_partial_step_ends_at_the_requested_time(h: float) -> None:
     for k in range(0, 40, 3):
         for share in (1e-12, 0.02, 0.5, 0.98, 1.0):
             end = run.t[k] + share * (run.t[k + 1] - run.t[k])
-            q, p, part = part_of_step(made, run.t[k], h, end, run.q[k], run.p[k], values, None)
+            q, p, part = part_of_step(run, run.t[k], h, end, run.q[k], run.p[k])
             assert 0.0 < part <= 1.0
             short = made.integrate(run.q[k], run.p[k], h=part * h, steps=1, t=run.t[k], parameters=values)
             assert abs(short.t[1] - end) <= 6 * 2.0**-52 * max(abs(end), abs(run.t[k]), abs(end - run.t[k]))

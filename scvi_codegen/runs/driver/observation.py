@@ -381,10 +381,8 @@ class Observation:
         if part.tau is None or (left := run.left_to(t)) == 0.0:
             return part.q[-1], part.p[-1], None if part.tau is None else float(part.tau[-1])
         span = left if run.stepper.interface.words == 1 else fraction_of(t) - run._exact_time
-        q, p, x = part_of_step(
-            run.stepper, 0.0, run._step_size, span, part.q[-1], part.p[-1], run.parameters, run.options
-        )
-        return q, p, float(part.tau[-1]) + x * run._step_size
+        q, p, fraction = part_of_step(run, 0.0, run._step_size, span, part.q[-1], part.p[-1])
+        return q, p, float(part.tau[-1]) + fraction * run._step_size
 
     def _with_state(
         self, part: Trajectory, lengths: Array, t: float, q: Array, p: Array, tau: float | None

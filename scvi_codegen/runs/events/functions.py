@@ -10,18 +10,27 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from scvi_codegen.common.errors import EventError
+from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.states.words import DIGITS, low_words, two_words, with_low, word, word_of
 from scvi_codegen.runs.stepping.projection import projected
 from scvi_codegen.systems.event import JAMMED, Event
 
 if TYPE_CHECKING:
-    from scvi_codegen.runs.results.saved_states import Array
     from scvi_codegen.runs.stepping.integrator import Integrator
+
+
+class TimedState(NamedTuple):
+    """Time and state of two words."""
+
+    t: Fraction
+    q: Array
+    p: Array
+
 
 POINTS = (1, 2, 4, 8, 16, 32)
 """Numbers of points of the quadratures of a mean, in the order of their use."""
@@ -60,92 +69,88 @@ class EventFunctions:
         self.velocities = [any(not each.free_symbols.isdisjoint(moving) for each in group) for group in of_changes]
         self.stepper = stepper
 
-    def value(self, number: int, q: Array, p: Array, t: Fraction, parameters: Array) -> Any:
+    def value(self, number: int, at: TimedState, parameters: Array) -> Any:
         """Return the value of a function at a state; raise ``ArithmeticError`` outside its domain."""
-        return self._values(self.tapes[number], number, q, p, t, parameters)[0]
+        return self._values(self.tapes[number], number, at, parameters)[0]
 
-    def _values(self, tape: Any, number: int, q: Array, p: Array, t: Fraction, parameters: Array) -> list[Any]:
+    def _values(self, tape: Any, number: int, at: TimedState, parameters: Array) -> list[Any]:
         from scvi_codegen.common.precision import mp
 
-        v = self._velocity(q, p, t, parameters) if self.velocities[number] else q
+        v = self._velocity(at, parameters) if self.velocities[number] else at.q
         with mp.workdps(DIGITS):
-            words = [x for each in (q, p, v, parameters) for x in _numbers(each)]
-            words.insert(3 * len(q), mp.mpf(t.numerator) / t.denominator)
-            values: list[Any] = tape(words)
+            arguments = [x for vector in (at.q, at.p, v, parameters) for x in _numbers(vector)]
+            arguments.insert(3 * len(at.q), mp.mpf(at.t.numerator) / at.t.denominator)
+            values: list[Any] = tape(arguments)
         return values
 
-    def _velocity(self, q: Array, p: Array, t: Fraction, parameters: Array) -> Array:
-        velocity: Array = self.stepper._transformed("velocity", word_of(t), q, p, parameters.copy())
+    def _velocity(self, at: TimedState, parameters: Array) -> Array:
+        velocity: Array = self.stepper._transformed("velocity", word_of(at.t), at.q, at.p, parameters.copy())
         return velocity
 
     def changed(
-        self, numbers: Sequence[int], q: Array, p: Array, t: Fraction, parameters: Array, forward: bool, begin: float
-    ) -> tuple[Array, Array]:
+        self, numbers: Sequence[int], at: TimedState, parameters: Array, forward: bool, begin: float
+    ) -> TimedState:
         """Return the state after simultaneous crossings of functions, the impacts repeated while a wall is approached.
 
         Args:
             numbers: of the functions, in the order of their changes.
+            at: state before them.
+            parameters: of the run.
             forward: whether the run is forward in time; a run backward undoes impacts.
             begin: start of the step, for the message.
 
         Raises:
             EventError: if the impacts do not end.
         """
-        state = q, p
         for number in numbers:
-            state = self._change(number, *state, t, parameters, forward)
+            at = self._change(number, at, parameters, forward)
         walls = [number for number in numbers if self.is_impact[number]]
-        for _ in range(MOST_ROUNDS if len(walls) > 1 else 0):
-            before = state
+        if len(walls) < 2:
+            return at
+        for _ in range(MOST_ROUNDS):
+            before = at
             for number in walls:
-                state = self._change(number, *state, t, parameters, forward)
-            if state[1] is before[1]:
-                return state
-        if len(walls) > 1:
-            raise EventError(JAMMED.format(function=self.events[min(walls)].function, t=begin))
-        return state
+                at = self._change(number, at, parameters, forward)
+            if at.p is before.p:
+                return at
+        raise EventError(JAMMED.format(function=self.events[min(walls)].function, t=begin))
 
-    def _change(
-        self, number: int, q: Array, p: Array, t: Fraction, parameters: Array, forward: bool
-    ) -> tuple[Array, Array]:
+    def _change(self, number: int, at: TimedState, parameters: Array, forward: bool) -> TimedState:
         """Return the state after a change; the same arrays for a wall that is not approached."""
-        stepper, m = self.stepper, len(q)
-        values = self._values(self.new_values[number], number, q, p, t, parameters)
+        stepper, m = self.stepper, len(at.q)
+        values = self._values(self.new_values[number], number, at, parameters)
         if self.is_impact[number]:
-            return q, self._impact(q, p, t, parameters, values[:m], values[m], values[m + 1], forward)
+            return at._replace(p=self._impact(at, parameters, values, forward))
         by_velocity = any(index >= 2 * m for index in self.indices[number])
-        state = [q.copy(), p.copy(), self._velocity(q, p, t, parameters) if by_velocity else p]
+        state = [at.q.copy(), at.p.copy(), self._velocity(at, parameters) if by_velocity else at.p]
         for index, value in zip(self.indices[number], values, strict=True):
             state[index // m][index % m] = word(*two_words(value, "a value of then="))
         if by_velocity:
-            state[1] = stepper.momentum(state[0], state[2], word_of(t), parameters)
+            state[1] = stepper.momentum(state[0], state[2], word_of(at.t), parameters)
         q, p, _ = state
-        return projected(stepper, q, p, word_of(t), parameters)[:2] if stepper.constraints else (q, p)
+        if stepper.constraints:
+            q, p, _ = projected(stepper, q, p, word_of(at.t), parameters)
+        return TimedState(at.t, q, p)
 
-    def _impact(
-        self,
-        q: Array,
-        p: Array,
-        t: Fraction,
-        parameters: Array,
-        normal: list[Any],
-        by_time: Any,
-        restitution: Any,
-        forward: bool,
-    ) -> Array:
-        """Return the momenta after an impact; the same array if the wall is not approached."""
+    def _impact(self, at: TimedState, parameters: Array, values: list[Any], forward: bool) -> Array:
+        """Return the momenta after an impact; the same array if the wall is not approached.
+
+        ``values``: g_q, g_t and the coefficient of restitution.
+        """
         from scvi_codegen.common.precision import mp
 
-        stepper, momenta_before = self.stepper, _numbers(p)
+        stepper, momenta_before, m = self.stepper, _numbers(at.p), len(at.q)
+        normal, by_time, restitution = values[:m], values[m], values[m + 1]
 
         def momenta(impulse: Any) -> Array:
             moved = [x + impulse * n for x, n in zip(momenta_before, normal, strict=True)]
             high = [float(x) for x in moved]
             words: Array = with_low(np.array(high), np.array([float(x - y) for x, y in zip(moved, high, strict=True)]))
-            return projected(stepper, q, words, word_of(t), parameters)[1] if stepper.constraints else words
+            return projected(stepper, at.q, words, word_of(at.t), parameters)[1] if stepper.constraints else words
 
         def terms(impulse: Any) -> list[Any]:
-            v = _numbers(self._velocity(q, momenta(impulse) if impulse else p, t, parameters))
+            moved = at._replace(p=momenta(impulse)) if impulse else at
+            v = _numbers(self._velocity(moved, parameters))
             return [by_time, *(n * x for n, x in zip(normal, v, strict=True))]
 
         def rate(impulse: Any) -> Any:
@@ -155,7 +160,7 @@ class EventFunctions:
             size = mp.fsum(map(abs, terms(0)))
             first = rate(0)
             if not (first if forward else -first) < -EQUAL * size:
-                return p
+                return at.p
             derivative = rate(mp.one) - first
             impulse, before = -2 * first / derivative, mp.inf
             for _ in range(MOST_CORRECTIONS):
@@ -166,7 +171,7 @@ class EventFunctions:
                 impulse, before = impulse - change, abs(change)
             if not before <= max(SOLVED * abs(impulse), EQUAL * size / abs(derivative)):
                 raise EventError(
-                    f"the impulse of the impact at t = {float(t):.17g} did not converge: use a smaller step"
+                    f"the impulse of the impact at t = {float(at.t):.17g} did not converge: use a smaller step"
                 )
             return momenta((1 + (restitution if forward else 1 / restitution)) * impulse / 2)
 

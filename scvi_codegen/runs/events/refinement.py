@@ -21,7 +21,7 @@ import numpy as np
 
 from scvi_codegen.common.errors import EventError, MethodError, StateError, StepFailedError
 from scvi_codegen.runs.events.detection import CrossingSearch
-from scvi_codegen.runs.events.functions import EventFunctions
+from scvi_codegen.runs.events.functions import EventFunctions, TimedState
 from scvi_codegen.runs.results.dense_output import stepped_to
 from scvi_codegen.runs.states.times import WHOLE
 from scvi_codegen.runs.states.words import Word, block_of, fraction_of, stacked, with_low, word_of
@@ -45,14 +45,6 @@ class RefinedCrossing(NamedTuple):
     q: Array
     p: Array
     element: int
-
-
-class TimedState(NamedTuple):
-    """Time and state of two words from which a partial step starts."""
-
-    t: Fraction
-    q: Array
-    p: Array
 
 
 class SavedRow(NamedTuple):
@@ -106,7 +98,7 @@ class RefinedSearch(CrossingSearch):
         here = self._moved(states, start, guess)
 
         def value(at: TimedState) -> Fraction:
-            number = self.precise._event_functions.value(function, at.q, at.p, at.t, states.parameters)
+            number = self.precise._event_functions.value(function, at, states.parameters)
             numerator, exponent = number.man_exp  # of the absolute value
             size = int(numerator) * Fraction(2**exponent if exponent >= 0 else Fraction(1, 2**-exponent))
             return size if number > 0 else -size
@@ -180,9 +172,9 @@ class RefinedSearch(CrossingSearch):
                 roots = [before] * len(crossings)
                 functions = [self._function(crossings[k]) for k in acting]
                 changed = self.precise._event_functions.changed
-                after = changed(functions, *before[1:], before.t, run.parameters, h > 0, float(start.t))
-                rows.append(SavedRow(TimedState(before.t, *after), float(before.t - at.t)))
-                at = rows[-1].at
+                after = changed(functions, before, run.parameters, h > 0, float(start.t))
+                rows.append(SavedRow(after, float(before.t - at.t)))
+                at = after
             self.refined += map(self._crossing, crossings, roots)
             self.last = self.refined[-1][1:4]
         if self.ended:

@@ -120,9 +120,7 @@ def stepped_to(
 ) -> tuple[Array, Array]:
     """Return the state after one step from (1,) time t of two words to ``end``, whose size has two words as well."""
     if states.stepper.in_tau:
-        return part_of_step(states.stepper, t[0], cast(float, states.h), end, q, p, states.parameters, states.options)[
-            :2
-        ]
+        return part_of_step(states, t[0], cast(float, states.h), end, q, p)[:2]
     settings: dict[str, Any] = {"parameters": states.parameters, "options": states.options}
     target = fraction_of(end)
     h = float(target - Fraction(float(t[0])))

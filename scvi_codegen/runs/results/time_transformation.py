@@ -8,11 +8,10 @@ from fractions import Fraction
 
 import numpy as np
 
-from scvi_codegen.codegen.native.options import SolverOptions, step_failure
+from scvi_codegen.codegen.native.options import step_failure
 from scvi_codegen.runs.results.saved_states import SavedStates
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.states.words import block_of, fraction_of
-from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.memory import Memory
 from scvi_codegen.runs.stepping.step_plan import Fixed
 
@@ -22,49 +21,34 @@ of a step in which the rate dt/dtau is nearly constant."""
 
 
 def part_of_step(
-    stepper: Integrator,
-    t: float,
-    h: float,
-    end: float | Fraction,
-    q: Array,
-    p: Array,
-    parameters: Array,
-    options: SolverOptions | None,
+    along: SavedStates | Memory, t: float, h: float, end: float | Fraction, q: Array, p: Array
 ) -> tuple[Array, Array, float]:
     """Return the state at the time ``end`` within a step of h from (q, p) at t, and the fraction of the step taken.
+
+    ``along``: the run or its states, with the parameters and options of the step.
 
     Raises:
         StepFailedError: if a partial step fails.
     """
-    if stepper.interface.words > 1:  # systems in transformed time are autonomous
-        return _part_of_two_words(stepper, h, fraction_of(end) - fraction_of(t), q, p, parameters, options)
-    return _located(stepper, t, h, float(end), q, p, parameters, options)
+    if along.stepper.interface.words > 1:  # systems in transformed time are autonomous
+        return _part_of_two_words(along, h, fraction_of(end) - fraction_of(t), q, p)
+    return _located(along, t, h, float(end), q, p)
 
 
 def _located(
-    stepper: Integrator,
-    t: float,
-    h: float,
-    end: float,
-    q: Array,
-    p: Array,
-    parameters: Array,
-    options: SolverOptions | None,
+    along: SavedStates | Memory, t: float, h: float, end: float, q: Array, p: Array
 ) -> tuple[Array, Array, float]:
     """Return the result of :func:`part_of_step`, to the precision of a double."""
-    binding = stepper.binding
+    binding = along.stepper.binding
     start_q, start_p, q1, p1 = (np.array(block_of(x), dtype=float) for x in (q, p, q, p))
     part, report = binding.numbers("double *"), binding.new("report *")
     status = binding.function("part_of_step")(
         t,
         h,
         end,
-        binding.pointer(start_q),
-        binding.pointer(start_p),
-        binding.pointer(block_of(parameters)),
-        binding.options(options),
-        binding.pointer(q1),
-        binding.pointer(p1),
+        *map(binding.pointer, (start_q, start_p, block_of(along.parameters))),
+        binding.options(along.options),
+        *map(binding.pointer, (q1, p1)),
         part,
         report,
         binding.workspace(),
@@ -75,14 +59,18 @@ def _located(
 
 
 def _part_of_two_words(
-    stepper: Integrator, h: float, span: Fraction, q: Array, p: Array, parameters: Array, options: SolverOptions | None
+    along: SavedStates | Memory, h: float, span: Fraction, q: Array, p: Array
 ) -> tuple[Array, Array, float]:
-    """Return the result of :func:`part_of_step` after a time in double-double arithmetic, by Newton's method."""
-    run = Memory.started(stepper, q, p, plan=Fixed(h), parameters=parameters, options=options)
+    """Return the result of :func:`part_of_step` after a time in double-double arithmetic.
+
+    Newton's method: the step size s in tau with t(s) = span is corrected by (span - t(s)) / (dt/dtau).
+    """
+    stepper, parameters = along.stepper, along.parameters
+    run = Memory.started(stepper, q, p, plan=Fixed(h), parameters=parameters, options=along.options)
     before, whole = run.snapshot, Fraction(h)
     size = span / Fraction(float(stepper.rates(q, p, parameters)[0]))
     if abs(size) > SHORT * abs(whole):
-        size = whole * Fraction(_located(stepper, 0.0, h, float(span), q, p, parameters, options)[2])
+        size = whole * Fraction(_located(along, 0.0, h, float(span), q, p)[2])
     for _ in range(MOST_CORRECTIONS):
         run.rollback(before)
         run._set_step(size)
@@ -90,7 +78,7 @@ def _part_of_two_words(
         miss = span - run._exact_time
         if abs(miss) <= MET * abs(span):
             break
-        size += miss / Fraction(float(run.stepper.rates(run.q, run.p, run.parameters)[0]))
+        size += miss / Fraction(float(stepper.rates(run.q, run.p, run.parameters)[0]))
     return run.q, run.p, float(size / whole)
 
 
@@ -105,9 +93,7 @@ def states_in_transformed_time(states: SavedStates, times: Array) -> tuple[Array
             j = int(np.searchsorted(states.forward * t_near, states.forward * times[k], side="right")) - 1
             q[k], p[k], part = q_near[j], p_near[j], 0.0
             if t_near[j] - times[k] != 0.0:
-                q[k], p[k], part = part_of_step(
-                    states.stepper, t_near[j], h, times[k], q[k], p[k], states.parameters, states.options
-                )
+                q[k], p[k], part = part_of_step(states, t_near[j], h, times[k], q[k], p[k])
             tau[k] = states.tau[saved] + (j + part) * h
     return q, p, tau
 
@@ -121,5 +107,5 @@ def _steps_from(states: SavedStates, saved: int) -> tuple[Array, Array, Array, f
     if count <= 1:
         return t, q, p, h
     further = states._restarted(saved, h)._fill(count - 1)
-    t, q, p = (np.concatenate(each) for each in zip((t, q, p), further, strict=True))
+    t, q, p = (np.concatenate(columns) for columns in zip((t, q, p), further, strict=True))
     return t, q, p, h
