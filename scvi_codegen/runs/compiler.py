@@ -225,8 +225,8 @@ class CachedSources:
         """The sources that are not in the cache."""
         from scvi_codegen.codegen.pipeline import Sources
 
-        chosen = self.solver, self.prefix, self.symmetries, self.g, self.controller, self.precision
-        return Sources(self.system, self.method, *chosen)
+        choices = self.solver, self.prefix, self.symmetries, self.g, self.controller, self.precision
+        return Sources(self.system, self.method, *choices)
 
     @property
     def variants(self) -> Variants:

@@ -396,13 +396,13 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         if not self.interface.layout.coordinates:
             self._check_not_of_run(None, threads)
         stepper: Any
-        stepper, state, known, own = read_checkpoint(
+        stepper, state, by_name, own = read_checkpoint(
             saved, self.origin or self, threads=threads, adaptive=t_end is not None
         )
         if isinstance(plan, Adaptive):
             plan = ErrorControl(**own._asdict() | control.named).to(plan.t_end)
         if parameters is None or isinstance(parameters, Mapping):
-            parameters = known | dict(parameters or {})
+            parameters = by_name | dict(parameters or {})
         return Run.restored(stepper, state, parameters=parameters, options=options, plan=plan)
 
     @checks_arguments(StateError)
@@ -636,7 +636,7 @@ class StepperOfRunTimeSizes(Stepper):
         if at_rest and not arguments and named.get("p") is None and named.get("velocity") is None:
             layout = self.interface.layout
             general = layout.momentum_formulas or (self._reason is not None and not layout.momenta)
-            spins = any(each.startswith("spin") for each in bound.interface.rotations)
+            spins = any(rotation.startswith("spin") for rotation in bound.interface.rotations)
             if not (spins or bound.interface.variables):  # their state has momenta of its own
                 positions, *_ = bound._states.start(state, None, None)
                 named["velocity" if general else "p"] = np.zeros(np.shape(positions))

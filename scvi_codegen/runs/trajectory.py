@@ -152,14 +152,14 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
                 f"a slice of a run with inputs must have stride 1, unlike {rows}: omit the stride, or slice the arrays "
                 "t, q and p"
             )
-        chosen: list[Self] = []
+        slices: list[Self] = []
         start = 0
         for piece in self.pieces:
             low, high = max(first - start, 0), min(last - start, len(piece))
             start += len(piece) - 1
-            if high - low > 1 or (high - low == 1 == last - first and not chosen):
-                chosen.append(piece[low:high])
-        return replace(joined(chosen), confirmation=self.confirmation)
+            if high - low > 1 or (high - low == 1 == last - first and not slices):
+                slices.append(piece[low:high])
+        return replace(joined(slices), confirmation=self.confirmation)
 
     def _joined(self, part: Callable[[Self], NDArray[Number]]) -> NDArray[Number]:
         """Return a quantity of the states, computed with the parameters of each piece."""
@@ -167,7 +167,7 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
 
     def _summed(self, part: Callable[[Self], Array]) -> Array:
         """Return a quantity that accumulates along the run."""
-        parts = [part(piece) for piece in self.pieces or (self,)]
+        parts = [part(piece) for piece in self._runs]
         for before, after in pairwise(parts):
             after += before[-1]
         return concatenated(parts)
@@ -232,10 +232,7 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
 
     def momentum_errors(self) -> Array:
         """Return (n, k) changes of the momentum maps since the first state, relative to their largest term."""
-        maps = [
-            each.stepper._momentum_maps_and_sizes(each.q, each.p, each.t, each.parameters)
-            for each in self.pieces or (self,)
-        ]
+        maps = [run.stepper._momentum_maps_and_sizes(run.q, run.p, run.t, run.parameters) for run in self._runs]
         values, sizes = (concatenated(part) for part in zip(*maps, strict=True))
         states = self.q, self.p, self.t, self.parameters
         return relative_changes(values, sizes, lambda _: self.stepper._momentum_bounds(*states))
@@ -258,7 +255,7 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
             StateError: if the states are not at whole steps.
         """
         require(self.stepper, "action")
-        parts = [actions_until(piece, piece.actions) for piece in self.pieces or (self,)]
+        parts = [actions_until(piece, piece.actions) for piece in self._runs]
         ends = compensated_sums(np.array([0.0, *(part[-1] for part in parts)]))
         sums = concatenated([part + end for part, end in zip(parts, ends, strict=False)])
         return sums if cumulative else float(ends[-1])
@@ -311,29 +308,27 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
 
     def constraint_values(self) -> tuple[Array, Array]:
         """Return (n, c) constraint residuals and (n, c) rates at the states, zero up to rounding."""
-        values = [
-            constraint_values(each.stepper, each.q, each.p, each.t, each.parameters) for each in self.pieces or (self,)
-        ]
+        values = [constraint_values(run.stepper, run.q, run.p, run.t, run.parameters) for run in self._runs]
         g, rate = (concatenated(part) for part in zip(*values, strict=True))
         return g, rate
 
     def states(self, units: Mapping[str, str] | None = None) -> States:
         """Return the states for :mod:`scvi_codegen.runs.results.export`."""
-        interface, piece = self.stepper.interface, (self.t, self.q, self.p, self.iterations)
-        known = dict(zip(interface.parameters, map(float, self.parameters), strict=True))
+        interface, columns = self.stepper.interface, (self.t, self.q, self.p, self.iterations)
+        by_name = dict(zip(interface.parameters, map(float, self.parameters), strict=True))
         derived: Callable[..., Any] = partial(quantities, self.stepper, self.parameters)
         if self.pieces:
             for k in columns_of_inputs(interface):
-                del known[interface.parameters[k]]
-            by_piece = [quantities(each.stepper, each.parameters, each.t, each.q, each.p) for each in self.pieces]
-            whole = {name: concatenated([each[name] for each in by_piece]) for name in by_piece[0]}
+                del by_name[interface.parameters[k]]
+            by_piece = [quantities(piece.stepper, piece.parameters, piece.t, piece.q, piece.p) for piece in self.pieces]
+            whole = {name: concatenated([values[name] for values in by_piece]) for name in by_piece[0]}
             derived = lambda *_: whole  # noqa: E731  (computed once)
         return States(
             count=len(self),
-            pieces=lambda: iter([piece]),
+            pieces=lambda: iter([columns]),
             coordinates=interface.coordinates,
             momenta=interface.momentum_columns,
-            parameters=known,
+            parameters=by_name,
             h=self.h,
             about=interface.about(),
             maps=interface.map_names,
@@ -418,7 +413,7 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
         if not (asked := as_events(events)):
             raise EventError("crossings requires at least one event, such as 'q' or Event('q', direction=1)")
         stepper = self.stepper.with_events(asked)
-        by_piece = [crossings_of(stepper, each) for each in self.pieces or (self,)]
+        by_piece = [crossings_of(stepper, piece) for piece in self._runs]
         return tuple(map(joined_crossings, zip(*by_piece, strict=True)))
 
     def _repr_html_(self) -> str:

@@ -158,25 +158,28 @@ class ConfirmedEnsemble:
     __slots__ = ()
     confirmations: tuple[GlobalError | None, ...]
 
+    def _of_each(self, name: str, missing: float) -> NDArray[Any]:
+        return np.array([missing if result is None else getattr(result, name) for result in self.confirmations])
+
     @property
     def global_error(self) -> Array:
         """(k,) estimated relative errors; NaN without ``error=`` and for trajectories that fail."""
-        return np.array([math.nan if each is None else each.estimate for each in self.confirmations])
+        return self._of_each("estimate", math.nan)
 
     @property
     def confirmed_digits(self) -> NDArray[np.int64]:
         """(k,) numbers of decimal digits of all states that a second run confirms; 0 where there is none."""
-        return np.array([0 if each is None else each.digits for each in self.confirmations], dtype=np.int64)
+        return self._of_each("digits", 0).astype(np.int64)
 
     @property
     def confirmed_until(self) -> Array:
         """(k,) times until which a second run confirms the error asked for; NaN where there is none."""
-        return np.array([math.nan if each is None else each.confirmed_until for each in self.confirmations])
+        return self._of_each("confirmed_until", math.nan)
 
 
 def warn_of_unconfirmed(confirmations: Sequence[GlobalError | None]) -> None:
     """Issue one warning for the trajectories whose requested global error is not confirmed."""
-    lost = [(j, each) for j, each in enumerate(confirmations) if each is not None and not each.confirmed]
+    lost = [(j, result) for j, result in enumerate(confirmations) if result is not None and not result.confirmed]
     if lost:
         j, first = lost[0]
         warn(
@@ -189,24 +192,24 @@ def warn_of_unconfirmed(confirmations: Sequence[GlobalError | None]) -> None:
 
 def checked_error(error: Any, others: Mapping[str, Any], stepper: Any = None) -> float:
     """Return the requested global error; raise StateError if it is unattainable or another option sets step sizes."""
-    wanted = checked_number(error, "the global error")
-    if not 0.0 < wanted < 1.0:
-        raise StateError(f"error={wanted:g} must be between 0 and 1: it bounds the relative global error")
+    bound = checked_number(error, "the global error")
+    if not 0.0 < bound < 1.0:
+        raise StateError(f"error={bound:g} must be between 0 and 1: it bounds the relative global error")
     for name, value in others.items():
         if value is not None:
             raise StateError(
-                f"error={wanted:g} and {name}={value!r} both determine the step size: error= requires adaptive steps; "
+                f"error={bound:g} and {name}={value!r} both determine the step size: error= requires adaptive steps; "
                 f"omit {name} and give t_end"
             )
     if stepper is not None:
         words = max(stepper.interface.words, 1 + (stepper._precise is not None))
-        if wanted < (least := smallest_estimate(words)):
+        if bound < (least := smallest_estimate(words)):
             remedy = ", or precision='double-double'" if words == 1 else ""
             raise StateError(
-                f"error={wanted:g} is below {least:.1e}, the least error that {NAMES_OF_PRECISIONS[words]} arithmetic "
+                f"error={bound:g} is below {least:.1e}, the least error that {NAMES_OF_PRECISIONS[words]} arithmetic "
                 f"confirms: give a larger error{remedy}"
             )
-    return wanted
+    return bound
 
 
 def smallest_estimate(words: int) -> float:
@@ -340,7 +343,7 @@ class Runs:
             attempts.append(attempt)
         if self.failure is not None and not attempts:
             raise self.failure
-        return min(attempts, key=lambda each: each[1].estimate)
+        return min(attempts, key=lambda attempt: attempt[1].estimate)
 
     def _by_tolerance(self) -> Iterator[Attempt]:
         """Yield runs of smaller and smaller tolerances, until errors are too large for an extrapolation."""
@@ -480,24 +483,24 @@ class _Samples:
         self.steps_of_run = t if t[0] == start else np.insert(t, 0, start)
         m = trajectory.q.shape[1]
         count = max(LEAST_SAMPLES, min(len(t) // STEPS_PER_SAMPLE, MOST_SAMPLES, MOST_NUMBERS // m))
-        chosen: Any = slice(None)
+        rows: Any = slice(None)
         if count < steps:
             speed = np.zeros(steps)
             with np.errstate(all="ignore"):
-                for each in map(np.asarray, states):
-                    largest = np.abs(each).max(axis=0)
+                for columns in map(np.asarray, states):
+                    largest = np.abs(columns).max(axis=0)
                     unit = np.maximum(largest, SLIGHT * largest.max() or 1.0)
-                    speed = np.fmax(speed, np.abs(np.diff(each / unit, axis=0)).max(axis=1))
+                    speed = np.fmax(speed, np.abs(np.diff(columns / unit, axis=0)).max(axis=1))
                 speed /= np.maximum(abs(np.diff(t)), TINY)
             size = -(-steps // count)
             parts = np.full((-(-steps // size), size), -1.0)
             parts.ravel()[:steps] = speed
             fastest = np.arange(1, steps + 1, size) + parts.argmax(axis=1)
-            chosen = [0, *fastest.tolist()]
-            chosen += [steps] if chosen[-1] < steps else []
-        self.t, self.states = t[chosen], [each[chosen] for each in states]
+            rows = [0, *fastest.tolist()]
+            rows += [steps] if rows[-1] < steps else []
+        self.t, self.states = t[rows], [vectors[rows] for vectors in states]
         self.epsilon, self.firsts = roundoff(interface.words), first_of_groups(interface, m)
-        self.errors = self.epsilon * np.abs(np.array([np.asarray(each) for each in self.states]))
+        self.errors = self.epsilon * np.abs(np.array([np.asarray(vectors) for vectors in self.states]))
         self.motion: Motion | None = None
         q, p = self.states
         self.kinetic = momenta_of_velocities(trajectory.stepper, self.t, q, p, trajectory.parameters)

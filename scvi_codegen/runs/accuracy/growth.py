@@ -246,11 +246,11 @@ class _Repetition:
     def _begin(self, nudge: float, tolerance: float) -> None:
         """Start the run at its perturbed initial state, on its constraints, with another local tolerance."""
         run, states = self.run, self.states
-        plan, t, given = replace(self._plan(), tolerance=tolerance), float(states.t[0]), states.parameters
-        q, p = (_perturbed(np.asarray(each), nudge, i) for i, each in enumerate((states.q, states.p)))
+        plan, t, values = replace(self._plan(), tolerance=tolerance), float(states.t[0]), states.parameters
+        q, p = (_perturbed(np.asarray(vectors), nudge, i) for i, vectors in enumerate((states.q, states.p)))
         if run.stepper.interface.constraints:
-            q, p, _ = projected(run.stepper, q, p, t, given)
-        run._start(q, p, plan=plan, t=t, parameters=given, options=run.options)
+            q, p, _ = projected(run.stepper, q, p, t, values)
+        run._start(q, p, plan=plan, t=t, parameters=values, options=run.options)
 
     def _plan(self) -> Adaptive:
         return cast(Adaptive, self.run.plan)

@@ -94,11 +94,11 @@ def warn_of_energy_errors(ensemble: Any, ends: Array | None = None) -> None:
     if stepper.changes_states or not (plans and stepper.interface.conserves_energy and warnings_wanted()):
         return
     by_trajectory, stride = {}, -(-len(plans) // MOST_CHECKED)
-    chosen = np.arange(0, len(plans), stride)
+    checked = np.arange(0, len(plans), stride)
     if ends is not None:
-        first, last = np.abs(ends[chosen]).T, np.abs(np.diff(ends[chosen])[:, 0])
-        chosen = chosen[~(last <= 0.5 * TOLERABLE_ERROR * np.maximum(first[0], first[1]))]
-    for j in chosen.tolist():
+        first, last = np.abs(ends[checked]).T, np.abs(np.diff(ends[checked])[:, 0])
+        checked = checked[~(last <= 0.5 * TOLERABLE_ERROR * np.maximum(first[0], first[1]))]
+    for j in checked.tolist():
         t, q, p, _, _ = ensemble._one(j)
         if len(t) and (energies := _changed_energies(stepper, t, q, p, ensemble.parameters[j])):
             by_trajectory[j] = energies
@@ -146,7 +146,7 @@ def _changed_energies(
     resolution = RESOLVED * roundoff(stepper.interface.words)
     if (np.ptp(np.asarray(q), axis=0) <= resolution * np.abs(np.asarray(q)).max(axis=0)).all():
         return None
-    t, q, p = (each[:: max(1, len(each) - 1)].copy() for each in (t, q, p))
+    t, q, p = (column[:: max(1, len(column) - 1)].copy() for column in (t, q, p))
     try:
         energies = stepper._energies_of(t, q, p, parameters)
         first, last = float(energies[0]), float(energies[-1])

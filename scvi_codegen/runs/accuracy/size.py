@@ -133,7 +133,7 @@ class SizeOfMotion:
     @classmethod
     def of(cls, q: Array, p: Array, at_rest: Array | float = 0.0) -> "SizeOfMotion":
         """Return the sizes of (n, m) states; ``at_rest``: (m,) momenta without velocity, of the gauge of L."""
-        of_q, of_p = (roundoff(1) * float(np.abs(each).max(initial=0.0)) for each in (q, p))
+        of_q, of_p = (roundoff(1) * float(np.abs(vectors).max(initial=0.0)) for vectors in (q, p))
         return cls(largest_range(q), float(np.abs(p - at_rest).max(initial=0.0)), (of_q, of_p))
 
     def error(self, position: float, momentum: float) -> float:

@@ -72,14 +72,14 @@ def actions_between(states: SavedStates) -> Array:
     return result
 
 
-def actions_until(states: SavedStates, known: Array | None) -> Array:
-    """Return the (n,) actions from the first saved state to each; ``known``: those that the run summed.
+def actions_until(states: SavedStates, summed: Array | None) -> Array:
+    """Return the (n,) actions from the first saved state to each; ``summed``: those of the run.
 
     They are computed again where a step was not solved by the fixed-point iteration that sums them. Raises as
     :func:`actions_between`.
     """
-    if known is not None and np.isfinite(known).all():
-        return np.asarray(known - known[0])
+    if summed is not None and np.isfinite(summed).all():
+        return np.asarray(summed - summed[0])
     return compensated_sums(np.concatenate([[0.0], actions_between(states)]))
 
 

@@ -165,12 +165,12 @@ def propagate(states: SavedStates, starts: Starts, numbers: NDArray[np.intp], ve
         ends = states.stepper._propagate(
             part, vectors[first : last + 1], states.parameters, states.options, transpose=back
         )
-        known = np.concatenate([part.q, part.p], axis=1)
+        saved = np.concatenate([part.q, part.p], axis=1)
         if last in jumps:
-            known[-1] = jumps[last].before
+            saved[-1] = jumps[last].before
             if not back:
                 vectors[last] = vectors[last] @ jumps[last].matrix.T
-        check_recomputed(part.t, np.concatenate(ends, axis=1), known[1:], known[:-1])
+        check_recomputed(part.t, np.concatenate(ends, axis=1), saved[1:], saved[:-1])
 
 
 def pieces(states: SavedStates) -> Iterator[tuple[int, int]]:

@@ -8,6 +8,7 @@ states along v: tangent propagation, then second-order adjoints.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -108,10 +109,12 @@ class TrajectoryDerivatives(SavedStates):
     steps of tau are fixed and the times of states vary, except the final time of a run (t_end or an event).
     """
 
+    pieces: tuple[Self, ...]
+
     @property
-    def _runs(self) -> tuple[SavedStates, ...]:
+    def _runs(self) -> tuple[Self, ...]:
         """Trajectories between the breakpoints of inputs, this one without inputs; each begins where the last ends."""
-        return getattr(self, "pieces", ()) or (self,)
+        return self.pieces or (self,)
 
     def _require(self, operation: str) -> None:
         """Raise the error of an operation that the stepper or the inputs of the run exclude."""
@@ -195,8 +198,8 @@ class TrajectoryDerivatives(SavedStates):
             at_starts.append(forward(run, at_starts[-1])[1])
         now, by_runs = np.zeros((2, *at_starts[0].shape)), list[Array]()
         backward_runs = zip(self._back(derivatives), self._back(hessian_blocks), reversed(at_starts), strict=True)
-        for (run, run_seeds), (_, curved), tangents in backward_runs:
-            now = second_order_adjoints(run, run_seeds, curved, tangents, self._without_inputs(now))
+        for (part, run_seeds), (_, curved), tangents in backward_runs:
+            now = second_order_adjoints(part, run_seeds, curved, tangents, self._without_inputs(now))
             by_runs.append(now[1])
         return self._gradient(by_runs[::-1], columns.shape[1:])
 

@@ -90,30 +90,30 @@ class Saver(Observer):
 
     def check_room(self, run: Memory) -> None:
         """Raise ``StepFailedError`` if the saved states fill the memory."""
-        self.bytes += sum(each.nbytes for rows in self.rows[self.measured :] for each in rows)
+        self.bytes += sum(column.nbytes for rows in self.rows[self.measured :] for column in rows)
         self.measured = len(self.rows)
         if self.bytes > room_for_states():
-            raise too_many_states(sum(len(each[0]) for each in self.rows), run.steps, float(run.t))
+            raise too_many_states(sum(len(rows[0]) for rows in self.rows), run.steps, float(run.t))
 
-    def wanted(self, chunk: StateChunk) -> NDArray[np.bool_]:
+    def is_saved(self, chunk: StateChunk) -> NDArray[np.bool_]:
         """Return which states of a chunk to save."""
-        wanted: NDArray[np.bool_] = chunk.numbers % self.save_every == 0  # states within a step only if all are saved
-        wanted &= self.within_steps | (chunk.numbers >= 0)
-        wanted[0] = chunk.is_first
-        wanted[-1] |= chunk.is_last
-        return wanted
+        saved: NDArray[np.bool_] = chunk.numbers % self.save_every == 0  # states within a step only if all are saved
+        saved &= self.within_steps | (chunk.numbers >= 0)
+        saved[0] = chunk.is_first
+        saved[-1] |= chunk.is_last
+        return saved
 
     def receive(self, chunk: StateChunk) -> None:
-        """Save the states that are wanted."""
-        if (wanted := self.wanted(chunk)).any():
-            self.save(chunk, wanted)
+        """Save the states of the output."""
+        if (saved := self.is_saved(chunk)).any():
+            self.save(chunk, saved)
 
-    def save(self, chunk: StateChunk, wanted: NDArray[np.bool_]) -> None:
+    def save(self, chunk: StateChunk, saved: NDArray[np.bool_]) -> None:
         """Save some states of a chunk."""
         part = chunk.states
-        t, q, p, sizes, stepped = (each[wanted] for each in (part.t, part.q, part.p, part.step_sizes, part.stepped))
-        actions = np.full(len(t), np.nan) if part.actions is None else part.actions[wanted]
-        self.rows.append((t, q, p, sizes, stepped, chunk.iterations[wanted], actions))
+        t, q, p, sizes, stepped = (column[saved] for column in (part.t, part.q, part.p, part.step_sizes, part.stepped))
+        actions = np.full(len(t), np.nan) if part.actions is None else part.actions[saved]
+        self.rows.append((t, q, p, sizes, stepped, chunk.iterations[saved], actions))
 
     def cut_step(self, size: float) -> None:
         """Set the size of the step that follows the last state, which an event may have cut, if that is saved."""
@@ -168,14 +168,14 @@ class Observed(Saver):
 
     def receive(self, chunk: StateChunk) -> None:
         """Pass the states to the observer."""
-        wanted = self.wanted(chunk)
+        saved = self.is_saved(chunk)
         if isinstance(self.observer, Observer):
             self.observer.receive(chunk)
-        elif wanted.any():
+        elif saved.any():
             self._call(chunk)
-        if not wanted.any():
+        if not saved.any():
             return
-        self.save(chunk, wanted)
+        self.save(chunk, saved)
         t, q, p, sizes, stepped, count, actions = self.rows[-1]
         self.rows[-1] = t, q[:0], p[:0], sizes, stepped, count, actions
         self.ends = [*self.ends[:1], (q[-1], p[-1])]
@@ -202,7 +202,7 @@ class Observed(Saver):
         observed: Any = self.observed
         if isinstance(self.observer, Observer):
             observed = real_array(self.observer.result(), "the result of observe")
-        q, p = (np.concatenate([end[None] for end in each]) for each in zip(*self.ends, strict=True))
+        q, p = (np.concatenate([end[None] for end in states]) for states in zip(*self.ends, strict=True))
         return {"q": q, "p": p, "observed": np.array(observed), "conserved": np.array(self.conserved)}
 
 

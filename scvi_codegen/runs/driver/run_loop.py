@@ -124,16 +124,16 @@ class StateRows:
     def after(self, row: int) -> tuple[Any, ...]:
         """Return pointers to a row."""
         (t, q, p, *others), begin = self.starts, row * self.states[1].shape[1]
-        return t + self.words * row, q + begin, p + begin, *(each + row for each in others)
+        return t + self.words * row, q + begin, p + begin, *(column + row for column in others)
 
     def first(self, count: int) -> States:
         """Return the first rows, in the same memory; copies of numbers of two words."""
-        t, q, p, *others = (each[:count] for each in self.states)
+        t, q, p, *others = (column[:count] for column in self.states)
         return (t, q, p, *others) if self.words == 1 else (*_numbers(t, q, p), *others)
 
     def copies(self, count: int) -> States:
         """Return copies of the first rows."""
-        return tuple(each.copy() for each in self.first(count))
+        return tuple(column.copy() for column in self.first(count))
 
 
 class ShortRuns(StateRows):
@@ -225,8 +225,8 @@ class _StateRecorder:
             t, q, p, _, *actions = self.rows.states
             t[0] = memory.t if self.rows.words == 1 else (memory.t, memory._memory.t_low)
             q[0], p[0] = map(block_of, (memory._q, memory._p))
-            for each in actions:
-                each[0] = memory._memory.action
+            for sums in actions:
+                sums[0] = memory._memory.action
         self.earlier: list[States] = []
         self.bytes = 0
         self.watch = ProgressWatch(memory.stepper, plan.t_end) if isinstance(plan, InTau) else None
@@ -238,10 +238,10 @@ class _StateRecorder:
         before = None if watch is None else memory.t
         if to_end and self.filled + size // save_every + 2 > len(self.rows.states[0]):
             self.earlier.append(self._states())
-            self.bytes += sum(each.nbytes for each in self.earlier[-1])
+            self.bytes += sum(column.nbytes for column in self.earlier[-1])
             if self.bytes > room_for_states():
                 self.filled = 0
-                raise too_many_states(sum(len(each[0]) for each in self.earlier), memory.steps, float(memory.t))
+                raise too_many_states(sum(len(states[0]) for states in self.earlier), memory.steps, float(memory.t))
             self.rows, self.filled = StateRows(memory, size // save_every + 2), 0
         rows, filled = self.rows, self.filled
         status = memory._advance(size, save_every, rows.after(filled))

@@ -155,7 +155,7 @@ def _in_two_words(name: str, argument: Any, trajectories: int | None) -> Input:
 
 def _rates_of_lines(t: Array, high: Array, low: Array) -> tuple[Array, Array]:
     """Return the time derivatives of linear pieces between values of two words, in two words."""
-    (rise, rest), (run, run_low) = (_differences(np.asarray(each)) for each in (high, t))
+    (rise, rest), (run, run_low) = (_differences(np.asarray(values)) for values in (high, t))
     rates = rise / run
     product, cut = exact_product(rates, run)
     return rates, ((rise - product) - cut + (rest + np.diff(low)) - rates * run_low) / run
@@ -245,14 +245,14 @@ def record_segments(
     for steps in segments:
         try:
             if size > room_for_states():
-                raise too_many_states(sum(len(each) - 1 for each in pieces) + 1, run.steps, float(run.t))
+                raise too_many_states(sum(len(piece) - 1 for piece in pieces) + 1, run.steps, float(run.t))
             piece = recorded(steps)
         except StepFailedError as failure:
             last = [] if failure.trajectory is None else [with_final_state(Trajectory.before(failure), run)]
             failure.trajectory = joined([*pieces, *last])
             raise
         pieces.append(piece if run.ended else with_final_state(piece, run))
-        size += sum(each.nbytes for each in (piece.t, piece.q, piece.p))
+        size += sum(column.nbytes for column in (piece.t, piece.q, piece.p))
         if run.ended or stopped():
             break
     return joined(pieces or [recorded(0)])

@@ -71,7 +71,7 @@ class CrossingSearch:
         done = 0
         while True:
             crossings, filled = self.binding.new(f"crossing[{self._capacity}]"), self.binding.numbers("long long *")
-            rows = [self.binding.pointer(each[done:]) for each in (h, t, q, p)]
+            rows = [self.binding.pointer(column[done:]) for column in (h, t, q, p)]
             to = self._capacity, crossings, filled, report, workspace
             status = self.binding.function("crossings")(self.watch, len(t) - done, *rows, parameters, options, *to)
             self._record(crossings, int(filled[0]))
@@ -107,7 +107,7 @@ class CrossingSearch:
         filled = binding.numbers("long long *")
         t_end = np.inf if isinstance(plan, Fixed) else plan.t_end
         arguments = self.watch, t_end, run._control, size, *run._arguments, most
-        states = *(binding.pointer(each[1:]) for each in rows), binding.integers(iterations[1:])
+        states = *(binding.pointer(column[1:]) for column in rows), binding.integers(iterations[1:])
         to = self._capacity, crossings, filled, run._report, run._workspace
         advance = binding.function("advance_with_changes", run._memory)
         status = advance(*arguments, *states, binding.whole_numbers(numbers[1:]), *to)
@@ -116,7 +116,7 @@ class CrossingSearch:
         failure = self._failure(status, report, number + int(report.steps), run._step_size) if status else None
         if not (failure or self.ended or report.steps == size or run.arrived):
             self._capacity *= 2  # too small for the crossings of a step
-        t, q, p, lengths = (each[:count] for each in rows)
+        t, q, p, lengths = (column[:count] for column in rows)
         sizes = np.append(lengths[1:], np.nan if run.h is None else run.h)
         return (t, q, p, iterations[:count]), sizes, numbers[:count], failure
 
@@ -129,7 +129,9 @@ class CrossingSearch:
         self.recorded.append(records)
         if self._bytes > MOST_BYTES:
             names: Any = [name for name in ("t", "function", "element") if name in (records.dtype.names or ())]
-            self.recorded = [each[names].copy() if each.dtype.names != (*names,) else each for each in self.recorded]
+            self.recorded = [
+                records[names].copy() if records.dtype.names != (*names,) else records for records in self.recorded
+            ]
         if before <= MOST_BYTES < self._bytes:
             warn(
                 f"the states of crossings until t = {self.last[0]:.6g} exceed {MOST_BYTES / 2**30:g} GiB and are not "

@@ -66,7 +66,7 @@ class EventFunctions:
         moving = set(formulas.v)
         pairs = zip(formulas.functions, formulas.changes, strict=True)
         of_changes = [[function, *values] for function, (_, values) in pairs]
-        self.velocities = [any(not each.free_symbols.isdisjoint(moving) for each in group) for group in of_changes]
+        self.velocities = [any(moving & formula.free_symbols for formula in group) for group in of_changes]
         self.stepper = stepper
 
     def value(self, number: int, at: TimedState, parameters: Array) -> Any:

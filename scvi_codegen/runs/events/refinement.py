@@ -67,9 +67,9 @@ class RefinedSearch(CrossingSearch):
     def search(self, part: SavedStates, first: int = 0) -> int:
         """Search between consecutive states; see the base class."""
         numbers: dict[str, Any] = {name: np.array(getattr(part, name)) for name in ("t", "q", "p", "parameters")}
-        known = len(self.recorded)
+        before = len(self.recorded)
         reached = super().search(replace(cast(Any, part), **numbers), first)
-        for records in self.recorded[known:]:
+        for records in self.recorded[before:]:
             self.refined += [self._refined(part, record) for record in records]
         self.recorded.clear()
         if self.ended:
@@ -164,8 +164,9 @@ class RefinedSearch(CrossingSearch):
         iterations, run.iterations, end = run.iterations, 0, _place(run)
         at, h, rows = start, end.t - start.t, list[SavedRow]()
         for crossings in self._located(run, start, h, number):
-            roots = [self._root(run, at, self._function(each), Fraction(float(each["t"])), h) for each in crossings]
-            acting = [k for k, each in enumerate(crossings) if self.watch.acts[int(each["function"])]]
+            guesses = [(self._function(crossing), Fraction(float(crossing["t"]))) for crossing in crossings]
+            roots = [self._root(run, at, *guess, h) for guess in guesses]
+            acting = [k for k, crossing in enumerate(crossings) if self.watch.acts[int(crossing["function"])]]
             stop = None if acting else roots[-1]
             if acting:  # crossings that coincide have one state
                 before = roots[acting[0]]
@@ -215,7 +216,7 @@ class RefinedSearch(CrossingSearch):
             if failure is not None:
                 raise failure
             if self.ended or twin._report.steps:
-                together = groupby(records, lambda each: (each["t"], each["fraction"]))
+                together = groupby(records, lambda crossing: (crossing["t"], crossing["fraction"]))
                 return [[*group] for _, group in together]
 
     @cached_property
@@ -224,14 +225,14 @@ class RefinedSearch(CrossingSearch):
 
     def crossings(self) -> tuple[Crossings, ...]:
         """Return the crossings by event, with times and states of two words."""
-        states, found = self.precise._states, []
+        states, by_event = self.precise._states, []
         for number, event in enumerate(self.stepper.events):
-            mine = [each for each in self.refined if each.function == number]
+            mine = [crossing for crossing in self.refined if crossing.function == number]
             none = states.missing((0,)), *(states.missing((0, states.dimension)) for _ in range(2))
-            t, q, p = (stacked([each[k] for each in mine]) for k in (1, 2, 3)) if mine else none
-            elements = np.array([each.element for each in mine], dtype=np.int64)
-            found.append(Crossings(event=event, t=t, q=states.named(q), p=states.named(p), element=elements))
-        return tuple(found)
+            t, q, p = (stacked([crossing[k] for crossing in mine]) for k in (1, 2, 3)) if mine else none
+            elements = np.array([crossing.element for crossing in mine], dtype=np.int64)
+            by_event.append(Crossings(event=event, t=t, q=states.named(q), p=states.named(p), element=elements))
+        return tuple(by_event)
 
 
 def _element(record: Any) -> int:

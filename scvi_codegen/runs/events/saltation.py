@@ -81,7 +81,7 @@ def _changes(states: SavedStates, numbers: NDArray[np.intp]) -> dict[int, tuple[
         if states.forward < 0.0:
             raise StateError("derivatives through events that change the state require a run forward in time")
         here = (numbers[0] < rows) & (rows <= numbers[-1])
-        each = states.stepper._events_of_entries(crossings.event) if here.any() else ()
+        entry_events = states.stepper._events_of_entries(crossings.event) if here.any() else ()
         entries = (crossings.element[here], crossings.q[here], crossings.p[here])
         for row, element, q, p in zip(rows[here].tolist(), *entries, strict=True):
             if row in result:
@@ -89,7 +89,7 @@ def _changes(states: SavedStates, numbers: NDArray[np.intp]) -> dict[int, tuple[
                     f"the run meets the events '{result[row][0].function}' and '{crossings.event.function}' at once at "
                     f"t = {states.t[row]:.17g}: derivatives do not exist in a corner"
                 )
-            result[row] = each[element], np.concatenate([q, p])
+            result[row] = entry_events[element], np.concatenate([q, p])
     return result
 
 
@@ -171,12 +171,12 @@ def _derivatives(interface: Interface, event: Event) -> Callable[[Array, float, 
     variables = (*z, *formulas.parameters, time)
     new = dict(zip(indices, values, strict=True))
     if any(index >= len(z) for index in indices) or any(
-        each.free_symbols.intersection(formulas.v) for each in (*formulas.functions, *values)
+        formula.free_symbols.intersection(formulas.v) for formula in (*formulas.functions, *values)
     ):
         raise StateError(
             f"derivatives through the event '{event.function}' require momenta instead of velocities in its formulas"
         )
-    mapped = [new.get(k, each) for k, each in enumerate(z)] if event.restitution is None else list(values)
+    mapped = [new.get(k, unchanged) for k, unchanged in enumerate(z)] if event.restitution is None else list(values)
     entries = [formulas.functions[0].diff(x) for x in variables]
     entries += [value.diff(x) for value in mapped for x in variables]
     function = sympy.lambdify((variables,), [*entries, *mapped], cse=True)
@@ -211,7 +211,7 @@ def _impact(states: SavedStates, values: Values, before: Array, after: Array, t:
         return state[m:], by[m:] + impulse * onto @ values.map[:m], onto @ n
 
     p1, p1_by, p1_by_impulse = changed(full)
-    v0, v1 = (np.asarray(stepper.velocity(q, each, t, parameters)) for each in (p, p1))
+    v0, v1 = (np.asarray(stepper.velocity(q, momenta, t, parameters)) for momenta in (p, p1))
     residual = full * (v1 @ values.map[:m] + values.map[m])
     residual[m : 2 * m] += v1 - v0
     residual += _energy_differences(states, q, (p, p1), t, all_inputs)
@@ -265,7 +265,7 @@ def _differences(
 
 def _increments(states: SavedStates) -> Array:
     """Return the (m + 1,) increments of q and t, which do not depend on their origins, as windings of angles do."""
-    by_q, by_t = (np.abs(np.diff(each, axis=0)).mean(axis=0) for each in (np.asarray(states.q), np.asarray(states.t)))
+    by_q, by_t = (np.abs(np.diff(np.asarray(x), axis=0)).mean(axis=0) for x in (states.q, states.t))
     return np.append(np.maximum(DIFFERENCE, OF_STEP * by_q), OF_STEP * by_t)
 
 
@@ -288,7 +288,7 @@ def _energy_differences(states: SavedStates, q: Array, ends: tuple[Array, Array]
     for k in range(len(parameters) if all_inputs else 0):
         step = DIFFERENCE * max(1.0, abs(parameters[k]))
         sides = [parameters + place * step * (np.arange(len(parameters)) == k) for place in PLACES]
-        result[2 * m + k] = _central_differences(np.concatenate([difference(each) for each in sides])) / step
+        result[2 * m + k] = _central_differences(np.concatenate([difference(side) for side in sides])) / step
     return result
 
 

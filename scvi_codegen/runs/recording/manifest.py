@@ -326,7 +326,7 @@ class Manifest:
             **({"events": [event.table for event in self.events]} if self.events else {}),
             **({"mesh": self.mesh} if self.mesh else {}),
             **({"parameters_low": self.parameters_low} if self.parameters_low else {}),
-            **({"double": [each and each.to_record() for each in self.double]} if self.double else {}),
+            **({"double": [part and part.to_record() for part in self.double]} if self.double else {}),
         }
         return sealed_text(document)
 

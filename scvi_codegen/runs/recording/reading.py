@@ -100,8 +100,8 @@ class RecordedRun(AttitudeHistory):
         if not isinstance(rows, slice):
             k = checked_row(rows, len(self))
             return scalar(self.t[k]), self.q[k], self.p[k]
-        wanted = self.rows(rows)
-        return self._trajectory(tuple(self.gather(wanted, range(len(COLUMNS)))), wanted)
+        numbers = self.rows(rows)
+        return self._trajectory(tuple(self.gather(numbers, range(len(COLUMNS)))), numbers)
 
     @cached_property
     def mesh(self) -> Any:
@@ -253,8 +253,10 @@ class RecordedRun(AttitudeHistory):
 
     def states(self, units: Mapping[str, str] | None = None) -> States:
         """Return the states for :mod:`scvi_codegen.runs.results.export`, read file by file."""
-        manifest = self.manifest
-        numbers = (("t", self.t), ("q", self.q), ("p", self.p), ("parameters", manifest.values))
+        manifest, low = self.manifest, dict[str, Array]()
+        if manifest.interface.words > 1:
+            numbers = {"t": self.t, "q": self.q, "p": self.p, "parameters": manifest.values}
+            low = {f"{name}_low": low_words(column[:]) for name, column in numbers.items()}
         return States(
             count=len(self),
             pieces=self._pieces,
@@ -267,7 +269,7 @@ class RecordedRun(AttitudeHistory):
             attitudes=named_quantities(manifest.interface),
             quantities=lambda t, q, p: quantities(self.stepper, manifest.values, t, q, p),
             units=checked_units(units),
-            low={f"{name}_low": low_words(each[:]) for name, each in numbers} if manifest.interface.words > 1 else {},
+            low=low,
         )
 
     @checks_arguments()
@@ -288,7 +290,7 @@ class RecordedRun(AttitudeHistory):
         in_tau = manifest.interface.in_tau and isinstance(manifest.plan, Fixed)
         tau = times_after(0.0, self.h, taken)[0] if in_tau else None
         lengths, low, high = self._lengths(t, rows), t.min(initial=np.inf), t.max(initial=-np.inf)
-        events = tuple(each.chosen((each.t >= low) & (each.t <= high)) for each in self.events)
+        events = tuple(crossings.chosen((crossings.t >= low) & (crossings.t <= high)) for crossings in self.events)
         trajectory = trajectory_of(run, (t, q, p, iterations), lengths, tau=tau, events=events)
         trajectory.h = self.h
         return trajectory
@@ -350,6 +352,6 @@ class LazyArray:
 
     def __getitem__(self, index: Any) -> Any:
         rows, *rest = index if isinstance(index, tuple) else (index,)
-        wanted = self._run.rows(rows)
-        (values,) = self._run.gather(np.atleast_1d(wanted), [self._column])
-        return values[(slice(None), *rest)] if wanted.ndim else values[(0, *rest)]
+        numbers = self._run.rows(rows)
+        (values,) = self._run.gather(np.atleast_1d(numbers), [self._column])
+        return values[(slice(None), *rest)] if numbers.ndim else values[(0, *rest)]

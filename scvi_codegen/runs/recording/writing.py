@@ -192,9 +192,13 @@ def resume_run(
 def _mesh(run: Run) -> dict[str, Any] | None:
     """Return the mesh of the fields of a density for the manifest."""
     mesh, names = run.stepper.interface.layout.mesh, run.stepper.interface.parameters
+    if mesh is None:
+        return None
     values = dict(zip(names, map(float, run.parameters), strict=True))
-    known = () if mesh is None else map(str, mesh.field_system.parameters)
-    return mesh and {"field": mesh.to_section(), "parameters": {name: values[name] for name in known}}
+    return {
+        "field": mesh.to_section(),
+        "parameters": {name: values[name] for name in map(str, mesh.field_system.parameters)},
+    }
 
 
 def _double(stepper: Any) -> tuple[Any, ...]:
@@ -300,10 +304,10 @@ class _Recorder:
         run, (pieces, crossings, *_) = self.run, self.pending
         piece = trajectory.t[first:], trajectory.q[first:], trajectory.p[first:], trajectory.iterations[first:]
         events = trajectory.events
-        for k, each in enumerate(events):
-            numbers = (k + len(events) * each.element)[:, np.newaxis]
-            found = np.concatenate([numbers, each.t[:, np.newaxis], each.q, each.p], axis=1)
-            crossings = np.concatenate([crossings, found])
+        for k, crossing in enumerate(events):
+            numbers = (k + len(events) * crossing.element)[:, np.newaxis]
+            rows = np.concatenate([numbers, crossing.t[:, np.newaxis], crossing.q, crossing.p], axis=1)
+            crossings = np.concatenate([crossings, rows])
         self.pending = ([*pieces, piece], crossings, run.steps, run.t, run.checkpoint())
 
     def checkpoint(self) -> None:
@@ -371,8 +375,8 @@ def _extended(manifest: Manifest, run: Run, steps: int | None, t_end: float | No
     if isinstance(run.plan, FixedSteps):
         if t_end is not None:
             raise StateError(f"the run has fixed steps h = {run._step_size:g}: give steps instead of t_end")
-        wanted = manifest.steps if steps is None else steps
-        return replace(manifest, steps=checked_count(wanted, "steps", least=0)), run.plan
+        count = manifest.steps if steps is None else steps
+        return replace(manifest, steps=checked_count(count, "steps", least=0)), run.plan
     _checked_steps(run, steps)
     assert not isinstance(manifest.plan, Fixed)  # as that of the run
     plan = run.plan if t_end is None else replace(run.plan, t_end=checked_number(t_end, "t_end"))
@@ -385,8 +389,8 @@ def _of_known_sizes(run: Run) -> Run:
     """Return the run of the stepper with known sizes from the same state."""
     if run.stepper.known is run.stepper:
         return run
-    known = run.stepper._known_with_events
-    return Run.started(known, run.q, run.p, plan=run.plan, t=run.t, parameters=run.parameters, options=run.options)
+    stepper = run.stepper._known_with_events
+    return Run.started(stepper, run.q, run.p, plan=run.plan, t=run.t, parameters=run.parameters, options=run.options)
 
 
 def _checked_checkpoints(seconds: float, steps: int | None) -> tuple[float, int | None]:

@@ -120,8 +120,9 @@ class States:
             whole["symmetry"] = np.array(self.maps)
         attitudes = self.attitudes if self.quantities is not None else ()
         if attitudes:
-            axes = {axis: values for each in attitudes for axis, values in each.axes.items()}
-            dimensions |= {axis: (axis,) for axis in axes} | {each.name: ("t", *each.dimensions) for each in attitudes}
+            axes = {axis: values for quantity in attitudes for axis, values in quantity.axes.items()}
+            dimensions |= {axis: (axis,) for axis in axes}
+            dimensions |= {quantity.name: ("t", *quantity.dimensions) for quantity in attitudes}
             whole |= axes
         return Labelled(
             dimensions=dimensions,
@@ -130,7 +131,7 @@ class States:
             count=self.count,
             units={name: unit for name, unit in self.units.items() if name in dimensions},
             attributes=self.attributes,
-            long_names={each.name: each.long_name for each in attitudes},
+            long_names={quantity.name: quantity.long_name for quantity in attitudes},
         )
 
     def _labelled_pieces(self) -> Iterator[dict[str, NDArray[Any]]]:
@@ -204,7 +205,7 @@ def _names(states: States) -> list[str]:
     names = ["t", *states.coordinates, *states.momenta, "iterations"]
     if states.quantities is not None:
         names += [*(f"{name}_dot" for name in states.coordinates), "energy"]
-        names += [name for each in states.attitudes for name in each.columns]
+        names += [name for quantity in states.attitudes for name in quantity.columns]
     return names
 
 
@@ -214,7 +215,7 @@ def _columns(states: States) -> Iterator[Iterator[NDArray[Any]]]:
         derived = {} if states.quantities is None else states.quantities(t, q, p)
         more = (*derived["velocity"].T, derived["energy"]) if derived else ()
         if derived:
-            tables = [derived[each.name].reshape(len(t), -1).T for each in states.attitudes if each.columns]
+            tables = [derived[quantity.name].reshape(len(t), -1).T for quantity in states.attitudes if quantity.columns]
             more += tuple(column for table in tables for column in table)
         yield iter((t, *q.T, *p.T, iterations, *more))
 

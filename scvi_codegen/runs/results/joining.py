@@ -44,7 +44,7 @@ def concatenated(parts: Sequence[NDArray[Number]]) -> NDArray[Number]:
 def joined_crossings(crossings: Sequence[Crossings]) -> Crossings:
     """Concatenate the crossings of one event over all pieces."""
     names = "t", "q", "p", "element"
-    joined = {name: np.concatenate([getattr(each, name) for each in crossings]) for name in names}
+    joined = {name: np.concatenate([getattr(part, name) for part in crossings]) for name in names}
     return Crossings(event=crossings[0].event, **joined)
 
 

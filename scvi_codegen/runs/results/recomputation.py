@@ -59,17 +59,17 @@ def changes_by_events(states: SavedStates) -> Iterator[tuple[Crossings, NDArray[
         times = states.forward * crossings.t
         here = (t[0] <= times) & (times <= t[-1])
         rows = np.searchsorted(t, times[here])
-        chosen = crossings.chosen(here)
+        inside = crossings.chosen(here)
         # the time of a crossing near the end of a step is that of two states: the first may be the one before it
-        after, (q, p) = np.minimum(rows + 1, len(t) - 1), (np.asarray(each) for each in (chosen.q, chosen.p))
+        after, (q, p) = np.minimum(rows + 1, len(t) - 1), (np.asarray(state) for state in (inside.q, inside.p))
         apart = [np.abs(states.q[k] - q).sum(axis=1) + np.abs(states.p[k] - p).sum(axis=1) for k in (rows, after)]
         rows = np.where((t[after] == times[here]) & (apart[0] < 0.5 * apart[1]), after, rows)
         if crossings.event.changes_state:
             if not np.array_equal(t[rows], times[here]):
                 raise StateError("this requires the states after changes by events: save all states (save_every=1)")
-            if np.isnan(np.asarray(chosen.q)).any():
+            if np.isnan(np.asarray(inside.q)).any():
                 raise StateError("this requires the states of crossings, which exceed 1 GiB: integrate in parts")
-            yield chosen, rows
+            yield inside, rows
 
 
 def steps_after(states: SavedStates, first: int, last: int) -> Array:
@@ -92,21 +92,21 @@ def steps_between(length: float, span: float) -> int:
     return max(1, count)
 
 
-def check_recomputed(t: Array, recomputed: Array, known: Array, before: Array) -> None:
+def check_recomputed(t: Array, recomputed: Array, saved: Array, before: Array) -> None:
     """Raise :class:`StateError` for the first of n recomputed steps that converged to a spurious root.
 
     Deviations are relative to the largest entry of a state, since entries that are 0 contain only rounding errors.
 
     Args:
         t: (n,) start times of the steps.
-        recomputed, known: (n, 2m) recomputed and saved states at their ends.
+        recomputed, saved: (n, 2m) recomputed and saved states at their ends.
         before: (n, 2m) states at their starts.
     """
-    apart = recomputed - known
-    lengths = (np.einsum("ij,ij->i", x, x) for x in (apart, known))
-    near = np.less(known.shape[1] * next(lengths), SAME_STATE**2 * next(lengths))  # sufficient, cheaper than maxima
+    apart = recomputed - saved
+    lengths = (np.einsum("ij,ij->i", x, x) for x in (apart, saved))
+    near = np.less(saved.shape[1] * next(lengths), SAME_STATE**2 * next(lengths))  # sufficient, cheaper than maxima
     rows = np.flatnonzero(~near)
-    sizes = np.maximum(np.abs(known[rows]).max(axis=1), np.abs(before[rows]).max(axis=1))
+    sizes = np.maximum(np.abs(saved[rows]).max(axis=1), np.abs(before[rows]).max(axis=1))
     deviating = rows[~(np.abs(apart[rows]).max(axis=1) <= SAME_STATE * sizes)]
     if deviating.size:
         raise StateError(

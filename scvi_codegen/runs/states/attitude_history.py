@@ -133,21 +133,9 @@ class AttitudeHistory:
             return {"q": q, "p": p}[name] if name != "velocity" else self._velocities(q, p, None)
         shown = [name for name, _ in coordinate_shapes(interface)]
         shown += [name for _, name, *_ in map(str.split, interface.rotations)]
-        known = list(
-            dict.fromkeys(
-                [
-                    *shown,
-                    *(f"p_{each}" for each in shown),
-                    *(f"{each}{DOT}" for each in shown),
-                    "t",
-                    "energy",
-                    "q",
-                    "p",
-                    "velocity",
-                ]
-            )
-        )
-        raise StateError(f"there is no quantity '{name}' of the states{closest(name, known)} Known: {', '.join(known)}")
+        conjugates = [*(f"p_{name}" for name in shown), *(f"{name}{DOT}" for name in shown)]
+        names = list(dict.fromkeys([*shown, *conjugates, "t", "energy", "q", "p", "velocity"]))
+        raise StateError(f"there is no quantity '{name}' of the states{closest(name, names)} Known: {', '.join(names)}")
 
     def _states(self, t: ArrayLike | None) -> tuple[Array, Array]:
         if t is None:
@@ -173,9 +161,9 @@ class AttitudeHistory:
     def _member(self, kind: str, name: str | None) -> Member:
         interface = self.stepper.interface
         members: Sequence[Member] = [
-            each for each in members_of(interface.dimension, interface.rotations) if each.kind == kind
+            member for member in members_of(interface.dimension, interface.rotations) if member.kind == kind
         ]
-        names = [each.name for each in members]
+        names = [member.name for member in members]
         arrays = _columns_of_arrays(interface, names)
         if name in arrays or (name is None and len(arrays) == 1):
             array = name or next(iter(arrays))
@@ -203,7 +191,8 @@ def _columns(interface: Interface, name: str) -> NDArray[np.intp] | int | None:
 def _momentum_columns(interface: Interface, name: str) -> NDArray[np.intp] | int | None:
     if name in interface.momenta:
         return interface.momenta.index(name)
-    arrays = dict(zip((each.name for each in interface.layout.momenta), shapes_of(interface) or (), strict=False))
+    names = [momentum.name for momentum in interface.layout.momenta]
+    arrays = dict(zip(names, shapes_of(interface) or (), strict=False))
     conjugate = arrays[name][0] if name in arrays else name.removeprefix("p_")
     return None if conjugate == name else _columns(interface, conjugate)
 
@@ -212,7 +201,7 @@ def _fields(mesh: Any, q: Array, p: Array) -> dict[str, Array]:
     """Return fields at the points of a mesh, (.., shape of the fields), of (.., m) states; none without a mesh."""
     if mesh is None:
         return {}
-    fields = mesh.fields_of(*(each.reshape(-1, each.shape[-1]) for each in (q, p)))
+    fields = mesh.fields_of(*(vectors.reshape(-1, vectors.shape[-1]) for vectors in (q, p)))
     return {name: values.reshape(*q.shape[:-1], *values.shape[1:]) for name, values in fields.items()}
 
 

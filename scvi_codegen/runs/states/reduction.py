@@ -75,14 +75,14 @@ class Reduction:
         m, state = self.dimension, state.copy()
         q, p = state[:m], state[m:]
         for member, rows, _ in self._parts():
-            wanted = like[:m][rows]
+            reference = like[:m][rows]
             if member.kind == "spin":
-                z, leading = q[rows] + 1j * p[rows], wanted + 1j * like[m:][rows]
+                z, leading = q[rows] + 1j * p[rows], reference + 1j * like[m:][rows]
                 z *= np.exp(1j * np.angle(np.vdot(z, leading)))
                 q[rows], p[rows] = z.real, z.imag
                 continue
-            factor = np.linalg.norm(wanted) / np.linalg.norm(q[rows])
-            factor *= -1.0 if member.kind == "rotation" and q[rows] @ wanted < 0.0 else 1.0
+            factor = np.linalg.norm(reference) / np.linalg.norm(q[rows])
+            factor *= -1.0 if member.kind == "rotation" and q[rows] @ reference < 0.0 else 1.0
             q[rows], p[rows] = q[rows] * factor, p[rows] / factor
         return state
 

@@ -26,7 +26,7 @@ def named_quantities(interface: Interface) -> tuple[NamedQuantity, ...]:
     variables = [name for name in interface.momenta if name in interface.variables]
     named = tuple(NamedQuantity(name, (), (), f"variable {name} of the state") for name in variables)
     return named + tuple(
-        each for member in members_of(interface.dimension, interface.rotations) for each in _names(member)
+        quantity for member in members_of(interface.dimension, interface.rotations) for quantity in _names(member)
     )
 
 
@@ -47,7 +47,7 @@ def values_by_name(interface: Interface, q: Array, p: Array, velocity: Array) ->
     if interface.variables:
         result |= {name: p[..., k] for k, name in enumerate(interface.momenta)}
     for member in members_of(interface.dimension, interface.rotations):
-        own, momenta, rates = (each[..., member.columns] for each in (q, p, velocity))
+        own, momenta, rates = (vectors[..., member.columns] for vectors in (q, p, velocity))
         values: tuple[Array, ...]
         if member.kind == "rotation":
             values = matrices(own), angular_velocity(own, rates), body_momentum(own, momenta)
@@ -57,7 +57,7 @@ def values_by_name(interface: Interface, q: Array, p: Array, velocity: Array) ->
             values = n, moving / np.linalg.norm(own, axis=-1, keepdims=True)
         else:
             values = (spins(own, momenta),)
-        result |= zip((each.name for each in _names(member)), values, strict=True)
+        result |= zip((quantity.name for quantity in _names(member)), values, strict=True)
     return result
 
 
@@ -96,8 +96,8 @@ def observable_derivatives(interface: Interface, states: Array) -> Array:
 def _observables(member: Member) -> tuple[str, ...]:
     """Return the columns of the quantities of a member that are functions of (q, p)."""
     quantities = _names(member)
-    chosen = quantities[::2] if member.kind == "rotation" else quantities[:1]
-    return tuple(name for each in chosen for name in each.columns)
+    of_state = quantities[::2] if member.kind == "rotation" else quantities[:1]
+    return tuple(name for quantity in of_state for name in quantity.columns)
 
 
 def _names(member: Member) -> tuple[NamedQuantity, ...]:
@@ -106,7 +106,7 @@ def _names(member: Member) -> tuple[NamedQuantity, ...]:
     if member.kind == "spin":
         return (NamedQuantity(name, SPACE, _columns(name), f"spin {name}"),)
     if member.kind == "direction":
-        rates = tuple(f"{each}_dot" for each in _columns(name))
+        rates = tuple(f"{component}_dot" for component in _columns(name))
         return (
             NamedQuantity(name, SPACE, _columns(name), f"unit vector {name}"),
             NamedQuantity(f"{name}_dot", SPACE, rates, f"velocity of the unit vector {name}"),

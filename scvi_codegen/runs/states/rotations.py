@@ -113,7 +113,7 @@ def state_of(
     Raises:
         StateError: naming what is unknown, missing or invalid.
     """
-    q, p, velocity = (_by_entry(shapes, members, each) for each in (q, p, velocity))
+    q, p, velocity = (_by_entry(shapes, members, part) for part in (q, p, velocity))
     ordinary = coordinates[: members[0].columns.start]
     if isinstance(q, Mapping):
         check_names(q, [*ordinary, *(member.name for member in members)], "q")
@@ -143,14 +143,14 @@ def state_of(
 
 def state_by_name(system: MechanicalSystem, q: Any, p: Any, velocity: Any) -> tuple[Any, Any, Any]:
     """Return the state of a system as of :func:`state_of`; as it is if q names no rotation, direction or spin."""
-    members = members_of(system.dimension, [each.declaration for each in system.rotations])
+    members = members_of(system.dimension, [rotation.declaration for rotation in system.rotations])
     shapes = [(array.name, array.shape({})) for array in system.arrays if array.axes]
     turning = {*(member.name for member in members), *(array.name for array in system.arrays if array.letters)}
     if not isinstance(q, Mapping) or turning.isdisjoint(q):
         return q, p, velocity
     names = [coordinate.name for coordinate in system.coordinates]
     q, p, velocity = state_of(names, members, q, p, velocity, shapes)
-    return q, *(None if each is None else np.asarray(each, dtype=float) for each in (p, velocity))
+    return q, *(None if part is None else np.asarray(part, dtype=float) for part in (p, velocity))
 
 
 def _coordinates(member: Member, q: Mapping[str, Any]) -> tuple[Array, Array]:
@@ -187,8 +187,8 @@ def _moving(
     """Return the parts of momenta or velocities by name, for positions of this shape."""
     named = {m.name for m in members if m.kind == "rotation" and (m.momentum or argument == "velocity")}
     names = {m.name: m.rate if m.name in named else m.name for m in members}
-    known = [*ordinary, *(names[m.name] for m in members if m.kind != "spin")]
-    check_names(values, known, argument, also=[f"{names[m.name]}_space" for m in members if m.kind == "rotation"])
+    required = [*ordinary, *(names[m.name] for m in members if m.kind != "spin")]
+    check_names(values, required, argument, also=[f"{names[m.name]}_space" for m in members if m.kind == "rotation"])
     parts = {name: column(values, name, argument) for name in ordinary}
     for name, rates in parts.items():
         common_shape({"q": states, f"{argument}: '{name}'": rates.shape[:-1]})
@@ -218,14 +218,15 @@ def _moving(
     return parts
 
 
-def check_names(values: Mapping[str, Any], known: Sequence[str], argument: str, also: Sequence[str] = ()) -> None:
+def check_names(values: Mapping[str, Any], required: Sequence[str], argument: str, also: Sequence[str] = ()) -> None:
     """Raise :class:`StateError` for names that are unknown, missing or, with ``_space``, twice there."""
     for name in values:
-        if name not in known and name not in also:
+        if name not in required and name not in also:
             raise StateError(
-                f"there is no '{name}' in {argument}{closest(str(name), [*known, *also])} Known: {', '.join(known)}"
+                f"there is no '{name}' in {argument}{closest(str(name), [*required, *also])} "
+                f"Known: {', '.join(required)}"
             )
-    for name in known:
+    for name in required:
         count = (name in values) + (f"{name}_space" in set(also) & set(values))
         if count != 1:
             both = f"both '{name}' and '{name}_space' are in {argument}: give one of them"

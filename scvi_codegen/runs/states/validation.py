@@ -67,7 +67,7 @@ def flat_state(interface: Interface, value: Any, name: str) -> Any:
         return value
     arrays = coordinate_shapes(interface)
     if isinstance(value, Mapping):
-        coordinates = dict(zip((each.name for each in interface.layout.momenta), arrays, strict=False))
+        coordinates = dict(zip((momentum.name for momentum in interface.layout.momenta), arrays, strict=False))
         named = {coordinates[key][0] if name == "p" and key in coordinates else key: value[key] for key in value}
         return _joined(arrays, named, name)
     (_, shape), *others = arrays
@@ -190,8 +190,8 @@ def parameter_values(interface: Interface, parameters: Parameters, base: Array |
     elif parameters is not None:
         array = real_array(parameters, "parameters")
         if array.shape != values.shape:
-            known = ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")
-            raise StateError(f"parameters must have {len(values)} values ({known or 'none'}), not {array.size}")
+            listed = ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")
+            raise StateError(f"parameters must have {len(values)} values ({listed or 'none'}), not {array.size}")
         values = array
     if not np.isfinite(values).all():
         worst = int(np.flatnonzero(~np.isfinite(values))[0])

@@ -293,9 +293,9 @@ def hashed(t: float) -> float | Fraction:
 
 def check_doubles(**times: Any) -> None:
     """Raise ``StateError`` if a time is not a double, which rounding would change."""
-    for name, given in times.items():
-        if type(given) is not float and given is not None:
-            low = split(given, name)[1]
+    for name, time in times.items():
+        if type(time) is not float and time is not None:
+            low = split(time, name)[1]
             if np.any(low):
                 raise StateError(f"{name} must be doubles, such as 0.125 or float({name}): it has digits beyond those")
 
@@ -311,13 +311,13 @@ def split(values: Any, name: str) -> tuple[Any, Any]:
         return {key: part[0] for key, part in parts.items()}, {key: part[1] for key, part in parts.items()}
     if values is None or isinstance(values, Words):
         return (None, None) if values is None else (np.asarray(values), values.low)
-    if isinstance(values, list | tuple) and any(isinstance(each, Words) for each in values):
-        rows = [split(each, f"{name}[{k}]") for k, each in enumerate(values)]
+    if isinstance(values, list | tuple) and any(isinstance(entry, Words) for entry in values):
+        rows = [split(entry, f"{name}[{k}]") for k, entry in enumerate(values)]
         return np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
     array = np.asarray(values) if isinstance(values, np.ndarray) else np.array(values, dtype=object)
     if array.dtype == np.float64:
         return array, np.zeros(array.shape)
-    words = [two_words(each, f"{name}{list(k) if k else ''}") for k, each in np.ndenumerate(array)]
+    words = [two_words(entry, f"{name}{list(k) if k else ''}") for k, entry in np.ndenumerate(array)]
     high, low = np.array(words, dtype=float).reshape(array.size, 2).T.reshape(2, *array.shape)
     return high, low
 

@@ -65,8 +65,8 @@ def read_arrays(
                     f"positions: the field '{array.name}' has the shape {shape}: the mesh has {points} points"
                 )
     shapes += [(table, index_tables[table.name].shape) for table in interface.layout.tables]
-    known = {field.name for field in interface.layout.fields}
-    argument = {name: value for name, value in interface.layout.data.items() if name in known} | dict(parameters or {})
+    names = {field.name for field in interface.layout.fields}
+    argument = {name: value for name, value in interface.layout.data.items() if name in names} | dict(parameters or {})
     numbers = number_values(interface, argument)
     shapes += [
         (field, real_array(argument[field.name], field.name).shape)
@@ -88,8 +88,8 @@ def first_state(interface: Interface, argument: Any) -> Any:
     if values is None or (array := real_array(values, "positions")).ndim <= len(first.axes) or not len(array):
         return argument
     if isinstance(argument, Mapping):
-        arrays = {name: real_array(each, f"q: '{name}'") for name, each in argument.items()}
-        return {name: each[0] if each.ndim and len(each) else each for name, each in arrays.items()}
+        arrays = {name: real_array(values, f"q: '{name}'") for name, values in argument.items()}
+        return {name: values[0] if values.ndim and len(values) else values for name, values in arrays.items()}
     return real_array(argument, "q")[0]
 
 
@@ -115,9 +115,9 @@ def read_state(interface: Interface, argument: ArrayLike | Mapping[str, ArrayLik
 
 def number_values(interface: Interface, argument: Mapping[str, ArrayLike]) -> list[float]:
     """Return the scalar parameters in order."""
-    known = dict(zip(interface.parameters, interface.defaults, strict=True))
-    check_named(argument, [*known, *(field.name for field in interface.layout.fields)], "parameters", whole=False)
-    return [checked_number(argument.get(name, value), name) for name, value in known.items()]
+    defaults = dict(zip(interface.parameters, interface.defaults, strict=True))
+    check_named(argument, [*defaults, *(field.name for field in interface.layout.fields)], "parameters", whole=False)
+    return [checked_number(argument.get(name, value), name) for name, value in defaults.items()]
 
 
 def field_values(
@@ -294,15 +294,17 @@ def shapes_of_call(q: Any, parameters: Any, threads: Any) -> Hashable:
         return q.shape, threads
     named = q if type(q) is dict else {"": q}
     numbers = parameters if type(parameters) is dict else {}
-    known = all(type(x) in (float, int) for x in numbers.values()) and (parameters is None or numbers is parameters)
-    if not known or any(type(x) is not np.ndarray for x in named.values()):
+    is_read = parameters is None or numbers is parameters
+    if not is_read or any(type(x) not in (float, int) for x in numbers.values()):
+        return None
+    if any(type(x) is not np.ndarray for x in named.values()):
         return None
     return tuple(named), tuple(x.shape for x in named.values()), tuple(numbers), threads
 
 
 def _homogeneous(interface: Interface, q: Any) -> Any:
     """Return a state by name with homogeneous coordinates of the shape of rotations, directions and spins."""
-    arrays = {each.name: each for each in interface.layout.coordinates if each.letters}
+    arrays = {array.name: array for array in interface.layout.coordinates if array.letters}
     if not isinstance(q, Mapping) or arrays.keys().isdisjoint(q):
         return q
     shapes = {
@@ -351,7 +353,7 @@ def interface_of_sizes(interface: Interface, sizes: Mapping[str, int]) -> Interf
         ),
     }
     declared = tuple(f"{name}[{', '.join(map(str, shape))}]" if shape else name for name, shape in shapes)
-    return replace(interface, arrays=declared, map_names=tuple(each.name for each in layout.maps), **names)
+    return replace(interface, arrays=declared, map_names=tuple(quantity.name for quantity in layout.maps), **names)
 
 
 def constraint_shapes(layout: ArrayLayout, sizes: Mapping[str, int]) -> list[list[int]]:

@@ -31,11 +31,11 @@ def drive(
         ended: function that returns whether the run has ended; called before each chunk.
         progress: called with the number of steps after each chunk.
     """
-    done, size, began, wanted = 0, first, -math.inf, CALL_SECONDS if seconds is None else seconds
+    done, size, began, target = 0, first, -math.inf, CALL_SECONDS if seconds is None else seconds
     while done < steps and not ended():
         now = time.perf_counter()
         if done:
-            faster = min(growth, wanted / max(now - began, 1e-6))
+            faster = min(growth, target / max(now - began, 1e-6))
             size = max(1, int(min(size * faster, most)))
         size, began = int(min(size, steps - done)), now
         done += advance(size)

@@ -144,8 +144,8 @@ class CompiledMethod:
         stepper = self.known
         if stepper._with_action is None:
             source = stepper._variants[Acting()]
-            found = stepper._with_action = stepper._copy(stepper.events, source) if source else stepper
-            found._with_action, found.sums_action = found, source is not None
+            acting = stepper._with_action = stepper._copy(stepper.events, source) if source else stepper
+            acting._with_action, acting.sums_action = acting, source is not None
         return stepper._with_action
 
     def _copy(self, events: tuple[Event, ...], source: Source | None = None) -> Self:
@@ -281,8 +281,8 @@ class CompiledMethod:
             ensemble: the variant for many trajectories at once.
             events: the formulas that later calls pass as ``events=``, all those of one call together.
         """
-        for each in (self,) if events is None else (self, self.with_events(events)):
-            each._compile()
+        for stepper in (self,) if events is None else (self, self.with_events(events)):
+            stepper._compile()
         requested = {Derivatives(): tangent, Derivatives(order=2): second, Lanes(): ensemble}
         for variant in [variant for variant, is_requested in requested.items() if is_requested]:
             if (source := self._variants[variant]) is not None:
@@ -354,7 +354,7 @@ class CompiledMethod:
     @property
     def momentum_map_names(self) -> tuple[str, ...]:
         """Names of the conserved quantities of the system: ``"angular momentum"``, ``"boost of x"``."""
-        return self.interface.map_names or tuple(each.name for each in self.interface.layout.maps)
+        return self.interface.map_names or tuple(quantity.name for quantity in self.interface.layout.maps)
 
     @property
     def dimension(self) -> int:
@@ -384,14 +384,14 @@ class CompiledMethod:
 
     def with_events(self, events: EventLike | Sequence[EventLike]) -> Self:
         """Return the integrator with these events in place of its own."""
-        wanted = as_events(events)
-        if wanted == self.events:
+        events_of_runs = as_events(events)
+        if events_of_runs == self.events:
             return self
-        if wanted not in self._event_variants:
+        if events_of_runs not in self._event_variants:
             while len(self._event_variants) >= MOST_EVENT_SETS:
                 self._event_variants.pop(next(iter(self._event_variants)), None)
-            self._event_variants[wanted] = self._copy(wanted)
-        return self._event_variants[wanted]
+            self._event_variants[events_of_runs] = self._copy(events_of_runs)
+        return self._event_variants[events_of_runs]
 
     def _lacks(self, variant: Variant) -> bool:
         """Return whether the method lacks a variant; arrays of run-time sizes take it from their system."""

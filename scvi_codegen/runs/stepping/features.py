@@ -204,7 +204,9 @@ FEATURES = {
 """Remedies of the operations that a property of the stepper, or another argument of the run, excludes."""
 
 
-_EXCLUDING = {each: [property_ for operation, property_ in FEATURES if operation == each] for each, _ in FEATURES}
+_EXCLUDING: dict[str, list[str]] = {}
+for _operation, _property in FEATURES:
+    _EXCLUDING.setdefault(_operation, []).append(_property)
 
 
 @dataclass(frozen=True, slots=True)

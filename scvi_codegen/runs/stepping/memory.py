@@ -116,7 +116,7 @@ class Memory:
         self._q, self._p = map(binding.vector, (memory.q, memory.p))
         values = self._parameters = stepper.defaults
         if stepper.interface.words > 1:
-            carries = (binding.vector(each)[: stepper.dimension] for each in (memory.carry_q, memory.carry_p))
+            carries = (binding.vector(carry)[: stepper.dimension] for carry in (memory.carry_q, memory.carry_p))
             self._q, self._p = (with_low(high, low) for high, low in zip((self._q, self._p), carries, strict=True))
             values = np.concatenate([values, np.zeros(len(values))])
             self._parameters = stepper._states.numbers(values)

@@ -34,7 +34,7 @@ def temperature(states: Any) -> Any:
         StateError: if the system is no Lagrangian of arrays with sizes known at run time.
     """
     stepper, maps = states.stepper, states.stepper.interface.layout.maps
-    momenta = sum(each.other is None and not each.phase for each in maps)
+    momenta = sum(quantity.other is None and not quantity.phase for quantity in maps)
     return 2 * _kinetic(states) / (stepper.dimension - momenta - len(stepper.constraints))
 
 

@@ -103,12 +103,12 @@ def _read(
         binding: Any = stepper  # of run-time sizes
         stepper = binding._bound_to(problem).with_events(stepper.events)
     values = np.frombuffer(rest, count=stepper.interface.words * len(stepper.defaults), offset=first)
-    known = stepper.parameters_by_name(values if stepper.interface.words == 1 else from_block(values))
+    parameters = stepper.parameters_by_name(values if stepper.interface.words == 1 else from_block(values))
     for name in header["unset inputs"]:
-        del known[f"{name}_0"]
+        del parameters[f"{name}_0"]
     control = ErrorControl(**header.get("control", {}))
     control.checked()
-    return stepper, rest[first + values.nbytes :], known, control
+    return stepper, rest[first + values.nbytes :], parameters, control
 
 
 def _integrator(stepper: Integrator) -> str:

@@ -119,7 +119,7 @@ class StateFunctions(CompiledMethod):
         """Return (n, 3) kinetic, potential and total energies of (n, m) states; parts of run-time sizes, else NaN."""
         parts = np.full((len(q), 3), np.nan)
         if self.binding.has("energy_parts"):
-            arrays = (np.ascontiguousarray(each, dtype=float) for each in (t, q, p, parameters))
+            arrays = (np.ascontiguousarray(vectors, dtype=float) for vectors in (t, q, p, parameters))
             pointers = map(self.binding.pointer, (*arrays, parts))
             self.binding.function("energy_parts")(len(t), *pointers, self.binding.workspace())
         else:
@@ -180,7 +180,7 @@ class StateFunctions(CompiledMethod):
 
         |xi| is estimated by random momenta.
         """
-        q, p, t = (np.asarray(each, dtype=float) for each in (q, p, t))
+        q, p, t = (np.asarray(vectors, dtype=float) for vectors in (q, p, t))
         sizes = np.linalg.norm(p, axis=1)
         at = int(np.argmax(sizes))
         probes = np.random.default_rng(PROBES).normal(size=(1 + PROBES, p.shape[1]))

@@ -224,8 +224,8 @@ def plan_from_record(*, h: Any = None, tau: Any = None, **control: Any) -> Fixed
 def checked_absolute_tolerance(value: Any) -> AbsoluteTolerance:
     """Return an absolute tolerance of users; raise ``StateError`` for NaN, infinite and negative numbers."""
     if isinstance(value, Mapping):
-        each = ((str(name), _not_negative(number, f"absolute_tolerance of {name}")) for name, number in value.items())
-        return tuple((name, number) for name, number in each if number)
+        sizes = {str(name): _not_negative(size, f"absolute_tolerance of {name}") for name, size in value.items()}
+        return tuple((name, size) for name, size in sizes.items() if size)
     return _not_negative(value, "absolute_tolerance") or ()
 
 
