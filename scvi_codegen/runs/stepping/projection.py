@@ -177,23 +177,23 @@ def _first_names(names: Sequence[str]) -> str:
     return f"{shown}, .." if len(names) > MOST_SHOWN else shown
 
 
-def _dependent(stepper: Integrator, q: Array, t: float, parameters: Parameters, *, nearest: bool = False) -> str:
-    """Return the message of :func:`rank_deficiency`; "" for run-time sizes too large for dense linear algebra."""
+def _dependent(stepper: Integrator, q: Array, t: float, parameters: Parameters, *, nearest: bool = False) -> str | None:
+    """Return the message of :func:`rank_deficiency`; ``None`` for run-time sizes too large for dense linear algebra."""
     if stepper.interface.layout.coordinates and max(stepper.dimension, len(stepper.constraints)) > MOST_DENSE:
-        return ""
+        return None
     massless = _massless(stepper, q, t, parameters)
     return massless or rank_deficiency(stepper.constraints, q, _linearised(stepper, t, parameters), nearest=nearest)
 
 
-def _massless(stepper: Integrator, q: Array, t: float, parameters: Parameters) -> str:
-    """Return what is wrong with coordinates whose velocities contribute to no momentum, and the remedy, or ""."""
+def _massless(stepper: Integrator, q: Array, t: float, parameters: Parameters) -> str | None:
+    """Return what is wrong with coordinates whose velocities contribute to no momentum, and the remedy, or ``None``."""
     try:
         _, momenta = _at_unit_velocities(stepper, q, t, parameters)
     except StateError:
-        return ""
+        return None
     names = [name for name, p in zip(stepper.coordinates, momenta[1:], strict=True) if (p == momenta[0]).all()]
     if not names:
-        return ""
+        return None
     listed = _first_names(names)
     return (
         f"{listed} ha{'ve' if len(names) > 1 else 's'} no kinetic energy there, so that momenta do not determine "
@@ -299,8 +299,8 @@ def nearly_dependent(jacobian: Array) -> str:
     )
 
 
-def rank_deficiency(names: Sequence[str], q: Array, at: Jacobian, *, nearest: bool = False) -> str:
-    """Return what is wrong with constraints of deficient rank, and what to do; "" if they are independent.
+def rank_deficiency(names: Sequence[str], q: Array, at: Jacobian, *, nearest: bool = False) -> str | None:
+    """Return what is wrong with constraints of deficient rank, and what to do; ``None`` if they are independent.
 
     Args:
         names: formulas of the constraints.
@@ -311,14 +311,14 @@ def rank_deficiency(names: Sequence[str], q: Array, at: Jacobian, *, nearest: bo
     for _ in range(ITERATIONS if nearest else 0):
         g, jacobian = at(q)
         if not (np.isfinite(g).all() and np.isfinite(jacobian).all()):
-            return ""
+            return None
         q = q - np.linalg.lstsq(jacobian, g, rcond=DEPENDENT)[0]
     g, jacobian = at(q)
     if not (np.isfinite(g).all() and np.isfinite(jacobian).all()):
-        return ""
+        return None
     rank, rows = dependence(jacobian)
     if not len(rows):
-        return ""
+        return None
     listed = " and ".join(f"'{names[k]}'" for k in rows) if len(rows) < 5 else f"{len(rows)} of them"
     rests = ", ".join(f"{g[k]:.3g}" for k in rows[:4])
     if nearest and np.abs(g).max() > CONTRADICTED * max(float(np.abs(q).max()), 1e-300):
