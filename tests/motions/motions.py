@@ -93,10 +93,10 @@ class Problem:
 
     def system(self) -> Any:
         """The system as the package reads it."""
-        made = sc.HamiltonianSystem if "hamiltonian" in (self.array or self.text) else sc.LagrangianSystem
+        formulation = sc.HamiltonianSystem if "hamiltonian" in (self.array or self.text) else sc.LagrangianSystem
         if self.array is not None:
-            return made.from_text(name=self.name, **self.array)
-        system = made.from_text(name=self.name, **self.text)
+            return formulation.from_text(name=self.name, **self.array)
+        system = formulation.from_text(name=self.name, **self.text)
         return sc.reparametrise(system, self.time_transformation) if self.kind == "slowed" else system
 
     @property
@@ -170,19 +170,19 @@ class Truth:
         names = problem.coordinates
         others = list(text.get("momenta", [f"{name}_dot" for name in names]))
         t, inputs, parameters = sympy.Symbol("t"), list(problem.inputs), list(text["parameters"])
-        known = {name: sympy.Symbol(name) for name in (*names, *others, *inputs, *parameters)} | {"t": t}
+        symbols = {name: sympy.Symbol(name) for name in (*names, *others, *inputs, *parameters)} | {"t": t}
 
         def read(formula: str | float) -> sympy.Expr:
-            return sympy.sympify(str(formula), locals=known)
+            return sympy.sympify(str(formula), locals=symbols)
 
-        q, x = (sympy.Matrix([known[name] for name in group]) for group in (names, others))
+        q, x = (sympy.Matrix([symbols[name] for name in group]) for group in (names, others))
         f = sympy.Matrix([read(text.get("forces", {}).get(name, 0)) for name in names])
         damping = read(text.get("damping", 0))
-        arguments = [t, list(q), list(x), [known[name] for name in parameters], [known[name] for name in inputs]]
+        arguments = [t, list(q), list(x), [symbols[name] for name in parameters], [symbols[name] for name in inputs]]
 
         def function(expression: Any) -> Callable[..., np.ndarray]:
-            made = sympy.lambdify(arguments, expression, "numpy", cse=True)
-            return lambda *given: np.array(made(*given), dtype=float)
+            compiled = sympy.lambdify(arguments, expression, "numpy", cse=True)
+            return lambda *numbers: np.array(compiled(*numbers), dtype=float)
 
         if "hamiltonian" in text:
             H = read(text["hamiltonian"])
@@ -204,10 +204,10 @@ class Truth:
             rate = None
         self._rate = function(rate[0]) if rate else None
         self._p, self._v, self._energy, self._f = map(function, (p, v, energy, f))
-        self._maps = [function(read(each)) for each in problem.maps]
+        self._maps = [function(read(formula)) for formula in problem.maps]
         self._event = function(read(problem.event))
         self.directions = function(
-            sympy.Matrix([[read(each) for each in xi] for xi in problem.impulses] or [[0] * len(names)])
+            sympy.Matrix([[read(component) for component in xi] for xi in problem.impulses] or [[0] * len(names)])
         )
         self.m = len(names)
 
@@ -216,11 +216,11 @@ class Truth:
 
     def rates(self, t: float, q: Any, x: Any, values: list[float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Velocities, the rates of x, and multipliers."""
-        given = (t, q, x, values, self._inputs(t))
+        state = (t, q, x, values, self._inputs(t))
         if self._rate is not None:
-            return self._v(*given).ravel(), self._rate(*given).ravel(), np.empty(0)
-        solved = np.linalg.solve(self._block(*given), self._right(*given).ravel())
-        return np.asarray(x), solved[: self.m], solved[self.m :]
+            return self._v(*state).ravel(), self._rate(*state).ravel(), np.empty(0)
+        rates_and_multipliers = np.linalg.solve(self._block(*state), self._right(*state).ravel())
+        return np.asarray(x), rates_and_multipliers[: self.m], rates_and_multipliers[self.m :]
 
     def motion(self, start: float, end: float, q: Any, x: Any, parameters: Mapping[str, float]) -> Motion:
         """Integrate (q, x) from start to end."""
@@ -250,13 +250,13 @@ class Motion:
             return np.array([*v, *a, f @ v, *(xi @ f)])
 
         begin = [*self.q0, *self.x0, *np.zeros(1 + count)]
-        found = solve_ivp(
+        solution = solve_ivp(
             rates, (self.start, self.end), begin, method="DOP853", rtol=3e-13, atol=1e-13, dense_output=True
         )
-        assert found.success, found.message
-        return found.sol
+        assert solution.success, solution.message
+        return solution.sol
 
-    def _each(self, function: Callable[..., np.ndarray], t: Any) -> np.ndarray:
+    def _along(self, function: Callable[..., np.ndarray], t: Any) -> np.ndarray:
         return np.array([function(s, *self._state(s), list(self.values), self.truth._inputs(s)) for s in np.ravel(t)])
 
     def _state(self, t: float) -> tuple[np.ndarray, np.ndarray]:
@@ -266,22 +266,23 @@ class Motion:
         return np.array([self._state(s)[0] for s in np.ravel(t)])
 
     def p(self, t: Any) -> np.ndarray:
-        return self._each(self.truth._p, t).reshape(-1, self.truth.m)
+        return self._along(self.truth._p, t).reshape(-1, self.truth.m)
 
     def v(self, t: Any) -> np.ndarray:
-        return self._each(self.truth._v, t).reshape(-1, self.truth.m)
+        return self._along(self.truth._v, t).reshape(-1, self.truth.m)
 
     def x(self, t: Any) -> np.ndarray:
         return np.array([self._state(s)[1] for s in np.ravel(t)])
 
     def energy(self, t: Any) -> np.ndarray:
-        return self._each(self.truth._energy, t).ravel()
+        return self._along(self.truth._energy, t).ravel()
 
     def event(self, t: Any) -> np.ndarray:
-        return self._each(self.truth._event, t).ravel()
+        return self._along(self.truth._event, t).ravel()
 
     def maps(self, t: Any) -> np.ndarray:
-        return np.array([self._each(each, t).ravel() for each in self.truth._maps]).reshape(-1, np.size(t)).T
+        values = [self._along(momentum_map, t).ravel() for momentum_map in self.truth._maps]
+        return np.array(values).reshape(-1, np.size(t)).T
 
     def work_and_impulses(self, t: Any) -> np.ndarray:
         """(n, 1 + k) the work of the forces, and their impulses."""
@@ -297,6 +298,11 @@ def truth_of(problem: Problem) -> Truth:
 
 
 HIGH, LOW = 3e-8, 3e-3
+SCHEMES_OF_EACH_SOLVER = (
+    Scheme("svi:4", "fixed-point", HIGH),
+    Scheme("gauss:4", "newton", HIGH),
+    Scheme("svi:8", "auto", HIGH, "double-double"),
+)
 
 
 def chain(
@@ -310,7 +316,7 @@ def chain(
 ) -> Problem:
     """Return a chain of unlike masses, as an array and written out, with springs k x^2/2 + b x^4/4 and forces of i."""
     count = len(masses)
-    parameters = {**dict.fromkeys(own, 0.1), "k": 1.0, "a": 0.2}
+    parameters = {**dict.fromkeys(own, 0.1), "k": 1.0, "a": 0.2, "e": 0.01}
     parameters |= {STOP: 100.0} if STOP in force else {}
     kinetic = "+".join(f"m{i}*q{i}_dot**2/2 - (1 + a*cos(t))*q{i}**2/2" for i in range(count))
     springs = "+".join(f"k*(q{i + 1}-q{i})**2/2 + {b}*(q{i + 1}-q{i})**4/4" for i in range(count - 1))
@@ -447,11 +453,7 @@ AT_HOME: tuple[Problem, ...] = (
         q=(0.6, 0.2),
         x=(-0.3, 0.5),
         own={"m": 1.4, "c": 0.7, "r": 0.9},
-        methods=(
-            Scheme("svi:4", "fixed-point", HIGH),
-            Scheme("gauss:4", "newton", HIGH),
-            Scheme("svi:8", "auto", HIGH, "double-double"),
-        ),
+        methods=SCHEMES_OF_EACH_SOLVER,
         event="x - z/m",
         text={
             "coordinates": ["x", "z"],
@@ -548,11 +550,7 @@ AT_HOME: tuple[Problem, ...] = (
         q=(0.6, -0.1),
         x=(-0.3, 0.2),
         own={"c": 0.5, "m": 1.6},
-        methods=(
-            Scheme("svi:4", "fixed-point", HIGH),
-            Scheme("gauss:4", "newton", HIGH),
-            Scheme("svi:8", "auto", HIGH, "double-double"),
-        ),
+        methods=SCHEMES_OF_EACH_SOLVER,
         event="q - s*m/4",
         text={
             "coordinates": ["q", "s"],
@@ -571,7 +569,7 @@ AT_HOME: tuple[Problem, ...] = (
         masses=(1.3, 0.7, 2.1, 0.9),
         b=0.3,
         force=f"-c*q_dot[i]*m[i] + sin(2*t)/3 + e*sqrt({STOP} - t)",
-        damping="a*c",
+        damping="a*c/8",
         methods=(Scheme("svi:4", "fixed-point", HIGH), Scheme("gauss:9", "fixed-point", HIGH)),
     ),
     chain(

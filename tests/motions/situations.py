@@ -121,10 +121,10 @@ class Case:
 
     def parameters(self, values: dict[str, float] | None = None) -> dict[str, Any]:
         """Return the parameters as the package accepts them: arrays by name."""
-        known = dict(values or self.values)
+        parameters: dict[str, Any] = dict(values or self.values)
         for name, array in self.problem.fields.items():
-            known[name] = np.array([known.pop(f"{name}{i}") for i in range(len(array))])
-        return known
+            parameters[name] = np.array([parameters.pop(f"{name}{i}") for i in range(len(array))])
+        return parameters
 
     def moving(self, x: Any = None) -> dict[str, Any]:
         x = self.problem.x if x is None else x
@@ -153,22 +153,22 @@ class Case:
     def integrate(self, stepper: Any = None, q: Any = None, x: Any = None, **more: Any) -> Any:
         """The run, with what else is wanted; that of an array with its states as rows."""
         stepper, save_every = stepper or self.stepper, more.pop("save_every", self.setting.save_every)
-        given = {**self.common(save_every=save_every), **self.moving(x), **more}
+        arguments = {**self.common(save_every=save_every), **self.moving(x), **more}
         q = np.asanyarray(self.problem.q if q is None else q)
         if "t_eval" in more:
-            del given["save_every"]
+            del arguments["save_every"]
         if "t_end" not in more and self.kind == "reversible":
-            given["t_end"] = self.setting.t + self.span
+            arguments["t_end"] = self.setting.t + self.span
         if "h" not in more and ("t_end" not in more or self.kind in ("reversible", "slowed")):
-            given["h"] = self.h
-        if "t_end" not in given:
-            given.setdefault("steps", STEPS)
+            arguments["h"] = self.h
+        if "t_end" not in arguments:
+            arguments.setdefault("steps", STEPS)
         if self.kind == "driven":
-            span = max(abs(given.get("steps", STEPS) * self.problem.h), 2.0 * abs(self.span))
+            span = max(abs(arguments.get("steps", STEPS) * self.problem.h), 2.0 * abs(self.span))
             data = self.problem.data(self.setting.t, self.setting.t + math.copysign(span, self.span))
-            return stepper.integrate(q, inputs=data, **given)
-        found = stepper.integrate(q, **given)
-        return as_rows(found) if self.kind == "array" else found
+            return stepper.integrate(q, inputs=data, **arguments)
+        trajectory = stepper.integrate(q, **arguments)
+        return as_rows(trajectory) if self.kind == "array" else trajectory
 
     @cached_property
     def run(self) -> Any:
@@ -192,21 +192,22 @@ class Case:
         return stepper.from_checkpoint(saved, parameters=run.parameters, options=self.options, **plan)
 
 
-def as_rows(found: Any) -> SimpleNamespace:
+def as_rows(trajectory: Any) -> SimpleNamespace:
     """The trajectory of an array as those of coordinates are: states are rows."""
-    flat = lambda arrays: arrays["q"].reshape(len(found.t), -1)  # noqa: E731
+    flat = lambda arrays: arrays["q"].reshape(len(trajectory.t), -1)  # noqa: E731
     return SimpleNamespace(
-        t=found.t,
-        q=flat(found.q),
-        p=flat(found.p),
-        velocity=flat(found.velocity),
-        energy=found.energy,
-        momentum_maps=found.momentum_maps,
-        steps=found.steps,
-        step_error=found.step_error,
-        worst_step_time=found.worst_step_time,
-        at=lambda t: tuple(each["q"].reshape(len(t), -1) for each in found.at(t)),
+        t=trajectory.t,
+        q=flat(trajectory.q),
+        p=flat(trajectory.p),
+        velocity=flat(trajectory.velocity),
+        energy=trajectory.energy,
+        momentum_maps=trajectory.momentum_maps,
+        steps=trajectory.steps,
+        step_error=trajectory.step_error,
+        worst_step_time=trajectory.worst_step_time,
+        at=lambda t: tuple(arrays["q"].reshape(len(t), -1) for arrays in trajectory.at(t)),
         events=[
-            SimpleNamespace(t=e.t, q=e.q["q"].reshape(len(e), -1), p=e.p["q"].reshape(len(e), -1)) for e in found.events
+            SimpleNamespace(t=e.t, q=e.q["q"].reshape(len(e), -1), p=e.p["q"].reshape(len(e), -1))
+            for e in trajectory.events
         ],
     )
