@@ -80,6 +80,19 @@ def test_newton_iteration_is_strict_c(name: str, tmp_path: Path) -> None:
     check_arrays(rendered(name, "svi:4", newton=True), tmp_path)
 
 
+def test_single_file_with_a_list_of_neighbours_is_strict_c(tmp_path: Path) -> None:
+    """Names of its functions differ from the fields of the lists, which its header declares."""
+    liquid = either_system(
+        name="liquid",
+        coordinates=["r[N, 3]"],
+        neighbours={"near": {"of": "r", "cutoff": 2.5, "skin": 0.3}},
+        lagrangian="sum(i in N, sum(a in 3, r_dot[i, a]**2)/2) - sum(i < j in near, 1/(r[i, 0] - r[j, 0])**12)",
+    )
+    program = lower_arrays(liquid, as_method("svi:4"), prefix="arrays")
+    render_arrays(program, control_of(program)).single_file().write(tmp_path)
+    run([*find_compiler(), *STRICT, "-Wno-psabi", "-c", "arrays.c"], tmp_path)
+
+
 def check_arrays(source: Source, folder: Path) -> None:
     """Compile as a library with strict flags."""
     check_style(source.code)
