@@ -71,6 +71,7 @@ class Problem:
         impulses: momentum maps of L alone, p . xi by the formulas of xi.
         falls_back: whether fixed-point iterations fail at steps of h, so that Newton's iteration takes their place.
         work: whether forces act whose work is told.
+        time: unit of time, by which initial times are multiplied.
     """
 
     name: str
@@ -84,6 +85,7 @@ class Problem:
     impulses: tuple[tuple[str, ...], ...] = ()
     work: bool = False
     h: float = 0.04
+    time: float = 1.0
     kind: str = "plain"
     time_transformation: str = ""
     inputs: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
@@ -108,7 +110,12 @@ class Problem:
 
         def text(names: list[str], home: Mapping[str, Any]) -> dict[str, Any]:
             power = chart.energy / chart.length
-            formulas = {"lagrangian": chart.scaled(home["lagrangian"], chart.energy, names)}
+            parameters = dict(home["parameters"])
+            parameters |= {STOP: chart.time * parameters[STOP]} if STOP in parameters else {}
+            formulas: dict[str, Any] = {
+                "parameters": parameters,
+                "lagrangian": chart.scaled(home["lagrangian"], chart.energy, names),
+            }
             formulas["constraints"] = [chart.formula(g, names) for g in home.get("constraints", ())]
             formulas["damping"] = home.get("damping") and chart.scaled(home["damping"], 1.0 / chart.time, names)
             formulas["forces"] = {x: chart.scaled(f, power, names) for x, f in home.get("forces", {}).items()}
@@ -120,6 +127,7 @@ class Problem:
             q=tuple(chart.length * (x - chart.origin) for x in self.q),
             x=tuple(chart.length / chart.time * v for v in self.x),
             h=chart.time * self.h,
+            time=chart.time,
             event=chart.formula(self.event, self.coordinates),
             text=text(self.coordinates, self.text),
             array=self.array and text(["q"], self.array),
@@ -360,7 +368,7 @@ AT_HOME: tuple[Problem, ...] = (
             Scheme("svi:3", "newton", HIGH),
             Scheme("gauss:4", "auto", HIGH),
             Scheme("radau-iia:4", "auto", HIGH),
-            Scheme("explicit-euler", "auto", 0.1),
+            Scheme("explicit-euler", "auto", 0.3),
             Scheme("svi:8", "auto", HIGH, "double-double"),
         ),
         event="x - y - l - t/50",

@@ -2,7 +2,7 @@
 
 import math
 import pickle
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from types import SimpleNamespace
 from typing import Any
@@ -76,7 +76,8 @@ class Case:
 
     @property
     def setting(self) -> Situation:
-        return SITUATIONS[self.situation]
+        situation = SITUATIONS[self.situation]
+        return replace(situation, t=situation.t * self.problem.time)
 
     @property
     def kind(self) -> str:
