@@ -16,12 +16,14 @@ from typing import TYPE_CHECKING, Any, cast
 
 from scvi_codegen.common.errors import StateError, closest
 from scvi_codegen.common.validation import checked_count
-from scvi_codegen.runs.ensembles.ensemble import Ensemble
+from scvi_codegen.runs.ensembles.ensemble import EnsembleSettings
+from scvi_codegen.runs.ensembles.individual import IndividualRuns, runs_of
+from scvi_codegen.runs.ensembles.lanes import CommonRuns
 from scvi_codegen.runs.ensembles.result import EnsembleTrajectory
 from scvi_codegen.runs.stepper import checked_ensemble_result
 
 if TYPE_CHECKING:
-    from scvi_codegen.runs.states.validation import States
+    from scvi_codegen.runs.states.validation import Array, States
     from scvi_codegen.runs.stepper import Stepper
 
 __all__ = ["integrate_ensemble"]
@@ -64,12 +66,15 @@ def integrate_ensemble(
         BuildError: if a worker cannot compile the source.
     """
     _check_arguments(stepper, arguments)
-    work = stepper._ensemble(q, p, **arguments)
+    velocity, action = arguments.pop("velocity", None), arguments.pop("action", False)
+    settings = EnsembleSettings(**{name: value for name, value in arguments.items() if name not in OF_THIS_MACHINE})
+    ensemble = stepper._ensemble(q, p, settings, velocity=velocity, action=action)
+    runs = runs_of(ensemble)
     blocks = None if blocks is None else checked_count(blocks, "blocks", least=1)
     with _client(address) as client:
         count = blocks or BLOCKS_A_THREAD * sum(client.ncores().values())
-        _gather(client, work, list(_slices(len(work), count)), progress)
-    return checked_ensemble_result(work)
+        _gather(client, runs, list(_slices(len(ensemble), count)), progress)
+    return checked_ensemble_result(runs)
 
 
 def _check_arguments(stepper: Stepper, arguments: dict[str, Any]) -> None:
@@ -115,17 +120,21 @@ def _slices(count: int, blocks: int) -> Iterator[slice]:
         yield slice(first, min(first + size, count))
 
 
-def _gather(client: Any, work: Ensemble, parts: list[slice], progress: Callable[[int], None] | None) -> None:
+def _gather(
+    client: Any, runs: CommonRuns | IndividualRuns, parts: list[slice], progress: Callable[[int], None] | None
+) -> None:
     """Submit the slices and store their results."""
     from distributed import as_completed
 
-    pickled = pickle.dumps(work.stepper)
-    futures = {client.submit(_integrate, pickled, work.part(part), pure=False): part for part in parts}
-    done = 0
+    ensemble, done = runs.ensemble, 0
+    pickled, futures = pickle.dumps(ensemble.stepper), dict[Any, slice]()
+    for part in parts:
+        arguments = ensemble.q[part], ensemble.p[part], ensemble.settings_of(part)
+        futures[client.submit(_integrate, pickled, arguments, pure=False)] = part
     try:
         for future, trajectories in as_completed(futures, with_results=True):
             part = futures[future]
-            work.keep(part, trajectories)
+            runs.keep(part, trajectories)
             future.release()
             done += part.stop - part.start
             if progress is not None:
@@ -134,11 +143,11 @@ def _gather(client: Any, work: Ensemble, parts: list[slice], progress: Callable[
         client.cancel(list(futures))
 
 
-def _integrate(pickled: bytes, arguments: dict[str, Any]) -> EnsembleTrajectory:
+def _integrate(pickled: bytes, arguments: tuple[Array, Array, EnsembleSettings]) -> EnsembleTrajectory:
     """Integrate one slice on a single worker thread; return its results without stepper and functions."""
-    work = _stepper(pickled)._ensemble(**arguments)
-    work.run(threads=1)
-    return replace(work.result(), stepper=cast(Any, None), spans=())
+    runs = runs_of(_stepper(pickled)._ensemble(*arguments))
+    runs.run(threads=1)
+    return replace(runs.result(), stepper=cast(Any, None), spans=())
 
 
 @lru_cache(maxsize=16)

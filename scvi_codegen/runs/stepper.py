@@ -34,7 +34,10 @@ from scvi_codegen.runs.driver.bounded_motion import BoundedMotion
 from scvi_codegen.runs.driver.observation import Observe
 from scvi_codegen.runs.driver.run import Run
 from scvi_codegen.runs.driver.segments import InputSegments, checked_inputs, final_time
-from scvi_codegen.runs.ensembles.ensemble import Ensemble
+from scvi_codegen.runs.ensembles.device import DeviceRuns
+from scvi_codegen.runs.ensembles.ensemble import Ensemble, EnsembleSettings
+from scvi_codegen.runs.ensembles.individual import IndividualRuns, runs_of
+from scvi_codegen.runs.ensembles.lanes import CommonRuns
 from scvi_codegen.runs.ensembles.result import EnsembleTrajectory
 from scvi_codegen.runs.events.refinement import WithEventsInDouble, constantly
 from scvi_codegen.runs.forwarding import SteppersAnalysis
@@ -469,11 +472,8 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
             StateError: if a shape, name or number is invalid.
             BuildError: with ``device`` if there is no GPU, or too little memory on it.
         """
-        work = self._ensemble(
-            q,
-            p,
+        settings = EnsembleSettings(
             inputs=inputs,
-            velocity=velocity,
             h=h,
             steps=steps,
             t_end=t_end,
@@ -488,30 +488,30 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
             options=options,
             error=error,
             device=device,
-            action=action,
             observe=observe,
         )
-        work.run(progress=progress, threads=threads)
-        if device is not None:
-            return cast("EnsembleTrajectory", work.device_result())
-        return checked_ensemble_result(work)
+        runs = runs_of(self._ensemble(q, p, settings, velocity=velocity, action=action))
+        runs.run(progress=progress, threads=threads)
+        if isinstance(runs, DeviceRuns):
+            return cast("EnsembleTrajectory", runs.device_result())
+        return checked_ensemble_result(runs)
 
     def _ensemble(
         self,
         q: States,
-        p: States | None = None,
+        p: States | None,
+        settings: EnsembleSettings,
         *,
         velocity: States | None = None,
         action: bool = False,
-        **settings: Any,
     ) -> Ensemble:
-        """Return the ensemble of :meth:`integrate_ensemble`, with the same arguments, before its first step."""
+        """Return the ensemble of :meth:`integrate_ensemble`, with the same arguments."""
         q, p, velocity = self._states.start(q, p, velocity)
-        if settings.get("error") is not None:
+        if settings.error is not None:
             require(self, "error")
-            steps = {name: settings.get(name) for name in ("h", "steps", "tolerance")}
-            settings["error"] = checked_error(settings["error"], steps, self)
-        return Ensemble(self._for_run(None, action=action), q, p, velocity=velocity, **settings)
+            steps = {"h": settings.h, "steps": settings.steps, "tolerance": settings.tolerance}
+            settings = replace(settings, error=checked_error(settings.error, steps, self))
+        return Ensemble.of(self._for_run(None, action=action), q, p, settings, velocity=velocity)
 
     def project(
         self,
@@ -707,13 +707,17 @@ class StepperOfRunTimeSizes(Stepper):
         return self._reason is not None or "advance_to" in self.source.contents.functions
 
 
-def checked_ensemble_result(work: Ensemble) -> EnsembleTrajectory:
+def checked_ensemble_result(runs: CommonRuns | IndividualRuns) -> EnsembleTrajectory:
     """Return the trajectories of an ensemble that was integrated; issue warnings of inaccurate ones."""
-    trajectories = work.result()
-    work.warn_of_too_many_states(trajectories)
+    trajectories = runs.result()
+    if isinstance(runs, CommonRuns):
+        successive = None
+    else:
+        runs.warn_of_too_many_states(trajectories)
+        successive = runs.successive
     try:
         warn_of_unconfirmed(trajectories.confirmations)
-        warn_of_energy_errors(trajectories, None if work.successive is None else work.successive.energies)
+        warn_of_energy_errors(trajectories, None if successive is None else successive.energies)
         warn_of_unresolved_members(trajectories)
     except Exception as error:  # noqa: BLE001  (the runs are complete)
         warn_of_failed_check(error)

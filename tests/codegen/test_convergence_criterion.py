@@ -12,7 +12,7 @@ import pytest
 from either_system import either_system
 from notation import hamilton, lagrange
 from programs import needs
-from samples import QUICK_FLAGS
+from samples import QUICK_FLAGS, ensemble_runs
 
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.codegen.rendering.environment import support_text
@@ -22,7 +22,6 @@ from scvi_codegen.interfaces.models.problems import problem
 from scvi_codegen.methods import SCVI, SVI, SpectralCollocation
 from scvi_codegen.methods.exact.step import derived_step
 from scvi_codegen.runs.compiler import compile_stepper
-from scvi_codegen.runs.ensembles.ensemble import Ensemble
 from scvi_codegen.systems.hamiltonian import HamiltonianSystem
 from scvi_codegen.systems.lagrangian import LagrangianSystem
 
@@ -291,7 +290,7 @@ def test_standing_waves_of_an_ensemble_converge_at_known_sizes():
     stepper, counts = compile_stepper(system, "svi:4", sizes={"N": SITES}, flags=QUICK_FLAGS), []
     for shift in (0.0, 0.3):
         waves = np.cos(phase + shift) * np.arange(1, 9)[:, None]
-        runs = Ensemble(stepper, waves, 0 * waves, h=0.5, steps=20).common
+        runs = ensemble_runs(stepper, waves, 0 * waves, h=0.5, steps=20)
         block = runs.batch().part(0, 8)
         block.advance()
         counts.append(block.memory.iterations / 20)

@@ -11,10 +11,9 @@ from functools import cache
 
 import pytest
 from certified_cases import case
-from samples import QUICK_FLAGS
+from samples import QUICK_FLAGS, ensemble_runs
 
 from scvi_codegen import SolverOptions, Stepper, compile_stepper, problem
-from scvi_codegen.runs.ensembles.ensemble import Ensemble
 from scvi_codegen.runs.ensembles.lanes import LaneRuns
 
 STEPS = 100
@@ -60,8 +59,7 @@ def test_lanes_use_as_many_iterations_as_single_runs(name):
     given, own = case(name), stepper(name, "fixed-point")
     for part in (1, 8, 64):
         h = given.h / part
-        work = Ensemble(own, [given.q] * 8, [given.p] * 8, h=h, steps=STEPS)
-        batch = work.common.batch()
+        batch = ensemble_runs(own, [given.q] * 8, [given.p] * 8, h=h, steps=STEPS).batch()
         assert isinstance(batch, LaneRuns)
         block = batch.part(0, batch.width)
         block.advance()

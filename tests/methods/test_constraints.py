@@ -12,7 +12,7 @@ from sympy.physics.mechanics import LagrangesMethod, dynamicsymbols
 
 import scvi_codegen as sc
 from scvi_codegen.interfaces.models.model_files.model_file import parse_model
-from scvi_codegen.runs.ensembles.ensemble import Ensemble
+from scvi_codegen.runs.ensembles.ensemble import Ensemble, EnsembleSettings
 
 G = 9.81
 
@@ -401,8 +401,8 @@ def test_initial_states_are_projected_or_rejected():
     ensemble = stepper.integrate_ensemble([on_circle(0.3), on_circle(0.4)], np.zeros((2, 2)), h=0.1, steps=5)
     assert np.isfinite(ensemble.q).all()
     with pytest.warns(sc.AccuracyWarning, match=r"projected onto the constraints"):
-        moved = Ensemble(stepper, [[1.061, -1.061]], [[0.0, 0.0]], h=0.1, steps=1)
-    assert np.abs(stepper.constraint_values(*moved.start)).max() < 1e-15
+        moved = Ensemble.of(stepper, [[1.061, -1.061]], [[0.0, 0.0]], EnsembleSettings(h=0.1, steps=1))
+    assert np.abs(stepper.constraint_values(moved.q, moved.p)).max() < 1e-15
 
 
 def test_states_far_from_constraints_with_sines_are_projected():

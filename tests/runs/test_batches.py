@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from counting import TooMuchWorkError, at_most
 from notation import lagrange
+from samples import ensemble_runs
 from scipy.spatial.transform import Rotation
 
 import scvi_codegen as sc
 from scvi_codegen.runs.ensembles import batches
-from scvi_codegen.runs.ensembles.ensemble import Ensemble
 
 COUNT = 7
 RNG = np.random.default_rng(3)
@@ -128,7 +128,7 @@ def test_a_step_that_requests_newtons_method_is_repeated_with_it() -> None:
     system = lagrange("stiff", "x", "x_dot**2/2 - k*x**2/2", k=1.0)
     one, k = sc.compile_stepper(system, sc.SVI(3)), np.array([1.0, 1e5, 2.0])
     end = 0.2
-    work = Ensemble(one, np.ones((3, 1)), np.zeros((3, 1)), t_end=end, tolerance=1e-3, parameters={"k": k})
+    work = ensemble_runs(one, np.ones((3, 1)), np.zeros((3, 1)), t_end=end, tolerance=1e-3, parameters={"k": k})
     assert work.successive is not None
     work.run()
     for j, (_, q, *_) in enumerate(work.result().each()):
@@ -138,7 +138,7 @@ def test_a_step_that_requests_newtons_method_is_repeated_with_it() -> None:
 
 @pytest.mark.parametrize("plan", [{"h": 0.1, "steps": 5}, {"t_end": 0.5, "tolerance": 1e-6}])
 def test_ensembles_are_released_without_the_garbage_collector(plan: dict[str, Any]) -> None:
-    work = Ensemble(stepper("kepler"), *states("kepler"), **plan)
+    work = ensemble_runs(stepper("kepler"), *states("kepler"), **plan)
     work.run()
     released = weakref.ref(work)
     gc.disable()

@@ -16,14 +16,13 @@ import pytest
 from commands import invoke
 from emulated_gpu import ArrayOfLibrary, EmulatedGpu
 from pages import ROOT, runnable
-from samples import pushed_pendulum, sample_named
+from samples import ensemble_runs, pushed_pendulum, sample_named
 
 import scvi_codegen as sc
 from scvi_codegen.codegen.native import cuda
 from scvi_codegen.codegen.native.building import PORTABLE_FLAGS
 from scvi_codegen.methods import Method
 from scvi_codegen.runs.ensembles.device import DeviceEnsemble
-from scvi_codegen.runs.ensembles.ensemble import Ensemble
 
 pytestmark = pytest.mark.second
 
@@ -175,7 +174,7 @@ def test_trajectories_that_leave_their_lane_are_observed(gpu: EmulatedGpu) -> No
 @pytest.mark.quick
 def test_interrupted_runs_have_the_states_so_far(gpu: EmulatedGpu) -> None:
     stepper, (q, p) = compiled("kepler", sc.SVI(4)), states("kepler")
-    work = Ensemble(stepper, q, p, h=0.05, steps=200, device="cuda")
+    work = ensemble_runs(stepper, q, p, h=0.05, steps=200, device="cuda")
 
     def stop(done: int) -> None:
         raise KeyboardInterrupt

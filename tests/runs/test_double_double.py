@@ -19,7 +19,7 @@ import sympy
 from mpmath import mp
 from notation import lagrange
 from oracle import stepper_of
-from samples import GENERIC, sample_named
+from samples import GENERIC, ensemble_runs, sample_named
 
 import scvi_codegen as sc
 from scvi_codegen.codegen.native.building import TUNED_FLAGS
@@ -28,8 +28,7 @@ from scvi_codegen.codegen.pipeline import Sources
 from scvi_codegen.codegen.rendering.kernels.double_double import FUNCTIONS, arithmetic_headers
 from scvi_codegen.codegen.variants import Lanes
 from scvi_codegen.common.errors import MethodError, StateError
-from scvi_codegen.runs.ensembles.ensemble import Ensemble
-from scvi_codegen.runs.ensembles.lanes import SingleRun
+from scvi_codegen.runs.ensembles.lanes import CommonRuns, Departure, follow
 from scvi_codegen.runs.states.words import as_mpmath, split, two_words, with_low
 
 KEPLER = "m*(x_dot**2 + y_dot**2)/2 + mu/sqrt(x**2 + y**2)"
@@ -635,7 +634,9 @@ def test_ensembles(tmp_path: Path) -> None:
         root, third = mp.sqrt(3), mp.mpf(1) / 3
         q, v = [["0.5", "0"], [third, "0"]], [["0", root], ["0", mp.sqrt(third + 3)]]
         for plan, has_successive in (({"h": 0.07, "t_end": 6.01}, False), ({"t_end": 2.0}, True)):
-            assert (Ensemble(stepper, q, None, velocity=v, **plan).successive is not None) == has_successive
+            together = ensemble_runs(stepper, q, None, velocity=v, **plan)
+            by_c = not isinstance(together, CommonRuns) and together.successive is not None
+            assert by_c == has_successive
         ends = stepper.integrate_ensemble(q, velocity=v, h=0.07, t_end=6.01)
         assert max(abs(x - y) for x, y in zip(ends[0].mp("q")[-1], exact_orbit(6.01), strict=True)) < 1e-29
         again = stepper.integrate_ensemble([run.q[-1] for run in (ends[0], ends[1])], ends.p[-1], h=-0.07, steps=3)
@@ -738,13 +739,12 @@ def test_largest_systems_in_lanes(count: int, has_lanes: bool) -> None:
 def test_trajectory_that_leaves_its_lane() -> None:
     """A trajectory that the single integrator continues ends at the final time, with the state of its lane."""
     stepper = sc.compile_stepper(system("driven"), "svi:4", precision="double-double")
-    common = Ensemble(stepper, [["0.7"]] * 3, [["0.3"]] * 3, t=0.001, h=0.1, t_end=1.0).common
-    assert common is not None
+    common = ensemble_runs(stepper, [["0.7"]] * 3, [["0.3"]] * 3, t=0.001, h=0.1, t_end=1.0)
     common.run(progress=None, threads=1)
     q, p = common.q.copy(), common.p.copy()
     carries = q.low[4, 1].copy(), p.low[4, 1].copy()
     common.q[5:, 1] = np.nan
-    SingleRun(common, 1, np.array(q[4, 1]), np.array(p[4, 1]), 4, carries).follow(lambda _: None)
+    follow(common, Departure(1, 4, np.array(q[4, 1]), np.array(p[4, 1]), carries), lambda _: None)
     for now, before in ((common.q, q), (common.p, p)):
         assert abs(as_mpmath(now[:, 1]) - as_mpmath(before[:, 1])).max() < 1e-31
     assert (q.low[-1, 1] != 0).all()

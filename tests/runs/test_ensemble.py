@@ -20,14 +20,13 @@ import pytest
 from commands import error_of, invoke, output_of
 from notation import hamilton, lagrange
 from numpy.testing import assert_allclose
-from samples import pushed_pendulum, sample_named, stepper_for
+from samples import ensemble_runs, pushed_pendulum, sample_named, stepper_for
 from scipy.interpolate import CubicSpline
 
 import scvi_codegen as sc
 from benchmarks.cases.robots import chain
 from scvi_codegen.interfaces.models.model_files.ensemble_file import load_ensemble
 from scvi_codegen.methods import Method
-from scvi_codegen.runs.ensembles.ensemble import Ensemble
 from scvi_codegen.runs.ensembles.lanes import LaneRuns
 
 KNOTS = np.array([0.0, 0.37, 0.9, 1.41, 2.05, 2.6])
@@ -376,8 +375,7 @@ class TestFailures:
         ends = []
         for radius in (1.0, 1e-4, 0.0, np.nan):
             q, p = np.tile([1.0, 0.0], (2, 1)), np.tile([0.0, 1.0], (2, 1))
-            runs = Ensemble(kepler, q, p, h=0.1, steps=20).common
-            assert runs is not None
+            runs = ensemble_runs(kepler, q, p, h=0.1, steps=20)
             batch = runs.batch()
             assert isinstance(batch, LaneRuns)
             block = batch.part(0, 2)
@@ -443,7 +441,7 @@ class TestThreadsAndInterruption:
 
     def test_interrupt_ends_all_threads_and_returns_completed_states(self, kepler: sc.Stepper):
         q, p = states("kepler", 64)
-        work = Ensemble(kepler, q, p, h=0.05, steps=10**9, save_every=10**7)
+        work = ensemble_runs(kepler, q, p, h=0.05, steps=10**9, save_every=10**7)
 
         def interrupt(done: int) -> None:
             raise KeyboardInterrupt
@@ -479,7 +477,7 @@ class TestThreadsAndInterruption:
 
     def test_interrupted_adaptive_runs_return_completed_states(self) -> None:
         q, p = states("eccentric", 4)
-        work = Ensemble(stepper_of("eccentric", sc.SVI(4)), q, p, t_end=[5.0, 5.0, 5.0, 1e7], tolerance=1e-10)
+        work = ensemble_runs(stepper_of("eccentric", sc.SVI(4)), q, p, t_end=[5.0, 5.0, 5.0, 1e7], tolerance=1e-10)
 
         def interrupt(done: int) -> None:
             if done:
@@ -808,8 +806,7 @@ def test_lanes_converge_as_single_runs(h: float) -> None:
     generator = np.random.default_rng(1)
     q, v = generator.uniform(-1, 1, (count, 4)), generator.normal(size=(count, 4))
     p = np.array([stepper.momentum(*each) for each in zip(q, v, strict=True)])
-    runs = Ensemble(stepper, q, p, h=h, steps=steps).common
-    assert runs is not None
+    runs = ensemble_runs(stepper, q, p, h=h, steps=steps)
     batch = runs.batch()
     assert isinstance(batch, LaneRuns)
     batch.run(progress=None, threads=1)

@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, cached_property
+from typing import Any
 
 import numpy as np
 from oracle import Mechanics, numbers, oracle_step
@@ -15,6 +16,9 @@ from scvi_codegen.codegen.lowering.program import iteration_of, lower
 from scvi_codegen.codegen.native.building import FLAGS_VARIABLE, TUNED_FLAGS
 from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.methods.method import Method
+from scvi_codegen.runs.ensembles.ensemble import Ensemble, EnsembleSettings
+from scvi_codegen.runs.ensembles.individual import runs_of
+from scvi_codegen.runs.states.validation import States
 from scvi_codegen.systems.system import MechanicalSystem
 
 
@@ -26,6 +30,13 @@ def lowered(system: MechanicalSystem, method: Method) -> Program:
 def fixed_point(system: MechanicalSystem, method: Method) -> FixedPointIteration | None:
     """The fixed-point iteration, if there is one."""
     return iteration_of(system, discretise(system, method))
+
+
+def ensemble_runs(
+    stepper: Stepper, q: States, p: States | None, *, velocity: States | None = None, **settings: Any
+) -> Any:
+    """The runs of an ensemble, before its first step, of arguments of ``integrate_ensemble``."""
+    return runs_of(Ensemble.of(stepper, q, p, EnsembleSettings(**settings), velocity=velocity))
 
 
 def oscillator() -> LagrangianSystem:

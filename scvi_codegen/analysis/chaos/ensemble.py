@@ -33,6 +33,7 @@ from scvi_codegen.common.errors import StateError, StepFailedError
 from scvi_codegen.common.validation import checked_count
 from scvi_codegen.runs.accuracy.local_error import warn_of_large_steps
 from scvi_codegen.runs.driver.run_loop import record
+from scvi_codegen.runs.ensembles.ensemble import Ensemble, EnsembleSettings
 from scvi_codegen.runs.ensembles.initial_states import momenta_of_each, start_of_ensemble
 from scvi_codegen.runs.ensembles.lanes import LaneRuns
 from scvi_codegen.runs.ensembles.result import OK
@@ -127,7 +128,7 @@ class ChaosIndicatorsEnsemble:
         count, steps, tangents = len(self.q), len(self.t) - 1, self._first(0)
         orthonormal, triangle = np.linalg.qr(tangents)
         frames = (np.tile(half.T.ravel(), (count, 1)) for half in np.split(orthonormal, 2))  # one vector after another
-        start = tuple(np.hstack(pair) for pair in zip((self.q, self.p), frames, strict=True))
+        q, p = (np.hstack(pair) for pair in zip((self.q, self.p), frames, strict=True))
         with np.errstate(divide="ignore"):  # linearly dependent directions span zero volume
             diagonal = np.log(np.abs(np.diagonal(triangle)))
         k = tangents.shape[1]
@@ -136,8 +137,10 @@ class ChaosIndicatorsEnsemble:
         saved = np.full((len(plan.numbers), count, len(SERIES), k), np.nan)
         saved[0] = growth[: len(SERIES) * k].reshape(len(SERIES), k)
         binding = Binding(building.load(source, flags=self.stepper.flags), source.prefix)
-        arguments = binding, self.options, start, self.parameters, plan.t0, plan.fixed_segments()
-        runs = LaneRuns(*arguments, fields={"positions": saved, "growth": growth})
+        settings = EnsembleSettings(options=self.options)
+        start: dict[str, Any] = {"t0": plan.t0, "q": q, "p": p, "parameters": self.parameters}
+        ensemble = Ensemble(stepper=self.stepper, settings=settings, **start, fixed=plan)
+        runs = LaneRuns(binding, ensemble, {"positions": saved, "growth": growth})
         runs.run(progress=lambda _: report(int(np.count_nonzero(runs.status == 0))), threads=threads)
         ended = runs.status == 0
         self.values[:, :, ended] = saved.transpose(2, 0, 1, 3)[:, :, ended]

@@ -23,7 +23,8 @@ from scvi_codegen.common.errors import StateError
 from scvi_codegen.common.precision import mp
 from scvi_codegen.methods import SCVI
 from scvi_codegen.methods.exact.solution import numbers
-from scvi_codegen.runs.ensembles.ensemble import Ensemble
+from scvi_codegen.runs.ensembles.ensemble import Ensemble, EnsembleSettings
+from scvi_codegen.runs.ensembles.individual import runs_of
 from scvi_codegen.runs.ensembles.lanes import CommonRuns, LaneRuns
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepper import Stepper
@@ -169,8 +170,8 @@ def _lanes(tested: SystemUnderTest, starts: list[State], steps: int, carry: Arra
     """Yield final state and compensation terms of each lane, as :func:`_advanced`."""
     q, p = (np.array([getattr(start, name) for start in starts]) for name in "qp")
     first, m = starts[0], len(carry) // 2
-    ensemble = Ensemble(tested.stepper, q, p, h=first.h, steps=steps, t=first.t, parameters=tested.parameters)
-    work = ensemble.common
+    settings = EnsembleSettings(h=first.h, steps=steps, t=first.t, parameters=tested.parameters)
+    work = runs_of(Ensemble.of(tested.stepper, q, p, settings))
     assert isinstance(work, CommonRuns)
     batch = work.batch()
     assert isinstance(batch, LaneRuns)

@@ -15,7 +15,9 @@ from scvi_codegen.interfaces.cli.reports import LARGE_ERROR, duration, momentum_
 from scvi_codegen.interfaces.cli.supervision import check_memory, interruptions, progress_bar
 from scvi_codegen.interfaces.models.model import Model
 from scvi_codegen.interfaces.models.model_files.ensemble_file import EnsembleStates
-from scvi_codegen.runs.ensembles.ensemble import Ensemble
+from scvi_codegen.runs.ensembles.device import DeviceRuns
+from scvi_codegen.runs.ensembles.ensemble import Ensemble, EnsembleSettings
+from scvi_codegen.runs.ensembles.individual import IndividualRuns, runs_of
 from scvi_codegen.runs.ensembles.lanes import CommonRuns
 from scvi_codegen.runs.ensembles.result import EnsembleTrajectory
 from scvi_codegen.runs.results.energy import MOST_BALANCED_STEPS, energy_account, energy_reason
@@ -51,9 +53,9 @@ def integrate_states(states: EnsembleStates) -> EnsembleOutcome:
     model, began = states.model, time.perf_counter()
     check_memory(model, trajectories=len(states))
     stepper = model.stepper()
-    work = _work(model, stepper, states)
+    runs = _runs(model, stepper, states)
     started, interrupted = time.perf_counter(), False
-    length = work.length
+    length = runs.length
     with interruptions() as caught, progress_bar(length) as show_progress:
 
         def look(done: int) -> None:
@@ -62,30 +64,30 @@ def integrate_states(states: EnsembleStates) -> EnsembleOutcome:
                 raise _Stop
 
         try:
-            work.run(progress=look)
+            runs.run(progress=look)
         except _Stop:
             interrupted = True
     return EnsembleOutcome(
-        result=work.result(),
+        result=runs.result(),
         preparation=started - began,
         seconds=time.perf_counter() - started,
         interrupted=interrupted,
     )
 
 
-def _work(model: Model, stepper: Stepper, states: EnsembleStates) -> Ensemble:
+def _runs(model: Model, stepper: Stepper, states: EnsembleStates) -> CommonRuns | IndividualRuns:
     """Return the compiled ensemble; Ctrl-C still ends the process here."""
-    start = stepper, states.q, states.momenta(stepper)
-    arguments = {
-        "options": model.solver_options,
-        "device": model.device,
-        "observe": model.observe,
+    settings = EnsembleSettings(
+        options=model.solver_options,
+        device=model.device,
+        observe=model.observe,
+        parameters=states.parameters,
         **model._run_arguments(),
-    }
-    work = Ensemble(*start, parameters=states.parameters, **arguments)
-    if isinstance(work.common, CommonRuns):
-        work.common.batch()
-    return work
+    )
+    runs = runs_of(Ensemble.of(stepper, states.q, states.momenta(stepper), settings))
+    if isinstance(runs, CommonRuns) and not isinstance(runs, DeviceRuns):
+        runs.batch()
+    return runs
 
 
 def ensemble_summary(model: Model, outcome: EnsembleOutcome, balance: float | None) -> str:

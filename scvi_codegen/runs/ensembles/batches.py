@@ -17,16 +17,15 @@ from numpy.typing import NDArray
 
 from scvi_codegen.codegen.native.binding import Binding
 from scvi_codegen.codegen.native.capacity import TOO_MANY_STATES
-from scvi_codegen.codegen.native.options import OUTCOMES, SolverOptions
+from scvi_codegen.codegen.native.options import OUTCOMES
 from scvi_codegen.common.validation import checked_count
+from scvi_codegen.runs.ensembles.ensemble import Ensemble
 from scvi_codegen.runs.ensembles.result import INTERRUPTED, OK
-from scvi_codegen.runs.ensembles.schedule import FixedSegments
 from scvi_codegen.runs.ensembles.thread_pool import StopCheck, run_jobs
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.states.words import Word, block_of, from_block
 from scvi_codegen.runs.stepping.chunks import drive
-from scvi_codegen.runs.stepping.integrator import Integrator
-from scvi_codegen.runs.stepping.step_plan import Adaptive, step_control
+from scvi_codegen.runs.stepping.step_plan import step_control
 
 FIRST_CHUNK_STEPS = 64
 """Steps of the first call, before the speed of the steps is known."""
@@ -48,6 +47,7 @@ class Rows(NamedTuple):
     Attributes:
         trajectories, first, numbers: (k,) trajectories, their first rows and their numbers of rows.
         t, q, p, actions: one row per state; actions are empty unless runs sum them.
+        tau: its values in transformed time, where they do not follow from the number of steps, else empty.
     """
 
     trajectories: NDArray[np.intp]
@@ -57,42 +57,43 @@ class Rows(NamedTuple):
     q: Array
     p: Array
     actions: Array
+    tau: Array = np.empty(0)
 
-    def copies(self) -> Rows:
-        """Return copies, in memory of their own."""
-        return Rows(*self[:3], *(each.copy() for each in self[3:]))
+    def copies(self, shift: int) -> Rows:
+        """Return copies, in memory of their own, of which other rows are the first ones."""
+        return Rows(self.trajectories, self.first + shift, self.numbers, *(values.copy() for values in self[3:]))
 
     def indices(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Return the row and the trajectory of each state."""
-        rows = np.arange(len(self.t)) + np.repeat(self.first + self.numbers - np.cumsum(self.numbers), self.numbers)
-        return rows, np.repeat(self.trajectories, self.numbers)
+        before = self.first + self.numbers - self.numbers.cumsum()  # a state's row minus its place in this memory
+        rows = before.repeat(self.numbers)
+        return rows + np.arange(len(rows)), self.trajectories.repeat(self.numbers)
 
     def put(self, *pairs: tuple[Array | None, Array]) -> None:
         """Store values of the states in (n, k, ..) arrays of all trajectories; ``None`` is not stored."""
-        k, row, count = (int(each[0]) for each in self[:3])
-        where: Any = slice(row, row + count), slice(k, k + len(self.first))
-        alike = (self.first == row).all() and (self.numbers == count).all()
-        where = where if alike else self.indices()
-        for whole, values in pairs:
-            if whole is not None:
+        k, row, count = (int(numbers[0]) for numbers in self[:3])
+        equal = bool((self.first == row).all() and (self.numbers == count).all())
+        rectangle = slice(row, row + count), slice(k, k + len(self.first))
+        places: Any = rectangle if equal else self.indices()
+        for array, values in pairs:
+            if array is not None:
                 shape = (-1, count, *values.shape[1:])
-                whole[where] = values.reshape(shape).swapaxes(0, 1) if alike else values
+                array[places] = values.reshape(shape).swapaxes(0, 1) if equal else values
 
 
 class Batch:
-    """Trajectories from given states, with the same fixed steps or with adaptive steps to individual times.
+    """Trajectories of an ensemble as C integrates them.
 
     Parts of it (:meth:`part`), which threads integrate, share all arrays and have a C structure of their own, whose
     memory they release when they end.
 
     Args:
-        binding, options: the compiled integrator and its solver options.
-        start: (k, m) initial positions and momenta at the time ``t``.
-        parameters: (k, number of parameters) values.
-        steps: segments of fixed steps, or (k,) final times of adaptive steps.
-        values_at: function that returns the parameters at a time of a slice of trajectories, if they change.
+        binding: the compiled integrator.
+        ensemble: the trajectories.
 
     Attributes:
+        segments: the fixed steps, ``None`` for adaptive steps.
+        q, p, parameters: contiguous initial states and present parameters; numbers of two words have both.
         width: number of trajectories that C integrates at the same time.
         status: (k,) status of C, -1 before the end of a trajectory.
         done: (k,) numbers of completed steps.
@@ -102,19 +103,12 @@ class Batch:
     width = 1
     struct: Any
 
-    def __init__(
-        self,
-        binding: Binding,
-        options: SolverOptions | None,
-        start: tuple[Array, Array],
-        parameters: Array,
-        t: float,
-        steps: FixedSegments | Array,
-        values_at: Callable[[float, slice], Array] | None = None,
-    ) -> None:
-        self.binding, self.options, self.t, self.steps, self.values_at = binding, options, t, steps, values_at
-        self.q, self.p, self.parameters = (np.ascontiguousarray(block_of(each)) for each in (*start, parameters))
-        if values_at is not None:
+    def __init__(self, binding: Binding, ensemble: Ensemble) -> None:
+        self.binding, self.ensemble = binding, ensemble
+        self.segments = None if ensemble.fixed is None else ensemble.fixed.fixed_segments()
+        numbers = ensemble.q, ensemble.p, ensemble.parameters
+        self.q, self.p, self.parameters = (np.ascontiguousarray(block_of(values)) for values in numbers)
+        if ensemble.inputs:
             self.parameters = self.parameters.copy()
         self.status = np.full(len(self.q), -1, np.int32)
         self.done = np.zeros(len(self.q), np.int64)
@@ -128,27 +122,27 @@ class Batch:
 
     def prepare(self, first: int, end: int) -> None:
         """Set the C structure of a part."""
-        binding, struct = self.binding, self.binding.new("each *")
-        self.struct, self.solver = struct, binding.options(self.options)
+        binding, struct, t0 = self.binding, self.binding.new("each *"), self.ensemble.t0
+        self.struct, self.solver = struct, binding.options(self.ensemble.settings.options)
         struct.options = self.solver
         struct.q, struct.p, struct.parameters = map(binding.pointer, (self.q, self.p, self.parameters))
-        if isinstance(self.steps, FixedSegments):
-            steps, save_every, h, *_ = self.steps
+        if self.segments is not None:
+            steps, save_every, h, *_ = self.segments
             struct.segment_steps, struct.segment_every = map(binding.whole_numbers, (steps, save_every))
             struct.segment_h, struct.segments = binding.pointer(h), len(h)
         struct.status, struct.done = binding.integers(self.status), binding.whole_numbers(self.done)
-        struct.t, struct.next, struct.end, struct.segment = self.t, first, end, -1
-        if isinstance(self.t, Word):
-            struct.t_low = self.t.low
-        struct.pauses = self.values_at is not None
+        struct.t, struct.next, struct.end, struct.segment = t0, first, end, -1
+        if isinstance(t0, Word):
+            struct.t_low = t0.low
+        struct.pauses = bool(self.ensemble.inputs)
         self.take = binding.each(struct)
 
     def completed(self) -> float:
         """Return the number of completed trajectories, of fixed steps with the parts of the others."""
         ended = self.status >= 0
-        if not isinstance(self.steps, FixedSegments):
+        if self.segments is None:
             return float(ended.sum())
-        return float(np.where(ended, 1.0, self.done / self.steps.steps.sum()).sum())
+        return float(np.where(ended, 1.0, self.done / self.segments.steps.sum()).sum())
 
     def run(self, *, progress: Callable[[float], None] | None, threads: int | None) -> None:
         """Integrate all trajectories; ``progress`` is called with the number of completed ones and may raise.
@@ -207,10 +201,10 @@ class Batch:
 
     def enter(self, segment: int) -> None:
         """Set the parameters of the present trajectories in a segment."""
-        first = int(self.struct.next)
-        if self.values_at is not None and isinstance(self.steps, FixedSegments):
+        if self.ensemble.inputs and self.segments is not None:
+            first = int(self.struct.next)
             present = slice(first, min(first + self.width, len(self.q)))
-            self.parameters[present] = self.values_at(float(self.steps.middle[segment]), present)
+            self.parameters[present] = self.ensemble.values_at(float(self.segments.middle[segment]), present)
 
     def limit(self) -> None:
         """End the present trajectory if it has too many states."""
@@ -220,13 +214,13 @@ class Batch:
 
 
 class SuccessiveRuns(Batch):
-    """Trajectories that C integrates one after the other; arguments as of :class:`Batch`.
+    """Trajectories that C integrates one after the other.
 
     Args:
-        stepper: the integrator.
-        plan, save_every: of adaptive steps; the target time of the plan is not used.
-        most_states: number of states with which a trajectory ends.
+        ensemble: the trajectories.
         receive: receives saved states after the initial ones, row 0, possibly from several threads; they are views.
+        save_every: of adaptive steps.
+        most_states: number of states with which a trajectory ends.
 
     Attributes:
         stored: (k,) numbers of saved states without the initial one.
@@ -235,22 +229,14 @@ class SuccessiveRuns(Batch):
     """
 
     def __init__(
-        self,
-        stepper: Integrator,
-        *arguments: Any,
-        plan: Adaptive | None = None,
-        save_every: int = 1,
-        most_states: float = math.inf,
-        receive: Callable[[Rows], None],
+        self, ensemble: Ensemble, receive: Callable[[Rows], None], *, save_every: int = 1, most_states: float = math.inf
     ) -> None:
-        super().__init__(stepper.binding, *arguments)
-        self.stepper = stepper
-        self.words, self.sums_action = stepper.interface.words, stepper.sums_action
-        self.conserves_energy = stepper.interface.conserves_energy and self.words == 1
-        self.plan, self.save_every, self.receive, count = plan, save_every, receive, len(self.q)
-        self.most_states = most_states
-        self.stored, self.fallback_steps = np.zeros((2, count), np.int64)
-        self.energies = np.full((count, 2), np.nan)
+        super().__init__(ensemble.stepper.binding, ensemble)
+        interface = ensemble.stepper.interface
+        self.words, self.conserves_energy = interface.words, interface.conserves_energy and interface.words == 1
+        self.receive, self.save_every, self.most_states = receive, save_every, most_states
+        self.stored, self.fallback_steps = np.zeros((2, len(self.q)), np.int64)
+        self.energies = np.full((len(self.q), 2), np.nan)
 
     @property
     def names(self) -> NDArray[np.str_]:
@@ -260,7 +246,7 @@ class SuccessiveRuns(Batch):
     def prepare(self, first: int, end: int) -> None:
         """Set the C structure of a part, with the memory of a run and for states."""
         super().prepare(first, end)
-        binding, struct, m = self.binding, self.struct, self.q.shape[1]
+        binding, struct, stepper, m = self.binding, self.struct, self.ensemble.stepper, self.q.shape[1]
         self.flushed = first
         self.capacity = max(FEWEST_ROWS, MOST_NUMBERS // (2 * m + 1))
         self.before = 0  # states of the first trajectory that were stored earlier
@@ -269,11 +255,12 @@ class SuccessiveRuns(Batch):
         self.workspace = struct.workspace = binding.workspace(self.runs[0])
         if binding.count is None:
             self.run_before = struct.before = binding.new("run *")
-        if isinstance(self.steps, FixedSegments):
-            struct.segment_end = binding.pointer(self.steps.end)
+        if self.segments is not None:
+            struct.segment_end = binding.pointer(self.segments.end)
         else:
-            assert self.plan is not None  # by the caller
-            struct.t_end, self.control = binding.pointer(self.steps), step_control(self.stepper, self.plan)
+            assert self.ensemble.plan is not None  # by the caller
+            struct.t_end = binding.pointer(self.ensemble.ends)
+            self.control = step_control(stepper, self.ensemble.plan)
             struct.control = self.control[0]
             if self.conserves_energy:
                 struct.energies = binding.pointer(self.energies)
@@ -282,7 +269,7 @@ class SuccessiveRuns(Batch):
         struct.words, struct.capacity = self.words, self.capacity
         self.iterations = np.empty(self.capacity, np.int32)
         struct.iterations = binding.integers(self.iterations)
-        self.actions = np.full(self.capacity if self.sums_action else 0, np.nan)
+        self.actions = np.full(self.capacity if stepper.sums_action else 0, np.nan)
         struct.actions = binding.pointer(self.actions)
         self.states = tuple(np.empty((self.capacity, numbers)) for numbers in (self.words, m, m))
         struct.times, struct.positions, struct.momenta = binding.pointers(*self.states)
@@ -299,13 +286,13 @@ class SuccessiveRuns(Batch):
         call, count = self.struct, int(self.struct.rows)
         if not count or (not last and count + FEWEST_ROWS <= self.capacity):
             return
-        each = np.arange(self.flushed, min(call.next + 1, call.end))
-        first = np.ones(len(each), np.int64)
+        trajectories = np.arange(self.flushed, min(call.next + 1, call.end))
+        first = np.ones(len(trajectories), np.int64)
         first[0] += self.before
-        numbers = self.stored[each] + 1 - first
-        states = (each[:count] if self.words == 1 else from_block(each[:count]) for each in self.states)
+        numbers = self.stored[trajectories] + 1 - first
+        states = (block[:count] if self.words == 1 else from_block(block[:count]) for block in self.states)
         t, q, p = states
-        self.receive(Rows(each, first, numbers, t[:, 0], q, p, self.actions[:count]))
+        self.receive(Rows(trajectories, first, numbers, t[:, 0], q, p, self.actions[:count]))
         self.flushed = int(call.next)
         self.before = int(self.stored[self.flushed]) if self.flushed < call.end and call.segment >= 0 else 0
         call.rows = 0

@@ -6,7 +6,7 @@ leave a block of SIMD lanes (:mod:`scvi_codegen.runs.ensembles.lanes`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, cast
@@ -14,21 +14,17 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.codegen.native.cuda import DEVICES, Device, has_device_memory
+from scvi_codegen.codegen.native.cuda import Device
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.codegen.rendering.source import Source
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.common.representation import one_line
-from scvi_codegen.runs.ensembles.lanes import CommonRuns, SingleRun
-from scvi_codegen.runs.ensembles.observation import EnsembleObservation
-from scvi_codegen.runs.ensembles.result import OK, EnsembleRuns, EnsembleTrajectory
-from scvi_codegen.runs.ensembles.schedule import CommonSteps
+from scvi_codegen.runs.ensembles.lanes import CommonRuns, Departure, follow
+from scvi_codegen.runs.ensembles.result import EnsembleRuns, EnsembleTrajectory
 from scvi_codegen.runs.ensembles.thread_pool import StopCheck, run_jobs
 from scvi_codegen.runs.results.descriptions import short_title
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepping.chunks import drive
-from scvi_codegen.runs.stepping.features import check_together
-from scvi_codegen.runs.stepping.integrator import Integrator
 
 FIRST_STEPS, GROWTH = 64, 8.0
 """Steps of the first launch, and the largest ratio of those of successive ones."""
@@ -36,62 +32,29 @@ HEAD = 4
 """Numbers in front of the memory of a trajectory: time, its low word, steps for the predictor, 1 while active."""
 
 
-def check_device(device: str | None, h: float | None, **others: Any) -> None:
-    """Raise ``StateError`` for an unknown device, without a step size h, and for arguments that a device excludes."""
-    if device not in (None, *DEVICES):
-        raise StateError(f"device is {device!r}: it must be {' or '.join(map(repr, DEVICES))}, or omitted")
-    check_together(device=device, adaptive=True if h is None else None, **others)
+class DeviceRuns(CommonRuns):
+    """Trajectories with common fixed steps on a GPU; ``q`` and ``p`` are arrays of the device."""
 
+    q: Any
+    p: Any
 
-def on_processor(value: Any) -> Any:
-    """Return a copy on the processor of an array of a GPU, alone or in a mapping; other values unchanged."""
-    if isinstance(value, Mapping):
-        return {name: on_processor(each) for name, each in value.items()}
-    return Device().copy_of(value) if has_device_memory(value) else value
-
-
-class DeviceRuns:
-    """Trajectories with common fixed steps on a GPU; arguments as of :class:`CommonRuns`.
-
-    Attributes:
-        q, p: (n, k, m) saved states, on the device.
-        times, actions: ``None``: all trajectories have the same times, and no action is summed.
-        status, done, fallback_steps: as of :class:`CommonRuns`.
-    """
-
-    times = actions = None
-
-    def __init__(
-        self,
-        stepper: Integrator,
-        options: SolverOptions | None,
-        start: tuple[Array, Array],
-        parameters: Array,
-        values_at: Callable[[float, slice], Array],
-        steps: CommonSteps,
-        observation: EnsembleObservation | None = None,
-    ) -> None:
-        self.stepper, self.options, self.start, self.steps = stepper, options or SolverOptions(), start, steps
-        self.values_at, self.observation, self.device = values_at, observation, Device()
-        source = cast(Source, stepper.ensemble if observation is None else observation.source)
-        self.launch = self.device.kernels(source)
+    def _allocate(self) -> None:
+        """Create the arrays on the device, with the initial states, and the memory of the threads."""
+        stepper, device, q = self.ensemble.stepper, Device(), self.ensemble.q
+        source = cast(Source, stepper.ensemble if self.observation is None else self.observation.source)
+        self.device, self.launch = device, device.kernels(source)
         lanes = source.contents.lanes
         assert lanes is not None  # of an ensemble
         self.points, self.needs_velocities = lanes.points, lanes.needs_velocities
-        count, self.m = map(int, start[0].shape)
-        self.count, device = count, self.device
-        self.q, self.p = (device.empty((len(steps.numbers), *each.shape)) for each in start)
-        for initial, states in zip(start, (self.q, self.p), strict=True):
-            device.copy_in(initial, states)
-        self.parameters = device.copied(parameters if parameters.size else np.zeros((count, 1)))
-        self.h = steps.segments[0].h
+        self.count, self.m = map(int, q.shape)
+        self.q, self.p = (device.empty((len(self.steps.numbers), *q.shape)) for _ in "qp")
+        device.copy_in(q, self.q)
+        device.copy_in(self.ensemble.p, self.p)
+        parameters = self.ensemble.parameters
+        self.parameters = device.copied(parameters if parameters.size else np.zeros((self.count, 1)))
+        self.h = self.steps.segments[0].h
         self.memory = device.copied(self._first_memory(parameters))
-        self.counts = device.copied(np.zeros(count, np.int64))
-        self.status, self.done = np.full(count, OK, dtype="<U32"), np.zeros(count, dtype=np.int64)
-        self.fallback_steps = np.zeros_like(self.done)
-
-    def __len__(self) -> int:
-        return self.count
+        self.counts = device.copied(np.zeros(self.count, np.int64))
 
     @property
     def size(self) -> int:
@@ -108,7 +71,7 @@ class DeviceRuns:
         memory = np.zeros((self.size + len(observed), self.count))
         memory[self.size :] = observed
         memory[0], memory[3] = self.steps.t0, 1.0
-        for i, states in enumerate(self.start):
+        for i, states in enumerate((self.ensemble.q, self.ensemble.p)):
             memory[HEAD + i * self.m : HEAD + (i + 1) * self.m] = states.T
         self._reset_predictor(memory, parameters)
         return memory
@@ -122,15 +85,15 @@ class DeviceRuns:
         q, p, running = memory[HEAD : HEAD + m].T, memory[HEAD + m : HEAD + 2 * m].T, memory[3] > 0.0
         if running.all() and (parameters == parameters[0]).all():  # in one call
             with suppress(StateError):
-                stored[:] = self.stepper.velocity(q, p, memory[0], parameters[0]).T
+                stored[:] = self.ensemble.stepper.velocity(q, p, memory[0], parameters[0]).T
                 return
         for j in np.flatnonzero(running):
             memory[3, j] = 0.0
             with suppress(StateError):
-                stored[:, :, j] = self.stepper.velocity(q[j], p[j], memory[0, j], parameters[j])
+                stored[:, :, j] = self.ensemble.stepper.velocity(q[j], p[j], memory[0, j], parameters[j])
                 memory[3, j] = 1.0
 
-    def run(self, *, progress: Callable[[int], None] | None, threads: int | None) -> None:
+    def run(self, *, progress: Callable[[int], None] | None = None, threads: int | None = None) -> None:
         """Integrate all trajectories; then continue those that failed on the processor, with ``threads`` threads."""
         step = 0
 
@@ -138,7 +101,7 @@ class DeviceRuns:
             nonlocal step
             for chunk in self.steps.chunks(step, size):
                 if chunk.entered is not None:
-                    self._enter(chunk.entered.h, self.values_at(chunk.entered.middle, slice(None)))
+                    self._enter(chunk.entered.h, self.ensemble.values_at(chunk.entered.middle))
                 self._advance(step, chunk.steps, chunk.save_every)
                 step += chunk.steps
             return size
@@ -164,10 +127,11 @@ class DeviceRuns:
     def _rows(self, begin: int) -> Iterator[np.uint64]:
         """Yield the places of the positions and of the momenta that are saved first after a step."""
         size = self.steps.row(begin) * self.count * self.q.shape[2] * self.q.dtype.itemsize
-        yield from (np.uint64(each.ptr + size) for each in (self.q, self.p))
+        yield from (np.uint64(states.ptr + size) for states in (self.q, self.p))
 
     def _advance(self, begin: int, size: int, save_every: int) -> None:
-        solver = float(self.options.tolerance), int(self.options.max_iterations), int(self.options.absolute)
+        options = self.ensemble.settings.options or SolverOptions()
+        solver = float(options.tolerance), int(options.max_iterations), int(options.absolute)
         memory = self.memory, self.parameters, *self._rows(begin), self.counts
         self.launch("thread_advance", self.count, self.count, begin, size, save_every, float(self.h), *solver, *memory)
 
@@ -176,19 +140,12 @@ class DeviceRuns:
         if not failed.size:
             return
         memory = self.device.copy_out(self.memory)[HEAD : HEAD + 4 * self.m, failed]
-        q, p, *carries = (np.ascontiguousarray(each.T) for each in memory.reshape(4, self.m, -1))
-
-        def values_at(time: float, part: slice) -> Array:
-            return self.values_at(time, slice(None))[failed][part]
-
-        start = self.start[0][failed], self.start[1][failed]
-        initial = values_at(self.steps.segments[0].middle, slice(None))
+        q, p, *low = (np.ascontiguousarray(values.T) for values in memory.reshape(4, self.m, -1))
         observation = None if self.observation is None else self.observation.part(failed)
-        work = CommonRuns(self.stepper, self.options, start, initial, values_at, self.steps, observation)
+        work = CommonRuns(self.ensemble.some(failed), observation)
 
         def advance(j: int, check_stop: StopCheck) -> None:
-            step = int(self.done[failed[j]])
-            SingleRun(work, j, q[j], p[j], step, (carries[0][j], carries[1][j])).follow(check_stop)
+            follow(work, Departure(j, int(self.done[failed[j]]), q[j], p[j], (low[0][j], low[1][j])), check_stop)
 
         run_jobs(len(failed), advance, progress=None, threads=threads)
         self.status[failed], self.done[failed] = work.status, work.done
@@ -199,6 +156,10 @@ class DeviceRuns:
         for target, values in ((self.q, work.q), (self.p, work.p)):
             arguments = self.count, rows, len(failed), which, self.device.copied(values), target
             self.launch("thread_replace", rows * len(failed), *arguments)
+
+    def device_result(self) -> DeviceEnsemble:
+        """Return the trajectories, whose states stay in the memory of the device."""
+        return DeviceEnsemble(q=self.q, p=self.p, _to_host=self.result, **self.about())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -3,7 +3,7 @@
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping
 from itertools import accumulate
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,6 +83,11 @@ class CommonSteps:
             start = time_after_steps(last.start, last.h, last.steps - 1)
             self.segments[-1:] = last._replace(steps=last.steps - 1), Segment(1, last.h, start, last.middle, t_end)
         self.words, self.ends = words, list(accumulate(segment.steps for segment in self.segments))
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Arguments of :meth:`Stepper.integrate` for these steps."""
+        return {"h": self.h} | ({"steps": self.steps} if self.t_end is None else {"t_end": self.t_end})
 
     def row(self, step: int) -> int:
         """Return the index of the first saved state after ``step`` steps."""

@@ -1,0 +1,350 @@
+"""Ensembles whose trajectories have steps or ends of their own: adaptive steps, events, t_end in transformed time.
+
+C integrates them one after the other, bitwise equal to single runs, or :meth:`Stepper.integrate` does: with inputs,
+output times, changes by events or a bound of the global error.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from functools import partial
+from itertools import pairwise
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.codegen.native.capacity import TOO_MANY_STATES, room_for_states, too_many_states
+from scvi_codegen.codegen.native.options import FAILURES
+from scvi_codegen.common.errors import AccuracyWarning, EventError, StateError, StepFailedError, warn
+from scvi_codegen.common.validation import LARGEST_COUNT
+from scvi_codegen.runs.accuracy.global_error import GlobalError
+from scvi_codegen.runs.accuracy.warning_switch import without_accuracy_warnings
+from scvi_codegen.runs.driver.segments import breakpoints_until, inputs_of_slice
+from scvi_codegen.runs.ensembles.batches import Rows, SuccessiveRuns
+from scvi_codegen.runs.ensembles.device import DeviceRuns
+from scvi_codegen.runs.ensembles.ensemble import Ensemble
+from scvi_codegen.runs.ensembles.lanes import CommonRuns
+from scvi_codegen.runs.ensembles.observation import EnsembleObservation
+from scvi_codegen.runs.ensembles.result import EVENT_FAILED, INTERRUPTED, OK, EnsembleTrajectory, Span
+from scvi_codegen.runs.ensembles.schedule import CommonSteps
+from scvi_codegen.runs.ensembles.thread_pool import StopCheck, run_jobs
+from scvi_codegen.runs.states.times import WHOLE
+from scvi_codegen.runs.states.validation import Array, columns_of_inputs
+from scvi_codegen.runs.states.words import unnamed
+from scvi_codegen.runs.stepping.step_plan import Adaptive, AdaptivePlans
+from scvi_codegen.runs.trajectory import Trajectory
+from scvi_codegen.systems.event import Crossings
+
+
+class IndividualRuns:
+    """Trajectories that are integrated one by one, each as by ``integrate``.
+
+    Attributes:
+        ensemble: the trajectories.
+        t_eval: common output times, ``None`` where each trajectory has times of its own.
+        most_states: largest number of states of a trajectory: arrays of all have the size of the longest one.
+        ends: (k,) final times.
+        successive: the trajectories as C integrates them in one call, ``None`` if ``integrate`` does.
+        stored: states of completed trajectories, and the initial states.
+        status, steps, fallback_steps, events: (k,) of each trajectory.
+        plans: adaptive steps of each; with ``error=`` their tolerances differ.
+        confirmations: with ``error=``, of each trajectory.
+    """
+
+    def __init__(self, ensemble: Ensemble) -> None:
+        stepper, fixed, count = ensemble.stepper, ensemble.fixed, len(ensemble)
+        self.ensemble, self.t_eval, self.ends = ensemble, ensemble.t_eval, ensemble.ends
+        self.plans: Sequence[Adaptive] = ()
+        if ensemble.plan is not None:
+            self.plans = AdaptivePlans(self.ends, ensemble.plan)
+        if fixed is not None:
+            self.t_eval, self.ends = self._common_times(), np.full(count, fixed.times(tau=False)[-1])
+        self.confirmations = list[GlobalError | None]()
+        if ensemble.settings.error is not None:
+            self.plans, self.confirmations = list(self.plans), [None] * count
+        numbers = stepper.interface.words * (1 + 2 * stepper.dimension)  # of a state
+        self.most_states = math.inf if self.t_eval is not None else room_for_states() / (8 * numbers * max(count, 1))
+        self.status = np.full(count, INTERRUPTED, dtype="<U32")
+        self.steps, self.fallback_steps = np.zeros((2, count), np.int64)
+        self.events: list[tuple[Crossings, ...]] = [()] * count
+        self.stored = [self._start()]
+        self.successive = self._successive()
+
+    def __len__(self) -> int:
+        return len(self.ensemble)
+
+    @property
+    def length(self) -> int:
+        """Final value of ``progress``: the number of trajectories."""
+        return len(self)
+
+    def _common_times(self) -> Array | None:
+        """Return the times of fixed steps, without terminal events and t_end in transformed time.
+
+        Two words are saved as they are.
+        """
+        fixed, events = cast(CommonSteps, self.ensemble.fixed), self.ensemble.stepper.events
+        if self.ensemble.stepper.in_tau or any(event.terminal for event in events) or (fixed.words > 1 and not events):
+            return None
+        return fixed.times(tau=False)
+
+    def _start(self) -> Rows:
+        """Return the initial states, row 0 of all trajectories, or no states if output times begin later."""
+        ensemble, stepper, saved = self.ensemble, self.ensemble.stepper, len(self)
+        if self.t_eval is not None and self.t_eval[0] != ensemble.t0:
+            saved = 0
+        numbers = np.zeros(len(self), np.int64)
+        t = stepper._states.missing((saved,))
+        t[:] = ensemble.t0
+        actions, tau = (np.zeros(saved if summed else 0) for summed in (stepper.sums_action, stepper.in_tau))
+        where = np.arange(len(self)), numbers, numbers + bool(saved)
+        return Rows(*where, t, ensemble.q[:saved], ensemble.p[:saved], actions, tau)
+
+    def _successive(self) -> SuccessiveRuns | None:
+        """Return the trajectories that C integrates one after the other, ``None`` for other ensembles."""
+        ensemble, stepper, t_eval = self.ensemble, self.ensemble.stepper, self.t_eval
+        if ensemble.inputs or stepper.events or stepper.in_tau or not stepper.binding.reusable or self.confirmations:
+            return None
+        if t_eval is None:
+            receive = partial(_receive, self.stored, 0)  # without self, so that no cycle keeps the memory
+            return SuccessiveRuns(ensemble, receive, save_every=ensemble.save_every, most_states=self.most_states)
+        later = t_eval[t_eval != ensemble.t0]
+        if len(later) != 1 or len(t_eval) > 2 or (self.ends != later[0]).any():
+            return None
+        return SuccessiveRuns(ensemble, partial(_receive, self.stored, len(t_eval) - 2), save_every=LARGEST_COUNT)
+
+    def run(self, *, progress: Callable[[int], None] | None = None, threads: int | None = None) -> None:
+        """Integrate all trajectories with ``threads`` threads; an exception raised by ``progress`` stops them promptly.
+
+        Afterwards, also after an exception, :meth:`result` returns what was computed.
+
+        Args:
+            progress: called with the number of completed trajectories, see :attr:`length`.
+            threads: number of threads, by default one per core.
+        """
+        if self.successive is None:
+            run_jobs(len(self), self._integrate, progress=progress, threads=threads)
+            return
+        try:
+            report = None if progress is None else lambda done: progress(int(done))
+            self.successive.run(progress=report, threads=threads)
+        finally:
+            self.status, self.steps = self.successive.names, self.successive.done
+            self.fallback_steps = self.successive.fallback_steps
+
+    def _integrate(self, j: int, check_stop: StopCheck) -> None:
+        """Integrate trajectory j as :meth:`Stepper.integrate` does; with ``error`` keep its confirmed local tolerance.
+
+        One whose confirming runs fail has errors at round-off level.
+        """
+        ensemble, rows, status = self.ensemble, slice(None), OK
+        arguments, error = self._arguments(j, check_stop), ensemble.settings.error
+        if ensemble.fixed is None and self.t_eval is not None:
+            times = self.t_eval[np.abs(self.t_eval - ensemble.t0) <= abs(self.ends[j] - ensemble.t0)]
+            rows = slice(None if times.size else 0)
+            arguments["t_eval"] = times if times.size else self.ends[j : j + 1]  # runs have at least one
+        integrate = partial(ensemble.stepper.integrate, ensemble.q[j], ensemble.p[j], **arguments)
+        with without_accuracy_warnings():
+            if error is not None:
+                with suppress(StateError, StepFailedError):
+                    states = integrate(error=error)
+                    self.confirmations[j], cast(list[Any], self.plans)[j] = states.confirmation, states.plan
+                    self._store(j, states, rows, OK)
+                    return
+            try:
+                states = integrate()
+            except StepFailedError as failure:
+                states, status = Trajectory.before(failure), failure.status
+            except EventError as failure:
+                if failure.trajectory is None:
+                    raise
+                states, status = cast(Trajectory, failure.trajectory), EVENT_FAILED
+            except StateError:  # a sum of finite terms has overflowed
+                self.status[j] = "not finite"
+                return
+        if ensemble.fixed is not None and self.t_eval is not None:
+            rows = self._common_rows(states, ensemble.fixed.h)
+        self._store(j, states, rows, status)
+
+    def _arguments(self, j: int, check_stop: StopCheck) -> dict[str, Any]:
+        """Return the arguments of :meth:`Stepper.integrate` for trajectory j, without its state and output times."""
+        ensemble, stepper, parameters = self.ensemble, self.ensemble.stepper, self.ensemble.parameters[j]
+        if stepper.interface.words == 1:
+            of_inputs = columns_of_inputs(stepper.interface) if ensemble.inputs else ()
+            values = zip(stepper.parameters, parameters.tolist(), strict=True)
+            parameters = {name: value for k, (name, value) in enumerate(values) if k not in of_inputs}
+        steps: dict[str, Any] = {"t_end": float(self.ends[j]), **ensemble.settings.control.named}
+        if ensemble.fixed is not None:
+            steps = ensemble.fixed.arguments
+        return steps | {
+            "parameters": parameters,
+            "inputs": inputs_of_slice(ensemble.inputs, j) or None,
+            "t": ensemble.t0,
+            "save_every": 1 if ensemble.inputs and self.t_eval is not None else ensemble.save_every,
+            "options": ensemble.settings.options,
+            "progress": partial(self._check, check_stop),
+        }
+
+    def _check(self, check_stop: StopCheck, steps: int) -> None:
+        """Raise an error if another trajectory failed, or if a run has more states than :attr:`most_states`."""
+        check_stop(steps)
+        states = steps // self.ensemble.save_every
+        if states > self.most_states:
+            raise too_many_states(states, steps, math.nan)
+
+    def _common_rows(self, states: Trajectory, h: float) -> Any:
+        """Return the rows at the common times of fixed steps: the last states there, after changes by events."""
+        times, common = (states.forward * np.asarray(t) for t in (states.t, self.t_eval))
+        latest = common + WHOLE * abs(h)
+        return np.searchsorted(times, latest[latest < times[-1] + 2 * WHOLE * abs(h)], side="right") - 1
+
+    def _store(self, j: int, states: Trajectory, rows: Any, status: str) -> None:
+        """Store rows of the states of trajectory j and how it ended."""
+        t, q, p = states.t[rows], unnamed(states.q)[rows], unnamed(states.p)[rows]
+        actions, tau = (values if values is None else values[rows] for values in (states.actions, states.tau))
+        self.events[j] = states.events
+        self._append(j, (t, q, p, status, states.steps), states.fallback_steps, actions, tau)
+
+    def _append(
+        self,
+        j: int,
+        trajectory: tuple[Array, Array, Array, str, int],
+        fallback_steps: int,
+        actions: Array | None,
+        tau: Array | None,
+    ) -> None:
+        """Store the times, positions and momenta of trajectory j, its status and its numbers of steps."""
+        t, q, p, status, self.steps[j] = trajectory
+        self.status[j] = TOO_MANY_STATES if len(t) > self.most_states else status
+        self.fallback_steps[j] = fallback_steps
+        if actions is None:
+            actions = np.full(len(t) if self.ensemble.stepper.sums_action else 0, np.nan)
+        where = np.array([j]), np.zeros(1, np.int64), np.array([len(t)])
+        self.stored.append(Rows(*where, t, q, p, actions, np.empty(0) if tau is None else tau))
+
+    def keep(self, part: slice, trajectories: EnsembleTrajectory) -> None:
+        """Store the results of a slice that was integrated elsewhere."""
+        fallback_steps, along = cast(Array, trajectories.fallback_steps), (trajectories.actions, trajectories.tau)
+        for k, trajectory in enumerate(trajectories.each()):
+            actions, tau = (None if values is None else values[: len(trajectory[0]), k] for values in along)
+            self._append(part.start + k, trajectory, int(fallback_steps[k]), actions, tau)
+        if trajectories.events:
+            self.events[part] = trajectories.events
+        if self.confirmations:
+            self.confirmations[part] = trajectories.confirmations
+            cast(list[Any], self.plans)[part] = trajectories.plans
+
+    def result(self) -> EnsembleTrajectory:
+        """Return the trajectories; those neither completed nor failed have the status ``"interrupted"``."""
+        ensemble, stepper, fixed = self.ensemble, self.ensemble.stepper, self.ensemble.fixed
+        states = self._all_states()
+        index = self._places(states)
+
+        def ordered(values: Array) -> Array:  # by rows and trajectories, NaN after their ends
+            return values[index] if stepper._states.words > 1 else values.take(index, axis=0)
+
+        t = self.t_eval if fixed is None else None
+        if t is None:
+            t = self._times(ordered(states.t))
+        return EnsembleTrajectory(
+            t=t,
+            tau=ordered(states.tau) if stepper.in_tau else None,
+            q=ordered(states.q),
+            p=ordered(states.p),
+            actions=ordered(states.actions) if stepper.sums_action else None,
+            status=self.status,
+            steps=self.steps,
+            fallback_steps=self.fallback_steps,
+            events=tuple(self.events) if stepper.events else (),
+            h=None if fixed is None else fixed.h,
+            plans=self.plans,
+            confirmations=tuple(self.confirmations),
+            parameters=ensemble.parameters,
+            stepper=stepper,
+            spans=tuple(self._spans(t)) if ensemble.inputs else (),
+        )
+
+    def _all_states(self) -> Rows:
+        """Return all states in the order in which they were stored, and NaN as the last row, of no trajectory."""
+        missing, m, none = self.ensemble.stepper._states.missing, self.ensemble.q.shape[1], np.empty(0, np.int64)
+        undefined = Rows(none, none, none, missing((1,)), *(missing((1, m)) for _ in "qp"), *np.full((2, 1), np.nan))
+        return Rows(*map(np.concatenate, zip(*self.stored, undefined, strict=True)))
+
+    def _places(self, states: Rows) -> NDArray[np.intp]:
+        """Return the (n, k) places of the rows of all trajectories among the stored states, -1 after their ends.
+
+        Of a trajectory with too many states these are the first and the last one.
+        """
+        row, j = states.indices()
+        places, full = np.arange(len(row)), self.status == TOO_MANY_STATES
+        if full.any():
+            last = np.zeros(len(self), np.int64)
+            np.maximum.at(last, j, row)
+            saved = ~full[j] | (row == 0) | (row == last[j])
+            row, j, places = np.where(full[j], np.minimum(row, 1), row)[saved], j[saved], places[saved]
+        rows = 1 + int(row.max()) if self.t_eval is None else len(self.t_eval)
+        index = np.full((rows, len(self)), -1)
+        index[row, j] = places  # the initial state of a run replaces that of the ensemble
+        return index
+
+    def _times(self, times: Array) -> Array:
+        """Return the (n,) times of all trajectories where they are common, else the (n, k) times of each."""
+        stepper = self.ensemble.stepper
+        common = self.ensemble.fixed is not None and not stepper.in_tau
+        if common and not any(event.terminal for event in stepper.events):
+            complete = np.flatnonzero(np.isfinite(np.asarray(times)).all(axis=0))
+            if complete.size:  # all may end before t_end
+                return times[:, complete[0]]
+        return times if self.t_eval is None else self.t_eval
+
+    def _spans(self, t: Array) -> Iterator[Span]:
+        """Yield the rows of each trajectory, of states at the times t, in each piece of its inputs."""
+        t0 = self.ensemble.t0
+        for j, end_of_run in enumerate(self.ends.tolist()):
+            times = t if t.ndim == 1 else t[:, j]
+            forward = -1.0 if end_of_run < t0 else 1.0
+            ends = breakpoints_until(t0, end_of_run, self.ensemble.inputs) or [end_of_run]
+            last = np.searchsorted(forward * times[np.isfinite(times)], forward * np.array(ends), side="right").tolist()
+            for (start, end), (first, until) in zip(pairwise([t0, *ends]), pairwise([0, *last]), strict=True):
+                yield slice(first, until), slice(j, j + 1), partial(self.ensemble.values_at, (start + end) / 2)
+
+    def warn_of_too_many_states(self, trajectories: EnsembleTrajectory) -> None:
+        """Issue a warning if trajectories ended because their states exceed the memory."""
+        full = np.flatnonzero(trajectories.status == TOO_MANY_STATES)
+        if not full.size:
+            return
+        j, others, (cause, remedy) = int(full[0]), len(full) - 1, FAILURES[TOO_MANY_STATES]
+        more = f" (and {others} more)" if others else ""
+        warn(
+            f"trajectory {j}{more} ended at t = {trajectories.ends[0][j]:g}, after "
+            f"{trajectories.steps[j]} steps: {cause}. The memory holds {int(self.most_states)} states of each of "
+            f"{len(self)} trajectories. {remedy}",
+            AccuracyWarning,
+        )
+
+
+def _receive(stored: list[Rows], shift: int, states: Rows) -> None:
+    """Store copies of states that C has saved, whose rows begin elsewhere."""
+    stored.append(states.copies(shift))
+
+
+def runs_of(ensemble: Ensemble) -> CommonRuns | IndividualRuns:
+    """Return the way in which the trajectories of an ensemble are integrated, before its first step."""
+    stepper, settings, fixed = ensemble.stepper, ensemble.settings, ensemble.fixed
+    common = fixed is not None and not settings.records_events(stepper)
+    if fixed is not None and fixed.words > 1:
+        common = common and not ensemble.inputs and stepper.ensemble is not None
+    if fixed is not None and fixed.t_end is not None and stepper.in_tau:  # after steps of their own
+        common = False
+    if not common:
+        if settings.observe is not None:
+            raise StateError(
+                f"observe={settings.observe!r} requires a fixed step size: give h and steps, or observe each "
+                "trajectory by integrate"
+            )
+        return IndividualRuns(ensemble)
+    observation = None if settings.observe is None else EnsembleObservation(stepper, settings.observe, len(ensemble))
+    return CommonRuns(ensemble, observation) if settings.device is None else DeviceRuns(ensemble, observation)
