@@ -59,6 +59,10 @@ class Growth:
     def add(self, t: Array, numbers: NDArray[np.intp], log_growth: Array, log_diagonals: Array) -> None:
         """Add consecutive steps; the integrals use the trapezoidal rule.
 
+        MEGNO is the mean <Y> of Y (Cincotta & Simo, Astron. Astrophys. Suppl. 147 (2000) 205), here in the elapsed time
+        T and with the norm d: Y(T) = (2 / T) integral of t d(ln d), the ``moments``, and
+        <Y>(T) = (1 / T) integral of Y dt, the ``areas``; Y = 0 at the start.
+
         Args:
             t: (steps + 1,) times at their ends.
             numbers: (steps,) index of the saved value at the end of each step, -1 for none.
@@ -68,13 +72,13 @@ class Growth:
         times = np.abs(t - self.start).reshape(-1, *[1] * self.log_norms.ndim)
         log_norms = self.log_norms + log_growth
         max_log_norms = np.maximum(np.maximum.accumulate(log_norms, axis=0), self.max_log_norms)
-        steps = np.diff(log_norms, axis=0, prepend=self.log_norms[np.newaxis])
-        moments = self.moments + np.cumsum((times[1:] + times[:-1]) / 2 * steps, axis=0)
+        growth_of_steps = np.diff(log_norms, axis=0, prepend=self.log_norms[np.newaxis])
+        moments = self.moments + np.cumsum((times[1:] + times[:-1]) / 2 * growth_of_steps, axis=0)
         rates = 2.0 * moments / times[1:]
-        means = rates.copy()
-        means[1:] += rates[:-1]
-        means[0] += self.rates
-        areas = self.areas + np.cumsum(np.diff(times, axis=0) / 2 * means, axis=0)
+        sums_of_rates = rates.copy()  # at both ends of each step
+        sums_of_rates[1:] += rates[:-1]
+        sums_of_rates[0] += self.rates
+        areas = self.areas + np.cumsum(np.diff(times, axis=0) / 2 * sums_of_rates, axis=0)
         saved = np.flatnonzero(numbers >= 0)
         self.values[:, numbers[saved]] = [
             log_norms[saved],

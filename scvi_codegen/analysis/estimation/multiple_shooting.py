@@ -288,6 +288,7 @@ def _step_length(chain: Chain, x: Array, update: Array, weight: float) -> float:
     residuals, jacobian = chain.evaluated(x)
     rows = len(residuals) - chain.jumps.size
     before, part = _merit(residuals, rows, weight), 1.0
+    # derivative of the merit function along the update u, which cancels the linearised jumps: r . J u - weight |c|_1
     descent = residuals[:rows] @ jacobian[:rows] @ update - weight * np.abs(residuals[rows:]).sum()
     while not _merit(chain.residuals(x + part * update), rows, weight) <= before + ARMIJO * part * descent:
         part /= 2.0
@@ -300,16 +301,25 @@ def _step_length(chain: Chain, x: Array, update: Array, weight: float) -> float:
 
 
 def _merit(residuals: Array, rows: int, weight: float) -> float:
-    """Return the exact penalty function: half the sum of squares plus weighted absolute jumps."""
+    """Return the l1 merit function |r|^2 / 2 + weight |c|_1 of residuals r and jumps c.
+
+    It is an exact penalty function (Nocedal & Wright, *Numerical Optimization*, 15.4).
+    """
     return float(0.5 * residuals[:rows] @ residuals[:rows] + weight * np.abs(residuals[rows:]).sum())
 
 
 def _equality_constrained_update(jacobian: Array, residuals: Array, rows: int) -> tuple[Array, Array]:
-    """Solve the sparse equality-constrained least-squares problem; return the update and the multipliers."""
+    """Return the update u that minimises |r + J u|^2 / 2 subject to c + C u = 0, and the multipliers of the latter.
+
+    r and J are the first ``rows`` rows, c and C the others. With s = -(r + J u) and J^T s + C^T y = 0, y the
+    multipliers, u follows from the augmented system, whose matrix is as sparse as J and C.
+    """
     from scipy.sparse import block_array, csc_array, identity
     from scipy.sparse.linalg import splu
 
-    by, of = csc_array(jacobian[:rows]), csc_array(jacobian[rows:])
-    matrix = block_array([[identity(rows), by, None], [by.T, None, of.T], [None, of, None]], format="csc")
-    solved = splu(matrix).solve(-np.concatenate([residuals[:rows], np.zeros(jacobian.shape[1]), residuals[rows:]]))
-    return solved[rows : rows + jacobian.shape[1]], solved[rows + jacobian.shape[1] :]
+    unknowns = jacobian.shape[1]
+    J, C = csc_array(jacobian[:rows]), csc_array(jacobian[rows:])
+    # [1 J 0; J^T 0 C^T; 0 C 0] (s, u, y) = -(r, 0, c)
+    matrix = block_array([[identity(rows), J, None], [J.T, None, C.T], [None, C, None]], format="csc")
+    s_u_y = splu(matrix).solve(-np.concatenate([residuals[:rows], np.zeros(unknowns), residuals[rows:]]))
+    return s_u_y[rows : rows + unknowns], s_u_y[rows + unknowns :]

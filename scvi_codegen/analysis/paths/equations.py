@@ -19,8 +19,9 @@ NULL_EIGENVALUE = 1e-7
 
 def hessian_blocks(at: Linearised) -> tuple[Array, Array, Array]:
     """Return the diagonal (N - 1, d, d) and the upper and lower blocks (N - 2, d, d)."""
-    a, b, c, e = at.blocks
-    return e[:-1] - a[1:], -b[1:-1], c[1:-1]
+    # H_(k, k) = dp1_(k-1)/dq1 - dp0_k/dq0,  H_(k, k+1) = -dp0_k/dq1,  H_(k+1, k) = dp1_k/dq0,  k = 1 to N - 1
+    p0_by_q0, p0_by_q1, p1_by_q0, p1_by_q1 = at.blocks
+    return p1_by_q1[:-1] - p0_by_q0[1:], -p0_by_q1[1:-1], p1_by_q0[1:-1]
 
 
 class Band:
@@ -37,6 +38,7 @@ class Band:
             self.positive = not _negative_pivots(diagonal, upper, lower)[-1]
         count, d, _ = diagonal.shape
         self.shape, self.reach = (count, d), 2 * d - 1
+        # LAPACK's band storage for dgbtrf: the entry (I, J) is in row 2 reach + I - J and column J
         matrix = np.zeros((3 * self.reach + 1, count * d))
         i, j = np.indices((d, d))
         for blocks, row, column in ((diagonal, 0, 0), (upper, 0, d), (lower, d, 0)):
@@ -62,8 +64,9 @@ class Sparse:
         a, b, c, e = at.blocks
         count, d = a.shape[0] - 1, intervals.dimension
         rows, columns, data = [], [], []
-        for first, i, j, blocks in ((0, 0, 0, e[:-1] - a[1:]), (0, 0, 1, -b[1:-1]), (0, 1, 0, c[1:-1])):
-            k = np.arange(first, first + len(blocks))[:, np.newaxis]
+        # blocks (k + i, k + j) of the matrix, k = 0 to N - 2, as in hessian_blocks
+        for i, j, blocks in ((0, 0, e[:-1] - a[1:]), (0, 1, -b[1:-1]), (1, 0, c[1:-1])):
+            k = np.arange(len(blocks))[:, np.newaxis]
             rows.append(((k + i) * d + intervals.rows).ravel())
             columns.append(((k + j) * d + intervals.columns).ravel())
             data.append(blocks.ravel())
@@ -108,34 +111,53 @@ def negative_directions(at: Linearised) -> list[int]:
 
 
 def _negative_pivots(diagonal: Array, upper: Array, lower: Array) -> list[int]:
-    index, inverse = [0], np.zeros_like(diagonal[0])
+    """Return the numbers of negative eigenvalues of the leading 0, 1, .., N - 1 blocks.
+
+    Block LDL^T factorisation of a symmetric block-tridiagonal matrix: the pivots are D_1 = H_11 and
+    D_k = H_kk - H_(k, k-1) D_(k-1)^-1 H_(k-1, k); by Sylvester's law of inertia their negative eigenvalues add up.
+    """
+    indices = [0]
+    inverse_pivot = np.zeros_like(diagonal[0])
     for k, block in enumerate(diagonal):
-        pivot = block - (lower[k - 1] @ inverse @ upper[k - 1] if k else 0.0)
+        pivot = block
+        if k > 0:
+            pivot = block - lower[k - 1] @ inverse_pivot @ upper[k - 1]
         pivot = (pivot + pivot.T) / 2.0
-        index.append(index[-1] + int((np.linalg.eigvalsh(pivot) < 0).sum()))
-        inverse = np.linalg.pinv(pivot, hermitian=True)
-    return index
+        negative = int((np.linalg.eigvalsh(pivot) < 0).sum())
+        indices.append(indices[-1] + negative)
+        inverse_pivot = np.linalg.pinv(pivot, hermitian=True)
+    return indices
 
 
 def condensed_hessian(at: Linearised, factors: Band) -> Array:
-    """Return the (2d, 2d) Hessian of the action of a path as a function of both ends."""
-    a, b, c, e = at.blocks
-    count, d = factors.shape
-    result = np.zeros((2 * d, 2 * d))
-    result[:d, :d], result[d:, d:] = -a[0], e[-1]
-    if not count:
-        result[:d, d:], result[d:, :d] = -b[0], c[0]
-        return result
-    for column in range(2 * d):
-        r = np.zeros((count, d))
-        if column < d:
-            r[0] = c[0][:, column]
+    """Return the (2d, 2d) Hessian of the action of a path as a function of both ends.
+
+    The inner nodes x follow the ends E = (q_0, q_N) so that the action stays stationary in them: the Hessian is the
+    Schur complement S_EE - S_Ex S_xx^-1 S_xE. Its blocks are derivatives of the gradient of the action,
+    S_q0 = -p0_0 and S_qN = p1_(N-1) (generating function of the first kind), S_xk = p1_(k-1) - p0_k.
+    """
+    p0_by_q0, p0_by_q1, p1_by_q0, p1_by_q1 = at.blocks
+    inner_nodes, d = factors.shape
+    start, end = slice(0, d), slice(d, 2 * d)
+    hessian = np.zeros((2 * d, 2 * d))
+    hessian[start, start] = -p0_by_q0[0]
+    hessian[end, end] = p1_by_q1[-1]
+    if inner_nodes == 0:
+        hessian[start, end] = -p0_by_q1[0]
+        hessian[end, start] = p1_by_q0[0]
+        return hessian
+    for j in range(2 * d):
+        # column j of S_xE: q_0 acts on the first inner node, q_N on the last
+        by_end = np.zeros((inner_nodes, d))
+        if j < d:
+            by_end[0] = p1_by_q0[0][:, j]
         else:
-            r[-1] = -b[-1][:, column - d]
-        x = factors.solve(r)
-        result[:d, column] += b[0] @ x[0]
-        result[d:, column] -= c[-1] @ x[-1]
-    return result
+            by_end[-1] = -p0_by_q1[-1][:, j - d]
+        x = factors.solve(by_end)
+        # S_Ex has the rows -dp0_0/dq1 (first inner node) and dp1_(N-1)/dq0 (last)
+        hessian[start, j] += p0_by_q1[0] @ x[0]
+        hessian[end, j] -= p1_by_q0[-1] @ x[-1]
+    return hessian
 
 
 class Closed:
@@ -146,15 +168,18 @@ class Closed:
 
     def __init__(self, at: Linearised, M: Array, *, symmetric: bool) -> None:
         self.shape = count, d = at.p0.shape[0], len(M)
-        a, b, c, e = at.blocks
+        p0_by_q0, p0_by_q1, p1_by_q0, p1_by_q1 = at.blocks
         matrix = np.zeros((count * d,) * 2)
+        # Step k goes from q_k to T q_j, j = k + 1 and T = 1, but j = 0 and T = M for the last one. Its action has the
+        # gradient (-p0_k, T^T p1_k) with respect to (q_k, q_j); the matrix is the sum of the derivatives of all steps.
         for k in range(count):
-            here, after = slice(k * d, k * d + d), slice((k + 1) % count * d, (k + 1) % count * d + d)
-            T = M if k == count - 1 else np.eye(d)
-            matrix[here, here] -= a[k]
-            matrix[after, after] += T.T @ e[k] @ T
-            matrix[here, after] -= b[k] @ T
-            matrix[after, here] += T.T @ c[k]
+            next_node, T = (0, M) if k == count - 1 else (k + 1, np.eye(d))
+            here = slice(k * d, k * d + d)
+            after = slice(next_node * d, next_node * d + d)
+            matrix[here, here] -= p0_by_q0[k]
+            matrix[after, after] += T.T @ p1_by_q1[k] @ T
+            matrix[here, after] -= p0_by_q1[k] @ T
+            matrix[after, here] += T.T @ p1_by_q0[k]
         self.symmetric, self.matrix = symmetric, matrix
         if symmetric:
             self.matrix = (matrix + matrix.T) / 2.0
@@ -181,17 +206,22 @@ class Closed:
 
 
 class Bordered:
-    """Factors of [H, border; row, corner] by those of H, with one more unknown and equation."""
+    """Factors of [H, border; row, corner] by those of H, with one more unknown and equation.
+
+    Block elimination of H x + border s = r, row . x_1 + corner s = rho, x_1 the first inner node:
+    s = (rho - row . (H^-1 r)_1) / (corner - row . (H^-1 border)_1) and x = H^-1 r - s H^-1 border.
+    """
 
     def __init__(self, factors: Band | Sparse, border: Array, row: Array, corner: float) -> None:
-        self.factors, self.row, self.along = factors, row, factors.solve(border)
-        self.pivot = corner - float(row @ self.along[0])
+        self.factors, self.row = factors, row
+        self.solved_border = factors.solve(border)
+        self.pivot = corner - float(row @ self.solved_border[0])
 
     def solve(self, r: Array) -> Array:
-        """Return the solution; the row is that of the first inner node."""
-        own = self.factors.solve(r[:-1])
-        last = (r[-1] - self.row @ own[0]) / self.pivot
-        return np.append(own - last * self.along, last)
+        """Return x and s, flat, for the right-hand sides r and rho, flat."""
+        unbordered = self.factors.solve(r[:-1])
+        s = (r[-1] - self.row @ unbordered[0]) / self.pivot
+        return np.append(unbordered - s * self.solved_border, s)
 
 
 class BorderedClosed(Closed):
@@ -202,15 +232,16 @@ class BorderedClosed(Closed):
         super().__init__(at, M, symmetric=True)
 
     def factorise(self) -> None:
-        """See :meth:`Closed.factorise`."""
+        """See :meth:`Closed.factorise`; of D A D with D = diag(1, .., 1, scale), which also replaces ``matrix``."""
         self.scale = np.sqrt(np.abs(self.matrix).max() / abs(self.corner)) if self.corner else 1.0
         side, corner = self.scale * self.border, np.array([[self.scale**2 * self.corner]])
         self.matrix = np.block([[self.matrix, side], [side.T, corner]])
         super().factorise()
 
     def solve(self, r: Array) -> Array:
-        """See :meth:`Closed.solve`."""
-        kept, scales = self.vectors[:, self.kept], np.append(np.ones(r.size - 1), self.scale)
+        """See :meth:`Closed.solve`: A x = r by x = D (D A D)^+ D r."""
+        kept = self.vectors[:, self.kept]
+        scales = np.append(np.ones(r.size - 1), self.scale)
         return np.asarray(scales * (kept @ ((kept.T @ (scales * r)) / self.values[self.kept])))
 
 

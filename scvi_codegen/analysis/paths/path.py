@@ -235,14 +235,25 @@ def _energies_and_velocities(stepper: Any, begin: float, parameters: Array, q: A
 def _closed_solution(
     intervals: Intervals, nodes: Array | None, M: Array, energy: float | None, states: solver.States
 ) -> solver.Solution:
-    """Return the closed path q(T) = M q(0) near the nodes of a start."""
+    """Return the closed path q(T) = M q(0) near the nodes of a start; sets ``intervals.range_of_start``.
+
+    Without forces its equations are the gradient of the discrete action, whose Hessian is symmetric; forces enter
+    beside the action (Lagrange-d'Alembert principle), so that there is neither symmetry nor a minimum to seek.
+    """
     if nodes is None:
         raise StateError("closed paths require start=: an array (steps + 1, m), or a function of time")
     intervals.range_of_start = largest_range(nodes)
-    forced = bool(intervals.stepper.interface.exchange_names)
-    minimised = not (forced or isinstance(intervals, ReducedIntervals))
+    variational = not intervals.stepper.interface.exchange_names
+    on_manifold = isinstance(intervals, ReducedIntervals)
+    unknown_nodes = nodes[: len(intervals.h)]  # q_N = M q_0 is none
     return solver.closed(
-        intervals, nodes[: len(intervals.h)], M, minimise=minimised, symmetric=not forced, energy=energy, states=states
+        intervals,
+        unknown_nodes,
+        M,
+        minimise=variational and not on_manifold,
+        symmetric=variational,
+        energy=energy,
+        states=states,
     )
 
 

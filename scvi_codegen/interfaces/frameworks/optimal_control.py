@@ -250,21 +250,32 @@ class Task:
         return values if len(values) == 2 else (values or [0.0]) * 2
 
     def motion(self, program: NonlinearProgram, result: Any, stats: Mapping[str, Any]) -> ControlledMotion:
-        """Return the solution, with the multipliers of the step equations as costates."""
+        """Return the solution, with the multipliers of the step equations as costates.
+
+        Args:
+            program: the nonlinear program.
+            result: minimiser ``x``, cost ``f`` and multipliers ``lam_g`` of ``casadi.nlpsol``.
+            stats: its statistics.
+        """
         m, n = self.system.dimension, self.steps
-        values = program.split(result["x"])
-        states = values["states"]
-        states[np.abs(states) < ZERO * np.abs(states).max(axis=1, keepdims=True)] = 0.0
-        costate_values = -np.asarray(result["lam_g"]).ravel()[: 2 * m * n].reshape(n, 2 * m)
-        inputs = values["inputs"].reshape(len(self.system.inputs), n, self.degree + 1)
+        unknowns = program.split(result["x"])
+        states = unknowns["states"]  # (2m, n + 1)
+        largest = np.abs(states).max(axis=1, keepdims=True)
+        states[np.abs(states) < ZERO * largest] = 0.0
+        # CasADi's Lagrangian is f + lam_g . g. The first 2 m n equations are g_k = z_(k+1) - F(z_k), z = (q, p), a
+        # column for each step; F without its stages. With lambda_k = -lam_g it is stationary in z_k where
+        # lambda_(k-1) = (dF/dz_k)^T lambda_k + df/dz_k (without bounds): the discrete adjoint equation.
+        step_multipliers = np.asarray(result["lam_g"]).ravel()[: 2 * m * n]
+        costates = -step_multipliers.reshape(n, 2 * m)
+        bernstein_coefficients = unknowns["inputs"].reshape(len(self.system.inputs), n, self.degree + 1)
         return ControlledMotion(
-            t=self.t + np.linspace(0.0, values["duration"].item(), n + 1),
+            t=self.t + np.linspace(0.0, unknowns["duration"].item(), n + 1),
             q=states[:m].T,
             p=states[m:].T,
-            coefficients=dict(zip(self.system.inputs, inputs, strict=True)),
+            coefficients=dict(zip(self.system.inputs, bernstein_coefficients, strict=True)),
             coordinates=tuple(coordinate.name for coordinate in self.system.coordinates),
             cost=float(result["f"]),
-            costates=costate_values,
+            costates=costates,
             iterations=int(stats["iter_count"]),
             status=str(stats["return_status"]),
             solved=bool(stats["success"]),

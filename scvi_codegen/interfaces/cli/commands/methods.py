@@ -45,16 +45,21 @@ def methods(tableau: str | None) -> None:
 
 def _entries_of(name: str) -> Iterator[dict[str, Any]]:
     """Yield the properties of an example of a method, and of the printed form of the paper if there is one."""
-    variants: list[dict[str, Any]] = [{}, {"variational": False}] if "variational" in ARGUMENTS[name] else [{}]
+    example: Mapping[str, Any] = EXAMPLES.get(name, {})
+    if name not in EXAMPLES and "stages" in ARGUMENTS[name]:
+        example = {"stages": EXAMPLE_STAGES}
+    variants: list[dict[str, Any]] = [{}]
+    if "variational" in ARGUMENTS[name]:
+        variants.append({"variational": False})
+    size = size_of(name)  # the argument after the colon, as the degree of svi:4
     for variant in variants:
-        arguments = {**EXAMPLES.get(name, {"stages": EXAMPLE_STAGES} if "stages" in ARGUMENTS[name] else {}), **variant}
+        arguments = {**example, **variant}
         method = method_from_specification({"method": name, **arguments})
-        size = size_of(name)
         yield {
             "name": name,
             "arguments": list(ARGUMENTS[name]),
-            "number": size_of(name),
-            "example": (f"{name}:{arguments[size]}" if size and size in arguments else name),
+            "number": size,
+            "example": f"{name}:{arguments[size]}" if size and size in arguments else name,
             "options": _options(arguments),
             "order": method.order,
             "symplectic": method.symplectic,
@@ -65,14 +70,16 @@ def _entries_of(name: str) -> Iterator[dict[str, Any]]:
 def methods_table(entries: Iterable[Mapping[str, Any]]) -> str:
     """Return a line for each method with its arguments, and the properties of an example."""
     rows: list[Sequence[str]] = [("name", "arguments", "example", "order", "symplectic", "symmetric")]
-    last = ""
+    previous_method: str | None = None
     for entry in entries:
-        name = f"{entry['name']}[:{entry['number']}]" if entry["number"] else entry["name"]
-        first = (name, ", ".join(entry["arguments"]) or "none") if entry["name"] != last else ("", "")
+        name_and_arguments = ("", "")  # of a further example of the same method
+        if entry["name"] != previous_method:
+            name = f"{entry['name']}[:{entry['number']}]" if entry["number"] else entry["name"]
+            name_and_arguments = (name, ", ".join(entry["arguments"]) or "none")
         order = "none claimed" if entry["order"] is None else str(entry["order"])
         holds = ("yes" if entry[claim] else "no" for claim in ("symplectic", "symmetric"))
-        rows.append((*first, " ".join([entry["example"], *entry["options"]]), order, *holds))
-        last = entry["name"]
+        rows.append((*name_and_arguments, " ".join([entry["example"], *entry["options"]]), order, *holds))
+        previous_method = entry["name"]
     return table(rows)
 
 

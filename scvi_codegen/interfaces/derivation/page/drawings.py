@@ -103,7 +103,7 @@ CAPTIONS = {
 SHOWN_WITH_PARTS = ("w", "dw", "d", "b")
 """Entries that are part of the tables of quadratures and tableaux."""
 MOST_CELLS = 40
-"""Largest number of rows, and of columns, of a table."""
+"""Largest number of rows, and of columns, of a table; of a longer column the first ones are shown."""
 tau, j, s = Symbol("tau"), Symbol("j", integer=True), Symbol("s")
 
 
@@ -131,12 +131,14 @@ def tables_section(method: Method, entries: tuple[TableEntry, ...]) -> Section:
 
 
 def _entry_table(prefix: str, entries: list[TableEntry]) -> Iterator[Content]:
-    """Yield entries of one name: a matrix, or a column if they have one index."""
+    """Yield entries of one name: a matrix, or a column if they have one index; say what is left out."""
     cells: dict[tuple[int, ...], Cell] = {entry.name.indices: _shown(entry) for entry in entries}
     caption = CAPTIONS.get(prefix, f"{prefix}_{{n,j}}: coefficients of the equations")
     if any(len(index) < 2 for index in cells):
         column = tuple((str(index[-1]), cell) for index, cell in sorted(cells.items()))
         yield TableBlock(columns=("", prefix), rows=column[:MOST_CELLS], name=caption)
+        if len(column) > MOST_CELLS:
+            yield Paragraph(f"{caption}: the first {MOST_CELLS} of {len(column)} entries.")
         return
     lines, columns = ({index[k] for index in cells} for k in range(2))
     if max(len(lines), len(columns)) > MOST_CELLS:

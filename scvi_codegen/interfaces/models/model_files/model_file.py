@@ -245,8 +245,11 @@ def _with_time_transformation(model: Model, document: Document, specification: S
     g, controller = document.get("system", {}).get("time_transformation"), document["run"].get("controller")
     if g is not None or controller is not None:
         in_section("[run] controller", partial(check_controller, controller, transformed=g is not None))
-        model, where = model.with_known_sizes() if g else model, "[system] time_transformation"
-        system, g = in_section(where, lambda: with_time_transformation(model.system, g, controller))
+        if g is not None:
+            model = model.with_known_sizes()
+        system, g = in_section(
+            "[system] time_transformation", lambda: with_time_transformation(model.system, g, controller)
+        )
         default = default_controller(in_tau=g is not None)
         controller = None if controller in (SYMPLECTIC, default) else controller
         method = read_method(fitted(specification, system))

@@ -34,29 +34,38 @@ KEYS: Final = {
 }
 EVENT_KEYS: Final = ("function", "direction", "terminal", "then", "where", "restitution")
 NAMED_SECTIONS: Final = ("parameters", "forces", "torques", "torques_space", "initial", "run")
-LOCATIONS: Final = {
-    **{option.key: f"'{option.key}' belongs in [{option.section}]" for option in KEYED},
-    **{key: f"'{key}' belongs in [{section}]" for section, keys in KEYS.items() for key in keys.split()},
-    **{key: f"there is a section [{key}]" for key in NAMED_SECTIONS},
+SECTION_OF_KEY: Final = {
+    **{option.key: option.section for option in KEYED},
+    **{key: section for section, keys in KEYS.items() for key in keys.split()},
+    **{section: section for section in NAMED_SECTIONS},
 }
-"""Location of each key in a model file."""
+"""Section of each key in a model file; of the name of a section that section."""
 
 
-def key_hint(key: str, names: Iterable[str]) -> str:
-    """Return ``"; did you mean 'step'?"`` or ``"; it belongs in [run], as 'step'."``, or a full stop.
+def key_hint(key: str, names: Iterable[str], section: str) -> str:
+    """Return ``"; did you mean 'step'?"``, ``"; 'step' belongs in [run]."`` or ``"; there is a section [run]."``.
+
+    Else a full stop, also where the key belongs in this section, but not with the present method.
 
     Args:
         key: the unknown key.
         names: known keys of its section.
+        section: this section, as in ``"[run]"``.
     """
     names = list(names)
-    if here := synonym_hint(key, names):
-        return here
-    if key not in LOCATIONS and (hint := closest(key, names)) != ".":
-        return hint
-    likely = [key] if key in LOCATIONS else likely_names(key)
-    locations = [LOCATIONS[name] for name in likely if name in LOCATIONS]
-    return f"; {locations[0]}." if locations else "."
+    if synonym := synonym_hint(key, names):
+        return synonym
+    if key not in SECTION_OF_KEY and (similar := closest(key, names)) != ".":
+        return similar
+    likely = [key] if key in SECTION_OF_KEY else likely_names(key)
+    known_key = next((name for name in likely if name in SECTION_OF_KEY), None)
+    if known_key is None:
+        return "."
+    if known_key in NAMED_SECTIONS:
+        return f"; there is a section [{known_key}]."
+    if section == f"[{SECTION_OF_KEY[known_key]}]":
+        return "."
+    return f"; '{known_key}' belongs in [{SECTION_OF_KEY[known_key]}]."
 
 
 Built = TypeVar("Built")
@@ -188,15 +197,10 @@ def formula_of(section: Section, key: str, where: str) -> str:
 def check_keys(section: Section, names: Iterable[str], kind: str, where: str = "the file") -> None:
     """Raise an error for unknown keys."""
     names = list(names)
-    hint = key_hint if kind in ("key", "section") else closest
     for key in section:
         if key not in names:
-            where_else = hint(key, names)
-            if f"belongs in {where.split(' ')[0]}" in where_else:  # a key of other methods than the present one
-                where_else = "."
-            raise ModelFileError(
-                f"unknown {kind} '{key}' in {where}{where_else} Known: {', '.join(dict.fromkeys(names))}"
-            )
+            hint = key_hint(key, names, where.split(" ")[0]) if kind in ("key", "section") else closest(key, names)
+            raise ModelFileError(f"unknown {kind} '{key}' in {where}{hint} Known: {', '.join(dict.fromkeys(names))}")
 
 
 def in_section(where: str, build: Callable[[], Built]) -> Built:
