@@ -77,35 +77,49 @@ class _PairPrinter:
         return "ddl" if source in self.sources else "dd"
 
     def printed(self, expression: Expression) -> _Printed:
+        """Return the source of an expression, and the form of its low word.
+
+        A sum of pairs adds high words without error and low words as they are, so its operands need not be settled:
+        ``a + b = two_sum(a, b) + (a' + b')`` (Lange & Rump 2020). A sign keeps the form of its operand. Quotients,
+        roots and functions take settled sums and return settled pairs.
+        """
         if isinstance(expression, Constant):
             high, low = _words(mp.convert(expression.value), 2)  # of small constants as well, unlike Target.rest
             return _Printed(f"dd_of({high}, {low})", "dd") if float(low) else _Printed(high, "word")
         if isinstance(expression, Load):
             return self._load(expression)
         operands = [self.printed(operand) for operand in expression.operands]
-        result = "ddl" if any(operand.kind == "ddl" for operand in operands) else "dd"
-        if expression.operator == "*":
-            return self._product(expression, operands, result)
-        name, added = OPERATORS.get(expression.operator, expression.operator), expression.operator in SUMS
-        form = "settled" if not added else operands[0].form if name == "negative" else "sum"
-        texts = (operand.as_pair(result, summed=added) for operand in operands)
-        return _Printed(f"{result}_{name}({', '.join(texts)})", result, form)
+        kind = "ddl" if any(operand.kind == "ddl" for operand in operands) else "dd"
+        operator = expression.operator
+        if operator == "*":
+            return self._product(expression, operands, kind)
+        is_sum = operator in SUMS
+        arguments = ", ".join(operand.as_pair(kind, summed=is_sum) for operand in operands)
+        call = f"{kind}_{OPERATORS.get(operator, operator)}({arguments})"
+        if operator == "neg":
+            return _Printed(call, kind, operands[0].form)
+        return _Printed(call, kind, "sum" if is_sum else "settled")
 
     def _product(self, expression: Operation, operands: list[_Printed], kind: str) -> _Printed:
-        """Return a product, whose low word is settled if those of its factors are not."""
-        factors = {operand.form for operand in operands}
-        names, form = (SETTLED_PRODUCTS, "settled") if "product" in factors else (PRODUCTS, "product")
+        """Return a product, settled at once if a factor is itself an unsettled product.
+
+        ``(a + a') (b + b') = a b + (a b' + a' b)`` to a' b': the low word of a product of settled pairs is up to 3 u of
+        the high one (``templates/support/double_double/pairs.h``), and a product of such products is settled.
+        """
+        settles = any(operand.form == "product" for operand in operands)
+        square, by_word, by_pair = SETTLED_PRODUCTS if settles else PRODUCTS
+        form = "settled" if settles else "product"
         if len(set(expression.operands)) == 1:
-            return _Printed(f"{kind}_{names[0]}({operands[0].as_pair(kind)})", kind, form)
-        word, pair = sorted(operands, key=lambda operand: operand.kind != "word")
-        if word.kind != "word":
-            return _Printed(
-                f"{kind}_{names[2]}({', '.join(operand.as_pair(kind) for operand in operands)})", kind, form
-            )
-        exact = math.frexp(abs(float(word.text)))[0] == 0.5  # a power of two
-        name, form = ("times_power", pair.form) if exact else (names[1], form)
-        number = word.text if kind == "dd" else f"lanes_of({word.text})"
-        return _Printed(f"{kind}_{name}({pair.as_pair(kind, summed=exact)}, {number})", kind, form)
+            return _Printed(f"{kind}_{square}({operands[0].as_pair(kind)})", kind, form)
+        if all(operand.kind != "word" for operand in operands):
+            factors = ", ".join(operand.as_pair(kind) for operand in operands)
+            return _Printed(f"{kind}_{by_pair}({factors})", kind, form)
+        word, pair = operands if operands[0].kind == "word" else reversed(operands)
+        factor = word.text if kind == "dd" else f"lanes_of({word.text})"
+        mantissa, _ = math.frexp(abs(float(word.text)))
+        if mantissa == 0.5:  # a power of two: exact, so that the form stays
+            return _Printed(f"{kind}_times_power({pair.as_pair(kind, summed=True)}, {factor})", kind, pair.form)
+        return _Printed(f"{kind}_{by_word}({pair.as_pair(kind)}, {factor})", kind, form)
 
     def _load(self, load: Load) -> _Printed:
         if load.source == "w":
