@@ -112,6 +112,11 @@ class _Graph:
         return self.node((name, tuple(self.read(argument) for argument in expression.args)))
 
     def _sum(self, expression: sympy.Add) -> int:
+        """Return the node of ``sum_i c_i x_i = c sum_i (c_i / c) x_i``, c the content of the c_i with the first sign.
+
+        Multiples of a sum, its negative among them, share the node of the last sum. With ``paired`` c is only the sign
+        if a term has a sum as a factor.
+        """
         content, primitive = expression.primitive()
         terms = [term.as_coeff_Mul() for term in primitive.args]
         terms.sort(key=lambda term: self._rank(term[1]))
@@ -128,12 +133,18 @@ class _Graph:
         return self._times(content, total)
 
     def _in_pairs(self, terms: Sequence[tuple[bool, int]]) -> tuple[bool, int]:
-        """Return sign and node of the sum of terms with signs, those of two halves added, which are independent."""
+        """Return the sum of terms by pairwise summation (Higham, Accuracy and Stability, sec. 4.1).
+
+        Terms and sum are a sign (``True`` if negative) and a node. The first sign s is taken out of both halves, which
+        do not wait for each other: ``s a + s' b = s (a + b)`` for equal signs, else ``s (a - b)``.
+        """
         if len(terms) == 1:
             return terms[0]
-        half = (len(terms) + 1) // 4 * 2 or 1
-        (negative, first), (other, second) = self._in_pairs(terms[:half]), self._in_pairs(terms[half:])
-        return negative, self.node(("-" if other != negative else "+", (first, second)))
+        half = (len(terms) + 1) // 4 * 2 or 1  # whole pairs; of two terms, one
+        left_negative, left = self._in_pairs(terms[:half])
+        right_negative, right = self._in_pairs(terms[half:])
+        operation = "+" if left_negative == right_negative else "-"
+        return left_negative, self.node((operation, (left, right)))
 
     def _scaled(self, coefficient: sympy.Rational, rest: sympy.Expr) -> int:
         if rest == 1:
@@ -173,6 +184,10 @@ class _Graph:
         return self.node(("neg", (product,))) if negative else product
 
     def _power(self, base: sympy.Expr, exponent: sympy.Expr) -> int:
+        """Return the node of a power: ``x^(n/2)`` by roots, odd quarters as one of these times a root of a root.
+
+        ``x^(k/4) = x^(n/2) x^(1/4)`` with n = (k - 1) / 2 for k > 0; ``x^(-k/4) = x^(-n/2) x^(-1/4)``.
+        """
         quarters = 4 * exponent
         if not (quarters.is_Integer and abs(quarters) <= 4 * LARGEST_UNROLLED_POWER):
             return self.node(("pow", (self.read(base), self.read(exponent))))
@@ -183,6 +198,10 @@ class _Graph:
         return self.node(("*", (self._by_roots(x, halves), quarter))) if halves else quarter
 
     def _by_roots(self, x: int, halves: int) -> int:
+        """Return the node of ``x^(n/2) = x^w sqrt(x)^r``, n = 2 w + r the ``halves``, r in (0, 1).
+
+        ``x^w = (1/x)^-w`` for w < 0; x^(-k/2) for k = 1, 3, 5, 7 are functions of their own.
+        """
         if -halves in INVERSE_ROOTS:
             return self.node((INVERSE_ROOTS[-halves], (x,)))
         whole, half = divmod(halves, 2)
@@ -221,7 +240,11 @@ class _Graph:
         return self.node(Constant(Fraction(0))) if error is None else error
 
     def _inherited(self, operation: str, operands: tuple[int, ...], errors: Mapping[int, int | None]) -> Iterator[int]:
-        """Yield the errors of operands times the absolute derivatives of an operation by them."""
+        """Yield the nodes of ``|d f / d x_j| error_j`` for an operation f of the operands x_j.
+
+        Operands without an error are left out, and all of an operation that is constant but for jumps. To differentiate
+        f, a symbol of SymPy stands for each operand; it is entered in the graph as a name of the operand's node.
+        """
         slots = [sympy.Dummy(real=True) for _ in operands]
         value = OPERATIONS[operation](*slots) if operation in OPERATIONS else sympy.Integer(0)
         self._read.update(zip(slots, operands, strict=True))
@@ -339,10 +362,10 @@ def _order(graph: _Graph, roots: Sequence[int]) -> list[int]:
 
 def _first_arguments(graph: _Graph) -> list[float]:
     """Return the smallest index of an argument on which each node depends."""
-    first: list[float] = []
+    smallest: list[float] = []
     for k, content in enumerate(graph.nodes):  # operands have smaller ids
         if isinstance(content, Load) and content.source == "u":
-            first.append(content.index)
+            smallest.append(content.index)
         else:
-            first.append(min((first[operand] for operand in graph.operands(k)), default=math.inf))
-    return first
+            smallest.append(min((smallest[operand] for operand in graph.operands(k)), default=math.inf))
+    return smallest

@@ -34,25 +34,36 @@ def check_solver_of_arrays(
     resolved: Splitting | ConstrainedSteps | FixedPointIteration | None,
     loops: RolledTerms,
 ) -> None:
-    """Raise :class:`MethodError` for a method and a solver that are not available for an array system.
+    """Raise an error unless a method and a solver are available for an array system of run-time sizes.
+
+    Args:
+        system: of arrays.
+        method: of its steps.
+        solver: one of :data:`SOLVERS`.
+        resolved: what the method becomes for the system with one coordinate; ``None`` if it is not available.
+        loops: the terms in loops, with the eigenvectors of the method's matrix (``shifts``) if Newton's method can use
+            them.
 
     Raises:
-        SizesRequiredError: if they are available for known sizes.
+        MethodError: for splittings of a system whose forces depend on velocities.
+        SizesRequiredError: for what is available if the sizes are known.
     """
     if isinstance(resolved, Splitting) and system.velocities:
         raise MethodError(
             f"{method.name} does not support velocity-dependent forces of array systems: use an SVI or a "
             "Runge-Kutta method"
         )
-    iterated = isinstance(resolved, FixedPointIteration) and resolved.name in ("separable", "Hamiltonian")
-    if solver == "newton" and (system.neighbours or not (loops.shifts and iterated)):
+    is_iterated = isinstance(resolved, FixedPointIteration) and resolved.name in ("separable", "Hamiltonian")
+    has_newton = is_iterated and loops.shifts is not None and not system.neighbours
+    if solver == "newton" and not has_newton:
         raise SizesRequiredError(
             "Newton's method for array systems requires forces that are not constant, no constraints, no lists of "
             "neighbours, and an implicit method whose matrix has a basis of eigenvectors (for a Hamiltonian and for "
             "forces of velocities one with the same table for positions and momenta, as SVI and Gauss): leave out "
             "solver='newton'"
         )
-    if not (iterated or isinstance(resolved, Splitting | ConstrainedSteps)):
+    is_available = is_iterated or isinstance(resolved, Splitting | ConstrainedSteps)
+    if not is_available:
         explicit = "" if system.momenta else ", Stoermer-Verlet or a composition"
         raise SizesRequiredError(
             f"{method.name} is not supported for array systems: use an SVI, a Runge-Kutta method of at "

@@ -110,7 +110,11 @@ def _energy_derivatives(system: MechanicalSystem) -> Kernel:
 
 
 def _curvature(system: MechanicalSystem, group: StageGroup) -> Kernel | None:
-    """Return the kernel of the Hessian-vector product of multipliers . results: gradient of a derivative."""
+    """Return the kernel of the Hessian of ``mu . phi(y)`` times dy, phi the results; ``None`` if phi is linear.
+
+    It is the gradient of a scalar, ``sum_k dy_k d2(mu . phi) / dy_j dy_k = d/dy_j (sum_ik mu_i dphi_i/dy_k dy_k)``,
+    y being the arguments, the parameters and time, and mu and dy the symbols ``multiplier`` and ``change``.
+    """
     depends = (*group.arguments, *system.parameters, system.time)
     multipliers = [Symbol(f"multiplier[{i}]", real=True) for i in range(len(group.results))]
     changes = [Symbol(f"change[{j}]", real=True) for j in range(len(depends))]
@@ -165,7 +169,11 @@ def correction_of(system: MechanicalSystem, fixed_point: FixedPointIteration) ->
 def _iterated(
     system: MechanicalSystem, stages: StageSystem, fixed_point: FixedPointIteration
 ) -> PointDerivatives | None:
-    """Return the kernels of the iteration, with the table from its points to the unknowns of the stage equations."""
+    """Return the kernels of the iteration, with the table from its points to the unknowns of the stage equations.
+
+    Values at the points are ``G z``, z being the unknowns: displacements divided by h with G = ``position``, or
+    velocities with G = ``velocity``. The table is the left inverse ``(G^T G)^-1 G^T``.
+    """
     iteration, shape = point_derivatives_of(system, fixed_point), stages.shape
     if iteration is None or not isinstance(shape, Velocities) or len(stages.blocks) != len(shape.end):
         return iteration

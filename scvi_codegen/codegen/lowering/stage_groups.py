@@ -314,6 +314,12 @@ def argument_name(system: MechanicalSystem, gather: Gather) -> str:
 def _derivative_blocks(
     group: StageGroup, sites: UnknownLayout
 ) -> tuple[tuple[sympy.Expr, ...], tuple[DerivativeBlock, ...]]:
+    """Return the nonzero derivatives of results with respect to arguments, block by block, and these blocks.
+
+    A block has the results of one scatter and the arguments of one gather, which begin at row ``top`` and column
+    ``left`` of the group's matrix. Its entries are sites of the step's matrix, (row, column); ``first`` is the place of
+    its derivatives among all.
+    """
     entries = _partials(group)
     partials: list[sympy.Expr] = []
     blocks = []

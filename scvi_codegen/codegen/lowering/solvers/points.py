@@ -188,7 +188,11 @@ def _linear_part(system: LagrangianSystem, product: Matrix, lanes: int) -> Linea
 
 
 def _is_stable(system: LagrangianSystem, entries: Mapping[tuple[int, int], Expr]) -> bool:
-    """Return whether derivatives of forces depend on constant parameters alone and are negative semidefinite."""
+    """Return whether derivatives F_q of forces depend on constant parameters alone and are negative semidefinite.
+
+    With the default parameters q'' = M^-1 F_q q is stable then: no eigenvalue of F_q is above rounding, relative to the
+    smallest, which must be negative.
+    """
     inputs = {symbol(f"{name}_{k}") for name in system.inputs for k in range(INPUT_PARAMETERS)}
     values = dict(zip(system.parameters, system.defaults, strict=True))
     if any(entry.free_symbols - (values.keys() - inputs) for entry in entries.values()):
@@ -430,7 +434,13 @@ def _linearised_forces(system: LagrangianSystem) -> tuple[Expr, ...]:
 
 
 def weighted_tables(tables: VelocityTables) -> tuple[Matrix, Vector, Matrix, Vector]:
-    """Return position table and weights, momentum table and weights, whose products are the method's own tables."""
+    """Return position table and weights, momentum table and weights, whose products are the method's own tables.
+
+    Of a variational method ``mu[n][b] = position[n][b] / beta_b``, rounded to multiples of 2^-51 (in two words 2^-102),
+    and its adjoint ``1 - mu[n][b]``, transposed, which is exact then: ``beta_b momentum[b][n] = w_n (beta_b -
+    position[n][b])`` holds of the rounded tables, too. With a projection the momentum table is not that of mu and is
+    only divided by its weights. Other methods have weights 1.
+    """
     beta, weights = tables.end_position, tables.end_momentum
     if not tables.variational:
         ones = (mp.one,) * len(beta)

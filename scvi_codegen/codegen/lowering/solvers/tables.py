@@ -106,14 +106,14 @@ def remainder_tables(product: Matrix, end_position: Vector, end_momentum: Vector
     points, adjugate, determinant = len(P), np.diag([1 << REMAINDER_BITS] * len(P)), []
     rows: tuple[list[Vector], ...] = ([], [])
     for k in range(1, points + 1):
-        all_of = P.dot(adjugate) >> REMAINDER_BITS
+        product_with = P.dot(adjugate) >> REMAINDER_BITS  # P B_(k-1), two fixed-point factors
         for table, weights in zip(rows, (end_position, end_momentum), strict=True):
-            columns = (zip(weights, all_of[:, n], strict=True) for n in range(points))
+            columns = (zip(weights, product_with[:, n], strict=True) for n in range(points))
             table.append(
                 tuple(-mp.ldexp(mp.fsum(b * int(x) for b, x in column), -REMAINDER_BITS) for column in columns)
             )
-        determinant.append(int(np.trace(all_of)) // k)
-        adjugate = np.diag([determinant[-1]] * points) - all_of
+        determinant.append(int(np.trace(product_with)) // k)
+        adjugate = np.diag([determinant[-1]] * points) - product_with
     fastest = float(np.abs(np.linalg.eigvals(np.array(product, dtype=float))).max())
     padding = (mp.zero,) * (lanes - points)
     at_points = (tuple((*line, *padding) for line in transpose(tuple(table))) for table in rows)
@@ -134,7 +134,15 @@ LARGEST_CONDITION, LEAST_ANGLE = mp.mpf("1e8"), mp.mpf("0.1")
 
 @lru_cache(maxsize=16)
 def shift_tables(matrix: NumberTable, lanes: int) -> ShiftTables | None:
-    """Return the eigenvectors of the matrix of a step, whose rows are padded by repeating the last one.
+    """Return the eigenvectors of the (g, g) matrix P of a step: P = V diag(mu) V^-1, x = V z, z = V^-1 x.
+
+    Of two conjugate eigenvalues the one with positive imaginary part is kept, since for real x
+
+        x_n = sum_k V_nk z_k = sum_real V_nk z_k + sum_kept 2 (Re V_nk Re z_k - Im V_nk Im z_k).
+
+    So ``back`` has the factor 2 and the sign of the imaginary parts, and ``into`` the rows of V^-1 as they are. Each
+    vector of kept components is padded to a power of two and stored as its real, then its imaginary parts. Rows of
+    ``back`` beyond the g points repeat the last one, up to ``lanes``.
 
     ``None`` if the matrix is defective, as that of SVI(3, "gauss-lobatto:3").
     """
@@ -167,9 +175,11 @@ def shift_tables(matrix: NumberTable, lanes: int) -> ShiftTables | None:
 
 
 def eigenvectors(matrix: NumberTable) -> tuple[list[Any], Any]:
-    """Return the eigenvalues and the matrix of eigenvectors, by Newton's method from those in double precision.
+    """Return the eigenvalues and the matrix of eigenvectors, by inverse iteration from those in double precision.
 
-    The largest component of an eigenvector is 1. (``mp.eig`` takes ten times as long.)
+    The largest component x_m of an eigenvector is 1. Inverse iteration with the latest shift is Newton's method for
+    A x = mu x, x_m = 1 (Peters & Wilkinson 1979): with (A - mu) y = x, mu + 1 / y_m and y / y_m are the next mu and x.
+    (``mp.eig`` takes ten times as long.)
     """
     values, vectors = np.linalg.eig(np.array(matrix, dtype=float))
     exact, eigenvalues, columns = mp.matrix(matrix), [], []
@@ -284,7 +294,15 @@ def tableau_tables(abscissae: Vector, A: Matrix, b: Vector) -> VelocityTables:
 
 
 def _variational_tables(shape: Velocities) -> VelocityTables | None:
-    """Return the adjoint pair; if the velocities are not those at the points, with the projected equations."""
+    """Return the adjoint pair, ``None`` if a weight beta_b is 0 or the velocities do not determine the curve.
+
+    With velocities at the points: ``momentum[b][n] = w_n (beta_b - position[n][b]) / beta_b``. With other points and
+    l = ``velocity``, the matrix K = l^T w l takes the place of the beta_b by which this divides:
+
+        momentum = K^-1 (beta_b - position[n][b])_bn w,    projection = K^-1 l^T w,
+
+    and K^-1 beta = 1 is required: free motion with a constant mass, m K V = beta p, has constant velocities.
+    """
     beta, weights = shape.end, shape.weights
     if any(x == 0 for x in beta):
         return None
