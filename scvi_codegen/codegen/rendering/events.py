@@ -399,7 +399,13 @@ class ArrayEvents:
     Attributes:
         events: C of each: ``functions``, ``conditions`` and ``changes``, statements; ``ranges``, the first index, end,
             and whether it is the greater index of a pair, of each loop; ``count`` of functions; ``entries``, the
-            largest number of variables that one changes; ``accesses`` of arrays, with the loops around them.
+            largest number of variables that one changes; ``accesses`` of arrays, with the loops around them; ``timed``,
+            1 for a function of time alone, 2 if it is affine, else 0; ``rates``, statements that compute its
+            :func:`turn_rate`, none if it does not turn.
+        timed: the same ``timed`` of each event.
+        layout: the arrays, tables, sizes and parameters of the stepper.
+        moving: by the name of an array of coordinates, momenta or velocities: 0, 1 or 2 for q, p or v, and the name of
+            its coordinates.
         functions: texts of the functions that their statements call.
         kernels: the kernels that these call.
         positions, rates: arrays whose entries may occur: coordinates, fields and momenta; velocities, of which a
