@@ -94,7 +94,11 @@ class RefinedSearch(CrossingSearch):
     def _root(
         self, states: SavedStates | Memory, start: TimedState, function: int, guess: Fraction, h: Fraction
     ) -> TimedState:
-        """Return the time of a simple zero near ``guess`` in the step from ``start``, else ``guess``, and the state."""
+        """Return the time of a simple zero near ``guess`` in the step from ``start``, else ``guess``, and the state.
+
+        Two steps of the secant method, t - g(t) (t' - t) / (g(t') - g(t)): the first from the guess t_0 and
+        t_0 + DIFFERENCE h, the second from its result t_1 and t_0.
+        """
         here = self._moved(states, start, guess)
 
         def value(at: TimedState) -> Fraction:
@@ -105,15 +109,15 @@ class RefinedSearch(CrossingSearch):
 
         try:
             near = guess + h * Fraction(DIFFERENCE)
-            first, second = value(here), value(self._moved(states, start, near))
-            if not first or first == second:
+            g_guess, g_near = value(here), value(self._moved(states, start, near))
+            if not g_guess or g_guess == g_near:
                 return here
-            t = guess - first * (near - guess) / (second - first)
+            t = guess - g_guess * (near - guess) / (g_near - g_guess)
             if abs(t - guess) > abs(h) * Fraction(LARGEST_CHANGE):
                 return here
-            last = value(self._moved(states, start, t))
-            if last != first:
-                t -= last * (t - guess) / (last - first)
+            g_t = value(self._moved(states, start, t))
+            if g_t != g_guess:
+                t -= g_t * (t - guess) / (g_t - g_guess)
         except ArithmeticError:  # undefined beside the zero
             return here
         return self._moved(states, start, t)

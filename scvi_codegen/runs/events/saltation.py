@@ -96,7 +96,11 @@ def _changes(states: SavedStates, numbers: NDArray[np.intp]) -> dict[int, tuple[
 def _jump(
     states: SavedStates, starts: Starts, k: int, row: int, event: Event, before: Array, *, all_inputs: bool
 ) -> Jump:
-    """Return the change of the state at the end of step k - 1 of ``starts``, in a row of the saved states."""
+    """Return the change of the state at the end of step k - 1 of ``starts``, in a row of the saved states.
+
+    With the module's equation, dz+ = R_x dx + (R_z X- + R_t - X+) dtau, dtau = -g_x dx / (g_z X- + g_t), for
+    x = (q, p, parameters, t).
+    """
     stepper, parameters, options = states.stepper, states.parameters, states.options
     m, size = stepper.dimension, stepper._input_size
     t, after = float(states.t[row]), np.concatenate([states.q[row], states.p[row]])
@@ -108,9 +112,11 @@ def _jump(
     arrival = products(start, float(starts.h[k - 1]), float(starts.t[k - 1]), np.eye(size)[-1:])[:, 0]
     at_end = row + 1 == len(states)
     h = SMALL_STEP * abs(states.h) if at_end else float(steps_after(states, row, row + 1)[0])
-    # 1 if the next step is the rest of a step of size h, whose variation belongs to the first part
-    partial = abs(h) < (1.0 - WHOLE) * abs(states.h) or abs(starts.h[k - 1]) < WHOLE * abs(states.h)
-    rest = float(not at_end and isinstance(states.plan, FixedSteps) and partial)
+    # the change divides a step of fixed size if the part after or before it is shorter than h
+    short = abs(h) < (1.0 - WHOLE) * abs(states.h) or abs(starts.h[k - 1]) < WHOLE * abs(states.h)
+    divided = float(not at_end and isinstance(states.plan, FixedSteps) and short)
+    # a start moved along the flow has the same end: Phi(z + X+ s, t + s, h - s) = Phi(z, t, h), hence
+    # Phi_z X+ = Phi_h - Phi_t, solved for X+ = departure + basis y
     step = products(after, h, t, np.eye(size))
     departure, basis = np.zeros(2 * m), np.eye(2 * m)
     if stepper.constraints:  # tangent vectors are admissible: departure + the range of the derivative of the projection
@@ -134,12 +140,14 @@ def _jump(
         by = _projection(states, values.value, t, all_inputs=all_inputs)[1]
         change = by[:, : 2 * m] @ values.map
         change[:, 2 * m :] += by[:, 2 * m :]
-    shift = -gradient / rate
+    crossing_time = -gradient / rate  # dtau = crossing_time (dx, dh)
     matrix = np.eye(size)
     matrix[: 2 * m] = np.concatenate([change, np.zeros((2 * m, 1))], axis=1)
-    matrix[: 2 * m] += np.outer(change[:, : 2 * m] @ arrival + change[:, -1] - departure, shift)
-    matrix[: 2 * m, -1] -= rest * departure
-    matrix[-2, -1] -= rest
+    matrix[: 2 * m] += np.outer(change[:, : 2 * m] @ arrival + change[:, -1] - departure, crossing_time)
+    # dh of a divided step is added to both of its parts, but lengthens only the second: without that of the first,
+    # which the crossing makes X+ dh, and without its dt = dh
+    matrix[: 2 * m, -1] -= divided * departure
+    matrix[-2, -1] -= divided
     return Jump(matrix, before)
 
 
@@ -194,7 +202,13 @@ def _impact(states: SavedStates, values: Values, before: Array, after: Array, t:
     """Return the (2m, x) derivative of the state after an impact by x = (q, p, parameters, t).
 
     With n = g_q, u = p + lambda n and p1 = P(q, u), F = H(q, p1) - H(q, p) + lambda g_t - (p1 - u).v1 = 0 gives
-    lambda_x = -F_x / F_lambda; the last term is the work of moving constraints.
+    lambda_x = -F_x / F_lambda; the last term is the work of moving constraints. Its root lambda_1 is the impulse
+    without loss, that of restitution e is lambda = lambda_1 (1 + e) / 2. The terms v1.p1_x and v1.p1_lambda cancel:
+
+        F_x = lambda (v1.n_x + g_tx) + (v1 - v0).p_x + (H(q, p1) - H(q, p))_x - (p1 - u).v1_x,
+        F_lambda = v1.n + g_t - (p1 - u).v1_lambda,
+
+    where H is differentiated at fixed momenta.
     """
     stepper, parameters = states.stepper, states.parameters
     m, count = stepper.dimension, values.gradient.size
@@ -222,9 +236,10 @@ def _impact(states: SavedStates, values: Values, before: Array, after: Array, t:
         work[m : 2 * m] = 0.0
         residual -= work + by_momentum @ p1_by
         residual_by_impulse -= by_momentum @ p1_by_impulse
-    total = 0.5 * (full * values.map[m + 1] - (1.0 + e) * residual / residual_by_impulse)
+    # lambda_x = (lambda_1 e_x + (1 + e) lambda_1x) / 2
+    impulse_by = 0.5 * (full * values.map[m + 1] - (1.0 + e) * residual / residual_by_impulse)
     _, by, by_impulse = changed(impulse)
-    return np.vstack([np.eye(m, count), by + np.outer(by_impulse, total)])
+    return np.vstack([np.eye(m, count), by + np.outer(by_impulse, impulse_by)])
 
 
 def _projection(states: SavedStates, state: Array, t: float, *, all_inputs: bool) -> tuple[Array, Array]:

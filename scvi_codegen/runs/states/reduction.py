@@ -43,26 +43,33 @@ class Reduction:
         self.size = 2 * (self.ordinary + sum(FREEDOM[member.kind] for member in self.members))
 
     def inward(self, q: Array, p: Array) -> Array:
-        """Return (.., 2m, size) matrices from (a, b) to changes of (q, p)."""
-        m, n = self.dimension, self.ordinary
+        """Return (.., 2m, size) matrices from (a, b) to changes of (q, p), from (.., m) positions and momenta."""
+        m, n, half = self.dimension, self.ordinary, self.size // 2
         result = np.zeros((*q.shape[:-1], 2 * m, self.size))
-        result[..., :n, :n] = result[..., m : m + n, self.size // 2 : self.size // 2 + n] = np.eye(n)
-        for member, rows, own in self._parts():
-            dq, dp, size = rows, slice(m + rows.start, m + rows.stop), self.size // 2
-            a, b = own, slice(size + own.start, size + own.stop)
-            position, momentum = q[..., rows], p[..., rows]
-            if member.kind == "spin":
+        result[..., :n, :n] = np.eye(n)
+        result[..., m : m + n, half : half + n] = np.eye(n)
+        for member, dq, a in self._parts():
+            dp = slice(m + dq.start, m + dq.stop)
+            b = slice(half + a.start, half + a.stop)
+            position, momentum = q[..., dq], p[..., dq]
+            if member.kind == "spin":  # dq + i dp = (a + i b) other
                 other = _orthogonal_spin(position, momentum)[..., np.newaxis]
                 result[..., dq, a], result[..., dq, b] = other.real, -other.imag
                 result[..., dp, a], result[..., dp, b] = other.imag, other.real
                 continue
+            # dq = |q| B a, dp = B b / |q| - q^ (p . B a)
             basis, unit, length = _basis(member, position)
             result[..., dq, a], result[..., dp, b] = length * basis, basis / length
             result[..., dp, a] = -unit[..., np.newaxis] * (momentum[..., np.newaxis, :] @ basis)
         return result
 
     def outward(self, q: Array, p: Array) -> Array:
-        """Return (.., size, 2m) matrices from changes of (q, p) to (a, b), the symplectic transposes of ``inward``."""
+        """Return (.., size, 2m) matrices from changes of (q, p) to (a, b), the symplectic transposes of ``inward``.
+
+        With S = (Q_a Q_b; P_a P_b) of ``inward`` and J = (0 1; -1 0) it is J^-1 S^T J, hence
+
+            a = P_b^T dq - Q_b^T dp,   b = -P_a^T dq + Q_a^T dp.
+        """
         m, half = self.dimension, self.size // 2
         columns = np.swapaxes(self.inward(q, p), -1, -2)
         by_q, by_p = columns[..., :m], columns[..., m:]

@@ -165,11 +165,15 @@ def _coordinates(member: Member, q: Mapping[str, Any]) -> tuple[Array, Array]:
 
 
 def _hopf(s: Array, length: Array) -> tuple[Array, Array]:
-    """Return coordinates and momenta (.., 2) of a spin: a real and positive, or b where s points down."""
+    """Return coordinates and momenta (.., 2) of spins (.., 3): a real and positive, or b where s points down.
+
+    With (a, b) = q + i p in C^2 (Hopf map): s_x + i s_y = conj(a) b / 2, s_z = (|a|^2 - |b|^2) / 4 and
+    |s| = (|a|^2 + |b|^2) / 4. Hence |a|^2 = 2 (|s| + s_z) and |b|^2 = 2 (|s| - s_z); the larger one is free of
+    cancellation, the smaller amplitude follows from the product conj(a) b.
+    """
     transverse, up = s[..., 0] + 1j * s[..., 1], s[..., 2]
-    size = length[..., 0]
     north = up >= 0
-    large = np.sqrt(2 * (size + np.abs(up)))
+    large = np.sqrt(2 * (length[..., 0] + np.abs(up)))
     small = 2 * transverse / large
     a = np.where(north, large, np.conj(small))
     b = np.where(north, small, large)

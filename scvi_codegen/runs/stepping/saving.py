@@ -66,7 +66,8 @@ def read_checkpoint(
         adaptive: whether the run continues with adaptive steps.
 
     Raises:
-        StateError: if the bytes are damaged or belong to another integrator or another kind of steps.
+        StateError: if the bytes are damaged or belong to another integrator or another kind of steps, or, of run-time
+            sizes, for an invalid ``threads``.
     """
     body = unsealed(saved)
     try:
@@ -80,7 +81,8 @@ def read_checkpoint(
 def _read(
     body: bytes, stepper: Integrator, threads: int | None, *, adaptive: bool
 ) -> tuple[Integrator, bytes, dict[str, Any], ErrorControl]:
-    text, _, rest = body.partition(b"\n")
+    # body: header in JSON, newline, tables of int32, words of the parameters, memory of the run
+    text, _, arrays = body.partition(b"\n")
     header, layout = json.loads(text), stepper.interface.layout
     if header["integrator"] != _integrator(stepper):
         raise StateError(f"the saved run is one of '{header['integrator']}', not of '{_integrator(stepper)}'")
@@ -88,27 +90,28 @@ def _read(
         raise StateError(
             "the saved run has fixed steps: omit t_end" if adaptive else "the saved run has adaptive steps: give t_end"
         )
-    first = 0
+    offset = 0
     if layout.coordinates:
         sizes = {name: checked_count(header["sizes"][name], name, least=0) for name in layout.sizes}
         tables = {}
         for table in layout.tables:
             shape = table.shape(sizes)
-            tables[table.name] = np.frombuffer(rest, np.int32, math.prod(shape), first).reshape(shape)
-            first += tables[table.name].nbytes
+            tables[table.name] = np.frombuffer(arrays, np.int32, math.prod(shape), offset).reshape(shape)
+            offset += tables[table.name].nbytes
         places = read_tables(stepper.interface, tables)
         check_accesses(layout, sizes, places)
         count = checked_count(1 if threads is None else threads, "threads", least=1, most=MOST_THREADS)
         problem = RunSizes(sizes=sizes, places=places, threads=count)
         binding: Any = stepper  # of run-time sizes
         stepper = binding._bound_to(problem).with_events(stepper.events)
-    values = np.frombuffer(rest, count=stepper.interface.words * len(stepper.defaults), offset=first)
-    parameters = stepper.parameters_by_name(values if stepper.interface.words == 1 else from_block(values))
+    words = stepper.interface.words
+    values = np.frombuffer(arrays, count=words * len(stepper.defaults), offset=offset)
+    parameters = stepper.parameters_by_name(values if words == 1 else from_block(values))
     for name in header["unset inputs"]:
         del parameters[f"{name}_0"]
     control = ErrorControl(**header.get("control", {}))
     control.checked()
-    return stepper, rest[first + values.nbytes :], parameters, control
+    return stepper, arrays[offset + values.nbytes :], parameters, control
 
 
 def _integrator(stepper: Integrator) -> str:
