@@ -136,7 +136,11 @@ def _symbols(name: str, system: MechanicalSystem) -> tuple[Symbol, ...]:
 
 
 def _framed(system: MechanicalSystem, stages: StageSystem, turns: Sequence[Turn], potential: Expr) -> StageSystem:
-    """Return the equations of W(Q, u_n), u_n = (c_n - 1/2) h P_n, in place of H: in the moving frame."""
+    """Return the equations of W(Q, u) in place of H: in the moving frame.
+
+    W is the potential at the coordinates after the free rotation by u_n = tau_n h P_n, tau_n = c_n - 1/2. With
+    L = P . v - W(Q, u) the forces L_Q are -W_Q, and 0 = L_P = v_n - tau_n h W_u(Q_n, u_n) replaces 0 = v_n - H_p.
+    """
     q, u, (group,) = system.coordinates, _symbols("turn", system), stages.stage_groups
     W = potential.xreplace(_into_frame(turns, q, u))
     velocity, push = (tuple(-x for x in gradient_tuple(W, variables)) for variables in (u, q))
@@ -167,7 +171,10 @@ def _rotated(
 ) -> StageSystem:
     """Return the equations with rotations of bodies at the end, or ``first``.
 
-    V is their change of q by h, P the momentum before them.
+    V is their change of q divided by h, P the momentum before them. Rotations by u = h P change q by dq and u by du.
+
+        At the end:  0 = -(dq - h V)/h,   0 = (momentum before them) - P,   q1 += h V,   p1 += du/h.
+        First:       0 = -(dq - h V)/h,   0 = p0 - P,   q0 -> q0 + h V and p0 -> p0 + du/h in all other equations.
     """
     size, u, v = len(stages.rows), _symbols("turn", system), _symbols("change", system)
     moved, pushed = rotated(turns, system.coordinates, u, *rotations)

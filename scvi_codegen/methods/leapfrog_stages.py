@@ -34,71 +34,96 @@ def leapfrog_system(system: MechanicalSystem, method: Method) -> StageSystem:
     kicks, drifts = kicks_and_drifts(method, split)
     moving = tuple(x for x in drifts if x)
     drift = _rotating_group(split, moving) if split.bodies else _drift_group(split, drifts)
-    numbers, more = range(1, len(moving) + 1), len(moving) if split.bodies else 0
+    numbers = range(1, len(moving) + 1)
+    momenta = len(moving) if split.bodies else 0
     return StageSystem(
         blocks=(
             *(Block(letter="V", index=k, straight=(mp.zero, mp.one)) for k in numbers),
-            *(Block(letter="P", index=k, momentum=1, moves=False) for k in numbers[:more]),
+            *(Block(letter="P", index=k, momentum=1, moves=False) for k in numbers[:momenta]),
         ),
         rows=(
-            *(Row(number=f"V_{k}", kind="stage", momentum=mp.zero) for k in numbers[:more]),
-            *(Row(number=f"{'P' if more else 'V'}_{k}", kind="IDEL", momentum=mp.one) for k in numbers),
+            *(Row(number=f"V_{k}", kind="stage", momentum=mp.zero) for k in numbers[:momenta]),
+            *(Row(number=f"{'P' if momenta else 'V'}_{k}", kind="IDEL", momentum=mp.one) for k in numbers),
         ),
         stage_groups=(*([_kick_group(split, kicks, drifts)] if any(split.force) else []), drift),
-        end_position=Table.joined(Table.constant(1, 1, 1), Table.named("gamma", (moving,)), Table.constant(1, more)),
+        end_position=Table.joined(Table.constant(1, 1, 1), Table.named("gamma", (moving,)), Table.constant(1, momenta)),
         end_momentum=mp.one,
         end_numbers=("q1", "p1"),
-        extrapolation=identity_matrix(len(moving) + more),
+        extrapolation=identity_matrix(len(moving) + momenta),
     )
 
 
-def _rotating_group(split: KineticSplitting, moving: Vector) -> StageGroup:
-    """Return the changes of q and of the momentum by the flow of the kinetic energy in each drift."""
-    n, m, q = len(moving), range(split.system.dimension), split.system.coordinates
-    none, last = Table.constant(n, n), Table.constant(n, 1)
-    u, v = (tuple(symbol(f"{name}_{i}") for i in m) for name in ("turn", "change"))
-    moved, turned = split.flow(u)
-    places = Table.named("a", [[x * int(k < j) for k, x in enumerate(moving)] for j in range(n)])
-    durations = Table.named("gamma", [[x * int(k == j) for k in range(n)] for j, x in enumerate(moving)])
-    rates = Table.named("r", [[-int(k == j) / x for k in range(n)] for j, x in enumerate(moving)])
-    later = Table.named("s", [[int(k > j) / x for k in range(n + 1)] for j, x in enumerate(moving)])
+def _rotating_group(split: KineticSplitting, durations: Vector) -> StageGroup:
+    """Return the drifts of systems with rigid bodies: exact flows of the kinetic energy T, of these durations.
+
+    Drift j of duration d_j h begins at (q_j, P_j); the flow of T changes q by dq_j and u_j = d_j h P_j by du_j:
+
+        q_j = q0 + h sum_{k < j} d_k V_k,
+        row V_j:  0 = -(dq_j(q_j, u_j) - d_j h V_j)/(d_j h),
+        row P_j:  0 = p0 + sum_{k < j} du_k/(d_k h) + kicks before drift j - u_j/(d_j h),
+        p1 = p0 + sum_k du_k/(d_k h) + all kicks
+
+    (splitting methods: Hairer, Lubich, Wanner, Geometric Numerical Integration, II.5).
+    """
+    drifts, q = range(len(durations)), split.system.coordinates
+    components = range(split.system.dimension)
+    u = tuple(symbol(f"turn_{i}") for i in components)
+    dV = tuple(symbol(f"change_{i}") for i in components)  # d_j h V_j
+    dq, du = split.flow(u)
+    # Rows are drifts j. Columns of gathers are those of q0, V and P; columns of scatters the rows V, P and p1.
+    zero_square, zero_column = Table.constant(len(drifts), len(drifts)), Table.constant(len(drifts), 1)
+    earlier = Table.named("a", [[d if k < j else mp.zero for k, d in enumerate(durations)] for j in drifts])
+    own = Table.named("gamma", [[d if k == j else mp.zero for k in drifts] for j, d in enumerate(durations)])
+    minus_inverse = Table.named("r", [[-1 / d if k == j else mp.zero for k in drifts] for j, d in enumerate(durations)])
+    to_later_and_p1 = Table.named(
+        "s", [[1 / d if k > j else mp.zero for k in range(len(drifts) + 1)] for j, d in enumerate(durations)]
+    )
     return StageGroup(
         name="drift",
-        abscissae=tuple(mp.fsum(moving[:k]) for k in range(n)),
+        abscissae=tuple(mp.fsum(durations[:j]) for j in drifts),
         gathers=(
-            Gather(arguments=q, table=Table.joined(Table.constant(n, 1, 1), places, none), power=0),
-            Gather(arguments=u, table=Table.joined(last, none, durations), power=0),
-            Gather(arguments=v, table=Table.joined(last, durations, none), power=0),
+            Gather(arguments=q, table=Table.joined(Table.constant(len(drifts), 1, 1), earlier, zero_square), power=0),
+            Gather(arguments=u, table=Table.joined(zero_column, zero_square, own), power=0),
+            Gather(arguments=dV, table=Table.joined(zero_column, own, zero_square), power=0),
         ),
         scatters=(
             Scatter(
-                results=tuple(x - y for x, y in zip(moved, v, strict=True)),
-                table=Table.joined(rates, none, last),
+                results=tuple(change - estimate for change, estimate in zip(dq, dV, strict=True)),
+                table=Table.joined(minus_inverse, zero_square, zero_column),
                 power=-1,
             ),
-            Scatter(results=tuple(turned), table=Table.joined(none, later), power=-1),
-            Scatter(results=u, table=Table.joined(none, rates, last), power=-1),
+            Scatter(results=tuple(du), table=Table.joined(zero_square, to_later_and_p1), power=-1),
+            Scatter(results=u, table=Table.joined(zero_square, minus_inverse, zero_column), power=-1),
         ),
         computes="Changes of q and u by the flow of the kinetic energy, less v, and u",
     )
 
 
 def _kick_group(split: KineticSplitting, kicks: Vector, drifts: Vector) -> StageGroup:
-    """Return L_q at the positions before, between and after the drifts, added to all later velocities (kicks)."""
-    points, moving = ([k for k, x in enumerate(coefficients) if x] for coefficients in (kicks, drifts))
-    drifted = tuple(tuple(drifts[k] if k < n else mp.zero for k in moving) for n in points)
-    before = tuple(tuple(int(n <= k) for k in moving) for n in points)
-    every = Table.constant(len(points), 1, 1)
-    none = Table.constant(len(points), len(moving) if split.bodies else 0)
-    places = Table.joined(every, Table.named("a", drifted), none)
-    later = Table.joined(none, Table.named("", before), every)
+    """Return the kicks: forces F = L_q at the positions before, between and after the drifts, times w_n h.
+
+    With the durations d_k h of the drifts, kick n of weight w_n precedes drift n,
+
+        q_n = q0 + h sum_{k < n} d_k V_k,    row k += w_n h F(q_n) for k >= n,    p1 += w_n h F(q_n);
+
+    row k determines the momentum before drift k. Kicks and drifts of weight 0 are left out.
+    """
+    kicking = [n for n, weight in enumerate(kicks) if weight]
+    moving = [k for k, duration in enumerate(drifts) if duration]
+    earlier_drifts = tuple(tuple(drifts[k] if k < n else mp.zero for k in moving) for n in kicking)
+    later_rows = tuple(tuple(int(k >= n) for k in moving) for n in kicking)
+    ones = Table.constant(len(kicking), 1, 1)
+    # With rigid bodies gathers have further columns for the blocks P, and scatters for the rows V.
+    zeros = Table.constant(len(kicking), len(moving) if split.bodies else 0)
+    positions = Table.joined(ones, Table.named("a", earlier_drifts), zeros)
+    momenta = Table.joined(zeros, Table.named("", later_rows), ones)
     return StageGroup(
         name="kick",
-        abscissae=tuple(mp.fsum(line) for line in drifted),
-        weights=tuple(kicks[n] for n in points),
-        weight_names=tuple(EntryName("w", n) for n in points),
-        gathers=(Gather(arguments=split.system.coordinates, table=places, power=0),),
-        scatters=(Scatter(results=split.force, table=later, power=1),),
+        abscissae=tuple(mp.fsum(durations) for durations in earlier_drifts),
+        weights=tuple(kicks[n] for n in kicking),
+        weight_names=tuple(EntryName("w", n) for n in kicking),
+        gathers=(Gather(arguments=split.system.coordinates, table=positions, power=0),),
+        scatters=(Scatter(results=split.force, table=momenta, power=1),),
         scalar=_potential_part(split.system) if _acts(split) else None,
         in_action=_acts(split),
     )

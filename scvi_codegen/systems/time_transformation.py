@@ -168,7 +168,8 @@ def time_rescaling_function(system: MechanicalSystem, g: str | Expr, *, in_time:
     formula = names.in_coordinates(formula)
     unknown = sorted(free.name for free in formula.free_symbols - set(symbols.values()))
     if unknown:
-        kinds = "coordinates, momenta and parameters" if system.auxiliaries else "coordinates and parameters"
+        kinds = "coordinates, momenta" if system.auxiliaries else "coordinates"
+        kinds += ", parameters, time and inputs" if in_time else " and parameters"
         raise SystemDefinitionError(
             f"the time transformation contains '{unknown[0]}': it may depend only on {kinds} of '{system.name}'"
         )

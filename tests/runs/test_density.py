@@ -9,6 +9,8 @@ from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 from scvi_codegen.runs.stepping.step_plan import InTau
+from scvi_codegen.systems.formulas.symbols import symbol
+from scvi_codegen.systems.time_transformation import time_rescaling_function
 
 KEPLER = sc.problem("kepler").system
 E = 0.8
@@ -124,6 +126,13 @@ def test_steps_that_end_at_a_time_advance_the_density_partially():
 
 
 @pytest.mark.second
+def test_unknown_symbols_are_refused_with_all_that_is_allowed():
+    with pytest.raises(sc.SystemDefinitionError, match=r"'z'.* only on coordinates, parameters, time and inputs of"):
+        time_rescaling_function(DRIVEN, DRIVEN.coordinates[0] + symbol("z"), in_time=True)
+    with pytest.raises(sc.SystemDefinitionError, match=r"'z'.* only on coordinates and parameters of"):
+        time_rescaling_function(DRIVEN, DRIVEN.coordinates[0] + symbol("z"))
+
+
 def test_time_transformations_of_runs_with_inputs():
     """Steps of tau are positive, and their number is not prescribed."""
     system = sc.LagrangianSystem.from_text(name="u", coordinates=["x"], lagrangian="x_dot**2/2 + u*x", inputs=["u"])
