@@ -193,9 +193,9 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
         t, q, p = self.times[last, j], self.q[last, j], self.p[last, j]
         t[reached == 0] = np.nan
         for k, crossings in enumerate(self.events if self.t.ndim == 1 else ()):
-            for each in crossings:
-                if 0 < int(each.event.terminal) <= len(each):
-                    t[k], q[k], p[k] = each.t[-1], each.q[-1], each.p[-1]
+            for crossing in crossings:
+                if 0 < int(crossing.event.terminal) <= len(crossing):  # the number of the crossing that ends a run
+                    t[k], q[k], p[k] = crossing.t[-1], crossing.q[-1], crossing.p[-1]
         return t, q, p
 
     def each(self) -> Iterator[tuple[Array, Array, Array, str, int]]:
@@ -224,7 +224,7 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
             if np.isfinite(actions[self._reached(j), j]).all():
                 continue
             actions[self._reached(j), j] = self[j].action(cumulative=True)
-        last = [np.flatnonzero(self._reached(j))[-1] for j in range(len(self))]
+        last = [int(self._reached(j).nonzero()[0].max(initial=0)) for j in range(len(self))]  # 0: reached no time
         return actions if cumulative else np.where(self.ok, actions[last, np.arange(len(self))], np.nan)
 
     def momentum_maps(self) -> Array:
