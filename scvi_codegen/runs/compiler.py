@@ -231,8 +231,11 @@ class CachedSources:
     @property
     def variants(self) -> Variants:
         """The variants of the source."""
-        damped = self.system.damping != 0
-        return Variants(make=self.variant, lacking=lambda variant: damped and variant == Derivatives(order=2))
+
+        def lacking(variant: Variant) -> bool:  # asks the system last, whose text need not be read before
+            return variant == Derivatives(order=2) and self.system.damping != 0
+
+        return Variants(make=self.variant, lacking=lacking)
 
     def integrator(self) -> tuple[Source, Interface]:
         """Return the C source and its interface."""

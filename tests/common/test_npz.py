@@ -55,7 +55,7 @@ def ensemble_to_ends() -> Result:
     stepper = sc.compile_stepper(free(), "svi:3")
     start = np.array([[0.3, 0.2], [0.1, 0.5]])
     found = stepper.integrate_ensemble(start, start[::-1], t=0.7, t_end=[2.0, 3.1], tolerance=1e-6)
-    return described(found, "t", "q", "p", "h", "status", "steps", "parameters", "times")
+    return described(found, "t", "q", "p", "status", "steps", "parameters")
 
 
 def driven() -> Result:

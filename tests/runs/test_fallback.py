@@ -175,7 +175,7 @@ ROD = {"lagrangian": "(x_dot**2 + y_dot**2)/2 - g*y", "coordinates": ["x", "y"],
     ("text", "q", "h", "values"),
     [
         (STIFF, [0.3], 0.7, {"k": np.array([10.0, 30.0, 40.0])}),
-        (ROD | {"constraints": ["x**2 + y**2 - 1"]}, [1.0, 0.0], 0.4, {"g": np.array([2.0, 9.81, 12.0])}),
+        (ROD | {"constraints": ["x**2 + y**2 - 1"]}, [1.0, 0.0], 0.4, {"g": np.array([2.0, 10.5, 10.5])}),
     ],
     ids=["spring", "rod"],
 )

@@ -92,8 +92,8 @@ def test_run_killed_at_random_times_continues(kepler, times):
 
 @pytest.mark.rotated
 def test_file_size_limit_is_reported_with_the_state_of_the_run(kepler):
-    limit = "resource.setrlimit(resource.RLIMIT_FSIZE, (500_000, resource.RLIM_INFINITY))"
-    with child(kepler, before=limit, rows=20_000) as process:
+    limit = "resource.setrlimit(resource.RLIMIT_FSIZE, (2_000_000, resource.RLIM_INFINITY))"  # above the manifest
+    with child(kepler, before=limit, rows=80_000) as process:
         _, stderr = process.communicate(timeout=600)
     last, steps = stderr.splitlines()[-1], load_run("a.run").steps
     assert "RecordingError: 'a.run' cannot be written: File too large. " in last

@@ -99,6 +99,8 @@ class EnsembleSettings:
         if h is not None and t_end is not None and np.ndim(t_end):
             raise StateError("with h all trajectories have one t_end: give one number, or omit h (adaptive step size)")
         ends = None if t_end is None else real_array(t_end, "t_end")
+        if ends is not None and not ends.size:
+            raise StateError("t_end has no final time: give one number, or one for each trajectory")
         first = None if ends is None else float(ends.flat[0])
         planned_steps(KindOfSteps(), h, self.steps, first, *self.control, 1, hashed(t))
         if h is None or (self.inputs is None and first is None):

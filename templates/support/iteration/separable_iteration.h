@@ -535,8 +535,9 @@ static void refine_forces(const step_points *w)
           (coefficient_rests(w, g, w->drifts[i], i) + data->inverse_mass[i] * (data->square_low * sum));
     }
   solve_linear_part(&data->linear, d[0]);
-  for (int k = 0; k < GROUPS * M; k++)
-    w->X[k] += d[0][k];
+  for (int g = 0; g < GROUPS; g++)
+    for (int i = 0; i < M; i++)
+      w->X[g * M + i] += d[g][i];
   correct_forces(&data->linear, d[0], w->F);
 }
 #else
