@@ -38,6 +38,8 @@ from scvi_codegen.codegen.rendering.kernels.simd import (
 from scvi_codegen.codegen.rendering.preprocessor import included
 from scvi_codegen.codegen.rendering.source import Contents, ExampleInput, Interface, LaneContents, Sizes, Source
 from scvi_codegen.codegen.rendering.text import INPUT_PRECISION, LARGEST_VIOLATION, MAX_ITERATIONS, ROUNDING_UNITS
+from scvi_codegen.codegen.statements.printing import Layout
+from scvi_codegen.codegen.statements.steps import pair_rattle_functions, rattle_iteration, splitting_header
 
 Embedded: TypeAlias = Literal["double", "single"]
 """Precision of C source for a microcontroller."""
@@ -58,6 +60,8 @@ DECLARATIONS = {
 
 OF_THREE_WORDS = ("DRIFT", "PRODUCT", "POINT_END_POSITION", "POINT_END_MOMENTUM")
 """Tables of a separable iteration in double-double arithmetic, by their names in C."""
+LEAP = "support/iteration/leap.h"
+"""Header of the increments of an explicit step, which is generated."""
 SHOOTING = "shooting_iteration"
 """Part of an iteration that is a tenth slower, like Newton's method, if its short loops are not unrolled."""
 LARGEST_INLINED = 150
@@ -319,7 +323,8 @@ def _render_explicit(program: Program) -> Source:
     context = _context(program, DOUBLE, None)
     words = {"derivatives": 0, "of_numbers": kernels, "of_vectors": (), "functions": uses_functions(kernels)}
     sizes = {"memory": memory_in_pairs(program), "workspace": workspace_in_pairs(program)}
-    return _render(program.prefix, context | sizes | {"two_words": words})
+    headers = {LEAP: splitting_header(split, Layout(2), action=False)}
+    return _render(program.prefix, context | sizes | {"two_words": words, "own_headers": headers})
 
 
 def render_ensemble_in_pairs(program: Program, derivatives: PointDerivatives | None) -> Source | None:
@@ -361,6 +366,8 @@ def render_ensemble_in_pairs(program: Program, derivatives: PointDerivatives | N
             "functions": uses_functions(kernels),
         },
     }
+    if split is not None:
+        context["own_headers"] = {LEAP: splitting_header(split, Layout(2, lanes=True), action=False)}
     return _render(f"{program.prefix}_ensemble", context, "ensemble")
 
 
@@ -440,6 +447,11 @@ def _render(prefix: str, context: Mapping[str, object], entry: str = "stepper") 
     headers = dict(cast("Mapping[str, str]", context.get("own_headers", {})))
     if context["two_words"]:
         headers |= arithmetic_headers()
+    program = context.get("program")
+    if isinstance(program, Program) and program.rattle:
+        features = [name.lower() for name in program.rattle.macros]
+        headers["support/constraints/iterate.h"] = rattle_iteration(program.rattle.part, features)
+        headers["support/double_double/correct_points.h"] = pair_rattle_functions()
     return Source(
         prefix=prefix,
         header=environment.get_template(f"{entry}.h.jinja").render(context | {"declarations": declarations}),
@@ -492,6 +504,9 @@ CONTENTS: dict[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
 
 def _control_context(program: Program, control: Control | None) -> dict[str, object]:
     """Return the template's context for adaptive steps; the predictor tables are a separate header."""
+    if program.splitting:
+        action = program.splitting.at_rest is not None
+        return {"control": control, "own_headers": {LEAP: splitting_header(program.splitting, Layout(), action=action)}}
     name = f"support/{program.prefix}_predictor.h"
     if not (control and control.predictor and program.fixed_point):
         return {"control": control, "own_headers": {}}
@@ -514,11 +529,12 @@ def render_ensemble(
         counts: whether changes of their signs are counted instead.
         tangents: number of tangent vectors among the coordinates.
     """
-    fixed_point, split = program.fixed_point, program.splitting
+    fixed_point, split, headers = program.fixed_point, program.splitting, dict[str, str]()
     if program.quantities.integrals:
         return None
     if split is not None and not split.bodies:
         kernels, points, source = split.kernels, 1, splitting_source(split, observed)
+        headers = {LEAP: splitting_header(split, Layout(lanes=True), action=program.acts_along)}
     elif fixed_point is not None and fixed_point.serves_many:
         kernels, points = fixed_point.kernels, len(fixed_point.guess.abscissae)
         source = iteration_source(fixed_point, TRAJECTORIES, kernels=(*kernels, *((observed,) if observed else ())))
@@ -535,6 +551,7 @@ def render_ensemble(
         "needs_velocities": fixed_point is not None and fixed_point.kept is StoredValues.VELOCITIES,
         "hot": "static",
         "fixed_point": source,
+        "own_headers": headers,
     }
     return _render(prefix, context, "ensemble")
 

@@ -62,7 +62,7 @@ typedef struct {
 
 /* Inverts the masses of a group of points; not finite if they are singular. Coordinates that no masses couple share a
  * solution. */
-static inline void invert_masses(const lanes *mass, inverse_masses inverse)
+static inline void invert(const lanes *mass, inverse_masses inverse)
 {
   lanes l[M * (MASS_REACH + 1)] = {{0}}, x[M];
 #pragma GCC unroll 64
@@ -80,6 +80,16 @@ static inline void invert_masses(const lanes *mass, inverse_masses inverse)
       if (MASS_COLUMN[INVERSE_MASS_ENTRY[e][1]] == column)
         inverse[e] = x[MASS_POSITION[INVERSE_MASS_ENTRY[e][0]]];
   }
+}
+
+/* Inverts the masses of a group of points. */
+static inline void invert_masses(rattle_step *now, int g)
+{
+  lanes mass[LOWER_MASSES];
+#pragma GCC unroll 64
+  for (int e = 0; e < LOWER_MASSES; e++)
+    mass[e] = load(now->mass[e], g);
+  invert(mass, now->inverse_mass[g]);
 }
 
 /* Evaluates the last point. */
@@ -170,92 +180,7 @@ static inline void find_forces(rattle_step *now)
   IN_MEMORY(now->p);
 }
 
-/* Computes y = M^-1 r, and factors of M and P. */
-static inline void find_corrections(const step_data *step, rattle_step *now, factors *l, int factorised)
-{
-  for (int g = 0; g < GROUPS; g++) {
-    lanes derivative[CONSTRAINT_ENTRIES], mass[LOWER_MASSES], r[M], y[M];
-    if (!factorised) {
-#pragma GCC unroll 64
-      for (int e = 0; e < LOWER_MASSES; e++)
-        mass[e] = load(now->mass[e], g);
-      invert_masses(mass, now->inverse_mass[g]);
-      former_derivatives(now, g, derivative);
-      factorise_points(derivative, now->inverse_mass[g], l[g]);
-    }
-    for (int i = 0; i < M; i++) {
-      const lanes mean = times(RATTLE_MEAN, DEGREE, now->p[i], g) + load(RATTLE_MEAN_OF_LAST, g) * now->last_p[i];
-      r[i] = (now->base_p[i][g] + (step->h * times(RATTLE_IMPULSE, DEGREE, now->f[i], g) - mean)) / GROWN(now, g);
-    }
-    find_accelerations(now->inverse_mass[g], r, y);
-    for (int i = 0; i < M; i++)
-      store(now->y[i], g, y[i]);
-  }
-  IN_MEMORY(now->y);
-}
-
-/* Computes c = g + h G D y. */
-static inline void find_misfits(const step_data *step, rattle_step *now)
-{
-  for (int g = 0; g < GROUPS; g++) {
-    lanes moved[M], c[CONSTRAINTS];
-    for (int i = 0; i < M; i++)
-      moved[i] = step->h * times(RATTLE_DISPLACEMENT, DEGREE, now->y[i], g);
-    for (int k = 0; k < CONSTRAINTS; k++)
-      c[k] = load(now->g[k], g);
-#pragma GCC unroll 64
-    for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
-      c[CONSTRAINT_ENTRY[e][0]] += load(now->derivative[e], g) * moved[CONSTRAINT_ENTRY[e][1]];
-    for (int k = 0; k < CONSTRAINTS; k++)
-      store(now->c[k], g, c[k]);
-  }
-  IN_MEMORY(now->c);
-}
-
-/* Updates lambda; f is the change of the constraint forces. */
-static inline void update_multipliers(const step_data *step, rattle_step *now, factors *l)
-{
-  const real scale = 1 / (step->h * step->h);
-  for (int g = 0; g < GROUPS; g++) {
-    lanes derivative[CONSTRAINT_ENTRIES], f[M] = {{0}}, x[CONSTRAINTS];
-    for (int k = 0; k < CONSTRAINTS; k++)
-      x[CONSTRAINT_POSITION[k]] = times(RATTLE_INVERSE, DEGREE, now->c[k], g) * scale;
-    solve_points(l[g], x);
-    for (int k = 0; k < CONSTRAINTS; k++)
-      now->lambda[k][g] -= x[CONSTRAINT_POSITION[k]];
-    former_derivatives(now, g, derivative);
-#pragma GCC unroll 64
-    for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
-      f[CONSTRAINT_ENTRY[e][1]] -= GROWN(now, g) * derivative[e] * x[CONSTRAINT_POSITION[CONSTRAINT_ENTRY[e][0]]];
-    for (int i = 0; i < M; i++)
-      store(now->f[i], g, f[i]);
-  }
-  IN_MEMORY(now->f);
-}
-
-/* One iteration: updates lambda, v and u, the last by `change`. */
-static inline void iterate(const step_data *step, rattle_step *now, factors *l, int factorised, lanes *change)
-{
-  find_forces(now);
-  find_corrections(step, now, l, factorised);
-  find_misfits(step, now);
-  update_multipliers(step, now, l);
-  for (int g = 0; g < GROUPS; g++) {
-    lanes r[M], v[M];
-    for (int i = 0; i < M; i++)
-      r[i] = step->h * times(RATTLE_IMPULSE, DEGREE, now->f[i], g) / GROWN(now, g);
-    find_accelerations(now->inverse_mass[g], r, v);
-    for (int i = 0; i < M; i++)
-      store(now->v[i], g, load(now->v[i], g) + (load(now->y[i], g) + v[i]));
-  }
-  IN_MEMORY(now->v);
-  for (int i = 0; i < M; i++)
-    for (int g = 0; g < GROUPS; g++) {
-      const lanes u = now->base[i][g] + step->h * times(RATTLE_DISPLACEMENT, DEGREE, now->v[i], g);
-      change[i * GROUPS + g] = u - load(now->u[i], g);
-      store(now->u[i], g, u);
-    }
-}
+#include "iterate.h"
 
 /* Sizes of the terms of the displacements, with reactions if requested. */
 static inline void term_sizes(const step_data *step, rattle_step *now, int reactions, real *size)
@@ -327,7 +252,7 @@ static inline void finish_curve(const step_data *step, rattle_step *now, real *v
 #pragma GCC unroll 64
   for (int e = 0; e < LOWER_MASSES; e++)
     end_mass[e] = lanes_of(mass[e]);
-  invert_masses(end_mass, now->end_mass);
+  invert(end_mass, now->end_mass);
 #pragma GCC unroll 64
   for (int e = 0; e < INVERSE_MASSES; e++)
     now->end_inverse[e] = now->end_mass[e][0];

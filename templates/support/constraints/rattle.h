@@ -209,34 +209,6 @@ static inline void all_forces(const rattle_step *now, const lanes *derivative, i
     f[CONSTRAINT_ENTRY[e][1]] += derivative[e] * now->lambda[CONSTRAINT_ENTRY[e][0]][g];
 }
 
-/* Updates lambda and a of a group of points. */
-static inline void update_multipliers(const step_data *step, rattle_step *now, factors l, int factorised, int g)
-{
-  const real scale = 1 / (step->h * step->h);
-  lanes derivative[CONSTRAINT_ENTRIES], f[M], a[M], x[CONSTRAINTS];
-  former_derivatives(now, g, derivative);
-  if (!factorised)
-    factorise_points(derivative, now->inverse_mass, l);
-  all_forces(now, derivative, g, f);
-  find_accelerations(now->inverse_mass, f, a);
-  for (int i = 0; i < M; i++)
-    a[i] = a[i] - load(now->a[i], g) - OF_MOMENTA(1 / step->h, RATTLE_SHIFT_RESPONSE, now->change[i], g);
-  for (int k = 0; k < CONSTRAINTS; k++)
-    x[CONSTRAINT_POSITION[k]] = times(RATTLE_INVERSE, DEGREE, now->g[k], g) * scale;
-#pragma GCC unroll 64
-  for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
-    x[CONSTRAINT_POSITION[CONSTRAINT_ENTRY[e][0]]] += derivative[e] * a[CONSTRAINT_ENTRY[e][1]];
-  solve_points(l, x);
-  for (int k = 0; k < CONSTRAINTS; k++)
-    now->lambda[k][g] -= x[CONSTRAINT_POSITION[k]];
-#pragma GCC unroll 64
-  for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
-    f[CONSTRAINT_ENTRY[e][1]] -= derivative[e] * x[CONSTRAINT_POSITION[CONSTRAINT_ENTRY[e][0]]];
-  find_accelerations(now->inverse_mass, f, a);
-  for (int i = 0; i < M; i++)
-    store(now->a[i], g, a[i]);
-}
-
 /* Sizes of the terms of the displacements, with reactions if requested. */
 static inline void term_sizes(const step_data *step, rattle_step *now, int reactions, real *size)
 {
@@ -246,21 +218,7 @@ static inline void term_sizes(const step_data *step, rattle_step *now, int react
   find_term_sizes(step, force, now->first_derivative, reactions ? now->lambda : NULL, now->inverse_mass, size);
 }
 
-/* One iteration: updates lambda, a and u, the last by `change`. */
-static inline void iterate(const step_data *step, rattle_step *now, factors *l, int factorised, lanes *change)
-{
-  const real hh = step->h * step->h;
-  for (int g = 0; g < GROUPS; g++)
-    update_multipliers(step, now, l[g], factorised, g);
-  IN_MEMORY(now->a);
-  for (int i = 0; i < M; i++)
-    for (int g = 0; g < GROUPS; g++) {
-      const lanes moved = hh * times(RATTLE_RESPONSE, DEGREE, now->a[i], g);
-      const lanes u = now->base[i][g] + (moved - OF_MOMENTA(step->h, RATTLE_SHIFT, now->w[i], g));
-      change[i * GROUPS + g] = u - load(now->u[i], g);
-      store(now->u[i], g, u);
-    }
-}
+#include "iterate.h"
 
 /* Values at the first point, and v0. */
 static inline void begin_first(const step_data *step, rattle_step *now)

@@ -122,76 +122,19 @@ static inline void all_pair_forces(rattle_pairs *at)
   }
 }
 
-/* Computes the residuals r of the positions, and h^2 R a + h c v0. */
-static inline void find_pair_residuals(const solved_step *solved, rattle_pairs *at, real (*r)[GROUP_LANES])
+/* a = M^-1 f at a group of points. */
+static inline void vector_accelerations(const dd *inverse_mass, const ddl *f, ddl (*a)[GROUPS], int g)
 {
-  const ddl square = ddl_of(dd_multiply(at->h, at->h));
-  ddl a[M][GROUPS];
-  for (int g = 0; g < GROUPS; g++) {
-    for (int i = 0; i < M; i++)
-      a[i][g] = ddl_multiply(ddl_of(solved->inverse_mass[i]), at->f[i][g]);
-    for (int e = M; e < INVERSE_MASSES; e++) {
-      const int i = INVERSE_MASS_ENTRY[e][0], j = INVERSE_MASS_ENTRY[e][1];
-      a[i][g] = ddl_add(a[i][g], ddl_multiply(ddl_of(solved->inverse_mass[e]), at->f[j][g]));
-      a[j][g] = ddl_add(a[j][g], ddl_multiply(ddl_of(solved->inverse_mass[e]), at->f[i][g]));
-    }
+  for (int i = 0; i < M; i++)
+    a[i][g] = ddl_multiply(ddl_of(inverse_mass[i]), f[i]);
+  for (int e = M; e < INVERSE_MASSES; e++) {
+    const int i = INVERSE_MASS_ENTRY[e][0], j = INVERSE_MASS_ENTRY[e][1];
+    a[i][g] = ddl_add(a[i][g], ddl_multiply(ddl_of(inverse_mass[e]), f[j]));
+    a[j][g] = ddl_add(a[j][g], ddl_multiply(ddl_of(inverse_mass[e]), f[i]));
   }
-  for (int i = 0; i < M; i++) {
-    real high[GROUP_LANES], low[GROUP_LANES];
-    for (int g = 0; g < GROUPS; g++) {
-      store(high, g, a[i][g].high);
-      store(low, g, a[i][g].low);
-    }
-    IN_MEMORY(high);
-    IN_MEMORY(low);
-    for (int g = 0; g < GROUPS; g++) {
-      const ddl node = {load(RATTLE_DRIFT, g), load(RATTLE_DRIFT_LOW, g)};
-      const ddl curved = ddl_multiply(square, pair_times(RATTLE_RESPONSE, RATTLE_RESPONSE_LOW, high, low, g));
-      at->moved[i][g] = ddl_add(ddl_multiply(node, ddl_of(at->drift[i])), curved);
-      store(r[i], g, ddl_subtract(ddl_add(ddl_of(at->q0[i]), at->moved[i][g]), at->u[i][g]).high);
-    }
-  }
-  IN_MEMORY(*r);
 }
 
-/* Corrects the multipliers, and replaces r by the correction of the positions. */
-static inline void correct_points(const rattle_step *now, rattle_pairs *at, factors *l, real (*r)[GROUP_LANES])
-{
-  const real hh = at->h.high * at->h.high, scale = 1 / hh;
-  real g_high[CONSTRAINTS][GROUP_LANES], change[M][GROUP_LANES];
-  for (int k = 0; k < CONSTRAINTS; k++)
-    for (int g = 0; g < GROUPS; g++)
-      store(g_high[k], g, at->g[k][g].high);
-  IN_MEMORY(g_high);
-  for (int g = 0; g < GROUPS; g++) {
-    lanes derivative[CONSTRAINT_ENTRIES], x[CONSTRAINTS], f[M], a[M];
-    former_derivatives(now, g, derivative);
-    for (int i = 0; i < M; i++) {
-      a[i] = scale * times(RATTLE_INVERSE, DEGREE, r[i], g);
-      f[i] = lanes_of(0);
-    }
-    for (int k = 0; k < CONSTRAINTS; k++)
-      x[CONSTRAINT_POSITION[k]] = scale * times(RATTLE_INVERSE, DEGREE, g_high[k], g);
-    for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
-      x[CONSTRAINT_POSITION[CONSTRAINT_ENTRY[e][0]]] += derivative[e] * a[CONSTRAINT_ENTRY[e][1]];
-    solve_points(l[g], x);
-    for (int k = 0; k < CONSTRAINTS; k++)
-      at->lambda[k][g] = ddl_add(at->lambda[k][g], ddl_word(-x[CONSTRAINT_POSITION[k]]));
-    for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
-      f[CONSTRAINT_ENTRY[e][1]] -= derivative[e] * x[CONSTRAINT_POSITION[CONSTRAINT_ENTRY[e][0]]];
-    find_accelerations(now->inverse_mass, f, a);
-    for (int i = 0; i < M; i++)
-      store(change[i], g, a[i]);
-  }
-  IN_MEMORY(change);
-  for (int i = 0; i < M; i++)
-    for (int g = 0; g < GROUPS; g++) {
-      const lanes curved = hh * times(RATTLE_RESPONSE, DEGREE, change[i], g), update = load(r[i], g) + curved;
-      at->moved[i][g] = ddl_add(at->moved[i][g], ddl_word(curved));
-      at->u[i][g] = ddl_add(at->u[i][g], ddl_word(update));
-      store(r[i], g, update);
-    }
-}
+#include "correct_points.h"
 
 /* Projects the momenta p0 + dp at the end of the step, where the multipliers are nearly x. */
 static void project_end(const solved_step *solved, const step_data *step, const rattle_pairs *at, const dd *q,
@@ -264,7 +207,7 @@ static int refine_points(solved_step *solved, const step_data *step, const doubl
   rattle_pairs at;
   factors l[GROUPS];
   lanes derivative[CONSTRAINT_ENTRIES], change[M * GROUPS];
-  real r[M][GROUP_LANES], last = INFINITY;
+  real r[M][GROUP_LANES], g_high[CONSTRAINTS][GROUP_LANES], last = INFINITY;
   unknown_sizes sizes = {.widened = 0};
   dd end[M], q[M];
   find_sizes(step, &solved->now, &sizes);
@@ -277,9 +220,8 @@ static int refine_points(solved_step *solved, const step_data *step, const doubl
   }
   for (int k = 0;; k++) {
     evaluate_pairs_of_points(step->parameters, &at);
-    all_pair_forces(&at);
-    find_pair_residuals(solved, &at, r);
-    correct_points(&solved->now, &at, l, r);
+    find_pair_residuals(solved, &at, r, g_high);
+    correct_points(&solved->now, &at, l, r, g_high);
     for (int n = 0; n < M * GROUPS; n++)
       change[n] = load(r[n / GROUPS], n % GROUPS);
     real moved = measure_change(change, sizes.inverse, sizes.largest).relative;

@@ -23,37 +23,7 @@ static inline void invert_mass_pairs(double time, const number *parameters, pair
     inverse_mass[i] = OF_PAIRS(divide)(PAIR_OF(dd_of(1.0, 0.0)), inverse_mass[i]);
 }
 
-/* Computes the increments of one step. F is the last force; it is that of the first kick if `known`. */
-static inline void leap_in_pairs(const step_data *step, dd t, dd h, const pair *inverse_mass, int known, pair *F,
-    number *dq, number *dp)
-{
-  pair u[M], q[M], p[M];
-  for (int i = 0; i < M; i++)
-    q[i] = p[i] = PAIR_OF(dd_of(0.0, 0.0));
-  for (int n = 0; n < LEAPS; n++) {
-    if (KICK[n] != 0.0) {
-      const pair kick = PAIR_OF(dd_multiply(h, dd_of(KICK[n], KICK_LOW[n])));
-      if (n > 0 || !known) {
-        for (int i = 0; i < M; i++)
-          u[i] = OF_PAIRS(add)(PAIR_OF_WORDS(step->q0[i], step->carry_q[i]), q[i]);
-        force_pairs(u, dd_add(t, dd_multiply(h, dd_of(KICK_ABSCISSA[n], KICK_ABSCISSA_LOW[n]))), step->parameters, F);
-      }
-      for (int i = 0; i < M; i++)
-        p[i] = OF_PAIRS(add)(p[i], OF_PAIRS(multiply)(kick, F[i]));
-    }
-    if (DRIFT[n] != 0.0) {
-      const pair part = PAIR_OF(dd_multiply(h, dd_of(DRIFT[n], DRIFT_LOW[n])));
-      for (int i = 0; i < M; i++) {
-        const pair momentum = OF_PAIRS(add)(PAIR_OF_WORDS(step->p0[i], step->carry_p[i]), p[i]);
-        q[i] = OF_PAIRS(add)(q[i], OF_PAIRS(multiply)(part, OF_PAIRS(multiply)(inverse_mass[i], momentum)));
-      }
-    }
-  }
-  for (int i = 0; i < M; i++) {
-    dq[i] = q[i].high, dq[M + i] = q[i].low;
-    dp[i] = p[i].high, dp[M + i] = p[i].low;
-  }
-}
+#include "../iteration/leap.h"
 
 #ifdef LANES
 typedef struct {

@@ -1,0 +1,293 @@
+"""Steps as statements, and their C."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from scvi_codegen.codegen.ir.equations import Splitting
+from scvi_codegen.codegen.statements.printing import Layout, Place, PointsAsLanes, Printer, Quantity
+from scvi_codegen.codegen.statements.statements import read
+
+SPLITTING = """
+for n in LEAPS:
+    if KICK[n] != 0:
+        if n > 0 or not known:
+            u[i] = q0[i] + q[i]
+            F[i] = force(u, t + KICK_ABSCISSA[n] * h)
+            if action:
+                L = at_rest(u, t + KICK_ABSCISSA[n] * h)
+        p[i] += h * KICK[n] * F[i]
+        if action:
+            S += KICK[n] * L
+    if DRIFT[n] != 0:
+        if masses:
+            P[i] = p0[i] + p[i]
+            q[i] += h * DRIFT[n] * inverse_mass[i] * P[i]
+        else:
+            P[i] = p0[i] + p[i]
+            v[i] = velocity(P, t)
+            q[i] += h * DRIFT[n] * v[i]
+        if action:
+            S += DRIFT[n] / 2 * inverse_mass[i] * P[i] * P[i]
+        if bodies:
+            turn(P)
+"""
+"""Kicks and drifts (Hairer, Lubich & Wanner, Geometric Numerical Integration, sec. II.5), with the increments q and p
+of positions and momenta. S is the action divided by h, the sum of the Lagrangian L at rest and the kinetic energies.
+Rigid bodies are turned by the flow of their kinetic energy in the time of a drift."""
+
+TURN = """\
+for (int k = 0; k < BODIES; k++) {
+  const int first = BODY[k][0];
+  turn_body(step, first, BODY[k][2], data->bodies + k, AXES, step->h * DRIFT[n], ARGUMENT + first, dq + first,
+      dp + first);
+}
+"""
+
+
+def splitting_step(split: Splitting, layout: Layout, *, action: bool) -> list[str]:
+    """Return the lines of C that compute the increments of a step of a splitting method."""
+    features = {"masses": split.by_masses, "bodies": bool(split.bodies), "action": action}
+    words, alike = layout.words, not layout.lanes
+    pairs, time = ("_pairs", "") if words == 2 else ("", "step->")
+    arrays = {name: Quantity(name, words=words, uniform=alike) for name in ("F", "inverse_mass")}
+    increments = {x: Quantity(x if words == 2 else f"d{x}", words=words, uniform=alike) for x in "qp"}
+    states = {f"{x}0": Quantity(f"step->{x}0", Place.STATE, low=f"step->carry_{x}", uniform=alike) for x in "qp"}
+    numbers = {x: Quantity(f"{time}{x}", Place.NUMBER, words, uniform=True) for x in "th"}
+    of_run = {"L": Quantity("acted[0]", Place.NUMBER), "S": Quantity("acted[1]", Place.NUMBER)}
+    if words == 1:
+        arrays["inverse_mass"] = Quantity("data->inverse_mass", uniform=alike)
+    operations = {
+        "force": f"force{pairs}(ARGUMENT, TIME, step->parameters, TARGET);",
+        "velocity": "drift_velocity(ARGUMENT, TIME, step->parameters, TARGET);",
+        "at_rest": "at_rest(ARGUMENT, TIME, step->parameters, &TARGET);",
+        "turn": TURN.replace("AXES", "PRINCIPAL_AXES[k]" if split.principal else "NULL"),
+    }
+    printer = Printer({**arrays, **increments, **states, **numbers, **of_run}, layout, operations)
+    return printer.function_body(read(SPLITTING, [name for name, holds in features.items() if holds]))
+
+
+def splitting_header(split: Splitting, layout: Layout, *, action: bool) -> str:
+    """Return the header with the function that computes the increments of a step of a splitting method."""
+    lines = splitting_step(split, layout, action=action)
+    if layout.words == 1:
+        head = """\
+/* Computes the increments of one step. F is the last force; it is that of the first kick if `known`. Of a run that sums
+ * the action, acted[0] is L at v = 0 at the last kick, and acted[1] the action of the step divided by h. */
+SPLITTING void leap(const step_data *step, const solver_data *data, int known, number *F, number *dq, number *dp,
+    number *acted)
+{
+"""
+        first = ["memset(dq, 0, sizeof(number) * M);", "memset(dp, 0, sizeof(number) * M);"]
+        first += ["acted[1] = 0;"] if action else ["(void)acted;"]
+        first += [] if split.by_masses or split.bodies else ["(void)data;"]
+        last: list[str] = []
+    else:
+        kind, zero = layout.number, f"{layout.number}_word({'lanes_of(0.0)' if layout.lanes else '0.0'})"
+        head = f"""\
+/* Computes the increments of one step in pairs. F is the last force; it is that of the first kick if `known`. */
+static inline void leap_in_pairs(const step_data *step, dd t, dd h, const {kind} *inverse_mass, int known, {kind} *F,
+    number *dq, number *dp)
+{{
+"""
+        first = [f"{kind} q[M], p[M];", "for (int i = 0; i < M; i++)", f"  q[i] = p[i] = {zero};"]
+        words = [f"  d{x}[i] = {x}[i].high, d{x}[M + i] = {x}[i].low;" for x in "qp"]
+        last = ["for (int i = 0; i < M; i++) {", *words, "}"]
+    return head + "".join(f"  {line}\n" for line in (*first, *lines, *last)) + "}\n"
+
+
+RATTLE = """
+G[e] = former(derivative[e])
+factorise(G)
+if velocity_forces:
+    f[i] = force[i]
+else:
+    f[i] = former(force[i])
+f[col(e)] += G[e] * lam[row(e)]
+d[i] = mass(f[i])
+if momentum_terms:
+    d[i] = d[i] - a[i] - rate * (RATTLE_SHIFT_RESPONSE @ turned[i])
+else:
+    d[i] = d[i] - a[i]
+x[pos(k)] = (RATTLE_INVERSE @ g[k]) * scale
+x[pos(row(e))] += G[e] * d[col(e)]
+x[k] = solve(x[k])
+lam[k] -= x[pos(k)]
+f[col(e)] -= G[e] * x[pos(row(e))]
+a[i] = mass(f[i])
+moved[i] = hh * (RATTLE_RESPONSE @ a[i])
+if momentum_terms:
+    v[i] = base[i] + (moved[i] - h * (RATTLE_SHIFT @ w[i]))
+else:
+    v[i] = base[i] + moved[i]
+change[i] = v[i] - u[i]
+u[i] = v[i]
+"""
+"""Iteration for the multipliers of a constrained step with constant masses (RATTLE for two points; L. Jay, SIAM J.
+Numer. Anal. 33, 1996): P x = G (a_new - a) + R^-1 g / h^2, lambda -= x, with P = G M^-1 G^T; then
+u = q0 + h c v0 + h^2 R a."""
+
+COUPLED_RATTLE = """
+G[e] = former(derivative[e])
+f[i] = force[i]
+f[col(e)] += (GROWN * G[e]) * lam[row(e)]
+invert(masses)
+factorise(G)
+mean[i] = (RATTLE_MEAN @ p[i]) + RATTLE_MEAN_OF_LAST * last_p[i]
+r[i] = (base_p[i] + (h * (RATTLE_IMPULSE @ f[i]) - mean[i])) / GROWN
+y[i] = mass(r[i])
+moved[i] = h * (RATTLE_DISPLACEMENT @ y[i])
+c[k] = g[k]
+c[row(e)] += derivative[e] * moved[col(e)]
+x[pos(k)] = (RATTLE_INVERSE @ c[k]) * scale
+x[k] = solve(x[k])
+lam[k] -= x[pos(k)]
+H[e] = former(derivative[e])
+s[i] = zero
+s[col(e)] -= (GROWN * H[e]) * x[pos(row(e))]
+w[i] = h * (RATTLE_IMPULSE @ s[i]) / GROWN
+d[i] = mass(w[i])
+v[i] = v[i] + (y[i] + d[i])
+m[i] = base[i] + h * (RATTLE_DISPLACEMENT @ v[i])
+change[i] = m[i] - u[i]
+u[i] = m[i]
+"""
+"""The same for masses that depend on positions: y = M^-1 r with the residual r of the momenta,
+P x = (D I)^-1 (g + h G D y) / h^2, v += y - h M^-1 I G^T x."""
+
+PAIR_RESIDUALS = """
+f[i] = former(force[i])
+f[col(e)] += former(derivative[e]) * lam[row(e)]
+a[i] = mass(f[i])
+moved[i] = RATTLE_DRIFT * drift[i] + square * (RATTLE_RESPONSE @ a[i])
+r[i] = word((q0[i] + moved[i]) - u[i])
+gh[k] = word(g[k])
+"""
+PAIR_CORRECTIONS = """
+G[e] = former(derivative[e])
+y[i] = scale * (RATTLE_INVERSE @ r[i])
+x[pos(k)] = scale * (RATTLE_INVERSE @ gh[k])
+x[pos(row(e))] += G[e] * y[col(e)]
+x[k] = solve(x[k])
+lam[k] += -x[pos(k)]
+s[i] = zero
+s[col(e)] -= G[e] * x[pos(row(e))]
+d[i] = mass(s[i])
+curved[i] = hh * (RATTLE_RESPONSE @ d[i])
+moved[i] += curved[i]
+r[i] = r[i] + curved[i]
+u[i] += r[i]
+"""
+"""Residuals in two words of the solution in one, and its correction by the same iteration in one word."""
+
+
+def _number(text: str, words: int = 1) -> Quantity:
+    return Quantity(text, Place.NUMBER, words, uniform=True)
+
+
+OF_POINTS = {
+    "mass": "find_accelerations(now->inverse_mass, ARGUMENT, TARGET);",
+    "solve": "solve_points(l[g], ARGUMENT);",
+    "factorise": "if (!factorised)\n  factorise_points(ARGUMENT, now->inverse_mass, l[g]);",
+    "invert": "if (!factorised)\n  invert_masses(now, g);",
+}
+VARYING_MASS = {name: text.replace("inverse_mass", "inverse_mass[g]") for name, text in OF_POINTS.items()}
+VECTOR_MASS = {"mass": "vector_accelerations(solved->inverse_mass, ARGUMENT, TARGET, g);"}
+
+
+def _of_constraints() -> dict[str, Quantity]:
+    """Return the quantities of an iteration of a constrained step, which the headers declare."""
+    memory = {name: Quantity(f"now->{name}", Place.MEMORY) for name in "auwvyf"}
+    return memory | {
+        "derivative": Quantity("now->derivative", Place.MEMORY, first="now->first_derivative", index="e"),
+        "force": Quantity("now->force", Place.MEMORY, first="now->first_force"),
+        "turned": Quantity("now->change", Place.MEMORY),
+        "g": Quantity("now->g", Place.MEMORY, index="k"),
+        "lam": Quantity("now->lambda", Place.GROUPS, index="k"),
+        "base": Quantity("now->base", Place.GROUPS),
+        "change": Quantity("change", Place.FLAT),
+        "zero": Quantity("lanes_of(0)", Place.NUMBER),
+        "h": _number("step->h"),
+        "hh": _number("(step->h * step->h)"),
+        "rate": _number("(1 / step->h)"),
+        "scale": _number("scale"),
+    }
+
+
+def rattle_iteration(part: str, features: Sequence[str]) -> str:
+    """Return the function of an iteration of a constrained step; ``part`` is the header that it belongs to."""
+    quantities, layout = _of_constraints(), PointsAsLanes()
+    if part == "rattle":
+        own = {name: quantities[name] for name in quantities if name not in ("v", "y", "f")}
+        lines = Printer(own, layout, OF_POINTS).function_of_points(read(RATTLE, features))
+    else:
+        own = {name: each for name, each in quantities.items() if name not in ("w",)} | {
+            "p": Quantity("now->p", Place.MEMORY),
+            "s": Quantity("now->f", Place.MEMORY),
+            "c": Quantity("now->c", Place.MEMORY, index="k"),
+            "masses": Quantity("now->mass", Place.MEMORY, index="e"),
+            "last_p": Quantity("now->last_p", uniform=True),
+            "base_p": Quantity("now->base_p", Place.GROUPS),
+            "GROWN": Quantity("GROWN(now, g)", Place.NUMBER),
+            "RATTLE_MEAN_OF_LAST": Quantity("RATTLE_MEAN_OF_LAST", Place.TABLE),
+        }
+        lines = Printer(own, layout, VARYING_MASS).function_of_points(read(COUPLED_RATTLE))
+    head = """\
+/* One iteration: updates the multipliers, accelerations or velocities, and positions, the last by `change`. */
+static inline void iterate(const step_data *step, rattle_step *now, factors *l, int factorised, lanes *change)
+{
+  const real scale = 1 / (step->h * step->h);
+"""
+    return head + _indented(lines) + "}\n"
+
+
+def pair_rattle_functions() -> str:
+    """Return the functions of the correction in two words of the solution of a constrained step."""
+    pairs = {
+        "derivative": Quantity("at->derivative", Place.MEMORY, 2, first="at->first_derivative", index="e"),
+        "force": Quantity("at->force", Place.MEMORY, 2, first="at->first_force"),
+        "lam": Quantity("at->lambda", Place.GROUPS, 2, index="k"),
+        "drift": Quantity("at->drift", words=2, uniform=True),
+        "square": _number("square", 2),
+        "q0": Quantity("at->q0", words=2, uniform=True),
+        "u": Quantity("at->u", Place.GROUPS, 2),
+        "g": Quantity("at->g", Place.GROUPS, 2, index="k"),
+        "moved": Quantity("at->moved", Place.GROUPS, 2),
+        "RATTLE_DRIFT": Quantity("RATTLE_DRIFT", Place.TABLE, 2),
+        "r": Quantity("r", Place.MEMORY),
+        "gh": Quantity("g_high", Place.MEMORY, index="k"),
+    }
+    residuals = Printer(pairs, PointsAsLanes(2), VECTOR_MASS).function_of_points(read(PAIR_RESIDUALS))
+    words = _of_constraints()
+    own = {name: words[name] for name in ("derivative", "scale", "hh", "zero")}
+    own |= {name: pairs[name] for name in ("r", "gh", "lam", "moved", "u")}
+    corrections = Printer(own, PointsAsLanes(2), OF_POINTS).function_of_points(read(PAIR_CORRECTIONS))
+    memory = "real (*r)[GROUP_LANES], real (*g_high)[GROUP_LANES]"
+    return (
+        f"""\
+/* Residuals r of the positions and g of the constraints, and h^2 R a + h c v0. */
+static inline void find_pair_residuals(const solved_step *solved, rattle_pairs *at, {memory})
+{{
+  const dd square = dd_multiply(at->h, at->h);
+"""
+        + _indented(residuals)
+        + f"""\
+  IN_MEMORY(*r);
+  IN_MEMORY(*g_high);
+}}
+
+/* Corrects the multipliers, and replaces r by the correction of the positions. */
+static inline void correct_points(const rattle_step *now, rattle_pairs *at, factors *l, {memory})
+{{
+  const int factorised = 1;
+  const real hh = at->h.high * at->h.high, scale = 1 / hh;
+  (void)factorised;
+"""
+        + _indented([line.replace("(step->h * step->h)", "hh") for line in corrections])
+        + "}\n"
+    )
+
+
+def _indented(lines: Iterable[str]) -> str:
+    """Return the lines of a function; directives are not indented."""
+    return "".join(f"{line.lstrip()}\n" if line.lstrip().startswith("#") else f"  {line}\n" for line in lines)
