@@ -43,6 +43,18 @@ static SELDOM int fall_back(int status, const step_data *step, double *dq, doubl
 
 typedef iteration_data solver_data;
 
+/* Returns 1 if 1 / m is finite: without a mass, the equations that Newton's method would solve have no motion in them. */
+static int has_masses(const solver_data *data)
+{
+#ifdef SUPPORT_SEPARABLE_ITERATION_H
+  for (int i = 0; i < M; i++)
+    if (!(fabs(data->inverse_mass[i]) < INFINITY))
+      return 0;
+#endif
+  (void)data;
+  return 1;
+}
+
 static void prepare(const step_data *step, solver_data *data)
 {
   prepare_iteration(step, data);
@@ -56,6 +68,8 @@ static __attribute__((noinline)) int solve_afresh(const step_data *step, const s
   int status = NOT_CONVERGED;
   if (!is_suspended(*guess))
     status = fixed_point(step, data, memory, &steps, dq, dp, options, report);
+  if (status != OK && !has_masses(data))
+    return SINGULAR;
   if (status != OK) {
     status = fall_back(status, step, dq, dp, options, report, workspace, &(error_measure){ALL, DECAY});
     if (status == OK && !reaches(step, dq, dp))
