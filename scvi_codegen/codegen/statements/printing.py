@@ -20,7 +20,8 @@ from scvi_codegen.codegen.statements.schedule import (
     reads,
     target_name,
 )
-from scvi_codegen.codegen.statements.statements import (
+from scvi_codegen.common.errors import MethodError
+from scvi_codegen.methods.statements import (
     COUNTS,
     Apply,
     Assign,
@@ -36,7 +37,6 @@ from scvi_codegen.codegen.statements.statements import (
     Statement,
     When,
 )
-from scvi_codegen.common.errors import MethodError
 
 
 class Place(Enum):

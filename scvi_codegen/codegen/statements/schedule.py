@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 
-from scvi_codegen.codegen.statements.statements import (
+from scvi_codegen.methods.statements import (
     Apply,
     Assign,
     At,

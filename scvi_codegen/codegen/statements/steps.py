@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 
 from scvi_codegen.codegen.ir.equations import Splitting
 from scvi_codegen.codegen.statements.printing import Layout, Place, PointsAsLanes, Printer, Quantity
-from scvi_codegen.codegen.statements.statements import read
+from scvi_codegen.methods.statements import read
 
 SPLITTING = """
 for n in LEAPS:
