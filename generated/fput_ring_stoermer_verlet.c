@@ -20,7 +20,7 @@ enum {
   TABLES = 0,
   FIELDS = 0,
   SCALARS = 1, /* parameters before the fields */
-  WORK = 4, /* numbers per coordinate for steps */
+  WORK = 7, /* numbers per coordinate for steps */
   CONTINUED = 0 /* whether predictors are extrapolated, else forces are used again */
 };
 
@@ -128,6 +128,14 @@ static void state_energies(const problem *arrays, double t, const double *q, con
 typedef double lanes, times; /* one point at a time */
 enum { CHUNK = 512 }; /* values computed before any is added */
 
+static inline void describe_coordinate_arrays(const problem *arrays, coordinate_array *all)
+{
+  const long long size_N = arrays->size[0];
+  (void)arrays;
+  long long end = 0;
+  end = append_array(&all[0], end, size_N, 1);
+}
+
 /* sum(i in N periodic, -beta*(q[i+1] - q[i])**4/4 - (q[i+1] - q[i])**2/2) */
 static void add_force_0(const problem *arrays, const lanes *restrict X, times t, double by, lanes *restrict F,
     const window *here)
@@ -188,8 +196,40 @@ static const double KICK[2] = {0.5, 0.5};
 static const double DRIFT[2] = {1.0, 0.0};
 static const double KICK_ABSCISSA[2] = {0.0, 1.0};
 #define NO_ERROR_ESTIMATE
+#define TOGETHER 32 /* steps that are checked at once */
+
+#define ROWS
+enum { REACH = 1, CHUNKED_ROWS = 1, BEFORE_CHUNKS = 0 };
+#define share_rows share_force_0
+
+static long long rows_of(const problem *arrays)
+{
+  const long long size_N = arrays->size[0];
+  (void)arrays;
+  return size_N;
+}
 
 #include "support/arrays/array_splitting.h"
+
+static void prepare_rows(const sweep *of, section rows)
+{
+  window here;
+  (void)of, (void)rows, (void)here;
+}
+
+static void add_rows(const sweep *of, section rows)
+{
+  window here;
+  (void)of, (void)rows, (void)here;
+  here = window_of_rows(share_force_0(of->run, of->arrays, of->work->n), rows);
+  add_force_0(of->arrays, of->X, of->t, of->by, of->F, &here);
+}
+
+static void complete_rows(const sweep *of, section rows)
+{
+  window here;
+  (void)of, (void)rows, (void)here;
+}
 
 /* Returns 1 if there is enough work for more than one thread. */
 static inline int is_worth_sharing(const run_memory *run, const problem *arrays)

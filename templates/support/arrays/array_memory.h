@@ -197,6 +197,15 @@ const problem *NAME(data_at)(const double *parameters, double *workspace)
   return use_parameters(run, parameters) == OK ? &run->data : NULL;
 }
 
+/* Advances time and counters by a step that took `iterations`. */
+static void count_step(run_memory *run, solver_report *report, long long iterations)
+{
+  add_compensated(&run->t, &run->t_low, run->h, 0.0);
+  run->iterations += iterations;
+  run->step++;
+  report->steps++;
+}
+
 void NAME(start)(run_memory *run, double t, double h, const double *q, const double *p)
 {
   const size_t size = sizeof(double) * (size_t)coordinates_of(&run->data), head = offsetof(run_memory, t);

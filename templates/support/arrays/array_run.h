@@ -72,7 +72,8 @@ static int run_workers(run_memory *run, const job *way, solver_report *report)
 }
 #endif
 
-/* Runs of array systems. Requires: array_memory.h, bind_work_arrays, perform_step of a solver, ERROR_POWER; with
+/* Runs of array systems. Requires: array_memory.h, bind_work_arrays, perform_step of a solver, or perform_steps and
+ * TOGETHER, ERROR_POWER; with
  * CONSTRAINTS_OF_ARRAYS project_run. */
 
 /* Stores the state after a step if its number is a multiple of `every`, and at the end of an adaptive run; each thread
@@ -94,20 +95,33 @@ static void store_state(run_memory *run, const job *way, solver_report *report, 
   report->stored++;
 }
 
+#ifndef TOGETHER
+/* Performs `most` steps one by one. */
+static int perform_steps(run_memory *run, const problem *arrays, const work_arrays *work, const solver_options *options,
+    solver_report *report, long long most)
+{
+  for (long long k = 0; k < most; k++) {
+    const long long before = report->iterations;
+    int status;
+    report->t = run->t;
+    status = perform_step(run, arrays, work, options, report);
+    if (status != OK)
+      return status;
+    count_step(run, report, report->iterations - before);
+  }
+  return OK;
+}
+#endif
+
 static int take_steps(run_memory *run, const job *way, solver_report *report)
 {
   const work_arrays work = bind_work_arrays(run, coordinates_of(way->arrays));
   while (report->steps < way->steps) {
-    const long long before = report->iterations;
-    int status;
-    report->t = run->t;
-    status = perform_step(run, way->arrays, &work, way->options, report);
+    const long long left = way->steps - report->steps;
+    const long long next = way->every ? way->every - run->step % way->every : left;
+    const int status = perform_steps(run, way->arrays, &work, way->options, report, next < left ? next : left);
     if (status != OK)
       return status;
-    add_compensated(&run->t, &run->t_low, run->h, 0.0);
-    run->iterations += report->iterations - before;
-    run->step++;
-    report->steps++;
     store_state(run, way, report, work.n, 0);
   }
   return OK;

@@ -1,94 +1,227 @@
 #include "../core/step.h"
+#include "array_memory.h"
 #include "arrays.h"
 
-/* Splitting step of an array system, with the equations of splitting.h. Forces are added to the increments of the
- * momenta term by term, without an array of their own: a pass less over memory. Requires: arrays.h, add_forces, LEAPS,
- * CHUNK, the tables. */
+/* Splitting steps of an array system, with the equations of splitting.h, in few passes over memory. A pass adds the
+ * forces of a kick and continues the coordinates behind them to the positions of the next kick, also into the next
+ * step. Within a step the increments are in the memory of the compensation terms. Infinite and undefined numbers remain
+ * in a state, so that many steps are checked at once; if one fails, they are repeated one by one. Requires: arrays.h,
+ * add_forces, LEAPS, TOGETHER, the tables; with ROWS array_rows.h. */
 
-/* Workspace: positions of the next kick, forces at the end of a step, increments of positions and momenta. */
+/* Workspace: positions of the next kick, forces at the end of a step; the state before steps that are checked. */
 typedef struct {
   long long n; /* coordinates */
-  double *X, *F, *dq, *dp;
+  double *X, *F, *before;
+  int equal_masses;
 } work_arrays;
+
+enum { SECTION = 512 }; /* coordinates that stay in the first cache */
 
 static work_arrays bind_work_arrays(const run_memory *run, long long n)
 {
   double *work = run->work;
-  const work_arrays of = {n, work, work + n, work + 2 * n, work + 3 * n};
+  work_arrays of = {n, work, work + n, work + 2 * n, 0};
+  for (long long i = 0; i < n; i++)
+    of.equal_masses |= run->inverse_mass[i] != run->inverse_mass[0];
+  of.equal_masses = !of.equal_masses;
   return of;
 }
 
-/* Adds a drift to the increments; X are the positions afterwards. */
-static void drift_by(double by, const double *restrict inverse_mass, const double *restrict p,
-    const double *restrict dp, const double *restrict q, double *restrict dq, double *restrict X, section own)
+/* What follows the forces of a kick: a step ends, one starts, a drift, the last one of its step. */
+typedef struct {
+  int ends, starts, moves, arrives;
+  double end, start, drift; /* factors of the forces in these steps, and of the velocity */
+} continuation;
+
+/* Returns 1 if the last kick is at the end of a step: its forces are those of the first kick of the next step. */
+static inline int ends_with_a_kick(void)
 {
-  for (long long i = own.first; i < own.end; i++) {
-    dq[i] += by * (inverse_mass[i] * (p[i] + dp[i]));
-    X[i] = q[i] + dq[i];
+  return KICK[0] != 0.0 && KICK[LEAPS - 1] != 0.0 && DRIFT[LEAPS - 1] == 0.0;
+}
+
+/* Rounded sum of x and its increment, which becomes the rounding error (two-sum; Knuth, TAOCP vol. 2, sec. 4.2.2). */
+static inline void add_increment(double *x, double *increment)
+{
+  const double sum = *x + *increment, part = sum - *x;
+  *increment = (*x - (sum - part)) + (*increment - part);
+  *x = sum;
+}
+
+/* Continues `count` coordinates. Forces that were used in both steps become 0 for the next ones. */
+static inline __attribute__((always_inline)) void continue_coordinates(double *restrict q, double *restrict p,
+    double *restrict dq, double *restrict dp, double *restrict X, double *restrict F,
+    const double *restrict inverse_mass, long long count, continuation by)
+{
+  for (long long i = 0; i < count; i++) {
+    double at = q[i], moving = p[i], more_q = dq[i], more_p = dp[i];
+    if (by.ends) {
+      if (ends_with_a_kick())
+        more_p += by.end * F[i];
+      add_increment(&moving, &more_p);
+      p[i] = moving;
+    }
+    if (by.starts) {
+      more_p += by.start * F[i];
+      F[i] = 0.0;
+    }
+    if (by.ends || by.starts)
+      dp[i] = more_p;
+    if (by.moves) {
+      more_q += by.drift * (inverse_mass[i] * (moving + more_p));
+      if (by.arrives) {
+        add_increment(&at, &more_q);
+        q[i] = at;
+      } else
+        X[i] = at + more_q;
+      dq[i] = more_q;
+    }
   }
 }
 
-static int all_sums_finite(const run_memory *run, const work_arrays *work)
+/* Continues the coordinates of a section; the flags are constants of each loop. */
+static void continue_section(const run_memory *run, const work_arrays *work, section here, const continuation *by)
+{
+  for (long long first = here.first, count; first < here.end; first += count) {
+    const double *masses = run->inverse_mass + (work->equal_masses ? 0 : first);
+    count = here.end - first < SECTION ? here.end - first : SECTION;
+#define CONTINUE(ends, starts, moves, arrives)                                                                      \
+  continue_coordinates(run->q + first, run->p + first, run->carry_q + first, run->carry_p + first, work->X + first, \
+      work->F + first, masses, count, (continuation){ends, starts, moves, arrives, by->end, by->start, by->drift})
+    if (LEAPS > 2 && by->moves && !by->arrives) {
+      if (by->ends)
+        CONTINUE(1, 1, 1, 0);
+      else if (by->starts)
+        CONTINUE(0, 1, 1, 0);
+      else
+        CONTINUE(0, 0, 1, 0);
+    } else if (by->ends && by->starts)
+      CONTINUE(1, 1, 1, 1);
+    else if (by->ends && by->moves)
+      CONTINUE(1, 0, 1, 1);
+    else if (by->ends)
+      CONTINUE(1, 0, 0, 0);
+    else if (by->starts)
+      CONTINUE(0, 1, 1, 1);
+    else
+      CONTINUE(0, 0, 1, 1);
+#undef CONTINUE
+  }
+}
+
+static void continue_own(const run_memory *run, const work_arrays *work, continuation by)
+{
+  continue_section(run, work, mine(run, work->n), &by);
+}
+
+#ifdef ROWS
+#include "array_rows.h"
+#endif
+
+/* Adds `by` times the forces at X to F, and continues all coordinates. */
+static void kick(const run_memory *run, const problem *arrays, const work_arrays *work, const double *X, double t,
+    double by, double *F, continuation then)
+{
+#ifdef ROWS
+  if (kick_by_rows(run, arrays, work, X, t, by, F, &then))
+    return;
+#endif
+  add_forces(run, arrays, X, t, by, F);
+  continue_own(run, work, then);
+}
+
+/* The first drift of a step, with the first kick if its forces are known. */
+static continuation starting(double h, int ends, int starts)
+{
+  const continuation by = {.ends = ends,
+      .starts = starts,
+      .moves = 1,
+      .arrives = LEAPS == 2 && ends_with_a_kick(),
+      .end = h * KICK[LEAPS - 1],
+      .start = h * KICK[0],
+      .drift = h * DRIFT[0]};
+  return by;
+}
+
+/* Performs a step; `continues` from a former one, and into a next one. */
+static void take_step(run_memory *run, const problem *arrays, const work_arrays *work, int continues, int into_next)
+{
+  const double h = run->h;
+  const int last = LEAPS - 1, kicks_end = ends_with_a_kick();
+  if (!continues && (run->guess || !kicks_end))
+    continue_own(run, work, starting(h, 0, kicks_end));
+  else if (!continues)
+    kick(run, arrays, work, run->q, run->t, h * KICK[0], run->carry_p, starting(h, 0, 0));
+  for (int k = 1; k < last + !kicks_end; k++) {
+    const continuation then = {.ends = k == last, .moves = 1, .arrives = k == last - kicks_end, .drift = h * DRIFT[k]};
+    kick(run, arrays, work, work->X, run->t + KICK_ABSCISSA[k] * h, h * KICK[k], run->carry_p, then);
+  }
+  if (kicks_end) {
+    const continuation then = into_next ? starting(h, 1, 1) : (continuation){.ends = 1, .end = h * KICK[last]};
+    kick(run, arrays, work, run->q, run->t + KICK_ABSCISSA[last] * h, 1.0, work->F, then);
+  }
+  run->guess = kicks_end;
+}
+
+/* Copies this thread's part of the state and of the forces at its end, or copies it back. */
+static void copy_state(const run_memory *run, const work_arrays *work, int back)
+{
+  double *const now[] = {run->q, run->p, run->carry_q, run->carry_p, work->F};
+  const section own = mine(run, work->n);
+  for (int k = 0; k < (int)(sizeof now / sizeof *now); k++) {
+    double *here = now[k] + own.first, *saved = work->before + k * work->n + own.first;
+    memcpy(back ? here : saved, back ? saved : here, sizeof(double) * (size_t)(own.end - own.first));
+  }
+}
+
+static int is_state_finite(const run_memory *run, long long n)
 {
   sums all;
-  begin_sums(&all, run, work->n);
+  wait_at_barrier(run);
+  begin_sums(&all, run, n);
   while (next_block(&all)) {
     int faults = 0;
-    for (long long i = all.here.first; i < all.here.end; i++) {
-      faults |= !is_finite(run->q[i] + work->dq[i]);
-      faults |= !is_finite(run->p[i] + work->dp[i]);
-    }
+    for (long long i = all.here.first; i < all.here.end; i++)
+      faults |= !is_finite(run->q[i]) | !is_finite(run->p[i]);
     add_block(&all, faults, 0.0);
   }
   wait_at_barrier(run);
   return sum_of(&all, 0) == 0.0;
 }
 
-/* Returns 1 if the last kick is at the end of a step: its forces are those of the first kick of the next step. */
-static int ends_with_a_kick(void)
+/* Performs up to `most` steps; after a failure the state is that before the step that failed. */
+static int perform_steps(run_memory *run, const problem *arrays, const work_arrays *work, const solver_options *options,
+    solver_report *report, long long most)
 {
-  return KICK[0] != 0.0 && KICK[LEAPS - 1] != 0.0 && DRIFT[LEAPS - 1] == 0.0;
-}
-
-/* Kicks the momenta of this thread; stores forces that the next step can reuse. */
-static void kick_by(const run_memory *run, const problem *arrays, const work_arrays *work, int k, section own)
-{
-  const double by = run->h * KICK[k], t = run->t + KICK_ABSCISSA[k] * run->h;
-  const long long size = own.end - own.first;
-  if (k == 0 && run->guess)
-    add_to(work->dp + own.first, work->F + own.first, by, size);
-  else if (k == LEAPS - 1 && ends_with_a_kick()) {
-    memset(work->F + own.first, 0, sizeof(double) * (size_t)size);
-    add_forces(run, arrays, work->X, t, 1.0, work->F);
-    add_to(work->dp + own.first, work->F + own.first, by, size);
-  } else
-    add_forces(run, arrays, work->X, t, by, work->dp);
-}
-
-/* Performs a step. The increments start with the compensation terms of the state. */
-static int perform_step(run_memory *run, const problem *arrays, const work_arrays *work, const solver_options *options,
-    solver_report *report)
-{
-  const section own = mine(run, work->n);
-  const size_t size = (size_t)(own.end - own.first);
+  long long together = TOGETHER;
   (void)options;
-  memcpy(work->dq + own.first, run->carry_q + own.first, sizeof(double) * size);
-  memcpy(work->dp + own.first, run->carry_p + own.first, sizeof(double) * size);
-  drift_by(0.0, run->inverse_mass, run->p, work->dp, run->q, work->dq, work->X, own);
-  for (int k = 0; k < LEAPS; k++) {
-    if (KICK[k] != 0.0)
-      kick_by(run, arrays, work, k, own);
-    if (DRIFT[k] != 0.0)
-      drift_by(run->h * DRIFT[k], run->inverse_mass, run->p, work->dp, run->q, work->dq, work->X, own);
-  }
-  report->iterations++;
   run->error = NAN;
-  if (!all_sums_finite(run, work)) {
-    run->guess = 0; /* the stored forces belong to no accepted state */
-    return NOT_FINITE;
+  while (most > 0) {
+    const run_memory before = *run;
+    const solver_report report_before = *report;
+    const long long count = most < together ? most : together;
+    const section own = mine(run, work->n);
+    if (!run->guess)
+      memset(work->F + own.first, 0, sizeof(double) * (size_t)(own.end - own.first));
+    copy_state(run, work, 0);
+    for (long long k = 0; k < count; k++) {
+      report->t = run->t;
+      take_step(run, arrays, work, k > 0 && ends_with_a_kick(), k + 1 < count);
+      report->iterations++;
+      count_step(run, report, 1);
+    }
+    if (is_state_finite(run, work->n)) {
+      most -= count;
+      continue;
+    }
+    copy_state(run, work, 1);
+    *run = before, *report = report_before;
+    if (count == 1) {
+      report->t = run->t;
+      report->iterations++;
+      run->guess = 0; /* the stored forces belong to no accepted state */
+      return NOT_FINITE;
+    }
+    together = 1;
   }
-  add_all(run->q + own.first, work->dq + own.first, run->carry_q + own.first, (long long)size);
-  add_all(run->p + own.first, work->dp + own.first, run->carry_p + own.first, (long long)size);
-  run->guess = ends_with_a_kick();
   return OK;
 }

@@ -24,14 +24,15 @@ from scvi_codegen.codegen.rendering.kernels.loop_nests import (
     size_text,
 )
 from scvi_codegen.codegen.rendering.kernels.printer import DOUBLE, inverse_roots
+from scvi_codegen.codegen.rendering.kernels.rows import rows_text
 from scvi_codegen.codegen.rendering.kernels.simd import POINTS, iteration_source, loop_functions
 from scvi_codegen.systems.formulas.indices import MOST_THREADS, Array, Convolution, couples_elements
 
-EXPLICIT_VECTORS, CONSTRAINED_VECTORS, ITERATION_VECTORS = 4, 7, 4
+EXPLICIT_VECTORS, CONSTRAINED_VECTORS, ITERATION_VECTORS = 7, 7, 4
 """Number of vectors in ``work``.
 
-Positions, forces, increments; with constraints also constraint forces and trial increments; for iterations positions
-at the points, forces in this step and in two former ones.
+Positions, forces, and a former state with its forces; with constraints positions, forces, increments, constraint forces
+and trial increments; for iterations positions at the points, forces in this step and in two former ones.
 """
 NEWTON_VECTORS = 4 + 17
 """Further vectors: residual, correction, products, and the basis of GMRES (templates/support/arrays/newton_gmres.h)."""
@@ -93,6 +94,7 @@ def loop_context(program: ArrayProgram) -> dict[str, Any]:
         ),
         "maps": describing_function(layout, "maps", "momentum_map", [*_map_texts(program)]),
         "hot": "static",
+        "rows": rows_text(program.layout, loops.forces) if program.splitting and not (pairs or sums) else None,
         "waves": _lattice_context(program) if _on_lattices(program) else None,
         "arrays": function_of_sizes(
             layout,
