@@ -94,8 +94,8 @@ static void sweep_odd(const sweep *of, long long block)
 }
 
 /* Adds `by` times the forces at X to F, and continues all coordinates; returns 0 if there are too few rows. */
-static int kick_by_rows(const run_memory *run, const problem *arrays, const work_arrays *work, const double *X, double t,
-    double by, double *F, const continuation *then)
+static int kick_by_rows(const run_memory *run, const problem *arrays, const work_arrays *work, const double *X,
+    double t, double by, double *F, const continuation *then)
 {
   sweep of = {run, arrays, work, X, t, by, F, then, share_rows(run, arrays, work->n), rows_of(arrays)};
   const long long blocks = of.how.blocks;
