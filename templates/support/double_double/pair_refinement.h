@@ -1,13 +1,11 @@
 #include "mixed_newton.h"
-#ifdef RATTLE_IN_PAIRS
-#include "pair_rattle.h"
-#elif defined(MIXED_VELOCITIES)
+#ifdef MIXED_VELOCITIES
 #include "../newton/newton_from_line.h"
 #include "mixed_velocities.h"
 #endif
 
 /* Increments of a step in two words: by RATTLE or by the fixed-point iteration if that solved it in double, else by
- * Newton's method. */
+ * Newton's method. Requires: pair_rattle.h if RATTLE_IN_PAIRS is defined. */
 
 /* Replaces the increments of a step, solved in double, by those in two words. On failure they are undefined. */
 static int refine_increments(const step_data *step, double *memory, double t_low, double h_low, double *dq, double *dp,
