@@ -240,7 +240,7 @@ class Mesh:
         oscillator = one_coordinate(cast(Any, self.field_system))
         program = program_of(oscillator, as_method(method, oscillator))
         if program.splitting:
-            phase = _stability_limit(program.splitting.kicks, program.splitting.drifts)
+            phase = _stability_limit(*(program.splitting.numbers[name] for name in ("KICK", "DRIFT")))
         else:
             phase = 1 + CONTRACTION * program.fixed_point.points if program.fixed_point else np.inf
         frequency = self.highest_frequency(**parameters)

@@ -12,6 +12,7 @@ of Suzuki, Phys. Lett. A 146 (1990), Kahan & Li, Math. Comp. 66 (1997), and Sofr
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, ClassVar
 
 from scvi_codegen.common.errors import MethodError
@@ -19,6 +20,7 @@ from scvi_codegen.common.precision import Vector, mp
 from scvi_codegen.common.representation import counted, summary
 from scvi_codegen.common.toml_text import package_table
 from scvi_codegen.common.validation import checked_count
+from scvi_codegen.methods.explicit import ExplicitStep
 from scvi_codegen.methods.method import Exactness, Method, Specification
 from scvi_codegen.methods.tables.tableau import lobatto_iiia
 from scvi_codegen.systems.system import MechanicalSystem
@@ -26,6 +28,7 @@ from scvi_codegen.systems.system import MechanicalSystem
 if TYPE_CHECKING:
     from scvi_codegen.methods.stage_system import StageSystem
     from scvi_codegen.methods.tables.number_tables import Part
+    from scvi_codegen.systems.splittings.kinetic import KineticSplitting
 
 KICK_DRIFT_KICK, DRIFT_KICK_DRIFT = "kick-drift-kick", "drift-kick-drift"
 """Sequences of a leapfrog step: forces at both ends, shared between steps, or forces in the middle."""
@@ -34,6 +37,35 @@ FIRST_HALVES: dict[int, tuple[str, ...]] = {
     int(order): tuple(gammas) for order, gammas in package_table("methods/compositions.toml").items()
 }
 """Coefficients gamma_1, gamma_2, .. before the middle one, which makes the sum 1; by order."""
+
+
+SPLITTING = """
+for n in LEAPS:
+    if KICK[n] != 0:
+        if n > 0 or not known:
+            u[i] = q0[i] + q[i]
+            F[i] = force(u, t + KICK_ABSCISSA[n] * h)
+            if action:
+                L = at_rest(u, t + KICK_ABSCISSA[n] * h)
+        p[i] += h * KICK[n] * F[i]
+        if action:
+            S += KICK[n] * L
+    if DRIFT[n] != 0:
+        if masses:
+            P[i] = p0[i] + p[i]
+            q[i] += h * DRIFT[n] * inverse_mass[i] * P[i]
+        else:
+            P[i] = p0[i] + p[i]
+            v[i] = velocity(P, t)
+            q[i] += h * DRIFT[n] * v[i]
+        if action:
+            S += DRIFT[n] / 2 * inverse_mass[i] * P[i] * P[i]
+        if bodies:
+            turn(P)
+"""
+"""Kicks and drifts (Hairer, Lubich & Wanner, Geometric Numerical Integration, sec. II.5), with the increments q and p
+of positions and momenta. S is the action divided by h, the sum of the Lagrangian L at rest and the kinetic energies.
+Rigid bodies are turned by the flow of their kinetic energy in the time of a drift."""
 
 
 class _Leapfrogs(Method):
@@ -75,11 +107,25 @@ class _Leapfrogs(Method):
         """Exactness of straight lines, which composition preserves; f may be linear in q."""
         return Exactness(curve=1, quadrature=2, gauge=1)
 
+    def explicit_step(self, split: KineticSplitting) -> ExplicitStep:
+        """Return kick 0, drift 0, kick 1, .., of which the last drift is 0, and the first kick if drifts come first.
+
+        The step of free rigid bodies is one drift, which is exact.
+        """
+        halves = tuple((a + b) / 2 for a, b in pairwise((mp.zero, *self.fractions, mp.zero)))
+        kicks, drifts = halves, (*self.fractions, mp.zero)
+        if self.drifts_first:
+            kicks, drifts = (mp.zero, *self.fractions), halves
+        if split.bodies and not any(split.force):
+            kicks, drifts = (mp.zero, mp.zero), (mp.one, mp.zero)
+        abscissae = tuple(mp.fsum(drifts[:n]) for n in range(len(kicks)))
+        return ExplicitStep.of(SPLITTING, {"LEAPS": {"KICK": kicks, "DRIFT": drifts, "KICK_ABSCISSA": abscissae}})
+
     def stage_system(self, system: MechanicalSystem) -> StageSystem:
         """Return the leapfrog equations; unknowns are the velocities V_k of the drifts, determined row after row."""
-        from scvi_codegen.methods.leapfrog_stages import leapfrog_system
+        from scvi_codegen.methods.explicit_stages import explicit_system
 
-        return leapfrog_system(system, self)
+        return explicit_system(system, self)
 
     def paper_form(self, system: MechanicalSystem) -> StageSystem:
         """Return the same equations: the paper uses Stoermer-Verlet without printing it."""

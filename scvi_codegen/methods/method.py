@@ -30,8 +30,10 @@ from scvi_codegen.methods.tables.tableau import MAX_STAGES
 from scvi_codegen.systems.system import MechanicalSystem
 
 if TYPE_CHECKING:
+    from scvi_codegen.methods.explicit import ExplicitStep
     from scvi_codegen.methods.stage_system import StageSystem
     from scvi_codegen.methods.tables.number_tables import Part
+    from scvi_codegen.systems.splittings.kinetic import KineticSplitting
     from scvi_codegen.systems.symmetry.symmetry import Symmetry
 
 degree_count = partial(checked_count, least=1, most=MAX_STAGES, error=MethodError)
@@ -114,6 +116,10 @@ class Method(ABC):
     def exactness(self) -> Exactness:
         """Momentum maps conserved to round-off; by default none is claimed."""
         return Exactness()
+
+    def explicit_step(self, split: KineticSplitting) -> ExplicitStep | None:
+        """Return the statements of an explicit step for a separable system; ``None`` for other methods."""
+        return None
 
     @property
     def fractions(self) -> Vector:

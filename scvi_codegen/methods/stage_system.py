@@ -130,6 +130,10 @@ class Table:
         names = tuple(tuple(name and name.transposed for name in line) for line in zip(*self.names, strict=True))
         return Table(entries=tuple(zip(*self.entries, strict=True)), names=names)
 
+    def rows(self, indices: Sequence[int]) -> Table:
+        """Return the rows with these indices, in that order."""
+        return Table(entries=tuple(self.entries[i] for i in indices), names=tuple(self.names[i] for i in indices))
+
     def columns(self, indices: Sequence[int]) -> Table:
         """Return the columns with these indices, in that order."""
         return Table(

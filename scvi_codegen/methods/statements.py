@@ -128,10 +128,52 @@ class Repeat:
 
 
 @dataclass(frozen=True, slots=True)
-class When:
-    """Statements under a condition, in C."""
+class Comparison:
+    """Comparison of numbers of tables and rows."""
 
-    condition: str
+    left: Expression
+    operator: str
+    right: Expression
+
+    @property
+    def text(self) -> str:
+        """The comparison in C."""
+        return f"{_number_text(self.left)} {self.operator} {_number_text(self.right)}"
+
+
+@dataclass(frozen=True, slots=True)
+class Not:
+    """True if a flag of the step does not hold."""
+
+    flag: str
+
+    @property
+    def text(self) -> str:
+        """The condition in C."""
+        return f"!{self.flag}"
+
+
+@dataclass(frozen=True, slots=True)
+class Junction:
+    """Conditions of which one must hold, or all (``&&``)."""
+
+    operator: str
+    parts: tuple[Condition, ...]
+
+    @property
+    def text(self) -> str:
+        """The condition in C."""
+        return f" {self.operator} ".join(part.text for part in self.parts)
+
+
+Condition: TypeAlias = Comparison | Not | Junction
+
+
+@dataclass(frozen=True, slots=True)
+class When:
+    """Statements under a condition."""
+
+    condition: Condition
     body: tuple[Statement, ...]
 
 
@@ -140,6 +182,10 @@ Statement: TypeAlias = Assign | Apply | Repeat | When
 OPERATORS: dict[type[ast.operator], str] = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/"}
 OF_CONSTRAINTS = ("mass", "solve", "factorise", "invert")
 COMPARISONS: dict[type[ast.cmpop], str] = {ast.NotEq: "!=", ast.Gt: ">", ast.Eq: "=="}
+FORMS = (
+    "statements are x[i] = .., x[i] += .., x[i] -= .., x[i] = kernel(y, t), 'for n in ROWS:' and 'if condition:', "
+    "of sums, differences, products and quotients"
+)
 
 
 def read(text: str, features: Sequence[str] = ()) -> tuple[Statement, ...]:
@@ -152,7 +198,44 @@ def read(text: str, features: Sequence[str] = ()) -> tuple[Statement, ...]:
     Raises:
         MethodError: for a line of another form.
     """
-    return tuple(_Reader(frozenset(features)).block(ast.parse(text).body))
+    return tuple(_Reader(frozenset(features)).block(_parsed(text).body))
+
+
+def selected(text: str, features: Sequence[str]) -> str:
+    """Return a text without conditions on features, some of which hold.
+
+    Raises:
+        MethodError: for a line that is not in the syntax of Python.
+    """
+    return ast.unparse(_Selection(frozenset(features)).visit(_parsed(text)))
+
+
+def _parsed(text: str) -> ast.Module:
+    try:
+        return ast.parse(text)
+    except SyntaxError as failure:
+        where = f"line {failure.lineno} of a step: '{(failure.text or '').strip()}'"
+        raise MethodError(f"{where} is no statement ({failure.msg}): {FORMS}") from None
+
+
+def _refused(node: ast.AST, of: str) -> MethodError:
+    return MethodError(f"line {getattr(node, 'lineno', 0)} of a step: '{ast.unparse(node)}' is {of}")
+
+
+@dataclass(frozen=True)
+class _Selection(ast.NodeTransformer):
+    features: frozenset[str]
+
+    def visit_If(self, node: ast.If) -> ast.AST | list[ast.AST]:
+        """Return the statements that hold in place of a condition on a feature."""
+        if not isinstance(node.test, ast.Name):
+            return self.generic_visit(node)
+        held = node.body if node.test.id in self.features else node.orelse
+        return [each for statement in held for each in self._listed(self.visit(statement))]
+
+    @staticmethod
+    def _listed(visited: ast.AST | list[ast.AST]) -> list[ast.AST]:
+        return visited if isinstance(visited, list) else [visited]
 
 
 @dataclass(frozen=True)
@@ -177,34 +260,38 @@ class _Reader:
                 name in OF_CONSTRAINTS or time
             ):
                 whole = argument.value if isinstance(argument, ast.Subscript) else argument
-                assert isinstance(whole, ast.Name)
+                if not isinstance(whole, ast.Name):
+                    raise _refused(argument, f"not a quantity: assign it first, as u[i] = .., and write {name}(u)")
                 at = self.expression(time[0]) if time else None
                 yield Apply(name, whole.id, self.quantity(target), at)
             case ast.Assign(targets=[target], value=value):
                 yield Assign(self.quantity(target), self.expression(value))
-            case ast.AugAssign(target=target, op=operator, value=value):
+            case ast.AugAssign(target=target, op=ast.Add() | ast.Sub() as operator, value=value):
                 yield Assign(self.quantity(target), self.expression(value), OPERATORS[type(operator)])
             case _:
-                raise MethodError(f"'{ast.unparse(node)}' is not a statement of a step")
+                raise _refused(node, f"no statement: {FORMS}")
 
-    def condition(self, node: ast.expr) -> str:
+    def condition(self, node: ast.expr) -> Condition:
         match node:
             case ast.BoolOp(op=operator, values=values):
-                word = " || " if isinstance(operator, ast.Or) else " && "
-                return word.join(map(self.condition, values))
+                return Junction("||" if isinstance(operator, ast.Or) else "&&", tuple(map(self.condition, values)))
             case ast.UnaryOp(op=ast.Not(), operand=ast.Name(name)):
-                return f"!{name}"
-            case ast.Compare(left=left, ops=[operator], comparators=[right]):
-                return f"{ast.unparse(left)} {COMPARISONS[type(operator)]} {ast.unparse(right)}"
-        raise MethodError(f"'{ast.unparse(node)}' is not a condition of a step")
+                return Not(name)
+            case ast.Compare(left=left, ops=[operator], comparators=[right]) if type(operator) in COMPARISONS:
+                return Comparison(self.expression(left), COMPARISONS[type(operator)], self.expression(right))
+        raise _refused(node, f"no condition: compare two numbers by {', '.join(COMPARISONS.values())}")
 
     def expression(self, node: ast.expr) -> Expression:
         match node:
-            case ast.Constant(value=value):
+            case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
+                if isinstance(value, float) and not _is_exact(value):
+                    raise _refused(node, "not exact in binary: put the number into a table")
                 return Constant(repr(value))
             case ast.BinOp(op=ast.MatMult(), left=ast.Name(table), right=right):
                 return OverPoints(table, self.quantity(right))
-            case ast.BinOp(left=left, op=operator, right=right):
+            case ast.BinOp(left=ast.Constant(), op=ast.Div(), right=ast.Constant()):
+                raise _refused(node, "a quotient of numbers: divide a quantity, as h / 2, or put it into a table")
+            case ast.BinOp(left=left, op=operator, right=right) if type(operator) in OPERATORS:
                 return Operation(OPERATORS[type(operator)], (self.expression(left), self.expression(right)))
             case ast.UnaryOp(op=ast.USub(), operand=operand):
                 return Operation("-", (self.expression(operand),))
@@ -222,7 +309,7 @@ class _Reader:
                 return Read(name)
             case ast.Subscript(value=ast.Name(name), slice=index):
                 return Read(name, self.index(index))
-        raise MethodError(f"'{ast.unparse(node)}' is not a quantity of a step: write one with an index, as q[i]")
+        raise _refused(node, "not a quantity: write one with an index, as q[i], and sums and products of these")
 
     def index(self, node: ast.expr) -> At:
         match node:
@@ -231,4 +318,19 @@ class _Reader:
             case ast.Call(func=ast.Name(name), args=[argument]) if name in GATHERS:
                 inner = self.index(argument)
                 return At(inner.letter, (name, *inner.gathers))
-        raise MethodError(f"'{ast.unparse(node)}' is not an index: write one of {', '.join(COUNTS)}, or row(e)")
+        raise _refused(node, f"not an index: write one of {', '.join(COUNTS)}, or row(e)")
+
+
+def _is_exact(value: float) -> bool:
+    """Return whether a decimal number is a multiple of 2^-20, as it is read."""
+    return (value * 2**20).is_integer()
+
+
+def _number_text(expression: Expression) -> str:
+    """Return a number of a condition in C."""
+    match expression:
+        case Constant(text=text) | Read(name=text):
+            return text
+        case Entry(table=table, row=row):
+            return f"{table}[{row}]"
+    raise MethodError(f"{expression} is not a number of a table or a row, which conditions compare")

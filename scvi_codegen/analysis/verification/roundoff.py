@@ -83,8 +83,9 @@ def _compensated(tested: SystemUnderTest) -> bool:
 
 def _has_compensation(tested: SystemUnderTest) -> bool:
     """Return True if the method has fixed-point iterations or leapfrog steps, which use the compensation."""
-    leaps = bool(tested.method.fractions) and not isinstance(kinetic_splitting(tested.moved), str)
-    return leaps or tested.stepper.interface.has_fallback
+    split = kinetic_splitting(tested.moved)
+    explicit = not isinstance(split, str) and tested.method.explicit_step(split) is not None
+    return explicit or tested.stepper.interface.has_fallback
 
 
 def _advanced(

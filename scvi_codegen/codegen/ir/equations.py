@@ -378,12 +378,11 @@ def transposed(table: NumberTable, points: int) -> NumberTable:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Splitting:
-    """An explicit step: kick 0, drift 0, kick 1, drift 1, .., without those of weight 0.
+    """An explicit step: its statements (:mod:`scvi_codegen.methods.statements`), and their kernels.
 
     Attributes:
-        kicks: (n,) p += h kicks[n] L_q.
-        drifts: (n,) q += h drifts[n] v.
-        abscissae: (n,) c_n of the kicks.
+        statements: their text.
+        tables: numbers by their name, those of the same rows by the name of the rows.
         force: L_q at (q, t).
         drift: the constant diagonal of M (no arguments), v = M^-1 p, or v = H_p at p.
         by_masses: True for M^-1 p.
@@ -392,11 +391,11 @@ class Splitting:
         turning: a_i, a_j - a_i and a_k - a_i of each body (no arguments), or ``None``.
         principal: of each body the principal axes as columns, row by row; empty if they are the body axes.
         at_rest: L at v = 0 if runs sum the action, else ``None``.
+        leaps: whether the statements are kicks and drifts in turn by the tables KICK and DRIFT.
     """
 
-    kicks: tuple[Number, ...]
-    drifts: tuple[Number, ...]
-    abscissae: tuple[Number, ...]
+    statements: str
+    tables: tuple[tuple[str, tuple[tuple[str, tuple[Number, ...]], ...]], ...]
     force: Kernel
     drift: Kernel
     by_masses: bool
@@ -404,6 +403,7 @@ class Splitting:
     turning: Kernel | None = None
     principal: NumberTable = ()
     at_rest: Kernel | None = None
+    leaps: bool = True
 
     @property
     def kernels(self) -> tuple[Kernel, ...]:
@@ -411,9 +411,20 @@ class Splitting:
         return tuple(kernel for kernel in (self.force, self.drift, self.turning, self.at_rest) if kernel)
 
     @property
+    def numbers(self) -> dict[str, tuple[Number, ...]]:
+        """The tables by their names."""
+        return {name: numbers for _, named in self.tables for name, numbers in named}
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Number of rows by their name."""
+        return {rows: len(named[0][1]) for rows, named in self.tables}
+
+    @property
     def acts(self) -> bool:
         """True if it has a discrete Lagrangian in closed form: a single drift, whose velocity is (q1 - q0) / h."""
-        return self.by_masses and sum(x != 0 for x in self.drifts) == 1
+        drifts = self.numbers["DRIFT"] if self.leaps else ()
+        return self.by_masses and sum(x != 0 for x in drifts) == 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -202,7 +202,8 @@ def with_sums(program: Program, split: SplitSystem) -> Program | None:
         forces.append(_over_terms(rest, f"pull_{number}", group, group.partials, ()))
         terms.append(_over_terms(rest, f"term_{number}", group, (sign * group.formula,), first))
     fixed_point, splitting = program.fixed_point and program.fixed_point.with_forces(tuple(forces)), program.splitting
-    if program.newton or energy is None or not (fixed_point or (splitting and any(splitting.kicks))):
+    kicks = splitting is not None and any(splitting.numbers.get("KICK", (1,)))
+    if program.newton or energy is None or not (fixed_point or kicks):
         return None
     return replace(
         program,

@@ -52,7 +52,6 @@ from scvi_codegen.common.errors import MethodError
 from scvi_codegen.common.precision import Matrix, Vector, mp
 from scvi_codegen.methods.constraints import END_VELOCITY
 from scvi_codegen.methods.discretise import discretise, is_conformally_symplectic, is_symplectic
-from scvi_codegen.methods.leapfrog_stages import kicks_and_drifts
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import Accelerations, PrintedCurve, ShotCurve, StageSystem, Velocities
 from scvi_codegen.methods.tables.basis import cardinal_values, legendre_functional
@@ -108,9 +107,12 @@ def check_solver(
 
 def splitting_of(system: MechanicalSystem, method: Method) -> Splitting | None:
     """Return the sequence of kicks and drifts, or ``None`` if the method is implicit."""
-    if not method.fractions or system.constraints or isinstance(split := kinetic_splitting(system), str):
+    if system.constraints or isinstance(split := kinetic_splitting(system), str):
         return None
-    moved, (kicks, drifts) = split.system, kicks_and_drifts(method, split)
+    step = method.explicit_step(split)
+    if step is None:
+        return None
+    moved = split.system
     turned = any(not axes.is_diagonal() for axes in split.axes)
     turning = system_kernel(moved, "turning", sum(split.rates, ()), u=(), purpose="a_i, a_j - a_i, a_k - a_i.")
     if split.velocity:
@@ -118,15 +120,17 @@ def splitting_of(system: MechanicalSystem, method: Method) -> Splitting | None:
     else:
         drift = system_kernel(moved, "mass", forms_of(moved).mass.values(), u=(), purpose="The constant masses.")
     return Splitting(
-        kicks=lower_vector(kicks),
-        drifts=lower_vector(drifts),
-        abscissae=lower_vector(tuple(mp.fsum(drifts[:n]) for n in range(len(kicks)))),
+        statements=step.statements,
+        tables=tuple(
+            (rows, tuple((name, lower_vector(numbers)) for name, numbers in named)) for rows, named in step.tables
+        ),
         force=system_kernel(moved, "force", split.force, u=moved.coordinates, purpose="L_q at u = q."),
         drift=drift,
         by_masses=not split.velocity,
         bodies=tuple((first, *axes) for first, _, *axes in split.bodies),
         turning=turning if split.bodies else None,
         principal=lower_matrix(tuple(tuple(map(mp.mpf, map(str, axes))) for axes in split.axes if turned)),
+        leaps=bool(method.fractions),
     )
 
 
@@ -206,7 +210,7 @@ def lower_arrays(system: ArraySystem, method: Method, *, prefix: str, solver: st
     of_tables = one_coordinate(system)
     stages, velocities = discretise(of_tables, method), bool(system.velocities)
     constrained = constrained_steps(system, stages, method)
-    splitting = None if constrained else splitting_of(of_tables, method)
+    splitting = splitting_of(of_tables, method) if method.fractions and not constrained else None
     iterated = constrained is None and splitting is None
     fixed_point = iteration_of(of_tables, stages, velocities=velocities) if iterated else None
     if fixed_point:

@@ -317,7 +317,7 @@ class Printer:
                     yield from map("  {}".format, self.lines(body))
                     yield "}"
                 case When(condition=condition, body=body):
-                    yield f"if ({condition}) {{"
+                    yield f"if ({condition.text}) {{"
                     yield from map("  {}".format, self.lines(body))
                     yield "}"
                 case Apply(name=name, argument=argument, target=target, time=time):

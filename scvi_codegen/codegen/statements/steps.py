@@ -2,39 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 
 from scvi_codegen.codegen.ir.equations import Splitting
 from scvi_codegen.codegen.statements.printing import Layout, Place, PointsAsLanes, Printer, Quantity
-from scvi_codegen.methods.statements import read
-
-SPLITTING = """
-for n in LEAPS:
-    if KICK[n] != 0:
-        if n > 0 or not known:
-            u[i] = q0[i] + q[i]
-            F[i] = force(u, t + KICK_ABSCISSA[n] * h)
-            if action:
-                L = at_rest(u, t + KICK_ABSCISSA[n] * h)
-        p[i] += h * KICK[n] * F[i]
-        if action:
-            S += KICK[n] * L
-    if DRIFT[n] != 0:
-        if masses:
-            P[i] = p0[i] + p[i]
-            q[i] += h * DRIFT[n] * inverse_mass[i] * P[i]
-        else:
-            P[i] = p0[i] + p[i]
-            v[i] = velocity(P, t)
-            q[i] += h * DRIFT[n] * v[i]
-        if action:
-            S += DRIFT[n] / 2 * inverse_mass[i] * P[i] * P[i]
-        if bodies:
-            turn(P)
-"""
-"""Kicks and drifts (Hairer, Lubich & Wanner, Geometric Numerical Integration, sec. II.5), with the increments q and p
-of positions and momenta. S is the action divided by h, the sum of the Lagrangian L at rest and the kinetic energies.
-Rigid bodies are turned by the flow of their kinetic energy in the time of a drift."""
+from scvi_codegen.methods.statements import Apply, Assign, Operation, Read, Repeat, Statement, When, read
 
 TURN = """\
 for (int k = 0; k < BODIES; k++) {
@@ -64,7 +37,21 @@ def splitting_step(split: Splitting, layout: Layout, *, action: bool) -> list[st
         "turn": TURN.replace("AXES", "PRINCIPAL_AXES[k]" if split.principal else "NULL"),
     }
     printer = Printer({**arrays, **increments, **states, **numbers, **of_run}, layout, operations)
-    return printer.function_body(read(SPLITTING, [name for name, holds in features.items() if holds]))
+    statements = read(split.statements, [name for name, holds in features.items() if holds])
+    return printer.function_body([*velocities_by_masses(statements)] if split.by_masses else statements)
+
+
+def velocities_by_masses(statements: Iterable[Statement]) -> Iterator[Statement]:
+    """Yield statements in which velocities are momenta times the inverse masses."""
+    for statement in statements:
+        match statement:
+            case Apply(name="velocity", argument=momentum, target=Read() as target):
+                product = Operation("*", (Read("inverse_mass", target.at), Read(momentum, target.at)))
+                yield Assign(target, product)
+            case Repeat(body=body) | When(body=body):
+                yield replace(statement, body=tuple(velocities_by_masses(body)))
+            case _:
+                yield statement
 
 
 def splitting_header(split: Splitting, layout: Layout, *, action: bool) -> str:
@@ -81,6 +68,7 @@ SPLITTING void leap(const step_data *step, const solver_data *data, int known, n
         first = ["memset(dq, 0, sizeof(number) * M);", "memset(dp, 0, sizeof(number) * M);"]
         first += ["acted[1] = 0;"] if action else ["(void)acted;"]
         first += [] if split.by_masses or split.bodies else ["(void)data;"]
+        first += [] if split.leaps else ["(void)known, (void)F;"]
         last: list[str] = []
     else:
         kind, zero = layout.number, f"{layout.number}_word({'lanes_of(0.0)' if layout.lanes else '0.0'})"
@@ -91,6 +79,7 @@ static inline void leap_in_pairs(const step_data *step, dd t, dd h, const {kind}
 {{
 """
         first = [f"{kind} q[M], p[M];", "for (int i = 0; i < M; i++)", f"  q[i] = p[i] = {zero};"]
+        first += [] if split.leaps else ["(void)known, (void)F;"]
         words = [f"  d{x}[i] = {x}[i].high, d{x}[M + i] = {x}[i].low;" for x in "qp"]
         last = ["for (int i = 0; i < M; i++) {", *words, "}"]
     return head + "".join(f"  {line}\n" for line in (*first, *lines, *last)) + "}\n"

@@ -101,7 +101,8 @@ def _step(program: ArrayProgram, method: Method) -> Iterator[str]:
 
 def _splitting(splitting: Splitting) -> Iterator[str]:
     yield "(m its mass, F the force on it):"
-    for kick, drift, abscissa in zip(splitting.kicks, splitting.drifts, splitting.abscissae, strict=True):
+    numbers = [splitting.numbers[name] for name in ("KICK", "DRIFT", "KICK_ABSCISSA")]
+    for kick, drift, abscissa in zip(*numbers, strict=True):
         if kick != 0:
             yield f"  p += h*({_number(kick)})*F at t + h*({_number(abscissa)})"
         if drift != 0:

@@ -163,15 +163,15 @@ def splitting_source(split: Splitting, observed: Kernel | None = None) -> Iterat
     """Return the template data of explicit steps of many trajectories, which are lanes."""
     kernels = (split.force, *(() if split.by_masses else (split.drift,)), *((observed,) if observed else ()))
     functions = {name for kernel in (*kernels, split.drift) for name in lane_functions(kernel, TRAJECTORIES.sources)}
-    sizes = {"LEAPS": str(len(split.kicks)), "EXPLICIT_STEPS": "1", "SPLITTING": "static inline"}
-    tables = (("KICK", split.kicks), ("DRIFT", split.drifts), ("KICK_ABSCISSA", split.abscissae))
+    sizes = {rows: str(count) for rows, count in split.sizes.items()}
+    sizes |= {"EXPLICIT_STEPS": "1", "SPLITTING": "static inline"}
     return IterationSource(
         lanes=1,
         whole=False,
         meaning=TRAJECTORIES,
         defines=sizes | ({"CONSTANT_MASSES": "1"} if split.by_masses else {}),
         functions=tuple(map(_vector_function, sorted(functions))),
-        tables=tuple(lane_table(name, numbers, len(numbers)) for name, numbers in tables),
+        tables=tuple(lane_table(name, numbers, len(numbers)) for name, numbers in split.numbers.items()),
         kernels=kernels,
         mass=split.drift if split.by_masses else None,
         damping=None,
