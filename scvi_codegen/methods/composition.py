@@ -20,8 +20,8 @@ from scvi_codegen.common.precision import Vector, mp
 from scvi_codegen.common.representation import counted, summary
 from scvi_codegen.common.toml_text import package_table
 from scvi_codegen.common.validation import checked_count
-from scvi_codegen.methods.explicit import ExplicitStep
 from scvi_codegen.methods.method import Exactness, Method, Specification
+from scvi_codegen.methods.recurrence import ExplicitStep
 from scvi_codegen.methods.tables.tableau import lobatto_iiia
 from scvi_codegen.systems.system import MechanicalSystem
 

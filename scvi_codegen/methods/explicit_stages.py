@@ -19,12 +19,12 @@ from scvi_codegen.systems.system import MechanicalSystem
 
 @dataclass(frozen=True, slots=True)
 class _Drift:
-    """A velocity V_k, which enters positions with the factor h^power.
+    """An unknown V_k = h^(power - 1) M^-1 X_k, which enters positions with the factor h.
 
     Attributes:
-        letter: of the velocity in the recurrence.
-        power: of h.
-        momentum: evaluation of the sum of p0 and forces that it belongs to.
+        letter: of the velocity M^-1 X_k in the recurrence.
+        power: of h with which it enters positions.
+        momentum: evaluation of X_k, the sum of p0 and forces.
     """
 
     letter: Letter
@@ -32,8 +32,16 @@ class _Drift:
     momentum: Evaluation
 
     def factor(self, position: Sum) -> Number:
-        """Return the factor of the velocity, and h^power, in a position."""
+        """Return the factor of h V_k in a position."""
         return position.get(self.letter, {}).get(self.power, mp.zero)
+
+    @property
+    def forces(self) -> Sum:
+        """The momentum h^(power - 1) X_k of the unknown."""
+        by_power = {k: {n + self.power - 1: x for n, x in own.items()} for k, own in self.momentum.argument.items()}
+        if not self.power > 0 or (P in by_power and self.power > 1):
+            raise MethodError("positions are sums of h times velocities, and of higher powers times those of forces")
+        return by_power
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,23 +74,20 @@ def explicit_system(system: MechanicalSystem, method: Method) -> StageSystem:
         )
     step = _carried_out(method, split)
     durations = tuple(drift.factor(step.q) for drift in step.drifts)
-    drifts = [_rotating_group(split, durations)] if split.bodies else _drift_groups(split, step)
+    drift = _rotating_group(split, durations) if split.bodies else _drift_group(split, step)
     momenta = len(step.drifts) if split.bodies else 0
     names = [f"{'P' if momenta else 'V'}_{k}" for k in range(1, len(step.drifts) + 1)]
-    starts = [drift.momentum.argument.get(P, {0: mp.zero})[0] for drift in step.drifts]
+    starts = [drift.forces.get(P, {0: mp.zero})[0] for drift in step.drifts]
     return StageSystem(
         blocks=(
-            *(
-                Block(letter="V", index=k, power=drift.power, straight=(mp.zero, start))
-                for k, (drift, start) in enumerate(zip(step.drifts, starts, strict=True), 1)
-            ),
+            *(Block(letter="V", index=k, straight=(mp.zero, start)) for k, start in enumerate(starts, 1)),
             *(Block(letter="P", index=k, momentum=1, moves=False) for k in range(1, momenta + 1)),
         ),
         rows=(
             *(Row(number=f"V_{k}", kind="stage", momentum=mp.zero) for k in range(1, momenta + 1)),
             *(Row(number=x, kind="IDEL" if a else "stage", momentum=a) for x, a in zip(names, starts, strict=True)),
         ),
-        stage_groups=(*([_kick_group(split, step)] if any(split.force) else []), *drifts),
+        stage_groups=(*([_kick_group(split, step)] if any(split.force) else []), drift),
         end_position=Table.joined(
             Table.constant(1, 1, 1), Table.named("gamma", (durations,)), Table.constant(1, momenta)
         ),
@@ -101,6 +106,11 @@ def _carried_out(method: Method, split: KineticSplitting) -> _Step:
     run = Recurrence.of(explicit, read(explicit.statements, features), masses=not split.velocity)
     if split.bodies and not run.turns:
         raise MethodError(f"{method.name} does not turn rigid bodies: use 'stoermer-verlet' or a composition")
+    if split.velocity and any(x.argument.get(P) != {0: mp.one} for x in run.velocities):
+        raise MethodError(
+            f"{method.name} computes velocities M^-1 X of sums X other than momenta, for which H = T(p) + V(q, t) of "
+            f"'{split.system.name}' has no constant masses: use a method of kicks and drifts"
+        )
     ends = {"q": {Q: {0: mp.one}, **run.values["q"]}, "p": {P: {0: mp.one}, **run.values["p"]}}
     for name, end in ends.items():
         own, added = ("q0", "V") if name == "q" else ("p0", "F")
@@ -182,11 +192,11 @@ def _rotating_group(split: KineticSplitting, durations: Vector) -> StageGroup:
 def _kick_group(split: KineticSplitting, step: _Step) -> StageGroup:
     """Return the kicks: forces F_n = L_q at the positions u_n, which add to the momenta X_k of velocities and to p1.
 
-        u_n = q0 + sum_k h^(power of k) a_nk V_k,    row k += h^r s_nk F_n,    p1 += h w_n F_n;
+        u_n = q0 + h sum_k a_nk V_k,    row k += h^r s_nk F_n,    p1 += h w_n F_n;
 
     s_nk of a composition is w_n for the drifts after the kick, which has the weight w_n then.
     """
-    sums = [*(drift.momentum.argument for drift in step.drifts), step.p]
+    sums = [*(drift.forces for drift in step.drifts), step.p]
     factors = [[use.get(letter, {}) for use in sums] for letter, _ in step.kicks]
     weights = tuple(line[-1].get(1, mp.zero) for line in factors)
     plain = [w != 0 and all(x in ({}, {1: w}) for x in line) for w, line in zip(weights, factors, strict=True)]
@@ -232,23 +242,18 @@ def _potential_part(system: MechanicalSystem) -> Expr:
     return system.lagrangian.xreplace(dict.fromkeys(system.velocities, S.Zero))
 
 
-def _drift_groups(split: KineticSplitting, step: _Step) -> list[StageGroup]:
-    """Return L_v at the velocities, which are the momenta X_k, by the power of h with which they enter positions."""
-    system, acts, groups = split.system, _acts(split) and bool(step.action), []
-    for power in sorted({drift.power for drift in step.drifts}):
-        own = [k for k, drift in enumerate(step.drifts) if drift.power == power]
-        sums = [step.action.get(("T", step.drifts[k].letter[1]), {}).get(0, mp.zero) for k in own]
-        into = Table.joined(Table.constant(len(own), 1), Table.identity(len(step.drifts)).rows(own))
-        back = Table.joined(Table.identity(len(step.drifts), -1).rows(own), Table.constant(len(own), 1))
-        groups.append(
-            StageGroup(
-                name="drift" if power == 1 else f"drift_{power}",
-                abscissae=tuple(step.drifts[k].momentum.time for k in own),
-                gathers=(Gather(arguments=system.velocities, table=into, power=-power),),
-                scatters=(Scatter(results=forms_of(system).momentum, table=back, power=0),),
-                scalar=system.lagrangian - _potential_part(system) if acts else None,
-                scalar_weights=tuple(sums) if acts else (),
-                in_action=acts,
-            )
-        )
-    return groups
+def _drift_group(split: KineticSplitting, step: _Step) -> StageGroup:
+    """Return L_v at the velocity of each drift, which is its momentum."""
+    system, acts, size = split.system, _acts(split) and bool(step.action), len(step.drifts)
+    into = Table.joined(Table.constant(size, 1), Table.identity(size))
+    back = Table.joined(Table.identity(size, -1), Table.constant(size, 1))
+    sums = tuple(step.action.get(("T", drift.letter[1]), {}).get(0, mp.zero) for drift in step.drifts)
+    return StageGroup(
+        name="drift",
+        abscissae=tuple(drift.momentum.time for drift in step.drifts),
+        gathers=(Gather(arguments=system.velocities, table=into, power=-1),),
+        scatters=(Scatter(results=forms_of(system).momentum, table=back, power=0),),
+        scalar=system.lagrangian - _potential_part(system) if acts else None,
+        scalar_weights=sums if acts else (),
+        in_action=acts,
+    )

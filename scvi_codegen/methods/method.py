@@ -30,7 +30,7 @@ from scvi_codegen.methods.tables.tableau import MAX_STAGES
 from scvi_codegen.systems.system import MechanicalSystem
 
 if TYPE_CHECKING:
-    from scvi_codegen.methods.explicit import ExplicitStep
+    from scvi_codegen.methods.recurrence import ExplicitStep
     from scvi_codegen.methods.stage_system import StageSystem
     from scvi_codegen.methods.tables.number_tables import Part
     from scvi_codegen.systems.splittings.kinetic import KineticSplitting
