@@ -394,7 +394,7 @@ class Sources:
             MethodError: if velocities at given momenta, on which a function depends, have no formula.
         """
         system, program = self.system, self.program()
-        if render_ensemble(program) is None:
+        if program.rattle or render_ensemble(program) is None:
             return None
         states = *system.coordinates, *system.momentum_symbols
         match observed:

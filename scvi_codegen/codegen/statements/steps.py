@@ -194,8 +194,8 @@ def _number(text: str, words: int = 1) -> Quantity:
 OF_POINTS = {
     "mass": "find_accelerations(now->inverse_mass, ARGUMENT, TARGET);",
     "solve": "solve_points(l[g], ARGUMENT);",
-    "factorise": "if (!factorised)\n  factorise_points(ARGUMENT, now->inverse_mass, l[g]);",
-    "invert": "if (!factorised)\n  invert_masses(now, g);",
+    "factorise": "refactorise_points(factorised, ARGUMENT, now->inverse_mass, l[g]);",
+    "invert": "invert_masses(factorised, now, g);",
 }
 VARYING_MASS = {name: text.replace("inverse_mass", "inverse_mass[g]") for name, text in OF_POINTS.items()}
 VECTOR_MASS = {"mass": "vector_accelerations(solved->inverse_mass, ARGUMENT, TARGET, g);"}
@@ -240,7 +240,8 @@ def rattle_iteration(part: str, features: Sequence[str]) -> str:
         lines = Printer(own, layout, VARYING_MASS).function_of_points(read(COUPLED_RATTLE))
     head = """\
 /* One iteration: updates the multipliers, accelerations or velocities, and positions, the last by `change`. */
-static inline void iterate(const step_data *step, rattle_step *now, factors *l, int factorised, lanes *change)
+static inline void iterate(const step_data *step, rattle_step *now, factors *l, condition factorised,
+    lanes *change)
 {
   const real scale = 1 / (step->h * step->h);
 """
