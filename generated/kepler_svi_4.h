@@ -54,10 +54,11 @@ typedef struct {
 /* State of a run: copy it to save the run, copy it back to resume, bit for bit. t_low and the carries are the
  * compensation terms (low words) of t, q and p; the stages of the last step are extrapolated to predict the next. */
 typedef struct {
-  double t, t_low, h;
-  long long step; /* completed */
+  double t, t_low;
   double q[2], p[2];
   double carry_q[2], carry_p[2];
+  double h;
+  long long step; /* completed */
   double largest_v[2], largest_a[2]; /* velocities and accelerations so far, for the size of errors */
   double largest_dq[2], largest_bend[2]; /* displacements by a step and by its curvature so far */
   double memory[16];

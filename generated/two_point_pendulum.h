@@ -55,10 +55,11 @@ typedef struct {
 /* State of a run: copy it to save the run, copy it back to resume, bit for bit. t_low and the carries are the
  * compensation terms (low words) of t, q and p; the stages of the last step are extrapolated to predict the next. */
 typedef struct {
-  double t, t_low, h;
-  long long step; /* completed */
+  double t, t_low;
   double q[1], p[1];
   double carry_q[1], carry_p[1];
+  double h;
+  long long step; /* completed */
   double largest_v[1], largest_a[1]; /* velocities and accelerations so far, for the size of errors */
   double largest_dq[1], largest_bend[1]; /* displacements by a step and by its curvature so far */
   double memory[4];

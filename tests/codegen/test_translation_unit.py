@@ -54,6 +54,10 @@ int main(void)
 """
 
 
+VERLET_LINES, FIRST_STEP = 390, 190
+"""Largest number of lines of Stoermer-Verlet for the Kepler problem, and of those up to the end of its step."""
+
+
 def written(source: Source, folder: Path) -> None:
     for name, text in source.single_file().files.items():
         (folder / name).write_text(text)
@@ -97,6 +101,24 @@ def test_single_file_defines_no_macro_that_it_does_not_use():
     assert "#undef" not in plain
     for name in re.findall(r"^#define (\w+)$", plain, re.MULTILINE):
         assert len(re.findall(rf"\b{name}\b", plain)) > 1, name
+
+
+@pytest.mark.parametrize("compiler", ["gcc", "clang"])
+@pytest.mark.parametrize("method", ["stoermer-verlet", "composition:8", "svi:4"])
+def test_generated_source_begins_with_the_step_and_contains_what_it_uses(compiler, method, tmp_path):
+    made = generate_source(catalogue("kepler")(), method, prefix="one")[0].readable()
+    for name, text in made.files.items():
+        assert [line for line in text.split("\n") if len(line) > 120] == []
+        (tmp_path / name).write_text(text)
+    run([needs(compiler), *STRICT, "-Wno-psabi", "-c", "one.c"], tmp_path)
+    if method == "stoermer-verlet":
+        lines = made.code.split("\n")
+        assert len(lines) <= VERLET_LINES
+        assert next(i for i, line in enumerate(lines) if "int solve(" in line) < FIRST_STEP
+        assert not set(re.findall(r"\w*(?:newton|band|tolerance|fallback|predictor)\w*", made.code, re.IGNORECASE)) - {
+            "tolerance",
+            "TOLERANCE",
+        }
 
 
 @pytest.mark.parametrize("name", ["first order", "constraints"])

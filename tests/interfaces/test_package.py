@@ -43,7 +43,7 @@ def pendulum() -> sc.Model:
 def test_folder_contains_a_complete_integrator(pendulum, tmp_path):
     folder = sc.generate_package(pendulum, tmp_path / "made" / "pendulum_svi")
     assert folder == tmp_path / "made" / "pendulum_svi"
-    names = "Makefile README.md __init__.py interface.json main.c model.toml pendulum_svi.c pendulum_svi.h support"
+    names = "Makefile README.md __init__.py interface.json main.c model.toml pendulum_svi.c pendulum_svi.h"
     assert sorted(path.name for path in folder.iterdir()) == names.split()
     assert sc.load_model(folder / "model.toml") == pendulum
     assert "pendulum_svi_step" in (folder / "README.md").read_text()
@@ -60,12 +60,6 @@ def test_a_single_file_computes_the_same_bits(tmp_path):
     assert len(printed[0]) > 20
     assert printed[0] == printed[1]
     assert sc.load_package(single).step([0.5], [0.0], 0.1) == sc.load_package(many).step([0.5], [0.0], 0.1)
-
-
-def test_single_file_replaces_the_files_of_a_folder(pendulum, tmp_path):
-    folder = sc.generate_package(pendulum, tmp_path / "pendulum_svi")
-    sc.generate_package(pendulum, folder, single_file=True)
-    assert list(folder.glob("support/*/*")) == []
 
 
 def test_equal_models_give_equal_bytes(pendulum, tmp_path):

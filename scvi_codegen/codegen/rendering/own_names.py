@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
 
-from scvi_codegen.codegen.rendering.text import CONTINUATION, WIDTH
+from scvi_codegen.codegen.rendering.text import CONTINUATION, WIDTH, wrapped_prototype
 
 IGNORED = re.compile(r'/\*(?:[^*]|\*(?!/))*\*/|"(?:\\.|[^"\\])*"|^#(?:.*\\\n)*.*$', re.MULTILINE)
 MACRO = re.compile(r"^#define (?P<name>\w+)(?:\((?P<parameters>[^)]*)\))?(?P<body>(?:.*\\\n)*.*)$", re.MULTILINE)
@@ -20,27 +20,48 @@ DECLARED = re.compile(r"(\w+)\s*(?:\[[^=]*\])?\s*;?\s*$")
 EXPORTED = re.compile(r"\b(NAME|STATUS)\((\w+)\)")
 PREFIXING = re.compile(r"^#define (NAME|STATUS)\(word\) (\w+)##word.*\n", re.MULTILINE)
 TOKEN = re.compile(r'/\*(?:[^*]|\*(?!/))*\*/|"(?:\\.|[^"\\])*"|#include .*|\bFMI\(\w+\)|\b[A-Za-z_]\w*')
+HEAD = re.compile(r'^(?P<head>[A-Za-z_][^;{}#/"]*\))(?=\n\{)', re.MULTILINE)
+"""Head of the definition of a function."""
+CONTINUED = re.compile(r"^#define .*\\\n(?:.*\\\n)*.*$", re.MULTILINE)
 BREAK = re.compile(r'(?:[^" ]|"(?:\\.|[^"\\])*")+ ')
+
+
+def with_exported_names(code: str) -> str:
+    """Return a source with exported names in place of the macros that make them."""
+    prefixes = dict(PREFIXING.findall(code))
+    code = EXPORTED.sub(lambda match: prefixes[match[1]] + match[2], PREFIXING.sub("", code))
+    return re.sub(r"\n{3,}", "\n\n", _wrapped(code))
 
 
 def with_own_names(code: str, prefix: str, header: str) -> str:
     """Return a source whose macros and names at file scope begin with the prefix of the integrator.
 
     Args:
-        code: of one file, without include guards.
+        code: of one file, without include guards and macros of exported names.
         prefix: of its own names; exported ones may have another, of the integrator that it belongs to.
         header: included by the code; its names are retained.
     """
-    prefixes = dict(PREFIXING.findall(code))
-    code = EXPORTED.sub(lambda match: prefixes[match[1]] + match[2], PREFIXING.sub("", code))
     taken = set(TOKEN.findall(header + code))
     names = {}
-    for name in (*(match["name"] for match in MACRO.finditer(code)), *_names(code)):
+    for name in FileScope(code).names(code):
         if not name.lower().startswith(f"{prefix.lower()}_"):
             upper, local = (prefix.upper(), "LOCAL") if name.isupper() else (prefix, "local")
             names[name] = f"{upper}_{name}" if f"{upper}_{name}" not in taken else f"{upper}_{local}_{name}"
     renamed = TOKEN.sub(lambda match: names.get(match[0], match[0]), code)
-    return "\n".join(_broken(renamed.split("\n")))
+    return _wrapped(renamed)
+
+
+def _wrapped(code: str) -> str:
+    """Return a source whose lines have changed lengths with those that are too long broken."""
+    code = HEAD.sub(lambda match: wrapped_prototype(" ".join(match["head"].split()).replace("( ", "(")), code)
+    return CONTINUED.sub(_aligned, "\n".join(_broken(code.split("\n"))))
+
+
+def _aligned(macro: re.Match[str]) -> str:
+    """Return the lines of a macro with the backslashes at their ends in one column."""
+    lines = [line.removesuffix("\\").rstrip() for line in macro[0].split("\n")]
+    width = max(map(len, lines[:-1])) + 1
+    return "\n".join([*(f"{line:{width}}\\" for line in lines[:-1]), lines[-1]])
 
 
 def _broken(lines: Sequence[str]) -> Iterator[str]:
@@ -60,18 +81,34 @@ def _broken(lines: Sequence[str]) -> Iterator[str]:
         yield line
 
 
-def _names(code: str) -> Iterator[str]:
-    """Yield names with internal linkage, types and enumerators in order."""
-    makers = {
-        match["name"]: ([parameter.strip() for parameter in match["parameters"].split(",")], names)
-        for match in MACRO.finditer(code)
-        if match["parameters"] and (names := re.findall(r"\bstatic\b[\w ]*?(\w+##\w+)\(", match["body"]))
-    }
-    local = {match["name"] for match in MACRO.finditer(code) if not match["parameters"] and "static" in match["body"]}
-    for text in _declarations(ATTRIBUTE.sub("", IGNORED.sub("", code))):
+class FileScope:
+    """Names that declarations at file scope make, in a source with certain macros."""
+
+    def __init__(self, code: str) -> None:
+        macros = [*MACRO.finditer(code)]
+        self._makers = {
+            match["name"]: ([parameter.strip() for parameter in match["parameters"].split(",")], names)
+            for match in macros
+            if match["parameters"] and (names := re.findall(r"\bstatic\b[\w ]*?(\w+(?:##\w+)+)\(", match["body"]))
+        }
+        for match in macros:  # those that end in another one
+            if (inner := self._makers.get((match["body"].split() or [""])[-1].partition("(")[0])) and match[
+                "parameters"
+            ]:
+                self._makers[match["name"]][1].extend(inner[1])
+        self._local = {match["name"] for match in macros if not match["parameters"] and "static" in match["body"]}
+
+    def names(self, code: str) -> Iterator[str]:
+        """Yield the names of macros, of types and enumerators, and of variables and functions in order."""
+        yield from (match["name"] for match in MACRO.finditer(code))
+        for text in _declarations(ATTRIBUTE.sub("", IGNORED.sub("", code))):
+            yield from self._declared(text)
+
+    def _declared(self, text: str) -> Iterator[str]:
+        """Yield the names of one declaration, that of a function that is exported as ``NAME(word)``."""
         head, _, rest = re.sub(r" = .*", "", text, flags=re.DOTALL).partition("{")
         words = head.split()
-        if (maker := makers.get(head.partition("(")[0])) is not None:
+        if (maker := self._makers.get(head.partition("(")[0])) is not None:
             yield from _made(*maker, head)
         elif words[0] == "enum":
             yield from re.findall(r"(?:^|,)\s*(\w+)", text[text.index("{") + 1 :])
@@ -82,8 +119,10 @@ def _names(code: str) -> Iterator[str]:
             elif words[0] == "typedef":
                 declared = (rest.rpartition("}")[2] or head).split(",")
                 yield from (name for declarator in declared for name in DECLARED.findall(declarator))
-        elif "static" in words or words[0] in local:
+        elif "static" in words or words[0] in self._local:
             yield (FUNCTION.match(head) or DECLARED.search(head) or [""])[1]
+        elif exported := re.search(r"\bNAME\(\w+\)(?=\()", head):
+            yield exported[0]
 
 
 def _declarations(text: str) -> Iterator[str]:
@@ -102,5 +141,5 @@ def _made(parameters: Iterable[str], names: Iterable[str], head: str) -> Iterato
     """Yield the names of functions that a macro defines, and those parts of them that the macro contains."""
     arguments = dict(zip(parameters, re.split(r"[(),]", head)[1:], strict=False))
     for name in names:
-        yield from [part for part in name.split("##") if part not in arguments]
+        yield from [part for part in name.split("##")[:1] if part not in arguments]
         yield "".join(arguments.get(part, part).strip() for part in name.split("##"))

@@ -81,10 +81,18 @@ class _Macros:
         word, condition = _directive(line)
         if word == "else":
             return True
-        match = DEFINED.fullmatch(condition if word in ("if", "elif") else f"defined({condition})")
+        if word in ("ifdef", "ifndef"):
+            condition = f"{'!' * (word == 'ifndef')}defined({condition})"
+        operator, decides = (" || ", True) if " || " in condition else (" && ", False)
+        terms = [self._term(term) for term in condition.split(operator)]
+        return decides if decides in terms else None if None in terms else not decides
+
+    def _term(self, term: str) -> bool | None:
+        """Return whether a condition on one macro holds; ``None`` if unknown."""
+        match = DEFINED.fullmatch(term)
         if match is None or match["macro"] in self.uncertain or match["macro"].startswith(("_", "SCVI_")):
             return None
-        return (match["macro"] in self.defined) != (word == "ifndef" or bool(match["negated"]))
+        return (match["macro"] in self.defined) != bool(match["negated"])
 
 
 def _joined(ends: Sequence[_Macros]) -> _Macros:

@@ -10,6 +10,7 @@ The support headers contain all of it: ``flow.h`` the function, ``xla_flow.h`` a
 frameworks.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import accumulate, chain
@@ -29,7 +30,6 @@ from scvi_codegen.codegen.rendering.kernels.simd import (
     POINTS,
     TRAJECTORIES,
     Fallback,
-    constrained_source,
     iteration_source,
     lane_table,
     loop_functions,
@@ -440,7 +440,8 @@ def _render(prefix: str, context: Mapping[str, object], entry: str = "stepper") 
     """Return the source of entry templates from their context, with defaults for all of them."""
     common = {"prefix": prefix, "target": DOUBLE, "real": DOUBLE.scalar, "max_iterations": MAX_ITERATIONS}
     absent = {"two_words": None, "rattle_in_pairs": False, "derivatives": None, "fallback": "none", "embedded": False}
-    environment, context = template_environment(), {**common, **absent, **context}
+    environment, context = template_environment(), {"diagonal_masses": None, **common, **absent, **context}
+    context["diagonal_masses"] = None if context["two_words"] else context["diagonal_masses"]
     record = HeaderRecord(cast(str, context["prefix"]), cast(str, context["real"]))
     recorded = context | {"prototype": record.prototype, "optional": record.optional}
     declarations = environment.get_template(DECLARATIONS[entry]).render(recorded)
@@ -536,16 +537,12 @@ def render_ensemble(
     if split is not None and not split.bodies:
         kernels, points, source = split.kernels, 1, splitting_source(split, observed)
         headers = {LEAP: splitting_header(split, Layout(lanes=True), action=program.acts_along)}
-    elif program.rattle and program.constraints and not program.damping:
-        kernels, points = program.rattle.kernels, program.rattle.points + 1
-        source = constrained_source(program.rattle, program.constraints)
     elif fixed_point is not None and fixed_point.serves_many:
         kernels, points = fixed_point.kernels, len(fixed_point.guess.abscissae)
         source = iteration_source(fixed_point, TRAJECTORIES, kernels=(*kernels, *((observed,) if observed else ())))
     else:
         return None
-    prefix, by_masses = f"{program.prefix}_ensemble", bool(program.rattle and program.rattle.lower_masses)
-    velocities = by_masses or (fixed_point is not None and fixed_point.kept is StoredValues.VELOCITIES)
+    prefix = f"{program.prefix}_ensemble"
     context = {
         "program": program,
         "points": points,
@@ -553,11 +550,10 @@ def render_ensemble(
         "counts": counts,
         "tangents": tangents,
         "cut": is_divided((*kernels, *((observed,) if observed else ()))),
-        "needs_velocities": velocities,
+        "needs_velocities": fixed_point is not None and fixed_point.kept is StoredValues.VELOCITIES,
         "hot": "static",
         "fixed_point": source,
         "own_headers": headers,
-        "scratch": scratch_size(program),
     }
     return _render(prefix, context, "ensemble")
 
@@ -649,9 +645,28 @@ def _context(
         "unrolled_equations": unrolled_equations(program, target),
         "vector_functions": loop_functions(_kernels_of_points(program)),
         "fallback": fallback,
+        "diagonal_masses": _diagonal_masses(program),
         **_control_context(program, control),
         **_lane_context(program, lanes, changes=beside is not None and bool(lanes)),
     }
+
+
+def _diagonal_masses(program: Program) -> Literal["exact", "rounded"] | None:
+    """Return how velocities follow from momenta by constant masses, without a matrix; ``None`` if they do not.
+
+    Products and quotients by powers of 2 are exact, by other masses rounded.
+    """
+    split, fixed_point, quantities = program.splitting, program.fixed_point, program.quantities
+    if split:
+        constant = split.drift if split.by_masses else None
+    else:
+        constant = fixed_point.constant_mass if fixed_point else None
+    otherwise = program.newton or quantities.hamiltonian or quantities.inverse_legendre
+    diagonal = tuple(quantities.mass_entries) == tuple((i, i) for i in range(program.dimension))
+    if constant is None or otherwise or not diagonal:
+        return None
+    powers = all(mass.is_number and math.frexp(float(mass))[0] == 0.5 for mass in constant.formulas)
+    return "exact" if powers and constant.formulas else "rounded"
 
 
 def _kernels_of_points(program: Program) -> tuple[Kernel, ...]:

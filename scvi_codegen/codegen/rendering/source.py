@@ -14,8 +14,9 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from scvi_codegen.codegen.rendering.own_names import with_own_names
-from scvi_codegen.codegen.rendering.preprocessor import preprocessed, specialised
+from scvi_codegen.codegen.rendering.own_names import with_exported_names, with_own_names
+from scvi_codegen.codegen.rendering.preprocessor import preprocessed
+from scvi_codegen.codegen.rendering.reachable import readable
 from scvi_codegen.systems.formulas.indices import Access, ArrayDeclarations, ArrayMap, Loop
 from scvi_codegen.version import __version__
 
@@ -142,29 +143,23 @@ class Source:
         """Sources to compile: this one, and those of :attr:`beside`."""
         return (self, *self.beside.sources) if self.beside else (self,)
 
-    def specialised(self) -> Source:
-        """Return the source with support headers for it alone, without alternatives that it does not use."""
-        support = specialised(self.code, dict(self.support).__getitem__)
-        return replace(self, support=support, beside=self.beside and self.beside.with_used_headers())
-
-    def with_used_headers(self) -> Source:
-        """Return the source without support headers that it includes under conditions that do not hold."""
-        used = {name for name, _ in specialised(self.code, dict(self.support).__getitem__)}
-        support = tuple((name, text) for name, text in self.support if name in used)
-        return replace(self, support=support, beside=self.beside and self.beside.with_used_headers())
-
     def amalgamated(self) -> Source:
         """Return the source as one file: support headers inserted, without alternatives that it does not use."""
         code = preprocessed(self.code, dict(self.support).__getitem__)
         beside = self.beside.amalgamated() if self.beside else None
         return replace(self, code=code, support=(), beside=beside)
 
+    def readable(self) -> Source:
+        """Return the source as one file without what no exported function uses, the step first."""
+        code = with_exported_names(readable(self.amalgamated().code))
+        return replace(self, code=code, support=(), beside=self.beside.readable() if self.beside else None)
+
     def single_file(self) -> Source:
         """Return the source as one file whose names have the integrator's prefix.
 
         Files of several integrators can be included in one translation unit.
         """
-        code = with_own_names(self.amalgamated().code, self.prefix, self.header)
+        code = with_own_names(self.readable().code, self.prefix, self.header)
         return replace(self, code=code, support=(), beside=self.beside.single_file() if self.beside else None)
 
     def to_record(self) -> dict[str, Any]:

@@ -247,7 +247,7 @@ class Page:
 def _integrator(model: Model) -> tuple[Source, Interface]:
     """Return the C of the integrator, and its interface; of arrays without conserved quantities."""
     source, interface = integrator_of(model, PREFIX)
-    source = source.specialised()
+    source = source.readable()
     check_example(model, controlled="advance_to" in source.contents.functions)
     if model.array_system is not None:
         interface = replace(interface, momentum_names=(), map_names=(), constraints=())

@@ -3,12 +3,7 @@
 
 /* SIMD lanes are trajectories: a vector contains values of LANES trajectories at one point. points.h defines the same
  * names. Requires: vectors.h. */
-enum {
-#ifdef TRAJECTORIES_AS_LANES
-  GROUPS = S - 1, /* vectors for all points of a constrained step but one */
-#else
-  GROUPS = S, /* vectors for all points */
-#endif
+enum { GROUPS = S, /* vectors for all points */
   TERMS = S < 8 ? S : 8 /* of a polynomial with a coefficient per point: no more are needed */
 };
 #define TABLE_ENTRY(table, point, j) (table)[point][j]

@@ -1,8 +1,10 @@
 /* Explicit splitting method (Hairer, Lubich & Wanner, Geometric Numerical Integration, sec. II.5): for every n
- *   p += h KICK[n] F(q, t + h KICK_ABSCISSA[n]),      q += h DRIFT[n] v,
- * with v = M^-1 p for constant masses (CONSTANT_MASSES), else v(p, t), for rigid bodies (ROTATING_BODIES) with the flow
- * of their kinetic energy in the time h DRIFT[n]. Of many trajectories, which are SIMD lanes, if LANES is
- * defined. Requires: step.h, status_codes.h; or trajectories.h. */
+ *   p += h KICK[n] F(q, t + h KICK_ABSCISSA[n]),      q += h DRIFT[n] v. */
+
+/* v = M^-1 p for constant masses (CONSTANT_MASSES), else v(p, t), for rigid bodies (ROTATING_BODIES) with the flow of
+ * their kinetic energy in the time h DRIFT[n]. Of many trajectories, which are SIMD lanes, if LANES is defined.
+ * Requires: step.h, status_codes.h; or trajectories.h. */
+
 #ifndef LANES
 typedef real number; /* a value of the trajectory */
 #endif

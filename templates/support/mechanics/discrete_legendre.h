@@ -1,10 +1,10 @@
 /* Discrete Lagrangian of an explicit method (EXPLICIT_STEPS) or of an implicit one (DISCRETE_LAGRANGIAN), with its
  * Legendre transforms; otherwise work and impulses of the forces of a step. */
+
 #if defined(EXPLICIT_STEPS)
 /* Discrete Lagrangian of the kick-drift-kick scheme (Stoermer-Verlet) and its discrete Legendre transforms. The drift
  * has the velocity (q1 - q0) / h, so that no equations are solved. Requires: splitting.h, energy. */
-
-SELDOM int NAME(discrete_legendre)(real t, real h, const real *q0, const real *q1, const real *parameters,
+int NAME(discrete_legendre)(real t, real h, const real *q0, const real *q1, const real *parameters,
     const solver_options *options, real *p0, real *p1, real *action, solver_report *report, real *workspace)
 {
   const real *ends[2] = {q0, q1};

@@ -42,7 +42,7 @@ int NAME(advance_to)(run_memory *run, real t_end, const step_control *control, l
   memset(report, 0, sizeof *report);
   now.step = step_from(run->t, 0, now.at.q, now.at.p, now.at.carry_q, now.at.carry_p, parameters, workspace);
   now.step.motion_of = run;
-  load_state(run, &now.at);
+  memcpy(&now.at, run, sizeof now.at);
 #ifdef MIXED_POINTS
   now.step.points = (double *)&now.points;
 #elif defined(ERROR_GROWTH)
@@ -59,7 +59,7 @@ int NAME(advance_to)(run_memory *run, real t_end, const step_control *control, l
           now.step.scratch + SCRATCH);
     if (status != OK) {
       run->guess = 0;
-      save_state(&now.at, run);
+      memcpy(run, &now.at, sizeof now.at);
       return status;
     }
     accept_trial(run, &now);
@@ -69,10 +69,12 @@ int NAME(advance_to)(run_memory *run, real t_end, const step_control *control, l
       const long long stored = report->stored++;
       store_row(&now.at, stored, t, q, p);
       iterations[stored] = (int)run->iterations;
+#ifdef RUN_ACTION
       store_action(run, stored);
+#endif
       run->iterations = 0;
     }
   }
-  save_state(&now.at, run);
+  memcpy(run, &now.at, sizeof now.at);
   return OK;
 }

@@ -813,7 +813,9 @@ static inline void accept_trial(run_memory *run, trial *now)
   if (run->measures_growth)
     measure_growth(run, &now->step, &now->data, now->points, now->dq, now->dp);
 #endif
+#ifdef RUN_ACTION
   add_action(run, &now->step, &now->data, now->guess);
+#endif
   add_increments(now->at.q, now->at.carry_q, now->dq);
   add_increments(now->at.p, now->at.carry_p, now->dp);
 #endif

@@ -1,7 +1,6 @@
 """Generated folders: a complete integrator as C code for C programs, and as an importable package for Python.
 
     pendulum_svi/  pendulum_svi.h  pendulum_svi.c   the integrator, C99
-                   support/                         headers, without alternatives that the integrator does not use
                    main.c  Makefile                 ``make run`` runs the example with a C compiler and libm
                    __init__.py  interface.json      ``import pendulum_svi`` provides ``pendulum_svi.stepper``
                    model.toml  README.md            the model file, and instructions
@@ -241,7 +240,7 @@ def generate_package(
         force: overwrite files of the same names that were edited or not generated.
         embedded: the precision, ``"double"`` or ``"single"``, of C for a microcontroller, without a Python package;
             arrays have the sizes of the model.
-        single_file: include the support headers in the single source file instead of separate files.
+        single_file: give all names at file scope the prefix, so that one C file can include several integrators.
 
     Returns:
         The folder.
@@ -307,7 +306,7 @@ def _texts(model: Model, prefix: str, embedded: Embedded | None, *, single_file:
     written = model_texts(model if model.events else model.with_known_sizes())  # events may contain loops over arrays
     model = model.with_known_sizes()
     source, interface = integrator_of(model, prefix, embedded=embedded)
-    source = source.single_file() if single_file else source.specialised()
+    source = source.single_file() if single_file else source.readable()
     controlled = "advance_to" in source.contents.functions
     texts = source.files
     texts |= render_example(interface, example_of(model, interface, controlled=controlled), embedded or "double")
@@ -356,7 +355,7 @@ def _texts_of_arrays(model: Model, prefix: str, embedded: Embedded | None, *, si
     source, interface = integrator_of(model, prefix)
     example, arrays = array_example_of(model, interface)
     lines = {f"{name}.txt": "".join(f"{x!r}\n" for x in values.reshape(-1).tolist()) for name, values in arrays.items()}
-    source = source.single_file() if single_file else source.specialised()
+    source = source.single_file() if single_file else source.readable()
     texts = {**source.files, **render_example(interface, example), **lines}
     if described := model_texts(model):
         texts |= {**described, "__init__.py": package_template("__init__.py")}

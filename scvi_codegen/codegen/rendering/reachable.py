@@ -1,0 +1,290 @@
+"""Source of one file as a reader needs it: what exported functions reach, each declaration behind those that it needs.
+
+The step comes first. Like :mod:`~scvi_codegen.codegen.rendering.own_names` this relies on the layout of the templates,
+where a declaration at file scope begins in the first column, and is not a C parser: a name counts as used wherever it
+occurs other than as a member.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+from scvi_codegen.codegen.rendering.own_names import FileScope
+
+FIRST = "NAME(step)"
+"""Function whose source comes first."""
+PREFIXED = {"NAME", "STATUS"}
+"""Macros of the prefix, which stay."""
+WORD = re.compile(r"\b(?:NAME|STATUS)\(\w+\)|(?<![.\w])(?<!->)[A-Za-z_]\w*")
+OUTSIDE = re.compile(rf"/\*(?:[^*]|\*(?!/))*\*/|{WORD.pattern}")
+"""Comments and, outside of them, names."""
+COMMENTS = re.compile(r"/\*.*?\*/", re.DOTALL)
+REQUIRED = re.compile(r"\s+(?:\* )?Requires:.*?(?= \*/)", re.DOTALL)
+INTERNAL = re.compile(r"(?:typedef|struct|enum|static)\b|#")
+"""Begin of a declaration without external linkage, as far as macros do not hide it."""
+CHOICE = re.compile(r"\b[A-Z]{4,}(?:_[A-Z]+)*\b")
+"""Name of an alternative or number in a comment."""
+CHOICES = "/* Choices of this integrator among the alternatives of the support headers. */\n"
+ENUMERATOR = re.compile(r"\s*(?P<name>\w+) = (?P<value>[^,]+)")
+STANDARD = {
+    "#include <float.h>": re.compile(r"(?:DBL|FLT)_"),
+    "#include <limits.h>": re.compile(r"U?L{0,2}(?:INT|LONG)_M"),
+}
+"""Headers of the C library that are omitted if none of their constants occurs."""
+ALIAS = re.compile(r"^typedef (?P<name>double|float|NAME\(\w+\)|struct NAME\(\w+\)) (?P<alias>\w+);.*\n", re.MULTILINE)
+STATUS = re.compile(r"^  (?P<alias>\w+) = (?P<name>STATUS\(\w+\)),?\n", re.MULTILINE)
+SHORT = re.compile(r"^#define (?P<macro>\w+) (?P<text>(?!\d)[\w ,]+|NAME\(\w+\))\n", re.MULTILINE)
+"""Macro for a name or words of a declaration, without a comment."""
+NAMING = re.compile(r"^#define (?P<macro>\w+)\((?P<of>\w+)\) (?P=of)(?:##(?P<end>\w+))?(?: /\*.*)?\n", re.MULTILINE)
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Declaration, macro, conditional or other line of the preprocessor at file scope.
+
+    Attributes:
+        comment: above it.
+        lines: without the comment.
+        names: that it declares.
+        conditions: lines of the conditionals around it.
+        section: comments above several parts, of which this is one.
+        joined: whether it follows the part before it without an empty line.
+        branches: of a conditional, the line that begins each and the parts below it.
+    """
+
+    comment: tuple[str, ...]
+    lines: tuple[str, ...]
+    names: frozenset[str]
+    conditions: tuple[str, ...]
+    section: tuple[str, ...]
+    joined: bool
+    branches: tuple[tuple[str, tuple[Part, ...]], ...] = ()
+
+    @cached_property
+    def words(self) -> frozenset[str]:
+        """Names that occur in it and in the conditions around it."""
+        return frozenset(WORD.findall(COMMENTS.sub("", "\n".join((*self.conditions, *self.lines)))))
+
+    @property
+    def leaves(self) -> Iterator[Part]:
+        """Parts that are no conditionals."""
+        if not self.branches:
+            yield self
+        for _, parts in self.branches:
+            for part in parts:
+                yield from part.leaves
+
+
+def readable(code: str) -> str:
+    """Return a source of one file without what no exported function reaches, the step first."""
+    if "#define NAME(" not in code:
+        return code
+    code = _without_aliases(code.replace(CHOICES, ""))
+    scope = FileScope(code)
+    parts = tuple(_parts(code.split("\n"), scope, ()))
+    text = "\n".join(_lines(_without_alternatives(_ordered(_reached(parts)))))
+    return re.sub(r"\n{3,}", "\n\n", text) + "\n"
+
+
+def _without_aliases(code: str) -> str:
+    """Return a source with the names that aliases have in C or in its header, and without macros of names."""
+    for pattern in (STATUS, ALIAS, ALIAS):  # an alias may be one of an alias
+        aliases = {match["alias"]: match["name"] for match in pattern.finditer(code)}
+        code = pattern.sub("", code).replace("enum {\n};\n", "")
+        code = _renamed(code, aliases)
+    for macro in re.findall(r"^#define (\w+) 1\n", code, re.MULTILINE):  # factors
+        if len(re.findall(rf"\b{macro}\b", code)) == len(re.findall(rf"\b{macro} \*", code)) + 1:
+            code = code.replace(f"#define {macro} 1\n", "").replace(f"{macro} * ", "")
+    for macro in [match["macro"] for match in SHORT.finditer(code)]:
+        if len(re.findall(rf"^ *#.*\b{macro}\b", code, re.MULTILINE)) == 1:
+            match = next(match for match in SHORT.finditer(code) if match["macro"] == macro)
+            code = _renamed(code.replace(match[0], ""), {macro: match["text"]})
+    for match in NAMING.finditer(code):
+        end = match["end"] or ""
+        code = re.sub(rf"\b{match['macro']}\(([\w.+-]+)\)", rf"\g<1>{end}", code.replace(match[0], ""))
+    return code
+
+
+def _renamed(code: str, names: Mapping[str, str]) -> str:
+    """Return a source with other names, but for comments and members."""
+    return OUTSIDE.sub(lambda match: names.get(match[0], match[0]), code)
+
+
+def _parts(lines: Sequence[str], scope: FileScope, conditions: tuple[str, ...]) -> Iterator[Part]:
+    """Yield the parts of lines at file scope in order."""
+    rest, joined, opened = iter(lines), False, False
+    section, comment = tuple[str, ...](), tuple[str, ...]()
+    for line in rest:
+        if not line:
+            if comment:
+                section, opened = ((*section, "\n".join(comment)) if opened else ("\n".join(comment),)), True
+            comment, joined = (), False
+            continue
+        block = (line, *_continued(line, rest))
+        if line.startswith("/*"):
+            comment += block
+            continue
+        if line.startswith("#if"):
+            branches = tuple(_branches(block, scope, conditions))
+            names = frozenset(name for _, parts in branches for part in parts for name in part.names)
+        else:
+            branches, names = (), _names(scope, block)
+        comment = tuple(REQUIRED.sub("", "\n".join(comment)).split("\n")) if comment else ()
+        yield Part(comment, block, names, conditions, section, joined and not comment, branches)
+        comment, joined, opened = (), True, False
+
+
+def _names(scope: FileScope, block: Sequence[str]) -> frozenset[str]:
+    """Return the names that a declaration or macro makes, without parts of them that a macro contains."""
+    return frozenset(name for name in scope.names("\n".join(block)) if not name.endswith("_")) - PREFIXED
+
+
+def _continued(line: str, rest: Iterator[str]) -> Iterator[str]:
+    """Yield the lines of a part or comment behind the first one."""
+    if line.startswith("/*"):
+        while not line.endswith("*/"):
+            line = next(rest)
+            yield line
+    elif line.startswith("#"):
+        depth, commented = int(line.startswith("#if")), False
+        while (commented := _is_open(line, commented)) or depth or line.endswith("\\"):
+            line = next(rest)
+            depth += line.startswith("#if") - line.startswith("#endif")
+            yield line
+    else:
+        code, depth = COMMENTS.sub("", line).rstrip(), 0
+        while (depth := depth + code.count("{") - code.count("}")) or not code.endswith((";", "}")):
+            line = next(rest)
+            code = COMMENTS.sub("", line).rstrip()
+            yield line
+
+
+def _is_open(line: str, before: bool) -> bool:
+    """Return whether a comment continues behind a line."""
+    return line.rfind("/*") > line.rfind("*/") or (before and "*/" not in line)
+
+
+def _branches(block: Sequence[str], scope: FileScope, outer: tuple[str, ...]) -> Iterator[tuple[str, tuple[Part, ...]]]:
+    """Yield the branches of a conditional."""
+    depth, start = 0, 0
+    for i, line in enumerate(block):
+        depth -= line.startswith("#endif")
+        if i and (depth == 0 or (depth == 1 and line.startswith(("#else", "#elif")))):
+            yield block[start], tuple(_parts(block[start + 1 : i], scope, (*outer, block[0])))
+            start = i
+        depth += line.startswith("#if")
+
+
+def _is_exported(part: Part) -> bool:
+    return any(name.startswith("NAME(") for name in part.names)
+
+
+def _reached(parts: Sequence[Part]) -> list[Part]:
+    """Return the parts that exported functions reach, with nothing else in conditionals."""
+    leaves = [leaf for part in parts for leaf in part.leaves]
+    by_name: dict[str, list[Part]] = {}
+    for leaf in leaves:
+        for name in leaf.names:
+            by_name.setdefault(name, []).append(leaf)
+    pending, reached = [leaf for leaf in leaves if _is_exported(leaf)], set[Part]()
+    while pending:
+        leaf = pending.pop()
+        if leaf not in reached:
+            reached.add(leaf)
+            pending += [other for word in leaf.words for other in by_name.get(word, ())]
+    kept = [left for part in parts if (left := _kept(part, reached))]
+    if any(part.branches for part in kept):  # what one branch uses is idle with another
+        kept = [left for part in parts if (left := part if part.branches and not part.names else _kept(part, reached))]
+    return _without_unused_numbers(kept)
+
+
+def _kept(part: Part, reached: set[Part]) -> Part | None:
+    """Return what remains of a part, if anything."""
+    if not part.branches:
+        return part if part in reached or not (part.names or part.conditions) else None
+    if not any(leaf in reached for leaf in part.leaves):
+        return None
+    branches = []
+    for line, parts in part.branches:
+        nameless = {leaf for each in parts for leaf in each.leaves if not leaf.names}
+        branches.append((line, tuple(left for each in parts if (left := _kept(each, reached | nameless)))))
+    lines = [text for line, parts in branches for text in (line, *_lines(parts))]
+    return replace(part, lines=(*lines, "#endif"), branches=tuple(branches))
+
+
+def _without_unused_numbers(parts: Sequence[Part]) -> list[Part]:
+    """Return parts without enumerators, and without headers of the C library, that nothing uses."""
+    words = set[str]().union(*(part.words for part in parts if part.lines[0] != "enum {"))
+    lists = [part for part in parts if part.lines[0] == "enum {"]
+    enumerators = {
+        match["name"]: match["value"] for part in lists for line in part.lines if (match := ENUMERATOR.match(line))
+    }
+    pending = [*words]
+    while pending:
+        values = WORD.findall(enumerators.pop(pending.pop(), ""))
+        pending += values
+        words.update(values)
+
+    def left(part: Part) -> Part:
+        if part not in lists:
+            return part
+        lines = [line for line in part.lines[1:-1] if not (match := ENUMERATOR.match(line)) or match["name"] in words]
+        return replace(part, lines=("enum {", *lines, "};"))
+
+    kept = [part for part in map(left, parts) if part.lines != ("enum {", "};")]
+    return [part for part in kept if not (of := STANDARD.get(part.lines[0])) or any(map(of.match, words))]
+
+
+def _ordered(parts: Sequence[Part]) -> list[Part]:
+    """Return parts with the step and what it needs first; in their order if a name has several declarations."""
+    by_name = {name: part for part in parts for name in part.names}
+    if sum(len(part.names) for part in parts) > len(by_name):
+        return [*parts]
+    order: dict[Part, None] = {}
+
+    def place(part: Part) -> None:
+        if part in order or part in placing:
+            return
+        placing.add(part)
+        needed = {by_name[word] for word in part.words & by_name.keys()}
+        for other in parts:
+            if other in needed:
+                place(other)
+        order[part] = None
+
+    placing = set[Part]()
+    first = [part for part in parts if not part.names]
+    for part in (*first, *(part for part in parts if FIRST in part.names), *filter(_is_exported, parts), *parts):
+        place(part)
+    return [*order]
+
+
+def _lines(parts: Sequence[Part]) -> Iterator[str]:
+    """Yield the lines of parts, comments of a section above the first one of it."""
+    sections, last = set[tuple[str, ...]](), None
+    for part in parts:
+        comments = () if part.section in sections else part.section
+        sections.add(part.section)
+        if last and not (part.joined and not comments and len(part.lines) == 1 == len(last.lines)):
+            yield ""
+        for comment in comments:
+            yield from comment.split("\n")
+            if part.comment:
+                yield ""
+        yield from part.comment
+        yield from part.lines
+        last = part
+
+
+def _without_alternatives(parts: Sequence[Part]) -> list[Part]:
+    """Return parts without comments of sections on alternatives that the source does not have."""
+    names = {name for part in parts for leaf in part.leaves for name in leaf.words}
+    kept = []
+    for part in parts:
+        comments = [REQUIRED.sub("", comment) for comment in part.section]
+        section = [each for each in comments if each != "/* */" and {*CHOICE.findall(each)} <= names]
+        kept.append(replace(part, section=tuple(section)))
+    return kept
