@@ -158,10 +158,14 @@ static void add_force_0(const problem *arrays, const lanes *restrict X, times t,
       values[0][index_i - begin] = by * value[0];
       values[1][index_i - begin] = by * value[1];
     }
-    for (long long index_i = begin; index_i < end; index_i++)
-      F[start_q + index_i + shift_i_plus_1] += values[0][index_i - begin];
-    for (long long index_i = begin; index_i < end; index_i++)
-      F[start_q + index_i] += values[1][index_i - begin];
+    const section part_0 = {begin + shift_i_plus_1, end + shift_i_plus_1};
+    const section part_1 = {begin, end};
+    const section common_0 = overlap(part_0, part_1);
+    lanes *restrict row_0 = F + start_q + 0;
+    add_ends(row_0, values[0], part_0, common_0);
+    add_ends(row_0, values[1], part_1, common_0);
+    for (long long at = common_0.first; at < common_0.end; at++)
+      row_0[at] = row_0[at] + values[0][at - part_0.first] + values[1][at - part_1.first];
   }
 }
 

@@ -63,6 +63,7 @@ from scvi_codegen.codegen.variants import (
     Lanes,
     NewtonFallback,
     Observing,
+    Sums,
     TangentVectors,
     Variant,
 )
@@ -460,7 +461,12 @@ class ArraySources(Sources):
     """C source of an integrator of arrays whose sizes are known at run time: loops over the arrays, without variants.
 
     Other systems of velocities than m v**2/2 are integrated by their Hamiltonian, if its terms are those of elements.
+
+    Attributes:
+        sums: of the increments of explicit steps.
     """
+
+    sums: Sums = "compensated"
 
     def _form_of(self, system: MechanicalSystem) -> MechanicalSystem:
         self.solver = "fixed-point" if self.solver == "auto" else self.solver
@@ -487,7 +493,7 @@ class ArraySources(Sources):
         try:
             if self.g is not None:
                 raise SizesRequiredError("time_transformation is not available for arrays of run-time sizes")
-            program = lower_arrays(system, self.method, prefix=self.prefix, solver=self.solver)
+            program = lower_arrays(system, self.method, prefix=self.prefix, solver=self.solver, sums=self.sums)
         except SizesRequiredError as error:
             raise SizesRequiredError(f"{error}. This concerns '{self.system.name}': {SIZES_REQUIRED}") from error
         layout = self.interface.layout

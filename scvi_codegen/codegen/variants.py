@@ -1,9 +1,14 @@
 """Variants of a compiled method: the further C sources of one integrator, each derived on first use."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal, TypeAlias, get_args
 
 from scvi_codegen.systems.event import Event
+
+Sums: TypeAlias = Literal["compensated", "plain"]
+"""Sums of the increments of explicit steps: with their rounding errors, or rounded."""
+
+SUMS: tuple[Sums, ...] = get_args(Sums)
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike
 from scvi_codegen.codegen.native.building import TUNED_FLAGS
 from scvi_codegen.codegen.native.compilers import REORDERING_FLAGS
 from scvi_codegen.codegen.rendering.source import AUTO, DOUBLE_DOUBLE, PRECISIONS, Interface, Source
-from scvi_codegen.codegen.variants import Derivatives, Variant
+from scvi_codegen.codegen.variants import SUMS, Derivatives, Sums, Variant
 from scvi_codegen.common.cache import cached_source, key_of
 from scvi_codegen.common.errors import MethodError, SizesRequiredError
 from scvi_codegen.common.validation import TEXTS, OfRunTimeSizes, check_kind, checks_arguments
@@ -59,6 +59,7 @@ def compile_stepper(
     sizes: Mapping[str, int] | None = None,
     tables: Mapping[str, ArrayLike] | None = None,
     precision: str = "double",
+    sums: str = "compensated",
 ) -> Stepper:
     """Derive, generate, compile and load the integrator of ``system`` by ``method``.
 
@@ -93,12 +94,17 @@ def compile_stepper(
         precision: ``"double"``; or ``"double-double"`` for states and results of 31 digits (docs/digits.md); or
             ``"auto"``: double, and double-double for runs with ``error=`` that double does not confirm, as
             ``run.confirmation.precision`` reports.
+        sums: of the increments of steps: ``"compensated"``, whose rounding errors are added to later steps (Kahan), or
+            ``"plain"``, for explicit methods and arrays of run-time sizes: faster, with rounding errors that grow with
+            the number of steps (docs/lattices.md).
 
     Raises:
         BuildError: if there is no C compiler.
         MethodError: if the method, the solver or another argument is not available for the system.
     """
     check_precision(precision, flags)
+    if sums not in SUMS:
+        raise MethodError(f"unknown sums {sums!r}: use {' or '.join(map(repr, SUMS))}")
     common: dict[str, Any] = {
         "solver": solver,
         "flags": flags,
@@ -111,7 +117,12 @@ def compile_stepper(
 
         check_kind(SYMMETRIES, symmetries, "symmetries")
     if isinstance(system, OfRunTimeSizes) and sizes is None and tables is None:
-        return _compile_arrays(system, method, symmetries, as_events(events), precision, common)
+        return _compile_arrays(system, method, symmetries, as_events(events), precision, common, sums)
+    if sums == "plain":
+        raise MethodError(
+            f"sums='plain' is not available for '{system.name}' with named coordinates or known sizes: leave out "
+            "sums=, or declare arrays, q[N], whose sizes each run gives"
+        )
     compiled = partial(compile_stepper, system, method, symmetries=symmetries, sizes=sizes, tables=tables, **common)
     if precision == AUTO:
         return _in_both_precisions(compiled, events)
@@ -138,6 +149,7 @@ def _compile_arrays(
     events: tuple[Event, ...],
     precision: str,
     common: Mapping[str, Any],
+    sums: Sums,
 ) -> Stepper:
     """Return the stepper of arrays whose sizes each run determines; ``common``: further arguments."""
     if precision == AUTO:
@@ -149,7 +161,10 @@ def _compile_arrays(
     discretisation = as_method(method, system)
     solver, prefix, g, controller = (common[name] for name in ("solver", "prefix", "time_transformation", "controller"))
     sources = CachedArraySources(system, discretisation, solver, prefix, (), g, controller)
+    sources.use_sums(sums)
     source, interface, reason = sources.of_run_time_sizes()
+    if source is None and sums == "plain":
+        raise MethodError(f"sums='plain' is not available for '{system.name}': {reason}")
     if system.constraints and isinstance(discretisation, StoermerVerlet):
         method = SVI(1, "gauss-lobatto:2")  # the name of RATTLE for known sizes
     of_sizes = partial(compile_stepper, system, method, **common)
@@ -261,12 +276,20 @@ class CachedSources:
 class CachedArraySources(CachedSources):
     """C source of an integrator of arrays of run-time sizes, from the cache if it was derived before."""
 
+    sums: Sums = "compensated"
+
+    def use_sums(self, sums: Sums) -> None:
+        """Use these sums for the increments of explicit steps, others than before in the cache."""
+        self.sums, self.key = sums, (*self.key, *([sums] if sums == "plain" else []))
+
     @cached_property
     def derived(self) -> Sources:
         """The source that is not in the cache, and its interface."""
         from scvi_codegen.codegen.pipeline import ArraySources
 
-        return ArraySources(self.system, self.method, self.solver, self.prefix, (), self.g, self.controller)
+        sources = ArraySources(self.system, self.method, self.solver, self.prefix, (), self.g, self.controller)
+        sources.sums = self.sums
+        return sources
 
     def of_run_time_sizes(self) -> tuple[Source | None, Interface, str | None]:
         """Return the C source for run-time sizes, or ``None``; the interface; the reason why there is none."""

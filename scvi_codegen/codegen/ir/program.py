@@ -19,6 +19,7 @@ from scvi_codegen.codegen.ir.equations import (
     Splitting,
 )
 from scvi_codegen.codegen.ir.kernel import Kernel, Number, NumberTable, RolledKernel
+from scvi_codegen.codegen.variants import Sums
 from scvi_codegen.systems.formulas.indices import Array, ArrayDeclarations, ArrayMap, Convolution
 
 LEAST_REUSED_UNKNOWNS = 32
@@ -390,9 +391,11 @@ class ArrayProgram(Program):
 
     Attributes:
         loops: the terms of the system.
+        increments: how those of explicit steps are added.
     """
 
     loops: RolledTerms
+    increments: Sums = "compensated"
 
     @property
     def momentum_maps(self) -> tuple[MomentumMap | ArrayMap, ...]:

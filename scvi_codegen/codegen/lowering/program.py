@@ -48,6 +48,7 @@ from scvi_codegen.codegen.lowering.stage_groups import (
     lowered_stage_group,
     system_kernel,
 )
+from scvi_codegen.codegen.variants import Sums
 from scvi_codegen.common.errors import MethodError
 from scvi_codegen.common.precision import Matrix, Vector, mp
 from scvi_codegen.methods.constraints import END_VELOCITY
@@ -201,7 +202,9 @@ def lower(
     )
 
 
-def lower_arrays(system: ArraySystem, method: Method, *, prefix: str, solver: str = "fixed-point") -> ArrayProgram:
+def lower_arrays(
+    system: ArraySystem, method: Method, *, prefix: str, solver: str = "fixed-point", sums: Sums = "compensated"
+) -> ArrayProgram:
     """Return the program of one step of a system of arrays of run-time sizes, with its terms in loops.
 
     Their masses are constant, so that the tables of a method are the same for every coordinate: those of a system of
@@ -211,6 +214,11 @@ def lower_arrays(system: ArraySystem, method: Method, *, prefix: str, solver: st
     stages, velocities = discretise(of_tables, method), bool(system.velocities)
     constrained = constrained_steps(system, stages, method)
     splitting = splitting_of(of_tables, method) if method.fractions and not constrained else None
+    if sums == "plain" and splitting is None:
+        raise MethodError(
+            f"sums='plain' is not available for {method.name} with '{system.name}': its steps are not explicit. Leave "
+            "out sums=, or use Stoermer-Verlet or a composition without constraints"
+        )
     iterated = constrained is None and splitting is None
     fixed_point = iteration_of(of_tables, stages, velocities=velocities) if iterated else None
     if fixed_point:
@@ -226,6 +234,7 @@ def lower_arrays(system: ArraySystem, method: Method, *, prefix: str, solver: st
         layout=Layout(**{kind: getattr(system, kind) for kind in arrays}, **_numbers_of(system)),
         fixed_point=fixed_point,
         splitting=splitting,
+        increments=sums,
         loops=loops,
         polynomial_curves=bool(fixed_point and (fixed_point.points > 1 or not velocities)),
     )

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from scvi_codegen.codegen.lowering.arrays import check_solver
+from scvi_codegen.codegen.variants import SUMS
 from scvi_codegen.common.display.cards import Html, card, listed, plain
 from scvi_codegen.common.errors import ModelFileError, StateError
 from scvi_codegen.common.representation import summary
@@ -65,8 +66,8 @@ class Model(TimeSpan):
             or axis and angle.
         p: (m,) initial momenta, or ``None`` if ``velocity`` is given.
         velocity: (m,) initial velocities, or ``None`` if ``p`` is given.
-        h, tolerance, error, span, steps, save_every, t, time_transformation, controller, precision, device, observe,
-            solver_tolerance, max_iterations, threads, action: as of
+        h, tolerance, error, span, steps, save_every, t, time_transformation, controller, precision, sums, device,
+            observe, solver_tolerance, max_iterations, threads, action: as of
                 :class:`~scvi_codegen.interfaces.models.time_span.TimeSpan`.
         inputs: by name a table of values, ``(t, values)`` or ``(t, values, kind)`` as :meth:`Stepper.integrate` accepts
             it, or a number; a run requires all inputs of the system.
@@ -287,6 +288,7 @@ class Model(TimeSpan):
             time_transformation=self.time_transformation,
             controller=self.controller,
             precision=self.precision or "double",
+            sums=self.sums or SUMS[0],
         )
         if self.mesh is not None and stepper.interface.layout.mesh is None:
             stepper.interface = replace(stepper.interface, layout=replace(stepper.interface.layout, mesh=self.mesh))

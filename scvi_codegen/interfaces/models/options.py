@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 from scvi_codegen.codegen.native.cuda import DEVICES
 from scvi_codegen.codegen.rendering.source import AUTO, DOUBLE_DOUBLE, PRECISIONS
+from scvi_codegen.codegen.variants import SUMS
 from scvi_codegen.common.errors import ModelFileError
 from scvi_codegen.common.validation import NUMERAL, TOLERANCE_RANGE, ExactNumber, checked_count
 from scvi_codegen.methods.controllers import CONTROLLERS, SYMPLECTIC
@@ -187,6 +188,11 @@ class RunOptions:
     precision: str | None = run_option(
         *("run", CHOICE, "", f"Arithmetic [double]; {DOUBLE_DOUBLE}: 31 digits; {AUTO}: this if --error requires it."),
         choices=PRECISIONS,
+        common=False,
+    )
+    sums: str | None = run_option(
+        *("run", CHOICE, "", "Sums of explicit steps of an array model [compensated]; plain: faster, rounded."),
+        choices=SUMS,
         common=False,
     )
     device: str | None = run_option(

@@ -9,6 +9,7 @@ from typing import Any, Self
 from scvi_codegen.codegen.native.cuda import DEVICES
 from scvi_codegen.codegen.native.options import SolverOptions
 from scvi_codegen.codegen.rendering.source import DOUBLE_DOUBLE, PRECISIONS
+from scvi_codegen.codegen.variants import SUMS
 from scvi_codegen.common.errors import MethodWarning, ModelFileError, warn
 from scvi_codegen.common.validation import LARGEST_COUNT
 from scvi_codegen.interfaces.models.options import (
@@ -49,6 +50,8 @@ class TimeSpan(RunOptions):
             requires adaptive steps.
         precision: ``"double-double"`` for runs with states of two words; ``"auto"``: double, and double-double for
             ``error`` that double does not confirm; ``None`` means ``"double"``.
+        sums: ``"plain"`` for explicit steps of arrays without compensation, as of
+            :func:`~scvi_codegen.compile_stepper`; ``None`` means ``"compensated"``.
         device: ``"cuda"`` for ensembles on a GPU; single runs are not available with it.
         observe: ``"extremes"`` or ``"energy"`` of ensembles, as of :meth:`Stepper.integrate_ensemble`.
         solver_tolerance, max_iterations: of the iteration on the stage equations, as of
@@ -63,7 +66,12 @@ class TimeSpan(RunOptions):
         for option in RUN_FIELDS:
             if (value := getattr(self, option.field)) is not None:
                 object.__setattr__(self, option.field, option.checked(value))
-        for name, choices in (("precision", PRECISIONS), ("device", DEVICES), ("observe", OBSERVED[:2])):
+        for name, choices in (
+            ("precision", PRECISIONS),
+            ("sums", SUMS),
+            ("device", DEVICES),
+            ("observe", OBSERVED[:2]),
+        ):
             if (value := getattr(self, name)) not in (None, *choices):
                 raise ModelFileError(f"unknown {name} {value!r}: use {' or '.join(map(repr, choices))}")
         if self.h is not None and (control := self._control):

@@ -5,7 +5,8 @@
 /* Splitting steps of an array system, with the equations of splitting.h, in few passes over memory. A pass adds the
  * forces of a kick and continues the coordinates behind them to the positions of the next kick, also into the next
  * step. Within a step the increments are in the memory of the compensation terms. Infinite and undefined numbers remain
- * in a state, so that many steps are checked at once; if one fails, they are repeated one by one. Requires: arrays.h,
+ * in a state, so that many steps are checked at once; if one fails, they are repeated one by one. With PLAIN_SUMS
+ * increments are added to the state at once, and their rounding errors are dropped. Requires: arrays.h,
  * add_forces, LEAPS, TOGETHER, the tables; with ROWS array_rows.h. */
 
 /* Workspace: positions of the next kick, forces at the end of a step; the state before steps that are checked. */
@@ -14,6 +15,14 @@ typedef struct {
   double *X, *F, *before;
   int equal_masses;
 } work_arrays;
+
+#ifdef PLAIN_SUMS
+#define INCREMENTS(run) (run)->p /* kicks add to the momenta themselves, */
+#define POSITIONS(run, work) (run)->q /* drifts to the positions */
+#else
+#define INCREMENTS(run) (run)->carry_p
+#define POSITIONS(run, work) (work)->X
+#endif
 
 enum { SECTION = 512 }; /* coordinates that stay in the first cache */
 
@@ -39,6 +48,7 @@ static inline int ends_with_a_kick(void)
   return KICK[0] != 0.0 && KICK[LEAPS - 1] != 0.0 && DRIFT[LEAPS - 1] == 0.0;
 }
 
+#ifndef PLAIN_SUMS
 /* Rounded sum of x and its increment, which becomes the rounding error (two-sum; Knuth, TAOCP vol. 2, sec. 4.2.2). */
 static inline void add_increment(double *x, double *increment)
 {
@@ -47,11 +57,29 @@ static inline void add_increment(double *x, double *increment)
   *x = sum;
 }
 
+#endif
+
 /* Continues `count` coordinates. Forces that were used in both steps become 0 for the next ones. */
 static inline __attribute__((always_inline)) void continue_coordinates(double *restrict q, double *restrict p,
     double *restrict dq, double *restrict dp, double *restrict X, double *restrict F,
     const double *restrict inverse_mass, long long count, continuation by)
 {
+#ifdef PLAIN_SUMS
+  (void)dq, (void)dp, (void)X;
+  for (long long i = 0; i < count; i++) {
+    double moving = p[i];
+    if (by.ends && ends_with_a_kick())
+      moving += by.end * F[i];
+    if (by.starts) {
+      moving += by.start * F[i];
+      F[i] = 0.0;
+    }
+    if (by.ends || by.starts)
+      p[i] = moving;
+    if (by.moves)
+      q[i] += by.drift * (inverse_mass[i] * moving);
+  }
+#else
   for (long long i = 0; i < count; i++) {
     double at = q[i], moving = p[i], more_q = dq[i], more_p = dp[i];
     if (by.ends) {
@@ -76,6 +104,7 @@ static inline __attribute__((always_inline)) void continue_coordinates(double *r
       dq[i] = more_q;
     }
   }
+#endif
 }
 
 /* Continues the coordinates of a section; the flags are constants of each loop. */
@@ -87,7 +116,7 @@ static void continue_section(const run_memory *run, const work_arrays *work, sec
 #define CONTINUE(ends, starts, moves, arrives)                                                                      \
   continue_coordinates(run->q + first, run->p + first, run->carry_q + first, run->carry_p + first, work->X + first, \
       work->F + first, masses, count, (continuation){ends, starts, moves, arrives, by->end, by->start, by->drift})
-    if (LEAPS > 2 && by->moves && !by->arrives) {
+    if ((LEAPS > 2 || !ends_with_a_kick()) && by->moves && !by->arrives) {
       if (by->ends)
         CONTINUE(1, 1, 1, 0);
       else if (by->starts)
@@ -147,13 +176,15 @@ static void take_step(run_memory *run, const problem *arrays, const work_arrays 
 {
   const double h = run->h;
   const int last = LEAPS - 1, kicks_end = ends_with_a_kick();
+  if (!kicks_end)
+    wait_at_barrier(run); /* other threads may continue coordinates of the former step */
   if (!continues && (run->guess || !kicks_end))
     continue_own(run, work, starting(h, 0, kicks_end));
   else if (!continues)
-    kick(run, arrays, work, run->q, run->t, h * KICK[0], run->carry_p, starting(h, 0, 0));
+    kick(run, arrays, work, run->q, run->t, h * KICK[0], INCREMENTS(run), starting(h, 0, 0));
   for (int k = 1; k < last + !kicks_end; k++) {
     const continuation then = {.ends = k == last, .moves = 1, .arrives = k == last - kicks_end, .drift = h * DRIFT[k]};
-    kick(run, arrays, work, work->X, run->t + KICK_ABSCISSA[k] * h, h * KICK[k], run->carry_p, then);
+    kick(run, arrays, work, POSITIONS(run, work), run->t + KICK_ABSCISSA[k] * h, h * KICK[k], INCREMENTS(run), then);
   }
   if (kicks_end) {
     const continuation then = into_next ? starting(h, 1, 1) : (continuation){.ends = 1, .end = h * KICK[last]};
@@ -165,7 +196,11 @@ static void take_step(run_memory *run, const problem *arrays, const work_arrays 
 /* Copies this thread's part of the state and of the forces at its end, or copies it back. */
 static void copy_state(const run_memory *run, const work_arrays *work, int back)
 {
+#ifdef PLAIN_SUMS
+  double *const now[] = {run->q, run->p, work->F};
+#else
   double *const now[] = {run->q, run->p, run->carry_q, run->carry_p, work->F};
+#endif
   const section own = mine(run, work->n);
   for (int k = 0; k < (int)(sizeof now / sizeof *now); k++) {
     double *here = now[k] + own.first, *saved = work->before + k * work->n + own.first;

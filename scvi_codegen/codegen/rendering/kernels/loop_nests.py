@@ -239,14 +239,55 @@ class Nest:
         if self.chunked:
             lines += [*self._part_passed_over(loop), f"lanes values[{len(self.rolled.writes)}][CHUNK];"]
         lines += _loop(loop, "begin", "end", inner)
-        together = [[line for of_target in behind for line in of_target]]
-        for statements in together if loop.near else behind:
-            lines += _loop(loop, "begin", "end", statements)
+        if loop.near:
+            lines += _loop(loop, "begin", "end", [line for of_target in behind for line in of_target])
+        else:
+            for targets in self._targets_by_rows(loop):
+                together = len(targets) > 1
+                lines += (
+                    self._sums_of_row(loop, targets) if together else _loop(loop, "begin", "end", behind[targets[0]])
+                )
         return [
             f"for (long long begin = {first}, end; begin < {end}; begin = end) {{",
             *(f"  {line}" for line in lines),
             "}",
         ]
+
+    def _targets_by_rows(self, loop: Loop) -> list[list[int]]:
+        """Return the targets in turn; together those that differ in the innermost index alone, if tasks add to all."""
+        if not self.chunked:
+            return []
+        rows: list[tuple[object, list[int]]] = []
+        for k, target in enumerate(self.rolled.writes):
+            last = target.places[-1] if target.places else Place()
+            along = last.index == loop.index and not (last.table or last.minus or target.sums)
+            row = (target.array, target.places[:-1]) if along and self.sharing is Sharing.IN_TURN else None
+            if row is not None and rows and rows[-1][0] == row:
+                rows[-1][1].append(k)
+            else:
+                rows.append((row, [k]))
+        return [targets for _, targets in rows]
+
+    def _sums_of_row(self, loop: Loop, targets: Sequence[int]) -> list[str]:
+        """Return the lines that add the values of a part to the elements of a row, in one loop where all targets reach.
+
+        At both ends they are added target by target, so that the sums of an element have the order of separate loops.
+        """
+        lines, row, value = [], "", ""
+        for k in targets:
+            access = self.rolled.writes[k]
+            shift = self.index(access.places[-1]).removeprefix(f"index_{loop.index}")
+            lines.append(f"const section part_{k} = {{begin{shift}, end{shift}}};")
+            value += f" + values[{k}][at - part_{k}.first]"
+            row = self.place_of(replace(access, places=(*access.places[:-1], Place())))
+        common = f"part_{targets[0]}"
+        for k in targets[1:]:
+            common = f"overlap({common}, part_{k})"
+        lines.append(f"const section common_{targets[0]} = {common};")
+        lines.append(f"lanes *restrict row_{targets[0]} = F + {row};")
+        lines += [f"add_ends(row_{targets[0]}, values[{k}], part_{k}, common_{targets[0]});" for k in targets]
+        head = f"for (long long at = common_{targets[0]}.first; at < common_{targets[0]}.end; at++)"
+        return [*lines, head, f"  row_{targets[0]}[at] = row_{targets[0]}[at]{value};"]
 
     def _span(self, loop: Loop) -> tuple[str, str]:
         """Return the first index and the end of a loop in a task."""

@@ -329,6 +329,7 @@ def integrator_of(model: Model, prefix: str, *, embedded: Embedded | None = None
 
     if model.array_system is not None:
         sources = ArraySources(model.array_system, model.method, model.solver, prefix)
+        sources.sums = "plain" if model.sums == "plain" else "compensated"
         source, interface = sources.integrator(controlled=False)
     else:
         source, interface = generate_source(
