@@ -97,7 +97,16 @@ static void sweep_odd(const sweep *of, long long block)
 static int kick_by_rows(const run_memory *run, const problem *arrays, const work_arrays *work, const double *X,
     double t, double by, double *F, const continuation *then)
 {
-  sweep of = {run, arrays, work, X, t, by, F, then, share_rows(run, arrays, work->n), rows_of(arrays)};
+  sweep of = {.run = run,
+      .arrays = arrays,
+      .work = work,
+      .X = X,
+      .t = t,
+      .by = by,
+      .F = F,
+      .then = then,
+      .how = share_rows(run, arrays, work->n),
+      .rows = rows_of(arrays)};
   const long long blocks = of.how.blocks;
   if (blocks == 1 || (of.how.of.end - of.how.of.first) / blocks < 2 * REACH)
     return 0;

@@ -215,8 +215,10 @@ static int is_state_finite(const run_memory *run, long long n)
   begin_sums(&all, run, n);
   while (next_block(&all)) {
     int faults = 0;
-    for (long long i = all.here.first; i < all.here.end; i++)
-      faults |= !is_finite(run->q[i]) | !is_finite(run->p[i]);
+    for (long long i = all.here.first; i < all.here.end; i++) {
+      faults |= !is_finite(run->q[i]);
+      faults |= !is_finite(run->p[i]);
+    }
     add_block(&all, faults, 0.0);
   }
   wait_at_barrier(run);
