@@ -14,7 +14,7 @@ The rooms, in the order of the way from L to a run; imports go up:
 * ``common``: what every room uses: errors, checks of arguments, the cache, atomic files, displays.
 * ``systems``: what the user states: formulas, Lagrangians, Hamiltonians, constraints, bodies, events.
 * ``methods``: tables of numbers, discretisations, controllers of step sizes, reference solutions in 60 digits.
-* ``codegen``: the way to C: intermediate form, lowering, rendering of ``templates/``, compilers.
+* ``codegen``: the way to C: intermediate form, lowering, statements of steps, rendering of ``templates/``, compilers.
 * ``fields``: densities, meshes, semi-discretisation, conservation laws.
 * ``runs``: states, steps, runs, events, ensembles, accuracy, results, recordings; ``compile_stepper``.
 * ``analysis``: chaos, periodic orbits, paths, estimation, advice, verification.

@@ -99,6 +99,8 @@ from scvi_codegen.methods import as_method as as_method
 from scvi_codegen.methods.exact.discrete_lagrangian import ExactStep as ExactStep
 from scvi_codegen.methods.exact.discrete_lagrangian import exact_discrete_lagrangian as exact_discrete_lagrangian
 from scvi_codegen.methods.exact.discrete_lagrangian import exact_map as exact_map
+from scvi_codegen.methods.explicit import ExplicitMethod as ExplicitMethod
+from scvi_codegen.methods.recurrence import ExplicitStep as ExplicitStep
 from scvi_codegen.methods.tables.nodes import Nodes as Nodes
 from scvi_codegen.methods.tables.nodes import chebyshev_lobatto as chebyshev_lobatto
 from scvi_codegen.methods.tables.nodes import equispaced as equispaced

@@ -11,7 +11,6 @@ from benchmarks.report import Contender
 from scvi_codegen.codegen.native import building
 from scvi_codegen.codegen.rendering.source import Source
 from scvi_codegen.methods.composition import Composition
-from scvi_codegen.methods.leapfrog_stages import kicks_and_drifts
 
 DECLARATIONS = (
     "void leapfrog(int is_field, double *q, double *v, double *work, long n, double strength, double h, long steps, "
@@ -47,7 +46,7 @@ def by_hand(case: Case, method: str, order: int, steps: int) -> Contender:
     code = LATTICES.read_text(encoding="utf-8")
     source = Source(prefix="lattices", header=f"{DECLARATIONS}\n", code=code, declarations=DECLARATIONS)
     library = building.load(source, flags=(*building.TUNED_FLAGS, "-ffast-math"))
-    kicks, drifts = (np.array([float(x) for x in row]) for row in kicks_and_drifts(Composition(order)))
+    kicks, drifts = (np.array([float(x) for x in row]) for row in Composition(order).kicks_and_drifts)
     is_field, count, strength = case.arrays.by_hand
 
     def prepare() -> Integrate:

@@ -10,7 +10,6 @@ import numpy as np
 from benchmarks.cases.unforced import Array, Case
 from benchmarks.report import Contender
 from scvi_codegen.methods.composition import Composition
-from scvi_codegen.methods.leapfrog_stages import kicks_and_drifts
 
 MESHES = ((128, 1e-4), (512, 1e-6), (2048, 1e-8))
 """Points of an axis and tolerance of py-pde, whose differences are of order 2."""
@@ -25,7 +24,7 @@ LARGEST = {1: 2048, 2: 512}
 def composed(order: int) -> tuple[Array, Array]:
     """Return kicks and drifts of leapfrog, Suzuki's composition of order 4 or that of this package of order 8."""
     if order != 4:
-        kicks, drifts = kicks_and_drifts(Composition(order))
+        kicks, drifts = Composition(order).kicks_and_drifts
         return np.array(kicks, dtype=float), np.array(drifts, dtype=float)
     p = 1.0 / (4.0 - 4.0 ** (1 / 3))
     parts = [p, p, 1.0 - 4.0 * p, p, p]

@@ -7,7 +7,8 @@
                                    (:mod:`scvi_codegen.codegen.lowering.program`)
       -> symmetries  Symmetry      conserved quantities (:mod:`scvi_codegen.systems.symmetry.symmetry`)
       -> lower       Program       kernels, tables, loops: intermediate form (:mod:`.lowering.program`)
-      -> render      Source        header, source: from ``templates/`` (:mod:`.rendering.program_source`);
+      -> render      Source        header, source: from ``templates/`` (:mod:`.rendering.program_source`), and from the
+                                   statements of explicit and constrained steps (:mod:`.statements.steps`);
                                    plus event detection, if requested (:mod:`scvi_codegen.codegen.rendering.events`)
 
 Two other consumers read a ``StageSystem``: :func:`scvi_codegen.interfaces.derivation.equations.derive` prints the
@@ -394,7 +395,7 @@ class Sources:
             MethodError: if velocities at given momenta, on which a function depends, have no formula.
         """
         system, program = self.system, self.program()
-        if render_ensemble(program) is None:
+        if program.rattle or render_ensemble(program) is None:
             return None
         states = *system.coordinates, *system.momentum_symbols
         match observed:

@@ -107,15 +107,18 @@ class _Leapfrogs(Method):
         """Exactness of straight lines, which composition preserves; f may be linear in q."""
         return Exactness(curve=1, quadrature=2, gauge=1)
 
-    def explicit_step(self, split: KineticSplitting) -> ExplicitStep:
-        """Return kick 0, drift 0, kick 1, .., of which the last drift is 0, and the first kick if drifts come first.
+    @property
+    def kicks_and_drifts(self) -> tuple[Vector, Vector]:
+        """Weights of the kicks and of the drifts: kick 0, drift 0, kick 1, .., the last drift being 0.
 
-        The step of free rigid bodies is one drift, which is exact.
+        If drifts come first, kick 0 has weight 0.
         """
         halves = tuple((a + b) / 2 for a, b in pairwise((mp.zero, *self.fractions, mp.zero)))
-        kicks, drifts = halves, (*self.fractions, mp.zero)
-        if self.drifts_first:
-            kicks, drifts = (mp.zero, *self.fractions), halves
+        return ((mp.zero, *self.fractions), halves) if self.drifts_first else (halves, (*self.fractions, mp.zero))
+
+    def explicit_step(self, split: KineticSplitting) -> ExplicitStep:
+        """Return kicks and drifts in turn; the step of free rigid bodies is one drift, which is exact."""
+        kicks, drifts = self.kicks_and_drifts
         if split.bodies and not any(split.force):
             kicks, drifts = (mp.zero, mp.zero), (mp.one, mp.zero)
         abscissae = tuple(mp.fsum(drifts[:n]) for n in range(len(kicks)))

@@ -1,7 +1,9 @@
 """The closed form: the paper's own example, names and displays; ``test_printed_formulas.py`` solves what is printed."""
 
 import re
+import textwrap
 
+import numpy as np
 import pytest
 import sympy
 from notation import lagrange
@@ -71,3 +73,45 @@ def test_singular_hamiltonians_have_no_printed_equations_where_velocities_are_ne
     assert not shear.is_regular
     with pytest.raises(sc.MethodError, match="singular"):
         paper_equations(shear, sc.Gauss(2, form="position"))
+
+
+@pytest.mark.parametrize("method", [sc.Composition(4), sc.StoermerVerlet("drift-kick-drift")], ids=lambda m: m.name)
+def test_printed_statements_and_tables_are_the_step(method):
+    """The lines of the text as they stand, with NumPy arrays in place of the index i."""
+    system = lagrange("springs", "x y", "3*x_dot**2/2 + y_dot**2 - (x - y)**2 - y**4/4 + x*sin(t)")
+    derived = sc.derive(system, method)
+    printed = derived.to_text().split("\nstatements of the C: ")[1:]
+    statements, tables = (textwrap.dedent(part.partition("\n")[2].partition("\n\n")[0]) for part in printed)
+    q0, p0, t, h = np.array([0.4, -0.3]), np.array([0.2, 0.5]), 0.75, 0.25
+
+    def force(u, at):
+        return np.array([-2 * (u[0] - u[1]) + np.sin(at), 2 * (u[0] - u[1]) - u[1] ** 3])
+
+    values = {
+        "q0": q0,
+        "p0": p0,
+        "t": t,
+        "h": h,
+        "force": force,
+        "known": False,
+        "inverse_mass": np.array([1 / 3, 0.5]),
+    }
+    values |= {"q": np.zeros(2), "p": np.zeros(2)}
+    values |= {line.partition(" = ")[0]: eval(f"[{line.partition(' = ')[2]}]") for line in tables.splitlines()}
+    exec(statements.replace("[i]", ""), values | {"LEAPS": range(len(values["KICK"]))})
+    end = sc.compile_stepper(system, method).step(q0, p0, h, t=t)
+    np.testing.assert_allclose([q0 + values["q"], p0 + values["p"]], end[:2], rtol=1e-15, atol=2e-16)
+    assert derived.to_latex().endswith("\\end{verbatim}")
+    assert "verbatim" not in derived._repr_latex_()
+
+
+def test_statements_of_constraints_are_those_of_their_masses():
+    constant, varying = (
+        lagrange("rod", "x y", f"x_dot**2/2 + y_dot**2*{mass}/2 - y", constraints=["x**2 + y**2 = 1"])
+        for mass in ("2", "(1 + x**2)")
+    )
+    first, second = ("".join(sc.derive(system, "svi:2").statements.values()) for system in (constant, varying))
+    assert "a[i] = mass(f[i])" in first
+    assert "momentum_terms" not in first
+    assert "invert(masses)" in second
+    assert not sc.derive(PENDULUM, "svi:2").statements

@@ -99,7 +99,7 @@ def test_ensembles_with_masses_of_zero_agree_with_single_runs(massless):
     )
     for k, (m, M) in enumerate(masses):
         run = massless.integrate(POSITION, [0.0] * 5, parameters={"m": m, "M": M}, h=0.01, steps=10)
-        assert np.array_equal(ensemble.q[-1, k], run.q[-1])
+        assert np.abs(ensemble.q[-1, k] - run.q[-1]).max() <= 4 * 2**-52
 
 
 @pytest.mark.second
@@ -154,7 +154,7 @@ def test_ensembles_of_mass_ratios_agree_with_single_runs(pendulum):
     ensemble = pendulum[0].integrate_ensemble(*states, parameters=parameters, h=0.005, steps=20)
     for k, m in enumerate(MASSES):
         run = pendulum[0].integrate(POSITION, [0.0] * 5, parameters={"m": m, "M": 1.0}, h=0.005, steps=20)
-        assert np.array_equal(ensemble.q[-1, k], run.q[-1])
+        assert np.abs(ensemble.q[-1, k] - run.q[-1]).max() <= 4 * 2**-52
 
 
 @pytest.mark.second

@@ -307,10 +307,11 @@ def _equals_single_run(case: Case, runs: Any, j: int, values: Any, way: Any, row
 
 
 def _rounding_of_lanes(case: Case, way: dict[str, Any]) -> float:
-    """Return the difference of SIMD lanes from single runs; adaptive ones are the same code."""
+    """Return the difference of SIMD lanes from single runs; adaptive ones are the same code, constrained ones round
+    alike."""
     if case.two_words and case.problem.text.get("constraints"):
         return 1e-28  # of initial states that are projected
-    if "t_end" in way:
+    if "t_end" in way or case.problem.text.get("constraints"):
         return 0.0
     if case.two_words:
         return 4e-31

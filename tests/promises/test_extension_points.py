@@ -70,7 +70,7 @@ def test_documented_additions_need_one_file_and_one_line() -> None:
     new, changes = additions()
     lines = [line for _, change in changes for line in change.splitlines() if line[:1] in "+-"]
     of_package = [path for path, _ in new if path.startswith("scvi_codegen/")]
-    assert len(of_package) == len(new) == 8
+    assert len(of_package) == len(new) == 9
     assert not any((ROOT / path).exists() for path, _ in new)
     assert all(line.startswith("+") for line in lines)
     assert sum("import" not in line for line in lines) == len(of_package) + 1, "an option is one entry"
@@ -100,6 +100,32 @@ same = own.equations.stage_groups == gauss.equations.stage_groups, own.fixed_poi
 print(*same, *(each.exact for each in own.quantities.momentum_maps))
 """
     assert run(extended, script).split() == ["True", "True", "True"]
+
+
+def test_documented_statements_are_a_method_in_each_layout(extended: Path) -> None:
+    """One text: a step in one and in two words, lanes equal to single runs, order and claims by the certificate."""
+    script = """
+import numpy as np
+from scvi_codegen import LagrangianSystem, compile_stepper, verify
+from scvi_codegen.methods import as_method
+L = "3*x_dot**2/2 + y_dot**2 - (x - y)**2 - y**4/4 + x*sin(t)"
+given, method = LagrangianSystem.from_text("springs", ["x", "y"], L), as_method("blanes-moan")
+q, p, span = np.array([1.0, 0.3]), np.array([0.1, -0.4]), {"h": 0.125, "steps": 16, "t": 0.5}
+exact = compile_stepper(given, "gauss:8").integrate(q, p, **span)
+for precision in ("double", "double-double"):
+    stepper = compile_stepper(given, method, precision=precision)
+    one, many = stepper.integrate(q, p, **span), stepper.integrate_ensemble([q, 2*q], [p, -p], **span)
+    other = stepper.integrate(2*q, -p, **span)
+    print(np.array_equal(many.q[:, 0], one.q), np.array_equal(many.q[:, 1], other.q), len(stepper.step(q, p, 0.1)))
+    print(abs(one.q[-1] - exact.q[-1]).max() < 2e-6)
+halved = stepper.integrate(q, p, h=0.0625, steps=32, t=0.5)
+print(12 < abs(one.q[-1] - exact.q[-1]).max() / abs(halved.q[-1] - exact.q[-1]).max() < 20)
+small = LagrangianSystem.from_text("pendulum", ["x"], "x_dot**2/2 + cos(x)")
+certificate = verify(small, method)
+print(certificate.passed, sorted({check.name for check in certificate.checks} & {"order", "symplecticity", "reversal"}))
+"""
+    lines = run(extended, script).splitlines()
+    assert lines == ["True True 2", "True"] * 2 + ["True", "True ['order', 'reversal', 'symplecticity']"]
 
 
 def test_documented_solver_agrees_with_newton(extended: Path) -> None:

@@ -6,7 +6,7 @@ matrix: on positions, on velocities, or on momenta and velocities
 (:mod:`~scvi_codegen.codegen.lowering.solvers.curves`).
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -48,6 +48,7 @@ from scvi_codegen.codegen.lowering.stage_groups import (
     lowered_stage_group,
     system_kernel,
 )
+from scvi_codegen.codegen.statements.steps import rattle_texts, splitting_texts
 from scvi_codegen.codegen.variants import Sums
 from scvi_codegen.common.errors import MethodError
 from scvi_codegen.common.precision import Matrix, Vector, mp
@@ -133,6 +134,21 @@ def splitting_of(system: MechanicalSystem, method: Method) -> Splitting | None:
         principal=lower_matrix(tuple(tuple(map(mp.mpf, map(str, axes))) for axes in split.axes if turned)),
         leaps=bool(method.fractions),
     )
+
+
+def step_texts(system: MechanicalSystem, method: Method) -> Mapping[str, str]:
+    """Return the statements from which the C of a step is generated, by their titles; none of other steps.
+
+    Raises:
+        MethodError: for a system that the method does not support.
+    """
+    if not system.constraints:
+        splitting = splitting_of(system, method)
+        return splitting_texts(splitting) if splitting else {}
+    stages = discretise(system, method)
+    extrapolation = _equations(system, method, stages, newton=False, curve=False).extrapolation
+    rattle = rattle_of(system, stages, extrapolation)
+    return rattle_texts(rattle) if rattle else {}
 
 
 def summing_splitting(splitting: Splitting, system: MechanicalSystem) -> Splitting:

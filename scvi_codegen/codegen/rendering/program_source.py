@@ -30,6 +30,7 @@ from scvi_codegen.codegen.rendering.kernels.simd import (
     POINTS,
     TRAJECTORIES,
     Fallback,
+    constrained_source,
     iteration_source,
     lane_table,
     loop_functions,
@@ -537,12 +538,16 @@ def render_ensemble(
     if split is not None and not split.bodies:
         kernels, points, source = split.kernels, 1, splitting_source(split, observed)
         headers = {LEAP: splitting_header(split, Layout(lanes=True), action=program.acts_along)}
+    elif program.rattle and program.constraints and not program.damping:
+        kernels, points = program.rattle.kernels, program.rattle.points + 1
+        source = constrained_source(program.rattle, program.constraints)
     elif fixed_point is not None and fixed_point.serves_many:
         kernels, points = fixed_point.kernels, len(fixed_point.guess.abscissae)
         source = iteration_source(fixed_point, TRAJECTORIES, kernels=(*kernels, *((observed,) if observed else ())))
     else:
         return None
-    prefix = f"{program.prefix}_ensemble"
+    prefix, by_masses = f"{program.prefix}_ensemble", bool(program.rattle and program.rattle.lower_masses)
+    velocities = by_masses or (fixed_point is not None and fixed_point.kept is StoredValues.VELOCITIES)
     context = {
         "program": program,
         "points": points,
@@ -550,10 +555,11 @@ def render_ensemble(
         "counts": counts,
         "tangents": tangents,
         "cut": is_divided((*kernels, *((observed,) if observed else ()))),
-        "needs_velocities": fixed_point is not None and fixed_point.kept is StoredValues.VELOCITIES,
+        "needs_velocities": velocities,
         "hot": "static",
         "fixed_point": source,
         "own_headers": headers,
+        "scratch": scratch_size(program),
     }
     return _render(prefix, context, "ensemble")
 

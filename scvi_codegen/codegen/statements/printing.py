@@ -171,9 +171,9 @@ class PointsAsLanes(Layout):
             case Place.FLAT:
                 return Value(f"{quantity.text}[{at and at.text} * GROUPS + g]", words)
             case Place.TABLE if words == 1:
-                return Value(f"load({text}, g)")
+                return Value(f"weights({text}, g)")
             case Place.TABLE:
-                return Value(f"ddl_of_words(load({text}, g), load({text}_LOW, g))", 2)
+                return Value(f"ddl_of_words(weights({text}, g), weights({text}_LOW, g))", 2)
         return Value(text, words, quantity.uniform)
 
     def write(self, quantity: Quantity, at: At | None, value: str) -> str:
@@ -200,7 +200,7 @@ class PointsAsLanes(Layout):
         count = COUNTS[quantity.index]
         if quantity.place is Place.GROUPS or quantity.words == 2:
             return f"{self.type_of(quantity)} {quantity.text}[{count}][GROUPS];"
-        return f"real {quantity.text}[{count}][GROUP_LANES];"
+        return f"number {quantity.text}[{count}][GROUP_LANES];"
 
 
 @dataclass

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
-from scvi_codegen.codegen.ir.equations import Splitting
+from scvi_codegen.codegen.ir.equations import Rattle, Splitting
 from scvi_codegen.codegen.statements.printing import Layout, Place, PointsAsLanes, Printer, Quantity
-from scvi_codegen.methods.statements import Apply, Assign, Operation, Read, Repeat, Statement, When, read
+from scvi_codegen.methods.statements import Apply, Assign, Operation, Read, Repeat, Statement, When, read, selected
 
 TURN = """\
 for (int k = 0; k < BODIES; k++) {
@@ -39,6 +39,23 @@ def splitting_step(split: Splitting, layout: Layout, *, action: bool) -> list[st
     printer = Printer({**arrays, **increments, **states, **numbers, **of_run}, layout, operations)
     statements = read(split.statements, [name for name, holds in features.items() if holds])
     return printer.function_body([*velocities_by_masses(statements)] if split.by_masses else statements)
+
+
+def splitting_texts(split: Splitting) -> dict[str, str]:
+    """Return the statements of an explicit step and its tables, by titles."""
+    features = [name for name, holds in (("masses", split.by_masses), ("bodies", split.bodies)) if holds]
+    rows = (f"{name} = {', '.join(f'{float(x):.17g}' for x in numbers)}\n" for name, numbers in split.numbers.items())
+    return {
+        "increments q and p of the state q0, p0": f"{selected(split.statements, features)}\n",
+        "tables of the statements": "".join(rows),
+    }
+
+
+def rattle_texts(rattle: Rattle) -> dict[str, str]:
+    """Return the statements of an iteration of a constrained step, by their title."""
+    text = RATTLE if rattle.part == "rattle" else COUPLED_RATTLE
+    features = [name.lower() for name in rattle.macros]
+    return {"an iteration for the positions u and multipliers lam at the points": f"{selected(text, features)}\n"}
 
 
 def velocities_by_masses(statements: Iterable[Statement]) -> Iterator[Statement]:
@@ -177,8 +194,8 @@ def _number(text: str, words: int = 1) -> Quantity:
 OF_POINTS = {
     "mass": "find_accelerations(now->inverse_mass, ARGUMENT, TARGET);",
     "solve": "solve_points(l[g], ARGUMENT);",
-    "factorise": "if (!factorised)\n  factorise_points(ARGUMENT, now->inverse_mass, l[g]);",
-    "invert": "if (!factorised)\n  invert_masses(now, g);",
+    "factorise": "refactorise_points(factorised, ARGUMENT, now->inverse_mass, l[g]);",
+    "invert": "invert_masses(factorised, now, g);",
 }
 VARYING_MASS = {name: text.replace("inverse_mass", "inverse_mass[g]") for name, text in OF_POINTS.items()}
 VECTOR_MASS = {"mass": "vector_accelerations(solved->inverse_mass, ARGUMENT, TARGET, g);"}
@@ -223,7 +240,8 @@ def rattle_iteration(part: str, features: Sequence[str]) -> str:
         lines = Printer(own, layout, VARYING_MASS).function_of_points(read(COUPLED_RATTLE))
     head = """\
 /* One iteration: updates the multipliers, accelerations or velocities, and positions, the last by `change`. */
-static inline void iterate(const step_data *step, rattle_step *now, factors *l, int factorised, lanes *change)
+static inline void iterate(const step_data *step, rattle_step *now, factors *l, condition factorised,
+    lanes *change)
 {
   const real scale = 1 / (step->h * step->h);
 """

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, overload
 
 import sympy
 
+from scvi_codegen.codegen.lowering.program import step_texts
 from scvi_codegen.common.display.cards import card, listed, plain
 from scvi_codegen.common.precision import Number
 from scvi_codegen.common.representation import LONGEST, clipped, counted
@@ -105,6 +106,11 @@ class StepEquations:
         return symmetries(self.system)
 
     @property
+    def statements(self) -> Mapping[str, str]:
+        """Statements that the C of a step is generated from, by their titles; none of other steps."""
+        return step_texts(self.system, self.method)
+
+    @property
     def jacobian(self) -> sympy.ImmutableSparseMatrix:
         """Derivatives of the residuals with respect to the unknowns, square and sparse."""
         size = len(self.unknowns)
@@ -118,11 +124,12 @@ class StepEquations:
     def to_text(self) -> str:
         """Return plain text: unknowns, equations, end state, guess, tables."""
         written = text_lines(self.equations, self._end, self.initial_guess, self.entries)
-        return "".join(f"{line}\n" for line in (*self._heading(), *written, *self._conserved()))
+        return "".join(f"{line}\n" for line in (*self._heading(), *written, *self._statements(), *self._conserved()))
 
     def to_latex(self) -> str:
-        """Return LaTeX: an ``align*`` environment with the paper's numbers as tags, and the tables."""
-        return latex(self.equations, self._end, self.entries, self.symmetries)
+        """Return LaTeX: ``align*`` with the paper's numbers as tags, the tables, and statements as ``verbatim``."""
+        listed = (f"\n\\begin{{verbatim}}\n{text}\\end{{verbatim}}" for text in self.statements.values())
+        return latex(self.equations, self._end, self.entries, self.symmetries) + "".join(listed)
 
     @property
     def _end(self) -> dict[sympy.Symbol, Equation]:
@@ -144,6 +151,11 @@ class StepEquations:
         yield f"known: {', '.join(s.name for s in (*q, *p, self.time, self.step))}"
         yield f"unknown: {', '.join(s.name for s in self.unknowns)}"
 
+    def _statements(self) -> Iterator[str]:
+        for title, text in self.statements.items():
+            yield f"\nstatements of the C: {title}"
+            yield from (f"  {line}" for line in text.splitlines())
+
     def _conserved(self) -> Iterator[str]:
         if self.symmetries:
             variables = "positions and momenta" if self.system.auxiliaries else "the coordinates"
@@ -159,7 +171,9 @@ class StepEquations:
     def _repr_latex_(self) -> str | None:
         """Return the LaTeX of all equations, nothing if a notebook could not show them."""
         size = sympy.count_ops(self.equations[0].residual) * len(self.equations)
-        return self.to_latex() if size <= MOST_SHOWN * LARGEST_SHOWN else None
+        if size > MOST_SHOWN * LARGEST_SHOWN:
+            return None
+        return latex(self.equations, self._end, self.entries, self.symmetries)
 
     def _repr_html_(self) -> str:
         shown = [html(equation) for equation in self.equations[:MOST_SHOWN]]

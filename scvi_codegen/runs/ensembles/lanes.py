@@ -109,14 +109,20 @@ class CommonRuns:
         """Return the trajectories as C integrates many in one call.
 
         ``None`` if memory of runs is not reusable, and of constraints with inputs, which single runs check for jumps.
+        Actions of constrained steps are summed by runs one after the other.
         """
         stepper, observation = self.ensemble.stepper, self.observation
-        binding = stepper._ensemble_binding if observation is None else observation.binding
+        constrained = bool(stepper.interface.constraints)
+        binding = None
+        if observation is not None:
+            binding = observation.binding
+        elif not (constrained and (self.ensemble.inputs or stepper.sums_action)):
+            binding = stepper._ensemble_binding
         if binding is not None:
             lanes = LaneRuns(binding, self.ensemble, self._fields(), common=self)
             self.done = lanes.done
             return lanes
-        if not stepper.binding.reusable or (self.ensemble.inputs and stepper.interface.constraints):
+        if not stepper.binding.reusable or (self.ensemble.inputs and constrained):
             return None
         return SuccessiveRuns(self.ensemble, self._store)
 
@@ -184,6 +190,7 @@ class LaneRuns(Batch):
         common: the trajectories whose failed lanes single runs continue; if ``None``, they are left.
 
     Attributes:
+        keeps_unknowns: whether the memory of a block contains the unknowns of the last step, as that of a single run.
         memory, active: of a part, the block, and a view of the flags of its active lanes.
         left: failed lanes of blocks that have ended, which single runs continue.
     """
@@ -194,6 +201,7 @@ class LaneRuns(Batch):
         super().__init__(binding, ensemble)
         self.fields, self.common, self.width = fields, common, len(binding.new("block *").active)
         self.needs_velocities = common is not None and bool(binding.constant("NEEDS_VELOCITIES"))
+        self.keeps_unknowns = bool(ensemble.stepper.interface.constraints)
 
     def prepare(self, first: int, end: int) -> None:
         """Set the C structure of a part, with the memory of a block."""
@@ -258,7 +266,9 @@ class LaneRuns(Batch):
             if ended:
                 self.done[j] = step
                 q, p, *low = (self.lanes(name)[..., lane].copy() for name in ("q", "p", "carry_q", "carry_p"))
-                self.left.append(Departure(j, step, q, p, (low[0], low[1])))
+                continued = step and common.steps.at(step)[0].h == common.steps.at(step - 1)[0].h
+                unknowns = self.lanes("memory")[..., lane].ravel() if self.keeps_unknowns and continued else None
+                self.left.append(Departure(j, step, q, p, (low[0], low[1]), unknowns))
         self.active[:] = 1.0 if ended else self.active
 
 
@@ -270,6 +280,7 @@ class Departure(NamedTuple):
         step: number of completed steps.
         q, p: (m,) state.
         low: compensation of the sums of q and p by the lane that the trajectory has left, ``None`` at the start.
+        unknowns: of the last step, if a single run predicts the next step by them.
     """
 
     j: int
@@ -277,6 +288,7 @@ class Departure(NamedTuple):
     q: Array
     p: Array
     low: tuple[Array, Array] | None = None
+    unknowns: Array | None = None
 
 
 def follow(common: CommonRuns, departure: Departure, check_stop: StopCheck) -> None:
@@ -310,7 +322,7 @@ def follow(common: CommonRuns, departure: Departure, check_stop: StopCheck) -> N
 
 def _started(common: CommonRuns, departure: Departure) -> Memory | None:
     """Return the memory of a single run; ``None`` if its start is not finite."""
-    ensemble, (j, step, q, p, low) = common.ensemble, departure
+    ensemble, (j, step, q, p, low, unknowns) = common.ensemble, departure
     segment, time = common.steps.at(step)
     parameters = ensemble.values_at(segment.middle, slice(j, j + 1))[0]
     arguments: dict[str, Any] = {"t": ensemble.t0, "parameters": parameters, "options": ensemble.settings.options}
@@ -320,7 +332,7 @@ def _started(common: CommonRuns, departure: Departure) -> Memory | None:
         common.status[j] = "not finite"
         return None
     if low is not None:
-        run._resume_at(step, time, low)
+        run._resume_at(step, time, low, unknowns)
     return run
 
 

@@ -135,6 +135,7 @@ FEATURES = {
             "error device observe_ensemble check_growth hessian chaos_ensemble flow advice shadow_energy",
             "make them terminal and restart",
         ),
+        ("with constraints", "device observe_ensemble", "use coordinates without constraints, or omit it"),
         ("with constraints", "periodic_orbit fit", "use coordinates without constraints, such as the angles of rods"),
         ("with constraints of arrays", "threads", "omit threads; the step uses one"),
         (

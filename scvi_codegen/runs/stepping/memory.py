@@ -407,12 +407,21 @@ class Memory:
         return self.stepper.named(vector(memory.carry_q).copy()), self.stepper.named(vector(memory.carry_p).copy())
 
     @alone
-    def _resume_at(self, steps: int, time: tuple[float, float], carries: tuple[Array, Array]) -> None:
-        """Continue a run made elsewhere: set its step number, double-double time and compensation terms of q and p."""
+    def _resume_at(
+        self, steps: int, time: tuple[float, float], carries: tuple[Array, Array], unknowns: Array | None = None
+    ) -> None:
+        """Continue a run made elsewhere: set its step number, double-double time and compensation terms of q and p.
+
+        With the unknowns of the last step the next one is predicted by them.
+        """
         self._memory.step = steps
         self._memory.t, self._memory.t_low = time
         for i, (cut_q, cut_p) in enumerate(zip(*map(np.ravel, carries), strict=True)):
             self._memory.carry_q[i], self._memory.carry_p[i] = cut_q, cut_p
+        if unknowns is not None:
+            self._memory.guess = 1
+            for i in range(len(self._memory.memory)):
+                self._memory.memory[i] = unknowns[i]
 
     @property
     def snapshot(self) -> bytes:

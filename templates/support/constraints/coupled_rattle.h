@@ -1,4 +1,4 @@
-#include "point_lanes.h"
+#include "multiplier_iteration.h"
 
 /* Constrained steps on Lobatto points for mass matrices M(q, t) that depend on positions, and for uniform damping,
  * whose factors e^(gamma c_n h) multiply the values at point n. Unknowns are the velocities v and multipliers lambda at
@@ -14,7 +14,7 @@
  * which neglects that M and G vary between the points and that F varies, errors of order h. Unconstrained systems have
  * the same iteration without multipliers (coupled_iteration.h).
  *
- * Requires: point_lanes.h with what it requires, MASSES_OF_POINTS, the kernel constrained_point of L_q + f and L_v,
+ * Requires: multiplier_iteration.h with what it requires, MASSES_OF_POINTS, the kernel constrained_point of L_q + f and L_v,
  * with the lower half of M, LOWER_MASS_ENTRY; MASS_REACH of M in the order MASS_POSITION; if DAMPED, damping.h; the
  * tables RATTLE_ABSCISSA, RATTLE_WEIGHT; RATTLE_DISPLACEMENT, RATTLE_IMPULSE, RATTLE_MEAN and, of the last point,
  * RATTLE_MEAN_OF_LAST with their low words; RATTLE_INVERSE of D I; RATTLE_LAST_VELOCITY, from v to the velocity at the
@@ -50,14 +50,16 @@ static void prepare_rattle(const step_data *step, rattle_data *data)
  * last_p. With f, y and c the right-hand sides of an iteration; base and base_p, q0 and p0 with the effect of low
  * words; at the end M^-1, end_mass and end_inverse, and L_v at v = 0, end_rest. */
 typedef struct {
-  const rattle_data *run;
-  real u[M][GROUP_LANES], at[M][GROUP_LANES], v[M][GROUP_LANES], force[M][GROUP_LANES], p[M][GROUP_LANES];
-  real mass[LOWER_MASSES][GROUP_LANES], g[CONSTRAINTS][GROUP_LANES], derivative[CONSTRAINT_ENTRIES][GROUP_LANES];
-  real first_derivative[CONSTRAINT_ENTRIES], last_force[M], last_p[M];
-  real f[M][GROUP_LANES], y[M][GROUP_LANES], c[CONSTRAINTS][GROUP_LANES];
-  lanes base[M][GROUPS], base_p[M][GROUPS], lambda[CONSTRAINTS][GROUPS];
+  number u[M][GROUP_LANES], v[M][GROUP_LANES], force[M][GROUP_LANES], derivative[CONSTRAINT_ENTRIES][GROUP_LANES];
+  lanes lambda[CONSTRAINTS][GROUPS];
+  number last_force[M];
+  number g[CONSTRAINTS][GROUP_LANES], at[M][GROUP_LANES], p[M][GROUP_LANES]; /* from here on not part of the solution */
+  number mass[LOWER_MASSES][GROUP_LANES], first_derivative[CONSTRAINT_ENTRIES], last_p[M];
+  number f[M][GROUP_LANES], y[M][GROUP_LANES], c[CONSTRAINTS][GROUP_LANES];
+  lanes base[M][GROUPS], base_p[M][GROUPS];
   inverse_masses inverse_mass[GROUPS], end_mass;
-  real end_inverse[INVERSE_MASSES], end_rest[M];
+  number end_inverse[INVERSE_MASSES], end_rest[M];
+  const rattle_data *run;
 } rattle_step;
 
 /* Inverts the masses of a group of points; not finite if they are singular. Coordinates that no masses couple share a
@@ -82,20 +84,29 @@ static inline void invert(const lanes *mass, inverse_masses inverse)
   }
 }
 
-/* Inverts the masses of a group of points. */
-static inline void invert_masses(rattle_step *now, int g)
+/* Inverts the masses of a group of points, except where the inverses are kept. */
+static inline void invert_masses(condition kept, rattle_step *now, int g)
 {
   lanes mass[LOWER_MASSES];
+  if (all_of(kept))
+    return;
 #pragma GCC unroll 64
   for (int e = 0; e < LOWER_MASSES; e++)
     mass[e] = load(now->mass[e], g);
+#ifdef TRAJECTORIES_AS_LANES
+  inverse_masses renewed;
+  invert(mass, renewed);
+  for (int e = 0; e < INVERSE_MASSES; e++)
+    now->inverse_mass[g][e] = where(kept, now->inverse_mass[g][e], renewed[e]);
+#else
   invert(mass, now->inverse_mass[g]);
+#endif
 }
 
 /* Evaluates the last point. */
 static inline void evaluate_last(const step_data *step, rattle_step *now)
 {
-  real u[2 * M] = {0}, value[2 * M], mass[LOWER_MASSES];
+  number u[2 * M] = {0}, value[2 * M], mass[LOWER_MASSES];
   for (int i = 0; i < M; i++) {
     u[i] = now->u[i][DEGREE - 1];
     for (int n = 0; n < DEGREE; n++)
@@ -119,7 +130,7 @@ static __attribute__((flatten)) void evaluate_points(const step_data *step, ratt
     for (int g = 0; g < GROUPS; g++)
       store(now->at[i], g, former(now->u[i], step->q0[i], g));
   for (int n = 0; n < GROUP_LANES; n++) {
-    real u[2 * M], value[2 * M], mass[LOWER_MASSES];
+    number u[2 * M], value[2 * M], mass[LOWER_MASSES];
     for (int i = 0; i < M; i++) {
       u[i] = now->at[i][n];
       u[M + i] = now->v[i][n];
@@ -134,7 +145,7 @@ static __attribute__((flatten)) void evaluate_points(const step_data *step, ratt
       now->mass[e][n] = mass[e];
   }
   for (int n = 0; n < GROUP_LANES; n++) {
-    real u[M], g[CONSTRAINTS], derivative[CONSTRAINT_ENTRIES];
+    number u[M], g[CONSTRAINTS], derivative[CONSTRAINT_ENTRIES];
     for (int i = 0; i < M; i++)
       u[i] = now->u[i][n];
     constraints(u, step->t + RATTLE_ABSCISSA[n + 1] * step->h, step->parameters, g, derivative);
@@ -183,30 +194,28 @@ static inline void find_forces(rattle_step *now)
 #include "iterate.h"
 
 /* Sizes of the terms of the displacements, with reactions if requested. */
-static inline void term_sizes(const step_data *step, rattle_step *now, int reactions, real *size)
+static inline void term_sizes(const step_data *step, rattle_step *now, int reactions, number *size)
 {
-  real force[M], inverse_mass[INVERSE_MASSES];
+  number force[M], inverse_mass[INVERSE_MASSES];
   for (int i = 0; i < M; i++)
     force[i] = now->force[i][0];
 #pragma GCC unroll 64
   for (int e = 0; e < INVERSE_MASSES; e++)
-    inverse_mass[e] = now->inverse_mass[0][e][0];
+    inverse_mass[e] = FIRST_LANE(now->inverse_mass[0][e]);
   find_term_sizes(step, force, now->first_derivative, reactions ? now->lambda : NULL, inverse_mass, size);
 }
 
 /* Initial values: the first point, and a guess of the others from the unknowns of the previous step, or if they are
- * NULL motion without forces. The low words of the tables act on the guess. */
-static int begin(const step_data *step, const rattle_data *run, const real *memory, rattle_step *now)
+ * NULL motion without forces of the velocities `start`. The low words of the tables act on the guess. */
+static void begin(const step_data *step, const rattle_data *run, const number *memory, const number *start,
+    rattle_step *now)
 {
-  real constraint[CONSTRAINTS], v0[M];
-  const int status = memory ? OK : find_velocity(step->t, step->q0, step->p0, step->parameters, v0, step->scratch);
-  if (status != OK)
-    return status;
+  number constraint[CONSTRAINTS];
   now->run = run;
   constraints(step->q0, step->t, step->parameters, constraint, now->first_derivative);
   for (int i = 0; i < M; i++)
     for (int g = 0; g < GROUPS; g++)
-      store(now->v[i], g, memory ? times(RATTLE_VELOCITIES, B, memory + i * B, g) : lanes_of(v0[i]));
+      store(now->v[i], g, memory ? times(RATTLE_VELOCITIES, B, memory + i * B, g) : lanes_of_number(start[i]));
   IN_MEMORY(now->v);
   for (int i = 0; i < M; i++)
     for (int g = 0; g < GROUPS; g++) {
@@ -222,23 +231,22 @@ static int begin(const step_data *step, const rattle_data *run, const real *memo
   for (int i = 0; i < M; i++)
     for (int g = 0; g < GROUPS; g++) {
       const lanes mean = times(RATTLE_MEAN_LOW, DEGREE, now->p[i], g) +
-          load(RATTLE_MEAN_OF_LAST_LOW, g) * now->last_p[i];
+          weights(RATTLE_MEAN_OF_LAST_LOW, g) * now->last_p[i];
       now->base_p[i][g] = step->p0[i] + (step->h * times(RATTLE_IMPULSE_LOW, DEGREE, now->f[i], g) - mean);
     }
-  return OK;
 }
 
 /* Velocities z of the curve, p1 - p0 before the projection, and the masses at the end. */
-static inline void finish_curve(const step_data *step, rattle_step *now, real *velocities, real *dp)
+static inline void finish_curve(const step_data *step, rattle_step *now, number *velocities, number *dp)
 {
-  real z[GROUP_LANES], u[2 * M] = {0}, value[2 * M], mass[LOWER_MASSES];
+  number z[GROUP_LANES], u[2 * M] = {0}, value[2 * M], mass[LOWER_MASSES];
   lanes end_mass[LOWER_MASSES];
   find_forces(now);
   for (int i = 0; i < M; i++) {
-    real sum = RATTLE_WEIGHT[DEGREE] * now->last_force[i];
+    number sum = RATTLE_WEIGHT[DEGREE] * now->last_force[i];
     for (int g = 0; g < GROUPS; g++)
       store(z, g, times(RATTLE_UNKNOWNS, DEGREE, now->v[i], g));
-    memcpy(velocities + i * B, z, sizeof(real) * DEGREE);
+    memcpy(velocities + i * B, z, sizeof(number) * DEGREE);
     for (int n = 0; n < DEGREE; n++)
       sum += RATTLE_WEIGHT[n] * now->f[i][n];
     dp[i] = step->h * sum;
@@ -251,19 +259,19 @@ static inline void finish_curve(const step_data *step, rattle_step *now, real *v
   memcpy(now->end_rest, value + M, sizeof now->end_rest);
 #pragma GCC unroll 64
   for (int e = 0; e < LOWER_MASSES; e++)
-    end_mass[e] = lanes_of(mass[e]);
+    end_mass[e] = lanes_of_number(mass[e]);
   invert(end_mass, now->end_mass);
 #pragma GCC unroll 64
   for (int e = 0; e < INVERSE_MASSES; e++)
-    now->end_inverse[e] = now->end_mass[e][0];
+    now->end_inverse[e] = FIRST_LANE(now->end_mass[e]);
 }
 
 #define END_MASSES(now) (now)->end_mass /* inverted, at the end */
 
 /* Velocities at the end, where the momenta are p0 + dp. */
-static inline void end_velocity(const step_data *step, const rattle_step *now, const real *dp, real *v)
+static inline void end_velocity(const step_data *step, const rattle_step *now, const number *dp, number *v)
 {
-  real p[M];
+  number p[M];
   for (int i = 0; i < M; i++)
     p[i] = (step->p0[i] - now->end_rest[i]) + dp[i];
   find_velocities(now->end_inverse, p, v);

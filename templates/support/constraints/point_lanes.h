@@ -1,31 +1,10 @@
 #include "../core/vector_width.h"
 #include "../newton/newton.h"
 
-/* Points of a constrained step as SIMD lanes, in groups that fill a register: vectors, systems of the multipliers,
- * convergence. The matrix P = G M^-1 G^T of a point is a band matrix factorised as L D L^T (Golub & Van Loan, Matrix
- * Computations, sec. 4.3.6). Requires: newton.h, constraints.h; PRODUCT, {e, f, row, distance, entry}: the product of
- * derivatives e and f and this entry of M^-1 is part of the entry of P in this row at this distance below the diagonal;
- * INVERSE_MASS_ENTRY, {i, j}: the lower half of M^-1, the diagonal first; MASS_COLUMN, a number below MASS_COLUMNS that
- * differs for coordinates that masses couple; CONSTRAINT_POSITION of constraints, CONSTRAINT_REACH of P; POINT_LANES, a
- * power of two. MASSES_OF_POINTS: M^-1 differs from point to point. */
+/* Points of a constrained step as SIMD lanes, in groups that fill a register. trajectory_lanes.h defines the same names.
+ * Requires: newton.h; POINT_LANES, a power of two. */
 #define RATTLE
 #pragma GCC diagnostic ignored "-Wpsabi" /* all functions with vector arguments are static */
-
-#define PREDICTED REAL(4.0) /* multiple of the next update, from the convergence rate, that is below the tolerance */
-#define SLOWEST_MULTIPLIERS REAL(0.5) /* convergence rate of the multipliers beyond which Newton's method is faster */
-#define TRANSIENT_ITERATIONS 2 /* that need not contract */
-#define LARGEST_REACTION REAL(8.0) /* times the size of forces: larger ones indicate light bodies */
-#define REUSED_FACTORS REAL(1e-2) /* relative update below which the factors of P are reused in the next iteration */
-#ifdef VELOCITY_FORCES
-#define MULTIPLIER_ROUNDOFF (16 * REAL_EPSILON) /* updates below it that decrease slowly are rounding errors, but with
-                                                * complex convergence rates: updates that grow may shrink later */
-#define ROUNDED_SHRINKING 1
-#define FASTEST_MULTIPLIERS REAL(2e-2) /* credible convergence rate; a lower one is accidental */
-#else
-#define FASTEST_MULTIPLIERS REAL(1e-3)
-#define MULTIPLIER_ROUNDOFF (64 * REAL_EPSILON)
-#define ROUNDED_SHRINKING STOPPED_SHRINKING
-#endif
 
 #ifdef SINGLE_PRECISION
 #define REGISTER_LANES (VECTOR_BYTES / 4)
@@ -67,6 +46,12 @@ typedef real lanes __attribute__((vector_size(LANE_BYTES)));
 #endif
 typedef lane_number lane_numbers __attribute__((vector_size(LANE_BYTES)));
 
+typedef real number; /* a value of the trajectory */
+typedef int condition;
+
+#define FIRST_LANE(x) (x)[0] /* value at the first point, of group 0 */
+#define LAST_LANE(x) (x)[(DEGREE - 1) % LANES] /* at the last one, of LAST_GROUP */
+
 #if defined(__AVX512F__) && POINT_LANES >= 8 && !defined(__clang__)
 #pragma GCC target("prefer-vector-width=512") /* loops over lanes become whole vectors, not halves */
 #endif
@@ -74,13 +59,6 @@ typedef lane_number lane_numbers __attribute__((vector_size(LANE_BYTES)));
 #define FORMER(x, before) __builtin_shufflevector(x, before, FORMER_LANES)
 #else
 #define FORMER(x, before) __builtin_shuffle(x, before, (lane_numbers){FORMER_LANES})
-#endif
-
-typedef lanes factors[CONSTRAINTS * (CONSTRAINT_REACH + 1)];
-#ifdef MASSES_OF_POINTS
-typedef lanes inverse_masses[INVERSE_MASSES];
-#else
-typedef real inverse_masses[INVERSE_MASSES];
 #endif
 
 #define LANE_FUNCTION static inline __attribute__((always_inline)) /* vectors are not passed to functions */
@@ -108,6 +86,17 @@ LANE_FUNCTION lanes lanes_of(real x)
 }
 #endif
 
+/* Group g of the numbers of a table, one for each point. */
+LANE_FUNCTION lanes weights(const real *table, int g)
+{
+  return load(table, g);
+}
+
+LANE_FUNCTION lanes lanes_of_number(number x)
+{
+  return lanes_of(x);
+}
+
 /* Group g of x at the points before, first at the first point. */
 LANE_FUNCTION lanes former(const real *x, real first, int g)
 {
@@ -127,146 +116,33 @@ LANE_FUNCTION lanes times(const real (*table)[POINT_LANES], int count, const rea
   return sum + other;
 }
 
-/* a = M^-1 f. */
-LANE_FUNCTION void find_accelerations(const inverse_masses inverse_mass, const lanes *f, lanes *a)
+static inline number magnitude(number x)
 {
-#pragma GCC unroll 64
-  for (int i = 0; i < M; i++)
-    a[i] = inverse_mass[i] * f[i];
-#pragma GCC unroll 64
-  for (int e = M; e < INVERSE_MASSES; e++) {
-    const int i = INVERSE_MASS_ENTRY[e][0], j = INVERSE_MASS_ENTRY[e][1];
-    a[i] += inverse_mass[e] * f[j];
-    a[j] += inverse_mass[e] * f[i];
-  }
+  return MATH(fabs)(x);
 }
 
-/* v = M^-1 p. */
-static inline void find_velocities(const real *inverse_mass, const real *p, real *v)
+static inline number larger_number(number a, number b)
 {
-  for (int i = 0; i < M; i++)
-    v[i] = inverse_mass[i] * p[i];
-  for (int e = M; e < INVERSE_MASSES; e++) {
-    const int i = INVERSE_MASS_ENTRY[e][0], j = INVERSE_MASS_ENTRY[e][1];
-    v[i] += inverse_mass[e] * p[j];
-    v[j] += inverse_mass[e] * p[i];
-  }
+  return larger(a, b);
 }
 
-/* Factorises a symmetric band matrix as L D L^T. The entry at distance b below the diagonal in row k is l[k (reach + 1)
- * + b]; the factors replace it, D^-1 at distance 0. Singular matrices lead to solutions that are not finite. */
-LANE_FUNCTION void factorise_band(lanes *l, int count, int reach)
+static inline int all_of(condition holds)
 {
-  const int width = reach + 1;
-  for (int k = 0; k < count; k++) {
-    lanes *row = l + k * width;
-    const int below = least(k, reach);
-    for (int b = below - 1; b > 0; b--)
-      for (int c = b + 1; c <= below; c++)
-        row[b] -= row[c] * l[(k - b) * width + c - b];
-    for (int b = 1; b <= below; b++) {
-      const lanes scaled = row[b] * l[(k - b) * width];
-      row[0] -= scaled * row[b];
-      row[b] = scaled;
-    }
-    row[0] = 1 / row[0];
-  }
+  return holds;
 }
 
-/* Solves a system with these factors. */
-LANE_FUNCTION void solve_band(const lanes *l, int count, int reach, lanes *x)
+/* a / b, 0 unless a is positive. */
+static inline number share(number a, number b)
 {
-  const int width = reach + 1;
-  for (int k = 1; k < count; k++)
-    for (int b = 1; b <= least(k, reach); b++)
-      x[k] -= l[k * width + b] * x[k - b];
-  for (int k = count - 1; k >= 0; k--) {
-    x[k] *= l[k * width];
-    for (int b = 1; b <= least(count - 1 - k, reach); b++)
-      x[k] -= l[(k + b) * width + b] * x[k + b];
-  }
+  return a > 0 ? a / b : 0;
 }
 
-/* Factorises P at a group of points with these derivatives. */
-static inline void factorise_points(const lanes *derivative, const inverse_masses inverse_mass, factors l)
-{
-  memset(l, 0, sizeof(factors));
-#pragma GCC unroll 64
-  for (int q = 0; q < PRODUCTS; q++) {
-    const int e = PRODUCT[q][0], f = PRODUCT[q][1];
-    l[PRODUCT[q][2] * (CONSTRAINT_REACH + 1) + PRODUCT[q][3]] +=
-        inverse_mass[PRODUCT[q][4]] * derivative[e] * derivative[f];
-  }
-  factorise_band(l, CONSTRAINTS, CONSTRAINT_REACH);
-}
-
-/* Solves P x = right with these factors, both in the order CONSTRAINT_POSITION. */
-static inline void solve_points(const factors l, lanes *x)
-{
-  solve_band(l, CONSTRAINTS, CONSTRAINT_REACH, x);
-}
-
-/* Sizes of the terms of the displacements by momenta, forces and, unless lambda is NULL, reactions, from the forces and
- * derivatives at the first point: forces and reactions cancel at a pinned coordinate, which may be 0. */
-static inline void find_term_sizes(const step_data *step, const real *first_force, const real *first_derivative,
-    lanes (*lambda)[GROUPS], const real *inverse_mass, real *size)
-{
-  real force[M], change[M], term[INVERSE_MASSES];
-  for (int i = 0; i < M; i++)
-    force[i] = MATH(fabs)(first_force[i]);
-  for (int e = 0; lambda && e < CONSTRAINT_ENTRIES; e++)
-    force[CONSTRAINT_ENTRY[e][1]] += MATH(fabs)(first_derivative[e] * lambda[CONSTRAINT_ENTRY[e][0]][0][0]);
-  for (int i = 0; i < M; i++)
-    force[i] = MATH(fabs)(step->p0[i]) + MATH(fabs)(step->h) * force[i];
-  for (int e = 0; e < INVERSE_MASSES; e++)
-    term[e] = MATH(fabs)(step->h * inverse_mass[e]);
-  find_velocities(term, force, change);
-  for (int i = 0; i < M; i++)
-    size[i] = MATH(fabs)(step->q0[i]) + change[i];
-}
-
-/* Inverts sizes; returns the largest one. */
-static inline real invert_sizes(real *size)
-{
-  real largest = 0;
-  for (int i = 0; i < M; i++) {
-    largest = larger(largest, size[i]);
-    size[i] = 1 / (size[i] + REAL_MIN);
-  }
-  return largest;
-}
-
-/* Returns 1 if the iterate that `moved` led to is accepted: its update, or the next one as predicted from the lower of
- * the last two rates, is below the tolerance, or rounding ended the decrease. 0: continue; -1: convergence is slow.
- * The rate is that of the largest coordinates: updates of one that is held at 0 may be rounding errors of others. */
-static inline int accepts(const movement *moved, const movement *last, const solver_options *options, int k)
-{
-  const int absolute = options->absolute;
-  const real now = absolute ? moved->absolute : moved->relative, tolerance = options->tolerance;
-  const real before = absolute ? last[0].absolute : last[0].relative;
-  const real earlier = absolute ? last[1].absolute : last[1].relative;
-  const real next = PREDICTED * now * larger(now, FASTEST_MULTIPLIERS * before); /* times `before` */
-  const int stagnant = moved->overall >= SLOWEST_MULTIPLIERS * last[0].overall &&
-      moved->overall >= SLOWEST_MULTIPLIERS * SLOWEST_MULTIPLIERS * last[1].overall;
-  if (absolute ? now < tolerance : now <= tolerance)
-    return 1;
-  if (k > 0 && next <= tolerance * before && PREDICTED * now * before <= tolerance * earlier)
-    return 1;
-  if (!absolute && moved->overall <= MULTIPLIER_ROUNDOFF && now >= ROUNDED_SHRINKING * before)
-    return 1;
-  if (!absolute && stagnant && moved->overall <= MULTIPLIER_ROUNDOFF && moved->overall >= last[0].overall)
-    return 1;
-  return k > TRANSIENT_ITERATIONS && stagnant && moved->overall > MULTIPLIER_ROUNDOFF ? -1 : 0;
-}
-
-#ifndef RATTLE_IN_PAIRS
 /* The larger of x and y, x where y is NaN. */
-LANE_FUNCTION lanes larger_lanes(lanes x, lanes y)
+LANE_FUNCTION lanes greater_lanes(lanes x, lanes y)
 {
   const lane_numbers chosen = (lane_numbers)(y > x);
   return (lanes)(((lane_numbers)y & chosen) | ((lane_numbers)x & ~chosen));
 }
-#endif
 
 LANE_FUNCTION real largest_lane(const lanes *x)
 {
@@ -276,20 +152,4 @@ LANE_FUNCTION real largest_lane(const lanes *x)
     for (int n = 0; n < half; n++)
       largest[n] = larger(largest[n + half], largest[n]);
   return largest[0];
-}
-
-/* Measures a change in units of these inverse sizes. Lanes beyond the points do not change. */
-static inline movement measure_change(const lanes *change, const real *inverse_size, real largest_size)
-{
-  movement moved = no_movement();
-  lanes relative = {0}, absolute = {0};
-  for (int n = 0; n < M * GROUPS; n++) {
-    const lanes size = (lanes)((lane_numbers)change[n] & BUT_SIGN);
-    relative = larger_lanes(relative, size * inverse_size[n / GROUPS]);
-    absolute = larger_lanes(absolute, size);
-  }
-  moved.relative = largest_lane(&relative);
-  moved.absolute = largest_lane(&absolute);
-  moved.overall = moved.absolute > 0 ? moved.absolute / largest_size : 0;
-  return moved;
 }

@@ -1,4 +1,5 @@
-#include "point_lanes.h"
+#include "../mechanics/mass_system.h"
+#include "multiplier_iteration.h"
 
 /* Constrained steps on Lobatto points for a constant mass matrix M (RATTLE for two points; Lobatto IIIA-IIIB: L. Jay,
  * SIAM J. Numer. Anal. 33, 1996), without the full Newton matrix: iteration for the multipliers that give g = 0 at the
@@ -19,7 +20,7 @@
  * (A - A0) at all points but the first the positions are less h Q w, Q = RATTLE_SHIFT with its low words, v is less
  * RATTLE_VELOCITY_SHIFT w, and da less R^-1 Q dw / h.
  *
- * Requires: point_lanes.h with what it requires, the kernels constrained_force and, with MOMENTUM_TERMS,
+ * Requires: multiplier_iteration.h with what it requires, the kernels constrained_force and, with MOMENTUM_TERMS,
  * constrained_momentum, A; the tables RATTLE_ABSCISSA, RATTLE_WEIGHT, RATTLE_START, RATTLE_MOMENTUM, RATTLE_RESPONSE
  * and RATTLE_DRIFT with their low words, RATTLE_INVERSE of R, and from the unknowns of the previous step
  * RATTLE_POSITIONS, in units of h, and RATTLE_MULTIPLIERS, padded with zeros; with VELOCITY_FORCES also
@@ -31,18 +32,21 @@
  * VELOCITY_FORCES force, positions `at` and velocities v are at all points but the last, and base_v is v without
  * forces. With MOMENTUM_TERMS A, w and its last change, at all points but the first, where A is first_A. */
 typedef struct {
-  real u[M][GROUP_LANES], a[M][GROUP_LANES], force[M][GROUP_LANES], g[CONSTRAINTS][GROUP_LANES];
-  real derivative[CONSTRAINT_ENTRIES][GROUP_LANES], first_force[M], first_derivative[CONSTRAINT_ENTRIES];
-  real inverse_mass[INVERSE_MASSES];
-  real v0[M];
-  lanes base[M][GROUPS], lambda[CONSTRAINTS][GROUPS];
+  number u[M][GROUP_LANES], force[M][GROUP_LANES], derivative[CONSTRAINT_ENTRIES][GROUP_LANES];
+  lanes lambda[CONSTRAINTS][GROUPS];
+#ifdef MOMENTUM_TERMS
+  number w[M][GROUP_LANES];
+#endif
+  number g[CONSTRAINTS][GROUP_LANES], a[M][GROUP_LANES]; /* from here on not part of the solution */
 #ifdef VELOCITY_FORCES
-  real at[M][GROUP_LANES], v[M][GROUP_LANES];
+  number at[M][GROUP_LANES], v[M][GROUP_LANES];
   lanes base_v[M][GROUPS];
 #endif
 #ifdef MOMENTUM_TERMS
-  real A[M][GROUP_LANES], w[M][GROUP_LANES], change[M][GROUP_LANES], first_A[M];
+  number A[M][GROUP_LANES], change[M][GROUP_LANES], first_A[M];
 #endif
+  number first_derivative[CONSTRAINT_ENTRIES], first_force[M], inverse_mass[INVERSE_MASSES], v0[M];
+  lanes base[M][GROUPS];
 } rattle_step;
 
 /* factor table w of momentum terms. */
@@ -54,7 +58,7 @@ typedef struct {
 
 /* Constants of a run. */
 typedef struct {
-  real inverse_mass[INVERSE_MASSES];
+  number inverse_mass[INVERSE_MASSES];
 } rattle_data;
 
 #ifdef RATTLE_IN_PAIRS
@@ -69,12 +73,12 @@ typedef struct {
 #endif
 
 /* Computes the lower half of M^-1; NaN if M is singular. Coordinates that no masses couple share a solution. */
-static void prepare_rattle(const step_data *step, rattle_data *data)
+static void invert_constant_masses(real t, const real *parameters, real *mass, real *inverse)
 {
   const band shape = band_of(M, 1);
-  real u[2 * M] = {0}, p[M], pivot[M], x[M], *mass = step->scratch;
+  real u[2 * M] = {0}, p[M], pivot[M], x[M];
   int regular;
-  transform_and_derivatives(step->t, u, step->parameters, p, mass);
+  transform_and_derivatives(t, u, parameters, p, mass);
   regular = factorise(mass, &shape, pivot);
   for (int column = 0; column < MASS_COLUMNS; column++) {
     for (int i = 0; i < M; i++)
@@ -83,15 +87,31 @@ static void prepare_rattle(const step_data *step, rattle_data *data)
       back_substitute(mass, &shape, pivot, x);
     for (int e = 0; e < INVERSE_MASSES; e++)
       if (MASS_COLUMN[INVERSE_MASS_ENTRY[e][1]] == column)
-        data->inverse_mass[e] = regular ? x[MASS_POSITION[INVERSE_MASS_ENTRY[e][0]]] : (real)NAN;
+        inverse[e] = regular ? x[MASS_POSITION[INVERSE_MASS_ENTRY[e][0]]] : (real)NAN;
   }
+}
+
+static void prepare_rattle(const step_data *step, rattle_data *data)
+{
+#ifdef TRAJECTORIES_AS_LANES
+  real mass[SCRATCH], inverse[INVERSE_MASSES], parameters[P + 1];
+  for (int j = 0; j < LANES; j++) {
+    for (int i = 0; i < P; i++)
+      parameters[i] = step->parameters[i][j];
+    invert_constant_masses(step->t, parameters, mass, inverse);
+    for (int e = 0; e < INVERSE_MASSES; e++)
+      data->inverse_mass[e][j] = inverse[e];
+  }
+#else
+  invert_constant_masses(step->t, step->parameters, step->scratch, data->inverse_mass);
+#endif
 }
 
 #ifdef VELOCITY_FORCES
 /* Forces at the point of a lane. */
-LANE_FUNCTION void force_of_lane(const step_data *step, const rattle_step *now, int n, real *force)
+LANE_FUNCTION void force_of_lane(const step_data *step, const rattle_step *now, int n, number *force)
 {
-  real u[2 * M];
+  number u[2 * M];
 #pragma GCC unroll 64
   for (int i = 0; i < M; i++)
     u[i] = now->at[i][n];
@@ -112,9 +132,9 @@ static inline void move_points(const step_data *step, rattle_step *now)
     }
 }
 #else
-LANE_FUNCTION void force_of_lane(const step_data *step, const rattle_step *now, int n, real *force)
+LANE_FUNCTION void force_of_lane(const step_data *step, const rattle_step *now, int n, number *force)
 {
-  real u[M];
+  number u[M];
 #pragma GCC unroll 64
   for (int i = 0; i < M; i++)
     u[i] = now->u[i][n];
@@ -132,7 +152,7 @@ static inline void move_points(const step_data *step, rattle_step *now)
 static inline __attribute__((flatten)) void evaluate_momenta(const step_data *step, rattle_step *restrict now)
 {
   for (int n = 0; n < GROUP_LANES; n++) {
-    real u[M], A[M];
+    number u[M], A[M];
     for (int i = 0; i < M; i++)
       u[i] = now->u[i][n];
     constrained_momentum(u, step->t + RATTLE_ABSCISSA[n + 1] * step->h, step->parameters, A);
@@ -165,7 +185,7 @@ static __attribute__((flatten)) void evaluate_points(const step_data *step, ratt
   evaluate_momenta(step, now);
   move_points(step, now);
   for (int n = 0; n < GROUP_LANES; n++) {
-    real u[M], force[M], g[CONSTRAINTS], derivative[CONSTRAINT_ENTRIES];
+    number u[M], force[M], g[CONSTRAINTS], derivative[CONSTRAINT_ENTRIES];
     const real t = step->t + RATTLE_ABSCISSA[n + 1] * step->h;
 #pragma GCC unroll 64
     for (int i = 0; i < M; i++)
@@ -210,9 +230,9 @@ static inline void all_forces(const rattle_step *now, const lanes *derivative, i
 }
 
 /* Sizes of the terms of the displacements, with reactions if requested. */
-static inline void term_sizes(const step_data *step, rattle_step *now, int reactions, real *size)
+static inline void term_sizes(const step_data *step, rattle_step *now, int reactions, number *size)
 {
-  real force[M];
+  number force[M];
   for (int i = 0; i < M; i++)
     force[i] = FIRST_FORCE(now, i);
   find_term_sizes(step, force, now->first_derivative, reactions ? now->lambda : NULL, now->inverse_mass, size);
@@ -223,7 +243,7 @@ static inline void term_sizes(const step_data *step, rattle_step *now, int react
 /* Values at the first point, and v0. */
 static inline void begin_first(const step_data *step, rattle_step *now)
 {
-  real constraint[CONSTRAINTS], p0[M];
+  number constraint[CONSTRAINTS], p0[M];
   memcpy(p0, step->p0, sizeof p0);
 #ifndef VELOCITY_FORCES
   constrained_force(step->q0, step->t, step->parameters, now->first_force);
@@ -239,23 +259,26 @@ static inline void begin_first(const step_data *step, rattle_step *now)
 }
 
 /* Initial values: the first point, and a guess of the others from the unknowns of the previous step, or if they are
- * NULL motion without forces. Rounded tables would be those of another method, whose energy drifts: the low words of R
+ * NULL motion without forces, of the velocities `start` where masses depend on positions. Rounded tables would be those of another method, whose energy drifts: the low words of R
  * act on the guess of the accelerations. */
-static int begin(const step_data *step, const rattle_data *run, const real *memory, rattle_step *now)
+static void begin(const step_data *step, const rattle_data *run, const number *memory, const number *start,
+    rattle_step *now)
 {
+  (void)start;
   memcpy(now->inverse_mass, run->inverse_mass, sizeof now->inverse_mass);
   begin_first(step, now);
   for (int i = 0; i < M; i++)
     for (int g = 0; g < GROUPS; g++) {
       const lanes z = memory ? times(RATTLE_POSITIONS, B, memory + i * B, g) : lanes_of(0);
-      const lanes drift = load(RATTLE_DRIFT, g);
+      const lanes drift = weights(RATTLE_DRIFT, g);
       const lanes moved = memory ? step->h * z : drift * (step->h * now->v0[i]);
       store(now->u[i], g, step->q0[i] + (step->carry_q[i] + moved));
       store(now->a[i], g, memory ? z - drift * now->v0[i] : z);
     }
   evaluate_momenta(step, now);
   for (int i = 0; i < M; i++) {
-    const real v = now->v0[i], moved = step->h * v, rate = 1 / step->h;
+    const real rate = 1 / step->h;
+    const number v = now->v0[i], moved = step->h * v;
     lanes a[GROUPS];
     for (int g = 0; g < GROUPS; g++)
       store(now->a[i], g, load(now->a[i], g) - OF_MOMENTA(-1, RATTLE_SHIFT, now->w[i], g));
@@ -266,29 +289,28 @@ static int begin(const step_data *step, const rattle_data *run, const real *memo
       store(now->a[i], g, a[g]);
     IN_MEMORY(now->a[i]);
     for (int g = 0; g < GROUPS; g++) {
-      const lanes low = load(RATTLE_DRIFT_LOW, g) * moved +
+      const lanes low = weights(RATTLE_DRIFT_LOW, g) * moved +
           step->h * step->h * times(RATTLE_RESPONSE_LOW, DEGREE, now->a[i], g) -
           OF_MOMENTA(step->h, RATTLE_SHIFT_LOW, now->w[i], g);
 #ifdef VELOCITY_FORCES
-      const lanes change = load(RATTLE_VELOCITY_START, g) * v +
+      const lanes change = weights(RATTLE_VELOCITY_START, g) * v +
           step->h * times(RATTLE_VELOCITY_LOW, DEGREE, now->a[i], g);
       now->base_v[i][g] = v + change;
 #endif
-      now->base[i][g] = step->q0[i] + (step->carry_q[i] + (low + load(RATTLE_DRIFT, g) * moved));
+      now->base[i][g] = step->q0[i] + (step->carry_q[i] + (low + weights(RATTLE_DRIFT, g) * moved));
     }
   }
   for (int k = 0; k < CONSTRAINTS; k++)
     for (int g = 0; g < GROUPS; g++)
       now->lambda[k][g] = memory ? times(RATTLE_MULTIPLIERS, B, memory + (M + k) * B, g) : lanes_of(0);
   evaluate_points(step, now);
-  return OK;
 }
 
 /* Force at the last point, where the velocity is that of the curve with velocities z. */
-static inline void last_force(const step_data *step, const rattle_step *now, const real *z, real *force)
+static inline void last_force(const step_data *step, const rattle_step *now, const number *z, number *force)
 {
 #ifdef VELOCITY_FORCES
-  real u[2 * M] = {0};
+  number u[2 * M] = {0};
   for (int i = 0; i < M; i++) {
     u[i] = now->u[i][DEGREE - 1];
     for (int b = 0; b < DEGREE; b++)
@@ -305,7 +327,7 @@ static inline void last_force(const step_data *step, const rattle_step *now, con
 #define END_MASSES(now) (now)->inverse_mass /* inverted, at the end */
 
 /* Velocities at the end, where the momenta are p0 + dp. */
-static inline void end_velocity(const step_data *step, const rattle_step *now, const real *dp, real *v)
+static inline void end_velocity(const step_data *step, const rattle_step *now, const number *dp, number *v)
 {
   (void)step;
   find_velocities(now->inverse_mass, dp, v);
@@ -318,10 +340,10 @@ static inline void end_velocity(const step_data *step, const rattle_step *now, c
 }
 
 /* Velocities z of the curve, and p1 - p0 before the projection. */
-static inline void finish_curve(const step_data *step, rattle_step *now, real *velocities, real *dp)
+static inline void finish_curve(const step_data *step, rattle_step *now, number *velocities, number *dp)
 {
   lanes derivative[CONSTRAINT_ENTRIES], f[M], a[M];
-  real force[M], all[M][GROUP_LANES], z[GROUP_LANES];
+  number force[M], all[M][GROUP_LANES], z[GROUP_LANES];
   for (int g = 0; g < GROUPS; g++) {
     former_derivatives(now, g, derivative);
     all_forces(now, derivative, g, f);
@@ -336,14 +358,14 @@ static inline void finish_curve(const step_data *step, rattle_step *now, real *v
     for (int g = 0; g < GROUPS; g++) {
       const lanes push = times(RATTLE_MOMENTUM, DEGREE, now->a[i], g) +
           times(RATTLE_MOMENTUM_LOW, DEGREE, now->a[i], g);
-      const lanes change = load(RATTLE_START, g) * now->v0[i] + step->h * push;
+      const lanes change = weights(RATTLE_START, g) * now->v0[i] + step->h * push;
       store(z, g, now->v0[i] + (change - OF_MOMENTA(1, RATTLE_PROJECTION, now->w[i], g)));
     }
-    memcpy(velocities + i * B, z, sizeof(real) * DEGREE);
+    memcpy(velocities + i * B, z, sizeof(number) * DEGREE);
   }
   last_force(step, now, velocities, force);
   for (int i = 0; i < M; i++) {
-    real sum = RATTLE_WEIGHT[DEGREE] * force[i];
+    number sum = RATTLE_WEIGHT[DEGREE] * force[i];
     for (int n = 0; n < DEGREE; n++)
       sum += RATTLE_WEIGHT[n] * all[i][n];
     dp[i] = step->h * sum;

@@ -3,7 +3,12 @@
 
 /* SIMD lanes are trajectories: a vector contains values of LANES trajectories at one point. points.h defines the same
  * names. Requires: vectors.h. */
-enum { GROUPS = S, /* vectors for all points */
+enum {
+#ifdef TRAJECTORIES_AS_LANES
+  GROUPS = S - 1, /* vectors for all points of a constrained step but one */
+#else
+  GROUPS = S, /* vectors for all points */
+#endif
   TERMS = S < 8 ? S : 8 /* of a polynomial with a coefficient per point: no more are needed */
 };
 #define TABLE_ENTRY(table, point, j) (table)[point][j]

@@ -43,11 +43,13 @@ static inline void push(const step_data *step, const iteration_data *data, lanes
 #include "moving_frame.h"
 #else
 
-/* 1 / the size of x at both ends of the step, which makes its changes relative, or `absolute`. */
-static inline void measure_ends(lanes (*x)[M], const solver_options *options, double absolute, double *inverse_size)
+/* 1 / the size of x at both ends of the step, which makes its changes relative, or `absolute`; groups of points are
+ * `apart` elements apart. */
+static inline void measure_ends(const lanes *x, int apart, const solver_options *options, double absolute,
+    double *inverse_size)
 {
   for (int i = 0; i < M; i++)
-    inverse_size[i] = fabs(at_start(x, i)) + fabs(at_end(x, i));
+    inverse_size[i] = fabs(at_first(&x[i])) + fabs(at_point(&x[i], apart, POINTS - 1));
   invert_sizes(options, absolute, inverse_size);
 }
 
@@ -154,11 +156,8 @@ static inline int iterate(const step_data *step, const iteration_data *data, his
         velocity_lanes(u[n], step->t + step->h * ABSCISSA[n], step->parameters, value[n]);
     }
     if (k == 0) {
-      for (int n = 0; n < GROUPS; n++)
-        for (int i = 0; i < M; i++)
-          momentum[n][i] = u[n][M + i];
-      measure_ends(value, options, fabs(step->h), velocity_size);
-      measure_ends(momentum, options, 1.0, momentum_size);
+      measure_ends(value[0], M, options, fabs(step->h), velocity_size);
+      measure_ends(u[0] + M, 2 * M, options, 1.0, momentum_size);
     }
     for (int n = 0; n < GROUPS; n++)
       for (int i = 0; i < M; i++) {

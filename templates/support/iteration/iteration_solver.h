@@ -43,7 +43,7 @@ static SELDOM int fall_back(int status, const step_data *step, double *dq, doubl
 
 typedef iteration_data solver_data;
 
-/* Returns 1 if 1 / m is finite: without a mass, the equations that Newton's method would solve have no motion in them. */
+/* Returns 1 if 1 / m is finite: without a mass, the equations that Newton's method would solve have no motion. */
 static int has_masses(const solver_data *data)
 {
 #ifdef SUPPORT_SEPARABLE_ITERATION_H

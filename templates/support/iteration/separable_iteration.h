@@ -149,27 +149,16 @@ static inline lanes sum_of_three(lanes x, lanes y, lanes rest)
   return sum + (((x - (sum - part)) + (y - part)) + rest);
 }
 
-/* Low words of a point with the low part of the coefficients of the forces. */
-PASS lanes coefficient_rests(const step_points *w, int g, drift_words of, long long i)
-{
-  return low_words(w, g, of, i) +
-      w->data->inverse_mass[i] * (w->data->square * SUM_OF_FORCES(PRODUCT_LOW, w, g, i));
-}
-
-/* A point with double-double coefficients. */
-PASS lanes accurate_point(const step_points *w, int g, drift_words of, long long i)
+/* Displacement of a point from q0 with double-double coefficients, and low words with those of q0. */
+PASS lanes displacement_of(const step_points *w, int g, long long i, lanes *low)
 {
   const iteration_data *data = w->data;
-  const lanes sum = SUM_OF_FORCES(PRODUCT, w, g, i);
-  return sum_of_three(lanes_of_number(w->step->q0[i]),
-      DRIFT[g] * of.high + data->inverse_mass[i] * (data->square * sum),
-      coefficient_rests(w, g, of, i) + data->inverse_mass[i] * (data->square_low * sum));
+  const drift_words of = DRIFT_OF(w, i);
+  const lanes sum = SUM_OF_FORCES(PRODUCT, w, g, i), rest = SUM_OF_FORCES(PRODUCT_LOW, w, g, i);
+  *low = low_words(w, g, of, i) + data->inverse_mass[i] * (data->square * rest) +
+      data->inverse_mass[i] * (data->square_low * sum);
+  return DRIFT[g] * of.high + data->inverse_mass[i] * (data->square * sum);
 }
-
-/* Increments of a coordinate: of q, with its low word, and of p. */
-typedef struct {
-  number q, q_low, p;
-} end_increments;
 
 /* sum_n weights_n F_n of a coordinate, with the remainder of the iteration. */
 PASS number weigh_forces(const step_points *w, const weight *weights, const weight *low, const lanes *further,
@@ -178,22 +167,6 @@ PASS number weigh_forces(const step_points *w, const weight *weights, const weig
   if (!w->former)
     return weigh_apart_twice(weights, low, &w->F[i], EXTENT(w->n));
   return weigh_apart_thrice(weights, low, &w->F[i], further, &w->former[i], EXTENT(w->n));
-}
-
-PASS end_increments increments_of(const step_points *w, long long i)
-{
-  const iteration_data *data = w->data;
-  const drift_words of = DRIFT_OF(w, i);
-  const lanes *position = w->former ? w->remainder->position : NULL;
-  const lanes *momentum = w->former ? w->remainder->momentum : NULL;
-  const number sum = weigh_forces(w, POINT_END_POSITION, POINT_END_POSITION_LOW, position, i);
-  const number kick = data->inverse_mass[i] * (data->square * sum), q = of.high + kick, part = q - of.high;
-  end_increments end;
-  end.q = q;
-  end.q_low =
-      (of.high - (q - part)) + (kick - part) + (of.low + data->inverse_mass[i] * (data->square_low * sum));
-  end.p = weigh_forces(w, data->kick, data->kick_low, momentum, i);
-  return end;
 }
 
 /* Adds the square of a change. For many coordinates with names the sum of the rounding errors would stay above the
@@ -232,7 +205,8 @@ PASS void refine_points(const step_points *w, section here)
 {
   for (long long i = here.first; i < here.end; i++)
     for (int g = 0; g < GROUPS; g++) {
-      w->X[g * OF_EACH * EXTENT(w->n) + i] = accurate_point(w, g, DRIFT_OF(w, i), i);
+      lanes low, moved = displacement_of(w, g, i, &low);
+      w->X[g * OF_EACH * EXTENT(w->n) + i] = sum_of_three(lanes_of_number(w->step->q0[i]), moved, low);
       if (w->former)
         w->former[g * EXTENT(w->n) + i] = w->F[g * EXTENT(w->n) + i];
     }
@@ -254,7 +228,7 @@ PASS void find_rough_increments(const step_points *w, number *dq, number *dp)
 #endif
 
 #if defined(SUMS_OF_EIGHT) && defined(EIGHT_COORDINATES)
-/* increments_of eight coordinates, which are lanes; dq_low: low words. */
+/* Increments of eight coordinates, which are lanes; dq_low: low words. */
 PASS void find_eight_increments(const step_points *w, int i, double *dq, double *dq_low, double *dp)
 {
   const iteration_data *data = w->data;
@@ -282,6 +256,9 @@ PASS void find_eight_increments(const step_points *w, int i, double *dq, double 
 /* Computes the increments of a range of coordinates; low words follow those of q. */
 PASS void find_increments(const step_points *w, section here, number *dq, number *dp)
 {
+  const iteration_data *data = w->data;
+  const lanes *position = w->former ? w->remainder->position : NULL;
+  const lanes *momentum = w->former ? w->remainder->momentum : NULL;
 #if defined(SUMS_OF_EIGHT) && defined(EIGHT_COORDINATES)
   enum { IN_EIGHTS = GROUPS == 1 ? M / 8 * 8 : 0 };
   for (int i = 0; i < IN_EIGHTS; i += 8)
@@ -289,8 +266,13 @@ PASS void find_increments(const step_points *w, section here, number *dq, number
   here.first = IN_EIGHTS;
 #endif
   for (long long i = here.first; i < here.end; i++) {
-    const end_increments end = increments_of(w, i);
-    dq[i] = end.q, dq[EXTENT(w->n) + i] = end.q_low, dp[i] = end.p;
+    const drift_words of = DRIFT_OF(w, i);
+    const number sum = weigh_forces(w, POINT_END_POSITION, POINT_END_POSITION_LOW, position, i);
+    const number kick = data->inverse_mass[i] * (data->square * sum), q = of.high + kick, part = q - of.high;
+    dq[i] = q;
+    dq[EXTENT(w->n) + i] =
+        (of.high - (q - part)) + (kick - part) + (of.low + data->inverse_mass[i] * (data->square_low * sum));
+    dp[i] = weigh_forces(w, data->kick, data->kick_low, momentum, i);
   }
 }
 
@@ -525,20 +507,18 @@ static number correct_points(const step_points *w)
 /* Corrects the points and, by their linear part, the forces, with double-double coefficients. */
 static void refine_forces(const step_points *w)
 {
-  const iteration_data *data = w->data;
+  const linear_part *linear = &w->data->linear;
   coordinates d[GROUPS];
   for (int i = 0; i < M; i++)
     for (int g = 0; g < GROUPS; g++) {
-      const lanes sum = SUM_OF_FORCES(PRODUCT, w, g, i);
-      d[g][i] = (w->step->q0[i] - w->X[g * M + i]) +
-          (DRIFT[g] * w->drifts[i].high + data->inverse_mass[i] * (data->square * sum)) +
-          (coefficient_rests(w, g, w->drifts[i], i) + data->inverse_mass[i] * (data->square_low * sum));
+      lanes low, moved = displacement_of(w, g, i, &low);
+      d[g][i] = (w->step->q0[i] - w->X[g * M + i]) + moved + low;
     }
-  solve_linear_part(&data->linear, d[0]);
+  solve_linear_part(linear, d[0]);
   for (int g = 0; g < GROUPS; g++)
     for (int i = 0; i < M; i++)
       w->X[g * M + i] += d[g][i];
-  correct_forces(&data->linear, d[0], w->F);
+  correct_forces(linear, d[0], w->F);
 }
 #else
 #define solves_linear_part(data) 0

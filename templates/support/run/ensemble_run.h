@@ -2,7 +2,7 @@
 
 /* Ensemble runs with compensated sums; trajectories are SIMD lanes. Requires: trajectories.h, numbers.h, and
  * prepare_iteration and fixed_point of a solver, which compute the increments of a step; EXPLICIT_STEPS if it does not
- * iterate. */
+ * repeat a failed step. */
 
 #ifdef DOUBLE_DOUBLE
 #define WORDS 2 /* of a number of a state, high words of a vector before low words */
@@ -237,8 +237,12 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
   step.points = (double *)points;
 #endif
   for (long long k = 0, stored = 0; k < steps; k++) {
+#ifdef TRAJECTORIES_AS_LANES
+    const history past = {memory[0], memory[1]};
+#else
     const long long parity = block->step % 2;
     const history past = {memory[1 - parity], memory[parity]};
+#endif
     step.t = block->t;
 #ifdef DOUBLE_DOUBLE
     step.t_low = block->t_low, step.h_low = block->h_low;

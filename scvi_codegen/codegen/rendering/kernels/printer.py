@@ -198,7 +198,8 @@ def print_statements(code: Kernel | Part, target: Target = DOUBLE) -> list[str]:
 def print_lane_statements(code: Kernel | Part, fixed_point: FixedPointIteration | None, sources: Sources) -> list[str]:
     """Return the statements of a kernel of vectors, or of one of its parts.
 
-    Variables that are the same in every lane remain numbers; derivatives are stored at their indices in the mass.
+    Variables that are the same in every lane remain numbers; derivatives of an iteration are stored at their indices in
+    the mass.
     """
     cut = parts(code) if isinstance(code, Kernel) else (code,)
     if len(cut) > 1:
@@ -221,7 +222,8 @@ def _call(part: Part) -> str:
 
 
 def _mass_element(fixed_point: FixedPointIteration | None, k: int) -> str:
-    assert fixed_point is not None  # explicit steps have no mass matrix
+    if fixed_point is None:  # of constraints, in the order of their entries
+        return f"derivative[{k}]"
     i, j = fixed_point.mass_entries[k] if fixed_point.mass_entries else (k, k)
     return f"derivative[{i}]" if fixed_point.diagonal else f"derivative[{i} * M + {j}]"
 

@@ -16,8 +16,10 @@ from typing import Literal, TypeAlias
 
 from scvi_codegen.codegen.ir.equations import (
     AdaptivePredictor,
+    Constraints,
     FixedPointIteration,
     LinearPart,
+    Rattle,
     Splitting,
     StoredValues,
 )
@@ -176,6 +178,25 @@ def splitting_source(split: Splitting, observed: Kernel | None = None) -> Iterat
         mass=split.drift if split.by_masses else None,
         damping=None,
         support=("iteration/splitting",),
+    )
+
+
+def constrained_source(rattle: Rattle, constraints: Constraints) -> IterationSource:
+    """Return the template data of constrained steps of many trajectories, which are lanes."""
+    kernels = (*rattle.kernels, constraints.kernel, constraints.rounding, constraints.motion)
+    functions = {name for kernel in kernels for name in lane_functions(kernel, TRAJECTORIES.sources)}
+    names = ("EXPLICIT_STEPS", "TRAJECTORIES_AS_LANES", "EXACT_ROOTS")
+    return IterationSource(
+        lanes=1,
+        whole=False,
+        meaning=TRAJECTORIES,
+        defines=dict.fromkeys(names, "1"),
+        functions=tuple(map(_vector_function, sorted(functions))),
+        tables=(),
+        kernels=kernels,
+        mass=None,
+        damping=None,
+        support=(f"constraints/{rattle.part}", "constraints/many_constrained"),
     )
 
 

@@ -26,6 +26,8 @@ from scvi_codegen.interfaces.derivation.notation import events_text
 def derive(model_name: str, latex: bool, radicals: bool, output: str | None, html: str | None, **choices: Any) -> None:
     """Print the equations of one step of MODEL: unknowns, stage equations, end state.
 
+    Of explicit and of constrained steps also the statements that the C is generated from.
+
     --html writes a self-contained page with the whole derivation: equations of motion, trial curve, tables, equations
     with the paper's numbers, Jacobian, operation counts, and the C code next to its formulas.
 
@@ -73,5 +75,6 @@ def _formulas(equations: StepEquations) -> dict[str, Any]:
         },
         "initial_guess": {symbol.name: str(value) for symbol, value in equations.initial_guess.items()},
         "entries": {entry.symbol.name: float(entry.value) for entry in equations.entries},
+        "statements": dict(equations.statements),
         "conserved": [str(symmetry) for symmetry in equations.symmetries],
     }

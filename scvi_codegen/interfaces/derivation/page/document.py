@@ -10,6 +10,7 @@ from sympy import Symbol
 
 from scvi_codegen.codegen.ir.kernel import Kernel
 from scvi_codegen.codegen.ir.program import Program
+from scvi_codegen.codegen.lowering.program import step_texts
 from scvi_codegen.codegen.pipeline import c_identifier, program_of
 from scvi_codegen.codegen.rendering.outline import Function, functions_of, reached
 from scvi_codegen.codegen.rendering.program_source import render
@@ -267,10 +268,22 @@ def _sections(system: MechanicalSystem, method: Method) -> Iterator[Section]:
     yield stage_section(system, stages)
     yield idel_section(system, stages)
     yield component_equations_section(derived)
+    if texts := step_texts(system, method):
+        yield statements_section(texts)
     yield jacobian_section(system, stages, derived, program)
     yield operations_section(program)
     yield kernels_section(system, program, functions)
     yield functions_section(system, method, program, functions)
+
+
+def statements_section(texts: Mapping[str, str]) -> Section:
+    """Return the section with the statements that the C of a step is generated from."""
+    paragraph = Paragraph(
+        "The C of a step is generated from these statements, for all coordinates i, constraints k and nonzero "
+        "derivatives e of constraints; A @ x[i] is a sum over the points of a step."
+    )
+    listed = (each for title, text in texts.items() for each in (Paragraph(f"{title.capitalize()}:"), Listing(text)))
+    return Section(name="statements", title="Statements", contents=(paragraph, *listed))
 
 
 COUNTS = re.compile(r" Operations: .*$")

@@ -1,0 +1,95 @@
+#include "../core/trajectories.h"
+
+/* Trajectories as SIMD lanes of a constrained step, whose points are in turn: group g is point g. point_lanes.h defines
+ * the same names, and the order of sums is the same. Requires: trajectories.h; POINT_LANES, columns of the tables. */
+#define RATTLE
+#define LANE_FUNCTION static inline __attribute__((always_inline)) /* vectors are not passed to functions */
+#define IN_MEMORY(values) (void)0
+#define BUT_SIGN LLONG_MAX
+#define FIRST_LANE(x) (x)
+#define LAST_LANE(x) (x)
+
+enum {
+  DEGREE = B - 1, /* of B points; point n + 1 of positions is point n of forces and multipliers */
+  GROUP_LANES = DEGREE,
+  LAST_GROUP = DEGREE - 1
+};
+typedef long long lane_numbers __attribute__((vector_size(8 * LANES)));
+typedef lane_numbers condition; /* all bits of the lanes where it holds */
+
+/* Change of an iteration: the largest ratio to the own size, the ratio of the largest to the largest size, and the
+ * largest itself. */
+typedef struct {
+  number relative, overall, absolute;
+} movement;
+
+LANE_FUNCTION lanes load(const lanes *x, int g)
+{
+  return x[g];
+}
+
+LANE_FUNCTION void store(lanes *x, int g, lanes values)
+{
+  x[g] = values;
+}
+
+LANE_FUNCTION lanes weights(const real *table, int g)
+{
+  return lanes_of(table[g]);
+}
+
+LANE_FUNCTION lanes former(const lanes *x, lanes first, int g)
+{
+  return g > 0 ? x[g - 1] : first;
+}
+
+LANE_FUNCTION lanes times(const real (*table)[POINT_LANES], int count, const lanes *x, int g)
+{
+  lanes sum = table[0][g] * x[0], other = lanes_of(0);
+#pragma GCC unroll 16
+  for (int n = 1; n < count; n += 2)
+    other += table[n][g] * x[n];
+#pragma GCC unroll 16
+  for (int n = 2; n < count; n += 2)
+    sum += table[n][g] * x[n];
+  return sum + other;
+}
+
+/* x in the lanes where the condition holds, y in others. */
+LANE_FUNCTION lanes where(condition holds, lanes x, lanes y)
+{
+  return (lanes)(((lane_numbers)x & holds) | ((lane_numbers)y & ~holds));
+}
+
+LANE_FUNCTION int any_of(condition holds)
+{
+  long long any = 0;
+  for (int j = 0; j < LANES; j++)
+    any |= holds[j];
+  return any != 0;
+}
+
+LANE_FUNCTION int all_of(condition holds)
+{
+  return !any_of(~holds);
+}
+
+LANE_FUNCTION lanes greater_lanes(lanes x, lanes y)
+{
+  return where((condition)(y > x), y, x);
+}
+
+LANE_FUNCTION number larger_number(number a, number b)
+{
+  return where((condition)(a > b), a, b);
+}
+
+static inline number share(number a, number b)
+{
+  return where((condition)(a > 0.0), a / b, lanes_of(0));
+}
+
+LANE_FUNCTION number largest_lane(const lanes *x)
+{
+  return *x;
+}
