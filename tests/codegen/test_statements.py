@@ -3,8 +3,9 @@
 import re
 
 import pytest
+from notation import lagrange
 
-from scvi_codegen import MethodError
+from scvi_codegen import MethodError, compile_stepper
 from scvi_codegen.codegen.statements.arithmetic import Value, combine, negated
 from scvi_codegen.codegen.statements.printing import Layout, Place, PointsAsLanes, Printer, Quantity
 from scvi_codegen.codegen.statements.schedule import in_registers, point_loops
@@ -207,3 +208,14 @@ def test_features_are_decided_when_a_text_is_read():
     assert selected(text, ["fast"]) == "if not known:\n    q[i] += h"
     assert selected(text, []) == "q[i] -= h"
     assert read(text, ["fast"]) == read(selected(text, ["fast"]))
+
+
+@pytest.mark.tiers(1)
+@pytest.mark.parametrize("method", ["svi:1", "svi:3"])
+def test_rods_of_varying_masses_need_no_fallback(method):
+    """Newton's method, the fallback, would hide an iteration that does not converge."""
+    squares = "x1_dot**2*(1 + y1**2) + y1_dot**2*(2 + x1**2) + x2_dot**2*(1 + y2**2) + y2_dot**2"
+    rods = ["x1**2 + y1**2 = 1", "(x2 - x1)**2 + (y2 - y1)**2 = 1"]
+    system = lagrange("rods", "x1 y1 x2 y2", f"({squares})/2 - y1 - y2", constraints=rods)
+    run = compile_stepper(system, method).integrate([1.0, 0.0, 2.0, 0.0], velocity=[0.0] * 4, h=0.02, steps=20)
+    assert run.fallback_steps == 0
