@@ -70,6 +70,8 @@ class Problem:
         maps: momentum maps by formula, in the order of the stepper.
         impulses: momentum maps of L alone, p . xi by the formulas of xi.
         falls_back: whether fixed-point iterations fail at steps of h, so that Newton's iteration takes their place.
+        alike_in_lanes: whether trajectories in SIMD lanes have the bits of single runs: two, four or eight points, and
+            no function of time alone, which is a number of all trajectories but a vector of all points.
         work: whether forces act whose work is told.
         time: unit of time, by which initial times are multiplied.
     """
@@ -90,6 +92,7 @@ class Problem:
     time_transformation: str = ""
     inputs: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     falls_back: bool = False
+    alike_in_lanes: bool = False
     array: Mapping[str, Any] | None = None
     fields: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
 
@@ -418,6 +421,35 @@ AT_HOME: tuple[Problem, ...] = (
             "parameters": {"m": 1.0, "n": 1.0, "k": 1.0, "a": 0.2, "w": 1.7, "e": 0.02, STOP: 100.0},
         },
         h=0.03,
+    ),
+    Problem(
+        name="double pendulum",
+        q=(0.9, -0.4),
+        x=(0.3, 1.1),
+        own={"m": 1.7, "l": 0.8},
+        methods=(Scheme("svi:4", "auto", HIGH),),
+        event="a - b - l",
+        text={
+            "coordinates": ["a", "b"],
+            "lagrangian": "m*a_dot**2 + l**2*b_dot**2/2 + l*a_dot*b_dot*cos(a - b) + 2*m*cos(a) + l*cos(b)",
+            "parameters": {"m": 1.0, "l": 1.0},
+        },
+        alike_in_lanes=True,
+    ),
+    Problem(
+        name="vortices",
+        q=(0.9, -0.4),
+        x=(0.3, 1.1),
+        own={"a": 1.7, "b": 0.8},
+        methods=(Scheme("svi:4", "auto", HIGH), Scheme("gauss:2", "auto", LOW)),
+        event="x - b*y",
+        text={
+            "coordinates": ["x", "y"],
+            "momenta": ["u", "w"],
+            "hamiltonian": "-a*log((x - y)**2 + b*(u - w)**2) - x*u/4 + a*y**2*w**2/8",
+            "parameters": {"a": 1.0, "b": 1.2},
+        },
+        alike_in_lanes=True,
     ),
     Problem(
         name="stiff",

@@ -311,7 +311,7 @@ def _rounding_of_lanes(case: Case, way: dict[str, Any]) -> float:
     alike."""
     if case.two_words and case.problem.text.get("constraints"):
         return 1e-28  # of initial states that are projected
-    if "t_end" in way or case.problem.text.get("constraints"):
+    if "t_end" in way or case.problem.alike_in_lanes or case.problem.text.get("constraints"):
         return 0.0
     if case.two_words:
         return 4e-31

@@ -319,6 +319,11 @@ class FixedPointIteration:
             yield IterationTable(name.upper(), getattr(self.guess, name))
 
     @property
+    def curves(self) -> int:
+        """Number of curves whose values at the points are stored."""
+        return self.stored // (2 * self.lanes)
+
+    @property
     def derivatives_tables(self) -> tuple[IterationTable, ...]:
         """Tables of tangent and adjoint vectors: positions from forces, or from velocities and momenta from forces."""
         if self.name == "separable":

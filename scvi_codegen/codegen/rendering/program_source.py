@@ -342,14 +342,14 @@ def render_ensemble_in_pairs(program: Program, derivatives: PointDerivatives | N
     kernels, beside, own = tuple[Kernel, ...](), tuple[Kernel, ...](), dict[str, object]()
     if split is not None and in_pairs(program):
         kernels = split.drift, split.force
-        own = {"points": 2, "fixed_point": None}  # points: words of the stored force
+        own = {"points": 2, "stored": 2, "fixed_point": None}  # points: words of the stored force
     elif fixed_point and derivatives and program.dimension * fixed_point.points <= LARGEST_IN_LANES:
         program, mass = _in_three_words(program), fixed_point.constant_mass
         assert mass is not None  # of separable systems
         kernels, beside = (mass, *fixed_point.kernels), (derivatives.partials, derivatives.products[0])
         iteration = cast(FixedPointIteration, program.fixed_point)
         source = iteration_source(iteration, TRAJECTORIES, kernels=(*fixed_point.kernels, *beside))
-        own = {"points": fixed_point.points, "fixed_point": source}
+        own = {"points": fixed_point.points, "stored": fixed_point.points, "fixed_point": source}
     else:
         return None
     context = own | {
@@ -551,6 +551,7 @@ def render_ensemble(
     context = {
         "program": program,
         "points": points,
+        "stored": points * (fixed_point.curves if fixed_point else 1),
         "observed": observed.values if observed else 0,
         "counts": counts,
         "tangents": tangents,

@@ -65,9 +65,9 @@ class Sizes:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LaneContents:
-    """Points of a step and functions observed of trajectories in lanes; whether blocks initially contain velocities."""
+    """Stored values of a coordinate, observed functions; whether blocks initially contain velocities."""
 
-    points: int
+    stored: int
     observed: int
     needs_velocities: bool
 

@@ -45,7 +45,7 @@ class DeviceRuns(CommonRuns):
         self.device, self.launch = device, device.kernels(source)
         lanes = source.contents.lanes
         assert lanes is not None  # of an ensemble
-        self.points, self.needs_velocities = lanes.points, lanes.needs_velocities
+        self.stored, self.needs_velocities = lanes.stored, lanes.needs_velocities
         self.count, self.m = map(int, q.shape)
         self.q, self.p = (device.empty((len(self.steps.numbers), *q.shape)) for _ in "qp")
         device.copy_in(q, self.q)
@@ -59,7 +59,7 @@ class DeviceRuns(CommonRuns):
     @property
     def size(self) -> int:
         """Numbers in the memory of a trajectory, without observed values."""
-        return HEAD + (4 + 2 * self.points) * self.m
+        return HEAD + (4 + 2 * self.stored) * self.m
 
     def states(self) -> tuple[Array, Array]:
         """Return copies of the (n, k, m) saved positions and momenta on the processor."""
@@ -81,7 +81,7 @@ class DeviceRuns(CommonRuns):
         memory[2] = 0.0
         if not self.needs_velocities:
             return
-        m, stored = self.m, memory[HEAD + 4 * self.m : self.size].reshape(2 * self.points, self.m, -1)
+        m, stored = self.m, memory[HEAD + 4 * self.m : self.size].reshape(2 * self.stored, self.m, -1)
         q, p, running = memory[HEAD : HEAD + m].T, memory[HEAD + m : HEAD + 2 * m].T, memory[3] > 0.0
         if running.all() and (parameters == parameters[0]).all():  # in one call
             with suppress(StateError):

@@ -18,6 +18,7 @@ typedef lanes coordinates[M]; /* values of all coordinates at a point */
 
 typedef lanes number; /* a value of each trajectory */
 typedef double weight; /* a value of a point, the same for all trajectories */
+typedef const double (*point_table)[S];
 
 static inline number number_of(double x)
 {
@@ -101,17 +102,32 @@ static inline weight rest_of_weights(double a, weight b, weight product)
   return rest_of_product(a, b, product);
 }
 
-/* sum_j table_nj x_j, in two independent sums; values at successive points are `apart` elements apart. */
+/* Sums over points add in the order of points.h, so that trajectories have the bits of single runs: POINTS_THERE is the
+ * number of points with those that fill vectors, PARTS its largest factor that is a power of two. */
+enum {
+  POINTS_THERE = S > 16 ? (S + 7) / 8 * 8 : S > 8 ? 16
+      : S > 4                                     ? 8
+      : S > 2                                     ? 4
+                                                  : S,
+  PARTS = POINTS_THERE & -POINTS_THERE,
+  SUMS = POINTS_THERE < WIDEST ? POINTS_THERE : WIDEST /* of changes, one for each lane there */
+};
+
+/* sum_j table_nj x_j in `parts` independent sums; values at successive points are `apart` elements apart. */
+static inline __attribute__((always_inline)) lanes sum_in_parts(const double *row, const lanes *x, long long apart,
+    int parts)
+{
+  lanes sum[4];
+  for (int j = S; j < parts; j++)
+    sum[j] = lanes_of(0.0);
+  for (int j = 0; j < S; j++)
+    sum[j % parts] = j < parts ? row[j] * x[j * apart] : sum[j % parts] + row[j] * x[j * apart];
+  return parts == 1 ? sum[0] : (sum[0] + sum[1]) + (sum[2] + sum[3]);
+}
+
 static inline lanes contribution_of_points(const double (*table)[S], int n, const lanes *x, long long apart)
 {
-  lanes a = table[n][0] * x[0], b = lanes_of(0.0);
-  for (int j = 1; j + 1 < S; j += 2) {
-    b += table[n][j] * x[j * apart];
-    a += table[n][j + 1] * x[(j + 1) * apart];
-  }
-  if (S % 2 == 0)
-    b += table[n][S - 1] * x[(S - 1) * apart];
-  return a + b;
+  return sum_in_parts(table[n], x, apart, POINTS_THERE < 8 ? 1 : 4);
 }
 
 /* The same for one coordinate. */
@@ -125,43 +141,72 @@ typedef lanes (*stored_forces)[M];
 
 static inline lanes sum_of_stored(const double (*table)[S], int n, stored_forces x, int i)
 {
-  return apply(table, n, x, i);
+  return sum_in_parts(table[n], &x[0][i], M, POINTS_THERE < 4 ? 1 : 4);
+}
+
+/* Products of values and weights of the points. */
+typedef struct {
+  coordinates of[S];
+} point_products;
+
+static inline void store_products(const weight *weights, lanes (*x)[M], point_products *products)
+{
+  for (int n = 0; n < S; n++)
+    for (int i = 0; i < M; i++)
+      products->of[n][i] = weights[n] * x[n][i];
+}
+
+/* Sum over the points. */
+static inline lanes points_total(lanes *x)
+{
+  for (int n = PARTS; n < S; n++)
+    x[n % PARTS] += x[n];
+  for (int half = PARTS / 2; half > 0; half /= 2)
+    for (int n = 0; n < half && n + half < S; n++)
+      x[n] += x[n + half];
+  return x[0];
 }
 
 /* sum_n weights_n x_n with the low words of the weights. */
 static inline number weigh_apart_twice(const weight *weights, const weight *low, const lanes *x, long long apart)
 {
-  number sum = lanes_of(0.0);
+  lanes part[S];
   for (int n = 0; n < S; n++)
-    sum += multiply_add(lanes_of(weights[n]), x[n * apart], low[n] * x[n * apart]);
-  return sum;
+    part[n] = multiply_add(lanes_of(weights[n]), x[n * apart], low[n] * x[n * apart]);
+  return points_total(part);
 }
 
 /* The same with further weights of the changes from values y. */
 static inline number weigh_apart_thrice(const weight *weights, const weight *low, const lanes *x, const lanes *further,
     const lanes *y, long long apart)
 {
-  number sum = lanes_of(0.0);
+  lanes part[S];
   for (int n = 0; n < S; n++) {
     const lanes rest = multiply_add(further[n], x[n * apart] - y[n * apart], low[n] * x[n * apart]);
-    sum += multiply_add(lanes_of(weights[n]), x[n * apart], rest);
+    part[n] = multiply_add(lanes_of(weights[n]), x[n * apart], rest);
   }
-  return sum;
+  return points_total(part);
 }
 
 /* sum_n weights_n x_n of one coordinate. */
 static inline number weigh(const weight *weights, lanes (*x)[M], int i)
 {
-  number sum = lanes_of(0.0);
+  lanes part[S];
   for (int n = 0; n < S; n++)
-    sum += weights[n] * x[n][i];
-  return sum;
+    part[n] = weights[n] * x[n][i];
+  return points_total(part);
 }
 
 /* Value at the first point. */
 static inline number at_first(const lanes *x)
 {
   return x[0];
+}
+
+/* Value at the last point. */
+static inline number at_last(const lanes *x, long long apart)
+{
+  return x[(S - 1) * apart];
 }
 
 /* Values at the first and at the last point. */
@@ -172,7 +217,23 @@ static inline number at_start(lanes (*x)[M], int i)
 
 static inline number at_end(lanes (*x)[M], int i)
 {
-  return x[S - 1][i];
+  return at_last(&x[0][i], M);
+}
+
+/* Sums over coordinates, of each point, and the place of those of a point. */
+typedef lanes point_sums[SUMS];
+
+static inline lanes *sum_at(lanes *sums, int n)
+{
+  return sums + n % SUMS;
+}
+
+static inline number total_of(lanes *sums)
+{
+  for (int half = SUMS / 2; half > 0; half /= 2)
+    for (int n = 0; n < half; n++)
+      sums[n] += sums[n + half];
+  return sums[0];
 }
 
 /* Change of each trajectory. */

@@ -67,7 +67,7 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
   if (status != OK)
     return status;
   for (int k = 0; needs_iteration(&now); k++) {
-    lanes change = lanes_of(0.0);
+    point_sums change = {lanes_of(0.0)};
     scale(data->position_weight, z, scaled);
 #ifdef FROZEN_MASS
     if (k % MASS_AGE == 0)
@@ -145,9 +145,9 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
     for (int n = 0; n < GROUPS; n++)
       for (int i = 0; i < M; i++) {
         const lanes moved = r[n][i] * inverse_size[i];
-        change += moved * moved;
+        *sum_at(change, n) += moved * moved;
       }
-    take_change(&now, total_change(change), options, k, report);
+    take_change(&now, total_of(change), options, k, report);
     if (is_stagnant(&now, options, k))
       measure_by_largest(stagnant(&now), inverse_size);
 #ifdef SUPPORT_SECANTS_H

@@ -1,5 +1,4 @@
-#include "../core/progress.h"
-#include "one_trajectory.h"
+#include "convergence.h"
 #include "point_weights.h"
 
 /* Fixed-point iteration of a step for any Hamiltonian H(q, p, t) (Li, Wu & Leok, eq. (35)). With the weights beta and
@@ -8,23 +7,18 @@
  *   f_n = -H_q(q_n, p_n),                           z_n = H_p(q_n, p_n).
  * With JOINT_RATES both are evaluated at once, at the same (q_n, p_n): a fifth more iterations, each of which takes
  * little more than half the time if H_p and H_q have most operations in common. If that does not converge, they are
- * evaluated in turn. Requires: one_trajectory.h, point_weights.h, the tables, the kernels velocity_lanes and
- * force_lanes, and with JOINT_RATES rate_lanes. */
+ * evaluated in turn. Requires: points.h or trajectories.h with what they require, point_weights.h, the tables, the
+ * kernels velocity_lanes and force_lanes, and with JOINT_RATES rate_lanes. */
 
 /* Values u at the points, from those at the start and their rates: start + (carry + sum_j TABLE_nj weight_j rate_j). */
-static inline void integrate(const lanes *table, const weight *weights, lanes (*rate)[M], const double *start,
-    const double *carry, lanes (*u)[2 * M], int first)
+static inline void integrate(const point_table table, const weight *weights, lanes (*rate)[M], const number *start,
+    const number *carry, lanes (*u)[2 * M], int first)
 {
-  double scaled[M][POINTS] __attribute__((aligned(sizeof(lanes))));
-  for (int i = 0; i < M; i++)
-    for (int n = 0; n < GROUPS; n++) {
-      const lanes value = weights[n] * rate[n][i];
-      memcpy(scaled[i] + n * LANES, &value, sizeof value);
-    }
-  IN_MEMORY(scaled);
+  point_products scaled;
+  store_products(weights, rate, &scaled);
   for (int n = 0; n < GROUPS; n++)
     for (int i = 0; i < M; i++)
-      u[n][first + i] = start[i] + (carry[i] + sum_over_points(table, n, scaled[i]));
+      u[n][first + i] = start[i] + (carry[i] + sum_of_stored(table, n, scaled.of, i));
 }
 
 /* Positions at the points of the curve with velocities z. */
@@ -46,10 +40,10 @@ static inline void push(const step_data *step, const iteration_data *data, lanes
 /* 1 / the size of x at both ends of the step, which makes its changes relative, or `absolute`; groups of points are
  * `apart` elements apart. */
 static inline void measure_ends(const lanes *x, int apart, const solver_options *options, double absolute,
-    double *inverse_size)
+    number *inverse_size)
 {
   for (int i = 0; i < M; i++)
-    inverse_size[i] = fabs(at_first(&x[i])) + fabs(at_point(&x[i], apart, POINTS - 1));
+    inverse_size[i] = magnitude(at_first(&x[i])) + magnitude(at_last(&x[i], apart));
   invert_sizes(options, absolute, inverse_size);
 }
 
@@ -110,28 +104,55 @@ static inline void turn_step(const step_data *step, history past, lanes (*z)[M],
 }
 #endif
 
+/* Forces at the converged velocities, which rates evaluated at once are already. */
+static inline void converged_forces(const step_data *step, const iteration_data *data, lanes (*z)[M], lanes (*u)[2 * M],
+    lanes (*force)[M], int joint)
+{
+  if (!joint) {
+    place(step, data, z, u);
+    forces(step, u, force);
+  }
+}
+
+#ifndef POINTS
+/* Stores the velocities and forces of the trajectories that converge before others. */
+static __attribute__((noinline)) void keep_early(const step_data *step, const iteration_data *data, lanes (*z)[M],
+    lanes (*u)[2 * M], lanes (*force)[M], int joint, progress *now, coordinates (*stored)[S])
+{
+  converged_forces(step, data, z, u, force, joint);
+  store_early(now, z[0], stored[0][0]);
+  store_early(now, force[0], stored[1][0]);
+  mark_stored(now);
+}
+#endif
+
 /* Computes the increments of one step: forces, momenta and velocities are updated in turn until momenta and velocities
  * converge; the increments follow from the forces there. Velocities and forces are stored for the predictor. On failure
  * the increments are undefined. */
-static inline int iterate(const step_data *step, const iteration_data *data, history past, long long *steps, double *dq,
-    double *dp, const solver_options *options, solver_report *report, int joint)
+static inline int iterate(const step_data *step, const iteration_data *data, history past, long long *steps, number *dq,
+    number *dp, const solver_options *options, solver_report *report, int joint)
 {
-  lanes z[GROUPS][M], force[GROUPS][M], u[GROUPS][2 * M], value[GROUPS][M], momentum[GROUPS][M];
-  double velocity_size[M], momentum_size[M];
+  coordinates own[2][GROUPS], *z = kept(past, own[0]), *force = kept(second_curve(past), own[1]);
+  lanes u[GROUPS][2 * M], value[GROUPS][M], momentum[GROUPS][M];
+  number velocity_size[M], momentum_size[M];
+#ifndef POINTS
+  coordinates stored[2][S];
+#endif
   progress now = before_iterations();
   int status = OK;
   if (*steps > 0) {
     continue_curve(step, past, *steps, z);
-    continue_curve(step, past + 2 * M * POINTS, *steps, force);
+    continue_curve(step, second_curve(past), *steps, force);
   } else {
     status = start_velocities(step, z);
-    memset(force, 0, sizeof force);
+    memset(force, 0, sizeof(coordinates) * GROUPS);
   }
   if (status != OK)
     return status;
   push(step, data, force, u);
   for (int k = 0; needs_iteration(&now); k++) {
-    lanes change = lanes_of(0.0), before[GROUPS][M];
+    lanes before[GROUPS][M];
+    point_sums change = {lanes_of(0.0)};
     for (int n = 0; n < GROUPS; n++)
       for (int i = 0; i < M; i++)
         before[n][i] = u[n][M + i];
@@ -163,27 +184,32 @@ static inline int iterate(const step_data *step, const iteration_data *data, his
       for (int i = 0; i < M; i++) {
         const lanes correction = value[n][i] - z[n][i], moved = correction * velocity_size[i];
         const lanes pushed = (u[n][M + i] - before[n][i]) * momentum_size[i];
-        change += moved * moved + pushed * pushed;
+        *sum_at(change, n) += moved * moved + pushed * pushed;
         z[n][i] = value[n][i];
         value[n][i] = correction;
       }
-    take_change(&now, total_change(change), options, k, report);
+    take_change(&now, total_of(change), options, k, report);
     if (is_stagnant(&now, options, k)) {
-      measure_by_largest(1.0, velocity_size);
-      measure_by_largest(1.0, momentum_size);
+      measure_by_largest(stagnant(&now), velocity_size);
+      measure_by_largest(stagnant(&now), momentum_size);
     }
     if (must_amplify(&now, options, k))
       for (int n = 0; n < GROUPS; n++)
         for (int i = 0; i < M; i++)
           z[n][i] += amplification(&now) * value[n][i];
+#ifndef POINTS
+    if (converge_early(&now))
+      keep_early(step, data, z, u, force, joint, &now, stored);
+#endif
   }
   status = outcome(&now, report);
   if (status != OK)
     return status;
-  if (!joint) {
-    place(step, data, z, u);
-    forces(step, u, force);
-  }
+  converged_forces(step, data, z, u, force, joint);
+#ifndef POINTS
+  restore_early(&now, stored[0][0], z[0]);
+  restore_early(&now, stored[1][0], force[0]);
+#endif
   scale(data->position_weight, z, value);
   scale(data->momentum_weight, force, momentum);
   for (int i = 0; i < M; i++) {
@@ -196,13 +222,13 @@ static inline int iterate(const step_data *step, const iteration_data *data, his
   if (!accept(step, dq, dp, report))
     return NOT_FINITE;
   remember_curve(z, past);
-  remember_curve(force, past + 2 * M * POINTS);
+  remember_curve(force, second_curve(past));
   *steps = next_guess(*steps, &now, report);
   return OK;
 }
 
-HOT int fixed_point(const step_data *step, const iteration_data *data, history past, long long *steps, double *dq,
-    double *dp, const solver_options *options, solver_report *report)
+HOT int fixed_point(const step_data *step, const iteration_data *data, history past, long long *steps, number *dq,
+    number *dp, const solver_options *options, solver_report *report)
 {
 #ifdef JOINT_RATES
   if (*steps > 0 && iterate(step, data, past, steps, dq, dp, options, report, 1) == OK)

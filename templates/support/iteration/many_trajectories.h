@@ -5,6 +5,13 @@
  * trajectories, which become inactive, never for all. Requires: trajectories.h, stagnation.h, and the tables
  * LAST_ALONE, LAST, BEFORE, which extrapolate stored values into the next step. */
 
+/* The second curve of stored values. */
+static inline history second_curve(history past)
+{
+  const history second = {past.last + S, past.before + S};
+  return second;
+}
+
 /* Memory for the values to be stored. */
 static inline coordinates *kept(history past, coordinates *own)
 {
@@ -26,7 +33,7 @@ static __attribute__((noinline)) void continue_differently(history past, long lo
     lanes next[S];
     for (int n = 0; n < S; n++)
       next[n] = lanes_selected(
-          one.all, apply(LAST_ALONE, n, past.last, i), apply(LAST, n, past.last, i) + apply(BEFORE, n, x, i));
+          one.all, sum_of_stored(LAST_ALONE, n, past.last, i), sum_of_stored(LAST, n, past.last, i) + sum_of_stored(BEFORE, n, x, i));
     for (int n = 0; n < S; n++)
       x[n][i] = next[n];
   }
@@ -43,7 +50,7 @@ static inline void continue_curve(const step_data *step, history past, long long
   for (int i = 0; i < M; i++) {
     lanes next[S];
     for (int n = 0; n < S; n++)
-      next[n] = steps == 1 ? apply(LAST_ALONE, n, past.last, i) : apply(LAST, n, past.last, i) + apply(BEFORE, n, x, i);
+      next[n] = steps == 1 ? sum_of_stored(LAST_ALONE, n, past.last, i) : sum_of_stored(LAST, n, past.last, i) + sum_of_stored(BEFORE, n, x, i);
     for (int n = 0; n < S; n++)
       x[n][i] = next[n];
   }

@@ -153,7 +153,7 @@ static void store_actions(const block_memory *block, int count, long long place)
 
 /* Results of a step of which some trajectories are repeated. */
 typedef struct {
-  lanes curve[S][M], position[2 * M], momentum[2 * M];
+  lanes curve[STORED][M], position[2 * M], momentum[2 * M];
   double active[LANES]; /* before the step, or before its repetition */
   long long guess;
   int repeated;
@@ -168,7 +168,7 @@ static SELDOM int repeats_failed(first_results *stored, history past, long long 
   if (stored->repeated) {
     for (int j = 0; j < LANES; j++) {
       if (stored->active[j] > 0.0) {
-        for (int i = 0; i < S * M; i++)
+        for (int i = 0; i < STORED * M; i++)
           before[i][j] = curve[i][j];
         for (int i = 0; i < 2 * M; i++) {
           dq[i][j] = stored->position[i][j];
@@ -206,7 +206,7 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
   state now;
   iteration_data data;
   solver_report report = {.active = block->active};
-  lanes parameters[P + 1], memory[2][S][M];
+  lanes parameters[P + 1], memory[2][STORED][M];
 #ifndef EXPLICIT_STEPS
   first_results stored_results;
 #endif

@@ -8,7 +8,7 @@
 typedef struct {
   lanes head[4];
   state now;
-  lanes last[S][M], before[S][M];
+  lanes last[STORED][M], before[STORED][M];
 #ifdef OBSERVED
   observation seen;
 #endif
@@ -32,8 +32,8 @@ static inline void transfer_all(int writes, thread_memory *own, double *memory, 
   memory = transfer(writes, own->now.p, M, memory, count);
   memory = transfer(writes, own->now.carry_q, M, memory, count);
   memory = transfer(writes, own->now.carry_p, M, memory, count);
-  memory = transfer(writes, &own->last[0][0], S * M, memory, count);
-  memory = transfer(writes, &own->before[0][0], S * M, memory, count);
+  memory = transfer(writes, &own->last[0][0], STORED * M, memory, count);
+  memory = transfer(writes, &own->before[0][0], STORED * M, memory, count);
 #ifdef OBSERVED
   transfer(writes, own->seen.last, 5 * OBSERVED, memory, count);
 #endif
@@ -55,7 +55,7 @@ static inline int starts_again(thread_memory *own, long long *guess, long long s
 #endif
 }
 
-/* Advances `count` trajectories from step number `begin`. memory: (4 + 4 M + 2 S M, count) numbers, and 5 OBSERVED
+/* Advances `count` trajectories from step number `begin`. memory: (4 + 4 M + 2 STORED M, count) numbers, and 5 OBSERVED
  * more; parameters: (count, P). Every `every` steps counted from the start states are stored in rows of (count, M)
  * numbers. done: the numbers of completed steps. */
 KERNEL NAME(thread_advance)(long long count, long long begin, long long steps, long long every, double h,
@@ -100,7 +100,7 @@ KERNEL NAME(thread_advance)(long long count, long long begin, long long steps, l
       break;
     add_increments(own.now.q, own.now.carry_q, dq, &active);
     add_increments(own.now.p, own.now.carry_p, dp, &active);
-    for (int point = 0; point < S; point++)
+    for (int point = 0; point < STORED; point++)
       for (int i = 0; i < M; i++) {
         const lanes earlier = own.last[point][i];
         own.last[point][i] = own.before[point][i];

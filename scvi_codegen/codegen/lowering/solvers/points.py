@@ -274,6 +274,7 @@ def hamiltonian_iteration(problem: StepProblem) -> FixedPointIteration | None:
         stored=4 * lanes,
         parts=("point_weights", "hamiltonian_iteration"),
         macros=tuple((name, value) for name, value in macros.items() if value),
+        serves_many=not turns,
         matrix=tables.position if _nearly_equal(tables.position, tables.momentum) else (),
     )
 
