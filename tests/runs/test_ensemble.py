@@ -25,6 +25,7 @@ from scipy.interpolate import CubicSpline
 
 import scvi_codegen as sc
 from benchmarks.cases.robots import chain
+from scvi_codegen.codegen.native.building import PORTABLE_FLAGS
 from scvi_codegen.interfaces.models.model_files.ensemble_file import load_ensemble
 from scvi_codegen.methods import Method
 from scvi_codegen.runs.ensembles.lanes import LaneRuns
@@ -225,6 +226,23 @@ def test_a_failing_trajectory_equals_its_single_run_and_does_not_affect_others(n
 @pytest.mark.parametrize("name", CASES)
 def test_each_trajectory_equals_the_single_run(name: str) -> None:
     CASES[name].check()
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("count", [1, 2, 7, 33])
+def test_heavy_tops_in_lanes_have_the_bits_of_single_runs(count: int) -> None:
+    """With flags that fuse no products."""
+    energy = "omega_1**2/2 + omega_2**2 + 3*omega_3**2/2 - 1.3*rotate_3(R, 0.1, 0.2, 1)"
+    top = sc.LagrangianSystem.from_text("heavy top", rotations={"R": "omega"}, lagrangian=energy)
+    stepper = sc.compile_stepper(top, sc.SVI(4), flags=PORTABLE_FLAGS)
+    assert stepper.ensemble is not None
+    q = {"R": np.tile([0.6, 0.0, 0.8, 0.0], (count, 1))}
+    velocity = {"omega": np.random.default_rng(1).uniform(-2.0, 2.0, (count, 3))}
+    runs = stepper.integrate_ensemble(q, velocity=velocity, h=0.1, steps=50)
+    for j in range(count):
+        alone = stepper.integrate({"R": q["R"][j]}, velocity={"omega": velocity["omega"][j]}, h=0.1, steps=50)
+        assert runs.q[:, j].tobytes() == alone.q.tobytes()
+        assert runs.p[:, j].tobytes() == alone.p.tobytes()
 
 
 @pytest.mark.second
