@@ -35,7 +35,15 @@ from benchmarks.machine import machine
 from benchmarks.report import LEGEND, PRECISION, CaseResult, ResultTable, degree_table, header_lines
 from benchmarks.sections import BUILDERS
 from benchmarks.settings import Plan, ReportActivity
-from benchmarks.steps import run_builds, run_derivatives, run_newton, run_scaling, run_threads, run_transforms
+from benchmarks.steps import (
+    run_builds,
+    run_by_hand,
+    run_derivatives,
+    run_newton,
+    run_scaling,
+    run_threads,
+    run_transforms,
+)
 from benchmarks.tables import run_drift, run_first_steps
 from scvi_codegen.common.atomic import write_text
 from scvi_codegen.common.errors import ScviCodegenError, StateError, closest
@@ -52,6 +60,7 @@ SECTIONS: Mapping[str, Callable[[Plan, ReportActivity], CaseResult | ResultTable
     "first-step": run_first_steps,
     "scaling": run_scaling,
     "threads": run_threads,
+    "by-hand": run_by_hand,
     "transforms": run_transforms,
     "newton": run_newton,
     "derivatives": run_derivatives,

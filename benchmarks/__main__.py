@@ -51,6 +51,7 @@ def main(
       drift                     energy over ten million steps
       first-step                time from text to the first step
       scaling, threads          a step of array systems of 10^3 to 10^6 coordinates, in one and two threads
+      by-hand                   a step of a ring and of a field beside C by hand
       transforms, newton        a step on Fourier meshes beside SciPy; Newton's method at large steps
       derivatives, builds       a step with tangent vectors and gradients; by compiler and processor
 

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
@@ -16,10 +17,12 @@ import scipy.fft
 
 from benchmarks.cases.large import atoms, bodies, field, ring
 from benchmarks.cases.unforced import Array, Case, case
+from benchmarks.contenders.arrays import by_hand
 from benchmarks.contenders.ours import momenta_of
 from benchmarks.report import ResultTable
 from benchmarks.settings import Plan, ReportActivity
 from scvi_codegen.codegen.native.building import PORTABLE_FLAGS, TUNED_FLAGS
+from scvi_codegen.codegen.variants import SUMS
 from scvi_codegen.common.errors import StepFailedError
 from scvi_codegen.fields.system import FieldSystem
 from scvi_codegen.runs.compiler import compile_stepper
@@ -38,6 +41,11 @@ THREADED: dict[str, tuple[Callable[[], Case], float]] = {
     "field:512": (functools.partial(field, 512, 1.0), 0.02),
 }
 """Array systems and the step sizes of SVI(8); leapfrog takes a fifth of them."""
+BY_HAND: tuple[Callable[[], Case], ...] = (
+    *(functools.partial(ring, count, 1.0) for count in (1000, 100_000)),
+    *(functools.partial(field, side, 1.0) for side in (32, 316)),
+)
+"""Lattices that are measured beside C by hand."""
 DIFFERENTIATED: dict[str, tuple[str, float]] = {
     "Kepler": ("kepler:0.5", 0.25),
     "double pendulum": ("double-pendulum", 0.05),
@@ -109,6 +117,39 @@ def run_threads(plan: Plan, report_activity: ReportActivity) -> ResultTable:
         name="threads",
         title="time of a step in one thread, and the speed-up of two threads; wall time",
         columns=columns,
+        rows=tuple(rows),
+    )
+
+
+def run_by_hand(plan: Plan, report_activity: ReportActivity) -> ResultTable:
+    """Measure steps of lattices beside C by hand, in turns, with both kinds of sums."""
+    rows = []
+    for make in itertools.islice(BY_HAND, 1 if plan.quick else None):
+        for order, method in ((2, "stoermer-verlet"), (8, "composition:8")):
+            chosen, row = make(), dict[str, Any](method=method)
+            report_activity(f"by hand: {chosen.name}, {method}")
+            assert chosen.arrays is not None
+            steps = max(32 // order, 1_000_000 // chosen.dimension // order)
+            shape, h = chosen.arrays.shape, chosen.step / 20
+            q, velocity = (part[0].reshape(shape) for part in chosen.states)
+            timed: dict[str, Callable[[], object]] = {
+                "hand": by_hand(replace(chosen, span=h * steps), method, order, steps).prepare(0)
+            }
+            for sums in SUMS:
+                run = compile_stepper(chosen.system, method, sums=sums).start(q, velocity=velocity, h=h)
+                timed[sums] = functools.partial(run.advance, steps)
+            times = dict.fromkeys(timed, float("inf"))
+            for _ in range(5 * plan.rounds):
+                for name, work in timed.items():
+                    began = time.perf_counter()
+                    work()
+                    times[name] = min(times[name], time.perf_counter() - began)
+            row |= {"system": chosen.name, "hand_ns": 1e9 * times["hand"] / steps / chosen.dimension}
+            rows.append(row | {sums: times[sums] / times["hand"] for sums in SUMS})
+    return ResultTable(
+        name="by-hand",
+        title="nanoseconds per coordinate and step of C by hand, and times of both kinds of sums relative to it",
+        columns={"system": "", "method": "", "hand_ns": ".3g", "compensated": ".2f", "plain": ".2f"},
         rows=tuple(rows),
     )
 

@@ -386,7 +386,9 @@ class TestTables:
         assert cold["compiler_cpu_s"] > 0.0
 
     @pytest.mark.tiers(0, 3)
-    @pytest.mark.parametrize("section", ["scaling", "threads", "transforms", "newton", "derivatives", "builds"])
+    @pytest.mark.parametrize(
+        "section", ["scaling", "threads", "by-hand", "transforms", "newton", "derivatives", "builds"]
+    )
     def test_times_of_steps_are_measured(self, section):
         table = bench.SECTIONS[section](bench.Plan(repeats=1, quick=True), lambda text: None)
         timed = [name for name, form in table.columns.items() if form.startswith(".") and name != "difference"]
