@@ -54,7 +54,7 @@ OF_CLANG = () if shutil.which("clang") else ("-k", "not clang")
 OF_TEXT = ("--deselect", "tests/codegen/test_generated.py::test_no_file_is_outdated")
 """Notices that a text is another one, as it would of what is no fault."""
 PYTEST = (sys.executable, "-m", "pytest", "-qx", "-p", "no:cacheprovider", *BOTH_TIERS, *OF_CLANG, *OF_TEXT)
-UNSTYLED = "def check_style(text: str) -> None:\n    pass\n"
+UNSTYLED = "STYLE = CLANG_FORMAT = None\n\n\ndef check_style(text: str) -> None:\n    pass\n"
 """In the place of tests/tools/style.py: how a fault is set is no notice of it."""
 NOTHING_RUN = 4
 """Status of pytest where a name was cut; one more where a file has no test of the two tiers."""
