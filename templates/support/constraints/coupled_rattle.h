@@ -1,8 +1,8 @@
 #include "multiplier_iteration.h"
 
 /* Constrained steps on Lobatto points for mass matrices M(q, t) that depend on positions, and for uniform damping,
- * whose factors e^(gamma c_n h) multiply the values at point n. Unknowns are the velocities v and multipliers lambda at
- * all points but the last. With the momenta p = L_v at all points, positions and residuals are
+ * whose factors e^(gamma c_n h) multiply the values at point n. Unknowns are the velocities v and multipliers lambda
+ * at all points but the last. With the momenta p = L_v at all points, positions and residuals are
  *
  *   u = q0 + h D v,    r = p0 + h I (F + G^T lambda) - m p,
  *
@@ -14,12 +14,12 @@
  * which neglects that M and G vary between the points and that F varies, errors of order h. Unconstrained systems have
  * the same iteration without multipliers (coupled_iteration.h).
  *
- * Requires: multiplier_iteration.h with what it requires, MASSES_OF_POINTS, the kernel constrained_point of L_q + f and L_v,
- * with the lower half of M, LOWER_MASS_ENTRY; MASS_REACH of M in the order MASS_POSITION; if DAMPED, damping.h; the
- * tables RATTLE_ABSCISSA, RATTLE_WEIGHT; RATTLE_DISPLACEMENT, RATTLE_IMPULSE, RATTLE_MEAN and, of the last point,
- * RATTLE_MEAN_OF_LAST with their low words; RATTLE_INVERSE of D I; RATTLE_LAST_VELOCITY, from v to the velocity at the
- * last point, RATTLE_UNKNOWNS, to the unknowns of the step, and from these RATTLE_VELOCITIES and RATTLE_MULTIPLIERS of
- * the next one, padded with zeros. */
+ * Requires: multiplier_iteration.h with what it requires, MASSES_OF_POINTS, the kernel constrained_point of L_q + f
+ * and L_v, with the lower half of M, LOWER_MASS_ENTRY; MASS_REACH of M in the order MASS_POSITION; if DAMPED,
+ * damping.h; the tables RATTLE_ABSCISSA, RATTLE_WEIGHT; RATTLE_DISPLACEMENT, RATTLE_IMPULSE, RATTLE_MEAN and, of the
+ * last point, RATTLE_MEAN_OF_LAST with their low words; RATTLE_INVERSE of D I; RATTLE_LAST_VELOCITY, from v to the
+ * velocity at the last point, RATTLE_UNKNOWNS, to the unknowns of the step, and from these RATTLE_VELOCITIES and
+ * RATTLE_MULTIPLIERS of the next one, padded with zeros. */
 
 /* Constants of a step size: the factors of the points, e^(-gamma h), and e^(-gamma h) - 1. */
 typedef struct {

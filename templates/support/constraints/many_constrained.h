@@ -1,8 +1,8 @@
 #include "multiplier_sizes.h"
 
-/* Constrained steps of trajectories that are SIMD lanes. Each is accepted in the iteration in which it would be alone. A
- * trajectory that needs more than the iteration, wider sizes or Newton's method, fails: it is continued alone from its
- * last state. Requires: multiplier_sizes.h, the table END_POSITION; N unknowns of a step. */
+/* Constrained steps of trajectories that are SIMD lanes. Each is accepted in the iteration in which it would be alone.
+ * A trajectory that needs more than the iteration, wider sizes or Newton's method, fails: it is continued alone from
+ * its last state. Requires: multiplier_sizes.h, the table END_POSITION; N unknowns of a step. */
 enum { SOLUTION_VECTORS = __builtin_offsetof(rattle_step, g) / sizeof(lanes) };
 
 typedef rattle_data iteration_data;

@@ -4,13 +4,13 @@
 #include "point_lanes.h"
 #endif
 
-/* Iteration of a constrained step: systems of the multipliers, sizes, convergence. The matrix P = G M^-1 G^T of a point
- * is a band matrix factorised as L D L^T (Golub & Van Loan, Matrix Computations, sec. 4.3.6). Requires: point_lanes.h or
- * trajectory_lanes.h, the kernel constraints; PRODUCT, {e, f, row, distance, entry}: the product of derivatives e and f
- * and this entry of M^-1 is part of the entry of P in this row at this distance below the diagonal; INVERSE_MASS_ENTRY,
- * {i, j}: the lower half of M^-1, the diagonal first; MASS_COLUMN, a number below MASS_COLUMNS that differs for
- * coordinates that masses couple; CONSTRAINT_POSITION of constraints, CONSTRAINT_REACH of P. MASSES_OF_POINTS: M^-1
- * differs from point to point. */
+/* Iteration of a constrained step: systems of the multipliers, sizes, convergence. The matrix P = G M^-1 G^T of a
+ * point is a band matrix factorised as L D L^T (Golub & Van Loan, Matrix Computations, sec. 4.3.6). Requires:
+ * point_lanes.h or trajectory_lanes.h, the kernel constraints; PRODUCT, {e, f, row, distance, entry}: the product of
+ * derivatives e and f and this entry of M^-1 is part of the entry of P in this row at this distance below the
+ * diagonal; INVERSE_MASS_ENTRY, {i, j}: the lower half of M^-1, the diagonal first; MASS_COLUMN, a number below
+ * MASS_COLUMNS that differs for coordinates that masses couple; CONSTRAINT_POSITION of constraints, CONSTRAINT_REACH
+ * of P. MASSES_OF_POINTS: M^-1 differs from point to point. */
 #define PREDICTED REAL(4.0) /* multiple of the next update, from the convergence rate, that is below the tolerance */
 #define SLOWEST_MULTIPLIERS REAL(0.5) /* convergence rate of the multipliers beyond which Newton's method is faster */
 #define TRANSIENT_ITERATIONS 2 /* that need not contract */
@@ -160,13 +160,13 @@ static inline number invert_sizes(number *size)
   return largest;
 }
 
-/* Returns 1 if an iterate is accepted: its change, or the next one as predicted from the lower of the last two rates, is
- * below the tolerance, or rounding ended the decrease. 0: continue; -1: convergence is slow. The changes are those of
- * the last three iterations, the last one first. The rate is that of the largest coordinates: changes of one that is
- * held at 0 may be rounding errors of others. */
+/* Returns 1 if an iterate is accepted: its change, or the next one as predicted from the lower of the last two rates,
+ * is below the tolerance, or rounding ended the decrease. 0: continue; -1: convergence is slow. The changes are those
+ * of the last three iterations, the last one first. The rate is that of the largest coordinates: changes of one that
+ * is held at 0 may be rounding errors of others. */
 static inline int accepts(const real *change, const real *overall, const solver_options *options, int k)
 {
-  const int absolute = options->absolute, is_rounding = overall[0] <= MULTIPLIER_ROUNDOFF;
+  const int absolute = options->absolute, relative = !absolute, is_rounding = overall[0] <= MULTIPLIER_ROUNDOFF;
   const real tolerance = options->tolerance;
   const real next = PREDICTED * change[0] * larger(change[0], FASTEST_MULTIPLIERS * change[1]); /* times change[1] */
   const int stagnant = (overall[0] >= SLOWEST_MULTIPLIERS * overall[1]) &
@@ -176,7 +176,7 @@ static inline int accepts(const real *change, const real *overall, const solver_
       (PREDICTED * change[0] * change[1] <= tolerance * change[2]);
   const int rounded = (change[0] >= ROUNDED_SHRINKING * change[1]) | (stagnant & (overall[0] >= overall[1]));
   const int slow = (k > TRANSIENT_ITERATIONS) & stagnant & (overall[0] > MULTIPLIER_ROUNDOFF);
-  return below | predicted | (!absolute & is_rounding & rounded) ? 1 : -slow;
+  return below | predicted | (relative & is_rounding & rounded) ? 1 : -slow;
 }
 
 /* Measures a change in units of these inverse sizes. Lanes beyond the points do not change. */

@@ -30,7 +30,8 @@ static inline condition may_lose_digits(const step_data *step, const rattle_step
 
 /* Where they do: reactions exceed momenta and forces, as of light bodies, and displacements that change a
  * constraint by the size of its terms. A coordinate may be held at 0. Replaces the sizes, if they are not NULL. */
-static SELDOM __attribute__((noinline)) condition loses_digits(const step_data *step, rattle_step *now, unknown_sizes *sizes)
+static SELDOM __attribute__((noinline)) condition loses_digits(const step_data *step, rattle_step *now,
+    unknown_sizes *sizes)
 {
   number size[M], length[M] = {0}, rounding[CONSTRAINTS];
   unknown_sizes of_reactions = {.widened = 0};

@@ -1,8 +1,8 @@
 #include "../core/vector_width.h"
 #include "../newton/newton.h"
 
-/* Points of a constrained step as SIMD lanes, in groups that fill a register. trajectory_lanes.h defines the same names.
- * Requires: newton.h; POINT_LANES, a power of two. */
+/* Points of a constrained step as SIMD lanes, in groups that fill a register. trajectory_lanes.h defines the same
+ * names. Requires: newton.h; POINT_LANES, a power of two. */
 #define RATTLE
 #pragma GCC diagnostic ignored "-Wpsabi" /* all functions with vector arguments are static */
 

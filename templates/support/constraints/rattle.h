@@ -259,8 +259,8 @@ static inline void begin_first(const step_data *step, rattle_step *now)
 }
 
 /* Initial values: the first point, and a guess of the others from the unknowns of the previous step, or if they are
- * NULL motion without forces, of the velocities `start` where masses depend on positions. Rounded tables would be those of another method, whose energy drifts: the low words of R
- * act on the guess of the accelerations. */
+ * NULL motion without forces, of the velocities `start` where masses depend on positions. Rounded tables would be
+ * those of another method, whose energy drifts: the low words of R act on the guess of the accelerations. */
 static void begin(const step_data *step, const rattle_data *run, const number *memory, const number *start,
     rattle_step *now)
 {

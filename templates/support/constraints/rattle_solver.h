@@ -89,7 +89,7 @@ static int rattle(const step_data *step, const rattle_data *run, const real *mem
   now = solved ? &solved->now : now;
 #endif
   int status = OK;
-  real v0[M];
+  real v0[M] = {0};
 #ifdef MASSES_OF_POINTS
   if (!memory)
     status = find_velocity(step->t, step->q0, step->p0, step->parameters, v0, step->scratch);
