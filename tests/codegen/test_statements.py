@@ -9,7 +9,7 @@ from scvi_codegen import MethodError, compile_stepper
 from scvi_codegen.codegen.statements.arithmetic import Value, combine, negated
 from scvi_codegen.codegen.statements.printing import Layout, Place, PointsAsLanes, Printer, Quantity
 from scvi_codegen.codegen.statements.schedule import in_registers, point_loops
-from scvi_codegen.codegen.statements.steps import rattle_iteration
+from scvi_codegen.codegen.statements.steps import rattle_iteration, velocities_by_masses
 from scvi_codegen.methods.statements import At, Read, read, selected
 
 OPERATIONS = {"mass": "find(ARGUMENT, TARGET);", "force": "force(ARGUMENT, TIME, TARGET);", "solve": "solve(ARGUMENT);"}
@@ -57,6 +57,9 @@ def cut(text: str, *stored: str) -> list[str]:
         pytest.param(
             "d[i] = u[i]\nd[i] += h\na[i] = u[i]\nb[i] = A @ a[i] + d[i]", ["dda", "b"], id="not if set twice"
         ),
+        pytest.param(
+            "d[i] = u[i]\na[i] = u[i]\nb[i] = A @ a[i] + d[i]\nc[i] = B @ b[i] + d[i]", ["a", "db", "c"], id="the first"
+        ),
     ],
 )
 def test_loops_over_points_end_where_all_points_are_needed(text, loops):
@@ -82,6 +85,22 @@ def test_sums_over_points_read_memory_not_registers():
     (loop,) = point_loops(read("v[i] = A @ u[i]\nv[i] += h\nw[i] = v[i]"), {"v"})
     assert [each.target.name for each in in_registers(loop, {"v"}).body] == ["v_now", "v_now", "w", "v"]
     assert "store(now->u[i], g, u_now[i])" in " ".join(of_points("u[i] = A @ u[i]\nu[i] += h"))
+
+
+def test_results_of_operations_and_increments_are_stored():
+    lines = of_points("f[i] = h\nu[i] = mass(f[i])\ng[k] += h")
+    assert [line.strip() for line in lines if "u_now" in line or "now->g" in line] == [
+        f"{lines[1].split()[0]} f[M], u_now[M];",
+        "find(f, u_now);",
+        "store(now->g[k], g, load(now->g[k], g) + step->h);",
+        "store(now->u[i], g, u_now[i]);",
+    ]
+
+
+def test_values_of_several_loops_are_vectors_of_all_points():
+    lines = of_points("d[i] = u[i]\nd[i] += h\na[i] = u[i]\nb[i] = A @ a[i] + d[i]")
+    assert "lanes d[M][GROUPS];" in lines
+    assert any("d[i][g] += step->h;" in line for line in lines)
 
 
 def test_the_residual_of_varying_masses_has_as_many_values_as_constraints():
@@ -191,10 +210,17 @@ def test_places_of_values_at_points():
 
 
 def test_gathered_values_are_loops_of_their_own():
-    lines = of_points("x[k] = g[k]\nx[row(e)] += force[col(e)]\nx[row(e)] -= h\nlam[k] = x[k]")
+    text = "x[k] = g[k]\nx[row(e)] += force[col(e)]\nx[row(e)] -= h\ny[e] = h\nx[row(e)] -= y[e]\nlam[k] = x[k]"
+    lines = of_points(text)
     heads = [line.strip() for line in lines if "for (int" in line and "int g" not in line]
-    assert [head.partition("int ")[2][0] for head in heads] == ["k", "e", "e", "k"]
+    assert [head.partition("int ")[2][0] for head in heads] == ["k", "e", "e", "e", "e", "k"]
+    assert sum("unroll" in line for line in lines) == 4
     assert "x[CONSTRAINT_ENTRY[e][0]] += load(now->force[CONSTRAINT_ENTRY[e][1]], g);" in "\n".join(lines)
+
+
+def test_velocities_are_momenta_times_inverse_masses():
+    written, expected = (f"for n in ROWS:\n    v[i] = {x}" for x in ("velocity(P, t)", "inverse_mass[i] * P[i]"))
+    assert tuple(velocities_by_masses(read(written))) == read(expected)
 
 
 def test_steps_without_points_have_no_sums_over_them():
@@ -210,12 +236,27 @@ def test_features_are_decided_when_a_text_is_read():
     assert read(text, ["fast"]) == read(selected(text, ["fast"]))
 
 
-@pytest.mark.tiers(1)
-@pytest.mark.parametrize("method", ["svi:1", "svi:3"])
-def test_rods_of_varying_masses_need_no_fallback(method):
+VARYING, CONSTANT = "(1 + y1**2)", "2"
+"""Masses of rods."""
+
+
+@pytest.mark.tiers(2)
+@pytest.mark.parametrize(
+    ("method", "mass", "precision"),
+    [
+        ("svi:1", VARYING, "double"),
+        ("svi:1", CONSTANT, "double"),
+        ("svi:1", CONSTANT, "double-double"),
+        ("svi:3", VARYING, "double"),
+        ("svi:3", CONSTANT, "double"),
+    ],
+)
+def test_iterations_of_rods_converge_without_the_fallback(method, mass, precision):
     """Newton's method, the fallback, would hide an iteration that does not converge."""
-    squares = "x1_dot**2*(1 + y1**2) + y1_dot**2*(2 + x1**2) + x2_dot**2*(1 + y2**2) + y2_dot**2"
+    squares = f"x1_dot**2*{mass} + y1_dot**2*2 + x2_dot**2 + y2_dot**2"
     rods = ["x1**2 + y1**2 = 1", "(x2 - x1)**2 + (y2 - y1)**2 = 1"]
     system = lagrange("rods", "x1 y1 x2 y2", f"({squares})/2 - y1 - y2", constraints=rods)
-    run = compile_stepper(system, method).integrate([1.0, 0.0, 2.0, 0.0], velocity=[0.0] * 4, h=0.02, steps=20)
+    stepper = compile_stepper(system, method, precision=precision)
+    run = stepper.integrate([1.0, 0.0, 2.0, 0.0], velocity=[0.0] * 4, h=0.02, steps=20)
     assert run.fallback_steps == 0
+    assert max(run.iterations) <= 4

@@ -430,11 +430,8 @@ def _fused(statements: Sequence[Statement]) -> Iterator[Statement | tuple[Assign
 
 
 def _continues(loop: Sequence[Assign], statement: Assign) -> bool:
-    """Return whether a statement can be in a loop: it reads nothing that the loop computes at other indices."""
-    if _letter(loop[0]) != _letter(statement) or _gathers(statement) or any(map(_gathers, loop)):
-        return False
-    computed = {each.target.name for each in loop}
-    return not computed & over_points(statement.value)
+    """Return whether a statement can be in a loop: on the same index, without values at indices from tables."""
+    return _letter(loop[0]) == _letter(statement) and not any(map(_gathers, (*loop, statement)))
 
 
 def _loops(statements: Sequence[Statement]) -> Iterator[Sequence[Statement]]:
@@ -470,16 +467,9 @@ def _all_names(statement: Statement) -> set[str]:
 def _is_of_one_loop(name: str, statements: Sequence[Statement]) -> bool:
     """Return whether one loop over an index computes a quantity, once, and uses it, at its own index alone."""
     users = [loop for loop in _loops(statements) if any(name in _all_names(each) for each in loop)]
-    if len(users) > 1 or any(_is_whole(name, each) or _gathers_name(name, each) for each in users[0]):
+    if len(users) > 1 or any(_is_whole(name, each) for each in users[0]):
         return False
     return sum(target_name(each) == name for each in users[0]) == 1
-
-
-def _gathers_name(name: str, statement: Statement) -> bool:
-    """Return whether a statement uses a quantity at indices from tables."""
-    assert isinstance(statement, Assign)
-    uses = (each for each in (statement.target, *reads(statement.value)) if each.name == name)
-    return any(each.at is not None and each.at.gathers for each in uses)
 
 
 def _is_whole(name: str, statement: Statement) -> bool:
