@@ -95,6 +95,13 @@ def test_systems_and_methods_with_lanes_have_the_same_bits(gpu: EmulatedGpu, sys
     check_bits(compiled(system, CASES[system]), *states(system), **PLAN | {"t": 0.3})
 
 
+@pytest.mark.second
+def test_threads_store_velocities_and_forces_of_hamiltonian_systems(gpu: EmulatedGpu) -> None:
+    stepper = sc.compile_stepper(sc.problem("point-vortices").system, sc.SVI(4), flags=PORTABLE_FLAGS)
+    start = np.random.default_rng(3).uniform(-0.1, 0.1, (2, COUNT, 4))
+    check_bits(stepper, [-0.5, 0.5, -1.5, 1.5] + start[0], start[1], **PLAN)
+
+
 @pytest.mark.parametrize(
     "plan", [{"h": 0.1, "t_end": 2.3, "save_every": 3}, {"h": -0.1, "t": 2.55, "t_end": 0.02}], ids=["on", "back"]
 )
