@@ -54,7 +54,7 @@ static SELDOM __attribute__((noinline)) condition loses_digits(const step_data *
  * in registers: a vector that is loaded soon after its parts were stored waits for them. */
 static void finish_step(const step_data *step, rattle_step *now, number *z, number *dp)
 {
-  const real weight = step->h * RATTLE_WEIGHT[DEGREE];
+  const real last_weight = step->h * RATTLE_WEIGHT[DEGREE];
   factors l;
   lanes derivative[CONSTRAINT_ENTRIES], x[CONSTRAINTS];
   number u[2 * M], value[M + 2 * CONSTRAINTS];
@@ -67,11 +67,11 @@ static void finish_step(const step_data *step, rattle_step *now, number *z, numb
     derivative[e] = load(now->derivative[e], LAST_GROUP);
   factorise_points(derivative, END_MASSES(now), l);
   for (int k = 0; k < CONSTRAINTS; k++)
-    x[CONSTRAINT_POSITION[k]] = lanes_of_number(-value[M + k] / weight);
+    x[CONSTRAINT_POSITION[k]] = lanes_of_number(-value[M + k] / last_weight);
   solve_points(l, x);
 #pragma GCC unroll 64
   for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
-    dp[CONSTRAINT_ENTRY[e][1]] += weight * now->derivative[e][DEGREE - 1] *
+    dp[CONSTRAINT_ENTRY[e][1]] += last_weight * now->derivative[e][DEGREE - 1] *
         LAST_LANE(x[CONSTRAINT_POSITION[CONSTRAINT_ENTRY[e][0]]]);
   end_velocity(step, now, dp, u);
   for (int i = 0; i < M; i++)
