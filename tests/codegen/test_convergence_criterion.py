@@ -338,7 +338,7 @@ enum {{ M = 1, S = 1, FINAL_ITERATIONS = 0, OK = 0, NOT_CONVERGED = 1, NOT_FINIT
 #define SUPPORT_STATUS_CODES_H
 #define SUPPORT_STEP_H
 #define SUPPORT_TRAJECTORIES_H
-#define apply(table, n, x, i) x[n][i]
+#define sum_of_stored(table, n, x, i) x[n][i]
 #define reaches(step, dq, dp) 1
 static inline double larger(double a, double b) {{ return a > b ? a : b; }}
 static inline lanes lanes_of(double x)
