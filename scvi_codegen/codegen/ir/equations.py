@@ -458,29 +458,6 @@ class Control:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TangentScheme:
-    """Explicit Runge-Kutta-Nystroem scheme of n stages for a tangent vector (``codegen/lowering/control.py``).
-
-    Attributes:
-        which: (n,) indices of the nodes among the points of a step; ``nodes``: their abscissae.
-        position, velocity: (n, 5) from a_0 and the stages to the displacements and velocities at the nodes.
-        expected: (n,) from a_0 and the stages before the last to its extrapolation.
-        end_position, end_velocity, end_acceleration: (n,) from the stages to the end of the step.
-        at_points: (n, lanes) from the stages to the accelerations at all points.
-    """
-
-    which: tuple[int, ...]
-    nodes: tuple[Number, ...]
-    position: NumberTable
-    velocity: NumberTable
-    expected: tuple[Number, ...]
-    end_position: tuple[Number, ...]
-    end_velocity: tuple[Number, ...]
-    end_acceleration: tuple[Number, ...]
-    at_points: NumberTable
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class ErrorGrowth:
     """Propagation of a tangent vector along adaptive runs (``codegen/lowering/control.py``).
 
@@ -489,18 +466,18 @@ class ErrorGrowth:
         product: at u = (x, these) their product with x = dq, or (dq, dq'), on lanes.
         energy: gradient of the energy at (q, v), on lanes; ``None`` of separable systems, and if it is not conserved.
         conserves_energy: false if forces act or the system depends on time.
-        schemes: for tolerances at round-off level, and for larger ones.
-        at_end: (lanes,) extrapolation from all points to the end.
-        tables: those of corrections at the points, if accelerations depend on velocities; else the iteration's own.
+        of_velocities: true if accelerations depend on velocities.
+        ends: (points, 8) from accelerations at the points to Taylor's coefficients at the end of a step.
+        tables: of the extrapolation to the end and, ``of_velocities``, from accelerations to tangent vectors.
     """
 
     partials: Kernel
     product: Kernel
     energy: Kernel | None
     conserves_energy: bool
-    schemes: tuple[TangentScheme, TangentScheme]
-    at_end: tuple[Number, ...]
-    tables: tuple[IterationTable, ...] = ()
+    of_velocities: bool
+    ends: NumberTable
+    tables: tuple[IterationTable, ...]
 
     @property
     def kernels(self) -> tuple[Kernel, ...]:

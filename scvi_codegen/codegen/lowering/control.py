@@ -5,17 +5,11 @@ The stored values of the last step, or of the last two, are extrapolated into th
 As predictors they need only double precision, by Stieltjes' procedure (Gautschi, *Orthogonal Polynomials*, 2004,
 section 2.2), in sums that round the same on all platforms.
 
-Growth of errors along adaptive runs: a tangent vector by an explicit Runge-Kutta-Nystroem scheme.
+Growth of errors along adaptive runs: a tangent vector by Picard iterations.
 
 The variational equation dq'' = F_q dq / m of a separable system, or L_vv dq'' = -E_q dq - E_v dq' with the residual
-E(q, v, a) of the Euler-Lagrange equations, is integrated over each accepted step. Its nodes c_s are a few of the points
-of the step, at which the derivatives are evaluated in SIMD lanes; the acceleration a_0 at the start of the step is
-extrapolated from the step before. The stages
-
-    x_s = dq + c_s h dv + h^2 sum_{j < s} position[s][j] a_j,      a_s = F_q(X_s) x_s / m,
-
-are explicit, with the integrals of the polynomial through a_0, .., a_{s-1}; the polynomial through a_1, .., a_n gives
-the end. (Nystroem methods: Hairer, Norsett & Wanner, Solving ODEs I, sec. II.14.)
+E(q, v, a) of the Euler-Lagrange equations, is integrated over each accepted step by collocation at its points (Hairer,
+Norsett & Wanner, Solving ODEs I, sec. II.7 and II.14).
 """
 
 import math
@@ -33,18 +27,8 @@ from scvi_codegen.codegen.ir.equations import (
     FixedPointIteration,
     IterationTable,
     StoredValues,
-    TangentScheme,
 )
-from scvi_codegen.codegen.ir.kernel import (
-    Expression,
-    Kernel,
-    Load,
-    Number,
-    NumberTable,
-    Operation,
-    lower_matrix,
-    lower_vector,
-)
+from scvi_codegen.codegen.ir.kernel import Expression, Kernel, Load, Number, NumberTable, Operation
 from scvi_codegen.codegen.ir.program import Program
 from scvi_codegen.codegen.lowering.derivatives import NOTHING, force_derivatives, vector_product
 from scvi_codegen.codegen.lowering.solvers.tables import (
@@ -200,8 +184,6 @@ def _padded(rows: list[list[float]], through: NumberTable, lanes: int) -> Number
     return (*wide, *(wide[-1],) * (lanes - count))
 
 
-MOST_NODES = 3, 4
-"""Largest numbers of nodes at round-off level and above; those nearest to the Gauss points of as many are chosen."""
 MOST_COORDINATES, MOST_DERIVATIVES, MOST_OPERATIONS = 20, 180, 1500
 """Largest numbers of coordinates, of distinct derivatives F_q and of operations in coupled equations (a chain of five
 links has 1200): their derivatives would take more than half of the time of compilation of larger systems."""
@@ -217,43 +199,53 @@ def error_growth_of(system: MechanicalSystem, program: Program) -> ErrorGrowth |
     make = GROWTH_KERNELS.get(fixed_point.derivatives_part)
     twin = equivalent_lagrangian(system) if make else None
     points = fixed_point.guess.abscissae
-    which = [_nodes(points, most) for most in MOST_NODES]
-    if make is None or twin is None or len(set(points)) < len(points) or len(which[0]) < 2:
+    if make is None or twin is None or len(set(points)) < len(points) or sum(c > 0 for c in points) < 2:
         return None
     kernels = make(twin)
     if kernels is None or kernels[0].values > MOST_DERIVATIVES:
         return None
     partials, product, energy = kernels
-    lanes = fixed_point.lanes
-    tables = (
-        IterationTable("TANGENT_INTEGRALS", pad_matrix(cardinal_integrals(points, points, mp.zero), lanes)),
-        IterationTable("TANGENT_END", pad_vector(cardinal_integrals(points, (mp.one,), mp.zero)[0], lanes)),
-        IterationTable("VELOCITY_RATE", pad_matrix(differentiation_matrix(points), lanes)),
-    )
-    of_roundoff, of_tolerance = (_tangent_scheme(points, nodes, lanes) for nodes in which)
+    of_velocities = make is _coupled_growth
     return ErrorGrowth(
         partials=_with_common_roots(partials),
         product=product,
         energy=energy,
         conserves_energy=not system.changes_energy,
-        schemes=(of_roundoff, of_tolerance),
-        at_end=pad_vector(cardinal_values(points, (mp.one,))[0], lanes),
-        tables=() if make is _separable_growth else tables,
+        of_velocities=of_velocities,
+        ends=_taylor_table(points, fixed_point.lanes),
+        tables=_growth_tables(points, fixed_point.lanes, of_velocities=of_velocities),
     )
 
 
-def _tangent_scheme(points: Vector, which: tuple[int, ...], lanes: int) -> TangentScheme:
-    nodes = tuple(points[n] for n in which)
-    return TangentScheme(
-        which=which,
-        nodes=lower_vector(nodes),
-        position=_explicit(nodes, _twice_integrated),
-        velocity=_explicit(nodes, lambda before, at: cardinal_integrals(before, at, mp.zero)),
-        expected=lower_vector(cardinal_values((mp.zero, *nodes[:-1]), nodes[-1:])[0]),
-        end_position=lower_vector(_twice_integrated(nodes, (mp.one,))[0]),
-        end_velocity=lower_vector(cardinal_integrals(nodes, (mp.one,), mp.zero)[0]),
-        end_acceleration=lower_vector(cardinal_values(nodes, (mp.one,))[0]),
-        at_points=tuple(pad_vector(column, lanes) for column in transpose(cardinal_values(nodes, points))),
+TAYLOR_NUMBERS = 8
+"""Columns of the table from accelerations to Taylor's coefficients: whole vectors of any length."""
+
+
+def _taylor_table(points: Vector, lanes: int) -> NumberTable:
+    """Return the table from h^2 dq'' at the points to h^k dq^(k) / k! at the end; further columns are zero."""
+    end, rates = (mp.one,), differentiation_matrix(points)
+    at_end = cardinal_values(points, end)[0]
+    slope = tuple(mp.fdot(at_end, column) for column in transpose(rates))
+    bend = tuple(mp.fdot(slope, column) for column in transpose(rates))
+    rows = (
+        _twice_integrated(points, end)[0],
+        cardinal_integrals(points, end, mp.zero)[0],
+        *(tuple(x / k for x in row) for k, row in ((2, at_end), (6, slope), (24, bend))),
+    )
+    columns = [pad_vector(column, TAYLOR_NUMBERS) for column in transpose(rows)]
+    return (*columns, *(pad_vector((), TAYLOR_NUMBERS),) * (lanes - len(columns)))
+
+
+def _growth_tables(points: Vector, lanes: int, *, of_velocities: bool) -> tuple[IterationTable, ...]:
+    """Return the extrapolation to the end, and the tables from accelerations to tangent vectors at the points."""
+    at_points = {
+        "TANGENT_INTEGRALS": cardinal_integrals(points, points, mp.zero),
+        "TANGENT_INTEGRALS_TWICE": _twice_integrated(points, points),
+        "VELOCITY_RATE": differentiation_matrix(points),
+    }
+    return (
+        IterationTable("AT_END", pad_vector(cardinal_values(points, (mp.one,))[0], lanes)),
+        *(IterationTable(name, pad_matrix(table, lanes)) for name, table in at_points.items() if of_velocities),
     )
 
 
@@ -298,23 +290,6 @@ GROWTH_KERNELS: Mapping[str, Callable[[LagrangianSystem], tuple[Kernel, Kernel, 
     "separable_derivatives": _separable_growth,
     "coupled_derivatives": _coupled_growth,
 }
-
-
-def _explicit(nodes: Vector, integrated: Callable[[Vector, Vector], Matrix]) -> NumberTable:
-    """Return integrals up to each node of the polynomial through the start and the nodes before, padded by zeros."""
-    width = max(MOST_NODES)
-    rows = ((*integrated((mp.zero, *nodes[:s]), (c,))[0], *(mp.zero,) * (width - s)) for s, c in enumerate(nodes))
-    return lower_matrix(tuple(rows))
-
-
-def _nodes(points: Vector, most: int) -> tuple[int, ...]:
-    """Return the indices of the nodes among the points; the start of the step is not one."""
-    inner = [n for n, c in enumerate(points) if c > 0]
-    if len(inner) <= most:
-        return tuple(inner)
-    gauss = [(1 + x) / 2 for x in gauss_legendre(most).points]
-    distances = ([abs(points[n] - c) for n in inner] for c in gauss)
-    return tuple(dict.fromkeys(inner[each.index(min(each))] for each in distances))
 
 
 def _twice_integrated(points: Vector, ends: Vector) -> Matrix:

@@ -70,8 +70,8 @@ Bodies that are ejected move regularly from then on, which brings the mean close
 RIGHT, LOOSER, MOST_REPEATED, PARTS, DIGITS = 1e-10, 1e4, 2**16, 16, 15
 """Difference that leaves ten digits, and its ratio to the tolerance if that is larger; most steps of a repetition that
 confirms a growth, and number of its comparisons; digits of a double."""
-ROUNDOFF, LOOSE_TOLERANCE = 1e-14, 1e-6
-"""Tolerances above which the propagation of the tangent vector needs four stages, and more corrections."""
+ALL_STEPS, SOME_STEPS, LOOSE_TOLERANCE = 1, 4, 1e-5
+"""One of how many steps measures the growth above this tolerance, where an orbit has few steps, and below."""
 
 
 def warn_of_error_growth(
@@ -102,7 +102,7 @@ def warn_of_error_growth(
 
 
 def measured_growth(stepper: Integrator, plan: StepPlan, requested: bool | None) -> int:
-    """Return how C measures the growth of errors along a run: 0 no, 1 to 3 by a tangent vector (``measures_growth``).
+    """Return in one of how many steps C measures the growth of a tangent vector; 0: it has none (``measures_growth``).
 
     Raises:
         MethodError: for a requested check, if events change the state.
@@ -118,8 +118,7 @@ def measured_growth(stepper: Integrator, plan: StepPlan, requested: bool | None)
     double = stepper.interface.words == 1 and not stepper.changes_states
     if requested is not None or not isinstance(plan, Adaptive) or not double or not warnings_wanted():
         return 0
-    tolerance = plan.tolerance
-    return 1 if tolerance is None else 1 + (tolerance > ROUNDOFF) + (tolerance > LOOSE_TOLERANCE)
+    return ALL_STEPS if plan.admissible_error > LOOSE_TOLERANCE else SOME_STEPS
 
 
 def _warn_of_amplification(what: str, difference: float, t: float) -> None:

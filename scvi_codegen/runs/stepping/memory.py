@@ -601,7 +601,7 @@ class Memory:
 
     @property
     def _growth(self) -> tuple[float, float] | None:
-        """Logarithm g of the growth of the tangent vector at the end, and the largest g - mean g."""
+        """Largest logarithm g of the growth of the tangent vector, and the largest g - mean g."""
         samples = self._can_measure_growth and self._memory.growth_samples
         return (self._memory.growth, self._memory.growth_excess) if samples else None
 
