@@ -160,6 +160,11 @@ PASS lanes displacement_of(const step_points *w, int g, long long i, lanes *low)
   return DRIFT[g] * of.high + data->inverse_mass[i] * (data->square * sum);
 }
 
+/* Increments of a coordinate: of q, with its low word, and of p. */
+typedef struct {
+  number q, q_low, p;
+} end_increments;
+
 /* sum_n weights_n F_n of a coordinate, with the remainder of the iteration. */
 PASS number weigh_forces(const step_points *w, const weight *weights, const weight *low, const lanes *further,
     long long i)
@@ -167,6 +172,22 @@ PASS number weigh_forces(const step_points *w, const weight *weights, const weig
   if (!w->former)
     return weigh_apart_twice(weights, low, &w->F[i], EXTENT(w->n));
   return weigh_apart_thrice(weights, low, &w->F[i], further, &w->former[i], EXTENT(w->n));
+}
+
+PASS end_increments increments_of(const step_points *w, long long i)
+{
+  const iteration_data *data = w->data;
+  const drift_words of = DRIFT_OF(w, i);
+  const lanes *position = w->former ? w->remainder->position : NULL;
+  const lanes *momentum = w->former ? w->remainder->momentum : NULL;
+  const number sum = weigh_forces(w, POINT_END_POSITION, POINT_END_POSITION_LOW, position, i);
+  const number kick = data->inverse_mass[i] * (data->square * sum), q = of.high + kick, part = q - of.high;
+  end_increments end;
+  end.q = q;
+  end.q_low =
+      (of.high - (q - part)) + (kick - part) + (of.low + data->inverse_mass[i] * (data->square_low * sum));
+  end.p = weigh_forces(w, data->kick, data->kick_low, momentum, i);
+  return end;
 }
 
 /* Adds the square of a change. For many coordinates with names the sum of the rounding errors would stay above the
@@ -228,7 +249,7 @@ PASS void find_rough_increments(const step_points *w, number *dq, number *dp)
 #endif
 
 #if defined(SUMS_OF_EIGHT) && defined(EIGHT_COORDINATES)
-/* Increments of eight coordinates, which are lanes; dq_low: low words. */
+/* increments_of eight coordinates, which are lanes; dq_low: low words. */
 PASS void find_eight_increments(const step_points *w, int i, double *dq, double *dq_low, double *dp)
 {
   const iteration_data *data = w->data;
@@ -256,9 +277,6 @@ PASS void find_eight_increments(const step_points *w, int i, double *dq, double 
 /* Computes the increments of a range of coordinates; low words follow those of q. */
 PASS void find_increments(const step_points *w, section here, number *dq, number *dp)
 {
-  const iteration_data *data = w->data;
-  const lanes *position = w->former ? w->remainder->position : NULL;
-  const lanes *momentum = w->former ? w->remainder->momentum : NULL;
 #if defined(SUMS_OF_EIGHT) && defined(EIGHT_COORDINATES)
   enum { IN_EIGHTS = GROUPS == 1 ? M / 8 * 8 : 0 };
   for (int i = 0; i < IN_EIGHTS; i += 8)
@@ -266,13 +284,8 @@ PASS void find_increments(const step_points *w, section here, number *dq, number
   here.first = IN_EIGHTS;
 #endif
   for (long long i = here.first; i < here.end; i++) {
-    const drift_words of = DRIFT_OF(w, i);
-    const number sum = weigh_forces(w, POINT_END_POSITION, POINT_END_POSITION_LOW, position, i);
-    const number kick = data->inverse_mass[i] * (data->square * sum), q = of.high + kick, part = q - of.high;
-    dq[i] = q;
-    dq[EXTENT(w->n) + i] =
-        (of.high - (q - part)) + (kick - part) + (of.low + data->inverse_mass[i] * (data->square_low * sum));
-    dp[i] = weigh_forces(w, data->kick, data->kick_low, momentum, i);
+    const end_increments end = increments_of(w, i);
+    dq[i] = end.q, dq[EXTENT(w->n) + i] = end.q_low, dp[i] = end.p;
   }
 }
 
