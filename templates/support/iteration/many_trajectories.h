@@ -33,7 +33,8 @@ static __attribute__((noinline)) void continue_differently(history past, long lo
     lanes next[S];
     for (int n = 0; n < S; n++)
       next[n] = lanes_selected(
-          one.all, sum_of_stored(LAST_ALONE, n, past.last, i), sum_of_stored(LAST, n, past.last, i) + sum_of_stored(BEFORE, n, x, i));
+          one.all, sum_of_stored(LAST_ALONE, n, past.last, i),
+          sum_of_stored(LAST, n, past.last, i) + sum_of_stored(BEFORE, n, x, i));
     for (int n = 0; n < S; n++)
       x[n][i] = next[n];
   }
@@ -50,7 +51,8 @@ static inline void continue_curve(const step_data *step, history past, long long
   for (int i = 0; i < M; i++) {
     lanes next[S];
     for (int n = 0; n < S; n++)
-      next[n] = steps == 1 ? sum_of_stored(LAST_ALONE, n, past.last, i) : sum_of_stored(LAST, n, past.last, i) + sum_of_stored(BEFORE, n, x, i);
+      next[n] = steps == 1 ? sum_of_stored(LAST_ALONE, n, past.last, i)
+                           : sum_of_stored(LAST, n, past.last, i) + sum_of_stored(BEFORE, n, x, i);
     for (int n = 0; n < S; n++)
       x[n][i] = next[n];
   }
