@@ -17,8 +17,8 @@ from scvi_codegen.analysis.verification.arrays import small_start
 from scvi_codegen.analysis.verification.arrays.whole import WholeStart
 from scvi_codegen.codegen import pipeline
 from scvi_codegen.codegen.ir.equations import Control
-from scvi_codegen.codegen.ir.program import Program
-from scvi_codegen.codegen.rendering.program_source import render
+from scvi_codegen.codegen.ir.program import ArrayProgram
+from scvi_codegen.codegen.rendering.program_source import render_arrays
 from scvi_codegen.codegen.rendering.source import Source
 from scvi_codegen.runs import compiler
 from scvi_codegen.runs.stepping.array_interface import read_arrays
@@ -119,7 +119,7 @@ FAULTS = {
     ),
     "what rounding cuts off is lost": ("ring", "svi:2", r"\*low = rest - \(rounded - sum\);", "*low = 0.0;"),
     "positions by the rates of momenta": ("waves", "gauss:2", r"X, past\.now \+ n, ", "X, past.now, "),
-    "a kick too long": ("net", "stoermer-verlet", r"run->h \* KICK\[k\]", "1.000000001 * run->h * KICK[k]"),
+    "a kick too long": ("net", "stoermer-verlet", r"h \* KICK\[LEAPS - 1\]", "1.000000001 * h * KICK[LEAPS - 1]"),
     "a long loop without its second part": (
         "ring",
         "stoermer-verlet",
@@ -148,14 +148,14 @@ def test_planted_faults_are_detected(fault: str, monkeypatch: pytest.MonkeyPatch
     name, method, pattern, replacement = FAULTS[fault]
     edits = 0
 
-    def rendered(program: Program, control: Control | None = None, **options: str) -> Source:
+    def rendered(program: ArrayProgram, control: Control | None) -> Source:
         nonlocal edits
-        source = render(program, control, **options).amalgamated()
+        source = render_arrays(program, control).amalgamated()
         code, made = re.subn(pattern, replacement, source.code, count=1)
         edits += made
         return replace(source, code=code)
 
-    monkeypatch.setattr(pipeline, "render", rendered)
+    monkeypatch.setattr(pipeline, "render_arrays", rendered)
     monkeypatch.setattr(compiler, "cached_source", lambda key, derive: derive())
     found = certificate(name, method)
     assert edits > 0

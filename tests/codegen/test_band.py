@@ -18,6 +18,10 @@ HEAD = """#include "band.h"
 #define SUPPORT_NUMBERS_H
 typedef double real;
 #define MATH(f) f
+static inline int least(int a, int b)
+{
+  return a < b ? a : b;
+}
 static int BAND;
 #include "support/newton/band.h"
 """

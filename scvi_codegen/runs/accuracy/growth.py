@@ -118,7 +118,7 @@ def measured_growth(stepper: Integrator, plan: StepPlan, requested: bool | None)
     double = stepper.interface.words == 1 and not stepper.changes_states
     if requested is not None or not isinstance(plan, Adaptive) or not double or not warnings_wanted():
         return 0
-    return ALL_STEPS if plan.admissible_error > LOOSE_TOLERANCE else SOME_STEPS
+    return SOME_STEPS if plan.tolerance is None or plan.tolerance <= LOOSE_TOLERANCE else ALL_STEPS
 
 
 def _warn_of_amplification(what: str, difference: float, t: float) -> None:
