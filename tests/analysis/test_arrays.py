@@ -119,7 +119,7 @@ FAULTS = {
     ),
     "what rounding cuts off is lost": ("ring", "svi:2", r"\*low = rest - \(rounded - sum\);", "*low = 0.0;"),
     "positions by the rates of momenta": ("waves", "gauss:2", r"X, past\.now \+ n, ", "X, past.now, "),
-    "a kick too long": ("net", "stoermer-verlet", r"h \* KICK\[LEAPS - 1\]", "1.000000001 * h * KICK[LEAPS - 1]"),
+    "a kick too long": ("net", "stoermer-verlet", r"h \* KICK\[last\]", "1.000000001 * h * KICK[last]"),
     "a long loop without its second part": (
         "ring",
         "stoermer-verlet",
