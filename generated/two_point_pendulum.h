@@ -63,7 +63,7 @@ typedef struct {
   double largest_v[1], largest_a[1]; /* velocities and accelerations so far, for the size of errors */
   double largest_dq[1], largest_bend[1]; /* displacements by a step and by its curvature so far */
   double memory[4];
-  long long guess; /* what memory contains of the previous steps; 0: nothing; < 0: the iteration failed */
+  long long guess; /* steps kept in memory; 0: none (set it after a change of parameters); < 0: the iteration failed */
   long long fallback_steps; /* steps that the iteration did not solve, but its fallback */
   long long iterations; /* since the last stored state */
   double error, error_t; /* largest error estimate of a step so far, and the time of that step */

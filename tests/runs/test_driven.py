@@ -92,6 +92,32 @@ def test_sampled_controller_continues_bitwise(pendulum):
 
 
 @pytest.mark.second
+@pytest.mark.parametrize("precision", ["double", "double-double"])
+@pytest.mark.parametrize("method", ["stoermer-verlet", "composition:4", "svi:2"])
+def test_first_kick_after_a_jump_is_that_of_the_new_input(method, precision):
+    """Explicit steps reuse their last force, which is that of the former input; new runs have none."""
+    formula, levels = "x_dot**2/2 - x**4/4 + u*x", [0.0, 1.0, -2.0, 3.0]
+    driven, constant = (
+        sc.compile_stepper(sc.LagrangianSystem.from_text("driven", ["x"], formula, **role), method, precision=precision)
+        for role in ({"inputs": ["u"]}, {"parameters": {"u": 0.0}})
+    )
+    q, p = np.array([1.0]), np.array([0.0])
+    for level in levels:
+        part = constant.integrate(q, p, h=0.1, steps=5, parameters={"u": level})
+        q, p = part.q[-1], part.p[-1]
+    whole = driven.integrate(
+        [1.0], [0.0], inputs={"u": ([0.0, 0.5, 1.0, 1.5, 2.0], [*levels, 0.0], "constant")}, h=0.1, t_end=2.0
+    )
+    sampled, changed = driven.start([1.0], [0.0], h=0.1), constant.start([1.0], [0.0], h=0.1)
+    for level in levels:
+        sampled.set_inputs(u=level)
+        sampled.advance(5)
+        changed.update(parameters={"u": level})
+        changed.advance(5)
+    for found in (whole.q[-1], sampled.q, changed.q):
+        assert_allclose(found, q, rtol=0, atol=1e-14)
+
+
 def test_inputs_from_sympy_and_scipy():
     q, v, u = sympy.symbols("q q_dot u")
     system = sc.LagrangianSystem.from_sympy(

@@ -133,6 +133,7 @@ def splitting_of(system: MechanicalSystem, method: Method) -> Splitting | None:
         turning=turning if split.bodies else None,
         principal=lower_matrix(tuple(tuple(map(mp.mpf, map(str, axes))) for axes in split.axes if turned)),
         leaps=bool(method.fractions),
+        driven=bool(system.inputs),
     )
 
 

@@ -299,7 +299,7 @@ class CompiledMethod:
     @cached_property
     def _ensemble_binding(self) -> Binding | None:
         """Library of trajectories in SIMD lanes, compiled on first use; ``None`` if the method has none."""
-        source = (self._variants[Acting(in_lanes=True)] if self.sums_action else None) or self.ensemble
+        source = self._variants[Acting(in_lanes=True)] if self.sums_action else self.ensemble
         return None if source is None else Binding(building.load(source, flags=self.flags), source.prefix)
 
     @cached_property

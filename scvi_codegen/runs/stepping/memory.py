@@ -371,6 +371,8 @@ class Memory:
             check_reachable(self.stepper, self.q, self.p, self.t, values)
         self._parameters[:] = values
         self._has_defaults = False
+        if self.stepper.interface.solver == "explicit":
+            self._memory.guess = 0  # the last force is that of the former parameters
         self._check_masses()
 
     def _check_masses(self) -> None:
