@@ -231,7 +231,7 @@ class _Selection(ast.NodeTransformer):
         if not isinstance(node.test, ast.Name):
             return self.generic_visit(node)
         held = node.body if node.test.id in self.features else node.orelse
-        return [each for statement in held for each in self._listed(self.visit(statement))]
+        return [line for statement in held for line in self._listed(self.visit(statement))]
 
     @staticmethod
     def _listed(visited: ast.AST | list[ast.AST]) -> list[ast.AST]:

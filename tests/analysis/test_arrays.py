@@ -163,8 +163,8 @@ def test_planted_faults_are_detected(fault: str, monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.second
-def test_model_file_is_verified(tmp_path: Path) -> None:
-    """Beside it lies the certificate; the exit status is 0."""
+def test_model_file_is_verified_and_run(tmp_path: Path) -> None:
+    """Beside it lies the certificate; the exit status is 0. Plain sums differ by their rounding errors."""
     path = tmp_path / "oscillators.toml"
     path.write_text(
         """
@@ -184,6 +184,10 @@ def test_model_file_is_verified(tmp_path: Path) -> None:
     )
     assert "all measured properties are satisfied" in output_of("verify", path)
     assert json.loads((tmp_path / "oscillators.certificate.json").read_text())["passed"]
+    ends = [
+        json.loads(output_of("run", path, "--json", *sums))["final"]["q"]["q"] for sums in ((), ("--sums", "plain"))
+    ]
+    assert np.abs(np.subtract(*ends)).max() < 1e-14
 
 
 @pytest.mark.parametrize("place", [0, 20, 49])

@@ -209,8 +209,8 @@ def _kept(part: Part, reached: set[Part]) -> Part | None:
         return None
     branches = []
     for line, parts in part.branches:
-        nameless = {leaf for each in parts for leaf in each.leaves if not leaf.names}
-        branches.append((line, tuple(left for each in parts if (left := _kept(each, reached | nameless)))))
+        nameless = {leaf for inner in parts for leaf in inner.leaves if not leaf.names}
+        branches.append((line, tuple(left for inner in parts if (left := _kept(inner, reached | nameless)))))
     lines = [text for line, parts in branches for text in (line, *_lines(parts))]
     return replace(part, lines=(*lines, "#endif"), branches=tuple(branches))
 
@@ -285,6 +285,6 @@ def _without_alternatives(parts: Sequence[Part]) -> list[Part]:
     kept = []
     for part in parts:
         comments = [REQUIRED.sub("", comment) for comment in part.section]
-        section = [each for each in comments if each != "/* */" and {*CHOICE.findall(each)} <= names]
+        section = [comment for comment in comments if comment != "/* */" and {*CHOICE.findall(comment)} <= names]
         kept.append(replace(part, section=tuple(section)))
     return kept

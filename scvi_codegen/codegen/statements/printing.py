@@ -229,33 +229,37 @@ class Printer:
     def function_of_points(self, statements: Sequence[Statement]) -> list[str]:
         """Return the lines of a function with points."""
         assert isinstance(self.layout, PointsAsLanes)
-        stored = {name for name, each in self.quantities.items() if each.place in (Place.MEMORY, Place.GROUPS)}
+        stored = {name for name, quantity in self.quantities.items() if quantity.place in (Place.MEMORY, Place.GROUPS)}
         loops = point_loops(statements, stored)
         self._place(loops)
-        every = {**self.quantities, **self.locals}
-        memory = {name for name, each in every.items() if each.place is Place.MEMORY and each.words == 1}
+        quantities = {**self.quantities, **self.locals}
+        memory = {
+            name for name, quantity in quantities.items() if quantity.place is Place.MEMORY and quantity.words == 1
+        }
         loops = [in_registers(loop, memory) for loop in loops]
-        shared = [each for each in self.locals.values() if each.place in (Place.MEMORY, Place.GROUPS)]
-        lines = [self.layout.declaration(each) for each in shared]
+        shared = [quantity for quantity in self.locals.values() if quantity.place in (Place.MEMORY, Place.GROUPS)]
+        lines = [self.layout.declaration(quantity) for quantity in shared]
         for loop in loops:
             lines += self._point_loop(loop)
         return lines
 
     def _place(self, loops: Sequence[PointLoop]) -> None:
         """Find the place of each local quantity."""
-        every = [each for loop in loops for each in loop.body]
-        summed = set[str]().union(*(over_points(each.value) for each in every if isinstance(each, Assign)))
-        for name, letter in _computed(every).items():
+        statements = [statement for loop in loops for statement in loop.body]
+        summed = set[str]().union(
+            *(over_points(statement.value) for statement in statements if isinstance(statement, Assign))
+        )
+        for name, letter in _computed(statements).items():
             if name in self.quantities:
                 continue
-            users = [k for k, loop in enumerate(loops) if any(name in _all_names(each) for each in loop.body)]
+            users = [k for k, loop in enumerate(loops) if any(name in _all_names(statement) for statement in loop.body)]
             if name in summed:
                 place = Place.MEMORY
             elif len(users) > 1:
                 place = Place.GROUPS
             else:
                 place = Place.LOCAL if _is_of_one_loop(name, loops[users[0]].body) else Place.ARRAY
-            self.locals[name] = self.layout.local(name, place, self._words(name, every), letter)
+            self.locals[name] = self.layout.local(name, place, self._words(name, statements), letter)
 
     def _words(self, name: str, statements: Sequence[Statement]) -> int:
         """Return the words of a local quantity: those of the first value that it is given."""
@@ -330,7 +334,7 @@ class Printer:
 
     def loop(self, assignments: Sequence[Assign]) -> Iterator[str]:
         """Yield a loop over one index."""
-        letter, lines = _letter(assignments[0]), [self.assignment(each) for each in assignments]
+        letter, lines = _letter(assignments[0]), [self.assignment(statement) for statement in assignments]
         if letter is None:
             yield from lines
             return
@@ -405,13 +409,15 @@ class Printer:
 
 def _letter(statement: Assign) -> str | None:
     """Return the letter of the index of a statement; of a number that is no sum over an index ``None``."""
-    every = (statement.target, *reads(statement.value))
-    return next((each.at.letter for each in every if each.at is not None), None)
+    quantities = (statement.target, *reads(statement.value))
+    return next((quantity.at.letter for quantity in quantities if quantity.at is not None), None)
 
 
 def _gathers(statement: Assign) -> bool:
     """Return whether a statement reads or computes values at indices from tables."""
-    return any(each.at is not None and each.at.gathers for each in (statement.target, *reads(statement.value)))
+    return any(
+        quantity.at is not None and quantity.at.gathers for quantity in (statement.target, *reads(statement.value))
+    )
 
 
 def _fused(statements: Sequence[Statement]) -> Iterator[Statement | tuple[Assign, ...]]:
@@ -448,14 +454,14 @@ def _loops(statements: Sequence[Statement]) -> Iterator[Sequence[Statement]]:
 
 def _computed(statements: Sequence[Statement]) -> dict[str, str]:
     """Return the names of the quantities that statements compute, in order, with the letters of their indices."""
-    found: dict[str, str] = {}
+    letters: dict[str, str] = {}
     for statement in statements:
         match statement:
             case Assign(target=Read(name=name, at=At() as at)) | Apply(target=Read(name=name, at=At() as at)):
-                found.setdefault(name, at.letter)
+                letters.setdefault(name, at.letter)
             case Repeat(body=body) | When(body=body):
-                found = {**_computed(body), **found}
-    return found
+                letters = {**_computed(body), **letters}
+    return letters
 
 
 def _all_names(statement: Statement) -> set[str]:
@@ -466,10 +472,10 @@ def _all_names(statement: Statement) -> set[str]:
 
 def _is_of_one_loop(name: str, statements: Sequence[Statement]) -> bool:
     """Return whether one loop over an index computes a quantity, once, and uses it, at its own index alone."""
-    users = [loop for loop in _loops(statements) if any(name in _all_names(each) for each in loop)]
-    if len(users) > 1 or any(_is_whole(name, each) for each in users[0]):
+    users = [loop for loop in _loops(statements) if any(name in _all_names(statement) for statement in loop)]
+    if len(users) > 1 or any(_is_whole(name, statement) for statement in users[0]):
         return False
-    return sum(target_name(each) == name for each in users[0]) == 1
+    return sum(target_name(statement) == name for statement in users[0]) == 1
 
 
 def _is_whole(name: str, statement: Statement) -> bool:

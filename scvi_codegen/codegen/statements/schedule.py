@@ -69,12 +69,12 @@ def over_points(expression: Expression) -> set[str]:
 
 def point_loops(statements: Sequence[Statement], stored: Collection[str]) -> list[PointLoop]:
     """Return the loops over points of statements, of which the stored quantities are in memory in any case."""
-    blocks = _blocks([_simple(each) for each in statements])
+    blocks = _blocks([_simple(statement) for statement in statements])
     _delay(blocks, stored)
     loops = []
     for number, block in enumerate(blocks):
-        later = set[str]().union(*(_needs(each) for after in blocks[number + 1 :] for each in after))
-        summed = dict.fromkeys(name for each in block if (name := target_name(each)) in later and name)
+        later = set[str]().union(*(_needs(statement) for after in blocks[number + 1 :] for statement in after))
+        summed = dict.fromkeys(name for statement in block if (name := target_name(statement)) in later and name)
         loops.append(PointLoop(tuple(block), tuple(summed)))
     return loops
 
@@ -121,15 +121,16 @@ def _blocks(statements: Sequence[Simple]) -> list[list[Simple]]:
 
 def _delay(blocks: list[list[Simple]], stored: Collection[str]) -> None:
     """Move local values to the block that first uses them, if no other points of them are needed."""
-    everything = [each for block in blocks for each in block]
+    statements = [statement for block in blocks for statement in block]
     for number in range(len(blocks) - 2, -1, -1):
         for statement in reversed(blocks[number][:]):
             name = target_name(statement)
             if name is None or name in stored:
                 continue
-            if sum(target_name(each) == name for each in everything) > 1 or any(name in _needs(x) for x in everything):
+            times_computed = sum(target_name(other) == name for other in statements)
+            if times_computed > 1 or any(name in _needs(other) for other in statements):
                 continue
-            users = [k for k, block in enumerate(blocks) if any(name in names_read(each) for each in block)]
+            users = [k for k, block in enumerate(blocks) if any(name in names_read(other) for other in block)]
             if users and min(users) > number:
                 blocks[number].remove(statement)
                 blocks[min(users)].insert(0, statement)

@@ -229,7 +229,7 @@ def rattle_iteration(part: str, features: Sequence[str]) -> str:
         own = {name: quantities[name] for name in quantities if name not in ("v", "y", "f")}
         lines = Printer(own, layout, OF_POINTS).function_of_points(read(RATTLE, features))
     else:
-        own = {name: each for name, each in quantities.items() if name not in ("w",)} | {
+        own = {name: quantity for name, quantity in quantities.items() if name != "w"} | {
             "p": Quantity("now->p", Place.MEMORY),
             "s": Quantity("now->f", Place.MEMORY),
             "c": Quantity("now->c", Place.MEMORY, index="k"),

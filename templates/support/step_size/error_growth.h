@@ -34,7 +34,7 @@
  * larger limits regular orbits of large steps show exponential growth. */
 #ifdef VARIABLE_ACCELERATIONS
 enum { TANGENT = 2 * M }; /* numbers of a tangent vector on which accelerations depend */
-#define IS_SMALL(change, k, size, rate) ((change) <= (0.0015 * LESS) * (size) + 0.0 * (rate))
+#define IS_SMALL(change, k, size, rate) ((void)(rate), (change) <= (0.0015 * LESS) * (size))
 #else
 enum { TANGENT = M };
 #define IS_SMALL(change, k, size, rate) \
