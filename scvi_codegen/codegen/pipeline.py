@@ -167,6 +167,7 @@ def describe(
         time_transformation=None if g is None else str(g),
         exchange_names=program.quantities.work_and_impulses,
         constraints=program.constraints.formulas if program.constraints else (),
+        masked=len(system.reactions),
         conserves_energy=not system.changes_energy and not system.inputs,
         arrays=_arrays_of(system),
         indices=tuple(f"{name} = {value}" for name, value in system.indices.items()),

@@ -21,6 +21,10 @@ are imposed at s Gauss points, where the velocity of a curve of degree s is most
 The order is 2s, measured, and the step symmetric; like the nonholonomic flow it is not symplectic. Momentum maps of
 symmetries along which constraint forces do no work are conserved.
 
+A constraint that is imposed in some modes only (:class:`~scvi_codegen.systems.constraints.kind.Reaction`) has the rows
+c g(q_n) + (1 - c) lambda_{n-1} = 0 with its mask c, and the direction of its force in place of that of G^T: sliding
+friction is the force (G - mu d T)^T lambda of the multipliers at the points. The order 2s is measured.
+
 Sources: L. Jay, SIAM J. Numer. Anal. 33 (1996); J. E. Marsden, M. West, Acta Numerica 10 (2001), section 3.5; T.
 Wenger, S. Ober-Bloebaum, S. Leyendecker, Adv. Comput. Math. 43 (2017). Other nonholonomic methods: R. McLachlan, M.
 Perlmutter, J. Nonlinear Sci. 16 (2006); D. Martin de Diego, R. Sato Martin de Almagro, arXiv 1810.10926.
@@ -38,6 +42,8 @@ from scvi_codegen.methods.tables.quadrature import gauss_legendre
 from scvi_codegen.systems.constraints import (
     constraint_multipliers,
     constraint_rates,
+    has_oblique_forces,
+    idle_multipliers,
     position_conditions,
     velocity_conditions,
     with_constraint_forces,
@@ -125,6 +131,9 @@ def _with_multipliers(system: MechanicalSystem, group: StageGroup) -> StageGroup
     positions = position_conditions(system)
     if any(positions):
         scatters.append(Scatter(results=positions, table=conditions_table, power=-1, scale=scatters[0].scale))
+    if system.reactions:
+        table = Table.joined(Table.constant(points, rows), zero, Table.identity(points), zero)
+        scatters.append(Scatter(results=idle_multipliers(system), table=table, power=1))
     products = [factor * g for factor, g in zip(factors, positions, strict=True)]
     return replace(
         group,
@@ -132,7 +141,7 @@ def _with_multipliers(system: MechanicalSystem, group: StageGroup) -> StageGroup
         scatters=tuple(scatters),
         scalar=sympy.Add(group.scalar, *products),
         computes="L_q + G^T lambda, L_v and g",
-        forced=group.forced or any(velocity_conditions(system)),
+        forced=group.forced or any(velocity_conditions(system)) or has_oblique_forces(system),
     )
 
 

@@ -243,7 +243,7 @@ def is_symplectic(method: Method, system: MechanicalSystem) -> bool:
 
 def is_conformally_symplectic(method: Method, system: MechanicalSystem) -> bool:
     """Return whether the steps multiply dq ^ dp by exp(-gamma h), where gamma is the damping rate."""
-    return method.symplectic and not (system.forces or system.is_prescribed or system.is_rolling)
+    return method.symplectic and not (system.forces or system.is_prescribed or system.is_rolling or system.has_friction)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -42,6 +42,7 @@ from scvi_codegen.systems.formulas.symbols import DOT, number, symbol
 if TYPE_CHECKING:
     from sympy import Expr, Symbol
 
+    from scvi_codegen.systems.constraints.kind import Reaction
     from scvi_codegen.systems.formulas.rotations import Homogeneous, Reduced
 
 
@@ -170,6 +171,8 @@ class MechanicalSystem(Deferred, ABC):
             (:mod:`scvi_codegen.systems.formulas.symbols`).
         constraints: expressions in (q, t), or linear in v, that are 0 along trajectories of a Lagrangian
             (:mod:`scvi_codegen.systems.forces`).
+        reactions: masks and directions of force of the last constraints, as of contacts
+            (:class:`~scvi_codegen.systems.constraints.kind.Reaction`).
         arrays: declarations of the arrays of known sizes whose entries are coordinates and parameters.
         indices: sizes and index tables of these arrays by name, for events in index notation.
         lengths: cutoffs and periods of lists of neighbours
@@ -187,6 +190,7 @@ class MechanicalSystem(Deferred, ABC):
     clock: TimeTransformation | None = None
     forces: tuple[Expr, ...] = ()
     constraints: tuple[Expr, ...] = ()
+    reactions: tuple[Reaction, ...] = ()
     inputs: tuple[str, ...] = ()
     damping: Expr = field(default_factory=zero)
     arrays: tuple[Array, ...] = field(default=(), compare=False)
@@ -238,7 +242,7 @@ class MechanicalSystem(Deferred, ABC):
     @property
     def is_prescribed(self) -> bool:
         """True if there are as many constraints as coordinates, which then prescribe the motion."""
-        return 0 < len(self.constraints) == self.dimension
+        return 0 < len(self.constraints) - len(self.reactions) == self.dimension
 
     @property
     def is_rolling(self) -> bool:
@@ -246,6 +250,13 @@ class MechanicalSystem(Deferred, ABC):
         from scvi_codegen.systems.constraints import velocity_conditions  # imported here: it imports SymPy
 
         return any(velocity_conditions(self))
+
+    @property
+    def has_friction(self) -> bool:
+        """True if a constraint force is oblique, as of contacts with friction, and does work."""
+        from scvi_codegen.systems.constraints import has_oblique_forces
+
+        return bool(self.reactions) and has_oblique_forces(self)
 
     @property
     def is_first_order(self) -> bool:

@@ -143,6 +143,9 @@ class Constraints:
         rounding: bounds of the rounding errors of g, in units of the round-off.
         motion: at u = (q, v): L_vv a without constraints, m numbers; then g_q v + g_t, and the terms of its time
             derivative without a.
+        reactions: 1 - mask of each constraint, then the nonzero entries of D at u = (q, v), whose forces are D^T
+            lambda; ``None`` if all constraints are always imposed and ideal.
+        directions: (k, i) of the entries of D.
     """
 
     formulas: tuple[str, ...]
@@ -150,6 +153,8 @@ class Constraints:
     entries: tuple[tuple[int, int], ...]
     rounding: Kernel
     motion: Kernel
+    reactions: Kernel | None = None
+    directions: tuple[tuple[int, int], ...] = ()
 
     @property
     def count(self) -> int:

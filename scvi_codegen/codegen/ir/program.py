@@ -294,6 +294,7 @@ class Program:
             *(
                 constraints and constraints.rounding,
                 constraints and constraints.motion,
+                constraints and constraints.reactions,
                 self.damping,
                 *(rattle.kernels if rattle else ()),
             ),

@@ -35,7 +35,7 @@ Chem. 16 (1995), on the iteration.
 from collections.abc import Container, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 from sympy import Symbol
 from sympy.utilities.iterables import connected_components
@@ -58,7 +58,9 @@ from scvi_codegen.systems.arrays.system import (
 )
 from scvi_codegen.systems.constraints import (
     constraint_jacobian,
+    constraint_masks,
     constraint_rates,
+    force_directions,
     position_conditions,
     time_derivatives,
     velocity_conditions,
@@ -78,7 +80,7 @@ def rattle_of(system: MechanicalSystem, stages: StageSystem, predictor: NumberTa
         predictor: (2 (s + 1), s + 1) tables to the unknowns of the next step, of velocities and of multipliers.
     """
     forms, tables = forms_of(system), velocity_tables(stages.shape)
-    if any(velocity_conditions(system)) or tables is None or not forms.has_quadratic_energy:
+    if system.reactions or any(velocity_conditions(system)) or tables is None or not forms.has_quadratic_energy:
         return None
     if forms.regular_legendre is not forms.legendre:  # massless coordinates: M has no inverse
         return None
@@ -283,4 +285,21 @@ def lowered_constraints(system: MechanicalSystem) -> Constraints:
             u=(*system.coordinates, *system.velocities),
             purpose="L_q - L_vq v - L_vt + f, then rates G v + .., and their derivatives in time at constant v.",
         ),
+        **(_reactions(system) if system.reactions else {}),
     )
+
+
+def _reactions(system: LagrangianSystem) -> dict[str, Any]:
+    """Return the kernel of the masks and directions of constraint forces, and the entries of the latter."""
+    directions = force_directions(system)
+    return {
+        "reactions": system_kernel(
+            system,
+            "reactions",
+            [1 - mask for mask in constraint_masks(system)],
+            u=(*system.coordinates, *system.velocities),
+            partials=directions.values(),
+            purpose="1 - mask of the constraints; nonzero entries of D at u = (q, v): forces D^T lambda.",
+        ),
+        "directions": tuple(directions),
+    }

@@ -352,6 +352,7 @@ class Interface:
         momentum_names: in order; none of arrays of run-time sizes with a Lagrangian: see :attr:`momenta`.
         exchange_names: of work and impulses of forces in a step: energy and momentum maps; none without forces.
         constraints: formulas g of the constraints g = 0.
+        masked: number of the last constraints, which are imposed in some modes only.
         inputs: names of tabulated inputs, each of which has five parameters.
         energy_parameter: of a time-transformed system, the parameter that is the energy of the initial state.
         time_transformation: time-rescaling function g in dt = g dtau that determines its step sizes.
@@ -394,6 +395,7 @@ class Interface:
     time_transformation: str | None = None
     exchange_names: tuple[str, ...] = ()
     constraints: tuple[str, ...] = ()
+    masked: int = 0
     inputs: tuple[str, ...] = ()
     conserves_energy: bool = False
     changes_energy: str | None = None

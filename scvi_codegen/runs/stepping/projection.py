@@ -181,8 +181,21 @@ def _dependent(stepper: Integrator, q: Array, t: float, parameters: Parameters, 
     """Return the message of :func:`rank_deficiency`; ``None`` for run-time sizes too large for dense linear algebra."""
     if stepper.interface.layout.coordinates and max(stepper.dimension, len(stepper.constraints)) > MOST_DENSE:
         return None
-    massless = _massless(stepper, q, t, parameters)
-    return massless or rank_deficiency(stepper.constraints, q, _linearised(stepper, t, parameters), nearest=nearest)
+    massless, at = _massless(stepper, q, t, parameters), _linearised(stepper, t, parameters)
+    names = [stepper.constraints[k] for k in _imposed(stepper, at(q)[1])]
+    return massless or rank_deficiency(names, q, lambda q: _rows(stepper, *at(q)), nearest=nearest)
+
+
+def _imposed(stepper: Integrator, jacobian: Array) -> NDArray[np.intp]:
+    """Return the indices of the constraints that are imposed: the masks of others make their rows of G zero."""
+    always = np.arange(len(jacobian)) < len(jacobian) - stepper.interface.masked
+    return np.flatnonzero(always | jacobian.any(axis=1))
+
+
+def _rows(stepper: Integrator, g: Array, jacobian: Array) -> tuple[Array, Array]:
+    """Return g and G of the constraints that are imposed."""
+    rows = _imposed(stepper, jacobian)
+    return g[rows], jacobian[rows]
 
 
 def _massless(stepper: Integrator, q: Array, t: float, parameters: Parameters) -> str | None:
@@ -231,7 +244,8 @@ def singular_position(stepper: Integrator, q: Array, t: float, parameters: Array
     """Return a remark on a failed step from positions where the constraints are nearly dependent, or ""."""
     if not stepper.constraints or max(stepper.dimension, len(stepper.constraints)) > MOST_DENSE:
         return ""
-    return nearly_dependent(_linearised(stepper, t, parameters)(q)[1])
+    _, imposed = _rows(stepper, *_linearised(stepper, t, parameters)(q))
+    return nearly_dependent(imposed) if len(imposed) else ""
 
 
 def _linearised(stepper: Integrator, t: float, parameters: Parameters) -> Callable[[Array], tuple[Array, Array]]:

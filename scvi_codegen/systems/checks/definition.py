@@ -281,9 +281,10 @@ def _check_constraints(system: MechanicalSystem) -> None:
             f"the constraint '{name}' is not linear in the velocity {system.velocities[i]}: "
             f"constraints must have the form {forms_of_constraints()}"
         )
-    if len(names) > system.dimension:
+    always = len(names) - len(system.reactions)
+    if always > system.dimension:
         raise SystemDefinitionError(
-            f"there are {len(names)} constraints, but only {system.dimension} coordinates of '{system.name}': the "
+            f"there are {always} constraints, but only {system.dimension} coordinates of '{system.name}': the "
             "mechanism is overconstrained. At most as many independent constraints as coordinates are required "
             "(as many prescribe the motion). Leave out redundant constraints"
         )
@@ -294,9 +295,12 @@ def _check_constraints(system: MechanicalSystem) -> None:
 
 
 def _dependent(system: MechanicalSystem) -> int:
-    """Return the index of the first constraint dependent on earlier ones at every sampled point, or 0."""
-    derivatives, count = constraint_jacobian(system), len(system.constraints)
-    first = 0
+    """Return the index of the first constraint dependent on earlier ones at every sampled point, or 0.
+
+    Constraints that are imposed in some modes only may be dependent.
+    """
+    count, first = len(system.constraints) - len(system.reactions), 0
+    derivatives = {place: entry for place, entry in constraint_jacobian(system).items() if place[0] < count}
     points = sample_points(system.coordinates, (system.time,), system.constants)
     for values in values_at(points, list(derivatives.values())):
         matrix = dense(derivatives, values, (count, system.dimension))

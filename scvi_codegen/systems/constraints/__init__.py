@@ -1,7 +1,8 @@
 """Constraints of a system: kinds, reading, conditions, and constraint forces.
 
 d/dt L_v = L_q + f + G^T lambda with the rates G v + .. = 0 of all constraints. The index is not reduced
-(:mod:`scvi_codegen.methods.constraints`).
+(:mod:`scvi_codegen.methods.constraints`). Constraints with reactions (:class:`.kind.Reaction`) are multiplied by their
+masks, and have forces in directions of their own.
 """
 
 import re
@@ -96,14 +97,30 @@ def constraint_multipliers(system: Constrained) -> tuple[Symbol, ...]:
     return tuple(sympy.Symbol(f"lambda_{k}", real=True) for k in range(1, len(system.constraints) + 1))
 
 
+def constraint_masks(system: Constrained) -> tuple[Expr, ...]:
+    """Return the mask of each constraint, 1 for those that are always imposed."""
+    always = len(system.constraints) - len(system.reactions)
+    return (*(sympy.S.One,) * always, *(reaction.active for reaction in system.reactions))
+
+
 def position_conditions(system: Constrained) -> tuple[Expr, ...]:
-    """Return g(q, t) of each constraint, 0 for those without a condition on positions."""
-    return tuple(kind_of(system, g).position(g) for g in system.constraints)
+    """Return g(q, t) of each constraint times its mask, 0 for those without a condition on positions."""
+    masked = zip(constraint_masks(system), system.constraints, strict=True)
+    return tuple(mask * kind_of(system, g).position(g) for mask, g in masked)
 
 
 def velocity_conditions(system: Constrained) -> tuple[Expr, ...]:
-    """Return A v + b of each constraint, 0 for those whose condition is one on positions."""
-    return tuple(kind_of(system, g).velocity(g) for g in system.constraints)
+    """Return A v + b of each constraint times its mask, 0 for those whose condition is one on positions."""
+    masked = zip(constraint_masks(system), system.constraints, strict=True)
+    return tuple(mask * kind_of(system, g).velocity(g) for mask, g in masked)
+
+
+def idle_multipliers(system: Constrained) -> tuple[Expr, ...]:
+    """Return (1 - mask) lambda of each constraint, which is 0 where the constraint is not imposed."""
+    return tuple(
+        (1 - mask) * factor
+        for mask, factor in zip(constraint_masks(system), constraint_multipliers(system), strict=True)
+    )
 
 
 def constraint_rates(system: Constrained) -> tuple[Expr, ...]:
@@ -112,7 +129,9 @@ def constraint_rates(system: Constrained) -> tuple[Expr, ...]:
 
 
 def constraints_work(system: Constrained) -> bool:
-    """Return whether constraint forces can do work: the rate of a constraint at zero velocity is not 0."""
+    """Return whether constraint forces can do work: the rate of a constraint at zero velocity is not 0, or friction."""
+    if has_oblique_forces(system):
+        return True
     at_rest = dict.fromkeys(system.velocities, sympy.S.Zero)
     return any(rate.xreplace(at_rest) != 0 for rate in constraint_rates(system))
 
@@ -120,6 +139,27 @@ def constraints_work(system: Constrained) -> bool:
 def constraint_jacobian(system: Constrained) -> dict[tuple[int, int], Expr]:
     """Return the non-zero entries of the constraint Jacobian G by (constraint, coordinate)."""
     return jacobian(constraint_rates(system), system.velocities)
+
+
+def has_oblique_forces(system: Constrained) -> bool:
+    """Return whether the force of a constraint is not in the direction of G^T: sliding friction, which does work."""
+    if not system.reactions:
+        return False
+    imposed = {reaction.active: sympy.S.One for reaction in system.reactions}
+    ideal = {place: entry.xreplace(imposed) for place, entry in constraint_jacobian(system).items()}
+    return force_directions(system) != ideal
+
+
+def force_directions(system: Constrained) -> dict[tuple[int, int], Expr]:
+    """Return the non-zero entries of D by (constraint, coordinate): D^T lambda are the forces of the constraints."""
+    always = len(system.constraints) - len(system.reactions)
+    directions = {
+        (always + k, i): component
+        for k, reaction in enumerate(system.reactions)
+        for i, component in enumerate(reaction.direction)
+        if component != 0
+    }
+    return {place: entry for place, entry in constraint_jacobian(system).items() if place[0] < always} | directions
 
 
 def time_derivative(function: Expr, coordinates: Sequence[Symbol], time: Symbol) -> Expr:
@@ -144,9 +184,9 @@ def time_derivatives(system: Constrained, functions: Sequence[Expr]) -> tuple[Ex
 
 
 def with_constraint_forces(system: Constrained, forces: Sequence[Expr]) -> tuple[Expr, ...]:
-    """Return the forces plus the constraint forces G^T lambda, m expressions."""
+    """Return the forces plus the constraint forces, G^T lambda of ideal constraints, m expressions."""
     terms: list[list[Expr]] = [[force] for force in forces]
     factors = constraint_multipliers(system)
-    for (k, i), derivative in constraint_jacobian(system).items():
-        terms[i].append(derivative * factors[k])
+    for (k, i), direction in force_directions(system).items():
+        terms[i].append(direction * factors[k])
     return tuple(sympy.Add(*row) for row in terms)

@@ -26,6 +26,26 @@ class Constrained(Protocol):
     def constraints(self) -> tuple[Expr, ...]:
         """Expressions that are 0."""
 
+    @property
+    def reactions(self) -> tuple["Reaction", ...]:
+        """Masks and directions of force of the last constraints; all others are ideal and always imposed."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reaction:
+    """Mask and direction of force of a constraint that is imposed in some modes only, as of contacts.
+
+    The equation of the constraint g with the multiplier lambda is ``active * g + (1 - active) * lambda = 0``, and its
+    force is ``direction * lambda``: oblique, (G - mu d T)^T lambda, of a contact that slides in the direction d.
+
+    Attributes:
+        active: mask, 0 or 1, a formula of parameters.
+        direction: m components of the force per multiplier, in (q, v, t).
+    """
+
+    active: Expr
+    direction: tuple[Expr, ...]
+
 
 def difference(sides: Sequence[Expr], _rate: Callable[[Expr], Expr]) -> Expr:
     """Return left - right of an equation, or the expression that is 0."""

@@ -8,7 +8,9 @@
  * Positions: Gauss-Newton iteration in the metric of the mass matrix; momenta: p -= G^T y with G H_pp G^T y = rate
  * (Hairer, Lubich & Wanner, Geometric Numerical Integration, sec. VII.1). Requires: legendre.h, band.h, the
  * kernels constraints, constraint_rounding and constrained_motion, and CONSTRAINT_ENTRY, the indices of the entries of
- * G = g_q or A. */
+ * G = g_q or A. With MASKED_CONSTRAINTS g and G are multiplied by masks c, the matrix is [L_vv, G^T; G, 1 - c], and
+ * [L_vv, D^T; G, 1 - c] for the multipliers of forces D^T lambda: requires the kernel reactions, of 1 - c and the
+ * entries of D, whose indices are DIRECTION_ENTRY. */
 
 #define MAX_PROJECTIONS 100 /* Gauss-Newton iterations; more indicate that no state is near */
 #define MOST_UPDATE_HALVINGS 60 /* of an update */
@@ -19,6 +21,9 @@
 #define ACCEPTED_UPDATE REAL(1e-6)
 #define ROUNDED_UPDATE (1024 * REAL_EPSILON) /* at rest, where a relative distance is undefined */
 #define ROUNDED_RESIDUAL (4 * REAL_EPSILON) /* times the rounding size of g: residuals that an update does not reduce */
+
+enum { IDEAL_FORCES,
+  ACTUAL_FORCES }; /* G^T, of projections, and D^T, of multipliers */
 
 /* Factors of the saddle-point matrix [L_vv, G^T; G, 0] of a state, and a right-hand side. */
 typedef struct {
@@ -31,8 +36,25 @@ static saddle *saddle_in(real *workspace)
   return (saddle *)workspace;
 }
 
-/* Factorises the matrix at u = (q, v) and computes g. */
-static int factorise_saddle(real t, const real *u, const real *parameters, saddle *at, real *g)
+#ifdef MASKED_CONSTRAINTS
+/* Adds the masks to the matrix, and replaces G^T by D^T of the actual forces. */
+static void add_reactions(real t, const real *u, const real *parameters, int forces, const band *shape, real *matrix)
+{
+  real idle[CONSTRAINTS], direction[DIRECTION_ENTRIES];
+  reactions(u, t, parameters, idle, direction);
+  for (int k = 0; k < CONSTRAINTS; k++)
+    matrix[shape->first + POSITION_IN_MATRIX[M + k] * (shape->stride + 1)] = idle[k];
+  for (int e = 0; forces == ACTUAL_FORCES && e < CONSTRAINT_ENTRIES; e++)
+    matrix[shape->first + POSITION_IN_MATRIX[M + CONSTRAINT_ENTRY[e][0]] * shape->stride +
+        POSITION_IN_MATRIX[CONSTRAINT_ENTRY[e][1]]] = 0;
+  for (int e = 0; forces == ACTUAL_FORCES && e < DIRECTION_ENTRIES; e++)
+    matrix[shape->first + POSITION_IN_MATRIX[M + DIRECTION_ENTRY[e][0]] * shape->stride +
+        POSITION_IN_MATRIX[DIRECTION_ENTRY[e][1]]] = direction[e];
+}
+#endif
+
+/* Factorises the matrix at u = (q, v), with the given kind of forces, and computes g. */
+static int factorise_saddle_of(int forces, real t, const real *u, const real *parameters, saddle *at, real *g)
 {
   const band shape = band_of(SITES, 1);
   real p[M], mass[MASS_ENTRIES], derivative[CONSTRAINT_ENTRIES];
@@ -47,9 +69,19 @@ static int factorise_saddle(real t, const real *u, const real *parameters, saddl
     at->matrix[shape.first + column * shape.stride + row] = derivative[e];
     at->matrix[shape.first + row * shape.stride + column] = derivative[e];
   }
+#ifdef MASKED_CONSTRAINTS
+  add_reactions(t, u, parameters, forces, &shape, at->matrix);
+#else
+  (void)forces;
+#endif
   if (!all_finite(g, CONSTRAINTS) || !all_finite(at->matrix, (int)band_size(&shape)))
     return NOT_FINITE;
   return factorise(at->matrix, &shape, at->pivot) ? OK : SINGULAR;
+}
+
+static int factorise_saddle(real t, const real *u, const real *parameters, saddle *at, real *g)
+{
+  return factorise_saddle_of(IDEAL_FORCES, t, u, parameters, at, g);
 }
 
 /* Solves L_vv x + G^T y = a (0 if NULL), G x = b. */
@@ -359,7 +391,7 @@ int NAME(multipliers)(long long count, const real *t, const real *q, const real 
     int status = find_velocity(t[k], q + k * M, p + k * M, parameters, u + M, workspace);
     memcpy(u, q + k * M, sizeof(real) * M);
     if (status == OK)
-      status = factorise_saddle(t[k], u, parameters, at, g);
+      status = factorise_saddle_of(ACTUAL_FORCES, t[k], u, parameters, at, g);
     if (status != OK)
       return status;
     constrained_motion(u, t[k], parameters, value);
