@@ -61,6 +61,7 @@ from scvi_codegen.codegen.variants import (
     Crossings,
     Derivatives,
     Energies,
+    Kinks,
     Lanes,
     NewtonFallback,
     Observing,
@@ -78,9 +79,10 @@ from scvi_codegen.methods.stage_system import tables_in_two_words
 from scvi_codegen.systems.arrays.symmetry import momentum_maps
 from scvi_codegen.systems.derived_expressions import forms_of
 from scvi_codegen.systems.derived_systems import with_tangent_vectors
-from scvi_codegen.systems.event import EventLike, as_events
+from scvi_codegen.systems.event import EventLike, Kink, as_events
 from scvi_codegen.systems.formulas.expressions import gradient_tuple
 from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED
+from scvi_codegen.systems.kinks import located_kinks
 from scvi_codegen.systems.legendre.of_arrays import SiteHamiltonian, site_hamiltonian
 from scvi_codegen.systems.legendre.transform import energy_of_states, equivalent_lagrangian
 from scvi_codegen.systems.symmetry.symmetry import SYMMETRIES, Symmetry, all_symmetries
@@ -105,13 +107,15 @@ def program_of(
     symmetries: Sequence[Symmetry] = (),
     lanes: bool = True,
     fallback: bool = True,
+    without_modes: MechanicalSystem | None = None,
 ) -> Program:
     """Return the lowered program of an integrator; other arguments as of :func:`compile_stepper`.
 
-    ``lanes`` and ``fallback`` are those of :func:`~scvi_codegen.codegen.lowering.program.lower`.
+    ``without_modes`` is the same system with kinks by its formulas, whose symmetries are sought. ``lanes`` and
+    ``fallback`` are those of :func:`~scvi_codegen.codegen.lowering.program.lower`.
     """
     name = c_identifier(prefix or f"{system.name}_{method.name}")
-    tracked = all_symmetries(system, symmetries)
+    tracked = all_symmetries(without_modes or system, symmetries)
     program_part = partial(
         lower, method=method, prefix=name, solver=solver, symmetries=tracked, lanes=lanes, fallback=fallback
     )
@@ -121,10 +125,17 @@ def program_of(
 
 
 def lower_unrolled(
-    system: MechanicalSystem, method: Method, *, prefix: str, symmetries: Sequence[Symmetry] = (), **further: Any
+    system: MechanicalSystem,
+    method: Method,
+    *,
+    prefix: str,
+    symmetries: Sequence[Symmetry] = (),
+    without_modes: MechanicalSystem,
+    **further: Any,
 ) -> Program:
     """Return the program without loops over terms, which kernels in double-double arithmetic do not have."""
-    return lower(system, method, prefix=c_identifier(prefix), symmetries=all_symmetries(system, symmetries), **further)
+    tracked = all_symmetries(without_modes, symmetries)
+    return lower(system, method, prefix=c_identifier(prefix), symmetries=tracked, **further)
 
 
 def c_identifier(name: str) -> str:
@@ -223,24 +234,36 @@ class Sources:
         g: str | Expr | None = None,
         controller: str | None = None,
         precision: str = "double",
+        kinks: Kinks = "as formulas",
     ) -> None:
         self.method, self.solver, self.g, self.precision = method, solver, g, precision
         self._arguments = system, method, solver, prefix, symmetries, g, controller
+        self._locates = kinks == "located" and g is None
         self.symmetries = symmetries
         self.controller = controller_named(controller, in_tau=g is not None)
         self.prefix = c_identifier(prefix or f"{system.name}_{method.name}")
         self._programs: dict[bool, Program] = {}
+        self.kinks: tuple[Kink, ...] = ()
         self.system: Any = self._form_of(system)
 
     def _form_of(self, system: MechanicalSystem) -> MechanicalSystem:
-        """Return the system in the form that the method discretises."""
-        return discretised_form(system, self.method)
+        """Return the system in the form that the method discretises, with a mode for each kink that runs locate."""
+        form = self._without_modes = discretised_form(system, self.method)
+        if self._locates:
+            form, self.kinks = located_kinks(form)
+        return form
 
     def _derived(self, *, solver: str, fallback: bool = True) -> Program:
         """Return the lowered program; ``fallback``: with Newton's iteration as a fallback."""
         derive = lower_unrolled if self.precision == DOUBLE_DOUBLE else program_of
         return derive(
-            self.system, self.method, prefix=self.prefix, symmetries=self.symmetries, solver=solver, fallback=fallback
+            self.system,
+            self.method,
+            prefix=self.prefix,
+            symmetries=self.symmetries,
+            solver=solver,
+            fallback=fallback,
+            without_modes=self._without_modes,
         )
 
     @cached_property
@@ -273,6 +296,9 @@ class Sources:
         interface = describe(
             program, self.system, self.method, uses_fallback_library=self.uses_fallback_library, g=self.g
         )
+        if self.kinks:
+            modes = tuple((kink.mode, str(kink.function)) for kink in self.kinks)
+            interface = replace(interface, kinks=self._without_modes.kinks, modes=modes)
         if self.precision != DOUBLE_DOUBLE:
             return interface
         size = workspace_in_pairs(program) if in_pairs(program) else interface.workspace

@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike
 from scvi_codegen.codegen.native.building import TUNED_FLAGS
 from scvi_codegen.codegen.native.compilers import REORDERING_FLAGS
 from scvi_codegen.codegen.rendering.source import AUTO, DOUBLE_DOUBLE, PRECISIONS, Interface, Source
-from scvi_codegen.codegen.variants import SUMS, Derivatives, Sums, Variant
+from scvi_codegen.codegen.variants import KINKS, SUMS, Derivatives, Kinks, Sums, Variant
 from scvi_codegen.common.cache import cached_source, key_of
 from scvi_codegen.common.errors import MethodError, SizesRequiredError
 from scvi_codegen.common.validation import TEXTS, OfRunTimeSizes, check_kind, checks_arguments
@@ -60,6 +60,7 @@ def compile_stepper(
     tables: Mapping[str, ArrayLike] | None = None,
     precision: str = "double",
     sums: str = "compensated",
+    kinks: Kinks = "located",
 ) -> Stepper:
     """Derive, generate, compile and load the integrator of ``system`` by ``method``.
 
@@ -97,6 +98,10 @@ def compile_stepper(
         sums: of the increments of steps: ``"compensated"``, whose rounding errors are added to later steps (Kahan), or
             ``"plain"``, for explicit methods and arrays of run-time sizes: faster, with rounding errors that grow with
             the number of steps (docs/lattices.md).
+        kinks: zeros of the arguments of unit_step, abs, sign, min, max, where and positive_part along runs:
+            ``"located"``, so that steps end there and keep their order; or ``"as formulas"``, so that steps of equal
+            size stay equal and symplectic, and lose order there. Arrays of run-time sizes, constraints, rotations,
+            time transformations and double-double arithmetic have formulas alone (docs/events.md).
 
     Raises:
         BuildError: if there is no C compiler.
@@ -112,6 +117,8 @@ def compile_stepper(
         "time_transformation": time_transformation,
         "controller": controller,
     }
+    if kinks not in KINKS:
+        raise MethodError(f"unknown kinks {kinks!r}: use {' or '.join(map(repr, KINKS))}")
     if symmetries != ():
         from scvi_codegen.systems.symmetry.symmetry import SYMMETRIES
 
@@ -124,13 +131,18 @@ def compile_stepper(
             "sums=, or declare arrays, q[N], whose sizes each run gives"
         )
     compiled = partial(compile_stepper, system, method, symmetries=symmetries, sizes=sizes, tables=tables, **common)
+    if precision == DOUBLE_DOUBLE:
+        kinks, compiled = "as formulas", partial(compiled, kinks="as formulas")
+    else:
+        compiled = partial(compiled, kinks=kinks)
     if precision == AUTO:
         return _in_both_precisions(compiled, events)
     shape: dict[str, Any] = {"mesh": system.mesh, "links": system.drawn_links}
     if sizes is not None or tables is not None:
         system, time_transformation = _at_sizes(system, time_transformation, sizes or {}, tables)
     method = as_method(method, system)
-    sources = CachedSources(system, method, solver, prefix, symmetries, time_transformation, controller, precision)
+    settings = solver, prefix, symmetries, time_transformation, controller, precision, kinks
+    sources = CachedSources(system, method, *settings)
     source, interface = sources.integrator()
     interface = replace(interface, layout=replace(interface.layout, **shape))
     system.store_key()
@@ -228,11 +240,13 @@ class CachedSources:
         g: str | Expr | None,
         controller: str | None = None,
         precision: str = "double",
+        kinks: Kinks = "as formulas",
     ) -> None:
-        self.precision = precision
+        self.precision, self.kinks = precision, kinks
         self.system, self.method, self.solver, self.prefix = system, method, solver, prefix
         self.symmetries, self.g, self.controller = symmetries, g, controller
         choices = (solver, prefix, tuple(symmetries), g, controller, *([precision] if precision != "double" else []))
+        choices = (*choices, *([kinks] if kinks == "located" else []))
         self.key = (*system.key(), *method.key(), key_of(choices))
 
     @cached_property
@@ -240,7 +254,7 @@ class CachedSources:
         """The sources that are not in the cache."""
         from scvi_codegen.codegen.pipeline import Sources
 
-        choices = self.solver, self.prefix, self.symmetries, self.g, self.controller, self.precision
+        choices = self.solver, self.prefix, self.symmetries, self.g, self.controller, self.precision, self.kinks
         return Sources(self.system, self.method, *choices)
 
     @property

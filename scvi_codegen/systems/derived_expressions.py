@@ -25,7 +25,7 @@ from sympy import Expr, Matrix, Symbol
 from sympy.utilities.iterables import connected_components
 
 from scvi_codegen.common.precision import Number, mp
-from scvi_codegen.systems.formulas.expressions import NEGLIGIBLE, Tape, dot, gradient_tuple, hessian, jacobian
+from scvi_codegen.systems.formulas.expressions import NEGLIGIBLE, Tape, dot, gradient_tuple, hessian, jacobian, kinks_of
 from scvi_codegen.systems.formulas.intermediates import separated
 from scvi_codegen.systems.system import MechanicalSystem
 
@@ -251,8 +251,10 @@ class Forms:
 
     @cached_property
     def forces_depend_on_velocities(self) -> bool:
-        """True if :attr:`force` depends on velocities, judged by the structure of its derivatives."""
-        return bool(jacobian(self.force, self.system.velocities))
+        """True if :attr:`force` depends on velocities, judged by its derivatives, or by them across a jump."""
+        moving = set(self.system.velocities)
+        jumps = any(kink.free_symbols & moving for kink in kinks_of(self.force))
+        return jumps or bool(jacobian(self.force, self.system.velocities))
 
     @cached_property
     def has_constant_masses(self) -> bool:

@@ -52,6 +52,10 @@ JAMMED = (
 
 Formula: TypeAlias = "str | Expr | float"
 """Formula as text or a SymPy expression, or a number."""
+SLIDING = (
+    "the motion slides on '{function}' = 0 at t = {t:.17g}: the forces on both sides of this jump point to it (dry "
+    "friction, a relay). Use a smooth force such as tanh({function}/width) instead of the jump, or end the run there"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,6 +167,22 @@ class Event:
         unset = {"direction": 0, "terminal": 0}
         table = {name: plain(value) for name, value in named.items() if value != unset.get(name)}
         return table | ({"then": {name: plain(value) for name, value in self.changes}} if self.then else {})
+
+
+@dataclass(frozen=True, slots=True)
+class Kink(Event):
+    """Zero of a switching function u, where steps change to the formulas of its other side.
+
+    Attributes:
+        mode: parameter that is added to u: 0, or a number beyond all values of u, whose sign then decides.
+    """
+
+    mode: str = ""
+
+    @property
+    def changes_state(self) -> bool:
+        """True: the state is the same, but steps end there."""
+        return True
 
 
 def _name(variable: Any) -> str:

@@ -76,10 +76,11 @@ METHODS = ("svi:4", "svi:6", "svi:8")
 
 
 @cache
-def stepper_of(kind: str, method: str) -> Any:
+def stepper_of(kind: str, method: str, **options: Any) -> Any:
     names, lagrangian, forces, parameters = (SMOOTH | NOT_SMOOTH)[kind]
     inputs = "u" if kind == "table" else ""
-    return sc.compile_stepper(lagrange("motion", names, lagrangian, forces=forces, inputs=inputs, **parameters), method)
+    system = lagrange("motion", names, lagrangian, forces=forces, inputs=inputs, **parameters)
+    return sc.compile_stepper(system, method, **options)
 
 
 def integrated(rates, y0, times):
@@ -322,7 +323,7 @@ def test_a_ball_on_a_stiff_floor_is_not_falsely_confirmed(method):
 def test_an_unconfirmed_motion_with_kinks_has_the_remedies_for_these():
     height, span = FLOOR_HEIGHT, 3.0 * math.sqrt(2.0 * FLOOR_HEIGHT / 9.8)
     with pytest.warns(sc.AccuracyWarning, match=r"max_step=, .*sc\.impact, sc\.Event.* not smooth where") as caught:
-        stepper_of("floor", "svi:4").integrate([height], [0.0], t_end=span, error=1e-14)
+        stepper_of("floor", "svi:4", kinks="as formulas").integrate([height], [0.0], t_end=span, error=1e-14)
     assert "time transformation" not in str(caught[0].message)
 
 
@@ -402,8 +403,9 @@ def test_a_run_for_comparison_has_other_steps():
 
 @pytest.mark.second
 def test_steps_of_a_confirmed_run_with_kinks_reproduce_it(tmp_path):
-    """In Python, of models and on the command line: the tolerance and the largest step."""
-    stepper = stepper_of("motor", "svi:4")
+    """In Python, of models and on the command line: the tolerance and the largest step; rint is not located."""
+    force = "rint((t - a)/100 + 1/2)"
+    stepper = sc.compile_stepper(lagrange("motion", "x", "x_dot**2/2", forces={"x": force}, a=5.0), "svi:4")
     start = {"q": [0.0], "p": [1.0], "t_end": 10.0, "parameters": {"a": 4.1}}
     with warnings.catch_warnings(action="ignore"):
         for a in np.linspace(4.1, 5.9, 7):
@@ -414,9 +416,7 @@ def test_steps_of_a_confirmed_run_with_kinks_reproduce_it(tmp_path):
     assert run.confirmation.max_step < 1.0
     assert np.array_equal(stepper.integrate(**start, **run.confirmation.steps).q, run.q)
     path = tmp_path / "motor.toml"
-    system = (
-        '[system]\nname = "motion"\ncoordinates = ["x"]\nlagrangian = "x_dot**2/2"\n[forces]\nx = "unit_step(t - a)"'
-    )
+    system = f'[system]\nname = "motion"\ncoordinates = ["x"]\nlagrangian = "x_dot**2/2"\n[forces]\nx = "{force}"'
     more = f'[parameters]\na = {a}\n[method]\nmethod = "svi:4"\n[run]\nspan = 10.0\nerror = 1e-8'
     path.write_text(f"{system}\n{more}\n[initial]\nq = [0.0]\np = [1.0]\n")
     assert np.array_equal(sc.load_model(path).integrate().q, run.q)

@@ -40,6 +40,7 @@ from scvi_codegen.codegen.rendering.source import Interface, Source
 from scvi_codegen.common.errors import EventError, ScviCodegenError, SystemDefinitionError, closest
 from scvi_codegen.common.precision import mp
 from scvi_codegen.methods.tables.nodes import chebyshev_lobatto, to_unit
+from scvi_codegen.systems.event import Kink
 from scvi_codegen.systems.formulas.array_statements import (
     EntryRules,
     entry_names,
@@ -335,6 +336,8 @@ def _search(interface: Interface, events: tuple[SearchedEvent, ...], *, controll
         uses_velocity=not variables.isdisjoint(formulas.v),
         changed=tuple(index for indices, _ in formulas.changes for index in indices),
         first_values=(0, *accumulate(len(values) for _, values in formulas.changes)),
+        parameters=len(interface.parameters),
+        modes=tuple(interface.parameters.index(event.mode) for event in events if isinstance(event, Kink)),
     )
 
 

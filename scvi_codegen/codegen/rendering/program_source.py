@@ -163,6 +163,8 @@ class EventSearch:
         uses_velocity: whether v occurs in the formulas.
         changed: index among (q, p, v) of the variable of each value of the changes.
         first_values: index of the first value of each function, and the number of values.
+        parameters: number of parameters.
+        modes: index of the parameter that is the mode of each kink; kinks are the last events.
         elements: number of functions of each event, one for each element of its loops.
         ENTRY: name of the entry templates.
     """
@@ -185,6 +187,8 @@ class EventSearch:
     changed: tuple[int, ...] = ()
     first_values: tuple[int, ...] = ()
     elements: tuple[int, ...] = ()
+    parameters: int = 0
+    modes: tuple[int, ...] = ()
     ENTRY: ClassVar[str] = "events"
 
     @property

@@ -372,6 +372,8 @@ class Interface:
             checks.
         words: number of doubles of each number of a state, 2 in double-double arithmetic.
         kinks: functions at whose zeros the equations are not smooth, for events.
+        modes: parameter and switching function of each kink that runs locate
+            (:mod:`scvi_codegen.systems.kinks`); these parameters are the last ones.
     """
 
     prefix: str
@@ -409,6 +411,7 @@ class Interface:
     lengths: tuple[tuple[str, ...], ...] = ()
     words: int = 1
     kinks: tuple[str, ...] = ()
+    modes: tuple[tuple[str, ...], ...] = ()
 
     @property
     def in_tau(self) -> bool:

@@ -44,7 +44,7 @@ class BoundedMotion:
     def compared(self) -> Any:
         """Stepper of runs for comparison, without events; its steps end where the equations are not smooth."""
         interface = self.stepper.interface
-        if interface.kinks and not self.stepper._has_tau and interface.words == 1:
+        if len(interface.kinks) > len(interface.modes) and not self.stepper._has_tau and interface.words == 1:
             name = interface.coordinates[0]
             if interface.layout.coordinates:
                 array, shape = coordinate_shapes(interface)[0]
@@ -58,7 +58,7 @@ class BoundedMotion:
     @property
     def smooth(self) -> bool:
         """True if the equations are smooth along each step of runs for comparison."""
-        return bool(self.compared.events) or not self.stepper.interface.kinks
+        return bool(self.compared.searched) or not self.stepper.interface.kinks
 
     def step_of_tau(self, tolerance: float) -> float:
         """Return the largest step of tau for a tolerance."""

@@ -33,7 +33,7 @@ class Run(Memory, AttitudeHistory):
 
     def __init__(self, stepper: Integrator) -> None:
         super().__init__(stepper)
-        self._untimed &= not stepper.changes_states
+        self._untimed &= not stepper.divides_steps
 
     def __repr__(self) -> str:
         return describe_run(self)
@@ -81,7 +81,7 @@ class Run(Memory, AttitudeHistory):
 
     def _advance_timed(self, steps: int, progress: Callable[[int], None] | None, stop: Callable[[], bool]) -> None:
         """Advance with the changes of the state by events."""
-        if not self.stepper.changes_states:
+        if not self.stepper.divides_steps:
             super()._advance_timed(steps, progress, stop)
         else:
             Observation(self, Saver(LARGEST_COUNT)).advance(steps, progress, stop)
@@ -91,7 +91,7 @@ class Run(Memory, AttitudeHistory):
     ) -> Trajectory:
         """Return the states as :meth:`record` does, without its warnings and its lock."""
         is_observed = output.times is not None or output.observe is not None
-        if self.stepper.events or is_observed or isinstance(self._plan, Until):
+        if self.stepper.searched or is_observed or isinstance(self._plan, Until):
             return Observation(self, saver_of(output)).advance(steps, output.progress, stop or (lambda: False))
         return record(self, steps, save_every=output.save_every, progress=output.progress, stop=stop)
 
@@ -105,7 +105,7 @@ class Run(Memory, AttitudeHistory):
         plan, h, save_every, short = self._plan, self._h, output.save_every, self._rows
         most = FIRST_STEPS if save_every == 1 else self._first_steps(save_every)
         fits = steps is None if h is None else steps is not None and steps <= most
-        special = short is None or self._has_tau or self._unset_inputs or self.stepper.events
+        special = short is None or self._has_tau or self._unset_inputs or self.stepper.searched
         is_plain = output is ALL_STATES or output.has_states_alone
         if special or not (fits and is_plain and (isinstance(plan, Fixed) or initial.t != plan.t_end)):
             self._start_from(initial, growth)

@@ -299,7 +299,7 @@ class InputSegments:
         def recorded(steps: int | None) -> Trajectory:
             start, end = run.t, cast(Adaptive, run.plan).t_end
             ends = [*(t for t in stops if min(start, end) < t < max(start, end)), end]
-            if not run.stepper.events:
+            if not run.stepper.searched:
                 return record_with_stops(run, ends, progress=progress)
             return record_segments(run, prepared_ends(ends), partial(run._recorded, output=Output(progress=progress)))
 

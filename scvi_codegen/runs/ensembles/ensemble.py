@@ -82,7 +82,7 @@ class EnsembleSettings:
 
     def records_events(self, stepper: Any) -> bool:
         """Return whether trajectories record the events of the stepper, which may be counted instead."""
-        return bool(stepper.events) and self.observe != "events"
+        return bool(stepper.searched) and self.observe != "events"
 
     def steps_or_ends(self, t: float, words: int) -> tuple[int | None, Array | None]:
         """Return the number of common steps or the final time; with adaptive steps the final time or times.

@@ -106,7 +106,7 @@ class IndividualRuns:
     def _successive(self) -> SuccessiveRuns | None:
         """Return the trajectories that C integrates one after the other, ``None`` for other ensembles."""
         ensemble, stepper, t_eval = self.ensemble, self.ensemble.stepper, self.t_eval
-        if ensemble.inputs or stepper.events or stepper.in_tau or not stepper.binding.reusable or self.confirmations:
+        if ensemble.inputs or stepper.searched or stepper.in_tau or not stepper.binding.reusable or self.confirmations:
             return None
         if t_eval is None:
             receive = partial(_receive, self.stored, 0)  # without self, so that no cycle keeps the memory

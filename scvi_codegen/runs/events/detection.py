@@ -12,7 +12,16 @@ from scvi_codegen.common.errors import EventError, EventWarning, warn
 from scvi_codegen.runs.results.saved_states import Array, SavedStates
 from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.step_plan import Fixed
-from scvi_codegen.systems.event import ACCUMULATED, BEHIND, JAMMED, THROUGH, UNDEFINED, UNDEFINED_CHANGE, Crossings
+from scvi_codegen.systems.event import (
+    ACCUMULATED,
+    BEHIND,
+    JAMMED,
+    SLIDING,
+    THROUGH,
+    UNDEFINED,
+    UNDEFINED_CHANGE,
+    Crossings,
+)
 
 if TYPE_CHECKING:
     from scvi_codegen.runs.stepping.memory import Memory
@@ -41,8 +50,8 @@ class CrossingSearch:
         self.stepper, self.binding = stepper, stepper.binding
         self.recorded: list[NDArray[Any]] = []
         self.watch = self.binding.new("watch *") if watch is None else watch
-        self.changes = terminal and stepper.changes_states
-        for number, event in enumerate(stepper.events if watch is None else ()):
+        self.changes = terminal and stepper.divides_steps
+        for number, event in enumerate(stepper.searched if watch is None else ()):
             self.watch.direction[number] = event.direction
             self.watch.acts[number] = terminal and event.changes_state
             self.watch.remaining[number] = terminal and int(event.terminal)
@@ -123,7 +132,9 @@ class CrossingSearch:
     def _record(self, crossings: Any, count: int) -> None:
         """Record the first crossings of an array; discard all states if these would exceed ``MOST_BYTES``."""
         records = self.binding.records(crossings, count)
-        if count:
+        if len(self.stepper.searched) > len(self.stepper.events):
+            records = records[records["function"] < len(self.stepper.events)]
+        if len(records):
             self.last = float(records["t"][-1]), records["q"][-1], records["p"][-1]
         before, self._bytes = self._bytes, self._bytes + records.nbytes
         self.recorded.append(records)
@@ -144,17 +155,18 @@ class CrossingSearch:
         through = BEHIND if behind < 0.0 else THROUGH
         undefined = UNDEFINED_CHANGE if getattr(self.watch, "undefined", 0) < 0 else UNDEFINED
         messages = {"undefined": undefined, "accumulated": ACCUMULATED, "through": through, "jammed": JAMMED}
+        messages["sliding"] = SLIDING
         for name, message in messages.items():
             number = getattr(self.watch, name, 0)
             if number and not (name == "accumulated" and self.ended):
-                function = self.stepper.events[abs(number) - 1].function
+                function = self.stepper.searched[abs(number) - 1].function
                 return EventError(message.format(function=function, t=report.t, g=behind))
         return step_failure(status, report, step=step, h=h, failures=self.binding.failures)
 
     def warn_of_accumulation(self) -> None:
         """Issue a :class:`EventWarning` if the run ended where crossings accumulate."""
         if self.changes and self.watch.accumulated:
-            function, t = self.stepper.events[self.watch.accumulated - 1].function, self.last[0]
+            function, t = self.stepper.searched[self.watch.accumulated - 1].function, self.last[0]
             warn(
                 f"the crossings of '{function}' accumulate at t = {self.watch.end:.17g} (infinitely many impacts in "
                 f"finite time): the run ended at t = {t:.17g}. Continue with a constraint, or ignore this warning",

@@ -277,7 +277,7 @@ class _Recorder:
     def _advance(self, steps: int) -> None:
         run, save_every = self.run, self.manifest.save_every
         try:
-            if run.stepper.events:
+            if run.stepper.searched:
                 trajectory = Observation(run, Saver(save_every, within_steps=False)).advance(steps)
             else:
                 trajectory = record(run, steps, save_every=save_every)

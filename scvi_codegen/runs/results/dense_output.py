@@ -50,7 +50,7 @@ def states_and_steps_at(states: SavedStates, times: Array) -> tuple[Array, Array
         return states_in_transformed_time(states, times)
     left = np.searchsorted(states.forward * states.t, states.forward * times, side="right") - 1
     lengths, fixed, several = states.step_sizes[:-1], isinstance(states.plan, FixedSteps), False
-    if states.stepper.changes_states:
+    if states.stepper.divides_steps:
         several = not (np.abs(np.diff(states.t)) < 1.5 * np.abs(lengths)).all()
     if several or (not fixed and np.isnan(lengths).any()):
         return *_integrate_to_each(states, left, times, states.plan), times

@@ -188,7 +188,7 @@ def parameter_values(interface: Interface, parameters: Parameters, base: Array |
                 raise StateError(f"the parameter {name} must have the shape of one state, not {value.shape}")
             values[where] = value if isinstance(where, slice) else checked_number(value, f"the parameter {name}")
     elif parameters is not None:
-        array = real_array(parameters, "parameters")
+        array = _with_modes(interface, real_array(parameters, "parameters"))
         if array.shape != values.shape:
             listed = ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")
             raise StateError(f"parameters must have {len(values)} values ({listed or 'none'}), not {array.size}")
@@ -196,6 +196,14 @@ def parameter_values(interface: Interface, parameters: Parameters, base: Array |
     if not np.isfinite(values).all():
         worst = int(np.flatnonzero(~np.isfinite(values))[0])
         raise StateError(f"the parameter {names[worst]} is {values[worst]}: it must be finite")
+    return values
+
+
+def _with_modes(interface: Interface, values: Array) -> Array:
+    """Return (.., k) parameters in order, with those of the modes of kinks, which may be omitted: they are 0."""
+    modes = len(interface.modes)
+    if modes and values.ndim and values.shape[-1] == len(interface.parameters) - modes:
+        return np.concatenate([values, np.zeros((*values.shape[:-1], modes))], axis=-1)
     return values
 
 
@@ -214,7 +222,7 @@ def parameters_of_each(interface: Interface, argument: EnsembleParameters, count
                 )
             values[:, where] = column
     elif argument is not None:
-        array = real_array(argument, "parameters")
+        array = _with_modes(interface, real_array(argument, "parameters"))
         if array.shape not in ((len(names),), (count, len(names))):
             raise StateError(f"parameters must have shape ({count}, {len(names)}), not {array.shape}")
         values[:] = array

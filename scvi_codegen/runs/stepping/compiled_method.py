@@ -23,7 +23,7 @@ from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepping.array_binding import ArrayBinding, EventBinding
 from scvi_codegen.runs.stepping.array_interface import RunSizes, check_few_coordinates
 from scvi_codegen.runs.stepping.features import Support, check_features, require
-from scvi_codegen.systems.event import Event, EventLike, as_events
+from scvi_codegen.systems.event import Event, EventLike, Kink, as_events
 
 MOST_EVENT_SETS = 16
 """Number of event sets whose compiled integrators are cached, so that repeated calls do not parse formulas again."""
@@ -81,7 +81,9 @@ class CompiledMethod:
         source: the C source it was compiled from; ``None`` of arrays that are compiled with the sizes of each call.
         fallback: source with Newton's iteration, if the main source contains only the fixed-point iteration.
         events: events that every run records.
-        changes_states: whether one of them changes the states of runs.
+        searched: functions whose zeros every run locates: of the events, and of the kinks of the system.
+        divides_steps: whether steps end at zeros: of events that change the state, and of kinks.
+        changes_states: whether an event changes the states of runs.
         in_tau: whether the system is one in transformed time, whose steps are steps of tau.
         run_time_sizes: whether the sizes of its arrays are those of each call; the stepper is bound to them, or
             compiled with them if an integrator of run-time sizes is impossible.
@@ -105,7 +107,10 @@ class CompiledMethod:
     ) -> None:
         self.interface, self.flags, self.events = interface, flags, events
         self.in_tau = interface.in_tau
+        kinks = (Kink(function, mode=mode) for mode, function in interface.modes)
+        self.searched: tuple[Event, ...] = (*events, *kinks)
         self.changes_states = any(event.changes_state for event in events)
+        self.divides_steps = self.changes_states or bool(interface.modes)
         self.origin, self.problem, self._of_sizes, self._reason = origin, problem, of_sizes, reason
         self._variants = Variants() if variants is None else variants
         self._event_variants: dict[tuple[Event, ...], Self] = {}
@@ -121,7 +126,7 @@ class CompiledMethod:
         self._load()
 
     def _load(self) -> None:
-        interface, events = self.interface if self.origin is None else self.origin.interface, self.events
+        interface, events = self.interface if self.origin is None else self.origin.interface, self.searched
         if interface.words > 1:
             events = ()  # located by the integrator in double
         if events:

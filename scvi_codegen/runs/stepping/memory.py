@@ -66,7 +66,7 @@ RANGES = {
 """Smallest and largest values of whole numbers in the memory of a run, which C uses as counts and indices."""
 STEPS_NEAR_REST = 16
 """Number of steps in which a force moves a state away from rest."""
-EVENT_NUMBERS = ("undefined", "accumulated", "through", "jammed")
+EVENT_NUMBERS = ("undefined", "accumulated", "through", "jammed", "sliding")
 """Numbers of events, from 1 on, in the state of the search for events; 0 for none, < 0 for an undefined change."""
 NO_OUTPUT, NO_PLAN = LARGEST_COUNT, Fixed(math.nan)
 """Output stride that saves no state; plan of a run that was not started."""
@@ -235,8 +235,8 @@ class Memory:
         vectors = map(stepper.binding.vector, (memory.q, memory.p, memory.carry_q, memory.carry_p))
         if not np.isfinite(np.concatenate([[memory.t, memory.h], *vectors])).all():
             raise StateError(f"invalid saved run: its state is not finite, h = {memory.h:g}")
-        searched = dict.fromkeys(EVENT_NUMBERS, (0, len(stepper.events)))
-        searched["undefined"] = (-len(stepper.events), len(stepper.events))
+        count = len(stepper.searched)
+        searched = {**dict.fromkeys(EVENT_NUMBERS, (0, count)), "undefined": (-count, count)}
         numbers = [*((memory, *each) for each in RANGES.items()), *((run._watch, *each) for each in searched.items())]
         for owner, name, (least, most) in numbers:
             if not least <= (value := getattr(owner, name, least)) <= most:
@@ -447,7 +447,7 @@ class Memory:
         binding, stepper = self.stepper.binding, cast(Any, self.stepper)
         buffer = binding.buffer(self._memory)
         watch = None
-        if stepper.events and len(saved) > len(buffer):
+        if stepper.searched and len(saved) > len(buffer):
             watch = (binding if stepper.interface.words == 1 else stepper._in_double.binding).new("watch *")
         size = len(buffer) + (0 if watch is None else len(binding.buffer(watch)))
         if len(saved) != size:

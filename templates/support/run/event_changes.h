@@ -1,5 +1,6 @@
 #include "events.h"
 #include "impacts.h"
+#include "kinks.h"
 
 /* Runs whose events change the state: impacts, impulses, switches.
  *
@@ -99,7 +100,10 @@ static int change_at_crossings(const event_step *step, long long first, event_sa
   real rate, *const v = step->memory + 3 * M;
   for (long long i = first; status == OK && i < last; i++)
     if (step->watch->acts[step->found[i].function]) {
-      status = change_state(step, FUNCTION_OF(step->found + i), at);
+      if (is_kink(step->found[i].function))
+        step->watch->history[FUNCTION_OF(step->found + i)].slack = fabs(at->g);
+      else
+        status = change_state(step, FUNCTION_OF(step->found + i), at);
       note_hit(step, step->found + i, at->t);
     }
   for (int round = 0; status == OK && met; round++) {
@@ -270,6 +274,10 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
     if (status == OK)
       status = change_at_crossings(step, group, &at);
     length -= part;
+#ifdef EVENT_KINKS
+    if (status == OK)
+      status = change_sides(step, group, &at, step->whole);
+#endif
     ends = fabs(length) <= CHANGE_SAFETY * DBL_EPSILON * fabs(step->whole);
     if (status == OK)
       status = store_state(to, &at, part, ends ? iterations : 0, ends ? run->step : within, step->report);
@@ -348,6 +356,13 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
     solver_report *report, real *workspace)
 {
   EVENT_MEMORY(watch, memory, 15 * M + CHANGE_VALUES)
+#ifdef EVENT_KINKS
+  real own[PARAMETERS];
+  memcpy(own, parameters, BYTES(PARAMETERS));
+  parameters = own;
+#else
+  real *const own = NULL;
+#endif
   event_sample horizon = {.q = memory + 7 * M, .p = memory + 8 * M};
   const event_watch initial = *watch;
   const stored_states to = {states, number, t, q, p, length, iterations};
@@ -359,11 +374,23 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
     const event_watch watched = *watch;
     const long long kept = report->stored, crossed = *filled;
     event_step step = {0.0, 0.0, 0.0, NULL, NULL, parameters, options, watch, found, room, filled, report, workspace,
-        memory, memory + 15 * M, 0, &horizon};
+        memory, memory + 15 * M, 0, &horizon, own};
     real size;
     int count = 0;
     keep_run(&before, run, step.values + (long long)EVENT_VALUES * EVENTS);
-    status = take_step(run, t_end, control, &step, &size, &count);
+#ifdef EVENT_KINKS
+    event_sample start = {.t = run->t, .q = before.q, .p = before.p};
+    int unknown;
+    status = settle_sides(&step, &start, &unknown);
+    if (status == OK && unknown) {
+      status = take_step(run, t_end, control, &step, &size, &count);
+      if (status == OK)
+        status = sides_after_start(&step, &start, size);
+      copy_run(run, &before);
+    }
+    if (status == OK)
+#endif
+      status = take_step(run, t_end, control, &step, &size, &count);
     if (status == OK)
       status = change_in_step(&before, run, &step, control != NULL, size, count, &to);
     if (status != OK) {

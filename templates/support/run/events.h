@@ -56,6 +56,7 @@ typedef struct {
   real *values; /* of the functions (EVENT_VALUES EVENTS) */
   int rounding_known; /* whether the effect of rounding on this step is */
   event_sample *horizon; /* first known crossing that changes the state; later ones are not located */
+  real *own; /* the parameters, with the modes of kinks */
 } event_step;
 
 /* Values of all functions at a node, at a state (EVENT_DEGREE + 1), and the effect of rounding (EVENT_DEGREE + 2). */
