@@ -60,11 +60,12 @@ SLIDING = (
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Zero crossings of a function g(q, v, p, t; inputs, parameters), which may change the state.
+    """Zero crossings of a function g(q, v, p, lambda, t; inputs, parameters), which may change the state.
 
     Attributes:
         function: g, as a formula or a SymPy expression in the coordinates, their velocities (``q_dot``), their momenta
-            (``p_q``, or the names of the Hamiltonian), time ``t``, inputs and parameters. For arrays of run-time sizes
+            (``p_q``, or the names of the Hamiltonian), multipliers of constraints (``lambda_1``, in double precision),
+            time ``t``, inputs and parameters. For arrays of run-time sizes
             ``"r[i, 0] for i in N"`` is a function for each element; its index may occur in all formulas of the event.
         direction: 1 for crossings from negative to positive in the direction of the run, -1 for the opposite, 0 both.
         terminal: ``True`` if the first crossing ends the run, or the number of the crossing that ends it. Simultaneous

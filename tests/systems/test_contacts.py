@@ -119,3 +119,14 @@ def test_the_direction_of_sliding_in_space_turns(degree: int, order: int, larges
         errors.append(np.abs(np.concatenate([run.q[-1], run.velocity[-1]]) - true).max())
     assert errors[-1] < largest
     assert np.log2(errors[0] / errors[1]) > order - 0.3
+
+
+def test_a_multiplier_is_an_event() -> None:
+    system = sc.LagrangianSystem.from_text(
+        name="bead", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 = 1"]
+    )
+    start = [0.05, np.sqrt(1 - 0.05**2)]
+    leaves = sc.Event("lambda_1", terminal=True)
+    run = sc.compile_stepper(system, "svi:4").integrate(start, velocity=[0, 0], t_end=5, events=leaves)
+    assert run.q[-1, 1] == pytest.approx(2 / 3 * start[1], abs=1e-13)
+    assert abs(run.multipliers()[-1, 0]) < 1e-13

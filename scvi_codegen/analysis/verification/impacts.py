@@ -102,6 +102,8 @@ def _event_functions(run: Trajectory) -> Iterator[tuple[Crossings, Callable[...,
     formulas = EventFormulas(run.stepper.interface, [event for _, event in scalar_events])
     arguments = (*formulas.q, *formulas.p, *formulas.v, symbol(TIME), *formulas.parameters)
     for (crossings, _), g, (_, values) in zip(scalar_events, formulas.functions, formulas.changes, strict=True):
+        if not g.free_symbols.isdisjoint(formulas.multipliers):
+            continue
         restitution = sympy.nan if crossings.event.restitution is None else values[-1]
         gradient = [g.diff(variable) for variable in (*formulas.q, symbol(TIME))]
         yield crossings, sympy.lambdify(arguments, [g, restitution, *gradient])

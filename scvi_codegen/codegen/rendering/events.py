@@ -117,11 +117,12 @@ class EventFormulas:
         self.parameters = tuple(symbol(name) for name in interface.parameters)
         taken = {*self.q, *self.v, symbol(TIME), *self.parameters}
         self.p = [sympy.Dummy() if symbol(name) in taken else symbol(name) for name in interface.momenta]
+        self.multipliers = [symbol(name) for name in multiplier_names(interface) if symbol(name) not in taken]
         self.functions = [self._read(event.function, f"event function '{event.function}'") for event in self.events]
         for event, function in zip(self.events, self.functions, strict=True):
             if interface.variables and event.restitution is not None:
                 raise EventError(f"'{interface.system}' is a first-order system without impacts: write them in then=")
-            moving = sorted(free.name for free in function.free_symbols & {*self.p, *self.v})
+            moving = sorted(free.name for free in function.free_symbols & {*self.p, *self.v, *self.multipliers})
             event.check_function(moving, constant=not function.free_symbols)
         self.guards = [
             (number, self._read(condition, f"condition where='{condition}'"))
@@ -138,8 +139,8 @@ class EventFormulas:
 
     @property
     def arguments(self) -> tuple[Symbol, ...]:
-        """Arguments (q, p, v) of the kernels."""
-        return (*self.q, *self.p, *self.v)
+        """Arguments (q, p, v, lambda) of the kernels, the multipliers of constraints last."""
+        return (*self.q, *self.p, *self.v, *self.multipliers)
 
     def kernel(self, name: str, values: Sequence[Expr]) -> Kernel:
         """Return the kernel of some of the formulas."""
@@ -186,7 +187,7 @@ class EventFormulas:
             gradient = [sympy.diff(g, variable) for variable in (*self.q, symbol(TIME))]  # g_q, g_t
             restitution = self._read(event.restitution, f"restitution '{event.restitution}'")
             return [*range(len(self.q)), 0, 0], [*gradient, restitution]
-        settable = (*self.q, *self.p) if self.interface.variables else self.arguments
+        settable = (*self.q, *self.p) if self.interface.variables else (*self.q, *self.p, *self.v)
         places = {variable: k for k, variable in enumerate(settable)}
         named = {name: places[variable] for name, variable in self._known.items() if variable in places}
         new = {
@@ -247,8 +248,13 @@ def _arrays(interface: Interface) -> list[Array]:
 def _names(interface: Interface) -> dict[str, Symbol]:
     """Return the names that a function may use; coordinates and parameters precede default names of momenta."""
     velocities = [name + DOT for name in interface.coordinates]
-    moving = *interface.coordinates, *velocities, *interface.momenta
+    moving = *multiplier_names(interface), *interface.coordinates, *velocities, *interface.momenta
     return {name: symbol(name) for name in (*moving, TIME, *interface.parameters, *interface.inputs)}
+
+
+def multiplier_names(interface: Interface) -> list[str]:
+    """Return the names of the multipliers of the constraints: lambda_1, .. in double; none of run-time sizes."""
+    return [f"lambda_{k}" for k in range(1, len(interface.constraints) + 1)] if interface.words == 1 else []
 
 
 def _expression(
@@ -266,8 +272,8 @@ def _expression(
     unknown = sorted(free.name for free in expression.free_symbols.difference(names.values()))
     if unknown:
         raise EventError(
-            f"'{unknown[0]}' in the {role} is neither a coordinate, a velocity, a momentum, time, an input nor a "
-            f"parameter{closest(unknown[0], names)} Known here: {', '.join(names)}"
+            f"'{unknown[0]}' in the {role} is neither a coordinate, a velocity, a momentum, a multiplier, time, an "
+            f"input nor a parameter{closest(unknown[0], names)} Known here: {', '.join(names)}"
         )
     return expression
 
@@ -334,6 +340,7 @@ def _search(interface: Interface, events: tuple[SearchedEvent, ...], *, controll
         guarded=tuple(number for number, _ in formulas.guards),
         kernels=tuple(formulas.kernel(name, values) for name, values in formulas_of_kernel.items() if values),
         uses_velocity=not variables.isdisjoint(formulas.v),
+        multipliers=0 if variables.isdisjoint(formulas.multipliers) else len(formulas.multipliers),
         changed=tuple(index for indices, _ in formulas.changes for index in indices),
         first_values=(0, *accumulate(len(values) for _, values in formulas.changes)),
         parameters=len(interface.parameters),

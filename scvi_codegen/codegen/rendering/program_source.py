@@ -161,6 +161,7 @@ class EventSearch:
         kernels: the functions at u = (q, p, v); conditions; values of variables that crossings change, gradient and
             restitution of impacts.
         uses_velocity: whether v occurs in the formulas.
+        multipliers: number of multipliers if one occurs in the formulas, else 0.
         changed: index among (q, p, v) of the variable of each value of the changes.
         first_values: index of the first value of each function, and the number of values.
         parameters: number of parameters.
@@ -184,6 +185,7 @@ class EventSearch:
     changes_states: bool
     kernels: tuple[Kernel, ...]
     uses_velocity: bool
+    multipliers: int = 0
     changed: tuple[int, ...] = ()
     first_values: tuple[int, ...] = ()
     elements: tuple[int, ...] = ()

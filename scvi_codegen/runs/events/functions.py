@@ -56,7 +56,7 @@ class EventFunctions:
         from scvi_codegen.systems.formulas.symbols import TIME, symbol
 
         formulas = EventFormulas(stepper.interface, events)
-        symbols = [*formulas.arguments, symbol(TIME), *formulas.parameters]
+        symbols = [*formulas.q, *formulas.p, *formulas.v, symbol(TIME), *formulas.parameters]
         self.firsts = np.cumsum([0, *formulas.elements]).tolist()
         self.tapes = [Tape([function], symbols) for function in formulas.functions]
         self.indices = [indices for indices, _ in formulas.changes]

@@ -178,11 +178,13 @@ def _derivatives(interface: Interface, event: Event) -> Callable[[Array, float, 
     z, time = (*formulas.q, *formulas.p), symbol(TIME)
     variables = (*z, *formulas.parameters, time)
     new = dict(zip(indices, values, strict=True))
+    others = {*formulas.v, *formulas.multipliers}
     if any(index >= len(z) for index in indices) or any(
-        formula.free_symbols.intersection(formulas.v) for formula in (*formulas.functions, *values)
+        formula.free_symbols & others for formula in (*formulas.functions, *values)
     ):
         raise StateError(
-            f"derivatives through the event '{event.function}' require momenta instead of velocities in its formulas"
+            f"derivatives through the event '{event.function}' require momenta instead of velocities in its formulas, "
+            "and no multipliers"
         )
     mapped = [new.get(k, unchanged) for k, unchanged in enumerate(z)] if event.restitution is None else list(values)
     entries = [formulas.functions[0].diff(x) for x in variables]
