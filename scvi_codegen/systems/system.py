@@ -336,7 +336,8 @@ class MechanicalSystem(Deferred, ABC):
         """Functions as text at whose zeros the function, forces or constraints are not smooth, by unit_step or rint."""
         from scvi_codegen.systems.formulas.expressions import kinks_of
 
-        return tuple(sorted(map(self.text_of, kinks_of((self.lagrangian, *self.forces, *self.constraints)))))
+        kinks = kinks_of((self.lagrangian, *self.forces, *self.constraints))
+        return tuple(sorted(self.text_of(u) for u in kinks if not u.free_symbols <= {*self.parameters}))
 
     @property
     def balances_energy(self) -> bool:

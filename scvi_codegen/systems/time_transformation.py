@@ -39,7 +39,7 @@ from scvi_codegen.systems.derived_expressions import forms_of
 from scvi_codegen.systems.formulas.array_statements import formula_of_entries, is_indexed, momentum_arrays
 from scvi_codegen.systems.formulas.expressions import gradient, hessian
 from scvi_codegen.systems.formulas.grammar import parse_expression
-from scvi_codegen.systems.formulas.intermediates import root_of_square, with_even_roots
+from scvi_codegen.systems.formulas.intermediates import without_abs
 from scvi_codegen.systems.formulas.rotations import RotationNames
 from scvi_codegen.systems.formulas.symbols import input_formulas, symbol
 from scvi_codegen.systems.formulas.translation import format_expression
@@ -228,13 +228,14 @@ def _frequency(system: MechanicalSystem) -> Expr:
     _, simplest = sympy.factor(sympy.simplify(squares.xreplace(positive))).as_coeff_Mul()
     root = simplest ** sympy.Rational(-1, 4)
     made = sympy.powdenest(root, force=True).xreplace({stand_in: parameter for parameter, stand_in in positive.items()})
-    zero = root_of_square(with_even_roots(made), [*system.coordinates, system.time])
+    moving = {*system.coordinates, system.time}
+    zero = next((root.args[0] for root in made.atoms(sympy.Abs) if root.free_symbols & moving), None)
     if zero is not None:
         raise SystemDefinitionError(
             f"the time transformation 'frequency' of '{system.name}' is infinite where its stiffness is 0, {zero} = 0: "
             "use a formula in its coordinates that is positive everywhere"
         )
-    return made
+    return without_abs(made)
 
 
 def _distance(system: MechanicalSystem) -> Expr:

@@ -15,7 +15,7 @@ from scvi_codegen.interfaces.models.model_files.model_file import parse_model
 from scvi_codegen.interfaces.models.model_files.page_section import drawn_system_of_model
 from scvi_codegen.interfaces.pictures.recognition import shape_of
 from scvi_codegen.interfaces.pictures.shape import shape_of_picture
-from scvi_codegen.systems.formulas.expressions import FUNCTIONS, OF_TWO
+from scvi_codegen.systems.formulas.expressions import ARGUMENTS, FUNCTIONS
 
 ROOT = Path(__file__).parents[2]
 MOTIONS = ROOT / "docs" / "motions"
@@ -159,7 +159,8 @@ console.log(JSON.stringify(states.map(([t, q, p]) => pointsOf(q, p, t))));
 
 def shapes():
     """Return models with their shapes: every function, solids, a robot with fixed and moving base, a periodic box."""
-    formulas = [f"{name}(0.3*sin(x + t){', theta**2' * (name in OF_TWO)} + l - 1)" for name in FUNCTIONS]
+    further = {2: ", theta**2", 3: " > 0, theta, theta**2"}
+    formulas = [f"{name}(0.3*sin(x + t){further.get(ARGUMENTS.get(name), '')} + l - 1)" for name in FUNCTIONS]
     formulas = [each.replace(" - 1", "") if each.startswith("acosh") else each for each in formulas]
     points = {f"p{k}": [each, "-theta**3/p_x"] for k, each in enumerate(formulas)}
     model = parse_model(CART)

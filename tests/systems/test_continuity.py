@@ -15,6 +15,8 @@ JUMPS = {
     "whole numbers": "x_dot**2/2 - rint(x)",
     "a moving step": "x_dot**2/2 - unit_step(x - t)",
     "a far step": "x_dot**2/2 - unit_step(x - 1e6)",
+    "a sign": "x_dot**2/2 - sign(x - a)",
+    "pieces that do not meet": "x_dot**2/2 - where(x > a, x, 0)",
     "a thin layer": "x_dot**2/2 - unit_step(x - a)*unit_step(a + 1/10 - x)",
 }
 CONTINUOUS = {
@@ -23,6 +25,10 @@ CONTINUOUS = {
     "a product that vanishes on the surface": "x_dot**2/2 - unit_step(x)*x**2",
     "two jumps that cancel": "x_dot**2/2 - unit_step(x) - unit_step(-x)",
     "a power that is not whole": "x_dot**2/2 - 1000*positive_part(-x)**(5/2)",
+    "the size of a coordinate as mass": "(1 + abs(x))*x_dot**2/2",
+    "powers of sizes": "x_dot**2/2 - abs(x)**2.5 - abs(x - a)**3 - k*abs(x)",
+    "an infinite potential": "x_dot**2/2 - 1/abs(x) + log(abs(x - a))",
+    "pieces that meet": "x_dot**2/2 - where(x > a, x - a, 0) - min(x, 2*x, 3)",
     "a time": "x_dot**2/2 - unit_step(t - a)*x",
     "a periodic spring": "x_dot**2/2 - wrap(x, 3)**2",
     "a shifted potential": "x_dot**2/2 - unit_step(4 - x**2)*(1/(1 + x**2) - 1/5)",

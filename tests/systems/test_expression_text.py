@@ -12,7 +12,7 @@ from sympy import Integer, Rational, S, Symbol, pi
 import scvi_codegen as sc
 from scvi_codegen.common.errors import ExpressionError, SystemDefinitionError
 from scvi_codegen.common.precision import mp
-from scvi_codegen.systems.formulas.expressions import FUNCTIONS, OF_TWO, evaluate, evaluated, unsupported_part
+from scvi_codegen.systems.formulas.expressions import ARGUMENTS, FUNCTIONS, evaluate, evaluated, unsupported_part
 from scvi_codegen.systems.formulas.grammar import MAX_CHARACTERS, parse_expression
 from scvi_codegen.systems.formulas.translation import format_expression
 
@@ -74,7 +74,14 @@ def test_valid_text_is_accepted(text: str, expected: sympy.Expr) -> None:
         ("'x'", 0, "string"),
         ('"x"', 0, "string"),
         ("x < y", 2, "comparison"),
-        ("x == y", 2, "comparison"),
+        ("x == y", 2, "equalit"),
+        ("x + (y > 1)", 7, "first argument of where"),
+        ("where(x, 1, 2)", 7, "comparison first"),
+        ("where(x > 0 > y, 1, 2)", 12, "first argument of where"),
+        ("where(x > 0, 1)", 0, "3 arguments, not 2"),
+        ("max(x)", 0, "2 or more arguments, not 1"),
+        ("Max(x, y)", 0, "did you mean 'max'"),
+        ("Heaviside(x)", 0, "did you mean 'unit_step'"),
         ("x^2", 1, r"x\*\*2"),
         ("x % 2", 2, "remainder"),
         ("x # y", 2, "comment"),
@@ -167,7 +174,8 @@ def test_long_sums_and_products_do_not_recurse() -> None:
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_nested_expressions_are_read_or_rejected_without_crashing(name: str) -> None:
     assert parse("(" * 100 + "x" + ")" * 100) == X
-    text = f"{name}(x+y, " * 100 + "x" + ")" * 100 if name in OF_TWO else f"{name}(x+" * 100 + "y" + ")" * 100
+    before = ["x+y, ", "x > y, x, "][ARGUMENTS.get(name, 1) - 2] if name in ARGUMENTS else "x+"
+    text = f"{name}({before}" * 100 + "x" + ")" * 100
     try:
         parse(text)
     except ExpressionError as error:
@@ -191,7 +199,7 @@ def numbers() -> st.SearchStrategy[sympy.Expr]:
 
 def grown(children: st.SearchStrategy[sympy.Expr]) -> st.SearchStrategy[sympy.Expr]:
     exponents = st.sampled_from([Integer(n) for n in (-3, -2, -1, 2, 3)] + [Rational(k, 2) for k in (-3, -1, 1, 3, 5)])
-    unary = st.sampled_from([function for name, function in FUNCTIONS.items() if name not in OF_TWO])
+    unary = st.sampled_from([function for name, function in FUNCTIONS.items() if name not in ARGUMENTS])
     built = st.one_of(
         st.lists(children, min_size=2, max_size=4).map(lambda parts: sympy.Add(*parts)),
         st.lists(children, min_size=2, max_size=4).map(lambda parts: sympy.Mul(*parts)),

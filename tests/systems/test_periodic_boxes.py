@@ -1,4 +1,4 @@
-"""``wrap``, ``positive_part``, ``rint`` and ``unit_step`` in formulas: values, derivatives, C, orders."""
+"""Functions with kinks, as ``wrap``, ``abs``, ``max`` and ``where``, in formulas: values, derivatives, C, orders."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ import math
 
 import numpy as np
 import pytest
+import sympy
 from notation import lagrange
 from scipy.spatial import cKDTree
 
 import scvi_codegen as sc
 from scvi_codegen.common.precision import mp
-from scvi_codegen.systems.formulas.expressions import Tape, gradient
+from scvi_codegen.systems.formulas.expressions import Tape, evaluated, gradient, kinks_of
 from scvi_codegen.systems.formulas.grammar import parse_expression
 from scvi_codegen.systems.formulas.numpy_values import array_value
 from scvi_codegen.systems.formulas.symbols import symbol
@@ -24,18 +25,81 @@ VALUES = {
     "positive_part(x)": lambda x, _: np.maximum(x, 0.0),
     "unit_step(x - 1)": lambda x, _: np.where(x >= 1.0, 1.0, 0.0),
     "rint(3*x)": lambda x, _: np.rint(3 * x),
+    "abs(L - x)": lambda x, length: np.abs(length - x),
+    "abs(x)**3 + sqrt(x**2)": lambda x, _: np.abs(x) ** 3 + np.abs(x),
+    "sign(1 - x)": lambda x, _: np.sign(1 - x),
+    "max(x, L, 2*x - 1) - min(-x, 0.4)": lambda x, length: (
+        np.max([x, 0 * x + length, 2 * x - 1], axis=0) - np.minimum(-x, 0.4)
+    ),
+    "min(x, -1, 7 - x, L, 2)": lambda x, length: np.min([x, 0 * x - 1, 7 - x, 0 * x + length], axis=0),
+    "where(x >= L, L, where(-x < 1, 2, x))": lambda x, length: np.where(x >= length, length, np.where(-x < 1, 2, x)),
+    "where(x > L, 1, 0) + where(L >= x, 5, 0)": lambda x, length: (
+        np.where(x > length, 1, 0) + np.where(x <= length, 5, 0)
+    ),
 }
 
 
 @pytest.mark.parametrize("text", VALUES)
 def test_values_in_60_digits_and_in_arrays(text: str) -> None:
-    points = np.array([-7.3, -1.6, -0.2, 0.4, 1.7, 12.1])
+    points = np.array([-7.3, -1.6, -0.2, 0.4, 1.7, 3.0, 12.1])
     expression = parse_expression(text, KNOWN)
     expected = VALUES[text](points, 3.0)
     assert array_value(expression, {X: points, L: 3.0}) == pytest.approx(expected)
     tape = Tape([expression], [X, L])
     assert [float(tape([mp.mpf(x), mp.mpf(3)])[0]) for x in points] == pytest.approx(expected)
     assert parse_expression(format_expression(expression), KNOWN) == expression
+
+
+OF_SYMPY = {
+    sympy.Abs(X - L): "abs(x - L)",
+    sympy.sign(X) * X**2: "sign(x)*x**2",
+    sympy.Max(X, L): "max(x, L)",
+    sympy.Min(X, 2 * L): "min(x, 2*L)",
+    sympy.Heaviside(X - L): "unit_step(x - L)",
+    sympy.Piecewise((X, (X > 0) & (X <= L)), (-L, ~(X < 1)), (L, True)): "where(x > 0, where(x <= L, x, 0), 0)"
+    " + (1 - where(x > 0, where(x <= L, 1, 0), 0))*where(x >= 1, -L, L)",
+}
+
+
+@pytest.mark.parametrize("formula", OF_SYMPY, ids=str)
+def test_functions_of_sympy_are_those_of_text(formula: sympy.Expr) -> None:
+    tape = Tape([evaluated(formula), parse_expression(OF_SYMPY[formula], KNOWN)], [X, L])
+    for x in (-7.3, 0.0, 0.4, 1.7, 3.0, 12.1):
+        value, expected = tape([mp.mpf(x), mp.mpf(3)])
+        assert value == expected
+
+
+def test_arguments_that_differ_by_a_factor_have_one_switching_function() -> None:
+    texts = "abs(x - L)", "unit_step(3*L - 3*x)", "max(x, L)", "min(L, x)", "where(L < x, 1, 2)", "sign(pi*(x - L)/2)"
+    assert kinks_of([parse_expression(text, KNOWN) for text in texts]) in ({X - L}, {L - X})
+    assert lagrange("plain", "x", "sqrt(L**2)*x_dot**2/2 - abs(x)", L=2.0).kinks == ("x",)
+
+
+def test_declared_names_replace_functions() -> None:
+    text, parameters = "abs*x_dot**2/2 - abs*x**2/2", {"abs": 2.0}
+    with pytest.warns(sc.SystemDefinitionWarning, match=r"'abs' is a name of this system.*rename"):
+        system = sc.LagrangianSystem.from_text("named", ["x"], text, parameters=parameters)
+    assert system.kinks == ()
+    with pytest.warns(sc.SystemDefinitionWarning, match="'max'"):
+        sc.LagrangianSystem.from_text("arrays", ["max[N]"], "sum(i in N, max_dot[i]**2/2 - abs(max[i]))")
+
+
+@pytest.mark.parametrize("precision", ["double"])
+def test_steps_have_the_forces_of_numpy(precision: str) -> None:
+    """One explicit step of unit mass from rest: the velocity is h/2 times the forces at its ends."""
+    potential = "where(x > y, (x - y)**2, 0) + max(x, 2*x, -3*x) + abs(x + y)**3 + min(y, 1)"
+    friction = {"x": "sign(y - 1) - where(t < 1, x, 0)", "y": "abs(x)*2"}
+    system = lagrange("kinks", "x y", f"(x_dot**2 + y_dot**2)/2 - ({potential})", forces=friction)
+    stepper, h = sc.compile_stepper(system, "stoermer-verlet", precision=precision), 1e-9
+
+    def force(x: float, y: float) -> list[float]:
+        of_pair, of_sum = 2 * max(x - y, 0), 3 * (x + y) * abs(x + y)
+        of_x = np.sign(y - 1) - x - of_pair - (-3 if x < 0 else 2) - of_sum
+        return [of_x, 2 * abs(x) + of_pair - of_sum - (y < 1)]
+
+    for q in np.random.default_rng(7).uniform(-2, 2, (20, 2)):
+        run = stepper.integrate(q, velocity=[0.0, 0.0], h=h, steps=1)
+        assert run.p[-1] / h == pytest.approx(force(*q), rel=1e-6)
 
 
 def test_derivatives_are_those_of_the_pieces() -> None:

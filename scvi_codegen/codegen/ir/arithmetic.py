@@ -24,8 +24,8 @@ import sympy
 
 from scvi_codegen.codegen.ir.kernel import Constant, Expression, Kernel, Load, Operation, exact_number
 from scvi_codegen.common.errors import SystemDefinitionError
-from scvi_codegen.systems.formulas.expressions import rint, unit_step
 from scvi_codegen.systems.formulas.intermediates import Intermediate, intermediates
+from scvi_codegen.systems.formulas.kinks import rint, switching_function, unit_step
 
 CIRCULAR = ("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh")
 FUNCTIONS = {getattr(sympy, name): name for name in (*CIRCULAR, "atan2", "exp", "log")} | {rint: "rint"}
@@ -101,7 +101,7 @@ class _Graph:
         if isinstance(expression, sympy.Pow):
             return self._power(*expression.as_base_exp())
         if isinstance(expression, unit_step):  # (1 + copysign(1, x)) / 2
-            sign = self.node(("copysign", (self.read(sympy.S.One), self.read(expression.args[0]))))
+            sign = self.node(("copysign", (self.read(sympy.S.One), self._switching(expression.args[0]))))
             return self.node(("*", (self.read(sympy.S.Half), self.node(("+", (self.read(sympy.S.One), sign))))))
         name = FUNCTIONS.get(expression.func)
         if name is None:
@@ -110,6 +110,11 @@ class _Graph:
                 f"{', '.join(FUNCTIONS.values())}, powers or roots"
             )
         return self.node((name, tuple(self.read(argument) for argument in expression.args)))
+
+    def _switching(self, argument: sympy.Expr) -> int:
+        """Return the node of a value with the sign of an argument; 0 - u of -u, since the sign of 0 is to be +."""
+        u, sign = switching_function(argument)
+        return self.read(u) if sign > 0 else self.node(("-", (self.read(sympy.S.Zero), self.read(u))))
 
     def _sum(self, expression: sympy.Add) -> int:
         """Return the node of ``sum_i c_i x_i = c sum_i (c_i / c) x_i``, c the content of the c_i with the first sign.

@@ -36,19 +36,12 @@ from scvi_codegen.common.cache import key_of
 from scvi_codegen.common.errors import SizesRequiredError, SystemDefinitionError
 from scvi_codegen.common.representation import LONGEST, clipped
 from scvi_codegen.common.validation import OfRunTimeSizes, of
-from scvi_codegen.systems.checks.continuity import corner_message, jump_message, jump_of
+from scvi_codegen.systems.checks.continuity import corner_message, irregularity, jump_of
 from scvi_codegen.systems.checks.definition import warn_of_negative, warn_of_unused
 from scvi_codegen.systems.forces import check_damping
 from scvi_codegen.systems.formulas.array_statements import ArrayForce, latex_sum
 from scvi_codegen.systems.formulas.arrays import ArrayTerm, parse_array, parse_coordinate
-from scvi_codegen.systems.formulas.expressions import (
-    gradient,
-    gradient_tuple,
-    hessian,
-    kinked_root,
-    kinks_of,
-    unsupported_part,
-)
+from scvi_codegen.systems.formulas.expressions import gradient, gradient_tuple, hessian, kinks_of, unsupported_part
 from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED, Access, Array, Convolution, Loop, Size
 from scvi_codegen.systems.formulas.neighbours import Neighbours
 from scvi_codegen.systems.formulas.rotations import MemberArray
@@ -294,10 +287,8 @@ class ArraySystem(OfRunTimeSizes, MechanicalSystem):
         object.__setattr__(self, "arrays", arrays)
         object.__setattr__(self, "lengths", tuple(length for near in self.neighbours for length in near.lengths))
         self._check_names()
-        constant = {array.name for array in self.fields}
         for term in self.terms:
-            varying = [slot for slot, access in term.slots if access.array.name not in constant]
-            if problem := unsupported_part(term.formula) or kinked_root(term.formula, [*varying, self.time]):
+            if problem := unsupported_part(term.formula):
                 raise SystemDefinitionError(f"in the {self.function} of '{self.name}': {problem}")
         self._check_continuity()
         for force in self.forces:
@@ -319,16 +310,20 @@ class ArraySystem(OfRunTimeSizes, MechanicalSystem):
         check_damping(self.name, self.damping, self.parameters)
 
     def _check_continuity(self) -> None:
-        """Raise :class:`SystemDefinitionError` for jumps of L or H across a surface, and for corners of constraints."""
+        """Raise :class:`SystemDefinitionError` for kinks of L or H that no step follows and corners of constraints."""
         constant = {array.name for array in self.fields}
-        values = self.constants
-        of_energy = [] if self.neighbours else [(term, False) for term in self.terms]  # lists end at their cutoff
-        for term, first_derivatives in (*of_energy, *((term, True) for term in self.constraints)):
-            moving = [slot for slot, access in term.slots if access.array.name not in constant]
-            if jump := jump_of(term.formula, moving, values, first_derivatives=first_derivatives):
-                subject = f"the constraint '{term}'" if first_derivatives else f"the {self.function}"
-                message = corner_message if first_derivatives else jump_message
-                raise SystemDefinitionError(message(f"{subject} of '{self.name}'", *jump))
+        moving = {
+            term: {slot: access.array.name for slot, access in term.slots if access.array.name not in constant}
+            for term in (*self.terms, *self.constraints)
+        }
+        for term in () if self.neighbours else self.terms:  # lists end at their cutoff
+            velocities = [slot for slot, name in moving[term].items() if name in self._velocities and not self.momenta]
+            subject = f"the {self.function} of '{self.name}'"
+            if problem := irregularity(term.formula, subject, moving[term], velocities, self.constants):
+                raise SystemDefinitionError(problem)
+        for term in self.constraints:
+            if corner := jump_of(term.formula, moving[term], self.constants, first_derivatives=True):
+                raise SystemDefinitionError(corner_message(f"the constraint '{term}' of '{self.name}'", *corner))
 
     def check_run_time_sizes(self) -> None:
         """Raise :class:`SizesRequiredError` for a system that cannot be compiled for sizes known at run time."""
@@ -444,8 +439,12 @@ class ArraySystem(OfRunTimeSizes, MechanicalSystem):
             return ()
         terms = [(term.loops, [term.formula]) for term in (*self.terms, *self.constraints)]
         forces = [(force.loops, [formula for _, formula in force.targets]) for force in self.applied_forces]
-        zeros = ((zero, loops) for loops, formulas in (*terms, *forces) for zero in kinks_of(formulas))
-        return tuple(sorted({f"{zero}{loops_text(loops)}" for zero, loops in zeros}))
+        zeros = ((u, loops) for loops, formulas in (*terms, *forces) for u in kinks_of(formulas))
+        constants = {
+            *self.parameters,
+            *(symbol(str(access)) for access, _ in self.accesses if access.array in self.fields),
+        }
+        return tuple(sorted({f"{u}{loops_text(loops)}" for u, loops in zeros if not u.free_symbols <= constants}))
 
     @property
     def is_first_order(self) -> bool:

@@ -1,21 +1,26 @@
-"""Jumps of a Lagrangian or Hamiltonian, and corners of constraints, where the argument of a unit_step or rint is 0.
+"""Kinks that no step can follow, where the argument of a unit_step or rint is 0: jumps, corners, powers, velocities.
 
 A jump of L across a surface u(q, t) = 0 changes the momentum there (Weierstrass-Erdmann condition), and a corner of a
-constraint is an impact. Steps do neither: they would pass such a surface without any error estimate.
+constraint is an impact. Steps do neither: they would pass such a surface without any error estimate. The force of
+|u|**k with 1 < k < 2 in L is not Lipschitz continuous, so that a motion may not be unique; a kink in velocities makes
+the Legendre transform multivalued.
 
 Each surface is examined at points that Newton's method finds on it, in 60 digits: a function jumps if the difference of
 its values on both sides does not vanish with their distance. So products that are continuous, as ``unit_step(x)*x**2``
-and ``positive_part(x)``, are no jumps, and neither are surfaces of time alone: forces are then finite at all times.
+and ``positive_part(x)``, are no jumps, and neither are surfaces of time alone: forces are then finite at all times. A
+force is not Lipschitz continuous if its difference quotients on one side grow without bound towards the surface.
 """
 
 import random
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 
 import sympy
 from sympy import Expr, Symbol
 
 from scvi_codegen.common.precision import Number, mp
-from scvi_codegen.systems.formulas.expressions import Tape, jacobian, kinks_of, rint, shortened, unit_step
+from scvi_codegen.systems.formulas.expressions import Tape, jacobian, kinks_of, shortened
+from scvi_codegen.systems.formulas.intermediates import parts
+from scvi_codegen.systems.formulas.kinks import rint, unit_step
 
 POINTS, ATTEMPTS, ITERATIONS = 3, 24, 40
 """Points of a surface that are examined; starts of Newton's method, and its iterations."""
@@ -23,8 +28,27 @@ MOST_SURFACES = 64
 """Largest number of surfaces of a function that are examined: those of arrays of known sizes are alike."""
 APART = (mp.mpf(10) ** -16, mp.mpf(10) ** -24)
 """Distances of the two sides, relative to the coordinate."""
+NEAR = (mp.mpf(10) ** -8, *APART)
+"""Distances from a surface at which difference quotients are compared."""
 VANISHING = mp.mpf(10) ** -28
 """Size of a difference relative to the values, below which it is a rounding error."""
+
+
+def irregularity(
+    formula: Expr,
+    subject: str,
+    moving: Iterable[Symbol],
+    velocities: Iterable[Symbol],
+    constants: Mapping[Symbol, float],
+) -> str | None:
+    """Return why a Lagrangian, or a Hamiltonian without velocities, has a kink that no step follows, or ``None``."""
+    variables = list(moving)
+    if kink := kink_in_velocities(formula, velocities):
+        return velocity_message(subject, *kink)
+    if jump := jump_of(formula, variables, constants):
+        return jump_message(subject, *jump)
+    slope = unbounded_slope_of(formula, variables, constants)
+    return slope_message(subject, *slope) if slope else None
 
 
 def jump_of(
@@ -39,22 +63,55 @@ def jump_of(
         first_derivatives: whether jumps of first derivatives count as well, which are corners of the formula.
     """
     variables = set(moving)
-    for surface in sorted(kinks_of([formula]), key=str)[:MOST_SURFACES]:
-        if not surface.free_symbols & variables:
-            continue
-        terms = [term for term in sympy.Add.make_args(formula) if term.has(unit_step, rint)]
-        near = [term for term in terms if kinks_of([term]) & {surface, -surface}] or [formula]
-        rest = [term for term in terms if term not in near and term.free_symbols & surface.free_symbols]
-        whole = sympy.Add(*near, *rest)
+    for surface, term, whole in _surfaces(formula, variables):
         functions = [whole]
         if first_derivatives:
             functions += jacobian([whole], sorted(whole.free_symbols & variables, key=str)).values()
         if any(_jumps(function, surface, variables, constants) for function in functions):
-            return surface, near[0]
+            return surface, term
     return None
 
 
-def _jumps(function: Expr, surface: Expr, moving: set[Symbol], constants: Mapping[Symbol, float]) -> bool:
+def unbounded_slope_of(
+    formula: Expr, moving: Iterable[Symbol], constants: Mapping[Symbol, float]
+) -> tuple[Expr, Expr] | None:
+    """Return a function u and the term of a formula whose second derivatives grow without bound where u is 0.
+
+    Args:
+        formula, moving, constants: as of :func:`jump_of`. Terms that are infinite where u is 0 are left out.
+    """
+    variables = set(moving)
+    for surface, term, whole in _surfaces(formula, variables):
+        if all(part.exp.is_Integer for part in parts(whole) if part.is_Pow) and not whole.has(sympy.log):
+            continue
+        crossing = sorted(surface.free_symbols & variables, key=str)
+        derivatives = jacobian([whole], crossing).values()
+        if any(_steepens(whole, force, surface, variables, constants) for force in derivatives):
+            return surface, term
+    return None
+
+
+def kink_in_velocities(formula: Expr, velocities: Iterable[Symbol]) -> tuple[Expr, Expr] | None:
+    """Return a function u of velocities and a term of a formula that has a kink where u is 0; ``None`` without any."""
+    surfaces = _surfaces(formula, set(velocities))
+    return next(((surface, term) for surface, term, _ in surfaces), None)
+
+
+def _surfaces(formula: Expr, moving: Set[Symbol]) -> Iterator[tuple[Expr, Expr, Expr]]:
+    """Yield functions u of moving symbols, a term with a kink where u is 0, and the sum of the terms with symbols of u.
+
+    At most ``MOST_SURFACES``.
+    """
+    for surface in sorted(kinks_of([formula]), key=str)[:MOST_SURFACES]:
+        if not surface.free_symbols & moving:
+            continue
+        terms = [term for term in sympy.Add.make_args(formula) if term.has(unit_step, rint)]
+        near = [term for term in terms if surface in kinks_of([term])] or [formula]
+        rest = [term for term in terms if term not in near and term.free_symbols & surface.free_symbols]
+        yield surface, near[0], sympy.Add(*near, *rest)
+
+
+def _jumps(function: Expr, surface: Expr, moving: Set[Symbol], constants: Mapping[Symbol, float]) -> bool:
     """Return whether a function jumps at one of some points of a surface."""
     symbols = sorted(function.free_symbols | surface.free_symbols, key=str)
     tapes = Tape([surface], symbols), Tape([function], symbols)
@@ -69,6 +126,31 @@ def _jumps(function: Expr, surface: Expr, moving: set[Symbol], constants: Mappin
             continue
         if apart[1] > max(apart[0] / 2, VANISHING * (1 + size)):
             return True
+        examined += 1
+        if examined == POINTS:
+            break
+    return False
+
+
+def _steepens(
+    function: Expr, force: Expr, surface: Expr, moving: Set[Symbol], constants: Mapping[Symbol, float]
+) -> bool:
+    """Return whether at one of some points of a surface a function is bounded, but not quotients of its force."""
+    symbols = sorted(function.free_symbols | surface.free_symbols, key=str)
+    tapes = Tape([surface], symbols), Tape([function, force], symbols)
+    free = [k for k, symbol in enumerate(symbols) if symbol in moving and symbol in surface.free_symbols]
+    examined = 0
+    for point, k in _points(tapes[0], symbols, free, constants, random.Random(20250101)):
+        for side in (1, -1):
+            try:
+                near = [tapes[1](_moved(point, k, side * distance)) for distance in (*NEAR, *(2 * d for d in NEAR))]
+            except ArithmeticError:  # outside the domain of the function
+                continue
+            values, forces = zip(*near, strict=True)
+            quotients = [abs(forces[i + 3] - forces[i]) / NEAR[i] for i in (1, 2)]
+            converges = abs(values[2] - values[1]) <= abs(values[1] - values[0]) * mp.mpf("0.95") + VANISHING
+            if converges and quotients[1] > quotients[0] * mp.mpf("1.001") + VANISHING * (1 + abs(forces[2])):
+                return True
         examined += 1
         if examined == POINTS:
             break
@@ -125,4 +207,22 @@ def corner_message(subject: str, surface: Expr, term: Expr) -> str:
         f"{subject} has a corner or a jump where {shortened(surface)} = 0, in its term {shortened(term)}: the velocity "
         "would jump there, which steps do not do. Constraints must have continuous first derivatives: write "
         "positive_part(..)**2 or a smooth function, or use an event with impact"
+    )
+
+
+def slope_message(subject: str, surface: Expr, term: Expr) -> str:
+    """Return the message for a term of a Lagrangian or Hamiltonian whose force is not Lipschitz continuous."""
+    return (
+        f"the force of {subject} has no bounded slope where {shortened(surface)} = 0: there the second derivatives of "
+        f"its term {shortened(term)} are infinite, and motions are not unique. Use powers of abs(..) and "
+        "positive_part(..) that are 1, or 2 and more"
+    )
+
+
+def velocity_message(subject: str, surface: Expr, term: Expr) -> str:
+    """Return the message for a kink of a Lagrangian in velocities."""
+    return (
+        f"{subject} has a kink in velocities where {shortened(surface)} = 0, in its term {shortened(term)}: its "
+        "momenta do not determine the velocities there. Put friction and drag, such as -c*v*abs(v), into forces or "
+        "into dissipation (Rayleigh's function)"
     )

@@ -9,7 +9,7 @@ from sympy import Expr, Symbol
 
 from scvi_codegen.common.errors import SystemDefinitionError, SystemDefinitionWarning, closest, warn
 from scvi_codegen.common.precision import Number, mp
-from scvi_codegen.systems.checks.continuity import corner_message, jump_message, jump_of
+from scvi_codegen.systems.checks.continuity import corner_message, irregularity, jump_of
 from scvi_codegen.systems.constraints import constraint_jacobian, forms_of_constraints, without_coordinate
 from scvi_codegen.systems.derived_expressions import (
     Entries,
@@ -22,7 +22,7 @@ from scvi_codegen.systems.derived_expressions import (
     values_at,
 )
 from scvi_codegen.systems.forces import check_damping
-from scvi_codegen.systems.formulas.expressions import Tape, hessian, jacobian, kinked_root, unsupported_part
+from scvi_codegen.systems.formulas.expressions import Tape, hessian, jacobian, unsupported_part
 from scvi_codegen.systems.formulas.symbols import DOT, PARTS, TIME, check_names, number, symbol
 from scvi_codegen.systems.massless import gauge_of_rates
 from scvi_codegen.systems.system import MechanicalSystem
@@ -157,8 +157,6 @@ def _check_symbols(system: MechanicalSystem, role: str, arguments: Sequence[Symb
         problem = unsupported_part(formula)
         if problem:
             raise SystemDefinitionError(f"in the {where} of '{system.name}': {problem}")
-        if problem := kinked_root(formula, [*system.coordinates, *arguments, system.time]):
-            raise SystemDefinitionError(f"in the {where} of '{system.name}': {problem}")
         unknown = sorted(free.name for free in formula.free_symbols.difference(declared))
         if unknown:
             hint = closest(unknown[0], [symbol.name for symbol in declared])
@@ -172,9 +170,12 @@ def _check_symbols(system: MechanicalSystem, role: str, arguments: Sequence[Symb
 def _check_continuity(
     system: MechanicalSystem, role: str, formulas: Mapping[str, Expr], moving: Sequence[Symbol]
 ) -> None:
-    """Raise :class:`SystemDefinitionError` for jumps of L or H across a surface, and for corners of constraints."""
-    if not system.lengths and (jump := jump_of(formulas[role], moving, system.constants)):  # lists end at a cutoff
-        raise SystemDefinitionError(jump_message(f"the {role} of '{system.name}'", *jump))
+    """Raise :class:`SystemDefinitionError` for kinks of L or H that no step follows, and for corners of constraints."""
+    velocities = system.velocities if role == "Lagrangian" else ()
+    if not system.lengths and (  # lists end at a cutoff
+        problem := irregularity(formulas[role], f"the {role} of '{system.name}'", moving, velocities, system.constants)
+    ):
+        raise SystemDefinitionError(problem)
     for name, g in zip(system.constraint_texts if system.constraints else (), system.constraints, strict=True):
         if corner := jump_of(g, moving, system.constants, first_derivatives=True):
             raise SystemDefinitionError(corner_message(f"the constraint '{name}' of '{system.name}'", *corner))

@@ -18,6 +18,7 @@ from scvi_codegen.systems.constraints.holonomic import HOLONOMIC
 from scvi_codegen.systems.constraints.kind import Constrained, ConstraintKind
 from scvi_codegen.systems.constraints.nonholonomic import NONHOLONOMIC
 from scvi_codegen.systems.formulas.expressions import derivative_along, jacobian
+from scvi_codegen.systems.formulas.grammar import sides_of
 from scvi_codegen.systems.formulas.symbols import DOT, symbol
 
 CONSTRAINT_KINDS = {
@@ -49,7 +50,7 @@ def constraint_sides(formula: Any) -> tuple[list[Any], Callable[[Sequence[Expr],
     its argument is the first side.
     """
     equation = [formula.lhs, formula.rhs] if isinstance(formula, sympy.Eq) else [formula]
-    sides = formula.split("=") if isinstance(formula, str) else equation
+    sides = sides_of(formula) if isinstance(formula, str) else equation
     if len(sides) > 2:
         raise SystemDefinitionError(
             f"the constraint '{formula}' has more than one '=': write one equation per constraint"

@@ -34,8 +34,9 @@ from sympy.printing.str import StrPrinter
 from scvi_codegen.common.errors import ExpressionError, SystemDefinitionError
 from scvi_codegen.systems.formulas.arrays import ArrayParser, ArrayTerm, Bound, term_of
 from scvi_codegen.systems.formulas.expressions import derivative_along
-from scvi_codegen.systems.formulas.grammar import parsed
+from scvi_codegen.systems.formulas.grammar import parsed, sides_of
 from scvi_codegen.systems.formulas.indices import Access, Array, Loop, Place, Size, elements, periods_of
+from scvi_codegen.systems.formulas.kinks import OF_SYMPY
 from scvi_codegen.systems.formulas.symbols import DOT, symbol
 
 _FOR = re.compile(r"\bfor\b")
@@ -45,7 +46,7 @@ Combination = Callable[[Sequence[Expr], Callable[[Expr], Expr]], Expr]
 
 def plain_sides(equation: str) -> tuple[Sequence[str], Combination]:
     """Return the sides of ``left = right``, or the one formula that is 0, and the function left - right."""
-    return equation.split("="), lambda sides, _: Add(sides[0], *(-side for side in sides[1:]))
+    return sides_of(equation), lambda sides, _: Add(sides[0], *(-side for side in sides[1:]))
 
 
 def parse_constraint(
@@ -279,6 +280,8 @@ def array_text(expression: Expr) -> str:
     >>> array_text(-Sum((q[Mod(i + 1, N)] - q[i]) ** 2 / 2, (i, 0, N - 1)))
     '-sum(i in N periodic, (q[i + 1] - q[i])**2/2)'
     """
+    for function, written in OF_SYMPY.items():
+        expression = expression.replace(function, written)
     return str(_Printer({"full_prec": False}).doprint(expression))
 
 

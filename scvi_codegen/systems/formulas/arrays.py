@@ -22,7 +22,7 @@ from scvi_codegen.systems.formulas.symbols import check_name, symbol
 
 _TOKEN = re.compile(
     r"(?P<number>(?:\d+(?:\.(?!\.)\d*)?|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>[A-Za-z_]\w*)"
-    r"|(?P<operator>\*\*|\.\.|[-+*/(),\[\]<])",
+    r"|(?P<operator>\*\*|\.\.|[<>]=?|[-+*/(),\[\]])",
     re.ASCII,
 )
 MAX_UNROLLED_TERMS, MAX_NESTED_TERMS = 64, 4096

@@ -25,93 +25,39 @@ from sympy.core.function import AppliedUndef
 
 from scvi_codegen.common.precision import Number, mp
 from scvi_codegen.systems.formulas.adjoints import Elimination, Gradient, gradient_by_adjoints
-from scvi_codegen.systems.formulas.intermediates import (
-    Intermediate,
-    intermediate,
-    intermediates,
-    parts,
-    root_of_square,
-    with_even_roots,
+from scvi_codegen.systems.formulas.intermediates import Intermediate, intermediate, intermediates, parts, without_abs
+from scvi_codegen.systems.formulas.kinks import (
+    OF_SYMPY,
+    absolute,
+    maximum,
+    minimum,
+    positive_part,
+    sign,
+    switching_function,
+    where,
+    wrap,
 )
+from scvi_codegen.systems.formulas.kinks import rint as rint
+from scvi_codegen.systems.formulas.kinks import unit_step as unit_step
 
 LARGEST = 1.7976931348623157e308
 """Largest finite C double."""
 
 
-def _call(printer: Any, name: str, *arguments: Any) -> str:
-    """Return a call of a function of NumPy or mpmath, for printers of :func:`sympy.lambdify`."""
-    return f"{printer._module_format(name)}({', '.join(map(printer._print, arguments))})"
-
-
-class rint(Function):  # type: ignore[misc]  # noqa: N801  (a function of formulas, like sympy.sin)
-    """Nearest whole number, of two the even one; its derivative is 0."""
-
-    is_real = True
-
-    @classmethod
-    def eval(cls, x: Expr) -> Expr | None:
-        """Return the value at a number."""
-        return sympy.Integer(round(x.evalf(50))) if x.is_number and x.is_finite and x.is_real else None
-
-    def fdiff(self, argindex: int = 1) -> Expr:
-        """Return 0."""
-        return S.Zero
-
-    def _numpycode(self, printer: Any) -> str:
-        return _call(printer, "numpy.rint", *self.args)
-
-    _scipycode = _numpycode
-
-    def _mpmathcode(self, printer: Any) -> str:
-        return _call(printer, "mpmath.nint", *self.args)
-
-
-class unit_step(Function):  # type: ignore[misc]  # noqa: N801
-    """1 where the argument is positive, 0 where it is negative; its derivative is 0."""
-
-    is_real = True
-
-    @classmethod
-    def eval(cls, x: Expr) -> Expr | None:
-        """Return the value at a number, 1 at 0."""
-        return sympy.Integer(int(bool(x.evalf(50) >= 0))) if x.is_number and x.is_finite and x.is_real else None
-
-    def _eval_power(self, exponent: Expr) -> Expr | None:
-        if exponent.is_positive:
-            return self
-        return 1 / self if exponent.is_negative and exponent != -1 else None
-
-    def fdiff(self, argindex: int = 1) -> Expr:
-        """Return 0."""
-        return S.Zero
-
-    def _numpycode(self, printer: Any) -> str:
-        return _call(printer, "numpy.heaviside", *self.args, S.One)
-
-    _scipycode = _numpycode
-
-    def _mpmathcode(self, printer: Any) -> str:
-        return f"({_call(printer, 'mpmath.sign', *self.args)} >= 0)"
-
-
 def kinks_of(expressions: Iterable[Expr]) -> set[Expr]:
-    """Return functions at whose zeros expressions may jump or have a kink: x of unit_step(x), cos(pi x) of rint(x)."""
+    """Return functions at whose zeros expressions may jump or have a kink: u of unit_step(u), cos(pi x) of rint(x).
+
+    Arguments that differ by sign or a positive number are one function u.
+    """
     formulas = {f for e in expressions for f in (e, *(quantity.definition for quantity in intermediates(e)))}
     jumps = {part for part in parts(*formulas) if isinstance(part, unit_step | rint)}
-    return {jump.args[0] if isinstance(jump, unit_step) else sympy.cos(sympy.pi * jump.args[0]) for jump in jumps}
+    return {
+        switching_function(jump.args[0])[0] if isinstance(jump, unit_step) else sympy.cos(sympy.pi * jump.args[0])
+        for jump in jumps
+    }
 
 
-def wrap(x: Expr, length: Expr) -> Expr:
-    """Return x - L rint(x / L), the number of smallest size that differs from x by a multiple of L."""
-    return x - length * rint(x / length)
-
-
-def positive_part(x: Expr) -> Expr:
-    """Return x where it is positive, else 0."""
-    return x * unit_step(x)
-
-
-FUNCTIONS: Mapping[str, Callable[..., Expr]] = {
+RESERVED: Mapping[str, Callable[..., Expr]] = {
     function.__name__: function
     for function in (
         *(sympy.sin, sympy.cos, sympy.tan, sympy.asin, sympy.acos, sympy.atan, sympy.atan2),
@@ -120,8 +66,18 @@ FUNCTIONS: Mapping[str, Callable[..., Expr]] = {
         *(rint, unit_step, wrap, positive_part),
     )
 }
-"""Functions of the grammar by name; all take one argument, those of ``OF_TWO`` two."""
-OF_TWO = ("atan2", "wrap")
+"""Functions of the grammar by name, without those that may be names of coordinates, parameters and arrays."""
+KINKED: Mapping[str, Callable[..., Expr]] = {
+    "abs": absolute,
+    "sign": sign,
+    "min": minimum,
+    "max": maximum,
+    "where": where,
+}
+"""Further functions; a coordinate, parameter or array of one of these names replaces it."""
+FUNCTIONS = {**RESERVED, **KINKED}
+ARGUMENTS = {"atan2": 2, "wrap": 2, "min": 2, "max": 2, "where": 3}
+"""Numbers of arguments of functions with more than one; min and max take any more, too."""
 PIECEWISE_CONSTANT: Mapping[str, tuple[Callable[[Number], Number], Callable[..., Any]]] = {
     "rint": (mp.nint, np.rint),
     "unit_step": (lambda x: mp.mpf(x >= 0), lambda x: np.heaviside(x, 1.0)),
@@ -279,23 +235,6 @@ def beyond_double(number: Expr) -> bool:
 NODES = frozenset([Add, Mul, Pow, Intermediate, *NAME_OF])
 
 
-_SMOOTHER = {
-    "Abs": "the absolute value is not differentiable, and neither is sqrt(x**2)",
-    "sign": "the sign is not differentiable",
-    "Piecewise": "piecewise functions are not differentiable where pieces meet",
-    "Heaviside": "step functions are not differentiable",
-    "Max": "the maximum is not differentiable",
-    "Min": "the minimum is not differentiable",
-    "ImaginaryUnit": "a Lagrangian must be real",
-}
-SWITCHES = frozenset(("abs", "sign", "max", "min", "heaviside", "piecewise"))
-BY_EVENTS = (
-    ". A force or velocity that switches, an impact or a stop is an event: events=sc.impact(..), or "
-    "sc.Event(.., then={..}); see docs/events.md. For dry friction and contact that persists use Siconos or Drake"
-)
-"""Advice for functions that are not smooth."""
-
-
 def unsupported_part(expression: Expr) -> str | None:
     """Return why an expression is outside the grammar, or ``None``; shared by parser, printer and systems.
 
@@ -319,21 +258,14 @@ def _node_problem(node: Any) -> str | None:
     elif node.func in NODES:
         return exponent_problem(node.exp) if node.is_Pow else None
     kind = type(node).__name__
-    reason = f": {_SMOOTHER[kind]}" if kind in _SMOOTHER else ""
+    reason = ": the formulas of a system are real" if kind == "ImaginaryUnit" else ""
     names = ", ".join([*FUNCTIONS, *CONSTANTS])
-    advice = BY_EVENTS if kind.lower() in SWITCHES else ""
-    return f"{kind} ('{shortened(node)}') is not supported{reason}. Use + - * / ** and {names}{advice}"
+    return f"{kind} ('{shortened(node)}') is not supported{reason}. Use + - * / ** and {names}"
 
 
 def kinked_root(formula: Expr, variables: Collection[Symbol]) -> str | None:
-    """Return why a formula has a kink, a root of the square of a function of variables, or ``None``."""
-    kink = root_of_square(formula, variables)
-    if kink is None:
-        return None
-    return (
-        f"Abs({shortened(kink)}), the root of its square, is not differentiable where it is 0: write "
-        f"{shortened(kink)} if it is positive{BY_EVENTS}"
-    )
+    """Return ``None``: roots of squares are absolute values."""
+    return None
 
 
 def exponent_problem(exponent: Expr) -> str | None:
@@ -397,9 +329,8 @@ def _rebuilt_node(expression: Expr, replacements: dict[Expr, Expr]) -> Expr:
     arguments = [_rebuilt(argument, replacements) for argument in expression.args]
     if isinstance(expression, Intermediate):
         return intermediate(arguments[0])
-    rebuilt = expression.func(*arguments)
-    is_root = expression.is_Pow and not expression.exp.is_integer
-    return with_even_roots(rebuilt) if is_root or isinstance(expression, sympy.Abs) else rebuilt
+    rebuilt = OF_SYMPY.get(expression.func, expression.func)(*arguments)
+    return without_abs(rebuilt) if expression.is_Pow and not expression.exp.is_integer else rebuilt
 
 
 def gradient(expression: Expr, variables: Sequence[Symbol]) -> dict[int, Expr]:

@@ -4,7 +4,8 @@
     product  = signed (("*" | "/") signed)*
     signed   = ("+" | "-")* power
     power    = atom ["**" ("+" | "-")* atom]
-    atom     = number | name | function "(" sum ("," sum)* ")" | "(" sum ")"
+    atom     = number | name | function "(" argument ("," sum)* ")" | "(" sum ")"
+    argument = sum | sum ("<" | "<=" | ">" | ">=") sum                     the second one of where(condition, a, b)
 
 Precedences are Python's. Python's ``ast`` is not used because it fails for sums of some three thousand terms (long
 lattices have more), counts columns in bytes, and loses the digits of decimals and the brackets in towers of powers.
@@ -22,29 +23,32 @@ from sympy import Add, Expr, Mul, Pow, Rational, S, Symbol
 
 from scvi_codegen.common.errors import ExpressionError, SystemDefinitionError, closest
 from scvi_codegen.systems.formulas.expressions import (
-    BY_EVENTS,
+    ARGUMENTS,
     CONSTANTS,
     FUNCTIONS,
+    KINKED,
     MAX_BITS,
     MAX_DIGITS,
     NODES,
-    OF_TWO,
-    SWITCHES,
     beyond_double,
     bits,
     evaluated,
     exponent_problem,
     unsupported_part,
 )
-from scvi_codegen.systems.formulas.intermediates import with_even_roots
+from scvi_codegen.systems.formulas.intermediates import without_abs
+from scvi_codegen.systems.formulas.kinks import comparison
 from scvi_codegen.systems.formulas.symbols import DOT
 
 MAX_CHARACTERS = 1_000_000
 """Length limit; parsing time grows with length times bracket depth (fifty atoms in a gas: 212 000 characters)."""
-MAX_DEPTH = 100
+MAX_DEPTH, MAX_KINK_DEPTH = 100, 8
+"""Limits of the depth of brackets, and of functions that contain their arguments two to four times."""
+REPEATING = frozenset([*KINKED, "positive_part", "wrap"])
 
 _TOKEN = re.compile(
-    r"(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>[A-Za-z_]\w*)|(?P<operator>\*\*|[-+*/(),])", re.ASCII
+    r"(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>[A-Za-z_]\w*)|(?P<operator>\*\*|[<>]=?|[-+*/(),])",
+    re.ASCII,
 )
 
 _SPACE = re.compile(r"[ \t\r\n\f]*")
@@ -53,9 +57,7 @@ _HINTS = {
     ".": "attribute access is not part of the grammar",
     "[": "subscripts require arrays, declared among the coordinates or parameters, as q[N] (of a rotation: R_11)",
     "^": "powers are written x**2",
-    "=": "write the right-hand side only; comparisons, assignments and keyword arguments are not part of the grammar",
-    "<": "comparisons are not part of the grammar",
-    ">": "comparisons are not part of the grammar",
+    "=": "write the right-hand side only; equalities, assignments and keyword arguments are not part of the grammar",
     "'": "write the velocity of q as q_dot; strings are not part of the grammar",
     '"': "strings are not part of the grammar",
     "|": "write abs(x)",
@@ -69,6 +71,18 @@ _HINTS = {
     "{": "sets are not part of the grammar",
     ":": "lambda, slices and dictionaries are not part of the grammar",
 }
+
+
+_FUNCTIONS_ELSEWHERE = {
+    "Abs": "abs",
+    "fabs": "abs",
+    "fmax": "max",
+    "fmin": "min",
+    "sgn": "sign",
+    "heaviside": "unit_step",
+}
+_FUNCTIONS_ELSEWHERE |= {"Max": "max", "Min": "min", "Heaviside": "unit_step", "Piecewise": "where"}
+"""Functions of SymPy, C and NumPy that have other names here."""
 
 
 class Token(NamedTuple):
@@ -115,6 +129,11 @@ def parsed(parser: Parser) -> Expr:
         raise ExpressionError(message, text, parser.column) from error
 
 
+def sides_of(equation: str) -> list[str]:
+    """Return the sides of ``left = right``, or the whole text without ``=``; ``<=`` and ``>=`` are comparisons."""
+    return re.split(r"(?<![<>])=", equation)
+
+
 def _is_zero(part: Expr) -> bool:
     """Return whether a constant is 0; formulas with symbols are not tested, which SymPy would do slowly."""
     return bool(part.is_number and part.is_zero)
@@ -157,7 +176,7 @@ class Parser:
             raise SystemDefinitionError(f"a formula must be text, not {text!r:.60}: write it between quotes")
         self.text, self.symbols = text, symbols
         self.tokens = _tokens(text, self.pattern)
-        self.position = self.depth = 0
+        self.position = self.depth = self.kink_depth = 0
 
     @property
     def column(self) -> int:
@@ -188,6 +207,8 @@ class Parser:
             self.refuse(f"unexpected '{text}': there is nothing for it to close or separate", column)
         if kind == "end":
             self.refuse("the formula ends inside brackets: a ')' is missing", column)
+        if kind == "operator" and text[0] in "<>":
+            self.refuse("a comparison must be the first argument of where, as in where(x > 0, a, b)", column)
         remedy = "only the functions of the grammar can be called" if text == "(" else "write * for a product"
         self.refuse(f"an operator is missing before '{text}': {remedy}", column)
 
@@ -284,8 +305,8 @@ class Parser:
         return self.supported(Pow(base, exponent), operator.column)
 
     def supported(self, result: Expr, column: int) -> Expr:
-        """Return the result, with even roots in place of Abs; raise an error if it is invalid: sqrt(-1), exp(10**9)."""
-        result = with_even_roots(result)
+        """Return the result, without SymPy's Abs; raise an error if it is invalid: sqrt(-1), exp(10**9)."""
+        result = without_abs(result)
         if result.is_number or (result.args and result.func not in NODES) or result.is_Pow:
             problem = unsupported_part(result)
             if problem:
@@ -327,12 +348,13 @@ class Parser:
 
     def name(self, name: str, column: int) -> Expr:
         """Return the symbol, constant or function call of a name."""
-        if name in FUNCTIONS:
+        if name in FUNCTIONS and name not in self.symbols:
             return self.call(name, column)
         if self.tokens[self.position][:2] == ("operator", "("):
-            names = ", ".join(FUNCTIONS)
-            names += BY_EVENTS if name.lower() in SWITCHES else ""
-            self.refuse(f"'{name}' is not a function of the grammar{closest(name, FUNCTIONS)} Known: {names}", column)
+            if name in KINKED:
+                self.refuse(f"'{name}' is a name of this system, not the function {name}(..): rename it", column)
+            known = f"{closest(_FUNCTIONS_ELSEWHERE.get(name, name), FUNCTIONS)} Known: {', '.join(FUNCTIONS)}"
+            self.refuse(f"'{name}' is not a function of the grammar{known}", column)
         value = self.symbols.get(name, CONSTANTS.get(name))
         if value is None:
             names = ", ".join([*self.symbols, *CONSTANTS])
@@ -350,11 +372,25 @@ class Parser:
         if opening is None:
             self.refuse(f"'{name}' is a function: write {name}(...)", column)
         self.open(opening.column)
-        arguments = [self.sum()]
+        self.kink_depth += name in REPEATING
+        if self.kink_depth > MAX_KINK_DEPTH:
+            self.refuse(f"abs, max and the like are nested too deeply: at most {MAX_KINK_DEPTH} in another", column)
+        arguments = [self.condition() if name == "where" else self.sum()]
         while self.accept(","):
             arguments.append(self.sum())
         self.close()
-        expected = 2 if name in OF_TWO else 1
-        if len(arguments) != expected:
-            self.refuse(f"{name} takes {expected} argument{'s'[: expected - 1]}, not {len(arguments)}", column)
+        self.kink_depth -= name in REPEATING
+        expected = ARGUMENTS.get(name, 1)
+        more = " or more" if name in ("min", "max") else ""
+        if len(arguments) != expected and not (more and len(arguments) > expected):
+            plural = "s" if expected > 1 else ""
+            self.refuse(f"{name} takes {expected}{more} argument{plural}, not {len(arguments)}", column)
         return self.supported(FUNCTIONS[name](*arguments), column)
+
+    def condition(self) -> Expr:
+        """Parse the condition of ``where``, and return 1 where it holds, 0 elsewhere."""
+        left, column = self.sum(), self.column
+        relation = self.accept("<", "<=", ">", ">=")
+        if relation is None:
+            self.refuse("where needs a comparison first, by <, <=, > or >=, as in where(x > 0, a, b)", column)
+        return comparison(left, relation.text, self.sum())

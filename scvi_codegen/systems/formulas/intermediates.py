@@ -17,9 +17,10 @@ from itertools import count
 from typing import Any
 from weakref import WeakValueDictionary
 
-from sympy import Abs, Basic, Expr, S, Symbol, sqrt
+from sympy import Abs, Basic, Expr, S, Symbol
 
 from scvi_codegen.common.errors import SystemDefinitionError
+from scvi_codegen.systems.formulas.kinks import absolute
 
 LONGEST_WRITTEN = 20_000
 """Largest number of nodes of a formula that is displayed or stored as text."""
@@ -157,7 +158,7 @@ def written_out(expression: Expr) -> Expr:
     rules: dict[Expr, Expr] = {}
     for quantity in intermediates(expression):
         rules[quantity] = quantity.definition.xreplace(dict(rules))
-    return with_even_roots(expression.xreplace(rules)) if rules else expression
+    return without_abs(expression.xreplace(rules)) if rules else expression
 
 
 def parts(*expressions: Basic) -> dict[Any, None]:
@@ -171,29 +172,14 @@ def parts(*expressions: Basic) -> dict[Any, None]:
     return result
 
 
-def with_even_roots(expression: Expr) -> Expr:
-    """Write ``Abs(u)``, which SymPy makes of even roots of powers of u, as the root of the opaque quantity u**2.
+def without_abs(expression: Expr) -> Expr:
+    """Write ``Abs(u)``, which SymPy makes of even roots of powers of u, by the sign of u.
 
-    Such a root is smooth where u is not 0: for parameters u, whose values do not change along a motion.
-
-    >>> from sympy.abc import x
-    >>> a = Symbol("a", real=True)
-    >>> with_even_roots(sqrt(a**2 * (x**2 + 1)))
-    sqrt(x**2 + 1)*sqrt((a**2))
+    >>> x = Symbol("x", real=True)
+    >>> without_abs(abs(x))
+    x*(2*unit_step(x) - 1)
     """
-    if not expression.has(Abs):
-        return expression
-    return expression.replace(Abs, lambda u: sqrt(intermediate(u**2)))
-
-
-def root_of_square(expression: Expr, variables: Collection[Symbol]) -> Expr | None:
-    """Return a part u of which the expression contains a root of u**2 and that depends on variables, or ``None``."""
-    for node in parts(expression):
-        if node.is_Pow and isinstance(node.base, Intermediate) and not node.exp.is_integer:
-            square = node.base.definition
-            if square.is_Pow and square.exp == 2 and not square.free_symbols.isdisjoint(variables):
-                return square.base
-    return None
+    return expression.replace(Abs, absolute) if expression.has(Abs) else expression
 
 
 def written_size(expression: Expr) -> int:

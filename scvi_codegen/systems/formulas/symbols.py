@@ -24,7 +24,7 @@ import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from scvi_codegen.common.errors import SystemDefinitionError
+from scvi_codegen.common.errors import SystemDefinitionError, SystemDefinitionWarning, warn
 from scvi_codegen.common.validation import ExactNumber
 
 if TYPE_CHECKING:
@@ -99,10 +99,16 @@ def check_name(name: object) -> None:
         )
     if name in C_KEYWORDS:
         raise SystemDefinitionError(f"'{name}' is a keyword of C: rename the symbol, for example to '{name}_'")
-    from scvi_codegen.systems.formulas.expressions import FUNCTIONS
+    from scvi_codegen.systems.formulas.expressions import KINKED, RESERVED
 
-    if name in FUNCTIONS or name == "pi":
+    if name in RESERVED or name == "pi":
         raise SystemDefinitionError(f"'{name}' is reserved in formulas: rename the symbol, for example to '{name}_'")
+    if name in KINKED:
+        warn(
+            f"'{name}' is a name of this system, so the function {name}(..) is not available in its formulas: rename "
+            f"the symbol, for example to '{name}_', to use both",
+            SystemDefinitionWarning,
+        )
 
 
 def check_names(
