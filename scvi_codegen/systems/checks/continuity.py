@@ -21,6 +21,7 @@ from scvi_codegen.common.precision import Number, mp
 from scvi_codegen.systems.formulas.expressions import Tape, jacobian, kinks_of, shortened
 from scvi_codegen.systems.formulas.intermediates import parts
 from scvi_codegen.systems.formulas.kinks import rint, unit_step
+from scvi_codegen.systems.formulas.modes import Mode
 
 POINTS, ATTEMPTS, ITERATIONS = 3, 24, 40
 """Points of a surface that are examined; starts of Newton's method, and its iterations."""
@@ -100,10 +101,10 @@ def kink_in_velocities(formula: Expr, velocities: Iterable[Symbol]) -> tuple[Exp
 def _surfaces(formula: Expr, moving: Set[Symbol]) -> Iterator[tuple[Expr, Expr, Expr]]:
     """Yield functions u of moving symbols, a term with a kink where u is 0, and the sum of the terms with symbols of u.
 
-    At most ``MOST_SURFACES``.
+    At most ``MOST_SURFACES``. Surfaces with the mode of a kink were examined without it.
     """
     for surface in sorted(kinks_of([formula]), key=str)[:MOST_SURFACES]:
-        if not surface.free_symbols & moving:
+        if not surface.free_symbols & moving or any(isinstance(free, Mode) for free in surface.free_symbols):
             continue
         terms = [term for term in sympy.Add.make_args(formula) if term.has(unit_step, rint)]
         near = [term for term in terms if surface in kinks_of([term])] or [formula]
