@@ -155,8 +155,9 @@ def _framed(system: MechanicalSystem, stages: StageSystem, turns: Sequence[Turn]
         group,
         gathers=(*others, momenta, Gather(arguments=u, table=timed, power=momenta.power + 1)),
         scatters=(replace(force, results=push), momentum, *rates),
-        scalar=None,
-        in_action=False,
+        scalar=Add(*(p * v for p, v in zip(system.auxiliaries, system.velocities, strict=True)), -W),
+        in_action=True,
+        forced=True,
     )
     still = (replace(block, straight=(mp.zero,) * 2) if block.moves else block for block in stages.blocks)
     return replace(stages, blocks=tuple(still), stage_groups=(framed,))
@@ -192,6 +193,7 @@ def _rotated(
         into = Table.named("", [(*(row.momentum for row in stages.rows), mp.zero, mp.zero, momentum)])
         before, end, momentum = Table.joined(unit, others, none, none), end.columns(columns), mp.one
     change = tuple(a - b for a, b in zip(moved, v, strict=True))
+    acts = [turn.action(rotation, system.coordinates, u) for turn in turns for rotation in rotations]
     tables = Table.joined(others, minus, none, none), into, Table.joined(others, none, minus, none)
     group = StageGroup(
         name=name,
@@ -205,6 +207,10 @@ def _rotated(
             Scatter(results=result, table=table, power=-1)
             for result, table in zip((change, pushed, u), tables, strict=True)
         ),
+        scalar=Add(*acts),
+        scalar_power=-2,
+        in_action=True,
+        forced=True,
         computes="Changes of q and u = h p by rotations of bodies, less v, and u",
     )
     still = Block(letter="V", index=name)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from scvi_codegen.common.errors import MethodError
+from scvi_codegen.common.validation import SWITCH, ArgumentType, check_kind, checked_count, of
 from scvi_codegen.methods.method import Exactness, Method, Specification
 from scvi_codegen.methods.recurrence import ExplicitStep
 from scvi_codegen.systems.system import MechanicalSystem
@@ -28,6 +30,9 @@ class ExplicitMethod(Method):
         symmetric, symplectic: what is claimed of its steps.
         step: its statements, ``ExplicitStep.of(text, tables)``.
         exactness: momentum maps that it conserves to round-off.
+
+    Raises:
+        MethodError: for a claim of another type, an empty name, and an order below 1.
     """
 
     name: str
@@ -39,6 +44,15 @@ class ExplicitMethod(Method):
     exactness: Exactness = field(default_factory=Exactness)
 
     implicit = False
+
+    def __post_init__(self) -> None:
+        name = ArgumentType("a name, as 'blanes-moan'", lambda text: isinstance(text, str) and bool(text.strip()))
+        step = of("a text of statements, ExplicitStep.of(text, tables)", ExplicitStep)
+        exactness = of("Exactness", Exactness)
+        kinds = {"name": name, "title": name, "symmetric": SWITCH, "symplectic": SWITCH}
+        for argument, kind in (kinds | {"step": step, "exactness": exactness}).items():
+            check_kind(kind, getattr(self, argument), argument, MethodError)
+        checked_count(self.order, "the order", least=1, error=MethodError)
 
     def explicit_step(self, split: KineticSplitting) -> ExplicitStep:
         """See :meth:`Method.explicit_step`."""

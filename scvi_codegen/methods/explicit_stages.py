@@ -117,6 +117,9 @@ def _carried_out(method: Method, split: KineticSplitting) -> _Step:
         if any(letter[0] not in (own, added) for letter in end) or (own, 0) in run.values[name]:
             what = "velocities" if name == "q" else "forces"
             raise MethodError(f"the increment {name}[i] of {method.name} is not a sum of {what}")
+    for name, remedy in {"q": "q[i] += h * v[i] with v[i] = velocity(P, t)", "p": "p[i] += h * F[i]"}.items():
+        if not run.values[name] and (name == "q" or any(split.force)):
+            raise MethodError(f"the statements of {method.name} leave the increment {name}[i] 0: add {remedy}")
     return _needed(run, ends["q"], ends["p"])
 
 

@@ -9,10 +9,11 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 from scvi_codegen.common.errors import MethodError
 from scvi_codegen.common.precision import Number, Vector, mp
+from scvi_codegen.common.validation import MAPPING, NUMBERS, TEXT, ArgumentType, check_kind
 from scvi_codegen.methods.statements import (
     Apply,
     Assign,
@@ -32,6 +33,7 @@ from scvi_codegen.methods.statements import (
     read,
 )
 from scvi_codegen.methods.tables.nodes import to_number
+from scvi_codegen.systems.formulas.symbols import C_KEYWORDS, IDENTIFIER
 
 Letter: TypeAlias = tuple[str, int]
 """A kind of value, with the number of a force or a velocity: ``("F", 2)``."""
@@ -46,8 +48,14 @@ COMPARE: dict[str, Callable[[Number, Number], bool]] = {
 }
 GIVEN = ("q0", "p0", "h", "t", "inverse_mass")
 """Quantities of which statements have values at first."""
-OF_C = "M L S step data known acted dq dp number real lanes dd ddl force velocity int long double float if for const"
-"""Names that quantities of statements cannot have, since they have another meaning in C."""
+OF_C = C_KEYWORDS.union(
+    """
+    M L S i k e step data known acted dq dp number real lanes dd ddl force velocity NAN INFINITY NULL ALL CARRIES
+    COMPARISON DECAY EACH HOT MATH NAME PARAMETER REAL SELDOM SPLITTING STATUS TOLERANCE VANISHING WORDS
+    """.split()  # noqa: SIM905  (as a paragraph)
+)
+"""Names that quantities, rows and tables of statements cannot have, since they have another meaning in C."""
+TABLE = re.compile(r"[A-Z][A-Z_]{2,}", re.ASCII)
 
 RowTables: TypeAlias = tuple[tuple[str, tuple[tuple[str, Vector], ...]], ...]
 
@@ -73,14 +81,17 @@ class ExplicitStep:
         """Return the step with tables of numbers, or of text with all of their digits.
 
         Raises:
-            MethodError: for a line that is not a statement, names that are not those of tables, and tables of different
-                lengths with the same rows.
+            MethodError: for a line that is not a statement, names that are not those of tables, tables that are no
+                lists of numbers, and of different lengths with the same rows.
         """
+        check_kind(TEXT, statements, "statements", MethodError)
+        of_rows = ArgumentType("a mapping from rows, as {'STAGES': {'KICK': [0.5, 0.5]}}", MAPPING.accepts)
+        check_kind(of_rows, tables, "tables", MethodError)
         read(statements)
+        names = [name for rows, named in tables.items() for name in (rows, *_checked_tables(rows, named))]
+        if double := [name for name in names if names.count(name) > 1]:
+            raise MethodError(f"'{double[0]}' is the name of two tables, or of a table and of rows: rename one")
         for rows, named in tables.items():
-            for name in (rows, *named):
-                if not re.fullmatch(r"[A-Z][A-Z_]{2,}", name):
-                    raise MethodError(f"'{name}' is not the name of a table: write three capital letters or more")
             if len({len(numbers) for numbers in named.values()}) != 1 or not all(named.values()):
                 lengths = ", ".join(f"{len(numbers)} of {name}" for name, numbers in named.items()) or "none"
                 raise MethodError(f"tables of the rows {rows} need the same number of numbers, not {lengths}")
@@ -101,6 +112,19 @@ class ExplicitStep:
     def sizes(self) -> dict[str, int]:
         """Number of rows by their name."""
         return {rows: len(named[0][1]) for rows, named in self.tables}
+
+
+def _checked_tables(rows: str, named: Any) -> Mapping[str, Sequence[Any]]:
+    """Return the tables of some rows by their names, or raise :class:`MethodError` for what is none."""
+    of_numbers = ArgumentType("tables by name, as {'KICK': [0.5, 0.5]}", MAPPING.accepts)
+    check_kind(of_numbers, named, f"tables['{rows}']", MethodError)
+    for name in (rows, *named):
+        if not TABLE.fullmatch(name) or name in OF_C:
+            why = "has another meaning in C" if name in OF_C else "is not the name of a table"
+            raise MethodError(f"'{name}' {why}: write three capital letters or more, as in STAGES")
+    for name, numbers in named.items():
+        check_kind(NUMBERS, numbers, f"the table {name}", MethodError)
+    return cast(Mapping[str, Sequence[Any]], named)
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,16 +190,23 @@ class Recurrence:
                     self.assign(target, increment)
                 case Apply():
                     self.apply(statement)
-                case Repeat(row=row, count=count, body=body):
-                    if count not in self.step.sizes:
-                        rows = ", ".join(self.step.sizes) or "there are none"
-                        raise MethodError(f"'for {row} in {count}' needs rows of tables: {rows}")
-                    for n in range(self.step.sizes[count]):
-                        self.rows[row] = n
-                        self.block(body)
+                case Repeat():
+                    self.repeat(statement)
                 case When(condition=condition, body=body):
                     if self.holds(condition):
                         self.block(body)
+
+    def repeat(self, statement: Repeat) -> None:
+        """Carry out statements for the rows of tables."""
+        row, count = statement.row, statement.count
+        if count not in self.step.sizes:
+            rows = ", ".join(self.step.sizes) or "there are none"
+            raise MethodError(f"'for {row} in {count}' needs rows of tables: {rows}")
+        if not _is_name(row):
+            raise MethodError(f"'{row}' cannot count rows: it has another meaning there; write n")
+        for n in range(self.step.sizes[count]):
+            self.rows[row] = n
+            self.block(statement.body)
 
     def apply(self, statement: Apply) -> None:
         """Carry out an operation."""
@@ -198,7 +229,7 @@ class Recurrence:
         if name == "S":
             self.values[name] = value
             return
-        if name in (*GIVEN, *OF_C.split(), *self.step.numbers, *self.step.sizes):
+        if name in (*GIVEN, *self.rows) or not _is_name(name):
             raise MethodError(f"'{name}' cannot be assigned in a step: it has another meaning there; rename it")
         if target.at != At("i"):
             raise MethodError(f"'{name}' has values for all coordinates i in an explicit step: write {name}[i] = ..")
@@ -252,8 +283,11 @@ class Recurrence:
                 numbers = self.step.numbers[table]
                 if self.rows[row] < len(numbers):
                     return numbers[self.rows[row]]
-        known = ", ".join(self.step.numbers) or "there are none"
-        raise MethodError(f"{entry} is not a number of a table for its rows: tables are {known}")
+        text = f"{entry.table}[{entry.row}]" if isinstance(entry, Entry) else getattr(entry, "name", "an expression")
+        tables = ", ".join(self.step.numbers) or "there are none"
+        raise MethodError(
+            f"'{text}' is not a number of a table for its rows: write the row of the loop around; tables are {tables}"
+        )
 
     def holds(self, condition: Condition) -> bool:
         """Return whether a condition holds; nothing is known of an earlier step."""
@@ -316,6 +350,11 @@ class Recurrence:
     def row(self) -> int:
         """Row of the tables, of the outermost loop."""
         return next(iter(self.rows.values()), len(self.forces))
+
+
+def _is_name(name: str) -> bool:
+    """Return whether a quantity or a row may have a name, which is one in C, too, and not that of a table."""
+    return bool(IDENTIFIER.fullmatch(name)) and name not in OF_C and not TABLE.fullmatch(name)
 
 
 def _sum(left: Sum, right: Sum, sign: Number) -> Sum:

@@ -231,7 +231,8 @@ class StageGroup(StagePoints):
     """Points evaluated by one kernel.
 
     If the kernel is the gradient of ``scalar``, sum_n w_n h^(1 + scalar_power) scalar(u_n) is part of a generating
-    function, and of the discrete Lagrangian if ``in_action``; if ``forced``, forces are added to the gradient.
+    function, and of the discrete Lagrangian if ``in_action``; if ``forced``, the results are its gradient plus forces,
+    or changes by a rotation.
     ``computes`` describes the results of the kernel if the name does not; ``scalar_weights`` replace the weights in the
     sum of the scalar.
     """

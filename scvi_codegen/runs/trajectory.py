@@ -22,7 +22,7 @@ from scvi_codegen.runs.accuracy.global_error import Confirmed, GlobalError
 from scvi_codegen.runs.accuracy.local_error import TOLERABLE_ERROR
 from scvi_codegen.runs.accuracy.resolution import unresolved_parts
 from scvi_codegen.runs.accuracy.size import relative
-from scvi_codegen.runs.derivatives.actions import actions_until, compensated_sums, shadow_energy
+from scvi_codegen.runs.derivatives.actions import actions_until, shadow_energy
 from scvi_codegen.runs.derivatives.trajectory_derivatives import TrajectoryDerivatives
 from scvi_codegen.runs.events.refinement import crossings_of
 from scvi_codegen.runs.forwarding import ChaosOfRun, Pictured
@@ -30,7 +30,14 @@ from scvi_codegen.runs.results.dense_output import states_at, times_of_words, wi
 from scvi_codegen.runs.results.descriptions import describe_states, describe_step_size
 from scvi_codegen.runs.results.energy import energy_account
 from scvi_codegen.runs.results.export import States, to_dataframe, write_states
-from scvi_codegen.runs.results.joining import Number, concatenated, joined, joined_crossings, relative_changes
+from scvi_codegen.runs.results.joining import (
+    Number,
+    accumulated,
+    concatenated,
+    joined,
+    joined_crossings,
+    relative_changes,
+)
 from scvi_codegen.runs.results.quantities import quantities
 from scvi_codegen.runs.results.recomputation import work_and_impulses_until
 from scvi_codegen.runs.results.saved_states import Array, checked_row
@@ -255,10 +262,9 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
             StateError: if the states are not at whole steps.
         """
         require(self.stepper, "action")
-        parts = [actions_until(piece, piece.actions) for piece in self._runs]
-        ends = compensated_sums(np.array([0.0, *(part[-1] for part in parts)]))
-        sums = concatenated([part + end for part, end in zip(parts, ends, strict=False)])
-        return sums if cumulative else float(ends[-1])
+        sums = accumulated([actions_until(piece, piece.actions) for piece in self._runs])
+        assert sums is not None  # since each piece has one
+        return sums if cumulative else float(sums[-1])
 
     def shadow_energy(self, order: int = 12) -> Array:
         """Return (n,) energies of the shadow Hamiltonian, of which the states are an exact solution.

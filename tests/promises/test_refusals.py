@@ -52,8 +52,9 @@ def subject(description: str) -> Any:
 def value(name: str, x: Any) -> Any:
     """Return an argument as the package takes it: methods and events are made, tables of inputs are tuples."""
     if name == "method" and isinstance(x, dict) and "statements" in x:
-        claims = {"name": "mine", "title": "Mine", "order": 2, "symmetric": False, "symplectic": True}
-        return sc.ExplicitMethod(**claims, step=sc.ExplicitStep.of(x["statements"], x.get("tables", {})))
+        claims = {"name": "mine", "title": "Mine", "order": 2, "symmetric": False, "symplectic": True} | x
+        step = sc.ExplicitStep.of(claims.pop("statements"), claims.pop("tables", {}))
+        return sc.ExplicitMethod(**claims, step=step)
     if name == "method" and isinstance(x, dict):
         return method_from_specification(x)
     if name == "events" and isinstance(x, dict):

@@ -48,6 +48,17 @@ def test_axes_of_symmetry(lagrangian, arguments, axes):
     assert (core is system) == (not axes)
 
 
+@pytest.mark.parametrize("others", ["", " + x_dot**2/2 - x**2/2"], ids=["in the moving frame", "beside others"])
+def test_actions_are_those_with_three_moments(others):
+    names, q, v = (["x"], {"x": 0.2}, {"x": 0.1}) if others else ([], {}, {})
+    moments, actions = {"A": 1.0, "B": 1.0, "C": 0.5, "w": 1.0}, []
+    for kinetic in (KINETIC, THREE):
+        top = body(f"{kinetic} - w*R_33{others}", coordinates=names, parameters=moments)
+        run = sc.compile_stepper(top, "svi:6").integrate(START | q, velocity=OMEGA | v, h=0.05, steps=20)
+        actions.append(run.action())
+    assert abs(actions[1] - actions[0]) < 1e-11
+
+
 @pytest.mark.rotated
 @pytest.mark.parametrize("solver", ["auto", pytest.param("newton", marks=pytest.mark.full)])
 def test_a_symmetric_top_moves_as_one_with_three_moments(solver):

@@ -174,7 +174,7 @@ def test_defaults_cannot_be_changed_through_the_stepper(kepler):
 def test_step_beyond_the_domain_fails_with_a_message(compiled):
     """Leapfrog falls into the centre, where the potential is infinite."""
     stepper = compiled("kepler", sc.StoermerVerlet())
-    with pytest.raises(sc.StepFailedError, match=r"infinite or NaN.*undefined there") as caught:
+    with pytest.raises(sc.StepFailedError, match=r"infinite or NaN.*undefined there.*no mass is 0") as caught:
         stepper.step([0.0, 0.0], [1.0, 0.0], 0.1)
     assert (caught.value.status, caught.value.step, caught.value.t) == ("not finite", 0, 0.0)
     assert caught.value.trajectory is None

@@ -36,7 +36,8 @@ FAILURES = {
     ),
     "not finite": (
         "a value is infinite or NaN: the Lagrangian is undefined there, or the step is far too large",
-        "Use a smaller step, and check that the Lagrangian is defined all along the motion",
+        "Use a smaller step, and check that no mass is 0 with these parameters, and that the Lagrangian is defined all "
+        "along the motion",
     ),
     "step size underflow": (
         "the step size is below machine precision",

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scvi_codegen.codegen.native.options import SolverOptions, step_failure
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.runs.derivatives.gradients import pieces, starts_of
+from scvi_codegen.runs.results.joining import compensated_sums
 from scvi_codegen.runs.results.recomputation import changes_by_events, check_recomputed
 from scvi_codegen.runs.results.saved_states import SavedStates
 from scvi_codegen.runs.states.validation import Array
@@ -81,14 +82,6 @@ def actions_until(states: SavedStates, summed: Array | None) -> Array:
     if summed is not None and np.isfinite(summed).all():
         return np.asarray(summed - summed[0])
     return compensated_sums(np.concatenate([[0.0], actions_between(states)]))
-
-
-def compensated_sums(terms: Array) -> Array:
-    """Return the partial sums, with the rounding errors of the additions summed besides."""
-    sums = np.cumsum(terms)
-    before = np.concatenate([[0.0], sums[:-1]])
-    added = sums - before
-    return np.asarray(sums + np.cumsum((before - (sums - added)) + (terms - added)))
 
 
 def shadow_energy(states: SavedStates, order: int) -> Array:

@@ -28,7 +28,7 @@ def joined(pieces: Sequence[Result]) -> Result:
         **states,
         **{name: getattr(last, name) for name in same},
         step_sizes=np.concatenate([*(piece.step_sizes[:-1] for piece in every), last.step_sizes[-1:]]),
-        actions=None,
+        actions=accumulated([piece.actions for piece in every]),
         events=tuple(map(joined_crossings, zip(*(piece.events for piece in every), strict=True))),
         pieces=tuple(pieces),
     )
@@ -39,6 +39,24 @@ def concatenated(parts: Sequence[NDArray[Number]]) -> NDArray[Number]:
     """Concatenate arrays of successive pieces; the first state of each repeats the last of the previous one."""
     first, *others = parts
     return np.concatenate([first, *(other[1:] for other in others)]) if others else first
+
+
+def accumulated(parts: Sequence[Array | None]) -> Array | None:
+    """Return sums along a run from those along its pieces, which may begin with any value; ``None`` without one."""
+    sums = [part for part in parts if part is not None]
+    if len(sums) < len(parts):
+        return None
+    before = compensated_sums(np.array([0.0, *(part[-1] - part[0] for part in sums[:-1])]))
+    along: Array = sums[0][0] + concatenated([part - part[0] + start for part, start in zip(sums, before, strict=True)])
+    return along
+
+
+def compensated_sums(terms: Array) -> Array:
+    """Return the partial sums, with the rounding errors of the additions summed besides."""
+    sums = np.cumsum(terms)
+    before = np.concatenate([[0.0], sums[:-1]])
+    added = sums - before
+    return np.asarray(sums + np.cumsum((before - (sums - added)) + (terms - added)))
 
 
 def joined_crossings(crossings: Sequence[Crossings]) -> Crossings:

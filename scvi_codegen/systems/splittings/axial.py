@@ -77,6 +77,13 @@ class Turn:
         g = exponential([intermediate(self.rate * x / 4) for x in self.momentum(q, u)])
         return (g.a - 1, g.b, g.c, g.d)
 
+    def action(self, rotation: Callable[..., tuple[Expr, ...]], q: Sequence[Expr], u: Sequence[Expr]) -> Expr:
+        """Return h times the action of a rotation, the integral of p . v - T = T: kappa Pi_k^2/2, or |Pi|^2/(2A)."""
+        momentum = self.momentum(q, u)
+        if rotation is Turn.rotation:
+            return self.kappa * momentum[self.axis] ** 2 / 2
+        return self.rate * Add(*(x**2 for x in momentum)) / 4
+
     def is_symmetry(self, system: HamiltonianSystem) -> bool:
         """Return whether H does not change along (q e_k, p e_k), at random states, so that Pi_k is conserved."""
         variables = (*system.coordinates, *system.momenta)
