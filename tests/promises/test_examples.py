@@ -67,7 +67,8 @@ def output_of(tmp_path, monkeypatch, capfd) -> Callable[..., str]:
         if "matplotlib.pyplot" in sys.modules:
             sys.modules["matplotlib.pyplot"].close("all")
         printed, complaints = capfd.readouterr()
-        assert complaints == ""
+        announced = "scvi-codegen: compiling "  # where it takes longer than others
+        assert [line for line in complaints.splitlines() if not line.startswith(announced)] == []
         return printed
 
     return output
