@@ -2,13 +2,14 @@
 
 A run is compared with one whose local tolerance is a thousand times smaller, so that the difference is its error, and
 whose steps end at other, irregular times, as steps that follow from the motion alone (free flight) are the same for all
-tolerances; where formulas are not smooth, they also end where these jump or have a kink. Three times the largest
-difference is the estimate. While that exceeds the wanted error, a run of smaller tolerance is judged in the same way.
-Where rounding dominates, all runs have errors of the same size, and one run with nearly the same error is not rare: the
-run is compared with two others and a factor of twelve, or with three and a factor of four, for which agreement by
-chance is equally improbable. The last runs, at round-off level, are compared with each other; what they do not confirm
-stays unconfirmed. (R. D. Skeel, Thirteen ways to estimate global error, Numer. Math. 48 (1986) 1-20; E. Hairer, S. P.
-Norsett, G. Wanner, Solving Ordinary Differential Equations I, II.4.)
+tolerances; where formulas are not smooth, they also end where these jump or have a kink. Forces that are so narrow that
+both pass over them are sought in short pieces (:mod:`.narrow_forces`), and limit the steps of further runs. Three times
+the largest difference is the estimate. While that exceeds the wanted error, a run of smaller tolerance is judged in the
+same way. Where rounding dominates, all runs have errors of the same size, and one run with nearly the same error is not
+rare: the run is compared with two others and a factor of twelve, or with three and a factor of four, for which
+agreement by chance is equally improbable. The last runs, at round-off level, are compared with each other; what they do
+not confirm stays unconfirmed. (R. D. Skeel, Thirteen ways to estimate global error, Numer. Math. 48 (1986) 1-20; E.
+Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equations I, II.4.)
 """
 
 import math
@@ -25,6 +26,7 @@ from numpy.typing import NDArray
 from scvi_codegen.codegen.native.arguments import checked_number
 from scvi_codegen.codegen.rendering.source import Interface
 from scvi_codegen.common.errors import AccuracyWarning, StateError, StepFailedError, warn
+from scvi_codegen.runs.accuracy.narrow_forces import differences_in_pieces, longest_piece
 from scvi_codegen.runs.accuracy.size import Motion, first_of_groups, momenta_of_velocities, relative, roundoff
 from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted, without_accuracy_warnings
 from scvi_codegen.runs.stepping.step_plan import Adaptive, absolute_tolerances
@@ -58,6 +60,10 @@ PARTS_AT_KINKS, LEAST_AT_KINKS = (math.inf, 0.0913, 0.0331, 0.0127, 0.00491), 1e
 """Largest steps relative to the run, one after the other, of formulas that are not smooth: free flight has the same
 steps for all tolerances, one of which may end beyond a kink. The least tolerance of these runs, unless the first one is
 smaller."""
+MOST_EXAMINATIONS, FINER_PIECES = 2, 0.0625
+"""Searches for narrow forces; ratio of their pieces, the second one where the first one succeeds."""
+PART_OF_ERROR, ROUNDINGS = 0.01, 1024.0
+"""Differences in pieces that count: parts of the wanted error, which later steps may enlarge; roundings."""
 LEAST_STOPS, LONG, STRIDE, MOST_STOPS = 8, 64, 16, 32
 """Of a run for comparison, numbers of times at which steps end: least; see :func:`irregular_stops`; most of others."""
 GOLDEN, MARGIN, IRREGULAR = 0.6180339887498949, 0.05, 0.8191725134
@@ -96,7 +102,7 @@ class GlobalError:
         confirmed_until: last of the times up to which the factor times each difference is at most the requested error.
         runs: number of runs.
         precision: ``"double"`` or ``"double-double"``.
-        max_step: largest step of the returned run, limited where the formulas are not smooth.
+        max_step: largest step of the returned run, limited where the formulas are not smooth or forces are narrow.
     """
 
     requested: float
@@ -282,6 +288,7 @@ class Runs:
         self.least, self.rounded = LEAST, ROUNDED
         self.last: tuple[float | None, ...] = LAST
         self.failure: StepFailedError | None = None
+        self.compared: tuple[Any, _Samples] | None = None
         if self.words > 1:
             self.least, self.rounded, self.last = LEAST_OF_TWO_WORDS, ROUNDED_OF_TWO_WORDS, LAST_OF_TWO_WORDS
         if not motion.smooth:  # errors are as random as those of rounding
@@ -293,6 +300,8 @@ class Runs:
         elif self.first < self.rounded:  # the factor of the estimate is larger there
             self.first *= FINER
         self.parts = () if has_tau or not self.interface.kinks else PARTS_AT_KINKS
+        self.is_examined = not (has_tau or self.interface.kinks or self.words > 1)
+        self.examinations, self.largest = 0, math.inf
 
     @without_accuracy_warnings()
     def confirmed_run(self) -> Any:
@@ -314,7 +323,7 @@ class Runs:
     def _run(self, tolerance: float | None, max_step: float = math.inf) -> Any:
         self.count += 1
         check = self._check_count if self.most < math.inf else None
-        limit = {} if max_step == math.inf else {"max_step": max_step}
+        limit = {} if (max_step := min(max_step, self.largest)) == math.inf else {"max_step": max_step}
         trajectory = self.motion.run(check, **self._steps(tolerance), **limit)
         self.most = min(self.most, FURTHER * trajectory.steps + MANY)
         return trajectory
@@ -323,12 +332,15 @@ class Runs:
         """Return a run for comparison, to its last state if it fails or takes too many steps."""
         self.count += 1
         stops = irregular_stops(compared.steps_of_run, number)
+        limit = {} if self.largest == math.inf else {"max_step": IRREGULAR * self.largest}
         try:
-            return self.motion.compared_run(stops, self._check_count, **self._steps(tolerance, IRREGULAR))
+            run = self.motion.compared_run(stops, self._check_count, **self._steps(tolerance, IRREGULAR), **limit)
         except StepFailedError as failure:
             if failure.trajectory is None:
                 raise
-            return failure.trajectory
+            run = failure.trajectory
+        self.compared = run, compared
+        return run
 
     def _check_count(self, steps: int) -> None:
         if steps > self.most:
@@ -336,14 +348,30 @@ class Runs:
 
     def _judged(self) -> Attempt:
         """Return the first run that is confirmed, and its estimate; otherwise the better one."""
-        attempts: list[Attempt] = []
+        attempts: list[tuple[Attempt, Any]] = []
         for attempt in chain(self._limited() if self.parts else self._by_tolerance(), self._at_round_off()):
             if attempt[1].confirmed:
-                return attempt
-            attempts.append(attempt)
+                return self._judged() if self._passes_over_forces(self.compared) else attempt
+            attempts.append((attempt, self.compared))
         if self.failure is not None and not attempts:
             raise self.failure
-        return min(attempts, key=lambda attempt: attempt[1].estimate)
+        best, compared = min(attempts, key=lambda attempt: attempt[0][1].estimate)
+        further = [best[0]] if len(best[0].t) == best[0].steps + 1 else []
+        return self._judged() if self._passes_over_forces(compared, *further) else best
+
+    def _passes_over_forces(self, compared: tuple[Any, "_Samples"] | None, *further: Any) -> bool:
+        """Return whether a run for comparison, or a further one, passes over forces; runs have smaller steps then."""
+        if not self.is_examined or self.examinations == MOST_EXAMINATIONS or compared is None:
+            return False
+        run, samples = compared
+        size = longest_piece(run, self.motion.end - self.start) * FINER_PIECES**self.examinations
+        self.examinations += 1
+        apart = np.array([differences_in_pieces(each, size) for each in (run, *further)]).max(axis=0)
+        differences = relative(apart, samples.sizes(len(samples.t), apart)).max()
+        if differences <= max(PART_OF_ERROR * self.requested, ROUNDINGS * samples.epsilon):
+            return False
+        self.largest = size
+        return True
 
     def _by_tolerance(self) -> Iterator[Attempt]:
         """Yield runs of smaller and smaller tolerances, until errors are too large for an extrapolation."""
@@ -426,7 +454,7 @@ class Runs:
             requested=self.requested,
             tolerance=tolerance,
             h=self._steps(tolerance).get("h"),
-            max_step=max_step,
+            max_step=min(max_step, self.largest),
             t=compared.t,
             differences=differences,
             safety=safety,
@@ -530,6 +558,11 @@ class _Samples:
         """Return the largest error relative to the size of the whole motion."""
         return float(self.relative()[0].max(initial=0.0))
 
+    def sizes(self, reached: int, errors: Array) -> Array:
+        """Return (2, m) sizes of positions and momenta up to a sample, for errors of shape (2, m)."""
+        assert self.motion is not None
+        return self.motion.sizes(float(self.t[reached - 1]), errors, self.kinetic[:reached].max(axis=0))
+
     def relative(self, within: Callable[[Array], NDArray[np.bool_]] | None = None) -> tuple[Array, int]:
         """Return (k,) errors relative to the size of the motion, and up to which of them ``within`` is true.
 
@@ -541,9 +574,7 @@ class _Samples:
         whole, reached = np.empty(0), len(self.t)
         while reached:
             errors = self.errors[:, :reached]
-            sizes = self.motion.sizes(
-                float(self.t[reached - 1]), errors.max(axis=1), self.kinetic[:reached].max(axis=0)
-            )
+            sizes = self.sizes(reached, errors.max(axis=1))
             differences = relative(errors, sizes[:, None]).max(axis=(0, 2))
             whole = whole if whole.size else differences
             met = np.ones(reached, bool) if within is None else within(differences)
