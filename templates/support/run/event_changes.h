@@ -231,14 +231,21 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
     event_sample at = {.q = states + 4 * M, .p = states + 5 * M};
     solver_report own;
     real part = length;
-    int acts = 0, ends;
+    int acts = 0, far = 0, ends;
     step->t = left.t;
     step->h = length;
     step->q = left.q;
     step->p = left.p;
     status = evaluate_functions(step, &right, values_at(step, EVENT_DEGREE));
-    if (status == OK)
+#ifdef EVENT_KINKS
+    far = status == OK && kinks_are_far(step, &left, &right);
+#endif
+    if (status == OK && !far)
       status = search_step(step, &left, &right);
+#ifdef EVENT_KINKS
+    if (status == OK && !far)
+      note_rates(step);
+#endif
     step->rounding_known |= !step->watch->started;
     if (status == OK)
       status = settle_crossings(step, first);
@@ -293,6 +300,10 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
         run->t_low = 0.0;
       }
       set_run(run, ends ? run->t : at.t, &at);
+#if defined(EVENT_KINKS) && EVENTS_CONTROLLED
+      if (adaptive)
+        run->error_before = 0.0; /* the next step size is searched for as that of a start */
+#endif
       return OK;
     }
     left.t = at.t;

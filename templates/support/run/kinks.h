@@ -17,6 +17,10 @@ static int is_kink(int event)
 #define KINK_SIDE 0x1p1000 /* beyond all values of u: the sign of u + mode is that of the mode */
 #define KINK_PROBE 0x1p-10 /* part of a step after which u has left zero at a start */
 
+enum { KINK_SEARCHES = 64 }; /* steps after which a far kink is searched for, too */
+#define KINK_FAR 2.0 /* a kink is far beyond so many times the change of its function in a step */
+#define KINK_FORGETS 0.97 /* factor of former rates of change for each step */
+
 /* Sets the side of a kink in the search and in the parameters of its steps. */
 static void set_side(const event_step *step, int kink, int side)
 {
@@ -108,5 +112,58 @@ static int change_sides(const event_step *step, long long first, const event_sam
     }
   }
   return status;
+}
+
+/* Whether no kink is reached in a step: each function is farther from zero than KINK_FAR times its change, by the control
+ * points of the cubic Hermite polynomial of a position, u(q0 + h v0 / 3) and u(q1 - h v1 / 3), and by its rate of change
+ * in former steps. */
+static int kinks_are_far(const event_step *step, const event_sample *left, const event_sample *right)
+{
+  const real *const before = values_at(step, 0), *const after = values_at(step, EVENT_DEGREE);
+  real *const v = step->memory + 2 * M, third = step->h / 3.0;
+  event_sample next = {.q = v + M};
+  if (FIRST_KINK > 0 || !step->watch->started || ++step->watch->unsearched >= KINK_SEARCHES)
+    return 0;
+  for (int side = 0; side < 2; side++, third = -third) {
+    const event_sample *const end = side ? right : left;
+    if (event_velocity(end->t, end->q, end->p, step->parameters, v, step->workspace) != OK)
+      return 0;
+    next.t = end->t + third;
+    next.p = end->p;
+    for (int i = 0; i < M; i++)
+      next.q[i] = end->q[i] + third * v[i];
+    if (all_values(next.t, next.q, next.p, step->parameters, values_at(step, 1 + side), step->workspace) != OK)
+      return 0;
+  }
+  for (int k = 0; k < EVENT_KINKS; k++) {
+    const int e = EVENT_FIRST[FIRST_KINK + k];
+#ifdef EVENTS_OF_TIME
+    if (EVENTS_OF_TIME_ALONE || IS_TIMED[FIRST_KINK + k] == 1)
+      return 0;
+#endif
+    const real first = values_at(step, 1)[e], last = values_at(step, 2)[e], rate = step->watch->rate[k];
+    const real low = fmin(fmin(before[e], after[e]), fmin(first, last));
+    const real high = fmax(fmax(before[e], after[e]), fmax(first, last));
+    const real change = fmax(high - low, rate * fabs(step->h));
+    if (!(low > KINK_FAR * change || -high > KINK_FAR * change))
+      return 0;
+    step->watch->rate[k] = KINK_FORGETS * change / fabs(step->h);
+  }
+  return 1;
+}
+
+/* Notes the rates of change of the functions of kinks in a step that was searched. */
+static void note_rates(const event_step *step)
+{
+  step->watch->unsearched = 0;
+  for (int k = 0; k < EVENT_KINKS; k++) {
+    const int e = EVENT_FIRST[FIRST_KINK + k];
+    real low = INFINITY, high = -INFINITY;
+    for (int j = 0; j <= EVENT_DEGREE; j++) {
+      low = fmin(low, values_at(step, j)[e]);
+      high = fmax(high, values_at(step, j)[e]);
+    }
+    step->watch->rate[k] = fmax(KINK_FORGETS * step->watch->rate[k], (high - low) / fabs(step->h));
+  }
 }
 #endif
