@@ -48,7 +48,7 @@ from scvi_codegen.runs.states.words import TwoWords, Words, check_keeps_words, l
 from scvi_codegen.runs.stepping.features import refusal, require
 from scvi_codegen.runs.stepping.projection import constraint_values, multipliers
 from scvi_codegen.runs.stepping.step_plan import FixedSteps
-from scvi_codegen.systems.event import Crossings, Event, EventLike, as_events
+from scvi_codegen.systems.event import Crossings, Event, EventLike, Switches, as_events
 
 if TYPE_CHECKING:
     import pandas
@@ -77,6 +77,7 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
         stepper: the compiled integrator.
         options: convergence criterion of the solver, ``None`` for the defaults.
         events: zero crossings found, parallel to ``stepper.events``.
+        switches: changes of the side of each kink, in the order of ``stepper.interface.modes``.
         plan: step sizes and target time of the run.
         steps, rejected_steps: numbers of completed and of rejected steps since the start of the run.
         fallback_steps: number of completed steps that the iteration did not solve, but its fallback, Newton's method.
@@ -95,6 +96,7 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
 
     iterations: NDArray[np.int32]
     events: tuple[Crossings, ...] = ()
+    switches: tuple[Switches, ...] = ()
     rejected_steps: int = 0
     fallback_steps: int = 0
     confirmation: GlobalError | None = field(default=None, repr=False)
@@ -151,6 +153,7 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
             actions=None if self.actions is None else self.actions[rows],
             step_sizes=lengths,
             events=tuple(crossings.chosen((crossings.t >= low) & (crossings.t <= high)) for crossings in self.events),
+            switches=tuple(found.chosen((found.t >= low) & (found.t <= high)) for found in self.switches),
         )
 
     def _slice_of_pieces(self, first: int, last: int, stride: int, rows: slice) -> Self:

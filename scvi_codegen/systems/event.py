@@ -5,9 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from numbers import Real
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, Self, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -261,9 +261,25 @@ class Crossings:
     def __len__(self) -> int:
         return len(self.t)
 
-    def chosen(self, which: NDArray[np.bool_]) -> Crossings:
+    def chosen(self, which: NDArray[np.bool_]) -> Self:
         """Return the crossings selected by a (k,) boolean mask."""
-        return replace(self, **{name: getattr(self, name)[which] for name in ("t", "q", "p", "element")})
+        return replace(self, **{name: getattr(self, name)[which] for name in self.columns})
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the arrays with a row for each crossing."""
+        return tuple(field.name for field in fields(self) if field.name != "event")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Switches(Crossings):
+    """Zeros of the function of a kink, where the motion changes to its other side.
+
+    Attributes:
+        side: (k,) 1 where the function becomes positive, -1 where it becomes negative.
+    """
+
+    side: NDArray[np.int64]
 
 
 def as_events(events: EventLike | Sequence[EventLike] | None) -> tuple[Event, ...]:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from scvi_codegen.systems.event import Kink
 from scvi_codegen.systems.formulas.expressions import parts_of_type, unit_step
-from scvi_codegen.systems.formulas.symbols import symbol
+from scvi_codegen.systems.formulas.modes import Mode
 
 if TYPE_CHECKING:
     from sympy import Expr
@@ -43,7 +43,7 @@ def located_kinks(system: MechanicalSystem) -> tuple[MechanicalSystem, tuple[Kin
         return system, ()
     taken = {free.name for formula in formulas for free in formula.free_symbols}
     numbers = (k for k in range(1, 10**6) if f"mode_{k}" not in taken)
-    modes = {u: symbol(f"mode_{k}") for u, k in zip(sorted(arguments, key=str), numbers, strict=False)}
+    modes = {u: Mode(f"mode_{k}", real=True) for u, k in zip(sorted(arguments, key=str), numbers, strict=False)}
     rules: dict[Expr, Expr] = {}
     for step in steps:
         u = step.args[0]

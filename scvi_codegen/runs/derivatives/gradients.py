@@ -16,7 +16,7 @@ from scvi_codegen.codegen.native.arguments import real_array
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.common.representation import summary
 from scvi_codegen.runs.derivatives.transformed_derivatives import time_of
-from scvi_codegen.runs.events.saltation import Jump, jumps_within
+from scvi_codegen.runs.events.saltation import Jump, jumps_within, parameters_on_sides
 from scvi_codegen.runs.results.recomputation import SAME_STEP_SIZE, check_recomputed, steps_after, steps_between
 from scvi_codegen.runs.results.saved_states import SavedStates
 from scvi_codegen.runs.states.validation import Array
@@ -154,7 +154,7 @@ def forward(states: SavedStates, tangents: Array) -> tuple[Array, Array]:
 def propagate(states: SavedStates, starts: Starts, numbers: NDArray[np.intp], vectors: Array, *, back: bool) -> None:
     """Propagate tangent or adjoint vectors along the steps of a segment and compare its step ends with the run."""
     jumps: dict[int, Jump] = {}
-    if states.stepper.changes_states:
+    if states.stepper.divides_steps:
         more = back or bool(vectors[..., 2 * states.stepper.dimension :].any())
         jumps = jumps_within(states, starts, numbers, all_inputs=more)
     parts = list(pairwise(sorted({0, len(starts.h), *jumps})))
@@ -163,7 +163,7 @@ def propagate(states: SavedStates, starts: Starts, numbers: NDArray[np.intp], ve
             vectors[last] = vectors[last] @ jumps[last].matrix
         part = starts.part(first, last) if jumps else starts
         ends = states.stepper._propagate(
-            part, vectors[first : last + 1], states.parameters, states.options, transpose=back
+            part, vectors[first : last + 1], parameters_on_sides(states, part.t[0]), states.options, transpose=back
         )
         saved = np.concatenate([part.q, part.p], axis=1)
         if last in jumps:

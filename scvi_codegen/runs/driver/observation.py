@@ -437,4 +437,6 @@ class Observation:
         crossings = self.search.crossings() if self.search is not None else ()
         tau = stepped if self.run.stepper.in_tau else None
         steps = self.run.steps + (self.partial_steps if self.arrived else 0)
-        return trajectory_of(self.run, (t, q, p, iterations), lengths, steps=steps, events=crossings, tau=tau)
+        made = trajectory_of(self.run, (t, q, p, iterations), lengths, steps=steps, events=crossings, tau=tau)
+        made.switches = self.search.switches() if self.search is not None else ()
+        return made

@@ -326,7 +326,7 @@ def plain_trajectory(
     else:
         trajectory.step_error = trajectory.worst_step_time = math.nan
     trajectory.parameters = memory._parameters.copy()
-    trajectory.events = trajectory.pieces = ()
+    trajectory.events = trajectory.switches = trajectory.pieces = ()
     trajectory.tau = trajectory.confirmation = trajectory.observed = trajectory.conserved = None
     return trajectory
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,6 +22,8 @@ from scvi_codegen.systems.event import (
     UNDEFINED,
     UNDEFINED_CHANGE,
     Crossings,
+    Event,
+    Switches,
 )
 
 if TYPE_CHECKING:
@@ -132,14 +135,14 @@ class CrossingSearch:
     def _record(self, crossings: Any, count: int) -> None:
         """Record the first crossings of an array; discard all states if these would exceed ``MOST_BYTES``."""
         records = self.binding.records(crossings, count)
-        if len(self.stepper.searched) > len(self.stepper.events):
-            records = records[records["function"] < len(self.stepper.events)]
-        if len(records):
-            self.last = float(records["t"][-1]), records["q"][-1], records["p"][-1]
+        own = records[records["function"] < len(self.stepper.events)] if self.stepper.interface.modes else records
+        if len(own):
+            self.last = float(own["t"][-1]), own["q"][-1], own["p"][-1]
         before, self._bytes = self._bytes, self._bytes + records.nbytes
         self.recorded.append(records)
         if self._bytes > MOST_BYTES:
-            names: Any = [name for name in ("t", "function", "element") if name in (records.dtype.names or ())]
+            kept = {"t", "function", "direction", "element"}
+            names: Any = [name for name in records.dtype.names or () if name in kept]
             self.recorded = [
                 records[names].copy() if records.dtype.names != (*names,) else records for records in self.recorded
             ]
@@ -175,10 +178,29 @@ class CrossingSearch:
 
     def crossings(self) -> tuple[Crossings, ...]:
         """Return the crossings by event."""
-        none, named = self.binding.records(self.binding.new("crossing[1]"), 0), self.stepper.named
-        records: Any = np.concatenate(self.recorded) if len(self.recorded) > 1 else [*self.recorded, none][0]
-        crossings = []
-        for number, event in enumerate(self.stepper.events):
+        return self._by_event(self.stepper.events, self._records())
+
+    def switches(self) -> tuple[Switches, ...]:
+        """Return the changes of the side of each kink."""
+        events = self.stepper.events
+        if not self.stepper.interface.modes:
+            return ()
+        records = self._records()
+        found = self._by_event(self.stepper.searched, records)[len(events) :]
+        numbers = range(len(events), len(self.stepper.searched))
+        sides = [records["direction"][records["function"] == number].astype(np.int64) for number in numbers]
+        return tuple(
+            Switches(event=of.event, t=of.t, q=of.q, p=of.p, element=of.element, side=side)
+            for of, side in zip(found, sides, strict=True)
+        )
+
+    def _records(self) -> Any:
+        none = self.binding.records(self.binding.new("crossing[1]"), 0)
+        return np.concatenate(self.recorded) if len(self.recorded) > 1 else [*self.recorded, none][0]
+
+    def _by_event(self, events: Sequence[Event], records: Any) -> tuple[Crossings, ...]:
+        named, crossings = self.stepper.named, []
+        for number, event in enumerate(events):
             mine, names = records["function"] == number, records.dtype.names
             values = {name: records[name][mine] for name in ("t", "q", "p", "element") if name in names}
             unknown = np.broadcast_to(np.nan, (len(values["t"]), self.stepper.dimension))

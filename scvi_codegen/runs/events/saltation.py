@@ -43,8 +43,24 @@ OF_STEP = 0.25
 """Increments of the time and of positions relative to their mean change in a step; of positions at least DIFFERENCE."""
 ADMISSIBLE = 0.5
 """Singular values of the derivative of a projection are at least 1, or 0 for inadmissible directions."""
+SIDE = 2.0**1000
+"""Size of the mode of a kink that decides its side, as in ``kinks.h``."""
 WEIGHTS = np.array([1.0, -9.0, 45.0]) / 60.0
 PLACES = np.array([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])
+
+
+def parameters_on_sides(states: SavedStates, t: float) -> Array:
+    """Return the parameters of the steps after time t, with the sides of the kinks that the run passed."""
+    switches = getattr(states, "switches", ())
+    if not any(map(len, switches)):
+        return states.parameters
+    parameters = states.parameters.copy()
+    sides = parameters[len(parameters) - len(switches) :]
+    for k, kink in enumerate(switches):
+        if len(kink):
+            passed = int(np.count_nonzero(states.forward * kink.t <= states.forward * t))
+            sides[k] = SIDE * (kink.side[passed - 1] if passed else -kink.side[0])
+    return parameters
 
 
 class Jump(NamedTuple):
@@ -106,7 +122,8 @@ def _jump(
     t, after = float(states.t[row]), np.concatenate([states.q[row], states.p[row]])
 
     def products(state: Array, h: float, time: float, seeds: Array) -> Array:
-        return stepper._products(state[:m], state[m:], h, time, parameters, options, seeds)[:, : 2 * m].T
+        sides = parameters_on_sides(states, time)
+        return stepper._products(state[:m], state[m:], h, time, sides, options, seeds)[:, : 2 * m].T
 
     start = np.concatenate([starts.q[k - 1], starts.p[k - 1]])
     arrival = products(start, float(starts.h[k - 1]), float(starts.t[k - 1]), np.eye(size)[-1:])[:, 0]

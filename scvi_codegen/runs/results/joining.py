@@ -12,6 +12,7 @@ from scvi_codegen.systems.event import Crossings
 
 Number = TypeVar("Number", bound=np.generic)
 Result = TypeVar("Result")
+Found = TypeVar("Found", bound=Crossings)
 
 
 def joined(pieces: Sequence[Result]) -> Result:
@@ -30,6 +31,7 @@ def joined(pieces: Sequence[Result]) -> Result:
         step_sizes=np.concatenate([*(piece.step_sizes[:-1] for piece in every), last.step_sizes[-1:]]),
         actions=accumulated([piece.actions for piece in every]),
         events=tuple(map(joined_crossings, zip(*(piece.events for piece in every), strict=True))),
+        switches=tuple(map(joined_crossings, zip(*(piece.switches for piece in every), strict=True))),
         pieces=tuple(pieces),
     )
     return whole
@@ -59,11 +61,11 @@ def compensated_sums(terms: Array) -> Array:
     return np.asarray(sums + np.cumsum((before - (sums - added)) + (terms - added)))
 
 
-def joined_crossings(crossings: Sequence[Crossings]) -> Crossings:
+def joined_crossings(crossings: Sequence[Found]) -> Found:
     """Concatenate the crossings of one event over all pieces."""
-    names = "t", "q", "p", "element"
-    joined = {name: np.concatenate([getattr(part, name) for part in crossings]) for name in names}
-    return Crossings(event=crossings[0].event, **joined)
+    columns: Any = {name: [getattr(part, name) for part in crossings] for name in crossings[0].columns}
+    joined: dict[str, Any] = {name: np.concatenate(parts) for name, parts in columns.items()}
+    return replace(crossings[0], **joined)
 
 
 SUSPICIOUS, ROUNDING = 1e-6, 1e-10

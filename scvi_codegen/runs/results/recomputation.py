@@ -55,7 +55,7 @@ def work_and_impulses_until(states: SavedStates) -> Array:
 def changes_by_events(states: SavedStates) -> Iterator[tuple[Crossings, NDArray[np.intp]]]:
     """Yield the crossings of each event that changes the state, and the rows of the states after them."""
     t = states.forward * states.t
-    for crossings in getattr(states, "events", ()):
+    for crossings in (*getattr(states, "events", ()), *getattr(states, "switches", ())):
         times = states.forward * crossings.t
         here = (t[0] <= times) & (times <= t[-1])
         rows = np.searchsorted(t, times[here])

@@ -60,7 +60,8 @@ def jump_of(
     Args:
         formula: function of the symbols of a state, time and parameters.
         moving: symbols that vary along a motion, without time.
-        constants: values of the parameters; others are tried for those that are 0.
+        constants: values of the parameters; others are tried for those that are 0. Surfaces with the mode of a kink
+            were examined without it.
         first_derivatives: whether jumps of first derivatives count as well, which are corners of the formula.
     """
     variables = set(moving)

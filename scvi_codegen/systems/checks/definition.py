@@ -23,6 +23,7 @@ from scvi_codegen.systems.derived_expressions import (
 )
 from scvi_codegen.systems.forces import check_damping
 from scvi_codegen.systems.formulas.expressions import Tape, hessian, jacobian, unsupported_part
+from scvi_codegen.systems.formulas.modes import Mode
 from scvi_codegen.systems.formulas.symbols import DOT, PARTS, TIME, check_names, number, symbol
 from scvi_codegen.systems.massless import gauge_of_rates
 from scvi_codegen.systems.system import MechanicalSystem
@@ -121,7 +122,7 @@ def check_definition(system: MechanicalSystem, role: str, arguments: Sequence[Sy
             f"the name {system.name!r} contains an unpaired surrogate, which cannot be encoded in UTF-8: remove it"
         )
     for variable in (*system.coordinates, *system.auxiliaries, system.time, *system.parameters):
-        if not isinstance(variable, Symbol) or variable != symbol(variable.name):
+        if not isinstance(variable, Mode) and variable != symbol(getattr(variable, "name", "")):
             raise SystemDefinitionError(
                 f"{variable!r} is not a real symbol: build systems with from_sympy or from_text"
             )
