@@ -218,8 +218,9 @@ class _Model:
     ) -> _Model:
         """Construct from validated arguments of :func:`fit`."""
         stepper, m = measurements.stepper, measurements.stepper.dimension
-        inputs = columns_of_inputs(stepper.interface)
-        estimable = [name for k, name in enumerate(stepper.parameters) if k not in inputs]
+        modes = {stepper.parameters.index(mode) for mode, _ in stepper.interface.modes}
+        fixed = modes.union(columns_of_inputs(stepper.interface))
+        estimable = [name for k, name in enumerate(stepper.parameters) if k not in fixed]
         estimated = tuple(estimable) if unknown is None else distinct(unknown, "unknown")
         for name in estimated:
             if name not in estimable:

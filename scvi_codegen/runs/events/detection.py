@@ -135,9 +135,8 @@ class CrossingSearch:
     def _record(self, crossings: Any, count: int) -> None:
         """Record the first crossings of an array; discard all states if these would exceed ``MOST_BYTES``."""
         records = self.binding.records(crossings, count)
-        own = records[records["function"] < len(self.stepper.events)] if self.stepper.interface.modes else records
-        if len(own):
-            self.last = float(own["t"][-1]), own["q"][-1], own["p"][-1]
+        if count:
+            self.last = float(records["t"][-1]), records["q"][-1], records["p"][-1]
         before, self._bytes = self._bytes, self._bytes + records.nbytes
         self.recorded.append(records)
         if self._bytes > MOST_BYTES:

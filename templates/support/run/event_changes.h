@@ -283,7 +283,7 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
     length -= part;
 #ifdef EVENT_KINKS
     if (status == OK)
-      status = change_sides(step, group, &at, step->whole);
+      status = change_sides(step, group, &at);
 #endif
     ends = fabs(length) <= CHANGE_SAFETY * DBL_EPSILON * fabs(step->whole);
     if (status == OK)
@@ -393,12 +393,13 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
     event_sample start = {.t = run->t, .q = before.q, .p = before.p};
     int unknown;
     status = settle_sides(&step, &start, &unknown);
-    if (status == OK && unknown) {
+    size = run->h;
+    if (status == OK && unknown && control)
       status = take_step(run, t_end, control, &step, &size, &count);
-      if (status == OK)
-        status = sides_after_start(&step, &start, size);
+    if (status == OK && unknown)
+      status = sides_after_start(&step, &start, size);
+    if (unknown)
       copy_run(run, &before);
-    }
     if (status == OK)
 #endif
       status = take_step(run, t_end, control, &step, &size, &count);

@@ -37,6 +37,17 @@ enum {
 #endif
 #define FUNCTION_OF(crossing) ((int)(EVENT_FIRST[(crossing)->function] + (crossing)->element))
 
+/* Side of a kink by its function e, > 0 or < 0; 0 for other functions, and without sides. */
+static inline real side_at_start(const event_watch *watch, int e)
+{
+#ifdef EVENT_KINKS
+  return EVENT_OF(e) >= FIRST_KINK ? watch->side[EVENT_OF(e) - FIRST_KINK] : 0.0;
+#else
+  (void)watch, (void)e;
+  return 0.0;
+#endif
+}
+
 /* A function at a fraction of a step, and the state there, in memory that later samples may use as well. */
 typedef struct {
   real fraction, t, g, *q, *p;
@@ -391,6 +402,34 @@ static int leave_zero(const event_step *step, int e, const event_sample *left, r
   return OK;
 }
 
+/* Start of the search in a part that begins at the zero of a kink, to whose side the motion goes: the last of a few
+ * states that are within rounding of zero, or the first beyond on that side. */
+static int leave_kink(const event_step *step, int e, const event_sample *left, event_sample *from)
+{
+  static const int PLACES[2][4] = {{4, 6, 8, 10}, {16, 24, 32, 40}};
+  const real side = side_at_start(step->watch, e), noise = 8.0 * values_at(step, EVENT_DEGREE + 2)[e];
+  const real tiny = copysign(DBL_MIN, side);
+  event_sample next = *left;
+  int status = OK, away = 0;
+  if (fabs(left->g) > noise)
+    return OK;
+  from->g = tiny;
+  for (int k = 3; k >= 0 && status == OK && !away; k--) {
+    status = take_sample(step, e, ldexp(1.0, -PLACES[0][k]), &next);
+    away = fabs(next.g) > noise;
+    *from = next;
+    from->g = away ? next.g : tiny;
+  }
+  for (int k = 0; k < 4 && status == OK && changes_sign(tiny, from->g); k++) {
+    status = take_sample(step, e, ldexp(1.0, -PLACES[1][k]), &next);
+    *from = next;
+    from->g = fabs(next.g) > noise ? next.g : tiny;
+  }
+  if (changes_sign(tiny, from->g))
+    from->g = tiny;
+  return status;
+}
+
 /* Marks the functions that are far from zero along a step, as search_part would find, in a loop over all of them. */
 static void mark_far(const event_step *step, real *far)
 {
@@ -445,7 +484,9 @@ static int search_function(const event_step *step, int e, const event_sample *le
   if (fabs(middle) > EVENT_FAR * range)
     return OK;
   from = start;
-  if (!step->watch->started) {
+  if (!step->watch->started && side_at_start(step->watch, e) != 0.0) {
+    status = leave_kink(step, e, &start, &from);
+  } else if (!step->watch->started) {
     range = fabs(to.g - from.g);
     for (int j = 1; j < EVENT_DEGREE; j++)
       range = fmax(range, fabs(inner[j - 1] - from.g));

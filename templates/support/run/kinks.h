@@ -15,9 +15,13 @@ static int is_kink(int event)
 
 #ifdef EVENT_KINKS
 #define KINK_SIDE 0x1p1000 /* beyond all values of u: the sign of u + mode is that of the mode */
-#define KINK_PROBE 0x1p-10 /* part of a step after which u has left zero at a start */
 
-enum { KINK_SEARCHES = 64 }; /* steps after which a far kink is searched for, too */
+enum {
+  KINK_FIRST_PROBE = 25, /* 2^-25 of a step after its start u may have left zero */
+  KINK_LAST_PROBE = 5,
+  KINK_SEARCHES = 64 /* steps after which a far kink is searched for, too */
+};
+
 #define KINK_FAR 2.0 /* a kink is far beyond so many times the change of its function in a step */
 #define KINK_FORGETS 0.97 /* factor of former rates of change for each step */
 
@@ -59,55 +63,77 @@ static int settle_sides(const event_step *step, const event_sample *at, int *unk
   return status;
 }
 
-/* Sides of the kinks at whose zeros a run starts: those after a small part of its first step by the formula. A function
- * that stays within rounding has the side 1, as unit_step(0) = 1. */
-static int sides_after_start(event_step *step, const event_sample *at, real length)
+/* Signs of the functions of all kinks after small parts of a step from a state, by the sides that are set: at the first
+ * of them where each is beyond rounding; 0 if none is. */
+static int signs_after(const event_step *step, const event_sample *at, real length, int *sign)
 {
+  event_step from = *step;
   event_sample next;
-  int status;
-  step->t = at->t;
-  step->h = length;
-  step->q = at->q;
-  step->p = at->p;
-  status = state_at(step, KINK_PROBE, &next);
-  if (status == OK)
-    status = evaluate_functions(step, &next, values_at(step, EVENT_DEGREE + 1));
-  for (int k = 0; status == OK && k < EVENT_KINKS; k++)
-    if (step->watch->side[k] == 0.0)
-      set_side(step, k, side_of(step, k, values_at(step, EVENT_DEGREE + 1)) < 0 ? -1 : 1);
+  real *const value = values_at(step, EVENT_DEGREE + 1);
+  int status = OK, unknown = EVENT_KINKS;
+  from.t = at->t;
+  from.h = length;
+  from.q = at->q;
+  from.p = at->p;
+  memset(sign, 0, sizeof(int) * EVENT_KINKS);
+  for (int place = KINK_FIRST_PROBE; status == OK && unknown > 0 && place >= KINK_LAST_PROBE; place -= 5) {
+    status = state_at(&from, ldexp(1.0, -place), &next);
+    if (status == OK)
+      status = evaluate_functions(step, &next, value);
+    unknown = 0;
+    for (int k = 0; status == OK && k < EVENT_KINKS; k++) {
+      sign[k] = sign[k] ? sign[k] : side_of(step, k, value);
+      unknown += sign[k] == 0;
+    }
+  }
   return status;
 }
 
-/* Changes to the other side at the crossings from `first` on, which have one state. The motion must leave zero there:
- * if the equations of both sides point to the surface, it slides (A. F. Filippov, Differential Equations with
- * Discontinuous Righthand Sides, 1988). */
-static int change_sides(const event_step *step, long long first, const event_sample *at, real length)
+/* Sides of the kinks at whose zeros a run starts: those after a small part of its first step by the formula. A function
+ * that stays within rounding has the side 1, as unit_step(0) = 1. */
+static int sides_after_start(const event_step *step, const event_sample *at, real length)
 {
-  event_step after = *step;
-  int status = OK, known = 0;
+  int sign[EVENT_KINKS];
+  const int status = signs_after(step, at, length, sign);
+  for (int k = 0; status == OK && k < EVENT_KINKS; k++)
+    if (step->watch->side[k] == 0.0)
+      set_side(step, k, sign[k] < 0 ? -1 : 1);
+  return status;
+}
+
+/* Changes to the other side at the crossings from `first` on, which have one state. If the motion returns at once, it
+ * touches the surface and keeps its side; if by the equations of that side it returns, too, it slides (A. F. Filippov,
+ * Differential Equations with Discontinuous Righthand Sides, 1988). */
+static int change_sides(const event_step *step, long long first, const event_sample *at)
+{
+  int sign[EVENT_KINKS], changed = 0, returns = 0, status = OK;
   for (long long i = first; i < *step->filled; i++)
-    if (step->found[i].function >= FIRST_KINK)
+    if (is_kink(step->found[i].function)) {
       set_side(step, step->found[i].function - FIRST_KINK, step->found[i].direction);
-  after.t = at->t;
-  after.h = length;
-  after.q = at->q;
-  after.p = at->p;
-  for (long long i = first; status == OK && i < *step->filled; i++) {
-    const event_crossing *crossing = step->found + i;
-    const int e = FUNCTION_OF(crossing);
-    real change, doubt;
-    if (crossing->function < FIRST_KINK)
-      continue;
-    if (!known) {
-      status = evaluate_functions(&after, at, values_at(step, 0));
-      if (status == OK)
-        status = rounding_of(&after, at);
+      changed = 1;
     }
-    known = 1;
-    if (status == OK)
-      status = first_change(&after, e, at, values_at(step, EVENT_DEGREE + 2)[e], &change, &doubt);
-    if (status == OK && crossing->direction * change < -4.0 * doubt) {
-      step->watch->sliding = crossing->function + 1;
+  if (!changed)
+    return OK;
+  status = evaluate_functions(step, at, values_at(step, 0));
+  if (status == OK)
+    status = rounding_of(step, at);
+  if (status == OK)
+    status = signs_after(step, at, step->whole, sign);
+  for (long long i = first; status == OK && i < *step->filled; i++) {
+    event_crossing *crossing = step->found + i;
+    const int kink = crossing->function - FIRST_KINK;
+    if (kink >= 0 && sign[kink] == -crossing->direction) {
+      crossing->direction = -crossing->direction;
+      set_side(step, kink, crossing->direction);
+      returns = 1;
+    }
+  }
+  if (status == OK && returns)
+    status = signs_after(step, at, step->whole, sign);
+  for (long long i = first; status == OK && returns && i < *step->filled; i++) {
+    const int kink = step->found[i].function - FIRST_KINK;
+    if (kink >= 0 && sign[kink] == -step->found[i].direction) {
+      step->watch->sliding = step->found[i].function + 1;
       status = NOT_CONVERGED;
     }
   }
