@@ -15,7 +15,8 @@ from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 from scvi_codegen.systems.event import Kink
-from scvi_codegen.systems.formulas.expressions import parts_of_type, unit_step
+from scvi_codegen.systems.formulas.expressions import parts_of_type
+from scvi_codegen.systems.formulas.kinks import switching_function, unit_step
 from scvi_codegen.systems.formulas.modes import Mode
 
 if TYPE_CHECKING:
@@ -38,7 +39,8 @@ def located_kinks(system: MechanicalSystem) -> tuple[MechanicalSystem, tuple[Kin
     owned = [field.name for field in fields(system) if field.name in FORMULAS]
     formulas = [formula for name in owned for formula in _formulas(getattr(system, name))]
     steps = sorted(parts_of_type(unit_step, *formulas), key=str)
-    arguments = {_direction(step.args[0]) for step in steps if _moves(step, system) and _goes_on(step, formulas)}
+    located = [step for step in steps if _moves(step, system) and _goes_on(step, formulas)]
+    arguments = {switching_function(step.args[0])[0] for step in located}
     if not arguments or len(arguments) > MOST_KINKS or system.clock or system.constraints or system.rotations:
         return system, ()
     taken = {free.name for formula in formulas for free in formula.free_symbols}
@@ -46,9 +48,9 @@ def located_kinks(system: MechanicalSystem) -> tuple[MechanicalSystem, tuple[Kin
     modes = {u: Mode(f"mode_{k}", real=True) for u, k in zip(sorted(arguments, key=str), numbers, strict=False)}
     rules: dict[Expr, Expr] = {}
     for step in steps:
-        u = step.args[0]
-        if (mode := modes.get(_direction(u))) is not None:
-            rules[step] = unit_step(u + mode if _direction(u) == u else u - mode)
+        u, sign = switching_function(step.args[0])
+        if u in modes:
+            rules[step] = unit_step(step.args[0] + sign * modes[u])
     with_modes = copy.copy(system)  # not made anew, as it would be checked again
     changes: dict[str, Any] = {name: _replaced(getattr(system, name), rules) for name in owned}
     changes["parameters"] = (*system.parameters, *modes.values())
@@ -64,11 +66,6 @@ def _formulas(value: Any) -> tuple[Expr, ...]:
 
 def _replaced(value: Any, rules: dict[Expr, Expr]) -> Any:
     return tuple(_replaced(formula, rules) for formula in value) if isinstance(value, tuple) else value.xreplace(rules)
-
-
-def _direction(u: Expr) -> Expr:
-    """Return u or -u, the same for both."""
-    return min(u, -u, key=lambda formula: (str(formula).count("-"), str(formula)))
 
 
 def _moves(step: Expr, system: MechanicalSystem) -> bool:

@@ -140,9 +140,9 @@ static int change_sides(const event_step *step, long long first, const event_sam
   return status;
 }
 
-/* Whether no kink is reached in a step: each function is farther from zero than KINK_FAR times its change, by the control
- * points of the cubic Hermite polynomial of a position, u(q0 + h v0 / 3) and u(q1 - h v1 / 3), and by its rate of change
- * in former steps. */
+/* Whether no kink is reached in a step: each function is farther from zero than KINK_FAR times its change, by the
+ * control points of the cubic Hermite polynomial of a position, u(q0 + h v0 / 3) and u(q1 - h v1 / 3), and by its rate
+ * of change in former steps. */
 static int kinks_are_far(const event_step *step, const event_sample *left, const event_sample *right)
 {
   const real *const before = values_at(step, 0), *const after = values_at(step, EVENT_DEGREE);
