@@ -114,7 +114,11 @@ class _Graph:
     def _switching(self, argument: sympy.Expr) -> int:
         """Return the node of a value with the sign of an argument; 0 - u of -u, since the sign of 0 is to be +."""
         u, sign = switching_function(argument)
-        return self.read(u) if sign > 0 else self.node(("-", (self.read(sympy.S.Zero), self.read(u))))
+        node = self.read(u)
+        content = self.nodes[node]
+        if isinstance(content, tuple) and content[0] == "neg":
+            sign, node = -sign, content[1][0]
+        return node if sign > 0 else self.node(("-", (self.read(sympy.S.Zero), node)))
 
     def _sum(self, expression: sympy.Add) -> int:
         """Return the node of ``sum_i c_i x_i = c sum_i (c_i / c) x_i``, c the content of the c_i with the first sign.

@@ -135,6 +135,18 @@ INLINE PAIR OF(divide)(PAIR a, PAIR b)
   return OF(fast_two_sum)(sum.high, sum.low + third);
 }
 
+/* A positive number with the sign of another. */
+INLINE PAIR OF(copysign)(PAIR size, PAIR x)
+{
+  return OF(times_power)(size, OF(sign)(x.high));
+}
+
+/* The nearest whole number: that of the high word, of two the one towards the low word, and that of the low word. */
+INLINE PAIR OF(rint)(PAIR x)
+{
+  return OF(fast_two_sum)(OF(whole)(x.high, x.low), OF(whole)(x.low, BROADCAST(0.0)));
+}
+
 /* 1 / x, corrected by a series. */
 INLINE PAIR OF(inverse)(PAIR x)
 {

@@ -32,6 +32,7 @@ LANE_OPERATION(power_of_2);
 
 LANE_OPERATION_OF_TWO(atan2_of);
 LANE_OPERATION_OF_TWO(are_equal);
+LANE_OPERATION_OF_TWO(whole);
 
 static inline lanes ddl_select(lanes chosen, lanes a, lanes b)
 {

@@ -39,6 +39,13 @@ static inline double dd_sign(double x)
   return copysign(1.0, x);
 }
 
+/* The whole number nearest to x + rest. */
+static inline double dd_whole(double x, double rest)
+{
+  const double whole = rint(x), half = x - whole;
+  return fabs(half) == 0.5 && half * rest > 0.0 ? whole + 2.0 * half : whole;
+}
+
 static inline double dd_is_small(double x)
 {
   return fabs(x) < 0.25 ? 1.0 : 0.0;

@@ -14,7 +14,6 @@ from scvi_codegen.codegen.rendering.kernels.printer import INVERSE_ROOT, scalar_
 from scvi_codegen.codegen.rendering.kernels.simd import Lanes
 from scvi_codegen.codegen.rendering.text import table, wrapped, wrapped_comment, wrapped_prototype
 from scvi_codegen.common.cache import template_folder
-from scvi_codegen.common.errors import MethodError
 from scvi_codegen.common.precision import mp
 
 OPERATORS = {"+": "sum", "-": "difference", "/": "divide", "neg": "negative"}
@@ -29,11 +28,6 @@ FUNCTIONS = frozenset(
 
 PER_TURN, PER_BINADE, NEAR = 128, 64, 64
 """Rows of the tables of sines and cosines, of powers of 2, and of powers less 1."""
-
-
-def unsupported(kernels: tuple[Kernel, ...]) -> set[str]:
-    """Return the functions of kernels that have no double-double form."""
-    return set().union(*map(scalar_functions, kernels)) - ROOTS - FUNCTIONS
 
 
 def uses_functions(kernels: tuple[Kernel, ...]) -> bool:
@@ -131,17 +125,7 @@ class _PairPrinter:
 
 
 def pair_kernel_text(kernel: Kernel, lanes: Lanes | None = None) -> str:
-    """Return the function ``<name>_pairs`` of numbers, or with ``lanes`` of vectors, and its comment.
-
-    Raises:
-        MethodError: for a function that has no double-double form.
-    """
-    if missing := unsupported((kernel,)):
-        names = ", ".join(sorted(missing)).replace("copysign", "unit_step").replace("rint", "rint (wrap)")
-        raise MethodError(
-            f"{names} in the formulas is not available with precision='double-double': use precision='double', "
-            f"or {', '.join(sorted(FUNCTIONS))} and powers"
-        )
+    """Return the function ``<name>_pairs`` of numbers, or with ``lanes`` of vectors, and its comment."""
     kind, printer, statements = "ddl" if lanes else "dd", _PairPrinter(lanes), []
     for array, k, expression in kernel.statements():
         value = printer.printed(expression)
