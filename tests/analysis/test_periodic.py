@@ -208,6 +208,9 @@ def test_adaptive_steps_reach_the_bound(galaxy, restricted):
     assert_allclose([*halo.q, halo.period], [*x, period], rtol=0, atol=1e-10)
     adaptive = sc.periodic_orbit(galaxy, [0.0, 0.28], [0.4, 0.02], period=6.2, energy=1 / 8)
     equal = sc.periodic_orbit(galaxy, [0.0, 0.28], [0.4, 0.02], period=6.2, energy=1 / 8, h=0.05)
+    limited = sc.periodic_orbit(galaxy, [0.0, 0.28], [0.4, 0.02], period=6.2, energy=1 / 8, max_step=0.02)
+    assert np.diff(limited.sequence.ends).max() * limited.period < 0.021
+    assert limited.period == pytest.approx(adaptive.period, abs=1e-8)
     assert adaptive.period == pytest.approx(equal.period, rel=1e-11)
     assert_allclose(adaptive.monodromy, adaptive.run().tangent()[-1], rtol=0, atol=1e-9)
 

@@ -32,6 +32,9 @@ OPTIONS: dict[str, tuple[dict[str, Any], sc.LagrangianSystem, tuple[sc.Event, ..
     "backward": ({"h": -0.125, "steps": 40}, PENDULUM, ()),
     "adaptive": (ADAPTIVE, PENDULUM, ()),
     "tolerance": (ADAPTIVE | {"tolerance": 1e-6}, PENDULUM, ()),
+    "max_step": (ADAPTIVE | {"max_step": 0.1}, PENDULUM, ()),
+    "max_step, steps": (FIXED | {"max_step": 0.1}, PENDULUM, ()),
+    "max_step, error": (ADAPTIVE | {"max_step": 0.1, "error": 1e-6}, PENDULUM, ()),
     "save_every": (FIXED | {"save_every": 7}, PENDULUM, ()),
     "t": (FIXED | {"t": 0.5}, PENDULUM, ()),
     "parameters": (FIXED | {"parameters": {"k": 2.0}}, PENDULUM, ()),
@@ -40,6 +43,7 @@ OPTIONS: dict[str, tuple[dict[str, Any], sc.LagrangianSystem, tuple[sc.Event, ..
     "t_eval": (ADAPTIVE | {"t_eval": [1.0, 3.0, 5.0]}, PENDULUM, ()),
     "inputs": (FIXED | PULSE, PUSHED, ()),
     "inputs, adaptive": (ADAPTIVE | PULSE, PUSHED, ()),
+    "max_step, inputs": (ADAPTIVE | PULSE | {"max_step": 0.1}, PUSHED, ()),
     "observe=extremes": (FIXED | {"observe": "extremes"}, PENDULUM, ()),
     "observe=energy": (FIXED | {"observe": "energy"}, PENDULUM, ()),
     "observe, adaptive": (ADAPTIVE | {"observe": "extremes"}, PENDULUM, ()),
@@ -71,6 +75,9 @@ h and t_end             =        =     =       =       -        =
 backward                =        =     =       =       =        =
 adaptive                =        =     =       =       =        =
 tolerance               =        =     =       =       =        =
+max_step                =        =     =       =       =        =
+max_step, steps         -        -     -       -       -        -
+max_step, error         =        =     =       =       -        =
 save_every              =        =     =       =       =        =
 t                       =        =     =       =       =        =
 parameters              =        =     =       =       =        =
@@ -79,6 +86,7 @@ velocity                =        =     =       =       =        =
 t_eval                  =        =     =       =       -        =
 inputs                  =        =     =       =       -        =
 inputs, adaptive        =        =     =       =       -        =
+max_step, inputs        =        =     =       =       -        =
 observe=extremes        -        =     =       =       -        -
 observe=energy          -        =     =       =       -        -
 observe, adaptive       -        -     -       -       -        -
@@ -144,6 +152,7 @@ def check_recorded(stepper: sc.Stepper, arguments: dict[str, Any], folder: Path)
     for one, other in zip(recorded.events, expected.events, strict=True):
         assert np.array_equal(one.t, other.t)
     assert recorded.t[-1] == expected.t[-1]
+    assert "max_step" not in arguments or len(recorded.t) == len(expected.t)
     assert np.array_equal(recorded.q[-1], expected.q[-1])
 
 
@@ -165,6 +174,8 @@ def check_equal(runs: Any, stepper: sc.Stepper, arguments: dict[str, Any]) -> No
         assert [len(each) for each in runs[j].events] == [len(each) for each in one.events]
         for its, expected in zip(runs[j].events, one.events, strict=True):
             assert np.abs(its.t - expected.t).max(initial=0.0) < 1e-13
+        if "max_step" in arguments:
+            assert len(one) > (end.t[-1] - one.t[0]) / arguments["max_step"]
         if "error" in arguments:
             assert runs.confirmed_until[j] == one.confirmed_until
             assert runs.global_error[j] == one.global_error

@@ -160,6 +160,9 @@ def test_model_files_and_command_line(tmp_path: Path) -> None:
     numbers = json.loads(output_of("run", str(tmp_path / "circle.toml"), *options))
     assert numbers["steps"] < 5.0 / 0.1
     json.loads(output_of("run", str(tmp_path / "circle.toml"), "--step", "0.5", "--json"))  # replaces adaptive steps
+    sc.generate_package(model, tmp_path / "package")
+    programs = [path.read_text() for path in (tmp_path / "package").rglob("main.c")]
+    assert [".max_step = 0.1," in program for program in programs] == [True]
     with pytest.raises(sc.ModelFileError, match="is for adaptive steps, but the step size is fixed"):
         parse_model(MODEL.replace("tolerance = 1e-3", "step = 0.5"))
     with pytest.raises(sc.ModelFileError, match="absolute_tolerance is -1"):

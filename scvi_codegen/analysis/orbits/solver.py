@@ -50,7 +50,7 @@ from scvi_codegen.runs.states.times import steps_within
 from scvi_codegen.runs.states.validation import Array, Parameters, check_inputs_given
 from scvi_codegen.runs.stepper import STEPPER, Stepper
 from scvi_codegen.runs.stepping.features import require
-from scvi_codegen.runs.stepping.step_plan import Fixed
+from scvi_codegen.runs.stepping.step_plan import ErrorControl, Fixed
 from scvi_codegen.runs.trajectory import Trajectory
 
 SYMPLECTIC = 1e-9
@@ -223,6 +223,7 @@ def periodic_orbit(
     steps: int | None = None,
     h: float | None = None,
     error: float | None = None,
+    max_step: float | None = None,
     fixed_period: bool = False,
     energy: float | None = None,
     fixed: Sequence[str] = (),
@@ -251,6 +252,7 @@ def periodic_orbit(
         h: instead of ``steps``, the largest step size for the initial period; its sign is ignored.
         error: bound of the discretisation error ``orbit.error``, by default 1e-9; adaptive steps become smaller until
             it is met. By default 1e-6 with ``steps`` or ``h``, which it does not change.
+        max_step: largest size of adaptive steps, at most an eighth of the period.
         fixed_period: keep the period fixed; required if the system depends on time.
         energy: prescribed energy of the orbit.
         fixed: coordinates and momenta (``"p_x"``) that keep their initial values: an amplitude, or a section such as
@@ -278,7 +280,9 @@ def periodic_orbit(
         require(stepper, "energy")
     if (period := checked_number(period, "the period")) <= 0.0:
         raise StateError(f"the period must be positive, not {period:g}")
-    sequence = _equal_steps(period, steps, h)
+    sequence, limits = _equal_steps(period, steps, h), ErrorControl(max_step=max_step).checked()
+    if sequence is not None and limits:
+        raise StateError(f"max_step={max_step:g} requires adaptive steps: omit it, or steps and h")
     if sequence is None:
         require(stepper, "adaptive")
     bound = ERROR if sequence is None else ERROR_OF_EQUAL_STEPS
@@ -296,6 +300,7 @@ def periodic_orbit(
         reduction=Reduction(interface),
         period=period,
         sequence=sequence,
+        max_step=limits.get("max_step", math.inf),
         fixed_indices=(*map(names.index, dict.fromkeys(fixed)), *([-1] if fixed_period else [])),
         energy=None if energy is None else checked_number(energy, "the energy"),
         gain=np.zeros(stepper.dimension) if gain is None else stepper._states.vector(gain, "gain"),
@@ -331,6 +336,7 @@ class _OrbitSearch:
     Attributes:
         reduction: maps between (q, p) and the tangent space without gauge directions of rotations.
         sequence: ends of the steps relative to the period; ``None`` for adaptive ones that are not yet known.
+        max_step: largest size of adaptive steps.
         fixed_indices: indices of the fixed entries of z, -1 that of the period.
         at_rest: (m,) momenta without velocity at the guess, which are no size of the motion.
     """
@@ -340,6 +346,7 @@ class _OrbitSearch:
     at_rest: Array
     period: float
     sequence: StepSequence | None
+    max_step: float
     fixed_indices: tuple[int, ...]
     energy: float | None
     gain: Array
@@ -368,7 +375,7 @@ class _OrbitSearch:
 
     def _adapted(self, z: Array, tolerance: float) -> _OrbitSearch:
         """Return the search with the steps of an adaptive run along z."""
-        at = self.t, self.parameters, self.options
+        at = self.max_step, self.t, self.parameters, self.options
         return replace(self, sequence=StepSequence.adaptive(self.stepper, z[:-1], float(z[-1]), tolerance, *at))
 
     def _refreshed(self, z: Array) -> PeriodicOrbit:

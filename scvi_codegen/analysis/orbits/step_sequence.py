@@ -47,6 +47,7 @@ class StepSequence:
         start: Array,
         period: float,
         tolerance: float,
+        max_step: float,
         t: float,
         parameters: Array,
         options: SolverOptions | None,
@@ -61,7 +62,7 @@ class StepSequence:
             stepper: the compiled stepper.
             start, period: (2m,) state and period of the guess.
             tolerance: that of the local error; 0 for round-off.
-            t, parameters, options: as of :class:`_OrbitSearch`.
+            max_step, t, parameters, options: as of :class:`_OrbitSearch`.
         """
 
         def ends_of(duration: float) -> Array:
@@ -69,7 +70,7 @@ class StepSequence:
                 *np.split(start, 2),
                 t_end=t + duration,
                 tolerance=tolerance or None,
-                max_step=period / LEAST_STEPS,
+                max_step=min(max_step, period / LEAST_STEPS),
                 t=t,
                 parameters=parameters,
                 options=options,

@@ -349,6 +349,7 @@ def checked_plan(kind: KindOfSteps, h: float | None, t_end: float | None, contro
     if kind.time_transformation is not None:
         if h is None or t_end is None or control.named:
             remedy = FEATURES["adaptive", "with a time transformation"]
+            remedy += f"; omit {', '.join(control.named)}" if control.named else ""
             raise StateError(f"the time transformation {kind.time_transformation} determines the step size: {remedy}")
         tau = checked_step(h)
         if tau < 0.0:
