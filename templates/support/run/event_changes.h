@@ -44,26 +44,46 @@ static void note_hit(const event_step *step, event_crossing *crossing, real t)
   }
 }
 
+/* Rate of change of function e along the step at a state, in the direction of the run. */
+static int rate_along(const event_step *step, int e, const event_sample *at, real *rate)
+{
+  const real part = 0x1p-20 * step->h;
+  event_sample next = {.t = at->t + part, .q = step->memory, .p = step->memory + M};
+  solver_report own;
+  int status = NAME(step)(at->t, part, at->q, at->p, step->parameters, step->options, next.q, next.p, &own,
+      step->workspace);
+  if (status == OK)
+    status = evaluate_function(step, e, &next);
+  *rate = (next.g - at->g) / fabs(part);
+  return status;
+}
+
 /* State of the crossings from `first` on. That of an impact is moved back along the flow by g / (dg/dt), at most the
- * resolution of a fraction of the step, so that large steps do not enter walls by many roundings. */
+ * resolution of a fraction of the step, so that large steps do not enter walls by many roundings; that of a kink either
+ * way, since a force that jumps adds energy in each step that passes it. */
 static int refine_crossing(const event_step *step, long long first, event_sample *at, real *part)
 {
   event_crossing *crossing = step->found + first;
   event_entries wall;
   solver_report own;
-  real back = 0.0, *const q = step->memory, *const p = q + M;
+  real back = 0.0, least, *const q = step->memory, *const p = q + M;
   int status;
   at->t = crossing->t;
   copy_state(at->q, at->p, crossing->q, crossing->p);
   status = evaluate_function(step, FUNCTION_OF(crossing), at);
-  if (status != OK || !IS_IMPACT[crossing->function])
+  if (status != OK || !(IS_IMPACT[crossing->function] || is_kink(crossing->function)))
     return status;
-  status = changes_at(step, FUNCTION_OF(crossing), at, &wall);
+  if (is_kink(crossing->function)) {
+    status = rate_along(step, FUNCTION_OF(crossing), at, &wall.rate);
+  } else {
+    status = changes_at(step, FUNCTION_OF(crossing), at, &wall);
+  }
   back = at->g / wall.rate; /* in the direction of the run */
 #ifdef EVENT_CONSTRAINTS
   back = 0.0; /* a constrained step of the size of rounding is ill-conditioned */
 #endif
-  if (status != OK || !(back > 0.0 && back <= CHANGE_SAFETY * DBL_EPSILON * fabs(step->h)))
+  least = is_kink(crossing->function) ? -CHANGE_SAFETY * DBL_EPSILON * fabs(step->h) : 0.0;
+  if (status != OK || !(back > least && back <= CHANGE_SAFETY * DBL_EPSILON * fabs(step->h)))
     return status;
   back = step->h < 0.0 ? -back : back;
   status = NAME(step)(at->t, -back, at->q, at->p, step->parameters, step->options, q, p, &own, step->workspace);
@@ -90,6 +110,13 @@ static int may_be_touched(const event_step *step, int e)
   return fabs(value) <= 0x1p-20 * range + 0x1p26 * values_at(step, EVENT_DEGREE + 2)[e];
 }
 
+/* Notes the rounding of the function of a kink at its zero: that of its change in the step. */
+static void note_rounding(const event_step *step, int e, const event_sample *at)
+{
+  const real change = fmax(fabs(values_at(step, 0)[e]), fabs(values_at(step, EVENT_DEGREE)[e]));
+  step->watch->history[e].slack = fmax(fabs(at->g), EVENT_AT_ZERO * change);
+}
+
 /* Changes the state at the crossings from `first` on, which have one state, then at all walls that it touches within
  * rounding and approaches, in their order, until there is none; walls that are met there are crossings, too. */
 static int change_at_crossings(const event_step *step, long long first, event_sample *at)
@@ -101,7 +128,7 @@ static int change_at_crossings(const event_step *step, long long first, event_sa
   for (long long i = first; status == OK && i < last; i++)
     if (step->watch->acts[step->found[i].function]) {
       if (is_kink(step->found[i].function))
-        step->watch->history[FUNCTION_OF(step->found + i)].slack = fabs(at->g);
+        note_rounding(step, FUNCTION_OF(step->found + i), at);
       else
         status = change_state(step, FUNCTION_OF(step->found + i), at);
       note_hit(step, step->found + i, at->t);

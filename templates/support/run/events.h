@@ -407,7 +407,8 @@ static int leave_zero(const event_step *step, int e, const event_sample *left, r
 static int leave_kink(const event_step *step, int e, const event_sample *left, event_sample *from)
 {
   static const int PLACES[2][4] = {{4, 6, 8, 10}, {16, 24, 32, 40}};
-  const real side = side_at_start(step->watch, e), noise = 8.0 * values_at(step, EVENT_DEGREE + 2)[e];
+  const real side = side_at_start(step->watch, e);
+  const real noise = 8.0 * values_at(step, EVENT_DEGREE + 2)[e] + RESIDUAL(step->watch, e);
   const real tiny = copysign(DBL_MIN, side);
   event_sample next = *left;
   int status = OK, away = 0;

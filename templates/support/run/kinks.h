@@ -35,7 +35,7 @@ static void set_side(const event_step *step, int kink, int side)
 static int side_of(const event_step *step, int kink, const real *value)
 {
   const int e = EVENT_FIRST[FIRST_KINK + kink];
-  const real noise = 8.0 * values_at(step, EVENT_DEGREE + 2)[e];
+  const real noise = 8.0 * values_at(step, EVENT_DEGREE + 2)[e] + RESIDUAL(step->watch, e);
   return (value[e] > noise) - (value[e] < -noise);
 }
 
@@ -182,6 +182,10 @@ static int kinks_are_far(const event_step *step, const event_sample *left, const
 static void note_rates(const event_step *step)
 {
   step->watch->unsearched = 0;
+#ifdef EVENTS_OF_TIME
+  if (EVENTS_OF_TIME_ALONE)
+    return; /* without values within the step */
+#endif
   for (int k = 0; k < EVENT_KINKS; k++) {
     const int e = EVENT_FIRST[FIRST_KINK + k];
     real low = INFINITY, high = -INFINITY;
