@@ -10,7 +10,8 @@ from sympy import Add, Expr, S, Symbol
 
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.common.representation import summary
-from scvi_codegen.systems.formulas.expressions import evaluated, hessian, rint, unit_step
+from scvi_codegen.systems.formulas.expressions import evaluated, hessian
+from scvi_codegen.systems.formulas.kinks import rint, unit_step
 from scvi_codegen.systems.formulas.symbols import TIME, symbol
 
 Boundary = Mapping[str, Any]

@@ -50,8 +50,9 @@ from scvi_codegen.systems.formulas.array_statements import (
     parse_constraint,
 )
 from scvi_codegen.systems.formulas.arrays import ArrayTerm, parse_coordinate, parse_sums
-from scvi_codegen.systems.formulas.expressions import evaluated, kinked_root, rint, unit_step, unsupported_part
+from scvi_codegen.systems.formulas.expressions import evaluated, unsupported_part
 from scvi_codegen.systems.formulas.indices import Access, Array, Loop, Size
+from scvi_codegen.systems.formulas.kinks import rint, unit_step
 from scvi_codegen.systems.formulas.rotations import RotationNames, entries_in_formulas
 from scvi_codegen.systems.formulas.symbols import DOT, TIME, identifier, input_formulas, symbol
 
@@ -266,7 +267,7 @@ def _expression(
         expression = _translated(formula, role)
     else:
         raise EventError(f"the {role} must be text or a SymPy expression; got {formula!r}")
-    problem = unsupported_part(expression) or kinked_root(expression, names.values())
+    problem = unsupported_part(expression)
     if problem:
         raise EventError(f"in the {role}: {problem}")
     unknown = sorted(free.name for free in expression.free_symbols.difference(names.values()))

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import operator
 import random
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import lru_cache
 from itertools import islice
@@ -32,13 +32,13 @@ from scvi_codegen.systems.formulas.kinks import (
     maximum,
     minimum,
     positive_part,
+    rint,
     sign,
     switching_function,
+    unit_step,
     where,
     wrap,
 )
-from scvi_codegen.systems.formulas.kinks import rint as rint
-from scvi_codegen.systems.formulas.kinks import unit_step as unit_step
 
 LARGEST = 1.7976931348623157e308
 """Largest finite C double."""
@@ -261,11 +261,6 @@ def _node_problem(node: Any) -> str | None:
     reason = ": the formulas of a system are real" if kind == "ImaginaryUnit" else ""
     names = ", ".join([*FUNCTIONS, *CONSTANTS])
     return f"{kind} ('{shortened(node)}') is not supported{reason}. Use + - * / ** and {names}"
-
-
-def kinked_root(formula: Expr, variables: Collection[Symbol]) -> str | None:
-    """Return ``None``: roots of squares are absolute values."""
-    return None
 
 
 def exponent_problem(exponent: Expr) -> str | None:
