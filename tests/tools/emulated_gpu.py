@@ -1,7 +1,7 @@
 """Emulated GPU: what the package calls of ``cuda.core``, on the processor, for tests of the driver without a device.
 
-Kernels are compiled as C99, or by NVRTC to PTX, which is translated to C; threads run one after the other. Arguments of
-types that launches do not pass as 8 bytes, and writes beyond the ends of an array, are errors.
+Kernels are compiled as C99; threads run one after the other. Arguments of types that launches do not pass as 8 bytes,
+and writes beyond the ends of an array, are errors.
 """
 
 from __future__ import annotations
@@ -17,9 +17,19 @@ from typing import Any
 from weakref import WeakSet
 
 import numpy as np
-from ptx import ESTIMATE, THREAD, ptx_of, translated
 
 HEADERS = "#include <float.h>\n#include <math.h>\n#include <stdint.h>\n#include <string.h>\n"
+THREAD = "long long trajectory; /* number of the thread */\n"
+ESTIMATE = """static inline double device_inverse_root(double x)
+{
+  uint64_t bits;
+  memcpy(&bits, &x, 8), bits &= ~0xffffffffULL, memcpy(&x, &bits, 8);
+  x = 1.0 / sqrt(x);
+  memcpy(&bits, &x, 8), bits &= ~0xffffffffULL, memcpy(&x, &bits, 8);
+  return x;
+}
+"""
+"""x^(-1/2) from the high words, as rsqrt.approx.ftz.f64 computes it to 20 bits; a device may round differently."""
 PRELUDE = """#define SCVI_DEVICE
 #define KERNEL void
 #define TRAJECTORY trajectory
@@ -47,11 +57,10 @@ class EmulatedGpu:
         launches: names of the kernels launched, with their numbers of threads.
         memory: largest number of bytes of an allocation.
         estimates: whether inverse roots begin with an estimate, as on a device; else with division and square root.
-        by_nvrtc: whether NVRTC compiles kernels, which are then executed as PTX, with the estimates.
     """
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.memory, self.estimates, self.by_nvrtc = folder, 2**30, False, False
+        self.folder, self.memory, self.estimates = folder, 2**30, False
         self.compiled: list[str] = []
         self.launches: list[tuple[str, int]] = []
         self.buffers: WeakSet[Buffer] = WeakSet()
@@ -63,8 +72,7 @@ class EmulatedGpu:
     @property
     def version(self) -> str:
         """Version of the compiler, which depends on this file."""
-        texts = b"".join(Path(__file__).with_name(name).read_bytes() for name in ("emulated_gpu.py", "ptx.py"))
-        return f"{hashlib.sha256(texts).hexdigest()} {self.estimates} {self.by_nvrtc}"
+        return f"{hashlib.sha256(Path(__file__).read_bytes()).hexdigest()} {self.estimates}"
 
     def Program(self, text: str, language: str, options: Any) -> Any:
         """Stand for the compiler; the ``cubin`` is a shared library."""
@@ -75,13 +83,11 @@ class EmulatedGpu:
             assert form == "cubin"
             self.compiled.append(options.arch)
             with tempfile.TemporaryDirectory(dir=self.folder) as folder:
-                return SimpleNamespace(code=self._compiled(text, options.arch, Path(folder)).read_bytes())
+                return SimpleNamespace(code=self._compiled(text, Path(folder)).read_bytes())
 
         return SimpleNamespace(compile=compile_text)
 
-    def _compiled(self, text: str, architecture: str, folder: Path) -> Path:
-        if self.by_nvrtc:
-            return library_of(translated(ptx_of(text, architecture)), folder, "-w", "-fno-strict-aliasing")
+    def _compiled(self, text: str, folder: Path) -> Path:
         estimate = f"{ESTIMATE}#define SCVI_INVERSE_ROOT device_inverse_root\n" if self.estimates else ""
         return library_of(HEADERS + THREAD + estimate + PRELUDE + text, folder, *WARNINGS)
 

@@ -5,11 +5,9 @@ units are parameters, so that one compiled stepper runs in all charts. :func:`vi
 chart, converts both to the units of home and compares: failures, numbers of steps or iterations, and errors against a
 run of high order. Errors of adaptive steps are compared on average: step sizes are powers of 2^(1/4) in the unit of
 time, and one such power is a factor of 16 in an error of order 16. Over 60 motions each, the logarithms of the ratios
-in other units are symmetric about 0, with standard deviations of up to a factor of 18 in encounters. Run as a program,
-it prints the number of violations of each cell of kind x method x number type x stepping.
+in other units are symmetric about 0, with standard deviations of up to a factor of 18 in encounters.
 """
 
-import argparse
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -451,34 +449,3 @@ def charts_of(cell: Cell) -> Iterator[tuple[str, Chart]]:
         special = kind.array or kind.rotation or kind.constraints
         if (kind.rest or not chart.rest) and not (special and chart.alone) and not (kind.rotation and chart.offset):
             yield name, chart
-
-
-def main() -> None:
-    """Print the number of violations of each cell, and the violations themselves."""
-    parser = argparse.ArgumentParser(description=main.__doc__)
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--kind", choices=KINDS)
-    parser.add_argument("--method", choices=METHODS)
-    parser.add_argument("--precision", choices=TYPES)
-    parser.add_argument("--stepping", choices=STEPPING)
-    arguments = parser.parse_args()
-    asked = {name: value for name, value in vars(arguments).items() if name != "seeds" and value}
-    total = 0
-    for cell in cells():
-        if any(getattr(cell, name) != value for name, value in asked.items()):
-            continue
-        lines, count = [], 0
-        for name, chart in charts_of(cell):
-            count += arguments.seeds
-            lines += [f"    {name}, {what}" for what in violations(cell, chart, range(arguments.seeds))]
-        total += len(lines)
-        print(
-            f"{cell.kind:12} {cell.method:8} {cell.precision:14} {cell.stepping:9} {len(lines):3} of {count}",
-            flush=True,
-        )
-        print("\n".join(lines), end="\n" if lines else "", flush=True)
-    print(f"{total} violations")
-
-
-if __name__ == "__main__":
-    main()
