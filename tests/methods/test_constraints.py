@@ -51,14 +51,6 @@ def on_circle(angle):
     return 1.5 * np.array([np.sin(angle), -np.cos(angle)])
 
 
-@pytest.fixture(scope="module")
-def swung():
-    """Angle and rate after 1.2 time units of the pendulum, from 1.3 at rest, by its angle."""
-    angle = lagrange("angle", "a", "l**2*a_dot**2/2 + g*l*cos(a)", g=G, l=1.5)
-    run = sc.compile_stepper(angle, sc.SVI(8)).integrate([1.3], [0.0], h=0.01, steps=120)
-    return float(run.q[-1, 0]), float(run.velocity[-1, 0])
-
-
 def test_degree_1_is_rattle():
     """RATTLE written down for the rod: two kicks, a drift, and multipliers that two quadratic equations give."""
     stepper, h, m, l2 = sc.compile_stepper(rod(), lobatto(1)), 0.05, 2.0, 2.25
@@ -217,23 +209,6 @@ def test_many_coupled_masses_take_newton_iteration(monkeypatch):
             f"coupled{further}", "x y z", lagrangian.format(further), constraints=["x**2 + y**2 + z**2 = 1"]
         )
         assert ("constrained_force(" in sc.generate_source(system, lobatto(1))[0].amalgamated().code) is expected
-
-
-def test_rod_in_a_rotating_frame(swung):
-    """Compare with the motion in an inertial frame."""
-    frame = sc.LagrangianSystem.from_text(
-        name="turning",
-        coordinates=["x", "y"],
-        lagrangian="((x_dot - w*y)**2 + (y_dot + w*x)**2)/2 - g*(x*sin(w*t) + y*cos(w*t))",
-        parameters={"g": G, "w": 0.7},
-        constraints=["x**2 + y**2 = 1.5**2"],
-    )
-    x, y = on_circle(1.3)
-    run = sc.compile_stepper(frame, lobatto(6)).integrate([x, y], [0.0, 0.0], h=0.02, steps=60)
-    at = on_circle(swung[0])
-    turn = 0.7 * 1.2
-    expected = [np.cos(turn) * at[0] + np.sin(turn) * at[1], np.cos(turn) * at[1] - np.sin(turn) * at[0]]
-    assert_allclose(run.q[-1], expected, rtol=0, atol=1e-12)
 
 
 @pytest.mark.second

@@ -12,7 +12,6 @@ import pytest
 from counting import TooMuchWorkError, at_most
 from notation import lagrange
 from samples import ensemble_runs
-from scipy.spatial.transform import Rotation
 
 import scvi_codegen as sc
 from scvi_codegen.runs.ensembles import batches
@@ -20,14 +19,11 @@ from scvi_codegen.runs.ensembles import batches
 COUNT = 7
 RNG = np.random.default_rng(3)
 MU = RNG.uniform(0.8, 1.2, COUNT)
-TOP = sc.LagrangianSystem.from_text(
-    "free top", rotations={"R": "omega"}, lagrangian="(omega_1**2 + 2*omega_2**2 + 3*omega_3**2)/2"
-)
 
 
 @cache
 def stepper(name: str) -> sc.Stepper:
-    """Return an integrator of each kind of run: iterated, constrained, of arrays, of rotations."""
+    """Return an integrator of each kind of run: iterated, constrained, of arrays."""
     if name == "rod":
         system = lagrange(
             "rod", "x y", "m*(x_dot**2 + y_dot**2)/2 - g*y", m=1.0, g=9.81, constraints=["x**2 + y**2 = 1"]
@@ -38,8 +34,6 @@ def stepper(name: str) -> sc.Stepper:
             "chain", ["q[N]"], "sum(i in N, q_dot[i]**2/2 - q[i]**4/4) - sum(i in N periodic, (q[i + 1] - q[i])**2/2)"
         )
         return sc.compile_stepper(system, sc.SVI(4))
-    if name == "top":
-        return sc.compile_stepper(TOP, "composition:4")
     return sc.compile_stepper(sc.problem("kepler").system, "svi:6")
 
 
@@ -95,33 +89,6 @@ def test_trajectories_equal_single_runs(name: str, plan: str, capacity: int, mon
         for those, expected in ((found, np.asarray(run.q)), (momenta, np.asarray(run.p))):
             assert those[:last].tobytes() == expected[:last].tobytes()
             np.testing.assert_allclose(those, expected, rtol=0, atol=1e-14)
-
-
-def test_bodies_in_all_orientations_equal_single_runs() -> None:
-    one, attitudes, omega = stepper("top"), Rotation.random(COUNT, random_state=1), RNG.normal(size=(COUNT, 3))
-    plan = {"h": 0.1, "steps": 12, "save_every": 4}
-    runs = one.integrate_ensemble({"R": attitudes}, velocity={"omega": omega}, **plan)
-    for j in range(COUNT):
-        run = one.integrate({"R": attitudes[j]}, velocity={"omega": omega[j]}, **plan)
-        assert runs.q[:, j].tobytes() == run.q.tobytes()
-        assert runs.p[:, j].tobytes() == run.p.tobytes()
-
-
-def test_failures_leave_the_states_before_them() -> None:
-    one, (q, p) = stepper("kepler"), states("kepler")
-    p[2] = 0.0  # falls into the centre
-    runs = one.integrate_ensemble(q, p, t_end=5.0, tolerance=1e-9)
-    with pytest.raises(sc.StepFailedError) as failure:
-        one.integrate(q[2], p[2], t_end=5.0, tolerance=1e-9)
-    before = failure.value.trajectory
-    assert runs.ok.tolist() == [j != 2 for j in range(COUNT)]
-    assert runs.status[2] == failure.value.status
-    t, positions, *_ = list(runs.each())[2]
-    assert t.tobytes() == before.t.tobytes()
-    assert positions.tobytes() == before.q.tobytes()
-    ends = one.integrate_ensemble(q, p, t_end=5.0, tolerance=1e-9, t_eval=[5.0])
-    assert np.isnan(ends.q[0, 2]).all()
-    assert np.isfinite(np.delete(ends.q[0], 2, axis=0)).all()
 
 
 def test_a_step_that_requests_newtons_method_is_repeated_with_it() -> None:

@@ -91,16 +91,6 @@ def test_a_trajectory_begins_with_the_initial_state_and_has_float64_arrays(keple
     assert (len(none), *none.q[0], *none.p[0]) == (1, *STATE[0], *STATE[1])
 
 
-@pytest.mark.parametrize("save_every", [1, 2, 7, 300, 1000, 5000])
-def test_save_every_selects_states_of_the_same_run(kepler, save_every):
-    """1000 steps are several calls into C: their seams must not show."""
-    dense, thin = (kepler.integrate(*STATE, h=0.05, steps=1000, save_every=e) for e in (1, save_every))
-    assert np.array_equal(thin.q, dense.q[::save_every])
-    assert np.array_equal(thin.p, dense.p[::save_every])
-    assert np.array_equal(thin.t, dense.t[::save_every])
-    assert thin.iterations.sum() == dense.iterations[: 1000 // save_every * save_every + 1].sum()
-
-
 def test_progress_receives_the_completed_steps(kepler):
     reported = []
     kepler.integrate(*STATE, h=0.05, steps=3000, progress=reported.append)
@@ -190,31 +180,6 @@ def test_a_step_without_solution_fails_with_advice(compiled):
     assert caught.value.trajectory is None
 
 
-def falling(compiled):
-    """A free fall into the centre of attraction, which every method with steps of this size must fail to survive."""
-    return compiled("kepler", sc.SVI(4)), ([1.0, 0.0], [-0.5, 1e-9])
-
-
-def test_failing_run_returns_completed_states_and_ends_before_the_failing_step(compiled):
-    stepper, state = falling(compiled)
-    run = stepper.start(*state, h=0.05, options=sc.SolverOptions(max_iterations=8))
-    with pytest.raises(sc.StepFailedError) as caught:
-        run.record(400, save_every=2)
-    error, saved_states = caught.value, caught.value.trajectory
-    assert 5 < error.step < 400
-    assert error.step == run.steps
-    assert error.t == run.t == pytest.approx(0.05 * error.step)
-    assert len(saved_states) == error.step // 2 + 1
-    again = stepper.integrate(*state, h=0.05, steps=error.step, save_every=2)
-    assert np.array_equal(saved_states.q, again.q)
-    before = run.checkpoint()
-    with pytest.raises(sc.StepFailedError) as repeated:
-        run.record(1)
-    assert repeated.value.step == error.step
-    assert len(repeated.value.trajectory) == 1
-    assert run.checkpoint() == before
-
-
 def test_failed_run_continues_with_other_options(compiled):
     state = compiled("kepler", sc.SVI(4)), STATE
     run = state[0].start(*STATE, h=0.3, options=sc.SolverOptions(max_iterations=1))
@@ -231,17 +196,6 @@ def test_failed_run_continues_with_other_options(compiled):
 
 
 # Convergence.
-
-
-def test_relative_tolerance_does_not_depend_on_units(compiled):
-    """Lengths in units 2^30 times smaller, time unchanged: the same bits, but for the exponent."""
-    stepper, scale = compiled("kepler", sc.SVI(3)), 2.0**30
-    q, p = stepper.integrate(*STATE, h=0.1, steps=20).q, stepper.integrate(*STATE, h=0.1, steps=20).p
-    large = stepper.integrate(
-        np.multiply(scale, STATE[0]), np.multiply(scale, STATE[1]), h=0.1, steps=20, parameters={"mu": scale**3}
-    )
-    assert np.abs(large.q / scale - q).max() < 1e-14
-    assert np.abs(large.p / scale - p).max() < 1e-14
 
 
 def test_looser_tolerance_needs_fewer_iterations_and_loses_digits(kepler):

@@ -26,13 +26,6 @@ def in_last_places(time: float, t: float, h: float, n: int) -> float:
     return float(abs(Fraction(time) - (Fraction(t) + n * Fraction(h))) / Fraction(math.ulp(time)))
 
 
-@pytest.mark.second
-@pytest.mark.parametrize(("t", "h"), GRIDS)
-def test_the_time_of_a_run_is_the_sum_of_its_steps_rounded(free, t, h):
-    run = free.integrate([0.0], [0.0], h=h, steps=3_000, t=t)
-    assert max(in_last_places(float(time), t, h, n) for n, time in enumerate(run.t)) <= 0.5 + 1e-9
-
-
 def test_time_is_the_rounded_sum_after_a_million_steps(free):
     run = free.start([0.0], [0.0], h=0.1, t=0.7)
     run.advance(1_000_000)
