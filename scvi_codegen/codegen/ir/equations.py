@@ -402,7 +402,7 @@ class Splitting:
         principal: of each body the principal axes as columns, row by row; empty if they are the body axes.
         at_rest: L at v = 0 if runs sum the action, else ``None``.
         leaps: whether the statements are kicks and drifts in turn by the tables KICK and DRIFT.
-        driven: whether forces depend on inputs, which may jump between steps: no step reuses the last force.
+        driven: whether forces depend on inputs, which may jump between steps: no step reuses the force of former ones.
     """
 
     statements: str

@@ -359,7 +359,8 @@ class Program:
     def memory(self) -> int:
         """Numbers that a run stores of its last steps to predict the next."""
         if self.splitting:
-            return self.dimension + 2 * self.acts_along
+            inputs = 5 * len(self.layout.inputs) * self.splitting.driven
+            return self.dimension + 2 * self.acts_along + inputs
         points = self.dimension * self.fixed_point.stored if self.fixed_point else 0
         if self.acts_along and self.fixed_point and self.fixed_point.name == "shooting":
             points += 1

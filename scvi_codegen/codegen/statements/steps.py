@@ -99,7 +99,7 @@ static inline void leap_in_pairs(const step_data *step, dd t, dd h, const {kind}
         first += [] if split.leaps else ["(void)known, (void)F;"]
         words = [f"  d{x}[i] = {x}[i].high, d{x}[M + i] = {x}[i].low;" for x in "qp"]
         last = ["for (int i = 0; i < M; i++) {", *words, "}"]
-    if split.driven:
+    if split.driven and layout.words == 2:
         first += ["known = 0; /* inputs, which may jump between steps, have changed the last force */"]
     return head + "".join(f"  {line}\n" for line in (*first, *lines, *last)) + "}\n"
 

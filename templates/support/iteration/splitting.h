@@ -48,8 +48,21 @@ static void prepare(const step_data *step, solver_data *data)
 #include "leap.h"
 
 #ifndef LANES
+#ifdef DRIVEN_FORCES
+/* Returns whether the inputs are those of the last step, after which they may jump, and keeps them. */
+static int keep_inputs(const step_data *step, real *kept)
+{
+  int same = 1;
+  for (int i = 0; i < DRIVING_INPUTS; i++, kept += 5) {
+    same &= !memcmp(kept, step->parameters + DRIVING_INPUT[i], 5 * sizeof(real));
+    memcpy(kept, step->parameters + DRIVING_INPUT[i], 5 * sizeof(real));
+  }
+  return same;
+}
+#endif
+
 /* Computes the increments of one step; memory contains the last force, which the next step reuses if it starts with a
- * kick. */
+ * kick, unless inputs have changed, and the inputs last. */
 SPLITTING int solve(const step_data *step, const solver_data *data, real *memory, long long *guess, real *dq, real *dp,
     const solver_options *options, solver_report *report, real *workspace)
 {
@@ -59,6 +72,10 @@ SPLITTING int solve(const step_data *step, const solver_data *data, real *memory
   memcpy(F, memory, sizeof F);
 #ifdef RUN_ACTION
   acted[0] = memory[M];
+#endif
+#ifdef DRIVEN_FORCES
+  if (!keep_inputs(step, memory + MEMORY - 5 * DRIVING_INPUTS))
+    *guess = 0;
 #endif
   leap(step, data, *guess > 0, F, dq, dp, acted);
   report->iterations++;

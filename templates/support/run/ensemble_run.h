@@ -381,6 +381,9 @@ long long NAME(call_each)(NAME(each) * c, long long steps)
     c->left -= size;
     while (c->left == 0 && ++c->segment < c->segments) {
       c->left = c->segment_steps[c->segment];
+#ifdef DRIVEN_FORCES
+      block->guess = 0; /* the last force is that of the former inputs */
+#endif
       block->guess = c->segment_h[c->segment] == block->h ? block->guess : 0;
       block->h = c->segment_h[c->segment];
 #ifdef DOUBLE_DOUBLE

@@ -171,7 +171,9 @@ def splitting_source(split: Splitting, observed: Kernel | None = None) -> Iterat
         lanes=1,
         whole=False,
         meaning=TRAJECTORIES,
-        defines=sizes | ({"CONSTANT_MASSES": "1"} if split.by_masses else {}),
+        defines=sizes
+        | ({"CONSTANT_MASSES": "1"} if split.by_masses else {})
+        | ({"DRIVEN_FORCES": "1"} if split.driven else {}),
         functions=tuple(map(_vector_function, sorted(functions))),
         tables=tuple(lane_table(name, numbers, len(numbers)) for name, numbers in split.numbers.items()),
         kernels=kernels,
