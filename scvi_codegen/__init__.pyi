@@ -21,6 +21,7 @@ from scvi_codegen.common.errors import AccuracyWarning as AccuracyWarning
 from scvi_codegen.common.errors import ArgumentError as ArgumentError
 from scvi_codegen.common.errors import BuildError as BuildError
 from scvi_codegen.common.errors import CacheWarning as CacheWarning
+from scvi_codegen.common.errors import ContactError as ContactError
 from scvi_codegen.common.errors import ControlError as ControlError
 from scvi_codegen.common.errors import EventError as EventError
 from scvi_codegen.common.errors import EventWarning as EventWarning
@@ -129,6 +130,10 @@ from scvi_codegen.runs.stepping.molecular_dynamics import radial_distribution as
 from scvi_codegen.runs.stepping.molecular_dynamics import temperature as temperature
 from scvi_codegen.runs.stepping.step_derivatives import Sensitivity as Sensitivity
 from scvi_codegen.runs.trajectory import Trajectory as Trajectory
+from scvi_codegen.systems.constraints.contact import Contact as Contact
+from scvi_codegen.systems.constraints.contact import Friction as Friction
+from scvi_codegen.systems.constraints.contact import contact as contact
+from scvi_codegen.systems.constraints.contact import friction as friction
 from scvi_codegen.systems.derived_systems import change_coordinates as change_coordinates
 from scvi_codegen.systems.derived_systems import variational_system as variational_system
 from scvi_codegen.systems.event import Crossings as Crossings

@@ -117,7 +117,11 @@ class EventError(ScviCodegenError, ValueError):
 
 
 class EventWarning(UserWarning):
-    """A run that ended where its events accumulate: infinitely many impacts in finite time."""
+    """A run that ended where its events accumulate, or whose contacts have several modes or created energy."""
+
+
+class ContactError(ScviCodegenError, ValueError):
+    """Contacts without a consistent mode (Painleve's paradox), with a negative gap at the start, or too many."""
 
 
 class PlotError(ScviCodegenError):

@@ -42,7 +42,6 @@ from scvi_codegen.methods.tables.quadrature import gauss_legendre
 from scvi_codegen.systems.constraints import (
     constraint_multipliers,
     constraint_rates,
-    has_oblique_forces,
     idle_multipliers,
     position_conditions,
     velocity_conditions,
@@ -141,7 +140,7 @@ def _with_multipliers(system: MechanicalSystem, group: StageGroup) -> StageGroup
         scatters=tuple(scatters),
         scalar=sympy.Add(group.scalar, *products),
         computes="L_q + G^T lambda, L_v and g",
-        forced=group.forced or any(velocity_conditions(system)) or has_oblique_forces(system),
+        forced=group.forced or bool(system.reactions) or any(velocity_conditions(system)),
     )
 
 

@@ -66,6 +66,8 @@ def discretise(system: MechanicalSystem, method: Method) -> StageSystem:
     """
     stages = method.stage_system(axial_turns(system)[0])
     check_regular(method, system)
+    if system.has_contacts:
+        raise MethodError(f"the contacts of '{system.name}' require compile_stepper: omit them, contacts=()")
     if system.damping != 0 and not isinstance(stages.shape, Velocities):
         raise MethodError(
             f"{method.name} does not support the damping of '{system.name}', which weights L_q and "

@@ -31,8 +31,11 @@ from scvi_codegen.common.errors import MethodError, SizesRequiredError
 from scvi_codegen.common.validation import TEXTS, OfRunTimeSizes, check_kind, checks_arguments
 from scvi_codegen.methods import SVI, StoermerVerlet, as_method, default_method
 from scvi_codegen.methods.method import Method
+from scvi_codegen.runs.contacts.driver import ContactsOfStepper
 from scvi_codegen.runs.stepper import Stepper, StepperOfRunTimeSizes
 from scvi_codegen.runs.stepping.compiled_method import Variants
+from scvi_codegen.systems.constraints.contact import ContactLike
+from scvi_codegen.systems.contacts.modes import bound_contacts
 from scvi_codegen.systems.event import Event, EventLike, as_events
 from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED
 from scvi_codegen.systems.system import SYSTEM_OR_ARRAYS, MechanicalSystem
@@ -61,6 +64,7 @@ def compile_stepper(
     precision: str = "double",
     sums: str = "compensated",
     kinks: Kinks = "located",
+    contacts: Sequence[ContactLike] = (),
 ) -> Stepper:
     """Derive, generate, compile and load the integrator of ``system`` by ``method``.
 
@@ -102,6 +106,9 @@ def compile_stepper(
             ``"located"``, so that steps end there and keep their order; or ``"as formulas"``, so that steps of equal
             size stay equal and symplectic, and lose order there. Arrays of run-time sizes, constraints, rotations,
             time transformations and double-double arithmetic have formulas alone (docs/events.md).
+        contacts: contacts and dry friction of the system, made by :func:`~scvi_codegen.contact` and
+            :func:`~scvi_codegen.friction`, in addition to its own. The method is an SVI of degree s with s + 1 Lobatto
+            points, ``"svi:3"``, in double precision.
 
     Raises:
         BuildError: if there is no C compiler.
@@ -110,6 +117,13 @@ def compile_stepper(
     check_precision(precision, flags)
     if sums not in SUMS:
         raise MethodError(f"unknown sums {sums!r}: use {' or '.join(map(repr, SUMS))}")
+    if kinks not in KINKS:
+        raise MethodError(f"unknown kinks {kinks!r}: use {' or '.join(map(repr, KINKS))}")
+    if any((*contacts, system.has_contacts)):
+        arguments = {"flags": flags, "prefix": prefix, "symmetries": symmetries, "events": events}
+        others = {"solver": solver, "precision": precision, "sizes": sizes, "tables": tables, "controller": controller}
+        others["time_transformation"] = time_transformation
+        return _compile_contacts(system, method, contacts, arguments, others)
     common: dict[str, Any] = {
         "solver": solver,
         "flags": flags,
@@ -117,12 +131,7 @@ def compile_stepper(
         "time_transformation": time_transformation,
         "controller": controller,
     }
-    if kinks not in KINKS:
-        raise MethodError(f"unknown kinks {kinks!r}: use {' or '.join(map(repr, KINKS))}")
-    if symmetries != ():
-        from scvi_codegen.systems.symmetry.symmetry import SYMMETRIES
-
-        check_kind(SYMMETRIES, symmetries, "symmetries")
+    _check_symmetries(symmetries)
     if isinstance(system, OfRunTimeSizes) and sizes is None and tables is None:
         return _compile_arrays(system, method, symmetries, as_events(events), precision, common, sums)
     if sums == "plain":
@@ -152,6 +161,30 @@ def compile_stepper(
         of_two_words._doubles = cache(compiled)
         return of_two_words.with_events(as_events(events))
     return stepper(events=as_events(events))
+
+
+def _check_symmetries(symmetries: Any) -> None:
+    """Raise an error for symmetries of other types."""
+    if symmetries != ():
+        from scvi_codegen.systems.symmetry.symmetry import SYMMETRIES
+
+        check_kind(SYMMETRIES, symmetries, "symmetries")
+
+
+def _compile_contacts(
+    system: MechanicalSystem,
+    method: Method | str,
+    contacts: Sequence[ContactLike],
+    arguments: Mapping[str, Any],
+    others: Mapping[str, Any],
+) -> Stepper:
+    """Return the stepper of a system with contacts; ``others`` are arguments that it does not support."""
+    if passed := [name for name, value in others.items() if value not in (None, "auto", "double")]:
+        raise MethodError(f"{passed[0]}={others[passed[0]]!r} is not available with contacts: omit it")
+    bound = bound_contacts(system, (*system.contacts, *contacts))
+    stepper = compile_stepper(bound.system, method, **arguments)
+    stepper._contacts = ContactsOfStepper(bound.rows, bound.events)
+    return stepper
 
 
 def _compile_arrays(

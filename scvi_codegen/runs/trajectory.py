@@ -22,6 +22,7 @@ from scvi_codegen.runs.accuracy.global_error import Confirmed, GlobalError
 from scvi_codegen.runs.accuracy.local_error import TOLERABLE_ERROR
 from scvi_codegen.runs.accuracy.resolution import unresolved_parts
 from scvi_codegen.runs.accuracy.size import relative
+from scvi_codegen.runs.contacts.driver import contact_forces, contact_modes
 from scvi_codegen.runs.derivatives.actions import actions_until, shadow_energy
 from scvi_codegen.runs.derivatives.trajectory_derivatives import TrajectoryDerivatives
 from scvi_codegen.runs.events.refinement import crossings_of
@@ -314,6 +315,24 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
             MethodError: if the system has no constraints.
         """
         return self._joined(lambda piece: multipliers(piece.stepper, piece.q, piece.p, piece.t, piece.parameters))
+
+    @property
+    def contact_modes(self) -> list[tuple[float, tuple[str, ...]]]:
+        """Times from which contacts have modes, ``"open"``, ``"stick"`` or ``"slip"`` of each, with these modes."""
+        modes: list[tuple[float, tuple[str, ...]]] = []
+        for run in self._runs:
+            names = contact_modes(run)
+            if not modes or modes[-1][1] != names:
+                modes.append((float(run.t[0]), names))
+        return modes
+
+    def contact_forces(self) -> Array:
+        """Return (n, k, 2) normal and tangential forces of the k contacts; at a transition those before it.
+
+        Raises:
+            MethodError: if the system has no contacts.
+        """
+        return concatenated([contact_forces(run) for run in self._runs])
 
     def constraint_values(self) -> tuple[Array, Array]:
         """Return (n, c) constraint residuals and (n, c) rates at the states, zero up to rounding."""

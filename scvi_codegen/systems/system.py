@@ -42,6 +42,7 @@ from scvi_codegen.systems.formulas.symbols import DOT, number, symbol
 if TYPE_CHECKING:
     from sympy import Expr, Symbol
 
+    from scvi_codegen.systems.constraints.contact import ContactLike
     from scvi_codegen.systems.constraints.kind import Reaction
     from scvi_codegen.systems.formulas.rotations import Homogeneous, Reduced
 
@@ -173,6 +174,7 @@ class MechanicalSystem(Deferred, ABC):
             (:mod:`scvi_codegen.systems.forces`).
         reactions: masks and directions of force of the last constraints, as of contacts
             (:class:`~scvi_codegen.systems.constraints.kind.Reaction`).
+        contacts: contacts and dry friction (:mod:`scvi_codegen.systems.constraints.contact`).
         arrays: declarations of the arrays of known sizes whose entries are coordinates and parameters.
         indices: sizes and index tables of these arrays by name, for events in index notation.
         lengths: cutoffs and periods of lists of neighbours
@@ -191,6 +193,7 @@ class MechanicalSystem(Deferred, ABC):
     forces: tuple[Expr, ...] = ()
     constraints: tuple[Expr, ...] = ()
     reactions: tuple[Reaction, ...] = ()
+    contacts: tuple[ContactLike, ...] = ()
     inputs: tuple[str, ...] = ()
     damping: Expr = field(default_factory=zero)
     arrays: tuple[Array, ...] = field(default=(), compare=False)
@@ -238,6 +241,11 @@ class MechanicalSystem(Deferred, ABC):
     def constrained_at_nodes(self) -> bool:
         """True if there are constraints, which an SVI imposes at its nodes; reads no formulas."""
         return bool(self.constraints if self._text is None else json.loads(self._text)[1]["constraints"])
+
+    @property
+    def has_contacts(self) -> bool:
+        """True if there are contacts whose modes are no parameters yet; reads no formulas."""
+        return self._text is None and bool(self.contacts) and not self.reactions
 
     @property
     def is_prescribed(self) -> bool:

@@ -81,6 +81,9 @@ SITUATIONS = {
     "for a first-order system": lambda: stepper_of(**FIRST_ORDER),
     "with events that change the state": lambda: stepper_of(events=sc.Event("q - 0.25", then={"p_q": "-p_q"})),
     "with constraints": lambda: stepper_of(**LOBATTO, constraints=["q - r = 0"]),
+    "with contacts": lambda: sc.compile_stepper(
+        sc.LagrangianSystem.from_text("body", ["q"], "q_dot**2/2 - q"), "svi:2", contacts=[sc.contact("q + 1")]
+    ),
     "with constraints of arrays": lambda: array_with_constraint("stoermer-verlet"),
     "with constraints of arrays by a composition": lambda: array_with_constraint("composition:4"),
     "with constraints that prescribe the motion": lambda: stepper_of(

@@ -130,3 +130,152 @@ def test_a_multiplier_is_an_event() -> None:
     run = sc.compile_stepper(system, "svi:4").integrate(start, velocity=[0, 0], t_end=5, events=leaves)
     assert run.q[-1, 1] == pytest.approx(2 / 3 * start[1], abs=1e-13)
     assert abs(run.multipliers()[-1, 0]) < 1e-13
+
+
+def of(text: str, coordinates: str, contacts: list[Any], method: str, **parameters: float) -> Any:
+    """Return the stepper of a system with contacts."""
+    system = sc.LagrangianSystem.from_text(
+        name="bodies", coordinates=coordinates.split(), lagrangian=text, parameters=parameters
+    )
+    return sc.compile_stepper(system, method, contacts=contacts)
+
+
+def sticks_at(run: Any) -> list[float]:
+    return [t for t, modes in run.contact_modes if "stick" in modes]
+
+
+PLANE = "(x_dot**2 + y_dot**2)/2"
+METHODS = pytest.mark.parametrize("degree", [1, 2, 3])
+
+
+@METHODS
+def test_a_sliding_ball_rolls(degree: int) -> None:
+    table = sc.contact("y - r", slip="x_dot - r*a_dot", friction=0.3)
+    text = "m*(x_dot**2 + y_dot**2)/2 + m*r**2*a_dot**2/5 - m*g*y"
+    stepper = of(text, "x y a", [table], f"svi:{degree}", m=2, r=0.5, g=9.81)
+    run = stepper.integrate([0, 0.5, 0], velocity=[4, 0, 0], h=0.05, t_end=2)
+    rolls = 8 / (7 * 0.3 * 9.81)
+    assert sticks_at(run) == pytest.approx([rolls], abs=1e-14)
+    assert run.velocity[-1, 0] == pytest.approx(20 / 7, abs=1e-13)
+    assert run.q[-1, 0] == pytest.approx(4 * rolls - 0.3 * 9.81 * rolls**2 / 2 + 20 / 7 * (2 - rolls), abs=1e-13)
+    assert np.allclose(run.contact_forces()[[0, -1], 0], [[19.62, -5.886], [19.62, 0]], atol=1e-12)
+    assert run.t[-1] == 2.0
+
+
+@pytest.mark.parametrize(("degree", "error"), [(1, 6e-5), (2, 5e-9), (3, 4e-13)])
+def test_a_ladder_leaves_the_wall(degree: int, error: float) -> None:
+    contacts = [sc.contact("y - cos(a)"), sc.contact("x - sin(a)")]
+    stepper = of(f"{PLANE} + a_dot**2/6 - g*y", "x y a", contacts, f"svi:{degree}", g=1)
+    run = stepper.integrate([np.sin(0.2), np.cos(0.2), 0.2], velocity=[0, 0, 0], h=0.05, t_end=2.6)
+    (_, closed), (leaves, after) = run.contact_modes
+    assert (closed, after) == (("slip", "slip"), ("slip", "open"))
+    row = int(np.searchsorted(run.t, leaves))
+    assert abs(np.cos(run.q[row, 2]) - 2 / 3 * np.cos(0.2)) < error
+
+
+@pytest.mark.parametrize(("degree", "error"), [(1, 4e-4), (2, 3e-8), (3, 4e-14)])
+def test_an_oscillator_on_a_belt_sticks_and_slips(degree: int, error: float) -> None:
+    belt = sc.contact("y", slip="x_dot - vb", friction=0.25, static_friction=0.4)
+    stepper = of(f"{PLANE} - x**2/2 - y", "x y", [belt], f"svi:{degree}", vb=0.3)
+    run = stepper.integrate([0, 0], velocity=[0.3, 0], h=0.05, t_end=30)
+    times = sticks_at(run)
+    period = 2 * 0.15 / 0.3 + 2 * (np.pi - np.arctan(0.15 / 0.3))
+    assert times[-1] - times[-2] == pytest.approx(period, abs=error)
+
+
+@pytest.mark.parametrize(("degree", "error"), [(1, 4e-6), (2, 1e-9), (3, 1e-13)])
+@pytest.mark.parametrize("gap", [True, False])
+def test_an_oscillator_stops_after_four_swings(degree: int, error: float, gap: bool) -> None:
+    dry: Any = sc.contact("y", slip="x_dot", friction=0.13) if gap else sc.friction("x_dot", limit=0.13)
+    stepper = of(f"{PLANE} - x**2/2{' - y' * gap}", "x y", [dry], f"svi:{degree}")
+    run = stepper.integrate([1, 0], velocity=[0, 0], h=0.1, t_end=20)
+    assert run.q[-1, 0] == pytest.approx(-0.04, abs=error)
+    assert sticks_at(run) == pytest.approx([4 * np.pi], abs=1e-2 if degree == 1 else 1e-6)
+    assert run.contact_forces()[-1, 0] == pytest.approx([float(gap), -0.04], abs=error)
+
+
+@pytest.mark.parametrize(("degree", "error"), [(1, 3e-3), (2, 2e-7), (3, 2e-11)])
+def test_a_falling_rod_sticks_and_slides(degree: int, error: float) -> None:
+    floor = sc.contact("y - cos(a)", slip="x_dot - cos(a)*a_dot", friction=0.3)
+    runs = [
+        of(f"{PLANE} + a_dot**2/6 - g*y", "x y a", [floor], f"svi:{s}", g=1).integrate(
+            [0, np.cos(0.1), 0.1], velocity=[0, 0, 0], t_end=3.8, **steps
+        )
+        for s, steps in ((degree, {"h": 0.1}), (4, {"h": 0.02}), (4, {"tolerance": 1e-12}))
+    ]
+    near, true, adaptive = (np.concatenate([run.q[-1], run.velocity[-1]]) for run in runs)
+    assert [modes for _, modes in runs[0].contact_modes] == [("stick",), ("slip",)]
+    assert np.abs(near - true).max() < error
+    assert np.abs(adaptive - true).max() < 1e-11
+
+
+def test_a_block_on_a_slope_creeps_nowhere() -> None:
+    for degrees, slides in ((20, False), (35, True)):
+        a = np.deg2rad(degrees)
+        floor = sc.contact("y", slip="x_dot", friction=0.5)
+        stepper = of(f"{PLANE} - 9.81*(c*y - s*x)", "x y", [floor], "svi:2", c=np.cos(a), s=np.sin(a))
+        run = stepper.integrate([0, 0], velocity=[0, 0], h=0.05, t_end=1)
+        expected = slides * 9.81 * (np.sin(a) - 0.5 * np.cos(a))
+        assert run.velocity[-1, 0] == pytest.approx(expected, rel=1e-14)
+        assert slides or not run.q.any()
+
+
+def test_a_bouncing_ball_comes_to_rest() -> None:
+    floor = sc.contact("y", restitution=0.7)
+    run = of("y_dot**2/2 - g*y", "y", [floor], "svi:2", g=9.81).integrate([1], velocity=[0], h=0.05, t_end=4)
+    assert [modes for _, modes in run.contact_modes] == [("open",), ("slip",)]
+    assert run.contact_modes[1][0] == pytest.approx(np.sqrt(2 / 9.81) * 1.7 / 0.3, abs=1e-7)
+    assert abs(run.q[-1, 0]) < 1e-60
+    assert run.contact_forces()[-1, 0, 0] == pytest.approx(9.81)
+
+
+@pytest.mark.parametrize(("tangent", "consistent"), [(0.30, True), (0.31, False), (0.81, False), (0.83, True)])
+def test_painleve_is_named_where_rigid_bodies_have_no_motion(tangent: float, consistent: bool) -> None:
+    floor = sc.contact("y - cos(a)", slip="x_dot - cos(a)*a_dot", friction=1.5)
+    stepper = of(f"{PLANE} + a_dot**2/6 - g*y", "x y a", [floor], "svi:2", g=1)
+    a = np.arctan(tangent)
+    start = {"velocity": [-3, 0, 0], "h": 1e-3, "steps": 1}
+    if consistent:
+        stepper.integrate([0, np.cos(a), a], **start)
+    else:
+        with pytest.raises(sc.ContactError, match=r"Painleve's paradox.*\(G - mu d T\)\^T = -0\.\d+ of contact 1"):
+            stepper.integrate([0, np.cos(a), a], **start)
+
+
+def test_the_balls_of_a_cradle_at_rest_contact() -> None:
+    contacts = [sc.contact("b - a - 1", restitution=1), sc.contact("c - b - 1", restitution=1)]
+    stepper = of("(a_dot**2 + b_dot**2 + c_dot**2)/2", "a b c", contacts, "svi:2")
+    run = stepper.integrate([-1, 1, 2], velocity=[1, 0, 0], h=0.1, t_end=2)
+    assert np.allclose(run.velocity[-1], [0, 0, 1], atol=1e-14)
+
+
+def on_floor() -> Any:
+    return of(PLANE, "x y", [sc.contact("y")], "svi:2")
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: sc.contact("y", friction=0.3), "friction=0.3 without slip="),
+        (lambda: sc.contact("y", slip="x_dot"), "slip='x_dot' without friction="),
+        (lambda: sc.contact("y", slip="x_dot", friction=-1), "friction=-1 .* is invalid"),
+        (lambda: sc.contact("y", slip="x_dot", friction=1, static_friction=0.5), "static_friction=0.5 .* less than"),
+        (lambda: sc.contact("y", restitution=1.5), "restitution=1.5"),
+        (lambda: sc.friction("x_dot", limit=2, static_limit=1), "static_limit=1 .* less than"),
+        (lambda: of(PLANE, "x y", [sc.contact("z")], "svi:2"), "z"),
+        (lambda: of(PLANE, "x y", [sc.contact("y + x_dot")], "svi:2"), "gap=.*x_dot"),
+        (lambda: of(PLANE, "x y", [sc.friction("x_dot**2", limit=1)], "svi:2"), "slip=.*linear in velocities.*x_dot"),
+        (lambda: of(PLANE, "x y", [sc.contact("y")], "gauss:4"), "contacts|constraints"),
+        (
+            lambda: of(PLANE, "x y", [sc.contact("y")], "svi:2").integrate([0, -1], [0, 0], h=1, t_end=1),
+            "gap of contact",
+        ),
+        (
+            lambda: of(PLANE, "x y", [sc.contact("y")], "svi:2").integrate_ensemble([[0, 1]], [[0, 0]], h=1, steps=1),
+            "cont",
+        ),
+    ],
+)
+def test_what_is_refused_is_named(make: Any, message: str) -> None:
+    with pytest.raises(sc.ScviCodegenError, match=message):
+        make()

@@ -146,6 +146,8 @@ class Constraints:
         reactions: 1 - mask of each constraint, then the nonzero entries of D at u = (q, v), whose forces are D^T
             lambda; ``None`` if all constraints are always imposed and ideal.
         directions: (k, i) of the entries of D.
+        masked: number of the last constraints, which are imposed in some modes only.
+        coefficients: friction, static friction and restitution of each contact at u = (q, v), or ``None``.
     """
 
     formulas: tuple[str, ...]
@@ -155,6 +157,8 @@ class Constraints:
     motion: Kernel
     reactions: Kernel | None = None
     directions: tuple[tuple[int, int], ...] = ()
+    masked: int = 0
+    coefficients: Kernel | None = None
 
     @property
     def count(self) -> int:

@@ -295,6 +295,7 @@ class Program:
                 constraints and constraints.rounding,
                 constraints and constraints.motion,
                 constraints and constraints.reactions,
+                constraints and constraints.coefficients,
                 self.damping,
                 *(rattle.kernels if rattle else ()),
             ),

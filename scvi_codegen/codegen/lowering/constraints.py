@@ -65,6 +65,7 @@ from scvi_codegen.systems.constraints import (
     time_derivatives,
     velocity_conditions,
 )
+from scvi_codegen.systems.constraints.contact import coefficients
 from scvi_codegen.systems.derived_expressions import forms_of
 from scvi_codegen.systems.lagrangian import LagrangianSystem
 from scvi_codegen.systems.system import MechanicalSystem
@@ -302,4 +303,12 @@ def _reactions(system: LagrangianSystem) -> dict[str, Any]:
             purpose="1 - mask of the constraints; nonzero entries of D at u = (q, v): forces D^T lambda.",
         ),
         "directions": tuple(directions),
+        "masked": len(system.reactions),
+        "coefficients": system_kernel(
+            system,
+            "contact_coefficients",
+            coefficients(system),
+            u=(*system.coordinates, *system.velocities),
+            purpose="Friction, static friction and restitution of each contact at u = (q, v).",
+        ),
     }

@@ -63,6 +63,7 @@ PROPERTIES: dict[str, Callable[[Any], bool]] = {
     "with constraints of arrays by a composition": lambda stepper: bool(
         stepper.interface.layout.constraints and stepper.interface.method.startswith("composition")
     ),
+    "with contacts": lambda stepper: stepper.interface.masked > 0,
     "without constraints": lambda stepper: not (stepper.interface.constraints or stepper.interface.layout.constraints),
     "with the long steps of this method": lambda stepper: not stepper.interface.method.startswith(SHORT_STEPS),
     "where the energy changes": lambda stepper: bool(stepper.interface.changes_energy),
@@ -134,6 +135,12 @@ FEATURES = {
             "with events that change the state",
             "error device observe_ensemble check_growth hessian chaos_ensemble flow advice shadow_energy",
             "make them terminal and restart",
+        ),
+        (
+            "with contacts",
+            "error check_growth t_eval observe inputs ensembles ensemble_events device observe_ensemble checkpoint "
+            f"recording {_DERIVATIVES} hessian advice",
+            "use integrate(q, velocity=.., h=.., t_end=..) or without h, and run.at(t)",
         ),
         ("with constraints", "device observe_ensemble", "use coordinates without constraints, or omit it"),
         ("with constraints", "periodic_orbit fit", "use coordinates without constraints, such as the angles of rods"),

@@ -405,4 +405,55 @@ int NAME(multipliers)(long long count, const real *t, const real *q, const real 
   }
   return OK;
 }
+#ifdef MASKED_CONSTRAINTS
+
+/* Masked constraints at a state, for the choice of their modes and for impacts: values g, rates G v + .., second rates
+ * without forces of these constraints, the matrix W = G M^-1 G^T by rows, G by rows, then the coefficients of the
+ * contacts. M^-1 includes the reactions of the other constraints. Parameters with masks of 0, and of 1. */
+int NAME(contact_terms)(real t, const real *q, const real *p, const real *idle, const real *imposed, real *terms,
+    real *workspace)
+{
+  enum { FIRST = CONSTRAINTS - MASKED };
+  saddle *at = saddle_in(workspace);
+  real *rate = terms + MASKED, *second = rate + MASKED, *W = second + MASKED, *G = W + MASKED * MASKED;
+  real u[2 * M], g[CONSTRAINTS], derivative[CONSTRAINT_ENTRIES], value[M + 2 * CONSTRAINTS], right[CONSTRAINTS] = {0};
+  real x[M], y[CONSTRAINTS];
+  int status = find_velocity(t, q, p, idle, u + M, workspace);
+  memcpy(u, q, sizeof(real) * M);
+  if (status == OK)
+    status = factorise_saddle(t, u, idle, at, g);
+  if (status != OK)
+    return status;
+  constraints(u, t, imposed, g, derivative);
+  constrained_motion(u, t, imposed, value);
+  memcpy(terms, g + FIRST, sizeof(real) * MASKED);
+  memcpy(rate, value + M + FIRST, sizeof(real) * MASKED);
+  memset(G, 0, sizeof(real) * MASKED * M);
+  for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
+    if (CONSTRAINT_ENTRY[e][0] >= FIRST)
+      G[(CONSTRAINT_ENTRY[e][0] - FIRST) * M + CONSTRAINT_ENTRY[e][1]] = derivative[e];
+  for (int k = 0; k < FIRST; k++)
+    right[k] = -value[M + CONSTRAINTS + k];
+  constrained_motion(u, t, idle, value);
+  for (int column = 0; column <= MASKED; column++) { /* the last one: free motion */
+    const int is_free = column == MASKED;
+    const real none[CONSTRAINTS] = {0};
+    solve_saddle(at, is_free ? value : G + column * M, is_free ? right : none, x, y);
+    for (int row = 0; row < MASKED; row++) {
+      real sum = 0;
+      for (int i = 0; i < M; i++)
+        sum += G[row * M + i] * x[i];
+      if (is_free)
+        second[row] = sum;
+      else
+        W[row * MASKED + column] = sum;
+    }
+  }
+  constrained_motion(u, t, imposed, value);
+  for (int k = 0; k < MASKED; k++)
+    second[k] += value[M + CONSTRAINTS + FIRST + k];
+  contact_coefficients(u, t, imposed, G + MASKED * M);
+  return all_finite(terms, MASKED * (3 + MASKED + M)) ? OK : NOT_FINITE;
+}
+#endif
 #endif

@@ -1,0 +1,165 @@
+"""Contacts with dry friction: definitions, and the constraints and forces of all their modes.
+
+A contact has a gap g(q, t) >= 0 and a slip w = T(q, t) v + b(q, t). Its mode is open (lambda = 0), stick (g = 0, w = 0)
+or slip in a direction d = +-1 (g = 0, tau = 0); the constraint forces are
+
+    (G - mu d T)^T lambda + T^T tau,     G = g_q,     lambda >= 0,     |tau| <= mu_s lambda.
+
+Sliding friction is thus a constraint with an oblique force. Friction without a gap has a limit F in place of mu lambda:
+w = 0 with |tau| <= F_s, or the force -F d T^T. The modes are parameters of the compiled step: ``closed``, ``sticks``
+(0 or 1) and ``direction`` (d, or 0) of each contact, all 0 by default.
+
+Sources: F. Pfeiffer, Ch. Glocker, *Multibody Dynamics with Unilateral Contacts* (1996); J. J. Moreau, in *Nonsmooth
+Mechanics and Applications*, CISM 302 (1988). That the multipliers of the stages suffice for the order of the step is
+measured (:mod:`scvi_codegen.methods.constraints`).
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
+
+from scvi_codegen.common.errors import SystemDefinitionError
+
+if TYPE_CHECKING:
+    from sympy import Expr
+
+Formula: TypeAlias = "str | Expr | float"
+"""A formula as text or a SymPy expression, or a number."""
+
+
+def _number(formula: Formula) -> float | None:
+    """Return the value of a formula that is a number, else ``None``."""
+    with suppress(TypeError, ValueError):
+        return float(cast(float, formula))
+    return None
+
+
+def _check_limits(shown: str, kinetic: tuple[str, Formula], static: tuple[str, Formula | None]) -> None:
+    """Raise :class:`SystemDefinitionError` for a negative coefficient, or a static one below that of sliding."""
+    slides, sticks = _number(kinetic[1]), None if static[1] is None else _number(static[1])
+    for (name, formula), value in zip((kinetic, static), (slides, sticks), strict=True):
+        if value is not None and not 0.0 <= value < float("inf"):
+            raise SystemDefinitionError(f"{name}={formula!r} of {shown} is invalid: give a number >= 0 or a formula")
+    if slides is not None and sticks is not None and sticks < slides:
+        raise SystemDefinitionError(
+            f"{static[0]}={static[1]!r} of {shown} is less than {kinetic[0]}={kinetic[1]!r}: give at least that, or "
+            f"omit {static[0]}"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Contact:
+    """Unilateral contact, made by :func:`contact`.
+
+    Attributes:
+        gap: distance g(q, t) that is >= 0.
+        slip: slip velocity w, linear in the velocities; ``None`` without friction.
+        friction: coefficient mu of sliding, a formula of (q, v, t) and parameters; ``None`` without friction.
+        static_friction: coefficient mu_s up to which the contact sticks; ``None``: mu.
+        restitution: coefficient e of impacts, v_n+ = -e v_n-.
+
+    Raises:
+        SystemDefinitionError: for friction without slip or slip without friction, and invalid coefficients.
+    """
+
+    gap: Formula
+    slip: Formula | None = None
+    friction: Formula | None = None
+    static_friction: Formula | None = None
+    restitution: Formula = 0.0
+
+    def __post_init__(self) -> None:
+        shown = f"the contact '{self.gap}'"
+        if (self.slip is None) != (self.friction is None):
+            passed, lacking = ("friction", "slip") if self.slip is None else ("slip", "friction")
+            raise SystemDefinitionError(
+                f"{shown} has {passed}={getattr(self, passed)!r} without {lacking}=: friction requires the slip "
+                "velocity, such as 'x_dot - r*a_dot', and a coefficient; omit both for a smooth contact"
+            )
+        if self.friction is None and self.static_friction is not None:
+            raise SystemDefinitionError(f"{shown} has static_friction= without friction=: give slip= and friction=")
+        if self.friction is not None:
+            _check_limits(shown, ("friction", self.friction), ("static_friction", self.static_friction))
+        e = _number(self.restitution)
+        if e is not None and not 0.0 <= e <= 1.0:
+            raise SystemDefinitionError(f"restitution={self.restitution!r} of {shown} is invalid: give 0 to 1")
+
+
+@dataclass(frozen=True, slots=True)
+class Friction:
+    """Dry friction without a gap, made by :func:`friction`.
+
+    Attributes:
+        slip: slip velocity w, linear in the velocities.
+        limit: friction force F of sliding, a formula of (q, v, t) and parameters.
+        static_limit: force up to which it sticks; ``None``: F.
+    """
+
+    slip: Formula
+    limit: Formula
+    static_limit: Formula | None = None
+
+    def __post_init__(self) -> None:
+        _check_limits(f"the friction '{self.slip}'", ("limit", self.limit), ("static_limit", self.static_limit))
+
+
+ContactLike: TypeAlias = "Contact | Friction"
+
+
+def contact(
+    gap: Formula,
+    *,
+    slip: Formula | None = None,
+    friction: Formula | None = None,
+    static_friction: Formula | None = None,
+    restitution: Formula = 0.0,
+) -> Contact:
+    """Return a unilateral contact of a system in the plane: gap >= 0 with normal force and Coulomb friction.
+
+    The gap must be a distance to first order, |g_q| = 1 in the units of the slip, because friction is mu times the
+    normal *force*: of a curve ``z - x**2/2`` divide by ``sqrt(1 + x**2)``.
+
+    Args:
+        gap: g(q, t), a formula in coordinates, time and parameters.
+        slip: w = T(q, t) v + b(q, t), the velocity of sliding, ``"x_dot - r*a_dot"``.
+        friction, static_friction: coefficients of sliding and of sticking friction, numbers or formulas.
+        restitution: coefficient of impacts, 0 to 1; with 0 the contact closes at once.
+
+    >>> contact("y - r", slip="x_dot - r*a_dot", friction=0.3).friction
+    0.3
+    """
+    return Contact(gap, slip, friction, static_friction, restitution)
+
+
+def friction(slip: Formula, *, limit: Formula, static_limit: Formula | None = None) -> Friction:
+    """Return dry friction without a gap, of joints and belts: sticking up to ``static_limit``, sliding with ``limit``.
+
+    >>> friction("x_dot - 0.3", limit="0.25", static_limit="0.4").limit
+    '0.25'
+    """
+    return Friction(slip, limit, static_limit)
+
+
+def static_limit(item: Any) -> Any:
+    """Return the coefficient or the force up to which a contact sticks."""
+    kinetic, static = (
+        (item.friction, item.static_friction) if isinstance(item, Contact) else (item.limit, item.static_limit)
+    )
+    return kinetic if static is None else static
+
+
+def coefficients(system: Any) -> list[Expr]:
+    """Return (friction, static friction, restitution) of each contact; limits, and 0, of friction without a gap."""
+    from sympy import S
+
+    values: list[Expr] = []
+    for item in system.contacts:
+        if isinstance(item, Contact):
+            none = item.friction is None
+            values += [S.Zero, S.Zero] if none else [cast("Expr", item.friction), static_limit(item)]
+            values.append(cast("Expr", item.restitution))
+        else:
+            values += [item.limit, static_limit(item), S.Zero]
+    return values

@@ -1,0 +1,183 @@
+"""Constraints, forces and transitions of contacts in all their modes, for one compiled step.
+
+Masks of the modes multiply the rows of constraints (:class:`~scvi_codegen.systems.constraints.kind.Reaction`);
+transitions are terminal events, whose functions are 1 in modes that they do not end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
+
+from scvi_codegen.common.errors import SystemDefinitionError
+from scvi_codegen.systems.constraints.contact import Contact, ContactLike, Friction, static_limit
+from scvi_codegen.systems.event import Event, Formula
+
+if TYPE_CHECKING:
+    from sympy import Expr, Symbol
+
+    from scvi_codegen.systems.lagrangian import LagrangianSystem
+
+
+class ContactRows(NamedTuple):
+    """Places of a contact among the masked rows and the parameters of a system; ``None`` for what it does not have.
+
+    Attributes:
+        normal, tangential: numbers of its rows among the masked constraints.
+        closed, sticks, direction: names of the parameters of its mode.
+    """
+
+    normal: int | None
+    tangential: int | None
+    closed: str | None
+    sticks: str | None
+    direction: str | None
+
+
+class BoundContacts(NamedTuple):
+    """System whose step has the modes of its contacts as parameters, with what a run needs of them.
+
+    Attributes:
+        system: with masked constraints and, as ``contacts``, the formulas as expressions.
+        rows: places of each contact.
+        events: transitions, in the order of the contacts: gap, normal force; slip, and friction at either limit.
+    """
+
+    system: LagrangianSystem
+    rows: tuple[ContactRows, ...]
+    events: tuple[Event, ...]
+
+
+def bound_contacts(system: Any, contacts: Sequence[ContactLike]) -> BoundContacts:
+    """Return the system with the constraints and forces of contacts in all their modes.
+
+    Raises:
+        SystemDefinitionError: for a system without contacts of this kind, unknown symbols, a gap with velocities, and a
+            slip that is not linear in them; the message names the formula and the symbol.
+    """
+    from scvi_codegen.systems.lagrangian import LagrangianSystem
+
+    if not isinstance(system, LagrangianSystem) or system.clock or system.gauge != 0 or system.rotations:
+        raise SystemDefinitionError(
+            f"contacts of '{system.name}' are not supported: they require a Lagrangian in named coordinates with "
+            "masses, without rotations and in physical time"
+        )
+    return _Binding(system).bound(contacts)
+
+
+class _Binding:
+    """Constraints, forces, parameters and events of the contacts of a system."""
+
+    def __init__(self, system: LagrangianSystem) -> None:
+        import sympy
+
+        from scvi_codegen.systems.formulas.symbols import input_formulas, symbol
+
+        self.sympy, self.system, self.symbol = sympy, system, symbol
+        own = (*system.coordinates, *system.velocities, system.time, *system.parameters)
+        self.names = {x.name: x for x in own} | {name: symbol(name) for name in system.inputs}
+        self.driven = input_formulas(system.inputs, system.time)
+        self.masks: list[Symbol] = []
+        self.constraints: list[Expr] = []
+        self.reactions: list[Any] = []
+        self.forces = [*(system.forces or (sympy.S.Zero,) * system.dimension)]
+        self.events: list[Event] = []
+
+    def bound(self, contacts: Sequence[ContactLike]) -> BoundContacts:
+        """Return the system with these contacts."""
+        expressions, rows = [], []
+        for number, item in enumerate(contacts, 1):
+            if not isinstance(item, Contact | Friction):
+                raise SystemDefinitionError(f"contacts are made by contact(..) and friction(..), not {item!r}")
+            names = {name: self._read(getattr(item, name), name, item) for name in item.__dataclass_fields__}
+            expressions.append(replace(cast("Any", item), **names))
+            rows.append(self._add(number, expressions[-1]))
+        system = replace(
+            self.system,
+            parameters=(*self.system.parameters, *self.masks),
+            defaults=(*self.system.defaults, *(0.0 for _ in self.masks)),
+            constraints=(*self.system.constraints, *self.constraints),
+            forces=tuple(self.forces) if any(self.forces) else (),
+            reactions=tuple(self.reactions),
+            contacts=tuple(expressions),
+        )
+        return BoundContacts(system, tuple(rows), tuple(self.events))
+
+    def _read(self, formula: Formula | None, role: str, item: ContactLike) -> Expr | None:
+        from scvi_codegen.systems.formulas.grammar import parse_expression
+
+        if formula is None:
+            return None
+        if isinstance(formula, str):
+            expression = parse_expression(formula, self.names)
+        else:
+            expression = self.sympy.nsimplify(self.sympy.sympify(formula), rational=True)
+            expression = expression.xreplace({x: self.names.get(x.name, x) for x in expression.free_symbols})
+        if unknown := sorted(x.name for x in expression.free_symbols - {*self.names.values()}):
+            raise SystemDefinitionError(
+                f"'{unknown[0]}' in {role}='{formula}' of a contact of '{self.system.name}' is not among its names: "
+                f"{', '.join(self.names)}"
+            )
+        return cast("Expr", expression.xreplace(self.driven))
+
+    def _mask(self, number: int, role: str) -> Symbol:
+        name = f"contact_{number}_{role}"
+        if name in self.names:
+            raise SystemDefinitionError(f"the name '{name}' of '{self.system.name}' is that of a contact: rename it")
+        self.masks.append(self.symbol(name))
+        return self.masks[-1]
+
+    def _row(self, formula: Expr, active: Symbol, direction: Sequence[Expr]) -> int:
+        """Add a masked constraint; return its number among them."""
+        from scvi_codegen.systems.constraints.kind import Reaction
+
+        self.constraints.append(formula)
+        self.reactions.append(Reaction(active=active, direction=tuple(direction)))
+        return len(self.constraints) - 1
+
+    def _multiplier(self, row: int) -> Symbol:
+        return self.symbol(f"lambda_{len(self.system.constraints) + row + 1}")
+
+    def _gradient(self, item: ContactLike, formula: Expr, variables: Sequence[Symbol], role: str) -> list[Expr]:
+        """Return the derivatives of a gap or a slip; raise unless they contain no velocities and do not vanish."""
+        gradient = [formula.diff(x) for x in variables]
+        moving = {x for entry in gradient for x in entry.free_symbols} & {*self.system.velocities}
+        if role == "gap":
+            moving = formula.free_symbols & {*self.system.velocities}
+        if moving or not any(gradient):
+            form = "a function of positions and time" if role == "gap" else "linear in velocities, and contain one"
+            raise SystemDefinitionError(
+                f"{role}='{formula}' of a contact of '{self.system.name}' must be {form}"
+                f"{f': it contains {min(map(str, moving))}' if moving else ''}"
+            )
+        return gradient
+
+    def _add(self, number: int, item: Any) -> ContactRows:
+        q, v = self.system.coordinates, self.system.velocities
+        of_gap, slip = isinstance(item, Contact), item.slip
+        along = None if slip is None else self._gradient(item, slip, v, "slip")
+        closed = self._mask(number, "closed") if of_gap else None
+        sticks = None if slip is None else self._mask(number, "sticks")
+        direction = None if slip is None else self._mask(number, "direction")
+        normal = tangential = None
+        if of_gap:
+            force = self._gradient(item, item.gap, q, "gap")
+            if along is not None:
+                force = [a - item.friction * direction * b for a, b in zip(force, along, strict=True)]
+            normal = self._row(item.gap, cast("Symbol", closed), force)
+            pushes = closed * self._multiplier(normal) + 1 - closed
+            self.events += [Event(item.gap + closed, -1, terminal=True), Event(pushes, -1, terminal=True)]
+        elif along is not None:
+            pairs = zip(self.forces, along, strict=True)
+            self.forces = [force - item.limit * direction * b for force, b in pairs]
+        if along is not None:
+            tangential = self._row(slip, cast("Symbol", sticks), along)
+            held = self._multiplier(normal) * static_limit(item) if normal is not None else static_limit(item)
+            tau = self._multiplier(tangential)
+            self.events += [
+                Event(direction * slip + 1 - cast("Symbol", direction) ** 2, -1, terminal=True),
+                *(Event(sticks * (held - sign * tau) + 1 - sticks, -1, terminal=True) for sign in (1, -1)),
+            ]
+        names = (x and x.name for x in (closed, sticks, direction))
+        return ContactRows(normal, tangential, *names)
