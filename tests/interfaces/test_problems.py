@@ -78,30 +78,6 @@ def test_double_pendulum_in_the_textbook_form() -> None:
     assert accelerations(system, values) == pytest.approx([first, second], rel=1e-12)
 
 
-@pytest.mark.second
-def test_outer_solar_system_satisfies_newtons_equations() -> None:
-    entry = problem("outer-solar-system")
-    system = entry.system
-    assert system.dimension == 18
-    defaults = dict(zip((parameter.name for parameter in system.parameters), system.defaults, strict=True))
-    q = np.array(entry.q).reshape(6, 3)
-    masses = np.array([defaults[f"m_{body}"] for body in ("sun", "jupiter", "saturn", "uranus", "neptune", "pluto")])
-    expected = np.zeros((6, 3))
-    for one in range(6):
-        for two in range(6):
-            if one != two:
-                distance = q[two] - q[one]
-                expected[one] += defaults["G"] * masses[two] * distance / np.linalg.norm(distance) ** 3
-    values = dict(zip(system.coordinates, entry.q, strict=True)) | dict(
-        zip(system.velocities, entry.velocity, strict=True)
-    )
-    values |= dict(zip(system.parameters, system.defaults, strict=True)) | {system.time: 0.0}
-    force = sympy.lambdify(list(values), [system.lagrangian.diff(coordinate) for coordinate in system.coordinates])
-    assert np.array(force(*values.values())) / np.repeat(masses, 3) == pytest.approx(expected.ravel(), rel=1e-12)
-    speed = np.linalg.norm(np.array(entry.velocity).reshape(6, 3)[1])
-    assert speed**2 / 2 - defaults["G"] / np.linalg.norm(q[1]) < 0
-
-
 @pytest.mark.parametrize("n", [1, 2, 5])
 def test_forces_of_a_chain(n: int) -> None:
     system = fput_chain(n, alpha=0.25, beta=0.5)

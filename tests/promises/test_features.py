@@ -228,10 +228,3 @@ def test_arguments_of_one_run_exclude_each_other():
 
 def test_page_lists_the_names_and_what_excludes_them():
     assert PAGE.endswith(refusals())
-
-
-@pytest.mark.second
-def test_known_sizes_of_rattle_compute_the_same_run():
-    stepper = array_with_constraint("stoermer-verlet")
-    run, known = (run_of(each, steps=30) for each in (stepper, stepper.with_sizes(N=2)))
-    assert np.abs(run.q["q"] - known.q["q"]).max() < 1e-14

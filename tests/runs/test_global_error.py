@@ -344,23 +344,6 @@ def kepler_stepper():
     return sc.compile_stepper(sc.problem("kepler").system, "svi:8")
 
 
-class TestWhatIsRefused:
-    @pytest.mark.parametrize(
-        ("given", "message"),
-        [
-            ({"h": 0.1, "steps": 10}, "error=1e-06 and h=0.1 both determine the step size"),
-            ({"t_end": 1.0, "tolerance": 1e-9}, "and tolerance=1e-09 both determine the step size"),
-            ({"t_end": 1.0, "error": 0.0}, "error=0 must be between 0 and 1"),
-            ({"t_end": 1.0, "error": math.nan}, "it must be finite"),
-            ({}, "t_end"),
-            ({"h": 0.1, "steps": 10, "error": None, "check_growth": True}, "requires adaptive steps"),
-        ],
-    )
-    def test_contradictory_arguments_are_rejected(self, kepler_stepper, given, message):
-        with pytest.raises(sc.StateError, match=message):
-            kepler_stepper.integrate([1.6, 0.0], [0.0, 0.5], **{"error": 1e-6, **given})
-
-
 def kepler_positions(e, t):
     """The exact motion from the pericentre, with a semi-major axis of 1, by Kepler's equation."""
     anomaly = t + e * np.sin(t)
