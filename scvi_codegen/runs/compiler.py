@@ -104,8 +104,8 @@ def compile_stepper(
             the number of steps (docs/lattices.md).
         kinks: zeros of the arguments of unit_step, abs, sign, min, max, where and positive_part along runs:
             ``"located"``, so that steps end there and keep their order; or ``"as formulas"``, so that steps of equal
-            size stay equal and symplectic, and lose order there. Arrays of run-time sizes, constraints, rotations,
-            time transformations and double-double arithmetic have formulas alone (docs/events.md).
+            size stay equal and symplectic, and lose order there. Arrays of run-time sizes, time transformations and
+            double-double arithmetic have formulas alone (docs/events.md).
         contacts: contacts and dry friction of the system, made by :func:`~scvi_codegen.contact` and
             :func:`~scvi_codegen.friction`, in addition to its own. The method is an SVI of degree s with s + 1 Lobatto
             points, ``"svi:3"``, in double precision.

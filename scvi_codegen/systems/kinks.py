@@ -33,15 +33,14 @@ FORMULAS = ("lagrangian", "hamiltonian", "forces")
 def located_kinks(system: MechanicalSystem) -> tuple[MechanicalSystem, tuple[Kink, ...]]:
     """Return the system with a mode for each of its switching functions, and these; itself if it has none.
 
-    Systems in transformed time, with constraints or rotations, and with more than ``MOST_KINKS`` switching functions
-    stay as they are.
+    Systems in transformed time, and with more than ``MOST_KINKS`` switching functions, stay as they are.
     """
     owned = [field.name for field in fields(system) if field.name in FORMULAS]
     formulas = [formula for name in owned for formula in _formulas(getattr(system, name))]
     steps = sorted(parts_of_type(unit_step, *formulas), key=str)
     located = [step for step in steps if _moves(step, system) and _goes_on(step, formulas)]
     arguments = {switching_function(step.args[0])[0] for step in located}
-    if not arguments or len(arguments) > MOST_KINKS or system.clock or system.constraints or system.rotations:
+    if not arguments or len(arguments) > MOST_KINKS or system.clock:
         return system, ()
     taken = {free.name for formula in formulas for free in formula.free_symbols}
     numbers = (k for k in range(1, 10**6) if f"mode_{k}" not in taken)

@@ -73,15 +73,15 @@ static int refine_crossing(const event_step *step, long long first, event_sample
   status = evaluate_function(step, FUNCTION_OF(crossing), at);
   if (status != OK || !(IS_IMPACT[crossing->function] || is_kink(crossing->function)))
     return status;
+#ifdef EVENT_CONSTRAINTS
+  return status; /* a constrained step of the size of rounding is ill-conditioned */
+#endif
   if (is_kink(crossing->function)) {
     status = rate_along(step, FUNCTION_OF(crossing), at, &wall.rate);
   } else {
     status = changes_at(step, FUNCTION_OF(crossing), at, &wall);
   }
   back = at->g / wall.rate; /* in the direction of the run */
-#ifdef EVENT_CONSTRAINTS
-  back = 0.0; /* a constrained step of the size of rounding is ill-conditioned */
-#endif
   least = is_kink(crossing->function) ? -CHANGE_SAFETY * DBL_EPSILON * fabs(step->h) : 0.0;
   if (status != OK || !(back > least && back <= CHANGE_SAFETY * DBL_EPSILON * fabs(step->h)))
     return status;

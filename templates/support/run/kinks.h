@@ -16,8 +16,13 @@ static int is_kink(int event)
 #ifdef EVENT_KINKS
 #define KINK_SIDE 0x1p1000 /* beyond all values of u: the sign of u + mode is that of the mode */
 
+#ifdef EVENT_CONSTRAINTS
+#define KINK_FIRST_PROBE 10 /* shorter steps are ill-conditioned */
+#else
+#define KINK_FIRST_PROBE 25 /* 2^-25 of a step after its start u may have left zero */
+#endif
+
 enum {
-  KINK_FIRST_PROBE = 25, /* 2^-25 of a step after its start u may have left zero */
   KINK_LAST_PROBE = 5,
   KINK_SEARCHES = 64 /* steps after which a far kink is searched for, too */
 };
