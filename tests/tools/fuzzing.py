@@ -148,7 +148,7 @@ EXTREME = (
 NAMES = "x y z x x y t pi q q_dot p m sin exp e E I oo nan inf zoo S N Q".split()  # noqa: SIM905
 FUNCTIONS = """
     sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh exp log sqrt sqrt sin cos abs Abs eval __import__
-    lambdify Integer Symbol sign gamma
+    lambdify Integer Symbol sign gamma max min where positive_part unit_step
 """.split()  # noqa: SIM905
 OPERATORS = ["+", "-", "*", "/", "**", "+", "*", " - ", " + "]
 POISON = [
