@@ -70,45 +70,7 @@ def test_slices_have_the_states_of_the_run(steppers):
         observed[0]
 
 
-class TestControlledSteps:
-    @pytest.mark.second
-    @pytest.mark.parametrize("tolerance", [1e-4, 1e-6, 1e-9])
-    def test_error_satisfies_the_tolerance(self, steppers, tolerance):
-        stepper, other = steppers
-        run = stepper.integrate(Q, velocity=V, t_end=10.0, tolerance=tolerance)
-        exact = other.integrate(Q, velocity=V, t_end=10.0).q[-1]
-        assert run.step_error <= 2.0 ** (14 / 4) * tolerance  # one level of the step-size grid too many, at order 12
-        error = np.abs(run.q["q"][-1] - exact).max() / np.abs(exact).max()
-        assert error < 10.0 * run.steps * tolerance
-        assert error > 1e-3 * tolerance  # no more work than was asked for
-
-
-class TestStatesBetween:
-    @pytest.mark.second
-    def test_unsaved_states_are_not_available(self, steppers):
-        run = steppers[0].integrate(Q, h=0.1, steps=4, observe=lambda run: run.energy)
-        with pytest.raises(sc.StateError, match="omit observe"):
-            run.at(0.15)
-        with pytest.raises(sc.StateError, match="outside the trajectory"):
-            steppers[0].integrate(Q, h=0.1, steps=4).at(0.5)
-
-
 class TestEvents:
-    @pytest.mark.second
-    def test_new_state_has_the_opposite_sign(self, steppers):
-        run = steppers[0].integrate(Q, velocity=V, t_end=6.0, tolerance=1e-9, events="q[1] - q[2]")
-        assert len(run.events[0]) > 1
-        signs = np.sign(run.events[0].q["q"][:, 1] - run.events[0].q["q"][:, 2])
-        assert (signs[1:] * signs[:-1] <= 0).all()
-
-    def test_run_continues_after_a_terminal_event(self, steppers):
-        stepper, _ = steppers
-        first = stepper.integrate(Q, velocity=V, h=0.1, steps=100, events=sc.Event("q[1] - q[2]", terminal=True))
-        again = stepper.integrate(
-            first.q["q"][-1], first.p["q"][-1], t=first.t[-1], h=0.1, steps=20, events="q[1] - q[2]"
-        )
-        assert (again.events[0].t > first.t[-1] + 0.1).all()
-
     @pytest.mark.second
     def test_invalid_events_are_rejected(self, steppers):
         stepper, _ = steppers
