@@ -201,10 +201,13 @@ def _name(variable: Any) -> str:
 def _condition(condition: Any) -> Formula:
     """Return the formula that is >= 0 where a condition is satisfied, ``"x > 1"`` or a SymPy relation."""
     if isinstance(condition, str):
-        sides = COMPARISON.split(condition)
-        if len(sides) == 3 and sides[0].strip() and sides[2].strip():
-            left, right = (sides[0], sides[2]) if sides[1][0] == ">" else (sides[2], sides[0])
-            return f"({left.strip()}) - ({right.strip()})"
+        parts = COMPARISON.split(condition)
+        before = ["".join(parts[:k]) for k in range(len(parts))]  # of operators, in odd places, and of formulas
+        outer = [k for k in range(1, len(parts), 2) if before[k].count("(") == before[k].count(")")]
+        sides = (before[outer[0]].strip(), "".join(parts[outer[0] + 1 :]).strip()) if len(outer) == 1 else ("", "")
+        if all(sides):
+            left, right = sides if parts[outer[0]][0] == ">" else sides[::-1]
+            return f"({left}) - ({right})"
     elif hasattr(condition, "gts"):
         return cast(Formula, condition.gts - condition.lts)
     raise EventError(f"where= must be a comparison such as 'x > 1', or several of them, not {condition!r}")

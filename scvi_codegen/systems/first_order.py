@@ -28,6 +28,7 @@ from sympy import Expr, Symbol
 
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.common.representation import counted, summary
+from scvi_codegen.systems.checks.continuity import irregularity
 from scvi_codegen.systems.formulas.expressions import SAMPLES, dot, hessian, samples, sums_to_zero
 from scvi_codegen.systems.formulas.intermediates import written_out
 from scvi_codegen.systems.formulas.symbols import DOT, inputs_by_name, symbol
@@ -234,6 +235,9 @@ def first_order_system(fields: Mapping[str, Any]) -> FirstOrderSystem | None:
                 f"{key}: {reason}. Leave it out, or add the missing kinetic energy, such as "
                 f"m*{velocities[0]}**2/2"
             )
+    moving, constants = (*coordinates, *velocities), dict(zip(fields["parameters"], fields["defaults"], strict=True))
+    if problem := irregularity(lagrangian, f"the Lagrangian of '{name}'", moving, velocities, constants):
+        raise SystemDefinitionError(problem)
     form = OneForm(name, lagrangian, coordinates, velocities, fields["time"])
     common = {key: fields[key] for key in ("name", "time", "parameters", "defaults", "inputs") if key in fields}
     inputs = fields.get("inputs", ())

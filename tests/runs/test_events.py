@@ -443,6 +443,8 @@ def test_equal_events_are_parsed_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.quick
 def test_tuples_of_events_and_conditions_are_those_of_lists():
+    inner = sc.Event("x", where="where(y > 0, 1, x) >= max(x, where(x < y, 2, 3))")
+    assert inner.conditions == ("(where(y > 0, 1, x)) - (max(x, where(x < y, 2, 3)))",)
     wall, where = sc.Event("x", where=["y > 0", "y < 2"]), ("y > 0", "y < 2")
     assert wall.where == sc.Event("x", where=where).where == where
     assert [each.function for each in as_events(("x", wall))] == [each.function for each in as_events(["x", wall])]
