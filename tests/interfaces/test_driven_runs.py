@@ -137,15 +137,3 @@ def test_terminal_event_is_the_last_saved_state(model, inputs):
     with np.load("run.npz") as file:
         assert (np.diff(file["t"]) > 0.0).all()
         assert abs(file["q"][-1] - 0.5) < 1e-13
-
-
-def test_ensemble_of_adaptive_runs_with_inputs(model):
-    text = Path("pushed.toml").read_text()
-    Path("pushed.toml").write_text(text.replace("step = 0.1", "tolerance = 1e-10"))
-    Path("grid.csv").write_text("q,p_q\n0.1,0.0\n0.2,1.0\n")
-    output_of(*RUN, "--ensemble", "grid.csv", "-o", "many.npz")
-    stepper = compile_stepper(model.system, model.method)
-    with np.load("many.npz") as file:
-        for j, (q, p) in enumerate([(0.1, 0.0), (0.2, 1.0)]):
-            one = stepper.integrate([q], [p], inputs=dict(model.inputs), t_end=2.3, tolerance=1e-10)
-            assert (file["q"][: len(one), j] == one.q).all()

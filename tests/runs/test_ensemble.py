@@ -772,18 +772,6 @@ def test_files_contain_the_energies_of_each_segment(tmp_path):
     assert (tmp_path / "runs.csv").read_text().splitlines()[0] == "trajectory,t,q,p_q"
 
 
-def test_ensemble_to_end_times_over_a_cluster() -> None:
-    pytest.importorskip("distributed")
-    from scvi_codegen.interfaces.distributed import integrate_ensemble
-
-    stepper, ends = stepper_of("eccentric", sc.SVI(4)), np.tile(ENDS, 4)
-    q, p = (np.tile(x, (4, 1)) for x in states("eccentric", 4))
-    here = stepper.integrate_ensemble(q, p, t_end=ends, tolerance=1e-10)
-    there = integrate_ensemble(stepper, q, p, t_end=ends, tolerance=1e-10, blocks=2)
-    for name in ("times", "q", "p", "steps"):
-        assert np.array_equal(getattr(here, name), getattr(there, name), equal_nan=True)
-
-
 def test_files_contain_individual_times(tmp_path: Path) -> None:
     runs = CASES["adaptive"].run(save_every=5)
     runs.save(tmp_path / "e.csv")
@@ -796,18 +784,6 @@ def test_files_contain_individual_times(tmp_path: Path) -> None:
     dataset = runs.to_xarray()
     assert np.array_equal(dataset.time, runs.times, equal_nan=True)
     assert np.array_equal(np.isfinite(dataset.energy), np.isfinite(runs.times))
-
-
-def test_command_line_runs_a_grid(here: Path) -> None:
-    Path("k.toml").write_text(
-        '[system]\ncatalogue = "kepler"\n[method]\nmethod = "svi"\ndegree = 4\n[run]\ntolerance = 1e-9\nspan = 9\n'
-    )
-    Path("grid.toml").write_text("[grid]\nq1 = [0.5, 0.7]\nmu = [1.0, 1.1]\n")
-    done = invoke("run", "k.toml", "--ensemble", "grid.toml", "-o", "grid.npz")
-    assert "adaptive steps from t = 0 to t = 9" in done.output
-    assert "4 ok" in done.output
-    with np.load("grid.npz") as file:
-        assert (np.nanmax(file["t"], axis=0) == 9.0).all()
 
 
 @pytest.mark.rotated
