@@ -10,6 +10,7 @@ from sympy import Add, Expr, S, Symbol
 
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.common.representation import summary
+from scvi_codegen.systems.checks.continuity import kink_in_velocities, velocity_message
 from scvi_codegen.systems.formulas.expressions import evaluated, hessian
 from scvi_codegen.systems.formulas.kinks import rint, unit_step
 from scvi_codegen.systems.formulas.symbols import TIME, symbol
@@ -60,6 +61,8 @@ class Density:
     def _check_regular(self) -> None:
         """Raise an error unless the kinetic part is a sum of m u_t^2/2 with m > 0 of position and parameters."""
         rates = self.rates
+        if kink := kink_in_velocities(self.density, rates):
+            raise SystemDefinitionError(velocity_message(f"the density of '{self.name}'", *kink))
         masses = hessian(self.density, rates)
         for (i, j), entry in masses.items():
             if i != j:

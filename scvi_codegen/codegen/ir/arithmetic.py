@@ -118,7 +118,12 @@ class _Graph:
         content = self.nodes[node]
         if isinstance(content, tuple) and content[0] == "neg":
             sign, node = -sign, content[1][0]
-        return node if sign > 0 else self.node(("-", (self.read(sympy.S.Zero), node)))
+        if sign > 0:
+            return node
+        content = self.nodes[node]
+        if isinstance(content, tuple) and content[0] == "-":
+            return self.node(("-", content[1][::-1]))
+        return self.node(("-", (self.read(sympy.S.Zero), node)))
 
     def _sum(self, expression: sympy.Add) -> int:
         """Return the node of ``sum_i c_i x_i = c sum_i (c_i / c) x_i``, c the content of the c_i with the first sign.
