@@ -329,7 +329,7 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
       set_run(run, ends ? run->t : at.t, &at);
 #if defined(EVENT_KINKS) && EVENTS_CONTROLLED
       if (adaptive)
-        run->error_before = 0.0; /* the next step size is searched for as that of a start */
+        run->error_before = 0.0, run->steps_to_compare = 1; /* the next step is found and compared as the first one */
 #endif
       return OK;
     }
