@@ -8,7 +8,7 @@ document.addEventListener("DOMContentLoaded", () => {
   const box = document.getElementById("own");
   if (!box) return;
   const [lagrangian, values] = box.querySelectorAll("textarea, div"), model = box.querySelector("pre"), note = box.querySelector(".note"), copy = box.querySelector("button");
-  const FUNCTIONS = new Set("sin cos tan asin acos atan atan2 sinh cosh tanh exp log sqrt Abs sign Min Max pi E t sum".split(" "));
+  const FUNCTIONS = new Set("sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh exp log sqrt rint unit_step wrap positive_part abs sign min max where pi t sum".split(" "));
   const numbers = {}; // by key, as typed
 
   /** Returns what is wrong with a formula in one line, or nothing. */

@@ -20,6 +20,7 @@ from docutils.utils.math.latex2mathml import tex2mathml
 from pages import BLOCK, ROOT, Part, agree, run_command, run_page, runnable
 
 import scvi_codegen
+from scvi_codegen.systems.formulas.expressions import CONSTANTS, FUNCTIONS
 
 DOCS = ROOT / "docs"
 PAGES = {str(path.relative_to(DOCS)): path.read_text(encoding="utf-8") for path in sorted(DOCS.rglob("*.md"))}
@@ -56,6 +57,14 @@ def test_code_blocks_have_known_languages_and_links_have_targets(name):
 def test_the_reference_contains_every_public_name_once():
     pages = "".join(page for name, page in PAGES.items() if name.startswith("reference/"))
     assert sorted(re.findall(r"^\.\. auto\w+:: (\w+)", pages, re.MULTILINE)) == sorted(scvi_codegen.__all__)
+
+
+def test_functions_of_formulas_are_listed_for_readers_and_for_the_editor_of_the_site():
+    names = {*FUNCTIONS, *CONSTANTS}
+    script = (DOCS / "_static" / "motions.js").read_text(encoding="utf-8")
+    assert {*re.findall(r'FUNCTIONS = new Set\("([^"]*)"', script)[0].split()} == names | {"t", "sum"}
+    section = PAGES["systems.md"].partition("## Functions in formulas")[2].partition("```python")[0]
+    assert names - {*re.findall(r"`(\w+)", section)} == {"acos", "acosh", "asinh", "atan", "atanh"}  # "their inverses"
 
 
 def test_every_page_is_in_a_table_of_contents():
