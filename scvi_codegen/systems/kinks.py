@@ -56,7 +56,8 @@ def located_kinks(system: MechanicalSystem) -> tuple[MechanicalSystem, tuple[Kin
     changes["defaults"] = (*system.defaults, *(0.0 for _ in modes))
     for name, value in (changes | {"_key": None, "_text": None}).items():
         object.__setattr__(with_modes, name, value)
-    return with_modes, tuple(Kink(system.text_of(u), mode=mode.name) for u, mode in modes.items())
+    functions = {mode.name: system.text_of(u.xreplace(rules)) for u, mode in modes.items()}  # u may contain kinks, too
+    return with_modes, tuple(Kink(function, mode=mode) for mode, function in functions.items())
 
 
 def _formulas(value: Any) -> tuple[Expr, ...]:

@@ -17,12 +17,14 @@ from scvi_codegen.systems.event import (
     ACCUMULATED,
     BEHIND,
     JAMMED,
+    PASSED,
     SLIDING,
     THROUGH,
     UNDEFINED,
     UNDEFINED_CHANGE,
     Crossings,
     Event,
+    Kink,
     Switches,
 )
 
@@ -161,7 +163,11 @@ class CrossingSearch:
         for name, message in messages.items():
             number = getattr(self.watch, name, 0)
             if number and not (name == "accumulated" and self.ended):
-                function = self.stepper.searched[abs(number) - 1].function
+                event = self.stepper.searched[abs(number) - 1]
+                function, message = (
+                    event.function,
+                    PASSED if message is THROUGH and isinstance(event, Kink) else message,
+                )
                 return EventError(message.format(function=function, t=report.t, g=behind))
         return step_failure(status, report, step=step, h=h, failures=self.binding.failures)
 

@@ -299,6 +299,10 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
       if (changes > 0)
         set_run(run, run->t, &right);
       status = check_walls(step, &left, &right);
+#ifdef EVENT_KINKS
+      if (status == OK)
+        status = check_sides(step, &right);
+#endif
       return status == OK ? store_state(to, &right, length, iterations, run->step, step->report) : status;
     }
     if (status == OK && EVENTS > EVENT_FEW && !step->rounding_known) {

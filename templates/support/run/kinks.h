@@ -145,6 +145,25 @@ static int change_sides(const event_step *step, long long first, const event_sam
   return status;
 }
 
+/* Fails if a function has the sign of the other side at the end of a step in which no crossing was found. */
+static int check_sides(const event_step *step, const event_sample *right)
+{
+  const real *const value = values_at(step, EVENT_DEGREE);
+  int doubtful = 0, status = OK;
+  for (int k = 0; k < EVENT_KINKS; k++)
+    doubtful |= value[EVENT_FIRST[FIRST_KINK + k]] * (step->watch->side[k] / KINK_SIDE) < 0.0;
+  if (!doubtful)
+    return OK;
+  memcpy(values_at(step, 0), value, BYTES(EVENTS));
+  status = rounding_of(step, right);
+  for (int k = 0; status == OK && k < EVENT_KINKS; k++)
+    if (side_of(step, k, value) * step->watch->side[k] < 0.0) {
+      step->watch->through = FIRST_KINK + k + 1;
+      return NOT_CONVERGED;
+    }
+  return status;
+}
+
 /* Whether no kink is reached in a step: each function is farther from zero than KINK_FAR times its change, by the
  * control points of the cubic Hermite polynomial of a position, u(q0 + h v0 / 3) and u(q1 - h v1 / 3), and by its rate
  * of change in former steps. */
