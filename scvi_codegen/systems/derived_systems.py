@@ -52,6 +52,10 @@ def change_coordinates(
     >>> sympy.simplify(polar.lagrangian - expected.lagrangian)
     0
     """
+    if system.has_contacts:
+        raise SystemDefinitionError(
+            f"the contacts of '{system.name}' are in its coordinates: pass contacts= in the new ones to compile_stepper"
+        )
     names = [q.name for q in system.coordinates]
     for name in old:
         if name not in names:
@@ -128,7 +132,7 @@ def with_tangent_vectors(system: LagrangianSystem, count: int) -> LagrangianSyst
     ``None`` unless it is separable and unconstrained. The momenta of a tangent vector are variations of p.
     """
     forms = forms_of(system)
-    if not forms.separable or system.constraints or system.clock:
+    if not forms.separable or system.constrained_at_nodes or system.clock:
         return None
     word = "change"
     while any(f"_{word}" in variable.name for variable in (*system.coordinates, *system.parameters)):

@@ -11,6 +11,7 @@ from scvi_codegen.systems.arrays.reading import arrays_from_sympy, arrays_from_t
 from scvi_codegen.systems.arrays.system import ArraySystem
 from scvi_codegen.systems.checks.definition import warn_of_mistakes
 from scvi_codegen.systems.constraints import constraint_sides, constraints_of, rate_of_positions
+from scvi_codegen.systems.constraints.contact import contacts_of, names_in
 from scvi_codegen.systems.forces import damping_rate
 from scvi_codegen.systems.formulas.rotations import RotationNames
 from scvi_codegen.systems.formulas.symbols import (
@@ -47,6 +48,8 @@ def system_from_text(cls: Any, arguments: Mapping[str, Any]) -> tuple[Any, bool]
     turning = [arguments.get(key) for key in TURNING]
     declared = (parameters, arguments["tables"], *turning)
     if are_arrays(ordinary, *(declarations or () for declarations in declared)) or arguments.get("neighbours"):
+        if arguments.get("contacts"):
+            raise SystemDefinitionError(f"contacts of '{arguments['name']}' require named coordinates, without arrays")
         if arguments.get("point_forces"):
             raise SystemDefinitionError("point_forces of arrays are not supported: give torques and forces by index")
         return _of_arrays(cls, arrays_from_text(arguments)), True
@@ -77,6 +80,7 @@ def system_from_text(cls: Any, arguments: Mapping[str, Any]) -> tuple[Any, bool]
         values=values,
         definition=definition_of(arguments) if names.members else {},
         inputs=tuple(inputs),
+        **({"contacts": contacts_of(arguments["contacts"])} if arguments.get("contacts") else {}),
     )
 
 
@@ -129,7 +133,8 @@ def _system(
         defaults=tuple(number(parameter, value) for parameter, value in values.items()),
         **others,
     )
-    return system, warn_of_mistakes(system)
+    used = (symbol(name) for item in others.get("contacts", ()) for name in names_in(item))
+    return system, warn_of_mistakes(system, used)
 
 
 def system_from_sympy(

@@ -122,6 +122,7 @@ def _mark(names: set[str]) -> str:
 def _check_supported(system: MechanicalSystem) -> None:
     for part, value in (
         ("constraints", system.constraints),
+        ("contacts", system.has_contacts),
         ("damping", system.damping != 0),
         ("transformed time", system.clock),
     ):

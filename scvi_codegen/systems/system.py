@@ -28,7 +28,7 @@ from __future__ import annotations
 
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, Self
 
@@ -117,6 +117,12 @@ def _text_of(cls: type, arguments: Mapping[str, Any]) -> str | None:
         return json.dumps([f"{cls.__module__}.{cls.__qualname__}", plain])
     except (TypeError, ValueError):
         return None
+
+
+def tables_of_contacts(contacts: Iterable[Any]) -> list[dict[str, Any]]:
+    """Return contacts and tables as tables of their arguments, as of ``[[contacts]]`` in model files."""
+    plain = (item if isinstance(item, Mapping) else item.table for item in contacts)
+    return [dict(table) for table in plain]
 
 
 def are_arrays(*declarations: Any) -> bool:
@@ -239,13 +245,17 @@ class MechanicalSystem(Deferred, ABC):
 
     @property
     def constrained_at_nodes(self) -> bool:
-        """True if there are constraints, which an SVI imposes at its nodes; reads no formulas."""
-        return bool(self.constraints if self._text is None else json.loads(self._text)[1]["constraints"])
+        """True if there are constraints or contacts, which an SVI imposes at its nodes; reads no formulas."""
+        return self.has_contacts or bool(
+            self.constraints if self._text is None else json.loads(self._text)[1]["constraints"]
+        )
 
     @property
     def has_contacts(self) -> bool:
         """True if there are contacts whose modes are no parameters yet; reads no formulas."""
-        return self._text is None and bool(self.contacts) and not self.reactions
+        if self._text is None:
+            return bool(self.contacts) and not self.reactions
+        return bool(json.loads(self._text)[1].get("contacts"))
 
     @property
     def is_prescribed(self) -> bool:

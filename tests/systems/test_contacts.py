@@ -1,5 +1,6 @@
 """Contacts: constraints in some modes only, whose forces are oblique where they slide."""
 
+import pickle
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -279,3 +280,77 @@ def on_floor() -> Any:
 def test_what_is_refused_is_named(make: Any, message: str) -> None:
     with pytest.raises(sc.ScviCodegenError, match=message):
         make()
+
+
+MODEL = """
+[system]
+name = "ball"
+coordinates = ["x", "y", "a"]
+lagrangian = "m*(x_dot**2 + y_dot**2)/2 + m*r**2*a_dot**2/5 - m*g*y"
+
+[[contacts]]
+gap = "y - r"
+slip = "x_dot - r*a_dot"
+friction = "mu"
+
+[parameters]
+m = 2.0
+r = 0.5
+g = 9.81
+mu = 0.3
+
+[initial]
+q = [0.0, 0.5, 0.0]
+q_dot = [4.0, 0.0, 0.0]
+
+[method]
+method = "svi"
+degree = 3
+
+[run]
+step = 0.05
+span = 2.0
+"""
+
+
+@pytest.mark.filterwarnings("error")
+def test_contacts_are_part_of_a_system_and_of_its_model_file(tmp_path: Any) -> None:
+    (tmp_path / "ball.toml").write_text(MODEL)
+    model = sc.load_model(tmp_path / "ball.toml")
+    assert model.system.contacts == (sc.contact("y - r", slip="x_dot - r*a_dot", friction="mu"),)
+    sc.save_model(model, tmp_path / "again.toml")
+    assert sc.load_model(tmp_path / "again.toml") == model
+    run = model.integrate()
+    copy = pickle.loads(pickle.dumps(sc.compile_stepper(model.system, "svi:3")))
+    again = copy.integrate(model.q, velocity=[4, 0, 0], h=0.05, t_end=2)
+    assert sticks_at(run) == pytest.approx([8 / (7 * 0.3 * 9.81)], abs=1e-14)
+    for name in ("t", "q", "p"):
+        assert np.array_equal(getattr(run, name), getattr(again, name))
+    with pytest.raises(sc.SystemDefinitionError, match="contacts of 'ball' are in its coordinates"):
+        sc.change_coordinates(model.system, {"y": "z + r"}, coordinates=["z"])
+    with pytest.raises(sc.MethodError, match="contacts of 'ball' require compile_stepper"):
+        sc.generate_source(model.system, "svi:3")
+
+
+def test_three_contacts_of_a_woodpecker_lead_to_its_cycle() -> None:
+    system = sc.LagrangianSystem.from_text(
+        name="woodpecker",
+        coordinates=["y", "u", "s"],
+        lagrangian="(mS + mM)*y_dot**2/2 + mS*lM*y_dot*u_dot + mS*lG*y_dot*s_dot + (JM + mS*lM**2)*u_dot**2/2"
+        " + mS*lM*lG*u_dot*s_dot + (JS + mS*lG**2)*s_dot**2/2 - (mS + mM)*g*y - k*(u - s)**2/2 - mS*g*(lM*u + lG*s)",
+        parameters={"mS": 4.5e-3, "mM": 3e-4, "JS": 7e-7, "JM": 5e-9, "k": 0.0056, "g": 9.81, "lM": 0.01, "lG": 0.015},
+        contacts=[
+            sc.contact("0.0024 - 0.02*s", slip="y_dot + lM*u_dot - 0.0051*s_dot", friction=0.3, restitution=0.5),
+            *(sc.contact(f"0.0006 {way} 0.0058*u", slip="y_dot + 0.0031*u_dot", friction=0.3) for way in "+-"),
+        ],
+    )
+    passes = sc.Event("s + 0.2788", direction=-1)
+    run = sc.compile_stepper(system, "svi:4").integrate(
+        [0, -0.6 / 5.8, -0.2788], velocity=[-0.3411, 0, -7.4583], t_end=3, tolerance=1e-10, events=passes
+    )
+    (cycle,) = run.events
+    ends = run.stepper.velocity(cycle.q[-2:], cycle.p[-2:], cycle.t[-2:])
+    assert len(cycle) >= 20
+    assert ends.mean(axis=0) == pytest.approx([-0.3411, 0, -7.4583], rel=6e-3, abs=1e-9)
+    assert np.diff(cycle.t[-3:]).mean() == pytest.approx(0.14598, abs=1e-5)
+    assert {modes[1] for _, modes in run.contact_modes} == {"open", "stick", "slip"}

@@ -90,9 +90,10 @@ def terms_at(stepper: Stepper, contacts: ContactsOfStepper, q: Array, p: Array, 
         raise ContactError(f"the contacts are undefined at t = {t:.17g}, q = {q}: {STATUS[status]}")
     values, rates, second, response, gradients, coefficients = np.split(numbers, np.cumsum([k, k, k, k * k, k * m]))
     G = gradients.reshape(k, m)
-    velocity = stepper.velocity(q, p, t, idle)
-    sizes = np.array([np.abs(G) @ np.abs(q), np.abs(G) @ np.abs(velocity) + np.abs(rates - G @ velocity)])
-    return ContactTerms(modes, values, rates, second, response.reshape(k, k), G, coefficients.reshape(n, 3), sizes)
+    velocity, W = stepper.velocity(q, p, t, idle), response.reshape(k, k)
+    bounds = np.sqrt(np.abs(np.diagonal(W) * (p @ velocity)))  # |G v| <= sqrt(G M^-1 G^T) sqrt(v^T M v)
+    sizes = np.array([np.abs(G) @ np.abs(q), bounds + np.abs(rates - G @ velocity)])
+    return ContactTerms(modes, values, rates, second, W, G, coefficients.reshape(n, 3), sizes)
 
 
 class ContactRun:

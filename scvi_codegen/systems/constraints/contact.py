@@ -16,11 +16,13 @@ measured (:mod:`scvi_codegen.methods.constraints`).
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
-from scvi_codegen.common.errors import SystemDefinitionError
+from scvi_codegen.common.errors import SystemDefinitionError, closest
 
 if TYPE_CHECKING:
     from sympy import Expr
@@ -70,6 +72,11 @@ class Contact:
     static_friction: Formula | None = None
     restitution: Formula = 0.0
 
+    @property
+    def table(self) -> dict[str, Any]:
+        """Arguments by name, as in ``[[contacts]]`` of a model file."""
+        return _table(self)
+
     def __post_init__(self) -> None:
         shown = f"the contact '{self.gap}'"
         if (self.slip is None) != (self.friction is None):
@@ -101,11 +108,49 @@ class Friction:
     limit: Formula
     static_limit: Formula | None = None
 
+    @property
+    def table(self) -> dict[str, Any]:
+        """Arguments by name, as in ``[[contacts]]`` of a model file."""
+        return _table(self)
+
     def __post_init__(self) -> None:
         _check_limits(f"the friction '{self.slip}'", ("limit", self.limit), ("static_limit", self.static_limit))
 
 
+def _table(item: Any) -> dict[str, Any]:
+    """Return the table of a contact: its formulas as text, and its numbers."""
+    values = {name: getattr(item, name) for name in item.__dataclass_fields__}
+    plain = {
+        name: value if isinstance(value, int | float) else str(value)
+        for name, value in values.items()
+        if value is not None
+    }
+    return {name: value for name, value in plain.items() if (name, value) != ("restitution", 0.0)}
+
+
 ContactLike: TypeAlias = "Contact | Friction"
+
+
+def contacts_of(tables: Sequence[Mapping[str, Any]]) -> tuple[ContactLike, ...]:
+    """Return the contacts of tables of their arguments: those with a gap, and friction without."""
+    contacts: list[ContactLike] = []
+    for table in tables:
+        kind: Any = Contact if "gap" in table else Friction
+        known = kind.__dataclass_fields__
+        if unknown := sorted(set(table) - set(known)):
+            raise SystemDefinitionError(
+                f"'{unknown[0]}' of a contact is unknown{closest(unknown[0], list(known))} Known: {', '.join(known)}"
+            )
+        lacking = [name for name in ("slip", "limit") if kind is Friction and name not in table]
+        if lacking:
+            raise SystemDefinitionError(f"a contact requires gap=, or slip= and limit= of friction: give {lacking[0]}=")
+        contacts.append(kind(**table))
+    return tuple(contacts)
+
+
+def names_in(item: ContactLike) -> set[str]:
+    """Return the names in the formulas of a contact."""
+    return set(re.findall(r"[A-Za-z_]\w*", " ".join(map(str, item.table.values()))))
 
 
 def contact(

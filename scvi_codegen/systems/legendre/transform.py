@@ -161,9 +161,9 @@ def hamiltonian_of(system: LagrangianSystem, *, momenta: Sequence[str] | None = 
     >>> hamiltonian_of(oscillator).hamiltonian
     k*x**2/2 + p_x**2/(2*m)
     """
-    if system.constraints:
+    if system.constrained_at_nodes:
         raise SystemDefinitionError(
-            f"'{system.name}' has constraints, which are supported for Lagrangians only: keep the "
+            f"'{system.name}' has constraints or contacts, which are supported for Lagrangians only: keep the "
             "Lagrangian, or convert it without constraints"
         )
     if system.rotations and momenta is None and system.clock is None and (singular := hamiltonian_of_rotations(system)):

@@ -33,6 +33,8 @@ def document_of(model: Model, *, as_arrays: bool = True) -> dict[str, Any]:
         document["system"]["time_transformation"] = g
     if model.inputs:
         document["inputs"] = {name: _as_lists(value) for name, value in model.inputs.items()}
+    if system.has_contacts:
+        document["contacts"] = [item.table for item in system.contacts]
     if model.events:
         document["events"] = [event.table for event in model.events]
     if (sizes := {name: size for name, size in model.sizes.items() if size}) and "field" not in document:

@@ -26,6 +26,7 @@ from scvi_codegen.interfaces.models.model_files.entries import ROBOT_KEYS, URDF_
 from scvi_codegen.interfaces.models.model_files.page_section import PAGE_KEYS, PICTURE_KEYS, check_page, check_picture
 from scvi_codegen.interfaces.models.model_files.sections import (
     FORMULAS,
+    LISTS,
     TORQUES,
     TURNING,
     Document,
@@ -65,7 +66,7 @@ KEYS = {"system": SYSTEM_KEYS, "field": FIELD_KEYS, "page": PAGE_KEYS, "picture"
 }
 SECTIONS = (
     *("system", "field", "forces", *TORQUES, "inputs", "sizes", "parameters", "tables", "initial"),
-    *("events", "method", "run", "path", "page", "picture"),
+    *("contacts", "events", "method", "run", "path", "page", "picture"),
 )
 ARRAY_SECTIONS = ("sizes", "tables")
 """Sections of systems with arrays."""
@@ -135,7 +136,7 @@ def parse_model(text: str, changes: Document | None = None, *, folder: str | os.
         document = read_toml(text, ExactNumber)
     check_keys(document, SECTIONS, "section")
     for name, content in document.items():
-        if not isinstance(content, dict) and name != "events":
+        if not isinstance(content, dict) and name not in LISTS:
             raise ModelFileError(f"'{name}' must be a section, [{name}], not {content!r}")
     for name, keys in KEYS.items():
         check_keys(document.get(name, {}), keys, "key", f"[{name}]")

@@ -32,6 +32,8 @@ KEYS: Final = {
     "system": "lagrangian hamiltonian damping dissipation constraints time_transformation inputs",
     "field": "density space boundary discretisation",
 }
+LISTS: Final = ("events", "contacts")
+"""Sections that are lists of tables, ``[[events]]``."""
 EVENT_KEYS: Final = ("function", "direction", "terminal", "then", "where", "restitution")
 NAMED_SECTIONS: Final = ("parameters", "forces", "torques", "torques_space", "initial", "run")
 SECTION_OF_KEY: Final = {
@@ -82,7 +84,7 @@ def chosen_method(document: Document, changes: Document) -> Section:
     """Return the method of a file, or the default one, with the given changes."""
     default: Section = DEFAULT_METHOD.specification()
     section = {**document.get("system", {}), **changes.get("system", {})}
-    if section.get("constraints"):
+    if section.get("constraints") or document.get("contacts") or changes.get("contacts"):
         default = {"method": "svi", "degree": 6}
     base = _split_method_name(document.get("method", default))
     return _changed_method(base, _split_method_name(changes.get("method", {})))
@@ -92,7 +94,7 @@ def merged_sections(below: Document, above: Document) -> dict[str, Section]:
     """Return all sections merged; keys in ``above`` replace those in ``below`` and their alternatives."""
     document: dict[str, Any] = dict(below)
     for name, section in above.items():
-        if name == "events":
+        if name in LISTS:
             document[name] = [*below.get(name, ()), *section]
             continue
         replaced = {key for keys in ALTERNATIVES if not keys.isdisjoint(section) for key in keys}
@@ -298,12 +300,17 @@ def words_of(document: Document) -> set[str]:
     return {word for text in texts(sections) for word in re.findall(r"[A-Za-z_]\w*", text)}
 
 
+def tables_in(entries: Any, name: str) -> list[dict[str, Any]]:
+    """Return the tables ``[[name]]``."""
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise ModelFileError(f"{name} must be tables, [[{name}]], not {entries!r}")
+    return entries
+
+
 def read_events(entries: Any) -> tuple[Event, ...]:
     """Return the events of the tables ``[[events]]``."""
-    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise ModelFileError(f"events must be tables, [[events]], not {entries!r}")
     events = []
-    for entry in entries:
+    for entry in tables_in(entries, "events"):
         check_keys(entry, EVENT_KEYS, "key", "[[events]]")
         direction = {"direction": -1} if "restitution" in entry else {}
         where = f"[[events]] function = {required(entry, 'function', '[[events]]')!r}"
@@ -332,13 +339,16 @@ def read_system(document: Document, named: MechanicalSystem | None = None) -> Me
     """Return the system of a file, ``named`` if it names one, with the values of its scalar parameters."""
     forces, values = document.get("forces", {}), _scalars(document)
     if named is not None:
-        if forces:
+        if forces or document.get("contacts"):
+            part = "[forces]" if forces else "[[contacts]]"
             raise ModelFileError(
-                "[forces] are not supported for a system of the catalogue or of a robot: write it out in [system]"
+                f"{part} are not supported for a system of the catalogue or of a robot: write it out in [system]"
             )
         return in_section("[parameters]", lambda: named.with_parameters(**values))
     section = document["system"]
     check_one(section, "system", "lagrangian", "hamiltonian")
+    if document.get("contacts") and "hamiltonian" in section:
+        raise ModelFileError("[[contacts]] require a lagrangian in [system]: write the Lagrangian")
     arguments: dict[str, Any] = {
         "name": text_of(section, "name", "[system]"),
         "coordinates": names_of(section, "coordinates") if "coordinates" in section else (),
@@ -369,6 +379,7 @@ def read_system(document: Document, named: MechanicalSystem | None = None) -> Me
     arguments["lagrangian"] = text_of(section, "lagrangian", "[system]")
     arguments["point_forces"] = section.get("point_forces", ())
     arguments["dissipation"] = text_of(section, "dissipation", "[system]") if "dissipation" in section else None
+    arguments["contacts"] = tables_in(document.get("contacts", []), "contacts")
     return in_section("[system]", lambda: LagrangianSystem.from_text(**arguments, constraints=constraints))
 
 
