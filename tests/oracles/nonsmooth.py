@@ -1,0 +1,327 @@
+"""Motions with kinks: random cases of eight families, and their motion by DOP853, restarted at each kink.
+
+A kink is the zero of a switching function, the argument of ``positive_part`` or ``unit_step``. Between two of them the
+equations are those of one mode, smooth beyond the zeros too. Zeros are bracketed on the polynomials of steps and found
+by Newton's iteration with steps that end there. Motions have units and an origin of their own; cases have others.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from notation import lagrange
+from scipy.integrate import DOP853, solve_ivp
+
+Array = np.ndarray
+ACCURACY = {"rtol": 3e-14, "atol": 1e-17}
+PERTURBATION = 1e-8
+"""Relative change of a state, whose growth is measured."""
+
+
+class Motion(NamedTuple):
+    """Equations of unit masses with kinks, and a state at t = 0.
+
+    Attributes:
+        parameters: values by name.
+        q, v: (m,) positions and velocities.
+        span: duration.
+        rate: of the fastest change, in radians per time.
+        acceleration: function of (t, q, v, modes); a mode is 1 where its switching function is positive, else 0.
+        switching: functions of (t, q, v), also of arrays q, v (m, n) and t (n,).
+    """
+
+    parameters: dict[str, float]
+    q: Sequence[float]
+    v: Sequence[float]
+    span: float
+    rate: float
+    acceleration: Callable[[float, Array, Array, list[int]], Sequence[float]]
+    switching: Callable[[Any, Any, Any], Sequence[Any]]
+
+    def states(self, times: Array, change: Array | float = 0.0) -> tuple[Array, int]:
+        """Return states (n, 2m), q and v, at ascending times, the first of them 0, and the number of kinks."""
+        t, y, kinks = 0.0, np.array([*self.q, *self.v]) + change, 0
+        modes, found = self._first_modes(y), [y]
+        while len(found) < len(times):
+            solver = DOP853(self._rates(modes), t, y, times[-1], max_step=self.span / 40, **ACCURACY)
+            zeros: list[tuple[float, int, Array]] = []
+            while solver.status == "running" and not zeros:
+                begin = solver.t, solver.y
+                solver.step()
+                zeros = self._zeros(modes, begin, solver)
+                end = min(zeros)[0] if zeros else solver.t
+                while len(found) < len(times) and times[len(found)] <= end:
+                    found.append(self._advanced(modes, begin, times[len(found)]))
+            if zeros:
+                t, k, y = min(zeros)
+                modes[k], kinks = 1 - modes[k], kinks + 1
+        return np.array(found), kinks
+
+    def _rates(self, modes: list[int]) -> Callable[[float, Array], Any]:
+        m = len(self.q)
+        return lambda t, y: [*y[m:], *self.acceleration(t, y[:m], y[m:], modes)]
+
+    def _values(self, t: Any, y: Array) -> Array:
+        m = len(self.q)
+        return np.array(np.broadcast_arrays(*self.switching(t, y[:m], y[m:])))
+
+    def _advanced(self, modes: list[int], begin: tuple[float, Array], end: float) -> Array:
+        t, y = begin
+        return y if end == t else solve_ivp(self._rates(modes), (t, end), y, method="DOP853", **ACCURACY).y[:, -1]
+
+    def _first_modes(self, y: Array) -> list[int]:
+        """Return the modes just after t = 0, those of a short step where functions vanish."""
+        m, now, dt = len(self.q), self._values(0.0, y), 1e-5 * self.span
+        modes = [int(u >= 0.0) for u in now]
+        a = np.array(self.acceleration(0.0, y[:m], y[m:], modes))
+        ahead = self._values(dt, np.array([*(y[:m] + dt * y[m:] + dt * dt / 2 * a), *(y[m:] + dt * a)]))
+        return [int(u > 0.0) if abs(w) < 1e-13 else int(w > 0.0) for w, u in zip(now, ahead, strict=True)]
+
+    def _zeros(self, modes: list[int], begin: tuple[float, Array], solver: Any) -> list[tuple[float, int, Array]]:
+        """Return time, number and state of the first zeros within a step, which is sampled at 32 times."""
+        curve, grid, zeros = solver.dense_output(), np.linspace(begin[0], solver.t, 33), []
+        changed = (self._values(grid[1:], curve(grid[1:])) > 0.0) != np.array(modes, dtype=bool)[:, None]
+        first = np.flatnonzero(changed.any(axis=0))[:1]
+        for k in np.flatnonzero(changed[:, first[0]]) if len(first) else ():
+            low, high = grid[first[0]], grid[first[0] + 1]
+            width = 1e-4 * (high - low)
+            for _ in range(50):
+                middle = (low + high) / 2
+                is_before = bool(self._values(middle, curve(middle))[k] > 0.0) == modes[k]
+                low, high = (middle, high) if is_before else (low, middle)
+            sides = [self._values(t, curve(t))[k] for t in (high - width, high + width)]
+            slope, t = (sides[1] - sides[0]) / (2 * width), high
+            for _ in range(3):
+                y = self._advanced(modes, begin, t)
+                t = max(t - self._values(t, y)[k] / slope, begin[0])
+            zeros.append((t, int(k), self._advanced(modes, begin, t)))
+        return zeros
+
+
+class Family(NamedTuple):
+    """A kind of motion.
+
+    Attributes:
+        coordinates, lagrangian, forces: its equations, with a mass ``m`` and the origin ``o`` of positions.
+        units: powers of the units of mass, length and time in those of the parameters.
+        motion: function of a random generator that returns a motion.
+    """
+
+    coordinates: str
+    lagrangian: str
+    forces: dict[str, str]
+    units: dict[str, tuple[int, int, int]]
+    motion: Callable[[np.random.Generator], Motion]
+
+    def system(self, name: str) -> Any:
+        return lagrange(name, self.coordinates, self.lagrangian, forces=self.forces, **dict.fromkeys(self.units, 1.0))
+
+
+def floor(random):
+    """A ball on a floor between two walls: free, or from the surface, at rest or not; pressed into a wall."""
+    u = random.uniform
+    k, s, a = 10.0 ** u(0, 5), 10.0 ** u(0, 3), u(0.2, 1.0)
+    y, w = random.choice([(u(0.05, 3.0), 0.0), (u(0.05, 3.0), u(-1, 1)), (0.0, 0.0), (0.0, u(0.2, 1.0))])
+    x, v = random.choice([(0.0, u(-1, 1)), (a, u(-1, 1)), (-1.2 * a, 0.0)])
+    span = u(2.0, 6.0) * (abs(w) + math.sqrt(2 * y + 0.1))
+    force = lambda t, q, v, on: (-2 * s * (on[1] * (q[0] - a) + on[2] * (q[0] + a)), -1.0 - 2 * k * on[0] * q[1])
+    switching = lambda t, q, v: (-q[1], q[0] - a, -q[0] - a)
+    values = {"g": 1.0, "k": k, "s": s, "a": a}
+    return Motion(values, [x, y], [v, w], span, 1 + math.sqrt(2 * max(k, s)), force, switching)
+
+
+def backlash(random):
+    """A motor moves a mass on a spring through a gear with play."""
+    u = random.uniform
+    k, j, a, f, w = 10.0 ** u(0, 3.5), u(0, 2), u(0.05, 0.5), u(0.2, 2.0), u(0.5, 3.0)
+    x, v = random.choice([(0.0, 0.0), (a, 0.0), (-a, u(-1, 1)), (u(-0.5, 0.5), u(-1, 1))])
+
+    def force(t, q, v, on):
+        pull = 2 * k * (on[0] * (q[0] - q[1] - a) - on[1] * (q[1] - q[0] - a))
+        return f * math.cos(w * t) - pull, pull - j * q[1]
+
+    switching = lambda t, q, v: (q[0] - q[1] - a, q[1] - q[0] - a)
+    values = {"k": k, "j": j, "a": a, "f": f, "w": w, "b": 0.0}
+    return Motion(values, [x, 0.0], [v, 0.0], u(2, 6), w + math.sqrt(4 * k + j), force, switching)
+
+
+def rope(random):
+    """A mass on a rope that goes slack; from rest on the surface, too."""
+    u = random.uniform
+    k, r, angle = 10.0 ** u(0, 4), random.choice([u(0.1, 1.0), 1.0, 1.01]), u(-math.pi, math.pi)
+    q, v = random.choice([((r * math.cos(angle), r * math.sin(angle)), (u(-1, 1), u(-1, 1))), ((1.0, 0.0), (0.0, 0.0))])
+
+    def force(t, q, v, on):
+        r = math.hypot(*q)
+        pull = 2 * k * on[0] * (r - 1.0) / r
+        return -pull * q[0], -1.0 - pull * q[1]
+
+    values = {"g": 1.0, "k": k, "l": 1.0}
+    return Motion(values, q, v, u(1, 5), 3 + math.sqrt(2 * k), force, lambda t, q, v: (np.hypot(*q) - 1.0,))
+
+
+PAIRS = ((0, 1), (0, 2), (1, 2))
+
+
+def cutoff(random):
+    """Three particles that repel each other within a distance: apart, touching, or pressed and at rest."""
+    u, k = random.uniform, 10.0 ** random.uniform(1.7, 3.5)
+    start = random.choice(["apart", "touching", "pressed"], p=[0.6, 0.2, 0.2])
+    q = np.array([0.0, 0.0, u(0.8, 1.5), u(-0.5, 0.5), u(-1.5, 0.0), u(1.0, 1.6)])
+    if start != "apart":
+        q[2:4] = (1.0 if start == "touching" else 0.9), 0.0
+    v = np.array([*u(-0.3, 0.3, 2), u(-1, 0), u(-0.5, 0.5), u(0, 1.0), u(-1, 0)]) * (start != "pressed")
+
+    def force(t, q, v, on):
+        found = np.zeros(6)
+        for (i, j), touch in zip(PAIRS, on, strict=True):
+            d = q[2 * i : 2 * i + 2] - q[2 * j : 2 * j + 2]
+            push = 2 * k * touch * (1.0 / math.hypot(*d) - 1.0) * d
+            found[2 * i : 2 * i + 2] += push
+            found[2 * j : 2 * j + 2] -= push
+        return found
+
+    apart = lambda q, i, j: np.hypot(q[2 * i] - q[2 * j], q[2 * i + 1] - q[2 * j + 1])
+    switching = lambda t, q, v: [1.0 - apart(q, i, j) for i, j in PAIRS]
+    return Motion({"k": k, "a": 1.0}, q, v, u(1, 3), 1 + math.sqrt(4 * k), force, switching)
+
+
+def pulse(random, power=0):
+    """A mass, on a damped spring or free, that is pushed for a while, also from the start on."""
+    u = random.uniform
+    span, j, d, f = u(3, 10), random.choice([0.0, u(0.5, 3)]), random.choice([0.0, u(0, 0.5)]), 10.0 ** u(-1, 1)
+    begin, width = random.choice([0.0, u(0, 0.9) * span, u(0, 0.9) * span]), 10.0 ** u(-3, 0.3)
+    x, v = random.choice([(0.0, 0.0), (u(-1, 1), 0.0), (u(-1, 1), u(-1, 1))])
+
+    def force(t, q, v, on):
+        push = on[0] * (t - begin) ** power - on[1] * (t - begin - width) ** power
+        return (-j * q[0] - d * v[0] + f * push,)
+
+    values = {"j": j, "d": d, "f": f, "a": begin, "b": begin + width}
+    return Motion(values, [x], [v], span, 1 + math.sqrt(j), force, lambda t, q, v: (t - begin, t - begin - width))
+
+
+def ramp(random):
+    return pulse(random, power=1)
+
+
+def relay(random):
+    """A mass that is pushed back with a constant force, to which a smaller one is added."""
+    u = random.uniform
+    j, f, c = random.choice([0.0, u(0.1, 3)]), u(0.5, 3), u(-0.4, 0.4)
+    x, v = random.choice([(u(0.1, 1.0), 0.0), (0.0, u(0.3, 1.0)), (0.0, u(-1, -0.3)), (u(-1, 1), u(-1, 1))])
+    force = lambda t, q, v, on: (-j * q[0] + f * (1 - 2 * on[0]) + c,)
+    return Motion({"j": j, "f": f, "c": c}, [x], [v], u(3, 10), 2 + math.sqrt(j), force, lambda t, q, v: (q[0],))
+
+
+def drag(random):
+    """A driven mass in a fluid."""
+    u = random.uniform
+    j, d, f, w = random.choice([0.0, u(0.1, 3)]), 10.0 ** u(-1, 1), u(0.3, 2), u(0.5, 3)
+    x, v = random.choice([(u(-1, 1), u(-1, 1)), (0.0, 0.0), (u(-1, 1), 0.0)])
+    force = lambda t, q, v, on: (-j * q[0] - d * v[0] ** 2 * (2 * on[0] - 1) + f * math.cos(w * t),)
+    values, rate = {"j": j, "d": d, "f": f, "w": w, "b": 0.0}, w + math.sqrt(j) + 2 * math.sqrt(d * f)
+    return Motion(values, [x], [v], u(3, 10), rate, force, lambda t, q, v: (v[0],))
+
+
+FORCE, STIFFNESS, LENGTH, GRAVITY, RATE, TIME = (1, 1, -2), (1, 0, -2), (0, 1, 0), (0, 1, -2), (0, 0, -1), (0, 0, 1)
+ORIGIN = {"m": (1, 0, 0), "o": LENGTH}
+PUSHED = "m*x_dot**2/2 - j*(x - o)**2/2"
+FAMILIES = {
+    "floor": Family(
+        "x y",
+        "m*(x_dot**2 + y_dot**2)/2 - m*g*y - k*positive_part(o - y)**2"
+        " - s*(positive_part(x - o - a)**2 + positive_part(o - a - x)**2)",
+        {}, ORIGIN | {"g": GRAVITY, "k": STIFFNESS, "s": STIFFNESS, "a": LENGTH}, floor,
+    ),
+    "backlash": Family(
+        "x y",
+        "m*(x_dot**2 + y_dot**2)/2 - k*(positive_part(x - y - a)**2 + positive_part(y - x - a)**2) - j*(y - o)**2/2",
+        {"x": "f*cos(w*(t - b))"},
+        ORIGIN | {"k": STIFFNESS, "j": STIFFNESS, "a": LENGTH, "f": FORCE, "w": RATE, "b": TIME}, backlash,
+    ),
+    "rope": Family(
+        "x y", "m*(x_dot**2 + y_dot**2)/2 - m*g*y - k*positive_part(sqrt((x - o)**2 + (y - o)**2) - l)**2",
+        {}, ORIGIN | {"g": GRAVITY, "k": STIFFNESS, "l": LENGTH}, rope,
+    ),
+    "cutoff": Family(
+        "x0 y0 x1 y1 x2 y2",
+        "m*(x0_dot**2 + y0_dot**2 + x1_dot**2 + y1_dot**2 + x2_dot**2 + y2_dot**2)/2"
+        + "".join(f" - k*positive_part(a - sqrt((x{i} - x{j})**2 + (y{i} - y{j})**2))**2" for i, j in PAIRS),
+        {}, {"m": (1, 0, 0), "k": STIFFNESS, "a": LENGTH}, cutoff,
+    ),
+    "pulse": Family(
+        "x", PUSHED, {"x": "f*(unit_step(t - a) - unit_step(t - b)) - d*x_dot"},
+        ORIGIN | {"j": STIFFNESS, "d": (1, 0, -1), "f": FORCE, "a": TIME, "b": TIME}, pulse,
+    ),
+    "ramp": Family(
+        "x", PUSHED, {"x": "f*(positive_part(t - a) - positive_part(t - b)) - d*x_dot"},
+        ORIGIN | {"j": STIFFNESS, "d": (1, 0, -1), "f": (1, 1, -3), "a": TIME, "b": TIME}, ramp,
+    ),
+    "relay": Family(
+        "x", PUSHED, {"x": "f*(1 - 2*unit_step(x - o)) + c"},
+        ORIGIN | {"j": STIFFNESS, "f": FORCE, "c": FORCE}, relay,
+    ),
+    "drag": Family(
+        "x", PUSHED, {"x": "-d*x_dot**2*(2*unit_step(x_dot) - 1) + f*cos(w*(t - b))"},
+        ORIGIN | {"j": STIFFNESS, "d": (1, -1, 0), "f": FORCE, "w": RATE, "b": TIME}, drag,
+    ),
+}  # fmt: skip
+"""Parameters that are times count from the start."""
+
+
+class Case(NamedTuple):
+    """A motion in units and from an origin of its own.
+
+    Attributes:
+        motion: the motion.
+        arguments: q, p, t, t_end and parameters of :meth:`Stepper.integrate`.
+        units: (2m,) of the state q, p.
+        t, q: (n,) times and (n, m) exact positions.
+        ranges: (m,) of the positions.
+        growth: by which a relative change of the initial state is multiplied at most.
+        kinks: their number.
+    """
+
+    motion: Motion
+    arguments: dict[str, Any]
+    units: Array
+    t: Array
+    q: Array
+    ranges: Array
+    growth: float
+    kinks: int
+
+
+def case_of(family: str, number: int, count: int = 21) -> Case:
+    """Return a random case; every third one has the units and the origin of its motion."""
+    random = np.random.default_rng([number, [*FAMILIES].index(family)])
+    motion, units = FAMILIES[family].motion(random), FAMILIES[family].units
+    m, times = len(motion.q), np.linspace(0.0, motion.span, count)
+    exact, kinks = motion.states(times)
+    sizes = np.repeat([np.ptp(exact[:, :m], axis=0).max(), np.abs(exact[:, m:]).max()], m)
+    signs = np.resize([1.0, -1.0, 1.0, 1.0, -1.0], 2 * m)
+    changed = motion.states(times, PERTURBATION * sizes * signs)[0]
+    mass, length, time = 10.0 ** random.uniform(-3, 3, 3) if number % 3 else (1.0, 1.0, 1.0)
+    shift, start = random.uniform(-10, 10, 2) * [sizes[0] * length, motion.span * time] * (number % 3 > 0)
+    values = motion.parameters | {"m": 1.0, "o": 0.0}
+    powers = {name: mass**a * length**b * time**c for name, (a, b, c) in units.items()}
+    origins = {LENGTH: {"o": shift}, TIME: {"a": start, "b": start}}
+    parameters = {
+        name: float(values[name] * powers[name] + origins.get(units[name], {}).get(name, 0.0)) for name in units
+    }
+    arguments = {
+        "q": shift + length * np.array(motion.q), "p": mass * length / time * np.array(motion.v),
+        "t": float(start), "t_end": float(start + time * motion.span), "parameters": parameters,
+    }  # fmt: skip
+    return Case(
+        motion=motion,
+        arguments=arguments,
+        units=np.repeat([length, mass * length / time], m),
+        t=np.append(start + time * times[:-1], arguments["t_end"]),
+        q=shift + length * exact[:, :m],
+        ranges=length * np.ptp(exact[:, :m], axis=0),
+        growth=float((np.abs(changed - exact) / sizes).max() / PERTURBATION),
+        kinks=kinks,
+    )
