@@ -39,9 +39,9 @@ class Motion(NamedTuple):
     acceleration: Callable[[float, Array, Array, list[int]], Sequence[float]]
     switching: Callable[[Any, Any, Any], Sequence[Any]]
 
-    def states(self, times: Array, change: Array | float = 0.0) -> tuple[Array, int]:
-        """Return states (n, 2m), q and v, at ascending times, the first of them 0, and the number of kinks."""
-        t, y, kinks = 0.0, np.array([*self.q, *self.v]) + change, 0
+    def states(self, times: Array, change: Array | float = 0.0) -> tuple[Array, list[float]]:
+        """Return states (n, 2m), q and v, at ascending times, the first of them 0, and the times of kinks."""
+        t, y, kinks = 0.0, np.array([*self.q, *self.v]) + change, list[float]()
         modes, found = self._first_modes(y), [y]
         while len(found) < len(times):
             solver = DOP853(self._rates(modes), t, y, times[-1], max_step=self.span / 40, **ACCURACY)
@@ -55,7 +55,8 @@ class Motion(NamedTuple):
                     found.append(self._advanced(modes, begin, times[len(found)]))
             if zeros:
                 t, k, y = min(zeros)
-                modes[k], kinks = 1 - modes[k], kinks + 1
+                modes[k] = 1 - modes[k]
+                kinks.append(t)
         return np.array(found), kinks
 
     def _rates(self, modes: list[int]) -> Callable[[float, Array], Any]:
@@ -118,13 +119,22 @@ class Family(NamedTuple):
         return lagrange(name, self.coordinates, self.lagrangian, forces=self.forces, **dict.fromkeys(self.units, 1.0))
 
 
+def dyadic(number: float) -> float:
+    """Return the nearest multiple of 2^-26: sums of these are exact, from any origin."""
+    return round(float(number) * 2.0**26) / 2.0**26
+
+
+def numbers(random: np.random.Generator) -> Callable[[float, float], float]:
+    return lambda low, high: dyadic(random.uniform(low, high))
+
+
 def floor(random):
     """A ball on a floor between two walls: free, or from the surface, at rest or not; pressed into a wall."""
-    u = random.uniform
+    u = numbers(random)
     k, s, a = 10.0 ** u(0, 5), 10.0 ** u(0, 3), u(0.2, 1.0)
     y, w = random.choice([(u(0.05, 3.0), 0.0), (u(0.05, 3.0), u(-1, 1)), (0.0, 0.0), (0.0, u(0.2, 1.0))])
-    x, v = random.choice([(0.0, u(-1, 1)), (a, u(-1, 1)), (-1.2 * a, 0.0)])
-    span = u(2.0, 6.0) * (abs(w) + math.sqrt(2 * y + 0.1))
+    x, v = random.choice([(0.0, u(-1, 1)), (a, u(-1, 1)), (-a - 0.25, 0.0)])
+    span = dyadic(u(2.0, 6.0) * (abs(w) + math.sqrt(2 * y + 0.1)))
     force = lambda t, q, v, on: (-2 * s * (on[1] * (q[0] - a) + on[2] * (q[0] + a)), -1.0 - 2 * k * on[0] * q[1])
     switching = lambda t, q, v: (-q[1], q[0] - a, -q[0] - a)
     values = {"g": 1.0, "k": k, "s": s, "a": a}
@@ -133,7 +143,7 @@ def floor(random):
 
 def backlash(random):
     """A motor moves a mass on a spring through a gear with play."""
-    u = random.uniform
+    u = numbers(random)
     k, j, a, f, w = 10.0 ** u(0, 3.5), u(0, 2), u(0.05, 0.5), u(0.2, 2.0), u(0.5, 3.0)
     x, v = random.choice([(0.0, 0.0), (a, 0.0), (-a, u(-1, 1)), (u(-0.5, 0.5), u(-1, 1))])
 
@@ -148,9 +158,10 @@ def backlash(random):
 
 def rope(random):
     """A mass on a rope that goes slack; from rest on the surface, too."""
-    u = random.uniform
+    u = numbers(random)
     k, r, angle = 10.0 ** u(0, 4), random.choice([u(0.1, 1.0), 1.0, 1.01]), u(-math.pi, math.pi)
-    q, v = random.choice([((r * math.cos(angle), r * math.sin(angle)), (u(-1, 1), u(-1, 1))), ((1.0, 0.0), (0.0, 0.0))])
+    on_circle = dyadic(r * math.cos(angle)), dyadic(r * math.sin(angle))
+    q, v = random.choice([(on_circle, (u(-1, 1), u(-1, 1))), ((1.0, 0.0), (0.0, 0.0))])
 
     def force(t, q, v, on):
         r = math.hypot(*q)
@@ -166,12 +177,12 @@ PAIRS = ((0, 1), (0, 2), (1, 2))
 
 def cutoff(random):
     """Three particles that repel each other within a distance: apart, touching, or pressed and at rest."""
-    u, k = random.uniform, 10.0 ** random.uniform(1.7, 3.5)
+    u, k = numbers(random), 10.0 ** random.uniform(1.7, 3.5)
     start = random.choice(["apart", "touching", "pressed"], p=[0.6, 0.2, 0.2])
     q = np.array([0.0, 0.0, u(0.8, 1.5), u(-0.5, 0.5), u(-1.5, 0.0), u(1.0, 1.6)])
     if start != "apart":
         q[2:4] = (1.0 if start == "touching" else 0.9), 0.0
-    v = np.array([*u(-0.3, 0.3, 2), u(-1, 0), u(-0.5, 0.5), u(0, 1.0), u(-1, 0)]) * (start != "pressed")
+    v = np.array([u(-0.3, 0.3), u(-0.3, 0.3), u(-1, 0), u(-0.5, 0.5), u(0, 1.0), u(-1, 0)]) * (start != "pressed")
 
     def force(t, q, v, on):
         found = np.zeros(6)
@@ -189,9 +200,9 @@ def cutoff(random):
 
 def pulse(random, power=0):
     """A mass, on a damped spring or free, that is pushed for a while, also from the start on."""
-    u = random.uniform
+    u = numbers(random)
     span, j, d, f = u(3, 10), random.choice([0.0, u(0.5, 3)]), random.choice([0.0, u(0, 0.5)]), 10.0 ** u(-1, 1)
-    begin, width = random.choice([0.0, u(0, 0.9) * span, u(0, 0.9) * span]), 10.0 ** u(-3, 0.3)
+    begin, width = random.choice([0.0, u(0, 0.9 * span), u(0, 0.9 * span)]), dyadic(10.0 ** u(-3, 0.3))
     x, v = random.choice([(0.0, 0.0), (u(-1, 1), 0.0), (u(-1, 1), u(-1, 1))])
 
     def force(t, q, v, on):
@@ -208,7 +219,7 @@ def ramp(random):
 
 def relay(random):
     """A mass that is pushed back with a constant force, to which a smaller one is added."""
-    u = random.uniform
+    u = numbers(random)
     j, f, c = random.choice([0.0, u(0.1, 3)]), u(0.5, 3), u(-0.4, 0.4)
     x, v = random.choice([(u(0.1, 1.0), 0.0), (0.0, u(0.3, 1.0)), (0.0, u(-1, -0.3)), (u(-1, 1), u(-1, 1))])
     force = lambda t, q, v, on: (-j * q[0] + f * (1 - 2 * on[0]) + c,)
@@ -217,7 +228,7 @@ def relay(random):
 
 def drag(random):
     """A driven mass in a fluid."""
-    u = random.uniform
+    u = numbers(random)
     j, d, f, w = random.choice([0.0, u(0.1, 3)]), 10.0 ** u(-1, 1), u(0.3, 2), u(0.5, 3)
     x, v = random.choice([(u(-1, 1), u(-1, 1)), (0.0, 0.0), (u(-1, 1), 0.0)])
     force = lambda t, q, v, on: (-j * q[0] - d * v[0] ** 2 * (2 * on[0] - 1) + f * math.cos(w * t),)
@@ -281,7 +292,7 @@ class Case(NamedTuple):
         t, q: (n,) times and (n, m) exact positions.
         ranges: (m,) of the positions.
         growth: by which a relative change of the initial state is multiplied at most.
-        kinks: their number.
+        kinks: their times, from the start in units of the motion.
     """
 
     motion: Motion
@@ -291,7 +302,7 @@ class Case(NamedTuple):
     q: Array
     ranges: Array
     growth: float
-    kinks: int
+    kinks: list[float]
 
 
 def case_of(family: str, number: int, count: int = 21) -> Case:
@@ -303,8 +314,11 @@ def case_of(family: str, number: int, count: int = 21) -> Case:
     sizes = np.repeat([np.ptp(exact[:, :m], axis=0).max(), np.abs(exact[:, m:]).max()], m)
     signs = np.resize([1.0, -1.0, 1.0, 1.0, -1.0], 2 * m)
     changed = motion.states(times, PERTURBATION * sizes * signs)[0]
-    mass, length, time = 10.0 ** random.uniform(-3, 3, 3) if number % 3 else (1.0, 1.0, 1.0)
-    shift, start = random.uniform(-10, 10, 2) * [sizes[0] * length, motion.span * time] * (number % 3 > 0)
+    mass, length, time, shift, start = 1.0, 1.0, 1.0, 0.0, 0.0
+    if number % 3:
+        mass, length, time = 10.0 ** random.uniform(-3, 3), *(2.0 ** random.integers(-10, 11, 2))
+        shift = length * dyadic(random.uniform(-10, 10) * sizes[0])
+        start = time * dyadic(random.uniform(-10, 10) * motion.span)
     values = motion.parameters | {"m": 1.0, "o": 0.0}
     powers = {name: mass**a * length**b * time**c for name, (a, b, c) in units.items()}
     origins = {LENGTH: {"o": shift}, TIME: {"a": start, "b": start}}
