@@ -4,28 +4,111 @@ Default and given tolerances, output times and dense output, orders of fixed ste
 (``tools/kinks.py``, which prints a table of all); bits of restored runs and of ensembles; derivatives.
 """
 
+from functools import cache
+from itertools import count
+
 import numpy as np
 import pytest
 from kinks import KINDS, METHODS, stepper_of, wrong
-from nonsmooth import FAMILIES, case_of
+from nonsmooth import FAMILIES, Case, case_of
 
 pytestmark = pytest.mark.filterwarnings("ignore::scvi_codegen.common.errors.AccuracyWarning")
+families = pytest.mark.parametrize("family", FAMILIES)
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@cache
+def differentiable(family: str) -> Case:
+    """Return the first case with kinks that does not start at one, where a derivative has two values."""
+    for number in count(1):
+        case = case_of(family, number)
+        start = case.motion.switching(0.0, case.motion.q, case.motion.v)
+        if case.kinks and np.abs(start).min() > 0.01:
+            return case
+    raise AssertionError
+
+
+def without_end(case: Case) -> dict:
+    return {name: value for name, value in case.arguments.items() if name != "t_end"}
+
+
+@families
 def test_motions_across_kinks_are_within_tolerances(family):
-    assert not wrong(family, [1], ["svi:4"])
+    assert not wrong(family, [1], ["svi:4"], [kind for kind in KINDS if kind != "order"])
 
 
 @pytest.mark.second
-@pytest.mark.parametrize("family", FAMILIES)
+@families
+def test_orders_across_kinks(family):
+    """SVI(1), SVI(2) and SVI(4) have orders 2, 4 and 8."""
+    assert not wrong(family, [1, 2], METHODS, ["order"])
+
+
+@pytest.mark.second
+@families
 def test_methods_of_other_orders_are_within_tolerances(family):
-    assert not wrong(family, [2, 3], ["svi:2", "svi:8"])
+    assert not wrong(family, [2, 3], ["svi:2", "svi:8"], ["round-off", "tolerance", "error="])
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("family", FAMILIES)
+@families
 def test_two_thousand_cases_across_kinks(family, method):
     first = 84 * [*METHODS].index(method)
     assert not wrong(family, range(first, first + 84), [method])
+
+
+@pytest.mark.tiers(3, 8)
+@families
+def test_restored_runs_have_the_same_bits_at_kinks(family):
+    """After each of the first steps, some of which end at kinks."""
+    stepper, case = stepper_of(family, "svi:4"), differentiable(family)
+    span = case.arguments["t_end"] - case.arguments["t"]
+    for plan, again in (({"t_end": case.arguments["t_end"]},) * 2, ({"h": span / 40}, {})):
+        run, ends = stepper.start(**without_end(case), **plan), []
+        checkpoints = []
+        for _ in range(40):
+            checkpoints.append(run.checkpoint())
+            run.advance(1)
+        for saved, steps in zip(checkpoints, range(40, 0, -1), strict=True):
+            restored = stepper.from_checkpoint(saved, **again)
+            restored.advance(steps)
+            ends.append((restored.t, *restored.q, *restored.p))
+        assert {*ends} == {(run.t, *run.q, *run.p)}
+
+
+@pytest.mark.tiers(3, 8)
+@families
+@pytest.mark.parametrize("plan", [{}, {"tolerance": 1e-6}, {"h": 0.01}], ids=["round-off", "tolerance", "fixed"])
+def test_trajectories_of_ensembles_have_the_bits_of_runs(family, plan):
+    stepper, case = stepper_of(family, "svi:4"), differentiable(family)
+    arguments = dict(case.arguments)
+    plan = plan | ({"h": 0.01 * (arguments["t_end"] - arguments["t"])} if "h" in plan else {})
+    q = arguments.pop("q") + np.array([0.0, 0.01, -0.02])[:, None] * case.ranges.max()
+    p = arguments.pop("p") * np.array([1.0, 0.9, 1.1])[:, None]
+    together = stepper.integrate_ensemble(q, p, **arguments, **plan)
+    for j in range(3):
+        run = stepper.integrate(q[j], p[j], **arguments, **plan)
+        assert np.array_equal(together.ends[1][j], run.q[-1])
+        assert np.array_equal(together.ends[2][j], run.p[-1])
+
+
+@pytest.mark.tiers(2, 8)
+@families
+def test_derivatives_across_kinks_are_those_of_the_motion(family):
+    """With respect to the initial state, to differences of the reference; to parameters, to differences of runs."""
+    stepper, case = stepper_of(family, "svi:4"), differentiable(family)
+    motion, m, run = case.motion, len(case.motion.q), stepper.integrate(**case.arguments)
+    found, times = run.sensitivity(), np.array([0.0, motion.span])
+    for k, unit in enumerate(np.eye(2 * m)):
+        ends = [motion.states(times, factor * 1e-5 * unit)[0][-1] for factor in (-2, -1, 1, 2)]
+        exact = np.dot([1.0, -8.0, 8.0, -1.0], ends) / 12e-5
+        assert np.abs(found.state[-1][:, k] / case.units * case.units[k] - exact).max() < 1e-6 * max(1.0, case.growth)
+    for j, name in enumerate(case.arguments["parameters"]):
+        ends, value = [], case.arguments["parameters"][name]
+        step = 1e-5 * {"o": case.units[0]}.get(name, value)
+        for factor in (-2, -1, 1, 2):
+            parameters = case.arguments["parameters"] | {name: value + factor * step}
+            ends.append(stepper.integrate(**case.arguments | {"parameters": parameters}).q[-1])
+        exact = np.dot([1.0, -8.0, 8.0, -1.0], ends) / 12.0
+        j = stepper.interface.parameters.index(name)
+        assert np.abs(found.parameters[-1][:m, j] * step - exact).max() < 1e-11 * max(1.0, case.growth) * case.ranges.max()
