@@ -40,13 +40,13 @@ def test_motions_across_kinks_are_within_tolerances(family):
 @families
 def test_orders_across_kinks(family):
     """SVI(1), SVI(2) and SVI(4) have orders 2, 4 and 8."""
-    assert not wrong(family, [1, 2], METHODS, ["order"])
+    assert not wrong(family, [1], METHODS, ["order"])
 
 
 @pytest.mark.second
 @families
 def test_methods_of_other_orders_are_within_tolerances(family):
-    assert not wrong(family, [2, 3], ["svi:2", "svi:8"], ["round-off", "tolerance", "error="])
+    assert not wrong(family, [2, 4], ["svi:2", "svi:8"], ["round-off", "tolerance", "error="])
 
 
 @pytest.mark.full
@@ -92,23 +92,22 @@ def test_trajectories_of_ensembles_have_the_bits_of_runs(family, plan):
         assert np.array_equal(together.ends[2][j], run.p[-1])
 
 
-@pytest.mark.tiers(2, 8)
-@families
+@pytest.mark.tiers(1, 8)
+@pytest.mark.parametrize("family", [family for family in FAMILIES if family != "drag"])
 def test_derivatives_across_kinks_are_those_of_the_motion(family):
     """With respect to the initial state, to differences of the reference; to parameters, to differences of runs."""
     stepper, case = stepper_of(family, "svi:4"), differentiable(family)
     motion, m, run = case.motion, len(case.motion.q), stepper.integrate(**case.arguments)
     found, times = run.sensitivity(), np.array([0.0, motion.span])
     for k, unit in enumerate(np.eye(2 * m)):
-        ends = [motion.states(times, factor * 1e-5 * unit)[0][-1] for factor in (-2, -1, 1, 2)]
-        exact = np.dot([1.0, -8.0, 8.0, -1.0], ends) / 12e-5
+        before, after = (motion.states(times, change * unit)[0][-1] for change in (-1e-6, 1e-6))
+        exact = (after - before) / 2e-6
         assert np.abs(found.state[-1][:, k] / case.units * case.units[k] - exact).max() < 1e-6 * max(1.0, case.growth)
-    for j, name in enumerate(case.arguments["parameters"]):
-        ends, value = [], case.arguments["parameters"][name]
-        step = 1e-5 * {"o": case.units[0]}.get(name, value)
-        for factor in (-2, -1, 1, 2):
-            parameters = case.arguments["parameters"] | {name: value + factor * step}
-            ends.append(stepper.integrate(**case.arguments | {"parameters": parameters}).q[-1])
-        exact = np.dot([1.0, -8.0, 8.0, -1.0], ends) / 12.0
-        j = stepper.interface.parameters.index(name)
-        assert np.abs(found.parameters[-1][:m, j] * step - exact).max() < 1e-11 * max(1.0, case.growth) * case.ranges.max()
+    parameters = case.arguments["parameters"]
+    for name in {*parameters} - {"m", "o", "b"}:
+        step, change = 1e-6 * parameters[name], found.parameters[-1][:m, stepper.interface.parameters.index(name)]
+        before, after = (
+            stepper.integrate(**case.arguments | {"parameters": parameters | {name: value}}).q[-1]
+            for value in (parameters[name] - step, parameters[name] + step)
+        )
+        assert np.abs(change * step - (after - before) / 2).max() < 1e-11 * max(1.0, case.growth) * case.ranges.max()

@@ -80,7 +80,7 @@ def outcome(family: str, case: Case, method: str, kind: str) -> tuple[float, int
             return (float(error.max() / BOUND) if run.confirmation.confirmed else math.nan), run.steps
         if kind == "round-off":
             run = stepper.integrate(**case.arguments, t_eval=case.t)
-            return error_of(case, run.q) / rounding_of(case, run.steps), run.steps
+            return error_of(case, run.q) / rounding_of(case, run.steps) / UNSEEN.get(method, 1.0), run.steps
         times = {"t_eval": case.t} if kind == "tolerance" else {}
         run = stepper.integrate(**case.arguments, tolerance=LOOSE, **times)
         return error_of(case, run.q if times else run.at(case.t)[0]) / LOOSE / UNSEEN.get(method, 1.0), run.steps
