@@ -101,22 +101,17 @@ class Motion(NamedTuple):
 
 
 class Family(NamedTuple):
-    """A kind of motion.
-
-    Attributes:
-        coordinates, lagrangian, forces: its equations, with a mass ``m`` and the origin ``o`` of positions.
-        units: powers of the units of mass, length and time in those of the parameters.
-        motion: function of a random generator that returns a motion.
-    """
+    """A kind of motion: its equations, with a mass ``m`` and the origin ``o`` of positions, and random motions."""
 
     coordinates: str
     lagrangian: str
     forces: dict[str, str]
-    units: dict[str, tuple[int, int, int]]
     motion: Callable[[np.random.Generator], Motion]
 
     def system(self, name: str) -> Any:
-        return lagrange(name, self.coordinates, self.lagrangian, forces=self.forces, **dict.fromkeys(self.units, 1.0))
+        parameters = self.motion(np.random.default_rng(0)).parameters
+        origin = {"o": 0.0} if "o" in self.lagrangian else {}
+        return lagrange(name, self.coordinates, self.lagrangian, forces=self.forces, **parameters, m=1.0, **origin)
 
 
 def dyadic(number: float) -> float:
@@ -134,11 +129,12 @@ def floor(random):
     k, s, a = 10.0 ** u(0, 5), 10.0 ** u(0, 3), u(0.2, 1.0)
     y, w = random.choice([(u(0.05, 3.0), 0.0), (u(0.05, 3.0), u(-1, 1)), (0.0, 0.0), (0.0, u(0.2, 1.0))])
     x, v = random.choice([(0.0, u(-1, 1)), (a, u(-1, 1)), (-a - 0.25, 0.0)])
-    span = dyadic(u(2.0, 6.0) * (abs(w) + math.sqrt(2 * y + 0.1)))
-    force = lambda t, q, v, on: (-2 * s * (on[1] * (q[0] - a) + on[2] * (q[0] + a)), -1.0 - 2 * k * on[0] * q[1])
-    switching = lambda t, q, v: (-q[1], q[0] - a, -q[0] - a)
-    values = {"g": 1.0, "k": k, "s": s, "a": a}
-    return Motion(values, [x, y], [v, w], span, 1 + math.sqrt(2 * max(k, s)), force, switching)
+    span, rate = dyadic(u(2.0, 6.0) * (abs(w) + math.sqrt(2 * y + 0.1))), 1 + math.sqrt(2 * max(k, s))
+    laws = (
+        lambda t, q, v, on: (-2 * s * (on[1] * (q[0] - a) + on[2] * (q[0] + a)), -1.0 - 2 * k * on[0] * q[1]),
+        lambda t, q, v: (-q[1], q[0] - a, -q[0] - a),
+    )
+    return Motion({"g": 1.0, "k": k, "s": s, "a": a}, [x, y], [v, w], span, rate, *laws)
 
 
 def backlash(random):
@@ -146,14 +142,13 @@ def backlash(random):
     u = numbers(random)
     k, j, a, f, w = 10.0 ** u(0, 3.5), u(0, 2), u(0.05, 0.5), u(0.2, 2.0), u(0.5, 3.0)
     x, v = random.choice([(0.0, 0.0), (a, 0.0), (-a, u(-1, 1)), (u(-0.5, 0.5), u(-1, 1))])
-
-    def force(t, q, v, on):
-        pull = 2 * k * (on[0] * (q[0] - q[1] - a) - on[1] * (q[1] - q[0] - a))
-        return f * math.cos(w * t) - pull, pull - j * q[1]
-
-    switching = lambda t, q, v: (q[0] - q[1] - a, q[1] - q[0] - a)
-    values = {"k": k, "j": j, "a": a, "f": f, "w": w, "b": 0.0}
-    return Motion(values, [x, 0.0], [v, 0.0], u(2, 6), w + math.sqrt(4 * k + j), force, switching)
+    pull = lambda q, on: 2 * k * (on[0] * (q[0] - q[1] - a) - on[1] * (q[1] - q[0] - a))  # noqa: E731
+    laws = (
+        lambda t, q, v, on: (f * math.cos(w * t) - pull(q, on), pull(q, on) - j * q[1]),
+        lambda t, q, v: (q[0] - q[1] - a, q[1] - q[0] - a),
+    )
+    values = {"k": k, "j": j, "a": a, "f": f, "w": w, "t0": 0.0}
+    return Motion(values, [x, 0.0], [v, 0.0], u(2, 6), w + math.sqrt(4 * k + j), *laws)
 
 
 def rope(random):
@@ -162,14 +157,11 @@ def rope(random):
     k, r, angle = 10.0 ** u(0, 4), random.choice([u(0.1, 1.0), 1.0, 1.01]), u(-math.pi, math.pi)
     on_circle = dyadic(r * math.cos(angle)), dyadic(r * math.sin(angle))
     q, v = random.choice([(on_circle, (u(-1, 1), u(-1, 1))), ((1.0, 0.0), (0.0, 0.0))])
-
-    def force(t, q, v, on):
-        r = math.hypot(*q)
-        pull = 2 * k * on[0] * (r - 1.0) / r
-        return -pull * q[0], -1.0 - pull * q[1]
-
-    values = {"g": 1.0, "k": k, "l": 1.0}
-    return Motion(values, q, v, u(1, 5), 3 + math.sqrt(2 * k), force, lambda t, q, v: (np.hypot(*q) - 1.0,))
+    laws = (
+        lambda t, q, v, on: -2 * k * on[0] * (1.0 - 1.0 / math.hypot(*q)) * q - np.array([0.0, 1.0]),
+        lambda t, q, v: (np.hypot(*q) - 1.0,),
+    )
+    return Motion({"g": 1.0, "k": k, "a": 1.0}, q, v, u(1, 5), 3 + math.sqrt(2 * k), *laws)
 
 
 PAIRS = ((0, 1), (0, 2), (1, 2))
@@ -182,35 +174,35 @@ def cutoff(random):
     q = np.array([0.0, 0.0, u(0.8, 1.5), u(-0.5, 0.5), u(-1.5, 0.0), u(1.0, 1.6)])
     if start != "apart":
         q[2:4] = (1.0 if start == "touching" else 0.9), 0.0
-    v = np.array([u(-0.3, 0.3), u(-0.3, 0.3), u(-1, 0), u(-0.5, 0.5), u(0, 1.0), u(-1, 0)]) * (start != "pressed")
+    v = [u(-0.3, 0.3), u(-0.3, 0.3), u(-1, 0), u(-0.5, 0.5), u(0, 1.0), u(-1, 0)]
 
-    def force(t, q, v, on):
-        found = np.zeros(6)
+    def acceleration(t, q, v, on):
+        forces = np.zeros(6)
         for (i, j), touch in zip(PAIRS, on, strict=True):
             d = q[2 * i : 2 * i + 2] - q[2 * j : 2 * j + 2]
             push = 2 * k * touch * (1.0 / math.hypot(*d) - 1.0) * d
-            found[2 * i : 2 * i + 2] += push
-            found[2 * j : 2 * j + 2] -= push
-        return found
+            forces[2 * i : 2 * i + 2] += push
+            forces[2 * j : 2 * j + 2] -= push
+        return forces
 
-    apart = lambda q, i, j: np.hypot(q[2 * i] - q[2 * j], q[2 * i + 1] - q[2 * j + 1])
-    switching = lambda t, q, v: [1.0 - apart(q, i, j) for i, j in PAIRS]
-    return Motion({"k": k, "a": 1.0}, q, v, u(1, 3), 1 + math.sqrt(4 * k), force, switching)
+    def switching(t, q, v):
+        return [1.0 - np.hypot(q[2 * i] - q[2 * j], q[2 * i + 1] - q[2 * j + 1]) for i, j in PAIRS]
+
+    v = np.zeros(6) if start == "pressed" else v
+    return Motion({"k": k, "a": 1.0}, q, v, u(1, 3), 1 + math.sqrt(4 * k), acceleration, switching)
 
 
 def pulse(random, power=0):
     """A mass, on a damped spring or free, that is pushed for a while, also from the start on."""
     u = numbers(random)
     span, j, d, f = u(3, 10), random.choice([0.0, u(0.5, 3)]), random.choice([0.0, u(0, 0.5)]), 10.0 ** u(-1, 1)
-    begin, width = random.choice([0.0, u(0, 0.9 * span), u(0, 0.9 * span)]), dyadic(10.0 ** u(-3, 0.3))
+    begin = random.choice([0.0, u(0, 0.9 * span), u(0, 0.9 * span)])
     x, v = random.choice([(0.0, 0.0), (u(-1, 1), 0.0), (u(-1, 1), u(-1, 1))])
-
-    def force(t, q, v, on):
-        push = on[0] * (t - begin) ** power - on[1] * (t - begin - width) ** power
-        return (-j * q[0] - d * v[0] + f * push,)
-
-    values = {"j": j, "d": d, "f": f, "a": begin, "b": begin + width}
-    return Motion(values, [x], [v], span, 1 + math.sqrt(j), force, lambda t, q, v: (t - begin, t - begin - width))
+    end = begin + dyadic(10.0 ** u(-3, 0.3))
+    push = lambda t, on: on[0] * (t - begin) ** power - on[1] * (t - end) ** power  # noqa: E731
+    laws = (lambda t, q, v, on: (f * push(t, on) - j * q[0] - d * v[0],), lambda t, q, v: (t - begin, t - end))
+    values = {"j": j, "d": d, "fr"[power]: f, "t1": begin, "t2": end}
+    return Motion(values, [x], [v], span, 1 + math.sqrt(j), *laws)
 
 
 def ramp(random):
@@ -222,64 +214,55 @@ def relay(random):
     u = numbers(random)
     j, f, c = random.choice([0.0, u(0.1, 3)]), u(0.5, 3), u(-0.4, 0.4)
     x, v = random.choice([(u(0.1, 1.0), 0.0), (0.0, u(0.3, 1.0)), (0.0, u(-1, -0.3)), (u(-1, 1), u(-1, 1))])
-    force = lambda t, q, v, on: (-j * q[0] + f * (1 - 2 * on[0]) + c,)
-    return Motion({"j": j, "f": f, "c": c}, [x], [v], u(3, 10), 2 + math.sqrt(j), force, lambda t, q, v: (q[0],))
+    laws = (lambda t, q, v, on: (f * (1 - 2 * on[0]) + c - j * q[0],), lambda t, q, v: (q[0],))
+    return Motion({"j": j, "f": f, "c": c}, [x], [v], u(3, 10), 2 + math.sqrt(j), *laws)
 
 
 def drag(random):
     """A driven mass in a fluid."""
     u = numbers(random)
-    j, d, f, w = random.choice([0.0, u(0.1, 3)]), 10.0 ** u(-1, 1), u(0.3, 2), u(0.5, 3)
+    j, e, f, w = random.choice([0.0, u(0.1, 3)]), 10.0 ** u(-1, 1), u(0.3, 2), u(0.5, 3)
     x, v = random.choice([(u(-1, 1), u(-1, 1)), (0.0, 0.0), (u(-1, 1), 0.0)])
-    force = lambda t, q, v, on: (-j * q[0] - d * v[0] ** 2 * (2 * on[0] - 1) + f * math.cos(w * t),)
-    values, rate = {"j": j, "d": d, "f": f, "w": w, "b": 0.0}, w + math.sqrt(j) + 2 * math.sqrt(d * f)
-    return Motion(values, [x], [v], u(3, 10), rate, force, lambda t, q, v: (v[0],))
+    laws = (
+        lambda t, q, v, on: (f * math.cos(w * t) - e * v[0] ** 2 * (2 * on[0] - 1) - j * q[0],),
+        lambda t, q, v: (v[0],),
+    )
+    values, rate = {"j": j, "e": e, "f": f, "w": w, "t0": 0.0}, w + math.sqrt(j) + 2 * math.sqrt(e * f)
+    return Motion(values, [x], [v], u(3, 10), rate, *laws)
 
 
-FORCE, STIFFNESS, LENGTH, GRAVITY, RATE, TIME = (1, 1, -2), (1, 0, -2), (0, 1, 0), (0, 1, -2), (0, 0, -1), (0, 0, 1)
-ORIGIN = {"m": (1, 0, 0), "o": LENGTH}
+PLANE = "m*(x_dot**2 + y_dot**2)/2"
 PUSHED = "m*x_dot**2/2 - j*(x - o)**2/2"
 FAMILIES = {
     "floor": Family(
         "x y",
-        "m*(x_dot**2 + y_dot**2)/2 - m*g*y - k*positive_part(o - y)**2"
-        " - s*(positive_part(x - o - a)**2 + positive_part(o - a - x)**2)",
-        {}, ORIGIN | {"g": GRAVITY, "k": STIFFNESS, "s": STIFFNESS, "a": LENGTH}, floor,
+        f"{PLANE} - m*g*y - k*positive_part(o - y)**2 - s*(positive_part(x - o - a)**2 + positive_part(o - a - x)**2)",
+        {}, floor,
     ),
     "backlash": Family(
-        "x y",
-        "m*(x_dot**2 + y_dot**2)/2 - k*(positive_part(x - y - a)**2 + positive_part(y - x - a)**2) - j*(y - o)**2/2",
-        {"x": "f*cos(w*(t - b))"},
-        ORIGIN | {"k": STIFFNESS, "j": STIFFNESS, "a": LENGTH, "f": FORCE, "w": RATE, "b": TIME}, backlash,
+        "x y", f"{PLANE} - k*(positive_part(x - y - a)**2 + positive_part(y - x - a)**2) - j*(y - o)**2/2",
+        {"x": "f*cos(w*(t - t0))"}, backlash,
     ),
     "rope": Family(
-        "x y", "m*(x_dot**2 + y_dot**2)/2 - m*g*y - k*positive_part(sqrt((x - o)**2 + (y - o)**2) - l)**2",
-        {}, ORIGIN | {"g": GRAVITY, "k": STIFFNESS, "l": LENGTH}, rope,
+        "x y", f"{PLANE} - m*g*y - k*positive_part(sqrt((x - o)**2 + (y - o)**2) - a)**2", {}, rope,
     ),
     "cutoff": Family(
         "x0 y0 x1 y1 x2 y2",
         "m*(x0_dot**2 + y0_dot**2 + x1_dot**2 + y1_dot**2 + x2_dot**2 + y2_dot**2)/2"
         + "".join(f" - k*positive_part(a - sqrt((x{i} - x{j})**2 + (y{i} - y{j})**2))**2" for i, j in PAIRS),
-        {}, {"m": (1, 0, 0), "k": STIFFNESS, "a": LENGTH}, cutoff,
+        {}, cutoff,
     ),
-    "pulse": Family(
-        "x", PUSHED, {"x": "f*(unit_step(t - a) - unit_step(t - b)) - d*x_dot"},
-        ORIGIN | {"j": STIFFNESS, "d": (1, 0, -1), "f": FORCE, "a": TIME, "b": TIME}, pulse,
-    ),
-    "ramp": Family(
-        "x", PUSHED, {"x": "f*(positive_part(t - a) - positive_part(t - b)) - d*x_dot"},
-        ORIGIN | {"j": STIFFNESS, "d": (1, 0, -1), "f": (1, 1, -3), "a": TIME, "b": TIME}, ramp,
-    ),
-    "relay": Family(
-        "x", PUSHED, {"x": "f*(1 - 2*unit_step(x - o)) + c"},
-        ORIGIN | {"j": STIFFNESS, "f": FORCE, "c": FORCE}, relay,
-    ),
-    "drag": Family(
-        "x", PUSHED, {"x": "-d*x_dot**2*(2*unit_step(x_dot) - 1) + f*cos(w*(t - b))"},
-        ORIGIN | {"j": STIFFNESS, "d": (1, -1, 0), "f": FORCE, "w": RATE, "b": TIME}, drag,
-    ),
+    "pulse": Family("x", PUSHED, {"x": "f*(unit_step(t - t1) - unit_step(t - t2)) - d*x_dot"}, pulse),
+    "ramp": Family("x", PUSHED, {"x": "r*(positive_part(t - t1) - positive_part(t - t2)) - d*x_dot"}, ramp),
+    "relay": Family("x", PUSHED, {"x": "f*(1 - 2*unit_step(x - o)) + c"}, relay),
+    "drag": Family("x", PUSHED, {"x": "f*cos(w*(t - t0)) - e*x_dot*abs(x_dot)"}, drag),
 }  # fmt: skip
-"""Parameters that are times count from the start."""
+UNITS = {
+    "m": (1, 0, 0), "o": (0, 1, 0), "a": (0, 1, 0), "g": (0, 1, -2), "w": (0, 0, -1), "d": (1, 0, -1), "e": (1, -1, 0),
+    **dict.fromkeys("ksj", (1, 0, -2)), **dict.fromkeys("fc", (1, 1, -2)), "r": (1, 1, -3),
+    **dict.fromkeys(["t0", "t1", "t2"], (0, 0, 1)),
+}  # fmt: skip
+"""Powers of the units of mass, length and time in those of parameters."""
 
 
 class Case(NamedTuple):
@@ -308,7 +291,7 @@ class Case(NamedTuple):
 def case_of(family: str, number: int, count: int = 21) -> Case:
     """Return a random case; every third one has the units and the origin of its motion."""
     random = np.random.default_rng([number, [*FAMILIES].index(family)])
-    motion, units = FAMILIES[family].motion(random), FAMILIES[family].units
+    motion = FAMILIES[family].motion(random)
     m, times = len(motion.q), np.linspace(0.0, motion.span, count)
     exact, kinks = motion.states(times)
     sizes = np.repeat([np.ptp(exact[:, :m], axis=0).max(), np.abs(exact[:, m:]).max()], m)
@@ -319,12 +302,10 @@ def case_of(family: str, number: int, count: int = 21) -> Case:
         mass, length, time = 10.0 ** random.uniform(-3, 3), *(2.0 ** random.integers(-10, 11, 2))
         shift = length * dyadic(random.uniform(-10, 10) * sizes[0])
         start = time * dyadic(random.uniform(-10, 10) * motion.span)
-    values = motion.parameters | {"m": 1.0, "o": 0.0}
-    powers = {name: mass**a * length**b * time**c for name, (a, b, c) in units.items()}
-    origins = {LENGTH: {"o": shift}, TIME: {"a": start, "b": start}}
-    parameters = {
-        name: float(values[name] * powers[name] + origins.get(units[name], {}).get(name, 0.0)) for name in units
-    }
+    parameters = {"m": mass} | ({"o": shift} if "o" in FAMILIES[family].lagrangian else {})
+    for name, value in motion.parameters.items():
+        a, b, c = UNITS[name]
+        parameters[name] = float(value * mass**a * length**b * time**c + start * name.startswith("t"))
     arguments = {
         "q": shift + length * np.array(motion.q), "p": mass * length / time * np.array(motion.v),
         "t": float(start), "t_end": float(start + time * motion.span), "parameters": parameters,
