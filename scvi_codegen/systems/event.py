@@ -53,8 +53,8 @@ JAMMED = (
 Formula: TypeAlias = "str | Expr | float"
 """Formula as text or a SymPy expression, or a number."""
 PASSED = (
-    "the step from t = {t:.17g} passes '{function}' = 0 without a crossing that was found: the function changes its sign "
-    "more often than the search sees. Limit the steps by max_step= (or h=)"
+    "the step from t = {t:.17g} passes '{function}' = 0 without a crossing that was found: the function changes its "
+    "sign more often than the search sees. Limit the steps by max_step= (or h=)"
 )
 SLIDING = (
     "the motion slides on '{function}' = 0 at t = {t:.17g}: the forces on both sides of this jump point to it (dry "

@@ -16,9 +16,9 @@ from scvi_codegen.codegen.native.arguments import real_array
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.common.representation import summary
 from scvi_codegen.runs.derivatives.transformed_derivatives import time_of
-from scvi_codegen.runs.events.saltation import Jump, jumps_within, parameters_on_sides
+from scvi_codegen.runs.events.saltation import Jump, jumps_within
 from scvi_codegen.runs.results.recomputation import SAME_STEP_SIZE, check_recomputed, steps_after, steps_between
-from scvi_codegen.runs.results.saved_states import SavedStates
+from scvi_codegen.runs.results.saved_states import SavedStates, parameters_on_sides
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepping.step_derivatives import LinearisedMethod, Sensitivity, Starts
 from scvi_codegen.runs.stepping.step_plan import FixedSteps

@@ -183,14 +183,14 @@ class CrossingSearch:
 
     def crossings(self) -> tuple[Crossings, ...]:
         """Return the crossings by event."""
-        return self._by_event(self.stepper.events, self._records())
+        return self._by_event(self.stepper.events, self._joined(self.recorded))
 
-    def switches(self) -> tuple[Switches, ...]:
-        """Return the changes of the side of each kink."""
+    def switches(self, recorded: Sequence[NDArray[Any]]) -> tuple[Switches, ...]:
+        """Return the changes of the side of each kink among some of the records."""
         events = self.stepper.events
         if not self.stepper.interface.modes:
             return ()
-        records = self._records()
+        records = self._joined(recorded)
         found = self._by_event(self.stepper.searched, records)[len(events) :]
         numbers = range(len(events), len(self.stepper.searched))
         sides = [records["direction"][records["function"] == number].astype(np.int64) for number in numbers]
@@ -199,9 +199,9 @@ class CrossingSearch:
             for of, side in zip(found, sides, strict=True)
         )
 
-    def _records(self) -> Any:
+    def _joined(self, recorded: Sequence[NDArray[Any]]) -> Any:
         none = self.binding.records(self.binding.new("crossing[1]"), 0)
-        return np.concatenate(self.recorded) if len(self.recorded) > 1 else [*self.recorded, none][0]
+        return np.concatenate(recorded) if len(recorded) > 1 else [*recorded, none][0]
 
     def _by_event(self, events: Sequence[Event], records: Any) -> tuple[Crossings, ...]:
         named, crossings = self.stepper.named, []

@@ -23,11 +23,12 @@ from numpy.typing import NDArray
 from scvi_codegen.codegen.rendering.source import Interface
 from scvi_codegen.common.errors import StateError
 from scvi_codegen.runs.results.recomputation import changes_by_events, steps_after
+from scvi_codegen.runs.results.saved_states import parameters_on_sides
 from scvi_codegen.runs.states.times import WHOLE
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepping.projection import projected
 from scvi_codegen.runs.stepping.step_plan import FixedSteps
-from scvi_codegen.systems.event import Event
+from scvi_codegen.systems.event import Event, Kink
 
 if TYPE_CHECKING:
     from scvi_codegen.runs.results.saved_states import SavedStates
@@ -43,24 +44,10 @@ OF_STEP = 0.25
 """Increments of the time and of positions relative to their mean change in a step; of positions at least DIFFERENCE."""
 ADMISSIBLE = 0.5
 """Singular values of the derivative of a projection are at least 1, or 0 for inadmissible directions."""
-SIDE = 2.0**1000
-"""Size of the mode of a kink that decides its side, as in ``kinks.h``."""
+CONTINUOUS = 1e-9
+"""Largest difference of the rates of both sides of a kink that is rounding: the flow has no jump there."""
 WEIGHTS = np.array([1.0, -9.0, 45.0]) / 60.0
 PLACES = np.array([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])
-
-
-def parameters_on_sides(states: SavedStates, t: float) -> Array:
-    """Return the parameters of the steps after time t, with the sides of the kinks that the run passed."""
-    switches = getattr(states, "switches", ())
-    if not any(map(len, switches)):
-        return states.parameters
-    parameters = states.parameters.copy()
-    sides = parameters[len(parameters) - len(switches) :]
-    for k, kink in enumerate(switches):
-        if len(kink):
-            passed = int(np.count_nonzero(states.forward * kink.t <= states.forward * t))
-            sides[k] = SIDE * (kink.side[passed - 1] if passed else -kink.side[0])
-    return parameters
 
 
 class Jump(NamedTuple):
@@ -142,6 +129,13 @@ def _jump(
         departure, basis = onto[:, -1], directions[:, sizes > ADMISSIBLE]
     moved = step[:, -1] - step[:, -2] - step[:, : 2 * m] @ departure
     departure = departure + basis @ np.linalg.lstsq(step[:, : 2 * m] @ basis, moved)[0]
+    matrix = np.eye(size)
+    # dh of a divided step is added to both of its parts, but lengthens only the second: without that of the first,
+    # which the crossing makes X+ dh, and without its dt = dh
+    matrix[: 2 * m, -1] -= divided * departure
+    matrix[-2, -1] -= divided
+    if isinstance(event, Kink) and np.linalg.norm(departure - arrival) <= CONTINUOUS * np.linalg.norm(arrival):
+        return Jump(matrix, before)
     values = _derivatives(stepper.known.interface, event)(before, t, parameters)
     gradient = np.concatenate([values.gradient, np.zeros(1)])
     rate = values.gradient[: 2 * m] @ arrival + values.gradient[-1]
@@ -158,13 +152,8 @@ def _jump(
         change = by[:, : 2 * m] @ values.map
         change[:, 2 * m :] += by[:, 2 * m :]
     crossing_time = -gradient / rate  # dtau = crossing_time (dx, dh)
-    matrix = np.eye(size)
-    matrix[: 2 * m] = np.concatenate([change, np.zeros((2 * m, 1))], axis=1)
+    matrix[: 2 * m] += np.concatenate([change, np.zeros((2 * m, 1))], axis=1) - np.eye(2 * m, size)
     matrix[: 2 * m] += np.outer(change[:, : 2 * m] @ arrival + change[:, -1] - departure, crossing_time)
-    # dh of a divided step is added to both of its parts, but lengthens only the second: without that of the first,
-    # which the crossing makes X+ dh, and without its dt = dh
-    matrix[: 2 * m, -1] -= divided * departure
-    matrix[-2, -1] -= divided
     return Jump(matrix, before)
 
 

@@ -81,3 +81,21 @@ class SavedStates:
         """Return a run from saved state k with fixed steps h."""
         settings: dict[str, Any] = {"parameters": self.parameters, "options": self.options}
         return Memory.started(self.stepper, self.q[k], self.p[k], plan=Fixed(h), t=scalar(self.t[k]), **settings)
+
+
+SIDE = 2.0**1000
+"""Size of the mode of a kink that decides its side, as in ``kinks.h``."""
+
+
+def parameters_on_sides(states: SavedStates, t: float) -> Array:
+    """Return the parameters of the steps after time t, with the sides of the kinks that the run passed."""
+    switches = getattr(states, "switches", ())
+    if not any(map(len, switches)):
+        return states.parameters
+    parameters = states.parameters.copy()
+    sides = parameters[len(parameters) - len(switches) :]
+    for k, kink in enumerate(switches):
+        if len(kink):
+            passed = int(np.searchsorted(states.forward * kink.t, states.forward * t, side="right"))
+            sides[k] = SIDE * (kink.side[passed - 1] if passed else -kink.side[0])
+    return parameters

@@ -9,6 +9,7 @@
  * EVENT_NODES, the nodes as fractions of a part of a step. */
 enum {
   EVENT_SPLITS = 6, /* greatest depth of subdivision of a step */
+  EVENT_OCTAVES = 10, /* intervals of a part of a step after a kink */
   EVENT_TRIALS = 200, /* largest number of states evaluated for one crossing; bisection takes 52 */
   EVENT_FIRST_PROBE = 40, /* after a start at a zero, the first state tested is 2^-40 of a step later */
   EVENT_LAST_PROBE = 4,
@@ -431,6 +432,26 @@ static int leave_kink(const event_step *step, int e, const event_sample *left, e
   return status;
 }
 
+/* Search in a part that begins at a kink or a start, from twice as long to twice as long intervals, so that the first
+ * of many crossings is found. */
+static int search_octaves(const event_step *step, int e, const event_sample *from, const event_sample *right)
+{
+  event_sample low = *from, high;
+  int status = OK;
+  for (int k = EVENT_OCTAVES; k >= 0 && status == OK && low.fraction < step->horizon->fraction; k--) {
+    const real fraction = ldexp(1.0, -k);
+    if (fraction <= low.fraction)
+      continue;
+    high = *right;
+    if (k > 0)
+      status = take_sample(step, e, fraction, &high);
+    if (status == OK)
+      status = search_part(step, e, &low, &high, NULL, EVENT_SPLITS);
+    low = high;
+  }
+  return status;
+}
+
 /* Marks the functions that are far from zero along a step, as search_part would find, in a loop over all of them. */
 static void mark_far(const event_step *step, real *far)
 {
@@ -493,6 +514,8 @@ static int search_function(const event_step *step, int e, const event_sample *le
       range = fmax(range, fabs(inner[j - 1] - from.g));
     status = leave_zero(step, e, &start, range, &from);
   }
+  if (status == OK && !step->watch->started && side_at_start(step->watch, e) != 0.0)
+    return search_octaves(step, e, &from, &to);
   return status == OK ? search_part(step, e, &from, &to, from.fraction > 0.0 ? NULL : inner, EVENT_SPLITS) : status;
 }
 
