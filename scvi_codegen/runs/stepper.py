@@ -372,7 +372,9 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         """Return (q, p), or q and the momenta of a velocity, on the constraints."""
         q, p, velocity, t, parameters, _ = initial
         p = self._initial_momenta(q, p, velocity, t, parameters)
-        return consistent(self, q, p, t, parameters) if self.interface.constraints else (q, p)
+        if not self.interface.constraints or self._contacts is not None:  # which project the start of each piece
+            return q, p
+        return consistent(self, q, p, t, parameters)
 
     def _validated(self, initial: InitialData, *, converted: bool) -> InitialData:
         """Return initial data with momenta, on the constraints; or with a velocity that the run itself converts."""
