@@ -83,8 +83,10 @@ def unbounded_slope_of(
         formula, moving, constants: as of :func:`jump_of`. Terms that are infinite where u is 0 are left out.
     """
     variables = set(moving)
-    for surface, term, whole in _surfaces(formula, variables):
-        if all(part.exp.is_Integer for part in parts(whole) if part.is_Pow) and not whole.has(sympy.log):
+    powers = [part for part in parts(formula) if part.is_Pow and not part.exp.is_Integer]
+    roots = [*powers, *(part for part in parts(formula) if isinstance(part, sympy.log))]
+    for surface, term, whole in _surfaces(formula, variables) if roots else ():
+        if not whole.has(*roots):
             continue
         crossing = sorted(surface.free_symbols & variables, key=str)
         derivatives = jacobian([whole], crossing).values()
@@ -104,12 +106,12 @@ def _surfaces(formula: Expr, moving: Set[Symbol]) -> Iterator[tuple[Expr, Expr, 
 
     At most ``MOST_SURFACES``. Surfaces with the mode of a kink were examined without it.
     """
-    for surface in sorted(kinks_of([formula]), key=str)[:MOST_SURFACES]:
+    kinks = {term: kinks_of([term]) for term in sympy.Add.make_args(formula) if term.has(unit_step, rint)}
+    for surface in sorted(set().union(*kinks.values()), key=str)[:MOST_SURFACES]:
         if not surface.free_symbols & moving or any(isinstance(free, Mode) for free in surface.free_symbols):
             continue
-        terms = [term for term in sympy.Add.make_args(formula) if term.has(unit_step, rint)]
-        near = [term for term in terms if surface in kinks_of([term])] or [formula]
-        rest = [term for term in terms if term not in near and term.free_symbols & surface.free_symbols]
+        near = [term for term, surfaces in kinks.items() if surface in surfaces]
+        rest = [term for term in kinks if term not in near and term.free_symbols & surface.free_symbols]
         yield surface, near[0], sympy.Add(*near, *rest)
 
 
