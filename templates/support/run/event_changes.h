@@ -423,6 +423,7 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
 #ifdef EVENT_KINKS
     event_sample start = {.t = run->t, .q = before.q, .p = before.p};
     int unknown;
+    step.h = control ? t_end - run->t : run->h; /* whose direction counts */
     status = settle_sides(&step, &start, &unknown);
     size = run->h;
     if (status == OK && unknown && control)

@@ -36,11 +36,36 @@ static void set_side(const event_step *step, int kink, int side)
   step->watch->side[kink] = step->own[MODE_PLACE[kink]] = side * KINK_SIDE;
 }
 
+/* Whether the function of a kink is one of time alone, whose zeros do not depend on the state. */
+static int is_of_time(int kink)
+{
+#ifdef EVENTS_OF_TIME
+  return IS_TIMED[FIRST_KINK + kink] != 0;
+#else
+  (void)kink;
+  return 0;
+#endif
+}
+
+/* Values of all functions at a state; those of time alone eight roundings later, as at the ends of steps. */
+static int values_of_kinks(const event_step *step, const event_sample *at, real *value)
+{
+  int status = evaluate_functions(step, at, value);
+#ifdef EVENTS_OF_TIME
+  for (int k = 0; status == OK && k < EVENT_KINKS; k++)
+    if (is_of_time(k)) {
+      const int e = EVENT_FIRST[FIRST_KINK + k];
+      status = end_value(step, e, at->t, step->h, value + e);
+    }
+#endif
+  return status;
+}
+
 /* The side of u at a state, 0 within the effect of rounding; values: of all functions there. */
 static int side_of(const event_step *step, int kink, const real *value)
 {
   const int e = EVENT_FIRST[FIRST_KINK + kink];
-  const real noise = 8.0 * values_at(step, EVENT_DEGREE + 2)[e] + RESIDUAL(step->watch, e);
+  const real noise = is_of_time(kink) ? 0.0 : 8.0 * values_at(step, EVENT_DEGREE + 2)[e] + RESIDUAL(step->watch, e);
   return (value[e] > noise) - (value[e] < -noise);
 }
 
@@ -49,7 +74,7 @@ static int side_of(const event_step *step, int kink, const real *value)
 static int settle_sides(const event_step *step, const event_sample *at, int *unknown)
 {
   real *const value = values_at(step, 0);
-  int doubtful = 0, status = evaluate_functions(step, at, value);
+  int doubtful = 0, status = values_of_kinks(step, at, value);
   *unknown = 0;
   for (int k = 0; status == OK && k < EVENT_KINKS; k++) {
     const real g = value[EVENT_FIRST[FIRST_KINK + k]], side = step->watch->side[k];
@@ -84,7 +109,7 @@ static int signs_after(const event_step *step, const event_sample *at, real leng
   for (int place = KINK_FIRST_PROBE; status == OK && unknown > 0 && place >= KINK_LAST_PROBE; place -= 5) {
     status = state_at(&from, ldexp(1.0, -place), &next);
     if (status == OK)
-      status = evaluate_functions(step, &next, value);
+      status = values_of_kinks(&from, &next, value);
     unknown = 0;
     for (int k = 0; status == OK && k < EVENT_KINKS; k++) {
       sign[k] = sign[k] ? sign[k] : side_of(step, k, value);
@@ -127,7 +152,7 @@ static int change_sides(const event_step *step, long long first, const event_sam
   for (long long i = first; status == OK && i < *step->filled; i++) {
     event_crossing *crossing = step->found + i;
     const int kink = crossing->function - FIRST_KINK;
-    if (kink >= 0 && sign[kink] == -crossing->direction) {
+    if (kink >= 0 && !is_of_time(kink) && sign[kink] == -crossing->direction) {
       crossing->direction = -crossing->direction;
       set_side(step, kink, crossing->direction);
       returns = 1;
@@ -137,7 +162,7 @@ static int change_sides(const event_step *step, long long first, const event_sam
     status = signs_after(step, at, step->whole, sign);
   for (long long i = first; status == OK && returns && i < *step->filled; i++) {
     const int kink = step->found[i].function - FIRST_KINK;
-    if (kink >= 0 && sign[kink] == -step->found[i].direction) {
+    if (kink >= 0 && !is_of_time(kink) && sign[kink] == -step->found[i].direction) {
       step->watch->sliding = step->found[i].function + 1;
       status = NOT_CONVERGED;
     }
@@ -148,9 +173,9 @@ static int change_sides(const event_step *step, long long first, const event_sam
 /* Fails if a function has the sign of the other side at the end of a step in which no crossing was found. */
 static int check_sides(const event_step *step, const event_sample *right)
 {
-  const real *const value = values_at(step, EVENT_DEGREE);
-  int doubtful = 0, status = OK;
-  for (int k = 0; k < EVENT_KINKS; k++)
+  real *const value = values_at(step, EVENT_DEGREE);
+  int doubtful = 0, status = values_of_kinks(step, right, value);
+  for (int k = 0; status == OK && k < EVENT_KINKS; k++)
     doubtful |= value[EVENT_FIRST[FIRST_KINK + k]] * (step->watch->side[k] / KINK_SIDE) < 0.0;
   if (!doubtful)
     return OK;
