@@ -96,7 +96,7 @@ def test_trajectories_of_ensembles_have_the_bits_of_runs(family, plan):
 
 
 @pytest.mark.tiers(1, 8)
-@pytest.mark.parametrize("family", [family for family in SMALLEST_FIRST if family != "drag"])
+@families
 def test_derivatives_across_kinks_are_those_of_the_motion(family):
     """With respect to the initial state, to differences of the reference; to parameters, to differences of runs."""
     stepper, case = stepper_of(family, "svi:4"), differentiable(family)
