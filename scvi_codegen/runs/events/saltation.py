@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -136,7 +136,8 @@ def _jump(
     matrix[-2, -1] -= divided
     if isinstance(event, Kink) and np.linalg.norm(departure - arrival) <= CONTINUOUS * np.linalg.norm(arrival):
         return Jump(matrix, before)
-    values = _derivatives(stepper.known.interface, event)(before, t, parameters)
+    values = _at_kink(states, event, before, t, all_inputs) if isinstance(event, Kink) else None
+    values = values or _derivatives(stepper.known.interface, event)(before, t, parameters)
     gradient = np.concatenate([values.gradient, np.zeros(1)])
     rate = values.gradient[: 2 * m] @ arrival + values.gradient[-1]
     steepest = np.linalg.norm(values.gradient[: 2 * m]) * np.linalg.norm(arrival) + abs(values.gradient[-1])
@@ -204,6 +205,37 @@ def _derivatives(interface: Interface, event: Event) -> Callable[[Array, float, 
         return Values(numbers[:count], rest, numbers[len(entries) :])
 
     return evaluate
+
+
+@lru_cache(maxsize=64)
+def _function_of_velocities(interface: Interface, kink: Kink) -> Callable[..., Any] | None:
+    """Return the function of a kink by (q, p, v), parameters and t; ``None`` if it contains no velocities."""
+    import sympy  # here: slow to import, with the modules that use it
+
+    from scvi_codegen.codegen.rendering.events import EventFormulas
+    from scvi_codegen.systems.formulas.symbols import TIME, symbol
+
+    formulas = EventFormulas(interface, (kink,))
+    (function,) = formulas.functions
+    if function.free_symbols.isdisjoint(formulas.v):
+        return None
+    variables = (*formulas.q, *formulas.p, *formulas.v, *formulas.parameters, symbol(TIME))
+    made: Callable[..., Any] = sympy.lambdify((variables,), [function], cse=True)
+    return made
+
+
+def _at_kink(states: SavedStates, kink: Kink, before: Array, t: float, all_inputs: bool) -> Values | None:
+    """Return the derivatives of a kink of velocities, by differences of sixth order; ``None`` for other kinks."""
+    stepper, m = states.stepper, states.stepper.dimension
+    function = _function_of_velocities(stepper.known.interface, kink)
+    if function is None:
+        return None
+
+    def value(q: Array, p: Array, t: float, parameters: Array) -> Array:
+        return np.array(function([*q, *p, *stepper.velocity(q, p, t, parameters), *parameters, t]), dtype=float)
+
+    (gradient,) = _differences(value, states, before[:m], before[m:], t, all_inputs=all_inputs)
+    return Values(gradient, np.eye(2 * m, len(gradient)), before)
 
 
 def _impact(states: SavedStates, values: Values, before: Array, after: Array, t: float, all_inputs: bool) -> Array:

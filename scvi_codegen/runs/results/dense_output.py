@@ -52,6 +52,7 @@ def states_and_steps_at(states: SavedStates, times: Array) -> tuple[Array, Array
     lengths, fixed, several = states.step_sizes[:-1], isinstance(states.plan, FixedSteps), False
     if states.stepper.divides_steps:
         several = not (np.abs(np.diff(states.t)) < 1.5 * np.abs(lengths)).all()
+        several |= len(getattr(states, "switches", ())) < len(states.stepper.interface.modes)  # sides are not known
     if several or (not fixed and np.isnan(lengths).any()):
         return *_integrate_to_each(states, left, times, states.plan), times
     t, q, p = states.t[left], states.q[left], states.p[left]

@@ -630,7 +630,7 @@ int NAME(crossings)(event_watch *watch, long long count, const real *h, const re
   for (long long k = 0; k < count && !watch->ended; k++) {
     const long long start = k > 0 ? k - 1 : 0, first = *filled;
     const event_step step = {t[start], h[start], h[start], q + start * M, p + start * M, parameters, options, watch,
-        found, room, filled, report, workspace, memory, memory + 9 * M, 0, &horizon};
+        found, room, filled, report, workspace, memory, memory + 9 * M, 0, &horizon, NULL};
     int status;
     report->t = t[start];
     right.fraction = k > 0 ? 1.0 : 0.0;
