@@ -358,6 +358,17 @@ class MechanicalSystem(Deferred, ABC):
         return tuple(sorted(self.text_of(u) for u in kinks if not u.free_symbols <= {*self.parameters}))
 
     @property
+    def has_localised_forces(self) -> bool:
+        """True if exponentials or hyperbolic functions may confine a force to a short time or a small region."""
+        from sympy import exp
+        from sympy.functions.elementary.hyperbolic import HyperbolicFunction
+
+        from scvi_codegen.systems.formulas.expressions import parts_of_type
+
+        formulas = (self.formula, *self.forces)
+        return any(parts_of_type(kind, *formulas) for kind in (exp, HyperbolicFunction))
+
+    @property
     def balances_energy(self) -> bool:
         """True if the energy changes by the work of forces or damping only."""
         acted = bool(self.forces) or self.damping != 0

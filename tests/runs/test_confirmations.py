@@ -337,13 +337,24 @@ def test_no_error_is_confirmed_but_wrong(family, kind):
     """Three cases of each kind, more with narrow forces, some of which all stages miss; most are confirmed."""
     kinds = [*FAMILIES[family][0]]
     first, stride, count = kinds.index(kind), len(kinds), 15 if family == "narrow" else 3
-    least = {"smooth": 0.6, "not smooth": 0.0, "narrow": 0.9}[family]
+    least = {"smooth": 0.6, "not smooth": 0.0, "narrow": 0.8}[family]
     check(counts(range(first, first + count * stride, stride), family, ["svi:4"]), least)
+
+
+@pytest.mark.second
+def test_free_flight_is_examined_for_narrow_forces():
+    """Without ``error=``: of thirty runs, steps that are not examined in pieces miss the force in eleven."""
+    missed = 0
+    for number in range(30):
+        case = case_of(number, "narrow", ["svi:4"])
+        run = case.stepper.integrate(**{name: x for name, x in case.arguments.items() if name != "error"})
+        missed += abs(run.q[-1] - case.positions(run.t[-1:])[0]).max() > 1e-7
+    assert missed <= 3
 
 
 @pytest.mark.full
 @pytest.mark.parametrize(
-    ("family", "count", "least"), [("smooth", 2000, 0.95), ("not smooth", 1000, 0.6), ("narrow", 1000, 0.95)]
+    ("family", "count", "least"), [("smooth", 2000, 0.95), ("not smooth", 1000, 0.6), ("narrow", 1000, 0.9)]
 )
 def test_no_false_confirmation_in_four_thousand_cases(family, count, least):
     check(counts(range(count), family), least)

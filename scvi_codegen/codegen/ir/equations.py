@@ -456,6 +456,7 @@ class Control:
         density: values of a time transformation at (q, v), or (q, p) of a Hamiltonian; instead of the predictor.
         growth: of errors, measured along runs; ``None`` if it is not.
         arrays: first and end of the named coordinates of each array of known size, which are to be accurate as a whole.
+        localised: whether forces may be confined to a short time or a small region.
     """
 
     code: str
@@ -466,6 +467,7 @@ class Control:
     density: Kernel | None = None
     growth: ErrorGrowth | None = None
     arrays: tuple[tuple[int, int], ...] = ()
+    localised: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

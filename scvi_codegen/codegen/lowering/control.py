@@ -79,7 +79,8 @@ def control_of(
     Args:
         program: the lowered program.
         controller: the step-size controller.
-        system, g: of a controller of steps in tau, the system in physical time and the time-rescaling function.
+        system: the system, for steps in tau in physical time.
+        g: time-rescaling function of steps in tau.
     """
     if controller.values is not None:
         assert system is not None  # by the caller
@@ -103,6 +104,7 @@ def control_of(
         predictor=predictor_of(program.fixed_point) if program.fixed_point else None,
         stage_growth=2.0 ** (stage_curve.power / LEVELS_PER_BINADE) if stage_curve else 0.0,
         arrays=program.layout.whole,
+        localised=system is not None and system.has_localised_forces,
     )
 
 

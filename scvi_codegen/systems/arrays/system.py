@@ -389,6 +389,11 @@ class ArraySystem(OfRunTimeSizes, MechanicalSystem):
     formula = lagrangian
 
     @property
+    def has_localised_forces(self) -> bool:
+        """False: free flights of arrays of run-time sizes are not examined in pieces."""
+        return False
+
+    @property
     def positions(self) -> tuple[Array, ...]:
         """Coordinates, and homogeneous coordinates of rotations, directions and spins."""
         return (*self.coordinates, *(rotation.array for rotation in self.rotations))

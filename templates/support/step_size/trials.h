@@ -29,6 +29,10 @@
 #define EQUAL_FORCES REAL(1e-2) /* relative difference of the force in both halves of a free flight */
 #define NO_FORCE REAL(1e-12) /* impulse relative to the largest momentum: coordinates that motion has not reached yet */
 #define OTHER_FORCE REAL(0.5) /* relative difference beyond which another force sets in */
+#define PIECES 256 /* of a free flight to the end of the run, .. */
+#define LEAST_PIECES 4 /* .. and least number of others, shorter ones are not examined */
+#define UNEVEN REAL(0.5) /* of a piece: range of its irregular end, as forces may be periodic in time */
+#define GOLDEN REAL(0.6180339887498949)
 #define STEPS_COMPARED_AFTER_DOUBT 16 /* steps that are compared after one that was shortened by a comparison */
 
 #ifdef ARRAYS
@@ -677,8 +681,52 @@ static SELDOM int force_sets_in(const trial *now, const solver_options *options)
   return largest_over(&all, 0) > 0;
 }
 
+/* Returns 1 if a free flight ends elsewhere in irregular pieces: a force that is narrow in time or space lies between
+ * the points of the step. */
+static SELDOM int passes_over_force(const trial *now, real allowed, const solver_options *options)
+{
+#ifdef LOCALISED_FORCES
+  const step_data *step = &now->step;
+  const section own = own_part(step);
+  step_data part = *step;
+  const int count = (int)(PIECES * MATH(fabs)(step->h / (now->t_end - now->at.t)));
+  real begin = 0, far = 0;
+  VECTORS(nothing, 1, step);
+  VECTORS(q, 1, step);
+  VECTORS(p, 1, step);
+  VECTORS(halves, 1, step);
+  VECTORS(changes, 1, step);
+  if (count < LEAST_PIECES)
+    return 0;
+  set_zero(step, nothing), set_zero(step, halves), set_zero(step, changes);
+  part.tables = NULL;
+#if defined(ERROR_GROWTH) || defined(MIXED_POINTS)
+  part.points = NULL;
+#endif
+  part.first = COMPARISON;
+  for (int k = 1; k <= count; k++) {
+    const real turn = GOLDEN * (real)k - MATH(floor)(GOLDEN * (real)k);
+    const real end = k < count ? ((real)k + UNEVEN * (turn - REAL(0.5))) / (real)count : 1;
+    part.h = (end - begin) * step->h;
+    if (add_part(&part, options, halves, changes) != OK)
+      return 0;
+    for (long long i = own.first; i < own.end; i++) {
+      q[i] = step->q0[i] + (step->carry_q[i] + halves[i]);
+      p[i] = step->p0[i] + (step->carry_p[i] + changes[i]);
+    }
+    part.q0 = q, part.p0 = p;
+    part.carry_q = part.carry_p = nothing;
+    begin = end;
+  }
+  return difference(step, step->h, step->q0, now->dq, halves, &far) > allowed;
+#else
+  (void)now, (void)allowed, (void)options;
+  return 0;
+#endif
+}
+
 /* Compares a step with its half steps and shortens it while the difference is far above its error estimate, or, a
- * limited number of times, a force sets in at its end. */
+ * limited number of times, a force sets in at its end or is passed over. */
 static SELDOM int compare_step(run_memory *run, trial *now, int steps_to_compare, const solver_options *options,
     solver_report *report)
 {
@@ -690,7 +738,9 @@ static SELDOM int compare_step(run_memory *run, trial *now, int steps_to_compare
     int status = compare_trial(now, steps_to_compare, options, &apart);
     if (status > STATUS(SPURIOUS_SOLUTION))
       return status;
-    if (status == OK && apart <= allowed && !(examined-- > 0 && force_sets_in(now, options))) {
+    if (status == OK && apart <= allowed &&
+        !(examined-- > 0 &&
+            (force_sets_in(now, options) || passes_over_force(now, allowed, options)))) {
       now->apart = MATH(pow)(apart, 1 / ERROR_POWER);
       run->steps_to_compare -= run->steps_to_compare > 0;
       return OK;
