@@ -103,12 +103,12 @@ def verify(
     t, h = checked_number(t, "the time t"), None if h is None else checked_step(h)
     began, method = time.perf_counter(), as_method(method, system)
     if isinstance(system, ArraySystem):
-        stepper = stepper or compile_stepper(system, method, solver=solver)
+        stepper = stepper or compile_stepper(system, method, solver=solver, kinks="as formulas")
         of_known_sizes = partial(verify, solver=solver, tolerance=tolerance)
         of_run |= {"of_known_sizes": of_known_sizes, "tolerance": tolerance}
         return verify_arrays(system, method, stepper, (q, p, cast(float, h), t), began, **of_run)
     system = discretised_form(system, method)
-    stepper = stepper or compile_stepper(system, method, solver=solver)
+    stepper = stepper or compile_stepper(system, method, solver=solver, kinks="as formulas")
     start = _initial_state(system, stepper, q, p, h, t)
     return _certificate(system, method, stepper, start, began, solver=solver, tolerance=tolerance)
 
