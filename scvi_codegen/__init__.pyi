@@ -130,10 +130,10 @@ from scvi_codegen.runs.stepping.molecular_dynamics import radial_distribution as
 from scvi_codegen.runs.stepping.molecular_dynamics import temperature as temperature
 from scvi_codegen.runs.stepping.step_derivatives import Sensitivity as Sensitivity
 from scvi_codegen.runs.trajectory import Trajectory as Trajectory
-from scvi_codegen.systems.contacts.definitions import Contact as Contact
-from scvi_codegen.systems.contacts.definitions import Friction as Friction
-from scvi_codegen.systems.contacts.definitions import contact as contact
-from scvi_codegen.systems.contacts.definitions import friction as friction
+from scvi_codegen.systems.contact import Contact as Contact
+from scvi_codegen.systems.contact import Friction as Friction
+from scvi_codegen.systems.contact import contact as contact
+from scvi_codegen.systems.contact import friction as friction
 from scvi_codegen.systems.derived_systems import change_coordinates as change_coordinates
 from scvi_codegen.systems.derived_systems import variational_system as variational_system
 from scvi_codegen.systems.event import Crossings as Crossings

@@ -34,7 +34,7 @@ from scvi_codegen.methods.method import Method
 from scvi_codegen.runs.contacts.driver import ContactsOfStepper
 from scvi_codegen.runs.stepper import Stepper, StepperOfRunTimeSizes
 from scvi_codegen.runs.stepping.compiled_method import Variants
-from scvi_codegen.systems.contacts.definitions import ContactLike
+from scvi_codegen.systems.contact import ContactLike
 from scvi_codegen.systems.contacts.modes import bound_contacts
 from scvi_codegen.systems.event import Event, EventLike, as_events
 from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED

@@ -58,7 +58,7 @@ PASSED = (
 )
 SLIDING = (
     "the motion slides on '{function}' = 0 at t = {t:.17g}: the forces on both sides of this jump point to it (dry "
-    "friction, a relay). Use a smooth force such as tanh({function}/width) instead of the jump, or end the run there"
+    "friction, a relay). Use sc.friction(..), or a smooth force such as tanh({function}/width), or end the run there"
 )
 
 
@@ -280,7 +280,7 @@ class Crossings:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Switches(Crossings):
-    """Zeros of the function of a kink, where the motion changes to its other side.
+    """Zeros of the function of a kink where the motion changes to its other side, without touches.
 
     Attributes:
         side: (k,) 1 where the function becomes positive, -1 where it becomes negative.

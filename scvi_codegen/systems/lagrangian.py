@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from sympy import Expr, Symbol
     from sympy.physics.mechanics import KanesMethod, LagrangesMethod, System
 
-    from scvi_codegen.systems.contacts.definitions import ContactLike
+    from scvi_codegen.systems.contact import ContactLike
     from scvi_codegen.systems.formulas.rotations import Reduced
 
 LAGRANGES_METHOD = ArgumentType("a LagrangesMethod of sympy.physics.mechanics", lambda value: hasattr(value, "lam_vec"))

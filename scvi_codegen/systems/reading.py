@@ -11,7 +11,7 @@ from scvi_codegen.systems.arrays.reading import arrays_from_sympy, arrays_from_t
 from scvi_codegen.systems.arrays.system import ArraySystem
 from scvi_codegen.systems.checks.definition import warn_of_mistakes
 from scvi_codegen.systems.constraints import constraint_sides, constraints_of, rate_of_positions
-from scvi_codegen.systems.contacts.definitions import contacts_of, names_in
+from scvi_codegen.systems.contact import contacts_of, names_in
 from scvi_codegen.systems.forces import damping_rate
 from scvi_codegen.systems.formulas.rotations import RotationNames
 from scvi_codegen.systems.formulas.symbols import (

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from sympy import Expr, Symbol
 
     from scvi_codegen.systems.constraints.kind import Reaction
-    from scvi_codegen.systems.contacts.definitions import ContactLike
+    from scvi_codegen.systems.contact import ContactLike
     from scvi_codegen.systems.formulas.rotations import Homogeneous, Reduced
 
 
@@ -180,7 +180,7 @@ class MechanicalSystem(Deferred, ABC):
             (:mod:`scvi_codegen.systems.forces`).
         reactions: masks and directions of force of the last constraints, as of contacts
             (:class:`~scvi_codegen.systems.constraints.kind.Reaction`).
-        contacts: contacts and dry friction (:mod:`scvi_codegen.systems.contacts.definitions`).
+        contacts: contacts and dry friction (:mod:`scvi_codegen.systems.contact`).
         arrays: declarations of the arrays of known sizes whose entries are coordinates and parameters.
         indices: sizes and index tables of these arrays by name, for events in index notation.
         lengths: cutoffs and periods of lists of neighbours

@@ -113,6 +113,7 @@ ARGUMENTS = {
     "inputs": [["w", "u"], ["u"]],
     "tables": [["bonds[B, 2]"], ["bonds[B, 3]"]],
     "neighbours": [{"near": {"of": "q", "cutoff": 1.0}}],
+    "contacts": [[{"gap": "q"}]],
 }
 TEXT = {
     "name": "pair",
@@ -131,6 +132,7 @@ TEXT = {
     "inputs": ["u", "w"],
     "tables": [],
     "neighbours": None,
+    "contacts": (),
 }
 
 

@@ -65,7 +65,7 @@ from scvi_codegen.systems.constraints import (
     time_derivatives,
     velocity_conditions,
 )
-from scvi_codegen.systems.contacts.definitions import coefficients
+from scvi_codegen.systems.contact import coefficients
 from scvi_codegen.systems.derived_expressions import forms_of
 from scvi_codegen.systems.lagrangian import LagrangianSystem
 from scvi_codegen.systems.system import MechanicalSystem

@@ -191,6 +191,7 @@ class CrossingSearch:
         if not self.stepper.interface.modes:
             return ()
         records = self._joined(recorded)
+        records = records[records["direction"] != 0]  # without touches, which keep their side
         found = self._by_event(self.stepper.searched, records)[len(events) :]
         numbers = range(len(events), len(self.stepper.searched))
         sides = [records["direction"][records["function"] == number].astype(np.int64) for number in numbers]

@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from scvi_codegen.common.errors import SystemDefinitionError
-from scvi_codegen.systems.contacts.definitions import Contact, ContactLike, Friction, static_limit
+from scvi_codegen.systems.contact import Contact, ContactLike, Friction, static_limit
 from scvi_codegen.systems.event import Event, Formula
 
 if TYPE_CHECKING:

@@ -27,6 +27,7 @@ enum {
   KINK_SEARCHES = 64 /* steps after which a far kink is searched for, too */
 };
 
+#define KINK_MISSED 16.0 /* effects of rounding beyond which the sign of the other side shows a missed crossing */
 #define KINK_FAR 2.0 /* a kink is far beyond so many times the change of its function in a step */
 #define KINK_FORGETS 0.97 /* factor of former rates of change for each step */
 
@@ -61,12 +62,18 @@ static int values_of_kinks(const event_step *step, const event_sample *at, real 
   return status;
 }
 
+/* Effect of rounding on the function of a kink. */
+static real rounding_at(const event_step *step, int kink)
+{
+  const int e = EVENT_FIRST[FIRST_KINK + kink];
+  return is_of_time(kink) ? 0.0 : 8.0 * values_at(step, EVENT_DEGREE + 2)[e] + RESIDUAL(step->watch, e);
+}
+
 /* The side of u at a state, 0 within the effect of rounding; values: of all functions there. */
 static int side_of(const event_step *step, int kink, const real *value)
 {
-  const int e = EVENT_FIRST[FIRST_KINK + kink];
-  const real noise = is_of_time(kink) ? 0.0 : 8.0 * values_at(step, EVENT_DEGREE + 2)[e] + RESIDUAL(step->watch, e);
-  return (value[e] > noise) - (value[e] < -noise);
+  const real g = value[EVENT_FIRST[FIRST_KINK + kink]], rounding = rounding_at(step, kink);
+  return (g > rounding) - (g < -rounding);
 }
 
 /* Sides of all kinks at a state where a run is or starts: by the signs of their functions, within rounding as before.
@@ -153,8 +160,8 @@ static int change_sides(const event_step *step, long long first, const event_sam
     event_crossing *crossing = step->found + i;
     const int kink = crossing->function - FIRST_KINK;
     if (kink >= 0 && !is_of_time(kink) && sign[kink] == -crossing->direction) {
-      crossing->direction = -crossing->direction;
-      set_side(step, kink, crossing->direction);
+      set_side(step, kink, -crossing->direction);
+      crossing->direction = 0; /* a touch */
       returns = 1;
     }
   }
@@ -162,7 +169,7 @@ static int change_sides(const event_step *step, long long first, const event_sam
     status = signs_after(step, at, step->whole, sign);
   for (long long i = first; status == OK && returns && i < *step->filled; i++) {
     const int kink = step->found[i].function - FIRST_KINK;
-    if (kink >= 0 && !is_of_time(kink) && sign[kink] == -step->found[i].direction) {
+    if (kink >= 0 && step->found[i].direction == 0 && sign[kink] * step->watch->side[kink] < 0.0) {
       step->watch->sliding = step->found[i].function + 1;
       status = NOT_CONVERGED;
     }
@@ -182,7 +189,8 @@ static int check_sides(const event_step *step, const event_sample *right)
   memcpy(values_at(step, 0), value, BYTES(EVENTS));
   status = rounding_of(step, right);
   for (int k = 0; status == OK && k < EVENT_KINKS; k++)
-    if (side_of(step, k, value) * step->watch->side[k] < 0.0) {
+    if (side_of(step, k, value) * step->watch->side[k] < 0.0 &&
+        fabs(value[EVENT_FIRST[FIRST_KINK + k]]) > KINK_MISSED * rounding_at(step, k)) {
       step->watch->through = FIRST_KINK + k + 1;
       return NOT_CONVERGED;
     }
