@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from numbers import Real
 from typing import TYPE_CHECKING, Any, Self, TypeAlias, cast
 
@@ -182,7 +182,7 @@ class Kink(Event):
         mode: parameter that is added to u: 0, or a number beyond all values of u, whose sign then decides.
     """
 
-    mode: str = ""
+    mode: str = field(kw_only=True)
 
     @property
     def changes_state(self) -> bool:
@@ -275,7 +275,7 @@ class Crossings:
     @property
     def columns(self) -> tuple[str, ...]:
         """Names of the arrays with a row for each crossing."""
-        return tuple(field.name for field in fields(self) if field.name != "event")
+        return tuple(column.name for column in fields(self) if column.name != "event")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

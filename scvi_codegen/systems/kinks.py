@@ -43,6 +43,7 @@ def located_kinks(system: MechanicalSystem) -> tuple[MechanicalSystem, tuple[Kin
     if not arguments or len(arguments) > MOST_KINKS or system.clock:
         return system, ()
     taken = {free.name for formula in formulas for free in formula.free_symbols}
+    taken |= {variable.name for variable in (*system.coordinates, *system.velocities, *system.parameters)}
     numbers = (k for k in range(1, 10**6) if f"mode_{k}" not in taken)
     modes = {u: Mode(f"mode_{k}", real=True) for u, k in zip(sorted(arguments, key=str), numbers, strict=False)}
     rules: dict[Expr, Expr] = {}
