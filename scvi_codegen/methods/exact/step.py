@@ -165,9 +165,9 @@ class DerivedStep:
     def action_gradient(self, solved: SolvedStep, q: Any, p: Any, h: Any, t: Any = 0) -> tuple[Numbers, Numbers] | None:
         """Return the (m,) and (unknowns,) central differences of the generating function by q0 and the unknowns.
 
-        ``None`` if a group of points has no scalar.
+        ``None`` if a group of points has no scalar, or its results are not the gradient of that alone (forces, turns).
         """
-        if None in self.scalars:
+        if None in self.scalars or any(group.forced for group in self.stages.stage_groups):
             return None
         start = self._start_of(q, p, h, t)
         joined, m = np.array([*start.q, *solved.unknowns], dtype=object), self.system.dimension
