@@ -11,6 +11,9 @@ import numpy as np
 import pytest
 from kinks import KINDS, METHODS, stepper_of, wrong
 from nonsmooth import FAMILIES, Case, case_of
+from notation import lagrange
+
+import scvi_codegen as sc
 
 pytestmark = pytest.mark.filterwarnings("ignore::scvi_codegen.common.errors.AccuracyWarning")
 SMALLEST_FIRST = sorted(FAMILIES, key=lambda family: len(FAMILIES[family].coordinates))
@@ -114,3 +117,76 @@ def test_derivatives_across_kinks_are_those_of_the_motion(family):
             for value in (parameters[name] - step, parameters[name] + step)
         )
         assert np.abs(change * step - (after - before) / 2).max() < 1e-11 * max(1.0, case.growth) * case.ranges.max()
+
+
+def test_functions_of_nested_kinks_follow_their_sides():
+    """Outer functions are smooth in a step only with the sides of the inner ones."""
+    nested = sc.compile_stepper(lagrange("nested", "x", "x_dot**2/2 - abs(max(x, -x/3) - 1)"), "svi:4")
+    assert nested.integrate([0.2], [1.7], t_end=30.0).energy_error() < 1e-13
+    square = sc.compile_stepper(lagrange("square", "x y", "(x_dot**2 + y_dot**2)/2 - max(abs(x), abs(y))"), "svi:4")
+    for q, p in np.random.default_rng(0).normal(size=(8, 2, 2)):
+        assert square.integrate(q, p, t_end=20.0).energy_error() < 1e-13
+
+
+def test_the_first_of_many_crossings_in_a_step_is_found():
+    saw = lagrange("saw", "x", "x_dot**2/2", forces={"x": "e*sign(sin(w*x))"}, e=1e-3, w=20.0)
+    run = sc.compile_stepper(saw, "svi:4").integrate([0.01], [1.0], t_end=30.0)
+    assert len(run.switches[0]) == np.floor(20.0 * run.q[-1, 0] / np.pi) == 191
+
+
+@pytest.mark.parametrize("periods", [0, 1, 100])
+@pytest.mark.parametrize("steps", [{}, {"h": 2 * np.pi / 35}], ids=["adaptive", "fixed"])
+def test_kinks_of_time_at_starts_and_ends_of_steps(periods, steps):
+    """x'' = +-1/2 in turn: x grows by P^2/8 in each period P."""
+    square_wave = lagrange("wave", "x", "x_dot**2/2", forces={"x": "unit_step(sin(5*t)) - 1/2"})
+    period = 2 * np.pi / 5
+    begin = periods * period
+    run = sc.compile_stepper(square_wave, "svi:4").integrate([0.0], [0.0], t=begin, t_end=begin + 3 * period, **steps)
+    assert abs(run.q[-1, 0] - 3 * period**2 / 8) < 1e-13 * (1 + periods)
+
+
+@pytest.mark.parametrize("width", [1e-3, 1e-6, 1e-9])
+@pytest.mark.parametrize("steps", [{}, {"h": 0.7}], ids=["adaptive", "fixed"])
+def test_short_visits_of_the_other_side_count(width, steps):
+    window = lagrange("window", "x", "x_dot**2/2", forces={"x": "0.1/w*where(abs(x - 5) < w, 1, 0)"}, w=1.0)
+    stepper = sc.compile_stepper(window, "svi:4")
+    run = stepper.integrate([0.0], [1.0], t_end=10.0, parameters={"w": width}, **steps)
+    assert run.p[-1, 0] ** 2 / 2 - 0.5 == pytest.approx(0.2, abs=1e-15 / width)
+    assert [len(switches) for switches in run.switches] == [2, 1]
+
+
+def test_steps_across_many_kinks_do_not_add_energy():
+    """After whole periods x = 0 and |v| is that of the start: 112 jumps of a force."""
+    relay = lagrange("relay", "x", "x_dot**2/2", forces={"x": "f*(1 - 2*unit_step(x)) + c"}, f=2.875, c=-0.125)
+    end = 56 * (2 * 0.375 / 3 + 2 * 0.375 / 2.75)
+    run = sc.compile_stepper(relay, "svi:4").integrate([0.0], [0.375], t_end=end)
+    assert abs(run.q[-1, 0]) < 1e-13
+    assert abs(run.p[-1, 0]) == pytest.approx(0.375, rel=1e-11)
+
+
+def test_members_of_ensembles_have_dense_output_across_kinks():
+    floor = lagrange("floor", "y", "y_dot**2/2 - y - k*positive_part(-y)**2/2", k=1e3)
+    stepper = sc.compile_stepper(floor, "svi:4")
+    settings, times = {"h": 0.05, "steps": 120}, np.linspace(0.0, 6.0, 97)
+    member = stepper.integrate_ensemble([[0.5], [1.0]], [[0.0], [0.0]], **settings)[1]
+    assert member.at(times)[1] == pytest.approx(stepper.integrate([1.0], [0.0], **settings).at(times)[1], abs=1e-12)
+    with pytest.raises(sc.StateError, match='compile it with kinks="as formulas"'):
+        stepper.integrate_ensemble([[0.5], [1.0]], [[0.0], [0.0]], **settings, observe="extremes")
+
+
+def test_sliding_is_an_error_that_names_it():
+    rough = lagrange("rough", "x", "x_dot**2/2 - x**2/2", forces={"x": "-0.15*sign(x_dot)"})
+    with pytest.raises(sc.EventError, match=r"slides on 'x_dot' = 0 .* sc\.friction"):
+        sc.compile_stepper(rough, "svi:4").integrate([1.0], [0.0], t_end=10.0)
+
+
+def test_modes_may_be_left_out_of_parameters_in_order():
+    spring = lagrange("spring", "x", "x_dot**2/2 - k*positive_part(x)**2 - x**2", k=1.0)
+    stepper = sc.compile_stepper(spring, "svi:4")
+    assert stepper.parameters == ("k", "mode_1")
+    runs = [stepper.integrate([1.0], [0.0], t_end=5.0, parameters=values) for values in ([2.0], [2.0, 0.0], {"k": 2.0})]
+    assert len({run.q.tobytes() for run in runs}) == 1
+    formulas = sc.compile_stepper(spring, "svi:4", kinks="as formulas")
+    assert (formulas.parameters, formulas.integrate([1.0], [0.0], h=0.1, steps=9).switches) == (("k",), ())
+    with pytest.raises(sc.MethodError, match="unknown kinks 'exact'"):
+        sc.compile_stepper(spring, "svi:4", kinks="exact")

@@ -19,7 +19,7 @@ static int is_kink(int event)
 #ifdef EVENT_CONSTRAINTS
 #define KINK_FIRST_PROBE 10 /* shorter steps are ill-conditioned */
 #else
-#define KINK_FIRST_PROBE 25 /* 2^-25 of a step after its start u may have left zero */
+#define KINK_FIRST_PROBE 40 /* 2^-40 of a step after its start u may have left zero */
 #endif
 
 enum {
