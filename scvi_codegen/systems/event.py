@@ -143,6 +143,11 @@ class Event:
         return loops[0] if loops else ""
 
     @property
+    def is_text(self) -> bool:
+        """Return whether all formulas are text or numbers."""
+        return _is_text(tuple(getattr(self, part.name) for part in fields(self)))
+
+    @property
     def changes_state(self) -> bool:
         """Return whether crossings change the state."""
         return self.then is not None or self.restitution is not None
@@ -188,6 +193,10 @@ class Kink(Event):
     def changes_state(self) -> bool:
         """True: the state is the same, but steps end there."""
         return True
+
+
+def _is_text(value: Any) -> bool:
+    return all(map(_is_text, value)) if isinstance(value, tuple) else isinstance(value, str | int | float | None)
 
 
 def _name(variable: Any) -> str:

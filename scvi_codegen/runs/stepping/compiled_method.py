@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -15,6 +16,7 @@ from scvi_codegen.codegen.native.binding import Binding
 from scvi_codegen.codegen.native.calls import with_calls
 from scvi_codegen.codegen.rendering.source import Interface, Source
 from scvi_codegen.codegen.variants import Acting, Derivatives, Lanes, NewtonFallback, Variant, WithEvents
+from scvi_codegen.common.cache import cached_source
 from scvi_codegen.common.display.cards import card, listed, plain
 from scvi_codegen.common.errors import MethodError, ScviCodegenError
 from scvi_codegen.common.representation import LONGEST, clipped
@@ -139,9 +141,17 @@ class CompiledMethod:
             self.binding = Binding(library, interface.prefix, interface.workspace, fallback=self._load_fallback)
 
     def _derived_with_events(self, interface: Interface, events: tuple[Event, ...]) -> Source:
-        from scvi_codegen.codegen.rendering.events import with_events  # here, because it imports SymPy
+        """Return the source with the search for zeros, from the cache if the formulas are text and were read before."""
 
-        return with_events(self._plain, interface, events)
+        def derived() -> Source:
+            from scvi_codegen.codegen.rendering.events import with_events  # here, because it imports SymPy
+
+            return with_events(self._plain, interface, events)
+
+        if interface.layout.coordinates or not all(event.is_text for event in events):
+            return derived()
+        key = "zeros", self._plain.to_json(), json.dumps(interface.to_record()), repr(events)
+        return Source.from_json(cached_source(key, lambda: derived().to_json()))
 
     @property
     def acting(self) -> Self:
