@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from scvi_codegen.common.errors import MethodError
+from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import SWITCH, ArgumentType, check_kind, checked_count, of
 from scvi_codegen.methods.method import Exactness, Method, Specification
 from scvi_codegen.methods.recurrence import ExplicitStep
@@ -44,6 +45,7 @@ class ExplicitMethod(Method):
     exactness: Exactness = field(default_factory=Exactness)
 
     implicit = False
+    __repr__ = summary("name", "order")
 
     def __post_init__(self) -> None:
         name = ArgumentType("a name, as 'blanes-moan'", lambda text: isinstance(text, str) and bool(text.strip()))

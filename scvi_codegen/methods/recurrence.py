@@ -13,6 +13,7 @@ from typing import Any, TypeAlias, cast
 
 from scvi_codegen.common.errors import MethodError
 from scvi_codegen.common.precision import Number, Vector, mp
+from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import MAPPING, NUMBERS, TEXT, ArgumentType, check_kind
 from scvi_codegen.methods.statements import (
     Apply,
@@ -75,6 +76,8 @@ class ExplicitStep:
 
     statements: str
     tables: RowTables
+
+    __repr__ = summary("statements")
 
     @classmethod
     def of(cls, statements: str, tables: Mapping[str, Mapping[str, Sequence[Any]]]) -> ExplicitStep:

@@ -154,7 +154,7 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
             actions=None if self.actions is None else self.actions[rows],
             step_sizes=lengths,
             events=tuple(crossings.chosen((crossings.t >= low) & (crossings.t <= high)) for crossings in self.events),
-            switches=tuple(found.chosen((found.t >= low) & (found.t <= high)) for found in self.switches),
+            switches=tuple(kink.chosen((kink.t >= low) & (kink.t <= high)) for kink in self.switches),
         )
 
     def _slice_of_pieces(self, first: int, last: int, stride: int, rows: slice) -> Self:

@@ -12,6 +12,7 @@ from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 from scvi_codegen.common.representation import LONGEST
+from scvi_codegen.methods.composition import SPLITTING
 
 NEEDS_LIBRARIES = {"ControlledMotion", "GravitatingBodies", "JaxFlow", "Page", "TorchFlow"}
 """Made by optional libraries only."""
@@ -23,6 +24,10 @@ def definitions() -> Iterator[Any]:
     yield from (sc.StoermerVerlet(), sc.Composition.of(8), sc.SpectralCollocation(4), sc.CollocationRK((0.5,)))
     yield from (sc.gauss_legendre(8), sc.clenshaw_curtis(6), sc.chebyshev_lobatto(8), sc.Polynomials())
     yield from (sc.Splines(3), sc.Trigonometric(0.5), sc.SolverOptions(), sc.Event("q - 1", terminal=True))
+    yield from (sc.contact("y - r", slip="x_dot - r*a_dot", friction=0.3), sc.friction("x_dot - 0.3", limit=0.25))
+    step = sc.ExplicitStep.of(SPLITTING, {"LEAPS": {"KICK": [0.5, 0.5], "DRIFT": [1, 0], "KICK_ABSCISSA": [0, 1]}})
+    claims = {"order": 2, "symmetric": True, "symplectic": True}
+    yield from (step, sc.ExplicitMethod(name="splitting", title=NAME, **claims, step=step))
     yield sc.HamiltonianSystem.from_text(NAME, ["q"], "p**2/2 - cos(q)", momenta=["p"])
     yield sc.LagrangianSystem.from_text(NAME, ["x", "y"], "x*y_dot - x**2/2 - y**2/2")
     waves = sc.FieldSystem.from_text(NAME, ["u"], {"x": (0, 1)}, "u_t**2/2 - u_x**2/2")

@@ -190,3 +190,19 @@ def test_modes_may_be_left_out_of_parameters_in_order():
     assert (formulas.parameters, formulas.integrate([1.0], [0.0], h=0.1, steps=9).switches) == (("k",), ())
     with pytest.raises(sc.MethodError, match="unknown kinks 'exact'"):
         sc.compile_stepper(spring, "svi:4", kinks="exact")
+
+
+def test_a_stiffness_is_fitted_across_kinks():
+    floor = lagrange("floor", "y", "y_dot**2/2 - 9.8*y - k*positive_part(-y)**2", k=1e3)
+    stepper, times = sc.compile_stepper(floor, "svi:4"), np.arange(0.1, 2.01, 0.05)
+    measured = stepper.integrate([1.0], [0.0], t_end=2.0, t_eval=times, parameters={"k": 1.2e3}).q
+    start = {"q": [1.0], "p": [0.0], "start": 0.0, "fit_initial_state": False}
+    fit = sc.fit(stepper, times, measured, **start, parameters={"k": 1.1e3}, unknown=["k"], h=0.01)
+    assert fit.parameters["k"] == pytest.approx(1.2e3, rel=1e-9)
+
+
+def test_periodic_orbits_between_springy_walls():
+    """Of any velocity v: 4/v in flight and half a period of each spring."""
+    walls = lagrange("walls", "x", "x_dot**2/2 - 50*(positive_part(x - 1)**2 + positive_part(-x - 1)**2)")
+    orbit = sc.periodic_orbit(sc.compile_stepper(walls, "svi:4"), [0.0], [1.0], period=4.6)
+    assert orbit.period == pytest.approx(4 / np.sqrt(2 * orbit.energy) + np.pi / 5, rel=1e-9)

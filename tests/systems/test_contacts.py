@@ -354,3 +354,14 @@ def test_three_contacts_of_a_woodpecker_lead_to_its_cycle() -> None:
     assert ends.mean(axis=0) == pytest.approx([-0.3411, 0, -7.4583], rel=6e-3, abs=1e-9)
     assert np.diff(cycle.t[-3:]).mean() == pytest.approx(0.14598, abs=1e-5)
     assert {modes[1] for _, modes in run.contact_modes} == {"open", "stick", "slip"}
+
+
+@pytest.mark.parametrize("height", [0.0, 1e-18, -1e-18, -1e-14])
+def test_a_start_within_rounding_of_a_gap_at_the_origin_is_in_contact(height: float) -> None:
+    """The size of a gap is that of its motion in a step, not that of the position, which is 0."""
+    ball = sc.LagrangianSystem.from_text("ball", ["x", "y"], "(x_dot**2 + y_dot**2)/2 - 9.81*y")
+    stepper = sc.compile_stepper(ball, "svi:2", contacts=[sc.contact("y", slip="x_dot", friction=0.3)])
+    run = stepper.integrate([0.0, height], velocity=[1.0, 0.0], h=0.05, t_end=0.5)
+    assert [modes for _, modes in run.contact_modes] == [("slip",), ("stick",)]
+    with pytest.raises(sc.ContactError, match="must not be negative"):
+        stepper.integrate([0.0, -1e-6], velocity=[1.0, 0.0], h=0.05, t_end=0.5)

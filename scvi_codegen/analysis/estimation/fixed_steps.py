@@ -46,7 +46,7 @@ def tangents_along(
         StepFailedError: if a step fails.
     """
     m, size, count = stepper.dimension, len(state), len(h)
-    if not stepper.changes_states:
+    if not stepper.divides_steps:
         starts, vectors = Starts.chain(state[:m], state[m:], t, h), np.zeros((count + 1, *tangents.shape))
         vectors[0] = tangents
         if size_variations is not None:  # the variation of h of each step is added to that of the step before

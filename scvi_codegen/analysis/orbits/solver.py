@@ -511,7 +511,7 @@ class _OrbitSearch:
         steps = self._steps
         half, count = steps.middle, len(steps)
         inward = self.reduction.inward(*np.split(start, 2))
-        if self.stepper.changes_states:  # derivatives through events require runs forward in time
+        if self.stepper.divides_steps:  # derivatives through events require runs forward in time
             forward = self._segment(start, steps, 0, count, period)
             later, monodromy = self._states_before(start, period), self._leaving(forward) @ forward.monodromy @ inward
         else:
@@ -722,7 +722,7 @@ class _OrbitSearch:
             monodromy = monodromy / units[:, np.newaxis] * units
             largest = np.linalg.norm(end, axis=1) * np.linalg.norm(monodromy, 2)
             conserved_masks.append(np.linalg.norm(end @ monodromy - begin, axis=1) <= CONSERVED * largest)
-            if self.stepper.changes_states:
+            if self.stepper.divides_steps:
                 states = np.vstack([start, segment.states])
                 values = self._integrals(states, np.linspace(segment.start_time, segment.end_time, len(states)))
                 conserved_masks.append(np.ptp(values, axis=0) <= CONSERVED * np.linalg.norm(begin, axis=1))

@@ -56,7 +56,7 @@ class StepSequence:
 
         Both halves stay closer to the orbit than a whole period in one direction. Steps are no longer than an eighth of
         the period: their ends show the sizes of positions and momenta. Runs with events that change the
-        state go forward only, and their steps end at no event, whose time varies with the start.
+        state, and across kinks, go forward only, and their steps end at no event, whose time varies with the start.
 
         Args:
             stepper: the compiled stepper.
@@ -77,11 +77,12 @@ class StepSequence:
                 check_growth=False,
             )
             times, counts = np.unique(np.asarray(run.t), return_counts=True)
-            ends = np.abs(times - t)[(counts == 1) | (times == t)] / period
+            at_kinks = np.isin(times, [time for switches in run.switches for time in switches.t])
+            ends = np.abs(times - t)[((counts == 1) & ~at_kinks) | (times == t)] / period
             return np.sort(ends)
 
         with without_accuracy_warnings():
-            if stepper.changes_states:
+            if stepper.divides_steps:
                 ends = ends_of(period)
             else:
                 ends = np.concatenate([ends_of(0.5 * period), 1.0 - ends_of(-0.5 * period)[-2::-1]])

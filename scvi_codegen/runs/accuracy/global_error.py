@@ -366,7 +366,7 @@ class Runs:
         run, samples = compared
         size = longest_piece(run, self.motion.end - self.start) * FINER_PIECES**self.examinations
         self.examinations += 1
-        apart = np.array([differences_in_pieces(each, size) for each in (run, *further)]).max(axis=0)
+        apart = np.array([differences_in_pieces(compared, size) for compared in (run, *further)]).max(axis=0)
         differences = relative(apart, samples.sizes(len(samples.t), apart)).max()
         if differences <= max(PART_OF_ERROR * self.requested, ROUNDINGS * samples.epsilon):
             return False

@@ -6,7 +6,6 @@ error (E. Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equati
 """
 
 import math
-from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -33,19 +32,22 @@ def differences_in_pieces(run: Any, size: float) -> Array:
 
     Args:
         run: trajectory with all states of adaptive steps.
-        size: of the pieces; steps from ``LONG`` times it on are taken in pieces.
+        size: of the pieces; steps from ``LONG`` times it on are taken in pieces. If one fails, the differences are
+            infinite.
     """
     largest = np.zeros((2, run.q.shape[1]))
     for part in run.pieces or (run,):
         pieces, rows, ends = part._restarted(0, size), list[int](), list[tuple[Array, Array]]()
         for k in np.flatnonzero(np.abs(np.diff(part.t)) > LONG * size).tolist():
             t, h = part.t.item(k), part.t.item(k + 1) - part.t.item(k)
-            with suppress(StepFailedError):
+            try:
                 pieces.plan = Fixed(h / (count := math.ceil(abs(h) / size)))
                 pieces._begin(part.q[k], part.p[k], t)
                 pieces.advance(count)
                 rows.append(k + 1)
                 ends.append((pieces.q, pieces.p))
+            except StepFailedError:  # the step was solved over what its pieces meet
+                largest[:] = np.inf
         if rows:
             np.fmax(largest, np.abs(np.array(ends) - np.stack([part.q, part.p], 1)[rows]).max(axis=0), out=largest)
     return largest

@@ -32,6 +32,8 @@ FEWEST_HITS, RATIO, REST = 8, 1e-3, 1e-8
 relative to that since the first impact, at which a contact comes to rest."""
 WHOLE = 1e-9
 """Part of a step that counts as rounding of its end."""
+PENETRATION, STEPS = 1e-9, 1000
+"""Negative gap at a start, relative to its size, that is rounding; parts of a run of adaptive steps that measure it."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -77,8 +79,10 @@ class ContactsOfStepper:
         )
 
 
-def terms_at(stepper: Stepper, contacts: ContactsOfStepper, q: Array, p: Array, t: float, named: Any) -> ContactTerms:
-    """Return the rows of all contacts at a state."""
+def terms_at(
+    stepper: Stepper, contacts: ContactsOfStepper, q: Array, p: Array, t: float, named: Any, duration: float
+) -> ContactTerms:
+    """Return the rows of all contacts at a state; gaps are as large as their terms and their motion in a duration."""
     modes = contacts.places
     idle = stepper._parameters({**named, **contacts.masks((Mode(False),) * len(modes))})
     imposed = stepper._parameters({**named, **contacts.masks((Mode(True, True),) * len(modes))})
@@ -92,7 +96,8 @@ def terms_at(stepper: Stepper, contacts: ContactsOfStepper, q: Array, p: Array, 
     G = gradients.reshape(k, m)
     velocity, W = stepper.velocity(q, p, t, idle), response.reshape(k, k)
     bounds = np.sqrt(np.abs(np.diagonal(W) * (p @ velocity)))  # |G v| <= sqrt(G M^-1 G^T) sqrt(v^T M v)
-    sizes = np.array([np.abs(G) @ np.abs(q), bounds + np.abs(rates - G @ velocity)])
+    moving = bounds + np.abs(rates - G @ velocity)
+    sizes = np.array([np.abs(G) @ np.abs(q) + moving * duration + np.abs(second) * duration**2, moving])
     return ContactTerms(modes, values, rates, second, W, G, coefficients.reshape(n, 3), sizes)
 
 
@@ -108,6 +113,7 @@ class ContactRun:
         self.stepper._contacts = replace(self.contacts, in_piece=True)
         self.q, self.p, self.t, self.named = q, p, t, dict(named)
         self.modes: Modes = (Mode(False),) * len(self.contacts.places)
+        self.duration = 0.0  # of a step, by which gaps are measured
         self.hits: dict[int, list[float]] = {}
         self.pieces: list[Trajectory] = []
         self._warned = False
@@ -117,7 +123,7 @@ class ContactRun:
         terms = self._terms()
         for k, place in enumerate(self.contacts.places):
             row = place.normal
-            if row is not None and terms.values[row] < -1e-9 * max(terms.sizes[0, row], 1e-300):
+            if row is not None and terms.values[row] < -PENETRATION * terms.sizes[0, row]:
                 raise ContactError(
                     f"the run starts with the gap of contact {k + 1} at {terms.values[row]:.6g}, which must not be "
                     "negative: correct the initial positions, or the sign of the gap"
@@ -128,6 +134,7 @@ class ContactRun:
 
     def integrate(self, plan: dict[str, Any], t_end: float, h: float | None) -> Trajectory:
         """Return the run to t_end, with fixed steps h or adaptive steps with the arguments ``plan``."""
+        self.duration = abs(t_end - self.t) / STEPS if h is None else abs(h)
         self.start()
         begin, forward = self.t, h is None or h > 0
         while (self.t < t_end) == forward and self.t != t_end:
@@ -160,9 +167,9 @@ class ContactRun:
         )
         self.pieces.append(piece)
         self.q, self.p, self.t = np.array(piece.q[-1]), np.array(piece.p[-1]), float(piece.t[-1])
-        if any(len(found) and event.terminal for found, event in zip(piece.events, self.stepper.events, strict=True)):
-            found = piece.events[self.own :]
-            kinds = [kind for kind, crossings in zip(self.contacts.kinds, found, strict=True) if len(crossings)]
+        if piece.ended_by is not None:
+            transitions = piece.events[self.own :]
+            kinds = [kind for kind, crossings in zip(self.contacts.kinds, transitions, strict=True) if len(crossings)]
             if not kinds:
                 return True
             begun = {k: 1 if kind == "forward" else -1 for k, kind in kinds if kind in ("forward", "backward")}
@@ -171,7 +178,7 @@ class ContactRun:
         return False
 
     def _terms(self) -> ContactTerms:
-        return terms_at(self.stepper, self.contacts, self.q, self.p, self.t, self.named)
+        return terms_at(self.stepper, self.contacts, self.q, self.p, self.t, self.named, self.duration)
 
     def _change(self, closing: Collection[int], stopping: Collection[int], begun: dict[int, int]) -> None:
         """Apply impacts of closing contacts, then choose the modes and project the state onto their constraints."""
@@ -264,7 +271,7 @@ def contact_forces(piece: Trajectory) -> Array:
     first = len(stepper.constraints) - stepper.interface.masked
     multipliers, forces = piece.multipliers(), np.zeros((len(piece.t), len(modes), 2))
     states = zip(piece.q, piece.p, piece.t.tolist(), strict=True)
-    friction = np.array([terms_at(stepper, contacts, q, p, t, named).coefficients[:, 0] for q, p, t in states])
+    friction = np.array([terms_at(stepper, contacts, q, p, t, named, 0.0).coefficients[:, 0] for q, p, t in states])
     for k, (place, mode) in enumerate(zip(contacts.places, modes, strict=True)):
         if place.normal is not None:
             forces[:, k, 0] = multipliers[:, first + place.normal]

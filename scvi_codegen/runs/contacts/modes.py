@@ -130,7 +130,7 @@ def chosen_modes(
     """
     begun = begun or {}
     options = [_options(terms, k, touching, resting, begun) for k in range(len(terms.places))]
-    if sum(len(each) > 1 for each in options) > MOST_AT_ONCE:
+    if sum(len(modes) > 1 for modes in options) > MOST_AT_ONCE:
         raise ContactError(
             f"more than {MOST_AT_ONCE} contacts close or change at once at t = {t:.17g}: their modes are chosen by "
             "enumeration; use fewer contacts"
@@ -250,16 +250,16 @@ def _impulses_of(terms: ContactTerms, first: int, others: Sequence[int], rates: 
     ]
     # gap-less friction has no impulses
     small = ROUNDING * float(terms.sizes[1].max())
-    for modes in product(options[0], *([OPEN, *each] for each in options[1:])):
+    for modes in product(options[0], *([OPEN, *closed] for closed in options[1:])):
         right = rates.copy()
         right[_normal(terms, first)] *= 1.0 + terms.coefficients[first, 2]
         by_contact = dict(zip((first, *others), modes, strict=True))
         try:
-            found, after = terms.solved(by_contact, right)
+            impulse, after = terms.solved(by_contact, right)
         except np.linalg.LinAlgError:
             continue
-        if all(_obeys(terms, k, mode, found, after, small) for k, mode in by_contact.items()):
-            yield found
+        if all(_obeys(terms, k, mode, impulse, after, small) for k, mode in by_contact.items()):
+            yield impulse
 
 
 def _obeys(terms: ContactTerms, k: int, mode: Mode, impulse: Array, after: Array, small: float) -> bool:

@@ -192,12 +192,12 @@ class CrossingSearch:
             return ()
         records = self._joined(recorded)
         records = records[records["direction"] != 0]  # without touches, which keep their side
-        found = self._by_event(self.stepper.searched, records)[len(events) :]
+        crossings = self._by_event(self.stepper.searched, records)[len(events) :]
         numbers = range(len(events), len(self.stepper.searched))
         sides = [records["direction"][records["function"] == number].astype(np.int64) for number in numbers]
         return tuple(
             Switches(event=of.event, t=of.t, q=of.q, p=of.p, element=of.element, side=side)
-            for of, side in zip(found, sides, strict=True)
+            for of, side in zip(crossings, sides, strict=True)
         )
 
     def _joined(self, recorded: Sequence[NDArray[Any]]) -> Any:

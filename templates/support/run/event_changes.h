@@ -332,8 +332,10 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
       }
       set_run(run, ends ? run->t : at.t, &at);
 #if defined(EVENT_KINKS) && EVENTS_CONTROLLED
-      if (adaptive)
-        run->error_before = 0.0, run->steps_to_compare = 1; /* the next step is found and compared as the first one */
+      if (adaptive) { /* the next step is found and compared as the first one */
+        run->error_before = 0.0;
+        run->steps_to_compare = 1;
+      }
 #endif
       return OK;
     }
