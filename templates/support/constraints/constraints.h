@@ -211,13 +211,12 @@ static SELDOM real length_of_constraints(const step_data *step)
 }
 #endif
 
-/* Sum of squares of g; infinite if g is not finite. */
-static real misfit(real t, const real *q, const real *parameters, real *g)
+/* Sum of the squares of g relative to its sizes; infinite if g is not finite. */
+static real misfit(const real *g, const real *size)
 {
-  real derivative[CONSTRAINT_ENTRIES], sum = 0;
-  constraints(q, t, parameters, g, derivative);
+  real sum = 0;
   for (int k = 0; k < CONSTRAINTS; k++)
-    sum += g[k] * g[k];
+    sum += size[k] > 0 ? (g[k] / size[k]) * (g[k] / size[k]) : 0;
   return all_finite(g, CONSTRAINTS) ? sum : (real)INFINITY;
 }
 
@@ -230,40 +229,58 @@ static int is_below(const real *g, real limit, const real *size)
   return below;
 }
 
+/* Adds to the sizes of g those by which an update of squared length x^T L_vv x rounds: |x_i| <= |x| / sqrt(m_i), and g
+ * may depend on a position that is 0. */
+static void add_size_of_update(real t, const real *u, const real *parameters, real square, real *size)
+{
+  real p[M], mass[MASS_ENTRIES], g[CONSTRAINTS], derivative[CONSTRAINT_ENTRIES], longest[M] = {0};
+  legendre(u, t, parameters, p, mass);
+  constraints(u, t, parameters, g, derivative);
+  for (int e = 0; e < MASS_ENTRIES; e++)
+    if (MASS_ENTRY[e][0] == MASS_ENTRY[e][1] && mass[e] != 0)
+      longest[MASS_ENTRY[e][0]] = MATH(sqrt)(MATH(fabs)(square / mass[e]));
+  for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
+    size[CONSTRAINT_ENTRY[e][0]] += MATH(fabs)(derivative[e]) * longest[CONSTRAINT_ENTRY[e][1]];
+}
+
 /* Projects q onto g = 0 by Gauss-Newton steps in the metric of the mass matrix at u = (q, v). An update is halved while
- * it does not reduce |g|; the iteration ends where g is a rounding error, whose size is that of its terms: positions
- * may be 0. */
+ * it does not reduce g; the iteration ends where g is a rounding error, whose size is that of its terms and of the
+ * updates: positions may be 0. */
 static int project_position(real t, real *u, const real *parameters, saddle *at)
 {
-  real g[CONSTRAINTS], right[CONSTRAINTS], y[CONSTRAINTS], update[M], nearest[M], rounding[CONSTRAINTS];
-  real left = misfit(t, u, parameters, g);
-  memcpy(nearest, u, sizeof nearest);
+  real g[CONSTRAINTS], right[CONSTRAINTS], y[CONSTRAINTS], update[M], nearest[M], size[CONSTRAINTS],
+      derivative[CONSTRAINT_ENTRIES], last = 0;
   for (int k = 0; k < MAX_PROJECTIONS; k++) {
     const int status = factorise_saddle(t, u, parameters, at, g);
     int halvings = 0, is_rounding;
-    real now;
+    real left, now, square = 0;
     if (status != OK)
       return status;
-    constraint_rounding(u, t, parameters, rounding);
-    if (is_below(g, REAL_EPSILON / 2, rounding))
+    constraint_rounding(u, t, parameters, size);
+    if (is_below(g, REAL_EPSILON / 2, size))
       return OK;
-    is_rounding = is_below(g, ROUNDED_RESIDUAL, rounding);
     for (int j = 0; j < CONSTRAINTS; j++)
       right[j] = -g[j];
     solve_saddle(at, NULL, right, update, y);
     if (!all_finite(update, M))
       return SINGULAR;
+    for (int j = 0; j < CONSTRAINTS; j++)
+      square -= right[j] * y[j]; /* x^T L_vv x, as L_vv x = -G^T y */
+    add_size_of_update(t, u, parameters, larger(MATH(fabs)(square), last), size);
+    is_rounding = is_below(g, ROUNDED_RESIDUAL, size);
+    last = MATH(fabs)(square);
+    left = misfit(g, size);
+    memcpy(nearest, u, sizeof nearest);
     do {
       for (int i = 0; i < M; i++)
         u[i] = nearest[i] + MATH(ldexp)(update[i], -halvings);
-      now = misfit(t, u, parameters, g);
+      constraints(u, t, parameters, g, derivative);
+      now = misfit(g, size);
     } while (!(now < left) && !is_rounding && ++halvings < MOST_UPDATE_HALVINGS);
     if (!(now < left)) {
       memcpy(u, nearest, sizeof nearest);
       return is_rounding ? OK : NOT_CONVERGED;
     }
-    left = now;
-    memcpy(nearest, u, sizeof nearest);
   }
   return NOT_CONVERGED;
 }
