@@ -15,7 +15,7 @@ import scvi_codegen as sc
 from scvi_codegen.analysis.verification import Outcome
 from scvi_codegen.codegen.lowering.arrays import one_coordinate
 from scvi_codegen.codegen.pipeline import ArraySources, Sources
-from scvi_codegen.codegen.rendering.preprocessor import specialised
+from scvi_codegen.codegen.rendering.preprocessor import preprocessed
 from scvi_codegen.codegen.variants import Derivatives, Lanes
 from scvi_codegen.common.cache import template_folder
 from scvi_codegen.systems.arrays.system import ArraySystem
@@ -192,9 +192,9 @@ def headers_of(name: str) -> Iterator[str]:
             with suppress(sc.MethodError):
                 sources.append(made.variant(kind))
     for source in filter(None, sources):
-        yield from (
-            header.removeprefix("support/") for header, _ in specialised(source.code, dict(source.support).__getitem__)
-        )
+        texts, used = dict(source.support), list[str]()
+        preprocessed(source.code, lambda name, texts=texts, used=used: used.append(name) or texts[name])
+        yield from (header.removeprefix("support/") for header in used)
 
 
 @pytest.mark.second

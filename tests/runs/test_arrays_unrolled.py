@@ -4,8 +4,6 @@ All that a run computes is that of the unrolled system, to round-off. Runs that 
 threads equal undivided runs bit by bit.
 """
 
-import copy
-import pickle
 import re
 from dataclasses import dataclass, field
 from functools import cache
@@ -323,94 +321,6 @@ def test_array_system_equals_the_unrolled_system(name, method, solver, situation
         exact = other.multipliers(expected.q[-1], expected.p[-1])
         assert_close(np.concatenate([np.ravel(each) for each in end.multipliers]), exact, 1e-10)
         assert max(np.abs(each).max() for values in end.constraint_values for each in values) < 1e-12
-
-
-def states(run):
-    return (*(each.tobytes() for each in (np.asarray(run.q), np.asarray(run.p))), run.t, run.steps, run.iterations)
-
-
-def restored(stepper, run, plan):
-    return stepper.from_checkpoint(run.checkpoint(), **plan)
-
-
-WAYS = {
-    "checkpoint": restored,
-    "other threads": lambda stepper, run, plan: stepper.from_checkpoint(run.checkpoint(), threads=2, **plan),
-    "pickle": lambda stepper, run, plan: pickle.loads(pickle.dumps(run)),
-    "copy": lambda stepper, run, plan: copy.deepcopy(run),
-}
-CONTINUED = [
-    ("net", "svi:4", "auto", "checkpoint"),
-    ("net", "composition:8", "auto", "checkpoint"),
-    ("bodies", "svi:4", "auto", "pickle"),
-    ("bodies", "svi:4", "auto", "other threads"),
-    ("stiff", "svi:4", "newton", "checkpoint"),
-    ("rods", RATTLE, "auto", "copy"),
-    ("rods", RATTLE, "auto", "checkpoint"),
-    ("waves", "gauss:3", "auto", "copy"),
-]
-
-
-@pytest.mark.tiers(2, 10)
-@pytest.mark.parametrize("adaptive", [False, True])
-@pytest.mark.parametrize(("name", "method", "solver", "way"), CONTINUED)
-def test_continued_runs_equal_undivided_runs_bitwise(name, method, solver, way, adaptive):
-    """A pickled stepper takes single steps, then those of a run that is continued."""
-    motion = MOTIONS[name]
-    if adaptive and not method.startswith(("svi:4", "gauss")):
-        return
-    plan = {"t_end": 4.0, "tolerance": 1e-7} if adaptive else {}
-    start = motion.start() | (plan or {"h": motion.h})
-    stepper = motion.stepper(method, solver)
-    whole, parts = stepper.start(**start), pickle.loads(pickle.dumps(stepper)).start(**start)
-    whole.advance(9)
-    for _ in range(3):
-        parts.advance(1)
-        if name == "rods":
-            parts.multipliers, parts.constraint_values  # noqa: B018  (they leave what the next step begins with)
-    other = WAYS[way](stepper, parts, plan)
-    for each in (parts, other):
-        each.advance(6)
-        assert states(each) == states(whole)
-        assert each.energy == whole.energy
-
-
-@pytest.mark.second
-def test_inputs_are_set_between_steps():
-    motion = MOTIONS["data"]
-    runs = [
-        motion.stepper("svi:6").start(**motion.start(), h=0.1),
-        motion.unrolled("svi:6").start(**motion.start(True), h=0.1),
-    ]
-    for force in (1.0, -2.0):
-        for run in runs:
-            run.set_inputs(F=force)
-            run.advance(5)
-    assert_close(np.asarray(runs[0].q), runs[1].q, 1e-14)
-    with pytest.raises(sc.StateError, match="'G' is not an input"):
-        runs[0].set_inputs(G=1.0)
-
-
-@pytest.mark.rotated
-def test_known_sizes_names_and_ensembles():
-    """Sizes that are known when compiled, literal or by an argument, are those of the unrolled system."""
-    motion = MOTIONS["body on ring"]
-    known = sc.compile_stepper(motion.system, "svi:4", sizes={"N": 5}, flags=QUICK_FLAGS)
-    masses, rest = motion.data["parameters"], np.zeros(6)
-    own = motion.stepper("svi:4").integrate(**motion.start(), h=0.1, steps=40)
-    run = known.integrate(motion.q, velocity=rest, h=0.1, steps=40, parameters=masses)
-    for found, expected in ((known.arrays(run.q), own.q), (known.arrays(run.p), own.p)):
-        assert {name: values.shape for name, values in found.items()} == {"x": (41,), "q": (41, 5)}
-        for name, values in found.items():
-            assert_close(values, expected[name], 1e-13)
-    starts = {"x": [0.3, 0.1], "q": [motion.q["q"], -motion.q["q"]]}
-    for plan in ({"h": 0.1, "steps": 40}, {"t_end": 4.0}):
-        many = motion.stepper("svi:4").integrate_ensemble(starts, threads=2, **plan, parameters=masses)
-        expected = known.integrate_ensemble(starts, velocity=np.zeros((2, 6)), **plan, parameters=masses)
-        assert_close(many.ends[1], expected.ends[1], 1e-13)
-        single = known.integrate({"x": 0.1, "q": -motion.q["q"]}, rest, **plan, parameters=masses)
-        assert_close(expected.ends[1][1], single.q[-1], 1e-13)
-    assert known.jacobian(motion.q, rest, 0.1).shape == (12, 12)
 
 
 @pytest.mark.second

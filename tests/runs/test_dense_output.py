@@ -8,13 +8,6 @@ from scipy.integrate import solve_ivp as scipy_solve_ivp
 
 import scvi_codegen as sc
 
-METHODS = (sc.SVI(3), sc.SpectralCollocation(4), sc.Composition(8), sc.StoermerVerlet())
-MORE_METHODS = (sc.SCVI(3), sc.Gauss(2), sc.RadauIIA(2), sc.ExplicitEuler(), sc.SVI(4, "gauss-lobatto:5"))
-each_method = pytest.mark.parametrize(
-    "method",
-    [*METHODS, *(pytest.param(method, marks=pytest.mark.full) for method in MORE_METHODS)],
-    ids=lambda method: method.name,
-)
 FLAGS = ("-O0",)
 E = 0.3
 START = {"q": [1 - E, 0.0], "p": [0.0, math.sqrt((1 + E) / (1 - E))]}
@@ -34,28 +27,6 @@ def kepler() -> sc.Stepper:
 
 
 # Order, continuity, ends.
-
-
-@pytest.mark.tiers(0, 4)
-@each_method
-@pytest.mark.parametrize("h", [0.1, -0.1])
-def test_dense_output_is_continuous_at_saved_states(compiled, sample, method, h):
-    q, p = sample("driven-duffing").state
-    run = compiled("driven-duffing", method).integrate(q, p, h=h, steps=20, t=0.4)
-    assert np.array_equal(run.at(run.t)[0], run.q)
-    assert np.array_equal(run.at(run.t)[1], run.p)
-    assert np.array_equal(run.at(np.nextafter(run.t[-1], run.t[-1] + h))[0], run.q[-1])
-    for near in (np.nextafter(run.t[1:], run.t[:-1]), np.nextafter(run.t[1:-1], run.t[2:])):
-        saved = run.q[1 : 1 + len(near)], run.p[1 : 1 + len(near)]
-        for value, state in zip(run.at(near), saved, strict=True):
-            assert np.abs(value - state).max() < 1e-14
-
-
-def test_options_of_the_run_apply_to_dense_output(kepler):
-    rough = kepler.integrate(**START, h=0.3, steps=10, options=sc.SolverOptions(tolerance=1e-3))
-    fine = kepler.integrate(**START, h=0.3, steps=10)
-    t = 0.3 * np.arange(10) + 0.29
-    assert np.abs(rough.at(t)[0] - fine.at(t)[0]).max() > 1e-10
 
 
 # t_eval.

@@ -135,26 +135,20 @@ def _parsed(lines: Iterator[str]) -> tuple[_Block, str]:
 
 
 class _Preprocessor:
-    """Lines that remain of a source and of the headers that it includes.
-
-    Attributes:
-        visits: name and lines of each text in order: those of the source, then of a header each time it is included.
-    """
+    """Lines that remain of a source and of the headers that it includes."""
 
     def __init__(self, code: str, read: Read) -> None:
         self._read, self._macros, self._ends = read, _Macros(), dict[str, _Macros]()
-        self.visits: list[tuple[str, list[str]]] = []
         self.lines = list(self._visit("", code))
 
-    def _visit(self, name: str, text: str) -> Iterator[str]:
+    def _visit(self, folder: str, text: str) -> Iterator[str]:
         """Yield the lines of a text with headers inserted."""
-        self.visits.append((name, []))
-        yield from self._block(_parsed(iter(text.split("\n")))[0], *self.visits[-1])
+        yield from self._block(_parsed(iter(text.split("\n")))[0], folder)
 
-    def _block(self, block: _Block, name: str, own: list[str]) -> Iterator[str]:
+    def _block(self, block: _Block, folder: str) -> Iterator[str]:
         for part in block:
             if not isinstance(part, str):
-                yield from self._conditional(part, name, own)
+                yield from self._conditional(part, folder)
                 continue
             word, rest = _directive(part)
             if word in ("define", "undef"):
@@ -162,50 +156,35 @@ class _Preprocessor:
                 self._macros.uncertain.discard(macro)
                 (self._macros.defined.add if word == "define" else self._macros.defined.discard)(macro)
             self._macros.failed |= word == "error"
-            own.append(part)
-            header = _support_name(part, posixpath.dirname(name))
+            header = _support_name(part, folder)
             if header is None:
                 yield part
             else:
-                yield from self._visit(header, self._read(header).removesuffix("\n"))
+                yield from self._visit(posixpath.dirname(header), self._read(header).removesuffix("\n"))
 
-    def _conditional(self, alternatives: Sequence[_Alternative], name: str, own: list[str]) -> Iterator[str]:
+    def _conditional(self, alternatives: Sequence[_Alternative], folder: str) -> Iterator[str]:
         before, ends, holds = self._macros, list[_Macros](), None
         for alternative in alternatives:
             holds = before.holds(alternative.line)
             if holds is False:
                 continue
             if holds and not ends:
-                yield from self._block(alternative.block, name, own)
+                yield from self._block(alternative.block, folder)
                 return
             line = "#else" if holds else alternative.line
             if not ends and alternative is not alternatives[0]:
                 line = f"#if {_directive(line)[1]}"
-            own.append(line)
             yield line
             self._macros = before.copy() if ends else before.resumed(self._ends.get(line))
-            yield from self._block(alternative.block, name, own)
+            yield from self._block(alternative.block, folder)
             if not ends:
                 self._ends[line] = self._macros
             ends.append(self._macros)
             if holds:
                 break
         if ends:
-            own.append("#endif")
             yield "#endif"
             self._macros = _joined(ends if holds else [*ends, before])
-
-
-def specialised(code: str, read: Read) -> tuple[tuple[str, str], ...]:
-    """Return the support headers that a source includes, in order, without alternatives that it does not use."""
-    texts: dict[str, str] = {}
-    for name, lines in _Preprocessor(code, read).visits[1:]:
-        if any(lines):
-            guard = read(name).partition("\n")[0]
-            guarded = [guard, *lines, "#endif", ""] if guard.startswith("#ifndef ") else [*lines, ""]
-            text = re.sub(r"\n{3,}", "\n\n", "\n".join(guarded))
-            texts[name] = text if texts.setdefault(name, text) == text else read(name)
-    return tuple(texts.items())
 
 
 def preprocessed(code: str, read: Read) -> str:
