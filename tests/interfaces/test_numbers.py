@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 from commands import json_of, output_of
-from notation import lagrange
 
 import scvi_codegen as sc
 from scvi_codegen.analysis.advice.tolerance_check import Known
@@ -365,37 +364,6 @@ def test_every_field_and_line_of_a_recorded_run_is_correct(springs):
     assert text[3:5] == output_of(*words).splitlines()[4:6]
     finals = [float(x) for line in text for x in re.findall(r"= +(-?[\d.]{9,})", line)]
     assert finals == [memory["final"][letter][name] for name in ("x", "y") for letter in "qp"]
-
-
-@pytest.mark.rotated
-def test_every_number_of_advice_is_correct(springs):
-    words = ("run", "model.toml", "--span", "5.25", *flags({}), "--advise", "1e-6")
-    numbers = json_of(*words, "-o", "advised.npz")
-    advice = numbers["advice"]
-    assert advice.keys() == {"h", "steps", "message", "warnings"}
-    assert (advice["h"], advice["steps"], advice["warnings"]) == (numbers["h"], numbers["steps"], [])
-    assert advice["h"] * advice["steps"] == pytest.approx(5.25)
-    assert advice["message"].startswith(f"{advice['steps']} steps of {advice['h']:.6g} by {sc.SVI(2).name}")
-    formula = "m*(x_dot**2 + y_dot**2)/2 - k*(x**2 + y**2)/2 - c*(x**2 + y**2)**2/4"
-    model = lagrange("springs", "x y", formula, parameters=CHANGED)
-    with np.load("advised.npz") as saved:
-        q, p = saved["q"], saved["p"]
-    end = sc.compile_stepper(model, "svi:8").integrate(q[0], p[0], t=T, t_end=T + 5.25).q[-1]
-    size = math.sqrt(np.mean(np.sum(q**2, axis=1)))
-    error = np.linalg.norm(end - q[-1]) / size
-    assert 1e-8 < error < 1e-6
-    assert float(re.search(r"expected error of (\S+)\.", advice["message"])[1]) > 0.3 * error
-    lines = output_of(*words).splitlines()
-    pilots = [re.fullmatch(r"  h = (\S+) +(?:error (\S+)|no correct digit|fails) .*", line) for line in lines[1:]]
-    rows = [(float(row[1]), row[2]) for row in pilots if row]
-    assert len(rows) >= 3
-    for h, message in rows:
-        steps = round(5.25 / h)
-        if message is None or steps > 2000:
-            continue
-        again = sc.compile_stepper(model, "svi:2").integrate(q[0], p[0], h=5.25 / steps, steps=steps, t=T)
-        off = np.linalg.norm(again.q[-1] - end) / size
-        assert 0.2 * off < float(message) < 20 * off
 
 
 RING = """

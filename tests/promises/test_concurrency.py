@@ -155,18 +155,6 @@ def test_killed_compilation_leaves_a_usable_cache(folder, times, monkeypatch):
     assert building.load(source(0), flags=FAST).lib.answer_0() == 0.0
 
 
-COMPILING = """
-import sys
-import scvi_codegen as sc
-print("ready", flush=True)
-sys.stdin.readline()
-entry = sc.problem(sys.argv[1])
-stepper = sc.compile_stepper(entry.system, sc.SVI(3))
-run = stepper.integrate(entry.q, stepper.momentum(entry.q, entry.velocity), h=0.002, steps=100)
-print(run.q[-1].tobytes().hex(), run.p[-1].tobytes().hex())
-"""
-
-
 # Steppers and runs that travel.
 
 

@@ -5,7 +5,6 @@ exception must be a :class:`~scvi_codegen.common.errors.ScviCodegenError`.
 """
 
 import json
-import math
 import os
 import warnings
 from collections.abc import Callable
@@ -21,32 +20,8 @@ from samples import QUICK_FLAGS
 import scvi_codegen as sc
 from scvi_codegen.codegen.native import building, compilers
 from scvi_codegen.codegen.rendering.source import Source
-from scvi_codegen.interfaces.models.packages.package import generate_package
 from scvi_codegen.runs.recording.manifest import sealed_archive, sealed_text
 
-MODEL = """[system]
-name = "swing"
-coordinates = ["q"]
-lagrangian = "q_dot**2/2 - w*q**2/2 + u*q"
-inputs = ["u"]
-
-[parameters]
-w = 1.0
-
-[inputs]
-u = { t = [0.0, 10.0], values = [0.0, 1.0] }
-
-[initial]
-q = [1.0]
-q_dot = [0.0]
-
-[method]
-method = "svi:2"
-
-[run]
-step = 0.1
-steps = 10
-"""
 ODD: list[Any] = [
     None, True, "x", "", b"x", 1j, [], {}, (), [[]], [[1.0]], [None], ["1"], [1.0, [2.0]], float("nan"), float("inf"),
     -1, 0, 10**400, 2**63, 1e300, -1e300, object(), {"q": 1}, {1: 2}, {None: 1.0}, range(3), np.zeros((0, 1)),
@@ -208,91 +183,6 @@ def _read_whole(folder: Path) -> None:
         assert np.isfinite(run[0:3].energy()).all()
     np.asarray(run.q)
     assert (len(run), run.steps, repr(run)) is not None
-
-
-GAS = """
-[system]
-name = "gas"
-coordinates = ["x", "q[3]"]
-lagrangian = "x_dot**2/2 + sum(i in 3, m[i]*q_dot[i]**2/2) - sum(i < j in near, (q[i] - q[j])**2) - x**2/2"
-neighbours = { near = { of = "q", cutoff = "2*s", box = "L" } }
-[parameters]
-s = 1.0
-L = 5.0
-"m[3]" = 1.0
-[initial]
-q = { x = 0.1, q = [0.1, 1.0, 2.0] }
-q_dot = { x = 0.0, q = 0.0 }
-[method]
-method = "svi:2"
-[run]
-step = 0.01
-steps = 3
-"""
-TRANSFORMED = """
-[system]
-name = "kepler"
-coordinates = ["x", "y"]
-lagrangian = "(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2)"
-time_transformation = "sqrt(x**2 + y**2)"
-[initial]
-q = [1.0, 0.0]
-q_dot = [0.0, 1.0]
-[method]
-method = "svi:2"
-[run]
-step = 0.01
-steps = 3
-"""
-WORDS = [
-    "", " ", "q[", "q[-1]", "q[9]", "N = [[", "N = " + "[" * 9000, "near", "0.1.2", "((", "zz", "1/0", "spin s",
-    "\0",
-]  # fmt: skip
-
-
-@pytest.mark.rotated
-@pytest.mark.sampled(1)
-@pytest.mark.parametrize("part", range(3))
-@pytest.mark.parametrize("text", [GAS, TRANSFORMED, MODEL], ids=["gas", "transformed", "driven"])
-def test_damaged_interfaces_of_packages_are_rejected(text: str, part: int, tmp_path: Path) -> None:
-    """Every entry with a third of other values, entries left out and repeated: refused, or used without harm."""
-    (tmp_path / "model.toml").write_text(text)
-    folder = generate_package(sc.load_model(tmp_path / "model.toml"), tmp_path / "made_here")
-    path = folder / "interface.json"
-    record = json.loads(path.read_text())
-    values = [*WORDS, 0, -1, 1, 2**39, math.nan, None, True, [], {}, [["near", "box", "("]], [[]], "[" * 9000]
-    interface, count = record["interface"], 0
-    for number, (key, old) in enumerate(interface.items()):
-        changed = [*values]
-        if isinstance(old, list):
-            changed += [old[1:], old[:-1], old + old[:1], old[::-1], *([word, *old[1:]] for word in WORDS)]
-        for new in changed[(number + part) % 3 :: 3]:
-            path.write_text(json.dumps(record | {"interface": interface | {key: new}}))
-            count += refused(lambda: _use(folder)) is not None
-    assert count > 60
-    source = record["source"]
-    declarations = [line for k, line in enumerate(source["declarations"]) if k != len(source["declarations"]) // 2]
-    contents, sizes = source["contents"], source["contents"]["sizes"]
-    damaged_sources = (
-        {"declarations": declarations},
-        {"support": ["../../secret.h"]},
-        {"contents": contents | {"sizes": sizes | {"workspace": sizes["workspace"] - 1}}},
-        {"contents": contents | {"sizes": sizes | {"coordinates": -1}}},
-        {"contents": contents | {"sizes": None}},
-        {"contents": contents | {"lanes": {"points": 1}}},
-    )
-    damaged_records = [json.dumps(record | {"source": source | each}) for each in damaged_sources]
-    for other in ('{"format": ' + "[" * 99999, *damaged_records):
-        path.write_text(other)
-        assert isinstance(refused(lambda: sc.load_package(folder)), sc.PackageError)
-
-
-def _use(folder: Path) -> None:
-    stepper = sc.load_package(folder)
-    q = np.linspace(0.3, 1.2, stepper.dimension)
-    run = stepper.integrate(q, 0 * q, h=0.01, steps=2, parameters=None if stepper.in_tau else {})
-    run.save(folder / "a.csv")
-    assert (repr(stepper), repr(run), run.energy(), stepper.momentum_maps(q, q)) is not None
 
 
 def test_damaged_state_files_are_rejected(recorded: Path) -> None:

@@ -9,9 +9,8 @@ from fractions import Fraction
 import numpy as np
 import pytest
 import sympy
-from notation import hamilton, lagrange
+from notation import lagrange
 from samples import QUICK_FLAGS, damped_pair
-from scipy.integrate import solve_ivp
 
 import scvi_codegen as sc
 from scvi_codegen.interfaces.models.model_files.model_file import parse_model
@@ -60,66 +59,6 @@ def test_linear_steps_contract_area_exactly(method):
     for t in (0.0, 1e6):
         columns = [np.concatenate(stepper.step([q], [p], 0.2, t)) for q, p in ((1.0, 0.0), (0.0, 1.0))]
         assert np.linalg.det(columns) == pytest.approx(np.exp(-0.3 * 0.2), rel=5e-16)
-
-
-@pytest.mark.second
-def test_momentum_maps_decay_exactly_and_work_is_reported():
-    """The angular momentum of a body about a centre; damping takes energy to the order of the method."""
-    system = lagrange(
-        "slowed body", "x y", "m*(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2)", m=2.0, c=0.2, damping="c"
-    )
-    assert system.changes_energy
-    stepper = sc.compile_stepper(system, sc.SVI(3))
-    assert not stepper.interface.map_names
-    assert stepper.impulse_names == ("angular momentum",)
-    apart = []
-    for h in (0.1, 0.05):
-        run = stepper.integrate([1.0, 0.0], velocity=[0.1, 0.9], h=h, steps=round(3 / h))
-        angular = run.q[:, 0] * run.p[:, 1] - run.q[:, 1] * run.p[:, 0]
-        assert np.abs(angular / angular[0] - np.exp(-0.2 * run.t)).max() < 4e-15
-        apart.append(np.abs(run.energy() - run.energy()[0] - run.work()).max())
-        taken = np.abs(angular - angular[0] - run.impulses()[:, 0]).max()
-    assert np.log2(apart[0] / apart[1]) > 5.6
-    assert taken < 1e-9
-
-
-@pytest.mark.second
-def test_damping_with_adaptive_steps_ensembles_and_hamiltonians():
-    """Lanes with different rates; H, its Lagrangian, additional forces; constrained systems."""
-    hamiltonian = hamilton(
-        "damped from H", "x", "p**2/(2*m) - cos(x)", momenta="p", m=1.5, c=0.3, forces={"x": "cos(t)/2"}, damping="c"
-    )
-
-    def pendulum(t, z, rate):
-        return [z[1] / 1.5, -np.sin(z[0]) + np.cos(t) / 2 - rate * z[1]]
-
-    for system in (hamiltonian, sc.lagrangian_of(hamiltonian)):
-        stepper = sc.compile_stepper(system, sc.SVI(4), flags=QUICK_FLAGS)
-        values = np.array([[1.5, 0.3], [1.5, 1.2], [1.5, -0.1]])
-        ends = [
-            solve_ivp(pendulum, (0, 3), [1.0, 0.2], args=(c,), method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
-            for c in values[:, 1]
-        ]
-        run = stepper.integrate([1.0], [0.2], t_end=3.0)
-        assert np.abs([run.q[-1, 0], run.p[-1, 0]] - ends[0]).max() < 1e-10
-        q, p = np.full((3, 1), 1.0), np.full((3, 1), 0.2)
-        many = stepper.integrate_ensemble(q, p, h=0.05, steps=60, parameters={"c": values[:, 1]})
-        assert np.abs(np.concatenate([many.q[-1], many.p[-1]], axis=1) - ends).max() < 1e-8
-
-
-@pytest.mark.second
-def test_constrained_motion_is_that_of_the_angle():
-    rod = lagrange(
-        "damped rod", "x y", "(x_dot**2 + y_dot**2)/2 - y", c=0.5, damping="c", constraints=["x**2 + y**2 = 1"]
-    )
-    angle = lagrange("damped angle", "a", "a_dot**2/2 + cos(a)", c=0.5, damping="c")
-    exact = sc.compile_stepper(angle, "svi:8").integrate([1.0], [0.0], h=0.1, steps=20).q[-1, 0]
-    stepper, errors = sc.compile_stepper(rod, sc.SVI(2, "gauss-lobatto:3"), flags=QUICK_FLAGS), []
-    for steps in (20, 40):
-        run = stepper.integrate([np.sin(1), -np.cos(1)], velocity=[0, 0], h=2 / steps, steps=steps)
-        errors.append(np.abs(run.q[-1] - [np.sin(exact), -np.cos(exact)]).max())
-        assert np.abs(run.constraint_values()).max() < 4e-15
-    assert np.log2(errors[0] / errors[1]) > 3.7
 
 
 @pytest.mark.rotated

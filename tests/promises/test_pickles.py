@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable
 from functools import cache
 from typing import Any
 
@@ -13,9 +12,9 @@ from notation import lagrange
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
-from scvi_codegen import Run, Stepper, compile_stepper, problem
+from scvi_codegen import Stepper, compile_stepper, problem
 from scvi_codegen.codegen.variants import TangentVectors
-from scvi_codegen.runs.stepping.step_plan import Adaptive, FixedSteps
+from scvi_codegen.runs.stepping.step_plan import Adaptive
 
 Q, P = [0.3, 0.8], [-1.1, 0.4]
 H, STEPS = 0.1, 6
@@ -74,46 +73,6 @@ def assert_same(one: Any, other: Any) -> None:
     assert np.array_equal(one.t, other.t)
     assert np.array_equal(one.q, other.q)
     assert np.array_equal(one.p, other.p)
-
-
-OWN = sc.SolverOptions(tolerance=1e-9, max_iterations=37)
-RUNS: dict[str, dict[str, Any]] = {
-    "h": {"h": H},
-    "t": {"h": H, "t": 1.5},
-    "t_end": {"t_end": 1.2},
-    "tolerance": {"t_end": 1.2, "tolerance": 1e-7},
-    "absolute_tolerance": {"t_end": 1.2, "tolerance": 1e-7, "absolute_tolerance": {"q1": 1e-3}},
-    "max_step": {"t_end": 1.2, "tolerance": 1e-7, "max_step": 0.01},
-    "first_step": {"t_end": 1.2, "tolerance": 1e-7, "first_step": 0.001},
-    "parameters": {"h": H, "parameters": {"mu": 1.3}},
-    "options": {"h": H, "options": OWN},
-    "velocity": {"h": H, "velocity": P},
-}
-"""By the argument of ``start`` that it is about."""
-
-
-@pytest.mark.parametrize("argument", RUNS)
-@pytest.mark.parametrize("steps", [0, 3])
-def test_pickled_run_continues_identically(argument: str, steps: int) -> None:
-    given = RUNS[argument]
-    run = stepper("").start(Q, None if "velocity" in given else P, **given)
-    run.record(steps)
-    check_same_run(run, copied(run), lambda each: each.record(STEPS if isinstance(each.plan, FixedSteps) else None))
-
-
-@pytest.mark.second
-def test_pickled_run_with_time_transformation_continues_identically() -> None:
-    run = stepper("time_transformation").start(Q, P, h=0.2, t_end=0.9)
-    run.record(2)
-    check_same_run(run, copied(run), Run.record)
-
-
-def check_same_run(run: Run, copy: Run, record: Callable[[Run], Any]) -> None:
-    for name in ("t", "h", "plan", "options", "steps", "longest"):
-        assert getattr(copy, name) == getattr(run, name), name
-    assert np.array_equal(copy.parameters, run.parameters)
-    assert copy.checkpoint() == run.checkpoint()
-    assert_same(record(run), record(copy))
 
 
 def test_target_time_of_a_run_may_be_changed_and_is_pickled() -> None:

@@ -162,26 +162,3 @@ def test_advice_solutions_and_recorded_runs_are_those_of_known_sizes(ring, stepp
         direct = sc.compile_stepper(ring, "svi:6", sizes={"N": N}).start(Q, V, t=0.5, parameters={"beta": 0.3}, **plan)
         assert np.array_equal(recorded.q, direct.record(**steps).q)
         assert run.steps == 0
-
-
-@pytest.mark.rotated
-def test_advice_of_ensembles_by_name(ring) -> None:
-    """The advice is that of the unrolled system, with parameters of each trajectory or of all."""
-    springs = sc.LagrangianSystem.from_text(
-        name="springs",
-        coordinates=["r[N, 2]"],
-        parameters={"k[N]": 1.0},
-        lagrangian="sum(i in N, r_dot[i, 0]**2/2 + r_dot[i, 1]**2/2 - k[i]*(r[i, 0]**4 + r[i, 1]**2)/4)",
-    )
-    states, k = np.stack([Q, 2 * Q]), np.stack([np.linspace(1.0, 2.0, 3), np.linspace(9.0, 8.0, 3)])
-    for system, name, size, parameters in (
-        (ring, "q", N, {"beta": [0.25, 0.5]}),
-        (ring, "q", N, None),
-        (springs, "r", 3, {"k": k}),
-        (springs, "r", 3, {"k": k[1]}),
-    ):
-        named = {name: states if name == "q" else states.reshape(2, 3, 2)}
-        further = {"span": 1.0, "tolerance": 1e-6, "parameters": parameters}
-        advice = sc.advise(system, "svi:4", named, velocity=named, **further)
-        plain = sc.advise(sc.unroll_sums(system, {"N": size}), "svi:4", states, velocity=states, **further)
-        assert (advice.h, advice.member, advice.expected_error) == (plain.h, 1, plain.expected_error)

@@ -1,6 +1,6 @@
-"""Random runs with ``error=``, a third of them not smooth, or with narrow forces: none is falsely confirmed.
+"""Random runs with ``error=``, some with narrow forces: none is falsely confirmed; those with kinks: test_kinks.py.
 
-References are closed forms, or DOP853 at a relative tolerance of 1e-13 between the zeros of the switching functions.
+References are closed forms, or DOP853 at a relative tolerance of 3e-14.
 """
 
 import math
@@ -57,19 +57,6 @@ SMOOTH = {
         {}, {"w": 1.0, "c": 0.1},
     ),
 }  # fmt: skip
-NOT_SMOOTH = {
-    "floor": (("y",), "y_dot**2/2 - 9.8*y - k*positive_part(-y)**2", {}, {"k": 1e5}),
-    "motor": (("x",), "x_dot**2/2", {"x": "unit_step(t - a)"}, {"a": 5.0}),
-    "pulse": (("x",), "x_dot**2/2 - x**2/2", {"x": "unit_step(t - a)*unit_step(a + w - t)"}, {"a": 5.0, "w": 0.1}),
-    "ramp": (("x",), "x_dot**2/2 - x**2/2", {"x": "positive_part(t - a)"}, {"a": 5.0}),
-    "layer": (("x",), "x_dot**2/2", {"x": "k*unit_step(x - a)*unit_step(a + w - x)"}, {"a": 5.0, "w": 0.1, "k": 1.0}),
-    "two springs": (("x",), "x_dot**2/2 - x**2/2 - k*positive_part(x)**2/2", {}, {"k": 3.0}),
-    "saturation": (
-        ("x",), "x_dot**2/2 - x**2/2 - positive_part(x - a)**2*k - positive_part(-x - a)**2*k", {"x": "w*cos(t)"},
-        {"a": 1.0, "k": 10.0, "w": 0.5},
-    ),
-    "table": (("x",), "x_dot**2/2 - x**2/2", {"x": "u"}, {}),
-}  # fmt: skip
 NARROW = {
     "flash": (("x",), "x_dot**2/2", {"x": "k*exp(-((t - a)/w)**2)"}, {"a": 5.0, "w": 0.1, "k": 1.0}),
     "well": (("x",), "x_dot**2/2 + k*(1 - tanh((x - a)/w)**2)", {}, {"a": 5.0, "w": 0.1, "k": 1.0}),
@@ -78,11 +65,10 @@ METHODS = ("svi:4", "svi:6", "svi:8")
 
 
 @cache
-def stepper_of(kind: str, method: str, **options: Any) -> Any:
-    names, lagrangian, forces, parameters = (SMOOTH | NOT_SMOOTH | NARROW)[kind]
-    inputs = "u" if kind == "table" else ""
-    system = lagrange("motion", names, lagrangian, forces=forces, inputs=inputs, **parameters)
-    return sc.compile_stepper(system, method, **options)
+def stepper_of(kind: str, method: str) -> Any:
+    names, lagrangian, forces, parameters = (SMOOTH | NARROW)[kind]
+    system = lagrange("motion", names, lagrangian, forces=forces, **parameters)
+    return sc.compile_stepper(system, method)
 
 
 def integrated(rates, y0, times):
@@ -103,56 +89,6 @@ def on_an_ellipse(r, v, times):
         above = middle - e * np.sin(middle) > mean - whole
         low, high = np.where(above, low, middle), np.where(above, middle, high)
     return np.stack([a * (np.cos(low) - e), a * np.sqrt(1 - e * e) * np.sin(low)], axis=1).astype(float)
-
-
-def linear_motion(coefficients, start, t):
-    """Return x, x_dot at times t of x'' = -W x + f + g t + A cos(t), from (t0, x0, v0)."""
-    (W, f, g, A), (t0, x0, v0) = coefficients, start
-
-    def particular(t):
-        if W == 0.0:
-            return f * t**2 / 2 + g * t**3 / 6 - A * np.cos(t), f * t + g * t**2 / 2 + A * np.sin(t)
-        x, v = (f + g * t) / W, g / W + 0.0 * t
-        if W == 1.0:
-            return x + A * t * np.sin(t) / 2, v + A * (np.sin(t) + t * np.cos(t)) / 2
-        return x + A * np.cos(t) / (W - 1), v - A * np.sin(t) / (W - 1)
-
-    (x_start, v_start), (x, v), w, s = particular(t0), particular(t), math.sqrt(W), t - t0
-    x0, v0 = x0 - x_start, v0 - v_start
-    if W == 0.0:
-        return x + x0 + v0 * s, v + v0 + 0.0 * s
-    return x + x0 * np.cos(w * s) + v0 / w * np.sin(w * s), v - x0 * w * np.sin(w * s) + v0 * np.cos(w * s)
-
-
-def switched(coefficients, guards, state, times):
-    """Return positions (n, 1) at times of a motion that is linear between the zeros of guards, functions of (t, x).
-
-    ``coefficients``: function of the signs of the guards that returns those of :func:`linear_motion`.
-    """
-    (t, end), (x, v), found = (times[0], times[-1]), state, np.empty((len(times), 1))
-    ahead = linear_motion(coefficients([g(t, x) > 0.0 for g in guards]), (t, x, v), t + 1e-9)
-    signs = [bool((g(t, x) or g(t + 1e-9, ahead[0])) > 0.0) for g in guards]
-    while True:
-        now, start = coefficients(signs), (t, x, v)
-        grid = t + (end - t) * np.linspace(0.0, 1.0, 20_001)[1:]
-        along = linear_motion(now, start, grid)[0]
-        crossing = [np.flatnonzero((g(grid, along) > 0.0) != sign) for g, sign in zip(guards, signs, strict=True)]
-        firsts = [k[0] if len(k) else len(grid) for k in crossing]
-        k, j = min((k, j) for j, k in enumerate(firsts))
-        until = end
-        if k < len(grid):
-            low, high = grid[k - 1] if k else t, grid[k]
-            for _ in range(80):
-                middle = 0.5 * (low + high)
-                there = guards[j](middle, linear_motion(now, start, middle)[0]) > 0.0
-                low, high = (middle, high) if there == signs[j] else (low, middle)
-            until = high
-        inside = (times >= t) & (times <= until)
-        found[inside, 0] = linear_motion(now, start, times[inside])[0]
-        if until == end:
-            return found
-        x, v = linear_motion(now, start, until)
-        t, signs[j] = until, not signs[j]
 
 
 def smooth_case(random, kind):
@@ -206,48 +142,6 @@ def smooth_case(random, kind):
     return arguments, lambda times: integrated(rates, [*q, *p], times)[:, :m]
 
 
-def case_with_kinks(random, kind):
-    """Return arguments, and a function of times that returns positions."""
-    u, span = random.uniform, random.uniform(3.0, 12.0)
-    a, w, k = u(0.1, 0.9) * span, 10.0 ** u(-4.0, 0.3), 10.0 ** u(0.0, 2.0)
-    q, p, values, inputs = u(-1.5, 1.5), u(-1.0, 1.0), {}, None
-    at = {"after": lambda t, x: t - a, "before": lambda t, x: a + w - t}
-    if kind == "floor":
-        k = 10.0 ** u(2.0, 5.0)
-        q, p, values = u(0.05, 3.0), 0.0, {"k": k}
-        span = u(1.5, 6.0) * math.sqrt(2 * q / 9.8)
-        motion = lambda s: (2 * k if s[0] else 0.0, -9.8, 0.0, 0.0), [lambda t, x: -x]
-    elif kind == "motor":
-        values, motion = {"a": a}, (lambda s: (0.0, float(s[0]), 0.0, 0.0), [at["after"]])
-    elif kind == "pulse":
-        values, motion = {"a": a, "w": w}, (lambda s: (1.0, float(s[0] and s[1]), 0.0, 0.0), [*at.values()])
-    elif kind == "ramp":
-        values = {"a": a}
-        motion = lambda s: (1.0, -a * s[0], float(s[0]), 0.0), [at["after"]]
-    elif kind == "layer":
-        q, p, a, w = 0.0, 1.0, u(0.1, 0.9) * span, 10.0 ** u(-3.0, 0.3)
-        values = {"a": a, "w": w, "k": k}
-        motion = (lambda s: (0.0, k * (s[0] and s[1]), 0.0, 0.0), [lambda t, x: x - a, lambda t, x: a + w - x])
-    elif kind == "two springs":
-        values, motion = {"k": k}, (lambda s: (1.0 + k * s[0], 0.0, 0.0, 0.0), [lambda t, x: x])
-    elif kind == "saturation":
-        a, drive = u(0.3, 1.5), u(0.1, 1.0)
-        values = {"a": a, "k": k / 2, "w": drive}
-        motion = (
-            lambda s: (1.0 + k * (s[0] or s[1]), k * a * (int(s[0]) - int(s[1])), 0.0, drive),
-            [lambda t, x: x - a, lambda t, x: -x - a],
-        )
-    else:
-        t, x = np.sort(np.append(u(0.0, span, 4), [0.0, span])), u(-1.0, 1.0, 6)
-        inputs, rates = {"u": (t, x)}, np.diff(x) / np.diff(t)
-        edges = [lambda s, x, each=each: s - each for each in t[1:-1]]
-        motion = lambda s: (1.0, x[sum(s)] - rates[sum(s)] * t[sum(s)], rates[sum(s)], 0.0), edges
-    arguments = {"q": [q], "p": [p], "t_end": span, "parameters": values}
-    if inputs:
-        arguments = {"q": [q], "p": [p], "t_end": span, "inputs": inputs}
-    return arguments, lambda times: switched(*motion, (q, p), times)
-
-
 def narrow_case(random, kind):
     """Return arguments, and a function of times that returns positions; the width is 1e-4 to 1 of the duration."""
     u, span, x0, v = random.uniform, random.uniform(3.0, 12.0), random.uniform(-1.5, 1.5), random.uniform(0.3, 1.5)
@@ -280,16 +174,12 @@ def _arcsinh_of(ratio, y):
     return np.where(abs(y) < 30.0, np.arcsinh(ratio * np.sinh(near)), far)
 
 
-FAMILIES = {
-    "not smooth": (NOT_SMOOTH, case_with_kinks),
-    "smooth": (SMOOTH, smooth_case),
-    "narrow": (NARROW, narrow_case),
-}
+FAMILIES = {"smooth": (SMOOTH, smooth_case), "narrow": (NARROW, narrow_case)}
 
 
 def case_of(number: int, family: str, methods: Sequence[str] = METHODS) -> Case:
     """Return a random case, by one of the methods."""
-    random = np.random.default_rng([number, [*FAMILIES].index(family)])
+    random = np.random.default_rng([number, 1 + [*FAMILIES].index(family)])
     kinds, arguments_of = FAMILIES[family]
     kind, method = [*kinds][number % len(kinds)], str(random.choice(methods))
     arguments, positions = arguments_of(random, kind)
@@ -337,7 +227,7 @@ def test_no_error_is_confirmed_but_wrong(family, kind):
     """Three cases of each kind, more with narrow forces, some of which all stages miss; most are confirmed."""
     kinds = [*FAMILIES[family][0]]
     first, stride, count = kinds.index(kind), len(kinds), 15 if family == "narrow" else 3
-    least = {"smooth": 0.6, "not smooth": 0.0, "narrow": 0.8}[family]
+    least = {"smooth": 0.6, "narrow": 0.8}[family]
     check(counts(range(first, first + count * stride, stride), family, ["svi:4"]), least)
 
 
@@ -353,47 +243,21 @@ def test_free_flight_is_examined_for_narrow_forces():
 
 
 @pytest.mark.full
-@pytest.mark.parametrize(
-    ("family", "count", "least"), [("smooth", 2000, 0.95), ("not smooth", 1000, 0.6), ("narrow", 1000, 0.9)]
-)
-def test_no_false_confirmation_in_four_thousand_cases(family, count, least):
+@pytest.mark.parametrize(("family", "count", "least"), [("smooth", 2000, 0.95), ("narrow", 1000, 0.9)])
+def test_no_false_confirmation_in_three_thousand_cases(family, count, least):
     check(counts(range(count), family), least)
 
 
 FLOOR_HEIGHT = 2.55
 
 
-@pytest.mark.parametrize("method", ["svi:4", *(pytest.param(each, marks=pytest.mark.full) for each in METHODS[1:])])
-def test_a_ball_on_a_stiff_floor_is_not_falsely_confirmed(method):
-    """Free flight has the same steps for all tolerances, one of which ends inside the floor."""
-    start = {"q": [FLOOR_HEIGHT], "p": [0.0], "t_end": 3.0 * math.sqrt(2.0 * FLOOR_HEIGHT / 9.8)}
-    motion = lambda signs: (2e5 * signs[0], -9.8, 0.0, 0.0), [lambda t, x: -x]
-    exact = switched(*motion, (FLOOR_HEIGHT, 0.0), np.array([0.0, start["t_end"]]))[-1, 0]
-    assert exact == pytest.approx(0.049518, abs=1e-6)
-    with warnings.catch_warnings(action="ignore"):
-        run = stepper_of("floor", method).integrate(**start, error=1e-8)
-    assert run.confirmation.confirmed == (abs(run.q[-1, 0] - exact) < 1e-8 * FLOOR_HEIGHT)
-
-
 def test_an_unconfirmed_motion_with_kinks_has_the_remedies_for_these():
     height, span = FLOOR_HEIGHT, 3.0 * math.sqrt(2.0 * FLOOR_HEIGHT / 9.8)
+    floor = lagrange("floor", "y", "y_dot**2/2 - 9.8*y - 1e5*positive_part(-y)**2")
+    stepper = sc.compile_stepper(floor, "svi:4", kinks="as formulas")
     with pytest.warns(sc.AccuracyWarning, match=r"max_step=, .*sc\.impact, sc\.Event.* not smooth where") as caught:
-        stepper_of("floor", "svi:4", kinks="as formulas").integrate([height], [0.0], t_end=span, error=1e-14)
+        stepper.integrate([height], [0.0], t_end=span, error=1e-14)
     assert "time transformation" not in str(caught[0].message)
-
-
-@pytest.mark.second
-def test_switched_forces_are_not_falsely_confirmed():
-    """x'' = 1 from t = a on: 30 times a, each confirmed run is right; those that are not are reported."""
-    stepper, confirmed = stepper_of("motor", "svi:4"), 0
-    for a in np.linspace(0.3, 9.7, 30):
-        with warnings.catch_warnings(action="ignore"):
-            run = stepper.integrate([0.0], [1.0], t_end=10.0, parameters={"a": a}, error=1e-8)
-        exact = run.t + np.maximum(run.t - a, 0.0) ** 2 / 2
-        reached = run.t <= run.confirmed_until
-        assert np.abs(run.q[:, 0] - exact)[reached].max() <= 1e-8 * np.ptp(exact)
-        confirmed += run.confirmation.confirmed
-    assert confirmed >= 18
 
 
 @pytest.mark.parametrize("offset", [0.0, 1e6])
@@ -483,7 +347,7 @@ def test_steps_of_a_confirmed_run_with_kinks_reproduce_it(tmp_path):
 
 @pytest.mark.second
 def test_kinks_of_arrays_are_found():
-    """Two balls on a stiff floor: the second one is at the height of the test above."""
+    """Two balls on a stiff floor: the second one meets it at the end of a step at all tolerances."""
     system = lagrange("floor", "y[N]", "sum(i in N, y_dot[i]**2/2 - 9.8*y[i] - 1e5*positive_part(-y[i])**2)")
     start = {"q": [1.7, FLOOR_HEIGHT], "t_end": 3.0 * math.sqrt(2.0 * FLOOR_HEIGHT / 9.8)}
     with warnings.catch_warnings(action="ignore"):

@@ -77,23 +77,6 @@ def test_step_sizes_are_smaller_where_errors_grow(degree, e, tolerance):
     assert run.iterations.sum() < 6 * run.steps
 
 
-def test_dense_output_and_states_at_requested_times(kepler):
-    q, p = orbit(0.6)
-    run = kepler.integrate(q, p, t_end=20.0)
-    times = np.linspace(0.0, 20.0, 13)
-    there, _ = run.at(times)
-    asked = kepler.integrate(q, p, t_end=20.0, t_eval=times)
-    thinned = kepler.integrate(q, p, t_end=20.0, save_every=7)
-    assert np.array_equal(asked.t, times)
-    assert np.array_equal(asked.q, there)
-    assert thinned.t[-1] == 20.0
-    assert len(thinned) == -(-run.steps // 7) + 1
-    assert np.array_equal(thinned.q[:-1], run.q[:-1:7])
-    assert np.abs(thinned.at(times)[0] - there).max() < 1e-12
-    for t, position in zip(times[1:], there[1:], strict=True):
-        assert np.abs(position - exact_position(q, p, t)).max() < 1e-12
-
-
 def test_restored_adaptive_runs_require_their_end(kepler):
     run = kepler.start(*orbit(0.8), t_end=20.0)
     run.advance(37)
@@ -175,24 +158,6 @@ def test_three_lobatto_points_estimate_errors_by_the_momentum_derivative(solver)
     assert 1e-8 < run.step_error < 2e-5
 
 
-@pytest.mark.tiers(1)
-@pytest.mark.parametrize("method", [sc.SVI(8), sc.SVI(6, "gauss-legendre:9")])
-def test_newton_iteration_has_adaptive_steps(method):
-    stepper = sc.compile_stepper(sc.problem("kepler").system, method, solver="newton")
-    assert "_iteration.h" not in stepper.source.code
-    for e in (0.2, 0.9):
-        q, p = orbit(e)
-        run = stepper.integrate(q, p, t_end=20.0)
-        assert run.t[-1] == 20.0
-        assert np.abs(run.q[-1] - exact_position(q, p, 20.0)).max() < 5e-11
-        assert run.rejected_steps <= 0.05 * run.steps
-        assert np.abs(np.diff(run.energy())).max() < 3e-14
-    saved = stepper.start(q, p, t_end=20.0)
-    first = saved.record(31)
-    rest = stepper.from_checkpoint(saved.checkpoint(), t_end=20.0).record()
-    assert np.array_equal(np.concatenate([first.q, rest.q[1:]]), run.q)
-
-
 @pytest.mark.second
 def test_newton_solves_stiff_systems_with_steps_of_the_slow_time_scale():
     system = lagrange("penalty pendulum", "x y", "(x_dot**2 + y_dot**2)/2 - y - k*(x**2 + y**2 - 1)**2/8", k=1e10)
@@ -204,17 +169,6 @@ def test_newton_solves_stiff_systems_with_steps_of_the_slow_time_scale():
     assert run.steps < 300  # of the vibration there are 30,000 in this time
     assert np.abs(run.q[-1] - [math.sin(angle), -math.cos(angle)]).max() < 1e-8
     assert np.ptp(run.energy()) < 1e-6
-
-
-def test_solve_ivp_accepts_the_tolerance_of_steps(kepler):
-    q, p = orbit(0.9)
-    motion = sc.solve_ivp(kepler, (0.0, 20.0), [*q, *p], rtol=1e-12, t_eval=[5.0, 20.0])
-    assert motion.success
-    assert motion.y.shape == (4, 2)
-    assert np.abs(motion.y[:2, 1] - exact_position(q, p, 20.0)).max() < 1e-9
-    with pytest.raises(sc.StateError, match="t_end"):
-        sc.solve_ivp(kepler, (0.0, 20.0), [*q, *p], h=0.1, rtol=1e-12)
-    assert not sc.solve_ivp(kepler, (0.0, 2.0), [1.0, 0.0, 0.0, 0.0], rtol=1e-12).success
 
 
 @pytest.mark.tiers(0, 1)
@@ -420,29 +374,6 @@ def test_many_iterations_limit_the_step_size():
     errors = [np.abs(run.q[-1] - exact.q[-1]).max() for run in (loose, middle, tight)]
     assert errors[0] > errors[2]
     assert errors[0] < 0.1
-
-
-def test_step_sizes_do_not_depend_on_the_origin_of_time():
-    """Also of steps that are compared with two of half their size."""
-    pumped = lagrange("pumped", "x", "x_dot**2/2 - (1 + cos(3*(t - s))/2)*x**4/4", s=0.0)
-    stepper = sc.compile_stepper(pumped, "svi:4")
-    first, shifted = (
-        stepper.integrate([1.0], [0.0], t=s, t_end=s + 9.0, tolerance=1e-8, parameters={"s": s}) for s in (0.0, 64.0)
-    )
-    assert (shifted.steps, shifted.rejected_steps) == (first.steps, first.rejected_steps)
-    assert np.array_equal(shifted.step_sizes[:-2], first.step_sizes[:-2])
-
-
-@pytest.mark.second
-@pytest.mark.parametrize("solver", ["fixed-point", "newton"])
-def test_known_sizes_take_the_adaptive_steps_of_arrays_at_the_nodes_of_a_wave(solver):
-    text = "sum(i in N, q_dot[i]**2/2 - q[i]**4/4) - sum(i in N periodic, (q[i+1] - q[i])**2/2)"
-    ring = sc.LagrangianSystem.from_text(name="ring", coordinates=["q[N]"], lagrangian=text)
-    q = np.sin(np.arange(8) * 2 * np.pi / 8)
-    of_any, known = (sc.compile_stepper(ring, "svi:4", solver=solver, **more) for more in ({}, {"sizes": {"N": 8}}))
-    run, other = (each.integrate(q, 0.0 * q, t_end=5.0, tolerance=1e-9) for each in (of_any, known))
-    assert run.steps <= other.steps < 2 * run.steps
-    np.testing.assert_allclose(run.q[-1], other.q[-1], atol=1e-8)
 
 
 @pytest.mark.second

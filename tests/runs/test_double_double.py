@@ -28,7 +28,7 @@ from scvi_codegen.codegen.pipeline import Sources
 from scvi_codegen.codegen.rendering.kernels.double_double import FUNCTIONS, arithmetic_headers
 from scvi_codegen.codegen.variants import Lanes
 from scvi_codegen.common.errors import MethodError, StateError
-from scvi_codegen.runs.ensembles.lanes import CommonRuns, Departure, follow
+from scvi_codegen.runs.ensembles.lanes import CommonRuns
 from scvi_codegen.runs.states.words import as_mpmath, split, two_words, with_low
 
 KEPLER = "m*(x_dot**2 + y_dot**2)/2 + mu/sqrt(x**2 + y**2)"
@@ -253,43 +253,6 @@ def test_divided_kernels() -> None:
     whole = stepper.integrate(entry.q, velocity=entry.velocity, h=0.5, steps=1)
     halves = stepper.integrate(entry.q, velocity=entry.velocity, h=0.25, steps=2)
     assert max(abs(whole.mp("q")[-1] - halves.mp("q")[-1])) < 1e-29
-
-
-@pytest.mark.second
-def test_states_by_name() -> None:
-    """States by the names of coordinates or arrays keep both words."""
-    third = Fraction(1, 3)
-    named = {"x": "0.7", "y": third}, {"x": 0, "y": "1.3"}
-    chain = lagrange("springs", "x[2]", "sum(i in 2, x_dot[i]**2/2 - x[i]**2/2)")
-    arrays = {"x": ["0.7", third]}, {"x": [0, "1.3"]}
-    for each, (q, v) in ((system("kepler"), named), (chain, arrays)):
-        stepper = sc.compile_stepper(each, "svi:4", precision="double-double")
-        run, plain = (
-            stepper.integrate(*start[:1], velocity=start[1], h=0.1, steps=2)
-            for start in ((q, v), (["0.7", third], [0, "1.3"]))
-        )
-        assert (run.mp("q") == plain.mp("q")).all()
-        assert run.q_low[0].all()
-
-
-@pytest.mark.rotated
-def test_large_steps() -> None:
-    """Corrections whose last changes are rounding errors are accepted, near pericentre with 16 steps a period."""
-    stepper = sc.compile_stepper(system("kepler"), "svi:24", precision="double-double")
-    run = stepper.integrate([0.5, 0.0], velocity=[0.0, 3.0**0.5], h=0.392699092626572, steps=12_000, save_every=100)
-    assert run.energy_error() < 3e-29
-
-
-@pytest.mark.rotated
-def test_energy_does_not_drift() -> None:
-    """The mean change of the energy is a random walk: tables of two words would be those of a dissipative method."""
-    springs = lagrange("springs", "x y", "(x_dot**2 + y_dot**2)/2 - x**2/2 - y**2/3")
-    stepper, steps, changes = sc.compile_stepper(springs, "svi:16", precision="double-double"), 100_000, []
-    for x, y, u, w in np.random.default_rng(1).uniform(-0.25, 0.25, (4, 4)):
-        run = stepper.integrate([x, y], velocity=[u, w], h=0.5, steps=steps, save_every=steps)
-        energy = run.energy()
-        changes.append(float(energy[-1] - energy[0]) / abs(float(energy[0])) / steps)
-    assert abs(np.mean(changes)) < 4e-35
 
 
 def test_numbers() -> None:
@@ -537,26 +500,6 @@ def test_advice() -> None:
 
 
 @pytest.mark.second
-def test_advice_of_ensembles() -> None:
-    """The step is that of the trajectory with the largest error, with both words of its parameters."""
-    parts = [Fraction(1, 10), Fraction(3, 5), Fraction(3, 10)]
-    numbers = {"m": ["1/7", 1, 1], "mu": ["1/7", 1, 1]}
-    with mp.workdps(50):
-        q = [[1 - e, 0] for e in parts]
-        squares = [(1 + e) / (1 - e) for e in parts]
-        v = [[0, mp.sqrt(mp.mpf(each.numerator) / each.denominator)] for each in squares]
-        known = {"span": 9.3, "tolerance": 1e-24, "precision": "double-double"}
-        advice = sc.advise(system("kepler"), "svi:12", q, velocity=v, parameters=numbers, **known)
-        assert advice.member == 1
-        alone = sc.advise(system("kepler"), "svi:12", q[1], velocity=v[1], **known)
-        assert advice.h == pytest.approx(alone.h, rel=0.1)
-        stepper = sc.compile_stepper(system("kepler"), "svi:12", precision="double-double")
-        runs = stepper.integrate_ensemble(q, velocity=v, parameters=numbers, h=advice.h, t_end=9.3)
-        errors = [mp.norm(list(runs[j].mp("q")[-1] - exact_orbit(9.3, e))) for j, e in enumerate(parts)]
-        assert 1e-27 < max(errors) == errors[1] < 1e-24
-
-
-@pytest.mark.second
 def test_ensembles(tmp_path: Path) -> None:
     """States of two words go on, are saved, and end with a failure; adaptive trajectories are one call of C."""
     stepper = sc.compile_stepper(system("kepler"), "svi:12", precision="double-double")
@@ -665,21 +608,6 @@ def test_largest_systems_in_lanes(count: int, has_lanes: bool) -> None:
     assert (source is not None) == has_lanes
 
 
-@pytest.mark.second
-def test_trajectory_that_leaves_its_lane() -> None:
-    """A trajectory that the single integrator continues ends at the final time, with the state of its lane."""
-    stepper = sc.compile_stepper(system("driven"), "svi:4", precision="double-double")
-    common = ensemble_runs(stepper, [["0.7"]] * 3, [["0.3"]] * 3, t=0.001, h=0.1, t_end=1.0)
-    common.run(progress=None, threads=1)
-    q, p = common.q.copy(), common.p.copy()
-    carries = q.low[4, 1].copy(), p.low[4, 1].copy()
-    common.q[5:, 1] = np.nan
-    follow(common, Departure(1, 4, np.array(q[4, 1]), np.array(p[4, 1]), carries), lambda _: None)
-    for now, before in ((common.q, q), (common.p, p)):
-        assert abs(as_mpmath(now[:, 1]) - as_mpmath(before[:, 1])).max() < 1e-31
-    assert (q.low[-1, 1] != 0).all()
-
-
 def driven_spring(t: list[float], u: list[Fraction], end: float, kind: str) -> list:
     """Return q and its velocity at an end for q'' + q = u with values u at t, constant or linear between."""
     q, v = mp.mpf("0.3"), mp.mpf("0.2")
@@ -727,21 +655,6 @@ def test_inputs() -> None:
             stepper.integrate(**start, h=0.1, steps=3, inputs={"u": wrong})
 
 
-def test_global_errors_of_ensembles() -> None:
-    """The bound error= holds for each trajectory, with a local tolerance of its own."""
-    stepper = sc.compile_stepper(system("kepler"), "svi:12", precision="double-double")
-    with mp.workdps(50):
-        v = [["0", mp.sqrt(3)], ["0", "1.7"]]
-        runs = stepper.integrate_ensemble([["0.5", "0"]] * 2, velocity=v, t_end=2.0, error=1e-13)
-        assert runs.global_error.max() <= 1e-13
-        assert [each.precision for each in runs.confirmations] == ["double-double"] * 2
-        exact = exact_orbit(2.0)
-        error = max(abs(x - y) for x, y in zip(as_mpmath(runs.ends[1][0]), exact, strict=True))
-        assert 1e-28 < error < 1e-13
-    one = stepper.integrate(["0.5", "0"], velocity=v[0], t_end=2.0, error=1e-13)
-    assert (one.q_low[-1] == runs[0].q_low[-1]).all()
-
-
 @pytest.mark.parametrize("kind", ["fixed", "tau", "inputs", "events"])
 def test_dense_output_at_the_times_of_states_is_these_states(kind: str) -> None:
     """Times have low words, which dense output takes as well: in arrays, in lists and alone."""
@@ -780,15 +693,6 @@ def test_recordings(tmp_path: Path) -> None:
             assert np.array_equal(saved[f"{name}_low"], getattr(memory, name).low)
     with pytest.raises(StateError, match=r"NAME\.npz"):
         recorded.save(tmp_path / "a.h5")
-
-
-def test_velocities_of_files() -> None:
-    """Files and datasets of a run whose last step is shorter have its velocities."""
-    stepper = sc.compile_stepper(system("kepler"), "svi:12", precision="double-double")
-    run = stepper.integrate(["0.5", 0], velocity=[0, "1.7"], h=0.0625, t_end=1.01)
-    derived = run.states().quantities
-    assert derived is not None
-    assert np.array_equal(derived(run.t, run.q, run.p)["velocity"], run.p)
 
 
 @pytest.mark.rotated

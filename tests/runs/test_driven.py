@@ -181,18 +181,6 @@ def test_files_contain_energies_with_the_inputs_of_their_times(pendulum, tmp_pat
     assert run.worst_step_time in run.t
 
 
-@pytest.mark.second
-def test_momentum_maps_with_inputs():
-    """A push inside of a pair leaves its momentum alone."""
-    pair = lagrange("pair", "x y", "x_dot**2/2 + y_dot**2 - (x - y - u)**2/2", inputs="u")
-    run = sc.compile_stepper(pair, sc.SVI(3)).integrate(
-        [0.0, 1.0], velocity=[0.5, 0.1], inputs={"u": (KNOTS, VALUES)}, h=0.1, t_end=2.3
-    )
-    assert np.ptp(run.energy()) > 0.1
-    assert [name.split()[0] for name in run.stepper.momentum_map_names] == ["momentum", "boost"]
-    assert np.abs(run.momentum_errors()).max(axis=0) == pytest.approx([0.0, 0.0], abs=4e-15)
-
-
 @pytest.mark.parametrize(
     ("inputs", "message"),
     [

@@ -253,14 +253,6 @@ def test_iterations_of_coupled_systems_start_with_velocities() -> None:
     assert stepper_of("pushed pendulum", sc.SCVI(2)).ensemble is None
 
 
-def test_constant_inputs_are_parameters() -> None:
-    stepper, start = stepper_of("pushed pendulum", sc.SVI(3)), ([0.2], [0.1])
-    for plan in ({"h": 0.1, "steps": 7}, {"t_end": 0.7}):
-        by_input = stepper.integrate(*start, inputs={"u": -1.2, "w": 0.5}, parameters={"c": 0.1}, **plan)
-        by_name = stepper.integrate(*start, parameters={"c": 0.1, "u_0": -1.2, "w_0": 0.5}, **plan)
-        assert np.array_equal(by_input.q, by_name.q)
-
-
 @pytest.mark.second
 def test_parameters_are_named_rows_or_one_row_per_trajectory() -> None:
     stepper = stepper_for("planar-pendulum", sc.SVI(5))
@@ -272,16 +264,6 @@ def test_parameters_are_named_rows_or_one_row_per_trajectory() -> None:
     assert np.array_equal(again.q, each.q)
     same = stepper.integrate_ensemble(q, p, h=0.1, steps=5, parameters=each.parameters[0])
     assert np.array_equal(same.parameters, np.tile(each.parameters[0], (3, 1)))
-
-
-@pytest.mark.second
-def test_options_are_passed_to_the_lanes() -> None:
-    stepper = stepper_for("double-pendulum", sc.SVI(5))
-    q, p = states("double-pendulum", 8)
-    loose = stepper.integrate_ensemble(q, p, h=0.05, steps=20, options=sc.SolverOptions(tolerance=1e-4))
-    exact = stepper.integrate_ensemble(q, p, h=0.05, steps=20)
-    assert loose.ok.all()
-    assert 1e-14 < np.abs(loose.q - exact.q).max() < 1e-3
 
 
 def test_ensembles_with_few_or_no_steps() -> None:
@@ -756,20 +738,6 @@ def test_threads_chunks_and_save_every_do_not_change_results():
     assert rows.sum() == len(fewer.t) == 24 + 3  # breakpoints that fall between hundreds of steps
     assert (full.q[rows] == fewer.q).all()
     assert_allclose(full.energy()[rows], fewer.energy(), rtol=0, atol=0)
-
-
-@pytest.mark.second
-def test_files_contain_the_energies_of_each_segment(tmp_path):
-    stepper = stepper_of("pushed pendulum", sc.SVI(3))
-    w = np.outer(np.arange(COUNT), [0.0, 0.1])
-    runs = stepper.integrate_ensemble(
-        *states("pushed pendulum", COUNT), inputs={"u": (KNOTS, VALUES), "w": ([0.0, 3.0], w)}, h=0.05, t_end=2.3
-    )
-    table = runs.to_xarray()
-    rising = 1 + np.outer(runs.t, np.arange(COUNT)) / 30
-    assert_allclose(table["energy"], runs.p[:, :, 0] ** 2 / 2 - rising * np.cos(runs.q[:, :, 0]), rtol=0, atol=1e-14)
-    runs.save(tmp_path / "runs.csv")
-    assert (tmp_path / "runs.csv").read_text().splitlines()[0] == "trajectory,t,q,p_q"
 
 
 def test_files_contain_individual_times(tmp_path: Path) -> None:

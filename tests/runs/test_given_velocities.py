@@ -14,20 +14,6 @@ def pendulum_on_cart():
     return sc.compile_stepper(sc.problem("cart-pole").system, "svi:2", flags=QUICK_FLAGS)
 
 
-def test_velocities_are_converted_with_the_parameters_and_time_of_the_run():
-    stepper = pendulum_on_cart()
-    name = stepper.parameters[0]
-    given = {"parameters": {name: 2.5}, "t": 0.7, "h": 0.01}
-    p = stepper.momentum(Q, V, 0.7, given["parameters"])
-    one, other = stepper.integrate(Q, p, steps=20, **given), stepper.integrate(Q, velocity=V, steps=20, **given)
-    assert np.array_equal(one.q, other.q)
-    assert np.array_equal(one.p, other.p)
-    assert other.velocity[0] == pytest.approx(V, rel=1e-14)
-    assert stepper.momentum(other.q, other.velocity, other.t, given["parameters"]) == pytest.approx(other.p, rel=1e-13)
-    run = stepper.start(Q, velocity=V, **given)
-    assert np.array_equal(run.record(20).q, one.q)
-
-
 @pytest.mark.tiers(1)
 @pytest.mark.parametrize(
     ("coordinates", "lagrangian", "q", "v", "dropped"),
@@ -75,15 +61,6 @@ def test_velocities_of_nonlinear_momenta_are_found_to_round_off():
         assert np.abs(stepper.momentum(p, c * p / energy) - p).max() < 16 * 2.0**-52 * condition * np.abs(p).max()
 
 
-def test_ensembles_accept_velocities_with_individual_parameters():
-    stepper = pendulum_on_cart()
-    q, v, name = np.array([Q, [0.2, 0.1]]), np.array([V, [0.5, 0.6]]), stepper.parameters[0]
-    settings = {"h": 0.01, "steps": 20, "t": 0.7}
-    runs = stepper.integrate_ensemble(q, velocity=v, parameters={name: [2.5, 0.8]}, **settings)
-    for j, value in enumerate((2.5, 0.8)):
-        assert runs.p[0, j] == pytest.approx(stepper.momentum(q[j], v[j], 0.7, {name: value}), rel=1e-15)
-
-
 def test_solve_ivp_accepts_velocities_and_scipy_arguments():
     stepper = pendulum_on_cart()
     values = [2.0 * value for value in stepper.defaults]
@@ -99,16 +76,6 @@ def test_solve_ivp_accepts_velocities_and_scipy_arguments():
         sc.solve_ivp(stepper, y0=Q, velocity=V, args=values, parameters=values, **given)
     with pytest.raises(sc.MethodError, match="RK45"):
         sc.solve_ivp(sc.problem("kepler").system, (0.0, 1.0), [1.0, 0.0, 0.0, 1.0], method="RK45")
-
-
-def test_velocities_and_momenta_of_many_states():
-    stepper = pendulum_on_cart()
-    q, t = np.array([Q, [0.2, 0.1], Q]), np.array([0.0, 0.5, 1.0])
-    v = np.array([V, [0.5, 0.6], [0.0, 0.0]])
-    p = stepper.momentum(q, v, t)
-    assert p.shape == (3, 2)
-    assert p[1] == pytest.approx(stepper.momentum(q[1], v[1], t[1]), rel=1e-15)
-    assert stepper.velocity(q, p, t) == pytest.approx(v, rel=1e-14, abs=1e-15)
 
 
 @pytest.mark.parametrize(
