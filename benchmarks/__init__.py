@@ -5,7 +5,7 @@
                  precision, independent of the package's steppers (references)
     contenders/  functions from a case and a step size or tolerance to its final state: steppers of this package; peers:
                  heyoka (taylor), IRKGL16 (irkgl16), REBOUND, CyRK, SciPy (peers), MuJoCo, Pinocchio, Exudyn (engines),
-                 OpenMM (arrays), PyDy (mechanisms), py-pde and spectral methods by hand (pdes)
+                 Siconos (contact), OpenMM (arrays), PyDy (mechanisms), py-pde and spectral methods by hand (pdes)
     comparison   timing of all contenders of a case in turn, in one process
     sections     which contenders and which reference belong to a case
     report       time at equal error, by interpolation; tables and JSON of results; plots: their pictures

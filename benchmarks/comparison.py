@@ -73,7 +73,7 @@ def _peer_contenders(
             continue
         missing = next((each for each in PEERS[name].modules if importlib.util.find_spec(each) is None), None)
         if missing is not None:
-            skipped[name] = f"{missing} is not installed (pip install 'scvi-codegen[bench]')"
+            skipped[name] = f"{missing} is not installed ({PEERS[name].source})"
             continue
         report_activity(f"{chosen.case.name}: compiling {name}")
         try:

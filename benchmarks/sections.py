@@ -20,6 +20,7 @@ from benchmarks.cases.suites import SUITE_CASES, SUITE_ENDS, suite_case
 from benchmarks.cases.unforced import CASES, STATES, Case, case
 from benchmarks.comparison import Race
 from benchmarks.contenders.arrays import step_counts
+from benchmarks.contenders.contact import CONTACTS, contact_case, mujoco_contacts, our_contacts, siconos_contacts
 from benchmarks.contenders.engines import mujoco_contenders
 from benchmarks.contenders.mechanisms import LINKS, links
 from benchmarks.contenders.ours import (
@@ -177,6 +178,13 @@ def _field(make: Callable[[], FieldCase], plan: Plan) -> Race:
     return Race(case=chosen.plain(), ours=lambda: our_fields(chosen, plan.quick), ends=lambda _, __: exact)
 
 
+def _contact(name: str, plan: Plan) -> Race:
+    """Return a problem with contacts; every contender knows the closed form."""
+    chosen, exact = contact_case(name), Reference(positions=np.ones((1, 1)), accuracy=0.0)
+    peers = {"mujoco": mujoco_contacts, "siconos": siconos_contacts}
+    return Race(case=chosen, ours=partial(our_contacts, chosen, plan.quick), peers=peers, ends=lambda _, __: exact)
+
+
 LATTICES: Mapping[str, Callable[[], Case]] = {
     "ring:1000": partial(ring, 1000, 20.0),
     "ring:100000": partial(ring, 100_000, 2.0),
@@ -213,6 +221,7 @@ BUILDERS: dict[str, Callable[[Plan], Race]] = {
     **{f"rotations:{name}": partial(_rotation, name) for name in ROTATIONS},
     "rotations:bodies": _tumbling,
     **{f"robots:{name}": partial(_robot, make) for name, make in ROBOTS.items()},
+    **{name: partial(_contact, name) for name in CONTACTS},
     **{f"fields:{name}": partial(_field, make) for name, make in FIELDS.items()},
     **{f"lattices:{name}": partial(_halved, make, EXPLICIT, EXACT) for name, make in LATTICES.items()},
     **{

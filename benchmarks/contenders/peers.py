@@ -20,6 +20,7 @@ import numpy as np
 
 from benchmarks.cases.unforced import Array, Case
 from benchmarks.contenders import arrays, pdes
+from benchmarks.contenders.contact import siconos_contacts
 from benchmarks.contenders.dop853 import absolute_tolerance, by_tolerance, dop853, start_of
 from benchmarks.contenders.engines import exudyn_contenders, mujoco_contenders, pinocchio_contenders
 from benchmarks.contenders.irkgl16 import irkgl16_contenders
@@ -40,11 +41,13 @@ class Peer:
         modules: modules that must be installed.
         contenders: function that yields its contenders, one per setting.
         suits: predicate of the cases it can integrate.
+        source: how to install it.
     """
 
     modules: tuple[str, ...]
     contenders: Callable[[Case, bool], Iterator[Contender]]
     suits: Callable[[Case], bool]
+    source: str = "pip install 'scvi-codegen[bench]'"
 
 
 def rebound_contenders(case: Case, quick: bool) -> Iterator[Contender]:
@@ -171,6 +174,9 @@ PEERS = {
     "irkgl16": Peer((), irkgl16_contenders, _has_formulations),
     "rebound": Peer(("rebound",), rebound_contenders, lambda case: case.bodies is not None),
     "mujoco": Peer(("mujoco",), mujoco_contenders, lambda case: case.mjcf is not None),
+    "siconos": Peer(
+        ("siconos",), siconos_contacts, lambda case: "contact:" in case.name, "apt install python3-siconos"
+    ),
     "pinocchio": Peer(("pinocchio",), pinocchio_contenders, _is_tree),
     "exudyn": Peer(("exudyn",), exudyn_contenders, _is_tree),
     "cyrk": Peer(("CyRK", "numba"), _cyrk, _has_formulations),

@@ -221,12 +221,17 @@ def test_a_block_on_a_slope_creeps_nowhere() -> None:
         assert slides or not run.q.any()
 
 
-def test_a_bouncing_ball_comes_to_rest() -> None:
-    floor = sc.contact("y", restitution=0.7)
-    run = of("y_dot**2/2 - g*y", "y", [floor], "svi:2", g=9.81).integrate([1], velocity=[0], h=0.05, t_end=4)
+LOW = pytest.mark.xfail(raises=sc.EventError, strict=True, reason="bounces below the rounding of y are not rest")
+
+
+@pytest.mark.parametrize("floor", [0, pytest.param(0.5, marks=LOW)])
+def test_a_bouncing_ball_comes_to_rest(floor: float) -> None:
+    contacts = [sc.contact(f"y - {floor}", restitution=0.7)]
+    stepper = of("y_dot**2/2 - g*y", "y", contacts, "svi:2", g=9.81)
+    run = stepper.integrate([1 + floor], velocity=[0], h=0.05, t_end=4)
     assert [modes for _, modes in run.contact_modes] == [("open",), ("slip",)]
     assert run.contact_modes[1][0] == pytest.approx(np.sqrt(2 / 9.81) * 1.7 / 0.3, abs=1e-7)
-    assert abs(run.q[-1, 0]) < 1e-60
+    assert abs(run.q[-1, 0] - floor) < 1e-60 + 1e-15 * floor
     assert run.contact_forces()[-1, 0, 0] == pytest.approx(9.81)
 
 
