@@ -19,10 +19,8 @@ from strict_c import STRICT, check_strict, run, write
 from style import check_style
 
 import scvi_codegen as sc
-from scvi_codegen.codegen.ir.program import LEAST_REUSED_UNKNOWNS
 from scvi_codegen.codegen.native.building import TUNED_FLAGS, _mathematics
 from scvi_codegen.codegen.rendering.source import Interface, Source
-from scvi_codegen.interfaces.models.systems import fput_chain
 from scvi_codegen.methods.method import Method
 from scvi_codegen.systems.system import MechanicalSystem
 
@@ -320,146 +318,6 @@ def test_reserved_prefixes_of_c_are_valid(prefix, tmp_path):
     source, _ = sc.generate_source(bare_oscillator(), sc.SVI(2), prefix=prefix)
     files = write([source], tmp_path)
     run([needs("gcc"), *STRICT, "-c", *files], tmp_path)
-
-
-# Sanitizers: exact workspaces, every exported function.
-
-DRIVER = """
-static int check_PREFIX(void)
-{
-  enum { m = CAPITALS_COORDINATES, k = CAPITALS_PARAMETERS, steps = 6, kept = 3 };
-  const double defaults[] = {DEFAULTS};
-  double *workspace = malloc(sizeof(double) * CAPITALS_WORKSPACE), *parameters = k ? malloc(sizeof(double) * k) : NULL;
-  double *q = malloc(sizeof(double) * m), *v = malloc(sizeof(double) * m), *p = malloc(sizeof(double) * m);
-  double *q1 = malloc(sizeof(double) * m), *p1 = malloc(sizeof(double) * m), t[kept], e[kept];
-  double *qs = malloc(sizeof(double) * kept * m), *ps = malloc(sizeof(double) * kept * m);
-  int iterations[kept], status = 0;
-  PREFIX_run run;
-  PREFIX_report report;
-  const PREFIX_options options = PREFIX_default_options();
-  for (int i = 0; i < k; i++)
-    parameters[i] = defaults[i];
-  for (int i = 0; i < m; i++) {
-    q[i] = 0.7 - 0.4 * i;
-    v[i] = 0.3 + 0.2 * i;
-  }
-  status |= PREFIX_momentum(0.1, q, v, parameters, p, workspace);
-  status |= PREFIX_velocity(0.1, q, p, parameters, v, workspace);
-  status |= PREFIX_energy(0.1, q, p, parameters, e, workspace);
-  status |= PREFIX_step(0.1, 0.05, q, p, parameters, NULL, q1, p1, NULL, workspace);
-  status |= PREFIX_step(0.15, -0.05, q1, p1, parameters, &options, q, p, &report, workspace);
-  PREFIX_start(&run, 0.1, 0.05, q, p);
-  status |= PREFIX_advance(&run, steps, steps / kept, parameters, NULL, t, qs, ps, iterations, &report, workspace);
-  status |= PREFIX_energies(kept, t, qs, ps, parameters, e, workspace);
-  LEGENDRE
-  MAPS
-  for (int i = 0; i < kept; i++)
-    status |= !(e[i] == e[i]);
-  status |= report.steps != steps;
-  free(workspace), free(parameters), free(q), free(v), free(p), free(q1), free(p1), free(qs), free(ps);
-  return status;
-}
-"""
-TO_MOMENTA = "status |= PREFIX_momentum(0.1, q, v, parameters, p, workspace);"
-LEGENDRE = """status |= PREFIX_discrete_legendre(0.1, 0.05, q, q1, parameters, NULL, p, p1, e, NULL, workspace);"""
-
-
-MAPS = """double maps[kept * COUNT], sizes[kept * COUNT];
-  status |= PREFIX_momentum_maps(kept, t, qs, ps, parameters, maps, sizes);
-  status |= PREFIX_momentum_maps(kept, t, qs, ps, parameters, maps, NULL);
-  for (int i = 0; i < kept * COUNT; i++)
-    status |= !(maps[i] == maps[i]) || !(sizes[i] >= 0.0);"""
-
-
-def driver(interfaces: Sequence[Interface]) -> str:
-    """A C program that calls everything each integrator exports."""
-    text = "#include <stdlib.h>\n#include <string.h>\n" + "".join(f'#include "{i.prefix}.h"\n' for i in interfaces)
-    for i in interfaces:
-        body = DRIVER.replace("LEGENDRE", LEGENDRE if i.has_action else "")
-        body = body.replace("MAPS", MAPS.replace("COUNT", str(len(i.map_names))) if i.map_names else "")
-        if i.system == "hyperbolic":  # velocities say nothing of momenta
-            body = body.replace(TO_MOMENTA, "memcpy(p, v, sizeof(double) * m);")
-        values = ", ".join(map(repr, i.defaults)) or "0.0"
-        text += body.replace("PREFIX", i.prefix).replace("CAPITALS", i.prefix.upper()).replace("DEFAULTS", values)
-    calls = " + ".join(f"check_{i.prefix}()" for i in interfaces)
-    return f"{text}\nint main(void)\n{{\n  return {calls};\n}}\n"
-
-
-def check_sanitized(pairs: Sequence[tuple[Source, Interface]], command: Sequence[str], folder: Path) -> None:
-    files = write([source for source, _ in pairs], folder)
-    (folder / "driver.c").write_text(driver([interface for _, interface in pairs]))
-    run([*command, "-std=c99", "-g", "-fno-sanitize-recover=all", *files, "driver.c", "-lm", "-o", "d"], folder)
-    run([str(folder / "d")], folder)
-
-
-ADDRESS = ("gcc", "-fsanitize=address,undefined", "-fsanitize=float-cast-overflow")
-MEMORY = ("clang", "-fsanitize=memory")
-
-
-def sanitizer(command: Sequence[str], folder: Path) -> None:
-    """Skip the test where the compiler, or what it links to, is not installed."""
-    needs(command[0])
-    tried = [*command, "-x", "c", "-", "-o", str(folder / "empty")]
-    if subprocess.run(
-        tried, input="int main(void) { return 0; }", text=True, capture_output=True, check=False
-    ).returncode:
-        pytest.skip(f"{' '.join(command)} links no program here")
-
-
-SANITIZED = ("svi-3", "scvi-2", "scvi-printed", "sc-3", "gauss", "stoermer")
-BRIEFLY = [name for name in METHODS if name.startswith(SANITIZED)]
-
-
-SANITIZERS = pytest.mark.parametrize(
-    "command", [ADDRESS, MEMORY], ids=["address and undefined behaviour", "uninitialised memory"]
-)
-
-
-@pytest.mark.sampled(2)
-@pytest.mark.covering
-@SANITIZERS
-@pytest.mark.parametrize("method", BRIEFLY)
-def test_method_families_pass_the_sanitizers(command, method, tmp_path):
-    sanitizer(command, tmp_path)
-    check_sanitized([generated(method)["pumped-cart-pole"]], command, tmp_path)
-
-
-@pytest.mark.tiers(0, 1)
-@pytest.mark.sampled(3)
-@pytest.mark.covering
-@SANITIZERS
-@pytest.mark.parametrize(
-    ("masses", "method"),
-    [
-        (5, sc.SVI(8)),
-        (12, sc.SVI(3, "gauss-lobatto:4")),
-        (12, sc.SCVI(2)),
-        (12, sc.Gauss(3)),
-        (9, sc.SpectralCollocation(3)),
-    ],
-)
-def test_band_solver_and_reused_factors_pass_the_sanitizers(command, masses, method, tmp_path):
-    sanitizer(command, tmp_path)
-    source, interface = sc.generate_source(fput_chain(masses), method, solver="newton")
-    assert interface.unknowns >= LEAST_REUSED_UNKNOWNS
-    run([needs(command[0]), *STRICT, "-c", *write([source], tmp_path)], tmp_path)
-    check_sanitized([(source, interface)], command, tmp_path)
-
-
-@pytest.mark.second
-@SANITIZERS
-def test_phase_space_iterations_pass_the_sanitizers(command, tmp_path):
-    sanitizer(command, tmp_path)
-    source, interface = sc.generate_source(driven_hamiltonian(), sc.Gauss(3), solver="fixed-point")
-    check_sanitized([(source, interface)], command, tmp_path)
-
-
-@pytest.mark.full
-@SANITIZERS
-@pytest.mark.parametrize("method", METHODS)
-def test_every_method_passes_the_sanitizers_for_every_system(command, method, tmp_path):
-    sanitizer(command, tmp_path)
-    check_sanitized(list(generated(method).values()), command, tmp_path)
 
 
 def test_every_method_has_a_unique_name():

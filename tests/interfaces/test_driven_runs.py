@@ -72,23 +72,6 @@ def test_unsupported_options_are_rejected(words, message):
     assert message in error_of(*RUN, *words)
 
 
-@pytest.mark.second
-def test_ensemble_of_runs_with_inputs(model):
-    Path("many.csv").write_text("q,q_dot\n0.1,0\n0.2,1\n0.3,-1\n")
-    Path("pushed.toml").write_text(MODEL.replace("cos(q)", "(1 + u)*cos(q)").replace('[forces]\nq = "u"\n', ""))
-    text = output_of(*RUN, "--ensemble", "many.csv", "-o", "many.npz")
-    model = load_model("pushed.toml")
-    stepper = compile_stepper(model.system, model.method)
-    given = {"inputs": dict(model.inputs), "h": 0.1, "t_end": 2.3}
-    expected = [stepper.integrate([q], velocity=[v], **given) for q, v in ((0.1, 0.0), (0.2, 1.0), (0.3, -1.0))]
-    with np.load("many.npz") as file:
-        assert (file["t"] == expected[0].t).all()
-        assert_allclose(file["q"], np.stack([run.q for run in expected], axis=1), rtol=0, atol=2e-15)
-    assert "3 trajectories of 24 steps of 0.1 from t = 0; 25 states saved of each" in text
-    changes = max(np.abs(run.energy() - run.energy()[0]).max() for run in expected)
-    assert f"it changed by {changes:.3g} at most" in text
-
-
 def test_runs_without_steps_and_columns_of_inputs():
     assert "0 steps of 0.1 from t = 0 to t = 0; 1 state saved" in output_of(*RUN, "--steps", "0")
     Path("many.csv").write_text("q,u_0\n0.1,5\n")
@@ -126,14 +109,3 @@ def test_signal_stops_a_run_between_chunks(model, monkeypatch):
     assert outcome.failure is None
     assert 1.2 < outcome.trajectory.t[-1] < 2.0
     assert outcome.trajectory.t[0] == 0.0
-
-
-@pytest.mark.second
-@pytest.mark.parametrize("inputs", [True, False])
-def test_terminal_event_is_the_last_saved_state(model, inputs):
-    """With several segments: of inputs, or of a last step that is shorter."""
-    words = [] if inputs else ["--input", "u=1", "--span", "2.25"]
-    output_of(*RUN, *words, "--event", "q - 0.5; terminal=1", "--save-every", "7", "-o", "run.npz")
-    with np.load("run.npz") as file:
-        assert (np.diff(file["t"]) > 0.0).all()
-        assert abs(file["q"][-1] - 0.5) < 1e-13

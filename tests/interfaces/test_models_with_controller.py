@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commands import error_of, output_of
-from notation import lagrange
+from commands import error_of
 
 import scvi_codegen as sc
 from scvi_codegen import ModelFileError, StateError, SystemDefinitionError, generate_package
@@ -71,26 +70,9 @@ FAR = (
 
 
 @pytest.mark.rotated
-@pytest.mark.parametrize("words", ["FILE", "kepler --time-transformation frequency --span 50"])
-def test_command_line_finds_the_step_in_tau(shaken: Path, words: str) -> None:
-    printed = output_of(f"run {words.replace('FILE', str(shaken))} --tolerance 1e-8")
-    error = float(printed.partition("largest local error: ")[2].partition(" ")[0])
-    assert 1e-12 < error < 1e-7
-
-
-@pytest.mark.rotated
 @pytest.mark.parametrize("controller", ["symplectic", "reversible"])
 def test_unsuitable_time_transformation_is_reported(controller: str) -> None:
     assert "use another time transformation" in error_of(f"{FAR} {controller}", status=1)
-
-
-def test_run_continues_from_a_folder(shaken: Path, tmp_path: Path) -> None:
-    folder = str(tmp_path / "shaken.run")
-    assert "of 0.1 in tau from t = 0 to t = 12;" in output_of("run", str(shaken), "-o", folder)
-    assert "to t = 20;" in output_of("run", "--resume", folder, "--span", "20")
-    model = sc.load_model(shaken)
-    exact = plain(model).integrate(model.q, model.p, t_end=20.0)
-    assert np.abs(sc.load_run(folder)[-1:].q - exact.q[-1]).max() < 1e-9
 
 
 @pytest.mark.quick
@@ -125,32 +107,6 @@ def test_integrate_uses_the_controller(shaken: Path) -> None:
             sc.solve_ivp(model.system, (0.0, 1.0), state, **wrong)
     with pytest.raises(StateError, match="need a system, not a compiled stepper"):
         sc.solve_ivp(model.stepper(), (0.0, 1.0), state, h=0.1, controller="reversible")
-
-
-def test_steps_end_at_breakpoints_of_inputs() -> None:
-    system = lagrange("pushed", "x", "x_dot**2/2 - x**4/4 + x*u", inputs="u")
-    pushes = {"u": ((0.0, 1.0, 2.5, 6.0), (0.3, -1.0, 0.5, 0.5), "constant")}
-    exact = sc.compile_stepper(system, sc.SVI(8)).integrate([1.0], [0.0], inputs=pushes, t_end=6.0).q[-1]
-    common: dict[str, Any] = {
-        "system": system,
-        "q": (1.0,),
-        "p": (0.0,),
-        "time_transformation": "1/(1 + x**2)",
-        "inputs": pushes,
-    }
-    errors = []
-    for tau in (0.4, 0.2):
-        model = sc.Model(method=sc.SVI(2), h=tau, span=6.0, **common)
-        driven = model.stepper().integrate(model.q, model.p, inputs=pushes, h=tau, t_end=6.0)
-        run = model.start(model.stepper())
-        for steps in model.segments(run):
-            run.record(steps)
-        assert np.array_equal(run.q, driven.q[-1])
-        errors.append(abs(driven.q[-1] - exact)[0])
-    assert np.log2(errors[0] / errors[1]) == pytest.approx(4.0, abs=0.8)
-    searching = sc.Model(method=sc.SVI(2), tolerance=1e-9, span=6.0, **common)
-    with pytest.raises(ModelFileError, match="cannot be found by a pilot run"):
-        searching.start(searching.stepper())
 
 
 @pytest.mark.quick

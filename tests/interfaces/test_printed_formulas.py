@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import sympy
 from derivation_page import Entry, PrintedPage, read_page
+from oracle import points
 from printed_formulas import FUNCTIONS, mp, names, trees_of_mathml, value
 
 import scvi_codegen as sc
@@ -482,6 +483,39 @@ def of_motion(name: str, entry: Entry, index: int) -> bool:
     return left[1:3] == ("p", case.coordinates[index]) and close(found, case.result("L_v", at["t"], **given)[index])
 
 
+def nodes_of(method: Any) -> Any:
+    return points({"chebyshev-lobatto": "chebyshev-lobatto"}[method.specification()["nodes"]], method.degree + 1)
+
+
+def cardinal(nodes: Any, j: int, x: Any) -> Any:
+    found = mp.one
+    for k, other in enumerate(nodes):
+        found *= (x - other) / (nodes[j] - other) if k != j else 1
+    return found
+
+
+def of_curve(name: str, entry: Entry, index: int) -> bool:
+    """(18), (21) of curves that are polynomials: their derivatives are exact. Other entries are the same for all."""
+    method = CASES[name][1]
+    if entry.number not in ("18", "21"):
+        return True
+    c, h, m = numbers(nodes_of(method) * H), mp.mpf(H), 2
+    partials = np.array([[mp.diff(lambda x, j=j: cardinal(c, j, x), t) for j in range(len(c))] for t in c[1:]])
+    curve = [np.array([[1 + 2 * t - t**2], [3 - t + 4 * t**2]]) for t in c]
+    rates = [np.array([[2 - 2 * t], [-1 + 8 * t]]) for t in c]
+    known = {"A": partials[:, 1:], "a_0": partials[:, :1], "q_k": curve[0], "p_k": curve[0], "v_k": rates[0]}
+    known |= {
+        "Q": np.vstack(curve[1:]),
+        "P": np.vstack(curve[1:]),
+        "V": np.vstack(rates[1:]),
+        "G": np.vstack(rates[1:]),
+    }
+    known |= {"Q''": np.vstack([np.array([[mp.mpf(-2)], [mp.mpf(8)]])] * method.degree), "h": h}
+    known |= {letter: np.array(np.eye(m, dtype=int), dtype=object) for letter in ("𝕀", "I")}
+    one, other = (value(side, known.__getitem__) for side in entry.tree[1:])
+    return bool(np.max(np.abs(one - other)) < mp.mpf("1e-12"))
+
+
 def of_components(name: str, entry: Entry, index: int) -> bool:
     """What is written out is what :func:`derive` returns, whose text is evaluated below."""
     equations = derived(name)
@@ -527,7 +561,7 @@ def of_kernels(name: str, entry: Entry, index: int) -> bool:
 CHECKS: dict[str, Callable[[str, Entry, int], bool]] = {
     "system": of_system,
     "motion": of_motion,
-    "curve": lambda name, entry, index: True,
+    "curve": of_curve,
     "stages": lambda name, entry, index: True,  # solved as they stand, above
     "idel": lambda name, entry, index: True,
     "written-out": of_components,

@@ -53,7 +53,7 @@ def files_named(*names: str) -> list[str]:
 def test_steppers_work_on_older_processors(tmp_path, level):
     if level == "x86-64-v3" and "avx2" not in Path("/proc/cpuinfo").read_text():
         pytest.skip("this processor has no AVX2")
-    files = files_named("stepper", "ensemble", "identities", "structure", "constraints")
+    files = files_named("stepper", "ensemble", "against_oracle", "structure", "constraints")
     run_stepper_tests(tmp_path, f"-march={level}", *files)
 
 

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from notation import hamilton, lagrange
+from notation import lagrange
 
 import scvi_codegen as sc
 
@@ -17,13 +17,6 @@ def random(*shape: int) -> Any:
 
 
 RING = lagrange("case", "q[N]", f"{KINETIC} - sum(i in N periodic, (q[i+1] - q[i])**4/4 + q[i-1]*q[i+2])")
-BODIES = sc.LagrangianSystem.from_text(
-    "case",
-    ["r[N, 2]"],
-    "sum(i in N, m[i]*sum(a in 2, r_dot[i, a]**2)/2)"
-    "+ sum(i < j in N, m[i]*m[j]/sqrt(sum(a in 2, (r[i, a] - r[j, a])**2) + e**2))",
-    parameters={"m[N]": 1, "e": 0.5},
-)
 FIELD = sc.LagrangianSystem.from_text(
     "case",
     ["u[NX, NY]"],
@@ -59,17 +52,6 @@ def test_energy_does_not_drift() -> None:
     assert abs(changes[-20:].mean() - changes[:20].mean()) < 3e-14
 
 
-def test_observed_runs_save_the_requested_quantities() -> None:
-    """The first and the last state are saved."""
-    stepper = sc.compile_stepper(RING, "svi:2")
-    run = stepper.integrate(random(5), h=0.01, steps=25, save_every=10, observe=lambda run: run.q["q"][:2])
-    assert run.observed is not None
-    assert run.observed.shape == (3, 2)
-    assert run.q["q"].shape == (2, 5)
-    assert run.t == pytest.approx([0.0, 0.1, 0.2])
-    assert np.array_equal(run.observed[-1], run.q["q"][-1, :2])
-
-
 @pytest.mark.parametrize(
     ("observe", "message"),
     [
@@ -84,24 +66,6 @@ def test_unsupported_observations_are_rejected(observe: Any, message: str) -> No
         sc.compile_stepper(RING, "svi:2").integrate(random(5), h=0.1, steps=2, observe=observe)
 
 
-def test_velocities_depend_on_masses() -> None:
-    """Velocities of saved states and of a run; representations fit one line."""
-    stepper, q, velocity = sc.compile_stepper(BODIES, "svi:2"), 3 * random(4, 2), random(4, 2)
-    given = {"velocity": velocity, "h": 0.05, "parameters": {"m": [1, 2, 0.5, 1]}}
-    run, going = stepper.integrate(q, steps=3, **given), stepper.start(q, **given)
-    assert run.velocity["r"].shape == (4, 4, 2)
-    assert run.velocity["r"][0] == pytest.approx(velocity, rel=1e-15)
-    assert run.p["r"][0, 2] == pytest.approx(0.5 * velocity[2], rel=1e-15)
-    ones = {"r": np.ones((4, 2))}
-    assert going.stepper.velocity(q, ones, 0.0, going.parameters)["r"][:, 0] == pytest.approx([1, 0.5, 2, 1])
-    going.advance(3)
-    assert np.array_equal(going.velocity["r"], run.velocity["r"][-1])
-    shown = [repr(one) for one in (run, going, BODIES)]
-    assert shown[0] == "<Trajectory of case, svi-2-gauss-legendre-2; 4 states from t = 0 to 0.15, 3 steps of 0.05>"
-    assert shown[1].endswith("; t = 0.15 after 3 steps of 0.05, solver fixed-point>")
-    assert shown[2] == "LagrangianSystem(name='case', coordinates=(r[N, 2]))"
-
-
 def test_table_with_one_column_may_be_a_list() -> None:
     """For example, fixed positions."""
     constrained = lagrange("held", "q[N]", f"{KINETIC} - sum(p in P, q[pins[p, 0]]**2/2)", tables=["pins[P, 1]"])
@@ -110,14 +74,6 @@ def test_table_with_one_column_may_be_a_list() -> None:
     assert np.array_equal(runs[0].q["q"], runs[1].q["q"])
     assert np.array_equal(runs[0].q["q"][-1, ::2], random(4)[::2])
     assert not np.any(runs[0].q["q"][-1, 1::2] == random(4)[1::2])
-
-
-def test_energies_are_drawn() -> None:
-    """The energies may share axes with other trajectories."""
-    pytest.importorskip("matplotlib")
-    run = sc.compile_stepper(RING, "svi:2").integrate(random(5), h=0.1, steps=20)
-    line = sc.plot_energy([run, run]).get_lines()[0]
-    assert line.get_ydata()[1:] == pytest.approx(abs(run.energy() / run.energy()[0] - 1)[1:], abs=1e-15)
 
 
 @pytest.mark.second
@@ -162,22 +118,6 @@ def test_fixed_point_converges_up_to_the_documented_step_size(form: str, method:
     run.advance(50)
     assert run.energy == pytest.approx(before, rel=1e-13)
     assert np.isnan(run.step_error) == (method == "svi:1" and form == "hamiltonian")
-
-
-@pytest.mark.second
-def test_uniform_damping_has_the_exact_rate() -> None:
-    """Damped oscillators of mass 2, in closed form; for a Hamiltonian it requires known sizes."""
-    system = lagrange("damped", "q[N]", "sum(i in N, q_dot[i]**2 - q[i]**2)", damping=0.4)
-    stepper = sc.compile_stepper(system, "svi:5")
-    assert "not symplectic" in stepper.source.header
-    with pytest.raises(sc.MethodError, match="does not support velocity-dependent forces"):
-        sc.compile_stepper(system, "stoermer-verlet")
-    other = hamilton("damped", "q[N]", "sum(i in N, p_q[i]**2 + q[i]**2)", damping=0.4)
-    start = np.array([1.0, 2.0, 3.0])
-    run = sc.compile_stepper(other, "svi:5").integrate(start, h=0.2, steps=50)  # compiled with these sizes
-    w = np.sqrt(4 - 0.2**2)
-    exact = np.exp(-2.0) * (np.cos(10 * w) + 0.2 / w * np.sin(10 * w))
-    assert run.q["q"][-1] == pytest.approx(start * exact, abs=1e-9)
 
 
 def test_error_estimate_of_a_step_from_rest_at_the_origin() -> None:

@@ -35,11 +35,6 @@ def stepper(method: str, g: str = "frequency", *, hamiltonian: bool = False) -> 
     return sc.compile_stepper(system, method, precision="double-double")
 
 
-@cache
-def reversible(method: str) -> sc.Stepper:
-    return sc.compile_stepper(KEPLER, method, time_transformation="frequency", precision="double-double")
-
-
 def start(e: str) -> dict[str, Any]:
     """Return the pericentre of an orbit with semi-major axis 1."""
     with mp.workdps(50):
@@ -48,16 +43,6 @@ def start(e: str) -> dict[str, Any]:
 
 def largest(values: Any) -> float:
     return float(max(map(abs, values)))
-
-
-def anomaly_error(run: Any, e: str, k: int) -> float:
-    """Return the error of Kepler's equation t = u - e sin u and of the velocity at state k."""
-    e, (x, y), (v, w) = mp.mpf(e), run.mp("q")[k], run.mp("p")[k]
-    axis, t = mp.sqrt(1 - e * e), run.mp("t")[k]
-    u = mp.atan2(y / axis, x + e)
-    u += 2 * mp.pi * mp.nint((t - (u - e * mp.sin(u))) / (2 * mp.pi))
-    rate = 1 / (1 - e * mp.cos(u))
-    return largest([u - e * mp.sin(u) - t, v + mp.sin(u) * rate, w - axis * mp.cos(u) * rate])
 
 
 def gauss_tables() -> tuple[list, list]:
@@ -114,55 +99,6 @@ def test_steps(form: str, method: str) -> None:
                 values = getattr(exact, part)
                 found = run.mp(part)[k + 1]
                 assert largest(a - b for a, b in zip(found, values, strict=True)) < 3e-31 * largest(values)
-
-
-@pytest.mark.second
-@pytest.mark.parametrize("e", ["0.5", "0.9"])
-def test_kepler(e: str) -> None:
-    """States and times of fixed steps of tau, and a last step to t_end, satisfy Kepler's equation to 1e-28."""
-    run = stepper("svi:16").integrate(**start(e), h=0.125, t_end=7.5)
-    with mp.workdps(50):
-        assert max(anomaly_error(run, e, k) for k in range(0, len(run), 5)) < 1e-28
-        assert anomaly_error(run, e, -1) < 1e-28
-        assert run.t[-1] == 7.5
-        assert largest(run.mp("energy") + mp.mpf(1) / 2) < 1e-28
-        v = stepper("svi:16").velocity(run.q, run.p, 0.0, run.parameters)
-        assert largest((as_mpmath(v) - run.mp("p")).ravel()) < 1e-29  # dq/dt, of unit mass
-        p = stepper("svi:16").momentum(run.q[3], v[3], 0.0, run.parameters)
-        assert largest(as_mpmath(p) - run.mp("p")[3]) < 1e-29
-
-
-def test_reversible_controller() -> None:
-    """Steps of equal tau are those of the step sizes dt = g dtau in physical time, and the last one ends at t_end."""
-    run = reversible("svi:12").integrate(**start("0.5"), h=0.25, t_end=6.5)
-    plain = sc.compile_stepper(KEPLER, "svi:12", precision="double-double")
-    with mp.workdps(50):
-        for k in (0, 5, len(run) - 2):
-            h = run.mp("t")[k + 1] - run.mp("t")[k]
-            at = {"t": run.t[k], "h": float(h), "t_end": run.t[k + 1]} if k + 2 == len(run) else {"h": float(h)}
-            one = plain.integrate(run.q[k], run.p[k], **at, **({} if "t_end" in at else {"steps": 1}))
-            assert largest(one.mp("q")[-1] - run.mp("q")[k + 1]) < 1e-31
-            assert largest(one.mp("p")[-1] - run.mp("p")[k + 1]) < 3e-31
-        assert run.t[-1] == 6.5
-        assert anomaly_error(run, "0.5", -1) < 1e-22
-    double = sc.compile_stepper(KEPLER, "svi:12", time_transformation="frequency").integrate(
-        [0.5, 0.0], velocity=[0.0, 3.0**0.5], h=0.25, t_end=6.5
-    )
-    assert len(double) == len(run)
-    assert np.abs(double.t - run.t).max() < 1e-13
-    assert np.ptp(run.step_sizes[:-2]) > 0.1
-
-
-@pytest.mark.second
-def test_order_of_the_reversible_controller() -> None:
-    """At small steps the error against Kepler's equation is round-off; constraints and forces go with it, too."""
-    with mp.workdps(50):
-        run = reversible("svi:16").integrate(**start("0.9"), h=0.0625, t_end=6.5)
-        assert anomaly_error(run, "0.9", -1) < 1e-27
-        assert run.energy_error() < 1e-28
-        swing = sc.compile_stepper(ROD, "svi:4", time_transformation="2 + y", precision="double-double")
-        held = swing.integrate(["0.6", "-0.8"], velocity=["0.8", "0.6"], h=0.125, t_end=3.0)
-        assert max(np.abs(each).max() for each in held.constraint_values()) < 1e-30
 
 
 def walk_of_energy(g: str, method: str, steps: int) -> np.ndarray:

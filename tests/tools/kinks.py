@@ -26,7 +26,7 @@ ROUNDOFF, LOOSE, BOUND = 2e-14, 1e-6, 1e-8
 EPSILON, ROUNDING_AT_KINK = 2.0**-52, 50
 """Rounding error of steps and of positions, and by how much those at kinks exceed it, in the reference, too."""
 UNSEEN = {"svi:2": 8.0}
-"""By which local errors of curves of one coefficient exceed their estimates, as in ``test_local_errors.py``."""
+"""By which local errors of curves of one coefficient exceed their estimates."""
 KINDS = ("round-off", "tolerance", "at", "error=", "order")
 ALLOWED = {"round-off": 10.0, "tolerance": 10.0, "at": 10.0, "error=": 1.0, "order": 0.0}
 """Largest errors in tolerances, and by how much a measured order may be too low."""

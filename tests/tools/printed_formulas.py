@@ -11,6 +11,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 import mpmath
+import numpy as np
 
 mp = mpmath.MPContext()
 mp.dps = 60
@@ -228,14 +229,19 @@ def value(tree: Tree, lookup: Lookup, running: dict[str, int] | None = None) -> 
         case ("*", *factors):
             total = of(factors[0])
             for factor in factors[1:]:
-                total = total * of(factor)
+                other = of(factor)
+                total = total @ other if np.ndim(total) == 2 and np.ndim(other) == 2 else total * other
             return total
+        case ("⊗", left, right):
+            return np.kron(of(left), of(right))
         case ("/", top, bottom):
             return of(top) / of(bottom)
         case ("^", ("name", "e", "", ""), exponent):
             return mp.exp(of(exponent))
         case ("^", base, exponent):
             below, power = of(base), of(exponent)
+            if np.ndim(below) == 2:
+                return np.linalg.matrix_power(below, int(power))
             return below ** (int(power) if power == int(power) else power)
         case ("sum", variable, first, end, body):
             last = int(running[end[1]] if end[0] == "name" and end[1] in running else of(end))
