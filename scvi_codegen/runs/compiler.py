@@ -31,11 +31,10 @@ from scvi_codegen.common.errors import MethodError, SizesRequiredError
 from scvi_codegen.common.validation import TEXTS, OfRunTimeSizes, check_kind, checks_arguments
 from scvi_codegen.methods import SVI, StoermerVerlet, as_method, default_method
 from scvi_codegen.methods.method import Method
-from scvi_codegen.runs.contacts.driver import ContactsOfStepper
 from scvi_codegen.runs.stepper import Stepper, StepperOfRunTimeSizes
 from scvi_codegen.runs.stepping.compiled_method import Variants
 from scvi_codegen.systems.contact import ContactLike
-from scvi_codegen.systems.contacts.modes import bound_contacts
+from scvi_codegen.systems.contacts.modes import ContactRows, bound_contacts
 from scvi_codegen.systems.event import Event, EventLike, as_events
 from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED
 from scvi_codegen.systems.system import SYSTEM_OR_ARRAYS, MechanicalSystem
@@ -119,11 +118,13 @@ def compile_stepper(
         raise MethodError(f"unknown sums {sums!r}: use {' or '.join(map(repr, SUMS))}")
     if kinks not in KINKS:
         raise MethodError(f"unknown kinks {kinks!r}: use {' or '.join(map(repr, KINKS))}")
+    rows: tuple[ContactRows, ...] = ()
     if any((*contacts, system.has_contacts)):
-        arguments = {"flags": flags, "prefix": prefix, "symmetries": symmetries, "events": events}
         others = {"solver": solver, "precision": precision, "sizes": sizes, "tables": tables, "controller": controller}
         others["time_transformation"] = time_transformation
-        return _compile_contacts(system, method, contacts, arguments, others)
+        if passed := [name for name, value in others.items() if value not in (None, "auto", "double")]:
+            raise MethodError(f"{passed[0]}={others[passed[0]]!r} is not available with contacts: omit it")
+        system, rows = bound_contacts(system, (*system.contacts, *contacts))
     common: dict[str, Any] = {
         "solver": solver,
         "flags": flags,
@@ -153,7 +154,7 @@ def compile_stepper(
     settings = solver, prefix, symmetries, time_transformation, controller, precision, kinks
     sources = CachedSources(system, method, *settings)
     source, interface = sources.integrator()
-    interface = replace(interface, layout=replace(interface.layout, **shape))
+    interface = replace(interface, layout=replace(interface.layout, **shape), contacts=rows)
     system.store_key()
     stepper = partial(Stepper, source, interface, variants=sources.variants, flags=flags)
     if precision == DOUBLE_DOUBLE:
@@ -169,22 +170,6 @@ def _check_symmetries(symmetries: Any) -> None:
         from scvi_codegen.systems.symmetry.symmetry import SYMMETRIES
 
         check_kind(SYMMETRIES, symmetries, "symmetries")
-
-
-def _compile_contacts(
-    system: MechanicalSystem,
-    method: Method | str,
-    contacts: Sequence[ContactLike],
-    arguments: Mapping[str, Any],
-    others: Mapping[str, Any],
-) -> Stepper:
-    """Return the stepper of a system with contacts; ``others`` are arguments that it does not support."""
-    if passed := [name for name, value in others.items() if value not in (None, "auto", "double")]:
-        raise MethodError(f"{passed[0]}={others[passed[0]]!r} is not available with contacts: omit it")
-    bound = bound_contacts(system, (*system.contacts, *contacts))
-    stepper = compile_stepper(bound.system, method, **arguments)
-    stepper._contacts = ContactsOfStepper(bound.rows, bound.events)
-    return stepper
 
 
 def _compile_arrays(

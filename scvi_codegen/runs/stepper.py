@@ -30,7 +30,6 @@ from scvi_codegen.runs.accuracy.growth import measured_growth, warn_of_error_gro
 from scvi_codegen.runs.accuracy.local_error import warn_of_energy_errors, warn_of_inaccuracy
 from scvi_codegen.runs.accuracy.resolution import warn_of_unresolved_members
 from scvi_codegen.runs.accuracy.warning_switch import warn_of_failed_check
-from scvi_codegen.runs.contacts.driver import ContactRun, ContactsOfStepper
 from scvi_codegen.runs.driver.bounded_motion import BoundedMotion
 from scvi_codegen.runs.driver.observation import Observe
 from scvi_codegen.runs.driver.run import Run
@@ -40,6 +39,7 @@ from scvi_codegen.runs.ensembles.ensemble import Ensemble, EnsembleSettings
 from scvi_codegen.runs.ensembles.individual import IndividualRuns, runs_of
 from scvi_codegen.runs.ensembles.lanes import CommonRuns
 from scvi_codegen.runs.ensembles.result import EnsembleTrajectory
+from scvi_codegen.runs.events.contacts import in_first_modes
 from scvi_codegen.runs.events.refinement import WithEventsInDouble, constantly
 from scvi_codegen.runs.forwarding import SteppersAnalysis
 from scvi_codegen.runs.results.dense_output import times_of_run
@@ -50,7 +50,7 @@ from scvi_codegen.runs.states.validation import Array, EnsembleParameters, Param
 from scvi_codegen.runs.states.words import check_doubles, hashed
 from scvi_codegen.runs.stepping.array_interface import RunSizes, interface_of_sizes, shapes_of_call, sizes_of_run
 from scvi_codegen.runs.stepping.compiled_method import Variants
-from scvi_codegen.runs.stepping.features import OPERATIONS, check_together, require
+from scvi_codegen.runs.stepping.features import check_together, require
 from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.projection import consistent, constraint_values, multipliers, projected
 from scvi_codegen.runs.stepping.saving import read_checkpoint
@@ -68,7 +68,7 @@ from scvi_codegen.runs.stepping.step_plan import (
     planned_steps,
 )
 from scvi_codegen.runs.trajectory import Trajectory
-from scvi_codegen.systems.event import Event, EventLike, as_events
+from scvi_codegen.systems.event import Event, EventLike
 from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED
 
 Called = TypeVar("Called", bound=Callable[..., Any])
@@ -80,12 +80,10 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
     _trajectory_type = Trajectory
     _precise: Callable[[], Stepper | None] | None = None
     """Function that returns the stepper in double-double if there is one, for ``error=`` with precision="auto"."""
-    _contacts: ContactsOfStepper | None = None
-    """Contacts of the system, ``None`` without contacts."""
 
     def _copy(self, events: tuple[Event, ...], source: Source | None = None) -> Self:
         copy = super()._copy(events, source)
-        copy._precise, copy._doubles, copy._contacts = self._precise, self._doubles, self._contacts
+        copy._precise, copy._doubles = self._precise, self._doubles
         return copy
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -93,8 +91,7 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
             return (_rebuild_bound, (self.origin, self.problem, self.events))
         variants = self._variants if self._reason is None else Variants()
         made = partial(type(self), variants=variants, flags=self.flags, events=self.events, reason=self._reason)
-        further: dict[str, Any] = {} if self._contacts is None else {"_contacts": self._contacts}
-        further |= {} if self._doubles is None or not self.events else {"_doubles": constantly(self._doubles())}
+        further = {} if self._doubles is None or not self.events else {"_doubles": constantly(self._doubles())}
         return made, (self._plain, self.interface), further
 
     @checks_arguments(StateError)
@@ -193,15 +190,6 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         """
         if type(save_every) is not int or save_every != 1:
             save_every = checked_count(save_every, "save_every", least=1)
-        if self._contacts is not None and not self._contacts.in_piece:
-            control: dict[str, Any] = {"tolerance": tolerance, "absolute_tolerance": absolute_tolerance}
-            control |= {"max_step": max_step, "first_step": first_step, "options": options}
-            self._check_not_of_run(tables, threads)
-            others = {"inputs": inputs, "t_eval": t_eval, "observe": observe, "error": error, "progress": progress}
-            others |= {"action": action or None, "save_every": None if save_every == 1 else save_every}
-            others["check_growth"] = check_growth or None
-            initial = InitialData(q, p, velocity, t, parameters, options)
-            return self._integrate_contacts(initial, events, (h, steps, t_end), control, others)
         stepper = self if events is None and not action else self._for_run(events, action=action)
         interface = self.interface
         if not (inputs is None and t_eval is None and observe is None and tables is None and threads is None):
@@ -242,32 +230,6 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
             output = Output(save_every, times, observe, progress)
         initial = tuple.__new__(InitialData, (q, p, velocity, t, parameters, options))  # without a call of Python
         return stepper._integrated(initial, plan, count, output, segments, check_growth)
-
-    def _integrate_contacts(
-        self,
-        initial: InitialData,
-        events: EventLike | Sequence[EventLike] | None,
-        end: tuple[float | None, int | None, float | None],
-        control: Mapping[str, Any],
-        others: Mapping[str, Any],
-    ) -> Trajectory:
-        """Return a run with contacts to its ``end``, (h, steps, t_end); ``others`` are not supported."""
-        for name in [name for name, value in others.items() if value is not None]:
-            if name in OPERATIONS:
-                require(self, name)
-            raise StateError(f"{name}= is not available with contacts: omit it")
-        (q, p, velocity, t, parameters, _), (h, steps, t_end) = initial, end
-        if (p is None) == (velocity is None):
-            raise neither_or_both(p)
-        t, named = self._states.time(t), self.parameters_by_name(self._parameters(parameters))
-        q0, p0 = self._states.pair(q, self._initial_momenta(q, p, velocity, t, parameters))
-        if t_end is None:
-            if h is None or steps is None:
-                raise StateError("give either h and steps (fixed step size), h and t_end, or t_end (adaptive steps)")
-            t_end = t + h * checked_count(steps, "steps", least=0)
-        plan = {name: value for name, value in control.items() if value is not None}
-        run = ContactRun(self, self.events if events is None else as_events(events), q0, p0, t, named)
-        return cast("Trajectory", run.integrate(plan, checked_number(t_end, "the time t_end"), h))
 
     def _integrated(
         self,
@@ -357,8 +319,6 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         The other arguments are those of :meth:`integrate`.
         """
         self._check_not_of_run(tables, threads)
-        if self._contacts is not None:
-            require(self, "checkpoint")
         initial = InitialData(*self._states.start(q, p, velocity), t, parameters, options)
         control = ErrorControl(tolerance, absolute_tolerance, max_step, first_step)
         return self._started(initial, self._plan(h, t_end, control))
@@ -372,7 +332,9 @@ class Stepper(WithEventsInDouble, SteppersAnalysis, Integrator):
         """Return (q, p), or q and the momenta of a velocity, on the constraints."""
         q, p, velocity, t, parameters, _ = initial
         p = self._initial_momenta(q, p, velocity, t, parameters)
-        if not self.interface.constraints or self._contacts is not None:  # which project the start of each piece
+        if self.interface.contacts:
+            return in_first_modes(self, q, p, t, parameters)
+        if not self.interface.constraints:
             return q, p
         return consistent(self, q, p, t, parameters)
 

@@ -22,9 +22,9 @@ from scvi_codegen.runs.accuracy.global_error import Confirmed, GlobalError
 from scvi_codegen.runs.accuracy.local_error import TOLERABLE_ERROR
 from scvi_codegen.runs.accuracy.resolution import unresolved_parts
 from scvi_codegen.runs.accuracy.size import relative
-from scvi_codegen.runs.contacts.driver import contact_forces, contact_modes
 from scvi_codegen.runs.derivatives.actions import actions_until, shadow_energy
 from scvi_codegen.runs.derivatives.trajectory_derivatives import TrajectoryDerivatives
+from scvi_codegen.runs.events.contacts import contact_forces, contact_modes
 from scvi_codegen.runs.events.refinement import crossings_of
 from scvi_codegen.runs.forwarding import ChaosOfRun, Pictured
 from scvi_codegen.runs.results.dense_output import states_at, times_of_words, within
@@ -41,7 +41,7 @@ from scvi_codegen.runs.results.joining import (
 )
 from scvi_codegen.runs.results.quantities import quantities
 from scvi_codegen.runs.results.recomputation import work_and_impulses_until
-from scvi_codegen.runs.results.saved_states import Array, checked_row
+from scvi_codegen.runs.results.saved_states import Array, ModeHistory, checked_row, in_modes
 from scvi_codegen.runs.states.attitude_history import AttitudeHistory
 from scvi_codegen.runs.states.rotation_quantities import named_quantities
 from scvi_codegen.runs.states.validation import columns_of_inputs
@@ -79,6 +79,7 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
         options: convergence criterion of the solver, ``None`` for the defaults.
         events: zero crossings found, parallel to ``stepper.events``.
         switches: changes of the side of each kink, in the order of ``stepper.interface.modes``.
+        modes: values of the parameters that are modes of contacts and kinks, ``None`` without them.
         plan: step sizes and target time of the run.
         steps, rejected_steps: numbers of completed and of rejected steps since the start of the run.
         fallback_steps: number of completed steps that the iteration did not solve, but its fallback, Newton's method.
@@ -98,6 +99,7 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
     iterations: NDArray[np.int32]
     events: tuple[Crossings, ...] = ()
     switches: tuple[Switches, ...] = ()
+    modes: ModeHistory | None = None
     rejected_steps: int = 0
     fallback_steps: int = 0
     confirmation: GlobalError | None = field(default=None, repr=False)
@@ -314,20 +316,16 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
         Raises:
             MethodError: if the system has no constraints.
         """
-        return self._joined(lambda piece: multipliers(piece.stepper, piece.q, piece.p, piece.t, piece.parameters))
+        return self._joined(lambda piece: in_modes(piece, partial(multipliers, piece.stepper)))
 
     @property
     def contact_modes(self) -> list[tuple[float, tuple[str, ...]]]:
         """Times from which contacts have modes, ``"open"``, ``"stick"`` or ``"slip"`` of each, with these modes."""
-        modes: list[tuple[float, tuple[str, ...]]] = []
-        for run in self._runs:
-            names = contact_modes(run)
-            if not modes or modes[-1][1] != names:
-                modes.append((float(run.t[0]), names))
-        return modes
+        changes = [change for run in self._runs for change in contact_modes(run)]
+        return [change for k, change in enumerate(changes) if not k or change[1] != changes[k - 1][1]]
 
     def contact_forces(self) -> Array:
-        """Return (n, k, 2) normal and tangential forces of the k contacts; at a transition those before it.
+        """Return (n, k, 2) normal and tangential forces of the k contacts; at a transition those after it.
 
         Raises:
             MethodError: if the system has no contacts.
@@ -336,9 +334,10 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
 
     def constraint_values(self) -> tuple[Array, Array]:
         """Return (n, c) constraint residuals and (n, c) rates at the states, zero up to rounding."""
-        values = [constraint_values(run.stepper, run.q, run.p, run.t, run.parameters) for run in self._runs]
-        g, rate = (concatenated(part) for part in zip(*values, strict=True))
-        return g, rate
+        values = self._joined(
+            lambda run: in_modes(run, lambda *of: constraint_values(run.stepper, *of).swapaxes(0, 1))
+        )
+        return values[:, 0], values[:, 1]
 
     def states(self, units: Mapping[str, str] | None = None) -> States:
         """Return the states for :mod:`scvi_codegen.runs.results.export`."""

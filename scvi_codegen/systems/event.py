@@ -195,6 +195,24 @@ class Kink(Event):
         return True
 
 
+@dataclass(frozen=True, slots=True)
+class Transition(Event):
+    """End of a mode of a contact, where the run chooses the next modes.
+
+    Attributes:
+        contact: number of the contact, from 0.
+        kind: ``"closes"``, ``"lifts"``, ``"stops"``, and of slip that begins ``"forward"`` or ``"backward"``.
+    """
+
+    contact: int = field(kw_only=True)
+    kind: str = field(kw_only=True)
+
+    @property
+    def changes_state(self) -> bool:
+        """True: momenta change at impacts, and constraints with the mode."""
+        return True
+
+
 def _is_text(value: Any) -> bool:
     return all(map(_is_text, value)) if isinstance(value, tuple) else isinstance(value, str | int | float | None)
 

@@ -218,7 +218,7 @@ class _Model:
     ) -> _Model:
         """Construct from validated arguments of :func:`fit`."""
         stepper, m = measurements.stepper, measurements.stepper.dimension
-        modes = {stepper.parameters.index(mode) for mode, _ in stepper.interface.modes}
+        modes = {stepper.parameters.index(mode) for mode in stepper.interface.mode_names}
         fixed = modes.union(columns_of_inputs(stepper.interface))
         estimable = [name for k, name in enumerate(stepper.parameters) if k not in fixed]
         estimated = tuple(estimable) if unknown is None else distinct(unknown, "unknown")

@@ -40,7 +40,8 @@ from scvi_codegen.codegen.rendering.source import Interface, Source
 from scvi_codegen.common.errors import EventError, ScviCodegenError, SystemDefinitionError, closest
 from scvi_codegen.common.precision import mp
 from scvi_codegen.methods.tables.nodes import chebyshev_lobatto, to_unit
-from scvi_codegen.systems.event import Kink
+from scvi_codegen.systems.contacts.modes import ContactRows
+from scvi_codegen.systems.event import Kink, Transition
 from scvi_codegen.systems.formulas.array_statements import (
     EntryRules,
     entry_names,
@@ -345,8 +346,18 @@ def _search(interface: Interface, events: tuple[SearchedEvent, ...], *, controll
         changed=tuple(index for indices, _ in formulas.changes for index in indices),
         first_values=(0, *accumulate(len(values) for _, values in formulas.changes)),
         parameters=len(interface.parameters),
-        modes=tuple(interface.parameters.index(event.mode) for event in events if isinstance(event, Kink)),
+        modes=len(interface.mode_names),
+        kinks=sum(isinstance(event, Kink) for event in events),
+        contacts=tuple(_places(interface, contact) for contact in interface.contacts),
+        transitions=tuple((event.contact, event.kind) for event in events if isinstance(event, Transition)),
     )
+
+
+def _places(interface: Interface, contact: ContactRows) -> tuple[int, ...]:
+    """Return the rows of a contact, and its masks among the modes; -1 for what it does not have."""
+    rows = (-1 if row is None else row for row in (contact.normal, contact.tangential))
+    masks = (contact.closed, contact.sticks, contact.direction)
+    return *rows, *(-1 if name is None else interface.mode_names.index(name) for name in masks)
 
 
 def _kind_in_time(g: Expr, moving: Iterable[Symbol]) -> int:

@@ -165,7 +165,11 @@ class EventSearch:
         changed: index among (q, p, v) of the variable of each value of the changes.
         first_values: index of the first value of each function, and the number of values.
         parameters: number of parameters.
-        modes: index of the parameter that is the mode of each kink; kinks are the last events.
+        modes: number of the last parameters that are modes of contacts and of kinks.
+        kinks: number of kinks, which are the last events.
+        contacts: normal and tangential row of each contact, and its closed, sticks and direction among the modes, -1 of
+            what it does not have.
+        transitions: contact and kind of each of their transitions, the events before the kinks.
         elements: number of functions of each event, one for each element of its loops.
         ENTRY: name of the entry templates.
     """
@@ -190,7 +194,10 @@ class EventSearch:
     first_values: tuple[int, ...] = ()
     elements: tuple[int, ...] = ()
     parameters: int = 0
-    modes: tuple[int, ...] = ()
+    modes: int = 0
+    kinks: int = 0
+    contacts: tuple[tuple[int, ...], ...] = ()
+    transitions: tuple[tuple[int, str], ...] = ()
     ENTRY: ClassVar[str] = "events"
 
     @property

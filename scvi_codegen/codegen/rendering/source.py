@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 from scvi_codegen.codegen.rendering.own_names import with_exported_names, with_own_names
 from scvi_codegen.codegen.rendering.preprocessor import preprocessed
 from scvi_codegen.codegen.rendering.reachable import readable
+from scvi_codegen.systems.contacts.modes import ContactRows
 from scvi_codegen.systems.formulas.indices import Access, ArrayDeclarations, ArrayMap, Loop
 from scvi_codegen.version import __version__
 
@@ -34,6 +35,7 @@ KINDS: dict[str, Callable[[Any], bool]] = {
     "tuple[float, ...]": lambda value: isinstance(value, tuple) and all(map(_is_number, value)),
     "tuple[tuple[str, ...], ...]": lambda value: isinstance(value, tuple) and all(map(KINDS["tuple[str, ...]"], value)),
     "ArrayLayout": lambda value: False,
+    "tuple[ContactRows, ...]": lambda value: value == (),
     "Sizes | None": lambda value: value is None or isinstance(value, Sizes),
     "LaneContents | None": lambda value: value is None or isinstance(value, LaneContents),
 }
@@ -373,7 +375,8 @@ class Interface:
         words: number of doubles of each number of a state, 2 in double-double arithmetic.
         kinks: functions at whose zeros the equations are not smooth, for events.
         modes: parameter and switching function of each kink that runs locate
-            (:mod:`scvi_codegen.systems.kinks`); these parameters are the last ones.
+            (:mod:`scvi_codegen.systems.kinks`).
+        contacts: places of each contact (:mod:`scvi_codegen.systems.contacts.modes`).
     """
 
     prefix: str
@@ -412,6 +415,12 @@ class Interface:
     words: int = 1
     kinks: tuple[str, ...] = ()
     modes: tuple[tuple[str, ...], ...] = ()
+    contacts: tuple[ContactRows, ...] = ()
+
+    @property
+    def mode_names(self) -> tuple[str, ...]:
+        """Names of the parameters that runs change: modes of contacts and of kinks; they are the last ones."""
+        return tuple(name for contact in self.contacts for name in contact.masks) + tuple(name for name, _ in self.modes)
 
     @property
     def in_tau(self) -> bool:

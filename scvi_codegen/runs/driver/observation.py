@@ -340,6 +340,7 @@ class Observation:
         self.arrived = self.end is not None and t[-1] == self.end
         part = trajectory_of(run, (t, run.stepper.named(q), run.stepper.named(p), iterations), sizes)
         part.switches = self.search.switches(self.search.recorded[-1:])
+        part.modes = self.search.modes(self.search.recorded[-1:])
         return part, numbers, failure
 
     def _arrived(self, part: Trajectory, before: bytes) -> Trajectory:
@@ -439,5 +440,7 @@ class Observation:
         tau = stepped if self.run.stepper.in_tau else None
         steps = self.run.steps + (self.partial_steps if self.arrived else 0)
         made = trajectory_of(self.run, (t, q, p, iterations), lengths, steps=steps, events=crossings, tau=tau)
-        made.switches = self.search.switches(self.search.recorded) if self.search is not None else ()
+        if self.search is not None:
+            made.switches = self.search.switches(self.search.recorded)
+            made.modes = self.search.modes(self.search.recorded)
         return made

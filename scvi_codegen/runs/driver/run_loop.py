@@ -327,7 +327,7 @@ def plain_trajectory(
         trajectory.step_error = trajectory.worst_step_time = math.nan
     trajectory.parameters = memory._parameters.copy()
     trajectory.events = trajectory.switches = trajectory.pieces = ()
-    trajectory.tau = trajectory.confirmation = trajectory.observed = trajectory.conserved = None
+    trajectory.modes = trajectory.tau = trajectory.confirmation = trajectory.observed = trajectory.conserved = None
     return trajectory
 
 

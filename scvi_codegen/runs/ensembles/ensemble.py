@@ -76,7 +76,7 @@ class EnsembleSettings:
             require(stepper, "observe_ensemble")
         if self.device is not None:
             require(stepper, "device")
-        if stepper.interface.modes and self.observe is not None:
+        if stepper.interface.mode_names and self.observe is not None:
             raise StateError(
                 f"observe= of ensembles of '{stepper.interface.system}' is not available, as its runs locate kinks: "
                 'compile it with kinks="as formulas", or pass no observe='

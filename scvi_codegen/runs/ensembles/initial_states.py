@@ -10,6 +10,7 @@ from scvi_codegen.common.errors import StateError
 from scvi_codegen.runs.states.validation import Array, EnsembleParameters, States, check_inputs_given
 from scvi_codegen.runs.states.words import stacked
 from scvi_codegen.runs.stepping.integrator import Integrator
+from scvi_codegen.runs.events.contacts import in_first_modes
 from scvi_codegen.runs.stepping.projection import make_consistent
 from scvi_codegen.runs.stepping.state_functions import neither_or_both
 
@@ -61,5 +62,9 @@ def start_of_ensemble(
     if stepper.interface.constraints:
         if stepper.interface.words == 1:
             positions, momenta = (np.ascontiguousarray(each) for each in (positions, momenta))
-        make_consistent(stepper, positions, momenta, t, values)
+        if stepper.interface.contacts:
+            for k, start in enumerate(zip(positions.copy(), momenta.copy(), values, strict=True)):
+                positions[k], momenta[k] = in_first_modes(stepper, *start[:2], t, start[2])
+        else:
+            make_consistent(stepper, positions, momenta, t, values)
     return positions, momenta, values

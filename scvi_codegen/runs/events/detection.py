@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from scvi_codegen.codegen.native.options import step_failure
 from scvi_codegen.common.errors import EventError, EventWarning, warn
-from scvi_codegen.runs.results.saved_states import Array, SavedStates
+from scvi_codegen.runs.events.contacts import refusal_of, warn_of_choices
+from scvi_codegen.runs.results.saved_states import Array, ModeHistory, SavedStates
 from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.step_plan import Fixed
 from scvi_codegen.systems.event import (
@@ -26,6 +27,7 @@ from scvi_codegen.systems.event import (
     Event,
     Kink,
     Switches,
+    Transition,
 )
 
 if TYPE_CHECKING:
@@ -142,7 +144,7 @@ class CrossingSearch:
         before, self._bytes = self._bytes, self._bytes + records.nbytes
         self.recorded.append(records)
         if self._bytes > MOST_BYTES:
-            kept = {"t", "function", "direction", "element"}
+            kept = {"t", "function", "direction", "element", "acted", "mode"}
             names: Any = [name for name in records.dtype.names or () if name in kept]
             self.recorded = [
                 records[names].copy() if records.dtype.names != (*names,) else records for records in self.recorded
@@ -155,6 +157,8 @@ class CrossingSearch:
             )
 
     def _failure(self, status: int, report: Any, step: int, h: float) -> Exception:
+        if refusal := refusal_of(self.watch, report.t):
+            return refusal
         behind = getattr(self.watch, "behind", 0.0)
         through = BEHIND if behind < 0.0 else THROUGH
         undefined = UNDEFINED_CHANGE if getattr(self.watch, "undefined", 0) < 0 else UNDEFINED
@@ -166,13 +170,14 @@ class CrossingSearch:
                 event = self.stepper.searched[abs(number) - 1]
                 function, message = (
                     event.function,
-                    PASSED if message is THROUGH and isinstance(event, Kink) else message,
+                    PASSED if message is THROUGH and isinstance(event, Kink | Transition) else message,
                 )
                 return EventError(message.format(function=function, t=report.t, g=behind))
         return step_failure(status, report, step=step, h=h, failures=self.binding.failures)
 
     def warn_of_accumulation(self) -> None:
-        """Issue a :class:`EventWarning` if the run ended where crossings accumulate."""
+        """Issue a :class:`EventWarning` if the run ended where crossings accumulate, and for choices of contacts."""
+        warn_of_choices(self.watch)
         if self.changes and self.watch.accumulated:
             function, t = self.stepper.searched[self.watch.accumulated - 1].function, self.last[0]
             warn(
@@ -187,18 +192,27 @@ class CrossingSearch:
 
     def switches(self, recorded: Sequence[NDArray[Any]]) -> tuple[Switches, ...]:
         """Return the changes of the side of each kink among some of the records."""
-        events = self.stepper.events
-        if not self.stepper.interface.modes:
+        kinks = len(self.stepper.interface.modes)
+        if not kinks:
             return ()
         records = self._joined(recorded)
         records = records[records["direction"] != 0]  # without touches, which keep their side
-        crossings = self._by_event(self.stepper.searched, records)[len(events) :]
-        numbers = range(len(events), len(self.stepper.searched))
+        crossings = self._by_event(self.stepper.searched, records)[-kinks:]
+        numbers = range(len(self.stepper.searched) - kinks, len(self.stepper.searched))
         sides = [records["direction"][records["function"] == number].astype(np.int64) for number in numbers]
         return tuple(
             Switches(event=of.event, t=of.t, q=of.q, p=of.p, element=of.element, side=side)
             for of, side in zip(crossings, sides, strict=True)
         )
+
+    def modes(self, recorded: Sequence[NDArray[Any]]) -> ModeHistory | None:
+        """Return the modes of contacts and kinks along some of the records, the last of which are the latest."""
+        if not (self.changes and self.stepper.interface.mode_names):
+            return None
+        records = self._joined(recorded)
+        records = records[records["acted"] != 0]
+        latest = np.array(list(self.watch.mode))
+        return ModeHistory(records["t"], np.concatenate([records["mode"], latest[np.newaxis]]))
 
     def _joined(self, recorded: Sequence[NDArray[Any]]) -> Any:
         none = self.binding.records(self.binding.new("crossing[1]"), 0)

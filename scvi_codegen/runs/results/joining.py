@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.runs.results.saved_states import Array
+from scvi_codegen.runs.results.saved_states import Array, ModeHistory
 from scvi_codegen.systems.event import Crossings
 
 Number = TypeVar("Number", bound=np.generic)
@@ -32,6 +32,7 @@ def joined(pieces: Sequence[Result]) -> Result:
         actions=accumulated([piece.actions for piece in every]),
         events=tuple(map(joined_crossings, zip(*(piece.events for piece in every), strict=True))),
         switches=tuple(map(joined_crossings, zip(*(piece.switches for piece in every), strict=True))),
+        modes=None if first.modes is None else ModeHistory.joined([piece.modes for piece in every]),
         pieces=tuple(pieces),
     )
     return whole

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -83,19 +84,49 @@ class SavedStates:
         return Memory.started(self.stepper, self.q[k], self.p[k], plan=Fixed(h), t=scalar(self.t[k]), **settings)
 
 
-SIDE = 2.0**1000
-"""Size of the mode of a kink that decides its side, as in ``kinks.h``."""
+@dataclass(frozen=True, slots=True, eq=False)
+class ModeHistory:
+    """Modes of contacts and kinks along a run.
+
+    Attributes:
+        t: (k,) times of changes, in the order of the run.
+        values: (k + 1, modes) values of the last parameters before the first change and after each.
+    """
+
+    t: Array
+    values: Array
+
+    def at(self, t: float, forward: float) -> Array:
+        """Return (modes,) values after time t; ``forward`` is -1 for a run backward in time."""
+        changes = int(np.searchsorted(forward * self.t, forward * t, side="right"))
+        return np.asarray(self.values[changes])
+
+    @classmethod
+    def joined(cls, histories: Sequence[ModeHistory]) -> ModeHistory:
+        """Return the history of consecutive parts of a run."""
+        values = [*(part.values[:-1] for part in histories), histories[-1].values[-1:]]
+        return cls(np.concatenate([part.t for part in histories]), np.concatenate(values))
 
 
 def parameters_on_sides(states: SavedStates, t: float) -> Array:
-    """Return the parameters of the steps after time t, with the sides of the kinks that the run passed."""
-    switches = getattr(states, "switches", ())
-    if not any(map(len, switches)):
+    """Return the parameters of the steps after time t, with the modes of contacts and kinks in the run."""
+    modes = getattr(states, "modes", None)
+    if modes is None:
         return states.parameters
     parameters = states.parameters.copy()
-    sides = parameters[len(parameters) - len(switches) :]
-    for k, kink in enumerate(switches):
-        if len(kink):
-            passed = int(np.searchsorted(states.forward * kink.t, states.forward * t, side="right"))
-            sides[k] = SIDE * (kink.side[passed - 1] if passed else -kink.side[0])
+    parameters[len(parameters) - modes.values.shape[1] :] = modes.at(t, states.forward)
     return parameters
+
+
+def in_modes(states: SavedStates, quantity: Callable[[Any, Any, Any, Array], Array]) -> Array:
+    """Return a (n, ..) quantity of (q, p, t, parameters), with the modes after each state."""
+    modes = getattr(states, "modes", None)
+    if modes is None or not len(modes.t):
+        return quantity(states.q, states.p, states.t, parameters_on_sides(states, float(states.t[-1])))
+    rows = np.searchsorted(states.forward * modes.t, states.forward * states.t, side="right")
+    parts = [np.flatnonzero(rows == number) for number in np.unique(rows)]
+    values = [
+        quantity(states.q[part], states.p[part], states.t[part], parameters_on_sides(states, float(states.t[part[0]])))
+        for part in parts
+    ]
+    return np.concatenate(values)

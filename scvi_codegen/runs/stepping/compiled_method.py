@@ -25,7 +25,7 @@ from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepping.array_binding import ArrayBinding, EventBinding
 from scvi_codegen.runs.stepping.array_interface import RunSizes, check_few_coordinates
 from scvi_codegen.runs.stepping.features import Support, check_features, require
-from scvi_codegen.systems.event import Event, EventLike, Kink, as_events
+from scvi_codegen.systems.event import Event, EventLike, Kink, Transition, as_events
 
 MOST_EVENT_SETS = 16
 """Number of event sets whose compiled integrators are cached, so that repeated calls do not parse formulas again."""
@@ -83,8 +83,8 @@ class CompiledMethod:
         source: the C source it was compiled from; ``None`` of arrays that are compiled with the sizes of each call.
         fallback: source with Newton's iteration, if the main source contains only the fixed-point iteration.
         events: events that every run records.
-        searched: functions whose zeros every run locates: of the events, and of the kinks of the system.
-        divides_steps: whether steps end at zeros: of events that change the state, and of kinks.
+        searched: functions whose zeros every run locates: of the events, the contacts and the kinks of the system.
+        divides_steps: whether steps end at zeros: of events that change the state, transitions and kinks.
         changes_states: whether an event changes the states of runs.
         in_tau: whether the system is one in transformed time, whose steps are steps of tau.
         run_time_sizes: whether the sizes of its arrays are those of each call; the stepper is bound to them, or
@@ -109,10 +109,15 @@ class CompiledMethod:
     ) -> None:
         self.interface, self.flags, self.events = interface, flags, events
         self.in_tau = interface.in_tau
+        transitions = (
+            Transition(function, -1, contact=number, kind=kind)
+            for number, contact in enumerate(interface.contacts)
+            for kind, function in contact.transitions
+        )
         kinks = (Kink(function, mode=mode) for mode, function in interface.modes)
-        self.searched: tuple[Event, ...] = (*events, *kinks)
+        self.searched: tuple[Event, ...] = (*events, *transitions, *kinks)
         self.changes_states = any(event.changes_state for event in events)
-        self.divides_steps = self.changes_states or bool(interface.modes)
+        self.divides_steps = self.changes_states or bool(interface.mode_names)
         self.origin, self.problem, self._of_sizes, self._reason = origin, problem, of_sizes, reason
         self._variants = Variants() if variants is None else variants
         self._event_variants: dict[tuple[Event, ...], Self] = {}

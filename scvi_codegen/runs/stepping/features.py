@@ -138,9 +138,8 @@ FEATURES = {
         ),
         (
             "with contacts",
-            "error check_growth t_eval observe inputs ensembles ensemble_events device observe_ensemble checkpoint "
-            f"recording {_DERIVATIVES} hessian advice",
-            "use integrate(q, velocity=.., h=.., t_end=..) or without h, and run.at(t)",
+            f"error check_growth device observe_ensemble {_DERIVATIVES} hessian advice",
+            "use runs and ensembles with h, or with t_end and a tolerance, without it",
         ),
         ("with constraints", "device observe_ensemble", "use coordinates without constraints, or omit it"),
         ("with constraints", "periodic_orbit fit", "use coordinates without constraints, such as the angles of rods"),

@@ -369,6 +369,8 @@ class Memory:
         """Set parameter values; raise ``StateError`` if position constraints jump."""
         if self.stepper.interface.constraints:
             check_reachable(self.stepper, self.q, self.p, self.t, values)
+        if self.stepper.interface.contacts and self._watch is not None:
+            self._watch.begun = 0  # forces may jump: the modes follow from the state
         self._parameters[:] = values
         self._has_defaults = False
         if self.stepper.interface.solver == "explicit":

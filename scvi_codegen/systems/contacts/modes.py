@@ -1,7 +1,7 @@
 """Constraints, forces and transitions of contacts in all their modes, for one compiled step.
 
 Masks of the modes multiply the rows of constraints (:class:`~scvi_codegen.systems.constraints.kind.Reaction`);
-transitions are terminal events, whose functions are 1 in modes that they do not end.
+the functions of transitions are 1 in modes that they do not end. Runs choose the modes (``support/run/contacts.h``).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.systems.contact import Contact, ContactLike, Friction, static_limit
-from scvi_codegen.systems.event import Event, Formula
+from scvi_codegen.systems.event import Formula
 
 if TYPE_CHECKING:
     from sympy import Expr, Symbol
@@ -26,6 +26,7 @@ class ContactRows(NamedTuple):
     Attributes:
         normal, tangential: numbers of its rows among the masked constraints.
         closed, sticks, direction: names of the parameters of its mode.
+        transitions: kinds and functions of its transitions (:class:`~scvi_codegen.systems.event.Transition`).
     """
 
     normal: int | None
@@ -33,6 +34,12 @@ class ContactRows(NamedTuple):
     closed: str | None
     sticks: str | None
     direction: str | None
+    transitions: tuple[tuple[str, str], ...]
+
+    @property
+    def masks(self) -> tuple[str, ...]:
+        """Names of the parameters of its mode."""
+        return tuple(name for name in (self.closed, self.sticks, self.direction) if name is not None)
 
 
 class BoundContacts(NamedTuple):
@@ -41,12 +48,10 @@ class BoundContacts(NamedTuple):
     Attributes:
         system: with masked constraints and, as ``contacts``, the formulas as expressions.
         rows: places of each contact.
-        events: transitions, in the order of the contacts: gap, normal force; slip, and friction at either limit.
     """
 
     system: LagrangianSystem
     rows: tuple[ContactRows, ...]
-    events: tuple[Event, ...]
 
 
 def bound_contacts(system: Any, contacts: Sequence[ContactLike]) -> BoundContacts:
@@ -82,7 +87,6 @@ class _Binding:
         self.constraints: list[Expr] = []
         self.reactions: list[Any] = []
         self.forces = [*(system.forces or (sympy.S.Zero,) * system.dimension)]
-        self.events: list[Event] = []
 
     def bound(self, contacts: Sequence[ContactLike]) -> BoundContacts:
         """Return the system with these contacts."""
@@ -102,7 +106,7 @@ class _Binding:
             reactions=tuple(self.reactions),
             contacts=tuple(expressions),
         )
-        return BoundContacts(system, tuple(rows), tuple(self.events))
+        return BoundContacts(system, tuple(rows))
 
     def _read(self, formula: Formula | None, role: str, item: ContactLike) -> Expr | None:
         from scvi_codegen.systems.formulas.grammar import parse_expression
@@ -161,13 +165,14 @@ class _Binding:
         sticks = None if slip is None else self._mask(number, "sticks")
         direction = None if slip is None else self._mask(number, "direction")
         normal = tangential = None
+        transitions: dict[str, Expr] = {}
         if of_gap:
             force = self._gradient(item, item.gap, q, "gap")
             if along is not None:
                 force = [a - item.friction * direction * b for a, b in zip(force, along, strict=True)]
             normal = self._row(item.gap, cast("Symbol", closed), force)
             pushes = closed * self._multiplier(normal) + 1 - closed
-            self.events += [Event(item.gap + closed, -1, terminal=True), Event(pushes, -1, terminal=True)]
+            transitions |= {"closes": item.gap + closed, "lifts": pushes}
         elif along is not None:
             pairs = zip(self.forces, along, strict=True)
             self.forces = [force - item.limit * direction * b for force, b in pairs]
@@ -175,9 +180,9 @@ class _Binding:
             tangential = self._row(slip, cast("Symbol", sticks), along)
             held = self._multiplier(normal) * static_limit(item) if normal is not None else static_limit(item)
             tau = self._multiplier(tangential)
-            self.events += [
-                Event(direction * slip + 1 - cast("Symbol", direction) ** 2, -1, terminal=True),
-                *(Event(sticks * (held - sign * tau) + 1 - sticks, -1, terminal=True) for sign in (1, -1)),
-            ]
+            transitions["stops"] = direction * slip + 1 - cast("Symbol", direction) ** 2
+            transitions["backward"] = sticks * (held - tau) + 1 - sticks  # slip begins against the force
+            transitions["forward"] = sticks * (held + tau) + 1 - sticks
         names = (x and x.name for x in (closed, sticks, direction))
-        return ContactRows(normal, tangential, *names)
+        functions = tuple((kind, self.system.text_of(function)) for kind, function in transitions.items())
+        return ContactRows(normal, tangential, *names, functions)

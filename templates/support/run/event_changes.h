@@ -1,6 +1,9 @@
 #include "events.h"
 #include "impacts.h"
 #include "kinks.h"
+#ifdef EVENT_CONTACTS
+#include "contacts.h"
+#endif
 
 /* Runs whose events change the state: impacts, impulses, switches.
  *
@@ -15,6 +18,7 @@ enum {
 
 #define CHANGE_WHOLE 1e-9 /* relative to a step: a difference of its end from t_end that is rounding */
 #define CHANGE_RATIO 1e-3 /* relative spread of the ratios of intervals that accumulate */
+#define CHANGE_REST 1e-8 /* relative to the time since the first of them: remaining time at which a contact closes */
 #define CHANGE_END 1e-6 /* relative to a step: remaining time at which an accumulation ends the run */
 
 /* Records the interval since the last hit. If the last intervals decrease geometrically and the remaining ones are
@@ -29,6 +33,9 @@ static void note_hit(const event_step *step, event_crossing *crossing, real t)
   memmove(gaps, gaps + 1, sizeof(real) * (CHANGE_GAPS - 1));
   last = gaps[CHANGE_GAPS - 1] = fabs(watch->time - history->last);
   history->last = watch->time;
+#ifdef EVENT_CONTACTS
+  history->since = history->hits > 0 ? history->since : watch->time;
+#endif
   history->hits += history->hits <= CHANGE_GAPS;
   for (int k = 1; k < CHANGE_GAPS; k++) {
     ratio = gaps[k] / gaps[k - 1];
@@ -36,9 +43,18 @@ static void note_hit(const event_step *step, event_crossing *crossing, real t)
     high = fmax(high, ratio);
   }
   watch->end = t + (step->h < 0.0 ? -1.0 : 1.0) * (ratio < 1.0 ? last * ratio / (1.0 - ratio) : 0.0);
-  if (history->hits > CHANGE_GAPS && high < 1.0 &&
-      high - low <= CHANGE_RATIO * ratio + 50.0 * DBL_EPSILON * fabs(t) / last + history->rounding / last &&
-      last * ratio / (1.0 - ratio) < CHANGE_END * fabs(step->whole)) {
+  if (history->hits <= CHANGE_GAPS || high >= 1.0 ||
+      high - low > CHANGE_RATIO * ratio + 50.0 * DBL_EPSILON * fabs(t) / last + history->rounding / last)
+    return;
+#ifdef EVENT_CONTACTS
+  if (is_transition(crossing->function) && TRANSITION[crossing->function - FIRST_TRANSITION][1] == CONTACT_CLOSES) {
+    const int rests = last * ratio / (1.0 - ratio) < CHANGE_REST * fabs(watch->time - history->since);
+    watch->accumulates[TRANSITION[crossing->function - FIRST_TRANSITION][0]] = rests;
+    history->hits *= !rests;
+    return;
+  }
+#endif
+  if (last * ratio / (1.0 - ratio) < CHANGE_END * fabs(step->whole)) {
     watch->accumulated = crossing->function + 1;
     watch->ended = 1;
   }
@@ -110,11 +126,23 @@ static int may_be_touched(const event_step *step, int e)
   return fabs(value) <= 0x1p-20 * range + 0x1p26 * values_at(step, EVENT_DEGREE + 2)[e];
 }
 
-/* Notes the rounding of the function of a kink at its zero: that of its change in the step. */
-static void note_rounding(const event_step *step, int e, const event_sample *at)
+/* Notes the rounding of a function at its zero: that of its change in the step. */
+static int note_rounding(const event_step *step, int e, event_sample *at)
 {
   const real change = fmax(fabs(values_at(step, 0)[e]), fabs(values_at(step, EVENT_DEGREE)[e]));
+  const int status = evaluate_function(step, e, at);
   step->watch->history[e].slack = fmax(fabs(at->g), EVENT_AT_ZERO * change);
+  return status;
+}
+
+/* Whether the zeros of an event end a mode, and do not change the state themselves. */
+static int ends_mode(int event)
+{
+#ifdef EVENT_CONTACTS
+  if (is_transition(event))
+    return 1;
+#endif
+  return is_kink(event);
 }
 
 /* Changes the state at the crossings from `first` on, which have one state, then at all walls that it touches within
@@ -127,8 +155,11 @@ static int change_at_crossings(const event_step *step, long long first, event_sa
   real rate, *const v = step->memory + 3 * M;
   for (long long i = first; status == OK && i < last; i++)
     if (step->watch->acts[step->found[i].function]) {
-      if (is_kink(step->found[i].function))
-        note_rounding(step, FUNCTION_OF(step->found + i), at);
+#ifdef EVENT_MODES
+      memcpy(step->found[i].mode, step->watch->mode, BYTES(EVENT_MODES));
+#endif
+      if (ends_mode(step->found[i].function))
+        status = note_rounding(step, FUNCTION_OF(step->found + i), at);
       else
         status = change_state(step, FUNCTION_OF(step->found + i), at);
       note_hit(step, step->found + i, at->t);
@@ -303,6 +334,10 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
       if (status == OK)
         status = check_sides(step, &right);
 #endif
+#ifdef EVENT_CONTACTS
+      if (status == OK)
+        status = check_gaps(step, &right);
+#endif
       return status == OK ? store_state(to, &right, length, iterations, run->step, step->report) : status;
     }
     if (status == OK && EVENTS > EVENT_FEW && !step->rounding_known) {
@@ -315,6 +350,10 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
 #ifdef EVENT_KINKS
     if (status == OK)
       status = change_sides(step, group, &at);
+#endif
+#ifdef EVENT_CONTACTS
+    if (status == OK)
+      status = change_contacts(step, group, &at);
 #endif
     ends = fabs(length) <= CHANGE_SAFETY * DBL_EPSILON * fabs(step->whole);
     if (status == OK)
@@ -331,7 +370,7 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
         run->t_low = 0.0;
       }
       set_run(run, ends ? run->t : at.t, &at);
-#if defined(EVENT_KINKS) && EVENTS_CONTROLLED
+#if defined(EVENT_MODES) && EVENTS_CONTROLLED
       if (adaptive) { /* the next step is found and compared as the first one */
         run->error_before = 0.0;
         run->steps_to_compare = 1;
@@ -349,6 +388,34 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
   }
   return status;
 }
+
+#ifdef EVENT_CONTACTS
+/* First modes of contacts of a run; gaps are measured by their change in a duration. */
+static int begin_run(event_run *run, event_step *step, real duration)
+{
+  event_sample at = {.t = run->t, .q = step->memory + 9 * M, .p = step->memory + 10 * M};
+  int status;
+  copy_state(at.q, at.p, run->q, run->p);
+  step->whole = step->h = duration;
+  status = begin_contacts(step, &at);
+  if (status == OK && (memcmp(at.q, run->q, BYTES(M)) != 0 || memcmp(at.p, run->p, BYTES(M)) != 0))
+    set_run(run, run->t, &at);
+  return status;
+}
+
+int NAME(begin_contacts)(event_watch *watch, real t, real duration, real *q, real *p, const real *parameters,
+    real *workspace)
+{
+  EVENT_MEMORY(watch, memory, 15 * M + CHANGE_VALUES)
+  real own[PARAMETERS];
+  event_sample at = {.t = t, .q = q, .p = p}, horizon = {.q = memory + 7 * M, .p = memory + 8 * M};
+  solver_report report = {0};
+  const event_step step = {t, duration, duration, q, p, own, NULL, watch, NULL, 0, NULL, &report, workspace, memory,
+      memory + 15 * M, 0, &horizon, own};
+  memcpy(own, parameters, BYTES(PARAMETERS));
+  return begin_contacts(&step, &at);
+}
+#endif
 
 /* One step of a run: adaptive, or without `control` of its h. */
 static int advance_run(event_run *run, real t_end, const step_control *control, const event_step *step, int *iterations,
@@ -400,9 +467,10 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
     solver_report *report, real *workspace)
 {
   EVENT_MEMORY(watch, memory, 15 * M + CHANGE_VALUES)
-#ifdef EVENT_KINKS
+#ifdef EVENT_MODES
   real own[PARAMETERS];
   memcpy(own, parameters, BYTES(PARAMETERS));
+  memcpy(own + FIRST_MODE, watch->mode, BYTES(EVENT_MODES));
   parameters = own;
 #else
   real *const own = NULL;
@@ -421,12 +489,18 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
         memory, memory + 15 * M, 0, &horizon, own};
     real size;
     int count = 0;
+#ifdef EVENT_CONTACTS
+    if (!watch->begun)
+      status = begin_run(run, &step, control ? (t_end - run->t) / CONTACT_STEPS : run->h);
+    memcpy(own + FIRST_MODE, watch->mode, BYTES(EVENT_MODES));
+#endif
     keep_run(&before, run, step.values + (long long)EVENT_VALUES * EVENTS);
 #ifdef EVENT_KINKS
     event_sample start = {.t = run->t, .q = before.q, .p = before.p};
-    int unknown;
+    int unknown = 0;
     step.h = control ? t_end - run->t : run->h; /* whose direction counts */
-    status = settle_sides(&step, &start, &unknown);
+    if (status == OK)
+      status = settle_sides(&step, &start, &unknown);
     size = run->h;
     if (status == OK && unknown && control)
       status = take_step(run, t_end, control, &step, &size, &count);
@@ -434,8 +508,8 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
       status = sides_after_start(&step, &start, size);
     if (unknown)
       copy_run(run, &before);
-    if (status == OK)
 #endif
+    if (status == OK)
       status = take_step(run, t_end, control, &step, &size, &count);
     if (status == OK)
       status = change_in_step(&before, run, &step, control != NULL, size, count, &to);

@@ -36,13 +36,14 @@ enum {
 #define JUST_CHANGED(watch, e) 0
 #define RESIDUAL(watch, e) 0.0
 #endif
+#define SIDE_OF(watch, kink) ((watch)->mode[FIRST_SIDE + (kink)])
 #define FUNCTION_OF(crossing) ((int)(EVENT_FIRST[(crossing)->function] + (crossing)->element))
 
 /* Side of a kink by its function e, > 0 or < 0; 0 for other functions, and without sides. */
 static inline real side_at_start(const event_watch *watch, int e)
 {
 #ifdef EVENT_KINKS
-  return EVENT_OF(e) >= FIRST_KINK ? watch->side[EVENT_OF(e) - FIRST_KINK] : 0.0;
+  return EVENT_OF(e) >= FIRST_KINK ? SIDE_OF(watch, EVENT_OF(e) - FIRST_KINK) : 0.0;
 #else
   (void)watch, (void)e;
   return 0.0;

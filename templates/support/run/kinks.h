@@ -1,8 +1,8 @@
 #include "events.h"
 
 /* Kinks: zeros of u in unit_step(u + mode). A step has one mode, so that its equations are smooth beyond u = 0, too; at
- * the zero of u the side changes and a new part of the step begins. Requires: EVENT_KINKS, FIRST_KINK, MODE_PLACE,
- * PARAMETERS, events.h. */
+ * the zero of u the side changes and a new part of the step begins. Requires: EVENT_KINKS, FIRST_KINK, FIRST_SIDE,
+ * FIRST_MODE, events.h. */
 static int is_kink(int event)
 {
 #ifdef EVENT_KINKS
@@ -34,7 +34,7 @@ enum {
 /* Sets the side of a kink in the search and in the parameters of its steps. */
 static void set_side(const event_step *step, int kink, int side)
 {
-  step->watch->side[kink] = step->own[MODE_PLACE[kink]] = side * KINK_SIDE;
+  SIDE_OF(step->watch, kink) = step->own[FIRST_MODE + FIRST_SIDE + kink] = side * KINK_SIDE;
 }
 
 /* Whether the function of a kink is one of time alone, whose zeros do not depend on the state. */
@@ -84,9 +84,9 @@ static int settle_sides(const event_step *step, const event_sample *at, int *unk
   int doubtful = 0, status = values_of_kinks(step, at, value);
   *unknown = 0;
   for (int k = 0; status == OK && k < EVENT_KINKS; k++) {
-    const real g = value[EVENT_FIRST[FIRST_KINK + k]], side = step->watch->side[k];
+    const real g = value[EVENT_FIRST[FIRST_KINK + k]], side = SIDE_OF(step->watch, k);
     step->watch->acts[FIRST_KINK + k] = 1;
-    step->own[MODE_PLACE[k]] = side;
+    step->own[FIRST_MODE + FIRST_SIDE + k] = side;
     doubtful |= !((g > 0.0 && side > 0.0) || (g < 0.0 && side < 0.0));
   }
   if (status == OK && doubtful)
@@ -95,7 +95,7 @@ static int settle_sides(const event_step *step, const event_sample *at, int *unk
     const int side = side_of(step, k, value);
     if (side)
       set_side(step, k, side);
-    *unknown += step->watch->side[k] == 0.0;
+    *unknown += SIDE_OF(step->watch, k) == 0.0;
   }
   return status;
 }
@@ -133,7 +133,7 @@ static int sides_after_start(const event_step *step, const event_sample *at, rea
   int sign[EVENT_KINKS];
   const int status = signs_after(step, at, length, sign);
   for (int k = 0; status == OK && k < EVENT_KINKS; k++)
-    if (step->watch->side[k] == 0.0)
+    if (SIDE_OF(step->watch, k) == 0.0)
       set_side(step, k, sign[k] < 0 ? -1 : 1);
   return status;
 }
@@ -169,7 +169,7 @@ static int change_sides(const event_step *step, long long first, const event_sam
     status = signs_after(step, at, step->whole, sign);
   for (long long i = first; status == OK && returns && i < *step->filled; i++) {
     const int kink = step->found[i].function - FIRST_KINK;
-    if (kink >= 0 && step->found[i].direction == 0 && sign[kink] * step->watch->side[kink] < 0.0) {
+    if (kink >= 0 && step->found[i].direction == 0 && sign[kink] * SIDE_OF(step->watch, kink) < 0.0) {
       step->watch->sliding = step->found[i].function + 1;
       status = NOT_CONVERGED;
     }
@@ -183,13 +183,13 @@ static int check_sides(const event_step *step, const event_sample *right)
   real *const value = values_at(step, EVENT_DEGREE);
   int doubtful = 0, status = values_of_kinks(step, right, value);
   for (int k = 0; status == OK && k < EVENT_KINKS; k++)
-    doubtful |= value[EVENT_FIRST[FIRST_KINK + k]] * (step->watch->side[k] / KINK_SIDE) < 0.0;
+    doubtful |= value[EVENT_FIRST[FIRST_KINK + k]] * (SIDE_OF(step->watch, k) / KINK_SIDE) < 0.0;
   if (!doubtful)
     return OK;
   memcpy(values_at(step, 0), value, BYTES(EVENTS));
   status = rounding_of(step, right);
   for (int k = 0; status == OK && k < EVENT_KINKS; k++)
-    if (side_of(step, k, value) * step->watch->side[k] < 0.0 &&
+    if (side_of(step, k, value) * SIDE_OF(step->watch, k) < 0.0 &&
         fabs(value[EVENT_FIRST[FIRST_KINK + k]]) > KINK_MISSED * rounding_at(step, k)) {
       step->watch->through = FIRST_KINK + k + 1;
       return NOT_CONVERGED;

@@ -1,0 +1,130 @@
+"""Contacts along runs: first modes, reasons why none is possible, and the modes and forces of a trajectory."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from scvi_codegen.codegen.native.options import REASONS
+from scvi_codegen.common.errors import ContactError, EventWarning, MethodError, warn
+from scvi_codegen.runs.results.saved_states import Array, SavedStates, parameters_on_sides
+from scvi_codegen.runs.states.validation import Parameters, States
+from scvi_codegen.runs.stepping.integrator import Integrator
+from scvi_codegen.systems.contacts.modes import ContactRows
+
+STEPS = 1000
+"""Parts of the time since 0, at least of 1, by whose motion gaps are measured at a start."""
+REFUSALS = {
+    1: "the run starts at t = {t:.17g} with the gap of contact {k} at {value:.6g}, which must not be negative: correct "
+    "the initial positions, or the sign of the gap",
+    3: "{k} contacts close or change at once at t = {t:.17g}: their modes are chosen by enumeration of at most 6; use "
+    "fewer contacts",
+    4: "no impulses satisfy the law of impact with friction at t = {t:.17g}, contact {k}: reduce its friction",
+    5: "the impacts at t = {t:.17g} do not end: contacts close a corner; set a restitution to 0",
+}
+"""Messages by the reasons of contacts.h."""
+PARADOX = (
+    "no mode of the contacts is consistent at t = {t:.17g}: Painleve's paradox, rigid bodies with this friction have no "
+    "motion. G M^-1 (G - mu d T)^T = {value:.3g} of contact {k} must be positive: reduce its friction, or change the "
+    "geometry"
+)
+REDUNDANT = (
+    "no mode of the contacts is consistent at t = {t:.17g}: the contacts are redundant or contradict each other. Use "
+    "independent contacts"
+)
+
+
+def refusal_of(watch: Any, t: float) -> ContactError | None:
+    """Return why contacts allow no motion at time t, ``None`` if they do."""
+    reason, contact = getattr(watch, "refusal", 0), getattr(watch, "refused", 0)
+    if not reason:
+        return None
+    message = REFUSALS.get(reason, PARADOX if contact else REDUNDANT)
+    return ContactError(message.format(t=t, k=contact, value=watch.behind))
+
+
+def warn_of_choices(watch: Any) -> None:
+    """Warn if several modes were consistent at a transition, and if the restitution of an impact was replaced."""
+    if getattr(watch, "ambiguous", 0) > 1:
+        message = "up to {} modes of the contacts were consistent at a transition; the run continued in those that stick"
+        warn(f"{message.format(watch.ambiguous)} most", EventWarning)
+    if getattr(watch, "plastic", 0):
+        warn("the restitution of an impact would have created kinetic energy with friction: it was 0", EventWarning)
+
+
+def in_first_modes(
+    stepper: Integrator, q: States, p: States, t: float, parameters: Parameters, duration: float = 1.0 / STEPS
+) -> tuple[Array, Array]:
+    """Return a state after the impacts of contacts that are closed, on the constraints of their first modes.
+
+    Args:
+        stepper, q, p, t, parameters: of the start.
+        duration: time by whose motion gaps are measured.
+
+    Raises:
+        ContactError: if a gap is negative, or no mode is consistent.
+    """
+    binding = stepper.binding
+    q1, p1 = (np.array(part, float) for part in stepper._states.pair(q, p))
+    values = stepper._parameters(parameters)
+    watch, numbers = binding.new("watch *"), [binding.pointer(part) for part in (q1, p1, values)]
+    status = binding.function("begin_contacts")(watch, t, duration, *numbers, binding.workspace())
+    if status:
+        reason = f"the contacts are undefined at t = {t:.17g}, q = {q}: {REASONS[status]}"
+        raise refusal_of(watch, t) or ContactError(reason)
+    return q1, p1
+
+
+def mode_names(contacts: tuple[ContactRows, ...], parameters: dict[str, Any]) -> tuple[str, ...]:
+    """Return ``"open"``, ``"stick"`` or ``"slip"`` of each contact; one without friction that is closed slips."""
+    names = []
+    for contact in contacts:
+        if contact.closed is not None and not parameters[contact.closed]:
+            names.append("open")
+        else:
+            names.append("stick" if contact.sticks is not None and parameters[contact.sticks] else "slip")
+    return tuple(names)
+
+
+def contact_modes(states: SavedStates) -> list[tuple[float, tuple[str, ...]]]:
+    """Return the times from which contacts have modes, and these."""
+    stepper: Any = _with_contacts(states)
+    starts = [float(states.t[0]), *states.modes.t.tolist()] if states.modes is not None else [float(states.t[0])]
+    result: list[tuple[float, tuple[str, ...]]] = []
+    for t in starts:
+        named = stepper.parameters_by_name(parameters_on_sides(states, t))
+        names = mode_names(stepper.interface.contacts, named)
+        if not result or result[-1][1] != names:
+            result.append((t, names))
+    return result
+
+
+def contact_forces(states: SavedStates) -> Array:
+    """Return (n, contacts, 2) normal and tangential forces; at a transition those after it."""
+    stepper: Any = _with_contacts(states)
+    contacts, first = stepper.interface.contacts, len(stepper.constraints) - stepper.interface.masked
+    forces, k, m = np.zeros((len(states), len(contacts), 2)), stepper.interface.masked, stepper.dimension
+    multipliers = states.multipliers()
+    numbers, binding = np.zeros(k * (3 + k + m) + 3 * len(contacts)), stepper.binding
+    for row, (q, p, t) in enumerate(zip(states.q, states.p, states.t.tolist(), strict=True)):
+        parameters = parameters_on_sides(states, t)
+        blocks = [binding.pointer(np.ascontiguousarray(part, float)) for part in (q, p, parameters, parameters)]
+        binding.function("contact_terms")(t, *blocks, binding.pointer(numbers), binding.workspace())
+        friction = numbers[-3 * len(contacts) :: 3]
+        named = stepper.parameters_by_name(parameters)
+        for j, contact in enumerate(contacts):
+            if contact.normal is not None:
+                forces[row, j, 0] = multipliers[row, first + contact.normal]
+            if contact.sticks is None:
+                continue
+            size = 1.0 if contact.normal is None else forces[row, j, 0]
+            sticks = multipliers[row, first + contact.tangential] if named[contact.sticks] else 0.0
+            forces[row, j, 1] = sticks - named[contact.direction] * friction[j] * size
+    return forces
+
+
+def _with_contacts(states: SavedStates) -> Integrator:
+    if not states.stepper.interface.contacts:
+        raise MethodError(f"{states.stepper.title} has no contacts: pass contacts= to compile_stepper")
+    return states.stepper

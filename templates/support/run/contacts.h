@@ -1,0 +1,548 @@
+#include "events.h"
+#include "impacts.h"
+
+/* Contacts: the modes of a run, which transitions change at their located times.
+ *
+ * With the rows r of all contacts (gaps g, slips w) the second rates are r'' = b + W f for the forces f of the rows, W =
+ * G M^-1 G^T. In a mode forces are unknown at the gaps of closed contacts and at the slips of sticking ones, where r'' =
+ * 0; sliding adds -mu d times the normal force at the slip. A mode is consistent if normal forces are >= 0, open
+ * contacts have g'' >= 0, sticking ones |tau| <= mu_s lambda, and slip that begins w' d > 0. With friction none (P.
+ * Painleve, C. R. Acad. Sci. 121, 1895; F. Genot & B. Brogliato, Eur. J. Mech. A 18, 1999) or several may be. Impacts
+ * obey the same conditions for impulses and velocities (C. Glocker, Set-Valued Force Laws, 2001). Requires:
+ * parts/contacts.c.jinja. */
+enum {
+  CONTACTS_AT_ONCE = 6, /* largest number of contacts whose modes are enumerated */
+  CONTACT_OPTIONS = 4, /* open, stick, slip in either direction */
+  CONTACT_IMPACTS = 100 /* of a contact in a corner */
+};
+
+#define CONTACT_ROUNDING 1e-10 /* part of their size below which gaps, rates and forces count as 0 */
+#define CONTACT_PENETRATION 1e-9 /* part of its size by which a gap may be negative at a start */
+#define CONTACT_STEPS 1000.0 /* parts of a run of adaptive steps by which gaps are measured at its start */
+#define CONTACT_MISSED 128.0 /* effects of rounding beyond which a negative gap shows a missed transition */
+#define CONTACT_DEPENDENT 1e-12 /* part of a column below which a pivot counts as 0 */
+#define CONTACT_GAIN 1e-9 /* part of the work of an impact by which energy may grow */
+
+/* What the modes of contacts do not allow, in watch->refusal. */
+enum {
+  CONTACT_PENETRATES = 1,
+  CONTACT_WITHOUT_MODE, /* Painleve's paradox, or redundant contacts */
+  CONTACTS_UNDECIDED, /* too many */
+  CONTACT_WITHOUT_IMPULSE,
+  CONTACT_IN_CORNER
+};
+
+/* A contact without gap is always closed; one without friction does not stick, and has direction 0. */
+typedef struct {
+  int closed, sticks, direction;
+} contact_mode;
+
+static const contact_mode CONTACT_IS_OPEN = {0, 0, 0};
+static const contact_mode CONTACT_STICKS = {1, 1, 0};
+static const contact_mode CONTACT_SLIPS[3] = {{1, 0, -1}, {1, 0, 0}, {1, 0, 1}}; /* by direction + 1 */
+
+/* Rows at a state: values and rates, second rates b, W and G by rows, coefficients (mu, mu_s, e; limits of friction
+ * without gap), and the sizes of the terms of values and rates. */
+typedef struct {
+  real numbers[CONTACT_NUMBERS];
+  const real *value, *rate, *second, *W, *G, *coefficient;
+  real size[CONTACT_ROWS], speed[CONTACT_ROWS];
+} contact_terms;
+
+/* Transitions that end a mode together, and their consequences: contacts that close, slips that stop, directions of
+ * slips that begin; contacts with g = g' = 0, and with w = 0. */
+typedef struct {
+  int closes[EVENT_CONTACTS], stops[EVENT_CONTACTS], begins[EVENT_CONTACTS];
+  int touches[EVENT_CONTACTS], rests[EVENT_CONTACTS];
+} contact_change;
+
+static int is_transition(int event)
+{
+  return event >= FIRST_TRANSITION && event < FIRST_TRANSITION + TRANSITIONS;
+}
+
+/* The present mode of a contact, and its change. */
+static contact_mode mode_of(const event_step *step, int k)
+{
+  const contact_places *at = CONTACTS + k;
+  const real *mode = step->watch->mode;
+  const contact_mode now = {
+      at->closed < 0 || mode[at->closed] != 0.0,
+      at->sticks >= 0 && mode[at->sticks] != 0.0,
+      at->direction < 0 ? 0 : (int)mode[at->direction],
+  };
+  return now;
+}
+
+static void put_mode(const contact_places *at, contact_mode mode, real *modes)
+{
+  if (at->closed >= 0)
+    modes[at->closed] = mode.closed;
+  if (at->sticks >= 0) {
+    modes[at->sticks] = mode.sticks;
+    modes[at->direction] = mode.direction;
+  }
+}
+
+static int terms_at(const event_step *step, const event_sample *at, contact_terms *of)
+{
+  real idle[PARAMETERS], imposed[PARAMETERS], *const v = step->memory + 3 * M, power = 0.0;
+  const real duration = fabs(step->whole);
+  real *const numbers = of->numbers;
+  int status;
+  memcpy(idle, step->own, BYTES(PARAMETERS));
+  memcpy(imposed, step->own, BYTES(PARAMETERS));
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    put_mode(CONTACTS + k, CONTACT_IS_OPEN, idle + FIRST_MODE);
+    put_mode(CONTACTS + k, CONTACT_STICKS, imposed + FIRST_MODE);
+  }
+  status = NAME(contact_terms)(at->t, at->q, at->p, idle, imposed, numbers, step->workspace);
+  if (status == OK)
+    status = NAME(velocity)(at->t, at->q, at->p, idle, v, step->workspace);
+  of->value = numbers;
+  of->rate = of->value + CONTACT_ROWS;
+  of->second = of->rate + CONTACT_ROWS;
+  of->W = of->second + CONTACT_ROWS;
+  of->G = of->W + CONTACT_ROWS * CONTACT_ROWS;
+  of->coefficient = of->G + CONTACT_ROWS * M;
+  for (int i = 0; i < M; i++)
+    power += at->p[i] * v[i];
+  for (int r = 0; r < CONTACT_ROWS; r++) {
+    real by_position = 0.0, by_velocity = 0.0;
+    for (int i = 0; i < M; i++) {
+      by_position += fabs(of->G[r * M + i] * at->q[i]);
+      by_velocity += of->G[r * M + i] * v[i];
+    }
+    /* |G v| <= sqrt(G M^-1 G^T) sqrt(v^T M v), and the change of the rate in a step */
+    of->speed[r] = sqrt(fabs(of->W[r * (CONTACT_ROWS + 1)] * power)) + fabs(of->rate[r] - by_velocity) +
+        fabs(of->second[r]) * duration;
+    of->size[r] = by_position + of->speed[r] * duration;
+  }
+  return status;
+}
+
+/* Solves A x = b in place of the last column of the rows (A, b), by elimination with pivots; returns 0 if A is
+ * singular but for rounding. */
+static int eliminate(real (*line)[CONTACT_ROWS + 1], int count)
+{
+  for (int i = 0; i < count; i++) {
+    int best = i;
+    real size = 0.0;
+    for (int r = i; r < count; r++)
+      best = fabs(line[r][i]) > fabs(line[best][i]) ? r : best;
+    for (int r = 0; r < count; r++)
+      size = fmax(size, fabs(line[r][i]));
+    if (!(fabs(line[best][i]) > CONTACT_DEPENDENT * size))
+      return 0;
+    for (int j = i; j <= count; j++) {
+      const real swapped = line[i][j];
+      line[i][j] = line[best][j];
+      line[best][j] = swapped;
+    }
+    for (int r = 0; r < count; r++) {
+      const real factor = line[r][i] / line[i][i];
+      for (int j = i; r != i && j <= count; j++)
+        line[r][j] -= factor * line[i][j];
+    }
+  }
+  for (int i = 0; i < count; i++)
+    line[i][count] /= line[i][i];
+  return 1;
+}
+
+/* Solves for the forces of the rows in given modes with after = right + W f = 0 in imposed rows; returns 0 if these are
+ * dependent. */
+static int solve_contacts(const contact_terms *of, const contact_mode *mode, const real *right, real *force, real *after)
+{
+  real matrix[CONTACT_ROWS][CONTACT_ROWS + 1], oblique[CONTACT_ROWS] = {0.0};
+  int row[CONTACT_ROWS], along[CONTACT_ROWS], count = 0; /* imposed rows, and the slips of those that slide */
+  memset(force, 0, BYTES(CONTACT_ROWS));
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const contact_places *at = CONTACTS + k;
+    const real slides = at->tangential < 0 ? 0.0 : -of->coefficient[3 * k] * mode[k].direction;
+    if (at->normal < 0)
+      force[at->tangential] = slides;
+    if (at->normal >= 0 && mode[k].closed) {
+      row[count] = at->normal;
+      along[count] = at->tangential;
+      oblique[count++] = slides;
+    }
+    if (at->tangential >= 0 && mode[k].sticks) {
+      row[count] = at->tangential;
+      along[count++] = -1;
+    }
+  }
+  for (int i = 0; i < count; i++) {
+    const real *W = of->W + row[i] * CONTACT_ROWS;
+    real *line = matrix[i];
+    for (int j = 0; j < count; j++)
+      line[j] = W[row[j]] + (along[j] < 0 ? 0.0 : oblique[j] * W[along[j]]);
+    line[count] = -right[row[i]];
+    for (int r = 0; r < CONTACT_ROWS; r++)
+      line[count] -= W[r] * force[r];
+  }
+  if (!eliminate(matrix, count))
+    return 0;
+  for (int i = 0; i < count; i++) {
+    force[row[i]] += matrix[i][count];
+    if (along[i] >= 0)
+      force[along[i]] += oblique[i] * matrix[i][count];
+  }
+  for (int r = 0; r < CONTACT_ROWS; r++) {
+    after[r] = right[r];
+    for (int j = 0; j < CONTACT_ROWS; j++)
+      after[r] += of->W[r * CONTACT_ROWS + j] * force[j];
+  }
+  return 1;
+}
+
+/* Largest friction force or impulse of a contact, by its coefficient of sliding (0) or sticking (1). */
+static real friction_limit(const contact_terms *of, int k, int which, const real *force)
+{
+  return of->coefficient[3 * k + which] * (CONTACTS[k].normal < 0 ? 1.0 : force[CONTACTS[k].normal]);
+}
+
+/* Modes of a contact that its gap and its slip at a state allow; returns their number. */
+static int options_of(const contact_terms *of, int k, contact_change *now, contact_mode *option)
+{
+  const contact_places *at = CONTACTS + k;
+  const int slip = at->tangential;
+  int count = 0;
+  if (at->normal >= 0)
+    option[count++] = CONTACT_IS_OPEN;
+  if (at->normal >= 0 && !now->touches[k] &&
+      (of->value[at->normal] > CONTACT_ROUNDING * of->size[at->normal] ||
+          of->rate[at->normal] > CONTACT_ROUNDING * of->speed[at->normal]))
+    return count;
+  if (slip < 0) {
+    option[count++] = CONTACT_SLIPS[1];
+  } else if (now->begins[k]) {
+    option[count++] = CONTACT_SLIPS[1 + now->begins[k]];
+  } else if (now->rests[k] || fabs(of->rate[slip]) <= CONTACT_ROUNDING * of->speed[slip]) {
+    now->rests[k] = 1;
+    option[count++] = CONTACT_STICKS;
+    option[count++] = CONTACT_SLIPS[2];
+    option[count++] = CONTACT_SLIPS[0];
+  } else {
+    option[count++] = CONTACT_SLIPS[of->rate[slip] > 0.0 ? 2 : 0];
+  }
+  return count;
+}
+
+/* Whether modes satisfy the conditions; is_free: contacts that are open by their gap. */
+static int is_consistent(const contact_terms *of, const contact_mode *mode, const int *is_free,
+    const contact_change *now)
+{
+  real force[CONTACT_ROWS], second[CONTACT_ROWS], small = 0.0;
+  if (!solve_contacts(of, mode, of->second, force, second))
+    return 0;
+  for (int r = 0; r < CONTACT_ROWS; r++)
+    small = fmax(small, CONTACT_ROUNDING * fmax(fabs(of->second[r]), fabs(second[r])));
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential, d = mode[k].direction;
+    if (is_free[k])
+      continue;
+    if (normal >= 0 && mode[k].closed && !(force[normal] * of->W[normal * (CONTACT_ROWS + 1)] > small))
+      return 0;
+    if (normal >= 0 && !mode[k].closed && second[normal] < -small)
+      return 0;
+    if (!mode[k].closed || slip < 0)
+      continue;
+    if (mode[k].sticks && (fabs(force[slip]) - friction_limit(of, k, 1, force)) * of->W[slip * (CONTACT_ROWS + 1)] > small)
+      return 0;
+    if (!mode[k].sticks && now->begins[k] && d * second[slip] < -small)
+      return 0;
+    if (!mode[k].sticks && now->rests[k] && !(d * second[slip] > small))
+      return 0;
+  }
+  return 1;
+}
+
+/* Notes why no motion is possible; contact k, or all. */
+static int refuse(const event_step *step, int reason, int k, real value)
+{
+  step->watch->refusal = reason;
+  step->watch->refused = k + 1;
+  step->watch->behind = value;
+  return NOT_CONVERGED;
+}
+
+/* Names the contact of Painleve's paradox by its entry of G M^-1 (G - mu d T)^T <= 0, if there is one. */
+static int refuse_modes(const event_step *step, const contact_terms *of, contact_mode (*option)[CONTACT_OPTIONS],
+    const int *options)
+{
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    for (int i = 0; i < options[k] && CONTACTS[k].normal >= 0 && CONTACTS[k].tangential >= 0; i++) {
+      const real *W = of->W + CONTACTS[k].normal * CONTACT_ROWS;
+      const real slides = of->coefficient[3 * k] * option[k][i].direction;
+      const real entry = W[CONTACTS[k].normal] - slides * W[CONTACTS[k].tangential];
+      if (option[k][i].direction && entry <= 0.0)
+        return refuse(step, CONTACT_WITHOUT_MODE, k, entry);
+    }
+  return refuse(step, CONTACT_WITHOUT_MODE, -1, 0.0);
+}
+
+/* Sets the consistent modes at a state that stick most: the first of those with the least sum of 2 for each contact that
+ * does not stick, less 1 for each that is closed. */
+static int choose_modes(const event_step *step, const contact_terms *of, contact_change *now)
+{
+  contact_mode option[EVENT_CONTACTS][CONTACT_OPTIONS], mode[EVENT_CONTACTS], best[EVENT_CONTACTS];
+  int options[EVENT_CONTACTS], place[EVENT_CONTACTS] = {0}, is_free[EVENT_CONTACTS];
+  int undecided = 0, consistent = 0, least = 1 << 30, more = 1;
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    options[k] = options_of(of, k, now, option[k]);
+    undecided += options[k] > 1;
+    is_free[k] = options[k] == 1 && !option[k][0].closed;
+  }
+  if (undecided > CONTACTS_AT_ONCE)
+    return refuse(step, CONTACTS_UNDECIDED, undecided - 1, 0.0);
+  while (more) {
+    int weight = 0;
+    for (int k = 0; k < EVENT_CONTACTS; k++) {
+      mode[k] = option[k][place[k]];
+      weight += 2 * !mode[k].sticks - mode[k].closed;
+    }
+    if (is_consistent(of, mode, is_free, now)) {
+      consistent++;
+      if (weight < least)
+        memcpy(best, mode, sizeof best);
+      least = weight < least ? weight : least;
+    }
+    more = 0;
+    for (int k = EVENT_CONTACTS - 1; k >= 0 && !more; k--) { /* the next of all combinations */
+      place[k] = (place[k] + 1) % options[k];
+      more = place[k] > 0;
+    }
+  }
+  if (!consistent)
+    return refuse_modes(step, of, option, options);
+  step->watch->ambiguous = consistent > step->watch->ambiguous ? consistent : step->watch->ambiguous;
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    put_mode(CONTACTS + k, best[k], step->watch->mode);
+  memcpy(step->own + FIRST_MODE, step->watch->mode, BYTES(EVENT_MODES));
+  return OK;
+}
+
+/* Whether the impulses and the rates after an impact satisfy its conditions. */
+static int obeys(const contact_terms *of, const contact_mode *mode, const int *takes_part, const real *impulse,
+    const real *after, real small)
+{
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential;
+    if (!takes_part[k])
+      continue;
+    if (!mode[k].closed && after[normal] < -small)
+      return 0;
+    if (mode[k].closed && impulse[normal] * of->W[normal * (CONTACT_ROWS + 1)] < -small)
+      return 0;
+    if (mode[k].sticks &&
+        (fabs(impulse[slip]) - friction_limit(of, k, 0, impulse)) * of->W[slip * (CONTACT_ROWS + 1)] > small)
+      return 0;
+    if (mode[k].closed && !mode[k].sticks && mode[k].direction * (slip < 0 ? 0.0 : after[slip]) < -small)
+      return 0;
+  }
+  return 1;
+}
+
+/* Impulses of a contact that approaches with the given rates, and of those that are closed, in the first consistent
+ * modes; 0 if there are none. */
+static int impulses_of(const contact_terms *of, int contact, const int *closed, real restitution, const real *rate,
+    real *impulse)
+{
+  contact_mode option[EVENT_CONTACTS][CONTACT_OPTIONS], mode[EVENT_CONTACTS];
+  int options[EVENT_CONTACTS], place[EVENT_CONTACTS] = {0}, takes_part[EVENT_CONTACTS], more = 1;
+  real right[CONTACT_ROWS], after[CONTACT_ROWS], small = 0.0;
+  memcpy(right, rate, sizeof right);
+  right[CONTACTS[contact].normal] *= 1.0 + restitution;
+  for (int r = 0; r < CONTACT_ROWS; r++)
+    small = fmax(small, CONTACT_ROUNDING * of->speed[r]);
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    int count = 0;
+    takes_part[k] = CONTACTS[k].normal >= 0 && (k == contact || closed[k]);
+    if (k != contact)
+      option[k][count++] = CONTACT_IS_OPEN;
+    if (takes_part[k] && CONTACTS[k].tangential >= 0) {
+      option[k][count++] = CONTACT_STICKS;
+      option[k][count++] = CONTACT_SLIPS[2];
+      option[k][count++] = CONTACT_SLIPS[0];
+    } else if (takes_part[k]) {
+      option[k][count++] = CONTACT_SLIPS[1];
+    }
+    options[k] = count;
+  }
+  while (more) {
+    for (int k = 0; k < EVENT_CONTACTS; k++)
+      mode[k] = option[k][place[k]];
+    if (solve_contacts(of, mode, right, impulse, after) && obeys(of, mode, takes_part, impulse, after, small))
+      return 1;
+    more = 0;
+    for (int k = EVENT_CONTACTS - 1; k >= 0 && !more; k--) {
+      place[k] = (place[k] + 1) % options[k];
+      more = place[k] > 0;
+    }
+  }
+  return 0;
+}
+
+/* Impulses of the rows of contacts that approach, one after another, until none does: rates after the impact are -e
+ * times those before it (Newton), and impulses are in the friction cone. Closed contacts take part with e = 0. */
+static int find_impulses(const event_step *step, const contact_terms *of, const int *approaches, const int *closed,
+    int is_plastic, real *total)
+{
+  memset(total, 0, BYTES(CONTACT_ROWS));
+  for (int round = 0; round < CONTACT_IMPACTS * EVENT_CONTACTS; round++) {
+    real rate[CONTACT_ROWS], impulse[CONTACT_ROWS];
+    int meets = -1;
+    for (int r = 0; r < CONTACT_ROWS; r++) {
+      rate[r] = of->rate[r];
+      for (int j = 0; j < CONTACT_ROWS; j++)
+        rate[r] += of->W[r * CONTACT_ROWS + j] * total[j];
+    }
+    for (int k = EVENT_CONTACTS - 1; k >= 0; k--)
+      if (approaches[k] && rate[CONTACTS[k].normal] < -CONTACT_ROUNDING * of->speed[CONTACTS[k].normal])
+        meets = k;
+    if (meets < 0)
+      return OK;
+    if (!impulses_of(of, meets, closed, is_plastic ? 0.0 : of->coefficient[3 * meets + 2], rate, impulse))
+      return refuse(step, CONTACT_WITHOUT_IMPULSE, meets, 0.0);
+    for (int r = 0; r < CONTACT_ROWS; r++)
+      total[r] += impulse[r];
+  }
+  return refuse(step, CONTACT_IN_CORNER, -1, 0.0);
+}
+
+/* Kinetic energy that impulses create, relative to the sizes of its terms. */
+static real gain_of(const contact_terms *of, const real *impulse)
+{
+  real gain = 0.0, size = 0.0;
+  for (int r = 0; r < CONTACT_ROWS; r++) {
+    real change = of->rate[r];
+    for (int j = 0; j < CONTACT_ROWS; j++)
+      change += 0.5 * of->W[r * CONTACT_ROWS + j] * impulse[j];
+    gain += impulse[r] * change;
+    size += impulse[r] * of->rate[r];
+  }
+  return size != 0.0 ? gain / fabs(size) : 0.0;
+}
+
+/* Impulses of all contacts that meet at a state, and which contacts touch and rest afterwards; restitution is 0 where
+ * Newton's law would create kinetic energy. */
+static int collide(const event_step *step, event_sample *at, contact_terms *of, const int *closed, contact_change *now)
+{
+  const contact_terms before = *of;
+  real impulse[CONTACT_ROWS];
+  int approaches[EVENT_CONTACTS], is_plastic = 0, status;
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const int normal = CONTACTS[k].normal;
+    approaches[k] = normal >= 0 &&
+        (now->closes[k] || (!closed[k] && fabs(of->value[normal]) <= CONTACT_ROUNDING * of->size[normal]));
+  }
+  status = find_impulses(step, of, approaches, closed, 0, impulse);
+  if (status == OK && gain_of(of, impulse) > CONTACT_GAIN) {
+    is_plastic = step->watch->plastic = 1;
+    status = find_impulses(step, of, approaches, closed, 1, impulse);
+  }
+  for (int r = 0; status == OK && r < CONTACT_ROWS; r++)
+    for (int i = 0; i < M; i++)
+      at->p[i] += of->G[r * M + i] * impulse[r];
+  if (status == OK)
+    status = terms_at(step, at, of);
+  for (int k = 0; status == OK && k < EVENT_CONTACTS; k++) {
+    const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential;
+    if (normal < 0 || !(approaches[k] || closed[k]))
+      continue;
+    if (impulse[normal] > 0.0 && (closed[k] || is_plastic || before.coefficient[3 * k + 2] == 0.0))
+      now->touches[k] = 1;
+    if (slip >= 0 && fabs(of->rate[slip]) <= CONTACT_ROUNDING * before.speed[slip])
+      now->rests[k] = 1;
+    if (of->rate[normal] > CONTACT_ROUNDING * before.speed[normal])
+      now->touches[k] = 0;
+    if (approaches[k] && step->watch->accumulates[k])
+      now->touches[k] = 1;
+    step->watch->accumulates[k] = 0;
+  }
+  return status;
+}
+
+/* Impacts and new modes at a state, which is projected onto their constraints. */
+static int change_modes(const event_step *step, event_sample *at, contact_change *now)
+{
+  contact_terms of;
+  int closed[EVENT_CONTACTS], approach = 0, status = terms_at(step, at, &of);
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const contact_mode mode = mode_of(step, k);
+    closed[k] = CONTACTS[k].normal >= 0 && mode.closed;
+    now->touches[k] |= closed[k];
+    now->rests[k] = (now->stops[k] || mode.sticks) && !now->begins[k];
+    approach |= now->closes[k] && of.rate[CONTACTS[k].normal] < 0.0;
+  }
+  if (status == OK && approach)
+    status = collide(step, at, &of, closed, now);
+  if (status == OK)
+    status = choose_modes(step, &of, now);
+  return status == OK ? satisfy_constraints(step, at->t, at->q, at->p, 1) : status;
+}
+
+/* Modes after the transitions among the crossings from `first` on, which have one state. */
+static int change_contacts(const event_step *step, long long first, event_sample *at)
+{
+  contact_change now;
+  int changed = 0;
+  memset(&now, 0, sizeof now);
+  for (long long i = first; i < *step->filled; i++)
+    if (is_transition(step->found[i].function)) {
+      const int *const transition = TRANSITION[step->found[i].function - FIRST_TRANSITION];
+      const int k = transition[0];
+      now.closes[k] |= transition[1] == CONTACT_CLOSES;
+      now.stops[k] |= transition[1] == CONTACT_STOPS;
+      now.begins[k] += (transition[1] == CONTACT_FORWARD) - (transition[1] == CONTACT_BACKWARD);
+    }
+  for (long long i = first; i < *step->filled; i++) /* forces may jump at kinks, momenta at events */
+    changed |= step->watch->acts[step->found[i].function];
+  return changed ? change_modes(step, at, &now) : OK;
+}
+
+/* First modes of a run, after impacts of contacts that are closed and approach. */
+static int begin_contacts(const event_step *step, event_sample *at)
+{
+  contact_terms of;
+  contact_change now;
+  int status;
+  memset(&now, 0, sizeof now);
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    put_mode(CONTACTS + k, CONTACT_IS_OPEN, step->watch->mode);
+  memcpy(step->own + FIRST_MODE, step->watch->mode, BYTES(EVENT_MODES));
+  status = terms_at(step, at, &of);
+  for (int k = 0; status == OK && k < EVENT_CONTACTS; k++) {
+    const int row = CONTACTS[k].normal;
+    if (row >= 0 && of.value[row] < -CONTACT_PENETRATION * of.size[row])
+      status = refuse(step, CONTACT_PENETRATES, k, of.value[row]);
+    now.closes[k] = row >= 0 && fabs(of.value[row]) <= CONTACT_ROUNDING * of.size[row];
+  }
+  if (status == OK)
+    status = change_modes(step, at, &now);
+  step->watch->begun = status == OK;
+  return status;
+}
+
+/* Fails if a gap is negative at the end of a step in which no transition was found. */
+static int check_gaps(const event_step *step, const event_sample *right)
+{
+  real value[EVENTS];
+  int doubtful = 0, status = evaluate_functions(step, right, value);
+  for (int i = 0; i < TRANSITIONS; i++)
+    doubtful |= TRANSITION[i][1] == CONTACT_CLOSES && value[EVENT_FIRST[FIRST_TRANSITION + i]] < 0.0;
+  if (status != OK || !doubtful)
+    return status;
+  memcpy(values_at(step, 0), value, BYTES(EVENTS));
+  status = rounding_of(step, right);
+  for (int i = 0; status == OK && i < TRANSITIONS; i++) {
+    const int e = EVENT_FIRST[FIRST_TRANSITION + i];
+    const real rounding = CONTACT_MISSED * values_at(step, EVENT_DEGREE + 2)[e] + step->watch->history[e].slack;
+    if (TRANSITION[i][1] == CONTACT_CLOSES && value[e] < -rounding) {
+      step->watch->through = FIRST_TRANSITION + i + 1;
+      return NOT_CONVERGED;
+    }
+  }
+  return status;
+}
