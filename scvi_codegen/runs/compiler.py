@@ -118,13 +118,8 @@ def compile_stepper(
         raise MethodError(f"unknown sums {sums!r}: use {' or '.join(map(repr, SUMS))}")
     if kinks not in KINKS:
         raise MethodError(f"unknown kinks {kinks!r}: use {' or '.join(map(repr, KINKS))}")
-    rows: tuple[ContactRows, ...] = ()
-    if any((*contacts, system.has_contacts)):
-        others = {"solver": solver, "precision": precision, "sizes": sizes, "tables": tables, "controller": controller}
-        others["time_transformation"] = time_transformation
-        if passed := [name for name, value in others.items() if value not in (None, "auto", "double")]:
-            raise MethodError(f"{passed[0]}={others[passed[0]]!r} is not available with contacts: omit it")
-        system, rows = bound_contacts(system, (*system.contacts, *contacts))
+    others = {"solver": solver, "precision": precision, "sizes": sizes, "tables": tables, "controller": controller}
+    system, rows = _with_contacts(system, contacts, **others, time_transformation=time_transformation)
     common: dict[str, Any] = {
         "solver": solver,
         "flags": flags,
@@ -170,6 +165,17 @@ def _check_symmetries(symmetries: Any) -> None:
         from scvi_codegen.systems.symmetry.symmetry import SYMMETRIES
 
         check_kind(SYMMETRIES, symmetries, "symmetries")
+
+
+def _with_contacts(
+    system: MechanicalSystem, contacts: Sequence[ContactLike], **others: Any
+) -> tuple[MechanicalSystem, tuple[ContactRows, ...]]:
+    """Return the system with the modes of its contacts as parameters, and their places; ``others`` exclude contacts."""
+    if not any((*contacts, system.has_contacts)):
+        return system, ()
+    if passed := [name for name, value in others.items() if value not in (None, "auto", "double")]:
+        raise MethodError(f"{passed[0]}={others[passed[0]]!r} is not available with contacts: omit it")
+    return bound_contacts(system, (*system.contacts, *contacts))
 
 
 def _compile_arrays(

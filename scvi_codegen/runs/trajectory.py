@@ -79,7 +79,7 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
         options: convergence criterion of the solver, ``None`` for the defaults.
         events: zero crossings found, parallel to ``stepper.events``.
         switches: changes of the side of each kink, in the order of ``stepper.interface.modes``.
-        modes: values of the parameters that are modes of contacts and kinks, ``None`` without them.
+        modes: values of ``stepper.modes`` along the run, ``None`` without them.
         plan: step sizes and target time of the run.
         steps, rejected_steps: numbers of completed and of rejected steps since the start of the run.
         fallback_steps: number of completed steps that the iteration did not solve, but its fallback, Newton's method.
@@ -157,6 +157,7 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
             step_sizes=lengths,
             events=tuple(crossings.chosen((crossings.t >= low) & (crossings.t <= high)) for crossings in self.events),
             switches=tuple(kink.chosen((kink.t >= low) & (kink.t <= high)) for kink in self.switches),
+            modes=None if self.modes is None else self.modes.between(low, high),
         )
 
     def _slice_of_pieces(self, first: int, last: int, stride: int, rows: slice) -> Self:
@@ -201,14 +202,14 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
         """Return (n,) energies p.v - L, constant along exact trajectories if L does not depend on time."""
         if self.conserved is not None:
             return self.conserved[:, 2]
-        return self._joined(lambda piece: piece.stepper.energy(piece.q, piece.p, piece.t, piece.parameters))
+        return self._joined(lambda piece: in_modes(piece, piece.stepper.energy))
 
     @property
     def energies(self) -> Array:
         """(n, 3) kinetic, potential and total energy; parts of arrays of run-time sizes only, else NaN."""
         if self.conserved is not None:
             return self.conserved[:, :3]
-        return self._joined(lambda piece: piece.stepper._energy_parts(piece.q, piece.p, piece.t, piece.parameters))
+        return self._joined(lambda piece: in_modes(piece, piece.stepper._energy_parts))
 
     def energy_error(self) -> float:
         """Return the largest error of the energy, relative to the largest sum of its absolute parts if known.
@@ -241,7 +242,7 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
         """Return (n, k) conserved quantities, in the order of ``stepper.momentum_map_names``."""
         if self.conserved is not None:
             return self.conserved[:, 3:]
-        return self._joined(lambda piece: piece.stepper.momentum_maps(piece.q, piece.p, piece.t, piece.parameters))
+        return self._joined(lambda piece: in_modes(piece, piece.stepper.momentum_maps))
 
     def momentum_errors(self) -> Array:
         """Return (n, k) changes of the momentum maps since the first state, relative to their largest term."""
@@ -334,9 +335,7 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
 
     def constraint_values(self) -> tuple[Array, Array]:
         """Return (n, c) constraint residuals and (n, c) rates at the states, zero up to rounding."""
-        values = self._joined(
-            lambda run: in_modes(run, lambda *of: constraint_values(run.stepper, *of).swapaxes(0, 1))
-        )
+        values = self._joined(lambda run: in_modes(run, lambda *of: constraint_values(run.stepper, *of).swapaxes(0, 1)))
         return values[:, 0], values[:, 1]
 
     def states(self, units: Mapping[str, str] | None = None) -> States:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from numbers import Real
@@ -263,6 +263,12 @@ def impact(
         where, terminal: as of :class:`Event`.
     """
     return Event(function, direction=-1, terminal=terminal, where=where, restitution=restitution)
+
+
+def modes_of(events: Iterable[Any], parameters: Collection[str], own: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of the parameters that runs change: by events, and ``own``, the modes of contacts and kinks."""
+    changed = (name for event in events for name, _ in event.changes)
+    return *dict.fromkeys(name for name in changed if name in parameters and name not in own), *own
 
 
 EventLike: TypeAlias = "Event | str | Expr"

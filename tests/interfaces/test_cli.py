@@ -179,7 +179,7 @@ class TestChoices:
             ("kepler --method collocation:2", "collocation does not take a number; its arguments are abscissae, form"),
             ("kepler --method gaus:2", "did you mean 'gauss'?"),
             ("kepler --event q3", "unknown name 'q3'. Known here: q1, q2"),
-            ("kepler --event q1;z=3", "'z' is not a coordinate, a momentum or a velocity"),
+            ("kepler --event q1;z=3", "'z' is not a coordinate, a momentum, a velocity or a parameter"),
             ("kepler --event q1;p_q1", "'p_q1' in the event 'q1;p_q1' is not of the form NAME=VALUE"),
             (
                 "kepler --stages 3",

@@ -346,6 +346,36 @@ def test_impacts_on_moving_curved_walls_are_satisfied(wall, restitution, flags):
     assert impacts.measured < 2.0
 
 
+def stiffness_changes(t: float) -> float:
+    """Position of an oscillator that starts at 1 and whose stiffness is 4 for x < 0, 1 for x > 0."""
+    t += np.pi / 2  # since x = 0
+    t %= 1.5 * np.pi
+    return np.sin(t) if t < np.pi else -np.sin(2 * (t - np.pi)) / 2
+
+
+@pytest.mark.parametrize("plan", [{"h": 0.05}, {}])
+def test_events_set_parameters(plan):
+    system = sc.LagrangianSystem.from_text("gear", ["x"], "x_dot**2/2 - k*x**2/2", parameters={"k": 1.0})
+    gears = [sc.Event("x", direction, then={"k": k}) for direction, k in ((-1, "4*k"), (1, 1))]
+    stepper = sc.compile_stepper(system, "svi:4", events=gears)
+    run = stepper.integrate([1.0], [0.0], t_end=10.0, **plan)
+    np.testing.assert_allclose(run.q[:, 0], [stiffness_changes(t) for t in run.t], atol=2e-14)
+    assert np.array_equal(run.modes.values, [[1], [4], [1], [4], [1]])
+    times = np.linspace(0, 10, 77)
+    np.testing.assert_allclose(run.at(times)[0][:, 0], [stiffness_changes(t) for t in times], atol=2e-14)
+    np.testing.assert_allclose(run.energy(), 0.5, atol=1e-14)
+    assert run[:5].modes.values.tolist() == [[1]]
+    ensemble = stepper.integrate_ensemble([[0.5], [1.0]], [[0.0], [0.0]], t_end=10.0, **plan)
+    assert np.array_equal(ensemble[1].q[-1], run.q[-1])
+    part = stepper.start([1.0], [0.0], **(plan or {"t_end": 10.0}))
+    part.advance(50)
+    again = stepper.from_checkpoint(part.checkpoint(), **({} if plan else {"t_end": 10.0}))
+    assert np.array_equal(again.record(60).q, part.record(60).q)
+    assert part.parameters == run.modes.at(part.t, 1.0)
+    with pytest.raises(sc.MethodError, match="sensitivity"):
+        run.sensitivity()
+
+
 def test_conditions_select_crossings(point):
     """A plate of finite length: a point that passes beside it is not reflected."""
     plate = sc.Event("y", then={"p_y": "-p_y"}, where=("x > 0", sympy.Symbol("x") < 1))

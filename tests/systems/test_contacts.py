@@ -277,8 +277,8 @@ def on_floor() -> Any:
             "gap of contact",
         ),
         (
-            lambda: of(PLANE, "x y", [sc.contact("y")], "svi:2").integrate_ensemble([[0, 1]], [[0, 0]], h=1, steps=1),
-            "cont",
+            lambda: of(PLANE, "x y", [sc.contact("y")], "svi:2").integrate([0, 1], [0, 0], h=-0.1, steps=9),
+            "forward in time",
         ),
     ],
 )

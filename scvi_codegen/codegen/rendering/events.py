@@ -41,7 +41,7 @@ from scvi_codegen.common.errors import EventError, ScviCodegenError, SystemDefin
 from scvi_codegen.common.precision import mp
 from scvi_codegen.methods.tables.nodes import chebyshev_lobatto, to_unit
 from scvi_codegen.systems.contacts.modes import ContactRows
-from scvi_codegen.systems.event import Kink, Transition
+from scvi_codegen.systems.event import Kink, Transition, modes_of
 from scvi_codegen.systems.formulas.array_statements import (
     EntryRules,
     entry_names,
@@ -131,6 +131,7 @@ class EventFormulas:
             for number, event in enumerate(self.events)
             for condition in event.conditions
         ]
+        self.modes = modes_of(events, interface.parameters, interface.mode_names)
         self.changes = [self._changes(event, g) for event, g in zip(self.events, self.functions, strict=True)]
         if interface.in_tau and any(event.changes_state for event in events):
             raise EventError(
@@ -191,6 +192,8 @@ class EventFormulas:
             return [*range(len(self.q)), 0, 0], [*gradient, restitution]
         settable = (*self.q, *self.p) if self.interface.variables else (*self.q, *self.p, *self.v)
         places = {variable: k for k, variable in enumerate(settable)}
+        own = len(self.modes) - len(self.interface.mode_names)  # those of contacts and kinks follow
+        places |= {symbol(name): 3 * len(self.q) + k for k, name in enumerate(self.modes[:own])}
         named = {name: places[variable] for name, variable in self._known.items() if variable in places}
         new = {
             str(self._read(name, "then=")) if "[" in name else name: self._read(value, f"value '{value}' of '{name}'")
@@ -205,9 +208,9 @@ class EventFormulas:
                 names += named
                 raise EventError(
                     f"then={{'{name}': '{value}'}} of the event '{event.function}': '{name}' is not a coordinate, a "
-                    f"momentum or a velocity{closest(name, names)} An event can set: {', '.join(names)}"
+                    f"momentum, a velocity or a parameter{closest(name, names)} An event can set: {', '.join(names)}"
                 )
-        if {index // len(self.q) for index in indices} >= {1, 2}:
+        if {min(index // len(self.q), 3) for index in indices} >= {1, 2}:
             raise EventError(f"the event '{event.function}' sets momenta and velocities: set one or the other")
         return indices, [*new.values()]
 
@@ -346,18 +349,18 @@ def _search(interface: Interface, events: tuple[SearchedEvent, ...], *, controll
         changed=tuple(index for indices, _ in formulas.changes for index in indices),
         first_values=(0, *accumulate(len(values) for _, values in formulas.changes)),
         parameters=len(interface.parameters),
-        modes=len(interface.mode_names),
+        modes=tuple(map(interface.parameters.index, formulas.modes)),
         kinks=sum(isinstance(event, Kink) for event in events),
-        contacts=tuple(_places(interface, contact) for contact in interface.contacts),
+        contacts=tuple(_places(formulas.modes, contact) for contact in interface.contacts),
         transitions=tuple((event.contact, event.kind) for event in events if isinstance(event, Transition)),
     )
 
 
-def _places(interface: Interface, contact: ContactRows) -> tuple[int, ...]:
+def _places(modes: Sequence[str], contact: ContactRows) -> tuple[int, ...]:
     """Return the rows of a contact, and its masks among the modes; -1 for what it does not have."""
     rows = (-1 if row is None else row for row in (contact.normal, contact.tangential))
     masks = (contact.closed, contact.sticks, contact.direction)
-    return *rows, *(-1 if name is None else interface.mode_names.index(name) for name in masks)
+    return *rows, *(-1 if name is None else modes.index(name) for name in masks)
 
 
 def _kind_in_time(g: Expr, moving: Iterable[Symbol]) -> int:

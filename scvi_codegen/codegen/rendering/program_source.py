@@ -162,10 +162,10 @@ class EventSearch:
             restitution of impacts.
         uses_velocity: whether v occurs in the formulas.
         multipliers: number of multipliers if one occurs in the formulas, else 0.
-        changed: index among (q, p, v) of the variable of each value of the changes.
+        changed: index among (q, p, v, modes) of the variable of each value of the changes.
         first_values: index of the first value of each function, and the number of values.
         parameters: number of parameters.
-        modes: number of the last parameters that are modes of contacts and of kinks.
+        modes: indices of the parameters that change along runs: by events, as modes of contacts, and of kinks.
         kinks: number of kinks, which are the last events.
         contacts: normal and tangential row of each contact, and its closed, sticks and direction among the modes, -1 of
             what it does not have.
@@ -194,7 +194,7 @@ class EventSearch:
     first_values: tuple[int, ...] = ()
     elements: tuple[int, ...] = ()
     parameters: int = 0
-    modes: int = 0
+    modes: tuple[int, ...] = ()
     kinks: int = 0
     contacts: tuple[tuple[int, ...], ...] = ()
     transitions: tuple[tuple[int, str], ...] = ()

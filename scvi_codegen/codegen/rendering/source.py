@@ -420,7 +420,9 @@ class Interface:
     @property
     def mode_names(self) -> tuple[str, ...]:
         """Names of the parameters that runs change: modes of contacts and of kinks; they are the last ones."""
-        return tuple(name for contact in self.contacts for name in contact.masks) + tuple(name for name, _ in self.modes)
+        return tuple(name for contact in self.contacts for name in contact.masks) + tuple(
+            name for name, _ in self.modes
+        )
 
     @property
     def in_tau(self) -> bool:

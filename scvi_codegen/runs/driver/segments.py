@@ -328,13 +328,14 @@ def prepared_segments(
         for segment in planned_segments(
             run._times[0], t_end, run._step_size, inputs, words=run.stepper.interface.words
         ):
-            run.update(parameters=values(segment.middle), h=segment.h)
+            run.update(parameters=run._with_set_by_events(values(segment.middle)), h=segment.h)
             if run.stepper.interface.words > 1 and segment.end is not None:
                 run._step_to(segment.end)
             yield segment.steps
         return
     for end in breakpoints_until(run.t, t_end, inputs):
-        run.update(parameters=values(run.t + 0.5 * (end - run.t)), plan=ending_at(run.plan, end))
+        parameters = run._with_set_by_events(values(run.t + 0.5 * (end - run.t)))
+        run.update(parameters=parameters, plan=ending_at(run.plan, end))
         yield None
 
 

@@ -7,10 +7,10 @@ import numpy as np
 
 from scvi_codegen.codegen.native.cuda import Device, has_device_memory
 from scvi_codegen.common.errors import StateError
+from scvi_codegen.runs.events.contacts import in_first_modes
 from scvi_codegen.runs.states.validation import Array, EnsembleParameters, States, check_inputs_given
 from scvi_codegen.runs.states.words import stacked
 from scvi_codegen.runs.stepping.integrator import Integrator
-from scvi_codegen.runs.events.contacts import in_first_modes
 from scvi_codegen.runs.stepping.projection import make_consistent
 from scvi_codegen.runs.stepping.state_functions import neither_or_both
 

@@ -25,9 +25,9 @@ REFUSALS = {
 }
 """Messages by the reasons of contacts.h."""
 PARADOX = (
-    "no mode of the contacts is consistent at t = {t:.17g}: Painleve's paradox, rigid bodies with this friction have no "
-    "motion. G M^-1 (G - mu d T)^T = {value:.3g} of contact {k} must be positive: reduce its friction, or change the "
-    "geometry"
+    "no mode of the contacts is consistent at t = {t:.17g}: Painleve's paradox, rigid bodies with this friction have "
+    "no motion. G M^-1 (G - mu d T)^T = {value:.3g} of contact {k} must be positive: reduce its friction, or change "
+    "the geometry"
 )
 REDUNDANT = (
     "no mode of the contacts is consistent at t = {t:.17g}: the contacts are redundant or contradict each other. Use "
@@ -44,11 +44,21 @@ def refusal_of(watch: Any, t: float) -> ContactError | None:
     return ContactError(message.format(t=t, k=contact, value=watch.behind))
 
 
+def check_forward(run: Any) -> None:
+    """Raise :class:`ContactError` for a run backward in time with contacts: what slid before it stuck is unknown."""
+    backward = run.h < 0.0 if run.h is not None else run.plan.t_end < run.t
+    if run.stepper.interface.contacts and backward:
+        raise ContactError("runs with contacts go forward in time: give h > 0, or a final time after the start")
+
+
 def warn_of_choices(watch: Any) -> None:
     """Warn if several modes were consistent at a transition, and if the restitution of an impact was replaced."""
     if getattr(watch, "ambiguous", 0) > 1:
-        message = "up to {} modes of the contacts were consistent at a transition; the run continued in those that stick"
-        warn(f"{message.format(watch.ambiguous)} most", EventWarning)
+        warn(
+            f"up to {watch.ambiguous} modes of the contacts were consistent at a transition; the run continued in "
+            "those that stick most",
+            EventWarning,
+        )
     if getattr(watch, "plastic", 0):
         warn("the restitution of an impact would have created kinetic energy with friction: it was 0", EventWarning)
 
@@ -71,7 +81,7 @@ def in_first_modes(
     watch, numbers = binding.new("watch *"), [binding.pointer(part) for part in (q1, p1, values)]
     status = binding.function("begin_contacts")(watch, t, duration, *numbers, binding.workspace())
     if status:
-        reason = f"the contacts are undefined at t = {t:.17g}, q = {q}: {REASONS[status]}"
+        reason = f"the contacts are undefined at t = {t:.17g}, q = {q!r}: {REASONS[status]}"
         raise refusal_of(watch, t) or ContactError(reason)
     return q1, p1
 
@@ -87,7 +97,7 @@ def mode_names(contacts: tuple[ContactRows, ...], parameters: dict[str, Any]) ->
     return tuple(names)
 
 
-def contact_modes(states: SavedStates) -> list[tuple[float, tuple[str, ...]]]:
+def contact_modes(states: Any) -> list[tuple[float, tuple[str, ...]]]:
     """Return the times from which contacts have modes, and these."""
     stepper: Any = _with_contacts(states)
     starts = [float(states.t[0]), *states.modes.t.tolist()] if states.modes is not None else [float(states.t[0])]
@@ -100,7 +110,7 @@ def contact_modes(states: SavedStates) -> list[tuple[float, tuple[str, ...]]]:
     return result
 
 
-def contact_forces(states: SavedStates) -> Array:
+def contact_forces(states: Any) -> Array:
     """Return (n, contacts, 2) normal and tangential forces; at a transition those after it."""
     stepper: Any = _with_contacts(states)
     contacts, first = stepper.interface.contacts, len(stepper.constraints) - stepper.interface.masked

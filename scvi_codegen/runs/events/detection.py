@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.codegen.native.options import step_failure
 from scvi_codegen.common.errors import EventError, EventWarning, warn
-from scvi_codegen.runs.events.contacts import refusal_of, warn_of_choices
+from scvi_codegen.runs.events.contacts import check_forward, refusal_of, warn_of_choices
 from scvi_codegen.runs.results.saved_states import Array, ModeHistory, SavedStates
 from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.step_plan import Fixed
@@ -111,6 +111,7 @@ class CrossingSearch:
             and the failure that ended the run, or ``None``.
         """
         plan, binding, number = run._plan, self.binding, run.steps
+        check_forward(run)
         most = 2 * size + self._capacity
         crossings, rows = self._buffers  # kept for later calls, as new memory of large states is slow
         if crossings is None or len(crossings) != self._capacity:
@@ -207,7 +208,7 @@ class CrossingSearch:
 
     def modes(self, recorded: Sequence[NDArray[Any]]) -> ModeHistory | None:
         """Return the modes of contacts and kinks along some of the records, the last of which are the latest."""
-        if not (self.changes and self.stepper.interface.mode_names):
+        if not (self.changes and self.stepper.modes):
             return None
         records = self._joined(recorded)
         records = records[records["acted"] != 0]

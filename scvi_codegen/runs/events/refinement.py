@@ -61,6 +61,10 @@ class RefinedSearch(CrossingSearch):
 
     def __init__(self, stepper: Any, watch: Any = None, *, terminal: bool = True) -> None:
         super().__init__(stepper._in_double, watch, terminal=terminal)
+        if self.changes and self.stepper.modes:
+            raise EventError(
+                f"an event sets '{self.stepper.modes[0]}': events that set parameters require precision='double'"
+            )
         self.precise, self.refined = stepper, list[RefinedCrossing]()
         self._partial: Memory | None = None  # run of partial steps
 

@@ -52,7 +52,7 @@ def states_and_steps_at(states: SavedStates, times: Array) -> tuple[Array, Array
     lengths, fixed, several = states.step_sizes[:-1], isinstance(states.plan, FixedSteps), False
     if states.stepper.divides_steps:
         several = not (np.abs(np.diff(states.t)) < 1.5 * np.abs(lengths)).all()
-        several |= getattr(states, "modes", None) is None and bool(states.stepper.interface.mode_names)  # not known
+        several |= getattr(states, "modes", None) is None and bool(states.stepper.modes)  # not known
     if several or (not fixed and np.isnan(lengths).any()):
         return *_integrate_to_each(states, left, times, states.plan), times
     t, q, p = states.t[left], states.q[left], states.p[left]
@@ -109,7 +109,7 @@ def _take_partial_steps(states: SavedStates, t: Array, h: Array, q: Array, p: Ar
     numbers, iterations = np.flatnonzero(h), 0
     for k, begin, length in zip(numbers.tolist(), t[numbers].tolist(), h[numbers].tolist(), strict=True):
         q_k, p_k = q_start + k * m, p_start + k * m
-        if states.stepper.interface.mode_names:
+        if states.stepper.modes:
             parameters = binding.pointer(sides := parameters_on_sides(states, begin))  # noqa: F841  (kept for C)
         status = step(begin, length, q_k, p_k, parameters, options, q_k, p_k, report, workspace)
         if status:

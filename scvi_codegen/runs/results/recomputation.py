@@ -13,7 +13,13 @@ from numpy.typing import NDArray
 
 from scvi_codegen.common.errors import ScviCodegenError, StateError
 from scvi_codegen.runs.results.dense_output import whole_steps
-from scvi_codegen.runs.results.saved_states import ROUNDINGS, STEP_END_TOLERANCE, Array, SavedStates
+from scvi_codegen.runs.results.saved_states import (
+    ROUNDINGS,
+    STEP_END_TOLERANCE,
+    Array,
+    SavedStates,
+    parameters_on_sides,
+)
 from scvi_codegen.systems.event import Crossings
 
 SAME_STEP_SIZE = 1e-9
@@ -32,7 +38,6 @@ def work_and_impulses_until(states: SavedStates) -> Array:
     """
     stepper = states.stepper
     values = [np.zeros(1)]  # of the first state; the number of impulses of arrays is known after a step
-    step = partial(stepper.work_and_impulses, parameters=states.parameters, options=states.options)
     ends = np.concatenate([states.q, states.p], axis=1)
     for crossings, rows in changes_by_events(states):
         ends[rows] = np.concatenate([crossings.q, crossings.p], axis=1)
@@ -42,6 +47,7 @@ def work_and_impulses_until(states: SavedStates) -> Array:
     ):
         count, q, p = steps_between(length, span), states.q[k], states.p[k]
         total = values[-1]
+        step = partial(stepper.work_and_impulses, parameters=parameters_on_sides(states, start), options=states.options)
         for j in range(count):
             q, p, output = step(q, p, length if count > 1 else span, start + j * length)
             total = total + output
@@ -124,9 +130,9 @@ def exchanged_energy(states: Any, energy: Array) -> Array | None:
     before = stepper._states.missing((len(energy),))  # before the first event at a time
     try:
         for crossings, rows in changes_by_events(states):
-            for row, value in zip(
-                rows, stepper.energy(crossings.q, crossings.p, crossings.t, states.parameters), strict=True
-            ):
+            states_before = zip(rows.tolist(), crossings.q, crossings.p, crossings.t.tolist(), strict=True)
+            for row, q, p, t in states_before:
+                value = stepper.energy(q, p, t, parameters_on_sides(states, float(states.t[row - 1])))
                 if not abs(value - energy[row - 1]) >= abs(before[row] - energy[row - 1]):  # NaN: none
                     before[row] = value
         exchanged = np.where(np.isfinite(before), energy - before, 0.0)

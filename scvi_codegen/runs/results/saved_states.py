@@ -86,11 +86,11 @@ class SavedStates:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModeHistory:
-    """Modes of contacts and kinks along a run.
+    """Values of ``stepper.modes`` along a run: parameters that events set, modes of contacts and of kinks.
 
     Attributes:
         t: (k,) times of changes, in the order of the run.
-        values: (k + 1, modes) values of the last parameters before the first change and after each.
+        values: (k + 1, modes) values before the first change and after each.
     """
 
     t: Array
@@ -100,6 +100,15 @@ class ModeHistory:
         """Return (modes,) values after time t; ``forward`` is -1 for a run backward in time."""
         changes = int(np.searchsorted(forward * self.t, forward * t, side="right"))
         return np.asarray(self.values[changes])
+
+    def between(self, low: float, high: float) -> ModeHistory:
+        """Return the history between two times, low <= high."""
+        inside = np.flatnonzero((low <= self.t) & (self.t <= high))
+        if not len(inside):  # no change since the last one before
+            earlier = (self.t < low) if not len(self.t) or self.t[0] <= self.t[-1] else (self.t > high)
+            last = int(np.count_nonzero(earlier))
+            return ModeHistory(self.t[:0], self.values[last : last + 1])
+        return ModeHistory(self.t[inside], self.values[inside[0] : inside[-1] + 2])
 
     @classmethod
     def joined(cls, histories: Sequence[ModeHistory]) -> ModeHistory:
@@ -114,7 +123,7 @@ def parameters_on_sides(states: SavedStates, t: float) -> Array:
     if modes is None:
         return states.parameters
     parameters = states.parameters.copy()
-    parameters[len(parameters) - modes.values.shape[1] :] = modes.at(t, states.forward)
+    parameters[[*map(states.stepper.parameters.index, states.stepper.modes)]] = modes.at(t, states.forward)
     return parameters
 
 

@@ -25,7 +25,7 @@ from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepping.array_binding import ArrayBinding, EventBinding
 from scvi_codegen.runs.stepping.array_interface import RunSizes, check_few_coordinates
 from scvi_codegen.runs.stepping.features import Support, check_features, require
-from scvi_codegen.systems.event import Event, EventLike, Kink, Transition, as_events
+from scvi_codegen.systems.event import Event, EventLike, Kink, Transition, as_events, modes_of
 
 MOST_EVENT_SETS = 16
 """Number of event sets whose compiled integrators are cached, so that repeated calls do not parse formulas again."""
@@ -84,6 +84,7 @@ class CompiledMethod:
         fallback: source with Newton's iteration, if the main source contains only the fixed-point iteration.
         events: events that every run records.
         searched: functions whose zeros every run locates: of the events, the contacts and the kinks of the system.
+        modes: names of the parameters that runs change: by events, as modes of contacts, and of kinks.
         divides_steps: whether steps end at zeros: of events that change the state, transitions and kinks.
         changes_states: whether an event changes the states of runs.
         in_tau: whether the system is one in transformed time, whose steps are steps of tau.
@@ -116,6 +117,7 @@ class CompiledMethod:
         )
         kinks = (Kink(function, mode=mode) for mode, function in interface.modes)
         self.searched: tuple[Event, ...] = (*events, *transitions, *kinks)
+        self.modes = modes_of(events, interface.parameters, interface.mode_names)
         self.changes_states = any(event.changes_state for event in events)
         self.divides_steps = self.changes_states or bool(interface.mode_names)
         self.origin, self.problem, self._of_sizes, self._reason = origin, problem, of_sizes, reason

@@ -63,6 +63,7 @@ PROPERTIES: dict[str, Callable[[Any], bool]] = {
     "with constraints of arrays by a composition": lambda stepper: bool(
         stepper.interface.layout.constraints and stepper.interface.method.startswith("composition")
     ),
+    "with events that set parameters": lambda stepper: len(stepper.modes) > len(stepper.interface.mode_names),
     "with contacts": lambda stepper: stepper.interface.masked > 0,
     "without constraints": lambda stepper: not (stepper.interface.constraints or stepper.interface.layout.constraints),
     "with the long steps of this method": lambda stepper: not stepper.interface.method.startswith(SHORT_STEPS),
@@ -136,6 +137,7 @@ FEATURES = {
             "error device observe_ensemble check_growth hessian chaos_ensemble flow advice shadow_energy",
             "make them terminal and restart",
         ),
+        ("with events that set parameters", _DERIVATIVES, "make them terminal, and restart with the new parameters"),
         (
             "with contacts",
             f"error check_growth device observe_ensemble {_DERIVATIVES} hessian advice",

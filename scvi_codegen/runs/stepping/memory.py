@@ -286,8 +286,15 @@ class Memory:
 
     @property
     def parameters(self) -> Array:
-        """(k,) values in the order of ``stepper.parameters``."""
-        return self._parameters.copy()
+        """(k,) values in the order of ``stepper.parameters``, with those that events have set."""
+        return self._with_set_by_events(self._parameters.copy())
+
+    def _with_set_by_events(self, values: Array) -> Array:
+        """Put the parameters that events have set among the values of all."""
+        own = len(self.stepper.modes) - len(self.stepper.interface.mode_names)  # modes of contacts and kinks follow
+        if own and self._watch is not None and self._watch.begun:
+            values[[*map(self.stepper.parameters.index, self.stepper.modes[:own])]] = list(self._watch.mode)[:own]
+        return values
 
     @property
     def options(self) -> SolverOptions | None:
@@ -337,7 +344,7 @@ class Memory:
             check_max_step(plan, self.t, interface.words)
         missing = inputs_not_given(interface, parameters)
         if parameters is not None:
-            self._set_parameters(self.stepper._parameters(parameters, self._parameters))
+            self._set_parameters(self.stepper._parameters(parameters, self.parameters))
             self._unset_inputs = tuple(name for name in self._unset_inputs if name in missing)
         if h is not None and checked_step(h) != self._memory.h:
             self.plan = Fixed(checked_step(h))
@@ -369,7 +376,7 @@ class Memory:
         """Set parameter values; raise ``StateError`` if position constraints jump."""
         if self.stepper.interface.constraints:
             check_reachable(self.stepper, self.q, self.p, self.t, values)
-        if self.stepper.interface.contacts and self._watch is not None:
+        if self.stepper.modes and self._watch is not None:
             self._watch.begun = 0  # forces may jump: the modes follow from the state
         self._parameters[:] = values
         self._has_defaults = False

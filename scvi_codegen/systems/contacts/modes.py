@@ -183,6 +183,6 @@ class _Binding:
             transitions["stops"] = direction * slip + 1 - cast("Symbol", direction) ** 2
             transitions["backward"] = sticks * (held - tau) + 1 - sticks  # slip begins against the force
             transitions["forward"] = sticks * (held + tau) + 1 - sticks
-        names = (x and x.name for x in (closed, sticks, direction))
+        closed_name, sticks_name, direction_name = (x and x.name for x in (closed, sticks, direction))
         functions = tuple((kind, self.system.text_of(function)) for kind, function in transitions.items())
-        return ContactRows(normal, tangential, *names, functions)
+        return ContactRows(normal, tangential, closed_name, sticks_name, direction_name, functions)

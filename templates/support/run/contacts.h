@@ -3,12 +3,12 @@
 
 /* Contacts: the modes of a run, which transitions change at their located times.
  *
- * With the rows r of all contacts (gaps g, slips w) the second rates are r'' = b + W f for the forces f of the rows, W =
- * G M^-1 G^T. In a mode forces are unknown at the gaps of closed contacts and at the slips of sticking ones, where r'' =
- * 0; sliding adds -mu d times the normal force at the slip. A mode is consistent if normal forces are >= 0, open
- * contacts have g'' >= 0, sticking ones |tau| <= mu_s lambda, and slip that begins w' d > 0. With friction none (P.
- * Painleve, C. R. Acad. Sci. 121, 1895; F. Genot & B. Brogliato, Eur. J. Mech. A 18, 1999) or several may be. Impacts
- * obey the same conditions for impulses and velocities (C. Glocker, Set-Valued Force Laws, 2001). Requires:
+ * With the rows r of all contacts (gaps g, slips w) the second rates are r'' = b + W f for the forces f of the rows,
+ * W = G M^-1 G^T. In a mode forces are unknown at the gaps of closed contacts and at the slips of sticking ones, where
+ * r'' = 0; sliding adds -mu d times the normal force at the slip. A mode is consistent if normal forces are >= 0, open
+ * contacts have g'' >= 0, sticking ones |tau| <= mu_s lambda, and slip that begins w' d > 0. With friction none
+ * (P. Painleve, C. R. Acad. Sci. 121, 1895; F. Genot & B. Brogliato, Eur. J. Mech. A 18, 1999) or several may be.
+ * Impacts obey the same conditions for impulses and velocities (C. Glocker, Set-Valued Force Laws, 2001). Requires:
  * parts/contacts.c.jinja. */
 enum {
   CONTACTS_AT_ONCE = 6, /* largest number of contacts whose modes are enumerated */
@@ -18,7 +18,6 @@ enum {
 
 #define CONTACT_ROUNDING 1e-10 /* part of their size below which gaps, rates and forces count as 0 */
 #define CONTACT_PENETRATION 1e-9 /* part of its size by which a gap may be negative at a start */
-#define CONTACT_STEPS 1000.0 /* parts of a run of adaptive steps by which gaps are measured at its start */
 #define CONTACT_MISSED 128.0 /* effects of rounding beyond which a negative gap shows a missed transition */
 #define CONTACT_DEPENDENT 1e-12 /* part of a column below which a pivot counts as 0 */
 #define CONTACT_GAIN 1e-9 /* part of the work of an impact by which energy may grow */
@@ -86,16 +85,19 @@ static void put_mode(const contact_places *at, contact_mode mode, real *modes)
 
 static int terms_at(const event_step *step, const event_sample *at, contact_terms *of)
 {
-  real idle[PARAMETERS], imposed[PARAMETERS], *const v = step->memory + 3 * M, power = 0.0;
+  real idle[PARAMETERS], imposed[PARAMETERS], mode[EVENT_MODES], *const v = step->memory + 3 * M, power = 0.0;
   const real duration = fabs(step->whole);
   real *const numbers = of->numbers;
   int status;
   memcpy(idle, step->own, BYTES(PARAMETERS));
   memcpy(imposed, step->own, BYTES(PARAMETERS));
-  for (int k = 0; k < EVENT_CONTACTS; k++) {
-    put_mode(CONTACTS + k, CONTACT_IS_OPEN, idle + FIRST_MODE);
-    put_mode(CONTACTS + k, CONTACT_STICKS, imposed + FIRST_MODE);
-  }
+  memcpy(mode, step->watch->mode, sizeof mode);
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    put_mode(CONTACTS + k, CONTACT_IS_OPEN, mode);
+  put_modes(mode, idle);
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    put_mode(CONTACTS + k, CONTACT_STICKS, mode);
+  put_modes(mode, imposed);
   status = NAME(contact_terms)(at->t, at->q, at->p, idle, imposed, numbers, step->workspace);
   if (status == OK)
     status = NAME(velocity)(at->t, at->q, at->p, idle, v, step->workspace);
@@ -152,7 +154,8 @@ static int eliminate(real (*line)[CONTACT_ROWS + 1], int count)
 
 /* Solves for the forces of the rows in given modes with after = right + W f = 0 in imposed rows; returns 0 if these are
  * dependent. */
-static int solve_contacts(const contact_terms *of, const contact_mode *mode, const real *right, real *force, real *after)
+static int solve_contacts(const contact_terms *of, const contact_mode *mode, const real *right, real *force,
+    real *after)
 {
   real matrix[CONTACT_ROWS][CONTACT_ROWS + 1], oblique[CONTACT_ROWS] = {0.0};
   int row[CONTACT_ROWS], along[CONTACT_ROWS], count = 0; /* imposed rows, and the slips of those that slide */
@@ -248,7 +251,8 @@ static int is_consistent(const contact_terms *of, const contact_mode *mode, cons
       return 0;
     if (!mode[k].closed || slip < 0)
       continue;
-    if (mode[k].sticks && (fabs(force[slip]) - friction_limit(of, k, 1, force)) * of->W[slip * (CONTACT_ROWS + 1)] > small)
+    if (mode[k].sticks &&
+        (fabs(force[slip]) - friction_limit(of, k, 1, force)) * of->W[slip * (CONTACT_ROWS + 1)] > small)
       return 0;
     if (!mode[k].sticks && now->begins[k] && d * second[slip] < -small)
       return 0;
@@ -282,8 +286,8 @@ static int refuse_modes(const event_step *step, const contact_terms *of, contact
   return refuse(step, CONTACT_WITHOUT_MODE, -1, 0.0);
 }
 
-/* Sets the consistent modes at a state that stick most: the first of those with the least sum of 2 for each contact that
- * does not stick, less 1 for each that is closed. */
+/* Sets the consistent modes at a state that stick most: the first of those with the least sum of 2 for each contact
+ * that does not stick, less 1 for each that is closed. */
 static int choose_modes(const event_step *step, const contact_terms *of, contact_change *now)
 {
   contact_mode option[EVENT_CONTACTS][CONTACT_OPTIONS], mode[EVENT_CONTACTS], best[EVENT_CONTACTS];
@@ -319,7 +323,7 @@ static int choose_modes(const event_step *step, const contact_terms *of, contact
   step->watch->ambiguous = consistent > step->watch->ambiguous ? consistent : step->watch->ambiguous;
   for (int k = 0; k < EVENT_CONTACTS; k++)
     put_mode(CONTACTS + k, best[k], step->watch->mode);
-  memcpy(step->own + FIRST_MODE, step->watch->mode, BYTES(EVENT_MODES));
+  put_modes(step->watch->mode, step->own);
   return OK;
 }
 
@@ -511,7 +515,7 @@ static int begin_contacts(const event_step *step, event_sample *at)
   memset(&now, 0, sizeof now);
   for (int k = 0; k < EVENT_CONTACTS; k++)
     put_mode(CONTACTS + k, CONTACT_IS_OPEN, step->watch->mode);
-  memcpy(step->own + FIRST_MODE, step->watch->mode, BYTES(EVENT_MODES));
+  put_modes(step->watch->mode, step->own);
   status = terms_at(step, at, &of);
   for (int k = 0; status == OK && k < EVENT_CONTACTS; k++) {
     const int row = CONTACTS[k].normal;
@@ -521,7 +525,6 @@ static int begin_contacts(const event_step *step, event_sample *at)
   }
   if (status == OK)
     status = change_modes(step, at, &now);
-  step->watch->begun = status == OK;
   return status;
 }
 

@@ -16,6 +16,7 @@ enum {
   CHANGE_GAPS = 8 /* intervals between hits from which their accumulation is estimated */
 };
 
+#define CONTACT_STEPS 1000.0 /* parts of a run of adaptive steps by which gaps are measured at its start */
 #define CHANGE_WHOLE 1e-9 /* relative to a step: a difference of its end from t_end that is rounding */
 #define CHANGE_RATIO 1e-3 /* relative spread of the ratios of intervals that accumulate */
 #define CHANGE_REST 1e-8 /* relative to the time since the first of them: remaining time at which a contact closes */
@@ -389,19 +390,27 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
   return status;
 }
 
-#ifdef EVENT_CONTACTS
-/* First modes of contacts of a run; gaps are measured by their change in a duration. */
+#ifdef EVENT_MODES
+/* First modes of a run, those of contacts by its state, whose gaps are measured by their change in a duration. */
 static int begin_run(event_run *run, event_step *step, real duration)
 {
+  int status = OK;
+  for (int k = 0; k < EVENT_MODES; k++)
+    step->watch->mode[k] = step->own[MODE_PLACE[k]];
+#ifdef EVENT_CONTACTS
   event_sample at = {.t = run->t, .q = step->memory + 9 * M, .p = step->memory + 10 * M};
-  int status;
   copy_state(at.q, at.p, run->q, run->p);
   step->whole = step->h = duration;
   status = begin_contacts(step, &at);
   if (status == OK && (memcmp(at.q, run->q, BYTES(M)) != 0 || memcmp(at.p, run->p, BYTES(M)) != 0))
     set_run(run, run->t, &at);
+#endif
+  (void)run, (void)duration;
+  step->watch->begun = status == OK;
   return status;
 }
+#endif
+#ifdef EVENT_CONTACTS
 
 int NAME(begin_contacts)(event_watch *watch, real t, real duration, real *q, real *p, const real *parameters,
     real *workspace)
@@ -413,6 +422,8 @@ int NAME(begin_contacts)(event_watch *watch, real t, real duration, real *q, rea
   const event_step step = {t, duration, duration, q, p, own, NULL, watch, NULL, 0, NULL, &report, workspace, memory,
       memory + 15 * M, 0, &horizon, own};
   memcpy(own, parameters, BYTES(PARAMETERS));
+  for (int k = 0; k < EVENT_MODES; k++)
+    watch->mode[k] = own[MODE_PLACE[k]];
   return begin_contacts(&step, &at);
 }
 #endif
@@ -470,7 +481,8 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
 #ifdef EVENT_MODES
   real own[PARAMETERS];
   memcpy(own, parameters, BYTES(PARAMETERS));
-  memcpy(own + FIRST_MODE, watch->mode, BYTES(EVENT_MODES));
+  if (watch->begun)
+    put_modes(watch->mode, own);
   parameters = own;
 #else
   real *const own = NULL;
@@ -489,10 +501,10 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
         memory, memory + 15 * M, 0, &horizon, own};
     real size;
     int count = 0;
-#ifdef EVENT_CONTACTS
+#ifdef EVENT_MODES
     if (!watch->begun)
       status = begin_run(run, &step, control ? (t_end - run->t) / CONTACT_STEPS : run->h);
-    memcpy(own + FIRST_MODE, watch->mode, BYTES(EVENT_MODES));
+    put_modes(watch->mode, own);
 #endif
     keep_run(&before, run, step.values + (long long)EVENT_VALUES * EVENTS);
 #ifdef EVENT_KINKS

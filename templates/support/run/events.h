@@ -39,6 +39,15 @@ enum {
 #define SIDE_OF(watch, kink) ((watch)->mode[FIRST_SIDE + (kink)])
 #define FUNCTION_OF(crossing) ((int)(EVENT_FIRST[(crossing)->function] + (crossing)->element))
 
+#ifdef EVENT_MODES
+/* Puts modes among the parameters of steps. */
+static void put_modes(const real *mode, real *parameters)
+{
+  for (int k = 0; k < EVENT_MODES; k++)
+    parameters[MODE_PLACE[k]] = mode[k];
+}
+#endif
+
 /* Side of a kink by its function e, > 0 or < 0; 0 for other functions, and without sides. */
 static inline real side_at_start(const event_watch *watch, int e)
 {

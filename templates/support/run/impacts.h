@@ -192,13 +192,13 @@ static int impact(const event_step *step, event_sample *at, const event_entries 
   return status == OK ? satisfy_constraints(step, at->t, at->q, at->p, 0) : status;
 }
 
-/* Sets the variables of a map to its values; velocities are set last, by their momenta. */
+/* Sets the variables of a map to its values, modes too; velocities are set last, by their momenta. */
 static int apply_map(const event_step *step, event_sample *at, const event_entries *map)
 {
   real *const v = step->memory + 3 * M;
   int by_velocity = 0, status = OK;
   for (int i = 0; i < map->count; i++)
-    by_velocity |= map->place[i] >= 2 * M;
+    by_velocity |= map->place[i] >= 2 * M && map->place[i] < 3 * M;
   if (by_velocity)
     status = NAME(velocity)(at->t, at->q, at->p, step->parameters, v, step->workspace);
   for (int i = 0; i < map->count; i++)
@@ -206,8 +206,15 @@ static int apply_map(const event_step *step, event_sample *at, const event_entri
       at->q[map->place[i]] = map->value[i];
     else if (map->place[i] < 2 * M)
       at->p[map->place[i] - M] = map->value[i];
+#ifdef EVENT_MODES
+    else if (map->place[i] >= 3 * M)
+      step->watch->mode[map->place[i] - 3 * M] = map->value[i];
+#endif
     else
       v[map->place[i] - 2 * M] = map->value[i];
+#ifdef EVENT_MODES
+  put_modes(step->watch->mode, step->own);
+#endif
   return by_velocity && status == OK
       ? NAME(momentum)(at->t, at->q, v, step->parameters, at->p, step->workspace)
       : status;

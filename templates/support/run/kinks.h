@@ -2,7 +2,7 @@
 
 /* Kinks: zeros of u in unit_step(u + mode). A step has one mode, so that its equations are smooth beyond u = 0, too; at
  * the zero of u the side changes and a new part of the step begins. Requires: EVENT_KINKS, FIRST_KINK, FIRST_SIDE,
- * FIRST_MODE, events.h. */
+ * MODE_PLACE, events.h. */
 static int is_kink(int event)
 {
 #ifdef EVENT_KINKS
@@ -34,7 +34,7 @@ enum {
 /* Sets the side of a kink in the search and in the parameters of its steps. */
 static void set_side(const event_step *step, int kink, int side)
 {
-  SIDE_OF(step->watch, kink) = step->own[FIRST_MODE + FIRST_SIDE + kink] = side * KINK_SIDE;
+  SIDE_OF(step->watch, kink) = step->own[MODE_PLACE[FIRST_SIDE + kink]] = side * KINK_SIDE;
 }
 
 /* Whether the function of a kink is one of time alone, whose zeros do not depend on the state. */
@@ -86,7 +86,7 @@ static int settle_sides(const event_step *step, const event_sample *at, int *unk
   for (int k = 0; status == OK && k < EVENT_KINKS; k++) {
     const real g = value[EVENT_FIRST[FIRST_KINK + k]], side = SIDE_OF(step->watch, k);
     step->watch->acts[FIRST_KINK + k] = 1;
-    step->own[FIRST_MODE + FIRST_SIDE + k] = side;
+    step->own[MODE_PLACE[FIRST_SIDE + k]] = side;
     doubtful |= !((g > 0.0 && side > 0.0) || (g < 0.0 && side < 0.0));
   }
   if (status == OK && doubtful)
