@@ -163,7 +163,7 @@ def contact(
 ) -> Contact:
     """Return a unilateral contact of a system in the plane: gap >= 0 with normal force and Coulomb friction.
 
-    The gap must be a distance to first order, |g_q| = 1 in the units of the slip, because friction is mu times the
+    The gap must be a distance to first order, ``|g_q| = 1`` in the units of the slip, because friction is mu times the
     normal *force*: of a curve ``z - x**2/2`` divide by ``sqrt(1 + x**2)``.
 
     Args:

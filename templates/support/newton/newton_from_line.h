@@ -17,7 +17,8 @@ static int line_from(const step_data *step, newton_data *data)
  * have no error estimate that shows it. Roots that take few iterations are near the initial guess. Others are computed
  * again by continuation in the step size (Deuflhard, Newton Methods for Nonlinear Problems, sec. 5.1): from the stages
  * at one size to those at a larger one, in few iterations each. */
-#define NEARBY_ITERATIONS 8 /* of Newton's method, to a root near the initial guess */
+/* Iterations to a root near the initial guess: with frozen factors multipliers converge after positions. */
+#define NEARBY_ITERATIONS (SITES > M ? 12 : 8)
 #define LEAST_ADVANCE REAL(0.00390625) /* of the step size: the branch ends, or turns back */
 
 /* Follows the branch from the stages at the line to those at step->h, with the results of newton. Returns

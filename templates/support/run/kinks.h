@@ -127,14 +127,16 @@ static int signs_after(const event_step *step, const event_sample *at, real leng
 }
 
 /* Sides of the kinks at whose zeros a run starts: those after a small part of its first step by the formula. A function
- * that stays within rounding has the side 1, as unit_step(0) = 1. */
+ * that stays within rounding has the side of its value, 1 for 0 as unit_step(0) = 1: another sign is a crossing. */
 static int sides_after_start(const event_step *step, const event_sample *at, real length)
 {
   int sign[EVENT_KINKS];
   const int status = signs_after(step, at, length, sign);
   for (int k = 0; status == OK && k < EVENT_KINKS; k++)
-    if (SIDE_OF(step->watch, k) == 0.0)
-      set_side(step, k, sign[k] < 0 ? -1 : 1);
+    if (SIDE_OF(step->watch, k) == 0.0) {
+      const real value = values_at(step, 0)[EVENT_FIRST[FIRST_KINK + k]];
+      set_side(step, k, sign[k] < 0 || (sign[k] == 0 && value < 0.0) ? -1 : 1);
+    }
   return status;
 }
 

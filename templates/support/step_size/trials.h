@@ -261,12 +261,14 @@ HOT void try_step(run_memory *run, trial *now, real least, const solver_options 
 #endif
 #ifdef NEWTON_ADMITTED
   now->fallbacks = 0;
-  if (run->avoiding < TRIED_AGAIN)
+  if (run->avoiding < TRIED_AGAIN) {
     now->error = larger(attempt_by_newton(now, options, report), least);
-  else
+    now->iterations = report->iterations - now->iterations;
+    return;
+  }
 #endif
-    now->error = ATTEMPT(options, run, &now->step, &now->data, now->last, now->last ? 0 : now->inside, &now->guess,
-        now->dq, now->dp, &now->limits, least, options, report);
+  now->error = ATTEMPT(options, run, &now->step, &now->data, now->last, now->last ? 0 : now->inside, &now->guess,
+      now->dq, now->dp, &now->limits, least, options, report);
   now->iterations = report->iterations - now->iterations;
 #ifdef RATTLE
   now->fallbacks = report->fallback_steps - now->fallbacks;
