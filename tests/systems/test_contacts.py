@@ -221,7 +221,7 @@ def test_a_block_on_a_slope_creeps_nowhere() -> None:
         assert slides or not run.q.any()
 
 
-LOW = pytest.mark.xfail(raises=sc.EventError, strict=True, reason="bounces below the rounding of y are not rest")
+LOW = pytest.mark.xfail(raises=sc.EventWarning, strict=True, reason="bounces below the rounding of y are not rest")
 
 
 @pytest.mark.parametrize("floor", [0, pytest.param(0.5, marks=LOW)])
@@ -351,13 +351,14 @@ def test_three_contacts_of_a_woodpecker_lead_to_its_cycle() -> None:
     )
     passes = sc.Event("s + 0.2788", direction=-1)
     run = sc.compile_stepper(system, "svi:4").integrate(
-        [0, -0.6 / 5.8, -0.2788], velocity=[-0.3411, 0, -7.4583], t_end=3, tolerance=1e-10, events=passes
+        [0, -0.6 / 5.8, -0.2788], velocity=[-0.3411, 0, -7.4583], t_end=5, tolerance=1e-10, events=passes
     )
     (cycle,) = run.events
     ends = run.stepper.velocity(cycle.q[-2:], cycle.p[-2:], cycle.t[-2:])
-    assert len(cycle) >= 20
-    assert ends.mean(axis=0) == pytest.approx([-0.3411, 0, -7.4583], rel=6e-3, abs=1e-9)
-    assert np.diff(cycle.t[-3:]).mean() == pytest.approx(0.14598, abs=1e-5)
+    assert len(cycle) >= 33
+    # by DOP853 between events, 70 pecks; published (-0.3411, 0, -7.4583)
+    assert ends.mean(axis=0) == pytest.approx([-0.3394786, 0, -7.4620946], rel=2e-6, abs=1e-9)
+    assert np.abs(cycle.t - 2.9194720658).min() < 2e-9
     assert {modes[1] for _, modes in run.contact_modes} == {"open", "stick", "slip"}
 
 

@@ -89,7 +89,7 @@ def warn_of_error_growth(
     plan = run._plan
     if requested is False or not isinstance(plan, Adaptive) or len(states.t) < 2 or not warnings_wanted():
         return
-    if run.stepper.changes_states or run.stepper.interface.words > 1:
+    if not _continuous_in_double(run.stepper):
         return
     measured = run._growth
     if measured is not None and not requested:
@@ -99,6 +99,11 @@ def warn_of_error_growth(
         return
     if requested or run.steps * DECADES_PER_STEP >= _thresholds(plan.admissible_error)[2]:
         _Repetition(run, states, advance_until).warn(requested=bool(requested))
+
+
+def _continuous_in_double(stepper: Integrator) -> bool:
+    """Return whether runs have a tangent vector in double: without events that change the state, and contacts."""
+    return stepper.interface.words == 1 and not stepper.changes_states and not stepper.interface.masked
 
 
 def measured_growth(stepper: Integrator, plan: StepPlan, requested: bool | None) -> int:
@@ -115,8 +120,12 @@ def measured_growth(stepper: Integrator, plan: StepPlan, requested: bool | None)
                 "check_growth=True requires adaptive steps, but the step size is fixed: give t_end without h, or omit "
                 "check_growth"
             )
-    double = stepper.interface.words == 1 and not stepper.changes_states
-    if requested is not None or not isinstance(plan, Adaptive) or not double or not warnings_wanted():
+    if (
+        requested is not None
+        or not isinstance(plan, Adaptive)
+        or not _continuous_in_double(stepper)
+        or not warnings_wanted()
+    ):
         return 0
     return SOME_STEPS if plan.tolerance is None or plan.tolerance <= LOOSE_TOLERANCE else ALL_STEPS
 
