@@ -140,6 +140,7 @@ from scvi_codegen.systems.event import Crossings as Crossings
 from scvi_codegen.systems.event import Event as Event
 from scvi_codegen.systems.event import impact as impact
 from scvi_codegen.systems.first_order import FirstOrderSystem as FirstOrderSystem
+from scvi_codegen.systems.formulas.table import Table as Table
 from scvi_codegen.systems.hamiltonian import HamiltonianSystem as HamiltonianSystem
 from scvi_codegen.systems.lagrangian import LagrangianSystem as LagrangianSystem
 from scvi_codegen.systems.legendre.transform import hamiltonian_of as hamiltonian_of

@@ -20,9 +20,10 @@ as CasADi expressions.
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -82,6 +83,7 @@ from scvi_codegen.systems.derived_systems import with_tangent_vectors
 from scvi_codegen.systems.event import EventLike, Kink, as_events
 from scvi_codegen.systems.formulas.expressions import gradient_tuple
 from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED
+from scvi_codegen.systems.formulas.tables import tables_in
 from scvi_codegen.systems.kinks import located_kinks
 from scvi_codegen.systems.legendre.of_arrays import SiteHamiltonian, site_hamiltonian
 from scvi_codegen.systems.legendre.transform import energy_of_states, equivalent_lagrangian
@@ -186,6 +188,12 @@ def describe(
         energy_parameter=system.clock.energy.name if system.clock else None,
         solver=_solver_of(program),
         variables=tuple(variable.name for variable in getattr(system, "variables", ())),
+        ranges=tuple(
+            (system.text_of(value), system.text_of(argument), repr(x[0]), repr(x[-1]))
+            for value in tables_in(system.lagrangian, *system.forces, *system.constraints)
+            if (table := value.function.table).outside == "refuse"
+            for argument, x in zip(value.arguments, table.axes, strict=True)
+        ),
     )
 
 
@@ -197,6 +205,7 @@ def _interface(system: MechanicalSystem, method: Method, **of_kind: Any) -> Inte
         method=method.name,
         parameters=tuple(parameter.name for parameter in system.parameters),
         defaults=system.defaults,
+        functions=tuple((name, json.dumps(asdict(table))) for name, table in system.functions),
         inputs=system.inputs,
         changes_energy=system.changes_energy or inputs_act,
         balances_energy=system.balances_energy,

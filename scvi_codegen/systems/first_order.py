@@ -239,7 +239,9 @@ def first_order_system(fields: Mapping[str, Any]) -> FirstOrderSystem | None:
     if problem := irregularity(lagrangian, f"the Lagrangian of '{name}'", moving, velocities, constants):
         raise SystemDefinitionError(problem)
     form = OneForm(name, lagrangian, coordinates, velocities, fields["time"])
-    common = {key: fields[key] for key in ("name", "time", "parameters", "defaults", "inputs") if key in fields}
+    common = {
+        key: fields[key] for key in ("name", "time", "parameters", "defaults", "functions", "inputs") if key in fields
+    }
     inputs = fields.get("inputs", ())
     shown = format_expression(inputs_by_name(written_out(lagrangian), inputs))
     text = {"coordinates": [q.name for q in coordinates], "lagrangian": shown, **({"inputs": inputs} if inputs else {})}

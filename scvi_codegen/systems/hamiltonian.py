@@ -15,10 +15,13 @@ from typing import TYPE_CHECKING, Any
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import FORMULAS, TEXTS, checks_arguments
+from scvi_codegen.systems.formulas.table import tables_of
 from scvi_codegen.systems.system import MechanicalSystem, zero
 
 if TYPE_CHECKING:
     from sympy import Expr, Symbol
+
+    from scvi_codegen.systems.formulas.table import Table
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,13 +82,14 @@ class HamiltonianSystem(MechanicalSystem):
         inputs: Sequence[str] = (),
         tables: Sequence[str] | Mapping[str, Any] = (),
         neighbours: Mapping[str, Mapping[str, Any]] | None = None,
+        functions: Mapping[str, Table | Mapping[str, Any]] | None = None,
     ) -> HamiltonianSystem | Any:
         """Read H from text of the grammar in :mod:`scvi_codegen.systems.formulas.grammar`.
 
         Arrays are declared and treated as in :meth:`LagrangianSystem.from_text`.
 
         Args:
-            name, coordinates, parameters, damping, inputs, tables, neighbours: as of
+            name, coordinates, parameters, damping, inputs, tables, neighbours, functions: as of
                 :meth:`LagrangianSystem.from_text`.
             hamiltonian: the formula; it may span several lines.
             rotations: as of :meth:`LagrangianSystem.from_text`, but with the name of the angular momentum in the body
@@ -102,7 +106,7 @@ class HamiltonianSystem(MechanicalSystem):
         -p**2/2 + p*q_dot + cos(q)
         """
         arguments = {key: value for key, value in locals().items() if key != "cls"}
-        return cls._of_text(arguments)
+        return cls._of_text({**arguments, "functions": tables_of(functions)})
 
     @classmethod
     @checks_arguments(SystemDefinitionError, inputs=FORMULAS)

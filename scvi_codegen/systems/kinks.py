@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 from scvi_codegen.systems.event import Kink
 from scvi_codegen.systems.formulas.expressions import parts_of_type
-from scvi_codegen.systems.formulas.kinks import switching_function, unit_step
-from scvi_codegen.systems.formulas.modes import Mode
+from scvi_codegen.systems.formulas.intermediates import parts
+from scvi_codegen.systems.formulas.kinks import Mode, switching_function, unit_step
 
 if TYPE_CHECKING:
     from sympy import Expr
@@ -38,7 +38,8 @@ def located_kinks(system: MechanicalSystem) -> tuple[MechanicalSystem, tuple[Kin
     owned = [field.name for field in fields(system) if field.name in FORMULAS]
     formulas = [formula for name in owned for formula in _formulas(getattr(system, name))]
     steps = sorted(parts_of_type(unit_step, *formulas), key=str)
-    located = [step for step in steps if _moves(step, system) and _goes_on(step, formulas)]
+    one_sided = _one_sided(formulas)
+    located = [step for step in steps if _moves(step, system) and step not in one_sided]
     arguments = {switching_function(step.args[0])[0] for step in located}
     if not arguments or len(arguments) > MOST_KINKS or system.clock:
         return system, ()
@@ -74,14 +75,13 @@ def _moves(step: Expr, system: MechanicalSystem) -> bool:
     return not step.free_symbols.issubset(system.parameters)
 
 
-def _goes_on(step: Expr, formulas: Iterable[Expr]) -> bool:
-    """Return whether the formulas of both sides are defined on the other side, too.
+def _one_sided(formulas: Iterable[Expr]) -> set[Expr]:
+    """Return steps whose formulas may be undefined on the other side.
 
-    The base of a power that is not whole, and the arguments of roots, logarithms and inverse functions, may not be.
+    They are in the base of a power that is not whole, or in the argument of a root, logarithm or inverse function.
     """
-    return not any(
-        part.has(step) for formula in formulas for part in formula.atoms(*_domains()) if not _is_whole_power(part)
-    )
+    domains = [part for part in parts(*formulas) if isinstance(part, _domains()) and not _is_whole_power(part)]
+    return parts_of_type(unit_step, *domains)
 
 
 def _domains() -> tuple[type, ...]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import FORMULAS, MAPPED, NAMES, NUMBERS, TEXTS, ArgumentType, checks_arguments
+from scvi_codegen.systems.formulas.table import tables_of
 from scvi_codegen.systems.system import MechanicalSystem, tables_of_contacts, zero
 
 if TYPE_CHECKING:
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
     from scvi_codegen.systems.contact import ContactLike
     from scvi_codegen.systems.formulas.rotations import Reduced
+    from scvi_codegen.systems.formulas.table import Table
 
 LAGRANGES_METHOD = ArgumentType("a LagrangesMethod of sympy.physics.mechanics", lambda value: hasattr(value, "lam_vec"))
 KANES_METHOD = ArgumentType("a KanesMethod of sympy.physics.mechanics", lambda value: hasattr(value, "kindiffdict"))
@@ -99,6 +101,7 @@ class LagrangianSystem(MechanicalSystem):
         inputs: Sequence[str] = (),
         tables: Sequence[str] | Mapping[str, Any] = (),
         neighbours: Mapping[str, Mapping[str, Any]] | None = None,
+        functions: Mapping[str, Table | Mapping[str, Any]] | None = None,
         contacts: Sequence[ContactLike | Mapping[str, Any]] = (),
     ) -> LagrangianSystem | Any:
         """Read L from text of the grammar in :mod:`scvi_codegen.systems.formulas.grammar`.
@@ -137,6 +140,7 @@ class LagrangianSystem(MechanicalSystem):
                 ``{"near": {"of": "r", "cutoff": "c", "box": "L", "skin": 0.3}}``. Lengths are numbers or formulas of
                 parameters; ``box`` is one length or one per component, and absent without a periodic boundary;
                 ``skin`` is by default an eighth of the cutoff (:mod:`scvi_codegen.systems.formulas.neighbours`).
+            functions: tables by name, ``{"F": Table(x, y)}``, which formulas, events and contacts call as ``F(x - 1)``.
             contacts: contacts and dry friction, made by :func:`~scvi_codegen.contact` and
                 :func:`~scvi_codegen.friction`, or tables of their arguments.
 
@@ -152,7 +156,7 @@ class LagrangianSystem(MechanicalSystem):
         chain: L(q[N]) = sum(i in N, q_dot[i]**2/2) + sum(i in N periodic, -k*(q[i+1] - q[i])**2/2)
         """
         arguments = {key: value for key, value in locals().items() if key != "cls"}
-        return cls._of_text({**arguments, "contacts": tables_of_contacts(contacts)})
+        return cls._of_text({**arguments, "contacts": tables_of_contacts(contacts), "functions": tables_of(functions)})
 
     @classmethod
     @checks_arguments(SystemDefinitionError, inputs=FORMULAS, torques=MAPPED, torques_space=MAPPED)

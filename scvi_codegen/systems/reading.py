@@ -13,6 +13,7 @@ from scvi_codegen.systems.checks.definition import warn_of_mistakes
 from scvi_codegen.systems.constraints import constraint_sides, constraints_of, rate_of_positions
 from scvi_codegen.systems.contact import contacts_of, names_in
 from scvi_codegen.systems.forces import damping_rate
+from scvi_codegen.systems.formulas.grammar import named_tables
 from scvi_codegen.systems.formulas.rotations import RotationNames
 from scvi_codegen.systems.formulas.symbols import (
     DOT,
@@ -25,6 +26,7 @@ from scvi_codegen.systems.formulas.symbols import (
     symbol,
     with_inputs,
 )
+from scvi_codegen.systems.formulas.table import functions_of
 from scvi_codegen.systems.formulas.translation import Translation, sympy_expression
 from scvi_codegen.systems.rotations.points import forces_at_points, rotations_of_frames
 from scvi_codegen.systems.system import are_arrays
@@ -61,7 +63,9 @@ def system_from_text(cls: Any, arguments: Mapping[str, Any]) -> tuple[Any, bool]
     check_names(ordinary, (*values, *inputs), momenta, (*names.coordinates, *names.symbols))
     velocities = () if of_momenta else tuple(coordinate + DOT for coordinate in coordinates)
     symbols = {key: symbol(key) for key in (*coordinates, *velocities, *momenta, TIME, *values, *inputs)}
+    functions = functions_of(arguments["functions"])
     symbols |= names.symbols
+    symbols |= named_tables(functions, symbols)
     driven = input_formulas(inputs, symbols[TIME])
 
     def read(text: str) -> Expr:
@@ -79,6 +83,7 @@ def system_from_text(cls: Any, arguments: Mapping[str, Any]) -> tuple[Any, bool]
         momenta=momenta,
         values=values,
         definition=definition_of(arguments) if names.members else {},
+        functions=functions,
         inputs=tuple(inputs),
         **({"contacts": contacts_of(arguments["contacts"])} if arguments.get("contacts") else {}),
     )

@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from scvi_codegen.systems.constraints.kind import Reaction
     from scvi_codegen.systems.contact import ContactLike
     from scvi_codegen.systems.formulas.rotations import Homogeneous, Reduced
+    from scvi_codegen.systems.formulas.table import Table
 
 
 class Deferred:
@@ -174,6 +175,7 @@ class MechanicalSystem(Deferred, ABC):
             (q, v, t) for a Lagrangian and (q, p, t) for a Hamiltonian, or empty (:mod:`scvi_codegen.systems.forces`).
         damping: damping rate gamma of all momenta, a formula of parameters, 0 without damping
             (:mod:`scvi_codegen.systems.forces`).
+        functions: tables by name, which texts of formulas call (:class:`~scvi_codegen.systems.formulas.table.Table`).
         inputs: names of inputs, each represented by five of the parameters
             (:mod:`scvi_codegen.systems.formulas.symbols`).
         constraints: expressions in (q, t), or linear in v, that are 0 along trajectories of a Lagrangian
@@ -200,6 +202,7 @@ class MechanicalSystem(Deferred, ABC):
     constraints: tuple[Expr, ...] = ()
     reactions: tuple[Reaction, ...] = ()
     contacts: tuple[ContactLike, ...] = ()
+    functions: tuple[tuple[str, Table], ...] = ()
     inputs: tuple[str, ...] = ()
     damping: Expr = field(default_factory=zero)
     arrays: tuple[Array, ...] = field(default=(), compare=False)
@@ -320,7 +323,10 @@ class MechanicalSystem(Deferred, ABC):
     @property
     def _common_fields(self) -> dict[str, Any]:
         """Fields that a Lagrangian and its Hamiltonian have in common, by name."""
-        names = "name", "coordinates", "time", "parameters", "defaults", "damping", "inputs", "rotations", "lengths"
+        names = (
+            *("name", "coordinates", "time", "parameters", "defaults"),
+            *("damping", "inputs", "functions", "rotations", "lengths"),
+        )
         return {name: getattr(self, name) for name in names}
 
     @property

@@ -12,6 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from notation import lagrange
 from scipy.integrate import DOP853, solve_ivp
+from scipy.interpolate import make_interp_spline
+
+from scvi_codegen import Table
 
 Array = np.ndarray
 ACCURACY = {"rtol": 3e-14, "atol": 1e-17}
@@ -107,11 +110,13 @@ class Family(NamedTuple):
     lagrangian: str
     forces: dict[str, str]
     motion: Callable[[np.random.Generator], Motion]
+    functions: dict[str, Table] | None = None
 
     def system(self, name: str) -> Any:
         parameters = self.motion(np.random.default_rng(0)).parameters
         origin = {"o": 0.0} if "o" in self.lagrangian else {}
-        return lagrange(name, self.coordinates, self.lagrangian, forces=self.forces, **parameters, m=1.0, **origin)
+        options = {"forces": self.forces, "functions": self.functions}
+        return lagrange(name, self.coordinates, self.lagrangian, **options, **parameters, m=1.0, **origin)
 
 
 def dyadic(number: float) -> float:
@@ -231,6 +236,39 @@ def drag(random):
     return Motion(values, [x], [v], u(3, 10), rate, *laws)
 
 
+TABLES = {
+    "F": Table([-1.5, -0.8, -0.3, 0.4, 0.9, 1.6], [1.1, 0.2, -0.4, 0.5, 0.3, 1.4], degree=3, outside="linear"),
+    "G": Table(
+        ([-1.0, -0.25, 0.5, 1.25], [1.0, 0.375, -0.75]),
+        [[0.5, 1.0, 0.0], [0.25, -0.5, 0.5], [1.0, 0.0, 0.0], [-0.5, 0.5, 1.0]],
+        outside="linear",
+    ),
+}
+
+
+def tables(random):
+    """A mass in a potential of tables: a cubic one of one argument, and a bilinear one of two."""
+    u, spline = numbers(random), make_interp_spline(TABLES["F"].x, TABLES["F"].y, 3)
+    ends, (gx, gy), z = np.unique(spline.t), map(np.array, TABLES["G"].x), np.array(TABLES["G"].y)
+    breaks, j, f = (ends, gx[1:-1], gy[1:-1]), u(0.2, 2.0), u(0.3, 2.0)
+
+    def acceleration(t, q, v, on):
+        c, i, k = (int(sum(part)) for part in np.split(on, np.cumsum([len(b) for b in breaks[:-1]])))
+        middle = ends[[0, -1][c > 0]] if c in (0, len(ends)) else (ends[c - 1] + ends[c]) / 2
+        terms = 1 if c in (0, len(ends)) else 3
+        slope = sum(float(spline(middle, 1 + n)) * (q[0] - middle) ** n / math.factorial(n) for n in range(terms))
+        dx, dy, ((w, x), (y, s)) = gx[i + 1] - gx[i], gy[k + 1] - gy[k], z[i : i + 2, k : k + 2]
+        a, b = (q[0] - gx[i]) / dx, (q[1] - gy[k]) / dy
+        by_x, by_y = ((1 - b) * (y - w) + b * (s - x)) / dx, ((1 - a) * (x - w) + a * (s - y)) / dy
+        return -j * q[0] - f * (slope + by_x), -j * q[1] - f * by_y
+
+    def switching(t, q, v):
+        return [*(q[0] - b for b in breaks[0]), *(q[0] - b for b in breaks[1]), *(q[1] - b for b in breaks[2])]
+
+    x, w = random.choice([(0.5, u(-1, 1)), (u(-1.5, 1.5), 0.0), (-1.5, u(-2, 2))])
+    return Motion({"j": j, "f": f, "a": 1.0}, [x, u(-1, 1)], [w, u(-1, 1)], u(2, 6), 3.0, acceleration, switching)
+
+
 PLANE = "m*(x_dot**2 + y_dot**2)/2"
 PUSHED = "m*x_dot**2/2 - j*(x - o)**2/2"
 FAMILIES = {
@@ -256,6 +294,10 @@ FAMILIES = {
     "ramp": Family("x", PUSHED, {"x": "r*(positive_part(t - t1) - positive_part(t - t2)) - d*x_dot"}, ramp),
     "relay": Family("x", PUSHED, {"x": "f*(1 - 2*unit_step(x - o)) + c"}, relay),
     "drag": Family("x", PUSHED, {"x": "f*cos(w*(t - t0)) - e*x_dot*abs(x_dot)"}, drag),
+    "tables": Family(
+        "x y", f"{PLANE} - j*((x - o)**2 + (y - o)**2)/2 - f*a*(F((x - o)/a) + G((x - o)/a, (y - o)/a))",
+        {}, tables, TABLES,
+    ),
 }  # fmt: skip
 UNITS = {
     "m": (1, 0, 0), "o": (0, 1, 0), "a": (0, 1, 0), "g": (0, 1, -2), "w": (0, 0, -1), "d": (1, 0, -1), "e": (1, -1, 0),

@@ -20,6 +20,7 @@ involve.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -52,10 +53,12 @@ from scvi_codegen.systems.formulas.array_statements import (
 )
 from scvi_codegen.systems.formulas.arrays import ArrayTerm, parse_coordinate, parse_sums
 from scvi_codegen.systems.formulas.expressions import evaluated, unsupported_part
+from scvi_codegen.systems.formulas.grammar import named_tables
 from scvi_codegen.systems.formulas.indices import Access, Array, Loop, Size
 from scvi_codegen.systems.formulas.kinks import rint, unit_step
 from scvi_codegen.systems.formulas.rotations import RotationNames, entries_in_formulas
 from scvi_codegen.systems.formulas.symbols import DOT, TIME, identifier, input_formulas, symbol
+from scvi_codegen.systems.formulas.table import functions_of
 
 DEGREE = 4
 Formula: TypeAlias = "str | Expr | float"
@@ -254,7 +257,12 @@ def _names(interface: Interface) -> dict[str, Symbol]:
     """Return the names that a function may use; coordinates and parameters precede default names of momenta."""
     velocities = [name + DOT for name in interface.coordinates]
     moving = *multiplier_names(interface), *interface.coordinates, *velocities, *interface.momenta
-    return {name: symbol(name) for name in (*moving, TIME, *interface.parameters, *interface.inputs)}
+    named = {name: symbol(name) for name in (*moving, TIME, *interface.parameters, *interface.inputs)}
+    return named | _functions(interface)
+
+
+def _functions(interface: Interface) -> dict[str, Any]:
+    return named_tables(functions_of({name: json.loads(table) for name, table in interface.functions}))
 
 
 def multiplier_names(interface: Interface) -> list[str]:
@@ -450,7 +458,7 @@ class ArrayEvents:
         rates = [Array(array.name + DOT, array.axes) for array in layout.coordinates if not layout.momenta]
         vectors = layout.coordinates, momenta, rates
         self.positions, self.rates = [*layout.coordinates, *layout.fields, *momenta], rates
-        self.symbols = {name: symbol(name) for name in (TIME, *interface.parameters)}
+        self.symbols = {name: symbol(name) for name in (TIME, *interface.parameters)} | _functions(interface)
         self.moving = {
             array.name: (k, layout.coordinates[j].name)
             for k, arrays in enumerate(vectors)

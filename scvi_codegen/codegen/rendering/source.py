@@ -355,6 +355,8 @@ class Interface:
         exchange_names: of work and impulses of forces in a step: energy and momentum maps; none without forces.
         constraints: formulas g of the constraints g = 0.
         masked: number of the last constraints, which are imposed in some modes only.
+        ranges: call, argument and its bounds of each table that is undefined beyond them.
+        functions: name and arguments as JSON of each table that formulas call.
         inputs: names of tabulated inputs, each of which has five parameters.
         energy_parameter: of a time-transformed system, the parameter that is the energy of the initial state.
         time_transformation: time-rescaling function g in dt = g dtau that determines its step sizes.
@@ -401,6 +403,8 @@ class Interface:
     exchange_names: tuple[str, ...] = ()
     constraints: tuple[str, ...] = ()
     masked: int = 0
+    functions: tuple[tuple[str, ...], ...] = ()
+    ranges: tuple[tuple[str, ...], ...] = ()
     inputs: tuple[str, ...] = ()
     conserves_energy: bool = False
     changes_energy: str | None = None

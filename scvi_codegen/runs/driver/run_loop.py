@@ -14,6 +14,7 @@ from scvi_codegen.codegen.native.capacity import room_for_states, too_many_state
 from scvi_codegen.common.errors import StepFailedError
 from scvi_codegen.common.validation import checked_count
 from scvi_codegen.runs.driver.singular_time import ProgressWatch, check_energy_surface
+from scvi_codegen.runs.driver.table_ranges import end_run
 from scvi_codegen.runs.states.times import times_after
 from scvi_codegen.runs.states.validation import BINARY64, FEW, NUMBERS, SEQUENCES, Array
 from scvi_codegen.runs.states.words import block_of, from_block
@@ -71,7 +72,7 @@ def record(
                 progress=progress,
             )
     except StepFailedError as failure:
-        failure.trajectory = recorder.trajectory()
+        end_run(failure, memory, recorder.trajectory())
         raise
     trajectory = recorder.trajectory()
     if trajectory.tau is not None:
@@ -97,7 +98,7 @@ def record_with_stops(
                 if progress is not None:
                     progress(memory.steps - first)
     except StepFailedError as failure:
-        failure.trajectory = recorder.trajectory()
+        end_run(failure, memory, recorder.trajectory())
         raise
     finally:
         memory.plan = ending_at(target, stops[-1])

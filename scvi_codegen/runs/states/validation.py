@@ -261,7 +261,7 @@ def _length(formula: str, names: Sequence[str], values: Array) -> float:
         return float(formula)
     if formula.isidentifier() and formula in names:
         return float(values[names.index(formula)])
-    evaluate, used = _evaluation(formula)
+    evaluate, used = evaluation(formula)
     try:
         return evaluate([float(values[names.index(name)]) for name in used])
     except ArithmeticError:
@@ -269,7 +269,7 @@ def _length(formula: str, names: Sequence[str], values: Array) -> float:
 
 
 @lru_cache(maxsize=64)
-def _evaluation(formula: str) -> tuple[Callable[[Sequence[float]], float], tuple[str, ...]]:
+def evaluation(formula: str) -> tuple[Callable[[Sequence[float]], float], tuple[str, ...]]:
     """Return the function of a formula and the names of its arguments."""
     # imported here because SymPy is slow to import, and most lengths are parameters
     from scvi_codegen.common.precision import mp

@@ -45,6 +45,7 @@ def unrolled_fields(
         "time": system.time,
         "parameters": constants,
         "defaults": (*numbers.values(), *values.values()),
+        "functions": system.functions,
         "inputs": system.inputs,
         "damping": system.damping,
         "arrays": tuple(

@@ -20,11 +20,12 @@ from scvi_codegen.systems.constraints import constraint_sides
 from scvi_codegen.systems.forces import damping_rate
 from scvi_codegen.systems.formulas.array_statements import ArrayForce, array_text, parse_constraint, parse_force
 from scvi_codegen.systems.formulas.arrays import parse_array, parse_coordinate, parse_sums
-from scvi_codegen.systems.formulas.grammar import parse_expression
+from scvi_codegen.systems.formulas.grammar import named_tables, parse_expression
 from scvi_codegen.systems.formulas.indices import Array
 from scvi_codegen.systems.formulas.neighbours import parse_neighbours
 from scvi_codegen.systems.formulas.rotations import MemberArray, member_arrays, torque_components
 from scvi_codegen.systems.formulas.symbols import DOT, TIME, input_formulas, number, symbol, with_inputs
+from scvi_codegen.systems.formulas.table import functions_of
 
 LISTED = ("coordinates", "directions", "spins", "momenta", "constraints", "inputs", "tables", "point_forces")
 """Arguments that are lists."""
@@ -69,12 +70,13 @@ def arrays_from_text(arguments: Mapping[str, Any]) -> ArraySystem:
     values = with_inputs(numbers, inputs)
     fields = {key: parse_array(key) for key in values if "[" in key}
     scalars = {key: value for key, value in values.items() if key not in fields}
+    functions = functions_of(arguments.get("functions"))
     names = Names(
         arrays=(
             *(*coordinates, *momenta, *velocities, *fields.values()),
             *(array for rotation in rotations for array in rotation.formulas),
         ),
-        symbols={key: symbol(key) for key in (*scalars, *inputs, TIME)},
+        symbols={key: symbol(key) for key in (*scalars, *inputs, TIME)} | named_tables(functions, values),
         tables=tuple(map(table_of, tables)),
     )
     lengths = {key: names.symbols[key] for key in scalars}
@@ -106,6 +108,7 @@ def arrays_from_text(arguments: Mapping[str, Any]) -> ArraySystem:
         neighbours=neighbours,
         terms=tuple(substituted(term, of_inputs) for term in terms),
         forces=tuple(substituted(force, of_inputs) for force in forces),
+        functions=functions,
         inputs=tuple(inputs),
         constraints=tuple(constraints),
         damping=damping_rate(arguments.get("damping"), lambda formula: parse_expression(str(formula), names.symbols)),

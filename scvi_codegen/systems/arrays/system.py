@@ -36,7 +36,7 @@ from scvi_codegen.common.cache import key_of
 from scvi_codegen.common.errors import SizesRequiredError, SystemDefinitionError
 from scvi_codegen.common.representation import LONGEST, clipped
 from scvi_codegen.common.validation import OfRunTimeSizes, of
-from scvi_codegen.systems.checks.continuity import corner_message, irregularity, jump_of
+from scvi_codegen.systems.checks.continuity import corner_in, irregularity
 from scvi_codegen.systems.checks.definition import warn_of_negative, warn_of_unused
 from scvi_codegen.systems.forces import check_damping
 from scvi_codegen.systems.formulas.array_statements import ArrayForce, latex_sum
@@ -322,8 +322,9 @@ class ArraySystem(OfRunTimeSizes, MechanicalSystem):
             if problem := irregularity(term.formula, subject, moving[term], velocities, self.constants):
                 raise SystemDefinitionError(problem)
         for term in self.constraints:
-            if corner := jump_of(term.formula, moving[term], self.constants, first_derivatives=True):
-                raise SystemDefinitionError(corner_message(f"the constraint '{term}' of '{self.name}'", *corner))
+            subject = f"the constraint '{term}' of '{self.name}'"
+            if corner := corner_in(term.formula, subject, moving[term], self.constants):
+                raise SystemDefinitionError(corner)
 
     def check_run_time_sizes(self) -> None:
         """Raise :class:`SizesRequiredError` for a system that cannot be compiled for sizes known at run time."""

@@ -20,8 +20,8 @@ from sympy import Expr, Symbol
 from scvi_codegen.common.precision import Number, mp
 from scvi_codegen.systems.formulas.expressions import Tape, jacobian, kinks_of, shortened
 from scvi_codegen.systems.formulas.intermediates import parts
-from scvi_codegen.systems.formulas.kinks import rint, unit_step
-from scvi_codegen.systems.formulas.modes import Mode
+from scvi_codegen.systems.formulas.kinks import Mode, rint, unit_step
+from scvi_codegen.systems.formulas.tables import table_with_corners, without_tables
 
 POINTS, ATTEMPTS, ITERATIONS = 3, 24, 40
 """Points of a surface that are examined; starts of Newton's method, and its iterations."""
@@ -46,6 +46,7 @@ def irregularity(
     variables = list(moving)
     if kink := kink_in_velocities(formula, velocities):
         return velocity_message(subject, *kink)
+    formula = without_tables(formula)
     if jump := jump_of(formula, variables, constants):
         return jump_message(subject, *jump)
     slope = unbounded_slope_of(formula, variables, constants)
@@ -72,6 +73,17 @@ def jump_of(
         if any(_jumps(function, surface, variables, constants) for function in functions):
             return surface, term
     return None
+
+
+def corner_in(formula: Expr, subject: str, moving: Iterable[Symbol], constants: Mapping[Symbol, float]) -> str | None:
+    """Return why a constraint has a corner or a jump, or ``None``."""
+    if table := table_with_corners(formula):
+        return (
+            f"{subject} contains {table}, a table whose slope jumps, so that the velocity would jump: give it a degree "
+            'of 2 or more and outside="refuse" or "linear"'
+        )
+    corner = jump_of(without_tables(formula), moving, constants, first_derivatives=True)
+    return corner_message(subject, *corner) if corner else None
 
 
 def unbounded_slope_of(

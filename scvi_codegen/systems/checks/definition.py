@@ -9,7 +9,7 @@ from sympy import Expr, Symbol
 
 from scvi_codegen.common.errors import SystemDefinitionError, SystemDefinitionWarning, closest, warn
 from scvi_codegen.common.precision import Number, mp
-from scvi_codegen.systems.checks.continuity import corner_message, irregularity, jump_of
+from scvi_codegen.systems.checks.continuity import corner_in, irregularity
 from scvi_codegen.systems.constraints import constraint_jacobian, forms_of_constraints, without_coordinate
 from scvi_codegen.systems.derived_expressions import (
     Entries,
@@ -23,7 +23,7 @@ from scvi_codegen.systems.derived_expressions import (
 )
 from scvi_codegen.systems.forces import check_damping
 from scvi_codegen.systems.formulas.expressions import Tape, hessian, jacobian, unsupported_part
-from scvi_codegen.systems.formulas.modes import Mode
+from scvi_codegen.systems.formulas.kinks import Mode
 from scvi_codegen.systems.formulas.symbols import DOT, PARTS, TIME, check_names, number, symbol
 from scvi_codegen.systems.massless import gauge_of_rates
 from scvi_codegen.systems.system import MechanicalSystem
@@ -178,8 +178,8 @@ def _check_continuity(
     ):
         raise SystemDefinitionError(problem)
     for name, g in zip(system.constraint_texts if system.constraints else (), system.constraints, strict=True):
-        if corner := jump_of(g, moving, system.constants, first_derivatives=True):
-            raise SystemDefinitionError(corner_message(f"the constraint '{name}' of '{system.name}'", *corner))
+        if corner := corner_in(g, f"the constraint '{name}' of '{system.name}'", moving, system.constants):
+            raise SystemDefinitionError(corner)
 
 
 def checked_gauge(system: MechanicalSystem) -> Expr:

@@ -77,11 +77,13 @@ class _Binding:
     def __init__(self, system: LagrangianSystem) -> None:
         import sympy
 
+        from scvi_codegen.systems.formulas.grammar import named_tables
         from scvi_codegen.systems.formulas.symbols import input_formulas, symbol
 
         self.sympy, self.system, self.symbol = sympy, system, symbol
         own = (*system.coordinates, *system.velocities, system.time, *system.parameters)
         self.names = {x.name: x for x in own} | {name: symbol(name) for name in system.inputs}
+        self.functions = named_tables(system.functions)
         self.driven = input_formulas(system.inputs, system.time)
         self.masks: list[Symbol] = []
         self.constraints: list[Expr] = []
@@ -114,7 +116,7 @@ class _Binding:
         if formula is None:
             return None
         if isinstance(formula, str):
-            expression = parse_expression(formula, self.names)
+            expression = parse_expression(formula, self.names | self.functions)
         else:
             expression = self.sympy.nsimplify(self.sympy.sympify(formula), rational=True)
             expression = expression.xreplace({x: self.names.get(x.name, x) for x in expression.free_symbols})

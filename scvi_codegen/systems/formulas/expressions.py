@@ -39,6 +39,7 @@ from scvi_codegen.systems.formulas.kinks import (
     where,
     wrap,
 )
+from scvi_codegen.systems.formulas.tables import Tabulated
 
 LARGEST = 1.7976931348623157e308
 """Largest finite C double."""
@@ -50,7 +51,9 @@ def kinks_of(expressions: Iterable[Expr]) -> set[Expr]:
     Arguments that differ by sign or a positive number are one function u.
     """
     formulas = {f for e in expressions for f in (e, *(quantity.definition for quantity in intermediates(e)))}
-    jumps = {part for part in parts(*formulas) if isinstance(part, unit_step | rint)}
+    nodes = parts(*formulas)
+    ends = {part.base for part in nodes if part.is_Pow and part.exp == -1}  # 1/unit_step(u): undefined where u < 0
+    jumps = {part for part in nodes if isinstance(part, unit_step | rint) and part not in ends}
     return {
         switching_function(jump.args[0])[0] if isinstance(jump, unit_step) else sympy.cos(sympy.pi * jump.args[0])
         for jump in jumps
@@ -232,7 +235,7 @@ def beyond_double(number: Expr) -> bool:
     return p > int(LARGEST) * q or (p > 0 and p << 1075 <= q)
 
 
-NODES = frozenset([Add, Mul, Pow, Intermediate, *NAME_OF])
+NODES = frozenset([Add, Mul, Pow, Intermediate, Tabulated, *NAME_OF])
 
 
 def unsupported_part(expression: Expr) -> str | None:
@@ -424,7 +427,7 @@ class _Accumulation:
 
     def derived(self, node: Expr) -> Gradient:
         if isinstance(node, Intermediate):
-            return {node: S.One} if self.variables & node.free_symbols else {}
+            return {} if self.variables.isdisjoint(node.varies_with) else {node: S.One}
         inner = [self.of(argument) for argument in node.args]
         return _combined(
             [

@@ -16,7 +16,7 @@ constructor could fold a constant that fills the memory.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
 from typing import ClassVar, NamedTuple, NoReturn
 
 from sympy import Add, Expr, Mul, Pow, Rational, S, Symbol
@@ -38,7 +38,9 @@ from scvi_codegen.systems.formulas.expressions import (
 )
 from scvi_codegen.systems.formulas.intermediates import without_abs
 from scvi_codegen.systems.formulas.kinks import comparison
-from scvi_codegen.systems.formulas.symbols import DOT
+from scvi_codegen.systems.formulas.symbols import DOT, check_name
+from scvi_codegen.systems.formulas.table import Table
+from scvi_codegen.systems.formulas.tables import NamedTable
 
 MAX_CHARACTERS = 1_000_000
 """Length limit; parsing time grows with length times bracket depth (fifty atoms in a gas: 212 000 characters)."""
@@ -111,6 +113,21 @@ def parse_expression(text: str, symbols: Mapping[str, Symbol]) -> Expr:
     x**2/2 - cos(2*x)/3
     """
     return parsed(Parser(text, symbols))
+
+
+def named_tables(functions: Iterable[tuple[str, Table]], names: Container[str] = ()) -> dict[str, NamedTable]:
+    """Return functions by name, for formulas.
+
+    Raises:
+        SystemDefinitionError: for an invalid name, and for one of ``names``.
+    """
+    tables = {}
+    for name, table in functions:
+        check_name(name)
+        if name in names:
+            raise SystemDefinitionError(f"'{name}' is the name of both a function and another quantity: rename one")
+        tables[name] = NamedTable(name, table)
+    return tables
 
 
 def parsed(parser: Parser) -> Expr:
@@ -348,8 +365,9 @@ class Parser:
 
     def name(self, name: str, column: int) -> Expr:
         """Return the symbol, constant or function call of a name."""
-        if name in FUNCTIONS and name not in self.symbols:
-            return self.call(name, column)
+        function = self.symbols.get(name) or FUNCTIONS.get(name)
+        if callable(function):
+            return self.call(name, function, column)
         if self.tokens[self.position][:2] == ("operator", "("):
             if name in KINKED:
                 self.refuse(f"'{name}' is a name of this system, not the function {name}(..): rename it", column)
@@ -366,8 +384,8 @@ class Parser:
             self.refuse(f"unknown name '{name}'{hint} Known here: {names}; {declared}", column)
         return value
 
-    def call(self, name: str, column: int) -> Expr:
-        """Parse a function call."""
+    def call(self, name: str, function: Callable[..., Expr], column: int) -> Expr:
+        """Parse a call of a function."""
         opening = self.accept("(")
         if opening is None:
             self.refuse(f"'{name}' is a function: write {name}(...)", column)
@@ -380,12 +398,13 @@ class Parser:
             arguments.append(self.sum())
         self.close()
         self.kink_depth -= name in REPEATING
-        expected = ARGUMENTS.get(name, 1)
-        more = " or more" if name in ("min", "max") else ""
+        expected, more = ARGUMENTS.get(name, 1), " or more" if name in ("min", "max") else ""
+        if isinstance(function, NamedTable):
+            expected, more = len(function.table.axes), ""
         if len(arguments) != expected and not (more and len(arguments) > expected):
             plural = "s" if expected > 1 else ""
             self.refuse(f"{name} takes {expected}{more} argument{plural}, not {len(arguments)}", column)
-        return self.supported(FUNCTIONS[name](*arguments), column)
+        return self.supported(function(*arguments), column)
 
     def condition(self) -> Expr:
         """Parse the condition of ``where``, and return 1 where it holds, 0 elsewhere."""

@@ -20,7 +20,7 @@ from weakref import WeakValueDictionary
 from sympy import Abs, Basic, Expr, S, Symbol
 
 from scvi_codegen.common.errors import SystemDefinitionError
-from scvi_codegen.systems.formulas.kinks import absolute
+from scvi_codegen.systems.formulas.kinks import absolute, rint, unit_step
 
 LONGEST_WRITTEN = 20_000
 """Largest number of nodes of a formula that is displayed or stored as text."""
@@ -37,6 +37,10 @@ class Intermediate(Expr):  # type: ignore[misc]  # SymPy is untyped
 
     number: int
     inner: tuple[Intermediate, ...]
+    varies_with: frozenset[Symbol]
+    """Symbols by which its derivatives are not 0 everywhere."""
+    arguments: tuple[Expr, ...] = ()
+    """Arguments of the function that is written in its place; none of other quantities."""
     is_commutative = True
     is_real = True
 
@@ -48,6 +52,7 @@ class Intermediate(Expr):  # type: ignore[misc]  # SymPy is untyped
             quantity.number = next(_NUMBERS)
             quantity.inner = inner_of(definition)
             quantity._free = frozenset(definition.free_symbols)
+            quantity.varies_with = _varies_with(definition)
             _KNOWN[definition] = quantity
         return quantity
 
@@ -69,6 +74,9 @@ class Intermediate(Expr):  # type: ignore[misc]  # SymPy is untyped
     def _hashable_content(self) -> tuple[int]:
         return (self.number,)
 
+    def _replaced(self, definition: Expr, _: Any) -> Expr:
+        return intermediate(definition)
+
     def _printed(self, printer: Any, *_: Any) -> str:
         """Return its definition in parentheses, or its number where that is too long to read."""
         if printer.printmethod == "_sympystr" and written_size(self) > LONGEST_WRITTEN:
@@ -89,8 +97,24 @@ class Intermediate(Expr):  # type: ignore[misc]  # SymPy is untyped
                 replaced[quantity] = (rule[quantity], True)
             else:
                 value, changed = quantity.definition._xreplace(rule)
-                replaced[quantity] = (intermediate(value), True) if changed else (quantity, False)
+                replaced[quantity] = (quantity._replaced(value, rule), True) if changed else (quantity, False)
         return replaced[self]
+
+
+def _varies_with(definition: Expr) -> frozenset[Symbol]:
+    """Return the symbols of an expression without those that occur in piecewise constant functions alone."""
+    seen, symbols, pending = {definition}, set[Symbol](), [definition]
+    while pending:
+        node = pending.pop()
+        if isinstance(node, Intermediate):
+            symbols |= node.varies_with
+        elif node.is_Symbol:
+            symbols.add(node)
+        elif not isinstance(node, unit_step | rint):
+            new = [argument for argument in node.args if argument not in seen]
+            seen.update(new)
+            pending += new
+    return frozenset(symbols)
 
 
 _LAST: list[Any] = [{}, {}]
@@ -143,7 +167,7 @@ def separated(expressions: Sequence[Expr], variables: Collection[Symbol]) -> tup
 
 
 def written_out(expression: Expr) -> Expr:
-    """Return an expression without intermediate quantities, for display.
+    """Return an expression without intermediate quantities, for display; tables are written by name.
 
     Raises:
         SystemDefinitionError: if it is too long.
@@ -156,7 +180,8 @@ def written_out(expression: Expr) -> Expr:
             "which the system was read"
         )
     rules: dict[Expr, Expr] = {}
-    for quantity in intermediates(expression):
+    named = {quantity for quantity in intermediates(expression) if quantity.arguments}
+    for quantity in intermediates(expression, without=named):
         rules[quantity] = quantity.definition.xreplace(dict(rules))
     return without_abs(expression.xreplace(rules)) if rules else expression
 
@@ -190,7 +215,8 @@ def written_size(expression: Expr) -> int:
         return sizes.get(node) or 1 + sum(map(size, node.args))
 
     for quantity in intermediates(expression):
-        sizes[quantity] = size(quantity.definition)
+        written = quantity.arguments or quantity.args
+        sizes[quantity] = sum(map(size, written))
     return size(expression)
 
 

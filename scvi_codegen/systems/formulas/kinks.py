@@ -9,7 +9,7 @@ same. SymPy's functions of these names become these. Both values of ``where`` ar
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import reduce
+from functools import lru_cache, reduce
 from typing import Any
 
 import sympy
@@ -76,6 +76,11 @@ class unit_step(Function):  # type: ignore[misc]  # noqa: N801
         return f"({_call(printer, 'mpmath.sign', *self.args)} >= 0)"
 
 
+class Mode(sympy.Symbol):  # type: ignore[misc]
+    """Mode in unit_step(u + mode): 0, or beyond all values of u (:mod:`scvi_codegen.systems.kinks`)."""
+
+
+@lru_cache(maxsize=4096)
 def switching_function(u: Expr) -> tuple[Expr, int]:
     """Return a switching function without constant factor, and the sign 1 or -1 of the factor that was left out.
 

@@ -15,6 +15,7 @@ from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.systems.formulas.expressions import NAME_OF, evaluated, parts_of_type, unsupported_part
 from scvi_codegen.systems.formulas.intermediates import Intermediate
 from scvi_codegen.systems.formulas.symbols import DOT, TIME, identifier, symbol
+from scvi_codegen.systems.formulas.tables import Tabulated
 
 
 def sympy_expression(value: Any, role: str) -> Expr:
@@ -174,6 +175,8 @@ def format_expression(expression: Expr) -> str:
 
 
 def _sum_text(expression: Expr) -> str:
+    if isinstance(expression, Tabulated):
+        return _atom_text(expression)
     if isinstance(expression, Intermediate):
         return _sum_text(expression.definition)
     if not expression.is_Add:
@@ -214,6 +217,8 @@ def _power_text(expression: Expr) -> str:
 
 
 def _atom_text(expression: Expr) -> str:
+    if isinstance(expression, Tabulated):
+        return f"{expression.function.name}({', '.join(map(_sum_text, expression.arguments))})"
     if isinstance(expression, Intermediate):
         return f"({_sum_text(expression)})"
     if expression.is_Symbol:

@@ -18,7 +18,7 @@ from scvi_codegen.common.validation import TEXTS, checks_arguments, of
 from scvi_codegen.systems.constraints import constraints_of, rate_of_positions
 from scvi_codegen.systems.derived_expressions import coupled_blocks, forms_of, sample_points
 from scvi_codegen.systems.formulas.expressions import dot, evaluate, gradient, gradient_tuple, hessian, unsupported_part
-from scvi_codegen.systems.formulas.grammar import parse_expression
+from scvi_codegen.systems.formulas.grammar import named_tables, parse_expression
 from scvi_codegen.systems.formulas.symbols import default_momenta, input_formulas, symbol
 from scvi_codegen.systems.hamiltonian import HamiltonianSystem
 from scvi_codegen.systems.lagrangian import LagrangianSystem
@@ -201,7 +201,7 @@ def lagrangian_of(system: HamiltonianSystem, *, constraints: Sequence[str] = ())
     if not constraints:
         return lagrangian
     symbols = {x.name: x for x in (*system.coordinates, *lagrangian.velocities, system.time, *system.parameters)}
-    symbols |= {name: symbol(name) for name in system.inputs}
+    symbols |= {name: symbol(name) for name in system.inputs} | named_tables(system.functions)
     driven = input_formulas(system.inputs, system.time)
     expressions = constraints_of(
         constraints,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -31,6 +32,8 @@ def document_of(model: Model, *, as_arrays: bool = True) -> dict[str, Any]:
     document, parameters, motion = _system_and_state(model, system, as_arrays=as_arrays)
     if g := clock.time_transformation if clock else model.time_transformation:
         document["system"]["time_transformation"] = g
+    if system.functions:
+        document["functions"] = {name: asdict(table) for name, table in system.functions}
     if model.inputs:
         document["inputs"] = {name: _as_lists(value) for name, value in model.inputs.items()}
     if system.has_contacts:

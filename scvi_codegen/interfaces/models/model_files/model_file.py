@@ -65,7 +65,7 @@ KEYS = {"system": SYSTEM_KEYS, "field": FIELD_KEYS, "page": PAGE_KEYS, "picture"
     section: tuple(option.key for option in options_of(section)) for section in ("initial", "run", "path")
 }
 SECTIONS = (
-    *("system", "field", "forces", *TORQUES, "inputs", "sizes", "parameters", "tables", "initial"),
+    *("system", "field", "forces", *TORQUES, "functions", "inputs", "sizes", "parameters", "tables", "initial"),
     *("contacts", "events", "method", "run", "path", "page", "picture"),
 )
 ARRAY_SECTIONS = ("sizes", "tables")
@@ -191,6 +191,8 @@ def _read_model(document: Document, changes: Document, folder: str | os.PathLike
     for name in ARRAY_SECTIONS:
         if (name in document or name in changes) and not has_arrays(document):
             raise ModelFileError(f'[{name}] belongs to coordinates that are arrays, coordinates = ["q[N]"]')
+    if "functions" in document and "field" in document:
+        raise ModelFileError("[functions] belongs to [system]: densities of fields contain no tables")
     if "error" not in document.get("run", {}):
         changes = _without_inherited_step(changes)
     document = _without_inherited_step(document)

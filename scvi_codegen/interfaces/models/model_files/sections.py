@@ -339,8 +339,8 @@ def read_system(document: Document, named: MechanicalSystem | None = None) -> Me
     """Return the system of a file, ``named`` if it names one, with the values of its scalar parameters."""
     forces, values = document.get("forces", {}), _scalars(document)
     if named is not None:
-        if forces or document.get("contacts"):
-            part = "[forces]" if forces else "[[contacts]]"
+        if further := [name for name in ("forces", "contacts", "functions") if document.get(name)]:
+            part = "[[contacts]]" if further[0] == "contacts" else f"[{further[0]}]"
             raise ModelFileError(
                 f"{part} are not supported for a system of the catalogue or of a robot: write it out in [system]"
             )
@@ -359,6 +359,7 @@ def read_system(document: Document, named: MechanicalSystem | None = None) -> Me
         "inputs": names_of(section, "inputs") if "inputs" in section else (),
         "tables": list(document.get("tables", {})),
         "neighbours": section.get("neighbours"),
+        "functions": document.get("functions"),
     }
     constraints = names_of(section, "constraints") if "constraints" in section else ()
     if "hamiltonian" in section:
