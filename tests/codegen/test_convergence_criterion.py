@@ -287,21 +287,6 @@ def test_bodies_of_known_number_are_measured_one_by_one():
     assert not any(array.is_field for array in system.arrays)
 
 
-@pytest.mark.second
-@pytest.mark.parametrize("form", ["", "*(1 + y**2/1000)"])
-def test_middle_of_a_molecule_at_rest_converges(form):
-    """Three masses: in the antisymmetric mode the second one stays at 0. Beside the formula, and in ensembles."""
-    kinetic = f"(x_dot**2 + y_dot**2{form} + z_dot**2)/2"
-    system = LagrangianSystem.from_text("three", ["x", "y", "z"], f"{kinetic} - (x**2 + (y-x)**2 + (z-y)**2 + z**2)/2")
-    stepper = compile_stepper(system, SVI(8), solver="fixed-point", flags=QUICK_FLAGS)
-    start = [0.7, 0.0, -0.7], [0.0, 0.0, 0.0]
-    one = stepper.integrate(*start, h=1.2, steps=40)
-    many = stepper.integrate_ensemble([start[0]] * 8, [start[1]] * 8, h=1.2, steps=40)
-    assert one.q[:, 1] == pytest.approx(0.0, abs=1e-14)
-    assert np.ptp(one.energy()) < 1e-14
-    assert many.q[-1] == pytest.approx(np.array([one.q[-1]] * 8), abs=1e-14)
-
-
 @pytest.mark.parametrize("name", ["kepler", "heavy top"])
 def test_tolerance_of_adaptive_steps_ends_the_iteration_early(name):
     """Half of the iterations, and momentum maps to their error, or to round-off with a criterion of one's own."""

@@ -6,7 +6,6 @@ import warnings
 import numpy as np
 import pytest
 from samples import QUICK_FLAGS
-from sympy import Function, symbols
 
 import scvi_codegen as sc
 from scvi_codegen.runs.recording.manifest import sealed_text
@@ -176,20 +175,3 @@ def test_nodes_of_waves_do_not_slow_convergence(name, density):
     shifted = iterations(0.3, 0.0)
     assert iterations(0.0, 0.0) <= 1.1 * shifted + 0.2
     assert iterations(0.0, 1.0) <= 2 * shifted
-
-
-X, T = symbols("x t")
-U = Function("u")(X, T)
-
-
-@pytest.mark.parametrize(
-    ("density", "name"),
-    [
-        (U.diff(T, 2) ** 2 / 2, "u_tt: of the derivatives in time"),
-        (U.diff(T) ** 2 - U.diff(X, 3) ** 2, "u_xxx: derivatives in space"),
-    ],
-)
-def test_higher_derivatives_are_refused_by_name(density, name):
-    arguments = {"name": "ring", "fields": [U], "space": {"x": (0, 1)}}
-    with pytest.raises(sc.SystemDefinitionError, match=name):
-        sc.FieldSystem.from_sympy(density=density, **arguments)

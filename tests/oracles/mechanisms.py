@@ -28,7 +28,7 @@ from sympy.physics.mechanics import (
     dynamicsymbols,
     inertia,
 )
-from sympy.physics.mechanics.models import multi_mass_spring_damper, n_link_pendulum_on_cart
+from sympy.physics.mechanics.models import n_link_pendulum_on_cart
 
 from scvi_codegen import LagrangianSystem
 
@@ -121,15 +121,6 @@ def links_on_a_cart(n: int) -> Mechanism:
     q = (0.1, *(0.4 + 0.2 * i for i in range(n)))
     model = n_link_pendulum_on_cart(n, cart_force=True)
     return Mechanism(model, LagrangianSystem.from_kanes_method, constants | {"g": G, "F": 1.5}, q, (0.2,) * (n + 1))
-
-
-def masses_in_a_row(n: int) -> Mechanism:
-    """``sympy.physics.mechanics.models.multi_mass_spring_damper`` with weights and forces."""
-    model = multi_mass_spring_damper(n, apply_gravity=True, apply_external_forces=True)
-    values = {"m": 1.0, "k": 30.0, "c": 0.4, "f": 2.0}
-    constants = {f"{name}{i}": value + 0.1 * i for name, value in values.items() for i in range(n)}
-    q = tuple(0.1 * (i + 1) for i in range(n))
-    return Mechanism(model, LagrangianSystem.from_kanes_method, constants | {"g": G}, q, (0.0,) * n)
 
 
 def standing_human() -> Mechanism:
@@ -362,7 +353,6 @@ def bicycle() -> KanesMethod:
 
 MECHANISMS: dict[str, Callable[[], Mechanism]] = {
     "two links on a cart": cache(lambda: links_on_a_cart(2)),
-    "three masses": cache(lambda: masses_in_a_row(3)),
     "standing human": cache(standing_human),
     "four-bar linkage": cache(four_bar_linkage),
     "double pendulum": cache(double_pendulum),

@@ -214,11 +214,6 @@ def test_every_property_of_a_stepper_has_a_stepper_that_has_it():
     assert named & known == set(SITUATIONS) - {""} | set(PLAIN)
 
 
-def test_unknown_features_are_errors_with_the_nearest_name():
-    with pytest.raises(sc.StateError, match="unknown feature 'input'; did you mean 'inputs'"):
-        stepper_of().supports("t_eval", "input")
-
-
 def test_arguments_of_one_run_exclude_each_other():
     stepper = stepper_of()
     for operation, other in (("t_eval", "inputs"), ("observe", "inputs"), ("observe", "t_eval"), ("chaos", "inputs")):

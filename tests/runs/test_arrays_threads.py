@@ -201,20 +201,6 @@ def test_plain_sums_lose_the_rounding_errors_alone() -> None:
 
 
 @pytest.mark.rotated
-def test_iterative_methods_agree_with_leapfrog() -> None:
-    """Both methods take small steps."""
-    for name in ("ring", "pairs", "net"):
-        case = CASES[name]
-        ends = [
-            stepper_of(name, method).integrate(
-                start_of(name), h=h, steps=round(0.02 / h), save_every=round(0.02 / h), threads=2, **case.given
-            )
-            for method, h in (("svi:4", 0.02), ("stoermer-verlet", 5e-5))
-        ]
-        np.testing.assert_allclose(ends[0].q["q"][-1], ends[1].q["q"][-1], rtol=0, atol=1e-9)
-
-
-@pytest.mark.rotated
 def test_newton_iteration_with_threads() -> None:
     """The last bits of a large step from q = 0 depend on the order in which inner products are summed."""
     stepper, start = stepper_of("ring", "svi:2", "newton"), start_of("ring")

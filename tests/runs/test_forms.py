@@ -82,17 +82,3 @@ def test_a_top_in_transformed_time_moves_as_in_time(method):
     run = stepper.integrate(**START, h=0.05, steps=20)
     np.testing.assert_allclose(run.rotation()[-1], end(TOP, t_end=float(run.t[-1])), rtol=0, atol=1e-12)
     assert np.ptp(np.diff(run.t)) > 1e-3
-
-
-def test_forms_that_do_not_exist_are_named():
-    spin = sc.HamiltonianSystem.from_text("spin", spins=["a"], hamiltonian="a_3 + a_3**2/3")
-    with pytest.raises(sc.SystemDefinitionError, match=r"rotations or spins \('a'\)"):
-        sc.lagrangian_of(spin)
-
-
-def test_a_parameter_named_as_an_entry_of_a_rotation_is_refused():
-    lagrangian = sum(sympy.Symbol(f"omega_{k}") ** 2 for k in (1, 2, 3)) - sympy.Symbol("R_33")
-    with pytest.raises(sc.SystemDefinitionError, match="'R_33' is the name of both an entry of a rotation"):
-        sc.LagrangianSystem.from_sympy(
-            name="top", lagrangian=lagrangian, coordinates=[], rotations={"R": "omega"}, parameters={"R_33": 1}
-        )

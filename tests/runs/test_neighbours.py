@@ -275,11 +275,6 @@ def test_a_list_in_sympy() -> None:
     assert "sum(i < j in near, -exp(-(q[i] - q[j])**2)*unit_step(4 - (q[i] - q[j])**2))" in map(str, system.terms)
 
 
-def test_states_have_three_components() -> None:
-    with pytest.raises(sc.StateError, match="3"):
-        stepper().integrate(np.zeros((4, 2)), h=0.1, steps=1)
-
-
 INVALID: tuple[tuple[dict[str, float], str], ...] = (
     (
         {"box": 3.7},

@@ -11,17 +11,7 @@ from notation import hamilton, lagrange
 import scvi_codegen as sc
 from scvi_codegen.runs.states.validation import parameter_values
 
-METHODS = (
-    sc.SVI(3),
-    sc.SCVI(3),
-    sc.SCVI(2, variational=False),
-    sc.SpectralCollocation(2),
-    sc.RadauIIA(2),
-    sc.StoermerVerlet(),
-    sc.ExplicitEuler(),
-)
 WITH_ACTION = (sc.SVI(2, "gauss-legendre:3"), sc.SCVI(3), sc.Gauss(2), sc.StoermerVerlet())
-each_method = pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
 each_action = pytest.mark.parametrize("method", WITH_ACTION, ids=lambda method: method.name)
 KEPLER = sc.problem("kepler")
 STATE = KEPLER.q, KEPLER.velocity
@@ -38,18 +28,6 @@ def kepler(compiled):
 
 
 # Steps and runs.
-
-
-@pytest.mark.tiers(0, 3)
-@each_method
-def test_run_equals_repeated_steps(sample, compiled, method):
-    stepper, (q, p) = compiled("pumped-cart-pole", method), sample("pumped-cart-pole").state
-    run = stepper.integrate(q, p, h=0.05, steps=40, t=0.3)
-    for k in range(40):
-        q, p = stepper.step(q, p, 0.05, 0.3 + k * 0.05)
-    # Forty roundings of plain steps, amplified along the trajectory; runs keep what rounding cuts off.
-    assert np.abs(run.q[-1] - q).max() < 1e-13
-    assert np.abs(run.p[-1] - p).max() < 1e-13
 
 
 def test_run_has_smaller_rounding_errors_than_repeated_steps(sample, compiled):
@@ -256,16 +234,6 @@ def test_velocity_is_undefined_beyond_the_range_of_the_momenta(compiled, sample)
         stepper.momentum([0.0], [1.5])
 
 
-def test_energies_of_many_states_equal_single_energies(sample, compiled):
-    stepper = compiled("pumped-cart-pole", sc.SVI(3))
-    run = stepper.integrate(*sample("pumped-cart-pole").state, h=0.1, steps=9)
-    each = [stepper.energy(q, p, t) for q, p, t in zip(run.q, run.p, run.t, strict=True)]
-    assert np.array_equal(run.energy(), each)
-    at_one_time = [stepper.energy(q, p, 0.3) for q, p in zip(run.q, run.p, strict=True)]
-    assert np.array_equal(stepper.energy(run.q, run.p, 0.3), at_one_time)
-    assert stepper.energy(run.q[::2], run.p[::2], run.t[::2]) == pytest.approx(each[::2], abs=0.0)
-
-
 # The discrete Lagrangian.
 
 
@@ -300,26 +268,6 @@ def test_momenta_are_derivatives_of_the_discrete_lagrangian(sample, compiled, me
         weights = np.array([1, -8, 8, -1]) / (12 * width)
         assert -weights @ first == pytest.approx(p0[i], abs=1e-9)
         assert weights @ second == pytest.approx(p1[i], abs=1e-9)
-
-
-@pytest.mark.second
-def test_the_discrete_lagrangian_is_the_quadrature_along_the_oracles_curve(sample, compiled):
-    """The nodal curve of the oracle, whose end values give L_d by (25)."""
-    case, (c, w) = sample("pumped-cart-pole"), oracle.rule("gauss-legendre:3")
-    q, p = map(oracle.numbers, case.state)
-    nodes, h, t = oracle.points("lobatto", 3), oracle.mp.mpf(0.1), oracle.mp.mpf(0.3)
-    q1, _ = oracle.svi(case.mechanics, t, q, p, h, nodes=nodes, c=c, w=w)
-    stepper = compiled("pumped-cart-pole", sc.SVI(2, "gauss-legendre:3"))
-
-    def along(middle):
-        return oracle.action(case.mechanics, t, np.vstack([q[None], middle, q1[None]]), h, nodes, c, w)
-
-    def derivative(middle):
-        return oracle.central(lambda x: along(x[None]), middle, "1e-12")
-
-    middle = oracle.newton(derivative, (q + q1) / 2, digits=20, width="1e-9")[None]
-    found = stepper.discrete_lagrangian(q.astype(float), q1.astype(float), 0.1, 0.3)
-    assert found == pytest.approx(float(along(middle)), abs=1e-14)
 
 
 @pytest.mark.tiers(0, 2)

@@ -15,7 +15,6 @@ from sympy.physics.mechanics import LagrangesMethod, Particle, Point, ReferenceF
 
 from scvi_codegen import ExpressionError, LagrangianSystem, SystemDefinitionError, SystemDefinitionWarning
 from scvi_codegen.systems.derived_expressions import curve_rates, forms_of
-from scvi_codegen.systems.formulas.symbols import C_KEYWORDS
 
 T = dynamicsymbols._t
 Q1, Q2 = dynamicsymbols("q1 q2")
@@ -219,12 +218,6 @@ def test_text_errors_carry_the_column() -> None:
     with pytest.raises(ExpressionError) as caught:
         from_text("x", "x_dot**2/2 - k*x")
     assert caught.value.column == 13
-
-
-@pytest.mark.parametrize("keyword", sorted(C_KEYWORDS))
-def test_keywords_of_c_are_rejected_in_sympy_input(keyword: str) -> None:
-    with pytest.raises(SystemDefinitionError, match=f"'{keyword}' is a keyword of C"):
-        from_sympy(V**2 / 2 - Symbol(keyword) * X, X, parameters={keyword: 1})
 
 
 KINETIC = V**2 / 2
