@@ -324,6 +324,7 @@ class LagrangianSystem(MechanicalSystem):
         floating: bool = False,
         gravity: Sequence[float] = (0.0, 0.0, -9.81),
         actuated: Sequence[str] | bool = False,
+        limits: bool = False,
         name: str | None = None,
     ) -> LagrangianSystem:
         """Create the system from a URDF file, in joint coordinates: kinetic energy, gravity and damping of joints.
@@ -340,6 +341,8 @@ class LagrangianSystem(MechanicalSystem):
             floating: whether the base moves freely; otherwise it is fixed to the world.
             gravity: acceleration of gravity in the world frame, in the units of the file (m/s^2).
             actuated: names of the joints on which an input ``tau_JOINT``, a torque or force, acts; ``True`` for all.
+            limits: whether limits and dry friction of hinges and slides are part of the motion, as its ``contacts``,
+                with the restrictions of contacts (:func:`~scvi_codegen.contact`); otherwise the warning lists them.
             name: name of the system; by default that of the robot.
 
         Raises:
@@ -347,13 +350,18 @@ class LagrangianSystem(MechanicalSystem):
         """
         from scvi_codegen.systems.multibody.trees.urdf import links_of_urdf
 
-        robot, links = links_of_urdf(path, floating=floating)
+        robot, links = links_of_urdf(path, floating=floating, limits=limits)
         return cls._of_tree(name or robot, links, gravity, actuated)
 
     @classmethod
     @checks_arguments(SystemDefinitionError, actuated=JOINTS)
     def from_mjcf(
-        cls, path: str | PathLike[str], *, actuated: Sequence[str] | bool = False, name: str | None = None
+        cls,
+        path: str | PathLike[str],
+        *,
+        actuated: Sequence[str] | bool = False,
+        limits: bool = False,
+        name: str | None = None,
     ) -> LagrangianSystem:
         """Create the system from an MJCF file of MuJoCo: kinetic energy, gravity, springs and damping of joints.
 
@@ -364,7 +372,7 @@ class LagrangianSystem(MechanicalSystem):
         what is not part of the motion: limits, dry friction, contacts, actuators.
 
         Args:
-            path, actuated: see :meth:`from_urdf`.
+            path, actuated, limits: see :meth:`from_urdf`; limits are rigid, without the softness of the file.
             name: name of the system; by default that of the model.
 
         Raises:
@@ -374,7 +382,7 @@ class LagrangianSystem(MechanicalSystem):
         from scvi_codegen.systems.multibody.trees.closures import conditions_of
         from scvi_codegen.systems.multibody.trees.mjcf import links_of_mjcf
 
-        model, links, gravity, closures = links_of_mjcf(path)
+        model, links, gravity, closures = links_of_mjcf(path, limits=limits)
         return cls._of_tree(name or model, links, gravity, actuated, conditions_of(links, closures))
 
     @classmethod

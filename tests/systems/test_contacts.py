@@ -371,3 +371,21 @@ def test_a_start_within_rounding_of_a_gap_at_the_origin_is_in_contact(height: fl
     assert [modes for _, modes in run.contact_modes] == [("slip",), ("stick",)]
     with pytest.raises(sc.ContactError, match="must not be negative"):
         stepper.integrate([0.0, -1e-6], velocity=[1.0, 0.0], h=0.05, t_end=0.5)
+
+
+@pytest.mark.xfail(strict=True, reason="contacts that stick before an impact of others are taken to stick after it")
+def test_an_impact_lets_dry_friction_slip_that_is_finite() -> None:
+    """At x = 0 the momentum of y stays -1, which friction of 0.1 cannot take: y' = -1/2."""
+    contacts = [sc.contact("x"), sc.friction("y_dot", limit=0.1)]
+    run = of("(x_dot**2 + y_dot**2 + (x_dot + y_dot)**2)/2", "x y", contacts, "svi:2").integrate(
+        [0.5, 0], velocity=[-1, 0], h=0.05, t_end=1
+    )
+    assert [modes for _, modes in run.contact_modes] == [("open", "stick"), ("slip", "slip")]
+    assert run.velocity[-1, 1] == pytest.approx(-0.5 + 0.05 * 0.5, abs=1e-12)
+
+
+@pytest.mark.xfail(strict=True, raises=sc.ContactError, reason="dependent rows of contacts have no consistent mode")
+def test_a_joint_with_dry_friction_rests_at_its_limit() -> None:
+    contacts = [sc.contact("x"), sc.friction("x_dot", limit=0.1)]
+    run = of("x_dot**2/2 - x", "x", contacts, "svi:2").integrate([0.5], velocity=[0], h=0.05, t_end=2)
+    assert abs(run.q[-1, 0]) < 1e-12

@@ -405,6 +405,38 @@ def test_limits_and_dry_friction_are_named_in_one_warning(tmp_path):
     assert Path(caught[0].filename).name == "test_robots.py"
 
 
+LIFT = {
+    "mjcf": """<mujoco><worldbody>
+<body><joint name="lift" type="slide" axis="0 0 1" range="-.5 1"/><geom size=".1" mass="1"/></body>
+<body pos="2 0 0"><joint name="wheel" axis="0 0 1" frictionloss=".1" range="-90 90" limited="false"/>
+<inertial pos="0 0 0" mass="1" diaginertia=".1 .1 .1"/></body></worldbody></mujoco>""",
+    "urdf": """<robot name="lift"><link name="base"/><link name="cage"><inertial>
+<mass value="1"/>INERTIA</inertial></link>
+<link name="disc"><inertial><mass value="1"/>INERTIA</inertial></link>
+<joint name="lift" type="prismatic"><parent link="base"/><child link="cage"/><axis xyz="0 0 1"/>
+<limit lower="-.5" upper="1" effort="1" velocity="1"/></joint><joint name="wheel" type="continuous">
+<parent link="base"/><child link="disc"/><axis xyz="0 0 1"/><dynamics friction=".1"/></joint></robot>""".replace(
+        "INERTIA", '<inertia ixx=".1" iyy=".1" izz=".1" ixy="0" ixz="0" iyz="0"/>'
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", LIFT)
+def test_limits_and_dry_friction_of_joints_are_contacts(kind, tmp_path):
+    file = tmp_path / f"lift.{kind}"
+    file.write_text(LIFT[kind])
+    with pytest.warns(SystemDefinitionWarning, match="limits of joints lift; dry friction of joints wheel$"):
+        assert not getattr(sc.LagrangianSystem, f"from_{kind}")(file).has_contacts
+    system = getattr(sc.LagrangianSystem, f"from_{kind}")(file, limits=True)
+    stepper = sc.compile_stepper(system, "svi:2")
+    run = stepper.integrate({"lift": 0.0, "wheel": 0.0}, velocity={"lift": 0.0, "wheel": 1.0}, h=0.05, t_end=1.5)
+    (_, falls), (lands, rests), (stops, sticks) = run.contact_modes
+    assert (falls, rests, sticks) == (("open", "open", "slip"), ("slip", "open", "slip"), ("slip", "open", "stick"))
+    assert (lands, stops) == pytest.approx((np.sqrt(1 / 9.81), 1.0), rel=1e-13)
+    assert run.q[-1] == pytest.approx([-0.5, 0.5], rel=1e-13)
+    assert run.contact_forces()[-1, 0, 0] == pytest.approx(9.81, rel=1e-12)
+
+
 @pytest.mark.rotated
 def test_parts_of_models_that_are_not_read_are_named_in_one_warning(tmp_path):
     text, file = (ROBOTS / "figure.xml").read_text(), tmp_path / "figure.xml"

@@ -42,6 +42,7 @@ from typing import Any
 from sympy import Add, Expr, Matrix, Rational, S, Symbol, cos, eye, sin, zeros
 
 from scvi_codegen.common.errors import SystemDefinitionError, closest
+from scvi_codegen.systems.contact import ContactLike, contact, friction
 from scvi_codegen.systems.formulas.intermediates import intermediate
 from scvi_codegen.systems.formulas.rotations import Rotation, RotationNames
 from scvi_codegen.systems.formulas.symbols import DOT, default_momenta, symbol
@@ -220,6 +221,17 @@ class Tree:
         """Return Rayleigh's function of the damping of joints."""
         return Add(*(self.quadratic(joint, joint.damping) for joint in self.joints.values()))
 
+    def contacts(self) -> tuple[ContactLike, ...]:
+        """Return the contacts q >= low and q <= high of joints with limits, and the dry friction of joints."""
+        contacts: list[ContactLike] = []
+        for joint in self.joints.values():
+            if joint.limits is not None:
+                q, (low, high) = self.coordinate(joint)[0], map(exact_number, joint.limits)
+                contacts += [contact(q - low), contact(high - q)]
+            if joint.dry_friction:
+                contacts.append(friction(self.coordinate(joint)[1], limit=exact_number(joint.dry_friction)))
+        return tuple(contacts)
+
     def arguments(self, actuated: Collection[str] | bool) -> dict[str, Any]:
         """Return arguments of :meth:`LagrangianSystem.from_sympy`: coordinates, rotations, lagrangian, forces.
 
@@ -293,10 +305,12 @@ def system_of_tree(
 ) -> Any:
     """Return the system of a tree, of class ``kind``; other arguments as of :class:`Tree` and its ``arguments``."""
     tree = Tree(links, gravity)
+    contacts = tree.contacts()
 
     def made(**fields: Any) -> Any:
-        members, fields = fields.get("rotations", ()), fields | {"links": tuple(map(DrawnLink.of, tree.links))}
-        if constraints or len(fields["coordinates"]) - len(members) < SMALLEST:
+        members, drawn = fields.get("rotations", ()), tuple(map(DrawnLink.of, tree.links))
+        fields |= {"links": drawn, "contacts": contacts}
+        if constraints or contacts or len(fields["coordinates"]) - len(members) < SMALLEST:
             return kind(**fields)
         return kind(**fields, dual_energy=_in_quaternions(dual_energy(tree), **fields))
 

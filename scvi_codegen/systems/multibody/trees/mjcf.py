@@ -71,8 +71,12 @@ Defaults = dict[str, dict[str, str]]
 """Attributes by kind of element."""
 
 
-def links_of_mjcf(path: str | PathLike[str]) -> tuple[str, list[Link], Vector, list[Closure | Coupling]]:
+def links_of_mjcf(
+    path: str | PathLike[str], *, limits: bool = False
+) -> tuple[str, list[Link], Vector, list[Closure | Coupling]]:
     """Return the name of the model, its links with parents first, the acceleration of gravity, and its equalities.
+
+    ``limits``: whether those of hinges and slides and their dry friction are read; otherwise the warning names them.
 
     Raises:
         SystemDefinitionError: naming file and element, if something is malformed or unknown, or changes the motion and
@@ -81,7 +85,7 @@ def links_of_mjcf(path: str | PathLike[str]) -> tuple[str, list[Link], Vector, l
     root = root_of(Path(path), "mujoco")
     _include(root)
     _apply_defaults(root)
-    model = _MujocoModel(root)
+    model = _MujocoModel(root, limits)
     closures = [*model.closures()]
     model.unread.warn(root.file)
     return root.text("model", Path(path).stem), model.scaled(), model.gravity, closures
@@ -90,8 +94,8 @@ def links_of_mjcf(path: str | PathLike[str]) -> tuple[str, list[Link], Vector, l
 class _MujocoModel:
     """Links of a document whose attributes are explicit."""
 
-    def __init__(self, root: Element) -> None:
-        self.root, self.unread = root, Unread()
+    def __init__(self, root: Element, limits: bool) -> None:
+        self.root, self.unread, self.limits = root, Unread(), limits
         self.settings, option, flags = (
             _merged(root, tag, parts)
             for tag, parts in (
@@ -231,15 +235,19 @@ class _MujocoModel:
                 joint = replace(joint, damping=damping, armature=joint.armature + factor * armature)
                 self.links[place] = replace(self.links[place], joint=joint)
 
-    def read_limits(self, element: Element, part: str, name: str) -> None:
+    def read_limits(self, element: Element, part: str, name: str) -> tuple[tuple[float, float] | None, float]:
+        """Return the range and the dry friction of a joint or tendon, in the units of the file, that are in force."""
         limited = element.choice("limited", "auto", "true", "false")
         low, high = element.vector("range", (0, 0), (2,))
         if limited == "auto" and low < high and self.settings.choice("autolimits", "true", "false") == "true":
             limited = "true"
-        if limited == "true" and not self.disabled & {"limit", "constraint"}:
-            self.unread.add(f"limits of {part}", name)
-        if element.number("frictionloss", 0, 0) and not self.disabled & {"frictionloss", "constraint"}:
-            self.unread.add(f"dry friction of {part}", name)
+        limits = (low, high) if limited == "true" and not self.disabled & {"limit", "constraint"} else None
+        friction = element.number("frictionloss", 0, 0) * (not self.disabled & {"frictionloss", "constraint"})
+        if not (self.limits and element.tag == "joint" and element.text("type", "hinge") in SINGLE):
+            for what in ("limits of",) * (limits is not None) + ("dry friction of",) * (friction > 0):
+                self.unread.add(f"{what} {part}", name)
+            return None, 0.0
+        return limits, friction
 
     def closures(self) -> Iterator[Closure | Coupling]:
         """Yield the equalities that are active; their softness is not read.
@@ -312,7 +320,7 @@ class _MujocoModel:
             joint.refuse("has a stiffness, which is read for hinges and slides only")
         if joint.choice("actuatorgravcomp", "false", "true") == "true":
             self.compensating.append(joint)
-        self.read_limits(joint, "joints", name)
+        limits, friction = self.read_limits(joint, "joints", name)
         damping = joint.number("damping", 0, 0)
         return Joint(
             name=name,
@@ -324,6 +332,8 @@ class _MujocoModel:
             rest=rest * turn,
             armature=joint.number("armature", 0, 0),
             zero=zero * turn if kind in SINGLE else 0.0,
+            limits=limits and (limits[0] * turn, limits[1] * turn),
+            dry_friction=friction,
         )
 
     def inertia(self, body: Element) -> Inertia:

@@ -94,6 +94,8 @@ class Joint:
         damping, stiffness, rest: torque or force -damping q_dot - stiffness (q - rest).
         armature: inertia of the rotor, which adds armature q_dot^2/2 to the kinetic energy.
         zero: value of the coordinate at ``pose``.
+        limits: smallest and largest value of the coordinate, or none.
+        dry_friction: torque or force of dry friction.
         follows: name of another joint, factor and offset: q = factor q_other + offset, without a coordinate of its own.
     """
 
@@ -106,6 +108,8 @@ class Joint:
     rest: float = 0.0
     armature: float = 0.0
     zero: float = 0.0
+    limits: tuple[float, float] | None = None
+    dry_friction: float = 0.0
     follows: tuple[str, float, float] | None = None
 
 

@@ -22,12 +22,13 @@ PRINTED = 5e-6
 """Angles that differ less from a multiple of pi/2 are this multiple: files print 1.5708 or 1.57079632."""
 
 
-def links_of_urdf(path: str | PathLike[str], *, floating: bool) -> tuple[str, list[Link]]:
+def links_of_urdf(path: str | PathLike[str], *, floating: bool, limits: bool = False) -> tuple[str, list[Link]]:
     """Return the name of the robot and its links, parents first.
 
     Args:
         path: the file.
         floating: whether the base moves freely; otherwise it is fixed to the world.
+        limits: whether those of joints and dry friction are read; otherwise a warning names them.
 
     Raises:
         SystemDefinitionError: naming file and element, if a link or joint is missing, named twice or malformed, the
@@ -56,29 +57,37 @@ def links_of_urdf(path: str | PathLike[str], *, floating: bool) -> tuple[str, li
     places = {roots[0]: 0}
     for parent in (order := [roots[0]]):
         for child in outgoing[parent]:
-            tree.append(Link(child, places[parent], _joint(joints[child]), _inertia(links[child])))
+            tree.append(Link(child, places[parent], _joint(joints[child], limits), _inertia(links[child])))
             places[child] = len(order)
             order.append(child)
     if len(order) < len(links):
         raise SystemDefinitionError(f"{path}: the links {sorted(set(links) - set(order))} form a circle")
-    _unread(robot).warn(str(path))
+    _unread(robot, limits).warn(str(path))
     return robot.name, tree
 
 
-def _unread(robot: Element) -> Unread:
+def _unread(robot: Element, limits: bool) -> Unread:
     """Return the parts of a document that matter and are not read."""
     unread = Unread()
-    for joint in robot.children("joint"):
-        limit, dynamics = joint.child("limit"), joint.child("dynamics")
-        if limit and (limit.number("lower", 0) or limit.number("upper", 0)) and joint.text("type") in LIMITED:
+    for joint in robot.children("joint") if not limits else ():
+        bounds, friction = _limits(joint)
+        if bounds:
             unread.add("limits of joints", joint.name)
-        if dynamics and dynamics.number("friction", 0, 0):
+        if friction:
             unread.add("dry friction of joints", joint.name)
     if any(link.child("collision") for link in robot.children("link")):
         unread.add("contacts")
     for actuator in robot.children("transmission", "ros2_control"):
         unread.add("actuators", actuator.name)
     return unread
+
+
+def _limits(joint: Element) -> tuple[tuple[float, float] | None, float]:
+    """Return the smallest and the largest value of a joint, if they limit it, and its dry friction."""
+    limit, dynamics = joint.child("limit"), joint.child("dynamics")
+    low, high = (0.0, 0.0) if limit is None else (limit.number("lower", 0), limit.number("upper", 0))
+    friction = 0.0 if dynamics is None else dynamics.number("friction", 0, 0)
+    return (low, high) if (low or high) and joint.text("type") in LIMITED else None, friction
 
 
 def _by_name(robot: Element, tag: str) -> dict[str, Element]:
@@ -98,7 +107,7 @@ def _linked(joint: Element, end: str) -> str:
     return element.text("link")
 
 
-def _joint(joint: Element) -> Joint:
+def _joint(joint: Element, limits: bool) -> Joint:
     kind = joint.text("type")
     if kind not in KINDS:
         joint.refuse(f"is of type '{kind}', which is not read; possible: {', '.join(KINDS)}")
@@ -109,12 +118,15 @@ def _joint(joint: Element) -> Joint:
         if not single:
             joint.refuse(f"is of type '{kind}', which cannot mimic another joint")
         follows = (mimic.text("joint"), mimic.number("multiplier", 1), mimic.number("offset", 0))
+    bounds, friction = _limits(joint) if limits and single else (None, 0.0)
     return Joint(
         name=joint.name,
         kind=KINDS[kind],
         pose=_pose(joint),
         axis=axis.unit("xyz", (1, 0, 0)) if axis is not None and single else np.array([1.0, 0.0, 0.0]),
         damping=0.0 if dynamics is None else dynamics.number("damping", 0, 0),
+        limits=bounds,
+        dry_friction=friction,
         follows=follows,
     )
 
