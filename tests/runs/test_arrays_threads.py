@@ -157,15 +157,20 @@ def test_every_term_is_counted_once(name: str, threads: int) -> None:
     np.testing.assert_allclose(run.p["q"][1], kick, rtol=0, atol=2e-15 * np.abs(kick).max())
 
 
+FEW = {"h": 0.01, "steps": 4}
+
+
 @pytest.mark.tiers(2, 3)
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize(
-    ("name", "method"),
-    [(name, "stoermer-verlet") for name in CASES] + [(name, "svi:4") for name in ("ring", "pairs", "net")],
+    ("name", "method", "plan"),
+    [(name, "stoermer-verlet", FEW) for name in CASES]
+    + [(name, "svi:4", FEW) for name in ("ring", "pairs", "net")]
+    + [("pairs", "svi:4", {"t_end": 3.0, "tolerance": 1e-9})],
 )
-def test_results_do_not_depend_on_the_number_of_threads(name: str, method: str) -> None:
+def test_results_do_not_depend_on_the_number_of_threads(name: str, method: str, plan: dict[str, Any]) -> None:
     found = [
-        bits(stepper_of(name, method).integrate(start_of(name), h=0.01, steps=4, threads=threads, **CASES[name].given))
+        bits(stepper_of(name, method).integrate(start_of(name), **plan, threads=threads, **CASES[name].given))
         for threads in THREADS
     ]
     assert found[1:] == found[:1] * (len(THREADS) - 1)
@@ -211,15 +216,6 @@ def test_newton_iteration_with_threads() -> None:
         for threads in THREADS[:2]
     )
     assert one == two
-
-
-@pytest.mark.second
-def test_adaptive_steps_with_threads() -> None:
-    stepper = stepper_of("pairs", "svi:4")
-    found = [
-        bits(stepper.integrate(start_of("pairs"), t_end=3.0, tolerance=1e-9, threads=threads)) for threads in THREADS
-    ]
-    assert found[1:] == found[:1] * (len(THREADS) - 1)
 
 
 @pytest.mark.rotated

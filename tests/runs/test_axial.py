@@ -89,26 +89,6 @@ def test_a_predictor_turns_with_the_body():
     assert run.iterations.sum() < 0.8 * expected.iterations.sum()
 
 
-@pytest.mark.full
-def test_steps_with_turns_backward_at_other_times_and_with_adaptive_steps():
-    ours, other = (sc.compile_stepper(each, "svi:8") for each in (body(f"{KINETIC} - w*R_33"), three()))
-    run, expected = (each.integrate(START, velocity=OMEGA, t_end=5.0, tolerance=1e-12) for each in (ours, other))
-    assert len(run.t) < 0.8 * len(expected.t)
-    np.testing.assert_allclose(run.at(3.3)[0], expected.at(3.3)[0], rtol=0, atol=1e-11)
-    there = ours.integrate(START, velocity=OMEGA, h=0.2, steps=20)
-    back = ours.integrate(there.q[-1], there.p[-1], h=-0.2, steps=20)
-    np.testing.assert_allclose(back.q[-1], there.q[0], rtol=0, atol=1e-13)
-
-
-@pytest.mark.full
-def test_energy_of_a_symmetric_top_over_many_steps():
-    stepper = sc.compile_stepper(body(f"{KINETIC} - w*R_33"), "svi:4")
-    run = stepper.integrate(START, velocity=OMEGA, h=0.1, steps=10**6, save_every=1000)
-    energies = np.array([stepper.energy(q, p) for q, p in zip(run.q, run.p, strict=True)])
-    error = abs(energies / energies[0] - 1)
-    assert error[-100:].max() < 2 * error[:100].max() + 1e-13
-
-
 PAIR = " - w*(R_33 + S_33)/2 - v*(R_13*S_13 + R_23*S_23 + R_33*S_33)**2"
 TWO = {"R": [0.9, 0.3, -0.2, 0.1], "S": [0.5, -0.1, 0.8, 0.3]}
 SPINS = {"omega": [0.4, -0.7, 3.0], "nu": [0.2, 0.9, -2.0]}

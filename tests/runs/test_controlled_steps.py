@@ -77,13 +77,6 @@ def test_step_sizes_are_smaller_where_errors_grow(degree, e, tolerance):
     assert run.iterations.sum() < 6 * run.steps
 
 
-def test_restored_adaptive_runs_require_their_end(kepler):
-    run = kepler.start(*orbit(0.8), t_end=20.0)
-    run.advance(37)
-    with pytest.raises(sc.StateError, match="adaptive steps: give t_end"):
-        kepler.from_checkpoint(run.checkpoint())
-
-
 def test_collision_is_rejected_where_it_occurs(kepler):
     with pytest.raises(sc.StepFailedError, match="collision") as failure:
         kepler.integrate([1.0, 0.0], [0.0, 0.0], t_end=2.0)
@@ -331,13 +324,6 @@ class TestStepsOfHLeadToAnEnd:
     @staticmethod
     def positions(run):
         return (run.q if isinstance(run.q, np.ndarray) else run.q["q"])[:, 0]
-
-    @pytest.mark.second
-    def test_integer_number_of_steps_is_exact(self, oscillators, name, sign):
-        run = oscillators[name].integrate([1.0], [0.0], h=sign * 0.1, t_end=sign * 2.0)
-        same = oscillators[name].integrate([1.0], [0.0], h=sign * 0.1, steps=20)
-        assert np.array_equal(run.t, same.t)
-        assert np.array_equal(self.positions(run), self.positions(same))
 
     @pytest.mark.parametrize("save_every", [1, 4])
     def test_last_step_is_shortened_if_h_does_not_divide_the_span(self, oscillators, name, sign, save_every):

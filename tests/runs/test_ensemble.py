@@ -513,10 +513,6 @@ class TestFiles:
             assert np.array_equal(rows[:, 3:5], result.q[: len(rows), j])
             assert set(rows[:, 1]) == {result.parameters[j, 0]}
 
-    def test_unknown_suffixes_are_rejected(self, result: sc.EnsembleTrajectory, tmp_path):
-        with pytest.raises(sc.StateError, match=r"use \.npz, \.csv, \.h5"):
-            result.save(tmp_path / "runs.txt")
-
 
 GRID = """
 [grid]

@@ -122,17 +122,6 @@ def test_recorded_run_continues_with_its_fallback(start, tmp_path):
     assert np.array_equal(whole.iterations, expected.iterations)
 
 
-@pytest.mark.full
-def test_low_words_do_not_depend_on_the_split_of_a_run():
-    """Low words of fixed-point and Newton steps are separate, for one call as for many."""
-    stepper = sc.compile_stepper(sc.problem("kepler").system, sc.SVI(4), flags=PORTABLE_FLAGS)
-    whole, cut = (stepper.start([0.3, 0.0], [0.0, (1.7 / 0.3) ** 0.5], h=0.8) for _ in range(2))
-    whole.advance(40)
-    for _ in range(40):
-        cut.advance(1)
-    assert whole.checkpoint() == cut.checkpoint()
-
-
 @pytest.mark.second
 def test_failed_run_ends_before_the_step(start):
     borrowing, _ = both(sc.SVI(4))

@@ -13,7 +13,6 @@ from scvi_codegen.codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.common.cache import identity
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.common.precision import mp
-from scvi_codegen.systems.derived_expressions import forms_of
 from scvi_codegen.systems.formulas.expressions import evaluate, gradient, hessian, jacobian, unsupported_part
 from scvi_codegen.systems.formulas.intermediates import intermediate, intermediates, written_out, written_size
 from scvi_codegen.systems.formulas.numpy_values import array_value
@@ -118,30 +117,6 @@ def chain(folder: Path, n: int) -> sc.LagrangianSystem:
     path = folder / f"chain{n}.xml"
     path.write_text(f"<mujoco><worldbody>{bodies}{'</body>' * n}</worldbody></mujoco>")
     return sc.LagrangianSystem.from_mjcf(path)
-
-
-def operations(system: sc.LagrangianSystem, formulas) -> int:
-    arguments = (*system.coordinates, *system.velocities)
-    kernel = lower_kernel("k", arguments=arguments, time=system.time, parameters=(), values=tuple(formulas))
-    return sum(kernel.operation_counts().values())
-
-
-@pytest.mark.full
-def test_operations_of_a_chain_of_bodies_are_linear_and_those_of_its_mass_matrix_quadratic(tmp_path):
-    counts = []
-    for n in (8, 16, 24):
-        system = chain(tmp_path, n)
-        forms = forms_of(system)
-        counts.append(
-            [
-                operations(system, formulas)
-                for formulas in ([system.lagrangian], (*forms.force, *forms.momentum), forms.lower_mass.values())
-            ]
-        )
-    few, some, many = np.array(counts)
-    assert np.all(np.abs((many - some) - (some - few))[:2] <= 4)  # equal differences: linear
-    assert many[1] < 5 * many[0]  # the gradient by adjoints
-    assert many[2] < 30 * 24**2 + 300 * 24
 
 
 @pytest.mark.tiers(0, 1)
