@@ -163,7 +163,8 @@ static int change_sides(const event_step *step, long long first, const event_sam
     const int kink = crossing->function - FIRST_KINK;
     if (kink >= 0 && !is_of_time(kink) && sign[kink] == -crossing->direction) {
       set_side(step, kink, -crossing->direction);
-      crossing->direction = 0; /* a touch */
+      crossing->direction = 0; /* a touch: many in what remains of a step do not accumulate */
+      step->watch->history[FUNCTION_OF(crossing)].hits = 1;
       returns = 1;
     }
   }
