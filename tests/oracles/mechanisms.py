@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import sympy
 from scipy.integrate import solve_ivp
-from sympy import Matrix, cos, sin, symbols
+from sympy import Matrix, sin, symbols
 from sympy.core.function import AppliedUndef
 from sympy.physics.mechanics import (
     KanesMethod,
@@ -187,27 +187,6 @@ def four_bar_linkage() -> Mechanism:
     return Mechanism(model, LagrangianSystem.from_system, constants, q, u, 0.2)
 
 
-def double_pendulum() -> Mechanism:
-    """SymPy's test of ``LagrangesMethod`` with bodies that have potential energies."""
-    (q1, q2), (m, length, g) = dynamicsymbols("q1 q2"), symbols("m l g")
-    ground, pivot = ReferenceFrame("N"), Point("O")
-    pivot.set_vel(ground, 0)
-    bodies, at = [], pivot
-    for name, q in (("P", q1), ("R", q2)):
-        rod = ground.orientnew(f"B{name}", "Axis", (q, ground.z))
-        point = at.locatenew(name, length * rod.x)
-        point.v2pt_theory(at, ground, rod)
-        bodies.append(Particle(f"Par{name}", point, m))
-        at = point
-    bodies[0].potential_energy = -m * g * length * cos(q1)
-    bodies[1].potential_energy = -m * g * length * (cos(q1) + cos(q2))
-    model = LagrangesMethod(Lagrangian(ground, *bodies), [q1, q2], bodies=bodies, frame=ground)
-    model.form_lagranges_equations()
-    return Mechanism(
-        model, LagrangianSystem.from_lagranges_method, {"m": 1.3, "l": 0.7, "g": G}, (1.2, -0.4), (0.0, 0.5)
-    )
-
-
 def disc_on_an_incline() -> Mechanism:
     """SymPy's test of ``LagrangesMethod`` with a holonomic constraint: a disc that rolls down a plane."""
     (y, theta), (m, g, r, length, alpha) = dynamicsymbols("y theta"), symbols("m g R l alpha")
@@ -355,7 +334,6 @@ MECHANISMS: dict[str, Callable[[], Mechanism]] = {
     "two links on a cart": cache(lambda: links_on_a_cart(2)),
     "standing human": cache(standing_human),
     "four-bar linkage": cache(four_bar_linkage),
-    "double pendulum": cache(double_pendulum),
     "disc on an incline": cache(disc_on_an_incline),
     "rolling disc": cache(rolling_disc),
     "chaos pendulum": cache(chaos_pendulum),

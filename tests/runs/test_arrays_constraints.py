@@ -112,18 +112,6 @@ def test_cloth_conserves_rod_lengths_and_energy():
     assert np.abs(run.q["r"] - q).max() > 0.1  # it moved
 
 
-@pytest.mark.second
-def test_compositions_have_their_order_and_satisfy_constraints():
-    stepper = sc.compile_stepper(net(), "composition:8")
-    q, data = chain(3)
-    exact = stepper.integrate(q, h=1 / 800, steps=800, save_every=800, **data).q["r"][-1]
-    errors = [
-        np.abs(stepper.integrate(q, h=1 / n, steps=n, save_every=n, **data).q["r"][-1] - exact).max() for n in (50, 100)
-    ]
-    assert errors[1] < 1e-7
-    assert 2.0**7 < errors[0] / errors[1] < 2.0**10
-
-
 def test_initial_state_is_projected_to_the_nearest_state(stepper):
     q, data = chain(3)
     off = q + 1e-3 * np.random.default_rng(1).normal(size=q.shape)
