@@ -107,6 +107,8 @@ def _check_points(system: MechanicalSystem, stages: StageSystem, name: str) -> N
 
 def _is_polynomial(group: StageGroup) -> bool:
     """Return whether the velocity at the last point is interpolated by the others, as for a polynomial of degree s."""
+    if len(group.gathers) < 2:  # compositions have positions alone
+        return False
     velocities, points = group.gathers[1].table.entries, group.abscissae
     others = Table(entries=velocities[:-1], names=group.gathers[1].table.names[:-1])
     last = _interpolated(others, cardinal_values(points[:-1], points[-1:]), "").entries[0]

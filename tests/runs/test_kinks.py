@@ -185,6 +185,15 @@ def test_sliding_is_an_error_that_names_it():
         sc.compile_stepper(rough, "svi:4").integrate([1.0], [0.0], t_end=10.0)
 
 
+@pytest.mark.full
+def test_steps_across_kinks_are_verified_as_formulas():
+    """Sizes of tangent vectors are those of the parameters, without modes."""
+    spring = lagrange("spring", "x", "x_dot**2/2 - k*positive_part(x)**2 - x**2", k=1.0)
+    assert sc.verify(spring, "svi:1").passed
+    with pytest.raises(sc.StateError, match='modes along runs, .* compile it with kinks="as formulas"'):
+        sc.verify(spring, "svi:1", stepper=sc.compile_stepper(spring, "svi:1"))
+
+
 def test_modes_may_be_left_out_of_parameters_in_order():
     spring = lagrange("spring", "x", "x_dot**2/2 - k*positive_part(x)**2 - x**2", k=1.0)
     stepper = sc.compile_stepper(spring, "svi:4")

@@ -259,6 +259,9 @@ def on_floor() -> Any:
     return of(PLANE, "x y", [sc.contact("y")], "svi:2")
 
 
+RESTS = sc.LagrangianSystem.from_text("rests", ["y"], "y_dot**2/2 - y", contacts=[sc.contact("y")])
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -272,6 +275,10 @@ def on_floor() -> Any:
         (lambda: of(PLANE, "x y", [sc.contact("y + x_dot")], "svi:2"), "gap=.*x_dot"),
         (lambda: of(PLANE, "x y", [sc.friction("x_dot**2", limit=1)], "svi:2"), "slip=.*linear in velocities.*x_dot"),
         (lambda: of(PLANE, "x y", [sc.contact("y")], "gauss:4"), "contacts|constraints"),
+        (lambda: of("x_dot**2/2", "x", [sc.friction("x_dot", limit=1)], "composition:4"), "curves are not polynomials"),
+        (lambda: sc.verify(RESTS, "svi:2"), "changes its modes"),
+        (lambda: sc.advise(RESTS, "svi:2", [1], [0], 1.0, 1e-6), "steps end at the contacts"),
+        (lambda: sc.exact_map(RESTS, [1], [0], 0.1), "has contacts, which exact steps"),
         (
             lambda: of(PLANE, "x y", [sc.contact("y")], "svi:2").integrate([0, -1], [0, 0], h=1, t_end=1),
             "gap of contact",

@@ -175,6 +175,10 @@ def advise(
         raise MethodError(
             f"'{system.name}' is in transformed time: no step size is recommended; use largest_step or try h"
         )
+    if system.has_contacts:
+        raise MethodError(
+            f"steps end at the contacts of '{system.name}', so that none is recommended: use t_end and a tolerance"
+        )
     length, target = _checked_request(span, tolerance)
     state = {"p": p, "velocity": velocity, "t": t, "parameters": parameters, "options": options}
     result: list[tuple[float, Advice]] = []

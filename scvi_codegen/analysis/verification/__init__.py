@@ -52,6 +52,9 @@ LONGEST, HALVINGS, PART = 1.0, 40, 0.1
 """Largest step tried, number of halvings, and the largest change of the state per step relative to its size."""
 
 
+_compiled = partial(compile_stepper, kinks="as formulas")
+
+
 @checks_arguments(system=SYSTEM_OR_ARRAYS, stepper=STEPPER)
 @without_accuracy_warnings()
 def verify(
@@ -103,12 +106,17 @@ def verify(
     t, h = checked_number(t, "the time t"), None if h is None else checked_step(h)
     began, method = time.perf_counter(), as_method(method, system)
     if isinstance(system, ArraySystem):
-        stepper = stepper or compile_stepper(system, method, solver=solver, kinks="as formulas")
+        stepper = stepper or _compiled(system, method, solver=solver)
         of_known_sizes = partial(verify, solver=solver, tolerance=tolerance)
         of_run |= {"of_known_sizes": of_known_sizes, "tolerance": tolerance}
         return verify_arrays(system, method, stepper, (q, p, cast(float, h), t), began, **of_run)
     system = discretised_form(system, method)
-    stepper = stepper or compile_stepper(system, method, solver=solver, kinks="as formulas")
+    stepper = stepper or _compiled(system, method, solver=solver)
+    if stepper.interface.mode_names:
+        raise StateError(
+            f"{stepper!r} changes its modes along runs, of kinks or contacts: measured are the formulas of one step. "
+            'Omit stepper, or compile it with kinks="as formulas"; omit contacts'
+        )
     start = _initial_state(system, stepper, q, p, h, t)
     return _certificate(system, method, stepper, start, began, solver=solver, tolerance=tolerance)
 
@@ -145,7 +153,7 @@ def _certificate(
     flags, with_events, stepper = stepper.flags, stepper, stepper.with_events(())
     steps, single = stepper, at_fixed_energy(system, stepper.energy(start.q, start.p, start.t))
     if single is not system or stepper.interface.time_transformation is not None:
-        steps = compile_stepper(single, method, solver=solver, flags=flags)
+        steps = _compiled(single, method, solver=solver, flags=flags)
     tested = SystemUnderTest(single, method, steps, _newton(single, method, steps, solver, flags), start)
     variable = steps is not stepper or tolerance is not None
     in_time = system.clock.plain if system.clock and system.clock.plain else system
@@ -177,7 +185,7 @@ def _newton(
         return stepper
     if solver != "auto" or not method.implicit:
         return None
-    return compile_stepper(system, method, solver="newton", flags=flags)
+    return _compiled(system, method, solver="newton", flags=flags)
 
 
 def _initial_state(system: MechanicalSystem, stepper: Stepper, q: Any, p: Any, h: float | None, t: float) -> State:

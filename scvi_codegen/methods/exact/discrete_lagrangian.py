@@ -167,10 +167,10 @@ class _Problem:
         self.digits, self.t, self.h = digits, _number(t, "the time t"), _number(h, "the step h")
         if self.h == 0:
             raise StateError("the step size h is 0: it must be positive or negative")
-        if system.constraints:
+        if system.constraints or system.has_contacts:
             raise StateError(
-                f"'{system.name}' has constraints, which exact steps do not support: use coordinates "
-                "without constraints"
+                f"'{system.name}' has {'constraints' if system.constraints else 'contacts'}, which exact steps do not "
+                "support: use coordinates without them"
             )
         self.motion = ExactMotion(system, list(_parameter_values(system, parameters).values()))
 

@@ -99,7 +99,9 @@ def _at_known_sizes(
     unrolled = unroll_sums(system, arrays.sizes, tables=arrays.places, parameters=parameters)
     stepper = None
     if with_events.events:
-        stepper = compile_stepper(unrolled, method, flags=with_events.flags, events=with_events.events)
+        stepper = compile_stepper(
+            unrolled, method, flags=with_events.flags, events=with_events.events, kinks="as formulas"
+        )
     if system.constraints and isinstance(method, StoermerVerlet):
         method = SVI(1, "gauss-lobatto:2")  # RATTLE under its name for known sizes
     certificate = of_known_sizes(unrolled, method, initial.q, initial.p, h=initial.h, t=initial.t, stepper=stepper)
@@ -145,7 +147,7 @@ def _unrolled_checks(tested: SystemUnderTest) -> Iterator[Check]:
 def _compared_with_unrolled(tested: SystemUnderTest) -> Finding:
     """Return the largest difference from the compiled unrolled system, in units of rounding of the first step."""
     first = tested.states[0]
-    other = compile_stepper(tested.system, tested.method, flags=tested.stepper.flags)
+    other = compile_stepper(tested.system, tested.method, flags=tested.stepper.flags, kinks="as formulas")
     run: dict[str, Any] = {"h": first.h, "t": first.t, "steps": SMALL_STEPS, "parameters": tested.parameters}
     rolled, expected = (stepper.integrate(first.q, first.p, **run) for stepper in (tested.stepper, other))
     difference = np.abs(np.concatenate([rolled.q - expected.q, rolled.p - expected.p], axis=1)) / tested.rounding(first)
