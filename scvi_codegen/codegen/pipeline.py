@@ -306,7 +306,7 @@ class Sources:
             program, self.system, self.method, uses_fallback_library=self.uses_fallback_library, g=self.g
         )
         if self.kinks:
-            modes = tuple((kink.mode, str(kink.function)) for kink in self.kinks)
+            modes = tuple((kink.mode, str(kink.function), *map(str, kink.power_sides)) for kink in self.kinks)
             interface = replace(interface, kinks=self._without_modes.kinks, modes=modes)
         if self.precision != DOUBLE_DOUBLE:
             return interface

@@ -185,9 +185,11 @@ class Kink(Event):
 
     Attributes:
         mode: parameter that is added to u: 0, or a number beyond all values of u, whose sign then decides.
+        power_sides: signs of u with powers of it that are not whole, so that motions there are not smooth at u = 0.
     """
 
     mode: str = field(kw_only=True)
+    power_sides: tuple[int, ...] = field(default=(), kw_only=True)
 
     @property
     def changes_state(self) -> bool:

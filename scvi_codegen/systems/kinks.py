@@ -10,7 +10,7 @@ C. Fuehrer, Numerical Methods in Multibody Dynamics, 6).
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
@@ -38,7 +38,8 @@ def located_kinks(system: MechanicalSystem) -> tuple[MechanicalSystem, tuple[Kin
     owned = [field.name for field in fields(system) if field.name in FORMULAS]
     formulas = [formula for name in owned for formula in _formulas(getattr(system, name))]
     steps = sorted(parts_of_type(unit_step, *formulas), key=str)
-    one_sided = _one_sided(formulas)
+    powers = _vanishing_powers(formulas)
+    one_sided = _one_sided(formulas, powers)
     located = [step for step in steps if _moves(step, system) and step not in one_sided]
     arguments = {switching_function(step.args[0])[0] for step in located}
     if not arguments or len(arguments) > MOST_KINKS or system.clock:
@@ -48,18 +49,25 @@ def located_kinks(system: MechanicalSystem) -> tuple[MechanicalSystem, tuple[Kin
     numbers = (k for k in range(1, 10**6) if f"mode_{k}" not in taken)
     modes = {u: Mode(f"mode_{k}", real=True) for u, k in zip(sorted(arguments, key=str), numbers, strict=False)}
     rules: dict[Expr, Expr] = {}
-    for step in steps:
+    for step in located:
         u, sign = switching_function(step.args[0])
-        if u in modes:
-            rules[step] = unit_step(step.args[0] + sign * modes[u])
+        rules[step] = unit_step(step.args[0] + sign * modes[u])
+    rules |= {power: rules[step] * power for power, step in powers.items() if step in rules}
     with_modes = copy.copy(system)  # not made anew, as it would be checked again
     changes: dict[str, Any] = {name: _replaced(getattr(system, name), rules) for name in owned}
     changes["parameters"] = (*system.parameters, *modes.values())
     changes["defaults"] = (*system.defaults, *(0.0 for _ in modes))
     for name, value in (changes | {"_key": None, "_text": None}).items():
         object.__setattr__(with_modes, name, value)
-    functions = {mode.name: system.text_of(u.xreplace(rules)) for u, mode in modes.items()}  # u may contain kinks, too
-    return with_modes, tuple(Kink(function, mode=mode) for mode, function in functions.items())
+    sides = {switching_function(step.args[0]) for step in powers.values() if step in rules}
+    return with_modes, tuple(
+        Kink(system.text_of(u.xreplace(rules)), mode=mode.name, power_sides=_signs(u, sides))
+        for u, mode in modes.items()
+    )
+
+
+def _signs(u: Expr, sides: Container[tuple[Expr, int]]) -> tuple[int, ...]:
+    return tuple(side for side in (-1, 1) if (u, side) in sides)
 
 
 def _formulas(value: Any) -> tuple[Expr, ...]:
@@ -75,13 +83,23 @@ def _moves(step: Expr, system: MechanicalSystem) -> bool:
     return not step.free_symbols.issubset(system.parameters)
 
 
-def _one_sided(formulas: Iterable[Expr]) -> set[Expr]:
+def _vanishing_powers(formulas: Iterable[Expr]) -> dict[Expr, Expr]:
+    """Return powers that are not whole, and the step by which their base is 0 on a side, as positive_part(u)**(5/2).
+
+    There u**(5/2) is undefined: its factor unit_step(u + mode) is that of the side, the base that of the formula.
+    """
+    powers = [part for part in parts(*formulas) if part.is_Pow and part.exp.is_positive and not part.exp.is_Integer]
+    bases = {power: [factor for factor in power.base.args if isinstance(factor, unit_step)] for power in powers}
+    return {power: factors[0] for power, factors in bases.items() if power.base.is_Mul and len(factors) == 1}
+
+
+def _one_sided(formulas: Iterable[Expr], powers: Mapping[Expr, Expr]) -> set[Expr]:
     """Return steps whose formulas may be undefined on the other side.
 
     They are in the base of a power that is not whole, or in the argument of a root, logarithm or inverse function.
     """
     domains = [part for part in parts(*formulas) if isinstance(part, _domains()) and not _is_whole_power(part)]
-    return parts_of_type(unit_step, *domains)
+    return {step for part in domains for step in parts_of_type(unit_step, part) if step != powers.get(part)}
 
 
 def _domains() -> tuple[type, ...]:

@@ -12,6 +12,8 @@ import pytest
 from kinks import KINDS, METHODS, stepper_of, wrong
 from nonsmooth import FAMILIES, Case, case_of
 from notation import lagrange
+from scipy.integrate import quad
+from scipy.optimize import brentq
 
 import scvi_codegen as sc
 
@@ -220,3 +222,26 @@ def test_periodic_orbits_between_springy_walls():
     walls = lagrange("walls", "x", "x_dot**2/2 - 50*(positive_part(x - 1)**2 + positive_part(-x - 1)**2)")
     orbit = sc.periodic_orbit(sc.compile_stepper(walls, "svi:4"), [0.0], [1.0], period=4.6)
     assert orbit.period == pytest.approx(4 / np.sqrt(2 * orbit.energy) + np.pi / 5, rel=1e-9)
+
+
+def duration_of_contact(v: float) -> float:
+    """Time from y = 0 to y = 0 with L = y_dot^2/2 - 10 y - 1e5 positive_part(-y)^(5/2), by y = -d (1 - z^2)."""
+    d = brentq(lambda y: v * v + 20.0 * y - 2e5 * y**2.5, 1e-9, 1.0, xtol=1e-17, rtol=1e-15)
+    rate = lambda z: 2e5 * d**1.5 * -np.expm1(2.5 * np.log1p(-z * z)) / z**2 - 20.0  # noqa: E731
+    return 4.0 * np.sqrt(d) * quad(lambda z: 1.0 / np.sqrt(rate(z)), 0.0, 1.0, epsabs=0.0, epsrel=1e-13)[0]
+
+
+@pytest.mark.parametrize(
+    ("method", "tolerance", "bound"), [("svi:4", 1e-8, 1e-6), ("svi:8", 1e-8, 2e-7), ("svi:8", None, 1e-12)]
+)
+def test_adaptive_steps_keep_the_tolerance_at_powers_that_are_not_whole(method, tolerance, bound):
+    """A Hertz ball that is dropped from 50 heights and bounces ten times, and one that starts on the surface."""
+    hertz = lagrange("hertz", "y", "y_dot**2/2 - 10*y - 1e5*positive_part(-y)**(5/2)")
+    stepper, heights = sc.compile_stepper(hertz, method), np.linspace(0.3, 2.0, 50)
+    falls, plan = np.sqrt(heights / 5.0), {"tolerance": tolerance} if tolerance else {}
+    ends = 10 * (2 * falls + [duration_of_contact(10.0 * fall) for fall in falls]) + falls / 2
+    runs = stepper.integrate_ensemble(heights[:, None], np.zeros((50, 1)), t_end=ends, **plan)
+    assert np.abs(runs.ends[1][:, 0] - 0.75 * heights).max() < bound
+    assert runs.ends[1][7] == stepper.integrate([heights[7]], [0.0], t_end=ends[7], **plan).q[-1]
+    start = stepper.integrate([0.0], [-3.0], t_end=duration_of_contact(3.0) + 0.1, **plan)
+    assert abs(start.q[-1, 0] - 0.25) < bound

@@ -337,6 +337,7 @@ def _search(interface: Interface, events: tuple[SearchedEvent, ...], *, controll
             uses_velocity=arrays.uses_velocity,
         )
     formulas = EventFormulas(interface, events)
+    sides = [event.power_sides for event in events if isinstance(event, Kink)]
     timed = [0 if interface.in_tau else _kind_in_time(g, formulas.arguments) for g in formulas.functions]
     rates = [turn_rate(g) if kind else sympy.Integer(0) for g, kind in zip(formulas.functions, timed, strict=True)]
     formulas_of_kernel = {
@@ -359,6 +360,7 @@ def _search(interface: Interface, events: tuple[SearchedEvent, ...], *, controll
         parameters=len(interface.parameters),
         modes=tuple(map(interface.parameters.index, formulas.modes)),
         kinks=sum(isinstance(event, Kink) for event in events),
+        powers=tuple((int(-1 in side), int(1 in side)) for side in sides) if any(sides) else (),
         contacts=tuple(_places(formulas.modes, contact) for contact in interface.contacts),
         transitions=tuple((event.contact, event.kind) for event in events if isinstance(event, Transition)),
     )

@@ -167,6 +167,7 @@ class EventSearch:
         parameters: number of parameters.
         modes: indices of the parameters that change along runs: by events, as modes of contacts, and of kinks.
         kinks: number of kinks, which are the last events.
+        powers: below and above the zero of each of them, whether a power that is not whole acts; empty if none does.
         contacts: normal and tangential row of each contact, and its closed, sticks and direction among the modes, -1 of
             what it does not have.
         transitions: contact and kind of each of their transitions, the events before the kinks.
@@ -196,6 +197,7 @@ class EventSearch:
     parameters: int = 0
     modes: tuple[int, ...] = ()
     kinks: int = 0
+    powers: tuple[tuple[int, int], ...] = ()
     contacts: tuple[tuple[int, ...], ...] = ()
     transitions: tuple[tuple[int, str], ...] = ()
     ENTRY: ClassVar[str] = "events"

@@ -376,7 +376,7 @@ class Interface:
             checks.
         words: number of doubles of each number of a state, 2 in double-double arithmetic.
         kinks: functions at whose zeros the equations are not smooth, for events.
-        modes: parameter and switching function of each kink that runs locate
+        modes: parameter, switching function and sides of powers of each kink that runs locate
             (:mod:`scvi_codegen.systems.kinks`).
         contacts: places of each contact (:mod:`scvi_codegen.systems.contacts.modes`).
     """
@@ -425,7 +425,7 @@ class Interface:
     def mode_names(self) -> tuple[str, ...]:
         """Names of the parameters that runs change: modes of contacts and of kinks; they are the last ones."""
         return tuple(name for contact in self.contacts for name in contact.masks) + tuple(
-            name for name, _ in self.modes
+            name for name, *_ in self.modes
         )
 
     @property

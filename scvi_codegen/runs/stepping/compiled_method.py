@@ -115,7 +115,9 @@ class CompiledMethod:
             for number, contact in enumerate(interface.contacts)
             for kind, function in contact.transitions
         )
-        kinks = (Kink(function, mode=mode) for mode, function in interface.modes)
+        kinks = (
+            Kink(function, mode=mode, power_sides=tuple(map(int, sides))) for mode, function, *sides in interface.modes
+        )
         self.searched: tuple[Event, ...] = (*events, *transitions, *kinks)
         self.modes = modes_of(events, interface.parameters, interface.mode_names)
         self.changes_states = any(event.changes_state for event in events)

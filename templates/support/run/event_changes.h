@@ -453,6 +453,10 @@ static int take_step(event_run *run, real t_end, const step_control *control, co
   event_sample end = {.q = step->memory, .p = step->memory + M};
   solver_report own;
   int status;
+#if defined(EVENT_POWERS) && EVENTS_CONTROLLED
+  step_control shorter;
+  control = control ? graded(step, control, &shorter) : control;
+#endif
   if (control || fabs(left) >= (1.0 - CHANGE_WHOLE) * fabs(run->h)) {
     status = advance_run(run, t_end, control, step, iterations, &own);
     *length = control ? run->t - start : run->h;
@@ -514,12 +518,20 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
     if (status == OK)
       status = settle_sides(&step, &start, &unknown);
     size = run->h;
-    if (status == OK && unknown && control)
+    int tried = unknown;
+#if defined(EVENT_POWERS) && EVENTS_CONTROLLED
+    tried |= control && enters_power(&step);
+    watch->first = INFINITY;
+#endif
+    if (status == OK && tried && control)
       status = take_step(run, t_end, control, &step, &size, &count);
     if (status == OK && unknown)
       status = sides_after_start(&step, &start, size);
-    if (unknown)
+    if (tried)
       copy_run(run, &before);
+#ifdef EVENT_POWERS
+    watch->first = tried ? fabs(size) : INFINITY;
+#endif
 #endif
     if (status == OK)
       status = take_step(run, t_end, control, &step, &size, &count);

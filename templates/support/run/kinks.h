@@ -30,10 +30,16 @@ enum {
 #define KINK_MISSED 16.0 /* effects of rounding beyond which the sign of the other side shows a missed crossing */
 #define KINK_FAR 2.0 /* a kink is far beyond so many times the change of its function in a step */
 #define KINK_FORGETS 0.97 /* factor of former rates of change for each step */
+#define GRADE 0.5 /* step size relative to the time from or to the zero of the base of a power */
+#define GRADE_FIRST 0.02 /* size of the first one relative to a trial by the error of a smooth motion */
+#define GRADE_POWER 0.3 /* least such time by the tolerance: errors are of order 7/2 at the zero of u in u^(5/2) */
 
 /* Sets the side of a kink in the search and in the parameters of its steps. */
 static void set_side(const event_step *step, int kink, int side)
 {
+#ifdef EVENT_POWERS
+  step->watch->depth[kink] = 0.0;
+#endif
   SIDE_OF(step->watch, kink) = step->own[MODE_PLACE[FIRST_SIDE + kink]] = side * KINK_SIDE;
 }
 
@@ -199,6 +205,42 @@ static int check_sides(const event_step *step, const event_sample *right)
     }
   return status;
 }
+
+#if defined(EVENT_POWERS) && EVENTS_CONTROLLED
+/* Whether a power of the function of a kink acts on its side. */
+static int has_power(const event_step *step, int kink)
+{
+  const real side = SIDE_OF(step->watch, kink);
+  return side != 0.0 && HAS_POWER[kink][side > 0.0];
+}
+
+/* Whether a step begins at the zero of the base of a power, on its side. */
+static int enters_power(const event_step *step)
+{
+  int enters = 0;
+  for (int k = 0; k < EVENT_KINKS; k++)
+    enters |= JUST_CHANGED(step->watch, EVENT_FIRST[FIRST_KINK + k]) && has_power(step, k);
+  return enters;
+}
+
+/* Control of a step on the side of a power u^k that is not whole, whose solutions are not smooth at u = 0: its size is
+ * at most a part of the time from or to there, until that is so short that the error of the last one is negligible. */
+static const step_control *graded(const event_step *step, const step_control *control, step_control *shorter)
+{
+  const real last = pow(fmax(control->tolerance, DBL_EPSILON), GRADE_POWER);
+  *shorter = *control;
+  shorter->max_step = fmin(control->max_step, GRADE_FIRST * step->watch->first);
+  for (int k = 0; k < EVENT_KINKS; k++) {
+    const real size = fabs(values_at(step, 0)[EVENT_FIRST[FIRST_KINK + k]]), rate = step->watch->rate[k];
+    real *const depth = step->watch->depth + k;
+    if (!(step->watch->started && rate > 0.0 && has_power(step, k)))
+      continue;
+    *depth = fmax(*depth, size);
+    shorter->max_step = fmin(shorter->max_step, fmax(GRADE * size, last * *depth) / rate);
+  }
+  return shorter;
+}
+#endif
 
 /* Whether no kink is reached in a step: each function is farther from zero than KINK_FAR times its change, by the
  * control points of the cubic Hermite polynomial of a position, u(q0 + h v0 / 3) and u(q1 - h v1 / 3), and by its rate
