@@ -80,6 +80,9 @@ SITUATIONS = {
     "in transformed time of a first-order system": lambda: stepper_of(tau="1/(1 + q**2)", **FIRST_ORDER),
     "for a first-order system": lambda: stepper_of(**FIRST_ORDER),
     "with events that change the state": lambda: stepper_of(events=sc.Event("q - 0.25", then={"p_q": "-p_q"})),
+    "with events that set parameters": lambda: stepper_of(
+        lagrangian="q_dot**2/2 - k*q**2/2", parameters={"k": 1.0}, events=sc.Event("q - 0.25", then={"k": "2"})
+    ),
     "with constraints": lambda: stepper_of(**LOBATTO, constraints=["q - r = 0"]),
     "with contacts": lambda: sc.compile_stepper(
         sc.LagrangianSystem.from_text("body", ["q"], "q_dot**2/2 - q"), "svi:2", contacts=[sc.contact("q + 1")]

@@ -192,7 +192,7 @@ def test_steps_across_kinks_are_verified_as_formulas():
     """Sizes of tangent vectors are those of the parameters, without modes."""
     spring = lagrange("spring", "x", "x_dot**2/2 - k*positive_part(x)**2 - x**2", k=1.0)
     assert sc.verify(spring, "svi:1").passed
-    with pytest.raises(sc.StateError, match='modes along runs, .* compile it with kinks="as formulas"'):
+    with pytest.raises(sc.StateError, match=r'modes along runs, .* compile it with kinks="as formulas"'):
         sc.verify(spring, "svi:1", stepper=sc.compile_stepper(spring, "svi:1"))
 
 
