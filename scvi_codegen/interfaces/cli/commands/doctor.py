@@ -36,7 +36,8 @@ ENERGY_BOUND = 1e-6
 """Bound on the relative energy error of the trial run, which is far below it on a sound machine."""
 
 TRIAL = f"""
-import os, sys
+import logging, os, sys
+logging.getLogger("scvi_codegen").setLevel(logging.WARNING)
 sys.excepthook = lambda kind, error, place: print(error, file=sys.stderr)
 os.environ["{CACHE_VARIABLE}"] = os.getcwd()
 sys.path.insert(0, {str(Path(__file__).parents[3])!r})
