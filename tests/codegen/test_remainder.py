@@ -23,32 +23,6 @@ OSCILLATOR = LagrangianSystem.from_text("oscillator", ["x"], "x_dot**2/2-4*x**2/
 RING = LagrangianSystem.from_text(
     "ring", ["u[N]"], "sum(i in N, u_dot[i]**2/2) - sum(i in N periodic, (u[i+1]-u[i])**2/2)"
 )
-ANGLES = (
-    0.05,
-    0.1,
-    0.2,
-    0.3,
-    0.4,
-    0.5,
-    0.6,
-    0.7,
-    0.8,
-    0.9,
-    1.0,
-    1.2,
-    1.3,
-    1.5,
-    1.8,
-    2.0,
-    2.2,
-    2.5,
-    3.0,
-    3.5,
-    4.0,
-    4.5,
-    5.0,
-)
-"""Angles omega h of a step."""
 WORST = [
     ("svi:2", 0.9),
     ("svi:2", 2.0),
@@ -61,17 +35,13 @@ WORST = [
 """Where the rates were largest."""
 
 
-def slope(system: LagrangianSystem, method: str, q: list[float], angle: float) -> float | None:
-    """Return the slope of the energy; ``None`` if the iteration fails at this step size."""
+def slope(system: LagrangianSystem, method: str, q: list[float], angle: float) -> float:
+    """Return the slope of the energy."""
     run = compile_stepper(system, method, flags=QUICK_FLAGS)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # large steps
-        try:
-            found = run.integrate(q, [0.0] * len(q), h=angle / 2, steps=STEPS, save_every=STEPS // 200)
-        except Exception:  # noqa: BLE001  # beyond the largest step
-            return None
-    if np.sum(found.fallback_steps):
-        return None
+        found = run.integrate(q, [0.0] * len(q), h=angle / 2, steps=STEPS, save_every=STEPS // 200)
+    assert not np.sum(found.fallback_steps)
     energy = np.asarray(found.energy())
     per_step = np.polyfit(np.arange(len(energy)) * (STEPS // 200), energy - energy[0], 1)[0]
     return float(abs(per_step / energy[0]) * 2**53)
@@ -89,13 +59,6 @@ def test_the_energy_of_an_oscillator_does_not_drift(method, angle):
 @pytest.mark.second
 def test_the_energy_of_a_lattice_does_not_drift(method, angle):
     assert slope(RING, method, [*np.sin(np.pi * 14 / 16 * (np.arange(16) + 0.5))], angle) <= LARGEST_SLOPE
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("method", [*(f"svi:{s}" for s in range(2, 13)), *(f"gauss:{s}" for s in range(2, 7))])
-def test_no_energy_drifts_at_any_step_size_at_which_the_iteration_converges(method):
-    rates = {angle: slope(OSCILLATOR, method, [1.0], angle) for angle in ANGLES}
-    assert not {angle: found for angle, found in rates.items() if found is not None and found > LARGEST_SLOPE}
 
 
 def test_tables_of_the_remainder_are_those_of_the_matrix():

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import sympy
 from notation import lagrange
-from scipy.spatial import cKDTree
 
 import scvi_codegen as sc
 from scvi_codegen.common.precision import mp
@@ -150,25 +149,6 @@ def test_order_is_preserved_up_to_the_smoothness_at_the_cut_off() -> None:
 def test_certificate() -> None:
     certificate = sc.verify(pair(6), "svi:2")
     assert certificate.passed, str(certificate)
-
-
-def test_lists_of_neighbours_have_the_energy_of_all_pairs() -> None:
-    box, cut = 5.0, 1.5
-    apart = "sum(a in 3, wrap(r[pairs[k, 0], a] - r[pairs[k, 1], a], box)**2)"
-    gas = sc.LagrangianSystem.from_text(
-        "gas",
-        ["r[N, 3]"],
-        f"sum(i in N, sum(a in 3, r_dot[i, a]**2)/2) - sum(k in K, positive_part(1 - {apart}/{cut**2})**4)",
-        tables=["pairs[K, 2]"],
-        parameters={"box": box},
-    )
-    places = np.random.default_rng(3).uniform(-20.0, 20.0, (60, 3))
-    pairs = cKDTree(places % box, boxsize=box).query_pairs(cut, output_type="ndarray")
-    run = sc.compile_stepper(gas, "stoermer-verlet").integrate(places, h=1e-3, steps=1, tables={"pairs": pairs})
-    difference = places[:, None] - places
-    difference -= box * np.rint(difference / box)
-    square = (difference**2).sum(axis=-1)[np.triu_indices(60, 1)]
-    assert run.energy()[0] == pytest.approx((np.maximum(1 - square / cut**2, 0) ** 4).sum(), rel=1e-13)
 
 
 def test_single_precision_source_uses_functions_of_floats() -> None:
