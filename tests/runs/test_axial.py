@@ -89,6 +89,14 @@ def test_a_predictor_turns_with_the_body():
     assert run.iterations.sum() < 0.8 * expected.iterations.sum()
 
 
+@pytest.mark.full
+def test_adaptive_steps_turn_with_the_body():
+    ours, other = (sc.compile_stepper(each, "svi:8") for each in (body(f"{KINETIC} - w*R_33"), three()))
+    run, expected = (each.integrate(START, velocity=OMEGA, t_end=5.0, tolerance=1e-12) for each in (ours, other))
+    assert len(run.t) < 0.8 * len(expected.t)
+    np.testing.assert_allclose(run.at(3.3)[0], expected.at(3.3)[0], rtol=0, atol=1e-11)
+
+
 PAIR = " - w*(R_33 + S_33)/2 - v*(R_13*S_13 + R_23*S_23 + R_33*S_33)**2"
 TWO = {"R": [0.9, 0.3, -0.2, 0.1], "S": [0.5, -0.1, 0.8, 0.3]}
 SPINS = {"omega": [0.4, -0.7, 3.0], "nu": [0.2, 0.9, -2.0]}
