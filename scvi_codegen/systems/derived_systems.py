@@ -83,6 +83,7 @@ def change_coordinates(
         clock=system.clock and replace(system.clock, rate=system.clock.rate.xreplace(replaced)),
         forces=_projected(system, positions, replaced, variables),
         constraints=tuple(g.xreplace(replaced) for g in system.constraints),
+        functions=system.functions,
         inputs=system.inputs,
         damping=system.damping,
     )

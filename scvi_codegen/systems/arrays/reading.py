@@ -76,7 +76,8 @@ def arrays_from_text(arguments: Mapping[str, Any]) -> ArraySystem:
             *(*coordinates, *momenta, *velocities, *fields.values()),
             *(array for rotation in rotations for array in rotation.formulas),
         ),
-        symbols={key: symbol(key) for key in (*scalars, *inputs, TIME)} | named_tables(functions, values),
+        symbols={key: symbol(key) for key in (*scalars, *inputs, TIME)}
+        | named_tables(functions, {*values, *(array.name for array in coordinates)}),
         tables=tuple(map(table_of, tables)),
     )
     lengths = {key: names.symbols[key] for key in scalars}

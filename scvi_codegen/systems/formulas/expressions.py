@@ -39,7 +39,6 @@ from scvi_codegen.systems.formulas.kinks import (
     where,
     wrap,
 )
-from scvi_codegen.systems.formulas.tables import Tabulated
 
 LARGEST = 1.7976931348623157e308
 """Largest finite C double."""
@@ -235,7 +234,7 @@ def beyond_double(number: Expr) -> bool:
     return p > int(LARGEST) * q or (p > 0 and p << 1075 <= q)
 
 
-NODES = frozenset([Add, Mul, Pow, Intermediate, Tabulated, *NAME_OF])
+NODES = frozenset([Add, Mul, Pow, Intermediate, *NAME_OF])
 
 
 def unsupported_part(expression: Expr) -> str | None:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from scvi_codegen.common.errors import SystemDefinitionError
 
 Outside: TypeAlias = Literal["refuse", "constant", "linear"]
-LARGEST_DEGREE = 5
 
 
 @dataclass(frozen=True)
@@ -38,52 +37,41 @@ class Table:
     outside: Outside = "refuse"
 
     def __post_init__(self) -> None:
-        if self.degree not in range(1, LARGEST_DEGREE + 1):
-            raise SystemDefinitionError(f"degree of a table must be 1 to {LARGEST_DEGREE}, not {self.degree!r}")
+        if self.degree not in range(1, 6):
+            raise SystemDefinitionError(f"degree of a table must be 1 to 5, not {self.degree!r}")
         if self.outside not in get_args(Outside):
-            allowed = " or ".join(map(repr, get_args(Outside)))
-            raise SystemDefinitionError(f"outside of a table must be {allowed}, not {self.outside!r}")
-        two = len(self.x) == 2 and np.ndim(self.x[0]) == 1
-        axes = [_monotone(axis, self.degree) for axis in (self.x if two else [self.x])]
-        try:
-            values = np.array(self.y, dtype=float)
-        except (TypeError, ValueError):
-            values = np.array(np.nan)
-        if values.shape != (shape := tuple(map(len, axes))) or not np.isfinite(values).all():
+            raise SystemDefinitionError(f"outside of a table must be one of {get_args(Outside)}, not {self.outside!r}")
+        pair = isinstance(self.x, tuple | list) and len(self.x) == 2 and np.ndim(self.x[0]) == 1
+        axes, values = [_numbers(axis) for axis in (self.x if pair else [self.x])], _numbers(self.y)
+        if values.shape != (shape := tuple(map(np.size, axes))) or not np.isfinite(values).all():
             raise SystemDefinitionError(f"y of a table must be finite numbers of the shape {shape} of its abscissae")
         for k, axis in enumerate(axes):
+            if axis.ndim != 1 or len(axis) <= self.degree or not np.isfinite(axis).all():
+                least = f"at least {self.degree + 1} finite numbers"
+                raise SystemDefinitionError(f"x of a table of degree {self.degree} must be {least}")
             if axis[0] > axis[-1]:
                 axes[k], values = axis[::-1], np.flip(values, k)
+            for j in np.flatnonzero(np.diff(axes[k]) <= 0.0)[:1]:
+                raise SystemDefinitionError(
+                    f"x of a table must be strictly monotone: it contains {axes[k][j]:g} before {axes[k][j + 1]:g}. "
+                    "Sort the points, and keep one of those with equal x"
+                )
         x = tuple(tuple(axis.tolist()) for axis in axes)
-        object.__setattr__(self, "x", x if two else x[0])
-        object.__setattr__(self, "y", tuple(map(tuple, values.tolist())) if two else tuple(values.tolist()))
+        object.__setattr__(self, "x", x if pair else x[0])
+        object.__setattr__(self, "y", tuple(map(tuple, values.tolist())) if pair else tuple(values.tolist()))
 
     @property
     def axes(self) -> tuple[tuple[float, ...], ...]:
         """Abscissae of each argument, ascending."""
         return self.x if isinstance(self.x[0], tuple) else (self.x,)
 
-    @property
-    def is_smooth(self) -> bool:
-        """Whether its first derivatives are continuous."""
-        return self.degree > 1 and self.outside != "constant"
 
-
-def _monotone(values: Any, degree: int) -> NDArray[np.float64]:
-    """Return abscissae as numbers."""
+def _numbers(values: Any) -> NDArray[np.float64]:
+    """Return an array of numbers, NaN for anything else."""
     try:
-        x = np.array(values, dtype=float)
+        return np.array(values, dtype=float)
     except (TypeError, ValueError):
-        x = np.array(np.nan)
-    if x.ndim != 1 or len(x) <= degree or not np.isfinite(x).all():
-        raise SystemDefinitionError(f"x of a table of degree {degree} must be at least {degree + 1} finite numbers")
-    steps = np.diff(x) * (1.0 if x[-1] > x[0] else -1.0)
-    for k in np.flatnonzero(steps <= 0.0)[:1]:
-        raise SystemDefinitionError(
-            f"x of a table must be strictly monotone: {x[k + 1]:g} follows {x[k]:g}. Sort the points, and keep one "
-            "of those with equal x"
-        )
-    return x
+        return np.array(np.nan)
 
 
 def tables_of(functions: Mapping[str, Table | Mapping[str, Any]] | None) -> dict[str, dict[str, Any]]:

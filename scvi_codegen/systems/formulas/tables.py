@@ -57,6 +57,14 @@ class Tabulated(Intermediate):
         value.function, value.arguments = function, tuple(arguments)
         return value
 
+    @property
+    def func(self) -> type[Intermediate]:
+        """Class by which SymPy rebuilds it from its definition."""
+        return Intermediate
+
+    def __reduce_ex__(self, protocol: Any) -> tuple[Any, ...]:
+        return Tabulated.of, (self.definition, self.function, self.arguments)
+
     def _replaced(self, definition: Expr, rule: Any) -> Expr:
         return Tabulated.of(definition, self.function, [argument.xreplace(rule) for argument in self.arguments])
 
@@ -75,7 +83,8 @@ def tables_in(*formulas: Expr) -> list[Tabulated]:
 
 def table_with_corners(formula: Expr) -> str | None:
     """Return the first table in a formula whose first derivatives are not continuous."""
-    return next((str(value) for value in tables_in(formula) if not value.function.table.is_smooth), None)
+    tables = {value: value.function.table for value in tables_in(formula)}
+    return next((str(x) for x, table in tables.items() if table.degree == 1 or table.outside == "constant"), None)
 
 
 def without_tables(formula: Expr) -> Expr:
@@ -84,55 +93,49 @@ def without_tables(formula: Expr) -> Expr:
 
 
 def _value(table: Table, arguments: Sequence[Expr]) -> Expr:
-    """Return the value of a table as an expression."""
+    """Return the value of a table as an expression; of two arguments by B-splines in the second one."""
     from scipy.interpolate import BSpline, make_interp_spline  # here: slow to import
 
     short = [u if len(parts(u)) <= SHORT else intermediate(u) for u in arguments]
-    spline = make_interp_spline(table.axes[0], table.y, table.degree)
+    values, degree, outside = np.array(table.y)[:, None], table.degree, table.outside
     if len(short) == 1:
-        (value,) = _pieces(short[0], BSpline(spline.t, spline.c[:, None], table.degree), table.outside)
+        (value,) = _pieces(short[0], make_interp_spline(table.axes[0], values, degree), outside)
     else:
-        second = make_interp_spline(table.axes[1], spline.c.T, table.degree)
-        bases = [
-            _pieces(u, BSpline(f.t, np.eye(len(f.c)), table.degree), table.outside)
-            for u, f in zip(short, (spline, second), strict=True)
-        ]
-        columns = [intermediate(_sum(column, bases[0])) for column in second.c]
-        value = Add(*(b * column for b, column in zip(bases[1], columns, strict=True)))
-    if table.outside != "refuse":
-        return value.definition if isinstance(value, Intermediate) else value
+        second = make_interp_spline(table.axes[1], values[:, 0].T, degree)
+        basis = _pieces(short[1], BSpline(second.t, np.eye(len(second.c)), degree), outside)
+        columns = _pieces(short[0], make_interp_spline(table.axes[0], second.c.T, degree), outside)
+        value = Add(*(intermediate(b) * intermediate(column) for b, column in zip(basis, columns, strict=True)))
+    if outside != "refuse":
+        return value
     ends = [
-        unit_step(side * (u - exact(x[0 if side > 0 else -1] - side * ROUNDING * (x[-1] - x[0]))))
+        unit_step(side * (u - _exact(end - side * ROUNDING * (x[-1] - x[0]))))
         for u, x in zip(short, table.axes, strict=True)
-        for side in (1, -1)
+        for side, end in ((1, x[0]), (-1, x[-1]))
     ]
     return Mul(intermediate(value), *(1 / step for step in ends))  # not finite outside
 
 
 def _pieces(u: Expr, splines: BSpline, outside: Outside) -> list[Expr]:
     """Return splines with common breakpoints as expressions in u."""
-    knots, degree = splines.t, splines.k
-    starts = np.unique(knots)[:-1]
-    coefficients = np.array([splines(starts, k) / factorial(k) for k in range(degree + 1)])
-    if outside == "constant" or (outside == "linear" and degree > 1):
-        beyond = np.zeros((2, *coefficients.shape[::2]))
-        for order in range(1 if outside == "constant" else 2):
-            beyond[:, order] = splines([knots[0], knots[-1]], order)
-        coefficients = np.concatenate([beyond[0][:, None], coefficients, beyond[1][:, None]], axis=1)
-        starts = np.array([knots[0], *starts, knots[-1]])
-    steps = [S.One, *(unit_step(u - exact(start)) for start in starts[1:]), S.Zero]
+    starts, ends = np.unique(splines.t)[:-1], splines.t[[0, -1]]
+    coefficients = np.array([splines(starts, k) / factorial(k) for k in range(splines.k + 1)])
+    if outside == "constant" or (outside == "linear" and splines.k > 1):
+        orders = 1 if outside == "constant" else 2
+        beyond = np.array([splines(ends, k) * (k < orders) for k in range(splines.k + 1)])
+        coefficients = np.concatenate([beyond[:, :1], coefficients, beyond[:, 1:]], axis=1)
+        starts = np.array([ends[0], *starts, ends[1]])
+    steps = [S.One, *(unit_step(u - _exact(start)) for start in starts[1:]), S.Zero]
     masks = [intermediate(step - following) for step, following in pairwise(steps)]
     distance = intermediate(u - _sum(starts, masks))
     return [
-        intermediate(reduce(lambda value, c: _sum(c, masks) + distance * value, column[::-1], S.Zero))
+        reduce(lambda value, c: _sum(c, masks) + distance * value, column[::-1], S.Zero)
         for column in np.moveaxis(coefficients, 2, 0)
     ]
 
 
 def _sum(numbers: Iterable[float], factors: Sequence[Expr]) -> Expr:
-    return Add(*(exact(number) * factor for number, factor in zip(numbers, factors, strict=True) if number != 0.0))
+    return Add(*(_exact(number) * factor for number, factor in zip(numbers, factors, strict=True) if number != 0.0))
 
 
-def exact(value: float) -> Expr:
-    """Return the shortest decimal number that rounds to a float."""
-    return Rational(repr(float(value)))
+def _exact(value: float) -> Expr:
+    return Rational(repr(float(value)))  # the shortest decimal number that rounds to it
