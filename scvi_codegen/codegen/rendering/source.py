@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -35,7 +35,7 @@ KINDS: dict[str, Callable[[Any], bool]] = {
     "tuple[float, ...]": lambda value: isinstance(value, tuple) and all(map(_is_number, value)),
     "tuple[tuple[str, ...], ...]": lambda value: isinstance(value, tuple) and all(map(KINDS["tuple[str, ...]"], value)),
     "ArrayLayout": lambda value: False,
-    "tuple[ContactRows, ...]": lambda value: value == (),
+    "tuple[ContactRows, ...]": lambda value: all(isinstance(row, ContactRows) for row in value),
     "Sizes | None": lambda value: value is None or isinstance(value, Sizes),
     "LaneContents | None": lambda value: value is None or isinstance(value, LaneContents),
 }
@@ -50,6 +50,20 @@ def _checked(cls: type, record: Mapping[str, Any]) -> dict[str, Any]:
         if name in arguments and not KINDS[kind](arguments[name]):
             raise ValueError(f"{name} is {arguments[name]!r:.60}: it must be of type {kind}")
     return arguments
+
+
+def _contact_of(row: Sequence[Any]) -> ContactRows:
+    """Return the places of a contact from JSON; raise :class:`ValueError` for values of other types."""
+    *places, transitions = row
+    contact = ContactRows._make((*places, _as_tuples(transitions)))
+    numbers, names = contact[:2], contact[2:5]
+    if not (
+        all(number is None or KINDS["int"](number) for number in numbers)
+        and all(map(KINDS["str | None"], names))
+        and KINDS["tuple[tuple[str, ...], ...]"](contact.transitions)
+    ):
+        raise ValueError(f"contacts contain {contact!r:.60}: these are not the places of a contact")
+    return contact
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -474,7 +488,8 @@ class Interface:
         Raises:
             ValueError, TypeError: for other fields, and values of other types.
         """
-        interface = cls(**_checked(cls, record))
+        contacts = tuple(_contact_of(row) for row in record.get("contacts", ()))
+        interface = cls(**_checked(cls, {**record, "contacts": contacts}))
         if interface.words not in (1, 2):
             raise ValueError(f"words is {interface.words}: it must be 1 or, in double-double arithmetic, 2")
         try:
