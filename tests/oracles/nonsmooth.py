@@ -1,4 +1,4 @@
-"""Motions with kinks: random cases of eight families, and their motion by DOP853, restarted at each kink.
+"""Motions with kinks: random cases of nine families, and their motion by DOP853, restarted at each kink.
 
 A kink is the zero of a switching function, the argument of ``positive_part`` or ``unit_step``. Between two of them the
 equations are those of one mode, smooth beyond the zeros too. Zeros are bracketed on the polynomials of steps and found
