@@ -78,7 +78,7 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
         stepper: the compiled integrator.
         options: convergence criterion of the solver, ``None`` for the defaults.
         events: zero crossings found, parallel to ``stepper.events``.
-        switches: changes of the side of each kink, in the order of ``stepper.interface.modes``.
+        switches: transitions of contacts, then changes of the side of each kink, in the order of ``stepper.searched``.
         modes: values of ``stepper.modes`` along the run, ``None`` without them.
         plan: step sizes and target time of the run.
         steps, rejected_steps: numbers of completed and of rejected steps since the start of the run.

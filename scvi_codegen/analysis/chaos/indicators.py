@@ -24,7 +24,7 @@ from scvi_codegen.common.errors import StateError
 from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import checked_count
 from scvi_codegen.runs.derivatives.gradients import pieces, propagate, starts_of
-from scvi_codegen.runs.results.saved_states import SavedStates
+from scvi_codegen.runs.results.saved_states import SavedStates, parameters_on_sides
 from scvi_codegen.runs.states.reduction import Reduction
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepping.features import require
@@ -291,7 +291,8 @@ def _frame(dimension: int) -> Array:
 def along(states: SavedStates, tangents: InitialTangents) -> ChaosIndicators:
     """Return the deviations of a run at its saved states; steps between these are recomputed."""
     first = states.q[0], states.p[0], float(states.step_sizes[0]), float(states.t[0])
-    propagation = TangentPropagation(tangents, tangents.at(*first, states.parameters, states.options), states.t)
+    parameters = parameters_on_sides(states, first[3])
+    propagation = TangentPropagation(tangents, tangents.at(*first, parameters, states.options), states.t)
     segments = (starts_of(states, first, last) for first, last in pieces(states))
     propagation.follow(segments, partial(propagate, states, back=False))
     return ChaosIndicators.of(states.t, propagation.growth.values)

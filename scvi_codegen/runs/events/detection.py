@@ -192,8 +192,8 @@ class CrossingSearch:
         return self._by_event(self.stepper.events, self._joined(self.recorded))
 
     def switches(self, recorded: Sequence[NDArray[Any]]) -> tuple[Switches, ...]:
-        """Return the changes of the side of each kink among some of the records."""
-        kinks = len(self.stepper.interface.modes)
+        """Return the transitions of contacts, and the changes of the side of each kink, among some of the records."""
+        kinks = len(self.stepper.searched) - len(self.stepper.events)
         if not kinks:
             return ()
         records = self._joined(recorded)

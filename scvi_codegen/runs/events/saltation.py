@@ -8,7 +8,9 @@ initial data, rate = g_z X- + g_t. At a fixed time after it
 where X- and X+ are the rates of the computed flow: the derivatives of the steps before and after the crossing with
 respect to their sizes, so that the result is the derivative of the computed run (Aizerman & Gantmacher, Q. J. Mech.
 Appl. Math. 11 (1958) 243). The impulse lambda_1 of an impact is differentiated through its energy equation. Constraints
-add the derivative of the projection P of the new state, p+ = P(q, p + lambda g_q).
+add the derivative of the projection P of the new state, p+ = P(q, p + lambda g_q). At a transition of a contact R is
+its impact and the projection onto the constraints of the new modes (:mod:`~scvi_codegen.runs.events.contact_changes`);
+R and g, which contains multipliers, are differentiated by differences.
 """
 
 from __future__ import annotations
@@ -20,15 +22,17 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from scvi_codegen.codegen.native.options import REASONS
 from scvi_codegen.codegen.rendering.source import Interface
 from scvi_codegen.common.errors import StateError
+from scvi_codegen.runs.events.contact_changes import change_at
 from scvi_codegen.runs.results.recomputation import changes_by_events, steps_after
 from scvi_codegen.runs.results.saved_states import parameters_on_sides
 from scvi_codegen.runs.states.times import WHOLE
 from scvi_codegen.runs.states.validation import Array
-from scvi_codegen.runs.stepping.projection import projected
+from scvi_codegen.runs.stepping.projection import projected, roots_of_masses
 from scvi_codegen.runs.stepping.step_plan import FixedSteps
-from scvi_codegen.systems.event import Event, Kink
+from scvi_codegen.systems.event import Event, Kink, Transition
 
 if TYPE_CHECKING:
     from scvi_codegen.runs.results.saved_states import SavedStates
@@ -36,10 +40,12 @@ if TYPE_CHECKING:
 
 GRAZING = 2.0**-20
 """Smallest rate of an event function relative to its gradient and the flow; below it rounding dominates 1/rate."""
+GRAZING_IMPACT = 2.0**-36
+"""The same of a contact that closes: impacts of a body that comes to rest are slow."""
 SMALL_STEP = 2.0**-15
 """Fraction of a step from which the rate of the flow at a last state is computed."""
 DIFFERENCE = 2.0**-10
-"""Increment of differences of sixth order, of parameters and momenta above 1 relative to them."""
+"""Increment of differences of sixth order, relative to parameters, and to the momenta of the run."""
 OF_STEP = 0.25
 """Increments of the time and of positions relative to their mean change in a step; of positions at least DIFFERENCE."""
 ADMISSIBLE = 0.5
@@ -104,9 +110,10 @@ def _jump(
     With the module's equation, dz+ = R_x dx + (R_z X- + R_t - X+) dtau, dtau = -g_x dx / (g_z X- + g_t), for
     x = (q, p, parameters, t).
     """
-    stepper, parameters, options = states.stepper, states.parameters, states.options
+    stepper, options = states.stepper, states.options
     m, size = stepper.dimension, stepper._input_size
     t, after = float(states.t[row]), np.concatenate([states.q[row], states.p[row]])
+    parameters, new_parameters = (parameters_on_sides(states, time) for time in (float(starts.t[k - 1]), t))
 
     def products(state: Array, h: float, time: float, seeds: Array) -> Array:
         sides = parameters_on_sides(states, time)
@@ -124,7 +131,7 @@ def _jump(
     step = products(after, h, t, np.eye(size))
     departure, basis = np.zeros(2 * m), np.eye(2 * m)
     if stepper.constraints:  # tangent vectors are admissible: departure + the range of the derivative of the projection
-        onto = _projection(states, after, t, all_inputs=False)[1]
+        onto = _projection(states, after, t, new_parameters, all_inputs=False)[1]
         directions, sizes, _ = np.linalg.svd(onto[:, : 2 * m])
         departure, basis = onto[:, -1], directions[:, sizes > ADMISSIBLE]
     moved = step[:, -1] - step[:, -2] - step[:, : 2 * m] @ departure
@@ -136,20 +143,14 @@ def _jump(
     matrix[-2, -1] -= divided
     if isinstance(event, Kink) and np.linalg.norm(departure - arrival) <= CONTINUOUS * np.linalg.norm(arrival):
         return Jump(matrix, before)
-    values = _at_kink(states, event, before, t, all_inputs) if isinstance(event, Kink) else None
-    values = values or _derivatives(stepper.known.interface, event)(before, t, parameters)
+    values, rate = _crossing(states, event, (before, after), t, (parameters, new_parameters), arrival, all_inputs)
     gradient = np.concatenate([values.gradient, np.zeros(1)])
-    rate = values.gradient[: 2 * m] @ arrival + values.gradient[-1]
-    steepest = np.linalg.norm(values.gradient[: 2 * m]) * np.linalg.norm(arrival) + abs(values.gradient[-1])
-    if not abs(rate) > GRAZING * steepest:
-        raise StateError(
-            f"the event '{event.function}' is tangent to the run at t = {t:.17g}: derivatives do not exist at a "
-            "grazing crossing"
-        )
     if event.restitution is not None:
-        change = _impact(states, values, before, after, t, all_inputs)
+        change = _impact(states, values, before, after, t, parameters, all_inputs)
+    elif isinstance(event, Transition):
+        change = values.map
     else:
-        by = _projection(states, values.value, t, all_inputs=all_inputs)[1]
+        by = _projection(states, values.value, t, new_parameters, all_inputs=all_inputs)[1]
         change = by[:, : 2 * m] @ values.map
         change[:, 2 * m :] += by[:, 2 * m :]
     crossing_time = -gradient / rate  # dtau = crossing_time (dx, dh)
@@ -170,6 +171,44 @@ class Values(NamedTuple):
     gradient: Array
     map: Array
     value: Array
+
+
+def _crossing(
+    states: SavedStates,
+    event: Event,
+    ends: tuple[Array, Array],
+    t: float,
+    modes: tuple[Array, Array],
+    arrival: Array,
+    all_inputs: bool,
+) -> tuple[Values, float]:
+    """Return the derivatives of an event and its rate along the run.
+
+    Args:
+        states, event, t, all_inputs: as of :func:`_jump`.
+        ends: (2m,) states before and after it.
+        modes: parameters with the modes before and after it.
+        arrival: (2m,) rate of the state before it.
+    """
+    size, values = len(arrival), None
+    if isinstance(event, Transition):
+        values = _at_transition(states, event, ends, t, modes, all_inputs)
+    elif isinstance(event, Kink):
+        values = _at_kink(states, event, ends[0], t, modes[0], all_inputs)
+    if values is None:
+        values = _derivatives(states.stepper.known.interface, event)(ends[0], t, modes[0])
+    rate = values.gradient[:size] @ arrival + values.gradient[-1]
+    steepest, least = np.linalg.norm(values.gradient[:size]) * np.linalg.norm(arrival), GRAZING
+    if isinstance(event, Transition):  # whose gradients by momenta, of multipliers, have another size
+        typical = np.abs(np.diff(np.hstack([states.q, states.p]), axis=0)).mean(axis=0) / np.diff(states.t).mean()
+        steepest = np.abs(values.gradient[:size]) @ np.maximum(np.abs(arrival), typical)
+        least = GRAZING_IMPACT if event.kind == "closes" else GRAZING
+    if not abs(rate) > least * (steepest + abs(values.gradient[-1])):
+        raise StateError(
+            f"the event '{event.function}' is tangent to the run at t = {t:.17g}: derivatives do not exist at a "
+            "grazing crossing"
+        )
+    return values, float(rate)
 
 
 @lru_cache(maxsize=64)
@@ -224,7 +263,38 @@ def _function_of_velocities(interface: Interface, kink: Kink) -> Callable[..., A
     return made
 
 
-def _at_kink(states: SavedStates, kink: Kink, before: Array, t: float, all_inputs: bool) -> Values | None:
+def _at_transition(
+    states: SavedStates, event: Transition, ends: tuple[Array, Array], t: float, modes: tuple[Array, Array], more: bool
+) -> Values:
+    """Return the derivatives of a transition of a contact by differences of sixth order.
+
+    Args:
+        states, event, t: run and transition.
+        ends: (2m,) states before and after it.
+        modes: parameters with the modes before and after it.
+        more: whether derivatives with respect to parameters are required.
+    """
+    stepper, binding = states.stepper, states.stepper.binding
+    own = sum(len(stepper._events_of_entries(other)) for other in stepper.events)
+    number = own + stepper.searched.index(event) - len(stepper.events)
+    change = change_at(stepper, event, *ends, t, modes)
+
+    def mapped(q: Array, p: Array, t: float, parameters: Array) -> Array:
+        """Return the function of the transition, and the state after it."""
+        values = np.zeros(own + len(stepper.searched) - len(stepper.events))
+        blocks = [binding.pointer(np.ascontiguousarray(part)) for part in (q, p, parameters)]
+        if status := binding.function("event_values")(t, *blocks, binding.pointer(values), binding.workspace()):
+            raise StateError(f"the transition '{event.function}' at t = {t:.17g} is undefined: {REASONS[status]}")
+        return np.append(values[number], change(q, p, t, parameters))
+
+    q, p = np.split(ends[0], 2)
+    by = _differences(mapped, states, q, p, t, modes[0], all_inputs=more)
+    return Values(by[0], by[1:], ends[1])
+
+
+def _at_kink(
+    states: SavedStates, kink: Kink, before: Array, t: float, parameters: Array, all_inputs: bool
+) -> Values | None:
     """Return the derivatives of a kink of velocities, by differences of sixth order; ``None`` for other kinks."""
     stepper, m = states.stepper, states.stepper.dimension
     function = _function_of_velocities(stepper.known.interface, kink)
@@ -234,11 +304,13 @@ def _at_kink(states: SavedStates, kink: Kink, before: Array, t: float, all_input
     def value(q: Array, p: Array, t: float, parameters: Array) -> Array:
         return np.array(function([*q, *p, *stepper.velocity(q, p, t, parameters), *parameters, t]), dtype=float)
 
-    (gradient,) = _differences(value, states, before[:m], before[m:], t, all_inputs=all_inputs)
+    (gradient,) = _differences(value, states, before[:m], before[m:], t, parameters, all_inputs=all_inputs)
     return Values(gradient, np.eye(2 * m, len(gradient)), before)
 
 
-def _impact(states: SavedStates, values: Values, before: Array, after: Array, t: float, all_inputs: bool) -> Array:
+def _impact(
+    states: SavedStates, values: Values, before: Array, after: Array, t: float, parameters: Array, all_inputs: bool
+) -> Array:
     """Return the (2m, x) derivative of the state after an impact by x = (q, p, parameters, t).
 
     With n = g_q, u = p + lambda n and p1 = P(q, u), F = H(q, p1) - H(q, p) + lambda g_t - (p1 - u).v1 = 0 gives
@@ -250,17 +322,17 @@ def _impact(states: SavedStates, values: Values, before: Array, after: Array, t:
 
     where H is differentiated at fixed momenta.
     """
-    stepper, parameters = states.stepper, states.parameters
+    stepper = states.stepper
     m, count = stepper.dimension, values.gradient.size
     n, e, (q, p) = values.value[:m], values.value[m + 1], np.split(before, 2)
     # P_u maps G^T mu to 0, and the change of p, lambda n + G^T mu, to lambda P_u n
-    onto = _projection(states, after, t, all_inputs=False)[1][m:, m : 2 * m]
+    onto = _projection(states, after, t, parameters, all_inputs=False)[1][m:, m : 2 * m]
     impulse = float((onto @ (after - before)[m:]) @ (onto @ n) / ((onto @ n) @ (onto @ n)))
     full = 2.0 * impulse / (1.0 + e)
 
     def changed(impulse: float) -> tuple[Array, Array, Array]:
         """Return P(q, p + lambda n), its derivative by x at constant lambda, and by lambda."""
-        state, by = _projection(states, np.concatenate([q, p + impulse * n]), t, all_inputs=all_inputs)
+        state, by = _projection(states, np.concatenate([q, p + impulse * n]), t, parameters, all_inputs=all_inputs)
         onto = by[m:, m : 2 * m]
         return state[m:], by[m:] + impulse * onto @ values.map[:m], onto @ n
 
@@ -268,10 +340,11 @@ def _impact(states: SavedStates, values: Values, before: Array, after: Array, t:
     v0, v1 = (np.asarray(stepper.velocity(q, momenta, t, parameters)) for momenta in (p, p1))
     residual = full * (v1 @ values.map[:m] + values.map[m])
     residual[m : 2 * m] += v1 - v0
-    residual += _energy_differences(states, q, (p, p1), t, all_inputs)
+    residual += _energy_differences(states, q, (p, p1), t, parameters, all_inputs)
     residual_by_impulse = n @ v1 + values.value[m]
     if stepper.constraints:
-        work = (p1 - p - full * n) @ _differences(stepper.velocity, states, q, p1, t, all_inputs=all_inputs)
+        by = _differences(stepper.velocity, states, q, p1, t, parameters, all_inputs=all_inputs)
+        work = (p1 - p - full * n) @ by
         by_momentum = work[m : 2 * m].copy()
         work[m : 2 * m] = 0.0
         residual -= work + by_momentum @ p1_by
@@ -282,9 +355,11 @@ def _impact(states: SavedStates, values: Values, before: Array, after: Array, t:
     return np.vstack([np.eye(m, count), by + np.outer(by_impulse, impulse_by)])
 
 
-def _projection(states: SavedStates, state: Array, t: float, *, all_inputs: bool) -> tuple[Array, Array]:
+def _projection(
+    states: SavedStates, state: Array, t: float, parameters: Array, *, all_inputs: bool
+) -> tuple[Array, Array]:
     """Return the projection of a state onto the constraints, and its (2m, x) derivative; without constraints 1."""
-    stepper, parameters = states.stepper, states.parameters
+    stepper = states.stepper
     if not stepper.constraints:
         return state, np.eye(len(state), len(state) + len(parameters) + 1)
 
@@ -292,7 +367,7 @@ def _projection(states: SavedStates, state: Array, t: float, *, all_inputs: bool
         return np.concatenate(projected(stepper, q, p, t, values)[:2])
 
     q, p = np.split(state, 2)
-    return onto(q, p, t, parameters), _differences(onto, states, q, p, t, all_inputs=all_inputs)
+    return onto(q, p, t, parameters), _differences(onto, states, q, p, t, parameters, all_inputs=all_inputs)
 
 
 def _differences(
@@ -301,16 +376,23 @@ def _differences(
     q: Array,
     p: Array,
     t: float,
+    parameters: Array,
     *,
     all_inputs: bool,
 ) -> Array:
-    """Return the (.., x) derivative of a function of q, p, t and parameters by differences of sixth order."""
-    m, parameters = len(q), states.parameters
+    """Return the (.., x) derivative of a function of q, p, t and parameters by differences of sixth order.
+
+    Momenta change relative to the largest of the run in units of the roots of masses. Modes are held fixed.
+    """
+    m, stepper = len(q), states.stepper
     x, moved = np.concatenate([q, p, parameters, [t]]), _increments(states)
-    steps = DIFFERENCE * np.maximum(1.0, np.abs(x))
+    steps, roots = DIFFERENCE * np.where(x == 0.0, 1.0, np.abs(x)), roots_of_masses(stepper, q, t, parameters)
     steps[:m], steps[-1] = moved[:-1], moved[-1]
+    steps[m : 2 * m] = DIFFERENCE * roots * (np.abs(np.asarray(states.p) / roots).max() or 1.0)
     columns = np.zeros((len(x), len(function(q, p, t, parameters))))
-    for k in (*range(2 * m), *(range(2 * m, len(x) - 1) if all_inputs else ()), -1):
+    fixed = {2 * m + stepper.parameters.index(name) for name in stepper.modes}
+    varied = [k for k in range(2 * m, len(x) - 1) if k not in fixed] if all_inputs else []
+    for k in (*range(2 * m), *varied, -1):
         step, values = steps[k], np.tile(x, (len(PLACES), 1))
         values[:, k] += step * PLACES
         at = [np.asarray(function(y[:m], y[m : 2 * m], float(y[-1]), y[2 * m : -1])) for y in values]
@@ -324,9 +406,11 @@ def _increments(states: SavedStates) -> Array:
     return np.append(np.maximum(DIFFERENCE, OF_STEP * by_q), OF_STEP * by_t)
 
 
-def _energy_differences(states: SavedStates, q: Array, ends: tuple[Array, Array], t: float, all_inputs: bool) -> Array:
+def _energy_differences(
+    states: SavedStates, q: Array, ends: tuple[Array, Array], t: float, parameters: Array, all_inputs: bool
+) -> Array:
     """Return the derivatives of H(q, p1) - H(q, p0) at fixed momenta by x = (q, p, parameters, t), 0 by p."""
-    stepper, parameters, m = states.stepper, states.parameters, len(q)
+    stepper, m = states.stepper, len(q)
     result = np.zeros(2 * m + len(parameters) + 1)
     x, steps = np.append(q, t), _increments(states)
     shifted = (x + (np.diag(steps)[:, np.newaxis] * PLACES[:, np.newaxis])).reshape(-1, m + 1)

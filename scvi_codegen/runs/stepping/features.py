@@ -58,7 +58,9 @@ PROPERTIES: dict[str, Callable[[Any], bool]] = {
     "in transformed time of a first-order system": lambda stepper: bool(stepper.in_tau and stepper.interface.variables),
     "for a first-order system": lambda stepper: bool(stepper.interface.variables),
     "with events that change the state": lambda stepper: stepper.changes_states,
-    "with constraints": lambda stepper: bool(stepper.interface.constraints or stepper.interface.layout.constraints),
+    "with constraints": lambda stepper: bool(
+        len(stepper.interface.constraints) > stepper.interface.masked or stepper.interface.layout.constraints
+    ),
     "with constraints of arrays": lambda stepper: bool(stepper.interface.layout.constraints),
     "with constraints of arrays by a composition": lambda stepper: bool(
         stepper.interface.layout.constraints and stepper.interface.method.startswith("composition")
@@ -81,7 +83,7 @@ PROPERTIES: dict[str, Callable[[Any], bool]] = {
 
 PROPERTIES_OF_SIZES: dict[str, Callable[[Any], bool]] = {
     "with constraints that prescribe the motion": lambda stepper: (
-        len(stepper.interface.constraints) == stepper.dimension
+        len(stepper.interface.constraints) - stepper.interface.masked == stepper.dimension
     ),
     "with forces": lambda stepper: bool(stepper.interface.exchange_names),
     "without the work of forces": lambda stepper: not stepper.interface.exchange_names,
@@ -140,7 +142,7 @@ FEATURES = {
         ("with events that set parameters", _DERIVATIVES, "make them terminal, and restart with the new parameters"),
         (
             "with contacts",
-            f"error check_growth device observe_ensemble {_DERIVATIVES} hessian advice",
+            "error check_growth device observe_ensemble hessian chaos_ensemble flow advice shadow_energy",
             "use runs and ensembles with h, or with t_end and a tolerance, without it",
         ),
         ("with constraints", "device observe_ensemble", "use coordinates without constraints, or omit it"),
