@@ -6,8 +6,6 @@ equations in the modes that they had in the run (``support/run/contacts.h``): G 
 G v+ = 0 at others with an impulse, and T v+ = 0 at slips that stop.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -30,18 +28,11 @@ Change = Callable[[Array, Array, float, Array], Array]
 
 
 class Impulse(NamedTuple):
-    """Impulse of a row of a contact: normal, or of a slip that stops.
-
-    Attributes:
-        contact, row: numbers.
-        slides: row of the slip and its direction if the contact slides, else ``None``.
-        restitution: whether the row is that of the contact that closes with its restitution.
-    """
+    """Impulse of the row of a gap, with the row of the slip and its direction if it slides, or of a slip that stops."""
 
     contact: int
     row: int
     slides: tuple[int, float] | None = None
-    restitution: bool = False
 
 
 class Rows(NamedTuple):
@@ -53,20 +44,19 @@ class Rows(NamedTuple):
     coefficients: Array
 
     @classmethod
-    def at(cls, stepper: Integrator, q: Array, p: Array, t: float, parameters: Array) -> Rows:
-        """Evaluate them, in the frame of the other constraints."""
+    def at(cls, stepper: Integrator, state: Array, t: float, parameters: Array) -> "Rows":
+        """Evaluate them at a (2m,) state, in the frame of the other constraints."""
         contacts, k, m = stepper.interface.contacts, stepper.interface.masked, stepper.dimension
         idle, imposed = parameters.copy(), parameters.copy()
         for contact in contacts:
-            masks = (contact.closed, contact.sticks, contact.direction)
-            for name, value in zip(masks, (1.0, 1.0, 0.0), strict=True):
+            for name, value in zip((contact.closed, contact.sticks, contact.direction), (1.0, 1.0, 0.0), strict=True):
                 if name is not None:
-                    idle[stepper.parameters.index(name)] = 0.0
-                    imposed[stepper.parameters.index(name)] = value
+                    place = stepper.parameters.index(name)
+                    idle[place], imposed[place] = 0.0, value
         numbers, binding = np.zeros(k * (3 + k + m) + 3 * len(contacts)), stepper.binding
-        blocks = map(binding.pointer, (q, p, idle, imposed, numbers))
+        blocks = map(binding.pointer, (state[:m], state[m:], idle, imposed, numbers))
         if status := binding.function("contact_terms")(t, *blocks, binding.workspace()):
-            raise StateError(f"the contacts at t = {t:.17g}, q = {q} are undefined: {REASONS[status]}")
+            raise StateError(f"the contacts at t = {t:.17g}, q = {state[:m]} are undefined: {REASONS[status]}")
         _, rate, _, inverse, gradients, others = np.split(numbers, np.cumsum([k, k, k, k * k, k * m]))
         return cls(rate, inverse.reshape(k, k), gradients.reshape(k, m), others.reshape(-1, 3))
 
@@ -84,30 +74,30 @@ def change_at(
     Raises:
         StateError: if the impulses are those of several impacts, one after another.
     """
-    m, places = stepper.dimension, [*map(stepper.parameters.index, stepper.modes)]
+    q, p = np.split(before, 2)
+    impulses = _impulses(stepper, event, before, after, t, modes[0]) if event.kind == "closes" else []
+    places = [*map(stepper.parameters.index, stepper.modes)]
 
-    def onto(q: Array, p: Array, t: float, values: Array, new: Array) -> tuple[Array, Array]:
-        values = values.copy()
-        values[places] = new[places]
-        return projected(stepper, q, p, t, values)[:2]
-
-    def by(impulses: list[Impulse]) -> Change:
-        def changed(q: Array, p: Array, t: float, values: Array) -> Array:
-            q, p = onto(q, p, t, values, modes[0])
+    def with_restitution(elastic: float) -> Change:
+        def changed(q: Array, p: Array, t: float, parameters: Array) -> Array:
+            old, new = parameters.copy(), parameters.copy()
+            old[places], new[places] = modes[0][places], modes[1][places]
+            q, p, _ = projected(stepper, q, p, t, old)
             if impulses:
-                p = p + _sum_of(impulses, Rows.at(stepper, q, p, t, values))
-            return np.concatenate(onto(q, p, t, values, modes[1]))
+                p = p + _momenta(impulses, event.contact, elastic, Rows.at(stepper, np.concatenate([q, p]), t, old))
+            return np.concatenate(projected(stepper, q, p, t, new)[:2])
 
         return changed
 
-    if event.kind != "closes":
-        return by([])
-    q, p = np.split(before, 2)
-    changes = [by([]), *(by(impulses) for impulses in _impulses(stepper, event, before, after, t, modes[0]))]
+    changes = [with_restitution(elastic) for elastic in (1.0, 0.0)]  # 0 where it would create energy
     roots = roots_of_masses(stepper, q, t, modes[0])
-    errors = [float(np.abs((change(q, p, t, modes[0]) - after)[m:] / roots).max()) for change in changes]
-    impulse, largest = (float(np.abs(momenta / roots).max()) for momenta in (after[m:] - p, p))
-    if not min(errors) <= SAME_IMPULSE * impulse + SAME_MOMENTUM * largest:
+    differences = (
+        *(change(q, p, t, modes[0])[len(q) :] - after[len(q) :] for change in changes),
+        after[len(q) :] - p,
+        p,
+    )
+    *errors, impulse, momentum = (float(np.abs(difference / roots).max()) for difference in differences)
+    if not min(errors) <= SAME_IMPULSE * impulse + SAME_MOMENTUM * momentum:
         raise StateError(
             f"the contact '{event.function}' closes at t = {t:.17g} with several impacts, one after another: "
             "derivatives through them are not available"
@@ -117,37 +107,39 @@ def change_at(
 
 def _impulses(
     stepper: Integrator, event: Transition, before: Array, after: Array, t: float, parameters: Array
-) -> list[list[Impulse]]:
-    """Return the impulses of an impact by the modes they had in the run, with restitution and without; [] if none."""
+) -> list[Impulse]:
+    """Return the impulses of an impact in the modes they had in the run."""
     contacts, named = stepper.interface.contacts, dict(zip(stepper.parameters, parameters.tolist(), strict=True))
-    (q, p), (q1, p1) = np.split(before, 2), np.split(after, 2)
-    first, last = Rows.at(stepper, q, p, t, parameters), Rows.at(stepper, q1, p1, t, parameters)
+    first, last = (Rows.at(stepper, state, t, parameters) for state in (before, after))
+    q, p = np.split(before, 2)
     sizes = np.sqrt(np.abs(np.diag(first.inverse_masses) * (p @ stepper.velocity(q, p, t, parameters))))
-    meets = contacts[event.contact].normal
     taking_part = [k for k, item in enumerate(contacts) if k == event.contact or (item.closed and named[item.closed])]
     rows = [row for k in taking_part for row in contacts[k][:2] if row is not None]
     total = np.zeros(len(first.rate))
     total[rows] = np.linalg.lstsq(first.inverse_masses[np.ix_(rows, rows)], (last.rate - first.rate)[rows])[0]
-    elastic: list[Impulse] = []
+    impulses: list[Impulse] = []
     for k in taking_part:
         normal, slip = contacts[k].normal, contacts[k].tangential
-        if normal is None or not total[normal] > ROUNDING * total[meets]:
+        if normal is None or not total[normal] > ROUNDING * total[contacts[event.contact].normal]:
             continue
-        stops = slip is not None and abs(last.rate[slip]) <= ROUNDING * sizes[slip]
-        slides = None if slip is None or stops else (slip, float(np.sign(last.rate[slip])))
-        elastic.append(Impulse(k, normal, slides, k == event.contact))
-        elastic += [Impulse(k, slip)] if slip is not None and stops else []
-    return [elastic, [impulse._replace(restitution=False) for impulse in elastic]]
+        if slip is None:
+            impulses.append(Impulse(k, normal))
+        elif abs(last.rate[slip]) <= ROUNDING * sizes[slip]:
+            impulses += [Impulse(k, normal), Impulse(k, slip)]
+        else:
+            impulses.append(Impulse(k, normal, (slip, float(np.sign(last.rate[slip])))))
+    return impulses
 
 
-def _sum_of(impulses: list[Impulse], of: Rows) -> Array:
-    """Return the (m,) change of the momenta by impulses of rows."""
+def _momenta(impulses: list[Impulse], closing: int, elastic: float, of: Rows) -> Array:
+    """Return the (m,) change of the momenta; ``elastic`` multiplies the restitution of the contact that closes."""
     columns, active = np.zeros((len(of.rate), len(impulses))), [impulse.row for impulse in impulses]
-    for column, impulse in zip(columns.T, impulses, strict=True):
-        column[impulse.row] = 1.0
-        if impulse.slides is not None:
-            slip, direction = impulse.slides
-            column[slip] = -of.coefficients[impulse.contact, 0] * direction
-    elasticity = np.array([impulse.restitution * of.coefficients[impulse.contact, 2] for impulse in impulses])
-    sizes = np.linalg.solve(of.inverse_masses[active] @ columns, -(1.0 + elasticity) * of.rate[active])
-    return np.asarray(of.gradients.T @ (columns @ sizes))
+    right = -of.rate[active]
+    for j, (contact, row, slides) in enumerate(impulses):
+        columns[row, j] = 1.0
+        if slides is not None:
+            columns[slides[0], j] = -of.coefficients[contact, 0] * slides[1]
+    right[[impulse.contact == closing for impulse in impulses].index(True)] *= (
+        1.0 + elastic * of.coefficients[closing, 2]
+    )
+    return np.asarray(of.gradients.T @ (columns @ np.linalg.solve(of.inverse_masses[active] @ columns, right)))

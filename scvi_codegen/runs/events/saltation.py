@@ -63,6 +63,15 @@ class Jump(NamedTuple):
     before: Array
 
 
+class Place(NamedTuple):
+    """Run and time of a change, parameters with the modes there, and whether derivatives by them are required."""
+
+    states: SavedStates
+    t: float
+    parameters: Array
+    all_inputs: bool
+
+
 def jumps_within(
     states: SavedStates, starts: Starts, numbers: NDArray[np.intp], *, all_inputs: bool
 ) -> dict[int, Jump]:
@@ -113,7 +122,8 @@ def _jump(
     stepper, options = states.stepper, states.options
     m, size = stepper.dimension, stepper._input_size
     t, after = float(states.t[row]), np.concatenate([states.q[row], states.p[row]])
-    parameters, new_parameters = (parameters_on_sides(states, time) for time in (float(starts.t[k - 1]), t))
+    sides = (parameters_on_sides(states, time) for time in (float(starts.t[k - 1]), t))
+    here, later = (Place(states, t, parameters, all_inputs) for parameters in sides)
 
     def products(state: Array, h: float, time: float, seeds: Array) -> Array:
         sides = parameters_on_sides(states, time)
@@ -131,7 +141,7 @@ def _jump(
     step = products(after, h, t, np.eye(size))
     departure, basis = np.zeros(2 * m), np.eye(2 * m)
     if stepper.constraints:  # tangent vectors are admissible: departure + the range of the derivative of the projection
-        onto = _projection(states, after, t, new_parameters, all_inputs=False)[1]
+        onto = _projection(later._replace(all_inputs=False), after)[1]
         directions, sizes, _ = np.linalg.svd(onto[:, : 2 * m])
         departure, basis = onto[:, -1], directions[:, sizes > ADMISSIBLE]
     moved = step[:, -1] - step[:, -2] - step[:, : 2 * m] @ departure
@@ -143,14 +153,14 @@ def _jump(
     matrix[-2, -1] -= divided
     if isinstance(event, Kink) and np.linalg.norm(departure - arrival) <= CONTINUOUS * np.linalg.norm(arrival):
         return Jump(matrix, before)
-    values, rate = _crossing(states, event, (before, after), t, (parameters, new_parameters), arrival, all_inputs)
+    values, rate = _crossing(here, event, (before, after), later.parameters, arrival)
     gradient = np.concatenate([values.gradient, np.zeros(1)])
     if event.restitution is not None:
-        change = _impact(states, values, before, after, t, parameters, all_inputs)
+        change = _impact(here, values, before, after)
     elif isinstance(event, Transition):
         change = values.map
     else:
-        by = _projection(states, values.value, t, new_parameters, all_inputs=all_inputs)[1]
+        by = _projection(later, values.value)[1]
         change = by[:, : 2 * m] @ values.map
         change[:, 2 * m :] += by[:, 2 * m :]
     crossing_time = -gradient / rate  # dtau = crossing_time (dx, dh)
@@ -174,29 +184,17 @@ class Values(NamedTuple):
 
 
 def _crossing(
-    states: SavedStates,
-    event: Event,
-    ends: tuple[Array, Array],
-    t: float,
-    modes: tuple[Array, Array],
-    arrival: Array,
-    all_inputs: bool,
+    here: Place, event: Event, ends: tuple[Array, Array], new_parameters: Array, arrival: Array
 ) -> tuple[Values, float]:
-    """Return the derivatives of an event and its rate along the run.
-
-    Args:
-        states, event, t, all_inputs: as of :func:`_jump`.
-        ends: (2m,) states before and after it.
-        modes: parameters with the modes before and after it.
-        arrival: (2m,) rate of the state before it.
-    """
+    """Return the derivatives of an event between two states, and its rate where that of the state is ``arrival``."""
     size, values = len(arrival), None
     if isinstance(event, Transition):
-        values = _at_transition(states, event, ends, t, modes, all_inputs)
+        values = _at_transition(here, event, ends, new_parameters)
     elif isinstance(event, Kink):
-        values = _at_kink(states, event, ends[0], t, modes[0], all_inputs)
+        values = _at_kink(here, event, ends[0])
+    states, t = here.states, here.t
     if values is None:
-        values = _derivatives(states.stepper.known.interface, event)(ends[0], t, modes[0])
+        values = _derivatives(states.stepper.known.interface, event)(ends[0], t, here.parameters)
     rate = values.gradient[:size] @ arrival + values.gradient[-1]
     steepest, least = np.linalg.norm(values.gradient[:size]) * np.linalg.norm(arrival), GRAZING
     if isinstance(event, Transition):  # whose gradients by momenta, of multipliers, have another size
@@ -263,21 +261,12 @@ def _function_of_velocities(interface: Interface, kink: Kink) -> Callable[..., A
     return made
 
 
-def _at_transition(
-    states: SavedStates, event: Transition, ends: tuple[Array, Array], t: float, modes: tuple[Array, Array], more: bool
-) -> Values:
-    """Return the derivatives of a transition of a contact by differences of sixth order.
-
-    Args:
-        states, event, t: run and transition.
-        ends: (2m,) states before and after it.
-        modes: parameters with the modes before and after it.
-        more: whether derivatives with respect to parameters are required.
-    """
-    stepper, binding = states.stepper, states.stepper.binding
+def _at_transition(here: Place, event: Transition, ends: tuple[Array, Array], new_parameters: Array) -> Values:
+    """Return the derivatives of a transition of a contact, by differences of sixth order."""
+    stepper, binding = here.states.stepper, here.states.stepper.binding
     own = sum(len(stepper._events_of_entries(other)) for other in stepper.events)
     number = own + stepper.searched.index(event) - len(stepper.events)
-    change = change_at(stepper, event, *ends, t, modes)
+    change = change_at(stepper, event, *ends, here.t, (here.parameters, new_parameters))
 
     def mapped(q: Array, p: Array, t: float, parameters: Array) -> Array:
         """Return the function of the transition, and the state after it."""
@@ -287,16 +276,13 @@ def _at_transition(
             raise StateError(f"the transition '{event.function}' at t = {t:.17g} is undefined: {REASONS[status]}")
         return np.append(values[number], change(q, p, t, parameters))
 
-    q, p = np.split(ends[0], 2)
-    by = _differences(mapped, states, q, p, t, modes[0], all_inputs=more)
+    by = _differences(mapped, here, *np.split(ends[0], 2))
     return Values(by[0], by[1:], ends[1])
 
 
-def _at_kink(
-    states: SavedStates, kink: Kink, before: Array, t: float, parameters: Array, all_inputs: bool
-) -> Values | None:
+def _at_kink(here: Place, kink: Kink, before: Array) -> Values | None:
     """Return the derivatives of a kink of velocities, by differences of sixth order; ``None`` for other kinks."""
-    stepper, m = states.stepper, states.stepper.dimension
+    stepper = here.states.stepper
     function = _function_of_velocities(stepper.known.interface, kink)
     if function is None:
         return None
@@ -304,13 +290,11 @@ def _at_kink(
     def value(q: Array, p: Array, t: float, parameters: Array) -> Array:
         return np.array(function([*q, *p, *stepper.velocity(q, p, t, parameters), *parameters, t]), dtype=float)
 
-    (gradient,) = _differences(value, states, before[:m], before[m:], t, parameters, all_inputs=all_inputs)
-    return Values(gradient, np.eye(2 * m, len(gradient)), before)
+    (gradient,) = _differences(value, here, *np.split(before, 2))
+    return Values(gradient, np.eye(len(before), len(gradient)), before)
 
 
-def _impact(
-    states: SavedStates, values: Values, before: Array, after: Array, t: float, parameters: Array, all_inputs: bool
-) -> Array:
+def _impact(here: Place, values: Values, before: Array, after: Array) -> Array:
     """Return the (2m, x) derivative of the state after an impact by x = (q, p, parameters, t).
 
     With n = g_q, u = p + lambda n and p1 = P(q, u), F = H(q, p1) - H(q, p) + lambda g_t - (p1 - u).v1 = 0 gives
@@ -322,17 +306,17 @@ def _impact(
 
     where H is differentiated at fixed momenta.
     """
-    stepper = states.stepper
+    stepper, t, parameters = here.states.stepper, here.t, here.parameters
     m, count = stepper.dimension, values.gradient.size
     n, e, (q, p) = values.value[:m], values.value[m + 1], np.split(before, 2)
     # P_u maps G^T mu to 0, and the change of p, lambda n + G^T mu, to lambda P_u n
-    onto = _projection(states, after, t, parameters, all_inputs=False)[1][m:, m : 2 * m]
+    onto = _projection(here._replace(all_inputs=False), after)[1][m:, m : 2 * m]
     impulse = float((onto @ (after - before)[m:]) @ (onto @ n) / ((onto @ n) @ (onto @ n)))
     full = 2.0 * impulse / (1.0 + e)
 
     def changed(impulse: float) -> tuple[Array, Array, Array]:
         """Return P(q, p + lambda n), its derivative by x at constant lambda, and by lambda."""
-        state, by = _projection(states, np.concatenate([q, p + impulse * n]), t, parameters, all_inputs=all_inputs)
+        state, by = _projection(here, np.concatenate([q, p + impulse * n]))
         onto = by[m:, m : 2 * m]
         return state[m:], by[m:] + impulse * onto @ values.map[:m], onto @ n
 
@@ -340,11 +324,10 @@ def _impact(
     v0, v1 = (np.asarray(stepper.velocity(q, momenta, t, parameters)) for momenta in (p, p1))
     residual = full * (v1 @ values.map[:m] + values.map[m])
     residual[m : 2 * m] += v1 - v0
-    residual += _energy_differences(states, q, (p, p1), t, parameters, all_inputs)
+    residual += _energy_differences(here, q, (p, p1))
     residual_by_impulse = n @ v1 + values.value[m]
     if stepper.constraints:
-        by = _differences(stepper.velocity, states, q, p1, t, parameters, all_inputs=all_inputs)
-        work = (p1 - p - full * n) @ by
+        work = (p1 - p - full * n) @ _differences(stepper.velocity, here, q, p1)
         by_momentum = work[m : 2 * m].copy()
         work[m : 2 * m] = 0.0
         residual -= work + by_momentum @ p1_by
@@ -355,11 +338,9 @@ def _impact(
     return np.vstack([np.eye(m, count), by + np.outer(by_impulse, impulse_by)])
 
 
-def _projection(
-    states: SavedStates, state: Array, t: float, parameters: Array, *, all_inputs: bool
-) -> tuple[Array, Array]:
+def _projection(here: Place, state: Array) -> tuple[Array, Array]:
     """Return the projection of a state onto the constraints, and its (2m, x) derivative; without constraints 1."""
-    stepper = states.stepper
+    stepper, t, parameters = here.states.stepper, here.t, here.parameters
     if not stepper.constraints:
         return state, np.eye(len(state), len(state) + len(parameters) + 1)
 
@@ -367,23 +348,15 @@ def _projection(
         return np.concatenate(projected(stepper, q, p, t, values)[:2])
 
     q, p = np.split(state, 2)
-    return onto(q, p, t, parameters), _differences(onto, states, q, p, t, parameters, all_inputs=all_inputs)
+    return onto(q, p, t, parameters), _differences(onto, here, q, p)
 
 
-def _differences(
-    function: Callable[[Array, Array, float, Array], Array],
-    states: SavedStates,
-    q: Array,
-    p: Array,
-    t: float,
-    parameters: Array,
-    *,
-    all_inputs: bool,
-) -> Array:
+def _differences(function: Callable[[Array, Array, float, Array], Array], here: Place, q: Array, p: Array) -> Array:
     """Return the (.., x) derivative of a function of q, p, t and parameters by differences of sixth order.
 
     Momenta change relative to the largest of the run in units of the roots of masses. Modes are held fixed.
     """
+    states, t, parameters, all_inputs = here
     m, stepper = len(q), states.stepper
     x, moved = np.concatenate([q, p, parameters, [t]]), _increments(states)
     steps, roots = DIFFERENCE * np.where(x == 0.0, 1.0, np.abs(x)), roots_of_masses(stepper, q, t, parameters)
@@ -406,10 +379,9 @@ def _increments(states: SavedStates) -> Array:
     return np.append(np.maximum(DIFFERENCE, OF_STEP * by_q), OF_STEP * by_t)
 
 
-def _energy_differences(
-    states: SavedStates, q: Array, ends: tuple[Array, Array], t: float, parameters: Array, all_inputs: bool
-) -> Array:
+def _energy_differences(here: Place, q: Array, ends: tuple[Array, Array]) -> Array:
     """Return the derivatives of H(q, p1) - H(q, p0) at fixed momenta by x = (q, p, parameters, t), 0 by p."""
+    states, t, parameters, all_inputs = here
     stepper, m = states.stepper, len(q)
     result = np.zeros(2 * m + len(parameters) + 1)
     x, steps = np.append(q, t), _increments(states)
