@@ -2,7 +2,7 @@
 
 The stage equations of a page are solved as they stand there, and lead where the compiled C does; so do those that are
 written out, in HTML and text. Formulas of the system and its motion are compared with derivatives taken here of
-a text that stands here; those of kernels with the C beside them.
+a text that stands here; those of kernels with the C beside them. An entry without a check fails.
 """
 
 import re
@@ -15,16 +15,20 @@ from typing import Any
 import numpy as np
 import pytest
 import sympy
-from derivation_page import Entry, PrintedPage, read_page
+from derivation_page import Entry, PrintedPage, PrintedTable, read_page
 from oracle import points
 from printed_formulas import FUNCTIONS, mp, names, trees_of_mathml, value
 
 import scvi_codegen as sc
+from scvi_codegen.codegen.pipeline import program_of
 from scvi_codegen.common.display.mathml import mathml_terms
 from scvi_codegen.interfaces.derivation import derivation_html
 from scvi_codegen.interfaces.derivation.equations import derive
 from scvi_codegen.methods.discretise import discretise, paper_equations
 from scvi_codegen.methods.stage_system import EntryName
+from scvi_codegen.methods.tables.number_tables import Part
+from scvi_codegen.methods.tables.quadrature import Quadrature
+from scvi_codegen.methods.tables.tableau import Tableau
 
 T, H, TIME = mp.mpf("1e-40"), 0.125, 0.375
 Q, P = (0.625, -0.4375), (0.3125, 0.875)
@@ -487,6 +491,28 @@ def nodes_of(method: Any) -> Any:
     return points({"chebyshev-lobatto": "chebyshev-lobatto"}[method.specification()["nodes"]], method.degree + 1)
 
 
+def of_curve(name: str, entry: Entry, index: int) -> bool:
+    """The trial curve, its action and its matrices, of numbers that are computed here."""
+    method = CASES[name][1]
+    left = entry.tree[1] if entry.number not in ("18", "21") else None
+    right = entry.tree[2]
+    if left is None:
+        return kronecker(method, entry, index)
+    if left[0] == "apply":  # q(tau) through the values of t^2 at the nodes, between them
+        nodes = numbers(2 * nodes_of(method) - 1)
+        known = {f"Q^{j}": x**2 for j, x in enumerate(nodes)} | {"s": mp.mpf(method.degree)}
+        at = mp.mpf("0.3")
+        known |= {f"l_{j}(τ)": cardinal(nodes, j, at) for j in range(len(nodes))}
+        expected = at**2 if method.degree > 1 else nodes[0] ** 2
+        return close(value(right, known.__getitem__), expected)
+    if left[1:3] == ("L", "d"):
+        known = {"h": mp.mpf(3), "g": mp.mpf(2), "w_1": mp.mpf("0.75"), "w_2": mp.mpf("1.25")}
+        known |= {f"L(q(τ_{n}), q'(τ_{n}), t_{n})": mp.mpf(4 + n) for n in (1, 2)}
+        return close(value(right, known.__getitem__), mp.mpf(3) / 2 * (mp.mpf("0.75") * 5 + mp.mpf("1.25") * 6))
+    known = {"L_d": mp.mpf(5), "s": mp.mpf(2), "λ_1": mp.mpf(2), "λ_2": mp.mpf(3), "E_1": mp.mpf(7), "E_2": mp.mpf(11)}
+    return left[1] == "G" and close(value(right, known.__getitem__), mp.mpf(5 + 14 + 33))
+
+
 def cardinal(nodes: Any, j: int, x: Any) -> Any:
     found = mp.one
     for k, other in enumerate(nodes):
@@ -494,11 +520,8 @@ def cardinal(nodes: Any, j: int, x: Any) -> Any:
     return found
 
 
-def of_curve(name: str, entry: Entry, index: int) -> bool:
-    """(18), (21) of curves that are polynomials: their derivatives are exact. Other entries are the same for all."""
-    method = CASES[name][1]
-    if entry.number not in ("18", "21"):
-        return True
+def kronecker(method: Any, entry: Entry, index: int) -> bool:
+    """(18), (21) of curves that are polynomials: their derivatives are exact."""
     c, h, m = numbers(nodes_of(method) * H), mp.mpf(H), 2
     partials = np.array([[mp.diff(lambda x, j=j: cardinal(c, j, x), t) for j in range(len(c))] for t in c[1:]])
     curve = [np.array([[1 + 2 * t - t**2], [3 - t + 4 * t**2]]) for t in c]
@@ -558,6 +581,114 @@ def of_kernels(name: str, entry: Entry, index: int) -> bool:
     return bool(abs(found - expected) < mp.mpf("1e-14") * (1 + abs(expected)))
 
 
+def of_functions(name: str, entry: Entry, index: int) -> bool:
+    """Check Newton's iteration, the gather and the fixed-point iterations at the points of the step."""
+    if entry.pair == "evaluate":
+        return True  # solved as they stand, above
+    if entry.pair == "newton":
+        known = {"J": mp.mpf(3), "z": mp.mpf(5), "R": mp.mpf(3) * 5 - 7, "δ": (mp.mpf(3) * 5 - 7) / 3}
+        known |= {"z_new": mp.mpf(7) / 3}
+        return close(*(value(side, known.__getitem__) for side in entry.tree[1:]))
+    if entry.pair == "gather":
+        known = {"B": mp.mpf(2), "table_1,n": mp.mpf(3), "table_2,n": mp.mpf(5), "z_1": mp.mpf(7), "z_2": mp.mpf(11)}
+        return close(value(entry.tree[2], known.__getitem__), mp.mpf(21 + 55))
+    return entry.pair in ("fixed_point", "iterate") and of_iteration(name, entry)
+
+
+@cache
+def iteration_numbers(name: str) -> tuple[int, dict[str, Any]]:
+    """Return the values of symbols of a fixed-point iteration on the solved step; tables are those of the package."""
+    case, method, _ = made(name)
+    q, p, h, t = start_of(case)
+    with warnings.catch_warnings(action="ignore"):
+        fixed_point = program_of(case.system, method, prefix="printed").fixed_point
+    step, x = (
+        solution(name, "evaluate")
+        if any(e.pair == "evaluate" for e in made(name)[2].entries)
+        else (solution(name, "stages"))
+    )
+    known = step.known(x, q, p, h, t)
+    end = step.end(x, q, p, h, t)
+    found: dict[str, Any] = {"h": mp.mpf(h), "q_k": numbers(q), "p_k": numbers(p), "q_k+1": end[0], "p_k+1": end[1]}
+    found["v_0"] = known.get("v_0", velocity_of(case, q, p, t))
+    stage_groups = [f for f in step.stages.stage_groups if f.name != "derivative_1"]
+    curve = fixed_point is not None and fixed_point.name in ("collocation", "shooting")
+    places = stage_groups[-1] if curve and len(stage_groups) > 1 else stage_groups[0]
+    places = next((f for f in stage_groups if f.name == "node"), places) if curve else places
+    first = places.weight_names[0].point if places.weight_names[0] else 1
+    for n in range(1, len(places.abscissae) + 1):
+        given = step.arguments(places, n, str(n - 1 + first), known)
+        time = mp.mpf(t) + of_package(places.abscissae[n - 1]) * mp.mpf(h)
+        momentum = given["p"] if case.momenta else case.result("L_v", time, **given)
+        found |= {
+            f"q_{n}": given["q"],
+            f"V_{n}": given["q'"],
+            f"P_{n}": momentum,
+            f"c_{n}": of_package(places.abscissae[n - 1]),
+        }
+        found |= {f"L_q,{n}": case.result("L_q", time, **given), f"F_{n}": case.result("L_q", time, **given)}
+        found |= {f"z_{n}": known.get(f"z_{n}"), f"L_v,{n}": momentum - 2, f"E_{n}": 3}
+        found |= {f"H_q(q_{n}, P_{n})": -found[f"F_{n}"], f"H_p(q_{n}, P_{n})": given["q'"]}
+        growth = mp.exp(
+            mp.mpf(str(case.parsed(case.damping).subs(PARAMETERS))) * of_package(places.abscissae[n - 1]) * mp.mpf(h)
+        )
+        for letter in ("P_", "L_q,", "F_"):  # points of a quadrature weigh so much
+            found[f"{letter}{n}"] = found[f"{letter}{n}"] * growth
+    projected = fixed_point is not None and any(each.name == "PROJECTION" for each in fixed_point.own_tables)
+    if projected and len(fixed_point.guess.abscissae) != len(places.abscissae):  # V_j are then those of the curve
+        found |= {f"V_{n}": known.get(f"V^{n}", numbers([0, 0])) for n in range(1, len(places.abscissae) + 1)}
+    found |= {"g": mp.mpf(len(places.abscissae)), "p_k+1": end[1] * known["growth"]}
+    return len(places.abscissae), found | step.tables | tables_of(fixed_point, len(places.abscissae), case)
+
+
+def tables_of(fixed_point: Any, count: int, case: Case) -> dict[str, Any]:
+    """Return the tables of a fixed-point iteration by their names on the page; constant masses are inverted."""
+    found: dict[str, Any] = {"M^−1": np.array([1 / mp.mpf(PARAMETERS["m"]), 1 / mp.mpf(3)], dtype=object)}
+    tables = {each.name: each.numbers for each in fixed_point.own_tables} if fixed_point else {}
+    if "PROJECTION" in tables:
+        found["projection"] = tables["PROJECTION"]
+    if "PRODUCT" in tables:
+        for n in range(count):
+            found |= {f"a_{n + 1},{j + 1}": of_package(x) for j, x in enumerate(tables["PRODUCT"][n])}
+            found |= {
+                f"β_{n + 1}": of_package(tables["POINT_END_POSITION"][n]),
+                f"b_{n + 1}": of_package(tables["POINT_END_MOMENTUM"][n]),
+            }
+    elif "POSITION" in tables:
+        for n in range(count):
+            w, u = (list(map(of_package, each)) for each in (tables["POSITION_WEIGHT"], tables["MOMENTUM_WEIGHT"]))
+            found |= {f"a_{n + 1},{j + 1}": of_package(x) * w[j] for j, x in enumerate(tables["POSITION"][n])}
+            found |= {f"A_{n + 1},{j + 1}": of_package(x) * u[j] for j, x in enumerate(tables["MOMENTUM"][n])}
+            found |= {
+                f"b_{n + 1}": of_package(tables["POINT_END_POSITION"][n]) * w[n],
+                f"B_{n + 1}": of_package(tables["POINT_END_MOMENTUM"][n]) * u[n],
+            }
+    return found
+
+
+def of_iteration(name: str, entry: Entry) -> bool:
+    count, known = iteration_numbers(name)
+    _, left, right = entry.tree
+    if left == ("name", "P", "n", "") and "projection" in known:
+        return True  # fewer velocities than points: their corrections are means of P_n - L_v, which the page leaves out
+    for n in range(1, count + 1):
+        at = dict(known)
+        if left[2] == "n,new":  # one step of Newton's iteration, here of residuals and masses that are linear
+            m = 1 / at["M^−1"]
+            speed, momentum = numbers([5, 7])[: len(m)], numbers([11, 13])[: len(m)]
+            at |= {f"V_{n}": speed, f"L_v,{n}": m * speed, f"P_{n}": momentum, f"z_{n}": speed}
+            at[f"E_{n}"] = m * speed / at["h"] - momentum
+            expected = momentum / m if left[1] == "V" else at["h"] * momentum / m
+        elif left == ("name", "z", "n", ""):
+            m, at[f"F_{n}"] = 1 / at["M^−1"], numbers([11, 13])
+            expected = at["h"] * at[f"F_{n}"] / m
+        else:
+            expected = at["_".join([left[1], str(n) if left[2] == "n" else left[2]])]
+        if not np.max(np.abs(value(right, at.__getitem__, {"n": n}) - expected)) < mp.mpf("1e-14"):
+            return False
+    return True
+
+
 CHECKS: dict[str, Callable[[str, Entry, int], bool]] = {
     "system": of_system,
     "motion": of_motion,
@@ -567,7 +698,7 @@ CHECKS: dict[str, Callable[[str, Entry, int], bool]] = {
     "written-out": of_components,
     "jacobian": of_jacobian,
     "kernels": of_kernels,
-    "functions": lambda name, entry, index: True,
+    "functions": of_functions,
 }
 """By section of the page; what is not here fails."""
 
@@ -581,6 +712,58 @@ def test_every_entry_of_the_page_is_right(name):
         counts[entry.section] += 1
     assert counts["system"] > 0 < counts["motion"]
     assert counts["kernels"] > 3
+
+
+CAPTIONS = {
+    "lj(τn)": "l", "Slopes of": "dl", "Dn,j": "D", "Products of": "DD", "an,j": "a", "(A2)n,j": "aa", "cn": "c",
+    "rn,j": "r", "un,j": "u", "(bA)j": "bA", "βj": "beta", "γj": "gamma", "s1n,j": "s1", "s2n,j": "s2", "s3n,j": "s3",
+    "s4n,j": "s4", "s5n,j": "s5",
+}  # fmt: skip
+"""First words of the text above tables of entries, and prefixes of the entries' names."""
+
+
+def cell_number(cell: Any) -> Any:
+    return value(cell, lambda name: None) if isinstance(cell, tuple) else mp.mpf(cell)
+
+
+def check_part(table: PrintedTable, part: Part) -> None:
+    """Cells are in 17 digits the numbers of nodes, of a quadrature or of a tableau, or exact."""
+    if isinstance(part, Tableau):
+        rows = [*((c, *line) for c, line in zip(part.c, part.A, strict=True)), part.b]
+    else:
+        columns = {"node": part.points, "point": part.points}
+        if isinstance(part, Quadrature):
+            columns["weight"] = part.weights
+            columns |= {f"weight of derivative {k}": x for k, x in enumerate(part.derivative_weights, 1)}
+        rows = list(zip(*(columns[heading] for heading in table.columns[1:]), strict=True))
+    for row, numbers_of_row in zip(table.rows, rows, strict=True):
+        cells = [cell_number(cell) for cell in row[1:] if cell != ""]
+        assert all(abs(x - of_package(y)) < mp.mpf("1e-16") for x, y in zip(cells, numbers_of_row, strict=True))
+
+
+def check_entries(name: str, table: PrintedTable) -> None:
+    """Cells are in 17 digits the numbers of the equations, or exact."""
+    prefix = next(prefix for begin, prefix in CAPTIONS.items() if table.caption.startswith(begin))
+    known = dict(solution(name, "stages")[0].tables)
+    for row in table.rows:
+        for column, cell in zip(table.columns[1:], row[1:], strict=True):
+            index = column.partition("= ")[2] if "=" in column else ""
+            if cell != "":
+                own = printed("_".join(filter(None, [prefix, row[0], index])))
+                assert abs(cell_number(cell) - known[own]) < mp.mpf("2e-17") * max(1, abs(known[own])) * 10, own
+
+
+@pytest.mark.tiers(1, 1)
+@pytest.mark.parametrize("name", NAMES)
+def test_tables_have_the_numbers_of_the_equations(name):
+    (parameters, *tables, operations), parts = made(name)[2].tables, CASES[name][1].parts
+    assert {row[0][1]: float(row[1]) for row in parameters.rows} == PARAMETERS
+    assert operations.caption == "Operations of the kernels"  # counted in test_derivation_page.py
+    assert tables
+    for table, part in zip(tables, parts, strict=False):
+        check_part(table, part)
+    for table in tables[len(parts) :]:
+        check_entries(name, table)
 
 
 @cache
