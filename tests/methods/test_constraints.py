@@ -396,6 +396,15 @@ def test_states_far_from_constraints_with_sines_are_projected():
         stepper.integrate(far, p, h=0.1, steps=1)
 
 
+def test_states_far_from_constraints_with_unequal_masses_are_projected():
+    masses, rods = (1, 3, 30), ("x1**2 + y1**2 = 1", "(x2-x1)**2 + (y2-y1)**2 = 1", "(x3-x2)**2 + (y3-y2)**2 = 1")
+    kinetic = " + ".join(f"{m}*({a}{k}_dot**2)/2" for k, m in enumerate(masses, 1) for a in "xy")
+    stepper = sc.compile_stepper(lagrange("chain", "x1 y1 x2 y2 x3 y3", kinetic, constraints=[*rods]), lobatto(1))
+    for far in 1e3 * np.random.default_rng(3).normal(size=(5, 6)):
+        q, p = stepper.project(far, np.zeros(6))
+        assert np.abs(stepper.constraint_values(q, p)).max() < 1e-14
+
+
 def test_angles_at_zero_satisfy_constraints_up_to_rounding():
     """The second constraint of this linkage is 0.2 + 0.4 - 0.6 = 1.1e-16 at 0, where angles have no relative size."""
     linkage = sc.LagrangianSystem.from_text(

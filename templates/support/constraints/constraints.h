@@ -12,10 +12,11 @@
  * [L_vv, D^T; G, 1 - c] for the multipliers of forces D^T lambda: requires the kernel reactions, of 1 - c and the
  * entries of D, whose indices are DIRECTION_ENTRY. */
 
-#define MAX_PROJECTIONS 100 /* Gauss-Newton iterations; more indicate that no state is near */
+#define MAX_PROJECTIONS 1000 /* Gauss-Newton iterations: unequal masses far away need hundreds */
 #define MOST_UPDATE_HALVINGS 60 /* of an update */
 #define MOMENTUM_PROJECTIONS 3 /* one suffices except for rounding and non-quadratic kinetic energies, for which the
                                 * iteration continues until an update of the velocity, relative to it, is settled */
+#define MOST_MOMENTUM_PROJECTIONS 100
 #define SETTLED_UPDATE REAL(1e-9)
 /* relative to the state: accepted size of the last update where rounding prevents a smaller residual */
 #define ACCEPTED_UPDATE REAL(1e-6)
@@ -310,7 +311,7 @@ static real square_by_constraints(real t, const real *q, const real *parameters,
 static int project_momentum(real t, const real *q, real *p, const real *parameters, saddle *at, real *workspace)
 {
   real u[2 * M], g[CONSTRAINTS], rate[CONSTRAINTS], y[CONSTRAINTS], update[M], derivative[CONSTRAINT_ENTRIES];
-  for (int k = 0; k < MAX_PROJECTIONS; k++) {
+  for (int k = 0; k < MOST_MOMENTUM_PROJECTIONS; k++) {
     int status = constrained(t, q, p, parameters, u, g, rate, workspace);
     if (status == OK)
       status = factorise_saddle(t, u, parameters, at, g);
