@@ -357,7 +357,8 @@ def test_three_contacts_of_a_woodpecker_lead_to_its_cycle() -> None:
         ],
     )
     passes = sc.Event("s + 0.2788", direction=-1)
-    run = sc.compile_stepper(system, "svi:4").integrate(
+    stepper = sc.compile_stepper(system, "svi:4")
+    run = stepper.integrate(
         [0, -0.6 / 5.8, -0.2788], velocity=[-0.3411, 0, -7.4583], t_end=5, tolerance=1e-10, events=passes
     )
     (cycle,) = run.events
@@ -367,6 +368,19 @@ def test_three_contacts_of_a_woodpecker_lead_to_its_cycle() -> None:
     assert ends.mean(axis=0) == pytest.approx([-0.3394786, 0, -7.4620946], rel=2e-6, abs=1e-9)
     assert np.abs(cycle.t - 2.9194720658).min() < 2e-9
     assert {modes[1] for _, modes in run.contact_modes} == {"open", "stick", "slip"}
+    flight = [t for t, modes in run.contact_modes[:-1] if {*modes} == {"open"}][-1] + 0.012
+    q, p = run.at(flight)[:2]
+    orbit = sc.periodic_orbit(stepper, q, p, period=0.146, steps=150, gain=[None, 0, 0])
+    assert orbit.period == pytest.approx(0.145976, abs=1e-6)
+    assert orbit.error < 1e-8
+    assert orbit.multipliers == pytest.approx([1, 1, -0.8391557, 0, 0, 0], abs=1e-6)  # 1: shifts of y and of time
+
+    def end(change: float) -> NDArray[Any]:
+        again = stepper.integrate(orbit.q, orbit.p + change * np.eye(3)[2], h=orbit.period / 150, steps=150)
+        return np.concatenate([again.q[-1], again.p[-1]])
+
+    difference = (8 * (end(1e-9) - end(-1e-9)) - (end(2e-9) - end(-2e-9))) / 12e-9
+    assert orbit.monodromy[:, 5] == pytest.approx(difference, rel=1e-6, abs=1e-9)
 
 
 @pytest.mark.parametrize("height", [0.0, 1e-18, -1e-18, -1e-14])

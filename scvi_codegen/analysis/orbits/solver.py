@@ -227,7 +227,7 @@ def periodic_orbit(
     fixed_period: bool = False,
     energy: float | None = None,
     fixed: Sequence[str] = (),
-    gain: ArrayLike | None = None,
+    gain: ArrayLike | Sequence[float | None] | None = None,
     t: float = 0.0,
     parameters: Parameters = None,
     options: SolverOptions | None = None,
@@ -257,7 +257,8 @@ def periodic_orbit(
         energy: prescribed energy of the orbit.
         fixed: coordinates and momenta (``"p_x"``) that keep their initial values: an amplitude, or a section such as
             ``["y"]``.
-        gain: (m,) increase of the positions over a period: 2 pi for a rotating angle, by default 0.
+        gain: (m,) increase of the positions over a period: 2 pi for a rotating angle, by default 0, and ``None`` where
+            it is unknown, of a coordinate on which the motion does not depend: the way of a walker.
         t, parameters, options: as of :meth:`Stepper.integrate`.
 
     Returns:
@@ -303,7 +304,7 @@ def periodic_orbit(
         max_step=limits.get("max_step", math.inf),
         fixed_indices=(*map(names.index, dict.fromkeys(fixed)), *([-1] if fixed_period else [])),
         energy=None if energy is None else checked_number(energy, "the energy"),
-        gain=np.zeros(stepper.dimension) if gain is None else stepper._states.vector(gain, "gain"),
+        **_gain(stepper, gain),
         t=t,
         parameters=values,
         options=options,
@@ -315,6 +316,15 @@ def _momenta_at_rest(stepper: Stepper, q: Array, t: float, parameters: Array) ->
     with suppress(StateError):  # undefined of most Hamiltonians
         return stepper.momentum(q, np.zeros_like(q), t, parameters)
     return np.zeros_like(q)
+
+
+def _gain(stepper: Stepper, gain: ArrayLike | Sequence[float | None] | None) -> dict[str, Any]:
+    """Return the increase of the positions over a period, and a mask of those that return up to an unknown increase."""
+    entries: Any = np.zeros(stepper.dimension) if gain is None else gain
+    drifts = np.array([entry is None for entry in np.atleast_1d(np.asarray(entries, dtype=object))])
+    if drifts.any():
+        entries = [0.0 if entry is None else entry for entry in entries]
+    return {"gain": stepper._states.vector(entries, "gain"), "drifts": drifts}
 
 
 def _equal_steps(period: float, steps: int | None, h: float | None) -> StepSequence | None:
@@ -339,6 +349,8 @@ class _OrbitSearch:
         max_step: largest size of adaptive steps.
         fixed_indices: indices of the fixed entries of z, -1 that of the period.
         at_rest: (m,) momenta without velocity at the guess, which are no size of the motion.
+        gain: (m,) increase of the positions over a period.
+        drifts: (m,) mask of positions with another increase, which is unknown.
     """
 
     stepper: Stepper
@@ -350,6 +362,7 @@ class _OrbitSearch:
     fixed_indices: tuple[int, ...]
     energy: float | None
     gain: Array
+    drifts: NDArray[np.bool_]
     t: float
     parameters: Array
     options: SolverOptions | None
@@ -526,7 +539,8 @@ class _OrbitSearch:
         count = len(self._steps)
         plan, steps = Fixed(-period / count), count - count // 2
         q, p = np.split(start, 2)
-        if self._steps.tolerance is None and not any(event.changes for event in self.stepper.events):
+        forward_only = self.stepper.interface.contacts or any(event.changes for event in self.stepper.events)
+        if self._steps.tolerance is None and not forward_only:
             initial = InitialData(q, p, None, self.t, self.parameters, self.options)
             run = self.stepper._started(initial, plan)
             with suppress(EventError, StepFailedError):
@@ -641,13 +655,12 @@ class _OrbitSearch:
         for k, segment in enumerate(segments):
             after = (k + 1) % count
             leaving, outward = self._leaving(segment), self.reduction.outward(*np.split(starts[after], 2))
-            end = segment.states[-1].copy()
-            if after == 0:
-                end[: size // 2] -= self.gain
+            end = segment.states[-1] if after else self._returned(segment.states[-1], starts[0])
             defects[k] = outward @ (self.reduction.aligned(end, starts[after]) - starts[after])
             rows[k, :, k * size : (k + 1) * size] = leaving @ segment.monodromy
             rows[k, :, after * size : (after + 1) * size] -= outward
             rows[k, :, -1] = leaving @ segment.by_period
+        rows[-1, np.flatnonzero(self.drifts)] = 0.0
         error, relative_error = float(np.abs(defects).max()), float(np.abs(defects / self._reduced(sizes)).max())
         monodromy = leaving @ segments[-1].monodromy @ self.reduction.inward(*np.split(starts[-1], 2))
         rows[-1], defects[-1] = left @ rows[-1], left @ defects[-1]
@@ -660,6 +673,11 @@ class _OrbitSearch:
             row[:size] = gradients[0][0]
             partials = np.vstack([partials, row])
         return _ClosingEquations(segments, monodromy, error, relative_error, sizes, residuals, partials, left)
+
+    def _returned(self, end: Array, start: Array) -> Array:
+        """Return the state after a period without the increase of its positions."""
+        q, p = np.split(end, 2)
+        return np.concatenate([np.where(self.drifts, start[: len(q)], q - self.gain), p])
 
     def _leaving(self, segment: _Segment) -> Array:
         """Return the matrix from changes of (q, p) at the end of a segment to the reduced tangent space."""
@@ -695,9 +713,7 @@ class _OrbitSearch:
             states = tangents_along(self.stepper, start, *at)[0]
         except (EventError, StepFailedError):
             return math.inf
-        end = states[-1].copy()
-        end[: len(end) // 2] -= self.gain
-        outward = self.reduction.outward(*np.split(start, 2))
+        end, outward = self._returned(states[-1], start), self.reduction.outward(*np.split(start, 2))
         defects = equations.independent @ outward @ (self.reduction.aligned(end, start) - start)
         change = self._inverse(equations) @ np.append(defects, np.zeros(len(equations.defects) - len(defects)))
         q, p = (float(np.abs(part).max()) for part in np.split(change[:-1], 2))
