@@ -204,7 +204,8 @@ def checked_gauge(system: MechanicalSystem) -> Expr:
 
 def _singular_velocities(system: MechanicalSystem, lagrangian: Expr) -> tuple[tuple[Symbol, ...], Entries] | None:
     """Return :func:`singular_part` of L, with an empty block for velocities that do not occur in it."""
-    if missing := tuple(velocity for velocity in system.velocities if velocity not in lagrangian.free_symbols):
+    occurring = lagrangian.free_symbols
+    if missing := tuple(velocity for velocity in system.velocities if velocity not in occurring):
         return missing, {}
     return singular_part(lagrangian, system.velocities, (*system.coordinates, system.time), system.constants)
 
