@@ -160,6 +160,23 @@ def test_sums_of_high_and_low_words_are_exact(name: str) -> None:
     assert worst[1] < (1e-16 if "composition" in name else 1e-17)  # whose coefficients have 53 bits
 
 
+@pytest.mark.second
+@pytest.mark.parametrize("name", ["svi", "gauss of a Hamiltonian", "svi, coupled"])
+def test_ensemble_states_are_within_a_rounding_of_exact_sums(name: str) -> None:
+    """Low words keep what sums leave: high words alone are off by no more than half a rounding each, however long."""
+    steps, members = 1024, 5
+    shift = np.arange(members)[:, None] / 16
+    begun = Q + shift, P - shift / 4
+    ends = compiled(name).integrate_ensemble(*begun, t=1 / 3, h=H, steps=steps, save_every=64)
+    most_p = float(np.spacing(np.abs(ends.p)).max(axis=0).sum(axis=1).max()) / 2
+    most_q = float((np.spacing(np.abs(ends.q)).max(axis=0) * MASSES).sum(axis=1).max()) / 2
+    for j in range(members):
+        first, begun_at = exact(*begun[1][j]), exact(*(begun[0][j] * MASSES))
+        for k, (q, p) in enumerate(zip(ends.q[:, j], ends.p[:, j], strict=True)):
+            assert abs(exact(*p) - first) <= most_p * 1.01
+            assert abs(exact(*(q * MASSES)) - begun_at - first * 64 * k * Fraction(H)) <= most_q * 1.01
+
+
 @pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("name", ["rattle", "lobatto"])
 def test_constraints_hold_for_the_sum_of_high_and_low_words(name: str) -> None:
