@@ -47,6 +47,29 @@ def test_an_oscillator_stops_at_x0_less_8_d(gap: bool) -> None:
     assert dict(zip(stepper.parameters, gradient.parameters.tolist(), strict=True))["d"] == pytest.approx(-8, abs=1e-10)
 
 
+def test_an_input_releases_a_body_that_sticks_at_rest() -> None:
+    system = sc.LagrangianSystem.from_text(
+        name="pulled",
+        coordinates=["x"],
+        lagrangian="x_dot**2/2 - x**2/2",
+        forces={"x": "F"},
+        inputs=["F"],
+        parameters={"d": 0.13},
+        contacts=[sc.friction("x_dot", limit="d")],
+    )
+    stepper = sc.compile_stepper(system, "svi:3")
+
+    def run(d: float) -> Any:
+        force = ([0, 5, 11, 20], [0, 0.3, -0.2, 0.1])
+        return stepper.integrate([1], [0], h=0.1, t_end=18, inputs={"F": force}, parameters={"d": d})
+
+    assert [modes for _, modes in run(0.13).contact_modes] == [("slip",), ("stick",), ("slip",)]
+    seeds = np.zeros((len(run(0.13)), 2, 2))
+    seeds[-1] = np.eye(2)
+    exact = derivative(lambda change: end(run(0.13 + change)), 1e-4)
+    assert run(0.13).pullback(seeds).parameters[0] == pytest.approx(exact, abs=1e-9)
+
+
 @pytest.mark.parametrize("steps", [{"h": 0.1}, {"tolerance": 1e-12}])
 def test_a_falling_rod_sticks_slides_and_turns(steps: dict[str, float]) -> None:
     floor = sc.contact("y - cos(a)", slip="x_dot - cos(a)*a_dot", friction="mu")

@@ -90,6 +90,8 @@ def change_at(
         return changed
 
     changes = [with_restitution(elastic) for elastic in (1.0, 0.0)]  # 0 where it would create energy
+    if event.kind != "closes":
+        return changes[0]
     roots = roots_of_masses(stepper, q, t, modes[0])
     differences = (
         *(change(q, p, t, modes[0])[len(q) :] - after[len(q) :] for change in changes),
