@@ -118,7 +118,7 @@ def compile_stepper(
         raise MethodError(f"unknown sums {sums!r}: use {' or '.join(map(repr, SUMS))}")
     if kinks not in KINKS:
         raise MethodError(f"unknown kinks {kinks!r}: use {' or '.join(map(repr, KINKS))}")
-    others = {"solver": solver, "precision": precision, "sizes": sizes, "tables": tables, "controller": controller}
+    others = {"precision": precision, "sizes": sizes, "tables": tables, "controller": controller}
     system, rows = _with_contacts(system, contacts, **others, time_transformation=time_transformation)
     common: dict[str, Any] = {
         "solver": solver,

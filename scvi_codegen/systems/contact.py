@@ -1,13 +1,13 @@
 """Contacts with dry friction: definitions, and the constraints and forces of all their modes.
 
 A contact has a gap g(q, t) >= 0 and a slip w = T(q, t) v + b(q, t). Its mode is open (lambda = 0), stick (g = 0, w = 0)
-or slip in a direction d = +-1 (g = 0, tau = 0); the constraint forces are
+or slip in a direction d = w/|w| (g = 0, tau = 0), +-1 in a plane; the constraint forces are
 
     (G - mu d T)^T lambda + T^T tau,     G = g_q,     lambda >= 0,     |tau| <= mu_s lambda.
 
 Sliding friction is thus a constraint with an oblique force. Friction without a gap has a limit F in place of mu lambda:
 w = 0 with |tau| <= F_s, or the force -F d T^T. The modes are parameters of the compiled step: ``closed``, ``sticks``
-(0 or 1) and ``direction`` (d, or 0) of each contact, all 0 by default.
+(0 or 1) and ``direction`` (d, or 0) of each contact, all 0 by default, in space vectors (``support/run/contacts.h``).
 
 Sources: F. Pfeiffer, Ch. Glocker, *Multibody Dynamics with Unilateral Contacts* (1996); J. J. Moreau, in *Nonsmooth
 Mechanics and Applications*, CISM 302 (1988). That the multipliers of the stages suffice for the order of the step is
@@ -57,7 +57,7 @@ class Contact:
 
     Attributes:
         gap: distance g(q, t) that is >= 0.
-        slip: slip velocity w, linear in the velocities; ``None`` without friction.
+        slip: slip velocity w, linear in the velocities, or its two components in space; ``None`` without friction.
         friction: coefficient mu of sliding, a formula of (q, v, t) and parameters; ``None`` without friction.
         static_friction: coefficient mu_s up to which the contact sticks; ``None``: mu.
         restitution: coefficient e of impacts, v_n+ = -e v_n-.
@@ -67,7 +67,7 @@ class Contact:
     """
 
     gap: Formula
-    slip: Formula | None = None
+    slip: Formula | tuple[Formula, ...] | None = None
     friction: Formula | None = None
     static_friction: Formula | None = None
     restitution: Formula = 0.0
@@ -79,6 +79,7 @@ class Contact:
 
     def __post_init__(self) -> None:
         shown = f"the contact '{self.gap}'"
+        _set_slip(self, shown)
         if (self.slip is None) != (self.friction is None):
             passed, lacking = ("friction", "slip") if self.slip is None else ("slip", "friction")
             raise SystemDefinitionError(
@@ -99,12 +100,12 @@ class Friction:
     """Dry friction without a gap, made by :func:`friction`.
 
     Attributes:
-        slip: slip velocity w, linear in the velocities.
+        slip: slip velocity w, linear in the velocities, or its two components in space.
         limit: friction force F of sliding, a formula of (q, v, t) and parameters.
         static_limit: force up to which it sticks; ``None``: F.
     """
 
-    slip: Formula
+    slip: Formula | tuple[Formula, ...]
     limit: Formula
     static_limit: Formula | None = None
 
@@ -114,14 +115,36 @@ class Friction:
         return _table(self)
 
     def __post_init__(self) -> None:
+        _set_slip(self, f"the friction '{self.slip}'")
         _check_limits(f"the friction '{self.slip}'", ("limit", self.limit), ("static_limit", self.static_limit))
+
+
+def _set_slip(item: Any, shown: str) -> None:
+    """Replace a list of slips by a tuple; raise unless it has two components, of which one alone is no list."""
+    if isinstance(item.slip, list | tuple):
+        if len(item.slip) != 2:
+            raise SystemDefinitionError(
+                f"slip={item.slip!r} of {shown} has {len(item.slip)} components: give one formula in a plane, or two"
+            )
+        object.__setattr__(item, "slip", tuple(item.slip))
+
+
+def slips_of(item: Any) -> tuple[Any, ...]:
+    """Return the components of the slip of a contact."""
+    if item.slip is None:
+        return ()
+    return item.slip if isinstance(item.slip, tuple) else (item.slip,)
 
 
 def _table(item: Any) -> dict[str, Any]:
     """Return the table of a contact: its formulas as text, and its numbers."""
     values = {name: getattr(item, name) for name in item.__dataclass_fields__}
     plain = {
-        name: value if isinstance(value, int | float) else str(value)
+        name: [*map(str, value)]
+        if isinstance(value, tuple)
+        else value
+        if isinstance(value, int | float)
+        else str(value)
         for name, value in values.items()
         if value is not None
     }
@@ -156,35 +179,36 @@ def names_in(item: ContactLike) -> set[str]:
 def contact(
     gap: Formula,
     *,
-    slip: Formula | None = None,
+    slip: Formula | Sequence[Formula] | None = None,
     friction: Formula | None = None,
     static_friction: Formula | None = None,
     restitution: Formula = 0.0,
 ) -> Contact:
-    """Return a unilateral contact of a system in the plane: gap >= 0 with normal force and Coulomb friction.
+    """Return a unilateral contact of a system: gap >= 0 with normal force and Coulomb friction.
 
     The gap must be a distance to first order, ``|g_q| = 1`` in the units of the slip, because friction is mu times the
     normal *force*: of a curve ``z - x**2/2`` divide by ``sqrt(1 + x**2)``.
 
     Args:
         gap: g(q, t), a formula in coordinates, time and parameters.
-        slip: w = T(q, t) v + b(q, t), the velocity of sliding, ``"x_dot - r*a_dot"``.
+        slip: w = T(q, t) v + b(q, t), the velocity of sliding, ``"x_dot - r*a_dot"``; in space its two components in
+            orthonormal directions of the surface, ``["x_dot", "y_dot"]``.
         friction, static_friction: coefficients of sliding and of sticking friction, numbers or formulas.
         restitution: coefficient of impacts, 0 to 1; with 0 the contact closes at once.
 
     >>> contact("y - r", slip="x_dot - r*a_dot", friction=0.3).friction
     0.3
     """
-    return Contact(gap, slip, friction, static_friction, restitution)
+    return Contact(gap, cast(Any, slip), friction, static_friction, restitution)
 
 
-def friction(slip: Formula, *, limit: Formula, static_limit: Formula | None = None) -> Friction:
+def friction(slip: Formula | Sequence[Formula], *, limit: Formula, static_limit: Formula | None = None) -> Friction:
     """Return dry friction without a gap, of joints and belts: sticking up to ``static_limit``, sliding with ``limit``.
 
     >>> friction("x_dot - 0.3", limit="0.25", static_limit="0.4").limit
     '0.25'
     """
-    return Friction(slip, limit, static_limit)
+    return Friction(cast(Any, slip), limit, static_limit)
 
 
 def static_limit(item: Any) -> Any:

@@ -74,8 +74,8 @@ class Event:
         direction: 1 for crossings from negative to positive in the direction of the run, -1 for the opposite, 0 both.
         terminal: ``True`` if the first crossing ends the run, or the number of the crossing that ends it. Simultaneous
             crossings of other events (two walls in a corner) are recorded as well.
-        then: new values of coordinates, and of momenta or velocities, by name: ``{"p_y": "-e*p_y"}``, formulas of the
-            state at the crossing, from which the run continues.
+        then: new values of coordinates, of momenta or velocities, and of parameters, by name: ``{"p_y": "-e*p_y"}``,
+            ``{"gear": 2}``, formulas of the state at the crossing, from which the run continues.
         where: condition of crossings, ``"x > 1"``, or several of them; other crossings are ignored.
         restitution: of a wall g = 0 (:func:`impact`), its coefficient; instead of ``then``.
 
@@ -203,7 +203,8 @@ class Transition(Event):
 
     Attributes:
         contact: number of the contact, from 0.
-        kind: ``"closes"``, ``"lifts"``, ``"stops"``, and of slip that begins ``"forward"`` or ``"backward"``.
+        kind: ``"closes"``, ``"lifts"``, ``"stops"``, and of slip that begins ``"forward"`` or ``"backward"`` in a plane
+            and ``"begins"`` in space.
     """
 
     contact: int = field(kw_only=True)

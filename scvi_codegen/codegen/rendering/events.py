@@ -362,15 +362,17 @@ def _search(interface: Interface, events: tuple[SearchedEvent, ...], *, controll
         kinks=sum(isinstance(event, Kink) for event in events),
         powers=tuple((int(-1 in side), int(1 in side)) for side in sides) if any(sides) else (),
         contacts=tuple(_places(formulas.modes, contact) for contact in interface.contacts),
+        contact_rows=interface.masked,
+        first_contact_row=len(interface.constraints) - interface.masked,
         transitions=tuple((event.contact, event.kind) for event in events if isinstance(event, Transition)),
     )
 
 
 def _places(modes: Sequence[str], contact: ContactRows) -> tuple[int, ...]:
-    """Return the rows of a contact, and its masks among the modes; -1 for what it does not have."""
+    """Return the rows of a contact, the number of slips, and the places of its mode; -1 for what it does not have."""
     rows = (-1 if row is None else row for row in (contact.normal, contact.tangential))
-    masks = (contact.closed, contact.sticks, contact.direction)
-    return *rows, *(-1 if name is None else modes.index(name) for name in masks)
+    masks = (contact.closed, contact.sticks, contact.directions[0] if contact.directions else None)
+    return *rows, contact.slips, *(-1 if name is None else modes.index(name) for name in masks)
 
 
 def _kind_in_time(g: Expr, moving: Iterable[Symbol]) -> int:

@@ -93,7 +93,8 @@ def mode_names(contacts: tuple[ContactRows, ...], parameters: dict[str, Any]) ->
         if contact.closed is not None and not parameters[contact.closed]:
             names.append("open")
         else:
-            names.append("stick" if contact.sticks is not None and parameters[contact.sticks] else "slip")
+            slides = not contact.slips or any(parameters[name] for name in contact.directions)
+            names.append("slip" if slides else "stick")  # or is held by others
     return tuple(names)
 
 
@@ -111,27 +112,41 @@ def contact_modes(states: Any) -> list[tuple[float, tuple[str, ...]]]:
 
 
 def contact_forces(states: Any) -> Array:
-    """Return (n, contacts, 2) normal and tangential forces; at a transition those after it."""
+    """Return (n, contacts, 1 + slips) normal and tangential forces, at a transition those after it."""
     stepper: Any = _with_contacts(states)
-    contacts, first = stepper.interface.contacts, len(stepper.constraints) - stepper.interface.masked
-    forces, k, m = np.zeros((len(states), len(contacts), 2)), stepper.interface.masked, stepper.dimension
-    multipliers = states.multipliers()
-    numbers, binding = np.zeros(k * (3 + k + m) + 3 * len(contacts)), stepper.binding
+    contacts, k = stepper.interface.contacts, stepper.interface.masked
+    first, count = len(stepper.constraints) - k, len(contacts)
+    forces = np.zeros((len(states), count, 1 + max(1, *(contact.slips for contact in contacts))))
+    multipliers = states.multipliers()[:, first:]
+    numbers, binding = np.zeros(k * (3 + k + stepper.dimension) + 3 * count), stepper.binding
     for row, (q, p, t) in enumerate(zip(states.q, states.p, states.t.tolist(), strict=True)):
         parameters = parameters_on_sides(states, t)
-        blocks = [binding.pointer(np.ascontiguousarray(part, float)) for part in (q, p, parameters, parameters)]
-        binding.function("contact_terms")(t, *blocks, binding.pointer(numbers), binding.workspace())
-        friction = numbers[-3 * len(contacts) :: 3]
         named = stepper.parameters_by_name(parameters)
+        blocks = [np.ascontiguousarray(part, float) for part in (q, p, parameters)]
+        imposed = stepper._parameters(named | {name: 1.0 for contact in contacts for name in contact.masks[:2]})
+        pointers = [binding.pointer(part) for part in (*blocks, imposed)]
+        binding.function("contact_terms")(t, *pointers, binding.pointer(numbers), binding.workspace())
+        friction, rates = numbers[-3 * count :: 3], numbers[k : 2 * k]
         for j, contact in enumerate(contacts):
             if contact.normal is not None:
-                forces[row, j, 0] = multipliers[row, first + contact.normal]
-            if contact.sticks is None:
+                forces[row, j, 0] = multipliers[row, contact.normal]
+            if not contact.slips:
                 continue
-            size = 1.0 if contact.normal is None else forces[row, j, 0]
-            sticks = multipliers[row, first + contact.tangential] if named[contact.sticks] else 0.0
-            forces[row, j, 1] = sticks - named[contact.direction] * friction[j] * size
+            rows = slice(contact.tangential, contact.tangential + contact.slips)
+            size = friction[j] * (1.0 if contact.normal is None else forces[row, j, 0])
+            sticks = multipliers[row, rows] * named[contact.sticks]
+            forces[row, j, 1 : 1 + contact.slips] = sticks - size * _direction(contact, named, rates[rows])
     return forces
+
+
+def _direction(contact: ContactRows, named: dict[str, Any], w: Array) -> Array:
+    """Return the direction of a slip w, 0 where it does not slip."""
+    values = np.array([named[name] for name in contact.directions])
+    if contact.slips == 1:
+        return values
+    vector = w @ w * w + values[1:3]
+    length = np.linalg.norm(vector)
+    return np.asarray(values[0] * vector / length) if length else vector
 
 
 def _with_contacts(states: SavedStates) -> Integrator:

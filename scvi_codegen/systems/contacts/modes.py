@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from scvi_codegen.common.errors import SystemDefinitionError
-from scvi_codegen.systems.contact import Contact, ContactLike, Friction, static_limit
+from scvi_codegen.systems.contact import Contact, ContactLike, Friction, slips_of, static_limit
 from scvi_codegen.systems.event import Formula
 
 if TYPE_CHECKING:
@@ -20,26 +20,41 @@ if TYPE_CHECKING:
     from scvi_codegen.systems.lagrangian import LagrangianSystem
 
 
+LEAST_SLIP = 10**200
+"""Inverse fourth power of a slip that is no direction: formulas of a vector that may be 0 are finite."""
+
+
 class ContactRows(NamedTuple):
     """Places of a contact among the masked rows and the parameters of a system; ``None`` for what it does not have.
 
     Attributes:
-        normal, tangential: numbers of its rows among the masked constraints.
-        closed, sticks, direction: names of the parameters of its mode.
+        normal, tangential: numbers of its row of the gap and of the first of its slips among the masked constraints.
+        slips: number of slips: 1 in a plane, 2 in space, 0 without friction.
+        closed, sticks: names of the masks of its mode.
+        directions: of slip: d in a plane; in space whether it slips, and vectors of two components each (contacts.h).
         transitions: kinds and functions of its transitions (:class:`~scvi_codegen.systems.event.Transition`).
     """
 
     normal: int | None
     tangential: int | None
+    slips: int
     closed: str | None
     sticks: str | None
-    direction: str | None
+    directions: tuple[str, ...]
     transitions: tuple[tuple[str, str], ...]
 
     @property
     def masks(self) -> tuple[str, ...]:
         """Names of the parameters of its mode."""
-        return tuple(name for name in (self.closed, self.sticks, self.direction) if name is not None)
+        return *(name for name in (self.closed, self.sticks) if name is not None), *self.directions
+
+
+class Slipping(NamedTuple):
+    """Direction of a slip, the function that vanishes where it stops, and the names of the parameters of both."""
+
+    direction: tuple[Expr, ...]
+    ahead: Expr
+    names: tuple[str, ...]
 
 
 class BoundContacts(NamedTuple):
@@ -96,7 +111,7 @@ class _Binding:
         for number, item in enumerate(contacts, 1):
             if not isinstance(item, Contact | Friction):
                 raise SystemDefinitionError(f"contacts are made by contact(..) and friction(..), not {item!r}")
-            names = {name: self._read(getattr(item, name), name, item) for name in item.__dataclass_fields__}
+            names = {name: self._read_all(getattr(item, name), name, item) for name in item.__dataclass_fields__}
             expressions.append(replace(cast("Any", item), **names))
             rows.append(self._add(number, expressions[-1]))
         system = replace(
@@ -109,6 +124,10 @@ class _Binding:
             contacts=tuple(expressions),
         )
         return BoundContacts(system, tuple(rows))
+
+    def _read_all(self, formulas: Any, role: str, item: ContactLike) -> Any:
+        several = isinstance(formulas, tuple)
+        return tuple(self._read(part, role, item) for part in formulas) if several else self._read(formulas, role, item)
 
     def _read(self, formula: Formula | None, role: str, item: ContactLike) -> Expr | None:
         from scvi_codegen.systems.formulas.grammar import parse_expression
@@ -160,31 +179,57 @@ class _Binding:
         return gradient
 
     def _add(self, number: int, item: Any) -> ContactRows:
-        q, v = self.system.coordinates, self.system.velocities
-        of_gap, slip = isinstance(item, Contact), item.slip
-        along = None if slip is None else self._gradient(item, slip, v, "slip")
+        of_gap = isinstance(item, Contact)
+        slips = slips_of(item)
+        along = [self._gradient(item, slip, self.system.velocities, "slip") for slip in slips]
         closed = self._mask(number, "closed") if of_gap else None
-        sticks = None if slip is None else self._mask(number, "sticks")
-        direction = None if slip is None else self._mask(number, "direction")
+        sticks = self._mask(number, "sticks") if slips else None
+        moving = self._slipping(number, slips) if slips else None
         normal = tangential = None
         transitions: dict[str, Expr] = {}
-        if of_gap:
-            force = self._gradient(item, item.gap, q, "gap")
-            if along is not None:
-                force = [a - item.friction * direction * b for a, b in zip(force, along, strict=True)]
-            normal = self._row(item.gap, cast("Symbol", closed), force)
+        oblique = (
+            [
+                self.sympy.Add(*(d * b for d, b in zip(moving.direction, column, strict=True)))
+                for column in zip(*along, strict=True)
+            ]
+            if moving
+            else [0] * self.system.dimension
+        )
+        if closed is not None:
+            force = self._gradient(item, item.gap, self.system.coordinates, "gap")
+            if moving:
+                force = [a - item.friction * b for a, b in zip(force, oblique, strict=True)]
+            normal = self._row(item.gap, closed, force)
             pushes = closed * self._multiplier(normal) + 1 - closed
             transitions |= {"closes": item.gap + closed, "lifts": pushes}
-        elif along is not None:
-            pairs = zip(self.forces, along, strict=True)
-            self.forces = [force - item.limit * direction * b for force, b in pairs]
-        if along is not None:
-            tangential = self._row(slip, cast("Symbol", sticks), along)
+        else:
+            self.forces = [force - item.limit * b for force, b in zip(self.forces, oblique, strict=True)]
+        if moving and sticks is not None:
+            rows = [self._row(slip, sticks, row) for slip, row in zip(slips, along, strict=True)]
+            tangential = rows[0]
             held = self._multiplier(normal) * static_limit(item) if normal is not None else static_limit(item)
-            tau = self._multiplier(tangential)
-            transitions["stops"] = direction * slip + 1 - cast("Symbol", direction) ** 2
-            transitions["backward"] = sticks * (held - tau) + 1 - sticks  # slip begins against the force
-            transitions["forward"] = sticks * (held + tau) + 1 - sticks
-        closed_name, sticks_name, direction_name = (x and x.name for x in (closed, sticks, direction))
+            transitions["stops"] = moving.ahead
+            tau = [self._multiplier(row) for row in rows]
+            if len(slips) == 1:
+                transitions["backward"] = sticks * (held - tau[0]) + 1 - sticks  # slip begins against the force
+                transitions["forward"] = sticks * (held + tau[0]) + 1 - sticks
+            else:
+                transitions["begins"] = sticks * (held**2 - tau[0] ** 2 - tau[1] ** 2) + 1 - sticks
+        closed_name, sticks_name = (x and x.name for x in (closed, sticks))
+        directions = moving.names if moving else ()
         functions = tuple((kind, self.system.text_of(function)) for kind, function in transitions.items())
-        return ContactRows(normal, tangential, closed_name, sticks_name, direction_name, functions)
+        return ContactRows(normal, tangential, len(slips), closed_name, sticks_name, directions, functions)
+
+    def _slipping(self, number: int, slips: Sequence[Expr]) -> Slipping:
+        """Return the direction of a slip w: a parameter d in a plane, else that of (ahead.w) w + start."""
+        if len(slips) == 1:
+            d = self._mask(number, "direction")
+            return Slipping((d,), d * slips[0] + 1 - d**2, (d.name,))
+        slides, *vectors = (self._mask(number, role) for role in ("slides", "start_1", "start_2", "ahead_1", "ahead_2"))
+        ahead = self.sympy.Add(*(w * a for w, a in zip(slips, vectors[2:], strict=True)))
+        vector = [ahead * w + start for w, start in zip(slips, vectors[:2], strict=True)]
+        length = self.sympy.sqrt(
+            self.sympy.Add(*(x**2 for x in vector)) + 1 - slides + self.sympy.Rational(1, LEAST_SLIP)
+        )
+        names = (slides.name, *(vector.name for vector in vectors))
+        return Slipping(tuple(slides * x / length for x in vector), slides * ahead + 1 - slides, names)

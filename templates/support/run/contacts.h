@@ -12,13 +12,20 @@
  * parts/contacts.c.jinja. */
 enum {
   CONTACTS_AT_ONCE = 6, /* largest number of contacts whose modes are enumerated */
-  CONTACT_OPTIONS = 4, /* open, stick, slip in either direction */
+  CONTACT_OPTIONS = 5, /* open, stick, slip in either direction, held by others */
+  CONTACT_DIRECTIONS = 32, /* of a slip in space, between which one is enclosed */
+  CONTACT_SWEEPS = 50, /* over several slips that begin */
   CONTACT_IMPACTS = 100 /* of a contact in a corner */
 };
 
 #define CONTACT_ROUNDING 1e-10 /* part of their size below which gaps, rates and forces count as 0 */
+#define CONTACT_SLOW 1e-4 /* part of its size below which the direction of a slip in space is kept */
+#define CONTACT_BRAKES 0.25 /* longest part of a step relative to the time to a stop of a slip in space .. */
+#define CONTACT_GROWS 0.3 /* .. and relative to that since its beginning */
 #define CONTACT_PENETRATION 1e-9 /* part of its size by which a gap may be negative at a start */
 #define CONTACT_MISSED 128.0 /* effects of rounding beyond which a negative gap shows a missed transition */
+#define CONTACT_LOWEST 16.0 /* roundings of a gap below which a rebound ends */
+#define CONTACT_TURN 0.866 /* cosine of an angle after which a direction is renewed */
 #define CONTACT_DEPENDENT 1e-12 /* part of a column below which a pivot counts as 0 */
 #define CONTACT_GAIN 1e-9 /* part of the work of an impact by which energy may grow */
 
@@ -31,27 +38,31 @@ enum {
   CONTACT_IN_CORNER
 };
 
-/* A contact without gap is always closed; one without friction does not stick, and has direction 0. */
+/* A contact without gap is always closed; one without friction does not stick, and has direction 0. Slip in space that
+ * begins has a direction to be found, 0 until then. */
 typedef struct {
-  int closed, sticks, direction;
+  int closed, sticks;
+  real direction[2];
 } contact_mode;
 
-static const contact_mode CONTACT_IS_OPEN = {0, 0, 0};
-static const contact_mode CONTACT_STICKS = {1, 1, 0};
-static const contact_mode CONTACT_SLIPS[3] = {{1, 0, -1}, {1, 0, 0}, {1, 0, 1}}; /* by direction + 1 */
+static const real AT_REST[2] = {0.0, 0.0};
+static const contact_mode CONTACT_IS_OPEN = {0, 0, {0.0, 0.0}};
+static const contact_mode CONTACT_STICKS = {1, 1, {0.0, 0.0}};
+static const contact_mode CONTACT_SLIPS[3] = {{1, 0, {-1.0, 0.0}}, {1, 0, {0.0, 0.0}}, {1, 0, {1.0, 0.0}}};
 
 /* Rows at a state: values and rates, second rates b, W and G by rows, coefficients (mu, mu_s, e; limits of friction
- * without gap), and the sizes of the terms of values and rates. */
+ * without gap), the sizes of the terms of values and rates, and the rounding of values. */
 typedef struct {
   real numbers[CONTACT_NUMBERS];
   const real *value, *rate, *second, *W, *G, *coefficient;
-  real size[CONTACT_ROWS], speed[CONTACT_ROWS];
+  real size[CONTACT_ROWS], speed[CONTACT_ROWS], rounding[CONTACT_ROWS];
 } contact_terms;
 
 /* Transitions that end a mode together, and their consequences: contacts that close, slips that stop, directions of
  * slips that begin; contacts with g = g' = 0, and with w = 0. */
 typedef struct {
   int closes[EVENT_CONTACTS], stops[EVENT_CONTACTS], begins[EVENT_CONTACTS];
+  real toward[EVENT_CONTACTS][2]; /* of slips that begin in space, against the friction while it stuck */
   int touches[EVENT_CONTACTS], rests[EVENT_CONTACTS];
 } contact_change;
 
@@ -60,7 +71,12 @@ static int is_transition(int event)
   return event >= FIRST_TRANSITION && event < FIRST_TRANSITION + TRANSITIONS;
 }
 
-/* The present mode of a contact, and its change. */
+static real length_of(const real *x, int count)
+{
+  return count < 2 ? fabs(x[0]) : hypot(x[0], x[1]);
+}
+
+/* Present mode of a contact; without the direction of a slip in space, which is that of its velocity. */
 static contact_mode mode_of(const event_step *step, int k)
 {
   const contact_places *at = CONTACTS + k;
@@ -68,18 +84,27 @@ static contact_mode mode_of(const event_step *step, int k)
   const contact_mode now = {
       at->closed < 0 || mode[at->closed] != 0.0,
       at->sticks >= 0 && mode[at->sticks] != 0.0,
-      at->direction < 0 ? 0 : (int)mode[at->direction],
+      {at->slips == 1 ? mode[at->direction] : 0.0, 0.0},
   };
   return now;
 }
 
-static void put_mode(const contact_places *at, contact_mode mode, real *modes)
+/* Sets the parameters of a mode. In the plane the direction of slip is one, d. In space it is that of (ahead.w) w +
+ * start: smooth where w vanishes and slip stops, beyond which ahead.w < 0, with the direction `ahead` at an earlier
+ * step; the second term keeps the direction of slow slips. */
+static void put_mode(const contact_places *at, contact_mode mode, const real *w, real speed, real *modes)
 {
+  real *const slides = modes + at->direction;
   if (at->closed >= 0)
     modes[at->closed] = mode.closed;
-  if (at->sticks >= 0) {
+  if (at->slips > 0)
     modes[at->sticks] = mode.sticks;
-    modes[at->direction] = mode.direction;
+  if (at->slips == 1)
+    slides[0] = mode.direction[0];
+  for (int i = 0; at->slips == 2 && i < 2; i++) {
+    slides[0] = mode.closed && !mode.sticks;
+    slides[1 + i] = length_of(w, 2) > CONTACT_SLOW * speed ? 0.0 : speed * speed * mode.direction[i];
+    slides[3 + i] = mode.direction[i];
   }
 }
 
@@ -93,10 +118,10 @@ static int terms_at(const event_step *step, const event_sample *at, contact_term
   memcpy(imposed, step->own, BYTES(PARAMETERS));
   memcpy(mode, step->watch->mode, sizeof mode);
   for (int k = 0; k < EVENT_CONTACTS; k++)
-    put_mode(CONTACTS + k, CONTACT_IS_OPEN, mode);
+    put_mode(CONTACTS + k, CONTACT_IS_OPEN, AT_REST, 0.0, mode);
   put_modes(mode, idle);
   for (int k = 0; k < EVENT_CONTACTS; k++)
-    put_mode(CONTACTS + k, CONTACT_STICKS, mode);
+    put_mode(CONTACTS + k, CONTACT_STICKS, AT_REST, 0.0, mode);
   put_modes(mode, imposed);
   status = NAME(contact_terms)(at->t, at->q, at->p, idle, imposed, numbers, step->workspace);
   if (status == OK)
@@ -118,6 +143,7 @@ static int terms_at(const event_step *step, const event_sample *at, contact_term
     /* |G v| <= sqrt(G M^-1 G^T) sqrt(v^T M v), and the change of the rate in a step */
     of->speed[r] = sqrt(fabs(of->W[r * (CONTACT_ROWS + 1)] * power)) + fabs(of->rate[r] - by_velocity) +
         fabs(of->second[r]) * duration;
+    of->rounding[r] = DBL_EPSILON * by_position;
     of->size[r] = by_position + of->speed[r] * duration;
   }
   return status;
@@ -157,40 +183,39 @@ static int eliminate(real (*line)[CONTACT_ROWS + 1], int count)
 static int solve_contacts(const contact_terms *of, const contact_mode *mode, const real *right, real *force,
     real *after)
 {
-  real matrix[CONTACT_ROWS][CONTACT_ROWS + 1], oblique[CONTACT_ROWS] = {0.0};
-  int row[CONTACT_ROWS], along[CONTACT_ROWS], count = 0; /* imposed rows, and the slips of those that slide */
+  real matrix[CONTACT_ROWS][CONTACT_ROWS + 1], column[CONTACT_ROWS][CONTACT_ROWS]; /* forces by unknowns */
+  int row[CONTACT_ROWS], count = 0;
   memset(force, 0, BYTES(CONTACT_ROWS));
+  memset(column, 0, sizeof column);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const contact_places *at = CONTACTS + k;
-    const real slides = at->tangential < 0 ? 0.0 : -of->coefficient[3 * k] * mode[k].direction;
-    if (at->normal < 0)
-      force[at->tangential] = slides;
+    real *const sliding = at->normal < 0 ? force : column[count];
+    for (int i = 0; i < at->slips; i++)
+      sliding[at->tangential + i] = -of->coefficient[3 * k] * mode[k].direction[i];
     if (at->normal >= 0 && mode[k].closed) {
       row[count] = at->normal;
-      along[count] = at->tangential;
-      oblique[count++] = slides;
+      column[count++][at->normal] = 1.0;
     }
-    if (at->tangential >= 0 && mode[k].sticks) {
-      row[count] = at->tangential;
-      along[count++] = -1;
+    for (int i = 0; i < at->slips && mode[k].sticks; i++) {
+      row[count] = at->tangential + i;
+      column[count++][at->tangential + i] = 1.0;
     }
   }
   for (int i = 0; i < count; i++) {
     const real *W = of->W + row[i] * CONTACT_ROWS;
-    real *line = matrix[i];
-    for (int j = 0; j < count; j++)
-      line[j] = W[row[j]] + (along[j] < 0 ? 0.0 : oblique[j] * W[along[j]]);
-    line[count] = -right[row[i]];
-    for (int r = 0; r < CONTACT_ROWS; r++)
-      line[count] -= W[r] * force[r];
+    for (int j = 0; j <= count; j++)
+      matrix[i][j] = j < count ? 0.0 : -right[row[i]];
+    for (int r = 0; r < CONTACT_ROWS; r++) {
+      for (int j = 0; j < count; j++)
+        matrix[i][j] += W[r] * column[j][r];
+      matrix[i][count] -= W[r] * force[r];
+    }
   }
   if (!eliminate(matrix, count))
     return 0;
-  for (int i = 0; i < count; i++) {
-    force[row[i]] += matrix[i][count];
-    if (along[i] >= 0)
-      force[along[i]] += oblique[i] * matrix[i][count];
-  }
+  for (int i = 0; i < count; i++)
+    for (int r = 0; r < CONTACT_ROWS; r++)
+      force[r] += column[i][r] * matrix[i][count];
   for (int r = 0; r < CONTACT_ROWS; r++) {
     after[r] = right[r];
     for (int j = 0; j < CONTACT_ROWS; j++)
@@ -209,7 +234,7 @@ static real friction_limit(const contact_terms *of, int k, int which, const real
 static int options_of(const contact_terms *of, int k, contact_change *now, contact_mode *option)
 {
   const contact_places *at = CONTACTS + k;
-  const int slip = at->tangential;
+  const real *const w = of->rate + at->tangential, speed = at->slips > 0 ? of->speed[at->tangential] : 0.0;
   int count = 0;
   if (at->normal >= 0)
     option[count++] = CONTACT_IS_OPEN;
@@ -217,46 +242,130 @@ static int options_of(const contact_terms *of, int k, contact_change *now, conta
       (of->value[at->normal] > CONTACT_ROUNDING * of->size[at->normal] ||
           of->rate[at->normal] > CONTACT_ROUNDING * of->speed[at->normal]))
     return count;
-  if (slip < 0) {
+  if (at->slips == 0) {
     option[count++] = CONTACT_SLIPS[1];
   } else if (now->begins[k]) {
-    option[count++] = CONTACT_SLIPS[1 + now->begins[k]];
-  } else if (now->rests[k] || fabs(of->rate[slip]) <= CONTACT_ROUNDING * of->speed[slip]) {
+    option[count++] = CONTACT_SLIPS[at->slips == 2 ? 1 : 1 + now->begins[k]];
+  } else if (now->rests[k] || length_of(w, at->slips) <= CONTACT_ROUNDING * speed) {
     now->rests[k] = 1;
     option[count++] = CONTACT_STICKS;
-    option[count++] = CONTACT_SLIPS[2];
-    option[count++] = CONTACT_SLIPS[0];
+    option[count++] = CONTACT_SLIPS[at->slips == 2 ? 1 : 2];
+    if (at->slips == 1) {
+      option[count++] = CONTACT_SLIPS[0];
+      option[count++] = CONTACT_SLIPS[1]; /* held by others, whose rows depend on its own */
+    }
   } else {
-    option[count++] = CONTACT_SLIPS[of->rate[slip] > 0.0 ? 2 : 0];
+    option[count] = CONTACT_SLIPS[1];
+    for (int i = 0; i < at->slips; i++)
+      option[count].direction[i] = w[i] / length_of(w, at->slips);
+    count++;
   }
   return count;
 }
 
-/* Whether modes satisfy the conditions; is_free: contacts that are open by their gap. */
-static int is_consistent(const contact_terms *of, const contact_mode *mode, const int *is_free,
-    const contact_change *now)
+/* Moment d x w' and component d.w' of the rates of a slip in the direction d = (cos angle, sin angle). */
+static int turn_slip(const contact_terms *of, int k, real angle, const real *right, contact_mode *mode, real *moment,
+    real *along)
+{
+  real force[CONTACT_ROWS], after[CONTACT_ROWS], *const d = mode[k].direction;
+  const real *const w = after + CONTACTS[k].tangential;
+  d[0] = cos(angle);
+  d[1] = sin(angle);
+  if (!solve_contacts(of, mode, right, force, after))
+    return 0;
+  *moment = d[0] * w[1] - d[1] * w[0];
+  *along = d[0] * w[0] + d[1] * w[1];
+  return 1;
+}
+
+/* Finds the direction of a slip that begins, that of its own rate: d x w' = 0, d.w' > 0; 0 if there is none. */
+static int find_direction(const contact_terms *of, int k, const real *right, contact_mode *mode)
+{
+  const real turn = 6.283185307179586 / CONTACT_DIRECTIONS;
+  real low, high, along;
+  for (int i = 0; i < CONTACT_DIRECTIONS; i++) {
+    real from = i * turn, to = from + turn;
+    if (!turn_slip(of, k, from, right, mode, &low, &along) || !turn_slip(of, k, to, right, mode, &high, &along))
+      return 0;
+    if ((low > 0.0) == (high > 0.0) || along <= 0.0)
+      continue;
+    for (int bisection = 0; bisection < DBL_MANT_DIG; bisection++) {
+      const real middle = from + 0.5 * (to - from);
+      real moment;
+      if (!turn_slip(of, k, middle, right, mode, &moment, &along))
+        return 0;
+      if ((moment > 0.0) == (low > 0.0))
+        from = middle;
+      else
+        to = middle;
+    }
+    if (along > 0.0)
+      return 1;
+  }
+  return 0;
+}
+
+/* Finds the directions of slips in space that begin; returns 0 if one has none. */
+static int find_directions(const contact_terms *of, const int *begins, const real *right, contact_mode *mode)
+{
+  int count = 0, exists = 1;
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    count += begins[k];
+  for (int sweep = 0; exists && sweep < (count > 1 ? CONTACT_SWEEPS : count); sweep++)
+    for (int k = 0; k < EVENT_CONTACTS; k++)
+      exists &= !begins[k] || find_direction(of, k, right, mode);
+  return exists;
+}
+
+/* Which contacts in space begin to slip in a mode. */
+static void list_beginning(const contact_mode *mode, const int *rests, int *begins)
+{
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    begins[k] = CONTACTS[k].slips == 2 && rests[k] && mode[k].closed && !mode[k].sticks;
+}
+
+/* Whether a contact in a plane rests without friction, since others hold it. */
+static int is_held(const contact_mode *mode, int slips)
+{
+  return slips == 1 && mode->closed && !mode->sticks && mode->direction[0] == 0.0;
+}
+
+/* Whether modes, whose unknown directions are found, satisfy the conditions; is_free: contacts that are open by their
+ * gap. */
+static int is_consistent(const contact_terms *of, contact_mode *mode, const int *is_free, const contact_change *now)
 {
   real force[CONTACT_ROWS], second[CONTACT_ROWS], small = 0.0;
+  int begins[EVENT_CONTACTS];
+  list_beginning(mode, now->rests, begins);
+  if (!find_directions(of, begins, of->second, mode))
+    return 0;
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    if (CONTACTS[k].slips == 2 && now->begins[k] && mode[k].closed && !find_direction(of, k, of->second, mode))
+      memcpy(mode[k].direction, now->toward[k], sizeof now->toward[k]);
   if (!solve_contacts(of, mode, of->second, force, second))
     return 0;
   for (int r = 0; r < CONTACT_ROWS; r++)
     small = fmax(small, CONTACT_ROUNDING * fmax(fabs(of->second[r]), fabs(second[r])));
   for (int k = 0; k < EVENT_CONTACTS; k++) {
-    const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential, d = mode[k].direction;
+    const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential, slips = CONTACTS[k].slips;
+    real begin = 0.0;
     if (is_free[k])
       continue;
     if (normal >= 0 && mode[k].closed && !(force[normal] * of->W[normal * (CONTACT_ROWS + 1)] > small))
       return 0;
     if (normal >= 0 && !mode[k].closed && second[normal] < -small)
       return 0;
-    if (!mode[k].closed || slip < 0)
+    if (!mode[k].closed || slips == 0)
       continue;
     if (mode[k].sticks &&
-        (fabs(force[slip]) - friction_limit(of, k, 1, force)) * of->W[slip * (CONTACT_ROWS + 1)] > small)
+        (length_of(force + slip, slips) - friction_limit(of, k, 1, force)) * of->W[slip * (CONTACT_ROWS + 1)] > small)
       return 0;
-    if (!mode[k].sticks && now->begins[k] && d * second[slip] < -small)
+    for (int i = 0; i < slips; i++)
+      begin += mode[k].direction[i] * second[slip + i];
+    if (!mode[k].sticks && now->begins[k] && begin < -small)
       return 0;
-    if (!mode[k].sticks && now->rests[k] && !(d * second[slip] > small))
+    if (is_held(mode + k, slips) ? fabs(second[slip]) > small
+                                 : !mode[k].sticks && now->rests[k] && !now->begins[k] && !(begin > small))
       return 0;
   }
   return 1;
@@ -276,11 +385,12 @@ static int refuse_modes(const event_step *step, const contact_terms *of, contact
     const int *options)
 {
   for (int k = 0; k < EVENT_CONTACTS; k++)
-    for (int i = 0; i < options[k] && CONTACTS[k].normal >= 0 && CONTACTS[k].tangential >= 0; i++) {
+    for (int i = 0; i < options[k] && CONTACTS[k].normal >= 0; i++) {
       const real *W = of->W + CONTACTS[k].normal * CONTACT_ROWS;
-      const real slides = of->coefficient[3 * k] * option[k][i].direction;
-      const real entry = W[CONTACTS[k].normal] - slides * W[CONTACTS[k].tangential];
-      if (option[k][i].direction && entry <= 0.0)
+      real entry = W[CONTACTS[k].normal];
+      for (int j = 0; j < CONTACTS[k].slips; j++)
+        entry -= of->coefficient[3 * k] * option[k][i].direction[j] * W[CONTACTS[k].tangential + j];
+      if (entry <= 0.0)
         return refuse(step, CONTACT_WITHOUT_MODE, k, entry);
     }
   return refuse(step, CONTACT_WITHOUT_MODE, -1, 0.0);
@@ -292,7 +402,7 @@ static int choose_modes(const event_step *step, const contact_terms *of, contact
 {
   contact_mode option[EVENT_CONTACTS][CONTACT_OPTIONS], mode[EVENT_CONTACTS], best[EVENT_CONTACTS];
   int options[EVENT_CONTACTS], place[EVENT_CONTACTS] = {0}, is_free[EVENT_CONTACTS];
-  int undecided = 0, consistent = 0, least = 1 << 30, more = 1;
+  int undecided = 0, consistent = 0, least = 1 << 30;
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     options[k] = options_of(of, k, now, option[k]);
     undecided += options[k] > 1;
@@ -300,29 +410,36 @@ static int choose_modes(const event_step *step, const contact_terms *of, contact
   }
   if (undecided > CONTACTS_AT_ONCE)
     return refuse(step, CONTACTS_UNDECIDED, undecided - 1, 0.0);
-  while (more) {
-    int weight = 0;
-    for (int k = 0; k < EVENT_CONTACTS; k++) {
-      mode[k] = option[k][place[k]];
-      weight += 2 * !mode[k].sticks - mode[k].closed;
-    }
-    if (is_consistent(of, mode, is_free, now)) {
-      consistent++;
-      if (weight < least)
-        memcpy(best, mode, sizeof best);
-      least = weight < least ? weight : least;
-    }
-    more = 0;
-    for (int k = EVENT_CONTACTS - 1; k >= 0 && !more; k--) { /* the next of all combinations */
-      place[k] = (place[k] + 1) % options[k];
-      more = place[k] > 0;
+  for (int with_held = 0; with_held < 2 && !consistent; with_held++) {
+    for (int more = 1; more;) {
+      int weight = 0, held = 0;
+      for (int k = 0; k < EVENT_CONTACTS; k++) {
+        mode[k] = option[k][place[k]];
+        weight += 2 * !mode[k].sticks - mode[k].closed;
+        held |= options[k] > 1 && is_held(mode + k, CONTACTS[k].slips);
+      }
+      if (held == with_held && is_consistent(of, mode, is_free, now)) {
+        consistent++;
+        if (weight < least)
+          memcpy(best, mode, sizeof best);
+        least = weight < least ? weight : least;
+      }
+      more = 0;
+      for (int k = EVENT_CONTACTS - 1; k >= 0 && !more; k--) { /* the next of all combinations */
+        place[k] = (place[k] + 1) % options[k];
+        more = place[k] > 0;
+      }
     }
   }
   if (!consistent)
     return refuse_modes(step, of, option, options);
   step->watch->ambiguous = consistent > step->watch->ambiguous ? consistent : step->watch->ambiguous;
-  for (int k = 0; k < EVENT_CONTACTS; k++)
-    put_mode(CONTACTS + k, best[k], step->watch->mode);
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const int slip = CONTACTS[k].tangential;
+    const int is_slow = CONTACTS[k].slips > 0 && (now->rests[k] || now->begins[k]);
+    put_mode(CONTACTS + k, best[k], is_slow || slip < 0 ? AT_REST : of->rate + slip, slip < 0 ? 0.0 : of->speed[slip],
+        step->watch->mode);
+  }
   put_modes(step->watch->mode, step->own);
   return OK;
 }
@@ -333,6 +450,7 @@ static int obeys(const contact_terms *of, const contact_mode *mode, const int *t
 {
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential;
+    real along = 0.0;
     if (!takes_part[k])
       continue;
     if (!mode[k].closed && after[normal] < -small)
@@ -340,9 +458,13 @@ static int obeys(const contact_terms *of, const contact_mode *mode, const int *t
     if (mode[k].closed && impulse[normal] * of->W[normal * (CONTACT_ROWS + 1)] < -small)
       return 0;
     if (mode[k].sticks &&
-        (fabs(impulse[slip]) - friction_limit(of, k, 0, impulse)) * of->W[slip * (CONTACT_ROWS + 1)] > small)
+        (length_of(impulse + slip, CONTACTS[k].slips) - friction_limit(of, k, 0, impulse)) *
+                of->W[slip * (CONTACT_ROWS + 1)] >
+            small)
       return 0;
-    if (mode[k].closed && !mode[k].sticks && mode[k].direction * (slip < 0 ? 0.0 : after[slip]) < -small)
+    for (int i = 0; i < CONTACTS[k].slips; i++)
+      along += mode[k].direction[i] * after[slip + i];
+    if (mode[k].closed && !mode[k].sticks && along < -small)
       return 0;
   }
   return 1;
@@ -354,7 +476,8 @@ static int impulses_of(const contact_terms *of, int contact, const int *closed, 
     real *impulse)
 {
   contact_mode option[EVENT_CONTACTS][CONTACT_OPTIONS], mode[EVENT_CONTACTS];
-  int options[EVENT_CONTACTS], place[EVENT_CONTACTS] = {0}, takes_part[EVENT_CONTACTS], more = 1;
+  int options[EVENT_CONTACTS], place[EVENT_CONTACTS] = {0}, takes_part[EVENT_CONTACTS], begins[EVENT_CONTACTS];
+  int more = 1;
   real right[CONTACT_ROWS], after[CONTACT_ROWS], small = 0.0;
   memcpy(right, rate, sizeof right);
   right[CONTACTS[contact].normal] *= 1.0 + restitution;
@@ -365,10 +488,11 @@ static int impulses_of(const contact_terms *of, int contact, const int *closed, 
     takes_part[k] = CONTACTS[k].normal >= 0 && (k == contact || closed[k]);
     if (k != contact)
       option[k][count++] = CONTACT_IS_OPEN;
-    if (takes_part[k] && CONTACTS[k].tangential >= 0) {
+    if (takes_part[k] && CONTACTS[k].slips > 0) {
       option[k][count++] = CONTACT_STICKS;
-      option[k][count++] = CONTACT_SLIPS[2];
-      option[k][count++] = CONTACT_SLIPS[0];
+      option[k][count++] = CONTACT_SLIPS[CONTACTS[k].slips == 2 ? 1 : 2];
+      if (CONTACTS[k].slips == 1)
+        option[k][count++] = CONTACT_SLIPS[0];
     } else if (takes_part[k]) {
       option[k][count++] = CONTACT_SLIPS[1];
     }
@@ -377,7 +501,9 @@ static int impulses_of(const contact_terms *of, int contact, const int *closed, 
   while (more) {
     for (int k = 0; k < EVENT_CONTACTS; k++)
       mode[k] = option[k][place[k]];
-    if (solve_contacts(of, mode, right, impulse, after) && obeys(of, mode, takes_part, impulse, after, small))
+    list_beginning(mode, takes_part, begins);
+    if (find_directions(of, begins, right, mode) && solve_contacts(of, mode, right, impulse, after) &&
+        obeys(of, mode, takes_part, impulse, after, small))
       return 1;
     more = 0;
     for (int k = EVENT_CONTACTS - 1; k >= 0 && !more; k--) {
@@ -429,6 +555,12 @@ static real gain_of(const contact_terms *of, const real *impulse)
   return size != 0.0 ? gain / fabs(size) : 0.0;
 }
 
+/* Whether the height w^2 / (2 g'') of a rebound is of the size of rounding. */
+static int is_low(const contact_terms *of, int row)
+{
+  return of->rate[row] * of->rate[row] <= -2.0 * of->second[row] * CONTACT_LOWEST * of->rounding[row];
+}
+
 /* Impulses of all contacts that meet at a state, and which contacts touch and rest afterwards; restitution is 0 where
  * Newton's law would create kinetic energy. */
 static int collide(const event_step *step, event_sample *at, contact_terms *of, const int *closed, contact_change *now)
@@ -452,34 +584,63 @@ static int collide(const event_step *step, event_sample *at, contact_terms *of, 
   if (status == OK)
     status = terms_at(step, at, of);
   for (int k = 0; status == OK && k < EVENT_CONTACTS; k++) {
-    const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential;
+    const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential, slips = CONTACTS[k].slips;
+    if (slips > 0)
+      now->rests[k] = !now->begins[k] && length_of(of->rate + slip, slips) <= CONTACT_ROUNDING * before.speed[slip];
     if (normal < 0 || !(approaches[k] || closed[k]))
       continue;
     if (impulse[normal] > 0.0 && (closed[k] || is_plastic || before.coefficient[3 * k + 2] == 0.0))
       now->touches[k] = 1;
-    if (slip >= 0 && fabs(of->rate[slip]) <= CONTACT_ROUNDING * before.speed[slip])
-      now->rests[k] = 1;
     if (of->rate[normal] > CONTACT_ROUNDING * before.speed[normal])
       now->touches[k] = 0;
-    if (approaches[k] && step->watch->accumulates[k])
+    if (approaches[k] && (step->watch->accumulates[k] || is_low(of, normal)))
       now->touches[k] = 1;
     step->watch->accumulates[k] = 0;
   }
   return status;
 }
 
+/* Whether a slip that vanishes along its former direction stops: in space it may pass near 0. */
+static int stops_at(const event_step *step, const contact_terms *of, int k)
+{
+  const real speed = fmax(step->watch->fastest[k], of->speed[CONTACTS[k].tangential]);
+  return CONTACTS[k].slips == 1 || length_of(of->rate + CONTACTS[k].tangential, 2) <= CONTACT_SLOW * speed;
+}
+
+/* Directions of slips in space that begin, against the forces while they stuck. */
+static void find_toward(const event_step *step, const contact_terms *of, contact_change *now)
+{
+  contact_mode mode[EVENT_CONTACTS];
+  real force[CONTACT_ROWS], second[CONTACT_ROWS];
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    mode[k] = mode_of(step, k);
+    for (int i = 0; i < 2 && CONTACTS[k].slips == 2 && mode[k].closed && !mode[k].sticks; i++)
+      mode[k].direction[i] = of->rate[CONTACTS[k].tangential + i] / length_of(of->rate + CONTACTS[k].tangential, 2);
+  }
+  if (!solve_contacts(of, mode, of->second, force, second))
+    return;
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const real *const tau = force + CONTACTS[k].tangential;
+    for (int i = 0; i < CONTACTS[k].slips; i++)
+      now->toward[k][i] = -tau[i] / length_of(tau, CONTACTS[k].slips);
+  }
+}
+
 /* Impacts and new modes at a state, which is projected onto their constraints. */
 static int change_modes(const event_step *step, event_sample *at, contact_change *now)
 {
   contact_terms of;
-  int closed[EVENT_CONTACTS], approach = 0, status = terms_at(step, at, &of);
+  int closed[EVENT_CONTACTS], approach = 0, slips = 0, status = terms_at(step, at, &of);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const contact_mode mode = mode_of(step, k);
     closed[k] = CONTACTS[k].normal >= 0 && mode.closed;
     now->touches[k] |= closed[k];
-    now->rests[k] = (now->stops[k] || mode.sticks) && !now->begins[k];
+    now->rests[k] = (mode.sticks || (now->stops[k] && stops_at(step, &of, k))) && !now->begins[k];
+    slips |= now->begins[k] && CONTACTS[k].slips == 2;
     approach |= now->closes[k] && of.rate[CONTACTS[k].normal] < 0.0;
   }
+  if (status == OK && slips)
+    find_toward(step, &of, now);
   if (status == OK && approach)
     status = collide(step, at, &of, closed, now);
   if (status == OK)
@@ -499,7 +660,8 @@ static int change_contacts(const event_step *step, long long first, event_sample
       const int k = transition[0];
       now.closes[k] |= transition[1] == CONTACT_CLOSES;
       now.stops[k] |= transition[1] == CONTACT_STOPS;
-      now.begins[k] += (transition[1] == CONTACT_FORWARD) - (transition[1] == CONTACT_BACKWARD);
+      now.begins[k] += (transition[1] == CONTACT_FORWARD || transition[1] == CONTACT_BEGINS) -
+          (transition[1] == CONTACT_BACKWARD);
     }
   for (long long i = first; i < *step->filled; i++) /* forces may jump at kinks, momenta at events */
     changed |= step->watch->acts[step->found[i].function];
@@ -514,7 +676,7 @@ static int begin_contacts(const event_step *step, event_sample *at)
   int status;
   memset(&now, 0, sizeof now);
   for (int k = 0; k < EVENT_CONTACTS; k++)
-    put_mode(CONTACTS + k, CONTACT_IS_OPEN, step->watch->mode);
+    put_mode(CONTACTS + k, CONTACT_IS_OPEN, AT_REST, 0.0, step->watch->mode);
   put_modes(step->watch->mode, step->own);
   status = terms_at(step, at, &of);
   for (int k = 0; status == OK && k < EVENT_CONTACTS; k++) {
@@ -531,6 +693,7 @@ static int begin_contacts(const event_step *step, event_sample *at)
 /* Fails if a gap is negative at the end of a step in which no transition was found. */
 static int check_gaps(const event_step *step, const event_sample *right)
 {
+  contact_terms of;
   real value[EVENTS];
   int doubtful = 0, status = evaluate_functions(step, right, value);
   for (int i = 0; i < TRANSITIONS; i++)
@@ -539,9 +702,12 @@ static int check_gaps(const event_step *step, const event_sample *right)
     return status;
   memcpy(values_at(step, 0), value, BYTES(EVENTS));
   status = rounding_of(step, right);
+  if (status == OK)
+    status = terms_at(step, right, &of);
   for (int i = 0; status == OK && i < TRANSITIONS; i++) {
     const int e = EVENT_FIRST[FIRST_TRANSITION + i];
-    const real rounding = CONTACT_MISSED * values_at(step, EVENT_DEGREE + 2)[e] + step->watch->history[e].slack;
+    const real rounding = CONTACT_MISSED * values_at(step, EVENT_DEGREE + 2)[e] + step->watch->history[e].slack +
+        CONTACT_ROUNDING * of.size[CONTACTS[TRANSITION[i][0]].normal];
     if (TRANSITION[i][1] == CONTACT_CLOSES && value[e] < -rounding) {
       step->watch->through = FIRST_TRANSITION + i + 1;
       return NOT_CONVERGED;
@@ -549,3 +715,77 @@ static int check_gaps(const event_step *step, const event_sample *right)
   }
   return status;
 }
+
+#ifdef CONTACTS_IN_SPACE
+/* Adds a change of the modes at a state to the crossings. */
+static int add_change(const event_step *step, int event, const event_sample *at)
+{
+  event_crossing *crossing = step->found + *step->filled;
+  if (*step->filled == step->room || !place_crossing(step->watch, crossing, step->room))
+    return EVENT_NO_ROOM;
+  crossing->t = at->t;
+  crossing->function = event;
+  crossing->direction = 0;
+  crossing->element = 0;
+  crossing->acted = 1;
+  crossing->before = step->watch->history[EVENT_FIRST[event]];
+  memcpy(crossing->mode, step->watch->mode, BYTES(EVENT_MODES));
+  copy_state(crossing->q, crossing->p, at->q, at->p);
+  ++*step->filled;
+  return OK;
+}
+
+/* Slips in space at the beginning of a part of a step. Solutions are not smooth where they stop, and steps do not
+ * resolve where they begin: the direction of slow ones is kept, and steps are in proportion to |w|/|w'|, at most
+ * *longest. The direction `ahead` of others is renewed after a turn. */
+static int follow_slips(const event_step *step, const event_sample *at, real *longest)
+{
+  contact_terms of;
+  contact_mode mode[EVENT_CONTACTS];
+  real force[CONTACT_ROWS], second[CONTACT_ROWS];
+  int slips = 0, status;
+  *longest = INFINITY;
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    slips |= CONTACTS[k].slips == 2 && step->watch->mode[CONTACTS[k].direction] != 0.0;
+  status = slips ? terms_at(step, at, &of) : OK;
+  if (!slips || status != OK)
+    return status;
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    mode[k] = mode_of(step, k);
+    for (int i = 0; i < 2 && CONTACTS[k].slips == 2 && mode[k].closed && !mode[k].sticks; i++)
+      mode[k].direction[i] = step->watch->mode[CONTACTS[k].direction + 3 + i];
+  }
+  if (!solve_contacts(&of, mode, of.second, force, second))
+    return OK;
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const int slip = CONTACTS[k].tangential;
+    real *const start = step->watch->mode + CONTACTS[k].direction + 1, *const ahead = start + 2;
+    const real *const w = of.rate + slip, size = CONTACTS[k].slips == 2 ? length_of(w, 2) : 0.0;
+    if (CONTACTS[k].slips < 2 || start[-1] == 0.0)
+      continue;
+    const int is_kept = length_of(start, 2) > size * size;
+    const real rate = (is_kept ? ahead[0] * second[slip] + ahead[1] * second[slip + 1]
+                               : (w[0] * second[slip] + w[1] * second[slip + 1]) / size);
+    real *const fastest = step->watch->fastest + k;
+    *fastest = fmax(*fastest, fmax(size, of.speed[slip]));
+    const real slow = CONTACT_SLOW * *fastest;
+    const int is_slow = rate < 0.0 && size <= slow, is_released = is_kept && size > slow;
+    if (is_kept && !is_released)
+      *longest = fmin(*longest, rate > 0.0 ? 2.0 * slow / rate : INFINITY);
+    else if (!is_slow)
+      *longest = fmin(*longest, (rate < 0.0 ? CONTACT_BRAKES : CONTACT_GROWS) * size / fabs(rate));
+    const int turns = ahead[0] * w[0] + ahead[1] * w[1] < CONTACT_TURN * size;
+    if (is_kept ? !is_released : !(is_slow || turns))
+      continue;
+    status = add_change(step, FIRST_TRANSITION, at);
+    if (status != OK)
+      return status;
+    for (int i = 0; i < 2; i++) {
+      ahead[i] = w[i] / size;
+      start[i] = is_slow ? *fastest * *fastest * ahead[i] : 0.0;
+    }
+  }
+  put_modes(step->watch->mode, step->own);
+  return status;
+}
+#endif

@@ -269,6 +269,32 @@ static void set_run(event_run *run, real t, const event_sample *at)
   run->guess = 0;
 }
 
+/* State after a part of a step. */
+static int step_from_left(const event_step *step, const event_sample *left, real part, event_sample *right)
+{
+  solver_report own;
+  return NAME(step)(left->t, part, left->q, left->p, step->parameters, step->options, right->q, right->p, &own,
+      step->workspace);
+}
+
+#ifdef CONTACTS_IN_SPACE
+/* Cuts a part of a fixed step to one that resolves slips in space; the first part was taken by the run. */
+static int shorten_part(const event_step *step, const event_sample *left, event_sample *right, real end, int changes,
+    real *part)
+{
+  const real whole = *part;
+  real longest;
+  int status = follow_slips(step, left, &longest);
+  if (longest < fabs(whole))
+    *part = copysign(longest, whole);
+  if (status == OK && (*part != whole || changes > 0)) {
+    status = step_from_left(step, left, *part, right);
+    right->t = *part == whole ? end : left->t + *part;
+  }
+  return status;
+}
+#endif
+
 /* Searches a step of a run that was at `before`, changes the state at crossings and continues the step. */
 static int change_in_step(const event_run *before, event_run *run, event_step *step, int adaptive, real length,
     int iterations, const stored_states *to)
@@ -285,17 +311,25 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
   if (status == OK && before->step == 0)
     status = check_walls(step, NULL, &left);
   for (int changes = 0; status == OK; changes++) {
+    event_sample at = {.q = states + 4 * M, .p = states + 5 * M};
+    real part = length;
+    int acts = 0, far = 0, ends, cut = 0;
+#ifdef CONTACTS_IN_SPACE
+    if (!adaptive)
+      status = shorten_part(step, &left, &right, run->t, changes, &part);
+    cut = part != length;
+    if (status == OK && cut)
+      status = evaluate_functions(step, &left, values_at(step, 0));
+#endif
+    const real span = part;
     const long long first = *step->filled;
     long long group = first;
-    event_sample at = {.q = states + 4 * M, .p = states + 5 * M};
-    solver_report own;
-    real part = length;
-    int acts = 0, far = 0, ends;
     step->t = left.t;
-    step->h = length;
+    step->h = span;
     step->q = left.q;
     step->p = left.p;
-    status = evaluate_functions(step, &right, values_at(step, EVENT_DEGREE));
+    if (status == OK)
+      status = evaluate_functions(step, &right, values_at(step, EVENT_DEGREE));
 #ifdef EVENT_KINKS
     far = status == OK && kinks_are_far(step, &left, &right);
 #endif
@@ -326,7 +360,11 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
       status = refine_crossing(step, group, &at, &part);
     }
     step->watch->time += part;
-    if (!acts && !step->watch->ended) {
+    cut &= !acts && !step->watch->ended;
+    if (cut) {
+      at.t = right.t;
+      copy_state(at.q, at.p, right.q, right.p);
+    } else if (!acts && !step->watch->ended) {
       step->watch->started = 1;
       if (changes > 0)
         set_run(run, run->t, &right);
@@ -345,15 +383,15 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
       status = rounding_of(step, &left);
       step->rounding_known = 1;
     }
-    if (status == OK)
+    if (status == OK && !cut)
       status = change_at_crossings(step, group, &at);
     length -= part;
 #ifdef EVENT_KINKS
-    if (status == OK)
+    if (status == OK && !cut)
       status = change_sides(step, group, &at);
 #endif
 #ifdef EVENT_CONTACTS
-    if (status == OK)
+    if (status == OK && !cut)
       status = change_contacts(step, group, &at);
 #endif
     ends = fabs(length) <= CHANGE_SAFETY * DBL_EPSILON * fabs(step->whole);
@@ -363,7 +401,7 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
       step->watch->jammed = step->found[group].function + 1;
       status = NOT_CONVERGED;
     }
-    step->watch->started = 0;
+    step->watch->started = cut;
     if (status == OK && (ends || adaptive || step->watch->ended)) {
       if (!ends) {
         copy_run(run, before);
@@ -383,9 +421,10 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
     copy_state(left.q, left.p, at.q, at.p);
     if (status == OK)
       status = evaluate_functions(step, &left, values_at(step, 0));
+#ifndef CONTACTS_IN_SPACE /* which shorten the next part first */
     if (status == OK)
-      status = NAME(step)(left.t, length, left.q, left.p, step->parameters, step->options, right.q, right.p, &own,
-          step->workspace);
+      status = step_from_left(step, &left, length, &right);
+#endif
   }
   return status;
 }
@@ -510,6 +549,12 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
       status = begin_run(run, &step, control ? (t_end - run->t) / CONTACT_STEPS : run->h);
     put_modes(watch->mode, own);
 #endif
+#ifdef CONTACTS_IN_SPACE
+    const event_sample now = {.t = run->t, .q = run->q, .p = run->p};
+    real longest = INFINITY;
+    if (status == OK)
+      status = follow_slips(&step, &now, &longest);
+#endif
     keep_run(&before, run, step.values + (long long)EVENT_VALUES * EVENTS);
 #ifdef EVENT_KINKS
     event_sample start = {.t = run->t, .q = before.q, .p = before.p};
@@ -533,8 +578,22 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
     watch->first = tried ? fabs(size) : INFINITY;
 #endif
 #endif
+#ifdef CONTACTS_IN_SPACE
+    step_control cautious;
+    if (control) {
+      cautious = *control;
+      cautious.max_step = fmin(cautious.max_step, longest);
+    }
+    for (int k = 0; k < EVENT_CONTACTS && !control && longest < fabs(run->h); k++)
+      if (CONTACTS[k].slips == 2) /* its step is replaced by parts: only the time of the run advances */
+        own[MODE_PLACE[CONTACTS[k].direction]] = 0.0;
+    if (status == OK)
+      status = take_step(run, t_end, control ? &cautious : NULL, &step, &size, &count);
+    put_modes(watch->mode, own);
+#else
     if (status == OK)
       status = take_step(run, t_end, control, &step, &size, &count);
+#endif
     if (status == OK)
       status = change_in_step(&before, run, &step, control != NULL, size, count, &to);
     if (status != OK) {
