@@ -49,10 +49,9 @@ class Rows(NamedTuple):
         contacts, k, m = stepper.interface.contacts, stepper.interface.masked, stepper.dimension
         idle, imposed = parameters.copy(), parameters.copy()
         for contact in contacts:
-            for name, value in zip((contact.closed, contact.sticks, contact.direction), (1.0, 1.0, 0.0), strict=True):
-                if name is not None:
-                    place = stepper.parameters.index(name)
-                    idle[place], imposed[place] = 0.0, value
+            for name in contact.masks:
+                place = stepper.parameters.index(name)
+                idle[place], imposed[place] = 0.0, float(name not in contact.directions)
         numbers, binding = np.zeros(k * (3 + k + m) + 3 * len(contacts)), stepper.binding
         blocks = map(binding.pointer, (state[:m], state[m:], idle, imposed, numbers))
         if status := binding.function("contact_terms")(t, *blocks, binding.workspace()):
@@ -116,7 +115,7 @@ def _impulses(
     q, p = np.split(before, 2)
     sizes = np.sqrt(np.abs(np.diag(first.inverse_masses) * (p @ stepper.velocity(q, p, t, parameters))))
     taking_part = [k for k, item in enumerate(contacts) if k == event.contact or (item.closed and named[item.closed])]
-    rows = [row for k in taking_part for row in contacts[k][:2] if row is not None]
+    rows = [row for k in taking_part for row in (contacts[k].normal, contacts[k].tangential) if row is not None]
     total = np.zeros(len(first.rate))
     total[rows] = np.linalg.lstsq(first.inverse_masses[np.ix_(rows, rows)], (last.rate - first.rate)[rows])[0]
     impulses: list[Impulse] = []
