@@ -13,6 +13,7 @@ from scipy.integrate import quad, solve_ivp
 from scipy.optimize import brentq
 
 import scvi_codegen as sc
+from scvi_codegen.runs.results.energy import energy_account
 from scvi_codegen.systems.constraints.kind import Reaction
 from scvi_codegen.systems.formulas.symbols import symbol
 
@@ -231,6 +232,17 @@ def test_a_bouncing_ball_comes_to_rest(floor: float) -> None:
     assert run.contact_modes[1][0] == pytest.approx(np.sqrt(2 / 9.81) * 1.7 / 0.3, abs=1e-7 + 1e-7 * floor)
     assert abs(run.q[-1, 0] - floor) < 1e-60 + 1e-15 * floor
     assert run.contact_forces()[-1, 0, 0] == pytest.approx(9.81)
+
+
+@pytest.mark.parametrize("steps", [{"h": 0.02}, {}])
+@pytest.mark.parametrize("height", [0, 0.5])
+def test_a_bouncing_ball_comes_to_rest_on_a_floor_that_moves(steps: dict[str, float], height: float) -> None:
+    contacts = [sc.contact(f"y - {height} - 0.02*sin(3*t)", restitution=0.5)]
+    run = of("y_dot**2/2 - g*y", "y", contacts, "svi:2", g=9.81).integrate([1], velocity=[0], t_end=6, **steps)
+    assert [modes for _, modes in run.contact_modes] == [("open",), ("slip",)]
+    assert run.q[-1, 0] == pytest.approx(height + 0.02 * np.sin(18), abs=1e-15)
+    assert run.contact_forces()[-1, 0, 0] == pytest.approx(9.81 - 0.18 * np.sin(18), abs=1e-12)
+    assert not energy_account(run).is_error
 
 
 @pytest.mark.parametrize(("tangent", "consistent"), [(0.30, True), (0.31, False), (0.81, False), (0.83, True)])

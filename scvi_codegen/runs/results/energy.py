@@ -18,7 +18,9 @@ MOST_BALANCED_STEPS, MOST_BALANCED_COORDINATES = 10_000, 12
 
 def energy_reason(stepper: Any) -> str | None:
     """Return why the energy of a motion changes, so that its change is no error; ``None`` if it is conserved."""
-    reason: str | None = "events change the state" if stepper.changes_states else stepper.interface.changes_energy
+    if stepper.changes_states or stepper.interface.contacts:
+        return "contacts do work" if stepper.interface.contacts else "events change the state"
+    reason: str | None = stepper.interface.changes_energy
     return reason
 
 

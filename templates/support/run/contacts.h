@@ -143,7 +143,7 @@ static int terms_at(const event_step *step, const event_sample *at, contact_term
     /* |G v| <= sqrt(G M^-1 G^T) sqrt(v^T M v), and the change of the rate in a step */
     of->speed[r] = sqrt(fabs(of->W[r * (CONTACT_ROWS + 1)] * power)) + fabs(of->rate[r] - by_velocity) +
         fabs(of->second[r]) * duration;
-    of->rounding[r] = DBL_EPSILON * by_position;
+    of->rounding[r] = DBL_EPSILON * (by_position + fabs(at->t * (of->rate[r] - by_velocity)));
     of->size[r] = by_position + of->speed[r] * duration;
   }
   return status;
@@ -555,10 +555,15 @@ static real gain_of(const contact_terms *of, const real *impulse)
   return size != 0.0 ? gain / fabs(size) : 0.0;
 }
 
-/* Whether the height w^2 / (2 g'') of a rebound is of the size of rounding. */
-static int is_low(const contact_terms *of, int row)
+/* Whether the height w^2 / (2 g'') of a rebound is of the size of rounding, or of the residual of the located zero. */
+static int is_low(const event_step *step, const contact_terms *of, int k)
 {
-  return of->rate[row] * of->rate[row] <= -2.0 * of->second[row] * CONTACT_LOWEST * of->rounding[row];
+  const int row = CONTACTS[k].normal;
+  real lowest = CONTACT_LOWEST * of->rounding[row];
+  for (int i = 0; i < TRANSITIONS; i++)
+    if (TRANSITION[i][0] == k && TRANSITION[i][1] == CONTACT_CLOSES)
+      lowest += 4.0 * step->watch->history[EVENT_FIRST[FIRST_TRANSITION + i]].slack;
+  return of->rate[row] * of->rate[row] <= -2.0 * of->second[row] * lowest;
 }
 
 /* Impulses of all contacts that meet at a state, and which contacts touch and rest afterwards; restitution is 0 where
@@ -593,7 +598,7 @@ static int collide(const event_step *step, event_sample *at, contact_terms *of, 
       now->touches[k] = 1;
     if (of->rate[normal] > CONTACT_ROUNDING * before.speed[normal])
       now->touches[k] = 0;
-    if (approaches[k] && (step->watch->accumulates[k] || is_low(of, normal)))
+    if (approaches[k] && (step->watch->accumulates[k] || is_low(step, of, k)))
       now->touches[k] = 1;
     step->watch->accumulates[k] = 0;
   }
