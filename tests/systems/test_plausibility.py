@@ -9,8 +9,8 @@ import scvi_codegen as sc
 from scvi_codegen.interfaces.models.model_files.model_file import parse_model
 
 UNUSED = (
-    "does not occur in the {}, the forces and the constraints of 'system': remove it, unless events, contacts or a time "
-    "transformation, which are not known here, contain it."
+    "does not occur in the {}, the forces and the constraints of 'system': remove it, unless events, contacts or a "
+    "time transformation, which are not known here, contain it."
 )
 x, v, k, m, z = sympy.symbols("x x_dot k m z")
 
