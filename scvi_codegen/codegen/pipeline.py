@@ -78,6 +78,7 @@ from scvi_codegen.methods.discretise import discretise, discretised_form
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import tables_in_two_words
 from scvi_codegen.systems.arrays.symmetry import momentum_maps
+from scvi_codegen.systems.contacts.modes import ContactRows, bound_contacts
 from scvi_codegen.systems.derived_expressions import forms_of
 from scvi_codegen.systems.derived_systems import with_tangent_vectors
 from scvi_codegen.systems.event import EventLike, Kink, as_events
@@ -584,10 +585,12 @@ def generate_source(
     controlled: bool = False,
     time_transformation: str | Expr | None = None,
     controller: str | None = None,
+    kinks: Kinks = "as formulas",
 ) -> tuple[Source, Interface]:
     """Return the C source of an integrator and its interface; other arguments as of :func:`compile_stepper`.
 
-    The source has support headers beside it; ``source.single_file()`` includes them.
+    The source has support headers beside it; ``source.single_file()`` includes them. Located kinks and contacts are
+    those of ``_advance_with_changes``.
 
     Args:
         embedded: precision, ``"double"`` or ``"single"``, of source for a microcontroller. Its solver is explicit or
@@ -601,19 +604,29 @@ def generate_source(
             events are combined with ``embedded="single"``.
     """
     method = as_method(method, system)
-    system = discretised_form(system, method)
-    searched = as_events(events)
+    rows: tuple[ContactRows, ...] = ()
+    if system.has_contacts:
+        system, rows = bound_contacts(system, system.contacts)
+    form = discretised_form(system, method)
+    system, located = located_kinks(form) if kinks == "located" else (form, ())
     if embedded not in (None, *EMBEDDED):
         raise MethodError(f"embedded must be {' or '.join(EMBEDDED)}, not {embedded!r}")
     if embedded and solver == "fixed-point":
         raise MethodError("solver='fixed-point' is unavailable with embedded: use 'newton' or 'explicit'")
-    if embedded == "single" and searched:
+    if embedded == "single" and (rows or as_events(events)):
         raise MethodError("events require double precision, in which they are located: use embedded='double'")
-    program = program_of(system, method, solver=solver, prefix=prefix, symmetries=symmetries, lanes=embedded is None)
+    program = program_of(
+        system, method, solver=solver, prefix=prefix, symmetries=symmetries, lanes=embedded is None, without_modes=form
+    )
     g = time_transformation
     of_steps = controller_named(controller, in_tau=g is not None)
     control = control_of(program, of_steps, system, g) if controlled or g is not None else None
     source = render_embedded(program, embedded, control) if embedded else render(program, control)
-    interface = describe(program, system, method, g=g)
+    interface = replace(describe(program, system, method, g=g), contacts=rows)
+    if located:
+        interface = replace(
+            interface, kinks=form.kinks, modes=tuple((kink.mode, str(kink.function)) for kink in located)
+        )
+    searched = interface.searched(as_events(events))
     complete = with_events(source, interface, searched) if searched else source
     return (complete.single_file() if embedded else complete), interface

@@ -114,6 +114,7 @@ ARGUMENTS = {
     "tables": [["bonds[B, 2]"], ["bonds[B, 3]"]],
     "neighbours": [{"near": {"of": "q", "cutoff": 1.0}}],
     "contacts": [[{"gap": "q"}]],
+    "functions": [{"F": sc.Table([0, 1], [0, 1])}],
 }
 TEXT = {
     "name": "pair",
@@ -133,13 +134,16 @@ TEXT = {
     "tables": [],
     "neighbours": None,
     "contacts": (),
+    "functions": None,
 }
 
 
 def test_every_argument_of_from_text_changes_the_key_of_the_text():
     assert ARGUMENTS.keys() == TEXT.keys() == inspect.signature(sc.LagrangianSystem.from_text).parameters.keys()
     changed = [TEXT | {name: value} for name, values in ARGUMENTS.items() for value in values]
-    texts = [_text_of(sc.LagrangianSystem, each) for each in (TEXT, *changed) if not each["tables"]]
+    texts = [
+        _text_of(sc.LagrangianSystem, each) for each in (TEXT, *changed) if not (each["tables"] or each["functions"])
+    ]
     assert None not in texts
     assert len(set(texts)) == len(texts)
     assert _text_of(sc.HamiltonianSystem, TEXT) not in texts

@@ -35,9 +35,11 @@ class Sines(sc.Trajectory):
 
 def motion(names: str, links: tuple[Any, ...] = ()) -> Any:
     """Return a trajectory whose coordinates are sines of t, and whose momenta are sines of 2 t."""
-    interface = SimpleNamespace(system="S", title="S by M", map_names=("a", "b"), changes_energy=None, rotations=())
+    interface = SimpleNamespace(
+        system="S", title="S by M", map_names=("a", "b"), changes_energy=None, rotations=(), contacts=()
+    )
     interface.coordinates, interface.momenta = (tuple(f"{p}{each}" for each in names.split()) for p in ("", "p_"))
-    interface.arrays = interface.lengths = interface.parameters = interface.constraints = ()
+    interface.arrays = interface.lengths = interface.parameters = interface.constraints = interface.contacts = ()
     interface.layout = SimpleNamespace(links=links, mesh=None, coordinates=())
     q, p = (np.sin(T[:, np.newaxis] * rate + 1.7 * np.arange(len(names.split()))) for rate in (1.0, 2.0))
     sizes: Any = {"step_sizes": np.full(41, 0.05), "h": 0.05, "plan": Fixed(0.05), "iterations": np.zeros(41, np.int32)}

@@ -90,6 +90,18 @@ def test_states_equal_those_of_the_stepper_bitwise(name, tmp_path):
     assert_allclose(np.array(found), expected, rtol=0, atol=0)
 
 
+@pytest.mark.second
+def test_a_slave_locates_kinks_as_runs_do(tmp_path):
+    system = lagrange("floor", "y", "y_dot**2/2 - 9.8*y - 1e4*positive_part(-y)**2")
+    model = sc.Model(system=system, method=sc.SVI(4), q=(1.0,), velocity=(0.0,), h=H, steps=30)
+    one, run = Slave(Fmu(sc.generate_fmu(model, tmp_path / "one.fmu"), tmp_path / "unpacked")), model.integrate()
+    assert one.start(0.0) == OK
+    for k in range(30):
+        assert one.step(k * H, H) == OK, one.log
+    assert len(run.modes.t) > 0
+    assert_allclose(one.get("y", "p_y"), [run.q[-1, 0], run.p[-1, 0]], rtol=0, atol=1e-13)
+
+
 def check_event_mode(fmu, model, run):
     """Steps end at changes of the state, which appear when the discrete states are updated in event mode."""
     assert fmu.description.find("CoSimulation").get("hasEventMode") == "true"

@@ -157,7 +157,7 @@ def test_a_catalogue_reference_may_be_changed():
             "[[events]]\nfunctio = 'q'\n[system]",
             "unknown key 'functio' in [[events]]; did you mean 'function'?",
         ),
-        ("[method]", "[zzz]", "Known: system, field, forces, torques, torques_space, inputs, sizes, "),
+        ("[method]", "[zzz]", "Known: system, field, forces, torques, torques_space, functions, inputs, sizes, "),
         ("lagrangian", "lagrangain", "unknown key 'lagrangain' in [system]; did you mean 'lagrangian'?"),
         ("lagrangian", "forces", "unknown key 'forces' in [system]; there is a section [forces]. Known: name, coord"),
         ("degree", "degre", "unknown key 'degre' in [method] for svi; did you mean 'degree'?"),

@@ -351,4 +351,4 @@ def test_fixed_point_iteration_starts_from_rest(name, method):
 def test_messages_name_the_first_parameters_of_many() -> None:
     names = [f"k{i}" for i in range(8)]
     with pytest.raises(sc.StateError, match=r"must have 8 values \(k0, k1, k2, k3, k4, k5, \.\.\.\), not 1"):
-        parameter_values(SimpleNamespace(parameters=names, defaults=[1.0] * 8, modes=()), [2.0])  # type: ignore[arg-type]
+        parameter_values(SimpleNamespace(parameters=names, defaults=[1.0] * 8, modes=(), contacts=()), [2.0])  # type: ignore[arg-type]

@@ -3,6 +3,7 @@
 import pickle
 from dataclasses import replace
 from functools import cache
+from subprocess import check_output
 from typing import Any, cast
 
 import numpy as np
@@ -410,8 +411,23 @@ def test_contacts_are_part_of_a_system_and_of_its_model_file(tmp_path: Any) -> N
         assert np.array_equal(getattr(run, name), getattr(again, name))
     with pytest.raises(sc.SystemDefinitionError, match="contacts of 'ball' are in its coordinates"):
         sc.change_coordinates(model.system, {"y": "z + r"}, coordinates=["z"])
-    with pytest.raises(sc.MethodError, match="contacts of 'ball' require compile_stepper"):
-        sc.generate_source(model.system, "svi:3")
+
+
+FLOOR = MODEL.partition("[[contacts]]")[0].replace("- m*g*y", "- m*g*y - 1e4*positive_part(r - y)**2")
+
+
+@pytest.mark.parametrize("text", [MODEL, FLOOR + MODEL[MODEL.index("[parameters]") :].replace("mu = 0.3\n", "")])
+def test_generated_programs_and_packages_have_the_modes_of_runs(text: str, tmp_path: Any) -> None:
+    (tmp_path / "ball.toml").write_text(text.replace("q = [0.0, 0.5, 0.0]", "q = [0.0, 0.7, 0.0]"))
+    model = sc.load_model(tmp_path / "ball.toml")
+    run, folder = model.integrate(), sc.generate_package(model, tmp_path / "ball_c")
+    printed = check_output(["make", "-s", "-C", folder, "run", "CFLAGS=-O1 -std=c99"], text=True).splitlines()
+    last = [float(x) for x in [line for line in printed if line[0] != "#"][-1].split()[:7]]
+    package = sc.load_package(folder).integrate(model.q, velocity=[4, 0, 0], h=0.05, t_end=2)
+    assert len(run.modes.t) > 0
+    for made in (run, package):
+        assert np.array_equal(made.modes.values, run.modes.values)
+        assert np.abs(last - np.hstack([made.t[-1], made.q[-1], made.p[-1]])).max() < 1e-12
 
 
 def test_three_contacts_of_a_woodpecker_lead_to_its_cycle() -> None:

@@ -52,7 +52,9 @@ LONGEST, HALVINGS, PART = 1.0, 40, 0.1
 """Largest step tried, number of halvings, and the largest change of the state per step relative to its size."""
 
 
-_compiled = partial(compile_stepper, kinks="as formulas")
+def _compiled(*arguments: Any, **keywords: Any) -> Stepper:
+    """Return a stepper whose kinks are formulas: measured are single steps."""
+    return compile_stepper(*arguments, kinks="as formulas", **keywords)
 
 
 @checks_arguments(system=SYSTEM_OR_ARRAYS, stepper=STEPPER)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,6 +18,7 @@ from scvi_codegen.codegen.rendering.own_names import with_exported_names, with_o
 from scvi_codegen.codegen.rendering.preprocessor import preprocessed
 from scvi_codegen.codegen.rendering.reachable import readable
 from scvi_codegen.systems.contacts.modes import ContactRows
+from scvi_codegen.systems.event import Event, Kink, Transition
 from scvi_codegen.systems.formulas.indices import Access, ArrayDeclarations, ArrayMap, Loop
 from scvi_codegen.version import __version__
 
@@ -54,12 +55,11 @@ def _checked(cls: type, record: Mapping[str, Any]) -> dict[str, Any]:
 
 def _contact_of(row: Sequence[Any]) -> ContactRows:
     """Return the places of a contact from JSON; raise :class:`ValueError` for values of other types."""
-    *places, transitions = row
-    contact = ContactRows._make((*places, _as_tuples(transitions)))
-    numbers, names = contact[:2], contact[2:5]
+    contact = ContactRows._make(_as_tuples(value) for value in row)
     if not (
-        all(number is None or KINDS["int"](number) for number in numbers)
-        and all(map(KINDS["str | None"], names))
+        all(number is None or KINDS["int"](number) for number in (contact.normal, contact.tangential, contact.slips))
+        and all(map(KINDS["str | None"], (contact.closed, contact.sticks)))
+        and KINDS["tuple[str, ...]"](contact.directions)
         and KINDS["tuple[tuple[str, ...], ...]"](contact.transitions)
     ):
         raise ValueError(f"contacts contain {contact!r:.60}: these are not the places of a contact")
@@ -441,6 +441,15 @@ class Interface:
         return tuple(name for contact in self.contacts for name in contact.masks) + tuple(
             name for name, *_ in self.modes
         )
+
+    def searched(self, events: Iterable[Event]) -> tuple[Event, ...]:
+        """Return the events that runs search for: some events, the transitions of contacts, and the kinks."""
+        transitions = (
+            Transition(function, -1, contact=number, kind=kind)
+            for number, contact in enumerate(self.contacts)
+            for kind, function in contact.transitions
+        )
+        return *events, *transitions, *(Kink(function, mode=mode) for mode, function in self.modes)
 
     @property
     def in_tau(self) -> bool:

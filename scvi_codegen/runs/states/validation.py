@@ -201,6 +201,8 @@ def parameter_values(interface: Interface, parameters: Parameters, base: Array |
 
 def _with_modes(interface: Interface, values: Array) -> Array:
     """Return (.., k) parameters in order, with those of the modes of kinks, which may be omitted: they are 0."""
+    if not (interface.modes or interface.contacts):
+        return values
     modes = len(interface.mode_names)
     if modes and values.ndim and values.shape[-1] == len(interface.parameters) - modes:
         return np.concatenate([values, np.zeros((*values.shape[:-1], modes))], axis=-1)

@@ -25,7 +25,7 @@ from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepping.array_binding import ArrayBinding, EventBinding
 from scvi_codegen.runs.stepping.array_interface import RunSizes, check_few_coordinates
 from scvi_codegen.runs.stepping.features import Support, check_features, require
-from scvi_codegen.systems.event import Event, EventLike, Kink, Transition, as_events, modes_of
+from scvi_codegen.systems.event import Event, EventLike, as_events, modes_of
 
 MOST_EVENT_SETS = 16
 """Number of event sets whose compiled integrators are cached, so that repeated calls do not parse formulas again."""
@@ -110,15 +110,7 @@ class CompiledMethod:
     ) -> None:
         self.interface, self.flags, self.events = interface, flags, events
         self.in_tau = interface.in_tau
-        transitions = (
-            Transition(function, -1, contact=number, kind=kind)
-            for number, contact in enumerate(interface.contacts)
-            for kind, function in contact.transitions
-        )
-        kinks = (
-            Kink(function, mode=mode, power_sides=tuple(map(int, sides))) for mode, function, *sides in interface.modes
-        )
-        self.searched: tuple[Event, ...] = (*events, *transitions, *kinks)
+        self.searched = interface.searched(events)
         self.modes = modes_of(events, interface.parameters, interface.mode_names)
         self.changes_states = any(event.changes_state for event in events)
         self.divides_steps = self.changes_states or bool(interface.mode_names)

@@ -542,7 +542,7 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
     const long long kept = report->stored, crossed = *filled;
     event_step step = {0.0, 0.0, 0.0, NULL, NULL, parameters, options, watch, found, room, filled, report, workspace,
         memory, memory + 15 * M, 0, &horizon, own};
-    real size;
+    real size = 0.0;
     int count = 0;
 #ifdef EVENT_MODES
     if (!watch->begun)
@@ -579,16 +579,20 @@ int NAME(advance_with_changes)(event_run *run, event_watch *watch, real t_end, c
 #endif
 #endif
 #ifdef CONTACTS_IN_SPACE
-    step_control cautious;
+    const step_control *limited = control;
+#if EVENTS_CONTROLLED
+    step_control shorter;
     if (control) {
-      cautious = *control;
-      cautious.max_step = fmin(cautious.max_step, longest);
+      shorter = *control;
+      shorter.max_step = fmin(shorter.max_step, longest);
+      limited = &shorter;
     }
+#endif
     for (int k = 0; k < EVENT_CONTACTS && !control && longest < fabs(run->h); k++)
       if (CONTACTS[k].slips == 2) /* its step is replaced by parts: only the time of the run advances */
         own[MODE_PLACE[CONTACTS[k].direction]] = 0.0;
     if (status == OK)
-      status = take_step(run, t_end, control ? &cautious : NULL, &step, &size, &count);
+      status = take_step(run, t_end, limited, &step, &size, &count);
     put_modes(watch->mode, own);
 #else
     if (status == OK)

@@ -87,7 +87,7 @@ def example_of(model: Model, interface: Interface, *, controlled: bool) -> Examp
     return ExampleRun(
         q=model.q,
         p=momenta,
-        parameters=parameters,
+        parameters=(*parameters, *(0.0 for _ in interface.mode_names)),
         t=model.t,
         h=model.h if model.time_transformation is None else None,
         span=model.covered,
@@ -102,7 +102,7 @@ def example_of(model: Model, interface: Interface, *, controlled: bool) -> Examp
         to_end=bool(clock) and model.ends_at_time,
         inputs=inputs,
         end=model.end if inputs else 0.0,
-        events=model.events,
+        events=interface.searched(model.events),
     )
 
 

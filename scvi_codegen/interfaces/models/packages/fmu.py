@@ -228,10 +228,11 @@ def _check(platforms: tuple[str, ...]) -> None:
 def _texts(model: Model, prefix: str) -> tuple[Source, dict[str, bytes]]:
     """Return the source to compile, and the archive's text files by name."""
     events = model.events if any(event.changes_state for event in model.events) else ()
-    settings = [(event.direction, int(event.terminal), int(event.changes_state)) for event in events]
     source, interface = generate_source(
-        model.system, model.method, solver=model.solver, prefix=prefix, events=events or None
+        model.system, model.method, solver=model.solver, prefix=prefix, events=events or None, kinks="located"
     )
+    searched = interface.searched(events)
+    settings = [(event.direction, int(event.terminal), int(event.changes_state)) for event in searched]
     by_velocity = model.velocity is not None
     start = _start(model, interface)
     indices = tuple(interface.parameters.index(f"{name}_{PARTS[0]}") for name in interface.inputs)
@@ -241,7 +242,9 @@ def _texts(model: Model, prefix: str) -> tuple[Source, dict[str, bytes]]:
         source, interface, start, by_velocity=by_velocity, input_indices=indices, token=token, events=settings
     )
     texts = {
-        DESCRIPTION: model_description(interface, start, by_velocity=by_velocity, token=token, has_events=bool(events)),
+        DESCRIPTION: model_description(
+            interface, start, by_velocity=by_velocity, token=token, has_events=bool(searched)
+        ),
         **{f"sources/{name}": text for name, text in source.files.items()},
         "sources/buildDescription.xml": build_description(prefix, [f"{part.prefix}.c" for part in source.sources]),
         **{f"resources/{name}": text for name, text in model_texts(model).items()},

@@ -282,7 +282,7 @@ def load_package(folder: str | os.PathLike[str]) -> Stepper:
         raise
     except (ValueError, KeyError, TypeError) as error:
         raise damaged(target, error) from error
-    variants = Variants({WithEvents(events): source}) if events else None
+    variants = Variants({WithEvents(searched): source}) if (searched := interface.searched(events)) else None
     return Stepper(replace(source, beside=None), interface, events=events, variants=variants)
 
 
@@ -338,6 +338,7 @@ def integrator_of(model: Model, prefix: str, *, embedded: Embedded | None = None
             solver=model.solver,
             prefix=prefix,
             events=model.events,
+            kinks="as formulas" if embedded or model.time_transformation else "located",
             embedded=embedded,
             controlled=not embedded or model.h is None,
             time_transformation=model.time_transformation,
