@@ -27,6 +27,7 @@ OTHERS = {
     "run/tangent_growth.h": "compared with derivatives of single steps in test_chaos_indicators.py",
     "iteration/linear_part.h": "compared with Pade's approximation of linear chains in test_linear_part.py",
     "run/event_times.h": "compared with exact times in test_events_of_time.py",
+    "run/contacts.h": "compared with closed forms in test_contacts.py",
     "run/observation.h": "compared with the states of runs in test_observers.py",
     "frameworks/casadi_flow.h": "interface of CasADi to a compiled step",
     "frameworks/flow.h": "interface of JAX and PyTorch to a compiled step",
