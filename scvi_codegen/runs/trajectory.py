@@ -39,7 +39,7 @@ from scvi_codegen.runs.results.joining import (
     joined_crossings,
     relative_changes,
 )
-from scvi_codegen.runs.results.quantities import quantities
+from scvi_codegen.runs.results.quantities import quantities, quantities_in_modes
 from scvi_codegen.runs.results.recomputation import work_and_impulses_until
 from scvi_codegen.runs.results.saved_states import Array, ModeHistory, checked_row, in_modes
 from scvi_codegen.runs.states.attitude_history import AttitudeHistory
@@ -246,7 +246,15 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
 
     def momentum_errors(self) -> Array:
         """Return (n, k) changes of the momentum maps since the first state, relative to their largest term."""
-        maps = [run.stepper._momentum_maps_and_sizes(run.q, run.p, run.t, run.parameters) for run in self._runs]
+
+        def maps_of(run: Trajectory) -> tuple[Array, Array]:
+            maps_and_sizes = run.stepper._momentum_maps_and_sizes
+            if run.modes is None:
+                return maps_and_sizes(run.q, run.p, run.t, run.parameters)
+            first, second = (in_modes(run, lambda *of, k=k: maps_and_sizes(*of)[k]) for k in range(2))
+            return first, second
+
+        maps = [maps_of(run) for run in self._runs]
         values, sizes = (concatenated(part) for part in zip(*maps, strict=True))
         states = self.q, self.p, self.t, self.parameters
         return relative_changes(values, sizes, lambda _: self.stepper._momentum_bounds(*states))
@@ -346,7 +354,8 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
         if self.pieces:
             for k in columns_of_inputs(interface):
                 del by_name[interface.parameters[k]]
-            by_piece = [quantities(piece.stepper, piece.parameters, piece.t, piece.q, piece.p) for piece in self.pieces]
+        if self.pieces or self.modes is not None:
+            by_piece = [quantities_in_modes(piece) for piece in self._runs]
             whole = {name: concatenated([values[name] for values in by_piece]) for name in by_piece[0]}
             derived = lambda *_: whole  # noqa: E731  (computed once)
         return States(

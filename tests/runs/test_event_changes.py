@@ -963,3 +963,25 @@ def test_backward_runs_invert_impacts_and_apply_changes_as_written():
         returned.append(float(back.q[-1, 0]))
     assert returned[0] == pytest.approx(1.0, abs=1e-12)
     assert abs(returned[1] - 1.0) > 0.1
+
+
+def test_functions_of_parameters_that_events_set(tmp_path):
+    """Energies and dense output of sparse states, ensembles, runs in progress and exports have the set values."""
+    oscillator = sc.LagrangianSystem.from_text("oscillator", ["x"], "x_dot**2/2 - k*x**2/2", parameters={"k": 1.0})
+    stepper = sc.compile_stepper(oscillator, "svi:4", events=[sc.Event("x - 0.2", -1, then={"k": "2*k"})])
+    whole = stepper.integrate([1.0], [0.0], h=0.02, steps=500)
+    assert abs(whole.energy()[-1] - 0.64) < 1e-14  # 1/2 + (0.2)^2 (1 + 2 + 4)/2
+    times = np.linspace(0.0, 10.0, 37)
+    sparse = stepper.integrate([1.0], [0.0], h=0.02, steps=500, save_every=50)
+    np.testing.assert_allclose(sparse.at(times)[0], whole.at(times)[0], atol=1e-14)
+    run = stepper.start([1.0], [0.0], h=0.02)
+    run.advance(500)
+    assert run.energy == whole.energy()[-1]
+    whole.save(tmp_path / "run.csv")
+    assert float((tmp_path / "run.csv").read_text().split(",")[-1]) == whole.energy()[-1]
+    runs = stepper.integrate_ensemble([[1.0], [0.7]], [[0.0], [0.0]], h=0.02, steps=500)
+    assert runs.energy()[-1, 0] == runs[0].energy()[-1] == whole.energy()[-1]
+    np.testing.assert_allclose(runs[0].at(times)[0], whole.at(times)[0], atol=1e-14)
+    recorded = sc.record_run(stepper.start([1.0], [0.0], h=0.02), tmp_path / "run", steps=500)
+    with pytest.raises(sc.MethodError, match="parameters that events set are not stored"):
+        recorded.energy()

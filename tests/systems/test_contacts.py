@@ -494,3 +494,17 @@ def test_a_joint_with_dry_friction_rests_at_its_limit() -> None:
     contacts = [sc.contact("x"), sc.friction("x_dot", limit=0.1)]
     run = of("x_dot**2/2 - x", "x", contacts, "svi:2").integrate([0.5], velocity=[0], h=0.05, t_end=2)
     assert abs(run.q[-1, 0]) < 1e-12
+
+
+def test_recordings_and_ensembles_of_dry_friction(tmp_path: Any) -> None:
+    """Recordings with friction are read again, and trajectories of an ensemble have the modes of single runs."""
+    stepper = of("x_dot**2/2 - x**2/2", "x", [sc.friction("x_dot", limit=0.13)], "svi:3")
+    run = stepper.integrate([1.0], velocity=[0.0], h=0.1, steps=200)
+    recorded = sc.record_run(stepper.start([1.0], velocity=[0.0], h=0.1), tmp_path / "run", steps=200, save_every=10)
+    assert np.array_equal(recorded.q[-1], run.q[-1])
+    member = stepper.integrate_ensemble([[1.0], [0.9]], velocity=[[0.0], [0.0]], h=0.1, steps=200)[0]
+    assert [modes for _, modes in run.contact_modes] == [("slip",), ("stick",)]
+    assert member.contact_modes == run.contact_modes
+    assert np.array_equal(member.contact_forces()[-1], run.contact_forces()[-1])
+    times = np.linspace(0.0, 20.0, 97)
+    assert np.abs(member.at(times)[0] - run.at(times)[0]).max() < 1e-14

@@ -49,7 +49,7 @@ class Run(Memory, AttitudeHistory):
         return run
 
     def __reduce__(self) -> tuple[Any, ...]:
-        parameters = self.stepper.parameters_by_name(self._parameters)
+        parameters = self.stepper.parameters_by_name(self.parameters)
         for name in self._unset_inputs:
             del parameters[f"{name}_0"]
         with self.alone():
@@ -136,24 +136,24 @@ class Run(Memory, AttitudeHistory):
     @property
     def velocity(self) -> Array:
         """(m,) velocities."""
-        return self.stepper.velocity(self.q, self.p, self._times[0], self._parameters)
+        return self.stepper.velocity(self.q, self.p, self._times[0], self._parameters_in_modes)
 
     @property
     def energy(self) -> float:
         """Energy of the present state."""
-        return scalar(self.stepper.energy(self.q, self.p, self._times[0], self._parameters))
+        return scalar(self.stepper.energy(self.q, self.p, self._times[0], self._parameters_in_modes))
 
     @property
     def energies(self) -> tuple[float, float, float]:
         """Kinetic, potential and total energy in double-double arithmetic; of run-time sizes only, else NaN, NaN, E."""
         now = self._q[np.newaxis], self._p[np.newaxis], self._times
-        kinetic, potential, total = self.stepper._energy_parts(*now, self._parameters)[0].tolist()
+        kinetic, potential, total = self.stepper._energy_parts(*now, self._parameters_in_modes)[0].tolist()
         return kinetic, potential, total
 
     @property
     def momentum_maps(self) -> Array:
         """Conserved quantities of the present state, in the order of ``stepper.momentum_map_names``."""
-        return self.stepper.momentum_maps(self.q, self.p, self._times[0], self._parameters)
+        return self.stepper.momentum_maps(self.q, self.p, self._times[0], self._parameters_in_modes)
 
     @property
     def multipliers(self) -> Any:
@@ -162,13 +162,13 @@ class Run(Memory, AttitudeHistory):
         Raises:
             MethodError: if the system has no constraints.
         """
-        values = multipliers(self.stepper, self.q, self.p, self._times, self._parameters)
+        values = multipliers(self.stepper, self.q, self.p, self._times, self._parameters_in_modes)
         return self.stepper.constraint_arrays(values[0])
 
     @property
     def constraint_values(self) -> tuple[Any, Any]:
         """Constraint residuals and their rates, in the form of :attr:`multipliers`; raises as these."""
-        values = constraint_values(self.stepper, self.q, self.p, self._times, self._parameters)[:, 0]
+        values = constraint_values(self.stepper, self.q, self.p, self._times, self._parameters_in_modes)[:, 0]
         return self.stepper.constraint_arrays(values[0]), self.stepper.constraint_arrays(values[1])
 
 

@@ -31,6 +31,7 @@ from scvi_codegen.runs.ensembles.observation import EnsembleObservation
 from scvi_codegen.runs.ensembles.result import EVENT_FAILED, INTERRUPTED, OK, EnsembleTrajectory, Span
 from scvi_codegen.runs.ensembles.schedule import CommonSteps
 from scvi_codegen.runs.ensembles.thread_pool import StopCheck, run_jobs
+from scvi_codegen.runs.results.saved_states import ModeHistory
 from scvi_codegen.runs.states.times import WHOLE
 from scvi_codegen.runs.states.validation import Array, columns_of_inputs
 from scvi_codegen.runs.states.words import unnamed
@@ -70,6 +71,7 @@ class IndividualRuns:
         self.status = np.full(count, INTERRUPTED, dtype="<U32")
         self.steps, self.fallback_steps = np.zeros((2, count), np.int64)
         self.events: list[tuple[Crossings, ...]] = [()] * count
+        self.modes: list[ModeHistory | None] = [None] * count
         self.stored = [self._start()]
         self.successive = self._successive()
 
@@ -205,7 +207,7 @@ class IndividualRuns:
         """Store rows of the states of trajectory j and how it ended."""
         t, q, p = states.t[rows], unnamed(states.q)[rows], unnamed(states.p)[rows]
         actions, tau = (values if values is None else values[rows] for values in (states.actions, states.tau))
-        self.events[j] = states.events
+        self.events[j], self.modes[j] = states.events, states.modes
         self._append(j, (t, q, p, status, states.steps), states.fallback_steps, actions, tau)
 
     def _append(
@@ -233,6 +235,8 @@ class IndividualRuns:
             self._append(part.start + k, trajectory, int(fallback_steps[k]), actions, tau)
         if trajectories.events:
             self.events[part] = trajectories.events
+        if trajectories.modes:
+            self.modes[part] = trajectories.modes
         if self.confirmations:
             self.confirmations[part] = trajectories.confirmations
             cast(list[Any], self.plans)[part] = trajectories.plans
@@ -259,6 +263,7 @@ class IndividualRuns:
             steps=self.steps,
             fallback_steps=self.fallback_steps,
             events=tuple(self.events) if stepper.events else (),
+            modes=tuple(self.modes) if stepper.modes else (),
             h=None if fixed is None else fixed.h,
             plans=self.plans,
             confirmations=tuple(self.confirmations),

@@ -25,7 +25,7 @@ from scvi_codegen.runs.results.descriptions import short_title
 from scvi_codegen.runs.results.export import FORMATS, LABELLED, check_format, write_whole
 from scvi_codegen.runs.results.joining import joined, relative_changes
 from scvi_codegen.runs.results.quantities import quantities
-from scvi_codegen.runs.results.saved_states import checked_row
+from scvi_codegen.runs.results.saved_states import ModeHistory, checked_row
 from scvi_codegen.runs.states.attitude_history import AttitudeHistory
 from scvi_codegen.runs.states.rotation_quantities import named_quantities
 from scvi_codegen.runs.states.validation import Array
@@ -105,6 +105,7 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
         confirmations: with ``error=``, of each trajectory as of :class:`Trajectory`, ``None`` for one that fails; else
             empty.
         events: (k,) crossings of the events of each trajectory, parallel to ``stepper.events``; empty without events.
+        modes: (k,) values of ``stepper.modes`` along each trajectory, as of :class:`Trajectory`; empty without modes.
     """
 
     q: Array
@@ -114,6 +115,7 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
     spans: tuple[Span, ...] = field(default=(), repr=False)
     confirmations: tuple[GlobalError | None, ...] = field(default=(), repr=False)
     events: tuple[tuple[Crossings, ...], ...] = field(default=(), repr=False)
+    modes: tuple[ModeHistory | None, ...] = field(default=(), repr=False)
 
     @overload
     def __getitem__(self, j: int) -> Trajectory: ...
@@ -130,7 +132,9 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
         if tau is not None and tau.ndim == 2:
             tau = tau[:, j]
         plan, h = (self.plans[j], np.nan) if self.h is None else (Fixed(self.h), self.h)
-        pieces = []
+        modes, pieces = self.modes[j] if self.modes else None, []
+        changes = any(len(of.t) and of.event.changes_state for of in (self.events[j] if self.events else ()))
+        divided = changes or (modes is not None and len(modes.t) > 0)  # fixed steps, at changes that are not states
         for number, (good, parameters) in enumerate(parts):
             rows = np.insert(good, 0, good[0] - 1) if number else good  # the state at a breakpoint belongs to both
             q, p = (self.stepper.named(each[rows, j].copy()) for each in (self.q, self.p))
@@ -140,10 +144,11 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
                     q=q,
                     p=p,
                     iterations=np.zeros(len(rows), np.int32),
-                    step_sizes=np.full(len(rows), h),
+                    step_sizes=np.full(len(rows), np.nan if divided else h),
                     h=h,
                     tau=None if tau is None else tau[rows],
                     actions=None if self.actions is None else self.actions[rows, j],
+                    modes=None if modes is None else modes.between(*sorted(times[rows[[0, -1]]])),
                     parameters=parameters,
                     stepper=self.stepper,
                     plan=plan,
@@ -152,7 +157,7 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
                 )
             )
         whole = joined(pieces) if len(pieces) > 1 else pieces[0]
-        return replace(whole, events=self.events[j]) if self.events else whole
+        return replace(whole, events=self.events[j] if self.events else (), modes=modes)
 
     @property
     def _pictured(self) -> list[Trajectory]:
@@ -210,7 +215,7 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
     def energy(self) -> Array:
         """Return (n, k) energies p.v - L; NaN after a failure, and for trajectories that leave the domain of L."""
         energies = self.stepper._states.missing(self.q.shape[:2])
-        for j, good, parameters in self._with_parameters():
+        for j, good, parameters in self._with_modes():
             with suppress(StateError):
                 energies[good, j] = self.stepper.energy(
                     self.q[good, j], self.p[good, j], self.times[good, j], parameters
@@ -236,7 +241,7 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
 
         def bounds(wanted: NDArray[np.bool_]) -> Array:
             found = np.zeros(wanted.shape)
-            for j, good, parameters in self._with_parameters():
+            for j, good, parameters in self._with_modes():
                 if wanted[j].any():
                     states = self.q[good, j], self.p[good, j], self.times[good, j]
                     found[j] = np.maximum(found[j], self.stepper._momentum_bounds(*states, parameters))
@@ -247,7 +252,7 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
     def _momentum_maps(self) -> tuple[Array, Array]:
         shape = (*self.q.shape[:2], len(self.stepper.momentum_map_names))
         values, sizes = self.stepper._states.missing(shape), np.full(shape, np.nan)
-        for j, good, parameters in self._with_parameters():
+        for j, good, parameters in self._with_modes():
             with suppress(StateError):
                 values[good, j], sizes[good, j] = self.stepper._momentum_maps_and_sizes(
                     self.q[good, j], self.p[good, j], self.times[good, j], parameters
@@ -261,6 +266,22 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
                 good = np.flatnonzero(self._reached(j)[rows]) + (rows.start or 0)
                 if good.size:
                     yield j, good, values
+
+    def _with_modes(self) -> Iterator[tuple[int, NDArray[np.intp], Array]]:
+        """Yield what :meth:`_with_parameters` does, with the modes after each state, for the rows of each mode."""
+        columns = [*map(self.stepper.parameters.index, self.stepper.modes)]
+        for j, good, parameters in self._with_parameters():
+            history = self.modes[j] if self.modes else None
+            if history is None:
+                yield j, good, parameters
+                continue
+            t = self.times[self._reached(j), j]
+            forward = np.copysign(1.0, t[-1] - t[0])
+            changes = np.searchsorted(forward * history.t, forward * self.times[good, j], side="right")
+            for number in np.unique(changes):
+                values = parameters.copy()
+                values[columns] = history.values[number]
+                yield j, good[changes == number], values
 
     @checks_arguments()
     def save(self, path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> None:
@@ -344,7 +365,7 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
     def _quantities(self) -> dict[str, Array]:
         times = np.nan_to_num(self.times)
         result: dict[str, Array] = {}
-        for j, good, parameters in self._with_parameters():
+        for j, good, parameters in self._with_modes():
             part = quantities(self.stepper, parameters, times[good, j], self.q[good, j], self.p[good, j])
             for name, values in part.items():
                 shape = (*self.q.shape[:2], *values.shape[1:])

@@ -51,7 +51,7 @@ def states_and_steps_at(states: SavedStates, times: Array) -> tuple[Array, Array
     left = np.searchsorted(states.forward * states.t, states.forward * times, side="right") - 1
     lengths, fixed, several = states.step_sizes[:-1], isinstance(states.plan, FixedSteps), False
     if states.stepper.divides_steps:
-        several = not (np.abs(np.diff(states.t)) < 1.5 * np.abs(lengths)).all()
+        several = not (np.abs(np.diff(states.t)) < 1.5 * np.abs(lengths) + states.grid_tolerance[:-1]).all()
         several |= getattr(states, "modes", None) is None and bool(states.stepper.modes)  # not known
     if several or (not fixed and np.isnan(lengths).any()):
         return *_integrate_to_each(states, left, times, states.plan), times
@@ -85,11 +85,22 @@ def _integrate_to_each(
     between = between[np.lexsort((states.forward * times[between], left[between]))]
     for rows in np.split(between, np.flatnonzero(np.diff(left[between])) + 1) if between.size else ():
         to_last = ending_at(plan, float(times[rows[-1]]))
-        settings = {"t": states.t[left[rows[0]]], "parameters": states.parameters, "options": states.options}
+        start = states.t[left[rows[0]]]
+        settings = {"t": start, "parameters": parameters_set_until(states, start), "options": states.options}
         run = stepper._run(q[rows[0]], p[rows[0]], plan=to_last, **settings)
         reached = run._recorded(None, Output(times=times[rows]))
         q[rows], p[rows] = reached.q, reached.p
     return q, p
+
+
+def parameters_set_until(states: SavedStates, t: float) -> Array:
+    """Return the parameters of a run that is started at time t, as events have set them; modes are its own."""
+    stepper, modes = cast(Any, states.stepper), getattr(states, "modes", None)
+    parameters, own = states.parameters.copy(), len(stepper.modes) - len(stepper.interface.mode_names)
+    if own and modes is not None:
+        set_values = modes.at(t, states.forward)[:own]
+        parameters[[*map(stepper.parameters.index, stepper.modes[:own])]] = set_values
+    return parameters
 
 
 def whole_steps(spans: Array, h: Array, slack: float = 0.0) -> NDArray[np.int64]:

@@ -3,11 +3,13 @@
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.common.errors import StateError
+from scvi_codegen.runs.results.saved_states import SavedStates, in_modes
 from scvi_codegen.runs.states.rotation_quantities import values_by_name
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepping.integrator import Integrator
@@ -28,6 +30,18 @@ def quantities(stepper: Integrator, parameters: Array, t: Array, q: Array, p: Ar
         maps = partial(stepper.momentum_maps, parameters=parameters)
         _fill(result["momentum_map"], rows_of_states, lambda rows: maps(q[rows], p[rows], t[rows]))
     return result | values_by_name(stepper.interface, q, p, result["velocity"])
+
+
+def quantities_in_modes(states: SavedStates) -> dict[str, Array]:
+    """Return the quantities of the states of a run, with the modes after each state."""
+    parts = list[dict[str, Array]]()
+
+    def times(q: Any, p: Any, t: Array, parameters: Array) -> Array:
+        parts.append(quantities(states.stepper, parameters, t, q, p))
+        return t
+
+    in_modes(states, times)
+    return {name: np.concatenate([part[name] for part in parts]) if parts[1:] else parts[0][name] for name in parts[0]}
 
 
 def _fill(into: Array, rows: NDArray[np.intp], compute: Callable[[NDArray[np.intp]], Array]) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.codegen.native.options import SolverOptions
+from scvi_codegen.common.errors import MethodError
 from scvi_codegen.runs.states.words import scalar
 from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.memory import Memory
@@ -121,6 +122,11 @@ def parameters_on_sides(states: SavedStates, t: float) -> Array:
     """Return the parameters of the steps after time t, with the modes of contacts and kinks in the run."""
     modes = getattr(states, "modes", None)
     if modes is None:
+        if len(states.stepper.modes) > len(states.stepper.interface.mode_names):
+            raise MethodError(
+                "values of parameters that events set are not stored in recordings: energies and other functions of "
+                "parameters are those of integrate(..) with the same events"
+            )
         return states.parameters
     parameters = states.parameters.copy()
     parameters[[*map(states.stepper.parameters.index, states.stepper.modes)]] = modes.at(t, states.forward)

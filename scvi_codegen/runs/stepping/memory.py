@@ -297,6 +297,14 @@ class Memory:
         return values
 
     @property
+    def _parameters_in_modes(self) -> Array:
+        """(k,) values of the present step, with those that events have set and the modes of contacts and kinks."""
+        values, modes = self._parameters.copy(), self.stepper.modes
+        if modes and self._watch is not None and self._watch.begun:
+            values[[*map(self.stepper.parameters.index, modes)]] = list(self._watch.mode)[: len(modes)]
+        return values
+
+    @property
     def options(self) -> SolverOptions | None:
         """Convergence criterion of the solver; ``None`` for the defaults."""
         return self._options
