@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 from functools import cached_property, partial
 from typing import Any
@@ -307,8 +307,7 @@ class Sources:
             program, self.system, self.method, uses_fallback_library=self.uses_fallback_library, g=self.g
         )
         if self.kinks:
-            modes = tuple((kink.mode, str(kink.function), *map(str, kink.power_sides)) for kink in self.kinks)
-            interface = replace(interface, kinks=self._without_modes.kinks, modes=modes)
+            interface = replace(interface, kinks=self._without_modes.kinks, modes=_modes_of(self.kinks))
         if self.precision != DOUBLE_DOUBLE:
             return interface
         size = workspace_in_pairs(program) if in_pairs(program) else interface.workspace
@@ -572,6 +571,11 @@ class ArraySources(Sources):
         """Return ``None``: variants are those of known sizes."""
 
 
+def _modes_of(kinks: Iterable[Kink]) -> tuple[tuple[str, ...], ...]:
+    """Return the modes of kinks in an interface."""
+    return tuple((kink.mode, str(kink.function), *map(str, kink.power_sides)) for kink in kinks)
+
+
 @checks_arguments(system=SYSTEM, symmetries=SYMMETRIES)
 def generate_source(
     system: MechanicalSystem,
@@ -624,9 +628,7 @@ def generate_source(
     source = render_embedded(program, embedded, control) if embedded else render(program, control)
     interface = replace(describe(program, system, method, g=g), contacts=rows)
     if located:
-        interface = replace(
-            interface, kinks=form.kinks, modes=tuple((kink.mode, str(kink.function)) for kink in located)
-        )
+        interface = replace(interface, kinks=form.kinks, modes=_modes_of(located))
     searched = interface.searched(as_events(events))
     complete = with_events(source, interface, searched) if searched else source
     return (complete.single_file() if embedded else complete), interface

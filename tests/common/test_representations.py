@@ -25,6 +25,7 @@ def definitions() -> Iterator[Any]:
     yield from (sc.gauss_legendre(8), sc.clenshaw_curtis(6), sc.chebyshev_lobatto(8), sc.Polynomials())
     yield from (sc.Splines(3), sc.Trigonometric(0.5), sc.SolverOptions(), sc.Event("q - 1", terminal=True))
     yield from (sc.contact("y - r", slip="x_dot - r*a_dot", friction=0.3), sc.friction("x_dot - 0.3", limit=0.25))
+    yield sc.Table([0, 1], [0, 1])
     step = sc.ExplicitStep.of(SPLITTING, {"LEAPS": {"KICK": [0.5, 0.5], "DRIFT": [1, 0], "KICK_ABSCISSA": [0, 1]}})
     claims = {"order": 2, "symmetric": True, "symplectic": True}
     yield from (step, sc.ExplicitMethod(name="splitting", title=NAME, **claims, step=step))

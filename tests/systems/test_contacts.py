@@ -224,11 +224,12 @@ def test_a_block_on_a_slope_creeps_nowhere() -> None:
         assert slides or not run.q.any()
 
 
+@pytest.mark.parametrize("steps", [{"h": 0.05}, {}])
 @pytest.mark.parametrize("floor", [0, 0.5])
-def test_a_bouncing_ball_comes_to_rest(floor: float) -> None:
+def test_a_bouncing_ball_comes_to_rest(floor: float, steps: dict[str, float]) -> None:
     contacts = [sc.contact(f"y - {floor}", restitution=0.7)]
     stepper = of("y_dot**2/2 - g*y", "y", contacts, "svi:2", g=9.81)
-    run = stepper.integrate([1 + floor], velocity=[0], h=0.05, t_end=4)
+    run = stepper.integrate([1 + floor], velocity=[0], t_end=4, **steps)
     assert [modes for _, modes in run.contact_modes] == [("open",), ("slip",)]
     assert run.contact_modes[1][0] == pytest.approx(np.sqrt(2 / 9.81) * 1.7 / 0.3, abs=1e-7 + 1e-7 * floor)
     assert abs(run.q[-1, 0] - floor) < 1e-60 + 1e-15 * floor
@@ -308,6 +309,9 @@ def test_a_block_pushed_across_a_slope_turns_and_stops(steps: dict[str, float], 
     true = solve_ivp(rates, (0, 3), [0, 0, 0.3, 1.5], "DOP853", rtol=1e-13, atol=1e-15, events=stops).y[:2, -1]
     assert [modes for _, modes in run.contact_modes] == [("slip",), ("stick",)]
     assert np.abs(run.q[-1, :2] - true).max() < error
+    slips = np.linalg.norm(run.velocity[:, :2], axis=1) > 1e-3  # slower ones keep their direction
+    w, forces = run.velocity[slips, :2], run.contact_forces()[slips, 0]
+    assert np.allclose(forces[:, 1:], -0.5 * 9.81 * c * w / np.linalg.norm(w, axis=1)[:, np.newaxis], atol=1e-12)
 
 
 @pytest.mark.parametrize("steps", [{"h": 0.02}, {"h": 0.01}, {"tolerance": 1e-12}])
@@ -353,6 +357,17 @@ RESTS = sc.LagrangianSystem.from_text("rests", ["y"], "y_dot**2/2 - y", contacts
         (
             lambda: of(PLANE, "x y", [sc.contact("y")], "svi:2").integrate([0, -1], [0, 0], h=1, t_end=1),
             "gap of contact",
+        ),
+        *(
+            (
+                lambda dry=dry: of(PLANE, "x y", [dry], "svi:2", a=-0.1).integrate([0, 1], [0, 0], h=0.1, steps=9),
+                "imposs",
+            )
+            for dry in (
+                sc.contact("y", slip="x_dot", friction="a"),
+                sc.contact("y", restitution="1.5 + a/5"),
+                sc.friction("x_dot", limit="0.2 + a/5", static_limit="-a"),
+            )
         ),
         (
             lambda: of(PLANE, "x y", [sc.contact("y")], "svi:2").integrate([0, 1], [0, 0], h=-0.1, steps=9),

@@ -449,7 +449,8 @@ class Interface:
             for number, contact in enumerate(self.contacts)
             for kind, function in contact.transitions
         )
-        return *events, *transitions, *(Kink(function, mode=mode) for mode, function in self.modes)
+        kinks = (Kink(function, mode=mode, power_sides=tuple(map(int, sides))) for mode, function, *sides in self.modes)
+        return *events, *transitions, *kinks
 
     @property
     def in_tau(self) -> bool:

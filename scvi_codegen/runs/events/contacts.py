@@ -21,6 +21,8 @@ REFUSALS = {
     3: "{k} contacts close or change at once at t = {t:.17g}: their modes are chosen by enumeration of at most 6; use "
     "fewer contacts",
     4: "no impulses satisfy the law of impact with friction at t = {t:.17g}, contact {k}: reduce its friction",
+    6: "contact {k} has impossible coefficients at t = {t:.17g}: friction is {value:.6g}, which must not be negative, "
+    "nor at rest above static friction; restitution must be 0 to 1",
     5: "the impacts at t = {t:.17g} do not end: contacts close a corner; set a restitution to 0",
 }
 """Messages by the reasons of contacts.h."""
@@ -140,11 +142,11 @@ def contact_forces(states: Any) -> Array:
 
 
 def _direction(contact: ContactRows, named: dict[str, Any], w: Array) -> Array:
-    """Return the direction of a slip w, 0 where it does not slip."""
+    """Return the direction of a slip w, 0 where it does not slip; in space that of (ahead.w) w + start."""
     values = np.array([named[name] for name in contact.directions])
     if contact.slips == 1:
         return values
-    vector = w @ w * w + values[1:3]
+    vector = values[3:5] @ w * w + values[1:3]
     length = np.linalg.norm(vector)
     return np.asarray(values[0] * vector / length) if length else vector
 

@@ -25,6 +25,7 @@ enum {
 #define CONTACT_PENETRATION 1e-9 /* part of its size by which a gap may be negative at a start */
 #define CONTACT_MISSED 128.0 /* effects of rounding beyond which a negative gap shows a missed transition */
 #define CONTACT_LOWEST 16.0 /* roundings of a gap below which a rebound ends */
+#define CONTACT_RESIDUALS 16.0 /* residuals of its located zero below which a rebound ends */
 #define CONTACT_TURN 0.866 /* cosine of an angle after which a direction is renewed */
 #define CONTACT_DEPENDENT 1e-12 /* part of a column below which a pivot counts as 0 */
 #define CONTACT_GAIN 1e-9 /* part of the work of an impact by which energy may grow */
@@ -35,7 +36,8 @@ enum {
   CONTACT_WITHOUT_MODE, /* Painleve's paradox, or redundant contacts */
   CONTACTS_UNDECIDED, /* too many */
   CONTACT_WITHOUT_IMPULSE,
-  CONTACT_IN_CORNER
+  CONTACT_IN_CORNER,
+  CONTACT_IMPOSSIBLE /* coefficients */
 };
 
 /* A contact without gap is always closed; one without friction does not stick, and has direction 0. Slip in space that
@@ -51,11 +53,11 @@ static const contact_mode CONTACT_STICKS = {1, 1, {0.0, 0.0}};
 static const contact_mode CONTACT_SLIPS[3] = {{1, 0, {-1.0, 0.0}}, {1, 0, {0.0, 0.0}}, {1, 0, {1.0, 0.0}}};
 
 /* Rows at a state: values and rates, second rates b, W and G by rows, coefficients (mu, mu_s, e; limits of friction
- * without gap), the sizes of the terms of values and rates, and the rounding of values. */
+ * without gap), the sizes of the terms of values and rates, the rounding of values, and rates at rest. */
 typedef struct {
   real numbers[CONTACT_NUMBERS];
   const real *value, *rate, *second, *W, *G, *coefficient;
-  real size[CONTACT_ROWS], speed[CONTACT_ROWS], rounding[CONTACT_ROWS];
+  real size[CONTACT_ROWS], speed[CONTACT_ROWS], rounding[CONTACT_ROWS], drift[CONTACT_ROWS];
 } contact_terms;
 
 /* Transitions that end a mode together, and their consequences: contacts that close, slips that stop, directions of
@@ -143,7 +145,8 @@ static int terms_at(const event_step *step, const event_sample *at, contact_term
     /* |G v| <= sqrt(G M^-1 G^T) sqrt(v^T M v), and the change of the rate in a step */
     of->speed[r] = sqrt(fabs(of->W[r * (CONTACT_ROWS + 1)] * power)) + fabs(of->rate[r] - by_velocity) +
         fabs(of->second[r]) * duration;
-    of->rounding[r] = DBL_EPSILON * (by_position + fabs(at->t * (of->rate[r] - by_velocity)));
+    of->drift[r] = fabs(of->rate[r] - by_velocity);
+    of->rounding[r] = DBL_EPSILON * (by_position + fabs(at->t) * of->drift[r]);
     of->size[r] = by_position + of->speed[r] * duration;
   }
   return status;
@@ -396,6 +399,28 @@ static int refuse_modes(const event_step *step, const contact_terms *of, contact
   return refuse(step, CONTACT_WITHOUT_MODE, -1, 0.0);
 }
 
+/* Whether a mode sticks by static friction above that of sliding, so that slip would begin, too. */
+static int needs_static_friction(const contact_terms *of, const contact_mode *mode)
+{
+  real force[CONTACT_ROWS], second[CONTACT_ROWS];
+  int needs = 0;
+  if (!solve_contacts(of, mode, of->second, force, second))
+    return 0;
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    needs |= mode[k].sticks &&
+        length_of(force + CONTACTS[k].tangential, CONTACTS[k].slips) > friction_limit(of, k, 0, force);
+  return needs;
+}
+
+/* Whether friction is negative, less static than sliding at rest, or a restitution is not in [0, 1]. */
+static int is_impossible(const contact_terms *of, int k)
+{
+  const real mu = of->coefficient[3 * k], held = of->coefficient[3 * k + 1], e = of->coefficient[3 * k + 2];
+  const int slip = CONTACTS[k].tangential;
+  const int rests = slip >= 0 && length_of(of->rate + slip, CONTACTS[k].slips) <= CONTACT_ROUNDING * of->speed[slip];
+  return !(mu >= 0.0 && held >= 0.0 && e >= 0.0 && e <= 1.0) || (rests && held < (1.0 - CONTACT_ROUNDING) * mu);
+}
+
 /* Sets the consistent modes at a state that stick most: the first of those with the least sum of 2 for each contact
  * that does not stick, less 1 for each that is closed. */
 static int choose_modes(const event_step *step, const contact_terms *of, contact_change *now)
@@ -433,7 +458,8 @@ static int choose_modes(const event_step *step, const contact_terms *of, contact
   }
   if (!consistent)
     return refuse_modes(step, of, option, options);
-  step->watch->ambiguous = consistent > step->watch->ambiguous ? consistent : step->watch->ambiguous;
+  if (consistent > step->watch->ambiguous && !needs_static_friction(of, best))
+    step->watch->ambiguous = consistent;
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int slip = CONTACTS[k].tangential;
     const int is_slow = CONTACTS[k].slips > 0 && (now->rests[k] || now->begins[k]);
@@ -555,12 +581,13 @@ static real gain_of(const contact_terms *of, const real *impulse)
   return size != 0.0 ? gain / fabs(size) : 0.0;
 }
 
-/* Whether the height w^2 / (2 g'') of a rebound is of the size of rounding, or of the residual of the located zero. */
-static int is_low(const event_step *step, const contact_terms *of, int k)
+/* Whether the height w^2 / (2 g'') of a rebound is of the size of rounding, or of the residual of the located zero; of
+ * a gap that moves, of that of the search, which sees no rounding of time. */
+static int is_low(const event_step *step, const contact_terms *before, const contact_terms *of, int k)
 {
   const int row = CONTACTS[k].normal;
-  real lowest = CONTACT_LOWEST * of->rounding[row];
-  for (int i = 0; i < TRANSITIONS; i++)
+  real lowest = CONTACT_LOWEST * of->rounding[row] + CONTACT_RESIDUALS * fabs(before->value[row]);
+  for (int i = 0; i < TRANSITIONS && of->drift[row] > CONTACT_ROUNDING * of->speed[row]; i++)
     if (TRANSITION[i][0] == k && TRANSITION[i][1] == CONTACT_CLOSES)
       lowest += 4.0 * step->watch->history[EVENT_FIRST[FIRST_TRANSITION + i]].slack;
   return of->rate[row] * of->rate[row] <= -2.0 * of->second[row] * lowest;
@@ -598,7 +625,7 @@ static int collide(const event_step *step, event_sample *at, contact_terms *of, 
       now->touches[k] = 1;
     if (of->rate[normal] > CONTACT_ROUNDING * before.speed[normal])
       now->touches[k] = 0;
-    if (approaches[k] && (step->watch->accumulates[k] || is_low(step, of, k)))
+    if (approaches[k] && (step->watch->accumulates[k] || is_low(step, &before, of, k)))
       now->touches[k] = 1;
     step->watch->accumulates[k] = 0;
   }
@@ -688,6 +715,8 @@ static int begin_contacts(const event_step *step, event_sample *at)
     const int row = CONTACTS[k].normal;
     if (row >= 0 && of.value[row] < -CONTACT_PENETRATION * of.size[row])
       status = refuse(step, CONTACT_PENETRATES, k, of.value[row]);
+    if (status == OK && is_impossible(&of, k))
+      status = refuse(step, CONTACT_IMPOSSIBLE, k, of.coefficient[3 * k]);
     now.closes[k] = row >= 0 && fabs(of.value[row]) <= CONTACT_ROUNDING * of.size[row];
   }
   if (status == OK)
