@@ -106,7 +106,7 @@ def test_boundaries_and_amplitudes_need_few_products(name, shape, most):
 @pytest.mark.sampled(3)
 @pytest.mark.covering
 @pytest.mark.parametrize("name", LATTICES)
-@pytest.mark.parametrize("k", [1e2, 1e5])
+@pytest.mark.parametrize("k", [1e2, 1e4])
 def test_preconditioned_steps_equal_those_of_the_unrolled_system(name, k):
     """Compare with Newton's iteration with full matrices; very small lattices have no preconditioner."""
     for shape in [(2, 7), (7, 12)] if "plane" in name else [4, 34]:
