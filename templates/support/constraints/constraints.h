@@ -311,6 +311,7 @@ static real square_by_constraints(real t, const real *q, const real *parameters,
 static int project_momentum(real t, const real *q, real *p, const real *parameters, saddle *at, real *workspace)
 {
   real u[2 * M], g[CONSTRAINTS], rate[CONSTRAINTS], y[CONSTRAINTS], update[M], derivative[CONSTRAINT_ENTRIES];
+  real fastest = 0; /* the projection may be at rest */
   for (int k = 0; k < MOST_MOMENTUM_PROJECTIONS; k++) {
     int status = constrained(t, q, p, parameters, u, g, rate, workspace);
     if (status == OK)
@@ -323,7 +324,8 @@ static int project_momentum(real t, const real *q, real *p, const real *paramete
     constraints(u, t, parameters, g, derivative);
     for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
       p[CONSTRAINT_ENTRY[e][1]] -= derivative[e] * y[CONSTRAINT_ENTRY[e][0]];
-    if (k + 1 >= MOMENTUM_PROJECTIONS && !(largest_of(update) > SETTLED_UPDATE * largest_of(u + M)))
+    fastest = larger(fastest, largest_of(u + M));
+    if (k + 1 >= MOMENTUM_PROJECTIONS && !(largest_of(update) > SETTLED_UPDATE * fastest))
       break;
   }
   return all_finite(p, M) ? OK : NOT_FINITE;

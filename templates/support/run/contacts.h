@@ -68,11 +68,6 @@ typedef struct {
   int touches[EVENT_CONTACTS], rests[EVENT_CONTACTS];
 } contact_change;
 
-static int is_transition(int event)
-{
-  return event >= FIRST_TRANSITION && event < FIRST_TRANSITION + TRANSITIONS;
-}
-
 static real length_of(const real *x, int count)
 {
   return count < 2 ? fabs(x[0]) : hypot(x[0], x[1]);

@@ -139,11 +139,7 @@ static int note_rounding(const event_step *step, int e, event_sample *at)
 /* Whether the zeros of an event end a mode, and do not change the state themselves. */
 static int ends_mode(int event)
 {
-#ifdef EVENT_CONTACTS
-  if (is_transition(event))
-    return 1;
-#endif
-  return is_kink(event);
+  return is_transition(event) || is_kink(event);
 }
 
 /* Changes the state at the crossings from `first` on, which have one state, then at all walls that it touches within

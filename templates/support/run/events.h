@@ -48,15 +48,26 @@ static void put_modes(const real *mode, real *parameters)
 }
 #endif
 
-/* Side of a kink by its function e, > 0 or < 0; 0 for other functions, and without sides. */
+/* Whether an event is a transition of a contact, whose function is >= 0 in its mode. */
+static inline int is_transition(int event)
+{
+#ifdef EVENT_CONTACTS
+  return event >= FIRST_TRANSITION && event < FIRST_TRANSITION + TRANSITIONS;
+#else
+  (void)event;
+  return 0;
+#endif
+}
+
+/* Side on which the motion is beside a zero of function e, > 0 or < 0: of kinks and transitions; 0 for others. */
 static inline real side_at_start(const event_watch *watch, int e)
 {
 #ifdef EVENT_KINKS
-  return EVENT_OF(e) >= FIRST_KINK ? SIDE_OF(watch, EVENT_OF(e) - FIRST_KINK) : 0.0;
-#else
-  (void)watch, (void)e;
-  return 0.0;
+  if (EVENT_OF(e) >= FIRST_KINK)
+    return SIDE_OF(watch, EVENT_OF(e) - FIRST_KINK);
 #endif
+  (void)watch;
+  return is_transition(EVENT_OF(e)) ? 1.0 : 0.0;
 }
 
 /* A function at a fraction of a step, and the state there, in memory that later samples may use as well. */
@@ -413,9 +424,9 @@ static int leave_zero(const event_step *step, int e, const event_sample *left, r
   return OK;
 }
 
-/* Start of the search in a part that begins at the zero of a kink, to whose side the motion goes: the last of a few
- * states that are within rounding of zero, or the first beyond on that side. */
-static int leave_kink(const event_step *step, int e, const event_sample *left, event_sample *from)
+/* Start of the search in a part that begins at a zero to whose known side the motion goes: the last of a few states
+ * that are within rounding of zero, or the first beyond on that side. */
+static int leave_to_side(const event_step *step, int e, const event_sample *left, event_sample *from)
 {
   static const int PLACES[2][4] = {{4, 6, 8, 10}, {16, 24, 32, 40}};
   const real side = side_at_start(step->watch, e);
@@ -517,14 +528,14 @@ static int search_function(const event_step *step, int e, const event_sample *le
     return OK;
   from = start;
   if (!step->watch->started && side_at_start(step->watch, e) != 0.0) {
-    status = leave_kink(step, e, &start, &from);
+    status = leave_to_side(step, e, &start, &from);
   } else if (!step->watch->started) {
     range = fabs(to.g - from.g);
     for (int j = 1; j < EVENT_DEGREE; j++)
       range = fmax(range, fabs(inner[j - 1] - from.g));
     status = leave_zero(step, e, &start, range, &from);
   }
-  if (status == OK && !step->watch->started && side_at_start(step->watch, e) != 0.0)
+  if (status == OK && !step->watch->started && !is_transition(EVENT_OF(e)) && side_at_start(step->watch, e) != 0.0)
     return search_octaves(step, e, &from, &to);
   return status == OK ? search_part(step, e, &from, &to, from.fraction > 0.0 ? NULL : inner, EVENT_SPLITS) : status;
 }
