@@ -14,6 +14,7 @@ from scipy.integrate import quad, solve_ivp
 from scipy.optimize import brentq
 
 import scvi_codegen as sc
+from scvi_codegen.interfaces.derivation import derivation_html
 from scvi_codegen.runs.results.energy import energy_account
 from scvi_codegen.systems.constraints.kind import Reaction
 from scvi_codegen.systems.formulas.symbols import symbol
@@ -549,3 +550,21 @@ def test_recordings_and_ensembles_of_dry_friction(tmp_path: Any) -> None:
     assert np.array_equal(member.contact_forces()[-1], run.contact_forces()[-1])
     times = np.linspace(0.0, 20.0, 97)
     assert np.abs(member.at(times)[0] - run.at(times)[0]).max() < 1e-14
+
+
+def test_derivations_show_the_modes_of_contacts() -> None:
+    floor = sc.contact("y", slip="x_dot", friction="mu", restitution=0.5)
+    system = sc.LagrangianSystem.from_text(
+        name="block", coordinates=["x", "y"], lagrangian=f"{PLANE} - y", parameters={"mu": 0.3}, contacts=[floor]
+    )
+    derived = sc.derive(system, "svi:1")
+    text = derived.to_text()
+    assert "contact 1: gap = y, slip = x_dot, friction = mu, restitution = 1/2\nModes of contacts: open" in text
+    assert "momentum of x" not in text
+    assert [str(row.residual) for row in derived.equations[-4:]] == [
+        "Q_1_y*contact_1_closed*w_2/(2*h) + h*lambda_0_1*w_1*(1 - contact_1_closed)",
+        "contact_1_sticks*(2*L_1_0*x_k/h + 2*L_1_1*Q_1_x/h) + h*lambda_0_2*w_1*(1 - contact_1_sticks)",
+        "contact_1_closed*v_1_y + h*lambda_1_1*w_2*(1 - contact_1_closed)",
+        "contact_1_sticks*v_1_x + h*lambda_1_2*w_2*(1 - contact_1_sticks)",
+    ]
+    assert "contact 1: gap = y" in derivation_html(system, sc.SVI(1, "gauss-lobatto:2"))

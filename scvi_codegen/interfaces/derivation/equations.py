@@ -33,6 +33,7 @@ from scvi_codegen.interfaces.derivation.notation import (
     LARGEST_SHOWN,
     Equation,
     TableEntry,
+    contact_lines,
     entries,
     formula_text,
     html,
@@ -44,6 +45,7 @@ from scvi_codegen.methods.discretise import discretised_form, in_moving_frame, p
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import Block, EntryName, Row, StageGroup, StageSystem, Table
 from scvi_codegen.systems.arrays.system import ArraySystem
+from scvi_codegen.systems.contacts.modes import in_all_modes
 from scvi_codegen.systems.first_order import FirstOrderSystem
 from scvi_codegen.systems.formulas.expressions import jacobian
 from scvi_codegen.systems.formulas.intermediates import inner_of, written_out
@@ -144,6 +146,7 @@ class StepEquations:
         yield f"{'H' if self.system.auxiliaries else 'L'} = {formula_text(self.system.formula)}"
         for g in self.system.constraints:
             yield f"0 = {formula_text(g)}"
+        yield from contact_lines(self.system)
         if isinstance(self.system, FirstOrderSystem):
             yield f"subtracted from L: d/dt of {format_expression(self.system.integrated)}"
             for momentum, theta in zip(p, self.system.one_form, strict=True):
@@ -211,7 +214,7 @@ def derive(
         sites = site_hamiltonian(system) if system.coupled_terms else None
         return ArrayStepEquations(sites.system if sites else system, as_method(method, system))
     method = as_method(method, system)
-    system = discretised_form(system, method)
+    system = discretised_form(in_all_modes(system), method)
     if inner_of(system.formula):
         kind = "hamiltonian" if system.auxiliaries else "lagrangian"
         system = replace(system, **{kind: written_out(system.formula)})

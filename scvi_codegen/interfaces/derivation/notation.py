@@ -219,9 +219,23 @@ def _closed_forms(method: Method) -> Iterator[Sequence[sympy.Expr] | None]:
 
 
 IMPULSE = "p := p + (1 + e)/2 lambda n, H(q, p + lambda n) - H(q, p) + lambda g_t = 0"
+MODES = """Modes of contacts: open, 0 <= g; stick, g = 0 and w = 0; slip in the direction d = w/|w|, g = 0.
+Forces (G - mu d T)^T lambda + T^T tau with G = g_q, T = w_v; without gap - limit d T^T + T^T tau.
+Transitions: g = 0 closes; lambda = 0 lifts; w = 0 stops; |tau| = mu_s lambda, or the static limit, begins to slip."""
 SALTATION = """Derivatives by saltation matrices (scvi_codegen.runs.events.saltation): of z = (q, p) := R(z, t)
     dz := R_z (dz + X- dt) + R_t dt - X+ dt, dt = -g_z dz/(g_z X- + g_t)
     X-, X+: derivatives of the steps before and after the event with respect to their sizes"""
+
+
+def contact_lines(system: MechanicalSystem) -> list[str]:
+    """Return the formulas of the contacts of a system, and the conditions of their modes, in lines."""
+    lines = []
+    for k, contact in enumerate(getattr(system, "contacts", ()), 1):
+        formulas = (f"{name} = {value}" for name, value in contact.table.items())
+        lines.append(f"contact {k}: {', '.join(formulas)}")
+    if lines:
+        lines.append(MODES)
+    return lines
 
 
 def events_text(events: Iterable[Event], system: MechanicalSystem) -> str:

@@ -86,6 +86,12 @@ def bound_contacts(system: Any, contacts: Sequence[ContactLike]) -> BoundContact
     return _Binding(system).bound(contacts)
 
 
+def in_all_modes(system: Any) -> Any:
+    """Return a system with the constraints and forces of its contacts, if it has any, in all their modes."""
+    is_bound = any(getattr(system, "reactions", ()))
+    return system if is_bound or not getattr(system, "contacts", ()) else bound_contacts(system, system.contacts).system
+
+
 class _Binding:
     """Constraints, forces, parameters and events of the contacts of a system."""
 

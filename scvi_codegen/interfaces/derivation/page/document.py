@@ -31,13 +31,14 @@ from scvi_codegen.common.display.page import (
 )
 from scvi_codegen.common.representation import counted
 from scvi_codegen.interfaces.derivation.equations import StepEquations, derive
-from scvi_codegen.interfaces.derivation.notation import events_text, table_entries
+from scvi_codegen.interfaces.derivation.notation import contact_lines, events_text, table_entries
 from scvi_codegen.interfaces.derivation.page.drawings import curve_section, jacobian_section, tables_section
 from scvi_codegen.interfaces.derivation.page.sums import end_formulas, gather_formulas, meaning, row_formulas
 from scvi_codegen.methods.discretise import check_regular, discretise, paper_equations
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import StageGroup, StageSystem
 from scvi_codegen.systems.constraints import with_constraint_forces
+from scvi_codegen.systems.contacts.modes import in_all_modes
 from scvi_codegen.systems.derived_expressions import auxiliary_multipliers, forms_of, multipliers
 from scvi_codegen.systems.event import Event
 from scvi_codegen.systems.formulas.expressions import gradient_tuple
@@ -74,6 +75,8 @@ def system_section(system: MechanicalSystem) -> Section:
             ),
             *formulas([Formula(g, Symbol(f"g_{k}")) for k, g in enumerate(system.constraints, 1)], "constraint"),
         ]
+    if lines := contact_lines(system):
+        contents.append(Listing("\n".join(lines)))
     if system.parameters:
         rows = tuple((symbol, value) for symbol, value in system.constants.items())
         table = TableBlock(columns=("parameter", "default"), rows=rows, formats={"default": ".17g"}, name="Parameters")
@@ -243,6 +246,7 @@ def derivation_html(system: MechanicalSystem, method: Method, *, events: Sequenc
     Raises:
         MethodError: for a system that the method does not support.
     """
+    system = in_all_modes(system)
     check_regular(method, system)
     more = [Section(name="events", title="Events", contents=(Listing(events_text(events, system)),))] if events else []
     return page_template("derivation.html.jinja").render(

@@ -20,7 +20,12 @@ from scvi_codegen.common.display.mathml import RAISED
 from scvi_codegen.common.display.page import Formula
 from scvi_codegen.common.precision import Number
 from scvi_codegen.methods.stage_system import Block, Gather, Row, Scatter, StageGroup, StageSystem, Table
-from scvi_codegen.systems.constraints import constraint_rates, position_conditions, velocity_conditions
+from scvi_codegen.systems.constraints import (
+    constraint_rates,
+    idle_multipliers,
+    position_conditions,
+    velocity_conditions,
+)
 from scvi_codegen.systems.derived_expressions import forms_of
 from scvi_codegen.systems.system import MechanicalSystem
 
@@ -58,6 +63,8 @@ def result_symbol(system: MechanicalSystem, group: StageGroup, scatter: Scatter,
         return Symbol(f"g_{suffix}")
     if system.constraints and scatter.results in (velocity_conditions(system), constraint_rates(system)):
         return Symbol(f"g_dot_{suffix}")
+    if system.constraints and scatter.results == idle_multipliers(system):
+        return Symbol(f"lambda_open_{suffix}")
     if group.scalar is None:
         forms = forms_of(system)
         letters = {forms.force: "L_q", forms.momentum: "L_v", forms.euler_lagrange: "E", forms.constitutive: "L_p"}
