@@ -1,7 +1,5 @@
 """Animations: what moves is found, frames are states at equal times, files are whole."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from notation import lagrange
@@ -10,9 +8,6 @@ from samples import compile_quickly
 import scvi_codegen as sc
 from scvi_codegen.common.errors import PlotError, StateError
 from scvi_codegen.interfaces.pictures.animation import drawn_shape, positions_of
-from scvi_codegen.interfaces.pictures.recognition import shape_of
-from scvi_codegen.interfaces.pictures.shape import DrawnSystem
-from scvi_codegen.systems.multibody.trees.tree import identifier
 
 pytest.importorskip("matplotlib")
 
@@ -40,49 +35,6 @@ def run_with(lagrangian: str, coordinates: list[str], **parameters: float) -> sc
     system = lagrange("mine", coordinates, lagrangian, parameters=parameters)
     m = len(coordinates)
     return compile_quickly(system, sc.SVI(2)).integrate([0.5] * m, [0.2] * m, h=0.01, steps=5)
-
-
-ROBOTS = Path(__file__).parent.parent / "systems" / "robots"
-
-
-@pytest.mark.sampled(1)
-@pytest.mark.parametrize("name", ["figure.xml", "ball.xml"])
-def test_links_are_where_mujoco_has_them(name):
-    mujoco = pytest.importorskip("mujoco")
-    model = mujoco.MjModel.from_xml_path(str(ROBOTS / name))
-    data = mujoco.MjData(model)
-    system = sc.LagrangianSystem.from_mjcf(ROBOTS / name)
-    rng = np.random.default_rng(3)
-    data.qpos[:] = model.qpos0 + 0.3 * rng.standard_normal(model.nq)
-    mujoco.mj_normalizeQuat(model, data.qpos)
-    mujoco.mj_kinematics(model, data)
-    values, joints = {}, []
-    free, ball = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
-    for k in range(model.njnt):
-        joint = identifier(model.joint(k).name or model.body(model.jnt_bodyid[k]).name)
-        joints.append(joint)
-        first, kind = model.jnt_qposadr[k], int(model.jnt_type[k])
-        at = data.qpos[first:]
-        if kind == free:
-            values |= dict(zip((f"{axis}_{joint}" for axis in "xyz"), at, strict=False))
-        if kind in (free, ball):
-            turn = at[3:7] if kind == free else at[:4]
-            values |= dict(zip((f"R_{joint}_{axis}" for axis in "wxyz"), turn, strict=True))
-        else:
-            values[joint] = at[0]
-    names, turning = [q.name for q in system.coordinates], [each.declaration for each in system.rotations]
-    momenta = [f"p_{name}" for name in names]
-    shape = shape_of(
-        DrawnSystem(coordinates=names, momenta=momenta, parameters=(), rotations=turning, shapes={}, links=system.links)
-    )
-    q = np.array([[values[name] for name in names]])
-    points = shape.positions(np.zeros(1), q, q, ())[0]
-    for k, link in enumerate(system.links):
-        j = joints.index(link.name)
-        anchor = data.xanchor[j].copy()  # before the displacement of a slide
-        if int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_SLIDE):
-            anchor += data.xaxis[j] * (data.qpos[model.jnt_qposadr[j]] - model.qpos0[model.jnt_qposadr[j]])
-        assert np.abs(points - anchor).max(axis=1).min() < 1e-9, (k, link.name)
 
 
 class TestShapes:
@@ -177,13 +129,6 @@ class TestFilm:
             assert any(np.allclose(line.get_xydata(), rods) for line in axes.lines if len(line.get_xdata()) == 3)
             assert axes.get_title() == f"double pendulum, t = {run.t[frame]:.6g}"
 
-    @pytest.mark.tiers(0, 1)
-    @pytest.mark.sampled(2)
-    @pytest.mark.parametrize("name", ["charged-particle", "fput-chain", "planar-pendulum", "outer-solar-system"])
-    def test_animation_has_a_notebook_display(self, name):
-        shown = run_of(name, 3).animate(seconds=0.2)._repr_html_()
-        assert shown.count("data:image/png") == 4
-
     @pytest.mark.rotated
     def test_frames_of_adaptive_steps_are_dense_output_at_equal_times(self, capsys):
         run = run_of("kepler", 1).stepper.integrate([0.5, 0.0], [0.0, 3**0.5], t_end=6.0, tolerance=1e-5)
@@ -196,11 +141,6 @@ class TestFilm:
         assert drawn[-1] == (25, 25)
         assert capsys.readouterr().err == ""  # no terminal
 
-    def test_animation_of_a_backward_run_is_backward(self):
-        run = run_of("kepler", 10)
-        back = run.stepper.integrate(run.q[-1], run.p[-1], h=-run.h, steps=10)
-        assert list(back.animate(seconds=1.0).frames) == list(range(11))
-
     @pytest.mark.rotated
     def test_files_are_complete_animations(self, tmp_path):
         run = run_of("kepler", 4)
@@ -212,19 +152,6 @@ class TestFilm:
             assert film.n_frames == 5
         assert "<script" in (tmp_path / "film.html").read_text(encoding="utf-8")
         assert sorted(file.name for file in tmp_path.iterdir()) == ["film.gif", "film.html"]
-
-    @pytest.mark.second
-    def test_positions_may_be_supplied(self):
-        run = run_of("spherical-pendulum", 3)
-
-        def bob(q: np.ndarray) -> np.ndarray:
-            theta, phi = q.T
-            rod = np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), -np.cos(theta)
-            return np.stack(rod, axis=1)[:, np.newaxis]
-
-        film = run.animate(positions=bob, seconds=0.2)
-        film.animation._init_draw()
-        assert film.animation._fig.axes[0].name == "3d"
 
     @pytest.mark.parametrize(
         ("arguments", "words"),

@@ -72,27 +72,6 @@ def test_model_file_is_read_completely(net: Path) -> None:
 
 
 @pytest.mark.second
-def test_solver_is_read_from_the_file(net: Path) -> None:
-    """The run equals Newton's iteration bitwise; the solver is retained if the method changes."""
-    net.write_text(net.read_text().replace('"svi:2"', '"svi:2"\nsolver = "newton"'))
-    model = sc.load_model(net)
-    run = {"h": 0.1, "steps": 4, "tables": model.tables, "parameters": model.parameters}
-    newton, iterations = (
-        sc.compile_stepper(model.system, "svi:2", solver=solver).integrate(model.q, **run)
-        for solver in ("newton", "fixed-point")
-    )
-    own, other = (sc.load_model(net, {"method": given}).integrate() for given in ({}, {"solver": "fixed-point"}))
-    assert np.array_equal(own.q["r"], newton.q["r"])
-    assert np.array_equal(other.q["r"], iterations.q["r"])
-    counts = [run.iterations.sum() for run in (own, other, newton, iterations)]
-    assert counts[:2] == counts[2:]
-    assert counts[0] != counts[1]
-    assert sc.load_model(net, {"method": {"method": "gauss:2"}}).solver == "newton"
-    sc.save_model(sc.load_model(net), net.with_name("again.toml"))
-    assert sc.load_model(net.with_name("again.toml")).solver == "newton"
-
-
-@pytest.mark.second
 def test_newton_that_requires_known_sizes_runs_with_those_of_the_model(net: Path) -> None:
     """Its states are those of the other solver; C for arrays of run-time sizes is refused."""
     net.write_text(net.read_text().replace('"svi:2"', '"stoermer-verlet"', 1))
@@ -238,24 +217,6 @@ def test_model_files_with_arrays_of_known_sizes(tmp_path: Path) -> None:
     path.write_text(RING.replace("[0, 1, 2]", "[0, 1]"))
     with pytest.raises(sc.ModelFileError, match="q"):
         sc.load_model(path)
-
-
-@pytest.mark.second
-def test_tolerance_selects_adaptive_steps(net: Path) -> None:
-    """A tolerance, or a missing step, selects adaptive steps; an overriding step replaces it."""
-    given = {"tolerance": 1e-6, "span": -3.0}
-    net.write_text(net.read_text().replace("step = 0.1\nsteps = 4", "tolerance = 1e-6\nspan = -3.0"))
-    model = sc.load_model(net)
-    assert (model.h, model.tolerance, model.covered) == (None, 1e-6, -3.0)
-    own = model.integrate()
-    assert own.t[-1] == model.start().plan.t_end == -3.0
-    other = sc.compile_stepper(model.system, "svi:2").integrate(
-        model.q, t_end=-3.0, tolerance=given["tolerance"], tables=model.tables, parameters=model.parameters
-    )
-    assert np.array_equal(own.q["r"], other.q["r"])
-    with pytest.raises(sc.ModelFileError, match="give a step"):
-        model.step_count  # noqa: B018
-    assert sc.load_model(net, {"run": {"step": 0.1, "span": 1.0}}).step_count == 10
 
 
 @pytest.mark.second

@@ -86,35 +86,6 @@ def test_second_derivatives_are_those_of_runs():
     assert_allclose(by_seeds(Q, P, 1.1, 0.0, H, weights).full(), jacobian.T, rtol=0, atol=1e-11 * abs(jacobian).max())
 
 
-def test_ipopt_needs_fewer_iterations_with_the_exact_hessian():
-    """Multiple shooting of a rendezvous on a larger circle, ten impulses of least mean square: 5 instead of 25."""
-    arcs, angle, radius, found = 10, 3.2, 1.3, {}
-    end = ca.DM([radius * np.cos(angle), radius * np.sin(angle)])
-    speed = ca.DM([-np.sin(angle), np.cos(angle)]) / np.sqrt(radius)
-    ahead = 0.4 * np.arange(1, arcs + 1)
-    guess = np.stack([np.cos(ahead), np.sin(ahead), -np.sin(ahead), np.cos(ahead)], axis=1)
-    for exact in (True, False):
-        flow = casadi_flow(kepler(), steps=8, hessian=exact)
-        impulses, nodes = ca.MX.sym("impulses", 2, arcs), ca.MX.sym("nodes", 4, arcs)
-        now, jumps = ca.DM([1.0, 0.0, 0.0, 1.0]), []
-        for k in range(arcs):
-            to = flow(q=now[:2], p=now[2:] + impulses[:, k], parameters=1.0, h=0.05)
-            jumps.append(ca.vertcat(to["q1"], to["p1"]) - nodes[:, k])
-            now = nodes[:, k]
-        program = {
-            "x": ca.vertcat(ca.vec(impulses), ca.vec(nodes)),
-            "f": ca.sumsqr(impulses),
-            "g": ca.vertcat(*jumps, now - ca.vertcat(end, speed)),
-        }
-        how = GRADIENTS | {"ipopt.tol": 1e-10, "ipopt.hessian_approximation": "exact" if exact else "limited-memory"}
-        solver = ca.nlpsol("solver", "ipopt", program, how)
-        solved = solver(x0=np.concatenate([np.zeros(2 * arcs), guess.ravel()]), lbg=0.0, ubg=0.0)
-        assert solver.stats()["success"]
-        found[exact] = solver.stats()["iter_count"], float(solved["f"])
-    assert_allclose(found[True][1], found[False][1], rtol=1e-8)
-    assert found[True][0] < found[False][0] / 2, found
-
-
 def test_failed_step_and_missing_arguments_fail_the_call():
     flow = casadi_flow(kepler(), steps=3)
     with pytest.raises(RuntimeError, match="Evaluation failed"):

@@ -67,26 +67,6 @@ def test_names_of_constants_are_unrestricted():
     assert float(found["p1"]) == pytest.approx(float(exact.p[0]), abs=1e-13)
 
 
-def test_second_derivatives_of_a_flow_are_the_differences_of_its_gradients():
-    system, steps, at = sc.problem("planar-pendulum").system, 5, np.array([1.0, 0.3])
-    values = list(system.defaults)
-    step = sc.casadi_step(system, sc.SVI(2), solved=True)
-    x = ca.MX.sym("x", 2)
-    one = ca.Function("one", [x], [ca.vertcat(*step(x[0], x[1], NO_INPUTS, values, 0.0, 0.2)[:2])])
-    end = one.mapaccum(steps)(x)[0, -1]
-    hessian = ca.Function("hessian", [x], [ca.hessian(end, x)[0]])(at).full()
-    stepper = sc.compile_stepper(system, sc.SVI(2), flags=QUICK_FLAGS)
-
-    def gradient(state):
-        run = stepper.integrate(state[:1], state[1:], h=0.2, steps=steps)
-        found = run.pullback(np.eye(2 * (steps + 1))[-2].reshape(-1, 2))
-        return np.concatenate([found.q, found.p])
-
-    differences = [(gradient(at + e) - gradient(at - e)) / 2e-4 for e in 1e-4 * np.eye(2)]
-    assert abs(hessian).min() > 1e-2
-    assert_allclose(hessian, differences, rtol=1e-6)
-
-
 def test_unsupported_methods_are_reported():
     with pytest.raises(sc.MethodError, match=r"degree must be at most 3"):
         sc.casadi_step(TOWED, sc.SVI(2), degree=4)

@@ -66,11 +66,6 @@ class TestHelp:
             else:
                 output_of(*words)
 
-    def test_version(self):
-        from scvi_codegen import __version__
-
-        assert output_of("--version") == f"scvi-codegen, version {__version__}\n"
-
     @pytest.mark.parametrize(("word", "printed"), [("--help", "Usage"), ("--version", "version")])
     def test_the_overview_does_not_wait_for_sympy_or_numpy(self, word, printed):
         script = (
@@ -97,9 +92,6 @@ class TestHelp:
         completion = ShellComplete(main, {}, "scvi-codegen", "_SCVI_CODEGEN_COMPLETE")
         found = completion.get_completions(typed[:-1], typed[-1])
         assert {item.value for item in found if item.type == "plain"} == offered
-
-    def test_a_mistyped_command_is_a_usage_error(self):
-        assert "there is no command" in error_of("rum", "kepler")
 
 
 class TestChoices:
@@ -149,13 +141,6 @@ class TestChoices:
     def test_selected_quadrature_is_retained_for_another_degree(self):
         save_model(replace(chosen(), method=SVI(3, "clenshaw-curtis:7")), "a.toml")
         assert chosen("a.toml", degree=4).method == SVI(4, "clenshaw-curtis:7")
-
-    def test_states_and_step_sizes_are_read(self):
-        model = chosen(q=(1.0, 0.0), p=(0.0, 1.0), time=2.0, step=-0.5, steps=7, save_every=2, parameter=(("mu", 3.0),))
-        assert (model.q, model.p, model.velocity, model.t) == ((1.0, 0.0), (0.0, 1.0), None, 2.0)
-        assert (model.h, model.steps, model.span, model.save_every) == (-0.5, 7, None, 2)
-        assert model.system.defaults == (3.0,)
-        assert chosen(step=0.5).step_count == 400
 
     @pytest.mark.tiers(14, 35)
     @pytest.mark.parametrize(
@@ -275,19 +260,6 @@ class TestRun:
             shutil.rmtree("b.run")
 
     @pytest.mark.second
-    def test_step_of_an_ensemble_is_advised_for_all_of_its_states(self):
-        Path("g.toml").write_text("[grid]\nq1 = [0.9, 0.5]\n")
-        words = ("run", "kepler", "--q", "1,0", "--velocity", "0,1", "--span", "20", "--method", "svi:6")
-        text = output_of(*words, "--advise", "1e-6", "--ensemble", "g.toml", "-o", "a.npz")
-        assert "Of 2 trajectories, number 1 (from 0) has the largest error." in text
-        with np.load("a.npz") as saved:
-            ends = saved["q"][-1]
-        stepper = compile_stepper(problem("kepler").system, SVI(8))
-        for start, end in zip((0.9, 0.5), ends, strict=True):
-            exact = stepper.integrate([start, 0.0], velocity=[0.0, 1.0], t_end=20.0).q[-1]
-            assert np.linalg.norm(end - exact) < 1e-6 * np.linalg.norm(exact)
-
-    @pytest.mark.second
     def test_energy_drift_is_detected(self):
         text = output_of("run", "kepler", "--method", "explicit-euler", "--step", "0.001", "--span", "10")
         assert float(re.search(r"drift (\S+) over", text)[1]) > 1e-3
@@ -298,33 +270,12 @@ class TestRun:
             "run", "kepler", "--method", "explicit-euler", "--step", "0.1", "--span", "10"
         )
 
-    @pytest.mark.second
-    @pytest.mark.parametrize("option", ["--quiet", "--json"])
-    def test_far_too_long_step_warns_for_every_output_format(self, option):
-        """One point and a step of a quarter of the period: the energy of so few states is constant, by chance."""
-        words = ("run", "harmonic-oscillator", "--degree", "2", "--quadrature", "gauss-legendre:1", "--steps", "40")
-        result = invoke(*words, "--step", "1.5", option)
-        assert re.search(r"Warning: the step from t = \S+ is too large: .* use a smaller --step", result.stderr)
-        assert "too long" not in invoke("run", "harmonic-oscillator", option).stderr
-
-    @pytest.mark.second
-    def test_long_states_are_abbreviated(self):
-        text = output_of("run", "fput-chain:9", "--steps", "3")
-        assert "and 3 more coordinates" in text
-        assert "q7" not in text
-
     def test_fewer_steps_than_save_every_and_no_steps(self):
         assert "3 steps of 0.25 from t = 0 to t = 0.75; 1 state saved" in output_of(
             "run", "kepler", "--steps", "3", "--save-every", "5", "-o", "a.npz"
         )
         assert "0 steps of 0.25" in output_of("run", "kepler", "--steps", "0", "-o", "a.npz")
         assert len(arrays("a.npz")["t"]) == 1
-
-    def test_states_beyond_memory_are_saved_as_advised(self, monkeypatch):
-        monkeypatch.setattr("scvi_codegen.codegen.native.capacity.usable_memory", lambda: 20_000.0)
-        save_every = re.search(r"--save-every (\d+)", error_of("run", "kepler", "--steps", "1000"))[1]
-        assert 1 < int(save_every) < 10
-        assert "1000 steps" in output_of("run", "kepler", "--steps", "1000", "--save-every", save_every)
 
     @pytest.mark.parametrize("inputs", ["", "inputs = ['u']\n[forces]\nx = 'u'\n[inputs]\nu = {file = 'u.csv'}\n"])
     def test_adaptive_run_that_fills_the_memory_writes_its_states(self, inputs, monkeypatch):
@@ -369,17 +320,6 @@ class TestRun:
         assert np.array_equal(written["t"], 0.01 * np.arange(step + 1))
         assert np.isfinite(written["q"]).all()
 
-    @pytest.mark.second
-    def test_failure_of_the_first_step_is_one_short_message(self):
-        result = invoke("run", "double-pendulum", "--step", "5", status=1)
-        assert "Error: step 0 at t = 0 with h = 5 failed" in result.stderr
-        assert "the initial state was not written to a file (-o, --plot)" in result.stderr
-        assert "energy" not in result.stdout
-
-    def test_missing_compiler_is_a_failure(self, monkeypatch):
-        monkeypatch.setenv("CC", "no-such-compiler")
-        assert "CC ('no-such-compiler') was not found" in error_of("run", "kepler", status=1)
-
     def test_unwritable_folders_are_found_before_the_run(self, tmp_path, monkeypatch):
         monkeypatch.setattr(os, "access", lambda path, mode: False)
         assert "is not writable" in error_of("run", "kepler", "-o", str(tmp_path / "a.npz"))
@@ -410,24 +350,9 @@ class TestInstalledCommand:
         assert process.communicate(timeout=300) == ("", "Error: interrupted\n")
         assert process.returncode == 130
 
-    def test_statuses_reach_the_shell_and_messages_stderr(self):
-        for words, status in ((["run", "kepler", "--steps", "5"], 0), (["run", "keplr"], 2), (["--help"], 0)):
-            result = subprocess.run([COMMAND, *words], capture_output=True, text=True, check=False)
-            assert result.returncode == status
-            assert bool(result.stderr) == bool(status)
-
     def test_closed_pipe_is_not_an_error(self):
         result = subprocess.run(f"{COMMAND} systems | head -1", shell=True, capture_output=True, text=True, check=False)
         assert result.stderr == ""
-
-
-class TestDerive:
-    words = ("derive", "planar-pendulum", "--degree", "2")
-
-    def test_derive_writes_latex_to_a_file(self):
-        result = invoke(*self.words, "--latex", "-o", "step.tex")
-        assert (result.exit_code, result.stdout) == (0, "")
-        assert r"\tag{27a}" in Path("step.tex").read_text()
 
 
 class TestListings:

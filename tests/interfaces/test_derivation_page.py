@@ -15,7 +15,6 @@ from browsing import (
     assert_nothing_sticks_out,
     opened,
 )
-from commands import error_of
 from html_page import Page
 from notation import hamilton, lagrange
 
@@ -190,9 +189,6 @@ class TestPage:
         assert count > 1000
         assert f"/* .. {count - MOST_LINES} more lines */" in page
 
-    def test_equal_derivations_give_equal_pages(self):
-        assert derivation_html(sc.problem("kepler").system, sc.SVI(2)) == kepler_page(sc.SVI(2))
-
 
 @pytest.mark.tiers(0, 3)
 @pytest.mark.parametrize(("size", "scheme"), VIEWS)
@@ -219,19 +215,6 @@ def test_page_renders_in_a_browser(browser, tmp_path, size, scheme):
             below = left[2] <= right[1] and left[0] == right[0]
             assert extra if size == "desk" else below
         assert view.evaluate("[...document.querySelectorAll('svg')].every(e => e.getBoundingClientRect().width > 200)")
-
-
-class TestCommand:
-    @pytest.mark.parametrize("more", [["--latex"], ["--radicals"], ["-o", "text"]])
-    def test_html_and_text_output_are_exclusive(self, more, tmp_path):
-        assert "--html excludes --latex, --radicals and -o" in error_of(
-            "derive", "kepler", "--html", tmp_path / "page.html", *more
-        )
-        assert list(tmp_path.iterdir()) == []
-
-    @pytest.mark.rotated
-    def test_missing_folder_is_named(self):
-        assert "there is no folder 'no'" in error_of("derive", "kepler", "--html", "no/page.html")
 
 
 @pytest.mark.rotated

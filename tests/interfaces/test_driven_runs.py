@@ -84,16 +84,6 @@ def test_missing_input_is_reported():
     assert "final state" in output_of(*RUN, "--input", "u=u.csv")
 
 
-@pytest.mark.second
-def test_failing_step_saves_the_preceding_segments(model):
-    """Towards the end the push has no numbers left."""
-    Path("pushed.toml").write_text(MODEL.replace('q = "u"', 'q = "sqrt(u + 0.5)"'))
-    assert "states computed before were written: run.csv" in error_of(*RUN, "-o", "run.csv", status=1)
-    found = np.loadtxt("run.csv", delimiter=",", skiprows=1)
-    assert 1.0 < found[-1, 0] < 1.5
-    assert 1.0 in found[:, 0]
-
-
 def test_signal_stops_a_run_between_chunks(model, monkeypatch):
     advance, sent = Run._advance, []
 

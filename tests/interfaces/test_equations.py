@@ -1,6 +1,5 @@
 """The closed form: the paper's own example, names and displays; ``test_printed_formulas.py`` solves what is printed."""
 
-import re
 import textwrap
 
 import numpy as np
@@ -10,9 +9,6 @@ from notation import lagrange
 from sympy import sin, sqrt
 
 import scvi_codegen as sc
-from scvi_codegen.common.display.mathml import latex_name
-from scvi_codegen.interfaces.derivation.notation import readable
-from scvi_codegen.methods.discretise import paper_equations
 
 KEPLER, PENDULUM = (sc.problem(name).system for name in ("kepler", "planar-pendulum"))
 UNIT = {"m": 1, "l": 1, "g": 1}
@@ -44,35 +40,12 @@ def test_derivation_names_avoid_names_of_the_system():
     assert not {symbol.name for symbol in symbols} & {"q", "h", "w_1"}
 
 
-def test_equations_have_displays():
-    derived = sc.derive(KEPLER, sc.SCVI(2))
-    assert "lambda_1_q1" in derived.to_text()
-    assert r"\tag{34d}" in derived._repr_latex_()
-    assert derived._repr_latex_().count(r"\begin{align*}") == 3  # equations, tables, momentum maps
-    symbols = set().union(*(e.residual.free_symbols for e in derived.equations))
-    names = {symbol: latex_name(symbol.name) for symbol in symbols}
-    written = [sympy.latex(readable(e.residual), symbol_names=names) for e in derived.equations]
-    assert re.findall(r"^0 &= (.*) \\tag", derived.to_latex(), re.MULTILINE) == written
-    kinds = {e.kind for e in derived.stage_equations}
-    assert kinds == {"stage", "multiplier"}
-    assert [e.number for e in derived.idel_equations] == ["34d", "34d", "34e", "34e"]
-    assert derived.jacobian.shape == (10, 10)
-
-
 def test_numbers_of_many_digits_are_shown_as_decimals():
     mass = sympy.Rational(1234567, 10**7)
     derived = sc.derive(lagrange("numbers", "q", f"{mass}*q_dot**2/2 - q**4/3"), sc.SVI(1, "gauss-legendre:2"))
     assert "L = -q**4/3 + 0.06172835*q_dot**2" in derived.to_text()
     shown = (derived.to_text(), derived.to_latex(), derived.equations[0].residual)
     assert ["1234567" in str(each).replace("0.1234567", "") for each in shown] == [False, False, True]
-
-
-def test_singular_hamiltonians_have_no_printed_equations_where_velocities_are_needed():
-    """H = x y determines no velocities: a method in position form has no step to print."""
-    shear = sc.HamiltonianSystem.from_text(name="shear", coordinates=["x"], momenta=["y"], hamiltonian="x*y")
-    assert not shear.is_regular
-    with pytest.raises(sc.MethodError, match="singular"):
-        paper_equations(shear, sc.Gauss(2, form="position"))
 
 
 @pytest.mark.parametrize("method", [sc.Composition(4), sc.StoermerVerlet("drift-kick-drift")], ids=lambda m: m.name)

@@ -121,19 +121,6 @@ def test_state_is_that_of_the_formulas():
     assert (model.parameters["k"], model.array_system.defaults) == (2.0, (2.0,))
 
 
-def test_models_have_the_mesh_of_their_density():
-    model = parse_model(SCHROEDINGER)
-    assert model.mesh is model.system.mesh is not None
-    assert model.stepper().interface.layout.mesh is not None
-
-
-@pytest.mark.rotated
-def test_models_with_known_sizes_keep_the_mesh():
-    model = parse_model(SCHROEDINGER).with_known_sizes()
-    assert model.stepper().interface.layout.mesh is model.mesh is not None
-    assert model == parse_model(SCHROEDINGER).with_known_sizes()
-
-
 def test_long_states_are_written_to_tables(tmp_path):
     model = parse_model(SCHROEDINGER.replace("points = 48", "points = 1200"))
     sc.save_model(model, tmp_path / "long.toml")
@@ -174,9 +161,3 @@ def test_commands_accept_a_density(here):
     assert "the system has no parameter 'z'" in error_of("run", "nls.toml", "--parameter", "z=0.5")
     invoke("generate", "nls.toml", "-o", "nls_svi")
     assert sc.load_model("nls_svi/model.toml") == parse_model(SCHROEDINGER)
-
-
-@pytest.mark.full
-def test_verify_measures_the_integrator_of_a_file(here):
-    Path("nls.toml").write_text(SCHROEDINGER)
-    assert "reversal at full size" in output_of("verify", "nls.toml")

@@ -1,9 +1,7 @@
 """FMUs: what describes them, and what they compute through FMI's functions, bit for bit what the stepper computes."""
 
 import importlib.util
-import re
 import subprocess
-import uuid
 import zipfile
 from ctypes import byref, c_bool, c_char_p, c_double, c_size_t, c_uint32, c_void_p
 from dataclasses import replace
@@ -203,19 +201,6 @@ def test_communication_steps_of_any_length_are_divided_equally(fmu):
     assert_allclose(one.get("t"), 1.001, rtol=1e-15)
 
 
-@pytest.mark.second
-def test_million_rounded_communication_points_are_reached(fmu):
-    """An importer adds its step to its time; both drift apart by rounding, and no error comes of it."""
-    one, t = Slave(fmu), 0.5
-    assert one.start(t) == OK
-    for _ in range(3000):
-        assert one.step(t, 0.3) == OK
-        t += 0.3
-        assert abs(one.last - t) < 1e-9 * H + 1e-15 * t
-    assert one.call("Terminate") == OK
-    assert one.step(t, 0.3) == ERROR
-
-
 def test_saved_fmu_state_continues_bitwise_also_from_bytes(fmu):
     one, other = Slave(fmu), Slave(fmu)
     assert one.start(0.5) == one.step(0.5, 3 * H) == OK
@@ -281,39 +266,6 @@ def test_forbidden_calls_are_errors_with_a_reason(fmu):
     one.call("FreeInstance")
 
 
-def test_all_unsupported_functions_are_errors_with_their_name(fmu):
-    one = Slave(fmu)
-    [library] = (fmu.folder / "binaries").glob("*/*")
-    exported = {name.decode()[4:] for name in re.findall(rb"fmi3[A-Z]\w+", library.read_bytes())}
-    text = next(
-        text
-        for name, text in fmu_module._texts(pushed(), "push")[1].items()
-        if name.endswith("support/frameworks/fmu_unsupported.h")
-    ).decode()
-    absent = set(re.findall(r"^(?:ABSENT|NO_MODE)\((\w+)", text, re.MULTILINE))
-    assert absent < exported
-    assert len(absent) > 30
-    assert len(exported) == 75  # all functions of the standard
-    for name in absent:
-        assert one.call(name, *[c_void_p()] * 8) == ERROR
-        assert one.log[-1][2] == f"this FMU does not support fmi3{name}"
-    kinds = re.findall(r"^NO_VARIABLES\((\w+)", text, re.MULTILINE)
-    assert len(kinds) == 11
-    for kind in kinds:
-        for way in ("Get", "Set"):
-            assert one.call(f"{way}{kind}", None, c_size_t(0), None, c_size_t(0)) == OK
-            assert one.call(f"{way}{kind}", (c_uint32 * 1)(1), c_size_t(1), None, c_size_t(1)) == ERROR
-            assert one.log[-1][2] == f"this FMU has no variables of type {kind}"
-    for kind in ("ModelExchange", "ScheduledExecution"):
-        function = getattr(fmu.library, f"fmi3Instantiate{kind}")
-        function.restype = c_void_p
-        flags, environment = [c_bool(False)] * 2, c_void_p()
-        callbacks = [one._log, *[c_void_p()] * (0 if kind == "ModelExchange" else 3)]
-        before = len(one.log)
-        assert function(b"one", fmu.token, None, *flags, environment, *callbacks) is None
-        assert one.log[before:] == [(ERROR, b"logStatusError", "this FMU supports only co-simulation")]
-
-
 def test_version_and_start_time(fmu):
     fmu.library.fmi3GetVersion.restype = c_char_p
     assert fmu.library.fmi3GetVersion() == b"3.0"
@@ -328,31 +280,6 @@ def test_failed_instantiation_returns_null(fmu):
         one = Slave(fmu, **given)
         assert one.one.value is None
         assert one.log[-1][0] == ERROR
-
-
-def test_the_instantiation_token_identifies_the_model():
-    """The token is the same for equal models, and another for another state, step size, parameter or method."""
-
-    def token(model):
-        files = fmu_module._texts(model, "push")[1]
-        found = ElementTree.fromstring(files["modelDescription.xml"]).get("instantiationToken")
-        assert any(found.encode() in text for name, text in files.items() if name.startswith("sources/"))
-        return found
-
-    model = pushed()
-    others = [
-        replace(model, q=(0.4,)),
-        replace(model, velocity=(0.6,)),
-        replace(model, h=0.05),
-        replace(model, t=0.0),
-        replace(model, method=sc.SVI(3)),
-        replace(model, system=model.system.with_parameters(m=1.6)),
-        pushed(p=(0.4,)),
-    ]
-    tokens = [token(each) for each in (model, *others)]
-    assert token(pushed()) == tokens[0]
-    assert len(set(tokens)) == len(tokens)
-    assert all(each == f"{{{uuid.UUID(each)}}}" for each in tokens)
 
 
 def test_discards_are_logged_if_requested(fmu):
@@ -499,12 +426,3 @@ class TestPlatforms:
         words = ("generate", "kepler", "--platform", "x86_64-windows", "-o", tmp_path / "kepler")
         assert "--platform requires --fmu" in error_of(*words)
         assert list(tmp_path.iterdir()) == []
-
-
-class TestByFMPy:
-    """The same checks with the importer FMPy."""
-
-    def test_fmpy_validates_the_model_and_the_schema(self, fmu, tmp_path):
-        validation = pytest.importorskip("fmpy.validation", reason="FMPy is not installed")
-        path = sc.generate_fmu(pushed(), tmp_path / "pushed.fmu")
-        assert validation.validate_fmu(str(path)) == []

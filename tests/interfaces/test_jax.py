@@ -1,6 +1,5 @@
 """A flow in JAX: against leapfrog written in JAX, closed forms and runs; its transformations, and what it refuses."""
 
-import pickle
 import re
 import subprocess
 import sys
@@ -112,23 +111,6 @@ def test_a_jacobian_linearises_a_trajectory_once():
         assert len(calls) == 1
         assert "(tensor<7xf64>, tensor<2x" in calls[0]  # one start, both columns or rows
         assert "callback" not in text
-
-
-COPIED = """
-import pickle, sys, jax
-jax.config.update("jax_enable_x64", True)
-flow = pickle.load(open(sys.argv[1], "rb"))
-print(float(flow(jax.numpy.array([0.5, 0.0]), jax.numpy.array([0.0, 1.6]), h=0.1)[0][0]).hex())
-"""
-
-
-def test_result_is_equal_in_another_process(tmp_path):
-    flow = sc.jax_flow(kepler(), steps=5)
-    here = flow(jnp.array([0.5, 0.0]), jnp.array([0.0, 1.6]), h=H)[0][0]
-    (tmp_path / "flow").write_bytes(pickle.dumps(flow))
-    command = [sys.executable, "-c", COPIED, str(tmp_path / "flow")]
-    result = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert result.stdout.split() == [float(here).hex()]
 
 
 def test_inputs_with_zero_order_hold_are_parameters():

@@ -55,14 +55,6 @@ def test_quiet_prints_nothing_and_json_prints_one_document(words):
     assert json_of(*words)
 
 
-@pytest.mark.second
-def test_failed_run_reports_how_far_it_got():
-    found = json_of("run", "kepler", "--q", "1,0", "--velocity", "0,0", "--tolerance", "1e-9", "--span", "3", status=1)
-    assert "step" in found["failure"]
-    assert re.fullmatch(r"the run ended at t = 1\.1\d*, before t = 3", found["missed"])
-    assert 1.0 < found["final"]["t"] < math.pi / 8**0.5
-
-
 @pytest.mark.parametrize(
     ("words", "status", "error"),
     [
@@ -91,23 +83,6 @@ def test_errors_are_entries_of_the_document(words, status, error):
     assert found["exit_status"] == status
     assert found["message"] in result.stderr
     assert all(type(found[name]) is type(value) for name, value in error.items())
-
-
-@pytest.mark.second
-def test_json_of_several_momentum_maps():
-    """Explicit steps do not conserve the angular momentum."""
-    Path("spiral.toml").write_text(
-        '[system]\nname = "spiral"\ncoordinates = ["z", "x", "y"]\n'
-        'lagrangian = "(x_dot**2 + y_dot**2 + z_dot**2)/2 - x**2/2 - y**2/2"\n'
-        '[method]\nmethod = "explicit-euler"\n[run]\nstep = 0.1\nsteps = 20\n'
-        "[initial]\nq = [0.1, 1.0, 0.0]\nq_dot = [0.3, 0.0, 0.7]\n"
-    )
-    found = json_of("run", "spiral.toml")["momentum_errors"]
-    assert found["momentum of z"] < 1e-15 > found["boost of z"]
-    assert found["angular momentum z"] > 0.1
-    run = sc.load_model("spiral.toml").integrate()
-    assert list(found) == list(run.stepper.momentum_map_names)
-    assert [*found.values()] == np.abs(run.momentum_errors()).max(axis=0).tolist()
 
 
 @pytest.mark.second
@@ -186,13 +161,6 @@ def test_json_of_paths_is_that_of_the_model_file_and_of_the_interface():
         (("--q", "1", "--to", "0.3", "--span", str(math.pi), "--step", "0.2"), 1, "no path was found"),
     ):
         assert message in invoke("path", "harmonic-oscillator", *wrong, status=status).output
-
-
-@pytest.mark.rotated
-def test_certificate_equals_the_saved_one():
-    found = json_of("verify", "planar-pendulum", "--method", "svi:1", "-o", "certificate.json")
-    assert found == json.loads(Path("certificate.json").read_text())
-    assert any(check["name"].startswith("identity") for check in found["checks"])
 
 
 @pytest.mark.parametrize(

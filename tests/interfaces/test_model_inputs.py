@@ -1,14 +1,9 @@
 """Inputs of models: tables in files or inline, round trips, and messages on faulty ones."""
 
-import re
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from notation import lagrange
-from numpy.testing import assert_allclose
 
-from scvi_codegen import LagrangianSystem, Model, ModelFileError, compile_stepper, load_model, save_model
+from scvi_codegen import LagrangianSystem, Model, ModelFileError, compile_stepper, load_model
 from scvi_codegen.interfaces.models.input_tables import InputTable
 from scvi_codegen.interfaces.models.model_files.model_file import parse_model
 
@@ -51,33 +46,6 @@ def file(tmp_path):
 
 def _write(path, header):
     path.write_text("\n".join([header, "", *(f"{t!r}, {u!r}" for t, u in zip(T, U, strict=True))]) + "\n")
-
-
-def test_momenta_use_the_inputs_at_the_start():
-    system = lagrange("growing", "q", "(1 + u)*q_dot**2/2", inputs="u")
-    model = Model(
-        system=system, method="svi:2", q=(0.0,), velocity=(3.0,), h=0.1, span=0.5, t=1.0, inputs={"u": ([0, 2], [0, 2])}
-    )
-    stepper = compile_stepper(system, model.method)
-    assert_allclose(model.momenta(stepper), [6.0])
-    back = replace(model, h=-0.1, inputs={"u": ([0.0, 1.0, 2.0], [1.0, 4.0, 4.0], "constant")})
-    assert_allclose(back.momenta(stepper), [6.0])
-
-
-@pytest.mark.parametrize(
-    "lagrangian",
-    [
-        "q_dot**2/2 + (1 + w)*cos(q) - 3*u*q",
-        "(1 + w)*q_dot**2/2 - u**2*q**2 + sin(w + 2*u)*q",
-        "q_dot**2/2 - (u + w - q)**2 - (u - w)/2*q + 3*(u + 1)*q",
-    ],
-)
-def test_formulas_use_the_names_of_inputs(lagrangian, tmp_path):
-    system = lagrange("pushed", "q", lagrangian, inputs="u w", forces={"q": "-2*u"})
-    assert not re.search("[uw]_[0123t]", system.to_text())
-    model = Model(system=system, method="svi:4", q=(0.1,), p=(0.0,), h=0.1, span=1.0, inputs={"u": (T, U, "constant")})
-    save_model(model, tmp_path / "model.toml")
-    assert load_model(tmp_path / "model.toml") == model
 
 
 @pytest.mark.parametrize("header", ["t,value", "t,acceleration", "t,u"])

@@ -11,7 +11,6 @@ from commands import error_of
 
 import scvi_codegen as sc
 from scvi_codegen import ModelFileError, StateError, SystemDefinitionError, generate_package
-from scvi_codegen.analysis.advice.largest_step import REFINEMENTS, largest_step
 from scvi_codegen.interfaces.models.model_files.model_file import catalogue_model, dump_model, parse_model
 
 pytestmark = pytest.mark.second
@@ -75,19 +74,6 @@ def test_unsuitable_time_transformation_is_reported(controller: str) -> None:
     assert "use another time transformation" in error_of(f"{FAR} {controller}", status=1)
 
 
-@pytest.mark.quick
-@pytest.mark.sampled(2)
-@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
-@pytest.mark.parametrize("tolerance", [0.0, 1e-8])
-def test_largest_step_satisfies_the_tolerance_and_a_larger_one_does_not(unit: float, tolerance: float) -> None:
-    kepler, start = sc.problem("kepler").system, ([1.9, 0.0], [0.0, (0.1 / 1.9) ** 0.5])
-    stepper = sc.compile_stepper(kepler, sc.SVI(8), time_transformation=f"{unit}*(q1**2 + q2**2)**(3/4)")
-    h = largest_step(stepper, *start, 20.0, tolerance)
-    errors = [stepper.integrate(*start, h=x, t_end=20.0).step_error for x in (h, h * 2 ** (1 / REFINEMENTS))]
-    assert errors[0] <= (tolerance or 2.0**-53) < errors[1]
-    assert largest_step(stepper, *start, -20.0, tolerance) == h
-
-
 def test_integrate_uses_the_controller(shaken: Path) -> None:
     model = sc.load_model(shaken)
     state: Any = [*model.q, *(model.p or ())]
@@ -124,14 +110,6 @@ def test_integrate_uses_the_controller(shaken: Path) -> None:
 )
 def test_unsupported_combinations_with_a_controller_are_reported(shaken: Path, words: str, printed: str) -> None:
     assert printed in " ".join(error_of(*words.replace("FILE", str(shaken)).split()).split())
-
-
-def test_python_and_the_command_line_choose_the_same_step_of_tau() -> None:
-    model = parse_model(SHAKEN.replace("step = 0.1", "tolerance = 1e-9"))
-    run = model.integrate()
-    assert run.plan == model.start().plan
-    assert run.t[-1] == 12.0
-    assert run.plan.tau > 0.0
 
 
 @pytest.mark.quick

@@ -13,9 +13,6 @@ pytest.importorskip("casadi", reason="needs the extra 'casadi'")
 
 POINT = lagrange("point", "x", "x_dot**2/2", forces={"x": "u"}, inputs="u")
 SWING = lagrange("swing", "q", "(1 + a)*q_dot**2/2 + cos(q)", a=0.5, forces={"q": "u"}, inputs="u")
-ROTORS = lagrange(
-    "rotors", "theta a", "theta_dot**2 + (theta_dot + a_dot)**2*(2 + cos(a))/2", forces={"a": "u"}, inputs="u"
-)
 REST = {"start": {"x": 0.0, "x_dot": 0.0}, "end": {"x": 1.0, "x_dot": 0.0}}
 UP = {
     "steps": 12,
@@ -91,27 +88,6 @@ def test_path_bounds_hold_at_the_quadrature_points():
     assert free.cost < motion.cost
 
 
-def test_hamiltonian_has_the_same_solution():
-    motions = [sc.optimal_control(system, sc.SVI(2), **UP) for system in (SWING, sc.hamiltonian_of(SWING))]
-    assert_allclose(motions[1].q, motions[0].q, atol=1e-6)
-    assert motions[1].cost == pytest.approx(motions[0].cost, rel=1e-8)
-
-
-def test_momentum_without_input_is_conserved():
-    at_rest = {"a": 0.0, "theta_dot": 0.0, "a_dot": 0.0}
-    motion = sc.optimal_control(
-        ROTORS,
-        sc.SVI(2),
-        steps=10,
-        duration=4.0,
-        start={"theta": 0.0, **at_rest},
-        end={"theta": 1.0, "theta_dot": 0.0, "a_dot": 0.0},
-        cost="u**2",
-    )
-    assert abs(motion.p[:, 0]).max() < 1e-14
-    assert abs(motion.q[-1, 0] - 1.0) < 1e-8
-
-
 def test_unreachable_end_is_an_error_with_the_last_iterate():
     with pytest.raises(sc.ControlError, match=r"no optimal control was found: IPOPT ended with .* after") as raised:
         sc.optimal_control(POINT, sc.SVI(1), steps=4, duration=1.0, bounds={"u": (-0.1, 0.1)}, **REST)
@@ -163,35 +139,6 @@ def test_constraints_hold_and_the_optimum_is_that_in_the_angle():
     stepper = sc.compile_stepper(BOB, sc.SVI(3, "gauss-lobatto:4"), flags=QUICK_FLAGS)
     again = stepper.integrate(held.q[0], held.p[0], inputs=held.inputs, h=held.h, t_end=2.0)
     assert_allclose(again.q, held.q, atol=1e-9)
-
-
-def test_skate_moves_along_its_blade():
-    """A skate, turned and pushed by inputs: constraints of velocities; it parks aside without a step aside."""
-    skate = sc.LagrangianSystem.from_text(
-        name="skate",
-        coordinates=["x", "y", "a"],
-        lagrangian="(x_dot**2 + y_dot**2 + a_dot**2)/2",
-        constraints=["x_dot*sin(a) - y_dot*cos(a)"],
-        forces={"x": "u*cos(a)", "y": "u*sin(a)", "a": "w"},
-        inputs=["u", "w"],
-    )
-    method = sc.SVI(2, "gauss-lobatto:3")
-    rest = {"x_dot*cos(a) + y_dot*sin(a)": 0.0, "a_dot": 0.0}
-    parked = sc.optimal_control(
-        skate,
-        method,
-        steps=12,
-        duration=3.0,
-        start={"x": 0.0, "y": 0.0, "a": 0.0, **rest},
-        end={"x": 1.0, "y": 0.3, "a": 0.0, **rest},
-        cost="u**2 + w**2",
-        degree=1,
-    )
-    stepper = sc.compile_stepper(skate, method, flags=QUICK_FLAGS)
-    again = stepper.integrate(parked.q[0], parked.p[0], inputs=parked.inputs, h=parked.h, t_end=3.0)
-    assert_allclose(again.q, parked.q, atol=1e-8)
-    assert_allclose(parked.q[-1], [1.0, 0.3, 0.0], atol=1e-9)
-    assert np.abs(again.constraint_values()[1]).max() < 1e-10
 
 
 def test_constraint_that_depends_on_an_input_is_rejected():

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from notation import lagrange
 from numpy.testing import assert_allclose
-from style import check_style
 
-from scvi_codegen import SVI, Model, StoermerVerlet, compile_stepper, load_package
+from scvi_codegen import SVI, Model, compile_stepper, load_package
 from scvi_codegen.interfaces.models.packages.package import generate_package
-from scvi_codegen.runs.driver.segments import checked_inputs, parameters_of, prepared_segments
+from scvi_codegen.runs.driver.segments import checked_inputs
 from scvi_codegen.systems.event import Event, impact
 
 KNOTS, VALUES = (0.0, 0.37, 0.9, 1.41, 2.05, 2.6), (0.0, 1.2, -0.7, 0.4, 1.9, -1.0)
@@ -54,34 +53,6 @@ def test_events_of_a_system_with_inputs(model, h, restitution, tmp_path):
     assert_allclose(states[-1, :3], [2.3, run.q[-1, 0], run.p[-1, 0]], rtol=0, atol=1e-11)
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_segments_in_c_equal_those_in_python(model, seed):
-    """Breakpoints anywhere, some of them together, or a rounding apart; steps that are longer than pieces."""
-    generator = np.random.default_rng(seed)
-    times = np.unique(np.concatenate([[-0.1, 3.1], generator.uniform(0.0, 3.0, 12), 0.1 * np.arange(9)]))
-    other = np.unique(np.concatenate([times[::3], np.nextafter(times[1::3], 9.0), [-0.1, 3.1]]))
-    given = {"u": (times, generator.normal(size=len(times)), "cubic")}
-    given["w"] = other, generator.uniform(0, 0.1, len(other))
-    stepper = compile_stepper(model.system, model.method)
-    t, end = ((0.0, 3.0), (3.0, 0.05))[seed % 2]
-    h = np.copysign(generator.uniform(0.05, 0.3), end - t)
-    inputs = checked_inputs(stepper.interface, given)
-    ours, theirs = (stepper.start([0.3], [0.1], h=h, t=t) for _ in range(2))
-    table, saved = _tables(stepper, inputs)
-    values = np.array(stepper.defaults)
-    next_steps = stepper.binding.function("next_steps")
-    for n in prepared_segments(ours, inputs, end, parameters_of(stepper, None, inputs)):
-        ours.advance(n)
-        assert next_steps(theirs._memory, end, h, table, stepper.binding.pointer(values)) == n
-        assert theirs.h == ours.h
-        assert (values == ours.parameters).all()
-        theirs.update(parameters=values)
-        theirs.advance(n)
-    assert next_steps(theirs._memory, end, h, table, stepper.binding.pointer(values)) == 0
-    assert len(saved) == 4
-    assert (theirs.t, theirs.q, theirs.p) == (ours.t, ours.q, ours.p)
-
-
 def test_step_longer_than_the_segment_is_shortened(model):
     stepper = compile_stepper(model.system, model.method)
     given = {"u": ([0.0, 0.4, 1.0], [0.1, 0.2, 0.3]), "w": ([0.0, 1.0], [0.0, 0.0])}
@@ -121,10 +92,3 @@ def test_inputs_on_a_microcontroller(model, precision, tmp_path):
     size = 1e-13 if precision == "double" else 3e-6
     assert_allclose(states[-1, :3], [2.3, run.q[-1, 0], run.p[-1, 0]], rtol=0, atol=size)
     assert abs(len(states) - 20) < 6
-
-
-def test_generated_source_has_the_project_style(model, tmp_path):
-    """All but tables in predictors' headers, whose rows clang-format indents in two ways."""
-    folder = generate_package(replace(model, method=StoermerVerlet()), tmp_path / "pushed")
-    for path in folder.glob("*.[ch]"):
-        check_style(path.read_text())

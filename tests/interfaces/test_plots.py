@@ -4,7 +4,6 @@ import importlib.util
 from collections.abc import Iterator
 from dataclasses import replace
 
-import matplotlib as mpl
 import numpy as np
 import pytest
 from matplotlib import pyplot
@@ -12,7 +11,6 @@ from matplotlib import pyplot
 import scvi_codegen as sc
 from scvi_codegen.interfaces.pictures.canvas import check_plot_path
 from scvi_codegen.interfaces.pictures.conserved import largest_in_bins, plot_energy, plot_momentum_maps
-from scvi_codegen.systems.symmetry.sampling import bodies
 
 
 def trajectory_of(name: str, steps: int = 300, h: float | None = None) -> sc.Trajectory:
@@ -42,24 +40,6 @@ def test_equal_trajectories_give_equal_bytes(kepler, tmp_path, suffix):
     assert one.read_bytes().startswith({".png": b"\x89PNG", ".svg": b"<?xml", ".pdf": b"%PDF"}[suffix])
 
 
-@pytest.mark.tiers(0, 1)
-@pytest.mark.sampled(2)
-@pytest.mark.parametrize("name", ["kepler", "planar-pendulum", "fput-chain:12"])
-@pytest.mark.parametrize("steps", [0, 1])
-def test_a_single_state_can_be_drawn(name, steps, tmp_path):
-    sc.plot_trajectory(trajectory_of(name, steps), tmp_path / "short.png")
-
-
-@pytest.mark.rotated
-def test_a_run_backward_can_be_drawn(tmp_path):
-    sc.plot_trajectory(trajectory_of("fput-chain:12", h=-0.1), tmp_path / "back.svg")
-
-
-@pytest.mark.second
-def test_an_exactly_conserved_energy_can_be_drawn(tmp_path):
-    sc.plot_trajectory(trajectory_of("charged-particle", 2), tmp_path / "exact.png")
-
-
 def test_energy_error_is_the_largest_of_each_bin():
     error = np.zeros(60_000)
     error[777] = 3.0
@@ -68,26 +48,6 @@ def test_energy_error_is_the_largest_of_each_bin():
     assert largest.max() == 3.0
     assert (largest == 1.5).sum() == 599  # curves on a logarithmic axis do not break where the error is 0
     assert (largest_in_bins(np.arange(9.0), np.zeros(9))[1] > 0.0).all()
-
-
-@pytest.mark.parametrize(
-    ("names", "expected"),
-    [
-        (["x", "y"], [("", (0, 1))]),
-        (["z", "y", "x"], [("", (2, 1, 0))]),
-        (["a_x", "b_x", "a_y", "b_y"], [("a", (0, 2)), ("b", (1, 3))]),
-        (["x1", "y1", "x2", "y2"], [("1", (0, 1)), ("2", (2, 3))]),
-        (["x_a", "x_b", "y_a", "y_b"], [("a", (0, 2)), ("b", (1, 3))]),
-        (["x1", "y1", "x2"], []),
-        (["a_x", "a_y", "b_x", "b_y", "b_z"], []),
-        (["a_x", "a_z"], []),
-        (["q1", "q2"], []),
-        (["x"], []),
-        (["theta", "x", "y"], []),
-    ],
-)
-def test_coordinates_are_grouped_into_bodies(names, expected):
-    assert [(body.name, body.columns) for body in bodies(names)] == expected
 
 
 def test_unknown_suffix_and_missing_matplotlib_fail_before_the_run(monkeypatch):
@@ -208,27 +168,12 @@ class TestOnePicture:
         assert sc.plot_section(orbits, axes=("y", "p_y"), ax=given[1, 1]) is given[1, 1]
         assert all(axes.lines for axes in given.flat)
 
-    def test_without_axes_a_figure_is_returned(self, kepler):
-        axes = kepler.plot.energy()
-        assert pyplot.gcf() is axes.figure
-        assert mpl.rcParams["axes.grid"] is False
-
-    @pytest.mark.second
-    def test_path_writes_a_file_and_closes_the_figure(self, kepler, tmp_path):
-        kepler.plot.momentum_maps(tmp_path / "maps.svg")
-        assert "angular momentum" in (tmp_path / "maps.svg").read_text(encoding="utf-8")
-        assert pyplot.get_fignums() == []
-
     def test_phase_portrait_has_one_curve_per_orbit(self, orbits):
         axes = sc.plot_phase(orbits, axes=("y", "p_y"))
         assert (axes.get_xlabel(), axes.get_ylabel()) == ("y", "p_y")
         drawn = [line for line in axes.lines if len(line.get_xdata()) > 2]
         for line, orbit in zip(drawn, orbits, strict=True):
             assert np.array_equal(line.get_xydata(), np.stack([orbit.q[:, 1], orbit.p[:, 1]], axis=1))
-
-    def test_phase_portrait_is_that_of_the_first_coordinate_by_default(self, orbits):
-        axes = sc.plot_phase(orbits[0])
-        assert (axes.get_xlabel(), axes.get_ylabel()) == ("x", "p_x")
 
     def test_energies_of_several_runs_share_axes_that_contain_them(self, orbits):
         axes = plot_energy(orbits)

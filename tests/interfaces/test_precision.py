@@ -77,17 +77,6 @@ def test_other_options_and_commands_are_refused(spring: Path, words: list[str], 
 
 
 @pytest.mark.second
-def test_advice(spring: Path) -> None:
-    """The step that --advise recommends has the error asked for at the end of the span, to which the last one leads."""
-    spring.write_text(TEXT.replace("step = 0.125\nsteps = 16\n", "span = 1.3\n"))
-    document = json_of("run", spring, "--advise", "1e-24")
-    with mp.workdps(40):
-        end = mp.mpf(document["final"]["q"]["q"]) + document["final"]["q_low"]["q"]
-        assert 1e-30 < abs(end / (mp.cos(1.3) / 2 + mp.sin(1.3) / 4) - 1) < 1e-24
-    assert document["advice"]["steps"] < 16
-
-
-@pytest.mark.second
 def test_precision_of_error(spring: Path) -> None:
     """With "auto" a bound that double does not confirm is that of a run in two words; others are in double."""
     text = TEXT.replace("step = 0.125\nsteps = 16\n", "error = 3e-15\nspan = 200.0\n")
@@ -162,15 +151,6 @@ def test_ensembles_are_exact(spring: Path, file: str, text: str, starts: str) ->
             rate = mp.sqrt(mp.mpf(w) / 10)
             exact = q * mp.cos(2 * rate) + v * mp.sin(2 * rate) / rate
             assert abs(mp.mpf(saved["q"][-1, j, 0]) + saved["q_low"][-1, j, 0] - exact) < 1e-30
-
-
-def test_recorded_runs_have_both_words(spring: Path) -> None:
-    """A folder that is extended ends at the state of a run in memory, also in the document and in its file."""
-    ends = [json_of("run", spring, *words)["final"] for words in (["-o", "a.run"], ["--steps", "24"])]
-    assert json_of("run", "--resume", "a.run", "--steps", "24")["final"] == ends[1] != ends[0]
-    invoke("export", "a.run", "-o", "a.npz")
-    with np.load("a.npz") as saved:
-        assert saved["q_low"][[16, 24], 0].tolist() == [end["q_low"]["q"] for end in ends]
 
 
 def test_precision_is_read_and_replaced(spring: Path) -> None:

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import sympy
-from counting import at_most
 from sympy import Symbol
 
 from scvi_codegen import HamiltonianSystem, LagrangianSystem, SystemDefinitionError
@@ -76,25 +75,6 @@ def test_double_pendulum_in_the_textbook_form() -> None:
         * (da**2 * l1 * (m1 + m2) + g * (m1 + m2) * np.cos(a) + db**2 * l2 * m2 * np.cos(difference))
     ) / (l2 * bottom)  # fmt: skip
     assert accelerations(system, values) == pytest.approx([first, second], rel=1e-12)
-
-
-@pytest.mark.parametrize("n", [1, 2, 5])
-def test_forces_of_a_chain(n: int) -> None:
-    system = fput_chain(n, alpha=0.25, beta=0.5)
-    values = random_point(system)
-    q = np.array([0, *(values[symbol] for symbol in system.coordinates), 0])
-    alpha, beta = (values[parameter] for parameter in system.parameters)
-    tension = (d := np.diff(q)) + alpha * d**2 + beta * d**3
-    assert accelerations(system, values) == pytest.approx(np.diff(tension), rel=1e-12)
-    assert system.defaults == (0.25, 0.5)
-
-
-@pytest.mark.rotated
-def test_long_chain_is_defined_fast() -> None:
-    with at_most(5_000_000):
-        entry = problem("fput-chain:256")
-    assert entry.name == "fput-chain:256"
-    assert entry.system.dimension == len(entry.q) == 256
 
 
 @pytest.mark.parametrize("name", PROBLEMS)

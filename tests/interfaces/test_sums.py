@@ -1,6 +1,5 @@
 """The commands with a model of an array system."""
 
-import json
 import subprocess
 from pathlib import Path
 
@@ -12,7 +11,6 @@ from scvi_codegen import StateError
 from scvi_codegen.analysis import verification
 from scvi_codegen.codegen.native.compilers import find_compiler
 from scvi_codegen.methods.method import Method
-from scvi_codegen.systems.formulas.grammar import parse_expression
 from scvi_codegen.systems.system import MechanicalSystem
 
 RING = """
@@ -124,25 +122,6 @@ def test_options_that_compile_the_model_with_its_sizes(ring: str) -> None:
     assert not Path("one/support").exists()
 
 
-def test_failing_step_of_an_array_system(ring: str) -> None:
-    """Exit status 1, with the states before it."""
-    assert "smaller h" in error_of("run", ring, "--step", "9", "--steps", "5", "-o", "ring.npz", status=1)
-    assert Path("ring.npz").is_file()
-
-
-def test_derive_for_an_array_system(ring: str) -> None:
-    """Terms with their derivatives, and the step; in LaTeX sums are sums."""
-    text = output_of("derive", ring, "--method", "stoermer-verlet")
-    (derivative,) = (line.partition(": ")[2] for line in text.splitlines() if "by q[i]:" in line)
-    places = {"q[i+1]": "(3.0)", "q[i]": "(1.0)", "k": "0.5"}
-    for name, value in places.items():
-        derivative = derivative.replace(name, value)
-    assert float(parse_expression(derivative, {})) == 1.0
-    assert "p += h*(0.5)*F" in text
-    assert "Conserved: energy, momentum of q" in text
-    assert r"\sum_{i \in \mathbb{Z}_{N}}" in output_of("derive", ring, "--latex")
-
-
 @pytest.mark.rotated
 def test_generate_for_an_array_system(ring: str) -> None:
     """A folder whose program gives the states of the command, to round-off."""
@@ -170,22 +149,3 @@ def test_generate_for_an_array_system(ring: str) -> None:
     Path("ring_svi/main.c").write_text("mine")
     assert "was edited" in error_of("generate", ring, "-o", "ring_svi")
     invoke("generate", ring, "-o", "ring_svi", "--force")
-
-
-@pytest.mark.full
-def test_folder_is_verified_with_its_own_files(ring: str, tmp_path: Path) -> None:
-    """Also with arrays from files, which are elsewhere later; a fault in its C is found."""
-    np.save("start.npy", np.sin(np.arange(8.0)))
-    Path("masses.csv").write_text("m\n" + "".join(f"{1 + k / 8}\n" for k in range(8)))
-    text = RING.replace('q = "sin(2*pi*i/N)"', 'q = { file = "start.npy" }').replace(
-        "i in N, q_dot", "i in N, m[i]*q_dot"
-    )
-    Path("ring.toml").write_text(text.replace("k = 1.0", 'k = 1.0\n"m[N]" = { file = "masses.csv" }'))
-    invoke("generate", ring, "-o", "ring_svi")
-    Path("start.npy").unlink()
-    invoke("verify", "ring_svi")
-    assert set(json.loads(Path("ring_svi/certificate.json").read_text())["q"]) < set(np.sin(np.arange(8.0)).tolist())
-    code = Path("ring_svi/ring_svi.c").read_text()
-    assert "parameters[0]" in code
-    Path("ring_svi/ring_svi.c").write_text(code.replace("shift_i_plus_1]", "shift_i_plus_1 - 1]"))
-    invoke("verify", "ring_svi", status=1)

@@ -146,36 +146,6 @@ def test_actions_of_constraints_forces_damping_and_ensembles(stepper):
     assert runs.action(cumulative=True).shape == (21, 2)
 
 
-@pytest.mark.rotated
-@pytest.mark.parametrize(
-    "steps", [{"h": 0.2, "t_end": 4.1, "save_every": 4}, {"t_end": 6.0}], ids=["lanes", "adaptive"]
-)
-def test_ensembles_sum_the_actions_of_their_runs(stepper, steps):
-    q, p = np.array([START[:2], [0.0, 0.1], [0.1, 0.2]]), np.array([START[2:], [0.3, 0.1], [0.1, 0.0]])
-    q[2] = [0.0, 9.0]  # leaves the lanes: its steps fail with h = 0.2
-    without, runs = (stepper.integrate_ensemble(q[:2], p[:2], action=each, **steps) for each in (False, True))
-    assert without.actions is None
-    assert np.array_equal(without.q, runs.q, equal_nan=True)
-    singles = [stepper.integrate(q[j], p[j], check_growth=False, **steps | {"save_every": 1}) for j in range(2)]
-    assert np.abs(runs.action() - [each.action() for each in singles]).max() < 1e-15
-    assert np.isfinite(runs.actions[:3]).all()
-    if "h" in steps:
-        wild = stepper.integrate_ensemble(q, p, action=True, **steps)
-        assert np.array_equal(wild.action()[:2], runs.action())
-        assert wild.ok[2] or np.isnan(wild.action()[2])
-
-
-@pytest.mark.parametrize("method", ["svi:2", "gauss:2"])
-def test_actions_of_ensembles_whose_lanes_do_not_sum_them(method):
-    formula = {"hamiltonian": "a**2*(1 + x**2)/2 + x**2/2", "coordinates": ["x"], "momenta": ["a"]}
-    stepper = sc.compile_stepper(sc.HamiltonianSystem.from_text(name="oscillator", **formula), method)
-    start = np.array([[1.0], [0.5]]), np.zeros((2, 1))
-    runs = stepper.integrate_ensemble(*start, h=0.1, steps=3, action=True)
-    singles = [stepper.integrate(*(x[j] for x in start), h=0.1, steps=3, action=True).action() for j in range(2)]
-    assert np.abs(runs.action() - singles).max() < 1e-15
-    assert np.isfinite(runs.actions).all()
-
-
 def test_actions_of_trajectories_that_reach_no_output_time_are_none(stepper):
     """The second fails before the only output time, after the first step."""
     q, p = np.array([START[:2], [0.0, 9.0]]), np.array([START[2:], [0.3, 0.1]])

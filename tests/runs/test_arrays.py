@@ -42,16 +42,6 @@ def test_one_library_is_used_for_every_size(count: int) -> None:
     assert np.ptp(run.momentum_maps()[:, 0]) < 1e-14 * np.sqrt(count)
 
 
-@pytest.mark.second
-def test_energy_does_not_drift() -> None:
-    """Over 20 000 steps of a variational method; an explicit one of its order oscillates."""
-    ring = lagrange("ring", "q[N]", f"{KINETIC} - sum(i in N periodic, (q[i+1] - q[i])**2/2 + (q[i+1] - q[i])**4/4)")
-    run = sc.compile_stepper(ring, "svi:6").integrate(random(5), h=0.05, steps=20_000, save_every=200)
-    changes = run.energy() - run.energy()[0]
-    assert run.energy_error() < 1e-13
-    assert abs(changes[-20:].mean() - changes[:20].mean()) < 3e-14
-
-
 @pytest.mark.parametrize(
     ("observe", "message"),
     [
@@ -64,16 +54,6 @@ def test_unsupported_observations_are_rejected(observe: Any, message: str) -> No
     """Errors name the observation; they are neither NumPy errors nor NaN."""
     with pytest.raises(sc.StateError, match=message):
         sc.compile_stepper(RING, "svi:2").integrate(random(5), h=0.1, steps=2, observe=observe)
-
-
-def test_table_with_one_column_may_be_a_list() -> None:
-    """For example, fixed positions."""
-    constrained = lagrange("held", "q[N]", f"{KINETIC} - sum(p in P, q[pins[p, 0]]**2/2)", tables=["pins[P, 1]"])
-    stepper = sc.compile_stepper(constrained, "svi:4")
-    runs = [stepper.integrate(random(4), h=0.1, steps=5, tables={"pins": pins}) for pins in ([1, 3], [[1], [3]])]
-    assert np.array_equal(runs[0].q["q"], runs[1].q["q"])
-    assert np.array_equal(runs[0].q["q"][-1, ::2], random(4)[::2])
-    assert not np.any(runs[0].q["q"][-1, 1::2] == random(4)[1::2])
 
 
 @pytest.mark.second

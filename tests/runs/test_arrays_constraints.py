@@ -39,19 +39,6 @@ def chain(count):
     return np.concatenate([[[0.0, 0.0]], ends]), data
 
 
-def cloth(side):
-    """Rods along both directions, pinned along the upper edge, at rest but for a wave of its velocity."""
-    places = np.arange(side * side).reshape(side, side)
-    x, y = np.meshgrid(np.arange(side) / side, np.arange(side) / side)
-    along, down = (np.stack(pair, axis=-1) for pair in ((places[1:, :-1], places[1:, 1:]), (places[:-1], places[1:])))
-    rows = [np.concatenate([down[k], along[k]]) for k in range(side - 1)]  # in this order factors are nearly whole
-    q = np.stack([x, 0 * x, -y], axis=-1).reshape(-1, 3)
-    velocity = np.zeros_like(q)
-    velocity[:, 1] = -np.sin(3 * q[:, 0]) * q[:, 2]
-    parameters = {"l": 1 / side, "m": 1 / side**2, "x": q[places[0]]}
-    return q, velocity, {"tables": {"bonds": np.concatenate(rows), "pins": places[0]}, "parameters": parameters}
-
-
 def residuals(run):
     """The largest of g, and of its rate."""
     return [max(np.abs(each).max() for each in values) for values in run.constraint_values]
@@ -94,22 +81,6 @@ def test_chains_ordered_from_an_end_need_no_iteration_for_their_linear_systems(s
     assert report.iterations > 0
     assert (report.products == 0) == (stride == 1)
     assert np.abs(run.q["r"] - ordered.q["r"]).max() < 1e-14
-
-
-@pytest.mark.second
-def test_cloth_conserves_rod_lengths_and_energy():
-    stepper = sc.compile_stepper(net(3), "stoermer-verlet")
-    q, velocity, data = cloth(12)
-    run = stepper.start(*stepper.project(q, velocity=velocity, **data), h=0.004, **data)
-    before, kinetic, changes = run.energy, run.energies[0], []
-    for _ in range(20):
-        run.advance(50)
-        g, rate = residuals(run)
-        assert g < 64 * ROUNDING / 12
-        assert rate < 1e-13
-        changes.append(run.energy - before)
-    assert np.abs(changes).max() < 1e-3 * kinetic
-    assert np.abs(run.q["r"] - q).max() > 0.1  # it moved
 
 
 def test_initial_state_is_projected_to_the_nearest_state(stepper):

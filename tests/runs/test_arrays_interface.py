@@ -1,7 +1,6 @@
 """C interface of arrays whose sizes are known at run time: that of named coordinates, and runs bound to sizes."""
 
 import inspect
-import re
 
 import numpy as np
 import pytest
@@ -10,8 +9,6 @@ from samples import QUICK_FLAGS
 import scvi_codegen as sc
 from scvi_codegen.runs.stepper import StepperOfRunTimeSizes
 
-BOUND = {"memory", "bind", "data_at", "energy_parts", "release"}
-"""Functions of run-time sizes alone."""
 SYSTEMS = {
     "ring": {
         "coordinates": ["q[N]"],
@@ -42,38 +39,6 @@ def steppers(request):
     shape = (3, 2) if request.param == "plane" else (3,)
     parameters = {"c": 0.7} | ({"m": np.array([1.0, 2.0, 3.0])} if request.param == "ring" else {})
     return any_size, known, states.reshape(2, 4, *shape), parameters
-
-
-def prototypes(header: str, prefix: str) -> dict[str, str]:
-    """Return the result and the types of the arguments of each function, without its prefix."""
-    text = re.sub(r"/\*.*?\*/", " ", header, flags=re.DOTALL)
-    found = re.findall(rf"^([\w ]+[ *]){prefix}_(\w+)\(([^)]*)\);", text, re.MULTILINE)
-    types = ((name, result, re.sub(r"\w+(,|$)", r"\1", arguments)) for result, name, arguments in found)
-    return {name: " ".join(f"{result}({of})".replace(f"{prefix}_", "").split()) for name, result, of in types}
-
-
-@pytest.mark.tiers(0, 2)
-def test_functions_have_the_prototypes_of_named_coordinates(steppers) -> None:
-    any_size, known, *_ = steppers
-    ours, theirs = (prototypes(each.source.header, each.interface.prefix) for each in (any_size, known))
-    common = ours.keys() & theirs.keys()
-    assert common >= {
-        "start",
-        "advance",
-        "advance_to",
-        "step",
-        "energy",
-        "energies",
-        "velocity",
-        "momentum",
-        "step_error",
-    }
-    maps = [each.pop("momentum_maps", "") for each in (ours, theirs)]
-    assert maps[0].replace(", double *)", ")") == maps[1]  # the sizes of a run are in its memory
-    assert {name: ours[name] for name in common - {"momentum_maps"}} == {
-        name: theirs[name] for name in common - {"momentum_maps"}
-    }
-    assert ours.keys() - common <= BOUND
 
 
 @pytest.mark.tiers(1, 2)

@@ -9,17 +9,6 @@ import scvi_codegen as sc
 RANDOM = np.random.default_rng(1)
 
 
-def field(strength):
-    """A lattice of stiff places, with a force that depends on time, and one on the neighbours."""
-    return lagrange(
-        "field",
-        "q[N]",
-        "sum(i in N, m[i]*q_dot[i]**2/2 - w*q[i]**2/2 - q[i]**4/4)- sum(i in N periodic, (q[i+1] - q[i])**2/2)",
-        parameters={"w": strength, "m[N]": 1},
-        forces={"q[i]": "-sin(q[i])/3", "q[0]": "cos(t)"},
-    )
-
-
 def molecules():
     """Stiff bonds between soft ones, in the plane, by a table."""
     return sc.LagrangianSystem.from_text(
@@ -62,21 +51,3 @@ def test_step_without_convergence_fails():
     with pytest.raises(sc.StepFailedError, match="GMRES"):
         run.advance(1)
     assert (run.q["q"] == q).all()
-
-
-def test_newton_of_explicit_methods_is_compiled_with_the_sizes_of_the_call():
-    q = np.array([0.3, -0.2, 0.5])
-    one, two = (sc.compile_stepper(field(1.0), "stoermer-verlet", solver=each) for each in ("newton", "auto"))
-    ends = [each.integrate(q, h=0.1, steps=20).q["q"][-1] for each in (one, two)]
-    assert ends[0] == pytest.approx(ends[1], abs=1e-13)
-
-
-@pytest.mark.second
-@pytest.mark.parametrize("solver", ["auto", "newton"])
-def test_methods_without_a_basis_of_eigenvectors_are_compiled_with_known_sizes(solver):
-    """The matrix of these steps has the double eigenvalue 0 with one eigenvector."""
-    q = RANDOM.normal(size=30)
-    arrays = sc.compile_stepper(field(1.0), sc.SVI(3, "gauss-lobatto:3"), solver=solver)
-    known = sc.compile_stepper(sc.unroll_sums(field(1.0), {"N": 30}), sc.SVI(3, "gauss-lobatto:3"))
-    run, expected = (each.integrate(q, velocity=0 * q, h=0.1, steps=5) for each in (arrays, known))
-    assert np.abs(run.q["q"] - expected.q).max() < 1e-12

@@ -12,9 +12,6 @@ LAGRANGIAN = (
     "- sum(i in {N} periodic, (q[i+1] - q[i])**4/4) - k*sum(i in {N}, (q[i] - x)**2/2)"
 )
 FORCES = {"x": "cos(t)/10", "q[i]": "sin(t)*m[i]"}
-MASSES = np.arange(1.0, 6.0)
-Q0 = {"x": 0.3, "q": np.linspace(0.0, 1.0, 5)}
-GIVEN = {"h": 0.1, "steps": 40, "parameters": {"m": MASSES}}
 
 
 def body_on_ring(size: str) -> sc.LagrangianSystem:
@@ -29,29 +26,8 @@ def body_on_ring(size: str) -> sc.LagrangianSystem:
 
 
 @pytest.fixture(scope="module")
-def at_run_time():
-    return sc.compile_stepper(body_on_ring("N"), "svi:4")
-
-
-@pytest.fixture(scope="module")
 def known():
     return sc.compile_stepper(body_on_ring("N"), "svi:4", sizes={"N": 5})
-
-
-@pytest.mark.second
-def test_threads_do_not_change_single_coordinates(at_run_time):
-    start = {"x": 0.3, "q": np.random.default_rng(1).normal(size=20_000)}
-    runs = [at_run_time.integrate(start, h=0.1, steps=3, parameters={"k": 1e-4}, threads=n) for n in (1, 2)]
-    assert runs[0].q["x"][-1] == runs[1].q["x"][-1]
-
-
-@pytest.mark.second
-def test_literal_sizes_are_sizes_given_to_compile_stepper(known):
-    literal = body_on_ring("5")
-    assert [q.name for q in literal.coordinates] == ["x", "q_0", "q_1", "q_2", "q_3", "q_4"]
-    assert literal == sc.unroll_sums(body_on_ring("N"), {"N": 5})
-    run = sc.compile_stepper(literal, "svi:4").integrate(Q0, velocity=np.zeros(6), **GIVEN)
-    assert (run.q == known.integrate(Q0, velocity=np.zeros(6), **GIVEN).q).all()
 
 
 @pytest.mark.second

@@ -73,21 +73,6 @@ def test_arrays_of_rotations_move_as_by_names(tmp_path):
         stepper.start(q | {"R": QUATERNIONS, "n": UNIT}, velocity={"omega": OMEGA[:2]}, h=0.05)
 
 
-@pytest.mark.second
-def test_model_file_with_an_array_of_rotations(tmp_path):
-    path = tmp_path / "bodies.toml"
-    path.write_text(
-        "[system]\nname = 'bodies'\ncoordinates = ['x']\nrotations = { 'R[2]' = 'omega' }\n"
-        "lagrangian = 'x_dot**2/2 + sum(i in 2, omega_1[i]**2 + omega_2[i]**2 + 2*omega_3[i]**2 - x*R_33[i])'\n"
-        "[initial]\nq = { x = 0.0, R = [[1, 0, 0, 0], [1, 1, 0, 0]] }\n"
-        "q_dot = { x = 0.0, omega = [[0.1, 0, 1], [0, 1, 0]] }\n[run]\nstep = 0.1\nsteps = 3\n"
-    )
-    model = sc.load_model(path)
-    sc.save_model(model, tmp_path / "again.toml")
-    again = sc.load_model(tmp_path / "again.toml")
-    assert again.integrate().q == pytest.approx(np.asarray(model.integrate().q), abs=1e-15)
-
-
 @pytest.mark.rotated
 @pytest.mark.parametrize("size", ["6", "N"])
 def test_spin_chain_against_scipy(size):

@@ -11,8 +11,6 @@ import scvi_codegen as sc
 N = 6
 RANDOM = np.random.default_rng(1)
 Q, V = RANDOM.normal(size=N), RANDOM.normal(size=N)
-T = np.linspace(0.0, 5.0, 8)
-DATA = {"F": (T, np.sin(T), "cubic")}
 
 
 def written(system):
@@ -108,24 +106,6 @@ class TestInputs:
         assert np.abs(same.q["q"] - free.q["q"]).max() < 1e-15
         assert others.iterations < none.iterations
         assert np.abs(others.q["q"] - none.q["q"]).max() < 1e-13
-
-    def test_missing_inputs_are_reported(self, driven):
-        stepper = sc.compile_stepper(driven, "svi:6")
-        with pytest.raises(sc.StateError, match="the input 'F' is not set"):
-            stepper.integrate(Q, h=0.1, steps=1)
-        run = stepper.start(Q, h=0.1)
-        with pytest.raises(sc.StateError, match="the input 'F' is not set"):
-            run.advance(1)
-        assert run.steps == 0
-        run.update(parameters={"F_0": 0.0})
-        run.advance(1)
-        assert run.steps == 1
-        with pytest.raises(sc.StateError, match="covers t = 0 to 5"):
-            stepper.integrate(Q, inputs=DATA, h=0.1, t_end=6.0)
-
-    def test_inputs_are_displayed_by_name(self, driven):
-        assert "F on q[N-1]" in str(driven)
-        assert driven.depends_on_time
 
 
 @pytest.mark.second

@@ -194,17 +194,6 @@ def test_steps_together_are_those_one_by_one(sums: str, method: Any) -> None:
         assert ends[1:] == ends[:1] * 3
 
 
-def test_plain_sums_lose_the_rounding_errors_alone() -> None:
-    exact, rounded = (
-        sc.compile_stepper(system_of(CASES["ring"]), sc.Composition(8), sums=sums).integrate(
-            start_of("ring"), h=0.01, steps=500, save_every=500
-        )
-        for sums in ("compensated", "plain")
-    )
-    error = np.abs(rounded.q["q"][-1] - exact.q["q"][-1]).max()
-    assert 1e-16 < error < 1e-12
-
-
 @pytest.mark.rotated
 def test_newton_iteration_with_threads() -> None:
     """The last bits of a large step from q = 0 depend on the order in which inner products are summed."""
@@ -262,16 +251,6 @@ def test_forked_process_has_separate_threads() -> None:
     if child == 0:
         os._exit(int(bits(stepper.integrate(q, h=0.01, steps=3, threads=3)) != expected))
     assert os.waitpid(child, 0)[1] == 0
-
-
-def test_failed_step_fails_in_all_threads() -> None:
-    stepper = stepper_of("ring", "svi:4")
-    message = set()
-    for threads in THREADS:
-        with pytest.raises(sc.StepFailedError) as caught:
-            stepper.integrate(1e3 * start_of("ring"), h=1.0, steps=3, threads=threads)
-        message.add(str(caught.value))
-    assert len(message) == 1
 
 
 def test_invalid_thread_counts_are_rejected() -> None:
@@ -390,17 +369,6 @@ int main(void)
   return shared_advance(run, {steps}, 1, parameters, 0, t, q, p, iterations, 0, 0);
 }}
 """
-COUNTED = """
-#include <pthread.h>
-#include <stdio.h>
-static int create(pthread_t *thread, const pthread_attr_t *attributes, void *(*go)(void *), void *given)
-{
-  putchar('.');
-  return pthread_create(thread, attributes, go, given);
-}
-#define pthread_create create
-#include "shared.c"
-"""
 
 
 def program(name: str, method: str, solver: str, folder: Path, **numbers: int) -> None:
@@ -420,19 +388,6 @@ def program(name: str, method: str, solver: str, folder: Path, **numbers: int) -
         "sizes": ", ".join(str(sizes[size]) for size in layout.sizes),
     }
     (folder / "main.c").write_text(RACES.format(**texts, **numbers))
-
-
-@pytest.mark.second
-def test_as_many_threads_are_started_as_requested(tmp_path: Path) -> None:
-    """The caller is one of them; the largest number is that of the table of threads."""
-    (tmp_path / "counted.c").write_text(COUNTED)
-    flags = ["-std=gnu99", "-O0", "-DSCVI_THREADS", "-pthread", "-w"]
-    for threads in (1, 2, 5, 64):
-        program("ring", "stoermer-verlet", "fixed-point", tmp_path, threads=threads, steps=1)
-        command = [*find_compiler(), *flags, "main.c", "counted.c", "-lm", "-o", "main"]
-        subprocess.run(command, cwd=tmp_path, check=True)
-        done = subprocess.run([str(tmp_path / "main")], capture_output=True, text=True, check=True)
-        assert done.stdout == "." * (threads - 1)
 
 
 @pytest.mark.full

@@ -74,18 +74,3 @@ def test_orders_of_quaternions_and_rotation_vectors_are_named():
         quaternions({"quaternion": last, "order": "xwyz"}, "R")
     with pytest.raises(sc.StateError, match="the rotation vector of 'R' must have three components"):
         quaternions({"rotation_vector": [1.0, 2.0]}, "R")
-
-
-def test_quaternions_of_ccsds_messages_are_attitudes_with_the_scalar_part_last():
-    """An attitude parameter message from EME2000 to SC_BODY_1, and its direction cosine matrix from space to body."""
-    message = "Q1 = 0.171010\nQ2 = -0.030154\nQ3 = 0.336824\nQC = 0.925417"
-    a, b, c, d = components = [float(line.split("=")[1]) for line in message.splitlines()]
-    to_body = [
-        [a * a - b * b - c * c + d * d, 2 * (a * b + c * d), 2 * (a * c - b * d)],
-        [2 * (a * b - c * d), -a * a + b * b - c * c + d * d, 2 * (b * c + a * d)],
-        [2 * (a * c + b * d), 2 * (b * c - a * d), -a * a - b * b + c * c + d * d],
-    ]
-    matrix = matrices(quaternions({"quaternion": components, "order": "xyzw"}, "R"))
-    np.testing.assert_allclose(matrix.T, to_body, rtol=0, atol=2e-6)
-    inverse = Rotation.from_quat(components).inv()
-    np.testing.assert_allclose(matrices(quaternions(inverse, "R")), to_body, rtol=0, atol=2e-6)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import gc
-import weakref
 from functools import cache
 from typing import Any
 
@@ -11,7 +9,6 @@ import numpy as np
 import pytest
 from counting import TooMuchWorkError, at_most
 from notation import lagrange
-from samples import ensemble_runs
 
 import scvi_codegen as sc
 from scvi_codegen.runs.ensembles import batches
@@ -89,31 +86,6 @@ def test_trajectories_equal_single_runs(name: str, plan: str, capacity: int, mon
         for those, expected in ((found, np.asarray(run.q)), (momenta, np.asarray(run.p))):
             assert those[:last].tobytes() == expected[:last].tobytes()
             np.testing.assert_allclose(those, expected, rtol=0, atol=1e-14)
-
-
-def test_a_step_that_requests_newtons_method_is_repeated_with_it() -> None:
-    system = lagrange("stiff", "x", "x_dot**2/2 - k*x**2/2", k=1.0)
-    one, k = sc.compile_stepper(system, sc.SVI(3)), np.array([1.0, 1e5, 2.0])
-    end = 0.2
-    work = ensemble_runs(one, np.ones((3, 1)), np.zeros((3, 1)), t_end=end, tolerance=1e-3, parameters={"k": k})
-    assert work.successive is not None
-    work.run()
-    for j, (_, q, *_) in enumerate(work.result().each()):
-        run = one.integrate([1.0], [0.0], t_end=end, tolerance=1e-3, parameters={"k": k[j]})
-        assert q.tobytes() == run.q.tobytes()
-
-
-@pytest.mark.parametrize("plan", [{"h": 0.1, "steps": 5}, {"t_end": 0.5, "tolerance": 1e-6}])
-def test_ensembles_are_released_without_the_garbage_collector(plan: dict[str, Any]) -> None:
-    work = ensemble_runs(stepper("kepler"), *states("kepler"), **plan)
-    work.run()
-    released = weakref.ref(work)
-    gc.disable()
-    try:
-        del work
-        assert released() is None
-    finally:
-        gc.enable()
 
 
 @pytest.mark.parametrize(("name", "plan"), [("kepler", "own ends"), ("rod", "fixed")])

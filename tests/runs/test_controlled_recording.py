@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from recorded_runs import STATE, recorded
+from recorded_runs import STATE
 
 import scvi_codegen as sc
 
@@ -29,15 +29,3 @@ def test_run_may_be_extended_or_shortened_but_not_reversed(kepler, t_end):
     with pytest.raises(sc.StateError, match="omit steps"):
         sc.resume_run("a.run", steps=1000)
     assert sc.load_run("a.run").manifest == longer.manifest
-
-
-def test_other_kind_of_steps_is_rejected(kepler):
-    recorded(kepler, 10, folder="fixed.run")
-    with pytest.raises(sc.StateError, match="steps instead of t_end"):
-        sc.resume_run("fixed.run", t_end=3.0)
-    with pytest.raises(sc.StateError, match="omit steps"):
-        controlled(kepler, "b.run", steps=10)
-    with pytest.raises(sc.StateError, match="steps"):
-        sc.record_run(kepler.start(**STATE, h=0.1), "c.run")
-    with pytest.raises(sc.RecordingError, match="another folder"):
-        controlled(kepler, "fixed.run")

@@ -32,27 +32,6 @@ def kepler() -> sc.Stepper:
 # t_eval.
 
 
-@pytest.mark.parametrize("h", [0.1, -0.1])
-def test_states_at_requested_times_equal_the_dense_output(kepler, h):
-    run = kepler.integrate(**START, h=h, steps=10_000)
-    times = h * np.sort(np.random.default_rng(5).uniform(0, 10_000, 300))
-    times[[0, -1]] = 0.0, run.t[-1]
-    chosen = kepler.integrate(**START, h=h, steps=10_000, t_eval=times)
-    assert np.array_equal(chosen.t, times)
-    assert np.array_equal(chosen.q, run.at(times)[0])
-    assert np.array_equal(chosen.p, run.at(times)[1])
-    assert chosen.iterations.sum() == run.iterations.sum()
-
-
-@pytest.mark.second
-def test_states_before_a_failure_are_available():
-    runaway = sc.LagrangianSystem.from_text(name="runaway", coordinates=["q"], lagrangian="q_dot**2/2 + q**3/3")
-    stepper = sc.compile_stepper(runaway, sc.SVI(3), flags=FLAGS)
-    with pytest.raises(sc.StepFailedError) as failure:
-        stepper.integrate([1.0], [1.0], h=0.1, steps=100, t_eval=np.linspace(0, 10, 101))
-    assert 5 < len(failure.value.trajectory) < 50
-
-
 # The call that is like solve_ivp.
 
 

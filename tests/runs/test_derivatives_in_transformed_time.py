@@ -144,25 +144,6 @@ def test_derivatives_of_runs_by_steps_and_to_an_end_time(form):
     assert ended.sensitivity().h is None
 
 
-@pytest.mark.second
-@pytest.mark.parametrize("form", ["L", "K, momenta"])
-def test_steps_are_symplectic_with_time_and_its_momentum(form):
-    """(q, t, p, -E): what moves the energy of the start moves the time, and nothing else is lost."""
-    made = stepper(form)
-    run = made.integrate(Q, P, h=H, steps=10)
-    level = made._energy_gradient(Q, P, run.parameters)
-    found = run.sensitivity()
-    projected = found.state[-1] - np.outer(found.parameters[-1, :, -1], level[:4])
-    times = found.times.state[-1] - found.times.parameters[-1, -1] * level[:4]
-    by_energy = np.append(found.parameters[-1, :, -1], found.times.parameters[-1, -1])
-    order = [0, 1, 4, 2, 3, 5]  # q, t, p, -E
-    whole = np.eye(6)
-    whole[:4, :4], whole[4, :4], whole[:4, 5], whole[4, 5] = projected, times, -by_energy[:4], -by_energy[4]
-    whole = whole[np.ix_(order, order)]
-    omega = np.kron([[0, 1], [-1, 0]], np.eye(3))
-    assert np.abs(whole.T @ omega @ whole - omega).max() < 1e-13 * np.abs(whole).max() ** 2
-
-
 WAYS = {
     "all": {"steps": 12},
     "checkpoints": {"steps": 12, "save_every": 4},
@@ -221,13 +202,6 @@ def test_derivatives_of_a_rod_in_transformed_time():
     assert np.abs(forward[1].T - back[0]).max() < 1e-13 * np.abs(forward[1]).max()
     ends = [made.integrate(q, p, h=0.3 + by, steps=1, parameters=values).t[-1] for by in (1e-4, -1e-4)]
     assert forward[1, -1, -2] == pytest.approx((ends[0] - ends[1]) / 2e-4, rel=1e-7)
-
-
-@pytest.mark.second
-def test_unsupported_derivatives_in_transformed_time():
-    made = stepper("L")
-    with pytest.raises(sc.StateError, match="save all states"):
-        made.integrate(Q, P, h=H, t_end=2.7, save_every=4).tangent()
 
 
 @pytest.mark.second

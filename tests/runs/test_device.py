@@ -95,13 +95,6 @@ def test_systems_and_methods_with_lanes_have_the_same_bits(gpu: EmulatedGpu, sys
     check_bits(compiled(system, CASES[system]), *states(system), **PLAN | {"t": 0.3})
 
 
-@pytest.mark.second
-def test_threads_store_velocities_and_forces_of_hamiltonian_systems(gpu: EmulatedGpu) -> None:
-    stepper = sc.compile_stepper(sc.problem("point-vortices").system, sc.SVI(4), flags=PORTABLE_FLAGS)
-    start = np.random.default_rng(3).uniform(-0.1, 0.1, (2, COUNT, 4))
-    check_bits(stepper, [-0.5, 0.5, -1.5, 1.5] + start[0], start[1], **PLAN)
-
-
 @pytest.mark.parametrize(
     "plan", [{"h": 0.1, "t_end": 2.3, "save_every": 3}, {"h": -0.1, "t": 2.55, "t_end": 0.02}], ids=["on", "back"]
 )
@@ -161,21 +154,6 @@ def test_values_at_all_steps_are_observed_without_saving_them(gpu: EmulatedGpu, 
         [sc.Event("q", direction=1), "q_dot"] if observe == "events" else ()
     )
     check_observed(stepper, states(system), observe)
-
-
-@pytest.mark.second
-@pytest.mark.filterwarnings("ignore::scvi_codegen.common.errors.AccuracyWarning")
-def test_trajectories_that_leave_their_lane_are_observed(gpu: EmulatedGpu) -> None:
-    e = np.array([0.1, 0.97, 0.98, 0.99, 0.5])
-    q, p = np.stack([1 - e, 0 * e], axis=1), np.stack([0 * e, np.sqrt((1 + e) / (1 - e))], axis=1)
-    stepper, plan = compiled("kepler", sc.SVI(4)), {"h": 0.1, "steps": 100}
-    full = stepper.integrate_ensemble(q, p, **plan)
-    assert full.ok.tolist() != [True] * 5
-    values = np.concatenate([full.q, full.p], axis=2)
-    for device in (None, "cuda"):
-        seen = stepper.integrate_ensemble(q, p, **plan, save_every=7, observe="extremes", device=device)
-        assert np.abs(seen.observed - [np.nanmin(values, axis=0), np.nanmax(values, axis=0)]).max() < 1e-9
-        assert np.array_equal(seen.steps, full.steps)
 
 
 @pytest.mark.quick

@@ -1,10 +1,7 @@
 """Ensembles over a cluster equal those of one machine, also when a worker is killed on the way."""
 
 import os
-import pickle
 import signal
-import sys
-import threading
 import time
 import warnings
 from collections.abc import Iterator
@@ -13,10 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from samples import QUICK_FLAGS, pushed_pendulum
+from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
-from scvi_codegen.interfaces.distributed import _slices, _stepper, integrate_ensemble
+from scvi_codegen.interfaces.distributed import _slices, integrate_ensemble
 
 COUNT = 70
 
@@ -57,31 +54,6 @@ def test_parts_are_multiples_of_the_register_width():
 
 @pytest.mark.second
 class TestCluster:
-    def test_default_is_the_current_process(self, distributed: Any, kepler: sc.Stepper):
-        q, p = states()
-        mu = np.linspace(0.9, 1.1, COUNT)
-        arguments = {"h": 0.05, "steps": 100, "save_every": 30, "t": 1.0, "parameters": {"mu": mu}}
-        here = kepler.integrate_ensemble(q, p, **arguments)
-        done: list[int] = []
-        result = integrate_ensemble(kepler, q, p, **arguments, progress=done.append)
-        for name in ("t", "q", "p", "status", "steps", "parameters"):
-            assert np.array_equal(getattr(result, name), getattr(here, name))
-        assert done[-1] == COUNT
-        assert done == sorted(done)
-
-    @pytest.mark.parametrize("way", [{"h": 0.1, "t_end": 2.0}, {"t_end": np.linspace(1.0, 2.0, COUNT)}])
-    def test_ensembles_with_inputs_are_distributed(self, distributed: Any, way: dict[str, Any]):
-        stepper = sc.compile_stepper(pushed_pendulum(), sc.SVI(3))
-        knots, values = np.array([0.0, 0.7, 2.0]), np.linspace(-1.0, 1.0, 3 * COUNT).reshape(COUNT, 3)
-        given = {"inputs": {"u": (knots, values), "w": (knots, [0.0, 0.1, 0.0])}, **way}
-        q = np.linspace(0.1, 1.0, COUNT)[:, np.newaxis]
-        here = stepper.integrate_ensemble(q, 0.0 * q, **given)
-        result = integrate_ensemble(stepper, q, 0.0 * q, **given, blocks=3)
-        assert here.ok.all()
-        for found, expected in ((result.t, here.t), (result.q, here.q), (result.p, here.p), (result.steps, here.steps)):
-            assert np.array_equal(found, expected, equal_nan=True)
-        assert np.array_equal(result.energy(), here.energy(), equal_nan=True)
-
     @pytest.mark.quick
     def test_invalid_arguments_are_reported_before_distribution(self, kepler: sc.Stepper):
         q, p = states()
@@ -134,16 +106,6 @@ class TestCluster:
         assert np.array_equal(result.q, kepler.integrate_ensemble(q, p, h=0.05, steps=20).q)
         assert any(tmp_path.iterdir())
 
-    def test_no_process_remains(self, distributed: Any, kepler: sc.Stepper):
-        q, p = states()
-        counts = []
-        for _ in range(6):
-            integrate_ensemble(kepler, q, p, h=0.05, steps=20)
-            files = list(Path("/proc/self/fd").iterdir()) if sys.platform == "linux" else []
-            counts.append((threading.active_count(), len(files)))
-        left = np.subtract(counts[-1], counts[1])  # one may be about to close
-        assert max(left) < 3
-
     def test_interrupt_cancels_remaining_parts(self, distributed: Any, cluster: Any, kepler: sc.Stepper):
         def interrupt(done: int) -> None:
             raise KeyboardInterrupt
@@ -158,17 +120,3 @@ class TestCluster:
             while any(client.processing().values()) and time.monotonic() < end:
                 time.sleep(0.05)
             assert not any(client.processing().values())
-
-
-@pytest.mark.rotated
-def test_workers_compile_the_source_once(kepler: sc.Stepper):
-    pickled = pickle.dumps(kepler)
-    assert kepler.source.code.encode() in pickled
-    assert _stepper(pickled) is _stepper(pickled)
-
-
-@pytest.mark.rotated
-def test_missing_extra_names_what_to_install(kepler: sc.Stepper, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(ImportError, match=r"pip install 'scvi-codegen\[distributed\]'"):
-        integrate_ensemble(kepler, *states(), h=0.1, steps=1)

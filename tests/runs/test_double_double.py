@@ -23,13 +23,10 @@ from samples import GENERIC, ensemble_runs, sample_named
 
 import scvi_codegen as sc
 from scvi_codegen.codegen.native.building import TUNED_FLAGS
-from scvi_codegen.codegen.native.compilers import REORDERING_FLAGS
-from scvi_codegen.codegen.pipeline import Sources
 from scvi_codegen.codegen.rendering.kernels.double_double import FUNCTIONS, arithmetic_headers
-from scvi_codegen.codegen.variants import Lanes
 from scvi_codegen.common.errors import MethodError, StateError
 from scvi_codegen.runs.ensembles.lanes import CommonRuns
-from scvi_codegen.runs.states.words import as_mpmath, split, two_words, with_low
+from scvi_codegen.runs.states.words import split, two_words, with_low
 
 KEPLER = "m*(x_dot**2 + y_dot**2)/2 + mu/sqrt(x**2 + y**2)"
 ROOTS = ("sqrt", "inverse_root_1", "inverse_root_3", "inverse_root_5", "inverse_root_7")
@@ -280,38 +277,6 @@ def test_numbers() -> None:
     for wrong in (float("inf"), "nan", "1e999999999", mp.inf):
         with pytest.raises(StateError, match=r"q is .*: it must be finite"):
             two_words(wrong, "q")
-
-
-@pytest.mark.second
-def test_refusals() -> None:
-    """What double-double arithmetic does not have is refused with a remedy."""
-    kepler = system("kepler")
-    for flag in REORDERING_FLAGS:
-        with pytest.raises(MethodError, match="reorders sums"):
-            sc.compile_stepper(kepler, "svi:4", precision="double-double", flags=("-O2", flag))
-    with pytest.raises(MethodError, match="unknown precision 'quad'"):
-        sc.compile_stepper(kepler, "svi:4", precision="quad")
-    stepper = sc.compile_stepper(kepler, "svi:4", precision="double-double")
-    assert stepper.supports("adaptive")
-    assert not stepper.supports("observe_ensemble")
-    start = {"velocity": [0.0, 1.0], "h": 0.1}
-    with pytest.raises(StateError, match=r"q must have shape \(2,\)"):
-        stepper.integrate([1.0], **start, steps=3)
-    with pytest.raises(StateError, match="no parameter 'mass'"):
-        stepper.integrate([1.0, 0.0], **start, steps=3, parameters={"mass": 1.0})
-    for call, word in (
-        (lambda: stepper.integrate([1.0, 0.0], **start, steps=3, check_growth=True), "check_growth=True"),
-        (lambda: stepper.integrate_ensemble([[1.0, 0.0]], [[0.0, 1.0]], h=0.1, steps=3, device="cuda"), "device="),
-        (lambda: stepper.integrate([1.0, 0.0], **start, steps=3).action(), "action"),
-        (lambda: stepper.discrete_lagrangian([1.0, 0.0], [1.0, 0.1], 0.1), "discrete_lagrangian"),
-    ):
-        with pytest.raises(MethodError, match=f"{word} is not available with precision='double-double'"):
-            call()
-    run = stepper.integrate([1.0, 0.0], **start, steps=1)
-    with pytest.raises(StateError, match="'z'"):
-        run.mp("z")
-    with pytest.raises(StateError, match=r"NAME\.npz"):
-        run.save("a.csv")
 
 
 def exact_orbit(t: object, e: object = Fraction(1, 2)) -> list:
@@ -578,83 +543,6 @@ def test_lanes_do_not_depend_on_their_neighbours() -> None:
         assert (others.mp(name) == runs.mp(name)[:, order]).all()
 
 
-@pytest.mark.second
-def test_failing_lanes() -> None:
-    """A trajectory whose iteration fails keeps its states up to there, and the bits of its neighbours."""
-    stepper = sc.compile_stepper(system("kepler"), "svi:6", precision="double-double")
-    q, v, plan = [["0.9", "0.1"]] * 9, [["0.1", f"1.{j}"] for j in range(9)], {"h": 0.1, "steps": 12}
-    runs = stepper.integrate_ensemble(q, velocity=v, **plan)
-    v[4] = ["-0.6", "0.1"]  # towards the centre
-    failing = stepper.integrate_ensemble(q, velocity=v, **plan)
-    with pytest.raises(sc.StepFailedError) as failure:
-        stepper.integrate(q[4], velocity=v[4], **plan)
-    assert failing.status.tolist() == [*["ok"] * 4, failure.value.status, *["ok"] * 4]
-    done = failing.steps[4]
-    assert 0 < done == failure.value.step < 12
-    alone = stepper.integrate(q[4], velocity=v[4], **(plan | {"steps": done}))
-    assert abs(failing.mp("q")[: done + 1, 4] - alone.mp("q")).max() < 1e-29
-    assert np.isnan(failing.q[done + 1 :, 4]).all()
-    others = [0, 1, 2, 3, 5, 6, 7, 8]
-    assert (failing.mp("q")[:, others] == runs.mp("q")[:, others]).all()
-
-
-@pytest.mark.parametrize(("count", "has_lanes"), [(16, True), (17, False)])
-def test_largest_systems_in_lanes(count: int, has_lanes: bool) -> None:
-    """Trajectories are SIMD lanes for up to 256 values at the points of a step."""
-    names = [f"x{j}" for j in range(count)]
-    lagrangian = "+".join(f"{x}_dot**2/2 - {x}**4" for x in names)
-    free = sc.LagrangianSystem.from_text(name="free", coordinates=names, lagrangian=lagrangian)
-    source = Sources(free, sc.SVI(16), precision="double-double").variant(Lanes())
-    assert (source is not None) == has_lanes
-
-
-def driven_spring(t: list[float], u: list[Fraction], end: float, kind: str) -> list:
-    """Return q and its velocity at an end for q'' + q = u with values u at t, constant or linear between."""
-    q, v = mp.mpf("0.3"), mp.mpf("0.2")
-    for start, stop, *ends in zip(t, t[1:], u, u[1:], strict=False):
-        if start < end:
-            slope = (ends[1] - ends[0]) / (Fraction(stop) - Fraction(start)) * (kind == "linear")
-            at, rate = (mp.mpf(each.numerator) / each.denominator for each in (ends[0], Fraction(slope)))
-            h = mp.mpf(min(stop, end)) - start
-            c, s, x, y = mp.cos(h), mp.sin(h), q - at, v - rate
-            q, v = x * c + y * s + at + rate * h, y * c - x * s + rate
-    return [q, v]
-
-
-@pytest.mark.second
-def test_inputs() -> None:
-    """Inputs of two words, constant or linear between samples, or set by a controller, agree with the solution."""
-    spring = lagrange("driven spring", "q", "q_dot**2/2 - q**2/2 + u*q", inputs="u")
-    stepper = sc.compile_stepper(spring, "svi:10", precision="double-double")
-    t, u = [0.0, 1.0, 2.0, 4.0], ["0.1", "1/3", "-0.7", Fraction(1, 4)]
-    start = {"q": ["0.3"], "velocity": ["0.2"]}
-    with mp.workdps(50):
-        for kind, steps in (("linear", {"h": 0.07}), ("constant", {}), ("linear", {"tolerance": 1e-30})):
-            run = stepper.integrate(**start, **steps, t_end=3.7, inputs={"u": (t, u, kind)})
-            exact = driven_spring(t, [*map(Fraction, u)], 3.7, kind)
-            assert max(abs(run.mp(x)[-1, 0] - y) for x, y in zip("qp", exact, strict=True)) < 1e-30
-            inside = driven_spring(t, [*map(Fraction, u)], 1.3, kind)[0]
-            assert abs(as_mpmath(run.at(1.3)[0])[0] - inside) < 1e-30
-            many = stepper.integrate_ensemble(
-                [["0.3"]] * 2, velocity=[["0.2"]] * 2, **steps, t_end=3.7, inputs={"u": (t, [[0, 1, 2, 3], u], kind)}
-            )
-            assert (many[1].mp("q") == run.mp("q")).all()
-            assert (as_mpmath(many.energy()[: len(run), 1]) == run.mp("energy")).all()
-        held = stepper.start(**start, h=0.125)
-        for value in u[:3]:
-            held.set_inputs(u=value)
-            held.advance(8)
-        whole = stepper.integrate(**start, h=0.125, t_end=3.0, inputs={"u": ([0.0, 1.0, 2.0, 3.0], u, "constant")})
-        assert (as_mpmath(held.q) == whole.mp("q")[-1]).all()
-        constant = stepper.integrate(**start, h=0.125, steps=8, inputs={"u": "1/3"})
-        assert (
-            abs(constant.mp("q")[-1, 0] - driven_spring([0.0, 1.0], [Fraction(1, 3)] * 2, 1.0, "constant")[0]) < 1e-31
-        )
-    for wrong, message in (("u.csv", "not text; read a file first"), (([0, 1], ["a", 1]), "must be a real number")):
-        with pytest.raises(StateError, match=message):
-            stepper.integrate(**start, h=0.1, steps=3, inputs={"u": wrong})
-
-
 @pytest.mark.parametrize("kind", ["fixed", "tau", "inputs", "events"])
 def test_dense_output_at_the_times_of_states_is_these_states(kind: str) -> None:
     """Times have low words, which dense output takes as well: in arrays, in lists and alone."""
@@ -673,63 +561,6 @@ def test_dense_output_at_the_times_of_states_is_these_states(kind: str) -> None:
     assert not (run.at([run.t[3], run.t[4]])[0] - run.q[3:5]).any()
     assert not (run.at(run.t[3])[0] - run.q[3]).any()
     assert (run.at(float(run.t[3]))[0] - run.q[3]).any()
-
-
-def test_recordings(tmp_path: Path) -> None:
-    """Parameters and states of a recording keep both words, in checkpoints and files, too."""
-    stepper = sc.compile_stepper(system("kepler"), "svi:12", precision="double-double")
-    start = {"q": ["0.7", 0], "velocity": ["0", "1.3"], "t": 0.1, "parameters": {"m": "1.1", "mu": Fraction(6, 5)}}
-    run, memory = stepper.start(**start, h=0.07), stepper.integrate(**start, h=0.07, steps=40)
-    restored = stepper.from_checkpoint(run.checkpoint())
-    assert (as_mpmath(restored.parameters) == as_mpmath(run.parameters)).all()
-    recorded = sc.record_run(run, tmp_path / "a.run", rows=7, steps=40)
-    for name in ("parameters", "energy", "momentum_maps"):
-        assert (recorded[:].mp(name) == memory.mp(name)).all(), name
-    assert np.array_equal(recorded.p[::3].low, memory.p_low[::3])
-    recorded.save(tmp_path / "a.npz")
-    with np.load(tmp_path / "a.npz") as saved:
-        for name in ("t", "q", "p", "parameters"):
-            assert saved[f"{name}_low"].any()
-            assert np.array_equal(saved[f"{name}_low"], getattr(memory, name).low)
-    with pytest.raises(StateError, match=r"NAME\.npz"):
-        recorded.save(tmp_path / "a.h5")
-
-
-@pytest.mark.rotated
-def test_associative_math_is_an_error(tmp_path: Path) -> None:
-    """The C itself refuses to be compiled with reordered sums."""
-    stepper = sc.compile_stepper(system("kepler"), "svi:4", precision="double-double")
-    source = stepper.source.amalgamated()
-    (tmp_path / f"{source.prefix}.h").write_text(source.header)
-    (tmp_path / "step.c").write_text(source.code)
-    for flag, wanted in (("-ffast-math", "-fassociative-math"), ("-O1", "")):
-        command = ["cc", "-std=c99", flag, "-c", "step.c", "-o", "step.o"]
-        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-        assert (done.returncode != 0) == bool(wanted)
-        assert wanted in done.stderr
-
-
-@pytest.mark.second
-@pytest.mark.parametrize(("h", "t_end"), [(0.1, 20.0), (0.3, 3.0), (0.7, 2.1), (-0.3, -3.0), (0.25, 2.0), (0.15, 2.0)])
-def test_fixed_steps_end_at_the_final_time(h: float, t_end: float) -> None:
-    """y = 1 - t^2/2, and between impacts y = T s - s^2/2 with T = sqrt(2), at t_end, not at the multiple of h."""
-    ball = lagrange("ball", "y", "y_dot**2/2 - y")
-    stepper = sc.compile_stepper(ball, "svi:2", precision="double-double")
-    observed, reflected = sc.Event("y", -1), sc.Event("y", -1, then={"y_dot": "-y_dot"})
-    with mp.workdps(50):
-        t, T = mp.mpf(t_end), mp.sqrt(2)
-        s = abs(t) - (2 * mp.floor((abs(t) + T) / (2 * T)) - 1) * T
-        expected = 1 - t**2 / 2, T * s - s**2 / 2 if t > T else 1 - t**2 / 2
-        for events, y in zip((observed, reflected), expected, strict=True):
-            if t < 0 and events is reflected:
-                continue
-            for save_every in (1, 3):
-                run = stepper.integrate(["1"], ["0"], h=h, t_end=t_end, events=events, save_every=save_every)
-                assert run.mp("t")[-1] == t
-                assert abs(run.mp("q")[-1][0] - y) < 1e-30 * (1 + abs(y))
-                assert run.steps == round(t_end / h + 0.17)
-        many = stepper.integrate_ensemble([["1"]], [["0"]], h=h, t_end=t_end)
-        assert abs(many.mp("q")[-1][0][0] - expected[0]) < 1e-30 * (1 + t**2)
 
 
 @pytest.mark.rotated

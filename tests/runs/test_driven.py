@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import sympy
 from counting import at_most
-from notation import hamilton, lagrange
+from notation import lagrange
 from numpy.testing import assert_allclose
 from samples import pushed_pendulum
 from scipy.integrate import solve_ivp
@@ -160,27 +160,6 @@ def test_states_at_breakpoints_are_saved_for_any_save_every(pendulum, t_end):
         full.at(3.0)
 
 
-@pytest.mark.second
-def test_files_contain_energies_with_the_inputs_of_their_times(pendulum, tmp_path):
-    stepper = sc.compile_stepper(pendulum, sc.SVI(4))
-    inputs = {"u": (KNOTS, VALUES), "w": ([0.0, 1.0, 3.0], [0.0, 0.5, 0.0])}
-    run = stepper.integrate([0.3], [0.1], inputs=inputs, h=0.1, t_end=2.3, parameters={"c": 0.3}, events="q_dot")
-    run.save(tmp_path / "run.npz")
-    with np.load(tmp_path / "run.npz") as file:
-        assert (file["q"] == run.q).all()
-        assert dict(zip(file["parameter_names"].tolist(), file["parameters"].tolist(), strict=True)) == {"c": 0.3}
-    table = run.to_xarray()
-    w = np.interp(run.t, [0.0, 1.0, 3.0], [0.0, 0.5, 0.0])
-    assert_allclose(table["energy"], run.p[:, 0] ** 2 / 2 - (1 + w) * np.cos(run.q[:, 0]), rtol=1e-14)
-    assert len(run.to_dataframe()) == len(run)
-    (turns,) = run.events
-    assert_allclose(run.at(turns.t)[1], 0.0, rtol=0, atol=1e-9)
-    assert len(turns) == np.count_nonzero(np.diff(np.sign(run.p[:, 0])))
-    run.plot(tmp_path / "run.png")
-    assert 0.0 < run.step_error < 1e-4
-    assert run.worst_step_time in run.t
-
-
 @pytest.mark.parametrize(
     ("inputs", "message"),
     [
@@ -279,50 +258,6 @@ def test_events_and_time_transformations_use_inputs_by_name(pendulum):
     assert np.median(np.abs(ratio - 1)) < 0.05
     with pytest.raises(sc.ExpressionError, match=r"Known here: .* u, w"):
         stepper.with_events("v - 1")
-
-
-@pytest.mark.second
-def test_inputs_survive_changes_of_coordinates_and_formulation(pendulum):
-    inputs, data = ("u", "w"), {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], [0.0, 0.3])}
-    expected = sc.compile_stepper(pendulum, sc.SVI(4)).integrate([0.3], [0.1], inputs=data, h=0.05, t_end=2.3)
-    dual, half = sc.hamiltonian_of(pendulum), sc.change_coordinates(pendulum, {"q": "2*z"}, coordinates=["z"])
-    assert dual.inputs == sc.lagrangian_of(dual).inputs == half.inputs == inputs
-    found = sc.compile_stepper(dual, sc.SVI(4)).integrate([0.3], [0.1], inputs=data, h=0.05, t_end=2.3)
-    assert_allclose(found.q, expected.q, rtol=0, atol=1e-8)
-    found = sc.compile_stepper(half, sc.SVI(4)).integrate([0.15], [0.2], inputs=data, h=0.05, t_end=2.3)
-    assert_allclose(2.0 * found.q, expected.q, rtol=0, atol=1e-13)
-
-
-@pytest.mark.second
-def test_inputs_of_a_hamiltonian(pendulum):
-    """Text and SymPy input, in H and in forces, equal the Lagrangian formulation."""
-    data = {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], [0.0, 0.3])}
-    expected = sc.compile_stepper(pendulum, sc.SVI(6)).integrate([0.3], [0.1], inputs=data, h=0.05, t_end=2.3)
-    reported = hamilton(
-        "pushed pendulum", "q", "p**2/2 - (1 + w)*cos(q)", momenta="p", c=0.2, forces={"q": "u - c*p"}, inputs="u w"
-    )
-    q, p, c, u, w = sympy.symbols("q p c u w")
-    taken = sc.HamiltonianSystem.from_sympy(
-        name="pushed pendulum",
-        coordinates=[q],
-        momenta=[p],
-        hamiltonian=p**2 / 2 - (1 + w) * sympy.cos(q),
-        parameters={c: 0.2},
-        forces={q: u - c * p},
-        inputs=[u, w],
-    )
-    assert reported == taken
-    found = sc.compile_stepper(reported, sc.SVI(6)).integrate([0.3], [0.1], inputs=data, h=0.05, t_end=2.3)
-    assert_allclose(found.q, expected.q, rtol=0, atol=1e-13)
-
-
-def test_step_of_a_run_with_inputs_uses_the_first_segment(pendulum):
-    stepper = sc.compile_stepper(pendulum, "svi:2")
-    inputs = {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], [0.0, 0.3])}
-    for h in (0.1, 0.4):
-        run = stepper.integrate([0.3], [0.1], inputs=inputs, h=h, t_end=2.3)
-        assert run.h == run.t[1] - run.t[0] == min(h, KNOTS[1])
-    assert stepper.integrate([0.3], [0.1], inputs=inputs, h=0.1, t_end=0.3).h == 0.1
 
 
 @pytest.mark.rotated

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import gc
 import pickle
 import re
 import signal
 import threading
-import tracemalloc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -21,7 +19,6 @@ from commands import error_of, invoke, output_of
 from notation import hamilton, lagrange
 from numpy.testing import assert_allclose
 from samples import ensemble_runs, pushed_pendulum, sample_named, stepper_for
-from scipy.interpolate import CubicSpline
 
 import scvi_codegen as sc
 from benchmarks.cases.robots import chain
@@ -246,14 +243,6 @@ def test_heavy_tops_in_lanes_have_the_bits_of_single_runs(count: int) -> None:
 
 
 @pytest.mark.second
-def test_iterations_of_coupled_systems_start_with_velocities() -> None:
-    stepper = stepper_of("coupled with inputs", sc.SVI(3))
-    assert stepper.ensemble is not None
-    assert "_NEEDS_VELOCITIES = 1" in stepper.ensemble.header
-    assert stepper_of("pushed pendulum", sc.SCVI(2)).ensemble is None
-
-
-@pytest.mark.second
 def test_parameters_are_named_rows_or_one_row_per_trajectory() -> None:
     stepper = stepper_for("planar-pendulum", sc.SVI(5))
     q, p = states("planar-pendulum", 3)
@@ -429,16 +418,6 @@ def test_bits_of_trajectories_do_not_depend_on_others(
 
 
 class TestThreadsAndInterruption:
-    @pytest.mark.second
-    @pytest.mark.parametrize("method", [sc.SVI(5), sc.SCVI(2)], ids=lambda method: method.name)
-    def test_progress_counts_up_to_the_end(self, method: Method):
-        stepper = stepper_for("kepler", method)
-        q, p = states("kepler", 32)
-        calls: list[int] = []
-        stepper.integrate_ensemble(q, p, h=0.05, steps=4000, save_every=4000, progress=calls.append, threads=2)
-        assert calls == sorted(calls)
-        assert calls[-1] == 4000
-
     def test_interrupt_ends_all_threads_and_returns_completed_states(self, kepler: sc.Stepper):
         q, p = states("kepler", 64)
         work = ensemble_runs(kepler, q, p, h=0.05, steps=10**9, save_every=10**7)
@@ -453,27 +432,6 @@ class TestThreadsAndInterruption:
         result = work.result()
         assert set(result.status) == {"interrupted"}
         assert 0 < result.steps.max() < 10**9
-
-    def test_error_in_a_block_is_raised(self, kepler: sc.Stepper, monkeypatch: pytest.MonkeyPatch):
-        def fail(*arguments: object, **others: object) -> None:
-            raise RuntimeError("out of order")
-
-        monkeypatch.setattr("scvi_codegen.runs.ensembles.batches.Batch.advance", fail)
-        with pytest.raises(RuntimeError, match="out of order"):
-            kepler.integrate_ensemble(*states("kepler", 20), h=0.05, steps=10)
-
-    @pytest.mark.rotated
-    def test_memory_is_bounded_by_save_every(self, kepler: sc.Stepper):
-        q, p = states("kepler", 64)
-        kepler.integrate_ensemble(q, p, h=0.05, steps=1)
-        gc.collect()
-        tracemalloc.start()
-        try:
-            kepler.integrate_ensemble(q, p, h=0.05, steps=20_000, save_every=2000)
-            peak = tracemalloc.get_traced_memory()[1]
-        finally:
-            tracemalloc.stop()
-        assert peak < 1e6  # all states would take 41 MB
 
     def test_interrupted_adaptive_runs_return_completed_states(self) -> None:
         q, p = states("eccentric", 4)
@@ -676,38 +634,6 @@ class TestCommandLine:
             assert file["steps"].max() > 0
 
 
-@pytest.mark.parametrize("name", ["kepler", "double-pendulum"])
-def test_absolute_tolerance_equals_that_of_single_trajectories(name):
-    """With the absolute tolerance, lanes need as many iterations and reach the same states."""
-    chosen = sc.problem(name)
-    stepper = sc.compile_stepper(chosen.system, sc.SVI(4))
-    p = stepper.momentum(chosen.q, chosen.velocity)
-    options = sc.SolverOptions(tolerance=1e-6, absolute=True)
-    single = stepper.integrate(chosen.q, p, h=0.05, steps=20, save_every=20, options=options)
-    many = stepper.integrate_ensemble([chosen.q] * 8, [p] * 8, h=0.05, steps=20, save_every=20, options=options)
-    exact = stepper.integrate(chosen.q, p, h=0.05, steps=20, save_every=20)
-    np.testing.assert_allclose(many.q[-1, 0], single.q[-1], rtol=1e-13, atol=1e-13)
-    assert not np.allclose(exact.q[-1], single.q[-1], rtol=1e-14, atol=1e-14)
-
-
-def test_velocities_use_the_inputs_at_the_start():
-    stepper = stepper_of("coupled with inputs", sc.SVI(3))
-    q, v = states("coupled with inputs", COUNT)
-    inputs = {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], np.outer(np.arange(COUNT), [1.0, 0.0]))}
-    runs = stepper.integrate_ensemble(q, velocity=v, inputs=inputs, h=0.1, t_end=0.2)
-    assert_allclose(runs.p[0, :, 1], v[:, 0] / 3 + 2 * (1 + np.arange(COUNT) / 5) * v[:, 1])
-
-
-def test_splines_of_scipy_are_accepted():
-    stepper = stepper_of("pushed pendulum", sc.SVI(3))
-    by_spline, by_values = (
-        stepper.integrate_ensemble(*states("pushed pendulum", COUNT), inputs={"u": u, "w": W}, h=0.05, steps=40)
-        for u in (CubicSpline(KNOTS, OWN_VALUES, axis=1), (KNOTS, OWN_VALUES, "cubic"))
-    )
-    assert by_values.t[-1] == 2.0
-    assert (by_values.q == by_spline.q).all()
-
-
 @pytest.mark.second
 @pytest.mark.filterwarnings("ignore::scvi_codegen.common.errors.AccuracyWarning")
 def test_lane_with_failed_iteration_continues_as_scalar_across_breakpoints():
@@ -721,19 +647,6 @@ def test_lane_with_failed_iteration_continues_as_scalar_across_breakpoints():
     run = stepper.integrate(q[4], p[4], inputs={"u": (KNOTS, u[4])}, h=0.1, t_end=2.3)
     assert_allclose(runs.q[:, 4], run.q, rtol=0, atol=1e-11)
     assert_allclose(runs.energy()[:, 4], run.energy(), rtol=1e-10)
-
-
-def test_threads_chunks_and_save_every_do_not_change_results():
-    stepper = stepper_of("pushed pendulum", sc.SVI(3))
-    inputs, reported = {"u": (KNOTS, OWN_VALUES), "w": ([0.0, 3.0], [0.0, 0.3])}, []
-    arguments = {"inputs": inputs, "h": 0.001, "t_end": 2.3}
-    full = stepper.integrate_ensemble(*states("pushed pendulum", COUNT), **arguments, progress=reported.append)
-    fewer = stepper.integrate_ensemble(*states("pushed pendulum", COUNT), **arguments, save_every=100, threads=1)
-    assert reported[-1] == full.steps[0]
-    rows = np.isin(full.t, fewer.t)
-    assert rows.sum() == len(fewer.t) == 24 + 3  # breakpoints that fall between hundreds of steps
-    assert (full.q[rows] == fewer.q).all()
-    assert_allclose(full.energy()[rows], fewer.energy(), rtol=0, atol=0)
 
 
 def test_files_contain_individual_times(tmp_path: Path) -> None:

@@ -40,18 +40,6 @@ def test_files_are_read_by_xarray(xarray, ensemble, tmp_path, name):
         assert dataset.attrs["method"] == ensemble.stepper.interface.method
 
 
-@pytest.mark.second
-def test_dataset_contains_derived_quantities(ensemble):
-    dataset = ensemble.to_xarray()
-    assert dataset.q.dims == ("t", "trajectory", "coordinate")
-    np.testing.assert_array_equal(dataset.energy, ensemble.energy())
-    np.testing.assert_array_equal(dataset.momentum_map, ensemble.momentum_maps())
-    np.testing.assert_array_equal(dataset.parameters.sel(parameter="mu"), [1.0, 1.1, 1.2])
-    j, n = 1, 7
-    velocity = ensemble.stepper.velocity(ensemble.q[n, j], ensemble.p[n, j], parameters=ensemble.parameters[j])
-    np.testing.assert_array_equal(dataset.velocity[n, j], velocity)
-
-
 def test_failed_trajectory_is_nan_after_its_failure(ensemble):
     assert not ensemble.ok[2]
     dataset = ensemble.to_xarray()

@@ -144,14 +144,6 @@ def test_chaos_under_forces_is_reported_by_a_tangent_vector(name, tolerance):
     assert reports(stepper, q, p, t_end, tolerance=tolerance) == chaotic
 
 
-@pytest.mark.tiers(0, 1)
-@pytest.mark.parametrize("method", ["svi:3", "svi:12", "svi:16"])
-@pytest.mark.parametrize("name", ["Kepler 0.9", "Henon-Heiles, E = 1/6.2"])
-def test_other_methods_report_the_same(name, method):
-    system, q, p, t_end = (REGULAR | CHAOTIC)[name]
-    assert reports(stepper_of(system, method), q, p, t_end / 2, tolerance=1e-9) == (name in CHAOTIC)
-
-
 @pytest.mark.parametrize("tolerance", [0.0, 1e-9])
 @pytest.mark.parametrize("name", ["Henon-Heiles, E = 1/6.2", "double pendulum"])
 def test_growth_is_that_of_nearby_runs(name, tolerance):
@@ -167,45 +159,6 @@ def test_growth_is_that_of_nearby_runs(name, tolerance):
     apart = max(np.linalg.norm(b[-1] - a[-1]) / np.linalg.norm(a - c, axis=1).max() for a, b, c in pairs)
     assert run._growth[0] > 5.0
     assert run._growth[0] == pytest.approx(math.log(apart / size), abs=1.5)
-
-
-@pytest.mark.second
-@pytest.mark.parametrize(
-    ("system", "method", "measured"),
-    [
-        (PENDULUM, "svi:8", True),
-        (TOP, "svi:4", True),
-        ((("x",), "x_dot**2/2 - x**2/2 + x*sin(t)"), "svi:4", True),
-        (
-            (tuple(f"x{i}" for i in range(24)), " + ".join(f"x{i}_dot**2/2 - x{i}**4" for i in range(24))),
-            "svi:2",
-            False,
-        ),
-    ],
-    ids=["double pendulum", "top", "driven", "24 coordinates"],
-)
-def test_which_systems_have_a_tangent_vector(system, method, measured):
-    stepper = stepper_of(system, method)
-    assert (
-        hasattr(stepper.start([0.1] * len(system[0]), [0.1] * len(system[0]), t_end=1.0)._memory, "measures_growth")
-        == measured
-    )
-
-
-@pytest.mark.second
-@pytest.mark.parametrize(
-    "more",
-    [{"save_every": 7}, {"t_eval": np.linspace(0.0, 300.0, 20)}, {"observe": lambda run: run.q[0]}, {"events": "x"}],
-    ids=lambda each: next(iter(each)),
-)
-def test_reports_do_not_depend_on_what_is_saved(more):
-    system, q, p, t_end = CHAOTIC["Henon-Heiles, E = 1/6.2"]
-    assert reports(stepper_of(system), q, p, t_end, **more)
-
-
-def test_backward_runs_are_checked():
-    system, q, p, t_end = CHAOTIC["Henon-Heiles, E = 1/6.2"]
-    assert reports(stepper_of(system), q, p, -t_end)
 
 
 def test_growth_is_measured_only_where_the_check_needs_it():
@@ -319,12 +272,6 @@ def test_small_motions_on_a_rod_are_not_reported(angle, unit, tolerance):
     rod = lagrange("rod", "x y", f"({v}**2 + y_dot**2)/2 - y", constraints=[f"{u}**2 + y**2 = 1"])
     start = [np.sin(angle) / unit, -np.cos(angle)], [0.0, 0.0]
     assert not reports(sc.compile_stepper(rod, "svi:2"), *start, 20.0, tolerance=tolerance)
-
-
-def test_growth_of_coordinates_near_a_pole_is_not_reported():
-    """Angles of a spherical pendulum that passes its pole at a distance of 1e-7."""
-    with warnings.catch_warnings(action="error"):
-        stepper_of(SPHERICAL).integrate([2.0, 0.0], velocity=[0.0, 1e-7], t_end=50.0)
 
 
 @pytest.mark.second

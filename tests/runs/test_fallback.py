@@ -1,6 +1,5 @@
 """Newton's iteration from a fallback library equals a built-in one and is compiled on demand."""
 
-import pickle
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache
@@ -64,16 +63,6 @@ def test_fallback_library_gives_equal_bits(method, h, events, start):
     assert outcome(borrowing, start, h, **events) == outcome(owning, start, h, **events)
 
 
-def test_error_estimate_of_a_fallback_step_is_equal(start):
-    errors = []
-    for stepper in both(sc.SVI(4)):
-        run = stepper.start(*start, h=LONG)
-        run.advance(6)
-        errors.append((run.step_error, run.worst_step_time))
-    assert errors[0][0] == pytest.approx(errors[1][0], rel=1e-12)
-    assert errors[0][1] == errors[1][1]
-
-
 def test_newton_iteration_is_compiled_on_demand(start, monkeypatch):
     built = []
     load = building.load
@@ -90,14 +79,6 @@ def test_newton_iteration_is_compiled_on_demand(start, monkeypatch):
     assert built == ["late"] * 2
 
 
-def test_discrete_lagrangian_comes_from_the_fallback_library(start):
-    borrowing, owning = both(sc.SVI(4))
-    assert "discrete_legendre" not in borrowing.source.declarations
-    q, _ = start
-    values = [stepper.discrete_lagrangian(q, q + 0.01, 0.1) for stepper in (borrowing, owning)]
-    assert values[0] == values[1]
-
-
 def test_concurrent_threads_compile_the_fallback_once(start):
     stepper = sc.compile_stepper(
         sc.problem("double-pendulum").system, sc.SVI(3), prefix="threads", flags=PORTABLE_FLAGS
@@ -106,30 +87,6 @@ def test_concurrent_threads_compile_the_fallback_once(start):
         found = list(pool.map(lambda _: outcome(stepper, start, LONG), range(16)))
     assert all(each == found[0] for each in found)
     assert found[0] == outcome(stepper, start, LONG)
-
-
-def test_copy_in_another_process_uses_the_fallback(start):
-    borrowing, owning = both(sc.SVI(4))
-    assert outcome(pickle.loads(pickle.dumps(borrowing)), start, LONG) == outcome(owning, start, LONG)
-
-
-def test_recorded_run_continues_with_its_fallback(start, tmp_path):
-    borrowing, owning = both(sc.SVI(4))
-    expected = owning.start(*start, h=LONG).record(60)
-    sc.record_run(borrowing.start(*start, h=LONG), tmp_path / "run", steps=20)
-    whole = sc.resume_run(tmp_path / "run", steps=60)[:]
-    assert np.array_equal(whole.q, expected.q)
-    assert np.array_equal(whole.iterations, expected.iterations)
-
-
-@pytest.mark.second
-def test_failed_run_ends_before_the_step(start):
-    borrowing, _ = both(sc.SVI(4))
-    run = borrowing.start(*start, h=40.0)
-    before = run.checkpoint()
-    with pytest.raises(sc.StepFailedError):
-        run.advance(1)
-    assert run.checkpoint() == before
 
 
 def test_prepare_compiles_everything_later_calls_need(tmp_path, monkeypatch):

@@ -76,19 +76,3 @@ def test_solve_ivp_accepts_velocities_and_scipy_arguments():
         sc.solve_ivp(stepper, y0=Q, velocity=V, args=values, parameters=values, **given)
     with pytest.raises(sc.MethodError, match="RK45"):
         sc.solve_ivp(sc.problem("kepler").system, (0.0, 1.0), [1.0, 0.0, 0.0, 1.0], method="RK45")
-
-
-@pytest.mark.parametrize(
-    ("name", "method"),
-    [
-        ("svi", sc.SVI(8)),
-        ("svi:6", sc.SVI(6)),
-        ("scvi:3", sc.SCVI(3)),
-        ("gauss:4", sc.Gauss(4)),
-        ("stoermer-verlet", sc.StoermerVerlet()),
-        ("composition:10", sc.Composition(10)),
-    ],
-)
-def test_names_of_methods_are_accepted(name, method):
-    assert sc.as_method(name) == method
-    assert sc.as_method(method) is method

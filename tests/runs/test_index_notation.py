@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from golden_cells import catalogue
 from notation import hamilton
 from samples import QUICK_FLAGS
 
@@ -55,19 +54,6 @@ def test_time_transformation_by_momenta_of_a_hamiltonian():
     assert str(found) == "1/(p_0**2 + p_1**2 + p_2**2 + 1)"
 
 
-@pytest.mark.rotated
-def test_events_of_the_stepper_equal_events_of_the_run(ring):
-    event = f"q[0]*q[1] - sum(i in {size_of(ring)}, q[i]**2)/8"
-    options = {"velocity": 0 * Q, "h": 0.1, "steps": 150}
-    own = compiled(ring, events=event).integrate(Q, **options).events[0]
-    known = sc.LagrangianSystem.from_text(name="ring", coordinates=["q[4]"], lagrangian=RING.format(N=4))
-    of_entries = (
-        compiled(known).integrate(Q, events="q_0*q_1 - (q_0**2 + q_1**2 + q_2**2 + q_3**2)/8", **options).events[0]
-    )
-    assert len(own) > 3
-    np.testing.assert_allclose(own.t, of_entries.t, rtol=0, atol=1e-13)
-
-
 @pytest.mark.second
 def test_events_in_index_notation_change_the_state():
     system = sc.LagrangianSystem.from_text(name="ring", coordinates=["q[4]"], lagrangian=RING.format(N=4))
@@ -77,13 +63,6 @@ def test_events_in_index_notation_change_the_state():
     found, same = (compiled(system).integrate(Q, events=each, **options) for each in (by_index, by_name))
     assert len(found.events[0]) > 0
     np.testing.assert_array_equal(found.q[-1], same.q[-1])
-
-
-def test_symmetries_require_known_sizes():
-    ring = sc.LagrangianSystem.from_text(name="ring", coordinates=["q[N]"], lagrangian=RING.format(N="N"))
-    rotation = sc.check_symmetry(catalogue("kepler")(), ["-q2", "q1"])
-    with pytest.raises(sc.MethodError, match="symmetries= is unavailable for 'ring': the sizes"):
-        compiled(ring, symmetries=[rotation])
 
 
 @pytest.mark.parametrize("size", ["N", "3"])

@@ -100,12 +100,6 @@ def test_systems_with_linear_part(further, found):
     assert bool(program.fixed_point and program.fixed_point.linear_part) is found
 
 
-def test_ring_is_a_narrow_band():
-    linear = lower(ring(), SVI(2), prefix="x").fixed_point.linear_part
-    assert linear.bandwidth == 2
-    assert len(linear.entries) == 2 * COUNT
-
-
 @pytest.mark.rotated
 def test_fast_vibrations_that_cannot_be_extrapolated_begin_with_a_straight_line():
     """With former steps extrapolated whatever the error, the run takes 500 iterations."""

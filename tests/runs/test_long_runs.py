@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from commands import error_of, output_of
 from programs import needs
-from recorded_runs import STATE, H, assert_same, digests, recorded, start
+from recorded_runs import H, assert_same, digests, recorded, start
 
 import scvi_codegen as sc
 from scvi_codegen.runs.recording import load_run
@@ -130,18 +130,6 @@ def test_full_disk_loses_nothing_and_the_run_continues_later(kepler, small_disk)
     assert digests("a.run") == digests("whole.run")
 
 
-@pytest.mark.sampled(2)
-@pytest.mark.parametrize("suffix", ["npz", "csv", "h5", "zarr"])
-def test_failed_write_preserves_the_old_file(kepler, small_disk, suffix):
-    pytest.importorskip({"h5": "h5netcdf", "zarr": "zarr"}.get(suffix, "numpy"))
-    path = small_disk / f"a.{suffix}"
-    kepler.integrate(**STATE, h=H, steps=30).save(path)
-    before = {file: file.read_bytes() for file in small_disk.rglob("*") if file.is_file()}
-    with pytest.raises(OSError, match=rf"No space left on device: nothing was written.*a\.{suffix}'"):
-        kepler.integrate(**STATE, h=H, steps=100_000).save(path)
-    assert {file: file.read_bytes() for file in small_disk.rglob("*") if file.is_file()} == before
-
-
 WITHOUT_RIGHTS = """
 for path in (*Path("a.run").iterdir(), Path("a.run"), Path()):
     path.chmod(0o555 if path.is_dir() else 0o444)
@@ -166,17 +154,6 @@ def test_unwritable_folder_is_reported_before_the_run(kepler, tmp_path):
             folder.chmod(0o755)
     assert "'a.run' cannot be written: Permission denied. It contains the run up to step 100 (t = 5)" in stderr
     assert digests("a.run") == before
-
-
-def test_exception_in_a_callback_loses_nothing(kepler):
-    def interrupt(done: int) -> None:
-        if done > 300:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        recorded(kepler, 10**9, rows=10**6, progress=interrupt)
-    assert load_run("a.run").steps > 300
-    assert_same(sc.resume_run("a.run", steps=3000), kepler.integrate(**STATE, h=H, steps=3000))
 
 
 @pytest.mark.second

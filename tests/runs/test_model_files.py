@@ -5,7 +5,6 @@ import pytest
 
 import scvi_codegen as sc
 from scvi_codegen.codegen.rendering.source import Interface
-from scvi_codegen.interfaces.cli import main
 from scvi_codegen.interfaces.models.model_files.model_file import dump_model, parse_model
 
 TOP = """
@@ -82,26 +81,6 @@ def test_a_model_is_written_with_its_rotations(text):
     assert ("rotations" in written) == ("rotations" in text)
     assert ("spins" in written) == ("spins" in text)
     assert parse_model(written) == model
-
-
-@pytest.mark.rotated
-def test_the_command_line_runs_a_file_with_rotations(tmp_path):
-    path = tmp_path / "top.toml"
-    path.write_text(TOP)
-    with pytest.raises(SystemExit) as ended:
-        main(["run", str(path), "-o", str(tmp_path / "out.csv")])
-    assert ended.value.code == 0
-    assert "R_w" in (tmp_path / "out.csv").read_text()
-
-
-def test_torques_in_the_section_of_the_system_are_located():
-    with pytest.raises(sc.ModelFileError, match=r"'torques' in \[system\]; there is a section \[torques\]"):
-        parse_model(TOP.replace("[torques]\nR", "torques.R"))
-
-
-def test_an_unknown_rotation_in_the_initial_state_is_named():
-    with pytest.raises(sc.ModelFileError, match="no 'omeg' in velocity"):
-        parse_model(TOP.replace("omega = [0.1", "omeg = [0.1"))
 
 
 @pytest.mark.parametrize("wrong", ["spin", "rotation R", "motion R omega", "rotation R omega; x", "rotation R omega"])

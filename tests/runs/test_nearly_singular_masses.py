@@ -50,27 +50,11 @@ def test_light_cart_is_accelerated_strongly(cart, method, tolerance):
     np.testing.assert_allclose(run.q[:, 0], (np.sin(1.0) - np.sin(run.q[:, 1])) / (1 + LIGHT), rtol=0, atol=allowed)
 
 
-def test_light_cart_by_its_hamiltonian(cart):
-    run = sc.compile_stepper(sc.hamiltonian_of(cart), "gauss:8").integrate([0, 1], [0, 0], t_end=SPAN)
-    assert run.q[-1, 1] == pytest.approx(angle_alone(), abs=1e-9)
-    assert run.rejected_steps < 100
-
-
 def test_step_count_is_bounded_by_the_tolerance(stepper):
     """Rounding that were taken for unresolved motion would end in steps of 1e-17."""
     exact, loose = (stepper.integrate([0, 1], velocity=[0, 0], t_end=SPAN, tolerance=x) for x in (None, 1e-9))
     assert exact.steps < 3 * loose.steps
     assert exact.rejected_steps < 50
-
-
-@pytest.mark.quick
-def test_batched_and_single_steps_are_equal(stepper):
-    angles = 1.0 + 0.01 * np.arange(9)
-    start = np.column_stack([0.0 * angles, angles])
-    runs = stepper.integrate_ensemble(start, velocity=0.0 * start, t_end=SPAN)
-    assert list(runs.status) == ["ok"] * 9
-    alone = stepper.integrate(start[4], velocity=[0, 0], t_end=SPAN)
-    assert runs.q[len(alone.t) - 1, 4] == pytest.approx(alone.q[-1], abs=1e-9)
 
 
 def test_first_step_of_a_sleeping_top_is_not_tiny():

@@ -17,7 +17,6 @@ from programs import needs
 import scvi_codegen as sc
 from scvi_codegen.codegen.native.compilers import find_compiler
 from scvi_codegen.codegen.rendering.source import _check_lengths
-from scvi_codegen.interfaces.models.model_files.model_file import dump_model
 from scvi_codegen.interfaces.models.packages.package import generate_package
 
 SQUARE = "sum(a in 3, wrap(r[i, a] - r[j, a], box)**2)"
@@ -222,24 +221,6 @@ def test_boxes_of_other_shapes_and_none(box: Any) -> None:
 
 
 @pytest.mark.rotated
-def test_known_sizes_model_files_and_sympy_have_the_same_sum(tmp_path: Path) -> None:
-    r, v = start()
-    few = {"r": r[:4]}
-    expected = stepper("svi:2").integrate(few, velocity=v[:4], h=0.01, steps=20)
-    known = sc.compile_stepper(liquid(), "svi:2", sizes={"N": 4})
-    run = known.integrate(r[:4].reshape(-1), velocity=v[:4].reshape(-1), h=0.01, steps=20)
-    assert run.q == pytest.approx(expected.q["r"].reshape(21, -1), abs=1e-12)
-    moved = stepper("svi:2").jacobian(few, {"r": v[:4]}, h=0.01)
-    assert moved == pytest.approx(known.jacobian(r[:4].reshape(-1), v[:4].reshape(-1), h=0.01), abs=1e-9)
-    model = sc.Model(system=liquid(), q=few, velocity={"r": v[:4]}, h=0.01, method=sc.SVI(2), span=0.2)
-    path = tmp_path / "liquid.toml"
-    path.write_text(dump_model(model))
-    again = sc.load_model(path)
-    assert again.system == model.system
-    assert again.integrate().q["r"][-1] == pytest.approx(expected.q["r"][-1], abs=1e-12)
-
-
-@pytest.mark.rotated
 @pytest.mark.parametrize("sanitizer", ["address,undefined", pytest.param("thread", marks=pytest.mark.full)])
 def test_programs_of_packages_make_their_lists(sanitizer: str, tmp_path: Path) -> None:
     """With three threads and the compiler's sanitizers, from the same start to the same bits."""
@@ -334,20 +315,6 @@ steps = 3
         (tmp_path / "model.toml").write_text(text.replace("3.9", length))
         with pytest.raises(sc.StateError, match=message) if message else nullcontext():
             generate_package(sc.load_model(tmp_path / "model.toml"), tmp_path / "generated_gas")
-
-
-def test_lengths_may_be_formulas_and_defaults_are_checked() -> None:
-    near = {"near": {"of": "q", "box": "2*cell", "cutoff": "5*sqrt(s)/2"}}
-    text = "sum(i in N, q_dot[i]**2/2) - sum(i < j in near, (q[i] - q[j])**2)"
-    numbers = {"cell": 2.4, "s": 1.0}
-    line = sc.LagrangianSystem.from_text("line", ["q[N]"], text, parameters=numbers, neighbours=near)
-    each = sc.compile_stepper(line, "stoermer-verlet", sizes={"N": 2})
-    wrong = r"is 2\*cell = 4.8.* must be at least two cutoffs, 2\*\(5\*sqrt\(s\)/2\) = 5\b"
-    with pytest.raises(sc.StateError, match=wrong):
-        each.integrate({"q": [0.0, 1.0]}, {"q": [0.0, 0.0]}, h=0.1, steps=1)
-    each.integrate({"q": [0.0, 1.0]}, {"q": [0.0, 0.0]}, h=0.1, steps=1, parameters={"s": 0.9})
-    with pytest.raises(sc.StateError, match="must be a positive number"):
-        each.integrate({"q": [0.0, 1.0]}, {"q": [0.0, 0.0]}, h=0.1, steps=1, parameters={"s": -1})
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,5 @@
 """Observers receive every state of a run once, in any situation."""
 
-import signal
-import time
-
 import numpy as np
 import pytest
 
@@ -82,32 +79,6 @@ def test_energy_errors_of_observed_runs_are_those_of_saved_ones(stepper):
         assert run.energy_error() == pytest.approx(np.abs(energy - energy[0]).max() / np.abs(energy).max(), rel=1e-15)
     ends = stepper.velocity(run.q, run.p, run.t[[0, -1]])
     assert np.array_equal(run.velocity, ends)
-
-
-PLANS = {"fixed": {"h": 0.01, "steps": 50_000_000}, "adaptive": {"t_end": 1e8}}
-
-
-@pytest.mark.filterwarnings("ignore::scvi_codegen.common.errors.AccuracyWarning")
-@pytest.mark.parametrize("plan", PLANS)
-def test_few_saved_states_do_not_delay_interruptions(plan):
-    """A call into C that ended with the next saved state would take a second and more."""
-    pendulum = sc.compile_stepper(sc.problem("planar-pendulum").system, "svi:2")
-    longest = []
-
-    def stop(signum, frame):
-        longest.append(time.perf_counter())
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGALRM, stop)
-    try:
-        signal.setitimer(signal.ITIMER_REAL, 0.1)
-        began = time.perf_counter()
-        with pytest.raises(KeyboardInterrupt):
-            pendulum.integrate([1.0], [0.0], **PLANS[plan], save_every=10_000_000)
-        assert longest[0] - began < 0.9
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)
 
 
 @pytest.mark.parametrize("plan", [{"h": 0.1, "steps": 20_000}, {"t_end": 3000.0, "tolerance": 1e-6}])

@@ -134,25 +134,3 @@ def test_steps_of_racing_threads_are_all_counted(kind: str, stepper: sc.Stepper,
         each.join()
     assert run.steps == sum(made)
     assert np.isfinite(run.t)
-
-
-@pytest.mark.rotated
-def test_threads_may_read_a_recorded_run(stepper: sc.Stepper, tmp_path: Any) -> None:
-    run = sc.record_run(stepper.start([1.0], [0.0], h=0.1), tmp_path / "run", steps=199, rows=5)
-    expected = np.asarray(run.q)
-    failed = []
-
-    def read(seed: int) -> None:
-        for row in np.random.default_rng(seed).integers(0, len(run), 300).tolist():
-            try:
-                if run.q[row] != expected[row]:
-                    failed.append(row)
-            except KeyError as error:
-                failed.append(error)
-
-    threads = [threading.Thread(target=read, args=(seed,)) for seed in range(4)]
-    for each in threads:
-        each.start()
-    for each in threads:
-        each.join()
-    assert failed == []

@@ -3,7 +3,6 @@
 import json
 import os
 import sys
-import tracemalloc
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -50,24 +49,11 @@ class TestRecording:
         assert sc.resume_run("a.run").finished
         assert digests("a.run") == digests("whole.run")
 
-    def test_run_may_be_extended(self, kepler):
-        recorded(kepler, 500)
-        assert not sc.resume_run("a.run", steps=900, stop=StopsAfter(0)).finished
-        assert_same(sc.resume_run("a.run"), kepler.integrate(**STATE, h=H, steps=900))
-
     def test_resuming_a_finished_run_changes_nothing(self, kepler):
         recorded(kepler, 500)
         before = digests("a.run")
         assert sc.resume_run("a.run").finished
         assert digests("a.run") == before
-
-    def test_checkpoints_are_written_every_n_steps(self, kepler):
-        seen = []
-        recorded(
-            kepler, 100, checkpoint_steps=25, progress=lambda done: seen.append((done, sc.load_run("a.run").steps))
-        )
-        assert {25, 50, 75, 100} <= {done for done, _ in seen}
-        assert all(written >= done - done % 25 for done, written in seen)
 
     def test_manifest_describes_the_run(self, kepler):
         text = dump_model(sc.Model.from_problem(sc.problem("kepler")))
@@ -76,17 +62,6 @@ class TestRecording:
         assert about["source"]["code"] == kepler.source.code.split("\n")
         assert (about["model"], about["steps"], about["builds"][0]["step"]) == (text, 10, 0)
         assert found.manifest.about()["method"] == kepler.interface.method
-
-    @pytest.mark.second
-    def test_memory_does_not_grow_with_run_length(self, kepler):
-        recorded(kepler, 10, folder="first.run")  # what is imported on the way is not counted
-        tracemalloc.start()
-        found = recorded(kepler, 100_000, rows=2000)
-        sum(len(piece) for piece in found.pieces())
-        found.save("a.npz")
-        peak = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-        assert peak < 3.6e6 < 100_000 * (8 * 5 + 4)  # 2.0 to 3.2 MB; the run has 4.4 MB
 
     def test_different_compiler_or_processor_is_reported_and_saved(self, kepler, monkeypatch):
         recorded(kepler, 500, stop=StopsAfter(3))
@@ -255,17 +230,6 @@ class TestReading:
         with pytest.raises(IndexError):
             pair[0].q[index]
 
-    @pytest.mark.second
-    def test_columns_are_accepted_as_arrays(self, pair):
-        lazy, whole = pair
-        assert (lazy.q.shape, lazy.q.ndim, lazy.iterations.dtype, len(lazy.t)) == ((301, 2), 2, np.int32, 301)
-        assert np.abs(lazy.p).max() == np.abs(whole.p).max()
-        np.testing.assert_array_equal(list(lazy.t), whole.t)
-        dask = pytest.importorskip("dask.array")
-        blocks = dask.from_array(lazy.q, chunks=lazy.q.chunks)
-        assert blocks.numblocks == (5, 1)
-        assert blocks.sum(axis=0).compute(scheduler="sync") == pytest.approx(whole.q.sum(axis=0))
-
     def test_slices_are_trajectories(self, pair):
         lazy, whole = pair
         np.testing.assert_array_equal(lazy[100:200:7].energy(), whole.energy()[100:200:7])
@@ -274,17 +238,6 @@ class TestReading:
             assert str(lazy[number]) == str(whole[number])
         with pytest.raises(TypeError, match="must be a whole number or a slice"):
             lazy[0.5]
-
-    @pytest.mark.rotated
-    def test_active_run_can_be_read(self, kepler):
-        lengths = []
-
-        def look(done: int) -> None:
-            lengths.append(len(np.asarray(sc.load_run("a.run").q)))
-
-        recorded(kepler, 2000, checkpoint_steps=50, progress=look)
-        assert lengths == sorted(lengths)
-        assert lengths[-1] > lengths[0]
 
 
 class TestFiles:
@@ -301,16 +254,6 @@ class TestFiles:
             assert list(file["coordinates"]) == ["q1", "q2"]
             assert (file["h"], file["parameters"], file["parameter_names"]) == (H, [1.0], ["mu"])
             assert str(file["title"]) == whole.stepper.title
-
-    def test_csv_round_trip(self, saved):
-        given, whole = saved
-        given.save("a.csv")
-        columns, names = [whole.t, whole.q, whole.p, whole.iterations], "t,q1,q2,p_q1,p_q2,iterations"
-        if given is whole:  # a recording would have to be compiled
-            columns, names = [*columns, whole.velocity, whole.energy()], f"{names},q1_dot,q2_dot,energy"
-        assert Path("a.csv").read_text().splitlines()[0] == names
-        table = np.loadtxt("a.csv", delimiter=",", skiprows=1)
-        np.testing.assert_array_equal(table, np.column_stack(columns))
 
     def test_hdf5_round_trip(self, saved):
         h5py = pytest.importorskip("h5py")

@@ -94,22 +94,3 @@ def test_attitudes_between_saved_states_are_dense_output(stepper, run):
     together = stepper.integrate_ensemble(Q | {"x": [0.0, 0.0]}, velocity=V, h=0.1, steps=2)
     with pytest.raises(sc.StateError, match="no dense output"):
         together.rotation(t=0.05)
-
-
-@pytest.mark.second
-def test_a_run_in_progress_has_the_attitude_of_its_state(stepper, run):
-    running = stepper.start(Q, velocity=V, h=0.1)
-    running.advance(20)
-    for quantity in ("rotation", "angular_velocity", "body_momentum", "direction"):
-        np.testing.assert_array_equal(getattr(running, quantity)(), getattr(run, quantity)()[-1], err_msg=quantity)
-
-
-@pytest.mark.second
-def test_a_recorded_run_has_the_attitudes_of_the_run(stepper, tmp_path):
-    start = {"q": Q, "velocity": V, "h": 0.05}
-    sc.record_run(stepper.start(**start), tmp_path / "top.run", steps=40, save_every=2, rows=8)
-    recorded, run = sc.load_run(tmp_path / "top.run"), stepper.integrate(**start, steps=40, save_every=2)
-    np.testing.assert_array_equal(recorded.rotation(), run.rotation())
-    np.testing.assert_array_equal(recorded.angular_velocity(space=True), run.angular_velocity(space=True))
-    with pytest.raises(sc.StateError, match="have no dense output"):
-        recorded.rotation(t=0.1)

@@ -54,11 +54,6 @@ def test_velocities_are_rejected_where_there_are_spins():
         state_by_name(system, {"x": 0.1, "s": [0.3, 0.6, 0.8]}, None, {"x": 0.2})
 
 
-def test_the_total_spin_of_an_isotropic_pair_is_found():
-    pair = sc.HamiltonianSystem.from_text("pair", spins=["a", "b"], hamiltonian="a_1*b_1 + a_2*b_2 + a_3*b_3")
-    assert [each.name for each in sc.symmetries(pair)] == [f"angular momentum {axis}" for axis in "xyz"]
-
-
 def test_a_hamiltonian_in_body_momenta_is_that_of_the_lagrangian():
     system = sc.HamiltonianSystem.from_text(
         "heavy top",
@@ -107,18 +102,6 @@ def test_states_by_name_are_those_of_numbers_in_every_function_of_a_state():
     np.testing.assert_allclose(solution.y[:, -1], np.concatenate([mixed.q[-1], mixed.p[-1]]), rtol=0, atol=1e-14)
 
 
-def test_an_ensemble_has_the_attitudes_of_single_runs():
-    stepper = compiled(TOP, "svi:4")
-    attitudes = Rotation.random(5, random_state=4)
-    rates = np.random.default_rng(5).normal(size=(5, 3))
-    together = stepper.integrate_ensemble({"R": attitudes}, velocity={"omega": rates}, h=0.1, steps=20)
-    for k in range(5):
-        alone = stepper.integrate({"R": attitudes[k]}, velocity={"omega": rates[k]}, h=0.1, steps=20)
-        np.testing.assert_allclose(together.rotation()[:, k], alone.rotation(), rtol=0, atol=1e-13)
-        np.testing.assert_allclose(together.angular_momentum()[:, k], alone.angular_momentum(), rtol=0, atol=1e-13)
-        np.testing.assert_allclose(together.angular_velocity()[:, k], alone.angular_velocity(), rtol=0, atol=1e-13)
-
-
 EVENTS = ["R_33 - 0.5", "omega_1", "p_R_1", "rotate_3(R, 0, 0, 2) - 1"]
 
 
@@ -146,16 +129,6 @@ def test_events_are_found_in_the_names_of_rotations():
     for t in rate.t:
         end = by_states.integrate({"R": ATTITUDE}, velocity={"omega": OMEGA}, t_end=float(t))
         assert abs(end.angular_velocity()[-1, 0]) < 1e-9
-
-
-@pytest.mark.rotated
-def test_the_derivation_shows_the_form_that_is_stepped():
-    by_momenta = sc.derive(TOP, "svi:1").to_text()
-    by_velocities = sc.derive(TOP, sc.SVI(1, sc.gauss_legendre(2))).to_text()
-    for text in (by_momenta, by_velocities):
-        assert "rotation R = R(q), quaternion q = (R_w, R_x, R_y, R_z) of any length" in text
-    assert "\nH = " in by_momenta
-    assert "\nL = " in by_velocities
 
 
 def test_unrotate_is_the_inverse_of_rotate():

@@ -4,7 +4,6 @@
 its columns, ``pullback`` its transpose, and ``hessian_product`` the difference quotient of ``pullback``.
 """
 
-import pickle
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -151,29 +150,6 @@ def test_gradients_are_the_transpose_of_sensitivities(name, changes):
     assert gradient.h is None
 
 
-@pytest.mark.second
-def test_hessians_are_derivatives_of_gradients():
-    """F = sum w . x + x . C x/2 of all states; more directions than pass through a step at once."""
-    motion = MOTIONS["driven"]
-    x = np.array([0.4, -0.8, *motion.stepper.defaults, 0.3, 0.07])
-    rng, run = np.random.default_rng(2), motion.run(x)
-    w, C = rng.normal(size=(len(run), 2)), rng.normal(size=(len(run), 2, 2))
-    C = C + C.transpose(0, 2, 1)
-
-    def partials(run):
-        return w + np.einsum("nij,nj->ni", C, states_of(run))
-
-    expected = differences(lambda y: stacked(motion.run(y).pullback(partials(motion.run(y)))), x)
-    product = run.hessian_product(partials(run), np.eye(len(x)), C)
-    found = np.vstack([product.q, product.p, product.parameters, product.t, product.h])
-    assert_close(found, expected, 1e-7)
-    assert_close(found, found.T, 1e-12)
-    many = run.hessian_product(partials(run), np.tile(np.eye(len(x)), 3)[:, :19], C)
-    assert_close(many.q, np.tile(product.q, 3)[:, :19], 1e-11)
-    unpickled = replace(run, stepper=pickle.loads(pickle.dumps(motion.stepper)))
-    assert_close(stacked(unpickled.hessian_product(partials(run), x, C)), found @ x, 1e-10)
-
-
 def test_hessians_of_adaptive_runs_are_symmetric():
     run = MOTIONS["driven"].run(**ADAPTIVE)
     directions = np.eye(7)[:, :6]  # the step sizes are constant
@@ -206,34 +182,6 @@ def test_derivatives_by_data_and_named_parameters():
     product = run.hessian_product(w, directions)
     assert_close(stacked(product)[rows], differences(gradient, start), 1e-7)
     assert product.inputs["u"].shape == (4, 4, 4)
-
-
-@pytest.mark.second
-def test_derivatives_of_conserved_energies():
-    """Energy at the end is that at the start; after a Kepler period only the phase depends on the energy."""
-    stepper = sc.compile_stepper(sc.problem("planar-pendulum").system, sc.SVI(8), flags=QUICK_FLAGS)
-    run = stepper.integrate([2.0], [0.3], h=0.05, steps=200)
-    m, length, g = stepper.defaults
-
-    def partials(q, p):
-        return [m * g * length * np.sin(q), p / (m * length**2)]
-
-    def hessian(q):
-        return np.diag([m * g * length * np.cos(q), 1 / (m * length**2)])
-
-    w, C = np.zeros((len(run), 2)), np.zeros((len(run), 2, 2))
-    w[-1], C[-1] = partials(run.q[-1, 0], run.p[-1, 0]), hessian(run.q[-1, 0])
-    first, second = run.pullback(w), run.hessian_product(w, np.eye(2), C)
-    assert_allclose([*first.q, *first.p], partials(2.0, 0.3), rtol=1e-9)
-    assert abs(first.h) + abs(first.t) < 1e-9
-    assert_allclose(np.vstack([second.q, second.p]), hessian(2.0), atol=1e-7)
-    kepler = sc.compile_stepper(sc.problem("kepler").system, sc.SVI(8), flags=QUICK_FLAGS)
-    monodromy = kepler.integrate([0.5, 0.0], [0.0, 3**0.5], h=2 * np.pi / 64, steps=64).tangent()[-1]
-    assert np.linalg.matrix_rank(monodromy - np.eye(4), tol=1e-4) == 1
-    gradient = np.array([4.0, 0.0, 0.0, 3**0.5])  # of the energy
-    assert_allclose(gradient @ monodromy, gradient, rtol=0, atol=1e-6)
-    still = MOTIONS["driven"].run(steps=0).hessian_product(np.ones((1, 2)), np.eye(2), 3 * np.eye(2)[np.newaxis])
-    assert np.array_equal(np.vstack([still.q, still.p]), 3 * np.eye(2))
 
 
 W = np.zeros((61, 2))

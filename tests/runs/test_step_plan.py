@@ -1,49 +1,21 @@
 """Step plans: largest and first step sizes and absolute tolerances, in every way in which runs are started."""
 
-import json
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from commands import output_of
 from mpmath import mp
 from numpy.testing import assert_allclose
 
 import scvi_codegen as sc
-from scvi_codegen.interfaces.models.model_files.model_file import dump_model, parse_model
-from scvi_codegen.runs.stepping.step_plan import (
-    Adaptive,
-    ErrorControl,
-    Fixed,
-    InTau,
-    absolute_tolerances,
-    plan_from_record,
-    plan_to_record,
-)
+from scvi_codegen.runs.stepping.step_plan import Adaptive, absolute_tolerances
 
 Q, V = [1.0, 0.0], [0.0, 1.0]
 LIMITED: dict[str, Any] = {"t_end": 5.0, "tolerance": 1e-3, "max_step": 0.1}
 LARGEST = pytest.approx(2.0**-3.5)
 """Largest size of the grid below 0.1."""
-MODEL = """
-[system]
-name = "circle"
-coordinates = ["x", "y"]
-lagrangian = "(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2)"
-[method]
-method = "svi"
-degree = 4
-[initial]
-q = [1, 0]
-q_dot = [0, 1]
-[run]
-span = 5
-tolerance = 1e-3
-max_step = 0.1
-absolute_tolerance = { y = 1e-6 }
-"""
 
 
 @cache
@@ -141,34 +113,6 @@ def test_continued_runs_keep_their_options(tmp_path: Path) -> None:
     assert longest(finished.t) == LARGEST
 
 
-@pytest.mark.parametrize(
-    "plan", [Fixed(-0.1), InTau(3.0, 0.1), Adaptive(2.0), Adaptive(2.0, 1e-9, 0.1, 0.01, (("x", 1e-3),))]
-)
-def test_records_of_step_plans(plan: Adaptive | InTau) -> None:
-    assert plan_from_record(**json.loads(json.dumps(plan_to_record(plan)))) == plan
-
-
-@pytest.mark.second
-def test_model_files_and_command_line(tmp_path: Path) -> None:
-    model = parse_model(MODEL)
-    assert (model.max_step, model.absolute_tolerance) == (0.1, {"y": 1e-6})
-    assert parse_model(dump_model(model)).absolute_tolerance == {"y": 1e-6}
-    assert longest(model.integrate().t) == LARGEST
-    assert model.start().plan == Adaptive(5.0, 1e-3, 0.1, absolute_tolerance=(("y", 1e-6),))
-    (tmp_path / "circle.toml").write_text(MODEL)
-    options = ("--max-step", "0.5", "--absolute-tolerance", "x=1e-3", "--json")
-    numbers = json.loads(output_of("run", str(tmp_path / "circle.toml"), *options))
-    assert numbers["steps"] < 5.0 / 0.1
-    json.loads(output_of("run", str(tmp_path / "circle.toml"), "--step", "0.5", "--json"))  # replaces adaptive steps
-    sc.generate_package(model, tmp_path / "package")
-    programs = [path.read_text() for path in (tmp_path / "package").rglob("main.c")]
-    assert [".max_step = 0.1," in program for program in programs] == [True]
-    with pytest.raises(sc.ModelFileError, match="is for adaptive steps, but the step size is fixed"):
-        parse_model(MODEL.replace("tolerance = 1e-3", "step = 0.5"))
-    with pytest.raises(sc.ModelFileError, match="absolute_tolerance is -1"):
-        parse_model(MODEL.replace("{ y = 1e-6 }", "-1"))
-
-
 def test_arguments_of_scipy() -> None:
     arguments: dict[str, Any] = {"t_span": (0.0, 5.0), "y0": [*Q, *V], "rtol": 1e-3}
     motion = sc.solve_ivp(kepler(), **arguments, atol=1e-6, max_step=0.1, first_step=0.01)
@@ -190,8 +134,3 @@ def test_partial_steps_in_double_double_are_shorter_than_a_high_word() -> None:
             assert abs(run.at([t])[0].mp()[0][0] - mp.cos(mp.mpf(t))) < 1e-28
     saved = stepper.integrate([1.0], velocity=[0.0], h=0.1, t_end=2.0, t_eval=np.linspace(0.0, 2.0, 21))
     assert_allclose(np.asarray(saved.q)[:, 0], np.cos(np.linspace(0.0, 2.0, 21)), rtol=0, atol=2e-16)
-
-
-def test_arguments_that_are_omitted_are_those_of_no_plan() -> None:
-    assert ErrorControl().to(1.0) == Adaptive(1.0)
-    assert ErrorControl.of(Adaptive(1.0)) == ErrorControl()

@@ -1,15 +1,11 @@
 """Steps, runs, transforms and errors of a compiled stepper, as a user meets them."""
 
-from concurrent.futures import ThreadPoolExecutor
-from types import SimpleNamespace
-
 import numpy as np
 import oracle
 import pytest
 from notation import hamilton, lagrange
 
 import scvi_codegen as sc
-from scvi_codegen.runs.states.validation import parameter_values
 
 WITH_ACTION = (sc.SVI(2, "gauss-legendre:3"), sc.SCVI(3), sc.Gauss(2), sc.StoermerVerlet())
 each_action = pytest.mark.parametrize("method", WITH_ACTION, ids=lambda method: method.name)
@@ -43,46 +39,7 @@ def test_run_has_smaller_rounding_errors_than_repeated_steps(sample, compiled):
     assert abs(run.p[-1] - exact[1].astype(float)) <= 2.0**-53
 
 
-def test_a_step_is_a_function_of_its_arguments(kepler):
-    first = kepler.step(*STATE, 0.1)
-    kepler.step([1.0, 1.0], [0.1, 0.2], 0.3)
-    assert np.array_equal(first, kepler.step(*STATE, 0.1))
-
-
-def test_arguments_are_not_changed(kepler):
-    q, p = np.array(STATE)
-    kepler.step(q, p, 0.1)
-    kepler.integrate(q, p, h=0.1, steps=3)
-    assert np.array_equal([q, p], STATE)
-
-
-def test_a_trajectory_begins_with_the_initial_state_and_has_float64_arrays(kepler):
-    run = kepler.integrate(*STATE, h=0.1, steps=7, t=2.0)
-    assert len(run) == 8
-    assert run.t == pytest.approx(2.0 + 0.1 * np.arange(8), abs=1e-15)
-    assert np.array_equal([run.q[0], run.p[0]], STATE)
-    assert run.q.shape == run.p.shape == (8, 2)
-    assert run.q.dtype == run.p.dtype == run.t.dtype == np.float64
-    assert run.iterations[0] == 0
-    assert (run.iterations[1:] > 0).all()
-    none = kepler.integrate(*STATE, h=0.1, steps=0)
-    assert (len(none), *none.q[0], *none.p[0]) == (1, *STATE[0], *STATE[1])
-
-
-def test_progress_receives_the_completed_steps(kepler):
-    reported = []
-    kepler.integrate(*STATE, h=0.05, steps=3000, progress=reported.append)
-    assert reported == sorted(reported)
-    assert reported[-1] == 3000
-
-
 # Saving and restoring.
-
-
-def test_save_every_counts_from_the_start_of_the_run(kepler):
-    run = kepler.start(*STATE, h=0.05)
-    run.record(5)
-    assert run.record(10, save_every=4).t == pytest.approx(0.05 * np.array([5, 8, 12]))
 
 
 def test_checkpoints_contain_the_parameters(kepler):
@@ -129,11 +86,6 @@ def test_parameters_may_be_given_by_name_or_in_order(compiled, sample):
     values[stepper.parameters.index("k")] = 0.7
     assert np.array_equal(stepper.step(*state, 0.1, 0.2, {"k": 0.7}), stepper.step(*state, 0.1, 0.2, values))
     assert not np.array_equal(stepper.step(*state, 0.1, 0.2), stepper.step(*state, 0.1, 0.2, values))
-
-
-def test_defaults_cannot_be_changed_through_the_stepper(kepler):
-    kepler.defaults[:] = 7.0
-    assert kepler.defaults == [1.0]
 
 
 # Steps that fail.
@@ -297,11 +249,6 @@ def test_the_discrete_lagrangian_of_an_explicit_step_is_the_trapezoidal_sum(syst
     assert "newton_solver" not in stepper.source.code
 
 
-def test_undefined_action_is_an_error(compiled):
-    with pytest.raises(sc.StepFailedError):
-        compiled("kepler", sc.StoermerVerlet()).discrete_lagrangian([0.0, 0.0], [1.0, 0.0], 0.1)
-
-
 def test_methods_without_a_discrete_lagrangian_are_reported(compiled):
     for method in (sc.SpectralCollocation(2), sc.RadauIIA(2), sc.ExplicitEuler(), sc.SCVI(3, variational=False)):
         stepper = compiled("kepler", method)
@@ -311,23 +258,6 @@ def test_methods_without_a_discrete_lagrangian_are_reported(compiled):
 
 
 # Threads and copies.
-
-
-def test_threads_with_different_parameters_are_independent(kepler):
-    values = [0.8 + 0.05 * k for k in range(8)]
-
-    def final(mu):
-        return kepler.integrate(*STATE, h=0.05, steps=2000, parameters={"mu": mu}).q[-1]
-
-    with ThreadPoolExecutor(4) as pool:
-        found = list(pool.map(final, values))
-    assert np.array_equal(found, [final(mu) for mu in values])
-
-
-def test_a_stepper_shows_system_and_method(kepler):
-    assert "Kepler" in repr(kepler)
-    assert "degree 3" in repr(kepler)
-    assert kepler.dimension == 2
 
 
 @pytest.mark.tiers(0, 1)
@@ -346,9 +276,3 @@ def test_fixed_point_iteration_starts_from_rest(name, method):
         for solver in ("fixed-point", "newton")
     ]
     np.testing.assert_allclose(ends[0], ends[1], rtol=1e-14, atol=1e-16)
-
-
-def test_messages_name_the_first_parameters_of_many() -> None:
-    names = [f"k{i}" for i in range(8)]
-    with pytest.raises(sc.StateError, match=r"must have 8 values \(k0, k1, k2, k3, k4, k5, \.\.\.\), not 1"):
-        parameter_values(SimpleNamespace(parameters=names, defaults=[1.0] * 8, modes=(), contacts=()), [2.0])  # type: ignore[arg-type]

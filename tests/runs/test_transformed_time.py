@@ -133,17 +133,6 @@ def test_events_are_located_in_physical_time(form: str) -> None:
     assert 0.0 < ended.tau[-1] - ended.tau[-2] < 0.1
 
 
-@pytest.mark.full
-def test_event_functions_receive_physical_velocities() -> None:
-    """The radial speed is largest, e/sqrt(1 - e^2), at the ends of the latus rectum."""
-    functions = "(x*x_dot + y*y_dot)/sqrt(x**2 + y**2) - 2"
-    found = [stepper(form).integrate(*START, h=0.1, t_end=3.0, events=functions).events[0].t for form in FORMS]
-    assert len(found[0]) == 2
-    assert max(np.abs(found[0] - other).max() for other in found[1:]) < 1e-12
-    own = sc.compile_stepper(KEPLER, sc.SVI(8)).integrate(*START, h=0.001, steps=3000, events=functions)
-    assert np.abs(own.events[0].t - found[0]).max() < 1e-11
-
-
 @pytest.mark.second
 def test_levi_civita_follows_an_ellipse_that_is_almost_a_line() -> None:
     """Through e = 1 - 1e-8: the oscillator is solved to round-off, and the time with it."""
@@ -156,14 +145,6 @@ def test_levi_civita_follows_an_ellipse_that_is_almost_a_line() -> None:
     run = made.integrate(q, p, h=0.25, t_end=4 * np.pi)
     assert np.abs(run.q[-1] - q).max() < 1e-12
     assert run.parameters[-1] == pytest.approx(-0.5, rel=1e-13)
-
-
-@pytest.mark.second
-def test_unsupported_transformations_are_rejected() -> None:
-    with pytest.raises(sc.StateError, match="depends on the momenta"):
-        stepper("K, momenta").momentum(START[0], [0.0, 1.0])
-    with pytest.raises(sc.MethodError, match="is in transformed time: no step size is recommended"):
-        sc.advise(system_of("L"), sc.SVI(4), *START, span=10.0, tolerance=1e-9)
 
 
 @pytest.mark.second

@@ -17,21 +17,6 @@ def thrown():
     return lagrange("thrown", "x y", "(x_dot**2 + y_dot**2)/2 + k/sqrt(x**2 + y**2)", k=1.0, c=0.05, w=0.1, forces=DRAG)
 
 
-def test_work_balance_with_dense_output_and_adaptive_steps(thrown):
-    stepper = sc.compile_stepper(thrown, sc.SVI(4))
-    start = ([1.0, 0.0], [0.0, 1.1])
-    save_every, some = (stepper.integrate(*start, h=0.05, steps=40, save_every=n) for n in (1, 8))
-    assert np.abs(some.work() - save_every.work()[::8]).max() < 1e-13
-    later = [
-        stepper.integrate(*start, h=0.1, steps=140, save_every=n, t=1e6) for n in (1, 7)
-    ]  # where times are rounded
-    assert np.abs(later[1].work() - later[0].work()[::7]).max() < 1e-8  # of forces of time
-    free = stepper.integrate(*start, t_end=2.0)
-    assert np.abs(free.energy() - free.energy()[0] - free.work()).max() < 1e-12
-    with pytest.raises(sc.StateError, match="save_every=1"):
-        stepper.integrate(*start, t_end=2.0, t_eval=[0.3, 1.1]).work()
-
-
 @pytest.mark.rotated
 @pytest.mark.parametrize("plan", [{"h": 0.05}, {}])
 def test_work_balance_with_impacts(thrown, plan):
