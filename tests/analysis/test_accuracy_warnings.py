@@ -15,9 +15,6 @@ from scvi_codegen.analysis.advice.tolerance_check import known_digits, missed_to
 from scvi_codegen.interfaces.cli.reports import in_known_digits
 from scvi_codegen.runs.compiler import second_stepper
 
-PUSHED = lagrange("pushed", "x", "x_dot**2/2 - x**2/2", forces={"x": "a*cos(t) + b*sin(3*t)"}, a=1.0, b=0.0)
-FORCED = {"a": 1.0, "b": 0.0}
-
 
 @pytest.fixture(scope="module")
 def kepler() -> sc.Stepper:
@@ -51,27 +48,6 @@ class TestLongSteps:
         better = stepper.integrate(run.q[k], run.p[k], h=h / 16, steps=16).q[-1]
         true = np.abs(run.q[k + 1] - better).max() / np.abs(better).max()
         assert true / 10 < run.step_error < 1e-3
-
-    @pytest.mark.tiers(0, 3)
-    @pytest.mark.sampled(3)
-    @pytest.mark.filterwarnings("error")
-    @pytest.mark.parametrize("method", ["svi:1", "svi:2", "scvi:2", "svi:3"])
-    @pytest.mark.parametrize("h", [0.1, 0.02])
-    def test_start_at_rest_at_the_origin_does_not_warn(self, method, h):
-        """x = t sin(t) / 2: the first step is right to 2e-3 of its own way, which is a thousandth of the motion's."""
-        run = sc.compile_stepper(PUSHED, method).integrate([0.0], [0.0], h=h, steps=round(20 / h), parameters=FORCED)
-        assert np.abs(run.q[:, 0] - run.t * np.sin(run.t) / 2).max() < 0.1  # of 9
-        assert 0.0 < run.step_error < 3e-4
-
-    @pytest.mark.second
-    @pytest.mark.filterwarnings("error")
-    @pytest.mark.parametrize("method", ["svi:1", "svi:2"])
-    def test_rest_at_the_origin_during_a_run_does_not_warn(self, method):
-        """x = (3 sin(t) - sin(3 t)) / 8 rests at 0 whenever t is a multiple of pi."""
-        run = sc.compile_stepper(PUSHED, method).integrate(
-            [0.0], [0.0], h=0.1, steps=400, parameters={"a": 0.0, "b": 1.0}
-        )
-        assert np.abs(run.q[:, 0] - (3 * np.sin(run.t) - np.sin(3 * run.t)) / 8).max() < 0.1
 
     @pytest.mark.second
     @pytest.mark.filterwarnings("error")
@@ -107,20 +83,6 @@ class TestLongSteps:
         stepper = sc.compile_stepper(sc.problem("kepler").system, "svi:4")
         with pytest.warns(sc.AccuracyWarning, match="h = 0.02 is too large: .* from t = 3.14 is"):
             stepper.integrate([1.95, 0.0], [0.0, math.sqrt(2 / 1.95 - 1)], h=0.02, steps=300)
-
-    @pytest.mark.tiers(1, 2)
-    @pytest.mark.sampled(2)
-    @pytest.mark.filterwarnings("error")
-    @pytest.mark.parametrize("solver", ["fixed-point", "newton"])
-    @pytest.mark.parametrize("method", ["svi:2", "svi:3"])
-    def test_array_systems_from_rest_at_the_origin_do_not_warn(self, method, solver):
-        chain = sc.LagrangianSystem.from_text(
-            name="pushed chain",
-            coordinates=["x[N]"],
-            lagrangian="sum(i in N, x_dot[i]**2/2 - x[i]**2/2) - sum(i in N-1, (x[i+1] - x[i])**2/2) + x[0]*cos(t)",
-        )
-        run = sc.compile_stepper(chain, method, solver=solver).integrate(np.zeros(40), h=0.1, steps=200)
-        assert 0.0 < run.step_error < 1e-4
 
     def test_missing_error_estimate_is_reported(self):
         verlet = sc.compile_stepper(sc.problem("kepler").system, sc.StoermerVerlet())
@@ -183,17 +145,6 @@ class TestLostEnergy:
         with pytest.warns(sc.AccuracyWarning, match=rf"energy changed from -0.5\d* to \S+ {message}"):
             run = stepper.integrate(start, velocity=[[0.0, aside], [0.0, -aside]], **steps)
         assert abs(run.energy()[-1] - run.energy()[0]) > 0.1
-
-    def test_adaptive_steps_end_at_a_collision(self, pair):
-        with pytest.raises(sc.StepFailedError, match="a collision"):
-            sc.compile_stepper(pair, "svi:8").integrate([[-0.987, 0.0], [1.0, 0.0]], t_end=4.0, tolerance=1e-6)
-
-    @pytest.mark.filterwarnings("error")
-    @pytest.mark.parametrize("method", ["svi:8", "stoermer-verlet"])
-    def test_array_systems_that_conserve_energy_are_not_reported(self, pair, method):
-        steps = {"t_end": 4.0, "tolerance": 1e-6} if method == "svi:8" else {"h": 0.3, "steps": 60}
-        start = {"q": [[-1.0, 0.0], [1.0, 0.0]], "velocity": [[0.0, 0.5], [0.0, -0.5]]}
-        sc.compile_stepper(pair, method).integrate(**start, **steps)
 
 
 class TestTolerances:

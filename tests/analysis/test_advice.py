@@ -2,19 +2,15 @@
 
 import math
 import re
-from functools import cache
 from itertools import count
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from commands import error_of, invoke, output_of
 from mpmath import mp
-from nbody_reference import integrate
 from notation import lagrange
-from outer_planets import GRAVITY, MASSES, POSITIONS, VELOCITIES
 
-from scvi_codegen import Advice, LagrangianSystem, MethodError, StateError, advise, compile_stepper, problem
+from scvi_codegen import Advice, LagrangianSystem, StateError, advise, compile_stepper, problem
 from scvi_codegen.analysis.advice.advice import _advice, _choose
 from scvi_codegen.analysis.advice.pilot import run_pilot
 from scvi_codegen.common.errors import StepFailedError, UnresolvedError
@@ -130,21 +126,6 @@ class TestAchievedErrors:
         error = achieved(system, advice, q, p, kepler_end(0.2, span), 1.0)
         assert_achieved(advice, error, tolerance)
 
-    @pytest.mark.rotated
-    @pytest.mark.sampled(2)
-    @pytest.mark.parametrize(
-        ("method", "tolerance"), [(SVI(8), 1e-6), (SVI(8), 1e-9), (SVI(8), 1e-11), (SVI(5), 1e-9)], ids=name
-    )
-    def test_advised_step_achieves_the_tolerance_for_the_outer_solar_system(self, method: Method, tolerance: float):
-        system, span = problem("outer-solar-system").system, 100_000.0
-        stepper = compile_stepper(system, method)
-        q, v = np.array(POSITIONS).ravel().tolist(), np.array(VELOCITIES).ravel().tolist()
-        p = stepper.momentum(q, v).tolist()
-        advice = advise(system, method, q, p, span, tolerance)
-        exact = outer_reference(span)
-        error = achieved(system, advice, q, p, exact, float(np.linalg.norm(exact)))
-        assert_achieved(advice, error, tolerance)
-
     @pytest.mark.second
     def test_advice_backward_with_parameters_and_time(self):
         system, span = problem("duffing").system, -40.0
@@ -166,12 +147,6 @@ def cost(advice: Advice, points: int) -> float:
     return (row.iterations + 3.0) * math.ceil(points / 8) * 8 / advice.h
 
 
-@cache
-def outer_reference(span: float) -> np.ndarray:
-    q, _ = integrate(POSITIONS, VELOCITIES, MASSES, GRAVITY, span, 500)
-    return q.astype(float).ravel()
-
-
 class TestDegree:
     @pytest.mark.rotated
     @pytest.mark.sampled(1)
@@ -187,16 +162,6 @@ class TestDegree:
         assert costs[4] > 1.8 * costs[8]
         assert achieved(system, advice, q, p, kepler_end(0.2, 200.0), 1.0) < tolerance
 
-    @pytest.mark.full
-    def test_degree_choice_does_not_depend_on_timings(self, monkeypatch: pytest.MonkeyPatch):
-        system, (q, p) = problem("kepler").system, kepler_start(0.2)
-        times = iter(np.random.default_rng(1).uniform(0.0, 1e9, 10_000).cumsum())
-        monkeypatch.setattr(
-            "scvi_codegen.analysis.advice.pilot.time", SimpleNamespace(perf_counter=lambda: next(times))
-        )
-        first, second = (advise(system, Gauss(4), q, p, 50.0, 1e-8, degree=True) for _ in range(2))
-        assert (first.degree, first.h, first.message) == (second.degree, second.h, second.message)
-
     @pytest.mark.second
     def test_time_of_evidence_is_per_unit_of_time(self, monkeypatch: pytest.MonkeyPatch):
         """Pilot runs over the whole span of one second each."""
@@ -210,12 +175,6 @@ class TestDegree:
         assert [(float(h), time) for h, time in found] == [
             (pytest.approx(row.h, rel=1e-5), "1 s") for row in advice.evidence if math.isfinite(row.error)
         ]
-
-    @pytest.mark.second
-    def test_methods_without_a_degree(self):
-        assert advise(pendulum(), StoermerVerlet(), [1.5], [0.0], 20.0, 1e-3).degree is None
-        with pytest.raises(MethodError, match="stoermer-verlet has no degree or number of stages to choose"):
-            advise(pendulum(), StoermerVerlet(), [1.5], [0.0], 20.0, 1e-3, degree=True)
 
 
 @pytest.mark.second
@@ -250,15 +209,6 @@ class TestHonesty:
         assert any("chaos" in warning for warning in advice.warnings)
 
     @pytest.mark.rotated
-    def test_chaos_beyond_the_pilot_run_is_not_certified(self):
-        entry = problem("double-pendulum")
-        p = compile_stepper(entry.system, StoermerVerlet()).momentum(entry.q, entry.velocity)
-        advice = advise(entry.system, StoermerVerlet(), entry.q, p, 10.0, 1e-2)
-        assert advice.expected_error < 1e-2
-        assert len(advice.warnings) == 1
-        assert re.search(r"diverge tenfold every \S+ units of time \(chaos\).*uncertain", advice.warnings[0])
-
-    @pytest.mark.rotated
     @pytest.mark.parametrize(("k", "direction"), [(1.0, 1), (4.0, -1)])
     def test_growth_times_are_those_of_a_saddle(self, k: float, direction: int):
         """Errors of a motion that decays at a saddle grow tenfold in log(10)/sqrt(k)."""
@@ -279,13 +229,6 @@ class TestHonesty:
         assert advice.warnings == ()
         ends = [stepper.integrate(entry.q, p, h=advice.h / n, steps=n * advice.steps).q[-1] for n in (1, 3)]
         assert 1e-7 < np.linalg.norm(ends[0] - ends[1]) / np.linalg.norm(ends[1]) < 2e-5
-
-    def test_slow_chaos_is_detected_in_long_runs(self):
-        """Henon-Heiles at energy 1/6: errors grow tenfold every 60 units of time."""
-        entry = problem("henon-heiles").system
-        q, p = [0.0, -0.1475], [math.sqrt(1.0 / 3.0 - 0.1475**2 - 2.0 * 0.1475**3 / 3.0), 0.0]
-        advice = advise(entry, SVI(8), q, p, 1e5, 1e-6)
-        assert any("chaos" in warning for warning in advice.warnings)
 
     def test_quadratic_error_growth_is_extrapolated_quadratically(self):
         system, (q, p) = problem("kepler").system, kepler_start(0.5)
@@ -366,34 +309,6 @@ class TestEnsembles:
         assert advice.member == 1
         alone = advise(system, SVI(4), [1.0], [0.0], 10.0, 1e-6, parameters={"k": 25.0})
         assert advice.steps == pytest.approx(alone.steps, rel=0.1)
-
-    @pytest.mark.second
-    def test_failing_trajectory_counts(self):
-        system = lagrange("runaway", "q", "q_dot**2/2 + a*q**3/3 - q**2/2", a=1.0)
-        states, given = ([[0.1], [1.0], [0.2]], [[0.0], [1.0], [0.0]]), {"a": [0.0, 1.0, 0.0]}
-        with pytest.raises(StateError, match="may end in a singularity"):
-            advise(system, Gauss(2), *states, 10.0, 1e-6, parameters=given)
-
-
-class TestCommandLine:
-    def test_backward_and_from_a_number_of_steps(self):
-        assert "to t = 0;" in output_of("run kepler --time 50 --step -0.25 --span 50")
-
-    @pytest.mark.second
-    def test_warnings_go_to_stderr(self):
-        warned = invoke("run", "double-pendulum", "--span", "500", "--advise", "1e-9").stderr
-        assert "Warning: the tolerance cannot be met" in warned
-
-    @pytest.mark.rotated
-    def test_mistakes_are_usage_errors(self):
-        for words, message in (
-            ("kepler --advise 1e-6 --steps 10", "--advise determines the step size: omit --steps"),
-            ("kepler --tolerance 1e-6 --steps 10", "--tolerance determines the step size: omit --steps"),
-            ("kepler --advise 1e-6 --method explicit-euler", "steps, more than 1e+09: use a method of higher order"),
-            ("kepler --solver-tolerance 0", "solver_tolerance must be positive"),
-            ("kepler --solver-tolerance 2", "solver_tolerance must be positive and at most 0.1, not 2"),
-        ):
-            assert message in error_of(f"run {words}")
 
 
 @pytest.mark.second

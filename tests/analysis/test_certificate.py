@@ -171,14 +171,6 @@ def test_rounding_of_growing_motions_is_no_drift(method: str) -> None:
     )
 
 
-def test_missing_state_is_generated() -> None:
-    certificate = sc.verify(sc.problem("planar-pendulum").system, sc.Gauss(2), solver="newton")
-    assert certificate.passed
-    assert certificate.h > 0
-    with pytest.raises(sc.StateError, match="give both, or neither"):
-        sc.verify(sc.problem("planar-pendulum").system, sc.Gauss(2), [0.1])
-
-
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", [sc.SVI(2), sc.Gauss(2)], ids=lambda method: method.name)
 def test_inputs_are_certified_at_small_values(method) -> None:
@@ -308,32 +300,3 @@ def test_certificate_reports_slow_checks_and_their_duration(quickly_compiled, mo
     assert "which takes about" in capsys.readouterr().err  # which is no terminal
     assert "measuring stage equations" in message
     assert any("unknowns per step are solved in 60 digits, which takes about" in line for line in message)
-
-
-LITERATURE = (
-    (sc.Gauss(3), 6, True, True),
-    (sc.Gauss(3, form="position"), 6, False, True),
-    (sc.RadauIIA(3), 5, False, False),
-    (sc.RadauIA(3), 5, False, False),
-    (sc.LobattoIIIA(3), 4, False, True),
-    (sc.SVI(3, "gauss-lobatto:4"), 6, True, True),
-    (sc.SVI(3, "gauss-radau-left:3"), 5, True, False),
-    (sc.SVI(4, "clenshaw-curtis:4"), 2, True, True),
-    (sc.StoermerVerlet(), 2, True, True),
-    (sc.ExplicitEuler(), 1, False, False),
-)
-"""Order, symplecticity and symmetry (Hairer, Lubich and Wanner, II.1, II.2, VI.4)."""
-
-
-@pytest.mark.quick
-@pytest.mark.parametrize(("method", "order", "symplectic", "symmetric"), LITERATURE)
-def test_properties_are_those_in_the_literature(method, order, symplectic, symmetric):
-    assert (method.order, method.symplectic, method.symmetric) == (order, symplectic, symmetric)
-
-
-@pytest.mark.second
-def test_order_of_small_errors() -> None:
-    """The order 16 is measured, with errors of 1e-37 at a step of a tenth of the state."""
-    certificate = sc.verify(sc.problem("kepler").system, "svi:8")
-    order = next(check for check in certificate.checks if check.name == "order")
-    assert 15.8 < order.measured < 16.1

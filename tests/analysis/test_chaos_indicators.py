@@ -107,17 +107,6 @@ def test_regular_and_chaotic_trajectories_are_distinguished(galaxy):
     assert 0.0 < chaotic.sali()[1000] < 1e-2 < regular.sali()[-1]
 
 
-def test_stride_does_not_change_the_indicators(galaxy):
-    whole = galaxy.integrate(*CHAOTIC, h=0.2, steps=600)
-    some = galaxy.integrate(*CHAOTIC, h=0.2, steps=600, save_every=50)
-    for name in SERIES:
-        assert_allclose(
-            getattr(some.chaos_indicators(), name), getattr(whole.chaos_indicators(), name)[::50], rtol=1e-9, atol=1e-9
-        )
-    back = galaxy.integrate(whole.q[-1], whole.p[-1], h=-0.2, steps=600)
-    assert np.abs(back.lyapunov_exponents() + back.lyapunov_exponents()[::-1]).max() < 1e-13
-
-
 @pytest.mark.quick
 def test_maximal_growth_between_saved_states_is_found(galaxy):
     """Between states that are kept, too: of a regular motion, whose changes come and go."""
@@ -243,19 +232,6 @@ def test_fast_growing_tangent_vectors_in_lanes_use_shorter_segments():
     same(found, alone.chaos_indicators_ensemble(*start, h=0.1, steps=300, save_every=100), 1e-10)
 
 
-def test_diverging_trajectory_is_continued_as_scalar():
-    """x'' = 4 x^3 diverges: statuses and results until then equal those of single runs."""
-    away = sc.LagrangianSystem.from_text(name="away", coordinates=["x"], lagrangian="x_dot**2/2 + x**4")
-    stepper, done = sc.compile_stepper(away, sc.SVI(3)), []
-    alone = by_derivatives(stepper)
-    start = np.linspace(0.0, 0.8, 20)[:, np.newaxis], np.zeros((20, 1))
-    options = {"h": 0.1, "steps": 60, "save_every": 20, "count": 1}
-    found = stepper.chaos_indicators_ensemble(*start, **options, progress=done.append)
-    assert 2 < sum(found.status == "ok") < 15
-    assert done[-1] == 20
-    same(found, alone.chaos_indicators_ensemble(*start, **options), 1e-12)
-
-
 def test_failed_steps_are_rejected_as_in_runs():
     """Kepler's problem, e = 0.9, by steps too long for the pericentre: another solution is found."""
     kepler = sc.compile_stepper(sc.problem("kepler").system, sc.SVI(4))
@@ -268,22 +244,6 @@ def test_failed_steps_are_rejected_as_in_runs():
     found = kepler.chaos_indicators_ensemble([q], [p], h=0.4, steps=40, count=1)
     assert list(found.status) == ["spurious solution"]
     assert np.isnan(found.megno()[-1]).all()
-
-
-@pytest.mark.quick
-def test_more_trajectories_than_one_batch_are_distinguished(galaxy):
-    """A row of a map equals its single trajectories for any number of threads."""
-    y = np.linspace(-0.2, 0.3, 261)
-    start = np.column_stack([0 * y, y]), np.column_stack([0.3 + 0 * y, 0 * y])
-    done, common = [], {"h": 0.2, "steps": 40, "count": 1}
-    both = [
-        galaxy.chaos_indicators_ensemble(*start, **common, threads=threads, progress=done.append) for threads in (1, 3)
-    ]
-    assert_array_equal(both[0].log_norms, both[1].log_norms)
-    assert max(done) == done[-1] == len(y)
-    for j in (0, 7, 8, 255, 256, 260):
-        alone = galaxy.integrate(start[0][j], start[1][j], h=0.2, steps=40).chaos_indicators(1)
-        assert_allclose(both[0].log_norms[-1, j], alone.log_norms[-1], rtol=0, atol=1e-13)
 
 
 @pytest.mark.parametrize(
@@ -303,18 +263,6 @@ def test_ensembles_of_other_systems_are_the_same_as_runs(system, method, q, p, c
         alone = stepper.integrate(q[j], p[j], parameters=own, **common).chaos_indicators(1)
         assert_array_equal(found.t, alone.t)
         assert_allclose(found.log_norms[:, j], alone.log_norms, rtol=0, atol=1e-12)
-
-
-@pytest.mark.quick
-def test_last_step_of_an_event_run_is_not_changed(galaxy):
-    """The step size is fixed: the derivative is that of the state at that time, not of the crossing."""
-    run = galaxy.integrate(*CHAOTIC, h=0.2, steps=1000, events=sc.Event("y", terminal=True, direction=1))
-    assert run.ended_by is not None
-    assert run.t[-1] % 0.2 > 1e-6
-    moved = run.tangent()[-1] @ InitialTangents.checked(galaxy, 1, None).at(
-        *map(np.array, CHAOTIC), 0.2, 0.0, run.parameters, None
-    )
-    assert run.chaos_indicators(1).log_norms[-1, 0] == pytest.approx(np.log(np.linalg.norm(moved)), abs=1e-12)
 
 
 @pytest.mark.tiers(1)

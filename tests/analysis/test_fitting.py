@@ -1,12 +1,11 @@
 """Parameter estimation compared with DOP853 and curve_fit, and validity of standard errors."""
 
 import warnings
-from functools import cache, partial
+from functools import cache
 from itertools import product
 
 import numpy as np
 import pytest
-import scipy.optimize
 from notation import lagrange
 from numpy.testing import assert_allclose
 from samples import QUICK_FLAGS, linkage
@@ -202,27 +201,6 @@ def test_biased_parameters_warn_of_too_long_steps():
     assert abs(sc.fit(coarse, times, noisy, h=0.02, **given).parameters["b"] - 1.0) < 0.02
 
 
-@pytest.mark.second
-def test_initial_guess_with_failing_runs_is_accepted():
-    """A soft spring: on the way to the truth a trial leaves its well and goes to infinity."""
-    soft = lagrange("soft", "x", "x_dot**2/2 - a*x**2/2 + x**4/4", a=1.0)
-    stepper = sc.compile_stepper(soft, sc.SVI(4), flags=QUICK_FLAGS)
-    run = stepper.integrate([0.9], [0.0], h=0.1, steps=100)
-    found = sc.fit(stepper, run.t, run.q[:, 0], q=[0.8], p=[0.0], h=0.1, parameters={"a": 1.2})
-    assert_allclose(found.values, [1.0, 0.9, 0.0], rtol=0, atol=1e-9)
-    with pytest.raises(sc.StepFailedError):
-        sc.fit(stepper, run.t, run.q[:, 0], q=[2.0], p=[0.0], h=0.1)
-
-
-def test_measurement_at_the_start_determines_the_state():
-    """No step is taken: the state is the measured one, and parameters are undetermined."""
-    known = {"q": [0.7], "p": [0.2], "h": 0.1}
-    with pytest.raises(sc.FitError, match="do not determine delta: they do not depend on it"):
-        sc.fit(oscillator(), [0.0], [0.5], unknown=["delta"], fit_initial_state=False, **known)
-    found = sc.fit(oscillator(), [0.0], [[0.5, 0.4]], observed=["x", "p_x"], unknown=[], **known)
-    assert_allclose(found.values, [0.5, 0.4], rtol=1e-12)
-
-
 def test_parameter_at_a_bound_has_no_standard_error():
     """The parameter counts as known; other errors are those to first order."""
     bound = {"alpha": (-0.95, 0.0)}
@@ -241,23 +219,6 @@ def test_constraints_are_not_fitted():
     bars = sc.compile_stepper(linkage(), sc.SVI(1, "gauss-lobatto:2"), flags=QUICK_FLAGS)
     with pytest.raises(sc.MethodError, match="fit is not available with constraints"):
         sc.fit(bars, [0.0, 0.1], np.zeros((2, 4)), q=[0, 1, 1.94, 1.5], p=np.zeros(4), h=0.1)
-
-
-def test_search_without_convergence_is_reported(monkeypatch):
-    search = partial(scipy.optimize.least_squares, max_nfev=1)
-    monkeypatch.setattr(scipy.optimize, "least_squares", search)
-    with pytest.raises(sc.FitError, match=r"least squares did not converge: .* Give a better initial guess"):
-        sc.fit(oscillator(), TIMES, recorded()[0], unknown=SOME, **GUESS)
-
-
-def test_residuals_are_drawn():
-    found = sc.fit(oscillator(), TIMES, recorded(6)[0], unknown=SOME, **GUESS)
-    axes = found.plot()
-    assert_allclose(axes.get_lines()[0].get_ydata(), found.residuals[:, 0])
-    band = axes.patches[0].get_extents().transformed(axes.transData.inverted())
-    assert_allclose((band.y0, band.y1), (-2 * found.deviations[0], 2 * found.deviations[0]))
-    inside = np.abs(found.residuals) < 2 * found.deviations
-    assert 0.9 < inside.mean() < 1.0
 
 
 CHAOTIC = {"l": 0.8, "m": 1.3}
@@ -293,20 +254,6 @@ def test_chaotic_record_is_fitted_in_segments():
     assert np.sqrt((found.residuals**2).mean()) == pytest.approx(NOISE, rel=0.1)
     assert found.jumps.shape == (19, 4)
     assert np.abs(found.jumps).max() < 1e-9
-
-
-def test_segments_and_single_shooting_agree():
-    """For a short regular record, least squares and errors are equal."""
-    known = GUESS | {"unknown": SOME}
-    whole = sc.fit(oscillator(), TIMES, recorded(1)[0], **known)
-    parts = sc.fit(oscillator(), TIMES, recorded(1)[0], segments=5, **known)
-    assert_allclose(parts.values, whole.values, rtol=1e-7)
-    assert_allclose(parts.covariance, whole.covariance, rtol=1e-4, atol=1e-6 * np.abs(whole.covariance).max())
-    assert whole.jumps.shape == (0, 2)
-    momenta = sc.fit(
-        oscillator(), TIMES, recorded(1)[1], observed=["p_x"], segments=3, **known
-    )  # no coordinate measured
-    assert_allclose(momenta.values[:3], [TRUE[name] for name in SOME], rtol=0, atol=0.05)
 
 
 BOUNDS = [{"delta": (0.25, 0.5)}, {"delta": (0.0, 1.0)}, {"alpha": (-0.95, 0.0), "x": (0.6, 0.75)}]

@@ -80,19 +80,6 @@ def test_continuation_finds_what_the_straight_line_does_not(kepler):
     assert np.abs(kepler.path([1.0, 0.0], q1, 14.0, steps=56).q - found.q).max() < 1e-9
 
 
-def test_starts_at_random_find_paths_where_the_continuation_ends_at_a_fold():
-    stepper = sc.compile_stepper(sc.problem("henon-heiles").system, "svi:4")
-    q0, p0 = [0.26, 0.14], [0.27, 0.21]
-    q1, T = stepper.integrate(q0, p0, h=0.2, steps=45).q[-1], 9.0
-    intervals = Intervals(stepper, 0.5 * np.arange(18), np.full(18, 0.5), stepper.defaults, None)
-    line = np.linspace(q0, q1, 19)
-    for attempt in (solver.solved, lambda *each: solver.continued(*each, T), solver.descended):
-        with pytest.raises(PathError):
-            attempt(intervals, line)
-    path = stepper.path(q0, q1, T, steps=18)
-    assert np.abs(path.run().q[-1] - q1).max() < 1e-9
-
-
 @pytest.mark.quick
 def test_a_path_through_a_singularity_is_dropped(kepler):
     """Half of an ellipse with the semi-major axis a = 5/4; the mean of L over it is 3/(2 a) by the virial theorem."""
@@ -160,15 +147,6 @@ def test_error_of_a_path_depends_neither_on_the_origin_nor_on_the_gauge(amplitud
     assert not path.at_rest
 
 
-def test_indices_of_indefinite_kinetic_energy_are_refused():
-    stepper = compiled(["x", "y"], "(x_dot**2 - y_dot**2)/2 - (x**2 - y**2)/2 + x*y/10")
-    path = stepper.path([1.0, 0.0], [0.3, 0.2], 2.0, steps=12)
-    assert path.error < 1e-9
-    for name in ("index", "conjugate_times"):
-        with pytest.raises(MethodError, match="the kinetic energy of 'system' is indefinite"):
-            getattr(path, name)
-
-
 @pytest.mark.parametrize(("T", "index"), [(3.0, 0), (3.3, 1), (6.2, 1), (6.4, 2), (9.3, 2), (9.5, 3), (20.0, 6)])
 def test_morse_index_of_the_oscillator(oscillator, T, index):
     path = oscillator.path([1.0], [0.3], T, steps=40)
@@ -191,14 +169,6 @@ def test_hessian_by_both_ends_is_that_of_the_run():
     assert np.abs(path.hessian[2:, 2:] - D @ inverse).max() < 1e-12
     determinants = [np.linalg.det(each[:2, 2:]) for each in run.tangent()[1:]]
     assert path.index == 5 == np.count_nonzero(np.diff(np.sign(determinants)))
-
-
-@pytest.mark.quick
-def test_duration_at_a_given_energy(kepler):
-    run = kepler.integrate([1.0, 0.0], [0.0, 1.1], h=0.1, steps=20)
-    path = kepler.path(run.q[0], run.q[-1], 2.2, steps=20, energy=float(run.energy()[0]))
-    assert abs(path.t[-1] - 2.0) < 1e-9
-    assert np.abs(path.p - run.p).max() < 1e-8
 
 
 @pytest.mark.tiers(0, 1)
@@ -352,15 +322,6 @@ def test_closed_paths_of_given_energy_have_the_period_of_formulas(arguments, clo
     assert path.period == pytest.approx(4 * ellipk(m), abs=1e-9)
     assert path.run().energy() == pytest.approx(np.full(25, energy), abs=1e-9)
     assert path.zero_modes == zero_modes
-
-
-@pytest.mark.quick
-def test_closed_path_at_rest_is_reported(oscillator):
-    with pytest.warns(sc.AccuracyWarning, match="give energy="):
-        path = oscillator.path(T=5.0, steps=20, closed=True, start=lambda t: [np.cos(t)])
-    assert path.at_rest
-    assert path.residual < 1e-13
-    assert not oscillator.path([1.0], [0.3], 2.0, steps=10).at_rest
 
 
 def test_refusals_name_the_remedy(kepler):

@@ -275,27 +275,6 @@ def test_orbits_are_found_from_a_guess_that_is_15_percent_off(planar, speed, dur
         assert orbit.period == pytest.approx(2.780186915, abs=1e-8)
 
 
-@pytest.mark.rotated
-def test_another_orbit_is_reported(planar):
-    with pytest.warns(sc.AccuracyWarning, match=r"far from the guess: its period is .*, not 2\.78019"):
-        sc.periodic_orbit(planar, [0.82, 0.0], velocity=[0.0, 0.17876], period=2.780187, steps=200, fixed=["y", "p_x"])
-
-
-@pytest.mark.rotated
-def test_another_member_of_the_family_is_reported(planar):
-    """A velocity 15 % too large leads to a distant orbit of the family; one 10 % too small to a neighbour."""
-    for speed, reported in ((1.15, True), (0.9, False)):
-        with warnings.catch_warnings(record=True, action="always") as caught:
-            velocity = [0.0, 0.1625133 * speed]
-            orbit = sc.periodic_orbit(planar, [0.82, 0.0], velocity=velocity, period=2.780187, steps=200)
-        states = np.concatenate([orbit.run().q, orbit.run().p], axis=1)
-        away = np.abs([*orbit.q, *orbit.p] - np.array([0.82, 0.0, 0.0, 0.82 + velocity[1]])).max()
-        amplitude = np.ptp(states, axis=0).max() / 2
-        text = f"period is {orbit.period:.6g}, not 2.78019, and its state differs by {away:.2g}, where the amplitude "
-        assert [text in str(each.message) for each in caught] == [True] * reported
-        assert (away > amplitude / 3) == reported
-
-
 @pytest.mark.second
 def test_nonautonomous_orbits_have_a_period_of_the_system():
     """A forced oscillator closes after any time from some state, and goes elsewhere the next time round."""
@@ -310,28 +289,6 @@ def test_nonautonomous_orbits_have_a_period_of_the_system():
     twice = sc.periodic_orbit(stepper, [0.0], [0.1], period=2 * period, steps=80, fixed_period=True)
     once = sc.periodic_orbit(stepper, [0.0], [0.1], period=period, steps=40, fixed_period=True)
     assert_allclose(np.append(twice.q, twice.p), np.append(once.q, once.p), rtol=0, atol=1e-12)
-
-
-@pytest.mark.second
-def test_orbit_has_the_requested_energy():
-    oscillator = sc.LagrangianSystem.from_text(name="o", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2")
-    stepper = sc.compile_stepper(oscillator, sc.SVI(3))
-    with pytest.raises(sc.OrbitError, match=r"has the energy 0\.5, not 0\.5001"):
-        sc.periodic_orbit(stepper, [1.0], [0.0], period=2 * np.pi, steps=40, fixed=["x", "p_x"], energy=0.5001)
-    found = sc.periodic_orbit(stepper, [1.0], [0.1], period=2 * np.pi, steps=40, energy=5.0)
-    assert found.energy == pytest.approx(5.0, rel=1e-12)
-
-
-@pytest.mark.second
-def test_names_of_a_state_are_unique():
-    """A coordinate called p_x in addition to x: the momentum of x has another name."""
-    plane = lagrange("plane", "x p_x", "(x_dot**2 + p_x_dot**2)/2 - x**2/2 - p_x**2")
-    stepper = sc.compile_stepper(plane, sc.SVI(3))
-    assert stepper.interface.momenta == ("_p_x", "p_p_x")
-    given = [0.9, 0.0], [0.3, 0.0]
-    along = sc.periodic_orbit(stepper, *given, period=6.0, steps=60, fixed=["p_x", "p_p_x", "x"])
-    assert along.p[0] != 0.3
-    assert sc.periodic_orbit(stepper, *given, period=6.0, steps=60, fixed=["_p_x"]).p[0] == 0.3
 
 
 @pytest.mark.parametrize(

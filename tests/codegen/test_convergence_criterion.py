@@ -29,11 +29,6 @@ ROUNDING = 5e-16
 Q, P, STEPS = [1.2], [0.7], 5
 
 
-def scaling():
-    """H = x p_x: an implicit Euler step contracts by h per iteration, in x and in p_x."""
-    return HamiltonianSystem.from_text(name="scaling", coordinates=["x"], hamiltonian="x*p_x")
-
-
 @pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize("method", [SVI(1), SCVI(2), SVI(3, "clenshaw-curtis:4")], ids=lambda method: method.name)
 def test_long_steps_of_an_oscillator_equal_those_in_an_ensemble(method):

@@ -120,12 +120,3 @@ def test_few_terms_and_constraints_remain_unrolled():
     assert module.roll_terms(bodies("few", 5)) is None
     rods = [f"(x{i} - x{i + 1})**2 + (y{i} - y{i + 1})**2 + (z{i} - z{i + 1})**2 = 1" for i in range(46)]
     assert module.roll_terms(bodies("held", 47, constraints=rods)) is None
-
-
-@pytest.mark.usefixtures("few")
-def test_parameters_may_have_the_names_of_reads():
-    names = ["a", "b", "c", "d"]
-    springs = " ".join(f"- slot_0*given_0*({b} - {a})**{2}*{k + 2}" for k, (a, b) in enumerate(pairwise(names)))
-    system = lagrange("clash", names, " + ".join(f"{q}_dot**2" for q in names) + springs, slot_0=2, given_0=3)
-    (group,) = module.roll_terms(system).term_groups
-    assert {each.name for each in group.formula.free_symbols} >= {"slot_0", "given_0", "slot__0"}

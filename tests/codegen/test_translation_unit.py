@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from golden_cells import catalogue, ring, rods
+from golden_cells import catalogue, ring
 from programs import needs
 from samples import QUICK_FLAGS
 from strict_c import STRICT, run
 
-from scvi_codegen import SVI, LagrangianSystem, compile_stepper, generate_source
+from scvi_codegen import SVI, compile_stepper, generate_source
 from scvi_codegen.codegen.native.compilers import find_compiler
 from scvi_codegen.codegen.pipeline import ArraySources
 from scvi_codegen.codegen.rendering.source import Source
@@ -52,10 +52,6 @@ int main(void)
   return status;
 }}
 """
-
-
-VERLET_LINES, FIRST_STEP = 380, 140
-"""Largest number of lines of Stoermer-Verlet for the Kepler problem, and of those up to the end of its step."""
 
 
 def written(source: Source, folder: Path) -> None:
@@ -101,36 +97,3 @@ def test_single_file_defines_no_macro_that_it_does_not_use():
     assert "#undef" not in plain
     for name in re.findall(r"^#define (\w+)$", plain, re.MULTILINE):
         assert len(re.findall(rf"\b{name}\b", plain)) > 1, name
-
-
-@pytest.mark.parametrize("compiler", ["gcc", "clang"])
-@pytest.mark.parametrize("method", ["stoermer-verlet", "composition:8", "svi:4", SVI(1, "gauss-lobatto:2")], ids=str)
-def test_generated_source_begins_with_the_step_and_contains_what_it_uses(compiler, method, tmp_path):
-    system = catalogue("kepler")() if isinstance(method, str) else rods()
-    made = generate_source(system, method, prefix="one")[0].readable()
-    for name, text in made.files.items():
-        assert [line for line in text.split("\n") if len(line) > 120] == []
-        (tmp_path / name).write_text(text)
-    run([needs(compiler), *STRICT, "-Wno-psabi", "-c", "one.c"], tmp_path)
-    if method == "stoermer-verlet":
-        lines = made.code.split("\n")
-        assert len(lines) <= VERLET_LINES
-        assert next(i for i, line in enumerate(lines) if "int solve(" in line) < FIRST_STEP
-        assert not set(re.findall(r"\w*(?:newton|band|tolerance|fallback|predictor)\w*", made.code, re.IGNORECASE)) - {
-            "tolerance",
-            "TOLERANCE",
-        }
-
-
-@pytest.mark.parametrize("name", ["first order", "constraints"])
-def test_every_function_of_a_single_file_is_used(name, tmp_path):
-    """Systems without momenta of given velocities, and steps with constraints but without error estimates."""
-    coordinates, lagrangian, options = {
-        "first order": (["x", "y"], "log(y)/x*x_dot/2 - log(x)/y*y_dot/2 - (x + y - log(x) - log(y))", {}),
-        "constraints": (["x", "y"], "(x_dot**2 + y_dot**2)/2 - y", {"embedded": "double"}),
-    }[name]
-    conditions = {"constraints": ["x**2 + y**2 = 1"]} if options else {}
-    system = LagrangianSystem.from_text(name=name, coordinates=coordinates, lagrangian=lagrangian, **conditions)
-    method = SVI(2, "gauss-lobatto:3" if options else "gauss-legendre:2")
-    written(generate_source(system, method, prefix="one", **options)[0].single_file(), tmp_path)
-    run([*find_compiler(), *STRICT, "-Wno-psabi", "-c", "one.c"], tmp_path)

@@ -105,13 +105,6 @@ def test_names_are_typeset(name):
     assert inner(Symbol(name)) == NAMED[name]
 
 
-def test_names_of_tables_are_typeset():
-    assert f"<mi>l</mi>{DOT}" in inner(Symbol("dl_2_1"))
-    assert "<mi>D</mi><mo>^</mo>" in inner(Symbol("DD_1_0"))
-    assert "<msup><mi>A</mi><mn>2</mn></msup>" in inner(Symbol("aa_1_2"))
-    assert "<mi>b</mi><mi>A</mi>" in inner(Symbol("bA_2"))
-
-
 @pytest.mark.parametrize(
     ("number", "text"),
     [("0.1", "0.1"), ("3.0", "3.0"), ("0.33333333333333333", "0.333333"), ("1e-12", "1.0·10\N{MINUS SIGN}12")],
@@ -125,11 +118,6 @@ def test_a_power_of_a_symbol_with_an_upper_index_is_in_brackets():
         inner(Symbol("Q_1") ** 2)
         == "<msup><mrow><mo>(</mo><msup><mi>Q</mi><mn>1</mn></msup><mo>)</mo></mrow><mn>2</mn></msup>"
     )
-
-
-def test_digits_of_factors_are_separated_by_a_dot():
-    assert inner(2 * 3**x) == "<mrow><mn>2</mn><mo>·</mo><msup><mn>3</mn><mi>x</mi></msup></mrow>"
-    assert "·" not in inner(2 * x)
 
 
 @pytest.mark.parametrize(

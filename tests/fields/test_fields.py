@@ -157,21 +157,6 @@ def test_korteweg_de_vries_needs_fourier_modes():
                 field.discretise(method, **options)
 
 
-def test_wrong_shapes_of_fields_are_refused():
-    mesh = string(boundary={"x": "periodic"}).discretise("fourier", points=8)
-    with pytest.raises(sc.StateError, match=r"the field 'u' has the shape \(7,\): the mesh has 8 points"):
-        sc.compile_stepper(mesh.system, "stoermer-verlet").integrate({"u": np.zeros(7)}, h=0.1, steps=1)
-
-
-def test_model_file_contains_the_arrays_of_the_mesh(tmp_path):
-    mesh = string(boundary={"x": "periodic"}).discretise("spectral-elements", degree=3, elements=[0, 0.4, 1])
-    start = {"u": sin(2 * pi * mesh.points["x"])}
-    model = sc.Model(system=mesh.system, method=sc.SVI(2), q=start, h=0.01, steps=5)
-    sc.save_model(model, tmp_path / "string.toml")
-    again = sc.load_model(tmp_path / "string.toml")
-    assert np.asarray(again.integrate().q) == pytest.approx(np.asarray(model.integrate().q), abs=1e-15)
-
-
 @pytest.mark.tiers(1, 1)
 @pytest.mark.parametrize("ends", ["natural", (0, 0), (0, "natural"), ("natural", 0)])
 @pytest.mark.parametrize("others", ["natural", (0, 0)])
@@ -248,16 +233,3 @@ def test_densities_with_steps_and_positive_parts_have_a_highest_frequency():
     assert between.largest_step("svi:2") < frequency("1").largest_step("svi:2")
     run = sc.compile_stepper(between.system, "svi:2").integrate({"u": np.ones(32)}, h=0.01, steps=2)
     assert run.t[-1] == 0.02
-
-
-def test_failing_check_does_not_lose_a_finished_run(monkeypatch):
-    from scvi_codegen.runs.accuracy import local_error
-
-    def fails(*_, **__):
-        raise NameError("name 'unit_step' is not defined")
-
-    monkeypatch.setattr(local_error, "warn_of_energy_error", fails)
-    pendulum = sc.compile_stepper(sc.problem("planar-pendulum").system, "svi:4")
-    with pytest.warns(sc.AccuracyWarning, match=r"not checked \(NameError: name 'unit_step' is not defined\)"):
-        run = pendulum.integrate([1.0], [0.0], t_end=1.0)
-    assert run.t[-1] == 1.0

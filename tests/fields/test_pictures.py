@@ -51,18 +51,6 @@ def test_space_time_diagram_and_image_have_the_values_of_the_field(tmp_path):
     assert mesh.points["y"][0, 0] == 0
 
 
-@pytest.mark.rotated
-def test_spectrum_decays_where_the_field_is_resolved(tmp_path):
-    _, run = run_of("x", {"x": "periodic"}, "fourier", lambda x: cos(6 * pi * x), points=16)
-    first, last = run.plot.spectrum(tmp_path / "s.png").lines
-    assert first.get_ydata() == pytest.approx(np.where(np.arange(1, 9) == 3, 64, 0), abs=1e-9)
-    assert len(last.get_ydata()) == 8
-    _, run = on_a_line()
-    modes = run.plot.spectrum(tmp_path / "e.png").lines[0].get_ydata()
-    assert len(modes) == 5
-    assert modes[-1] < 1e-3 * modes[0]
-
-
 @pytest.mark.parametrize(("made", "lines", "dimension"), [(on_a_line, 1, 2), (in_the_plane, 7, 3)])
 def test_animation_shows_the_graph_over_the_points(made, lines, dimension):
     mesh, run = made()
@@ -104,15 +92,3 @@ def test_dataset_of_a_hamiltonian_density_has_the_density_of_momenta():
     data = stepper.integrate({"q": sin(2 * pi * x)}, p={"q": mesh.weights * x}, h=0.01, steps=1).to_xarray()
     assert data.p_.values[0] == pytest.approx(x)
     assert data.q_.values[0] == pytest.approx(sin(2 * pi * x))
-
-
-def test_plots_of_fields_are_refused_by_name():
-    _, run = on_a_line()
-    with pytest.raises(sc.StateError, match="no array 'v'"):
-        run.plot.field(field="v")
-    with pytest.raises(sc.StateError, match="no state 21"):
-        run.plot.field(state=21)
-    lattice = sc.LagrangianSystem.from_text(name="free", coordinates=["q[N]"], lagrangian="sum(i in N, q_dot[i]**2/2)")
-    alone = sc.compile_stepper(lattice, "svi:1", flags=QUICK_FLAGS).integrate({"q": np.ones(3)}, h=0.1, steps=2)
-    with pytest.raises(sc.StateError, match="not discretised from a density"):
-        sc.plot_spectrum(alone)

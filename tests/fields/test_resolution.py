@@ -54,28 +54,6 @@ def test_recorded_pieces_and_ensembles_warn_of_unresolved_fields():
         stepper.integrate_ensemble({"u": members}, velocity={"u": 0 * members}, h=0.01, steps=4)
 
 
-def test_small_states_at_the_start_do_not_warn(recwarn):
-    mesh = ring().discretise("finite-differences", order=2, points=16)
-    rough, smooth = (-1.0) ** np.arange(16), np.cos(mesh.points["x"])
-    stepper = sc.compile_stepper(mesh.system, "stoermer-verlet", flags=QUICK_FLAGS)
-    run = stepper.integrate({"u": 1e-6 * rough}, velocity={"u": smooth}, h=0.01, steps=100)
-    assert run.unresolved()[0] == pytest.approx(1.0)
-    assert not recwarn.list
-
-
-@pytest.mark.full
-def test_recordings_report_the_unresolved_part_and_warn_of_it(tmp_path):
-    mesh = ring().discretise("fourier", points=6)
-    stepper = sc.compile_stepper(mesh.system, "stoermer-verlet", flags=QUICK_FLAGS)
-    start = {"u": np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])}
-    with pytest.warns(sc.AccuracyWarning, match="does not resolve the fields: at t = 0"):
-        recorded = sc.record_run(stepper.start(start, h=0.01), tmp_path / "run", steps=4)
-    with pytest.warns(sc.AccuracyWarning, match="does not resolve the fields"):
-        expected = stepper.with_sizes(Nx=6).integrate(start, {"u": np.zeros(6)}, h=0.01, steps=4).unresolved()
-    np.testing.assert_array_equal(recorded.unresolved(), expected)
-    np.testing.assert_array_equal(sc.load_run(tmp_path / "run").unresolved(), expected)
-
-
 @pytest.mark.second
 def test_recordings_contain_their_mesh(tmp_path):
     """A driven end, elements of several sizes, a parameter, a momentum and its weights: all from the folder."""

@@ -33,24 +33,6 @@ def kepler():
     return sc.compile_stepper(sc.problem("kepler").system, sc.SVI(4), flags=QUICK_FLAGS)
 
 
-def leapfrog(x):
-    """(2, steps + 1) positions and momenta from (q, p, a, k, m, w, t, h), which JAX differentiates itself."""
-    q, p, a, k, m, w, t, h = x
-
-    def kicked(q, p, t):
-        return p + h / 2 * (a * jnp.cos(w * t) - k * q**3)
-
-    def step(state, i):
-        q, p = state
-        p = kicked(q, p, t + i * h)
-        q = q + h * p / m
-        p = kicked(q, p, t + (i + 1) * h)
-        return (q, p), jnp.stack([q, p])
-
-    found = jax.lax.scan(step, (q, p), jnp.arange(STEPS))[1]
-    return jnp.concatenate([jnp.stack([q, p])[:, None], found.T], axis=1)
-
-
 def test_transformations_apply_in_any_order():
     flow = sc.jax_flow(kepler(), steps=30)
     q, p = jnp.array([[0.5, 0.0], [0.6, 0.1], [0.9, -0.2]]), jnp.array([0.0, 1.6])

@@ -148,15 +148,6 @@ def test_masses_times_powers_of_two_give_equal_bits(pendulum, power):
         assert np.abs(runs[0].q - runs[1].q).max() <= 4 * 2**-52
 
 
-def test_ensembles_of_mass_ratios_agree_with_single_runs(pendulum):
-    parameters = np.array([[m, 1.0] for m in MASSES])
-    states = np.tile(POSITION, (len(MASSES), 1)), np.zeros((len(MASSES), 5))
-    ensemble = pendulum[0].integrate_ensemble(*states, parameters=parameters, h=0.005, steps=20)
-    for k, m in enumerate(MASSES):
-        run = pendulum[0].integrate(POSITION, [0.0] * 5, parameters={"m": m, "M": 1.0}, h=0.005, steps=20)
-        assert np.abs(ensemble.q[-1, k] - run.q[-1]).max() <= 4 * 2**-52
-
-
 @pytest.mark.second
 def test_a_light_pinned_slider_is_no_light_body():
     """Its coordinate y = 0 has no size, forces and reactions cancel there, but no other coordinate is lost by it."""

@@ -1,7 +1,5 @@
 """Nodes: names, symmetry, closed forms, wrong arguments; their numbers are proved in ``test_proofs.py``."""
 
-import subprocess
-import sys
 from fractions import Fraction
 
 import numpy as np
@@ -86,28 +84,3 @@ def test_numbers_of_many_kinds_are_converted() -> None:
 def test_non_finite_and_non_real_numbers_are_rejected(value: object) -> None:
     with pytest.raises(sc.MethodError, match="give a"):
         to_number(value)
-
-
-@pytest.mark.parametrize("name", NODE_FAMILIES)
-@pytest.mark.parametrize(("degree", "message"), [(0, "at least 1, not 0"), (2.0, "not 2.0"), (True, "not True")])
-def test_nonpositive_and_noninteger_degrees_are_rejected(name: str, degree: object, message: str) -> None:
-    nodes_by_name(name, 2)
-    nodes_by_name(name, 1)
-    with pytest.raises(sc.MethodError, match=message):
-        nodes_by_name(name, degree)  # type: ignore[arg-type]  # the wrong type is the point
-
-
-def test_user_precision_has_no_effect_and_is_not_changed() -> None:
-    import mpmath
-
-    with mpmath.workdps(5):
-        nodes = legendre_gauss(21)
-        assert mpmath.mp.dps == 5
-    assert abs(mp.legendre(22, nodes.points[0])) < mp.mpf("1e-55")
-
-
-def test_importing_the_tables_does_not_import_sympy() -> None:
-    code = (
-        "import sys; from scvi_codegen.methods.tables import basis, quadrature, nodes; sys.exit('sympy' in sys.modules)"
-    )
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

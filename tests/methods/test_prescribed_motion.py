@@ -93,18 +93,6 @@ def test_prescribed_velocities():
     assert_allclose(run.multipliers(), [[3.0, 1.0]] * 11, rtol=0, atol=1e-12)
 
 
-@pytest.mark.rotated
-@pytest.mark.sampled(1)
-def test_certificate_and_tangents():
-    system = lagrange("crank", "x y", "(x_dot**2 + y_dot**2)/2", constraints=["x = cos(t)", "y = sin(t)"])
-    certificate = sc.verify(system, "svi:2", [1.0, 0.0], [0.0, 1.0], h=0.1)
-    assert certificate.passed, str(certificate)
-    assert "symplecticity" not in {check.name for check in certificate.checks}
-    run = sc.compile_stepper(system, "svi:2").integrate([1.0, 0.0], [0.0, 1.0], h=0.1, steps=5)
-    with pytest.raises(sc.MethodError, match="not available with constraints that prescribe the motion"):
-        run.lyapunov_exponents()
-
-
 SLIDER = {
     "name": "slider-crank",
     "coordinates": ["angle", "x"],

@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 from programs import script
 
-import scvi_codegen as sc
 from scvi_codegen import SVI, RecordedRun, Stepper, record_run
 from scvi_codegen.codegen.native import building
 from scvi_codegen.codegen.rendering.source import Source
@@ -213,24 +212,9 @@ def test_threads_compile_each_text_once(folder, monkeypatch):
     assert len(built) == len(list(folder.glob("_scvi_*"))) == 2
 
 
-def test_threads_derive_at_once(folder):
-    """The generated source does not depend on concurrent derivations."""
-    systems = [sc.problem(name).system for name in ("kepler", "planar-pendulum", "henon-heiles")]
-    alone = [sc.generate_source(system, SVI(2)) for system in systems]
-    with ThreadPoolExecutor(6) as pool:
-        assert list(pool.map(lambda system: sc.generate_source(system, SVI(2)), systems * 2)) == alone * 2
-
-
 @pytest.mark.tiers(1, 1)
 @pytest.mark.parametrize("method", ["fork", "spawn", pytest.param("forkserver", marks=pytest.mark.full)])
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
 def test_steppers_are_pickled_to_other_processes(kepler, finals, method):
     with multiprocessing.get_context(method).Pool(2) as pool:
         assert pool.starmap(final, [(kepler, p) for p in MOMENTA[:4]]) == finals[:4]
-
-
-@pytest.mark.parametrize("backend", ["loky", "threading"])
-def test_joblib_runs_steppers(kepler, finals, backend):
-    joblib = pytest.importorskip("joblib")
-    work = [joblib.delayed(final)(kepler, p) for p in MOMENTA[:6]]
-    assert joblib.Parallel(n_jobs=2, backend=backend)(work) == finals[:6]

@@ -4,7 +4,6 @@ Each case damages one thing (a file, an argument, a variable of the environment)
 exception must be a :class:`~scvi_codegen.common.errors.ScviCodegenError`.
 """
 
-import json
 import os
 import warnings
 from collections.abc import Callable
@@ -20,7 +19,6 @@ from samples import QUICK_FLAGS
 import scvi_codegen as sc
 from scvi_codegen.codegen.native import building, compilers
 from scvi_codegen.codegen.rendering.source import Source
-from scvi_codegen.runs.recording.manifest import sealed_archive, sealed_text
 
 ODD: list[Any] = [
     None, True, "x", "", b"x", 1j, [], {}, (), [[]], [[1.0]], [None], ["1"], [1.0, [2.0]], float("nan"), float("inf"),
@@ -125,82 +123,6 @@ def test_special_values_are_rejected_or_handled(name: str, here: Path) -> None:
         except Exception as error:  # noqa: BLE001  (all of them are shown together)
             failed.append(f"{value!r:.40}: {error!r:.200}")
     assert failed == []
-
-
-def paths_of(document: Any, place: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """The places of all that a JSON document has, but the lines of texts."""
-    found = [place] if place else []
-    items = (
-        document.items()
-        if isinstance(document, dict)
-        else enumerate(document[:1])
-        if isinstance(document, list)
-        else ()
-    )
-    return found + [each for key, value in items for each in paths_of(value, (*place, key))]
-
-
-PARTS = 12
-VALUES: list[Any] = [None, 0, -1, 1, 1.5, 1e30, 10**30, "x", "1", "", [], [1], ["x"], {}, {"a": 1}, True, float("nan")]
-
-
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("recorded") / "a.run"
-    sc.record_run(stepper().start([1.0], [0.0], h=0.1, parameters=INPUT), folder, steps=20, rows=8)
-    return folder
-
-
-@pytest.mark.rotated
-@pytest.mark.parametrize("part", [0, *(pytest.param(part, marks=pytest.mark.full) for part in range(1, PARTS))])
-def test_damaged_manifests_are_rejected(recorded: Path, part: int) -> None:
-    """Every entry of a manifest with every value: refused as a recording, or read and used without harm."""
-    path = recorded / "manifest.json"
-    whole = path.read_text()
-    document = json.loads(whole)
-    del document["sha256"]
-    unsealed = json.dumps(document)
-    count = 0
-    try:
-        for place in paths_of(document):
-            for value in VALUES[part::PARTS]:
-                changed = json.loads(unsealed)
-                inner = changed
-                for key in place[:-1]:
-                    inner = inner[key]
-                inner[place[-1]] = value
-                path.write_text(sealed_text(changed))
-                count += refused(lambda: _read_whole(recorded)) is not None
-    finally:
-        path.write_text(whole)
-    assert count > 30
-
-
-def _read_whole(folder: Path) -> None:
-    """All that reads and needs no other C text than was compiled."""
-    run = sc.load_run(folder)
-    if run.manifest.source == stepper().source and run.manifest.flags == QUICK_FLAGS:
-        assert np.isfinite(run[0:3].energy()).all()
-    np.asarray(run.q)
-    assert (len(run), run.steps, repr(run)) is not None
-
-
-def test_damaged_state_files_are_rejected(recorded: Path) -> None:
-    path = recorded / "states-000001.npz"
-    whole = path.read_bytes()
-    with np.load(path) as file:
-        arrays_in_file = dict(file)
-    try:
-        for name in arrays_in_file:
-            for value in (np.zeros(0), np.zeros(3), np.zeros((8, 3)), np.array(["x"] * 8), np.zeros(8, dtype=complex)):
-                np.savez(path, **{**arrays_in_file, name: value})
-                path.write_bytes(sealed_archive(path.read_bytes()))
-                refused(lambda: np.asarray(sc.load_run(recorded).q))
-        for size in range(0, len(whole), 97):
-            path.write_bytes(whole[:size])
-            assert isinstance(refused(lambda: np.asarray(sc.load_run(recorded).q)), sc.RecordingError)
-    finally:
-        path.write_bytes(whole)
 
 
 ENVIRONMENT = [

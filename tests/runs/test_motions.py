@@ -388,10 +388,6 @@ def energy(run):
     return run.energy()
 
 
-def vertical(run):
-    return run.angular_momentum()[:, 2]
-
-
 @pytest.mark.second
 def test_states_by_name_are_projected_and_constraints_are_reported_as_written():
     stepper, turning = sc.compile_stepper(BALL, "svi:4", flags=QUICK_FLAGS), ATTITUDE[0].apply(ROLLING)

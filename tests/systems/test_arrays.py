@@ -8,7 +8,7 @@ from scvi_codegen import HamiltonianSystem, LagrangianSystem, SystemDefinitionEr
 from scvi_codegen.common.errors import SizesRequiredError
 from scvi_codegen.systems.arrays.reading import arrays_from_text
 from scvi_codegen.systems.arrays.symmetry import momentum_maps
-from scvi_codegen.systems.arrays.system import ArraySystem, force_of
+from scvi_codegen.systems.arrays.system import ArraySystem
 from scvi_codegen.systems.system import MechanicalSystem
 
 GRAVITY = "sum(i in N, m[i]*sum(a in 3, r_dot[i, a]**2)/2) + "
@@ -80,33 +80,6 @@ def test_unrolled_system_has_one_coordinate_per_element() -> None:
     springs = k[0] * (q[0] - q[2]) ** 2 + k[1] * (q[2] - q[1]) ** 2
     assert sympy.expand(found.formula - sum(x**2 for x in v) / 2 + c * springs) == 0
     assert found.constants == {c: 3.0, k[0]: 5.0, k[1]: 7.0}
-
-
-def test_derived_terms_are_displayed() -> None:
-    """Each read has a derivative; the formula has mathematical notation."""
-    net = system(
-        "q[N]",
-        "sum(i in N, mass[i]*q_dot[i]**2/2) - sum(b in B, cos(q[ends_of[b, 0]] - q[ends_of[b, 1]])) - q[N-1]**2"
-        "- sum(i < j in N, q[i]*q[j]) - sum(i in N periodic, q[i-1]*q[i])",
-        parameters={"mass[N]": 1},
-        tables=["ends_of[B, 2]"],
-    )
-    forces = {str(term): force_of(term, net.state).targets for term in net.potentials}
-    a, b = (sympy.Symbol(f"q[ends_of[b, {k}]]", real=True) for k in (0, 1))
-    pair = forces["sum(b in B, -cos(q[ends_of[b, 0]] - q[ends_of[b, 1]]))"]
-    assert {str(access): derivative for access, derivative in pair} == {
-        a.name: sympy.sin(a - b),
-        b.name: -sympy.sin(a - b),
-    }
-    shown = net._repr_latex_()
-    for part in (
-        r"\sum_{i=0}^{N-1} \left(\frac{\mathrm{mass}_{i} \dot{q}_{i}^{2}}{2}\right)",
-        r"\cos{\left(q_{\mathrm{ends\_of}_{b 0}} - q_{\mathrm{ends\_of}_{b 1}} \right)}",
-        r"\sum_{0 \le i < j < N} \left(- q_{i} q_{j}\right)",
-        r"\sum_{i \in \mathbb{Z}_{N}}",
-        "- q_{N-1}^{2}",
-    ):
-        assert part in shown
 
 
 def test_sympy_sums_are_read() -> None:
@@ -209,16 +182,3 @@ def test_forces_and_conserved_quantities() -> None:
     assert momentum_maps(system("q[N]", ring, forces={"q[i]": "-q_dot[i]"})) == ()
     assert [array.name for array in between.velocities] == ["q_dot"]
     assert system("q[N]", ring, forces={"q[0]": "cos(t)"}).velocities == ()
-
-
-def test_forces_are_unrolled() -> None:
-    """At every place, of every component, and at one place."""
-    found = unroll_sums(
-        system(
-            "r[N, 2]",
-            "sum(i in N, sum(a in 2, r_dot[i, a]**2))",
-            forces={"r[i, a]": "-r_dot[i, a]", "r[N-1, 0]": "cos(t)"},
-        ),
-        {"N": 2},
-    )
-    assert [str(force) for force in found.forces] == ["-r_0_0_dot", "-r_0_1_dot", "-r_1_0_dot + cos(t)", "-r_1_1_dot"]

@@ -79,13 +79,6 @@ def test_forces_of_sympys_mechanics_act_through_velocities():
     assert sympy.simplify(system.forces[0] - expected.forces[0]) == 0
 
 
-def test_symmetries_are_those_of_the_forced_motion():
-    still = lagrange("free", "x y", "(x_dot**2 + y_dot**2)/2 - y**4")
-    dragged = lagrange("free", "x y", "(x_dot**2 + y_dot**2)/2 - y**4", forces={"x": "-x_dot/2"})
-    assert "p_x" in {str(each.momentum_map) for each in sc.symmetries(still)}
-    assert [str(each.momentum_map) for each in sc.symmetries(dragged)] == ["p_x + x/2"]
-
-
 def test_functions_that_need_an_action_reject_forces():
     system = driven(forces={"x": "-c*x_dot"})
     with pytest.raises(sc.SystemDefinitionError, match="forces act on 'driven'"):

@@ -208,54 +208,6 @@ def test_a_singular_hamiltonian_has_no_momenta_of_velocities_and_no_discrete_lag
         stepper.discrete_lagrangian([1.0], [1.1], 0.1)
 
 
-def test_quadratures_with_derivatives_need_a_lagrangian() -> None:
-    with pytest.raises(sc.MethodError, match="lagrangian_of"):
-        sc.compile_stepper(hamiltonian_of(sc.problem("planar-pendulum").system), sc.SVI(2, "hermite:2"))
-
-
-def vortex_rates(state: np.ndarray, strength: np.ndarray) -> np.ndarray:
-    """Velocities of point vortices, from the law of Biot and Savart."""
-    n = len(strength)
-    x, y = state[:n], state[n:] / strength
-    dx, dy = x[:, None] - x, y[:, None] - y
-    distance = dx**2 + dy**2 + np.eye(n)
-    u = -(dy / distance) @ strength / (2 * np.pi)
-    v = (dx / distance) @ strength / (2 * np.pi)
-    return np.concatenate([u, strength * v])
-
-
-@pytest.mark.second
-def test_point_vortices_agree_with_gauss_by_hand() -> None:
-    entry = sc.problem("point-vortices")
-    strength = np.array(entry.system.defaults)
-    stepper = sc.compile_stepper(entry.system, sc.SVI(2), flags=QUICK)
-    root = np.sqrt(3.0) / 6.0
-    A = np.array([[0.25, 0.25 - root], [0.25 + root, 0.25]])
-    state, h = np.concatenate([entry.q, entry.p]), 0.1
-    partials = np.zeros((2, len(state)))
-    for _ in range(200):
-        partials = np.array([vortex_rates(state + h * line @ partials, strength) for line in A])
-    expected = state + h * partials.sum(axis=0) / 2
-    assert np.abs(np.concatenate(stepper.step(entry.q, entry.p, h)) - expected).max() < ROUND_OFF
-
-
-@pytest.mark.tiers(0, 1)
-@pytest.mark.sampled(4)
-@pytest.mark.parametrize(
-    "method", [sc.SVI(6), sc.Gauss(3), sc.RadauIIA(3), sc.StoermerVerlet()], ids=lambda method: method.name
-)
-@pytest.mark.parametrize("h", [0.1, -0.1])
-def test_both_solvers_give_the_same_step_without_a_lagrangian(method, h) -> None:
-    entry = sc.problem("point-vortices")
-    one, two = (
-        sc.compile_stepper(entry.system, method, solver=solver, flags=QUICK) for solver in ("fixed-point", "newton")
-    )
-    steps = [np.array(stepper.step(entry.q, entry.p, h)) for stepper in (one, two)]
-    assert np.abs(steps[0] - steps[1]).max() < ROUND_OFF
-    ends = [stepper.integrate(entry.q, entry.p, h=h, steps=50).q[-1] for stepper in (one, two)]
-    assert np.abs(ends[0] - ends[1]).max() < 1e-12
-
-
 def test_parameters_are_assumed_positive_if_their_values_are():
     """Roots of squares of other parameters have signs; a value of 0 does not determine the sign of others."""
     system = lagrange("signs", "q", "a*q_dot**2/2 - b*q - c*q**2", a=1.0, b=0.0, c=-1.0)

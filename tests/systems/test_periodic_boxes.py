@@ -119,16 +119,6 @@ def pair(power: int) -> sc.LagrangianSystem:
     )
 
 
-@pytest.mark.tiers(1)
-@pytest.mark.parametrize("solver", ["auto", "newton"])
-def test_particles_that_pass_through_the_box_keep_energy_and_momentum(solver: str) -> None:
-    stepper = sc.compile_stepper(pair(6), "svi:4", solver=solver)
-    run = stepper.integrate([0.1, 0.7], velocity=[0.3, 3.0], h=0.02, steps=2000)
-    assert np.ptp(run.q[:, 1] - run.q[:, 0]) > 30 * 3.0
-    assert run.energy_error() < 1e-9
-    assert run.momentum_errors().max() < 1e-13
-
-
 @pytest.mark.second
 def test_order_is_preserved_up_to_the_smoothness_at_the_cut_off() -> None:
     """positive_part()**k has k - 1 continuous derivatives: order 4 with k = 6, by formulas at most 2 with k = 1."""
@@ -143,16 +133,3 @@ def test_order_is_preserved_up_to_the_smoothness_at_the_cut_off() -> None:
     assert order(6) > 3.7
     assert order(1, kinks="as formulas") < 2.5
     assert order(1) > 3.7
-
-
-@pytest.mark.full
-def test_certificate() -> None:
-    certificate = sc.verify(pair(6), "svi:2")
-    assert certificate.passed, str(certificate)
-
-
-def test_single_precision_source_uses_functions_of_floats() -> None:
-    source, _ = sc.generate_source(pair(4), "stoermer-verlet", embedded="single")
-    text = "".join(source.files.values())
-    assert "rintf(" in text
-    assert "copysignf(" in text

@@ -68,19 +68,6 @@ def test_rolled_system_has_equal_trajectories(system):
     assert np.abs(run.energy() - other.energy()).max() < 1e-12 * np.abs(run.energies).max()
 
 
-def powers(count):
-    """Products and quotients of neighbours with exponents of their own, in names whose order is not that of places."""
-    q = [f"q{i}" for i in range(count)]
-    terms = [f" - {a}**2*{b}**3 - cos({a})*cos({b})**2 - {a}**2/({b}**2 + 2)" for a, b in pairwise(q)]
-    return lagrangian(q, " + ".join(f"{a}_dot**2/2" for a in q) + "".join(terms))
-
-
-def test_equal_terms_of_different_exponents_are_rolled_into_one_sum_each():
-    few, many = (sc.roll_sums(powers(count)).system for count in (5, 13))
-    assert str(few) == str(many)
-    assert len(many.terms) == 4
-
-
 def test_common_parameters_remain_scalar():
     found = sc.roll_sums(bodies(4))
     assert [str(name) for name in found.system.parameters] == ["G"]
@@ -128,23 +115,6 @@ def test_inputs_retain_their_names():
         np.zeros(4), velocity=np.zeros(4), inputs=data, h=0.1, steps=5
     )
     assert run.q["q"][-1] == pytest.approx(other.q[-1], abs=1e-14)
-
-
-@pytest.mark.tiers(0, 1)
-@pytest.mark.parametrize(
-    "term", ["3", *(pytest.param(x, marks=pytest.mark.full) for x in ("3*sin(t)", "g")), "g*cos(t) + x*0 + 2"]
-)
-def test_terms_without_coordinates_give_a_runnable_system(term):
-    written = lagrangian(["x", "y"], f"x_dot**2/2 - x**2/2 + y_dot**2/2 - y**2/2 + {term}", g=2.0)
-    found = sc.roll_sums(written)
-    assert {name: table.shape[1] for name, table in found.tables.items()} == {
-        f"at{k}": 1 for k in range(len(found.tables))
-    }
-    data = {"tables": found.tables, "parameters": found.parameters}
-    own = sc.compile_stepper(found.system, "svi:2").integrate([1.0, 2.0], h=0.1, steps=3, **data)
-    other = sc.compile_stepper(written, "svi:2").integrate([1.0, 2.0], [0.0, 0.0], h=0.1, steps=3)
-    assert np.abs(own.q["q"] - other.q).max() < 1e-15
-    assert np.abs(own.energy() - other.energy()).max() < 1e-14
 
 
 @pytest.mark.tiers(1, 3)

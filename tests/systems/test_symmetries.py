@@ -8,7 +8,6 @@ from itertools import combinations
 import numpy as np
 import pytest
 import sympy
-from counting import at_most
 from notation import hamilton, lagrange
 from sympy import Symbol
 
@@ -100,21 +99,6 @@ def test_symmetries_of_a_free_particle():
     }
 
 
-def test_uniform_field_has_the_symmetries_of_a_free_particle():
-    assert formulas(particle("m*g*y", g=9.81)) == {
-        "momentum of x": "p_x",
-        "momentum of y": "p_y + g*m*t",
-        "angular momentum": "x*p_y + g*m*x*t - y*p_x - g*p_x*t**2/2",
-        "boost of x": "m*x - p_x*t",
-        "boost of y": "m*y - p_y*t - g*m*t**2/2",
-    }
-
-
-def test_symmetries_with_anisotropic_masses():
-    system = lagrange("anisotropic", "u w", "m*u_dot**2/2 + M*w_dot**2/2", m=1.0, M=4.0)
-    assert formulas(system)["angular momentum of u, w"] == "m*u*p_w - M*w*p_u"
-
-
 def test_symmetries_with_sums_of_parameters_in_coefficients():
     system = lagrange(
         "trolley", "x y", "M*x_dot**2/2 + m*(x_dot + y_dot)**2/2 - k*(y - a - b)**4", m=1.0, M=4.0, k=1.0, a=0.1, b=0.2
@@ -148,19 +132,6 @@ def test_magnetic_fields_have_gauges():
     assert found["momentum of x"].formula == "p_x - B*e*y - E*e*t"
     assert str(found["momentum of x"].gauge) == "B*e*y + E*e*t"
     assert found["momentum of x"].direction == (1, 0, 0)
-
-
-@pytest.mark.tiers(1)
-@pytest.mark.parametrize("axes", ["xy", "xyz"])
-@pytest.mark.parametrize("gravity", [False, True])
-def test_three_bodies_have_the_full_galilean_group(axes, gravity):
-    """Translations, rotations and boosts, 5 in the plane, 9 in space; energy would be the tenth."""
-    found = formulas(bodies(axes, gravity=gravity))
-    turns = ["angular momentum"] if axes == "xy" else [f"angular momentum {axis}" for axis in axes]
-    assert list(found) == [*(f"linear momentum {a}" for a in axes), *turns, *(f"boost {a}" for a in axes)]
-    assert found["boost x"] == "m_a*a_x + m_b*b_x + m_c*c_x - p_a_x*t - p_b_x*t - p_c_x*t"
-    if not gravity:
-        assert found["linear momentum y"] == "p_a_y + p_b_y + p_c_y"
 
 
 def test_more_than_twelve_coordinates_are_searched_together():
@@ -230,10 +201,6 @@ def test_symmetries_that_mix_positions_and_momenta():
     }  # with the energy, Fradkin's tensor
 
 
-def test_energy_is_listed_as_symmetry_of_time_only():
-    assert symmetries(phase_space("p**2/(2*m) + k*x**2/2", "x", "p", m=1.3, k=2.0)) == ()
-
-
 def rate(system: MechanicalSystem, symmetry: Symmetry) -> sympy.Expr:
     """dJ/dt along a motion, by SymPy's own derivatives: accelerations from the Euler-Lagrange equations, solved."""
     at = dict(zip(symmetry.momenta, forms_of(system).momentum, strict=True))
@@ -252,15 +219,6 @@ def test_each_momentum_map_is_conserved_identically(system):
         assert rate(system, symmetry) == 0
         products = [p * xi for p, xi in zip(symmetry.momenta, symmetry.direction, strict=True)]
         assert sympy.expand(sympy.Add(*products) - symmetry.gauge - symmetry.momentum_map) == 0
-
-
-@pytest.mark.second
-def test_symmetry_search_is_fast():
-    for name in (*sc.PROBLEMS, "fput-chain:64"):
-        system = sc.problem(name).system
-        symmetries.cache_clear()
-        with at_most(1_000_000):  # the slowest takes 400,000, a tenth of a second
-            symmetries(system)
 
 
 # What is given.
@@ -382,14 +340,6 @@ def test_symmetry_of_another_system_or_with_a_used_name_is_rejected():
 # Compiled, tracked, shown.
 
 
-def test_without_symmetries_no_code_is_generated(quickly_compiled):
-    entry = sc.problem("henon-heiles")
-    stepper = quickly_compiled(entry.system, sc.SVI(2))
-    assert "momentum_maps" not in stepper.source.header + stepper.source.code
-    assert stepper.momentum_maps([0.1, 0.2], [0.1, 0.2]).shape == (0,)
-    assert stepper.integrate([0.1, 0.2], [0.1, 0.2], h=0.1, steps=3).momentum_errors().shape == (4, 0)
-
-
 SYSTEMS = {
     "fields": (magnetic(), [0.3, 0.2, 0.1], [0.5, 0.4, 0.2]),
     "falling": (particle("m*g*y", g=2.1), [0.3, 0.2], [0.5, 0.4]),
@@ -457,11 +407,6 @@ def test_supplied_generator_is_tracked(quickly_compiled):
     assert 0 < np.abs(run.momentum_errors()[:, 1]).max() < 1e-11
 
 
-def test_free_hamiltonians_without_lagrangian():
-    system = sc.HamiltonianSystem.from_text(name="shear", coordinates=["q"], hamiltonian="p_q*c", parameters={"c": 2.0})
-    assert set(formulas(system).values()) >= {"p_q"}
-
-
 @pytest.mark.parametrize("smallest", [0.0, 1e-12, 0.9e-9, 1.1e-9, 1e-6, 1.0])
 def test_only_large_singular_values_are_called_large(smallest):
     rng = np.random.default_rng(7)
@@ -470,12 +415,6 @@ def test_only_large_singular_values_are_called_large(smallest):
     message_text = invariants._all_larger(matrix, 1e-9)
     assert not message_text or smallest > 1e-9
     assert message_text or smallest < 1e-6
-
-
-def test_without_conserved_quantities_no_singular_values_are_computed(monkeypatch):
-    tilted = particle("sin(x*y) + x**4 + cos(y) + x*cos(t)")
-    monkeypatch.setattr(np.linalg, "svd", None)
-    assert symmetries(tilted) == ()
 
 
 def test_no_claims_for_one_forms_with_velocity_dependent_forces():
@@ -508,9 +447,3 @@ def test_momentum_map_of_rounding_errors_is_compared_with_its_bound():
         q[:, 0], p[:, 0] = states["q"], states["p"]
         errors = np.abs(replace(many, q=q, p=p).momentum_errors()).max(axis=0)
         assert errors[:, 0] == pytest.approx([found, 0.0], rel=1e-9, abs=1e-14)
-
-
-def test_constant_momentum_maps_have_no_error():
-    spiral = lagrange("spiral", "z x y", "(x_dot**2 + y_dot**2 + z_dot**2)/2 - x**2/2 - y**2/2")
-    run = sc.compile_stepper(spiral, sc.ExplicitEuler()).integrate([0.1, 1, 0], velocity=[0.3, 0, 0.7], h=0.01, steps=9)
-    assert np.abs(run.momentum_errors()).max(axis=0) == pytest.approx([0.0, 9e-4, 0.0], abs=1e-4)

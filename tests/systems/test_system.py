@@ -11,9 +11,9 @@ import pytest
 import sympy
 from notation import lagrange
 from sympy import Rational, Symbol, cos, sin
-from sympy.physics.mechanics import LagrangesMethod, Particle, Point, ReferenceFrame, dynamicsymbols
+from sympy.physics.mechanics import LagrangesMethod, dynamicsymbols
 
-from scvi_codegen import ExpressionError, LagrangianSystem, SystemDefinitionError, SystemDefinitionWarning
+from scvi_codegen import ExpressionError, LagrangianSystem, SystemDefinitionError
 from scvi_codegen.systems.derived_expressions import curve_rates, forms_of
 
 T = dynamicsymbols._t
@@ -113,16 +113,6 @@ def test_unusual_names_are_transliterated(given: str, spelled: str) -> None:
     assert from_text(spelled, system.to_text(), **{system.parameters[0].name: 1.0}) == system
 
 
-def test_time_under_another_name_and_assumptions() -> None:
-    tau = Symbol("tau", positive=True)
-    assert from_sympy(V**2 / 2 - X * cos(tau), X, time=tau) == from_text("x", "x_dot**2/2 - x*cos(t)")
-
-
-def test_numbers_of_all_kinds_as_defaults() -> None:
-    for value in (2, 2.0, Rational(2), np.float64(2), np.int32(2), sympy.Float(2)):
-        assert from_text("x", "k*x_dot**2", k=value).defaults == (2.0,)
-
-
 def test_with_parameters_replaces_values() -> None:
     system = from_text("x", "m*x_dot**2/2 - k*x**2", m=1, k=2)
     assert system.with_parameters(k=3) == from_text("x", "m*x_dot**2/2 - k*x**2", m=1, k=3)
@@ -133,11 +123,6 @@ def test_with_parameters_replaces_values() -> None:
         system.with_parameters(m=math.inf)
     with pytest.raises(SystemDefinitionError, match="singular"):
         system.with_parameters(m=0)
-
-
-def test_latex_of_a_system() -> None:
-    text = from_text("theta_1", "theta_1_dot**2/2 + cos(theta_1)")._repr_latex_()
-    assert text == r"$\displaystyle L = \frac{\dot{\theta_{1}}^{2}}{2} + \cos{\left(\theta_{1} \right)}$"
 
 
 def lagranges_method(**options: Any) -> LagrangesMethod:
@@ -151,18 +136,6 @@ def test_lagranges_method_has_equal_equations_of_motion() -> None:
     assert system.defaults == (1.5, 2.0, 9.81)
     expected = "m*l**2*(q1_dot**2 + q2_dot**2*sin(q1)**2)/2 + m*g*l*cos(q1)"
     assert system == from_text("q1 q2", expected, m=1.5, l=2, g=9.81)
-
-
-def test_lagranges_method_of_a_particle() -> None:
-    frame, origin = ReferenceFrame("N"), Point("O")
-    point = origin.locatenew("P", Q1 * frame.x)
-    origin.set_vel(frame, 0)
-    point.set_vel(frame, Q1.diff(T) * frame.x)
-    particle = Particle("P", point, M)
-    particle.potential_energy = G * Q1**2
-    method = LagrangesMethod(sympy.physics.mechanics.Lagrangian(frame, particle), [Q1])
-    system = LagrangianSystem.from_lagranges_method(method, name="system", parameters={M: 1, G: 1})
-    assert system == from_text("q1", "m*q1_dot**2/2 - g*q1**2", m=1, g=1)
 
 
 def test_constraints_on_velocities_are_not_dropped() -> None:
@@ -290,19 +263,6 @@ def test_invalid_arguments_are_rejected(arguments: tuple[Any, ...], options: dic
         from_sympy(*arguments, **options)
 
 
-def test_invalid_fields_are_rejected() -> None:
-    system = from_text("x", "x_dot**2/2 - k*x", k=1)
-    x = Symbol("x")
-    for changes, message in [
-        ({"name": ""}, "name of a system must be"),
-        ({"coordinates": (x,)}, "not a real symbol"),
-        ({"time": real("s")[0]}, "time is called 't'"),
-        ({"defaults": ()}, "give one value per parameter"),
-    ]:
-        with pytest.raises(SystemDefinitionError, match=message):
-            dataclasses.replace(system, **changes)  # type: ignore[arg-type]  # wrong on purpose
-
-
 @pytest.mark.parametrize(
     "lagrangian",
     [
@@ -317,11 +277,6 @@ def test_invalid_fields_are_rejected() -> None:
 )
 def test_regular_lagrangians_of_all_kinds_are_accepted(lagrangian: str) -> None:
     assert from_text("x y", lagrangian).dimension == 2
-
-
-def test_unused_parameter_is_retained() -> None:
-    with pytest.warns(SystemDefinitionWarning, match="parameter 'spare' does not occur"):
-        assert from_text("x", "x_dot**2", spare=3).parameters == real("spare")
 
 
 def test_large_coupled_mass_matrix_is_accepted() -> None:
