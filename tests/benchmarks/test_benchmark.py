@@ -12,12 +12,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import sympy
-from click.testing import CliRunner
 from mpmath import mp
 
 import benchmarks as bench
 from benchmarks import __main__ as command
-from benchmarks import comparison, digits, report, tables
+from benchmarks import comparison, digits, report
 from benchmarks.cases import unforced
 from benchmarks.cases.adaptive import adaptive_case
 from benchmarks.cases.forced import driven_pendulum
@@ -26,9 +25,8 @@ from benchmarks.cases.rods import rods
 from benchmarks.cases.suites import SUITE_CASES, SUITE_ENDS, suite_case
 from benchmarks.contenders import peers
 from benchmarks.contenders.tracing import rates_text
-from benchmarks.report import FLOOR, Contender, Point, ResultTable, common_error, frontier, time_at
-from benchmarks.tables import drift_row, fitted_rate
-from scvi_codegen import SVI, StateError, SystemDefinitionError, compile_stepper
+from benchmarks.report import FLOOR, Contender, Point, ResultTable, common_error, time_at
+from scvi_codegen import SVI, StateError, compile_stepper
 
 ROOT = Path(bench.__file__).parents[1]
 EXTENDED = np.finfo(np.longdouble).eps < 1e-18
@@ -81,14 +79,6 @@ class TestCases:
         stepper = compile_stepper(chosen.system, "svi:8")
         run = stepper.integrate(chosen.q[0], velocity=chosen.velocity[0], t_end=chosen.span, check_growth=False)
         assert rms_error(run.q[-1:], SUITE_ENDS["heyoka:three-bodies"](chosen, None)) < 4e-9
-
-    def test_unknown_names_are_rejected(self):
-        with pytest.raises(SystemDefinitionError, match=r"did you mean 'duffing'"):
-            unforced.case("dufing")
-        with pytest.raises(StateError, match=r"there is no section 'drif'; did you mean 'drift'\?"):
-            bench.benchmark(["drif"])
-        with pytest.raises(StateError, match="no peer 'heyoca'"):
-            bench.Plan(peers=("heyoca",))
 
     def test_traced_text_computes_the_same(self):
         chosen = unforced.case("outer-solar-system")
@@ -199,16 +189,6 @@ class TestCurves:
         assert time_at(curve, 1e-7) is None
         assert time_at([], 1e-7) is None
 
-    def test_errors_below_the_floor_are_equal(self):
-        curve = points((1.0, 1e-11), (4.0, 1e-15), (5.0, 1e-16))
-        assert [point.seconds for point in frontier(curve)] == [1.0, 4.0]
-        assert time_at(curve, 1e-15) == time_at(curve, FLOOR) == pytest.approx(2.0)
-        assert time_at(points((1.0, 1e-11), (4.0, 0.0)), FLOOR) < 4.0
-
-    def test_slower_and_less_accurate_settings_are_ignored(self):
-        curve = points((1.0, 1e-6), (2.0, 1e-10))
-        assert time_at([*curve, *points((3.0, 1e-7), (1.5, 1e-5), (1.0, math.nan))], 1e-8) == time_at(curve, 1e-8)
-
     def test_common_error_is_reached_by_both_programs(self):
         one, other = points((1.0, 1e-11)), points((1.0, 1e-9), (2.0, 1e-16))
         assert common_error(one, other) == pytest.approx(2e-11)
@@ -254,19 +234,6 @@ class TestReport:
         assert "1 ms by scvi-codegen svi; others over it: heyoka 4, heyoka fast_math 3, scvi-codegen other 2" in line
         assert line.endswith("not reached: broken, CyRK DOP853")
 
-    def test_ratios_require_heyoka(self):
-        result = result_of(measurement("scvi-codegen svi", 1e-3, 1e-12))
-        (row,) = report.rows(result)
-        assert row["default"] is row["best"] is row["peer"] is None
-        assert "-" in result.text()
-
-    def test_table_names_failures_and_skipped_peers(self):
-        text = self.result.text()
-        assert "skipped cyrk: not installed" in text
-        assert "broken h=1: ArithmeticError: no" in text
-        (line,) = (line.split() for line in text.splitlines() if line.startswith("  broken  "))
-        assert line[:3] == ["broken", "failed", "-"]
-
 
 class TestMeasuring:
     def test_rounds_alternate_and_failures_are_recorded(self):
@@ -292,17 +259,6 @@ class TestMeasuring:
         assert order == [*["one"] * 8, "bad", *["two"] * 8, *(["one"] * 8 + ["two"] * 8) * 2]
         assert (good.error, good.repeats, last.repeats) == (0.0, 2, 2)
         assert bad.failure == "ArithmeticError: no"
-
-    def test_ensemble_is_one_run_with_divided_time(self):
-        high = np.arange(8.0)[:, None]
-        final = np.tile(high, (2, 1))
-        ensemble = Contender(
-            method="all", setting="", options="", compile_seconds=0.0, prepare=lambda n: lambda: final, trajectories=16
-        )
-        exact = Reference(positions=high, accuracy=0.0)
-        (found,) = comparison.measure([ensemble], lambda _: exact, repeats=2)
-        assert found.error == 0.0
-        assert found.seconds < 1e-3
 
 
 @needs_extended
@@ -349,42 +305,8 @@ class TestCommand:
         assert json.loads(path.read_text())["interrupted"] == "two"
         assert "done: kept" in found.text()
 
-    def test_each_section_is_saved_when_measured(self, tmp_path, monkeypatch):
-        path, measured = tmp_path / "out.json", []
-
-        def section(name, plan, report_activity):
-            on_disk = json.loads(path.read_text())["tables"] if path.exists() else []
-            measured.append((name, [each["name"] for each in on_disk]))
-            if name == "two" and len(measured) == 2:
-                raise StateError("not yet")
-            return ResultTable(name=name, title="x", columns={"a": ""}, rows=({"a": name},))
-
-        monkeypatch.setattr(bench, "SECTIONS", {name: partial(section, name) for name in ("one", "two", "three")})
-        bench.benchmark(output=str(path))
-        assert measured == [("one", []), ("two", ["one"]), ("three", ["one", "two"])]
-
-
-class TestDrift:
-    def test_slope_of_a_random_walk_is_within_its_error(self):
-        random = np.random.default_rng(5)
-        walks = [fitted_rate(np.cumsum(random.standard_normal(2001))) for _ in range(300)]
-        scores = np.array([derivative / error for derivative, error in walks])
-        assert 0.85 < scores.std() < 1.2
-
-    def test_short_run_conserves_energy(self):
-        assert drift_row(unforced.case("kepler:0.2"), "svi:8", 0.2, 20_000)["largest"] < 1e-12
-
 
 class TestTables:
-    @pytest.mark.rotated
-    def test_start_up_time_is_measured(self):
-        cold, cached = tables.run_first_steps(bench.Plan(repeats=1, quick=True), lambda text: None).rows
-        assert (cold["cache"], cached["cache"]) == ("empty", "filled")
-        assert cached["first_step_s"] < cold["first_step_s"]
-        assert cold["coordinates"] == 2
-        assert cold["lines_of_C"] > 100
-        assert cold["compiler_cpu_s"] > 0.0
-
     @pytest.mark.tiers(0, 3)
     @pytest.mark.parametrize(
         "section", ["scaling", "threads", "by-hand", "transforms", "newton", "derivatives", "builds"]
@@ -406,9 +328,3 @@ class TestCommandLine:
         for line in lines:
             context = command.main.make_context("benchmarks", line.split())
             assert all(bench._sections(name) for name in context.params["sections"])
-
-    @pytest.mark.parametrize("words", [["drif"], ["drift", "--peers", "heyoca"], ["drift", "--plot", "a/b.png"]])
-    def test_errors_are_messages(self, words):
-        failed = CliRunner().invoke(command.main, words)
-        assert (failed.exit_code, failed.stdout) == (2, "")
-        assert "Error: " in failed.stderr

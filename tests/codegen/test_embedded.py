@@ -11,7 +11,7 @@ from commands import output_of
 from notation import lagrange
 from programs import needs
 from samples import sample_named, stepper_for
-from strict_c import STRICT, run, write
+from strict_c import STRICT, run
 
 import scvi_codegen as sc
 from scvi_codegen.codegen.ir.arithmetic import FUNCTIONS
@@ -243,26 +243,6 @@ def test_the_command_line_writes_a_folder_without_python(tmp_path):
         with pytest.raises(sc.PackageError, match="without --embedded"):
             sc.load_package(folder)
     assert 0.0 < np.abs(outputs["single"] - outputs["double"]).max() < 1e-2
-
-
-def test_lanes_are_rejected_by_name():
-    system = sc.problem("kepler").system
-    with pytest.raises(sc.MethodError, match="unavailable with embedded"):
-        sc.generate_source(system, sc.SVI(2), solver="fixed-point", embedded="double")
-    with pytest.raises(sc.MethodError, match="double or single"):
-        sc.generate_source(system, sc.SVI(2), embedded="half")
-    assert "lanes" not in sc.generate_source(system, sc.SVI(2), embedded="double")[0].code
-
-
-@pytest.mark.second
-def test_all_methods_compile_in_either_precision(tmp_path):
-    needs("gcc")
-    methods = {"collocation": sc.SpectralCollocation(2, form="position"), "printed": sc.SCVI(2, variational=False)}
-    for prefix, method in methods.items():
-        for precision in EMBEDDED:
-            source, _ = sc.generate_source(sample_named("cart-pole").system, method, prefix=prefix, embedded=precision)
-            pure = PURE_SINGLE if precision == "single" else ()
-            run(["gcc", *EXACT, *pure, "-c", *write([source], tmp_path)], tmp_path)
 
 
 EVENTS_MAIN = """

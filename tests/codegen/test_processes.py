@@ -15,7 +15,7 @@ from programs import script
 
 from scvi_codegen.codegen.native import announcements, building
 from scvi_codegen.codegen.native.building import PORTABLE_FLAGS
-from scvi_codegen.codegen.native.compilers import _alone, running
+from scvi_codegen.codegen.native.compilers import running
 from scvi_codegen.codegen.rendering.source import Source
 from scvi_codegen.common.errors import BuildError
 
@@ -90,18 +90,6 @@ def test_output_status_and_temporary_files_are_handled(tmp_path):
     with running(["sh", "-c", 'echo "$TMPDIR"; echo no >&2; exit 3', "name"], tmp_path) as process:
         assert process.communicate(timeout=300) == (f"{tmp_path}\n", "no\n")
     assert process.returncode == 3
-
-
-def test_without_a_shell_the_program_starts_directly(tmp_path):
-    command = [sys.executable, "-c", "import os, sys; print(os.environ['TEMP']); sys.exit('no')"]
-    with _alone(command, tmp_path) as process:
-        assert process.communicate(timeout=300) == (f"{tmp_path}\n", "no\n")
-    assert process.returncode == 1
-    with _alone([sys.executable, "-c", "import time; time.sleep(3600)"], tmp_path) as process:
-        pass
-    assert process.returncode is not None
-    with pytest.raises(BuildError, match="'no-such-compiler' does not run"), _alone(["no-such-compiler"], tmp_path):
-        pass
 
 
 MEETING_COMPILER = """#!/bin/sh

@@ -78,25 +78,11 @@ class TestSize:
         answer(0)
         assert (entries_in(folder), sc.cache_info().texts, sc.cache_info().references) == ({0}, 0, 0)
 
-    @pytest.mark.parametrize(
-        ("given", "size"), [("", 2**30), ("0", 0), ("1234", 1234), ("500M", 500 * 2**20), ("1.5 GiB", 3 * 2**29)]
-    )
-    def test_sizes_are_read(self, given, size, monkeypatch):
-        monkeypatch.setenv(cache.SIZE_VARIABLE, given)
-        assert cache.size_limit() == size
-
     @pytest.mark.parametrize("given", ["huge", "-1", "1X", "1e9"])
     def test_invalid_size_is_named(self, given, monkeypatch):
         monkeypatch.setenv(cache.SIZE_VARIABLE, given)
         with pytest.raises(BuildError, match=f"SCVI_CODEGEN_CACHE_SIZE is '{given}': it must be a size"):
             answer(0)
-
-    def test_zero_means_no_limit(self, folder, monkeypatch):
-        monkeypatch.setenv(cache.SIZE_VARIABLE, "0")
-        for number in range(3):
-            answer(number)
-        assert entries_in(folder) == {0, 1, 2}
-        assert "without a limit" in str(sc.cache_info())
 
 
 class TestTrust:
@@ -151,15 +137,6 @@ class TestTrust:
             assert answer(1) == 1.0
             assert not cache.exposed(exposed)
 
-    def test_world_writable_source_is_regenerated(self, folder, monkeypatch):
-        spring()
-        path = max((folder / "texts").glob("*.json"), key=lambda each: each.stat().st_size)  # not the system's key
-        before = path.stat().st_ino
-        path.chmod(0o666)
-        spring()
-        assert path.stat().st_ino != before
-        assert not cache.exposed(path)
-
     def test_cache_is_private_under_a_permissive_umask(self, folder):
         with umask(0):
             spring()
@@ -208,10 +185,6 @@ class TestClearing:
         assert sc.clear_cache() == size > 0
         assert [path.name for path in folder.rglob("*") if path.is_file()] == ["thesis.tex"]
         assert answer(1) == 1.0
-
-    def test_missing_cache_is_empty(self, folder):
-        assert sc.cache_info().size == sc.clear_cache() == 0
-        assert not folder.exists()
 
     def test_remains_of_killed_processes_are_removed_after_an_hour(self, folder):
         for name, age in ((".building-old", 7200), (".building-new", 60), (".removed-old", 7200)):

@@ -215,24 +215,6 @@ def test_one_correction_solves_linear_dissipation_and_gyroscopic_forces():
 
 
 @pytest.mark.second
-def test_damped_steps_equal_those_of_fixed_point_iteration():
-    field = sc.FieldSystem.from_text(
-        "layer",
-        ["u"],
-        {"x": (0, 2.5)},
-        "u_t**2/2 - u_x**2/2 - u**4/4",
-        boundary={"x": (0, "natural")},
-        dissipation="3*u_t**2*x + u_t**4/4",
-    )
-    mesh = field.discretise("spectral-elements", degree=3, elements=8)
-    start, h, ends = {"u": np.sin(np.pi * mesh.points["x"] / 5)}, mesh.largest_step("svi:2") / 8, []
-    for solver in ("fixed-point", "newton"):
-        stepper = sc.compile_stepper(mesh.system, "svi:2", solver=solver, flags=QUICK_FLAGS)
-        ends.append(stepper.integrate(start, h=h, steps=40).q["u"])
-    assert np.abs(ends[0] - ends[1]).max() < 1e-13 < 1e-3 < np.abs(ends[0][-1] - ends[0][0]).max()
-
-
-@pytest.mark.second
 def test_hamiltonians_with_too_many_couplings_are_refused():
     all_pairs = hamilton("all pairs", "q[N]", "sum(i in N, p_q[i]**2/2) + sum(i < j in N, (q[i] - q[j])**4)")
     stepper = sc.compile_stepper(all_pairs, "svi:1", solver="newton", flags=QUICK_FLAGS)

@@ -2,7 +2,6 @@
 
 import importlib.metadata
 import importlib.util
-import platform
 import re
 import tomllib
 from pathlib import Path
@@ -68,17 +67,6 @@ def test_missing_compiler_names_what_to_install(tmp_path, monkeypatch):
 
 
 @pytest.mark.rotated
-def test_output_of_a_failing_compiler_is_quoted(monkeypatch):
-    monkeypatch.setenv("SCVI_CODEGEN_CFLAGS", "-no-such-flag")
-    found = findings(1)
-    assert found["compiler"]["status"] == "ok"
-    assert found["trial"]["status"] == "fails"
-    assert "no-such-flag" in found["trial"]["remedy"]
-    assert "Traceback" not in found["trial"]["remedy"]
-    assert "-no-such-flag" in found["flags"]["result"]
-
-
-@pytest.mark.rotated
 def test_illegal_instructions_end_only_the_trial_process(tmp_path, monkeypatch):
     header = tmp_path / "trap.h"
     header.write_text("__attribute__((constructor)) static void trap(void) { __builtin_trap(); }\n")
@@ -92,16 +80,6 @@ def test_faulty_arithmetic_is_detected(tmp_path, monkeypatch):
     header.write_text("#include <math.h>\n#define sin(x) (0.9 * sin(x))\n")
     monkeypatch.setenv("SCVI_CODEGEN_CFLAGS", f"-O0 -USCVI_LIBMVEC -include {header}")
     assert "violate IEEE 754 arithmetic" in findings(1)["trial"]["remedy"]
-
-
-@pytest.mark.rotated
-def test_steppers_with_and_without_vector_functions_are_distinguished(monkeypatch):
-    monkeypatch.setenv("SCVI_CODEGEN_CFLAGS", "-O1")
-    tuned = findings()["vectors"]["status"]
-    monkeypatch.setenv("SCVI_CODEGEN_CFLAGS", "-O1 -USCVI_LIBMVEC")
-    assert findings()["vectors"]["status"] == "lacks"
-    on_glibc = platform.libc_ver()[0] == "glibc" and platform.machine() == "x86_64"
-    assert tuned == ("ok" if on_glibc else "lacks")
 
 
 @pytest.mark.usefixtures("without_trial")

@@ -3,7 +3,7 @@
 import importlib.util
 import subprocess
 import zipfile
-from ctypes import byref, c_bool, c_char_p, c_double, c_size_t, c_uint32, c_void_p
+from ctypes import byref, c_bool, c_double, c_size_t, c_uint32, c_void_p
 from dataclasses import replace
 from xml.etree import ElementTree
 
@@ -266,34 +266,6 @@ def test_forbidden_calls_are_errors_with_a_reason(fmu):
     one.call("FreeInstance")
 
 
-def test_version_and_start_time(fmu):
-    fmu.library.fmi3GetVersion.restype = c_char_p
-    assert fmu.library.fmi3GetVersion() == b"3.0"
-    for start in (float("inf"), float("nan")):
-        one = Slave(fmu)
-        assert one.start(start) == ERROR
-        assert one.log[-1][2] == "the start time must be finite"
-
-
-def test_failed_instantiation_returns_null(fmu):
-    for given in ({"token": b"another"}, {"events": True}):
-        one = Slave(fmu, **given)
-        assert one.one.value is None
-        assert one.log[-1][0] == ERROR
-
-
-def test_discards_are_logged_if_requested(fmu):
-    one = Slave(fmu, logging=False)
-    assert one.start(0.5, u=float("inf")) == OK
-    assert one.step(0.5, H) == DISCARD
-    assert one.log == []
-    names = (c_char_p * 1)(b"logStatusDiscard")
-    assert one.call("SetDebugLogging", c_bool(True), c_size_t(1), names) == OK
-    assert one.step(0.5, H) == DISCARD
-    assert len(one.log) == 1
-    assert one.call("SetDebugLogging", c_bool(True), c_size_t(1), (c_char_p * 1)(b"all")) == ERROR
-
-
 def test_initial_states_far_off_their_constraints_are_rejected(tmp_path):
     fmu = Fmu(sc.generate_fmu(rod(), tmp_path / "rod.fmu"), tmp_path / "unpacked")
     near, far = Slave(fmu), Slave(fmu)
@@ -334,13 +306,6 @@ def test_model_with_initial_momenta_starts_with_them(tmp_path):
     assert one.set(q_dot=1.0) == ERROR
     assert one.start(0.5, p_q=3.0) == OK
     assert one.get("q_dot") == [2.0]
-
-
-def test_names_are_made_unique(tmp_path):
-    system = lagrange("names", "q", "energy*q_dot**2/2 - p_q*q**2/2", energy=1.0, p_q=2.0, energy_=0.0)
-    model = sc.Model(system=system, method="svi:2", q=(1.0,), velocity=(0.0,), h=0.1, steps=1)
-    names = list(Fmu(sc.generate_fmu(model, tmp_path / "names.fmu"), tmp_path / "unpacked").variables)
-    assert len(set(names)) == len(names) == 8
 
 
 @pytest.mark.rotated

@@ -85,21 +85,6 @@ def test_errors_are_entries_of_the_document(words, status, error):
     assert all(type(found[name]) is type(value) for name, value in error.items())
 
 
-@pytest.mark.second
-def test_json_of_ensembles_with_unequal_steps():
-    """Bodies that fall to the centre in pi/sqrt(8) r**1.5."""
-    Path("grid.toml").write_text("[grid]\nq1 = [2.0, 1.0, 3.0]\n")
-    falling = ("kepler", "--velocity", "0,0", "--step", "0.05", "--steps", "80", "--method", "svi:4")
-    found = json_of("run", *falling, "--ensemble", "grid.toml")
-    stepper = sc.compile_stepper(sc.problem("kepler").system, "svi:4")
-    with pytest.raises(sc.StepFailedError) as failed:
-        stepper.integrate([1.0, 0.0], velocity=[0.0, 0.0], h=0.05, steps=80)
-    assert found["steps"] == {"least": failed.value.trajectory.steps, "most": 80}
-    assert found["steps"]["least"] == math.floor(math.pi / 8**0.5 / 0.05)
-    assert found["statuses"]["ok"] == 1
-    assert found["energy"] == pytest.approx([-1 / 2, -1.0, -1 / 3], rel=1e-15)
-
-
 def test_json_of_lists_and_model_files():
     listed = json_of("systems")["systems"]
     assert [entry["name"] for entry in listed] == list(sc.PROBLEMS)

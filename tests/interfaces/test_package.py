@@ -144,15 +144,6 @@ def test_every_kind_of_folder_is_built_without_a_warning(words, tmp_path):
     assert (result.returncode, result.stderr) == (0, "")
 
 
-@pytest.mark.rotated
-def test_user_names_do_not_occur_in_the_program(tmp_path):
-    base = model_of("planar-pendulum", method=sc.SVI(1))
-    model = replace(base, system=replace(base.system, name='*/ #error " ? \\\n """ evil'))
-    folder = sc.generate_package(model, tmp_path / "pendulum_svi")
-    assert printed_by(folder)
-    subprocess.run([sys.executable, "-c", "import pendulum_svi"], cwd=tmp_path, check=True)
-
-
 @pytest.mark.tiers(1, 2)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", ["main.c", "pendulum_svi.c", "__init__.py", "README.md", "interface.json"])
@@ -197,18 +188,6 @@ def test_methods_without_text_form_are_generated_without_a_model_file(pendulum, 
     folder = sc.generate_package(replace(pendulum, method=sc.SVI(1, own)), tmp_path / "own")
     assert not (folder / "model.toml").exists()
     assert sc.load_package(folder).dimension == 1
-
-
-def test_files_of_an_older_integrator_are_removed(pendulum, tmp_path):
-    folder = sc.generate_package(pendulum, tmp_path / "pendulum_svi")
-    (folder / "certificate.json").write_text("{}")
-    (folder / "notes.txt").write_text("mine")
-    sc.generate_package(pendulum, folder)  # the same code: what was measured of it holds
-    assert (folder / "certificate.json").exists()
-    sc.generate_package(replace(pendulum, method=sc.SVI(2)), folder, embedded="double")
-    assert not (folder / "certificate.json").exists()
-    assert not (folder / "__init__.py").exists()
-    assert (folder / "notes.txt").read_text() == "mine"
 
 
 def test_velocities_without_momenta_are_rejected(tmp_path):

@@ -131,19 +131,6 @@ def test_exported_outer_solar_system_has_the_trajectory_in_rebound():
     assert np.abs(run.q[-1] - positions(simulation)).max() < 1e-12 * np.abs(run.q).max()
 
 
-def test_energies_agree_in_two_axes_and_by_other_names(rebound):
-    pair = sc.LagrangianSystem.from_text(
-        name="pair",
-        coordinates=["a", "b", "c", "d"],
-        lagrangian="M*(a_dot**2 + b_dot**2)/2 + (c_dot**2 + d_dot**2)/4 + k*M/sqrt((a - c)**2 + (b - d)**2)",
-        parameters={"M": 2.0, "k": 0.75},
-    )
-    simulation = sc.to_rebound(pair, [0.0, 0.5, 1.0, 0.0], velocity=[0.0, 0.0, 0.2, 1.0])
-    assert [particle.m for particle in simulation.particles] == pytest.approx([2.0, 0.5], rel=1e-13)
-    assert pytest.approx(1.5, rel=1e-12) == simulation.G
-    assert simulation.energy() == pytest.approx(0.25 * (0.04 + 1.0) - 1.5 / 1.25**0.5, rel=1e-12)
-
-
 ODDITIES = {
     "softening": lambda made: setattr(made, "softening", 0.1),
     "collision": lambda made: setattr(made, "collision", "direct"),

@@ -90,20 +90,6 @@ def test_mistakes_in_a_picture_are_errors(old, new, message):
         parse_model(CART.replace(old, new))
 
 
-def test_a_family_of_points_is_listed_by_its_name():
-    text = CART.replace('points.cart = ["x", 0]', 'points."cart[k in 3]" = ["x + k*pi", "k"]')
-    model = parse_model(
-        text.replace('rods = [["cart", "bob"]]', 'rods = [["cart", "bob"]]\ntrails = ["cart[2]"]').replace(
-            '["end", "cart"]', '["end", "cart[0]"]'
-        )
-    )
-    shape = shape_of_picture(drawn_system_of_model(model), model.picture)
-    assert [mark["points"] for mark in shape.marks if mark["kind"] in ("rod", "spring")] == [[3, 4, 5, 6], [2, 3]]
-    assert shape.trails == [5]
-    state = shape.positions(0.0, np.array([[0.1, 0.5]]), np.zeros((1, 2)), [9.81, 2.0, 1.5])[0]
-    assert np.allclose(state[3:6], [[0.1, 0], [0.1 + np.pi, 1], [0.1 + 2 * np.pi, 2]])
-
-
 def test_pictures_of_arrays_and_rotations_use_entries():
     chain = lagrange("chain", "q[N]", "sum(i in N, q_dot[i]**2/2)-sum(i in 0..N-2, (q[i+1]-q[i])**2)")
     model = sc.Model(system=chain, method="svi:2", q={"q": np.arange(4.0)}, h=0.1, steps=1)

@@ -8,7 +8,7 @@ import pytest
 import scvi_codegen as sc
 from scvi_codegen.paper import correction
 from scvi_codegen.paper.catalogue import EXPERIMENTS
-from scvi_codegen.paper.experiment import Verdict, draw, largest_in_bins, statement
+from scvi_codegen.paper.experiment import Verdict, draw, statement
 from scvi_codegen.paper.runs import (
     KEPLER,
     SETTINGS,
@@ -134,13 +134,6 @@ def test_verdicts_follow_from_conditions(conditions, verdict):
     assert found.measured.endswith("; last t: 100.0 (SC). Note.")
 
 
-@pytest.mark.second
-def test_a_missing_quantity_satisfies_no_condition():
-    runs = {"sc2": SETTINGS["kepler-two-points"].run("sc2")}
-    assert runs["sc2"].last_revolution is None
-    assert compared("", "last_revolution: sc2 < 1, 1 < sc2", runs).verdict is Verdict.FAILS
-
-
 STRUCTURE = {(2, 2): (0.0, 0.0), (3, 2): (4.6e-2, -2.3e-2), (5, 4): (6.6e-4, 6.7e-5), (9, 7): (1.0e-7, -1.2e-9)}
 """(points, Gauss points) -> (defect, change of momentum) of the printed step."""
 
@@ -171,9 +164,3 @@ def test_the_correction_distinguishes_the_printed_form_from_the_full_one():
     assert draw(pickle.loads(pickle.dumps(found)).picture, "svg").startswith(b"<?xml")
     printed, *_ = EXPERIMENTS["figure-29"].result({}).checks
     assert printed.verdict is Verdict.FAILS
-
-
-def test_the_last_bin_of_an_error_contains_the_remainder():
-    t, largest = largest_in_bins(np.arange(11.0), [0, 1, 0, 0, 0, 0, -2, 0, 0, 0, 3], bins=2)
-    assert (t.tolist(), largest.tolist()) == ([0.0, 5.0], [1.0, 3.0])
-    assert largest_in_bins([0.0, 1.0], [1.0, 2.0], bins=600)[1].tolist() == [1.0, 2.0]

@@ -103,20 +103,6 @@ def test_entries_removed_during_loading_are_rebuilt(folder, rounds):
     assert results == [("".join(f"{number}.0\n" for number in order), "") for order in numbers]
 
 
-def test_removed_entry_is_rebuilt(folder, monkeypatch):
-    load, removed = building._open, []
-
-    def disturbed(entry: Path) -> object:
-        if not removed:
-            removed.append(entry)
-            cache.discard(entry)
-        return load(entry)
-
-    monkeypatch.setattr(building, "_open", disturbed)
-    assert building.load(source(1), flags=FAST).lib.answer_1() == 1.0
-    assert removed == list(folder.glob("_scvi_*"))
-
-
 SLOW_COMPILER = """#!/bin/sh
 touch "$COMPILING"
 sleep "$SECONDS_TO_WAIT"
@@ -192,11 +178,6 @@ def test_copies_of_steppers_runs_and_trajectories_are_equal(kepler, duplicate, t
     np.testing.assert_array_equal(duplicate(trajectory).energy(), trajectory.energy())
     recorded: RecordedRun = duplicate(record_run(kepler.start(*STATE, h=0.05), tmp_path / "a.run", steps=10))
     np.testing.assert_array_equal(recorded.q[:], trajectory.q)
-
-
-def test_threads_share_a_stepper(kepler, finals):
-    with ThreadPoolExecutor(8) as pool:
-        assert list(pool.map(lambda p: final(kepler, p), MOMENTA)) == finals
 
 
 def test_threads_compile_each_text_once(folder, monkeypatch):

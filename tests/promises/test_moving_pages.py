@@ -119,28 +119,6 @@ def test_a_link_reproduces_the_bits_after_reversal_and_a_change_of_parameters(vi
     assert {key: again[key] for key in ("t", "q", "p")} == {key: state[key] for key in ("t", "q", "p")}
 
 
-@pytest.mark.quick
-def test_a_link_reproduces_the_inputs_of_each_step_through_impacts(view, tmp_path):
-    pytest.importorskip("ziglang", reason="pages are compiled by the extra compiler")
-    system = sc.LagrangianSystem.from_text("ball", ["y"], lagrangian="y_dot**2/2 - y", inputs=["F"], forces={"y": "F"})
-    path, wall = tmp_path / "ball.html", sc.impact("y", restitution=0.9)
-    sc.page(system, q=[1.0], velocity=[0.0], h=0.1, events=[wall], method="svi:2", ranges={"F": (-2, 2)}).save(path)
-    opened(view, path, "#.n=17", 17)
-    view.fill("input[aria-label='F, value']", "-0.5")
-    view.keyboard.press("Enter")
-    view.evaluate("page.advance(30)")
-    view.keyboard.press("Tab")
-    state, address = view.evaluate("[page.state(), page.address()]")
-    assert address == "#.n=17,F:-0.5,30"
-    assert 0 <= state["q"][0] < 1
-    again = opened(view, path, address, 47)
-    assert {key: again[key] for key in ("t", "q", "p")} == {key: state[key] for key in ("t", "q", "p")}
-    opened(view, path, "#F=2.5")
-    view.wait_for_timeout(100)
-    assert "F must be between -2 and 2; the address has 2.5" in view.inner_text("#fault")
-    assert view.messages == []
-
-
 def test_bodies_are_dragged_by_mouse_and_touch(view, pages):
     view.add_init_script(
         "performance.now = () => 0"
@@ -180,22 +158,6 @@ def test_plots_are_those_given_and_offer_all_variables(view, pages, name, shown,
     chosen = view.evaluate("[...document.querySelectorAll('.choices select')].map((s) => s.selectedOptions[0].text)")
     assert chosen == shown
     assert view.evaluate("document.querySelector('.choices select').length") == count
-
-
-def test_keys_play_step_and_restart(view, pages):
-    opened(view, pages["figure_eight"], "#.n=7", 7)
-    view.keyboard.press("ArrowRight")
-    assert view.evaluate("page.state().steps") == 8
-    view.keyboard.press(" ")
-    state_when(view, lambda state: state["steps"] > 9)
-    view.keyboard.press("r")
-    assert view.evaluate("page.state().steps") < 8
-    view.focus("#play")
-    view.keyboard.press(" ")
-    stopped = view.evaluate("page.state().steps")
-    view.wait_for_timeout(150)
-    assert view.evaluate("page.state().steps") == stopped
-    assert view.inner_text("#play") == "Play"
 
 
 @pytest.mark.quick
@@ -268,13 +230,6 @@ def test_a_page_fits_the_screen_is_readable_and_named(browser, pages, width):
             !(each.getAttribute('aria-label') || each.textContent.trim() || each.labels?.length)).length"""
         assert page.evaluate(unnamed) == 0
         page.close()
-
-
-def test_steps_of_a_link_are_spread_over_frames(view, pages):
-    """The page shows progress, instead of blocking the browser for the seconds that the steps take."""
-    opened(view, pages["kinks"], "#.n=100000")
-    assert view.evaluate("page.state().steps") < 100000
-    assert "steps to go" in view.inner_text("#clock")
 
 
 def test_the_form_writes_a_model_file_that_is_read(view, tmp_path):

@@ -146,15 +146,6 @@ def test_actions_of_constraints_forces_damping_and_ensembles(stepper):
     assert runs.action(cumulative=True).shape == (21, 2)
 
 
-def test_actions_of_trajectories_that_reach_no_output_time_are_none(stepper):
-    """The second fails before the only output time, after the first step."""
-    q, p = np.array([START[:2], [0.0, 9.0]]), np.array([START[2:], [0.3, 0.1]])
-    runs = stepper.integrate_ensemble(q, p, t_end=4.0, t_eval=[4.0], action=True)
-    assert runs.ok.tolist() == [True, False]
-    assert np.isfinite(runs.action()[0])
-    assert np.isnan(runs.action()[1])
-
-
 @pytest.mark.quick
 def test_sums_are_compensated():
     terms = np.concatenate([[1.0], np.full(10_000, 1e-17)])

@@ -23,8 +23,6 @@ LATTICES = {
     "held plane": "sum(i in NX periodic, j in 0..NY-2, k*((q[i+1, j] - q[i, j])**2 + (q[i, j+1] - q[i, j])**2)/2)"
     "+ sum(i in NX, k*(q[i, 0]**2 + q[i, NY-1]**2)/2 + q[i, 1]**4)",
 }
-COUNTS = [("ring to the fourth", 1000, 5), ("chain", 1000, 40), ("beam", 500, 30), ("held plane", (32, 30), 110)]
-"""Sizes, products a step."""
 
 
 @pytest.fixture(autouse=True)
@@ -94,14 +92,6 @@ def test_each_array_has_its_circulant_preconditioner():
     assert products_of(stepper, start, 1.0) <= 3
 
 
-@pytest.mark.tiers(0, 1)
-@pytest.mark.sampled(2)
-@pytest.mark.parametrize(("name", "shape", "most"), COUNTS)
-def test_boundaries_and_amplitudes_need_few_products(name, shape, most):
-    """The diagonal alone gives all of these up."""
-    assert products_of(stepper_of(name), smooth(shape), 1.0, steps=3, parameters={"k": 1e4}) <= 3 * most
-
-
 @pytest.mark.rotated
 @pytest.mark.sampled(3)
 @pytest.mark.covering
@@ -129,16 +119,6 @@ def test_corrections_are_accurate_in_badly_scaled_systems(name):
     run = stepper_of(name).start(smooth(503), h=0.5, parameters={"k": 1e5})
     with pytest.raises(sc.StepFailedError, match="GMRES"):
         run.advance(1)
-
-
-@pytest.mark.full
-def test_results_do_not_depend_on_the_number_of_threads():
-    ends = []
-    for threads in (1, 2, 3):
-        run = stepper_of("held plane").start(smooth((64, 60)), h=0.5, parameters={"k": 1e4}, threads=threads)
-        run.advance(1)
-        ends.append((run.q["q"].tobytes(), run.p["q"].tobytes()))
-    assert ends[0] == ends[1] == ends[2]
 
 
 def test_diagonal_preconditioner_is_used_for_nonuniform_lattices():

@@ -326,22 +326,6 @@ def test_cost_of_the_default_tolerance() -> None:
         assert abs(run.q.mp() - few.mp("q")[-1]).max() < 1e-26
 
 
-def test_dense_output_at_decimal_times() -> None:
-    """States between and at the ends of steps of 1/10, which are no multiples of it in double, are those of the motion.
-
-    x = cos t. The time left to an output time may have one word, the low one.
-    """
-    oscillator = lagrange("oscillator", "x", "x_dot**2/2 - x**2/2")
-    stepper = sc.compile_stepper(oscillator, "svi:12", precision="double-double")
-    run, (times, ends) = stepper.integrate([1], [0], h=0.1, steps=20), (np.linspace(0, 2, 21), [0.1 * 3, 0.3, 0.7, 1.9])
-    with mp.workdps(40):
-        between = stepper.integrate([1], [0], h=0.1, t_end=2.0, t_eval=times).mp("q")[:, 0]
-        for values, at in ((between, times), (run.at(ends)[0].mp()[:, 0], ends)):
-            assert max(abs(x - mp.cos(mp.mpf(float(t)))) for x, t in zip(values, at, strict=True)) < 2e-32
-        for h in (1 / 96, 1 / 3, 0.07):
-            assert abs(stepper.integrate([1], [0], h=h, t_end=2.0).mp("q")[-1][0] - mp.cos(2)) < 2e-31
-
-
 @pytest.mark.second
 def test_every_quantity_has_both_words(tmp_path: Path) -> None:
     """Coordinates, momenta and velocities by name, of runs, in progress, of ensembles, recordings and events."""
@@ -435,33 +419,6 @@ def test_entries() -> None:
     assert not hasattr(x[1] + 1.0, "low")
     with mp.workdps(40):
         assert x[1].mp() == mp.mpf(1) + mp.mpf(3e-20)
-
-
-@pytest.mark.second
-def test_advice() -> None:
-    """Recommended steps have the error asked for at the end, compared with the exact orbit."""
-    with mp.workdps(50):
-        start = {"q": ["0.5", "0"], "velocity": ["0", mp.sqrt(3)]}
-        for method, tolerance, degree in (("svi:12", 1e-18, False), ("svi:12", 1e-26, False), ("svi:8", 1e-24, True)):
-            advice = sc.advise(
-                system("kepler"),
-                method,
-                **start,
-                span=9.3,
-                tolerance=tolerance,
-                degree=degree,
-                precision="double-double",
-            )
-            stepper = sc.compile_stepper(system("kepler"), advice.method, precision="double-double")
-            run = stepper.integrate(**start, h=advice.h, t_end=9.3)
-            exact = exact_orbit(9.3)
-            error = mp.norm([x - y for x, y in zip(run.mp("q")[-1], exact, strict=True)]) / mp.norm(exact)
-            assert tolerance / 1000 < error < tolerance
-            assert not advice.warnings
-            assert len(run) == advice.steps + 1
-            assert degree == (advice.degree > 12)
-    with pytest.raises(MethodError, match="'double' or 'double-double', not 'auto'"):
-        sc.advise(system("kepler"), "svi:4", [1.0, 0.0], [0.0, 1.0], 1.0, 1e-9, precision="auto")
 
 
 @pytest.mark.second

@@ -174,15 +174,6 @@ def test_constraints_hold() -> None:
     assert run.energy_error() < 1e-19
 
 
-@pytest.mark.full
-def test_constraints_hold_for_many_steps() -> None:
-    """The same for 10,000 steps of every mechanism."""
-    for name in ("rod", "rods", "four-bar"):
-        stepper = compiled(name, "svi:8")
-        run = stepper.integrate(*consistent(stepper, name), h=0.125, steps=10_000, save_every=10)
-        assert all(np.abs(values).max() < 1e-30 for values in run.constraint_values())
-
-
 @pytest.mark.parametrize("h", [0.02, 0.001, 1e-5])
 def test_constraints_from_rest_at_zero(h: float) -> None:
     """A four-bar linkage that starts from rest where its angles are 0 moves as with another origin of an angle.
@@ -208,32 +199,6 @@ def test_constraints_from_rest_at_zero(h: float) -> None:
         assert largest(q - moved + [0, 0, 1]) < 2e-31
         assert largest(runs[0].mp("p")[-1] - runs[1].mp("p")[-1]) < 2e-31 / h
     assert all(np.abs(values).max() < 1e-30 / h for values in runs[0].constraint_values())
-
-
-@pytest.mark.second
-def test_rod_and_angle() -> None:
-    """A pendulum as a rod, with adaptive and with fixed steps, agrees with that of an angle."""
-    angle = sc.LagrangianSystem.from_text(name="angle", coordinates=["a"], lagrangian="a_dot**2/2 + cos(a)")
-    exact = sc.compile_stepper(angle, "svi:16", precision="double-double").integrate(
-        ["0.75"], ["0.5"], h=0.0625, steps=32, save_every=32
-    )
-    stepper = sc.compile_stepper(system("rod"), "svi:4", precision="double-double")
-    with mp.workdps(40):
-        a, rate = mp.mpf("0.75"), mp.mpf("0.5")
-        q, v = [mp.sin(a), -mp.cos(a)], [rate * mp.cos(a), rate * mp.sin(a)]
-        end = exact.mp("q")[-1, 0]
-
-        def error(run) -> float:
-            return float(largest([run.mp("q")[-1, 0] - mp.sin(end), run.mp("q")[-1, 1] + mp.cos(end)]))
-
-        errors = [error(stepper.integrate(q, velocity=v, h=2.0 / n, steps=n, save_every=n)) for n in (512, 1024)]
-        assert abs(np.log2(errors[0] / errors[1]) - 8.0) < 0.1
-        assert errors[1] < 1e-27
-        dense = sc.compile_stepper(system("rod"), "svi:12", precision="double-double")
-        assert error(dense.integrate(q, velocity=v, t_end=2.0, tolerance=1e-28)) < 1e-28
-        m = mp.mpf(1.25)
-        force = dense.multipliers(q, p=[m * x for x in v])  # of m v^2 = force on a circle
-        assert abs(force.mp()[0] + m * (rate**2 + mp.cos(a)) / 2) < 1e-30
 
 
 def test_initial_states() -> None:
@@ -287,9 +252,6 @@ def test_constraints_by_multipliers(degree: int) -> None:
             assert max(abs(each).max() for each in runs[0].constraint_values()) < 5e-31
 
 
-STIFF = "(1 + b**2)*a_dot**2/2 + b_dot**2/2 - 5000*a**2 - b**2"
-
-
 @pytest.mark.tiers(0, 0)
 @pytest.mark.parametrize("degree", [3, *(pytest.param(s, marks=pytest.mark.second) for s in (9, 18))])
 def test_velocities_by_iteration(degree: int) -> None:
@@ -311,18 +273,6 @@ def test_velocities_by_iteration(degree: int) -> None:
             assert runs[0].fallback_steps == 0
             for name in ("q", "p", "t"):
                 assert abs(runs[0].mp(name) - runs[1].mp(name)).max() < 1e-30
-
-
-def test_newton_after_the_iteration() -> None:
-    """Steps whose iteration fails are those of Newton's method, in two words."""
-    stiff = sc.LagrangianSystem.from_text(name="stiff", coordinates=["a", "b"], lagrangian=STIFF)
-    one, other = (
-        sc.compile_stepper(stiff, "svi:3", solver=solver, precision="double-double") for solver in ("auto", "newton")
-    )
-    runs = [stepper.integrate([0.001, 0.5], velocity=[0.01, 0.25], h=0.125, steps=4) for stepper in (one, other)]
-    assert runs[0].fallback_steps == 4
-    for name in ("q", "p"):
-        assert abs(runs[0].mp(name) - runs[1].mp(name)).max() < 1e-30
 
 
 def test_light_axis_of_a_body_costs_few_steps():

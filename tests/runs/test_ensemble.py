@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 import re
 import signal
 import threading
@@ -272,18 +271,6 @@ def test_ensembles_with_few_or_no_steps() -> None:
     assert still.energy().shape == (1, COUNT)
 
 
-def test_rows_after_the_end_of_all_trajectories_keep_their_times() -> None:
-    """Impacts that accumulate end each trajectory before t_end, with NaN after its end."""
-    ball = sc.LagrangianSystem.from_text(name="ball", coordinates=["y"], lagrangian="y_dot**2/2 - y")
-    bouncing = sc.compile_stepper(ball, "svi:2", events=sc.impact("y", restitution="0.5"))
-    with pytest.warns(sc.EventWarning, match="accumulate"):
-        runs = bouncing.integrate_ensemble([[0.1], [0.2]], [[0.0], [0.0]], h=0.1, t_end=3.0)
-    assert_allclose(runs.t, np.arange(31) / 10, atol=1e-15)
-    assert runs.q.shape == (31, 2, 1)
-    assert np.isnan(runs.q[-1]).all()
-    assert (runs.ends[0] < 2.0).all()
-
-
 def test_rows_in_transformed_time_keep_their_tau() -> None:
     """Each trajectory reaches t_end within a step of its own; those that leave x > 0 fail, one in its first step."""
     system = sc.LagrangianSystem.from_text(name="root", coordinates=["x"], lagrangian="x_dot**2/2 - x**(5/2)")
@@ -320,22 +307,6 @@ def test_ends_with_output_times_are_those_of_terminal_events(t_eval: list[float]
     assert runs.ends[0][0] == pytest.approx(np.arccos(0.5), rel=1e-12)
     stopped = stepper.integrate_ensemble(**start | {"t_end": [0.3, 5.0]}, t_eval=[0.5, 5.0])
     assert np.isnan(stopped.ends[0]).tolist() == [True, False]
-
-
-@pytest.mark.second
-def test_results_have_target_times_and_are_pickled() -> None:
-    runs = CASES["adaptive"].run()
-    assert [plan.t_end for plan in runs.plans] == ENDS
-    assert runs.h is None
-    times, q, _ = runs.ends
-    assert times.tolist() == ENDS
-    assert np.array_equal(q[2], list(runs.each())[2][1][-1])
-    driven = CASES["inputs"].run()
-    assert np.array_equal(pickle.loads(pickle.dumps(driven)).energy(), driven.energy())
-    stepper = stepper_for("kepler", sc.SVI(5))
-    again, start = pickle.loads(pickle.dumps(stepper)), states("kepler", 9)
-    first, second = (each.integrate_ensemble(*start, h=0.05, steps=20) for each in (stepper, again))
-    assert np.array_equal(first.q, second.q)
 
 
 @pytest.fixture(scope="module")
@@ -432,18 +403,6 @@ class TestThreadsAndInterruption:
         result = work.result()
         assert set(result.status) == {"interrupted"}
         assert 0 < result.steps.max() < 10**9
-
-    def test_interrupted_adaptive_runs_return_completed_states(self) -> None:
-        q, p = states("eccentric", 4)
-        work = ensemble_runs(stepper_of("eccentric", sc.SVI(4)), q, p, t_end=[5.0, 5.0, 5.0, 1e7], tolerance=1e-10)
-
-        def interrupt(done: int) -> None:
-            if done:
-                raise KeyboardInterrupt
-
-        with pytest.raises(KeyboardInterrupt):
-            work.run(progress=interrupt, threads=1)
-        assert work.result().status.tolist()[::3] == ["ok", "interrupted"]
 
 
 class TestFiles:

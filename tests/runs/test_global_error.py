@@ -364,31 +364,9 @@ class TestEnsembles:
         assert np.isnan([runs.global_error[1], runs.confirmed_until[1]]).all()
         assert runs.confirmed_digits[1] == 0
 
-    def test_inputs_of_each_trajectory(self):
-        system = lagrange("pushed", "x", "x_dot**2/2 - x**2/2", inputs="u", c=0.2, forces={"x": "u - c*x_dot"})
-        stepper, t = sc.compile_stepper(system, "svi:4"), np.array([0.0, 1.0, 2.5, 6.0])
-        values = np.array([[0.0, 1.0, -1.0, 0.0], [1.0, 0.0, 0.5, 2.0]])
-        common = {"t_end": 6.0, "error": 1e-8}
-        start = [[1.0], [0.5]], [[0.0], [0.2]]
-        runs = stepper.integrate_ensemble(*start, inputs={"u": (t, values)}, parameters={"c": [0.1, 0.3]}, **common)
-        for j, (times, q, *_) in enumerate(runs.each()):
-            given = {"inputs": {"u": (t, values[j])}, "parameters": {"c": [0.1, 0.3][j]}}
-            run = stepper.integrate(start[0][j], start[1][j], **given, **common)
-            assert np.array_equal(times, run.t)
-            assert np.array_equal(q, run.q)
-            assert runs.global_error[j] == run.global_error <= 1e-8
-
 
 @pytest.mark.second
 class TestOtherRuns:
-    @pytest.mark.quick
-    def test_without_error_argument_nothing_is_confirmed(self, kepler_stepper):
-        run = kepler_stepper.integrate([1.6, 0.0], [0.0, 0.5], t_end=1.0)
-        assert run.confirmation is None
-        assert run.confirmed_digits is None
-        assert math.isnan(run.global_error)
-        assert math.isnan(run.confirmed_until)
-
     def test_saved_states_and_events_are_confirmed(self, kepler_stepper):
         start = {"q": [1.6, 0.0], "p": [0.0, 0.5]}
         at = kepler_stepper.integrate(**start, t_end=50.0, error=1e-9, t_eval=[10.0, 30.0])
@@ -444,18 +422,6 @@ class TestOtherRuns:
         with pytest.raises(sc.StateError, match="observe"):
             stepper.integrate(start, t_end=12.0, observe=lambda run: run.energy, error=1e-9)
 
-    def test_chaotic_arrays_warn(self):
-        system = lagrange(
-            "pendulums", "q[N]", "sum(i in N, q_dot[i]**2/2 + cos(q[i])) + sum(i in N - 1, cos(q[i] - q[i + 1]))"
-        )
-        stepper = sc.compile_stepper(system, "svi:8")
-        for more in ({}, {"save_every": 5}):
-            with pytest.warns(sc.AccuracyWarning, match="amplifies errors"):
-                stepper.integrate([2.5, -1.0, 1.0], [0.5, 1.5, -0.3], t_end=300.0, **more)
-        with warnings.catch_warnings(action="error"):
-            stepper.integrate([2.5, -1.0, 1.0], [0.5, 1.5, -0.3], t_end=300.0, check_growth=False)
-            stepper.integrate([0.2, 0.1, 0.0], [0.0, 0.0, 0.0], t_end=100.0)
-
 
 class TestSolveMotion:
     def test_unconfirmed_result_is_not_a_success(self, burrau_stepper):
@@ -508,44 +474,11 @@ class TestCommandLine:
         path.write_text(f'[system]\ncatalogue = "kepler"\n[run]\nspan = 20.0\n{run}\n')
         assert message in error_of("run", path, *words)
 
-    @pytest.mark.second
-    @pytest.mark.parametrize("controller", ["symplectic", "reversible"])
-    def test_error_and_time_transformation_can_be_combined(self, tmp_path, controller):
-        """In a file and by an option; the printed run is the confirmed one."""
-        path = self._kepler(tmp_path)
-        words = ["--time-transformation", "frequency", "--controller", controller, "-o", str(tmp_path / "k.npz")]
-        document = json_of("run", path, *words)
-        found, saved = document["global_error"], loaded(tmp_path / "k.npz")
-        exact = on_an_ellipse(saved["q"][0], saved["p"][0], saved["t"])
-        size = np.linalg.norm(saved["q"], axis=1).max()
-        assert found["h"] > 0.0
-        assert found["confirmed"]
-        assert np.linalg.norm(exact[:, :2] - saved["q"], axis=1).max() / size <= found["estimate"] <= 1e-9
-        motion = sc.solve_ivp(
-            sc.problem("kepler").system,
-            (0.0, 20.0),
-            np.concatenate([saved["q"][0], saved["p"][0]]),
-            error=1e-9,
-            time_transformation="frequency",
-            controller=controller,
-        )
-        assert motion.success
-        assert np.array_equal(motion.t, saved["t"])
-
-    def test_generated_folders_contain_the_error_argument(self, tmp_path):
-        model = sc.load_model(self._kepler(tmp_path))
-        folder = sc.generate_package(model, tmp_path / "orbit")
-        assert sc.load_model(folder / "model.toml").error == 1e-9
-
     @staticmethod
     def _kepler(folder):
         path = folder / "kepler.toml"
         path.write_text('[system]\ncatalogue = "kepler"\n[run]\nspan = 20.0\nerror = 1e-9\n')
         return path
-
-    @pytest.mark.parametrize("other", ["--tolerance", "--advise"])
-    def test_step_size_arguments_are_exclusive(self, other):
-        assert "exclude each other" in error_of("run", "kepler", "--error", "1e-9", other, "1e-9")
 
 
 @pytest.mark.parametrize("power", [-660, 660])

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from commands import error_of, output_of
 from programs import needs
-from recorded_runs import H, assert_same, digests, recorded, start
+from recorded_runs import H, digests, recorded, start
 
 import scvi_codegen as sc
 from scvi_codegen.runs.recording import load_run
@@ -154,21 +154,6 @@ def test_unwritable_folder_is_reported_before_the_run(kepler, tmp_path):
             folder.chmod(0o755)
     assert "'a.run' cannot be written: Permission denied. It contains the run up to step 100 (t = 5)" in stderr
     assert digests("a.run") == before
-
-
-@pytest.mark.second
-def test_failed_step_saves_the_preceding_states(compiled):
-    stepper = compiled("runaway", sc.SVI(4))
-    run = stepper.start([1.0], [1.0], h=0.05)
-    with pytest.raises(sc.StepFailedError) as error:
-        sc.record_run(run, "a.run", steps=1000, rows=8)
-    with pytest.raises(sc.StepFailedError) as whole:
-        stepper.integrate([1.0], [1.0], h=0.05, steps=1000)
-    assert_same(load_run("a.run"), whole.value.trajectory)
-    assert load_run("a.run").steps == error.value.step == whole.value.step
-    with pytest.raises(sc.StepFailedError):
-        sc.resume_run("a.run")
-    assert_same(load_run("a.run"), whole.value.trajectory)
 
 
 class TestCommandLine:

@@ -177,19 +177,6 @@ def test_ensemble_states_are_within_a_rounding_of_exact_sums(name: str) -> None:
             assert abs(exact(*(q * MASSES)) - begun_at - first * 64 * k * Fraction(H)) <= most_q * 1.01
 
 
-@pytest.mark.tiers(0, 1)
-@pytest.mark.parametrize("name", ["rattle", "lobatto"])
-def test_constraints_hold_for_the_sum_of_high_and_low_words(name: str) -> None:
-    """A thousandth of the state as its low word: that sum, and not the high word, meets the constraint after a step."""
-    own = Begun(name)
-    long = tuple(np.cos(np.arange(4)) / 1024 for _ in range(2))
-    own.run._resume_at(0, (own.run.t, 0.0), long)
-    own.run.advance(1)
-    q, _, low, _ = own.words()
-    x, y, _, w = q + low
-    assert abs((x - y) ** 2 + w**2 - 1) < 1e-14
-
-
 @pytest.mark.second
 @pytest.mark.parametrize("lengths", ["tolerance", "inputs"])
 def test_times_are_sums_of_all_steps(lengths: str) -> None:

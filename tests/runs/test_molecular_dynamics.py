@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from notation import lagrange
 
 import scvi_codegen as sc
 
@@ -101,17 +100,6 @@ def test_observers_are_the_functions_of_trajectories() -> None:
     assert observed[:, 0] == pytest.approx(sc.temperature(run), rel=1e-14)
     assert observed[:, 1] == pytest.approx(sc.pressure(run, BOX), rel=1e-12)
     assert observed[:, 2:].mean(axis=0) == pytest.approx(sc.radial_distribution(run, BOX, largest=2.0, bins=5)[1])
-
-
-def test_free_particles_are_an_ideal_gas() -> None:
-    line = lagrange("line", "q[N]", "sum(i in N, q_dot[i]**2/2) + L/L", L=2.0)
-    generator = np.random.default_rng(8)
-    start = {"q": generator.uniform(size=400) * 2}
-    run = sc.compile_stepper(line, "svi:2").integrate(
-        start, velocity={"q": generator.normal(size=400)}, h=1.0, steps=40
-    )
-    assert sc.pressure(run, "L")[-1] == pytest.approx(399 * sc.temperature(run)[-1] / 2.0, rel=1e-9)
-    assert sc.radial_distribution(run, "L", bins=4)[1] == pytest.approx(np.ones(4), rel=0.02)
 
 
 @pytest.mark.second

@@ -5,7 +5,6 @@ from __future__ import annotations
 import subprocess
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ from programs import needs
 
 import scvi_codegen as sc
 from scvi_codegen.codegen.native.compilers import find_compiler
-from scvi_codegen.codegen.rendering.source import _check_lengths
 from scvi_codegen.interfaces.models.packages.package import generate_package
 
 SQUARE = "sum(a in 3, wrap(r[i, a] - r[j, a], box)**2)"
@@ -315,20 +313,3 @@ steps = 3
         (tmp_path / "model.toml").write_text(text.replace("3.9", length))
         with pytest.raises(sc.StateError, match=message) if message else nullcontext():
             generate_package(sc.load_model(tmp_path / "model.toml"), tmp_path / "generated_gas")
-
-
-@pytest.mark.parametrize(
-    "lengths",
-    [
-        [("near", "skin", "0.5"), ("near", "cutoff", "1")],
-        [("near", "cutoff", "1"), ("far", "box", "9")],
-        [("near", "cutoff", "1"), ("near", "radius", "1")],
-        [("near", "cutoff", "r")],
-    ],
-    ids=["a skin before the cutoff", "no cutoff", "an unknown length", "an unknown parameter"],
-)
-def test_lengths_of_an_interface_are_those_of_lists_with_a_cutoff(lengths: list[tuple[str, str, str]]) -> None:
-    interface = stepper().interface
-    _check_lengths(replace(interface, lengths=(("near", "cutoff", "1"), ("near", "skin", "0.5"))))
-    with pytest.raises(ValueError, match="lengths"):
-        _check_lengths(replace(interface, lengths=tuple(lengths)))

@@ -1,6 +1,5 @@
 """Trajectories of SymPy's mechanics agree with SymPy's own equations; missing parts are named."""
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -203,36 +202,6 @@ def test_missing_parts_are_named(method: Any, message: str) -> None:
         taken(method())
 
 
-def test_masses_that_depend_on_coordinates_and_unknown_velocities_are_rejected() -> None:
-    method = kanes_method(Q1)
-    method.bodies[0].mass = M * Q1
-    with pytest.raises(SystemDefinitionError, match="mass or an inertia depends on a coordinate"):
-        taken(method)
-    method.bodies[0].mass = M
-    method.bodies[0].masscenter = Point("lost")
-    with pytest.raises(SystemDefinitionError, match=r"SymPy cannot determine .*lost"):
-        taken(method)
-
-
-def test_loads_of_lagranges_method_need_a_frame() -> None:
-    with pytest.raises(SystemDefinitionError, match="method must be a LagrangesMethod"):
-        LagrangianSystem.from_lagranges_method(kanes_method(Q1), name="another")
-    frame, point = ReferenceFrame("N"), Point("P")
-    point.set_vel(frame, Q1.diff(T) * frame.x)
-    options = {"forcelist": [(point, -C * Q1.diff(T) * frame.x)]}
-    energy = M * Q1.diff(T) ** 2 / 2
-    found = LagrangianSystem.from_lagranges_method(
-        LagrangesMethod(energy, [Q1], frame=frame, **options), name="taken", parameters=NAMED
-    )
-    assert found == text("q1", "m*q1_dot**2/2", forces={"q1": "-c*q1_dot"})
-    unnamed = LagrangianSystem.from_lagranges_method(
-        LagrangesMethod(energy, [Q1], frame=frame, **options), parameters=NAMED
-    )
-    assert unnamed == replace(found, name="mechanism")
-    with pytest.raises(SystemDefinitionError, match="no inertial frame"):
-        LagrangianSystem.from_lagranges_method(LagrangesMethod(energy, [Q1], **options), name="taken", parameters=NAMED)
-
-
 X, Y, Z, A = sympy.symbols("x y z a", real=True)
 DISTANCE = (sympy.sin(X) + A * sympy.sin(Y)) ** 2 + (2 - sympy.cos(X) - A * sympy.cos(Y)) ** 2
 
@@ -256,10 +225,3 @@ def test_potentials_are_recovered_from_their_gradients(potential: sympy.Expr) ->
     point = {X: 0.3, Y: 0.7, Z: 1.1, A: 0.6}
     for q in variables:
         assert float((found - potential).diff(q).subs(point)) == pytest.approx(0.0, abs=1e-13)
-
-
-@pytest.mark.parametrize(
-    "forces", [(Y, -X), (Y, 2 * X), (-X / (X**2 + Y**2) + Y, -Y / (X**2 + Y**2)), (Y * sympy.tan(X), 0)]
-)
-def test_nonconservative_forces_have_no_potential(forces: tuple[sympy.Expr, ...]) -> None:
-    assert potential_of(list(map(sympy.sympify, forces)), (X, Y)) is None
