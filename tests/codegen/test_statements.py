@@ -1,4 +1,4 @@
-"""Statements of steps as C: order, storage and arithmetic, on texts of a few lines."""
+"""Statements of steps as C: where loops end, and what is refused; the arithmetic has golden bits."""
 
 import pytest
 from notation import lagrange

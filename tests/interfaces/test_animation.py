@@ -38,6 +38,7 @@ def run_with(lagrangian: str, coordinates: list[str], **parameters: float) -> sc
 
 
 class TestShapes:
+    @pytest.mark.second
     def test_a_double_pendulum_hangs_from_the_origin_by_its_rods(self):
         run = run_of("double-pendulum", l1=2.0, l2=0.5)
         (places,) = positions(run, [[np.pi / 2, 0.0]])
@@ -45,12 +46,13 @@ class TestShapes:
         assert is_pendulum(run)
         assert np.allclose(np.linalg.norm(np.diff(positions(run, run.q), axis=1), axis=2), [2.0, 0.5])
 
+    @pytest.mark.second
     def test_angle_from_the_upright_position_is_drawn_upright_at_zero(self):
         run = run_with("m*l**2*q_dot**2/2 - m*g*l*cos(q)", ["q"], m=1.0, l=3.0, g=9.81)
         (places,) = positions(run, [[0.0]])
         assert np.allclose(places, [[0.0, 0.0], [0.0, 3.0]])
 
-    @pytest.mark.tiers(1, 2)
+    @pytest.mark.tiers(0, 2)
     @pytest.mark.sampled(2)
     @pytest.mark.parametrize(
         ("lagrangian", "coordinates"),
@@ -68,16 +70,19 @@ class TestShapes:
     def test_systems_that_resemble_pendulums_are_not_drawn_as_such(self, lagrangian, coordinates):
         assert not is_pendulum(run_with(lagrangian, coordinates))
 
+    @pytest.mark.second
     def test_chains_are_drawn_next_to_each_other(self):
         (places,) = positions(run_of("fput-chain:3", 2), [np.arange(3.0)])
         assert np.array_equal(places, np.stack([np.arange(1.0, 4.0), np.arange(3.0)], axis=1))
 
+    @pytest.mark.second
     def test_one_coordinate_uses_its_phase_plane_and_two_their_plane(self):
         oscillator, kepler = run_of("harmonic-oscillator"), run_of("kepler")
         drawn = positions_of(drawn_shape(oscillator), oscillator)
         assert np.array_equal(drawn[:, 0], np.hstack([oscillator.q, oscillator.p]))
         assert np.array_equal(positions_of(drawn_shape(kepler), kepler)[:, 0], kepler.q)
 
+    @pytest.mark.second
     @pytest.mark.sampled(1)
     @pytest.mark.parametrize(
         ("lagrangian", "coordinates", "place"),

@@ -55,6 +55,7 @@ def net(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.second
 def test_model_file_is_read_completely(net: Path) -> None:
     """Formulas at every place, a table from a file, and the run by hand."""
     model = sc.load_model(net, {"parameters": {"k": 3.0}, "run": {"span": 0.2}})

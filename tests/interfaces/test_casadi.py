@@ -64,28 +64,6 @@ def test_ipopt_finds_the_turning_point_of_a_pendulum():
     assert_allclose(12 * h, ellipk(np.sin(angle / 2.0) ** 2), rtol=1e-9)
 
 
-def test_second_derivatives_are_those_of_runs():
-    """Compare the Hessian of a function of saved states and the Jacobian of the adjoint by its cotangents."""
-    flow = casadi_flow(kepler(), steps=90, save_every=30, hessian=True)
-    given, weights = symbols(flow), np.random.default_rng(3).normal(size=(4, 4))
-    x, states = ca.vertcat(*given), ca.vertcat(*flow(*given))
-    curvature = ca.dot(states, weights) + ca.sumsqr(states[:, 1])
-    found = ca.Function("H", given, [ca.hessian(curvature, x)[0]])(Q, P, 1.1, 0.0, H).full()
-    motion = run(30)
-    saved = np.concatenate([motion.q, motion.p], axis=1)
-    partials, curvatures = weights.T.copy(), np.zeros((4, 4, 4))
-    partials[1] += 2 * saved[1]
-    curvatures[1] = 2 * np.eye(4)
-    expected = motion.hessian_product(partials, np.eye(7), curvatures)
-    whole = np.vstack([expected.q, expected.p, expected.parameters, expected.t, expected.h])
-    assert_allclose(found, whole, rtol=0, atol=1e-11 * np.abs(whole).max())
-    seeds = ca.MX.sym("seeds", 4, 4)
-    adjoint = ca.jtimes(ca.vec(states), x, ca.vec(seeds), True)
-    by_seeds = ca.Function("J", [*given, seeds], [ca.jacobian(adjoint, ca.vec(seeds))])
-    jacobian = ca.Function("J", given, [ca.jacobian(ca.vec(states), x)])(Q, P, 1.1, 0.0, H).full()
-    assert_allclose(by_seeds(Q, P, 1.1, 0.0, H, weights).full(), jacobian.T, rtol=0, atol=1e-11 * abs(jacobian).max())
-
-
 def test_failed_step_and_missing_arguments_fail_the_call():
     flow = casadi_flow(kepler(), steps=3)
     with pytest.raises(RuntimeError, match="Evaluation failed"):

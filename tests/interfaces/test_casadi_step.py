@@ -1,4 +1,4 @@
-"""A step as equations in CasADi: against the equations in 60 digits, compiled steps, and differences of gradients."""
+"""A step as equations in CasADi: against the equations in 60 digits, and compiled steps."""
 
 import numpy as np
 import pytest

@@ -277,6 +277,7 @@ class TestRun:
         assert "0 steps of 0.25" in output_of("run", "kepler", "--steps", "0", "-o", "a.npz")
         assert len(arrays("a.npz")["t"]) == 1
 
+    @pytest.mark.second
     @pytest.mark.parametrize("inputs", ["", "inputs = ['u']\n[forces]\nx = 'u'\n[inputs]\nu = {file = 'u.csv'}\n"])
     def test_adaptive_run_that_fills_the_memory_writes_its_states(self, inputs, monkeypatch):
         monkeypatch.setattr("scvi_codegen.codegen.native.capacity.usable_memory", lambda: 30_000.0)
@@ -384,6 +385,7 @@ def test_a_run_with_a_closed_stream_writes_its_file(stream, tmp_path):
     assert ("q1 =" in ended.stdout) == (stream == "2")
 
 
+@pytest.mark.second
 def test_unwritable_package_is_a_failure(tmp_path, monkeypatch):
     """Exit status 1, as for every file that cannot be written."""
 

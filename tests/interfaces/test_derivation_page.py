@@ -136,6 +136,7 @@ class TestPage:
         page = derivation_html(singular, sc.Gauss(2))
         assert "in turn to convergence" in page
 
+    @pytest.mark.second
     def test_operations_are_counted(self):
         program = program_of(sc.problem("kepler").system, sc.SVI(2), prefix="kepler_problem")
         functions = functions_of(render(program).amalgamated().code)

@@ -55,6 +55,7 @@ def test_trial_stepper_is_compiled_in_a_temporary_folder(tmp_path, monkeypatch):
     assert not (tmp_path / "cache").exists()
 
 
+@pytest.mark.second
 def test_missing_compiler_names_what_to_install(tmp_path, monkeypatch):
     no_compiler(monkeypatch, tmp_path)
     status, report = doctor()

@@ -1,4 +1,4 @@
-"""Optimal control by discrete mechanics: against closed forms, the stepper with the inputs found, the Hamiltonian."""
+"""Optimal control by discrete mechanics: against closed forms, and the stepper with the inputs found."""
 
 import numpy as np
 import pytest

@@ -4,7 +4,6 @@
 """
 
 import re
-from collections.abc import Callable
 from fractions import Fraction
 
 import numpy as np
@@ -27,10 +26,8 @@ from scvi_codegen.methods.tables.tableau import (
     gauss,
     is_nonnegative,
     lobatto_iiia,
-    lobatto_iiib,
     radau_ia,
     radau_iia,
-    simplifying_conditions,
     tableau_by_name,
 )
 
@@ -64,22 +61,6 @@ def test_orders_names_and_a_stability_of_every_family(tableau: Tableau) -> None:
     assert tableau.order == ORDERS[family](int(count))
     assert tableau_by_name(tableau.name) == tableau
     assert tableau.is_a_stable
-
-
-CONDITIONS = {
-    gauss: lambda s: (2 * s, s, s),
-    radau_ia: lambda s: (2 * s - 1, s - 1, s),
-    radau_iia: lambda s: (2 * s - 1, s, s - 1),
-    lobatto_iiia: lambda s: (2 * s - 2, s, s - 2),
-    lobatto_iiib: lambda s: (2 * s - 2, s - 2, s),
-}
-"""HW, table 5.13 of section IV.5: B, C and D of s stages."""
-
-
-@pytest.mark.parametrize("s", [2, 3, 4])
-@pytest.mark.parametrize("family", CONDITIONS)
-def test_simplifying_conditions_are_those_of_the_table(family: Callable[[int], Tableau], s: int) -> None:
-    assert simplifying_conditions(family(s)) == CONDITIONS[family](s)
 
 
 @pytest.mark.parametrize("tableau", members([1, 2, 3, 4, 5, 6, 7, 8]), ids=lambda tableau: tableau.name)

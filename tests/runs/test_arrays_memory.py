@@ -167,6 +167,7 @@ class TestDamage:
             chain.from_checkpoint(start(chain).checkpoint(), t_end=2.0)
 
 
+@pytest.mark.second
 def test_invalid_step_size_levels_are_rejected_also_for_scalar_runs() -> None:
     system = sc.LagrangianSystem.from_text(name="pendulum", coordinates=["q"], lagrangian="q_dot**2/2 + cos(q)")
     stepper = sc.compile_stepper(system, "svi:3", flags=QUICK_FLAGS)

@@ -1,4 +1,4 @@
-"""Systems of single coordinates and arrays: sizes known when compiled against sizes known at run time."""
+"""Arrays of known sizes: their names, and steps that require them."""
 
 import numpy as np
 import pytest

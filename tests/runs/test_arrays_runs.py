@@ -83,7 +83,7 @@ class TestEvents:
 
 
 class TestInputs:
-    @pytest.mark.tiers(1)
+    @pytest.mark.second
     @pytest.mark.parametrize("method", ["svi:2", "svi:6"])
     def test_equal_samples_do_not_reset_the_predictor(self, driven, method):
         """Equal samples need no additional iteration; different ones need fewer than without a predictor."""

@@ -120,6 +120,7 @@ def test_steps_equal_taylor_series_in_50_digits(stepper, name):
     np.testing.assert_allclose(np.ravel(back), [*q0, *p0], rtol=0, atol=20 * allowed)
 
 
+@pytest.mark.second
 def test_a_free_body_takes_one_drift(stepper):
     assert "LEAPS = 2 }" in stepper.source.code
 

@@ -112,6 +112,7 @@ def test_a_reversed_run_of_20_000_steps_returns_to_its_start(top):
     np.testing.assert_allclose(back.body_momentum()[-1], there.body_momentum()[0], rtol=0, atol=1e-8)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("h", [0.01, 3.0, pytest.param(400.0, marks=pytest.mark.quick)])
 def test_steps_without_a_potential_are_exact(top, h):
     """The attitude is that after rotations about the angular momentum and about the axis (Routh)."""

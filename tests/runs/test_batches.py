@@ -63,7 +63,7 @@ CASES = [
 ]
 
 
-@pytest.mark.tiers(1, 8)
+@pytest.mark.tiers(0, 8)
 @pytest.mark.parametrize(("name", "plan"), CASES)
 @pytest.mark.parametrize("capacity", [batches.MOST_NUMBERS, 1])
 def test_trajectories_equal_single_runs(name: str, plan: str, capacity: int, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -88,6 +88,7 @@ def test_trajectories_equal_single_runs(name: str, plan: str, capacity: int, mon
             np.testing.assert_allclose(those, expected, rtol=0, atol=1e-14)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("name", "plan"), [("kepler", "own ends"), ("rod", "fixed")])
 def test_threads_and_calls_do_not_change_results(name: str, plan: str, monkeypatch: pytest.MonkeyPatch) -> None:
     one, (q, p), arguments = stepper(name), states(name), PLANS[plan]

@@ -251,6 +251,7 @@ def test_no_false_confirmation_in_three_thousand_cases(family, count, least):
 FLOOR_HEIGHT = 2.55
 
 
+@pytest.mark.second
 def test_an_unconfirmed_motion_with_kinks_has_the_remedies_for_these():
     height, span = FLOOR_HEIGHT, 3.0 * math.sqrt(2.0 * FLOOR_HEIGHT / 9.8)
     floor = lagrange("floor", "y", "y_dot**2/2 - 9.8*y - 1e5*positive_part(-y)**2")
@@ -260,6 +261,7 @@ def test_an_unconfirmed_motion_with_kinks_has_the_remedies_for_these():
     assert "time transformation" not in str(caught[0].message)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("offset", [0.0, 1e6])
 def test_errors_are_relative_to_the_range_of_each_coordinate(offset):
     """A small oscillation beside a large one has its own size; far from the origin positions are rounded."""
@@ -272,6 +274,7 @@ def test_errors_are_relative_to_the_range_of_each_coordinate(offset):
     assert run.confirmation.confirmed == (offset == 0.0)
 
 
+@pytest.mark.second
 def test_a_coordinate_that_does_not_move_is_confirmed():
     """An equilibrium away from the origin, and rounding errors of a coordinate beside one that moves."""
     system = lagrange("two", ("x", "z"), "(x_dot**2 + z_dot**2)/2 - ((x - z)**2 + (x + z)**2)/4 - (z - 3)**2/2 + z*z/2")
@@ -375,6 +378,7 @@ class TestSizes:
         assert run.confirmation.confirmed
         assert off <= 1e-22
 
+    @pytest.mark.rotated
     def test_a_small_separation_is_confirmed_as_far_as_positions_resolve_it(self):
         """x1 - x2 = 1e-8 at x = 1: the positions are rounded at 1e-8 of their range."""
         system = "x y", "(x_dot**2 + y_dot**2)/2 - (x - y)**2/2"
@@ -385,6 +389,7 @@ class TestSizes:
             assert np.abs(run.q[:, 0] - exact).max() <= run.global_error * apart
         assert loose.confirmation.confirmed > tight.confirmation.confirmed
 
+    @pytest.mark.second
     @pytest.mark.parametrize("shift", [0.0, 100.0])
     def test_a_close_encounter_far_from_the_origin(self, shift):
         e, system = 0.9999, ("x y", f"(x_dot**2 + y_dot**2)/2 + 1/sqrt((x - {shift:g})**2 + y**2)")
@@ -394,6 +399,7 @@ class TestSizes:
         assert run.confirmation.confirmed
         assert (np.abs(run.q - exact).max(axis=0) / np.ptp(exact, axis=0)).max() <= run.global_error
 
+    @pytest.mark.second
     def test_nothing_is_confirmed_beyond_a_growth_that_exceeds_the_tolerance(self):
         """exp(-t) on a saddle, whose rounding errors grow by exp(t)."""
         run = confirmed(("q", "q_dot**2/2 + q**2/2"), [1.0], [-1.0], "svi:4", t_end=40.0, error=1e-6)
@@ -401,6 +407,7 @@ class TestSizes:
         assert np.abs(run.q[reached, 0] - np.exp(-run.t[reached])).max() <= 1e-6
         assert 15.0 < run.confirmed_until < 30.0
 
+    @pytest.mark.rotated
     def test_absolute_tolerances_are_sizes(self):
         """Positions of a range of 1e-9, far from the origin, to 1e-6 of a size of 1."""
         system, start = ("x", "x_dot**2/2 - (x - 10)**2/2"), ([10.0 + 1e-9], [0.0])
@@ -419,6 +426,7 @@ def test_a_comparison_that_is_given_up_confirms_nothing(monkeypatch):
     assert math.isinf(run.global_error)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("mass", [1.0, 2.0**-30])
 def test_momenta_of_light_bodies_count(mass):
     """A body that crosses ripples: errors of its velocity are 100 times those of its position relative to its range."""

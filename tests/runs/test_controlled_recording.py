@@ -1,4 +1,4 @@
-"""Recorded runs with adaptive steps: continued bit for bit, extended, read, and on the command line."""
+"""Recorded runs with adaptive steps are extended and shortened."""
 
 import numpy as np
 import pytest

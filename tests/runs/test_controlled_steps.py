@@ -180,6 +180,7 @@ def test_degree_two_error_estimate_uses_the_change_of_force(tolerance):
     assert errors.max() < (len(run) - 1) * tolerance
 
 
+@pytest.mark.second
 def test_a_singular_time_inside_a_run_is_resolved_or_its_error_reported():
     """The force -log((t - 1)^2): q(2) = q(0) + 4 from rest. The step across t = 1 has the error of the whole run."""
     singular = lagrange("singular", "q", "q_dot**2/2 - q*log((t - 1)**2)")

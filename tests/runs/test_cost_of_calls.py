@@ -43,6 +43,7 @@ def numbers(found):
     return [x.tobytes() for x in (found.t, found.q, found.p, found.iterations, found.step_sizes, found.parameters)]
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("plan", [{"h": 0.05, "steps": 400}, {"t_end": 9.0}])
 def test_memory_of_earlier_calls_does_not_matter(stepper, plan):
     first = stepper.integrate(Q, P, **plan)
@@ -56,12 +57,13 @@ def test_memory_of_earlier_calls_does_not_matter(stepper, plan):
     assert saved == numbers(sc.compile_stepper(sc.problem("kepler").system, sc.SVI(8)).integrate(Q, P, **plan))
 
 
+@pytest.mark.second
 def test_calls_within_calls_and_from_threads_have_runs_of_their_own(stepper):
-    plan, found, inner = {"h": 0.05, "steps": 3000}, {}, []
+    plan, found, inner = {"h": 0.05, "steps": 500}, {}, []
     alone = numbers(stepper.integrate(Q, P, **plan))
 
     def work(number):
-        found[number] = [numbers(stepper.integrate(Q, P, **plan)) for _ in range(5)]
+        found[number] = [numbers(stepper.integrate(Q, P, **plan)) for _ in range(2)]
 
     threads = [threading.Thread(target=work, args=(number,)) for number in range(4)]
     for thread in threads:
@@ -83,6 +85,7 @@ def chains():
     return [sc.compile_stepper(sc.LagrangianSystem.from_text(name="chain", **common, **each), by) for each, by in kinds]
 
 
+@pytest.mark.second
 def test_calls_of_arrays_take_few_function_calls(chains):
     q, p = {"x": np.arange(3.0), "y": np.zeros(3)}, np.zeros(6)
     run = chains[0].integrate(q, p, h=0.05, steps=50)

@@ -1,4 +1,4 @@
-"""Dense output: continuous, of the method's order, equal to the saved states at both ends; the solve_ivp-like call."""
+"""Iterations between saved states, and the solve_ivp-like call; dense output: tests/motions."""
 
 import math
 
@@ -24,15 +24,6 @@ def ellipse(t: np.ndarray) -> np.ndarray:
 @pytest.fixture(scope="module")
 def kepler() -> sc.Stepper:
     return sc.compile_stepper(sc.problem("kepler").system, sc.SVI(4), flags=FLAGS)
-
-
-# Order, continuity, ends.
-
-
-# t_eval.
-
-
-# The call that is like solve_ivp.
 
 
 @pytest.mark.second
@@ -101,6 +92,7 @@ def test_solve_ivp_ends_at_a_terminal_event(kepler):
     assert np.array_equal(chosen.sol(half.t[-1]), half.y[:, -1])
 
 
+@pytest.mark.second
 def test_solve_ivp_reports_a_failed_step():
     runaway = sc.LagrangianSystem.from_text(name="runaway", coordinates=["q"], lagrangian="q_dot**2/2 + q**3/3")
     failed = sc.solve_ivp(sc.compile_stepper(runaway, sc.SVI(3), flags=FLAGS), (0, 10), [1.0, 1.0], h=0.1)

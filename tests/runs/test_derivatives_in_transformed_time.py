@@ -172,6 +172,7 @@ def test_gradients_are_the_transpose_of_derivatives(way):
     assert (found.h is None) == ("steps" not in WAYS[way])
 
 
+@pytest.mark.second
 def test_run_that_ends_at_a_step_ends_at_its_time():
     made = stepper("L")
     t_end = float(made.integrate(Q, P, h=H, steps=7).t[-1])

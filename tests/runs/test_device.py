@@ -156,7 +156,7 @@ def test_values_at_all_steps_are_observed_without_saving_them(gpu: EmulatedGpu, 
     check_observed(stepper, states(system), observe)
 
 
-@pytest.mark.quick
+@pytest.mark.second
 def test_interrupted_runs_have_the_states_so_far(gpu: EmulatedGpu) -> None:
     stepper, (q, p) = compiled("kepler", sc.SVI(4)), states("kepler")
     work = ensemble_runs(stepper, q, p, h=0.05, steps=200, device="cuda")

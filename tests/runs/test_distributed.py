@@ -54,7 +54,7 @@ def test_parts_are_multiples_of_the_register_width():
 
 @pytest.mark.second
 class TestCluster:
-    @pytest.mark.quick
+    @pytest.mark.second
     def test_invalid_arguments_are_reported_before_distribution(self, kepler: sc.Stepper):
         q, p = states()
         for faults in ({"h": 0.0}, {"steps": -1}, {"blocks": 0}, {"parameters": {"nu": 1.0}}):

@@ -1,4 +1,4 @@
-"""Double-double arithmetic: elementary functions and steps against mpmath, ensembles, refusals."""
+"""Double-double arithmetic: elementary functions and steps against mpmath, ensembles."""
 
 import ctypes
 import json
@@ -361,6 +361,7 @@ def test_every_quantity_has_both_words(tmp_path: Path) -> None:
         assert abs(q.mp() - again.mp("q")[-1]).max() < 1e-30
 
 
+@pytest.mark.second
 def test_arrays_have_both_words() -> None:
     """Arrays of coordinates by name, and their items."""
     text = "q_dot[0]**2/2 + q_dot[1]**2/2 + z_dot**2/2 - (q[0] - q[1])**2/2 - z**2*q[0]**2"
@@ -500,6 +501,7 @@ def test_lanes_do_not_depend_on_their_neighbours() -> None:
         assert (others.mp(name) == runs.mp(name)[:, order]).all()
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("kind", ["fixed", "tau", "inputs", "events"])
 def test_dense_output_at_the_times_of_states_is_these_states(kind: str) -> None:
     """Times have low words, which dense output takes as well: in arrays, in lists and alone."""
@@ -561,6 +563,7 @@ def test_times_have_two_words_or_are_refused() -> None:
             stepper.integrate_ensemble([[0.0]], [[0.0]], **times)
 
 
+@pytest.mark.second
 def test_outputs_have_both_words_or_are_refused():
     body = lagrange("body", "x", "(omega_1**2 + 2*omega_2**2 + 3*omega_3**2 + x_dot**2)/2", rotations={"R": "omega"})
     stepper = sc.compile_stepper(body, "svi:3", precision="double-double")

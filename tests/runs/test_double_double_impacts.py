@@ -80,6 +80,7 @@ def test_ball(steps: dict[str, float]) -> None:
             assert largest(inside - end_of_ball(times, mp.mpf(4), mp.mpf(1) / 3 if kick else None)[1][:2]) < 1e-29
 
 
+@pytest.mark.rotated
 def test_runs_in_parts() -> None:
     """Thinned runs, output times, parts, checkpoints, ensembles and terminal counts agree with a single run."""
     stepper = compiled(BALL, events=[FLOOR, sc.Event("y_dot", terminal=3)])
@@ -231,6 +232,7 @@ def test_corner() -> None:
         assert abs(run.mp("q")[-1, 1] - (1 - (5 - t) / 8)) < 1e-31
 
 
+@pytest.mark.second
 def test_derivatives() -> None:
     """Derivatives through impacts are those of the run in double, at the states of two words."""
     starts = {"q": [-1.0, 1.1], "p": [0.3, 0.0], "h": 0.125, "steps": 14, "events": FLOOR}

@@ -122,6 +122,7 @@ def test_first_kick_after_a_jump_is_that_of_the_new_input(method, precision):
         assert_allclose(found, q, rtol=0, atol=1e-14)
 
 
+@pytest.mark.second
 def test_inputs_from_sympy_and_scipy():
     q, v, u = sympy.symbols("q q_dot u")
     system = sc.LagrangianSystem.from_sympy(

@@ -254,6 +254,7 @@ def test_parameters_are_named_rows_or_one_row_per_trajectory() -> None:
     assert np.array_equal(same.parameters, np.tile(each.parameters[0], (3, 1)))
 
 
+@pytest.mark.second
 def test_ensembles_with_few_or_no_steps() -> None:
     stepper = stepper_for("kepler", sc.SVI(5))
     q, p = states("kepler", 9)
@@ -271,6 +272,7 @@ def test_ensembles_with_few_or_no_steps() -> None:
     assert still.energy().shape == (1, COUNT)
 
 
+@pytest.mark.second
 def test_rows_in_transformed_time_keep_their_tau() -> None:
     """Each trajectory reaches t_end within a step of its own; those that leave x > 0 fail, one in its first step."""
     system = sc.LagrangianSystem.from_text(name="root", coordinates=["x"], lagrangian="x_dot**2/2 - x**(5/2)")
@@ -608,6 +610,7 @@ def test_lane_with_failed_iteration_continues_as_scalar_across_breakpoints():
     assert_allclose(runs.energy()[:, 4], run.energy(), rtol=1e-10)
 
 
+@pytest.mark.second
 def test_files_contain_individual_times(tmp_path: Path) -> None:
     runs = CASES["adaptive"].run(save_every=5)
     runs.save(tmp_path / "e.csv")

@@ -40,6 +40,7 @@ def test_files_are_read_by_xarray(xarray, ensemble, tmp_path, name):
         assert dataset.attrs["method"] == ensemble.stepper.interface.method
 
 
+@pytest.mark.second
 def test_failed_trajectory_is_nan_after_its_failure(ensemble):
     assert not ensemble.ok[2]
     dataset = ensemble.to_xarray()

@@ -134,7 +134,8 @@ DRIVEN = {
 }
 
 
-@pytest.mark.covering(2)
+@pytest.mark.second
+@pytest.mark.covering
 @pytest.mark.parametrize("tolerance", TOLERANCES)
 @pytest.mark.parametrize("name", DRIVEN)
 def test_chaos_under_forces_is_reported_by_a_tangent_vector(name, tolerance):
@@ -144,6 +145,7 @@ def test_chaos_under_forces_is_reported_by_a_tangent_vector(name, tolerance):
     assert reports(stepper, q, p, t_end, tolerance=tolerance) == chaotic
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("tolerance", [0.0, 1e-9])
 @pytest.mark.parametrize("name", ["Henon-Heiles, E = 1/6.2", "double pendulum"])
 def test_growth_is_that_of_nearby_runs(name, tolerance):
@@ -235,6 +237,7 @@ ORBITS = {  # initial velocities and periods: Hairer, Norsett, Wanner, Solving O
 }
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("velocity", ORBITS)
 def test_growth_that_leaves_ten_digits_is_not_reported(velocity):
     """Arenstorf's orbits return to their start with 12 digits; perturbations grow by a factor of 5e4."""
@@ -244,6 +247,7 @@ def test_growth_that_leaves_ten_digits_is_not_reported(velocity):
     assert np.abs(run.q[-1] - [0.994, 0.0]).max() < 1e-12
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("method", ["svi:4", "svi:8"])
 def test_a_fall_from_the_rounded_equilibrium_is_reported(method):
     """The angle pi is rounded: the fall of a pendulum at rest is amplified rounding from its start."""
@@ -252,6 +256,7 @@ def test_a_fall_from_the_rounded_equilibrium_is_reported(method):
         stepper.integrate([math.pi], [0.0], t_end=45.0)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("origin", [0.0, 1000.0])
 def test_a_regular_motion_in_a_magnetic_field_is_not_reported_far_from_the_origin(origin):
     """Its momenta are those of the vector potential there."""

@@ -40,6 +40,7 @@ def compiled(system, method, **how):
     return sc.compile_stepper(system, method, flags=QUICK_FLAGS, **how)
 
 
+@pytest.mark.second
 def test_a_symmetric_body_rotates_exactly_in_a_step_of_any_size():
     system = sc.LagrangianSystem.from_text(
         "free", rotations={"R": "omega"}, lagrangian="(omega_1**2 + 2*omega_2**2 + 2*omega_3**2)/2"

@@ -1,4 +1,4 @@
-"""A state may be given by its velocity, and a method by its name."""
+"""A state may be given by its velocity."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ def pendulum_on_cart():
     return sc.compile_stepper(sc.problem("cart-pole").system, "svi:2", flags=QUICK_FLAGS)
 
 
-@pytest.mark.tiers(1)
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("coordinates", "lagrangian", "q", "v", "dropped"),
     [

@@ -190,6 +190,7 @@ class TestMotions:
             assert each.confirmed
             assert each.estimate == pytest.approx(each.safety * each.differences.max())
 
+    @pytest.mark.second
     def test_runs_that_agree_by_chance_do_not_confirm_each_other(self):
         """Rounding errors grow a thousandfold: runs with tolerances 1e-14, 1e-17 agree to 3e-15, both off by 3e-13."""
         system = made("d", ["x"], "x_dot**2/2 + x**2/2 - x**4/4", forces={"x": "cos(t)/4 - x_dot/8"})
@@ -210,6 +211,7 @@ class TestMotions:
         assert found.differences == pytest.approx(off, rel=0.05, abs=1e-14)
         assert (off[found.t <= 12.0] > 0).any()
 
+    @pytest.mark.second
     def test_a_short_last_step_is_no_close_encounter(self):
         oscillator = made("o", ["x"], "x_dot**2/2 - x**2/2")
         stepper, lost = sc.compile_stepper(oscillator, "svi:6"), SimpleNamespace(estimate=1e-9)
@@ -380,7 +382,7 @@ class TestOtherRuns:
         assert len(saved) == -(-saved.steps // 10) + 1
         assert saved.global_error <= 1e-9
 
-    @pytest.mark.tiers(1)
+    @pytest.mark.second
     @pytest.mark.parametrize("indexed", [False, True], ids=["scalar", "array"])
     def test_confirmed_runs_with_inputs(self, indexed):
         """x'' = -x + u with u = 1 - t/2 until t = 2, then 0, from t = 0.5: exact."""
@@ -424,6 +426,7 @@ class TestOtherRuns:
 
 
 class TestSolveMotion:
+    @pytest.mark.second
     def test_unconfirmed_result_is_not_a_success(self, burrau_stepper):
         with pytest.warns(sc.AccuracyWarning, match="confirmed until"):
             motion = sc.solve_ivp(burrau_stepper, (0.0, 30.0), np.concatenate(PYTHAGOREAN), error=1e-9)
@@ -481,6 +484,7 @@ class TestCommandLine:
         return path
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("power", [-660, 660])
 def test_global_errors_of_linear_systems_are_scale_invariant(power):
     """Squares of such states overflow, or are 0."""

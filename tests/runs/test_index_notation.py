@@ -25,6 +25,7 @@ def size_of(system: sc.LagrangianSystem) -> str:
     return "4" if system.coordinates[0].name == "q_0" else "N"
 
 
+@pytest.mark.second
 def test_time_transformation_equals_that_of_the_entries(ring):
     options = {"velocity": 0 * Q, "h": 0.1, "t_end": 2.0}
     g = f"1/(1 + q[{size_of(ring)}-1]**2 + sum(i in {size_of(ring)}, q[i]**2))"

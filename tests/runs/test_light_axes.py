@@ -68,6 +68,7 @@ def test_steps_and_errors_are_those_of_newtons_method(method, axis):
         assert np.ptp(solved.energy()) < 1e-9
 
 
+@pytest.mark.second
 def test_ordinary_bodies_need_no_newton_steps():
     for moments in ((1.0, 1.0, 1.0), (1.0, 2.0, 2.5), (0.1, 1.0, 1.0)):
         run = motion(stepper("svi:4"), moments)

@@ -141,7 +141,7 @@ class Begun:
         return float(momentum - first), float(places - begun - first * (self.time() - t))
 
 
-@pytest.mark.tiers(1, 4)
+@pytest.mark.tiers(0, 4)
 @pytest.mark.sampled(6)
 @pytest.mark.parametrize("name", CASES)
 def test_sums_of_high_and_low_words_are_exact(name: str) -> None:
@@ -230,7 +230,7 @@ BY_DESIGN = ("Newton", "rattle", "lobatto")
 """Forces at the start of their steps are those of the high word: an error like a rounding of the increment."""
 
 
-@pytest.mark.tiers(1, 3)
+@pytest.mark.tiers(0, 3)
 @pytest.mark.parametrize("name", [name for name in CASES if not any(each in name for each in BY_DESIGN)])
 def test_low_words_enter_everywhere_the_state_does(name: str) -> None:
     """A thousandth of the state as its low word, or in its high word: a step has the same forces and velocities."""

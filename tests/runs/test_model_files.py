@@ -102,6 +102,7 @@ MATRIX = (
 )
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("attitude", [MATRIX, {"euler": "ZXZ", "angles": ANGLES}])
 def test_models_in_python_take_attitudes(attitude):
     system = parse_model(TOP).system

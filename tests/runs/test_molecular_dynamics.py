@@ -60,6 +60,7 @@ def test_temperature_and_pressure_are_those_of_sums_over_all_pairs(lengths: Any)
     assert sc.pressure(run, BOX) == pytest.approx(expected, rel=1e-8)
 
 
+@pytest.mark.second
 def test_temperature_with_constraints_excludes_their_degrees_of_freedom() -> None:
     """Two rods that turn and move as one: 6 coordinates of 3 masses, 2 conserved momenta, 2 constraints."""
     system = sc.LagrangianSystem.from_text(

@@ -367,7 +367,7 @@ def expected_of(name):
     return np.concatenate([np.ravel(each) for each in MOTIONS[name].expected()])
 
 
-@pytest.mark.tiers(1, 1)
+@pytest.mark.tiers(0, 1)
 @pytest.mark.parametrize(("name", "method", "counts", "order"), CASES)
 def test_motions_converge_with_the_order_of_the_method_and_reverse(name, method, counts, order):
     motion, errors = MOTIONS[name], []

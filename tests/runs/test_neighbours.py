@@ -264,7 +264,7 @@ INVALID: tuple[tuple[dict[str, float], str], ...] = (
 )
 
 
-@pytest.mark.tiers(1)
+@pytest.mark.second
 @pytest.mark.parametrize("kind", ["run-time sizes", "known sizes"])
 def test_lengths_are_checked_before_every_run(kind: str) -> None:
     points = np.array([[0.0, 0.0, 0.0], [0.9, 0.0, 0.0], [0.0, 1.1, 0.0]])
@@ -286,6 +286,7 @@ def test_lengths_are_checked_before_every_run(kind: str) -> None:
                 call(parameters=parameters)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("size", ["3", "N"])
 def test_lengths_are_checked_before_c_is_generated(size: str, tmp_path: Path) -> None:
     """The program of a package does not check them."""

@@ -97,6 +97,7 @@ def test_advancing_array_run_belongs_to_one_thread(arrays: sc.Stepper) -> None:
         enter()
 
 
+@pytest.mark.second
 def test_run_recorded_into_a_folder_belongs_to_one_thread(stepper: sc.Stepper, tmp_path: Any) -> None:
     run = stepper.start([1.0], [0.0], h=0.1)
     with Holder(run, lambda wait: sc.record_run(run, tmp_path / "run", steps=10, progress=lambda _: wait())):

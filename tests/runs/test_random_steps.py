@@ -156,7 +156,7 @@ def test_run_with_controller_starts_with_a_correct_step():
         assert abs(run.q[1, 0] - first) < 0.3
 
 
-@pytest.mark.quick
+@pytest.mark.second
 def test_comparison_with_half_steps_does_not_change_a_run():
     """Every 512th step is compared: what goes from step to step stays, by Newton's iteration, too."""
     system = sc.problem("henon-heiles").system

@@ -248,7 +248,7 @@ class TestFiles:
             assert (file["h"], file["parameters"], file["parameter_names"]) == (H, [1.0], ["mu"])
             assert str(file["title"]) == whole.stepper.title
 
-    @pytest.mark.tiers(1)
+    @pytest.mark.second
     def test_zarr_is_read_by_xarray(self, saved):
         pytest.importorskip("zarr")
         xarray = pytest.importorskip("xarray")

@@ -54,6 +54,7 @@ def test_velocities_are_rejected_where_there_are_spins():
         state_by_name(system, {"x": 0.1, "s": [0.3, 0.6, 0.8]}, None, {"x": 0.2})
 
 
+@pytest.mark.second
 def test_a_hamiltonian_in_body_momenta_is_that_of_the_lagrangian():
     system = sc.HamiltonianSystem.from_text(
         "heavy top",

@@ -1,7 +1,7 @@
 """Derivatives of runs: motions x situations, and a chain of identities.
 
 ``sensitivity`` of a run is the product of those of its steps (compared with 60 digits in test_sensitivity), ``tangent``
-its columns, ``pullback`` its transpose, and ``hessian_product`` the difference quotient of ``pullback``.
+its columns, and ``pullback`` its transpose; difference quotients of both: tests/motions.
 """
 
 from dataclasses import dataclass, field, replace
@@ -116,7 +116,7 @@ def differences(function, x, width=1e-4):
     return np.array(columns).T
 
 
-@pytest.mark.tiers(1, 2)
+@pytest.mark.tiers(0, 2)
 @pytest.mark.parametrize(("name", "changes"), CASES)
 def test_derivatives_of_runs_are_products_of_those_of_steps(name, changes):
     motion = MOTIONS[name]
@@ -139,6 +139,7 @@ def test_derivatives_of_runs_are_products_of_those_of_steps(name, changes):
     assert_close(run.tangent(direction)[-1], found[-1, :, :size] @ direction, 1e-11)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("name", "changes"), CASES)
 def test_gradients_are_the_transpose_of_sensitivities(name, changes):
     run = MOTIONS[name].run(**changes)

@@ -1,4 +1,4 @@
-"""Robots from URDF and MJCF: energies against poses composed by hand, and errors of malformed files."""
+"""Robots from URDF and MJCF: what is read, and errors of malformed files; energies: test_random_robots.py."""
 
 import re
 from pathlib import Path
