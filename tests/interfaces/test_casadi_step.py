@@ -58,15 +58,6 @@ def test_inputs_in_bernsteins_form_are_the_cubics_of_compiled_steps():
     )
 
 
-def test_names_of_constants_are_unrestricted():
-    system = lagrange("e", "x", "x_dot**2/2 - exp(1)*e*x**2/pi", e=0.25)
-    found = sc.casadi_step(system, sc.SVI(2), solved=True)(
-        q=0.4, p=0.3, inputs=NO_INPUTS, parameters=0.25, t=0.0, h=0.1
-    )
-    exact = compiled_equations(system, sc.SVI(2))([0.4], [0.3], 0.1)
-    assert float(found["p1"]) == pytest.approx(float(exact.p[0]), abs=1e-13)
-
-
 def test_unsupported_methods_are_reported():
     with pytest.raises(sc.MethodError, match=r"degree must be at most 3"):
         sc.casadi_step(TOWED, sc.SVI(2), degree=4)

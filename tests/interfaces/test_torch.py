@@ -64,24 +64,6 @@ def test_second_derivatives_are_those_of_leapfrog():
     assert_allclose(extra[1], expected, atol=1e-10)
 
 
-@pytest.mark.parametrize("save_every", [None, 4])
-def test_gradcheck_passes(save_every):
-    """PyTorch's own, by differences, back and forward, of batches, and of gradients."""
-    x = torch.stack([numbers(X), 0.9 * numbers(X)]).requires_grad_()
-    assert torch.autograd.gradcheck(lambda x: by_c(x, save_every), x, check_forward_ad=True)
-    assert torch.autograd.gradgradcheck(lambda x: by_c(x, save_every), x)
-
-
-def test_shapes_of_many_trajectories_broadcast():
-    flow = torch_flow(kepler(), steps=5, save_every=1)
-    q, p = flow(numbers([[[0.5, 0.0]], [[0.6, 0.0]]]), numbers([[0.0, 1.7]] * 3), h=0.05)
-    assert q.shape == p.shape == (2, 3, 6, 2)
-    derivative = torch.func.vmap(
-        torch.func.jacrev(lambda mu: flow(numbers([0.5, 0.0]), numbers([0.0, 1.7]), h=0.05, parameters={"mu": mu})[0])
-    )
-    assert derivative(numbers([0.9, 1.0])).shape == (2, 6, 2)
-
-
 def test_unsupported_functions_are_rejected():
     flow, q, p = torch_flow(kepler(), steps=5), numbers([0.5, 0.0]), numbers([0.0, 1.6])
     with pytest.raises(MethodError, match="no forward-over-forward second derivatives"):

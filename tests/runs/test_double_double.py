@@ -522,47 +522,6 @@ def test_dense_output_at_the_times_of_states_is_these_states(kind: str) -> None:
     assert (run.at(float(run.t[3]))[0] - run.q[3]).any()
 
 
-@pytest.mark.rotated
-def test_times_have_two_words_or_are_refused() -> None:
-    """x = cos(a) - cos(t) - (t - a) sin(a) from rest at the origin at a = 1/10, where the size of the state is zero."""
-    system = lagrange("driven", "x", "x_dot**2/2 + x*cos(t)")
-    stepper = sc.compile_stepper(system, "svi:8", precision="double-double")
-    run = stepper.integrate([0.0], [0.0], t="0.1", h=0.125, steps=8)
-    again = stepper.integrate(run.q[3], run.p[3], t=run.t[3], h=0.125, steps=5)
-    with mp.workdps(50):
-        tenth = mp.mpf(1) / 10
-        assert abs(run.mp("q")[-1][0] - (mp.cos(tenth) - mp.cos(tenth + 1) - mp.sin(tenth))) < 1e-29
-        assert abs(again.mp("q")[-1] - run.mp("q")[-1]).max() < 1e-31
-    of_input = lagrange("driven", "x", "x_dot**2/2 + x*(cos(t) + u)", inputs="u")
-    inputs: dict[str, Any] = {"inputs": {"u": ([0.0, 0.5, 2.0], ["0", "1/3", "0"])}}
-    for driven, method, more in (
-        (system, "svi:8", {"h": 0.125, "steps": 8}),
-        (system, "svi:8", {"h": 0.125, "t_end": 1.1, "save_every": 5}),
-        (system, "svi:8", {"t_end": 1.1}),
-        (system, "svi:8", {"t_end": 1.1, "t_eval": [0.5, 1.1]}),
-        (system, "composition:6", {"h": -0.125, "t_end": -1.1}),  # SIMD lanes
-        (of_input, "svi:8", {"h": 0.125, "t_end": 1.1, **inputs}),
-    ):
-        stepper = sc.compile_stepper(driven, method, precision="double-double")
-        least = 4e-31 if method == "svi:8" and "h" in more else 0  # those in SIMD lanes have other rounding errors
-        with mp.workdps(50):
-            for t in (
-                "1/10",
-                Fraction(1, 10),
-                mp.mpf(1) / 10,
-                stepper.integrate([1], [0], t="0.1", h=1.0, steps=0).t[0],
-            ):
-                many = stepper.integrate_ensemble([[1], ["0.7"]], velocity=[[0], ["0.1"]], t=t, **more)
-                one = stepper.integrate(["0.7"], velocity=["0.1"], t="0.1", **more)
-                for name in ("t", "q", "p"):
-                    assert abs(many[1].mp(name) - one.mp(name)).max() <= least, (t, more, name)
-    for times in ({"t_end": Fraction(1, 10)}, {"t_end": 1.0, "t_eval": [Fraction(3, 10)]}):
-        with pytest.raises(StateError, match="must be doubles"):
-            stepper.integrate([0.0], [0.0], **times)
-        with pytest.raises(StateError, match="must be doubles"):
-            stepper.integrate_ensemble([[0.0]], [[0.0]], **times)
-
-
 @pytest.mark.second
 def test_outputs_have_both_words_or_are_refused():
     body = lagrange("body", "x", "(omega_1**2 + 2*omega_2**2 + 3*omega_3**2 + x_dot**2)/2", rotations={"R": "omega"})

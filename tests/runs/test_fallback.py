@@ -1,6 +1,5 @@
 """Newton's iteration from a fallback library equals a built-in one and is compiled on demand."""
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache
 
@@ -77,16 +76,6 @@ def test_newton_iteration_is_compiled_on_demand(start, monkeypatch):
     with pytest.raises(sc.StepFailedError):
         stepper.step(*start, 40.0)
     assert built == ["late"] * 2
-
-
-def test_concurrent_threads_compile_the_fallback_once(start):
-    stepper = sc.compile_stepper(
-        sc.problem("double-pendulum").system, sc.SVI(3), prefix="threads", flags=PORTABLE_FLAGS
-    )
-    with ThreadPoolExecutor(8) as pool:
-        found = list(pool.map(lambda _: outcome(stepper, start, LONG), range(16)))
-    assert all(each == found[0] for each in found)
-    assert found[0] == outcome(stepper, start, LONG)
 
 
 def test_prepare_compiles_everything_later_calls_need(tmp_path, monkeypatch):

@@ -43,16 +43,6 @@ def test_paths_of_a_body_axis_and_a_direction_are_drawn_on_the_sphere(run, tmp_p
         sc.plot_attitude(pendulum.integrate([0.0], [1.0], h=0.1, steps=2), tmp_path / "none.png")
 
 
-@pytest.mark.second
-def test_the_overview_shows_body_axes_in_the_unit_circle(run, tmp_path):
-    first, second, _ = run.plot(tmp_path / "overview.png")
-    for axes, plane in ((first, (0, 1)), (second, (0, 2))):
-        circle, body, direction = (np.array(line.get_data()).T for line in axes.lines)
-        np.testing.assert_allclose(np.linalg.norm(circle, axis=1), 1)
-        np.testing.assert_array_equal(body, run.rotation()[:, plane, 2])
-        np.testing.assert_allclose(direction, run.direction()[:, plane], rtol=0, atol=1e-15)
-
-
 def test_an_animation_moves_and_turns_with_the_body(run):
     film = run.animate(seconds=0.2)
     centre, *axes, base, tip = np.moveaxis(positions_of(film.shapes[0], film.shown[0]), 1, 0)

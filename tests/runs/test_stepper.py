@@ -77,7 +77,7 @@ def test_damaged_checkpoints_are_rejected(kepler):
         kepler.start(*STATE, h=0.05).rollback(b"abc")
 
 
-# Wrong arguments.
+# Parameters.
 
 
 def test_parameters_may_be_given_by_name_or_in_order(compiled, sample):
@@ -255,9 +255,6 @@ def test_methods_without_a_discrete_lagrangian_are_reported(compiled):
         for call in (stepper.discrete_lagrangian, stepper.discrete_legendre_minus, stepper.step_positions):
             with pytest.raises(sc.MethodError, match="discrete_lagrangian is not available without an action"):
                 call([1.0, 0.0], [1.0, 0.1], 0.1)
-
-
-# Threads and copies.
 
 
 @pytest.mark.tiers(0, 1)

@@ -369,30 +369,6 @@ def test_claimed_conservation_is_measured(quickly_compiled, name, method):
     assert errors[exact].max() < ROUNDOFF
 
 
-BROKEN = [
-    ("fields", sc.StoermerVerlet(), "angular momentum z"),
-    ("fields", sc.SVI(3, "clenshaw-curtis:4"), "angular momentum z"),
-    ("fields", sc.RadauIIA(2), "angular momentum z"),
-    ("fields", sc.SCVI(3, variational=False), "momentum of x"),
-    ("bodies", sc.ExplicitEuler(), "angular momentum"),
-    ("bodies", sc.SpectralCollocation(3), "angular momentum"),
-    ("vortices", sc.RadauIIA(2), "quadratic invariant"),
-]
-
-
-@pytest.mark.tiers(1, 2)
-@pytest.mark.sampled(2)
-@pytest.mark.parametrize(("name", "method", "broken"), BROKEN, ids=lambda value: getattr(value, "name", value))
-def test_unclaimed_conservation_may_be_violated(quickly_compiled, name, method, broken):
-    """Compare with 100 times the round-off bound in cases where a claim would be wrong."""
-    system, q, p = SYSTEMS[name]
-    stepper = quickly_compiled(system, method)
-    k = stepper.momentum_map_names.index(broken)
-    errors = np.abs(stepper.integrate(q, p, h=0.05, steps=400).momentum_errors()).max(axis=0)
-    assert not stepper.interface.map_exact[k]
-    assert errors[k] > 100 * ROUNDOFF
-
-
 def test_supplied_generator_is_tracked(quickly_compiled):
     entry = sc.problem("kepler")
     lenz = sc.check_symmetry(
