@@ -61,7 +61,7 @@ def rendered(name: str, method: str, *, newton: bool = False) -> Source:
     return render_arrays(program, control)
 
 
-@pytest.mark.tiers(1, 3)
+@pytest.mark.tiers(0, 3)
 @pytest.mark.sampled(5)
 @pytest.mark.parametrize(
     ("name", "method"),
@@ -80,6 +80,7 @@ def test_newton_iteration_is_strict_c(name: str, tmp_path: Path) -> None:
     check_arrays(rendered(name, "svi:4", newton=True), tmp_path)
 
 
+@pytest.mark.second
 def test_single_file_with_a_list_of_neighbours_is_strict_c(tmp_path: Path) -> None:
     """Names of its functions differ from the fields of the lists, which its header declares."""
     liquid = either_system(

@@ -148,7 +148,7 @@ def check_symbols(prefix: str, folder: Path) -> None:
     assert line.split()[1:3] == ["0", "0"]  # data, bss
 
 
-@pytest.mark.tiers(1, 2)
+@pytest.mark.tiers(0, 2)
 @pytest.mark.parametrize("method", METHODS)
 def test_code_allocates_nothing_writes_nothing_and_has_no_static_state(method):
     for source, _ in generated(method).values():
@@ -300,7 +300,7 @@ TITLES = [
 ]
 
 
-@pytest.mark.tiers(1, 2)
+@pytest.mark.tiers(0, 2)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("title", TITLES)
 def test_title_cannot_end_its_comment(title, tmp_path):
@@ -311,7 +311,7 @@ def test_title_cannot_end_its_comment(title, tmp_path):
     run([needs("gcc"), *STRICT, "-c", file], tmp_path)
 
 
-@pytest.mark.tiers(1, 3)
+@pytest.mark.tiers(0, 3)
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize("prefix", ["fabs", "errno", "NULL", "main", "newton", "step", "int", "m", "b"])
 def test_reserved_prefixes_of_c_are_valid(prefix, tmp_path):

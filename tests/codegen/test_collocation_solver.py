@@ -59,7 +59,7 @@ def test_start_from_rest_does_not_need_newton(sample, compiled, method):
     assert np.abs(np.subtract(*steps)).max() < 1e-14
 
 
-@pytest.mark.tiers(1)
+@pytest.mark.second
 @pytest.mark.parametrize("method", [sc.SpectralCollocation(3), PRINTED[0]], **named)
 def test_stored_velocity_is_recomputed_for_new_parameters(sample, compiled, method):
     stepper = compiled("pumped-cart-pole", method, solver="fixed-point")

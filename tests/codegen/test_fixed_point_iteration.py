@@ -91,7 +91,7 @@ def test_velocities_are_updated_by_the_full_mass_matrix_to_first_order(system):
         assert close(stepper.step(q0, p0, H, T, options=ONE_ITERATION), expected)
 
 
-@pytest.mark.tiers(1)
+@pytest.mark.second
 @pytest.mark.parametrize(
     "system", [problem("charged-particle").system, leaning(), relativistic()], ids=lambda system: system.name
 )
@@ -115,6 +115,7 @@ def test_many_coordinates_do_not_request_the_jacobian():
     assert "support/iteration/corrections.h" in iterated(chain).source.files
 
 
+@pytest.mark.second
 def test_momenta_follow_forces_and_velocities_follow_momenta():
     system = hamiltonian_of(problem("charged-particle").system)
     stepper, (derivative, velocity, _) = iterated(system), functions(system)

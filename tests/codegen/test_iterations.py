@@ -40,7 +40,7 @@ def stepper(name: str, solver: str) -> Stepper:
     return compile_stepper(case(name).system, case(name).method(), solver=solver, flags=QUICK_FLAGS)
 
 
-@pytest.mark.tiers(2, 3)
+@pytest.mark.tiers(1, 3)
 @pytest.mark.sampled(5)
 @pytest.mark.parametrize(("name", "solver"), EXPECTED)
 def test_iteration_counts_are_those_recorded(name, solver):
@@ -52,7 +52,7 @@ def test_iteration_counts_are_those_recorded(name, solver):
     assert counts == pytest.approx([*expected.values()], rel=ROUNDING, abs=2)
 
 
-@pytest.mark.tiers(2)
+@pytest.mark.tiers(1)
 @pytest.mark.parametrize("name", ["kepler/svi-3", "cart/svi", "field/gauss"])
 def test_lanes_use_as_many_iterations_as_single_runs(name):
     """Lanes start from equal states; predictors from one and two steps are equally good in a block."""
@@ -104,7 +104,7 @@ def test_newton_factors_are_reused_in_the_next_short_step():
     assert run._memory.guess == 2
 
 
-@pytest.mark.tiers(1)
+@pytest.mark.second
 @pytest.mark.parametrize(("name", "expected"), [("double/svi", (78, 177)), ("tangle/scvi", (37, 95))])
 def test_adaptive_steps_use_the_predictor_of_the_preceding_step(name, expected):
     """Compare Newton steps and iteration counts with steps of equal size."""

@@ -270,6 +270,7 @@ class TestRun:
             "run", "kepler", "--method", "explicit-euler", "--step", "0.1", "--span", "10"
         )
 
+    @pytest.mark.second
     def test_fewer_steps_than_save_every_and_no_steps(self):
         assert "3 steps of 0.25 from t = 0 to t = 0.75; 1 state saved" in output_of(
             "run", "kepler", "--steps", "3", "--save-every", "5", "-o", "a.npz"

@@ -48,6 +48,7 @@ def test_numbers_of_many_digits_are_shown_as_decimals():
     assert ["1234567" in str(each).replace("0.1234567", "") for each in shown] == [False, False, True]
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("method", [sc.Composition(4), sc.StoermerVerlet("drift-kick-drift")], ids=lambda m: m.name)
 def test_printed_statements_and_tables_are_the_step(method):
     """The lines of the text as they stand, with NumPy arrays in place of the index i."""

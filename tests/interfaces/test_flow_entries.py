@@ -67,6 +67,7 @@ def test_second_derivatives_of_batches():
     assert_allclose(found, exact, rtol=0, atol=1e-7 * abs(exact).max())
 
 
+@pytest.mark.second
 def test_external_functions_of_casadi_are_exported():
     source, name = with_casadi_flow(compiled().derivatives, STEPS, EVERY), casadi_name(compiled().source.prefix)
     arguments = "(const double **arg, double **res, long long *iw, double *w, int mem);\n"

@@ -201,6 +201,7 @@ def test_communication_steps_of_any_length_are_divided_equally(fmu):
     assert_allclose(one.get("t"), 1.001, rtol=1e-15)
 
 
+@pytest.mark.second
 def test_saved_fmu_state_continues_bitwise_also_from_bytes(fmu):
     one, other = Slave(fmu), Slave(fmu)
     assert one.start(0.5) == one.step(0.5, 3 * H) == OK
@@ -266,6 +267,7 @@ def test_forbidden_calls_are_errors_with_a_reason(fmu):
     one.call("FreeInstance")
 
 
+@pytest.mark.second
 def test_initial_states_far_off_their_constraints_are_rejected(tmp_path):
     fmu = Fmu(sc.generate_fmu(rod(), tmp_path / "rod.fmu"), tmp_path / "unpacked")
     near, far = Slave(fmu), Slave(fmu)
@@ -299,6 +301,7 @@ def test_description_has_the_elements_required_by_the_standard(fmu):
     assert unknown == references[3:5]
 
 
+@pytest.mark.second
 def test_model_with_initial_momenta_starts_with_them(tmp_path):
     fmu = Fmu(sc.generate_fmu(pushed(p=(0.4,)), tmp_path / "by_momenta.fmu"), tmp_path / "unpacked")
     assert (fmu.variables["p_q"]["start"], fmu.variables["q_dot"]["initial"]) == ("0.4", "calculated")
@@ -371,6 +374,7 @@ def test_unsuitable_models_and_names_are_rejected(tmp_path):
 class TestPlatforms:
     """Libraries for other machines, by the cross compiler of the extra ``compiler``."""
 
+    @pytest.mark.second
     def test_each_platform_has_its_folder(self, tmp_path, monkeypatch):
         monkeypatch.setattr(fmu_module, "library_for", lambda name, source, *, flags: f"{name} {flags}".encode())
         here = fmu_module._this_platform()

@@ -85,6 +85,7 @@ def test_errors_are_entries_of_the_document(words, status, error):
     assert all(type(found[name]) is type(value) for name, value in error.items())
 
 
+@pytest.mark.second
 def test_json_of_lists_and_model_files():
     listed = json_of("systems")["systems"]
     assert [entry["name"] for entry in listed] == list(sc.PROBLEMS)
@@ -107,6 +108,7 @@ def test_json_of_lists_and_model_files():
     assert np.sum(tableau["A"], axis=1) == pytest.approx(tableau["c"], abs=1e-16)
 
 
+@pytest.mark.second
 def test_json_of_a_derivation_has_its_formulas():
     derived, found = sc.derive(sc.problem("kepler").system, "scvi:3"), json_of("derive", "kepler", "--method", "scvi:3")
     residuals = [[str(each.residual) for each in part] for part in (derived.equations, derived.end_position)]

@@ -112,7 +112,7 @@ def test_unsupported_combinations_with_a_controller_are_reported(shaken: Path, w
     assert printed in " ".join(error_of(*words.replace("FILE", str(shaken)).split()).split())
 
 
-@pytest.mark.quick
+@pytest.mark.second
 def test_unsupported_model_fields_are_reported(shaken: Path, tmp_path: Path) -> None:
     model = sc.load_model(shaken)
     with pytest.raises(ModelFileError, match="reversible controller"):

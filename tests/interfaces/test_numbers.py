@@ -384,6 +384,7 @@ method = "svi:2"
 """
 
 
+@pytest.mark.second
 def test_every_field_and_line_of_an_array_system_is_correct(here):
     Path("ring.toml").write_text(RING)
     given = {"step": 0.25, "steps": 60, "save_every": 4}

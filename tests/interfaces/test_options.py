@@ -96,6 +96,7 @@ def test_page_of_model_files_has_the_table_of_options():
     assert f"\n\n{table}\n\n" in PAGE
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("key", ["solver_tolerance", "max_iterations"])
 def test_generated_programs_warn_of_options_that_they_do_not_use(key, tmp_path):
     from scvi_codegen import MethodWarning, generate_package
@@ -105,6 +106,7 @@ def test_generated_programs_warn_of_options_that_they_do_not_use(key, tmp_path):
         generate_package(parse_model(model_file(lines)), tmp_path / "one")
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("generate", ["generate_package", "generate_fmu"])
 def test_generated_programs_refuse_a_controller_with_a_step_size(generate, tmp_path):
     import scvi_codegen as sc

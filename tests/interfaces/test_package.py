@@ -144,7 +144,7 @@ def test_every_kind_of_folder_is_built_without_a_warning(words, tmp_path):
     assert (result.returncode, result.stderr) == (0, "")
 
 
-@pytest.mark.tiers(1, 2)
+@pytest.mark.tiers(0, 2)
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", ["main.c", "pendulum_svi.c", "__init__.py", "README.md", "interface.json"])
 def test_foreign_and_edited_files_require_force(pendulum, tmp_path, name):
@@ -183,6 +183,7 @@ def test_unsuitable_folder_names_are_rejected_with_a_suggestion(pendulum, tmp_pa
     assert not (tmp_path / name).exists()
 
 
+@pytest.mark.second
 def test_methods_without_text_form_are_generated_without_a_model_file(pendulum, tmp_path):
     own = sc.Quadrature(name="mine", points=(-0.5, 0.5), weights=(1, 1))
     folder = sc.generate_package(replace(pendulum, method=sc.SVI(1, own)), tmp_path / "own")
@@ -190,6 +191,7 @@ def test_methods_without_text_form_are_generated_without_a_model_file(pendulum, 
     assert sc.load_package(folder).dimension == 1
 
 
+@pytest.mark.second
 def test_velocities_without_momenta_are_rejected(tmp_path):
     model = model_of("relativistic-particle", velocity=(2.0,))
     with pytest.raises(sc.StateError, match="no momenta"):

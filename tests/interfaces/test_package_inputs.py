@@ -53,6 +53,7 @@ def test_events_of_a_system_with_inputs(model, h, restitution, tmp_path):
     assert_allclose(states[-1, :3], [2.3, run.q[-1, 0], run.p[-1, 0]], rtol=0, atol=1e-11)
 
 
+@pytest.mark.second
 def test_step_longer_than_the_segment_is_shortened(model):
     stepper = compile_stepper(model.system, model.method)
     given = {"u": ([0.0, 0.4, 1.0], [0.1, 0.2, 0.3]), "w": ([0.0, 1.0], [0.0, 0.0])}
@@ -81,7 +82,7 @@ def _tables(stepper, inputs):
     return table, saved
 
 
-@pytest.mark.tiers(1)
+@pytest.mark.second
 @pytest.mark.parametrize("precision", ["double", "single"])
 def test_inputs_on_a_microcontroller(model, precision, tmp_path):
     folder = generate_package(model, tmp_path / "pushed", embedded=precision)

@@ -91,6 +91,7 @@ def without_compiler(monkeypatch):
     monkeypatch.setattr(pages, "webassembly", lambda folder, sources: "")
 
 
+@pytest.mark.second
 @pytest.mark.usefixtures("without_compiler")
 def test_a_page_has_no_address_no_text_as_code_and_the_licences(tmp_path):
     page = sc.page(written(tmp_path), ranges={"k": (0.5, 2.0)})
@@ -146,6 +147,7 @@ def test_unsupported_systems_are_refused(tmp_path, old, new, ranges, message):
         sc.page(written(tmp_path, OSCILLATOR.replace(old, new, 1)), ranges=ranges)
 
 
+@pytest.mark.second
 @pytest.mark.usefixtures("without_compiler")
 def test_hamiltonians_start_from_momenta():
     """These need not be functions of the velocities."""
@@ -205,6 +207,7 @@ def test_mistakes_in_the_section_page_are_errors(tmp_path, old, new, message):
         sc.load_model(written(tmp_path, OSCILLATOR + PAGE.replace(old, new, 1)))
 
 
+@pytest.mark.second
 @pytest.mark.usefixtures("without_compiler")
 def test_a_system_with_its_motion_has_a_page(tmp_path):
     model = sc.load_model(written(tmp_path))

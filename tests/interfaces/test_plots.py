@@ -98,6 +98,7 @@ def test_section_contains_the_states_at_the_crossings(orbits, tmp_path):
     assert one.read_bytes() == two.read_bytes()
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [({"axes": ("y", "z")}, "'z' is neither"), ({"axes": ("y", "p_y"), "event": 2}, "no event 2")],

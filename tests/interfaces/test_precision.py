@@ -129,6 +129,7 @@ def test_decimals_and_fractions_are_exact(spring: Path, words: list[str]) -> Non
             assert "give numbers separated by commas" in " ".join(error_of("run", spring, "--q", wrong).split())
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("file", "text", "starts"),
     [
@@ -153,6 +154,7 @@ def test_ensembles_are_exact(spring: Path, file: str, text: str, starts: str) ->
             assert abs(mp.mpf(saved["q"][-1, j, 0]) + saved["q_low"][-1, j, 0] - exact) < 1e-30
 
 
+@pytest.mark.second
 def test_precision_is_read_and_replaced(spring: Path) -> None:
     """The flag replaces the value of the file; unknown values are refused."""
     assert not sc.load_model(spring, {"run": {"precision": "double"}}).in_double_double

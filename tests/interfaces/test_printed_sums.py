@@ -94,7 +94,7 @@ def stepped(system: Any, method: Any) -> tuple[Any, Any]:
     return run.q["q"], run.p["q"]
 
 
-@pytest.mark.tiers(1)
+@pytest.mark.second
 @pytest.mark.parametrize("method", [sc.StoermerVerlet(), sc.Composition(8)], ids=lambda method: method.name)
 def test_kicks_and_drifts_are_the_step(method):
     q, p = numbers(Q), numbers(P)

@@ -46,6 +46,7 @@ def named(values, letters="xyz"):
     return {f"{letter}_box": float(value) for letter, value in zip(letters, values, strict=True)}
 
 
+@pytest.mark.second
 def test_massless_links_follow_the_crank_of_a_parallelogram(tmp_path):
     hinge = '<joint name="{0}" type="hinge" axis="0 1 0"/><inertial pos="{1}" mass="{2}" diaginertia="{2} {2} {2}"/>'
     crank = '<body name="crank">' + hinge.format("crank", "0 0 0.5", 1) + "{}</body>"

@@ -274,6 +274,7 @@ def test_unsupported_expressions_are_not_written(expression: sympy.Expr, message
         format_expression(expression)
 
 
+@pytest.mark.second
 @settings(max_examples=40, deadline=None)
 @given(EXPRESSIONS)
 @example(sympy.atan2(0, sympy.atan2(0, X)))

@@ -82,6 +82,7 @@ def test_order_2s_against_the_equations_without_gauge(name: str) -> None:
     assert np.abs(adaptive.variables[-1] - expected).max() < 1e-12
 
 
+@pytest.mark.second
 def test_a_gauge_that_depends_on_time() -> None:
     """theta_x = y (1 + sin(t)/2)/2 and theta_y = -x (1 + sin(t)/2)/2 require the term F_t in H."""
     driven = sc.LagrangianSystem.from_text(
@@ -158,6 +159,7 @@ def test_arrays_of_vortices(size: str) -> None:
     assert np.abs(run.variables - expected.variables).max() < 1e-14
 
 
+@pytest.mark.second
 def test_canonical_one_forms_use_the_fixed_point_iteration() -> None:
     oscillator = sc.LagrangianSystem.from_text("oscillator", ["x", "y"], "x*y_dot - x**2/2 - y**2/2")
     assert oscillator.is_canonical
@@ -190,6 +192,7 @@ def test_the_choice_with_the_shortest_one_form_is_used() -> None:
     assert fields == ((x,), (y,), (y**2,), x * y, x**2 + y**2)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", ["Lotka-Volterra", "massless particle"])
 def test_integrals_are_expanded_about_the_origins_of_the_lagrangian(name: str) -> None:
     """A motion at 1000 takes the steps of the same one at 0, also near an equilibrium, with errors of u |q|."""
@@ -215,6 +218,7 @@ def test_integrals_are_expanded_about_the_origins_of_the_lagrangian(name: str) -
         assert np.abs(ends[1e-6][1] - true).max() < 10 * np.abs(ends[1e-6][0] - true).max()
 
 
+@pytest.mark.second
 def test_velocities_are_refused_and_available() -> None:
     stepper = sc.compile_stepper(system("coupled"), "svi:2")
     start = CASES["coupled"][3]
@@ -292,6 +296,7 @@ def test_derivatives_of_steps_against_differences(method: str) -> None:
     assert np.abs(stepper.vjp(z[:2], z[2:], h, t, cotangents=seeds) - seeds @ exact.state).max() < 1e-13
 
 
+@pytest.mark.second
 def test_inputs(tmp_path) -> None:
     driven = lagrange("driven", "x y", "(x + x**3)*y_dot - x**2/2 - y**2/2 - f*x - f**2*y", inputs="f")
     times = np.linspace(0.0, 2.0, 3)

@@ -164,6 +164,7 @@ def test_two_hundred_thousand_random_model_files():
     assert sum(map(try_model, range(10_000, 210_000))) > 5_000
 
 
+@pytest.mark.second
 def test_grids_are_read_or_rejected(tmp_path):
     model, random = sc.Model.from_problem(sc.problem("kepler")), Random(1)
     grid = next(text for text in seeds("models") if "[grid]" in text)
@@ -301,7 +302,7 @@ def code_of(text: str) -> str:
     return re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL)
 
 
-@pytest.mark.tiers(2, 7)
+@pytest.mark.tiers(1, 7)
 @pytest.mark.parametrize("title", TITLES, ids=lambda title: repr(title)[:20])
 def test_system_name_occurs_only_in_comments_and_prose(title, tmp_path):
     plain = sc.generate_package(hostile_model("plain"), tmp_path / "a" / "pendulum")

@@ -32,7 +32,7 @@ def value(system: Any, state: dict[str, Any], velocity: dict[str, Any]) -> float
     return float(evaluate(system.lagrangian, {each: values[each.name] for each in system.lagrangian.free_symbols}))
 
 
-@pytest.mark.tiers(1, 4)
+@pytest.mark.tiers(0, 4)
 @pytest.mark.parametrize("shape", SHAPES)
 def test_inertias_of_shapes_are_integrals(shape):
     size = np.array([0.5, 0.7, 0.9][: SHAPES[shape][0]])

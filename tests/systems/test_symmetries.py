@@ -357,7 +357,7 @@ EXACT = [
 ]
 
 
-@pytest.mark.tiers(1, 3)
+@pytest.mark.tiers(0, 3)
 @pytest.mark.sampled(7)
 @pytest.mark.parametrize(("name", "method"), EXACT, ids=lambda value: getattr(value, "name", value))
 def test_claimed_conservation_is_measured(quickly_compiled, name, method):
@@ -369,6 +369,7 @@ def test_claimed_conservation_is_measured(quickly_compiled, name, method):
     assert errors[exact].max() < ROUNDOFF
 
 
+@pytest.mark.second
 def test_supplied_generator_is_tracked(quickly_compiled):
     entry = sc.problem("kepler")
     lenz = sc.check_symmetry(

@@ -287,6 +287,7 @@ def test_large_coupled_mass_matrix_is_accepted() -> None:
     assert from_text(" ".join(names), coupled + " + x0_dot**2").dimension == 40
 
 
+@pytest.mark.second
 def test_rates_along_a_curve_are_those_of_its_taylor_series():
     """dL/dt and d2L/dt2 of a system with velocities in every term, compared with L along a prescribed curve of time."""
     system = lagrange("twisted", "x y", "x_dot**2*y/2 + y_dot**2*exp(x)/2 + t*x*y_dot - x**2*y + sin(t)*x")

@@ -53,6 +53,7 @@ def test_values_of_two_arguments(degree):
         assert abs(float(tape([*map(mp.mpf, (u, w, 0.0, 0.0))])[0]) + exact) < 1e-12
 
 
+@pytest.mark.second
 def test_arrays_have_the_motion_of_named_coordinates():
     functions = {"F": sc.Table(X, np.abs(X), outside="linear"), "G": sc.Table(X, X**3, degree=2, outside="linear")}
     terms = [f"q_{i}_dot**2/2 - F(q_{i})" for i in range(3)]
@@ -99,6 +100,7 @@ function = "F(x) - 0.3"
 """
 
 
+@pytest.mark.second
 def test_model_files():
     model = parse_model(TABLED.replace("[[0, 1, 0], [1, 1, 1]]", "[[0, 1, 0], [1, 1, 1], [2, 0, 2]]"))
     assert parse_model(dump_model(model)) == model
@@ -111,6 +113,7 @@ def test_model_files():
         parse_model(TABLED)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("plan", [{"h": 0.01, "steps": 500}, {"t_end": 5.0}])
 @pytest.mark.parametrize("kinks", ["located", "as formulas"])
 def test_runs_end_where_a_table_ends(plan, kinks):
