@@ -289,6 +289,40 @@ def test_a_missing_compiler_is_an_error_with_its_remedy(tmp_path, monkeypatch):
         sc.page(written(tmp_path))
 
 
+FRAMES = """
+const { cost, slower, resolution, drawing } = JSON.parse(process.argv[1]);
+let time = 0, step = cost;
+const clock = () => Math.floor(time / resolution) * resolution, frames = scheduler(clock), list = [];
+for (let k = 0; k < 100; k++) {
+  const began = time;
+  if (k === 50) step *= slower;
+  frames.begin();
+  const done = frames.perform(() => 1e7, (now) => { time += now * step; }), drawn = clock();
+  time += drawing;
+  frames.drawn(clock() - drawn);
+  list.push([time - began, done * step]);
+  time += 4.7;
+}
+console.log(JSON.stringify(list));
+"""
+
+
+@pytest.mark.parametrize(
+    ("cost", "slower", "resolution", "drawing"),
+    [(0.0002, 4, 0.1, 0.5), (0.02, 4, 0.1, 3), (0.08, 4, 1, 1), (1.5, 1, 0.005, 3), (0.3, 4, 0.005, 9)],
+)
+def test_a_frame_takes_at_most_12_milliseconds(cost, slower, resolution, drawing):
+    """The clock of the scheduler is that of the test, rounded as in browsers; steps become slower in frame 50."""
+    node = needs("node")
+    text = (Path(__file__).parents[2] / "templates/page/frames.js").read_text(encoding="utf-8")
+    case = {"cost": cost, "slower": slower, "resolution": resolution, "drawing": drawing}
+    done = subprocess.run([node, "-e", text + FRAMES, json.dumps(case)], capture_output=True, check=True)
+    durations, performed = np.array(json.loads(done.stdout)).T
+    assert durations[1:].max() < 12.001 + max(0.0, resolution - 0.1)
+    assert durations[0] < 12.001 + drawing  # whose time is unknown
+    assert performed[5:].mean() > 0.5 * max(2.0, 10.5 - drawing)
+
+
 def computed(text, steps):
     """Return the state of a page after steps, in node."""
     node = needs("node")

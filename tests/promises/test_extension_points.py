@@ -310,6 +310,22 @@ for degree, least, most in ((4, 1e-3, 4e-3), (12, 1e-6, 2e-5)):
     assert run(extended, script).split() == ["True"] * 6
 
 
+def test_documented_observer_measures_the_variance(extended: Path) -> None:
+    script = """
+import numpy as np
+from scvi_codegen import compile_stepper
+from scvi_codegen.runs.driver.variance import Variance
+from scvi_codegen.interfaces.models.problems import problem
+stepper = compile_stepper(problem("kepler").system, "svi:2")
+arguments = {"q": [1.0, 0.0], "p": [0.0, 1.1], "h": 0.1, "steps": 500}
+saved = stepper.integrate(**arguments).q
+for observe in ("variance", Variance()):
+    run = stepper.integrate(**arguments, observe=observe)
+    print(np.allclose(run.observed, saved.var(axis=0), rtol=1e-12), len(run.q), np.array_equal(run.q[-1], saved[-1]))
+"""
+    assert run(extended, script).split() == ["True", "2", "True"] * 2
+
+
 @pytest.mark.quick
 def test_two_block_sizes_need_blocks_and_rows_of_each() -> None:
     """Multipliers are blocks of as many components as there are constraints."""
