@@ -40,7 +40,7 @@ def stepper(name: str, solver: str) -> Stepper:
     return compile_stepper(case(name).system, case(name).method(), solver=solver, flags=QUICK_FLAGS)
 
 
-@pytest.mark.tiers(1, 3)
+@pytest.mark.tiers(0, 3)
 @pytest.mark.sampled(5)
 @pytest.mark.parametrize(("name", "solver"), EXPECTED)
 def test_iteration_counts_are_those_recorded(name, solver):
@@ -52,7 +52,7 @@ def test_iteration_counts_are_those_recorded(name, solver):
     assert counts == pytest.approx([*expected.values()], rel=ROUNDING, abs=2)
 
 
-@pytest.mark.tiers(1)
+@pytest.mark.second
 @pytest.mark.parametrize("name", ["kepler/svi-3", "cart/svi", "field/gauss"])
 def test_lanes_use_as_many_iterations_as_single_runs(name):
     """Lanes start from equal states; predictors from one and two steps are equally good in a block."""
@@ -113,6 +113,7 @@ def test_adaptive_steps_use_the_predictor_of_the_preceding_step(name, expected):
     assert (len(run.t), int(run.iterations.sum())) == pytest.approx(expected, rel=ROUNDING, abs=2)
 
 
+@pytest.mark.second
 def test_reused_factors_need_two_updates_at_convergence():
     """Factors of another point must reduce an update once before a small update indicates convergence."""
     own = problem("fput-chain").system

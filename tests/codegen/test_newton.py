@@ -94,7 +94,7 @@ class TestReusedFactors:
     def test_runs_reuse_enough_factors(self, method):
         assert chain(method).interface.unknowns >= LEAST_REUSED_UNKNOWNS
 
-    @pytest.mark.tiers(1)
+    @pytest.mark.second
     def test_run_with_time_dependent_springs_split_anywhere_is_bitwise_equal(self, method):
         """Factors are made again where and when they were made: with all that their matrix depends on."""
         q, p = state()
@@ -107,6 +107,7 @@ class TestReusedFactors:
         assert np.array_equal(last.q[-1], expected.q[-1])
         assert np.array_equal(last.p[-1], expected.p[-1])
 
+    @pytest.mark.second
     def test_failed_step_does_not_change_the_run(self, method):
         q, p = state()
         run = chain(method).start(q, p, h=0.15)

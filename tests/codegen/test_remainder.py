@@ -47,7 +47,7 @@ def slope(system: LagrangianSystem, method: str, q: list[float], angle: float) -
     return float(abs(per_step / energy[0]) * 2**53)
 
 
-@pytest.mark.tiers(2, 4)
+@pytest.mark.tiers(1, 4)
 @pytest.mark.sampled(4)
 @pytest.mark.parametrize(("method", "angle"), WORST)
 def test_the_energy_of_an_oscillator_does_not_drift(method, angle):

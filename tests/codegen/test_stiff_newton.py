@@ -18,7 +18,7 @@ def spring_pendulum():
     )
 
 
-@pytest.mark.tiers(1)
+@pytest.mark.second
 @pytest.mark.parametrize("method", [RadauIIA(3), SVI(1), SVI(2)], ids=lambda method: method.name)
 def test_steps_are_those_of_60_digits_up_to_the_rounding_of_positions(method):
     """The momenta's error is what rounding of a position does through the spring in a step: h k epsilon."""

@@ -44,6 +44,7 @@ def spring(stiffness: float = 1.0) -> sc.LagrangianSystem:
     return lagrange("spring", "q", "q_dot**2/2 - k*q**2/2", k=stiffness)
 
 
+@pytest.mark.second
 def test_cached_derivations_are_not_repeated(made):
     first, second = (sc.compile_stepper(spring(), sc.SVI(2)) for _ in range(2))
     assert len(made) == 1
@@ -165,6 +166,7 @@ def test_source_is_derived_again_if_only_the_key_of_the_system_is_left(made, tmp
     assert source.exists()
 
 
+@pytest.mark.second
 def test_text_with_warnings_is_always_read(made):
     for _ in range(2):
         with pytest.warns(sc.SystemDefinitionWarning, match="parameter 'c' does not occur"):

@@ -76,6 +76,7 @@ def test_two_integrators_in_one_translation_unit_agree_with_python(compiler, tmp
     assert np.array(printed.split(), dtype=float) == pytest.approx(expected, rel=1e-13, abs=1e-13)
 
 
+@pytest.mark.second
 def test_no_name_or_macro_of_an_integrator_remains(tmp_path):
     """The same program twice, under two prefixes, is the hardest case: every name occurs in both."""
     for prefix in ("one", "two"):

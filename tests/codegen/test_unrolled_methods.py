@@ -51,6 +51,7 @@ def test_unrolled_and_tabulated_methods_are_equal(case, monkeypatch):
     assert (ours.p == theirs.p).all()
 
 
+@pytest.mark.second
 def test_example_of_the_paper_is_solved():
     """Equation (37) and (34e), with the numbers that the paper prints, at the states of the compiled step."""
     h, q0, p0 = 0.1, 0.5, 0.2

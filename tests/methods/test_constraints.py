@@ -50,6 +50,7 @@ def on_circle(angle):
     return 1.5 * np.array([np.sin(angle), -np.cos(angle)])
 
 
+@pytest.mark.second
 def test_degree_1_is_rattle():
     """RATTLE written down for the rod: two kicks, a drift, and multipliers that two quadratic equations give."""
     stepper, h, m, l2 = sc.compile_stepper(rod(), lobatto(1)), 0.05, 2.0, 2.25

@@ -221,7 +221,7 @@ def test_import_generated_stepper_runs_without_sympy(output_of):
     assert float(output.rsplit(maxsplit=1)[1]) < 1e-8
 
 
-@pytest.mark.quick
+@pytest.mark.second
 def test_custom_sympy_system_finds_the_bifurcation(output_of):
     output = output_of("custom_sympy_system")
     assert "the same from LagrangesMethod: True" in output
@@ -290,7 +290,7 @@ def test_joint_forces_are_the_documented_ones(output_of):
     assert sum(hangers) == pytest.approx((9 * 0.2 + 3.0) * 9.81, abs=1e-3)
 
 
-@pytest.mark.quick
+@pytest.mark.second
 def test_a_cart_balances_its_pole(output_of):
     output = output_of("balanced_cart_pole")
     assert float(re.search(r"formula to (\S+)", output)[1]) < 1e-9

@@ -31,7 +31,8 @@ def test_table_lists_the_features_that_are_tested():
     assert {cell for row in TABLE.values() for cell in row.values()} == {"yes", "no"}
 
 
-@pytest.mark.parametrize("kind", [KINDS[0], *(pytest.param(kind, marks=pytest.mark.second) for kind in KINDS[1:])])
+@pytest.mark.second
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("feature", FEATURES)
 def test_features_work_or_are_refused_with_a_reason(feature, kind, kinds, tmp_path):
     of = kinds[kind]
@@ -187,7 +188,7 @@ def situations():
     return cache(lambda name: SITUATIONS[name]())
 
 
-@pytest.mark.tiers(1, 3)
+@pytest.mark.tiers(0, 3)
 @pytest.mark.parametrize("situation", SITUATIONS)
 def test_refusals_of_the_table_are_those_of_the_operations(situation, situations):
     stepper = situations(situation)
@@ -222,6 +223,7 @@ def test_every_property_of_a_stepper_has_a_stepper_that_has_it():
     assert named & known == set(SITUATIONS) - {""} | set(PLAIN)
 
 
+@pytest.mark.second
 def test_arguments_of_one_run_exclude_each_other():
     stepper = stepper_of()
     for operation, other in (("t_eval", "inputs"), ("observe", "inputs"), ("observe", "t_eval"), ("chaos", "inputs")):

@@ -374,6 +374,7 @@ def test_only_regular_files_are_read(name: str, other: str, tmp_path: Path) -> N
         kind.read(tmp_path)
 
 
+@pytest.mark.second
 def test_a_full_disk_before_the_manifest_leaves_nothing_to_resume(tmp_path: Path) -> None:
     run = sc.compile_stepper(sc.problem("planar-pendulum").system, "svi:2", flags=QUICK_FLAGS).start(
         [1.0], [0.0], h=0.1

@@ -87,7 +87,7 @@ def middle_of(view: Any) -> tuple[float, float]:
     return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
 
 
-@pytest.mark.quick
+@pytest.mark.second
 @pytest.mark.second
 def test_a_page_computes_the_bits_of_python_and_asks_for_nothing(view, pages):
     state = opened(view, pages["figure_eight"], "#.n=1000", 1000)

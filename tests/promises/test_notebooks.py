@@ -42,6 +42,7 @@ def test_notebooks_are_saved_without_outputs(path):
     assert sum("alt" in cell["metadata"] for cell in code) >= 2
 
 
+@pytest.mark.second
 def test_results_are_below_their_cells(tmp_path):
     pytest.importorskip("matplotlib.pyplot").close("all")  # of other tests in this process
     drawn = "import matplotlib.pyplot as plt\nplt.plot([0, 1]);"
