@@ -123,7 +123,7 @@ def test_initial_states_cost_less_than_one_function_call_each(
     name: str, kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(batches, "CHUNK_SECONDS", 1e3)
-    one, (q, p) = stepper(name), (np.repeat(x, 250, axis=0) for x in states(name))
+    one, (q, p) = stepper(name), (np.repeat(x, 400, axis=0) for x in states(name))
     one.integrate_ensemble(q, **{kind: p}, h=0.05, steps=2, threads=1)
     with at_most(len(q)):
         one.integrate_ensemble(q, **{kind: p}, h=0.05, steps=2, threads=1)
