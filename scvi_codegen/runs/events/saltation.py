@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scvi_codegen.codegen.native.options import REASONS
 from scvi_codegen.codegen.rendering.source import Interface
 from scvi_codegen.common.errors import StateError
-from scvi_codegen.runs.events.contact_changes import change_at
+from scvi_codegen.runs.events.contact_changes import change_at, kept_direction
 from scvi_codegen.runs.results.recomputation import changes_by_events, steps_after
 from scvi_codegen.runs.results.saved_states import parameters_on_sides
 from scvi_codegen.runs.states.times import WHOLE
@@ -89,7 +89,59 @@ def jumps_within(
     """
     changes = _changes(states, numbers)
     rows = [(k, row) for k, row in enumerate(numbers.tolist()) if k and row in changes]
-    return {k: _jump(states, starts, k, row, *changes[row], all_inputs=all_inputs) for k, row in rows}
+    jumps = {k: _jump(states, starts, k, row, *changes[row], all_inputs=all_inputs) for k, row in rows}
+    if any(contact.slips == 2 for contact in states.stepper.interface.contacts):
+        _add_slips(jumps, states, starts, numbers, all_inputs=all_inputs)
+    return jumps
+
+
+def _add_slips(
+    jumps: dict[int, Jump], states: SavedStates, starts: Starts, numbers: NDArray[np.intp], *, all_inputs: bool
+) -> None:
+    """Add the derivatives of slips in space: of the directions that they keep, and at the ends of parts of steps.
+
+    The parameters S^2 d and d of a direction d = u/|u| change by (1 - d d^T) du / |u|. The size of a part is fixed: dh
+    lengthens the last one alone.
+    """
+    stepper = states.stepper
+    size, m, contacts = stepper._input_size, stepper.dimension, stepper.interface.contacts
+    history = getattr(states, "modes", None)
+    if history is None or not np.isin(history.t, states.t).all():
+        raise StateError("this requires the states where slips in space change: save all states (save_every=1)")
+    for k, row in enumerate(numbers.tolist()):
+        if (row > 0) != (k > 0):
+            continue
+        here = Place(states, float(states.t[row]), parameters_on_sides(states, float(states.t[row])), all_inputs)
+        before = parameters_on_sides(states, float(starts.t[k - 1])) if k else np.zeros(len(here.parameters))
+        state = np.concatenate([states.q[row], states.p[row]])
+        jump = jumps.get(k, Jump(np.eye(size), state))
+        if k and k not in jumps and _is_part(states, row):
+            place = (starts.q[k - 1], starts.p[k - 1], float(starts.h[k - 1]), float(starts.t[k - 1]))
+            jump.matrix[: 2 * m, -1] -= stepper._products(*place, before, states.options, np.eye(size)[-1:])[0, : 2 * m]
+            jump.matrix[-2, -1] -= 1.0
+            jumps[k] = jump
+        for number, contact in enumerate(contacts):
+            places = [*map(stepper.parameters.index, contact.directions[1:])]
+            if np.array_equal(before[places], here.parameters[places]):
+                continue
+            start, ahead = here.parameters[places].reshape(2, 2)
+            rows, change = [2 * m + place for place in places], np.zeros((4, size))
+            if start.any():
+                vector = kept_direction(stepper, number, state, here.t, here.parameters)
+                u = vector(state[:m], state[m:], here.t, here.parameters)
+                by = _differences(vector, here, state[:m], state[m:]) @ np.delete(jump.matrix, -1, axis=0)
+                turned = (by - np.outer(ahead, ahead @ by)) / np.linalg.norm(u)
+                change = np.concatenate([np.linalg.norm(start) * turned, turned])
+            jump.matrix[rows] = change
+            jumps[k] = jump
+
+
+def _is_part(states: SavedStates, row: int) -> bool:
+    """Return whether a state is within a fixed step."""
+    steps = abs(states.t[row] - states.t[0]) / abs(states.h)
+    return (
+        isinstance(states.plan, FixedSteps) and 0 < row < len(states) - 1 and abs(steps - round(steps)) > WHOLE * steps
+    )
 
 
 def _changes(states: SavedStates, numbers: NDArray[np.intp]) -> dict[int, tuple[Event, Array]]:

@@ -141,7 +141,6 @@ FEATURES = {
             "make them terminal and restart",
         ),
         ("with events that set parameters", _DERIVATIVES, "make them terminal, and restart with the new parameters"),
-        ("with slip in space", _DERIVATIVES, "use differences of runs"),
         (
             "with contacts",
             "error check_growth device observe_ensemble hessian chaos_ensemble flow advice shadow_energy",
