@@ -160,9 +160,9 @@ def propagate(states: SavedStates, starts: Starts, numbers: NDArray[np.intp], ve
     if states.stepper.divides_steps:
         more = back or bool(vectors[..., 2 * states.stepper.dimension :].any())
         jumps = jumps_within(states, starts, numbers, all_inputs=more)
-    start = _change_at_start(states, numbers, jumps)
-    if start is not None and not back:
-        vectors[0] = vectors[0] @ start.T
+    start = jumps.pop(0, None)
+    if start and not back:
+        vectors[0] = vectors[0] @ start.matrix.T
     parts = list(pairwise(sorted({0, len(starts.h), *jumps})))
     for first, last in reversed(parts) if back else parts:
         if back and last in jumps:
@@ -180,18 +180,8 @@ def propagate(states: SavedStates, starts: Starts, numbers: NDArray[np.intp], ve
         if jumps:  # states near rest, after impacts that accumulate, are not exact relative to themselves
             before = np.maximum(np.abs(before), max(np.abs(starts.q).max(), np.abs(starts.p).max()))
         check_recomputed(part.t, np.concatenate(ends, axis=1), saved[1:], before)
-    if start is not None and back:
-        vectors[0] = vectors[0] @ start
-
-
-def _change_at_start(states: SavedStates, numbers: NDArray[np.intp], jumps: dict[int, Jump]) -> Array | None:
-    """Return the derivative of the variables with the first modes of a run, which do not vary themselves."""
-    places = [2 * states.stepper.dimension + states.stepper.parameters.index(name) for name in states.stepper.modes]
-    if not places or numbers[0] != 0:
-        return None
-    matrix = jumps.pop(0).matrix if 0 in jumps else np.eye(states.stepper._input_size)
-    matrix[:, places] = 0.0
-    return matrix
+    if start and back:
+        vectors[0] = vectors[0] @ start.matrix
 
 
 def pieces(states: SavedStates) -> Iterator[tuple[int, int]]:

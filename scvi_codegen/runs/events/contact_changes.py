@@ -164,35 +164,45 @@ def change_at(
     return changes[int(np.argmin(errors))]
 
 
-def kept_direction(stepper: Integrator, k: int, state: Array, t: float, parameters: Array) -> Change:
-    """Return a vector along the direction that slip k in space keeps from a state on, as a function of the state.
+def slip_of(stepper: Integrator, k: int) -> Change:
+    """Return slip k as a function of the state."""
+    slips = Part.of(k, stepper.interface.contacts[k]).slips
+    return lambda q, p, t, parameters: Rows.at(stepper, np.concatenate([q, p]), t, parameters).rate[slips]
 
-    It is the slip, where slip begins its rate, and where that is 0, too, the friction of sticking, reversed.
+
+def kept_direction(stepper: Integrator, k: int, state: Array, t: float, parameters: Array) -> Change:
+    """Return the vector whose direction slip k in space keeps from a state on, as a function of the state.
+
+    It is the slip, and where slip begins its rate.
 
     Raises:
-        StateError: if none of them has the direction, or if slip begins while another contact slides in space.
+        StateError: if neither has this direction: for slip that begins without a jump of friction, and more than one.
     """
     contacts, named = stepper.interface.contacts, stepper.parameters_by_name(parameters)
-    ahead, slips = np.array([named[name] for name in contacts[k].directions[3:]]), Part.of(k, contacts[k]).slips
+    ahead, slip = np.array([named[name] for name in contacts[k].directions[3:]]), slip_of(stepper, k)
     closed = [(j, item) for j, item in enumerate(contacts) if item.closed is None or named[item.closed]]
     slides = [j for j, item in closed if item.slips and not named[str(item.sticks)]]
     directions = {j: np.array([named[contacts[j].directions[0]]]) for j in slides} | {k: ahead}
-    start = Rows.at(stepper, state, t, parameters)
-    vectors: list[Callable[[Rows], Array]] = [lambda of: of.rate[slips]]
-    if all(contacts[j].slips == 1 or j == k for j in slides):
-        parts = [Part.of(j, item, directions.get(j)) for j, item in closed]
-        held = [part._replace(direction=None) if part.contact == k else part for part in parts]
-        begins, sticks = (Response(which, start, start.second) for which in (parts, held))
-        vectors += [lambda of: begins.at(of, of.second)[1][slips], lambda of: -sticks.at(of, of.second)[0][slips]]
-    sizes = [(u := vector(start), float(np.linalg.norm(u))) for vector in vectors]
-    same = [float(np.abs(u - size * ahead).max()) < SAME_DIRECTION * size for u, size in sizes]
-    if True not in same:
+    start, slips = Rows.at(stepper, state, t, parameters), Part.of(k, contacts[k]).slips
+    if _is_along(start.rate[slips], ahead):
+        return slip
+    begins = Response([Part.of(j, item, directions.get(j)) for j, item in closed], start, start.second)
+    if any(contacts[j].slips == 2 and j != k for j in slides) or not _is_along(begins.rates[slips], ahead):
         raise StateError(
-            f"slip of contact {k + 1} at t = {t:.17g} begins in a direction that is not that of its state alone, as "
-            "while another contact slides in space: derivatives through it are not available"
+            f"the direction in which contact {k + 1} begins to slip at t = {t:.17g} has no derivative: require "
+            "static_friction above friction, and no other contact that slides in space"
         )
-    vector = vectors[same.index(True)]
-    return lambda q, p, t, parameters: vector(Rows.at(stepper, np.concatenate([q, p]), t, parameters))
+
+    def rate(q: Array, p: Array, t: float, parameters: Array) -> Array:
+        of = Rows.at(stepper, np.concatenate([q, p]), t, parameters)
+        return begins.at(of, of.second)[1][slips]
+
+    return rate
+
+
+def _is_along(vector: Array, direction: Array) -> bool:
+    size = float(np.linalg.norm(vector))
+    return float(np.abs(vector - size * direction).max()) < SAME_DIRECTION * size
 
 
 def _impulses(
