@@ -21,10 +21,8 @@ from scvi_codegen.systems.event import Transition
 
 ROUNDING = 1e-9
 """Part of their size below which rates and impulses count as 0."""
-SAME_DIRECTION = 1e-6
-"""Difference of directions up to which they are the same."""
 SAME_IMPULSE, SAME_MOMENTUM = 1e-6, 1e-13
-"""Differences from the run relative to an impulse, and to momenta, up to which an impulse is the same."""
+"""Differences from the run relative to an impulse or a slip, and to momenta, up to which they are the same."""
 
 Change = Callable[[Array, Array, float, Array], Array]
 """Map of q, p, t and parameters."""
@@ -62,18 +60,14 @@ class Part(NamedTuple):
     contact: int
     normal: int | None
     slips: list[int]
+    rows: list[int]
     direction: Array | None = None
 
     @classmethod
     def of(cls, k: int, item: ContactRows, direction: Array | None = None) -> "Part":
         """Construct for contact k."""
-        first = item.tangential or 0
-        return cls(k, item.normal, [*range(first, first + item.slips)], direction)
-
-    @property
-    def rows(self) -> list[int]:
-        """All rows."""
-        return ([] if self.normal is None else [self.normal]) + self.slips
+        slips = [*range(item.tangential or 0, (item.tangential or 0) + item.slips)]
+        return cls(k, item.normal, slips, ([] if item.normal is None else [item.normal]) + slips, direction)
 
 
 class Response:
@@ -87,7 +81,7 @@ class Response:
         self.active = [row for part in parts for row in part.rows]
         self.forces, self.turning = np.zeros(len(right)), np.zeros((len(right), len(right)))
         self.forces, self.rates = self.at(of, right)
-        for _, _, slips, d in parts:
+        for _, _, slips, _, d in parts:
             if d is not None and (speed := float(np.linalg.norm(self.rates[slips]))):
                 self.turning[np.ix_(slips, slips)] = (d @ d * np.eye(len(d)) - np.outer(d, d)) / speed
 
@@ -95,7 +89,7 @@ class Response:
         """Return the forces at other rows, and the rates after them, to first order."""
         rates, forces = right + of.inverse_masses @ self.forces, self.forces.copy()
         residual, matrix = rates.copy(), of.inverse_masses.copy()
-        for contact, normal, slips, direction in self.parts:
+        for contact, normal, slips, _, direction in self.parts:
             if direction is not None:
                 mu, turning = of.coefficients[contact, 0], self.turning[slips]
                 size = mu * (1.0 if normal is None else forces[normal])
@@ -122,6 +116,13 @@ def change_at(
         StateError: if the impulses are those of several impacts, one after another.
     """
     q, p = np.split(before, 2)
+    start = Rows.at(stepper, before, t, modes[0])
+    friction, static, _ = start.coefficients[event.contact]
+    if event.kind == "begins" and not static > friction:
+        raise StateError(
+            f"the direction in which contact {event.contact + 1} begins to slip at t = {t:.17g} has no derivative: it "
+            "requires static_friction above friction"
+        )
     parts = _impulses(stepper, event, before, after, t, modes[0]) if event.kind == "closes" else []
     normal = stepper.interface.contacts[event.contact].normal
     places = [*map(stepper.parameters.index, stepper.modes)]
@@ -132,7 +133,6 @@ def change_at(
             right[normal] *= 1.0 + elastic * of.coefficients[event.contact, 2]
             return right
 
-        start = Rows.at(stepper, before, t, modes[0])
         impulses = Response(parts, start, rates(start))
 
         def changed(q: Array, p: Array, t: float, parameters: Array) -> Array:
@@ -171,38 +171,32 @@ def slip_of(stepper: Integrator, k: int) -> Change:
 
 
 def kept_direction(stepper: Integrator, k: int, state: Array, t: float, parameters: Array) -> Change:
-    """Return the vector whose direction slip k in space keeps from a state on, as a function of the state.
-
-    It is the slip, and where slip begins its rate.
+    """Return the vector, slip k in space or where this begins its rate, whose direction it keeps from a state on.
 
     Raises:
-        StateError: if neither has this direction: for slip that begins without a jump of friction, and more than one.
+        StateError: if neither has this direction, that of slip that begins while another contact slides in space.
     """
     contacts, named = stepper.interface.contacts, stepper.parameters_by_name(parameters)
-    ahead, slip = np.array([named[name] for name in contacts[k].directions[3:]]), slip_of(stepper, k)
+    values = np.array([named[name] for name in contacts[k].directions])
+    ahead, speed = values[3:], float(np.sqrt(np.linalg.norm(values[1:3])))
     closed = [(j, item) for j, item in enumerate(contacts) if item.closed is None or named[item.closed]]
     slides = [j for j, item in closed if item.slips and not named[str(item.sticks)]]
     directions = {j: np.array([named[contacts[j].directions[0]]]) for j in slides} | {k: ahead}
     start, slips = Rows.at(stepper, state, t, parameters), Part.of(k, contacts[k]).slips
-    if _is_along(start.rate[slips], ahead):
-        return slip
+    if _is_along(start.rate[slips], ahead, speed):
+        return slip_of(stepper, k)
     begins = Response([Part.of(j, item, directions.get(j)) for j, item in closed], start, start.second)
-    if any(contacts[j].slips == 2 and j != k for j in slides) or not _is_along(begins.rates[slips], ahead):
-        raise StateError(
-            f"the direction in which contact {k + 1} begins to slip at t = {t:.17g} has no derivative: require "
-            "static_friction above friction, and no other contact that slides in space"
-        )
-
-    def rate(q: Array, p: Array, t: float, parameters: Array) -> Array:
-        of = Rows.at(stepper, np.concatenate([q, p]), t, parameters)
-        return begins.at(of, of.second)[1][slips]
-
-    return rate
+    rates, size = begins.rates[slips], float(np.abs(start.second[slips]).max())
+    if any(contacts[j].slips == 2 and j != k for j in slides) or not _is_along(rates, ahead, size):
+        raise StateError(f"slip {k + 1} begins at t = {t:.17g} while another one turns: derivatives are unavailable")
+    return lambda q, p, t, parameters: begins.at(
+        of := Rows.at(stepper, np.concatenate([q, p]), t, parameters), of.second
+    )[1][slips]
 
 
-def _is_along(vector: Array, direction: Array) -> bool:
+def _is_along(vector: Array, direction: Array, scale: float) -> bool:
     size = float(np.linalg.norm(vector))
-    return float(np.abs(vector - size * direction).max()) < SAME_DIRECTION * size
+    return ROUNDING * scale < size and float(np.abs(vector - size * direction).max()) < SAME_IMPULSE * size
 
 
 def _impulses(
@@ -214,9 +208,7 @@ def _impulses(
     q, p = np.split(before, 2)
     sizes = np.sqrt(np.abs(np.diag(first.inverse_masses) * (p @ stepper.velocity(q, p, t, parameters))))
     taking_part = [
-        Part.of(k, item)
-        for k, item in enumerate(contacts)
-        if item.normal is not None and (k == event.contact or named[str(item.closed)])
+        Part.of(k, item) for k, item in enumerate(contacts) if k == event.contact or named.get(str(item.closed))
     ]
     rows = [row for part in taking_part for row in part.rows]
     total, parts = np.zeros(len(first.rate)), []

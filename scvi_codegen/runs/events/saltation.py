@@ -72,12 +72,6 @@ class Place(NamedTuple):
     parameters: Array
     all_inputs: bool
 
-    @classmethod
-    def after(cls, states: SavedStates, row: int, all_inputs: bool) -> Place:
-        """Construct for a saved state."""
-        t = float(states.t[row])
-        return cls(states, t, parameters_on_sides(states, t), all_inputs)
-
 
 def jumps_within(
     states: SavedStates, starts: Starts, numbers: NDArray[np.intp], *, all_inputs: bool
@@ -95,15 +89,15 @@ def jumps_within(
             grazes, or for a run backward in time.
     """
     stepper, slides = states.stepper, _directions(states.stepper)
-    changes = (_turns(states, numbers) if slides else {}) | _changes(states, numbers)
-    rows = [(k, row) for k, row in enumerate(numbers.tolist()) if row > 0 < k]
-    jumps = {
-        k: _jump(states, starts, k, row, *changes[row], all_inputs=all_inputs) for k, row in rows if row in changes
-    }
-    if slides:
-        jumps |= {k: _end_of_part(states, starts, k, row) for k, row in rows if row not in changes}
+    changes, jumps = (_turns(states, numbers) if slides else {}) | _changes(states, numbers), {}
+    for k, row in enumerate(numbers.tolist()):
+        if row in changes and k:
+            jumps[k] = _jump(states, starts, k, row, *changes[row], all_inputs=all_inputs)
+        elif slides and row > 0 < k:
+            jumps[k] = _end_of_part(states, starts, k, row)
     if stepper.modes and numbers[0] == 0:
-        here, state = Place.after(states, 0, all_inputs), np.concatenate([states.q[0], states.p[0]])
+        t, state = float(states.t[0]), np.concatenate([states.q[0], states.p[0]])
+        here = Place(states, t, parameters_on_sides(states, t), all_inputs)
         matrix = _with_directions(here, np.eye(stepper._input_size), state, 0.0 * here.parameters)
         matrix[:, [len(state) + stepper.parameters.index(name) for name in stepper.modes]] = 0.0
         jumps[0] = Jump(matrix, state)
@@ -126,19 +120,18 @@ def _with_directions(later: Place, matrix: Array, state: Array, before: Array) -
 
     The parameters S^2 d and d change by (1 - d d^T) du / |u|; ``before`` are the parameters before the change.
     """
-    stepper, (q, p), result = later.states.stepper, np.split(state, 2), matrix.copy()
+    stepper, (q, p) = later.states.stepper, np.split(state, 2)
     for k, places in _directions(stepper):
-        start, ahead = later.parameters[places].reshape(2, 2)
+        rows, (start, ahead) = [len(state) + place for place in places], later.parameters[places].reshape(2, 2)
         if np.array_equal(before[places], later.parameters[places]):
             continue
-        rows = [len(state) + place for place in places]
-        result[rows] = 0.0
+        matrix[rows] = 0.0
         if start.any():
             vector = kept_direction(stepper, k, state, later.t, later.parameters)
             by = _differences(vector, later, q, p) @ np.delete(matrix, -1, axis=0)
             turned = (by - np.outer(ahead, ahead @ by)) / np.linalg.norm(vector(q, p, later.t, later.parameters))
-            result[rows] = np.concatenate([np.linalg.norm(start) * turned, turned])
-    return result
+            matrix[rows] = np.concatenate([np.linalg.norm(start) * turned, turned])
+    return matrix
 
 
 def _directions(stepper: Integrator) -> list[tuple[int, list[int]]]:
@@ -192,8 +185,8 @@ def _jump(
     stepper, options = states.stepper, states.options
     m, size = stepper.dimension, stepper._input_size
     t, after = float(states.t[row]), np.concatenate([states.q[row], states.p[row]])
-    later = Place.after(states, row, all_inputs)
-    here = later._replace(parameters=parameters_on_sides(states, float(starts.t[k - 1])))
+    sides = (parameters_on_sides(states, time) for time in (float(starts.t[k - 1]), t))
+    here, later = (Place(states, t, parameters, all_inputs) for parameters in sides)
 
     def products(state: Array, h: float, time: float, seeds: Array) -> Array:
         sides = parameters_on_sides(states, time)
@@ -241,10 +234,9 @@ def _jump(
 
 def _moved_back(matrix: Array, departure: Array, time: Array) -> Array:
     """Return the derivative of the variables before a time along the flow, by that after it."""
-    result = matrix.copy()
-    result[: len(departure)] -= np.outer(departure, time)
-    result[-2] -= time
-    return result
+    matrix[: len(departure)] -= np.outer(departure, time)
+    matrix[-2] -= time
+    return matrix
 
 
 class Values(NamedTuple):
