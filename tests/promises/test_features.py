@@ -88,11 +88,6 @@ SITUATIONS = {
     "with contacts": lambda: sc.compile_stepper(
         sc.LagrangianSystem.from_text("body", ["q"], "q_dot**2/2 - q"), "svi:2", contacts=[sc.contact("q + 1")]
     ),
-    "with slip in space": lambda: sc.compile_stepper(
-        sc.LagrangianSystem.from_text("puck", ["q", "r", "s"], "(q_dot**2 + r_dot**2 + s_dot**2)/2 - q"),
-        "svi:2",
-        contacts=[sc.contact("q + 1", slip=["r_dot", "s_dot"], friction=0.1)],
-    ),
     "with constraints of arrays": lambda: array_with_constraint("stoermer-verlet"),
     "with constraints of arrays by a composition": lambda: array_with_constraint("composition:4"),
     "with constraints that prescribe the motion": lambda: stepper_of(

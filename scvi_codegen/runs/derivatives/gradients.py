@@ -154,14 +154,15 @@ def forward(states: SavedStates, tangents: Array) -> tuple[Array, Array]:
 def propagate(states: SavedStates, starts: Starts, numbers: NDArray[np.intp], vectors: Array, *, back: bool) -> None:
     """Propagate tangent or adjoint vectors along the steps of a segment and compare its step ends with the run.
 
-    Modes, which are parameters of the steps, have no variations.
+    Modes, which are parameters of the steps, have no variations but those of the directions of slips in space.
     """
     jumps: dict[int, Jump] = {}
-    modes = [2 * states.stepper.dimension + states.stepper.parameters.index(name) for name in states.stepper.modes]
-    vectors[0][:, modes] = 0.0
     if states.stepper.divides_steps:
         more = back or bool(vectors[..., 2 * states.stepper.dimension :].any())
         jumps = jumps_within(states, starts, numbers, all_inputs=more)
+    start = jumps.pop(0, None)
+    if start and not back:
+        vectors[0] = vectors[0] @ start.matrix.T
     parts = list(pairwise(sorted({0, len(starts.h), *jumps})))
     for first, last in reversed(parts) if back else parts:
         if back and last in jumps:
@@ -179,7 +180,8 @@ def propagate(states: SavedStates, starts: Starts, numbers: NDArray[np.intp], ve
         if jumps:  # states near rest, after impacts that accumulate, are not exact relative to themselves
             before = np.maximum(np.abs(before), max(np.abs(starts.q).max(), np.abs(starts.p).max()))
         check_recomputed(part.t, np.concatenate(ends, axis=1), saved[1:], before)
-    vectors[0][:, modes] = 0.0
+    if start and back:
+        vectors[0] = vectors[0] @ start.matrix
 
 
 def pieces(states: SavedStates) -> Iterator[tuple[int, int]]:

@@ -16,29 +16,23 @@ from scvi_codegen.common.errors import StateError
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.projection import projected, roots_of_masses
+from scvi_codegen.systems.contacts.modes import ContactRows
 from scvi_codegen.systems.event import Transition
 
 ROUNDING = 1e-9
 """Part of their size below which rates and impulses count as 0."""
 SAME_IMPULSE, SAME_MOMENTUM = 1e-6, 1e-13
-"""Differences from the run relative to an impulse, and to momenta, up to which an impulse is the same."""
+"""Differences from the run relative to an impulse or a slip, and to momenta, up to which they are the same."""
 
 Change = Callable[[Array, Array, float, Array], Array]
 """Map of q, p, t and parameters."""
 
 
-class Impulse(NamedTuple):
-    """Impulse of the row of a gap, with the row of the slip and its direction if it slides, or of a slip that stops."""
-
-    contact: int
-    row: int
-    slides: tuple[int, float] | None = None
-
-
 class Rows(NamedTuple):
-    """Rates of the rows of all contacts, G M^-1 G^T, G, and (mu, mu_s, e) of each contact."""
+    """Rates of the rows of all contacts, second rates without forces, G M^-1 G^T, G, (mu, mu_s, e) of each."""
 
     rate: Array
+    second: Array
     inverse_masses: Array
     gradients: Array
     coefficients: Array
@@ -56,8 +50,56 @@ class Rows(NamedTuple):
         blocks = map(binding.pointer, (state[:m], state[m:], idle, imposed, numbers))
         if status := binding.function("contact_terms")(t, *blocks, binding.workspace()):
             raise StateError(f"the contacts at t = {t:.17g}, q = {state[:m]} are undefined: {REASONS[status]}")
-        _, rate, _, inverse, gradients, others = np.split(numbers, np.cumsum([k, k, k, k * k, k * m]))
-        return cls(rate, inverse.reshape(k, k), gradients.reshape(k, m), others.reshape(-1, 3))
+        _, rate, second, inverse, gradients, others = np.split(numbers, np.cumsum([k, k, k, k * k, k * m]))
+        return cls(rate, second, inverse.reshape(k, k), gradients.reshape(k, m), others.reshape(-1, 3))
+
+
+class Part(NamedTuple):
+    """Rows of a contact with forces. It sticks, or slides in a direction; friction without a gap has no ``normal``."""
+
+    contact: int
+    normal: int | None
+    slips: list[int]
+    rows: list[int]
+    direction: Array | None = None
+
+    @classmethod
+    def of(cls, k: int, item: ContactRows, direction: Array | None = None) -> "Part":
+        """Construct for contact k."""
+        slips = [*range(item.tangential or 0, (item.tangential or 0) + item.slips)]
+        return cls(k, item.normal, slips, ([] if item.normal is None else [item.normal]) + slips, direction)
+
+
+class Response:
+    """Forces f of rows and the rates w = r + W f after them, linearised at those in known directions of slip d0.
+
+    Imposed rows have w = 0, slips f_t = -mu f_n d, d = w/|w| = d0 + (1 - d0 d0^T)(w - w0)/|w0| + .. .
+    """
+
+    def __init__(self, parts: list[Part], of: Rows, right: Array) -> None:
+        self.parts, self.rates = parts, right
+        self.active = [row for part in parts for row in part.rows]
+        self.forces, self.turning = np.zeros(len(right)), np.zeros((len(right), len(right)))
+        self.forces, self.rates = self.at(of, right)
+        for _, _, slips, _, d in parts:
+            if d is not None and (speed := float(np.linalg.norm(self.rates[slips]))):
+                self.turning[np.ix_(slips, slips)] = (d @ d * np.eye(len(d)) - np.outer(d, d)) / speed
+
+    def at(self, of: Rows, right: Array) -> tuple[Array, Array]:
+        """Return the forces at other rows, and the rates after them, to first order."""
+        rates, forces = right + of.inverse_masses @ self.forces, self.forces.copy()
+        residual, matrix = rates.copy(), of.inverse_masses.copy()
+        for contact, normal, slips, _, direction in self.parts:
+            if direction is not None:
+                mu, turning = of.coefficients[contact, 0], self.turning[slips]
+                size = mu * (1.0 if normal is None else forces[normal])
+                residual[slips] = forces[slips] + size * (direction + turning @ (rates - self.rates))
+                matrix[slips] = size * turning @ of.inverse_masses
+                matrix[slips, slips] += 1.0
+                if normal is not None:
+                    matrix[slips, normal] += mu * direction
+        forces[self.active] -= np.linalg.solve(matrix[np.ix_(self.active, self.active)], residual[self.active])
+        return forces, right + of.inverse_masses @ forces
 
 
 def change_at(
@@ -74,16 +116,32 @@ def change_at(
         StateError: if the impulses are those of several impacts, one after another.
     """
     q, p = np.split(before, 2)
-    impulses = _impulses(stepper, event, before, after, t, modes[0]) if event.kind == "closes" else []
+    start = Rows.at(stepper, before, t, modes[0])
+    friction, static, _ = start.coefficients[event.contact]
+    if event.kind == "begins" and not static > friction:
+        raise StateError(
+            f"the direction in which contact {event.contact + 1} begins to slip at t = {t:.17g} has no derivative: it "
+            "requires static_friction above friction"
+        )
+    parts = _impulses(stepper, event, before, after, t, modes[0]) if event.kind == "closes" else []
+    normal = stepper.interface.contacts[event.contact].normal
     places = [*map(stepper.parameters.index, stepper.modes)]
 
     def with_restitution(elastic: float) -> Change:
+        def rates(of: Rows) -> Array:
+            right = of.rate.copy()
+            right[normal] *= 1.0 + elastic * of.coefficients[event.contact, 2]
+            return right
+
+        impulses = Response(parts, start, rates(start))
+
         def changed(q: Array, p: Array, t: float, parameters: Array) -> Array:
             old, new = parameters.copy(), parameters.copy()
             old[places], new[places] = modes[0][places], modes[1][places]
             q, p, _ = projected(stepper, q, p, t, old)
-            if impulses:
-                p = p + _momenta(impulses, event.contact, elastic, Rows.at(stepper, np.concatenate([q, p]), t, old))
+            if parts:
+                of = Rows.at(stepper, np.concatenate([q, p]), t, old)
+                p = p + of.gradients.T @ impulses.at(of, rates(of))[0]
             return np.concatenate(projected(stepper, q, p, t, new)[:2])
 
         return changed
@@ -106,41 +164,59 @@ def change_at(
     return changes[int(np.argmin(errors))]
 
 
+def slip_of(stepper: Integrator, k: int) -> Change:
+    """Return slip k as a function of the state."""
+    slips = Part.of(k, stepper.interface.contacts[k]).slips
+    return lambda q, p, t, parameters: Rows.at(stepper, np.concatenate([q, p]), t, parameters).rate[slips]
+
+
+def kept_direction(stepper: Integrator, k: int, state: Array, t: float, parameters: Array) -> Change:
+    """Return the vector, slip k in space or where this begins its rate, whose direction it keeps from a state on.
+
+    Raises:
+        StateError: if neither has this direction, that of slip that begins while another contact slides in space.
+    """
+    contacts, named = stepper.interface.contacts, stepper.parameters_by_name(parameters)
+    values = np.array([named[name] for name in contacts[k].directions])
+    ahead, speed = values[3:], float(np.sqrt(np.linalg.norm(values[1:3])))
+    closed = [(j, item) for j, item in enumerate(contacts) if item.closed is None or named[item.closed]]
+    slides = [j for j, item in closed if item.slips and not named[str(item.sticks)]]
+    directions = {j: np.array([named[contacts[j].directions[0]]]) for j in slides} | {k: ahead}
+    start, slips = Rows.at(stepper, state, t, parameters), Part.of(k, contacts[k]).slips
+    if _is_along(start.rate[slips], ahead, speed):
+        return slip_of(stepper, k)
+    begins = Response([Part.of(j, item, directions.get(j)) for j, item in closed], start, start.second)
+    rates, size = begins.rates[slips], float(np.abs(start.second[slips]).max())
+    if any(contacts[j].slips == 2 and j != k for j in slides) or not _is_along(rates, ahead, size):
+        raise StateError(f"slip {k + 1} begins at t = {t:.17g} while another one turns: derivatives are unavailable")
+    return lambda q, p, t, parameters: begins.at(
+        of := Rows.at(stepper, np.concatenate([q, p]), t, parameters), of.second
+    )[1][slips]
+
+
+def _is_along(vector: Array, direction: Array, scale: float) -> bool:
+    size = float(np.linalg.norm(vector))
+    return ROUNDING * scale < size and float(np.abs(vector - size * direction).max()) < SAME_IMPULSE * size
+
+
 def _impulses(
     stepper: Integrator, event: Transition, before: Array, after: Array, t: float, parameters: Array
-) -> list[Impulse]:
-    """Return the impulses of an impact in the modes they had in the run."""
+) -> list[Part]:
+    """Return the contacts with an impulse, in the modes they had in the run."""
     contacts, named = stepper.interface.contacts, dict(zip(stepper.parameters, parameters.tolist(), strict=True))
     first, last = (Rows.at(stepper, state, t, parameters) for state in (before, after))
     q, p = np.split(before, 2)
     sizes = np.sqrt(np.abs(np.diag(first.inverse_masses) * (p @ stepper.velocity(q, p, t, parameters))))
-    taking_part = [k for k, item in enumerate(contacts) if k == event.contact or (item.closed and named[item.closed])]
-    rows = [row for k in taking_part for row in (contacts[k].normal, contacts[k].tangential) if row is not None]
-    total = np.zeros(len(first.rate))
+    taking_part = [
+        Part.of(k, item) for k, item in enumerate(contacts) if k == event.contact or named.get(str(item.closed))
+    ]
+    rows = [row for part in taking_part for row in part.rows]
+    total, parts = np.zeros(len(first.rate)), []
     total[rows] = np.linalg.lstsq(first.inverse_masses[np.ix_(rows, rows)], (last.rate - first.rate)[rows])[0]
-    impulses: list[Impulse] = []
-    for k in taking_part:
-        normal, slip = contacts[k].normal, contacts[k].tangential
-        if normal is None or not total[normal] > ROUNDING * total[contacts[event.contact].normal]:
-            continue
-        if slip is None:
-            impulses.append(Impulse(k, normal))
-        elif abs(last.rate[slip]) <= ROUNDING * sizes[slip]:
-            impulses += [Impulse(k, normal), Impulse(k, slip)]
-        else:
-            impulses.append(Impulse(k, normal, (slip, float(np.sign(last.rate[slip])))))
-    return impulses
-
-
-def _momenta(impulses: list[Impulse], closing: int, elastic: float, of: Rows) -> Array:
-    """Return the (m,) change of the momenta; ``elastic`` multiplies the restitution of the contact that closes."""
-    columns, active = np.zeros((len(of.rate), len(impulses))), [impulse.row for impulse in impulses]
-    right = -of.rate[active]
-    for j, (contact, row, slides) in enumerate(impulses):
-        columns[row, j] = 1.0
-        if slides is not None:
-            columns[slides[0], j] = -of.coefficients[contact, 0] * slides[1]
-    right[[impulse.contact == closing for impulse in impulses].index(True)] *= (
-        1.0 + elastic * of.coefficients[closing, 2]
-    )
-    return np.asarray(of.gradients.T @ (columns @ np.linalg.solve(of.inverse_masses[active] @ columns, right)))
+    for part in taking_part:
+        rate = last.rate[part.slips]
+        speed = float(np.linalg.norm(rate))
+        slides = part.slips and speed > ROUNDING * sizes[part.slips].max()
+        if total[part.rows[0]] > ROUNDING * total[contacts[event.contact].normal]:
+            parts.append(part._replace(direction=rate / speed) if slides else part)
+    return parts

@@ -25,11 +25,12 @@ from numpy.typing import NDArray
 from scvi_codegen.codegen.native.options import REASONS
 from scvi_codegen.codegen.rendering.source import Interface
 from scvi_codegen.common.errors import StateError
-from scvi_codegen.runs.events.contact_changes import change_at
+from scvi_codegen.runs.events.contact_changes import change_at, kept_direction, slip_of
 from scvi_codegen.runs.results.recomputation import changes_by_events, steps_after
 from scvi_codegen.runs.results.saved_states import parameters_on_sides
 from scvi_codegen.runs.states.times import WHOLE
 from scvi_codegen.runs.states.validation import Array
+from scvi_codegen.runs.stepping.integrator import Integrator
 from scvi_codegen.runs.stepping.projection import projected, roots_of_masses
 from scvi_codegen.runs.stepping.step_plan import FixedSteps
 from scvi_codegen.systems.event import Event, Kink, Transition
@@ -87,9 +88,56 @@ def jumps_within(
         StateError: if states within steps were not saved, if several events change the state at once, if a crossing
             grazes, or for a run backward in time.
     """
-    changes = _changes(states, numbers)
-    rows = [(k, row) for k, row in enumerate(numbers.tolist()) if k and row in changes]
-    return {k: _jump(states, starts, k, row, *changes[row], all_inputs=all_inputs) for k, row in rows}
+    stepper, slides = states.stepper, _directions(states.stepper)
+    changes, jumps = (_turns(states, numbers) if slides else {}) | _changes(states, numbers), {}
+    for k, row in enumerate(numbers.tolist()):
+        if row in changes and k:
+            jumps[k] = _jump(states, starts, k, row, *changes[row], all_inputs=all_inputs)
+        elif slides and row > 0 < k:
+            jumps[k] = _end_of_part(states, starts, k, row)
+    if stepper.modes and numbers[0] == 0:
+        t, state = float(states.t[0]), np.concatenate([states.q[0], states.p[0]])
+        here = Place(states, t, parameters_on_sides(states, t), all_inputs)
+        matrix = _with_directions(here, np.eye(stepper._input_size), state, 0.0 * here.parameters)
+        matrix[:, [len(state) + stepper.parameters.index(name) for name in stepper.modes]] = 0.0
+        jumps[0] = Jump(matrix, state)
+    return jumps
+
+
+def _end_of_part(states: SavedStates, starts: Starts, k: int, row: int) -> Jump:
+    """Return the change at the end of a part of a step, whose size is fixed: dh lengthens the last part alone."""
+    stepper, size, steps = states.stepper, states.stepper._input_size, abs((states.t[row] - states.t[0]) / states.h)
+    matrix, by_size = np.eye(size), np.eye(size)[-1]
+    if isinstance(states.plan, FixedSteps) and row + 1 < len(states) and abs(steps - round(steps)) > WHOLE * steps:
+        start, t = (starts.q[k - 1], starts.p[k - 1], float(starts.h[k - 1])), float(starts.t[k - 1])
+        ends = stepper._products(*start, t, parameters_on_sides(states, t), states.options, by_size[np.newaxis])
+        matrix = _moved_back(matrix, ends[0, : 2 * stepper.dimension], by_size)
+    return Jump(matrix, np.concatenate([starts.q[k], starts.p[k]]))
+
+
+def _with_directions(later: Place, matrix: Array, state: Array, before: Array) -> Array:
+    """Return the derivative of the variables at a change with that of the directions d = u/|u| that slips then keep.
+
+    The parameters S^2 d and d change by (1 - d d^T) du / |u|; ``before`` are the parameters before the change.
+    """
+    stepper, (q, p) = later.states.stepper, np.split(state, 2)
+    for k, places in _directions(stepper):
+        rows, (start, ahead) = [len(state) + place for place in places], later.parameters[places].reshape(2, 2)
+        if np.array_equal(before[places], later.parameters[places]):
+            continue
+        matrix[rows] = 0.0
+        if start.any():
+            vector = kept_direction(stepper, k, state, later.t, later.parameters)
+            by = _differences(vector, later, q, p) @ np.delete(matrix, -1, axis=0)
+            turned = (by - np.outer(ahead, ahead @ by)) / np.linalg.norm(vector(q, p, later.t, later.parameters))
+            matrix[rows] = np.concatenate([np.linalg.norm(start) * turned, turned])
+    return matrix
+
+
+def _directions(stepper: Integrator) -> list[tuple[int, list[int]]]:
+    """Return the contacts with slip in space, and the places of the directions that these keep in the parameters."""
+    contacts = enumerate(stepper.interface.contacts)
+    return [(k, [*map(stepper.parameters.index, item.directions[1:])]) for k, item in contacts if item.slips == 2]
 
 
 def _changes(states: SavedStates, numbers: NDArray[np.intp]) -> dict[int, tuple[Event, Array]]:
@@ -108,6 +156,21 @@ def _changes(states: SavedStates, numbers: NDArray[np.intp]) -> dict[int, tuple[
                     f"t = {states.t[row]:.17g}: derivatives do not exist in a corner"
                 )
             result[row] = entry_events[element], np.concatenate([q, p])
+    return result
+
+
+def _turns(states: SavedStates, numbers: NDArray[np.intp]) -> dict[int, tuple[Event, Array]]:
+    """Return the changes between slip in space that keeps its direction and one that does not, as events."""
+    result: dict[int, tuple[Event, Array]] = {}
+    history = getattr(states, "modes", None)
+    if history is None or not np.isin(history.t, states.t).all():
+        raise StateError("this requires the states where slips in space change: save all states (save_every=1)")
+    for k, places in _directions(states.stepper):
+        event = Transition(function=f"slip of contact {k + 1}", contact=k, kind="turns")
+        for row in np.searchsorted(states.t, history.t).tolist():
+            old, new = (parameters_on_sides(states, float(states.t[n]))[places[:2]] for n in (row - 1, row))
+            if numbers[0] < row <= numbers[-1] and not np.array_equal(old, new):
+                result[row] = event, np.concatenate([states.q[row], states.p[row]])
     return result
 
 
@@ -146,13 +209,11 @@ def _jump(
         departure, basis = onto[:, -1], directions[:, sizes > ADMISSIBLE]
     moved = step[:, -1] - step[:, -2] - step[:, : 2 * m] @ departure
     departure = departure + basis @ np.linalg.lstsq(step[:, : 2 * m] @ basis, moved)[0]
-    matrix = np.eye(size)
     # dh of a divided step is added to both of its parts, but lengthens only the second: without that of the first,
     # which the crossing makes X+ dh, and without its dt = dh
-    matrix[: 2 * m, -1] -= divided * departure
-    matrix[-2, -1] -= divided
+    back, matrix = divided * np.eye(size)[-1], np.eye(size)
     if isinstance(event, Kink) and np.linalg.norm(departure - arrival) <= CONTINUOUS * np.linalg.norm(arrival):
-        return Jump(matrix, before)
+        return Jump(_moved_back(matrix, departure, back), before)
     values, rate = _crossing(here, event, (before, after), later.parameters, arrival)
     gradient = np.concatenate([values.gradient, np.zeros(1)])
     if event.restitution is not None:
@@ -164,9 +225,18 @@ def _jump(
         change = by[:, : 2 * m] @ values.map
         change[:, 2 * m :] += by[:, 2 * m :]
     crossing_time = -gradient / rate  # dtau = crossing_time (dx, dh)
-    matrix[: 2 * m] += np.concatenate([change, np.zeros((2 * m, 1))], axis=1) - np.eye(2 * m, size)
-    matrix[: 2 * m] += np.outer(change[:, : 2 * m] @ arrival + change[:, -1] - departure, crossing_time)
-    return Jump(matrix, before)
+    matrix[: 2 * m] = np.outer(change[:, : 2 * m] @ arrival + change[:, -1], crossing_time)
+    matrix[: 2 * m, :-1] += change
+    matrix[-2] += crossing_time
+    matrix = _with_directions(later, matrix, after, here.parameters)
+    return Jump(_moved_back(matrix, departure, back + crossing_time), before)
+
+
+def _moved_back(matrix: Array, departure: Array, time: Array) -> Array:
+    """Return the derivative of the variables before a time along the flow, by that after it."""
+    matrix[: len(departure)] -= np.outer(departure, time)
+    matrix[-2] -= time
+    return matrix
 
 
 class Values(NamedTuple):
@@ -264,6 +334,10 @@ def _function_of_velocities(interface: Interface, kink: Kink) -> Callable[..., A
 def _at_transition(here: Place, event: Transition, ends: tuple[Array, Array], new_parameters: Array) -> Values:
     """Return the derivatives of a transition of a contact, by differences of sixth order."""
     stepper, binding = here.states.stepper, here.states.stepper.binding
+    if event.kind == "turns":
+        slip, (q, p) = slip_of(stepper, event.contact), np.split(ends[0], 2)
+        gradient = slip(q, p, here.t, here.parameters) @ _differences(slip, here, q, p)
+        return Values(gradient, np.eye(len(ends[0]), len(gradient)), ends[0])
     own = sum(len(stepper._events_of_entries(other)) for other in stepper.events)
     number = own + stepper.searched.index(event) - len(stepper.events)
     change = change_at(stepper, event, *ends, here.t, (here.parameters, new_parameters))

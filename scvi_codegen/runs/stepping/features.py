@@ -66,7 +66,6 @@ PROPERTIES: dict[str, Callable[[Any], bool]] = {
         stepper.interface.layout.constraints and stepper.interface.method.startswith("composition")
     ),
     "with events that set parameters": lambda stepper: len(stepper.modes) > len(stepper.interface.mode_names),
-    "with slip in space": lambda stepper: any(contact.slips > 1 for contact in stepper.interface.contacts),
     "with contacts": lambda stepper: stepper.interface.masked > 0,
     "without constraints": lambda stepper: not (stepper.interface.constraints or stepper.interface.layout.constraints),
     "with the long steps of this method": lambda stepper: not stepper.interface.method.startswith(SHORT_STEPS),
@@ -141,7 +140,6 @@ FEATURES = {
             "make them terminal and restart",
         ),
         ("with events that set parameters", _DERIVATIVES, "make them terminal, and restart with the new parameters"),
-        ("with slip in space", _DERIVATIVES, "use differences of runs"),
         (
             "with contacts",
             "error check_growth device observe_ensemble hessian chaos_ensemble flow advice shadow_energy",

@@ -285,7 +285,7 @@ static int find_direction(const contact_terms *of, int k, const real *right, con
     real from = i * turn, to = from + turn;
     if (!turn_slip(of, k, from, right, mode, &low, &along) || !turn_slip(of, k, to, right, mode, &high, &along))
       return 0;
-    if ((low > 0.0) == (high > 0.0) || along <= 0.0)
+    if ((low > 0.0) == (high > 0.0))
       continue;
     for (int bisection = 0; bisection < DBL_MANT_DIG; bisection++) {
       const real middle = from + 0.5 * (to - from);
