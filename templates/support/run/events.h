@@ -516,7 +516,7 @@ static int first_to_change(const event_step *step, const real *far)
 static int search_function(const event_step *step, int e, const event_sample *left, const event_sample *right)
 {
   event_sample start = *left, from, to = *right;
-  real inner[EVENT_DEGREE - 1], middle = values_at(step, EVENT_DEGREE / 2)[e], range = 0.0;
+  real inner[EVENT_DEGREE - 1], middle = values_at(step, EVENT_DEGREE / 2)[e], range = 0.0, largest = 0.0;
   int status = OK;
   start.g = values_at(step, 0)[e];
   to.g = values_at(step, EVENT_DEGREE)[e];
@@ -524,8 +524,11 @@ static int search_function(const event_step *step, int e, const event_sample *le
     inner[j - 1] = values_at(step, j)[e];
   for (int j = 0; j <= EVENT_DEGREE; j++)
     range = fmax(range, fabs(values_at(step, j)[e] - middle));
-  if (fabs(middle) > EVENT_FAR * range)
-    return OK;
+  for (int j = 0; j <= EVENT_DEGREE; j++)
+    largest = fmax(largest, fabs(values_at(step, j)[e]));
+  if (fabs(middle) > EVENT_FAR * range ||
+      (!step->watch->started && is_transition(EVENT_OF(e)) && largest <= 8.0 * values_at(step, EVENT_DEGREE + 2)[e]))
+    return OK; /* far from zero, or at zero, as the gap of bodies that rest side by side */
   from = start;
   if (!step->watch->started && side_at_start(step->watch, e) != 0.0) {
     status = leave_to_side(step, e, &start, &from);
