@@ -40,7 +40,7 @@ from scvi_codegen.runs.results.joining import (
     relative_changes,
 )
 from scvi_codegen.runs.results.quantities import quantities, quantities_in_modes
-from scvi_codegen.runs.results.recomputation import work_and_impulses_until
+from scvi_codegen.runs.results.recomputation import work_and_impulses_until, work_until
 from scvi_codegen.runs.results.saved_states import Array, ModeHistory, checked_row, in_modes
 from scvi_codegen.runs.states.attitude_history import AttitudeHistory
 from scvi_codegen.runs.states.rotation_quantities import named_quantities
@@ -302,14 +302,15 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
     def work(self) -> Array:
         """Return (n,) work of the forces since the first state: sum h b_i f . v along the curves of the steps.
 
-        For time-independent L, E_n - E_0 - W_n is of the order of the method; for SCVI of order s + 1, that of its
+        That of contacts is included: of sliding friction, of surfaces that move, and the energy lost at impacts. For
+        time-independent L, E_n - E_0 - W_n is of the order of the method; for SCVI of order s + 1, that of its
         curve.
 
         Raises:
             MethodError: if no forces act, or the method has no curve of positions.
             StateError: if the states are not at whole steps.
         """
-        return self._summed(lambda piece: work_and_impulses_until(piece)[:, 0])
+        return self._summed(work_until)
 
     def impulses(self) -> Array:
         """Return (n, k) changes by forces of the quantities that L alone conserves, ``stepper.impulse_names``.
