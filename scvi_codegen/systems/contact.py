@@ -23,12 +23,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from scvi_codegen.common.errors import SystemDefinitionError, closest
+from scvi_codegen.systems.event import Formula, conditions_of
 
 if TYPE_CHECKING:
-    from sympy import Expr
-
-Formula: TypeAlias = "str | Expr | float"
-"""A formula as text or a SymPy expression, or a number."""
+    from sympy import Basic, Expr
 
 
 def _number(formula: Formula) -> float | None:
@@ -61,6 +59,8 @@ class Contact:
         friction: coefficient mu of sliding, a formula of (q, v, t) and parameters; ``None`` without friction.
         static_friction: coefficient mu_s up to which the contact sticks; ``None``: mu.
         restitution: coefficient e of impacts, v_n+ = -e v_n-.
+        where: condition, or several of them, of places and times where the contact exists; elsewhere, and where a
+            state is behind its surface, it is open.
 
     Raises:
         SystemDefinitionError: for friction without slip or slip without friction, and invalid coefficients.
@@ -71,6 +71,12 @@ class Contact:
     friction: Formula | None = None
     static_friction: Formula | None = None
     restitution: Formula = 0.0
+    where: str | Basic | tuple[str | Basic, ...] | None = None
+
+    @property
+    def conditions(self) -> tuple[Formula, ...]:
+        """Formulas that are >= 0 where the contact exists."""
+        return conditions_of(self.where)
 
     @property
     def table(self) -> dict[str, Any]:
@@ -93,6 +99,9 @@ class Contact:
         e = _number(self.restitution)
         if e is not None and not 0.0 <= e <= 1.0:
             raise SystemDefinitionError(f"restitution={self.restitution!r} of {shown} is invalid: give 0 to 1")
+        if isinstance(self.where, list):
+            object.__setattr__(self, "where", tuple(self.where))
+        _ = self.conditions
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,6 +192,7 @@ def contact(
     friction: Formula | None = None,
     static_friction: Formula | None = None,
     restitution: Formula = 0.0,
+    where: str | Basic | Sequence[str | Basic] | None = None,
 ) -> Contact:
     """Return a unilateral contact of a system: gap >= 0 with normal force and Coulomb friction.
 
@@ -195,11 +205,13 @@ def contact(
             orthonormal directions of the surface, ``["x_dot", "y_dot"]``.
         friction, static_friction: coefficients of sliding and of sticking friction, numbers or formulas.
         restitution: coefficient of impacts, 0 to 1; with 0 the contact closes at once.
+        where: condition of the places and times where the contact exists, ``"x < 1"`` of a table with an edge, or a
+            list of them. It opens where one fails; what is behind its surface passes freely.
 
     >>> contact("y - r", slip="x_dot - r*a_dot", friction=0.3).friction
     0.3
     """
-    return Contact(gap, cast(Any, slip), friction, static_friction, restitution)
+    return Contact(gap, cast(Any, slip), friction, static_friction, restitution, cast(Any, where))
 
 
 def friction(slip: Formula | Sequence[Formula], *, limit: Formula, static_limit: Formula | None = None) -> Friction:

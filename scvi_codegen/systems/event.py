@@ -160,9 +160,7 @@ class Event:
     @property
     def conditions(self) -> tuple[Formula, ...]:
         """Formulas that are >= 0 where the conditions of ``where`` are satisfied."""
-        if self.where is None:
-            return ()
-        return tuple(map(_condition, self.where if isinstance(self.where, tuple) else (self.where,)))
+        return conditions_of(self.where)
 
     @property
     def table(self) -> dict[str, Any]:
@@ -203,7 +201,7 @@ class Transition(Event):
 
     Attributes:
         contact: number of the contact, from 0.
-        kind: ``"closes"``, ``"lifts"``, ``"stops"``, and of slip that begins ``"forward"`` or ``"backward"`` in a plane
+        kind: ``"closes"``, ``"lifts"``, ``"leaves"`` where a condition fails, ``"stops"``, and of slip that begins ``"forward"`` or ``"backward"`` in a plane
             and ``"begins"`` in space.
     """
 
@@ -230,6 +228,13 @@ def _name(variable: Any) -> str:
     if isinstance(variable, Derivative):
         return f"{_name(variable.expr)}_dot"
     return str(variable.name if isinstance(variable, AppliedUndef) else variable)
+
+
+def conditions_of(where: Any) -> tuple[Formula, ...]:
+    """Return the formulas that are >= 0 where a condition, or several of them, are satisfied; none without."""
+    if where is None:
+        return ()
+    return tuple(map(_condition, where if isinstance(where, tuple) else (where,)))
 
 
 def _condition(condition: Any) -> Formula:

@@ -445,9 +445,9 @@ class Interface:
     def searched(self, events: Iterable[Event]) -> tuple[Event, ...]:
         """Return the events that runs search for: some events, the transitions of contacts, and the kinks."""
         transitions = (
-            Transition(function, -1, contact=number, kind=kind)
+            Transition(function, -1, where=tuple(where) or None, contact=number, kind=kind)
             for number, contact in enumerate(self.contacts)
-            for kind, function in contact.transitions
+            for kind, function, *where in contact.transitions
         )
         kinks = (Kink(function, mode=mode, power_sides=tuple(map(int, sides))) for mode, function, *sides in self.modes)
         return *events, *transitions, *kinks

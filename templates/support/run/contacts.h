@@ -58,12 +58,13 @@ typedef struct {
   real numbers[CONTACT_NUMBERS];
   const real *value, *rate, *second, *W, *G, *coefficient;
   real size[CONTACT_ROWS], speed[CONTACT_ROWS], rounding[CONTACT_ROWS], drift[CONTACT_ROWS];
+  int absent[EVENT_CONTACTS]; /* whether a condition of the contact fails, or the state is behind it */
 } contact_terms;
 
-/* Transitions that end a mode together, and their consequences: contacts that close, slips that stop, directions of
- * slips that begin; contacts with g = g' = 0, and with w = 0. */
+/* Transitions that end a mode together, and their consequences: contacts that close, or whose conditions fail, slips
+ * that stop, directions of slips that begin; contacts with g = g' = 0, and with w = 0. */
 typedef struct {
-  int closes[EVENT_CONTACTS], stops[EVENT_CONTACTS], begins[EVENT_CONTACTS];
+  int closes[EVENT_CONTACTS], leaves[EVENT_CONTACTS], stops[EVENT_CONTACTS], begins[EVENT_CONTACTS];
   real toward[EVENT_CONTACTS][2]; /* of slips that begin in space, against the friction while it stuck */
   int touches[EVENT_CONTACTS], rests[EVENT_CONTACTS];
 } contact_change;
@@ -143,6 +144,15 @@ static int terms_at(const event_step *step, const event_sample *at, contact_term
     of->drift[r] = fabs(of->rate[r] - by_velocity);
     of->rounding[r] = DBL_EPSILON * (by_position + fabs(at->t) * of->drift[r]);
     of->size[r] = by_position + of->speed[r] * duration;
+  }
+  memset(of->absent, 0, sizeof of->absent);
+  for (int i = 0; status == OK && i < TRANSITIONS; i++) {
+    const int event = FIRST_TRANSITION + i, k = TRANSITION[i][0], row = CONTACTS[k].normal;
+    int exists;
+    if (TRANSITION[i][1] != CONTACT_CLOSES || !IS_CONDITIONAL[event])
+      continue;
+    status = conditions(EVENT_FIRST[event], at->t, at->q, at->p, step->parameters, &exists, step->workspace);
+    of->absent[k] = !exists || of->value[row] < -CONTACT_PENETRATION * of->size[row];
   }
   return status;
 }
@@ -236,9 +246,10 @@ static int options_of(const contact_terms *of, int k, contact_change *now, conta
   int count = 0;
   if (at->normal >= 0)
     option[count++] = CONTACT_IS_OPEN;
-  if (at->normal >= 0 && !now->touches[k] &&
-      (of->value[at->normal] > CONTACT_ROUNDING * of->size[at->normal] ||
-          of->rate[at->normal] > CONTACT_ROUNDING * of->speed[at->normal]))
+  if (of->absent[k] || now->leaves[k] ||
+      (at->normal >= 0 && !now->touches[k] &&
+          (of->value[at->normal] > CONTACT_ROUNDING * of->size[at->normal] ||
+              of->rate[at->normal] > CONTACT_ROUNDING * of->speed[at->normal])))
     return count;
   if (at->slips == 0) {
     option[count++] = CONTACT_SLIPS[1];
@@ -597,7 +608,7 @@ static int collide(const event_step *step, event_sample *at, contact_terms *of, 
   int approaches[EVENT_CONTACTS], is_plastic = 0, status;
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal;
-    approaches[k] = normal >= 0 &&
+    approaches[k] = normal >= 0 && !of->absent[k] && !now->leaves[k] &&
         (now->closes[k] || (!closed[k] && fabs(of->value[normal]) <= CONTACT_ROUNDING * of->size[normal]));
   }
   status = find_impulses(step, of, approaches, closed, 0, impulse);
@@ -660,11 +671,11 @@ static int change_modes(const event_step *step, event_sample *at, contact_change
   int closed[EVENT_CONTACTS], approach = 0, slips = 0, status = terms_at(step, at, &of);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const contact_mode mode = mode_of(step, k);
-    closed[k] = CONTACTS[k].normal >= 0 && mode.closed;
+    closed[k] = CONTACTS[k].normal >= 0 && mode.closed && !now->leaves[k];
     now->touches[k] |= closed[k];
     now->rests[k] = (mode.sticks || (now->stops[k] && stops_at(step, &of, k))) && !now->begins[k];
     slips |= now->begins[k] && CONTACTS[k].slips == 2;
-    approach |= now->closes[k] && of.rate[CONTACTS[k].normal] < 0.0;
+    approach |= now->closes[k] && !now->leaves[k] && of.rate[CONTACTS[k].normal] < 0.0;
   }
   if (status == OK && slips)
     find_toward(step, &of, now);
@@ -673,6 +684,19 @@ static int change_modes(const event_step *step, event_sample *at, contact_change
   if (status == OK)
     status = choose_modes(step, &of, now);
   return status == OK ? satisfy_constraints(step, at->t, at->q, at->p, 1) : status;
+}
+
+/* Whether a condition of a contact has failed now: its gap may vanish again where that is 0 within rounding. */
+static int has_just_left(const event_step *step, int k)
+{
+  const event_watch *watch = step->watch;
+  int left = 0;
+  for (int i = 0; i < TRANSITIONS; i++) {
+    const NAME(event_history) *const history = watch->history + EVENT_FIRST[FIRST_TRANSITION + i];
+    left |= TRANSITION[i][0] == k && TRANSITION[i][1] == CONTACT_LEAVES && history->hits > 0 &&
+        fabs(watch->time - history->last) <= EVENT_TIE * fabs(step->whole);
+  }
+  return left;
 }
 
 /* Modes after the transitions among the crossings from `first` on, which have one state. */
@@ -686,6 +710,7 @@ static int change_contacts(const event_step *step, long long first, event_sample
       const int *const transition = TRANSITION[step->found[i].function - FIRST_TRANSITION];
       const int k = transition[0];
       now.closes[k] |= transition[1] == CONTACT_CLOSES;
+      now.leaves[k] |= transition[1] == CONTACT_LEAVES || (transition[1] == CONTACT_CLOSES && has_just_left(step, k));
       now.stops[k] |= transition[1] == CONTACT_STOPS;
       now.begins[k] += (transition[1] == CONTACT_FORWARD || transition[1] == CONTACT_BEGINS) -
           (transition[1] == CONTACT_BACKWARD);
@@ -708,15 +733,22 @@ static int begin_contacts(const event_step *step, event_sample *at)
   status = terms_at(step, at, &of);
   for (int k = 0; status == OK && k < EVENT_CONTACTS; k++) {
     const int row = CONTACTS[k].normal;
-    if (row >= 0 && of.value[row] < -CONTACT_PENETRATION * of.size[row])
+    if (row >= 0 && !of.absent[k] && of.value[row] < -CONTACT_PENETRATION * of.size[row])
       status = refuse(step, CONTACT_PENETRATES, k, of.value[row]);
     if (status == OK && is_impossible(&of, k))
       status = refuse(step, CONTACT_IMPOSSIBLE, k, of.coefficient[3 * k]);
-    now.closes[k] = row >= 0 && fabs(of.value[row]) <= CONTACT_ROUNDING * of.size[row];
+    now.closes[k] = row >= 0 && !of.absent[k] && fabs(of.value[row]) <= CONTACT_ROUNDING * of.size[row];
   }
   if (status == OK)
     status = change_modes(step, at, &now);
   return status;
+}
+
+/* Whether the function of a transition is not negative after a step without it; gaps of limited contacts may be. */
+static int is_kept(int transition)
+{
+  const int kind = TRANSITION[transition][1];
+  return kind == CONTACT_LEAVES || (kind == CONTACT_CLOSES && !IS_CONDITIONAL[FIRST_TRANSITION + transition]);
 }
 
 /* Fails if a gap is negative at the end of a step in which no transition was found. */
@@ -726,7 +758,7 @@ static int check_gaps(const event_step *step, const event_sample *right)
   real value[EVENTS];
   int doubtful = 0, status = evaluate_functions(step, right, value);
   for (int i = 0; i < TRANSITIONS; i++)
-    doubtful |= TRANSITION[i][1] == CONTACT_CLOSES && value[EVENT_FIRST[FIRST_TRANSITION + i]] < 0.0;
+    doubtful |= is_kept(i) && value[EVENT_FIRST[FIRST_TRANSITION + i]] < 0.0;
   if (status != OK || !doubtful)
     return status;
   memcpy(values_at(step, 0), value, BYTES(EVENTS));
@@ -737,7 +769,7 @@ static int check_gaps(const event_step *step, const event_sample *right)
     const int e = EVENT_FIRST[FIRST_TRANSITION + i];
     const real rounding = CONTACT_MISSED * values_at(step, EVENT_DEGREE + 2)[e] + step->watch->history[e].slack +
         CONTACT_ROUNDING * of.size[CONTACTS[TRANSITION[i][0]].normal];
-    if (TRANSITION[i][1] == CONTACT_CLOSES && value[e] < -rounding) {
+    if (is_kept(i) && value[e] < -rounding) {
       step->watch->through = FIRST_TRANSITION + i + 1;
       return NOT_CONVERGED;
     }
