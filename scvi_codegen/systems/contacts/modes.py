@@ -120,6 +120,8 @@ class _Binding:
                 raise SystemDefinitionError(f"contacts are made by contact(..) and friction(..), not {item!r}")
             formulas = (name for name in item.__dataclass_fields__ if name != "where")
             names = {name: self._read_all(getattr(item, name), name, item) for name in formulas}
+            if names.get("of"):
+                names |= {"gap": self._distance(item, names["gap"], names["of"]), "of": ()}
             expressions.append(replace(cast("Any", item), **names))
             rows.append(self._add(number, expressions[-1]))
         system = replace(
@@ -132,6 +134,16 @@ class _Binding:
             contacts=tuple(expressions),
         )
         return BoundContacts(system, tuple(rows))
+
+    def _distance(self, item: ContactLike, surface: Expr, position: Sequence[Symbol]) -> Expr:
+        """Return the distance from a surface to first order, g/|g_x|."""
+        if other := [x for x in position if x not in self.system.coordinates]:
+            raise SystemDefinitionError(
+                f"of= of the contact '{surface}' contains '{other[0]}', which is no coordinate of '{self.system.name}': "
+                f"give those of the point, among {', '.join(map(str, self.system.coordinates))}"
+            )
+        gradient = self._gradient(item, surface, position, "gap")
+        return surface / self.sympy.sqrt(self.sympy.Add(*(x**2 for x in gradient)))
 
     def _read_all(self, formulas: Any, role: str, item: ContactLike) -> Any:
         several = isinstance(formulas, tuple)
