@@ -100,8 +100,8 @@ def change_at(
     *errors, impulse, momentum = (float(np.abs(difference / roots).max()) for difference in differences)
     if not min(errors) <= SAME_IMPULSE * impulse + SAME_MOMENTUM * momentum:
         raise StateError(
-            f"the contact '{event.function}' closes at t = {t:.17g} with several impacts, one after another: "
-            "derivatives through them are not available"
+            f"the contact '{event.function}' closes at t = {t:.17g} with several impacts, one after another, or by "
+            "Poisson's law: derivatives through them are not available"
         )
     return changes[int(np.argmin(errors))]
 

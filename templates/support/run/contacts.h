@@ -15,7 +15,16 @@ enum {
   CONTACT_OPTIONS = 5, /* open, stick, slip in either direction, held by others */
   CONTACT_DIRECTIONS = 32, /* of a slip in space, between which one is enclosed */
   CONTACT_SWEEPS = 50, /* over several slips that begin */
-  CONTACT_IMPACTS = 100 /* of a contact in a corner */
+  CONTACT_IMPACTS = 100, /* of a contact in a corner */
+  CONTACT_SECANTS = 50 /* for the rate after a restitution */
+};
+
+/* Laws of impact, each where those before create kinetic energy: restitution of rates (Newton), of impulses (Poisson),
+ * none. */
+enum {
+  CONTACT_NEWTON,
+  CONTACT_POISSON,
+  CONTACT_PLASTIC
 };
 
 #define CONTACT_ROUNDING 1e-10 /* part of their size below which gaps, rates and forces count as 0 */
@@ -546,10 +555,39 @@ static int impulses_of(const contact_terms *of, int contact, const int *closed, 
   return 0;
 }
 
-/* Impulses of the rows of contacts that approach, one after another, until none does: rates after the impact are -e
- * times those before it (Newton), and impulses are in the friction cone. Closed contacts take part with e = 0. */
+/* Adds to the impulses of a compression those of a restitution, with e times its normal impulse in the friction cone
+ * (C. Glocker & F. Pfeiffer, Nonlinear Dyn. 7, 1995): as those of a contact that approaches with a rate, which follows
+ * by secants. */
+static int restitute(const contact_terms *of, int contact, const int *closed, const real *rate, real *impulse)
+{
+  const int normal = CONTACTS[contact].normal;
+  const real goal = of->coefficient[3 * contact + 2] * impulse[normal];
+  real after[CONTACT_ROWS], added[CONTACT_ROWS], low = 0.0, of_low = 0.0;
+  real high = -of->coefficient[3 * contact + 2] * rate[normal];
+  int exists = 1, differs = goal > 0.0;
+  for (int r = 0; r < CONTACT_ROWS; r++) {
+    after[r] = rate[r];
+    for (int j = 0; j < CONTACT_ROWS; j++)
+      after[r] += of->W[r * CONTACT_ROWS + j] * impulse[j];
+  }
+  for (int k = 0; exists && differs && k < CONTACT_SECANTS; k++) {
+    after[normal] = -high;
+    exists = impulses_of(of, contact, closed, 0.0, after, added);
+    const real slope = (added[normal] - of_low) / (high - low);
+    low = high;
+    of_low = added[normal];
+    differs = fabs(of_low - goal) > 4.0 * DBL_EPSILON * goal;
+    high += (goal - of_low) / slope;
+  }
+  for (int r = 0; exists && goal > 0.0 && r < CONTACT_ROWS; r++)
+    impulse[r] += added[r];
+  return exists && !differs;
+}
+
+/* Impulses of the rows of contacts that approach, one after another, until none does, by a law of restitution, in the
+ * friction cone. Closed contacts take part with e = 0. */
 static int find_impulses(const event_step *step, const contact_terms *of, const int *approaches, const int *closed,
-    int is_plastic, real *total)
+    int law, real *total)
 {
   memset(total, 0, BYTES(CONTACT_ROWS));
   for (int round = 0; round < CONTACT_IMPACTS * EVENT_CONTACTS; round++) {
@@ -565,7 +603,8 @@ static int find_impulses(const event_step *step, const contact_terms *of, const 
         meets = k;
     if (meets < 0)
       return OK;
-    if (!impulses_of(of, meets, closed, is_plastic ? 0.0 : of->coefficient[3 * meets + 2], rate, impulse))
+    if (!impulses_of(of, meets, closed, law == CONTACT_NEWTON ? of->coefficient[3 * meets + 2] : 0.0, rate, impulse) ||
+        (law == CONTACT_POISSON && !restitute(of, meets, closed, rate, impulse)))
       return refuse(step, CONTACT_WITHOUT_IMPULSE, meets, 0.0);
     for (int r = 0; r < CONTACT_ROWS; r++)
       total[r] += impulse[r];
@@ -599,23 +638,24 @@ static int is_low(const event_step *step, const contact_terms *before, const con
   return of->rate[row] * of->rate[row] <= -2.0 * of->second[row] * lowest;
 }
 
-/* Impulses of all contacts that meet at a state, and which contacts touch and rest afterwards; restitution is 0 where
- * Newton's law would create kinetic energy. */
+/* Impulses of all contacts that meet at a state, by the first law that creates no kinetic energy, and which contacts
+ * touch and rest afterwards. */
 static int collide(const event_step *step, event_sample *at, contact_terms *of, const int *closed, contact_change *now)
 {
   const contact_terms before = *of;
   real impulse[CONTACT_ROWS];
-  int approaches[EVENT_CONTACTS], is_plastic = 0, status;
+  int approaches[EVENT_CONTACTS], law = CONTACT_NEWTON, status;
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal;
     approaches[k] = normal >= 0 && !of->absent[k] && !now->leaves[k] &&
         (now->closes[k] || (!closed[k] && fabs(of->value[normal]) <= CONTACT_ROUNDING * of->size[normal]));
   }
-  status = find_impulses(step, of, approaches, closed, 0, impulse);
-  if (status == OK && gain_of(of, impulse) > CONTACT_GAIN) {
-    is_plastic = step->watch->plastic = 1;
-    status = find_impulses(step, of, approaches, closed, 1, impulse);
+  status = find_impulses(step, of, approaches, closed, law, impulse);
+  while (status == OK ? law < CONTACT_PLASTIC && gain_of(of, impulse) > CONTACT_GAIN : law == CONTACT_POISSON) {
+    step->watch->refusal = 0;
+    status = find_impulses(step, of, approaches, closed, ++law, impulse);
   }
+  step->watch->law = law > step->watch->law ? law : step->watch->law;
   for (int r = 0; status == OK && r < CONTACT_ROWS; r++)
     for (int i = 0; i < M; i++)
       at->p[i] += of->G[r * M + i] * impulse[r];
@@ -627,7 +667,7 @@ static int collide(const event_step *step, event_sample *at, contact_terms *of, 
       now->rests[k] = !now->begins[k] && length_of(of->rate + slip, slips) <= CONTACT_ROUNDING * before.speed[slip];
     if (normal < 0 || !(approaches[k] || closed[k]))
       continue;
-    if (impulse[normal] > 0.0 && (closed[k] || is_plastic || before.coefficient[3 * k + 2] == 0.0))
+    if (impulse[normal] > 0.0 && (closed[k] || law == CONTACT_PLASTIC || before.coefficient[3 * k + 2] == 0.0))
       now->touches[k] = 1;
     if (of->rate[normal] > CONTACT_ROUNDING * before.speed[normal])
       now->touches[k] = 0;
