@@ -350,7 +350,7 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
     def states(self, units: Mapping[str, str] | None = None) -> States:
         """Return the states for :mod:`scvi_codegen.runs.results.export`."""
         interface, columns = self.stepper.interface, (self.t, self.q, self.p, self.iterations)
-        by_name = dict(zip(interface.parameters, map(float, self.parameters), strict=True))
+        by_name = dict(zip(interface.own_parameters, map(float, self.parameters), strict=False))
         derived: Callable[..., Any] = partial(quantities, self.stepper, self.parameters)
         if self.pieces:
             for k in columns_of_inputs(interface):
@@ -459,7 +459,7 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
         with suppress(StateError):  # outside the domain of L
             energies = self.energy()[::save_every]
             rows.append((plain("energy"), sparkline(energies.tolist(), "energy"), _range(energies)))
-        names = zip(self.stepper.parameters, self.parameters, strict=True)
+        names = zip(self.stepper.parameters, self.parameters, strict=False)
         facts = (
             ("time", plain(f"{self.t[0]:g} to {self.t[-1]:g}, {self._steps()}")),
             ("states", plain(f"{len(self)}; q and p of shape {self.q.shape}")),

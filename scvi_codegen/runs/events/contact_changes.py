@@ -50,7 +50,7 @@ class Rows(NamedTuple):
         idle, imposed = parameters.copy(), parameters.copy()
         for contact in contacts:
             for name in contact.masks:
-                place = stepper.parameters.index(name)
+                place = stepper.interface.parameters.index(name)
                 idle[place], imposed[place] = 0.0, float(name not in contact.directions)
         numbers, binding = np.zeros(k * (3 + k + m) + 3 * len(contacts)), stepper.binding
         blocks = map(binding.pointer, (state[:m], state[m:], idle, imposed, numbers))
@@ -75,7 +75,7 @@ def change_at(
     """
     q, p = np.split(before, 2)
     impulses = _impulses(stepper, event, before, after, t, modes[0]) if event.kind == "closes" else []
-    places = [*map(stepper.parameters.index, stepper.modes)]
+    places = stepper.mode_columns
 
     def with_restitution(elastic: float) -> Change:
         def changed(q: Array, p: Array, t: float, parameters: Array) -> Array:
@@ -100,7 +100,7 @@ def change_at(
     *errors, impulse, momentum = (float(np.abs(difference / roots).max()) for difference in differences)
     if not min(errors) <= SAME_IMPULSE * impulse + SAME_MOMENTUM * momentum:
         raise StateError(
-            f"the contact '{event.function}' closes at t = {t:.17g} with several impacts, one after another, or by "
+            f"{event.title} at t = {t:.17g} with several impacts, one after another, or by "
             "Poisson's law: derivatives through them are not available"
         )
     return changes[int(np.argmin(errors))]
@@ -110,7 +110,7 @@ def _impulses(
     stepper: Integrator, event: Transition, before: Array, after: Array, t: float, parameters: Array
 ) -> list[Impulse]:
     """Return the impulses of an impact in the modes they had in the run."""
-    contacts, named = stepper.interface.contacts, dict(zip(stepper.parameters, parameters.tolist(), strict=True))
+    contacts, named = stepper.interface.contacts, stepper.parameters_by_name(parameters)
     first, last = (Rows.at(stepper, state, t, parameters) for state in (before, after))
     q, p = np.split(before, 2)
     sizes = np.sqrt(np.abs(np.diag(first.inverse_masses) * (p @ stepper.velocity(q, p, t, parameters))))

@@ -262,7 +262,7 @@ class RecordedRun(AttitudeHistory):
             pieces=self._pieces,
             coordinates=manifest.interface.coordinates,
             momenta=manifest.interface.momentum_columns,
-            parameters=dict(zip(manifest.interface.parameters, manifest.parameters, strict=True)),
+            parameters=dict(zip(manifest.interface.own_parameters, manifest.parameters, strict=False)),
             h=self.h,
             about=manifest.about(),
             maps=manifest.interface.map_names,

@@ -62,7 +62,7 @@ def changes_by_events(states: SavedStates) -> Iterator[tuple[Crossings, NDArray[
     """Yield the crossings of each event that changes the state, and the rows of the states after them."""
     t, switches = states.forward * states.t, getattr(states, "switches", ())
     if states.stepper.interface.contacts and not switches:
-        raise StateError("this requires the transitions of contacts, which recordings and ensembles do not store: use integrate(..)")
+        raise StateError("this requires the transitions of contacts, which only integrate(..) stores")
     for crossings in (*getattr(states, "events", ()), *switches):
         times = states.forward * crossings.t
         here = (t[0] <= times) & (times <= t[-1])

@@ -131,7 +131,7 @@ def constraint_rates(system: Constrained) -> tuple[Expr, ...]:
 
 def constraints_work(system: Constrained) -> bool:
     """Return whether constraint forces can do work: the rate of a constraint at zero velocity is not 0, or friction."""
-    return constraint_power(system) != 0
+    return bool(constraint_power(system) != 0)
 
 
 def constraint_power(system: Constrained) -> Expr:

@@ -32,6 +32,7 @@ class ContactRows(NamedTuple):
         slips: number of slips: 1 in a plane, 2 in space, 0 without friction.
         closed, sticks: names of the masks of its mode.
         directions: of slip: d in a plane; in space whether it slips, and vectors of two components each (contacts.h).
+        title: its formula, for messages.
         transitions: kinds, functions and conditions of its transitions
             (:class:`~scvi_codegen.systems.event.Transition`).
     """
@@ -42,6 +43,7 @@ class ContactRows(NamedTuple):
     closed: str | None
     sticks: str | None
     directions: tuple[str, ...]
+    title: str
     transitions: tuple[tuple[str, ...], ...]
 
     @property
@@ -139,8 +141,8 @@ class _Binding:
         """Return the distance from a surface to first order, g/|g_x|."""
         if other := [x for x in position if x not in self.system.coordinates]:
             raise SystemDefinitionError(
-                f"of= of the contact '{surface}' contains '{other[0]}', which is no coordinate of '{self.system.name}': "
-                f"give those of the point, among {', '.join(map(str, self.system.coordinates))}"
+                f"of= of the contact '{surface}' contains '{other[0]}': give coordinates of the point, among "
+                f"{', '.join(map(str, self.system.coordinates))}"
             )
         gradient = self._gradient(item, surface, position, "gap")
         return surface / self.sympy.sqrt(self.sympy.Add(*(x**2 for x in gradient)))
@@ -245,7 +247,9 @@ class _Binding:
             (kind, self.system.text_of(function), *(where if kind == "closes" else ()))
             for kind, function in (*transitions.items(), *leaves)
         )
-        return ContactRows(normal, tangential, len(slips), closed_name, sticks_name, directions, functions)
+        named, shown = ("gap", item.gap) if of_gap else ("slip", " and ".join(map(self.system.text_of, slips)))
+        title = f"{named} '{shown if isinstance(shown, str) else self.system.text_of(shown)}'"
+        return ContactRows(normal, tangential, len(slips), closed_name, sticks_name, directions, title, functions)
 
     def _slipping(self, number: int, slips: Sequence[Expr]) -> Slipping:
         """Return the direction of a slip w: a parameter d in a plane, else that of (ahead.w) w + start."""
