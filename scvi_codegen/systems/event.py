@@ -222,8 +222,8 @@ class Transition(Event):
     @property
     def title(self) -> str:
         """Name in messages."""
-        names = {"lifts": "lifts off", "stops": "stops to slip"} | dict.fromkeys(BEGINNINGS, "begins to slip")
-        return f"contact {self.contact + 1} ({self.gap}) {names.get(self.kind, self.kind)}"
+        begins = "begins to slip" if self.kind in BEGINNINGS else self.kind
+        return f"contact {self.contact + 1} ({self.gap}) {begins}"
 
     @property
     def changes_state(self) -> bool:

@@ -252,7 +252,7 @@ def _alternative(trajectory: Any, result: GlobalError) -> str:
     The latter is for conservative motions.
     """
     if math.isinf(result.estimate):
-        return f"; or use a method of higher order: others did not end within {FURTHER} times the steps of the first run"
+        return f"; or use a method of higher order: others took more than {FURTHER} times the steps of the first run"
     if kinks := trajectory.stepper.interface.kinks:
         return (
             "; or give max_step=, a tenth of the shortest pulse or contact, or, without error=, events there "
