@@ -39,7 +39,7 @@ from scvi_codegen.runs.results.joining import (
     joined_crossings,
     relative_changes,
 )
-from scvi_codegen.runs.results.quantities import quantities, quantities_in_modes
+from scvi_codegen.runs.results.quantities import quantities_in_modes, quantities_of
 from scvi_codegen.runs.results.recomputation import work_and_impulses_until, work_until
 from scvi_codegen.runs.results.saved_states import Array, ModeHistory, checked_row, in_modes
 from scvi_codegen.runs.states.attitude_history import AttitudeHistory
@@ -351,7 +351,7 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
         """Return the states for :mod:`scvi_codegen.runs.results.export`."""
         interface, columns = self.stepper.interface, (self.t, self.q, self.p, self.iterations)
         by_name = dict(zip(interface.own_parameters, map(float, self.parameters), strict=False))
-        derived: Callable[..., Any] = partial(quantities, self.stepper, self.parameters)
+        derived: Callable[..., Any] = partial(quantities_of, self)
         if self.pieces:
             for k in columns_of_inputs(interface):
                 del by_name[interface.parameters[k]]
@@ -400,8 +400,11 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
         """(n, m) velocities of the states, with an observer of those at both ends."""
 
         def of(piece: Self) -> Array:
-            t = piece.t if piece.observed is None else piece.t[:: max(1, len(piece.t) - 1)]
-            values: Array = piece.stepper.velocity(piece.q, piece.p, t, piece.parameters)
+            if piece.observed is None:
+                return in_modes(piece, piece.stepper.velocity)
+            values: Array = piece.stepper.velocity(
+                piece.q, piece.p, piece.t[:: max(1, len(piece.t) - 1)], piece.parameters
+            )
             return values
 
         values = self._joined(of)

@@ -285,7 +285,8 @@ class Runs:
         self.motion, self.requested, self.interface = motion, motion.error, motion.stepper.interface
         self.start: float = checked_number(motion.initial.t, "the time t")
         self.words: int = self.interface.words
-        self.first, self.count, self.most, self.taken = min(self.requested * FIRST, 0.1), 0, math.inf, 0
+        self.first, self.count, self.most = min(self.requested * FIRST, 0.1), 0, math.inf
+        self.taken: float = 0.0
         self.h: float | None = None
         self.least, self.rounded = LEAST, ROUNDED
         self.last: tuple[float | None, ...] = LAST
