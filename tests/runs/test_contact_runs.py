@@ -79,7 +79,7 @@ STEPS = pytest.mark.parametrize("steps", [{"h": 0.05}, {}])
 @STEPS
 def test_a_ball_rolls_off_the_edge_of_a_table(steps: dict[str, float]) -> None:
     """Rolling at 2 from x = 0 to the edge x = 1, then a fall by 1 onto the ground, on which it goes on."""
-    r = {"slip": "x_dot - 0.1*a_dot", "friction": 0.3}
+    r: Any = {"slip": "x_dot - 0.1*a_dot", "friction": 0.3}
     contacts = [sc.contact("y - 0.1", **r, where="x < 1"), sc.contact("y + 0.9", **r)]
     stepper = of(f"(x_dot**2 + y_dot**2)/2 + a_dot**2/500 - {G}*y", "x y a", contacts)
     run = stepper.integrate([0.0, 0.1, 0.0], velocity=[2.0, 0.0, 20.0], t_end=1.2, **steps)
@@ -134,8 +134,7 @@ def test_friction_on_a_surface_is_that_of_the_true_normal_force(steps: dict[str,
 
 
 def test_a_gap_is_a_distance_or_follows_from_a_surface() -> None:
-    wrong: list[dict[str, Any]] = [{"gap": "x", "of": ["x"]}, {"surface": "x"}, {}]
-    for arguments in wrong:
+    for arguments in list[Any]([{"gap": "x", "of": ["x"]}, {"surface": "x"}, {}]):
         with pytest.raises(sc.SystemDefinitionError, match="either its gap="):
             sc.contact(**arguments)
     with pytest.raises(sc.SystemDefinitionError, match="contains 't': give coordinates of the point, among x, y"):
