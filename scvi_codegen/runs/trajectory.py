@@ -39,8 +39,8 @@ from scvi_codegen.runs.results.joining import (
     joined_crossings,
     relative_changes,
 )
-from scvi_codegen.runs.results.quantities import quantities, quantities_in_modes
-from scvi_codegen.runs.results.recomputation import work_and_impulses_until
+from scvi_codegen.runs.results.quantities import quantities_in_modes, quantities_of
+from scvi_codegen.runs.results.recomputation import work_and_impulses_until, work_until
 from scvi_codegen.runs.results.saved_states import Array, ModeHistory, checked_row, in_modes
 from scvi_codegen.runs.states.attitude_history import AttitudeHistory
 from scvi_codegen.runs.states.rotation_quantities import named_quantities
@@ -302,14 +302,15 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
     def work(self) -> Array:
         """Return (n,) work of the forces since the first state: sum h b_i f . v along the curves of the steps.
 
-        For time-independent L, E_n - E_0 - W_n is of the order of the method; for SCVI of order s + 1, that of its
+        That of contacts is included: of sliding friction, of surfaces that move, and the energy lost at impacts. For
+        time-independent L, E_n - E_0 - W_n is of the order of the method; for SCVI of order s + 1, that of its
         curve.
 
         Raises:
             MethodError: if no forces act, or the method has no curve of positions.
             StateError: if the states are not at whole steps.
         """
-        return self._summed(lambda piece: work_and_impulses_until(piece)[:, 0])
+        return self._summed(work_until)
 
     def impulses(self) -> Array:
         """Return (n, k) changes by forces of the quantities that L alone conserves, ``stepper.impulse_names``.
@@ -349,8 +350,8 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
     def states(self, units: Mapping[str, str] | None = None) -> States:
         """Return the states for :mod:`scvi_codegen.runs.results.export`."""
         interface, columns = self.stepper.interface, (self.t, self.q, self.p, self.iterations)
-        by_name = dict(zip(interface.parameters, map(float, self.parameters), strict=True))
-        derived: Callable[..., Any] = partial(quantities, self.stepper, self.parameters)
+        by_name = dict(zip(interface.own_parameters, map(float, self.parameters), strict=False))
+        derived: Callable[..., Any] = partial(quantities_of, self)
         if self.pieces:
             for k in columns_of_inputs(interface):
                 del by_name[interface.parameters[k]]
@@ -399,8 +400,11 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
         """(n, m) velocities of the states, with an observer of those at both ends."""
 
         def of(piece: Self) -> Array:
-            t = piece.t if piece.observed is None else piece.t[:: max(1, len(piece.t) - 1)]
-            values: Array = piece.stepper.velocity(piece.q, piece.p, t, piece.parameters)
+            if piece.observed is None:
+                return in_modes(piece, piece.stepper.velocity)
+            values: Array = piece.stepper.velocity(
+                piece.q, piece.p, piece.t[:: max(1, len(piece.t) - 1)], piece.parameters
+            )
             return values
 
         values = self._joined(of)
@@ -458,7 +462,7 @@ class Trajectory(TrajectoryDerivatives, ChaosOfRun, AttitudeHistory, Confirmed, 
         with suppress(StateError):  # outside the domain of L
             energies = self.energy()[::save_every]
             rows.append((plain("energy"), sparkline(energies.tolist(), "energy"), _range(energies)))
-        names = zip(self.stepper.parameters, self.parameters, strict=True)
+        names = zip(self.stepper.parameters, self.parameters, strict=False)
         facts = (
             ("time", plain(f"{self.t[0]:g} to {self.t[-1]:g}, {self._steps()}")),
             ("states", plain(f"{len(self)}; q and p of shape {self.q.shape}")),

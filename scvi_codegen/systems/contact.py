@@ -23,12 +23,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from scvi_codegen.common.errors import SystemDefinitionError, closest
+from scvi_codegen.systems.event import Formula, conditions_of
 
 if TYPE_CHECKING:
-    from sympy import Expr
-
-Formula: TypeAlias = "str | Expr | float"
-"""A formula as text or a SymPy expression, or a number."""
+    from sympy import Basic, Expr, Symbol
 
 
 def _number(formula: Formula) -> float | None:
@@ -56,11 +54,14 @@ class Contact:
     """Unilateral contact, made by :func:`contact`.
 
     Attributes:
-        gap: distance g(q, t) that is >= 0.
+        gap: distance g(q, t) that is >= 0; with ``of`` a function with its zeros and its sign.
         slip: slip velocity w, linear in the velocities, or its two components in space; ``None`` without friction.
         friction: coefficient mu of sliding, a formula of (q, v, t) and parameters; ``None`` without friction.
         static_friction: coefficient mu_s up to which the contact sticks; ``None``: mu.
         restitution: coefficient e of impacts, v_n+ = -e v_n-.
+        where: condition, or several of them, of places and times where the contact exists; elsewhere, and where a
+            state is behind its surface, it is open.
+        of: coordinates by whose gradient the gap is divided, so that it is a distance to first order.
 
     Raises:
         SystemDefinitionError: for friction without slip or slip without friction, and invalid coefficients.
@@ -71,6 +72,13 @@ class Contact:
     friction: Formula | None = None
     static_friction: Formula | None = None
     restitution: Formula = 0.0
+    where: str | Basic | tuple[str | Basic, ...] | None = None
+    of: tuple[str | Symbol, ...] = ()
+
+    @property
+    def conditions(self) -> tuple[Formula, ...]:
+        """Formulas that are >= 0 where the contact exists."""
+        return conditions_of(self.where)
 
     @property
     def table(self) -> dict[str, Any]:
@@ -93,6 +101,10 @@ class Contact:
         e = _number(self.restitution)
         if e is not None and not 0.0 <= e <= 1.0:
             raise SystemDefinitionError(f"restitution={self.restitution!r} of {shown} is invalid: give 0 to 1")
+        for name in ("where", "of"):
+            if isinstance(getattr(self, name), list):
+                object.__setattr__(self, name, tuple(getattr(self, name)))
+        _ = self.conditions
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +160,8 @@ def _table(item: Any) -> dict[str, Any]:
         for name, value in values.items()
         if value is not None
     }
-    return {name: value for name, value in plain.items() if (name, value) != ("restitution", 0.0)}
+    named = {"surface" if name == "gap" and plain.get("of") else name: value for name, value in plain.items()}
+    return {name: value for name, value in named.items() if (name, value) not in (("restitution", 0.0), ("of", []))}
 
 
 ContactLike: TypeAlias = "Contact | Friction"
@@ -158,8 +171,8 @@ def contacts_of(tables: Sequence[Mapping[str, Any]]) -> tuple[ContactLike, ...]:
     """Return the contacts of tables of their arguments: those with a gap, and friction without."""
     contacts: list[ContactLike] = []
     for table in tables:
-        kind: Any = Contact if "gap" in table else Friction
-        known = kind.__dataclass_fields__
+        kind: Any = Friction if {"gap", "surface"}.isdisjoint(table) else Contact
+        known = [*kind.__dataclass_fields__, *(("surface",) if kind is Contact else ())]
         if unknown := sorted(set(table) - set(known)):
             raise SystemDefinitionError(
                 f"'{unknown[0]}' of a contact is unknown{closest(unknown[0], list(known))} Known: {', '.join(known)}"
@@ -167,7 +180,7 @@ def contacts_of(tables: Sequence[Mapping[str, Any]]) -> tuple[ContactLike, ...]:
         lacking = [name for name in ("slip", "limit") if kind is Friction and name not in table]
         if lacking:
             raise SystemDefinitionError(f"a contact requires gap=, or slip= and limit= of friction: give {lacking[0]}=")
-        contacts.append(kind(**table))
+        contacts.append((contact if kind is Contact else Friction)(**table))
     return tuple(contacts)
 
 
@@ -177,29 +190,39 @@ def names_in(item: ContactLike) -> set[str]:
 
 
 def contact(
-    gap: Formula,
+    gap: Formula | None = None,
     *,
+    surface: Formula | None = None,
+    of: Sequence[str | Symbol] = (),
     slip: Formula | Sequence[Formula] | None = None,
     friction: Formula | None = None,
     static_friction: Formula | None = None,
     restitution: Formula = 0.0,
+    where: str | Basic | Sequence[str | Basic] | None = None,
 ) -> Contact:
     """Return a unilateral contact of a system: gap >= 0 with normal force and Coulomb friction.
 
     The gap must be a distance to first order, ``|g_q| = 1`` in the units of the slip, because friction is mu times the
-    normal *force*: of a curve ``z - x**2/2`` divide by ``sqrt(1 + x**2)``.
+    normal *force*. ``surface="z - x**2/2", of=["x", "z"]`` is the gap ``(z - x**2/2)/sqrt(1 + x**2)``.
 
     Args:
         gap: g(q, t), a formula in coordinates, time and parameters.
+        surface, of: instead of a gap a function that is 0 on the surface and positive outside, which is divided by the
+            norm of its gradient with respect to the position of the point, the Cartesian coordinates ``of``.
         slip: w = T(q, t) v + b(q, t), the velocity of sliding, ``"x_dot - r*a_dot"``; in space its two components in
             orthonormal directions of the surface, ``["x_dot", "y_dot"]``.
         friction, static_friction: coefficients of sliding and of sticking friction, numbers or formulas.
         restitution: coefficient of impacts, 0 to 1; with 0 the contact closes at once.
+        where: condition of the places and times where the contact exists, ``"x < 1"`` of a table with an edge, or a
+            list of them. It opens where one fails; what is behind its surface passes freely.
 
     >>> contact("y - r", slip="x_dot - r*a_dot", friction=0.3).friction
     0.3
     """
-    return Contact(gap, cast(Any, slip), friction, static_friction, restitution)
+    if (gap is None) == (surface is None) or (surface is None) == bool(of):
+        raise SystemDefinitionError("give a contact either its gap=, a distance, or surface= and the coordinates of=")
+    distance = cast("Formula", surface if gap is None else gap)
+    return Contact(distance, cast(Any, slip), friction, static_friction, restitution, cast(Any, where), tuple(of))
 
 
 def friction(slip: Formula | Sequence[Formula], *, limit: Formula, static_limit: Formula | None = None) -> Friction:

@@ -23,29 +23,29 @@ Array = NDArray[np.float64]
 DIRECTIONS = (-1, 0, 1)
 COMPARISON = re.compile(r"(>=|<=|>|<)")
 LOOPS = re.compile(r"\s+for\b.*", re.DOTALL)
-UNDEFINED = "the event function '{function}' is not finite in the step from t = {t:.17g}"
+UNDEFINED = "the event function {function} is not finite in the step from t = {t:.17g}"
 UNDEFINED_CHANGE = (
-    "the state after the event '{function}' is not finite in the step from t = {t:.17g}: a formula of then= or "
+    "the {changed} after the event {function} is not finite in the step from t = {t:.17g}: a formula of then= or "
     "restitution is undefined at the state of the event; change it, or limit the event by where="
 )
 ACCUMULATED = (
-    "the crossings of the terminal event '{function}' accumulate at t = {t:.17g}: the run starts at its zero and "
+    "the crossings of the terminal event {function} accumulate at t = {t:.17g}: the run starts at its zero and "
     "returns within a rounding error (Zeno behaviour, as of infinitely many bounces). End the run here, or continue "
     "with a constraint"
 )
 
 THROUGH = (
-    "the state passes the wall '{function}' in the step from t = {t:.17g} without an impact: it started on the "
+    "the state passes the wall {function} in the step from t = {t:.17g} without an impact: it started on the "
     "wall or was at rest there, or two impacts are closer than rounding. Start before the wall, end the run before "
     "that time, or continue with a constraint"
 )
 BEHIND = (
-    "the run starts behind the wall '{function}', which is {g:.6g} at t = {t:.17g} and must not be negative. Start in "
+    "the run starts behind the wall {function}, which is {g:.6g} at t = {t:.17g} and must not be negative. Start in "
     "its region, change its sign if the region is the other one, or limit the wall by where="
 )
 
 JAMMED = (
-    "the changes of the state by '{function}' do not end in the step from t = {t:.17g}: a point is jammed in a corner "
+    "the changes of the state by {function} do not end in the step from t = {t:.17g}: a point is jammed in a corner "
     "that closes, constraints leave no motion away from it, or the new state crosses zero again. Check then= and where="
 )
 
@@ -53,12 +53,12 @@ JAMMED = (
 Formula: TypeAlias = "str | Expr | float"
 """Formula as text or a SymPy expression, or a number."""
 PASSED = (
-    "the step from t = {t:.17g} passes '{function}' = 0 without a crossing that was found: the function changes its "
+    "the step from t = {t:.17g} passes a zero that was not found, {function}: the function changes its "
     "sign more often than the search sees. Limit the steps by max_step= (or h=)"
 )
 SLIDING = (
-    "the motion slides on '{function}' = 0 at t = {t:.17g}: the forces on both sides of this jump point to it (dry "
-    "friction, a relay). Use sc.friction(..), or a smooth force such as tanh({function}/width), or end the run there"
+    "the motion slides on {function} = 0 at t = {t:.17g}: the forces on both sides of this jump point to it (dry "
+    "friction, a relay). Use sc.friction(..), or a smooth force such as tanh(u/width), or end the run there"
 )
 
 
@@ -137,6 +137,11 @@ class Event:
             )
 
     @property
+    def title(self) -> str:
+        """Name in messages."""
+        return f"'{self.function}'"
+
+    @property
     def loops(self) -> str:
         """Loops of an event with a function for each of their elements, ``" for i in N"``; else empty."""
         loops = LOOPS.search(self.function) if isinstance(self.function, str) else None
@@ -160,9 +165,7 @@ class Event:
     @property
     def conditions(self) -> tuple[Formula, ...]:
         """Formulas that are >= 0 where the conditions of ``where`` are satisfied."""
-        if self.where is None:
-            return ()
-        return tuple(map(_condition, self.where if isinstance(self.where, tuple) else (self.where,)))
+        return conditions_of(self.where)
 
     @property
     def table(self) -> dict[str, Any]:
@@ -197,18 +200,30 @@ class Kink(Event):
         return True
 
 
+BEGINNINGS = ("forward", "backward", "begins")
+"""Kinds of transitions at which a slip begins."""
+
+
 @dataclass(frozen=True, slots=True)
 class Transition(Event):
     """End of a mode of a contact, where the run chooses the next modes.
 
     Attributes:
         contact: number of the contact, from 0.
-        kind: ``"closes"``, ``"lifts"``, ``"stops"``, and of slip that begins ``"forward"`` or ``"backward"`` in a plane
-            and ``"begins"`` in space.
+        gap: its formula, for messages, ``"gap 'y'"`` or ``"slip 'x_dot'"``.
+        kind: ``"closes"``, ``"lifts"``, ``"leaves"`` where a condition fails, ``"stops"``, and of slip that begins
+            ``"forward"`` or ``"backward"`` in a plane and ``"begins"`` in space.
     """
 
     contact: int = field(kw_only=True)
     kind: str = field(kw_only=True)
+    gap: str = field(kw_only=True)
+
+    @property
+    def title(self) -> str:
+        """Name in messages."""
+        begins = "begins to slip" if self.kind in BEGINNINGS else self.kind
+        return f"contact {self.contact + 1} ({self.gap}) {begins}"
 
     @property
     def changes_state(self) -> bool:
@@ -230,6 +245,13 @@ def _name(variable: Any) -> str:
     if isinstance(variable, Derivative):
         return f"{_name(variable.expr)}_dot"
     return str(variable.name if isinstance(variable, AppliedUndef) else variable)
+
+
+def conditions_of(where: Any) -> tuple[Formula, ...]:
+    """Return the formulas that are >= 0 where a condition, or several of them, are satisfied; none without."""
+    if where is None:
+        return ()
+    return tuple(map(_condition, where if isinstance(where, tuple) else (where,)))
 
 
 def _condition(condition: Any) -> Formula:

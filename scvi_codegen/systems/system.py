@@ -376,9 +376,10 @@ class MechanicalSystem(Deferred, ABC):
 
     @property
     def balances_energy(self) -> bool:
-        """True if the energy changes by the work of forces or damping only."""
-        acted = bool(self.forces) or self.damping != 0
-        return acted and not (self.time in self.formula.free_symbols or self._constraints_work())
+        """True if the energy changes by the work of forces, damping and contacts only."""
+        works = self._constraints_work()
+        acted = bool(self.forces) or self.damping != 0 or works
+        return acted and not (self.time in self.formula.free_symbols or (works and not self.reactions))
 
     def _constraints_work(self) -> bool:
         from scvi_codegen.systems.constraints import constraints_work

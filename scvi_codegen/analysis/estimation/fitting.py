@@ -218,8 +218,7 @@ class _Model:
     ) -> _Model:
         """Construct from validated arguments of :func:`fit`."""
         stepper, m = measurements.stepper, measurements.stepper.dimension
-        modes = {stepper.parameters.index(mode) for mode in stepper.interface.mode_names}
-        fixed = modes.union(columns_of_inputs(stepper.interface))
+        fixed = columns_of_inputs(stepper.interface)
         estimable = [name for k, name in enumerate(stepper.parameters) if k not in fixed]
         estimated = tuple(estimable) if unknown is None else distinct(unknown, "unknown")
         for name in estimated:
@@ -241,7 +240,7 @@ class _Model:
             )
         values = stepper._parameters(parameters)
         momenta = stepper._initial_momenta(q, p, velocity, measurements.start, values)
-        unknown_indices = [2 * m + stepper.parameters.index(name) for name in estimated]
+        unknown_indices = [2 * m + stepper.interface.parameters.index(name) for name in estimated]
         names = estimated
         if fit_initial_state:
             names = (*estimated, *state_names(stepper))
@@ -284,7 +283,7 @@ class _Model:
             values=np.array(x[:count]),
             covariance=covariance[:count, :count],
             at_bounds=tuple(name for name, at in zip(self.names, at_bound[:count], strict=True) if at),
-            parameters=dict(zip(measurements.stepper.parameters, values[2 * m :].tolist(), strict=True)),
+            parameters=dict(zip(measurements.stepper.parameters, values[2 * m :].tolist(), strict=False)),
             q=values[:m],
             p=values[m : 2 * m],
             start=measurements.start,

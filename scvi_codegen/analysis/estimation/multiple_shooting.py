@@ -181,7 +181,7 @@ def _node_states_from_measurements(whole: Measurements, parts: Sequence[Measurem
         return _node_states_from_guess(parts, prior)
     states = []
     for part in parts[1:]:
-        values = parameters_at(whole.stepper.parameters, prior[2 * m :], whole.inputs, part.start)
+        values = parameters_at(whole.stepper.interface.parameters, prior[2 * m :], whole.inputs, part.start)
         parabolas = [_parabola(whole, int(columns[0]), part.start) for columns in measured_columns]
         q, v = np.array(parabolas).T
         states.append(np.concatenate([q, whole.stepper.momentum(q, v, part.start, values)]))

@@ -208,7 +208,7 @@ class EventFormulas:
             if index < 0:
                 rotations = self._turning.rotations
                 names = [str(rate) for rotation in rotations for rate in (*rotation.rates, *rotation.momenta)]
-                names += named
+                names += [*named, *(name for name in self.interface.own_parameters if name not in named)]
                 raise EventError(
                     f"then={{'{name}': '{value}'}} of the event '{event.function}': '{name}' is not a coordinate, a "
                     f"momentum, a velocity or a parameter{closest(name, names)} An event can set: {', '.join(names)}"

@@ -59,7 +59,7 @@ def _contact_of(row: Sequence[Any]) -> ContactRows:
     if not (
         all(number is None or KINDS["int"](number) for number in (contact.normal, contact.tangential, contact.slips))
         and all(map(KINDS["str | None"], (contact.closed, contact.sticks)))
-        and KINDS["tuple[str, ...]"](contact.directions)
+        and KINDS["tuple[str, ...]"]((*contact.directions, contact.title))
         and KINDS["tuple[tuple[str, ...], ...]"](contact.transitions)
     ):
         raise ValueError(f"contacts contain {contact!r:.60}: these are not the places of a contact")
@@ -442,12 +442,17 @@ class Interface:
             name for name, *_ in self.modes
         )
 
+    @property
+    def own_parameters(self) -> tuple[str, ...]:
+        """Names of the parameters of the system, without those of modes."""
+        return self.parameters[: len(self.parameters) - len(self.mode_names)]
+
     def searched(self, events: Iterable[Event]) -> tuple[Event, ...]:
         """Return the events that runs search for: some events, the transitions of contacts, and the kinks."""
         transitions = (
-            Transition(function, -1, contact=number, kind=kind)
+            Transition(function, -1, where=tuple(where) or None, contact=number, kind=kind, gap=contact.title)
             for number, contact in enumerate(self.contacts)
-            for kind, function in contact.transitions
+            for kind, function, *where in contact.transitions
         )
         kinks = (Kink(function, mode=mode, power_sides=tuple(map(int, sides))) for mode, function, *sides in self.modes)
         return *events, *transitions, *kinks

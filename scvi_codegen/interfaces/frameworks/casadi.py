@@ -74,13 +74,13 @@ def casadi_flow(stepper: Stepper, *, steps: int, save_every: int | None = None, 
     source = with_casadi_flow(derivatives, flow.steps, flow.spacing, second=hessian)
     library = building.load(source, flags=stepper.flags)
     name, m = casadi_name(source.prefix), stepper.dimension
-    sizes = (m, m, len(stepper.parameters), 1, 1)
+    sizes = (m, m, len(stepper.interface.parameters), 1, 1)
     arguments = [ca.MX.sym(word, size) for word, size in zip(FLOW_ARGUMENTS, sizes, strict=True)]
     states = ca.external(name, str(library.path))(ca.vertcat(*arguments))
     states = states[:, -1] if flow.save_every is None else states
     result = [states[:m, :], states[m:, :]]
     missing = float("nan")
-    defaults = [missing, missing, missing if stepper.parameters else 0.0, 0.0, missing]
+    defaults = [missing, missing, missing if stepper.interface.parameters else 0.0, 0.0, missing]
     return ca.Function(name, arguments, result, [*FLOW_ARGUMENTS], ["q1", "p1"], {"default_in": defaults})
 
 

@@ -139,7 +139,7 @@ class ArrayFlow(Flow):
             StepFailedError: if a step fails; in JAX its own error, with the time of the step.
         """
         m, values = self.stepper.dimension, self.parameter_values(parameters)
-        count = len(self.stepper.parameters)
+        count = len(self.stepper.interface.parameters)
         if isinstance(values, list):
             arguments = [self._number(value, "a parameter") for value in values]
         else:

@@ -361,8 +361,8 @@ class Model(TimeSpan):
         from scvi_codegen.runs.driver.segments import checked_inputs, parameters_at
 
         stepper: Any = getattr(integrator, "stepper", integrator)
-        inputs = checked_inputs(stepper.interface, self.all_inputs())
-        return inputs, partial(parameters_at, stepper.parameters, stepper._parameters(self.parameters), inputs)
+        inputs, names = checked_inputs(stepper.interface, self.all_inputs()), stepper.interface.parameters
+        return inputs, partial(parameters_at, names, stepper._parameters(self.parameters), inputs)
 
     def start(
         self, stepper: Stepper | None = None, *, options: SolverOptions | None = None, threads: int | None = None

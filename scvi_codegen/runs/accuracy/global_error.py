@@ -68,8 +68,8 @@ LEAST_STOPS, LONG, STRIDE, MOST_STOPS = 8, 64, 16, 32
 """Of a run for comparison, numbers of times at which steps end: least; see :func:`irregular_stops`; most of others."""
 GOLDEN, MARGIN, IRREGULAR = 0.6180339887498949, 0.05, 0.8191725134
 """Golden ratio; part of a step at its ends that is not cut; ratio of steps of tau of runs for comparison."""
-FURTHER, MANY = 1000, 100_000
-"""A run for comparison is given up after so many times the steps of the run, and so many more."""
+FURTHER, MANY = 300, 100_000
+"""Runs end after so many times the steps of the first one in all, and so many more: what is confirmed then remains."""
 LEAST_SAMPLES, STEPS_PER_SAMPLE, MOST_SAMPLES, MOST_NUMBERS = 16, 16, 512, 2**22
 """Numbers of states that are compared: least, per steps, most, and most times the number of coordinates."""
 ORDER = 10.0
@@ -251,6 +251,8 @@ def _alternative(trajectory: Any, result: GlobalError) -> str:
 
     The latter is for conservative motions.
     """
+    if math.isinf(result.estimate):
+        return f"; or use a method of higher order: others took more than {FURTHER} times the steps of the first run"
     if kinks := trajectory.stepper.interface.kinks:
         return (
             "; or give max_step=, a tenth of the shortest pulse or contact, or, without error=, events there "
@@ -284,6 +286,7 @@ class Runs:
         self.start: float = checked_number(motion.initial.t, "the time t")
         self.words: int = self.interface.words
         self.first, self.count, self.most = min(self.requested * FIRST, 0.1), 0, math.inf
+        self.taken: float = 0.0
         self.h: float | None = None
         self.least, self.rounded = LEAST, ROUNDED
         self.last: tuple[float | None, ...] = LAST
@@ -326,6 +329,7 @@ class Runs:
         limit = {} if (max_step := min(max_step, self.largest)) == math.inf else {"max_step": max_step}
         trajectory = self.motion.run(check, **self._steps(tolerance), **limit)
         self.most = min(self.most, FURTHER * trajectory.steps + MANY)
+        self.taken += trajectory.steps
         return trajectory
 
     def _other(self, tolerance: float | None, compared: "_Samples", number: int) -> Any:
@@ -339,11 +343,13 @@ class Runs:
             if failure.trajectory is None:
                 raise
             run = failure.trajectory
+        self.taken += run.steps
         self.compared = run, compared
         return run
 
     def _check_count(self, steps: int) -> None:
-        if steps > self.most:
+        if self.taken + steps > self.most:
+            self.taken = self.most  # no further run begins
             raise _TooManyStepsError
 
     def _judged(self) -> Attempt:
@@ -388,11 +394,15 @@ class Runs:
 
     def _limited(self) -> Iterator[Attempt]:
         """Yield runs of smaller and smaller largest steps."""
-        tolerance = self.first
+        tolerance, last, longest = self.first, None, math.inf
         for part in self.parts:
             max_step = part * abs(self.motion.end - self.start)
+            if (last, max_step >= longest) == (tolerance, True):
+                continue  # the steps would be those of the run before
+            last = tolerance
             with self._suppressed_failure():
                 trajectory = self._run(tolerance, max_step)
+                longest = float(np.abs(np.diff(trajectory.t)).max(initial=0.0))
                 yield trajectory, self._estimated(trajectory, tolerance, self._smaller(tolerance)[1], max_step)
             tolerance = max(RATIO * tolerance, min(tolerance, LEAST_AT_KINKS))
 

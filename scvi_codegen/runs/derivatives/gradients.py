@@ -6,7 +6,7 @@ Recomputed steps are checked against the run.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -71,7 +71,8 @@ def tangents_from_directions(stepper: LinearisedMethod, directions: Array) -> Ar
 def sensitivity(states: SavedStates) -> Sensitivity:
     """Return the derivatives of all states with respect to all inputs of the run."""
     columns, _ = forward(states, np.eye(states.stepper._input_size))
-    return Sensitivity.of(columns, states.stepper.dimension, stretched=_has_fixed_step_size(states))
+    result = Sensitivity.of(columns, states.stepper.dimension, stretched=_has_fixed_step_size(states))
+    return replace(result, parameters=result.parameters[..., : len(states.stepper.parameters)])  # without modes
 
 
 def seeds_of(stepper: LinearisedMethod, derivatives: Array) -> Array:
@@ -120,7 +121,7 @@ def gradient_of(states: SavedStates, columns: Array) -> Gradient:
     return Gradient(
         q=columns[:m],
         p=columns[m : 2 * m],
-        parameters=columns[2 * m : -2],
+        parameters=columns[2 * m : 2 * m + len(states.stepper.parameters)],
         t=columns[-2],
         h=columns[-1] if _has_fixed_step_size(states) else None,
     )
@@ -157,6 +158,11 @@ def propagate(states: SavedStates, starts: Starts, numbers: NDArray[np.intp], ve
     Modes, which are parameters of the steps, have no variations but those of the directions of slips in space.
     """
     jumps: dict[int, Jump] = {}
+<<<<<<< HEAD
+=======
+    modes = [2 * states.stepper.dimension + column for column in states.stepper.mode_columns]
+    vectors[0][:, modes] = 0.0
+>>>>>>> work
     if states.stepper.divides_steps:
         more = back or bool(vectors[..., 2 * states.stepper.dimension :].any())
         jumps = jumps_within(states, starts, numbers, all_inputs=more)

@@ -243,7 +243,7 @@ class TrajectoryDerivatives(SavedStates):
             return gradient
         inputs = {}
         for name in stepper.interface.inputs:
-            first = stepper.parameters.index(f"{name}_0")
+            first = stepper.interface.parameters.index(f"{name}_0")
             began = np.array([run.parameters[first + COEFFICIENTS] for run in self._runs])
             starts, piece = (
                 np.flatnonzero(np.diff(began, prepend=np.nan)),

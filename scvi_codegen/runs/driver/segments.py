@@ -432,7 +432,7 @@ def first_inner_time(t: float, t_end: float) -> float:
 def parameters_of(stepper: Integrator, argument: Any, inputs: Mapping[str, Input]) -> Callable[[float], Array]:
     """Return a function of time that evaluates all parameters, those of inputs by their pieces."""
     check_left_to_inputs(stepper.interface, argument)
-    return partial(parameters_at, stepper.parameters, stepper._parameters(argument), inputs)
+    return partial(parameters_at, stepper.interface.parameters, stepper._parameters(argument), inputs)
 
 
 def parameters_at(

@@ -174,7 +174,7 @@ class Ensemble:
             check_left_to_inputs(stepper.interface, parameters)
             values = layout.parameters_of_each(parameters, len(layout.members(q, "q")))
             first_end = 0.0 if ends is None else float(ends.flat[0])
-            parameters = parameters_at(stepper.parameters, values, inputs, first_inner_time(t0, first_end))
+            parameters = parameters_at(stepper.interface.parameters, values, inputs, first_inner_time(t0, first_end))
         momenta = momenta_of_each(stepper, q, p, velocity, t0, parameters)
         save_every, fixed = checked_count(settings.save_every, "save_every", least=1), None
         if settings.h is not None:
@@ -220,7 +220,7 @@ class Ensemble:
 
     def values_at(self, t: float, part: slice = ALL) -> Array:
         """Return the parameters at a time, those of inputs included, one row for each of a slice of trajectories."""
-        return parameters_at(self.stepper.parameters, self.parameters, self.inputs, t, part)
+        return parameters_at(self.stepper.interface.parameters, self.parameters, self.inputs, t, part)
 
     def some(self, part: Any) -> Self:
         """Return the ensemble of some of the trajectories with fixed steps, a slice or indices."""

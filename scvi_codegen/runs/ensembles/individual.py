@@ -176,7 +176,7 @@ class IndividualRuns:
         ensemble, stepper, parameters = self.ensemble, self.ensemble.stepper, self.ensemble.parameters[j]
         if stepper.interface.words == 1:
             of_inputs = columns_of_inputs(stepper.interface) if ensemble.inputs else ()
-            values = zip(stepper.parameters, parameters.tolist(), strict=True)
+            values = zip(stepper.interface.parameters, parameters.tolist(), strict=True)
             parameters = {name: value for k, (name, value) in enumerate(values) if k not in of_inputs}
         steps: dict[str, Any] = {"t_end": float(self.ends[j]), **ensemble.settings.control.named}
         if ensemble.fixed is not None:

@@ -269,7 +269,7 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
 
     def _with_modes(self) -> Iterator[tuple[int, NDArray[np.intp], Array]]:
         """Yield what :meth:`_with_parameters` does, with the modes after each state, for the rows of each mode."""
-        columns = [*map(self.stepper.parameters.index, self.stepper.modes)]
+        columns = self.stepper.mode_columns
         for j, good, parameters in self._with_parameters():
             history = self.modes[j] if self.modes else None
             if history is None:
@@ -391,7 +391,7 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
             steps=self.steps,
             parameters=self.parameters,
             coordinates=np.array(self.stepper.coordinates),
-            parameter_names=np.array(self.stepper.parameters, dtype=str),
+            parameter_names=np.array(self.stepper.interface.parameters, dtype=str),
             title=self.stepper.title,
             **optional,
         )
@@ -399,7 +399,8 @@ class EnsembleTrajectory(EnsembleRuns, AttitudeHistory, ConfirmedEnsemble, Pictu
     def _write_csv(self, file: IO[bytes]) -> None:
         names = self.stepper.coordinates
         varied = [i for i, column in enumerate(self.parameters.T) if (column != column[0]).any()]
-        header = ["trajectory", *(self.stepper.parameters[i] for i in varied), "t", *names, *(f"p_{n}" for n in names)]
+        varying = [self.stepper.interface.parameters[i] for i in varied]
+        header = ["trajectory", *varying, "t", *names, *(f"p_{n}" for n in names)]
         file.write((",".join(header) + "\n").encode())
         formats = ["%d"] + ["%.17g"] * (len(header) - 1)
         for j in range(len(self)):

@@ -61,8 +61,9 @@ def warn_of_choices(watch: Any) -> None:
             "those that stick most",
             EventWarning,
         )
-    if getattr(watch, "plastic", 0):
-        warn("the restitution of an impact would have created kinetic energy with friction: it was 0", EventWarning)
+    if law := getattr(watch, "law", 0):
+        used = "it was 0" if law > 1 else "that of the impulses was used (Poisson's law)"
+        warn(f"the restitution of an impact would have created kinetic energy with friction: {used}", EventWarning)
 
 
 def in_first_modes(
@@ -85,6 +86,7 @@ def in_first_modes(
     if status:
         reason = f"the contacts are undefined at t = {t:.17g}, q = {q!r}: {REASONS[status]}"
         raise refusal_of(watch, t) or ContactError(reason)
+    warn_of_choices(watch)
     return q1, p1
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -169,20 +170,20 @@ class CrossingSearch:
             number = getattr(self.watch, name, 0)
             if number and not (name == "accumulated" and self.ended):
                 event = self.stepper.searched[abs(number) - 1]
-                function, message = (
-                    event.function,
-                    PASSED if message is THROUGH and isinstance(event, Kink | Transition) else message,
-                )
-                return EventError(message.format(function=function, t=report.t, g=behind))
+                message = PASSED if message is THROUGH and isinstance(event, Kink | Transition) else message
+                modes = zip(self.stepper.modes, getattr(self.watch, "mode", ()), strict=False)
+                changed = next((f"parameter '{mode}'" for mode, value in modes if not math.isfinite(value)), "state")
+                texts = {"function": event.title, "changed": changed}
+                return EventError(message.format(**texts, t=report.t, g=behind))
         return step_failure(status, report, step=step, h=h, failures=self.binding.failures)
 
     def warn_of_accumulation(self) -> None:
         """Issue a :class:`EventWarning` if the run ended where crossings accumulate, and for choices of contacts."""
         warn_of_choices(self.watch)
         if self.changes and self.watch.accumulated:
-            function, t = self.stepper.searched[self.watch.accumulated - 1].function, self.last[0]
+            title, t = self.stepper.searched[self.watch.accumulated - 1].title, self.last[0]
             warn(
-                f"the crossings of '{function}' accumulate at t = {self.watch.end:.17g} (infinitely many impacts in "
+                f"the crossings of {title} accumulate at t = {self.watch.end:.17g} (infinitely many impacts in "
                 f"finite time): the run ended at t = {t:.17g}. Continue with a constraint, or ignore this warning",
                 EventWarning,
             )

@@ -113,7 +113,7 @@ class EventFunctions:
                 at = self._change(number, at, parameters, forward)
             if at.p is before.p:
                 return at
-        raise EventError(JAMMED.format(function=self.events[min(walls)].function, t=begin))
+        raise EventError(JAMMED.format(function=self.events[min(walls)].title, t=begin))
 
     def _change(self, number: int, at: TimedState, parameters: Array, forward: bool) -> TimedState:
         """Return the state after a change; the same arrays for a wall that is not approached."""

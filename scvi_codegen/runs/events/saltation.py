@@ -152,7 +152,7 @@ def _changes(states: SavedStates, numbers: NDArray[np.intp]) -> dict[int, tuple[
         for row, element, q, p in zip(rows[here].tolist(), *entries, strict=True):
             if row in result:
                 raise StateError(
-                    f"the run meets the events '{result[row][0].function}' and '{crossings.event.function}' at once at "
+                    f"the run meets the events {result[row][0].title} and {crossings.event.title} at once at "
                     f"t = {states.t[row]:.17g}: derivatives do not exist in a corner"
                 )
             result[row] = entry_events[element], np.concatenate([q, p])
@@ -273,7 +273,7 @@ def _crossing(
         least = GRAZING_IMPACT if event.kind == "closes" else GRAZING
     if not abs(rate) > least * (steepest + abs(values.gradient[-1])):
         raise StateError(
-            f"the event '{event.function}' is tangent to the run at t = {t:.17g}: derivatives do not exist at a "
+            f"the event {event.title} is tangent to the run at t = {t:.17g}: derivatives do not exist at a "
             "grazing crossing"
         )
     return values, float(rate)
@@ -297,7 +297,7 @@ def _derivatives(interface: Interface, event: Event) -> Callable[[Array, float, 
         formula.free_symbols & others for formula in (*formulas.functions, *values)
     ):
         raise StateError(
-            f"derivatives through the event '{event.function}' require momenta instead of velocities in its formulas, "
+            f"derivatives through the event {event.title} require momenta instead of velocities in its formulas, "
             "and no multipliers"
         )
     mapped = [new.get(k, unchanged) for k, unchanged in enumerate(z)] if event.restitution is None else list(values)
@@ -347,7 +347,7 @@ def _at_transition(here: Place, event: Transition, ends: tuple[Array, Array], ne
         values = np.zeros(own + len(stepper.searched) - len(stepper.events))
         blocks = [binding.pointer(np.ascontiguousarray(part)) for part in (q, p, parameters)]
         if status := binding.function("event_values")(t, *blocks, binding.pointer(values), binding.workspace()):
-            raise StateError(f"the transition '{event.function}' at t = {t:.17g} is undefined: {REASONS[status]}")
+            raise StateError(f"the transition {event.title} at t = {t:.17g} is undefined: {REASONS[status]}")
         return np.append(values[number], change(q, p, t, parameters))
 
     by = _differences(mapped, here, *np.split(ends[0], 2))
@@ -437,7 +437,7 @@ def _differences(function: Callable[[Array, Array, float, Array], Array], here: 
     steps[:m], steps[-1] = moved[:-1], moved[-1]
     steps[m : 2 * m] = DIFFERENCE * roots * (np.abs(np.asarray(states.p) / roots).max() or 1.0)
     columns = np.zeros((len(x), len(function(q, p, t, parameters))))
-    fixed = {2 * m + stepper.parameters.index(name) for name in stepper.modes}
+    fixed = {2 * m + column for column in stepper.mode_columns}
     varied = [k for k in range(2 * m, len(x) - 1) if k not in fixed] if all_inputs else []
     for k in (*range(2 * m), *varied, -1):
         step, values = steps[k], np.tile(x, (len(PLACES), 1))

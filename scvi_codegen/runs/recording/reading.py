@@ -20,7 +20,7 @@ from scvi_codegen.runs.driver.run import Run
 from scvi_codegen.runs.driver.run_loop import first_step_size, trajectory_of
 from scvi_codegen.runs.recording.manifest import Chunk, chunk_paths, no_states, read_chunk, read_manifest
 from scvi_codegen.runs.results.export import COLUMNS, Piece, States, write_states
-from scvi_codegen.runs.results.quantities import quantities
+from scvi_codegen.runs.results.quantities import quantities_of
 from scvi_codegen.runs.results.saved_states import checked_row
 from scvi_codegen.runs.states.attitude_history import AttitudeHistory
 from scvi_codegen.runs.states.rotation_quantities import named_quantities
@@ -262,12 +262,12 @@ class RecordedRun(AttitudeHistory):
             pieces=self._pieces,
             coordinates=manifest.interface.coordinates,
             momenta=manifest.interface.momentum_columns,
-            parameters=dict(zip(manifest.interface.parameters, manifest.parameters, strict=True)),
+            parameters=dict(zip(manifest.interface.own_parameters, manifest.parameters, strict=False)),
             h=self.h,
             about=manifest.about(),
             maps=manifest.interface.map_names,
             attitudes=named_quantities(manifest.interface),
-            quantities=lambda t, q, p: quantities(self.stepper, manifest.values, t, q, p),
+            quantities=lambda *of: quantities_of(self[:1], *of),
             units=checked_units(units),
             low=low,
         )

@@ -99,7 +99,7 @@ def parameters_set_until(states: SavedStates, t: float) -> Array:
     parameters, own = states.parameters.copy(), len(stepper.modes) - len(stepper.interface.mode_names)
     if own and modes is not None:
         set_values = modes.at(t, states.forward)[:own]
-        parameters[[*map(stepper.parameters.index, stepper.modes[:own])]] = set_values
+        parameters[stepper.mode_columns[:own]] = set_values
     return parameters
 
 

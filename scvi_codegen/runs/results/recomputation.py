@@ -20,7 +20,7 @@ from scvi_codegen.runs.results.saved_states import (
     SavedStates,
     parameters_on_sides,
 )
-from scvi_codegen.systems.event import Crossings
+from scvi_codegen.systems.event import Crossings, Transition
 
 SAME_STEP_SIZE = 1e-9
 """Largest relative difference of step sizes that are equal."""
@@ -60,8 +60,10 @@ def work_and_impulses_until(states: SavedStates) -> Array:
 
 def changes_by_events(states: SavedStates) -> Iterator[tuple[Crossings, NDArray[np.intp]]]:
     """Yield the crossings of each event that changes the state, and the rows of the states after them."""
-    t = states.forward * states.t
-    for crossings in (*getattr(states, "events", ()), *getattr(states, "switches", ())):
+    t, switches = states.forward * states.t, getattr(states, "switches", ())
+    if states.stepper.interface.contacts and not switches:
+        raise StateError("this requires the transitions of contacts, which only integrate(..) stores")
+    for crossings in (*getattr(states, "events", ()), *switches):
         times = states.forward * crossings.t
         here = (t[0] <= times) & (times <= t[-1])
         rows = np.searchsorted(t, times[here])
@@ -122,21 +124,38 @@ def check_recomputed(t: Array, recomputed: Array, saved: Array, before: Array) -
         )
 
 
+def work_until(states: SavedStates) -> Array:
+    """Return (n,) work of forces and contacts from the first state to each; raises as ``work_and_impulses_until``."""
+    interface = states.stepper.interface
+    if not interface.contacts:
+        return work_and_impulses_until(states)[:, 0]
+    impacts = _exchanged_at_events(states, states.energy(), by_contacts=True)  # type: ignore[attr-defined]
+    return impacts + work_and_impulses_until(states)[:, 0] if interface.exchange_names else impacts
+
+
+def _exchanged_at_events(states: SavedStates, energy: Array, *, by_contacts: bool) -> Array:
+    """Return (n,) energy exchanged until each state at transitions of contacts, or at other events."""
+    stepper, touching = states.stepper, np.zeros(len(energy), bool)
+    before = stepper._states.missing((len(energy),))  # before the first event at a time
+    for crossings, rows in changes_by_events(states):
+        touching[rows] |= isinstance(crossings.event, Transition)
+        states_before = zip(rows.tolist(), crossings.q, crossings.p, crossings.t.tolist(), strict=True)
+        for row, q, p, t in states_before:
+            value = stepper.energy(q, p, t, parameters_on_sides(states, float(states.t[row - 1])))
+            if not abs(value - energy[row - 1]) >= abs(before[row] - energy[row - 1]):  # NaN: none
+                before[row] = value
+    here = np.isfinite(before) & (touching == by_contacts)
+    total: Array = np.cumsum(np.where(here, energy - before, 0.0))
+    return total
+
+
 def exchanged_energy(states: Any, energy: Array) -> Array | None:
     """Return (n,) work of forces and energy exchanged at events; ``None`` if the states do not determine it."""
-    stepper = states.stepper
-    if stepper.interface.changes_energy and not stepper.interface.balances_energy:
+    interface = states.stepper.interface
+    if interface.changes_energy and not interface.balances_energy:
         return None
-    before = stepper._states.missing((len(energy),))  # before the first event at a time
     try:
-        for crossings, rows in changes_by_events(states):
-            states_before = zip(rows.tolist(), crossings.q, crossings.p, crossings.t.tolist(), strict=True)
-            for row, q, p, t in states_before:
-                value = stepper.energy(q, p, t, parameters_on_sides(states, float(states.t[row - 1])))
-                if not abs(value - energy[row - 1]) >= abs(before[row] - energy[row - 1]):  # NaN: none
-                    before[row] = value
-        exchanged = np.where(np.isfinite(before), energy - before, 0.0)
-        total: Array = np.cumsum(exchanged)
-        return total + states.work() if stepper.interface.changes_energy else total
+        total = _exchanged_at_events(states, energy, by_contacts=False)
+        return total + states.work() if interface.changes_energy or interface.contacts else total
     except ScviCodegenError:
         return None  # the method or the states do not determine the work, or there is no compiler

@@ -129,7 +129,7 @@ def parameters_on_sides(states: SavedStates, t: float) -> Array:
             )
         return states.parameters
     parameters = states.parameters.copy()
-    parameters[[*map(states.stepper.parameters.index, states.stepper.modes)]] = modes.at(t, states.forward)
+    parameters[states.stepper.mode_columns] = modes.at(t, states.forward)
     return parameters
 
 

@@ -357,4 +357,4 @@ def parameter_index(interface: Interface, name: str) -> int:
     if not names:
         raise StateError(f"there is no parameter {name!r}: '{interface.system}' has none. Declare it in its definition")
     hint = f"; did you mean {near[0]!r}?" if near else ""
-    raise StateError(f"there is no parameter {name!r} among {', '.join(names)}{hint}")
+    raise StateError(f"there is no parameter {name!r} among {', '.join(interface.own_parameters)}{hint}")

@@ -85,6 +85,7 @@ class CompiledMethod:
         events: events that every run records.
         searched: functions whose zeros every run locates: of the events, the contacts and the kinks of the system.
         modes: names of the parameters that runs change: by events, as modes of contacts, and of kinks.
+        mode_columns: their indices among the values of parameters.
         divides_steps: whether steps end at zeros: of events that change the state, transitions and kinks.
         changes_states: whether an event changes the states of runs.
         in_tau: whether the system is one in transformed time, whose steps are steps of tau.
@@ -112,6 +113,7 @@ class CompiledMethod:
         self.in_tau = interface.in_tau
         self.searched = interface.searched(events)
         self.modes = modes_of(events, interface.parameters, interface.mode_names)
+        self.mode_columns = [*map(interface.parameters.index, self.modes)]
         self.changes_states = any(event.changes_state for event in events)
         self.divides_steps = self.changes_states or bool(interface.mode_names)
         self.origin, self.problem, self._of_sizes, self._reason = origin, problem, of_sizes, reason
@@ -349,8 +351,8 @@ class CompiledMethod:
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """Parameter names."""
-        return self.interface.parameters
+        """Parameter names, without those of the modes of contacts and kinks, which follow them in vectors of values."""
+        return self.interface.own_parameters
 
     @property
     def defaults(self) -> Array:

@@ -293,7 +293,7 @@ class Memory:
         """Put the parameters that events have set among the values of all."""
         own = len(self.stepper.modes) - len(self.stepper.interface.mode_names)  # modes of contacts and kinks follow
         if own and self._watch is not None and self._watch.begun:
-            values[[*map(self.stepper.parameters.index, self.stepper.modes[:own])]] = list(self._watch.mode)[:own]
+            values[self.stepper.mode_columns[:own]] = list(self._watch.mode)[:own]
         return values
 
     @property
@@ -301,7 +301,7 @@ class Memory:
         """(k,) values of the present step, with those that events have set and the modes of contacts and kinks."""
         values, modes = self._parameters.copy(), self.stepper.modes
         if modes and self._watch is not None and self._watch.begun:
-            values[[*map(self.stepper.parameters.index, modes)]] = list(self._watch.mode)[: len(modes)]
+            values[self.stepper.mode_columns] = list(self._watch.mode)[: len(modes)]
         return values
 
     @property

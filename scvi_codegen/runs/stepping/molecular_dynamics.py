@@ -150,5 +150,5 @@ def _periods(states: Any, box: str | Sequence[str]) -> tuple[list[int], Array]:
     for name in names:
         if name not in stepper.parameters:
             raise ArgumentError(f"'{name}' is not a parameter of {stepper!r}: give the name of the length of the box")
-    places = [stepper.parameters.index(name) for name in names]
+    places = [stepper.interface.parameters.index(name) for name in names]
     return places, np.resize(np.array(states.parameters)[places], dimension)

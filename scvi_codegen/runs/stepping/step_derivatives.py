@@ -117,7 +117,7 @@ class LinearisedMethod(StateFunctions):
         gradient, name = np.zeros(self._input_size), self.interface.energy_parameter
         if name is None:
             return gradient
-        others = dict(zip(self.parameters, parameters.tolist(), strict=True))
+        others = dict(zip(self.interface.parameters, parameters.tolist(), strict=True))
         del others[name]
         binding, values = self.tangent, self._parameters_at(q, p, others)
         status = binding.function("energy_gradient")(

@@ -131,10 +131,22 @@ def constraint_rates(system: Constrained) -> tuple[Expr, ...]:
 
 def constraints_work(system: Constrained) -> bool:
     """Return whether constraint forces can do work: the rate of a constraint at zero velocity is not 0, or friction."""
-    if has_oblique_forces(system):
-        return True
-    at_rest = dict.fromkeys(system.velocities, sympy.S.Zero)
-    return any(rate.xreplace(at_rest) != 0 for rate in constraint_rates(system))
+    return bool(constraint_power(system) != 0)
+
+
+def constraint_power(system: Constrained) -> Expr:
+    """Return the power of the constraint forces D^T lambda, lambda . ((D - G) v - b), where rates are G v + b = 0."""
+    imposed = {reaction.active: sympy.S.One for reaction in system.reactions}
+    at_rest = imposed | dict.fromkeys(system.velocities, sympy.S.Zero)
+    ideal, oblique = constraint_jacobian(system), force_directions(system)
+    terms = [
+        -factor * rate.xreplace(at_rest)
+        for factor, rate in zip(constraint_multipliers(system), constraint_rates(system), strict=True)
+    ]
+    for k, i in sorted({*ideal, *oblique}):
+        apart = oblique.get((k, i), sympy.S.Zero) - ideal.get((k, i), sympy.S.Zero).xreplace(imposed)
+        terms.append(constraint_multipliers(system)[k] * apart * system.velocities[i])
+    return sympy.Add(*terms)
 
 
 def constraint_jacobian(system: Constrained) -> dict[tuple[int, int], Expr]:

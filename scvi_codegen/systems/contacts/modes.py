@@ -32,7 +32,9 @@ class ContactRows(NamedTuple):
         slips: number of slips: 1 in a plane, 2 in space, 0 without friction.
         closed, sticks: names of the masks of its mode.
         directions: of slip: d in a plane; in space whether it slips, and vectors of two components each (contacts.h).
-        transitions: kinds and functions of its transitions (:class:`~scvi_codegen.systems.event.Transition`).
+        title: its formula, for messages.
+        transitions: kinds, functions and conditions of its transitions
+            (:class:`~scvi_codegen.systems.event.Transition`).
     """
 
     normal: int | None
@@ -41,7 +43,8 @@ class ContactRows(NamedTuple):
     closed: str | None
     sticks: str | None
     directions: tuple[str, ...]
-    transitions: tuple[tuple[str, str], ...]
+    title: str
+    transitions: tuple[tuple[str, ...], ...]
 
     @property
     def masks(self) -> tuple[str, ...]:
@@ -117,7 +120,10 @@ class _Binding:
         for number, item in enumerate(contacts, 1):
             if not isinstance(item, Contact | Friction):
                 raise SystemDefinitionError(f"contacts are made by contact(..) and friction(..), not {item!r}")
-            names = {name: self._read_all(getattr(item, name), name, item) for name in item.__dataclass_fields__}
+            formulas = (name for name in item.__dataclass_fields__ if name != "where")
+            names = {name: self._read_all(getattr(item, name), name, item) for name in formulas}
+            if names.get("of"):
+                names |= {"gap": self._distance(item, names["gap"], names["of"]), "of": ()}
             expressions.append(replace(cast("Any", item), **names))
             rows.append(self._add(number, expressions[-1]))
         system = replace(
@@ -130,6 +136,16 @@ class _Binding:
             contacts=tuple(expressions),
         )
         return BoundContacts(system, tuple(rows))
+
+    def _distance(self, item: ContactLike, surface: Expr, position: Sequence[Symbol]) -> Expr:
+        """Return the distance from a surface to first order, g/|g_x|."""
+        if other := [x for x in position if x not in self.system.coordinates]:
+            raise SystemDefinitionError(
+                f"of= of the contact '{surface}' contains '{other[0]}': give coordinates of the point, among "
+                f"{', '.join(map(str, self.system.coordinates))}"
+            )
+        gradient = self._gradient(item, surface, position, "gap")
+        return surface / self.sympy.sqrt(self.sympy.Add(*(x**2 for x in gradient)))
 
     def _read_all(self, formulas: Any, role: str, item: ContactLike) -> Any:
         several = isinstance(formulas, tuple)
@@ -193,6 +209,7 @@ class _Binding:
         moving = self._slipping(number, slips) if slips else None
         normal = tangential = None
         transitions: dict[str, Expr] = {}
+        conditions: list[Expr] = []
         oblique = (
             [
                 self.sympy.Add(*(d * b for d, b in zip(moving.direction, column, strict=True)))
@@ -208,6 +225,7 @@ class _Binding:
             normal = self._row(item.gap, closed, force)
             pushes = closed * self._multiplier(normal) + 1 - closed
             transitions |= {"closes": item.gap + closed, "lifts": pushes}
+            conditions = [self._read_all(condition, "where", item) for condition in item.conditions]
         else:
             self.forces = [force - item.limit * b for force, b in zip(self.forces, oblique, strict=True)]
         if moving and sticks is not None:
@@ -223,8 +241,15 @@ class _Binding:
                 transitions["begins"] = sticks * (held**2 - tau[0] ** 2 - tau[1] ** 2) + 1 - sticks
         closed_name, sticks_name = (x and x.name for x in (closed, sticks))
         directions = moving.names if moving else ()
-        functions = tuple((kind, self.system.text_of(function)) for kind, function in transitions.items())
-        return ContactRows(normal, tangential, len(slips), closed_name, sticks_name, directions, functions)
+        leaves = [("leaves", closed * u + (1 - closed) ** 2) for u in conditions if closed is not None]  # u if closed
+        where = [f"{self.system.text_of(u)} >= 0" for u in conditions]
+        functions = tuple(
+            (kind, self.system.text_of(function), *(where if kind == "closes" else ()))
+            for kind, function in (*transitions.items(), *leaves)
+        )
+        named, shown = ("gap", item.gap) if of_gap else ("slip", " and ".join(map(self.system.text_of, slips)))
+        title = f"{named} '{shown if isinstance(shown, str) else self.system.text_of(shown)}'"
+        return ContactRows(normal, tangential, len(slips), closed_name, sticks_name, directions, title, functions)
 
     def _slipping(self, number: int, slips: Sequence[Expr]) -> Slipping:
         """Return the direction of a slip w: a parameter d in a plane, else that of (ahead.w) w + start."""

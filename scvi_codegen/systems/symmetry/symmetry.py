@@ -48,6 +48,7 @@ from scvi_codegen.common.representation import summary
 from scvi_codegen.common.validation import checks_arguments, several
 from scvi_codegen.systems.arrays.symmetry import momentum_maps
 from scvi_codegen.systems.arrays.system import ArraySystem
+from scvi_codegen.systems.constraints import constraint_power
 from scvi_codegen.systems.derived_expressions import forms_of
 from scvi_codegen.systems.first_order import FirstOrderSystem, translations
 from scvi_codegen.systems.formulas.expressions import dot, gradient_tuple
@@ -362,9 +363,11 @@ class WorkRate:
 
 def work_rates(system: MechanicalSystem) -> tuple[WorkRate, ...]:
     """Return the power, then the rate of each momentum map that forces or damping change; empty without forces."""
-    if not system.forces and system.damping == 0:
+    of_contacts = constraint_power(system) if system.reactions else sympy.S.Zero
+    power = _along(system, system.velocities) + of_contacts
+    if not system.forces and system.damping == 0 and of_contacts == 0:
         return ()
-    rates = [WorkRate(name="energy", rate=_along(system, system.velocities))]
+    rates = [WorkRate(name="energy", rate=power)]
     for symmetry in symmetries(replace(system, forces=(), damping=sympy.S.Zero)):
         direction_symbols = set().union(*(xi.free_symbols for xi in symmetry.direction))
         rate = _along(system, symmetry.direction)

@@ -15,7 +15,16 @@ enum {
   CONTACT_OPTIONS = 5, /* open, stick, slip in either direction, held by others */
   CONTACT_DIRECTIONS = 32, /* of a slip in space, between which one is enclosed */
   CONTACT_SWEEPS = 50, /* over several slips that begin */
-  CONTACT_IMPACTS = 100 /* of a contact in a corner */
+  CONTACT_IMPACTS = 100, /* of a contact in a corner */
+  CONTACT_SECANTS = 50 /* for the rate after a restitution */
+};
+
+/* Laws of impact, each where those before create kinetic energy: restitution of rates (Newton), of impulses (Poisson),
+ * none. */
+enum {
+  CONTACT_NEWTON,
+  CONTACT_POISSON,
+  CONTACT_PLASTIC
 };
 
 #define CONTACT_ROUNDING 1e-10 /* part of their size below which gaps, rates and forces count as 0 */
@@ -58,12 +67,13 @@ typedef struct {
   real numbers[CONTACT_NUMBERS];
   const real *value, *rate, *second, *W, *G, *coefficient;
   real size[CONTACT_ROWS], speed[CONTACT_ROWS], rounding[CONTACT_ROWS], drift[CONTACT_ROWS];
+  int absent[EVENT_CONTACTS]; /* whether a condition of the contact fails, or the state is behind it */
 } contact_terms;
 
-/* Transitions that end a mode together, and their consequences: contacts that close, slips that stop, directions of
- * slips that begin; contacts with g = g' = 0, and with w = 0. */
+/* Transitions that end a mode together, and their consequences: contacts that close, or whose conditions fail, slips
+ * that stop, directions of slips that begin; contacts with g = g' = 0, and with w = 0. */
 typedef struct {
-  int closes[EVENT_CONTACTS], stops[EVENT_CONTACTS], begins[EVENT_CONTACTS];
+  int closes[EVENT_CONTACTS], leaves[EVENT_CONTACTS], stops[EVENT_CONTACTS], begins[EVENT_CONTACTS];
   real toward[EVENT_CONTACTS][2]; /* of slips that begin in space, against the friction while it stuck */
   int touches[EVENT_CONTACTS], rests[EVENT_CONTACTS];
 } contact_change;
@@ -143,6 +153,15 @@ static int terms_at(const event_step *step, const event_sample *at, contact_term
     of->drift[r] = fabs(of->rate[r] - by_velocity);
     of->rounding[r] = DBL_EPSILON * (by_position + fabs(at->t) * of->drift[r]);
     of->size[r] = by_position + of->speed[r] * duration;
+  }
+  memset(of->absent, 0, sizeof of->absent);
+  for (int i = 0; status == OK && i < TRANSITIONS; i++) {
+    const int event = FIRST_TRANSITION + i, k = TRANSITION[i][0], row = CONTACTS[k].normal;
+    int exists;
+    if (TRANSITION[i][1] != CONTACT_CLOSES || !IS_CONDITIONAL[event])
+      continue;
+    status = conditions(EVENT_FIRST[event], at->t, at->q, at->p, step->parameters, &exists, step->workspace);
+    of->absent[k] = !exists || of->value[row] < -CONTACT_PENETRATION * of->size[row];
   }
   return status;
 }
@@ -236,9 +255,10 @@ static int options_of(const contact_terms *of, int k, contact_change *now, conta
   int count = 0;
   if (at->normal >= 0)
     option[count++] = CONTACT_IS_OPEN;
-  if (at->normal >= 0 && !now->touches[k] &&
-      (of->value[at->normal] > CONTACT_ROUNDING * of->size[at->normal] ||
-          of->rate[at->normal] > CONTACT_ROUNDING * of->speed[at->normal]))
+  if (of->absent[k] || now->leaves[k] ||
+      (at->normal >= 0 && !now->touches[k] &&
+          (of->value[at->normal] > CONTACT_ROUNDING * of->size[at->normal] ||
+              of->rate[at->normal] > CONTACT_ROUNDING * of->speed[at->normal])))
     return count;
   if (at->slips == 0) {
     option[count++] = CONTACT_SLIPS[1];
@@ -535,10 +555,39 @@ static int impulses_of(const contact_terms *of, int contact, const int *closed, 
   return 0;
 }
 
-/* Impulses of the rows of contacts that approach, one after another, until none does: rates after the impact are -e
- * times those before it (Newton), and impulses are in the friction cone. Closed contacts take part with e = 0. */
+/* Adds to the impulses of a compression those of a restitution, with e times its normal impulse in the friction cone
+ * (C. Glocker & F. Pfeiffer, Nonlinear Dyn. 7, 1995): as those of a contact that approaches with a rate, which follows
+ * by secants. */
+static int restitute(const contact_terms *of, int contact, const int *closed, const real *rate, real *impulse)
+{
+  const int normal = CONTACTS[contact].normal;
+  const real goal = of->coefficient[3 * contact + 2] * impulse[normal];
+  real after[CONTACT_ROWS], added[CONTACT_ROWS], low = 0.0, of_low = 0.0;
+  real high = -of->coefficient[3 * contact + 2] * rate[normal];
+  int exists = 1, differs = goal > 0.0;
+  for (int r = 0; r < CONTACT_ROWS; r++) {
+    after[r] = rate[r];
+    for (int j = 0; j < CONTACT_ROWS; j++)
+      after[r] += of->W[r * CONTACT_ROWS + j] * impulse[j];
+  }
+  for (int k = 0; exists && differs && k < CONTACT_SECANTS; k++) {
+    after[normal] = -high;
+    exists = impulses_of(of, contact, closed, 0.0, after, added);
+    const real slope = (added[normal] - of_low) / (high - low);
+    low = high;
+    of_low = added[normal];
+    differs = fabs(of_low - goal) > 4.0 * DBL_EPSILON * goal;
+    high += (goal - of_low) / slope;
+  }
+  for (int r = 0; exists && goal > 0.0 && r < CONTACT_ROWS; r++)
+    impulse[r] += added[r];
+  return exists && !differs;
+}
+
+/* Impulses of the rows of contacts that approach, one after another, until none does, by a law of restitution, in the
+ * friction cone. Closed contacts take part with e = 0. */
 static int find_impulses(const event_step *step, const contact_terms *of, const int *approaches, const int *closed,
-    int is_plastic, real *total)
+    int law, real *total)
 {
   memset(total, 0, BYTES(CONTACT_ROWS));
   for (int round = 0; round < CONTACT_IMPACTS * EVENT_CONTACTS; round++) {
@@ -554,7 +603,8 @@ static int find_impulses(const event_step *step, const contact_terms *of, const 
         meets = k;
     if (meets < 0)
       return OK;
-    if (!impulses_of(of, meets, closed, is_plastic ? 0.0 : of->coefficient[3 * meets + 2], rate, impulse))
+    if (!impulses_of(of, meets, closed, law == CONTACT_NEWTON ? of->coefficient[3 * meets + 2] : 0.0, rate, impulse) ||
+        (law == CONTACT_POISSON && !restitute(of, meets, closed, rate, impulse)))
       return refuse(step, CONTACT_WITHOUT_IMPULSE, meets, 0.0);
     for (int r = 0; r < CONTACT_ROWS; r++)
       total[r] += impulse[r];
@@ -588,23 +638,24 @@ static int is_low(const event_step *step, const contact_terms *before, const con
   return of->rate[row] * of->rate[row] <= -2.0 * of->second[row] * lowest;
 }
 
-/* Impulses of all contacts that meet at a state, and which contacts touch and rest afterwards; restitution is 0 where
- * Newton's law would create kinetic energy. */
+/* Impulses of all contacts that meet at a state, by the first law that creates no kinetic energy, and which contacts
+ * touch and rest afterwards. */
 static int collide(const event_step *step, event_sample *at, contact_terms *of, const int *closed, contact_change *now)
 {
   const contact_terms before = *of;
   real impulse[CONTACT_ROWS];
-  int approaches[EVENT_CONTACTS], is_plastic = 0, status;
+  int approaches[EVENT_CONTACTS], law = CONTACT_NEWTON, status;
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal;
-    approaches[k] = normal >= 0 &&
+    approaches[k] = normal >= 0 && !of->absent[k] && !now->leaves[k] &&
         (now->closes[k] || (!closed[k] && fabs(of->value[normal]) <= CONTACT_ROUNDING * of->size[normal]));
   }
-  status = find_impulses(step, of, approaches, closed, 0, impulse);
-  if (status == OK && gain_of(of, impulse) > CONTACT_GAIN) {
-    is_plastic = step->watch->plastic = 1;
-    status = find_impulses(step, of, approaches, closed, 1, impulse);
+  status = find_impulses(step, of, approaches, closed, law, impulse);
+  while (status == OK ? law < CONTACT_PLASTIC && gain_of(of, impulse) > CONTACT_GAIN : law == CONTACT_POISSON) {
+    step->watch->refusal = 0;
+    status = find_impulses(step, of, approaches, closed, ++law, impulse);
   }
+  step->watch->law = law > step->watch->law ? law : step->watch->law;
   for (int r = 0; status == OK && r < CONTACT_ROWS; r++)
     for (int i = 0; i < M; i++)
       at->p[i] += of->G[r * M + i] * impulse[r];
@@ -616,7 +667,7 @@ static int collide(const event_step *step, event_sample *at, contact_terms *of, 
       now->rests[k] = !now->begins[k] && length_of(of->rate + slip, slips) <= CONTACT_ROUNDING * before.speed[slip];
     if (normal < 0 || !(approaches[k] || closed[k]))
       continue;
-    if (impulse[normal] > 0.0 && (closed[k] || is_plastic || before.coefficient[3 * k + 2] == 0.0))
+    if (impulse[normal] > 0.0 && (closed[k] || law == CONTACT_PLASTIC || before.coefficient[3 * k + 2] == 0.0))
       now->touches[k] = 1;
     if (of->rate[normal] > CONTACT_ROUNDING * before.speed[normal])
       now->touches[k] = 0;
@@ -660,11 +711,11 @@ static int change_modes(const event_step *step, event_sample *at, contact_change
   int closed[EVENT_CONTACTS], approach = 0, slips = 0, status = terms_at(step, at, &of);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const contact_mode mode = mode_of(step, k);
-    closed[k] = CONTACTS[k].normal >= 0 && mode.closed;
+    closed[k] = CONTACTS[k].normal >= 0 && mode.closed && !now->leaves[k];
     now->touches[k] |= closed[k];
     now->rests[k] = (mode.sticks || (now->stops[k] && stops_at(step, &of, k))) && !now->begins[k];
     slips |= now->begins[k] && CONTACTS[k].slips == 2;
-    approach |= now->closes[k] && of.rate[CONTACTS[k].normal] < 0.0;
+    approach |= now->closes[k] && !now->leaves[k] && of.rate[CONTACTS[k].normal] < 0.0;
   }
   if (status == OK && slips)
     find_toward(step, &of, now);
@@ -673,6 +724,19 @@ static int change_modes(const event_step *step, event_sample *at, contact_change
   if (status == OK)
     status = choose_modes(step, &of, now);
   return status == OK ? satisfy_constraints(step, at->t, at->q, at->p, 1) : status;
+}
+
+/* Whether a condition of a contact has failed now: its gap may vanish again where that is 0 within rounding. */
+static int has_just_left(const event_step *step, int k)
+{
+  const event_watch *watch = step->watch;
+  int left = 0;
+  for (int i = 0; i < TRANSITIONS; i++) {
+    const NAME(event_history) *const history = watch->history + EVENT_FIRST[FIRST_TRANSITION + i];
+    left |= TRANSITION[i][0] == k && TRANSITION[i][1] == CONTACT_LEAVES && history->hits > 0 &&
+        fabs(watch->time - history->last) <= EVENT_TIE * fabs(step->whole);
+  }
+  return left;
 }
 
 /* Modes after the transitions among the crossings from `first` on, which have one state. */
@@ -686,6 +750,7 @@ static int change_contacts(const event_step *step, long long first, event_sample
       const int *const transition = TRANSITION[step->found[i].function - FIRST_TRANSITION];
       const int k = transition[0];
       now.closes[k] |= transition[1] == CONTACT_CLOSES;
+      now.leaves[k] |= transition[1] == CONTACT_LEAVES || (transition[1] == CONTACT_CLOSES && has_just_left(step, k));
       now.stops[k] |= transition[1] == CONTACT_STOPS;
       now.begins[k] += (transition[1] == CONTACT_FORWARD || transition[1] == CONTACT_BEGINS) -
           (transition[1] == CONTACT_BACKWARD);
@@ -708,15 +773,22 @@ static int begin_contacts(const event_step *step, event_sample *at)
   status = terms_at(step, at, &of);
   for (int k = 0; status == OK && k < EVENT_CONTACTS; k++) {
     const int row = CONTACTS[k].normal;
-    if (row >= 0 && of.value[row] < -CONTACT_PENETRATION * of.size[row])
+    if (row >= 0 && !of.absent[k] && of.value[row] < -CONTACT_PENETRATION * of.size[row])
       status = refuse(step, CONTACT_PENETRATES, k, of.value[row]);
     if (status == OK && is_impossible(&of, k))
       status = refuse(step, CONTACT_IMPOSSIBLE, k, of.coefficient[3 * k]);
-    now.closes[k] = row >= 0 && fabs(of.value[row]) <= CONTACT_ROUNDING * of.size[row];
+    now.closes[k] = row >= 0 && !of.absent[k] && fabs(of.value[row]) <= CONTACT_ROUNDING * of.size[row];
   }
   if (status == OK)
     status = change_modes(step, at, &now);
   return status;
+}
+
+/* Whether the function of a transition is not negative after a step without it; gaps of limited contacts may be. */
+static int is_kept(int transition)
+{
+  const int kind = TRANSITION[transition][1];
+  return kind == CONTACT_LEAVES || (kind == CONTACT_CLOSES && !IS_CONDITIONAL[FIRST_TRANSITION + transition]);
 }
 
 /* Fails if a gap is negative at the end of a step in which no transition was found. */
@@ -726,7 +798,7 @@ static int check_gaps(const event_step *step, const event_sample *right)
   real value[EVENTS];
   int doubtful = 0, status = evaluate_functions(step, right, value);
   for (int i = 0; i < TRANSITIONS; i++)
-    doubtful |= TRANSITION[i][1] == CONTACT_CLOSES && value[EVENT_FIRST[FIRST_TRANSITION + i]] < 0.0;
+    doubtful |= is_kept(i) && value[EVENT_FIRST[FIRST_TRANSITION + i]] < 0.0;
   if (status != OK || !doubtful)
     return status;
   memcpy(values_at(step, 0), value, BYTES(EVENTS));
@@ -737,7 +809,7 @@ static int check_gaps(const event_step *step, const event_sample *right)
     const int e = EVENT_FIRST[FIRST_TRANSITION + i];
     const real rounding = CONTACT_MISSED * values_at(step, EVENT_DEGREE + 2)[e] + step->watch->history[e].slack +
         CONTACT_ROUNDING * of.size[CONTACTS[TRANSITION[i][0]].normal];
-    if (TRANSITION[i][1] == CONTACT_CLOSES && value[e] < -rounding) {
+    if (is_kept(i) && value[e] < -rounding) {
       step->watch->through = FIRST_TRANSITION + i + 1;
       return NOT_CONVERGED;
     }

@@ -239,7 +239,12 @@ static int change_state(const event_step *step, int e, event_sample *at)
     if (status == OK)
       status = satisfy_constraints(step, at->t, at->q, at->p, 1);
   }
-  if (status == OK && !(all_finite(at->q, M) && all_finite(at->p, M))) {
+#ifdef EVENT_MODES
+  const int is_mode = all_finite(step->watch->mode, EVENT_MODES);
+#else
+  const int is_mode = 1;
+#endif
+  if (status == OK && !(is_mode && all_finite(at->q, M) && all_finite(at->p, M))) {
     step->watch->undefined = -(EVENT_OF(e) + 1);
     status = NOT_FINITE;
   }

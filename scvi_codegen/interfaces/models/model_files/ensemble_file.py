@@ -80,7 +80,7 @@ class EnsembleStates:
             default = stepper.velocity(model.q, model.momenta(stepper), model.t, start)
         parameters = self.parameters
         if model.inputs:  # with their initial coefficients
-            parameters = self._table(list(stepper.parameters), model.parameters_at_start(stepper))
+            parameters = self._table(list(stepper.interface.parameters), model.parameters_at_start(stepper))
         states = zip(self.q, self._table(velocities, default), parameters, strict=True)
         return stacked([stepper.momentum(q, v, model.t, values) for q, v, values in states])
 
