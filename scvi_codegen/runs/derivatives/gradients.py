@@ -158,11 +158,6 @@ def propagate(states: SavedStates, starts: Starts, numbers: NDArray[np.intp], ve
     Modes, which are parameters of the steps, have no variations but those of the directions of slips in space.
     """
     jumps: dict[int, Jump] = {}
-<<<<<<< HEAD
-=======
-    modes = [2 * states.stepper.dimension + column for column in states.stepper.mode_columns]
-    vectors[0][:, modes] = 0.0
->>>>>>> work
     if states.stepper.divides_steps:
         more = back or bool(vectors[..., 2 * states.stepper.dimension :].any())
         jumps = jumps_within(states, starts, numbers, all_inputs=more)

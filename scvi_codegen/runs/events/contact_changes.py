@@ -116,7 +116,6 @@ def change_at(
         StateError: if the impulses are those of several impacts, one after another.
     """
     q, p = np.split(before, 2)
-<<<<<<< HEAD
     start = Rows.at(stepper, before, t, modes[0])
     friction, static, _ = start.coefficients[event.contact]
     if event.kind == "begins" and not static > friction:
@@ -126,11 +125,7 @@ def change_at(
         )
     parts = _impulses(stepper, event, before, after, t, modes[0]) if event.kind == "closes" else []
     normal = stepper.interface.contacts[event.contact].normal
-    places = [*map(stepper.parameters.index, stepper.modes)]
-=======
-    impulses = _impulses(stepper, event, before, after, t, modes[0]) if event.kind == "closes" else []
     places = stepper.mode_columns
->>>>>>> work
 
     def with_restitution(elastic: float) -> Change:
         def rates(of: Rows) -> Array:
@@ -206,15 +201,9 @@ def _is_along(vector: Array, direction: Array, scale: float) -> bool:
 
 def _impulses(
     stepper: Integrator, event: Transition, before: Array, after: Array, t: float, parameters: Array
-<<<<<<< HEAD
 ) -> list[Part]:
     """Return the contacts with an impulse, in the modes they had in the run."""
-    contacts, named = stepper.interface.contacts, dict(zip(stepper.parameters, parameters.tolist(), strict=True))
-=======
-) -> list[Impulse]:
-    """Return the impulses of an impact in the modes they had in the run."""
     contacts, named = stepper.interface.contacts, stepper.parameters_by_name(parameters)
->>>>>>> work
     first, last = (Rows.at(stepper, state, t, parameters) for state in (before, after))
     q, p = np.split(before, 2)
     sizes = np.sqrt(np.abs(np.diag(first.inverse_masses) * (p @ stepper.velocity(q, p, t, parameters))))

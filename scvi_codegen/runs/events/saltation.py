@@ -99,7 +99,7 @@ def jumps_within(
         t, state = float(states.t[0]), np.concatenate([states.q[0], states.p[0]])
         here = Place(states, t, parameters_on_sides(states, t), all_inputs)
         matrix = _with_directions(here, np.eye(stepper._input_size), state, 0.0 * here.parameters)
-        matrix[:, [len(state) + stepper.parameters.index(name) for name in stepper.modes]] = 0.0
+        matrix[:, [len(state) + column for column in stepper.mode_columns]] = 0.0
         jumps[0] = Jump(matrix, state)
     return jumps
 
@@ -137,7 +137,7 @@ def _with_directions(later: Place, matrix: Array, state: Array, before: Array) -
 def _directions(stepper: Integrator) -> list[tuple[int, list[int]]]:
     """Return the contacts with slip in space, and the places of the directions that these keep in the parameters."""
     contacts = enumerate(stepper.interface.contacts)
-    return [(k, [*map(stepper.parameters.index, item.directions[1:])]) for k, item in contacts if item.slips == 2]
+    return [(k, [*map(stepper.interface.parameters.index, item.directions[1:])]) for k, item in contacts if item.slips == 2]
 
 
 def _changes(states: SavedStates, numbers: NDArray[np.intp]) -> dict[int, tuple[Event, Array]]:
@@ -166,7 +166,7 @@ def _turns(states: SavedStates, numbers: NDArray[np.intp]) -> dict[int, tuple[Ev
     if history is None or not np.isin(history.t, states.t).all():
         raise StateError("this requires the states where slips in space change: save all states (save_every=1)")
     for k, places in _directions(states.stepper):
-        event = Transition(function=f"slip of contact {k + 1}", contact=k, kind="turns")
+        event = Transition(function="1", contact=k, kind="turns", gap="slip")
         for row in np.searchsorted(states.t, history.t).tolist():
             old, new = (parameters_on_sides(states, float(states.t[n]))[places[:2]] for n in (row - 1, row))
             if numbers[0] < row <= numbers[-1] and not np.array_equal(old, new):
