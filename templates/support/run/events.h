@@ -434,7 +434,7 @@ static int leave_to_side(const event_step *step, int e, const event_sample *left
   const real tiny = copysign(DBL_MIN, side);
   event_sample next = *left;
   int status = OK, away = 0, remains = EVENT_DEGREE;
-  while (remains >= 0 && fabs(values_at(step, remains)[e]) <= noise)
+  while (remains >= 0 && !is_transition(EVENT_OF(e)) && fabs(values_at(step, remains)[e]) <= noise)
     remains--;
   if (remains < 0)
     from->fraction = 1.0; /* on the surface: nothing to search */
