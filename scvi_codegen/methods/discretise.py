@@ -27,6 +27,7 @@ from scvi_codegen.systems.first_order import FirstOrderSystem
 from scvi_codegen.systems.formulas.expressions import gradient_tuple
 from scvi_codegen.systems.formulas.intermediates import intermediate
 from scvi_codegen.systems.hamiltonian import HamiltonianSystem
+from scvi_codegen.systems.kinks import check_continuity
 from scvi_codegen.systems.lagrangian import LagrangianSystem
 from scvi_codegen.systems.legendre.of_rotations import hamiltonian_of_rotations
 from scvi_codegen.systems.splittings.axial import Turn, axial_turns, frame_potential, rotated
@@ -66,6 +67,7 @@ def discretise(system: MechanicalSystem, method: Method) -> StageSystem:
     """
     stages = method.stage_system(axial_turns(system)[0])
     check_regular(method, system)
+    check_continuity(system)
     if system.has_contacts:
         raise MethodError(f"the contacts of '{system.name}' require compile_stepper: omit them, contacts=()")
     if system.damping != 0 and not isinstance(stages.shape, Velocities):

@@ -33,6 +33,7 @@ from scvi_codegen.methods import SVI, StoermerVerlet, as_method, default_method
 from scvi_codegen.methods.method import Method
 from scvi_codegen.runs.stepper import Stepper, StepperOfRunTimeSizes
 from scvi_codegen.runs.stepping.compiled_method import Variants
+from scvi_codegen.runs.stepping.features import warn_of_formulas
 from scvi_codegen.systems.contact import ContactLike
 from scvi_codegen.systems.contacts.modes import ContactRows, bound_contacts
 from scvi_codegen.systems.event import Event, EventLike, as_events
@@ -129,17 +130,17 @@ def compile_stepper(
     }
     _check_symmetries(symmetries)
     if isinstance(system, OfRunTimeSizes) and sizes is None and tables is None:
-        return _compile_arrays(system, method, symmetries, as_events(events), precision, common, sums)
+        return _compile_arrays(system, method, symmetries, as_events(events), precision, common, sums, kinks)
     if sums == "plain":
         raise MethodError(
             f"sums='plain' is not available for '{system.name}' with named coordinates or known sizes: leave out "
             "sums=, or declare arrays, q[N], whose sizes each run gives"
         )
     compiled = partial(compile_stepper, system, method, symmetries=symmetries, sizes=sizes, tables=tables, **common)
+    located = kinks == "located"
     if precision == DOUBLE_DOUBLE:
-        kinks, compiled = "as formulas", partial(compiled, kinks="as formulas")
-    else:
-        compiled = partial(compiled, kinks=kinks)
+        kinks = "as formulas"
+    compiled = partial(compiled, kinks=kinks)
     if precision == AUTO:
         return _in_both_precisions(compiled, events)
     shape: dict[str, Any] = {"mesh": system.mesh, "links": system.drawn_links}
@@ -150,6 +151,8 @@ def compile_stepper(
     sources = CachedSources(system, method, *settings)
     source, interface = sources.integrator()
     interface = replace(interface, layout=replace(interface.layout, **shape), contacts=rows)
+    if located and not interface.modes:
+        warn_of_formulas(interface, f"the stepper of '{system.name}'")
     system.store_key()
     stepper = partial(Stepper, source, interface, variants=sources.variants, flags=flags)
     if precision == DOUBLE_DOUBLE:
@@ -186,6 +189,7 @@ def _compile_arrays(
     precision: str,
     common: Mapping[str, Any],
     sums: Sums,
+    kinks: Kinks,
 ) -> Stepper:
     """Return the stepper of arrays whose sizes each run determines; ``common``: further arguments."""
     if precision == AUTO:
@@ -203,7 +207,9 @@ def _compile_arrays(
         raise MethodError(f"sums='plain' is not available for '{system.name}': {reason}")
     if system.constraints and isinstance(discretisation, StoermerVerlet):
         method = SVI(1, "gauss-lobatto:2")  # the name of RATTLE for known sizes
-    of_sizes = partial(compile_stepper, system, method, **common)
+    if kinks == "located":
+        warn_of_formulas(interface, f"the stepper of '{system.name}' with sizes of each run")
+    of_sizes = partial(compile_stepper, system, method, **common, kinks=kinks)
     arguments: dict[str, Any] = {"variants": sources.variants, "flags": common["flags"], "events": events}
     return StepperOfRunTimeSizes(source, interface, **arguments, of_sizes=of_sizes, reason=reason)
 
@@ -219,7 +225,7 @@ def _in_both_precisions(compiled: Callable[..., Stepper], events: EventLike | Se
     @cache
     def in_double_double() -> Stepper | None:
         with suppress(MethodError):  # of this system or method
-            return compiled(precision=DOUBLE_DOUBLE)
+            return compiled(precision=DOUBLE_DOUBLE, kinks="as formulas")
         return None
 
     stepper = compiled(events=events)

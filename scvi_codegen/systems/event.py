@@ -158,6 +158,11 @@ class Event:
         return self.then is not None or self.restitution is not None
 
     @property
+    def is_wall(self) -> bool:
+        """Return whether crossings change the momenta along the gradient of the function."""
+        return self.restitution is not None
+
+    @property
     def changes(self) -> tuple[tuple[str, Formula], ...]:
         """Names and new values of the variables that crossings set."""
         return cast("tuple[tuple[str, Formula], ...]", self.then or ())
@@ -202,6 +207,16 @@ class Kink(Event):
 
 BEGINNINGS = ("forward", "backward", "begins")
 """Kinds of transitions at which a slip begins."""
+
+
+@dataclass(frozen=True, slots=True)
+class Refraction(Kink):
+    """Zero of a switching function u(q, t) where L jumps: momenta are refracted or reflected, p+ = p- + lambda u_q."""
+
+    @property
+    def is_wall(self) -> bool:
+        """True."""
+        return True
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,10 +14,13 @@ from collections.abc import Container, Iterable, Mapping
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
-from scvi_codegen.systems.event import Kink
+from scvi_codegen.common.errors import MethodError
+from scvi_codegen.systems.checks.continuity import MOST_SURFACES, jump_message, jumps_of
+from scvi_codegen.systems.event import Kink, Refraction
 from scvi_codegen.systems.formulas.expressions import parts_of_type
 from scvi_codegen.systems.formulas.intermediates import parts
 from scvi_codegen.systems.formulas.kinks import Mode, switching_function, unit_step
+from scvi_codegen.systems.formulas.tables import without_tables
 
 if TYPE_CHECKING:
     from sympy import Expr
@@ -53,6 +56,8 @@ def located_kinks(system: MechanicalSystem) -> tuple[MechanicalSystem, tuple[Kin
         u, sign = switching_function(step.args[0])
         rules[step] = unit_step(step.args[0] + sign * modes[u])
     rules |= {power: rules[step] * power for power, step in powers.items() if step in rules}
+    jumps = set(_jumps(system))
+    jumps = arguments if jumps and len(arguments) > MOST_SURFACES else jumps
     with_modes = copy.copy(system)  # not made anew, as it would be checked again
     changes: dict[str, Any] = {name: _replaced(getattr(system, name), rules) for name in owned}
     changes["parameters"] = (*system.parameters, *modes.values())
@@ -61,9 +66,25 @@ def located_kinks(system: MechanicalSystem) -> tuple[MechanicalSystem, tuple[Kin
         object.__setattr__(with_modes, name, value)
     sides = {switching_function(step.args[0]) for step in powers.values() if step in rules}
     return with_modes, tuple(
-        Kink(system.text_of(u.xreplace(rules)), mode=mode.name, power_sides=_signs(u, sides))
+        (Refraction if u in jumps else Kink)(
+            system.text_of(u.xreplace(rules)), mode=mode.name, power_sides=_signs(u, sides)
+        )
         for u, mode in modes.items()
     )
+
+
+def _jumps(system: MechanicalSystem) -> dict[Expr, Expr]:
+    """Return functions u without modes at whose zeros L or H jumps, of the first ``MOST_SURFACES``, and terms."""
+    if system.lengths:
+        return {}  # lists of neighbours end at a cutoff
+    moving = {*system.coordinates, *system.velocities, *system.auxiliaries}
+    return dict(jumps_of(without_tables(system.formula), moving, system.constants))
+
+
+def check_continuity(system: MechanicalSystem) -> None:
+    """Raise :class:`MethodError` if L or H jumps at a surface without a mode, where steps do not refract momenta."""
+    for jump in _jumps(system).items():
+        raise MethodError(jump_message(f"the function of '{system.name}'", *jump))
 
 
 def _signs(u: Expr, sides: Container[tuple[Expr, int]]) -> tuple[int, ...]:

@@ -204,8 +204,6 @@ def test_members_of_ensembles_have_dense_output_across_kinks():
     settings, times = {"h": 0.05, "steps": 120}, np.linspace(0.0, 6.0, 97)
     member = stepper.integrate_ensemble([[0.5], [1.0]], [[0.0], [0.0]], **settings)[1]
     assert member.at(times)[1] == pytest.approx(stepper.integrate([1.0], [0.0], **settings).at(times)[1], abs=1e-12)
-    with pytest.raises(sc.StateError, match='compile it with kinks="as formulas"'):
-        stepper.integrate_ensemble([[0.5], [1.0]], [[0.0], [0.0]], **settings, observe="extremes")
 
 
 def test_sliding_is_an_error_that_names_it():

@@ -42,7 +42,7 @@ from scvi_codegen.common.errors import EventError, ScviCodegenError, SystemDefin
 from scvi_codegen.common.precision import mp
 from scvi_codegen.methods.tables.nodes import chebyshev_lobatto, to_unit
 from scvi_codegen.systems.contacts.modes import ContactRows
-from scvi_codegen.systems.event import Kink, Transition, modes_of
+from scvi_codegen.systems.event import Kink, Refraction, Transition, modes_of
 from scvi_codegen.systems.formulas.array_statements import (
     EntryRules,
     entry_names,
@@ -79,6 +79,8 @@ class SearchedEvent(Protocol):
     def loops(self) -> str: ...
     @property
     def changes_state(self) -> bool: ...
+    @property
+    def is_wall(self) -> bool: ...
     def check_function(self, moving: Sequence[str], *, constant: bool) -> None: ...
 
 
@@ -189,9 +191,10 @@ class EventFormulas:
         ]
 
     def _changes(self, event: SearchedEvent, g: Expr) -> tuple[list[int], list[Expr]]:
-        if event.restitution is not None:
+        if event.is_wall:
             gradient = [sympy.diff(g, variable) for variable in (*self.q, symbol(TIME))]  # g_q, g_t
-            restitution = self._read(event.restitution, f"restitution '{event.restitution}'")
+            e = 1.0 if event.restitution is None else event.restitution
+            restitution = self._read(e, f"restitution '{e}'")
             return [*range(len(self.q)), 0, 0], [*gradient, restitution]
         settable = (*self.q, *self.p) if self.interface.variables else (*self.q, *self.p, *self.v)
         places = {variable: k for k, variable in enumerate(settable)}
@@ -338,6 +341,7 @@ def _search(interface: Interface, events: tuple[SearchedEvent, ...], *, controll
         )
     formulas = EventFormulas(interface, events)
     sides = [event.power_sides for event in events if isinstance(event, Kink)]
+    refracts = [isinstance(event, Refraction) for event in events]
     timed = [0 if interface.in_tau else _kind_in_time(g, formulas.arguments) for g in formulas.functions]
     rates = [turn_rate(g) if kind else sympy.Integer(0) for g, kind in zip(formulas.functions, timed, strict=True)]
     formulas_of_kernel = {
@@ -361,6 +365,7 @@ def _search(interface: Interface, events: tuple[SearchedEvent, ...], *, controll
         modes=tuple(map(interface.parameters.index, formulas.modes)),
         kinks=sum(isinstance(event, Kink) for event in events),
         powers=tuple((int(-1 in side), int(1 in side)) for side in sides) if any(sides) else (),
+        refracts=tuple(map(int, refracts)) if any(refracts) else (),
         contacts=tuple(_places(formulas.modes, contact) for contact in interface.contacts),
         contact_rows=interface.masked,
         first_contact_row=len(interface.constraints) - interface.masked,

@@ -168,6 +168,7 @@ class EventSearch:
         modes: indices of the parameters that change along runs: by events, as modes of contacts, and of kinks.
         kinks: number of kinks, which are the last events.
         powers: below and above the zero of each of them, whether a power that is not whole acts; empty if none does.
+        refracts: 1 for each event that is the zero of a kink where L jumps, else 0; empty if there is none.
         contacts: normal and first tangential row of each contact, number of its slips, and its closed, sticks and
             direction among the modes; -1 for what it does not have.
         contact_rows, first_contact_row: number of rows, and of the constraints before them.
@@ -199,6 +200,7 @@ class EventSearch:
     modes: tuple[int, ...] = ()
     kinks: int = 0
     powers: tuple[tuple[int, int], ...] = ()
+    refracts: tuple[int, ...] = ()
     contacts: tuple[tuple[int, ...], ...] = ()
     contact_rows: int = 0
     first_contact_row: int = 0

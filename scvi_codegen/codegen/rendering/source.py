@@ -18,7 +18,7 @@ from scvi_codegen.codegen.rendering.own_names import with_exported_names, with_o
 from scvi_codegen.codegen.rendering.preprocessor import preprocessed
 from scvi_codegen.codegen.rendering.reachable import readable
 from scvi_codegen.systems.contacts.modes import ContactRows
-from scvi_codegen.systems.event import Event, Kink, Transition
+from scvi_codegen.systems.event import Event, Kink, Refraction, Transition
 from scvi_codegen.systems.formulas.indices import Access, ArrayDeclarations, ArrayMap, Loop
 from scvi_codegen.version import __version__
 
@@ -390,7 +390,7 @@ class Interface:
             checks.
         words: number of doubles of each number of a state, 2 in double-double arithmetic.
         kinks: functions at whose zeros the equations are not smooth, for events.
-        modes: parameter, switching function and sides of powers of each kink that runs locate
+        modes: parameter, switching function, "jumps" or "", and sides of powers of each kink that runs locate
             (:mod:`scvi_codegen.systems.kinks`).
         contacts: places of each contact (:mod:`scvi_codegen.systems.contacts.modes`).
     """
@@ -454,7 +454,10 @@ class Interface:
             for number, contact in enumerate(self.contacts)
             for kind, function, *where in contact.transitions
         )
-        kinks = (Kink(function, mode=mode, power_sides=tuple(map(int, sides))) for mode, function, *sides in self.modes)
+        kinks = (
+            (Refraction if jumps else Kink)(function, mode=mode, power_sides=tuple(map(int, sides)))
+            for mode, function, jumps, *sides in self.modes
+        )
         return *events, *transitions, *kinks
 
     @property

@@ -29,6 +29,7 @@ from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import StageGroup, StageSystem, Table, straight
 from scvi_codegen.runs.stepper import Stepper
+from scvi_codegen.runs.stepping.features import warn_of_formulas
 from scvi_codegen.systems.constraints import constraint_rates, position_conditions
 from scvi_codegen.systems.derived_expressions import forms_of
 from scvi_codegen.systems.formulas.expressions import CONSTANTS, FUNCTIONS
@@ -226,6 +227,7 @@ def casadi_step(
         raise MethodError(f"'{system.name}' is in transformed time: pass the original system")
     if checked_count(degree, "degree", least=0) > HIGHEST:
         raise MethodError(f"degree must be at most {HIGHEST} (polynomial inputs), not {degree}")
+    warn_of_formulas(system, "casadi_step or optimal_control")
     stages = discretise(system, as_method(method, system))
     written = _StageExpressions(ca, system, stages, degree)
     *rows, p1 = written.rows()

@@ -23,6 +23,7 @@ from scvi_codegen.methods.exact.curve import Curve, Grid
 from scvi_codegen.methods.exact.newton import Array, NotConvergedError, largest
 from scvi_codegen.methods.exact.solution import ExactMotion
 from scvi_codegen.systems.arrays.system import ArrayLagrangian
+from scvi_codegen.systems.kinks import check_continuity
 from scvi_codegen.systems.lagrangian import LagrangianSystem
 from scvi_codegen.systems.rolling import unrolled_at
 
@@ -162,6 +163,7 @@ class _Problem:
 
     def __init__(self, system: LagrangianSystem, h: Any, t: Any, parameters: Values, digits: int) -> None:
         checked_count(digits, "digits", least=1, most=MOST_DIGITS)
+        check_continuity(system)
         self.names = [coordinate.name for coordinate in system.coordinates]
         self.arrays = [array.name for array in system.arrays] or self.names
         self.digits, self.t, self.h = digits, _number(t, "the time t"), _number(h, "the step h")

@@ -76,11 +76,6 @@ class EnsembleSettings:
             require(stepper, "observe_ensemble")
         if self.device is not None:
             require(stepper, "device")
-        if stepper.interface.mode_names and self.observe is not None:
-            raise StateError(
-                f"observe= of ensembles of '{stepper.interface.system}' is not available, as its runs locate kinks: "
-                'compile it with kinks="as formulas", or pass no observe='
-            )
         if self.records_events(stepper):
             check_together(events=stepper.events, device=self.device, observe_ensemble=self.observe)
             require(stepper, "ensemble_events")

@@ -212,12 +212,12 @@ def _jump(
     # dh of a divided step is added to both of its parts, but lengthens only the second: without that of the first,
     # which the crossing makes X+ dh, and without its dt = dh
     back, matrix = divided * np.eye(size)[-1], np.eye(size)
-    if isinstance(event, Kink) and np.linalg.norm(departure - arrival) <= CONTINUOUS * np.linalg.norm(arrival):
+    if type(event) is Kink and np.linalg.norm(departure - arrival) <= CONTINUOUS * np.linalg.norm(arrival):
         return Jump(_moved_back(matrix, departure, back), before)
     values, rate = _crossing(here, event, (before, after), later.parameters, arrival)
     gradient = np.concatenate([values.gradient, np.zeros(1)])
-    if event.restitution is not None:
-        change = _impact(here, values, before, after)
+    if event.is_wall:
+        change = _impact(here, later, values, before, after)
     elif isinstance(event, Transition):
         change = values.map
     else:
@@ -300,7 +300,7 @@ def _derivatives(interface: Interface, event: Event) -> Callable[[Array, float, 
             f"derivatives through the event {event.title} require momenta instead of velocities in its formulas, "
             "and no multipliers"
         )
-    mapped = [new.get(k, unchanged) for k, unchanged in enumerate(z)] if event.restitution is None else list(values)
+    mapped = list(values) if event.is_wall else [new.get(k, unchanged) for k, unchanged in enumerate(z)]
     entries = [formulas.functions[0].diff(x) for x in variables]
     entries += [value.diff(x) for value in mapped for x in variables]
     function = sympy.lambdify((variables,), [*entries, *mapped], cse=True)
@@ -368,40 +368,41 @@ def _at_kink(here: Place, kink: Kink, before: Array) -> Values | None:
     return Values(gradient, np.eye(len(before), len(gradient)), before)
 
 
-def _impact(here: Place, values: Values, before: Array, after: Array) -> Array:
-    """Return the (2m, x) derivative of the state after an impact by x = (q, p, parameters, t).
+def _impact(here: Place, later: Place, values: Values, before: Array, after: Array) -> Array:
+    """Return the (2m, x) derivative of the state after an impact or a refraction by x = (q, p, parameters, t).
 
-    With n = g_q, u = p + lambda n and p1 = P(q, u), F = H(q, p1) - H(q, p) + lambda g_t - (p1 - u).v1 = 0 gives
+    With n = g_q, u = p + lambda n and p1 = P(q, u), F = H1(q, p1) - H(q, p) + lambda g_t - (p1 - u).v1 = 0 gives
     lambda_x = -F_x / F_lambda; the last term is the work of moving constraints. Its root lambda_1 is the impulse
     without loss, that of restitution e is lambda = lambda_1 (1 + e) / 2. The terms v1.p1_x and v1.p1_lambda cancel:
 
-        F_x = lambda (v1.n_x + g_tx) + (v1 - v0).p_x + (H(q, p1) - H(q, p))_x - (p1 - u).v1_x,
+        F_x = lambda (v1.n_x + g_tx) + (v1 - v0).p_x + (H1(q, p1) - H(q, p))_x - (p1 - u).v1_x,
         F_lambda = v1.n + g_t - (p1 - u).v1_lambda,
 
-    where H is differentiated at fixed momenta.
+    where H is differentiated at fixed momenta. H1 and P are those of the side after a refraction, whose e is 1.
     """
-    stepper, t, parameters = here.states.stepper, here.t, here.parameters
+    stepper, t = here.states.stepper, here.t
     m, count = stepper.dimension, values.gradient.size
     n, e, (q, p) = values.value[:m], values.value[m + 1], np.split(before, 2)
     # P_u maps G^T mu to 0, and the change of p, lambda n + G^T mu, to lambda P_u n
-    onto = _projection(here._replace(all_inputs=False), after)[1][m:, m : 2 * m]
+    onto = _projection(later._replace(all_inputs=False), after)[1][m:, m : 2 * m]
     impulse = float((onto @ (after - before)[m:]) @ (onto @ n) / ((onto @ n) @ (onto @ n)))
     full = 2.0 * impulse / (1.0 + e)
 
     def changed(impulse: float) -> tuple[Array, Array, Array]:
         """Return P(q, p + lambda n), its derivative by x at constant lambda, and by lambda."""
-        state, by = _projection(here, np.concatenate([q, p + impulse * n]))
+        state, by = _projection(later, np.concatenate([q, p + impulse * n]))
         onto = by[m:, m : 2 * m]
         return state[m:], by[m:] + impulse * onto @ values.map[:m], onto @ n
 
     p1, p1_by, p1_by_impulse = changed(full)
-    v0, v1 = (np.asarray(stepper.velocity(q, momenta, t, parameters)) for momenta in (p, p1))
+    ends = [(p, here.parameters), (p1, later.parameters)]
+    v0, v1 = (np.asarray(stepper.velocity(q, momenta, t, parameters)) for momenta, parameters in ends)
     residual = full * (v1 @ values.map[:m] + values.map[m])
     residual[m : 2 * m] += v1 - v0
-    residual += _energy_differences(here, q, (p, p1))
+    residual += _energy_differences(here, q, ends)
     residual_by_impulse = n @ v1 + values.value[m]
     if stepper.constraints:
-        work = (p1 - p - full * n) @ _differences(stepper.velocity, here, q, p1)
+        work = (p1 - p - full * n) @ _differences(stepper.velocity, later, q, p1)
         by_momentum = work[m : 2 * m].copy()
         work[m : 2 * m] = 0.0
         residual -= work + by_momentum @ p1_by
@@ -453,26 +454,27 @@ def _increments(states: SavedStates) -> Array:
     return np.append(np.maximum(DIFFERENCE, OF_STEP * by_q), OF_STEP * by_t)
 
 
-def _energy_differences(here: Place, q: Array, ends: tuple[Array, Array]) -> Array:
-    """Return the derivatives of H(q, p1) - H(q, p0) at fixed momenta by x = (q, p, parameters, t), 0 by p."""
+def _energy_differences(here: Place, q: Array, ends: list[tuple[Array, Array]]) -> Array:
+    """Return the derivatives of H1(q, p1) - H(q, p) at fixed momenta by x = (q, p, parameters, t), 0 by p."""
     states, t, parameters, all_inputs = here
     stepper, m = states.stepper, len(q)
     result = np.zeros(2 * m + len(parameters) + 1)
     x, steps = np.append(q, t), _increments(states)
     shifted = (x + (np.diag(steps)[:, np.newaxis] * PLACES[:, np.newaxis])).reshape(-1, m + 1)
 
-    def difference(values: Array) -> Array:
+    def difference(changes: Array | float) -> Array:
         first, last = (
-            stepper.energy(shifted[:, :m], np.tile(p, (len(shifted), 1)), shifted[:, m], values) for p in ends
+            stepper.energy(shifted[:, :m], np.tile(p, (len(shifted), 1)), shifted[:, m], values + changes)
+            for p, values in ends
         )
         return np.asarray(last - first)
 
-    partials = _central_differences(difference(parameters).reshape(m + 1, -1)) / steps
+    partials = _central_differences(difference(0.0).reshape(m + 1, -1)) / steps
     result[:m], result[-1] = partials[:m], partials[m]
     shifted = x[np.newaxis]
     for k in range(len(parameters) if all_inputs else 0):
         step = DIFFERENCE * max(1.0, abs(parameters[k]))
-        sides = [parameters + place * step * (np.arange(len(parameters)) == k) for place in PLACES]
+        sides = [place * step * (np.arange(len(parameters)) == k) for place in PLACES]
         result[2 * m + k] = _central_differences(np.concatenate([difference(side) for side in sides])) / step
     return result
 

@@ -18,13 +18,13 @@ from scvi_codegen.codegen.rendering.source import Interface, Source
 from scvi_codegen.codegen.variants import Acting, Derivatives, Lanes, NewtonFallback, Variant, WithEvents
 from scvi_codegen.common.cache import cached_source
 from scvi_codegen.common.display.cards import card, listed, plain
-from scvi_codegen.common.errors import MethodError, ScviCodegenError
+from scvi_codegen.common.errors import MethodError
 from scvi_codegen.common.representation import LONGEST, clipped
 from scvi_codegen.runs.states.layout import layout_of
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepping.array_binding import ArrayBinding, EventBinding
 from scvi_codegen.runs.stepping.array_interface import RunSizes, check_few_coordinates
-from scvi_codegen.runs.stepping.features import Support, check_features, require
+from scvi_codegen.runs.stepping.features import Support, check_features, refusal_of, require
 from scvi_codegen.systems.event import Event, EventLike, as_events, modes_of
 
 MOST_EVENT_SETS = 16
@@ -120,6 +120,7 @@ class CompiledMethod:
         self._variants = Variants() if variants is None else variants
         self._event_variants: dict[tuple[Event, ...], Self] = {}
         self._released_runs: list[Any] = []
+        self.warned_of_kinks = False
         self._known: dict[Hashable, Self] = {}
         self._with_action: Self | None = None
         self.sums_action = False  # whether runs sum the action of their steps
@@ -394,11 +395,7 @@ class CompiledMethod:
             StateError: if a name is unknown.
         """
         check_features(feature, *together)
-        try:
-            require(self, feature, *together)
-        except ScviCodegenError as error:
-            return Support(str(error))
-        return Support()
+        return Support(str(refusal_of(self, feature, *together) or ""))
 
     def with_events(self, events: EventLike | Sequence[EventLike]) -> Self:
         """Return the integrator with these events in place of its own."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from scvi_codegen.codegen.variants import Derivatives
-from scvi_codegen.common.errors import MethodError, ScviCodegenError, StateError, closest
+from scvi_codegen.common.errors import MethodError, MethodWarning, ScviCodegenError, StateError, closest, warn
 from scvi_codegen.systems.formulas.indices import SIZES_REQUIRED
 
 OPERATIONS = {
@@ -50,6 +50,8 @@ OPERATIONS = {
 }
 """Names of :meth:`~scvi_codegen.Stepper.supports`, and what messages call them."""
 
+BY_FORMULAS = ("flow", "chaos_ensemble", "path")
+"""Operations with many steps that do not locate kinks."""
 SHORT_STEPS = ("svi-1-", "svi-2-", "stoermer-verlet", "composition")
 """Beginnings of the names of methods whose steps are short enough for the interpolation of the shadow energy."""
 PROPERTIES: dict[str, Callable[[Any], bool]] = {
@@ -65,6 +67,8 @@ PROPERTIES: dict[str, Callable[[Any], bool]] = {
     "with constraints of arrays by a composition": lambda stepper: bool(
         stepper.interface.layout.constraints and stepper.interface.method.startswith("composition")
     ),
+    "with kinks that runs locate": lambda stepper: bool(stepper.interface.modes),
+    "where L or H jumps": lambda stepper: any("jumps" in mode for mode in stepper.interface.modes),
     "with events that set parameters": lambda stepper: len(stepper.modes) > len(stepper.interface.mode_names),
     "with contacts": lambda stepper: stepper.interface.masked > 0,
     "without constraints": lambda stepper: not (stepper.interface.constraints or stepper.interface.layout.constraints),
@@ -139,6 +143,8 @@ FEATURES = {
             "error device observe_ensemble check_growth hessian chaos_ensemble flow advice shadow_energy",
             "make them terminal and restart",
         ),
+        ("with kinks that runs locate", "device observe_ensemble hessian", 'compile it with kinks="as formulas"'),
+        ("where L or H jumps", " ".join(BY_FORMULAS), "use runs, ensembles of runs and their first derivatives"),
         ("with events that set parameters", _DERIVATIVES, "make them terminal, and restart with the new parameters"),
         (
             "with contacts",
@@ -255,11 +261,32 @@ def check_together(**arguments: Any) -> None:
 
 
 def require(stepper: Any, operation: str, *together: str) -> None:
-    """Raise the refusal of an operation of a stepper, or of one together with others, if the table has one."""
+    """Raise the refusal of an operation of a stepper, or of one together with others; warn once of kinks."""
+    if error := refusal_of(stepper, operation, *together):
+        raise error
+    if operation in BY_FORMULAS and stepper.interface.modes and not stepper.warned_of_kinks:
+        stepper.warned_of_kinks = True
+        warn_of_formulas(stepper.interface, OPERATIONS[operation])
+
+
+def warn_of_formulas(of: Any, subject: str) -> None:
+    """Warn that steps do not end at kinks of a system or an interface, other than rint and cutoffs of lists."""
+    kinks = [u for u in of.kinks if not (u.startswith("cos(pi*") or of.lengths)]
+    if kinks:
+        warn(
+            f"{subject} does not locate the kinks of this system, such as {kinks[0]} = 0: steps across them use the "
+            'formulas as they are and lose order. Use short steps; steppers with kinks="as formulas" do not warn',
+            MethodWarning,
+        )
+
+
+def refusal_of(stepper: Any, operation: str, *together: str) -> ScviCodegenError | None:
+    """Return the refusal of an operation of a stepper, or of one together with others; ``None`` if it is available."""
     for property_ in _EXCLUDING.get(operation, ()):
         if property_ in PROPERTIES_OF_SIZES:
             applies = not stepper.run_time_sizes and PROPERTIES_OF_SIZES[property_](stepper.known)
         else:
             applies = PROPERTIES[property_](stepper) if property_ in PROPERTIES else property_[5:] in together
         if applies:
-            raise refusal(operation, property_, stepper.title)
+            return refusal(operation, property_, stepper.title)
+    return None

@@ -1,7 +1,8 @@
 """Kinks that no step can follow, where the argument of a unit_step or rint is 0: jumps, corners, powers, velocities.
 
 A jump of L across a surface u(q, t) = 0 changes the momentum there (Weierstrass-Erdmann condition), and a corner of a
-constraint is an impact. Steps do neither: they would pass such a surface without any error estimate. The force of
+constraint is an impact. Runs refract momenta at surfaces that they locate (``support/run/kinks.h``); else steps do
+neither: they would pass such a surface without any error estimate. The force of
 |u|**k with 1 < k < 2 in L is not Lipschitz continuous, so that a motion may not be unique; a kink in velocities makes
 the Legendre transform multivalued.
 
@@ -13,14 +14,15 @@ force is not Lipschitz continuous if its difference quotients on one side grow w
 
 import random
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from itertools import islice
 
 import sympy
 from sympy import Expr, Symbol
 
 from scvi_codegen.common.precision import Number, mp
-from scvi_codegen.systems.formulas.expressions import Tape, jacobian, kinks_of, shortened
+from scvi_codegen.systems.formulas.expressions import Tape, jacobian, kinks_of, parts_of_type, shortened
 from scvi_codegen.systems.formulas.intermediates import parts
-from scvi_codegen.systems.formulas.kinks import Mode, rint, unit_step
+from scvi_codegen.systems.formulas.kinks import Mode, rint, switching_function, unit_step
 from scvi_codegen.systems.formulas.tables import table_with_corners, without_tables
 
 POINTS, ATTEMPTS, ITERATIONS = 3, 24, 40
@@ -41,22 +43,26 @@ def irregularity(
     moving: Iterable[Symbol],
     velocities: Iterable[Symbol],
     constants: Mapping[Symbol, float],
+    refracting: Iterable[Symbol] = (),
 ) -> str | None:
-    """Return why a Lagrangian, or a Hamiltonian without velocities, has a kink that no step follows, or ``None``."""
+    """Return why L, or H without velocities, has a kink that no step follows; not jumps where u(refracting) = 0."""
     variables = list(moving)
     if kink := kink_in_velocities(formula, velocities):
         return velocity_message(subject, *kink)
     formula = without_tables(formula)
-    if jump := jump_of(formula, variables, constants):
-        return jump_message(subject, *jump)
+    steps = {switching_function(step.args[0])[0] for step in parts_of_type(unit_step, formula)}
+    refracting = set(refracting)
+    for surface, term in jumps_of(formula, variables, constants):
+        if surface not in steps or not surface.free_symbols & set(variables) <= refracting:
+            return jump_message(subject, surface, term)
     slope = unbounded_slope_of(formula, variables, constants)
     return slope_message(subject, *slope) if slope else None
 
 
-def jump_of(
+def jumps_of(
     formula: Expr, moving: Iterable[Symbol], constants: Mapping[Symbol, float], *, first_derivatives: bool = False
-) -> tuple[Expr, Expr] | None:
-    """Return a function u and the term of a formula that jumps where u is 0; ``None`` if no term does.
+) -> Iterator[tuple[Expr, Expr]]:
+    """Yield functions u and a term of a formula that jumps where u is 0.
 
     Args:
         formula: function of the symbols of a state, time and parameters.
@@ -71,8 +77,7 @@ def jump_of(
         if first_derivatives:
             functions += jacobian([whole], sorted(whole.free_symbols & variables, key=str)).values()
         if any(_jumps(function, surface, variables, constants) for function in functions):
-            return surface, term
-    return None
+            yield surface, term
 
 
 def corner_in(formula: Expr, subject: str, moving: Iterable[Symbol], constants: Mapping[Symbol, float]) -> str | None:
@@ -82,7 +87,7 @@ def corner_in(formula: Expr, subject: str, moving: Iterable[Symbol], constants: 
             f"{subject} contains {table}, a table whose slope jumps, so that the velocity would jump: give it a degree "
             'of 2 or more and outside="refuse" or "linear"'
         )
-    corner = jump_of(without_tables(formula), moving, constants, first_derivatives=True)
+    corner = next(jumps_of(without_tables(formula), moving, constants, first_derivatives=True), None)
     return corner_message(subject, *corner) if corner else None
 
 
@@ -129,15 +134,11 @@ def _surfaces(formula: Expr, moving: Set[Symbol]) -> Iterator[tuple[Expr, Expr, 
 
 def _jumps(function: Expr, surface: Expr, moving: Set[Symbol], constants: Mapping[Symbol, float]) -> bool:
     """Return whether a function jumps at one of some points of a surface."""
-    symbols = sorted(function.free_symbols | surface.free_symbols, key=str)
-    tapes = Tape([surface], symbols), Tape([function], symbols)
-    free = [k for k, symbol in enumerate(symbols) if symbol in moving and symbol in surface.free_symbols]
-    generator = random.Random(20250101)
     examined = 0
-    for point, k in _points(tapes[0], symbols, free, constants, generator):
+    for tape, point, k in _tapes([function], surface, moving, constants):
         try:
-            apart = [abs(_difference(tapes[1], point, k, distance)) for distance in APART]
-            size = abs(tapes[1](_moved(point, k, APART[0]))[0])
+            apart = [abs(_difference(tape, point, k, distance)) for distance in APART]
+            size = abs(tape(_moved(point, k, APART[0]))[0])
         except ArithmeticError:  # outside the domain of the function
             continue
         if apart[1] > max(apart[0] / 2, VANISHING * (1 + size)):
@@ -152,14 +153,10 @@ def _steepens(
     function: Expr, force: Expr, surface: Expr, moving: Set[Symbol], constants: Mapping[Symbol, float]
 ) -> bool:
     """Return whether at one of some points of a surface a function is bounded, but not quotients of its force."""
-    symbols = sorted(function.free_symbols | surface.free_symbols, key=str)
-    tapes = Tape([surface], symbols), Tape([function, force], symbols)
-    free = [k for k, symbol in enumerate(symbols) if symbol in moving and symbol in surface.free_symbols]
-    examined = 0
-    for point, k in _points(tapes[0], symbols, free, constants, random.Random(20250101)):
+    for tape, point, k in islice(_tapes([function, force], surface, moving, constants), POINTS):
         for side in (1, -1):
             try:
-                near = [tapes[1](_moved(point, k, side * distance)) for distance in (*NEAR, *(2 * d for d in NEAR))]
+                near = [tape(_moved(point, k, side * distance)) for distance in (*NEAR, *(2 * d for d in NEAR))]
             except ArithmeticError:  # outside the domain of the function
                 continue
             values, forces = zip(*near, strict=True)
@@ -167,10 +164,18 @@ def _steepens(
             converges = abs(values[2] - values[1]) <= abs(values[1] - values[0]) * mp.mpf("0.95") + VANISHING
             if converges and quotients[1] > quotients[0] * mp.mpf("1.001") + VANISHING * (1 + abs(forces[2])):
                 return True
-        examined += 1
-        if examined == POINTS:
-            break
     return False
+
+
+def _tapes(
+    functions: Sequence[Expr], surface: Expr, moving: Set[Symbol], constants: Mapping[Symbol, float]
+) -> Iterator[tuple[Tape, list[Number], int]]:
+    """Yield the tape of functions, points on a surface, and the coordinate that leads across it there."""
+    symbols = sorted(functions[0].free_symbols | surface.free_symbols, key=str)
+    free = [k for k, symbol in enumerate(symbols) if symbol in moving and symbol in surface.free_symbols]
+    tape = Tape(functions, symbols)
+    for point, k in _points(Tape([surface], symbols), symbols, free, constants, random.Random(20250101)):
+        yield tape, point, k
 
 
 def _points(
@@ -212,8 +217,9 @@ def jump_message(subject: str, surface: Expr, term: Expr) -> str:
     """Return the message for a term of a Lagrangian or Hamiltonian that jumps."""
     return (
         f"{subject} jumps where {shortened(surface)} = 0: its term {shortened(term)} is not continuous there, so the "
-        "momentum jumps too, which steps do not do. Write a continuous function, such as positive_part; put what jumps "
-        f"into forces; or use an event '{shortened(surface)}' that changes the state (impact, then=)"
+        "momentum jumps, too. This requires a surface of named coordinates that runs locate: compile_stepper(..) with "
+        'kinks="located" in double precision, without time transformation. Or write a continuous function, such as '
+        "positive_part, put what jumps into forces, or use an event that changes the state (impact, then=)"
     )
 
 

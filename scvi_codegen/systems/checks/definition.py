@@ -173,8 +173,9 @@ def _check_continuity(
 ) -> None:
     """Raise :class:`SystemDefinitionError` for kinks of L or H that no step follows, and for corners of constraints."""
     velocities = system.velocities if role == "Lagrangian" else ()
+    subject, q = f"the {role} of '{system.name}'", system.coordinates
     if not system.lengths and (  # lists end at a cutoff
-        problem := irregularity(formulas[role], f"the {role} of '{system.name}'", moving, velocities, system.constants)
+        problem := irregularity(formulas[role], subject, moving, velocities, system.constants, q)
     ):
         raise SystemDefinitionError(problem)
     for name, g in zip(system.constraint_texts if system.constraints else (), system.constraints, strict=True):

@@ -393,7 +393,7 @@ class Parser:
         self.kink_depth += name in REPEATING
         if self.kink_depth > MAX_KINK_DEPTH:
             self.refuse(f"abs, max and the like are nested too deeply: at most {MAX_KINK_DEPTH} in another", column)
-        arguments = [self.condition() if name == "where" else self.sum()]
+        arguments = [self.condition() if function is FUNCTIONS["where"] else self.sum()]
         while self.accept(","):
             arguments.append(self.sum())
         self.close()

@@ -80,6 +80,8 @@ static int search_times(const event_step *step, int e, const event_sample *left,
   const real span = right->t - left->t;
   event_sample from = *left, to = *right;
   int status = end_value(step, e, left->t, span, &from.g);
+  if (JUST_CHANGED(step->watch, e) && side_at_start(step->watch, e) != 0.0) /* whose sign may be that of rounding */
+    from.g = copysign(fmax(fabs(from.g), DBL_MIN), side_at_start(step->watch, e));
   while (status == OK && from.t != right->t && (from.t - step->t) / step->h < step->horizon->fraction) {
     status = next_time(step, e, from.t, right->t, span, &to.t);
     if (status == OK && to.t == right->t)

@@ -433,8 +433,12 @@ static int leave_to_side(const event_step *step, int e, const event_sample *left
   const real noise = 8.0 * values_at(step, EVENT_DEGREE + 2)[e] + RESIDUAL(step->watch, e);
   const real tiny = copysign(DBL_MIN, side);
   event_sample next = *left;
-  int status = OK, away = 0;
-  if (fabs(left->g) > noise)
+  int status = OK, away = 0, remains = EVENT_DEGREE;
+  while (remains >= 0 && !is_transition(EVENT_OF(e)) && fabs(values_at(step, remains)[e]) <= noise)
+    remains--;
+  if (remains < 0)
+    from->fraction = 1.0; /* on the surface: nothing to search */
+  if (remains < 0 || fabs(left->g) > noise)
     return OK;
   from->g = tiny;
   for (int k = 3; k >= 0 && status == OK && !away; k--) {

@@ -53,12 +53,18 @@ static int approach(const event_step *step, const event_sample *at, const event_
   return status;
 }
 
+#ifdef EVENT_REFRACTS
+#define IS_WALL(event) (IS_IMPACT[event] || REFRACTS[event]) /* momenta change along the gradient of its function */
+#else
+#define IS_WALL(event) IS_IMPACT[event]
+#endif
+
 /* Changes by function e; if it is a wall, with its rate at velocities v. */
 static int evaluate_changes(const event_step *step, int e, const event_sample *at, const real *v, event_entries *wall)
 {
   const int status = changes_by(e, at->t, at->q, at->p, step->parameters, step->values + EVENT_VALUES * EVENTS, wall,
       step->workspace);
-  if (status != OK || !IS_IMPACT[EVENT_OF(e)])
+  if (status != OK || !IS_WALL(EVENT_OF(e)))
     return status;
   wall->rate = wall->by_time;
   wall->size = fabs(wall->by_time);
@@ -78,7 +84,7 @@ static int evaluate_changes(const event_step *step, int e, const event_sample *a
 static int changes_at(const event_step *step, int e, const event_sample *at, event_entries *wall)
 {
   real rate, *const v = step->memory + 3 * M;
-  const int status = IS_IMPACT[EVENT_OF(e)] ? approach(step, at, NULL, 0.0, v, &rate) : OK;
+  const int status = IS_WALL(EVENT_OF(e)) ? approach(step, at, NULL, 0.0, v, &rate) : OK;
   return status == OK ? evaluate_changes(step, e, at, v, wall) : status;
 }
 
@@ -122,6 +128,58 @@ static int mean_rate(const event_step *step, const event_sample *at, const event
   return status;
 }
 
+/* H(p1) + lambda g_t - (p1 - u).v of p1 = P(u), u = p + lambda n, which an impulse conserves, of velocities v. The last
+ * term is the work of the constraints, mu.c_t = -mu.(G v). */
+static int energy_after(const event_step *step, const event_sample *at, const event_entries *wall, real lambda,
+    const real *v, real *energy)
+{
+  real *const moved = step->memory + 4 * M, *const free = moved + M;
+  int status;
+  add_impulse(wall, lambda, at->p, free);
+  memcpy(moved, free, BYTES(M));
+  status = satisfy_constraints(step, at->t, at->q, moved, 0);
+  if (status == OK)
+    status = NAME(energy)(at->t, at->q, moved, step->parameters, energy, step->workspace);
+  *energy += lambda * wall->by_time;
+  for (int i = 0; i < M; i++)
+    *energy -= (moved[i] - free[i]) * v[i];
+  return status;
+}
+
+/* Newton's method for the impulse lambda by which the energy becomes `after` from `start` at lambda = 0. Its derivative
+ * is the rate, of the sign of `toward` along the way: H is convex along n. *passes: whether there is one. */
+static int solve_impulse(const event_step *step, const event_sample *at, const event_entries *wall, real start,
+    real after, real toward, real *lambda, int *passes)
+{
+  real *const v = step->memory + 3 * M;
+  real rate, mean, now = after, size = fabs(after), last = INFINITY;
+  int status = approach(step, at, wall, *lambda, v, &rate);
+  *passes = 1;
+  for (int k = 0; status == OK && k < CHANGE_ITERATIONS; k++) {
+    real correction, precise;
+    if (!(toward * rate > 0.0)) {
+      *passes = 0;
+      return OK;
+    }
+    status = energy_after(step, at, wall, *lambda, v, &now);
+    if (status == OK)
+      status = mean_rate(step, at, wall, *lambda, v, &mean);
+    precise = start - after + *lambda * mean;
+    correction = now - after;
+    size = fabs(after) + fabs(now) + fabs(*lambda) * wall->size;
+    if (fabs(correction - precise) <= 4.0 * DBL_EPSILON * size)
+      correction = precise; /* the difference is rounding of the energy */
+    correction /= rate;
+    if (status != OK || !(fabs(correction) < last))
+      break; /* the correction is rounding */
+    last = fabs(correction);
+    *lambda -= correction;
+    status = approach(step, at, wall, *lambda, v, &rate);
+  }
+  *passes = fabs(now - after) <= CHANGE_SAFETY * DBL_EPSILON * size;
+  return status;
+}
+
 /* Impulse of an impact: p += (1 + e)/2 lambda_1 n. Where the kinetic energy is quadratic, i.e. W n, W = H_pp, is the
  * same at p and at 0, lambda_1 = -2 rate / (n.W n) reverses the rate; else Newton's method solves the energy equation,
  * whose derivative by lambda is the rate. A run backward in time undoes the impact. */
@@ -131,10 +189,9 @@ static int impact(const event_step *step, event_sample *at, const event_entries 
   const real rate = step->h < 0.0 ? -wall->rate : wall->rate;
   event_sample moved = *at;
   real *const v = step->memory + 3 * M, *const rest = v + 2 * M, *const change = rest + M;
-  real lambda, low = 0.0, at_rest = 0.0, after = 0.0, energy = 0.0, now = 0.0, mean = 0.0;
-  real correction, before = INFINITY;
+  real lambda, low = 0.0, at_rest = 0.0, after = 0.0, energy = 0.0, before = INFINITY;
   real inverse_mass, there = 0.0, size = wall->size;
-  int status;
+  int status, solved;
   moved.p = step->memory + 4 * M;
   memset(moved.p, 0, BYTES(M));
   status = approach(step, &moved, wall, 0.0, rest, &at_rest);
@@ -162,26 +219,8 @@ static int impact(const event_step *step, event_sample *at, const event_entries 
     lambda *= 2.0; /* beyond the minimum of the convex energy: Newton's method does not return to lambda = 0 */
     status = approach(step, at, wall, lambda, v, &after);
   }
-  for (int k = 0; status == OK && before > 0.0 && k < CHANGE_ITERATIONS; k++) {
-    add_impulse(wall, lambda, at->p, rest);
-    memcpy(moved.p, rest, BYTES(M));
-    status = satisfy_constraints(step, at->t, at->q, moved.p, 0);
-    if (status == OK)
-      status = NAME(energy)(at->t, at->q, moved.p, step->parameters, &now, step->workspace);
-    correction = now - energy + lambda * wall->by_time;
-    for (int i = 0; i < M; i++)
-      correction -= (moved.p[i] - rest[i]) * v[i]; /* work of the constraints, mu.c_t = -mu.(G v) */
-    if (status == OK)
-      status = mean_rate(step, at, wall, lambda, v, &mean);
-    if (fabs(correction - lambda * mean) <= 4.0 * DBL_EPSILON * (fabs(energy) + fabs(now) + fabs(lambda) * wall->size))
-      correction = lambda * mean; /* the difference is rounding of the energy */
-    correction /= after;
-    if (status != OK || !(fabs(correction) < before))
-      break; /* the correction is rounding */
-    before = fabs(correction);
-    lambda -= correction;
-    status = approach(step, at, wall, lambda, v, &after);
-  }
+  if (status == OK && before > 0.0)
+    status = solve_impulse(step, at, wall, energy, energy, -rate, &lambda, &solved);
   lambda *= 0.5 * (1.0 + restitution);
   low *= 0.5 * (1.0 + restitution);
   for (int i = 0; i < wall->count; i++) {

@@ -146,15 +146,72 @@ static int sides_after_start(const event_step *step, const event_sample *at, rea
   return status;
 }
 
+#ifdef EVENT_REFRACTS
+/* Momenta beyond a surface u(q, t) = 0 where L jumps, by the corner conditions of Weierstrass and Erdmann: p+ = p- +
+ * lambda n, n = u_q, H+(p+) - H-(p-) = -lambda u_t, n.v+ + u_t of the sign `toward`. H+ is convex along n: from that
+ * side Newton's method decreases to the root, or passes the minimum if there is none; then *passes is 0. */
+static int refract(const event_step *step, event_sample *at, const event_entries *wall, real before, int toward,
+    int *passes)
+{
+  real *const v = step->memory + 3 * M;
+  real lambda = 0.0, rate, start = 0.0, mass = 0.0;
+  int status = approach(step, at, wall, 0.0, v, &rate);
+  if (status == OK)
+    status = energy_after(step, at, wall, 0.0, v, &start);
+  if (status == OK && !(toward * rate > 0.0)) { /* beyond the root of a quadratic energy */
+    status = approach(step, at, wall, 1.0, v, &mass);
+    mass = 1.0 / (mass - rate);
+    lambda = toward * (2.0 * fabs(rate) * mass + sqrt(2.0 * fabs(mass * (start - before))));
+  }
+  if (status == OK)
+    status = solve_impulse(step, at, wall, start, before, toward, &lambda, passes);
+  if (status != OK || !*passes)
+    return status;
+  for (int i = 0; i < wall->count; i++)
+    at->p[wall->place[i]] += lambda * wall->value[i];
+  return satisfy_constraints(step, at->t, at->q, at->p, 0);
+}
+
+/* Passes the surface of a crossing, or is reflected by it: an impact that conserves the energy, with the former side as
+ * the direction of the crossing. A motion that returns without either touches it. */
+static int pass_surface(const event_step *step, event_crossing *crossing, event_sample *at)
+{
+  const int kink = crossing->function - FIRST_KINK, direction = crossing->direction, e = FUNCTION_OF(crossing);
+  event_entries wall;
+  real before = 0.0;
+  int sign[EVENT_KINKS], passes = 0, status = signs_after(step, at, step->whole, sign);
+  if (status != OK || sign[kink] != direction) {
+    crossing->direction = 0;
+    step->watch->history[e].hits = 1;
+    return status;
+  }
+  status = changes_at(step, e, at, &wall);
+  if (status == OK)
+    status = energy_after(step, at, &wall, 0.0, step->memory + 3 * M, &before);
+  set_side(step, kink, direction);
+  if (status == OK)
+    status = refract(step, at, &wall, before, step->h < 0.0 ? -direction : direction, &passes);
+  if (status != OK || passes)
+    return status;
+  set_side(step, kink, -direction);
+  crossing->direction = -direction;
+  status = impact(step, at, &wall);
+  if (status == NOT_CONVERGED)
+    step->watch->jammed = crossing->function + 1;
+  return status;
+}
+#endif
+
 /* Changes to the other side at the crossings from `first` on, which have one state. If the motion returns at once, it
  * touches the surface and keeps its side; if by the equations of that side it returns, too, it slides (A. F. Filippov,
  * Differential Equations with Discontinuous Righthand Sides, 1988). */
-static int change_sides(const event_step *step, long long first, const event_sample *at)
+static int change_sides(const event_step *step, long long first, event_sample *at)
 {
   int sign[EVENT_KINKS], changed = 0, returns = 0, status = OK;
   for (long long i = first; i < *step->filled; i++)
     if (is_kink(step->found[i].function)) {
-      set_side(step, step->found[i].function - FIRST_KINK, step->found[i].direction);
+      if (!IS_WALL(step->found[i].function))
+        set_side(step, step->found[i].function - FIRST_KINK, step->found[i].direction);
       changed = 1;
     }
   if (!changed)
@@ -162,12 +219,17 @@ static int change_sides(const event_step *step, long long first, const event_sam
   status = evaluate_functions(step, at, values_at(step, 0));
   if (status == OK)
     status = rounding_of(step, at);
+#ifdef EVENT_REFRACTS
+  for (long long i = first; status == OK && i < *step->filled; i++)
+    if (REFRACTS[step->found[i].function])
+      status = pass_surface(step, step->found + i, at);
+#endif
   if (status == OK)
     status = signs_after(step, at, step->whole, sign);
   for (long long i = first; status == OK && i < *step->filled; i++) {
     event_crossing *crossing = step->found + i;
     const int kink = crossing->function - FIRST_KINK;
-    if (kink >= 0 && !is_of_time(kink) && sign[kink] == -crossing->direction) {
+    if (kink >= 0 && !is_of_time(kink) && !IS_WALL(crossing->function) && sign[kink] == -crossing->direction) {
       set_side(step, kink, -crossing->direction);
       crossing->direction = 0; /* a touch: many in what remains of a step do not accumulate */
       step->watch->history[FUNCTION_OF(crossing)].hits = 1;
