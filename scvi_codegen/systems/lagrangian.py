@@ -76,6 +76,11 @@ class LagrangianSystem(MechanicalSystem):
         return self.links if self._text is None else ()
 
     @property
+    def joint_names(self) -> dict[str, str]:
+        """Names of the joints of a robot in this system by their names in the file."""
+        return {link.label: link.name for link in self.links}
+
+    @property
     def formula(self) -> Expr:
         """L."""
         return self.lagrangian

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import sympy
+from random_robots import motion_by_mujoco
 from scipy.spatial.transform import Rotation
 
 import scvi_codegen as sc
@@ -147,7 +148,7 @@ MUJOCO_CHANGES = {
     "replicate": ("</worldbody>", "<replicate/></worldbody>", "write out what it makes"),
     "ball spring": (' stiffness="0"', "", "hinges and slides only"),
     "axes": ('eulerseq="zyx"', 'eulerseq="zy"', "is not three of the letters"),
-    "name": ('name="slip"', 'name="flex"', "two joints are called 'flex'"),
+    "name": ('name="slip"', 'name="flex"', "<joint> 'flex' is the second joint of this name"),
     "include": ("<option", '<include file="none.xml"/><option', "none.xml cannot be read"),
     "include of a device": ("<option", '<include file="/dev/zero"/><option', "must have only file, a path relative to"),
     "include of a folder": ("<option", '<include file="."/><option', "it is no regular file"),
@@ -374,7 +375,7 @@ def test_included_files_are_sought_in_the_folder_of_the_main_document_first(tmp_
     (tmp_path / "arm.xml").write_text(body.format("outer"))
     assert str(sc.LagrangianSystem.from_mjcf(tmp_path / "main.xml").coordinates[0]) == "outer"
     (tmp_path / "arm.xml").write_text(body.format("outer").replace("geom ", "goem "))
-    with pytest.raises(SystemDefinitionError, match=r"arm\.xml: <body> 'outer' contains .*; did you mean 'geom'"):
+    with pytest.raises(SystemDefinitionError, match=r"arm\.xml:1: <body> 'outer' contains .*; did you mean 'geom'"):
         sc.LagrangianSystem.from_mjcf(tmp_path / "main.xml")
 
 
@@ -385,6 +386,60 @@ def test_deep_documents_are_read(tmp_path):
     bodies = '<body pos="0 0 0.1">' * depth
     file.write_text(f"<mujoco><worldbody>{bodies}{frames}{'</body>' * depth}</worldbody></mujoco>")
     assert len(sc.LagrangianSystem.from_mjcf(file).coordinates) == 1
+
+
+FOUR_BAR = """<mujoco><option><flag contact="disable"/></option><default><geom type="capsule" size=".03"/></default>
+<worldbody><body name="base">{base}<geom fromto="0 0 0 1 0 0"/>
+ <body name="crank"><joint name="crank" axis="0 1 0"/><geom fromto="0 0 0 0 0 .4"/>
+  <body name="coupler" pos="0 0 .4"><joint name="coupler" axis="0 1 0"/><geom fromto="0 0 0 1 0 .2"/></body></body>
+ <body name="rocker" pos="1 0 0"><joint name="rocker" axis="{axis}"/><geom fromto="0 0 0 0 0 .6"/></body></body>
+</worldbody><equality><connect body1="coupler" body2="rocker" anchor="1 0 .2"/></equality></mujoco>"""
+TURN = np.array([1, 0.2, 0.1, 0.3]) / np.sqrt(1.14)
+BASES = {
+    "fixed": ("", [], []),
+    "yaw": ('<joint name="base" axis="0 0 1"/>', [0.3], [1.0]),
+    "roll": ('<joint name="base" axis="1 0 0"/>', [0.3], [1.0]),
+    "ball": ('<joint name="my-base" type="ball"/>', [*TURN], [0.5, 0.3, 1.0]),
+    "free": ('<freejoint name="my-base"/>', [0.1, 0.2, 0.3, *TURN], [0.1, 0, 0.2, 0.5, 0.3, 1.0]),
+}
+
+
+@pytest.mark.rotated
+@pytest.mark.parametrize("base", BASES)
+def test_closed_loops_move_on_any_base(base, tmp_path):
+    file, (joint, place, rates) = tmp_path / "loop.xml", BASES[base]
+    file.write_text(FOUR_BAR.format(base=joint, axis="0 1 0"))
+    system = sc.LagrangianSystem.from_mjcf(file)
+    assert len(system.constraints) == 2
+    q, v = {"crank": 0.0, "coupler": 0.0, "rocker": 0.0}, {"crank": 2.0, "coupler": -2.0, "rocker": 4 / 3}
+    if base in ("ball", "free"):
+        q["R_my_base"], v["omega_my_base"] = place[-4:], rates[-3:]
+        names = ("x_my_base", "y_my_base", "z_my_base") if base == "free" else ()
+    else:
+        names = ("base",) if place else ()
+    q, v = q | dict(zip(names, place, strict=False)), v | dict(zip(names, rates, strict=False))
+    run = sc.compile_stepper(system, "svi:3").integrate(q, velocity=v, h=0.005, steps=50)
+    ends = {str(name): run.q[-1, k] for k, name in enumerate(system.coordinates)}
+    crank, coupler, rocker = (ends[name] for name in ("crank", "coupler", "rocker"))
+    tip = 0.4 * np.array([np.sin(crank), np.cos(crank)])
+    turned = crank + coupler
+    tip += [np.cos(turned) + 0.2 * np.sin(turned), 0.2 * np.cos(turned) - np.sin(turned)]
+    assert tip == pytest.approx([1 + 0.6 * np.sin(rocker), 0.6 * np.cos(rocker)], abs=1e-12)
+    assert np.ptp(run.energy()) < 1e-9
+    pytest.importorskip("mujoco", reason="pip install mujoco")
+    start = [*place, 0, 0, 0], [*rates, 2, -2, 4 / 3]
+    expected = motion_by_mujoco(file, *start, 0.25)
+    names = [*names, *(f"R_my_base_{part}" for part in "wxyz" if "R_my_base" in q), "crank", "coupler", "rocker"]
+    assert [ends[name] for name in names] == pytest.approx(expected, abs=2e-8)
+
+
+def test_axes_of_loops_that_are_rounded_are_parallel(tmp_path):
+    file = tmp_path / "loop.xml"
+    file.write_text(FOUR_BAR.format(base="", axis="1e-6 1 0"))
+    with pytest.warns(SystemDefinitionWarning, match="an equation of a closed loop is omitted"):
+        assert len(sc.LagrangianSystem.from_mjcf(file).constraints) == 2
+    file.write_text(FOUR_BAR.format(base="", axis=".1 1 0"))
+    assert len(sc.LagrangianSystem.from_mjcf(file).constraints) == 3
 
 
 def test_robot_in_which_nothing_moves_is_refused(tmp_path):

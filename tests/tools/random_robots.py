@@ -294,6 +294,53 @@ def by_pinocchio(robot: Urdf, state: State, path: Path) -> list[float]:
     return [energy - potentials[1] + potentials[0], -damped @ v**2]
 
 
+def accelerations(model: Any, data: Any) -> Any:
+    """Return accelerations with rigid equalities: M a = f + J^T l, J a = -dJ/dt v, with dependent equations."""
+    import mujoco
+    import numpy as np
+
+    place, step = data.qpos.copy(), 1e-5
+    sides = []
+    for sign in (1, -1, 0):
+        data.qpos[:] = place
+        mujoco.mj_integratePos(model, data.qpos, data.qvel, sign * step)
+        mujoco.mj_forward(model, data)
+        sides.append(np.array(data.efc_J).reshape(-1, model.nv)[: data.ne])
+    mass = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, mass)
+    free, rows = np.array(data.qacc_smooth), sides[2]
+    bias = (sides[0] - sides[1]) @ data.qvel / (2 * step)
+    lifted = np.linalg.solve(mass, rows.T)
+    return free - lifted @ np.linalg.lstsq(rows @ lifted, rows @ free + bias, rcond=1e-7)[0]
+
+
+def motion_by_mujoco(path: Path, place: Any, rates: Any, span: float) -> Any:
+    """Return qpos after a time span, by DOP853 with MuJoCo's mass matrices."""
+    import mujoco
+    import numpy as np
+    from scipy.integrate import solve_ivp
+
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    turned = [
+        int(model.jnt_qposadr[j]) + 3 * (model.jnt_type[j] == 0) for j in range(model.njnt) if model.jnt_type[j] < 2
+    ]
+
+    def field(_: float, state: Any) -> Any:
+        data.qpos[:], data.qvel[:] = np.split(state, [model.nq])
+        flow, k = [], 0
+        while len(flow) < model.nq:
+            if len(flow) in turned:
+                w, x, y, z = data.qpos[len(flow) : len(flow) + 4]
+                flow += [*(np.array([[-x, -y, -z], [w, -z, y], [z, w, -x], [-y, x, w]]) @ data.qvel[k : k + 3] / 2)]
+                k += 3
+            else:
+                flow, k = [*flow, data.qvel[k]], k + 1
+        return np.concatenate([flow, accelerations(model, data)])
+
+    return solve_ivp(field, (0, span), [*place, *rates], method="DOP853", rtol=1e-11, atol=1e-12).y[: model.nq, -1]
+
+
 if __name__ == "__main__":
     import tempfile
 

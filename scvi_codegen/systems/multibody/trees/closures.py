@@ -1,18 +1,23 @@
 """Closed loops of a tree of bodies: points and frames of two bodies that coincide, and relations between joints.
 
-The frame (x, R) of a body in the world follows from that of its parent along the tree, x + R p and R C A, with the
-rotation A and the displacement of its joint. Two frames coincide if x_1 = x_2 and the antisymmetric part of R_1^T R_2
-is zero, which has rank 3 where R_1 = R_2. Equations that are dependent at a random state, as those across the plane of
-a planar mechanism, are omitted.
+The frame (x, R) of a body in the nearest link that carries both bodies follows from that of its parent along the tree,
+x + R p and R C A, with the rotation A and the displacement of its joint. Two frames coincide if x_1 = x_2 and the
+antisymmetric part of R_1^T R_2 is zero, which has rank 3 where R_1 = R_2. Equations that are dependent at a random
+state of the closed mechanism, as those across the plane of a planar one, are omitted.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+import random
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain, pairwise
 
-from sympy import Add, Dummy, Expr, Matrix, cos, eye, sin
+import numpy as np
+from sympy import Add, Expr, Matrix, cos, eye, sin
 
-from scvi_codegen.common.errors import SystemDefinitionError, closest
-from scvi_codegen.systems.formulas.expressions import derivative_along
+from scvi_codegen.common.errors import SystemDefinitionWarning, warn
+from scvi_codegen.common.precision import mp
+from scvi_codegen.systems.derived_expressions import DEPENDENT, dense
+from scvi_codegen.systems.formulas.expressions import Tape, jacobian
 from scvi_codegen.systems.formulas.intermediates import intermediate
 from scvi_codegen.systems.formulas.rotations import RotationNames
 from scvi_codegen.systems.formulas.symbols import symbol
@@ -23,8 +28,12 @@ from scvi_codegen.systems.multibody.trees.energies import (
     position_of,
     rotation_of,
 )
-from scvi_codegen.systems.multibody.trees.tree import SINGLE, Link, Pose, hat, identifier, rounded
-from scvi_codegen.systems.multibody.variables import independent_of
+from scvi_codegen.systems.multibody.trees.tree import SINGLE, Link, Pose, Vector, hat, rounded
+
+ATTEMPTS, ITERATIONS = 8, 30
+"""Numbers of random points, and of iterations from each, by which a state of the closed mechanism is sought."""
+NEARLY_DEPENDENT = 1e-5
+"""Equations are omitted if less of their derivatives is independent of the others: axes of CAD models are rounded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,48 +65,109 @@ def at_reference(links: Sequence[Link], link: int) -> Pose:
 
 
 def conditions_of(links: Sequence[Link], closures: Iterable[Closure | Coupling]) -> list[Expr]:
-    """Return independent expressions that are 0.
-
-    Raises:
-        SystemDefinitionError: if a joint does not exist or has no coordinate of its own.
-    """
-    conditions = [intermediate(g) for closure in closures for g in _conditions(links, closure)]
+    """Return independent expressions that are 0."""
+    groups = [_conditions(links, closure) for closure in closures]
+    conditions = [*map(intermediate, chain.from_iterable(chain.from_iterable(groups)))]
+    sizes = [len(group) for parts in groups for group in parts]
     turning = [rotation_of(link.joint) for link in links if link.joint.kind in ("ball", "free")]
     in_coordinates = RotationNames(turning).in_coordinates
-    rates: dict[Expr, Dummy] = {}
-    rows = []
-    for g in map(in_coordinates, conditions):
-        coordinates = sorted(g.free_symbols, key=str)
-        rates |= {q: Dummy() for q in coordinates if q not in rates}
-        rows.append(derivative_along(g, coordinates, [rates[q] for q in coordinates]))
-    return [conditions[k] for k in independent_of((), rows, tuple(rates.values()))] if rows else []
+    independent = _independent([*map(in_coordinates, conditions)], sizes, _at_reference(links))
+    return [conditions[k] for k in independent]
 
 
-def _conditions(links: Sequence[Link], closure: Closure | Coupling) -> Iterator[Expr]:
-    """Yield the equations of one closure or coupling, with dependent ones."""
+def _at_reference(links: Sequence[Link]) -> dict[str, float]:
+    """Return the coordinates of the reference configuration by name; those that are not listed are 0."""
+    values = {f"{rotation_of(link.joint).name}_w": 1.0 for link in links if link.joint.kind in ("ball", "free")}
+    for joint in (link.joint for link in links):
+        values |= zip(position_of(joint), joint.pose.position, strict=True) if joint.kind == "free" else ()
+    return values | {link.joint.name: link.joint.zero for link in links if link.joint.kind in SINGLE}
+
+
+def _independent(conditions: Sequence[Expr], sizes: Sequence[int], reference: Mapping[str, float]) -> list[int]:
+    """Return the indices of equations that are independent at a random point where all hold.
+
+    The point is the limit of Gauss-Newton iterates q - G^+ g, with G and g scaled by the largest row of each group (the
+    components of a vector). Gram-Schmidt elimination with pivots then selects the rows of G, the first one whose
+    remainder has at least half of the largest length, until the largest is less than ``NEARLY_DEPENDENT``.
+
+    Args:
+        sizes: number of equations of each group, in order.
+        reference: coordinates near which the point is sought.
+    """
+    variables = sorted(set().union(*(g.free_symbols for g in conditions)), key=str)
+    entries, count = jacobian(conditions, variables), len(conditions)
+    tape, generator = Tape([*conditions, *entries.values()], variables), random.Random(20250101)
+    start = np.array([reference.get(q.name, 0.0) for q in variables])
+    ends = np.cumsum([0, *sizes])
+
+    def at(q: Vector) -> tuple[Vector, Vector]:
+        values = tape([mp.mpf(x) for x in q.tolist()])
+        rows = dense(entries, values[count:], (count, len(variables)))
+        lengths = [np.linalg.norm(rows[i:j], axis=1).max() for i, j in pairwise(ends)]
+        scales = np.repeat(np.where(np.array(lengths) > 0, lengths, 1.0), sizes)
+        return np.array(values[:count], float) / scales, rows / scales[:, None]
+
+    for attempt in range(ATTEMPTS if conditions else 0):
+        q = start + np.array([generator.uniform(-0.5, 0.5) for _ in variables]) / 2**attempt
+        for _ in range(ITERATIONS):
+            g, rows = at(q)
+            q = q - np.linalg.lstsq(rows, g, rcond=NEARLY_DEPENDENT)[0]
+        g, rows = at(q)
+        if np.abs(g).max() < NEARLY_DEPENDENT:
+            break
+    return sorted(_pivots(rows)) if conditions else []
+
+
+def _pivots(rows: Vector) -> Iterator[int]:
+    """Yield the indices of independent rows; warn of dependent ones that are not exactly so."""
+    while (lengths := np.linalg.norm(rows, axis=1)).max() > NEARLY_DEPENDENT:
+        pivot = int(np.argmax(lengths >= lengths.max() / 2))
+        yield pivot
+        unit = rows[pivot] / lengths[pivot]
+        rows = rows - np.outer(rows @ unit, unit)
+    if lengths.max() > DEPENDENT:
+        warn(
+            "an equation of a closed loop is omitted, because its derivatives are combinations of the others but for "
+            f"{lengths.max():.1e} of them, as by rounded axes",
+            SystemDefinitionWarning,
+        )
+
+
+def _conditions(links: Sequence[Link], closure: Closure | Coupling) -> list[list[Expr]]:
+    """Return the equations of one closure or coupling, with dependent ones, as components of vectors.
+
+    They are written in the frame of the nearest link that carries both, on whose motion they do not depend.
+    """
     if isinstance(closure, Coupling):
-        relative = _coordinate(links, closure.other) - exact_number(closure.zero) if closure.other else 0
+        relative = symbol(closure.other) - exact_number(closure.zero) if closure.other else 0
         terms = (a * relative**k for k, a in enumerate(map(exact_number, closure.coefficients)))
-        yield _coordinate(links, closure.joint) - exact_number(closure.offset) - Add(*terms)
-        return
-    (position, axes), (other, others) = map(_frame, (links, links), closure.links, closure.poses)
-    yield from position - other
+        return [[symbol(closure.joint) - exact_number(closure.offset) - Add(*terms)]]
+    first, second = (_carriers(links, link) for link in closure.links)
+    common = next(link for link in first if link in second)
+    (position, axes), (other, others) = (
+        _frame(links, link, pose, common) for link, pose in zip(closure.links, closure.poses, strict=True)
+    )
+    equations = [[*(position - other)]]
     if closure.turning:
         relative = axes.T * others
-        yield from (relative[2, 1] - relative[1, 2], relative[0, 2] - relative[2, 0], relative[1, 0] - relative[0, 1])
+        equations.append(
+            [relative[2, 1] - relative[1, 2], relative[0, 2] - relative[2, 0], relative[1, 0] - relative[0, 1]]
+        )
+    return equations
 
 
-def _coordinate(links: Sequence[Link], name: str) -> Expr:
-    joints = {link.joint.name: link.joint for link in links if link.joint.kind in SINGLE}
-    if name not in joints:
-        raise SystemDefinitionError(f"an equality names '{name}', which is no hinge or slide{closest(name, joints)}")
-    return symbol(identifier(name))
+def _carriers(links: Sequence[Link], link: int) -> list[int]:
+    """Return a link and those that carry it, up to the world."""
+    carriers = [link]
+    while carriers[-1] >= 0:
+        carriers.append(links[carriers[-1]].parent)
+    return carriers
 
 
-def _frame(links: Sequence[Link], link: int, pose: Pose) -> tuple[Matrix, Matrix]:
-    """Return position and axes in the world of a frame with a pose in a link."""
+def _frame(links: Sequence[Link], link: int, pose: Pose, outer: int) -> tuple[Matrix, Matrix]:
+    """Return position and axes, in the frame of a link ``outer``, of a frame with a pose in a link that it carries."""
     position, axes = exact_vector(pose.position), exact_matrix(rounded(pose.rotation))
-    while link >= 0:
+    while link != outer:
         joint = links[link].joint
         origin, turn = exact_vector(joint.pose.position), exact_matrix(rounded(joint.pose.rotation))
         if joint.kind == "free":
@@ -105,7 +175,7 @@ def _frame(links: Sequence[Link], link: int, pose: Pose) -> tuple[Matrix, Matrix
         if joint.kind in ("ball", "free"):
             turn *= Matrix(3, 3, rotation_of(joint).entries)
         elif joint.kind in SINGLE:
-            q = symbol(identifier(joint.name)) - exact_number(joint.zero)
+            q = symbol(joint.name) - exact_number(joint.zero)
             across = exact_matrix(rounded(hat(joint.axis)))
             if joint.kind == "hinge":
                 turn = turn * (eye(3) + sin(q) * across + (1 - cos(q)) * across * across)

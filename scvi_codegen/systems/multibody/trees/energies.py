@@ -46,17 +46,7 @@ from scvi_codegen.systems.contact import ContactLike, contact, friction
 from scvi_codegen.systems.formulas.intermediates import intermediate
 from scvi_codegen.systems.formulas.rotations import Rotation, RotationNames
 from scvi_codegen.systems.formulas.symbols import DOT, default_momenta, symbol
-from scvi_codegen.systems.multibody.trees.tree import (
-    SINGLE,
-    DrawnLink,
-    Joint,
-    Link,
-    Vector,
-    aligned,
-    identifier,
-    named,
-    without_fixed,
-)
+from scvi_codegen.systems.multibody.trees.tree import SINGLE, DrawnLink, Joint, Link, Vector, aligned, without_fixed
 from scvi_codegen.systems.reading import system_from_sympy
 
 
@@ -72,7 +62,7 @@ class Tree:
     """
 
     def __init__(self, links: Sequence[Link], gravity: Vector) -> None:
-        links = self.links = aligned(named(without_fixed(links)))
+        links = self.links = aligned(without_fixed(links))
         self.gravity = exact_vector(gravity)
         self.joints = {link.joint.name: link.joint for link in links}
         self.leaders = {joint.name: self.leader(joint) for joint in self.joints.values() if joint.kind in SINGLE}
@@ -244,7 +234,8 @@ class Tree:
         singles = [joint.name for joint in self.joints.values() if joint.kind in SINGLE and not joint.follows]
         if isinstance(actuated, bool):
             actuated = singles if actuated else []
-        driven = [*map(identifier, actuated)]
+        names = {joint.label: joint.name for joint in self.joints.values()}
+        driven = [names.get(name, name) for name in actuated]
         for name in driven:
             if name not in singles:
                 raise SystemDefinitionError(f"there is no hinge or slide '{name}' to act on{closest(name, singles)}")

@@ -21,7 +21,7 @@ from scvi_codegen.systems.formulas.rotations import matrix_of
 from scvi_codegen.systems.multibody.trees.closures import Closure, Coupling, at_reference
 from scvi_codegen.systems.multibody.trees.document import Element, Unread, root_of
 from scvi_codegen.systems.multibody.trees.schema import MJCF, TURN
-from scvi_codegen.systems.multibody.trees.tree import SINGLE, Inertia, Joint, Link, Pose, Vector, about
+from scvi_codegen.systems.multibody.trees.tree import SINGLE, Inertia, Joint, Link, Pose, Vector, about, named
 
 Sizes = Vector
 
@@ -87,8 +87,13 @@ def links_of_mjcf(
     _apply_defaults(root)
     model = _MujocoModel(root, limits)
     closures = [*model.closures()]
+    links, names = named(model.scaled())
+    for k, closure in enumerate(closures):
+        if isinstance(closure, Coupling):
+            other = names[closure.other] if closure.other else None
+            closures[k] = replace(closure, joint=names[closure.joint], other=other)
     model.unread.warn(root.file)
-    return root.text("model", Path(path).stem), model.scaled(), model.gravity, closures
+    return root.node.get("model") or Path(path).stem, links, model.gravity, closures
 
 
 class _MujocoModel:
@@ -109,6 +114,7 @@ class _MujocoModel:
         self.turn = np.pi / 180 if self.settings.choice("angle", "degree", "radian") == "degree" else 1.0
         self.links: list[Link] = []
         self.compensating: list[Element] = []
+        self.joints: dict[str, Element] = {}
         self.carriers, self.parents = {-1: -1}, dict[int, int]()
         """Of each body, by its link: the moving body that it is fixed to, and the one that this is connected with."""
         self.shapes: dict[tuple[int, int, int], None] = {}
@@ -165,14 +171,17 @@ class _MujocoModel:
 
     def add(self, body: Element, parent: int, pose: Pose) -> int:
         """Add a link for each joint of a body and one that carries its inertia; return the position of the last."""
-        name = body.text("name", f"body{len(self.links)}")
+        name = body.node.get("name") or f"body{len(self.links)}"
         joints = [*self.contents(body, "joint", "freejoint")]
         above, anchor = self.carriers[parent], np.zeros(3)
         for count, (joint, frame) in enumerate(joints):
             free = joint.tag == "freejoint" or joint.text("type", "hinge") == "free"  # has no place in the body
             at = np.zeros(3) if free else frame.position + frame.rotation @ joint.vector("pos", (0, 0, 0))
             moved = pose @ Pose(at - anchor)
-            label = joint.text("name", name if count == 0 else f"{name}_{count + 1}")
+            label = joint.node.get("name") or (name if count == 0 else f"{name}_{count + 1}")
+            if joint.has("name") and label in self.joints:
+                joint.refuse(f"is the second joint of this name, after {self.joints[label].where}: rename one")
+            self.joints |= {label: joint} if joint.has("name") else {}
             self.links.append(Link(label, parent, self.joint(joint, label, moved, frame, parent), Inertia()))
             parent, pose, anchor = len(self.links) - 1, Pose(), at
         place = len(self.links)
@@ -297,14 +306,17 @@ class _MujocoModel:
 
     def coupling(self, equality: Element) -> Coupling:
         """Return a relation between two joints, or the fixed value of one."""
-        zeros = {link.joint.name: link.joint.zero for link in self.links}
+        zeros = {link.joint.name: link.joint.zero for link in self.links if link.joint.kind in SINGLE}
         joint, other = equality.text("joint1"), equality.text("joint2", "") or None
+        for name in filter(None, (joint, other)):
+            if name not in zeros:
+                equality.refuse(f"names the joint '{name}', which is no hinge or slide{closest(name, zeros)}")
         if joint == other:
             equality.refuse(f"is between joint '{joint}' and itself")
         first = equality.vector("polycoef", (0,), range(1, 6))
         polynomial = (*first, *(0, 1, 0, 0, 0)[len(first) :])  # those that are not written keep their defaults
         coefficients = tuple(map(float, polynomial if other else polynomial[:1]))
-        return Coupling(joint, other, coefficients, zeros.get(joint, 0.0), zeros.get(other or "", 0.0))
+        return Coupling(joint, other, coefficients, zeros[joint], zeros.get(other or "", 0.0))
 
     def joint(self, joint: Element, name: str, pose: Pose, frame: Pose, parent: int) -> Joint:
         """Return a joint of a link, whose pose is that in its parent."""
@@ -443,7 +455,8 @@ class _MujocoModel:
 def _merged(root: Element, tag: str, parts: list[Element]) -> Element:
     """Return one element with the attributes of several, of which the later ones win."""
     attributes = {key: value for part in parts for key, value in part.node.attrib.items()}
-    return Element(root.file, ElementTree.Element(tag, attributes))
+    merged = ElementTree.Element(tag, attributes)
+    return Element(merged, {merged: root.places[(parts[0] if parts else root).node]})
 
 
 def _include(root: Element) -> None:
@@ -472,8 +485,8 @@ def _include(root: Element) -> None:
                 child.refuse(f"names '{name}', which is included already")
             read.add(path.resolve())
             included = root_of(path, "mujocoinclude", "mujoco")
-            root.files.update(dict.fromkeys(included.node, included.file))
-            children.extendleft(Element(included.file, node, root.files) for node in reversed(included.node))
+            root.places.update(included.places)
+            children.extendleft(Element(node, root.places) for node in reversed(included.node))
         if len(nodes) != len(outer.node) or any(a.node is not b for a, b in zip(nodes, outer.node, strict=True)):
             outer.node[:] = [element.node for element in nodes]
         pending += nodes

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -10,6 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.common.errors import SystemDefinitionError
+from scvi_codegen.systems.formulas.expressions import FUNCTIONS
+from scvi_codegen.systems.formulas.symbols import C_KEYWORDS, DOT, TIME
+from scvi_codegen.systems.formulas.symbols import identifier as spelled
 
 Vector = NDArray[np.float64]
 
@@ -87,7 +91,7 @@ class Joint:
     """Joint between a link and its parent.
 
     Attributes:
-        name: its name, which is that of the coordinate.
+        name, label: its name, which is that of the coordinate, and its name in the file.
         kind: one of ``KINDS``.
         pose: pose of the link in the parent's frame where the coordinate is 0.
         axis: unit vector of a hinge or slide, in the frame of the link.
@@ -111,6 +115,7 @@ class Joint:
     limits: tuple[float, float] | None = None
     dry_friction: float = 0.0
     follows: tuple[str, float, float] | None = None
+    label: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,6 +147,7 @@ class DrawnLink:
     center: tuple[float, ...]
     zero: float
     follows: tuple[str, float, float] | None
+    label: str
 
     @classmethod
     def of(cls, link: Link) -> DrawnLink:
@@ -149,7 +155,9 @@ class DrawnLink:
         joint = link.joint
         rotation = tuple(tuple(row) for row in link.joint.pose.rotation.tolist())
         position, center = (tuple(vector.tolist()) for vector in (joint.pose.position, link.inertia.center))
-        return cls(link.parent, joint.name, joint.kind, position, rotation, center, joint.zero, joint.follows)
+        return cls(
+            link.parent, joint.name, joint.kind, position, rotation, center, joint.zero, joint.follows, joint.label
+        )
 
 
 def without_fixed(links: Sequence[Link]) -> list[Link]:
@@ -246,23 +254,44 @@ def _frame_along(axis: Vector) -> Vector:
     return np.column_stack([x, np.cross(axis, x), axis])
 
 
-def named(links: Sequence[Link]) -> list[Link]:
-    """Return the links with joints whose names are valid in formulas: other characters become ``_``.
+def named(links: Sequence[Link]) -> tuple[list[Link], dict[str, str]]:
+    """Return the links with names of joints that are valid in formulas, and these names by those in the file.
 
-    Raises:
-        SystemDefinitionError: if two joints have one name.
+    A name whose symbols are those of an earlier joint is followed by ``_2``, ``_3``, ..
     """
-    renamed: dict[str, Link] = {}
+    names: dict[str, str] = {}
+    taken, renamed = set[str](), []
     for link in links:
         joint = link.joint
-        name = identifier(joint.name)
-        if name in renamed:
-            raise SystemDefinitionError(f"two joints are called '{name}': rename one")
-        follows = joint.follows and (identifier(joint.follows[0]), *joint.follows[1:])
-        renamed[name] = replace(link, joint=replace(joint, name=name, follows=follows))
-    return [*renamed.values()]
+        plain = identifier(joint.name)
+        numbered = (plain, *(f"{plain}_{k}" for k in range(2, len(links) + 2)))
+        name = next(name for name in numbered if taken.isdisjoint(_symbols(joint.kind, name)))
+        if joint.kind != "fixed":
+            taken |= _symbols(joint.kind, name)
+            names.setdefault(joint.name, name)
+        renamed.append(replace(link, joint=replace(joint, name=name, label=joint.name)))
+    for i, link in enumerate(renamed):
+        if link.joint.follows:
+            leader, factor, offset = link.joint.follows
+            follows = names.get(leader, leader), factor, offset
+            renamed[i] = replace(link, joint=replace(link.joint, follows=follows))
+    return renamed, names
+
+
+def _symbols(kind: str, name: str) -> set[str]:
+    """Return the names of the symbols of a joint."""
+    if kind in SINGLE:
+        return {name, f"{name}{DOT}", f"p_{name}", f"tau_{name}"}
+    return {f"{part}_{name}" for part in ("R", "omega", *"xyz")} | {f"R_{name}_{part}" for part in "wxyz"}
 
 
 def identifier(name: str) -> str:
-    """Return a name with the characters that formulas do not allow replaced by ``_``."""
-    return re.sub(r"\W", "_", name, flags=re.ASCII)
+    """Return a name that is valid in formulas.
+
+    Greek letters are spelled out, accents omitted, other characters replaced by ``_``. ``joint_`` precedes names that
+    do not begin with a letter, and ``_`` follows words of C and of formulas.
+    """
+    letters = unicodedata.normalize("NFKD", spelled(name))
+    plain = re.sub(r"\W", "_", "".join(x for x in letters if not unicodedata.combining(x)), flags=re.ASCII)
+    plain = plain if plain[:1].isalpha() else f"joint_{plain.lstrip('_')}"
+    return f"{plain}_" if plain in (*C_KEYWORDS, *FUNCTIONS, "pi", TIME) else plain

@@ -12,7 +12,7 @@ import numpy as np
 from scvi_codegen.common.errors import SystemDefinitionError, closest
 from scvi_codegen.systems.multibody.trees.document import Element, Unread, root_of
 from scvi_codegen.systems.multibody.trees.schema import URDF
-from scvi_codegen.systems.multibody.trees.tree import SINGLE, Inertia, Joint, Link, Pose, Vector, about
+from scvi_codegen.systems.multibody.trees.tree import SINGLE, Inertia, Joint, Link, Pose, Vector, about, named
 
 LIMITED = ("revolute", "prismatic")
 KINDS = {"fixed": "fixed", "revolute": "hinge", "continuous": "hinge", "prismatic": "slide", "floating": "free"}
@@ -63,7 +63,7 @@ def links_of_urdf(path: str | PathLike[str], *, floating: bool, limits: bool = F
     if len(order) < len(links):
         raise SystemDefinitionError(f"{path}: the links {sorted(set(links) - set(order))} form a circle")
     _unread(robot, limits).warn(str(path))
-    return robot.name, tree
+    return robot.node.get("name") or Path(path).stem, named(tree)[0]
 
 
 def _unread(robot: Element, limits: bool) -> Unread:
