@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import sympy
-from random_robots import motion_by_mujoco
+from random_robots import errors_of_motion, motion_by_mujoco
 from scipy.spatial.transform import Rotation
 
 import scvi_codegen as sc
@@ -79,7 +79,7 @@ CHANGES = {
     "missing link": (lambda text: text.replace('<child link="tool"/>', '<child link="tol"/>'), "'tol', which does not"),
     "two parents": (lambda text: text.replace('<child link="finger"/>', '<child link="tool"/>'), "moves as well"),
     "circle": (lambda text: text.replace('<parent link="base"/>', '<parent link="finger"/>'), "form a circle"),
-    "kind": (lambda text: text.replace('"prismatic"', '"planar"'), "is of type 'planar'"),
+    "kind": (lambda text: text.replace('"prismatic"', '"helical"'), "is of type 'helical'"),
     "axis": (lambda text: text.replace("1 2 -2", "0 0 0"), "must not be zero"),
     "numbers": (lambda text: text.replace("1 2 -2", "1 2"), "3 finite numbers"),
     "text": (lambda text: text.replace("1 2 -2", "1 2 x"), "must be numbers"),
@@ -138,15 +138,14 @@ MUJOCO_CHANGES = {
     "equality": ("</mujoco>", "<equality><weld/></equality></mujoco>", "<weld> 'weld' has no attribute 'body1'"),
     "tendon": (
         "</mujoco>",
-        '<tendon><fixed stiffness="1"/></tendon></mujoco>',
-        "has stiffness='1', which changes the motion",
+        '<tendon><spatial name="t" stiffness="1"><pulley divisor="2"/></spatial></tendon></mujoco>',
+        "<pulley> 'pulley' in <spatial> 't' is on the tendon 't', which is read through sites only",
     ),
     "mesh": ('type="box"', 'type="mesh"', "give its body an <inertial>"),
     "class": ('childclass="limb"', 'childclass="lim"', "of the class 'lim'"),
     "orientations": ('quat="1 0.1 0.2 0.3"', 'quat="1 0 0 0" euler="0 0 0"', "quat and euler"),
     "free inside": ('type="ball"', 'type="free"', "inside another body"),
     "replicate": ("</worldbody>", "<replicate/></worldbody>", "write out what it makes"),
-    "ball spring": (' stiffness="0"', "", "hinges and slides only"),
     "axes": ('eulerseq="zyx"', 'eulerseq="zy"', "is not three of the letters"),
     "name": ('name="slip"', 'name="flex"', "<joint> 'flex' is the second joint of this name"),
     "include": ("<option", '<include file="none.xml"/><option', "none.xml cannot be read"),
@@ -164,8 +163,8 @@ MUJOCO_CHANGES = {
     "medium": ("<option", '<option density="1.2"', "density='1.2', which changes the motion"),
     "tendon of a class": (
         "</mujoco>",
-        '<default><tendon damping="1"/></default><tendon><fixed/></tendon></mujoco>',
-        "has damping='1', which changes the motion",
+        '<default><tendon damping="1"/></default><tendon><fixed><joint joint="no" coef="1"/></fixed></tendon></mujoco>',
+        "names the joint 'no', which is no hinge or slide",
     ),
     "actuator of a tendon": (
         "</mujoco>",
@@ -178,7 +177,7 @@ MUJOCO_CHANGES = {
         "springdamper='1 1', which changes",
     ),
     "class twice": ("</default>", '</default><default class="limb"/>', "second of the class 'limb'"),
-    "places": ('fromto="', 'pos="0 0 0" fromto="', "has pos and fromto"),
+    "places": ('fromto="', 'pos="0 0 1" fromto="', "has pos and fromto"),
     "parallel": ('xyaxes="0 1 0 -1 0 0.2"', 'xyaxes="0 1 0 0 2 0"', "must be two different directions"),
     "size": ('size="0.1 0.2 0.3"', 'size="0.1 0.2"', "3 numbers > 0 are needed"),
     "sites": (
@@ -386,6 +385,144 @@ def test_deep_documents_are_read(tmp_path):
     bodies = '<body pos="0 0 0.1">' * depth
     file.write_text(f"<mujoco><worldbody>{bodies}{frames}{'</body>' * depth}</worldbody></mujoco>")
     assert len(sc.LagrangianSystem.from_mjcf(file).coordinates) == 1
+
+
+NAMES = {
+    "left-hip": "left_hip",
+    "left.hip": "left_hip_2",
+    "left hip": "left_hip_3",
+    "1_knee": "joint_1_knee",
+    "_x": "joint_x",
+    "θ1": "theta1",
+    "É": "E",
+    "t": "t_",
+    "pi": "pi_",
+    "int": "int_",
+    "exp": "exp_",
+    "q": "q",
+    "q_dot": "q_dot_2",
+    "膝": "joint_",
+}
+PART = '<geom size="0.1" pos="0.1 0 0"/>'
+
+
+def test_names_become_identifiers(tmp_path):
+    file = tmp_path / "names.xml"
+    bodies = "".join(f'<body pos="0 0 {k}"><joint name="{name}"/>{PART}</body>' for k, name in enumerate(NAMES))
+    ties = '<equality><joint joint1="left.hip" joint2="1_knee"/></equality>'
+    head = '<mujoco model=""><option><flag contact="disable"/></option>'
+    file.write_text(f"{head}<worldbody>{bodies}</worldbody>{ties}</mujoco>")
+    system = sc.LagrangianSystem.from_mjcf(file, actuated=["left hip"])
+    assert system.joint_names == NAMES
+    assert [str(q) for q in system.coordinates] == [*NAMES.values()]
+    assert (system.name, system.inputs) == ("names", ("tau_left_hip_3",))
+    assert {str(each) for each in system.constraints[0].free_symbols} == {"left_hip_2", "joint_1_knee"}
+
+
+URDF_LINK = """<link name="{0}"><inertial><mass value="{1}"/>
+<inertia ixx="{2}" iyy="{2}" izz="{2}" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+ENDS = '<parent link="a"/><child link="b"/>'
+MESSAGES = {
+    "massless": ((0, 0), '<joint name="j-1" type="revolute">', "robot.urdf: joint 'j-1' moves no mass"),
+    "floating": (
+        (1, 1),
+        '<joint name="f" type="floating">',
+        "robot.urdf:3: <joint> 'f' is free, and so is its parent by",
+    ),
+    "substitution": ((1, 1), '<joint name="$(optenv X)" type="fixed">', "write the file that xacro makes"),
+    "older": ((1, 1), '<joint name="j" type="revolute"><joint_properties damping="1"/>', "write <dynamics>"),
+    "impossible": (
+        (1, -1),
+        '<joint name="j" type="revolute">',
+        "robot.urdf: link 'b', with the links fixed to it, has the",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", MESSAGES)
+def test_messages_name_file_and_joint(case, tmp_path):
+    inertia, joint, message = MESSAGES[case]
+    file = tmp_path / "robot.urdf"
+    links = URDF_LINK.replace("\n", "").format("a", 1, 1) + URDF_LINK.replace("\n", "").format("b", *inertia)
+    file.write_text(f'<robot name="r">\n{links}\n{joint}{ENDS}</joint></robot>')
+    with pytest.raises(SystemDefinitionError, match=re.escape(message)):
+        sc.LagrangianSystem.from_urdf(file, floating=case == "floating")
+    if case == "impossible":
+        with pytest.warns(SystemDefinitionWarning, match="which no body has"):
+            assert len(sc.LagrangianSystem.from_urdf(file, check_inertias=False).coordinates) == 1
+
+
+def test_geoms_without_names_are_located(tmp_path):
+    file = tmp_path / "arm.xml"
+    file.write_text('<mujoco><worldbody><body name="hand">\n<joint/><geom/></body></worldbody></mujoco>')
+    with pytest.raises(SystemDefinitionError, match="2: <geom> 'geom' in <body> 'hand' has no attribute 'size'"):
+        sc.LagrangianSystem.from_mjcf(file)
+
+
+HINGES = '<joint name="1-a" axis="1 2 3" springref="10"/>', '<joint name="t" ref="7" axis="0 1 0"/>'
+FIXED = '<tendon><fixed {}><joint joint="1-a" coef=".5"/><joint joint="t" coef="-2"/></fixed></tendon>'
+SPATIAL = '<tendon><spatial {}><site site="w"/><site site="s"/><site site="e"/></spatial></tendon>'
+MOTIONS = {
+    "fixed tendon": (*HINGES, FIXED.format('stiffness="3" damping=".2"')),
+    "slack tendon": (*HINGES, FIXED.format('stiffness="3 2 1" springlength=".1 .2" damping="1 2 3"')),
+    "spatial tendon": (*HINGES, SPATIAL.format('stiffness="3 2" armature=".4" damping=".2"')),
+    "tendon of a ball": (
+        '<joint name="a" type="ball"/>',
+        '<joint name="b"/>',
+        SPATIAL.format('stiffness="3" springlength=".2" armature=".4" damping=".2"'),
+    ),
+    "polynomials": (
+        '<joint name="1-a" axis="1 2 3" stiffness="1 2 3" damping="3 2 1" springref="10"/>',
+        '<joint name="t" type="slide" stiffness="3 -2" damping="1 2"/>',
+        '<actuator><motor joint="t" gear="-2" damping="1 2 3"/></actuator>',
+    ),
+    "balls": (
+        '<joint name="a b" type="ball" stiffness="3 2 1" damping="1 2 3"/>',
+        '<joint name="exp" type="ball" stiffness="3"/>',
+        "",
+    ),
+    "free": ('<joint name="α" type="free" stiffness="3 2 1" damping="1 2 3"/>', '<joint name="exp"/>', ""),
+    "aligned": ('<freejoint name="my.free" align="false"/>', '<joint name="exp"/>', ""),
+}
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("case", MOTIONS)
+def test_equations_of_motion_are_those_of_mujoco(case, tmp_path):
+    pytest.importorskip("mujoco", reason="pip install mujoco")
+    file, (one, two, rest) = tmp_path / "model.xml", MOTIONS[case]
+    file.write_text(f"""<mujoco><option gravity="0 1 -9"><flag contact="disable"/></option><worldbody>
+<site name="w" pos=".1 .5 .2"/><body name="a" pos=".1 .2 .3" euler="10 20 30">{one}<geom size=".1" pos=".3 .1 0"/>
+<site name="s" pos=".3 .1 .1"/><body name="b" pos=".3 0 0">{two}<geom type="box" size=".1 .2 .3" pos=".3 0 .1"/>
+<site name="e" pos=".2 .2 .1"/></body></body></worldbody>{rest}</mujoco>""")
+    assert max(errors_of_motion(sc.LagrangianSystem.from_mjcf(file), file)) < 1e-12
+
+
+PLANAR = """<joint name="slab" type="planar"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>
+<dynamics damping=".3"/></joint><drake:joint name="socket" type="ball"><parent link="b"/><child link="c"/></drake:joint>
+<joint name="knee" type="revolute"><parent link="c"/><child link="d"/><axis xyz="0 1 0"/>
+<dynamics damping=".2" spring_stiffness="3" spring_reference=".4"/></joint><frame name="f" link="d"/>
+<transmission name="m"><joint name="knee"/><actuator name="m"><drake:rotor_inertia value=".01"/>
+<drake:gear_ratio value="-20"/></actuator></transmission>"""
+
+
+def test_joints_of_drake_are_those_of_mujoco(tmp_path):
+    file, other = tmp_path / "robot.urdf", tmp_path / "robot.xml"
+    inertia = '<origin xyz=".1 0 .2"/><mass value="1"/><inertia ixx=".2" iyy=".3" izz=".25" ixy="0" ixz="0" iyz="0"/>'
+    links = "".join(f'<link name="{each}"><inertial>{inertia}</inertial></link>' for each in "abcd")
+    file.write_text(f'<robot name="r">{links}{PLANAR}</robot>')
+    with pytest.warns(SystemDefinitionWarning, match="without elements <frame>; actuators m$"):
+        system = sc.LagrangianSystem.from_urdf(file)
+    body = '<body><inertial pos=".1 0 .2" mass="1" diaginertia=".2 .3 .25"/>'
+    slides = "".join(
+        f'<joint name="{x}_slab" type="slide" axis="{e}" damping=".3"/>' for x, e in (("x", "1 0 0"), ("y", "0 1 0"))
+    )
+    knee = '<joint name="knee" axis="0 1 0" damping=".2" stiffness="3" springref=".4" armature="4"/>'
+    inner = f'{body}{slides}<joint name="angle_slab" damping=".3"/>{body}<joint name="socket" type="ball"/>{body}{knee}'
+    head = '<mujoco model="r"><compiler angle="radian"/><worldbody>'
+    other.write_text(f"{head}{inner}</body></body></body></worldbody></mujoco>")
+    same = sc.LagrangianSystem.from_mjcf(other)
+    assert (system.lagrangian, system.forces) == (same.lagrangian, same.forces)
 
 
 FOUR_BAR = """<mujoco><option><flag contact="disable"/></option><default><geom type="capsule" size=".03"/></default>

@@ -294,6 +294,65 @@ def by_pinocchio(robot: Urdf, state: State, path: Path) -> list[float]:
     return [energy - potentials[1] + potentials[0], -damped @ v**2]
 
 
+def errors_of_motion(system: Any, path: Path, seed: int = 1) -> list[float]:
+    """Return errors of T - V (but for a constant), damping power and equations of motion at a random state of MuJoCo.
+
+    The accelerations are MuJoCo's without equalities. The error of d/dt L_v - L_q - f is relative to |f| + |L_q| + 1.
+    """
+    import mujoco
+    import numpy as np
+    from sympy import S
+
+    from scvi_codegen.common.precision import mp
+    from scvi_codegen.systems.formulas.expressions import Tape, gradient
+
+    model = mujoco.MjModel.from_xml_path(str(path))
+    model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
+    data, draw = mujoco.MjData(model), np.random.default_rng(seed)
+    m, variables = system.dimension, (*system.coordinates, *system.velocities)
+    slopes = gradient(system.lagrangian, variables)
+    forces = system.forces or [S.Zero] * m
+    tape = Tape([system.lagrangian, *(slopes.get(k, S.Zero) for k in range(2 * m)), *forces], variables)
+    energies = []
+    for scale in (0.0, 1.0):
+        mujoco.mj_resetData(model, data)
+        data.qvel[:] = draw.uniform(-1, 1, model.nv)
+        mujoco.mj_integratePos(model, data.qpos, data.qvel * scale, 1.0)
+        data.qvel[:] = scale * draw.uniform(-1, 1, model.nv)
+        mujoco.mj_forward(model, data)
+        q, v, a = ({} for _ in range(3))
+        for j in range(model.njnt):
+            name = system.joint_names[model.joint(j).name]
+            kind, at, k = model.jnt_type[j], model.jnt_qposadr[j], model.jnt_dofadr[j]
+            names = [[f"{x}_{name}" for x in "xyz"], [], [name], [name]][kind]
+            for i, each in enumerate(names):
+                q[each], v[each], a[each] = data.qpos[at + i], data.qvel[k + i], data.qacc_smooth[k + i]
+            if kind < 2:
+                at, k = at + len(names), k + len(names)
+                w, x, y, z = data.qpos[at : at + 4]
+                spin = [data.qvel[k : k + 3] / 2, data.qacc_smooth[k : k + 3] / 2]
+                matrix = np.array([[-x, -y, -z], [w, -z, y], [z, w, -x], [-y, x, w]])
+                rate = matrix @ spin[0]
+                second = matrix @ spin[1] - spin[0] @ spin[0] * data.qpos[at : at + 4]
+                for i, letter in enumerate("wxyz"):
+                    each = f"R_{name}_{letter}"
+                    q[each], v[each], a[each] = data.qpos[at + i], rate[i], second[i]
+        place, rates, second = ([mp.mpf(float(part[str(x)])) for x in system.coordinates] for part in (q, v, a))
+        step = mp.mpf("1e-15")
+        sides = []
+        for h in (-step, 0, step):
+            moved = [x + h * y + h * h / 2 * z for x, y, z in zip(place, rates, second, strict=True)]
+            sides.append(tape([*moved, *(y + h * z for y, z in zip(rates, second, strict=True))]))
+        values = sides[1]
+        lifts = model.body_gravcomp * model.body_mass
+        energies.append(values[0] - data.energy[1] + data.energy[0] + float(lifts @ data.xipos @ model.opt.gravity))
+    p = [(b - a) / (2 * step) for a, b in zip(sides[0], sides[2], strict=True)][1 + m : 1 + 2 * m]
+    sums = [x - y - z for x, y, z in zip(p, values[1 : 1 + m], values[1 + 2 * m :], strict=True)]
+    size = max(map(abs, values[1 : 1 + m])) + max(map(abs, values[1 + 2 * m :])) + 1
+    power = sum(x * y for x, y in zip(values[1 + 2 * m :], rates, strict=True)) - float(data.qfrc_damper @ data.qvel)
+    return [float(abs(x)) for x in (energies[1] - energies[0], power, max(map(abs, sums)) / size)]
+
+
 def accelerations(model: Any, data: Any) -> Any:
     """Return accelerations with rigid equalities: M a = f + J^T l, J a = -dJ/dt v, with dependent equations."""
     import mujoco

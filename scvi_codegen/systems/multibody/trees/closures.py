@@ -40,8 +40,7 @@ NEARLY_DEPENDENT = 1e-5
 class Closure:
     """Two frames that coincide, each of a link (-1 is the world) with a pose in it, or only their origins."""
 
-    links: tuple[int, int]
-    poses: tuple[Pose, Pose]
+    ends: tuple[tuple[int, Pose], tuple[int, Pose]]
     turning: bool
 
 
@@ -77,22 +76,19 @@ def conditions_of(links: Sequence[Link], closures: Iterable[Closure | Coupling])
 
 def _at_reference(links: Sequence[Link]) -> dict[str, float]:
     """Return the coordinates of the reference configuration by name; those that are not listed are 0."""
-    values = {f"{rotation_of(link.joint).name}_w": 1.0 for link in links if link.joint.kind in ("ball", "free")}
+    values: dict[str, float] = {}
     for joint in (link.joint for link in links):
-        values |= zip(position_of(joint), joint.pose.position, strict=True) if joint.kind == "free" else ()
-    return values | {link.joint.name: link.joint.zero for link in links if link.joint.kind in SINGLE}
+        values |= {joint.name: joint.zero, f"{rotation_of(joint).name}_w": 1.0}
+        values |= zip(position_of(joint), joint.pose.position, strict=True)
+    return values
 
 
 def _independent(conditions: Sequence[Expr], sizes: Sequence[int], reference: Mapping[str, float]) -> list[int]:
     """Return the indices of equations that are independent at a random point where all hold.
 
-    The point is the limit of Gauss-Newton iterates q - G^+ g, with G and g scaled by the largest row of each group (the
-    components of a vector). Gram-Schmidt elimination with pivots then selects the rows of G, the first one whose
-    remainder has at least half of the largest length, until the largest is less than ``NEARLY_DEPENDENT``.
-
-    Args:
-        sizes: number of equations of each group, in order.
-        reference: coordinates near which the point is sought.
+    The point is the limit of Gauss-Newton iterates q - G^+ g near the ``reference``, with g and G scaled by the largest
+    row of each vector, of which ``sizes`` are the numbers of components. The rows of G are selected by Gram-Schmidt
+    elimination with pivots: the first row whose remainder has at least half of the largest length, and so on.
     """
     variables = sorted(set().union(*(g.free_symbols for g in conditions)), key=str)
     entries, count = jacobian(conditions, variables), len(conditions)
@@ -134,19 +130,12 @@ def _pivots(rows: Vector) -> Iterator[int]:
 
 
 def _conditions(links: Sequence[Link], closure: Closure | Coupling) -> list[list[Expr]]:
-    """Return the equations of one closure or coupling, with dependent ones, as components of vectors.
-
-    They are written in the frame of the nearest link that carries both, on whose motion they do not depend.
-    """
+    """Return the equations of one closure or coupling, with dependent ones, as components of vectors."""
     if isinstance(closure, Coupling):
         relative = symbol(closure.other) - exact_number(closure.zero) if closure.other else 0
         terms = (a * relative**k for k, a in enumerate(map(exact_number, closure.coefficients)))
         return [[symbol(closure.joint) - exact_number(closure.offset) - Add(*terms)]]
-    first, second = (_carriers(links, link) for link in closure.links)
-    common = next(link for link in first if link in second)
-    (position, axes), (other, others) = (
-        _frame(links, link, pose, common) for link, pose in zip(closure.links, closure.poses, strict=True)
-    )
+    (position, axes), (other, others) = frames_in_common(links, closure.ends)
     equations = [[*(position - other)]]
     if closure.turning:
         relative = axes.T * others
@@ -156,12 +145,14 @@ def _conditions(links: Sequence[Link], closure: Closure | Coupling) -> list[list
     return equations
 
 
-def _carriers(links: Sequence[Link], link: int) -> list[int]:
-    """Return a link and those that carry it, up to the world."""
-    carriers = [link]
-    while carriers[-1] >= 0:
-        carriers.append(links[carriers[-1]].parent)
-    return carriers
+def frames_in_common(links: Sequence[Link], ends: Sequence[tuple[int, Pose]]) -> list[tuple[Matrix, Matrix]]:
+    """Return positions and axes of two frames, by link and pose in it, in the nearest link that carries both."""
+    carriers = [[link] for link, _ in ends]
+    for path in carriers:
+        while path[-1] >= 0:
+            path.append(links[path[-1]].parent)
+    common = next(link for link in carriers[0] if link in carriers[1])
+    return [_frame(links, link, pose, common) for link, pose in ends]
 
 
 def _frame(links: Sequence[Link], link: int, pose: Pose, outer: int) -> tuple[Matrix, Matrix]:

@@ -28,13 +28,8 @@ NAMED = 5
 """Number of names that a warning lists of each kind of parts."""
 
 
-@dataclass(frozen=True, slots=True)
-class Place:
-    """Path of a document, number of a line, and for messages the nearest element around it that has a name."""
-
-    file: str
-    line: int
-    around: str
+Place = tuple[str, int, str]
+"""Path of a document, number of a line, and for messages the nearest element around it that has a name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,12 +47,7 @@ class Element:
     @property
     def file(self) -> str:
         """Path of the document."""
-        return self.places[self.node].file
-
-    @property
-    def where(self) -> str:
-        """Path of the document and number of the line."""
-        return f"{self.file}:{self.places[self.node].line}"
+        return self.places[self.node][0]
 
     @property
     def name(self) -> str:
@@ -127,9 +117,9 @@ class Element:
 
     def refuse(self, problem: str) -> NoReturn:
         """Raise an error that names the file, the line and the element."""
-        around = self.places[self.node].around
+        file, line, around = self.places[self.node]
         inside = f" in {around}" if around and not self.node.get("name") else ""
-        raise SystemDefinitionError(f"{self.where}: <{self.tag}> '{self.name}'{inside} {problem}")
+        raise SystemDefinitionError(f"{file}:{line}: <{self.tag}> '{self.name}'{inside} {problem}")
 
     def walk(self, kinds: Mapping[str, Kind]) -> Iterator[tuple[Element, Kind]]:
         """Yield this element and those inside it whose attributes are known, parents first, with their kinds.
@@ -237,7 +227,7 @@ def _parsed(data: bytes, file: str) -> tuple[ElementTree.Element, dict[ElementTr
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         node = builder.start(tag, attributes)
-        places[node] = Place(file, parser.CurrentLineNumber, around[-1])
+        places[node] = file, parser.CurrentLineNumber, around[-1]
         around.append(f"<{tag}> '{attributes['name']}'" if attributes.get("name") else around[-1])
 
     def end(tag: str) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -95,7 +95,8 @@ class Joint:
         kind: one of ``KINDS``.
         pose: pose of the link in the parent's frame where the coordinate is 0.
         axis: unit vector of a hinge or slide, in the frame of the link.
-        damping, stiffness, rest: torque or force -damping q_dot - stiffness (q - rest).
+        damping, stiffness, rest: torque or force -(b1 v + b2 |v| v + b3 v^3) - (k1 x + k2 x^2 + k3 x^3) of each rate v
+            and the displacement x from ``rest``, of a rotation the angle, of a free body from its pose as well.
         armature: inertia of the rotor, which adds armature q_dot^2/2 to the kinetic energy.
         zero: value of the coordinate at ``pose``.
         limits: smallest and largest value of the coordinate, or none.
@@ -107,8 +108,8 @@ class Joint:
     kind: str
     pose: Pose
     axis: Vector = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
-    damping: float = 0.0
-    stiffness: float = 0.0
+    damping: tuple[float, ...] = ()
+    stiffness: tuple[float, ...] = ()
     rest: float = 0.0
     armature: float = 0.0
     zero: float = 0.0
@@ -155,9 +156,8 @@ class DrawnLink:
         joint = link.joint
         rotation = tuple(tuple(row) for row in link.joint.pose.rotation.tolist())
         position, center = (tuple(vector.tolist()) for vector in (joint.pose.position, link.inertia.center))
-        return cls(
-            link.parent, joint.name, joint.kind, position, rotation, center, joint.zero, joint.follows, joint.label
-        )
+        rest = joint.zero, joint.follows, joint.label
+        return cls(link.parent, joint.name, joint.kind, position, rotation, center, *rest)
 
 
 def without_fixed(links: Sequence[Link]) -> list[Link]:
@@ -183,16 +183,20 @@ def without_fixed(links: Sequence[Link]) -> list[Link]:
         raise SystemDefinitionError(
             "no body has a joint that moves: add one, or free the base (from_urdf: floating=True, MJCF: <freejoint>)"
         )
-    for link in moving:
+    return moving
+
+
+def impossible_inertias(links: Sequence[Link]) -> Iterator[str]:
+    """Yield what is wrong with moments of inertia that no body has."""
+    for link in links:
         mass, matrix = link.inertia.mass, link.inertia.matrix
         moments = np.linalg.eigvalsh(matrix) if np.isfinite(matrix).all() else np.full(3, np.nan)
         excess, allowed = moments[2] - moments[1] - moments[0], ROUGH * moments[2] + POINT * mass
         if not (moments[0] >= -1e-9 * abs(moments).max() - 1e-12 * mass and excess <= allowed):
-            raise SystemDefinitionError(
+            yield (
                 f"link '{link.name}', with the links fixed to it, has the mass {mass:g} and the moments of inertia "
                 f"{moments}, which no body has: none is < 0 or exceeds the sum of the others; correct its <inertial>"
             )
-    return moving
 
 
 def aligned(links: Sequence[Link]) -> list[Link]:
@@ -206,7 +210,7 @@ def aligned(links: Sequence[Link]) -> list[Link]:
     for link in links:
         outer = turns[link.parent] if link.parent >= 0 else np.eye(3)
         joint = link.joint
-        turn = np.eye(3) if joint.kind not in SINGLE else _frame_along(joint.axis)
+        turn = np.eye(3) if joint.kind not in SINGLE else axes_of(joint.axis)
         constant = outer.T @ joint.pose.rotation @ turn
         if joint.kind in SINGLE:
             along, across = constant[2, 1], constant[2, 0]
@@ -245,7 +249,7 @@ def hat(v: Vector) -> Vector:
     return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
 
 
-def _frame_along(axis: Vector) -> Vector:
+def axes_of(axis: Vector) -> Vector:
     """Return a rotation matrix with the given third column."""
     if abs(axis[2]) > 1 - ROUNDED:
         return np.diag([1.0, np.sign(axis[2]), np.sign(axis[2])])
@@ -254,8 +258,8 @@ def _frame_along(axis: Vector) -> Vector:
     return np.column_stack([x, np.cross(axis, x), axis])
 
 
-def named(links: Sequence[Link]) -> tuple[list[Link], dict[str, str]]:
-    """Return the links with names of joints that are valid in formulas, and these names by those in the file.
+def named(links: Sequence[Link]) -> list[Link]:
+    """Return the links with names of joints that are valid in formulas.
 
     A name whose symbols are those of an earlier joint is followed by ``_2``, ``_3``, ..
     """
@@ -269,13 +273,11 @@ def named(links: Sequence[Link]) -> tuple[list[Link], dict[str, str]]:
         if joint.kind != "fixed":
             taken |= _symbols(joint.kind, name)
             names.setdefault(joint.name, name)
-        renamed.append(replace(link, joint=replace(joint, name=name, label=joint.name)))
-    for i, link in enumerate(renamed):
-        if link.joint.follows:
-            leader, factor, offset = link.joint.follows
-            follows = names.get(leader, leader), factor, offset
-            renamed[i] = replace(link, joint=replace(link.joint, follows=follows))
-    return renamed, names
+        renamed.append(replace(joint, name=name, label=joint.name))
+    for i, joint in enumerate(renamed):
+        if joint.follows:
+            renamed[i] = replace(joint, follows=(names.get(joint.follows[0], joint.follows[0]), *joint.follows[1:]))
+    return [replace(link, joint=joint) for link, joint in zip(links, renamed, strict=True)]
 
 
 def _symbols(kind: str, name: str) -> set[str]:
