@@ -9,7 +9,7 @@ state of the closed mechanism, as those across the plane of a planar one, are om
 import random
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain, pairwise
+from itertools import chain
 
 import numpy as np
 from sympy import Add, Expr, Matrix, cos, eye, sin
@@ -70,8 +70,7 @@ def conditions_of(links: Sequence[Link], closures: Iterable[Closure | Coupling])
     sizes = [len(group) for parts in groups for group in parts]
     turning = [rotation_of(link.joint) for link in links if link.joint.kind in ("ball", "free")]
     in_coordinates = RotationNames(turning).in_coordinates
-    independent = _independent([*map(in_coordinates, conditions)], sizes, _at_reference(links))
-    return [conditions[k] for k in independent]
+    return [conditions[k] for k in _independent([*map(in_coordinates, conditions)], sizes, _at_reference(links))]
 
 
 def _at_reference(links: Sequence[Link]) -> dict[str, float]:
@@ -94,13 +93,13 @@ def _independent(conditions: Sequence[Expr], sizes: Sequence[int], reference: Ma
     entries, count = jacobian(conditions, variables), len(conditions)
     tape, generator = Tape([*conditions, *entries.values()], variables), random.Random(20250101)
     start = np.array([reference.get(q.name, 0.0) for q in variables])
-    ends = np.cumsum([0, *sizes])
+    first = np.cumsum([0, *sizes[:-1]])
 
     def at(q: Vector) -> tuple[Vector, Vector]:
         values = tape([mp.mpf(x) for x in q.tolist()])
         rows = dense(entries, values[count:], (count, len(variables)))
-        lengths = [np.linalg.norm(rows[i:j], axis=1).max() for i, j in pairwise(ends)]
-        scales = np.repeat(np.where(np.array(lengths) > 0, lengths, 1.0), sizes)
+        lengths = np.maximum.reduceat(np.linalg.norm(rows, axis=1), first)
+        scales = np.repeat(np.where(lengths > 0, lengths, 1.0), sizes)
         return np.array(values[:count], float) / scales, rows / scales[:, None]
 
     for attempt in range(ATTEMPTS if conditions else 0):
@@ -122,11 +121,8 @@ def _pivots(rows: Vector) -> Iterator[int]:
         unit = rows[pivot] / lengths[pivot]
         rows = rows - np.outer(rows @ unit, unit)
     if lengths.max() > DEPENDENT:
-        warn(
-            "an equation of a closed loop is omitted, because its derivatives are combinations of the others but for "
-            f"{lengths.max():.1e} of them, as by rounded axes",
-            SystemDefinitionWarning,
-        )
+        share = f"{lengths.max():.1e} of it is independent of the others, as by rounded axes"
+        warn(f"an equation of a closed loop is omitted, although {share}", SystemDefinitionWarning)
 
 
 def _conditions(links: Sequence[Link], closure: Closure | Coupling) -> list[list[Expr]]:

@@ -222,11 +222,7 @@ class Tree:
         return Add(*terms)
 
     def extensions(self, joint: Joint) -> Iterator[Expr]:
-        """Yield the displacements of the springs of a joint.
-
-        The angle of a rotation is atan2(|R - R^T|_F/8^(1/2), (tr R - 1)/2), with ``TINY`` under the root, because the
-        square of the angle is smooth at 0.
-        """
+        """Yield the displacements of springs, of a rotation the angle atan2(|R - R^T|_F/8^(1/2), (tr R - 1)/2)."""
         if joint.kind in SINGLE:
             yield self.coordinate(joint)[0] - exact_number(joint.rest)
             return

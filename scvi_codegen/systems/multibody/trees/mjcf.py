@@ -87,8 +87,7 @@ def links_of_mjcf(
     _include(root)
     _apply_defaults(root)
     model = _MujocoModel(root, limits)
-    closures = [*model.closures()]
-    tendons = [*model.tendons()]
+    closures, tendons = [*model.closures()], [*model.tendons()]
     model.unread.warn(root.file)
     return root.node.get("model") or Path(path).stem, model.scaled(), model.gravity, closures, tendons
 
@@ -101,9 +100,9 @@ class _MujocoModel:
         self.settings, option, flags = (
             _merged(root, tag, parts)
             for tag, parts in (
-                ("compiler", self.inside("compiler")),
-                ("option", self.inside("option")),
-                ("flag", [flag for element in self.inside("option") for flag in element.children("flag")]),
+                ("compiler", root.children("compiler")),
+                ("option", root.children("option")),
+                ("flag", [flag for element in root.children("option") for flag in element.children("flag")]),
             )
         )
         self.disabled = {key for key in flags.node.attrib if flags.choice(key, "enable", "disable") == "disable"}
@@ -118,7 +117,7 @@ class _MujocoModel:
         """Of geoms: the link, contype and conaffinity."""
         self.places: dict[tuple[str, str], tuple[int, Pose]] = {("body", "world"): (-1, Pose())}
         """Link and pose in it of bodies and sites, by tag and name."""
-        for world in self.inside("worldbody"):
+        for world in root.children("worldbody"):
             self.read(world)
         self.links = named(self.links)
         self.singles = {link.joint.label: link.joint for link in self.links if link.joint.kind in SINGLE}
@@ -128,12 +127,9 @@ class _MujocoModel:
         if self.compensating and any(link.inertia.lift[0] for link in self.links):
             self.compensating[0].refuse("has actuatorgravcomp, which is not read where bodies have gravcomp")
 
-    def inside(self, tag: str) -> list[Element]:
-        return self.root.children(tag)
-
     def entries(self, section: str) -> Iterator[Element]:
         """Yield the elements in all sections of a name."""
-        for element in self.inside(section):
+        for element in self.root.children(section):
             yield from element.children()
 
     def tendons(self) -> Iterator[Tendon]:
@@ -205,7 +201,9 @@ class _MujocoModel:
         carried = Joint(name=name, kind="fixed", pose=pose @ Pose(-anchor))
         fixed = self.carriers[place] < 0 and not self.settings.has("settotalmass")  # to the world
         lift = body.number("gravcomp", 0) * (not {"spring", "damper"} <= self.disabled)
-        self.links.append(Link(name, parent, carried, Inertia() if fixed else self.inertia(body).compensated(lift)))
+        inertia = Inertia() if fixed else self.inertia(body)
+        lifted = lift * inertia.mass, lift * inertia.mass * inertia.center
+        self.links.append(Link(name, parent, carried, replace(inertia, lift=lifted)))
         return place
 
     def contents(self, body: Element, *tags: str) -> Iterator[tuple[Element, Pose]]:
@@ -226,7 +224,7 @@ class _MujocoModel:
         """
         if self.disabled & {"contact", "constraint"}:
             return False
-        sections = self.inside("contact")
+        sections = self.root.children("contact")
         excluded = {
             frozenset(self.place(exclusion, key)[0] for key in ("body1", "body2"))
             for section in sections

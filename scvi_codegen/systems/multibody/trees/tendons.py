@@ -18,10 +18,7 @@ from scvi_codegen.systems.rotations.points import torque_of
 
 @dataclass(frozen=True, slots=True)
 class Tendon:
-    """Spring, damper and rotor of the length sum of factor q over joints, or along the points of links.
-
-    The spring is relaxed at the lengths of ``slack``, or at the length where the springs of joints are relaxed.
-    """
+    """Spring, relaxed at lengths in ``slack`` or as those of joints, damper and rotor on a combination or a path."""
 
     joints: tuple[tuple[str, float], ...]
     points: tuple[tuple[int, Pose], ...]

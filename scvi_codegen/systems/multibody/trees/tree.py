@@ -70,10 +70,6 @@ class Inertia:
             self.mass * factor, self.center, self.matrix * factor, (self.lift[0] * factor, self.lift[1] * factor)
         )
 
-    def compensated(self, share: float) -> Inertia:
-        """Return the inertia of a body that gravity does not act on with a share of its mass."""
-        return replace(self, lift=(share * self.mass, share * self.mass * self.center))
-
     def __add__(self, other: Inertia) -> Inertia:
         mass = self.mass + other.mass
         center = (self.mass * self.center + other.mass * other.center) / mass if mass else self.center

@@ -174,10 +174,10 @@ def _joints(joint: Element, limits: bool, armature: float) -> list[Joint]:
     )
     if kind != "planar":
         return [read]
-    x, y, _ = axes_of(along).T
-    slides = [replace(read, name=f"{letter}_{joint.name}", kind="slide", axis=e) for letter, e in (("x", x), ("y", y))]
-    turn = replace(read, name=f"angle_{joint.name}", kind="hinge", pose=Pose())
-    return [slides[0], replace(slides[1], pose=Pose()), turn]
+    parts = zip(
+        ("x", "y", "angle"), (*["slide"] * 2, "hinge"), axes_of(along).T, (read.pose, Pose(), Pose()), strict=True
+    )
+    return [replace(read, name=f"{part}_{joint.name}", kind=kind, axis=e, pose=at) for part, kind, e, at in parts]
 
 
 def _inertia(link: Element) -> Inertia:
