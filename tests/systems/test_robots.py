@@ -402,20 +402,19 @@ def test_deep_documents_are_read(tmp_path):
 
 NAMES = """left-hip left_hip, left.hip left_hip_2, left/hip left_hip_3, 1_knee joint_1_knee, _x joint_x, θ1 theta1, É E,
 t t_, pi pi_, int int_, exp exp_, q q, q_dot q_dot_2, 膝 joint_"""
-PART = '<geom size="0.1" pos="0.1 0 0"/>'
 
 
 def test_names_become_identifiers(tmp_path):
     file, expected = tmp_path / "names.xml", dict(pair.split() for pair in NAMES.split(","))
-    bodies = "".join(f'<body pos="0 0 {k}"><joint name="{name}"/>{PART}</body>' for k, name in enumerate(expected))
+    bodies = "".join(f'<body pos="0 0 {k}"><joint name="{name}"/>{{0}}</body>' for k, name in enumerate(expected))
     ties = '<equality><joint joint1="left.hip" joint2="1_knee"/></equality>'
-    head = '<mujoco model=""><option><flag contact="disable"/></option>'
-    file.write_text(f"{head}<worldbody>{bodies}</worldbody>{ties}</mujoco>")
+    part, head = '<geom size="0.1" pos="0.1 0 0"/>', '<mujoco model=""><option><flag contact="disable"/></option>'
+    file.write_text(f"{head}<worldbody>{bodies.format(part)}</worldbody>{ties}</mujoco>")
     system = sc.LagrangianSystem.from_mjcf(file, actuated=["left/hip"])
     assert system.joint_names == expected
     assert [str(q) for q in system.coordinates] == [*expected.values()]
     assert (system.name, system.inputs) == ("names", ("tau_left_hip_3",))
-    assert {str(each) for each in system.constraints[0].free_symbols} == {"left_hip_2", "joint_1_knee"}
+    assert str(system.constraints[0]) == "(-joint_1_knee + left_hip_2)"
 
 
 HINGES = '<joint name="1-a" axis="1 2 3" springref="10"/>', '<joint name="t" ref="7" axis="0 1 0"/>'
@@ -456,9 +455,9 @@ PLANAR = """<joint name="slab" type="planar"><parent link="a"/><child link="b"/>
 <transmission name="m"><joint name="knee"/><actuator name="m"><drake:rotor_inertia value=".01"/>
 <drake:gear_ratio value="-20"/></actuator></transmission></robot>"""
 SAME = """<mujoco model="r"><compiler angle="radian"/><default><joint damping=".3"/></default><worldbody><body>{0}
-<joint name="x_slab" type="slide" axis="1 0 0"/><joint name="y_slab" type="slide" axis="0 1 0"/><joint name="angle_slab"/>
-<body>{0}<joint name="socket" type="ball" damping="0"/><body>{0}<joint name="knee" axis="0 1 0" damping=".2" stiffness="3"
-springref=".4" armature="4"/></body></body></body></worldbody></mujoco>"""
+<joint name="x_slab" type="slide" axis="1 0 0"/><joint name="y_slab" type="slide" axis="0 1 0"/>
+<joint name="angle_slab"/><body>{0}<joint name="socket" type="ball" damping="0"/><body>{0}<joint name="knee"
+axis="0 1 0" damping=".2" stiffness="3" springref=".4" armature="4"/></body></body></body></worldbody></mujoco>"""
 
 
 def test_joints_of_drake_are_those_of_mujoco(tmp_path):
@@ -495,7 +494,6 @@ def test_closed_loops_move_on_any_base(base, tmp_path):
     file, (joint, place, rates) = tmp_path / "loop.xml", BASES[base]
     file.write_text(FOUR_BAR.format(base=joint, axis="0 1 0"))
     system = sc.LagrangianSystem.from_mjcf(file)
-    assert len(system.constraints) == 2
     q, v = {"crank": 0.0, "coupler": 0.0, "rocker": 0.0}, {"crank": 2.0, "coupler": -2.0, "rocker": 4 / 3}
     names = [*(f"{x}_my_base" for x in "xyz" if base == "free"), *(["base"] if len(place) == 1 else [])]
     q, v = q | dict(zip(names, place, strict=False)), v | dict(zip(names, rates, strict=False))
