@@ -30,8 +30,8 @@ from scvi_codegen.systems.multibody.trees.energies import (
 )
 from scvi_codegen.systems.multibody.trees.tree import SINGLE, Link, Pose, Vector, hat, rounded
 
-ATTEMPTS, ITERATIONS = 8, 30
-"""Numbers of random points, and of iterations from each, by which a state of the closed mechanism is sought."""
+ATTEMPTS, ITERATIONS = 4, 20
+"""Random points, and iterations from each, for states of the loop; half turns of welds are states of lower rank."""
 NEARLY_DEPENDENT = 1e-5
 """Equations are omitted if less of their derivatives is independent of the others: axes of CAD models are rounded."""
 
@@ -89,6 +89,8 @@ def _independent(conditions: Sequence[Expr], sizes: Sequence[int], reference: Ma
     row of each vector, of which ``sizes`` are the numbers of components. The rows of G are selected by Gram-Schmidt
     elimination with pivots: the first row whose remainder has at least half of the largest length, and so on.
     """
+    if not conditions:
+        return []
     variables = sorted(set().union(*(g.free_symbols for g in conditions)), key=str)
     entries, count = jacobian(conditions, variables), len(conditions)
     tape, generator = Tape([*conditions, *entries.values()], variables), random.Random(20250101)
@@ -102,15 +104,14 @@ def _independent(conditions: Sequence[Expr], sizes: Sequence[int], reference: Ma
         scales = np.repeat(np.where(lengths > 0, lengths, 1.0), sizes)
         return np.array(values[:count], float) / scales, rows / scales[:, None]
 
-    for attempt in range(ATTEMPTS if conditions else 0):
+    closed: list[Vector] = []
+    for attempt in range(ATTEMPTS):
         q = start + np.array([generator.uniform(-0.5, 0.5) for _ in variables]) / 2**attempt
         for _ in range(ITERATIONS):
             g, rows = at(q)
             q = q - np.linalg.lstsq(rows, g, rcond=NEARLY_DEPENDENT)[0]
-        g, rows = at(q)
-        if np.abs(g).max() < NEARLY_DEPENDENT:
-            break
-    return sorted(_pivots(rows)) if conditions else []
+        closed += [rows] if np.abs(g).max() < NEARLY_DEPENDENT else []
+    return sorted(_pivots(max(closed or [rows], key=lambda rows: np.linalg.matrix_rank(rows, NEARLY_DEPENDENT))))
 
 
 def _pivots(rows: Vector) -> Iterator[int]:
