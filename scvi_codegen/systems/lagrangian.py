@@ -76,6 +76,11 @@ class LagrangianSystem(MechanicalSystem):
         return self.links if self._text is None else ()
 
     @property
+    def joint_names(self) -> dict[str, str]:
+        """Names of the joints of a robot in this system by their names in the file."""
+        return {link.label: link.name for link in self.links}
+
+    @property
     def formula(self) -> Expr:
         """L."""
         return self.lagrangian
@@ -325,6 +330,7 @@ class LagrangianSystem(MechanicalSystem):
         gravity: Sequence[float] = (0.0, 0.0, -9.81),
         actuated: Sequence[str] | bool = False,
         limits: bool = False,
+        check_inertias: bool = True,
         name: str | None = None,
     ) -> LagrangianSystem:
         """Create the system from a URDF file, in joint coordinates: kinetic energy, gravity and damping of joints.
@@ -343,6 +349,8 @@ class LagrangianSystem(MechanicalSystem):
             actuated: names of the joints on which an input ``tau_JOINT``, a torque or force, acts; ``True`` for all.
             limits: whether limits and dry friction of hinges and slides are part of the motion, as its ``contacts``,
                 with the restrictions of contacts (:func:`~scvi_codegen.contact`); otherwise the warning lists them.
+            check_inertias: whether moments of inertia that no body has are an error; otherwise they are integrated as
+                they are written, with a warning.
             name: name of the system; by default that of the robot.
 
         Raises:
@@ -351,7 +359,7 @@ class LagrangianSystem(MechanicalSystem):
         from scvi_codegen.systems.multibody.trees.urdf import links_of_urdf
 
         robot, links = links_of_urdf(path, floating=floating, limits=limits)
-        return cls._of_tree(name or robot, links, gravity, actuated)
+        return cls._of_tree(path, name or robot, links, gravity, actuated, check_inertias)
 
     @classmethod
     @checks_arguments(SystemDefinitionError, actuated=JOINTS)
@@ -361,6 +369,7 @@ class LagrangianSystem(MechanicalSystem):
         *,
         actuated: Sequence[str] | bool = False,
         limits: bool = False,
+        check_inertias: bool = True,
         name: str | None = None,
     ) -> LagrangianSystem:
         """Create the system from an MJCF file of MuJoCo: kinetic energy, gravity, springs and damping of joints.
@@ -372,26 +381,32 @@ class LagrangianSystem(MechanicalSystem):
         what is not part of the motion: limits, dry friction, contacts, actuators.
 
         Args:
-            path, actuated, limits: see :meth:`from_urdf`; limits are rigid, without the softness of the file.
+            path, actuated, limits, check_inertias: see :meth:`from_urdf`; limits are rigid.
             name: name of the system; by default that of the model.
 
         Raises:
             SystemDefinitionError: naming file and element, if something is malformed or unknown, or changes the motion
-                and is not read: equalities of tendons, tendons with stiffness, inertias of meshes.
+                and is not read: equalities of tendons, tendons around geoms, inertias of meshes.
         """
-        from scvi_codegen.systems.multibody.trees.closures import conditions_of
         from scvi_codegen.systems.multibody.trees.mjcf import links_of_mjcf
 
-        model, links, gravity, closures = links_of_mjcf(path, limits=limits)
-        return cls._of_tree(name or model, links, gravity, actuated, conditions_of(links, closures))
+        model, links, gravity, *others = links_of_mjcf(path, limits=limits)
+        return cls._of_tree(path, name or model, links, gravity, actuated, check_inertias, *others)
 
     @classmethod
     def _of_tree(
-        cls, name: str, links: Any, gravity: Any, actuated: Sequence[str] | bool, constraints: Sequence[Expr] = ()
+        cls, path: Any, name: str, links: Any, gravity: Any, actuated: Any, checked: bool, *others: Any
     ) -> LagrangianSystem:
+        from scvi_codegen.systems.multibody.trees.closures import conditions_of
         from scvi_codegen.systems.multibody.trees.energies import system_of_tree
+        from scvi_codegen.systems.multibody.trees.tendons import energies_of
 
-        system: LagrangianSystem = system_of_tree(cls, name, links, gravity, actuated, constraints)
+        try:
+            closures, tendons = others or ((), ())
+            added = conditions_of(links, closures), checked, energies_of(links, tendons)
+            system: LagrangianSystem = system_of_tree(cls, name, links, gravity, actuated, *added)
+        except SystemDefinitionError as error:
+            raise SystemDefinitionError(f"{path}: {error}") from error
         return system
 
     @classmethod

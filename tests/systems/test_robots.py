@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import sympy
+from random_robots import errors_of_motion, motion_by_mujoco
 from scipy.spatial.transform import Rotation
 
 import scvi_codegen as sc
@@ -78,7 +79,13 @@ CHANGES = {
     "missing link": (lambda text: text.replace('<child link="tool"/>', '<child link="tol"/>'), "'tol', which does not"),
     "two parents": (lambda text: text.replace('<child link="finger"/>', '<child link="tool"/>'), "moves as well"),
     "circle": (lambda text: text.replace('<parent link="base"/>', '<parent link="finger"/>'), "form a circle"),
-    "kind": (lambda text: text.replace('"prismatic"', '"planar"'), "is of type 'planar'"),
+    "kind": (lambda text: text.replace('"prismatic"', '"helical"'), "is of type 'helical'"),
+    "massless": (
+        lambda text: re.sub("<inertial>.*?</inertial>", "", text, flags=re.DOTALL),
+        "'shoulder' moves no mass",
+    ),
+    "substitution": (lambda text: text.replace("1 2 -2", "$(optenv X)"), "write the file that xacro makes of it"),
+    "older": (lambda text: text.replace("<dynamics damp", "<joint_properties damp"), "is not read: write <dynamics>"),
     "axis": (lambda text: text.replace("1 2 -2", "0 0 0"), "must not be zero"),
     "numbers": (lambda text: text.replace("1 2 -2", "1 2"), "3 finite numbers"),
     "text": (lambda text: text.replace("1 2 -2", "1 2 x"), "must be numbers"),
@@ -128,6 +135,12 @@ def test_moments_of_inertia_are_checked_with_fixed_links(tmp_path):
     text, file = (ROBOTS / "arm.urdf").read_text(), tmp_path / "arm.urdf"
     negative = text.replace('ixx="0.001"', 'ixx="-0.001"')  # of the sensor: its sum with that of the arm is positive
     rounded = negative.replace('"0.0001"', '"-5.4e-20"').replace('"0.0002"', '"0"')
+    file.write_text(text.replace('izz="0.003"', 'izz="0.3"'))
+    with pytest.warns(SystemDefinitionWarning, match="which no body has"):
+        sc.LagrangianSystem.from_urdf(file, check_inertias=False)
+    file.write_text(text.replace('"revolute"', '"floating"'))
+    with pytest.raises(SystemDefinitionError, match=r"urdf:\d+: <joint> 'shoulder' is free, and so is its parent"):
+        sc.LagrangianSystem.from_urdf(file, floating=True)
     file.write_text(rounded)
     assert rounded != negative != text
     assert len(sc.LagrangianSystem.from_urdf(file).coordinates) == 2
@@ -137,17 +150,16 @@ MUJOCO_CHANGES = {
     "equality": ("</mujoco>", "<equality><weld/></equality></mujoco>", "<weld> 'weld' has no attribute 'body1'"),
     "tendon": (
         "</mujoco>",
-        '<tendon><fixed stiffness="1"/></tendon></mujoco>',
-        "has stiffness='1', which changes the motion",
+        '<tendon><spatial name="t" stiffness="1"><pulley divisor="2"/></spatial></tendon></mujoco>',
+        "<pulley> 'pulley' in <spatial> 't' is on the tendon 't', which is read through sites only",
     ),
     "mesh": ('type="box"', 'type="mesh"', "give its body an <inertial>"),
     "class": ('childclass="limb"', 'childclass="lim"', "of the class 'lim'"),
     "orientations": ('quat="1 0.1 0.2 0.3"', 'quat="1 0 0 0" euler="0 0 0"', "quat and euler"),
     "free inside": ('type="ball"', 'type="free"', "inside another body"),
     "replicate": ("</worldbody>", "<replicate/></worldbody>", "write out what it makes"),
-    "ball spring": (' stiffness="0"', "", "hinges and slides only"),
     "axes": ('eulerseq="zyx"', 'eulerseq="zy"', "is not three of the letters"),
-    "name": ('name="slip"', 'name="flex"', "two joints are called 'flex'"),
+    "name": ('name="slip"', 'name="flex"', "<joint> 'flex' is the second joint of this name"),
     "include": ("<option", '<include file="none.xml"/><option', "none.xml cannot be read"),
     "include of a device": ("<option", '<include file="/dev/zero"/><option', "must have only file, a path relative to"),
     "include of a folder": ("<option", '<include file="."/><option', "it is no regular file"),
@@ -163,8 +175,8 @@ MUJOCO_CHANGES = {
     "medium": ("<option", '<option density="1.2"', "density='1.2', which changes the motion"),
     "tendon of a class": (
         "</mujoco>",
-        '<default><tendon damping="1"/></default><tendon><fixed/></tendon></mujoco>',
-        "has damping='1', which changes the motion",
+        '<default><tendon damping="1"/></default><tendon><fixed><joint joint="no" coef="1"/></fixed></tendon></mujoco>',
+        "names the joint 'no', which is no hinge or slide",
     ),
     "actuator of a tendon": (
         "</mujoco>",
@@ -177,7 +189,8 @@ MUJOCO_CHANGES = {
         "springdamper='1 1', which changes",
     ),
     "class twice": ("</default>", '</default><default class="limb"/>', "second of the class 'limb'"),
-    "places": ('fromto="', 'pos="0 0 0" fromto="', "has pos and fromto"),
+    "places": ('fromto="', 'pos="0 0 1" fromto="', "has pos and fromto"),
+    "place": ('size="0.1 0.2 0.3"', "", "figure.xml:16: <geom> 'geom' in <body> 'torso' has no attribute 'size'"),
     "parallel": ('xyaxes="0 1 0 -1 0 0.2"', 'xyaxes="0 1 0 0 2 0"', "must be two different directions"),
     "size": ('size="0.1 0.2 0.3"', 'size="0.1 0.2"', "3 numbers > 0 are needed"),
     "sites": (
@@ -374,7 +387,7 @@ def test_included_files_are_sought_in_the_folder_of_the_main_document_first(tmp_
     (tmp_path / "arm.xml").write_text(body.format("outer"))
     assert str(sc.LagrangianSystem.from_mjcf(tmp_path / "main.xml").coordinates[0]) == "outer"
     (tmp_path / "arm.xml").write_text(body.format("outer").replace("geom ", "goem "))
-    with pytest.raises(SystemDefinitionError, match=r"arm\.xml: <body> 'outer' contains .*; did you mean 'geom'"):
+    with pytest.raises(SystemDefinitionError, match=r"arm\.xml:1: <body> 'outer' contains .*; did you mean 'geom'"):
         sc.LagrangianSystem.from_mjcf(tmp_path / "main.xml")
 
 
@@ -385,6 +398,126 @@ def test_deep_documents_are_read(tmp_path):
     bodies = '<body pos="0 0 0.1">' * depth
     file.write_text(f"<mujoco><worldbody>{bodies}{frames}{'</body>' * depth}</worldbody></mujoco>")
     assert len(sc.LagrangianSystem.from_mjcf(file).coordinates) == 1
+
+
+NAMES = """left-hip left_hip, left.hip left_hip_2, left/hip left_hip_3, 1_knee joint_1_knee, _x joint_x, θ1 theta1, É E,
+t t_, pi pi_, int int_, exp exp_, q q, q_dot q_dot_2, 膝 joint_"""
+
+
+def test_names_become_identifiers(tmp_path):
+    file, expected = tmp_path / "names.xml", dict(pair.split() for pair in NAMES.split(","))
+    bodies = "".join(f'<body pos="0 0 {k}"><joint name="{name}"/>{{0}}</body>' for k, name in enumerate(expected))
+    ties = '<equality><joint joint1="left.hip" joint2="1_knee"/></equality>'
+    part, head = '<geom size="0.1" pos="0.1 0 0"/>', '<mujoco model=""><option><flag contact="disable"/></option>'
+    file.write_text(f"{head}<worldbody>{bodies.format(part)}</worldbody>{ties}</mujoco>")
+    system = sc.LagrangianSystem.from_mjcf(file, actuated=["left/hip"])
+    assert system.joint_names == expected
+    assert [str(q) for q in system.coordinates] == [*expected.values()]
+    assert (system.name, system.inputs) == ("names", ("tau_left_hip_3",))
+    assert str(system.constraints[0]) == "(-joint_1_knee + left_hip_2)"
+
+
+HINGES = '<joint name="1-a" axis="1 2 3" springref="10"/>', '<joint name="t" ref="7" axis="0 1 0"/>'
+FIXED = '<tendon><fixed {}><joint joint="1-a" coef=".5"/><joint joint="t" coef="-2"/></fixed></tendon>'
+SPATIAL = '<tendon><spatial {}><site site="w"/><site site="s"/><site site="e"/></spatial></tendon>'
+BALLS = '<joint name="a b" type="ball" stiffness="3 2 1" damping="1 2 3"/>', '<joint name="exp" type="ball"/>'
+MOTIONS = {
+    "fixed tendon": (*HINGES, FIXED.format('stiffness="3" damping=".2"')),
+    "slack tendon": (*HINGES, FIXED.format('stiffness="3 2 1" springlength=".1 .2" damping="1 2 3"')),
+    "spatial tendon": (*HINGES, SPATIAL.format('stiffness="3 2" armature=".4" damping=".2"')),
+    "tendon of balls": (*BALLS, SPATIAL.format('stiffness="3" springlength=".2" armature=".4" damping=".2"')),
+    "springs of balls": (*BALLS, ""),
+    "free body": ('<joint name="α" type="free" stiffness="3 2 1" damping="1 2 3"/>', HINGES[1], ""),
+    "polynomials": (
+        '<joint name="1-a" axis="1 2 3" stiffness="1 2 3" damping="3 2 1" springref="10"/>',
+        '<joint name="t" type="slide" stiffness="3 -2" damping="1 2"/>',
+        '<actuator><motor joint="t" gear="-2" damping="1 2 3"/></actuator>',
+    ),
+}
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("case", MOTIONS)
+def test_equations_of_motion_are_those_of_mujoco(case, tmp_path):
+    pytest.importorskip("mujoco", reason="pip install mujoco")
+    file, (one, two, rest) = tmp_path / "model.xml", MOTIONS[case]
+    file.write_text(f"""<mujoco><option gravity="0 1 -9"><flag contact="disable"/></option><worldbody>
+<site name="w" pos=".1 .5 .2"/><body name="a" pos=".1 .2 .3" euler="10 20 30">{one}<geom size=".1" pos=".3 .1 0"/>
+<site name="s" pos=".3 .1 .1"/><body name="b" pos=".3 0 0">{two}<geom type="box" size=".1 .2 .3" pos=".3 0 .1"/>
+<site name="e" pos=".2 .2 .1"/></body></body></worldbody>{rest}</mujoco>""")
+    assert max(errors_of_motion(sc.LagrangianSystem.from_mjcf(file), file)) < 1e-12
+
+
+PLANAR = """<joint name="slab" type="planar"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>
+<dynamics damping=".3"/></joint><drake:joint name="socket" type="ball"><parent link="b"/><child link="c"/></drake:joint>
+<joint name="knee" type="revolute"><parent link="c"/><child link="d"/><axis xyz="0 1 0"/>
+<dynamics damping=".2" spring_stiffness="3" spring_reference=".4"/></joint><frame name="f" link="d"/>
+<transmission name="m"><joint name="knee"/><actuator name="m"><drake:rotor_inertia value=".01"/>
+<drake:gear_ratio value="-20"/></actuator></transmission></robot>"""
+SAME = """<mujoco model="r"><compiler angle="radian"/><default><joint damping=".3"/></default><worldbody><body>{0}
+<joint name="x_slab" type="slide" axis="1 0 0"/><joint name="y_slab" type="slide" axis="0 1 0"/>
+<joint name="angle_slab"/><body>{0}<joint name="socket" type="ball" damping="0"/><body>{0}<joint name="knee"
+axis="0 1 0" damping=".2" stiffness="3" springref=".4" armature="4"/></body></body></body></worldbody></mujoco>"""
+
+
+def test_joints_of_drake_are_those_of_mujoco(tmp_path):
+    file, other = tmp_path / "robot.urdf", tmp_path / "robot.xml"
+    inertia = '<origin xyz=".1 0 .2"/><mass value="1"/><inertia ixx=".2" iyy=".3" izz=".25" ixy="0" ixz="0" iyz="0"/>'
+    links = "".join(f'<link name="{each}"><inertial>{inertia}</inertial></link>' for each in "abcd")
+    file.write_text(f'<robot name="r">{links}{PLANAR}')
+    with pytest.warns(SystemDefinitionWarning, match="without elements <frame>; actuators m$"):
+        system = sc.LagrangianSystem.from_urdf(file)
+    other.write_text(SAME.format('<inertial pos=".1 0 .2" mass="1" diaginertia=".2 .3 .25"/>'))
+    same = sc.LagrangianSystem.from_mjcf(other)
+    assert (system.lagrangian, system.forces) == (same.lagrangian, same.forces)
+
+
+FOUR_BAR = """<mujoco><option><flag contact="disable"/></option><default><geom type="capsule" size=".03"/></default>
+<worldbody><body name="base">{base}<geom fromto="0 0 0 1 0 0"/>
+ <body name="crank"><joint name="crank" axis="0 1 0"/><geom fromto="0 0 0 0 0 .4"/>
+  <body name="coupler" pos="0 0 .4"><joint name="coupler" axis="0 1 0"/><geom fromto="0 0 0 1 0 .2"/></body></body>
+ <body name="rocker" pos="1 0 0"><joint name="rocker" axis="{axis}"/><geom fromto="0 0 0 0 0 .6"/></body></body>
+</worldbody><equality><connect body1="coupler" body2="rocker" anchor="1 0 .2"/></equality></mujoco>"""
+TURN = np.array([1, 0.2, 0.1, 0.3]) / np.sqrt(1.14)
+BASES = {
+    "fixed": ("", [], []),
+    "yaw": ('<joint name="base" axis="0 0 1"/>', [0.3], [1.0]),
+    "roll": ('<joint name="base" axis="1 0 0"/>', [0.3], [1.0]),
+    "ball": ('<joint name="my-base" type="ball"/>', [*TURN], [0.5, 0.3, 1.0]),
+    "free": ('<freejoint name="my-base"/>', [0.1, 0.2, 0.3, *TURN], [0.1, 0, 0.2, 0.5, 0.3, 1.0]),
+}
+
+
+@pytest.mark.rotated
+@pytest.mark.parametrize("base", BASES)
+def test_closed_loops_move_on_any_base(base, tmp_path):
+    file, (joint, place, rates) = tmp_path / "loop.xml", BASES[base]
+    file.write_text(FOUR_BAR.format(base=joint, axis="0 1 0"))
+    system = sc.LagrangianSystem.from_mjcf(file)
+    q, v = {"crank": 0.0, "coupler": 0.0, "rocker": 0.0}, {"crank": 2.0, "coupler": -2.0, "rocker": 4 / 3}
+    names = [*(f"{x}_my_base" for x in "xyz" if base == "free"), *(["base"] if len(place) == 1 else [])]
+    q, v = q | dict(zip(names, place, strict=False)), v | dict(zip(names, rates, strict=False))
+    if len(place) > 1:
+        q["R_my_base"], v["omega_my_base"] = place[-4:], rates[-3:]
+        names += [f"R_my_base_{x}" for x in "wxyz"]
+    run = sc.compile_stepper(system, "svi:3").integrate(q, velocity=v, h=0.005, steps=50)
+    ends = dict(zip(map(str, system.coordinates), run.q[-1], strict=True))
+    crank, turned, rocker = ends["crank"], ends["crank"] + ends["coupler"], ends["rocker"]
+    tip = 0.4 * np.exp(1j * crank) + (0.2 + 1j) * np.exp(1j * turned)  # z + i x
+    assert abs(tip - 1j - 0.6 * np.exp(1j * rocker)) < 1e-12
+    assert np.ptp(run.energy()) < 1e-9
+    pytest.importorskip("mujoco", reason="pip install mujoco")
+    expected = motion_by_mujoco(file, [*place, 0, 0, 0], [*rates, 2, -2, 4 / 3], 0.25)
+    assert [ends[name] for name in (*names, "crank", "coupler", "rocker")] == pytest.approx(expected, abs=2e-8)
+
+
+def test_axes_of_loops_that_are_rounded_are_parallel(tmp_path):
+    file = tmp_path / "loop.xml"
+    file.write_text(FOUR_BAR.format(base="", axis="1e-6 1 0"))
+    with pytest.warns(SystemDefinitionWarning, match="an equation of a closed loop is omitted"):
+        assert len(sc.LagrangianSystem.from_mjcf(file).constraints) == 2
+    file.write_text(FOUR_BAR.format(base="", axis=".1 1 0"))
+    assert len(sc.LagrangianSystem.from_mjcf(file).constraints) == 3
 
 
 def test_robot_in_which_nothing_moves_is_refused(tmp_path):

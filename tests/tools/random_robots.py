@@ -294,6 +294,93 @@ def by_pinocchio(robot: Urdf, state: State, path: Path) -> list[float]:
     return [energy - potentials[1] + potentials[0], -damped @ v**2]
 
 
+def flow(model: Any, q: Any, v: Any) -> Any:
+    """Return the rates of MuJoCo's positions q at its velocities v."""
+    import numpy as np
+
+    rates, k = [], 0
+    for kind in model.jnt_type:
+        count = (3, 0, 1, 1)[kind]
+        rates += [*v[k : k + count]]
+        k += count
+        if kind < 2:
+            w, x, y, z = q[len(rates) : len(rates) + 4]
+            rates += [*np.array([[-x, -y, -z], [w, -z, y], [z, w, -x], [-y, x, w]]) @ v[k : k + 3] / 2]
+            k += 3
+    return np.array(rates)
+
+
+def errors_of_motion(system: Any, path: Path) -> list[float]:
+    """Return errors of T - V (but for a constant), damping power and equations of motion at a random state of MuJoCo.
+
+    The accelerations are MuJoCo's without equalities. The error of d/dt L_v - L_q - f is relative to |f| + |L_q| + 1.
+    """
+    import mujoco
+    import numpy as np
+    from sympy import S
+
+    from scvi_codegen.common.precision import mp
+    from scvi_codegen.systems.formulas.expressions import Tape, gradient
+
+    model = mujoco.MjModel.from_xml_path(str(path))
+    model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
+    data, draw, names = mujoco.MjData(model), np.random.default_rng(1), []
+    for j, kind in enumerate(model.jnt_type):
+        name = system.joint_names[model.joint(j).name]
+        place, turn = [f"{x}_{name}" for x in "xyz"], [f"R_{name}_{x}" for x in "wxyz"]
+        names += ([*place, *turn], turn, [name], [name])[kind]
+    order = [names.index(str(q)) for q in system.coordinates]
+    m, variables = system.dimension, (*system.coordinates, *system.velocities)
+    slopes, forces = gradient(system.lagrangian, variables), system.forces or [S.Zero] * system.dimension
+    tape = Tape([system.lagrangian, *(slopes.get(k, S.Zero) for k in range(2 * m)), *forces], variables)
+    energies = []
+    for scale in (0.0, 1.0):
+        mujoco.mj_resetData(model, data)
+        mujoco.mj_integratePos(model, data.qpos, draw.uniform(-1, 1, model.nv) * scale, 1.0)
+        data.qvel[:] = scale * draw.uniform(-1, 1, model.nv)
+        mujoco.mj_forward(model, data)
+        rate = flow(model, data.qpos, data.qvel)
+        second = flow(model, data.qpos, data.qacc_smooth)
+        second += flow(model, rate, data.qvel) - flow(model, 0 * rate, data.qvel)
+        q, v, a = ([*map(mp.mpf, part[order].tolist())] for part in (data.qpos, rate, second))
+        step, sides = mp.mpf("1e-15"), []
+        for h in (-step, 0, step):
+            moved = [x + h * y + h * h / 2 * z for x, y, z in zip(q, v, a, strict=True)]
+            sides.append(tape([*moved, *(y + h * z for y, z in zip(v, a, strict=True))]))
+        energies.append(sides[1][0] - data.energy[1] + data.energy[0])
+    before, (_, *values), after = (np.array(side) for side in sides)
+    torques, along, acting = values[:m], ((after - before) / (2 * step))[1 + m : 1 + 2 * m], values[2 * m :]
+    size = max(map(abs, torques)) + max(map(abs, acting)) + 1
+    power = np.dot(acting, v) - float(data.qfrc_damper @ data.qvel)
+    errors = energies[1] - energies[0], power, np.abs(along - torques - acting).max() / size
+    return [float(abs(error)) for error in errors]
+
+
+def motion_by_mujoco(path: Path, place: Any, rates: Any, span: float) -> Any:
+    """Return qpos after a time span, by DOP853 of M a = f + J^T l, J a = -dJ/dt v, with dependent equations."""
+    import mujoco
+    import numpy as np
+    from scipy.integrate import solve_ivp
+
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data, mass, step = mujoco.MjData(model), np.zeros((model.nv, model.nv)), 1e-5
+
+    def field(_: float, state: Any) -> Any:
+        sides = []
+        for h in (step, -step, 0):
+            data.qpos[:], data.qvel[:] = np.split(state, [model.nq])
+            mujoco.mj_integratePos(model, data.qpos, data.qvel, h)
+            mujoco.mj_forward(model, data)
+            sides.append(np.array(data.efc_J).reshape(-1, model.nv)[: data.ne])
+        mujoco.mj_fullM(model, data, mass)
+        free, rows = np.array(data.qacc_smooth), sides[2]
+        bias, lifted = (sides[0] - sides[1]) @ data.qvel / (2 * step), np.linalg.solve(mass, rows.T)
+        forces = np.linalg.lstsq(rows @ lifted, rows @ free + bias, rcond=1e-7)[0]
+        return np.concatenate([flow(model, data.qpos, data.qvel), free - lifted @ forces])
+
+    return solve_ivp(field, (0, span), [*place, *rates], method="DOP853", rtol=1e-11, atol=1e-12).y[: model.nq, -1]
+
+
 if __name__ == "__main__":
     import tempfile
 

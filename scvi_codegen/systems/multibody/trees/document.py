@@ -7,10 +7,11 @@ import re
 import stat
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
 from xml.etree import ElementTree
+from xml.parsers import expat
 
 import numpy as np
 
@@ -22,8 +23,13 @@ LARGEST_FILE = 32 * 2**20
 LARGEST_NUMBER = 1e40
 """Bound of the magnitude of numbers, whose products are finite: those of an inertia have five factors."""
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+XACRO = re.compile(r"\$[({]")
 NAMED = 5
 """Number of names that a warning lists of each kind of parts."""
+
+
+Place = tuple[str, int, str]
+"""Path of a document, number of a line, and for messages the nearest element around it that has a name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,19 +37,22 @@ class Element:
     """Element of a document.
 
     Attributes:
-        file: path of the document, for messages.
         node: tag, attributes and children.
-        files: paths of the documents of included nodes.
+        places: of each node of the document and of included ones.
     """
 
-    file: str
     node: ElementTree.Element
-    files: dict[ElementTree.Element, str] = field(default_factory=dict)
+    places: dict[ElementTree.Element, Place]
+
+    @property
+    def file(self) -> str:
+        """Path of the document."""
+        return self.places[self.node][0]
 
     @property
     def name(self) -> str:
         """Attribute ``name``, or the tag."""
-        return self.node.get("name", self.node.tag)
+        return self.node.get("name") or self.node.tag
 
     @property
     def tag(self) -> str:
@@ -92,8 +101,7 @@ class Element:
 
     def children(self, *tags: str) -> list[Element]:
         """Return the children with one of the tags, in order; all of them without tags."""
-        nodes = (child for child in self.node if not tags or child.tag in tags)
-        return [Element(self.files.get(child, self.file), child, self.files) for child in nodes]
+        return [Element(child, self.places) for child in self.node if not tags or child.tag in tags]
 
     def child(self, tag: str) -> Element | None:
         """Return the first child with a tag."""
@@ -108,8 +116,10 @@ class Element:
         return vector / length
 
     def refuse(self, problem: str) -> NoReturn:
-        """Raise an error that names the file and the element."""
-        raise SystemDefinitionError(f"{self.file}: <{self.tag}> '{self.name}' {problem}")
+        """Raise an error that names the file, the line and the element."""
+        file, line, around = self.places[self.node]
+        inside = f" in {around}" if around and not self.node.get("name") else ""
+        raise SystemDefinitionError(f"{file}:{line}: <{self.tag}> '{self.name}'{inside} {problem}")
 
     def walk(self, kinds: Mapping[str, Kind]) -> Iterator[tuple[Element, Kind]]:
         """Yield this element and those inside it whose attributes are known, parents first, with their kinds.
@@ -121,17 +131,17 @@ class Element:
         pending = [(self, kinds[self.tag])]
         while pending:
             element, kind = pending.pop()
-            for key in element.node.attrib:
-                if key not in kind.attributes:
-                    element.refuse(f"has the unknown attribute '{key}'{closest(key, kind.attributes)}")
+            element.check_attributes(kind)
             yield element, kind
             seen: set[str] = set()
             inner: list[tuple[Element, Kind]] = []
             for child in element.children():
                 name = kind.children.get(child.tag)
+                if child.tag.startswith("xacro:"):
+                    child.refuse("is a macro: write the file that xacro makes of it")
+                if name is None and ":" in child.tag:  # of another namespace
+                    continue
                 if name is None:
-                    if child.tag.startswith("{") and "xacro" in child.tag:
-                        child.refuse("is a macro: write the file that xacro makes of it")
                     element.refuse(f"contains the unknown element <{child.tag}>{closest(child.tag, kind.children)}")
                 if name == "refused":
                     child.refuse("changes the motion and is not read: remove it, or write out what it makes")
@@ -141,6 +151,14 @@ class Element:
                 if name != "unchecked":
                     inner.append((child, kinds[name]))
             pending += reversed(inner)
+
+    def check_attributes(self, kind: Kind) -> None:
+        """Raise an error if an attribute is unknown, or xacro did not write its value; prefixed ones are ignored."""
+        for key, value in self.node.attrib.items():
+            if XACRO.search(value):
+                self.refuse(f"has {key}='{value}', a substitution: write the file that xacro makes of it")
+            if key not in kind.attributes and ":" not in key and key != "xmlns":
+                self.refuse(f"has the unknown attribute '{key}'{closest(key, kind.attributes)}")
 
     def check_neutral(self, kind: Kind) -> None:
         """Raise an error if an attribute that changes the motion and is not read has another value than its default."""
@@ -189,15 +207,36 @@ def root_of(path: Path, *tags: str) -> Element:
         raise SystemDefinitionError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}") from error
     if len(data) > LARGEST_FILE:
         raise SystemDefinitionError(f"{path} has more than {LARGEST_FILE} bytes, the most that are read")
-    if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
-        raise SystemDefinitionError(f"{path} declares a document type or entities, which are not read: remove them")
     try:
-        node = ElementTree.fromstring(data)
-    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        node, places = _parsed(data, str(path))
+    except (expat.ExpatError, ValueError, LookupError) as error:
         raise SystemDefinitionError(f"{path} is not XML: {error}") from error
     if node.tag not in tags:
         other = {"robot": ": it is a URDF file, NAME.urdf", "mujoco": ": it is an MJCF file, NAME.xml"}.get(
             node.tag, ""
         )
         raise SystemDefinitionError(f"{path} begins with <{node.tag}>, not with <{tags[0]}>{other}")
-    return Element(str(path), node)
+    return Element(node, places)
+
+
+def _parsed(data: bytes, file: str) -> tuple[ElementTree.Element, dict[ElementTree.Element, Place]]:
+    """Return the outermost node of a document, with prefixes of namespaces as they are written, and all places."""
+    builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()
+    places: dict[ElementTree.Element, Place] = {}
+    around = [""]
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        node = builder.start(tag, attributes)
+        places[node] = file, parser.CurrentLineNumber, around[-1]
+        around.append(f"<{tag}> '{attributes['name']}'" if attributes.get("name") else around[-1])
+
+    def end(tag: str) -> None:
+        builder.end(tag)
+        around.pop()
+
+    def refuse(*_: object) -> None:
+        raise SystemDefinitionError(f"{file} declares a document type or entities, which are not read: remove them")
+
+    parser.StartElementHandler, parser.EndElementHandler, parser.StartDoctypeDeclHandler = start, end, refuse
+    parser.Parse(data, True)
+    return builder.close(), places

@@ -39,9 +39,10 @@ from dataclasses import replace
 from itertools import chain
 from typing import Any
 
-from sympy import Add, Expr, Matrix, Rational, S, Symbol, cos, eye, sin, zeros
+import numpy as np
+from sympy import Abs, Add, Expr, Matrix, Rational, S, Symbol, atan2, cos, eye, sin, sqrt, zeros
 
-from scvi_codegen.common.errors import SystemDefinitionError, closest
+from scvi_codegen.common.errors import SystemDefinitionError, SystemDefinitionWarning, closest, warn
 from scvi_codegen.systems.contact import ContactLike, contact, friction
 from scvi_codegen.systems.formulas.intermediates import intermediate
 from scvi_codegen.systems.formulas.rotations import Rotation, RotationNames
@@ -53,8 +54,7 @@ from scvi_codegen.systems.multibody.trees.tree import (
     Link,
     Vector,
     aligned,
-    identifier,
-    named,
+    impossible_inertias,
     without_fixed,
 )
 from scvi_codegen.systems.reading import system_from_sympy
@@ -72,7 +72,7 @@ class Tree:
     """
 
     def __init__(self, links: Sequence[Link], gravity: Vector) -> None:
-        links = self.links = aligned(named(without_fixed(links)))
+        links = self.links = aligned(without_fixed(links))
         self.gravity = exact_vector(gravity)
         self.joints = {link.joint.name: link.joint for link in links}
         self.leaders = {joint.name: self.leader(joint) for joint in self.joints.values() if joint.kind in SINGLE}
@@ -134,6 +134,12 @@ class Tree:
                 masses[self.links[i].parent] += masses[i]
         return masses
 
+    def without_mass(self) -> list[str]:
+        """Return the names in the file of the joints that move neither a mass nor a rotor."""
+        sizes = self.of_subtrees([exact_number(np.abs(link.inertia.matrix).sum()) for link in self.links])
+        joints = [link.joint for link, *parts in zip(self.links, self.masses, sizes, strict=True) if not any(parts)]
+        return [joint.label for joint in joints if not (joint.armature or joint.follows)]
+
     def first_moments(self) -> list[Matrix]:
         """Return the first moment of the weight of each subtree, in the frame of its root."""
         moments = [
@@ -174,7 +180,7 @@ class Tree:
             momenta.append(exact_number(link.inertia.mass) * velocity)
             terms.append(velocity.dot(momenta[-1]) / 2)
             terms.append((turning[-1].T * exact_matrix(link.inertia.matrix) * turning[-1])[0] / 2)
-            terms.append(self.quadratic(joint, joint.armature))
+            terms.append(self.of_rates(joint, (joint.armature,)))
         return Add(*terms, *self.free_bases(momenta))
 
     def free_bases(self, momenta: list[Matrix]) -> Iterator[Expr]:
@@ -191,14 +197,14 @@ class Tree:
             elif parent >= 0:
                 momenta[parent] = as_quantities(momenta[parent] + self.turned(joint, momenta[i]))
 
-    def quadratic(self, joint: Joint, factor: float) -> Expr:
-        """Return factor/2 times the sum of the squared rates of a joint."""
+    def of_rates(self, joint: Joint, coefficients: Sequence[float]) -> Expr:
+        """Return the sum of :func:`integral` over the magnitudes of the rates of a joint."""
         if joint.kind in SINGLE:
             rates: list[Expr] = [self.coordinate(joint)[1]]
         else:
             rates = [*rotation_of(joint).rates]
             rates += [symbol(name + DOT) for name in position_of(joint)] if joint.kind == "free" else []
-        return exact_number(factor) * Add(*(rate**2 for rate in rates)) / 2
+        return Add(*(integral(coefficients, Abs(rate)) for rate in rates))
 
     def potential_energy(self) -> Expr:
         """Return V of gravity and springs."""
@@ -211,15 +217,26 @@ class Tree:
                     position = Matrix([symbol(name) for name in position_of(joint)])
                 place = self.weights[i] * position + self.turned(joint, self.moments[i])
                 terms.append(-self.gravity.dot(place))
-            if joint.stiffness:
-                terms.append(
-                    exact_number(joint.stiffness) * (self.coordinate(joint)[0] - exact_number(joint.rest)) ** 2 / 2
-                )
+            if any(joint.stiffness):
+                terms += [integral(joint.stiffness, x) for x in self.extensions(joint)]
         return Add(*terms)
+
+    def extensions(self, joint: Joint) -> Iterator[Expr]:
+        """Yield the displacements of springs, of a rotation the angle atan2(|R - R^T|_F/8^(1/2), (tr R - 1)/2)."""
+        if joint.kind in SINGLE:
+            yield self.coordinate(joint)[0] - exact_number(joint.rest)
+            return
+        turn = Matrix(3, 3, rotation_of(joint).entries)
+        if joint.kind == "free":
+            away = Matrix([symbol(name) for name in position_of(joint)]) - exact_vector(joint.pose.position)
+            yield sqrt(away.dot(away) + TINY)
+            turn = exact_matrix(joint.pose.rotation).T * turn
+        twice = [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
+        yield atan2(sqrt(Add(*(x**2 for x in twice)) / 4 + TINY), (turn.trace() - 1) / 2)
 
     def dissipation(self) -> Expr:
         """Return Rayleigh's function of the damping of joints."""
-        return Add(*(self.quadratic(joint, joint.damping) for joint in self.joints.values()))
+        return Add(*(self.of_rates(joint, joint.damping) for joint in self.joints.values()))
 
     def contacts(self) -> tuple[ContactLike, ...]:
         """Return the contacts q >= low and q <= high of joints with limits, and the dry friction of joints."""
@@ -244,18 +261,18 @@ class Tree:
         singles = [joint.name for joint in self.joints.values() if joint.kind in SINGLE and not joint.follows]
         if isinstance(actuated, bool):
             actuated = singles if actuated else []
-        driven = [*map(identifier, actuated)]
+        names = {joint.label: joint.name for joint in self.joints.values()}
+        driven = [names.get(name, name) for name in actuated]
         for name in driven:
             if name not in singles:
                 raise SystemDefinitionError(f"there is no hinge or slide '{name}' to act on{closest(name, singles)}")
         free = [joint for joint in self.joints.values() if joint.kind == "free"]
         turning = [rotation_of(joint) for joint in self.joints.values() if joint.kind in ("ball", "free")]
-        dissipation = self.dissipation()
         return {
             "coordinates": [symbol(name) for name in (*chain.from_iterable(map(position_of, free)), *singles)],
             "rotations": {rotation.name: rotation.rate for rotation in turning},
             "lagrangian": self.kinetic_energy() - self.potential_energy(),
-            "dissipation": None if dissipation == 0 else dissipation,
+            "dissipation": self.dissipation(),
             "forces": {name: symbol(f"tau_{name}") for name in driven},
             "inputs": [f"tau_{name}" for name in driven],
         }
@@ -269,6 +286,11 @@ def rotation_of(joint: Joint) -> Rotation:
 def position_of(joint: Joint) -> tuple[str, ...]:
     """Return the names of the position of a free body: ``x_NAME``, ``y_NAME``, ``z_NAME``."""
     return tuple(f"{axis}_{joint.name}" for axis in "xyz")
+
+
+def integral(coefficients: Sequence[float], x: Expr) -> Expr:
+    """Return c1 x^2/2 + c2 x^3/3 + ..: the energy of a spring with the force c1 x + c2 x^2 + .."""
+    return Add(*(exact_number(c) * x**k / k for k, c in enumerate(coefficients, 2)))
 
 
 def as_quantities(vector: Matrix) -> Matrix:
@@ -291,6 +313,7 @@ def exact_matrix(values: Vector) -> Matrix:
     return Matrix([[exact_number(float(entry)) for entry in row] for row in values])
 
 
+TINY = Rational(1, 10**60)  # of squares of lengths and angles, whose roots have derivatives everywhere
 SMALLEST = 12
 """Smallest number of degrees of freedom for which the recursion is used; below, the mass matrix is factorised."""
 
@@ -302,21 +325,35 @@ def system_of_tree(
     gravity: Vector,
     actuated: Collection[str] | bool,
     constraints: Sequence[Expr] = (),
+    check_inertias: bool = True,
+    tendons: tuple[Expr, Expr, Expr] = (S.Zero, S.Zero, S.Zero),
 ) -> Any:
-    """Return the system of a tree, of class ``kind``; other arguments as of :class:`Tree` and its ``arguments``."""
+    """Return the system of a tree, of class ``kind``, and of the energies of tendons; see :class:`Tree`."""
     tree = Tree(links, gravity)
+    for problem in impossible_inertias(tree.links):
+        if check_inertias:
+            raise SystemDefinitionError(f"{problem}, or integrate it as it is written by check_inertias=False")
+        warn(problem, SystemDefinitionWarning)
     contacts = tree.contacts()
 
     def made(**fields: Any) -> Any:
         members, drawn = fields.get("rotations", ()), tuple(map(DrawnLink.of, tree.links))
         fields |= {"links": drawn, "contacts": contacts}
-        if constraints or contacts or len(fields["coordinates"]) - len(members) < SMALLEST:
+        if constraints or contacts or tendons[0] != 0 or len(fields["coordinates"]) - len(members) < SMALLEST:
             return kind(**fields)
         return kind(**fields, dual_energy=_in_quaternions(dual_energy(tree), **fields))
 
     arguments = tree.arguments(actuated)
-    formula = arguments.pop("lagrangian")
-    return system_from_sympy(made, "Lagrangian", formula, name=name, constraints=constraints, **arguments)
+    formula = arguments.pop("lagrangian") + tendons[0] - tendons[1]
+    arguments["dissipation"] = arguments["dissipation"] + tendons[2] or None
+    try:
+        return system_from_sympy(made, "Lagrangian", formula, name=name, constraints=constraints, **arguments)
+    except SystemDefinitionError as error:
+        if idle := tree.without_mass():
+            raise SystemDefinitionError(
+                f"joint '{idle[0]}' moves no mass: give a link that it carries an <inertial>, or fix the joint"
+            ) from error
+        raise
 
 
 def _in_quaternions(

@@ -8,7 +8,7 @@ import re
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, zip_longest
 from os import PathLike
 from pathlib import Path
 from xml.etree import ElementTree
@@ -21,7 +21,8 @@ from scvi_codegen.systems.formulas.rotations import matrix_of
 from scvi_codegen.systems.multibody.trees.closures import Closure, Coupling, at_reference
 from scvi_codegen.systems.multibody.trees.document import Element, Unread, root_of
 from scvi_codegen.systems.multibody.trees.schema import MJCF, TURN
-from scvi_codegen.systems.multibody.trees.tree import SINGLE, Inertia, Joint, Link, Pose, Vector, about
+from scvi_codegen.systems.multibody.trees.tendons import Tendon
+from scvi_codegen.systems.multibody.trees.tree import SINGLE, Inertia, Joint, Link, Pose, Vector, about, named
 
 Sizes = Vector
 
@@ -73,8 +74,8 @@ Defaults = dict[str, dict[str, str]]
 
 def links_of_mjcf(
     path: str | PathLike[str], *, limits: bool = False
-) -> tuple[str, list[Link], Vector, list[Closure | Coupling]]:
-    """Return the name of the model, its links with parents first, the acceleration of gravity, and its equalities.
+) -> tuple[str, list[Link], Vector, list[Closure | Coupling], list[Tendon]]:
+    """Return the name of the model, its links with parents first, the gravity, its equalities, and its tendons.
 
     ``limits``: whether those of hinges and slides and their dry friction are read; otherwise the warning names them.
 
@@ -86,9 +87,9 @@ def links_of_mjcf(
     _include(root)
     _apply_defaults(root)
     model = _MujocoModel(root, limits)
-    closures = [*model.closures()]
+    closures, tendons = [*model.closures()], [*model.tendons()]
     model.unread.warn(root.file)
-    return root.text("model", Path(path).stem), model.scaled(), model.gravity, closures
+    return root.node.get("model") or Path(path).stem, model.scaled(), model.gravity, closures, tendons
 
 
 class _MujocoModel:
@@ -99,9 +100,9 @@ class _MujocoModel:
         self.settings, option, flags = (
             _merged(root, tag, parts)
             for tag, parts in (
-                ("compiler", self.inside("compiler")),
-                ("option", self.inside("option")),
-                ("flag", [flag for element in self.inside("option") for flag in element.children("flag")]),
+                ("compiler", root.children("compiler")),
+                ("option", root.children("option")),
+                ("flag", [flag for element in root.children("option") for flag in element.children("flag")]),
             )
         )
         self.disabled = {key for key in flags.node.attrib if flags.choice(key, "enable", "disable") == "disable"}
@@ -109,33 +110,46 @@ class _MujocoModel:
         self.turn = np.pi / 180 if self.settings.choice("angle", "degree", "radian") == "degree" else 1.0
         self.links: list[Link] = []
         self.compensating: list[Element] = []
+        self.labels = set[str | None]()
         self.carriers, self.parents = {-1: -1}, dict[int, int]()
         """Of each body, by its link: the moving body that it is fixed to, and the one that this is connected with."""
         self.shapes: dict[tuple[int, int, int], None] = {}
         """Of geoms: the link, contype and conaffinity."""
         self.places: dict[tuple[str, str], tuple[int, Pose]] = {("body", "world"): (-1, Pose())}
         """Link and pose in it of bodies and sites, by tag and name."""
-        for world in self.inside("worldbody"):
+        for world in root.children("worldbody"):
             self.read(world)
+        self.links = named(self.links)
+        self.singles = {link.joint.label: link.joint for link in self.links if link.joint.kind in SINGLE}
         self.read_actuators()
-        self.read_tendons()
         if self.contacts():
             self.unread.add("contacts")
         if self.compensating and any(link.inertia.lift[0] for link in self.links):
             self.compensating[0].refuse("has actuatorgravcomp, which is not read where bodies have gravcomp")
 
-    def inside(self, tag: str) -> list[Element]:
-        return self.root.children(tag)
-
     def entries(self, section: str) -> Iterator[Element]:
         """Yield the elements in all sections of a name."""
-        for element in self.inside(section):
+        for element in self.root.children(section):
             yield from element.children()
 
-    def read_tendons(self) -> None:
-        """Store the limits and dry friction of tendons."""
+    def tendons(self) -> Iterator[Tendon]:
+        """Yield the tendons with forces or rotors; limits and dry friction are listed as unread.
+
+        https://mujoco.readthedocs.io/en/stable/XMLreference.html#tendon
+        """
         for tendon in self.entries("tendon"):
             self.read_limits(tendon, "tendons", tendon.name)
+            stiffness, damping = (self.coefficients(tendon, key) for key in ("stiffness", "damping"))
+            armature = tendon.number("armature", 0, 0)
+            if not (any(stiffness) or any(damping) or armature):
+                continue
+            for part in tendon.children("geom", "pulley"):
+                part.refuse(f"is on the tendon '{tendon.name}', which is read through sites only, without wrapping")
+            factors = tuple((self.single(part, "joint").name, part.number("coef")) for part in tendon.children("joint"))
+            points = tuple(self.place(part, "site") for part in tendon.children("site"))
+            low, *high = map(float, tendon.vector("springlength", (-1,), (1, 2)))
+            slack = None if low == -1 else (low, high[0] if high else low)
+            yield Tendon(factors, points, stiffness, damping, armature, slack)
 
     def read(self, world: Element) -> None:
         """Add links, places and shapes of a world body and of all bodies in it, parents first."""
@@ -165,14 +179,17 @@ class _MujocoModel:
 
     def add(self, body: Element, parent: int, pose: Pose) -> int:
         """Add a link for each joint of a body and one that carries its inertia; return the position of the last."""
-        name = body.text("name", f"body{len(self.links)}")
+        name = body.node.get("name") or f"body{len(self.links)}"
         joints = [*self.contents(body, "joint", "freejoint")]
         above, anchor = self.carriers[parent], np.zeros(3)
         for count, (joint, frame) in enumerate(joints):
             free = joint.tag == "freejoint" or joint.text("type", "hinge") == "free"  # has no place in the body
             at = np.zeros(3) if free else frame.position + frame.rotation @ joint.vector("pos", (0, 0, 0))
             moved = pose @ Pose(at - anchor)
-            label = joint.text("name", name if count == 0 else f"{name}_{count + 1}")
+            label = joint.node.get("name") or (name if count == 0 else f"{name}_{count + 1}")
+            if joint.has("name") and label in self.labels:
+                joint.refuse("is the second joint of this name: rename one")
+            self.labels.add(joint.node.get("name"))
             self.links.append(Link(label, parent, self.joint(joint, label, moved, frame, parent), Inertia()))
             parent, pose, anchor = len(self.links) - 1, Pose(), at
         place = len(self.links)
@@ -184,7 +201,9 @@ class _MujocoModel:
         carried = Joint(name=name, kind="fixed", pose=pose @ Pose(-anchor))
         fixed = self.carriers[place] < 0 and not self.settings.has("settotalmass")  # to the world
         lift = body.number("gravcomp", 0) * (not {"spring", "damper"} <= self.disabled)
-        self.links.append(Link(name, parent, carried, Inertia() if fixed else self.inertia(body).compensated(lift)))
+        inertia = Inertia() if fixed else self.inertia(body)
+        lifted = lift * inertia.mass, lift * inertia.mass * inertia.center
+        self.links.append(Link(name, parent, carried, replace(inertia, lift=lifted)))
         return place
 
     def contents(self, body: Element, *tags: str) -> Iterator[tuple[Element, Pose]]:
@@ -205,7 +224,7 @@ class _MujocoModel:
         """
         if self.disabled & {"contact", "constraint"}:
             return False
-        sections = self.inside("contact")
+        sections = self.root.children("contact")
         excluded = {
             frozenset(self.place(exclusion, key)[0] for key in ("body1", "body2"))
             for section in sections
@@ -221,18 +240,19 @@ class _MujocoModel:
 
     def read_actuators(self) -> None:
         """Add the inertias of rotors and the damping of actuators, which are those of lengths gear q, to joints."""
-        places = {link.joint.name: i for i, link in enumerate(self.links) if link.joint.kind in SINGLE}
+        places = {link.joint.label: i for i, link in enumerate(self.links) if link.joint.kind in SINGLE}
         for actuator in self.entries("actuator"):
             self.unread.add("actuators", actuator.name)
-            armature, damping = (actuator.number(key, 0, 0) for key in ("armature", "damping"))
-            if armature or damping:
+            armature, damping = actuator.number("armature", 0, 0), self.coefficients(actuator, "damping")
+            if armature or any(damping):
                 place = places.get(actuator.text("joint", actuator.text("jointinparent", "")))
                 if place is None:
                     actuator.refuse("has armature or damping, which is read of actuators of hinges and slides only")
                 joint = self.links[place].joint
                 factor = actuator.vector("gear", (1,), range(1, 7))[0] ** 2
-                damping = joint.damping + factor * damping * ("damper" not in self.disabled)
-                joint = replace(joint, damping=damping, armature=joint.armature + factor * armature)
+                added = (factor * b for b in damping)
+                total = tuple(map(sum, zip_longest(joint.damping, added, fillvalue=0.0)))
+                joint = replace(joint, damping=total, armature=joint.armature + factor * armature)
                 self.links[place] = replace(self.links[place], joint=joint)
 
     def read_limits(self, element: Element, part: str, name: str) -> tuple[tuple[float, float] | None, float]:
@@ -266,7 +286,7 @@ class _MujocoModel:
 
     def place(self, element: Element, key: str) -> tuple[int, Pose]:
         """Return the link and the pose in it of the body or site that an attribute names."""
-        kind, name = key[:-1], element.text(key, "world" if key == "body2" else None)
+        kind, name = key.rstrip("12"), element.text(key, "world" if key == "body2" else None)
         if (kind, name) not in self.places:
             names = [other for tag, other in self.places if tag == kind]
             element.refuse(f"names the {kind} '{name}', which does not exist{closest(name, names)}")
@@ -293,18 +313,26 @@ class _MujocoModel:
         elif kind == "body":
             at = Pose(equality.vector("anchor"))
             end = at_reference(self.links, second).inverse @ at_reference(self.links, first) @ at
-        return Closure((first, second), (at, end), turning)
+        return Closure(((first, at), (second, end)), turning)
 
     def coupling(self, equality: Element) -> Coupling:
         """Return a relation between two joints, or the fixed value of one."""
-        zeros = {link.joint.name: link.joint.zero for link in self.links}
-        joint, other = equality.text("joint1"), equality.text("joint2", "") or None
-        if joint == other:
-            equality.refuse(f"is between joint '{joint}' and itself")
+        joint = self.single(equality, "joint1")
+        other = self.single(equality, "joint2") if equality.text("joint2", "") else None
+        if joint is other:
+            equality.refuse(f"is between joint '{joint.label}' and itself")
         first = equality.vector("polycoef", (0,), range(1, 6))
         polynomial = (*first, *(0, 1, 0, 0, 0)[len(first) :])  # those that are not written keep their defaults
         coefficients = tuple(map(float, polynomial if other else polynomial[:1]))
-        return Coupling(joint, other, coefficients, zeros.get(joint, 0.0), zeros.get(other or "", 0.0))
+        zeros = joint.zero, other.zero if other else 0.0
+        return Coupling(joint.name, other.name if other else None, coefficients, *zeros)
+
+    def single(self, element: Element, key: str) -> Joint:
+        """Return the hinge or slide that an attribute names."""
+        name = element.text(key)
+        if name not in self.singles:
+            element.refuse(f"names the joint '{name}', which is no hinge or slide{closest(name, self.singles)}")
+        return self.singles[name]
 
     def joint(self, joint: Element, name: str, pose: Pose, frame: Pose, parent: int) -> Joint:
         """Return a joint of a link, whose pose is that in its parent."""
@@ -313,28 +341,31 @@ class _MujocoModel:
         if kind == "free" and parent >= 0:
             joint.refuse("is free, but its body is inside another body")
         turn = self.turn if kind == "hinge" else 1.0
-        stiffness, rest, zero = (joint.number(key, 0) for key in ("stiffness", "springref", "ref"))
-        if "spring" in self.disabled:
-            stiffness = 0.0
-        if kind in ("ball", "free") and stiffness != 0:
-            joint.refuse("has a stiffness, which is read for hinges and slides only")
+        rest, zero = (joint.number(key, 0) for key in ("springref", "ref"))
         if joint.choice("actuatorgravcomp", "false", "true") == "true":
             self.compensating.append(joint)
         limits, friction = self.read_limits(joint, "joints", name)
-        damping = joint.number("damping", 0, 0)
         return Joint(
             name=name,
             kind=kind,
             pose=pose,
             axis=frame.rotation @ joint.unit("axis", (0, 0, 1)) if kind in SINGLE else np.zeros(3),
-            damping=0.0 if "damper" in self.disabled else damping,
-            stiffness=stiffness,
+            damping=self.coefficients(joint, "damping"),
+            stiffness=self.coefficients(joint, "stiffness"),
             rest=rest * turn,
             armature=joint.number("armature", 0, 0),
             zero=zero * turn if kind in SINGLE else 0.0,
             limits=limits and (limits[0] * turn, limits[1] * turn),
             dry_friction=friction,
         )
+
+    def coefficients(self, element: Element, key: str) -> tuple[float, ...]:
+        """Return the stiffness or damping of an element by power; none where a flag disables it."""
+        values = element.vector(key, (0,), (1, 2, 3))
+        if key == "damping" and values.min() < 0:
+            element.refuse(f"has the {key} {element.text(key)}, which must not be < 0")
+        disabled = {"stiffness": "spring", "damping": "damper"}[key] in self.disabled
+        return () if disabled else tuple(map(float, values))
 
     def inertia(self, body: Element) -> Inertia:
         """Return the inertia of a body, by its inertial or, as ``inertiafromgeom`` says, by its geoms."""
@@ -390,7 +421,7 @@ class _MujocoModel:
         """Return the pose of an element in its parent, by position and orientation or by ``fromto``."""
         if not element.has("fromto"):
             return Pose(element.vector("pos", (0, 0, 0)), self.orientation(element))
-        if element.has("pos"):
+        if element.vector("pos", (0, 0, 0)).any():
             element.refuse("has pos and fromto: one is needed")
         ends = element.vector("fromto", sizes=(6,))
         line = ends[:3] - ends[3:]
@@ -443,7 +474,8 @@ class _MujocoModel:
 def _merged(root: Element, tag: str, parts: list[Element]) -> Element:
     """Return one element with the attributes of several, of which the later ones win."""
     attributes = {key: value for part in parts for key, value in part.node.attrib.items()}
-    return Element(root.file, ElementTree.Element(tag, attributes))
+    merged = ElementTree.Element(tag, attributes)
+    return Element(merged, {merged: root.places[(parts[0] if parts else root).node]})
 
 
 def _include(root: Element) -> None:
@@ -472,8 +504,8 @@ def _include(root: Element) -> None:
                 child.refuse(f"names '{name}', which is included already")
             read.add(path.resolve())
             included = root_of(path, "mujocoinclude", "mujoco")
-            root.files.update(dict.fromkeys(included.node, included.file))
-            children.extendleft(Element(included.file, node, root.files) for node in reversed(included.node))
+            root.places.update(included.places)
+            children.extendleft(Element(node, root.places) for node in reversed(included.node))
         if len(nodes) != len(outer.node) or any(a.node is not b for a, b in zip(nodes, outer.node, strict=True)):
             outer.node[:] = [element.node for element in nodes]
         pending += nodes

@@ -44,9 +44,9 @@ SENSELESS = "group user margin solreflimit solimplimit solreffriction solimpfric
 BODIES = "body* frame* geom* site* camera~ light~ attach! replicate! composite! flexcomp! plugin!"
 JOINTS = "inertial joint* freejoint"
 TENDON = Kind(
-    "name class limited range frictionloss",
-    f"{SENSELESS} springlength springyield width material rgba actuatorfrcrange actuatorfrclimited",
-    {"stiffness": "0", "damping": "0", "armature": "0"},
+    "name class limited range frictionloss stiffness damping armature springlength",
+    f"{SENSELESS} width material rgba actuatorfrcrange actuatorfrclimited",
+    {"springyield": "0"},
     "joint~ site~ geom~ pulley~",
     "tendon",
 )
@@ -61,9 +61,9 @@ MJCF = {
     ),
     "compiler": Kind(
         "angle eulerseq autolimits inertiafromgeom inertiagrouprange settotalmass",
-        "assetdir conflict convexhull discardvisual exactmeshinertia fitaabb fusestatic meshdir passthrough "
+        "alignfree assetdir conflict convexhull discardvisual exactmeshinertia fitaabb fusestatic meshdir passthrough "
         "savecanonical savecompiled saveinertial strippath texturedir usethread",
-        {"alignfree": "false", "balanceinertia": "false", "boundinertia": "0", "boundmass": "0", "coordinate": "local"},
+        {"balanceinertia": "false", "boundinertia": "0", "boundmass": "0", "coordinate": "local"},
         "lengthrange~",
     ),
     "option": Kind(
@@ -96,7 +96,7 @@ MJCF = {
         {"springdamper": "0", "springyield": "0"},
         defaults="joint",
     ),
-    "freejoint": Kind("name", "group", {"align": "false auto"}),
+    "freejoint": Kind("name", "align group"),
     "geom": Kind(
         f"name class type pos {TURN} fromto size mass density shellinertia mesh group contype conaffinity",
         "adhesion castshadow condim fitscale fluidcoef fluidshape friction gap hfield margin material priority rgba "
@@ -138,7 +138,10 @@ MJCF = {
 
 URDF = {
     "robot": Kind(
-        "name", "version", None, "link* joint* transmission~ ros2_control~ material~ gazebo~ sensor~ mujoco~ group~"
+        "name",
+        "version",
+        None,
+        "link* joint* transmission~ ros2_control~ material~ gazebo~ sensor~ mujoco~ group~ frame~",
     ),
     "link": Kind(
         "name",
@@ -160,8 +163,8 @@ URDF = {
     "parent": Kind("link"),
     "child": Kind("link"),
     "axis": Kind("xyz", "", {"rpy": "0"}),
-    "dynamics": Kind("damping friction", "D K mu_coulomb mu_viscous"),
-    "joint_properties": Kind(refused={"damping": "0", "friction": "0"}),
+    "dynamics": Kind("damping friction spring_reference spring_stiffness", "D K mu_coulomb mu_viscous"),
+    "joint_properties": Kind("damping friction"),
     "limit": Kind("lower upper", "effort velocity acceleration deceleration jerk command_effort current gear_velocity"),
     "mimic": Kind("joint multiplier offset"),
 }

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+import unicodedata
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.common.errors import SystemDefinitionError
+from scvi_codegen.systems.formulas.expressions import FUNCTIONS
+from scvi_codegen.systems.formulas.symbols import C_KEYWORDS, DOT, TIME
+from scvi_codegen.systems.formulas.symbols import identifier as spelled
 
 Vector = NDArray[np.float64]
 
@@ -66,10 +70,6 @@ class Inertia:
             self.mass * factor, self.center, self.matrix * factor, (self.lift[0] * factor, self.lift[1] * factor)
         )
 
-    def compensated(self, share: float) -> Inertia:
-        """Return the inertia of a body that gravity does not act on with a share of its mass."""
-        return replace(self, lift=(share * self.mass, share * self.mass * self.center))
-
     def __add__(self, other: Inertia) -> Inertia:
         mass = self.mass + other.mass
         center = (self.mass * self.center + other.mass * other.center) / mass if mass else self.center
@@ -87,11 +87,12 @@ class Joint:
     """Joint between a link and its parent.
 
     Attributes:
-        name: its name, which is that of the coordinate.
+        name, label: its name, which is that of the coordinate, and its name in the file.
         kind: one of ``KINDS``.
         pose: pose of the link in the parent's frame where the coordinate is 0.
         axis: unit vector of a hinge or slide, in the frame of the link.
-        damping, stiffness, rest: torque or force -damping q_dot - stiffness (q - rest).
+        damping, stiffness, rest: torque or force -(b1 v + b2 |v| v + b3 v^3) - (k1 x + k2 x^2 + k3 x^3) of each rate v
+            and the displacement x from ``rest``, of a rotation the angle, of a free body from its pose as well.
         armature: inertia of the rotor, which adds armature q_dot^2/2 to the kinetic energy.
         zero: value of the coordinate at ``pose``.
         limits: smallest and largest value of the coordinate, or none.
@@ -103,14 +104,15 @@ class Joint:
     kind: str
     pose: Pose
     axis: Vector = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
-    damping: float = 0.0
-    stiffness: float = 0.0
+    damping: tuple[float, ...] = ()
+    stiffness: tuple[float, ...] = ()
     rest: float = 0.0
     armature: float = 0.0
     zero: float = 0.0
     limits: tuple[float, float] | None = None
     dry_friction: float = 0.0
     follows: tuple[str, float, float] | None = None
+    label: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,6 +144,7 @@ class DrawnLink:
     center: tuple[float, ...]
     zero: float
     follows: tuple[str, float, float] | None
+    label: str
 
     @classmethod
     def of(cls, link: Link) -> DrawnLink:
@@ -149,7 +152,8 @@ class DrawnLink:
         joint = link.joint
         rotation = tuple(tuple(row) for row in link.joint.pose.rotation.tolist())
         position, center = (tuple(vector.tolist()) for vector in (joint.pose.position, link.inertia.center))
-        return cls(link.parent, joint.name, joint.kind, position, rotation, center, joint.zero, joint.follows)
+        rest = joint.zero, joint.follows, joint.label
+        return cls(link.parent, joint.name, joint.kind, position, rotation, center, *rest)
 
 
 def without_fixed(links: Sequence[Link]) -> list[Link]:
@@ -175,16 +179,20 @@ def without_fixed(links: Sequence[Link]) -> list[Link]:
         raise SystemDefinitionError(
             "no body has a joint that moves: add one, or free the base (from_urdf: floating=True, MJCF: <freejoint>)"
         )
-    for link in moving:
+    return moving
+
+
+def impossible_inertias(links: Sequence[Link]) -> Iterator[str]:
+    """Yield what is wrong with moments of inertia that no body has."""
+    for link in links:
         mass, matrix = link.inertia.mass, link.inertia.matrix
         moments = np.linalg.eigvalsh(matrix) if np.isfinite(matrix).all() else np.full(3, np.nan)
         excess, allowed = moments[2] - moments[1] - moments[0], ROUGH * moments[2] + POINT * mass
         if not (moments[0] >= -1e-9 * abs(moments).max() - 1e-12 * mass and excess <= allowed):
-            raise SystemDefinitionError(
+            yield (
                 f"link '{link.name}', with the links fixed to it, has the mass {mass:g} and the moments of inertia "
                 f"{moments}, which no body has: none is < 0 or exceeds the sum of the others; correct its <inertial>"
             )
-    return moving
 
 
 def aligned(links: Sequence[Link]) -> list[Link]:
@@ -198,7 +206,7 @@ def aligned(links: Sequence[Link]) -> list[Link]:
     for link in links:
         outer = turns[link.parent] if link.parent >= 0 else np.eye(3)
         joint = link.joint
-        turn = np.eye(3) if joint.kind not in SINGLE else _frame_along(joint.axis)
+        turn = np.eye(3) if joint.kind not in SINGLE else axes_of(joint.axis)
         constant = outer.T @ joint.pose.rotation @ turn
         if joint.kind in SINGLE:
             along, across = constant[2, 1], constant[2, 0]
@@ -237,7 +245,7 @@ def hat(v: Vector) -> Vector:
     return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
 
 
-def _frame_along(axis: Vector) -> Vector:
+def axes_of(axis: Vector) -> Vector:
     """Return a rotation matrix with the given third column."""
     if abs(axis[2]) > 1 - ROUNDED:
         return np.diag([1.0, np.sign(axis[2]), np.sign(axis[2])])
@@ -247,22 +255,41 @@ def _frame_along(axis: Vector) -> Vector:
 
 
 def named(links: Sequence[Link]) -> list[Link]:
-    """Return the links with joints whose names are valid in formulas: other characters become ``_``.
+    """Return the links with names of joints that are valid in formulas.
 
-    Raises:
-        SystemDefinitionError: if two joints have one name.
+    A name whose symbols are those of an earlier joint is followed by ``_2``, ``_3``, ..
     """
-    renamed: dict[str, Link] = {}
+    names: dict[str, str] = {}
+    taken, renamed = set[str](), []
     for link in links:
         joint = link.joint
-        name = identifier(joint.name)
-        if name in renamed:
-            raise SystemDefinitionError(f"two joints are called '{name}': rename one")
-        follows = joint.follows and (identifier(joint.follows[0]), *joint.follows[1:])
-        renamed[name] = replace(link, joint=replace(joint, name=name, follows=follows))
-    return [*renamed.values()]
+        plain = identifier(joint.name)
+        numbered = (plain, *(f"{plain}_{k}" for k in range(2, len(links) + 2)))
+        name = next(name for name in numbered if taken.isdisjoint(_symbols(joint.kind, name)))
+        if joint.kind != "fixed":
+            taken |= _symbols(joint.kind, name)
+            names.setdefault(joint.name, name)
+        renamed.append(replace(joint, name=name, label=joint.name))
+    for i, joint in enumerate(renamed):
+        if joint.follows:
+            renamed[i] = replace(joint, follows=(names.get(joint.follows[0], joint.follows[0]), *joint.follows[1:]))
+    return [replace(link, joint=joint) for link, joint in zip(links, renamed, strict=True)]
+
+
+def _symbols(kind: str, name: str) -> set[str]:
+    """Return the names of the symbols of a joint."""
+    if kind in SINGLE:
+        return {name, f"{name}{DOT}", f"p_{name}", f"tau_{name}"}
+    return {f"{part}_{name}" for part in ("R", "omega", *"xyz")} | {f"R_{name}_{part}" for part in "wxyz"}
 
 
 def identifier(name: str) -> str:
-    """Return a name with the characters that formulas do not allow replaced by ``_``."""
-    return re.sub(r"\W", "_", name, flags=re.ASCII)
+    """Return a name that is valid in formulas.
+
+    Greek letters are spelled out, accents omitted, other characters replaced by ``_``. ``joint_`` precedes names that
+    do not begin with a letter, and ``_`` follows words of C and of formulas.
+    """
+    letters = unicodedata.normalize("NFKD", spelled(name))
+    plain = re.sub(r"\W", "_", "".join(x for x in letters if not unicodedata.combining(x)), flags=re.ASCII)
+    plain = plain if plain[:1].isalpha() else f"joint_{plain.lstrip('_')}"
+    return f"{plain}_" if plain in (*C_KEYWORDS, *FUNCTIONS, "pi", TIME) else plain

@@ -4,6 +4,10 @@ Axes and angles are those of https://docs.ros.org/en/rolling/p/urdfdom: ``rpy`` 
 z, in this order. :mod:`scvi_codegen.systems.multibody.trees.schema` lists the attributes that are read.
 """
 
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import replace
+from itertools import product
 from os import PathLike
 from pathlib import Path
 
@@ -12,11 +16,12 @@ import numpy as np
 from scvi_codegen.common.errors import SystemDefinitionError, closest
 from scvi_codegen.systems.multibody.trees.document import Element, Unread, root_of
 from scvi_codegen.systems.multibody.trees.schema import URDF
-from scvi_codegen.systems.multibody.trees.tree import SINGLE, Inertia, Joint, Link, Pose, Vector, about
+from scvi_codegen.systems.multibody.trees.tree import SINGLE, Inertia, Joint, Link, Pose, Vector, about, axes_of, named
 
 LIMITED = ("revolute", "prismatic")
 KINDS = {"fixed": "fixed", "revolute": "hinge", "continuous": "hinge", "prismatic": "slide", "floating": "free"}
-"""Kind of joint by URDF's name."""
+KINDS |= {"spherical": "ball", "ball": "ball", "planar": "planar"}
+"""Kind of joint by URDF's and Drake's name; a planar joint is two slides across the axis and a hinge about it."""
 RIGHT_ANGLE = np.pi / 2
 PRINTED = 5e-6
 """Angles that differ less from a multiple of pi/2 are this multiple: files print 1.5708 or 1.57079632."""
@@ -35,40 +40,69 @@ def links_of_urdf(path: str | PathLike[str], *, floating: bool, limits: bool = F
             links are no tree, or a joint is of a kind that is not read.
     """
     robot = root_of(Path(path), "robot")
+    unread = Unread()
+    for node in robot.node.iter("drake:joint"):
+        node.tag = "joint"
     for element, kind in robot.walk(URDF):
         element.check_neutral(kind)
+        if others := [f"<{child.tag}>" for child in element.node if ":" in child.tag or child.tag == "frame"]:
+            unread.add("elements", *others)
     links = _by_name(robot, "link")
-    joints: dict[str, Element] = {}  # by the name of the child
-    outgoing: dict[str, list[str]] = {name: [] for name in links}
-    for joint in _by_name(robot, "joint").values():
-        ends = {end: _linked(joint, end) for end in ("parent", "child")}
-        for name in ends.values():
-            if name not in links:
-                joint.refuse(f"names the link '{name}', which does not exist{closest(name, links)}")
-        if ends["child"] in joints:
-            joint.refuse(f"moves the link '{ends['child']}', which joint '{joints[ends['child']].name}' moves as well")
-        joints[ends["child"]] = joint
-        outgoing[ends["parent"]].append(ends["child"])
+    joints = _by_child(robot, links, floating=floating)
     roots = [name for name in links if name not in joints]
     if len(roots) != 1:
         raise SystemDefinitionError(f"{path}: the links must form one tree, but without parents are {roots or 'none'}")
+    outgoing = defaultdict[str, list[str]](list)
+    for child, joint in joints.items():
+        outgoing[_linked(joint, "parent")].append(child)
     base = Joint(name=roots[0], kind="free" if floating else "fixed", pose=Pose())
     tree = [Link(roots[0], -1, base, _inertia(links[roots[0]]))]
-    places = {roots[0]: 0}
+    places, rotors = {roots[0]: 0}, _rotors(robot)
     for parent in (order := [roots[0]]):
         for child in outgoing[parent]:
-            tree.append(Link(child, places[parent], _joint(joints[child], limits), _inertia(links[child])))
-            places[child] = len(order)
+            place = places[parent]
+            for moved in _joints(joints[child], limits, rotors.get(joints[child].name, 0.0)):
+                tree.append(Link(child, place, moved, Inertia()))
+                place = len(tree) - 1
+            tree[-1] = replace(tree[-1], inertia=_inertia(links[child]))
+            places[child] = place
             order.append(child)
     if len(order) < len(links):
         raise SystemDefinitionError(f"{path}: the links {sorted(set(links) - set(order))} form a circle")
-    _unread(robot, limits).warn(str(path))
-    return robot.name, tree
+    _list_unread(robot, limits, unread)
+    unread.warn(str(path))
+    return robot.node.get("name") or Path(path).stem, named(tree)
 
 
-def _unread(robot: Element, limits: bool) -> Unread:
-    """Return the parts of a document that matter and are not read."""
-    unread = Unread()
+def _by_child(robot: Element, links: Mapping[str, Element], *, floating: bool) -> dict[str, Element]:
+    """Return the joints by the names of the links that they move, after checks of these."""
+    joints: dict[str, Element] = {}
+    for joint in _by_name(robot, "joint").values():
+        for name in (_linked(joint, "parent"), child := _linked(joint, "child")):
+            if name not in links:
+                joint.refuse(f"names the link '{name}', which does not exist{closest(name, links)}")
+        if child in joints:
+            joint.refuse(f"moves the link '{child}', which joint '{joints[child].name}' moves as well")
+        joints[child] = joint
+    for joint in joints.values() if floating else ():
+        if joint.text("type") == "floating" and _linked(joint, "parent") not in joints:
+            joint.refuse("is free, and so is its parent by floating=True: omit floating")
+    return joints
+
+
+def _rotors(robot: Element) -> dict[str, float]:
+    """Return inertias of rotors as seen from their joints, I gear_ratio^2, by the names of these (Drake)."""
+    rotors: dict[str, float] = {}
+    for transmission in robot.children("transmission"):
+        for actuator, joint in product(*map(transmission.children, ("actuator", "joint"))):
+            inertia, ratio = (actuator.child(f"drake:{tag}") for tag in ("rotor_inertia", "gear_ratio"))
+            factor = ratio.number("value") ** 2 if ratio else 1.0
+            rotors[joint.name] = factor * inertia.number("value", least=0) if inertia else 0.0
+    return rotors
+
+
+def _list_unread(robot: Element, limits: bool, unread: Unread) -> None:
+    """Add the parts of a document that matter and are not read."""
     for joint in robot.children("joint") if not limits else ():
         bounds, friction = _limits(joint)
         if bounds:
@@ -79,7 +113,6 @@ def _unread(robot: Element, limits: bool) -> Unread:
         unread.add("contacts")
     for actuator in robot.children("transmission", "ros2_control"):
         unread.add("actuators", actuator.name)
-    return unread
 
 
 def _limits(joint: Element) -> tuple[tuple[float, float] | None, float]:
@@ -107,11 +140,14 @@ def _linked(joint: Element, end: str) -> str:
     return element.text("link")
 
 
-def _joint(joint: Element, limits: bool) -> Joint:
+def _joints(joint: Element, limits: bool, armature: float) -> list[Joint]:
+    """Return a joint, or those that a planar one consists of, from the parent to the child."""
     kind = joint.text("type")
     if kind not in KINDS:
         joint.refuse(f"is of type '{kind}', which is not read; possible: {', '.join(KINDS)}")
-    axis, dynamics, mimic = (joint.child(tag) for tag in ("axis", "dynamics", "mimic"))
+    axis, dynamics, mimic, older = (joint.child(tag) for tag in ("axis", "dynamics", "mimic", "joint_properties"))
+    if older and (older.number("damping", 0) or older.number("friction", 0)):
+        older.refuse("has damping or friction, which is not read: write <dynamics>")
     single = KINDS[kind] in SINGLE
     follows = None
     if mimic is not None and kind != "fixed":
@@ -119,16 +155,29 @@ def _joint(joint: Element, limits: bool) -> Joint:
             joint.refuse(f"is of type '{kind}', which cannot mimic another joint")
         follows = (mimic.text("joint"), mimic.number("multiplier", 1), mimic.number("offset", 0))
     bounds, friction = _limits(joint) if limits and single else (None, 0.0)
-    return Joint(
+    along = axis.unit("xyz", (1, 0, 0)) if axis and (single or kind == "planar") else np.array([1.0, 0.0, 0.0])
+    spring = dynamics.number("spring_stiffness", 0, 0) if dynamics else 0.0
+    if spring and not single:
+        joint.refuse("has a spring_stiffness, which is read of revolute, continuous and prismatic joints only")
+    read = Joint(
         name=joint.name,
         kind=KINDS[kind],
         pose=_pose(joint),
-        axis=axis.unit("xyz", (1, 0, 0)) if axis is not None and single else np.array([1.0, 0.0, 0.0]),
-        damping=0.0 if dynamics is None else dynamics.number("damping", 0, 0),
+        axis=along,
+        damping=(dynamics.number("damping", 0, 0),) if dynamics else (),
+        stiffness=(spring,),
+        rest=dynamics.number("spring_reference", 0) if dynamics else 0.0,
+        armature=armature,
         limits=bounds,
         dry_friction=friction,
         follows=follows,
     )
+    if kind != "planar":
+        return [read]
+    parts = zip(
+        ("x", "y", "angle"), (*["slide"] * 2, "hinge"), axes_of(along).T, (read.pose, Pose(), Pose()), strict=True
+    )
+    return [replace(read, name=f"{part}_{joint.name}", kind=kind, axis=e, pose=at) for part, kind, e, at in parts]
 
 
 def _inertia(link: Element) -> Inertia:
