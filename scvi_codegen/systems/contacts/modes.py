@@ -81,10 +81,10 @@ def bound_contacts(system: Any, contacts: Sequence[ContactLike]) -> BoundContact
     """
     from scvi_codegen.systems.lagrangian import LagrangianSystem
 
-    if not isinstance(system, LagrangianSystem) or system.clock or system.gauge != 0 or system.rotations:
+    if not isinstance(system, LagrangianSystem) or system.clock or system.gauge != 0:
         raise SystemDefinitionError(
             f"contacts of '{system.name}' are not supported: they require a Lagrangian in named coordinates with "
-            "masses, without rotations and in physical time"
+            "masses, and in physical time"
         )
     return _Binding(system).bound(contacts)
 
@@ -102,10 +102,12 @@ class _Binding:
         import sympy
 
         from scvi_codegen.systems.formulas.grammar import named_tables
+        from scvi_codegen.systems.formulas.rotations import RotationNames
         from scvi_codegen.systems.formulas.symbols import input_formulas, symbol
 
         self.sympy, self.system, self.symbol = sympy, system, symbol
-        own = (*system.coordinates, *system.velocities, system.time, *system.parameters)
+        self.turning = RotationNames(system.rotations)
+        own = (*system.coordinates, *system.velocities, *self.turning.values, system.time, *system.parameters)
         self.names = {x.name: x for x in own} | {name: symbol(name) for name in system.inputs}
         self.functions = named_tables(system.functions)
         self.driven = input_formulas(system.inputs, system.time)
@@ -126,6 +128,7 @@ class _Binding:
                 names |= {"gap": self._distance(item, names["gap"], names["of"]), "of": ()}
             expressions.append(replace(cast("Any", item), **names))
             rows.append(self._add(number, expressions[-1]))
+        reduced = self.system.reduced
         system = replace(
             self.system,
             parameters=(*self.system.parameters, *self.masks),
@@ -134,6 +137,7 @@ class _Binding:
             forces=tuple(self.forces) if any(self.forces) else (),
             reactions=tuple(self.reactions),
             contacts=tuple(expressions),
+            reduced=reduced and replace(reduced, constraints=(*reduced.constraints, *self.constraints)),
         )
         return BoundContacts(system, tuple(rows))
 
@@ -152,12 +156,10 @@ class _Binding:
         return tuple(self._read(part, role, item) for part in formulas) if several else self._read(formulas, role, item)
 
     def _read(self, formula: Formula | None, role: str, item: ContactLike) -> Expr | None:
-        from scvi_codegen.systems.formulas.grammar import parse_expression
-
         if formula is None:
             return None
         if isinstance(formula, str):
-            expression = parse_expression(formula, self.names | self.functions)
+            expression = self.turning.read(formula, self.names | self.functions)
         else:
             expression = self.sympy.nsimplify(self.sympy.sympify(formula), rational=True)
             expression = expression.xreplace({x: self.names.get(x.name, x) for x in expression.free_symbols})
@@ -166,7 +168,7 @@ class _Binding:
                 f"'{unknown[0]}' in {role}='{formula}' of a contact of '{self.system.name}' is not among its names: "
                 f"{', '.join(self.names)}"
             )
-        return cast("Expr", expression.xreplace(self.driven))
+        return cast("Expr", self.turning.in_coordinates(expression).xreplace(self.driven))
 
     def _mask(self, number: int, role: str) -> Symbol:
         name = f"contact_{number}_{role}"
