@@ -339,6 +339,7 @@ def _search(interface: Interface, events: tuple[SearchedEvent, ...], *, controll
     formulas = EventFormulas(interface, events)
     sides = [event.power_sides for event in events if isinstance(event, Kink)]
     timed = [0 if interface.in_tau else _kind_in_time(g, formulas.arguments) for g in formulas.functions]
+    turning = tuple(len(member.coordinates) for member in RotationNames.members_of(interface.rotations))
     rates = [turn_rate(g) if kind else sympy.Integer(0) for g, kind in zip(formulas.functions, timed, strict=True)]
     formulas_of_kernel = {
         "event_functions": formulas.functions,
@@ -362,6 +363,7 @@ def _search(interface: Interface, events: tuple[SearchedEvent, ...], *, controll
         kinks=sum(isinstance(event, Kink) for event in events),
         powers=tuple((int(-1 in side), int(1 in side)) for side in sides) if any(sides) else (),
         contacts=tuple(_places(formulas.modes, contact) for contact in interface.contacts),
+        vectors=(1,) * (interface.dimension - sum(turning)) + turning,
         contact_rows=interface.masked,
         first_contact_row=len(interface.constraints) - interface.masked,
         transitions=tuple((event.contact, event.kind) for event in events if isinstance(event, Transition)),

@@ -170,6 +170,7 @@ class EventSearch:
         powers: below and above the zero of each of them, whether a power that is not whole acts; empty if none does.
         contacts: normal and first tangential row of each contact, number of its slips, and its closed, sticks and
             direction among the modes; -1 for what it does not have.
+        vectors: number of components of each coordinate, rotation and direction, in order.
         contact_rows, first_contact_row: number of rows, and of the constraints before them.
         transitions: contact and kind of each of their transitions, the events before the kinks.
         elements: number of functions of each event, one for each element of its loops.
@@ -200,6 +201,7 @@ class EventSearch:
     kinks: int = 0
     powers: tuple[tuple[int, int], ...] = ()
     contacts: tuple[tuple[int, ...], ...] = ()
+    vectors: tuple[int, ...] = ()
     contact_rows: int = 0
     first_contact_row: int = 0
     transitions: tuple[tuple[int, str], ...] = ()

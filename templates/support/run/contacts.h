@@ -115,6 +115,22 @@ static void put_mode(const contact_places *at, contact_mode mode, const real *w,
   }
 }
 
+/* Size of the terms of a row by positions. Of a rotation or a direction, on whose length it does not depend, that is
+ * |G| |q| instead of a sum by components: of a quaternion twice the derivative by an angle. */
+static real size_by_position(const real *G, const real *q)
+{
+  real sum = 0.0;
+  for (int k = 0, i = 0; k < CONTACT_VECTORS; k++) {
+    real gradient = 0.0, position = 0.0;
+    for (const int next = i + CONTACT_VECTOR[k]; i < next; i++) {
+      gradient = hypot(gradient, G[i]);
+      position = hypot(position, q[i]);
+    }
+    sum += gradient * position;
+  }
+  return sum;
+}
+
 static int terms_at(const event_step *step, const event_sample *at, contact_terms *of)
 {
   real idle[PARAMETERS], imposed[PARAMETERS], mode[EVENT_MODES], *const v = step->memory + 3 * M, power = 0.0;
@@ -142,11 +158,10 @@ static int terms_at(const event_step *step, const event_sample *at, contact_term
   for (int i = 0; i < M; i++)
     power += at->p[i] * v[i];
   for (int r = 0; r < CONTACT_ROWS; r++) {
-    real by_position = 0.0, by_velocity = 0.0;
-    for (int i = 0; i < M; i++) {
-      by_position += fabs(of->G[r * M + i] * at->q[i]);
+    const real by_position = size_by_position(of->G + r * M, at->q);
+    real by_velocity = 0.0;
+    for (int i = 0; i < M; i++)
       by_velocity += of->G[r * M + i] * v[i];
-    }
     /* |G v| <= sqrt(G M^-1 G^T) sqrt(v^T M v), and the change of the rate in a step */
     of->speed[r] = sqrt(fabs(of->W[r * (CONTACT_ROWS + 1)] * power)) + fabs(of->rate[r] - by_velocity) +
         fabs(of->second[r]) * duration;
