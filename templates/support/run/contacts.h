@@ -851,6 +851,12 @@ static int add_change(const event_step *step, int event, const event_sample *at)
   return OK;
 }
 
+/* Whether the direction (ahead.w) w + start of a slip in space is that of its second term. */
+static int is_kept(const real *start, const real *w)
+{
+  return length_of(start, 2) > length_of(w, 2) * length_of(w, 2);
+}
+
 /* Slips in space at the beginning of a part of a step. Solutions are not smooth where they stop, and steps do not
  * resolve where they begin: the direction of slow ones is kept, and steps are in proportion to |w|/|w'|, at most
  * *longest. The direction `ahead` of others is renewed after a turn. */
@@ -867,9 +873,10 @@ static int follow_slips(const event_step *step, const event_sample *at, real *lo
   if (!slips || status != OK)
     return status;
   for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const real *const w = of.rate + CONTACTS[k].tangential, *const start = step->watch->mode + CONTACTS[k].direction + 1;
     mode[k] = mode_of(step, k);
     for (int i = 0; i < 2 && CONTACTS[k].slips == 2 && mode[k].closed && !mode[k].sticks; i++)
-      mode[k].direction[i] = step->watch->mode[CONTACTS[k].direction + 3 + i];
+      mode[k].direction[i] = is_kept(start, w) ? start[2 + i] : w[i] / length_of(w, 2);
   }
   if (!solve_contacts(&of, mode, of.second, force, second))
     return OK;
@@ -879,19 +886,18 @@ static int follow_slips(const event_step *step, const event_sample *at, real *lo
     const real *const w = of.rate + slip, size = CONTACTS[k].slips == 2 ? length_of(w, 2) : 0.0;
     if (CONTACTS[k].slips < 2 || start[-1] == 0.0)
       continue;
-    const int is_kept = length_of(start, 2) > size * size;
-    const real rate = (is_kept ? ahead[0] * second[slip] + ahead[1] * second[slip + 1]
-                               : (w[0] * second[slip] + w[1] * second[slip + 1]) / size);
+    const real *const d = mode[k].direction, rate = d[0] * second[slip] + d[1] * second[slip + 1];
+    const int keeps = is_kept(start, w);
     real *const fastest = step->watch->fastest + k;
     *fastest = fmax(*fastest, fmax(size, of.speed[slip]));
     const real slow = CONTACT_SLOW * *fastest;
-    const int is_slow = rate < 0.0 && size <= slow, is_released = is_kept && size > slow;
-    if (is_kept && !is_released)
+    const int is_slow = rate < 0.0 && size <= slow, is_released = keeps && size > slow;
+    if (keeps && !is_released)
       *longest = fmin(*longest, rate > 0.0 ? 2.0 * slow / rate : INFINITY);
     else if (!is_slow)
       *longest = fmin(*longest, (rate < 0.0 ? CONTACT_BRAKES : CONTACT_GROWS) * size / fabs(rate));
     const int turns = ahead[0] * w[0] + ahead[1] * w[1] < CONTACT_TURN * size;
-    if (is_kept ? !is_released : !(is_slow || turns))
+    if (keeps ? !is_released : !(is_slow || turns))
       continue;
     status = add_change(step, FIRST_TRANSITION, at);
     if (status != OK)
