@@ -28,7 +28,7 @@ enum {
 };
 
 #define CONTACT_ROUNDING 1e-10 /* part of their size below which gaps, rates and forces count as 0 */
-#define CONTACT_SLOW 1e-4 /* part of its size below which the direction of a slip in space is kept */
+#define CONTACT_SLOW 1e-6 /* part of its size below which the direction of a slip in space is kept */
 #define CONTACT_BRAKES 0.25 /* longest part of a step relative to the time to a stop of a slip in space .. */
 #define CONTACT_GROWS 0.3 /* .. and relative to that since its beginning */
 #define CONTACT_PENETRATION 1e-9 /* part of its size by which a gap may be negative at a start */
