@@ -873,7 +873,8 @@ static int follow_slips(const event_step *step, const event_sample *at, real *lo
   if (!slips || status != OK)
     return status;
   for (int k = 0; k < EVENT_CONTACTS; k++) {
-    const real *const w = of.rate + CONTACTS[k].tangential, *const start = step->watch->mode + CONTACTS[k].direction + 1;
+    const real *const w = of.rate + CONTACTS[k].tangential;
+    const real *const start = step->watch->mode + CONTACTS[k].direction + 1;
     mode[k] = mode_of(step, k);
     for (int i = 0; i < 2 && CONTACTS[k].slips == 2 && mode[k].closed && !mode[k].sticks; i++)
       mode[k].direction[i] = is_kept(start, w) ? start[2 + i] : w[i] / length_of(w, 2);
