@@ -852,7 +852,7 @@ static int add_change(const event_step *step, int event, const event_sample *at)
 }
 
 /* Whether the direction (ahead.w) w + start of a slip in space is that of its second term. */
-static int is_kept(const real *start, const real *w)
+static int keeps_direction(const real *start, const real *w)
 {
   return length_of(start, 2) > length_of(w, 2) * length_of(w, 2);
 }
@@ -877,7 +877,7 @@ static int follow_slips(const event_step *step, const event_sample *at, real *lo
     const real *const start = step->watch->mode + CONTACTS[k].direction + 1;
     mode[k] = mode_of(step, k);
     for (int i = 0; i < 2 && CONTACTS[k].slips == 2 && mode[k].closed && !mode[k].sticks; i++)
-      mode[k].direction[i] = is_kept(start, w) ? start[2 + i] : w[i] / length_of(w, 2);
+      mode[k].direction[i] = keeps_direction(start, w) ? start[2 + i] : w[i] / length_of(w, 2);
   }
   if (!solve_contacts(&of, mode, of.second, force, second))
     return OK;
@@ -888,7 +888,7 @@ static int follow_slips(const event_step *step, const event_sample *at, real *lo
     if (CONTACTS[k].slips < 2 || start[-1] == 0.0)
       continue;
     const real *const d = mode[k].direction, rate = d[0] * second[slip] + d[1] * second[slip + 1];
-    const int keeps = is_kept(start, w);
+    const int keeps = keeps_direction(start, w);
     real *const fastest = step->watch->fastest + k;
     *fastest = fmax(*fastest, fmax(size, of.speed[slip]));
     const real slow = CONTACT_SLOW * *fastest;
