@@ -206,11 +206,11 @@ def contact(
     normal *force*. ``surface="z - x**2/2", of=["x", "z"]`` is the gap ``(z - x**2/2)/sqrt(1 + x**2)``.
 
     Args:
-        gap: g(q, t), a formula in coordinates, time and parameters.
+        gap: g(q, t), a formula in coordinates, entries of rotations and directions, time and parameters.
         surface, of: instead of a gap a function that is 0 on the surface and positive outside, which is divided by the
             norm of its gradient with respect to the position of the point, the Cartesian coordinates ``of``.
         slip: w = T(q, t) v + b(q, t), the velocity of sliding, ``"x_dot - r*a_dot"``; in space its two components in
-            orthonormal directions of the surface, ``["x_dot", "y_dot"]``.
+            orthonormal directions of the surface, ``["x_dot", "y_dot"]``. It is linear in angular velocities, too.
         friction, static_friction: coefficients of sliding and of sticking friction, numbers or formulas.
         restitution: coefficient of impacts, 0 to 1; with 0 the contact closes at once.
         where: condition of the places and times where the contact exists, ``"x < 1"`` of a table with an edge, or a

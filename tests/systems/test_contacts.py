@@ -293,23 +293,6 @@ def test_the_balls_of_a_cradle_at_rest_contact() -> None:
     assert np.allclose(run.velocity[-1], [0, 0, 1], atol=1e-14)
 
 
-@METHODS
-@pytest.mark.parametrize("steps", [{"h": 0.05}, {}])
-def test_a_ball_slides_along_a_parabola_and_rolls(degree: int, steps: dict[str, float]) -> None:
-    table = sc.contact("z - r", slip=["x_dot - r*a_dot", "y_dot - r*b_dot"], friction=0.3)
-    text = "m*(x_dot**2 + y_dot**2 + z_dot**2)/2 + m*r**2*(a_dot**2 + b_dot**2)/5 - m*g*z"
-    stepper = of(text, "x y z a b", [table], f"svi:{degree}", m=2, r=0.5, g=9.81)
-    velocity, spin = np.array([3.0, 1.0]), np.array([-2.0, 4.0])
-    run = stepper.integrate([0, 0, 0.5, 0, 0], velocity=[*velocity, 0, *spin], t_end=1.5, **steps)
-    slip = velocity - 0.5 * spin
-    direction, rolls = slip / np.linalg.norm(slip), np.linalg.norm(slip) * 2 / (7 * 0.3 * 9.81)
-    after = velocity - 0.3 * 9.81 * rolls * direction
-    assert sticks_at(run) == pytest.approx([rolls], abs=1e-14)
-    assert np.allclose(run.velocity[-1, :2], after, atol=1e-14)
-    assert np.allclose(run.q[-1, :2], (velocity + after) / 2 * rolls + after * (1.5 - rolls), atol=1e-14)
-    assert np.allclose(run.contact_forces()[0, 0], [19.62, *(-5.886 * direction)], atol=1e-12)
-
-
 SHAKEN = "0.2*t*cos(5*t)", "0.3*t*sin(5*t)"
 
 
@@ -360,6 +343,9 @@ def test_slip_on_a_shaken_table_begins_against_the_force(steps: dict[str, float]
     assert np.abs(np.concatenate([run.q[-1, :2], run.velocity[-1, :2]]) - true).max() < 2e-8
 
 
+TURNS = sc.LagrangianSystem.from_text(
+    "turns", ["z"], "z_dot**2 + omega_1**2 + omega_2**2 + omega_3**2 - z", rotations={"R": "omega"}
+)
 RESTS = sc.LagrangianSystem.from_text("rests", ["y"], "y_dot**2/2 - y", contacts=[sc.contact("y")])
 
 
@@ -377,6 +363,9 @@ RESTS = sc.LagrangianSystem.from_text("rests", ["y"], "y_dot**2/2 - y", contacts
         (lambda: of(PLANE, "x y", [sc.friction("x_dot**2", limit=1)], "svi:2"), "slip=.*linear in velocities.*x_dot"),
         (lambda: of(PLANE, "x y", [sc.contact("y")], "gauss:4"), "contacts|constraints"),
         (lambda: of("x_dot**2/2", "x", [sc.friction("x_dot", limit=1)], "composition:4"), "curves are not polynomials"),
+        (lambda: sc.compile_stepper(TURNS, contacts=[sc.contact("z + R_w")]), "R_w"),
+        (lambda: sc.compile_stepper(TURNS, contacts=[sc.contact("z + omega_2")]), "gap='.*positions.*omega_2"),
+        (lambda: sc.compile_stepper(TURNS, contacts=[sc.friction("omega_1**2", limit=1)]), "linear in .*s omega_1"),
         (lambda: sc.verify(RESTS, "svi:2"), "changes its modes"),
         (lambda: sc.advise(RESTS, "svi:2", [1], [0], 1.0, 1e-6), "steps end at the contacts"),
         (lambda: sc.exact_map(RESTS, [1], [0], 0.1), "has contacts, which exact steps"),

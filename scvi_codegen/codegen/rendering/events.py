@@ -343,6 +343,7 @@ def _search(interface: Interface, events: tuple[SearchedEvent, ...], *, controll
     sides = [event.power_sides for event in events if isinstance(event, Kink)]
     refracts = [isinstance(event, Refraction) for event in events]
     timed = [0 if interface.in_tau else _kind_in_time(g, formulas.arguments) for g in formulas.functions]
+    turning = tuple(len(member.coordinates) for member in RotationNames.members_of(interface.rotations))
     rates = [turn_rate(g) if kind else sympy.Integer(0) for g, kind in zip(formulas.functions, timed, strict=True)]
     formulas_of_kernel = {
         "event_functions": formulas.functions,
@@ -367,6 +368,7 @@ def _search(interface: Interface, events: tuple[SearchedEvent, ...], *, controll
         powers=tuple((int(-1 in side), int(1 in side)) for side in sides) if any(sides) else (),
         refracts=tuple(map(int, refracts)) if any(refracts) else (),
         contacts=tuple(_places(formulas.modes, contact) for contact in interface.contacts),
+        vectors=(1,) * (interface.dimension - sum(turning)) + turning,
         contact_rows=interface.masked,
         first_contact_row=len(interface.constraints) - interface.masked,
         transitions=tuple((event.contact, event.kind) for event in events if isinstance(event, Transition)),

@@ -171,6 +171,7 @@ class EventSearch:
         refracts: 1 for each event that is the zero of a kink where L jumps, else 0; empty if there is none.
         contacts: normal and first tangential row of each contact, number of its slips, and its closed, sticks and
             direction among the modes; -1 for what it does not have.
+        vectors: number of components of each coordinate, rotation and direction, in order.
         contact_rows, first_contact_row: number of rows, and of the constraints before them.
         transitions: contact and kind of each of their transitions, the events before the kinks.
         elements: number of functions of each event, one for each element of its loops.
@@ -202,6 +203,7 @@ class EventSearch:
     powers: tuple[tuple[int, int], ...] = ()
     refracts: tuple[int, ...] = ()
     contacts: tuple[tuple[int, ...], ...] = ()
+    vectors: tuple[int, ...] = ()
     contact_rows: int = 0
     first_contact_row: int = 0
     transitions: tuple[tuple[int, str], ...] = ()

@@ -9,6 +9,7 @@ from scvi_codegen.common.errors import AccuracyWarning, StateError, warn
 from scvi_codegen.runs.accuracy.resolution import warn_of_unresolved_fields
 from scvi_codegen.runs.accuracy.size import RESOLVED, roundoff
 from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted
+from scvi_codegen.runs.results.energy import energy_reason
 from scvi_codegen.runs.results.saved_states import SavedStates
 from scvi_codegen.runs.states.validation import Array
 from scvi_codegen.runs.stepping.integrator import Integrator
@@ -72,7 +73,7 @@ def warn_of_energy_error(trajectory: SavedStates, run: Memory) -> None:
         has_estimate = trajectory.step_error == trajectory.step_error
         if not isinstance(plan, FixedSteps) or has_estimate or not stepper.interface.layout.coordinates:
             return
-    if not stepper.interface.conserves_energy or stepper.changes_states or not warnings_wanted():
+    if not stepper.interface.conserves_energy or energy_reason(stepper) or not warnings_wanted():
         return
     t, q, p = trajectory.t, trajectory.q, trajectory.p
     ends = run._end_energies(t, q, p)
@@ -91,7 +92,7 @@ def warn_of_energy_errors(ensemble: Any, ends: Array | None = None) -> None:
     ``ends``: (k, 2) energies of the first and the last state where they are known, else NaN.
     """
     plans, stepper = ensemble.plans, ensemble.stepper
-    if stepper.changes_states or not (plans and stepper.interface.conserves_energy and warnings_wanted()):
+    if energy_reason(stepper) or not (plans and stepper.interface.conserves_energy and warnings_wanted()):
         return
     by_trajectory, stride = {}, -(-len(plans) // MOST_CHECKED)
     checked = np.arange(0, len(plans), stride)

@@ -6,8 +6,9 @@ the functions of transitions are 1 in modes that they do not end. Runs choose th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from scvi_codegen.common.errors import SystemDefinitionError
@@ -81,10 +82,10 @@ def bound_contacts(system: Any, contacts: Sequence[ContactLike]) -> BoundContact
     """
     from scvi_codegen.systems.lagrangian import LagrangianSystem
 
-    if not isinstance(system, LagrangianSystem) or system.clock or system.gauge != 0 or system.rotations:
+    if not isinstance(system, LagrangianSystem) or system.clock or system.gauge != 0:
         raise SystemDefinitionError(
             f"contacts of '{system.name}' are not supported: they require a Lagrangian in named coordinates with "
-            "masses, without rotations and in physical time"
+            "masses, and in physical time"
         )
     return _Binding(system).bound(contacts)
 
@@ -102,11 +103,16 @@ class _Binding:
         import sympy
 
         from scvi_codegen.systems.formulas.grammar import named_tables
+        from scvi_codegen.systems.formulas.rotations import RotationNames
         from scvi_codegen.systems.formulas.symbols import input_formulas, symbol
 
         self.sympy, self.system, self.symbol = sympy, system, symbol
-        own = (*system.coordinates, *system.velocities, system.time, *system.parameters)
+        self.turning = RotationNames(system.rotations)
+        ordinary = system.dimension - len(self.turning.coordinates)
+        moving = [*system.velocities[:ordinary], *(x for member in system.rotations for x in member.rates)]
+        own = (*system.coordinates[:ordinary], *moving, *self.turning.values, system.time, *system.parameters)
         self.names = {x.name: x for x in own} | {name: symbol(name) for name in system.inputs}
+        self.moving = {*moving}
         self.functions = named_tables(system.functions)
         self.driven = input_formulas(system.inputs, system.time)
         self.masks: list[Symbol] = []
@@ -120,20 +126,21 @@ class _Binding:
         for number, item in enumerate(contacts, 1):
             if not isinstance(item, Contact | Friction):
                 raise SystemDefinitionError(f"contacts are made by contact(..) and friction(..), not {item!r}")
-            formulas = (name for name in item.__dataclass_fields__ if name != "where")
-            names = {name: self._read_all(getattr(item, name), name, item) for name in formulas}
-            if names.get("of"):
-                names |= {"gap": self._distance(item, names["gap"], names["of"]), "of": ()}
-            expressions.append(replace(cast("Any", item), **names))
-            rows.append(self._add(number, expressions[-1]))
+            named = _mapped(item, partial(self._read, item))
+            if getattr(named, "of", ()):
+                named = replace(named, gap=self._distance(item, named.gap, named.of), of=())
+            expressions.append(_mapped(named, lambda formula, _: self.turning.in_coordinates(formula)))
+            rows.append(self._add(number, named))
+        reduced = self.system.reduced
         system = replace(
             self.system,
             parameters=(*self.system.parameters, *self.masks),
             defaults=(*self.system.defaults, *(0.0 for _ in self.masks)),
-            constraints=(*self.system.constraints, *self.constraints),
+            constraints=(*self.system.constraints, *map(self.turning.in_coordinates, self.constraints)),
             forces=tuple(self.forces) if any(self.forces) else (),
             reactions=tuple(self.reactions),
             contacts=tuple(expressions),
+            reduced=reduced and replace(reduced, constraints=(*reduced.constraints, *self.constraints)),
         )
         return BoundContacts(system, tuple(rows))
 
@@ -147,17 +154,10 @@ class _Binding:
         gradient = self._gradient(item, surface, position, "gap")
         return surface / self.sympy.sqrt(self.sympy.Add(*(x**2 for x in gradient)))
 
-    def _read_all(self, formulas: Any, role: str, item: ContactLike) -> Any:
-        several = isinstance(formulas, tuple)
-        return tuple(self._read(part, role, item) for part in formulas) if several else self._read(formulas, role, item)
-
-    def _read(self, formula: Formula | None, role: str, item: ContactLike) -> Expr | None:
-        from scvi_codegen.systems.formulas.grammar import parse_expression
-
-        if formula is None:
-            return None
+    def _read(self, item: ContactLike, formula: Formula, role: str) -> Expr:
+        """Return a formula in the names of rotations and directions."""
         if isinstance(formula, str):
-            expression = parse_expression(formula, self.names | self.functions)
+            expression = self.turning.read(formula, self.names | self.functions)
         else:
             expression = self.sympy.nsimplify(self.sympy.sympify(formula), rational=True)
             expression = expression.xreplace({x: self.names.get(x.name, x) for x in expression.free_symbols})
@@ -180,7 +180,7 @@ class _Binding:
         from scvi_codegen.systems.constraints.kind import Reaction
 
         self.constraints.append(formula)
-        self.reactions.append(Reaction(active=active, direction=tuple(direction)))
+        self.reactions.append(Reaction(active=active, direction=tuple(map(self.turning.in_coordinates, direction))))
         return len(self.constraints) - 1
 
     def _multiplier(self, row: int) -> Symbol:
@@ -188,10 +188,11 @@ class _Binding:
 
     def _gradient(self, item: ContactLike, formula: Expr, variables: Sequence[Symbol], role: str) -> list[Expr]:
         """Return the derivatives of a gap or a slip; raise unless they contain no velocities and do not vanish."""
-        gradient = [formula.diff(x) for x in variables]
-        moving = {x for entry in gradient for x in entry.free_symbols} & {*self.system.velocities}
-        if role == "gap":
-            moving = formula.free_symbols & {*self.system.velocities}
+        in_coordinates = self.turning.in_coordinates(formula)
+        gradient = [in_coordinates.diff(x) for x in variables]
+        moving = formula.free_symbols & self.moving
+        if role == "slip":
+            moving &= {x for rate in moving for x in formula.diff(rate).free_symbols}
         if moving or not any(gradient):
             form = "a function of positions and time" if role == "gap" else "linear in velocities, and contain one"
             raise SystemDefinitionError(
@@ -225,9 +226,10 @@ class _Binding:
             normal = self._row(item.gap, closed, force)
             pushes = closed * self._multiplier(normal) + 1 - closed
             transitions |= {"closes": item.gap + closed, "lifts": pushes}
-            conditions = [self._read_all(condition, "where", item) for condition in item.conditions]
+            conditions = [self._read(item, condition, "where") for condition in item.conditions]
         else:
-            self.forces = [force - item.limit * b for force, b in zip(self.forces, oblique, strict=True)]
+            sliding = [self.turning.in_coordinates(item.limit * b) for b in oblique]
+            self.forces = [force - push for force, push in zip(self.forces, sliding, strict=True)]
         if moving and sticks is not None:
             rows = [self._row(slip, sticks, row) for slip, row in zip(slips, along, strict=True)]
             tangential = rows[0]
@@ -264,3 +266,17 @@ class _Binding:
         )
         names = (slides.name, *(vector.name for vector in vectors))
         return Slipping(tuple(slides * x / length for x in vector), slides * ahead + 1 - slides, names)
+
+
+def _mapped(item: ContactLike, function: Callable[[Any, str], Any]) -> Any:
+    """Return a contact with the values of a function of each of its formulas and the role of this."""
+
+    def of(formulas: Any, role: str) -> Any:
+        return (
+            tuple(function(part, role) for part in formulas)
+            if isinstance(formulas, tuple)
+            else function(formulas, role)
+        )
+
+    fields = {name: getattr(item, name) for name in item.__dataclass_fields__ if name != "where"}
+    return replace(cast("Any", item), **{name: of(value, name) for name, value in fields.items() if value is not None})

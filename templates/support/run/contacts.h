@@ -28,7 +28,7 @@ enum {
 };
 
 #define CONTACT_ROUNDING 1e-10 /* part of their size below which gaps, rates and forces count as 0 */
-#define CONTACT_SLOW 1e-4 /* part of its size below which the direction of a slip in space is kept */
+#define CONTACT_SLOW 1e-6 /* part of its size below which the direction of a slip in space is kept */
 #define CONTACT_BRAKES 0.25 /* longest part of a step relative to the time to a stop of a slip in space .. */
 #define CONTACT_GROWS 0.3 /* .. and relative to that since its beginning */
 #define CONTACT_PENETRATION 1e-9 /* part of its size by which a gap may be negative at a start */
@@ -115,6 +115,22 @@ static void put_mode(const contact_places *at, contact_mode mode, const real *w,
   }
 }
 
+/* Size of the terms of a row by positions. Of a rotation or a direction, on whose length it does not depend, that is
+ * |G| |q| instead of a sum by components: of a quaternion twice the derivative by an angle. */
+static real size_by_position(const real *G, const real *q)
+{
+  real sum = 0.0;
+  for (int k = 0, i = 0; k < CONTACT_VECTORS; k++) {
+    real gradient = 0.0, position = 0.0;
+    for (const int next = i + CONTACT_VECTOR[k]; i < next; i++) {
+      gradient = hypot(gradient, G[i]);
+      position = hypot(position, q[i]);
+    }
+    sum += gradient * position;
+  }
+  return sum;
+}
+
 static int terms_at(const event_step *step, const event_sample *at, contact_terms *of)
 {
   real idle[PARAMETERS], imposed[PARAMETERS], mode[EVENT_MODES], *const v = step->memory + 3 * M, power = 0.0;
@@ -142,11 +158,10 @@ static int terms_at(const event_step *step, const event_sample *at, contact_term
   for (int i = 0; i < M; i++)
     power += at->p[i] * v[i];
   for (int r = 0; r < CONTACT_ROWS; r++) {
-    real by_position = 0.0, by_velocity = 0.0;
-    for (int i = 0; i < M; i++) {
-      by_position += fabs(of->G[r * M + i] * at->q[i]);
+    const real by_position = size_by_position(of->G + r * M, at->q);
+    real by_velocity = 0.0;
+    for (int i = 0; i < M; i++)
       by_velocity += of->G[r * M + i] * v[i];
-    }
     /* |G v| <= sqrt(G M^-1 G^T) sqrt(v^T M v), and the change of the rate in a step */
     of->speed[r] = sqrt(fabs(of->W[r * (CONTACT_ROWS + 1)] * power)) + fabs(of->rate[r] - by_velocity) +
         fabs(of->second[r]) * duration;
@@ -836,6 +851,12 @@ static int add_change(const event_step *step, int event, const event_sample *at)
   return OK;
 }
 
+/* Whether the direction (ahead.w) w + start of a slip in space is that of its second term. */
+static int keeps_direction(const real *start, const real *w)
+{
+  return length_of(start, 2) > length_of(w, 2) * length_of(w, 2);
+}
+
 /* Slips in space at the beginning of a part of a step. Solutions are not smooth where they stop, and steps do not
  * resolve where they begin: the direction of slow ones is kept, and steps are in proportion to |w|/|w'|, at most
  * *longest. The direction `ahead` of others is renewed after a turn. */
@@ -852,9 +873,11 @@ static int follow_slips(const event_step *step, const event_sample *at, real *lo
   if (!slips || status != OK)
     return status;
   for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const real *const w = of.rate + CONTACTS[k].tangential;
+    const real *const start = step->watch->mode + CONTACTS[k].direction + 1;
     mode[k] = mode_of(step, k);
     for (int i = 0; i < 2 && CONTACTS[k].slips == 2 && mode[k].closed && !mode[k].sticks; i++)
-      mode[k].direction[i] = step->watch->mode[CONTACTS[k].direction + 3 + i];
+      mode[k].direction[i] = keeps_direction(start, w) ? start[2 + i] : w[i] / length_of(w, 2);
   }
   if (!solve_contacts(&of, mode, of.second, force, second))
     return OK;
@@ -864,19 +887,18 @@ static int follow_slips(const event_step *step, const event_sample *at, real *lo
     const real *const w = of.rate + slip, size = CONTACTS[k].slips == 2 ? length_of(w, 2) : 0.0;
     if (CONTACTS[k].slips < 2 || start[-1] == 0.0)
       continue;
-    const int is_kept = length_of(start, 2) > size * size;
-    const real rate = (is_kept ? ahead[0] * second[slip] + ahead[1] * second[slip + 1]
-                               : (w[0] * second[slip] + w[1] * second[slip + 1]) / size);
+    const real *const d = mode[k].direction, rate = d[0] * second[slip] + d[1] * second[slip + 1];
+    const int keeps = keeps_direction(start, w);
     real *const fastest = step->watch->fastest + k;
     *fastest = fmax(*fastest, fmax(size, of.speed[slip]));
     const real slow = CONTACT_SLOW * *fastest;
-    const int is_slow = rate < 0.0 && size <= slow, is_released = is_kept && size > slow;
-    if (is_kept && !is_released)
+    const int is_slow = rate < 0.0 && size <= slow, is_released = keeps && size > slow;
+    if (keeps && !is_released)
       *longest = fmin(*longest, rate > 0.0 ? 2.0 * slow / rate : INFINITY);
     else if (!is_slow)
       *longest = fmin(*longest, (rate < 0.0 ? CONTACT_BRAKES : CONTACT_GROWS) * size / fabs(rate));
     const int turns = ahead[0] * w[0] + ahead[1] * w[1] < CONTACT_TURN * size;
-    if (is_kept ? !is_released : !(is_slow || turns))
+    if (keeps ? !is_released : !(is_slow || turns))
       continue;
     status = add_change(step, FIRST_TRANSITION, at);
     if (status != OK)
