@@ -190,7 +190,7 @@ def contact(
     normal *force*: of a curve ``z - x**2/2`` divide by ``sqrt(1 + x**2)``.
 
     Args:
-        gap: g(q, t), a formula in coordinates, time and parameters.
+        gap: g(q, t), a formula in coordinates, time and parameters; ``"y[i] for i in 4"`` for each element.
         slip: w = T(q, t) v + b(q, t), the velocity of sliding, ``"x_dot - r*a_dot"``; in space its two components in
             orthonormal directions of the surface, ``["x_dot", "y_dot"]``.
         friction, static_friction: coefficients of sliding and of sticking friction, numbers or formulas.

@@ -168,8 +168,8 @@ class EventSearch:
         modes: indices of the parameters that change along runs: by events, as modes of contacts, and of kinks.
         kinks: number of kinks, which are the last events.
         powers: below and above the zero of each of them, whether a power that is not whole acts; empty if none does.
-        contacts: normal and first tangential row of each contact, number of its slips, and its closed, sticks and
-            direction among the modes; -1 for what it does not have.
+        contacts: normal and first tangential row of each contact, number of its slips, and its closed, first sticks,
+            first direction and held among the modes; -1 for what it does not have.
         contact_rows, first_contact_row: number of rows, and of the constraints before them.
         transitions: contact and kind of each of their transitions, the events before the kinks.
         elements: number of functions of each event, one for each element of its loops.
