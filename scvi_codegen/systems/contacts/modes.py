@@ -251,7 +251,7 @@ class _Binding:
                 force = [a - item.friction * b for a, b in zip(force, oblique, strict=True)]
             normal = self._row(item.gap, closed, force)
             pushes = closed * self._multiplier(normal) + 1 - closed
-            transitions |= {"closes": (1 - held) * item.gap + held + closed, "lifts": pushes}
+            transitions |= {"closes": item.gap + closed + held, "lifts": pushes}
         else:
             self.forces = [force - item.limit * b for force, b in zip(self.forces, oblique, strict=True)]
         if moving:
