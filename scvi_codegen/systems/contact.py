@@ -206,7 +206,8 @@ def contact(
     normal *force*. ``surface="z - x**2/2", of=["x", "z"]`` is the gap ``(z - x**2/2)/sqrt(1 + x**2)``.
 
     Args:
-        gap: g(q, t), a formula in coordinates, entries of rotations and directions, time and parameters.
+        gap: g(q, t), a formula in coordinates, entries of rotations and directions, time and parameters;
+            ``"y[i] for i in 4"`` for each element.
         surface, of: instead of a gap a function that is 0 on the surface and positive outside, which is divided by the
             norm of its gradient with respect to the position of the point, the Cartesian coordinates ``of``.
         slip: w = T(q, t) v + b(q, t), the velocity of sliding, ``"x_dot - r*a_dot"``; in space its two components in

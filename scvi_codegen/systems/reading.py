@@ -50,11 +50,9 @@ def system_from_text(cls: Any, arguments: Mapping[str, Any]) -> tuple[Any, bool]
     turning = [arguments.get(key) for key in TURNING]
     declared = (parameters, arguments["tables"], *turning)
     if are_arrays(ordinary, *(declarations or () for declarations in declared)) or arguments.get("neighbours"):
-        if arguments.get("contacts"):
-            raise SystemDefinitionError(f"contacts of '{arguments['name']}' require named coordinates, without arrays")
         if arguments.get("point_forces"):
             raise SystemDefinitionError("point_forces of arrays are not supported: give torques and forces by index")
-        return _of_arrays(cls, arrays_from_text(arguments)), True
+        return _of_arrays(cls, arrays_from_text(arguments), arguments.get("contacts", ())), True
     names = RotationNames.declared(*turning, momentum=of_momenta)
     coordinates, momenta = (*ordinary, *names.coordinates), arguments.get("momenta", ())
     momenta = default_momenta(ordinary) if momenta is None else tuple(momenta)
@@ -264,9 +262,11 @@ def _components(force: Any, role: str, read: Callable[[Any, str], Expr]) -> Any:
     return tuple(read(f, role) for f in force) if isinstance(force, tuple | list) else read(force, role)
 
 
-def _of_arrays(cls: Any, system: ArraySystem) -> Any:
-    """Return the system of named coordinates of arrays of known sizes, others as they are."""
-    return system if system.sizes else cls(**unrolled_fields(system, {}))
+def _of_arrays(cls: Any, system: ArraySystem, contacts: Any = ()) -> Any:
+    """Return the system of named coordinates of arrays of known sizes, others as they are, without contacts."""
+    if contacts and system.sizes:
+        raise SystemDefinitionError(f"contacts of '{system.name}' require known sizes: write numbers, such as 'y[4]'")
+    return system if system.sizes else cls(**unrolled_fields(system, {}), contacts=contacts_of(contacts))
 
 
 def _named_parameters(parameters: Mapping[Any, float] | None) -> dict[str, float]:

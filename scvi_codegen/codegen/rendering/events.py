@@ -378,7 +378,11 @@ def _search(interface: Interface, events: tuple[SearchedEvent, ...], *, controll
 def _places(modes: Sequence[str], contact: ContactRows) -> tuple[int, ...]:
     """Return the rows of a contact, the number of slips, and the places of its mode; -1 for what it does not have."""
     rows = (-1 if row is None else row for row in (contact.normal, contact.tangential))
-    masks = (contact.closed, contact.sticks, contact.directions[0] if contact.directions else None)
+    masks = (
+        contact.closed,
+        *(names[0] if names else None for names in (contact.sticks, contact.directions)),
+        contact.held,
+    )
     return *rows, contact.slips, *(-1 if name is None else modes.index(name) for name in masks)
 
 

@@ -169,8 +169,8 @@ class EventSearch:
         kinks: number of kinks, which are the last events.
         powers: below and above the zero of each of them, whether a power that is not whole acts; empty if none does.
         refracts: 1 for each event that is the zero of a kink where L jumps, else 0; empty if there is none.
-        contacts: normal and first tangential row of each contact, number of its slips, and its closed, sticks and
-            direction among the modes; -1 for what it does not have.
+        contacts: normal and first tangential row of each contact, number of its slips, and its closed, first sticks,
+            first direction and held among the modes; -1 for what it does not have.
         vectors: number of components of each coordinate, rotation and direction, in order.
         contact_rows, first_contact_row: number of rows, and of the constraints before them.
         transitions: contact and kind of each of their transitions, the events before the kinks.

@@ -58,8 +58,8 @@ def _contact_of(row: Sequence[Any]) -> ContactRows:
     contact = ContactRows._make(_as_tuples(value) for value in row)
     if not (
         all(number is None or KINDS["int"](number) for number in (contact.normal, contact.tangential, contact.slips))
-        and all(map(KINDS["str | None"], (contact.closed, contact.sticks)))
-        and KINDS["tuple[str, ...]"]((*contact.directions, contact.title))
+        and all(map(KINDS["str | None"], (contact.closed, contact.held)))
+        and all(map(KINDS["tuple[str, ...]"], (contact.sticks, (*contact.directions, contact.title))))
         and KINDS["tuple[tuple[str, ...], ...]"](contact.transitions)
     ):
         raise ValueError(f"contacts contain {contact!r:.60}: these are not the places of a contact")

@@ -45,7 +45,7 @@ class Rows(NamedTuple):
         for contact in contacts:
             for name in contact.masks:
                 place = stepper.interface.parameters.index(name)
-                idle[place], imposed[place] = 0.0, float(name not in contact.directions)
+                idle[place], imposed[place] = 0.0, float(name in contact.imposing)
         numbers, binding = np.zeros(k * (3 + k + m) + 3 * len(contacts)), stepper.binding
         blocks = map(binding.pointer, (state[:m], state[m:], idle, imposed, numbers))
         if status := binding.function("contact_terms")(t, *blocks, binding.workspace()):
@@ -180,7 +180,7 @@ def kept_direction(stepper: Integrator, k: int, state: Array, t: float, paramete
     values = np.array([named[name] for name in contacts[k].directions])
     ahead, speed = values[3:], float(np.sqrt(np.linalg.norm(values[1:3])))
     closed = [(j, item) for j, item in enumerate(contacts) if item.closed is None or named[item.closed]]
-    slides = [j for j, item in closed if item.slips and not named[str(item.sticks)]]
+    slides = [j for j, item in closed if item.slips and not any(named[name] for name in item.sticks)]
     directions = {j: np.array([named[contacts[j].directions[0]]]) for j in slides} | {k: ahead}
     start, slips = Rows.at(stepper, state, t, parameters), Part.of(k, contacts[k]).slips
     if _is_along(start.rate[slips], ahead, speed):

@@ -18,22 +18,22 @@ STEPS = 1000
 REFUSALS = {
     1: "the run starts at t = {t:.17g} with the gap of contact {k} at {value:.6g}, which must not be negative: correct "
     "the initial positions, or the sign of the gap",
-    3: "{k} contacts close or change at once at t = {t:.17g}: their modes are chosen by enumeration of at most 6; use "
-    "fewer contacts",
-    4: "no impulses satisfy the law of impact with friction at t = {t:.17g}, contact {k}: reduce its friction",
-    6: "contact {k} has impossible coefficients at t = {t:.17g}: friction is {value:.6g}, which must not be negative, "
+    3: "no impulses satisfy the law of impact with friction at t = {t:.17g}, contact {k}: reduce its friction",
+    5: "contact {k} has impossible coefficients at t = {t:.17g}: friction is {value:.6g}, which must not be negative, "
     "nor at rest above static friction; restitution must be 0 to 1",
-    5: "the impacts at t = {t:.17g} do not end: contacts close a corner; set a restitution to 0",
+    4: "the impacts at t = {t:.17g} do not end: contacts close a corner; set a restitution to 0",
 }
 """Messages by the reasons of contacts.h."""
+HELD, LOADED = 1, 2
+"""Bits of the mask of contacts whose rows other contacts determine (contacts.h)."""
 PARADOX = (
     "no mode of the contacts is consistent at t = {t:.17g}: Painleve's paradox, rigid bodies with this friction have "
     "no motion. G M^-1 (G - mu d T)^T = {value:.3g} of contact {k} must be positive: reduce its friction, or change "
     "the geometry"
 )
 REDUNDANT = (
-    "no mode of the contacts is consistent at t = {t:.17g}: the contacts are redundant or contradict each other. Use "
-    "independent contacts"
+    "no mode of the contacts is consistent at t = {t:.17g}: the contacts contradict each other, or none was found. "
+    "Reduce friction, or use fewer contacts"
 )
 
 
@@ -94,11 +94,12 @@ def mode_names(contacts: tuple[ContactRows, ...], parameters: dict[str, Any]) ->
     """Return ``"open"``, ``"stick"`` or ``"slip"`` of each contact; one without friction that is closed slips."""
     names = []
     for contact in contacts:
-        if contact.closed is not None and not parameters[contact.closed]:
+        held = int(parameters[contact.held])
+        if contact.closed is not None and not parameters[contact.closed] and not held & LOADED:
             names.append("open")
         else:
             slides = not contact.slips or any(parameters[name] for name in contact.directions)
-            names.append("slip" if slides else "stick")  # or is held by others
+            names.append("slip" if slides and not held & HELD else "stick")
     return tuple(names)
 
 
@@ -116,41 +117,29 @@ def contact_modes(states: Any) -> list[tuple[float, tuple[str, ...]]]:
 
 
 def contact_forces(states: Any) -> Array:
-    """Return (n, contacts, 1 + slips) normal and tangential forces, at a transition those after it."""
+    """Return (n, contacts, 1 + slips) normal and tangential forces, at a transition those after it.
+
+    Of contacts that depend on each other, as of the legs of a table, only the resultant is unique: these are the forces
+    of least norm, of friction relative to its limits, with a warning.
+    """
     stepper: Any = _with_contacts(states)
-    contacts, k = stepper.interface.contacts, stepper.interface.masked
-    first, count = len(stepper.constraints) - k, len(contacts)
-    forces = np.zeros((len(states), count, 1 + max(1, *(contact.slips for contact in contacts))))
-    multipliers = states.multipliers()[:, first:]
-    numbers, binding = np.zeros(k * (3 + k + stepper.dimension) + 3 * count), stepper.binding
+    contacts, binding, total = stepper.interface.contacts, stepper.binding, np.zeros(stepper.interface.masked)
+    forces = np.zeros((len(states), len(contacts), 1 + max(1, *(contact.slips for contact in contacts))))
+    unique = True
     for row, (q, p, t) in enumerate(zip(states.q, states.p, states.t.tolist(), strict=True)):
         parameters = parameters_on_sides(states, t)
         named = stepper.parameters_by_name(parameters)
         blocks = [np.ascontiguousarray(part, float) for part in (q, p, parameters)]
-        imposed = stepper._parameters(named | {name: 1.0 for contact in contacts for name in contact.masks[:2]})
-        pointers = [binding.pointer(part) for part in (*blocks, imposed)]
-        binding.function("contact_terms")(t, *pointers, binding.pointer(numbers), binding.workspace())
-        friction, rates = numbers[-3 * count :: 3], numbers[k : 2 * k]
+        binding.function("contact_forces")(t, *map(binding.pointer, (*blocks, total)), binding.workspace())
+        unique &= not any(named[contact.held] for contact in contacts)
         for j, contact in enumerate(contacts):
             if contact.normal is not None:
-                forces[row, j, 0] = multipliers[row, contact.normal]
-            if not contact.slips:
-                continue
-            rows = slice(contact.tangential, contact.tangential + contact.slips)
-            size = friction[j] * (1.0 if contact.normal is None else forces[row, j, 0])
-            sticks = multipliers[row, rows] * named[contact.sticks]
-            forces[row, j, 1 : 1 + contact.slips] = sticks - size * _direction(contact, named, rates[rows])
+                forces[row, j, 0] = total[contact.normal]
+            if contact.tangential is not None:
+                forces[row, j, 1 : 1 + contact.slips] = total[contact.tangential : contact.tangential + contact.slips]
+    if not unique:
+        warn("the contacts depend on each other: their forces are not unique, only their resultant is", EventWarning)
     return forces
-
-
-def _direction(contact: ContactRows, named: dict[str, Any], w: Array) -> Array:
-    """Return the direction of a slip w, 0 where it does not slip; in space that of (ahead.w) w + start."""
-    values = np.array([named[name] for name in contact.directions])
-    if contact.slips == 1:
-        return values
-    vector = values[3:5] @ w * w + values[1:3]
-    length = np.linalg.norm(vector)
-    return np.asarray(values[0] * vector / length) if length else vector
 
 
 def _with_contacts(states: SavedStates) -> Integrator:

@@ -137,7 +137,9 @@ def _with_directions(later: Place, matrix: Array, state: Array, before: Array) -
 def _directions(stepper: Integrator) -> list[tuple[int, list[int]]]:
     """Return the contacts with slip in space, and the places of the directions that these keep in the parameters."""
     contacts = enumerate(stepper.interface.contacts)
-    return [(k, [*map(stepper.interface.parameters.index, item.directions[1:])]) for k, item in contacts if item.slips == 2]
+    return [
+        (k, [*map(stepper.interface.parameters.index, item.directions[1:])]) for k, item in contacts if item.slips == 2
+    ]
 
 
 def _changes(states: SavedStates, numbers: NDArray[np.intp]) -> dict[int, tuple[Event, Array]]:

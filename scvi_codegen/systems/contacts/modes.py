@@ -6,14 +6,17 @@ the functions of transitions are 1 in modes that they do not end. Runs choose th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import repeat
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from scvi_codegen.common.errors import SystemDefinitionError
 from scvi_codegen.systems.contact import Contact, ContactLike, Friction, slips_of, static_limit
-from scvi_codegen.systems.event import Formula
+from scvi_codegen.systems.event import LOOPS, Formula
+from scvi_codegen.systems.formulas.indices import Array, Size
+from scvi_codegen.systems.formulas.symbols import DOT
 
 if TYPE_CHECKING:
     from sympy import Expr, Symbol
@@ -21,6 +24,8 @@ if TYPE_CHECKING:
     from scvi_codegen.systems.lagrangian import LagrangianSystem
 
 
+MOST_CONTACTS = 64
+"""Contacts of a system."""
 LEAST_SLIP = 10**200
 """Inverse fourth power of a slip that is no direction: formulas of a vector that may be 0 are finite."""
 
@@ -31,8 +36,9 @@ class ContactRows(NamedTuple):
     Attributes:
         normal, tangential: numbers of its row of the gap and of the first of its slips among the masked constraints.
         slips: number of slips: 1 in a plane, 2 in space, 0 without friction.
-        closed, sticks: names of the masks of its mode.
+        closed, sticks: names of the masks of its mode, of each slip.
         directions: of slip: d in a plane; in space whether it slips, and vectors of two components each (contacts.h).
+        held: name of the mask that is 1 where the gap or slip stays 0 by other contacts, and has no transitions.
         title: its formula, for messages.
         transitions: kinds, functions and conditions of its transitions
             (:class:`~scvi_codegen.systems.event.Transition`).
@@ -42,15 +48,21 @@ class ContactRows(NamedTuple):
     tangential: int | None
     slips: int
     closed: str | None
-    sticks: str | None
+    sticks: tuple[str, ...]
     directions: tuple[str, ...]
+    held: str
     title: str
     transitions: tuple[tuple[str, ...], ...]
 
     @property
     def masks(self) -> tuple[str, ...]:
         """Names of the parameters of its mode."""
-        return *(name for name in (self.closed, self.sticks) if name is not None), *self.directions
+        return *self.imposing, *self.directions, self.held
+
+    @property
+    def imposing(self) -> tuple[str, ...]:
+        """Names of the masks of its rows."""
+        return *(() if self.closed is None else (self.closed,)), *self.sticks
 
 
 class Slipping(NamedTuple):
@@ -123,9 +135,12 @@ class _Binding:
     def bound(self, contacts: Sequence[ContactLike]) -> BoundContacts:
         """Return the system with these contacts."""
         expressions, rows = [], []
-        for number, item in enumerate(contacts, 1):
-            if not isinstance(item, Contact | Friction):
-                raise SystemDefinitionError(f"contacts are made by contact(..) and friction(..), not {item!r}")
+        elements = [element for item in contacts for element in self._elements(item)]
+        if len(elements) > MOST_CONTACTS:
+            raise SystemDefinitionError(
+                f"'{self.system.name}' has {len(elements)} contacts, of at most {MOST_CONTACTS}: leave some out"
+            )
+        for number, item in enumerate(elements, 1):
             named = _mapped(item, partial(self._read, item))
             if getattr(named, "of", ()):
                 named = replace(named, gap=self._distance(item, named.gap, named.of), of=())
@@ -153,6 +168,42 @@ class _Binding:
             )
         gradient = self._gradient(item, surface, position, "gap")
         return surface / self.sympy.sqrt(self.sympy.Add(*(x**2 for x in gradient)))
+
+    def _elements(self, item: ContactLike) -> list[ContactLike]:
+        """Return the contacts of the elements of the loops of a contact, with formulas of the entries of arrays."""
+        from scvi_codegen.systems.formulas.array_statements import EntryRules, entry_names, parse_constraint
+
+        if not isinstance(item, Contact | Friction):
+            raise SystemDefinitionError(f"contacts are made by contact(..) and friction(..), not {item!r}")
+        formula = item.gap if isinstance(item, Contact) else slips_of(item)[0]
+        first = str(formula)
+        loops, arrays, indices = "".join(LOOPS.findall(first)), self.system.arrays, self.system.indices
+        if not arrays and loops:
+            raise SystemDefinitionError(f"'{first}' of a contact has loops: declare coordinates as arrays, 'y[4]'")
+        if not arrays or not isinstance(formula, str):
+            return [item]
+        sizes = {name: size for name, size in indices.items() if isinstance(size, int)}
+        known = *arrays, *(Array(array.name + DOT, array.axes) for array in arrays), Array("", tuple(map(Size, sizes)))
+        rules = EntryRules(sizes, {}, {array.name: entry_names(array, {}) for array in arrays})
+
+        def formulas(value: Any) -> Iterable[Any]:
+            if isinstance(value, tuple) and value:
+                return zip(*map(formulas, value), strict=True)
+            if not isinstance(value, str):
+                return repeat(value)
+            term = parse_constraint(value if value == first else value + loops, known, self.names | self.functions)
+            return [term.formula.xreplace(rule) for _, rule in rules.rules(term)]
+
+        fields = {name: getattr(item, name) for name in item.__dataclass_fields__}
+        if fields.get("where") is not None:
+            fields["where"] = tuple(map(str, cast("Contact", item).conditions))  # formulas that are >= 0
+        elements = [
+            dict(zip(fields, values, strict=True)) for values in zip(*map(formulas, fields.values()), strict=False)
+        ]
+        for element in elements:
+            if element.get("where") is not None:
+                element["where"] = tuple(self.sympy.Ge(part, 0, evaluate=False) for part in element["where"])
+        return [replace(cast("Any", item), **element) for element in elements]
 
     def _read(self, item: ContactLike, formula: Formula, role: str) -> Expr:
         """Return a formula in the names of rotations and directions."""
@@ -206,8 +257,9 @@ class _Binding:
         slips = slips_of(item)
         along = [self._gradient(item, slip, self.system.velocities, "slip") for slip in slips]
         closed = self._mask(number, "closed") if of_gap else None
-        sticks = self._mask(number, "sticks") if slips else None
+        sticks = [self._mask(number, f"sticks_{k}") for k in range(1, len(slips) + 1)]
         moving = self._slipping(number, slips) if slips else None
+        held = self._mask(number, "held")
         normal = tangential = None
         transitions: dict[str, Expr] = {}
         conditions: list[Expr] = []
@@ -225,24 +277,24 @@ class _Binding:
                 force = [a - item.friction * b for a, b in zip(force, oblique, strict=True)]
             normal = self._row(item.gap, closed, force)
             pushes = closed * self._multiplier(normal) + 1 - closed
-            transitions |= {"closes": item.gap + closed, "lifts": pushes}
+            transitions |= {"closes": item.gap + closed + held, "lifts": pushes}
             conditions = [self._read(item, condition, "where") for condition in item.conditions]
         else:
             sliding = [self.turning.in_coordinates(item.limit * b) for b in oblique]
             self.forces = [force - push for force, push in zip(self.forces, sliding, strict=True)]
-        if moving and sticks is not None:
-            rows = [self._row(slip, sticks, row) for slip, row in zip(slips, along, strict=True)]
+        if moving:
+            rows = [self._row(slip, mask, row) for slip, mask, row in zip(slips, sticks, along, strict=True)]
             tangential = rows[0]
-            held = self._multiplier(normal) * static_limit(item) if normal is not None else static_limit(item)
-            transitions["stops"] = moving.ahead
+            normal_force = self._multiplier(normal) if normal is not None else self.sympy.S.One
+            limit = normal_force * static_limit(item)
+            transitions["stops"] = (1 - held) * moving.ahead + held
             tau = [self._multiplier(row) for row in rows]
             if len(slips) == 1:
-                transitions["backward"] = sticks * (held - tau[0]) + 1 - sticks  # slip begins against the force
-                transitions["forward"] = sticks * (held + tau[0]) + 1 - sticks
+                transitions["backward"] = sticks[0] * (limit - tau[0]) + 1 - sticks[0]  # slip begins against the force
+                transitions["forward"] = sticks[0] * (limit + tau[0]) + 1 - sticks[0]
             else:
-                transitions["begins"] = sticks * (held**2 - tau[0] ** 2 - tau[1] ** 2) + 1 - sticks
-        closed_name, sticks_name = (x and x.name for x in (closed, sticks))
-        directions = moving.names if moving else ()
+                transitions["begins"] = sticks[0] * (limit**2 - tau[0] ** 2 - tau[1] ** 2) + 1 - sticks[0]
+        names = closed and closed.name, tuple(mask.name for mask in sticks), moving.names if moving else (), held.name
         leaves = [("leaves", closed * u + (1 - closed) ** 2) for u in conditions if closed is not None]  # u if closed
         where = [f"{self.system.text_of(u)} >= 0" for u in conditions]
         functions = tuple(
@@ -251,7 +303,7 @@ class _Binding:
         )
         named, shown = ("gap", item.gap) if of_gap else ("slip", " and ".join(map(self.system.text_of, slips)))
         title = f"{named} '{shown if isinstance(shown, str) else self.system.text_of(shown)}'"
-        return ContactRows(normal, tangential, len(slips), closed_name, sticks_name, directions, title, functions)
+        return ContactRows(normal, tangential, len(slips), *names, title, functions)
 
     def _slipping(self, number: int, slips: Sequence[Expr]) -> Slipping:
         """Return the direction of a slip w: a parameter d in a plane, else that of (ahead.w) w + start."""

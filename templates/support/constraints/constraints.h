@@ -226,7 +226,7 @@ static int is_below(const real *g, real limit, const real *size)
 {
   int below = 1;
   for (int k = 0; k < CONSTRAINTS; k++)
-    below &= MATH(fabs)(g[k]) <= limit * size[k];
+    below &= MATH(fabs)(g[k]) <= limit * size[k] + REAL_MIN;
   return below;
 }
 

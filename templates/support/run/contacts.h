@@ -11,10 +11,10 @@
  * Impacts obey the same conditions for impulses and velocities (C. Glocker, Set-Valued Force Laws, 2001). Requires:
  * parts/contacts.c.jinja. */
 enum {
-  CONTACTS_AT_ONCE = 6, /* largest number of contacts whose modes are enumerated */
-  CONTACT_OPTIONS = 5, /* open, stick, slip in either direction, held by others */
-  CONTACT_DIRECTIONS = 32, /* of a slip in space, between which one is enclosed */
-  CONTACT_SWEEPS = 50, /* over several slips that begin */
+  CONTACT_COMBINATIONS = 15000, /* largest number of modes that are enumerated */
+  CONTACT_OPTIONS = 4, /* open, stick, slip in either direction */
+  CONTACT_TRIALS = 8, /* of a relaxation, each of twice as many sweeps */
+  CONTACT_SWEEPS = 50, /* over the forces of contacts */
   CONTACT_IMPACTS = 100, /* of a contact in a corner */
   CONTACT_SECANTS = 50 /* for the rate after a restitution */
 };
@@ -36,6 +36,9 @@ enum {
 #define CONTACT_LOWEST 16.0 /* roundings of a gap below which a rebound ends */
 #define CONTACT_RESIDUALS 16.0 /* residuals of its located zero below which a rebound ends */
 #define CONTACT_TURN 0.866 /* cosine of an angle after which a direction is renewed */
+#define CONTACT_ASIDE 1e-9 /* largest angle between friction and slip in space */
+#define CONTACT_FAST 1e9 /* length of a vector that is a direction */
+#define CONTACT_COMPLIANCE 1e-3 /* of friction at the start of a relaxation */
 #define CONTACT_DEPENDENT 1e-12 /* part of a column below which a pivot counts as 0 */
 #define CONTACT_GAIN 1e-9 /* part of the work of an impact by which energy may grow */
 
@@ -43,23 +46,30 @@ enum {
 enum {
   CONTACT_PENETRATES = 1,
   CONTACT_WITHOUT_MODE, /* Painleve's paradox, or redundant contacts */
-  CONTACTS_UNDECIDED, /* too many */
   CONTACT_WITHOUT_IMPULSE,
   CONTACT_IN_CORNER,
   CONTACT_IMPOSSIBLE /* coefficients */
 };
 
 /* A contact without gap is always closed; one without friction does not stick, and has direction 0. Slip in space that
- * begins has a direction to be found, 0 until then. */
+ * begins has a direction to be found, 0 until then. Bit i of `sticks` imposes slip i. A contact is held where the rows
+ * of others determine its own: open, it carries no load; closed, its friction is -mu d times the normal force at rest.
+ * Of closed and sticking contacts a step imposes independent rows; `held` then has bits for those of others. */
 typedef struct {
-  int closed, sticks;
+  int closed, sticks, held;
   real direction[2];
 } contact_mode;
 
+enum {
+  CONTACT_HELD = 1,
+  CONTACT_LOADED = 2, /* closed by others */
+  CONTACT_STUCK = 4 /* sticks by others */
+};
+
 static const real AT_REST[2] = {0.0, 0.0};
-static const contact_mode CONTACT_IS_OPEN = {0, 0, {0.0, 0.0}};
-static const contact_mode CONTACT_STICKS = {1, 1, {0.0, 0.0}};
-static const contact_mode CONTACT_SLIPS[3] = {{1, 0, {-1.0, 0.0}}, {1, 0, {0.0, 0.0}}, {1, 0, {1.0, 0.0}}};
+static const contact_mode CONTACT_IS_OPEN = {0, 0, 0, {0.0, 0.0}};
+static const contact_mode CONTACT_STICKS = {1, 3, 0, {0.0, 0.0}};
+static const contact_mode CONTACT_SLIPS[3] = {{1, 0, 0, {-1.0, 0.0}}, {1, 0, 0, {0.0, 0.0}}, {1, 0, 0, {1.0, 0.0}}};
 
 /* Rows at a state: values and rates, second rates b, W and G by rows, coefficients (mu, mu_s, e; limits of friction
  * without gap), the sizes of the terms of values and rates, the rounding of values, and rates at rest. */
@@ -74,7 +84,6 @@ typedef struct {
  * that stop, directions of slips that begin; contacts with g = g' = 0, and with w = 0. */
 typedef struct {
   int closes[EVENT_CONTACTS], leaves[EVENT_CONTACTS], stops[EVENT_CONTACTS], begins[EVENT_CONTACTS];
-  real toward[EVENT_CONTACTS][2]; /* of slips that begin in space, against the friction while it stuck */
   int touches[EVENT_CONTACTS], rests[EVENT_CONTACTS];
 } contact_change;
 
@@ -83,16 +92,20 @@ static real length_of(const real *x, int count)
   return count < 2 ? fabs(x[0]) : hypot(x[0], x[1]);
 }
 
-/* Present mode of a contact; without the direction of a slip in space, which is that of its velocity. */
-static contact_mode mode_of(const event_step *step, int k)
+/* Mode of a contact by its parameters; of a slip in space with the direction `ahead`. */
+static contact_mode mode_of(const real *mode, int k)
 {
   const contact_places *at = CONTACTS + k;
-  const real *mode = step->watch->mode;
-  const contact_mode now = {
-      at->closed < 0 || mode[at->closed] != 0.0,
-      at->sticks >= 0 && mode[at->sticks] != 0.0,
-      {at->slips == 1 ? mode[at->direction] : 0.0, 0.0},
-  };
+  const int held = (int)mode[at->held];
+  const real *const slides = mode + at->direction;
+  contact_mode now = {at->closed < 0 || mode[at->closed] != 0.0 || (held & CONTACT_LOADED), 0, held & CONTACT_HELD,
+      {0.0, 0.0}};
+  for (int i = 0; i < at->slips; i++) {
+    now.sticks |= (mode[at->sticks + i] != 0.0 || (held & CONTACT_STUCK)) << i;
+    now.direction[i] = slides[0];
+    if (at->slips == 2)
+      now.direction[i] *= now.held ? slides[1 + i] / fmax(length_of(slides + 1, 2), DBL_MIN) : slides[3 + i];
+  }
   return now;
 }
 
@@ -101,17 +114,20 @@ static contact_mode mode_of(const event_step *step, int k)
  * step; the second term keeps the direction of slow slips. */
 static void put_mode(const contact_places *at, contact_mode mode, const real *w, real speed, real *modes)
 {
+  const int held = mode.held & CONTACT_HELD, slips = mode.closed && !mode.sticks && !(mode.held & CONTACT_STUCK);
   real *const slides = modes + at->direction;
   if (at->closed >= 0)
-    modes[at->closed] = mode.closed;
-  if (at->slips > 0)
-    modes[at->sticks] = mode.sticks;
+    modes[at->closed] = mode.closed && !(mode.held & CONTACT_LOADED);
+  modes[at->held] = mode.held;
+  for (int i = 0; i < at->slips; i++)
+    modes[at->sticks + i] = mode.sticks >> i & 1;
   if (at->slips == 1)
     slides[0] = mode.direction[0];
   for (int i = 0; at->slips == 2 && i < 2; i++) {
-    slides[0] = mode.closed && !mode.sticks;
-    slides[1 + i] = length_of(w, 2) > CONTACT_SLOW * speed ? 0.0 : speed * speed * mode.direction[i];
-    slides[3 + i] = mode.direction[i];
+    const real size = length_of(mode.direction, 2), slow = length_of(w, 2) > CONTACT_SLOW * speed ? 0.0 : speed * speed;
+    slides[0] = held ? size : slips;
+    slides[1 + i] = (held && size > 0.0 ? CONTACT_FAST / size : slow) * mode.direction[i];
+    slides[3 + i] = held ? 0.0 : mode.direction[i];
   }
 }
 
@@ -131,30 +147,36 @@ static real size_by_position(const real *G, const real *q)
   return sum;
 }
 
-static int terms_at(const event_step *step, const event_sample *at, contact_terms *of)
+/* Evaluates the numbers of the rows at a state. */
+static int rows_at(real t, const real *q, const real *p, const real *parameters, contact_terms *of, real *workspace)
 {
-  real idle[PARAMETERS], imposed[PARAMETERS], mode[EVENT_MODES], *const v = step->memory + 3 * M, power = 0.0;
-  const real duration = fabs(step->whole);
-  real *const numbers = of->numbers;
-  int status;
-  memcpy(idle, step->own, BYTES(PARAMETERS));
-  memcpy(imposed, step->own, BYTES(PARAMETERS));
-  memcpy(mode, step->watch->mode, sizeof mode);
+  real idle[PARAMETERS], imposed[PARAMETERS], mode[EVENT_MODES];
+  for (int k = 0; k < EVENT_MODES; k++)
+    mode[k] = parameters[MODE_PLACE[k]];
+  memcpy(idle, parameters, BYTES(PARAMETERS));
+  memcpy(imposed, parameters, BYTES(PARAMETERS));
   for (int k = 0; k < EVENT_CONTACTS; k++)
     put_mode(CONTACTS + k, CONTACT_IS_OPEN, AT_REST, 0.0, mode);
   put_modes(mode, idle);
   for (int k = 0; k < EVENT_CONTACTS; k++)
     put_mode(CONTACTS + k, CONTACT_STICKS, AT_REST, 0.0, mode);
   put_modes(mode, imposed);
-  status = NAME(contact_terms)(at->t, at->q, at->p, idle, imposed, numbers, step->workspace);
-  if (status == OK)
-    status = NAME(velocity)(at->t, at->q, at->p, idle, v, step->workspace);
-  of->value = numbers;
+  of->value = of->numbers;
   of->rate = of->value + CONTACT_ROWS;
   of->second = of->rate + CONTACT_ROWS;
   of->W = of->second + CONTACT_ROWS;
   of->G = of->W + CONTACT_ROWS * CONTACT_ROWS;
   of->coefficient = of->G + CONTACT_ROWS * M;
+  return NAME(contact_terms)(t, q, p, idle, imposed, of->numbers, workspace);
+}
+
+static int terms_at(const event_step *step, const event_sample *at, contact_terms *of)
+{
+  real *const v = step->memory + 3 * M, power = 0.0;
+  const real duration = fabs(step->whole);
+  int status = rows_at(at->t, at->q, at->p, step->own, of, step->workspace);
+  if (status == OK)
+    status = NAME(velocity)(at->t, at->q, at->p, step->own, v, step->workspace);
   for (int i = 0; i < M; i++)
     power += at->p[i] * v[i];
   for (int r = 0; r < CONTACT_ROWS; r++) {
@@ -181,42 +203,81 @@ static int terms_at(const event_step *step, const event_sample *at, contact_term
   return status;
 }
 
-/* Solves A x = b in place of the last column of the rows (A, b), by elimination with pivots; returns 0 if A is
- * singular but for rounding. */
-static int eliminate(real (*line)[CONTACT_ROWS + 1], int count)
+/* Reduces the rows (A, b) by elimination with the pivots on the diagonal that are independent of those before but for
+ * rounding, so that their rows and columns are. Returns the number of others. */
+static int eliminate(real (*line)[CONTACT_ROWS + 1], int count, int *independent)
 {
+  int others = 0;
   for (int i = 0; i < count; i++) {
-    int best = i;
     real size = 0.0;
-    for (int r = i; r < count; r++)
-      best = fabs(line[r][i]) > fabs(line[best][i]) ? r : best;
     for (int r = 0; r < count; r++)
       size = fmax(size, fabs(line[r][i]));
-    if (!(fabs(line[best][i]) > CONTACT_DEPENDENT * size))
-      return 0;
-    for (int j = i; j <= count; j++) {
-      const real swapped = line[i][j];
-      line[i][j] = line[best][j];
-      line[best][j] = swapped;
-    }
-    for (int r = 0; r < count; r++) {
+    independent[i] = fabs(line[i][i]) > CONTACT_DEPENDENT * size;
+    others += !independent[i];
+    for (int r = 0; r < count && independent[i]; r++) {
       const real factor = line[r][i] / line[i][i];
       for (int j = i; r != i && j <= count; j++)
         line[r][j] -= factor * line[i][j];
     }
   }
-  for (int i = 0; i < count; i++)
-    line[i][count] /= line[i][i];
-  return 1;
+  return others;
 }
 
-/* Solves for the forces of the rows in given modes with after = right + W f = 0 in imposed rows; returns 0 if these are
- * dependent. */
+/* Moves a solution of dependent columns along their null vectors to that of the least sum of weight x^2. */
+static void reduce_norm(real (*line)[CONTACT_ROWS + 1], int count, const int *independent, const real *weight, real *x)
+{
+  real null[CONTACT_ROWS][CONTACT_ROWS];
+  int found = 0;
+  for (int d = 0; d < count; d++) {
+    real *const n = null[found], norm = 0.0, along = 0.0;
+    if (independent[d])
+      continue;
+    for (int i = 0; i < count; i++)
+      n[i] = independent[i] ? -line[i][d] / line[i][i] : i == d;
+    for (int e = 0; e < found; e++) {
+      real part = 0.0;
+      for (int i = 0; i < count; i++)
+        part += weight[i] * n[i] * null[e][i];
+      for (int i = 0; i < count; i++)
+        n[i] -= part * null[e][i];
+    }
+    for (int i = 0; i < count; i++) {
+      norm += weight[i] * n[i] * n[i];
+      along += weight[i] * n[i] * x[i];
+    }
+    for (int i = 0; i < count; i++) {
+      x[i] -= along / norm * n[i];
+      n[i] /= sqrt(norm);
+    }
+    found++;
+  }
+}
+
+/* Rate of a row, right + W f. */
+static real rate_after(const contact_terms *of, const real *right, const real *force, int row)
+{
+  real rate = right[row];
+  for (int j = 0; j < CONTACT_ROWS; j++)
+    rate += of->W[row * CONTACT_ROWS + j] * force[j];
+  return rate;
+}
+
+/* Largest friction force or impulse of a contact, by its coefficient of sliding (0) or sticking (1). */
+static real friction_limit(const contact_terms *of, int k, int which, const real *force)
+{
+  return of->coefficient[3 * k + which] * (CONTACTS[k].normal < 0 ? 1.0 : force[CONTACTS[k].normal]);
+}
+
+/* Solves for the forces of the rows in given modes with after = right + W f = 0 in imposed rows, those of least norm,
+ * friction relative to its limit, if these are dependent; returns 0 if they contradict each other, or such forces
+ * differ in the rates. If `imposed` is not NULL, it becomes 1 for rows to impose, which are independent. */
 static int solve_contacts(const contact_terms *of, const contact_mode *mode, const real *right, real *force,
-    real *after)
+    real *after, int *imposed)
 {
   real matrix[CONTACT_ROWS][CONTACT_ROWS + 1], column[CONTACT_ROWS][CONTACT_ROWS]; /* forces by unknowns */
-  int row[CONTACT_ROWS], count = 0;
+  real x[CONTACT_ROWS], least[CONTACT_ROWS], still[CONTACT_ROWS] = {0.0}, moved[CONTACT_ROWS] = {0.0};
+  real weight[CONTACT_ROWS], load = DBL_MIN;
+  int row[CONTACT_ROWS], independent[CONTACT_ROWS], owner[CONTACT_ROWS], count = 0, dependent;
   memset(force, 0, BYTES(CONTACT_ROWS));
   memset(column, 0, sizeof column);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
@@ -226,182 +287,383 @@ static int solve_contacts(const contact_terms *of, const contact_mode *mode, con
       sliding[at->tangential + i] = -of->coefficient[3 * k] * mode[k].direction[i];
     if (at->normal >= 0 && mode[k].closed) {
       row[count] = at->normal;
+      owner[count] = -1;
       column[count++][at->normal] = 1.0;
     }
-    for (int i = 0; i < at->slips && mode[k].sticks; i++) {
-      row[count] = at->tangential + i;
-      column[count++][at->tangential + i] = 1.0;
-    }
+    for (int i = 0; i < at->slips; i++)
+      if (mode[k].sticks >> i & 1) {
+        row[count] = at->tangential + i;
+        owner[count] = k;
+        column[count++][at->tangential + i] = 1.0;
+      }
   }
   for (int i = 0; i < count; i++) {
     const real *W = of->W + row[i] * CONTACT_ROWS;
-    for (int j = 0; j <= count; j++)
-      matrix[i][j] = j < count ? 0.0 : -right[row[i]];
-    for (int r = 0; r < CONTACT_ROWS; r++) {
+    for (int j = 0; j < count; j++)
+      matrix[i][j] = 0.0;
+    for (int r = 0; r < CONTACT_ROWS; r++)
       for (int j = 0; j < count; j++)
         matrix[i][j] += W[r] * column[j][r];
-      matrix[i][count] -= W[r] * force[r];
+    matrix[i][count] = -rate_after(of, right, force, row[i]);
+  }
+  dependent = eliminate(matrix, count, independent);
+  for (int i = 0; i < count; i++) {
+    least[i] = x[i] = independent[i] ? matrix[i][count] / matrix[i][i] : 0.0;
+    weight[i] = 1.0;
+  }
+  for (int pass = 0; pass < 2 && dependent; pass++) {
+    reduce_norm(matrix, count, independent, weight, least);
+    for (int i = 0; i < count; i++) {
+      moved[row[i]] = least[i];
+      load = fmax(load, fabs(least[i]));
+    }
+    for (int i = 0; i < count; i++) {
+      const real limit = owner[i] < 0 ? load : friction_limit(of, owner[i], 1, moved);
+      weight[i] = 1.0 / fmax(limit, CONTACT_SLOW * load);
     }
   }
-  if (!eliminate(matrix, count))
-    return 0;
+  memset(moved, 0, sizeof moved);
   for (int i = 0; i < count; i++)
-    for (int r = 0; r < CONTACT_ROWS; r++)
-      force[r] += column[i][r] * matrix[i][count];
-  for (int r = 0; r < CONTACT_ROWS; r++) {
-    after[r] = right[r];
+    for (int r = 0; r < CONTACT_ROWS; r++) {
+      force[r] += column[i][r] * least[i];
+      moved[r] += column[i][r] * (least[i] - x[i]);
+    }
+  for (int r = 0; r < CONTACT_ROWS; r++)
+    after[r] = rate_after(of, right, force, r);
+  for (int i = 0; i < count && imposed; i++)
+    imposed[row[i]] = independent[i];
+  for (int r = 0; r < CONTACT_ROWS && dependent; r++) {
+    real size = fabs(right[r]);
     for (int j = 0; j < CONTACT_ROWS; j++)
-      after[r] += of->W[r * CONTACT_ROWS + j] * force[j];
+      size += fabs(of->W[r * CONTACT_ROWS + j] * force[j]);
+    if (fabs(rate_after(of, still, moved, r)) > CONTACT_ROUNDING * size)
+      return 0;
+    for (int i = 0; i < count; i++)
+      if (row[i] == r && fabs(after[r]) > CONTACT_ROUNDING * size)
+        return 0;
   }
   return 1;
 }
 
-/* Largest friction force or impulse of a contact, by its coefficient of sliding (0) or sticking (1). */
-static real friction_limit(const contact_terms *of, int k, int which, const real *force)
+/* Present modes, with the directions of slips at a state, in space of (ahead.w) w + start. */
+static void modes_at(const contact_terms *of, const real *modes, contact_mode *mode)
 {
-  return of->coefficient[3 * k + which] * (CONTACTS[k].normal < 0 ? 1.0 : force[CONTACTS[k].normal]);
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const real *const w = of->rate + CONTACTS[k].tangential, *const start = modes + CONTACTS[k].direction + 1;
+    mode[k] = mode_of(modes, k);
+    if (CONTACTS[k].slips < 2 || start[-1] == 0.0 || mode[k].held)
+      continue;
+    const real along = start[2] * w[0] + start[3] * w[1], x[2] = {along * w[0] + start[0], along * w[1] + start[1]};
+    for (int i = 0; i < 2 && length_of(x, 2) > 0.0; i++)
+      mode[k].direction[i] = x[i] / length_of(x, 2);
+  }
 }
 
-/* Modes of a contact that its gap and its slip at a state allow; returns their number. */
-static int options_of(const contact_terms *of, int k, contact_change *now, contact_mode *option)
+/* Forces of the rows in the modes among parameters, 0 if they are not defined. */
+static int forces_at(real t, const real *q, const real *p, const real *parameters, contact_mode *mode, real *force,
+    real *workspace)
 {
+  contact_terms of;
+  real modes[EVENT_MODES], after[CONTACT_ROWS];
+  const int status = rows_at(t, q, p, parameters, &of, workspace);
+  for (int k = 0; k < EVENT_MODES; k++)
+    modes[k] = parameters[MODE_PLACE[k]];
+  modes_at(&of, modes, mode);
+  if (status != OK || !solve_contacts(&of, mode, of.second, force, after, NULL))
+    memset(force, 0, BYTES(CONTACT_ROWS));
+  return status;
+}
+
+int NAME(contact_forces)(real t, const real *q, const real *p, const real *parameters, real *force, real *workspace)
+{
+  contact_mode mode[EVENT_CONTACTS];
+  return forces_at(t, q, p, parameters, mode, force, workspace);
+}
+
+/* Multipliers and parameters for the functions of transitions: of dependent contacts the multipliers of least norm, and
+ * the masks of all that are closed or stick. */
+static int distribute(real t, const real *q, const real *p, const real *parameters, real *multipliers, real *shown,
+    real *workspace)
+{
+  contact_mode mode[EVENT_CONTACTS];
+  int any = 0, status;
+  memcpy(shown, parameters, BYTES(PARAMETERS));
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    any |= parameters[MODE_PLACE[CONTACTS[k].held]] > CONTACT_HELD;
+  status = any ? forces_at(t, q, p, parameters, mode, multipliers, workspace) : OK;
+  for (int k = 0; k < EVENT_CONTACTS && any; k++) {
+    const contact_places *at = CONTACTS + k;
+    if (at->closed >= 0)
+      shown[MODE_PLACE[at->closed]] = mode[k].closed;
+    for (int i = 0; i < at->slips; i++)
+      shown[MODE_PLACE[at->sticks + i]] = mode[k].sticks >> i & 1;
+    shown[MODE_PLACE[at->held]] = shown[MODE_PLACE[at->held]] != 0.0;
+  }
+  return status;
+}
+
+/* Modes among which those of contacts are chosen, and their conditions on the rates right + W f of the rows: second
+ * rates for forces, rates for impulses. is_free: open by its gap; rests: its slip is 0; begins: 1 or -1 if it slips
+ * after it stuck; limit: 1 if static friction is its limit. */
+typedef struct {
+  const contact_terms *of;
+  const real *right;
+  real scale; /* of the rates */
+  int is_strict; /* slips that begin have a rate */
+  int is_relaxed; /* contacts at their limit do not stick */
+  int is_free[EVENT_CONTACTS], rests[EVENT_CONTACTS], begins[EVENT_CONTACTS], limit[EVENT_CONTACTS];
+  contact_mode option[EVENT_CONTACTS][CONTACT_OPTIONS];
+  int options[EVENT_CONTACTS];
+} contact_problem;
+
+static void add_option(contact_problem *in, int k, contact_mode mode)
+{
+  in->option[k][in->options[k]++] = mode;
+}
+
+/* Adds the modes at a slip that rests. */
+static void add_options_at_rest(contact_problem *in, int k)
+{
+  in->rests[k] = 1;
+  add_option(in, k, CONTACT_STICKS);
+  add_option(in, k, CONTACT_SLIPS[CONTACTS[k].slips == 2 ? 1 : 2]);
+  if (CONTACTS[k].slips == 1)
+    add_option(in, k, CONTACT_SLIPS[0]);
+}
+
+/* Adds the modes of a contact that its gap and its slip at a state allow. */
+static void add_options(contact_problem *in, int k, const contact_change *now)
+{
+  const contact_terms *const of = in->of;
   const contact_places *at = CONTACTS + k;
   const real *const w = of->rate + at->tangential, speed = at->slips > 0 ? of->speed[at->tangential] : 0.0;
-  int count = 0;
+  contact_mode slides = CONTACT_SLIPS[1];
   if (at->normal >= 0)
-    option[count++] = CONTACT_IS_OPEN;
-  if (of->absent[k] || now->leaves[k] ||
+    add_option(in, k, CONTACT_IS_OPEN);
+  in->is_free[k] = of->absent[k] || now->leaves[k] ||
       (at->normal >= 0 && !now->touches[k] &&
           (of->value[at->normal] > CONTACT_ROUNDING * of->size[at->normal] ||
-              of->rate[at->normal] > CONTACT_ROUNDING * of->speed[at->normal])))
-    return count;
-  if (at->slips == 0) {
-    option[count++] = CONTACT_SLIPS[1];
-  } else if (now->begins[k]) {
-    option[count++] = CONTACT_SLIPS[at->slips == 2 ? 1 : 1 + now->begins[k]];
+              of->rate[at->normal] > CONTACT_ROUNDING * of->speed[at->normal]));
+  if (in->is_free[k])
+    return;
+  in->begins[k] = now->begins[k];
+  if (at->slips == 0 || now->begins[k]) {
+    add_option(in, k, CONTACT_SLIPS[at->slips == 1 ? 1 + now->begins[k] : 1]);
   } else if (now->rests[k] || length_of(w, at->slips) <= CONTACT_ROUNDING * speed) {
-    now->rests[k] = 1;
-    option[count++] = CONTACT_STICKS;
-    option[count++] = CONTACT_SLIPS[at->slips == 2 ? 1 : 2];
-    if (at->slips == 1) {
-      option[count++] = CONTACT_SLIPS[0];
-      option[count++] = CONTACT_SLIPS[1]; /* held by others, whose rows depend on its own */
-    }
+    add_options_at_rest(in, k);
   } else {
-    option[count] = CONTACT_SLIPS[1];
     for (int i = 0; i < at->slips; i++)
-      option[count].direction[i] = w[i] / length_of(w, at->slips);
-    count++;
+      slides.direction[i] = w[i] / length_of(w, at->slips);
+    add_option(in, k, slides);
   }
-  return count;
+  in->limit[k] = in->rests[k] || in->begins[k];
 }
 
-/* Moment d x w' and component d.w' of the rates of a slip in the direction d = (cos angle, sin angle). */
-static int turn_slip(const contact_terms *of, int k, real angle, const real *right, contact_mode *mode, real *moment,
-    real *along)
+/* Whether modes satisfy the conditions; their forces, and the rates with them. */
+static int is_consistent(const contact_problem *in, const contact_mode *mode, real *force, real *after)
 {
-  real force[CONTACT_ROWS], after[CONTACT_ROWS], *const d = mode[k].direction;
-  const real *const w = after + CONTACTS[k].tangential;
-  d[0] = cos(angle);
-  d[1] = sin(angle);
-  if (!solve_contacts(of, mode, right, force, after))
-    return 0;
-  *moment = d[0] * w[1] - d[1] * w[0];
-  *along = d[0] * w[0] + d[1] * w[1];
-  return 1;
-}
-
-/* Finds the direction of a slip that begins, that of its own rate: d x w' = 0, d.w' > 0; 0 if there is none. */
-static int find_direction(const contact_terms *of, int k, const real *right, contact_mode *mode)
-{
-  const real turn = 6.283185307179586 / CONTACT_DIRECTIONS;
-  real low, high, along;
-  for (int i = 0; i < CONTACT_DIRECTIONS; i++) {
-    real from = i * turn, to = from + turn;
-    if (!turn_slip(of, k, from, right, mode, &low, &along) || !turn_slip(of, k, to, right, mode, &high, &along))
-      return 0;
-    if ((low > 0.0) == (high > 0.0))
-      continue;
-    for (int bisection = 0; bisection < DBL_MANT_DIG; bisection++) {
-      const real middle = from + 0.5 * (to - from);
-      real moment;
-      if (!turn_slip(of, k, middle, right, mode, &moment, &along))
-        return 0;
-      if ((moment > 0.0) == (low > 0.0))
-        from = middle;
-      else
-        to = middle;
-    }
-    if (along > 0.0)
-      return 1;
-  }
-  return 0;
-}
-
-/* Finds the directions of slips in space that begin; returns 0 if one has none. */
-static int find_directions(const contact_terms *of, const int *begins, const real *right, contact_mode *mode)
-{
-  int count = 0, exists = 1;
-  for (int k = 0; k < EVENT_CONTACTS; k++)
-    count += begins[k];
-  for (int sweep = 0; exists && sweep < (count > 1 ? CONTACT_SWEEPS : count); sweep++)
-    for (int k = 0; k < EVENT_CONTACTS; k++)
-      exists &= !begins[k] || find_direction(of, k, right, mode);
-  return exists;
-}
-
-/* Which contacts in space begin to slip in a mode. */
-static void list_beginning(const contact_mode *mode, const int *rests, int *begins)
-{
-  for (int k = 0; k < EVENT_CONTACTS; k++)
-    begins[k] = CONTACTS[k].slips == 2 && rests[k] && mode[k].closed && !mode[k].sticks;
-}
-
-/* Whether a contact in a plane rests without friction, since others hold it. */
-static int is_held(const contact_mode *mode, int slips)
-{
-  return slips == 1 && mode->closed && !mode->sticks && mode->direction[0] == 0.0;
-}
-
-/* Whether modes, whose unknown directions are found, satisfy the conditions; is_free: contacts that are open by their
- * gap. */
-static int is_consistent(const contact_terms *of, contact_mode *mode, const int *is_free, const contact_change *now)
-{
-  real force[CONTACT_ROWS], second[CONTACT_ROWS], small = 0.0;
-  int begins[EVENT_CONTACTS];
-  list_beginning(mode, now->rests, begins);
-  if (!find_directions(of, begins, of->second, mode))
-    return 0;
-  for (int k = 0; k < EVENT_CONTACTS; k++)
-    if (CONTACTS[k].slips == 2 && now->begins[k] && mode[k].closed && !find_direction(of, k, of->second, mode))
-      memcpy(mode[k].direction, now->toward[k], sizeof now->toward[k]);
-  if (!solve_contacts(of, mode, of->second, force, second))
+  const contact_terms *const of = in->of;
+  real small = CONTACT_ROUNDING * in->scale;
+  if (!solve_contacts(of, mode, in->right, force, after, NULL))
     return 0;
   for (int r = 0; r < CONTACT_ROWS; r++)
-    small = fmax(small, CONTACT_ROUNDING * fmax(fabs(of->second[r]), fabs(second[r])));
+    small = fmax(small, CONTACT_ROUNDING * fmax(fabs(in->right[r]), fabs(after[r])));
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential, slips = CONTACTS[k].slips;
-    real begin = 0.0;
-    if (is_free[k])
+    real begin = 0.0, moves = 0.0, aside;
+    if (in->is_free[k])
       continue;
     if (normal >= 0 && mode[k].closed && !(force[normal] * of->W[normal * (CONTACT_ROWS + 1)] > small))
       return 0;
-    if (normal >= 0 && !mode[k].closed && second[normal] < -small)
+    if (normal >= 0 && !mode[k].closed && after[normal] < -small)
       return 0;
-    if (!mode[k].closed || slips == 0)
+    if (!mode[k].closed || slips == 0 || !(in->rests[k] || in->begins[k]))
       continue;
-    if (mode[k].sticks &&
-        (length_of(force + slip, slips) - friction_limit(of, k, 1, force)) * of->W[slip * (CONTACT_ROWS + 1)] > small)
+    for (int i = 0; i < slips; i++) {
+      begin += mode[k].direction[i] * after[slip + i];
+      moves = fmax(moves, fabs(after[slip + i]));
+    }
+    aside = slips == 2 ? mode[k].direction[0] * after[slip + 1] - mode[k].direction[1] * after[slip] : 0.0;
+    if ((mode[k].sticks || mode[k].held) && /* the friction of one that is held is at most at its limit */
+        (length_of(force + slip, slips) - friction_limit(of, k, in->limit[k], force)) *
+                of->W[slip * (CONTACT_ROWS + 1)] >
+            (in->is_relaxed && mode[k].sticks ? -small : small))
       return 0;
-    for (int i = 0; i < slips; i++)
-      begin += mode[k].direction[i] * second[slip + i];
-    if (!mode[k].sticks && now->begins[k] && begin < -small)
-      return 0;
-    if (is_held(mode + k, slips) ? fabs(second[slip]) > small
-                                 : !mode[k].sticks && now->rests[k] && !now->begins[k] && !(begin > small))
+    if (mode[k].held ? moves > small
+                     : !mode[k].sticks &&
+                (!(begin > (in->is_strict && !in->begins[k] ? small : -small)) ||
+                    fabs(aside) > fmax(small, CONTACT_ASIDE * begin)))
       return 0;
   }
   return 1;
+}
+
+/* Number of consistent combinations of the options, of motions that differ; the one that sticks most is the first of
+ * those with the least sum of 2 for each contact that does not stick, less 1 for each that is closed. */
+static int enumerate_modes(const contact_problem *in, contact_mode *best)
+{
+  contact_mode mode[EVENT_CONTACTS];
+  real force[CONTACT_ROWS], after[CONTACT_ROWS], first[CONTACT_ROWS];
+  int place[EVENT_CONTACTS] = {0}, consistent = 0, least = 1 << 30;
+  for (int more = 1; more;) {
+    int weight = 0;
+    for (int k = 0; k < EVENT_CONTACTS; k++) {
+      mode[k] = in->option[k][place[k]];
+      weight += 2 * !mode[k].sticks - mode[k].closed;
+    }
+    if (is_consistent(in, mode, force, after)) {
+      real differs = 0.0, size = 0.0;
+      for (int r = 0; r < CONTACT_ROWS && consistent; r++) {
+        differs = fmax(differs, fabs(after[r] - first[r]));
+        size = fmax(size, fabs(in->right[r]));
+      }
+      if (!consistent)
+        memcpy(first, after, sizeof first);
+      consistent += !consistent || differs > CONTACT_ROUNDING * size;
+      if (weight < least)
+        memcpy(best, mode, sizeof mode);
+      least = weight < least ? weight : least;
+    }
+    more = 0;
+    for (int k = EVENT_CONTACTS - 1; k >= 0 && !more; k--) { /* the next of all combinations */
+      place[k] = (place[k] + 1) % in->options[k];
+      more = place[k] > 0;
+    }
+  }
+  return consistent;
+}
+
+/* Number of independent rows that a mode imposes. */
+static int rank_of(const contact_problem *in, const contact_mode *mode)
+{
+  real force[CONTACT_ROWS], after[CONTACT_ROWS];
+  int imposed[CONTACT_ROWS] = {0}, rank = 0;
+  solve_contacts(in->of, mode, in->right, force, after, imposed);
+  for (int r = 0; r < CONTACT_ROWS; r++)
+    rank += imposed[r];
+  return rank;
+}
+
+/* Marks the contacts whose rows the imposed ones determine; returns whether one of them is closed. */
+static int hold_contacts(const contact_problem *in, contact_mode *mode)
+{
+  const int rank = rank_of(in, mode);
+  int any = 0;
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const contact_mode now = mode[k];
+    const int slips = CONTACTS[k].slips > 0 && !now.sticks && (in->rests[k] || in->begins[k]);
+    mode[k].held = 0;
+    if (now.closed ? !slips : in->is_free[k])
+      continue;
+    mode[k] = now.closed ? CONTACT_STICKS : CONTACT_SLIPS[1];
+    const int held = rank_of(in, mode) == rank;
+    mode[k] = now;
+    mode[k].held = held;
+    any |= held && now.closed;
+  }
+  return any;
+}
+
+/* Forces by projection onto the friction cones, contact by contact (M. Jean, Comput. Methods Appl. Mech. Eng. 177,
+ * 1999), from those given; role: whether a contact is closed, and its friction any (sticks) or in its direction.
+ * Compliance distributes friction in proportion to its limits. */
+static void relax(const contact_problem *in, const contact_mode *role, real compliance, int sweeps, real *force)
+{
+  const contact_terms *const of = in->of;
+  real strongest = 0.0;
+  for (; sweeps > 0; sweeps--)
+    for (int k = 0; k < EVENT_CONTACTS; k++) {
+      const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential, slips = CONTACTS[k].slips;
+      real diagonal = normal < 0 ? 0.0 : of->W[normal * (CONTACT_ROWS + 1)], oblique = diagonal, trace = 0.0;
+      real bound, size, friction[2] = {0.0, 0.0};
+      for (int i = 0; i < slips; i++) {
+        trace += of->W[(slip + i) * (CONTACT_ROWS + 1)];
+        if (normal >= 0 && !role[k].sticks)
+          oblique -= of->coefficient[3 * k] * role[k].direction[i] * of->W[normal * CONTACT_ROWS + slip + i];
+      }
+      if (normal >= 0)
+        force[normal] -= rate_after(of, in->right, force, normal) / (oblique > 0.0 ? oblique : diagonal);
+      if (normal >= 0 && !(role[k].closed && force[normal] > 0.0))
+        force[normal] = 0.0;
+      bound = role[k].closed ? friction_limit(of, k, in->limit[k], force) : 0.0;
+      strongest = fmax(strongest, bound);
+      const real kept = 1.0 - fmin(compliance * strongest, bound) / fmax(bound, DBL_MIN);
+      for (int i = 0; i < slips; i++)
+        friction[i] = role[k].sticks
+            ? kept * force[slip + i] - rate_after(of, in->right, force, slip + i) / trace
+            : -bound * role[k].direction[i];
+      size = length_of(friction, slips);
+      for (int i = 0; i < slips; i++)
+        force[slip + i] = friction[i] * (role[k].sticks && size > bound ? bound / size : 1.0);
+    }
+}
+
+/* Modes of forces in the friction cones; those below their limits stick. Where others determine a slip its friction is
+ * kept relative to the normal force. Returns whether a limit changed, that of a slip that begins. */
+static int modes_of_forces(contact_problem *in, const contact_mode *role, int trial, const real *force,
+    contact_mode *mode)
+{
+  const contact_terms *const of = in->of;
+  real small = in->scale;
+  int changed = 0;
+  for (int r = 0; r < CONTACT_ROWS; r++)
+    small = fmax(small, fabs(in->right[r]));
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const int normal = CONTACTS[k].normal;
+    const real tau = length_of(force + CONTACTS[k].tangential, CONTACTS[k].slips);
+    mode[k] = role[k];
+    if (normal >= 0 && force[normal] * of->W[normal * (CONTACT_ROWS + 1)] <= CONTACT_ROUNDING * small)
+      mode[k] = CONTACT_IS_OPEN;
+    if ((trial == 0 && in->begins[k]) ||
+        (mode[k].sticks && tau >= (1.0 - CONTACT_ROUNDING) * friction_limit(of, k, in->limit[k], force)))
+      mode[k].sticks = 0;
+  }
+  hold_contacts(in, mode);
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const int slip = CONTACTS[k].tangential;
+    const int slips = mode[k].closed && !mode[k].sticks && role[k].sticks ? CONTACTS[k].slips : 0;
+    const real length = length_of(force + slip, slips), limit = friction_limit(of, k, 0, force);
+    for (int i = 0; i < slips && length > 0.0 && limit > 0.0; i++)
+      mode[k].direction[i] = -force[slip + i] / length * (mode[k].held ? length / limit : 1.0);
+    if (slips > 0 && !mode[k].held && in->limit[k]) {
+      in->limit[k] = 0;
+      changed |= of->coefficient[3 * k] != of->coefficient[3 * k + 1];
+    }
+  }
+  return changed;
+}
+
+/* Finds modes by relaxation of the forces, from those given, then from 0, with friction in proportion to its limits. If
+ * slips without a rate are all that is consistent, these begin. Returns 0 if none is found. */
+static int relax_modes(contact_problem *in, real *force, contact_mode *best)
+{
+  real exact[CONTACT_ROWS], after[CONTACT_ROWS];
+  contact_mode role[EVENT_CONTACTS], mode[EVENT_CONTACTS];
+  int limit[EVENT_CONTACTS], found = 0;
+  in->is_relaxed = 1;
+  memcpy(limit, in->limit, sizeof limit);
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    role[k] = in->rests[k] || in->begins[k] ? CONTACT_STICKS : in->option[k][in->options[k] - 1];
+  for (int trial = 0; trial < CONTACT_TRIALS; trial++) {
+    const int sweeps = CONTACT_SWEEPS << trial;
+    memcpy(in->limit, limit, sizeof limit);
+    if (trial > 0)
+      relax(in, role, CONTACT_COMPLIANCE, sweeps, force);
+    for (int changes = 0, changed = 1; changed && changes <= EVENT_CONTACTS; changes++) {
+      relax(in, role, 0.0, sweeps, force);
+      changed = modes_of_forces(in, role, trial, force, mode);
+    }
+    for (in->is_strict = 1; in->is_strict >= found; in->is_strict--)
+      if (is_consistent(in, mode, exact, after)) {
+        memcpy(best, mode, sizeof mode);
+        found = 1;
+        if (in->is_strict)
+          return 1;
+      }
+    if (trial == 0)
+      memset(force, 0, BYTES(CONTACT_ROWS));
+  }
+  return found;
 }
 
 /* Notes why no motion is possible; contact k, or all. */
@@ -414,15 +676,14 @@ static int refuse(const event_step *step, int reason, int k, real value)
 }
 
 /* Names the contact of Painleve's paradox by its entry of G M^-1 (G - mu d T)^T <= 0, if there is one. */
-static int refuse_modes(const event_step *step, const contact_terms *of, contact_mode (*option)[CONTACT_OPTIONS],
-    const int *options)
+static int refuse_modes(const event_step *step, const contact_problem *in)
 {
   for (int k = 0; k < EVENT_CONTACTS; k++)
-    for (int i = 0; i < options[k] && CONTACTS[k].normal >= 0; i++) {
-      const real *W = of->W + CONTACTS[k].normal * CONTACT_ROWS;
+    for (int i = 0; i < in->options[k] && CONTACTS[k].normal >= 0; i++) {
+      const real *W = in->of->W + CONTACTS[k].normal * CONTACT_ROWS;
       real entry = W[CONTACTS[k].normal];
       for (int j = 0; j < CONTACTS[k].slips; j++)
-        entry -= of->coefficient[3 * k] * option[k][i].direction[j] * W[CONTACTS[k].tangential + j];
+        entry -= in->of->coefficient[3 * k] * in->option[k][i].direction[j] * W[CONTACTS[k].tangential + j];
       if (entry <= 0.0)
         return refuse(step, CONTACT_WITHOUT_MODE, k, entry);
     }
@@ -434,7 +695,7 @@ static int needs_static_friction(const contact_terms *of, const contact_mode *mo
 {
   real force[CONTACT_ROWS], second[CONTACT_ROWS];
   int needs = 0;
-  if (!solve_contacts(of, mode, of->second, force, second))
+  if (!solve_contacts(of, mode, of->second, force, second, NULL))
     return 0;
   for (int k = 0; k < EVENT_CONTACTS; k++)
     needs |= mode[k].sticks &&
@@ -451,123 +712,82 @@ static int is_impossible(const contact_terms *of, int k)
   return !(mu >= 0.0 && held >= 0.0 && e >= 0.0 && e <= 1.0) || (rests && held < (1.0 - CONTACT_ROUNDING) * mu);
 }
 
-/* Sets the consistent modes at a state that stick most: the first of those with the least sum of 2 for each contact
- * that does not stick, less 1 for each that is closed. */
-static int choose_modes(const event_step *step, const contact_terms *of, contact_change *now)
+/* Whether the combinations of modes are few, and slips in space have no direction to be found. */
+static int are_few(const contact_problem *in)
 {
-  contact_mode option[EVENT_CONTACTS][CONTACT_OPTIONS], mode[EVENT_CONTACTS], best[EVENT_CONTACTS];
-  int options[EVENT_CONTACTS], place[EVENT_CONTACTS] = {0}, is_free[EVENT_CONTACTS];
-  int undecided = 0, consistent = 0, least = 1 << 30;
+  real combinations = 1.0;
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    combinations *= CONTACTS[k].slips == 2 && (in->rests[k] || in->begins[k]) ? INFINITY : in->options[k];
+  return combinations <= CONTACT_COMBINATIONS;
+}
+
+/* Sets the consistent modes at a state that stick most, of many and of redundant contacts those near given forces. */
+static int choose_modes(const event_step *step, const contact_terms *of, const contact_change *now, real *force)
+{
+  contact_problem in = {.of = of, .right = of->second, .is_strict = 1};
+  contact_mode best[EVENT_CONTACTS];
+  real second[CONTACT_ROWS];
+  int imposed[CONTACT_ROWS] = {0}, consistent = 0, held = 0;
   for (int k = 0; k < EVENT_CONTACTS; k++) {
-    options[k] = options_of(of, k, now, option[k]);
-    undecided += options[k] > 1;
-    is_free[k] = options[k] == 1 && !option[k][0].closed;
+    in.rests[k] = now->rests[k];
+    held |= step->watch->mode[CONTACTS[k].held] != 0.0;
+    add_options(&in, k, now);
   }
-  if (undecided > CONTACTS_AT_ONCE)
-    return refuse(step, CONTACTS_UNDECIDED, undecided - 1, 0.0);
-  for (int with_held = 0; with_held < 2 && !consistent; with_held++) {
-    for (int more = 1; more;) {
-      int weight = 0, held = 0;
-      for (int k = 0; k < EVENT_CONTACTS; k++) {
-        mode[k] = option[k][place[k]];
-        weight += 2 * !mode[k].sticks - mode[k].closed;
-        held |= options[k] > 1 && is_held(mode + k, CONTACTS[k].slips);
-      }
-      if (held == with_held && is_consistent(of, mode, is_free, now)) {
-        consistent++;
-        if (weight < least)
-          memcpy(best, mode, sizeof best);
-        least = weight < least ? weight : least;
-      }
-      more = 0;
-      for (int k = EVENT_CONTACTS - 1; k >= 0 && !more; k--) { /* the next of all combinations */
-        place[k] = (place[k] + 1) % options[k];
-        more = place[k] > 0;
-      }
-    }
-  }
-  if (!consistent)
-    return refuse_modes(step, of, option, options);
+  if (!held && are_few(&in))
+    consistent = enumerate_modes(&in, best);
   if (consistent > step->watch->ambiguous && !needs_static_friction(of, best))
     step->watch->ambiguous = consistent;
+  if ((!consistent || hold_contacts(&in, best)) && !relax_modes(&in, force, best))
+    return refuse_modes(step, &in);
+  solve_contacts(of, best, of->second, force, second, imposed);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
-    const int slip = CONTACTS[k].tangential;
-    const int is_slow = CONTACTS[k].slips > 0 && (now->rests[k] || now->begins[k]);
-    put_mode(CONTACTS + k, best[k], is_slow || slip < 0 ? AT_REST : of->rate + slip, slip < 0 ? 0.0 : of->speed[slip],
-        step->watch->mode);
+    const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential;
+    const int is_slow = CONTACTS[k].slips > 0 && (in.rests[k] || in.begins[k]);
+    real speed = slip < 0 ? 0.0 : of->speed[slip]; /* and that by forces that cancel */
+    int sticks = 0;
+    for (int i = 0; i < CONTACTS[k].slips && best[k].sticks; i++)
+      sticks |= imposed[slip + i] << i;
+    if (best[k].closed && normal >= 0 && !imposed[normal])
+      best[k].held |= CONTACT_LOADED;
+    if (best[k].sticks && sticks != (1 << CONTACTS[k].slips) - 1)
+      best[k].held |= CONTACT_STUCK;
+    best[k].sticks = sticks;
+    for (int j = 0; j < CONTACT_ROWS && slip >= 0; j++)
+      speed += fabs(of->W[slip * CONTACT_ROWS + j] * force[j] * step->whole);
+    put_mode(CONTACTS + k, best[k], is_slow || slip < 0 ? AT_REST : of->rate + slip, speed, step->watch->mode);
+    if (is_slow)
+      step->watch->fastest[k] = fmax(step->watch->fastest[k], speed);
   }
   put_modes(step->watch->mode, step->own);
   return OK;
 }
 
-/* Whether the impulses and the rates after an impact satisfy its conditions. */
-static int obeys(const contact_terms *of, const contact_mode *mode, const int *takes_part, const real *impulse,
-    const real *after, real small)
-{
-  for (int k = 0; k < EVENT_CONTACTS; k++) {
-    const int normal = CONTACTS[k].normal, slip = CONTACTS[k].tangential;
-    real along = 0.0;
-    if (!takes_part[k])
-      continue;
-    if (!mode[k].closed && after[normal] < -small)
-      return 0;
-    if (mode[k].closed && impulse[normal] * of->W[normal * (CONTACT_ROWS + 1)] < -small)
-      return 0;
-    if (mode[k].sticks &&
-        (length_of(impulse + slip, CONTACTS[k].slips) - friction_limit(of, k, 0, impulse)) *
-                of->W[slip * (CONTACT_ROWS + 1)] >
-            small)
-      return 0;
-    for (int i = 0; i < CONTACTS[k].slips; i++)
-      along += mode[k].direction[i] * after[slip + i];
-    if (mode[k].closed && !mode[k].sticks && along < -small)
-      return 0;
-  }
-  return 1;
-}
-
-/* Impulses of a contact that approaches with the given rates, and of those that are closed, in the first consistent
- * modes; 0 if there are none. */
+/* Impulses of a contact that approaches with the given rates, and of those that are closed, in consistent modes; 0 if
+ * there are none. */
 static int impulses_of(const contact_terms *of, int contact, const int *closed, real restitution, const real *rate,
     real *impulse)
 {
-  contact_mode option[EVENT_CONTACTS][CONTACT_OPTIONS], mode[EVENT_CONTACTS];
-  int options[EVENT_CONTACTS], place[EVENT_CONTACTS] = {0}, takes_part[EVENT_CONTACTS], begins[EVENT_CONTACTS];
-  int more = 1;
-  real right[CONTACT_ROWS], after[CONTACT_ROWS], small = 0.0;
+  contact_problem in = {.of = of};
+  contact_mode mode[EVENT_CONTACTS];
+  real right[CONTACT_ROWS], after[CONTACT_ROWS];
   memcpy(right, rate, sizeof right);
   right[CONTACTS[contact].normal] *= 1.0 + restitution;
+  in.right = right;
   for (int r = 0; r < CONTACT_ROWS; r++)
-    small = fmax(small, CONTACT_ROUNDING * of->speed[r]);
+    in.scale = fmax(in.scale, of->speed[r]);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
-    int count = 0;
-    takes_part[k] = CONTACTS[k].normal >= 0 && (k == contact || closed[k]);
+    in.is_free[k] = CONTACTS[k].normal < 0 || !(k == contact || closed[k]);
     if (k != contact)
-      option[k][count++] = CONTACT_IS_OPEN;
-    if (takes_part[k] && CONTACTS[k].slips > 0) {
-      option[k][count++] = CONTACT_STICKS;
-      option[k][count++] = CONTACT_SLIPS[CONTACTS[k].slips == 2 ? 1 : 2];
-      if (CONTACTS[k].slips == 1)
-        option[k][count++] = CONTACT_SLIPS[0];
-    } else if (takes_part[k]) {
-      option[k][count++] = CONTACT_SLIPS[1];
-    }
-    options[k] = count;
+      add_option(&in, k, CONTACT_IS_OPEN);
+    if (!in.is_free[k] && CONTACTS[k].slips > 0)
+      add_options_at_rest(&in, k);
+    else if (!in.is_free[k])
+      add_option(&in, k, CONTACT_SLIPS[1]);
   }
-  while (more) {
-    for (int k = 0; k < EVENT_CONTACTS; k++)
-      mode[k] = option[k][place[k]];
-    list_beginning(mode, takes_part, begins);
-    if (find_directions(of, begins, right, mode) && solve_contacts(of, mode, right, impulse, after) &&
-        obeys(of, mode, takes_part, impulse, after, small))
-      return 1;
-    more = 0;
-    for (int k = EVENT_CONTACTS - 1; k >= 0 && !more; k--) {
-      place[k] = (place[k] + 1) % options[k];
-      more = place[k] > 0;
-    }
-  }
-  return 0;
+  if (are_few(&in) && enumerate_modes(&in, mode))
+    return is_consistent(&in, mode, impulse, after);
+  memset(impulse, 0, BYTES(CONTACT_ROWS));
+  return relax_modes(&in, impulse, mode) && is_consistent(&in, mode, impulse, after);
 }
 
 /* Adds to the impulses of a compression those of a restitution, with e times its normal impulse in the friction cone
@@ -608,11 +828,8 @@ static int find_impulses(const event_step *step, const contact_terms *of, const 
   for (int round = 0; round < CONTACT_IMPACTS * EVENT_CONTACTS; round++) {
     real rate[CONTACT_ROWS], impulse[CONTACT_ROWS];
     int meets = -1;
-    for (int r = 0; r < CONTACT_ROWS; r++) {
-      rate[r] = of->rate[r];
-      for (int j = 0; j < CONTACT_ROWS; j++)
-        rate[r] += of->W[r * CONTACT_ROWS + j] * total[j];
-    }
+    for (int r = 0; r < CONTACT_ROWS; r++)
+      rate[r] = rate_after(of, of->rate, total, r);
     for (int k = EVENT_CONTACTS - 1; k >= 0; k--)
       if (approaches[k] && rate[CONTACTS[k].normal] < -CONTACT_ROUNDING * of->speed[CONTACTS[k].normal])
         meets = k;
@@ -632,10 +849,7 @@ static real gain_of(const contact_terms *of, const real *impulse)
 {
   real gain = 0.0, size = 0.0;
   for (int r = 0; r < CONTACT_ROWS; r++) {
-    real change = of->rate[r];
-    for (int j = 0; j < CONTACT_ROWS; j++)
-      change += 0.5 * of->W[r * CONTACT_ROWS + j] * impulse[j];
-    gain += impulse[r] * change;
+    gain += 0.5 * impulse[r] * (of->rate[r] + rate_after(of, of->rate, impulse, r));
     size += impulse[r] * of->rate[r];
   }
   return size != 0.0 ? gain / fabs(size) : 0.0;
@@ -700,44 +914,27 @@ static int stops_at(const event_step *step, const contact_terms *of, int k)
   return CONTACTS[k].slips == 1 || length_of(of->rate + CONTACTS[k].tangential, 2) <= CONTACT_SLOW * speed;
 }
 
-/* Directions of slips in space that begin, against the forces while they stuck. */
-static void find_toward(const event_step *step, const contact_terms *of, contact_change *now)
-{
-  contact_mode mode[EVENT_CONTACTS];
-  real force[CONTACT_ROWS], second[CONTACT_ROWS];
-  for (int k = 0; k < EVENT_CONTACTS; k++) {
-    mode[k] = mode_of(step, k);
-    for (int i = 0; i < 2 && CONTACTS[k].slips == 2 && mode[k].closed && !mode[k].sticks; i++)
-      mode[k].direction[i] = of->rate[CONTACTS[k].tangential + i] / length_of(of->rate + CONTACTS[k].tangential, 2);
-  }
-  if (!solve_contacts(of, mode, of->second, force, second))
-    return;
-  for (int k = 0; k < EVENT_CONTACTS; k++) {
-    const real *const tau = force + CONTACTS[k].tangential;
-    for (int i = 0; i < CONTACTS[k].slips; i++)
-      now->toward[k][i] = -tau[i] / length_of(tau, CONTACTS[k].slips);
-  }
-}
-
 /* Impacts and new modes at a state, which is projected onto their constraints. */
 static int change_modes(const event_step *step, event_sample *at, contact_change *now)
 {
   contact_terms of;
-  int closed[EVENT_CONTACTS], approach = 0, slips = 0, status = terms_at(step, at, &of);
+  contact_mode present[EVENT_CONTACTS];
+  real force[CONTACT_ROWS];
+  int closed[EVENT_CONTACTS], approach = 0, status = terms_at(step, at, &of);
   for (int k = 0; k < EVENT_CONTACTS; k++) {
-    const contact_mode mode = mode_of(step, k);
+    const contact_mode mode = mode_of(step->watch->mode, k);
     closed[k] = CONTACTS[k].normal >= 0 && mode.closed && !now->leaves[k];
     now->touches[k] |= closed[k];
-    now->rests[k] = (mode.sticks || (now->stops[k] && stops_at(step, &of, k))) && !now->begins[k];
-    slips |= now->begins[k] && CONTACTS[k].slips == 2;
+    now->rests[k] = mode.sticks || (mode.closed && mode.held) || (now->stops[k] && stops_at(step, &of, k));
+    now->rests[k] &= !now->begins[k];
     approach |= now->closes[k] && !now->leaves[k] && of.rate[CONTACTS[k].normal] < 0.0;
   }
-  if (status == OK && slips)
-    find_toward(step, &of, now);
+  if (status == OK)
+    forces_at(at->t, at->q, at->p, step->own, present, force, step->workspace);
   if (status == OK && approach)
     status = collide(step, at, &of, closed, now);
   if (status == OK)
-    status = choose_modes(step, &of, now);
+    status = choose_modes(step, &of, now, force);
   return status == OK ? satisfy_constraints(step, at->t, at->q, at->p, 1) : status;
 }
 
@@ -867,25 +1064,26 @@ static int follow_slips(const event_step *step, const event_sample *at, real *lo
   real force[CONTACT_ROWS], second[CONTACT_ROWS];
   int slips = 0, status;
   *longest = INFINITY;
-  for (int k = 0; k < EVENT_CONTACTS; k++)
-    slips |= CONTACTS[k].slips == 2 && step->watch->mode[CONTACTS[k].direction] != 0.0;
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    mode[k] = mode_of(step->watch->mode, k);
+    slips |= CONTACTS[k].slips == 2 && step->watch->mode[CONTACTS[k].direction] != 0.0 && !mode[k].held;
+  }
   status = slips ? terms_at(step, at, &of) : OK;
   if (!slips || status != OK)
     return status;
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const real *const w = of.rate + CONTACTS[k].tangential;
     const real *const start = step->watch->mode + CONTACTS[k].direction + 1;
-    mode[k] = mode_of(step, k);
-    for (int i = 0; i < 2 && CONTACTS[k].slips == 2 && mode[k].closed && !mode[k].sticks; i++)
+    for (int i = 0; i < 2 && CONTACTS[k].slips == 2 && mode[k].closed && !mode[k].sticks && !mode[k].held; i++)
       mode[k].direction[i] = keeps_direction(start, w) ? start[2 + i] : w[i] / length_of(w, 2);
   }
-  if (!solve_contacts(&of, mode, of.second, force, second))
+  if (!solve_contacts(&of, mode, of.second, force, second, NULL))
     return OK;
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int slip = CONTACTS[k].tangential;
     real *const start = step->watch->mode + CONTACTS[k].direction + 1, *const ahead = start + 2;
     const real *const w = of.rate + slip, size = CONTACTS[k].slips == 2 ? length_of(w, 2) : 0.0;
-    if (CONTACTS[k].slips < 2 || start[-1] == 0.0)
+    if (CONTACTS[k].slips < 2 || start[-1] == 0.0 || mode[k].held)
       continue;
     const real *const d = mode[k].direction, rate = d[0] * second[slip] + d[1] * second[slip + 1];
     const int keeps = keeps_direction(start, w);

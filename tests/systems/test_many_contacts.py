@@ -1,0 +1,190 @@
+"""Many and redundant contacts: boxes on two corners, stacks, tables on four legs, balls, chains."""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
+
+import scvi_codegen as sc
+
+pytestmark = pytest.mark.second
+G, HEIGHT, WIDTH = 9.81, 0.2, 0.5
+INERTIA = (HEIGHT**2 + WIDTH**2) / 3
+
+
+def corners(*, base: str = "", **friction: Any) -> list[Any]:
+    """Return the contacts of the lower corners of a box of half sizes WIDTH, HEIGHT with its floor."""
+    return [
+        sc.contact(
+            f"y - {HEIGHT}*cos(a) {e:+}*{WIDTH}*sin(a)",
+            slip=f"x_dot + a_dot*({HEIGHT}*cos(a) {-e:+}*{WIDTH}*sin(a)){base}",
+            **friction,
+        )
+        for e in (-1, 1)
+    ]
+
+
+@cache
+def box(force: str = "0", base: str = "", **friction: float) -> Any:
+    """Return the stepper of a box of mass 1 on a slope s."""
+    system = sc.LagrangianSystem.from_text(
+        "box",
+        ["x", "y", "a"],
+        f"(x_dot**2 + y_dot**2)/2 + {INERTIA}*a_dot**2/2 - {G}*(y*cos(s) - x*sin(s))",
+        forces={"x": force} if force != "0" else None,
+        parameters={"s": 0.0},
+        contacts=corners(base=base, **friction),
+    )
+    return sc.compile_stepper(system, "svi:3")
+
+
+def rests(stepper: Any, t_end: float, **parameters: float) -> Any:
+    return stepper.integrate([0, HEIGHT, 0], velocity=[0, 0, 0], h=0.05, t_end=t_end, parameters=parameters)
+
+
+@pytest.mark.filterwarnings("ignore:the contacts depend")
+def test_a_box_on_a_slope_creeps_nowhere_and_slides_by_its_closed_form() -> None:
+    stepper = box(friction=0.5)
+    run = rests(stepper, 10.0, s=np.deg2rad(20))
+    assert np.abs(run.q - run.q[0]).max() < 1e-15
+    assert run.contact_modes == [(0.0, ("stick", "stick"))]
+    forces = run.contact_forces()[-1]
+    assert forces.sum(axis=0) == pytest.approx([G * np.cos(np.deg2rad(20)), -G * np.sin(np.deg2rad(20))])
+    assert forces[:, 1] / forces[:, 0] == pytest.approx([-np.tan(np.deg2rad(20))] * 2)  # in proportion to the limits
+    with pytest.warns(sc.EventWarning, match="not unique"):
+        run.contact_forces()
+    slides = rests(stepper, 1.0, s=np.deg2rad(35))
+    a = G * (np.sin(np.deg2rad(35)) - 0.5 * np.cos(np.deg2rad(35)))
+    assert slides.velocity[-1] == pytest.approx([a, 0, 0], abs=1e-13)
+
+
+@pytest.mark.parametrize(("kinetic", "static"), [(0.5, 0.5), (0.4, 0.5)])
+def test_a_pushed_box_slips_where_both_corners_together_hold_it_no_longer(kinetic: float, static: float) -> None:
+    run = rests(box(f"{0.5 * G / 0.97}*t", friction=kinetic, static_friction=static), 1.2)
+    assert run.contact_modes == [(0.0, ("stick", "stick")), (pytest.approx(0.97, abs=1e-12), ("slip", "slip"))]
+    after = 1.2 - 0.97
+    moves = (0.5 - kinetic) * G * after**2 / 2 + 0.5 * G / 0.97 * after**3 / 6
+    assert run.q[-1] == pytest.approx([moves, HEIGHT, 0], abs=1e-12)
+
+
+def test_a_box_on_a_shaken_base_slips_where_mu_g_is_its_acceleration() -> None:
+    run = rests(box(base=f" - {0.5 * G / 0.97}*t**2/2", friction=0.5), 1.2)
+    assert run.contact_modes[1] == (pytest.approx(0.97, abs=1e-12), ("slip", "slip"))
+    assert run.q[-1, 0] == pytest.approx(0.5 * G * (0.97**2 / 6 + 0.97 / 2 * 0.23 + 0.23**2 / 2), abs=1e-12)
+
+
+def test_a_box_tips_where_the_force_leaves_its_base() -> None:
+    rate = G * WIDTH / HEIGHT / 0.97
+    run = rests(box(f"{rate}*t", friction=5.0), 1.2)
+    assert run.contact_modes == [(0.0, ("stick", "stick")), (pytest.approx(0.97, abs=1e-12), ("open", "stick"))]
+
+    def lifted(t: float, state: NDArray[Any]) -> list[float]:
+        """Turn about the right corner, at which a body-fixed point (WIDTH, -HEIGHT) is at rest."""
+        a, w = state
+        x, y = WIDTH * np.cos(a) + HEIGHT * np.sin(a), WIDTH * np.sin(a) - HEIGHT * np.cos(a)
+        return [w, (G * x + rate * t * y) / (INERTIA + HEIGHT**2 + WIDTH**2)]
+
+    true = solve_ivp(lifted, (0.97, 1.2), [0.0, 0.0], "DOP853", rtol=1e-12, atol=1e-14).y[:, -1]
+    assert run.q[-1, 2] == pytest.approx(true[0], abs=1e-8)
+
+
+def test_a_stack_of_two_boxes_is_carried_and_slips_above() -> None:
+    """The upper box slips on the lower one, which sticks, where mu g is the force on it."""
+    upper = [
+        sc.contact(
+            f"Y - {HEIGHT}*cos(A) {e:+}*{WIDTH}*sin(A) - y - {HEIGHT}",
+            slip=f"X_dot + A_dot*{HEIGHT} - x_dot + a_dot*{HEIGHT}",
+            friction=0.3,
+        )
+        for e in (-1, 1)
+    ]
+    system = sc.LagrangianSystem.from_text(
+        "stack",
+        ["x", "y", "a", "X", "Y", "A"],
+        f"(x_dot**2 + y_dot**2 + X_dot**2 + Y_dot**2)/2 + {INERTIA}*(a_dot**2 + A_dot**2)/2 - {G}*(y + Y)",
+        forces={"X": f"{0.3 * G / 0.97}*t"},
+        contacts=[*corners(friction=0.5), *upper],
+    )
+    run = sc.compile_stepper(system, "svi:2").integrate(
+        [0, HEIGHT, 0, 0, 3 * HEIGHT, 0], velocity=np.zeros(6), h=0.05, t_end=1.2
+    )
+    assert run.contact_modes[1] == (pytest.approx(0.97, abs=1e-9), ("stick", "stick", "slip", "slip"))
+    assert run.q[-1] == pytest.approx([0, HEIGHT, 0, 0.3 * G / 0.97 * 0.23**3 / 6, 3 * HEIGHT, 0], abs=1e-9)
+
+
+LEGS = [(0.5, 0.4), (0.5, -0.4), (-0.5, 0.4), (-0.5, -0.4)]
+TOP = 0.7
+
+
+@cache
+def table(friction: float) -> Any:
+    """Return the stepper of a table of mass 1 with friction at four legs, for small angles."""
+    system = sc.LagrangianSystem.from_text(
+        "table",
+        ["x", "y", "z", "a", "b", "c"],
+        f"(x_dot**2 + y_dot**2 + z_dot**2)/2 + 0.1*(a_dot**2 + b_dot**2 + c_dot**2) - {G}*z",
+        parameters={"F": 0.0, "E": 0.0, "K": 0.0},
+        forces={"x": "F*t", "y": "E*t", "c": "K*t"},
+        contacts=[
+            sc.contact(
+                f"z - {TOP} {Y:+}*a {-X:+}*b",
+                slip=[f"x_dot {-TOP:+}*b_dot {-Y:+}*c_dot", f"y_dot {TOP:+}*a_dot {X:+}*c_dot"],
+                friction=friction,
+            )
+            for X, Y in LEGS
+        ],
+    )
+    return sc.compile_stepper(system, "svi:2")
+
+
+@pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.6, 0.8, 0.0), (0.0, 0.0, 1.0)])
+def test_a_table_on_four_legs_slips_at_the_sum_of_the_limits(direction: tuple[float, ...]) -> None:
+    mu, arm, inertia = 0.3, np.hypot(*LEGS[0]), 0.2
+    x, y, turn = np.array(direction) * mu * G / 0.97
+    parameters = {"F": x, "E": y, "K": turn * arm}
+    run = table(mu).integrate([0, 0, TOP, 0, 0, 0], velocity=np.zeros(6), h=0.05, t_end=1.2, parameters=parameters)
+    assert run.contact_modes[1:] == [(pytest.approx(0.97, abs=1e-9), ("slip",) * 4)]
+    moves = np.array([x, y, 0, 0, 0, turn * arm / inertia]) * 0.23**3 / 6
+    assert run.q[-1] - [0, 0, TOP, 0, 0, 0] == pytest.approx(moves, abs=1e-8)
+    with pytest.warns(sc.EventWarning, match="not unique"):
+        assert run.contact_forces()[0, :, 0] == pytest.approx([G / 4] * 4)
+
+
+def test_a_table_on_four_legs_tips() -> None:
+    start = {"velocity": np.zeros(6), "h": 0.05, "t_end": 1.1, "parameters": {"F": G * 0.5 / TOP / 0.97}}
+    run = table(1.5).integrate([0, 0, TOP, 0, 0, 0], **start)
+    assert run.contact_modes[1] == (pytest.approx(0.97, abs=1e-9), ("stick", "stick", "open", "open"))
+
+
+def test_balls_close_at_once_by_one_formula() -> None:
+    floor = sc.contact("y[i] for i in 12", slip="x_dot[i]", friction="mu[i]")
+    text, mu = "sum(i in 12, (x_dot[i]**2 + y_dot[i]**2)/2 - 9.81*y[i])", 0.01 * np.arange(1, 13)
+    system = sc.LagrangianSystem.from_text(
+        "balls", ["x[12]", "y[12]"], text, parameters={"mu[12]": mu}, contacts=[floor]
+    )
+    run = sc.compile_stepper(system, "svi:2").integrate(
+        [0] * 12 + [1] * 12, velocity=[1] * 12 + [0] * 12, h=0.05, t_end=12
+    )
+    v = 1 - mu * np.sqrt(2 * G)
+    assert run.contact_modes[-1][1] == ("stick",) * 12
+    assert run.q[-1, :12] == pytest.approx(np.sqrt(2 / G) + v**2 / (2 * mu * G), abs=1e-12)
+
+
+def test_five_balls_of_a_cradle_at_rest_contact() -> None:
+    contacts = [sc.contact("x[i+1] - x[i] - 1 for i in 4", restitution=1)]
+    system = sc.LagrangianSystem.from_text("cradle", ["x[5]"], "sum(i in 5, x_dot[i]**2)/2", contacts=contacts)
+    run = sc.compile_stepper(system, "svi:2").integrate([-1, 1, 2, 3, 4], velocity=[1, 0, 0, 0, 0], h=0.1, t_end=2)
+    assert run.velocity[-1] == pytest.approx([0, 0, 0, 0, 1], abs=1e-14)
+
+
+def test_loops_are_checked() -> None:
+    named = sc.LagrangianSystem.from_text("named", ["y"], "y_dot**2/2 - y", contacts=[sc.contact("y[i] for i in 2")])
+    with pytest.raises(sc.SystemDefinitionError, match=r"declare coordinates as arrays"):
+        sc.compile_stepper(named, "svi:2")
+    with pytest.raises(sc.SystemDefinitionError, match=r"require known sizes"):
+        sc.LagrangianSystem.from_text(
+            "sizes", ["y[N]"], "sum(i in N, y_dot[i]**2)/2", contacts=[sc.contact("y[i] for i in N")]
+        )
