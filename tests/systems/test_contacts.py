@@ -551,8 +551,8 @@ def test_derivations_show_the_modes_of_contacts() -> None:
     assert "momentum of x" not in text
     assert [str(row.residual) for row in derived.equations[-4:]] == [
         "Q_1_y*contact_1_closed*w_2/(2*h) + h*lambda_0_1*w_1*(1 - contact_1_closed)",
-        "contact_1_sticks*(2*L_1_0*x_k/h + 2*L_1_1*Q_1_x/h) + h*lambda_0_2*w_1*(1 - contact_1_sticks)",
+        "contact_1_sticks_1*(2*L_1_0*x_k/h + 2*L_1_1*Q_1_x/h) + h*lambda_0_2*w_1*(1 - contact_1_sticks_1)",
         "contact_1_closed*v_1_y + h*lambda_1_1*w_2*(1 - contact_1_closed)",
-        "contact_1_sticks*v_1_x + h*lambda_1_2*w_2*(1 - contact_1_sticks)",
+        "contact_1_sticks_1*v_1_x + h*lambda_1_2*w_2*(1 - contact_1_sticks_1)",
     ]
     assert "contact 1: gap = y" in derivation_html(system, sc.SVI(1, "gauss-lobatto:2"))
