@@ -88,6 +88,8 @@ SITUATIONS = {
     "with contacts": lambda: sc.compile_stepper(
         sc.LagrangianSystem.from_text("body", ["q"], "q_dot**2/2 - q"), "svi:2", contacts=[sc.contact("q + 1")]
     ),
+    "with kinks that runs locate": lambda: stepper_of(lagrangian="q_dot**2/2 - q**2/2 - positive_part(q - 0.25)**2"),
+    "where L or H jumps": lambda: stepper_of(lagrangian="q_dot**2/2 - q**2/2 - unit_step(q - 0.25)"),
     "with constraints of arrays": lambda: array_with_constraint("stoermer-verlet"),
     "with constraints of arrays by a composition": lambda: array_with_constraint("composition:4"),
     "with constraints that prescribe the motion": lambda: stepper_of(
