@@ -797,7 +797,7 @@ static int restitute(const contact_terms *of, int contact, const int *closed, co
 {
   const int normal = CONTACTS[contact].normal;
   const real goal = of->coefficient[3 * contact + 2] * impulse[normal];
-  real after[CONTACT_ROWS], added[CONTACT_ROWS], low = 0.0, of_low = 0.0;
+  real after[CONTACT_ROWS], added[CONTACT_ROWS] = {0.0}, low = 0.0, of_low = 0.0;
   real high = -of->coefficient[3 * contact + 2] * rate[normal];
   int exists = 1, differs = goal > 0.0;
   for (int r = 0; r < CONTACT_ROWS; r++) {

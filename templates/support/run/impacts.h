@@ -152,7 +152,7 @@ static int solve_impulse(const event_step *step, const event_sample *at, const e
     real after, real toward, real *lambda, int *passes)
 {
   real *const v = step->memory + 3 * M;
-  real rate, mean, now = after, size = fabs(after), last = INFINITY;
+  real rate, mean = 0.0, now = after, size = fabs(after), last = INFINITY;
   int status = approach(step, at, wall, *lambda, v, &rate);
   *passes = 1;
   for (int k = 0; status == OK && k < CHANGE_ITERATIONS; k++) {
