@@ -115,9 +115,10 @@ def verify(
     system = discretised_form(system, method)
     stepper = stepper or _compiled(system, method, solver=solver)
     if stepper.interface.mode_names:
+        remedy = 'omit stepper, or compile it with kinks="as formulas"'
         raise StateError(
-            f"{stepper!r} changes its modes along runs, of kinks or contacts: measured are the formulas of one step. "
-            'Omit stepper, or compile it with kinks="as formulas"; omit contacts'
+            f"{stepper!r} changes its modes along runs, and one step of one formula is measured: "
+            f"{'omit the contacts' if stepper.interface.contacts else remedy}"
         )
     start = _initial_state(system, stepper, q, p, h, t)
     return _certificate(system, method, stepper, start, began, solver=solver, tolerance=tolerance)
