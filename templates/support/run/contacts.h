@@ -444,8 +444,10 @@ static void add_options(contact_problem *in, int k, const contact_change *now)
       (at->normal >= 0 && !now->touches[k] &&
           (of->value[at->normal] > CONTACT_ROUNDING * of->size[at->normal] ||
               of->rate[at->normal] > CONTACT_ROUNDING * of->speed[at->normal]));
-  if (in->is_free[k])
+  if (in->is_free[k]) {
+    in->rests[k] = 0;
     return;
+  }
   in->begins[k] = now->begins[k];
   if (at->slips == 0 || now->begins[k]) {
     add_option(in, k, CONTACT_SLIPS[at->slips == 1 ? 1 + now->begins[k] : 1]);
