@@ -29,6 +29,10 @@ enum {
 
 #define CONTACT_ROUNDING 1e-10 /* part of their size below which gaps, rates and forces count as 0 */
 #define CONTACT_SLOW 1e-6 /* part of its size below which the direction of a slip in space is kept */
+#define CONTACT_BEGIN 1e-6 /* first part of a slip in space, relative to a step; the next ones .. */
+#define CONTACT_ANGLE 1e-4 /* .. turn by less, .. */
+#define CONTACT_STIFF 2e-2 /* .. until its rate relative to that by its friction reaches this, .. */
+#define CONTACT_GENTLE 0.1 /* .. and if it is below this one */
 #define CONTACT_BRAKES 0.25 /* longest part of a step relative to the time to a stop of a slip in space .. */
 #define CONTACT_GROWS 0.3 /* .. and relative to that since its beginning */
 #define CONTACT_PENETRATION 1e-9 /* part of its size by which a gap may be negative at a start */
@@ -755,8 +759,10 @@ static int choose_modes(const event_step *step, const contact_terms *of, const c
     for (int j = 0; j < CONTACT_ROWS && slip >= 0; j++)
       speed += fabs(of->W[slip * CONTACT_ROWS + j] * force[j] * step->whole);
     put_mode(CONTACTS + k, best[k], is_slow || slip < 0 ? AT_REST : of->rate + slip, speed, step->watch->mode);
-    if (is_slow)
+    if (is_slow) {
       step->watch->fastest[k] = fmax(step->watch->fastest[k], speed);
+      step->watch->first[k] = CONTACT_BEGIN * fabs(step->whole);
+    }
   }
   put_modes(step->watch->mode, step->own);
   return OK;
@@ -1054,6 +1060,28 @@ static int keeps_direction(const real *start, const real *w)
   return length_of(start, 2) > length_of(w, 2) * length_of(w, 2);
 }
 
+/* Present modes with the directions of slips in space, and the forces and second rates in them; whether there are
+ * such slips with forces. */
+static int slips_at(const event_step *step, const event_sample *at, contact_terms *of, contact_mode *mode, real *force,
+    real *second, int *status)
+{
+  int slips = 0;
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    mode[k] = mode_of(step->watch->mode, k);
+    slips |= CONTACTS[k].slips == 2 && step->watch->mode[CONTACTS[k].direction] != 0.0 && !mode[k].held;
+  }
+  *status = slips ? terms_at(step, at, of) : OK;
+  if (!slips || *status != OK)
+    return 0;
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const real *const w = of->rate + CONTACTS[k].tangential;
+    const real *const start = step->watch->mode + CONTACTS[k].direction + 1;
+    for (int i = 0; i < 2 && CONTACTS[k].slips == 2 && mode[k].closed && !mode[k].sticks && !mode[k].held; i++)
+      mode[k].direction[i] = keeps_direction(start, w) ? start[2 + i] : w[i] / length_of(w, 2);
+  }
+  return solve_contacts(of, mode, of->second, force, second, NULL);
+}
+
 /* Slips in space at the beginning of a part of a step. Solutions are not smooth where they stop, and steps do not
  * resolve where they begin: the direction of slow ones is kept, and steps are in proportion to |w|/|w'|, at most
  * *longest. The direction `ahead` of others is renewed after a turn. */
@@ -1062,23 +1090,10 @@ static int follow_slips(const event_step *step, const event_sample *at, real *lo
   contact_terms of;
   contact_mode mode[EVENT_CONTACTS];
   real force[CONTACT_ROWS], second[CONTACT_ROWS];
-  int slips = 0, status;
+  int status;
   *longest = INFINITY;
-  for (int k = 0; k < EVENT_CONTACTS; k++) {
-    mode[k] = mode_of(step->watch->mode, k);
-    slips |= CONTACTS[k].slips == 2 && step->watch->mode[CONTACTS[k].direction] != 0.0 && !mode[k].held;
-  }
-  status = slips ? terms_at(step, at, &of) : OK;
-  if (!slips || status != OK)
+  if (!slips_at(step, at, &of, mode, force, second, &status))
     return status;
-  for (int k = 0; k < EVENT_CONTACTS; k++) {
-    const real *const w = of.rate + CONTACTS[k].tangential;
-    const real *const start = step->watch->mode + CONTACTS[k].direction + 1;
-    for (int i = 0; i < 2 && CONTACTS[k].slips == 2 && mode[k].closed && !mode[k].sticks && !mode[k].held; i++)
-      mode[k].direction[i] = keeps_direction(start, w) ? start[2 + i] : w[i] / length_of(w, 2);
-  }
-  if (!solve_contacts(&of, mode, of.second, force, second, NULL))
-    return OK;
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int slip = CONTACTS[k].tangential;
     real *const start = step->watch->mode + CONTACTS[k].direction + 1, *const ahead = start + 2;
@@ -1090,9 +1105,12 @@ static int follow_slips(const event_step *step, const event_sample *at, real *lo
     real *const fastest = step->watch->fastest + k;
     *fastest = fmax(*fastest, fmax(size, of.speed[slip]));
     const real slow = CONTACT_SLOW * *fastest;
-    const int is_slow = rate < 0.0 && size <= slow, is_released = keeps && size > slow;
+    const real friction = length_of(force + slip, 2) * of.W[slip * (CONTACT_ROWS + 1)];
+    const real until_slow = rate > 0.0 ? 2.0 * slow / rate : INFINITY;
+    const int is_slow = rate < 0.0 && size <= slow, is_gentle = fabs(rate) < CONTACT_STIFF * friction;
+    const int is_released = keeps && !is_gentle && size > slow;
     if (keeps && !is_released)
-      *longest = fmin(*longest, rate > 0.0 ? 2.0 * slow / rate : INFINITY);
+      *longest = fmin(*longest, is_gentle ? step->watch->first[k] : until_slow);
     else if (!is_slow)
       *longest = fmin(*longest, (rate < 0.0 ? CONTACT_BRAKES : CONTACT_GROWS) * size / fabs(rate));
     const int turns = ahead[0] * w[0] + ahead[1] * w[1] < CONTACT_TURN * size;
@@ -1108,5 +1126,54 @@ static int follow_slips(const event_step *step, const event_sample *at, real *lo
   }
   put_modes(step->watch->mode, step->own);
   return status;
+}
+
+/* Turns slips in space that begin slowly at the end of a part. Where w' = W (s - mu N w/|w|) is small, w relaxes to the
+ * direction of s, opposite to the friction that would stop it, in a time of |w|/(mu N), too short for steps at first:
+ * impulses of the imposed rows turn it, with its component in the former direction. */
+static int turn_slips(const event_step *step, event_sample *at, int *turned)
+{
+  contact_terms of;
+  contact_mode mode[EVENT_CONTACTS];
+  real force[CONTACT_ROWS], second[CONTACT_ROWS], right[CONTACT_ROWS] = {0.0};
+  int turns[EVENT_CONTACTS] = {0}, released[EVENT_CONTACTS], status;
+  if (!slips_at(step, at, &of, mode, force, second, &status))
+    return status;
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const int slip = CONTACTS[k].tangential;
+    const real *const d = mode[k].direction, *const start = step->watch->mode + CONTACTS[k].direction + 1;
+    if (CONTACTS[k].slips < 2 || start[-1] == 0.0 || mode[k].held || !keeps_direction(start, of.rate + slip))
+      continue;
+    const real rate = d[0] * second[slip] + d[1] * second[slip + 1];
+    const real friction = length_of(force + slip, 2) * of.W[slip * (CONTACT_ROWS + 1)];
+    turns[k] = rate > -CONTACT_STIFF * friction && rate < CONTACT_GENTLE * friction;
+    released[k] = rate >= CONTACT_STIFF * friction;
+    mode[k] = turns[k] ? CONTACT_STICKS : mode[k];
+    *turned |= turns[k];
+  }
+  if (!*turned || !solve_contacts(&of, mode, of.second, force, second, NULL))
+    return OK;
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const real *const tau = force + CONTACTS[k].tangential, *const w = of.rate + CONTACTS[k].tangential;
+    real *const start = step->watch->mode + CONTACTS[k].direction + 1, *const ahead = start + 2;
+    const real load = turns[k] ? length_of(tau, 2) : 0.0, size = length_of(start, 2);
+    mode[k].direction[0] = mode[k].direction[1] = 0.0; /* friction of others has no impulse */
+    if (!turns[k])
+      continue;
+    const real part = (w[0] * ahead[0] + w[1] * ahead[1]) / (tau[0] * ahead[0] + tau[1] * ahead[1]);
+    const real angle = fabs(tau[0] * ahead[1] - tau[1] * ahead[0]) / load;
+    step->watch->first[k] *= fmin(2.0, CONTACT_ANGLE / fmax(angle, DBL_MIN));
+    for (int i = 0; i < 2; i++) {
+      right[CONTACTS[k].tangential + i] = w[i] - part * tau[i];
+      ahead[i] = -tau[i] / load;
+      start[i] = released[k] ? 0.0 : size * ahead[i];
+    }
+  }
+  put_modes(step->watch->mode, step->own);
+  if (solve_contacts(&of, mode, right, force, second, NULL))
+    for (int r = 0; r < CONTACT_ROWS; r++)
+      for (int i = 0; i < M; i++)
+        at->p[i] += of.G[r * M + i] * force[r];
+  return add_change(step, FIRST_TRANSITION, at);
 }
 #endif
