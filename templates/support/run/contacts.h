@@ -1074,6 +1074,14 @@ static int slips_at(const event_step *step, const event_sample *at, contact_term
   return solve_contacts(of, mode, of->second, force, second, NULL);
 }
 
+/* Whether a slip in space begins at a rate that is small relative to that by its friction. */
+static int is_gentle(const event_step *step, const contact_terms *of, int k, const real *force, real rate)
+{
+  const int slip = CONTACTS[k].tangential;
+  const real by_friction = length_of(force + slip, 2) * of->W[slip * (CONTACT_ROWS + 1)];
+  return step->watch->first[k] > 0.0 && rate > -CONTACT_ROUNDING * by_friction && rate < CONTACT_STIFF * by_friction;
+}
+
 /* Slips in space at the beginning of a part of a step. Solutions are not smooth where they stop, and steps do not
  * resolve where they begin: the direction of slow ones is kept, and steps are in proportion to |w|/|w'|, at most
  * *longest. The direction `ahead` of others is renewed after a turn. */
@@ -1097,12 +1105,11 @@ static int follow_slips(const event_step *step, const event_sample *at, real *lo
     real *const fastest = step->watch->fastest + k;
     *fastest = fmax(*fastest, fmax(size, of.speed[slip]));
     const real slow = CONTACT_SLOW * *fastest;
-    const real friction = length_of(force + slip, 2) * of.W[slip * (CONTACT_ROWS + 1)];
     const real until_slow = rate > 0.0 ? 2.0 * slow / rate : INFINITY;
-    const int is_slow = rate < 0.0 && size <= slow, is_gentle = fabs(rate) < CONTACT_STIFF * friction;
-    const int is_released = keeps && !is_gentle && size > slow;
+    const int begins = keeps && is_gentle(step, &of, k, force, rate);
+    const int is_slow = rate < 0.0 && size <= slow, is_released = keeps && !begins && size > slow;
     if (keeps && !is_released)
-      *longest = fmin(*longest, is_gentle ? step->watch->first[k] : until_slow);
+      *longest = fmin(*longest, begins ? step->watch->first[k] : until_slow);
     else if (!is_slow)
       *longest = fmin(*longest, (rate < 0.0 ? CONTACT_BRAKES : CONTACT_GROWS) * size / fabs(rate));
     const int turns = ahead[0] * w[0] + ahead[1] * w[1] < CONTACT_TURN * size;
@@ -1136,8 +1143,7 @@ static int turn_slips(const event_step *step, event_sample *at, int *turned)
     const real *const d = mode[k].direction, *const start = step->watch->mode + CONTACTS[k].direction + 1;
     if (CONTACTS[k].slips < 2 || start[-1] == 0.0 || mode[k].held || !keeps_direction(start, of.rate + slip))
       continue;
-    const real rate = d[0] * second[slip] + d[1] * second[slip + 1];
-    turns[k] = fabs(rate) < CONTACT_STIFF * length_of(force + slip, 2) * of.W[slip * (CONTACT_ROWS + 1)];
+    turns[k] = is_gentle(step, &of, k, force, d[0] * second[slip] + d[1] * second[slip + 1]);
     mode[k] = turns[k] ? CONTACT_STICKS : mode[k];
     *turned |= turns[k];
   }
