@@ -343,6 +343,23 @@ def test_slip_on_a_shaken_table_begins_against_the_force(steps: dict[str, float]
     assert np.abs(np.concatenate([run.q[-1, :2], run.velocity[-1, :2]]) - true).max() < 2e-8
 
 
+@pytest.mark.second
+@pytest.mark.parametrize("at_rest", [0.3, 0.301, 0.306])
+@pytest.mark.parametrize("steps", [{"h": 0.05}, {"h": 0.0125}, {}])
+def test_slip_in_space_begins_without_a_jump_of_friction(steps: dict[str, float], at_rest: float) -> None:
+    block = sc.contact("z", slip=["x_dot", "y_dot"], friction=0.3, static_friction="at_rest")
+    text = "(x_dot**2 + y_dot**2 + z_dot**2)/2 - 9.81*z + 2*x*t + y*sin(t)"
+    stepper = of(text, "x y z", [block], "svi:3", at_rest=at_rest)
+    run = stepper.integrate([1, 2, 0], velocity=[0, 0, 0], t_end=3, **steps)
+    begins = brentq(lambda t: np.hypot(2 * t, np.sin(t)) - at_rest * 9.81, 1.0, 2.0, xtol=1e-15)
+    assert run.contact_modes == [(0, ("stick",)), (pytest.approx(begins, abs=1e-13), ("slip",))]
+    rates = of_sliding(lambda t: (np.array([2 * t, np.sin(t)]), 0.3 * 9.81), lambda t: np.zeros(2))
+    first = [1, 2, 2e-13 * begins, 1e-13 * np.sin(begins)]
+    true = solve_ivp(rates, (begins, 3), first, "Radau", rtol=1e-11, atol=1e-15).y[:, -1]
+    assert np.abs(np.concatenate([run.q[-1, :2], run.velocity[-1, :2]]) - true).max() < 1e-8
+    assert np.abs(run.q[:, 2]).max() < 1e-14
+
+
 TURNS = sc.LagrangianSystem.from_text(
     "turns", ["z"], "z_dot**2 + omega_1**2 + omega_2**2 + omega_3**2 - z", rotations={"R": "omega"}
 )

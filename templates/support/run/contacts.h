@@ -29,8 +29,11 @@ enum {
 
 #define CONTACT_ROUNDING 1e-10 /* part of their size below which gaps, rates and forces count as 0 */
 #define CONTACT_SLOW 1e-6 /* part of its size below which the direction of a slip in space is kept */
+#define CONTACT_BEGIN 1e-6 /* first part of a slip in space, relative to a step; the next ones .. */
+#define CONTACT_ANGLE 1e-4 /* .. turn by less, until .. */
+#define CONTACT_STIFF 6e-2 /* .. its rate relative to that by its friction is larger than this */
 #define CONTACT_BRAKES 0.25 /* longest part of a step relative to the time to a stop of a slip in space .. */
-#define CONTACT_GROWS 0.3 /* .. and relative to that since its beginning */
+#define CONTACT_GROWS 0.2 /* .. and relative to that since its beginning */
 #define CONTACT_PENETRATION 1e-9 /* part of its size by which a gap may be negative at a start */
 #define CONTACT_MISSED 128.0 /* effects of rounding beyond which a negative gap shows a missed transition */
 #define CONTACT_LOWEST 16.0 /* roundings of a gap below which a rebound ends */
@@ -757,8 +760,10 @@ static int choose_modes(const event_step *step, const contact_terms *of, const c
     for (int j = 0; j < CONTACT_ROWS && slip >= 0; j++)
       speed += fabs(of->W[slip * CONTACT_ROWS + j] * force[j] * step->whole);
     put_mode(CONTACTS + k, best[k], is_slow || slip < 0 ? AT_REST : of->rate + slip, speed, step->watch->mode);
-    if (is_slow)
+    if (is_slow) {
       step->watch->fastest[k] = fmax(step->watch->fastest[k], speed);
+      step->watch->first[k] = CONTACT_BEGIN * fabs(step->whole);
+    }
   }
   put_modes(step->watch->mode, step->own);
   return OK;
@@ -1056,6 +1061,29 @@ static int keeps_direction(const real *start, const real *w)
   return length_of(start, 2) > length_of(w, 2) * length_of(w, 2);
 }
 
+/* Present modes, the forces and second rates in them; returns 0 without slips in space, or without forces. */
+static int slips_at(const event_step *step, const event_sample *at, contact_terms *of, contact_mode *mode, real *force,
+    real *second, int *status)
+{
+  const real *const modes = step->watch->mode;
+  int slips = 0;
+  for (int k = 0; k < EVENT_CONTACTS; k++)
+    slips |= CONTACTS[k].slips == 2 && modes[CONTACTS[k].direction] != 0.0 && !mode_of(modes, k).held;
+  *status = slips ? terms_at(step, at, of) : OK;
+  if (!slips || *status != OK)
+    return 0;
+  modes_at(of, modes, mode);
+  return solve_contacts(of, mode, of->second, force, second, NULL);
+}
+
+/* Whether a slip in space begins at a rate that is small relative to that by its friction. */
+static int is_gentle(const event_step *step, const contact_terms *of, int k, const real *force, real rate)
+{
+  const int slip = CONTACTS[k].tangential;
+  const real by_friction = length_of(force + slip, 2) * of->W[slip * (CONTACT_ROWS + 1)];
+  return step->watch->first[k] > 0.0 && rate > -CONTACT_ROUNDING * by_friction && rate < CONTACT_STIFF * by_friction;
+}
+
 /* Slips in space at the beginning of a part of a step. Solutions are not smooth where they stop, and steps do not
  * resolve where they begin: the direction of slow ones is kept, and steps are in proportion to |w|/|w'|, at most
  * *longest. The direction `ahead` of others is renewed after a turn. */
@@ -1064,23 +1092,10 @@ static int follow_slips(const event_step *step, const event_sample *at, real *lo
   contact_terms of;
   contact_mode mode[EVENT_CONTACTS];
   real force[CONTACT_ROWS], second[CONTACT_ROWS];
-  int slips = 0, status;
+  int status;
   *longest = INFINITY;
-  for (int k = 0; k < EVENT_CONTACTS; k++) {
-    mode[k] = mode_of(step->watch->mode, k);
-    slips |= CONTACTS[k].slips == 2 && step->watch->mode[CONTACTS[k].direction] != 0.0 && !mode[k].held;
-  }
-  status = slips ? terms_at(step, at, &of) : OK;
-  if (!slips || status != OK)
+  if (!slips_at(step, at, &of, mode, force, second, &status))
     return status;
-  for (int k = 0; k < EVENT_CONTACTS; k++) {
-    const real *const w = of.rate + CONTACTS[k].tangential;
-    const real *const start = step->watch->mode + CONTACTS[k].direction + 1;
-    for (int i = 0; i < 2 && CONTACTS[k].slips == 2 && mode[k].closed && !mode[k].sticks && !mode[k].held; i++)
-      mode[k].direction[i] = keeps_direction(start, w) ? start[2 + i] : w[i] / length_of(w, 2);
-  }
-  if (!solve_contacts(&of, mode, of.second, force, second, NULL))
-    return OK;
   for (int k = 0; k < EVENT_CONTACTS; k++) {
     const int slip = CONTACTS[k].tangential;
     real *const start = step->watch->mode + CONTACTS[k].direction + 1, *const ahead = start + 2;
@@ -1092,9 +1107,11 @@ static int follow_slips(const event_step *step, const event_sample *at, real *lo
     real *const fastest = step->watch->fastest + k;
     *fastest = fmax(*fastest, fmax(size, of.speed[slip]));
     const real slow = CONTACT_SLOW * *fastest;
-    const int is_slow = rate < 0.0 && size <= slow, is_released = keeps && size > slow;
+    const real until_slow = rate > 0.0 ? 2.0 * slow / rate : INFINITY;
+    const int begins = keeps && is_gentle(step, &of, k, force, rate);
+    const int is_slow = rate < 0.0 && size <= slow, is_released = keeps && !begins && size > slow;
     if (keeps && !is_released)
-      *longest = fmin(*longest, rate > 0.0 ? 2.0 * slow / rate : INFINITY);
+      *longest = fmin(*longest, begins ? step->watch->first[k] : until_slow);
     else if (!is_slow)
       *longest = fmin(*longest, (rate < 0.0 ? CONTACT_BRAKES : CONTACT_GROWS) * size / fabs(rate));
     const int turns = ahead[0] * w[0] + ahead[1] * w[1] < CONTACT_TURN * size;
@@ -1110,5 +1127,54 @@ static int follow_slips(const event_step *step, const event_sample *at, real *lo
   }
   put_modes(step->watch->mode, step->own);
   return status;
+}
+
+/* Turns slips in space that begin slowly at the end of a part. Where w' = W (s - mu N w/|w|) is small, w follows s,
+ * opposite to the friction that would stop it, at an angle with lag' = s' - lag W mu N/|w|, too stiff for steps at first:
+ * impulses of the imposed rows turn it, with its component in the former direction. */
+static int turn_slips(const event_step *step, event_sample *at, int *turned)
+{
+  contact_terms of;
+  contact_mode mode[EVENT_CONTACTS];
+  real force[CONTACT_ROWS], second[CONTACT_ROWS], right[CONTACT_ROWS] = {0.0};
+  int turns[EVENT_CONTACTS] = {0}, status;
+  if (!slips_at(step, at, &of, mode, force, second, &status))
+    return status;
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const int slip = CONTACTS[k].tangential;
+    const real *const d = mode[k].direction, *const start = step->watch->mode + CONTACTS[k].direction + 1;
+    if (CONTACTS[k].slips < 2 || start[-1] == 0.0 || mode[k].held || !keeps_direction(start, of.rate + slip))
+      continue;
+    turns[k] = is_gentle(step, &of, k, force, d[0] * second[slip] + d[1] * second[slip + 1]);
+    mode[k] = turns[k] ? CONTACT_STICKS : mode[k];
+    *turned |= turns[k];
+  }
+  if (!*turned || !solve_contacts(&of, mode, of.second, force, second, NULL))
+    return OK;
+  for (int k = 0; k < EVENT_CONTACTS; k++) {
+    const real *const tau = force + CONTACTS[k].tangential, *const w = of.rate + CONTACTS[k].tangential;
+    real *const start = step->watch->mode + CONTACTS[k].direction + 1, *const ahead = start + 2;
+    const real load = length_of(tau, 2), size = length_of(start, 2), speed = ahead[0] * w[0] + ahead[1] * w[1];
+    mode[k].direction[0] = mode[k].direction[1] = 0.0; /* friction of others has no impulse */
+    if (!turns[k])
+      continue;
+    const real angle = (ahead[1] * tau[0] - ahead[0] * tau[1]) / load;
+    const real relaxed = fabs(step->h) * load * of.W[CONTACTS[k].tangential * (CONTACT_ROWS + 1)];
+    const real lag = angle / (1.0 + relaxed / speed); /* by a step of Euler's implicit method */
+    const real d[2] = {-(tau[0] + lag * tau[1]) / load, -(tau[1] - lag * tau[0]) / load};
+    const real part = speed / (d[0] * ahead[0] + d[1] * ahead[1]);
+    step->watch->first[k] *= fmin(2.0, CONTACT_ANGLE / fmax(fabs(angle - lag), DBL_MIN));
+    for (int i = 0; i < 2; i++) {
+      right[CONTACTS[k].tangential + i] = w[i] - part * d[i];
+      ahead[i] = d[i];
+      start[i] = size * d[i];
+    }
+  }
+  put_modes(step->watch->mode, step->own);
+  if (solve_contacts(&of, mode, right, force, second, NULL))
+    for (int r = 0; r < CONTACT_ROWS; r++)
+      for (int i = 0; i < M; i++)
+        at->p[i] += of.G[r * M + i] * force[r];
+  return add_change(step, FIRST_TRANSITION, at);
 }
 #endif

@@ -309,7 +309,7 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
   for (int changes = 0; status == OK; changes++) {
     event_sample at = {.q = states + 4 * M, .p = states + 5 * M};
     real part = length;
-    int acts = 0, far = 0, ends, cut = 0;
+    int acts = 0, far = 0, ends, cut = 0, turned = 0;
 #ifdef CONTACTS_IN_SPACE
     if (!adaptive)
       status = shorten_part(step, &left, &right, run->t, changes, &part);
@@ -362,9 +362,13 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
       copy_state(at.q, at.p, right.q, right.p);
     } else if (!acts && !step->watch->ended) {
       step->watch->started = 1;
-      if (changes > 0)
+#ifdef CONTACTS_IN_SPACE
+      status = turn_slips(step, &right, &turned);
+#endif
+      if (changes > 0 || turned)
         set_run(run, run->t, &right);
-      status = check_walls(step, &left, &right);
+      if (status == OK)
+        status = check_walls(step, &left, &right);
 #ifdef EVENT_KINKS
       if (status == OK)
         status = check_sides(step, &right);
@@ -389,6 +393,10 @@ static int change_in_step(const event_run *before, event_run *run, event_step *s
 #ifdef EVENT_CONTACTS
     if (status == OK && !cut)
       status = change_contacts(step, group, &at);
+#endif
+#ifdef CONTACTS_IN_SPACE
+    if (status == OK)
+      status = turn_slips(step, &at, &turned);
 #endif
     ends = fabs(length) <= CHANGE_SAFETY * DBL_EPSILON * fabs(step->whole);
     if (status == OK)
