@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Container, Iterable, Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
 from scvi_codegen.common.errors import MethodError
@@ -40,6 +40,7 @@ def located_kinks(system: MechanicalSystem) -> tuple[MechanicalSystem, tuple[Kin
     """
     owned = [field.name for field in fields(system) if field.name in FORMULAS]
     formulas = [formula for name in owned for formula in _formulas(getattr(system, name))]
+    formulas += [part for reaction in system.reactions for part in reaction.direction]  # of friction
     steps = sorted(parts_of_type(unit_step, *formulas), key=str)
     powers = _vanishing_powers(formulas)
     one_sided = _one_sided(formulas, powers)
@@ -60,6 +61,9 @@ def located_kinks(system: MechanicalSystem) -> tuple[MechanicalSystem, tuple[Kin
     jumps = arguments if jumps and len(arguments) > MOST_SURFACES else jumps
     with_modes = copy.copy(system)  # not made anew, as it would be checked again
     changes: dict[str, Any] = {name: _replaced(getattr(system, name), rules) for name in owned}
+    changes["reactions"] = tuple(
+        replace(reaction, direction=_replaced(reaction.direction, rules)) for reaction in system.reactions
+    )
     changes["parameters"] = (*system.parameters, *modes.values())
     changes["defaults"] = (*system.defaults, *(0.0 for _ in modes))
     for name, value in (changes | {"_key": None, "_text": None}).items():

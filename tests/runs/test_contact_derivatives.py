@@ -11,6 +11,7 @@ from scipy.optimize import brentq
 
 import scvi_codegen as sc
 
+pytestmark = pytest.mark.second
 PLANE = "(x_dot**2 + y_dot**2)/2"
 
 
@@ -36,6 +37,7 @@ def by_parameter(run: Any, name: str) -> NDArray[Any]:
     return np.asarray(run.sensitivity().parameters[-1, :, run.stepper.parameters.index(name)])
 
 
+@pytest.mark.quick
 @pytest.mark.parametrize("gap", [False, True])
 def test_an_oscillator_stops_at_x0_less_8_d(gap: bool) -> None:
     dry: Any = sc.contact("y", slip="x_dot", friction="d") if gap else sc.friction("x_dot", limit="d")
@@ -186,21 +188,18 @@ def test_a_ball_in_space_slides_along_a_parabola_and_rolls() -> None:
     assert by_h == pytest.approx(20 * run.velocity[-1, :2], abs=1e-12)
 
 
-@pytest.mark.second
 def test_impacts_with_friction_in_space_turn_the_slip() -> None:
     floor = sc.contact("z - 1/2", slip=ROLLS, friction="mu", restitution="e")
     stepper = of(SPINS, "x y z a b", [floor], "svi:2", g=9.81, mu=0.03, e=0.7)
     check_by_differences(stepper, [0, 0, 1.5, 0, 0], [2, 3.2, 0, 0, 4], ["mu", "e"], h=0.05, t_end=1.5)
 
 
-@pytest.mark.second
 def test_slip_in_space_begins_at_rest_in_a_direction_that_depends_on_forces() -> None:
     table = sc.contact("z", slip=["x_dot", "y_dot"], friction="mu")
     stepper = of(f"{SPACE} - 9.81*z + F*x + G*x*y + H*y", "x y z", [table], "svi:3", F=3, G=0.5, H=1, mu=0.2)
     check_by_differences(stepper, [0, 0, 0], [0, 0, 0], ["mu", "F", "G", "H"], h=0.02, t_end=1.0)
 
 
-@pytest.mark.second
 @pytest.mark.parametrize(("steps", "error"), [({"h": 0.05}, 1e-7), ({"h": 0.025}, 5e-9), ({"tolerance": 1e-12}, 5e-10)])
 def test_where_a_puck_on_a_slope_stops(steps: dict[str, float], error: float) -> None:
     """With u = log |w| as independent variable the angle of w has d angle/du = -f sin(angle)/(f cos(angle) - mu N)."""
@@ -228,7 +227,6 @@ def test_where_a_puck_on_a_slope_stops(steps: dict[str, float], error: float) ->
     assert columns == pytest.approx(exact, abs=error)
 
 
-@pytest.mark.second
 def test_a_block_on_a_shaken_table_stops_and_slips_again() -> None:
     """By DOP853 until the slip is 1e-8, and from 1e-6 after it begins; the floor carries the block between."""
     slip = ["x_dot - 0.4*sin(3*t)", "y_dot - 0.3*A*sin(2*t)"]

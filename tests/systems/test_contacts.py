@@ -18,6 +18,7 @@ from scvi_codegen.interfaces.derivation import derivation_html
 from scvi_codegen.systems.constraints.kind import Reaction
 from scvi_codegen.systems.formulas.symbols import symbol
 
+pytestmark = pytest.mark.second
 MU = 0.3
 CLOSED, STICKS, DIRECTION = map(symbol, ("closed", "sticks", "direction"))
 
@@ -152,6 +153,7 @@ PLANE = "(x_dot**2 + y_dot**2)/2"
 METHODS = pytest.mark.parametrize("degree", [1, 2, 3])
 
 
+@pytest.mark.quick
 @METHODS
 def test_a_sliding_ball_rolls(degree: int) -> None:
     table = sc.contact("y - r", slip="x_dot - r*a_dot", friction=0.3)
@@ -187,6 +189,7 @@ def test_an_oscillator_on_a_belt_sticks_and_slips(degree: int, error: float) -> 
     assert times[-1] - times[-2] == pytest.approx(period, abs=error)
 
 
+@pytest.mark.quick
 @pytest.mark.parametrize(("degree", "error"), [(1, 4e-6), (2, 1e-9), (3, 1e-13)])
 @pytest.mark.parametrize("gap", [True, False])
 def test_an_oscillator_stops_after_four_swings(degree: int, error: float, gap: bool) -> None:
@@ -215,6 +218,7 @@ def test_a_falling_rod_sticks_and_slides(degree: int, error: float) -> None:
     assert np.abs(adaptive - true).max() < 1e-11
 
 
+@pytest.mark.quick
 def test_a_block_on_a_slope_creeps_nowhere() -> None:
     for degrees, slides in ((20, False), (35, True)):
         a = np.deg2rad(degrees)
@@ -366,6 +370,7 @@ TURNS = sc.LagrangianSystem.from_text(
 RESTS = sc.LagrangianSystem.from_text("rests", ["y"], "y_dot**2/2 - y", contacts=[sc.contact("y")])
 
 
+@pytest.mark.quick
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -573,3 +578,26 @@ def test_derivations_show_the_modes_of_contacts() -> None:
         "contact_1_sticks_1*v_1_x + h*lambda_1_2*w_2*(1 - contact_1_sticks_1)",
     ]
     assert "contact 1: gap = y" in derivation_html(system, sc.SVI(1, "gauss-lobatto:2"))
+
+
+def test_a_ball_in_space_bounces_where_friction_stops_its_slip() -> None:
+    ball = of(
+        f"{PLANE} + z_dot**2/2 - 9.81*z",
+        "x y z",
+        [sc.contact("z", slip=["x_dot", "y_dot"], friction=0.1, restitution=0.6)],
+        "svi:3",
+    )
+    run = ball.integrate([0, 0, 0.3], velocity=[0.1, 0.05, -1], h=0.05, t_end=0.4)
+    speed = np.sqrt(1 + 2 * 9.81 * 0.3)
+    rest = 0.4 - (speed - 1) / 9.81
+    assert run.q[-1, 2] == pytest.approx(0.6 * speed * rest - 9.81 * rest**2 / 2, abs=1e-14)
+    assert not run.velocity[-1, :2].any()
+
+
+def test_kinks_of_friction_coefficients_are_located() -> None:
+    block = of(f"{PLANE} - 10*y", "x y", [sc.contact("y", slip="x_dot", friction="where(x > 0.1, 0.05, 0.3)")], "svi:2")
+    run = block.integrate([0, 0], velocity=[1, 0], h=0.07, t_end=0.7)
+    first = (1 - np.sqrt(1 - 0.6)) / 3
+    later = 0.7 - first
+    assert run.q[-1, 0] == pytest.approx(0.1 + (1 - 3 * first) * later - later**2 / 4, abs=1e-14)
+    assert [round(float(t), 12) for t in run.switches[-1].t] == [round(first, 12)]

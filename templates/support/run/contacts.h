@@ -1079,6 +1079,11 @@ static int slips_at(const event_step *step, const event_sample *at, contact_term
 /* Whether a slip in space begins at a rate that is small relative to that by its friction. */
 static int is_gentle(const event_step *step, const contact_terms *of, int k, const real *force, real rate)
 {
+  int slides = 0; /* of several that slide, none is turned */
+  for (int j = 0; j < EVENT_CONTACTS; j++)
+    slides += CONTACTS[j].slips == 2 && step->watch->mode[CONTACTS[j].direction] != 0.0;
+  if (slides > 1)
+    return 0;
   const int slip = CONTACTS[k].tangential;
   const real by_friction = length_of(force + slip, 2) * of->W[slip * (CONTACT_ROWS + 1)];
   return step->watch->first[k] > 0.0 && rate > -CONTACT_ROUNDING * by_friction && rate < CONTACT_STIFF * by_friction;
@@ -1130,8 +1135,8 @@ static int follow_slips(const event_step *step, const event_sample *at, real *lo
 }
 
 /* Turns slips in space that begin slowly at the end of a part. Where w' = W (s - mu N w/|w|) is small, w follows s,
- * opposite to the friction that would stop it, at an angle with lag' = s' - lag W mu N/|w|, too stiff for steps at first:
- * impulses of the imposed rows turn it, with its component in the former direction. */
+ * opposite to the friction that would stop it, at an angle with lag' = s' - lag W mu N/|w|, too stiff for steps at
+ * first: impulses of the imposed rows turn it, with its component in the former direction. */
 static int turn_slips(const event_step *step, event_sample *at, int *turned)
 {
   contact_terms of;
