@@ -38,7 +38,7 @@ def liquid(skin: float | None = 0.3, pair: str = WELL) -> Any:
 
 @cache
 def stepper(method: str = "stoermer-verlet", skin: float | None = 0.3, pair: str = WELL) -> Any:
-    return sc.compile_stepper(liquid(skin, pair), method)
+    return sc.compile_stepper(liquid(skin, pair), method, kinks="located" if skin else "as formulas")
 
 
 def start(speed: float = 1.2, side: int = 4) -> tuple[Any, Any]:
@@ -167,7 +167,7 @@ def test_hamiltonians_constraints_and_friction_have_lists(kind: str, method: str
     r[[1, 3]] = r[[0, 2]] + np.array([[0, 0, BOX / 4], [0, BOX / 4, 0]])
     v[:4] = 0.0
     run, other = (
-        sc.compile_stepper(of_other_kind(kind, near), method).integrate(r, v, h=0.01, steps=40)
+        sc.compile_stepper(of_other_kind(kind, near), method, kinks="as formulas").integrate(r, v, h=0.01, steps=40)
         for near in ("near", "N")
     )
     assert abs(np.diff(run.q["r"][[0, -1]], axis=0)).max() > 0.2
@@ -210,7 +210,7 @@ def test_boxes_of_other_shapes_and_none(box: Any) -> None:
         generator = np.random.default_rng(5)
         state = {"x": 1.0, "r": generator.uniform(-6, 6, size=(70, 2))}
         velocity = {"x": 0.0, "r": generator.normal(size=(70, 2))}
-        run = sc.compile_stepper(system, "stoermer-verlet").integrate(
+        run = sc.compile_stepper(system, "stoermer-verlet", kinks="as formulas").integrate(
             state, velocity=velocity, h=0.01, steps=150, parameters={"m": np.linspace(0.5, 1.5, 70)}
         )
         runs.append((run.q["r"], run.energy()))

@@ -66,7 +66,9 @@ def test_arrays_have_the_motion_of_named_coordinates():
     steppers = [sc.compile_stepper(system, "svi:4") for system in (named, known)]
     ends = [stepper.integrate(q, p, **SPAN).q[-1] for stepper in steppers]
     assert np.abs(ends[0] - ends[1]).max() < 1e-13
-    fixed = [sc.compile_stepper(sized, "svi:4").integrate({"q": q}, {"q": p}, h=1e-3, steps=3000).q["q"][-1]]
+    with pytest.warns(sc.MethodWarning, match="does not locate the kinks"):
+        by_formulas = sc.compile_stepper(sized, "svi:4")
+    fixed = [by_formulas.integrate({"q": q}, {"q": p}, h=1e-3, steps=3000).q["q"][-1]]
     assert np.abs(fixed - ends[0]).max() < 1e-3  # formulas decide
 
 
