@@ -1,15 +1,12 @@
-"""Halo orbits of the Earth-Moon system about L2: a family continued towards the Moon by pseudo-arclength.
+"""Halo orbits of the Earth-Moon system about L2: the family towards the Moon, its stability and its bifurcations.
 
-The restricted three-body problem in its rotating frame. Each orbit is predicted by extrapolation from two previous ones
-and corrected by `periodic_orbit` at right angles to the family, so that turning points are passed; the step along the
-family grows while the correction is small. Four orbits are compared with the catalogue of the Jet Propulsion
-Laboratory.
+The restricted three-body problem in its rotating frame. `sc.family` continues an orbit by pseudo-arclength, so that
+turning points are passed. Four orbits are compared with the catalogue of the Jet Propulsion Laboratory.
 """
 
 import matplotlib
 
 matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
 
 import scvi_codegen as sc
@@ -32,45 +29,23 @@ PUBLISHED = (
 )
 
 
-def closed(z: np.ndarray, fixed: list[str]) -> sc.PeriodicOrbit:
-    return sc.periodic_orbit(stepper, z[:3], z[3:6], period=z[6], steps=160, fixed=fixed)
+def closed(height: float, x: float, speed: float, period: float) -> sc.PeriodicOrbit:
+    return sc.periodic_orbit(
+        stepper, [x, 0.0, height], velocity=[0.0, speed, 0.0], period=period, steps=160, fixed=["y", "z"]
+    )
 
 
-def place(orbit: sc.PeriodicOrbit) -> np.ndarray:
-    return np.concatenate([orbit.q, orbit.p, [orbit.period]])
+for z, x, speed, period in PUBLISHED:
+    orbit = closed(z, x * (1 + 1e-5), speed, period * (1 + 1e-5))
+    away = np.abs([orbit.q[0] - x, orbit.p[1] - (speed + x), orbit.period - period]).max()
+    print(f"z = {z:.4f}: period {orbit.period:.10f}, {away:.0e} from the published orbit")
 
-
-def published(height: float, x: float, speed: float, period: float) -> np.ndarray:
-    return np.array([x, 0.0, height, 0.0, speed + x, 0.0, period])
-
-
-family = [closed(published(*PUBLISHED[0]) - [0, 0, lower, 0, 0, 0, 0], ["y", "z"]) for lower in (0.001, 0.0)]
-way = 0.005
-while family[-1].period > 1.7:
-    before, last = map(place, family[-2:])
-    try:
-        family.append(closed(last + way * (last - before) / np.linalg.norm(last - before), ["y"]))
-        way = min(way * 4 / max(family[-1].iterations, 2), 0.03)
-    except sc.OrbitError:
-        way /= 2
-
-for row in PUBLISHED:
-    orbit = closed(published(*row) * (1 + 1e-5 * np.array([1, 0, 0, 0, 1, 0, 1])), ["y", "z"])
-    away = np.abs(place(orbit) - published(*row)).max()
-    print(f"z = {row[0]:.4f}: period {orbit.period:.10f}, {away:.0e} from the published orbit")
+family = sc.family(stepper, closed(*PUBLISHED[0]), step=0.05, fixed=["y"], until="period < 1.7")
 worst = max(orbit.reciprocal_error for orbit in family)
-largest = [max(abs(orbit.stability_indices)) for orbit in family]
+largest = abs(family.stability_indices).max(axis=1)
 stable = [orbit.period for orbit in family if orbit.stable]
-print(f"{len(family)} orbits, periods {family[0].period:.2f} to {family[-1].period:.2f}, pairs within {worst:.0e}")
+print(f"{len(family)} orbits, periods {family.periods[0]:.2f} to {family.periods[-1]:.2f}, pairs within {worst:.0e}")
 print(f"stability index {largest[0]:.0f} to {largest[-1]:.2f}; stable between {min(stable):.2f} and {max(stable):.2f}")
-
-figure, (path, index) = plt.subplots(1, 2, figsize=(9, 4), layout="constrained")
-for orbit in family[::3]:
-    run = orbit.run()
-    path.plot(run.q[:, 0], run.q[:, 2], color="C0" if orbit.stable else "C7", lw=0.8)
-path.plot(1 - stepper.defaults[0], 0, "ko")
-path.set(xlabel="x", ylabel="z", title="halo orbits about L2 (blue: stable)", aspect="equal")
-index.semilogy([orbit.period for orbit in family], largest, ".-")
-index.axhline(1.0, color="C7", lw=0.8)
-index.set(xlabel="period", ylabel="largest stability index")
-figure.savefig("halo_orbits.png", dpi=110)
+for found in family.bifurcations:
+    print(f"{found.kind} at the period {found.orbit.period:.6f}, C = {-2 * found.orbit.energy:.6f}")
+family.plot("halo_orbits.png")

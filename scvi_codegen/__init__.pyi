@@ -7,6 +7,11 @@ from scvi_codegen.analysis.advice.solve_ivp import solve_ivp as solve_ivp
 from scvi_codegen.analysis.chaos.indicators import ChaosIndicators as ChaosIndicators
 from scvi_codegen.analysis.estimation.fitting import Fit as Fit
 from scvi_codegen.analysis.estimation.fitting import fit as fit
+from scvi_codegen.analysis.orbits.equilibrium import Equilibrium as Equilibrium
+from scvi_codegen.analysis.orbits.equilibrium import equilibrium as equilibrium
+from scvi_codegen.analysis.orbits.family import Bifurcation as Bifurcation
+from scvi_codegen.analysis.orbits.family import Family as Family
+from scvi_codegen.analysis.orbits.family import family as family
 from scvi_codegen.analysis.orbits.solver import PeriodicOrbit as PeriodicOrbit
 from scvi_codegen.analysis.orbits.solver import periodic_orbit as periodic_orbit
 from scvi_codegen.analysis.paths.path import Path as Path

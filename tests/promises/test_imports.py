@@ -32,6 +32,7 @@ FORWARDING = {
         "interfaces.pictures.overview",
     },
     "analysis.estimation.fitting": {"interfaces.pictures.conserved"},
+    "analysis.orbits.family": {"interfaces.pictures.family"},
 }
 """Methods that forward to a higher room import inside."""
 

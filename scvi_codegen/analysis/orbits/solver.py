@@ -295,16 +295,16 @@ def periodic_orbit(
     t, values = checked_number(t, "the time t"), stepper._parameters(parameters)
     momenta = stepper._initial_momenta(q, p, velocity, t, values)
     start = np.concatenate(stepper._states.pair(q, momenta))
-    search = _OrbitSearch(
+    search = OrbitSearch(
         stepper=stepper,
-        at_rest=_momenta_at_rest(stepper, start[: stepper.dimension], t, values),
+        at_rest=momenta_at_rest(stepper, start[: stepper.dimension], t, values),
         reduction=Reduction(interface),
         period=period,
         sequence=sequence,
         max_step=limits.get("max_step", math.inf),
         fixed_indices=(*map(names.index, dict.fromkeys(fixed)), *([-1] if fixed_period else [])),
         energy=None if energy is None else checked_number(energy, "the energy"),
-        **_gain(stepper, gain),
+        **gains_of(stepper, gain),
         t=t,
         parameters=values,
         options=options,
@@ -312,13 +312,14 @@ def periodic_orbit(
     return search.orbit(np.append(start, search.period), bound)
 
 
-def _momenta_at_rest(stepper: Stepper, q: Array, t: float, parameters: Array) -> Array:
+def momenta_at_rest(stepper: Stepper, q: Array, t: float, parameters: Array) -> Array:
+    """Return the momenta without velocity, 0 where they are undefined."""
     with suppress(StateError):  # undefined of most Hamiltonians
         return stepper.momentum(q, np.zeros_like(q), t, parameters)
     return np.zeros_like(q)
 
 
-def _gain(stepper: Stepper, gain: ArrayLike | Sequence[float | None] | None) -> dict[str, Any]:
+def gains_of(stepper: Stepper, gain: ArrayLike | Sequence[float | None] | None) -> dict[str, Any]:
     """Return the increase of the positions over a period, and a mask of those that return up to an unknown increase."""
     entries: Any = np.zeros(stepper.dimension) if gain is None else gain
     drifts = np.array([entry is None for entry in np.atleast_1d(np.asarray(entries, dtype=object))])
@@ -340,7 +341,7 @@ def _equal_steps(period: float, steps: int | None, h: float | None) -> StepSeque
 
 
 @dataclass(frozen=True, eq=False)
-class _OrbitSearch:
+class OrbitSearch:
     """Equations of a periodic orbit as a function of z = (q, p, period).
 
     Attributes:
@@ -386,7 +387,7 @@ class _OrbitSearch:
         _warn_of_discretisation(orbit, bound)
         return orbit
 
-    def _adapted(self, z: Array, tolerance: float) -> _OrbitSearch:
+    def _adapted(self, z: Array, tolerance: float) -> OrbitSearch:
         """Return the search with the steps of an adaptive run along z."""
         at = self.max_step, self.t, self.parameters, self.options
         return replace(self, sequence=StepSequence.adaptive(self.stepper, z[:-1], float(z[-1]), tolerance, *at))
@@ -430,7 +431,7 @@ class _OrbitSearch:
         assert self.sequence is not None
         return self.sequence
 
-    def _described(self, z: Array, equations: _ClosingEquations, iterations: int, *, guess: Array) -> PeriodicOrbit:
+    def _described(self, z: Array, equations: ClosingEquations, iterations: int, *, guess: Array) -> PeriodicOrbit:
         """Return the orbit at the end of the iteration, after all checks; raise OrbitError if there is none."""
         m, motion = self.stepper.dimension, equations.motion
         sizes, reduced = equations.sizes, self._reduced(equations.sizes)
@@ -478,7 +479,7 @@ class _OrbitSearch:
                 "amplitude, fixed=['x', ..], or give a better initial guess"
             )
 
-    def _check_next_period(self, z: Array, equations: _ClosingEquations, allowed: float) -> None:
+    def _check_next_period(self, z: Array, equations: ClosingEquations, allowed: float) -> None:
         """Raise an error if the period of a time-dependent system is free, or the orbit does not close again."""
         system, period = self.stepper.interface.system, float(z[-1])
         if -1 not in self.fixed_indices:
@@ -494,18 +495,30 @@ class _OrbitSearch:
                 f"not periodic in time with the period {period:.10g}"
             )
 
-    def _by_segments(self, guess: Array, *, smoothed: bool) -> tuple[Array, _ClosingEquations, int]:
+    def _by_segments(self, guess: Array, *, smoothed: bool) -> tuple[Array, ClosingEquations, int]:
         """Improve a guess by multiple shooting where tangent vectors grow along it; one segment needs no improvement.
 
         States at the ends of segments are further unknowns, and continuity there further equations (Stoer & Bulirsch,
-        *Introduction to Numerical Analysis*, 7.3.5). The first nodes are those of half a period forward and half a
-        period backward from the guess: an error of the guess grows by the square root of the growth in a period.
+        *Introduction to Numerical Analysis*, 7.3.5).
+        """
+        nodes = self._nodes(guess, smoothed=smoothed)
+        if nodes is None:
+            return guess, self._closing(guess), 0
+        z, _, iterations = self._iterated(nodes, self._closing(nodes), 0)
+        nearer = np.append(z[: len(guess) - 1], z[-1])
+        return nearer, self._closing(nearer), iterations
+
+    def _nodes(self, guess: Array, *, smoothed: bool) -> Array | None:
+        """Return the starts of the segments of a guess and its period; ``None`` if one segment is enough.
+
+        The first nodes are those of half a period forward and half a period backward from the guess: an error of the
+        guess grows by the square root of the growth in a period.
         """
         start, count = guess[:-1], len(self._steps)
         earlier, later, monodromy = self._halves(start, float(guess[-1]))
         growth = float(np.abs(np.linalg.eigvals(monodromy)).max())
         if growth <= EASY:
-            return guess, self._closing(guess), 0
+            return None
         pairs = int(np.ceil(np.log(growth) / np.log(GROWTH) / 2.0))
         segments = min((4 if smoothed else 2) * pairs, count)
         middle = count - len(later)
@@ -514,10 +527,7 @@ class _OrbitSearch:
             k = np.arange(len(path))
             share = np.minimum(k / middle, (count - k) / len(later))
             path += np.outer(np.where(k <= middle, 0.5, -0.5) * share**2, later[-1] - earlier[middle - 1])
-        nodes = np.append(path[self._bounds(segments)[:-1]], guess[-1])
-        z, _, iterations = self._iterated(nodes, self._closing(nodes), 0)
-        nearer = np.append(z[: len(start)], z[-1])
-        return nearer, self._closing(nearer), iterations
+        return np.append(path[self._bounds(segments)[:-1]], guess[-1])
 
     def _halves(self, start: Array, period: float) -> tuple[Array, Array, Array]:
         """Return the states forward and backward from a start, the latter a period later, and the monodromy matrix."""
@@ -553,15 +563,13 @@ class _OrbitSearch:
         """Return the (count + 1,) numbers of the steps at which segments begin and end."""
         return np.linspace(0, len(self._steps), count + 1).round().astype(np.intp)
 
-    def _iterated(
-        self, z: Array, equations: _ClosingEquations, iterations: int
-    ) -> tuple[Array, _ClosingEquations, int]:
+    def _iterated(self, z: Array, equations: ClosingEquations, iterations: int) -> tuple[Array, ClosingEquations, int]:
         """Iterate until no step helps; return the unknowns, their equations, and the number of all iterations."""
         while iterations < MOST_ITERATIONS and (nearer := self._newton_iterate(z, equations)) is not None:
             (z, equations), iterations = nearer, iterations + 1
         return z, equations, iterations
 
-    def _check_energy(self, equations: _ClosingEquations, allowed: float) -> None:
+    def _check_energy(self, equations: ClosingEquations, allowed: float) -> None:
         """Raise :class:`OrbitError` if a closed orbit has another energy.
 
         ``allowed`` is the error of its state relative to the motion; that of the energy may be its rounding error.
@@ -575,7 +583,7 @@ class _OrbitSearch:
                 "fix fewer entries of the state, or give a better initial guess"
             )
 
-    def _newton_iterate(self, z: Array, equations: _ClosingEquations) -> tuple[Array, _ClosingEquations] | None:
+    def _newton_iterate(self, z: Array, equations: ClosingEquations) -> tuple[Array, ClosingEquations] | None:
         """Return the damped Newton iterate, or ``None`` if no step length succeeds or the step is negligible.
 
         A step length is accepted if the simplified Newton correction with the same Jacobian decreases (Deuflhard's
@@ -600,18 +608,18 @@ class _OrbitSearch:
                     return trial, at
         return None
 
-    def _units(self, equations: _ClosingEquations) -> Array:
+    def _units(self, equations: ClosingEquations) -> Array:
         """Return the sizes of the unknowns: of the motion for each start of a segment, and the time of one radian."""
         return np.append(np.tile(equations.sizes, len(equations.segments)), self.period / (2.0 * math.pi))
 
-    def _row_units(self, equations: _ClosingEquations) -> Array:
+    def _row_units(self, equations: ClosingEquations) -> Array:
         """Return the sizes of the equations, of that of the energy the change by the size of the motion."""
         rows = np.tile(self._reduced(equations.sizes), len(equations.segments))
         if self.energy is None:
             return rows
         return np.append(rows, float(np.linalg.norm(equations.partials[-1] * self._units(equations))) or 1.0)
 
-    def _inverse(self, equations: _ClosingEquations) -> Array:
+    def _inverse(self, equations: ClosingEquations) -> Array:
         """Return the pseudoinverse of the Jacobian in units of the motion; fixed unknowns do not change."""
         units, rows = self._units(equations), self._row_units(equations)
         free = np.delete(np.arange(len(units)), self.fixed_indices)
@@ -634,7 +642,7 @@ class _OrbitSearch:
         least = (RESOLVED * rounding or LEAST_SIZE for rounding in size.rounding)
         return np.repeat(list(map(max, (size.position, size.momentum), least)), self.stepper.dimension)
 
-    def _closing(self, z: Array) -> _ClosingEquations:
+    def _closing(self, z: Array) -> ClosingEquations:
         """Integrate one period and return the residuals with their derivatives; ``z`` has the start of each segment."""
         size = 2 * self.stepper.dimension
         starts = z[:-1].reshape(-1, size)
@@ -672,7 +680,7 @@ class _OrbitSearch:
             row = np.zeros(len(z))
             row[:size] = gradients[0][0]
             partials = np.vstack([partials, row])
-        return _ClosingEquations(segments, monodromy, error, relative_error, sizes, residuals, partials, left)
+        return ClosingEquations(segments, monodromy, error, relative_error, sizes, residuals, partials, left)
 
     def _returned(self, end: Array, start: Array) -> Array:
         """Return the state after a period without the increase of its positions."""
@@ -704,7 +712,7 @@ class _OrbitSearch:
             by_time=partials[:, size + 1],
         )
 
-    def _discretisation_error(self, z: Array, equations: _ClosingEquations) -> float:
+    def _discretisation_error(self, z: Array, equations: ClosingEquations) -> float:
         """Return the distance of a closed orbit to that of a finer sequence of steps; see :class:`PeriodicOrbit`."""
         start, period, steps = z[:-1], float(z[-1]), self._steps.finer
         tangents = np.zeros((0, self.stepper._input_size))
@@ -843,7 +851,7 @@ class _Segment:
 
 
 @dataclass(frozen=True, eq=False)
-class _ClosingEquations:
+class ClosingEquations:
     """Residuals of the conditions of continuity and closing.
 
     Attributes:
@@ -867,5 +875,6 @@ class _ClosingEquations:
 
     @property
     def motion(self) -> _Segment:
+        """The trajectory of a period in one segment."""
         (motion,) = self.segments
         return motion

@@ -62,7 +62,7 @@ class StepSequence:
             stepper: the compiled stepper.
             start, period: (2m,) state and period of the guess.
             tolerance: that of the local error; 0 for round-off.
-            max_step, t, parameters, options: as of :class:`_OrbitSearch`.
+            max_step, t, parameters, options: as of :class:`OrbitSearch`.
         """
 
         def ends_of(duration: float) -> Array:

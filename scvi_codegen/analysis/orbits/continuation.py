@@ -1,0 +1,509 @@
+"""Continuation of a periodic orbit: predictor along the tangent of its family, corrector at right angles to it.
+
+An orbit is a point y = (q, p, T), or (q, p, T, lambda) with a parameter of the system. At a point of a family the
+closing equations F(y) = 0 leave free
+
+* the fields X_J of the conserved quantities J, along the orbit (J = H) and along symmetries: the same orbit;
+* one more direction, the tangent of the family.
+
+An orbit is predicted along the tangent and corrected by Newton's method (H. B. Keller, in Applications of Bifurcation
+Theory, 1977; Munoz-Almaraz et al., Physica D 181 (2003) 1), in units of the motion: the ranges of positions and
+momenta, the time of one radian, and the change of the parameter that changes the end of the orbit by such a range. The
+steps of an orbit are adaptive and frozen while it is corrected, and its discretisation error is measured, as by
+`periodic_orbit`.
+
+Bifurcations are zeros of functions of the orbit, by its stability indices s (or multipliers m) but the trivial ones:
+fold: the derivative of the parameter, or else of the energy, along the family; branch: prod (s - 1); period doubling:
+prod (s + 1); Krein collision: the discriminant of the indices; torus, of steps that are not symplectic:
+prod (m_j m_k - 1).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from scvi_codegen.analysis.estimation.fixed_steps import tangents_along
+from scvi_codegen.analysis.orbits.equilibrium import Equilibrium
+from scvi_codegen.analysis.orbits.solver import (
+    DIFFERENCE_INCREMENT,
+    EASY,
+    NULL_SINGULAR_VALUE,
+    SYMPLECTIC,
+    TOLERANCES,
+    ClosingEquations,
+    OrbitSearch,
+    PeriodicOrbit,
+)
+from scvi_codegen.analysis.orbits.step_sequence import StepSequence
+from scvi_codegen.common.errors import EventError, OrbitError, StepFailedError
+from scvi_codegen.runs.states.validation import Array
+from scvi_codegen.systems.formulas.expressions import evaluate
+from scvi_codegen.systems.formulas.grammar import parse_expression
+from scvi_codegen.systems.formulas.symbols import symbol
+
+MOST_CORRECTIONS, FEW_CORRECTIONS, CONTRACTION = 10, 4, 0.7
+"""Newton iterations after which a prediction was too far, those up to which the next one may be farther, and the factor
+by which each must be shorter."""
+FIRST, GROWTH = 0.25, 1.5
+"""First step relative to the largest one, and factor between steps."""
+SETTLED, STAGNANT = 1e-12, 1e-8
+"""Newton step in units of the motion below which an orbit is corrected, and one that may cease to decrease."""
+LARGEST_TURN = math.radians(30)
+"""Angle between successive tangents above which the step is halved."""
+SMALLEST_STEP = 2.0**-12
+"""Step along the family, relative to the largest one, below which the family ends."""
+NULL = 1e-7
+"""Singular values of the closing equations, relative to the largest one, that count as zero."""
+LOCATED = 1e-10
+"""Accuracy of the location of a bifurcation between two orbits, relative to their distance."""
+BRANCHES = 1e-6
+"""Singular values of the closing equations below which another family crosses."""
+RANK = 1e-3
+"""Part of the largest of some directions below which the others depend on them."""
+
+
+class FamilyEndsError(OrbitError):
+    """No orbit follows."""
+
+
+@dataclass(frozen=True, eq=False)
+class Formula:
+    """A formula of named numbers."""
+
+    expression: Any
+    symbols: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, text: str, names: Sequence[str]) -> Formula:
+        """Return the formula that a text states."""
+        symbols = {name: symbol(name) for name in names}
+        return cls(parse_expression(text, symbols), symbols)
+
+    def __call__(self, values: Mapping[str, float]) -> float:
+        """Return its value."""
+        return float(evaluate(self.expression, {self.symbols[name]: values[name] for name in self.symbols}).real)
+
+    def derivative(self, name: str) -> Formula:
+        """Return its derivative by one of the names."""
+        return replace(self, expression=self.expression.diff(self.symbols[name]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Linearised:
+    """Closing equations and fixed entries by the reduced unknowns, in units of the motion."""
+
+    closing: ClosingEquations
+    units: Array
+    jacobian: Array
+    defects: Array
+
+
+@dataclass(frozen=True, eq=False)
+class FamilyPoint:
+    """A corrected orbit of a family, with its closing equations linearised.
+
+    Attributes:
+        y: (2m + 1,) state and period, or (2m + 2,) with the parameter.
+        orbit: the orbit.
+        units: (r,) sizes of the reduced unknowns, to which the following vectors refer.
+        jacobian: (n, r) of the closing equations and the fixed entries.
+        same: (r, k) orthonormal directions to the same orbit, from another start or shifted by a symmetry.
+        tangent: (r,) unit tangent of the family.
+        conserved: number of conserved quantities.
+        energy_gradient: (r,) derivative of the energy.
+        by_parameter: whether a parameter varies.
+        corrections: number of Newton iterations.
+        accuracy: index of the local tolerance in ``TOLERANCES`` that met the bound.
+        step: step to the next prediction.
+        of_both: whether the point belongs to another family, too, from which this one branches off.
+    """
+
+    y: Array
+    orbit: PeriodicOrbit
+    units: Array
+    jacobian: Array
+    same: Array
+    tangent: Array
+    conserved: int
+    energy_gradient: Array
+    by_parameter: bool
+    corrections: int
+    accuracy: int
+    step: float
+    of_both: bool = False
+
+    @property
+    def slope(self) -> float:
+        """Derivative of the parameter, or else of the energy, along the family."""
+        return float(self.tangent[-1] if self.by_parameter else self.energy_gradient @ self.tangent)
+
+    @cached_property
+    def tests(self) -> dict[str, float]:
+        """Test functions of the bifurcations by kind; see the top of the module."""
+        orbit, autonomous = self.orbit, not math.isnan(self.orbit.trivial_error)
+        symplectic = orbit.symplectic_error <= SYMPLECTIC
+        values = orbit.stability_indices if symplectic else orbit.multipliers
+        trivial = self.conserved if symplectic else max(self.conserved, int(autonomous))
+        others = values[np.argsort(np.abs(values - 1.0))][trivial:]
+        pairs = np.array(list(combinations(others, 2)), dtype=complex).reshape(-1, 2).T
+        collision = np.prod((pairs[0] - pairs[1]) ** 2 if symplectic else pairs[0] * pairs[1] - 1.0)
+        return {
+            "fold": self.slope,
+            "branch": float(np.prod(others - 1.0).real),
+            "period doubling": float(np.prod(others + 1.0).real),
+            "Krein collision" if symplectic else "torus": float(collision.real),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Continuation:
+    """Predictor and corrector of a family.
+
+    Attributes:
+        search: the closing equations.
+        parameter: index of the parameter that varies.
+        step: largest step in units of the motion.
+        bound: bound of the discretisation error.
+        period_of: the period as a function of the parameters by name.
+        parameter_unit: change of the parameter that changes the end of the first orbit by the size of its motion.
+    """
+
+    search: OrbitSearch
+    parameter: int | None
+    step: float
+    bound: float
+    period_of: Formula | None
+    parameter_unit: float = 1.0
+
+    def begun(
+        self, z: Array, start: PeriodicOrbit | Equilibrium, *, backward: bool
+    ) -> tuple[Continuation, FamilyPoint]:
+        """Return the continuation with the unit of its parameter, and the first point."""
+        continuation, y, growth = self, z, None
+        if self.parameter is not None:
+            continuation, y = self._with_unit(z), np.append(z, start.parameters[self.parameter])
+        if isinstance(start, Equilibrium):
+            growth = np.concatenate([z[:-1] - np.concatenate([start.q, start.p]), np.zeros(len(y) - len(z) + 1)])
+        point = continuation._corrected(y, growth)
+        sizes = np.linalg.svd(point.jacobian, compute_uv=False)
+        rank = int(np.count_nonzero(sizes > NULL * sizes[0]))
+        freedom = len(point.units) - rank - point.same.shape[1]
+        if freedom != 1:
+            raise OrbitError(self._freedom_message(freedom, point.orbit))
+        if growth is None and (point.slope < 0.0) != backward:
+            point = replace(point, tangent=-point.tangent)
+        return continuation, point
+
+    def _freedom_message(self, freedom: int, orbit: PeriodicOrbit) -> str:
+        if freedom < 1:
+            names = self.search.stepper.parameters or ("..",)
+            remedy = f"is isolated: vary a parameter of the system, parameter={names[0]!r}, or fix less"
+        else:
+            remedy = (
+                f"is one of a family of {freedom} parameters: fix {freedom - 1} more, by fixed=['x', ..], energy= or "
+                "fixed_period=True"
+            )
+        return f"the orbit of the period {orbit.period:.6g} {remedy}"
+
+    def following(self, point: FamilyPoint) -> FamilyPoint:
+        """Return the next point of the family, as far as its tangent turns by at most ``LARGEST_TURN``."""
+        step, failure = point.step, ""
+        while step >= SMALLEST_STEP * self.step:
+            try:
+                prediction = self._moved(point.y, step * point.tangent * point.units)
+                following = self._corrected(prediction, prediction - point.y, point)
+            except (EventError, OrbitError, StepFailedError, np.linalg.LinAlgError) as error:
+                step, failure = step / 2.0, str(error)
+                continue
+            turned = following.tangent * following.units / point.units
+            if turned @ point.tangent < math.cos(LARGEST_TURN) * np.linalg.norm(turned):
+                step, failure = step / 2.0, "its tangent turns by more than 30 degrees"
+                continue
+            wider = GROWTH if following.corrections <= FEW_CORRECTIONS else 1.0
+            return replace(following, step=min(self.step, wider * step))
+        raise FamilyEndsError(f"no orbit follows at {SMALLEST_STEP:.0e} of the step: {failure}")
+
+    def returns(self, points: Sequence[FamilyPoint]) -> bool:
+        """Return whether the last step leads past the first orbit, by quantities that no start on the orbit changes."""
+        first, before, last = (self._invariants(points[k]) for k in (0, -2, -1))
+        step = np.abs(last - before)
+        return bool((np.minimum(np.abs(last - first), np.abs(before - first)) <= step).all())
+
+    def _invariants(self, point: FamilyPoint) -> Array:
+        rest = point.y[2 * self.search.stepper.dimension + 1 :]
+        index = np.sort_complex(point.orbit.multipliers)[-1]
+        return np.array([point.orbit.energy, point.orbit.period, abs(index), *point.units[[0, -2]], *rest])
+
+    def located(self, before: FamilyPoint, after: FamilyPoint, kind: str) -> FamilyPoint:
+        """Return the point between two others where a test function vanishes, by Brent's method along their chord."""
+        from scipy.optimize import brentq
+
+        size, points = 2 * self.search.stepper.dimension, {0.0: before, 1.0: after}
+        chord = after.y - before.y
+        chord[:size] = self.search.reduction.aligned(after.y[:size], before.y[:size]) - before.y[:size]
+
+        def value(part: float) -> float:
+            if part not in points:
+                points[part] = self._corrected(before.y + part * chord, chord, before)
+            return points[part].tests[kind]
+
+        return points[float(brentq(value, 0.0, 1.0, xtol=LOCATED))]
+
+    def branching(self, point: FamilyPoint, periods: int, side: int) -> tuple[Continuation, FamilyPoint]:
+        """Return the point of a bifurcation with the tangent of the other family, whose period is a multiple."""
+        size = 2 * self.search.stepper.dimension
+        y = point.y.copy()
+        y[size] *= periods
+        doubled = replace(self, search=replace(self.search, period=float(y[size])))
+        if periods > 1 and self.search.sequence is not None:
+            equal = StepSequence.equal(periods * len(self.search.sequence))
+            doubled = replace(doubled, search=replace(doubled.search, sequence=equal))
+        both = doubled._corrected(y, None, point)
+        kept = _smallest(both.jacobian, both.same.shape[1] + 2)
+        others = _without(_without(kept, both.same), both.tangent[:, np.newaxis])
+        return doubled, replace(both, tangent=side * others[:, 0], step=self.step * FIRST, of_both=True)
+
+    def _corrected(self, prediction: Array, normal: Array | None, former: FamilyPoint | None = None) -> FamilyPoint:
+        """Return the point of the family next to a prediction, with a discretisation error below the bound.
+
+        Args:
+            prediction: unknowns.
+            normal: change of the unknowns, at right angles to which the prediction is corrected.
+            former: the point before it, whose units and whose direction along the family are kept.
+        """
+        y, corrections, end = prediction, 0, 2 * self.search.stepper.dimension + 1
+        for accuracy in range(former.accuracy if former else 0, len(TOLERANCES)):
+            search = self._search_at(y, TOLERANCES[accuracy] * self.bound)
+            y, further = self._solved(search, prediction, self._in_segments(search, y, former), normal, former)
+            linear = self._linearised(search, y)
+            corrections = max(corrections, further)
+            orbit = self._found(search, y)._described(y[:end], linear.closing, corrections, guess=y[:end])
+            if orbit.error <= self.bound or self.search.sequence is not None:
+                break
+        inward = search.reduction.inward(*np.split(y[: end - 1], 2))
+        gradient = search._integral_gradients(y[: end - 1], search.t, linear.closing.sizes)[0] @ inward
+        same, conserved = self._same_orbit(search, linear)
+        tangents = _without(_smallest(linear.jacobian, same.shape[1] + 1, BRANCHES), same)
+        tangent, before = tangents[:, 0], None
+        if former is not None:
+            before = former.tangent * former.units / linear.units
+            tangent = tangents @ (tangents.T @ before)  # the family's, where another one crosses it
+            tangent /= np.linalg.norm(tangent)
+        elif normal is not None:
+            before = self._reduced(search, y, normal) / linear.units
+        if before is not None and tangent @ before < 0.0:
+            tangent = -tangent
+        return FamilyPoint(
+            y=y,
+            orbit=orbit,
+            units=linear.units,
+            jacobian=linear.jacobian,
+            same=same,
+            tangent=tangent,
+            conserved=conserved,
+            energy_gradient=np.append(gradient, np.zeros(len(tangent) - len(gradient))) * linear.units,
+            by_parameter=self.parameter is not None,
+            corrections=corrections,
+            accuracy=accuracy,
+            step=self.step * FIRST if former is None else former.step,
+        )
+
+    def _search_at(self, y: Array, tolerance: float) -> OrbitSearch:
+        """Return the closing equations next to some unknowns, with the steps of a run there."""
+        end = 2 * self.search.stepper.dimension + 1
+        search = self._with_parameter(replace(self.search, period=float(y[end - 1])), y)
+        return search if search.sequence is not None else search._adapted(y[:end], tolerance)
+
+    def _found(self, search: OrbitSearch, y: Array) -> OrbitSearch:
+        """Return the closing equations of an orbit that was found, whose period is prescribed if a formula does so."""
+        search = self._with_parameter(search, y)
+        return search if self.period_of is None else replace(search, fixed_indices=(*search.fixed_indices, -1))
+
+    def _with_parameter(self, search: OrbitSearch, y: Array) -> OrbitSearch:
+        if self.parameter is None:
+            return search
+        parameters = search.parameters.copy()
+        parameters[self.parameter] = y[-1]
+        return replace(search, parameters=parameters)
+
+    def _in_segments(self, search: OrbitSearch, y: Array, former: FamilyPoint | None) -> Array:
+        """Return unknowns with the starts of more segments where tangent vectors grow along the orbit."""
+        end = 2 * search.stepper.dimension + 1
+        if former is not None and np.abs(former.orbit.multipliers[0]) <= EASY:
+            return y
+        nodes = search._nodes(y[:end], smoothed=False)
+        return y if nodes is None else np.concatenate([nodes, y[end:]])
+
+    def _solved(
+        self, search: OrbitSearch, prediction: Array, y: Array, normal: Array | None, former: FamilyPoint | None
+    ) -> tuple[Array, int]:
+        """Correct unknowns by Newton's method, by changes of least norm; return start, period and parameter."""
+        size, last = 2 * search.stepper.dimension, math.inf
+        tail = len(prediction) - size
+        for count in range(MOST_CORRECTIONS + 1):
+            linear = self._linearised(search, y)
+            jacobian, defects = linear.jacobian, linear.defects
+            if normal is not None:
+                own = np.append(linear.units[: search.reduction.size], linear.units[-tail:])
+                row = self._reduced(search, prediction, normal) / (own if former is None else former.units) ** 2
+                row /= np.linalg.norm(row * own)
+                away = np.append(search.reduction.aligned(y[:size], prediction[:size]), y[-tail:]) - prediction
+                defects = np.append(defects, row @ self._reduced(search, prediction, away))
+                row, columns = row * own, np.zeros(len(linear.units))
+                columns[: search.reduction.size], columns[-tail:] = row[:-tail], row[-tail:]
+                jacobian = np.vstack([jacobian, columns])
+            change = np.linalg.pinv(jacobian, NULL_SINGULAR_VALUE) @ defects
+            length = float(np.linalg.norm(change))
+            if length <= SETTLED or (length <= STAGNANT and length > last / 2.0):
+                return np.append(y[:size], y[-tail:]), count
+            if not length < CONTRACTION * last:
+                break
+            y, last = self._moved(y, -change * linear.units), length
+        raise OrbitError(f"the correction of an orbit of the period {prediction[size]:.6g} does not converge")
+
+    def _reduced(self, search: OrbitSearch, y: Array, change: Array) -> Array:
+        """Return a change of the unknowns in the reduced tangent space."""
+        size = 2 * search.stepper.dimension
+        outward = search.reduction.outward(*np.split(y[:size], 2))
+        return np.concatenate([outward @ change[:size], change[size:]])
+
+    def _moved(self, y: Array, change: Array) -> Array:
+        """Return unknowns after a change in the reduced tangent space, of the starts of one or more segments."""
+        tail, reduction = 1 + (self.parameter is not None), self.search.reduction
+        starts = y[:-tail].reshape(-1, 2, self.search.stepper.dimension)
+        changes = change[:-tail].reshape(len(starts), reduction.size)
+        moved = [
+            reduction.normalised(*(start + (reduction.inward(*start) @ by).reshape(2, -1)))
+            for start, by in zip(starts, changes, strict=True)
+        ]
+        return np.append(np.ravel(moved), y[-tail:] + change[-tail:])
+
+    def _linearised(self, search: OrbitSearch, y: Array) -> _Linearised:
+        """Return the closing equations at some unknowns, and their Jacobian by the reduced unknowns, in units."""
+        tail, search = 1 + (self.parameter is not None), self._with_parameter(search, y)
+        states, period = y[:-tail], y[len(y) - tail]
+        closing = search._closing(np.append(states, period))
+        rows = search._row_units(closing)
+        starts = states.reshape(-1, 2, search.stepper.dimension)
+        inward = _block_diagonal([search.reduction.inward(*start) for start in starts])
+        units = np.append(np.tile(search._reduced(closing.sizes), len(starts)), period / (2.0 * math.pi))
+        columns, defects = [closing.partials[:, :-1] @ inward, closing.partials[:, -1:]], closing.defects
+        into = _block_diagonal([inward, np.eye(tail)])
+        if self.parameter is not None:
+            units = np.append(units, self.parameter_unit)
+            columns.append(self._by_parameter(search, closing, starts, period)[:, np.newaxis])
+        jacobian = np.hstack(columns) * units / rows[:, np.newaxis]
+        fixed = into[[k if k >= 0 else len(states) for k in search.fixed_indices]] * units
+        jacobian = np.vstack([jacobian, fixed / np.abs(fixed).max(axis=1, keepdims=True)]) if len(fixed) else jacobian
+        defects = np.append(defects / rows, np.zeros(len(fixed)))
+        if self.period_of is not None:
+            value, slope = self._period(search)
+            row = np.zeros(len(units))
+            row[-2:] = 1.0, -slope * units[-1] / units[-2]
+            jacobian = np.vstack([jacobian, row])
+            defects = np.append(defects, (period - value) / units[-2])
+        return _Linearised(closing, units, jacobian, defects)
+
+    def _period(self, search: OrbitSearch) -> tuple[float, float]:
+        """Return the prescribed period and its derivative by the parameter that varies."""
+        names = search.stepper.parameters
+        values = dict(zip(names, search.parameters, strict=False))
+        if self.period_of is None or self.parameter is None:
+            return search.period, 0.0
+        return self.period_of(values), self.period_of.derivative(names[self.parameter])(values)
+
+    def _by_parameter(self, search: OrbitSearch, closing: ClosingEquations, starts: Array, period: float) -> Array:
+        """Return the derivatives of the closing equations by the parameter."""
+        assert self.parameter is not None
+        steps, bounds = search._steps, search._bounds(len(starts))
+        tangent = np.zeros((1, search.stepper._input_size))
+        tangent[0, starts[0].size + self.parameter] = 1.0
+        column = []
+        for k, segment in enumerate(closing.segments):
+            part = slice(bounds[k], bounds[k + 1])
+            times, sizes = search.t + period * steps.ends[:-1][part], period * steps.widths[part]
+            at = times, sizes, tangent, search.parameters, search.options, np.zeros((len(sizes), 1))
+            column.append(search._leaving(segment) @ tangents_along(search.stepper, starts[k].ravel(), *at)[1][-1][0])
+        column[-1][np.flatnonzero(search.drifts)] = 0.0
+        column[-1] = closing.independent @ column[-1]
+        if search.energy is not None:
+            column.append(np.array([self._energy_by_parameter(search, starts[0], self.parameter)]))
+        return np.concatenate(column)
+
+    def _energy_by_parameter(self, search: OrbitSearch, start: Array, parameter: int) -> float:
+        """Return the derivative of the energy of a state by a parameter, by central differences."""
+        width = DIFFERENCE_INCREMENT * (abs(search.parameters[parameter]) or 1.0)
+        changed = np.repeat(search.parameters[np.newaxis], 2, axis=0)
+        changed[:, parameter] += -width, width
+        q, p = start
+        less, more = (float(search.stepper.energy(q, p, search.t, values)) for values in changed)
+        return (more - less) / (2.0 * width)
+
+    def _with_unit(self, z: Array) -> Continuation:
+        """Return the continuation with the unit of its parameter."""
+        assert self.parameter is not None
+        search = self._search_at(np.append(z, self.search.parameters[self.parameter]), TOLERANCES[0] * self.bound)
+        closing = search._closing(z)
+        starts = z[:-1].reshape(1, 2, -1)
+        column = self._by_parameter(search, closing, starts, float(z[-1])) / search._row_units(closing)
+        effect = float(np.linalg.norm(column))
+        if self.period_of is not None:
+            effect += abs(self._period(search)[1]) * 2.0 * math.pi / float(z[-1])
+        if not effect > 0.0:
+            name = search.stepper.parameters[self.parameter]
+            raise OrbitError(f"the parameter '{name}' does not change this orbit: vary another one")
+        return replace(self, parameter_unit=1.0 / effect)
+
+    def _same_orbit(self, search: OrbitSearch, linear: _Linearised) -> tuple[Array, int]:
+        """Return the orthonormal directions to the same orbit, and the number of conserved quantities.
+
+        They are the flow and the fields Omega grad J of the conserved quantities, whose gradients are the equations
+        that the projection ``independent`` removes; of them those that keep the fixed entries.
+        """
+        closing, size, units = linear.closing, search.reduction.size, linear.units
+        kept, strengths, _ = np.linalg.svd(closing.independent * units[:size] / units[:size, np.newaxis])
+        gradients = kept[:, strengths < 0.5]
+        fields = np.vstack([gradients[size // 2 :], -gradients[: size // 2]])
+        if not closing.motion.by_time.any():
+            flow = search._leaving(closing.motion) @ closing.motion.by_period / units[:size]
+            fields = np.column_stack([flow / np.linalg.norm(flow), fields])
+        fields = np.vstack([fields, np.zeros((len(units) - size, fields.shape[1]))])
+        fields = _range(fields)
+        rows = linear.jacobian[len(closing.defects) :]
+        return _range(fields @ _smallest(rows @ fields, 0, RANK)), gradients.shape[1]
+
+
+def _block_diagonal(blocks: Sequence[Array]) -> Array:
+    """Return the matrix of blocks along the diagonal."""
+    rows, columns = np.cumsum([[0, 0], *(block.shape for block in blocks)], axis=0).T
+    matrix = np.zeros((rows[-1], columns[-1]))
+    for block, row, column in zip(blocks, rows, columns, strict=False):
+        matrix[row : row + len(block), column : column + block.shape[1]] = block
+    return matrix
+
+
+def _range(vectors: Array) -> Array:
+    """Return an orthonormal basis of the span of columns."""
+    basis, strengths, _ = np.linalg.svd(vectors, full_matrices=False)
+    return basis[:, strengths > RANK * strengths.max(initial=0.0)]
+
+
+def _smallest(matrix: Array, count: int, least: float = 0.0) -> Array:
+    """Return the right singular vectors of ``count`` smallest singular values, and of others up to ``least``."""
+    _, strengths, rows = np.linalg.svd(matrix)
+    rank = min(matrix.shape[1] - count, int(np.count_nonzero(strengths > least)))
+    return rows[rank:].T
+
+
+def _without(vectors: Array, directions: Array) -> Array:
+    """Return an orthonormal basis of the span of columns at right angles to some directions in it."""
+    rest = vectors - directions @ (directions.T @ vectors)
+    basis, _, _ = np.linalg.svd(rest, full_matrices=False)
+    return basis[:, : vectors.shape[1] - directions.shape[1]]

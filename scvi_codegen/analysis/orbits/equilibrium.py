@@ -1,0 +1,166 @@
+"""Equilibria and their modes, from the derivative of short steps.
+
+An equilibrium is a fixed point of the step of any size h. The eigenvalues mu of the step's derivative there are those
+of the linear motion, mu = exp(lambda h); at a pair lambda = +-i omega begins a family of periodic orbits of the period
+2 pi/omega (Lyapunov's centre theorem; Moser, Comm. Pure Appl. Math. 29 (1976) 727).
+"""
+
+from __future__ import annotations
+
+import math
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from scvi_codegen.analysis.estimation.fixed_steps import tangents_along
+from scvi_codegen.common.errors import OrbitError, StateError, StepFailedError
+from scvi_codegen.common.representation import summary
+from scvi_codegen.common.validation import checks_arguments
+from scvi_codegen.runs.states.reduction import Reduction
+from scvi_codegen.runs.states.validation import Array, Parameters, check_inputs_given
+from scvi_codegen.runs.stepper import STEPPER, Stepper
+from scvi_codegen.runs.stepping.features import require
+
+LEAST_CHANGE = 0.1
+"""Least |mu - 1| of the steps, whose eigenvalues have the error of one short step."""
+HALVINGS, MOST_ITERATIONS = 60, 50
+NULL = 1e-10
+"""Singular values below this fraction of the largest belong to directions in which the system is free."""
+SAME = 1e-6
+"""Relative change of the eigenvalues by the last but one iterate; the last one is accurate to its square."""
+OSCILLATES = 1e-6
+"""Real part of an eigenvalue, relative to its modulus, below which it is the rounding error of one on the axis."""
+FLAT = 1e-3
+"""Part of the eigenvalues at the guess below which the iteration leaves for infinity, where no force is left."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Equilibrium:
+    """A state of rest.
+
+    Attributes:
+        q, p: (m,) positions and momenta.
+        t: time at which it was determined.
+        eigenvalues: (2m,) those of the linear motion, in descending order of their imaginary parts.
+        vectors: (2m, 2m) their eigenvectors (changes of q and p), in columns.
+        parameters: (k,) in the order of ``stepper.parameters``.
+        stepper: the compiled integrator.
+    """
+
+    q: Array
+    p: Array
+    t: float
+    eigenvalues: NDArray[np.complex128]
+    vectors: NDArray[np.complex128] = field(repr=False)
+    parameters: Array
+    stepper: Stepper = field(repr=False)
+
+    __repr__ = summary("q", "p", "frequencies", "stable")
+
+    @property
+    def _oscillations(self) -> NDArray[np.bool_]:
+        values = self.eigenvalues
+        return (values.imag > 0) & (np.abs(values.real) <= OSCILLATES * np.abs(values))
+
+    @property
+    def frequencies(self) -> Array:
+        """Angular frequencies of the oscillations without growth or decay, in descending order."""
+        return np.asarray(self.eigenvalues.imag[self._oscillations])
+
+    @property
+    def modes(self) -> NDArray[np.complex128]:
+        """(2m, n) changes of (q, p) of the oscillations; the real and imaginary parts are a quarter period apart."""
+        return np.asarray(self.vectors[:, self._oscillations])
+
+    @property
+    def stable(self) -> bool:
+        """Return whether no eigenvalue has a positive real part, up to rounding."""
+        return bool((self.eigenvalues.real <= OSCILLATES * np.abs(self.eigenvalues).max()).all())
+
+
+@checks_arguments(StateError, stepper=STEPPER)
+def equilibrium(stepper: Stepper, q: ArrayLike, *, t: float = 0.0, parameters: Parameters = None) -> Equilibrium:
+    """Find the equilibrium near given positions by Newton's method, with the frequencies of its small oscillations.
+
+    Args:
+        stepper: the compiled stepper.
+        q: (m,) positions near those of the equilibrium.
+        t, parameters: as of :meth:`Stepper.integrate`.
+
+    Raises:
+        OrbitError: if the iteration does not converge.
+        MethodError: if the stepper has no derivatives, constraints or transformed time.
+        StateError: if a shape, name or number is invalid.
+    """
+    stepper = stepper.bind(q, parameters)[0]._known_with_events
+    require(stepper, "periodic_orbit")
+    check_inputs_given(stepper.interface, parameters)
+    values, rest = stepper._parameters(parameters), np.zeros(stepper.dimension)
+    positions, _, velocity = stepper._states.start(q, None, rest)
+    momenta = stepper._initial_momenta(positions, None, velocity, t, values)
+    state = np.concatenate(stepper._states.pair(positions, momenta))
+    reduction = Reduction(stepper.interface)
+    motion = _Motion(stepper, reduction, t, values)
+    motion = motion.of_short_steps(state)
+    factors, begun = np.full(reduction.size, math.inf), 0.0
+    for _ in range(MOST_ITERATIONS):
+        former, (defect, derivative) = factors, motion.step(state)
+        factors = np.linalg.eigvals(derivative)
+        change = np.linalg.lstsq(derivative - np.eye(reduction.size), -defect, rcond=NULL)[0]
+        state = np.ravel(reduction.normalised(*np.split(state + reduction.inward(*np.split(state, 2)) @ change, 2)))
+        # The derivative of the step, which the change of the state hardly changes, gives the scale of a small change.
+        strength = np.abs(factors - 1).max()
+        begun = begun or strength
+        if np.abs(np.sort(factors) - np.sort(former)).max() <= SAME * strength and strength >= FLAT * begun:
+            return motion.at_rest(state)
+    raise OrbitError(
+        f"no equilibrium of '{stepper.title}' was found near q = {np.asarray(q)}: {MOST_ITERATIONS} iterations did not "
+        "converge. Give a better initial guess"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Motion:
+    """Short steps of a system, and their derivatives in the reduced tangent space."""
+
+    stepper: Stepper
+    reduction: Reduction
+    t: float
+    parameters: Array
+    h: float = 1.0
+
+    def of_short_steps(self, state: Array) -> _Motion:
+        """Return the motion in the least step, a power of two, whose derivative differs from 1 by a tenth."""
+        for h in 2.0 ** np.arange(-HALVINGS, HALVINGS):
+            with suppress(StepFailedError), np.errstate(all="ignore"):
+                longer = replace(self, h=float(h))
+                if np.abs(np.linalg.eigvals(longer.step(state)[1]) - 1).max() >= LEAST_CHANGE:
+                    return longer
+        return self
+
+    def step(self, state: Array) -> tuple[Array, Array]:
+        """Return the change of a state by a step and the derivative of the step."""
+        tangents = np.zeros((len(state), self.stepper._input_size))
+        tangents[:, : len(state)] = np.eye(len(state))
+        at = np.array([self.t]), np.array([self.h]), tangents, self.parameters
+        states, vectors, _ = tangents_along(self.stepper, state, *at)
+        outward, inward = (m(*np.split(state, 2)) for m in (self.reduction.outward, self.reduction.inward))
+        end = self.reduction.aligned(states[-1], state)
+        return outward @ (end - state), outward @ vectors[-1].T @ inward
+
+    def at_rest(self, state: Array) -> Equilibrium:
+        """Return the equilibrium at a state."""
+        factors, vectors = np.linalg.eig(self.step(state)[1].astype(complex))
+        order = np.argsort(-np.angle(factors), kind="stable")
+        q, p = np.split(state, 2)
+        return Equilibrium(
+            q=q,
+            p=p,
+            t=self.t,
+            eigenvalues=np.log(factors[order]) / self.h,
+            vectors=self.reduction.inward(q, p) @ vectors[:, order],
+            parameters=self.parameters,
+            stepper=self.stepper,
+        )

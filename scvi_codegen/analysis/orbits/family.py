@@ -1,0 +1,346 @@
+"""Families of periodic orbits: orbits in a row, the bifurcations between them, and the families that begin there."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from scvi_codegen.analysis.estimation.measurements import state_names
+from scvi_codegen.analysis.orbits.continuation import Continuation, FamilyEndsError, FamilyPoint, Formula
+from scvi_codegen.analysis.orbits.equilibrium import Equilibrium
+from scvi_codegen.analysis.orbits.solver import (
+    ERROR,
+    ERROR_OF_EQUAL_STEPS,
+    OrbitSearch,
+    PeriodicOrbit,
+    gains_of,
+    momenta_at_rest,
+)
+from scvi_codegen.codegen.native.arguments import checked_number
+from scvi_codegen.common.errors import AccuracyWarning, OrbitError, StateError, closest, warn
+from scvi_codegen.common.representation import counted, summary
+from scvi_codegen.common.validation import checked_count, checks_arguments
+from scvi_codegen.runs.accuracy.warning_switch import warnings_wanted
+from scvi_codegen.runs.states.reduction import Reduction
+from scvi_codegen.runs.states.validation import Array
+from scvi_codegen.runs.stepper import STEPPER, Stepper
+from scvi_codegen.runs.stepping.features import require
+
+CLOSING = 10
+"""Least number of orbits of a family that ends where it began."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Bifurcation:
+    """Orbit of a family where its stability changes, or where the family turns.
+
+    Attributes:
+        kind: ``"fold"`` (the parameter, or else the energy, has an extremum), ``"branch"`` (another family crosses),
+            ``"period doubling"``, ``"Krein collision"`` (indices meet and leave the real axis), ``"torus"``.
+        orbit: the periodic orbit there.
+        after: number of the last orbit of the family before it.
+    """
+
+    kind: str
+    orbit: PeriodicOrbit
+    after: int
+    _at: FamilyPoint = field(repr=False)
+    _continuation: Continuation = field(repr=False)
+
+    __repr__ = summary("kind", "orbit", "after")
+
+    def switch(
+        self,
+        *,
+        side: int = 1,
+        step: float | None = None,
+        count: int = 100,
+        until: Until = None,
+        progress: Progress = None,
+    ) -> Family:
+        """Return the family that begins here, on one of its two sides, ``side`` 1 or -1; arguments of :func:`family`.
+
+        Raises:
+            OrbitError: if no other family of periodic orbits begins here.
+        """
+        periods = {"branch": 1, "period doubling": 2}.get(self.kind)
+        if periods is None:
+            raise OrbitError(f"no other family of periodic orbits begins at a {self.kind}: the family itself passes it")
+        if side not in (1, -1):
+            raise StateError(f"side must be 1 or -1, one of the two sides of a branch, not {side!r}")
+        continuation = self._continuation if step is None else replace(self._continuation, step=_checked_step(step))
+        continuation, start = continuation.branching(self._at, periods, side)
+        return _continued(continuation, [start], checked_count(count, "count", least=2), until, progress)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Family:
+    """One-parameter family of periodic orbits.
+
+    Attributes:
+        orbits: in their order along the family.
+        bifurcations: between them.
+        parameter: name of the parameter of the system that varies; ``None`` if none does.
+        ended: why the family has no further orbit here.
+    """
+
+    orbits: tuple[PeriodicOrbit, ...]
+    bifurcations: tuple[Bifurcation, ...]
+    parameter: str | None
+    ended: str
+    _last: FamilyPoint = field(repr=False)
+    _continuation: Continuation = field(repr=False)
+
+    __repr__ = summary("orbits", "bifurcations", "parameter", "ended")
+
+    def __len__(self) -> int:
+        return len(self.orbits)
+
+    def __iter__(self) -> Iterator[PeriodicOrbit]:
+        return iter(self.orbits)
+
+    def __getitem__(self, k: int) -> PeriodicOrbit:
+        return self.orbits[k]
+
+    @property
+    def periods(self) -> Array:
+        """(n,) periods."""
+        return np.array([orbit.period for orbit in self.orbits])
+
+    @property
+    def energies(self) -> Array:
+        """(n,) energies of the initial states."""
+        return np.array([orbit.energy for orbit in self.orbits])
+
+    @property
+    def values(self) -> Array:
+        """(n,) values of the parameter that varies, or else the energies."""
+        return np.array([self.value_of(orbit) for orbit in self.orbits])
+
+    def value_of(self, orbit: PeriodicOrbit) -> float:
+        """Return the value of the parameter that varies, or else the energy, of an orbit."""
+        if self.parameter is None:
+            return orbit.energy
+        return float(orbit.parameters[orbit.stepper.parameters.index(self.parameter)])
+
+    @property
+    def stability_indices(self) -> NDArray[np.complex128]:
+        """(n, m) stability indices; see :attr:`PeriodicOrbit.stability_indices`."""
+        return np.array([orbit.stability_indices for orbit in self.orbits])
+
+    def more(self, count: int = 100, *, until: Until = None, progress: Progress = None) -> Family:
+        """Return the family with up to ``count`` further orbits."""
+        longer = _continued(
+            self._continuation, [self._last], checked_count(count, "count", least=1) + 1, until, progress
+        )
+        own = len(self) - 1
+        later = (replace(found, after=found.after + own) for found in longer.bifurcations)
+        return replace(longer, orbits=self.orbits[:-1] + longer.orbits, bifurcations=(*self.bifurcations, *later))
+
+    def plot(self, path: str | os.PathLike[str] | None = None) -> Any:
+        """Draw the orbits, their stability, and energy (or parameter) against period with the bifurcations.
+
+        Returns:
+            The figure of matplotlib; a .png, .svg or .pdf is written if a path is passed.
+        """
+        from scvi_codegen.interfaces.pictures.family import plot_family
+
+        return plot_family(self, path)
+
+
+Until = str | Callable[[PeriodicOrbit], bool] | None
+Progress = Callable[[int], None] | None
+
+
+@checks_arguments(StateError, stepper=STEPPER)
+def family(
+    stepper: Stepper,
+    start: PeriodicOrbit | Equilibrium,
+    *,
+    parameter: str | None = None,
+    step: float = 0.1,
+    count: int = 100,
+    until: str | Callable[[PeriodicOrbit], bool] | None = None,
+    backward: bool = False,
+    fixed: Sequence[str] = (),
+    fixed_period: bool = False,
+    period: str | None = None,
+    energy: float | None = None,
+    mode: int = 0,
+    amplitude: float | None = None,
+    gain: ArrayLike | Sequence[float | None] | None = None,
+    error: float | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Family:
+    """Continue a family of periodic orbits, and locate its bifurcations.
+
+    Args:
+        stepper: the compiled stepper.
+        start: an orbit of the family, or an equilibrium where it begins, with ``amplitude``.
+        parameter: name of a parameter of the system that varies along the family. Without it orbits of a conservative
+            system form a family by energy.
+        step: largest change between successive orbits, relative to the size of the motion; it is halved where the
+            family turns by more than 30 degrees.
+        count: largest number of orbits.
+        until: condition after which the family ends, a formula such as ``"energy > -1.57"`` of the energy, the
+            ``period``, parameters and the initial state (``"x"``, ``"p_x"``), or a function of the orbit.
+        backward: continue towards smaller values of the parameter, or else of the energy.
+        fixed: coordinates and momenta that keep their initial values, such as those of a section.
+        fixed_period: keep the period, of systems that depend on time.
+        period: formula of the period of a system that depends on time, such as ``"2*pi/omega"``.
+        energy: prescribed energy, of a family along a parameter.
+        mode: number of the oscillation of the equilibrium, in descending order of frequencies.
+        amplitude: largest deviation of a coordinate from the equilibrium on the first orbit.
+        gain, error: as of :func:`periodic_orbit`.
+        progress: called with the number of orbits.
+
+    Returns:
+        A :class:`Family`; after Ctrl-C of the orbits so far, which :meth:`Family.more` continues.
+
+    Raises:
+        OrbitError: if the start is isolated (vary a parameter), one of a family of several parameters (fix some), or no
+            orbit is found next to it.
+        StateError: if a name or number is invalid.
+    """
+    require(stepper, "periodic_orbit")
+    if start.stepper.interface != stepper.interface:
+        raise StateError(f"the start is one of '{start.stepper.title}', not of '{stepper.title}'")
+    names, options = state_names(stepper), getattr(start, "options", None)
+    for name in fixed:
+        if name not in names:
+            raise StateError(f"fixed names '{name}', which is no coordinate or momentum{closest(name, names)}")
+    if parameter is not None and parameter not in stepper.parameters:
+        raise StateError(f"'{parameter}' is no parameter of '{stepper.title}'{closest(parameter, stepper.parameters)}")
+    first = _state_at(start, mode, amplitude)
+    sequence = getattr(start, "sequence", None)
+    equal = sequence if sequence is not None and sequence.tolerance is None else None
+    default = ERROR if equal is None else ERROR_OF_EQUAL_STEPS
+    search = OrbitSearch(
+        stepper=stepper,
+        at_rest=momenta_at_rest(stepper, start.q, start.t, start.parameters),
+        reduction=Reduction(stepper.interface),
+        period=float(first[-1]),
+        sequence=equal,
+        max_step=math.inf,
+        fixed_indices=(*map(names.index, dict.fromkeys(fixed)), *([-1] if fixed_period else [])),
+        energy=None if energy is None else checked_number(energy, "the energy"),
+        **gains_of(stepper, gain),
+        t=start.t,
+        parameters=np.array(start.parameters),
+        options=options,
+    )
+    continuation = Continuation(
+        search=search,
+        parameter=None if parameter is None else stepper.parameters.index(parameter),
+        step=_checked_step(step),
+        bound=default if error is None else checked_number(error, "error"),
+        period_of=None if period is None else Formula.of(period, stepper.parameters),
+    )
+    continuation, point = continuation.begun(first, start, backward=backward)
+    return _continued(continuation, [point], checked_count(count, "count", least=1), until, progress)
+
+
+def _checked_step(step: float) -> float:
+    if not 0.0 < (step := checked_number(step, "step")) <= 1.0:
+        raise StateError(f"step must be between 0 and 1, relative to the size of the motion, not {step:g}")
+    return step
+
+
+def _state_at(start: PeriodicOrbit | Equilibrium, mode: int, amplitude: float | None) -> Array:
+    """Return (q, p, period) of the first orbit, or of its guess next to an equilibrium."""
+    if isinstance(start, PeriodicOrbit):
+        if amplitude is not None:
+            raise StateError("amplitude= is for a start at an equilibrium: omit it")
+        return np.concatenate([start.q, start.p, [start.period]])
+    frequencies, count = start.frequencies, len(start.q)
+    if not 0 <= mode < len(frequencies):
+        raise StateError(f"the equilibrium has {counted(len(frequencies), 'oscillation')}, none with the number {mode}")
+    if amplitude is None or not (amplitude := checked_number(amplitude, "amplitude")) > 0.0:
+        raise StateError("a family that begins at an equilibrium needs the amplitude= of its first orbit, positive")
+    vector = start.modes[:, mode]
+    vector = vector / vector[np.abs(vector[:count]).argmax()]  # that coordinate is at its largest deviation
+    state = np.concatenate([start.q, start.p]) + amplitude * vector.real
+    return np.append(state, 2.0 * math.pi / frequencies[mode])
+
+
+def _condition(until: Until, stepper: Stepper) -> Callable[[PeriodicOrbit], bool]:
+    """Return whether an orbit is the last one."""
+    if not isinstance(until, str):
+        return until or (lambda orbit: False)
+    states = state_names(stepper)
+    holds = Formula.of(f"where({until}, 1, 0)", (*states, *stepper.parameters, "energy", "period"))
+
+    def condition(orbit: PeriodicOrbit) -> bool:
+        numbers = (*orbit.q, *orbit.p, *orbit.parameters, orbit.energy, orbit.period)
+        return holds(dict(zip(holds.symbols, numbers, strict=True))) == 1.0
+
+    return condition
+
+
+def _continued(
+    continuation: Continuation, points: list[FamilyPoint], count: int, until: Until, progress: Progress
+) -> Family:
+    """Return the family from the last of the points on, which are counted."""
+    condition, bifurcations = _condition(until, continuation.search.stepper), list[Bifurcation]()
+    ended = f"it has the {counted(count, 'orbit')} that were asked for"
+    try:
+        while len(points) < count:
+            following = continuation.following(points[-1])
+            try:
+                if not points[-1].of_both:
+                    bifurcations += tuple(_bifurcations(continuation, points[-1], following, len(points) - 1))
+            except OrbitError:  # the orbits between them are none of the chord: go on in smaller steps
+                points[-1] = replace(points[-1], step=points[-1].step / 4.0)
+                continue
+            points.append(following)
+            if progress is not None:
+                progress(len(points))
+            if condition(following.orbit):
+                ended = f"{until} holds" if isinstance(until, str) else "the condition of until holds"
+                break
+            if len(points) > CLOSING and continuation.returns(points):
+                ended = "it is closed: the next orbit is the first one"
+                break
+    except FamilyEndsError as reason:
+        ended = str(reason)
+    except KeyboardInterrupt:
+        ended = "it was interrupted"
+    orbits = tuple(point.orbit for point in points)
+    _warn_of_errors(orbits, continuation.bound)
+    stepper, parameter = continuation.search.stepper, continuation.parameter
+    return Family(
+        orbits=orbits,
+        bifurcations=tuple(bifurcations),
+        parameter=None if parameter is None else stepper.parameters[parameter],
+        ended=ended,
+        _last=points[-1],
+        _continuation=continuation,
+    )
+
+
+def _warn_of_errors(orbits: Sequence[PeriodicOrbit], bound: float) -> None:
+    worst = max(orbits, key=lambda orbit: orbit.error)
+    if worst.error > bound and warnings_wanted():
+        warn(
+            f"orbits of the family have discretisation errors up to {worst.error:.1e} (period {worst.period:.6g}), "
+            f"above the bound {bound:.1e}: use a method of higher degree or a larger error=",
+            AccuracyWarning,
+        )
+
+
+def _bifurcations(
+    continuation: Continuation, before: FamilyPoint, after: FamilyPoint, number: int
+) -> Iterator[Bifurcation]:
+    """Locate the bifurcations between two points of the family."""
+    kinds = [kind for kind, value in before.tests.items() if value * after.tests.get(kind, value) < 0.0]
+    for kind in kinds:
+        if kind == "branch" and "fold" in kinds:  # an index passes through 1 at a fold
+            continue
+        at = continuation.located(before, after, kind)
+        yield Bifurcation(kind=kind, orbit=at.orbit, after=number, _at=at, _continuation=continuation)

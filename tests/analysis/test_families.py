@@ -1,0 +1,157 @@
+"""Families of periodic orbits, beside elliptic integrals, published bifurcations and orbits found one by one."""
+
+import numpy as np
+import pytest
+from scipy.special import ellipk
+
+import scvi_codegen as sc
+
+PENDULUM = sc.LagrangianSystem.from_text("pendulum", ["q"], "q_dot**2/2 + g*cos(q)", parameters={"g": 1.0})
+RESTRICTED = sc.LagrangianSystem.from_text(
+    name="restricted three-body problem",
+    coordinates=["x", "y", "z"],
+    lagrangian="((x_dot - y)**2 + (y_dot + x)**2 + z_dot**2)/2"
+    " + (1 - mu)/sqrt((x + mu)**2 + y**2 + z**2) + mu/sqrt((x - 1 + mu)**2 + y**2 + z**2)",
+    parameters={"mu": 1.215058560962404e-2},
+)
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    return sc.compile_stepper(PENDULUM, "svi:8")
+
+
+@pytest.fixture(scope="module")
+def moon():
+    return sc.compile_stepper(RESTRICTED, "svi:8")
+
+
+@pytest.mark.second
+def test_equilibria_have_the_frequencies_of_the_linear_motion(moon, pendulum):
+    rest = sc.equilibrium(moon, [0.83, 0.01, 0.01])
+    (x, y, z), mu = rest.q, moon.defaults[0]
+    assert abs(x - (1 - mu) / (x + mu) ** 2 + mu / (x - 1 + mu) ** 2) < 1e-14
+    assert max(abs(y), abs(z)) < 1e-15
+    c = (1 - mu) / (x + mu) ** 3 + mu / (1 - mu - x) ** 3
+    assert rest.frequencies == pytest.approx([np.sqrt((2 - c + np.sqrt(9 * c**2 - 8 * c)) / 2), np.sqrt(c)], abs=1e-13)
+    assert not rest.stable
+    assert sc.equilibrium(pendulum, [0.0]).frequencies == pytest.approx([1.0], abs=1e-14)
+    above = sc.equilibrium(pendulum, [3.0])
+    assert above.q == pytest.approx([np.pi], abs=1e-14)
+    assert above.eigenvalues.real == pytest.approx([-1, 1], abs=1e-13) or above.eigenvalues.real[0] > 0
+
+
+@pytest.mark.second
+def test_periods_of_a_pendulum_are_elliptic_integrals(pendulum):
+    family = sc.family(
+        pendulum, sc.equilibrium(pendulum, [0.0]), amplitude=0.01, step=0.3, error=1e-11, until="energy > 0.9"
+    )
+    assert family.ended == "energy > 0.9 holds"
+    assert not family.bifurcations
+    expected = 4 * ellipk((family.energies + 1) / 2)
+    assert family.periods == pytest.approx(expected, rel=1e-12)
+    longer = family.more(2)
+    assert len(longer) == len(family) + 2
+    assert longer[-1].period == pytest.approx(4 * ellipk((longer[-1].energy + 1) / 2), rel=1e-11)
+
+
+def test_family_along_a_parameter_at_fixed_energy(pendulum):
+    """The period of q'' = -g sin q with the energy E is 4 K((E + g)/(2 g))/sqrt(g)."""
+    orbit = sc.periodic_orbit(pendulum, [0.5], [0.0], period=6.3)
+    family = sc.family(pendulum, orbit, parameter="g", energy=orbit.energy, count=6, backward=True)
+    g = family.values
+    assert (np.diff(g) < 0).all()
+    assert family.energies == pytest.approx(np.full(6, orbit.energy), abs=1e-12)
+    assert family.periods == pytest.approx(4 * ellipk((orbit.energy + g) / (2 * g)) / np.sqrt(g), rel=1e-9)
+
+
+@pytest.mark.rotated
+def test_lyapunov_orbits_branch_to_halo_orbits(moon):
+    """The bifurcation has C = 3.17435 and T = 2.74299, and both sides are mirror images."""
+    family = sc.family(moon, sc.equilibrium(moon, [0.83, 0, 0]), amplitude=0.01, step=0.2, until="energy > -1.585")
+    (halo,) = family.bifurcations
+    assert halo.kind == "branch"
+    assert -2 * halo.orbit.energy == pytest.approx(3.174351954, abs=1e-9)
+    assert halo.orbit.period == pytest.approx(2.742994069, abs=1e-9)
+    north, south = (halo.switch(side=side, count=3)[-1] for side in (1, -1))
+    assert max(abs(north.run().q[:, 2])) > 1e-4
+    assert north.period == pytest.approx(south.period, abs=1e-9)
+    assert north.energy == pytest.approx(south.energy, abs=1e-9)
+    assert north.run().q[:, 2].max() == pytest.approx(-south.run().q[:, 2].min(), abs=1e-6)
+
+
+@pytest.mark.rotated
+def test_resonance_curve_has_two_folds():
+    """Of a driven Duffing oscillator, at the frequencies where a multiplier is 1."""
+    system = sc.LagrangianSystem.from_text(
+        name="duffing",
+        coordinates=["x"],
+        lagrangian="x_dot**2/2 - x**2/2 - b*x**4/4 + F*x*cos(w*t)",
+        parameters={"b": 0.2, "F": 0.1, "w": 0.9, "c": 0.05},
+        dissipation="c*x_dot**2/2",
+    )
+    stepper = sc.compile_stepper(system, "svi:4")
+    orbit = sc.periodic_orbit(stepper, [0.5], [0.0], period=2 * np.pi / 0.9, fixed_period=True)
+    curve = sc.family(stepper, orbit, parameter="w", period="2*pi/w", step=0.3, until="w > 1.25")
+    assert [found.kind for found in curve.bifurcations] == ["fold", "fold"]
+    above, below = (found.orbit for found in curve.bifurcations)
+    for orbit in (above, below):
+        assert abs(orbit.multipliers - 1).min() < 1e-5
+        assert np.prod(orbit.multipliers).real == pytest.approx(np.exp(-0.05 * orbit.period), rel=1e-9)
+    assert above.parameters[2] == pytest.approx(1.194508, abs=1e-5)
+    assert below.parameters[2] == pytest.approx(1.097960, abs=1e-5)
+
+
+@pytest.mark.rotated
+def test_gait_of_a_walker_doubles_its_period():
+    """At the slopes of Garcia et al. (1998), .0151 and .0177."""
+    walker = sc.LagrangianSystem.from_text(
+        name="walker",
+        coordinates=["theta", "phi"],
+        lagrangian="(theta_dot**2 + phi_dot**2)/2 - cos(theta - gamma)",
+        forces={"phi": "sin(theta - gamma) + (theta_dot**2 - cos(theta - gamma))*sin(phi)"},
+        parameters={"gamma": 0.014},
+    )
+    then = {
+        "theta": "-theta",
+        "phi": "-2*theta",
+        "p_theta": "cos(2*theta)*p_theta",
+        "p_phi": "cos(2*theta)*(1 - cos(2*theta))*p_theta",
+    }
+    stepper = sc.compile_stepper(walker, "svi:8", events=sc.Event("phi - 2*theta", where="theta < -0.05", then=then))
+    run = stepper.integrate([0.2, 0.4], velocity=[-0.1995, -0.0157], t_end=40.0)
+    guess = [part[0] for part in run.at([run.events[0].t[-2] + 1.0])]
+    gaits = sc.family(
+        stepper, sc.periodic_orbit(stepper, *guess, period=3.9), parameter="gamma", until="gamma > 0.0155"
+    )
+    (limps,) = gaits.bifurcations
+    assert limps.kind == "period doubling"
+    assert limps.orbit.parameters[0] == pytest.approx(0.015088438, abs=1e-8)
+    (again,) = limps.switch(until="gamma > 0.0178").bifurcations
+    assert again.kind == "period doubling"
+    assert again.orbit.parameters[0] == pytest.approx(0.0176694, abs=1e-6)
+
+
+def test_starts_without_a_family_are_refused(pendulum):
+    rest = sc.equilibrium(pendulum, [0.0])
+    orbit = sc.periodic_orbit(pendulum, [0.5], [0.0], period=6.3)
+    with pytest.raises(sc.StateError, match="needs the amplitude="):
+        sc.family(pendulum, rest)
+    with pytest.raises(sc.StateError, match="has 1 oscillation, none with the number 1"):
+        sc.family(pendulum, rest, amplitude=0.1, mode=1)
+    with pytest.raises(sc.StateError, match="'h' is no parameter of"):
+        sc.family(pendulum, orbit, parameter="h")
+    with pytest.raises(sc.OrbitError, match="is isolated: vary a parameter of the system, parameter='g', or fix less"):
+        sc.family(pendulum, orbit, fixed_period=True, fixed=["q"])
+    with pytest.raises(sc.OrbitError, match="is one of a family of 2 parameters: fix 1 more"):
+        sc.family(pendulum, orbit, parameter="g")
+    falling = sc.compile_stepper(sc.LagrangianSystem.from_text("falling", ["q"], "q_dot**2/2 - exp(q)"), "svi:2")
+    with pytest.raises(sc.OrbitError, match="no equilibrium of 'falling"):
+        sc.equilibrium(falling, [0.0])
+
+
+@pytest.mark.second
+def test_family_is_drawn(pendulum, tmp_path):
+    family = sc.family(pendulum, sc.equilibrium(pendulum, [0.0]), amplitude=0.5, count=3)
+    family.plot(tmp_path / "family.png")
+    assert (tmp_path / "family.png").stat().st_size > 10_000
