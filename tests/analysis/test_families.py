@@ -151,7 +151,11 @@ def test_starts_without_a_family_are_refused(pendulum):
 
 
 @pytest.mark.second
-def test_family_is_drawn(pendulum, tmp_path):
+def test_family_is_saved_and_drawn(pendulum, tmp_path):
     family = sc.family(pendulum, sc.equilibrium(pendulum, [0.0]), amplitude=0.5, count=3)
+    family.save(tmp_path / "family.npz")
+    with np.load(tmp_path / "family.npz") as saved:
+        assert saved["period"] == pytest.approx(family.periods, rel=1e-15)
+        assert saved["multipliers"].shape == (3, 2)
     family.plot(tmp_path / "family.png")
     assert (tmp_path / "family.png").stat().st_size > 10_000

@@ -35,6 +35,7 @@ QUIET_COMMANDS = (
     ("doctor",),
     ("page", "planar-pendulum", "-o", "pendulum.html"),
     ("path", "kepler", "--from", "1,0", "--to=-0.5,0.8", "--span", "2", "--step", "0.1"),
+    ("family", "planar-pendulum", "--q", "0.1", "--amplitude", "0.1", "--count", "2"),
 )
 """Of every command one at least, after a run in the folder ``orbit.run``."""
 

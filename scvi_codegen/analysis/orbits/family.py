@@ -23,6 +23,7 @@ from scvi_codegen.analysis.orbits.solver import (
     momenta_at_rest,
 )
 from scvi_codegen.codegen.native.arguments import checked_number
+from scvi_codegen.common.atomic import write_atomically
 from scvi_codegen.common.errors import AccuracyWarning, OrbitError, StateError, closest, warn
 from scvi_codegen.common.representation import counted, summary
 from scvi_codegen.common.validation import checked_count, checks_arguments
@@ -142,6 +143,17 @@ class Family:
         own = len(self) - 1
         later = (replace(found, after=found.after + own) for found in longer.bifurcations)
         return replace(longer, orbits=self.orbits[:-1] + longer.orbits, bifurcations=(*self.bifurcations, *later))
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the orbits to a .npz file: q, p, period, energy, parameters, error, multipliers, stable, bifurcations.
+
+        ``bifurcations`` are the numbers of the orbits before them, ``kinds`` their kinds.
+        """
+        names = ("q", "p", "period", "energy", "parameters", "error", "multipliers", "stable")
+        arrays: dict[str, Any] = {name: np.array([getattr(orbit, name) for orbit in self.orbits]) for name in names}
+        arrays["bifurcations"] = np.array([found.after for found in self.bifurcations], dtype=np.intp)
+        arrays["kinds"] = np.array([found.kind for found in self.bifurcations], dtype=np.str_)
+        write_atomically(path, lambda file: np.savez(file, **arrays))
 
     def plot(self, path: str | os.PathLike[str] | None = None) -> Any:
         """Draw the orbits, their stability, and energy (or parameter) against period with the bifurcations.

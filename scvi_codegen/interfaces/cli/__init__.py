@@ -40,6 +40,7 @@ ABOUT = {
     "derive": "Print the equations of one step of MODEL.",
     "doctor": "Check compiler and libraries of this machine.",
     "export": "Write the states of a run in a folder to one file.",
+    "family": "Continue periodic orbits; locate bifurcations.",
     "generate": "Generate C code and a Python package for MODEL.",
     "methods": "List the methods and their properties.",
     "page": "Write a page that computes the motion in the browser.",

@@ -1,0 +1,137 @@
+"""Command ``scvi-codegen family``: a family of periodic orbits, by energy or along a parameter."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+from scvi_codegen.analysis.orbits import family as families
+from scvi_codegen.analysis.orbits.continuation import Formula
+from scvi_codegen.analysis.orbits.equilibrium import Equilibrium, equilibrium
+from scvi_codegen.analysis.orbits.solver import PeriodicOrbit, periodic_orbit
+from scvi_codegen.common.errors import ModelFileError
+from scvi_codegen.common.representation import counted
+from scvi_codegen.interfaces.cli.command_group import check_writable, is_quiet, reporting, tell
+from scvi_codegen.interfaces.cli.model_options import model_arguments, read_model, with_known_sizes
+from scvi_codegen.interfaces.models.model import Model
+from scvi_codegen.interfaces.pictures.canvas import PICTURES, check_plot_path
+from scvi_codegen.runs.stepper import Stepper
+
+
+@click.command()
+@model_arguments("solver")
+@click.option("--amplitude", type=float, metavar="A", help="Begin at the equilibrium near --q, with this deviation.")
+@click.option(
+    "--mode", type=int, default=0, metavar="N", help="Oscillation of the equilibrium, by descending frequency [0]."
+)
+@click.option("--period", metavar="T", help="Period of an orbit near --q, or its formula (2*pi/w).")
+@click.option("--vary", metavar="NAME", help="Parameter of the system along which the family is continued.")
+@click.option("--fixed", multiple=True, metavar="NAME", help="Coordinate or momentum that keeps its value.")
+@click.option("--until", metavar="CONDITION", help="Condition that ends the family, 'energy > -1.57'.")
+@click.option("--backward", is_flag=True, help="Towards smaller values of the parameter, or of the energy.")
+@click.option("--stride", type=float, default=0.1, metavar="S", help="Largest step, relative to the motion [0.1].")
+@click.option("--count", type=int, default=50, metavar="N", help="Largest number of orbits [50].")
+@click.option("-o", "--output", type=click.Path(), metavar="FILE", help="Orbits: .npz.")
+@click.option("--plot", type=click.Path(), metavar="FILE", help="Plot (.png, .svg, .pdf).")
+@reporting
+def family(model_name: str, output: str | None, plot: str | None, **choices: Any) -> None:
+    """Continue a family of periodic orbits of MODEL, and locate its bifurcations.
+
+    The family begins at an orbit near the initial state of MODEL (--period), or at the equilibrium near its positions
+    (--amplitude). It is one by energy, or along a parameter (--vary). After Ctrl-C the orbits so far are written.
+
+    \b
+    Examples:
+      scvi-codegen family planar-pendulum --q 0 --amplitude 0.1 --count 20 --plot pendulum.png
+      scvi-codegen family henon-heiles --q 0,0.9 --amplitude 0.01 --until 'energy > 0.2' -o family.npz
+    """
+    for target in (output, plot):
+        if target is not None:
+            check_writable(Path(target), "'-o', '--plot'")
+    if output is not None and Path(output).suffix != ".npz":
+        raise ModelFileError(f"orbits of a family are saved as .npz, not as '{output}'")
+    if plot is not None:
+        check_plot_path(plot, PICTURES)
+    model = with_known_sizes(read_model(model_name, choices), "family")
+    stepper, vary = model.stepper(), choices["vary"]
+    period = None if choices["period"] is None else Formula.of(choices["period"], stepper.parameters)
+    varies = period is not None and vary in map(str, period.expression.free_symbols)
+    found = families.family(
+        stepper,
+        _start(model, stepper, choices["amplitude"], period, fixed_period=varies),
+        parameter=vary,
+        step=choices["stride"],
+        count=choices["count"],
+        until=choices["until"],
+        backward=choices["backward"],
+        fixed=choices["fixed"],
+        period=choices["period"] if varies else None,
+        mode=choices["mode"],
+        amplitude=choices["amplitude"],
+        progress=None if is_quiet() or not sys.stderr.isatty() else _show_progress,
+    )
+    tell(_described(found), **_numbers(found))
+    for target, write in ((output, found.save), (plot, found.plot)):
+        if target is not None:
+            write(target)
+            tell(f"wrote {target}")
+    if written := [target for target in (output, plot) if target]:
+        tell(written=written)
+
+
+def _start(
+    model: Model, stepper: Stepper, amplitude: float | None, period: Formula | None, *, fixed_period: bool
+) -> PeriodicOrbit | Equilibrium:
+    """Return the orbit or the equilibrium near the initial state of a model."""
+    at: dict[str, Any] = {"t": model.t, "parameters": model.parameters}
+    if amplitude is not None and period is None:
+        return equilibrium(stepper, model.q, **at)
+    if period is None or amplitude is not None:
+        raise ModelFileError(
+            "give the period of an orbit (--period) or the amplitude next to an equilibrium (--amplitude)"
+        )
+    value = period(dict(zip(stepper.parameters, stepper._parameters(model.parameters), strict=False)))
+    return periodic_orbit(
+        stepper, model.q, model.p, velocity=model.velocity, period=value, fixed_period=fixed_period, **at
+    )
+
+
+def _show_progress(count: int) -> None:
+    click.echo(f"\r{counted(count, 'orbit')}", nl=False, err=True)
+
+
+def _described(found: families.Family) -> str:
+    name, stepper = found.parameter or "energy", found[0].stepper
+    first, last = found.values[[0, -1]]
+    lines = [
+        f"{stepper.title}: {counted(len(found), 'periodic orbit')}",
+        f"{name} {first:.12g} to {last:.12g}, period {found.periods[0]:.12g} to {found.periods[-1]:.12g}, discretisation "
+        f"errors up to {max(orbit.error for orbit in found):.1e}; {sum(orbit.stable for orbit in found)} are stable",
+        *(
+            f"{at.kind} at {name} {found.value_of(at.orbit):.12g}, period {at.orbit.period:.12g}"
+            for at in found.bifurcations
+        ),
+        f"ended: {found.ended}",
+    ]
+    return "\n".join(lines)
+
+
+def _numbers(found: families.Family) -> dict[str, Any]:
+    def numbers(orbit: PeriodicOrbit) -> dict[str, Any]:
+        return {
+            "value": found.value_of(orbit),
+            "period": orbit.period,
+            "energy": orbit.energy,
+            "error": orbit.error,
+            "stable": orbit.stable,
+            "start": dict(zip(orbit.stepper.coordinates, np.asarray(orbit.q).tolist(), strict=True)),
+        }
+
+    return {
+        "parameter": found.parameter,
+        "ended": found.ended,
+        "orbits": [numbers(orbit) for orbit in found],
+        "bifurcations": [{"kind": at.kind, "after": at.after, **numbers(at.orbit)} for at in found.bifurcations],
+    }
