@@ -89,9 +89,8 @@ def _start(
     if amplitude is not None and period is None:
         return equilibrium(stepper, model.q, **at)
     if period is None or amplitude is not None:
-        raise ModelFileError(
-            "give the period of an orbit (--period) or the amplitude next to an equilibrium (--amplitude)"
-        )
+        ways = "the period of an orbit (--period) or the amplitude next to an equilibrium (--amplitude)"
+        raise ModelFileError(f"give {ways}")
     value = period(dict(zip(stepper.parameters, stepper._parameters(model.parameters), strict=False)))
     return periodic_orbit(
         stepper, model.q, model.p, velocity=model.velocity, period=value, fixed_period=fixed_period, **at
