@@ -106,8 +106,9 @@ def _described(found: families.Family) -> str:
     first, last = found.values[[0, -1]]
     lines = [
         f"{stepper.title}: {counted(len(found), 'periodic orbit')}",
-        f"{name} {first:.12g} to {last:.12g}, period {found.periods[0]:.12g} to {found.periods[-1]:.12g}, discretisation "
-        f"errors up to {max(orbit.error for orbit in found):.1e}; {sum(orbit.stable for orbit in found)} are stable",
+        f"{name} {first:.12g} to {last:.12g}, period {found.periods[0]:.12g} to {found.periods[-1]:.12g}",
+        f"discretisation errors up to {max(orbit.error for orbit in found):.1e}",
+        f"{sum(orbit.stable for orbit in found)} are stable",
         *(
             f"{at.kind} at {name} {found.value_of(at.orbit):.12g}, period {at.orbit.period:.12g}"
             for at in found.bifurcations
